@@ -1,0 +1,68 @@
+//! AES-256-GCM by RustCrypto's `aes-gcm`.
+
+use alloc::boxed::Box;
+
+use aes_gcm::aead::inout::InOutBuf;
+use aes_gcm::{AeadInOut, Aes256Gcm, KeyInit};
+
+use super::{Aead, AeadError};
+use crate::TAG_LEN;
+use crate::header::NONCE_LEN;
+
+/// AES-256-GCM by RustCrypto, erased on drop.
+// Boxed, so that a move copies a pointer and leaves no key schedule behind.
+pub struct RustCrypto(Box<Aes256Gcm>);
+
+impl Aead for RustCrypto {
+    const NAME: &'static str = "aes-gcm";
+
+    fn new(key: &[u8; 32]) -> Self {
+        Self(Box::new(Aes256Gcm::new(key.into())))
+    }
+
+    fn seal_in_place(
+        &self,
+        nonce: &[u8; NONCE_LEN],
+        aad: &[u8],
+        in_out: &mut [u8],
+    ) -> Result<[u8; TAG_LEN], AeadError> {
+        let tag = self.0.encrypt_inout_detached(nonce.into(), aad, in_out.into());
+        tag.map(Into::into).map_err(|_| AeadError)
+    }
+
+    fn seal_apart(
+        &self,
+        nonce: &[u8; NONCE_LEN],
+        aad: &[u8],
+        plaintext: &[u8],
+        ciphertext: &mut [u8],
+    ) -> Result<[u8; TAG_LEN], AeadError> {
+        let buffers = InOutBuf::new(plaintext, ciphertext).map_err(|_| AeadError)?;
+        let tag = self.0.encrypt_inout_detached(nonce.into(), aad, buffers);
+        tag.map(Into::into).map_err(|_| AeadError)
+    }
+
+    fn open_in_place(
+        &self,
+        nonce: &[u8; NONCE_LEN],
+        aad: &[u8],
+        in_out: &mut [u8],
+        tag: &[u8; TAG_LEN],
+    ) -> Result<(), AeadError> {
+        self.0
+            .decrypt_inout_detached(nonce.into(), aad, in_out.into(), tag.into())
+            .map_err(|_| AeadError)
+    }
+
+    fn open_apart(
+        &self,
+        nonce: &[u8; NONCE_LEN],
+        aad: &[u8],
+        ciphertext: &[u8],
+        tag: &[u8; TAG_LEN],
+        plaintext: &mut [u8],
+    ) -> Result<(), AeadError> {
+        let buffers = InOutBuf::new(ciphertext, plaintext).map_err(|_| AeadError)?;
+        self.0.decrypt_inout_detached(nonce.into(), aad, buffers, tag.into()).map_err(|_| AeadError)
+    }
+}

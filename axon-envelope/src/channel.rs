@@ -1,0 +1,194 @@
+//! Who talks to whom: SAE IDs, the connection's context, and key_IDs.
+
+use alloc::sync::Arc;
+use alloc::vec::Vec;
+use core::borrow::Borrow;
+use core::fmt;
+
+use zeroize::Zeroizing;
+
+/// Longest SAE ID and longest key_ID, in bytes; the shortest is 1.
+pub const MAX_ID_LEN: usize = 255;
+
+/// Longest context, in bytes.
+pub const MAX_CONTEXT_LEN: usize = u16::MAX as usize;
+
+/// An ID that is empty or longer than [`MAX_ID_LEN`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("an ID of {0} bytes: an SAE ID or key_ID has 1 to 255")]
+pub struct IdError(pub usize);
+
+/// A key's name, as the sender's KME spelled it.
+///
+/// Compared byte for byte; two spellings of one UUID are two key_IDs. Cheap to clone.
+#[derive(Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct KeyId(Arc<[u8]>);
+
+impl KeyId {
+    /// # Errors
+    /// [`IdError`] unless it has 1 to [`MAX_ID_LEN`] bytes.
+    pub fn new(id: impl AsRef<[u8]>) -> Result<Self, IdError> {
+        Ok(Self(checked_id(id.as_ref())?.into()))
+    }
+
+    /// The ID's bytes.
+    pub fn as_bytes(&self) -> &[u8] {
+        &self.0
+    }
+}
+
+impl AsRef<[u8]> for KeyId {
+    fn as_ref(&self) -> &[u8] {
+        &self.0
+    }
+}
+
+// Slices order and hash as the derived impls of `Arc<[u8]>` do, which look-ups by `&[u8]` rely on.
+impl Borrow<[u8]> for KeyId {
+    fn borrow(&self) -> &[u8] {
+        &self.0
+    }
+}
+
+/// Printable ASCII as it is, everything else escaped, so that a peer's key_ID cannot forge a log
+/// line.
+impl fmt::Display for KeyId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.0.escape_ascii())
+    }
+}
+
+impl fmt::Debug for KeyId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "KeyId({self})")
+    }
+}
+
+/// One direction of one connection: the SAE that seals, the SAE that opens, and the context both
+/// agreed on.
+///
+/// All three are bound into every key derived for the channel, so what was sealed for one channel
+/// opens on no other. The context is opaque here. It has to be new for every connection, or
+/// envelopes of an earlier one open again after both ends have restarted; AXON uses the TLS
+/// exporter `EXPORTER-AXQKD001`.
+#[derive(Clone)]
+pub struct Channel {
+    sender: Arc<[u8]>,
+    receiver: Arc<[u8]>,
+    context: Arc<Zeroizing<Vec<u8>>>,
+}
+
+/// What is wrong with a [`Channel`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum ChannelError {
+    /// The sender's SAE ID is empty or too long.
+    #[error("sender: {0}")]
+    Sender(IdError),
+    /// The receiver's SAE ID is empty or too long.
+    #[error("receiver: {0}")]
+    Receiver(IdError),
+    /// Both ends have the same SAE ID, so a reflected message would open.
+    #[error("sender and receiver have the same SAE ID: each end needs an SAE ID of its own")]
+    SameSae,
+    /// The context is longer than [`MAX_CONTEXT_LEN`].
+    #[error("a context of {0} bytes: at most 65,535 are allowed")]
+    Context(usize),
+}
+
+impl Channel {
+    /// # Errors
+    /// [`ChannelError`] if an ID does not have 1 to 255 bytes, both are the same, or the context is
+    /// over 65,535 bytes.
+    pub fn new(
+        sender: impl AsRef<[u8]>,
+        receiver: impl AsRef<[u8]>,
+        context: impl AsRef<[u8]>,
+    ) -> Result<Self, ChannelError> {
+        let sender = checked_id(sender.as_ref()).map_err(ChannelError::Sender)?;
+        let receiver = checked_id(receiver.as_ref()).map_err(ChannelError::Receiver)?;
+        let context = context.as_ref();
+        if sender == receiver {
+            return Err(ChannelError::SameSae);
+        }
+        if context.len() > MAX_CONTEXT_LEN {
+            return Err(ChannelError::Context(context.len()));
+        }
+        Ok(Self {
+            sender: sender.into(),
+            receiver: receiver.into(),
+            context: Arc::new(Zeroizing::new(context.to_vec())),
+        })
+    }
+
+    /// The other direction of the same connection.
+    #[must_use]
+    pub fn reversed(&self) -> Self {
+        Self {
+            sender: self.receiver.clone(),
+            receiver: self.sender.clone(),
+            context: self.context.clone(),
+        }
+    }
+
+    /// SAE ID of the end that seals.
+    pub fn sender(&self) -> &[u8] {
+        &self.sender
+    }
+
+    /// SAE ID of the end that opens.
+    pub fn receiver(&self) -> &[u8] {
+        &self.receiver
+    }
+
+    pub(crate) fn context(&self) -> &[u8] {
+        &self.context
+    }
+}
+
+/// Leaves the context out: an exporter value is a secret of the connection.
+impl fmt::Debug for Channel {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Channel")
+            .field("sender", &format_args!("{}", self.sender.escape_ascii()))
+            .field("receiver", &format_args!("{}", self.receiver.escape_ascii()))
+            .finish_non_exhaustive()
+    }
+}
+
+fn checked_id(id: &[u8]) -> Result<&[u8], IdError> {
+    if (1..=MAX_ID_LEN).contains(&id.len()) { Ok(id) } else { Err(IdError(id.len())) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use alloc::{format, vec};
+
+    #[test]
+    fn ids_have_1_to_255_bytes() {
+        assert_eq!(KeyId::new("").unwrap_err(), IdError(0));
+        assert_eq!(KeyId::new(vec![b'x'; 256]).unwrap_err(), IdError(256));
+        assert_eq!(KeyId::new(vec![b'x'; 255]).unwrap().as_bytes().len(), 255);
+        let err = Channel::new("", "b", []).unwrap_err();
+        assert_eq!(err, ChannelError::Sender(IdError(0)));
+        let err = Channel::new("a", vec![b'x'; 256], []).unwrap_err();
+        assert_eq!(err, ChannelError::Receiver(IdError(256)));
+    }
+
+    #[test]
+    fn a_channel_to_oneself_and_an_endless_context_are_refused() {
+        assert_eq!(Channel::new("a", "a", []).unwrap_err(), ChannelError::SameSae);
+        let err = Channel::new("a", "b", vec![0; 65_536]).unwrap_err();
+        assert_eq!(err, ChannelError::Context(65_536));
+        assert!(Channel::new("a", "b", vec![0; 65_535]).is_ok());
+    }
+
+    #[test]
+    fn printing_escapes_ids_and_hides_the_context() {
+        let id = KeyId::new(b"a\n\xff").unwrap();
+        assert_eq!(format!("{id} {id:?}"), r"a\n\xff KeyId(a\n\xff)");
+        let channel = Channel::new("alice", "bob", b"exporter").unwrap();
+        assert_eq!(format!("{channel:?}"), "Channel { sender: alice, receiver: bob, .. }");
+    }
+}
