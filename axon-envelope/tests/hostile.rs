@@ -1,0 +1,200 @@
+//! Everything an attacker or a broken peer can do to one envelope.
+
+mod common;
+
+use std::time::Duration;
+
+use axon_envelope::{
+    Delivery, Header, HeaderError, Kind, MESSAGES_PER_KEY, OpenError, RefusalCause, Route,
+    SealError, Spent, TAG_LEN, TopicHash,
+};
+use common::{ROUTE, START, opener, seal, sealer};
+
+const PLAINTEXT: &[u8] = b"what the receiver acts on";
+
+#[test]
+fn no_changed_bit_opens_and_the_honest_envelope_still_does() {
+    let mut opener = opener("key", 1);
+    let envelope = seal(&mut sealer("key", 1), ROUTE, Delivery::Reliable, PLAINTEXT);
+    let mut out = vec![0; PLAINTEXT.len()];
+    for bit in 0..envelope.len() * 8 {
+        let mut changed = envelope.clone();
+        changed[bit / 8] ^= 1 << (bit % 8);
+        let parsed = Header::parse(&changed).map(|(header, _)| header.route);
+        match opener.open_into(START, parsed.unwrap_or(ROUTE), &changed, &mut out) {
+            Err(OpenError::Header(_)) => {}
+            // A shorter or longer ID moves the body, so the plaintext's length differs.
+            Err(OpenError::BufferTooSmall { .. }) => assert!(bit / 8 < 27 + 1 + 5 + 1 + 3),
+            Err(OpenError::Refused(_)) => assert!(out.iter().all(|byte| *byte == 0)),
+            other => panic!("bit {bit}: {other:?}"),
+        }
+        assert!(opener.open_in_place(START, ROUTE, &mut changed).is_err(), "bit {bit}");
+    }
+    assert_eq!(opener.open_into(START, ROUTE, &envelope, &mut out).unwrap(), PLAINTEXT.len());
+    assert_eq!(out, PLAINTEXT);
+}
+
+#[test]
+fn no_cut_and_no_extension_opens() {
+    let mut opener = opener("key", 1);
+    let mut sealer = sealer("key", 1);
+    let envelope = seal(&mut sealer, ROUTE, Delivery::Reliable, PLAINTEXT);
+    let least = sealer.overhead();
+    for cut in 0..envelope.len() {
+        let mut shorter = envelope[..cut].to_vec();
+        match opener.open_in_place(START, ROUTE, &mut shorter) {
+            Err(OpenError::Header(HeaderError::Truncated { needed, given })) => {
+                assert!(cut < least && given == cut && needed > cut && needed <= least);
+            }
+            Err(OpenError::Refused(refusal)) => {
+                assert!(cut >= least);
+                assert_eq!(refusal.cause(), RefusalCause::Unauthentic);
+            }
+            other => panic!("cut at {cut}: {other:?}"),
+        }
+    }
+    let mut longer = [&envelope[..], &[0]].concat();
+    let error = opener.open_in_place(START, ROUTE, &mut longer).unwrap_err();
+    assert_eq!(error.cause(), Some(RefusalCause::Unauthentic));
+    assert!(opener.open_in_place(START, ROUTE, &mut envelope.clone()).is_ok());
+}
+
+#[test]
+fn nothing_opens_twice_by_any_way_of_opening() {
+    let mut opener = opener("key", 1);
+    let mut sealer = sealer("key", 1);
+    let header_len = sealer.header_len();
+    let envelopes: Vec<_> =
+        (0..3).map(|_| seal(&mut sealer, ROUTE, Delivery::Reliable, PLAINTEXT)).collect();
+    for round in 0..3 {
+        for (first, envelope) in envelopes.iter().enumerate() {
+            let results = [0, 1, 2].map(|way| {
+                let mut copy = envelope.clone();
+                match (way + first) % 3 {
+                    0 => opener.open_in_place(START, ROUTE, &mut copy).map(|_| ()),
+                    1 => opener.open_into(START, ROUTE, envelope, &mut copy).map(|_| ()),
+                    _ => {
+                        let (header, rest) = copy.split_at_mut(header_len);
+                        let (body, tag) = rest.split_at_mut(PLAINTEXT.len());
+                        let tag: &[u8; TAG_LEN] = (&*tag).try_into().unwrap();
+                        opener.open_detached(START, ROUTE, header, body, tag)
+                    }
+                }
+            });
+            for (way, result) in results.into_iter().enumerate() {
+                if (round, way) == (0, 0) {
+                    result.unwrap();
+                } else {
+                    assert_eq!(result.unwrap_err().cause(), Some(RefusalCause::Replayed));
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn a_route_other_than_expected_is_refused_and_uses_nothing_up() {
+    let mut opener = opener("key", 1);
+    let envelope = seal(&mut sealer("key", 1), ROUTE, Delivery::Reliable, PLAINTEXT);
+    for wrong in [
+        Route { kind: Kind::Request, ..ROUTE },
+        Route { kind: Kind::Response, ..ROUTE },
+        Route { topic: TopicHash([8; 16]), ..ROUTE },
+    ] {
+        let error = opener.open_in_place(START, wrong, &mut envelope.clone()).unwrap_err();
+        assert_eq!(error.cause(), Some(RefusalCause::WrongRoute));
+    }
+    assert!(opener.open_in_place(START, ROUTE, &mut envelope.clone()).is_ok());
+}
+
+#[test]
+fn a_refused_envelope_leaves_no_plaintext_behind() {
+    let mut opener = opener("key", 1);
+    let mut sealer = sealer("key", 1);
+    let header_len = sealer.header_len();
+    let envelope = seal(&mut sealer, ROUTE, Delivery::Reliable, PLAINTEXT);
+    opener.open_in_place(START, ROUTE, &mut envelope.clone()).unwrap();
+
+    // A replay decrypts well: what matters is that the caller does not get to see it.
+    let mut replay = envelope.clone();
+    opener.open_in_place(START, ROUTE, &mut replay).unwrap_err();
+    assert!(replay[header_len..][..PLAINTEXT.len()].iter().all(|byte| *byte == 0));
+    let mut out = vec![0xaa; PLAINTEXT.len() + 1];
+    opener.open_into(START, ROUTE, &envelope, &mut out).unwrap_err();
+    assert!(out[..PLAINTEXT.len()].iter().all(|byte| *byte == 0));
+    assert_eq!(out[PLAINTEXT.len()], 0xaa, "written beyond the message");
+}
+
+#[test]
+fn a_short_buffer_uses_nothing_up_on_either_side() {
+    let mut opener = opener("key", 1);
+    let mut sealer = sealer("key", 1);
+    let needed = sealer.overhead() + PLAINTEXT.len();
+    for given in 0..needed {
+        let mut out = vec![0xaa; given];
+        for parts in [&[PLAINTEXT][..], &[&PLAINTEXT[..3], &PLAINTEXT[3..]]] {
+            let slot = sealer.slot(START, Delivery::Reliable).unwrap();
+            let error = slot.seal_into(ROUTE, parts, &mut out).unwrap_err();
+            assert_eq!(error, SealError::Buffer { needed, given });
+        }
+        assert!(out.iter().all(|byte| *byte == 0xaa));
+    }
+    let mut frame = vec![0; sealer.overhead() - 1];
+    let slot = sealer.slot(START, Delivery::Reliable).unwrap();
+    slot.seal_in_place(ROUTE, &mut frame).unwrap_err();
+    let slot = sealer.slot(START, Delivery::Reliable).unwrap();
+    slot.seal_detached(ROUTE, &mut [0; 3], &mut frame).unwrap_err();
+    assert_eq!((sealer.remaining(), sealer.mask_used().len()), (MESSAGES_PER_KEY, 0));
+
+    let envelope = seal(&mut sealer, ROUTE, Delivery::Reliable, PLAINTEXT);
+    for given in 0..PLAINTEXT.len() {
+        match opener.open_into(START, ROUTE, &envelope, &mut vec![0; given]) {
+            Err(OpenError::BufferTooSmall { needed, given: told }) => {
+                assert_eq!((needed, told), (PLAINTEXT.len(), given));
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+    opener.open_into(START, ROUTE, &envelope, &mut [0; PLAINTEXT.len()]).unwrap();
+}
+
+#[test]
+fn there_is_no_eleventh_message_and_none_after_an_hour() {
+    let mut full = sealer("key", 1);
+    for index in 0..10 {
+        let slot = full.slot(START, Delivery::BestEffort).unwrap();
+        assert_eq!(slot.index(), index);
+        drop(slot); // an unused permit uses nothing up
+        seal(&mut full, ROUTE, Delivery::BestEffort, PLAINTEXT);
+    }
+    assert_eq!(full.slot(START, Delivery::Reliable).err(), Some(Spent::Messages));
+    assert_eq!(full.retire().used.bits(), 0x3ff);
+
+    let mut old = sealer("key", 1);
+    let hour = Duration::from_secs(3600);
+    // A key waits for its first message as long as it has to.
+    assert_eq!(old.spent(START * 1_000), None);
+    seal(&mut old, ROUTE, Delivery::Reliable, PLAINTEXT);
+    assert_eq!(old.spent(START + hour - Duration::from_nanos(1)), None);
+    assert_eq!(old.slot(START + hour, Delivery::Reliable).err(), Some(Spent::Age));
+    assert_eq!(old.slot(Duration::MAX, Delivery::Reliable).err(), Some(Spent::Age));
+    assert_eq!(old.spent(Duration::ZERO), None, "a clock that goes backwards stands still");
+}
+
+#[test]
+fn a_header_with_something_behind_it_is_malformed_when_given_apart() {
+    let mut opener = opener("key", 1);
+    let mut sealer = sealer("key", 1);
+    let mut header = vec![0; sealer.header_len()];
+    let mut body = PLAINTEXT.to_vec();
+    let slot = sealer.slot(START, Delivery::Reliable).unwrap();
+    let tag = slot.seal_detached(ROUTE, &mut header, &mut body).unwrap();
+
+    let longer = [&header[..], &[0]].concat();
+    match opener.open_detached(START, ROUTE, &longer, &mut body.clone(), &tag) {
+        Err(OpenError::Header(HeaderError::Trailing(1))) => {}
+        other => panic!("{other:?}"),
+    }
+    opener.open_detached(START, ROUTE, &header, &mut body, &tag).unwrap();
+    assert_eq!(body, PLAINTEXT);
+}
