@@ -1,0 +1,89 @@
+//! What validation may ask of the file system.
+
+use std::{
+    fs::{File, Metadata, OpenOptions},
+    io::{self, Read},
+    os::unix::fs::{MetadataExt, OpenOptionsExt},
+    path::{Path, PathBuf},
+};
+
+/// Largest file that validation reads, in bytes.
+pub(super) const LARGEST: u64 = 4 << 20;
+
+/// The file system as [`Config::resolve`](super::Config::resolve) sees it. Nothing here writes.
+pub trait Files {
+    /// The whole content of `path`, an error when it is larger than 4 MiB.
+    fn read(&self, path: &Path) -> io::Result<Vec<u8>>;
+
+    /// What kind of file `path` is, links followed.
+    fn facts(&self, path: &Path) -> io::Result<FileFacts>;
+
+    /// Whether this process may read `path`.
+    fn readable(&self, path: &Path) -> io::Result<()>;
+
+    /// What relative paths in the environment are relative to.
+    fn current_dir(&self) -> io::Result<PathBuf>;
+}
+
+/// What `stat` says of a file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FileFacts {
+    /// What it is.
+    pub kind: FileKind,
+    /// Permission bits.
+    pub mode: u32,
+}
+
+/// What a path leads to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FileKind {
+    /// A regular file.
+    Regular,
+    /// A directory.
+    Directory,
+    /// A device, socket or pipe.
+    Other,
+}
+
+/// The real file system.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct OsFiles;
+
+impl Files for OsFiles {
+    fn read(&self, path: &Path) -> io::Result<Vec<u8>> {
+        let mut bytes = Vec::new();
+        open(path)?.take(LARGEST + 1).read_to_end(&mut bytes)?;
+        if bytes.len() as u64 > LARGEST {
+            return Err(io::Error::new(io::ErrorKind::FileTooLarge, "larger than 4 MiB"));
+        }
+        Ok(bytes)
+    }
+
+    fn facts(&self, path: &Path) -> io::Result<FileFacts> {
+        std::fs::metadata(path).map(|m| FileFacts { kind: kind(&m), mode: m.mode() & 0o7777 })
+    }
+
+    fn readable(&self, path: &Path) -> io::Result<()> {
+        open(path).map(drop)
+    }
+
+    fn current_dir(&self) -> io::Result<PathBuf> {
+        std::env::current_dir()
+    }
+}
+
+fn kind(metadata: &Metadata) -> FileKind {
+    if metadata.is_file() {
+        FileKind::Regular
+    } else if metadata.is_dir() {
+        FileKind::Directory
+    } else {
+        FileKind::Other
+    }
+}
+
+/// Opens without ever waiting: a pipe put in a file's place must not hang the start.
+fn open(path: &Path) -> io::Result<File> {
+    const O_NONBLOCK: i32 = rustix::fs::OFlags::NONBLOCK.bits() as i32;
+    OpenOptions::new().read(true).custom_flags(O_NONBLOCK).open(path)
+}

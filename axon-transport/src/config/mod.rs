@@ -1,0 +1,96 @@
+//! Configuration: environment and `axon.toml` in, one validated [`Config`] out.
+//!
+//! The only place that reads the environment. A setting that is unknown, obsolete or half-given is
+//! an error that names the variable, what was read and what is accepted. Validation creates
+//! nothing, reads no private key, and runs in the process that starts, before any daemon does.
+
+use std::{
+    ffi::OsString,
+    path::{Path, PathBuf},
+};
+
+mod error;
+mod files;
+mod model;
+mod names;
+mod resolve;
+mod sources;
+mod summary;
+#[cfg(test)]
+mod tests;
+mod values;
+
+pub use error::ConfigError;
+pub use files::{FileFacts, FileKind, Files, OsFiles};
+pub use model::{
+    ClassicAuth, ClassicConfig, Config, DaemonPolicy, DiscoveryRange, KeyMode, LinkConfig,
+    PeerAddress, QkdConfig, QkdPeers, Security,
+};
+pub use summary::security_settings;
+
+impl Config {
+    /// The configuration of this process: its environment, and the `axon.toml` that `AXON_CONFIG`
+    /// names, else the one beside the daemon (`AXON_DAEMON_PATH`, or this very program), if any.
+    pub fn from_env() -> Result<Self, ConfigError> {
+        Self::with_default_file(std::env::current_exe().ok())
+    }
+
+    /// As [`from_env`](Self::from_env), for a library that knows where its daemon is installed.
+    pub fn from_env_beside(daemon: &Path) -> Result<Self, ConfigError> {
+        Self::with_default_file(Some(daemon.to_path_buf()))
+    }
+
+    fn with_default_file(daemon: Option<PathBuf>) -> Result<Self, ConfigError> {
+        let named = std::env::var_os("AXON_DAEMON_PATH").map(PathBuf::from);
+        let file = named.or(daemon).map(|daemon| daemon.with_file_name("axon.toml"));
+        Self::resolve(std::env::vars_os(), file.as_deref(), &OsFiles)
+    }
+
+    /// The configuration that an environment makes, with `default_file` where it names no file.
+    ///
+    /// ```
+    /// use axon_transport::config::{Config, OsFiles, Security};
+    ///
+    /// let config = Config::resolve([("ROS_DOMAIN_ID".into(), "7".into())], None, &OsFiles)?;
+    /// assert_eq!(config.domain, 7);
+    /// assert!(matches!(config.security, Security::Classic(_)));
+    ///
+    /// let misspelt = [("AXON_SECURITY_MOED".into(), "qkd".into())];
+    /// let error = Config::resolve(misspelt, None, &OsFiles).unwrap_err();
+    /// assert_eq!(error.variable(), "AXON_SECURITY_MOED");
+    /// # Ok::<(), axon_transport::config::ConfigError>(())
+    /// ```
+    pub fn resolve(
+        env: impl IntoIterator<Item = (OsString, OsString)>,
+        default_file: Option<&Path>,
+        files: &impl Files,
+    ) -> Result<Self, ConfigError> {
+        resolve::resolve(env, default_file, files)
+    }
+
+    /// What whoever starts with this configuration should be told, once.
+    pub fn warnings(&self) -> Vec<String> {
+        let mut warnings = Vec::new();
+        match &self.security {
+            Security::Classic(classic) if classic.auth == ClassicAuth::None => warnings.push(
+                "AXON_CLASSIC_AUTH is none: peers are not authenticated. Traffic is safe from who \
+                 records it, not from who answers in a peer's place; give AXON_CLASSIC_KEY and \
+                 AXON_CLASSIC_TRUST to pin peers"
+                    .to_owned(),
+            ),
+            Security::Qkd(qkd) if qkd.peers == QkdPeers::Any => warnings.push(
+                "AXON_QKD_PEERS is *: every SAE that the KME shares keys with may connect"
+                    .to_owned(),
+            ),
+            Security::Classic(_) | Security::Qkd(_) => {}
+        }
+        if self.runtime_dir.is_none() {
+            warnings.push(
+                "neither AXON_RUNTIME_DIR nor XDG_RUNTIME_DIR is set: the daemon keeps nothing \
+                 across restarts"
+                    .to_owned(),
+            );
+        }
+        warnings
+    }
+}

@@ -1,0 +1,186 @@
+//! The validated settings of one process.
+
+use std::{net::IpAddr, path::PathBuf, time::Duration};
+
+use axon_tls::{Cipher, PskKex};
+
+/// Everything that the environment and `axon.toml` decide.
+#[derive(Clone, Debug)]
+pub struct Config {
+    /// How peers prove themselves and agree on keys.
+    pub security: Security,
+    /// The one cipher offered (`AXON_QUIC_CIPHER`).
+    pub cipher: Cipher,
+    /// `ROS_DOMAIN_ID`.
+    pub domain: u32,
+    /// How far automatic discovery reaches (`ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_LOCALHOST_ONLY`).
+    pub range: DiscoveryRange,
+    /// `ROS_STATIC_PEERS`: addresses or host names; empty where the range ignores them.
+    pub static_peers: Vec<String>,
+    /// `AXON_DAEMON`.
+    pub daemon: DaemonPolicy,
+    /// `AXON_DAEMON_PATH`.
+    pub daemon_path: Option<PathBuf>,
+    /// Where a daemon keeps files: `AXON_RUNTIME_DIR`, else `$XDG_RUNTIME_DIR/axon`, else nowhere.
+    pub runtime_dir: Option<PathBuf>,
+    /// Whether `AXON_RUNTIME_DIR` was set: then it holds the session socket too.
+    pub socket_in_runtime_dir: bool,
+    /// `AXON_BIND_ADDRS`; empty means every address.
+    pub bind_addrs: Vec<IpAddr>,
+    /// `AXON_DAEMON_PEERS`.
+    pub daemon_peers: Vec<PeerAddress>,
+    /// `AXON_ADVERTISE_ADDRS`; empty means the interfaces' addresses.
+    pub advertise_addrs: Vec<IpAddr>,
+    /// `AXON_RING_BUFFER_SIZE_MB` in bytes: history per ring.
+    pub ring_bytes: u64,
+    /// `AXON_MAX_MESSAGE_MB` in bytes: the largest message.
+    pub max_message: u64,
+    /// `AXON_RELIABLE_QUEUE_MB` in bytes: the daemon's reliable queue.
+    pub reliable_queue: u64,
+    /// `AXON_SHM_COPY`.
+    pub shm_copy: bool,
+    /// `AXON_TRUSTED_UIDS`.
+    pub trusted_uids: Vec<u32>,
+    /// `AXON_LOG`: a tracing filter.
+    pub log: String,
+    /// `[link]` of `axon.toml`.
+    pub link: LinkConfig,
+}
+
+/// How peers prove themselves and agree on keys (`AXON_SECURITY_MODE`).
+#[derive(Clone, Debug)]
+pub enum Security {
+    /// X25519MLKEM768 and nothing else.
+    Classic(ClassicConfig),
+    /// A KME key as external PSK.
+    Qkd(QkdConfig),
+}
+
+/// Settings of `classic`.
+#[derive(Clone, Debug)]
+pub struct ClassicConfig {
+    /// `AXON_CLASSIC_AUTH`.
+    pub auth: ClassicAuth,
+    /// `AXON_CLASSIC_KEY`: PKCS#8, mode 0600.
+    pub key: Option<PathBuf>,
+    /// `AXON_CLASSIC_TRUST`: the pins.
+    pub trust: Option<PathBuf>,
+    /// `AXON_CLASSIC_CA`.
+    pub ca: Option<PathBuf>,
+    /// `AXON_CLASSIC_CERT`.
+    pub cert: Option<PathBuf>,
+    /// `AXON_CLASSIC_CRL`.
+    pub crl: Option<PathBuf>,
+}
+
+/// How a peer is known in `classic`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ClassicAuth {
+    /// Not at all: stops a recording adversary, not an active one.
+    None,
+    /// Raw public keys listed in a trust file.
+    Pinned,
+    /// Certificates under given roots.
+    Ca,
+}
+
+/// Settings of `qkd`.
+#[derive(Clone, Debug)]
+pub struct QkdConfig {
+    /// `AXON_QKD_KEY_MODE`.
+    pub key_mode: KeyMode,
+    /// `AXON_QKD_KEX`.
+    pub kex: PskKex,
+    /// `AXON_QKD_PEERS`.
+    pub peers: QkdPeers,
+    /// `AXON_QKD_SESSION_MAX_AGE`.
+    pub session_max_age: Duration,
+    /// `AXON_KME_URL`.
+    pub kme_url: String,
+    /// `AXON_KME_CA`.
+    pub kme_ca: PathBuf,
+    /// `AXON_KME_ID`.
+    pub kme_id: Option<String>,
+    /// `AXON_SAE_ID`.
+    pub sae_id: String,
+    /// `AXON_SAE_CERT`.
+    pub sae_cert: PathBuf,
+    /// `AXON_SAE_KEY`.
+    pub sae_key: PathBuf,
+    /// `AXON_KME_QUIRKS`.
+    pub kme_quirks: Vec<String>,
+}
+
+/// What KME keys protect (`AXON_QKD_KEY_MODE`).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum KeyMode {
+    /// The QUIC session alone.
+    Session,
+    /// The QUIC session, and each message in an envelope whose key changes every ten.
+    Messages10,
+}
+
+/// Which SAEs may be peers (`AXON_QKD_PEERS`).
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum QkdPeers {
+    /// Any SAE that the KME knows; written `*`.
+    Any,
+    /// These.
+    Listed(Vec<String>),
+}
+
+impl QkdPeers {
+    /// Whether `sae` may be a peer.
+    pub fn allows(&self, sae: &str) -> bool {
+        match self {
+            Self::Any => true,
+            Self::Listed(saes) => saes.iter().any(|s| s == sae),
+        }
+    }
+}
+
+/// What a session does about its daemon (`AXON_DAEMON`).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DaemonPolicy {
+    /// Start one when there is none.
+    Spawn,
+    /// Fail when there is none.
+    Require,
+    /// Never use one: only what this process reaches by itself.
+    Off,
+}
+
+/// How far automatic discovery reaches, as ROS 2 means it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DiscoveryRange {
+    /// Nowhere: no peers at all.
+    Off,
+    /// This host, and peers that either side lists.
+    Localhost,
+    /// What multicast reaches, and listed peers.
+    Subnet,
+}
+
+/// A static peer (`AXON_DAEMON_PEERS`).
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PeerAddress {
+    /// Address or name.
+    pub host: String,
+    /// The QUIC port; all sixteen of the domain are tried when absent.
+    pub port: Option<u16>,
+}
+
+/// `[link]` of `axon.toml`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LinkConfig {
+    /// How long a daemon outlives its last session.
+    pub grace: Duration,
+    /// Largest UDP payload that path discovery tries, in bytes.
+    pub mtu: u16,
+}
+
+impl Default for LinkConfig {
+    fn default() -> Self {
+        Self { grace: Duration::from_secs(10), mtu: 1452 }
+    }
+}

@@ -1,0 +1,143 @@
+//! The names of all settings, and what to say about a name that is not one.
+
+use super::ConfigError;
+
+/// Every `AXON_` setting that `axon.toml` may hold too, there in lower case without the prefix.
+pub(super) const SETTINGS: &[&str] = &[
+    "AXON_SECURITY_MODE",
+    "AXON_QKD_KEY_MODE",
+    "AXON_QKD_KEX",
+    "AXON_QKD_PEERS",
+    "AXON_QKD_SESSION_MAX_AGE",
+    "AXON_QUIC_CIPHER",
+    "AXON_CLASSIC_AUTH",
+    "AXON_CLASSIC_KEY",
+    "AXON_CLASSIC_TRUST",
+    "AXON_CLASSIC_CA",
+    "AXON_CLASSIC_CERT",
+    "AXON_CLASSIC_CRL",
+    "AXON_KME_URL",
+    "AXON_KME_CA",
+    "AXON_KME_ID",
+    "AXON_KME_QUIRKS",
+    "AXON_SAE_ID",
+    "AXON_SAE_CERT",
+    "AXON_SAE_KEY",
+    "AXON_DAEMON",
+    "AXON_DAEMON_PATH",
+    "AXON_RUNTIME_DIR",
+    "AXON_BIND_ADDRS",
+    "AXON_DAEMON_PEERS",
+    "AXON_ADVERTISE_ADDRS",
+    "AXON_RING_BUFFER_SIZE_MB",
+    "AXON_MAX_MESSAGE_MB",
+    "AXON_RELIABLE_QUEUE_MB",
+    "AXON_SHM_COPY",
+    "AXON_TRUSTED_UIDS",
+    "AXON_LOG",
+];
+
+/// Where `axon.toml` is; the one setting that the file cannot hold.
+pub(super) const CONFIG: &str = "AXON_CONFIG";
+
+/// Settings that mean something in `qkd` only.
+pub(super) const QKD_ONLY: &[&str] = &[
+    "AXON_QKD_KEY_MODE",
+    "AXON_QKD_KEX",
+    "AXON_QKD_PEERS",
+    "AXON_QKD_SESSION_MAX_AGE",
+    "AXON_KME_URL",
+    "AXON_KME_CA",
+    "AXON_KME_ID",
+    "AXON_KME_QUIRKS",
+    "AXON_SAE_ID",
+    "AXON_SAE_CERT",
+    "AXON_SAE_KEY",
+];
+
+/// Settings that mean something in `classic` only.
+pub(super) const CLASSIC_ONLY: &[&str] = &[
+    "AXON_CLASSIC_AUTH",
+    "AXON_CLASSIC_KEY",
+    "AXON_CLASSIC_TRUST",
+    "AXON_CLASSIC_CA",
+    "AXON_CLASSIC_CERT",
+    "AXON_CLASSIC_CRL",
+];
+
+/// Settings that once were, with what takes their place.
+const OBSOLETE: &[(&str, &str)] = &[
+    (
+        "AXON_SECURITY_PROFILE",
+        "nothing, this setting is obsolete; remove it and say AXON_SECURITY_MODE=classic or \
+         AXON_SECURITY_MODE=qkd",
+    ),
+    (
+        "AXON_ENCRYPTION_MODE",
+        "nothing, this setting is obsolete; remove it: encryption is always on, AXON_SECURITY_MODE \
+         chooses its keys and AXON_QUIC_CIPHER its cipher",
+    ),
+    (
+        "AXON_ENCRYPTION_KEY",
+        "nothing, this setting is obsolete; remove it: keys come from the handshake or, with \
+         AXON_SECURITY_MODE=qkd, from the KME, and never from a setting",
+    ),
+];
+
+/// The setting called `name`, or why there is none.
+pub(super) fn setting(name: &str) -> Result<&'static str, ConfigError> {
+    if let Some(known) = SETTINGS.iter().chain([&CONFIG]).find(|known| **known == name) {
+        return Ok(known);
+    }
+    if let Some((_, instead)) = obsolete(name) {
+        // Its value may be a key.
+        return Err(ConfigError::withheld(name, *instead));
+    }
+    let close = nearest(name, SETTINGS.iter().copied().chain([CONFIG]));
+    let accepted = match close {
+        Some(close) => format!("the settings of docs/configuration.md; did you mean {close}?"),
+        None => "the settings of docs/configuration.md; remove this one".to_owned(),
+    };
+    Err(ConfigError::name(name, accepted))
+}
+
+/// Whether `name` once was a setting.
+pub(super) fn is_obsolete(name: &str) -> bool {
+    obsolete(name).is_some()
+}
+
+fn obsolete(name: &str) -> Option<&'static (&'static str, &'static str)> {
+    OBSOLETE.iter().find(|(old, _)| *old == name)
+}
+
+/// The candidate that `text` most likely meant, if any is close.
+pub(super) fn nearest<'a>(
+    text: &str,
+    candidates: impl IntoIterator<Item = &'a str>,
+) -> Option<&'a str> {
+    // Far longer than any name: nothing is close, and the distance would cost time.
+    if text.len() > 64 {
+        return None;
+    }
+    candidates
+        .into_iter()
+        .map(|candidate| (distance(text, candidate), candidate))
+        .filter(|(d, candidate)| *d <= 3 && *d * 3 <= candidate.len())
+        .min()
+        .map(|(_, candidate)| candidate)
+}
+
+/// Edits (insert, delete, replace a byte) from one text to the other.
+fn distance(a: &str, b: &str) -> usize {
+    let mut row: Vec<usize> = (0..=b.len()).collect();
+    for (i, x) in a.bytes().enumerate() {
+        let mut diagonal = row[0];
+        row[0] = i + 1;
+        for (j, y) in b.bytes().enumerate() {
+            let above = row[j + 1];
+            row[j + 1] = (above + 1).min(row[j] + 1).min(diagonal + usize::from(x != y));
+            diagonal = above;
+        }
+    }
+    row[b.len()]
+}

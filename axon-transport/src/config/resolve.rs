@@ -1,0 +1,284 @@
+//! Which settings go together, and what the absent ones are.
+
+use std::{
+    ffi::OsString,
+    path::{Path, PathBuf},
+    time::Duration,
+};
+
+use axon_tls::{Cipher, PskKex};
+
+use super::{
+    ClassicAuth, ClassicConfig, Config, ConfigError, DaemonPolicy, DiscoveryRange, KeyMode,
+    LinkConfig, QkdConfig, QkdPeers, Security,
+    files::Files,
+    names,
+    sources::Sources,
+    values::{self, Use, Values},
+};
+
+const MIB: u64 = 1 << 20;
+/// Longest path of a unix socket on Linux, in bytes, without the closing zero.
+const LONGEST_SOCKET_PATH: usize = 107;
+/// As many static peers as rcl takes.
+const MOST_ROS_PEERS: usize = 32;
+
+#[derive(Clone, Copy)]
+enum Mode {
+    Classic,
+    Qkd,
+}
+
+pub(super) fn resolve(
+    env: impl IntoIterator<Item = (OsString, OsString)>,
+    default_file: Option<&Path>,
+    files: &impl Files,
+) -> Result<Config, ConfigError> {
+    let sources = Sources::collect(env, default_file, files)?;
+    let values = Values { sources: &sources, files };
+
+    let modes = [("classic", Mode::Classic), ("qkd", Mode::Qkd)];
+    let security = match values.choice("AXON_SECURITY_MODE", &modes)?.unwrap_or(Mode::Classic) {
+        Mode::Classic => {
+            refuse_all(&values, names::QKD_ONLY, "qkd")?;
+            Security::Classic(classic(&values)?)
+        }
+        Mode::Qkd => {
+            refuse_all(&values, names::CLASSIC_ONLY, "classic")?;
+            Security::Qkd(qkd(&values)?)
+        }
+    };
+    let ciphers = [Cipher::ChaCha20Poly1305, Cipher::Aes256Gcm].map(|c| (c.name(), c));
+    let policies = [
+        ("spawn", DaemonPolicy::Spawn),
+        ("require", DaemonPolicy::Require),
+        ("off", DaemonPolicy::Off),
+    ];
+    let domain = domain(&sources)?;
+    let (range, static_peers) = range(&sources)?;
+    let (runtime_dir, socket_in_runtime_dir) = runtime_dir(&values)?;
+    let megabytes = |name: &str, most: u64, default: u64| {
+        values.number(name, 1..=most, "MiB").map(|given| given.unwrap_or(default) * MIB)
+    };
+
+    let bind_addrs = values.addresses("AXON_BIND_ADDRS", 16)?;
+    if values.is_set("AXON_BIND_ADDRS") && bind_addrs.is_empty() {
+        // Nothing must not come to mean everything.
+        return Err(values.refuse("AXON_BIND_ADDRS", "local addresses; unset it for all of them"));
+    }
+    Ok(Config {
+        security,
+        cipher: values.choice("AXON_QUIC_CIPHER", &ciphers)?.unwrap_or_default(),
+        domain,
+        range,
+        static_peers,
+        daemon: values.choice("AXON_DAEMON", &policies)?.unwrap_or(DaemonPolicy::Spawn),
+        daemon_path: values.file("AXON_DAEMON_PATH", Use::Program)?,
+        runtime_dir,
+        socket_in_runtime_dir,
+        bind_addrs,
+        daemon_peers: values.peer_addresses("AXON_DAEMON_PEERS")?,
+        advertise_addrs: values.addresses("AXON_ADVERTISE_ADDRS", 4)?,
+        ring_bytes: megabytes("AXON_RING_BUFFER_SIZE_MB", 65_536, 64)?,
+        // The length of a message is a u32 on every wire.
+        max_message: megabytes("AXON_MAX_MESSAGE_MB", 4_095, 256)?,
+        reliable_queue: megabytes("AXON_RELIABLE_QUEUE_MB", 65_536, 256)?,
+        shm_copy: values.choice("AXON_SHM_COPY", &[("0", false), ("1", true)])?.unwrap_or(false),
+        trusted_uids: values.uids("AXON_TRUSTED_UIDS")?,
+        log: values.log_filter("AXON_LOG")?.unwrap_or_else(|| "warn".to_owned()),
+        link: link(&sources)?,
+    })
+}
+
+/// A setting of the other mode would be without effect: whoever gave it believes in a protection
+/// that is not there.
+fn refuse_all(
+    values: &Values<'_, impl Files>,
+    settings: &[&str],
+    mode: &str,
+) -> Result<(), ConfigError> {
+    match settings.iter().find(|name| values.is_set(name)) {
+        None => Ok(()),
+        Some(name) => Err(values.refuse(
+            name,
+            format!("this setting with AXON_SECURITY_MODE={mode} only; set that, or remove this"),
+        )),
+    }
+}
+
+fn required<T>(value: Option<T>, name: &str, accepted: &str) -> Result<T, ConfigError> {
+    value.ok_or_else(|| ConfigError::missing(name, accepted))
+}
+
+fn classic(values: &Values<'_, impl Files>) -> Result<ClassicConfig, ConfigError> {
+    const KEY: &str = "AXON_CLASSIC_KEY";
+    const TRUST: &str = "AXON_CLASSIC_TRUST";
+    const CA: &str = "AXON_CLASSIC_CA";
+    const CERT: &str = "AXON_CLASSIC_CERT";
+    const CRL: &str = "AXON_CLASSIC_CRL";
+
+    let auths =
+        [("none", ClassicAuth::None), ("pinned", ClassicAuth::Pinned), ("ca", ClassicAuth::Ca)];
+    let given = values.choice("AXON_CLASSIC_AUTH", &auths)?;
+    let of_ca = [CA, CERT, CRL].into_iter().find(|name| values.is_set(name));
+    let auth = match given {
+        Some(auth) => auth,
+        None => match of_ca {
+            Some(name) => {
+                let with = "this setting with AXON_CLASSIC_AUTH=ca only; set that, or remove this";
+                return Err(values.refuse(name, with));
+            }
+            None if values.is_set(KEY) || values.is_set(TRUST) => ClassicAuth::Pinned,
+            None => ClassicAuth::None,
+        },
+    };
+    let (needed, unused): (&[&str], &[&str]) = match auth {
+        ClassicAuth::None => (&[], &[KEY, TRUST, CA, CERT, CRL]),
+        ClassicAuth::Pinned => (&[KEY, TRUST], &[CA, CERT, CRL]),
+        ClassicAuth::Ca => (&[CA, CERT, KEY], &[TRUST]),
+    };
+    let name_of = |auth| auths.iter().find(|(_, a)| *a == auth).map_or("", |(name, _)| *name);
+    if let Some(name) = unused.iter().find(|name| values.is_set(name)) {
+        return Err(values.refuse(
+            name,
+            format!(
+                "nothing, AXON_CLASSIC_AUTH={} makes no use of it; remove one of the two",
+                name_of(auth)
+            ),
+        ));
+    }
+    if let Some(name) = needed.iter().find(|name| !values.is_set(name)) {
+        return Err(ConfigError::missing(
+            name,
+            format!(
+                "the path of a file; AXON_CLASSIC_AUTH={} needs {}",
+                name_of(auth),
+                needed.join(" and ")
+            ),
+        ));
+    }
+    Ok(ClassicConfig {
+        auth,
+        key: values.file(KEY, Use::Secret)?,
+        trust: values.file(TRUST, Use::Public)?,
+        ca: values.file(CA, Use::Public)?,
+        cert: values.file(CERT, Use::Public)?,
+        crl: values.file(CRL, Use::Public)?,
+    })
+}
+
+fn qkd(values: &Values<'_, impl Files>) -> Result<QkdConfig, ConfigError> {
+    let key_modes = [("messages10", KeyMode::Messages10), ("session", KeyMode::Session)];
+    let kexes = [PskKex::PskKe, PskKex::PskDheKe].map(|kex| (kex.name(), kex));
+    let file = |name: &str, usage: Use| {
+        let path = values.file(name, usage)?;
+        required(path, name, "the path of a file; AXON_SECURITY_MODE=qkd needs it")
+    };
+
+    let sae_id = values.sae_id("AXON_SAE_ID")?;
+    let sae_id = required(sae_id, "AXON_SAE_ID", "this host's SAE ID, as its KME knows it")?;
+    let peers = required(
+        values.qkd_peers("AXON_QKD_PEERS")?,
+        "AXON_QKD_PEERS",
+        "the SAE IDs of the peers separated by ;, or * for every SAE that the KME knows",
+    )?;
+    if matches!(&peers, QkdPeers::Listed(_)) && peers.allows(&sae_id) {
+        let accepted = format!("SAE IDs of others; {sae_id} is this host's own, remove it");
+        return Err(values.refuse("AXON_QKD_PEERS", accepted));
+    }
+    let max_age = values.number("AXON_QKD_SESSION_MAX_AGE", 1..=86_400, "seconds")?;
+    Ok(QkdConfig {
+        key_mode: values.choice("AXON_QKD_KEY_MODE", &key_modes)?.unwrap_or(KeyMode::Messages10),
+        kex: values.choice("AXON_QKD_KEX", &kexes)?.unwrap_or_default(),
+        peers,
+        session_max_age: Duration::from_secs(max_age.unwrap_or(3_600)),
+        kme_url: required(
+            values.kme_url("AXON_KME_URL")?,
+            "AXON_KME_URL",
+            "https://host:port of this host's KME",
+        )?,
+        kme_ca: file("AXON_KME_CA", Use::Public)?,
+        kme_id: values.kme_id("AXON_KME_ID")?,
+        sae_id,
+        sae_cert: file("AXON_SAE_CERT", Use::Public)?,
+        sae_key: file("AXON_SAE_KEY", Use::Secret)?,
+        kme_quirks: values.quirks("AXON_KME_QUIRKS")?,
+    })
+}
+
+fn domain(sources: &Sources) -> Result<u32, ConfigError> {
+    const NAME: &str = "ROS_DOMAIN_ID";
+    match sources.foreign.get(NAME).map(String::as_str) {
+        None | Some("") => Ok(0),
+        Some(text) => match values::decimal(text).and_then(|n| u32::try_from(n).ok()) {
+            Some(domain @ 0..=232) => Ok(domain),
+            _ => Err(ConfigError::value(NAME, text, "0 to 232")),
+        },
+    }
+}
+
+/// ROS 2's discovery variables, by the rules of rcl: `ROS_LOCALHOST_ONLY=1` wins over the others.
+fn range(sources: &Sources) -> Result<(DiscoveryRange, Vec<String>), ConfigError> {
+    const RANGE: &str = "ROS_AUTOMATIC_DISCOVERY_RANGE";
+    const PEERS: &str = "ROS_STATIC_PEERS";
+    let variable = |name| sources.foreign.get(name).map_or("", String::as_str);
+
+    let peers: Vec<String> =
+        variable(PEERS).split(';').filter(|peer| !peer.is_empty()).map(str::to_owned).collect();
+    let good =
+        |peer: &String| peer.parse::<std::net::IpAddr>().is_ok() || values::is_host_name(peer);
+    if peers.len() > MOST_ROS_PEERS || !peers.iter().all(good) {
+        let accepted = "at most 32 addresses or host names, without ports, separated by ;";
+        return Err(ConfigError::value(PEERS, variable(PEERS), accepted));
+    }
+    if variable("ROS_LOCALHOST_ONLY") == "1" {
+        return Ok((DiscoveryRange::Localhost, Vec::new()));
+    }
+    match variable(RANGE) {
+        "" | "NOT_SET" | "SUBNET" => Ok((DiscoveryRange::Subnet, peers)),
+        "LOCALHOST" => Ok((DiscoveryRange::Localhost, peers)),
+        "SYSTEM_DEFAULT" => Ok((DiscoveryRange::Subnet, Vec::new())),
+        "OFF" => Ok((DiscoveryRange::Off, Vec::new())),
+        other => Err(ConfigError::value(RANGE, other, "SUBNET, LOCALHOST, OFF, SYSTEM_DEFAULT")),
+    }
+}
+
+fn runtime_dir(values: &Values<'_, impl Files>) -> Result<(Option<PathBuf>, bool), ConfigError> {
+    const NAME: &str = "AXON_RUNTIME_DIR";
+    if let Some(path) = values.directory(NAME)? {
+        let socket = path.as_os_str().len() + "/axon-232.sock".len();
+        if socket > LONGEST_SOCKET_PATH {
+            let longest = LONGEST_SOCKET_PATH - "/axon-232.sock".len();
+            let accepted = format!("a path of at most {longest} bytes: a socket is to stand in it");
+            return Err(values.refuse(NAME, accepted));
+        }
+        return Ok((Some(path), true));
+    }
+    // The XDG specification has relative paths ignored.
+    let xdg = values.sources.foreign.get("XDG_RUNTIME_DIR").map(Path::new);
+    Ok((xdg.filter(|path| path.is_absolute()).map(|path| path.join("axon")), false))
+}
+
+fn link(sources: &Sources) -> Result<LinkConfig, ConfigError> {
+    let mut link = LinkConfig::default();
+    for (key, value) in &sources.link {
+        let name = format!("link.{key}");
+        let place = sources.file.as_ref().map_or(String::new(), |path| path.display().to_string());
+        let number = |low: i64, high: i64, unit: &str| match value {
+            toml::Value::Integer(number) if (low..=high).contains(number) => Ok(*number as u64),
+            other => {
+                let read = other
+                    .as_integer()
+                    .map_or_else(|| other.type_str().to_owned(), |number| number.to_string());
+                Err(ConfigError::value(&name, &read, format!("{low} to {high} ({unit})"))
+                    .at(&*place))
+            }
+        };
+        match key.as_str() {
+            "grace_s" => link.grace = Duration::from_secs(number(0, 86_400, "seconds")?),
+            "mtu" => link.mtu = number(1_200, 65_527, "bytes")? as u16,
+            _ => return Err(ConfigError::name(&name, "grace_s, mtu").at(place)),
+        }
+    }
+    Ok(link)
+}

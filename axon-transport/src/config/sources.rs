@@ -1,0 +1,243 @@
+//! The two sources, environment and `axon.toml`, brought together under the settings' names.
+
+use std::{
+    collections::BTreeMap,
+    ffi::{OsStr, OsString},
+    path::{Path, PathBuf},
+    rc::Rc,
+};
+
+use super::{
+    ConfigError,
+    files::{FileKind, Files},
+    names,
+};
+
+/// One setting as text, before anything is known about its value.
+#[derive(Clone, Debug)]
+pub(super) struct Setting {
+    pub(super) text: String,
+    pub(super) origin: Origin,
+}
+
+#[derive(Clone, Debug)]
+pub(super) enum Origin {
+    Environment,
+    File(Rc<PathBuf>),
+}
+
+/// All settings given, and the few variables of others that count.
+#[derive(Debug, Default)]
+pub(super) struct Sources {
+    pub(super) settings: BTreeMap<&'static str, Setting>,
+    /// `ROS_*` and `XDG_RUNTIME_DIR`, from the environment alone.
+    pub(super) foreign: BTreeMap<&'static str, String>,
+    /// `[link]` of the file.
+    pub(super) link: toml::Table,
+    pub(super) file: Option<Rc<PathBuf>>,
+}
+
+/// Variables that are not ours but decide something.
+const FOREIGN: &[&str] = &[
+    "ROS_DOMAIN_ID",
+    "ROS_AUTOMATIC_DISCOVERY_RANGE",
+    "ROS_STATIC_PEERS",
+    "ROS_LOCALHOST_ONLY",
+    "XDG_RUNTIME_DIR",
+];
+
+impl Sources {
+    /// Reads the environment, then the file it names (or `default_file`), and lets the environment
+    /// win. `default_file` may be absent; one that `AXON_CONFIG` names may not.
+    pub(super) fn collect(
+        env: impl IntoIterator<Item = (OsString, OsString)>,
+        default_file: Option<&Path>,
+        files: &impl Files,
+    ) -> Result<Self, ConfigError> {
+        let mut sources = Self::default();
+        sources.take_environment(env)?;
+
+        let file = match sources.settings.remove(names::CONFIG) {
+            Some(setting) => Some(named_file(&setting.text, files)?),
+            None => match default_file.map(|path| (path, files.facts(path))) {
+                Some((path, Ok(facts))) if facts.kind == FileKind::Regular => {
+                    Some(path.to_path_buf())
+                }
+                Some((path, Ok(_))) => {
+                    let read = path.to_string_lossy();
+                    return Err(ConfigError::value(names::CONFIG, &read, "a regular file"));
+                }
+                // Only a file that is certainly not there is no file.
+                Some((_, Err(error))) if error.kind() == std::io::ErrorKind::NotFound => None,
+                Some((path, Err(error))) => return Err(unreadable(path, &error)),
+                None => None,
+            },
+        };
+        if let Some(path) = file {
+            sources.take_file(path, files)?;
+        }
+        Ok(sources)
+    }
+
+    fn take_environment(
+        &mut self,
+        env: impl IntoIterator<Item = (OsString, OsString)>,
+    ) -> Result<(), ConfigError> {
+        // In order of name, so that of two defects it is always the same one that is named.
+        let ours: BTreeMap<OsString, OsString> = env
+            .into_iter()
+            .filter(|(name, _)| is_ours(name) || FOREIGN.iter().any(|f| name == f))
+            .collect();
+        let obsolete = |name: &OsString| name.to_str().is_some_and(names::is_obsolete);
+        if let Some(name) = ours.keys().find(|name| obsolete(name)) {
+            names::setting(&name.to_string_lossy())?;
+        }
+        for (name, value) in ours {
+            let shown = name.to_string_lossy();
+            if let Some(foreign) = FOREIGN.iter().find(|f| name == **f) {
+                self.foreign.insert(foreign, utf8(&shown, &value)?);
+                continue;
+            }
+            let setting = names::setting(&shown)?;
+            let text = utf8(setting, &value)?;
+            self.settings.insert(setting, Setting { text, origin: Origin::Environment });
+        }
+        Ok(())
+    }
+
+    fn take_file(&mut self, path: PathBuf, files: &impl Files) -> Result<(), ConfigError> {
+        let shown = path.to_string_lossy().into_owned();
+        let facts = files.facts(&path).map_err(|e| unreadable(&path, &e))?;
+        if facts.mode & 0o002 != 0 && facts.kind == FileKind::Regular {
+            return Err(ConfigError::value(
+                names::CONFIG,
+                &shown,
+                "a file that not everybody may write: chmod o-w",
+            ));
+        }
+        let bytes = files.read(&path).map_err(|e| unreadable(&path, &e))?;
+        let text = String::from_utf8(bytes)
+            .map_err(|_| ConfigError::value(names::CONFIG, &shown, "a file in UTF-8"))?;
+        let table: toml::Table = text.parse().map_err(|error: toml::de::Error| {
+            let line = error.span().map_or(1, |span| {
+                1 + text.bytes().take(span.start).filter(|byte| *byte == b'\n').count()
+            });
+            ConfigError::value(
+                names::CONFIG,
+                &shown,
+                format!("a file in TOML; line {line}: {}", error.message()),
+            )
+        })?;
+
+        let path = Rc::new(path);
+        for (key, value) in table {
+            if key == "link" {
+                let toml::Value::Table(link) = value else {
+                    return Err(ConfigError::name("link", "a section, [link]").at(shown));
+                };
+                self.link = link;
+                continue;
+            }
+            let place = format!("{key} in {shown}");
+            let name = setting_of_key(&key).map_err(|e| e.at(&*place))?;
+            let text = text_of(name, value).map_err(|e| e.at(&*place))?;
+            self.settings
+                .entry(name)
+                .or_insert(Setting { text, origin: Origin::File(Rc::clone(&path)) });
+        }
+        self.file = Some(path);
+        Ok(())
+    }
+}
+
+fn is_ours(name: &OsStr) -> bool {
+    name.as_encoded_bytes().starts_with(b"AXON_")
+}
+
+fn utf8(name: &str, value: &OsStr) -> Result<String, ConfigError> {
+    match value.to_str() {
+        Some(text) => Ok(text.to_owned()),
+        None => Err(ConfigError::withheld(name, "text in UTF-8")),
+    }
+}
+
+fn named_file(text: &str, files: &impl Files) -> Result<PathBuf, ConfigError> {
+    let accepted = "the path of an axon.toml; unset it to use the one beside the daemon";
+    if text.is_empty() {
+        return Err(ConfigError::value(names::CONFIG, text, accepted));
+    }
+    let path = absolute(names::CONFIG, text, None, files)?;
+    match files.facts(&path) {
+        // The usual way to say "no file", where one is installed.
+        Ok(_) if path == Path::new("/dev/null") => Ok(path),
+        Ok(facts) if facts.kind == FileKind::Regular => Ok(path),
+        Ok(_) => Err(ConfigError::value(names::CONFIG, text, accepted)),
+        Err(error) => Err(unreadable(&path, &error)),
+    }
+}
+
+/// `text` as an absolute path: relative to the file it stands in, else to the current directory.
+pub(super) fn absolute(
+    name: &str,
+    text: &str,
+    file: Option<&Path>,
+    files: &impl Files,
+) -> Result<PathBuf, ConfigError> {
+    let path = Path::new(text);
+    if path.is_absolute() {
+        return Ok(path.to_path_buf());
+    }
+    if let Some(parent) = file.and_then(Path::parent) {
+        return Ok(parent.join(path));
+    }
+    match files.current_dir() {
+        Ok(directory) => Ok(directory.join(path)),
+        Err(_) => {
+            Err(ConfigError::value(name, text, "an absolute path: there is no current directory"))
+        }
+    }
+}
+
+fn unreadable(path: &Path, error: &std::io::Error) -> ConfigError {
+    let read = path.to_string_lossy();
+    ConfigError::value(names::CONFIG, &read, format!("a file that can be read ({error})"))
+}
+
+fn setting_of_key(key: &str) -> Result<&'static str, ConfigError> {
+    let upper = format!("AXON_{}", key.to_ascii_uppercase());
+    if key == "config" {
+        return Err(ConfigError::name(&upper, "in the environment only"));
+    }
+    // One spelling: `QKD_Peers` beside `qkd_peers` would be two keys of one setting.
+    if key.bytes().any(|byte| byte.is_ascii_uppercase()) {
+        let key = key.strip_prefix("AXON_").unwrap_or(key).to_ascii_lowercase();
+        return Err(ConfigError::name(&upper, format!("lower-case keys, here {key}")));
+    }
+    names::setting(&upper)
+}
+
+/// A value of the file as the environment would spell it.
+fn text_of(name: &str, value: toml::Value) -> Result<String, ConfigError> {
+    match value {
+        toml::Value::String(text) => Ok(text),
+        toml::Value::Integer(number) => Ok(number.to_string()),
+        toml::Value::Boolean(flag) if name == "AXON_SHM_COPY" => Ok(u8::from(flag).to_string()),
+        toml::Value::Array(values) => {
+            let mut texts = Vec::with_capacity(values.len());
+            for value in values {
+                match value {
+                    toml::Value::String(text) if !text.contains([';', ',']) => texts.push(text),
+                    toml::Value::Integer(number) => texts.push(number.to_string()),
+                    other => return Err(wrong_type(name, &other)),
+                }
+            }
+            Ok(texts.join(";"))
+        }
+        other => Err(wrong_type(name, &other)),
+    }
+}
+
+fn wrong_type(name: &str, value: &toml::Value) -> ConfigError {
+    let accepted = "a string, a whole number, or an array of strings without ; and ,";
+    ConfigError::value(name, value.type_str(), accepted)
+}

@@ -1,0 +1,257 @@
+//! What is refused, and what is said about it.
+
+use std::os::unix::ffi::OsStringExt;
+
+use super::*;
+
+#[test]
+fn obsolete_names_are_refused_first_and_their_values_stay_unsaid() {
+    for name in ["AXON_SECURITY_PROFILE", "AXON_ENCRYPTION_MODE", "AXON_ENCRYPTION_KEY"] {
+        for value in ["hunter2", ""] {
+            let error = resolve(QKD, &[(name, value), ("AXON_AAA", "x")]).unwrap_err();
+            assert_eq!(error.variable(), name);
+            assert_eq!(error.read(), None);
+            let line = error.to_string();
+            assert!(!line.contains("hunter2"), "{line}");
+            assert!(line.contains("AXON_SECURITY_MODE"), "says what takes its place: {line}");
+        }
+    }
+    let error = with_file(&[], "encryption_key = \"hunter2\"").unwrap_err();
+    assert_eq!(error.variable(), "AXON_ENCRYPTION_KEY");
+    assert!(!error.to_string().contains("hunter2"));
+}
+
+#[test]
+fn unknown_names_are_refused_with_the_nearest_known_one() {
+    for (name, nearest) in [
+        ("AXON_SECURITY_MOED", Some("AXON_SECURITY_MODE")),
+        ("AXON_QKD_PEER", Some("AXON_QKD_PEERS")),
+        ("AXON_KME_PASSWORD", None),
+        ("AXON_", None),
+        ("AXON_security_mode", None),
+    ] {
+        let error = resolve(&[], &[(name, "hunter2")]).unwrap_err();
+        assert_eq!(error.variable(), name);
+        let line = error.to_string();
+        assert!(!line.contains("hunter2"), "{line}");
+        match nearest {
+            Some(nearest) => assert!(line.contains(&format!("did you mean {nearest}?")), "{line}"),
+            None => assert!(!line.contains("did you mean"), "{line}"),
+        }
+    }
+    assert!(resolve(&[], &[("AXONX", "x"), ("axon_security_mode", "x")]).is_ok(), "not ours");
+}
+
+#[test]
+fn names_and_values_that_are_not_utf8_are_refused() {
+    let bad = || OsString::from_vec(b"AXON_\xff".to_vec());
+    let error = Config::resolve([(bad(), "x".into())], None, &Disk::new()).unwrap_err();
+    assert!(error.variable().starts_with("AXON_"));
+    for name in names::SETTINGS.iter().copied().chain(["AXON_CONFIG", "ROS_DOMAIN_ID"]) {
+        let env = [(OsString::from(name), bad())];
+        let error = Config::resolve(env, None, &Disk::new()).unwrap_err();
+        assert_eq!(error.variable(), name);
+        assert!(error.accepted().contains("UTF-8"));
+    }
+}
+
+#[test]
+fn empty_values_are_refused_but_for_lists_that_may_be_empty() {
+    let may_be_empty =
+        ["AXON_DAEMON_PEERS", "AXON_ADVERTISE_ADDRS", "AXON_TRUSTED_UIDS", "AXON_KME_QUIRKS"];
+    for name in names::SETTINGS.iter().copied().chain(["AXON_CONFIG"]) {
+        let base = if name.starts_with("AXON_CLASSIC") { CA } else { QKD };
+        let result = resolve(base, &[(name, "")]);
+        if may_be_empty.contains(&name) {
+            assert!(result.is_ok(), "{name}");
+        } else {
+            assert_eq!(result.unwrap_err().variable(), name);
+        }
+    }
+}
+
+/// A base, a variable and values that it must not have in there.
+type Refused = (&'static [(&'static str, &'static str)], &'static str, &'static [&'static str]);
+
+#[test]
+fn bad_values_are_refused_by_name() {
+    let long = "x".repeat(64);
+    let encoded = "/".repeat(27);
+    let too_long: Vec<(&str, String)> = vec![
+        ("AXON_SAE_ID", long.clone()),
+        ("AXON_QKD_PEERS", long),
+        ("AXON_SAE_ID", encoded),
+        ("AXON_KME_ID", "x".repeat(129)),
+        ("AXON_KME_URL", format!("https://a/{}", "x".repeat(2048))),
+        ("AXON_RUNTIME_DIR", format!("/{}", "x".repeat(94))),
+        ("AXON_DAEMON_PEERS", (0..65).map(|n| format!("h{n}")).collect::<Vec<_>>().join(";")),
+        ("AXON_BIND_ADDRS", (0..17).map(|n| format!("10.0.0.{n}")).collect::<Vec<_>>().join(";")),
+    ];
+    for (name, value) in &too_long {
+        assert_eq!(resolve(QKD, &[(name, value)]).unwrap_err().variable(), *name);
+    }
+
+    let table: &[Refused] = &[
+        (&[], "AXON_SECURITY_MODE", &["QKD", "none", "classic ", "plaintext", "qkd;classic"]),
+        (QKD, "AXON_QKD_KEY_MODE", &["messages", "message10", "Session", "session,messages10"]),
+        (QKD, "AXON_QKD_KEX", &["psk", "psk-ke", "x25519"]),
+        (
+            QKD,
+            "AXON_QKD_PEERS",
+            &["sae-a", "sae-b;sae-a", "*;sae-b", "sae-b;", ";", "a b", "é", "**"],
+        ),
+        (
+            QKD,
+            "AXON_QKD_SESSION_MAX_AGE",
+            &["0", "-1", "+5", "1h", "86401", "1e3", "99999999999999999999"],
+        ),
+        (&[], "AXON_QUIC_CIPHER", &["aes-128-gcm", "aes", "none", "CHACHA20"]),
+        (&[], "AXON_CLASSIC_AUTH", &["tofu", "pin", "psk"]),
+        (PINNED, "AXON_CLASSIC_KEY", &["/f/none", "/f", "/f/open-key.pem"]),
+        (PINNED, "AXON_CLASSIC_TRUST", &["/f/none", "/f", "/f/anyone-writes"]),
+        (CA, "AXON_CLASSIC_CA", &["/f/none", "/f"]),
+        (CA, "AXON_CLASSIC_CERT", &["/f/none", "/f"]),
+        (CA, "AXON_CLASSIC_CRL", &["/f/none", "/f"]),
+        (
+            QKD,
+            "AXON_KME_URL",
+            &[
+                "http://kme",
+                "kme",
+                "https://",
+                "https:///path",
+                "https://a:0",
+                "https://a:b",
+                "https://u:hunter2@kme",
+                "https://a/?q",
+                "https://a/#f",
+                "https://a b",
+                "https://::1",
+            ],
+        ),
+        (QKD, "AXON_KME_CA", &["/f/none", "/f"]),
+        (QKD, "AXON_KME_ID", &["a\nb", "é"]),
+        (QKD, "AXON_KME_QUIRKS", &["lenient", "any-key-id,", "any-key-id;lenient"]),
+        (QKD, "AXON_SAE_ID", &["sae-b", "sae a", "*", "a;b", "a,b", "a\n", "é"]),
+        (QKD, "AXON_SAE_CERT", &["/f/none", "/f", "/f/anyone-writes"]),
+        (QKD, "AXON_SAE_KEY", &["/f/none", "/f", "/f/open-key.pem"]),
+        (&[], "AXON_DAEMON", &["yes", "0", "Spawn"]),
+        (&[], "AXON_DAEMON_PATH", &["/f/none", "/f", "/f/ca.pem"]),
+        (&[], "AXON_RUNTIME_DIR", &["relative", "/f/ca.pem", "/a\0b"]),
+        (&[], "AXON_BIND_ADDRS", &["0.0.0.0", "::", "eth0", "127.0.0.1:80", "239.1.1.1", " "]),
+        (
+            &[],
+            "AXON_DAEMON_PEERS",
+            &[
+                "a b",
+                "host:",
+                "host:0",
+                "host:65536",
+                "host:+1",
+                "[::1",
+                "[::1]x",
+                "10.0.0.256",
+                "a..b",
+                "x;;y",
+            ],
+        ),
+        (&[], "AXON_ADVERTISE_ADDRS", &["::", "host", "1.1.1.1;1.1.1.2;1.1.1.3;1.1.1.4;1.1.1.5"]),
+        (&[], "AXON_RING_BUFFER_SIZE_MB", &["0", "65537", "64M", "0x40", " 64"]),
+        (&[], "AXON_MAX_MESSAGE_MB", &["0", "4096", "big"]),
+        (&[], "AXON_RELIABLE_QUEUE_MB", &["0", "65537", "-1"]),
+        (&[], "AXON_SHM_COPY", &["2", "true", "yes"]),
+        (&[], "AXON_TRUSTED_UIDS", &["root", "-1", "4294967296", "1;;2"]),
+        (&[], "AXON_LOG", &["loud", "axon=", "=info", "info,"]),
+        (&[], "AXON_CONFIG", &["/f/none", "/f"]),
+        (&[], "ROS_DOMAIN_ID", &["233", "-1", "x", "4294967296", " 1"]),
+        (&[], "ROS_AUTOMATIC_DISCOVERY_RANGE", &["EVERYWHERE", "subnet"]),
+        (&[], "ROS_STATIC_PEERS", &["host:80", "a b"]),
+    ];
+    for (base, name, values) in table {
+        for value in *values {
+            let error = resolve(base, &[(name, value)]).unwrap_err();
+            // A peer that is this host's own SAE is the peers' defect, from whichever side it came.
+            let own_peer = *name == "AXON_SAE_ID" && error.variable() == "AXON_QKD_PEERS";
+            assert!(error.variable() == *name || own_peer, "{name}={value:?}: {error}");
+            let line = error.to_string();
+            assert!(!line.contains(['\n', '\r', '\0']), "{line:?}");
+            assert!(!line.contains("hunter2"), "{line}");
+        }
+    }
+    // Every setting is somewhere in the table.
+    for name in names::SETTINGS {
+        assert!(table.iter().any(|(_, tested, _)| tested == name), "{name} is untested");
+    }
+}
+
+#[test]
+fn half_of_what_a_mode_needs_is_an_error() {
+    for base in [QKD, PINNED, CA] {
+        for (missing, _) in base {
+            if ["AXON_SECURITY_MODE", "AXON_CLASSIC_AUTH"].contains(missing) {
+                continue;
+            }
+            let rest: Vec<_> = base.iter().filter(|(name, _)| name != missing).copied().collect();
+            let error = resolve(&rest, &[]).unwrap_err();
+            assert_eq!(error.variable(), *missing);
+            assert!(error.to_string().contains("not set"), "{error}");
+        }
+    }
+}
+
+#[test]
+fn settings_of_another_mode_are_errors() {
+    for (name, value) in QKD.iter().skip(1).chain(&[("AXON_QKD_KEX", "psk_ke")]) {
+        let error = resolve(&[], &[(name, value)]).unwrap_err();
+        assert_eq!(error.variable(), *name);
+        assert!(error.accepted().contains("AXON_SECURITY_MODE=qkd"), "{error}");
+    }
+    for (name, value) in CA.iter().chain(PINNED) {
+        assert_eq!(resolve(QKD, &[(name, value)]).unwrap_err().variable(), *name);
+    }
+    for (base, change, named) in [
+        (PINNED, ("AXON_CLASSIC_AUTH", "none"), "AXON_CLASSIC_KEY"),
+        (PINNED, ("AXON_CLASSIC_CA", "/f/ca.pem"), "AXON_CLASSIC_CA"),
+        (CA, ("AXON_CLASSIC_TRUST", "/f/trust"), "AXON_CLASSIC_TRUST"),
+        (CA, ("AXON_CLASSIC_AUTH", "pinned"), "AXON_CLASSIC_CA"),
+        (&CA[..0], ("AXON_CLASSIC_CRL", "/f/crl.pem"), "AXON_CLASSIC_CRL"),
+    ] {
+        assert_eq!(resolve(base, &[change]).unwrap_err().variable(), named);
+    }
+}
+
+#[test]
+fn files_that_are_not_a_configuration_are_refused() {
+    for (text, variable) in [
+        ("security_mode = ", "AXON_CONFIG"),
+        ("security_mode = 'qkd'\nsecurity_mode = 'qkd'", "AXON_CONFIG"),
+        ("security_moed = 'qkd'", "AXON_SECURITY_MOED"),
+        ("Security_Mode = 'qkd'", "AXON_SECURITY_MODE"),
+        ("AXON_SECURITY_MODE = 'qkd'", "AXON_AXON_SECURITY_MODE"),
+        ("config = '/f/other.toml'", "AXON_CONFIG"),
+        ("security_mode = ['classic', { a = 1 }]", "AXON_SECURITY_MODE"),
+        ("security_mode = 1.5", "AXON_SECURITY_MODE"),
+        ("security_mode = true", "AXON_SECURITY_MODE"),
+        ("daemon_peers = ['a;b']", "AXON_DAEMON_PEERS"),
+        ("ring_buffer_size_mb = -1", "AXON_RING_BUFFER_SIZE_MB"),
+        ("link = 3", "link"),
+        ("[link]\nmtu = 100", "link.mtu"),
+        ("[link]\nmtu = '1500'", "link.mtu"),
+        ("[link]\ngrace_s = -1", "link.grace_s"),
+        ("[link]\nspeed = 1", "link.speed"),
+        ("[linc]\nmtu = 1500", "AXON_LINC"),
+    ] {
+        let error = with_file(&[], text).unwrap_err();
+        assert_eq!(error.variable(), variable, "{text}: {error}");
+        assert!(error.to_string().contains("/f/axon.toml"), "{error}");
+        assert!(!error.to_string().contains('\n'), "{error}");
+    }
+    let mut disk = Disk::new();
+    let path = Path::new("/f/axon.toml");
+    assert!(Config::resolve([], Some(path), &disk).is_ok(), "a default file may be absent");
+    disk.put("/f/axon.toml", 0o646, "");
+    let error = Config::resolve([], Some(path), &disk).unwrap_err();
+    assert!(error.accepted().contains("o-w"), "{error}");
+    disk.0.insert(path.into(), (0o644, vec![0xff]));
+    assert!(Config::resolve([], Some(path), &disk).is_err());
+}
