@@ -51,8 +51,12 @@ fn source_tree() -> Result<PathBuf, String> {
 
     let out = PathBuf::from(var("OUT_DIR")?);
     let cargo = var("CARGO")?;
-    let upstream =
-        upstream::locate(Path::new(&cargo), &crate_dir, &var("HOST")?, &out.join("where-is-rustls"))?;
+    let upstream = upstream::locate(
+        Path::new(&cargo),
+        &crate_dir,
+        &var("HOST")?,
+        &out.join("where-is-rustls"),
+    )?;
     let made = tree::assemble(&upstream, &crate_dir)?;
     tree::check(&made, &crate_dir.join("patched.sha256"))?;
 

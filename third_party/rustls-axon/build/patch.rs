@@ -64,8 +64,12 @@ impl Hunk {
         let (old, new) = ranges.split_once(" +")?;
         let ((old_start, old_len), (new_start, new_len)) = (range(old)?, range(new)?);
         // a hunk always has context here, so it has lines on both sides and starts at line 1 or on
-        (old_start > 0 && new_start > 0 && old_len > 0 && new_len > 0)
-            .then_some(Self { old_start, old_len, new_start, new_len })
+        (old_start > 0 && new_start > 0 && old_len > 0 && new_len > 0).then_some(Self {
+            old_start,
+            old_len,
+            new_start,
+            new_len,
+        })
     }
 }
 

@@ -21,7 +21,8 @@ pub(crate) fn locate(
     host: &str,
     scratch: &Path,
 ) -> Result<PathBuf, String> {
-    let workspace = run(cargo, crate_dir, &["locate-project", "--workspace", "--message-format=plain"])?;
+    let workspace =
+        run(cargo, crate_dir, &["locate-project", "--workspace", "--message-format=plain"])?;
     let lock = Path::new(workspace.trim_end()).with_file_name("Cargo.lock");
 
     let manifest = scratch.join("Cargo.toml");
@@ -99,7 +100,10 @@ fn run(cargo: &Path, crate_dir: &Path, args: &[&str]) -> Result<String, String> 
         .map_err(|err| format!("cannot run {}: {err}", cargo.display()))?;
     let stderr = String::from_utf8_lossy(&output.stderr);
     if !output.status.success() {
-        return Err(format!("cargo {} failed, so rustls's source is not found:\n{stderr}", args[0]));
+        return Err(format!(
+            "cargo {} failed, so rustls's source is not found:\n{stderr}",
+            args[0]
+        ));
     }
     String::from_utf8(output.stdout).map_err(|err| format!("cargo {}: {err}", args[0]))
 }

@@ -1,0 +1,39 @@
+//! The error of everything that makes a key, an identity or a configuration.
+
+/// Why a key, an identity or a configuration could not be made.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// An SAE ID or key_ID cannot be used.
+    #[error("{what} {reason}")]
+    Name {
+        /// Which of the names.
+        what: &'static str,
+        /// What is wrong with it.
+        reason: &'static str,
+    },
+    /// Both ends have the same SAE ID, so a reflected handshake could not be told from a real one.
+    #[error("client and server have the same SAE ID; give each host an SAE of its own")]
+    EqualSaeIds,
+    /// Bytes that are not a PSK identity of the form `axon-qkd-v1:CLIENT-SAE:key_ID`.
+    #[error("not a PSK identity of the form axon-qkd-v1:CLIENT-SAE:key_ID: {0}")]
+    PskIdentity(&'static str),
+    /// A private key that cannot be used.
+    #[error("private key: {0}")]
+    PrivateKey(&'static str),
+    /// The application protocol to negotiate is empty or too long.
+    #[error("ALPN protocol must have 1 to 255 bytes")]
+    Alpn,
+    /// rustls refused the configuration of a hybrid connection.
+    #[error("rustls: {0}")]
+    Rustls(#[from] rustls::Error),
+    /// rustls-axon refused the configuration of a QKD connection.
+    #[error("rustls-axon: {0}")]
+    RustlsAxon(#[from] rustls_axon::Error),
+    /// The system's random number generator or key generation failed.
+    #[error("key generation failed")]
+    KeyGeneration,
+    /// Roots, certificates or revocation lists that cannot be used.
+    #[error("certificates: {0}")]
+    Certificates(String),
+}

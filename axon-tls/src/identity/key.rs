@@ -1,0 +1,118 @@
+//! Our own key.
+
+use std::sync::Arc;
+
+use aws_lc_rs::signature::{ML_DSA_65_SIGNING, PqdsaKeyPair};
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use rustls::client::AlwaysResolvesClientRawPublicKeys;
+use rustls::crypto::aws_lc_rs::default_provider;
+use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer, PrivatePkcs8KeyDer};
+use rustls::server::AlwaysResolvesServerRawPublicKeys;
+use rustls::sign::CertifiedKey;
+use zeroize::Zeroizing;
+
+use super::SpkiDigest;
+use crate::Error;
+
+/// A private key that signs handshakes, shown to the peer as a raw public key.
+///
+/// ML-DSA-65 if it is made here; any that rustls can sign with if it is read (Ed25519, ECDSA,
+/// RSA-PSS). Not printable. Clones share one key.
+#[derive(Clone)]
+pub struct SigningKey {
+    certified: Arc<CertifiedKey>,
+}
+
+impl SigningKey {
+    /// Makes a new ML-DSA-65 key.
+    pub fn generate() -> Result<Self, Error> {
+        let pkcs8 = generate_pkcs8()?;
+        Self::from_pkcs8(&pkcs8)
+    }
+
+    /// Makes a new ML-DSA-65 key as a PEM file, to be read with [`SigningKey::from_pem()`].
+    pub fn generate_pem() -> Result<Zeroizing<String>, Error> {
+        let pkcs8 = generate_pkcs8()?;
+        let body = Zeroizing::new(STANDARD.encode(&*pkcs8));
+        // room for every line end, so that the text is never moved and left behind
+        let mut pem = Zeroizing::new(String::with_capacity(body.len() + body.len() / 64 + 80));
+        pem.push_str("-----BEGIN PRIVATE KEY-----\n");
+        for at in (0..body.len()).step_by(64) {
+            pem.push_str(&body[at..body.len().min(at + 64)]);
+            pem.push('\n');
+        }
+        pem.push_str("-----END PRIVATE KEY-----\n");
+        Ok(pem)
+    }
+
+    /// Reads a PKCS#8 key in DER.
+    pub fn from_pkcs8(der: &[u8]) -> Result<Self, Error> {
+        Self::load(PrivateKeyDer::Pkcs8(PrivatePkcs8KeyDer::from(der)))
+    }
+
+    /// Reads a PKCS#8 key in PEM: the first `PRIVATE KEY` in `text`.
+    pub fn from_pem(text: &str) -> Result<Self, Error> {
+        let mut der = PrivatePkcs8KeyDer::from_pem_slice(text.as_bytes())
+            .map_err(|_| Error::PrivateKey("no PEM section `PRIVATE KEY` (PKCS#8)"))?;
+        let loaded = Self::from_pkcs8(der.secret_pkcs8_der());
+        zeroize::Zeroize::zeroize(&mut der);
+        loaded
+    }
+
+    /// The digest by which a peer pins this key.
+    pub fn spki_digest(&self) -> SpkiDigest {
+        SpkiDigest::of(&self.certified.cert[0])
+    }
+
+    fn load(der: PrivateKeyDer<'_>) -> Result<Self, Error> {
+        // rustls asks for a key that it may keep, and copies it into the provider's own form
+        let key = default_provider()
+            .key_provider
+            .load_private_key(der.clone_key())
+            .map_err(|_| Error::PrivateKey("not a PKCS#8 key that can sign a TLS 1.3 handshake"))?;
+        let spki = key
+            .public_key()
+            .ok_or(Error::PrivateKey("the public key cannot be derived from it"))?
+            .into_owned();
+        let shown = CertificateDer::from(spki.as_ref().to_vec());
+        Ok(Self { certified: Arc::new(CertifiedKey::new(vec![shown], key)) })
+    }
+
+    pub(super) fn client_resolver(&self) -> Arc<AlwaysResolvesClientRawPublicKeys> {
+        Arc::new(AlwaysResolvesClientRawPublicKeys::new(Arc::clone(&self.certified)))
+    }
+
+    pub(super) fn server_resolver(&self) -> Arc<AlwaysResolvesServerRawPublicKeys> {
+        Arc::new(AlwaysResolvesServerRawPublicKeys::new(Arc::clone(&self.certified)))
+    }
+}
+
+fn generate_pkcs8() -> Result<Zeroizing<Vec<u8>>, Error> {
+    let document = PqdsaKeyPair::generate(&ML_DSA_65_SIGNING)
+        .and_then(|pair| pair.to_pkcs8v1())
+        .map_err(|_| Error::KeyGeneration)?;
+    Ok(Zeroizing::new(document.as_ref().to_vec()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_generated_key_reads_back_as_itself() {
+        let pem = SigningKey::generate_pem().unwrap();
+        let key = SigningKey::from_pem(&pem).unwrap();
+        assert_eq!(key.spki_digest(), SigningKey::from_pem(&pem).unwrap().spki_digest());
+        assert_ne!(key.spki_digest(), SigningKey::generate().unwrap().spki_digest());
+    }
+
+    #[test]
+    fn what_is_no_key_is_refused() {
+        assert!(SigningKey::from_pem("").is_err());
+        assert!(SigningKey::from_pem("-----BEGIN PRIVATE KEY-----\nAAAA\n").is_err());
+        assert!(SigningKey::from_pkcs8(&[0x30, 0x00]).is_err());
+        assert!(SigningKey::from_pkcs8(&[]).is_err());
+    }
+}

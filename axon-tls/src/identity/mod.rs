@@ -1,0 +1,92 @@
+//! Who the peer of a hybrid connection is.
+//!
+//! The key exchange keeps a recording adversary out; only authentication keeps an active one out.
+//! [`Auth`] says which of them a configuration does, and is never implied. It is mutual in every
+//! case, and the peer has to prove in every case that it has the private key it shows.
+
+mod ca;
+mod key;
+mod raw_key;
+mod spki;
+mod trust;
+
+use std::sync::Arc;
+
+use rustls::client::ResolvesClientCert;
+use rustls::server::ResolvesServerCert;
+use rustls::{ClientConfig, ConfigBuilder, ServerConfig, WantsVerifier};
+
+pub use ca::CaMaterial;
+pub use key::SigningKey;
+use raw_key::RawKeys;
+pub use spki::SpkiDigest;
+pub use trust::{Trust, TrustFile, TrustFileError};
+
+use crate::Error;
+
+/// How the two ends of a hybrid connection authenticate.
+#[derive(Clone)]
+#[non_exhaustive]
+pub enum Auth {
+    /// Not at all: any peer is accepted, under the ephemeral raw public key that it shows.
+    ///
+    /// **This stops who records the connection, and not who sits in the middle of it.**
+    None(SigningKey),
+    /// Raw public keys (RFC 7250) that both ends know beforehand.
+    Pinned {
+        /// Our key, which the peer has pinned.
+        key: SigningKey,
+        /// The keys of the peers.
+        trust: Trust,
+    },
+    /// Certificates from given roots alone, on both ends. There are no public roots.
+    Ca(Arc<CaMaterial>),
+}
+
+impl Auth {
+    /// The name used in configuration: `none`, `pinned` or `ca`.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::None(_) => "none",
+            Self::Pinned { .. } => "pinned",
+            Self::Ca(_) => "ca",
+        }
+    }
+
+    pub(crate) fn client(
+        &self,
+        builder: ConfigBuilder<ClientConfig, WantsVerifier>,
+    ) -> Result<ClientConfig, Error> {
+        let (key, trust) = match self {
+            Self::None(key) => (key, None),
+            Self::Pinned { key, trust } => (key, Some(trust.clone())),
+            Self::Ca(material) => return material.client(builder),
+        };
+        let ours: Arc<dyn ResolvesClientCert> = key.client_resolver();
+        Ok(builder
+            .dangerous()
+            .with_custom_certificate_verifier(Arc::new(RawKeys::new(trust)))
+            .with_client_cert_resolver(ours))
+    }
+
+    pub(crate) fn server(
+        &self,
+        builder: ConfigBuilder<ServerConfig, WantsVerifier>,
+    ) -> Result<ServerConfig, Error> {
+        let (key, trust) = match self {
+            Self::None(key) => (key, None),
+            Self::Pinned { key, trust } => (key, Some(trust.clone())),
+            Self::Ca(material) => return material.server(builder),
+        };
+        let ours: Arc<dyn ResolvesServerCert> = key.server_resolver();
+        Ok(builder
+            .with_client_cert_verifier(Arc::new(RawKeys::new(trust)))
+            .with_cert_resolver(ours))
+    }
+}
+
+impl std::fmt::Debug for Auth {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Auth::{}", self.name())
+    }
+}

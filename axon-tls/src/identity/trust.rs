@@ -1,0 +1,218 @@
+//! The keys of the peers: a file of pins, and the set in use, which can be replaced.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, PoisonError, RwLock};
+use std::time::{Duration, SystemTime};
+
+use super::SpkiDigest;
+
+/// A parsed trust file.
+///
+/// A line a key: a name, its digest and, if it ends, the last day it is valid on (UTC). A name may
+/// have two keys, for the time when a peer changes from one to the other. `#` begins a comment.
+///
+/// ```
+/// # use axon_tls::identity::TrustFile;
+/// let file = TrustFile::parse("
+/// ## the arm on table 2
+/// arm-2  spki-sha256:47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU=
+/// base   spki-sha256:AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA=  2030-12-31
+/// ")?;
+/// assert_eq!(file.names().collect::<Vec<_>>(), ["arm-2", "base"]);
+/// # Ok::<(), axon_tls::identity::TrustFileError>(())
+/// ```
+#[derive(Clone, Debug, Default)]
+pub struct TrustFile {
+    pins: BTreeMap<SpkiDigest, Pin>,
+}
+
+#[derive(Clone, Debug)]
+struct Pin {
+    name: String,
+    /// The first moment at which the pin no longer holds.
+    end: Option<SystemTime>,
+}
+
+/// A line of a trust file that cannot be used.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("trust file, line {line}: {reason}")]
+pub struct TrustFileError {
+    line: usize,
+    reason: &'static str,
+}
+
+impl TrustFile {
+    /// The most keys of one name.
+    pub const MAX_PINS_PER_NAME: usize = 2;
+    /// The largest file, in bytes.
+    pub const MAX_LEN: usize = 1 << 20;
+
+    /// Parses a whole file. One unusable line makes the file unusable.
+    pub fn parse(text: &str) -> Result<Self, TrustFileError> {
+        if text.len() > Self::MAX_LEN {
+            return Err(TrustFileError { line: 1, reason: "the file is larger than 1 MiB" });
+        }
+        let mut file = Self::default();
+        for (index, line) in text.lines().enumerate() {
+            file.parse_line(line).map_err(|reason| TrustFileError { line: index + 1, reason })?;
+        }
+        Ok(file)
+    }
+
+    /// The name that has the key, if it is valid at `now`.
+    pub fn name_of(&self, key: &SpkiDigest, now: SystemTime) -> Option<&str> {
+        let pin = self.pins.get(key)?;
+        pin.end.is_none_or(|end| now < end).then_some(pin.name.as_str())
+    }
+
+    /// Every name, sorted, once.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        let mut names: Vec<_> = self.pins.values().map(|pin| pin.name.as_str()).collect();
+        names.sort_unstable();
+        names.dedup();
+        names.into_iter()
+    }
+
+    /// Whether there is no key at all.
+    pub fn is_empty(&self) -> bool {
+        self.pins.is_empty()
+    }
+
+    fn parse_line(&mut self, line: &str) -> Result<(), &'static str> {
+        let content = line.split('#').next().unwrap_or_default();
+        let fields: Vec<_> = content.split_ascii_whitespace().collect();
+        let (name, digest, day) = match fields[..] {
+            [] => return Ok(()),
+            [name, digest] => (name, digest, None),
+            [name, digest, day] => (name, digest, Some(day)),
+            _ => return Err("expected `name spki-sha256:BASE64 [YYYY-MM-DD]`"),
+        };
+        if name.len() > 255 || !name.bytes().all(|byte| byte.is_ascii_graphic()) {
+            return Err("a name has at most 255 printable ASCII characters");
+        }
+        let digest = digest
+            .parse()
+            .map_err(|_| "the key must be `spki-sha256:` and 44 characters of base64")?;
+        let end = match day {
+            Some(day) => Some(end_of_day(day).ok_or("the last day must be a date YYYY-MM-DD")?),
+            None => None,
+        };
+
+        let same_name = self.pins.values().filter(|pin| pin.name == name).count();
+        if same_name == Self::MAX_PINS_PER_NAME {
+            return Err("a name can have at most two keys");
+        }
+        if self.pins.insert(digest, Pin { name: name.to_owned(), end }).is_some() {
+            return Err("this key is in the file twice");
+        }
+        Ok(())
+    }
+}
+
+/// The moment after the last of a day in UTC, for years 1970 to 9999.
+fn end_of_day(day: &str) -> Option<SystemTime> {
+    let bytes = day.as_bytes();
+    if bytes.len() != 10 || bytes[4] != b'-' || bytes[7] != b'-' {
+        return None;
+    }
+    let number = |range: std::ops::Range<usize>| -> Option<u64> {
+        let digits = day.get(range)?;
+        digits.bytes().all(|byte| byte.is_ascii_digit()).then(|| digits.parse().ok())?
+    };
+    let (year, month, date) = (number(0..4)?, number(5..7)?, number(8..10)?);
+
+    let leap = year.is_multiple_of(4) && (!year.is_multiple_of(100) || year.is_multiple_of(400));
+    let lengths = [31, if leap { 29 } else { 28 }, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31];
+    let length = *lengths.get(usize::try_from(month).ok()?.checked_sub(1)?)?;
+    if year < 1970 || date == 0 || date > length {
+        return None;
+    }
+    let leap_days = |year: u64| year / 4 - year / 100 + year / 400;
+    let days = (year - 1970) * 365 + leap_days(year - 1) - leap_days(1969)
+        + lengths[..usize::try_from(month).ok()? - 1].iter().sum::<u64>()
+        + date;
+    SystemTime::UNIX_EPOCH.checked_add(Duration::from_secs(days * 86_400))
+}
+
+/// The set of pins that connections are checked against. Clones share one set.
+///
+/// Replacing it affects handshakes from then on. Connections that stand are for their owner to
+/// close: [`Trust::name_of()`] tells which.
+#[derive(Clone, Debug, Default)]
+pub struct Trust {
+    file: Arc<RwLock<TrustFile>>,
+}
+
+impl Trust {
+    /// Starts with the pins of `file`.
+    pub fn new(file: TrustFile) -> Self {
+        Self { file: Arc::new(RwLock::new(file)) }
+    }
+
+    /// Goes on with the pins of `file` instead.
+    pub fn replace(&self, file: TrustFile) {
+        *self.file.write().unwrap_or_else(PoisonError::into_inner) = file;
+    }
+
+    /// The name that has the key now.
+    pub fn name_of(&self, key: &SpkiDigest) -> Option<String> {
+        let file = self.file.read().unwrap_or_else(PoisonError::into_inner);
+        file.name_of(key, SystemTime::now()).map(str::to_owned)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const KEY: &str = "spki-sha256:47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU=";
+
+    #[test]
+    fn unusable_lines_are_refused() {
+        for line in [
+            "name",
+            "name spki-sha256:",
+            "name spki-sha256:47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU",
+            "name sha256:47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU=",
+            "name spki-sha256:47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuF==",
+            "n\u{e4}me spki-sha256:47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU=",
+        ] {
+            assert!(TrustFile::parse(line).is_err(), "{line}");
+        }
+        for day in
+            ["2030", "2030-13-01", "2030-00-01", "2030-02-29", "1969-12-31", "2030-1-1", "x y"]
+        {
+            let error = TrustFile::parse(&format!("\n a {KEY} {day}")).unwrap_err();
+            assert!(error.to_string().starts_with("trust file, line 2: "), "{error}");
+        }
+        assert!(TrustFile::parse(&format!("a {KEY}\nb {KEY}")).is_err());
+        assert!(TrustFile::parse(&"#".repeat(TrustFile::MAX_LEN + 1)).is_err());
+    }
+
+    #[test]
+    fn a_name_has_two_keys_at_most() {
+        let line = |byte: u8| format!("a {}\n", SpkiDigest([byte; 32]));
+        assert!(TrustFile::parse(&(line(1) + &line(2))).is_ok());
+        assert!(TrustFile::parse(&(line(1) + &line(2) + &line(3))).is_err());
+    }
+
+    #[test]
+    fn a_pin_holds_to_the_end_of_its_last_day() {
+        let file = TrustFile::parse(&format!("a {KEY} 2024-02-29")).unwrap();
+        let key = KEY.parse().unwrap();
+        let midnight = SystemTime::UNIX_EPOCH + Duration::from_secs(1_709_251_200);
+        assert_eq!(file.name_of(&key, midnight - Duration::from_nanos(1)), Some("a"));
+        assert_eq!(file.name_of(&key, midnight), None);
+        assert_eq!(file.name_of(&SpkiDigest([0; 32]), midnight), None);
+    }
+
+    #[test]
+    fn replacing_takes_a_pin_away() {
+        let key = KEY.parse().unwrap();
+        let trust = Trust::new(TrustFile::parse(&format!("a {KEY}")).unwrap());
+        let shared = trust.clone();
+        assert_eq!(shared.name_of(&key).as_deref(), Some("a"));
+        trust.replace(TrustFile::default());
+        assert_eq!(shared.name_of(&key), None);
+    }
+}

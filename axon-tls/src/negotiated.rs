@@ -1,0 +1,146 @@
+//! What peers choose from, and what they agreed on.
+
+use std::fmt;
+use std::str::FromStr;
+
+use crate::identity::SpkiDigest;
+
+/// The cipher suite of a connection: TLS 1.3 with a 256-bit key.
+///
+/// A configuration has exactly one. It also fixes the hash of the key schedule and of a
+/// pre-shared key.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+pub enum Cipher {
+    /// TLS_CHACHA20_POLY1305_SHA256
+    #[default]
+    ChaCha20Poly1305,
+    /// TLS_AES_256_GCM_SHA384
+    Aes256Gcm,
+}
+
+impl Cipher {
+    /// Every cipher.
+    pub const ALL: [Self; 2] = [Self::ChaCha20Poly1305, Self::Aes256Gcm];
+
+    /// The name used in configuration: `chacha20-poly1305` or `aes-256-gcm`.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::ChaCha20Poly1305 => "chacha20-poly1305",
+            Self::Aes256Gcm => "aes-256-gcm",
+        }
+    }
+}
+
+/// How a pre-shared key is used (RFC 8446 section 4.2.9).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+pub enum PskKex {
+    /// The key alone. No forward secrecy: who learns the key later reads a recorded connection.
+    #[default]
+    PskKe,
+    /// The key together with X25519MLKEM768.
+    PskDheKe,
+}
+
+impl PskKex {
+    /// Both modes.
+    pub const ALL: [Self; 2] = [Self::PskKe, Self::PskDheKe];
+
+    /// The name used in configuration: `psk_ke` or `psk_dhe_ke`.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::PskKe => "psk_ke",
+            Self::PskDheKe => "psk_dhe_ke",
+        }
+    }
+}
+
+/// The key exchange of a finished handshake.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[non_exhaustive]
+pub enum KeyExchange {
+    /// X25519 and ML-KEM-768 together.
+    X25519MlKem768,
+    /// An external pre-shared key alone.
+    PskKe,
+    /// An external pre-shared key and X25519MLKEM768.
+    PskDheKe,
+}
+
+impl fmt::Display for KeyExchange {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::X25519MlKem768 => "X25519MLKEM768",
+            Self::PskKe => "psk_ke",
+            Self::PskDheKe => "psk_dhe_ke (X25519MLKEM768)",
+        })
+    }
+}
+
+/// What a finished handshake agreed on, as the connection tells it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Negotiated {
+    /// How the keys were agreed on.
+    pub key_exchange: KeyExchange,
+    /// The cipher suite.
+    pub cipher: Cipher,
+    /// The identity of the pre-shared key, if the connection runs on one.
+    pub psk_identity: Option<Vec<u8>>,
+    /// The digest of the peer's public key, if the connection does not run on a pre-shared key.
+    ///
+    /// The peer has proven that it has the private key. Whether that says who it is, depends on
+    /// the [`Auth`](crate::identity::Auth) of the configuration.
+    pub peer: Option<SpkiDigest>,
+    /// The application protocol; empty if none was configured.
+    pub alpn: Vec<u8>,
+}
+
+/// A name that is not one of those accepted.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("`{given}` is not one of {accepted}")]
+pub struct UnknownName {
+    given: String,
+    accepted: &'static str,
+}
+
+macro_rules! named {
+    ($ty:ty, $accepted:literal) => {
+        impl fmt::Display for $ty {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str(self.name())
+            }
+        }
+
+        impl FromStr for $ty {
+            type Err = UnknownName;
+
+            fn from_str(given: &str) -> Result<Self, Self::Err> {
+                Self::ALL.into_iter().find(|known| known.name() == given).ok_or_else(|| {
+                    UnknownName { given: given.chars().take(64).collect(), accepted: $accepted }
+                })
+            }
+        }
+    };
+}
+
+named!(Cipher, "chacha20-poly1305, aes-256-gcm");
+named!(PskKex, "psk_ke, psk_dhe_ke");
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_exact() {
+        for wrong in ["", "CHACHA20-POLY1305", "aes-256-gcm ", "aes-128-gcm", "psk"] {
+            assert!(wrong.parse::<Cipher>().is_err(), "{wrong}");
+            assert!(wrong.parse::<PskKex>().is_err(), "{wrong}");
+        }
+        for cipher in Cipher::ALL {
+            assert_eq!(cipher.to_string().parse(), Ok(cipher));
+        }
+        for kex in PskKex::ALL {
+            assert_eq!(kex.to_string().parse(), Ok(kex));
+        }
+    }
+}

@@ -1,0 +1,118 @@
+//! Configurations of rustls-axon for a pre-shared key, and what became of a connection.
+
+use std::fmt::{self, Debug};
+use std::sync::Arc;
+
+use rustls_axon::crypto::CryptoProvider;
+use rustls_axon::crypto::aws_lc_rs::{cipher_suite, default_provider, kx_group};
+use rustls_axon::external_psk::{
+    ExternalPsk, ExternalPskOffer, PskKeyExchangeMode, ResolvesExternalPsk,
+};
+use rustls_axon::{ClientConfig, CommonState, NamedGroup, ServerConfig, SupportedCipherSuite};
+
+use super::Psk;
+use crate::hybrid::protocols;
+use crate::{Cipher, Error, KeyExchange, Negotiated, PskKex};
+
+/// Where a server looks up pre-shared keys.
+///
+/// Called on the thread that handles the packet: an implementation must not block. Looking a key
+/// up must not spend it, because anybody can send an identity that they saw on the wire: it is
+/// spent when [`negotiated()`] of the connection is `Some`.
+pub trait PskResolver: Debug + Send + Sync {
+    /// The key with exactly this identity; `None` refuses the client with the alert
+    /// `unknown_psk_identity`.
+    ///
+    /// These are bytes from the network: see [`PskIdentity::parse()`](super::PskIdentity::parse).
+    fn resolve(&self, identity: &[u8]) -> Option<Arc<Psk>>;
+}
+
+/// A client's configuration for one connection on `psk`, with one ALPN protocol, or none if `alpn`
+/// is empty. The cipher is the one that the key was derived for.
+pub fn client_config(psk: Arc<Psk>, kex: PskKex, alpn: &[u8]) -> Result<ClientConfig, Error> {
+    let provider = provider(psk.cipher(), kex);
+    let mut config = ClientConfig::builder_with_provider(Arc::new(provider))
+        .with_external_psks(vec![psk.external()], mode(kex))?;
+    config.alpn_protocols = protocols(alpn)?;
+    config.enable_sni = false;
+    Ok(config)
+}
+
+/// A server's configuration, with one ALPN protocol, or none if `alpn` is empty.
+///
+/// A key that the resolver returns is used only if it was derived for `cipher`.
+pub fn server_config(
+    resolver: Arc<dyn PskResolver>,
+    cipher: Cipher,
+    kex: PskKex,
+    alpn: &[u8],
+) -> Result<ServerConfig, Error> {
+    let mut config = ServerConfig::builder_with_provider(Arc::new(provider(cipher, kex)))
+        .with_external_psk_resolver(Arc::new(FirstKnown(resolver)), mode(kex))?;
+    config.alpn_protocols = protocols(alpn)?;
+    Ok(config)
+}
+
+/// What a finished handshake agreed on; `None` while it is under way.
+///
+/// On a server it is finished when the client's Finished was verified, so that is when a key is
+/// spent.
+pub fn negotiated(conn: &CommonState) -> Option<Negotiated> {
+    let psk = conn.external_psk()?;
+    let agreed = conn.negotiated_cipher_suite()?.suite();
+    let group = conn.negotiated_key_exchange_group().map(|group| group.name());
+    Some(Negotiated {
+        key_exchange: match (psk.mode(), group) {
+            (PskKeyExchangeMode::PskKe, None) => KeyExchange::PskKe,
+            (PskKeyExchangeMode::PskDheKe, Some(NamedGroup::X25519MLKEM768)) => {
+                KeyExchange::PskDheKe
+            }
+            _ => return None,
+        },
+        cipher: Cipher::ALL.into_iter().find(|cipher| suite(*cipher).suite() == agreed)?,
+        psk_identity: Some(psk.identity().to_vec()),
+        peer: None,
+        alpn: conn.alpn_protocol().unwrap_or_default().to_vec(),
+    })
+}
+
+fn provider(cipher: Cipher, kex: PskKex) -> CryptoProvider {
+    CryptoProvider {
+        cipher_suites: vec![suite(cipher)],
+        kx_groups: match kex {
+            PskKex::PskKe => vec![],
+            PskKex::PskDheKe => vec![kx_group::X25519MLKEM768],
+        },
+        ..default_provider()
+    }
+}
+
+fn suite(cipher: Cipher) -> SupportedCipherSuite {
+    match cipher {
+        Cipher::ChaCha20Poly1305 => cipher_suite::TLS13_CHACHA20_POLY1305_SHA256,
+        Cipher::Aes256Gcm => cipher_suite::TLS13_AES_256_GCM_SHA384,
+    }
+}
+
+fn mode(kex: PskKex) -> PskKeyExchangeMode {
+    match kex {
+        PskKex::PskKe => PskKeyExchangeMode::PskKe,
+        PskKex::PskDheKe => PskKeyExchangeMode::PskDheKe,
+    }
+}
+
+/// Looks up the first identity alone: our clients offer one, and a look-up may cause work.
+struct FirstKnown(Arc<dyn PskResolver>);
+
+impl ResolvesExternalPsk for FirstKnown {
+    fn resolve(&self, offer: ExternalPskOffer<'_>) -> Option<Arc<ExternalPsk>> {
+        let identity = offer.identities().next()?;
+        self.0.resolve(identity).filter(|psk| psk.identity() == identity).map(|psk| psk.external())
+    }
+}
+
+impl Debug for FirstKnown {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.fmt(f)
+    }
+}
