@@ -63,6 +63,8 @@ struct State<A> {
     used: IndexMask,
     reliable: IndexMask,
     first_used: Option<Duration>,
+    /// The latest time a slot was asked for.
+    latest: Duration,
 }
 
 /// Why a sealer seals no more.
@@ -149,6 +151,7 @@ impl<A: Aead> Sealer<A> {
             used: IndexMask::EMPTY,
             reliable: IndexMask::EMPTY,
             first_used: None,
+            latest: Duration::ZERO,
         }))
     }
 
@@ -184,12 +187,13 @@ impl<A: Aead> Sealer<A> {
 
     /// Why no further message can be sealed at `now`, if so.
     ///
-    /// `now` is monotonic time since an instant of the caller's choice, here as everywhere.
+    /// `now` is monotonic time since an instant of the caller's choice, here as everywhere. If it
+    /// goes backwards, it counts as standing still.
     pub fn spent(&self, now: Duration) -> Option<Spent> {
         if self.remaining() == 0 {
             return Some(Spent::Messages);
         }
-        let age = now.saturating_sub(self.0.first_used?);
+        let age = now.max(self.0.latest).saturating_sub(self.0.first_used?);
         (age >= KEY_MAX_AGE).then_some(Spent::Age)
     }
 
@@ -198,9 +202,10 @@ impl<A: Aead> Sealer<A> {
     /// # Errors
     /// [`Spent`] after ten messages, or an hour after the first.
     pub fn slot(&mut self, now: Duration, delivery: Delivery) -> Result<Slot<'_, A>, Spent> {
+        self.0.latest = self.0.latest.max(now);
         match self.spent(now) {
             Some(spent) => Err(spent),
-            None => Ok(Slot { state: &mut self.0, now, delivery }),
+            None => Ok(Slot { state: &mut self.0, delivery }),
         }
     }
 
@@ -236,7 +241,6 @@ impl<A> fmt::Debug for Sealer<A> {
 /// A permit to seal one message under one index. Every way of sealing consumes it.
 pub struct Slot<'a, A = DefaultAead> {
     state: &'a mut State<A>,
-    now: Duration,
     delivery: Delivery,
 }
 
@@ -337,7 +341,7 @@ impl<A: Aead> Slot<'_, A> {
         let index = state.next;
         state.next += 1;
         state.key = None;
-        state.first_used.get_or_insert(self.now);
+        state.first_used.get_or_insert(state.latest);
 
         let nonce = state.template.write(route, index, header);
         let tag = seal(&state.aead, &nonce, header).map_err(|_| SealError::Aead)?;

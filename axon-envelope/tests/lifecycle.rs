@@ -135,7 +135,15 @@ fn a_key_that_is_never_retired_grows_too_old() {
     assert_eq!(open(&mut opener, last, &envelopes[1]), Ok(()));
     assert_eq!(opener.expire(last).keys, 0);
     assert_eq!(open(&mut opener, first + max_age, &envelopes[2]), Err(RefusalCause::Retired));
-    assert_eq!(opener.expire(first + max_age).keys, 1);
+    // Neither a late RETIRE nor a clock that goes backwards brings it back.
+    let (other, _) = six("other");
+    opener.add_key(key_id("other"), key(1)).unwrap();
+    assert_eq!(open(&mut opener, first, &other[0]), Ok(()));
+    assert_eq!(open(&mut opener, first, &envelopes[2]), Err(RefusalCause::Retired));
+    let outcome = opener.retire(first + max_age, b"key", mask(0b111111), mask(0b111111));
+    assert_eq!(outcome, Ok(RetireOutcome::NotHeld));
+    assert_eq!(open(&mut opener, first + max_age, &envelopes[2]), Err(RefusalCause::Retired));
+    assert_eq!(opener.expire(first + max_age * 2).keys, 1);
     assert_eq!(opener.key_count(), 0);
 }
 

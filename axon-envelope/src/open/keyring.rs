@@ -47,9 +47,11 @@ impl<A: Aead> Live<A> {
     /// Indexes that can still open at `now`.
     fn open_indexes(&self, now: Duration, limits: &Limits) -> IndexMask {
         let expected = match (&self.retire, self.first_opened) {
-            (Some(retire), _) if elapsed(retire.at, now) < limits.best_effort_grace => retire.used,
+            (Some(retire), _) if now.saturating_sub(retire.at) < limits.best_effort_grace => {
+                retire.used
+            }
             (Some(retire), _) => retire.reliable,
-            (None, Some(first)) if elapsed(first, now) >= limits.max_age => IndexMask::EMPTY,
+            (None, Some(first)) if now.saturating_sub(first) >= limits.max_age => IndexMask::EMPTY,
             (None, _) => IndexMask::ALL,
         };
         expected.minus(self.opened)
@@ -129,6 +131,8 @@ impl<A: Aead> Keyring<A> {
         if !reliable.is_subset(used) {
             return Err(RetireError::Masks { used, reliable });
         }
+        // A key that has grown too old is gone, whether `expire` has come by or not.
+        self.retire_if_done(id, now);
         let Some(Slot::Live(live)) = self.keys.get_mut(id) else {
             return Ok(RetireOutcome::NotHeld);
         };
@@ -211,9 +215,4 @@ impl<A: Aead> Keyring<A> {
             }
         }
     }
-}
-
-/// Time from `since` to `now`, none if the caller's clock went backwards.
-fn elapsed(since: Duration, now: Duration) -> Duration {
-    now.saturating_sub(since)
 }

@@ -32,6 +32,8 @@ pub struct Opener<A = DefaultAead> {
     channel: Channel,
     keys: Keyring<A>,
     decoy: A,
+    /// The latest time a caller has told.
+    latest: Duration,
 }
 
 /// How much an [`Opener`] keeps, and how long.
@@ -138,7 +140,7 @@ impl<A: Aead> Opener<A> {
         // Envelopes that are refused before the tag counts are run against a key that nobody
         // knows, so that they cost what a wrong tag costs.
         let decoy = A::new(KmeKey::random()?.expose());
-        Ok(Self { channel, keys: Keyring::new(limits), decoy })
+        Ok(Self { channel, keys: Keyring::new(limits), decoy, latest: Duration::ZERO })
     }
 
     /// Adds a key that the sender has announced.
@@ -229,12 +231,14 @@ impl<A: Aead> Opener<A> {
         used: IndexMask,
         reliable: IndexMask,
     ) -> Result<RetireOutcome, RetireError> {
+        let now = self.advance(now);
         self.keys.retire(now, key_id, used, reliable)
     }
 
     /// Erases the keys whose time is over. To be called about once a second; which messages open
     /// does not depend on it, only how long a dead key stays in memory.
     pub fn expire(&mut self, now: Duration) -> Expired {
+        let now = self.advance(now);
         self.keys.expire(now)
     }
 
@@ -263,6 +267,12 @@ impl<A: Aead> Opener<A> {
         self.keys.limits()
     }
 
+    /// Time never goes backwards, or what has been retired would live again.
+    fn advance(&mut self, now: Duration) -> Duration {
+        self.latest = self.latest.max(now);
+        self.latest
+    }
+
     /// Every envelope with a well-formed header goes this way: one look-up, one pass of the AEAD
     /// over all of it, and on failure one erasure, whatever the cause.
     fn open_with(
@@ -278,6 +288,7 @@ impl<A: Aead> Opener<A> {
             return Err(HeaderError::Trailing(header.len() - header_len).into());
         }
 
+        let now = self.advance(now);
         let held = self.keys.select(parsed.key_id, parsed.index, now);
         let admitted = if parsed.sender != self.channel.sender() {
             Err(RefusalCause::WrongSender)
