@@ -1,1 +1,90 @@
-//! etsi-qkd014
+//! A client for [ETSI GS QKD 014 V1.1.1], the REST interface through which a quantum key
+//! distribution (QKD) key manager hands out keys.
+//!
+//! A *KME* (key management entity) serves keys. An *SAE* (secure application entity) is the
+//! program that uses them. The *master* SAE draws fresh keys with [`Client::enc_keys`] and tells
+//! the *slave* SAE their key_IDs by any means; the slave draws the same keys from its own KME with
+//! [`Client::dec_keys`]. A KME gives each key once.
+//!
+//! ```no_run
+//! # async fn example() -> Result<(), etsi_qkd014::Error> {
+//! use etsi_qkd014::Client;
+//!
+//! let client = Client::builder()
+//!     .kme_url("https://kme-a.example:8443")
+//!     .ca_file("ca.pem")
+//!     .sae_cert_file("sae-a.crt")
+//!     .sae_key_file("sae-a.key")
+//!     .build()?;
+//! let key = client.enc_keys("sae-b").size(256).send().await?.into_single();
+//! println!("tell sae-b: {}", key.key_id());
+//! let secret: &[u8] = key.expose();
+//! # let _ = secret; Ok(())
+//! # }
+//! ```
+//!
+//! # What it holds to
+//!
+//! - **Mutual TLS, and only the CA you name.** The system's roots are never consulted, redirects
+//!   and proxies from the environment are never followed. TLS 1.3 and 1.2; X25519MLKEM768 is
+//!   preferred where the KME has it.
+//! - **Secrets are zeroized.** A [`Key`] cannot be cloned or printed, compares in constant time and
+//!   shows its bytes only through [`Key::expose`]. See [Secrets](#secrets) for what the crate can
+//!   and cannot reach.
+//! - **What a KME says is checked**, each check named by the clause it comes from
+//!   ([`Error::Check`]). Deviations that real KMEs show are tolerated only by name: [`Quirks`].
+//! - **Keys are not lost silently.** A call cut off after its request may have left says so:
+//!   [`Error::KeyPossiblyConsumed`]. Only a [`RetryPolicy`] repeats a call.
+//!
+//! # Secrets
+//!
+//! Zeroized when they are dropped, whether by success, error, timeout or cancellation: the
+//! assembled answer body, the base64 text taken from it, the decoded key, and the SAE's private
+//! key as read from bytes or file. Beyond the crate's reach: the receive buffers of hyper and
+//! rustls, which hold the answer for as long as a connection lives, and the private key inside
+//! rustls' signer. A program that must not leave these in freed memory needs an allocator that
+//! zeroizes on free, and should disable core dumps.
+//!
+//! # Features
+//!
+//! - `blocking`: [`blocking::Client`](crate::blocking), which needs no async runtime of yours.
+//! - `sim`: [`sim`](crate::sim), KMEs in process for tests, and the binary `kme-sim`.
+//!
+//! [ETSI GS QKD 014 V1.1.1]: https://www.etsi.org/deliver/etsi_gs/QKD/001_099/014/01.01.01_60/gs_qkd014v010101p.pdf
+
+#![forbid(unsafe_code)]
+#![cfg_attr(docsrs, feature(doc_cfg))]
+
+#[cfg(feature = "blocking")]
+pub mod blocking;
+mod builder;
+mod client;
+mod error;
+mod exchange;
+#[doc(hidden)]
+pub mod fuzzing;
+mod key;
+mod parse;
+mod quirks;
+mod request;
+mod retry;
+mod secret;
+#[cfg(feature = "sim")]
+pub mod sim;
+mod status;
+mod subject;
+mod tls;
+
+pub use builder::ClientBuilder;
+pub use client::Client;
+pub use error::{Error, RefusedBy};
+pub use key::{Key, KeyContainer};
+pub use quirks::Quirks;
+pub use request::{DecKeys, EncKeys};
+pub use retry::RetryPolicy;
+pub use status::Status;
+
+/// The README's example, compiled as a doc test.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

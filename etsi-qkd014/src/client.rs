@@ -1,0 +1,143 @@
+//! The client: one call is one or more tries, within a deadline.
+
+use std::fmt;
+use std::sync::Arc;
+use std::time::Duration;
+
+use reqwest::Url;
+use tokio::time::Instant;
+
+use crate::builder::Limits;
+use crate::exchange::{Body, Call, Failure, Prepared};
+use crate::{ClientBuilder, DecKeys, EncKeys, Error, Status, parse};
+
+/// A client of one KME, acting as one SAE.
+///
+/// Cheap to clone, and all clones share their connections. Calls may run at the same time from any
+/// task. They need a tokio runtime with time and I/O enabled; see [`blocking`](crate::blocking)
+/// for programs without one.
+///
+/// A call that is dropped before it ends leaves nothing behind here, but the KME may have served
+/// it: treat the keys of a dropped call as [consumed](Error::KeyPossiblyConsumed).
+#[derive(Clone)]
+pub struct Client {
+    inner: Arc<Inner>,
+}
+
+struct Inner {
+    http: reqwest::Client,
+    base: Url,
+    kme: String,
+    connect_timeout: Duration,
+    limits: Limits,
+}
+
+impl Client {
+    /// Starts the settings of a client.
+    pub fn builder() -> ClientBuilder {
+        ClientBuilder::default()
+    }
+
+    /// What the KME holds for keys between this SAE and `slave_sae` (clause 5.2).
+    ///
+    /// # Errors
+    /// Any [`Error`] but [`KeyPossiblyConsumed`](Error::KeyPossiblyConsumed).
+    pub async fn status(&self, slave_sae: &str) -> Result<Status, Error> {
+        let prepared = Prepared::get(self.url(slave_sae, "status")?);
+        let body = self.call(Call::Status, &prepared).await?;
+        parse::status(&body, slave_sae, self.limits().quirks)
+    }
+
+    /// Asks for fresh keys to share with `slave_sae`, as their master (clause 5.3).
+    pub fn enc_keys(&self, slave_sae: impl Into<String>) -> EncKeys<'_> {
+        EncKeys::new(self, slave_sae.into())
+    }
+
+    /// Asks for keys that `master_sae` drew, by their key_IDs, as their slave (clause 5.4).
+    pub fn dec_keys(&self, master_sae: impl Into<String>) -> DecKeys<'_> {
+        DecKeys::new(self, master_sae.into())
+    }
+
+    pub(crate) fn new(
+        http: reqwest::Client,
+        base: Url,
+        kme: String,
+        connect_timeout: Duration,
+        limits: Limits,
+    ) -> Self {
+        Self { inner: Arc::new(Inner { http, base, kme, connect_timeout, limits }) }
+    }
+
+    pub(crate) fn limits(&self) -> &Limits {
+        &self.inner.limits
+    }
+
+    /// The URL of a method; the SAE ID becomes one path segment whatever it holds.
+    pub(crate) fn url(&self, sae: &str, method: &str) -> Result<Url, Error> {
+        // "." and ".." would vanish from the path, and so name another resource.
+        let sane = !sae.is_empty() && sae.len() <= 255 && !matches!(sae, "." | "..");
+        if !sane || sae.chars().any(char::is_control) {
+            return Err(Error::Request {
+                reason: format!("SAE ID {sae:?}: 1 to 255 bytes without control characters"),
+            });
+        }
+        let mut url = self.inner.base.clone();
+        url.path_segments_mut().expect("https URLs have a path").extend([sae, method]);
+        Ok(url)
+    }
+
+    /// Makes a call with its repeats.
+    pub(crate) async fn call(&self, call: Call, prepared: &Prepared) -> Result<Body, Error> {
+        let Inner { http, kme, connect_timeout, limits, .. } = &*self.inner;
+        let deadline = Instant::now() + limits.deadline;
+        let mut repeat = 0;
+        let mut consumed = false;
+        loop {
+            let left = deadline.saturating_duration_since(Instant::now());
+            let time = limits.timeout.min(left);
+            let tried = prepared.attempt(http, kme, *connect_timeout, time, limits).await;
+            let Failure { error, ambiguous } = match tried {
+                Ok(body) => return Ok(body),
+                Err(failure) => failure,
+            };
+            consumed |= ambiguous;
+            let pause = pause(limits, repeat, &error);
+            let time_left = deadline.saturating_duration_since(Instant::now()) > pause;
+            if !(time_left && may_repeat(call, limits, repeat, &error, ambiguous)) {
+                return Err(if consumed { call.consumed(error) } else { error });
+            }
+            tokio::time::sleep(pause).await;
+            repeat += 1;
+        }
+    }
+}
+
+impl fmt::Debug for Client {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Client")
+            .field("base", &self.inner.base.as_str())
+            .field("limits", &self.inner.limits)
+            .finish_non_exhaustive()
+    }
+}
+
+fn may_repeat(call: Call, limits: &Limits, repeat: u32, error: &Error, ambiguous: bool) -> bool {
+    let policy = &limits.retry;
+    let (repeats, allowed) = match call {
+        Call::Status => (policy.status, true),
+        Call::DecKeys => (policy.dec_keys, true),
+        Call::EncKeys => (policy.enc_keys, !ambiguous || policy.enc_keys_ambiguous),
+    };
+    repeat < repeats && allowed && error.is_transient()
+}
+
+fn pause(limits: &Limits, repeat: u32, error: &Error) -> Duration {
+    let mut jitter = [0];
+    // Without randomness the pause is only less spread.
+    let _ = rustls::crypto::aws_lc_rs::default_provider().secure_random.fill(&mut jitter);
+    let pause = limits.retry.pause_before(repeat, jitter[0]);
+    match error {
+        Error::Unavailable { retry_after: Some(asked), .. } => pause.max(*asked),
+        _ => pause,
+    }
+}

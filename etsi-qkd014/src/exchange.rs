@@ -1,0 +1,193 @@
+//! One try of a call: request out, bounded answer in, and an honest word on what a failure means.
+
+use std::time::Duration;
+
+use reqwest::header::{ACCEPT, CONTENT_TYPE, RETRY_AFTER};
+use reqwest::{Method, Response, StatusCode, Url, Version};
+use zeroize::Zeroize;
+
+use crate::builder::Limits;
+use crate::secret::SecretBuf;
+use crate::{Error, Quirks, parse, tls};
+
+/// The answer of status 200, zeroized on drop.
+pub(crate) type Body = SecretBuf;
+
+/// Largest body of another status that is read for its message.
+const MAX_ERROR_BODY: usize = 64 << 10;
+
+/// The three methods of the interface.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Call {
+    Status,
+    EncKeys,
+    DecKeys,
+}
+
+impl Call {
+    /// Wraps a failure after which keys may be gone. A status consumes none.
+    pub(crate) fn consumed(self, cause: Error) -> Error {
+        let call = match self {
+            Self::Status => return cause,
+            Self::EncKeys => "enc_keys",
+            Self::DecKeys => "dec_keys",
+        };
+        Error::KeyPossiblyConsumed { call, cause: Box::new(cause) }
+    }
+}
+
+/// A request that can be sent more than once.
+pub(crate) struct Prepared {
+    method: Method,
+    url: Url,
+    body: Option<String>,
+}
+
+pub(crate) struct Failure {
+    pub(crate) error: Error,
+    /// The KME may have served the request all the same.
+    pub(crate) ambiguous: bool,
+}
+
+impl Failure {
+    fn clear(error: Error) -> Self {
+        Self { error, ambiguous: false }
+    }
+
+    fn ambiguous(error: Error) -> Self {
+        Self { error, ambiguous: true }
+    }
+}
+
+impl Prepared {
+    pub(crate) fn get(url: Url) -> Self {
+        Self { method: Method::GET, url, body: None }
+    }
+
+    pub(crate) fn post(url: Url, json: &serde_json::Value) -> Self {
+        Self { method: Method::POST, url, body: Some(json.to_string()) }
+    }
+
+    pub(crate) async fn attempt(
+        &self,
+        http: &reqwest::Client,
+        kme: &str,
+        connect_timeout: Duration,
+        time: Duration,
+        limits: &Limits,
+    ) -> Result<Body, Failure> {
+        let exchange = async {
+            let mut request = http
+                .request(self.method.clone(), self.url.clone())
+                .header(ACCEPT, "application/json");
+            if let Some(body) = &self.body {
+                request = request.header(CONTENT_TYPE, "application/json").body(body.clone());
+            }
+            let response =
+                request.send().await.map_err(|e| send_failure(&e, kme, connect_timeout))?;
+            receive(response, limits).await
+        };
+        match tokio::time::timeout(time, exchange).await {
+            Ok(result) => result,
+            // Connecting has its own, shorter time: the request is taken to have left.
+            Err(_) => Err(Failure::ambiguous(Error::Timeout { phase: "answer", after: time })),
+        }
+    }
+}
+
+/// A failure before there was an answer.
+fn send_failure(error: &reqwest::Error, kme: &str, connect_timeout: Duration) -> Failure {
+    let connected = !error.is_connect();
+    if let Some((refused_by, reason)) =
+        tls::tls_error(error).and_then(|tls| tls::refusal(tls, connected))
+    {
+        return Failure::clear(Error::Tls { kme: kme.to_owned(), refused_by, reason });
+    }
+    if connected {
+        return Failure::ambiguous(Error::Interrupted { reason: innermost(error) });
+    }
+    Failure::clear(if error.is_timeout() {
+        Error::Timeout { phase: "connect", after: connect_timeout }
+    } else {
+        Error::Unreachable { kme: kme.to_owned(), reason: innermost(error) }
+    })
+}
+
+/// The last reason in the chain: the outer ones repeat the URL.
+fn innermost(error: &reqwest::Error) -> String {
+    let mut reason: &dyn std::error::Error = error;
+    while let Some(source) = reason.source() {
+        reason = source;
+    }
+    reason.to_string()
+}
+
+async fn receive(mut response: Response, limits: &Limits) -> Result<Body, Failure> {
+    let status = response.status();
+    if status != StatusCode::OK {
+        return Err(refused(response).await);
+    }
+    let quirks = limits.quirks;
+    if response.version() < Version::HTTP_11 && !quirks.contains(Quirks::HTTP_1_0) {
+        return Err(Failure::ambiguous(Error::Malformed {
+            what: "HTTP version".to_owned(),
+            reason: "is older than 1.1 (quirk http-1.0 tolerates it)".to_owned(),
+        }));
+    }
+    if !quirks.contains(Quirks::ANY_MEDIA_TYPE) && !is_json(&response) {
+        return Err(Failure::ambiguous(Error::Malformed {
+            what: "Content-Type".to_owned(),
+            reason: "is not application/json (quirk any-media-type tolerates it)".to_owned(),
+        }));
+    }
+    read_body(&mut response, limits.max_body).await.map_err(Failure::ambiguous)
+}
+
+fn is_json(response: &Response) -> bool {
+    let value = response.headers().get(CONTENT_TYPE).and_then(|value| value.to_str().ok());
+    let media_type = value.and_then(|value| value.split(';').next()).unwrap_or_default();
+    media_type.trim().eq_ignore_ascii_case("application/json")
+}
+
+/// Reads at most `limit` bytes. Content-Length is a hint for the first allocation only.
+async fn read_body(response: &mut Response, limit: usize) -> Result<Body, Error> {
+    let expected = response.content_length().and_then(|length| usize::try_from(length).ok());
+    if expected.is_some_and(|length| length > limit) {
+        return Err(Error::BodyTooLarge { limit });
+    }
+    let mut body = SecretBuf::new(expected.unwrap_or(16 << 10), limit);
+    loop {
+        let chunk = match response.chunk().await {
+            Ok(Some(chunk)) => chunk,
+            Ok(None) => return Ok(body),
+            Err(e) => return Err(Error::Interrupted { reason: innermost(&e) }),
+        };
+        let kept = body.extend(&chunk);
+        // hyper often still shares this memory, and then it cannot be cleared from here.
+        if let Ok(mut own) = chunk.try_into_mut() {
+            own.zeroize();
+        }
+        kept.map_err(|_| Error::BodyTooLarge { limit })?;
+    }
+}
+
+/// An answer of a status other than 200.
+async fn refused(mut response: Response) -> Failure {
+    let status = response.status();
+    let retry_after = response
+        .headers()
+        .get(RETRY_AFTER)
+        .and_then(|value| value.to_str().ok()?.trim().parse().ok())
+        .map(Duration::from_secs);
+    let body = read_body(&mut response, MAX_ERROR_BODY).await;
+    let parse::ErrorAnswer { message, details } =
+        body.map(|body| parse::error_answer(&body)).unwrap_or_default();
+    match status.as_u16() {
+        400 => Failure::clear(Error::BadRequest { message, details }),
+        401 => Failure::clear(Error::Unauthorized { message, details }),
+        503 => Failure::clear(Error::Unavailable { message, details, retry_after }),
+        // A redirect or a refusal served nothing; a gateway's 502 or a KME's 500 may have.
+        code @ (300..=499) => Failure::clear(Error::Status { code, message }),
+        code => Failure::ambiguous(Error::Status { code, message }),
+    }
+}

@@ -1,0 +1,119 @@
+//! Keys: zeroized, not clonable, not printable.
+
+use serde_json::Value;
+use subtle::{Choice, ConstantTimeEq};
+use zeroize::Zeroizing;
+
+/// A key from a KME and its key_ID.
+///
+/// The secret is zeroized on drop. It is neither `Clone` nor `Debug` nor `Display`, and comes out
+/// only through [`expose`](Key::expose). Equality compares the secrets, and only them, in constant
+/// time.
+///
+/// ```compile_fail
+/// fn clone_it<T: Clone>() {}
+/// clone_it::<etsi_qkd014::Key>();
+/// ```
+/// ```compile_fail
+/// fn print_it<T: std::fmt::Debug>() {}
+/// print_it::<etsi_qkd014::Key>();
+/// ```
+pub struct Key {
+    key_id: String,
+    secret: Zeroizing<Box<[u8]>>,
+    key_id_extension: Option<Value>,
+    extension: Option<Value>,
+}
+
+impl Key {
+    pub(crate) fn new(
+        key_id: String,
+        secret: Zeroizing<Box<[u8]>>,
+        key_id_extension: Option<Value>,
+        extension: Option<Value>,
+    ) -> Self {
+        Self { key_id, secret, key_id_extension, extension }
+    }
+
+    pub(crate) fn set_key_id(&mut self, asked: String) {
+        self.key_id = asked;
+    }
+
+    /// The key_ID: from `enc_keys` exactly as the KME spelled it, from `dec_keys` exactly as you
+    /// asked for it (a KME may answer in another letter case).
+    #[must_use]
+    pub fn key_id(&self) -> &str {
+        &self.key_id
+    }
+
+    /// The secret itself.
+    #[must_use]
+    pub fn expose(&self) -> &[u8] {
+        &self.secret
+    }
+
+    /// The secret itself, where it is exactly `N` bytes long.
+    #[must_use]
+    pub fn expose_array<const N: usize>(&self) -> Option<&[u8; N]> {
+        self.expose().try_into().ok()
+    }
+
+    /// Length of the secret in bytes; never 0.
+    #[must_use]
+    #[allow(clippy::len_without_is_empty, reason = "a key is never empty")]
+    pub fn len(&self) -> usize {
+        self.secret.len()
+    }
+
+    /// The KME's `key_ID_extension` (clause 6.3).
+    #[must_use]
+    pub fn key_id_extension(&self) -> Option<&Value> {
+        self.key_id_extension.as_ref()
+    }
+
+    /// The KME's `key_extension` (clause 6.3).
+    #[must_use]
+    pub fn extension(&self) -> Option<&Value> {
+        self.extension.as_ref()
+    }
+}
+
+impl ConstantTimeEq for Key {
+    fn ct_eq(&self, other: &Self) -> Choice {
+        self.expose().ct_eq(other.expose())
+    }
+}
+
+impl PartialEq for Key {
+    fn eq(&self, other: &Self) -> bool {
+        self.ct_eq(other).into()
+    }
+}
+
+impl Eq for Key {}
+
+/// The keys of one answer (clause 6.3): always as many as were asked for, at least one.
+#[non_exhaustive]
+pub struct KeyContainer {
+    /// The keys; after `dec_keys` in the order in which they were asked for.
+    pub keys: Vec<Key>,
+    /// The KME's `key_container_extension`.
+    pub extension: Option<Value>,
+}
+
+impl KeyContainer {
+    /// The first key, for calls that asked for one. Others are dropped and zeroized.
+    #[must_use]
+    pub fn into_single(self) -> Key {
+        self.keys.into_iter().next().expect("a checked container is never empty")
+    }
+}
+
+impl IntoIterator for KeyContainer {
+    type Item = Key;
+    type IntoIter = std::vec::IntoIter<Key>;
+
+    fn into_iter(self) -> Self::IntoIter {
+        self.keys.into_iter()
+    }
+}

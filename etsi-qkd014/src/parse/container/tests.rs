@@ -1,0 +1,186 @@
+use proptest::prelude::*;
+use serde_json::{Value, json};
+
+use super::*;
+
+const ID_1: &str = "bc490419-7d60-487f-adc1-4ddcc177c139";
+const ID_2: &str = "0a782fb5-3434-48fe-aa4d-14f41d46cf92";
+const KEY_1: &str = "wHHVxRwDJs3/bXd38GHP3oe4svTuRpZS0yCC7x4Ly+s=";
+const KEY_2: &str = "OeGMPxh1+2RpJpNCYixWHFLYRubpOKCw94FcCI7VdJA=";
+
+fn two() -> Value {
+    json!({"keys": [{"key_ID": ID_1, "key": KEY_1}, {"key_ID": ID_2, "key": KEY_2}]})
+}
+
+fn parse(answer: &Value, asked: &Asked<'_>, size: Option<u32>) -> Result<KeyContainer, Error> {
+    key_container(answer.to_string().as_bytes(), asked, size, Quirks::STRICT)
+}
+
+fn refused(answer: &Value) -> Error {
+    let error = parse(answer, &Asked::Number(2), Some(256)).err().expect("it must be refused");
+    let shown = format!("{error} {error:?}");
+    for key in [KEY_1, KEY_2] {
+        assert!(!shown.contains(&key[..12]), "an error shows a key: {shown}");
+    }
+    error
+}
+
+fn changed(pointer: &str, to: Value) -> Value {
+    let mut answer = two();
+    *answer.pointer_mut(pointer).unwrap() = to;
+    answer
+}
+
+#[test]
+fn too_few_and_too_many_keys_are_refused() {
+    for number in [0, 1, 3] {
+        let error = parse(&two(), &Asked::Number(number), None).err().unwrap();
+        assert!(matches!(error, Error::Check { .. }), "{error}");
+    }
+    assert!(matches!(refused(&changed("/keys", json!([]))), Error::Check { .. }));
+}
+
+#[test]
+fn a_repeated_key_id_is_refused_in_any_letter_case() {
+    for again in [ID_1.to_owned(), ID_1.to_ascii_uppercase()] {
+        assert!(matches!(refused(&changed("/keys/1/key_ID", json!(again))), Error::Check { .. }));
+    }
+}
+
+#[test]
+fn key_ids_are_present_and_sane() {
+    let long = "x".repeat(129);
+    for bad in [json!(""), json!("two words"), json!("\n"), json!(long), json!(7), json!(null)] {
+        let error = refused(&changed("/keys/1/key_ID", bad.clone()));
+        assert!(matches!(error, Error::Malformed { .. }), "{bad}: {error}");
+    }
+    assert!(matches!(refused(&changed("/keys/1/key_ID", json!("key-7"))), Error::Check { .. }));
+    let mut answer = two();
+    answer["keys"][0].as_object_mut().unwrap().remove("key_ID");
+    assert!(matches!(refused(&answer), Error::Malformed { .. }));
+}
+
+#[test]
+fn an_id_that_is_no_uuid_needs_its_quirk() {
+    let answer = changed("/keys/1/key_ID", json!("key-7")).to_string();
+    let keys =
+        key_container(answer.as_bytes(), &Asked::Number(2), Some(256), Quirks::ANY_KEY_ID).unwrap();
+    assert_eq!(keys.keys[1].key_id(), "key-7");
+}
+
+#[test]
+fn keys_of_another_size_are_refused() {
+    assert!(matches!(refused(&changed("/keys/1/key", json!("AAAA"))), Error::Check { .. }));
+    // With no size asked they must at least agree with each other.
+    let unequal = changed("/keys/1/key", json!("AAAA"));
+    assert!(parse(&unequal, &Asked::Number(2), None).is_err());
+    assert!(parse(&two(), &Asked::Number(2), Some(128)).is_err());
+}
+
+#[test]
+fn a_key_that_is_no_base64_text_is_refused_without_being_shown() {
+    for bad in [
+        json!(&KEY_1[..43]),
+        json!(format!("{KEY_1}!")),
+        json!([KEY_1]),
+        json!({"a": KEY_1}),
+        json!(1),
+        json!(""),
+        json!(null),
+    ] {
+        refused(&changed("/keys/0/key", bad));
+    }
+    refused(&changed("/keys/0", json!(KEY_1)));
+    refused(&changed("/keys", json!(KEY_1)));
+    refused(&json!(KEY_1));
+    let mut extra = two();
+    extra["keys"][0][KEY_1] = json!(1);
+    refused(&extra);
+}
+
+#[test]
+fn members_that_come_twice_are_refused() {
+    let text = format!(r#"{{"keys":[{{"key_ID":"{ID_1}","key":"{KEY_1}","key":"{KEY_2}"}}]}}"#);
+    let error =
+        key_container(text.as_bytes(), &Asked::Number(1), None, Quirks::STRICT).err().unwrap();
+    assert!(error.to_string().contains("twice"), "{error}");
+}
+
+#[test]
+fn deep_and_wide_answers_are_refused() {
+    let deep = format!("{{\"keys\":{}{}}}", "[".repeat(10_000), "]".repeat(10_000));
+    let wide = format!("{{\"keys\":[{}1]}}", "1,".repeat(100_000));
+    let many: Vec<String> = (0..1000).map(|i| format!("\"m{i}\":1")).collect();
+    let members = format!("{{{}}}", many.join(","));
+    for text in [deep, wide, members] {
+        let result = key_container(text.as_bytes(), &Asked::Number(1), None, Quirks::EXTRA_MEMBERS);
+        assert!(matches!(result.err(), Some(Error::Malformed { .. })));
+    }
+}
+
+#[test]
+fn trailing_text_and_every_cut_are_refused() {
+    let text = two().to_string();
+    for cut in 0..text.len() {
+        let result =
+            key_container(&text.as_bytes()[..cut], &Asked::Number(2), None, Quirks::STRICT);
+        assert!(result.is_err(), "cut at {cut}");
+    }
+    let more = format!("{text}{{}}");
+    assert!(key_container(more.as_bytes(), &Asked::Number(2), None, Quirks::STRICT).is_err());
+}
+
+#[test]
+fn dec_keys_returns_what_was_asked_in_its_order_and_spelling() {
+    let asked = [ID_2.to_ascii_uppercase(), ID_1.to_owned()];
+    let container = parse(&two(), &Asked::Ids(&asked), Some(256)).unwrap();
+    assert_eq!(container.keys[0].key_id(), asked[0]);
+    assert_eq!(container.keys[1].key_id(), asked[1]);
+    assert_eq!(container.keys[0].expose()[0], 0x39);
+    assert_eq!(container.keys[1].expose()[0], 0xc0);
+}
+
+#[test]
+fn dec_keys_refuses_a_key_that_was_not_asked_for() {
+    let asked = [ID_1.to_owned(), "11111111-2222-4333-8444-555555555555".to_owned()];
+    assert!(matches!(parse(&two(), &Asked::Ids(&asked), None).err(), Some(Error::Check { .. })));
+}
+
+#[test]
+fn extensions_are_kept_as_json() {
+    let mut answer = two();
+    answer["key_container_extension"] = json!({"vendor": [1]});
+    answer["keys"][0]["key_extension"] = json!({"a": 1});
+    answer["keys"][0]["key_ID_extension"] = json!({"b": 2});
+    let container = parse(&answer, &Asked::Number(2), Some(256)).unwrap();
+    assert_eq!(container.extension, Some(json!({"vendor": [1]})));
+    assert_eq!(container.keys[0].extension(), Some(&json!({"a": 1})));
+    assert_eq!(container.keys[0].key_id_extension(), Some(&json!({"b": 2})));
+    assert_eq!(container.keys[1].extension(), None);
+}
+
+#[test]
+fn keys_compare_by_their_secret_alone() {
+    let same = changed("/keys/1/key", json!(KEY_1));
+    let container = parse(&same, &Asked::Number(2), Some(256)).unwrap();
+    assert!(container.keys[0] == container.keys[1]);
+    let other = parse(&two(), &Asked::Number(2), Some(256)).unwrap();
+    assert!(other.keys[0] != other.keys[1]);
+    assert_eq!(other.keys[0].expose_array::<32>().map(|k| k[0]), Some(0xc0));
+    assert!(other.keys[0].expose_array::<16>().is_none());
+}
+
+proptest! {
+    #[test]
+    fn any_bytes_are_parsed_without_panic(bytes: Vec<u8>) {
+        let _ = key_container(&bytes, &Asked::Number(1), None, Quirks::STRICT);
+    }
+
+    #[test]
+    fn a_damaged_answer_is_parsed_without_panic(at in 0..200_usize, byte: u8) {
+        let mut text = two().to_string().into_bytes();
+        let at = at % text.len();
+        text[at] = byte;
+        let _ = key_container(&text, &Asked::Number(2), Some(256), Quirks::STRICT);
+    }
+}

@@ -1,0 +1,21 @@
+//! Parsers of what a KME answers: bounded, without panic, and without a copy of a key outside
+//! zeroized memory.
+//!
+//! serde_json only cuts the text into members ([`json`]); the value of `key` is never made into a
+//! `String` by it but decoded from the raw text into zeroized bytes ([`base64`]).
+
+mod base64;
+mod container;
+mod error;
+mod json;
+mod status;
+
+pub(crate) use container::{Asked, key_container};
+pub(crate) use error::{ErrorAnswer, error_answer};
+pub(crate) use status::status;
+
+use crate::Error;
+
+fn malformed(what: impl Into<String>, reason: impl Into<String>) -> Error {
+    Error::Malformed { what: what.into(), reason: reason.into() }
+}

@@ -1,0 +1,249 @@
+//! Requests for keys: `enc_keys` and `dec_keys`.
+
+use reqwest::Url;
+use serde_json::{Map, Value, json};
+
+use crate::exchange::{Call, Prepared};
+use crate::parse::{self, Asked};
+use crate::{Client, Error, KeyContainer, Quirks};
+
+/// A request for fresh keys (clauses 5.3 and 6.2). Sent by [`send`](EncKeys::send).
+#[must_use = "nothing is sent before send()"]
+#[derive(Debug)]
+pub struct EncKeys<'c> {
+    client: &'c Client,
+    slave_sae: String,
+    number: Option<u32>,
+    size: Option<u32>,
+    additional_slaves: Vec<String>,
+    mandatory: Vec<Value>,
+    optional: Vec<Value>,
+    via_get: bool,
+}
+
+impl<'c> EncKeys<'c> {
+    pub(crate) fn new(client: &'c Client, slave_sae: String) -> Self {
+        Self {
+            client,
+            slave_sae,
+            number: None,
+            size: None,
+            additional_slaves: Vec::new(),
+            mandatory: Vec::new(),
+            optional: Vec::new(),
+            via_get: false,
+        }
+    }
+
+    /// How many keys. Default 1.
+    pub fn number(mut self, keys: u32) -> Self {
+        self.number = Some(keys);
+        self
+    }
+
+    /// Size of each key in bits, a multiple of 8. Default the KME's
+    /// [`key_size`](crate::Status::key_size).
+    pub fn size(mut self, bits: u32) -> Self {
+        self.size = Some(bits);
+        self
+    }
+
+    /// Further slaves that may draw the same keys (multicast).
+    pub fn additional_slave_sae_ids<I>(mut self, saes: I) -> Self
+    where
+        I: IntoIterator<Item: Into<String>>,
+    {
+        self.additional_slaves.extend(saes.into_iter().map(Into::into));
+        self
+    }
+
+    /// Adds an extension that the KME must support or refuse the request: a JSON object.
+    pub fn extension_mandatory(mut self, extension: Value) -> Self {
+        self.mandatory.push(extension);
+        self
+    }
+
+    /// Adds an extension that the KME may ignore: a JSON object.
+    pub fn extension_optional(mut self, extension: Value) -> Self {
+        self.optional.push(extension);
+        self
+    }
+
+    /// Sends it as GET, which carries `number` and `size` only.
+    pub fn via_get(mut self) -> Self {
+        self.via_get = true;
+        self
+    }
+
+    /// Sends the request and checks the answer: exactly as many keys as asked for, each of the
+    /// size asked for, under distinct key_IDs.
+    ///
+    /// # Errors
+    /// See [`Error`]; with [`KeyPossiblyConsumed`](Error::KeyPossiblyConsumed) the KME may have
+    /// spent keys on this call.
+    pub async fn send(self) -> Result<KeyContainer, Error> {
+        self.check()?;
+        let quirks = self.client.limits().quirks;
+        let url = self.client.url(&self.slave_sae, "enc_keys")?;
+        let prepared = if self.via_get { self.get(url) } else { self.post(url) };
+        let body = self.client.call(Call::EncKeys, &prepared).await?;
+        let number = self.number.unwrap_or(1) as usize;
+        parse::key_container(&body, &Asked::Number(number), self.size, quirks)
+            .map_err(|e| Call::EncKeys.consumed(e))
+    }
+
+    fn check(&self) -> Result<(), Error> {
+        if self.number == Some(0) {
+            return Err(refuse("number is 0"));
+        }
+        check_size(self.size)?;
+        let extensions = || self.mandatory.iter().chain(&self.optional);
+        if extensions().any(|extension| !extension.is_object()) {
+            return Err(refuse("an extension is a JSON object (clause 6.2)"));
+        }
+        let simple = self.additional_slaves.is_empty() && extensions().next().is_none();
+        if self.via_get && !simple {
+            return Err(refuse("GET carries only number and size; send it as POST (clause 5.3)"));
+        }
+        Ok(())
+    }
+
+    /// The size as the KME counts it.
+    fn wire_size(&self) -> Option<u32> {
+        let bytes = self.client.limits().quirks.contains(Quirks::SIZE_IN_BYTES);
+        self.size.map(|bits| if bytes { bits / 8 } else { bits })
+    }
+
+    fn get(&self, mut url: Url) -> Prepared {
+        if self.number.is_some() || self.size.is_some() {
+            let mut query = url.query_pairs_mut();
+            if let Some(number) = self.number {
+                query.append_pair("number", &number.to_string());
+            }
+            if let Some(size) = self.wire_size() {
+                query.append_pair("size", &size.to_string());
+            }
+        }
+        Prepared::get(url)
+    }
+
+    fn post(&self, url: Url) -> Prepared {
+        let mut body = Map::new();
+        if let Some(number) = self.number {
+            body.insert("number".into(), number.into());
+        }
+        if let Some(size) = self.wire_size() {
+            body.insert("size".into(), size.into());
+        }
+        if !self.additional_slaves.is_empty() {
+            body.insert("additional_slave_SAE_IDs".into(), json!(self.additional_slaves));
+        }
+        if !self.mandatory.is_empty() {
+            body.insert("extension_mandatory".into(), json!(self.mandatory));
+        }
+        if !self.optional.is_empty() {
+            body.insert("extension_optional".into(), json!(self.optional));
+        }
+        Prepared::post(url, &Value::Object(body))
+    }
+}
+
+/// A request for keys by their key_IDs (clauses 5.4 and 6.4). Sent by [`send`](DecKeys::send).
+#[must_use = "nothing is sent before send()"]
+#[derive(Debug)]
+pub struct DecKeys<'c> {
+    client: &'c Client,
+    master_sae: String,
+    ids: Vec<String>,
+    size: Option<u32>,
+    via_get: bool,
+}
+
+impl<'c> DecKeys<'c> {
+    pub(crate) fn new(client: &'c Client, master_sae: String) -> Self {
+        Self { client, master_sae, ids: Vec::new(), size: None, via_get: false }
+    }
+
+    /// Adds a key_ID, exactly as the master gave it.
+    pub fn key_id(mut self, id: impl Into<String>) -> Self {
+        self.ids.push(id.into());
+        self
+    }
+
+    /// Adds key_IDs.
+    pub fn key_ids<I>(mut self, ids: I) -> Self
+    where
+        I: IntoIterator<Item: Into<String>>,
+    {
+        self.ids.extend(ids.into_iter().map(Into::into));
+        self
+    }
+
+    /// The size in bits that every key must have. It is not sent; without it the keys need only
+    /// be of one size.
+    pub fn size(mut self, bits: u32) -> Self {
+        self.size = Some(bits);
+        self
+    }
+
+    /// Sends it as GET, which carries one key_ID.
+    pub fn via_get(mut self) -> Self {
+        self.via_get = true;
+        self
+    }
+
+    /// Sends the request and checks the answer: exactly the keys asked for, in their order.
+    ///
+    /// # Errors
+    /// See [`Error`]; with [`KeyPossiblyConsumed`](Error::KeyPossiblyConsumed) the KME may have
+    /// destroyed the keys of this call.
+    pub async fn send(self) -> Result<KeyContainer, Error> {
+        self.check()?;
+        let quirks = self.client.limits().quirks;
+        let mut url = self.client.url(&self.master_sae, "dec_keys")?;
+        let prepared = if self.via_get {
+            url.query_pairs_mut().append_pair("key_ID", &self.ids[0]);
+            Prepared::get(url)
+        } else {
+            let ids: Vec<Value> = self.ids.iter().map(|id| json!({ "key_ID": id })).collect();
+            Prepared::post(url, &json!({ "key_IDs": ids }))
+        };
+        let body = self.client.call(Call::DecKeys, &prepared).await?;
+        parse::key_container(&body, &Asked::Ids(&self.ids), self.size, quirks)
+            .map_err(|e| Call::DecKeys.consumed(e))
+    }
+
+    fn check(&self) -> Result<(), Error> {
+        check_size(self.size)?;
+        if self.ids.is_empty() {
+            return Err(refuse("no key_ID was given"));
+        }
+        if self.via_get && self.ids.len() > 1 {
+            return Err(refuse("GET carries one key_ID; send it as POST (clause 5.4)"));
+        }
+        let sane =
+            |id: &String| (1..=128).contains(&id.len()) && id.bytes().all(|c| c.is_ascii_graphic());
+        if !self.ids.iter().all(sane) {
+            return Err(refuse("a key_ID is 1 to 128 visible ASCII characters"));
+        }
+        let mut folded: Vec<_> = self.ids.iter().map(|id| id.to_ascii_lowercase()).collect();
+        folded.sort_unstable();
+        match folded.windows(2).find(|pair| pair[0] == pair[1]) {
+            Some(pair) => Err(refuse(&format!("key_ID {} is asked for twice", pair[0]))),
+            None => Ok(()),
+        }
+    }
+}
+
+fn check_size(size: Option<u32>) -> Result<(), Error> {
+    match size {
+        Some(bits) if bits == 0 || bits % 8 != 0 => {
+            Err(refuse(&format!("size {bits} is not a positive multiple of 8 bits (clause 6.2)")))
+        }
+        _ => Ok(()),
+    }
+}
+
+fn refuse(reason: &str) -> Error {
+    Error::Request { reason: reason.to_owned() }
+}

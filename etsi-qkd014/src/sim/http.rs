@@ -1,0 +1,235 @@
+//! HTTP/1.1 as far as this interface needs it: requests with a Content-Length, answers that can
+//! also be wrong on purpose.
+
+use std::time::Duration;
+
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use zeroize::{Zeroize, Zeroizing};
+
+use super::fault::Fault;
+
+const MAX_HEAD: usize = 16 << 10;
+const MAX_BODY: usize = 1 << 20;
+
+#[derive(Debug)]
+pub(super) struct Request {
+    pub(super) method: String,
+    /// Path, without the query.
+    pub(super) path: String,
+    pub(super) query: String,
+    pub(super) body: Vec<u8>,
+}
+
+/// Why there is no request.
+pub(super) enum NoRequest {
+    /// The client is done, or gone.
+    Closed,
+    /// What came is not accepted, with the status that says so.
+    Refused(u16),
+}
+
+pub(super) struct Answer {
+    pub(super) status: u16,
+    pub(super) body: Zeroizing<String>,
+}
+
+/// Reads one request. `buffer` keeps what came after it.
+pub(super) async fn read<S: AsyncRead + Unpin>(
+    stream: &mut S,
+    buffer: &mut Vec<u8>,
+) -> Result<Request, NoRequest> {
+    let end = loop {
+        if let Some(at) = buffer.windows(4).position(|window| window == b"\r\n\r\n") {
+            break at;
+        }
+        if buffer.len() > MAX_HEAD {
+            return Err(NoRequest::Refused(431));
+        }
+        if stream.read_buf(buffer).await.unwrap_or(0) == 0 {
+            return Err(NoRequest::Closed);
+        }
+    };
+    let (mut request, length) = head(&buffer[..end]).ok_or(NoRequest::Refused(400))?;
+    if length > MAX_BODY {
+        return Err(NoRequest::Refused(413));
+    }
+    let total = end + 4 + length;
+    while buffer.len() < total {
+        if stream.read_buf(buffer).await.unwrap_or(0) == 0 {
+            return Err(NoRequest::Closed);
+        }
+    }
+    request.body = buffer[end + 4..total].to_vec();
+    buffer.drain(..total);
+    Ok(request)
+}
+
+/// Parses a request's head; the body's length with it.
+fn head(bytes: &[u8]) -> Option<(Request, usize)> {
+    let text = std::str::from_utf8(bytes).ok()?;
+    let mut lines = text.split("\r\n");
+    let mut first = lines.next()?.split(' ');
+    let (method, target, version) = (first.next()?, first.next()?, first.next()?);
+    if first.next().is_some() || version != "HTTP/1.1" || !target.starts_with('/') {
+        return None;
+    }
+    let mut length = None;
+    for line in lines {
+        let (name, value) = line.split_once(':')?;
+        if name.eq_ignore_ascii_case("content-length") {
+            let value = value.trim();
+            if length.is_some() || !value.bytes().all(|c| c.is_ascii_digit()) {
+                return None;
+            }
+            length = Some(value.parse().ok()?);
+        }
+        if name.eq_ignore_ascii_case("transfer-encoding") {
+            return None;
+        }
+    }
+    let (path, query) = target.split_once('?').unwrap_or((target, ""));
+    let request = Request {
+        method: method.to_owned(),
+        path: path.to_owned(),
+        query: query.to_owned(),
+        body: Vec::new(),
+    };
+    Some((request, length.unwrap_or(0)))
+}
+
+/// Undoes percent-encoding; `None` where it is broken or not UTF-8.
+pub(super) fn percent_decode(text: &str) -> Option<String> {
+    let mut out = Vec::with_capacity(text.len());
+    let mut bytes = text.bytes();
+    while let Some(byte) = bytes.next() {
+        out.push(match byte {
+            b'%' => {
+                let digit = |c: u8| char::from(c).to_digit(16);
+                let (high, low) = (digit(bytes.next()?)?, digit(bytes.next()?)?);
+                u8::try_from(high << 4 | low).ok()?
+            }
+            plain => plain,
+        });
+    }
+    String::from_utf8(out).ok()
+}
+
+/// Writes an answer, wrong in the way of `fault`. Returns whether the connection stays open.
+pub(super) async fn write<S: AsyncWrite + Unpin>(
+    stream: &mut S,
+    answer: &Answer,
+    fault: Option<&Fault>,
+) -> std::io::Result<bool> {
+    let body: &str = if fault == Some(&Fault::Garbage) { "{\"keys\":[}" } else { &answer.body };
+    let length = match fault {
+        Some(Fault::LyingLength) => u64::MAX / 2,
+        _ => body.len() as u64,
+    };
+    let version = if fault == Some(&Fault::Http10) { "HTTP/1.0" } else { "HTTP/1.1" };
+    let media =
+        if fault == Some(&Fault::WrongMediaType) { "text/plain" } else { "application/json" };
+    let status = answer.status;
+    let mut head = format!("{version} {status} {}\r\nContent-Type: {media}\r\n", reason(status));
+    match fault {
+        Some(Fault::Endless) => head.push_str("Transfer-Encoding: chunked\r\n\r\n"),
+        Some(Fault::Http10) => head.push_str("\r\n"),
+        _ => head.push_str(&format!("Content-Length: {length}\r\n\r\n")),
+    }
+    // One write, so that an answer is one TLS record where it fits.
+    let mut bytes = Zeroizing::new(Vec::with_capacity(head.len() + body.len()));
+    bytes.extend_from_slice(head.as_bytes());
+    match fault {
+        Some(Fault::Endless) => {
+            stream.write_all(&bytes).await?;
+            let chunk = format!("1000\r\n{}\r\n", " ".repeat(0x1000));
+            loop {
+                stream.write_all(chunk.as_bytes()).await?;
+            }
+        }
+        Some(Fault::CutAnswer) => {
+            bytes.extend_from_slice(&body.as_bytes()[..body.len() / 2]);
+            stream.write_all(&bytes).await?;
+            stream.flush().await?;
+            return Ok(false);
+        }
+        Some(Fault::Drip(pause)) => {
+            bytes.extend_from_slice(body.as_bytes());
+            drip(stream, &bytes, *pause).await?;
+        }
+        _ => {
+            bytes.extend_from_slice(body.as_bytes());
+            stream.write_all(&bytes).await?;
+        }
+    }
+    bytes.zeroize();
+    stream.flush().await?;
+    Ok(!matches!(fault, Some(Fault::LyingLength | Fault::Http10)))
+}
+
+async fn drip<S: AsyncWrite + Unpin>(
+    stream: &mut S,
+    bytes: &[u8],
+    pause: Duration,
+) -> std::io::Result<()> {
+    for byte in bytes {
+        stream.write_all(std::slice::from_ref(byte)).await?;
+        stream.flush().await?;
+        tokio::time::sleep(pause).await;
+    }
+    Ok(())
+}
+
+fn reason(status: u16) -> &'static str {
+    match status {
+        200 => "OK",
+        400 => "Bad Request",
+        401 => "Unauthorized",
+        404 => "Not Found",
+        405 => "Method Not Allowed",
+        413 => "Content Too Large",
+        431 => "Request Header Fields Too Large",
+        503 => "Service Unavailable",
+        _ => "Status",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn heads_that_are_ambiguous_are_refused() {
+        for bad in [
+            "",
+            "GET",
+            "GET / HTTP/1.0",
+            "GET / HTTP/1.1 x",
+            "GET http://x/ HTTP/1.1",
+            "POST / HTTP/1.1\r\nContent-Length: 1\r\nContent-Length: 1",
+            "POST / HTTP/1.1\r\nContent-Length: +1",
+            "POST / HTTP/1.1\r\nTransfer-Encoding: chunked",
+            "POST / HTTP/1.1\r\nno colon",
+        ] {
+            assert!(head(bad.as_bytes()).is_none(), "{bad:?}");
+        }
+        let (request, length) = head(b"POST /a?b=c HTTP/1.1\r\ncontent-length: 7").unwrap();
+        assert_eq!((request.path.as_str(), request.query.as_str(), length), ("/a", "b=c", 7));
+    }
+
+    #[test]
+    fn percent_encoding_is_undone() {
+        assert_eq!(percent_decode("a%2Fb%c3%A9").as_deref(), Some("a/bé"));
+        for bad in ["%", "%2", "%zz", "%ff"] {
+            assert_eq!(percent_decode(bad), None);
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn any_head_is_parsed_without_panic(bytes: Vec<u8>, text: String) {
+            let _ = head(&bytes);
+            let _ = percent_decode(&text);
+        }
+    }
+}

@@ -1,0 +1,387 @@
+//! KMEs that run.
+
+use std::collections::BTreeSet;
+use std::net::SocketAddr;
+use std::path::Path;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use tokio::net::TcpListener;
+use tokio::task::JoinHandle;
+use zeroize::Zeroizing;
+
+use super::fault::{Fault, Faults};
+use super::pki::{Layout, Pair, Pki, Sae, Site, Validity};
+use super::store::{FillRate, Store};
+use super::{Error, server};
+use crate::{Client, ClientBuilder};
+
+/// What the KMEs promise in their status answers.
+#[derive(Clone, Debug)]
+pub(super) struct Limits {
+    pub(super) key_size: u32,
+    pub(super) min_key_size: u32,
+    pub(super) max_key_size: u32,
+    pub(super) max_stored: u64,
+    pub(super) max_keys_per_request: u64,
+    pub(super) max_sae_ids: u64,
+}
+
+/// Sets up a [`Network`].
+#[derive(Debug)]
+#[must_use]
+pub struct NetworkBuilder {
+    layout: Layout,
+    pki: Option<Pki>,
+    limits: Limits,
+    rate: FillRate,
+    initially: Option<u64>,
+    validity: Validity,
+}
+
+impl NetworkBuilder {
+    /// Adds a KME that listens on `bind` (port 0: any free one) and serves `saes`.
+    pub fn kme<I>(mut self, id: impl Into<String>, bind: SocketAddr, saes: I) -> Self
+    where
+        I: IntoIterator<Item: Into<String>>,
+    {
+        let saes = saes.into_iter().map(Into::into).collect();
+        self.layout.sites.push(Site { kme: id.into(), bind, saes });
+        self
+    }
+
+    /// Takes the KMEs of a layout, with the certificates made for it.
+    pub fn layout(mut self, layout: Layout, pki: Pki) -> Self {
+        self.layout = layout;
+        self.pki = Some(pki);
+        self
+    }
+
+    /// Default size of a key in bits, a multiple of 8 from 8 to 4096. Default 256.
+    pub fn key_size(mut self, bits: u32) -> Self {
+        self.limits.key_size = bits;
+        self
+    }
+
+    /// How fast each link between two KMEs makes keys. Default unlimited.
+    pub fn fill_rate(mut self, rate: FillRate) -> Self {
+        self.rate = rate;
+        self
+    }
+
+    /// Keys that each link stores at most. Default 10,000.
+    pub fn max_stored(mut self, keys: u64) -> Self {
+        self.limits.max_stored = keys;
+        self
+    }
+
+    /// Keys that each link stores at the start. Default as many as it can.
+    pub fn initially_stored(mut self, keys: u64) -> Self {
+        self.initially = Some(keys);
+        self
+    }
+
+    /// Most keys in one request. Default 128.
+    pub fn max_keys_per_request(mut self, keys: u64) -> Self {
+        self.limits.max_keys_per_request = keys;
+        self
+    }
+
+    /// Gives the KMEs certificates that are not valid yet.
+    pub fn certificates_not_valid_yet(mut self) -> Self {
+        self.validity = Validity::Future;
+        self
+    }
+
+    /// Gives the KMEs certificates that have expired.
+    pub fn certificates_expired(mut self) -> Self {
+        self.validity = Validity::Past;
+        self
+    }
+
+    /// Makes the certificates, binds and serves. Needs a tokio runtime, on which the KMEs run until
+    /// the network is dropped.
+    ///
+    /// # Errors
+    /// [`Error`] names the ID, setting or address that cannot be used.
+    pub async fn start(self) -> Result<Network, Error> {
+        let Self { layout, pki, limits, rate, initially, validity } = self;
+        layout.check()?;
+        let sizes = limits.min_key_size..=limits.max_key_size;
+        if !sizes.contains(&limits.key_size) || !limits.key_size.is_multiple_of(8) {
+            return Err(Error::Layout(format!(
+                "key_size {} is not a multiple of 8 from {} to {}",
+                limits.key_size, limits.min_key_size, limits.max_key_size
+            )));
+        }
+        let pki = pki.map_or_else(|| Pki::create(&layout), Ok)?;
+        let initially = initially.unwrap_or(limits.max_stored);
+        let shared = Arc::new(Shared {
+            store: Mutex::new(Store::new(rate, limits.max_stored, initially)),
+            layout: layout.clone(),
+            limits,
+        });
+        let mut kmes = Vec::new();
+        for (index, site) in layout.sites.iter().enumerate() {
+            let listener = TcpListener::bind(site.bind).await.map_err(Error::io(site.bind))?;
+            let addr = listener.local_addr().map_err(Error::io(site.bind))?;
+            let issued;
+            let pair = match validity {
+                Validity::Now => known(&pki, &site.kme)?,
+                other => {
+                    issued = pki.issue(&site.kme, Some(site.bind.ip()), other)?;
+                    &issued
+                }
+            };
+            let tls = server::tls_config(pki.ca_pem(), pair)?;
+            let state = Arc::new(KmeState {
+                id: site.kme.clone(),
+                index,
+                saes: site.saes.iter().cloned().collect(),
+                counters: Mutex::default(),
+                faults: Mutex::default(),
+            });
+            let serving = server::serve(listener, tls, Arc::clone(&shared), Arc::clone(&state));
+            let task = tokio::spawn(serving);
+            kmes.push(Kme { url: format!("https://{addr}"), addr, state, task });
+        }
+        let mut saes = Vec::new();
+        for (site, kme) in layout.sites.iter().zip(&kmes) {
+            for id in &site.saes {
+                let Pair { cert, key } = known(&pki, id)?;
+                saes.push(sae(id, kme, &pki, Pair { cert: cert.clone(), key: key.clone() }));
+            }
+        }
+        Ok(Network { kmes, saes, pki })
+    }
+}
+
+fn known<'p>(pki: &'p Pki, id: &str) -> Result<&'p Pair, Error> {
+    pki.pair(id).ok_or_else(|| Error::Certificates(format!("none was made for {id:?}")))
+}
+
+fn sae(id: &str, kme: &Kme, pki: &Pki, pair: Pair) -> Sae {
+    Sae {
+        id: id.to_owned(),
+        kme_id: kme.id().to_owned(),
+        kme_url: kme.url.clone(),
+        ca: pki.ca_pem().to_owned(),
+        pair,
+    }
+}
+
+/// KMEs that run until this is dropped.
+pub struct Network {
+    kmes: Vec<Kme>,
+    saes: Vec<Sae>,
+    pki: Pki,
+}
+
+impl Network {
+    /// Starts the settings of a network.
+    pub fn builder() -> NetworkBuilder {
+        NetworkBuilder {
+            layout: Layout::default(),
+            pki: None,
+            limits: Limits {
+                key_size: 256,
+                min_key_size: 8,
+                max_key_size: 4096,
+                max_stored: 10_000,
+                max_keys_per_request: 128,
+                max_sae_ids: 8,
+            },
+            rate: FillRate::Unlimited,
+            initially: None,
+            validity: Validity::Now,
+        }
+    }
+
+    /// The KMEs, in the order in which they were added.
+    #[must_use]
+    pub fn kmes(&self) -> &[Kme] {
+        &self.kmes
+    }
+
+    /// A KME by its ID.
+    #[must_use]
+    pub fn kme(&self, id: &str) -> Option<&Kme> {
+        self.kmes.iter().find(|kme| kme.id() == id)
+    }
+
+    /// The SAEs of all KMEs.
+    #[must_use]
+    pub fn saes(&self) -> &[Sae] {
+        &self.saes
+    }
+
+    /// An SAE by its ID.
+    #[must_use]
+    pub fn sae(&self, id: &str) -> Option<&Sae> {
+        self.saes.iter().find(|sae| sae.id == id)
+    }
+
+    /// Settings of a client that acts as the SAE `sae`.
+    ///
+    /// # Panics
+    /// Where the network has no such SAE.
+    pub fn client_builder(&self, sae: &str) -> ClientBuilder {
+        client_builder(self.sae(sae).unwrap_or_else(|| panic!("no SAE {sae:?} in this network")))
+    }
+
+    /// An SAE with a certificate of the network's CA that is attached to none of its KMEs, and the
+    /// KME `kme` to try.
+    ///
+    /// # Errors
+    /// [`Error`] where there is no such KME, or the CA's key is gone.
+    pub fn outsider(&self, id: &str, kme: &str) -> Result<Sae, Error> {
+        let kme = self
+            .kme(kme)
+            .ok_or_else(|| Error::Layout(format!("no KME {kme:?} in this network")))?;
+        let pair = self.pki.issue(id, None, Validity::Now)?;
+        Ok(sae(id, kme, &self.pki, pair))
+    }
+
+    /// Writes the certificates and keys into `dir`; see [`Pki::write`].
+    ///
+    /// # Errors
+    /// [`Error::Io`] names the file that cannot be written.
+    pub fn write_files(&self, dir: &Path) -> Result<(), Error> {
+        self.pki.write(dir)
+    }
+}
+
+/// Settings of a client that acts as `sae`.
+pub(super) fn client_builder(sae: &Sae) -> ClientBuilder {
+    Client::builder()
+        .kme_url(sae.kme_url())
+        .kme_id(sae.kme_id())
+        .ca(sae.ca_pem())
+        .sae_cert(sae.cert_pem())
+        .sae_key(Zeroizing::new(sae.key_pem().as_bytes().to_vec()))
+}
+
+impl Sae {
+    /// Settings of a client that acts as this SAE.
+    pub fn client_builder(&self) -> ClientBuilder {
+        client_builder(self)
+    }
+}
+
+/// One KME that runs.
+pub struct Kme {
+    url: String,
+    addr: SocketAddr,
+    state: Arc<KmeState>,
+    task: JoinHandle<()>,
+}
+
+impl Kme {
+    /// Its ID.
+    #[must_use]
+    pub fn id(&self) -> &str {
+        &self.state.id
+    }
+
+    /// `https://address:port`.
+    #[must_use]
+    pub fn url(&self) -> &str {
+        &self.url
+    }
+
+    /// Where it listens.
+    #[must_use]
+    pub fn addr(&self) -> SocketAddr {
+        self.addr
+    }
+
+    /// What it has done so far.
+    #[must_use]
+    pub fn counters(&self) -> Counters {
+        *lock(&self.state.counters)
+    }
+
+    /// Lets the next `times` requests meet a fault, after those injected before.
+    pub fn inject(&self, fault: Fault, times: u32) {
+        self.state.faults().push(fault, times);
+    }
+
+    /// Forgets the faults that have not met a request.
+    pub fn clear_faults(&self) {
+        self.state.faults().clear();
+    }
+
+    /// Ends it: its socket and connections are closed.
+    pub fn stop(&self) {
+        self.task.abort();
+    }
+}
+
+impl Drop for Kme {
+    fn drop(&mut self) {
+        self.stop();
+    }
+}
+
+/// Counts of one KME since its start.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Counters {
+    /// Calls of `status`.
+    pub status_calls: u64,
+    /// Calls of `enc_keys`.
+    pub enc_keys_calls: u64,
+    /// Calls of `dec_keys`.
+    pub dec_keys_calls: u64,
+    /// Keys given by `enc_keys`.
+    pub keys_to_masters: u64,
+    /// Keys given by `dec_keys`.
+    pub keys_to_slaves: u64,
+    /// Requests answered with a status other than 200.
+    pub refused: u64,
+}
+
+/// What all KMEs of a network share.
+pub(super) struct Shared {
+    store: Mutex<Store>,
+    layout: Layout,
+    pub(super) limits: Limits,
+}
+
+impl Shared {
+    pub(super) fn store(&self) -> MutexGuard<'_, Store> {
+        lock(&self.store)
+    }
+
+    /// Index of the KME that an SAE is attached to.
+    pub(super) fn site_of(&self, sae: &str) -> Option<usize> {
+        self.layout.sites.iter().position(|site| site.saes.iter().any(|id| id == sae))
+    }
+
+    pub(super) fn kme_id(&self, index: usize) -> &str {
+        &self.layout.sites[index].kme
+    }
+}
+
+/// What belongs to one KME.
+pub(super) struct KmeState {
+    pub(super) id: String,
+    pub(super) index: usize,
+    pub(super) saes: BTreeSet<String>,
+    counters: Mutex<Counters>,
+    faults: Mutex<Faults>,
+}
+
+impl KmeState {
+    pub(super) fn count(&self, change: impl FnOnce(&mut Counters)) {
+        change(&mut lock(&self.counters));
+    }
+
+    pub(super) fn faults(&self) -> MutexGuard<'_, Faults> {
+        lock(&self.faults)
+    }
+}
+
+/// Nothing here is left half changed by a panic.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,0 +1,218 @@
+//! Key material that the KMEs of a network share: what a QKD link would have put into both.
+
+use std::collections::{BTreeSet, HashMap, VecDeque};
+use std::time::Instant;
+
+use zeroize::Zeroizing;
+
+use crate::tls;
+
+/// How fast a link makes keys.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
+pub enum FillRate {
+    /// The store is always full.
+    Unlimited,
+    /// So many keys of the default size a second.
+    PerSecond(f64),
+}
+
+/// Keys given to a master and not yet to all slaves, at most; the oldest is wiped beyond it.
+const MAX_WAITING: usize = 65_536;
+
+pub(super) struct Store {
+    rate: FillRate,
+    max_stored: u64,
+    /// Keys in stock for each pair of KMEs, and when that was so.
+    links: HashMap<(usize, usize), (f64, Instant)>,
+    initially: u64,
+    waiting: HashMap<String, Waiting>,
+    /// In order of their drawing; may hold IDs that are gone.
+    order: VecDeque<String>,
+}
+
+/// A key that slaves may still draw.
+struct Waiting {
+    secret: Zeroizing<Vec<u8>>,
+    master: String,
+    slaves: BTreeSet<String>,
+}
+
+pub(super) type Drawn = (String, Zeroizing<Vec<u8>>);
+
+/// Why keys are not given to a slave.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) enum Refusal {
+    /// No such key, or this slave has had it.
+    Unknown(Vec<String>),
+    /// The key exists and is not for this pair of master and slave.
+    NotYours,
+}
+
+impl Store {
+    pub(super) fn new(rate: FillRate, max_stored: u64, initially: u64) -> Self {
+        Self {
+            rate,
+            max_stored,
+            links: HashMap::new(),
+            initially: initially.min(max_stored),
+            waiting: HashMap::new(),
+            order: VecDeque::new(),
+        }
+    }
+
+    /// Keys in stock between two KMEs now.
+    pub(super) fn stored(&mut self, a: usize, b: usize) -> u64 {
+        *self.level(a, b) as u64
+    }
+
+    fn level(&mut self, a: usize, b: usize) -> &mut f64 {
+        let now = Instant::now();
+        let max = self.max_stored as f64;
+        let start = (self.initially as f64, now);
+        let (level, at) = self.links.entry((a.min(b), a.max(b))).or_insert(start);
+        *level = match self.rate {
+            FillRate::Unlimited => max,
+            FillRate::PerSecond(rate) => (*level + rate * (now - *at).as_secs_f64()).min(max),
+        };
+        *at = now;
+        level
+    }
+
+    /// Draws `number` fresh keys of `bytes` each, at `cost` of the stock; `None` where it does not
+    /// hold that much.
+    pub(super) fn draw(
+        &mut self,
+        link: (usize, usize),
+        number: u64,
+        bytes: usize,
+        cost: u64,
+        master: &str,
+        slaves: &BTreeSet<String>,
+    ) -> Option<Vec<Drawn>> {
+        let level = self.level(link.0, link.1);
+        if *level < cost as f64 {
+            return None;
+        }
+        *level -= cost as f64;
+        let mut drawn = Vec::new();
+        for _ in 0..number {
+            let mut secret = Zeroizing::new(vec![0; bytes]);
+            random(&mut secret);
+            let id = uuid();
+            let (master, slaves) = (master.to_owned(), slaves.clone());
+            let waiting = Waiting { secret: secret.clone(), master, slaves };
+            self.waiting.insert(id.clone(), waiting);
+            self.order.push_back(id.clone());
+            drawn.push((id, secret));
+        }
+        while self.order.len() > MAX_WAITING {
+            if let Some(oldest) = self.order.pop_front() {
+                self.waiting.remove(&oldest);
+            }
+        }
+        Some(drawn)
+    }
+
+    /// Gives keys to a slave, each once; all of them or none.
+    pub(super) fn give(
+        &mut self,
+        ids: &[String],
+        master: &str,
+        slave: &str,
+    ) -> Result<Vec<Drawn>, Refusal> {
+        let folded: Vec<String> = ids.iter().map(|id| id.to_ascii_lowercase()).collect();
+        if folded.iter().collect::<BTreeSet<_>>().len() < folded.len() {
+            return Err(Refusal::Unknown(ids.to_vec()));
+        }
+        let mut unknown = Vec::new();
+        for id in &folded {
+            match self.waiting.get(id) {
+                Some(key) if key.master == master && key.slaves.contains(slave) => {}
+                Some(_) => return Err(Refusal::NotYours),
+                None => unknown.push(id.clone()),
+            }
+        }
+        if !unknown.is_empty() {
+            return Err(Refusal::Unknown(unknown));
+        }
+        let given = folded.into_iter().filter_map(|id| {
+            let key = self.waiting.get_mut(&id)?;
+            let secret = key.secret.clone();
+            key.slaves.remove(slave);
+            if key.slaves.is_empty() {
+                self.waiting.remove(&id);
+            }
+            Some((id, secret))
+        });
+        Ok(given.collect())
+    }
+}
+
+fn random(bytes: &mut [u8]) {
+    tls::provider().secure_random.fill(bytes).expect("the system's random number generator works");
+}
+
+/// A random UUID, version 4 (RFC 9562, 5.4).
+pub(super) fn uuid() -> String {
+    let mut bytes = [0; 16];
+    random(&mut bytes);
+    bytes[6] = bytes[6] & 0x0f | 0x40;
+    bytes[8] = bytes[8] & 0x3f | 0x80;
+    let mut text = String::with_capacity(36);
+    for (at, byte) in bytes.iter().enumerate() {
+        if matches!(at, 4 | 6 | 8 | 10) {
+            text.push('-');
+        }
+        text.push_str(&format!("{byte:02x}"));
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn slaves(names: &[&str]) -> BTreeSet<String> {
+        names.iter().map(|name| (*name).to_owned()).collect()
+    }
+
+    #[test]
+    fn each_named_slave_gets_a_key_once_and_nobody_else_does() {
+        let mut store = Store::new(FillRate::Unlimited, 10, 10);
+        let drawn = store.draw((0, 1), 1, 32, 1, "m", &slaves(&["s", "t"])).unwrap();
+        let ids = [drawn[0].0.clone()];
+        assert_eq!(store.give(&ids, "m", "x").unwrap_err(), Refusal::NotYours);
+        assert_eq!(store.give(&ids, "x", "s").unwrap_err(), Refusal::NotYours);
+        assert_eq!(store.give(&ids, "m", "s").unwrap(), drawn);
+        assert!(store.give(&ids, "m", "s").is_err());
+        assert_eq!(store.give(&ids, "m", "t").unwrap(), drawn);
+        assert!(matches!(store.give(&ids, "m", "t"), Err(Refusal::Unknown(_))));
+    }
+
+    #[test]
+    fn a_refused_batch_gives_and_consumes_nothing() {
+        let mut store = Store::new(FillRate::Unlimited, 10, 10);
+        let drawn = store.draw((0, 1), 1, 32, 1, "m", &slaves(&["s"])).unwrap();
+        let id = drawn[0].0.clone();
+        assert!(store.give(&[id.clone(), uuid()], "m", "s").is_err());
+        assert!(store.give(&[id.clone(), id.to_uppercase()], "m", "s").is_err());
+        assert!(store.give(&[id], "m", "s").is_ok());
+    }
+
+    #[test]
+    fn a_store_that_does_not_fill_runs_out() {
+        let mut store = Store::new(FillRate::PerSecond(0.0), 10, 3);
+        assert!(store.draw((0, 1), 4, 32, 4, "m", &slaves(&["s"])).is_none());
+        assert!(store.draw((0, 1), 3, 32, 3, "m", &slaves(&["s"])).is_some());
+        assert_eq!(store.stored(1, 0), 0);
+        assert_eq!(store.stored(0, 2), 3, "another link has its own stock");
+    }
+
+    #[test]
+    fn uuids_are_version_4() {
+        let id = uuid();
+        assert_eq!((id.len(), id.as_bytes()[14]), (36, b'4'));
+        assert!(matches!(id.as_bytes()[19], b'8' | b'9' | b'a' | b'b'));
+    }
+}
