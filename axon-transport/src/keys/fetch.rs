@@ -1,0 +1,108 @@
+//! `dec_keys` for announced key_IDs: again with the same IDs, then one by one, then given up.
+
+use std::{collections::VecDeque, time::Duration};
+
+use axon_envelope::{KeyId, KmeKey};
+
+use super::request::{Answer, FailureKind, Fetched, Purpose, Request};
+
+/// How often a batch is asked for.
+const TRIES: u8 = 3;
+/// How long a try takes: at most until its answer, and at least until the next one.
+const TRY: Duration = Duration::from_secs(2);
+/// Calls in flight at once.
+const IN_FLIGHT: usize = 4;
+
+/// The keys of one master that are being fetched. Bounded by its caller.
+pub(super) struct Fetches {
+    master: String,
+    purpose: Purpose,
+    waiting: VecDeque<Batch>,
+    in_flight: Vec<Batch>,
+}
+
+struct Batch {
+    key_ids: Vec<KeyId>,
+    tries_left: u8,
+    /// When it may be asked for; once asked, when it may be asked for again.
+    not_before: Duration,
+}
+
+/// How one key_ID ended.
+pub(super) type Outcome = (KeyId, Result<KmeKey, String>);
+
+impl Fetches {
+    pub(super) fn new(master: &str, purpose: Purpose) -> Self {
+        let (waiting, in_flight) = Default::default();
+        Self { master: master.to_owned(), purpose, waiting, in_flight }
+    }
+
+    /// Starts fetching `key_ids`, which must not be empty or under way already.
+    pub(super) fn start(&mut self, now: Duration, key_ids: Vec<KeyId>) {
+        self.waiting.push_back(Batch { key_ids, tries_left: TRIES, not_before: now });
+    }
+
+    pub(super) fn poll_request(&mut self, now: Duration) -> Option<Request> {
+        if self.in_flight.len() >= IN_FLIGHT {
+            return None;
+        }
+        let due = self.waiting.iter().position(|b| b.not_before <= now)?;
+        let mut batch = self.waiting.remove(due)?;
+        batch.tries_left -= 1;
+        batch.not_before = now + TRY;
+        let key_ids = batch.key_ids.clone();
+        self.in_flight.push(batch);
+        let (master, purpose) = (self.master.clone(), self.purpose);
+        Some(Request::Dec { master, key_ids, purpose, timeout: TRY })
+    }
+
+    /// What became of the keys that `answer` settles; none where they are asked for again.
+    pub(super) fn on_answer(&mut self, answer: Answer) -> Vec<Outcome> {
+        let Request::Dec { key_ids, .. } = answer.request else { return Vec::new() };
+        let Some(i) = self.in_flight.iter().position(|b| b.key_ids == key_ids) else {
+            return Vec::new();
+        };
+        let batch = self.in_flight.swap_remove(i);
+        let failure = match answer.outcome {
+            Ok(Fetched::Keys(keys)) => return given(batch.key_ids, keys),
+            Ok(Fetched::Stock(_)) => return failed(batch.key_ids, "the KME answered another call"),
+            Err(failure) => failure,
+        };
+        match failure.kind {
+            FailureKind::Refused if batch.key_ids.len() > 1 => {
+                // One unknown key_ID spoils a batch: the others may still be had.
+                let single = |key_id| Batch {
+                    key_ids: vec![key_id],
+                    tries_left: TRIES,
+                    not_before: Duration::ZERO,
+                };
+                self.waiting.extend(batch.key_ids.into_iter().map(single));
+                Vec::new()
+            }
+            kind if kind.is_transient() && batch.tries_left > 0 => {
+                self.waiting.push_back(batch);
+                Vec::new()
+            }
+            _ => failed(batch.key_ids, &failure.text),
+        }
+    }
+
+    /// When [`poll_request`](Self::poll_request) gives something without an answer before.
+    pub(super) fn poll_timeout(&self) -> Option<Duration> {
+        let free = self.in_flight.len() < IN_FLIGHT;
+        free.then(|| self.waiting.iter().map(|b| b.not_before).min()).flatten()
+    }
+}
+
+/// Each key_ID with its own key, whatever else the answer holds.
+fn given(asked: Vec<KeyId>, mut keys: Vec<(KeyId, KmeKey)>) -> Vec<Outcome> {
+    let outcome = |key_id: KeyId| match keys.iter().position(|(id, _)| *id == key_id) {
+        Some(i) => (key_id, Ok(keys.swap_remove(i).1)),
+        None => (key_id, Err("the KME's answer does not hold it".to_owned())),
+    };
+    asked.into_iter().map(outcome).collect()
+}
+
+fn failed(key_ids: Vec<KeyId>, reason: &str) -> Vec<Outcome> {
+    key_ids.into_iter().map(|key_id| (key_id, Err(reason.to_owned()))).collect()
+}

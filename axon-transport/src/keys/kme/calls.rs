@@ -1,0 +1,93 @@
+//! One request as one call of the client.
+
+use std::time::{Duration, Instant};
+
+use axon_envelope::{KeyId, KmeKey};
+use etsi_qkd014::{Client, Error, KeyContainer};
+
+use super::{Recorder, STATUS_TIMEOUT};
+use crate::keys::request::{Failure, FailureKind, Fetched, Request, Stock};
+
+/// Bits of a key.
+const KEY_SIZE: u32 = 256;
+
+/// Runs `request` and records how it went.
+pub(super) async fn run(
+    client: &Client,
+    recorder: &Recorder,
+    request: &Request,
+) -> Result<Fetched, Failure> {
+    let start = Instant::now();
+    let limit = match request {
+        Request::Enc { timeout, .. } | Request::Dec { timeout, .. } => *timeout,
+        Request::Status { .. } => STATUS_TIMEOUT,
+    };
+    let outcome = match tokio::time::timeout(limit, call(client, request)).await {
+        Ok(outcome) => outcome,
+        Err(_) => Err(timed_out(request, limit)),
+    };
+    recorder.record(request, start.elapsed(), &outcome);
+    outcome
+}
+
+async fn call(client: &Client, request: &Request) -> Result<Fetched, Failure> {
+    match request {
+        Request::Enc { slave, number, .. } => {
+            let enc = client.enc_keys(slave).number(*number).size(KEY_SIZE);
+            keys(enc.send().await.map_err(|e| failure(&e))?)
+        }
+        Request::Dec { master, key_ids, .. } => {
+            let mut names = Vec::with_capacity(key_ids.len());
+            for key_id in key_ids {
+                names.push(std::str::from_utf8(key_id.as_bytes()).map_err(|_| Failure {
+                    kind: FailureKind::Invalid,
+                    text: format!("key_ID {key_id} is no text"),
+                })?);
+            }
+            let dec = client.dec_keys(master).key_ids(names).size(KEY_SIZE);
+            keys(dec.send().await.map_err(|e| failure(&e))?)
+        }
+        Request::Status { slave } => {
+            let status = client.status(slave).await.map_err(|e| failure(&e))?;
+            Ok(Fetched::Stock(Stock {
+                stored_key_count: status.stored_key_count,
+                max_key_per_request: status.max_key_per_request,
+            }))
+        }
+    }
+}
+
+/// Moves the keys over; the client erases its own copies.
+fn keys(container: KeyContainer) -> Result<Fetched, Failure> {
+    let ambiguous = |text: String| Failure { kind: FailureKind::Ambiguous, text };
+    let keys = container.keys.iter().map(|key| {
+        let key_id = KeyId::new(key.key_id()).map_err(|e| ambiguous(format!("key_ID: {e}")))?;
+        let kme_key = KmeKey::from_slice(key.expose())
+            .map_err(|_| ambiguous(format!("key {key_id} has {} bytes, not 32", key.len())))?;
+        Ok((key_id, kme_key))
+    });
+    keys.collect::<Result<_, _>>().map(Fetched::Keys)
+}
+
+fn failure(e: &Error) -> Failure {
+    let kind = match e {
+        Error::KeyPossiblyConsumed { .. } | Error::Interrupted { .. } => FailureKind::Ambiguous,
+        Error::Unreachable { .. } => FailureKind::Unreachable,
+        Error::Timeout { .. } | Error::Unavailable { .. } => FailureKind::Unavailable,
+        Error::Unauthorized { .. } | Error::Tls { .. } => FailureKind::Unauthorized,
+        Error::BadRequest { .. } => FailureKind::Refused,
+        Error::Status { code: 404 | 410, .. } => FailureKind::Refused,
+        _ => FailureKind::Invalid,
+    };
+    Failure { kind, text: e.to_string() }
+}
+
+/// The call was dropped in the middle: whether it reached the KME is not known.
+fn timed_out(request: &Request, limit: Duration) -> Failure {
+    let (kind, call) = match request {
+        Request::Enc { .. } => (FailureKind::Ambiguous, "enc_keys"),
+        Request::Dec { .. } => (FailureKind::Ambiguous, "dec_keys"),
+        Request::Status { .. } => (FailureKind::Unavailable, "status"),
+    };
+    Failure { kind, text: format!("{call}: no answer from the KME within {limit:?}") }
+}

@@ -1,0 +1,278 @@
+//! The only place that talks to the KME: runs the machines' [`Request`]s, bounded, and answers
+//! every one of them.
+//!
+//! Calls for links (bootstrap, handshakes, proofs) and calls for messages wait in two queues with
+//! their own limits, so that a hungry supply cannot keep a link from being made.
+
+mod calls;
+mod statistics;
+
+use std::{
+    path::Path,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use etsi_qkd014::{Client, Quirks, RetryPolicy};
+use tokio::{
+    sync::{Semaphore, mpsc},
+    task::JoinSet,
+};
+
+use super::request::{Answer, Failure, FailureKind, Fetched, Purpose, Request, Stock};
+use crate::config::QkdConfig;
+
+pub use statistics::{CallStatistics, Statistics};
+
+use statistics::Recorder;
+
+/// Requests that wait, for links and for messages each.
+const QUEUE: usize = 256;
+/// Calls in flight for links: 16 for handshakes that come in, 8 for dials, and room for proofs.
+const LINK_CALLS: usize = 32;
+/// Calls in flight for messages.
+const MESSAGE_CALLS: usize = 16;
+/// How long a `status` may take.
+const STATUS_TIMEOUT: Duration = Duration::from_secs(5);
+/// TCP and TLS.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// Who asked, and so who gets the answer. The numbers are the caller's own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Origin {
+    /// The [`Dialler`](super::Dialler).
+    Dialler,
+    /// The [`Acceptor`](super::Acceptor).
+    Acceptor,
+    /// A [`ClientProof`](super::ClientProof).
+    Proof(u64),
+    /// A [`ProofResponder`](super::ProofResponder).
+    Responder(u64),
+    /// A [`Sender`](super::Sender).
+    Sender(u64),
+    /// A [`Receiver`](super::Receiver).
+    Receiver(u64),
+}
+
+/// An answer, and who asked.
+pub struct Event {
+    /// Who asked.
+    pub origin: Origin,
+    /// The answer.
+    pub answer: Answer,
+}
+
+/// Why the KME cannot even be asked.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum KmeError {
+    /// A file cannot be read.
+    #[error("{variable}={path}: {reason}")]
+    File {
+        /// The variable that names it.
+        variable: &'static str,
+        /// The path.
+        path: String,
+        /// Why.
+        reason: String,
+    },
+    /// A setting is unusable.
+    #[error("{variable}: {reason}")]
+    Setting {
+        /// The variable.
+        variable: &'static str,
+        /// What is wrong with it and what is accepted.
+        reason: String,
+    },
+}
+
+/// Takes requests. Clones share the KME; calls end when the last is dropped.
+#[derive(Clone)]
+pub struct Kme(Arc<Shared>);
+
+struct Shared {
+    client: Client,
+    links: mpsc::Sender<Job>,
+    messages: mpsc::Sender<Job>,
+    recorder: Arc<Recorder>,
+}
+
+/// Gives the answers.
+pub struct Events(mpsc::Receiver<Event>);
+
+struct Job {
+    origin: Origin,
+    request: Request,
+    since: Instant,
+}
+
+impl Kme {
+    /// Whether the settings make a client: URL, certificates, key and quirks. Opens no connection.
+    ///
+    /// # Errors
+    /// The variable that is wrong, and how.
+    pub fn check(config: &QkdConfig) -> Result<(), KmeError> {
+        client(config).map(drop)
+    }
+
+    /// Starts taking requests, on the current tokio runtime.
+    ///
+    /// # Errors
+    /// As [`check`](Self::check).
+    ///
+    /// # Panics
+    /// Outside a tokio runtime.
+    pub fn start(config: &QkdConfig) -> Result<(Self, Events), KmeError> {
+        let client = client(config)?;
+        let recorder = Arc::new(Recorder::default());
+        let (events, receiver) = mpsc::channel(QUEUE);
+        let serve = |limit: usize| {
+            let (sender, jobs) = mpsc::channel(QUEUE);
+            let (client, recorder) = (client.clone(), Arc::clone(&recorder));
+            tokio::spawn(serve(client, recorder, limit, jobs, events.clone()));
+            sender
+        };
+        let (links, messages) = (serve(LINK_CALLS), serve(MESSAGE_CALLS));
+        Ok((Self(Arc::new(Shared { client, links, messages, recorder })), Events(receiver)))
+    }
+
+    /// Queues a request; its answer comes out of [`Events`]. Never blocks.
+    ///
+    /// # Errors
+    /// The queue is full: the answer, to be given to the machine as if it had come out of there.
+    pub fn submit(&self, origin: Origin, request: Request) -> Result<(), Box<Event>> {
+        let queue = match &request {
+            Request::Enc { purpose: Purpose::Messages, .. }
+            | Request::Dec { purpose: Purpose::Messages, .. }
+            | Request::Status { .. } => &self.0.messages,
+            _ => &self.0.links,
+        };
+        queue.try_send(Job { origin, request, since: Instant::now() }).map_err(|e| {
+            let Job { origin, request, .. } = e.into_inner();
+            let text = format!("{QUEUE} calls wait for the KME already");
+            let outcome = Err(Failure { kind: FailureKind::Busy, text });
+            Box::new(Event { origin, answer: Answer { request, took: Duration::ZERO, outcome } })
+        })
+    }
+
+    /// Asks the KME for its status with `slave`: whether it can be reached and accepts this SAE.
+    ///
+    /// # Errors
+    /// Why not.
+    pub async fn probe(&self, slave: &str) -> Result<Stock, Failure> {
+        let request = Request::Status { slave: slave.to_owned() };
+        match calls::run(&self.0.client, &self.0.recorder, &request).await? {
+            Fetched::Stock(stock) => Ok(stock),
+            Fetched::Keys(_) => {
+                let text = "status answered with keys".to_owned();
+                Err(Failure { kind: FailureKind::Invalid, text })
+            }
+        }
+    }
+
+    /// What was asked and given since the start.
+    pub fn statistics(&self) -> Statistics {
+        self.0.recorder.statistics()
+    }
+}
+
+impl Events {
+    /// The next answer; `None` when the last [`Kme`] is dropped and all is answered. Cancel safe.
+    pub async fn recv(&mut self) -> Option<Event> {
+        self.0.recv().await
+    }
+}
+
+/// Runs the jobs of one queue, `limit` at a time, and answers each.
+async fn serve(
+    client: Client,
+    recorder: Arc<Recorder>,
+    limit: usize,
+    mut jobs: mpsc::Receiver<Job>,
+    events: mpsc::Sender<Event>,
+) {
+    let free = Arc::new(Semaphore::new(limit));
+    let mut running = JoinSet::new();
+    loop {
+        let permit = tokio::select! {
+            permit = Arc::clone(&free).acquire_owned() => permit,
+            // Nobody listens any more: calls in flight are cut off by dropping them.
+            () = events.closed() => return,
+        };
+        let (Ok(permit), Some(job)) = (permit, next(&mut jobs, &mut running, &events).await) else {
+            break;
+        };
+        let (client, recorder, events) = (client.clone(), Arc::clone(&recorder), events.clone());
+        running.spawn(async move {
+            let outcome = calls::run(&client, &recorder, &job.request).await;
+            drop(permit);
+            let took = job.since.elapsed();
+            let answer = Answer { request: job.request, took, outcome };
+            // A failed send: nobody is left to listen.
+            let _ = events.send(Event { origin: job.origin, answer }).await;
+        });
+    }
+    while running.join_next().await.is_some() {}
+}
+
+/// The next job; meanwhile finished calls are cleared away.
+async fn next(
+    jobs: &mut mpsc::Receiver<Job>,
+    running: &mut JoinSet<()>,
+    events: &mpsc::Sender<Event>,
+) -> Option<Job> {
+    loop {
+        tokio::select! {
+            job = jobs.recv() => return job,
+            Some(_) = running.join_next() => {}
+            () = events.closed() => return None,
+        }
+    }
+}
+
+fn client(config: &QkdConfig) -> Result<Client, KmeError> {
+    let quirks = config.kme_quirks.join(",").parse::<Quirks>();
+    let mut builder = Client::builder()
+        .kme_url(&config.kme_url)
+        .ca(read("AXON_KME_CA", &config.kme_ca)?)
+        .sae_cert(read("AXON_SAE_CERT", &config.sae_cert)?)
+        .sae_key(zeroize::Zeroizing::new(read("AXON_SAE_KEY", &config.sae_key)?))
+        .connect_timeout(CONNECT_TIMEOUT)
+        // The machines repeat what may be repeated, and know when.
+        .retry(RetryPolicy::none())
+        .quirks(quirks.map_err(setting)?);
+    if let Some(id) = &config.kme_id {
+        builder = builder.kme_id(id);
+    }
+    builder.build().map_err(setting)
+}
+
+fn read(variable: &'static str, path: &Path) -> Result<Vec<u8>, KmeError> {
+    let path_text = || path.display().to_string();
+    std::fs::read(path).map_err(|e| KmeError::File {
+        variable,
+        path: path_text(),
+        reason: e.to_string(),
+    })
+}
+
+/// Names the variable behind the client's setting.
+fn setting(e: etsi_qkd014::Error) -> KmeError {
+    let (setting, reason) = match e {
+        etsi_qkd014::Error::Config { setting, reason } => (setting, reason),
+        other => ("", other.to_string()),
+    };
+    let variable = match setting {
+        "kme_url" => "AXON_KME_URL",
+        "ca" | "ca_file" => "AXON_KME_CA",
+        "sae_cert" | "sae_cert_file" => "AXON_SAE_CERT",
+        "sae_key" | "sae_key_file" => "AXON_SAE_KEY",
+        "kme_id" => "AXON_KME_ID",
+        "quirks" => "AXON_KME_QUIRKS",
+        _ => "KME client",
+    };
+    KmeError::Setting { variable, reason }
+}
+
+#[cfg(test)]
+mod tests;

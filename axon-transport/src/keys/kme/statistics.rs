@@ -1,0 +1,121 @@
+//! What the KME was asked and what it gave, for status.
+
+use std::{
+    collections::BTreeMap,
+    sync::{Mutex, MutexGuard, PoisonError},
+    time::Duration,
+};
+
+use serde::Serialize;
+
+use crate::keys::request::{Failure, FailureKind, Fetched, Purpose, Request};
+
+/// Peers whose stock is shown.
+const MAX_PEERS: usize = 256;
+
+/// What the KME was asked and what it gave since the start.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[non_exhaustive]
+pub struct Statistics {
+    /// Calls of `enc_keys`.
+    pub enc_keys: CallStatistics,
+    /// Calls of `dec_keys`.
+    pub dec_keys: CallStatistics,
+    /// Calls of `status`.
+    pub status: CallStatistics,
+    /// Keys fetched to dial with.
+    pub keys_bootstrap: u64,
+    /// Keys fetched for handshakes that came in.
+    pub keys_accept: u64,
+    /// Keys fetched for the proof of a client's name.
+    pub keys_proof: u64,
+    /// Keys fetched for envelopes.
+    pub keys_messages: u64,
+    /// Keys of `enc_keys` calls that were cut off: the KME may have handed them out.
+    pub keys_possibly_lost: u64,
+    /// Keys in stock by peer, as the KME last said.
+    pub stored_key_count: BTreeMap<String, u64>,
+    /// The last failure, whatever the call.
+    pub last_failure: Option<String>,
+}
+
+/// One kind of call.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[non_exhaustive]
+pub struct CallStatistics {
+    /// Made.
+    pub calls: u64,
+    /// Of them failed.
+    pub failures: u64,
+    /// Recent mean time to the answer, over those that succeeded.
+    pub latency_ms: Option<f64>,
+}
+
+impl Statistics {
+    /// Keys fetched for any purpose.
+    pub fn keys(&self) -> u64 {
+        self.keys_bootstrap + self.keys_accept + self.keys_proof + self.keys_messages
+    }
+}
+
+/// Collects [`Statistics`] from calls that run side by side.
+#[derive(Default)]
+pub(super) struct Recorder(Mutex<Statistics>);
+
+impl Recorder {
+    pub(super) fn record(
+        &self,
+        request: &Request,
+        took: Duration,
+        outcome: &Result<Fetched, Failure>,
+    ) {
+        let mut guard = self.lock();
+        let s = &mut *guard;
+        let call = match request {
+            Request::Enc { .. } => &mut s.enc_keys,
+            Request::Dec { .. } => &mut s.dec_keys,
+            Request::Status { .. } => &mut s.status,
+        };
+        call.calls += 1;
+        match outcome {
+            Ok(_) => {
+                let new = took.as_secs_f64() * 1e3;
+                call.latency_ms =
+                    Some(call.latency_ms.map_or(new, |old| old + (new - old) / 8.0));
+            }
+            Err(failure) => {
+                call.failures += 1;
+                s.last_failure = Some(failure.text.clone());
+            }
+        }
+        match (request, outcome) {
+            (Request::Enc { purpose, .. } | Request::Dec { purpose, .. }, Ok(Fetched::Keys(k))) => {
+                *match purpose {
+                    Purpose::Bootstrap => &mut s.keys_bootstrap,
+                    Purpose::Accept => &mut s.keys_accept,
+                    Purpose::Proof => &mut s.keys_proof,
+                    Purpose::Messages => &mut s.keys_messages,
+                } += k.len() as u64;
+            }
+            (Request::Enc { number, .. }, Err(f)) if f.kind == FailureKind::Ambiguous => {
+                s.keys_possibly_lost += u64::from(*number);
+            }
+            (Request::Status { slave }, Ok(Fetched::Stock(stock)))
+                if s.stored_key_count.contains_key(slave)
+                    || s.stored_key_count.len() < MAX_PEERS =>
+            {
+                s.stored_key_count.insert(slave.clone(), stock.stored_key_count);
+            }
+            _ => {}
+        }
+    }
+
+    pub(super) fn statistics(&self) -> Statistics {
+        self.lock().clone()
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Statistics> {
+        // Counters stay sound whatever thread panicked over them.
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}

@@ -1,0 +1,31 @@
+//! KME keys: where they come from, what each of them may be used for, and when they end.
+//!
+//! [`bootstrap`] gives a link its first key (the TLS external PSK), [`verifier`] proves the client's name over
+//! it, [`supply`] keeps `messages10` in envelope keys. They are state machines: time, answers and messages go
+//! in, requests and messages come out. [`kme`] alone talks to the KME.
+//!
+//! Each machine hands its requests out by `poll_request` and takes their [`Answer`]s by `on_answer`. After any
+//! call on a machine, drain `poll_request` and `poll_message`; `poll_timeout` says when to do so without other
+//! cause. Every `now` is the time of the daemon's one [`Clock`].
+
+#![forbid(unsafe_code)]
+
+pub mod bootstrap;
+mod clock;
+mod exporters;
+mod fetch;
+pub mod kme;
+pub mod message;
+pub mod proof;
+pub mod request;
+pub mod supply;
+pub mod verifier;
+
+pub use bootstrap::{Acceptor, Attempt, Completion, Dial, DialRefusal, Dialler, Lookup, Resolver};
+pub use clock::Clock;
+pub use exporters::{ENVELOPE_EXPORTER, Exporters, READY_EXPORTER};
+pub use kme::{Event, Events, Kme, KmeError, Origin, Statistics};
+pub use message::{KeyMessage, MessageError, Violation};
+pub use request::{Answer, Failure, FailureKind, Fetched, Purpose, Request, Stock};
+pub use supply::{NoKey, Receiver, Sender, SupplyError};
+pub use verifier::{ClientProof, ProofFailure, ProofResponder, ProofState};

@@ -1,0 +1,121 @@
+//! What the machines ask of the KME, and what they are told.
+
+use std::{fmt, time::Duration};
+
+use axon_envelope::{KeyId, KmeKey};
+
+/// What a key is fetched for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Purpose {
+    /// A dialler's TLS external PSK.
+    Bootstrap,
+    /// The same key at the server, for a handshake that named it.
+    Accept,
+    /// The proof of the client's name.
+    Proof,
+    /// Envelopes of `messages10`.
+    Messages,
+}
+
+/// One call to the KME.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Request {
+    /// `enc_keys`: fresh 256-bit keys shared with `slave`. A failed call may have consumed keys and is never
+    /// repeated as such.
+    Enc {
+        /// The other SAE.
+        slave: String,
+        /// How many keys.
+        number: u32,
+        /// What for.
+        purpose: Purpose,
+        /// How long the call may take.
+        timeout: Duration,
+    },
+    /// `dec_keys`: the keys that `master` named.
+    Dec {
+        /// The SAE that called `enc_keys`.
+        master: String,
+        /// Their names.
+        key_ids: Vec<KeyId>,
+        /// What for.
+        purpose: Purpose,
+        /// How long the call may take.
+        timeout: Duration,
+    },
+    /// `status`: what is in stock with `slave`.
+    Status {
+        /// The other SAE.
+        slave: String,
+    },
+}
+
+/// A [`Request`] and how it ended.
+pub struct Answer {
+    /// As it was asked.
+    pub request: Request,
+    /// From asking to the end.
+    pub took: Duration,
+    /// What came of it.
+    pub outcome: Result<Fetched, Failure>,
+}
+
+/// What a successful [`Request`] gave.
+pub enum Fetched {
+    /// Keys, in the order asked for. All that were asked for, or it is a [`Failure`].
+    Keys(Vec<(KeyId, KmeKey)>),
+    /// The answer to [`Request::Status`].
+    Stock(Stock),
+}
+
+/// The part of the KME's status that the supply of keys depends on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stock {
+    /// Keys ready to be handed out. Some KMEs always say 0.
+    pub stored_key_count: u64,
+    /// Most keys a call may ask for.
+    pub max_key_per_request: u64,
+}
+
+/// Why a [`Request`] failed. Never holds anything of a key.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Failure {
+    /// What can be done about it.
+    pub kind: FailureKind,
+    /// For log and status.
+    pub text: String,
+}
+
+/// What can be done about a [`Failure`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum FailureKind {
+    /// No connection; nothing was asked. Try later.
+    Unreachable,
+    /// The KME cannot serve it now; an empty store is one reason. Try later.
+    Unavailable,
+    /// The KME knows no such key, or refuses such a request. Asking again is useless.
+    Refused,
+    /// The KME does not accept this SAE, or this host does not accept the KME: a matter of certificates.
+    Unauthorized,
+    /// Cut off or answered badly after the request may have arrived: its keys may be consumed.
+    Ambiguous,
+    /// Too many calls are waiting; nothing was asked.
+    Busy,
+    /// This host could not even put the request.
+    Invalid,
+}
+
+impl FailureKind {
+    /// Whether the same call may succeed later by itself.
+    pub fn is_transient(self) -> bool {
+        matches!(self, Self::Unreachable | Self::Unavailable | Self::Ambiguous | Self::Busy)
+    }
+}
+
+impl fmt::Display for Failure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.text)
+    }
+}
+
+impl std::error::Error for Failure {}

@@ -1,0 +1,52 @@
+//! Keys for `messages10`: ten messages each, fetched ahead, announced, proven, used, retired
+//! (docs/formats.md, section 4).
+//!
+//! Each host is master for what it sends: its [`Sender`] asks for keys, the peer's [`Receiver`]
+//! fetches the same ones. There is one pair for each peer SAE, and it outlives connections.
+
+mod calls;
+mod demand;
+mod receiver;
+mod sender;
+
+#[cfg(test)]
+mod tests;
+
+use axon_envelope::{ChannelError, RandomError};
+
+pub use demand::SupplyWarning;
+pub use receiver::{Receiver, ReceiverStatistics};
+pub use sender::{NoKey, Sender, SenderStatistics};
+
+use super::Violation;
+
+/// Most keys of one direction that are announced and not retired.
+pub const MAX_UNRETIRED: usize = 4096;
+
+/// Why the supply of a link stops.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum SupplyError {
+    /// The peer broke a rule.
+    #[error(transparent)]
+    Violation(#[from] Violation),
+    /// The SAE IDs make no channel.
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
+    /// The system gave no random bytes.
+    #[error(transparent)]
+    Random(#[from] RandomError),
+    /// A message came on a connection that is not attached.
+    #[error("connection {0} is not attached to this supply")]
+    Unattached(u64),
+}
+
+impl SupplyError {
+    /// The application error code to close the connection with (docs/formats.md, section 6).
+    pub fn code(&self) -> u64 {
+        match self {
+            Self::Violation(violation) => violation.code(),
+            _ => 0x50,
+        }
+    }
+}

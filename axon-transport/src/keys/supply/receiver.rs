@@ -1,0 +1,260 @@
+//! The receiving direction: fetches what is announced, and opens.
+
+use std::{
+    collections::{HashMap, VecDeque},
+    time::Duration,
+};
+
+use axon_envelope::{Channel, ChannelError, KeyId, KmeKey, Opener};
+use serde::Serialize;
+use zeroize::Zeroizing;
+
+use super::{MAX_UNRETIRED, SupplyError};
+use crate::keys::{
+    Exporters, KeyMessage, Violation,
+    fetch::Fetches,
+    proof,
+    request::{Answer, Purpose, Request},
+};
+
+/// How long unused keys of a lost connection wait to be announced on the next one.
+const KEPT_FOR: Duration = Duration::from_secs(120);
+/// How many of them.
+const KEPT: usize = 512;
+
+/// The keys of one peer's messages to this host.
+pub struct Receiver {
+    local: String,
+    peer: String,
+    links: HashMap<u64, Link>,
+    /// Being fetched, with the connection that last announced it. The answer goes there.
+    wanted: HashMap<KeyId, u64>,
+    fetches: Fetches,
+    /// Never used, from connections that are gone.
+    kept: VecDeque<(Duration, KeyId, KmeKey)>,
+    outbox: VecDeque<(u64, KeyMessage)>,
+    counts: Counts,
+}
+
+struct Link {
+    opener: Opener,
+    ready: Zeroizing<[u8; 32]>,
+}
+
+#[derive(Default)]
+struct Counts {
+    ready: u64,
+    failed: u64,
+    retired: u64,
+    expired: u64,
+}
+
+/// How a [`Receiver`] stands, for status.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[non_exhaustive]
+pub struct ReceiverStatistics {
+    /// Keys held and not retired, on all connections.
+    pub held: usize,
+    /// Keys being fetched.
+    pub fetching: usize,
+    /// Keys answered with READY.
+    pub ready: u64,
+    /// Keys answered with FAILED.
+    pub failed: u64,
+    /// Keys that the peer retired.
+    pub retired: u64,
+    /// Keys that time retired.
+    pub expired: u64,
+}
+
+impl Receiver {
+    /// For what `peer_sae` sends to `local_sae`.
+    ///
+    /// # Errors
+    /// SAE IDs that make no channel: empty, too long, equal.
+    pub fn new(local_sae: &str, peer_sae: &str) -> Result<Self, ChannelError> {
+        Channel::new(peer_sae, local_sae, [])?;
+        Ok(Self {
+            local: local_sae.to_owned(),
+            peer: peer_sae.to_owned(),
+            links: HashMap::new(),
+            wanted: HashMap::new(),
+            fetches: Fetches::new(peer_sae, Purpose::Messages),
+            kept: VecDeque::new(),
+            outbox: VecDeque::new(),
+            counts: Counts::default(),
+        })
+    }
+
+    /// Takes on a connection. One that it succeeds may stay attached until it is closed.
+    ///
+    /// # Errors
+    /// The system gives no random bytes.
+    pub fn attach(
+        &mut self,
+        now: Duration,
+        conn: u64,
+        exporters: &Exporters,
+    ) -> Result<(), SupplyError> {
+        self.detach(now, conn);
+        let channel = Channel::new(&self.peer, &self.local, exporters.envelope())?;
+        let opener = Opener::new(channel)?;
+        self.links.insert(conn, Link { opener, ready: Zeroizing::new(*exporters.ready()) });
+        Ok(())
+    }
+
+    /// A connection is closed: nothing opens on it any more. Keys under which nothing was opened
+    /// wait a while to be announced on the next.
+    pub fn detach(&mut self, now: Duration, conn: u64) {
+        let Some(mut link) = self.links.remove(&conn) else { return };
+        self.outbox.retain(|(c, _)| *c != conn);
+        let unused: Vec<KeyId> = link.opener.unused_keys().cloned().collect();
+        for key_id in unused {
+            if let Some((key_id, key)) = link.opener.take_unused(key_id.as_bytes()) {
+                self.keep(now, key_id, key);
+            }
+        }
+    }
+
+    /// Opens what comes on this connection.
+    pub fn opener(&mut self, conn: u64) -> Option<&mut Opener> {
+        self.links.get_mut(&conn).map(|link| &mut link.opener)
+    }
+
+    /// ANNOUNCE or RETIRE from the peer.
+    ///
+    /// # Errors
+    /// The peer broke a rule, or the connection is not attached.
+    pub fn on_message(
+        &mut self,
+        now: Duration,
+        conn: u64,
+        message: &KeyMessage,
+    ) -> Result<(), SupplyError> {
+        let link = self.links.get_mut(&conn).ok_or(SupplyError::Unattached(conn))?;
+        match message {
+            KeyMessage::Announce(key_ids) => {
+                let new: Vec<KeyId> =
+                    key_ids.iter().filter(|&id| self.announced(conn, id)).cloned().collect();
+                if !new.is_empty() {
+                    self.fetches.start(now, new);
+                }
+                Ok(())
+            }
+            KeyMessage::Retire { key_id, used, reliable } => {
+                link.opener
+                    .retire(now, key_id.as_bytes(), *used, *reliable)
+                    .map_err(|e| Violation::Masks(key_id.clone(), e.to_string()))?;
+                self.counts.retired += 1;
+                self.wanted.remove(key_id);
+                self.kept.retain(|(_, id, _)| id != key_id);
+                Ok(())
+            }
+            other => Err(Violation::Unexpected(other.name()).into()),
+        }
+    }
+
+    /// What is to be sent next, and on which connection.
+    pub fn poll_message(&mut self) -> Option<(u64, KeyMessage)> {
+        self.outbox.pop_front()
+    }
+
+    /// The next call to the KME, if any.
+    pub fn poll_request(&mut self, now: Duration) -> Option<Request> {
+        self.fetches.poll_request(now)
+    }
+
+    /// The KME's answer to one of our requests.
+    pub fn on_answer(&mut self, now: Duration, answer: Answer) {
+        for (key_id, outcome) in self.fetches.on_answer(answer) {
+            // Retired meanwhile: nobody waits for it.
+            let Some(conn) = self.wanted.remove(&key_id) else { continue };
+            match outcome {
+                Ok(key) if self.links.contains_key(&conn) => self.add(conn, key_id, key),
+                Ok(key) => self.keep(now, key_id, key),
+                Err(reason) => self.fail(conn, key_id, reason),
+            }
+        }
+    }
+
+    /// When to poll again without other cause.
+    pub fn poll_timeout(&self, _now: Duration) -> Option<Duration> {
+        self.fetches.poll_timeout()
+    }
+
+    /// Erases what time has retired; to be called about once a second.
+    pub fn expire(&mut self, now: Duration) {
+        for link in self.links.values_mut() {
+            self.counts.expired += link.opener.expire(now).keys as u64;
+        }
+        self.kept.retain(|(since, ..)| now.saturating_sub(*since) < KEPT_FOR);
+    }
+
+    /// How it stands.
+    pub fn statistics(&self) -> ReceiverStatistics {
+        ReceiverStatistics {
+            held: self.links.values().map(|l| l.opener.key_count()).sum(),
+            fetching: self.wanted.len(),
+            ready: self.counts.ready,
+            failed: self.counts.failed,
+            retired: self.counts.retired,
+            expired: self.counts.expired,
+        }
+    }
+
+    /// Deals with one announced key_ID; true where it has to be fetched.
+    fn announced(&mut self, conn: u64, key_id: &KeyId) -> bool {
+        if self.links.get(&conn).is_some_and(|l| l.opener.contains(key_id.as_bytes())) {
+            self.fail(conn, key_id.clone(), "announced twice".to_owned());
+            return false;
+        }
+        if let Some(key) = self.take_unused(key_id) {
+            self.add(conn, key_id.clone(), key);
+            return false;
+        }
+        if let Some(waiting) = self.wanted.get_mut(key_id) {
+            *waiting = conn;
+            return false;
+        }
+        let held = self.links.get(&conn).map_or(0, |l| l.opener.key_count());
+        if held + self.wanted.len() >= MAX_UNRETIRED {
+            self.fail(conn, key_id.clone(), format!("{MAX_UNRETIRED} keys are not retired"));
+            return false;
+        }
+        self.wanted.insert(key_id.clone(), conn);
+        true
+    }
+
+    /// A key that was announced before and never used, from another connection or one that is gone.
+    fn take_unused(&mut self, key_id: &KeyId) -> Option<KmeKey> {
+        if let Some(i) = self.kept.iter().position(|(_, id, _)| id == key_id) {
+            return self.kept.remove(i).map(|(_, _, key)| key);
+        }
+        let mut openers = self.links.values_mut().map(|l| &mut l.opener);
+        openers.find_map(|o| o.take_unused(key_id.as_bytes())).map(|(_, key)| key)
+    }
+
+    fn add(&mut self, conn: u64, key_id: KeyId, key: KmeKey) {
+        let Some(link) = self.links.get_mut(&conn) else { return };
+        let proof = proof::compute(&key, &key_id, &link.ready);
+        match link.opener.add_key(key_id.clone(), key) {
+            Ok(()) => {
+                self.counts.ready += 1;
+                self.outbox.push_back((conn, KeyMessage::Ready { key_id, proof }));
+            }
+            Err(e) => self.fail(conn, key_id, e.to_string()),
+        }
+    }
+
+    fn fail(&mut self, conn: u64, key_id: KeyId, reason: String) {
+        self.counts.failed += 1;
+        self.outbox.push_back((conn, KeyMessage::Failed { key_id, reason }));
+    }
+
+    fn keep(&mut self, now: Duration, key_id: KeyId, key: KmeKey) {
+        if self.kept.len() >= KEPT {
+            self.kept.pop_front();
+        }
+        self.kept.push_back((now, key_id, key));
+    }
+}

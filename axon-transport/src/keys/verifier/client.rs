@@ -1,0 +1,223 @@
+//! The server's side.
+
+use std::time::Duration;
+
+use axon_envelope::{KeyId, KmeKey};
+use zeroize::Zeroizing;
+
+use crate::keys::{
+    Exporters, KeyMessage, message, proof,
+    request::{Answer, Failure, FailureKind, Fetched, Purpose, Request},
+};
+
+/// How long the whole proof may take: the client's `dec_keys` has three tries of 2 s.
+const DEADLINE: Duration = Duration::from_secs(20);
+/// How long `enc_keys` may take.
+const TIMEOUT: Duration = Duration::from_secs(5);
+/// Calls to `enc_keys`, where it is certain that those before cost no key.
+const TRIES: u32 = 3;
+/// Wait before such a call is made again.
+const PAUSE: Duration = Duration::from_millis(500);
+
+/// Has the client of one connection prove its name.
+pub struct ClientProof {
+    client_sae: String,
+    ready: Zeroizing<[u8; 32]>,
+    deadline: Duration,
+    tries: u32,
+    step: Step,
+}
+
+enum Step {
+    Ask { not_before: Duration },
+    Asked,
+    Announce(KeyId, KmeKey),
+    Announced(KeyId, KmeKey),
+    Proven(KeyId, KmeKey),
+    Failed(ProofFailure),
+}
+
+/// How far a [`ClientProof`] is.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum ProofState {
+    /// Nothing is settled.
+    Pending,
+    /// The client is who it claims to be.
+    Proven,
+    /// It is not known to be: close the connection.
+    Failed(ProofFailure),
+}
+
+/// Why the client's name is not proven.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum ProofFailure {
+    /// Our KME gave no key for it.
+    #[error("no key to prove SAE {sae:?} with: enc_keys: {failure}")]
+    NoKey {
+        /// The client.
+        sae: String,
+        /// Why.
+        failure: Failure,
+    },
+    /// Its KME gave it no key.
+    #[error("SAE {sae:?} could not fetch the key announced to it: {reason}")]
+    ClientHasNoKey {
+        /// The client.
+        sae: String,
+        /// In the client's words.
+        reason: String,
+    },
+    /// It does not hold the key of the SAE it claims to be.
+    #[error("the client is not SAE {0:?}: its READY carries a wrong proof")]
+    WrongProof(String),
+    /// It sent something else.
+    #[error("SAE {sae:?} sent {message} where READY was due")]
+    Unexpected {
+        /// The client.
+        sae: String,
+        /// What it sent.
+        message: &'static str,
+    },
+    /// Time ran out.
+    #[error("SAE {0:?} did not prove its name within {DEADLINE:?}")]
+    Timeout(String),
+}
+
+impl ProofFailure {
+    /// The application error code to close the connection with (docs/formats.md, section 6).
+    pub fn code(&self) -> u64 {
+        match self {
+            Self::NoKey { .. } | Self::ClientHasNoKey { .. } => 0x23,
+            Self::Unexpected { .. } => 0x32,
+            Self::WrongProof(_) | Self::Timeout(_) => 0x20,
+        }
+    }
+}
+
+impl ClientProof {
+    /// Has the client of the connection with these `exporters` prove that it is `client_sae`.
+    pub fn new(now: Duration, client_sae: &str, exporters: &Exporters) -> Self {
+        Self {
+            client_sae: client_sae.to_owned(),
+            ready: Zeroizing::new(*exporters.ready()),
+            deadline: now + DEADLINE,
+            tries: TRIES,
+            step: Step::Ask { not_before: now },
+        }
+    }
+
+    /// The next call to the KME, if any.
+    pub fn poll_request(&mut self, now: Duration) -> Option<Request> {
+        match self.step {
+            Step::Ask { not_before } if not_before <= now => {}
+            _ => return None,
+        }
+        self.step = Step::Asked;
+        self.tries -= 1;
+        Some(Request::Enc {
+            slave: self.client_sae.clone(),
+            number: 1,
+            purpose: Purpose::Proof,
+            timeout: TIMEOUT,
+        })
+    }
+
+    /// The KME's answer to our request.
+    pub fn on_answer(&mut self, now: Duration, answer: Answer) {
+        if !matches!(self.step, Step::Asked) {
+            return;
+        }
+        let invalid = |text: &str| Failure { kind: FailureKind::Invalid, text: text.to_owned() };
+        let failure = match answer.outcome {
+            Ok(Fetched::Keys(mut keys)) => match keys.pop() {
+                Some((key_id, key)) if keys.is_empty() && message::announceable(&key_id) => {
+                    self.step = Step::Announce(key_id, key);
+                    return;
+                }
+                _ => invalid("the KME did not give one key with a key_ID of at most 128 bytes"),
+            },
+            Ok(Fetched::Stock(_)) => invalid("the KME answered another call"),
+            Err(failure) => failure,
+        };
+        let nothing_lost =
+            failure.kind.is_transient() && failure.kind != FailureKind::Ambiguous;
+        self.step = if nothing_lost && self.tries > 0 {
+            Step::Ask { not_before: now + PAUSE }
+        } else {
+            Step::Failed(ProofFailure::NoKey { sae: self.client_sae.clone(), failure })
+        };
+    }
+
+    /// The ANNOUNCE, once.
+    pub fn poll_message(&mut self) -> Option<KeyMessage> {
+        match std::mem::replace(&mut self.step, Step::Asked) {
+            Step::Announce(key_id, key) => {
+                let announce = KeyMessage::Announce(vec![key_id.clone()]);
+                self.step = Step::Announced(key_id, key);
+                Some(announce)
+            }
+            other => {
+                self.step = other;
+                None
+            }
+        }
+    }
+
+    /// What the client sent. Everything but the right READY ends in failure.
+    pub fn on_message(&mut self, _now: Duration, message: &KeyMessage) {
+        let sae = || self.client_sae.clone();
+        let failure = match (&self.step, message) {
+            (Step::Failed(_), _) => return,
+            (Step::Announced(id, key), KeyMessage::Ready { key_id, proof }) if id == key_id => {
+                if proof::verify(key, id, &self.ready, proof) {
+                    let announced = std::mem::replace(&mut self.step, Step::Asked);
+                    if let Step::Announced(key_id, key) = announced {
+                        self.step = Step::Proven(key_id, key);
+                    }
+                    return;
+                }
+                ProofFailure::WrongProof(sae())
+            }
+            (Step::Announced(id, _), KeyMessage::Failed { key_id, reason }) if id == key_id => {
+                ProofFailure::ClientHasNoKey { sae: sae(), reason: reason.clone() }
+            }
+            (_, other) => ProofFailure::Unexpected { sae: sae(), message: other.name() },
+        };
+        self.step = Step::Failed(failure);
+    }
+
+    /// When to call [`on_timeout`](Self::on_timeout) and poll again without other cause.
+    pub fn poll_timeout(&self) -> Option<Duration> {
+        match &self.step {
+            Step::Proven(..) | Step::Failed(_) => None,
+            Step::Ask { not_before } => Some((*not_before).min(self.deadline)),
+            _ => Some(self.deadline),
+        }
+    }
+
+    /// Ends the proof when its time is over.
+    pub fn on_timeout(&mut self, now: Duration) {
+        if now >= self.deadline && !matches!(self.step, Step::Proven(..) | Step::Failed(_)) {
+            self.step = Step::Failed(ProofFailure::Timeout(self.client_sae.clone()));
+        }
+    }
+
+    /// How far it is.
+    pub fn state(&self) -> ProofState {
+        match &self.step {
+            Step::Proven(..) => ProofState::Proven,
+            Step::Failed(failure) => ProofState::Failed(failure.clone()),
+            _ => ProofState::Pending,
+        }
+    }
+
+    /// The key that proved it: in `messages10` the first sending key, for
+    /// [`Sender::adopt`](crate::keys::Sender::adopt); in `session` it is spent by being dropped.
+    pub fn into_key(self) -> Option<(KeyId, KmeKey)> {
+        match self.step {
+            Step::Proven(key_id, key) => Some((key_id, key)),
+            _ => None,
+        }
+    }
+}

@@ -1,0 +1,9 @@
+//! Who the client is. The binder proves that it holds the PSK, but a KME may answer `dec_keys` to
+//! the slave without proof of who the master was; so the server fetches a key for the SAE the
+//! client claims to be, and has it prove that it got that one (docs/formats.md, section 2).
+
+mod client;
+mod responder;
+
+pub use client::{ClientProof, ProofFailure, ProofState};
+pub use responder::ProofResponder;

@@ -1,0 +1,84 @@
+//! The client's side in `session`; in `messages10` the [`Receiver`](crate::keys::Receiver) answers.
+
+use std::time::Duration;
+
+use zeroize::Zeroizing;
+
+use crate::keys::{
+    Exporters, KeyMessage, Violation,
+    fetch::Fetches,
+    proof,
+    request::{Answer, Purpose, Request},
+};
+
+/// Fetches the one key that the server announces and answers READY with its proof.
+pub struct ProofResponder {
+    ready: Zeroizing<[u8; 32]>,
+    fetches: Fetches,
+    announced: bool,
+    outbox: Option<KeyMessage>,
+    answered: Option<Result<(), String>>,
+}
+
+impl ProofResponder {
+    /// Answers `server_sae` on the connection with these `exporters`.
+    pub fn new(server_sae: &str, exporters: &Exporters) -> Self {
+        Self {
+            ready: Zeroizing::new(*exporters.ready()),
+            fetches: Fetches::new(server_sae, Purpose::Proof),
+            announced: false,
+            outbox: None,
+            answered: None,
+        }
+    }
+
+    /// What the server sent.
+    ///
+    /// # Errors
+    /// Anything but one ANNOUNCE of one key.
+    pub fn on_message(&mut self, now: Duration, message: &KeyMessage) -> Result<(), Violation> {
+        match message {
+            KeyMessage::Announce(key_ids) if !self.announced && key_ids.len() == 1 => {
+                self.announced = true;
+                self.fetches.start(now, key_ids.clone());
+                Ok(())
+            }
+            other => Err(Violation::Unexpected(other.name())),
+        }
+    }
+
+    /// The next call to the KME, if any.
+    pub fn poll_request(&mut self, now: Duration) -> Option<Request> {
+        self.fetches.poll_request(now)
+    }
+
+    /// The KME's answer to one of our requests. The key is used for the proof, and erased.
+    pub fn on_answer(&mut self, _now: Duration, answer: Answer) {
+        for (key_id, outcome) in self.fetches.on_answer(answer) {
+            let (message, answered) = match outcome {
+                Ok(key) => {
+                    let proof = proof::compute(&key, &key_id, &self.ready);
+                    (KeyMessage::Ready { key_id, proof }, Ok(()))
+                }
+                Err(reason) => (KeyMessage::Failed { key_id, reason: reason.clone() }, Err(reason)),
+            };
+            self.outbox = Some(message);
+            self.answered = Some(answered);
+        }
+    }
+
+    /// READY or FAILED, once.
+    pub fn poll_message(&mut self) -> Option<KeyMessage> {
+        self.outbox.take()
+    }
+
+    /// When to poll again without other cause.
+    pub fn poll_timeout(&self) -> Option<Duration> {
+        self.fetches.poll_timeout()
+    }
+
+    /// Whether the server was answered: with READY, or with FAILED and why.
+    pub fn answered(&self) -> Option<Result<(), String>> {
+        self.answered.clone()
+    }
+}
