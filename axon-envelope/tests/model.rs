@@ -261,7 +261,7 @@ impl World {
             Err(&[RefusalCause::WrongRoute][..])
         };
         let mut out = vec![0xaa; sent.plaintext.len()];
-        let result = if number % 2 == 0 {
+        let result = if number.is_multiple_of(2) {
             self.opener.open_into(self.now, expected_route, &sent.bytes, &mut out)
         } else {
             let mut bytes = sent.bytes.clone();
