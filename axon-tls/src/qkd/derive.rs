@@ -56,25 +56,27 @@ pub fn derive_psk(
         return Err(Error::EqualSaeIds);
     }
 
-    let (hash_name, hash) = match cipher {
-        Cipher::ChaCha20Poly1305 => ("SHA256", HashAlgorithm::SHA256),
-        Cipher::Aes256Gcm => ("SHA384", HashAlgorithm::SHA384),
+    let (hash_name, hash, len) = match cipher {
+        Cipher::ChaCha20Poly1305 => ("SHA256", HashAlgorithm::SHA256, 32),
+        Cipher::Aes256Gcm => ("SHA384", HashAlgorithm::SHA384, 48),
     };
-    let mut info = Vec::new();
-    for part in [key_id, client_sae, server_sae, hash_name] {
-        length_prefixed(&mut info, part.as_bytes());
-    }
+    let secret = secret(key, [key_id, client_sae, server_sae, hash_name], len)?;
+    let psk = ExternalPsk::new(identity.to_bytes(), secret, hash)?;
+    Ok(Psk { psk: Arc::new(psk), cipher })
+}
 
-    let len = if hash == HashAlgorithm::SHA384 { 48 } else { 32 };
+fn secret(key: &[u8; 32], names: [&str; 4], len: usize) -> Result<Zeroizing<Vec<u8>>, Error> {
+    let mut info = Vec::new();
+    for name in names {
+        length_prefixed(&mut info, name.as_bytes());
+    }
     let mut secret = Zeroizing::new(vec![0; len]);
     Salt::new(HKDF_SHA256, SALT)
         .extract(key)
         .expand(&[&info], Len(len))
         .and_then(|okm| okm.fill(&mut secret))
         .map_err(|_| Error::KeyGeneration)?;
-
-    let psk = ExternalPsk::new(identity.to_bytes(), secret, hash)?;
-    Ok(Psk { psk: Arc::new(psk), cipher })
+    Ok(secret)
 }
 
 const SALT: &[u8] = b"AXON-QKD-TLS13-EXTERNAL-PSK-v1";
@@ -91,5 +93,47 @@ struct Len(usize);
 impl KeyType for Len {
     fn len(&self) -> usize {
         self.0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The vectors are from `tests/vectors/make.py`, which knows nothing of this file.
+    #[test]
+    fn vectors() {
+        let vectors: Vec<serde_json::Value> =
+            serde_json::from_str(include_str!("../../tests/vectors/psk.json")).unwrap();
+        assert_eq!(vectors.len(), 12);
+        for vector in vectors {
+            let text = |name: &str| vector[name].as_str().unwrap();
+            let key: Vec<u8> = (0..32)
+                .map(|at| u8::from_str_radix(&text("key")[2 * at..][..2], 16).unwrap())
+                .collect();
+            let key: [u8; 32] = key.try_into().unwrap();
+            let (cipher, len) = match text("hash") {
+                "SHA256" => (Cipher::ChaCha20Poly1305, 32),
+                _ => (Cipher::Aes256Gcm, 48),
+            };
+            let (key_id, client, server) = (text("key_id"), text("client_sae"), text("server_sae"));
+
+            let psk = derive_psk(&key, key_id, client, server, cipher).unwrap();
+            assert_eq!(psk.identity(), text("identity").as_bytes());
+            assert_eq!(psk.cipher(), cipher);
+            let secret = secret(&key, [key_id, client, server, text("hash")], len).unwrap();
+            let hex: String = secret.iter().map(|byte| format!("{byte:02x}")).collect();
+            assert_eq!(hex, text("psk"));
+        }
+    }
+
+    #[test]
+    fn names_that_cannot_be_told_apart_are_refused() {
+        let derive = |client, server| derive_psk(&[1; 32], "k", client, server, Cipher::default());
+        assert!(matches!(derive("a", "a"), Err(Error::EqualSaeIds)));
+        assert!(derive("", "a").is_err());
+        assert!(derive("a", "").is_err());
+        assert!(derive("a", &"b".repeat(256)).is_err());
+        assert!(derive_psk(&[1; 32], "", "a", "b", Cipher::default()).is_err());
     }
 }

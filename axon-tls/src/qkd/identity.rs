@@ -4,7 +4,7 @@ use std::fmt;
 
 use crate::Error;
 
-/// `axon-qkd-v1:CLIENT-SAE:key_ID`, with the SAE ID percent-encoded.
+/// `axon-qkd-v1:CLIENT-SAE:key_ID`, with both names percent-encoded.
 ///
 /// Printable ASCII, at most 128 bytes. There is one spelling for each pair of names: the parser
 /// refuses every other, so identities can be compared as bytes. The key_ID is kept exactly as it
@@ -21,16 +21,14 @@ impl PskIdentity {
 
     /// Names the key `key_id` of the client `client_sae`.
     ///
-    /// `key_id` must be printable ASCII without blanks; KMEs use UUIDs.
+    /// Fails if one of them is empty, or if the identity would be longer than
+    /// [`PskIdentity::MAX_LEN`].
     pub fn new(client_sae: &str, key_id: &str) -> Result<Self, Error> {
         if client_sae.is_empty() {
             return Err(Error::Name { what: "client SAE ID", reason: "is empty" });
         }
-        if key_id.is_empty() || !key_id.bytes().all(|byte| byte.is_ascii_graphic()) {
-            return Err(Error::Name {
-                what: "key_ID",
-                reason: "must be printable ASCII without blanks",
-            });
+        if key_id.is_empty() {
+            return Err(Error::Name { what: "key_ID", reason: "is empty" });
         }
         let identity = Self { client_sae: client_sae.to_owned(), key_id: key_id.to_owned() };
         if identity.to_string().len() > Self::MAX_LEN {
@@ -51,11 +49,11 @@ impl PskIdentity {
         let rest = text.strip_prefix(PREFIX).ok_or(Error::PskIdentity("another prefix"))?;
         let (sae, key_id) = rest.split_once(':').ok_or(Error::PskIdentity("no key_ID"))?;
 
-        let client_sae = decode(sae).ok_or(Error::PskIdentity("SAE ID is not percent-encoded"))?;
-        let identity =
-            Self::new(&client_sae, key_id).map_err(|_| Error::PskIdentity("unusable names"))?;
+        let decoded = |name| decode(name).ok_or(Error::PskIdentity("not percent-encoded"));
+        let identity = Self::new(&decoded(sae)?, &decoded(key_id)?)
+            .map_err(|_| Error::PskIdentity("a name is empty"))?;
         if identity.to_string() != text {
-            return Err(Error::PskIdentity("SAE ID is encoded in an unusual way"));
+            return Err(Error::PskIdentity("percent-encoded in another way than AXON does"));
         }
         Ok(identity)
     }
@@ -79,15 +77,21 @@ impl PskIdentity {
 impl fmt::Display for PskIdentity {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(PREFIX)?;
-        for byte in self.client_sae.bytes() {
-            if is_unreserved(byte) {
-                write!(f, "{}", char::from(byte))?;
-            } else {
-                write!(f, "%{byte:02X}")?;
-            }
-        }
-        write!(f, ":{}", self.key_id)
+        encode(f, &self.client_sae)?;
+        f.write_str(":")?;
+        encode(f, &self.key_id)
     }
+}
+
+fn encode(f: &mut fmt::Formatter<'_>, name: &str) -> fmt::Result {
+    for byte in name.bytes() {
+        if is_unreserved(byte) {
+            write!(f, "{}", char::from(byte))?;
+        } else {
+            write!(f, "%{byte:02X}")?;
+        }
+    }
+    Ok(())
 }
 
 const PREFIX: &str = "axon-qkd-v1:";
@@ -120,7 +124,7 @@ mod tests {
     #[test]
     fn hostile_identities_are_refused() {
         let long = format!("axon-qkd-v1:{}:k", "a".repeat(115));
-        let hostile: [&[u8]; 16] = [
+        let hostile: [&[u8]; 18] = [
             b"",
             b"axon-qkd-v1",
             b"axon-qkd-v1:",
@@ -136,6 +140,8 @@ mod tests {
             b"axon-qkd-v1:sae%c3%a9:key",
             b"axon-qkd-v1:sae%FF:key",
             b"axon-qkd-v1:sae:k y",
+            b"axon-qkd-v1:sae:key:more",
+            b"axon-qkd-v1:sae:%6bey",
             b"axon-qkd-v1:sae\xff:key",
         ];
         for bytes in hostile.into_iter().chain([long.as_bytes()]) {

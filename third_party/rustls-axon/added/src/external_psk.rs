@@ -212,7 +212,8 @@ impl<'a> ExternalPskOffer<'a> {
 
     /// The server name that the client sent, if any.
     pub fn server_name(&self) -> Option<&str> {
-        self.server_name.map(|name| name.as_ref())
+        self.server_name
+            .map(|name| name.as_ref())
     }
 }
 

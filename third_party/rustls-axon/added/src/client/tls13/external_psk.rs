@@ -11,6 +11,7 @@ use super::{
 };
 use crate::NoKeyLog;
 use crate::client::ClientConfig;
+use crate::client::ClientConnectionData;
 use crate::client::common::ClientHelloDetails;
 use crate::client::hs::{ClientContext, ClientHelloInput};
 use crate::common_state::{HandshakeKind, Protocol, State};
@@ -18,12 +19,10 @@ use crate::conn::ConnectionRandoms;
 use crate::crypto::hash::HashAlgorithm;
 use crate::crypto::{ActiveKeyExchange, SharedSecret};
 use crate::enums::{AlertDescription, CipherSuite, HandshakeType};
-use crate::check::inappropriate_handshake_message;
 use crate::error::{Error, PeerMisbehaved};
 use crate::external_psk::{
     ExternalPsk, MAX_IDENTITIES_LEN, NegotiatedExternalPsk, PskKeyExchangeMode,
 };
-use crate::client::ClientConnectionData;
 use crate::hash_hs::{HandshakeHash, HandshakeHashBuffer};
 use crate::msgs::enums::NamedGroup;
 use crate::msgs::handshake::{
@@ -33,9 +32,7 @@ use crate::msgs::handshake::{
 use crate::msgs::message::{Message, MessagePayload};
 use crate::sync::Arc;
 use crate::tls13::Tls13CipherSuite;
-use crate::tls13::key_schedule::{
-    KeyScheduleEarly, KeyScheduleHandshake, KeySchedulePreHandshake,
-};
+use crate::tls13::key_schedule::{KeyScheduleEarly, KeyScheduleHandshake, KeySchedulePreHandshake};
 use crate::verify::{HandshakeSignatureValid, ServerCertVerified};
 
 /// The external PSKs that one connection offers.
@@ -236,8 +233,7 @@ pub(in crate::client) fn handle_server_hello(
     let psk = offered.selected(cx, server_hello.preshared_key, suite)?;
     let shared_secret = complete_key_exchange(cx, server_hello, our_key_share)?;
 
-    let key_schedule =
-        KeySchedulePreHandshake::from(KeyScheduleEarly::new(suite, psk.secret()));
+    let key_schedule = KeySchedulePreHandshake::from(KeyScheduleEarly::new(suite, psk.secret()));
     let key_schedule = match shared_secret {
         Some(shared_secret) => key_schedule.into_handshake(shared_secret),
         None => key_schedule.into_handshake_without_shared_secret(),

@@ -30,9 +30,7 @@ use crate::server::tls13::{ExpectAndSkipRejectedEarlyData, ExpectFinished};
 use crate::suites::SupportedCipherSuite;
 use crate::sync::Arc;
 use crate::tls13::Tls13CipherSuite;
-use crate::tls13::key_schedule::{
-    KeyScheduleEarly, KeyScheduleHandshake, KeySchedulePreHandshake,
-};
+use crate::tls13::key_schedule::{KeyScheduleEarly, KeyScheduleHandshake, KeySchedulePreHandshake};
 
 /// Handles a ClientHello under a config that has external PSKs, up to our Finished.
 pub(in crate::server) fn handle_client_hello(
@@ -50,7 +48,9 @@ pub(in crate::server) fn handle_client_hello(
         ..
     } = st;
     let mode = external_psks.mode;
-    let early_data_requested = client_hello.early_data_request.is_some();
+    let early_data_requested = client_hello
+        .early_data_request
+        .is_some();
 
     check_offer_is_well_formed(cx, client_hello, previous_hello.as_ref())?;
     let offer = offer_in_mode(cx, client_hello, mode)?;
@@ -227,7 +227,11 @@ fn check_offer_is_well_formed(
         ));
     }
 
-    if previous_hello.is_some() && client_hello.early_data_request.is_some() {
+    if previous_hello.is_some()
+        && client_hello
+            .early_data_request
+            .is_some()
+    {
         return Err(cx.common.send_fatal_alert(
             AlertDescription::IllegalParameter,
             PeerMisbehaved::EarlyDataAttemptedInSecondClientHello,
@@ -380,7 +384,8 @@ fn choose_group(
             .iter()
             .copied()
             .filter(|group| {
-                group.usable_for_version(ProtocolVersion::TLSv1_3) && offered.contains(&group.name())
+                group.usable_for_version(ProtocolVersion::TLSv1_3)
+                    && offered.contains(&group.name())
             })
     };
 
@@ -440,8 +445,8 @@ fn emit_server_hello(
 
     let sh = Message {
         version: ProtocolVersion::TLSv1_2,
-        payload: MessagePayload::handshake(HandshakeMessagePayload(
-            HandshakePayload::ServerHello(ServerHelloPayload {
+        payload: MessagePayload::handshake(HandshakeMessagePayload(HandshakePayload::ServerHello(
+            ServerHelloPayload {
                 legacy_version: ProtocolVersion::TLSv1_2,
                 random: Random::from(randoms.server),
                 session_id: *session_id,
@@ -454,8 +459,8 @@ fn emit_server_hello(
                     preshared_key: Some(psk_index as u16),
                     ..Default::default()
                 }),
-            }),
-        )),
+            },
+        ))),
     };
 
     cx.common.check_aligned_handshake()?;
