@@ -1,0 +1,107 @@
+//! Who has which bytes of a ring's payload area: first fit from the bottom, so that a ring touches
+//! little more memory than what stands in it.
+
+use super::layout::GRANULE;
+
+/// The free ranges of an area.
+#[derive(Debug)]
+pub(super) struct Area {
+    /// Start and end in bytes, ascending, never touching each other.
+    free: Vec<(u64, u64)>,
+}
+
+impl Area {
+    /// An area of `size` bytes in which up to `pieces` pieces are expected at a time.
+    pub(super) fn new(size: u64, pieces: usize) -> Self {
+        let mut free = Vec::with_capacity(pieces + 1);
+        free.push((0, size));
+        Self { free }
+    }
+
+    /// Bytes that a sample of `len` bytes takes.
+    pub(super) fn rounded(len: u64) -> u64 {
+        len.max(1).next_multiple_of(GRANULE)
+    }
+
+    /// The lowest place for `len` bytes, a multiple of the granule.
+    pub(super) fn allocate(&mut self, len: u64) -> Option<u64> {
+        let index = self.free.iter().position(|&(start, end)| end - start >= len)?;
+        let (start, end) = &mut self.free[index];
+        let at = *start;
+        *start += len;
+        if start == end {
+            self.free.remove(index);
+        }
+        Some(at)
+    }
+
+    /// Gives back what [`Area::allocate`] gave.
+    pub(super) fn release(&mut self, at: u64, len: u64) {
+        let index = self.free.partition_point(|&(start, _)| start < at);
+        let touches_below = index > 0 && self.free[index - 1].1 == at;
+        let touches_above = self.free.get(index).is_some_and(|&(start, _)| start == at + len);
+        match (touches_below, touches_above) {
+            (true, true) => {
+                self.free[index - 1].1 = self.free[index].1;
+                self.free.remove(index);
+            }
+            (true, false) => self.free[index - 1].1 = at + len,
+            (false, true) => self.free[index].0 = at,
+            (false, false) => self.free.insert(index, (at, at + len)),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::VecDeque;
+
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn pieces_never_overlap_and_all_comes_back(
+            lens in proptest::collection::vec(1u64..5000, 1..200),
+            keep in 0usize..20,
+        ) {
+            let size = 1 << 16;
+            let mut area = Area::new(size, 4);
+            let mut live: VecDeque<(u64, u64)> = VecDeque::new();
+            for len in lens {
+                let len = Area::rounded(len);
+                let at = loop {
+                    if let Some(at) = area.allocate(len) {
+                        break at;
+                    }
+                    let (at, len) = live.pop_front().expect("one piece fits in an empty area");
+                    area.release(at, len);
+                };
+                prop_assert!(at % GRANULE == 0 && at + len <= size);
+                for &(other, length) in &live {
+                    prop_assert!(at + len <= other || other + length <= at);
+                }
+                live.push_back((at, len));
+                while live.len() > keep {
+                    let (at, len) = live.pop_front().unwrap();
+                    area.release(at, len);
+                }
+            }
+            for (at, len) in live {
+                area.release(at, len);
+            }
+            prop_assert_eq!(area.free, vec![(0, size)]);
+        }
+    }
+
+    #[test]
+    fn the_bottom_is_reused_first() {
+        let mut area = Area::new(1 << 20, 4);
+        let pieces: Vec<_> = (0..4).map(|_| area.allocate(128).unwrap()).collect();
+        area.release(pieces[0], 128);
+        area.release(pieces[1], 128);
+        assert_eq!(area.allocate(256), Some(0));
+        assert_eq!(area.allocate(64), Some(512));
+    }
+}

@@ -1,0 +1,140 @@
+//! What can go wrong, for whom, and what to do about it.
+
+use std::io;
+
+use crate::ids::{Gid, SessionId};
+
+/// A segment could not be made, checked or mapped.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ShmError {
+    /// A system call failed.
+    #[error("shared memory: {what}: {source}")]
+    System {
+        /// What was being done.
+        what: &'static str,
+        /// What the system answered.
+        source: io::Error,
+    },
+    /// There is not enough memory to back a new segment.
+    #[error(
+        "shared memory: {needed} bytes needed, {available} available: \
+         free memory or raise the memory limit of this process's control group"
+    )]
+    NoMemory {
+        /// Bytes that were needed.
+        needed: u64,
+        /// Bytes available to this process when it asked.
+        available: u64,
+    },
+    /// A descriptor from another process is not a segment as it must be.
+    #[error("shared memory of another process refused: {what}")]
+    Refused {
+        /// What was wrong with it.
+        what: &'static str,
+    },
+    /// The ring would need more address space than one may take.
+    #[error(
+        "a ring for messages of {max_message} bytes and {budget} bytes of history is too large: \
+         messages may take {} bytes and histories {} bytes",
+        super::layout::MAX_MESSAGE,
+        super::layout::MAX_BUDGET
+    )]
+    TooLarge {
+        /// The largest message that was asked for, in bytes.
+        max_message: u64,
+        /// The history that was asked for, in bytes.
+        budget: u64,
+    },
+    /// The session reads as many rings as a session may.
+    #[error("session {session} has no free reader lane left (of {lanes}): close subscriptions")]
+    NoLane {
+        /// The session.
+        session: SessionId,
+        /// How many lanes it has.
+        lanes: u32,
+    },
+    /// A second waiter asked to lead the session's waits.
+    #[error("session {0} already has an external leader of its waits")]
+    AlreadyLed(SessionId),
+    /// The process forked: what was created before belongs to the parent.
+    #[error("used after fork: a child process must open a session of its own")]
+    Forked,
+}
+
+impl ShmError {
+    pub(super) fn system(what: &'static str) -> impl FnOnce(rustix::io::Errno) -> Self {
+        move |errno| Self::System { what, source: errno.into() }
+    }
+}
+
+/// A sample was not published.
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum PublishError {
+    /// The sample is larger than the ring was made for.
+    #[error("sample of {len} bytes; the largest is {max} (AXON_MAX_MESSAGE_MB)")]
+    TooLarge {
+        /// The sample's length in bytes.
+        len: u64,
+        /// The largest, in bytes.
+        max: u64,
+    },
+    /// A KEEP_ALL reader left no room for the whole time that a publish waits.
+    #[error("reader {reader} takes samples too slowly: KEEP_ALL history is full")]
+    Blocked {
+        /// The reader that lags.
+        reader: Gid,
+    },
+    /// Memory to hold the sample is not available.
+    #[error(
+        "no memory for the sample: {needed} bytes more needed, {available} available: \
+         free memory or raise the memory limit of this process's control group"
+    )]
+    NoMemory {
+        /// Bytes that were needed.
+        needed: u64,
+        /// Bytes available to this process when it asked.
+        available: u64,
+    },
+    /// Loans that were neither published nor dropped hold the ring's memory.
+    #[error("{loans} loans hold the ring's memory: publish or drop them first")]
+    Loaned {
+        /// How many loans are out.
+        loans: u32,
+    },
+    /// A loan was published before all of it was written.
+    #[error("loan of {len} bytes published with {written} written")]
+    Incomplete {
+        /// The loan's length in bytes.
+        len: u64,
+        /// Bytes that were written.
+        written: u64,
+    },
+    /// The process forked: the publisher belongs to the parent.
+    #[error("used after fork: a child process must open a session of its own")]
+    Forked,
+}
+
+/// A ring could not be read.
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum TakeError {
+    /// The publisher's process wrote what no publisher writes. The ring is not read again.
+    #[error("ring of publisher {writer} is corrupt ({what}): dropped")]
+    Corrupt {
+        /// The publisher.
+        writer: Gid,
+        /// What was wrong.
+        what: &'static str,
+    },
+    /// The sample does not fit in this process's memory.
+    #[error("no memory to take a sample of {len} bytes")]
+    NoMemory {
+        /// The sample's length in bytes.
+        len: u64,
+    },
+    /// The process forked: the subscription belongs to the parent.
+    #[error("used after fork: a child process must open a session of its own")]
+    Forked,
+}

@@ -1,0 +1,174 @@
+//! This process's own session segment: the lanes of its readers and the words that say who sleeps.
+
+use std::{
+    os::fd::{AsFd, BorrowedFd, OwnedFd},
+    sync::{Arc, Mutex, PoisonError, atomic::AtomicU64},
+    time::Duration,
+};
+
+use rustix::process::{PidfdFlags, getpid, pidfd_open};
+
+use super::{Lane, PeerDescriptors, ShmError, layout, memory::Segment};
+use crate::{
+    ids::SessionId,
+    wait::{Doorbell, ExternalLeader, Purpose, due},
+};
+
+/// The memory, doorbell and identity by which other sessions know this one.
+///
+/// One per session; a process may have several. All methods may be called from any thread.
+pub struct SessionSegment {
+    id: SessionId,
+    segment: Segment,
+    doorbell: Doorbell,
+    pidfd: OwnedFd,
+    lanes: Mutex<Lanes>,
+    /// The last ticket of each of our own armed words that we rang for.
+    rung: [AtomicU64; 2],
+}
+
+struct Lanes {
+    free: Vec<u32>,
+    /// Lanes from here on have never been used.
+    fresh: u32,
+    /// Bytes of the segment that are backed by memory.
+    committed: u64,
+}
+
+impl SessionSegment {
+    /// Makes the segment of a new session.
+    ///
+    /// # Errors
+    /// The system has no memory or descriptors left, or lacks sealed memfds or pidfds (Linux 5.3).
+    pub fn create(id: SessionId) -> Result<Arc<Self>, ShmError> {
+        let segment = Segment::create("axon-session", layout::session_bytes())?;
+        segment.commit(0, layout::ALIGN)?;
+        layout::write_session(segment.words(), id);
+        let pidfd = pidfd_open(getpid(), PidfdFlags::empty())
+            .map_err(ShmError::system("opening a pidfd of this process"))?;
+        Ok(Arc::new(Self {
+            id,
+            segment,
+            doorbell: Doorbell::new().map_err(ShmError::system("creating a doorbell"))?,
+            pidfd,
+            lanes: Mutex::new(Lanes { free: Vec::new(), fresh: 0, committed: layout::ALIGN }),
+            rung: Default::default(),
+        }))
+    }
+
+    /// Its id.
+    pub fn id(&self) -> SessionId {
+        self.id
+    }
+
+    /// Duplicates of the descriptors that other sessions need.
+    ///
+    /// # Errors
+    /// The process has no descriptors left.
+    pub fn descriptors(&self) -> Result<PeerDescriptors, ShmError> {
+        let clone = |fd: BorrowedFd<'_>| {
+            fd.try_clone_to_owned()
+                .map_err(|source| ShmError::System { what: "duplicating a descriptor", source })
+        };
+        Ok(PeerDescriptors {
+            segment: clone(self.segment.fd())?,
+            doorbell: clone(self.doorbell.bell().as_fd())?,
+            pidfd: clone(self.pidfd.as_fd())?,
+        })
+    }
+
+    /// The eventfd that is readable when this session was rung.
+    pub fn doorbell(&self) -> BorrowedFd<'_> {
+        self.doorbell.bell().as_fd()
+    }
+
+    /// A lane for a reader that is about to attach.
+    ///
+    /// # Errors
+    /// All lanes are taken, or memory is short.
+    pub fn allocate_lane(self: &Arc<Self>) -> Result<Lane, ShmError> {
+        if self.segment.is_forked() {
+            return Err(ShmError::Forked);
+        }
+        let mut lanes = self.lanes.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(index) = lanes.free.pop() {
+            return Ok(Lane::new(Arc::clone(self), index));
+        }
+        let index = lanes.fresh;
+        if index == layout::LANES {
+            return Err(ShmError::NoLane { session: self.id, lanes: layout::LANES });
+        }
+        let end = layout::lane_end(index);
+        if end > lanes.committed {
+            let upto = end.next_multiple_of(layout::ALIGN);
+            self.segment.commit(lanes.committed, upto)?;
+            lanes.committed = upto;
+        }
+        lanes.fresh += 1;
+        Ok(Lane::new(Arc::clone(self), index))
+    }
+
+    /// Blocks until `ready`, which is asked again whenever a publisher or [`Self::notify`] rang,
+    /// or until `timeout` has passed. Returns what `ready` said last.
+    ///
+    /// Any number of threads may wait; none of our locks is held while `ready` runs.
+    pub fn wait(&self, mut ready: impl FnMut() -> bool, timeout: Option<Duration>) -> bool {
+        if self.segment.is_forked() {
+            return ready();
+        }
+        self.doorbell.wait(self.armed_word(Purpose::Samples), Purpose::Samples, ready, &[], timeout)
+    }
+
+    /// Makes every waiter of this session look again.
+    pub fn notify(&self) {
+        self.doorbell.notify();
+    }
+
+    /// Lets an event loop lead this session's waits.
+    ///
+    /// # Errors
+    /// There is one already.
+    pub fn external_leader(self: &Arc<Self>) -> Result<ExternalLeader, ShmError> {
+        ExternalLeader::new(Arc::clone(self)).ok_or(ShmError::AlreadyLed(self.id))
+    }
+
+    /// Waits for room to publish; also looks again when one of `others` becomes readable.
+    pub(super) fn wait_for_room(
+        &self,
+        ready: impl FnMut() -> bool,
+        others: &[BorrowedFd<'_>],
+        timeout: Duration,
+    ) -> bool {
+        let word = self.armed_word(Purpose::Room);
+        self.doorbell.wait(word, Purpose::Room, ready, others, Some(timeout))
+    }
+
+    pub(crate) fn doorbell_hub(&self) -> &Doorbell {
+        &self.doorbell
+    }
+
+    pub(crate) fn armed_word(&self, purpose: Purpose) -> &AtomicU64 {
+        &self.segment.words()[match purpose {
+            Purpose::Samples => layout::session::ARMED,
+            Purpose::Room => layout::session::BLOCKED,
+        }]
+    }
+
+    pub(super) fn ring_if(&self, purpose: Purpose) {
+        if due(self.armed_word(purpose), &self.rung[purpose as usize]) {
+            self.doorbell.bell().ring();
+        }
+    }
+
+    pub(super) fn lane_words(&self, index: u32) -> &[AtomicU64] {
+        layout::lane_words(self.segment.words(), index)
+    }
+
+    pub(super) fn is_forked(&self) -> bool {
+        self.segment.is_forked()
+    }
+
+    pub(super) fn free_lane(&self, index: u32) {
+        self.lanes.lock().unwrap_or_else(PoisonError::into_inner).free.push(index);
+    }
+}

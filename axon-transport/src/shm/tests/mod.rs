@@ -1,0 +1,96 @@
+//! Two ends of a ring: in one process, in two, with a hostile one, and under the model checker.
+
+mod hostile;
+mod local;
+mod model;
+mod processes;
+
+use std::sync::Arc;
+
+use super::*;
+use crate::{
+    ids::{Gid, SessionId},
+    qos::{Durability, History, Qos},
+};
+
+const MAX: u64 = 1 << 20;
+
+fn session() -> Arc<SessionSegment> {
+    SessionSegment::create(SessionId::random()).unwrap()
+}
+
+fn keep_last(depth: u32) -> Qos {
+    Qos { history: History::KeepLast, depth, ..Qos::default() }
+}
+
+fn transient(qos: Qos) -> Qos {
+    Qos { durability: Durability::TransientLocal, ..qos }
+}
+
+fn writer(session: &Arc<SessionSegment>, qos: Qos, budget: u64) -> Writer {
+    let gid = Gid::new(session.id(), 1);
+    Writer::create(session.clone(), RingOptions { gid, qos, budget, max_message: MAX }).unwrap()
+}
+
+/// How `of` looks to `from`.
+fn peer(from: &SessionSegment, of: &Arc<SessionSegment>) -> Peer {
+    if from.id() == of.id() {
+        Peer::Local(of.clone())
+    } else {
+        Peer::Remote(PeerSession::map(of.id(), of.descriptors().unwrap()).unwrap())
+    }
+}
+
+/// A subscription in `reader` on a publisher in `publisher`.
+fn attach(
+    writer: &Writer,
+    publisher: &Arc<SessionSegment>,
+    reader: &Arc<SessionSegment>,
+    qos: Qos,
+) -> Reader {
+    let lane = reader.allocate_lane().unwrap();
+    let gid = Gid::new(reader.id(), 100 + lane.index());
+    let grant = writer
+        .attach(ReaderInfo {
+            gid,
+            lane: lane.index(),
+            qos,
+            peer: peer(publisher, reader),
+            stands_for: Vec::new(),
+        })
+        .unwrap();
+    let options = ReaderOptions {
+        reader: gid,
+        writer: writer.gid(),
+        peer: peer(reader, publisher),
+        lane,
+        grant,
+        qos,
+        max_message: MAX,
+    };
+    Reader::map(writer.descriptor().unwrap(), options).unwrap()
+}
+
+fn meta(sequence: u64) -> Meta {
+    Meta { sequence, source_timestamp: sequence.cast_signed() * 7 - 3 }
+}
+
+/// Bytes that differ by sequence number and place.
+fn pattern(sequence: u64, len: usize) -> Vec<u8> {
+    let mut state = sequence.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
+    let mut bytes = Vec::with_capacity(len + 8);
+    while bytes.len() < len {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        bytes.extend_from_slice(&state.to_le_bytes());
+    }
+    bytes.truncate(len);
+    bytes
+}
+
+/// The lengths at which something changes: none, inline, words, granules, pages, powers of two.
+fn lengths() -> Vec<usize> {
+    let around = (3..=18).flat_map(|power| [(1 << power) - 1, 1 << power, (1 << power) + 1]);
+    (0..=200).chain(around).collect()
+}

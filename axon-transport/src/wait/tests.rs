@@ -1,0 +1,140 @@
+//! No ring is ever lost: under the model checker and under load.
+
+use std::{
+    os::fd::AsFd,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, AtomicU64, Ordering},
+    },
+    thread,
+    time::Duration,
+};
+
+use rustix::event::{PollFd, PollFlags, poll};
+
+use super::{arm, disarm, due, settle};
+use crate::{ids::SessionId, shm::SessionSegment};
+
+/// Long enough that only a lost wake-up takes it.
+const EVER: Option<Duration> = Some(Duration::from_secs(60));
+
+#[test]
+fn the_last_look_or_the_ring_finds_what_came() {
+    use loom::{
+        sync::{Arc, Condvar, Mutex, atomic::AtomicU64},
+        thread,
+    };
+
+    loom::model(|| {
+        let head = Arc::new(AtomicU64::new(0));
+        let armed = Arc::new(AtomicU64::new(0));
+        let bell = Arc::new((Mutex::new(false), Condvar::new()));
+        let waker = {
+            let (head, armed, bell) = (head.clone(), armed.clone(), bell.clone());
+            thread::spawn(move || {
+                let rung = AtomicU64::new(0);
+                for position in 1..=2 {
+                    head.store(position, Ordering::Release);
+                    settle::<AtomicU64>();
+                    if due(&*armed, &rung) {
+                        *bell.0.lock().unwrap() = true;
+                        bell.1.notify_one();
+                    }
+                }
+            })
+        };
+        let mut ticket = 0;
+        for wanted in 1..=2 {
+            loop {
+                ticket += 1;
+                arm(&*armed, ticket);
+                if head.load(Ordering::Acquire) >= wanted {
+                    break;
+                }
+                let mut rung = bell.0.lock().unwrap();
+                while !*rung {
+                    // The model fails here when nobody is left to ring.
+                    rung = bell.1.wait(rung).unwrap();
+                }
+                *rung = false;
+            }
+        }
+        disarm(&*armed);
+        waker.join().unwrap();
+    });
+}
+
+#[test]
+fn each_waiter_of_a_crowd_is_woken() {
+    let session = SessionSegment::create(SessionId::random()).unwrap();
+    let turn = AtomicU64::new(0);
+    let threads = 4;
+    let rounds = 3000;
+    thread::scope(|scope| {
+        for me in 0..threads {
+            let (session, turn) = (&session, &turn);
+            scope.spawn(move || {
+                for round in 0..rounds {
+                    let mine = round * threads + me;
+                    assert!(session.wait(|| turn.load(Ordering::Acquire) == mine, EVER));
+                    turn.store(mine + 1, Ordering::Release);
+                    session.notify();
+                }
+            });
+        }
+    });
+}
+
+#[test]
+fn a_wait_ends_with_its_time_and_disarms() {
+    use crate::wait::Purpose;
+    let session = SessionSegment::create(SessionId::random()).unwrap();
+    assert!(!session.wait(|| false, Some(Duration::from_millis(5))));
+    assert!(!session.wait(|| false, Some(Duration::ZERO)));
+    assert!(session.wait(|| true, None));
+    assert_eq!(session.armed_word(Purpose::Samples).load(Ordering::Relaxed), 0);
+}
+
+#[test]
+fn an_external_leader_and_blocked_threads_share_the_doorbell() {
+    let session = SessionSegment::create(SessionId::random()).unwrap();
+    let rounds = 2000;
+    let (ping, pong) = (AtomicU64::new(0), AtomicU64::new(0));
+    let over = AtomicBool::new(false);
+    thread::scope(|scope| {
+        // Leads for a while as a thread, then follows.
+        scope.spawn(|| {
+            for round in 1..=rounds {
+                assert!(session.wait(|| ping.load(Ordering::Acquire) == round, EVER));
+                pong.store(round, Ordering::Release);
+                session.notify();
+            }
+            over.store(true, Ordering::Release);
+            session.notify();
+        });
+        let leader = session.external_leader().unwrap();
+        assert!(session.external_leader().is_err());
+        let mut round = 1;
+        ping.store(round, Ordering::Release);
+        session.notify();
+        loop {
+            leader.clear();
+            leader.arm(true);
+            if pong.load(Ordering::Acquire) == round {
+                leader.disarm();
+                if round == rounds {
+                    break;
+                }
+                round += 1;
+                ping.store(round, Ordering::Release);
+                session.notify();
+                continue;
+            }
+            let mut fds = [PollFd::from_borrowed_fd(leader.as_fd(), PollFlags::IN)];
+            assert_eq!(poll(&mut fds, EVER.map(|d| d.try_into().unwrap()).as_ref()), Ok(1));
+        }
+        drop(leader);
+        assert!(session.wait(|| over.load(Ordering::Acquire), EVER));
+    });
+    assert!(Arc::clone(&session).external_leader().is_ok());
+}
