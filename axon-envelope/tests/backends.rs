@@ -74,3 +74,20 @@ fn neither_seals_or_opens_between_buffers_of_different_lengths() {
     check::<AwsLc>();
     check::<RustCrypto>();
 }
+
+#[test]
+fn both_leave_zeroes_where_a_refused_message_lay() {
+    fn check<A: Aead>() {
+        let mut envelope = seal::<A>(1, [0; 8], &[&[0x5a; 100]]);
+        let body = envelope.len() - 116;
+        let mut opener = Opener::<A>::with_limits(channel(), Limits::default()).unwrap();
+        let mut out = [0xaa; 100];
+        // No key is held, so all there is to decrypt with is the opener's decoy.
+        opener.open_into(START, ROUTE, &envelope, &mut out).unwrap_err();
+        assert_eq!(out, [0; 100], "{}", A::NAME);
+        opener.open_in_place(START, ROUTE, &mut envelope).unwrap_err();
+        assert_eq!(envelope[body..][..100], [0; 100], "{}", A::NAME);
+    }
+    check::<AwsLc>();
+    check::<RustCrypto>();
+}
