@@ -169,7 +169,8 @@ impl KeyMessage {
                 (READY | FAILED | RETIRE, 0) => fields.key_id = Some(key_id(&mut d)?),
                 (READY, 1) => {
                     let bytes = d.bytes()?.try_into();
-                    fields.proof = Some(bytes.map_err(|_| MessageError::Range("a proof has 32 bytes"))?);
+                    fields.proof =
+                        Some(bytes.map_err(|_| MessageError::Range("a proof has 32 bytes"))?);
                 }
                 (FAILED, 1) => {
                     let reason = d.str()?;
@@ -226,7 +227,8 @@ pub(super) fn announceable(key_id: &KeyId) -> bool {
 }
 
 fn text(key_id: &KeyId) -> &str {
-    std::str::from_utf8(key_id.as_bytes()).expect("key_IDs are checked to be text before they are announced")
+    std::str::from_utf8(key_id.as_bytes())
+        .expect("key_IDs are checked to be text before they are announced")
 }
 
 /// As much of a reason as the format takes, cut between characters.
@@ -301,7 +303,10 @@ mod tests {
             KeyMessage::decode(RETIRE, &[0xa3, 0, 0x61, b'k', 1, 0x19, 4, 0, 2, 0]),
             Err(MessageError::Range(_))
         ));
-        assert_eq!(KeyMessage::decode(READY, &[0xa1, 0, 0x61, b'k']), Err(MessageError::Missing(1)));
+        assert_eq!(
+            KeyMessage::decode(READY, &[0xa1, 0, 0x61, b'k']),
+            Err(MessageError::Missing(1))
+        );
         assert_eq!(KeyMessage::decode(7, &[0xa0]), Err(MessageError::Type(7)));
         assert!(KeyMessage::decode(FAILED, &[0xa0, 0]).is_err());
     }
@@ -315,7 +320,10 @@ mod tests {
     #[test]
     fn a_long_reason_is_cut_at_a_character() {
         let m = KeyMessage::Failed { key_id: id("k"), reason: "ä".repeat(100) + "x" };
-        let KeyMessage::Failed { reason, .. } = KeyMessage::decode(FAILED, &encode(&m)).unwrap() else { panic!() };
+        let KeyMessage::Failed { reason, .. } = KeyMessage::decode(FAILED, &encode(&m)).unwrap()
+        else {
+            panic!()
+        };
         assert_eq!(reason, "ä".repeat(64));
     }
 

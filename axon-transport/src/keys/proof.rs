@@ -67,8 +67,18 @@ mod tests {
         let rising: Vec<u8> = (0..32).collect();
         let falling: Vec<u8> = (0..32).rev().map(|i| i * 8).collect();
         for (key, key_id, ready, expected) in [
-            (&rising, "bc490419-7d60-487f-adc1-4ddcc177c139", &falling[..], "ecfe13c9492accb137459ca74f8639bae49af7d8f1a5c799ff5df39d67b202e9"),
-            (&falling, "Key/7", &rising[..], "c3d3c766f252aa915b1c236fb3c7a0f60f166f03cabf758bdd44be69f08c5606"),
+            (
+                &rising,
+                "bc490419-7d60-487f-adc1-4ddcc177c139",
+                &falling[..],
+                "ecfe13c9492accb137459ca74f8639bae49af7d8f1a5c799ff5df39d67b202e9",
+            ),
+            (
+                &falling,
+                "Key/7",
+                &rising[..],
+                "c3d3c766f252aa915b1c236fb3c7a0f60f166f03cabf758bdd44be69f08c5606",
+            ),
         ] {
             let key = KmeKey::from_slice(key).unwrap();
             let ready: &[u8; 32] = ready.try_into().unwrap();

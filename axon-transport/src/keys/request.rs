@@ -51,6 +51,7 @@ pub enum Request {
 }
 
 /// A [`Request`] and how it ended.
+#[derive(Debug)]
 pub struct Answer {
     /// As it was asked.
     pub request: Request,
@@ -103,6 +104,15 @@ pub enum FailureKind {
     Busy,
     /// This host could not even put the request.
     Invalid,
+}
+
+impl fmt::Debug for Fetched {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Keys(keys) => f.debug_list().entries(keys.iter().map(|(id, _)| id)).finish(),
+            Self::Stock(stock) => stock.fmt(f),
+        }
+    }
 }
 
 impl FailureKind {

@@ -214,9 +214,11 @@ impl Acceptor {
         let now = self.0.clock.now();
         let Request::Dec { master, key_ids, .. } = answer.request else { return };
         let mut state = self.state();
-        let Some(i) = state.pending.iter().position(|p| {
-            p.identity.client_sae() == master && key_ids.first() == Some(&p.key_id)
-        }) else {
+        let Some(i) = state
+            .pending
+            .iter()
+            .position(|p| p.identity.client_sae() == master && key_ids.first() == Some(&p.key_id))
+        else {
             return;
         };
         let pending = state.pending.swap_remove(i);
@@ -337,7 +339,8 @@ impl State {
             return Some("2 in flight for one address and SAE");
         }
         // Under `*` anyone can make names up, so those that never authenticated share a bucket.
-        let own = matches!(allowed, QkdPeers::Listed(_)) || self.known_saes.contains(&sae.to_owned());
+        let own =
+            matches!(allowed, QkdPeers::Listed(_)) || self.known_saes.contains(&sae.to_owned());
         if !self.buckets.take(now, if own { sae } else { "" }) {
             return Some("5 a second for one SAE");
         }

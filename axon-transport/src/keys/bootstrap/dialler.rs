@@ -97,7 +97,10 @@ struct Peer {
 
 enum State {
     /// The next dial asks for a key, from this time on.
-    Empty { not_before: Duration, why: String },
+    Empty {
+        not_before: Duration,
+        why: String,
+    },
     /// A key is wanted.
     Wanted,
     /// The KME was asked.
@@ -201,8 +204,7 @@ impl Dialler {
         if asked >= IN_FLIGHT {
             return None;
         }
-        let (sae, peer) =
-            self.peers.iter_mut().find(|(_, p)| matches!(p.state, State::Wanted))?;
+        let (sae, peer) = self.peers.iter_mut().find(|(_, p)| matches!(p.state, State::Wanted))?;
         peer.state = State::Asked;
         Some(Request::Enc {
             slave: sae.clone(),
@@ -262,7 +264,8 @@ impl Dialler {
         if self.peers.len() < MAX_PEERS {
             return true;
         }
-        let idle = |p: &Peer| matches!(p.state, State::Empty { not_before, .. } if not_before <= now);
+        let idle =
+            |p: &Peer| matches!(p.state, State::Empty { not_before, .. } if not_before <= now);
         let Some(sae) = self.peers.iter().find(|(_, p)| idle(p)).map(|(sae, _)| sae.clone()) else {
             return false;
         };
@@ -273,10 +276,7 @@ impl Dialler {
 
 impl Peer {
     fn new() -> Self {
-        Self {
-            state: State::Empty { not_before: Duration::ZERO, why: String::new() },
-            failures: 0,
-        }
+        Self { state: State::Empty { not_before: Duration::ZERO, why: String::new() }, failures: 0 }
     }
 
     /// A call or a key failed: whatever is held is erased, and the KME is left alone for a while.

@@ -5,6 +5,8 @@ mod acceptor;
 mod dialler;
 mod limits;
 mod memory;
+#[cfg(test)]
+mod tests;
 
 pub use acceptor::{Acceptor, Lookup, Resolver};
 pub use dialler::{Attempt, Dial, DialRefusal, Dialler};

@@ -55,6 +55,7 @@ pub enum Origin {
 }
 
 /// An answer, and who asked.
+#[derive(Debug)]
 pub struct Event {
     /// Who asked.
     pub origin: Origin,

@@ -80,8 +80,7 @@ impl Recorder {
         match outcome {
             Ok(_) => {
                 let new = took.as_secs_f64() * 1e3;
-                call.latency_ms =
-                    Some(call.latency_ms.map_or(new, |old| old + (new - old) / 8.0));
+                call.latency_ms = Some(call.latency_ms.map_or(new, |old| old + (new - old) / 8.0));
             }
             Err(failure) => {
                 call.failures += 1;

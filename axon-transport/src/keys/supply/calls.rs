@@ -118,7 +118,8 @@ impl Calls {
     /// When [`poll`](Self::poll) may give something without an answer before.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         let status = (!self.status_asked).then_some(self.status_at);
-        let keys = self.waiting_since.filter(|_| self.in_flight.is_empty()).map(|_| self.not_before);
+        let keys =
+            self.waiting_since.filter(|_| self.in_flight.is_empty()).map(|_| self.not_before);
         [status, keys].into_iter().flatten().min()
     }
 }

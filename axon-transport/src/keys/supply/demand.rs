@@ -230,7 +230,8 @@ mod tests {
     #[test]
     fn it_warns_when_the_kme_gives_too_little() {
         let mut demand = Demand::new();
-        assert!(demand.warning(run(&mut demand, 0, 100)).is_none(), "no supply was measured");
+        let now = run(&mut demand, 0, 100);
+        assert!(demand.warning(now).is_none(), "no supply was measured");
         for _ in 0..10 {
             demand.answered(ms(1000), 5);
         }

@@ -12,9 +12,7 @@ use axon_envelope::{
 use serde::Serialize;
 use zeroize::Zeroizing;
 
-use super::{
-    MAX_UNRETIRED, SupplyError, SupplyWarning, calls::Calls, demand::Demand,
-};
+use super::{MAX_UNRETIRED, SupplyError, SupplyWarning, calls::Calls, demand::Demand};
 use crate::keys::{
     Exporters, KeyMessage, Violation, message, proof,
     request::{Answer, Fetched, Request},
@@ -180,6 +178,7 @@ impl Sender {
             Some(link) if link.conn == conn => {
                 self.ready.push_back(Sealer::new(&link.channel, key_id, key)?);
             }
+            _ if self.unretired() >= MAX_UNRETIRED => {}
             _ => self.fresh.push_back(Fresh { key_id, key, asked: None }),
         }
         Ok(())
@@ -206,9 +205,10 @@ impl Sender {
         first.slot(now, delivery).map_err(|_| NoKey::None)
     }
 
-    /// Bytes that an envelope has more than its plaintext: an upper bound for any key.
+    /// Bytes that an envelope has more than its plaintext: an upper bound for the next
+    /// [`slot`](Self::slot), since KMEs name keys as they like.
     pub fn overhead(&self) -> usize {
-        self.ready.front().map_or(MAX_HEADER_LEN + TAG_LEN, Sealer::overhead)
+        self.ready.iter().map(Sealer::overhead).max().unwrap_or(MAX_HEADER_LEN + TAG_LEN)
     }
 
     /// How many messages could be sealed now.

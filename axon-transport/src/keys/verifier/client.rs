@@ -140,8 +140,7 @@ impl ClientProof {
             Ok(Fetched::Stock(_)) => invalid("the KME answered another call"),
             Err(failure) => failure,
         };
-        let nothing_lost =
-            failure.kind.is_transient() && failure.kind != FailureKind::Ambiguous;
+        let nothing_lost = failure.kind.is_transient() && failure.kind != FailureKind::Ambiguous;
         self.step = if nothing_lost && self.tries > 0 {
             Step::Ask { not_before: now + PAUSE }
         } else {

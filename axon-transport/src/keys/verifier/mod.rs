@@ -4,6 +4,8 @@
 
 mod client;
 mod responder;
+#[cfg(test)]
+mod tests;
 
 pub use client::{ClientProof, ProofFailure, ProofState};
 pub use responder::ProofResponder;
