@@ -28,6 +28,9 @@ pub(crate) fn apply(tree: &mut BTreeMap<String, String>, diff: &str) -> Result<(
 
         let before = tree.get(path).ok_or_else(|| format!("src/{path} does not exist"))?;
         let mut file = Patched::new(before);
+        if !lines.peek().is_some_and(|(_, line)| line.starts_with("@@ ")) {
+            return Err(format!("src/{path} has no hunk"));
+        }
         while let Some((at, header)) = lines.next_if(|(_, line)| line.starts_with("@@ ")) {
             let hunk = Hunk::parse(header).ok_or_else(|| format!("line {}: bad hunk", at + 1))?;
             file.apply(&hunk, &mut lines)
