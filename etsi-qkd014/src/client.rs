@@ -14,8 +14,8 @@ use crate::{ClientBuilder, DecKeys, EncKeys, Error, Status, parse};
 /// A client of one KME, acting as one SAE.
 ///
 /// Cheap to clone, and all clones share their connections. Calls may run at the same time from any
-/// task. They need a tokio runtime with time and I/O enabled; see [`blocking`](crate::blocking)
-/// for programs without one.
+/// task. They need a tokio runtime with time and I/O enabled; programs
+/// without one use the feature `blocking`.
 ///
 /// A call that is dropped before it ends leaves nothing behind here, but the KME may have served
 /// it: treat the keys of a dropped call as [consumed](Error::KeyPossiblyConsumed).

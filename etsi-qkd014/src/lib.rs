@@ -47,8 +47,8 @@
 //!
 //! # Features
 //!
-//! - `blocking`: [`blocking::Client`](crate::blocking), which needs no async runtime of yours.
-//! - `sim`: [`sim`](crate::sim), KMEs in process for tests, and the binary `kme-sim`.
+//! - `blocking`: `blocking::Client`, which needs no async runtime of yours.
+//! - `sim`: the module `sim`, KMEs in process for tests, and the binary `kme-sim`.
 //!
 //! [ETSI GS QKD 014 V1.1.1]: https://www.etsi.org/deliver/etsi_gs/QKD/001_099/014/01.01.01_60/gs_qkd014v010101p.pdf
 

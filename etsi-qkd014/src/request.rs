@@ -237,7 +237,7 @@ impl<'c> DecKeys<'c> {
 
 fn check_size(size: Option<u32>) -> Result<(), Error> {
     match size {
-        Some(bits) if bits == 0 || bits % 8 != 0 => {
+        Some(bits) if bits == 0 || !bits.is_multiple_of(8) => {
             Err(refuse(&format!("size {bits} is not a positive multiple of 8 bits (clause 6.2)")))
         }
         _ => Ok(()),

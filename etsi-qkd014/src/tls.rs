@@ -248,3 +248,46 @@ fn certificate_reason(reason: &CertificateError) -> String {
         other => format!("the KME's certificate: {other}"),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rustls::NamedGroup;
+
+    #[test]
+    fn hybrid_key_exchange_is_offered_first_and_with_a_share() {
+        // rustls sends a share for the first group.
+        assert_eq!(provider().kx_groups[0].name(), NamedGroup::X25519MLKEM768);
+    }
+
+    #[test]
+    fn a_certificate_that_is_not_valid_yet_says_clock() {
+        assert!(certificate_reason(&CertificateError::NotValidYet).contains("clock"));
+    }
+
+    #[test]
+    fn only_handshake_alerts_mean_that_the_request_was_not_served() {
+        let alert = |alert, connected| {
+            refusal(&rustls::Error::AlertReceived(alert), connected).map(|(by, _)| by)
+        };
+        assert_eq!(alert(AlertDescription::InternalError, true), None);
+        assert_eq!(alert(AlertDescription::BadRecordMac, true), None);
+        assert_eq!(alert(AlertDescription::InternalError, false), Some(RefusedBy::Kme));
+        assert_eq!(alert(AlertDescription::UnknownCA, true), Some(RefusedBy::Kme));
+        assert!(refusal(&rustls::Error::DecryptError, true).is_none());
+    }
+
+    #[test]
+    fn private_keys_that_cannot_be_read_are_not_quoted() {
+        let secret = "c2VjcmV0c2VjcmV0";
+        for text in [
+            format!("-----BEGIN PRIVATE KEY-----\n{secret}\n-----END PRIVATE KEY-----\n"),
+            format!("-----BEGIN PRIVATE KEY-----\n{secret}"),
+            secret.to_owned(),
+        ] {
+            let key = Zeroizing::new(text.into_bytes());
+            let error = certified_key(b"x", &key).unwrap_err();
+            assert!(!format!("{error} {error:?}").contains(secret));
+        }
+    }
+}

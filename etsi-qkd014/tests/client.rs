@@ -105,6 +105,23 @@ async fn a_certificate_that_is_not_valid_yet_says_clock() {
 }
 
 #[tokio::test]
+async fn a_kme_of_tls_1_2_works_and_refuses_as_well() {
+    let network = two().tls12_only().start().await.unwrap();
+    let other = two().start().await.unwrap();
+    let stranger = other.sae("sae-a").unwrap();
+    let client = network
+        .client_builder("sae-a")
+        .sae_cert(stranger.cert_pem())
+        .sae_key(stranger.key_pem().as_bytes().to_vec())
+        .build()
+        .unwrap();
+    let error = failed(client.enc_keys("sae-b").send().await);
+    assert!(matches!(&error, Error::Tls { refused_by: RefusedBy::Kme, .. }), "{error}");
+    let client = network.client_builder("sae-a").build().unwrap();
+    client.enc_keys("sae-b").send().await.unwrap();
+}
+
+#[tokio::test]
 async fn an_expired_certificate_is_refused() {
     let network = two().certificates_expired().start().await.unwrap();
     let error = network.client_builder("sae-a").build().unwrap().status("sae-b").await.unwrap_err();

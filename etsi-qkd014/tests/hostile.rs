@@ -171,6 +171,22 @@ async fn status_codes_keep_their_meaning() {
     }
 }
 
+#[tokio::test]
+async fn retry_after_is_passed_on_and_obeyed_within_the_deadline() {
+    let error = enc(Fault::Busy(7), |b| b).await;
+    match error {
+        Error::Unavailable { retry_after, message, .. } => {
+            assert_eq!((retry_after, message.as_str()), (Some(Duration::from_secs(7)), "busy"));
+        }
+        other => panic!("{other}"),
+    }
+    let network = network().await;
+    let client = once(&network).retry(quick(RetryPolicy::none().status(9))).build().unwrap();
+    kme_a(&network).inject(Fault::Busy(3600), 1);
+    assert!(client.status("sae-b").await.is_err());
+    assert_eq!(kme_a(&network).counters().status_calls, 1, "an hour is beyond the deadline");
+}
+
 // Repeats
 
 fn quick(policy: RetryPolicy) -> RetryPolicy {

@@ -67,7 +67,7 @@ pub(super) fn error(status: u16, message: impl Into<String>, details: Vec<Value>
     if !details.is_empty() {
         body["details"] = details.into();
     }
-    Answer { status, body: body.to_string().into() }
+    Answer { status, body: body.to_string().into(), retry_after: None }
 }
 
 fn bad(message: impl Into<String>) -> Answer {
@@ -103,8 +103,16 @@ fn route(
     let caller = caller.filter(|id| kme.saes.contains(*id)).ok_or_else(unauthorized)?;
     match fault {
         Some(Fault::Empty) => return Err(error(503, "not enough keys are stored", Vec::new())),
+        Some(Fault::Busy(seconds)) => {
+            let busy = error(503, "busy", Vec::new());
+            return Err(Answer { retry_after: Some(*seconds), ..busy });
+        }
         Some(Fault::Status(code)) => {
-            return Err(Answer { status: *code, body: "out of order".to_owned().into() });
+            return Err(Answer {
+                status: *code,
+                body: "out of order".to_owned().into(),
+                retry_after: None,
+            });
         }
         _ => {}
     }
@@ -182,7 +190,7 @@ fn status(shared: &Shared, kme: &KmeState, caller: &str, slave: &str) -> Result<
         "min_key_size": limits.min_key_size,
         "max_SAE_ID_count": limits.max_sae_ids,
     });
-    Ok(Answer { status: 200, body: body.to_string().into() })
+    Ok(Answer { status: 200, body: body.to_string().into(), retry_after: None })
 }
 
 fn enc_keys(
@@ -200,7 +208,7 @@ fn enc_keys(
     }
     let size = asked.size.unwrap_or(limits.key_size.into());
     let (min, max) = (u64::from(limits.min_key_size), u64::from(limits.max_key_size));
-    if !(min..=max).contains(&size) || size % 8 != 0 {
+    if !(min..=max).contains(&size) || !size.is_multiple_of(8) {
         return Err(bad(format!("size is not a multiple of 8 in {min}..={max}")));
     }
     if asked.additional_slaves.len() as u64 > limits.max_sae_ids {
@@ -302,5 +310,5 @@ fn container(mut keys: Vec<Drawn>, echo: Option<&Value>, fault: Option<&Fault>) 
         body.push('}');
     }
     body.push('}');
-    Answer { status: 200, body }
+    Answer { status: 200, body, retry_after: None }
 }

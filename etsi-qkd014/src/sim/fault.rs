@@ -20,6 +20,8 @@ pub enum Fault {
     Drip(Duration),
     /// 503 as from an empty store. Nothing is served.
     Empty,
+    /// 503 that asks to come back after so many seconds. Nothing is served.
+    Busy(u64),
     /// Another status, without a JSON body. Nothing is served.
     Status(u16),
     /// The connection is reset after the request.

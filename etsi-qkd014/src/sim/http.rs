@@ -31,6 +31,8 @@ pub(super) enum NoRequest {
 pub(super) struct Answer {
     pub(super) status: u16,
     pub(super) body: Zeroizing<String>,
+    /// Seconds, for the header Retry-After.
+    pub(super) retry_after: Option<u64>,
 }
 
 /// Reads one request. `buffer` keeps what came after it.
@@ -130,6 +132,9 @@ pub(super) async fn write<S: AsyncWrite + Unpin>(
         if fault == Some(&Fault::WrongMediaType) { "text/plain" } else { "application/json" };
     let status = answer.status;
     let mut head = format!("{version} {status} {}\r\nContent-Type: {media}\r\n", reason(status));
+    if let Some(seconds) = answer.retry_after {
+        head.push_str(&format!("Retry-After: {seconds}\r\n"));
+    }
     match fault {
         Some(Fault::Endless) => head.push_str("Transfer-Encoding: chunked\r\n\r\n"),
         Some(Fault::Http10) => head.push_str("\r\n"),

@@ -36,6 +36,7 @@ pub struct NetworkBuilder {
     rate: FillRate,
     initially: Option<u64>,
     validity: Validity,
+    tls12_only: bool,
 }
 
 impl NetworkBuilder {
@@ -98,13 +99,19 @@ impl NetworkBuilder {
         self
     }
 
+    /// Offers TLS 1.2 and nothing newer, as old KMEs do.
+    pub fn tls12_only(mut self) -> Self {
+        self.tls12_only = true;
+        self
+    }
+
     /// Makes the certificates, binds and serves. Needs a tokio runtime, on which the KMEs run until
     /// the network is dropped.
     ///
     /// # Errors
     /// [`Error`] names the ID, setting or address that cannot be used.
     pub async fn start(self) -> Result<Network, Error> {
-        let Self { layout, pki, limits, rate, initially, validity } = self;
+        let Self { layout, pki, limits, rate, initially, validity, tls12_only } = self;
         layout.check()?;
         let sizes = limits.min_key_size..=limits.max_key_size;
         if !sizes.contains(&limits.key_size) || !limits.key_size.is_multiple_of(8) {
@@ -132,7 +139,7 @@ impl NetworkBuilder {
                     &issued
                 }
             };
-            let tls = server::tls_config(pki.ca_pem(), pair)?;
+            let tls = server::tls_config(pki.ca_pem(), pair, tls12_only)?;
             let state = Arc::new(KmeState {
                 id: site.kme.clone(),
                 index,
@@ -193,6 +200,7 @@ impl Network {
             rate: FillRate::Unlimited,
             initially: None,
             validity: Validity::Now,
+            tls12_only: false,
         }
     }
 

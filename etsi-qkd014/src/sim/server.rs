@@ -3,10 +3,11 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use rustls::RootCertStore;
 use rustls::pki_types::PrivateKeyDer;
 use rustls::pki_types::pem::PemObject;
 use rustls::server::{ServerConfig, WebPkiClientVerifier};
+use rustls::version::{TLS12, TLS13};
+use rustls::{RootCertStore, SupportedProtocolVersion};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
@@ -25,7 +26,11 @@ const MAX_CONNECTIONS: usize = 256;
 const HANDSHAKE_TIME: Duration = Duration::from_secs(10);
 const IDLE_TIME: Duration = Duration::from_secs(60);
 
-pub(super) fn tls_config(ca: &str, pair: &Pair) -> Result<Arc<ServerConfig>, Error> {
+pub(super) fn tls_config(
+    ca: &str,
+    pair: &Pair,
+    tls12_only: bool,
+) -> Result<Arc<ServerConfig>, Error> {
     let wrong = |e: &dyn std::fmt::Display| Error::Certificates(e.to_string());
     let provider = tls::provider();
     let mut roots = RootCertStore::empty();
@@ -38,8 +43,10 @@ pub(super) fn tls_config(ca: &str, pair: &Pair) -> Result<Arc<ServerConfig>, Err
             .map_err(|e| wrong(&e))?;
     let chain = tls::certificates(pair.cert.as_bytes(), "cert").map_err(|e| wrong(&e))?;
     let key = PrivateKeyDer::from_pem_slice(pair.key.as_bytes()).map_err(|e| wrong(&e))?;
+    let versions: &[&SupportedProtocolVersion] =
+        if tls12_only { const { &[&TLS12] } } else { const { &[&TLS13, &TLS12] } };
     ServerConfig::builder_with_provider(provider)
-        .with_safe_default_protocol_versions()
+        .with_protocol_versions(versions)
         .map_err(|e| wrong(&e))?
         .with_client_cert_verifier(verifier)
         .with_single_cert(chain, key)
