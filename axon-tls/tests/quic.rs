@@ -11,6 +11,9 @@ use axon_tls::qkd::{Psk, PskIdentity, PskResolver, derive_psk};
 use axon_tls::quic::{ALPN, hybrid_client, hybrid_server, qkd_client, qkd_server};
 use axon_tls::{Cipher, KeyExchange, PskKex};
 use common::{CLIENT_SAE, KEY_ID, OneKey, SERVER_SAE, connect, psk};
+use quinn::crypto::rustls::QuicClientConfig;
+use rustls::crypto::aws_lc_rs::{default_provider, kx_group};
+use rustls::crypto::{CryptoProvider, SupportedKxGroup};
 
 const HANDSHAKE_FAILURE: u8 = 40;
 const DECRYPT_ERROR: u8 = 51;
@@ -132,6 +135,40 @@ async fn modes_do_not_mix() {
         )
         .await;
         assert_eq!(classic_server.alert(), HANDSHAKE_FAILURE);
+    }
+}
+
+/// A client on quinn's own TLS that has classical groups alone.
+fn classical_client(groups: Vec<&'static dyn SupportedKxGroup>) -> quinn::ClientConfig {
+    let provider = CryptoProvider { kx_groups: groups, ..default_provider() };
+    let mut tls = rustls::ClientConfig::builder_with_provider(Arc::new(provider))
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .unwrap()
+        .with_root_certificates(rustls::RootCertStore::empty())
+        .with_no_client_auth();
+    tls.alpn_protocols = vec![ALPN.to_vec()];
+    quinn::ClientConfig::new(Arc::new(QuicClientConfig::try_from(tls).unwrap()))
+}
+
+#[tokio::test]
+async fn classical_groups_are_refused() {
+    for groups in [
+        vec![kx_group::X25519],
+        vec![kx_group::SECP256R1],
+        vec![kx_group::X25519, kx_group::SECP256R1, kx_group::SECP384R1],
+    ] {
+        let cipher = Cipher::default();
+        let hybrid = hybrid_server(&unauthenticated(), cipher, ALPN).unwrap();
+        let outcome = connect(classical_client(groups.clone()), hybrid).await;
+        assert_eq!(outcome.alert(), HANDSHAKE_FAILURE);
+        let reason = outcome.server.unwrap_err().to_string();
+        assert!(reason.contains("NoKxGroupsInCommon"), "{reason}");
+
+        for kex in PskKex::ALL {
+            let qkd = qkd_server(OneKey::new(psk(1, cipher)), cipher, kex, ALPN).unwrap();
+            let outcome = connect(classical_client(groups.clone()), qkd).await;
+            assert_eq!(outcome.alert(), MISSING_EXTENSION);
+        }
     }
 }
 

@@ -5,10 +5,11 @@ use std::fmt;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Duration;
 
 use axon_tls::qkd::{Psk, PskResolver, derive_psk};
 use axon_tls::{Cipher, Negotiated, quic};
-use quinn::{ClientConfig, ConnectionError, Endpoint, ServerConfig};
+use quinn::{ClientConfig, ConnectionError, Endpoint, ServerConfig, TransportConfig};
 
 pub(crate) const CLIENT_SAE: &str = "sae-client";
 pub(crate) const SERVER_SAE: &str = "sae-server";
@@ -72,13 +73,23 @@ impl Outcome {
     }
 }
 
-/// Connects, and if that works has both ends export a secret and send data both ways.
-pub(crate) async fn connect(client: ClientConfig, server: ServerConfig) -> Outcome {
+/// Connects, through a Retry, and if that works has both ends export a secret and send data both ways,
+/// with a key update in between.
+pub(crate) async fn connect(mut client: ClientConfig, mut server: ServerConfig) -> Outcome {
+    // how long a closed connection is waited for depends on it
+    let mut transport = TransportConfig::default();
+    transport.initial_rtt(Duration::from_millis(20));
+    let transport = Arc::new(transport);
+    client.transport_config(Arc::clone(&transport));
+    server.transport_config(transport);
+
     let localhost = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
     let server = Endpoint::server(server, localhost).unwrap();
     let addr = server.local_addr().unwrap();
 
     let serving = tokio::spawn(async move {
+        // the first packet is answered with a Retry, as by a server under load
+        server.accept().await.unwrap().retry().unwrap();
         let conn = server.accept().await.unwrap().await?;
         let negotiated = quic::negotiated(&conn);
         serve(&conn).await?;
@@ -107,6 +118,7 @@ async fn dial(conn: &quinn::Connection) -> Result<(), ConnectionError> {
     let (mut send, mut receive) = conn.open_bi().await?;
     send.write_all(&exported).await.map_err(lost)?;
     send.finish().unwrap();
+    conn.force_key_update();
     let echoed = receive.read_to_end(100_000).await.map_err(lost_reading)?;
     assert_eq!(echoed.len(), 70_000, "enough for some packets each way");
     Ok(())
