@@ -1,1 +1,16 @@
-//! axon-transport
+//! Shared memory on a host, QUIC between hosts: the transport under AXON.
+
+#![deny(unsafe_code)]
+
+pub mod config;
+pub mod daemon;
+pub mod discovery;
+pub mod gateway;
+pub mod graph;
+pub mod ids;
+pub mod keys;
+pub mod link;
+pub mod qos;
+pub mod session;
+pub mod shm;
+pub mod wait;

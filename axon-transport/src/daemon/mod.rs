@@ -1,0 +1,23 @@
+//! The daemon: brings the sessions of one user and domain on this host together, and with those
+//! on other hosts.
+//!
+//! The control plane (`registry`, `control`) runs on the calling thread. The gateway to other
+//! hosts runs on a thread and runtime of its own; `bridge` is all they share. Samples between
+//! processes of this host pass neither.
+
+pub mod bridge;
+mod admission;
+mod control;
+mod gateway;
+mod inherit;
+mod listen;
+pub mod registry;
+mod remote;
+mod report;
+mod run;
+pub mod spawn;
+pub mod status;
+pub(crate) mod watch;
+
+pub use gateway::GatewayEntry;
+pub use run::{DaemonError, DaemonOptions, Start, main, run};

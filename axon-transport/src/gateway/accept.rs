@@ -1,0 +1,96 @@
+//! Answering dials: Retry for every unvalidated address, then the handshake, then
+//! [`establish`](super::establish).
+
+use std::sync::Arc;
+
+use quinn::{Endpoint, Incoming};
+use tokio::sync::mpsc;
+
+use super::{
+    context::Context,
+    establish::{Established, establish},
+    refusal::Refusal,
+};
+use crate::{keys::Resolver, link::Side};
+
+/// Handshakes under way at once; further dials are refused and come again.
+const MAX_HANDSHAKES: usize = 64;
+
+/// What came of an incoming dial.
+#[derive(Debug)]
+pub(super) enum Incomer {
+    /// It awaits its election.
+    Established(Box<Established>),
+    /// It was refused.
+    Refused {
+        /// The address, and the SAE that it claimed.
+        peer: String,
+        /// By whom and why.
+        refusal: Refusal,
+    },
+}
+
+/// Accepts on `endpoint` until it is closed.
+pub(super) async fn accept(
+    context: Arc<Context>,
+    endpoint: Endpoint,
+    incomers: mpsc::Sender<Incomer>,
+) {
+    let limit = Arc::new(tokio::sync::Semaphore::new(MAX_HANDSHAKES));
+    while let Some(incoming) = endpoint.accept().await {
+        if !incoming.remote_address_validated() {
+            // Before any key work. A fresh Incoming may always be answered with a Retry.
+            if incoming.may_retry() {
+                let _ = incoming.retry();
+            } else {
+                incoming.refuse();
+            }
+            continue;
+        }
+        let Ok(permit) = Arc::clone(&limit).try_acquire_owned() else {
+            incoming.refuse();
+            continue;
+        };
+        let (context, incomers) = (Arc::clone(&context), incomers.clone());
+        tokio::spawn(async move {
+            let incomer = answer(&context, incoming).await;
+            drop(permit);
+            let _ = incomers.send(incomer).await;
+        });
+    }
+}
+
+async fn answer(context: &Arc<Context>, incoming: Incoming) -> Incomer {
+    let source = incoming.remote_address();
+    let refused = |refusal, resolver: Option<&Resolver>| {
+        let claimed = resolver.and_then(Resolver::identity);
+        let sae = claimed.as_ref().map(|i| i.client_sae());
+        let peer = super::establish::peer_text(sae, source);
+        Incomer::Refused { peer, refusal }
+    };
+    let (server, resolver) = match context.server(source) {
+        Ok(server) => server,
+        Err(error) => {
+            incoming.refuse();
+            return refused(Refusal::here(crate::link::CloseCode::Internal, error), None);
+        }
+    };
+    let connecting = match incoming.accept_with(Arc::new(server)) {
+        Ok(connecting) => connecting,
+        Err(error) => return refused(Refusal::of(&error), resolver.as_deref()),
+    };
+    let connection = match connecting.await {
+        Ok(connection) => connection,
+        Err(error) => {
+            let mut refusal = Refusal::of(&error);
+            if let Some(outcome) = resolver.as_ref().and_then(|r| r.outcome()) {
+                refusal.reason = format!("{}; PSK look-up: {outcome}", refusal.reason);
+            }
+            return refused(refusal, resolver.as_deref());
+        }
+    };
+    match establish(context, connection, Side::Server, context.hello.clone(), None).await {
+        Ok(established) => Incomer::Established(Box::new(established)),
+        Err(refusal) => refused(refusal, resolver.as_deref()),
+    }
+}

@@ -1,0 +1,457 @@
+//! From a completed QUIC handshake to a link that awaits its election: HELLO both ways and, in qkd,
+//! the proof of the client's name (`docs/formats.md`, sections 2 and 6).
+
+use std::{net::SocketAddr, sync::Arc, time::Duration};
+
+use axon_tls::{
+    KeyExchange, Negotiated, PskKex,
+    qkd::PskIdentity,
+    quic::{ALPN, negotiated},
+};
+use quinn::{Connection, VarInt};
+use tokio::sync::mpsc;
+
+use super::{
+    context::Context,
+    control::{ControlError, ControlReader, ControlWriter},
+    keyring::{Keyring, PeerKeys},
+    refusal::Refusal,
+};
+use crate::{
+    config::Security,
+    keys::{ClientProof, Completion, Exporters, Origin, ProofResponder, ProofState},
+    link::{CloseCode, Hello, Message, Order, Side, check},
+};
+
+/// HELLO, and the whole proof with its two KME calls, must be done in this time.
+const HELLO_TIMEOUT: Duration = Duration::from_secs(5);
+const PROOF_TIMEOUT: Duration = Duration::from_secs(15);
+
+/// A connection whose peer said who it is and, in qkd, proved it.
+pub(super) struct Established {
+    /// This daemon's number for the connection.
+    pub(super) number: u64,
+    /// The connection.
+    pub(super) connection: Connection,
+    /// Which end this side is.
+    pub(super) side: Side,
+    /// What the handshake agreed on.
+    pub(super) negotiated: Negotiated,
+    /// The peer's HELLO.
+    pub(super) hello: Hello,
+    /// Control messages from the peer.
+    pub(super) reader: ControlReader,
+    /// Control messages to the peer; written by a task of their own.
+    pub(super) outbox: mpsc::UnboundedSender<Message>,
+    /// What may come next.
+    pub(super) order: Order,
+    /// Message keys with this SAE, in qkd.
+    pub(super) keys: Option<Arc<PeerKeys>>,
+}
+
+impl std::fmt::Debug for Established {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Established")
+            .field("number", &self.number)
+            .field("side", &self.side)
+            .field("hello", &self.hello)
+            .finish_non_exhaustive()
+    }
+}
+
+/// Closes with a code and says why.
+pub(super) fn close(connection: &Connection, code: CloseCode, reason: &str) {
+    let end = reason.char_indices().map(|(i, c)| i + c.len_utf8()).take_while(|e| *e <= 300).last();
+    connection.close(VarInt::from_u32(code.code()), &reason.as_bytes()[..end.unwrap_or(0)]);
+}
+
+/// Carries a connection through HELLO and proof. `dialled` is the SAE that the client dialled.
+/// On failure the connection is closed and the refusal says why.
+pub(super) async fn establish(
+    context: &Arc<Context>,
+    connection: Connection,
+    side: Side,
+    ours: Hello,
+    dialled: Option<&str>,
+) -> Result<Established, Refusal> {
+    let number = context.next_link();
+    let result = run(context, &connection, side, ours, dialled, number).await;
+    if let Some(keyring) = &context.keyring {
+        keyring.proof_over(number);
+    }
+    result.map_err(|failure| {
+        let refusal = failure.into_refusal(&connection);
+        if let Some(code) = refusal.1 {
+            close(&connection, code, &refusal.0.reason);
+        }
+        if let Some(keyring) = &context.keyring {
+            keyring.forget_connection(number);
+        }
+        refusal.0
+    })
+}
+
+/// What went wrong on the way.
+enum Failure {
+    /// This side refuses.
+    Ours(CloseCode, String),
+    /// The peer closed, or the connection broke.
+    Connection,
+    /// The control stream said so; the connection may know more.
+    Control(ControlError),
+}
+
+impl Failure {
+    fn into_refusal(self, connection: &Connection) -> (Refusal, Option<CloseCode>) {
+        let lost = |fallback: String| match connection.close_reason() {
+            Some(error) => Refusal::of(&error),
+            None => Refusal::network(fallback),
+        };
+        match self {
+            Self::Ours(code, reason) => (Refusal::here(code, reason), Some(code)),
+            Self::Connection => (lost("the connection broke".into()), None),
+            Self::Control(error) => match error.code() {
+                Some(code) => (Refusal::here(code, &error), Some(code)),
+                None => (lost(error.to_string()), Some(CloseCode::Internal)),
+            },
+        }
+    }
+}
+
+impl From<ControlError> for Failure {
+    fn from(error: ControlError) -> Self {
+        Self::Control(error)
+    }
+}
+
+async fn run(
+    context: &Arc<Context>,
+    connection: &Connection,
+    side: Side,
+    ours: Hello,
+    dialled: Option<&str>,
+    number: u64,
+) -> Result<Established, Failure> {
+    let negotiated = agreed(context, connection)?;
+    let psk_sae = psk_sae(context, side, &negotiated, dialled)?;
+    let qkd = context.keyring.is_some();
+    let mut order = Order::new(side, qkd);
+
+    let hello = async {
+        let (mut writer, mut reader) = open_control(connection, side).await?;
+        if side == Side::Client {
+            writer.send(&Message::Hello(ours.clone())).await?;
+        }
+        let message = reader.next().await?;
+        order.accept(&message).map_err(|e| Failure::Ours(CloseCode::OutOfOrder, e.to_string()))?;
+        let Message::Hello(theirs) = message else {
+            return Err(Failure::Ours(CloseCode::OutOfOrder, "HELLO must come first".into()));
+        };
+        check(&ours, &theirs, psk_sae.as_deref())
+            .map_err(|m| Failure::Ours(m.code, m.to_string()))?;
+        if side == Side::Server {
+            writer.send(&Message::Hello(ours.clone())).await?;
+        }
+        Ok((writer, reader, theirs))
+    };
+    let late = |_| Failure::Ours(CloseCode::OutOfOrder, "no HELLO within 5 s".into());
+    let (writer, mut reader, theirs) =
+        tokio::time::timeout(HELLO_TIMEOUT, hello).await.map_err(late)??;
+    reader.hello_checked();
+    order.hello_checked(theirs.daemon < ours.daemon);
+    let outbox = spawn_writer(connection.clone(), writer);
+
+    let keys = match (&context.keyring, &theirs.sae) {
+        (Some(keyring), Some(sae)) => {
+            let proof = Proof { keyring, connection, number, sae, outbox: &outbox };
+            let late = |_| Failure::Ours(CloseCode::KeySupply, "no proof within 15 s".into());
+            let keys = tokio::time::timeout(PROOF_TIMEOUT, async {
+                match side {
+                    Side::Server => proof.demand(&mut reader, &mut order).await,
+                    Side::Client => proof.give(&mut reader, &mut order).await,
+                }
+            })
+            .await
+            .map_err(late)??;
+            order.proven();
+            keys
+        }
+        _ => None,
+    };
+    Ok(Established {
+        number,
+        connection: connection.clone(),
+        side,
+        negotiated,
+        hello: theirs,
+        reader,
+        outbox,
+        order,
+        keys,
+    })
+}
+
+/// What the handshake agreed on, checked against the settings once more: a defect in the TLS
+/// configuration must end here and not in a weaker link.
+fn agreed(context: &Context, connection: &Connection) -> Result<Negotiated, Failure> {
+    let internal = |text: &str| Failure::Ours(CloseCode::Internal, text.into());
+    let negotiated =
+        negotiated(connection).ok_or_else(|| internal("the handshake is not complete"))?;
+    let wanted = match &context.config.security {
+        Security::Classic(_) => KeyExchange::X25519MlKem768,
+        Security::Qkd(qkd) => match qkd.kex {
+            PskKex::PskKe => KeyExchange::PskKe,
+            PskKex::PskDheKe => KeyExchange::PskDheKe,
+        },
+    };
+    if negotiated.key_exchange != wanted || negotiated.cipher != context.config.cipher {
+        return Err(internal("the handshake agreed on something else than the settings"));
+    }
+    if negotiated.alpn != ALPN {
+        return Err(internal("the handshake agreed on another protocol than axon/1"));
+    }
+    Ok(negotiated)
+}
+
+/// The peer's SAE by the PSK, in qkd. A server spends the PSK here: the client's Finished was
+/// verified.
+fn psk_sae(
+    context: &Context,
+    side: Side,
+    negotiated: &Negotiated,
+    dialled: Option<&str>,
+) -> Result<Option<String>, Failure> {
+    let Some(keyring) = &context.keyring else { return Ok(None) };
+    if side == Side::Client {
+        return Ok(dialled.map(Into::into));
+    }
+    let identity = negotiated.psk_identity.as_deref().unwrap_or_default();
+    let parsed = PskIdentity::parse(identity)
+        .map_err(|e| Failure::Ours(CloseCode::Internal, e.to_string()))?;
+    match keyring.acceptor.spent(identity) {
+        Completion::First => Ok(Some(parsed.client_sae().to_owned())),
+        Completion::Reused => {
+            let text = "this PSK has completed a handshake before; a KME key is used once";
+            Err(Failure::Ours(CloseCode::KeyReused, text.into()))
+        }
+    }
+}
+
+async fn open_control(
+    connection: &Connection,
+    side: Side,
+) -> Result<(ControlWriter, ControlReader), Failure> {
+    let (send, receive) = match side {
+        Side::Client => connection.open_bi().await,
+        Side::Server => connection.accept_bi().await,
+    }
+    .map_err(|_| Failure::Connection)?;
+    Ok((ControlWriter::new(send), ControlReader::new(receive)))
+}
+
+/// Writes what is put into the outbox until the connection or the outbox ends.
+fn spawn_writer(
+    connection: Connection,
+    mut writer: ControlWriter,
+) -> mpsc::UnboundedSender<Message> {
+    let (outbox, mut messages) = mpsc::unbounded_channel::<Message>();
+    tokio::spawn(async move {
+        while let Some(message) = messages.recv().await {
+            if let Err(error) = writer.send(&message).await {
+                if let Some(code) = error.code() {
+                    tracing::error!(%error, "a control message could not be sent");
+                    close(&connection, code, &error.to_string());
+                }
+                return;
+            }
+        }
+    });
+    outbox
+}
+
+/// The proof of the client's name, from either end.
+struct Proof<'a> {
+    keyring: &'a Arc<Keyring>,
+    connection: &'a Connection,
+    number: u64,
+    sae: &'a str,
+    outbox: &'a mpsc::UnboundedSender<Message>,
+}
+
+impl Proof<'_> {
+    fn exporters(&self) -> Result<Exporters, Failure> {
+        Exporters::derive(|out, label| self.connection.export_keying_material(out, label, b""))
+            .map_err(|_| Failure::Ours(CloseCode::Internal, "no TLS exporter".into()))
+    }
+
+    fn say(&self, message: crate::keys::KeyMessage) {
+        let _ = self.outbox.send(Message::Keys(message));
+    }
+
+    /// In messages10: the keys of this peer, attached to this connection.
+    fn attach(&self, exporters: &Exporters) -> Result<Arc<PeerKeys>, Failure> {
+        let internal = |e: &dyn std::fmt::Display| {
+            Failure::Ours(CloseCode::Internal, format!("message keys: {e}"))
+        };
+        let keys = self.keyring.peer(self.sae).map_err(|e| internal(&e))?;
+        keys.attach(self.keyring, self.number, exporters, self.outbox.clone())
+            .map_err(|e| internal(&e))?;
+        tokio::spawn(Arc::clone(&keys).run_timers(Arc::clone(self.keyring), self.number));
+        Ok(keys)
+    }
+
+    /// The next key message, in its order.
+    async fn next(
+        &self,
+        reader: &mut ControlReader,
+        order: &mut Order,
+    ) -> Result<crate::keys::KeyMessage, Failure> {
+        loop {
+            let message = reader.next().await?;
+            order
+                .accept(&message)
+                .map_err(|e| Failure::Ours(CloseCode::OutOfOrder, e.to_string()))?;
+            if let Message::Keys(message) = message {
+                return Ok(message);
+            }
+        }
+    }
+
+    /// Server: announces a fresh key and takes nothing but the right READY.
+    async fn demand(
+        &self,
+        reader: &mut ControlReader,
+        order: &mut Order,
+    ) -> Result<Option<Arc<PeerKeys>>, Failure> {
+        let exporters = self.exporters()?;
+        let clock = &self.keyring.clock;
+        let mut answers = self.keyring.proof_answers(self.number);
+        let mut proof = ClientProof::new(clock.now(), self.sae, &exporters);
+        // One read at a time, held across the loop: a cancelled read would lose its place.
+        let mut read = Box::pin(self.next(reader, order));
+        loop {
+            while let Some(request) = proof.poll_request(clock.now()) {
+                self.keyring.submit(Origin::Proof(self.number), request);
+            }
+            while let Some(message) = proof.poll_message() {
+                self.say(message);
+            }
+            match proof.state() {
+                ProofState::Pending => {}
+                ProofState::Proven => break,
+                ProofState::Failed(failure) => {
+                    let code = CloseCode::from_code(failure.code());
+                    let code = code.unwrap_or(CloseCode::Proof);
+                    return Err(Failure::Ours(code, failure.to_string()));
+                }
+            }
+            let until = proof.poll_timeout().map_or(Duration::from_secs(1), |at| {
+                at.saturating_sub(clock.now()).min(Duration::from_secs(1))
+            });
+            tokio::select! {
+                Some(answer) = answers.recv() => proof.on_answer(clock.now(), answer),
+                message = &mut read => {
+                    proof.on_message(clock.now(), &message?);
+                    // At most one message proves or fails; another read is started only if not.
+                    if matches!(proof.state(), ProofState::Pending) {
+                        let text = "the message is no answer to the announced key";
+                        return Err(Failure::Ours(CloseCode::OutOfOrder, text.into()));
+                    }
+                }
+                () = tokio::time::sleep(until) => proof.on_timeout(clock.now()),
+            }
+        }
+        drop(read);
+        self.keyring.authenticated(self.connection.remote_address().ip(), self.sae);
+        if !self.keyring.seals_messages() {
+            return Ok(None);
+        }
+        let keys = self.attach(&exporters)?;
+        if let Some((key_id, key)) = proof.into_key() {
+            keys.with_sender(self.keyring, |now, s| s.adopt(now, self.number, key_id, key))
+                .map_err(|e| Failure::Ours(CloseCode::Internal, e.to_string()))?;
+        }
+        Ok(Some(keys))
+    }
+
+    /// Client: answers the server's ANNOUNCE.
+    async fn give(
+        &self,
+        reader: &mut ControlReader,
+        order: &mut Order,
+    ) -> Result<Option<Arc<PeerKeys>>, Failure> {
+        let exporters = self.exporters()?;
+        if self.keyring.seals_messages() {
+            return self.give_as_receiver(&exporters, reader, order).await.map(Some);
+        }
+        let clock = &self.keyring.clock;
+        let mut answers = self.keyring.proof_answers(self.number);
+        let mut responder = ProofResponder::new(self.sae, &exporters);
+        let announce = self.next(reader, order).await?;
+        responder.on_message(clock.now(), &announce).map_err(|violation| {
+            let code = CloseCode::from_code(violation.code()).unwrap_or(CloseCode::Malformed);
+            Failure::Ours(code, violation.to_string())
+        })?;
+        loop {
+            while let Some(request) = responder.poll_request(clock.now()) {
+                self.keyring.submit(Origin::Responder(self.number), request);
+            }
+            while let Some(message) = responder.poll_message() {
+                self.say(message);
+            }
+            match responder.answered() {
+                Some(Ok(())) => return Ok(None),
+                Some(Err(reason)) => return Err(Failure::Ours(CloseCode::KeySupply, reason)),
+                None => {}
+            }
+            let until = responder.poll_timeout().map_or(Duration::from_secs(1), |at| {
+                at.saturating_sub(clock.now()).min(Duration::from_secs(1))
+            });
+            tokio::select! {
+                Some(answer) = answers.recv() => responder.on_answer(clock.now(), answer),
+                () = tokio::time::sleep(until) => {}
+            }
+        }
+    }
+
+    /// Client in messages10: the announced key is the server's first sending key, so the receiver
+    /// of message keys answers.
+    async fn give_as_receiver(
+        &self,
+        exporters: &Exporters,
+        reader: &mut ControlReader,
+        order: &mut Order,
+    ) -> Result<Arc<PeerKeys>, Failure> {
+        let keys = self.attach(exporters)?;
+        let announce = self.next(reader, order).await?;
+        keys.on_message(self.keyring, self.number, &announce)
+            .map_err(|e| Failure::Ours(CloseCode::Malformed, e.to_string()))?;
+        let crate::keys::KeyMessage::Announce(key_ids) = announce else {
+            return Err(Failure::Ours(CloseCode::OutOfOrder, "ANNOUNCE was due".into()));
+        };
+        // READY is in the outbox once the key is held; ELECTED must not overtake it.
+        let held = |keys: &PeerKeys| {
+            keys.with_receiver(self.keyring, |_, receiver| {
+                receiver.opener(self.number).is_some_and(|opener| {
+                    key_ids.iter().any(|key_id| opener.contains(key_id.as_bytes()))
+                })
+            })
+        };
+        loop {
+            let changed = keys.changed.notified();
+            if held(&keys) {
+                return Ok(keys.clone());
+            }
+            tokio::select! {
+                () = changed => {}
+                () = tokio::time::sleep(Duration::from_millis(20)) => {}
+                _ = self.connection.closed() => return Err(Failure::Connection),
+            }
+        }
+    }
+}
+
+/// Where a peer is, for log and status.
+pub(super) fn peer_text(sae: Option<&str>, address: SocketAddr) -> String {
+    sae.map_or_else(|| address.to_string(), |sae| format!("{sae} at {address}"))
+}

@@ -1,0 +1,267 @@
+//! Samples from a peer: data streams in, stand-in publishers out (`docs/formats.md`, section 7).
+
+use std::{
+    collections::HashMap,
+    sync::{
+        Arc, RwLock,
+        atomic::{AtomicU64, Ordering},
+    },
+    time::Duration,
+};
+
+use quinn::{Connection, RecvStream, VarInt};
+use tokio::sync::mpsc;
+
+use super::{
+    counters::Counters,
+    establish::close,
+    pulse::Pulse,
+    seal::{MAX_OVERHEAD, Protection, RefusedMessage, publisher},
+};
+use crate::{
+    ids::Gid,
+    link::CloseCode,
+    session::Publisher,
+    shm::{Meta, PublishError},
+};
+
+const STREAM_HEADER: usize = 24;
+const RELIABLE: u8 = 1;
+const BEST_EFFORT: u8 = 2;
+/// A stream for a route that is gone is stopped with this.
+const NO_ROUTE: VarInt = VarInt::from_u32(CloseCode::OutOfOrder as u32);
+
+/// A remote publisher as local subscriptions see it.
+pub(super) struct StandIn {
+    /// Writes the ring that stands in for it.
+    pub(super) publisher: Publisher,
+    /// Held by the stream that feeds it: the stream of a successor waits until its predecessor's
+    /// is read to the end, so samples stay in order.
+    feeding: tokio::sync::Mutex<()>,
+    /// Sequence number of the newest sample written; 0 before the first.
+    last: AtomicU64,
+}
+
+impl StandIn {
+    /// A stand-in that nothing feeds yet.
+    pub(super) fn new(publisher: Publisher) -> Self {
+        Self { publisher, feeding: tokio::sync::Mutex::default(), last: AtomicU64::new(0) }
+    }
+
+    /// Sequence number of the newest sample written.
+    pub(super) fn last_sequence(&self) -> Option<u64> {
+        // Relaxed: only where a resumed route begins; sessions drop what they have seen.
+        Some(self.last.load(Ordering::Relaxed)).filter(|n| *n > 0)
+    }
+}
+
+/// A route that this side asked for.
+pub(super) struct RouteIn {
+    /// Topic and kind, for the envelope.
+    pub(super) route: axon_envelope::Route,
+    /// The remote publishers that feed it.
+    pub(super) publishers: HashMap<Gid, Arc<StandIn>>,
+}
+
+/// The routes of a peer by this side's numbers for them.
+pub(super) type RoutesIn = Arc<RwLock<HashMap<u32, RouteIn>>>;
+
+/// Everything a data stream of one connection needs.
+#[derive(Clone)]
+pub(super) struct Inbound {
+    /// The connection.
+    pub(super) connection: Connection,
+    /// Its routes.
+    pub(super) routes: RoutesIn,
+    /// How its messages are protected.
+    pub(super) protection: Protection,
+    /// What arrives.
+    pub(super) counters: Arc<Counters>,
+    /// Wakes a publish that waits for room.
+    pub(super) pulse: Pulse,
+    /// Largest payload accepted.
+    pub(super) max_message: u64,
+    /// What was refused, for the log and status.
+    pub(super) refused: mpsc::Sender<(CloseCode, String)>,
+}
+
+/// Why a stream ends.
+enum End {
+    /// It was read to its end, or the connection is gone.
+    Finished,
+    /// The peer broke the protocol: the connection is closed.
+    Violation(CloseCode, String),
+}
+
+impl Inbound {
+    /// Accepts data streams until the connection ends.
+    pub(super) async fn run(self) {
+        while let Ok(stream) = self.connection.accept_uni().await {
+            let inbound = self.clone();
+            tokio::spawn(async move {
+                if let End::Violation(code, reason) = inbound.stream(stream).await {
+                    // The peer learns that an envelope was refused, never why.
+                    let told = match code {
+                        CloseCode::Envelope => "an envelope was refused",
+                        _ => &reason,
+                    };
+                    close(&inbound.connection, code, told);
+                    let _ = inbound.refused.try_send((code, reason));
+                }
+            });
+        }
+    }
+
+    async fn stream(&self, mut stream: RecvStream) -> End {
+        let mut header = [0; STREAM_HEADER];
+        if stream.read_exact(&mut header).await.is_err() {
+            return End::Finished;
+        }
+        let (kind, number, gid) = match parse_header(&header) {
+            Ok(parsed) => parsed,
+            Err(reason) => return End::Violation(CloseCode::Malformed, reason.into()),
+        };
+        let Some((route, stand_in)) = self.find(number, gid) else {
+            // Unsubscribed, or the publisher is gone from the graph: its samples may still be
+            // under way.
+            self.counters.dropped("no_route", 1);
+            let _ = stream.stop(NO_ROUTE);
+            return End::Finished;
+        };
+        let _feeding = stand_in.feeding.lock().await;
+        let mut body = Vec::new();
+        loop {
+            match self.message(&mut stream, &mut body, route, gid, &stand_in).await {
+                Ok(true) if kind == RELIABLE => {}
+                Ok(_) => return End::Finished,
+                Err((code, reason)) => return End::Violation(code, reason),
+            }
+        }
+    }
+
+    fn find(&self, number: u32, gid: Gid) -> Option<(axon_envelope::Route, Arc<StandIn>)> {
+        let routes = self.routes.read().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let route = routes.get(&number)?;
+        Some((route.route, Arc::clone(route.publishers.get(&gid)?)))
+    }
+
+    /// Reads and publishes one message; false when the stream ended before it.
+    async fn message(
+        &self,
+        stream: &mut RecvStream,
+        body: &mut Vec<u8>,
+        route: axon_envelope::Route,
+        gid: Gid,
+        stand_in: &StandIn,
+    ) -> Result<bool, (CloseCode, String)> {
+        let mut prefix = [0; 4];
+        if stream.read_exact(&mut prefix).await.is_err() {
+            return Ok(false);
+        }
+        let length = u64::from(u32::from_be_bytes(prefix));
+        let limit = self.max_message + MAX_OVERHEAD as u64;
+        if length > limit {
+            let text = format!("a message of {length} bytes, at most {limit} are allowed");
+            return Err((CloseCode::TooLarge, text));
+        }
+        // Grows with what really arrives, not with what the length claims.
+        body.clear();
+        let mut left = length as usize;
+        while left > 0 {
+            match stream.read_chunk(left, true).await {
+                Ok(Some(chunk)) => {
+                    body.extend_from_slice(&chunk.bytes);
+                    left -= chunk.bytes.len();
+                }
+                Ok(None) | Err(_) => return Ok(false),
+            }
+        }
+        let opened = self.protection.open(body, route, self.max_message).map_err(|e| {
+            let code = match e {
+                RefusedMessage::Envelope { .. } => CloseCode::Envelope,
+                RefusedMessage::Malformed(_) => CloseCode::Malformed,
+            };
+            (code, e.to_string())
+        })?;
+        if publisher(&opened.header) != gid {
+            let text = "a message names another publisher than its stream";
+            return Err((CloseCode::Malformed, text.into()));
+        }
+        let meta = Meta {
+            sequence: opened.header.sequence,
+            source_timestamp: opened.header.source_timestamp,
+        };
+        if self.publish(&stand_in.publisher, meta, &opened.payload).await {
+            stand_in.last.store(meta.sequence, Ordering::Relaxed);
+        }
+        Ok(true)
+    }
+
+    /// Writes into the stand-in's ring; waits for a KEEP_ALL reader as long as the link stands,
+    /// which in turn holds the peer's stream back. False when the sample was dropped.
+    async fn publish(&self, publisher: &Publisher, meta: Meta, payload: &[u8]) -> bool {
+        let mut waiting = None;
+        let mut beat = self.pulse.subscribe();
+        loop {
+            beat.mark_unchanged();
+            match publisher.try_publish_with(meta, payload) {
+                Ok(()) => {
+                    self.counters.arrived(payload.len());
+                    return true;
+                }
+                Err(PublishError::Blocked { .. }) if self.connection.close_reason().is_none() => {
+                    waiting.get_or_insert_with(|| self.pulse.wait_for_room());
+                    // The timeout only covers a link that ends meanwhile.
+                    let _ = tokio::time::timeout(Duration::from_millis(100), beat.changed()).await;
+                }
+                Err(error) => {
+                    self.counters.dropped("ring", 1);
+                    tracing::warn!(gid = %publisher.gid(), %error, "a sample from a peer is lost");
+                    return false;
+                }
+            }
+        }
+    }
+}
+
+fn parse_header(header: &[u8; STREAM_HEADER]) -> Result<(u8, u32, Gid), &'static str> {
+    let kind = header[0];
+    if !matches!(kind, RELIABLE | BEST_EFFORT) {
+        return Err("a data stream of unknown kind");
+    }
+    if header[1..4] != [0; 3] {
+        return Err("a data stream with unknown flags");
+    }
+    let mut route = [0; 4];
+    route.copy_from_slice(&header[4..8]);
+    let mut gid = [0; 16];
+    gid.copy_from_slice(&header[8..]);
+    Ok((kind, u32::from_be_bytes(route), Gid(gid)))
+}
+
+/// The header of a data stream.
+pub(super) fn stream_header(reliable: bool, route: u32, gid: Gid) -> [u8; STREAM_HEADER] {
+    let mut header = [0; STREAM_HEADER];
+    header[0] = if reliable { RELIABLE } else { BEST_EFFORT };
+    header[4..8].copy_from_slice(&route.to_be_bytes());
+    header[8..].copy_from_slice(&gid.0);
+    header
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stream_header_comes_back_and_anything_else_is_refused() {
+        let gid = Gid([7; 16]);
+        assert_eq!(parse_header(&stream_header(true, 9, gid)), Ok((RELIABLE, 9, gid)));
+        assert_eq!(parse_header(&stream_header(false, 9, gid)), Ok((BEST_EFFORT, 9, gid)));
+        let mut unknown = stream_header(true, 9, gid);
+        unknown[0] = 3;
+        assert!(parse_header(&unknown).is_err());
+        let mut flags = stream_header(true, 9, gid);
+        flags[3] = 1;
+        assert!(parse_header(&flags).is_err());
+    }
+}

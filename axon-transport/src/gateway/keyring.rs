@@ -1,0 +1,404 @@
+//! All KME keys of the daemon in `qkd`: wires the machines of [`crate::keys`] to the KME and to the
+//! control streams.
+
+use std::{
+    collections::HashMap,
+    net::IpAddr,
+    sync::{
+        Arc, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicU64, Ordering},
+    },
+    time::Duration,
+};
+
+use axon_envelope::{KeyId, KmeKey};
+use tokio::sync::{Notify, mpsc};
+
+use crate::{
+    config::{Config, KeyMode, QkdConfig, Security},
+    keys::{
+        Acceptor, Answer, Clock, Dialler, Event, Events, Exporters, Fetched, KeyMessage, Kme,
+        KmeError, Origin, Purpose, Receiver, Request, Sender, SupplyError,
+    },
+    link::Message,
+};
+
+/// Locks a mutex; a panic elsewhere leaves nothing half-done that a later holder could trip over.
+pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// The keys of the daemon.
+pub(super) struct Keyring {
+    /// The daemon's monotonic clock.
+    pub(super) clock: Clock,
+    /// The settings that made it.
+    pub(super) config: QkdConfig,
+    /// Look-up of PSKs for incoming handshakes.
+    pub(super) acceptor: Acceptor,
+    /// Bootstrap keys for our own dials.
+    dialler: Mutex<Dialler>,
+    /// Wakes dials that wait for the KME.
+    dialler_answered: Notify,
+    kme: Kme,
+    peers: Mutex<HashMap<String, Arc<PeerKeys>>>,
+    /// Answers for proofs under way, by link number.
+    proofs: Mutex<HashMap<u64, mpsc::UnboundedSender<Answer>>>,
+    next_peer: AtomicU64,
+}
+
+impl std::fmt::Debug for Keyring {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Keyring").field("sae", &self.config.sae_id).finish_non_exhaustive()
+    }
+}
+
+impl Keyring {
+    /// The keyring of a daemon in `qkd`, `None` in `classic`. Must run within a tokio runtime.
+    pub(super) fn start(config: &Config) -> Result<Option<(Arc<Self>, Events)>, KmeError> {
+        let Security::Qkd(qkd) = &config.security else { return Ok(None) };
+        let clock = Clock::start();
+        let (kme, events) = Kme::start(qkd)?;
+        let keyring = Arc::new(Self {
+            acceptor: Acceptor::new(&qkd.sae_id, qkd.peers.clone(), config.cipher, clock.clone()),
+            dialler: Mutex::new(Dialler::new(&qkd.sae_id, qkd.peers.clone(), config.cipher)),
+            dialler_answered: Notify::new(),
+            kme,
+            peers: Mutex::default(),
+            proofs: Mutex::default(),
+            next_peer: AtomicU64::new(1),
+            config: qkd.clone(),
+            clock,
+        });
+        Ok(Some((keyring, events)))
+    }
+
+    /// Carries requests and answers until the keyring is dropped or the KME client ends.
+    pub(super) async fn run(self: Arc<Self>, mut events: Events) {
+        let mut second = tokio::time::interval(Duration::from_secs(1));
+        loop {
+            tokio::select! {
+                event = events.recv() => match event {
+                    Some(event) => self.dispatch(event),
+                    None => return,
+                },
+                request = self.acceptor.next_request() => self.submit(Origin::Acceptor, request),
+                _ = second.tick() => {
+                    self.acceptor.expire();
+                    self.with_dialler(|_, _| ());
+                    let peers: Vec<_> = lock(&self.peers).values().cloned().collect();
+                    for peer in peers {
+                        peer.with_receiver(&self, |now, receiver| receiver.expire(now));
+                        peer.warn(self.clock.now());
+                    }
+                }
+            }
+        }
+    }
+
+    /// Whether data is sealed per message.
+    pub(super) fn seals_messages(&self) -> bool {
+        self.config.key_mode == KeyMode::Messages10
+    }
+
+    /// Runs `f` on the dialler and sends off what it asks of the KME.
+    pub(super) fn with_dialler<T>(&self, f: impl FnOnce(Duration, &mut Dialler) -> T) -> T {
+        let now = self.clock.now();
+        let mut requests = Vec::new();
+        let result = {
+            let mut dialler = lock(&self.dialler);
+            let result = f(now, &mut dialler);
+            while let Some(request) = dialler.poll_request(now) {
+                requests.push(request);
+            }
+            result
+        };
+        for request in requests {
+            self.submit(Origin::Dialler, request);
+        }
+        result
+    }
+
+    /// Resolves when the dialler got an answer, or at `until` (on the keyring's clock).
+    pub(super) async fn dialler_ready(&self, until: Option<Duration>) {
+        let answered = self.dialler_answered.notified();
+        // A second at most: the dialler is asked again and says what it still waits for.
+        let wait = until
+            .map_or(Duration::from_secs(1), |u| u.saturating_sub(self.clock.now()))
+            .min(Duration::from_secs(1));
+        let _ = tokio::time::timeout(wait, answered).await;
+    }
+
+    /// The keys towards one peer SAE, which live across its connections.
+    pub(super) fn peer(&self, sae: &str) -> Result<Arc<PeerKeys>, axon_envelope::ChannelError> {
+        if let Some(peer) = lock(&self.peers).get(sae) {
+            return Ok(Arc::clone(peer));
+        }
+        let number = self.next_peer.fetch_add(1, Ordering::Relaxed);
+        let peer = Arc::new(PeerKeys {
+            number,
+            sae: sae.to_owned(),
+            sender: Mutex::new(Sender::new(&self.config.sae_id, sae)?),
+            receiver: Mutex::new(Receiver::new(&self.config.sae_id, sae)?),
+            outboxes: Mutex::default(),
+            changed: Notify::new(),
+            timer: Notify::new(),
+        });
+        Ok(Arc::clone(lock(&self.peers).entry(sae.to_owned()).or_insert(peer)))
+    }
+
+    /// Registers a proof under way on `link`; its answers come out of the receiver.
+    pub(super) fn proof_answers(&self, link: u64) -> mpsc::UnboundedReceiver<Answer> {
+        let (sender, receiver) = mpsc::unbounded_channel();
+        lock(&self.proofs).insert(link, sender);
+        receiver
+    }
+
+    /// The proof on `link` is over.
+    pub(super) fn proof_over(&self, link: u64) {
+        lock(&self.proofs).remove(&link);
+    }
+
+    /// One fresh key for the peer `slave`, outside every machine: for [`super::attempt`].
+    pub(super) async fn fetch_one(&self, slave: &str, link: u64) -> Result<(KeyId, KmeKey), String> {
+        let mut answers = self.proof_answers(link);
+        let request = Request::Enc {
+            slave: slave.to_owned(),
+            number: 1,
+            purpose: Purpose::Bootstrap,
+            timeout: Duration::from_secs(5),
+        };
+        self.submit(Origin::Proof(link), request);
+        let answer = answers.recv().await;
+        self.proof_over(link);
+        match answer.map(|a| a.outcome) {
+            Some(Ok(Fetched::Keys(mut keys))) if !keys.is_empty() => Ok(keys.swap_remove(0)),
+            Some(Err(failure)) => Err(failure.to_string()),
+            _ => Err("the KME gave no key".into()),
+        }
+    }
+
+    /// Hands a request to the KME; when its queue is full the machine is told at once.
+    pub(super) fn submit(&self, origin: Origin, request: Request) {
+        if let Err(event) = self.kme.submit(origin, request) {
+            self.dispatch(*event);
+        }
+    }
+
+    /// After READY's proof: this address is known from now on.
+    pub(super) fn authenticated(&self, source: IpAddr, sae: &str) {
+        self.acceptor.authenticated(source, sae);
+    }
+
+    /// A connection failed before it became a link.
+    pub(super) fn forget_connection(&self, connection: u64) {
+        let peers: Vec<_> = lock(&self.peers).values().cloned().collect();
+        for peer in peers {
+            if lock(&peer.outboxes).contains_key(&connection) {
+                peer.detach(self, connection);
+            }
+        }
+    }
+
+    /// For status: counters of the KME client and of each peer's supply.
+    pub(super) fn status(&self) -> serde_json::Value {
+        let now = self.clock.now();
+        let peers: Vec<_> = lock(&self.peers).values().cloned().collect();
+        let peers: serde_json::Map<_, _> = peers
+            .iter()
+            .map(|p| {
+                let status = serde_json::json!({
+                    "sending": lock(&p.sender).statistics(now),
+                    "receiving": lock(&p.receiver).statistics(),
+                });
+                (p.sae.clone(), status)
+            })
+            .collect();
+        serde_json::json!({ "kme": self.kme.statistics(), "peers": peers })
+    }
+
+    fn dispatch(&self, event: Event) {
+        let Event { origin, answer } = event;
+        match origin {
+            Origin::Dialler => {
+                self.with_dialler(|now, dialler| dialler.on_answer(now, answer));
+                self.dialler_answered.notify_waiters();
+            }
+            Origin::Acceptor => self.acceptor.on_answer(answer),
+            Origin::Proof(link) | Origin::Responder(link) => {
+                if let Some(waiting) = lock(&self.proofs).get(&link) {
+                    let _ = waiting.send(answer);
+                }
+            }
+            Origin::Sender(number) => {
+                if let Some(peer) = self.by_number(number) {
+                    peer.with_sender(self, |now, sender| sender.on_answer(now, answer));
+                }
+            }
+            Origin::Receiver(number) => {
+                if let Some(peer) = self.by_number(number) {
+                    peer.with_receiver(self, |now, receiver| receiver.on_answer(now, answer));
+                }
+            }
+        }
+    }
+
+    fn by_number(&self, number: u64) -> Option<Arc<PeerKeys>> {
+        lock(&self.peers).values().find(|p| p.number == number).cloned()
+    }
+}
+
+/// The message keys of both directions with one peer SAE.
+pub(super) struct PeerKeys {
+    number: u64,
+    sae: String,
+    sender: Mutex<Sender>,
+    receiver: Mutex<Receiver>,
+    /// Where the messages of a connection go.
+    outboxes: Mutex<HashMap<u64, mpsc::UnboundedSender<Message>>>,
+    /// Wakes streams that wait for a key.
+    pub(super) changed: Notify,
+    timer: Notify,
+}
+
+impl PeerKeys {
+    /// A connection begins: its messages go to `outbox`.
+    pub(super) fn attach(
+        &self,
+        keyring: &Keyring,
+        connection: u64,
+        exporters: &Exporters,
+        outbox: mpsc::UnboundedSender<Message>,
+    ) -> Result<(), SupplyError> {
+        lock(&self.outboxes).insert(connection, outbox);
+        self.with_receiver(keyring, |now, r| r.attach(now, connection, exporters))?;
+        let owed = self.with_sender(keyring, |now, s| s.attach(now, connection, exporters))?;
+        // They belong to the previous connection, which a successor has not closed yet.
+        for message in owed {
+            let outboxes = lock(&self.outboxes);
+            for outbox in outboxes.iter().filter(|(c, _)| **c != connection).map(|(_, o)| o) {
+                let _ = outbox.send(Message::Keys(message.clone()));
+            }
+        }
+        Ok(())
+    }
+
+    /// A connection ended.
+    pub(super) fn detach(&self, keyring: &Keyring, connection: u64) {
+        lock(&self.outboxes).remove(&connection);
+        self.with_receiver(keyring, |now, r| r.detach(now, connection));
+        self.with_sender(keyring, |now, s| s.detach(now, connection));
+    }
+
+    /// A key announcement came in.
+    pub(super) fn on_message(
+        &self,
+        keyring: &Keyring,
+        connection: u64,
+        message: &KeyMessage,
+    ) -> Result<(), SupplyError> {
+        match message {
+            KeyMessage::Announce(_) | KeyMessage::Retire { .. } => {
+                self.with_receiver(keyring, |now, r| r.on_message(now, connection, message))
+            }
+            KeyMessage::Ready { .. } | KeyMessage::Failed { .. } => {
+                let result =
+                    self.with_sender(keyring, |now, s| s.on_message(now, connection, message));
+                // A key may have become READY.
+                self.changed.notify_waiters();
+                result
+            }
+        }
+    }
+
+    /// Runs `f` on the sending side, then sends off what it asks for and has to say.
+    pub(super) fn with_sender<T>(
+        &self,
+        keyring: &Keyring,
+        f: impl FnOnce(Duration, &mut Sender) -> T,
+    ) -> T {
+        let now = keyring.clock.now();
+        let (mut requests, mut messages) = (Vec::new(), Vec::new());
+        let result = {
+            let mut sender = lock(&self.sender);
+            let result = f(now, &mut sender);
+            while let Some(request) = sender.poll_request(now) {
+                requests.push(request);
+            }
+            while let Some(message) = sender.poll_message(now) {
+                messages.push(message);
+            }
+            result
+        };
+        self.carry(keyring, Origin::Sender(self.number), requests, messages);
+        result
+    }
+
+    /// Runs `f` on the receiving side, then sends off what it asks for and has to say.
+    pub(super) fn with_receiver<T>(
+        &self,
+        keyring: &Keyring,
+        f: impl FnOnce(Duration, &mut Receiver) -> T,
+    ) -> T {
+        let now = keyring.clock.now();
+        let (mut requests, mut messages) = (Vec::new(), Vec::new());
+        let result = {
+            let mut receiver = lock(&self.receiver);
+            let result = f(now, &mut receiver);
+            while let Some(request) = receiver.poll_request(now) {
+                requests.push(request);
+            }
+            while let Some(message) = receiver.poll_message() {
+                messages.push(message);
+            }
+            result
+        };
+        self.carry(keyring, Origin::Receiver(self.number), requests, messages);
+        result
+    }
+
+    /// Drives the timers of both directions until `connection` is detached.
+    pub(super) async fn run_timers(self: Arc<Self>, keyring: Arc<Keyring>, connection: u64) {
+        while lock(&self.outboxes).contains_key(&connection) {
+            let now = keyring.clock.now();
+            let next = [
+                lock(&self.sender).poll_timeout(now),
+                lock(&self.receiver).poll_timeout(now),
+            ];
+            let next = next.into_iter().flatten().min();
+            let sleep = next
+                .map_or(Duration::from_secs(1), |at| at.saturating_sub(now))
+                .clamp(Duration::from_millis(5), Duration::from_secs(1));
+            let _ = tokio::time::timeout(sleep, self.timer.notified()).await;
+            self.with_sender(&keyring, |_, _| ());
+            self.with_receiver(&keyring, |_, _| ());
+        }
+    }
+
+    fn carry(
+        &self,
+        keyring: &Keyring,
+        origin: Origin,
+        requests: Vec<Request>,
+        messages: Vec<(u64, KeyMessage)>,
+    ) {
+        if !requests.is_empty() || !messages.is_empty() {
+            self.timer.notify_one();
+            self.changed.notify_waiters();
+        }
+        for (connection, message) in messages {
+            if let Some(outbox) = lock(&self.outboxes).get(&connection) {
+                let _ = outbox.send(Message::Keys(message));
+            }
+        }
+        for request in requests {
+            keyring.submit(origin, request);
+        }
+    }
+
+    fn warn(&self, now: Duration) {
+        if let Some(warning) = lock(&self.sender).warning(now) {
+            tracing::warn!(peer = %self.sae, "{warning}");
+        }
+    }
+}

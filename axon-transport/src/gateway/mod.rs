@@ -1,0 +1,36 @@
+//! The gateway: QUIC links to other hosts' daemons and the samples that cross them.
+//!
+//! It is one more session of its daemon: relays read the rings of local publishers, stand-ins write
+//! rings for remote ones. It runs on a thread and runtime of its own, so that its faults and stalls
+//! are not the control plane's (`docs/architecture.md`). [`attempt`] makes single links by hand,
+//! for tools that try what a daemon refuses.
+
+pub mod attempt;
+
+mod accept;
+mod context;
+mod control;
+mod counters;
+mod dial;
+mod endpoint;
+mod error;
+mod establish;
+mod hub;
+mod identity;
+mod inbound;
+mod keyring;
+mod outbound;
+mod peer;
+mod pulse;
+mod queue;
+mod refusal;
+mod routes;
+mod run;
+mod seal;
+mod socket;
+mod status;
+
+pub use endpoint::EndpointError;
+pub use error::GatewayError;
+pub use refusal::{Refusal, RefusedBy};
+pub use run::run;

@@ -1,0 +1,152 @@
+//! What waits to be sent for one publisher towards one peer: plain data in, data out.
+//!
+//! KEEP_LAST never blocks its publisher: it is lossless up to the bound, then drops the oldest and
+//! counts it. Only KEEP_ALL makes the relay wait, which leaves its samples in the ring and so in
+//! time holds its publisher back.
+
+use std::collections::VecDeque;
+
+use crate::{
+    qos::{History, Qos, Reliability},
+    session::MessageInfo,
+};
+
+/// One sample on its way to a peer.
+#[derive(Debug)]
+pub(super) struct Sample {
+    /// Publisher, sequence number and timestamps.
+    pub(super) info: MessageInfo,
+    /// The payload.
+    pub(super) payload: Vec<u8>,
+    /// When it was copied out of the ring, on the monotonic clock.
+    pub(super) since: std::time::Instant,
+}
+
+/// What became of a sample that was offered.
+#[derive(Debug)]
+pub(super) enum Offered {
+    /// It waits; so many older ones were dropped for it.
+    Queued {
+        /// Samples dropped.
+        dropped: u64,
+    },
+    /// There is no room and nothing may be dropped: offer it again later.
+    Full(Sample),
+}
+
+/// The queue of one (route, publisher).
+#[derive(Debug)]
+pub(super) struct Queue {
+    samples: VecDeque<Sample>,
+    bytes: usize,
+    max_bytes: usize,
+    policy: Policy,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Policy {
+    /// RELIABLE and KEEP_ALL: never drops.
+    Wait,
+    /// RELIABLE and KEEP_LAST: drops the oldest beyond the bytes.
+    Bytes,
+    /// BEST_EFFORT: drops the oldest beyond the history's depth too.
+    Depth(usize),
+}
+
+impl Queue {
+    /// The queue for a relay with `qos`, of at most `max_bytes` (one sample may always wait).
+    pub(super) fn new(qos: &Qos, max_bytes: usize) -> Self {
+        let policy = match (qos.reliability, qos.history) {
+            (Reliability::Reliable, History::KeepAll) => Policy::Wait,
+            (Reliability::Reliable, History::KeepLast) => Policy::Bytes,
+            (Reliability::BestEffort, _) => Policy::Depth(qos.depth as usize),
+        };
+        Self { samples: VecDeque::new(), bytes: 0, max_bytes, policy }
+    }
+
+    /// Puts `sample` at the end, as the policy says.
+    pub(super) fn offer(&mut self, sample: Sample) -> Offered {
+        let size = sample.payload.len();
+        let over = |q: &Self| !q.samples.is_empty() && q.bytes + size > q.max_bytes;
+        if self.policy == Policy::Wait && over(self) {
+            return Offered::Full(sample);
+        }
+        let mut dropped = 0;
+        while over(self) || matches!(self.policy, Policy::Depth(d) if self.samples.len() >= d.max(1))
+        {
+            if self.pop().is_none() {
+                break;
+            }
+            dropped += 1;
+        }
+        self.bytes += size;
+        self.samples.push_back(sample);
+        Offered::Queued { dropped }
+    }
+
+    /// The oldest sample.
+    pub(super) fn pop(&mut self) -> Option<Sample> {
+        let sample = self.samples.pop_front()?;
+        self.bytes -= sample.payload.len();
+        Some(sample)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ids::Gid;
+
+    fn sample(sequence: u64, size: usize) -> Sample {
+        let info = MessageInfo {
+            publisher: Gid::default(),
+            sequence,
+            source_timestamp: 0,
+            received_timestamp: 0,
+        };
+        Sample { info, payload: vec![0; size], since: std::time::Instant::now() }
+    }
+
+    fn offer(queue: &mut Queue, sequence: u64, size: usize) -> Result<u64, u64> {
+        match queue.offer(sample(sequence, size)) {
+            Offered::Queued { dropped } => Ok(dropped),
+            Offered::Full(s) => Err(s.info.sequence),
+        }
+    }
+
+    #[test]
+    fn keep_all_hands_the_sample_back_and_loses_nothing() {
+        let mut queue = Queue::new(&Qos::keep_all(), 100);
+        assert_eq!(offer(&mut queue, 1, 60), Ok(0));
+        assert_eq!(offer(&mut queue, 2, 60), Err(2));
+        assert_eq!(queue.pop().unwrap().info.sequence, 1);
+        assert_eq!(offer(&mut queue, 2, 60), Ok(0));
+        assert_eq!(queue.pop().unwrap().info.sequence, 2);
+        assert!(queue.pop().is_none());
+    }
+
+    #[test]
+    fn one_sample_over_the_bound_still_passes() {
+        let mut queue = Queue::new(&Qos::keep_all(), 100);
+        assert_eq!(offer(&mut queue, 1, 1000), Ok(0));
+    }
+
+    #[test]
+    fn keep_last_drops_the_oldest_and_says_how_many() {
+        let mut queue = Queue::new(&Qos::default(), 100);
+        for sequence in 1..=5 {
+            assert_eq!(offer(&mut queue, sequence, 20), Ok(0));
+        }
+        assert_eq!(offer(&mut queue, 6, 50), Ok(3));
+        assert_eq!(queue.pop().unwrap().info.sequence, 4);
+    }
+
+    #[test]
+    fn best_effort_keeps_no_more_than_its_depth() {
+        let mut queue = Queue::new(&Qos { depth: 2, ..Qos::sensor_data() }, 1000);
+        assert_eq!(offer(&mut queue, 1, 1), Ok(0));
+        assert_eq!(offer(&mut queue, 2, 1), Ok(0));
+        assert_eq!(offer(&mut queue, 3, 1), Ok(1));
+        assert_eq!(queue.pop().unwrap().info.sequence, 2);
+    }
+}

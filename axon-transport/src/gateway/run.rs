@@ -1,0 +1,125 @@
+//! Starting the gateway on the calling thread.
+
+use std::{
+    collections::HashMap,
+    net::{Ipv4Addr, SocketAddr},
+    sync::{Arc, RwLock},
+};
+
+use tokio::sync::{Notify, mpsc};
+
+use super::{
+    accept::accept,
+    context::Context,
+    endpoint::{Endpoints, reset_key},
+    error::GatewayError,
+    hub::{Event, Hub, Shared},
+    keyring::Keyring,
+    pulse::Pulse,
+};
+use crate::{
+    daemon::bridge::{CHANNEL, GatewayParts, ToControl},
+    session::{Session, SessionEvent, SessionOptions, SessionRole},
+};
+
+/// Worker threads: one that carries samples may be deep in an AEAD while another answers.
+const WORKERS: usize = 2;
+
+/// Runs the gateway until the control plane shuts it down.
+///
+/// # Errors
+/// [`GatewayError`], always before [`ToControl::Started`].
+pub fn run(parts: GatewayParts) -> Result<(), GatewayError> {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(WORKERS)
+        .thread_name("axon-gw")
+        .enable_all()
+        .build()?;
+    runtime.block_on(serve(parts))
+}
+
+async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
+    let GatewayParts { config, daemon, socket, control, mut orders } = parts;
+    let keyring = Keyring::start(&config)?;
+    let (keyring, key_events) = match keyring {
+        Some((keyring, events)) => (Some(keyring), Some(events)),
+        None => (None, None),
+    };
+    let context = Arc::new(Context::new(Arc::clone(&config), daemon, keyring.clone())?);
+
+    let unspecified = SocketAddr::from((Ipv4Addr::UNSPECIFIED, 0));
+    let (server, _) = context.server(unspecified)?;
+    let reset = reset_key(config.runtime_dir.as_deref(), config.domain);
+    let (datagrams, mut received) = mpsc::channel(CHANNEL);
+    let endpoints = Arc::new(Endpoints::bind(&config, &reset, Some(server), &datagrams)?);
+
+    let (events, inbox) = mpsc::channel(CHANNEL);
+    let graph = Arc::new(Notify::new());
+    let session = open_session(socket, &config, Arc::clone(&graph)).await?;
+    let shared = Arc::new(Shared {
+        pulse: Pulse::start(&session)?,
+        session,
+        local_qos: Arc::new(RwLock::new(HashMap::new())),
+        domain: config.domain,
+        max_message: config.max_message,
+    });
+    if let (Some(keyring), Some(key_events)) = (keyring, key_events) {
+        tokio::spawn(keyring.run(key_events));
+    }
+    let _ = control.send(ToControl::Started { port: endpoints.port }).await;
+
+    for endpoint in &endpoints.all {
+        let (incomers, mut answered) = mpsc::channel(64);
+        tokio::spawn(accept(Arc::clone(&context), endpoint.clone(), incomers));
+        let events = events.clone();
+        tokio::spawn(async move {
+            while let Some(incomer) = answered.recv().await {
+                if events.send(Event::Incomer(incomer)).await.is_err() {
+                    return;
+                }
+            }
+        });
+    }
+    let forward = control.clone();
+    tokio::spawn(async move {
+        while let Some(datagram) = received.recv().await {
+            let notice = ToControl::Datagram { from: datagram.from, bytes: datagram.bytes };
+            // A datagram that finds the control plane busy is lost, as datagrams may be.
+            let _ = forward.try_send(notice);
+        }
+    });
+    let ordered = events.clone();
+    tokio::spawn(async move {
+        while let Some(order) = orders.recv().await {
+            if ordered.send(Event::Order(order)).await.is_err() {
+                return;
+            }
+        }
+        let _ = ordered.send(Event::Order(crate::daemon::bridge::ToGateway::Shutdown)).await;
+    });
+    Hub::new(context, endpoints, shared, control, events).run(inbox, &graph).await;
+    Ok(())
+}
+
+/// The gateway's own session; graph changes notify `graph`. Opening waits for the control plane, so
+/// it must not hold up the runtime.
+async fn open_session(
+    socket: std::os::fd::OwnedFd,
+    config: &Arc<crate::config::Config>,
+    graph: Arc<Notify>,
+) -> Result<Session, GatewayError> {
+    let config = Arc::clone(config);
+    let opened = tokio::task::spawn_blocking(move || {
+        let options = SessionOptions::new("gateway").role(SessionRole::Gateway);
+        Session::over(socket, &config, options)
+    })
+    .await
+    .map_err(|e| std::io::Error::other(e.to_string()))?;
+    let session = opened?;
+    session.set_listener(move |event| {
+        if matches!(event, SessionEvent::Graph) {
+            graph.notify_one();
+        }
+    });
+    Ok(session)
+}

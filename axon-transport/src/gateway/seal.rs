@@ -1,0 +1,179 @@
+//! The body of a data message: the inner header and the payload, in `messages10` within an
+//! AXQKD001 envelope (`docs/formats.md`, sections 3 and 7).
+
+use std::{sync::Arc, time::Instant};
+
+use axon_envelope::{Delivery, OpenError, Route, TAG_LEN, inner};
+
+use super::{
+    keyring::{Keyring, PeerKeys},
+    queue::Sample,
+};
+use crate::{ids::Gid, keys::NoKey};
+
+/// Largest inner header and envelope around a payload.
+pub(super) const MAX_OVERHEAD: usize = axon_envelope::MAX_HEADER_LEN + inner::LEN + TAG_LEN;
+const LENGTH: usize = 4;
+
+/// How one link protects its messages.
+#[derive(Clone)]
+pub(super) enum Protection {
+    /// By QUIC alone: `classic`, and `qkd` with `session`.
+    Link,
+    /// Each message in an envelope of its own.
+    Envelope {
+        /// The daemon's keys.
+        keyring: Arc<Keyring>,
+        /// Those of this peer.
+        keys: Arc<PeerKeys>,
+        /// The connection's number, to which the keys are bound.
+        connection: u64,
+    },
+}
+
+/// What an opened message says.
+pub(super) struct Opened<'a> {
+    /// Publisher, sequence number, timestamp.
+    pub(super) header: inner::Header,
+    /// The payload, decompressed where it was compressed.
+    pub(super) payload: std::borrow::Cow<'a, [u8]>,
+}
+
+/// Why a message is refused.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub(super) enum RefusedMessage {
+    /// The envelope; the cause is for the local log alone.
+    #[error("{text}")]
+    Envelope {
+        /// Cause for log and status.
+        text: String,
+    },
+    /// The inner header or the compression.
+    #[error("{0}")]
+    Malformed(String),
+}
+
+fn header(sample: &Sample) -> inner::Header {
+    let age = sample.since.elapsed().as_millis();
+    inner::Header {
+        gid: sample.info.publisher.0,
+        sequence: sample.info.sequence,
+        source_timestamp: sample.info.source_timestamp,
+        request_id: inner::RequestId::default(),
+        compressed: false,
+        age_ms: u32::try_from(age).unwrap_or(u32::MAX),
+        // Bounded by AXON_MAX_MESSAGE_MB, which is far below 4 GiB.
+        uncompressed_len: u32::try_from(sample.payload.len()).unwrap_or(u32::MAX),
+    }
+}
+
+impl Protection {
+    /// Writes `length || body` of `sample` into `frame`, which is cleared first.
+    ///
+    /// # Errors
+    /// [`NoKey`] in `messages10` when no READY key is left for this kind of delivery.
+    pub(super) fn write(
+        &self,
+        sample: &Sample,
+        route: Route,
+        delivery: Delivery,
+        frame: &mut Vec<u8>,
+    ) -> Result<(), NoKey> {
+        frame.clear();
+        let header = header(sample).encode();
+        match self {
+            Self::Link => {
+                let length = header.len() + sample.payload.len();
+                frame.extend_from_slice(&(length as u32).to_be_bytes());
+                frame.extend_from_slice(&header);
+                frame.extend_from_slice(&sample.payload);
+                Ok(())
+            }
+            Self::Envelope { keyring, keys, .. } => keys.with_sender(keyring, |now, sender| {
+                let plain = header.len() + sample.payload.len();
+                frame.resize(LENGTH + sender.overhead() + plain, 0);
+                let slot = sender.slot(now, delivery)?;
+                let parts: [&[u8]; 2] = [&header, &sample.payload];
+                let sealed = slot.seal_into(route, &parts, &mut frame[LENGTH..]);
+                // The buffer has room for the longest header, and the payload is bounded.
+                let length = sealed.map_err(|_| NoKey::None)?;
+                frame.truncate(LENGTH + length);
+                frame[..LENGTH].copy_from_slice(&(length as u32).to_be_bytes());
+                Ok(())
+            }),
+        }
+    }
+
+    /// One more message waits to be sealed: what the key supply plans by.
+    pub(super) fn demand(&self, messages: u32) {
+        if let Self::Envelope { keyring, keys, .. } = self {
+            keys.with_sender(keyring, |now, sender| sender.demand(now, messages));
+        }
+    }
+
+    /// Opens `body` in place. `max_payload` bounds what decompression may yield.
+    ///
+    /// # Errors
+    /// [`RefusedMessage`]; nothing of the payload is handed on before its tag was verified.
+    pub(super) fn open<'a>(
+        &self,
+        body: &'a mut [u8],
+        route: Route,
+        max_payload: u64,
+    ) -> Result<Opened<'a>, RefusedMessage> {
+        let plain: &[u8] = match self {
+            Self::Link => body,
+            Self::Envelope { keyring, keys, connection } => {
+                let range = keys.with_receiver(keyring, |now, receiver| {
+                    let refused = |text: String| RefusedMessage::Envelope { text };
+                    let opener = receiver
+                        .opener(*connection)
+                        .ok_or_else(|| refused("the connection has no keys".into()))?;
+                    let start = body.as_ptr().addr();
+                    match opener.open_in_place(now, route, body) {
+                        Ok(plain) => {
+                            let at = plain.as_ptr().addr() - start;
+                            Ok(at..at + plain.len())
+                        }
+                        Err(error) => Err(refused(cause(&error))),
+                    }
+                })?;
+                &body[range]
+            }
+        };
+        let (header, payload) =
+            inner::Header::decode(plain).map_err(|e| RefusedMessage::Malformed(e.to_string()))?;
+        if !header.compressed {
+            return Ok(Opened { header, payload: payload.into() });
+        }
+        let length = u64::from(header.uncompressed_len);
+        if length > max_payload {
+            let text = format!("{length} bytes when decompressed, at most {max_payload} allowed");
+            return Err(RefusedMessage::Malformed(text));
+        }
+        let payload = zstd::bulk::decompress(payload, length as usize)
+            .ok()
+            .filter(|p| p.len() as u64 == length)
+            .ok_or_else(|| RefusedMessage::Malformed("not one zstd frame as declared".into()))?;
+        Ok(Opened { header, payload: payload.into() })
+    }
+}
+
+/// For the local log: never told to the peer.
+fn cause(error: &OpenError) -> String {
+    match error.cause() {
+        Some(cause) => format!("envelope refused: {cause}"),
+        None => format!("envelope refused: {error}"),
+    }
+}
+
+/// A sample as it was taken from a relay.
+pub(super) fn sample(info: crate::session::MessageInfo, payload: Vec<u8>) -> Sample {
+    Sample { info, payload, since: Instant::now() }
+}
+
+/// The publisher that the inner header names.
+pub(super) fn publisher(header: &inner::Header) -> Gid {
+    Gid(header.gid)
+}

@@ -1,0 +1,266 @@
+//! The messages of the control stream.
+
+use minicbor::{Decode, Encode};
+
+use super::frame::{FrameError, from_map, to_map};
+use crate::{
+    graph::{Endpoint, LIMITS},
+    ids::{DaemonId, Gid},
+    keys::KeyMessage,
+    qos::Qos,
+};
+
+/// Who a daemon is and how it is set up: the first message in each direction.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Hello {
+    /// Lowest protocol version spoken.
+    #[n(0)]
+    pub protocol_min: u8,
+    /// Highest protocol version spoken.
+    #[n(1)]
+    pub protocol_max: u8,
+    /// ROS domain.
+    #[n(2)]
+    pub domain: u32,
+    /// The sender.
+    #[n(3)]
+    pub daemon: DaemonId,
+    /// Security mode: 0 classic, 1 qkd.
+    #[n(4)]
+    pub mode: u8,
+    /// Key mode: 0 none, 1 session, 2 messages10.
+    #[n(5)]
+    pub key_mode: u8,
+    /// Key exchange: 0 X25519MLKEM768, 1 psk_ke, 2 psk_dhe_ke.
+    #[n(6)]
+    pub kex: u8,
+    /// Cipher: 0 chacha20-poly1305, 1 aes-256-gcm.
+    #[n(7)]
+    pub cipher: u8,
+    /// SAE ID, in qkd.
+    #[n(8)]
+    pub sae: Option<String>,
+    /// The host's name, for people.
+    #[n(9)]
+    pub host: String,
+    /// Classic authentication: 0 none, 1 pinned, 2 ca; absent in qkd.
+    #[n(12)]
+    pub auth: Option<u8>,
+    /// The link that this connection succeeds.
+    #[cbor(n(15), with = "minicbor::bytes")]
+    pub replaces: Option<[u8; 16]>,
+    /// The daemon that the dialler means to reach.
+    #[n(16)]
+    pub expects: Option<DaemonId>,
+    /// Whether the sender lists the receiver as a static peer.
+    #[n(17)]
+    pub static_peer: bool,
+}
+
+/// The connection that the lower daemon id keeps.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+struct Elected {
+    /// Names the link, for a successor's HELLO.
+    #[cbor(n(0), with = "minicbor::bytes")]
+    link: [u8; 16],
+}
+
+/// What changed in the sender's graph.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Graph {
+    /// Version after this message.
+    #[n(0)]
+    pub version: u64,
+    /// Version that it builds on; 0 for a whole graph.
+    #[n(1)]
+    pub before: u64,
+    /// Endpoints that came or changed.
+    #[n(2)]
+    pub added: Vec<Endpoint>,
+    /// Endpoints that went.
+    #[n(3)]
+    pub removed: Vec<Gid>,
+}
+
+/// The receiver of GRAPH missed a version and asks for the whole.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct GraphResync {
+    /// The version it holds.
+    #[n(0)]
+    pub version: u64,
+}
+
+/// One subscription on the asking side of a route.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Subscriber {
+    /// Its GID.
+    #[n(0)]
+    pub gid: Gid,
+    /// What it requests.
+    #[n(1)]
+    pub qos: Qos,
+}
+
+/// The newest sample of a publisher that the asking side has.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(array)]
+pub struct LastSeen {
+    /// The publisher.
+    #[n(0)]
+    pub publisher: Gid,
+    /// Its sequence number.
+    #[n(1)]
+    pub sequence: u64,
+}
+
+/// Asks for a topic's samples; again with the same route to change its subscriptions.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Subscribe {
+    /// The asking side's number for the route.
+    #[n(0)]
+    pub route: u32,
+    /// Topic name.
+    #[n(1)]
+    pub topic: String,
+    /// Type name.
+    #[n(2)]
+    pub type_name: String,
+    /// 0 topic, 1 request, 2 response.
+    #[n(3)]
+    pub kind: u8,
+    /// The subscriptions that the route serves.
+    #[n(4)]
+    pub subscribers: Vec<Subscriber>,
+    /// Where to resume.
+    #[n(5)]
+    pub last: Vec<LastSeen>,
+}
+
+/// Ends a route.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Unsubscribe {
+    /// The route.
+    #[n(0)]
+    pub route: u32,
+}
+
+/// The publishers that now feed a route.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct RouteReady {
+    /// The route.
+    #[n(0)]
+    pub route: u32,
+    /// Their GIDs.
+    #[n(1)]
+    pub publishers: Vec<Gid>,
+}
+
+/// KEEPALIVE carries nothing.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+struct Nothing {}
+
+const MAX_HOST: usize = 255;
+const MAX_SAE: usize = 63;
+
+/// A control message.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Message {
+    /// Who I am.
+    Hello(Hello),
+    /// This connection stays, under this link id.
+    Elected([u8; 16]),
+    /// Graph changes.
+    Graph(Graph),
+    /// Send the whole graph.
+    GraphResync(GraphResync),
+    /// Send a topic.
+    Subscribe(Subscribe),
+    /// Stop sending it.
+    Unsubscribe(Unsubscribe),
+    /// The topic's publishers are attached.
+    RouteReady(RouteReady),
+    /// Still here.
+    Keepalive,
+    /// About keys.
+    Keys(KeyMessage),
+}
+
+impl Message {
+    /// Type byte and CBOR map.
+    pub(super) fn encode(&self) -> (u8, Vec<u8>) {
+        match self {
+            Self::Hello(m) => (1, to_map(m)),
+            Self::Elected(link) => (2, to_map(&Elected { link: *link })),
+            Self::Graph(m) => (3, to_map(m)),
+            Self::GraphResync(m) => (4, to_map(m)),
+            Self::Subscribe(m) => (5, to_map(m)),
+            Self::Unsubscribe(m) => (6, to_map(m)),
+            Self::RouteReady(m) => (7, to_map(m)),
+            Self::Keepalive => (8, to_map(&Nothing {})),
+            Self::Keys(m) => {
+                let mut map = Vec::new();
+                m.encode(&mut map);
+                (m.frame_type(), map)
+            }
+        }
+    }
+
+    /// The message of type `kind`, `None` for an unknown type.
+    pub(super) fn decode(kind: u8, map: &[u8]) -> Result<Option<Self>, FrameError> {
+        let message = match kind {
+            1 => Self::Hello(from_map(kind, map)?),
+            2 => Self::Elected(from_map::<Elected>(kind, map)?.link),
+            3 => Self::Graph(from_map(kind, map)?),
+            4 => Self::GraphResync(from_map(kind, map)?),
+            5 => Self::Subscribe(from_map(kind, map)?),
+            6 => Self::Unsubscribe(from_map(kind, map)?),
+            7 => Self::RouteReady(from_map(kind, map)?),
+            8 => from_map::<Nothing>(kind, map).map(|_| Self::Keepalive)?,
+            16..=19 => Self::Keys(KeyMessage::decode(kind, map).map_err(|e| {
+                FrameError::Malformed { kind, reason: e.to_string() }
+            })?),
+            _ => return Ok(None),
+        };
+        match message.bounds() {
+            Ok(()) => Ok(Some(message)),
+            Err(reason) => Err(FrameError::Malformed { kind, reason: reason.into() }),
+        }
+    }
+
+    /// What the CBOR types alone do not bound.
+    fn bounds(&self) -> Result<(), &'static str> {
+        let ok = |condition: bool, reason| if condition { Ok(()) } else { Err(reason) };
+        match self {
+            Self::Hello(m) => ok(
+                m.host.len() <= MAX_HOST && m.sae.as_ref().is_none_or(|s| s.len() <= MAX_SAE),
+                "a name is too long",
+            ),
+            Self::Graph(m) => ok(
+                m.added.len() <= LIMITS.endpoints
+                    && m.removed.len() <= LIMITS.endpoints
+                    && m.added.iter().all(Endpoint::is_sane),
+                "an endpoint is out of bounds",
+            ),
+            Self::Subscribe(m) => ok(
+                m.topic.len() <= LIMITS.name
+                    && m.type_name.len() <= LIMITS.name
+                    && m.kind <= 2
+                    && m.subscribers.len() <= LIMITS.endpoints
+                    && m.last.len() <= LIMITS.endpoints
+                    && m.subscribers.iter().all(|s| s.qos.depth >= 1),
+                "a route is out of bounds",
+            ),
+            _ => Ok(()),
+        }
+    }
+}

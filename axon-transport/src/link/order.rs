@@ -1,0 +1,128 @@
+//! The order in which a connection becomes a link.
+//!
+//! HELLO both ways, in qkd the proof of the client's name, ELECTED by the lower daemon id; graph,
+//! routes, data and ordinary keys only after that (`docs/formats.md`, section 6).
+
+use super::message::Message;
+use crate::keys::KeyMessage;
+
+/// Which end of the TLS handshake this side is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Side {
+    /// It dialled.
+    Client,
+    /// It was dialled.
+    Server,
+}
+
+/// A message before its time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{message} is not allowed {when}")]
+pub struct OutOfOrder {
+    /// The message.
+    pub message: &'static str,
+    /// The step at which it came.
+    pub when: &'static str,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Step {
+    Hello,
+    /// qkd: the client's name is being proven.
+    Proof,
+    Election,
+    Open,
+}
+
+/// Judges each message that arrives on a connection's control stream.
+#[derive(Clone, Debug)]
+pub struct Order {
+    side: Side,
+    qkd: bool,
+    /// Whether the peer is the one that elects.
+    peer_elects: bool,
+    step: Step,
+    hello_seen: bool,
+}
+
+impl Order {
+    /// The order for a fresh connection, in qkd or classic.
+    pub fn new(side: Side, qkd: bool) -> Self {
+        Self { side, qkd, peer_elects: false, step: Step::Hello, hello_seen: false }
+    }
+
+    /// The peer's HELLO was checked; `peer_elects` when its daemon id is the lower one.
+    pub fn hello_checked(&mut self, peer_elects: bool) {
+        self.peer_elects = peer_elects;
+        self.step = if self.qkd { Step::Proof } else { Step::Election };
+    }
+
+    /// Server: READY with the right proof came. Client: it sent READY.
+    pub fn proven(&mut self) {
+        if self.step == Step::Proof {
+            self.step = Step::Election;
+        }
+    }
+
+    /// This side elected the connection, or the peer's ELECTED was accepted.
+    pub fn elected(&mut self) {
+        if self.step == Step::Election {
+            self.step = Step::Open;
+        }
+    }
+
+    /// Whether the link is open for graph, routes and data.
+    pub fn is_open(&self) -> bool {
+        self.step == Step::Open
+    }
+
+    /// Whether `message` may come now.
+    ///
+    /// # Errors
+    /// [`OutOfOrder`]; the connection is then closed.
+    pub fn accept(&mut self, message: &Message) -> Result<(), OutOfOrder> {
+        let allowed = match (message, self.step) {
+            (Message::Hello(_), Step::Hello) => !std::mem::replace(&mut self.hello_seen, true),
+            (Message::Hello(_), _) => false,
+            // The server announces the key that proves the client's name.
+            (Message::Keys(KeyMessage::Announce(_)), Step::Proof) => self.side == Side::Client,
+            (Message::Keys(KeyMessage::Ready { .. } | KeyMessage::Failed { .. }), Step::Proof) => {
+                self.side == Side::Server
+            }
+            (Message::Elected(_), Step::Election) => self.peer_elects,
+            (Message::Keepalive, step) => step != Step::Hello,
+            // Key announcements exist in qkd alone.
+            (Message::Keys(_), Step::Open) => self.qkd,
+            (Message::Elected(_), Step::Open) => false,
+            (_, Step::Open) => true,
+            _ => false,
+        };
+        if allowed {
+            return Ok(());
+        }
+        let when = match self.step {
+            Step::Hello => "before HELLO",
+            Step::Proof => "before the client's name is proven",
+            Step::Election => "before the link is elected",
+            Step::Open => "on an open link",
+        };
+        Err(OutOfOrder { message: message.name(), when })
+    }
+}
+
+impl Message {
+    /// The message's name in `docs/formats.md`.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Hello(_) => "HELLO",
+            Self::Elected(_) => "ELECTED",
+            Self::Graph(_) => "GRAPH",
+            Self::GraphResync(_) => "GRAPH_RESYNC",
+            Self::Subscribe(_) => "SUBSCRIBE",
+            Self::Unsubscribe(_) => "UNSUBSCRIBE",
+            Self::RouteReady(_) => "ROUTE_READY",
+            Self::Keepalive => "KEEPALIVE",
+            Self::Keys(m) => m.name(),
+        }
+    }
+}

@@ -1,0 +1,10 @@
+//! Quality of service: the policies under their ROS 2 names, and which offered and requested
+//! profiles go together.
+//!
+//! Plain data; no I/O. Durations are in nanoseconds, `None` is infinite.
+
+mod matching;
+mod policy;
+
+pub use matching::{Incompatible, compatible};
+pub use policy::{Durability, History, Liveliness, Qos, Reliability};

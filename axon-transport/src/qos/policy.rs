@@ -1,0 +1,114 @@
+//! The policies of one endpoint.
+
+use minicbor::{Decode, Encode};
+use serde::Serialize;
+
+/// Whether every sample must arrive.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode, Serialize)]
+#[cbor(index_only)]
+#[serde(rename_all = "snake_case")]
+pub enum Reliability {
+    /// Samples may be lost.
+    #[n(0)]
+    BestEffort,
+    /// Samples arrive, within the bounds of the history.
+    #[n(1)]
+    Reliable,
+}
+
+/// What a subscription that joins late receives.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode, Serialize)]
+#[cbor(index_only)]
+#[serde(rename_all = "snake_case")]
+pub enum Durability {
+    /// Samples from now on.
+    #[n(0)]
+    Volatile,
+    /// The publisher's history first.
+    #[n(1)]
+    TransientLocal,
+}
+
+/// How many samples are kept.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode, Serialize)]
+#[cbor(index_only)]
+#[serde(rename_all = "snake_case")]
+pub enum History {
+    /// The newest `depth`.
+    #[n(0)]
+    KeepLast,
+    /// All, up to the memory budget; then the publisher waits.
+    #[n(1)]
+    KeepAll,
+}
+
+/// Who asserts that a publisher is alive.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode, Serialize)]
+#[cbor(index_only)]
+#[serde(rename_all = "snake_case")]
+pub enum Liveliness {
+    /// Its session does.
+    #[n(0)]
+    Automatic,
+    /// The publisher itself, by publishing or asserting.
+    #[n(1)]
+    ManualByTopic,
+}
+
+/// The quality of service that an endpoint offers or requests.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode, Serialize)]
+#[cbor(map)]
+pub struct Qos {
+    /// Whether every sample must arrive.
+    #[n(0)]
+    pub reliability: Reliability,
+    /// What late joiners receive.
+    #[n(1)]
+    pub durability: Durability,
+    /// How many samples are kept.
+    #[n(2)]
+    pub history: History,
+    /// The number of samples kept by [`History::KeepLast`]; at least 1.
+    #[n(3)]
+    pub depth: u32,
+    /// Longest time between two samples, in nanoseconds.
+    #[n(4)]
+    pub deadline: Option<u64>,
+    /// Age at which a sample is no longer delivered, in nanoseconds.
+    #[n(5)]
+    pub lifespan: Option<u64>,
+    /// Who asserts liveliness.
+    #[n(6)]
+    pub liveliness: Liveliness,
+    /// Time without an assertion after which a publisher counts as not alive, in nanoseconds.
+    #[n(7)]
+    pub lease: Option<u64>,
+}
+
+impl Default for Qos {
+    /// ROS 2's default profile: RELIABLE, VOLATILE, KEEP_LAST(10).
+    fn default() -> Self {
+        Self {
+            reliability: Reliability::Reliable,
+            durability: Durability::Volatile,
+            history: History::KeepLast,
+            depth: 10,
+            deadline: None,
+            lifespan: None,
+            liveliness: Liveliness::Automatic,
+            lease: None,
+        }
+    }
+}
+
+impl Qos {
+    /// RELIABLE and KEEP_ALL: nothing is dropped; a publisher waits for its slowest such reader.
+    pub fn keep_all() -> Self {
+        Self { history: History::KeepAll, ..Self::default() }
+    }
+
+    /// ROS 2's sensor data profile: BEST_EFFORT, KEEP_LAST(5).
+    pub fn sensor_data() -> Self {
+        Self { reliability: Reliability::BestEffort, depth: 5, ..Self::default() }
+    }
+}
