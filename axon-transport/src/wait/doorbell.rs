@@ -186,12 +186,19 @@ impl Crowd {
 
 fn poll_readable(bell: BorrowedFd<'_>, others: &[BorrowedFd<'_>], left: Option<Duration>) -> bool {
     let timeout = left.and_then(|left| Timespec::try_from(left).ok());
-    let mut fds = Vec::with_capacity(1 + others.len());
-    fds.push(PollFd::from_borrowed_fd(bell, PollFlags::IN));
-    fds.extend(others.iter().map(|fd| PollFd::from_borrowed_fd(*fd, PollFlags::IN)));
+    let poll_fd = |fd| PollFd::from_borrowed_fd(fd, PollFlags::IN);
+    let (mut alone, mut all);
+    let fds = if others.is_empty() {
+        alone = [poll_fd(bell)];
+        &mut alone[..]
+    } else {
+        all = Vec::with_capacity(1 + others.len());
+        all.extend([bell].iter().chain(others).map(|fd| poll_fd(*fd)));
+        &mut all[..]
+    };
     // An interrupted poll counts as a spurious wake: the caller looks again and computes what
     // remains of its time.
-    poll(&mut fds, timeout.as_ref()).is_ok() && !fds[0].revents().is_empty()
+    poll(fds, timeout.as_ref()).is_ok() && !fds[0].revents().is_empty()
 }
 
 /// Leads a session's waits from an event loop instead of a blocked thread.

@@ -7,7 +7,7 @@ use std::{
         atomic::{AtomicBool, AtomicU64, Ordering},
     },
     thread,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use rustix::event::{PollFd, PollFlags, poll};
@@ -15,8 +15,14 @@ use rustix::event::{PollFd, PollFlags, poll};
 use super::{arm, disarm, due, settle};
 use crate::{ids::SessionId, shm::SessionSegment};
 
-/// Long enough that only a lost wake-up takes it.
-const EVER: Option<Duration> = Some(Duration::from_secs(60));
+/// Only a wake-up that was lost takes this long.
+const EVER: Duration = Duration::from_secs(60);
+
+/// Waits for `ready`, which must come true because the wait is woken.
+fn await_woken(session: &SessionSegment, ready: impl FnMut() -> bool) {
+    let start = Instant::now();
+    assert!(session.wait(ready, Some(EVER)) && start.elapsed() < EVER, "a wake-up was lost");
+}
 
 #[test]
 fn the_last_look_or_the_ring_finds_what_came() {
@@ -76,7 +82,7 @@ fn each_waiter_of_a_crowd_is_woken() {
             scope.spawn(move || {
                 for round in 0..rounds {
                     let mine = round * threads + me;
-                    assert!(session.wait(|| turn.load(Ordering::Acquire) == mine, EVER));
+                    await_woken(session, || turn.load(Ordering::Acquire) == mine);
                     turn.store(mine + 1, Ordering::Release);
                     session.notify();
                 }
@@ -105,7 +111,7 @@ fn an_external_leader_and_blocked_threads_share_the_doorbell() {
         // Leads for a while as a thread, then follows.
         scope.spawn(|| {
             for round in 1..=rounds {
-                assert!(session.wait(|| ping.load(Ordering::Acquire) == round, EVER));
+                await_woken(&session, || ping.load(Ordering::Acquire) == round);
                 pong.store(round, Ordering::Release);
                 session.notify();
             }
@@ -131,10 +137,10 @@ fn an_external_leader_and_blocked_threads_share_the_doorbell() {
                 continue;
             }
             let mut fds = [PollFd::from_borrowed_fd(leader.as_fd(), PollFlags::IN)];
-            assert_eq!(poll(&mut fds, EVER.map(|d| d.try_into().unwrap()).as_ref()), Ok(1));
+            assert_eq!(poll(&mut fds, Some(&EVER.try_into().unwrap())), Ok(1));
         }
         drop(leader);
-        assert!(session.wait(|| over.load(Ordering::Acquire), EVER));
+        await_woken(&session, || over.load(Ordering::Acquire));
     });
     assert!(Arc::clone(&session).external_leader().is_ok());
 }

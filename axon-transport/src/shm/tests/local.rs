@@ -1,6 +1,6 @@
 //! Both ends in one process, in one session and in two.
 
-use std::{io::Write as _, time::Duration};
+use std::io::Write as _;
 
 use super::*;
 
@@ -218,11 +218,12 @@ fn a_blocked_publish_goes_on_when_the_reader_does() {
         scope.spawn(|| {
             for sequence in 0..2000 {
                 let payload = pattern(sequence, 1024);
-                while writer.publish(meta(sequence), &payload).is_err() {}
+                let mut attempt = || writer.try_publish(meta(sequence), &payload).is_ok();
+                woken(|| a.wait_for_room(&mut attempt, &[], EVER));
             }
         });
         for sequence in 0..2000 {
-            assert!(b.wait(|| reader.has_data(), Some(Duration::from_secs(60))));
+            await_data(&b, &reader);
             assert_eq!(take(&mut reader), Some((sequence, pattern(sequence, 1024))));
         }
     });
@@ -336,7 +337,7 @@ fn several_threads_publish_into_one_ring() {
         }
         let mut next = [0; 3];
         for _ in 0..1500 {
-            assert!(b.wait(|| reader.has_data(), Some(Duration::from_secs(60))));
+            await_data(&b, &reader);
             let (sequence, payload) = take(&mut reader).unwrap();
             let thread = (sequence >> 32) as usize;
             assert_eq!(sequence & 0xffff_ffff, next[thread], "in order by thread");
@@ -362,7 +363,7 @@ fn an_overtaken_reader_never_sees_a_torn_sample() {
         });
         let mut last = None;
         while last != Some(total - 1) {
-            assert!(b.wait(|| reader.has_data(), Some(Duration::from_secs(60))));
+            await_data(&b, &reader);
             // None when it was overtaken time and again.
             let Some((sequence, payload)) = take(&mut reader) else { continue };
             assert_eq!(payload, pattern(sequence, payload.len()));

@@ -5,7 +5,10 @@ mod local;
 mod model;
 mod processes;
 
-use std::sync::Arc;
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use super::*;
 use crate::{
@@ -14,6 +17,19 @@ use crate::{
 };
 
 const MAX: u64 = 1 << 20;
+/// Only a wake-up that was lost takes this long: a wait that it ends has looked once more, and may
+/// have found what it was not woken for.
+const EVER: Duration = Duration::from_secs(60);
+
+/// Runs a wait of up to [`EVER`], which must end because it is woken.
+fn woken(wait: impl FnOnce() -> bool) {
+    let start = Instant::now();
+    assert!(wait() && start.elapsed() < EVER, "a wake-up was lost");
+}
+
+fn await_data(session: &SessionSegment, reader: &Reader) {
+    woken(|| session.wait(|| reader.has_data(), Some(EVER)));
+}
 
 fn session() -> Arc<SessionSegment> {
     SessionSegment::create(SessionId::random()).unwrap()

@@ -21,8 +21,6 @@ use super::*;
 /// Tells this binary that it is the other process, and which part it plays.
 const PART: &str = "SHM_TEST_PART";
 const LARGE: u64 = 25_000_000;
-/// Long enough that only a lost wake-up takes it.
-const EVER: Option<Duration> = Some(Duration::from_secs(60));
 
 /// One end of the socket pair.
 struct Wire(OwnedFd);
@@ -176,7 +174,7 @@ fn publish(writer: &Writer, sequence: u64, payload: &[u8]) {
 /// Takes the next sample and checks it.
 fn take(reader: &mut Reader, session: &SessionSegment, out: &mut Vec<u8>) -> u64 {
     loop {
-        assert!(session.wait(|| reader.has_data(), EVER), "no wake-up is lost");
+        await_data(session, reader);
         if let Some(taken) = reader.take(out).unwrap() {
             let sequence = taken.meta.sequence;
             assert_eq!(taken.meta, meta(sequence));
@@ -239,6 +237,31 @@ fn the_other_process() {
                 loan.publish(meta(sequence)).unwrap();
                 writer.publish(meta(sequence), &payload[..90]).unwrap();
             }
+        }
+        "fork" => {
+            let writer = large_writer(&session, keep_last(1), 1 << 20);
+            let mut reader = attach(&writer, &session, &session, keep_last(1));
+            writer.publish(meta(0), b"before").unwrap();
+            // SAFETY: the child makes no call but what follows, which takes no lock that another
+            // thread may have held, and leaves by _exit.
+            let child = unsafe { libc::fork() };
+            if child == 0 {
+                let poisoned = writer.publish(meta(1), b"child") == Err(PublishError::Forked)
+                    && reader.take(&mut out) == Err(TakeError::Forked)
+                    && matches!(session.allocate_lane(), Err(ShmError::Forked))
+                    && !session.wait(|| false, None);
+                drop((reader, writer, session));
+                // SAFETY: ends the process without running anything else.
+                unsafe { libc::_exit(if poisoned { 0 } else { 1 }) };
+            }
+            let mut status = -1;
+            // SAFETY: waits for the child just made; `status` outlives the call.
+            assert_eq!(unsafe { libc::waitpid(child, &mut status, 0) }, child);
+            assert_eq!(status, 0, "the child was refused, and killed by nothing");
+            // The parent goes on as if nothing had been.
+            assert_eq!(reader.take(&mut out).unwrap().unwrap().meta, meta(0));
+            writer.publish(meta(1), b"after").unwrap();
+            assert_eq!(reader.take(&mut out).unwrap().unwrap().meta, meta(1));
         }
         "echo" => {
             let mut ping = wire.join(&session, Qos::keep_all());
@@ -382,4 +405,9 @@ fn no_wake_up_is_lost_between_two_that_sleep() {
     }
     other.wire.send(b"done", &[]);
     other.succeed();
+}
+
+#[test]
+fn a_forked_child_is_refused_and_harms_nothing() {
+    Other::start("fork").succeed();
 }
