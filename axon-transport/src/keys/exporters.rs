@@ -2,10 +2,12 @@
 
 use zeroize::Zeroizing;
 
-/// Label of the TLS exporter that READY proofs cover (docs/formats.md, section 2). Empty context, 32 bytes.
+/// Label of the TLS exporter that READY proofs cover (docs/formats.md, section 2). Empty context,
+/// 32 bytes.
 pub const READY_EXPORTER: &[u8] = b"EXPORTER-axon-ready";
 
-/// Label of the TLS exporter that is the envelope's context (docs/formats.md, section 3). Empty context, 32 bytes.
+/// Label of the TLS exporter that is the envelope's context (docs/formats.md, section 3). Empty
+/// context, 32 bytes.
 pub const ENVELOPE_EXPORTER: &[u8] = b"EXPORTER-AXQKD001";
 
 /// The two TLS exporters of one connection (RFC 8446, 7.5). Erased on drop.

@@ -1,4 +1,5 @@
-//! Key announcements on the control stream: the CBOR maps of frame types 16 to 19 (docs/formats.md, section 4).
+//! Key announcements on the control stream: the CBOR maps of frame types 16 to 19
+//! (docs/formats.md, section 4).
 
 use axon_envelope::{IndexMask, KeyId};
 use minicbor::{Decoder, Encoder, data::Type};
@@ -211,7 +212,8 @@ impl KeyMessage {
 
 #[derive(Default)]
 struct Fields {
-    /// Bit i: key i was read. Keys of eight and more are nobody's, and skipped however often they come.
+    /// Bit i: key i was read. Keys of eight and more are nobody's, and skipped however often they
+    /// come.
     seen: u8,
     key_ids: Vec<KeyId>,
     key_id: Option<KeyId>,
@@ -292,7 +294,8 @@ mod tests {
         assert!(matches!(announce(1, 0), Err(MessageError::Range(_))));
         assert!(matches!(announce(1, 129), Err(MessageError::Range(_))));
         assert!(announce(16, 128).is_ok());
-        // A map that claims 2^63 pairs, an array that claims 2^63 items, key 0 twice, a mask with bit 10.
+        // A map that claims 2^63 pairs, an array that claims 2^63 items, key 0 twice, a mask with
+        // bit 10.
         assert!(KeyMessage::decode(ANNOUNCE, &[0xbb, 0x80, 0, 0, 0, 0, 0, 0, 0]).is_err());
         assert!(KeyMessage::decode(ANNOUNCE, &[0xa1, 0, 0x9b, 0x80, 0, 0, 0, 0, 0, 0, 0]).is_err());
         assert_eq!(
@@ -329,13 +332,17 @@ mod tests {
 
     proptest! {
         #[test]
-        fn no_bytes_panic(frame_type in 15u8..21, bytes in proptest::collection::vec(any::<u8>(), 0..64)) {
+        fn no_bytes_panic(
+            frame_type in 15u8..21,
+            bytes in proptest::collection::vec(any::<u8>(), 0..64),
+        ) {
             let _ = KeyMessage::decode(frame_type, &bytes);
         }
 
         #[test]
         fn what_was_written_is_read(
-            name in "[!-~]{1,128}", proof: [u8; 32], reason in "[a-z ]{0,128}", used in 0u16..1024, n in 1usize..17,
+            name in "[!-~]{1,128}", proof: [u8; 32], reason in "[a-z ]{0,128}",
+            used in 0u16..1024, n in 1usize..17,
         ) {
             let used = IndexMask::from_bits(used).unwrap();
             for m in [

@@ -1,4 +1,5 @@
-//! The proof in READY: its sender holds the key, and means this connection (docs/formats.md, section 2).
+//! The proof in READY: its sender holds the key, and means this connection (docs/formats.md,
+//! section 2).
 
 use axon_envelope::{KeyId, KmeKey};
 use hkdf::Hkdf;
@@ -9,8 +10,8 @@ use zeroize::Zeroizing;
 /// Bytes of a proof.
 pub const LEN: usize = 32;
 
-/// `HMAC-SHA256(HKDF-SHA256(no salt, key, "axon ready"), key_ID || ready)`; `ready` is the connection's TLS
-/// exporter [`READY_EXPORTER`](super::READY_EXPORTER).
+/// `HMAC-SHA256(HKDF-SHA256(no salt, key, "axon ready"), key_ID || ready)`; `ready` is the
+/// connection's TLS exporter [`READY_EXPORTER`](super::READY_EXPORTER).
 pub fn compute(key: &KmeKey, key_id: &KeyId, ready: &[u8; 32]) -> [u8; LEN] {
     mac(key, key_id, ready).finalize().into_bytes().into()
 }

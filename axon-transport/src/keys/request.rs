@@ -20,8 +20,8 @@ pub enum Purpose {
 /// One call to the KME.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Request {
-    /// `enc_keys`: fresh 256-bit keys shared with `slave`. A failed call may have consumed keys and is never
-    /// repeated as such.
+    /// `enc_keys`: fresh 256-bit keys shared with `slave`. A failed call may have consumed keys and
+    /// is never repeated as such.
     Enc {
         /// The other SAE.
         slave: String,
@@ -96,7 +96,8 @@ pub enum FailureKind {
     Unavailable,
     /// The KME knows no such key, or refuses such a request. Asking again is useless.
     Refused,
-    /// The KME does not accept this SAE, or this host does not accept the KME: a matter of certificates.
+    /// The KME does not accept this SAE, or this host does not accept the KME: a matter of
+    /// certificates.
     Unauthorized,
     /// Cut off or answered badly after the request may have arrived: its keys may be consumed.
     Ambiguous,

@@ -17,7 +17,8 @@ const RATE: f64 = 5.0;
 /// Calls at once for one SAE.
 const BURST: f64 = 10.0;
 
-/// Where a handshake comes from. An IPv6 host has a whole /64 to choose from, so that counts as one.
+/// Where a handshake comes from. An IPv6 host has a whole /64 to choose from, so that counts as
+/// one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(super) struct Source(IpAddr);
 

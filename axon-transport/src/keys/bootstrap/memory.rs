@@ -31,10 +31,10 @@ impl<K: Clone + Eq + std::hash::Hash> Memory<K> {
         let new = self.seen.insert(key.clone(), now).is_none();
         if !new {
             self.order.retain(|(_, k)| *k != key);
-        } else if self.seen.len() > self.capacity {
-            if let Some((_, oldest)) = self.order.pop_front() {
-                self.seen.remove(&oldest);
-            }
+        } else if self.seen.len() > self.capacity
+            && let Some((_, oldest)) = self.order.pop_front()
+        {
+            self.seen.remove(&oldest);
         }
         self.order.push_back((now, key));
         new

@@ -102,7 +102,7 @@ async fn keys_reach_both_sides_and_are_counted() {
     let Request::Dec { master, purpose, timeout, .. } = dec else { unreachable!() };
     let dec = Request::Dec { master, key_ids: vec![unknown], purpose, timeout };
     b.submit(Origin::Acceptor, dec).unwrap();
-    let failure = b_events.recv().await.unwrap().answer.outcome.err().expect("no such key");
+    let failure = b_events.recv().await.unwrap().answer.outcome.expect_err("no such key");
     assert_eq!(failure.kind, FailureKind::Refused, "{failure}");
 
     let (a, b) = (a.statistics(), b.statistics());
@@ -128,7 +128,7 @@ async fn failures_say_whether_keys_may_be_lost() {
         let name = format!("{fault:?}");
         sim.inject(fault, 1);
         kme.submit(Origin::Sender(0), enc(2, LONG)).unwrap();
-        let failure = events.recv().await.unwrap().answer.outcome.err().expect("a fault");
+        let failure = events.recv().await.unwrap().answer.outcome.expect_err("a fault");
         assert_eq!(failure.kind, kind, "{name}: {failure}");
         assert_eq!(kme.statistics().last_failure, Some(failure.text));
     }
@@ -136,7 +136,7 @@ async fn failures_say_whether_keys_may_be_lost() {
 
     sim.inject(Fault::Silence, 1);
     kme.submit(Origin::Sender(0), enc(2, Duration::from_millis(50))).unwrap();
-    let failure = events.recv().await.unwrap().answer.outcome.err().expect("too slow");
+    let failure = events.recv().await.unwrap().answer.outcome.expect_err("too slow");
     assert_eq!(failure.kind, FailureKind::Ambiguous, "{failure}");
 
     let mut gone = settings.clone();

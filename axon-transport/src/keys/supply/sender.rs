@@ -266,6 +266,7 @@ impl Sender {
     /// What is to be sent next, and on which connection.
     pub fn poll_message(&mut self, now: Duration) -> Option<(u64, KeyMessage)> {
         self.settle(now);
+        self.drop_unanswered(now);
         self.outbox.pop_front().or_else(|| self.announce(now))
     }
 
@@ -347,7 +348,7 @@ impl Sender {
         }
     }
 
-    /// Retires the key in use once it is finished, and drops announcements that nobody answered.
+    /// Retires the key in use once it is finished.
     fn settle(&mut self, now: Duration) {
         while let Some(first) = self.ready.front() {
             let old = self.begun.is_some_and(|at| now.saturating_sub(at) >= KEY_MAX_AGE);
@@ -356,6 +357,9 @@ impl Sender {
             }
             self.retire_first();
         }
+    }
+
+    fn drop_unanswered(&mut self, now: Duration) {
         let late = |a: &Announced| now.saturating_sub(a.since) >= ANSWER_WITHIN;
         let late: Vec<KeyId> =
             self.announced.iter().filter(|(_, a)| late(a)).map(|(id, _)| id.clone()).collect();

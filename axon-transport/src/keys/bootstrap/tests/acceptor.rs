@@ -1,0 +1,153 @@
+use super::*;
+
+pub(super) fn new(peers: QkdPeers) -> (Acceptor, Clock) {
+    let clock = Clock::manual();
+    (Acceptor::new("sae-b", peers, Cipher::default(), clock.clone()), clock)
+}
+
+pub(super) fn identity(sae: &str, key_id: &str) -> Vec<u8> {
+    PskIdentity::new(sae, key_id).unwrap().to_bytes()
+}
+
+fn look_up(acceptor: &Acceptor, source: &str, identity: &[u8]) -> Lookup {
+    let resolver = acceptor.resolver(ip(source));
+    let psk = resolver.resolve(identity);
+    let outcome = resolver.outcome().expect("was asked");
+    assert_eq!(psk.is_some(), outcome == Lookup::Found);
+    outcome
+}
+
+#[test]
+fn the_kme_is_not_asked_for_who_is_no_peer() {
+    let (acceptor, _) = new(listed(&["sae-a"]));
+    for (bytes, expected) in [
+        (identity("sae-x", "k"), Lookup::NotAPeer),
+        (identity("sae-b", "k"), Lookup::OwnSaeId),
+        (b"axon-qkd-v1:sae-%61:k".to_vec(), Lookup::Malformed),
+        (b"".to_vec(), Lookup::Malformed),
+        (vec![0xff; 200], Lookup::Malformed),
+    ] {
+        assert_eq!(look_up(&acceptor, "10.0.0.1", &bytes), expected);
+    }
+    assert!(acceptor.poll_request().is_none());
+}
+
+#[test]
+fn a_miss_asks_once_and_the_next_look_up_finds_the_clients_psk() {
+    let (acceptor, _) = new(listed(&["sae-a"]));
+    let bytes = identity("sae-a", "k1");
+    assert_eq!(look_up(&acceptor, "10.0.0.1", &bytes), Lookup::Fetching);
+    assert_eq!(look_up(&acceptor, "10.0.0.1", &bytes), Lookup::Fetching);
+    let request = acceptor.poll_request().unwrap();
+    assert!(acceptor.poll_request().is_none(), "one call for one key");
+    let Request::Dec { master, key_ids, .. } = &request else { panic!() };
+    assert_eq!((master.as_str(), &key_ids[..]), ("sae-a", &[id("k1")][..]));
+    acceptor.on_answer(key(request, "k1", 9));
+
+    let resolver = acceptor.resolver(ip("10.0.0.1"));
+    let found = resolver.resolve(&bytes).expect("cached");
+    let clients = qkd::derive_psk(&[9; 32], "k1", "sae-a", "sae-b", Cipher::default()).unwrap();
+    assert_eq!(found.identity(), clients.identity());
+    assert_eq!(resolver.identity().unwrap().client_sae(), "sae-a");
+}
+
+#[test]
+fn only_a_completed_handshake_spends_a_key_and_only_once() {
+    let (acceptor, clock) = new(listed(&["sae-a"]));
+    let bytes = identity("sae-a", "k1");
+    look_up(&acceptor, "10.0.0.1", &bytes);
+    acceptor.on_answer(key(acceptor.poll_request().unwrap(), "k1", 9));
+    for _ in 0..1000 {
+        // Copied ClientHellos, wrong binders.
+        assert_eq!(look_up(&acceptor, "10.0.0.66", &bytes), Lookup::Found);
+    }
+    assert_eq!(acceptor.spent(&bytes), Completion::First);
+    assert_eq!(acceptor.spent(&bytes), Completion::Reused);
+    assert_eq!(look_up(&acceptor, "10.0.0.1", &bytes), Lookup::Spent);
+    clock.advance(s(3600));
+    acceptor.expire();
+    assert_eq!(look_up(&acceptor, "10.0.0.1", &bytes), Lookup::Spent);
+    assert_eq!(acceptor.spent(b"not an identity"), Completion::Reused);
+    assert!(acceptor.poll_request().is_none());
+}
+
+#[test]
+fn a_key_that_arrives_after_it_was_spent_is_not_kept() {
+    let (acceptor, _) = new(listed(&["sae-a"]));
+    let bytes = identity("sae-a", "k1");
+    look_up(&acceptor, "10.0.0.1", &bytes);
+    let request = acceptor.poll_request().unwrap();
+    assert_eq!(acceptor.spent(&bytes), Completion::First);
+    acceptor.on_answer(key(request, "k1", 9));
+    assert_eq!(look_up(&acceptor, "10.0.0.1", &bytes), Lookup::Spent);
+}
+
+#[test]
+fn unknown_keys_are_not_asked_for_again_for_thirty_seconds() {
+    let (acceptor, clock) = new(listed(&["sae-a"]));
+    let bytes = identity("sae-a", "k1");
+    look_up(&acceptor, "10.0.0.1", &bytes);
+    acceptor.on_answer(failed(acceptor.poll_request().unwrap(), FailureKind::Refused));
+    clock.advance(s(29));
+    assert_eq!(look_up(&acceptor, "10.0.0.1", &bytes), Lookup::UnknownKeyId);
+    assert!(acceptor.poll_request().is_none());
+    clock.advance(s(2));
+    assert_eq!(look_up(&acceptor, "10.0.0.1", &bytes), Lookup::Fetching);
+}
+
+#[test]
+fn a_kme_that_is_down_is_named_and_asked_again() {
+    let (acceptor, _) = new(listed(&["sae-a"]));
+    let bytes = identity("sae-a", "k1");
+    look_up(&acceptor, "10.0.0.1", &bytes);
+    acceptor.on_answer(failed(acceptor.poll_request().unwrap(), FailureKind::Unreachable));
+    let again = look_up(&acceptor, "10.0.0.1", &bytes);
+    assert_eq!(again, Lookup::KmeFailed("as the test says".to_owned()));
+    assert!(acceptor.poll_request().is_some());
+}
+
+#[test]
+fn unspent_keys_are_kept_a_minute_and_eight_for_each_sae() {
+    let (acceptor, clock) = new(listed(&["sae-a"]));
+    let name = |i: u32| format!("k{i}");
+    for i in 0..9 {
+        look_up(&acceptor, "10.0.0.1", &identity("sae-a", &name(i)));
+        acceptor.on_answer(key(acceptor.poll_request().unwrap(), &name(i), 9));
+        clock.advance(s(1));
+    }
+    for i in 1..9 {
+        let found = look_up(&acceptor, "10.0.0.1", &identity("sae-a", &name(i)));
+        assert_eq!(found, Lookup::Found, "{i}");
+    }
+    assert_ne!(look_up(&acceptor, "10.0.0.1", &identity("sae-a", "k0")), Lookup::Found);
+    clock.advance(s(60));
+    assert_ne!(look_up(&acceptor, "10.0.0.1", &identity("sae-a", "k8")), Lookup::Found);
+}
+
+#[test]
+fn an_address_that_authenticated_before_gets_through_a_flood() {
+    let (acceptor, _) = new(listed(&["sae-a", "sae-c"]));
+    acceptor.authenticated(ip("10.9.9.9"), "sae-c");
+    for i in 0..2000 {
+        let source = format!("10.{}.{}.1", i / 250, i % 250);
+        acceptor.prefetch(ip(&source), &identity("sae-a", &format!("made-up-{i}")));
+        acceptor.prefetch(ip(&source), &identity("sae-c", &format!("made-up-{i}")));
+    }
+    let stranger = look_up(&acceptor, "10.8.8.8", &identity("sae-a", "k"));
+    assert!(matches!(stranger, Lookup::Limited(_)));
+    assert_eq!(look_up(&acceptor, "10.9.9.9", &identity("sae-c", "k")), Lookup::Fetching);
+}
+
+#[tokio::test]
+async fn a_waiting_caller_is_woken_by_a_look_up() {
+    let (acceptor, _) = new(listed(&["sae-a"]));
+    let other = acceptor.clone();
+    let waiting = tokio::spawn(async move { other.next_request().await });
+    tokio::task::yield_now().await;
+    let resolver = acceptor.resolver(ip("10.0.0.1"));
+    std::thread::spawn(move || Arc::clone(&resolver).resolve(&identity("sae-a", "k1")))
+        .join()
+        .map(|psk| assert!(psk.is_none()))
+        .unwrap();
+    assert!(matches!(waiting.await.unwrap(), Request::Dec { .. }));
+}

@@ -1,0 +1,147 @@
+use super::*;
+
+fn new() -> Dialler {
+    Dialler::new("sae-a", listed(&["sae-b", "sae-c"]), Cipher::default())
+}
+
+/// A dialler that holds key `name` for sae-b since `now`.
+fn holding(now: Duration, name: &str) -> Dialler {
+    let mut dialler = new();
+    give(&mut dialler, now, name);
+    dialler
+}
+
+fn give(dialler: &mut Dialler, now: Duration, name: &str) {
+    assert!(matches!(dialler.dial(now, "sae-b"), Dial::Wait { until: None, .. }));
+    let request = dialler.poll_request(now).expect("asks for a key");
+    dialler.on_answer(now, key(request, name, 1));
+}
+
+fn attempt(dialler: &mut Dialler, now: Duration) -> Option<KeyId> {
+    match dialler.dial(now, "sae-b") {
+        Dial::Attempt(attempt) => Some(attempt.key_id),
+        _ => None,
+    }
+}
+
+#[test]
+fn no_kme_call_for_who_is_no_peer() {
+    let mut dialler = new();
+    for sae in ["sae-a", "sae-x", "", "SAE-B", "sae-b ", "*"] {
+        assert!(matches!(dialler.dial(s(1), sae), Dial::Refused(_)), "{sae}");
+    }
+    assert!(dialler.poll_request(s(1)).is_none());
+    // Not even under `*`.
+    let mut dialler = Dialler::new("sae-a", QkdPeers::Any, Cipher::default());
+    let dial = dialler.dial(s(1), "sae-a");
+    assert!(matches!(dial, Dial::Refused(DialRefusal::OwnSaeId(_))));
+    assert!(dialler.poll_request(s(1)).is_none());
+}
+
+#[test]
+fn one_key_serves_every_address_and_attempt_until_it_is_spent() {
+    let mut dialler = holding(s(0), "k1");
+    for t in 0..100 {
+        assert_eq!(attempt(&mut dialler, s(t)), Some(id("k1")));
+        assert!(dialler.poll_request(s(t)).is_none());
+        dialler.silent(s(t), "sae-b", &id("k1"));
+    }
+    assert_eq!(dialler.succeeded(s(100), "sae-b", &id("other")), Completion::Reused);
+    assert_eq!(dialler.succeeded(s(100), "sae-b", &id("k1")), Completion::First);
+    assert_eq!(dialler.succeeded(s(100), "sae-b", &id("k1")), Completion::Reused);
+    assert_eq!(attempt(&mut dialler, s(100)), None, "spent");
+    assert!(dialler.poll_request(s(100)).is_some(), "the next dial has a key of its own");
+}
+
+#[test]
+fn a_key_is_tried_again_with_growing_pauses_and_given_up_after_ten_seconds() {
+    let mut dialler = holding(s(0), "k1");
+    let (mut now, mut pauses) = (s(0), Vec::new());
+    while attempt(&mut dialler, now).is_some() {
+        dialler.refused(now, "sae-b", &id("k1"));
+        match dialler.dial(now, "sae-b") {
+            Dial::Wait { until: Some(until), .. } => {
+                pauses.push((until - now).as_millis());
+                assert!(attempt(&mut dialler, until - ms(1)).is_none());
+                now = until;
+                if pauses.last() == Some(&1000) {
+                    break;
+                }
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+    assert_eq!(pauses[..8], [50, 100, 200, 400, 800, 1600, 1600, 1600]);
+    assert_eq!(pauses.pop(), Some(1000), "given up: back-off before the KME is asked again");
+    let tried: u128 = pauses.iter().sum();
+    assert!((10_000..=11_600).contains(&tried), "{tried}");
+    assert!(matches!(dialler.dial(now, "sae-b"), Dial::Wait { until: None, .. }));
+    assert!(dialler.poll_request(now).is_some());
+}
+
+#[test]
+fn silence_does_not_count_against_a_key() {
+    let mut dialler = holding(s(0), "k1");
+    let mut now = s(0);
+    for _ in 0..100 {
+        dialler.refused(now, "sae-b", &id("k1"));
+        now += s(2);
+        dialler.silent(now, "sae-b", &id("k1"));
+        now += s(2);
+    }
+    assert_eq!(attempt(&mut dialler, now), Some(id("k1")));
+}
+
+#[test]
+fn a_key_ends_after_ten_minutes() {
+    let mut dialler = holding(s(7), "k1");
+    assert_eq!(dialler.poll_timeout(), Some(s(607)));
+    assert!(attempt(&mut dialler, s(606)).is_some());
+    assert!(attempt(&mut dialler, s(607)).is_none());
+    assert_eq!(dialler.succeeded(s(607), "sae-b", &id("k1")), Completion::Reused);
+}
+
+#[test]
+fn failed_calls_are_spaced_out_up_to_a_minute() {
+    let mut dialler = new();
+    let (mut now, mut pauses) = (s(0), Vec::new());
+    for _ in 0..9 {
+        assert!(matches!(dialler.dial(now, "sae-b"), Dial::Wait { until: None, .. }));
+        let request = dialler.poll_request(now).unwrap();
+        assert!(dialler.poll_request(now).is_none(), "never two calls for one peer");
+        dialler.on_answer(now, failed(request, FailureKind::Ambiguous));
+        let Dial::Wait { until: Some(until), why } = dialler.dial(now, "sae-b") else { panic!() };
+        assert!(why.contains("as the test says"), "{why}");
+        pauses.push((until - now).as_secs());
+        now = until;
+    }
+    assert_eq!(pauses, [1, 2, 4, 8, 16, 32, 60, 60, 60]);
+    give(&mut dialler, now, "k1");
+    assert_eq!(dialler.succeeded(now, "sae-b", &id("k1")), Completion::First);
+    give(&mut dialler, now, "k2");
+}
+
+#[test]
+fn made_up_names_under_a_star_are_bounded() {
+    let mut dialler = Dialler::new("sae-a", QkdPeers::Any, Cipher::default());
+    let mut asked = 0;
+    for i in 0..2000 {
+        dialler.dial(s(0), &format!("made-up-{i}"));
+        asked += usize::from(dialler.poll_request(s(0)).is_some());
+    }
+    assert_eq!(asked, 8, "in flight");
+    let dial = dialler.dial(s(0), "one-more");
+    assert!(matches!(dial, Dial::Refused(DialRefusal::TooMany)));
+}
+
+#[test]
+fn answers_nobody_waits_for_are_dropped() {
+    let mut dialler = holding(s(0), "k1");
+    let request = Request::Status { slave: "sae-b".to_owned() };
+    dialler.on_answer(s(1), failed(request, FailureKind::Refused));
+    let mut other = new();
+    other.dial(s(1), "sae-b");
+    let request = other.poll_request(s(1)).unwrap();
+    dialler.on_answer(s(1), key(request, "k2", 2));
+    assert_eq!(attempt(&mut dialler, s(1)), Some(id("k1")));
+}

@@ -1,0 +1,180 @@
+//! A [`Sender`] and a [`Receiver`] with two KMEs between them, and a clock that stands still.
+
+mod any_order;
+mod receiving;
+mod sending;
+
+use std::{collections::HashMap, time::Duration};
+
+use axon_envelope::{Delivery, IndexMask, KeyId, Kind, KmeKey, OpenError, Route, TopicHash};
+
+use super::{NoKey, Receiver, Sender};
+use crate::keys::{
+    Exporters, KeyMessage,
+    request::{Answer, Failure, FailureKind, Fetched, Request, Stock},
+};
+
+const ROUTE: Route = Route { kind: Kind::Topic, topic: TopicHash([7; 16]) };
+
+fn ms(millis: u64) -> Duration {
+    Duration::from_millis(millis)
+}
+
+fn id(text: &str) -> KeyId {
+    KeyId::new(text).unwrap()
+}
+
+/// The exporters of connection `conn`, the same at both ends.
+fn exporters(conn: u64) -> Exporters {
+    Exporters::new([conn as u8; 32], [!conn as u8; 32])
+}
+
+/// Two KMEs with one store between them. A key is given to the slave once, as most KMEs do.
+#[derive(Default)]
+struct Kmes {
+    issued: u32,
+    stored: HashMap<KeyId, [u8; 32]>,
+    stock: u64,
+    /// Keys left to give; `None`: any number.
+    left: Option<u32>,
+    /// How the next calls fail.
+    failures: Vec<FailureKind>,
+}
+
+impl Kmes {
+    fn answer(&mut self, request: Request) -> Answer {
+        let failure = |kind| Err(Failure { kind, text: format!("{kind:?}") });
+        let outcome = match (&request, self.failures.pop()) {
+            (_, Some(kind)) => failure(kind),
+            (Request::Status { .. }, _) => {
+                Ok(Fetched::Stock(Stock { stored_key_count: self.stock, max_key_per_request: 128 }))
+            }
+            (Request::Enc { number, .. }, _) => {
+                if self.left.is_some_and(|left| left < *number) {
+                    failure(FailureKind::Unavailable)
+                } else {
+                    self.left = self.left.map(|left| left - number);
+                    Ok(Fetched::Keys((0..*number).map(|_| self.issue()).collect()))
+                }
+            }
+            (Request::Dec { key_ids, .. }, _) => {
+                if key_ids.iter().all(|id| self.stored.contains_key(id)) {
+                    let take = |id: &KeyId| {
+                        let bytes = self.stored.remove(id).unwrap();
+                        (id.clone(), KmeKey::from_slice(&bytes).unwrap())
+                    };
+                    Ok(Fetched::Keys(key_ids.iter().map(take).collect()))
+                } else {
+                    failure(FailureKind::Refused)
+                }
+            }
+        };
+        Answer { request, took: ms(10), outcome }
+    }
+
+    fn issue(&mut self) -> (KeyId, KmeKey) {
+        self.issued += 1;
+        let mut bytes = [0; 32];
+        bytes[..4].copy_from_slice(&self.issued.to_be_bytes());
+        let key_id = id(&format!("key-{}", self.issued));
+        self.stored.insert(key_id.clone(), bytes);
+        (key_id, KmeKey::take(&mut bytes))
+    }
+}
+
+struct Pair {
+    now: Duration,
+    kmes: Kmes,
+    sender: Sender,
+    receiver: Receiver,
+    conn: u64,
+    /// What was said in either direction.
+    log: Vec<KeyMessage>,
+}
+
+impl Pair {
+    fn new() -> Self {
+        let mut pair = Self {
+            now: ms(0),
+            kmes: Kmes::default(),
+            sender: Sender::new("sae-a", "sae-b").unwrap(),
+            receiver: Receiver::new("sae-b", "sae-a").unwrap(),
+            conn: 0,
+            log: Vec::new(),
+        };
+        pair.connect();
+        pair
+    }
+
+    /// The next connection; the one before stays open until `close` of it.
+    fn connect(&mut self) {
+        self.conn += 1;
+        let owed = self.sender.attach(self.now, self.conn, &exporters(self.conn)).unwrap();
+        self.receiver.attach(self.now, self.conn, &exporters(self.conn)).unwrap();
+        for message in owed {
+            self.receiver.on_message(self.now, self.conn - 1, &message).unwrap();
+            self.log.push(message);
+        }
+    }
+
+    fn close(&mut self, conn: u64) {
+        self.sender.detach(self.now, conn);
+        self.receiver.detach(self.now, conn);
+    }
+
+    /// Lets everything happen that can happen now.
+    fn run(&mut self) {
+        loop {
+            if let Some(request) = self.sender.poll_request(self.now) {
+                if let Request::Enc { number, .. } = request {
+                    assert!(number <= 8, "a lost call loses at most eight keys");
+                }
+                let answer = self.kmes.answer(request);
+                self.sender.on_answer(self.now, answer);
+            } else if let Some(request) = self.receiver.poll_request(self.now) {
+                let answer = self.kmes.answer(request);
+                self.receiver.on_answer(self.now, answer);
+            } else if let Some((conn, message)) = self.sender.poll_message(self.now) {
+                if conn == self.conn {
+                    self.receiver.on_message(self.now, conn, &message).unwrap();
+                }
+                self.log.push(message);
+            } else if let Some((conn, message)) = self.receiver.poll_message() {
+                self.sender.on_message(self.now, conn, &message).unwrap();
+                self.log.push(message);
+            } else {
+                return;
+            }
+        }
+    }
+
+    fn seal(&mut self, delivery: Delivery) -> Result<Vec<u8>, NoKey> {
+        let mut out = vec![0; 5 + self.sender.overhead()];
+        let slot = self.sender.slot(self.now, delivery)?;
+        let len = slot.seal_into(ROUTE, &[b"hello"], &mut out).unwrap();
+        out.truncate(len);
+        Ok(out)
+    }
+
+    fn open(&mut self, mut envelope: Vec<u8>) -> Result<(), OpenError> {
+        let opener = self.receiver.opener(self.conn).expect("attached");
+        opener.open_in_place(self.now, ROUTE, &mut envelope).map(|text| assert_eq!(text, b"hello"))
+    }
+
+    fn announced(&self) -> usize {
+        let count = |m: &KeyMessage| match m {
+            KeyMessage::Announce(key_ids) => key_ids.len(),
+            _ => 0,
+        };
+        self.log.iter().map(count).sum()
+    }
+
+    fn failures(&self) -> usize {
+        self.log.iter().filter(|m| matches!(m, KeyMessage::Failed { .. })).count()
+    }
+}
+
+fn retire(key_id: &str, used: u16, reliable: u16) -> KeyMessage {
+    let mask = |bits| IndexMask::from_bits(bits).unwrap();
+    KeyMessage::Retire { key_id: id(key_id), used: mask(used), reliable: mask(reliable) }
+}

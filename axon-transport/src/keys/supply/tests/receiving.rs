@@ -1,0 +1,92 @@
+use axon_envelope::{Delivery, KeyId};
+
+use super::{Pair, id, ms, retire};
+use crate::keys::{KeyMessage, request::FailureKind};
+
+#[test]
+fn a_batch_with_an_unknown_key_is_fetched_one_by_one() {
+    let mut pair = Pair::new();
+    let known: Vec<KeyId> = (0..3).map(|_| pair.kmes.issue().0).collect();
+    let announce = KeyMessage::Announce(vec![known[0].clone(), id("lost"), known[1].clone()]);
+    pair.receiver.on_message(pair.now, 1, &announce).unwrap();
+    let mut said = Vec::new();
+    while let Some(request) = pair.receiver.poll_request(pair.now) {
+        let answer = pair.kmes.answer(request);
+        pair.receiver.on_answer(pair.now, answer);
+    }
+    while let Some((_, message)) = pair.receiver.poll_message() {
+        said.push(message);
+    }
+    assert_eq!(said.len(), 3);
+    let failed = said
+        .iter()
+        .filter(|m| matches!(m, KeyMessage::Failed { key_id, .. } if *key_id == id("lost")));
+    assert_eq!(failed.count(), 1);
+}
+
+#[test]
+fn dec_keys_is_tried_three_times_with_the_same_ids() {
+    let mut pair = Pair::new();
+    let (key_id, _) = pair.kmes.issue();
+    pair.kmes.failures = vec![FailureKind::Ambiguous, FailureKind::Unreachable];
+    pair.receiver.on_message(pair.now, 1, &KeyMessage::Announce(vec![key_id])).unwrap();
+    let mut tries = 0;
+    for _ in 0..10 {
+        while let Some(request) = pair.receiver.poll_request(pair.now) {
+            tries += 1;
+            let answer = pair.kmes.answer(request);
+            pair.receiver.on_answer(pair.now, answer);
+        }
+        pair.now += ms(1000);
+    }
+    assert_eq!(tries, 3);
+    assert!(matches!(pair.receiver.poll_message(), Some((1, KeyMessage::Ready { .. }))));
+
+    pair.kmes.failures = vec![FailureKind::Unreachable; 9];
+    pair.receiver.on_message(pair.now, 1, &KeyMessage::Announce(vec![id("k")])).unwrap();
+    for _ in 0..10 {
+        while let Some(request) = pair.receiver.poll_request(pair.now) {
+            let answer = pair.kmes.answer(request);
+            pair.receiver.on_answer(pair.now, answer);
+        }
+        pair.now += ms(1000);
+    }
+    assert_eq!(pair.kmes.failures.len(), 6);
+    assert!(matches!(pair.receiver.poll_message(), Some((1, KeyMessage::Failed { .. }))));
+}
+
+#[test]
+fn a_peer_that_only_announces_is_stopped_at_the_cap() {
+    let mut pair = Pair::new();
+    for i in 0..600 {
+        let key_ids = (0..16).map(|j| id(&format!("flood-{i}-{j}"))).collect();
+        pair.receiver.on_message(pair.now, 1, &KeyMessage::Announce(key_ids)).unwrap();
+    }
+    assert_eq!(pair.receiver.statistics().fetching, 4096);
+    assert_eq!(pair.receiver.statistics().failed, 600 * 16 - 4096);
+    let mut in_flight = 0;
+    while pair.receiver.poll_request(pair.now).is_some() {
+        in_flight += 1;
+    }
+    assert_eq!(in_flight, 4);
+}
+
+#[test]
+fn contradicting_masks_end_the_link() {
+    let mut pair = Pair::new();
+    pair.run();
+    let first = pair.log.iter().find_map(|m| match m {
+        KeyMessage::Ready { key_id, .. } => Some(key_id.to_string()),
+        _ => None,
+    });
+    let key_id = first.unwrap();
+    assert!(pair.receiver.on_message(pair.now, 1, &retire(&key_id, 1, 2)).is_err());
+    let envelope = pair.seal(Delivery::Reliable).unwrap();
+    pair.open(envelope).unwrap();
+    assert!(
+        pair.receiver.on_message(pair.now, 1, &retire(&key_id, 0, 0)).is_err(),
+        "index 0 opened"
+    );
+    pair.receiver.on_message(pair.now, 1, &retire("never-seen", 3, 1)).unwrap();
+    assert!(pair.receiver.on_message(pair.now, 9, &retire(&key_id, 1, 1)).is_err(), "no such link");
+}

@@ -1,0 +1,189 @@
+use std::time::Duration;
+
+use axon_envelope::Delivery;
+
+use super::{Pair, ROUTE, id, ms, retire};
+use crate::keys::{
+    KeyMessage, NoKey, Receiver, SupplyError, Violation,
+    request::{FailureKind, Request},
+};
+
+#[test]
+fn nothing_is_sealed_before_ready() {
+    let mut pair = Pair::new();
+    assert_eq!(pair.seal(Delivery::Reliable), Err(NoKey::None));
+    while let Some(request) = pair.sender.poll_request(pair.now) {
+        let answer = pair.kmes.answer(request);
+        pair.sender.on_answer(pair.now, answer);
+    }
+    assert_eq!(pair.seal(Delivery::Reliable), Err(NoKey::None), "keys held, none announced");
+    let (_, announce) = pair.sender.poll_message(pair.now).unwrap();
+    assert_eq!(pair.seal(Delivery::Reliable), Err(NoKey::None), "announced, none READY");
+    pair.receiver.on_message(pair.now, 1, &announce).unwrap();
+    pair.run();
+    let envelope = pair.seal(Delivery::Reliable).unwrap();
+    pair.open(envelope).unwrap();
+}
+
+#[test]
+fn a_wrong_proof_ends_the_link_and_readies_nothing() {
+    let mut pair = Pair::new();
+    while let Some(request) = pair.sender.poll_request(pair.now) {
+        let answer = pair.kmes.answer(request);
+        pair.sender.on_answer(pair.now, answer);
+    }
+    let (_, KeyMessage::Announce(key_ids)) = pair.sender.poll_message(pair.now).unwrap() else {
+        panic!()
+    };
+    for proof in [[0; 32], [0xff; 32]] {
+        let ready = KeyMessage::Ready { key_id: key_ids[0].clone(), proof };
+        let refused = pair.sender.on_message(pair.now, 1, &ready);
+        assert!(matches!(refused, Err(SupplyError::Violation(Violation::WrongProof(_)))));
+    }
+    let unknown = KeyMessage::Ready { key_id: id("nobody's"), proof: [0; 32] };
+    pair.sender.on_message(pair.now, 1, &unknown).unwrap();
+    assert_eq!(pair.seal(Delivery::Reliable), Err(NoKey::None));
+    for unexpected in [KeyMessage::Announce(vec![id("k")]), retire("k", 0, 0)] {
+        assert!(pair.sender.on_message(pair.now, 1, &unexpected).is_err());
+    }
+}
+
+#[test]
+fn the_last_keys_are_kept_for_reliable() {
+    let mut pair = Pair::new();
+    pair.kmes.left = Some(4);
+    pair.run();
+    let mut best_effort = 0;
+    while pair.seal(Delivery::BestEffort).is_ok() {
+        best_effort += 1;
+    }
+    assert_eq!(best_effort, 20, "two keys of four");
+    assert_eq!(pair.sender.available(pair.now, Delivery::BestEffort), 0);
+    assert_eq!(pair.sender.available(pair.now, Delivery::Reliable), 20);
+    assert_eq!(pair.seal(Delivery::BestEffort), Err(NoKey::Reserved));
+    let mut reliable = 0;
+    while pair.seal(Delivery::Reliable).is_ok() {
+        reliable += 1;
+    }
+    assert_eq!(reliable, 20);
+    assert_eq!(pair.seal(Delivery::Reliable), Err(NoKey::None));
+}
+
+#[test]
+fn an_empty_store_is_asked_for_less_and_less_often() {
+    let mut pair = Pair::new();
+    pair.kmes.left = Some(0);
+    pair.sender.demand(pair.now, 10_000);
+    let mut asked = Vec::new();
+    for _ in 0..10_000 {
+        while let Some(request) = pair.sender.poll_request(pair.now) {
+            if let Request::Enc { number, .. } = request {
+                asked.push(number);
+            }
+            let answer = pair.kmes.answer(request);
+            pair.sender.on_answer(pair.now, answer);
+        }
+        pair.now += ms(10);
+    }
+    assert!(asked.len() < 80, "{} calls in 100 s", asked.len());
+    assert_eq!(asked[0], 8);
+    assert_eq!(asked.last(), Some(&1));
+    pair.kmes.left = Some(3);
+    pair.now += ms(2000);
+    pair.run();
+    assert_eq!(pair.announced(), 3, "what there is, is had");
+}
+
+#[test]
+fn a_call_that_may_have_lost_keys_is_not_repeated_at_once() {
+    let mut pair = Pair::new();
+    pair.sender.poll_request(pair.now).map(|status| pair.kmes.answer(status)).unwrap();
+    let request = pair.sender.poll_request(pair.now).unwrap();
+    pair.kmes.failures = vec![FailureKind::Ambiguous];
+    let answer = pair.kmes.answer(request);
+    pair.sender.on_answer(pair.now, answer);
+    assert!(pair.sender.poll_request(pair.now + ms(999)).is_none());
+    assert!(pair.sender.poll_request(pair.now + ms(1000)).is_some());
+}
+
+#[test]
+fn unused_keys_move_to_the_next_connection_without_another_dec_keys() {
+    let mut pair = Pair::new();
+    pair.run();
+    let envelope = pair.seal(Delivery::Reliable).unwrap();
+    let announced = pair.announced();
+    let stored = pair.kmes.stored.len();
+    pair.connect();
+    assert!(matches!(pair.log.last(), Some(KeyMessage::Retire { .. })), "the begun one ends");
+    pair.run();
+    assert_eq!(pair.failures(), 0);
+    assert_eq!(pair.kmes.stored.len(), stored, "nothing was fetched twice");
+    assert_eq!(pair.announced(), announced + 3 + 1, "three move, one is new");
+    // What was sealed on the old connection opens there, and there only.
+    let mut copy = envelope.clone();
+    assert!(pair.open(envelope).is_err());
+    let old = pair.receiver.opener(1).unwrap();
+    old.open_in_place(pair.now, ROUTE, &mut copy).unwrap();
+    let envelope = pair.seal(Delivery::Reliable).unwrap();
+    pair.open(envelope).unwrap();
+}
+
+#[test]
+fn unused_keys_survive_a_lost_connection() {
+    let mut pair = Pair::new();
+    pair.run();
+    pair.seal(Delivery::Reliable).unwrap();
+    pair.close(1);
+    assert_eq!(pair.seal(Delivery::Reliable), Err(NoKey::Detached));
+    pair.now += ms(60_000);
+    pair.connect();
+    pair.run();
+    assert_eq!(pair.failures(), 0);
+    let envelope = pair.seal(Delivery::Reliable).unwrap();
+    pair.open(envelope).unwrap();
+}
+
+#[test]
+fn a_restarted_receiver_costs_the_keys_and_no_more() {
+    let mut pair = Pair::new();
+    pair.run();
+    pair.close(1);
+    pair.receiver = Receiver::new("sae-b", "sae-a").unwrap();
+    pair.connect();
+    pair.run();
+    assert_eq!(pair.failures(), 4, "the KME gave them to the receiver before");
+    let envelope = pair.seal(Delivery::Reliable).unwrap();
+    pair.open(envelope).unwrap();
+}
+
+#[test]
+fn a_key_in_use_ends_after_an_hour() {
+    let mut pair = Pair::new();
+    pair.run();
+    pair.seal(Delivery::Reliable).unwrap();
+    pair.now += Duration::from_secs(3599);
+    pair.run();
+    assert!(!pair.log.iter().any(|m| matches!(m, KeyMessage::Retire { .. })));
+    pair.now += Duration::from_secs(1);
+    pair.run();
+    let retire = pair.log.iter().find_map(|m| match m {
+        KeyMessage::Retire { used, reliable, .. } => Some((used.bits(), reliable.bits())),
+        _ => None,
+    });
+    assert_eq!(retire, Some((1, 1)));
+    pair.seal(Delivery::Reliable).unwrap();
+}
+
+#[test]
+fn an_announcement_that_nobody_answers_is_dropped() {
+    let mut pair = Pair::new();
+    while let Some(request) = pair.sender.poll_request(pair.now) {
+        let answer = pair.kmes.answer(request);
+        pair.sender.on_answer(pair.now, answer);
+    }
+    assert!(matches!(pair.sender.poll_message(pair.now), Some((1, KeyMessage::Announce(_)))));
+    assert_eq!(pair.sender.statistics(pair.now).announced, 4);
+    pair.now += ms(60_000);
+    assert!(matches!(pair.sender.poll_message(pair.now), Some((1, KeyMessage::Retire { .. }))));
+    assert_eq!(pair.sender.statistics(pair.now).announced, 0);
+}
