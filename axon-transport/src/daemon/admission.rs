@@ -1,0 +1,167 @@
+//! Who is taken as a session.
+
+use std::os::fd::OwnedFd;
+
+use crate::{
+    config::Config,
+    session::{
+        message::{Hello, PROTOCOL, Refused, SessionRole},
+        socket::Peer,
+    },
+    shm::PeerDescriptors,
+};
+
+/// What a daemon compares sessions with.
+#[derive(Debug)]
+pub(super) struct Admission {
+    uid: u32,
+    trusted: Vec<u32>,
+    domain: u32,
+    settings: Vec<(String, String)>,
+}
+
+impl Admission {
+    pub(super) fn new(config: &Config, settings: Vec<(String, String)>) -> Self {
+        let uid = rustix::process::geteuid().as_raw();
+        Self { uid, trusted: config.trusted_uids.clone(), domain: config.domain, settings }
+    }
+
+    /// Whether a process of this user may speak at all.
+    pub(super) fn trusts(&self, uid: u32) -> bool {
+        uid == self.uid || self.trusted.contains(&uid)
+    }
+
+    /// Checks a HELLO, and hands out its descriptors. `inside` is the daemon's own gateway.
+    pub(super) fn check(
+        &self,
+        hello: &Hello,
+        descriptors: Vec<OwnedFd>,
+        peer: Peer,
+        inside: bool,
+    ) -> Result<Option<[OwnedFd; 3]>, Box<Refused>> {
+        if hello.protocol != PROTOCOL {
+            let text =
+                format!("this daemon speaks session protocol {PROTOCOL}, not {}", hello.protocol);
+            return Err(plain(text));
+        }
+        if hello.domain != self.domain {
+            return Err(differs("ROS_DOMAIN_ID", &hello.domain, &self.domain));
+        }
+        if (hello.role == SessionRole::Gateway) != inside {
+            return Err(plain("only the daemon's own gateway has that role".into()));
+        }
+        // A tool only asks, also why others are refused.
+        if hello.role == SessionRole::Tool {
+            return Ok(None);
+        }
+        self.compare(&hello.settings)?;
+        let count = descriptors.len();
+        let Ok([segment, doorbell, pidfd]) = <[OwnedFd; 3]>::try_from(descriptors) else {
+            return Err(plain(format!("HELLO came with {count} descriptors instead of three")));
+        };
+        let handed = PeerDescriptors { segment, doorbell, pidfd };
+        if handed.process() != Some(peer.pid) {
+            return Err(plain("the pidfd in HELLO is not the sender's own".into()));
+        }
+        let PeerDescriptors { segment, doorbell, pidfd } = handed;
+        Ok(Some([segment, doorbell, pidfd]))
+    }
+
+    fn compare(&self, theirs: &[(String, String)]) -> Result<(), Box<Refused>> {
+        let find = |all: &[(String, String)], name: &str| {
+            all.iter().find(|(n, _)| n == name).map_or("unset".to_owned(), |(_, v)| v.clone())
+        };
+        let names = self.settings.iter().chain(theirs).map(|(name, _)| name);
+        for name in names {
+            let (session, daemon) = (find(theirs, name), find(&self.settings, name));
+            if session != daemon {
+                return Err(differs(name, &session, &daemon));
+            }
+        }
+        Ok(())
+    }
+}
+
+fn differs(
+    variable: &str,
+    session: &dyn std::fmt::Display,
+    daemon: &dyn std::fmt::Display,
+) -> Box<Refused> {
+    let (variable, ours, theirs) = (variable.to_owned(), session.to_string(), daemon.to_string());
+    let text = format!("{variable} is {ours} in the session and {theirs} in the daemon");
+    Box::new(Refused { variable, ours, theirs, text })
+}
+
+fn plain(text: String) -> Box<Refused> {
+    Box::new(Refused { variable: String::new(), ours: String::new(), theirs: String::new(), text })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ids::SessionId;
+
+    fn admission() -> Admission {
+        let settings = [("AXON_SECURITY_MODE", "qkd"), ("AXON_SAE_ID", "alice")]
+            .map(|(n, v)| (n.to_owned(), v.to_owned()));
+        Admission { uid: 1000, trusted: vec![1001], domain: 3, settings: settings.into() }
+    }
+
+    fn hello() -> Hello {
+        Hello {
+            protocol: PROTOCOL,
+            session: SessionId::random(),
+            role: SessionRole::Application,
+            name: "test".into(),
+            domain: 3,
+            settings: admission().settings,
+        }
+    }
+
+    fn refusal(hello: &Hello) -> Refused {
+        let peer = Peer { uid: 1000, pid: std::process::id() };
+        *admission().check(hello, Vec::new(), peer, false).unwrap_err()
+    }
+
+    #[test]
+    fn each_difference_is_named() {
+        let mut other = hello();
+        other.settings[1].1 = "bob".into();
+        let refused = refusal(&other);
+        assert_eq!(refused.variable, "AXON_SAE_ID");
+        assert_eq!((refused.ours.as_str(), refused.theirs.as_str()), ("bob", "alice"));
+
+        let mut missing = hello();
+        missing.settings.pop();
+        assert_eq!(refusal(&missing).variable, "AXON_SAE_ID");
+
+        let mut extra = hello();
+        extra.settings.push(("AXON_KME_ID".into(), "k".into()));
+        assert_eq!(refusal(&extra).variable, "AXON_KME_ID");
+        assert_eq!(refusal(&extra).theirs, "unset");
+
+        assert_eq!(refusal(&Hello { domain: 4, ..hello() }).variable, "ROS_DOMAIN_ID");
+    }
+
+    #[test]
+    fn nobody_else_is_the_gateway_and_strangers_are_not_heard() {
+        let gateway = Hello { role: SessionRole::Gateway, ..hello() };
+        assert!(refusal(&gateway).text.contains("gateway"));
+        assert!(refusal(&Hello { protocol: 2, ..hello() }).text.contains("protocol"));
+        assert!(refusal(&hello()).text.contains("0 descriptors"));
+        assert!(admission().trusts(1000) && admission().trusts(1001) && !admission().trusts(0));
+    }
+
+    #[test]
+    fn a_pidfd_of_another_process_is_refused() {
+        use rustix::process::{Pid, PidfdFlags, pidfd_open};
+        let null = || OwnedFd::from(std::fs::File::open("/dev/null").unwrap());
+        let parent = rustix::process::getppid().unwrap();
+        let of = |pid: Pid| pidfd_open(pid, PidfdFlags::empty()).unwrap();
+        let peer = Peer { uid: 1000, pid: std::process::id() };
+        let check = |pidfd| admission().check(&hello(), vec![null(), null(), pidfd], peer, false);
+        assert!(check(of(parent)).unwrap_err().text.contains("pidfd"));
+        assert!(check(null()).unwrap_err().text.contains("pidfd"));
+        assert!(check(of(rustix::process::getpid())).unwrap().is_some());
+    }
+}

@@ -1,0 +1,258 @@
+//! Sessions' sockets: accepting them, and moving packets between each and the registry.
+
+use std::{
+    cell::RefCell,
+    os::fd::{AsFd, BorrowedFd, OwnedFd},
+    rc::Rc,
+    sync::Arc,
+    time::Duration,
+};
+
+use rustix::net::{SocketFlags, accept_with};
+use tokio::{io::unix::AsyncFd, sync::Notify, task::spawn_local, time::timeout};
+
+use super::{control::Control, watch::watch};
+use crate::{
+    ids::SessionId,
+    session::{
+        message::{Hello, Message, PROTOCOL, Welcome},
+        socket::{self, Peer, Received, SocketError},
+    },
+};
+
+/// How long a connection may take to say HELLO.
+const HELLO: Duration = Duration::from_secs(5);
+/// Connections that may be without a HELLO at a time.
+const STRANGERS: usize = 256;
+/// Packets taken from one session before the others have their turn.
+const BATCH: usize = 64;
+
+/// Accepts sessions for as long as it is polled.
+pub(super) async fn accept(control: Rc<RefCell<Control>>, listener: OwnedFd) {
+    let listener = match watch(listener) {
+        Ok(listener) => listener,
+        Err(error) => return tracing::error!(%error, "the session socket cannot be watched"),
+    };
+    let strangers = Arc::new(tokio::sync::Semaphore::new(STRANGERS));
+    loop {
+        let Ok(permit) = strangers.clone().acquire_owned().await else { return };
+        let Ok(mut ready) = listener.readable().await else { return };
+        let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+        let accepted = ready.try_io(|l| Ok(accept_with(l.get_ref(), flags)?));
+        match accepted {
+            Ok(Ok(socket)) => {
+                let control = control.clone();
+                spawn_local(async move {
+                    serve(control, socket, false, move || drop(permit)).await;
+                });
+            }
+            Ok(Err(error)) => {
+                // Out of descriptors, or the caller has gone: neither ends the daemon.
+                tracing::warn!(%error, "a session could not be accepted");
+                tokio::time::sleep(Duration::from_millis(50)).await;
+            }
+            Err(_not_ready) => {}
+        }
+    }
+}
+
+/// Serves one connection to its end. `known` is called when it is a stranger no more.
+pub(super) async fn serve(
+    control: Rc<RefCell<Control>>,
+    socket: OwnedFd,
+    inside: bool,
+    known: impl FnOnce(),
+) {
+    let Ok(peer) = socket::peer(&socket) else { return };
+    if !control.borrow().admission.trusts(peer.uid) {
+        tracing::warn!(uid = peer.uid, pid = peer.pid, "a stranger's connection was closed");
+        return;
+    }
+    let Ok(socket) = watch(socket) else { return };
+    let Ok(Some(hello)) = timeout(HELLO, first(&socket)).await else { return };
+    known();
+    let Some((id, bell, death)) = admit(&control, &socket, hello, peer, inside) else { return };
+    let why = converse(&control, &socket, id, &bell, death.as_ref()).await;
+    tracing::debug!(session = %id, why, "a session ended");
+    control.borrow_mut().remove(&id, &bell);
+}
+
+async fn first(socket: &AsyncFd<OwnedFd>) -> Option<(Hello, Vec<OwnedFd>)> {
+    let mut buffer = Vec::new();
+    loop {
+        let mut ready = socket.readable().await.ok()?;
+        match socket::receive(socket.get_ref(), &mut buffer) {
+            Ok(Received { message: Message::Hello(hello), descriptors }) => {
+                return Some((hello, descriptors));
+            }
+            Ok(Received { message: Message::Unknown(_), .. }) => {}
+            Err(SocketError::NotReady) => ready.clear_ready(),
+            Ok(_) | Err(_) => return None,
+        }
+    }
+}
+
+type Admitted = (SessionId, Rc<Notify>, Option<AsyncFd<OwnedFd>>);
+
+fn admit(
+    control: &Rc<RefCell<Control>>,
+    socket: &AsyncFd<OwnedFd>,
+    (mut hello, descriptors): (Hello, Vec<OwnedFd>),
+    peer: Peer,
+    inside: bool,
+) -> Option<Admitted> {
+    // It is shown in log and status.
+    hello.name = hello.name.chars().filter(|c| !c.is_control()).take(64).collect();
+    let control = &mut *control.borrow_mut();
+    let say = |message: Message| {
+        // The socket is new: its buffer has room.
+        let sent = message.encode().map(|packet| socket::send(socket.get_ref(), &packet, &[]));
+        matches!(sent, Ok(Ok(())))
+    };
+    let handed = match control.admission.check(&hello, descriptors, peer, inside) {
+        Ok(handed) => handed,
+        Err(refused) => {
+            let what =
+                if refused.variable.is_empty() { "session" } else { &refused.variable }.to_owned();
+            let who = format!("session {} (pid {})", hello.name, peer.pid);
+            control.refused(who, what, refused.text.clone());
+            say(Message::Refused(*refused));
+            return None;
+        }
+    };
+    // The id is the session's secret, but a mistake in one must not end another.
+    if control.registry.session(&hello.session).is_some_and(|s| s.pid != peer.pid) {
+        tracing::warn!(pid = peer.pid, "a session with another process's id was closed");
+        return None;
+    }
+    let death = match &handed {
+        Some([_, _, pidfd]) => Some(watch(pidfd.try_clone().ok()?).ok()?),
+        None => None,
+    };
+    let pid = std::process::id();
+    if !say(Message::Welcome(Welcome { protocol: PROTOCOL, daemon: control.id, pid })) {
+        return None;
+    }
+    let Hello { session, role, name, .. } = hello;
+    tracing::debug!(%session, name, pid = peer.pid, "a session");
+    let handed = handed.map(|fds| fds.map(Arc::new));
+    if let Err(violation) = control.registry.connect(session, role, name, peer.pid, handed) {
+        control.refused(format!("pid {}", peer.pid), "session".into(), violation.to_string());
+        return None;
+    }
+    let bell = control.add_waker(session);
+    control.settle();
+    Some((session, bell, death))
+}
+
+async fn converse(
+    control: &Rc<RefCell<Control>>,
+    socket: &AsyncFd<OwnedFd>,
+    id: SessionId,
+    bell: &Rc<Notify>,
+    death: Option<&AsyncFd<OwnedFd>>,
+) -> String {
+    let mut buffer = Vec::new();
+    loop {
+        let full = match send_all(control, socket, &id) {
+            Ok(full) => full,
+            Err(error) => return error.to_string(),
+        };
+        tokio::select! {
+            () = bell.notified() => {
+                if !control.borrow().is_current(&id, bell) {
+                    return "it came back on another connection".into();
+                }
+            }
+            ready = socket.writable(), if full => {
+                let Ok(mut ready) = ready else { return "its socket cannot be watched".into() };
+                match send_all(control, socket, &id) {
+                    Ok(true) => ready.clear_ready(),
+                    Ok(false) => {}
+                    Err(error) => return error.to_string(),
+                }
+            }
+            // Too many descriptors in flight: nothing says when that is over.
+            () = tokio::time::sleep(Duration::from_millis(20)), if full => {}
+            ready = socket.readable() => {
+                let Ok(mut ready) = ready else { return "its socket cannot be watched".into() };
+                match receive_some(control, socket, &id, bell, &mut buffer) {
+                    Ok(true) => ready.clear_ready(),
+                    Ok(false) => tokio::task::yield_now().await,
+                    Err(why) => return why,
+                }
+            }
+            () = ended(death) => return "its process ended".into(),
+        }
+    }
+}
+
+/// Sends what waits for a session; whether some is left because the socket is full.
+fn send_all(
+    control: &Rc<RefCell<Control>>,
+    socket: &AsyncFd<OwnedFd>,
+    id: &SessionId,
+) -> Result<bool, SocketError> {
+    let registry = &mut control.borrow_mut().registry;
+    while let Some(output) = registry.next_output(id) {
+        let descriptors: Vec<BorrowedFd<'_>> = output.descriptors.iter().map(|d| d.as_fd()).collect();
+        match socket::send(socket.get_ref(), &output.packet, &descriptors) {
+            Ok(()) => {}
+            Err(SocketError::NotReady) => {
+                drop(descriptors);
+                registry.return_output(id, output);
+                return Ok(true);
+            }
+            Err(error) => return Err(error),
+        }
+    }
+    Ok(false)
+}
+
+/// Takes a batch of packets; whether the socket is empty now.
+fn receive_some(
+    control: &Rc<RefCell<Control>>,
+    socket: &AsyncFd<OwnedFd>,
+    id: &SessionId,
+    bell: &Rc<Notify>,
+    buffer: &mut Vec<u8>,
+) -> Result<bool, String> {
+    let control = &mut *control.borrow_mut();
+    if !control.is_current(id, bell) {
+        return Err("it came back on another connection".into());
+    }
+    let mut outcome = Ok(false);
+    for _ in 0..BATCH {
+        match socket::receive(socket.get_ref(), buffer) {
+            Ok(Received { message: Message::StatusRequest, .. }) => control.send_status(id),
+            Ok(Received { message, descriptors }) => {
+                let descriptors = descriptors.into_iter().map(Arc::new).collect();
+                if let Err(violation) = control.registry.message(id, message, descriptors) {
+                    tracing::warn!(session = %id, %violation, "a session was disconnected");
+                    outcome = Err(violation.to_string());
+                    break;
+                }
+            }
+            Err(SocketError::NotReady) => {
+                outcome = Ok(true);
+                break;
+            }
+            Err(error) => {
+                if !matches!(error, SocketError::Closed) {
+                    tracing::warn!(session = %id, %error, "a session was disconnected");
+                }
+                outcome = Err(error.to_string());
+                break;
+            }
+        }
+    }
+    control.settle();
+    outcome
+}
+
+async fn ended(death: Option<&AsyncFd<OwnedFd>>) {
+    match death {
+        Some(pidfd) => drop(pidfd.readable().await),
+        None => std::future::pending().await,
+    }
+}

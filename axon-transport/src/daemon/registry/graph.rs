@@ -1,0 +1,152 @@
+//! The graph that sessions are shown, and its changes.
+
+use super::Registry;
+use crate::{
+    graph::{Endpoint, LIMITS},
+    ids::{DaemonId, Gid},
+    session::message::{EndpointRole, Graph, GraphItem, Message, SessionRole},
+};
+
+/// Bytes of endpoints in one packet; leaves room for the rest of the message and one endpoint more.
+const PART: usize = 24 * 1024;
+
+impl<F: Clone> Registry<F> {
+    /// What another host's daemon has: `reset` forgets what it had.
+    ///
+    /// Endpoints that are out of bounds, or whose GID another host or a session here has, are
+    /// left out.
+    pub fn remote_graph(
+        &mut self,
+        daemon: DaemonId,
+        reset: bool,
+        added: Vec<Endpoint>,
+        removed: Vec<Gid>,
+    ) {
+        if reset {
+            self.remote_gone(&daemon);
+        }
+        for gid in removed {
+            if self.remote.get_mut(&daemon).is_some_and(|all| all.remove(&gid).is_some()) {
+                self.graph_remove(gid);
+            }
+        }
+        for endpoint in added {
+            let gid = endpoint.gid;
+            let local = self.endpoints.get(&gid).is_some_and(|e| e.role != EndpointRole::StandIn);
+            let elsewhere =
+                self.remote.iter().any(|(other, all)| *other != daemon && all.contains_key(&gid));
+            let all = self.remote.entry(daemon).or_default();
+            if local || elsewhere || !endpoint.is_sane() || all.len() >= LIMITS.endpoints {
+                continue;
+            }
+            all.insert(gid, endpoint.clone());
+            self.graph_add(GraphItem { endpoint, daemon: Some(daemon) });
+        }
+    }
+
+    /// Another host's daemon is gone, and its endpoints with it.
+    pub fn remote_gone(&mut self, daemon: &DaemonId) {
+        for (gid, _) in self.remote.remove(daemon).unwrap_or_default() {
+            self.graph_remove(gid);
+        }
+    }
+
+    /// Queues what changed in the graph since the last call. Called a few milliseconds after a
+    /// change, so that a node that starts with twenty endpoints costs each session one packet.
+    pub fn flush(&mut self) {
+        if self.added.is_empty() && self.removed.is_empty() {
+            return;
+        }
+        self.version += 1;
+        let removed: Vec<Gid> = std::mem::take(&mut self.removed).into_iter().collect();
+        let added = std::mem::take(&mut self.added).into_values();
+        let parts = parts(self.version, false, added, &removed, false);
+        let sessions: Vec<_> = self
+            .sessions
+            .iter()
+            .filter(|(_, s)| s.role != SessionRole::Tool && !s.behind)
+            .map(|(id, _)| *id)
+            .collect();
+        for part in parts {
+            self.push_shared(&sessions, &Message::Graph(part));
+        }
+    }
+
+    /// Whether [`flush`](Self::flush) has something to do.
+    pub fn needs_flush(&self) -> bool {
+        !self.added.is_empty() || !self.removed.is_empty()
+    }
+
+    /// The whole graph, open-ended: the last part says that more follows.
+    pub(super) fn whole_graph(&self) -> Vec<Graph> {
+        let local = self
+            .endpoints
+            .values()
+            .filter(|e| e.role == EndpointRole::Application)
+            .map(|e| GraphItem { endpoint: e.endpoint.clone(), daemon: None });
+        let remote = self
+            .remote_endpoints()
+            .map(|(d, e)| GraphItem { endpoint: e.clone(), daemon: Some(*d) });
+        let tombstones: Vec<Gid> = self.tombstones.iter().copied().collect();
+        parts(self.version, true, local.chain(remote), &tombstones, true)
+    }
+
+    pub(super) fn graph_add_local(&mut self, endpoint: &Endpoint) {
+        // A session's word about its own GID outweighs another host's.
+        let claimed: Vec<DaemonId> = self
+            .remote
+            .iter_mut()
+            .filter_map(|(d, all)| all.remove(&endpoint.gid).map(|_| *d))
+            .collect();
+        if !claimed.is_empty() {
+            self.graph_remove(endpoint.gid);
+        }
+        self.graph_add(GraphItem { endpoint: endpoint.clone(), daemon: None });
+    }
+
+    fn graph_add(&mut self, item: GraphItem) {
+        self.added.insert(item.endpoint.gid, item);
+    }
+
+    pub(super) fn graph_remove(&mut self, gid: Gid) {
+        self.added.remove(&gid);
+        self.removed.insert(gid);
+    }
+}
+
+/// Splits a change into packets. `open` leaves `more` set in the last.
+fn parts(
+    version: u64,
+    whole: bool,
+    added: impl Iterator<Item = GraphItem>,
+    removed: &[Gid],
+    open: bool,
+) -> Vec<Graph> {
+    let empty = |whole| Graph { version, whole, added: Vec::new(), removed: Vec::new(), more: true };
+    let mut parts = Vec::new();
+    let mut part = empty(whole);
+    let mut size = 0;
+    // Removals go first: a GID that was removed and is back must end up present.
+    for gid in removed {
+        if size + 17 > PART {
+            parts.push(std::mem::replace(&mut part, empty(false)));
+            size = 0;
+        }
+        size += 17;
+        part.removed.push(*gid);
+    }
+    for item in added {
+        let e = &item.endpoint;
+        let names = e.topic.len() + e.type_name.len() + e.node.len() + e.namespace.len();
+        let bytes = names + e.type_hash.len() + 160;
+        if size + bytes > PART {
+            parts.push(std::mem::replace(&mut part, empty(false)));
+            size = 0;
+        }
+        size += bytes;
+        part.added.push(item);
+    }
+    part.more = open;
+    parts.push(part);
+    parts
+}

@@ -1,0 +1,265 @@
+//! What sessions say.
+
+use super::{
+    LocalEndpoint, MAX_SESSIONS, MAX_TOMBSTONES, Registry, SessionEntry, Violation,
+    output::session_entry,
+};
+use crate::{
+    graph::LIMITS,
+    ids::{Gid, SessionId},
+    session::message::{
+        Announce, Attach, EndpointRole, Granted, Message, Pair, Refused, SessionRole, Unmatch,
+        writes,
+    },
+};
+
+impl<F: Clone> Registry<F> {
+    /// A session whose HELLO was taken. It will be told the whole graph.
+    ///
+    /// # Errors
+    /// When there are too many sessions.
+    pub fn connect(
+        &mut self,
+        id: SessionId,
+        role: SessionRole,
+        name: String,
+        pid: u32,
+        descriptors: Option<[F; 3]>,
+    ) -> Result<(), Violation> {
+        self.disconnect(&id);
+        if self.sessions.len() >= MAX_SESSIONS {
+            return Err(Violation::Sessions);
+        }
+        self.sessions.insert(id, session_entry(role, name, pid, descriptors));
+        if role != SessionRole::Tool {
+            self.mark_behind(&id);
+        }
+        Ok(())
+    }
+
+    /// A session that is gone, and its endpoints with it.
+    pub fn disconnect(&mut self, id: &SessionId) {
+        let Some(entry) = self.sessions.get_mut(id) else { return };
+        for gid in std::mem::take(&mut entry.endpoints) {
+            self.remove_endpoint(&gid, "its session ended");
+        }
+        self.sessions.remove(id);
+        self.ready.remove(id);
+    }
+
+    /// A message of a session.
+    ///
+    /// # Errors
+    /// When no session sends such a message; the caller disconnects it.
+    pub fn message(
+        &mut self,
+        id: &SessionId,
+        message: Message,
+        descriptors: Vec<F>,
+    ) -> Result<(), Violation> {
+        let tool = self.sessions.get(id).is_none_or(|s| s.role == SessionRole::Tool);
+        let carries = matches!(message, Message::Endpoint(_) | Message::Unknown(_));
+        if !descriptors.is_empty() && !carries {
+            return Err(Violation::Descriptors(descriptors.len()));
+        }
+        match message {
+            Message::Unknown(_) => Ok(()),
+            _ if tool => Err(Violation::Unexpected),
+            Message::Endpoint(announce) => self.announce(id, announce, descriptors),
+            Message::EndpointGone(gone) => self.gone(id, gone.gid),
+            Message::Attach(attach) => self.attach(id, attach),
+            Message::Grant(grant) => self.grant(id, grant),
+            Message::Detach(pair) => self.detach(id, pair),
+            Message::Resync => {
+                self.mark_behind(id);
+                Ok(())
+            }
+            _ => Err(Violation::Unexpected),
+        }
+    }
+
+    fn announce(
+        &mut self,
+        id: &SessionId,
+        announce: Announce,
+        mut descriptors: Vec<F>,
+    ) -> Result<(), Violation> {
+        let Announce { endpoint, role, stands_for } = announce;
+        let gid = endpoint.gid;
+        let expected = usize::from(writes(endpoint.kind));
+        if descriptors.len() != expected {
+            return Err(Violation::Descriptors(descriptors.len()));
+        }
+        let Some(entry) = self.sessions.get(id) else { return Ok(()) };
+        let may = match role {
+            EndpointRole::Application => in_session(&gid, id),
+            EndpointRole::StandIn => {
+                entry.role == SessionRole::Gateway && writes(endpoint.kind) && !in_session(&gid, id)
+            }
+            EndpointRole::Relay => {
+                entry.role == SessionRole::Gateway && in_session(&gid, id) && !writes(endpoint.kind)
+            }
+        };
+        if !may {
+            return Err(Violation::NotItsOwn(gid));
+        }
+        if let Some(known) = self.endpoints.get_mut(&gid) {
+            if known.session != *id || known.role != role {
+                return Err(Violation::NotItsOwn(gid));
+            }
+            known.stands_for = stands_for;
+            return Ok(());
+        }
+        let refusal = if !endpoint.is_sane() {
+            Some("a name, type hash or depth out of bounds")
+        } else if entry.endpoints.len() >= LIMITS.endpoints {
+            Some("too many endpoints in one session")
+        } else {
+            None
+        };
+        if let Some(text) = refusal {
+            let text = format!("endpoint {gid}: {text}");
+            let refused =
+                Refused { variable: String::new(), ours: String::new(), theirs: String::new(), text };
+            self.push(id, &Message::Refused(refused), Vec::new());
+            return Ok(());
+        }
+        if let Some(entry) = self.sessions.get_mut(id) {
+            entry.endpoints.insert(gid);
+        }
+        if role == EndpointRole::Application {
+            self.graph_add_local(&endpoint);
+        }
+        let ring = descriptors.pop();
+        let local = LocalEndpoint { session: *id, endpoint, role, stands_for, ring };
+        self.index(&local);
+        self.endpoints.insert(gid, local);
+        self.match_endpoint(&gid);
+        Ok(())
+    }
+
+    fn gone(&mut self, id: &SessionId, gid: Gid) -> Result<(), Violation> {
+        match self.endpoints.get(&gid) {
+            Some(local) if local.session == *id => {
+                if let Some(entry) = self.sessions.get_mut(id) {
+                    entry.endpoints.remove(&gid);
+                }
+                self.remove_endpoint(&gid, "the endpoint is gone");
+                Ok(())
+            }
+            // It ended while there was no daemon. Its peers may still be attached to it, and those
+            // that have not come back yet have to hear of it too.
+            None if in_session(&gid, id) => {
+                if self.tombstones.len() == MAX_TOMBSTONES {
+                    self.tombstones.pop_front();
+                }
+                self.tombstones.push_back(gid);
+                self.graph_remove(gid);
+                Ok(())
+            }
+            _ => Err(Violation::NotItsOwn(gid)),
+        }
+    }
+
+    fn attach(&mut self, id: &SessionId, attach: Attach) -> Result<(), Violation> {
+        if self.endpoints.get(&attach.reader).is_some_and(|r| r.session != *id) {
+            return Err(Violation::NotItsOwn(attach.reader));
+        }
+        let pair = Pair { reader: attach.reader, writer: attach.writer };
+        // The pair may have ended while the message was on its way.
+        let Some(state) = self.pairs.get_mut(&pair) else { return Ok(()) };
+        *state = Some(Attach { session: *id, ..attach });
+        self.forward_attach(&pair);
+        Ok(())
+    }
+
+    /// Tells the writer's session what the reader asked.
+    pub(super) fn forward_attach(&mut self, pair: &Pair) {
+        let Some(Some(attach)) = self.pairs.get(pair) else { return };
+        let Some(writer) = self.endpoints.get(&pair.writer) else { return };
+        let (message, reader_session, to) =
+            (Message::Attach(attach.clone()), attach.session, writer.session);
+        let descriptors = self.introduce(&to, &reader_session, pair);
+        self.push(&to, &message, descriptors);
+    }
+
+    fn grant(&mut self, id: &SessionId, grant: Granted) -> Result<(), Violation> {
+        let ring = match self.endpoints.get(&grant.writer) {
+            None => return Ok(()),
+            Some(writer) if writer.session != *id => return Err(Violation::NotItsOwn(grant.writer)),
+            Some(writer) => writer.ring.clone(),
+        };
+        let pair = Pair { reader: grant.reader, writer: grant.writer };
+        if !matches!(self.pairs.get(&pair), Some(Some(_))) {
+            return Ok(());
+        }
+        let Some(to) = self.endpoints.get(&grant.reader).map(|r| r.session) else { return Ok(()) };
+        let mut descriptors: Vec<F> = ring.into_iter().collect();
+        descriptors.extend(self.introduce(&to, id, &pair));
+        self.push(&to, &Message::Grant(Granted { session: *id, ..grant }), descriptors);
+        Ok(())
+    }
+
+    fn detach(&mut self, id: &SessionId, pair: Pair) -> Result<(), Violation> {
+        if self.endpoints.get(&pair.reader).is_some_and(|r| r.session != *id) {
+            return Err(Violation::NotItsOwn(pair.reader));
+        }
+        if self.pairs.remove(&pair).is_none() {
+            return Ok(());
+        }
+        if let Some(to) = self.endpoints.get(&pair.writer).map(|w| w.session)
+            && to != *id
+        {
+            self.forget(&to, id, &pair);
+            self.push(&to, &Message::Detach(pair), Vec::new());
+            self.forget(id, &to, &pair);
+        }
+        let Pair { reader, writer } = pair;
+        let reason = "detached".to_owned();
+        self.push(id, &Message::Unmatch(Unmatch { reader, writer, reason }), Vec::new());
+        Ok(())
+    }
+
+    /// The descriptors of `of` when `to` holds none yet, and notes that it does for `pair`.
+    fn introduce(&mut self, to: &SessionId, of: &SessionId, pair: &Pair) -> Vec<F> {
+        if to == of {
+            return Vec::new();
+        }
+        let Some(descriptors) = self.sessions.get(of).and_then(|s| s.descriptors.clone()) else {
+            return Vec::new();
+        };
+        let Some(entry) = self.sessions.get_mut(to) else { return Vec::new() };
+        if entry.behind {
+            // The packet will not be queued.
+            return Vec::new();
+        }
+        let held = entry.known.entry(*of).or_default();
+        let first = held.is_empty();
+        held.insert(*pair);
+        if first { descriptors.into() } else { Vec::new() }
+    }
+
+    /// `at` is about to be told that `pair`, for which it held `of`'s descriptors, is over.
+    pub(super) fn forget(&mut self, at: &SessionId, of: &SessionId, pair: &Pair) {
+        if let Some(entry) = self.sessions.get_mut(at)
+            && let Some(held) = entry.known.get_mut(of)
+        {
+            held.remove(pair);
+            if held.is_empty() {
+                entry.known.remove(of);
+            }
+        }
+    }
+}
+
+/// Whether `gid` is one that `session` may give to an endpoint of its own.
+fn in_session(gid: &Gid, session: &SessionId) -> bool {
+    gid.0[..12] == session.0[..12]
+}
+
+impl<F> SessionEntry<F> {
+    /// Packets that wait for it.
+    pub fn queued(&self) -> usize {
+        self.queue.len()
+    }
+}

@@ -1,0 +1,162 @@
+//! The control plane's state: sessions, endpoints, who is matched with whom, and what each session
+//! has yet to be told.
+//!
+//! Plain data: messages go in, packets and descriptors come out, and nothing here does I/O. `F`
+//! stands for a descriptor. Matching is a function of the endpoints alone, so a session that
+//! could not be told in time is told everything anew ([`Registry::next_output`]).
+
+mod graph;
+mod input;
+mod matching;
+mod output;
+#[cfg(test)]
+mod tests;
+
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
+
+pub use output::Output;
+
+use crate::{
+    graph::Endpoint,
+    ids::{DaemonId, Gid, SessionId},
+    session::message::{Attach, EndpointRole, GraphItem, Pair, SessionRole},
+};
+
+/// Packets that may wait for one session before it is told everything anew instead.
+pub const MAX_QUEUE: usize = 4096;
+/// Sessions of one daemon.
+pub const MAX_SESSIONS: usize = 4096;
+/// Remembered GIDs of endpoints that ended while there was no daemon to tell.
+const MAX_TOMBSTONES: usize = 4096;
+
+/// The state of the control plane.
+#[derive(Debug)]
+pub struct Registry<F> {
+    sessions: BTreeMap<SessionId, SessionEntry<F>>,
+    endpoints: HashMap<Gid, LocalEndpoint<F>>,
+    topics: HashMap<Topic, Members>,
+    pairs: BTreeMap<Pair, Option<Attach>>,
+    remote: BTreeMap<DaemonId, BTreeMap<Gid, Endpoint>>,
+    tombstones: VecDeque<Gid>,
+    version: u64,
+    added: BTreeMap<Gid, GraphItem>,
+    removed: BTreeSet<Gid>,
+    ready: BTreeSet<SessionId>,
+}
+
+/// A session as the registry knows it.
+#[derive(Debug)]
+pub struct SessionEntry<F> {
+    /// What kind it is.
+    pub role: SessionRole,
+    /// Its process's name.
+    pub name: String,
+    /// Its process.
+    pub pid: u32,
+    /// Its endpoints.
+    pub endpoints: BTreeSet<Gid>,
+    /// Segment, doorbell and pidfd; a tool has none.
+    pub descriptors: Option<[F; 3]>,
+    /// Other sessions whose descriptors it holds, and the pairs for which it does.
+    known: HashMap<SessionId, HashSet<Pair>>,
+    queue: VecDeque<Output<F>>,
+    queue_limit: usize,
+    behind: bool,
+}
+
+/// An endpoint of a session here.
+#[derive(Debug)]
+pub struct LocalEndpoint<F> {
+    /// Whose it is.
+    pub session: SessionId,
+    /// The endpoint.
+    pub endpoint: Endpoint,
+    /// For whom it stands.
+    pub role: EndpointRole,
+    /// A relay's remote subscriptions.
+    pub stands_for: Vec<Gid>,
+    /// A writer's ring.
+    pub ring: Option<F>,
+}
+
+/// A topic's or service's name and type.
+#[derive(Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+struct Topic(String, String);
+
+#[derive(Debug, Default)]
+struct Members {
+    writers: BTreeSet<Gid>,
+    readers: BTreeSet<Gid>,
+}
+
+/// What a session did that no session does. It is disconnected.
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum Violation {
+    /// A message that only a daemon sends, or a second HELLO.
+    #[error("an unexpected message")]
+    Unexpected,
+    /// Descriptors where none belong, or not those that do.
+    #[error("a message with {0} descriptors")]
+    Descriptors(usize),
+    /// An endpoint of another session, or a role that is not the session's.
+    #[error("endpoint {0} is not its own")]
+    NotItsOwn(Gid),
+    /// Too many sessions.
+    #[error("more than {MAX_SESSIONS} sessions")]
+    Sessions,
+}
+
+impl<F> Default for Registry<F> {
+    fn default() -> Self {
+        Self {
+            sessions: BTreeMap::new(),
+            endpoints: HashMap::new(),
+            topics: HashMap::new(),
+            pairs: BTreeMap::new(),
+            remote: BTreeMap::new(),
+            tombstones: VecDeque::new(),
+            version: 0,
+            added: BTreeMap::new(),
+            removed: BTreeSet::new(),
+            ready: BTreeSet::new(),
+        }
+    }
+}
+
+impl<F: Clone> Registry<F> {
+    /// The sessions.
+    pub fn sessions(&self) -> impl Iterator<Item = (&SessionId, &SessionEntry<F>)> {
+        self.sessions.iter()
+    }
+
+    /// One session.
+    pub fn session(&self, id: &SessionId) -> Option<&SessionEntry<F>> {
+        self.sessions.get(id)
+    }
+
+    /// How many application sessions there are.
+    pub fn applications(&self) -> usize {
+        self.sessions.values().filter(|s| s.role == SessionRole::Application).count()
+    }
+
+    /// The endpoints of sessions here.
+    pub fn endpoints(&self) -> impl Iterator<Item = &LocalEndpoint<F>> {
+        self.endpoints.values()
+    }
+
+    /// The endpoints on other hosts.
+    pub fn remote_endpoints(&self) -> impl Iterator<Item = (&DaemonId, &Endpoint)> {
+        self.remote.iter().flat_map(|(daemon, all)| all.values().map(move |e| (daemon, e)))
+    }
+
+    /// The pairs whose reader has asked its writer.
+    pub fn attached(&self) -> impl Iterator<Item = &Attach> {
+        self.pairs.values().flatten()
+    }
+
+    /// The version that the next [`flush`](Self::flush) will exceed.
+    pub fn version(&self) -> u64 {
+        self.version
+    }
+}

@@ -1,0 +1,153 @@
+//! What sessions are told.
+
+use std::{
+    collections::{BTreeSet, HashMap, VecDeque},
+    sync::Arc,
+};
+
+use super::{MAX_QUEUE, Registry, SessionEntry};
+use crate::{
+    ids::SessionId,
+    session::message::{Graph, Message, Pair, SessionRole},
+};
+
+/// A packet for a session.
+#[derive(Clone, Debug)]
+pub struct Output<F> {
+    /// Its bytes.
+    pub packet: Arc<[u8]>,
+    /// What goes with it.
+    pub descriptors: Vec<F>,
+}
+
+impl<F: Clone> Registry<F> {
+    /// The next packet for a session; `None` when there is none.
+    ///
+    /// A session that is behind is told everything anew: the graph, its matches, and what readers
+    /// asked of its writers, closed by a GRAPH without `more`. What it does not hear again is over.
+    pub fn next_output(&mut self, id: &SessionId) -> Option<Output<F>> {
+        let entry = self.sessions.get_mut(id)?;
+        if entry.behind && entry.queue.is_empty() {
+            self.tell_everything(id);
+        }
+        let entry = self.sessions.get_mut(id)?;
+        let output = entry.queue.pop_front();
+        if entry.queue.is_empty() {
+            entry.queue_limit = MAX_QUEUE;
+        }
+        output
+    }
+
+    /// Puts a packet back that could not be sent.
+    pub fn return_output(&mut self, id: &SessionId, output: Output<F>) {
+        if let Some(entry) = self.sessions.get_mut(id) {
+            entry.queue.push_front(output);
+        }
+    }
+
+    /// Sessions that got something to be told since the last call.
+    pub fn take_ready(&mut self) -> BTreeSet<SessionId> {
+        std::mem::take(&mut self.ready)
+    }
+
+    /// Queues a message for one session.
+    pub fn push(&mut self, to: &SessionId, message: &Message, descriptors: Vec<F>) {
+        let Some(packet) = encode(message) else { return };
+        self.push_packet(to, Output { packet, descriptors });
+    }
+
+    pub(super) fn push_shared(&mut self, to: &[SessionId], message: &Message) {
+        let Some(packet) = encode(message) else { return };
+        for id in to {
+            self.push_packet(id, Output { packet: packet.clone(), descriptors: Vec::new() });
+        }
+    }
+
+    fn push_packet(&mut self, to: &SessionId, output: Output<F>) {
+        let Some(entry) = self.sessions.get_mut(to) else { return };
+        if entry.behind {
+            return;
+        }
+        if entry.queue.len() >= entry.queue_limit {
+            self.mark_behind(to);
+            return;
+        }
+        entry.queue.push_back(output);
+        self.ready.insert(*to);
+    }
+
+    pub(super) fn mark_behind(&mut self, id: &SessionId) {
+        if let Some(entry) = self.sessions.get_mut(id) {
+            entry.behind = true;
+            entry.queue.clear();
+            self.ready.insert(*id);
+        }
+    }
+
+    fn tell_everything(&mut self, id: &SessionId) {
+        // Pending changes are part of the whole, and the others hear of them as usual.
+        self.flush();
+        let parts = self.whole_graph();
+        let Some(entry) = self.sessions.get_mut(id) else { return };
+        entry.behind = false;
+        entry.known.clear();
+        entry.queue_limit = usize::MAX;
+        for part in parts {
+            self.push(id, &Message::Graph(part), Vec::new());
+        }
+        let own: Vec<Pair> = self
+            .pairs
+            .keys()
+            .filter(|p| [p.reader, p.writer].iter().any(|g| self.owner(g) == Some(*id)))
+            .copied()
+            .collect();
+        for pair in own {
+            if self.owner(&pair.reader) == Some(*id) {
+                self.push(id, &Message::Match(pair), Vec::new());
+            }
+            if self.owner(&pair.writer) == Some(*id) {
+                self.forward_attach(&pair);
+            }
+        }
+        let (added, removed) = (Vec::new(), Vec::new());
+        let end = Graph { version: self.version, whole: false, added, removed, more: false };
+        self.push(id, &Message::Graph(end), Vec::new());
+        if let Some(entry) = self.sessions.get_mut(id) {
+            entry.queue_limit = entry.queue.len() + MAX_QUEUE;
+        }
+    }
+
+    fn owner(&self, gid: &crate::ids::Gid) -> Option<SessionId> {
+        self.endpoints.get(gid).map(|e| e.session)
+    }
+}
+
+pub(super) fn session_entry<F>(
+    role: SessionRole,
+    name: String,
+    pid: u32,
+    descriptors: Option<[F; 3]>,
+) -> SessionEntry<F> {
+    SessionEntry {
+        role,
+        name,
+        pid,
+        endpoints: BTreeSet::new(),
+        descriptors,
+        known: HashMap::new(),
+        queue: VecDeque::new(),
+        queue_limit: MAX_QUEUE,
+        behind: false,
+    }
+}
+
+fn encode(message: &Message) -> Option<Arc<[u8]>> {
+    match message.encode() {
+        Ok(packet) => Some(packet.into()),
+        Err(error) => {
+            // Everything that is stored is small enough to be passed on.
+            tracing::error!(%error, "a control message could not be encoded");
+            None
+        }
+    }
+}

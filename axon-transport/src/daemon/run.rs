@@ -1,0 +1,280 @@
+//! A daemon's life: from its first system call to its exit status.
+
+use std::{
+    cell::RefCell,
+    os::fd::OwnedFd,
+    process::ExitCode,
+    rc::Rc,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use rustix::process::{DumpableBehavior, Resource, Rlimit, getrlimit, set_dumpable_behavior, setrlimit};
+use tokio::{
+    signal::unix::{SignalKind, signal},
+    task::{LocalSet, spawn_local},
+};
+
+use super::{
+    control::Control,
+    gateway::GatewayEntry,
+    inherit::close_inherited,
+    listen::accept,
+    remote::Remote,
+    spawn::{Report, detach, start_detached},
+};
+use crate::{
+    config::{Config, ConfigError, security_settings},
+    session::address::{Address, AddressError, private_directory},
+};
+
+/// Changes of the graph within this time go out together.
+const COALESCE: Duration = Duration::from_millis(5);
+
+/// How a daemon process came to be.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Start {
+    /// By hand: it stays in the foreground.
+    Foreground,
+    /// By a session (`--spawned`): starts the real daemon and ends.
+    Spawned,
+    /// By the process before (`--detached`): the real daemon.
+    Detached,
+}
+
+/// What a daemon runs with besides its configuration.
+#[derive(Debug)]
+pub struct DaemonOptions {
+    /// Who waits for it to be ready.
+    pub report: Report,
+    /// The gateway to other hosts. Without one, the daemon serves this host alone.
+    pub gateway: Option<GatewayEntry>,
+}
+
+impl Default for DaemonOptions {
+    fn default() -> Self {
+        Self { report: Report::none(), gateway: super::remote::GATEWAY }
+    }
+}
+
+/// Why a daemon does not run.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum DaemonError {
+    /// A setting, or a file that it names.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// Another daemon serves this user and domain.
+    #[error("another daemon serves {0} already")]
+    Taken(String),
+    /// The session socket.
+    #[error("the session socket: {0}")]
+    Address(#[from] AddressError),
+    /// The gateway to other hosts does not start.
+    #[error("the gateway: {0}")]
+    Gateway(String),
+    /// The system refused.
+    #[error("{what}: {source}")]
+    System {
+        /// What was tried.
+        what: &'static str,
+        /// What the system said.
+        source: std::io::Error,
+    },
+}
+
+/// The whole of a daemon program's `main`: reads the configuration from the environment, detaches
+/// if it is to, has `log` set logging up (to standard error, which is the log file by then), and
+/// runs. Call it before anything else opens a file or starts a thread.
+pub fn main(start: Start, log: impl FnOnce(&Config)) -> ExitCode {
+    let fail = |report: &mut Report, text: &str, status: u8| {
+        report.error(text);
+        eprint_line(text);
+        ExitCode::from(status)
+    };
+    if start == Start::Spawned {
+        close_inherited();
+        return match start_detached() {
+            Ok(()) => ExitCode::SUCCESS,
+            Err(error) => {
+                let mut report = Report::from_stdout().unwrap_or(Report::none());
+                fail(&mut report, &error.to_string(), 1)
+            }
+        };
+    }
+    let detached = start == Start::Detached;
+    let mut report = if detached {
+        match Report::from_stdout() {
+            Ok(report) => report,
+            Err(error) => return fail(&mut Report::none(), &error.to_string(), 1),
+        }
+    } else {
+        Report::none()
+    };
+    let config = match Config::from_env() {
+        Ok(config) => config,
+        Err(error) => return fail(&mut report, &error.to_string(), 2),
+    };
+    if detached && let Err(error) = detach(Some(&config)) {
+        return fail(&mut report, &error.to_string(), 1);
+    }
+    log(&config);
+    let options = DaemonOptions { report, ..DaemonOptions::default() };
+    match run(config, options) {
+        Ok(()) => ExitCode::SUCCESS,
+        // Losing the race to start is how all but one end.
+        Err(DaemonError::Taken(_)) if detached => ExitCode::SUCCESS,
+        Err(error @ DaemonError::Config(_)) => {
+            eprint_line(&error.to_string());
+            ExitCode::from(2)
+        }
+        Err(error) => {
+            eprint_line(&error.to_string());
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// Runs a daemon on this thread until nobody needs it, or SIGTERM or SIGINT.
+///
+/// # Errors
+/// When it cannot start. What goes wrong later is logged and shown in its status.
+pub fn run(config: Config, mut options: DaemonOptions) -> Result<(), DaemonError> {
+    let started = start(config, &options);
+    let (control, listener, _bound) = match started {
+        Ok(started) => started,
+        Err(error) => {
+            match &error {
+                DaemonError::Taken(_) => options.report.taken(),
+                other => options.report.error(&other.to_string()),
+            }
+            return Err(error);
+        }
+    };
+    let system = |what| move |source| DaemonError::System { what, source };
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .map_err(system("the control runtime"))?;
+    let control = Rc::new(RefCell::new(control));
+    let local = LocalSet::new();
+    let outcome = local.block_on(&runtime, serve(control.clone(), listener, options));
+    let address = control.borrow().address.clone();
+    if let Address::Path { socket, .. } = address {
+        let _ = std::fs::remove_file(socket);
+    }
+    // A session that is being served, or a gateway that hangs, does not hold up the end.
+    runtime.shutdown_background();
+    outcome
+}
+
+type Started = (Control, OwnedFd, crate::session::address::Lock);
+
+/// Everything before the runtime: the socket first, since it is the lock.
+fn start(config: Config, _options: &DaemonOptions) -> Result<Started, DaemonError> {
+    let settings = security_settings(&config)?;
+    let address = Address::of(&config);
+    let (listener, lock) = match address.bind() {
+        Ok(bound) => bound.into_parts(),
+        Err(AddressError::Taken) => return Err(DaemonError::Taken(address.to_string())),
+        Err(error) => return Err(error.into()),
+    };
+    harden();
+    let mut config = config;
+    if let Some(dir) = &config.runtime_dir
+        && let Err(error) = private_directory(dir)
+    {
+        tracing::warn!(%error, "nothing is kept across restarts");
+        config.runtime_dir = None;
+    }
+    Ok((Control::new(Arc::new(config), settings), listener, lock))
+}
+
+/// Keys live in this process: no core file, no debugger of the same user. And a robot has many
+/// sessions with three descriptors each.
+fn harden() {
+    let refused = |what, error: rustix::io::Errno| tracing::warn!(what, %error, "not hardened");
+    if let Err(error) = set_dumpable_behavior(DumpableBehavior::NotDumpable) {
+        refused("PR_SET_DUMPABLE", error);
+    }
+    let none = Rlimit { current: Some(0), maximum: Some(0) };
+    if let Err(error) = setrlimit(Resource::Core, none) {
+        refused("RLIMIT_CORE", error);
+    }
+    let files = getrlimit(Resource::Nofile);
+    if let Err(error) = setrlimit(Resource::Nofile, Rlimit { current: files.maximum, ..files }) {
+        refused("RLIMIT_NOFILE", error);
+    }
+}
+
+async fn serve(
+    control: Rc<RefCell<Control>>,
+    listener: OwnedFd,
+    mut options: DaemonOptions,
+) -> Result<(), DaemonError> {
+    let signals = signal(SignalKind::terminate()).and_then(|t| Ok((t, signal(SignalKind::interrupt())?)));
+    let (mut terminate, mut interrupt) =
+        signals.map_err(|source| DaemonError::System { what: "watching signals", source })?;
+    let mut remote = match Remote::start(&control, options.gateway).await {
+        Ok(remote) => remote,
+        Err(text) => {
+            options.report.error(&format!("the gateway: {text}"));
+            return Err(DaemonError::Gateway(text));
+        }
+    };
+    {
+        let control = control.borrow();
+        tracing::info!(daemon = %control.id, address = %control.address, "the daemon takes sessions");
+    }
+    let accepting = spawn_local(accept(control.clone(), listener));
+    let flushing = spawn_local(flush(control.clone()));
+    options.report.ready();
+    tokio::select! {
+        _ = terminate.recv() => tracing::info!("SIGTERM"),
+        _ = interrupt.recv() => tracing::info!("SIGINT"),
+        () = unneeded(&control) => tracing::info!("no session needs the daemon any more"),
+        () = remote.run(&control) => {}
+    }
+    // The address is free from here on: who connects now starts a new daemon.
+    accepting.abort();
+    let _ = accepting.await;
+    flushing.abort();
+    remote.end().await;
+    Ok(())
+}
+
+/// Sends changes of the graph a moment after they happened.
+async fn flush(control: Rc<RefCell<Control>>) {
+    loop {
+        if control.borrow().registry.needs_flush() {
+            tokio::time::sleep(COALESCE).await;
+            let control = &mut *control.borrow_mut();
+            control.registry.flush();
+            control.settle();
+        }
+        let changed = control.borrow().changed.clone();
+        changed.notified().await;
+    }
+}
+
+/// Ends when there was no application for the grace time.
+async fn unneeded(control: &Rc<RefCell<Control>>) {
+    let grace = control.borrow().config.link.grace;
+    let mut idle_since = Instant::now();
+    loop {
+        if control.borrow().registry.applications() > 0 {
+            idle_since = Instant::now();
+        }
+        let left = grace.saturating_sub(idle_since.elapsed());
+        if left.is_zero() {
+            return;
+        }
+        tokio::time::sleep(left.min(Duration::from_millis(500))).await;
+    }
+}
+
+/// The one line of a program that cannot go on.
+#[allow(clippy::print_stderr)]
+fn eprint_line(text: &str) {
+    eprintln!("axon: {}", text.replace('\n', " "));
+}

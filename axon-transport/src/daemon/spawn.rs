@@ -1,0 +1,218 @@
+//! Starting a daemon from a session, and a daemon's first steps in life.
+//!
+//! The command runs twice: the first process (`--spawned`) starts the second (`--detached`) and
+//! ends, so that the daemon is nobody's child; neither a zombie nor a SIGCHLD surprises the
+//! application. Standard output is the start-up pipe, over which the daemon says that it is ready,
+//! that another one was faster, or what is wrong.
+
+use std::{
+    ffi::OsString,
+    io::{Read, Write},
+    os::fd::{AsFd, OwnedFd},
+    path::{Path, PathBuf},
+    process::{Command, Stdio},
+    time::{Duration, Instant},
+};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+use crate::{
+    config::Config,
+    session::{DaemonCommand, SessionError, address::private_directory},
+};
+
+/// The flag of the first process.
+pub const SPAWNED: &str = "--spawned";
+/// The flag of the second.
+pub const DETACHED: &str = "--detached";
+
+/// How long a daemon may take to say how it is.
+const PATIENCE: Duration = Duration::from_secs(15);
+/// The most that is read from the start-up pipe.
+const MAX_REPORT: usize = 8192;
+
+/// What a daemon reports.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum Outcome {
+    /// It runs.
+    Ready,
+    /// Another one has the address.
+    Taken,
+}
+
+/// Starts a daemon and waits for its report.
+pub(crate) fn spawn(
+    config: &Config,
+    command: Option<&DaemonCommand>,
+    cancelled: &dyn Fn() -> bool,
+) -> Result<Outcome, SessionError> {
+    let DaemonCommand { program, arguments } = find(config, command)?;
+    let failed = |text: String| SessionError::DaemonFailed { program: program.clone(), text };
+    let (reader, writer) = std::io::pipe().map_err(|e| failed(e.to_string()))?;
+    let mut child = Command::new(&program)
+        .args(arguments)
+        .arg(SPAWNED)
+        .env_clear()
+        .envs(std::env::vars_os().filter(|(name, _)| inherited(name)))
+        .stdin(Stdio::null())
+        .stdout(writer)
+        .stderr(Stdio::null())
+        .spawn()
+        .map_err(|e| failed(e.to_string()))?;
+    let report = read_report(reader.into(), cancelled);
+    // The first process ends as soon as it has started the second, or did not.
+    let status = child.wait();
+    match report.trim_end() {
+        "ready" => Ok(Outcome::Ready),
+        "taken" => Ok(Outcome::Taken),
+        "" => Err(failed(match status {
+            Ok(status) => format!("it said nothing ({status})"),
+            Err(error) => error.to_string(),
+        })),
+        text => Err(failed(text.strip_prefix("error: ").unwrap_or(text).to_owned())),
+    }
+}
+
+/// The command for a daemon: `AXON_DAEMON_PATH`, the application's own, or `axon_daemon` beside
+/// the program or the library.
+fn find(config: &Config, command: Option<&DaemonCommand>) -> Result<DaemonCommand, SessionError> {
+    let alone = |program: PathBuf| DaemonCommand { program, arguments: Vec::new() };
+    if let Some(path) = &config.daemon_path {
+        return Ok(alone(path.clone()));
+    }
+    if let Some(command) = command {
+        return Ok(command.clone());
+    }
+    let beside = |file: PathBuf| file.with_file_name("axon_daemon");
+    let mut tried: Vec<PathBuf> =
+        [std::env::current_exe().ok(), own_file()].into_iter().flatten().map(beside).collect();
+    tried.dedup();
+    match tried.iter().find(|path| path.is_file()) {
+        Some(path) => Ok(alone(path.clone())),
+        None => Err(SessionError::NoProgram { tried }),
+    }
+}
+
+/// The file that this code was loaded from: the library's where it is in one.
+fn own_file() -> Option<PathBuf> {
+    let here = own_file as *const () as usize;
+    let maps = std::fs::read_to_string("/proc/self/maps").ok()?;
+    maps.lines().find_map(|line| {
+        let (range, rest) = line.split_once(' ')?;
+        let (start, end) = range.split_once('-')?;
+        let start = usize::from_str_radix(start, 16).ok()?;
+        let end = usize::from_str_radix(end, 16).ok()?;
+        let path = rest.get(rest.find('/')?..)?;
+        (start..end).contains(&here).then(|| Path::new(path).to_path_buf())
+    })
+}
+
+/// Whether a daemon gets this variable: what it reads, and what its system libraries need.
+fn inherited(name: &OsString) -> bool {
+    const NAMES: &[&str] = &[
+        "HOME", "LANG", "LD_LIBRARY_PATH", "LOGNAME", "PATH", "RUST_BACKTRACE", "TMPDIR", "TZ",
+        "USER", "XDG_RUNTIME_DIR",
+    ];
+    const PREFIXES: &[&str] = &["AXON_", "ROS_", "LC_"];
+    name.to_str().is_some_and(|name| {
+        NAMES.contains(&name) || PREFIXES.iter().any(|prefix| name.starts_with(prefix))
+    })
+}
+
+fn read_report(pipe: OwnedFd, cancelled: &dyn Fn() -> bool) -> String {
+    let deadline = Instant::now() + PATIENCE;
+    let mut file = std::fs::File::from(pipe);
+    let mut report = Vec::new();
+    let mut buffer = [0; 1024];
+    while !report.contains(&b'\n') && report.len() < MAX_REPORT {
+        let left = deadline.saturating_duration_since(Instant::now());
+        if left.is_zero() || cancelled() {
+            return format!("error: it did not come up within {} s", PATIENCE.as_secs());
+        }
+        let slice = Timespec::try_from(left.min(Duration::from_millis(100))).unwrap_or_default();
+        let mut fds = [PollFd::new(&file, PollFlags::IN)];
+        if !matches!(poll(&mut fds, Some(&slice)), Ok(1..)) {
+            continue;
+        }
+        match file.read(&mut buffer) {
+            Ok(0) | Err(_) => break,
+            Ok(n) => report.extend_from_slice(&buffer[..n]),
+        }
+    }
+    String::from_utf8_lossy(&report).into_owned()
+}
+
+/// The daemon's end of the start-up pipe. In the foreground there is none.
+#[derive(Debug)]
+pub struct Report {
+    pipe: Option<OwnedFd>,
+}
+
+impl Report {
+    /// Nobody waits.
+    pub fn none() -> Self {
+        Self { pipe: None }
+    }
+
+    /// Takes standard output, which goes to the null device from now on.
+    ///
+    /// # Errors
+    /// What the system says.
+    pub fn from_stdout() -> std::io::Result<Self> {
+        let pipe = rustix::stdio::stdout().try_clone_to_owned()?;
+        let null = std::fs::OpenOptions::new().write(true).open("/dev/null")?;
+        rustix::stdio::dup2_stdout(null.as_fd())?;
+        Ok(Self { pipe: Some(pipe) })
+    }
+
+    /// The daemon takes sessions.
+    pub fn ready(&mut self) {
+        self.say("ready\n");
+    }
+
+    /// Another daemon has the address.
+    pub fn taken(&mut self) {
+        self.say("taken\n");
+    }
+
+    /// The daemon gives up.
+    pub fn error(&mut self, text: &str) {
+        self.say(&format!("error: {}\n", text.replace('\n', " ")));
+    }
+
+    fn say(&mut self, text: &str) {
+        if let Some(pipe) = self.pipe.take() {
+            // Whoever started us may have gone meanwhile.
+            let _ = std::fs::File::from(pipe).write_all(text.as_bytes());
+        }
+    }
+}
+
+/// The first process: starts the second one with the same arguments, and is done.
+///
+/// # Errors
+/// When it cannot be started.
+pub fn start_detached() -> std::io::Result<()> {
+    let arguments = std::env::args_os().skip(1).filter(|argument| argument != SPAWNED);
+    // The handle is dropped: when this process ends, the daemon's parent is the system.
+    Command::new(std::env::current_exe()?).args(arguments).arg(DETACHED).spawn().map(drop)
+}
+
+/// The second process: leaves the session's terminal, directory and descriptors.
+///
+/// # Errors
+/// What the system says.
+pub fn detach(config: Option<&Config>) -> std::io::Result<()> {
+    rustix::process::setsid()?;
+    rustix::process::chdir("/")?;
+    let log = config.and_then(|config| {
+        let dir = config.runtime_dir.as_ref()?;
+        private_directory(dir).ok()?;
+        let path = dir.join(format!("axon-{}.log", config.domain));
+        std::fs::OpenOptions::new().create(true).append(true).open(path).ok()
+    });
+    if let Some(log) = log {
+        rustix::stdio::dup2_stderr(log.as_fd())?;
+    }
+    Ok(())
+}

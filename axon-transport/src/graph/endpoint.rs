@@ -1,0 +1,80 @@
+//! One endpoint as it is described to sessions and peers.
+
+use minicbor::{Decode, Encode};
+use serde::Serialize;
+
+use crate::{ids::Gid, qos::Qos};
+
+/// What an endpoint does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Encode, Decode, Serialize)]
+#[cbor(index_only)]
+#[serde(rename_all = "snake_case")]
+pub enum EndpointKind {
+    /// Sends samples of a topic.
+    #[n(0)]
+    Publisher,
+    /// Receives samples of a topic.
+    #[n(1)]
+    Subscription,
+    /// Answers requests.
+    #[n(2)]
+    Server,
+    /// Sends requests.
+    #[n(3)]
+    Client,
+}
+
+/// An endpoint as sessions, daemons and peers describe it to each other.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode, Serialize)]
+#[cbor(map)]
+pub struct Endpoint {
+    /// Its identity.
+    #[n(0)]
+    pub gid: Gid,
+    /// What it does.
+    #[n(1)]
+    pub kind: EndpointKind,
+    /// The full topic or service name.
+    #[n(2)]
+    pub topic: String,
+    /// The type's name. Endpoints match on topic and type.
+    #[n(3)]
+    pub type_name: String,
+    /// The type's hash; empty when unknown.
+    #[cbor(n(4), with = "minicbor::bytes")]
+    pub type_hash: Vec<u8>,
+    /// What it offers or requests.
+    #[n(5)]
+    pub qos: Qos,
+    /// The node it belongs to; empty when it belongs to none.
+    #[n(6)]
+    pub node: String,
+    /// That node's namespace.
+    #[n(7)]
+    pub namespace: String,
+}
+
+/// Upper bounds on what a peer or session may describe.
+#[derive(Clone, Copy, Debug)]
+pub struct Limits {
+    /// Bytes of a topic, type, node or namespace name.
+    pub name: usize,
+    /// Bytes of a type hash.
+    pub type_hash: usize,
+    /// Endpoints of one session or one peer.
+    pub endpoints: usize,
+}
+
+/// The bounds in force.
+pub const LIMITS: Limits = Limits { name: 512, type_hash: 64, endpoints: 65_536 };
+
+impl Endpoint {
+    /// Whether every field is within [`LIMITS`] and the depth is usable.
+    pub fn is_sane(&self) -> bool {
+        let names = [&self.topic, &self.type_name, &self.node, &self.namespace];
+        names.iter().all(|n| n.len() <= LIMITS.name && !n.contains('\0'))
+            && !self.topic.is_empty()
+            && self.type_hash.len() <= LIMITS.type_hash
+            && self.qos.depth >= 1
+    }
+}

@@ -1,0 +1,24 @@
+//! The graph as a session sees it.
+
+use std::{collections::HashMap, sync::Arc};
+
+use super::Endpoint;
+use crate::ids::{DaemonId, Gid};
+
+/// Every endpoint that a session's daemon knows, here and on other hosts.
+#[derive(Clone, Debug, Default)]
+pub struct GraphView {
+    /// The version that the daemon gave this state.
+    pub version: u64,
+    /// The endpoints.
+    pub endpoints: HashMap<Gid, GraphEntry>,
+}
+
+/// One endpoint of a [`GraphView`].
+#[derive(Clone, Debug)]
+pub struct GraphEntry {
+    /// The endpoint.
+    pub endpoint: Arc<Endpoint>,
+    /// The daemon it belongs to when it is on another host.
+    pub daemon: Option<DaemonId>,
+}

@@ -1,0 +1,228 @@
+//! Reaching the daemon: find it or start it, check who it is, and exchange HELLO and WELCOME.
+
+use std::{
+    os::fd::{AsFd, BorrowedFd, OwnedFd},
+    sync::atomic::{AtomicBool, Ordering},
+    time::{Duration, Instant},
+};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+use super::{
+    SessionOptions,
+    address::{Address, AddressError},
+    error::SessionError,
+    message::{Hello, Message, PROTOCOL, SessionRole, Welcome},
+    socket::{self, SocketError},
+};
+use crate::{
+    config::{Config, DaemonPolicy, security_settings},
+    daemon::spawn::{Outcome, spawn},
+    ids::SessionId,
+    shm::SessionSegment,
+};
+
+/// How long a daemon may take to come up and answer.
+const PATIENCE: Duration = Duration::from_secs(20);
+
+/// A daemon that took the session.
+#[derive(Debug)]
+pub(super) struct Connected {
+    pub(super) socket: OwnedFd,
+    pub(super) welcome: Welcome,
+}
+
+/// Who asks.
+#[derive(Clone, Copy)]
+pub(super) struct Caller<'a> {
+    pub(super) config: &'a Config,
+    pub(super) options: &'a SessionOptions,
+    pub(super) id: SessionId,
+    /// Absent for a tool.
+    pub(super) segment: Option<&'a SessionSegment>,
+    /// Set when the answer is no longer wanted.
+    pub(super) cancel: Option<&'a AtomicBool>,
+}
+
+impl Caller<'_> {
+    /// Connects to the daemon, which is started when there is none and the policy says so.
+    pub(super) fn connect(&self) -> Result<Connected, SessionError> {
+        let address = Address::of(self.config);
+        let deadline = Instant::now() + PATIENCE;
+        let mut pause = Duration::from_millis(2);
+        // A daemon that is on its way out, or another's that comes up, is worth some patience
+        // before one is started: only one of many that start at once gets the address.
+        let mut spawn_after = Instant::now();
+        loop {
+            match self.try_connect(&address, deadline) {
+                Err(Attempt::Final(error)) => return Err(error),
+                Ok(connected) => return Ok(connected),
+                Err(Attempt::Absent) if self.config.daemon != DaemonPolicy::Spawn => {
+                    return Err(SessionError::NoDaemon { address: address.to_string() });
+                }
+                Err(Attempt::Absent) if Instant::now() >= spawn_after => {
+                    let command = self.options.daemon_command.as_ref();
+                    match spawn(self.config, command, &|| self.cancelled())? {
+                        Outcome::Ready => continue,
+                        Outcome::Taken => spawn_after = Instant::now() + Duration::from_millis(500),
+                    }
+                }
+                Err(Attempt::Absent | Attempt::Again) => {}
+            }
+            if self.cancelled() || Instant::now() >= deadline {
+                return Err(SessionError::Silent { address: address.to_string() });
+            }
+            std::thread::sleep(pause);
+            pause = (pause * 2).min(Duration::from_millis(100));
+        }
+    }
+
+    fn cancelled(&self) -> bool {
+        // Pairs with the release store in `Shared::stop`.
+        self.cancel.is_some_and(|cancel| cancel.load(Ordering::Acquire))
+    }
+
+    fn try_connect(&self, address: &Address, deadline: Instant) -> Result<Connected, Attempt> {
+        let socket = match address.connect() {
+            Ok(socket) => socket,
+            Err(AddressError::Absent) => return Err(Attempt::Absent),
+            Err(error) => return Err(Attempt::Final(error.into())),
+        };
+        let peer = socket::peer(&socket).map_err(|_| Attempt::Again)?;
+        let own = rustix::process::geteuid().as_raw();
+        if peer.uid != own && !self.config.trusted_uids.contains(&peer.uid) {
+            let address = address.to_string();
+            return Err(Attempt::Final(SessionError::Untrusted { address, uid: peer.uid }));
+        }
+        self.greet(socket, &address.to_string(), peer.pid, deadline)
+    }
+
+    /// HELLO and its answer, over a socket that is connected.
+    pub(super) fn greet_over(&self, socket: OwnedFd) -> Result<Connected, SessionError> {
+        let deadline = Instant::now() + PATIENCE;
+        self.greet(socket, "the daemon's socket pair", std::process::id(), deadline).map_err(
+            |attempt| match attempt {
+                Attempt::Final(error) => error,
+                Attempt::Absent | Attempt::Again => SessionError::Disconnected,
+            },
+        )
+    }
+
+    fn greet(
+        &self,
+        socket: OwnedFd,
+        address: &str,
+        pid: u32,
+        deadline: Instant,
+    ) -> Result<Connected, Attempt> {
+        let settings = if self.options.role == SessionRole::Tool {
+            Vec::new()
+        } else {
+            security_settings(self.config).map_err(SessionError::from)?
+        };
+        let hello = Message::Hello(Hello {
+            protocol: PROTOCOL,
+            session: self.id,
+            role: self.options.role,
+            name: self.options.name.clone(),
+            domain: self.config.domain,
+            settings,
+        });
+        let packet = hello.encode().map_err(SessionError::from)?;
+        let descriptors = match self.segment {
+            Some(segment) => {
+                let d = segment.descriptors().map_err(SessionError::from)?;
+                vec![d.segment, d.doorbell, d.pidfd]
+            }
+            None => Vec::new(),
+        };
+        let descriptors: Vec<BorrowedFd<'_>> = descriptors.iter().map(AsFd::as_fd).collect();
+        loop {
+            match socket::send(&socket, &packet, &descriptors) {
+                Ok(()) => break,
+                Err(SocketError::NotReady) => self.await_socket(&socket, PollFlags::OUT, deadline, address)?,
+                // It ended between our connecting and our speaking.
+                Err(_) => return Err(Attempt::Again),
+            }
+        }
+        let mut buffer = Vec::new();
+        loop {
+            let received = match socket::receive(&socket, &mut buffer) {
+                Ok(received) => received,
+                Err(SocketError::NotReady) => {
+                    self.await_socket(&socket, PollFlags::IN, deadline, address)?;
+                    continue;
+                }
+                Err(SocketError::Closed) => return Err(Attempt::Again),
+                Err(error) => {
+                    return Err(Attempt::Final(SessionError::Protocol(error.to_string())));
+                }
+            };
+            return match received.message {
+                Message::Welcome(welcome) if welcome.protocol == PROTOCOL => {
+                    Ok(Connected { socket, welcome })
+                }
+                Message::Welcome(welcome) => Err(Attempt::Final(SessionError::Refused {
+                    address: address.to_owned(),
+                    text: format!("it speaks protocol {}, this {PROTOCOL}", welcome.protocol),
+                })),
+                Message::Refused(refused) if refused.variable.is_empty() => {
+                    let address = address.to_owned();
+                    Err(Attempt::Final(SessionError::Refused { address, text: refused.text }))
+                }
+                Message::Refused(refused) => Err(Attempt::Final(SessionError::Mismatch {
+                    variable: refused.variable,
+                    ours: refused.ours,
+                    theirs: refused.theirs,
+                    address: address.to_owned(),
+                    pid,
+                })),
+                Message::Unknown(_) => continue,
+                other => {
+                    let text = format!("{other:?} before WELCOME");
+                    Err(Attempt::Final(SessionError::Protocol(text)))
+                }
+            };
+        }
+    }
+}
+
+impl Caller<'_> {
+    fn await_socket(
+        &self,
+        socket: &OwnedFd,
+        flags: PollFlags,
+        deadline: Instant,
+        address: &str,
+    ) -> Result<(), Attempt> {
+        let left = deadline.saturating_duration_since(Instant::now());
+        if left.is_zero() || self.cancelled() {
+            let address = address.to_owned();
+            return Err(Attempt::Final(SessionError::Silent { address }));
+        }
+        let slice = left.min(Duration::from_millis(100));
+        let timeout = Timespec::try_from(slice).unwrap_or_default();
+        match poll(&mut [PollFd::new(socket, flags)], Some(&timeout)) {
+            Ok(_) | Err(rustix::io::Errno::INTR) => Ok(()),
+            Err(errno) => {
+                Err(Attempt::Final(SessionError::System { what: "poll", source: errno.into() }))
+            }
+        }
+    }
+}
+
+/// What became of one attempt.
+enum Attempt {
+    /// Nobody listens.
+    Absent,
+    /// Somebody did, and went away.
+    Again,
+    /// Trying again would not help.
+    Final(SessionError),
+}
+
+impl From<SessionError> for Attempt {
+    fn from(error: SessionError) -> Self {
+        Self::Final(error)
+    }
+}

@@ -1,0 +1,293 @@
+//! What the daemon says, and what a session does about it.
+
+use std::{
+    collections::{HashMap, HashSet},
+    os::fd::OwnedFd,
+    sync::Arc,
+};
+
+use super::{Control, append, stands_for};
+use crate::{
+    graph::{GraphEntry, GraphView},
+    ids::Gid,
+    session::{
+        message::{Attach, Graph, Granted, Message, Pair, Unmatch},
+        state::{SessionEvent, StatusAnswer},
+        subscription::{Accept, SubscriptionInner},
+    },
+    shm::{Grant, Reader, ReaderInfo, ReaderOptions},
+};
+
+impl Control {
+    pub(super) fn handle(&mut self, message: Message, descriptors: Vec<OwnedFd>) {
+        match message {
+            Message::Graph(graph) => self.graph(graph),
+            Message::Match(pair) => self.matched(pair),
+            Message::Attach(attach) => self.attach(attach, descriptors),
+            Message::Grant(grant) => self.grant(grant, descriptors),
+            Message::Detach(pair) => {
+                self.peers.release(&pair);
+                self.detach_reader(&pair);
+            }
+            Message::Unmatch(unmatch) => self.unmatch(&unmatch),
+            Message::Status(part) => {
+                let mut state = self.shared.state();
+                if let StatusAnswer::Parts(text) = &mut state.status
+                    && append(text, &part)
+                {
+                    state.status = StatusAnswer::Whole(std::mem::take(text));
+                    drop(state);
+                    self.shared.notify(None);
+                }
+            }
+            Message::Refused(refused) => {
+                tracing::error!(reason = refused.text, "the daemon refuses an endpoint");
+            }
+            // What a daemon never says is not worth more than not being heard.
+            _ => {}
+        }
+    }
+
+    fn graph(&mut self, graph: Graph) {
+        if graph.whole {
+            self.building = Some(GraphView::default());
+            self.peers.recount();
+            // A daemon that tells everything to a session it knew repeats every pair. A new daemon
+            // learns of the pairs from us, one by one.
+            self.repeated = self.told.then(HashSet::new);
+            self.told = true;
+        }
+        let shared = self.shared.clone();
+        let mut state = shared.state();
+        // A remote publisher's ring here is the gateway's, which ends when all has arrived.
+        let over: Vec<Gid> = graph
+            .removed
+            .iter()
+            .filter(|gid| state.graph.endpoints.get(gid).is_none_or(|e| e.daemon.is_none()))
+            .copied()
+            .collect();
+        for gid in &graph.removed {
+            state.tombstones.remove(gid);
+        }
+        let view = match &mut self.building {
+            Some(view) => view,
+            None => Arc::make_mut(&mut state.graph),
+        };
+        view.version = graph.version;
+        for gid in graph.removed {
+            view.endpoints.remove(&gid);
+        }
+        for item in graph.added {
+            let entry = GraphEntry { endpoint: Arc::new(item.endpoint), daemon: item.daemon };
+            view.endpoints.insert(entry.endpoint.gid, entry);
+        }
+        if !graph.more
+            && let Some(view) = self.building.take()
+        {
+            state.graph = Arc::new(view);
+        }
+        drop(state);
+        for gid in over {
+            self.endpoint_over(gid);
+        }
+        if !graph.more {
+            if let Some(repeated) = self.repeated.take() {
+                self.drop_unrepeated(&repeated);
+            }
+            self.shared.notify(Some(&SessionEvent::Graph));
+        }
+    }
+
+    /// An endpoint ended, perhaps while there was no daemon to say who was attached to it.
+    fn endpoint_over(&mut self, gid: Gid) {
+        let (publishers, subscriptions) = self.endpoints();
+        for (own, publisher) in publishers {
+            if publisher.detach(gid) {
+                self.shared.notify(Some(&SessionEvent::Matched(own)));
+            }
+        }
+        for (own, subscription) in subscriptions {
+            if subscription.lock().end(&gid) {
+                self.shared.notify(Some(&SessionEvent::Matched(own)));
+            }
+        }
+    }
+
+    /// What the daemon did not say again is over: it was unmatched while this session was too slow
+    /// to be told.
+    fn drop_unrepeated(&mut self, repeated: &HashSet<Pair>) {
+        let (publishers, subscriptions) = self.endpoints();
+        for (writer, publisher) in publishers {
+            let attached = publisher.attached().clone();
+            for reader in attached {
+                if !repeated.contains(&Pair { reader, writer }) && publisher.detach(reader) {
+                    self.shared.notify(Some(&SessionEvent::Matched(writer)));
+                }
+            }
+        }
+        for (reader, subscription) in subscriptions {
+            let mut slots = subscription.lock();
+            let gone = slots.writers().into_iter().filter(|&writer| {
+                !repeated.contains(&Pair { reader, writer })
+            });
+            let news = gone.collect::<Vec<_>>().iter().filter(|writer| slots.end(writer)).count();
+            drop(slots);
+            if news > 0 {
+                self.shared.notify(Some(&SessionEvent::Matched(reader)));
+            }
+        }
+    }
+
+    fn matched(&mut self, pair: Pair) {
+        if let Some(repeated) = &mut self.repeated {
+            repeated.insert(pair);
+        }
+        self.ask(&pair);
+    }
+
+    /// Asks a writer to serve a reader of ours, or repeats it.
+    fn ask(&mut self, pair: &Pair) {
+        let Some(subscription) = self.shared.state().subscriptions.get(&pair.reader).cloned()
+        else {
+            return;
+        };
+        let segment = self.shared.segment.clone();
+        let lane = subscription.lock().lane_for(pair.writer, || segment.allocate_lane());
+        match lane {
+            Ok(lane) => {
+                let message = self.attach_message(&subscription, pair.writer, lane);
+                self.outbox.push_back((message, Vec::new()));
+            }
+            Err(error) => {
+                let topic = &subscription.endpoint.topic;
+                tracing::error!(topic, %error, "a publisher cannot be received from");
+            }
+        }
+    }
+
+    pub(super) fn attach_message(
+        &self,
+        subscription: &SubscriptionInner,
+        writer: Gid,
+        lane: u32,
+    ) -> Message {
+        Message::Attach(Attach {
+            reader: subscription.endpoint.gid,
+            writer,
+            lane,
+            qos: subscription.endpoint.qos,
+            session: self.shared.id,
+            stands_for: stands_for(subscription),
+        })
+    }
+
+    fn attach(&mut self, attach: Attach, descriptors: Vec<OwnedFd>) {
+        let pair = Pair { reader: attach.reader, writer: attach.writer };
+        if let Some(repeated) = &mut self.repeated {
+            repeated.insert(pair);
+        }
+        // Counted whether or not it comes to anything, as the daemon does.
+        let peer = self.peers.hold(attach.session, pair, descriptors);
+        let Some(publisher) = self.shared.state().publishers.get(&attach.writer).cloned() else {
+            return;
+        };
+        let grant = peer.map_err(|e| e.to_string()).and_then(|peer| {
+            let Attach { reader: gid, lane, qos, stands_for, .. } = attach;
+            let reader = ReaderInfo { gid, lane, qos, peer, stands_for };
+            publisher.attach(reader).map_err(|e| e.to_string())
+        });
+        match grant {
+            Ok(Grant { generation, first }) => {
+                let Pair { reader, writer } = pair;
+                let session = self.shared.id;
+                let grant = Granted { reader, writer, generation, first, session };
+                self.outbox.push_back((Message::Grant(grant), Vec::new()));
+                self.shared.notify(Some(&SessionEvent::Matched(writer)));
+            }
+            Err(error) => {
+                let topic = &publisher.endpoint.topic;
+                tracing::error!(topic, reader = %pair.reader, error, "a reader is not served");
+            }
+        }
+    }
+
+    fn grant(&mut self, granted: Granted, mut descriptors: Vec<OwnedFd>) {
+        let Granted { reader, writer, generation, first, session } = granted;
+        let pair = Pair { reader, writer };
+        let others = if descriptors.is_empty() { Vec::new() } else { descriptors.split_off(1) };
+        let peer = self.peers.hold(session, pair, others);
+        let Some(subscription) = self.shared.state().subscriptions.get(&reader).cloned() else {
+            return;
+        };
+        let grant = Grant { generation, first };
+        // Bound to a name: a match on the temporary would hold the lock over its arms.
+        let accept = subscription.lock().accept(writer, grant);
+        let lane = match accept {
+            Accept::Stands => return,
+            Accept::AskAgain => return self.ask(&pair),
+            Accept::Map(lane) => lane,
+        };
+        let mapped = match (peer, descriptors.pop()) {
+            (Ok(peer), Some(ring)) => {
+                let options = ReaderOptions {
+                    reader,
+                    writer,
+                    peer,
+                    lane,
+                    grant,
+                    qos: subscription.endpoint.qos,
+                    max_message: self.shared.config.max_message,
+                };
+                Reader::map(ring, options).map_err(|e| e.to_string())
+            }
+            (Err(error), _) => Err(error.to_string()),
+            (_, None) => Err("its ring did not come".to_owned()),
+        };
+        match mapped {
+            Ok(mapped) => {
+                subscription.lock().add(mapped);
+                self.shared.notify(Some(&SessionEvent::Matched(reader)));
+                // It may have history to take.
+                self.shared.segment.notify();
+            }
+            Err(error) => {
+                let topic = &subscription.endpoint.topic;
+                tracing::error!(topic, %writer, error, "a publisher cannot be received from");
+                self.outbox.push_back((Message::Detach(pair), Vec::new()));
+            }
+        }
+    }
+
+    fn unmatch(&mut self, unmatch: &Unmatch) {
+        let Unmatch { reader, writer, reason } = unmatch;
+        let pair = Pair { reader: *reader, writer: *writer };
+        self.peers.release(&pair);
+        self.detach_reader(&pair);
+        let subscription = self.shared.state().subscriptions.get(reader).cloned();
+        if let Some(subscription) = subscription {
+            if subscription.lock().end(writer) {
+                self.shared.notify(Some(&SessionEvent::Matched(*reader)));
+            }
+            let topic = &subscription.endpoint.topic;
+            tracing::debug!(topic, %writer, reason, "a publisher is not received from");
+        }
+    }
+
+    fn detach_reader(&self, pair: &Pair) {
+        let publisher = self.shared.state().publishers.get(&pair.writer).cloned();
+        if publisher.is_some_and(|p| p.detach(pair.reader)) {
+            self.shared.notify(Some(&SessionEvent::Matched(pair.writer)));
+        }
+    }
+
+    #[allow(clippy::type_complexity)]
+    fn endpoints(
+        &self,
+    ) -> (
+        HashMap<Gid, Arc<crate::session::publisher::PublisherInner>>,
+        HashMap<Gid, Arc<SubscriptionInner>>,
+    ) {
+        let state = self.shared.state();
+        (state.publishers.clone(), state.subscriptions.clone())
+    }
+}

@@ -1,0 +1,362 @@
+//! The control thread: sends what the handles queue, handles what the daemon says, watches peers
+//! for their death, and finds another daemon when the old one is gone.
+
+mod handle;
+
+use std::{
+    collections::{HashSet, VecDeque},
+    os::fd::{AsFd, BorrowedFd, OwnedFd},
+    sync::{
+        Arc,
+        atomic::Ordering,
+        mpsc::{Receiver, TryRecvError, sync_channel},
+    },
+    time::{Duration, Instant},
+};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+use super::{
+    connect::{Caller, Connected},
+    error::SessionError,
+    local::Local,
+    message::{Announce, EndpointRole, Gone, Message, Pair, StatusPart},
+    peers::Peers,
+    socket::{self, SocketError},
+    state::{Outgoing, SessionEvent, Shared, StatusAnswer},
+};
+use crate::{graph::GraphView, ids::Gid};
+
+/// The longest status that is put together.
+const MAX_STATUS: usize = 64 << 20;
+/// Packets handled before queued ones are sent: neither direction starves the other.
+const BATCH: usize = 64;
+/// A relay stands for at most this many remote subscriptions by name; one packet holds no more.
+const MAX_STANDS_FOR: usize = 1024;
+
+pub(super) struct Control {
+    shared: Arc<Shared>,
+    link: Link,
+    reconnects: bool,
+    peers: Peers,
+    outbox: VecDeque<(Message, Vec<OwnedFd>)>,
+    buffer: Vec<u8>,
+    /// A whole graph of which parts are still to come.
+    building: Option<GraphView>,
+    /// Pairs that the daemon repeated since it began to tell everything anew.
+    repeated: Option<HashSet<Pair>>,
+    /// Whether this connection has brought a whole graph already.
+    told: bool,
+}
+
+enum Link {
+    Socket(OwnedFd),
+    Local(Box<Local>),
+    Reconnecting(Receiver<Connected>),
+    Ended,
+}
+
+impl Control {
+    pub(super) fn new(shared: Arc<Shared>, connected: Option<Connected>, reconnects: bool) -> Self {
+        let peers = Peers::new(shared.segment.clone());
+        let mut control = Self {
+            shared,
+            link: Link::Ended,
+            reconnects,
+            peers,
+            outbox: VecDeque::new(),
+            buffer: Vec::new(),
+            building: None,
+            repeated: None,
+            told: false,
+        };
+        match connected {
+            Some(connected) => control.connected(connected),
+            None => {
+                let local = Local::new(control.shared.id, control.shared.options.name.clone());
+                control.link = Link::Local(Box::new(local));
+            }
+        }
+        control
+    }
+
+    pub(super) fn run(mut self) {
+        // Pairs with the release store in `Shared::stop`.
+        while !self.shared.stopping.load(Ordering::Acquire) {
+            self.try_reconnected();
+            self.collect();
+            self.send();
+            self.sleep();
+            self.receive();
+            self.bury();
+        }
+        // What was queued last, such as ENDPOINT_GONE, is said by the end of the connection.
+    }
+
+    fn connected(&mut self, connected: Connected) {
+        self.outbox.clear();
+        self.building = None;
+        self.repeated = None;
+        self.told = false;
+        let daemon = connected.welcome.daemon;
+        {
+            let mut state = self.shared.state();
+            state.daemon = Some(daemon);
+            state.outgoing.clear();
+            let gids: Vec<Gid> =
+                state.publishers.keys().chain(state.subscriptions.keys()).copied().collect();
+            let gone: Vec<Gid> = state.tombstones.iter().copied().collect();
+            state.outgoing.extend(gids.into_iter().map(Outgoing::Announce));
+            let gone = gone.into_iter().map(|gid| Message::EndpointGone(Gone { gid }));
+            state.outgoing.extend(gone.map(Outgoing::Message));
+        }
+        self.link = Link::Socket(connected.socket);
+        self.shared.notify(Some(&SessionEvent::DaemonFound(daemon)));
+    }
+
+    fn lost(&mut self, why: &dyn std::fmt::Display) {
+        tracing::warn!(%why, "the connection to the daemon is lost");
+        self.outbox.clear();
+        {
+            let mut state = self.shared.state();
+            state.daemon = None;
+            if matches!(state.status, StatusAnswer::Parts(_)) {
+                state.status = StatusAnswer::Lost;
+            }
+        }
+        self.link = if self.reconnects { self.reconnect() } else { Link::Ended };
+        self.shared.notify(Some(&SessionEvent::DaemonLost));
+    }
+
+    /// Looks for a daemon on a thread of its own: meanwhile peers may die.
+    fn reconnect(&self) -> Link {
+        let shared = self.shared.clone();
+        let (found, receiver) = sync_channel(1);
+        let search = move || {
+            let mut pause = Duration::from_millis(100);
+            // Pairs with the release store in `Shared::stop`.
+            while !shared.stopping.load(Ordering::Acquire) {
+                let caller = Caller {
+                    config: &shared.config,
+                    options: &shared.options,
+                    id: shared.id,
+                    segment: Some(&shared.segment),
+                    cancel: Some(&shared.stopping),
+                };
+                match caller.connect() {
+                    Ok(connected) => {
+                        let _ = found.send(connected);
+                        shared.wake();
+                        return;
+                    }
+                    Err(SessionError::NoDaemon { .. }) => {}
+                    Err(error) => tracing::error!(%error, "no daemon took this session"),
+                }
+                std::thread::sleep(pause);
+                pause = (pause * 2).min(Duration::from_secs(2));
+            }
+        };
+        match std::thread::Builder::new().name("axon-connect".into()).spawn(search) {
+            Ok(_) => Link::Reconnecting(receiver),
+            Err(error) => {
+                tracing::error!(%error, "no thread to look for a daemon with");
+                Link::Ended
+            }
+        }
+    }
+
+    fn try_reconnected(&mut self) {
+        let Link::Reconnecting(receiver) = &self.link else { return };
+        match receiver.try_recv() {
+            Ok(connected) => self.connected(connected),
+            Err(TryRecvError::Empty) => {}
+            Err(TryRecvError::Disconnected) => self.link = Link::Ended,
+        }
+    }
+
+    /// Takes what the handles queued.
+    fn collect(&mut self) {
+        let shared = self.shared.clone();
+        let mut state = shared.state();
+        if matches!(self.link, Link::Reconnecting(_) | Link::Ended) {
+            // All of it is said to the next daemon from what stands then.
+            state.outgoing.clear();
+            return;
+        }
+        while let Some(outgoing) = state.outgoing.pop_front() {
+            match outgoing {
+                Outgoing::Message(message) => self.outbox.push_back((message, Vec::new())),
+                Outgoing::Announce(gid) => {
+                    if let Some(publisher) = state.publishers.get(&gid) {
+                        let announce = Announce {
+                            endpoint: publisher.endpoint.clone(),
+                            role: publisher.role,
+                            stands_for: Vec::new(),
+                        };
+                        match publisher.writer.descriptor() {
+                            Ok(ring) => {
+                                self.outbox.push_back((Message::Endpoint(announce), vec![ring]));
+                            }
+                            Err(error) => {
+                                let topic = &publisher.endpoint.topic;
+                                tracing::error!(topic, %error, "a publisher stays unannounced");
+                            }
+                        }
+                    } else if let Some(subscription) = state.subscriptions.get(&gid) {
+                        let announce = Announce {
+                            endpoint: subscription.endpoint.clone(),
+                            role: subscription.role,
+                            stands_for: stands_for(subscription),
+                        };
+                        self.outbox.push_back((Message::Endpoint(announce), Vec::new()));
+                        if subscription.role == EndpointRole::Relay {
+                            let lanes = subscription.lock().lanes();
+                            for (writer, lane) in lanes {
+                                let attach = self.attach_message(subscription, writer, lane);
+                                self.outbox.push_back((attach, Vec::new()));
+                            }
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    fn send(&mut self) {
+        while let Some((message, descriptors)) = self.outbox.pop_front() {
+            match &mut self.link {
+                Link::Local(local) => {
+                    for (message, descriptors) in local.exchange(Some((message, descriptors))) {
+                        self.handle(message, descriptors);
+                    }
+                }
+                Link::Socket(socket) => {
+                    let packet = match message.encode() {
+                        Ok(packet) => packet,
+                        Err(error) => {
+                            tracing::error!(%error, "a control message was dropped");
+                            continue;
+                        }
+                    };
+                    let fds: Vec<BorrowedFd<'_>> = descriptors.iter().map(AsFd::as_fd).collect();
+                    match socket::send(&*socket, &packet, &fds) {
+                        Ok(()) => {}
+                        Err(SocketError::NotReady) => {
+                            self.outbox.push_front((message, descriptors));
+                            return;
+                        }
+                        Err(error) => {
+                            // What the daemon said last, such as REFUSED, is worth hearing.
+                            self.receive();
+                            if matches!(self.link, Link::Socket(_)) {
+                                self.lost(&error);
+                            }
+                            return;
+                        }
+                    }
+                }
+                Link::Reconnecting(_) | Link::Ended => return,
+            }
+        }
+    }
+
+    fn sleep(&mut self) {
+        let sessions: Vec<_> = self.peers.sessions().cloned().collect();
+        let mut fds = vec![PollFd::new(&self.shared.wake, PollFlags::IN)];
+        if let Link::Socket(socket) = &self.link {
+            let waits = if self.outbox.is_empty() { PollFlags::empty() } else { PollFlags::OUT };
+            fds.push(PollFd::new(socket, PollFlags::IN | waits));
+        }
+        fds.extend(sessions.iter().map(|s| PollFd::from_borrowed_fd(s.pidfd(), PollFlags::IN)));
+        // A socket without room becomes writable, but one that is short of descriptors in flight
+        // does not say when that passes.
+        let nap = Timespec { tv_sec: 0, tv_nsec: 20_000_000 };
+        let timeout = (!self.outbox.is_empty()).then_some(&nap);
+        let _ = poll(&mut fds, timeout);
+        let mut count = [0; 8];
+        let _ = rustix::io::read(&self.shared.wake, &mut count);
+    }
+
+    fn receive(&mut self) {
+        for _ in 0..BATCH {
+            let Link::Socket(socket) = &self.link else { return };
+            match socket::receive(socket, &mut self.buffer) {
+                Ok(received) => self.handle(received.message, received.descriptors),
+                Err(SocketError::NotReady) => return,
+                Err(error) => return self.lost(&error),
+            }
+        }
+        self.shared.wake();
+    }
+
+    /// Looks for peers that died.
+    fn bury(&mut self) {
+        if self.peers.take_dead().is_empty() {
+            return;
+        }
+        let (publishers, subscriptions) = {
+            let state = self.shared.state();
+            let publishers: Vec<_> = state.publishers.values().cloned().collect();
+            let subscriptions: Vec<_> = state.subscriptions.values().cloned().collect();
+            (publishers, subscriptions)
+        };
+        for publisher in publishers {
+            if publisher.drop_dead() {
+                self.shared.notify(Some(&SessionEvent::Matched(publisher.endpoint.gid)));
+            }
+        }
+        for subscription in subscriptions {
+            if subscription.lock().end_dead() {
+                self.shared.notify(Some(&SessionEvent::Matched(subscription.endpoint.gid)));
+            }
+        }
+    }
+}
+
+fn stands_for(subscription: &super::subscription::SubscriptionInner) -> Vec<Gid> {
+    let mut gids = subscription.stands_for();
+    gids.truncate(MAX_STANDS_FOR);
+    gids
+}
+
+/// Asks for the status over a connection that does nothing else.
+pub(super) fn ask_status(
+    socket: &OwnedFd,
+    address: &str,
+    patience: Duration,
+) -> Result<Vec<u8>, SessionError> {
+    let silent = || SessionError::Silent { address: address.to_owned() };
+    let protocol = |e: SocketError| SessionError::Protocol(e.to_string());
+    let deadline = Instant::now() + patience;
+    socket::send(socket, &Message::StatusRequest.encode()?, &[]).map_err(protocol)?;
+    let (mut text, mut buffer) = (Vec::new(), Vec::new());
+    loop {
+        match socket::receive(socket, &mut buffer) {
+            Ok(received) => {
+                if let Message::Status(part) = received.message
+                    && append(&mut text, &part)
+                {
+                    return Ok(text);
+                }
+            }
+            Err(SocketError::NotReady) => {
+                let left = deadline.saturating_duration_since(Instant::now());
+                let timeout = Timespec::try_from(left).unwrap_or_default();
+                let mut fds = [PollFd::new(socket, PollFlags::IN)];
+                if left.is_zero() || poll(&mut fds, Some(&timeout)) == Ok(0) {
+                    return Err(silent());
+                }
+            }
+            Err(SocketError::Closed) => return Err(SessionError::Disconnected),
+            Err(error) => return Err(protocol(error)),
+        }
+    }
+}
+
+/// Adds a slice of the status; whether it was the last.
+fn append(text: &mut Vec<u8>, part: &StatusPart) -> bool {
+    if text.len() + part.text.len() <= MAX_STATUS {
+        text.extend_from_slice(&part.text);
+    }
+    part.part.saturating_add(1) >= part.parts
+}

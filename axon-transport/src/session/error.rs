@@ -1,0 +1,114 @@
+//! Why a session could not do what it was asked.
+
+use std::path::PathBuf;
+
+use super::{address::AddressError, message::CodecError};
+use crate::{config::ConfigError, shm::ShmError};
+
+/// Why a session could not be opened or used.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum SessionError {
+    /// `AXON_DAEMON=require`, and there is none.
+    #[error("no daemon listens at {address}: start `axon_daemon`, or set AXON_DAEMON=spawn")]
+    NoDaemon {
+        /// Where it was looked for.
+        address: String,
+    },
+    /// A call that needs a daemon under `AXON_DAEMON=off`.
+    #[error("there is no daemon to ask: AXON_DAEMON is off")]
+    Off,
+    /// The program to start was not found.
+    #[error(
+        "no daemon runs, and none can be started: {} is not there; set AXON_DAEMON_PATH",
+        tried.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", nor ")
+    )]
+    NoProgram {
+        /// Where it was looked for.
+        tried: Vec<PathBuf>,
+    },
+    /// The daemon that was started gave up.
+    #[error("the daemon {} did not start: {text}", program.display())]
+    DaemonFailed {
+        /// The program.
+        program: PathBuf,
+        /// What it said.
+        text: String,
+    },
+    /// The daemon's settings are not the session's.
+    #[error(
+        "{variable} is {ours} here but {theirs} in the daemon at {address} (pid {pid}); use the \
+         same settings, another ROS_DOMAIN_ID, or end that daemon"
+    )]
+    Mismatch {
+        /// The variable that differs.
+        variable: String,
+        /// Its value or digest here.
+        ours: String,
+        /// Its value or digest in the daemon.
+        theirs: String,
+        /// Where the daemon listens.
+        address: String,
+        /// The daemon's process.
+        pid: u32,
+    },
+    /// The daemon refuses the session for another reason.
+    #[error("the daemon at {address} refuses the session: {text}")]
+    Refused {
+        /// Where the daemon listens.
+        address: String,
+        /// Why.
+        text: String,
+    },
+    /// Whoever listens at the daemon's address belongs to another user.
+    #[error(
+        "{address} belongs to uid {uid}, which is neither this process's nor in AXON_TRUSTED_UIDS"
+    )]
+    Untrusted {
+        /// The address.
+        address: String,
+        /// The user who has it.
+        uid: u32,
+    },
+    /// The daemon does not answer.
+    #[error("the daemon at {address} does not answer")]
+    Silent {
+        /// Where it listens.
+        address: String,
+    },
+    /// The connection to the daemon ended, and there is none yet in its place.
+    #[error("the connection to the daemon is lost")]
+    Disconnected,
+    /// The daemon said something that it should not.
+    #[error("the daemon broke the session protocol: {0}")]
+    Protocol(String),
+    /// A name, type hash or depth that no endpoint may have.
+    #[error("endpoint {topic}: a name, type hash or depth is out of bounds")]
+    Endpoint {
+        /// The topic.
+        topic: String,
+    },
+    /// A setting or a file that it names.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The daemon's address.
+    #[error(transparent)]
+    Address(#[from] AddressError),
+    /// Shared memory.
+    #[error(transparent)]
+    Memory(#[from] ShmError),
+    /// The system refused.
+    #[error("{what}: {source}")]
+    System {
+        /// What was tried.
+        what: &'static str,
+        /// What the system said.
+        source: std::io::Error,
+    },
+}
+
+impl From<CodecError> for SessionError {
+    fn from(error: CodecError) -> Self {
+        Self::Protocol(error.to_string())
+    }
+}

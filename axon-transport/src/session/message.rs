@@ -1,0 +1,521 @@
+//! The control messages between sessions and their daemon (`docs/formats.md`, section 8).
+//!
+//! A packet is a type byte and one CBOR map. Unknown keys are skipped; a packet of unknown type
+//! decodes to [`Message::Unknown`]; everything else that does not fit is an error.
+
+use minicbor::{Decode, Encode};
+use serde::Serialize;
+
+use crate::{
+    graph::{Endpoint, EndpointKind},
+    ids::{DaemonId, Gid, SessionId},
+    qos::Qos,
+};
+
+/// The version of the session protocol that this crate speaks.
+pub const PROTOCOL: u32 = 1;
+/// The largest packet, in bytes.
+pub const MAX_PACKET: usize = 32 * 1024;
+/// The most descriptors that one packet carries.
+pub const MAX_DESCRIPTORS: usize = 4;
+
+/// What kind of session this is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode, Serialize)]
+#[cbor(index_only)]
+#[serde(rename_all = "snake_case")]
+pub enum SessionRole {
+    /// A program with publishers and subscriptions.
+    #[n(0)]
+    Application,
+    /// The daemon's own gateway to other hosts.
+    #[n(1)]
+    Gateway,
+    /// A program that only asks, such as for the status; it may have no endpoints.
+    #[n(2)]
+    Tool,
+}
+
+/// For whom an endpoint stands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Encode, Decode, Serialize)]
+#[cbor(index_only)]
+#[serde(rename_all = "snake_case")]
+pub enum EndpointRole {
+    /// For itself.
+    #[n(0)]
+    Application,
+    /// A local ring that stands in for a publisher on another host.
+    #[n(1)]
+    StandIn,
+    /// A local reader that carries samples to subscriptions on another host.
+    #[n(2)]
+    Relay,
+}
+
+/// The first message of a session.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Hello {
+    /// The protocol that the session speaks.
+    #[n(0)]
+    pub protocol: u32,
+    /// The session.
+    #[n(1)]
+    pub session: SessionId,
+    /// What kind it is.
+    #[n(2)]
+    pub role: SessionRole,
+    /// The process's name, for people.
+    #[n(3)]
+    pub name: String,
+    /// `ROS_DOMAIN_ID`.
+    #[n(4)]
+    pub domain: u32,
+    /// Effective security settings: variable, and value or digest.
+    #[n(5)]
+    pub settings: Vec<(String, String)>,
+}
+
+/// The daemon takes the session.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Welcome {
+    /// The protocol that the daemon speaks.
+    #[n(0)]
+    pub protocol: u32,
+    /// The daemon.
+    #[n(1)]
+    pub daemon: DaemonId,
+    /// Its process.
+    #[n(2)]
+    pub pid: u32,
+}
+
+/// The daemon does not take the session, or one of its endpoints.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Refused {
+    /// The variable that differs; empty when none does.
+    #[n(0)]
+    pub variable: String,
+    /// Its value in the session.
+    #[n(1)]
+    pub ours: String,
+    /// Its value in the daemon.
+    #[n(2)]
+    pub theirs: String,
+    /// What is wrong.
+    #[n(3)]
+    pub text: String,
+}
+
+/// An endpoint exists. Repeating it changes only for whom it stands.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Announce {
+    /// The endpoint.
+    #[n(0)]
+    pub endpoint: Endpoint,
+    /// Its role.
+    #[n(1)]
+    pub role: EndpointRole,
+    /// The remote subscriptions that a relay stands for.
+    #[n(2)]
+    pub stands_for: Vec<Gid>,
+}
+
+/// An endpoint is gone.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Gone {
+    /// Which.
+    #[n(0)]
+    pub gid: Gid,
+}
+
+/// One endpoint of the graph.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct GraphItem {
+    /// The endpoint.
+    #[n(0)]
+    pub endpoint: Endpoint,
+    /// The daemon it belongs to when that is another host's.
+    #[n(1)]
+    pub daemon: Option<DaemonId>,
+}
+
+/// A change of the graph, or a part of the whole of it.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Graph {
+    /// The version after this change.
+    #[n(0)]
+    pub version: u64,
+    /// Set in the first part of a whole graph: forget what was known.
+    #[n(1)]
+    pub whole: bool,
+    /// Endpoints that are new.
+    #[n(2)]
+    pub added: Vec<GraphItem>,
+    /// Endpoints that are gone.
+    #[n(3)]
+    pub removed: Vec<Gid>,
+    /// Whether another part of the same change follows.
+    #[n(4)]
+    pub more: bool,
+}
+
+/// A reader and a writer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Encode, Decode)]
+#[cbor(map)]
+pub struct Pair {
+    /// The reader's GID.
+    #[n(0)]
+    pub reader: Gid,
+    /// The writer's GID.
+    #[n(1)]
+    pub writer: Gid,
+}
+
+/// A reader asks a writer to serve it.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Attach {
+    /// The reader's GID.
+    #[n(0)]
+    pub reader: Gid,
+    /// The writer's GID.
+    #[n(1)]
+    pub writer: Gid,
+    /// The reader's lane in its session's segment.
+    #[n(2)]
+    pub lane: u32,
+    /// What the reader requests.
+    #[n(3)]
+    pub qos: Qos,
+    /// The reader's session.
+    #[n(4)]
+    pub session: SessionId,
+    /// The remote subscriptions that the reader stands for.
+    #[n(5)]
+    pub stands_for: Vec<Gid>,
+}
+
+/// The writer serves the reader.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Granted {
+    /// The reader's GID.
+    #[n(0)]
+    pub reader: Gid,
+    /// The writer's GID.
+    #[n(1)]
+    pub writer: Gid,
+    /// The grant's generation.
+    #[n(2)]
+    pub generation: u64,
+    /// The first position to take.
+    #[n(3)]
+    pub first: u64,
+    /// The writer's session.
+    #[n(4)]
+    pub session: SessionId,
+}
+
+/// A reader and a writer have nothing to do with each other any more.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Unmatch {
+    /// The reader's GID.
+    #[n(0)]
+    pub reader: Gid,
+    /// The writer's GID.
+    #[n(1)]
+    pub writer: Gid,
+    /// Why.
+    #[n(2)]
+    pub reason: String,
+}
+
+/// A slice of the status.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct StatusPart {
+    /// Its number, from 0.
+    #[n(0)]
+    pub part: u32,
+    /// How many there are.
+    #[n(1)]
+    pub parts: u32,
+    /// The bytes of the JSON text.
+    #[cbor(n(2), with = "minicbor::bytes")]
+    pub text: Vec<u8>,
+}
+
+#[derive(Clone, Copy, Debug, Encode, Decode)]
+#[cbor(map)]
+struct Empty {}
+
+/// A message of the session socket.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub enum Message {
+    Hello(Hello),
+    Welcome(Welcome),
+    Refused(Refused),
+    Endpoint(Announce),
+    EndpointGone(Gone),
+    Graph(Graph),
+    Match(Pair),
+    Attach(Attach),
+    Grant(Granted),
+    Detach(Pair),
+    Unmatch(Unmatch),
+    StatusRequest,
+    Status(StatusPart),
+    Resync,
+    /// A type that this version does not know; to be skipped.
+    Unknown(u8),
+}
+
+/// Why bytes are not a message, or a message has no bytes.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum CodecError {
+    /// Nothing at all.
+    #[error("an empty packet")]
+    Empty,
+    /// More than a packet holds.
+    #[error("a message of {0} bytes; a packet holds {MAX_PACKET}")]
+    TooLarge(usize),
+    /// Not the map that the type calls for.
+    #[error("message type {kind}: {source}")]
+    Malformed {
+        /// The message's type byte.
+        kind: u8,
+        /// What the decoder found.
+        source: minicbor::decode::Error,
+    },
+    /// Bytes after the map.
+    #[error("message type {0}: bytes after the map")]
+    Trailing(u8),
+}
+
+impl Message {
+    /// The packet's bytes.
+    ///
+    /// # Errors
+    /// [`CodecError::TooLarge`] when they do not fit into one packet.
+    pub fn encode(&self) -> Result<Vec<u8>, CodecError> {
+        let (kind, body) = match self {
+            Self::Hello(m) => (1, minicbor::to_vec(m)),
+            Self::Welcome(m) => (2, minicbor::to_vec(m)),
+            Self::Refused(m) => (3, minicbor::to_vec(m)),
+            Self::Endpoint(m) => (4, minicbor::to_vec(m)),
+            Self::EndpointGone(m) => (5, minicbor::to_vec(m)),
+            Self::Graph(m) => (6, minicbor::to_vec(m)),
+            Self::Match(m) => (7, minicbor::to_vec(m)),
+            Self::Attach(m) => (8, minicbor::to_vec(m)),
+            Self::Grant(m) => (9, minicbor::to_vec(m)),
+            Self::Detach(m) => (10, minicbor::to_vec(m)),
+            Self::Unmatch(m) => (11, minicbor::to_vec(m)),
+            Self::StatusRequest => (12, minicbor::to_vec(Empty {})),
+            Self::Status(m) => (13, minicbor::to_vec(m)),
+            Self::Resync => (14, minicbor::to_vec(Empty {})),
+            Self::Unknown(kind) => (*kind, minicbor::to_vec(Empty {})),
+        };
+        // Encoding into a Vec has no way to fail.
+        let body = body.unwrap_or_default();
+        if body.len() + 1 > MAX_PACKET {
+            return Err(CodecError::TooLarge(body.len() + 1));
+        }
+        let mut packet = Vec::with_capacity(body.len() + 1);
+        packet.push(kind);
+        packet.extend_from_slice(&body);
+        Ok(packet)
+    }
+
+    /// The message of one packet.
+    ///
+    /// # Errors
+    /// When it is empty, too large, or not the map its type calls for.
+    pub fn decode(packet: &[u8]) -> Result<Self, CodecError> {
+        if packet.len() > MAX_PACKET {
+            return Err(CodecError::TooLarge(packet.len()));
+        }
+        let (&kind, body) = packet.split_first().ok_or(CodecError::Empty)?;
+        Ok(match kind {
+            1 => Self::Hello(map(kind, body)?),
+            2 => Self::Welcome(map(kind, body)?),
+            3 => Self::Refused(map(kind, body)?),
+            4 => Self::Endpoint(map(kind, body)?),
+            5 => Self::EndpointGone(map(kind, body)?),
+            6 => Self::Graph(map(kind, body)?),
+            7 => Self::Match(map(kind, body)?),
+            8 => Self::Attach(map(kind, body)?),
+            9 => Self::Grant(map(kind, body)?),
+            10 => Self::Detach(map(kind, body)?),
+            11 => Self::Unmatch(map(kind, body)?),
+            12 => map::<Empty>(kind, body).map(|_| Self::StatusRequest)?,
+            13 => Self::Status(map(kind, body)?),
+            14 => map::<Empty>(kind, body).map(|_| Self::Resync)?,
+            _ => Self::Unknown(kind),
+        })
+    }
+}
+
+fn map<'b, T: Decode<'b, ()>>(kind: u8, body: &'b [u8]) -> Result<T, CodecError> {
+    let mut decoder = minicbor::Decoder::new(body);
+    let value = decoder.decode().map_err(|source| CodecError::Malformed { kind, source })?;
+    if decoder.position() == body.len() { Ok(value) } else { Err(CodecError::Trailing(kind)) }
+}
+
+/// Whether an endpoint of this kind owns a ring that readers map.
+pub(crate) fn writes(kind: EndpointKind) -> bool {
+    matches!(kind, EndpointKind::Publisher)
+}
+
+/// Whether an endpoint of this kind attaches to rings.
+pub(crate) fn reads(kind: EndpointKind) -> bool {
+    matches!(kind, EndpointKind::Subscription)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn endpoint() -> Endpoint {
+        Endpoint {
+            gid: Gid([7; 16]),
+            kind: EndpointKind::Publisher,
+            topic: "/scan".into(),
+            type_name: "sensor_msgs/msg/LaserScan".into(),
+            type_hash: vec![1, 2, 3],
+            qos: Qos::keep_all(),
+            node: "lidar".into(),
+            namespace: "/".into(),
+        }
+    }
+
+    fn messages() -> Vec<Message> {
+        let (reader, writer) = (Gid([1; 16]), Gid([2; 16]));
+        let session = SessionId([3; 16]);
+        vec![
+            Message::Hello(Hello {
+                protocol: PROTOCOL,
+                session,
+                role: SessionRole::Application,
+                name: "talker".into(),
+                domain: 7,
+                settings: vec![("AXON_SECURITY_MODE".into(), "classic".into())],
+            }),
+            Message::Welcome(Welcome { protocol: 1, daemon: DaemonId([4; 16]), pid: 12 }),
+            Message::Refused(Refused {
+                variable: "AXON_QUIC_CIPHER".into(),
+                ours: "a".into(),
+                theirs: "b".into(),
+                text: String::new(),
+            }),
+            Message::Endpoint(Announce {
+                endpoint: endpoint(),
+                role: EndpointRole::Relay,
+                stands_for: vec![reader, writer],
+            }),
+            Message::EndpointGone(Gone { gid: reader }),
+            Message::Graph(Graph {
+                version: 3,
+                whole: true,
+                added: vec![GraphItem { endpoint: endpoint(), daemon: Some(DaemonId([9; 16])) }],
+                removed: vec![writer],
+                more: false,
+            }),
+            Message::Match(Pair { reader, writer }),
+            Message::Attach(Attach {
+                reader,
+                writer,
+                lane: 4,
+                qos: Qos::default(),
+                session,
+                stands_for: vec![],
+            }),
+            Message::Grant(Granted { reader, writer, generation: 5, first: 6, session }),
+            Message::Detach(Pair { reader, writer }),
+            Message::Unmatch(Unmatch { reader, writer, reason: "gone".into() }),
+            Message::StatusRequest,
+            Message::Status(StatusPart { part: 0, parts: 1, text: b"{}".to_vec() }),
+            Message::Resync,
+        ]
+    }
+
+    #[test]
+    fn hostile_packets_are_errors() {
+        assert!(matches!(Message::decode(&[]), Err(CodecError::Empty)));
+        assert!(matches!(
+            Message::decode(&vec![0; MAX_PACKET + 1]),
+            Err(CodecError::TooLarge(n)) if n == MAX_PACKET + 1
+        ));
+        assert!(matches!(Message::decode(&[7]), Err(CodecError::Malformed { kind: 7, .. })));
+        // A map without a needed key.
+        assert!(matches!(Message::decode(&[5, 0xa0]), Err(CodecError::Malformed { .. })));
+        // An array that claims 2^32 elements allocates nothing.
+        assert!(Message::decode(&[6, 0xa1, 3, 0x9a, 0xff, 0xff, 0xff, 0xff]).is_err());
+        for message in messages() {
+            let mut packet = message.encode().unwrap();
+            packet.push(0);
+            assert!(Message::decode(&packet).is_err(), "{message:?} with a byte after it");
+            for cut in 1..packet.len() - 1 {
+                assert!(Message::decode(&packet[..cut]).is_err(), "{message:?} cut at {cut}");
+            }
+        }
+    }
+
+    #[test]
+    fn unknown_types_and_keys_are_skipped() {
+        assert_eq!(Message::decode(&[200, 1, 2, 3]).unwrap(), Message::Unknown(200));
+        // { 0: pid, 1: .., 99: [1, {2: 3}] } for WELCOME with one key more.
+        let mut packet = vec![2];
+        let mut e = minicbor::Encoder::new(&mut packet);
+        e.map(4).unwrap();
+        e.u8(0).unwrap().u8(1).unwrap();
+        e.u8(99).unwrap().array(2).unwrap().u8(1).unwrap();
+        e.map(1).unwrap().u8(2).unwrap().u8(3).unwrap();
+        e.u8(1).unwrap().bytes(&[4; 16]).unwrap();
+        e.u8(2).unwrap().u8(12).unwrap();
+        let welcome = Welcome { protocol: 1, daemon: DaemonId([4; 16]), pid: 12 };
+        assert_eq!(Message::decode(&packet).unwrap(), Message::Welcome(welcome));
+    }
+
+    #[test]
+    fn messages_survive_the_wire() {
+        for message in messages() {
+            let packet = message.encode().unwrap();
+            assert_eq!(Message::decode(&packet).unwrap(), message);
+        }
+    }
+
+    #[test]
+    fn a_message_larger_than_a_packet_is_refused_by_its_sender() {
+        let removed = vec![Gid([1; 16]); 3000];
+        let graph = Graph { version: 1, whole: false, added: vec![], removed, more: false };
+        assert!(matches!(Message::Graph(graph).encode(), Err(CodecError::TooLarge(_))));
+    }
+
+    proptest! {
+        #[test]
+        fn no_packet_panics(packet in proptest::collection::vec(any::<u8>(), 0..512)) {
+            let _ = Message::decode(&packet);
+        }
+
+        #[test]
+        fn no_mutated_packet_panics(
+            which in 0usize..14, at in any::<prop::sample::Index>(), byte: u8,
+        ) {
+            let mut packet = messages()[which].encode().unwrap();
+            let at = at.index(packet.len());
+            packet[at] = byte;
+            let _ = Message::decode(&packet);
+        }
+    }
+}

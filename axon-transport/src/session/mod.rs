@@ -1,0 +1,359 @@
+//! A process's way into AXON: publishers and subscriptions over shared memory, and the
+//! conversation with the daemon that brings them together.
+//!
+//! Samples never pass the daemon. It tells readers and writers of each other and hands the
+//! descriptors over; when it dies, what is attached flows on, and the control thread `axon-ctl`
+//! finds or starts another and repeats what the first one knew.
+
+pub mod address;
+mod connect;
+mod control;
+mod error;
+mod local;
+pub mod message;
+mod options;
+mod peers;
+mod publisher;
+mod signals;
+pub mod socket;
+mod state;
+mod subscription;
+
+use std::{
+    os::fd::OwnedFd,
+    sync::{Arc, PoisonError},
+    thread::JoinHandle,
+    time::Duration,
+};
+
+pub use error::SessionError;
+pub use message::SessionRole;
+pub use options::{DaemonCommand, EndpointSpec, SessionOptions};
+pub use publisher::{Loan, Publisher};
+pub use state::SessionEvent;
+pub use subscription::{MessageInfo, Subscription};
+
+use self::{
+    connect::{Caller, Connected},
+    control::Control,
+    message::{EndpointRole, Message},
+    publisher::PublisherInner,
+    state::{Outgoing, Shared, StatusAnswer},
+    subscription::SubscriptionInner,
+};
+use crate::{
+    config::{Config, DaemonPolicy},
+    graph::{Endpoint, EndpointKind, GraphView},
+    ids::{DaemonId, Gid, SessionId},
+    shm::{RingOptions, SessionSegment, Writer},
+};
+
+/// How long a daemon may take to answer a question.
+const ANSWER: Duration = Duration::from_secs(5);
+
+/// A process's session. Cheap to clone; thread-safe. It ends when the last clone and the last of
+/// its publishers and subscriptions are gone.
+///
+/// ```no_run
+/// use axon_transport::{
+///     config::Config,
+///     qos::Qos,
+///     session::{EndpointSpec, Session, SessionOptions},
+/// };
+///
+/// let config = Config::from_env()?;
+/// let session = Session::open(&config, SessionOptions::new("talker"))?;
+/// let spec = EndpointSpec::new("/chatter", "std_msgs/msg/String", Qos::default());
+/// let publisher = session.create_publisher(spec)?;
+/// publisher.publish(b"hello")?;
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Clone, Debug)]
+pub struct Session {
+    handle: Arc<Handle>,
+}
+
+#[derive(Debug)]
+struct Handle {
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Session {
+    /// Opens a session with the daemon of this user and domain, which is started when there is
+    /// none and `AXON_DAEMON` is `spawn`. Under `off`, endpoints of this session reach each other
+    /// and nobody else.
+    ///
+    /// # Errors
+    /// When the daemon cannot be reached or started, or has other security settings: the error
+    /// names the variable.
+    pub fn open(config: &Config, options: SessionOptions) -> Result<Self, SessionError> {
+        let segment = SessionSegment::create(SessionId::random())?;
+        let connected = if config.daemon == DaemonPolicy::Off {
+            None
+        } else {
+            let id = segment.id();
+            let caller = Caller { config, options: &options, id, segment: Some(&segment), cancel: None };
+            Some(caller.connect()?)
+        };
+        Self::start(config, options, segment, connected, true)
+    }
+
+    /// A session over a socket that is connected to a daemon. It ends with that connection.
+    ///
+    /// # Errors
+    /// When the daemon refuses it.
+    pub fn over(
+        socket: OwnedFd,
+        config: &Config,
+        options: SessionOptions,
+    ) -> Result<Self, SessionError> {
+        let segment = SessionSegment::create(SessionId::random())?;
+        let caller =
+            Caller { config, options: &options, id: segment.id(), segment: Some(&segment), cancel: None };
+        let connected = caller.greet_over(socket)?;
+        Self::start(config, options, segment, Some(connected), false)
+    }
+
+    /// Its id.
+    pub fn id(&self) -> SessionId {
+        self.shared().id
+    }
+
+    /// The daemon it is connected to; `None` while there is none.
+    pub fn daemon(&self) -> Option<DaemonId> {
+        self.shared().state().daemon
+    }
+
+    /// A publisher. Readers are matched later; see [`Publisher::wait_matched`].
+    ///
+    /// # Errors
+    /// When the specification is out of bounds or there is no memory.
+    pub fn create_publisher(&self, spec: EndpointSpec) -> Result<Publisher, SessionError> {
+        let endpoint = self.endpoint(spec, EndpointKind::Publisher)?;
+        self.add_publisher(endpoint, EndpointRole::Application)
+    }
+
+    /// A subscription. Publishers are matched later; see [`Subscription::wait_matched`].
+    ///
+    /// # Errors
+    /// When the specification is out of bounds.
+    pub fn create_subscription(&self, spec: EndpointSpec) -> Result<Subscription, SessionError> {
+        let endpoint = self.endpoint(spec, EndpointKind::Subscription)?;
+        Ok(self.add_subscription(endpoint, EndpointRole::Application, Vec::new()))
+    }
+
+    /// A local ring for a publisher on another host, under that publisher's own GID. For the
+    /// gateway alone; a daemon refuses it from anybody else.
+    ///
+    /// # Errors
+    /// When there is no memory.
+    pub fn create_stand_in(&self, remote: Endpoint) -> Result<Publisher, SessionError> {
+        self.add_publisher(remote, EndpointRole::StandIn)
+    }
+
+    /// A local reader that carries samples to subscriptions on another host, `stands_for`. For the
+    /// gateway alone; a daemon refuses it from anybody else.
+    ///
+    /// # Errors
+    /// When the specification is out of bounds.
+    pub fn create_relay(
+        &self,
+        spec: EndpointSpec,
+        stands_for: Vec<Gid>,
+    ) -> Result<Subscription, SessionError> {
+        let endpoint = self.endpoint(spec, EndpointKind::Subscription)?;
+        Ok(self.add_subscription(endpoint, EndpointRole::Relay, stands_for))
+    }
+
+    /// The graph as the daemon last described it.
+    pub fn graph(&self) -> Arc<GraphView> {
+        self.shared().state().graph.clone()
+    }
+
+    /// Waits until the graph is as `reached` wants it; whether it is.
+    pub fn wait_graph(
+        &self,
+        timeout: Duration,
+        mut reached: impl FnMut(&GraphView) -> bool,
+    ) -> bool {
+        self.wait_changed(timeout, || reached(&self.graph()))
+    }
+
+    /// Sleeps until `ready`, which is evaluated again whenever a sample arrives, or the timeout.
+    /// Returns its last value.
+    pub fn wait(&self, ready: impl FnMut() -> bool, timeout: Option<Duration>) -> bool {
+        self.shared().segment.wait(ready, timeout)
+    }
+
+    /// The session's segment, for waiting in other ways.
+    pub fn segment(&self) -> &Arc<SessionSegment> {
+        &self.shared().segment
+    }
+
+    /// Has `listener` called on the control thread for every event. It must not block, and must
+    /// not hold this session, which would otherwise never end.
+    pub fn set_listener(&self, listener: impl Fn(&SessionEvent) + Send + Sync + 'static) {
+        let mut slot = self.shared().listener.lock().unwrap_or_else(PoisonError::into_inner);
+        *slot = Some(Arc::new(listener));
+    }
+
+    /// The daemon's status: the JSON of [`Status`](crate::daemon::status::Status).
+    ///
+    /// # Errors
+    /// When there is no daemon or it does not answer in time.
+    pub fn status_json(&self) -> Result<String, SessionError> {
+        let shared = self.shared();
+        let _asking = shared.asking.lock().unwrap_or_else(PoisonError::into_inner);
+        if shared.config.daemon == DaemonPolicy::Off {
+            return Err(SessionError::Off);
+        }
+        {
+            let mut state = shared.state();
+            if state.daemon.is_none() {
+                return Err(SessionError::Disconnected);
+            }
+            state.status = StatusAnswer::Parts(Vec::new());
+        }
+        shared.tell(Outgoing::Message(Message::StatusRequest));
+        shared.wait_changed(ANSWER, || !matches!(shared.state().status, StatusAnswer::Parts(_)));
+        let answer = std::mem::take(&mut shared.state().status);
+        match answer {
+            StatusAnswer::Whole(bytes) => status_text(bytes),
+            StatusAnswer::Lost => Err(SessionError::Disconnected),
+            StatusAnswer::None | StatusAnswer::Parts(_) => {
+                Err(SessionError::Silent { address: address::Address::of(&shared.config).to_string() })
+            }
+        }
+    }
+
+    fn start(
+        config: &Config,
+        options: SessionOptions,
+        segment: Arc<SessionSegment>,
+        connected: Option<Connected>,
+        reconnects: bool,
+    ) -> Result<Self, SessionError> {
+        let flags = rustix::event::EventfdFlags::CLOEXEC | rustix::event::EventfdFlags::NONBLOCK;
+        let system = |what| move |source: std::io::Error| SessionError::System { what, source };
+        let wake = rustix::event::eventfd(0, flags)
+            .map_err(|e| system("creating an eventfd")(e.into()))?;
+        let shared = Arc::new(Shared::new(config.clone(), options, segment, wake));
+        let control = Control::new(shared.clone(), connected, reconnects);
+        let blocked = signals::Blocked::all();
+        let thread = std::thread::Builder::new()
+            .name("axon-ctl".into())
+            .spawn(move || control.run())
+            .map_err(system("starting the control thread"))?;
+        drop(blocked);
+        Ok(Self { handle: Arc::new(Handle { shared, thread: Some(thread) }) })
+    }
+
+    fn shared(&self) -> &Shared {
+        &self.handle.shared
+    }
+
+    fn endpoint(&self, spec: EndpointSpec, kind: EndpointKind) -> Result<Endpoint, SessionError> {
+        let number = {
+            let mut state = self.shared().state();
+            state.next_entity += 1;
+            state.next_entity
+        };
+        let EndpointSpec { topic, type_name, type_hash, qos, node, namespace } = spec;
+        let gid = Gid::new(self.shared().id, number);
+        let endpoint = Endpoint { gid, kind, topic, type_name, type_hash, qos, node, namespace };
+        if endpoint.is_sane() {
+            Ok(endpoint)
+        } else {
+            Err(SessionError::Endpoint { topic: endpoint.topic })
+        }
+    }
+
+    fn add_publisher(
+        &self,
+        endpoint: Endpoint,
+        role: EndpointRole,
+    ) -> Result<Publisher, SessionError> {
+        let shared = self.shared();
+        let gid = endpoint.gid;
+        let options = RingOptions {
+            gid,
+            qos: endpoint.qos,
+            budget: shared.config.ring_bytes,
+            max_message: shared.config.max_message,
+        };
+        let writer = Writer::create(shared.segment.clone(), options)?;
+        let inner = Arc::new(PublisherInner::new(endpoint, role, writer));
+        shared.state().publishers.insert(gid, inner.clone());
+        shared.tell(Outgoing::Announce(gid));
+        Ok(Publisher { inner, session: self.clone() })
+    }
+
+    fn add_subscription(
+        &self,
+        endpoint: Endpoint,
+        role: EndpointRole,
+        stands_for: Vec<Gid>,
+    ) -> Subscription {
+        let gid = endpoint.gid;
+        let inner = Arc::new(SubscriptionInner::new(endpoint, role, stands_for));
+        self.shared().state().subscriptions.insert(gid, inner.clone());
+        self.shared().tell(Outgoing::Announce(gid));
+        Subscription { inner, session: self.clone() }
+    }
+
+    /// An endpoint's handle is dropped.
+    fn forget_endpoint(&self, gid: &Gid) {
+        let mut state = self.shared().state();
+        let stand_in = state.publishers.remove(gid).is_some_and(|p| p.role != EndpointRole::Application);
+        let relay =
+            state.subscriptions.remove(gid).is_some_and(|s| s.role != EndpointRole::Application);
+        if !stand_in && !relay {
+            state.tombstones.insert(*gid);
+        }
+        let gone = message::Gone { gid: *gid };
+        state.outgoing.push_back(Outgoing::Message(Message::EndpointGone(gone)));
+        drop(state);
+        self.shared().wake();
+    }
+
+    /// A relay stands for others than before: its writers and the daemon hear of it.
+    fn renew(&self, gid: Gid) {
+        self.shared().tell(Outgoing::Announce(gid));
+    }
+
+    fn wait_changed(&self, timeout: Duration, reached: impl FnMut() -> bool) -> bool {
+        self.shared().wait_changed(timeout, reached)
+    }
+}
+
+impl Drop for Handle {
+    fn drop(&mut self) {
+        self.shared.stop();
+        if let Some(thread) = self.thread.take() {
+            // A listener may hold the last handle.
+            if thread.thread().id() != std::thread::current().id() {
+                let _ = thread.join();
+            }
+        }
+    }
+}
+
+/// The status of the daemon of this user and domain. Starts none, and is answered whatever the
+/// security settings.
+///
+/// # Errors
+/// [`SessionError::NoDaemon`] when there is none.
+pub fn daemon_status(config: &Config) -> Result<String, SessionError> {
+    let config = Config { daemon: DaemonPolicy::Require, ..config.clone() };
+    let options = SessionOptions::new("status").role(SessionRole::Tool);
+    let caller =
+        Caller { config: &config, options: &options, id: SessionId::random(), segment: None, cancel: None };
+    let connected = caller.connect()?;
+    let address = address::Address::of(&config).to_string();
+    status_text(control::ask_status(&connected.socket, &address, ANSWER)?)
+}
+
+fn status_text(bytes: Vec<u8>) -> Result<String, SessionError> {
+    String::from_utf8(bytes).map_err(|e| SessionError::Protocol(format!("status: {e}")))
+}

@@ -1,0 +1,192 @@
+//! A writer of a topic.
+
+use std::{
+    collections::BTreeSet,
+    fmt, io,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::Duration,
+};
+
+use super::{Session, message::EndpointRole, subscription::now};
+use crate::{
+    graph::Endpoint,
+    ids::Gid,
+    shm::{Grant, Meta, PublishError, ReaderInfo, ShmError, Writer},
+};
+
+/// Sends the samples of a topic. Thread-safe. When it is dropped, readers still take what it left.
+pub struct Publisher {
+    pub(super) inner: Arc<PublisherInner>,
+    pub(super) session: Session,
+}
+
+impl Publisher {
+    /// Its GID.
+    pub fn gid(&self) -> Gid {
+        self.inner.endpoint.gid
+    }
+
+    /// Itself, as others see it.
+    pub fn endpoint(&self) -> &Endpoint {
+        &self.inner.endpoint
+    }
+
+    /// Publishes a sample, stamped with the current time, and returns its sequence number.
+    ///
+    /// # Errors
+    /// [`PublishError::Blocked`] after 100 ms when a KEEP_ALL reader makes no room; the others say
+    /// what does not fit. A sample that was refused has no sequence number: nobody counts it lost.
+    pub fn publish(&self, payload: &[u8]) -> Result<u64, PublishError> {
+        self.publish_at(now(), payload)
+    }
+
+    /// As [`publish`](Self::publish), with a source timestamp of the caller's, in nanoseconds since
+    /// the Unix epoch.
+    ///
+    /// # Errors
+    /// As for [`publish`](Self::publish).
+    pub fn publish_at(&self, source_timestamp: i64, payload: &[u8]) -> Result<u64, PublishError> {
+        // Sequence numbers stand in the ring in their order, so one is given under the lock under
+        // which it is used.
+        let mut last = self.inner.lock();
+        let sequence = *last + 1;
+        self.inner.writer.publish(Meta { sequence, source_timestamp }, payload)?;
+        *last = sequence;
+        Ok(sequence)
+    }
+
+    /// Publishes for a remote publisher, whose number and time the sample keeps.
+    ///
+    /// # Errors
+    /// As for [`publish`](Self::publish).
+    pub fn publish_with(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
+        let mut last = self.inner.lock();
+        self.inner.writer.publish(meta, payload)?;
+        *last = meta.sequence;
+        Ok(())
+    }
+
+    /// As [`publish_with`](Self::publish_with), but never waits for room.
+    ///
+    /// # Errors
+    /// [`PublishError::Blocked`] at once when there is none.
+    pub fn try_publish_with(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
+        let mut last = self.inner.lock();
+        self.inner.writer.try_publish(meta, payload)?;
+        *last = meta.sequence;
+        Ok(())
+    }
+
+    /// Room for a sample of exactly `len` bytes in shared memory, to serialize into.
+    ///
+    /// # Errors
+    /// As for [`publish`](Self::publish).
+    pub fn loan(&self, len: usize) -> Result<Loan<'_>, PublishError> {
+        Ok(Loan { loan: self.inner.writer.loan(len)?, publisher: &self.inner })
+    }
+
+    /// The readers that receive from it; a relay shows as the remote ones it stands for.
+    pub fn matched(&self) -> Vec<Gid> {
+        self.inner.writer.readers()
+    }
+
+    /// Waits until at least `count` readers receive from it; whether they do.
+    pub fn wait_matched(&self, count: usize, timeout: Duration) -> bool {
+        self.session.wait_changed(timeout, || self.matched().len() >= count)
+    }
+}
+
+impl fmt::Debug for Publisher {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Publisher").field(self.endpoint()).finish()
+    }
+}
+
+impl Drop for Publisher {
+    fn drop(&mut self) {
+        self.session.forget_endpoint(&self.gid());
+    }
+}
+
+/// A sample that is being written. Dropped without [`publish`](Self::publish), it never was.
+pub struct Loan<'a> {
+    loan: crate::shm::Loan<'a>,
+    publisher: &'a PublisherInner,
+}
+
+impl Loan<'_> {
+    /// Publishes it, stamped with the current time, and returns its sequence number.
+    ///
+    /// # Errors
+    /// When fewer bytes were written than were asked for.
+    pub fn publish(self) -> Result<u64, PublishError> {
+        let mut last = self.publisher.lock();
+        let sequence = *last + 1;
+        self.loan.publish(Meta { sequence, source_timestamp: now() })?;
+        *last = sequence;
+        Ok(sequence)
+    }
+}
+
+impl fmt::Debug for Loan<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Loan").field(&self.publisher.endpoint.topic).finish()
+    }
+}
+
+impl io::Write for Loan<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.loan.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// What the session's control thread shares with the handle.
+pub(super) struct PublisherInner {
+    pub(super) endpoint: Endpoint,
+    pub(super) role: EndpointRole,
+    pub(super) writer: Writer,
+    last: Mutex<u64>,
+    /// Readers that were granted; a relay as itself.
+    attached: Mutex<BTreeSet<Gid>>,
+}
+
+impl PublisherInner {
+    pub(super) fn new(endpoint: Endpoint, role: EndpointRole, writer: Writer) -> Self {
+        Self { endpoint, role, writer, last: Mutex::new(0), attached: Mutex::default() }
+    }
+
+    pub(super) fn attach(&self, reader: ReaderInfo) -> Result<Grant, ShmError> {
+        let gid = reader.gid;
+        let grant = self.writer.attach(reader)?;
+        self.attached().insert(gid);
+        Ok(grant)
+    }
+
+    /// Whether it was attached.
+    pub(super) fn detach(&self, reader: Gid) -> bool {
+        self.attached().remove(&reader);
+        self.writer.detach(reader)
+    }
+
+    /// Whether any reader's process was dead.
+    pub(super) fn drop_dead(&self) -> bool {
+        let dead = self.writer.drop_dead();
+        let mut attached = self.attached();
+        dead.iter().for_each(|gid| {
+            attached.remove(gid);
+        });
+        !dead.is_empty()
+    }
+
+    pub(super) fn attached(&self) -> MutexGuard<'_, BTreeSet<Gid>> {
+        self.attached.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn lock(&self) -> MutexGuard<'_, u64> {
+        self.last.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}

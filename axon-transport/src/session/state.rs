@@ -1,0 +1,170 @@
+//! What the handles of a session and its control thread share.
+
+use std::{
+    collections::{BTreeSet, HashMap, VecDeque},
+    fmt,
+    os::fd::OwnedFd,
+    sync::{
+        Arc, Condvar, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::{Duration, Instant},
+};
+
+use super::{
+    SessionOptions, message::Message, publisher::PublisherInner, subscription::SubscriptionInner,
+};
+use crate::{
+    config::Config,
+    graph::GraphView,
+    ids::{DaemonId, Gid, SessionId},
+    shm::SessionSegment,
+};
+
+/// Something that a session's owner may want to hear of.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum SessionEvent {
+    /// The graph changed.
+    Graph,
+    /// The readers of this publisher, or the publishers of this subscription, changed.
+    Matched(Gid),
+    /// The daemon is gone. Rings that are attached flow on.
+    DaemonLost,
+    /// A daemon, perhaps another one than before, knows this session's endpoints.
+    DaemonFound(DaemonId),
+}
+
+type Listener = Arc<dyn Fn(&SessionEvent) + Send + Sync>;
+
+pub(super) struct Shared {
+    pub(super) config: Config,
+    pub(super) options: SessionOptions,
+    pub(super) id: SessionId,
+    pub(super) segment: Arc<SessionSegment>,
+    /// Wakes the control thread (an eventfd).
+    pub(super) wake: OwnedFd,
+    pub(super) stopping: AtomicBool,
+    pub(super) listener: Mutex<Option<Listener>>,
+    /// One status request at a time.
+    pub(super) asking: Mutex<()>,
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+#[derive(Default)]
+pub(super) struct State {
+    pub(super) next_entity: u32,
+    pub(super) publishers: HashMap<Gid, Arc<PublisherInner>>,
+    pub(super) subscriptions: HashMap<Gid, Arc<SubscriptionInner>>,
+    pub(super) outgoing: VecDeque<Outgoing>,
+    /// Endpoints that are gone, until a daemon has said so to everybody.
+    pub(super) tombstones: BTreeSet<Gid>,
+    pub(super) graph: Arc<GraphView>,
+    pub(super) daemon: Option<DaemonId>,
+    pub(super) status: StatusAnswer,
+    /// Counts what those who wait may want to look at.
+    pub(super) changes: u64,
+}
+
+/// Something for the daemon to be told.
+#[derive(Debug)]
+pub(super) enum Outgoing {
+    /// This endpoint of ours, as it is when the message is sent.
+    Announce(Gid),
+    /// A message without descriptors.
+    Message(Message),
+}
+
+#[derive(Debug, Default)]
+pub(super) enum StatusAnswer {
+    #[default]
+    None,
+    Parts(Vec<u8>),
+    Whole(Vec<u8>),
+    Lost,
+}
+
+impl Shared {
+    pub(super) fn new(
+        config: Config,
+        options: SessionOptions,
+        segment: Arc<SessionSegment>,
+        wake: OwnedFd,
+    ) -> Self {
+        Self {
+            config,
+            options,
+            id: segment.id(),
+            segment,
+            wake,
+            stopping: AtomicBool::new(false),
+            listener: Mutex::new(None),
+            asking: Mutex::new(()),
+            state: Mutex::default(),
+            changed: Condvar::new(),
+        }
+    }
+
+    pub(super) fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Queues something for the daemon.
+    pub(super) fn tell(&self, outgoing: Outgoing) {
+        self.state().outgoing.push_back(outgoing);
+        self.wake();
+    }
+
+    pub(super) fn wake(&self) {
+        // An eventfd whose counter is full is readable, which is all that is wanted.
+        let _ = rustix::io::write(&self.wake, &1u64.to_ne_bytes());
+    }
+
+    pub(super) fn stop(&self) {
+        // Pairs with the acquire load of the control thread's loop.
+        self.stopping.store(true, Ordering::Release);
+        self.wake();
+    }
+
+    /// Waits for changes of the state until `reached`, which runs without the state's lock.
+    pub(super) fn wait_changed(&self, timeout: Duration, mut reached: impl FnMut() -> bool) -> bool {
+        let deadline = Instant::now().checked_add(timeout);
+        loop {
+            // Read before `reached` looks, so that a change after it is not missed.
+            let seen = self.state().changes;
+            if reached() {
+                return true;
+            }
+            let mut state = self.state();
+            while state.changes == seen {
+                let left = deadline.map_or(Duration::MAX, |d| {
+                    d.saturating_duration_since(Instant::now())
+                });
+                if left.is_zero() {
+                    return false;
+                }
+                let nap = left.min(Duration::from_secs(3600));
+                let woken = self.changed.wait_timeout(state, nap);
+                state = woken.unwrap_or_else(PoisonError::into_inner).0;
+            }
+        }
+    }
+
+    /// Tells those who wait, and the listener.
+    pub(super) fn notify(&self, event: Option<&SessionEvent>) {
+        self.state().changes += 1;
+        self.changed.notify_all();
+        let Some(event) = event else { return };
+        let listener = self.listener.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        if let Some(listener) = listener {
+            listener(event);
+        }
+    }
+}
+
+impl fmt::Debug for Shared {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Shared").field("id", &self.id).finish_non_exhaustive()
+    }
+}

@@ -1,0 +1,338 @@
+//! A reader of every matched publisher of a topic, merged into one stream.
+
+use std::{
+    collections::HashMap,
+    fmt,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::{Duration, SystemTime},
+};
+
+use super::{Session, message::EndpointRole};
+use crate::{
+    graph::Endpoint,
+    ids::Gid,
+    qos::History,
+    shm::{Grant, Lane, Reader, TakeError},
+};
+
+/// Publishers whose last sequence number is remembered after they are gone.
+const REMEMBERED: usize = 4096;
+
+/// Receives the samples of a topic. Thread-safe.
+pub struct Subscription {
+    pub(super) inner: Arc<SubscriptionInner>,
+    pub(super) session: Session,
+}
+
+/// What is known of a sample besides its bytes. Times are nanoseconds since the Unix epoch.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct MessageInfo {
+    /// Who published it.
+    pub publisher: Gid,
+    /// The publication's number, from 1.
+    pub sequence: u64,
+    /// When it was published, by the publisher's clock.
+    pub source_timestamp: i64,
+    /// When it was taken, by this host's clock.
+    pub received_timestamp: i64,
+}
+
+impl Subscription {
+    /// Its GID.
+    pub fn gid(&self) -> Gid {
+        self.inner.endpoint.gid
+    }
+
+    /// Itself, as others see it.
+    pub fn endpoint(&self) -> &Endpoint {
+        &self.inner.endpoint
+    }
+
+    /// The oldest sample by source timestamp among all publishers, into `out`, which it replaces.
+    /// `None` when there is none.
+    pub fn take(&self, out: &mut Vec<u8>) -> Option<MessageInfo> {
+        self.inner.lock().take(out, &self.inner.endpoint)
+    }
+
+    /// As [`take`](Self::take), after waiting for a sample for at most `timeout`.
+    pub fn recv(&self, out: &mut Vec<u8>, timeout: Option<Duration>) -> Option<MessageInfo> {
+        let deadline = timeout.map(|t| std::time::Instant::now() + t);
+        loop {
+            if let Some(info) = self.take(out) {
+                return Some(info);
+            }
+            let left = deadline.map(|d| d.saturating_duration_since(std::time::Instant::now()));
+            if left.is_some_and(|l| l.is_zero()) || !self.session.wait(|| self.has_data(), left) {
+                return None;
+            }
+        }
+    }
+
+    /// Whether there is something to take.
+    pub fn has_data(&self) -> bool {
+        self.inner.lock().slots.iter().any(|s| s.reader.has_data())
+    }
+
+    /// The publishers it receives from.
+    pub fn matched(&self) -> Vec<Gid> {
+        let slots = self.inner.lock();
+        slots.slots.iter().filter(|s| !s.over).map(|s| s.reader.writer()).collect()
+    }
+
+    /// Waits until it receives from at least `count` publishers; whether it does.
+    pub fn wait_matched(&self, count: usize, timeout: Duration) -> bool {
+        self.session.wait_changed(timeout, || self.matched().len() >= count)
+    }
+
+    /// Samples that were overwritten before they were taken.
+    pub fn lost(&self) -> u64 {
+        let slots = self.inner.lock();
+        slots.lost + slots.slots.iter().map(|s| s.reader.lost()).sum::<u64>()
+    }
+
+    /// Samples taken.
+    pub fn received(&self) -> u64 {
+        self.inner.lock().received
+    }
+
+    /// For a relay: the remote subscriptions that it stands for from now on.
+    pub fn set_stands_for(&self, gids: Vec<Gid>) {
+        *lock(&self.inner.stands_for) = gids;
+        self.session.renew(self.gid());
+    }
+}
+
+impl fmt::Debug for Subscription {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Subscription").field(self.endpoint()).finish()
+    }
+}
+
+impl Drop for Subscription {
+    fn drop(&mut self) {
+        self.session.forget_endpoint(&self.gid());
+    }
+}
+
+/// What the session's control thread shares with the handle.
+pub(super) struct SubscriptionInner {
+    pub(super) endpoint: Endpoint,
+    pub(super) role: EndpointRole,
+    stands_for: Mutex<Vec<Gid>>,
+    slots: Mutex<Slots>,
+}
+
+#[derive(Default)]
+pub(super) struct Slots {
+    slots: Vec<Slot>,
+    /// Lanes given to writers that have not granted yet.
+    pending: HashMap<Gid, Lane>,
+    /// The last sequence number taken of each publisher, also of those that are gone: one that
+    /// comes back, as a remote one does with its link, must not be heard twice.
+    last: HashMap<Gid, u64>,
+    received: u64,
+    lost: u64,
+}
+
+/// What a grant calls for.
+pub(super) enum Accept {
+    /// Nothing: it repeats the one that stands, or nobody asked.
+    Stands,
+    /// Map the ring with this lane.
+    Map(Lane),
+    /// Ask again, with a fresh lane.
+    AskAgain,
+}
+
+struct Slot {
+    reader: Reader,
+    /// The writer is gone: take what it left, then unmap.
+    over: bool,
+}
+
+impl SubscriptionInner {
+    pub(super) fn new(endpoint: Endpoint, role: EndpointRole, stands_for: Vec<Gid>) -> Self {
+        let (stands_for, slots) = (Mutex::new(stands_for), Mutex::default());
+        Self { endpoint, role, stands_for, slots }
+    }
+
+    pub(super) fn lock(&self) -> MutexGuard<'_, Slots> {
+        lock(&self.slots)
+    }
+
+    pub(super) fn stands_for(&self) -> Vec<Gid> {
+        lock(&self.stands_for).clone()
+    }
+}
+
+impl Slots {
+    /// The lane that is, or from now on will be, the one for `writer`.
+    pub(super) fn lane_for<E>(
+        &mut self,
+        writer: Gid,
+        allocate: impl FnOnce() -> Result<Lane, E>,
+    ) -> Result<u32, E> {
+        if let Some(slot) = self.slots.iter().find(|s| s.reader.writer() == writer && !s.over) {
+            return Ok(slot.reader.lane());
+        }
+        if let Some(lane) = self.pending.get(&writer) {
+            return Ok(lane.index());
+        }
+        let lane = allocate()?;
+        let index = lane.index();
+        self.pending.insert(writer, lane);
+        Ok(index)
+    }
+
+    /// The lanes of all that are attached, or asked to be: what is repeated when `stands_for`
+    /// changes.
+    pub(super) fn lanes(&self) -> Vec<(Gid, u32)> {
+        let attached = self.slots.iter().filter(|s| !s.over);
+        let attached = attached.map(|s| (s.reader.writer(), s.reader.lane()));
+        attached.chain(self.pending.iter().map(|(gid, lane)| (*gid, lane.index()))).collect()
+    }
+
+    /// What a grant of `writer` calls for.
+    pub(super) fn accept(&mut self, writer: Gid, grant: Grant) -> Accept {
+        if let Some(slot) = self.slots.iter_mut().find(|s| !s.over && s.reader.writer() == writer) {
+            if slot.reader.grant() == grant {
+                return Accept::Stands;
+            }
+            // The writer forgot us and granted anew, on a lane whose words we still use for what
+            // it wrote before.
+            slot.over = true;
+            return Accept::AskAgain;
+        }
+        self.pending.remove(&writer).map_or(Accept::Stands, Accept::Map)
+    }
+
+    pub(super) fn add(&mut self, reader: Reader) {
+        self.slots.push(Slot { reader, over: false });
+    }
+
+    /// The writer will not write any more. Whether that is news.
+    pub(super) fn end(&mut self, writer: &Gid) -> bool {
+        self.pending.remove(writer);
+        self.end_where(|reader| reader.writer() == *writer)
+    }
+
+    /// Writers whose process is dead will not write any more. Whether there are any.
+    pub(super) fn end_dead(&mut self) -> bool {
+        self.end_where(Reader::writer_dead)
+    }
+
+    /// The writers that are attached, or asked to be.
+    pub(super) fn writers(&self) -> Vec<Gid> {
+        self.lanes().into_iter().map(|(gid, _)| gid).collect()
+    }
+
+    fn end_where(&mut self, which: impl Fn(&Reader) -> bool) -> bool {
+        let mut news = false;
+        for slot in self.slots.iter_mut().filter(|s| !s.over && which(&s.reader)) {
+            slot.over = true;
+            news = true;
+        }
+        self.sweep();
+        news
+    }
+
+    /// Unmaps writers that are gone and drained.
+    fn sweep(&mut self) {
+        let lost = &mut self.lost;
+        self.slots.retain(|s| {
+            let keep = !s.over || s.reader.has_data();
+            if !keep {
+                *lost += s.reader.lost();
+            }
+            keep
+        });
+        if self.last.len() > REMEMBERED {
+            let slots = &self.slots;
+            self.last.retain(|gid, _| slots.iter().any(|s| s.reader.writer() == *gid));
+        }
+    }
+
+    fn take(&mut self, out: &mut Vec<u8>, endpoint: &Endpoint) -> Option<MessageInfo> {
+        loop {
+            if endpoint.qos.history == History::KeepLast && self.slots.len() > 1 {
+                self.skip_to_depth(u64::from(endpoint.qos.depth));
+            }
+            let index = self.oldest()?;
+            let reader = &mut self.slots[index].reader;
+            let writer = reader.writer();
+            let taken = match reader.take(out) {
+                Ok(Some(taken)) => taken,
+                // Overwritten again and again while we read: let the caller come back.
+                Ok(None) => return None,
+                Err(error) => {
+                    self.discard(index, &error, endpoint);
+                    continue;
+                }
+            };
+            let last = self.last.entry(writer).or_default();
+            if taken.meta.sequence <= *last {
+                continue;
+            }
+            *last = taken.meta.sequence;
+            self.received += 1;
+            if self.slots[index].over {
+                self.sweep();
+            }
+            return Some(MessageInfo {
+                publisher: writer,
+                sequence: taken.meta.sequence,
+                source_timestamp: taken.meta.source_timestamp,
+                received_timestamp: now(),
+            });
+        }
+    }
+
+    /// The slot whose next sample is the oldest.
+    fn oldest(&mut self) -> Option<usize> {
+        if let [slot] = self.slots.as_slice() {
+            return slot.reader.has_data().then_some(0);
+        }
+        let mut oldest = None;
+        for (index, slot) in self.slots.iter_mut().enumerate() {
+            // A writer whose memory is corrupt is chosen, so that taking finds out.
+            let stamp = match slot.reader.peek() {
+                Ok(Some(meta)) => meta.source_timestamp,
+                Ok(None) => continue,
+                Err(_) => i64::MIN,
+            };
+            if oldest.is_none_or(|(least, _)| stamp < least) {
+                oldest = Some((stamp, index));
+            }
+        }
+        oldest.map(|(_, index)| index)
+    }
+
+    /// KEEP_LAST(depth) counts over all publishers together.
+    fn skip_to_depth(&mut self, depth: u64) {
+        let mut unread: u64 = self.slots.iter().map(|s| s.reader.unread()).sum();
+        while unread > depth {
+            let Some(index) = self.oldest() else { return };
+            if !self.slots[index].reader.skip() {
+                return;
+            }
+            unread -= 1;
+        }
+    }
+
+    fn discard(&mut self, index: usize, error: &TakeError, endpoint: &Endpoint) {
+        tracing::error!(topic = endpoint.topic, %error, "a publisher's memory is not usable");
+        let slot = self.slots.remove(index);
+        self.lost += slot.reader.lost();
+    }
+}
+
+/// Nanoseconds since the Unix epoch.
+pub(super) fn now() -> i64 {
+    SystemTime::now()
+        .duration_since(SystemTime::UNIX_EPOCH)
+        .map_or(0, |d| i64::try_from(d.as_nanos()).unwrap_or(i64::MAX))
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,0 +1,419 @@
+//! Sessions and their daemon as real processes.
+
+mod support;
+
+use std::{io::Write, os::fd::OwnedFd, time::Duration};
+
+use axon_transport::{
+    config::{Config, DaemonPolicy},
+    qos::Qos,
+    session::{
+        EndpointSpec, Publisher, Session, SessionError, SessionOptions, Subscription,
+        address::Address,
+        message::{Hello, Message, PROTOCOL, SessionRole},
+        socket,
+    },
+    shm::PublishError,
+};
+use rustix::process::Signal;
+use support::{Host, PATIENCE, say, signal, until, wait_for_the_end};
+
+fn spec(topic: &str) -> EndpointSpec {
+    EndpointSpec::new(topic, "test/Bytes", Qos::keep_all())
+}
+
+fn publish(publisher: &Publisher, number: u64) {
+    loop {
+        match publisher.publish(&number.to_le_bytes()) {
+            Ok(_) => return,
+            // The reader is slow: this is what KEEP_ALL means.
+            Err(PublishError::Blocked { .. }) => {}
+            Err(error) => panic!("{error}"),
+        }
+    }
+}
+
+fn receive(subscription: &Subscription) -> u64 {
+    let mut bytes = Vec::new();
+    let info = subscription.recv(&mut bytes, Some(PATIENCE)).expect("a sample in time");
+    let number = u64::from_le_bytes(bytes.as_slice().try_into().unwrap());
+    assert_eq!(info.sequence, number, "sequence numbers count what was published");
+    number
+}
+
+/// What the children of the tests do. In a run of the tests themselves it does nothing.
+#[test]
+fn child() {
+    let Ok(part) = std::env::var("PLAY") else { return };
+    let config = Config::from_env().unwrap();
+    let session = match Session::open(&config, SessionOptions::new(&*part)) {
+        Ok(session) => session,
+        Err(error) => return say(error),
+    };
+    match part.as_str() {
+        "idle" => {
+            say(session.daemon().unwrap());
+            wait_for_the_end();
+        }
+        // Publishes numbers until the test has enough, then says how many there were.
+        "talker" => {
+            let publisher = session.create_publisher(spec("/numbers")).unwrap();
+            assert!(publisher.wait_matched(1, PATIENCE));
+            say("matched");
+            let enough = std::thread::spawn(wait_for_the_end);
+            let mut number = 0;
+            while !enough.is_finished() {
+                number += 1;
+                publish(&publisher, number);
+                if number % 64 == 0 {
+                    std::thread::sleep(Duration::from_millis(1));
+                }
+            }
+            // The marker of the end.
+            let last = number + 1;
+            publish(&publisher, last);
+            say(last);
+            until("everything was taken", || publisher.matched().is_empty());
+        }
+        // Takes numbers, which must come without a gap, until the process is told the last.
+        "listener" => {
+            let subscription = session.create_subscription(spec("/numbers")).unwrap();
+            let first = receive(&subscription);
+            say(first);
+            let (tell, told) = std::sync::mpsc::channel();
+            std::thread::spawn(move || {
+                let mut line = String::new();
+                std::io::stdin().read_line(&mut line).unwrap();
+                tell.send(line.trim().parse::<u64>().unwrap()).unwrap();
+            });
+            let (mut number, mut last, mut bytes) = (first, None, Vec::new());
+            while last != Some(number) {
+                let nap = Some(Duration::from_millis(20));
+                if let Some(info) = subscription.recv(&mut bytes, nap) {
+                    assert_eq!(info.sequence, number + 1, "a gap or a repetition");
+                    assert_eq!(bytes, info.sequence.to_le_bytes());
+                    number += 1;
+                } else if last.is_none() {
+                    last = told.try_recv().ok();
+                }
+            }
+            assert_eq!(subscription.lost(), 0);
+            say("complete");
+        }
+        _ => unreachable!("no such part: {part}"),
+    }
+}
+
+fn run_pair(host: &Host, meanwhile: impl FnOnce(&str)) {
+    let mut listener = host.play("listener");
+    let mut talker = host.play("talker");
+    assert_eq!(talker.hear(), "matched");
+    let first: u64 = listener.hear().parse().unwrap();
+    let daemon = host.status().unwrap().daemon;
+    meanwhile(&daemon);
+    drop(talker.child.0.stdin.take());
+    let last = talker.hear();
+    writeln!(listener.child.0.stdin.as_ref().unwrap(), "{last}").unwrap();
+    assert_eq!(listener.hear(), "complete");
+    assert!(last.parse::<u64>().unwrap() > first);
+    listener.finish();
+    talker.finish();
+}
+
+#[test]
+fn two_processes_talk_through_a_daemon_that_the_first_one_started() {
+    let host = Host::new();
+    run_pair(&host, |_| std::thread::sleep(Duration::from_millis(200)));
+    let status = host.status().unwrap();
+    assert_eq!(status.mode, "classic");
+    let environ = std::fs::read(format!("/proc/{}/stat", status.pid)).unwrap();
+    let stat = String::from_utf8(environ).unwrap();
+    let fields: Vec<&str> = stat.rsplit(") ").next().unwrap().split(' ').collect();
+    // Its own session, and nobody's child among us.
+    assert_eq!(fields[3], status.pid.to_string(), "setsid");
+    assert_ne!(fields[1], std::process::id().to_string(), "our child");
+    let limits = std::fs::read_to_string(format!("/proc/{}/limits", status.pid)).unwrap();
+    let core = limits.lines().find(|l| l.starts_with("Max core file size")).unwrap();
+    assert_eq!(core.split_whitespace().nth(4), Some("0"), "{core}");
+}
+
+#[test]
+fn a_daemon_killed_in_the_middle_loses_nothing_and_another_takes_over() {
+    let host = Host::new();
+    run_pair(&host, |first| {
+        for _ in 0..3 {
+            let before = host.status().unwrap();
+            signal(before.pid, Signal::KILL);
+            until("both sessions have another daemon", || {
+                host.status().is_ok_and(|now| {
+                    now.daemon != before.daemon && now.sessions.len() - gateways(&now) == 2
+                })
+            });
+        }
+        assert_ne!(host.status().unwrap().daemon, first);
+        // Somebody who comes late is matched by the new daemon.
+        let late = host.session("late").unwrap();
+        let subscription = late.create_subscription(spec("/numbers")).unwrap();
+        assert!(subscription.wait_matched(1, PATIENCE));
+        receive(&subscription);
+    });
+}
+
+fn gateways(status: &axon_transport::daemon::status::Status) -> usize {
+    status.sessions.iter().filter(|s| s.role == "gateway").count()
+}
+
+#[test]
+fn an_endpoint_that_ends_while_there_is_no_daemon_is_gone_for_its_peers() {
+    let host = Host::new();
+    let mut daemon = host.daemon();
+    let (a, b) = (host.session("a").unwrap(), host.session("b").unwrap());
+    let publisher = a.create_publisher(spec("/t")).unwrap();
+    let subscription = b.create_subscription(spec("/t")).unwrap();
+    let other = b.create_subscription(spec("/t")).unwrap();
+    assert!(publisher.wait_matched(2, PATIENCE));
+    daemon.0.kill().unwrap();
+    daemon.0.wait().unwrap();
+    until("the loss is noticed", || a.daemon().is_none() && b.daemon().is_none());
+    publisher.publish(b"still").unwrap();
+    let gid = subscription.gid();
+    drop(subscription);
+    let _next = host.daemon();
+    assert!(other.wait_matched(1, PATIENCE));
+    until("the publisher heard of it", || !publisher.matched().contains(&gid));
+    assert_eq!(publisher.matched(), [other.gid()]);
+    let mut bytes = Vec::new();
+    assert!(other.recv(&mut bytes, Some(PATIENCE)).is_some());
+    assert_eq!(bytes, b"still");
+    publisher.publish(b"again").unwrap();
+    assert_eq!(other.recv(&mut bytes, Some(PATIENCE)).unwrap().sequence, 2);
+    drop(publisher);
+    until("the subscription heard of it", || other.matched().is_empty());
+}
+
+#[test]
+fn of_twenty_that_start_at_once_one_starts_the_daemon() {
+    let host = Host::new();
+    let mut players: Vec<_> = (0..20).map(|_| host.play("idle")).collect();
+    let daemons: Vec<String> = players.iter_mut().map(|p| p.hear()).collect();
+    assert!(daemons.iter().all(|d| *d == daemons[0]), "{daemons:?}");
+    let status = host.status().unwrap();
+    assert_eq!(status.daemon, daemons[0]);
+    assert_eq!(status.sessions.len() - gateways(&status), 20);
+    players.into_iter().for_each(support::Player::finish);
+}
+
+#[test]
+fn other_security_settings_are_refused_by_name() {
+    let host = Host::new().with("AXON_QUIC_CIPHER", "aes-256-gcm");
+    let _daemon = host.daemon();
+    let config = Config {
+        cipher: axon_tls::Cipher::ChaCha20Poly1305,
+        daemon: DaemonPolicy::Require,
+        ..host.config()
+    };
+    let refused = Session::open(&config, SessionOptions::new("other")).unwrap_err();
+    let SessionError::Mismatch { variable, ours, theirs, .. } = &refused else {
+        panic!("{refused}")
+    };
+    assert_eq!(variable, "AXON_QUIC_CIPHER");
+    assert_eq!((ours.as_str(), theirs.as_str()), ("chacha20-poly1305", "aes-256-gcm"));
+    let status = host.status().unwrap();
+    assert!(status.refusals.iter().any(|r| r.what == "AXON_QUIC_CIPHER"), "{:?}", status.refusals);
+    // The same as seen by a program.
+    let other = Host { env: host.env.clone(), dir: tempfile::tempdir().unwrap() }
+        .with("AXON_QUIC_CIPHER", "chacha20-poly1305");
+    let said = other.play("idle").hear();
+    assert!(said.contains("AXON_QUIC_CIPHER"), "{said}");
+}
+
+#[test]
+fn require_without_a_daemon_fails_and_off_needs_none() {
+    let host = Host::new();
+    let refused = host.session("alone").unwrap_err();
+    assert!(matches!(refused, SessionError::NoDaemon { .. }), "{refused}");
+    assert!(matches!(host.status(), Err(SessionError::NoDaemon { .. })));
+
+    let config = Config { daemon: DaemonPolicy::Off, ..host.config() };
+    let session = Session::open(&config, SessionOptions::new("off")).unwrap();
+    let subscription = session.create_subscription(spec("/t")).unwrap();
+    let publisher = session.create_publisher(spec("/t")).unwrap();
+    assert!(publisher.wait_matched(1, PATIENCE) && subscription.wait_matched(1, PATIENCE));
+    publish(&publisher, 1);
+    assert_eq!(receive(&subscription), 1);
+    assert!(session.wait_graph(PATIENCE, |g| g.endpoints.len() == 2));
+    assert!(matches!(session.status_json(), Err(SessionError::Off)));
+    assert!(!host.dir.path().join("run").exists(), "nothing was created");
+}
+
+#[test]
+fn a_session_killed_takes_its_endpoints_with_it() {
+    let host = Host::new();
+    let _daemon = host.daemon();
+    let session = host.session("witness").unwrap();
+    let subscription = session.create_subscription(spec("/numbers")).unwrap();
+    let mut talker = host.play("talker");
+    assert_eq!(talker.hear(), "matched");
+    assert!(subscription.wait_matched(1, PATIENCE));
+    let mut taken = receive(&subscription);
+    signal(talker.pid(), Signal::KILL);
+    assert!(session.wait_graph(PATIENCE, |g| g.endpoints.len() == 1));
+    until("the subscription heard of it", || subscription.matched().is_empty());
+    // What the dead one left is still there to be taken.
+    while subscription.has_data() {
+        let next = receive(&subscription);
+        assert_eq!(next, taken + 1);
+        taken = next;
+    }
+    assert_eq!(subscription.lost(), 0);
+    until("the daemon forgot it", || host.status().unwrap().topics[0].publishers == 0);
+}
+
+#[test]
+fn a_reader_killed_does_not_hold_its_writer_up() {
+    let host = Host::new();
+    let _daemon = host.daemon();
+    let session = host.session("writer").unwrap();
+    let publisher = session.create_publisher(spec("/numbers")).unwrap();
+    let listener = host.play("listener");
+    assert!(publisher.wait_matched(1, PATIENCE));
+    signal(listener.pid(), Signal::STOP);
+    let blocked = (1..).find(|n: &u64| {
+        matches!(publisher.publish(&n.to_le_bytes()), Err(PublishError::Blocked { .. }))
+    });
+    signal(listener.pid(), Signal::KILL);
+    assert!(blocked.is_some());
+    until("the publisher heard of it", || publisher.matched().is_empty());
+    publisher.publish(b"on").unwrap();
+}
+
+#[test]
+fn garbage_on_the_socket_hurts_nobody() {
+    let host = Host::new();
+    let _daemon = host.daemon();
+    let session = host.session("witness").unwrap();
+    let publisher = session.create_publisher(spec("/t")).unwrap();
+    let address = Address::of(&host.config());
+    let hello = |name: &str, settings| {
+        Message::Hello(Hello {
+            protocol: PROTOCOL,
+            session: axon_transport::ids::SessionId::random(),
+            role: SessionRole::Application,
+            name: name.into(),
+            domain: 0,
+            settings,
+        })
+        .encode()
+        .unwrap()
+    };
+    let packets: Vec<Vec<u8>> = vec![
+        vec![1],
+        vec![0xff; 32 * 1024],
+        vec![0xff; 40 * 1024],
+        Message::Resync.encode().unwrap(),
+        hello("without settings", vec![]),
+        hello(&"n".repeat(20_000), vec![]),
+        vec![],
+    ];
+    for packet in &packets {
+        let stranger = address.connect().unwrap();
+        let _ = socket::send(&stranger, packet, &[]);
+        until("the stranger is put out", || {
+            !matches!(
+                socket::receive(&stranger, &mut Vec::new()),
+                Ok(_) | Err(socket::SocketError::NotReady)
+            )
+        });
+    }
+    // A crowd that says nothing at all.
+    let crowd: Vec<OwnedFd> = (0..300).filter_map(|_| address.connect().ok()).collect();
+    drop(crowd);
+    // A tool that speaks out of turn.
+    let tool = address.connect().unwrap();
+    let packet = Message::Hello(Hello {
+        protocol: PROTOCOL,
+        session: axon_transport::ids::SessionId::random(),
+        role: SessionRole::Tool,
+        name: "tool".into(),
+        domain: 0,
+        settings: Vec::new(),
+    });
+    socket::send(&tool, &packet.encode().unwrap(), &[]).unwrap();
+    socket::send(&tool, &Message::Resync.encode().unwrap(), &[]).unwrap();
+    until("the tool is put out", || {
+        matches!(socket::receive(&tool, &mut Vec::new()), Err(socket::SocketError::Closed))
+    });
+    // All the while the daemon serves.
+    let subscription = host.session("b").unwrap().create_subscription(spec("/t")).unwrap();
+    assert!(subscription.wait_matched(1, PATIENCE) && publisher.wait_matched(1, PATIENCE));
+    publish(&publisher, 1);
+    assert_eq!(receive(&subscription), 1);
+}
+
+#[test]
+fn without_a_usable_runtime_directory_nothing_is_kept_and_everything_works() {
+    // The abstract name is the user's and the domain's: a domain that no other test has.
+    let host = Host::new()
+        .without("AXON_RUNTIME_DIR")
+        .with("XDG_RUNTIME_DIR", "/proc/no-such-directory")
+        .with("ROS_DOMAIN_ID", "87");
+    let mut player = host.play("idle");
+    let daemon = player.hear();
+    let status = host.status().unwrap();
+    assert_eq!((status.daemon, status.runtime_dir), (daemon, None));
+    assert!(status.socket.starts_with('@'), "{}", status.socket);
+    player.finish();
+}
+
+#[test]
+fn a_daemon_that_does_not_start_is_an_error_with_its_reason() {
+    let host = Host::new().with("AXON_DAEMON_PATH", "/bin/false");
+    let said = host.play("idle").hear();
+    assert!(said.contains("/bin/false did not start"), "{said}");
+
+    // The daemon is stricter than the session here: the directory is another user's to write to.
+    let host = Host::new();
+    let run = host.dir.path().join("run");
+    std::fs::create_dir(&run).unwrap();
+    let open = std::os::unix::fs::PermissionsExt::from_mode(0o777);
+    std::fs::set_permissions(&run, open).unwrap();
+    let said = host.play("idle").hear();
+    assert!(said.contains("AXON_RUNTIME_DIR") && said.contains("0700"), "{said}");
+}
+
+#[test]
+fn a_wrong_setting_ends_a_daemon_with_status_2_and_one_line() {
+    let host = Host::new().with("AXON_ENCRYPTION_MODE", "none");
+    let output = host.command(env!("CARGO_BIN_EXE_axon_daemon")).output().unwrap();
+    assert_eq!(output.status.code(), Some(2));
+    let text = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(text.lines().count(), 1, "{text}");
+    assert!(text.contains("AXON_ENCRYPTION_MODE"), "{text}");
+    assert!(!host.dir.path().join("run").exists(), "nothing was created");
+}
+
+#[test]
+fn a_second_daemon_by_hand_says_that_there_is_one() {
+    let host = Host::new();
+    let _daemon = host.daemon();
+    let output = host.command(env!("CARGO_BIN_EXE_axon_daemon")).output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    let text = String::from_utf8(output.stderr).unwrap();
+    assert!(text.contains("another daemon"), "{text}");
+}
+
+#[test]
+fn a_daemon_ends_on_sigterm_and_when_nobody_needs_it() {
+    let host = Host::new();
+    let mut daemon = host.daemon();
+    signal(daemon.0.id(), Signal::TERM);
+    assert!(daemon.0.wait().unwrap().success());
+    assert!(!host.dir.path().join("run/axon-0.sock").exists());
+
+    let toml = host.dir.path().join("axon.toml");
+    std::fs::write(&toml, "[link]\ngrace_s = 1\n").unwrap();
+    let host = Host::new().with("AXON_CONFIG", toml.to_str().unwrap());
+    let mut command = host.command(env!("CARGO_BIN_EXE_axon_daemon"));
+    let mut child = support::Kept(command.spawn().unwrap());
+    assert!(child.0.wait().unwrap().success());
+}

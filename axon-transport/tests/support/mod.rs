@@ -1,0 +1,178 @@
+//! A host of its own for each test: a runtime directory, a daemon binary, and child processes that
+//! play applications. A child is this very test program, told by `PLAY` what to do.
+
+use std::{
+    ffi::OsString,
+    io::{BufRead, BufReader, Lines},
+    path::Path,
+    process::{Child, ChildStdout, Command, Stdio},
+    time::{Duration, Instant},
+};
+
+use axon_transport::{
+    config::{Config, ConfigError, DaemonPolicy, OsFiles},
+    daemon::status::Status,
+    session::{Session, SessionError, SessionOptions, daemon_status},
+};
+
+/// Long enough for a loaded machine; a test that works never waits for it.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
+/// What a child's lines to its test begin with.
+const MARK: &str = "## ";
+
+pub(crate) struct Host {
+    pub(crate) dir: tempfile::TempDir,
+    pub(crate) env: Vec<(String, String)>,
+}
+
+impl Host {
+    pub(crate) fn new() -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        let run = dir.path().join("run");
+        let env = [
+            ("AXON_RUNTIME_DIR", run.to_str().unwrap()),
+            ("AXON_DAEMON_PATH", env!("CARGO_BIN_EXE_axon_daemon")),
+            ("AXON_BIND_ADDRS", "127.0.0.1"),
+            ("AXON_LOG", "debug"),
+        ];
+        Self { env: env.map(|(n, v)| (n.to_owned(), v.to_owned())).into(), dir }
+    }
+
+    pub(crate) fn with(mut self, name: &str, value: &str) -> Self {
+        self.env.retain(|(n, _)| n != name);
+        self.env.push((name.to_owned(), value.to_owned()));
+        self
+    }
+
+    pub(crate) fn without(mut self, name: &str) -> Self {
+        self.env.retain(|(n, _)| n != name);
+        self
+    }
+
+    /// The configuration that its processes read, for this very process.
+    pub(crate) fn config(&self) -> Config {
+        self.try_config().unwrap()
+    }
+
+    fn try_config(&self) -> Result<Config, ConfigError> {
+        let env = self.env.iter().map(|(n, v)| (OsString::from(n), OsString::from(v)));
+        Config::resolve(env, None, &OsFiles)
+    }
+
+    /// A session in this process with the daemon that runs. It starts none: a daemon would get the
+    /// environment of the tests.
+    pub(crate) fn session(&self, name: &str) -> Result<Session, SessionError> {
+        let config = Config { daemon: DaemonPolicy::Require, ..self.config() };
+        Session::open(&config, SessionOptions::new(name))
+    }
+
+    pub(crate) fn status(&self) -> Result<Status, SessionError> {
+        daemon_status(&self.try_config()?).map(|json| serde_json::from_str(&json).unwrap())
+    }
+
+    pub(crate) fn command(&self, program: impl AsRef<Path>) -> Command {
+        let mut command = Command::new(program.as_ref());
+        let axon = |name: &str| ["AXON_", "ROS_", "XDG_"].iter().any(|p| name.starts_with(p));
+        for (name, _) in std::env::vars().filter(|(name, _)| axon(name)) {
+            command.env_remove(name);
+        }
+        command.envs(self.env.iter().map(|(n, v)| (n, v)));
+        command
+    }
+
+    /// A daemon in the foreground, once it answers.
+    pub(crate) fn daemon(&self) -> Kept {
+        let child = self.command(env!("CARGO_BIN_EXE_axon_daemon")).spawn().unwrap();
+        let kept = Kept(child);
+        until("the daemon answers", || self.status().is_ok());
+        kept
+    }
+
+    /// A child that plays `part`.
+    pub(crate) fn play(&self, part: &str) -> Player {
+        let mut command = self.command(std::env::current_exe().unwrap());
+        command.args(["child", "--exact", "--nocapture", "--test-threads=1"]).env("PLAY", part);
+        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+        let lines = BufReader::new(child.stdout.take().unwrap()).lines();
+        Player { child: Kept(child), lines }
+    }
+}
+
+impl Drop for Host {
+    fn drop(&mut self) {
+        if let Ok(status) = self.status() {
+            signal(status.pid, rustix::process::Signal::KILL);
+        }
+        if std::thread::panicking()
+            && let Ok(log) = std::fs::read_to_string(self.dir.path().join("run/axon-0.log"))
+        {
+            eprintln!("--- the daemon's log:\n{log}");
+        }
+    }
+}
+
+/// A process that does not outlive the test.
+pub(crate) struct Kept(pub(crate) Child);
+
+impl Drop for Kept {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// A child that plays an application.
+pub(crate) struct Player {
+    pub(crate) child: Kept,
+    lines: Lines<BufReader<ChildStdout>>,
+}
+
+impl Player {
+    /// The child's next line.
+    pub(crate) fn hear(&mut self) -> String {
+        loop {
+            let line = self.lines.next().expect("the child said something before it ended").unwrap();
+            // The test harness writes a name without a newline in front of the first.
+            if let Some((_, said)) = line.split_once(MARK) {
+                return said.to_owned();
+            }
+        }
+    }
+
+    pub(crate) fn pid(&self) -> u32 {
+        self.child.0.id()
+    }
+
+    /// Closes its standard input, on which it waits, and waits for its end.
+    pub(crate) fn finish(mut self) {
+        drop(self.child.0.stdin.take());
+        let status = self.child.0.wait().unwrap();
+        assert!(status.success(), "a child failed: {status}");
+    }
+}
+
+/// Says something to the test, in a child.
+pub(crate) fn say(text: impl std::fmt::Display) {
+    println!("{MARK}{text}");
+}
+
+/// Waits for the test, in a child.
+pub(crate) fn wait_for_the_end() {
+    let mut line = String::new();
+    while std::io::stdin().read_line(&mut line).unwrap() > 0 {}
+}
+
+/// Waits for something that must come.
+#[track_caller]
+pub(crate) fn until(what: &str, mut reached: impl FnMut() -> bool) {
+    let deadline = Instant::now() + PATIENCE;
+    while !reached() {
+        assert!(Instant::now() < deadline, "in vain: {what}");
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
+pub(crate) fn signal(pid: u32, signal: rustix::process::Signal) {
+    let pid = rustix::process::Pid::from_raw(i32::try_from(pid).unwrap()).unwrap();
+    rustix::process::kill_process(pid, signal).unwrap();
+}
