@@ -38,3 +38,7 @@ pub mod quic;
 
 pub use error::Error;
 pub use negotiated::{Cipher, KeyExchange, Negotiated, PskKex, UnknownName};
+
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

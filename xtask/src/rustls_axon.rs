@@ -19,10 +19,18 @@ const AUTHOR: [&str; 4] = ["-c", "user.name=AXON", "-c", "user.email=axon@localh
 
 /// Makes `patched/`, checked against the committed digests.
 pub(crate) fn patched_tree() -> Result<String, String> {
-    let made = tree::assemble(&upstream_src()?, &crate_dir())?;
+    let upstream = upstream_src()?;
+    let made = tree::assemble(&upstream, &crate_dir())?;
     tree::check(&made, &crate_dir().join("patched.sha256"))?;
     let out = crate_dir().join("patched");
     tree::write(&made, &out.join("src"))?;
+
+    // what is shipped is a derived work, so rustls's licences and copyright notices go with it
+    for licence in ["LICENSE-APACHE", "LICENSE-ISC", "LICENSE-MIT"] {
+        let from = upstream.with_file_name(licence);
+        fs::copy(&from, out.join(licence))
+            .map_err(|err| format!("cannot copy {}: {err}", from.display()))?;
+    }
     Ok(format!("{}: {} files", out.display(), made.len()))
 }
 
