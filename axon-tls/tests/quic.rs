@@ -6,7 +6,7 @@ mod common;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use axon_tls::identity::{Auth, SigningKey, SpkiDigest, Trust, TrustFile};
+use axon_tls::identity::{Auth, CaMaterial, SigningKey, SpkiDigest, Trust, TrustFile};
 use axon_tls::qkd::{Psk, PskIdentity, PskResolver, derive_psk};
 use axon_tls::quic::{ALPN, hybrid_client, hybrid_server, qkd_client, qkd_server};
 use axon_tls::{Cipher, KeyExchange, PskKex};
@@ -230,6 +230,83 @@ async fn keys_that_are_not_pinned_are_refused() {
     let misled = hybrid_client(&pinned(&ours, stranger.spki_digest()), cipher, ALPN).unwrap();
     let outcome = connect(misled, server()).await;
     assert!(outcome.client.is_err() && outcome.server.is_err());
+}
+
+/// A certificate authority that signs end entities with the SAN that the tests connect with.
+struct Authority {
+    pem: String,
+    issuer: rcgen::Issuer<'static, rcgen::KeyPair>,
+}
+
+impl Authority {
+    fn new() -> Self {
+        let key = rcgen::KeyPair::generate().unwrap();
+        let mut params = rcgen::CertificateParams::new([]).unwrap();
+        params.is_ca = rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
+        params.key_usages =
+            vec![rcgen::KeyUsagePurpose::KeyCertSign, rcgen::KeyUsagePurpose::CrlSign];
+        let pem = params.self_signed(&key).unwrap().pem();
+        Self { pem, issuer: rcgen::Issuer::new(params, key) }
+    }
+
+    /// An end that trusts `roots` and shows a certificate of this authority.
+    fn member(&self, serial: u64, san: &str, roots: &Self, crl: Option<&str>) -> Auth {
+        let key = rcgen::KeyPair::generate().unwrap();
+        let mut params = rcgen::CertificateParams::new([san.to_owned()]).unwrap();
+        params.serial_number = Some(serial.into());
+        let certificate = params.signed_by(&key, &self.issuer).unwrap();
+        let material =
+            CaMaterial::from_pem(&roots.pem, &certificate.pem(), &key.serialize_pem(), crl);
+        Auth::Ca(Arc::new(material.unwrap()))
+    }
+
+    fn revoke(&self, serial: u64) -> String {
+        let year = |year| rcgen::date_time_ymd(year, 1, 1);
+        let params = rcgen::CertificateRevocationListParams {
+            this_update: year(2024),
+            next_update: year(2200),
+            crl_number: 1.into(),
+            issuing_distribution_point: None,
+            revoked_certs: vec![rcgen::RevokedCertParams {
+                serial_number: serial.into(),
+                revocation_time: year(2024),
+                reason_code: None,
+                invalidity_date: None,
+            }],
+            key_identifier_method: rcgen::KeyIdMethod::Sha256,
+        };
+        params.signed_by(&self.issuer).unwrap().pem().unwrap()
+    }
+}
+
+#[tokio::test]
+async fn certificates_of_the_given_roots_alone_are_accepted() {
+    let (ca, stranger) = (Authority::new(), Authority::new());
+    let crl = ca.revoke(666);
+    let server = ca.member(1, "axon", &ca, Some(&crl));
+    let works = |client: Auth, server: Auth| async move {
+        let cipher = Cipher::default();
+        let outcome = connect(
+            hybrid_client(&client, cipher, ALPN).unwrap(),
+            hybrid_server(&server, cipher, ALPN).unwrap(),
+        )
+        .await;
+        outcome.client.is_ok() && outcome.server.is_ok()
+    };
+
+    let another_root = stranger.member(2, "client", &ca, None);
+    assert!(!works(another_root, server.clone()).await);
+    let revoked = ca.member(666, "client", &ca, None);
+    assert!(!works(revoked, server.clone()).await);
+    let key_alone = unauthenticated();
+    assert!(!works(key_alone, server.clone()).await);
+    let client = ca.member(2, "client", &ca, None);
+    let another_name = ca.member(3, "other", &ca, None);
+    assert!(!works(client.clone(), another_name).await);
+
+    assert!(works(client, server).await);
+    assert!(CaMaterial::from_pem("", "", "", None).is_err());
+    assert!(CaMaterial::from_pem(&ca.pem, &ca.pem, "", Some("")).is_err());
 }
 
 #[tokio::test]
