@@ -253,6 +253,11 @@ impl Acceptor {
         state.failed.push_back((seen, failure));
     }
 
+    /// Unspent keys at hand, for status.
+    pub fn cached(&self) -> usize {
+        self.state().cached.values().map(VecDeque::len).sum()
+    }
+
     /// Erases what time has ended; to be called about once a second.
     pub fn expire(&self) {
         let now = self.0.clock.now();

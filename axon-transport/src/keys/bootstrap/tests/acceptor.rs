@@ -79,6 +79,7 @@ fn a_key_that_arrives_after_it_was_spent_is_not_kept() {
     let request = acceptor.poll_request().unwrap();
     assert_eq!(acceptor.spent(&bytes), Completion::First);
     acceptor.on_answer(key(request, "k1", 9));
+    assert_eq!(acceptor.cached(), 0);
     assert_eq!(look_up(&acceptor, "10.0.0.1", &bytes), Lookup::Spent);
 }
 
@@ -122,6 +123,19 @@ fn unspent_keys_are_kept_a_minute_and_eight_for_each_sae() {
     assert_ne!(look_up(&acceptor, "10.0.0.1", &identity("sae-a", "k0")), Lookup::Found);
     clock.advance(s(60));
     assert_ne!(look_up(&acceptor, "10.0.0.1", &identity("sae-a", "k8")), Lookup::Found);
+}
+
+#[test]
+fn one_address_has_two_calls_in_flight_for_an_sae() {
+    let (acceptor, _) = new(listed(&["sae-a", "sae-c"]));
+    let look_up = |source, sae, key_id| look_up(&acceptor, source, &identity(sae, key_id));
+    assert_eq!(look_up("10.0.0.1", "sae-a", "k1"), Lookup::Fetching);
+    assert_eq!(look_up("10.0.0.1", "sae-a", "k2"), Lookup::Fetching);
+    assert!(matches!(look_up("10.0.0.1", "sae-a", "k3"), Lookup::Limited(_)));
+    assert_eq!(look_up("10.0.0.2", "sae-a", "k3"), Lookup::Fetching);
+    assert_eq!(look_up("10.0.0.1", "sae-c", "k3"), Lookup::Fetching);
+    acceptor.on_answer(key(acceptor.poll_request().unwrap(), "k1", 9));
+    assert_eq!(look_up("10.0.0.1", "sae-a", "k4"), Lookup::Fetching);
 }
 
 #[test]
