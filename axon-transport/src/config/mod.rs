@@ -4,6 +4,8 @@
 //! an error that names the variable, what was read and what is accepted. Validation creates
 //! nothing, reads no private key, and runs in the process that starts, before any daemon does.
 
+#![forbid(unsafe_code)]
+
 use std::{
     ffi::OsString,
     path::{Path, PathBuf},

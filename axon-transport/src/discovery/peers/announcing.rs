@@ -1,0 +1,128 @@
+//! When this daemon says that it is here, to whom, and in what words.
+
+use std::{
+    net::{IpAddr, Ipv4Addr, SocketAddr},
+    time::Duration,
+};
+
+use rand::RngExt;
+
+use super::{Output, Peers};
+use crate::{
+    config::DiscoveryRange,
+    discovery::{
+        PROTOCOLS,
+        beacon::{Beacon, Datagram},
+        quic_ports,
+    },
+};
+
+/// The first beacons, when all is new.
+const BURST: [Duration; 5] = [
+    Duration::ZERO,
+    Duration::from_millis(200),
+    Duration::from_millis(500),
+    Duration::from_millis(1000),
+    Duration::from_millis(1900),
+];
+const INTERVAL_LEAST: Duration = Duration::from_secs(10);
+const INTERVAL_PER_HOST: Duration = Duration::from_millis(250);
+
+impl Peers {
+    /// This daemon ends: tells those who would otherwise dial it.
+    pub fn say_goodbye(&mut self) {
+        if self.port.is_none() {
+            return;
+        }
+        let goodbye = Datagram::Goodbye { domain: self.local.domain, daemon: self.local.daemon };
+        let bytes = goodbye.encode();
+        self.announce(&bytes);
+    }
+
+    fn interval(&self) -> Duration {
+        let hosts = u32::try_from(self.records.len() + 1).unwrap_or(u32::MAX);
+        INTERVAL_LEAST.max(INTERVAL_PER_HOST.saturating_mul(hosts))
+    }
+
+    /// How long a peer may be silent: five beacons, each as late as it may be.
+    pub(super) fn lifetime(&self) -> Duration {
+        self.interval().mul_f64(6.25)
+    }
+
+    pub(super) fn start_burst(&mut self, now: Duration) {
+        self.burst_left = BURST.len();
+        self.next_beacon = Some(now);
+    }
+
+    pub(super) fn schedule_beacon(&mut self, now: Duration) {
+        self.burst_left = self.burst_left.saturating_sub(1);
+        let wait = match self.burst_left {
+            0 => self.interval().mul_f64(self.random.random_range(0.75..1.25)),
+            left => {
+                let next = BURST.len() - left;
+                (BURST[next] - BURST[next - 1]).mul_f64(self.random.random_range(0.75..1.0))
+            }
+        };
+        self.next_beacon = Some(now + wait);
+    }
+
+    pub(super) fn send_beacon(&mut self, answer_wanted: bool) {
+        let Some(port) = self.port else { return };
+        let bytes = self.own_beacon(port, answer_wanted);
+        self.announce(&bytes);
+    }
+
+    /// Sends to all who may listen: the group, the QUIC ports of this host and of listed peers.
+    fn announce(&mut self, bytes: &[u8]) {
+        if self.local.range == DiscoveryRange::Subnet {
+            self.outputs.push_back(Output::Multicast(bytes.to_vec()));
+        }
+        let loopback = IpAddr::from(Ipv4Addr::LOCALHOST);
+        let mut targets = vec![(loopback, None)];
+        targets.extend(&self.listed);
+        for (address, port) in targets {
+            if !self.here.can_reach(address) {
+                continue;
+            }
+            let ports = match port {
+                Some(port) => port..=port,
+                None => quic_ports(self.local.domain),
+            };
+            for port in ports {
+                let own = Some(port) == self.port && self.is_own(address);
+                if !own {
+                    self.send(SocketAddr::new(address, port), bytes.to_vec());
+                }
+            }
+        }
+    }
+
+    /// Whether our own QUIC socket listens at `address`.
+    fn is_own(&self, address: IpAddr) -> bool {
+        if self.here.bind.is_empty() {
+            self.here.is_local(address)
+        } else {
+            self.here.bind.contains(&address)
+        }
+    }
+
+    pub(super) fn own_beacon(&self, port: u16, answer_wanted: bool) -> Vec<u8> {
+        let addresses = match self.local.advertise.is_empty() {
+            true => self.here.advertised(),
+            false => self.local.advertise.clone(),
+        };
+        Datagram::Beacon(Beacon {
+            protocols: (*PROTOCOLS.start(), *PROTOCOLS.end()),
+            domain: self.local.domain,
+            daemon: self.local.daemon,
+            terms: self.local.terms,
+            sae: self.local.sae.as_ref().map(|(own, _)| own.clone()),
+            port,
+            addresses,
+            graph: self.graph,
+            answer_wanted,
+            localhost: self.local.range == DiscoveryRange::Localhost,
+        })
+        .encode()
+    }
+}

@@ -1,0 +1,242 @@
+//! The task that gives [`Peers`] its clock, its sockets and its events.
+
+use std::{
+    future::pending,
+    net::{IpAddr, SocketAddr},
+    time::Duration,
+};
+
+use tokio::{
+    sync::mpsc,
+    task::JoinSet,
+    time::{Instant, MissedTickBehavior, interval, sleep_until, timeout},
+};
+use tracing::{debug, warn};
+
+use super::{Action, Arrival, Local, Output, Peers, interfaces, socket::SharedSocket};
+use crate::{
+    config::{Config, DiscoveryRange},
+    ids::DaemonId,
+};
+
+/// How often interfaces are looked at.
+const INTERFACES_EVERY: Duration = Duration::from_secs(3);
+/// How often names of listed peers are looked up.
+const NAMES_EVERY: Duration = Duration::from_secs(30);
+const NAME_TIMEOUT: Duration = Duration::from_secs(5);
+/// Most addresses of one name.
+const MOST_OF_A_NAME: usize = 4;
+
+/// What the daemon tells discovery.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Event {
+    /// A datagram came to the QUIC port whose first byte [is discovery's](super::is_discovery).
+    Datagram {
+        /// Where from.
+        from: SocketAddr,
+        /// All of it.
+        bytes: Vec<u8>,
+    },
+    /// The QUIC port is bound. Discovery says nothing before.
+    QuicPort(u16),
+    /// A link stands, whoever dialled it.
+    LinkUp {
+        /// With this daemon.
+        daemon: DaemonId,
+        /// At this address.
+        address: SocketAddr,
+    },
+    /// The last link with a daemon is gone.
+    LinkDown {
+        /// Which.
+        daemon: DaemonId,
+    },
+    /// An [`Action::Dial`] became no link.
+    DialFailed {
+        /// To whom.
+        daemon: DaemonId,
+    },
+    /// The graph has a new digest.
+    GraphDigest(u64),
+}
+
+/// Discovers until `events` closes, then says goodbye and ends, which closes `actions`.
+///
+/// Never waits for `actions` to have room: a datagram that finds none is lost, a dial counts as
+/// failed. No failure of a socket, an interface or a name ends it; what cannot work is logged, and
+/// the rest goes on. Dropping the future is safe, and says no goodbye.
+pub async fn run(
+    config: &Config,
+    daemon: DaemonId,
+    mut events: mpsc::Receiver<Event>,
+    actions: mpsc::Sender<Action>,
+) {
+    let mut shell = Shell::new(config, daemon, actions);
+    let mut look = interval(INTERFACES_EVERY);
+    look.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut names = interval(NAMES_EVERY);
+    names.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut lookups = JoinSet::new();
+
+    loop {
+        let wakeup = shell.peers.next_wakeup().map(|at| shell.start + at);
+        tokio::select! {
+            event = events.recv() => match event {
+                Some(event) => shell.event(event),
+                None => break,
+            },
+            datagram = receive(shell.socket.as_ref()) => match datagram {
+                Ok((from, bytes)) => {
+                    let now = shell.start.elapsed();
+                    shell.peers.datagram(now, from, Arrival::Shared, &bytes);
+                }
+                Err(error) => {
+                    debug!(%error, "the shared discovery port fails, opening it anew");
+                    shell.socket = None;
+                }
+            },
+            () = sleep_until_some(wakeup) => {}
+            _ = look.tick() => shell.look_at_interfaces(),
+            _ = names.tick(), if lookups.is_empty() => {
+                lookups.spawn(look_up(listed(config)));
+            }
+            Some(found) = lookups.join_next() => if let Ok(found) = found {
+                let now = shell.start.elapsed();
+                shell.peers.set_listed(now, found);
+            },
+        }
+        let now = shell.start.elapsed();
+        shell.peers.advance(now);
+        shell.carry_out();
+    }
+    shell.peers.say_goodbye();
+    shell.carry_out();
+}
+
+struct Shell {
+    start: Instant,
+    peers: Peers,
+    socket: Option<SharedSocket>,
+    /// Whether the shared port is used at all.
+    multicast: bool,
+    domain: u32,
+    bind: Vec<IpAddr>,
+    actions: mpsc::Sender<Action>,
+    /// The last failure to open the shared port, so that it is said once.
+    complained: bool,
+}
+
+impl Shell {
+    fn new(config: &Config, daemon: DaemonId, actions: mpsc::Sender<Action>) -> Self {
+        Self {
+            start: Instant::now(),
+            peers: Peers::new(Local::of(config, daemon), rand::random()),
+            socket: None,
+            multicast: config.range == DiscoveryRange::Subnet,
+            domain: config.domain,
+            bind: config.bind_addrs.clone(),
+            actions,
+            complained: false,
+        }
+    }
+
+    fn event(&mut self, event: Event) {
+        let now = self.start.elapsed();
+        match event {
+            Event::Datagram { from, bytes } => {
+                self.peers.datagram(now, from, Arrival::Quic, &bytes);
+            }
+            Event::QuicPort(port) => self.peers.set_port(now, port),
+            Event::LinkUp { daemon, address } => self.peers.link_up(now, daemon, address),
+            Event::LinkDown { daemon } => self.peers.link_down(now, daemon),
+            Event::DialFailed { daemon } => self.peers.dial_failed(now, daemon),
+            Event::GraphDigest(digest) => self.peers.set_graph(digest),
+        }
+    }
+
+    fn look_at_interfaces(&mut self) {
+        let found = match interfaces() {
+            Ok(found) => found,
+            Err(error) => return warn!(%error, "cannot list the network interfaces"),
+        };
+        if self.multicast && self.socket.is_none() {
+            match SharedSocket::open(self.domain, &self.bind) {
+                Ok(socket) => self.socket = Some(socket),
+                Err(error) if !self.complained => {
+                    self.complained = true;
+                    warn!(%error, "cannot open the shared discovery port; listed peers work");
+                }
+                Err(_) => {}
+            }
+        }
+        if let Some(socket) = &mut self.socket {
+            socket.follow(&found);
+        }
+        let now = self.start.elapsed();
+        self.peers.set_interfaces(now, found);
+    }
+
+    fn carry_out(&mut self) {
+        while let Some(output) = self.peers.poll() {
+            match output {
+                Output::Multicast(bytes) => {
+                    if let Some(socket) = &mut self.socket {
+                        socket.send(&bytes);
+                    }
+                }
+                Output::Action(action) => {
+                    let dial = match &action {
+                        Action::Dial { daemon, .. } => Some(*daemon),
+                        _ => None,
+                    };
+                    if let (Err(_), Some(daemon)) = (self.actions.try_send(action), dial) {
+                        let now = self.start.elapsed();
+                        self.peers.dial_failed(now, daemon);
+                    }
+                }
+            }
+        }
+    }
+}
+
+async fn receive(socket: Option<&SharedSocket>) -> std::io::Result<(SocketAddr, Vec<u8>)> {
+    match socket {
+        Some(socket) => socket.receive().await,
+        None => pending().await,
+    }
+}
+
+async fn sleep_until_some(at: Option<Instant>) {
+    match at {
+        Some(at) => sleep_until(at).await,
+        None => pending().await,
+    }
+}
+
+/// The peers that the configuration lists.
+fn listed(config: &Config) -> Vec<(String, Option<u16>)> {
+    let ours = config.daemon_peers.iter().map(|peer| (peer.host.clone(), peer.port));
+    let of_ros = config.static_peers.iter().map(|host| (host.clone(), None));
+    ours.chain(of_ros).collect()
+}
+
+async fn look_up(peers: Vec<(String, Option<u16>)>) -> Vec<(IpAddr, Option<u16>)> {
+    let mut found = Vec::new();
+    for (host, port) in peers {
+        if let Ok(address) = host.parse() {
+            found.push((address, port));
+            continue;
+        }
+        match timeout(NAME_TIMEOUT, tokio::net::lookup_host((&*host, 0))).await {
+            Ok(Ok(addresses)) => {
+                let addresses = addresses.take(MOST_OF_A_NAME);
+                found.extend(addresses.map(|address| (address.ip().to_canonical(), port)));
+            }
+            Ok(Err(error)) => debug!(host, %error, "listed peer has no address"),
+            Err(_) => debug!(host, "listed peer: no answer to the look-up of its name"),
+        }
+    }
+    found.dedup();
+    found
+}
