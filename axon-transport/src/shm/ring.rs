@@ -2,7 +2,8 @@
 //!
 //! A reader copies first and checks afterwards. The publisher raises the tail above a position
 //! before it reuses that position's slot or payload; a reader that finds the tail still at or
-//! below its position after the copy has copied what was published.
+//! below its position after the copy has copied what was published. The head orders all that a
+//! sample consists of; a slot's stamp only tells a scribbled ring from an honest one.
 
 use super::sync::{Ordering, Word};
 
@@ -89,8 +90,6 @@ pub(super) fn publish<W: Word>(
 ) {
     let slot = g.slot(words, position);
     slot[STAMP].store(2 * position + 1, Ordering::Relaxed);
-    // A reader that sees any of what follows sees that the slot is being written.
-    W::fence(Ordering::Release);
     slot[SEQUENCE].store(record.sequence, Ordering::Relaxed);
     slot[TIMESTAMP].store(record.timestamp.cast_unsigned(), Ordering::Relaxed);
     let flags = match record.place {
@@ -104,8 +103,7 @@ pub(super) fn publish<W: Word>(
         }
     };
     slot[LENGTH].store(u64::from(record.len) | u64::from(flags) << 32, Ordering::Relaxed);
-    // Release: pairs with the acquire load of the stamp in `look`.
-    slot[STAMP].store(2 * position + 2, Ordering::Release);
+    slot[STAMP].store(2 * position + 2, Ordering::Relaxed);
     // Release: pairs with `bounds`; whoever sees the head sees the sample.
     words[g.head].store(position + 1, Ordering::Release);
 }
@@ -133,8 +131,7 @@ pub(super) enum Look {
 /// Reader: the record at `position`, which is below the head. Good only if [`stands`] afterwards.
 pub(super) fn look<W: Word>(words: &[W], g: &Geometry, position: u64) -> Look {
     let slot = g.slot(words, position);
-    // Acquire: pairs with the release store of the stamp in `publish`.
-    if slot[STAMP].load(Ordering::Acquire) != 2 * position + 2 {
+    if slot[STAMP].load(Ordering::Relaxed) != 2 * position + 2 {
         return if stands(words, g, position) {
             Look::Corrupt("a slot that stands carries another position")
         } else {

@@ -89,19 +89,21 @@ fn memfd(bytes: u64, seals: SealFlags) -> OwnedFd {
 #[test]
 fn a_segment_must_be_a_sealed_memfd_of_a_sane_size() {
     let good = SealFlags::SHRINK | SealFlags::GROW | SealFlags::FUTURE_WRITE | SealFlags::SEAL;
+    let kind = "it is not a memfd";
+    let size = "its size is not a segment's";
     let mut bad = vec![
-        pipe().unwrap().0,
-        std::fs::File::open("/dev/null").unwrap().into(),
-        memfd(BYTES, SealFlags::empty()),
-        memfd(0, good),
-        memfd(4096, good),
-        memfd(layout::ALIGN + 8, good),
-        memfd(1 << 60, good),
+        (pipe().unwrap().0, kind),
+        (std::fs::File::open("/dev/null").unwrap().into(), kind),
+        (memfd(0, good), size),
+        (memfd(4096, good), size),
+        (memfd(layout::ALIGN + 8, good), size),
+        (memfd(1 << 60, good), size),
+        (memfd(BYTES, good), "it is not a ring"),
     ];
     for missing in [SealFlags::SHRINK, SealFlags::GROW, SealFlags::FUTURE_WRITE, SealFlags::SEAL] {
-        bad.push(memfd(BYTES, good - missing));
+        bad.push((memfd(BYTES, good - missing), "its seals are missing"));
     }
-    for fd in bad {
+    for (fd, reason) in bad {
         let scribble = Scribble::new();
         let options = ReaderOptions {
             reader: scribble.gid,
@@ -112,7 +114,7 @@ fn a_segment_must_be_a_sealed_memfd_of_a_sane_size() {
             qos: Qos::default(),
             max_message: MAX,
         };
-        refusal(Reader::map(fd.try_clone().unwrap(), options));
+        assert_eq!(refusal(Reader::map(fd.try_clone().unwrap(), options)), reason);
         let mut descriptors = scribble.session.descriptors().unwrap();
         descriptors.segment = fd;
         assert!(PeerSession::map(scribble.session.id(), descriptors).is_err());

@@ -1,6 +1,9 @@
 //! Both ends in one process, in one session and in two.
 
-use std::io::Write as _;
+use std::{
+    io::Write as _,
+    sync::atomic::{AtomicU64, Ordering},
+};
 
 use super::*;
 
@@ -372,4 +375,32 @@ fn an_overtaken_reader_never_sees_a_torn_sample() {
         }
     });
     assert_eq!(reader.received() + reader.skipped() + reader.lost(), total);
+}
+
+#[test]
+fn a_ring_reaches_the_one_of_several_waiting_threads_that_it_is_for() {
+    let (a, b) = (session(), session());
+    let acknowledged = AtomicU64::new(0);
+    let (threads, rounds) = (3, 2000);
+    let rings: Vec<_> = (0..threads).map(|_| writer(&a, keep_last(1), 1 << 20)).collect();
+    std::thread::scope(|scope| {
+        for ring in &rings {
+            let mut reader = attach(ring, &a, &b, keep_last(1));
+            let (a, b, acknowledged) = (&a, &b, &acknowledged);
+            scope.spawn(move || {
+                for _ in 0..rounds {
+                    await_data(b, &reader);
+                    let (sequence, _) = take(&mut reader).unwrap();
+                    acknowledged.store(sequence, Ordering::Release);
+                    a.notify();
+                }
+            });
+        }
+        for sequence in 1..=threads * rounds {
+            let ring = &rings[(sequence % threads) as usize];
+            ring.publish(meta(sequence), b"x").unwrap();
+            let ready = || acknowledged.load(Ordering::Acquire) == sequence;
+            woken(|| a.wait(ready, Some(EVER)));
+        }
+    });
 }

@@ -123,3 +123,18 @@ fn a_publisher_that_waits_for_the_cursor_overwrites_nothing_unread() {
         publisher.join().unwrap();
     });
 }
+
+#[test]
+fn a_reader_never_sees_a_tail_above_the_head() {
+    check(3, || {
+        let words = words();
+        let shared = words.clone();
+        let publisher = thread::spawn(move || {
+            write(&shared, 0);
+            write(&shared, 1);
+            retire(&shared, &GEOMETRY, 2);
+        });
+        bounds(&words, &GEOMETRY).unwrap();
+        publisher.join().unwrap();
+    });
+}
