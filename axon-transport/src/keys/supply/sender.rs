@@ -163,6 +163,11 @@ impl Sender {
         }
     }
 
+    /// The connection that [`slot`](Self::slot) seals for. What is sealed opens on no other.
+    pub fn attached(&self) -> Option<u64> {
+        self.link.as_ref().map(|link| link.conn)
+    }
+
     /// Takes on a key that the peer has proven to hold on `conn`, as READY.
     ///
     /// # Errors

@@ -133,7 +133,9 @@ fn unused_keys_survive_a_lost_connection() {
     let mut pair = Pair::new();
     pair.run();
     pair.seal(Delivery::Reliable).unwrap();
+    assert_eq!(pair.sender.attached(), Some(1));
     pair.close(1);
+    assert_eq!(pair.sender.attached(), None);
     assert_eq!(pair.seal(Delivery::Reliable), Err(NoKey::Detached));
     pair.now += ms(60_000);
     pair.connect();
