@@ -106,11 +106,14 @@ impl Running {
         }
     }
 
-    /// Gives an order, unless the gateway is so far behind that the channel is full.
-    pub(super) fn order(&self, order: ToGateway) {
-        if let Err(TrySendError::Full(order)) = self.orders.try_send(order) {
+    /// Gives an order, unless the gateway is gone or so far behind that the channel is full.
+    /// Whether it was given.
+    pub(super) fn order(&self, order: ToGateway) -> bool {
+        let sent = self.orders.try_send(order);
+        if let Err(TrySendError::Full(order)) = &sent {
             tracing::debug!(?order, "the gateway is busy; an order was dropped");
         }
+        sent.is_ok()
     }
 
     /// Has it say goodbye, and waits for that, but not for ever.

@@ -12,6 +12,7 @@ use std::{
 use rustix::process::{DumpableBehavior, Resource, Rlimit, getrlimit, set_dumpable_behavior, setrlimit};
 use tokio::{
     signal::unix::{SignalKind, signal},
+    sync::mpsc,
     task::{LocalSet, spawn_local},
 };
 
@@ -25,6 +26,7 @@ use super::{
 };
 use crate::{
     config::{Config, ConfigError, security_settings},
+    discovery::Event,
     session::address::{Address, AddressError, private_directory},
 };
 
@@ -227,7 +229,7 @@ async fn serve(
         tracing::info!(daemon = %control.id, address = %control.address, "the daemon takes sessions");
     }
     let accepting = spawn_local(accept(control.clone(), listener));
-    let flushing = spawn_local(flush(control.clone()));
+    let flushing = spawn_local(flush(control.clone(), remote.digests()));
     options.report.ready();
     tokio::select! {
         _ = terminate.recv() => tracing::info!("SIGTERM"),
@@ -239,18 +241,25 @@ async fn serve(
     accepting.abort();
     let _ = accepting.await;
     flushing.abort();
+    // It holds a sender, and discovery ends when there is none.
+    let _ = flushing.await;
     remote.end().await;
     Ok(())
 }
 
-/// Sends changes of the graph a moment after they happened.
-async fn flush(control: Rc<RefCell<Control>>) {
+/// Sends changes of the graph a moment after they happened, and tells discovery, whose beacons say
+/// whether a peer has missed some.
+async fn flush(control: Rc<RefCell<Control>>, digests: Option<mpsc::Sender<Event>>) {
     loop {
         if control.borrow().registry.needs_flush() {
             tokio::time::sleep(COALESCE).await;
             let control = &mut *control.borrow_mut();
             control.registry.flush();
             control.settle();
+            if let Some(digests) = &digests {
+                // One that is dropped is overtaken by the next.
+                let _ = digests.try_send(Event::GraphDigest(control.registry.digest()));
+            }
         }
         let changed = control.borrow().changed.clone();
         changed.notified().await;

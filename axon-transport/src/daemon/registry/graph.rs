@@ -72,6 +72,19 @@ impl<F: Clone> Registry<F> {
         }
     }
 
+    /// A number that stands for the endpoints of applications here: another one, most likely, when
+    /// they change.
+    pub fn digest(&self) -> u64 {
+        let own = self.endpoints.values().filter(|e| e.role == EndpointRole::Application);
+        own.fold(0, |digest, local| {
+            // GIDs are mostly random; FNV-1a spreads the rest.
+            let hash = local.endpoint.gid.0.iter().fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
+                (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)
+            });
+            digest ^ hash
+        })
+    }
+
     /// Whether [`flush`](Self::flush) has something to do.
     pub fn needs_flush(&self) -> bool {
         !self.added.is_empty() || !self.removed.is_empty()

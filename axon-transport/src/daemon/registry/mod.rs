@@ -23,7 +23,7 @@ use crate::{
 };
 
 /// Packets that may wait for one session before it is told everything anew instead.
-pub const MAX_QUEUE: usize = 4096;
+pub const MAX_QUEUE: usize = if cfg!(test) { 24 } else { 4096 };
 /// Sessions of one daemon.
 pub const MAX_SESSIONS: usize = 4096;
 /// Remembered GIDs of endpoints that ended while there was no daemon to tell.

@@ -1,0 +1,513 @@
+//! The registry under random sessions, some of them slow, checked against what a session may rely
+//! on: in the end everybody knows the graph, exactly the right pairs are attached at both ends, and
+//! a session is handed another's descriptors exactly when it holds none.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
+
+use proptest::prelude::*;
+
+use super::*;
+use crate::{
+    graph::EndpointKind,
+    qos::{Qos, Reliability, compatible},
+    session::message::{Announce, Gone, Granted, Message, Unmatch},
+};
+
+/// A descriptor in these tests: whose it is, and which.
+type Label = (SessionId, &'static str);
+
+fn session_id(number: u8) -> SessionId {
+    SessionId([number; 16])
+}
+
+fn handed(id: SessionId) -> [Label; 3] {
+    [(id, "segment"), (id, "doorbell"), (id, "pidfd")]
+}
+
+fn endpoint(gid: Gid, kind: EndpointKind, topic: u8, qos: Qos) -> Endpoint {
+    Endpoint {
+        gid,
+        kind,
+        topic: format!("/t{topic}"),
+        type_name: "T".into(),
+        type_hash: Vec::new(),
+        qos,
+        node: String::new(),
+        namespace: String::new(),
+    }
+}
+
+fn announce(endpoint: Endpoint) -> Message {
+    Message::Endpoint(Announce { endpoint, role: EndpointRole::Application, stands_for: vec![] })
+}
+
+/// A session that does what the client does, without rings.
+#[derive(Debug, Default)]
+struct Client {
+    id: SessionId,
+    connected: bool,
+    number: u32,
+    endpoints: BTreeMap<Gid, Endpoint>,
+    attached: BTreeSet<Pair>,
+    held: HashMap<SessionId, HashSet<Pair>>,
+    graph: BTreeMap<Gid, Option<DaemonId>>,
+    building: Option<BTreeMap<Gid, Option<DaemonId>>>,
+    repeated: Option<HashSet<Pair>>,
+    told: bool,
+    outgoing: Vec<(Message, Vec<Label>)>,
+}
+
+impl Client {
+    fn hold(&mut self, of: SessionId, pair: Pair, came: &[Label]) {
+        if of == self.id {
+            assert!(came.is_empty(), "one's own descriptors");
+            return;
+        }
+        let pairs = self.held.entry(of).or_default();
+        if pairs.is_empty() {
+            assert_eq!(came, handed(of), "descriptors that are needed");
+        } else {
+            assert!(came.is_empty(), "descriptors that are held already");
+        }
+        pairs.insert(pair);
+    }
+
+    fn release(&mut self, pair: &Pair) {
+        self.held.retain(|_, pairs| {
+            pairs.remove(pair);
+            !pairs.is_empty()
+        });
+    }
+
+    fn handle(&mut self, output: &Output<Label>) {
+        let fds = &output.descriptors;
+        match Message::decode(&output.packet).unwrap() {
+            Message::Graph(graph) => {
+                if graph.whole {
+                    self.building = Some(BTreeMap::new());
+                    self.held.clear();
+                    self.repeated = self.told.then(HashSet::new);
+                    self.told = true;
+                }
+                let view = self.building.as_mut().unwrap_or(&mut self.graph);
+                graph.removed.iter().for_each(|gid| {
+                    view.remove(gid);
+                });
+                view.extend(graph.added.iter().map(|i| (i.endpoint.gid, i.daemon)));
+                if !graph.more {
+                    if let Some(view) = self.building.take() {
+                        self.graph = view;
+                    }
+                    if let Some(repeated) = self.repeated.take() {
+                        self.attached.retain(|pair| repeated.contains(pair));
+                    }
+                }
+            }
+            Message::Match(pair) => {
+                if let Some(repeated) = &mut self.repeated {
+                    repeated.insert(pair);
+                }
+                if let Some(reader) = self.endpoints.get(&pair.reader) {
+                    let attach = Attach {
+                        reader: pair.reader,
+                        writer: pair.writer,
+                        lane: 0,
+                        qos: reader.qos,
+                        session: self.id,
+                        stands_for: vec![],
+                    };
+                    self.outgoing.push((Message::Attach(attach), vec![]));
+                }
+            }
+            Message::Attach(attach) => {
+                let pair = Pair { reader: attach.reader, writer: attach.writer };
+                if let Some(repeated) = &mut self.repeated {
+                    repeated.insert(pair);
+                }
+                self.hold(attach.session, pair, fds);
+                if self.endpoints.contains_key(&pair.writer) {
+                    self.attached.insert(pair);
+                    let Pair { reader, writer } = pair;
+                    let session = self.id;
+                    let grant = Granted { reader, writer, generation: 1, first: 0, session };
+                    self.outgoing.push((Message::Grant(grant), vec![]));
+                }
+            }
+            Message::Grant(grant) => {
+                let pair = Pair { reader: grant.reader, writer: grant.writer };
+                assert_eq!(fds[0], (grant.session, "ring"));
+                self.hold(grant.session, pair, &fds[1..]);
+                if self.endpoints.contains_key(&pair.reader) {
+                    self.attached.insert(pair);
+                }
+            }
+            Message::Unmatch(Unmatch { reader, writer, .. }) => {
+                self.release(&Pair { reader, writer });
+                self.attached.remove(&Pair { reader, writer });
+            }
+            Message::Detach(pair) => {
+                self.release(&pair);
+                self.attached.remove(&pair);
+            }
+            other => panic!("a session is never told {other:?}"),
+        }
+    }
+}
+
+#[derive(Clone, Debug)]
+enum Step {
+    Connect(u8),
+    Disconnect(u8),
+    Add { session: u8, topic: u8, writes: bool, reliable: bool },
+    Remove { session: u8, which: prop::sample::Index },
+    /// The session's messages arrive.
+    Up(u8),
+    /// Some packets reach the session.
+    Down(u8, u8),
+    Flush,
+    Resync(u8),
+    Remote { daemon: u8, reset: bool, add: u8, remove: u8 },
+    RemoteGone(u8),
+}
+
+const SESSIONS: u8 = 5;
+
+fn step() -> impl Strategy<Value = Step> {
+    let session = 0..SESSIONS;
+    prop_oneof![
+        2 => session.clone().prop_map(Step::Connect),
+        1 => session.clone().prop_map(Step::Disconnect),
+        8 => (session.clone(), 0u8..3, any::<bool>(), prop::bool::weighted(0.7)).prop_map(
+            |(session, topic, writes, reliable)| Step::Add { session, topic, writes, reliable }
+        ),
+        4 => (session.clone(), any::<prop::sample::Index>())
+            .prop_map(|(session, which)| Step::Remove { session, which }),
+        8 => session.clone().prop_map(Step::Up),
+        8 => (session.clone(), 0u8..40).prop_map(|(s, n)| Step::Down(s, n)),
+        4 => Just(Step::Flush),
+        1 => session.prop_map(Step::Resync),
+        2 => (0u8..3, any::<bool>(), 0u8..8, 0u8..8)
+            .prop_map(|(daemon, reset, add, remove)| Step::Remote { daemon, reset, add, remove }),
+        1 => (0u8..3).prop_map(Step::RemoteGone),
+    ]
+}
+
+#[derive(Default)]
+struct World {
+    registry: Registry<Label>,
+    clients: BTreeMap<u8, Client>,
+    generation: u8,
+}
+
+impl World {
+    fn up(&mut self, session: u8) -> bool {
+        let Some(client) = self.clients.get_mut(&session).filter(|c| c.connected) else {
+            return false;
+        };
+        let outgoing = std::mem::take(&mut client.outgoing);
+        let any = !outgoing.is_empty();
+        for (message, descriptors) in outgoing {
+            self.registry.message(&client.id, message, descriptors).unwrap();
+        }
+        any
+    }
+
+    fn down(&mut self, session: u8, count: usize) -> bool {
+        let Some(client) = self.clients.get_mut(&session).filter(|c| c.connected) else {
+            return false;
+        };
+        let mut any = false;
+        for _ in 0..count {
+            let Some(output) = self.registry.next_output(&client.id) else { break };
+            client.handle(&output);
+            any = true;
+        }
+        any
+    }
+
+    fn take(&mut self, step: Step) {
+        match step {
+            Step::Connect(session) => {
+                self.take(Step::Disconnect(session));
+                self.generation = self.generation.wrapping_add(SESSIONS);
+                let id = session_id(self.generation.wrapping_add(session));
+                self.registry
+                    .connect(id, SessionRole::Application, String::new(), 1, Some(handed(id)))
+                    .unwrap();
+                let client = Client { id, connected: true, ..Client::default() };
+                self.clients.insert(session, client);
+            }
+            Step::Disconnect(session) => {
+                if let Some(client) = self.clients.remove(&session) {
+                    self.registry.disconnect(&client.id);
+                }
+            }
+            Step::Add { session, topic, writes, reliable } => {
+                let Some(client) = self.clients.get_mut(&session) else { return };
+                client.number += 1;
+                let gid = Gid::new(client.id, client.number);
+                let kind =
+                    if writes { EndpointKind::Publisher } else { EndpointKind::Subscription };
+                let reliability =
+                    if reliable { Reliability::Reliable } else { Reliability::BestEffort };
+                let new = endpoint(gid, kind, topic, Qos { reliability, ..Qos::default() });
+                client.endpoints.insert(gid, new.clone());
+                let fds = if writes { vec![(client.id, "ring")] } else { vec![] };
+                client.outgoing.push((announce(new), fds));
+            }
+            Step::Remove { session, which } => {
+                let Some(client) = self.clients.get_mut(&session) else { return };
+                if client.endpoints.is_empty() {
+                    return;
+                }
+                let gid = *client.endpoints.keys().nth(which.index(client.endpoints.len())).unwrap();
+                client.endpoints.remove(&gid);
+                client.attached.retain(|p| p.reader != gid && p.writer != gid);
+                client.outgoing.push((Message::EndpointGone(Gone { gid }), vec![]));
+            }
+            Step::Up(session) => drop(self.up(session)),
+            Step::Down(session, count) => drop(self.down(session, count.into())),
+            Step::Flush => self.registry.flush(),
+            Step::Resync(session) => {
+                if let Some(client) = self.clients.get_mut(&session) {
+                    client.outgoing.push((Message::Resync, vec![]));
+                }
+            }
+            Step::Remote { daemon, reset, add, remove } => {
+                let gid = |n: u8| Gid([100 + daemon.wrapping_mul(8) + n; 16]);
+                let kind = EndpointKind::Publisher;
+                let added = vec![endpoint(gid(add), kind, 0, Qos::default())];
+                let id = DaemonId([daemon; 16]);
+                self.registry.remote_graph(id, reset, added, vec![gid(remove)]);
+            }
+            Step::RemoteGone(daemon) => self.registry.remote_gone(&DaemonId([daemon; 16])),
+        }
+    }
+
+    fn settle(&mut self) {
+        loop {
+            self.registry.flush();
+            let mut any = false;
+            for session in 0..SESSIONS {
+                any |= self.up(session);
+                any |= self.down(session, usize::MAX);
+            }
+            if !any && !self.registry.needs_flush() {
+                return;
+            }
+        }
+    }
+
+    fn check_settled(&self) {
+        let all: Vec<(SessionId, &Endpoint)> = self
+            .clients
+            .values()
+            .flat_map(|c| c.endpoints.values().map(|e| (c.id, e)))
+            .collect();
+        let mut graph: BTreeMap<Gid, Option<DaemonId>> =
+            all.iter().map(|(_, e)| (e.gid, None)).collect();
+        graph.extend(self.registry.remote_endpoints().map(|(d, e)| (e.gid, Some(*d))));
+        let mut pairs: BTreeMap<SessionId, BTreeSet<Pair>> = BTreeMap::new();
+        for (writer_session, writer) in &all {
+            for (reader_session, reader) in &all {
+                let pair = Pair { reader: reader.gid, writer: writer.gid };
+                if writer.kind == EndpointKind::Publisher
+                    && reader.kind == EndpointKind::Subscription
+                    && writer.topic == reader.topic
+                    && compatible(&writer.qos, &reader.qos).is_ok()
+                {
+                    pairs.entry(*writer_session).or_default().insert(pair);
+                    pairs.entry(*reader_session).or_default().insert(pair);
+                }
+            }
+        }
+        for client in self.clients.values() {
+            assert_eq!(client.graph, graph, "the graph of {}", client.id);
+            let expected = pairs.remove(&client.id).unwrap_or_default();
+            assert_eq!(client.attached, expected, "the pairs of {}", client.id);
+            let entry = self.registry.session(&client.id).unwrap();
+            assert_eq!(entry.known, client.held, "what {} holds", client.id);
+        }
+        assert_eq!(self.registry.endpoints.len(), all.len());
+        assert!(self.registry.topics.values().all(|m| m.writers.len() + m.readers.len() > 0));
+        assert_eq!(self.registry.sessions.len(), self.clients.len());
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(128))]
+
+    #[test]
+    fn whatever_happens_everybody_ends_up_knowing(steps in prop::collection::vec(step(), 0..400)) {
+        let mut world = World::default();
+        for step in steps {
+            world.take(step);
+            for entry in world.registry.sessions.values() {
+                prop_assert!(entry.queue.len() <= entry.queue_limit);
+            }
+        }
+        world.settle();
+        world.check_settled();
+    }
+}
+
+fn connected(sessions: u8) -> World {
+    let mut world = World::default();
+    (0..sessions).for_each(|s| world.take(Step::Connect(s)));
+    world
+}
+
+fn first(world: &World) -> SessionId {
+    world.clients[&0].id
+}
+
+#[test]
+fn what_no_session_does_is_a_violation() {
+    let mut world = connected(2);
+    let (own, other) = (first(&world), world.clients[&1].id);
+    let registry = &mut world.registry;
+    let foreign = endpoint(Gid::new(other, 1), EndpointKind::Subscription, 0, Qos::default());
+    let stolen = registry.message(&own, announce(foreign.clone()), vec![]);
+    assert_eq!(stolen, Err(Violation::NotItsOwn(foreign.gid)));
+    registry.message(&other, announce(foreign.clone()), vec![]).unwrap();
+    let gone = registry.message(&own, Message::EndpointGone(Gone { gid: foreign.gid }), vec![]);
+    assert_eq!(gone, Err(Violation::NotItsOwn(foreign.gid)));
+
+    let writer = endpoint(Gid::new(own, 1), EndpointKind::Publisher, 0, Qos::default());
+    let without = registry.message(&own, announce(writer.clone()), vec![]);
+    assert_eq!(without, Err(Violation::Descriptors(0)));
+    for role in [EndpointRole::StandIn, EndpointRole::Relay] {
+        let announce = Announce { endpoint: writer.clone(), role, stands_for: vec![] };
+        let taken = registry.message(&own, Message::Endpoint(announce), vec![(own, "ring")]);
+        assert_eq!(taken, Err(Violation::NotItsOwn(writer.gid)), "{role:?}");
+    }
+    let littered = registry.message(&own, Message::Resync, vec![(own, "ring")]);
+    assert_eq!(littered, Err(Violation::Descriptors(1)));
+    assert_eq!(registry.message(&own, Message::StatusRequest, vec![]), Err(Violation::Unexpected));
+    let pair = Pair { reader: foreign.gid, writer: writer.gid };
+    assert_eq!(registry.message(&own, Message::Match(pair), vec![]), Err(Violation::Unexpected));
+    assert_eq!(
+        registry.message(&own, Message::Detach(pair), vec![]),
+        Err(Violation::NotItsOwn(foreign.gid))
+    );
+}
+
+#[test]
+fn an_endpoint_out_of_bounds_is_refused_and_the_session_goes_on() {
+    let mut world = connected(1);
+    let own = first(&world);
+    while world.registry.next_output(&own).is_some() {}
+    let mut huge = endpoint(Gid::new(own, 1), EndpointKind::Subscription, 0, Qos::default());
+    huge.topic = "x".repeat(1000);
+    world.registry.message(&own, announce(huge), vec![]).unwrap();
+    let answer = world.registry.next_output(&own).unwrap();
+    assert!(matches!(Message::decode(&answer.packet).unwrap(), Message::Refused(_)));
+    assert_eq!(world.registry.endpoints().count(), 0);
+}
+
+#[test]
+fn a_sample_never_goes_back_to_where_it_came_from() {
+    let mut world = connected(1);
+    let gateway = session_id(200);
+    let name = String::new();
+    world
+        .registry
+        .connect(gateway, SessionRole::Gateway, name, 1, Some(handed(gateway)))
+        .unwrap();
+    let own = first(&world);
+    let remote = endpoint(Gid([9; 16]), EndpointKind::Publisher, 0, Qos::default());
+    let relay = endpoint(Gid::new(gateway, 1), EndpointKind::Subscription, 0, Qos::default());
+    let local = endpoint(Gid::new(own, 1), EndpointKind::Subscription, 0, Qos::default());
+    let talker = endpoint(Gid::new(own, 2), EndpointKind::Publisher, 0, Qos::default());
+    let say = |registry: &mut Registry<Label>, who, endpoint: &Endpoint, role| {
+        let fds = match endpoint.kind {
+            EndpointKind::Publisher => vec![(who, "ring")],
+            _ => vec![],
+        };
+        let announce = Announce { endpoint: endpoint.clone(), role, stands_for: vec![] };
+        registry.message(&who, Message::Endpoint(announce), fds).unwrap();
+    };
+    say(&mut world.registry, gateway, &remote, EndpointRole::StandIn);
+    say(&mut world.registry, gateway, &relay, EndpointRole::Relay);
+    say(&mut world.registry, own, &local, EndpointRole::Application);
+    say(&mut world.registry, own, &talker, EndpointRole::Application);
+    let pairs: Vec<Pair> = world.registry.pairs.keys().copied().collect();
+    let expected = [
+        Pair { reader: local.gid, writer: remote.gid },
+        Pair { reader: local.gid, writer: talker.gid },
+        Pair { reader: relay.gid, writer: talker.gid },
+    ];
+    assert_eq!(pairs.iter().collect::<BTreeSet<_>>(), expected.iter().collect());
+    // Neither is an endpoint of this host in the eyes of its sessions.
+    world.registry.flush();
+    let shown: BTreeSet<Gid> = world
+        .registry
+        .whole_graph()
+        .iter()
+        .flat_map(|g| g.added.iter().map(|i| i.endpoint.gid))
+        .collect();
+    assert_eq!(shown, [local.gid, talker.gid].into());
+}
+
+#[test]
+fn a_gid_that_is_taken_is_nobody_elses() {
+    let mut world = connected(1);
+    let own = first(&world);
+    let local = endpoint(Gid::new(own, 1), EndpointKind::Subscription, 0, Qos::default());
+    let (a, b) = (DaemonId([1; 16]), DaemonId([2; 16]));
+    let remote = endpoint(Gid([9; 16]), EndpointKind::Publisher, 0, Qos::default());
+    // Another host claims the GID before its session announces it.
+    world.registry.remote_graph(a, true, vec![local.clone(), remote.clone()], vec![]);
+    world.registry.message(&own, announce(local.clone()), vec![]).unwrap();
+    world.registry.remote_graph(b, true, vec![local.clone(), remote.clone()], vec![]);
+    let of: Vec<_> = world.registry.remote_endpoints().map(|(d, e)| (*d, e.gid)).collect();
+    assert_eq!(of, [(a, remote.gid)]);
+    // Nor can the one take away what is the other's.
+    world.registry.remote_graph(b, false, vec![], vec![remote.gid]);
+    assert_eq!(world.registry.remote_endpoints().count(), 1);
+}
+
+#[test]
+fn a_tombstone_reaches_those_who_come_later() {
+    let mut world = connected(1);
+    let own = first(&world);
+    let gid = Gid::new(own, 7);
+    world.registry.message(&own, Message::EndpointGone(Gone { gid }), vec![]).unwrap();
+    world.take(Step::Connect(1));
+    let late = world.clients[&1].id;
+    let mut removed = Vec::new();
+    while let Some(output) = world.registry.next_output(&late) {
+        if let Message::Graph(graph) = Message::decode(&output.packet).unwrap() {
+            removed.extend(graph.removed);
+        }
+    }
+    assert!(removed.contains(&gid));
+}
+
+#[test]
+fn a_detached_pair_is_over_at_both_ends() {
+    let mut world = connected(2);
+    world.take(Step::Add { session: 0, topic: 0, writes: true, reliable: true });
+    world.take(Step::Add { session: 1, topic: 0, writes: false, reliable: true });
+    world.settle();
+    let pair = *world.clients[&1].attached.first().unwrap();
+    let reader = world.clients.get_mut(&1).unwrap();
+    reader.outgoing.push((Message::Detach(pair), vec![]));
+    world.settle();
+    for client in world.clients.values() {
+        assert!(client.attached.is_empty() && client.held.is_empty());
+        assert!(world.registry.session(&client.id).unwrap().known.is_empty());
+    }
+}
+
+#[test]
+fn a_large_graph_is_told_in_packets_that_fit() {
+    let mut world = connected(1);
+    let added = (0..3000u32).map(|n| {
+        let gid = Gid::new(session_id(77), n);
+        Endpoint { topic: "t".repeat(400), ..endpoint(gid, EndpointKind::Publisher, 0, Qos::default()) }
+    });
+    world.registry.remote_graph(DaemonId([1; 16]), true, added.collect(), vec![]);
+    world.settle();
+    assert_eq!(world.clients[&0].graph.len(), 3000);
+}
