@@ -1,1 +1,38 @@
-fn main() {}
+//! The tool `axon`.
+
+#![forbid(unsafe_code)]
+
+mod cli;
+mod daemon;
+mod demo;
+mod echo;
+mod failure;
+mod log;
+mod logging;
+mod play;
+mod session;
+mod status;
+mod text;
+
+use std::process::ExitCode;
+
+use clap::Parser;
+
+use crate::cli::{Cli, Command};
+
+fn main() -> ExitCode {
+    let outcome = match &Cli::parse().command {
+        Command::Demo(args) => demo::run(args),
+        Command::Play(args) => play::run(args).map(done),
+        Command::Echo(args) => echo::run(args).map(done),
+        Command::Status(args) => status::run(args).map(done),
+        Command::Daemon(args) => daemon::run(args),
+        Command::DemoPlayer(args) => demo::run_player(args).map(done),
+        Command::DemoSubscriber(args) => demo::run_subscriber(args).map(done),
+    };
+    outcome.unwrap_or_else(|failure| failure.report())
+}
+
+fn done((): ()) -> ExitCode {
+    ExitCode::SUCCESS
+}

@@ -1,0 +1,249 @@
+//! The command line: what can be typed, and what `--help` says.
+
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+
+const ABOUT: &str = "Robot data between processes over shared memory and between hosts over QUIC, \
+                     under post-quantum or quantum-distributed keys";
+
+const AFTER_HELP: &str = "\
+Start here:
+  axon demo                     the whole of it on this machine, in about a minute
+  axon play log.mcap            replay a recorded log
+  axon echo /scan               look at what arrives, here or on another host
+  axon status                   the daemon's peers, links, keys and refusals
+
+Settings come from the environment (AXON_SECURITY_MODE, AXON_DAEMON_PEERS, ...) and from the file
+that AXON_CONFIG names; docs/configuration.md lists them. The first session on a host starts the
+daemon; it ends by itself when the last session has been gone for a while.
+
+Exit status:
+  0  done
+  1  it failed, and stderr says why
+  2  a setting or an argument is unknown, obsolete or half-given; one line on stderr names it";
+
+/// What was typed.
+#[derive(Debug, Parser)]
+#[command(name = "axon", version, about = ABOUT, after_help = AFTER_HELP)]
+#[command(disable_help_subcommand = true, max_term_width = 100)]
+pub(crate) struct Cli {
+    #[command(subcommand)]
+    pub(crate) command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Show AXON end to end on this machine: two hosts, two KMEs, a recorded log, every route
+    #[command(after_help = DEMO_HELP)]
+    Demo(Demo),
+    /// Replay a recorded MCAP log under the topics and types it was recorded with
+    #[command(after_help = PLAY_HELP)]
+    Play(Play),
+    /// Print a line for each message of a topic
+    #[command(after_help = ECHO_HELP)]
+    Echo(Echo),
+    /// Show the daemon: mode, peers, links, keys, topics, refusals
+    #[command(after_help = STATUS_HELP)]
+    Status(Status),
+    /// Run the daemon in the foreground
+    #[command(after_help = DAEMON_HELP)]
+    Daemon(Daemon),
+    #[command(hide = true)]
+    DemoPlayer(DemoPlayer),
+    #[command(hide = true)]
+    DemoSubscriber(DemoSubscriber),
+}
+
+const DEMO_HELP: &str = "\
+Starts two KMEs (ETSI GS QKD 014 over mutual TLS, certificates made on the spot) and two hosts, each
+with a daemon, a runtime directory, a KME and an SAE identity of its own, on 127.0.0.1 and 127.0.0.2.
+A log that a robot recorded goes from host A to a subscriber on host A and one on host B:
+
+  shared memory          between processes of one host
+  QUIC classic           TLS 1.3 with X25519MLKEM768 and nothing else
+  QUIC qkd/session       TLS 1.3 on a pre-shared key from the KMEs
+  QUIC qkd/messages10    the same, and every message in an envelope under a KME key of its own ten
+
+Each message is compared byte for byte with the log. Then peers that must not get in try to. Settings
+in the environment do not reach the demo's hosts (AXON_LOG does). Everything is removed at the end.
+
+Examples:
+  axon demo
+  axon demo --json | jq .verdict
+  axon demo --file camera.mcap --rate 1
+
+Exit status: 0 only when nothing was lost, all compared equal and every wrong peer was refused.";
+
+/// `axon demo`.
+#[derive(Args, Debug)]
+pub(crate) struct Demo {
+    /// The log to replay [default: examples/data/mit-csail.mcap, built in]
+    #[arg(long, value_name = "FILE.mcap")]
+    pub(crate) file: Option<PathBuf>,
+    /// Times the recorded pace; 0 is as fast as possible
+    #[arg(long, default_value_t = 40.0, value_parser = rate)]
+    pub(crate) rate: f64,
+    /// Print the report as one JSON document
+    #[arg(long)]
+    pub(crate) json: bool,
+    /// Leave the daemons' logs in this directory
+    #[arg(long, value_name = "DIR")]
+    pub(crate) logs: Option<PathBuf>,
+}
+
+const PLAY_HELP: &str = "\
+Each topic is published under the name and type in the log, at the pace of the recording. With
+--qos keep-all, the default, a full reader that keeps all as well slows the replay and nothing is
+lost; the other profiles never wait.
+
+Examples:
+  axon play examples/data/mit-csail.mcap
+  axon play log.mcap --rate 10 --wait 1
+  axon play log.mcap --rate 0 --qos sensor-data --loop";
+
+/// `axon play`.
+#[derive(Args, Debug)]
+pub(crate) struct Play {
+    /// The log
+    #[arg(value_name = "FILE.mcap")]
+    pub(crate) file: PathBuf,
+    /// Times the recorded pace; 0 is as fast as possible
+    #[arg(long, default_value_t = 1.0, value_parser = rate)]
+    pub(crate) rate: f64,
+    /// Quality of service that the publishers offer
+    #[arg(long, value_enum, default_value_t = Profile::KeepAll)]
+    pub(crate) qos: Profile,
+    /// Start when every topic has this many subscriptions
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub(crate) wait: usize,
+    /// Start again at the end, until interrupted
+    #[arg(long = "loop")]
+    pub(crate) repeat: bool,
+}
+
+/// The profiles on offer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Profile {
+    /// RELIABLE, KEEP_ALL
+    KeepAll,
+    /// RELIABLE, KEEP_LAST(10): ROS 2's default
+    Default,
+    /// BEST_EFFORT, KEEP_LAST(5): ROS 2's sensor data
+    SensorData,
+}
+
+const ECHO_HELP: &str = "\
+A line says when the message was published (UTC), its size, and the head of its payload in
+hexadecimal and ASCII. Without --qos the subscription asks for what the publishers offer: RELIABLE
+where all of them do, else BEST_EFFORT, and never slows them. How many messages it missed, if any,
+is said on stderr at the end.
+
+Examples:
+  axon echo /scan
+  axon echo /camera/image --type sensor_msgs/msg/Image --count 1
+  axon echo /odom --json | jq .size";
+
+/// `axon echo`.
+#[derive(Args, Debug)]
+pub(crate) struct Echo {
+    /// The topic
+    pub(crate) topic: String,
+    /// Its type, such as sensor_msgs/msg/LaserScan [default: as its first endpoint says]
+    #[arg(long = "type", value_name = "TYPE")]
+    pub(crate) type_name: Option<String>,
+    /// Quality of service to ask for; keep-all slows a publisher that keeps all rather than miss any
+    #[arg(long, value_enum)]
+    pub(crate) qos: Option<Profile>,
+    /// End after this many messages
+    #[arg(long, value_name = "N")]
+    pub(crate) count: Option<u64>,
+    /// A JSON object a line
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+const STATUS_HELP: &str = "\
+Asks the daemon of this user and ROS domain. Never starts one.
+
+Examples:
+  axon status
+  axon status --json | jq '.refusals'
+
+Exit status: 1 when there is no daemon.";
+
+/// `axon status`.
+#[derive(Args, Debug)]
+pub(crate) struct Status {
+    /// The daemon's own JSON
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+const DAEMON_HELP: &str = "\
+The same as axon_daemon. The first session on a host starts it, so this is for service managers,
+for logs (AXON_LOG=info) and for a host that only relays. Ends on SIGINT or SIGTERM, or after its
+grace time without sessions.
+
+Examples:
+  AXON_LOG=info axon daemon
+  AXON_SECURITY_MODE=classic AXON_DAEMON_PEERS=robot.local axon daemon";
+
+/// `axon daemon`.
+#[derive(Args, Debug)]
+pub(crate) struct Daemon {
+    /// Started by a session, which waits for the outcome
+    #[arg(long, hide = true)]
+    pub(crate) spawned: bool,
+    /// The process that remains of a spawned one
+    #[arg(long, hide = true, conflicts_with = "spawned")]
+    pub(crate) detached: bool,
+    /// End when standard input ends
+    #[arg(long, hide = true)]
+    pub(crate) while_stdin: bool,
+}
+
+/// The demo's publisher, a process of host A.
+#[derive(Args, Debug)]
+pub(crate) struct DemoPlayer {
+    #[arg(long)]
+    pub(crate) file: PathBuf,
+    #[arg(long, value_parser = rate)]
+    pub(crate) rate: f64,
+    #[arg(long)]
+    pub(crate) wait: usize,
+}
+
+/// One of the demo's subscribers.
+#[derive(Args, Debug)]
+pub(crate) struct DemoSubscriber {
+    #[arg(long)]
+    pub(crate) file: PathBuf,
+}
+
+fn rate(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(rate) if rate.is_finite() && rate >= 0.0 => Ok(rate),
+        _ => Err("not a number of at least 0".to_owned()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn a_rate_is_a_finite_number_of_at_least_zero() {
+        for wrong in ["-1", "nan", "inf", "", "fast"] {
+            assert!(rate(wrong).is_err(), "{wrong}");
+        }
+        assert_eq!((rate("0"), rate("0.5")), (Ok(0.0), Ok(0.5)));
+    }
+}

@@ -1,0 +1,112 @@
+//! `axon echo`: a line for each message of a topic.
+
+use std::{
+    io::{self, Write},
+    time::Duration,
+};
+
+use axon_transport::{
+    graph::{EndpointKind, GraphView},
+    qos::{Qos, Reliability},
+    session::{EndpointSpec, MessageInfo, Session},
+};
+use serde_json::json;
+
+use crate::{cli, failure::Failure, logging, session, text};
+
+/// Bytes of the payload that a line shows.
+const HEAD: usize = 16;
+
+/// Messages that may wait when the subscription asks for no profile.
+const DEPTH: u32 = 1_000;
+
+/// Time in which a topic that is there shows up in the graph.
+const AT_ONCE: Duration = Duration::from_secs(1);
+
+/// Runs `axon echo`.
+pub(crate) fn run(args: &cli::Echo) -> Result<(), Failure> {
+    let config = logging::configure()?;
+    let session = session::open(&config, "axon echo")?;
+    let type_name = match &args.type_name {
+        Some(type_name) => type_name.clone(),
+        None => find_type(&session, &args.topic),
+    };
+    let qos = args.qos.map_or_else(|| qos_of(&session, &args.topic), cli::Profile::qos);
+    let spec = EndpointSpec::new(&args.topic, &type_name, qos);
+    let subscription = session.create_subscription(spec).map_err(session::failure)?;
+
+    let mut payload = Vec::new();
+    let mut left = args.count;
+    let mut out = io::stdout().lock();
+    while left != Some(0) {
+        session.wait(|| subscription.has_data(), None);
+        while left != Some(0) {
+            let Some(info) = subscription.take(&mut payload) else { break };
+            let line = if args.json { as_json(&info, &payload) } else { as_text(&info, &payload) };
+            match writeln!(out, "{line}").and_then(|()| out.flush()) {
+                Ok(()) => {}
+                // The reader of the pipe has seen enough.
+                Err(error) if error.kind() == io::ErrorKind::BrokenPipe => return Ok(()),
+                Err(error) => return Err(error.into()),
+            }
+            left = left.map(|left| left - 1);
+        }
+    }
+    let lost = subscription.lost();
+    if lost > 0 {
+        eprintln!("axon echo: missed {} messages", text::grouped(lost));
+    }
+    Ok(())
+}
+
+/// The type of the topic's first endpoint, as soon as there is one.
+fn find_type(session: &Session, topic: &str) -> String {
+    let mut found = None;
+    let mut look = |graph: &GraphView| {
+        let endpoints = graph.endpoints.values().map(|entry| &entry.endpoint);
+        let known = endpoints.filter(|endpoint| endpoint.topic == topic).find(|endpoint| {
+            matches!(endpoint.kind, EndpointKind::Publisher | EndpointKind::Subscription)
+        });
+        found = known.map(|endpoint| endpoint.type_name.clone());
+        found.is_some()
+    };
+    if !session.wait_graph(AT_ONCE, &mut look) {
+        eprintln!("axon echo: waiting for {} to appear", text::printable(topic));
+        while !session.wait_graph(Duration::from_secs(3_600), &mut look) {}
+    }
+    found.unwrap_or_default()
+}
+
+/// What the topic's publishers offer: RELIABLE where all of them do.
+fn qos_of(session: &Session, topic: &str) -> Qos {
+    let graph = session.graph();
+    let best_effort = graph.endpoints.values().map(|entry| &entry.endpoint).any(|endpoint| {
+        endpoint.topic == topic
+            && endpoint.kind == EndpointKind::Publisher
+            && endpoint.qos.reliability == Reliability::BestEffort
+    });
+    let reliability = if best_effort { Reliability::BestEffort } else { Reliability::Reliable };
+    Qos { reliability, depth: DEPTH, ..Qos::default() }
+}
+
+fn as_text(info: &MessageInfo, payload: &[u8]) -> String {
+    format!(
+        "{}  {:>9} B  {:<47}  {}",
+        text::instant(info.source_timestamp),
+        payload.len(),
+        text::hex(payload, HEAD),
+        text::ascii(payload, HEAD),
+    )
+}
+
+fn as_json(info: &MessageInfo, payload: &[u8]) -> String {
+    json!({
+        "source_timestamp_ns": info.source_timestamp,
+        "received_timestamp_ns": info.received_timestamp,
+        "publisher": info.publisher,
+        "sequence": info.sequence,
+        "size": payload.len(),
+        "head": text::hex(payload, HEAD),
+    })
+    .to_string()
+}

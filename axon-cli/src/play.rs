@@ -1,0 +1,218 @@
+//! `axon play`: a recorded log, published as it was recorded.
+
+use std::{
+    io::IsTerminal,
+    sync::mpsc,
+    thread,
+    time::{Duration, Instant},
+};
+
+use axon_transport::{
+    qos::Qos,
+    session::{EndpointSpec, Publisher, Session},
+    shm::PublishError,
+};
+use indicatif::{ProgressBar, ProgressStyle};
+
+use crate::{
+    cli::{self, Profile},
+    failure::Failure,
+    log::{LogError, Message, Survey},
+    logging, session, text,
+};
+
+/// Messages read ahead of their time.
+const READ_AHEAD: usize = 64;
+
+impl Profile {
+    /// The policies of the profile.
+    pub(crate) fn qos(self) -> Qos {
+        match self {
+            Self::KeepAll => Qos::keep_all(),
+            Self::Default => Qos::default(),
+            Self::SensorData => Qos::sensor_data(),
+        }
+    }
+}
+
+/// How far a replay is.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Sent {
+    /// Messages published.
+    pub(crate) messages: u64,
+    /// Their bytes.
+    pub(crate) bytes: u64,
+    /// How often a full reader made the publisher wait.
+    pub(crate) waits: u64,
+}
+
+/// Runs `axon play`.
+pub(crate) fn run(args: &cli::Play) -> Result<(), Failure> {
+    let config = logging::configure()?;
+    let survey = Survey::of(&args.file).map_err(Failure::failed)?;
+    let session = session::open(&config, "axon play")?;
+    let publishers = publishers(&session, &survey, args.qos.qos())?;
+    if args.wait > 0 {
+        eprintln!("axon play: waiting for {} subscriptions a topic", args.wait);
+        wait_matched(&publishers, args.wait, Duration::MAX);
+    }
+    let started = Instant::now();
+    let bar = progress_bar(&survey);
+    let mut total = Sent::default();
+    loop {
+        let sent = replay(&survey, &publishers, args.rate, |sent| {
+            bar.set_position(sent.messages);
+            Ok(true)
+        })?;
+        total.messages += sent.messages;
+        total.bytes += sent.bytes;
+        total.waits += sent.waits;
+        if !args.repeat {
+            break;
+        }
+    }
+    bar.finish_and_clear();
+    eprintln!(
+        "axon play: {} messages, {} in {}; waited {} times for a reader",
+        text::grouped(total.messages),
+        text::bytes(total.bytes),
+        text::duration(started.elapsed().as_nanos() as u64),
+        text::grouped(total.waits),
+    );
+    Ok(())
+}
+
+/// A publisher for each topic of the log.
+pub(crate) fn publishers(
+    session: &Session,
+    survey: &Survey,
+    qos: Qos,
+) -> Result<Vec<Publisher>, Failure> {
+    let publisher = |topic: &crate::log::Topic| {
+        let spec = EndpointSpec::new(&topic.name, &topic.type_name, qos);
+        session.create_publisher(spec).map_err(session::failure)
+    };
+    survey.topics.iter().map(publisher).collect()
+}
+
+/// Waits until every publisher has `count` readers; the index of one that has not in time.
+pub(crate) fn wait_matched(
+    publishers: &[Publisher],
+    count: usize,
+    timeout: Duration,
+) -> Option<usize> {
+    let started = Instant::now();
+    publishers.iter().position(|publisher| {
+        !publisher.wait_matched(count, timeout.saturating_sub(started.elapsed()))
+    })
+}
+
+/// Publishes the log at `rate` times its pace, in the order of the file: a message that was
+/// recorded before the one in front of it goes at once. `progress` says whether to go on.
+pub(crate) fn replay(
+    survey: &Survey,
+    publishers: &[Publisher],
+    rate: f64,
+    mut progress: impl FnMut(Sent) -> std::io::Result<bool>,
+) -> Result<Sent, Failure> {
+    let mut sent = Sent::default();
+    let mut pace = None;
+    for message in read_ahead(survey)? {
+        let message = message.map_err(Failure::failed)?;
+        let pace = *pace.get_or_insert_with(|| Pace::new(message.time, rate));
+        thread::sleep(pace.until(message.time, Instant::now()));
+        loop {
+            match publishers[message.topic].publish(&message.data) {
+                Ok(_) => break,
+                Err(PublishError::Blocked { .. }) => sent.waits += 1,
+                Err(error) => {
+                    let topic = &survey.topics[message.topic].name;
+                    return Err(Failure::failed(format_args!("{topic}: {error}")));
+                }
+            }
+            if !progress(sent)? {
+                return Ok(sent);
+            }
+        }
+        sent.messages += 1;
+        sent.bytes += message.data.len() as u64;
+        if !progress(sent)? {
+            return Ok(sent);
+        }
+    }
+    Ok(sent)
+}
+
+/// Reads and decompresses on a thread of its own, so that neither disturbs the pace.
+fn read_ahead(
+    survey: &Survey,
+) -> Result<impl Iterator<Item = Result<Message, LogError>> + use<>, Failure> {
+    let messages = survey.messages().map_err(Failure::failed)?;
+    let (sender, receiver) = mpsc::sync_channel(READ_AHEAD);
+    thread::spawn(move || {
+        for message in messages {
+            if sender.send(message).is_err() {
+                break;
+            }
+        }
+    });
+    Ok(receiver.into_iter())
+}
+
+/// Maps recorded time to time now.
+#[derive(Clone, Copy, Debug)]
+struct Pace {
+    start: Instant,
+    first: u64,
+    rate: f64,
+}
+
+impl Pace {
+    fn new(first: u64, rate: f64) -> Self {
+        Self { start: Instant::now(), first, rate }
+    }
+
+    /// How long to wait at `now` for a message recorded at `time`.
+    fn until(&self, time: u64, now: Instant) -> Duration {
+        if self.rate == 0.0 {
+            return Duration::ZERO;
+        }
+        let recorded = Duration::from_nanos(time.saturating_sub(self.first));
+        // A time that no clock reaches (a rate next to zero) is waited for a day at a time.
+        let due = Duration::try_from_secs_f64(recorded.as_secs_f64() / self.rate)
+            .unwrap_or(Duration::MAX);
+        due.saturating_sub(now.duration_since(self.start)).min(Duration::from_secs(86_400))
+    }
+}
+
+fn progress_bar(survey: &Survey) -> ProgressBar {
+    if !std::io::stderr().is_terminal() {
+        return ProgressBar::hidden();
+    }
+    let bar = ProgressBar::new(survey.messages);
+    if let Ok(style) =
+        ProgressStyle::with_template("{bar:40} {human_pos}/{human_len} {per_sec} {eta}")
+    {
+        bar.set_style(style.progress_chars("=> "));
+    }
+    bar
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pace_is_kept_and_never_overflows() {
+        let second = 1_000_000_000;
+        let pace = Pace::new(5 * second, 2.0);
+        let now = pace.start;
+        assert_eq!(pace.until(5 * second, now), Duration::ZERO);
+        assert_eq!(pace.until(0, now), Duration::ZERO, "recorded out of order");
+        assert_eq!(pace.until(9 * second, now), Duration::from_secs(2));
+        assert_eq!(pace.until(9 * second, now + Duration::from_secs(3)), Duration::ZERO);
+        let slow = Pace::new(0, f64::MIN_POSITIVE);
+        assert_eq!(slow.until(u64::MAX, slow.start), Duration::from_secs(86_400));
+        assert_eq!(Pace::new(0, 0.0).until(u64::MAX, now), Duration::ZERO);
+    }
+}

@@ -1,0 +1,282 @@
+//! `axon status`: what the daemon says of itself, as tables.
+
+use std::{fmt::Write as _, io::Write as _};
+
+use axon_transport::{
+    daemon::status::{LinkStatus, Status},
+    session,
+};
+use serde_json::Value;
+
+use crate::{
+    cli,
+    failure::Failure,
+    logging,
+    text::{self, Table, grouped},
+};
+
+/// Runs `axon status`.
+pub(crate) fn run(args: &cli::Status) -> Result<(), Failure> {
+    let config = logging::configure()?;
+    let json = session::daemon_status(&config).map_err(crate::session::failure)?;
+    let text = if args.json {
+        let value: Value = serde_json::from_str(&json).map_err(Failure::failed)?;
+        serde_json::to_string_pretty(&value).map_err(Failure::failed)? + "\n"
+    } else {
+        render(&serde_json::from_str(&json).map_err(Failure::failed)?)
+    };
+    std::io::stdout().lock().write_all(text.as_bytes())?;
+    Ok(())
+}
+
+/// The status for people.
+fn render(status: &Status) -> String {
+    let mut out = String::new();
+    heading(&mut out, "Daemon");
+    let uptime = text::duration(status.uptime_s.saturating_mul(1_000_000_000));
+    let port = status.port.map_or_else(|| "none".to_owned(), |port| port.to_string());
+    facts(
+        &mut out,
+        &[
+            ("id", status.daemon.clone()),
+            ("process", format!("{}, up {uptime}, version {}", status.pid, status.version)),
+            ("domain", status.domain.to_string()),
+            ("mode", mode(status)),
+            ("socket", status.socket.clone()),
+            ("keeps files in", status.runtime_dir.clone().unwrap_or_else(|| "nothing".to_owned())),
+            ("gateway", format!("{}, UDP port {port}", status.gateway)),
+        ],
+    );
+    section(&mut out, "Settings", "none", settings(status));
+    section(&mut out, "Links", "no other host is linked", links(&status.links));
+    keys(&mut out, &status.keys);
+    section(&mut out, "Topics", "none", topics(status));
+    section(&mut out, "Sessions", "none", sessions(status));
+    section(&mut out, "Refusals", "nobody was refused", refusals(status));
+    out
+}
+
+fn mode(status: &Status) -> String {
+    let details = [status.key_mode.as_deref(), status.kex.as_deref(), Some(&status.cipher)];
+    let sae = status.sae.as_ref().map(|sae| format!(", SAE {sae}")).unwrap_or_default();
+    let details: Vec<&str> = details.into_iter().flatten().collect();
+    format!("{} ({}){sae}", status.mode, details.join(", "))
+}
+
+fn settings(status: &Status) -> Table {
+    let mut table = Table::new(&["variable", "value"]);
+    for (name, value) in &status.settings {
+        table.row([name.clone(), value.clone()]);
+    }
+    table
+}
+
+fn links(links: &[LinkStatus]) -> Table {
+    let mut table = Table::new(&[
+        "host",
+        "address",
+        "SAE",
+        "state",
+        "key exchange",
+        "cipher",
+        "peer is",
+        ">rtt",
+        ">in",
+        ">out",
+        ">dropped",
+    ]);
+    for link in links {
+        let traffic = |samples, bytes| format!("{} ({})", grouped(samples), text::bytes(bytes));
+        table.row([
+            link.host.clone(),
+            link.address.clone(),
+            link.sae.clone().unwrap_or_else(dash),
+            link.state.clone(),
+            link.key_exchange.clone(),
+            link.cipher.clone(),
+            link.authenticated_as.clone(),
+            text::duration(link.rtt_us.saturating_mul(1_000)),
+            traffic(link.samples_in, link.bytes_in),
+            traffic(link.samples_out, link.bytes_out),
+            dropped(link),
+        ]);
+    }
+    table
+}
+
+fn dropped(link: &LinkStatus) -> String {
+    let causes = link.dropped.iter().filter(|(_, count)| **count > 0);
+    let causes: Vec<String> =
+        causes.map(|(cause, count)| format!("{} {cause}", grouped(*count))).collect();
+    if causes.is_empty() { "0".to_owned() } else { causes.join(", ") }
+}
+
+/// The key supply comes as the gateway describes it: every value under its path.
+fn keys(out: &mut String, keys: &Value) {
+    let mut table = Table::new(&["of", ">value"]);
+    flatten(&mut table, "", keys);
+    section(out, "Keys", "no key manager in this mode", table);
+}
+
+fn flatten(table: &mut Table, path: &str, value: &Value) {
+    let under = |name: &str| {
+        if path.is_empty() { name.to_owned() } else { format!("{path} {name}") }
+    };
+    match value {
+        Value::Null => {}
+        Value::Object(fields) => {
+            fields.iter().for_each(|(name, value)| flatten(table, &under(name), value));
+        }
+        Value::Array(items) => {
+            for (number, value) in items.iter().enumerate() {
+                flatten(table, &under(&(number + 1).to_string()), value);
+            }
+        }
+        Value::String(text) => table.row([path.to_owned(), text.clone()]),
+        value => table.row([path.to_owned(), value.to_string()]),
+    }
+}
+
+fn topics(status: &Status) -> Table {
+    let mut table = Table::new(&[
+        "topic",
+        "type",
+        ">publishers",
+        ">elsewhere",
+        ">subscriptions",
+        ">elsewhere",
+        ">published",
+        ">arrived",
+        ">lost",
+    ]);
+    for topic in &status.topics {
+        let lost = topic.readers.iter().map(|reader| reader.lost).sum();
+        table.row([
+            topic.topic.clone(),
+            topic.type_name.clone(),
+            topic.publishers.to_string(),
+            topic.remote_publishers.to_string(),
+            topic.subscriptions.to_string(),
+            topic.remote_subscriptions.to_string(),
+            grouped(topic.published),
+            grouped(topic.arrived),
+            grouped(lost),
+        ]);
+    }
+    table
+}
+
+fn sessions(status: &Status) -> Table {
+    let mut table = Table::new(&[">process", "name", "role", ">endpoints"]);
+    for session in &status.sessions {
+        let (pid, endpoints) = (session.pid.to_string(), session.endpoints.to_string());
+        table.row([pid, session.name.clone(), session.role.clone(), endpoints]);
+    }
+    table
+}
+
+fn refusals(status: &Status) -> Table {
+    let mut table = Table::new(&["when", "who", "what", "why"]);
+    for refusal in &status.refusals {
+        let nanoseconds = i64::try_from(refusal.unix_ms).unwrap_or(0).saturating_mul(1_000_000);
+        table.row([
+            text::instant(nanoseconds),
+            refusal.peer.clone(),
+            refusal.what.clone(),
+            refusal.reason.clone(),
+        ]);
+    }
+    table
+}
+
+fn dash() -> String {
+    "-".to_owned()
+}
+
+fn heading(out: &mut String, title: &str) {
+    let gap = if out.is_empty() { "" } else { "\n" };
+    let _ = writeln!(out, "{gap}{title}");
+}
+
+fn facts(out: &mut String, facts: &[(&str, String)]) {
+    for (name, value) in facts {
+        let _ = writeln!(out, "  {name:<14}  {}", text::printable(value));
+    }
+}
+
+fn section(out: &mut String, title: &str, none: &str, table: Table) {
+    heading(out, title);
+    if table.is_empty() {
+        let _ = writeln!(out, "  {none}");
+    } else {
+        out.push_str(&table.render(2));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use axon_transport::daemon::status::{RefusalStatus, TopicStatus};
+    use serde_json::json;
+
+    use super::*;
+
+    fn status() -> Status {
+        Status {
+            daemon: "00ff".to_owned(),
+            pid: 7,
+            uptime_s: 90,
+            protocol: 1,
+            version: "0.1.0".to_owned(),
+            domain: 3,
+            settings: BTreeMap::from([("AXON_SECURITY_MODE".to_owned(), "qkd".to_owned())]),
+            mode: "qkd".to_owned(),
+            key_mode: Some("messages10".to_owned()),
+            kex: Some("psk_ke".to_owned()),
+            cipher: "chacha20-poly1305".to_owned(),
+            sae: Some("sae-a".to_owned()),
+            socket: "@axon/0/3/1".to_owned(),
+            runtime_dir: None,
+            port: Some(61_348),
+            gateway: "running".to_owned(),
+            sessions: Vec::new(),
+            topics: vec![TopicStatus { topic: "/scan".to_owned(), ..TopicStatus::default() }],
+            links: vec![LinkStatus {
+                host: "evil\x1b[2J".to_owned(),
+                dropped: BTreeMap::from([("no_key".to_owned(), 1_000), ("other".to_owned(), 0)]),
+                ..LinkStatus::default()
+            }],
+            keys: json!({"kme": {"enc": {"calls": 12}}, "peers": [{"ready": 4}]}),
+            refusals: vec![RefusalStatus {
+                unix_ms: u64::MAX,
+                peer: "sae-x".to_owned(),
+                what: "handshake".to_owned(),
+                reason: "wrong PSK".to_owned(),
+            }],
+        }
+    }
+
+    #[test]
+    fn what_a_peer_calls_itself_cannot_steer_the_terminal() {
+        assert!(!render(&status()).contains('\x1b'));
+    }
+
+    #[test]
+    fn every_part_is_shown() {
+        let text = render(&status());
+        for part in [
+            "qkd (messages10, psk_ke, chacha20-poly1305), SAE sae-a",
+            "AXON_SECURITY_MODE",
+            "1,000 no_key",
+            "kme enc calls",
+            "peers 1 ready",
+            "/scan",
+            "wrong PSK",
+            "Sessions\n  none\n",
+        ] {
+            assert!(text.contains(part), "{part:?} is missing in:\n{text}");
+        }
+        assert!(!text.contains("other"), "a cause that never happened is not shown:\n{text}");
+    }
+}

@@ -1,0 +1,117 @@
+//! `play`, `echo`, `status` and `daemon` on one host, over the daemon that the tool starts itself.
+
+#![forbid(unsafe_code)]
+
+mod common;
+
+use common::{Host, LOG, Running, eventually};
+use rustix::process::Signal;
+
+#[test]
+fn status_without_a_daemon_says_so_and_starts_none() {
+    let host = Host::new();
+    let output = host.run(&["status"]);
+    assert_eq!(output.status.code(), Some(1));
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(stderr.contains("no daemon"), "{stderr}");
+    assert!(host.status().is_none());
+}
+
+#[test]
+fn play_of_what_is_no_log_fails_and_names_it() {
+    let host = Host::new();
+    for file in ["/nonexistent.mcap", concat!(env!("CARGO_MANIFEST_DIR"), "/Cargo.toml")] {
+        let output = host.run(&["play", file]);
+        assert_eq!(output.status.code(), Some(1));
+        assert!(String::from_utf8_lossy(&output.stderr).contains(file));
+    }
+    assert!(host.status().is_none(), "no daemon is started for a log that cannot be read");
+}
+
+/// An `echo` for each topic of the log, its messages awaited.
+struct Echoes([(Running, u64); 3]);
+
+impl Echoes {
+    fn start(host: &Host) -> Self {
+        Self([("/scan", 1_988), ("/odom", 1_988), ("/tf", 1_988)].map(|(topic, count)| {
+            let text = count.to_string();
+            let args = ["echo", topic, "--qos", "keep-all", "--json", "--count", &text];
+            (Running::start(host.axon(&args)), count)
+        }))
+    }
+
+    /// Every message came, once and in order.
+    fn assert_whole(self) {
+        for (mut echo, count) in self.0 {
+            let sequences: Vec<u64> = echo.lines().map(|line| sequence(&line)).collect();
+            assert_eq!(sequences, (1..=count).collect::<Vec<_>>());
+            assert!(echo.finish().status.success());
+        }
+    }
+}
+
+fn sequence(line: &str) -> u64 {
+    let message: serde_json::Value = serde_json::from_str(line).expect("JSON");
+    message["sequence"].as_u64().expect("a sequence number")
+}
+
+#[test]
+fn echo_prints_every_message_that_play_publishes() {
+    let host = Host::new();
+    let echoes = Echoes::start(&host);
+    let play = Running::start(host.axon(&["play", LOG, "--rate", "0", "--wait", "1"]));
+    echoes.assert_whole();
+    let play = play.finish();
+    assert!(play.status.success(), "{}", String::from_utf8_lossy(&play.stderr));
+}
+
+#[test]
+fn echo_finds_the_type_and_shows_the_message() {
+    let host = Host::new();
+    let mut echo = Running::start(host.axon(&["echo", "/odom", "--count", "1"]));
+    let mut lines = echo.lines();
+    let _play = Running::start(host.axon(&["play", LOG, "--rate", "10", "--loop"]));
+    let line = lines.next().expect("a line");
+    assert!(line.contains(" B  00 01 00 00"), "no CDR header in {line:?}");
+    assert!(lines.next().is_none());
+    assert!(echo.finish().status.success());
+}
+
+#[test]
+fn a_daemon_killed_in_the_middle_of_a_replay_loses_nothing_and_has_a_successor() {
+    let host = Host::new();
+    let echoes = Echoes::start(&host);
+    let play = Running::start(host.axon(&["play", LOG, "--rate", "60", "--wait", "1"]));
+    eventually("the middle of the replay", || published(&host) > 500);
+    let before = host.daemon().expect("a daemon");
+    assert!(host.kill_daemon(Signal::KILL));
+    eventually("the next daemon", || host.daemon().is_some_and(|pid| pid != before));
+    assert!(published(&host) < 5_000, "it was killed after the replay, which shows nothing");
+    echoes.assert_whole();
+    assert!(play.finish().status.success());
+}
+
+#[test]
+fn the_daemon_in_the_foreground_is_the_one_that_status_shows_and_ends_on_sigterm() {
+    let host = Host::new();
+    let daemon = Running::start(host.axon(&["daemon"]));
+    eventually("the daemon", || host.status().is_some());
+    let shown = host.status().expect("a status");
+    assert_eq!(shown["pid"], daemon.0.id());
+    assert_eq!(shown["mode"], "classic");
+    let text = String::from_utf8(host.run(&["status"]).stdout).expect("text");
+    for part in ["Daemon", "Links", "Keys", "Topics", "Refusals", "classic"] {
+        assert!(text.contains(part), "{part} is missing in:\n{text}");
+    }
+    assert!(host.kill_daemon(Signal::TERM));
+    let output = daemon.finish();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(host.status().is_none());
+}
+
+/// Samples that the log's topics have seen on this host.
+fn published(host: &Host) -> u64 {
+    let Some(status) = host.status() else { return 0 };
+    let topics = status["topics"].as_array().expect("topics");
+    topics.iter().map(|topic| topic["published"].as_u64().expect("a count")).sum()
+}

@@ -1,0 +1,65 @@
+//! A bad setting ends every command with status 2 and one line that names the variable.
+
+#![forbid(unsafe_code)]
+
+mod common;
+
+use common::{LOG, axon};
+
+const COMMANDS: [&[&str]; 5] =
+    [&["demo"], &["play", LOG], &["echo", "/scan"], &["status"], &["daemon"]];
+
+fn assert_refused(args: &[&str], settings: &[(&str, &str)], variable: &str) {
+    let dir = tempfile::tempdir().expect("temporary directory");
+    let path = dir.path().to_str().expect("UTF-8");
+    let mut command = axon(settings.iter().copied());
+    let output = command.env("AXON_RUNTIME_DIR", path).args(args).output().expect("runs");
+    let stderr = String::from_utf8(output.stderr).expect("text");
+    assert_eq!(output.status.code(), Some(2), "{args:?} under {settings:?}: {stderr}");
+    assert_eq!(stderr.lines().count(), 1, "{args:?} under {settings:?}: {stderr:?}");
+    assert!(stderr.contains(variable), "{args:?} under {settings:?}: {stderr}");
+    assert_eq!(output.stdout, b"", "{args:?} under {settings:?}");
+    let left = std::fs::read_dir(dir.path()).expect("directory").count();
+    assert_eq!(left, 0, "{args:?} under {settings:?}: something was made before validation");
+}
+
+#[test]
+fn obsolete_and_unknown_variables_are_refused_by_every_command() {
+    for args in COMMANDS {
+        for name in
+            ["AXON_SECURITY_PROFILE", "AXON_ENCRYPTION_MODE", "AXON_ENCRYPTION_KEY", "AXON_TYPO"]
+        {
+            assert_refused(args, &[(name, "x")], name);
+        }
+    }
+}
+
+#[test]
+fn an_obsolete_key_is_not_repeated() {
+    let mut command = axon([("AXON_ENCRYPTION_KEY", "hunter2hunter2")]);
+    let output = command.arg("status").output().expect("runs");
+    assert!(!String::from_utf8_lossy(&output.stderr).contains("hunter2"));
+}
+
+#[test]
+fn bad_values_and_half_given_settings_name_the_variable() {
+    for (settings, variable) in [
+        (&[("AXON_SECURITY_MODE", "none")][..], "AXON_SECURITY_MODE"),
+        (&[("AXON_SECURITY_MODE", "")], "AXON_SECURITY_MODE"),
+        (&[("AXON_QUIC_CIPHER", "aes-128-gcm")], "AXON_QUIC_CIPHER"),
+        (&[("AXON_SECURITY_MODE", "qkd")], "AXON_"),
+        (&[("AXON_BIND_ADDRS", "nowhere")], "AXON_BIND_ADDRS"),
+        (&[("AXON_LOG", "info=\nwarn=nonsense")], "AXON_LOG"),
+        (&[("ROS_DOMAIN_ID", "-1")], "ROS_DOMAIN_ID"),
+        (&[("AXON_DAEMON", "maybe")], "AXON_DAEMON"),
+    ] {
+        assert_refused(&["status"], settings, variable);
+    }
+}
+
+#[test]
+fn a_wrong_argument_has_status_2_too() {
+    for args in [&["play"][..], &["play", LOG, "--rate", "nan"], &["echo"], &["dance"]] {
+        assert_eq!(axon([]).args(args).output().expect("runs").status.code(), Some(2), "{args:?}");
+    }
+}
