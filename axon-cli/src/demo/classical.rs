@@ -34,8 +34,13 @@ const ANSWER: Duration = Duration::from_secs(5);
 pub(crate) enum Outcome {
     /// The handshake completed.
     Connected,
-    /// The peer ended it, in these words.
-    Refused(String),
+    /// The peer ended the handshake.
+    Refused {
+        /// With this TLS alert, if with one.
+        alert: Option<u8>,
+        /// In these words.
+        reason: String,
+    },
 }
 
 /// Connects from the address of `from` to an AXON daemon in classic, offering `groups`.
@@ -59,7 +64,13 @@ pub(crate) async fn connect(
             connection.close(0_u32.into(), b"");
             Ok(Outcome::Connected)
         }
-        Err(ConnectionError::ConnectionClosed(close)) => Ok(Outcome::Refused(close.to_string())),
+        Err(ConnectionError::ConnectionClosed(close)) => {
+            // QUIC carries an alert in the low byte of a CRYPTO_ERROR, 0x0100 to 0x01ff (RFC 9001,
+            // section 4.8).
+            let code = u64::from(close.error_code);
+            let alert = (code >> 8 == 1).then_some(code.to_be_bytes()[7]);
+            Ok(Outcome::Refused { alert, reason: close.to_string() })
+        }
         Err(error) => Err(text(&error)),
     }
 }
@@ -160,6 +171,6 @@ mod tests {
         let right = against_a_server(&[kx_group::X25519MLKEM768]).await;
         assert!(matches!(right, Outcome::Connected), "{right:?}");
         let wrong = against_a_server(&CLASSICAL).await;
-        assert!(matches!(wrong, Outcome::Refused(_)), "{wrong:?}");
+        assert!(matches!(wrong, Outcome::Refused { alert: Some(40), .. }), "{wrong:?}");
     }
 }

@@ -35,6 +35,28 @@ const VISITOR: &str = "127.0.0.1";
 /// Time that the daemon has to record a refusal.
 const RECORD: Duration = Duration::from_secs(5);
 
+/// What is tried, and the name of the one refusal that answers it: a TLS alert, or the close code
+/// of a link (`docs/formats.md`, section 6). Refused for another reason is not refused for this.
+#[derive(Clone, Copy, Debug)]
+struct Wrong {
+    peer: &'static str,
+    refusal: &'static str,
+}
+
+const CLASSICAL_GROUPS: Wrong = Wrong {
+    peer: "a client with classical groups only (X25519, P-256, P-384)",
+    refusal: "TLS alert handshake_failure",
+};
+const CLASSIC_AGAINST_QKD: Wrong =
+    Wrong { peer: "classic against qkd", refusal: "TLS alert missing_extension" };
+const UNKNOWN_IDENTITY: Wrong =
+    Wrong { peer: "an unknown PSK identity", refusal: "TLS alert unknown_psk_identity" };
+const WRONG_PSK: Wrong = Wrong { peer: "a wrong PSK", refusal: "TLS alert decrypt_error" };
+const WRONG_KEY_MODE: Wrong =
+    Wrong { peer: "messages10 against session", refusal: "KEY_MODE_MISMATCH" };
+const TAMPERED: Wrong = Wrong { peer: "a tampered envelope", refusal: "ENVELOPE_REFUSED" };
+const REPLAYED: Wrong = Wrong { peer: "a replayed envelope", refusal: "ENVELOPE_REFUSED" };
+
 /// Attempts against one host.
 pub(crate) struct Visit<'a> {
     /// The mode of the host.
@@ -55,42 +77,44 @@ impl Visit<'_> {
         match self.mode {
             Mode::Classic => Ok(vec![self.classical_groups().await?]),
             Mode::Session => Ok(vec![
-                self.link("classic against qkd", Mode::Classic, Bootstrap::Genuine).await?,
-                self.link("an unknown PSK identity", Mode::Session, Bootstrap::UnknownKeyId)
-                    .await?,
-                self.link("a wrong PSK", Mode::Session, Bootstrap::WrongKey).await?,
-                self.link("messages10 against session", Mode::Messages10, Bootstrap::Genuine)
-                    .await?,
+                self.link(CLASSIC_AGAINST_QKD, Mode::Classic, Bootstrap::Genuine).await?,
+                self.link(UNKNOWN_IDENTITY, Mode::Session, Bootstrap::UnknownKeyId).await?,
+                self.link(WRONG_PSK, Mode::Session, Bootstrap::WrongKey).await?,
+                self.link(WRONG_KEY_MODE, Mode::Messages10, Bootstrap::Genuine).await?,
             ]),
             Mode::Messages10 => self.envelopes().await,
         }
     }
 
     async fn classical_groups(&self) -> Result<Attempt, DemoError> {
-        let peer = "a client with classical groups only (X25519, P-256, P-384)";
+        const HANDSHAKE_FAILURE: u8 = 40;
+        let wrong = CLASSICAL_GROUPS;
         let before = self.refusals().await?;
         let from = SocketAddr::from(([127, 0, 0, 1], 0));
-        let outcome = classical::connect(&classical::CLASSICAL, from, self.target(peer).await?);
-        let told = match outcome.await {
-            Ok(classical::Outcome::Refused(reason)) => Some(reason),
+        let target = self.target(wrong.peer).await?;
+        let told = match classical::connect(&classical::CLASSICAL, from, target).await {
+            Ok(classical::Outcome::Refused { alert, reason }) => {
+                Some((alert == Some(HANDSHAKE_FAILURE), reason))
+            }
             Ok(classical::Outcome::Connected) => None,
-            Err(reason) => return Err(DemoError::Attempt { attempt: peer, reason }),
+            Err(reason) => return Err(DemoError::Attempt { attempt: wrong.peer, reason }),
         };
-        self.attempt(peer, told, &before).await
+        self.attempt(wrong, told, &before).await
     }
 
     /// A dial as a daemon of `mode` makes it.
     async fn link(
         &self,
-        peer: &'static str,
+        wrong: Wrong,
         mode: Mode,
         bootstrap: Bootstrap,
     ) -> Result<Attempt, DemoError> {
         let before = self.refusals().await?;
-        let target = self.target(peer).await?;
+        let target = self.target(wrong.peer).await?;
         let sae = mode.is_qkd().then_some(kmes::SAE_B);
-        let outcome = attempt::link(&self.visitor(peer, mode)?, target, sae, bootstrap).await;
-        self.judge(peer, outcome.map(drop), &before).await
+        let config = self.visitor(wrong.peer, mode)?;
+        let outcome = attempt::link(&config, target, sae, bootstrap).await;
+        self.judge(wrong, outcome.map(drop), &before).await
     }
 
     /// Envelopes over a link that is as it should be. That an honest one is taken, on a link made
@@ -103,12 +127,10 @@ impl Visit<'_> {
             DemoError::Attempt { attempt: honest, reason }
         })?;
         let mut attempts = Vec::new();
-        for (peer, tamper) in
-            [("a tampered envelope", Tamper::FlipBit), ("a replayed envelope", Tamper::Replay)]
-        {
+        for (wrong, tamper) in [(TAMPERED, Tamper::FlipBit), (REPLAYED, Tamper::Replay)] {
             let before = self.refusals().await?;
-            let outcome = self.envelope(peer, tamper).await?;
-            attempts.push(self.judge(peer, outcome, &before).await?);
+            let outcome = self.envelope(wrong.peer, tamper).await?;
+            attempts.push(self.judge(wrong, outcome, &before).await?);
         }
         reader.stop().await;
         Ok(attempts)
@@ -137,47 +159,53 @@ impl Visit<'_> {
 
     async fn judge(
         &self,
-        peer: &'static str,
+        wrong: Wrong,
         outcome: Result<(), Refusal>,
         before: &[Value],
     ) -> Result<Attempt, DemoError> {
         let told = match outcome {
             Ok(()) => None,
             Err(refusal) if refusal.by == RefusedBy::Peer => {
-                Some(format!("{}: {}", refusal.name, refusal.reason))
+                let reason = format!("{}: {}", refusal.name, refusal.reason);
+                Some((refusal.name == wrong.refusal, reason))
             }
             // Then it is not the daemon that refused.
             Err(refusal) => {
-                return Err(DemoError::Attempt { attempt: peer, reason: refusal.to_string() });
+                let reason = refusal.to_string();
+                return Err(DemoError::Attempt { attempt: wrong.peer, reason });
             }
         };
-        self.attempt(peer, told, before).await
+        self.attempt(wrong, told, before).await
     }
 
-    /// Refused is who was told so, and of whom the daemon's own record says so.
+    /// `told`: whether the refusal has the right name, and its words. Refused is who was told so
+    /// and of whom the daemon's own record says the same.
     async fn attempt(
         &self,
-        peer: &'static str,
-        told: Option<String>,
+        wrong: Wrong,
+        told: Option<(bool, String)>,
         before: &[Value],
     ) -> Result<Attempt, DemoError> {
-        let recorded = match &told {
-            Some(_) => self.recorded(before).await?,
-            None => None,
+        let Some((right, told)) = told else {
+            let told = "nothing: it was let in".to_owned();
+            return Ok(Attempt { peer: wrong.peer, refused: false, told, recorded: None });
         };
-        Ok(Attempt {
-            peer,
-            refused: told.is_some() && recorded.is_some(),
-            told: told.unwrap_or_else(|| "nothing: it was let in".to_owned()),
-            recorded: Some(recorded.unwrap_or_else(|| "nothing".to_owned())),
-        })
+        let recorded = self.recorded(wrong.refusal, before).await?;
+        let refused = right && recorded.is_some();
+        let recorded = recorded.unwrap_or_else(|| format!("no {}", wrong.refusal));
+        Ok(Attempt { peer: wrong.peer, refused, told, recorded: Some(recorded) })
     }
 
-    async fn recorded(&self, before: &[Value]) -> Result<Option<String>, DemoError> {
+    /// The daemon's record of a refusal with this name that is not among those `before`.
+    async fn recorded(
+        &self,
+        refusal: &str,
+        before: &[Value],
+    ) -> Result<Option<String>, DemoError> {
         let deadline = Instant::now() + RECORD;
         loop {
-            let new = self.refusals().await?.into_iter().rfind(|entry| !before.contains(entry));
-            if let Some(entry) = new {
+            let is_it = |entry: &Value| entry["what"] == refusal && !before.contains(entry);
+            if let Some(entry) = self.refusals().await?.into_iter().rfind(is_it) {
                 let text = |key: &str| entry[key].as_str().unwrap_or("?").to_owned();
                 return Ok(Some(format!("{}: {}: {}", text("peer"), text("what"), text("reason"))));
             }
