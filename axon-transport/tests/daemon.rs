@@ -6,6 +6,11 @@ use std::{io::Write, os::fd::OwnedFd, time::Duration};
 
 use axon_transport::{
     config::{Config, DaemonPolicy},
+    daemon::{
+        self, DaemonOptions, GatewayEntry,
+        bridge::{GatewayParts, ToControl},
+        status::Status,
+    },
     qos::Qos,
     session::{
         EndpointSpec, Publisher, Session, SessionError, SessionOptions, Subscription,
@@ -159,7 +164,7 @@ fn a_daemon_killed_in_the_middle_loses_nothing_and_another_takes_over() {
     });
 }
 
-fn gateways(status: &axon_transport::daemon::status::Status) -> usize {
+fn gateways(status: &Status) -> usize {
     status.sessions.iter().filter(|s| s.role == "gateway").count()
 }
 
@@ -400,6 +405,47 @@ fn a_second_daemon_by_hand_says_that_there_is_one() {
     assert_eq!(output.status.code(), Some(1));
     let text = String::from_utf8(output.stderr).unwrap();
     assert!(text.contains("another daemon"), "{text}");
+}
+
+/// A gateway that stands, and then fails at once.
+fn failing_gateway(parts: GatewayParts) -> Result<(), String> {
+    parts.control.blocking_send(ToControl::Started { port: 1 }).unwrap();
+    panic!("as a gateway may")
+}
+
+#[test]
+fn a_gateway_that_panics_is_started_again_and_nobody_else_notices() {
+    let host = Host::new();
+    let config = host.config();
+    let daemon = std::thread::spawn(move || {
+        let options = DaemonOptions { gateway: Some(failing_gateway), ..DaemonOptions::default() };
+        daemon::run(config, options)
+    });
+    until("the daemon answers", || host.status().is_ok());
+    let session = host.session("a").unwrap();
+    let publisher = session.create_publisher(spec("/t")).unwrap();
+    for _ in 0..3 {
+        until("it failed", || host.status().unwrap().gateway.contains("panicked"));
+        let other = host.session("b").unwrap();
+        let subscription = other.create_subscription(spec("/t")).unwrap();
+        assert!(subscription.wait_matched(1, PATIENCE) && publisher.wait_matched(1, PATIENCE));
+        publisher.publish(b"x").unwrap();
+        assert!(subscription.recv(&mut Vec::new(), Some(PATIENCE)).is_some());
+        drop(subscription);
+        until("the reader is gone", || publisher.matched().is_empty());
+    }
+    // It would end when nobody needs it; the test need not wait for that.
+    assert!(!daemon.is_finished());
+}
+
+#[test]
+fn a_gateway_that_cannot_start_is_an_error_of_the_daemon() {
+    let host = Host::new();
+    let gateway: GatewayEntry = |_| Err("AXON_SAE_KEY: no key in it".into());
+    let options = DaemonOptions { gateway: Some(gateway), ..DaemonOptions::default() };
+    let error = daemon::run(host.config(), options).unwrap_err();
+    assert!(error.to_string().contains("AXON_SAE_KEY"), "{error}");
+    assert!(matches!(host.status(), Err(SessionError::NoDaemon { .. })));
 }
 
 #[test]

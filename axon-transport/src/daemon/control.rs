@@ -127,7 +127,7 @@ impl Control {
     }
 
     /// What the gateway says, but for what concerns discovery alone.
-    pub(super) fn from_gateway(&mut self, message: ToControl) {
+    pub(super) fn gateway_says(&mut self, message: ToControl) {
         match message {
             ToControl::Started { port } => {
                 self.port = Some(port);

@@ -43,7 +43,10 @@ pub(super) struct Running {
 
 impl Running {
     /// Starts one.
-    pub(super) fn start(control: &Rc<RefCell<Control>>, entry: GatewayEntry) -> std::io::Result<Self> {
+    pub(super) fn start(
+        control: &Rc<RefCell<Control>>,
+        entry: GatewayEntry,
+    ) -> std::io::Result<Self> {
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
         let (ours, theirs) = socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None)?;
         let (to_control, events) = mpsc::channel(CHANNEL);
@@ -86,7 +89,7 @@ impl Running {
         };
         match timeout(START, started).await {
             Ok(Ok(event)) => {
-                control.borrow_mut().from_gateway(event);
+                control.borrow_mut().gateway_says(event);
                 Ok(())
             }
             // It closed the channel before it ended: the end says why.

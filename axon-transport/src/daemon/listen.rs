@@ -195,7 +195,8 @@ fn send_all(
 ) -> Result<bool, SocketError> {
     let registry = &mut control.borrow_mut().registry;
     while let Some(output) = registry.next_output(id) {
-        let descriptors: Vec<BorrowedFd<'_>> = output.descriptors.iter().map(|d| d.as_fd()).collect();
+        let descriptors: Vec<BorrowedFd<'_>> =
+            output.descriptors.iter().map(|d| d.as_fd()).collect();
         match socket::send(socket.get_ref(), &output.packet, &descriptors) {
             Ok(()) => {}
             Err(SocketError::NotReady) => {

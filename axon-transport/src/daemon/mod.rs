@@ -5,8 +5,8 @@
 //! hosts runs on a thread and runtime of its own; `bridge` is all they share. Samples between
 //! processes of this host pass neither.
 
-pub mod bridge;
 mod admission;
+pub mod bridge;
 mod control;
 mod gateway;
 mod inherit;

@@ -110,7 +110,7 @@ impl Remote {
         }
         match event {
             ToControl::Datagram { from, bytes } => self.tell(Event::Datagram { from, bytes }),
-            other => control.borrow_mut().from_gateway(other),
+            other => control.borrow_mut().gateway_says(other),
         }
     }
 
@@ -197,8 +197,7 @@ impl Discovery {
         let (events, inbox) = mpsc::channel(CHANNEL);
         let (outbox, actions) = mpsc::channel(CHANNEL);
         let (config, daemon) = (Arc::clone(&control.config), control.id);
-        let task =
-            spawn_local(async move { discovery::run(&config, daemon, inbox, outbox).await });
+        let task = spawn_local(async move { discovery::run(&config, daemon, inbox, outbox).await });
         Self { events, actions, task }
     }
 

@@ -110,8 +110,16 @@ fn own_file() -> Option<PathBuf> {
 /// Whether a daemon gets this variable: what it reads, and what its system libraries need.
 fn inherited(name: &OsString) -> bool {
     const NAMES: &[&str] = &[
-        "HOME", "LANG", "LD_LIBRARY_PATH", "LOGNAME", "PATH", "RUST_BACKTRACE", "TMPDIR", "TZ",
-        "USER", "XDG_RUNTIME_DIR",
+        "HOME",
+        "LANG",
+        "LD_LIBRARY_PATH",
+        "LOGNAME",
+        "PATH",
+        "RUST_BACKTRACE",
+        "TMPDIR",
+        "TZ",
+        "USER",
+        "XDG_RUNTIME_DIR",
     ];
     const PREFIXES: &[&str] = &["AXON_", "ROS_", "LC_"];
     name.to_str().is_some_and(|name| {

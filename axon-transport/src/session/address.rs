@@ -62,6 +62,9 @@ pub enum AddressError {
     /// Nobody listens.
     #[error("no daemon listens there")]
     Absent,
+    /// Somebody listens, but has too many callers waiting to take another.
+    #[error("the daemon there has too many callers waiting")]
+    Busy,
     /// Another daemon has it.
     #[error("another daemon has the address")]
     Taken,
@@ -93,16 +96,16 @@ impl Address {
         }
     }
 
-    /// Connects to the daemon there.
+    /// Connects to the daemon there, without waiting for one that does not answer.
     ///
     /// # Errors
     /// [`AddressError::Absent`] when there is none.
     pub fn connect(&self) -> Result<OwnedFd, AddressError> {
-        let socket = seqpacket(SocketFlags::CLOEXEC)?;
+        let socket = seqpacket(SocketFlags::CLOEXEC | SocketFlags::NONBLOCK)?;
         match connect(&socket, &self.name()?) {
             Ok(()) => Ok(socket),
             Err(Errno::CONNREFUSED | Errno::NOENT) => Err(AddressError::Absent),
-            // The backlog of a daemon that starts is full; it is there all the same.
+            Err(Errno::AGAIN) => Err(AddressError::Busy),
             Err(errno) => Err(errno.into()),
         }
     }
@@ -174,11 +177,7 @@ impl std::fmt::Display for Address {
 /// # Errors
 /// Names the directory and what is wrong with it.
 pub fn private_directory(dir: &Path) -> Result<(), AddressError> {
-    DirBuilder::new()
-        .recursive(true)
-        .mode(0o700)
-        .create(dir)
-        .map_err(|e| directory(dir, &e))?;
+    DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(|e| directory(dir, &e))?;
     let meta = std::fs::metadata(dir).map_err(|e| directory(dir, &e))?;
     let uid = rustix::process::geteuid().as_raw();
     let refuse = |reason: String| AddressError::Directory { path: dir.into(), reason };

@@ -86,6 +86,7 @@ impl Caller<'_> {
         let socket = match address.connect() {
             Ok(socket) => socket,
             Err(AddressError::Absent) => return Err(Attempt::Absent),
+            Err(AddressError::Busy) => return Err(Attempt::Again),
             Err(error) => return Err(Attempt::Final(error.into())),
         };
         let peer = socket::peer(&socket).map_err(|_| Attempt::Again)?;
@@ -140,7 +141,9 @@ impl Caller<'_> {
         loop {
             match socket::send(&socket, &packet, &descriptors) {
                 Ok(()) => break,
-                Err(SocketError::NotReady) => self.await_socket(&socket, PollFlags::OUT, deadline, address)?,
+                Err(SocketError::NotReady) => {
+                    self.await_socket(&socket, PollFlags::OUT, deadline, address)?
+                }
                 // It ended between our connecting and our speaking.
                 Err(_) => return Err(Attempt::Again),
             }

@@ -93,7 +93,8 @@ impl Session {
             None
         } else {
             let id = segment.id();
-            let caller = Caller { config, options: &options, id, segment: Some(&segment), cancel: None };
+            let caller =
+                Caller { config, options: &options, id, segment: Some(&segment), cancel: None };
             Some(caller.connect()?)
         };
         Self::start(config, options, segment, connected, true)
@@ -109,8 +110,13 @@ impl Session {
         options: SessionOptions,
     ) -> Result<Self, SessionError> {
         let segment = SessionSegment::create(SessionId::random())?;
-        let caller =
-            Caller { config, options: &options, id: segment.id(), segment: Some(&segment), cancel: None };
+        let caller = Caller {
+            config,
+            options: &options,
+            id: segment.id(),
+            segment: Some(&segment),
+            cancel: None,
+        };
         let connected = caller.greet_over(socket)?;
         Self::start(config, options, segment, Some(connected), false)
     }
@@ -215,15 +221,15 @@ impl Session {
             }
             state.status = StatusAnswer::Parts(Vec::new());
         }
-        shared.tell(Outgoing::Message(Message::StatusRequest));
+        shared.tell(Outgoing::Message(Box::new(Message::StatusRequest)));
         shared.wait_changed(ANSWER, || !matches!(shared.state().status, StatusAnswer::Parts(_)));
         let answer = std::mem::take(&mut shared.state().status);
         match answer {
             StatusAnswer::Whole(bytes) => status_text(bytes),
             StatusAnswer::Lost => Err(SessionError::Disconnected),
-            StatusAnswer::None | StatusAnswer::Parts(_) => {
-                Err(SessionError::Silent { address: address::Address::of(&shared.config).to_string() })
-            }
+            StatusAnswer::None | StatusAnswer::Parts(_) => Err(SessionError::Silent {
+                address: address::Address::of(&shared.config).to_string(),
+            }),
         }
     }
 
@@ -305,14 +311,15 @@ impl Session {
     /// An endpoint's handle is dropped.
     fn forget_endpoint(&self, gid: &Gid) {
         let mut state = self.shared().state();
-        let stand_in = state.publishers.remove(gid).is_some_and(|p| p.role != EndpointRole::Application);
+        let stand_in =
+            state.publishers.remove(gid).is_some_and(|p| p.role != EndpointRole::Application);
         let relay =
             state.subscriptions.remove(gid).is_some_and(|s| s.role != EndpointRole::Application);
         if !stand_in && !relay {
             state.tombstones.insert(*gid);
         }
         let gone = message::Gone { gid: *gid };
-        state.outgoing.push_back(Outgoing::Message(Message::EndpointGone(gone)));
+        state.outgoing.push_back(Outgoing::Message(Box::new(Message::EndpointGone(gone))));
         drop(state);
         self.shared().wake();
     }
@@ -347,8 +354,13 @@ impl Drop for Handle {
 pub fn daemon_status(config: &Config) -> Result<String, SessionError> {
     let config = Config { daemon: DaemonPolicy::Require, ..config.clone() };
     let options = SessionOptions::new("status").role(SessionRole::Tool);
-    let caller =
-        Caller { config: &config, options: &options, id: SessionId::random(), segment: None, cancel: None };
+    let caller = Caller {
+        config: &config,
+        options: &options,
+        id: SessionId::random(),
+        segment: None,
+        cancel: None,
+    };
     let connected = caller.connect()?;
     let address = address::Address::of(&config).to_string();
     status_text(control::ask_status(&connected.socket, &address, ANSWER)?)

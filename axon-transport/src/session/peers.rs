@@ -5,7 +5,7 @@
 //! does, so that both agree on what this session holds.
 
 use std::{
-    collections::{HashMap, HashSet},
+    collections::{HashMap, HashSet, hash_map::Entry as Slot},
     os::fd::OwnedFd,
     sync::Arc,
 };
@@ -50,13 +50,15 @@ impl Peers {
         if id == self.own.id() {
             return Ok(Peer::Local(self.own.clone()));
         }
-        if !self.peers.contains_key(&id) {
-            let [segment, doorbell, pidfd] =
-                <[OwnedFd; 3]>::try_from(descriptors).map_err(|_| PeerError::Missing)?;
-            let session = PeerSession::map(id, PeerDescriptors { segment, doorbell, pidfd })?;
-            self.peers.insert(id, Entry { session, pairs: HashSet::new() });
-        }
-        let entry = self.peers.get_mut(&id).ok_or(PeerError::Missing)?;
+        let entry = match self.peers.entry(id) {
+            Slot::Occupied(held) => held.into_mut(),
+            Slot::Vacant(slot) => {
+                let [segment, doorbell, pidfd] =
+                    <[OwnedFd; 3]>::try_from(descriptors).map_err(|_| PeerError::Missing)?;
+                let session = PeerSession::map(id, PeerDescriptors { segment, doorbell, pidfd })?;
+                slot.insert(Entry { session, pairs: HashSet::new() })
+            }
+        };
         entry.pairs.insert(pair);
         Ok(Peer::Remote(entry.session.clone()))
     }

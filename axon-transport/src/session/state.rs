@@ -73,7 +73,7 @@ pub(super) enum Outgoing {
     /// This endpoint of ours, as it is when the message is sent.
     Announce(Gid),
     /// A message without descriptors.
-    Message(Message),
+    Message(Box<Message>),
 }
 
 #[derive(Debug, Default)]
@@ -128,7 +128,11 @@ impl Shared {
     }
 
     /// Waits for changes of the state until `reached`, which runs without the state's lock.
-    pub(super) fn wait_changed(&self, timeout: Duration, mut reached: impl FnMut() -> bool) -> bool {
+    pub(super) fn wait_changed(
+        &self,
+        timeout: Duration,
+        mut reached: impl FnMut() -> bool,
+    ) -> bool {
         let deadline = Instant::now().checked_add(timeout);
         loop {
             // Read before `reached` looks, so that a change after it is not missed.
@@ -138,9 +142,8 @@ impl Shared {
             }
             let mut state = self.state();
             while state.changes == seen {
-                let left = deadline.map_or(Duration::MAX, |d| {
-                    d.saturating_duration_since(Instant::now())
-                });
+                let left =
+                    deadline.map_or(Duration::MAX, |d| d.saturating_duration_since(Instant::now()));
                 if left.is_zero() {
                     return false;
                 }

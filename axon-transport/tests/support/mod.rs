@@ -33,6 +33,8 @@ impl Host {
             ("AXON_RUNTIME_DIR", run.to_str().unwrap()),
             ("AXON_DAEMON_PATH", env!("CARGO_BIN_EXE_axon_daemon")),
             ("AXON_BIND_ADDRS", "127.0.0.1"),
+            // Hosts of other tests are on the same loopback.
+            ("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF"),
             ("AXON_LOG", "debug"),
         ];
         Self { env: env.map(|(n, v)| (n.to_owned(), v.to_owned())).into(), dir }
@@ -100,7 +102,9 @@ impl Host {
 
 impl Drop for Host {
     fn drop(&mut self) {
-        if let Ok(status) = self.status() {
+        if let Ok(status) = self.status()
+            && status.pid != std::process::id()
+        {
             signal(status.pid, rustix::process::Signal::KILL);
         }
         if std::thread::panicking()
@@ -131,7 +135,8 @@ impl Player {
     /// The child's next line.
     pub(crate) fn hear(&mut self) -> String {
         loop {
-            let line = self.lines.next().expect("the child said something before it ended").unwrap();
+            let line =
+                self.lines.next().expect("the child said something before it ended").unwrap();
             // The test harness writes a name without a newline in front of the first.
             if let Some((_, said)) = line.split_once(MARK) {
                 return said.to_owned();
@@ -152,6 +157,7 @@ impl Player {
 }
 
 /// Says something to the test, in a child.
+#[allow(clippy::print_stdout)]
 pub(crate) fn say(text: impl std::fmt::Display) {
     println!("{MARK}{text}");
 }

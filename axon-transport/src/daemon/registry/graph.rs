@@ -135,7 +135,8 @@ fn parts(
     removed: &[Gid],
     open: bool,
 ) -> Vec<Graph> {
-    let empty = |whole| Graph { version, whole, added: Vec::new(), removed: Vec::new(), more: true };
+    let empty =
+        |whole| Graph { version, whole, added: Vec::new(), removed: Vec::new(), more: true };
     let mut parts = Vec::new();
     let mut part = empty(whole);
     let mut size = 0;

@@ -119,8 +119,12 @@ impl<F: Clone> Registry<F> {
         };
         if let Some(text) = refusal {
             let text = format!("endpoint {gid}: {text}");
-            let refused =
-                Refused { variable: String::new(), ours: String::new(), theirs: String::new(), text };
+            let refused = Refused {
+                variable: String::new(),
+                ours: String::new(),
+                theirs: String::new(),
+                text,
+            };
             self.push(id, &Message::Refused(refused), Vec::new());
             return Ok(());
         }
@@ -186,7 +190,9 @@ impl<F: Clone> Registry<F> {
     fn grant(&mut self, id: &SessionId, grant: Granted) -> Result<(), Violation> {
         let ring = match self.endpoints.get(&grant.writer) {
             None => return Ok(()),
-            Some(writer) if writer.session != *id => return Err(Violation::NotItsOwn(grant.writer)),
+            Some(writer) if writer.session != *id => {
+                return Err(Violation::NotItsOwn(grant.writer));
+            }
             Some(writer) => writer.ring.clone(),
         };
         let pair = Pair { reader: grant.reader, writer: grant.writer };
@@ -229,10 +235,6 @@ impl<F: Clone> Registry<F> {
             return Vec::new();
         };
         let Some(entry) = self.sessions.get_mut(to) else { return Vec::new() };
-        if entry.behind {
-            // The packet will not be queued.
-            return Vec::new();
-        }
         let held = entry.known.entry(*of).or_default();
         let first = held.is_empty();
         held.insert(*pair);

@@ -158,15 +158,28 @@ impl Client {
 enum Step {
     Connect(u8),
     Disconnect(u8),
-    Add { session: u8, topic: u8, writes: bool, reliable: bool },
-    Remove { session: u8, which: prop::sample::Index },
+    Add {
+        session: u8,
+        topic: u8,
+        writes: bool,
+        reliable: bool,
+    },
+    Remove {
+        session: u8,
+        which: prop::sample::Index,
+    },
     /// The session's messages arrive.
     Up(u8),
     /// Some packets reach the session.
     Down(u8, u8),
     Flush,
     Resync(u8),
-    Remote { daemon: u8, reset: bool, add: u8, remove: u8 },
+    Remote {
+        daemon: u8,
+        reset: bool,
+        add: u8,
+        remove: u8,
+    },
     RemoteGone(u8),
 }
 
@@ -260,7 +273,8 @@ impl World {
                 if client.endpoints.is_empty() {
                     return;
                 }
-                let gid = *client.endpoints.keys().nth(which.index(client.endpoints.len())).unwrap();
+                let gid =
+                    *client.endpoints.keys().nth(which.index(client.endpoints.len())).unwrap();
                 client.endpoints.remove(&gid);
                 client.attached.retain(|p| p.reader != gid && p.writer != gid);
                 client.outgoing.push((Message::EndpointGone(Gone { gid }), vec![]));
@@ -299,11 +313,8 @@ impl World {
     }
 
     fn check_settled(&self) {
-        let all: Vec<(SessionId, &Endpoint)> = self
-            .clients
-            .values()
-            .flat_map(|c| c.endpoints.values().map(|e| (c.id, e)))
-            .collect();
+        let all: Vec<(SessionId, &Endpoint)> =
+            self.clients.values().flat_map(|c| c.endpoints.values().map(|e| (c.id, e))).collect();
         let mut graph: BTreeMap<Gid, Option<DaemonId>> =
             all.iter().map(|(_, e)| (e.gid, None)).collect();
         graph.extend(self.registry.remote_endpoints().map(|(d, e)| (e.gid, Some(*d))));
@@ -335,7 +346,7 @@ impl World {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(128))]
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(256) })]
 
     #[test]
     fn whatever_happens_everybody_ends_up_knowing(steps in prop::collection::vec(step(), 0..400)) {
@@ -410,10 +421,7 @@ fn a_sample_never_goes_back_to_where_it_came_from() {
     let mut world = connected(1);
     let gateway = session_id(200);
     let name = String::new();
-    world
-        .registry
-        .connect(gateway, SessionRole::Gateway, name, 1, Some(handed(gateway)))
-        .unwrap();
+    world.registry.connect(gateway, SessionRole::Gateway, name, 1, Some(handed(gateway))).unwrap();
     let own = first(&world);
     let remote = endpoint(Gid([9; 16]), EndpointKind::Publisher, 0, Qos::default());
     let relay = endpoint(Gid::new(gateway, 1), EndpointKind::Subscription, 0, Qos::default());
@@ -505,7 +513,10 @@ fn a_large_graph_is_told_in_packets_that_fit() {
     let mut world = connected(1);
     let added = (0..3000u32).map(|n| {
         let gid = Gid::new(session_id(77), n);
-        Endpoint { topic: "t".repeat(400), ..endpoint(gid, EndpointKind::Publisher, 0, Qos::default()) }
+        Endpoint {
+            topic: "t".repeat(400),
+            ..endpoint(gid, EndpointKind::Publisher, 0, Qos::default())
+        }
     });
     world.registry.remote_graph(DaemonId([1; 16]), true, added.collect(), vec![]);
     world.settle();

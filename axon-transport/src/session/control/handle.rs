@@ -9,13 +9,14 @@ use std::{
 use super::{Control, append, stands_for};
 use crate::{
     graph::{GraphEntry, GraphView},
-    ids::Gid,
+    ids::{Gid, SessionId},
     session::{
-        message::{Attach, Graph, Granted, Message, Pair, Unmatch},
+        message::{Attach, Granted, Graph, Message, Pair, Unmatch},
+        peers::PeerError,
         state::{SessionEvent, StatusAnswer},
         subscription::{Accept, SubscriptionInner},
     },
-    shm::{Grant, Reader, ReaderInfo, ReaderOptions},
+    shm::{Grant, Peer, Reader, ReaderInfo, ReaderOptions},
 };
 
 impl Control {
@@ -127,9 +128,10 @@ impl Control {
         }
         for (reader, subscription) in subscriptions {
             let mut slots = subscription.lock();
-            let gone = slots.writers().into_iter().filter(|&writer| {
-                !repeated.contains(&Pair { reader, writer })
-            });
+            let gone = slots
+                .writers()
+                .into_iter()
+                .filter(|&writer| !repeated.contains(&Pair { reader, writer }));
             let news = gone.collect::<Vec<_>>().iter().filter(|writer| slots.end(writer)).count();
             drop(slots);
             if news > 0 {
@@ -187,7 +189,7 @@ impl Control {
             repeated.insert(pair);
         }
         // Counted whether or not it comes to anything, as the daemon does.
-        let peer = self.peers.hold(attach.session, pair, descriptors);
+        let peer = self.hold(attach.session, pair, descriptors);
         let Some(publisher) = self.shared.state().publishers.get(&attach.writer).cloned() else {
             return;
         };
@@ -215,7 +217,7 @@ impl Control {
         let Granted { reader, writer, generation, first, session } = granted;
         let pair = Pair { reader, writer };
         let others = if descriptors.is_empty() { Vec::new() } else { descriptors.split_off(1) };
-        let peer = self.peers.hold(session, pair, others);
+        let peer = self.hold(session, pair, others);
         let Some(subscription) = self.shared.state().subscriptions.get(&reader).cloned() else {
             return;
         };
@@ -256,6 +258,20 @@ impl Control {
                 self.outbox.push_back((Message::Detach(pair), Vec::new()));
             }
         }
+    }
+
+    fn hold(
+        &mut self,
+        session: SessionId,
+        pair: Pair,
+        descriptors: Vec<OwnedFd>,
+    ) -> Result<Peer, PeerError> {
+        let held = self.peers.hold(session, pair, descriptors);
+        if matches!(held, Err(PeerError::Missing)) {
+            // The daemon takes us to hold what we do not: have it start over.
+            self.outbox.push_back((Message::Resync, Vec::new()));
+        }
+        held
     }
 
     fn unmatch(&mut self, unmatch: &Unmatch) {

@@ -108,7 +108,7 @@ impl Control {
             let gone: Vec<Gid> = state.tombstones.iter().copied().collect();
             state.outgoing.extend(gids.into_iter().map(Outgoing::Announce));
             let gone = gone.into_iter().map(|gid| Message::EndpointGone(Gone { gid }));
-            state.outgoing.extend(gone.map(Outgoing::Message));
+            state.outgoing.extend(gone.map(|m| Outgoing::Message(Box::new(m))));
         }
         self.link = Link::Socket(connected.socket);
         self.shared.notify(Some(&SessionEvent::DaemonFound(daemon)));
@@ -185,7 +185,7 @@ impl Control {
         }
         while let Some(outgoing) = state.outgoing.pop_front() {
             match outgoing {
-                Outgoing::Message(message) => self.outbox.push_back((message, Vec::new())),
+                Outgoing::Message(message) => self.outbox.push_back((*message, Vec::new())),
                 Outgoing::Announce(gid) => {
                     if let Some(publisher) = state.publishers.get(&gid) {
                         let announce = Announce {
