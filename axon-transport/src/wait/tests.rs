@@ -92,6 +92,39 @@ fn each_waiter_of_a_crowd_is_woken() {
 }
 
 #[test]
+fn a_ring_that_another_thread_takes_is_not_slept_over() {
+    let session = SessionSegment::create(SessionId::random()).unwrap();
+    let (looks, over) = (AtomicU64::new(0), AtomicBool::new(false));
+    thread::scope(|scope| {
+        scope.spawn(|| {
+            await_woken(&session, || {
+                looks.fetch_add(1, Ordering::AcqRel);
+                over.load(Ordering::Acquire)
+            });
+        });
+        while looks.load(Ordering::Acquire) < 2 {
+            thread::yield_now();
+        }
+        // The other thread leads. This one has armed and looked in vain when what it waits for
+        // comes, and the other takes the ring before this one gets to sleep.
+        let mut mine = 0;
+        await_woken(&session, || {
+            mine += 1;
+            if mine == 2 {
+                let before = looks.load(Ordering::Acquire);
+                session.doorbell_hub().bell().ring();
+                while looks.load(Ordering::Acquire) == before {
+                    thread::yield_now();
+                }
+            }
+            mine > 2
+        });
+        over.store(true, Ordering::Release);
+        session.notify();
+    });
+}
+
+#[test]
 fn a_wait_ends_with_its_time_and_disarms() {
     use crate::wait::Purpose;
     let session = SessionSegment::create(SessionId::random()).unwrap();
