@@ -11,7 +11,10 @@ use super::{
     establish::{Established, establish},
     refusal::Refusal,
 };
-use crate::{keys::Resolver, link::Side};
+use crate::{
+    keys::{Lookup, Resolver},
+    link::Side,
+};
 
 /// Handshakes under way at once; further dials are refused and come again.
 const MAX_HANDSHAKES: usize = 64;
@@ -55,18 +58,21 @@ pub(super) async fn accept(
         tokio::spawn(async move {
             let incomer = answer(&context, incoming).await;
             drop(permit);
-            let _ = incomers.send(incomer).await;
+            if let Some(incomer) = incomer {
+                let _ = incomers.send(incomer).await;
+            }
         });
     }
 }
 
-async fn answer(context: &Arc<Context>, incoming: Incoming) -> Incomer {
+/// `None` when the dialler is to come again and nothing is to be said of it.
+async fn answer(context: &Arc<Context>, incoming: Incoming) -> Option<Incomer> {
     let source = incoming.remote_address();
     let refused = |refusal, resolver: Option<&Resolver>| {
         let claimed = resolver.and_then(Resolver::identity);
         let sae = claimed.as_ref().map(|i| i.client_sae());
         let peer = super::establish::peer_text(sae, source);
-        Incomer::Refused { peer, refusal }
+        Some(Incomer::Refused { peer, refusal })
     };
     let (server, resolver) = match context.server(source) {
         Ok(server) => server,
@@ -83,14 +89,20 @@ async fn answer(context: &Arc<Context>, incoming: Incoming) -> Incomer {
         Ok(connection) => connection,
         Err(error) => {
             let mut refusal = Refusal::of(&error);
-            if let Some(outcome) = resolver.as_ref().and_then(|r| r.outcome()) {
+            let outcome = resolver.as_ref().and_then(|r| r.outcome());
+            // How every bootstrap begins: the key is being fetched, and the dialler comes again.
+            if matches!(outcome, Some(Lookup::Fetching)) {
+                tracing::debug!(%source, "a PSK is being fetched; the dialler will come again");
+                return None;
+            }
+            if let Some(outcome) = outcome {
                 refusal.reason = format!("{}; PSK look-up: {outcome}", refusal.reason);
             }
             return refused(refusal, resolver.as_deref());
         }
     };
     match establish(context, connection, Side::Server, context.hello.clone(), None).await {
-        Ok(established) => Incomer::Established(Box::new(established)),
+        Ok(established) => Some(Incomer::Established(Box::new(established))),
         Err(refusal) => refused(refusal, resolver.as_deref()),
     }
 }

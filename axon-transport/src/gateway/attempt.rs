@@ -246,8 +246,8 @@ impl Link {
     }
 
     fn key_message(&self, message: &keys::KeyMessage) {
-        if let (Some(keyring), Some(keys)) = (&self.context.keyring, &self.established.keys) {
-            let _ = keys.on_message(keyring, self.established.number, message);
+        if let (Some(keyring), Some(sealing)) = (&self.context.keyring, &self.established.sealing) {
+            let _ = sealing.keys.on_message(keyring, self.established.number, message);
         }
     }
 
@@ -259,12 +259,15 @@ impl Link {
         type_name: &str,
     ) -> Result<Vec<u8>, Refusal> {
         let internal = |e: &dyn std::fmt::Display| Refusal::here(CloseCode::Internal, e);
-        let (Some(keyring), Some(keys)) =
-            (self.context.keyring.clone(), self.established.keys.clone())
+        let connection = self.established.number;
+        let (Some(keyring), Some(sealing)) =
+            (self.context.keyring.clone(), &mut self.established.sealing)
         else {
             return Err(internal(&"envelopes exist in messages10 alone"));
         };
-        let connection = self.established.number;
+        let (keys, first) = (Arc::clone(&sealing.keys), sealing.first.take());
+        keys.attach_sender(&keyring, connection, &sealing.exporters, first)
+            .map_err(|e| internal(&e))?;
         let protection = Protection::Envelope { keyring, keys, connection };
         let domain = self.context.config.domain;
         let hash = TopicHash::new(domain, topic, type_name).map_err(|e| internal(&e))?;

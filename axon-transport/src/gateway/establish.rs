@@ -8,6 +8,7 @@ use axon_tls::{
     qkd::PskIdentity,
     quic::{ALPN, negotiated},
 };
+use axon_envelope::{KeyId, KmeKey};
 use quinn::{Connection, VarInt};
 use tokio::sync::mpsc;
 
@@ -45,8 +46,18 @@ pub(super) struct Established {
     pub(super) outbox: mpsc::UnboundedSender<Message>,
     /// What may come next.
     pub(super) order: Order,
-    /// Message keys with this SAE, in qkd.
-    pub(super) keys: Option<Arc<PeerKeys>>,
+    /// What seals its messages, in messages10.
+    pub(super) sealing: Option<Sealing>,
+}
+
+/// The message keys of a connection in messages10.
+pub(super) struct Sealing {
+    /// Those of the peer's SAE.
+    pub(super) keys: Arc<PeerKeys>,
+    /// What binds them to this connection.
+    pub(super) exporters: Exporters,
+    /// Server: the key that proved the client's name, its first sending key.
+    pub(super) first: Option<(KeyId, KmeKey)>,
 }
 
 impl std::fmt::Debug for Established {
@@ -161,11 +172,11 @@ async fn run(
     order.hello_checked(theirs.daemon < ours.daemon);
     let outbox = spawn_writer(connection.clone(), writer);
 
-    let keys = match (&context.keyring, &theirs.sae) {
+    let sealing = match (&context.keyring, &theirs.sae) {
         (Some(keyring), Some(sae)) => {
             let proof = Proof { keyring, connection, number, sae, outbox: &outbox };
             let late = |_| Failure::Ours(CloseCode::KeySupply, "no proof within 15 s".into());
-            let keys = tokio::time::timeout(PROOF_TIMEOUT, async {
+            let sealing = tokio::time::timeout(PROOF_TIMEOUT, async {
                 match side {
                     Side::Server => proof.demand(&mut reader, &mut order).await,
                     Side::Client => proof.give(&mut reader, &mut order).await,
@@ -174,7 +185,7 @@ async fn run(
             .await
             .map_err(late)??;
             order.proven();
-            keys
+            sealing
         }
         _ => None,
     };
@@ -187,7 +198,7 @@ async fn run(
         reader,
         outbox,
         order,
-        keys,
+        sealing,
     })
 }
 
@@ -288,15 +299,14 @@ impl Proof<'_> {
         let _ = self.outbox.send(Message::Keys(message));
     }
 
-    /// In messages10: the keys of this peer, attached to this connection.
+    /// In messages10: the keys of this peer, ready to receive on this connection.
     fn attach(&self, exporters: &Exporters) -> Result<Arc<PeerKeys>, Failure> {
         let internal = |e: &dyn std::fmt::Display| {
             Failure::Ours(CloseCode::Internal, format!("message keys: {e}"))
         };
         let keys = self.keyring.peer(self.sae).map_err(|e| internal(&e))?;
-        keys.attach(self.keyring, self.number, exporters, self.outbox.clone())
+        keys.attach_receiver(self.keyring, self.number, exporters, self.outbox.clone())
             .map_err(|e| internal(&e))?;
-        tokio::spawn(Arc::clone(&keys).run_timers(Arc::clone(self.keyring), self.number));
         Ok(keys)
     }
 
@@ -322,7 +332,7 @@ impl Proof<'_> {
         &self,
         reader: &mut ControlReader,
         order: &mut Order,
-    ) -> Result<Option<Arc<PeerKeys>>, Failure> {
+    ) -> Result<Option<Sealing>, Failure> {
         let exporters = self.exporters()?;
         let clock = &self.keyring.clock;
         let mut answers = self.keyring.proof_answers(self.number);
@@ -367,11 +377,7 @@ impl Proof<'_> {
             return Ok(None);
         }
         let keys = self.attach(&exporters)?;
-        if let Some((key_id, key)) = proof.into_key() {
-            keys.with_sender(self.keyring, |now, s| s.adopt(now, self.number, key_id, key))
-                .map_err(|e| Failure::Ours(CloseCode::Internal, e.to_string()))?;
-        }
-        Ok(Some(keys))
+        Ok(Some(Sealing { keys, exporters, first: proof.into_key() }))
     }
 
     /// Client: answers the server's ANNOUNCE.
@@ -379,10 +385,11 @@ impl Proof<'_> {
         &self,
         reader: &mut ControlReader,
         order: &mut Order,
-    ) -> Result<Option<Arc<PeerKeys>>, Failure> {
+    ) -> Result<Option<Sealing>, Failure> {
         let exporters = self.exporters()?;
         if self.keyring.seals_messages() {
-            return self.give_as_receiver(&exporters, reader, order).await.map(Some);
+            let keys = self.give_as_receiver(&exporters, reader, order).await?;
+            return Ok(Some(Sealing { keys, exporters, first: None }));
         }
         let clock = &self.keyring.clock;
         let mut answers = self.keyring.proof_answers(self.number);

@@ -18,7 +18,7 @@ use super::{
     control::{ControlError, ControlReader},
     dial::{Target, dial},
     endpoint::{Endpoints, STREAMS_OPEN},
-    establish::{Established, close, peer_text},
+    establish::{Established, Sealing, close, peer_text},
     inbound::Inbound,
     outbound::Carrier,
     peer::{Peer, spawn_reader},
@@ -86,6 +86,8 @@ struct Link {
     candidate: Candidate,
     outbox: mpsc::UnboundedSender<Message>,
     carrier: Carrier,
+    /// Until the election: what then lets it announce keys.
+    sealing: Option<Sealing>,
     /// The peer's link id, once elected.
     id: Option<[u8; 16]>,
     since_unix_ms: u64,
@@ -251,10 +253,10 @@ impl Hub {
     }
 
     fn insert(&mut self, established: Established, candidate: Candidate) -> ControlReader {
-        let protection = match (&self.context.keyring, established.keys) {
-            (Some(keyring), Some(keys)) => Protection::Envelope {
+        let protection = match (&self.context.keyring, &established.sealing) {
+            (Some(keyring), Some(sealing)) => Protection::Envelope {
                 keyring: Arc::clone(keyring),
-                keys,
+                keys: Arc::clone(&sealing.keys),
                 connection: established.number,
             },
             _ => Protection::Link,
@@ -273,6 +275,7 @@ impl Hub {
             order: established.order,
             candidate,
             outbox: established.outbox,
+            sealing: established.sealing,
             id: None,
             since_unix_ms: crate::daemon::status::unix_ms(),
         };
@@ -297,6 +300,12 @@ impl Hub {
         let daemon = link.established.hello.daemon;
         let (connection, outbox) = (link.connection.clone(), link.outbox.clone());
         let (carrier, side) = (link.carrier.clone(), link.candidate.side);
+        if let (Some(keyring), Some(sealing)) = (&self.context.keyring, link.sealing.take()) {
+            let Sealing { keys, exporters, first } = sealing;
+            if let Err(error) = keys.attach_sender(keyring, number, &exporters, first) {
+                tracing::error!(peer = %daemon, %error, "no message keys for this link");
+            }
+        }
         connection.set_max_concurrent_uni_streams(VarInt::from_u32(STREAMS_OPEN));
         let new = match self.peers.get_mut(&daemon) {
             Some(peer) => {
@@ -342,6 +351,9 @@ impl Hub {
         if let Some(link) = self.links.remove(&old) {
             let keyring = self.context.keyring.clone();
             tokio::spawn(async move {
+                // All of it: dropping the outbox would end the control stream, and with it the
+                // link at the peer, before the successor's ELECTED is read there.
+                let link = link;
                 tokio::time::sleep(HAND_OVER).await;
                 close(&link.connection, CloseCode::Replaced, "a successor took over");
                 if let Some(keyring) = keyring {

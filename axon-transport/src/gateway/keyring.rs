@@ -262,17 +262,36 @@ pub(super) struct PeerKeys {
 }
 
 impl PeerKeys {
-    /// A connection begins: its messages go to `outbox`.
-    pub(super) fn attach(
-        &self,
-        keyring: &Keyring,
+    /// A connection begins: its messages go to `outbox`, and it can receive. Timers run from here.
+    pub(super) fn attach_receiver(
+        self: &Arc<Self>,
+        keyring: &Arc<Keyring>,
         connection: u64,
         exporters: &Exporters,
         outbox: mpsc::UnboundedSender<Message>,
     ) -> Result<(), SupplyError> {
         lock(&self.outboxes).insert(connection, outbox);
         self.with_receiver(keyring, |now, r| r.attach(now, connection, exporters))?;
-        let owed = self.with_sender(keyring, |now, s| s.attach(now, connection, exporters))?;
+        tokio::spawn(Arc::clone(self).run_timers(Arc::clone(keyring), connection));
+        Ok(())
+    }
+
+    /// The connection was elected: keys may be announced on it. `first` is the key that proved the
+    /// client's name, which the server uses for its first messages.
+    pub(super) fn attach_sender(
+        &self,
+        keyring: &Keyring,
+        connection: u64,
+        exporters: &Exporters,
+        first: Option<(KeyId, KmeKey)>,
+    ) -> Result<(), SupplyError> {
+        let owed = self.with_sender(keyring, |now, sender| {
+            let owed = sender.attach(now, connection, exporters)?;
+            if let Some((key_id, key)) = first {
+                sender.adopt(now, connection, key_id, key)?;
+            }
+            Ok::<_, SupplyError>(owed)
+        })?;
         // They belong to the previous connection, which a successor has not closed yet.
         for message in owed {
             let outboxes = lock(&self.outboxes);
@@ -318,19 +337,20 @@ impl PeerKeys {
         f: impl FnOnce(Duration, &mut Sender) -> T,
     ) -> T {
         let now = keyring.clock.now();
-        let (mut requests, mut messages) = (Vec::new(), Vec::new());
+        let (mut requests, mut said) = (Vec::new(), false);
         let result = {
             let mut sender = lock(&self.sender);
             let result = f(now, &mut sender);
             while let Some(request) = sender.poll_request(now) {
                 requests.push(request);
             }
+            // Under the lock: whoever then sees the new state finds its messages in the outbox.
             while let Some(message) = sender.poll_message(now) {
-                messages.push(message);
+                said |= self.post(message);
             }
             result
         };
-        self.carry(keyring, Origin::Sender(self.number), requests, messages);
+        self.carry(keyring, Origin::Sender(self.number), requests, said);
         result
     }
 
@@ -341,24 +361,25 @@ impl PeerKeys {
         f: impl FnOnce(Duration, &mut Receiver) -> T,
     ) -> T {
         let now = keyring.clock.now();
-        let (mut requests, mut messages) = (Vec::new(), Vec::new());
+        let (mut requests, mut said) = (Vec::new(), false);
         let result = {
             let mut receiver = lock(&self.receiver);
             let result = f(now, &mut receiver);
             while let Some(request) = receiver.poll_request(now) {
                 requests.push(request);
             }
+            // Under the lock: ELECTED, for one, must not overtake the READY that allows it.
             while let Some(message) = receiver.poll_message() {
-                messages.push(message);
+                said |= self.post(message);
             }
             result
         };
-        self.carry(keyring, Origin::Receiver(self.number), requests, messages);
+        self.carry(keyring, Origin::Receiver(self.number), requests, said);
         result
     }
 
     /// Drives the timers of both directions until `connection` is detached.
-    pub(super) async fn run_timers(self: Arc<Self>, keyring: Arc<Keyring>, connection: u64) {
+    async fn run_timers(self: Arc<Self>, keyring: Arc<Keyring>, connection: u64) {
         while lock(&self.outboxes).contains_key(&connection) {
             let now = keyring.clock.now();
             let next = [
@@ -375,21 +396,18 @@ impl PeerKeys {
         }
     }
 
-    fn carry(
-        &self,
-        keyring: &Keyring,
-        origin: Origin,
-        requests: Vec<Request>,
-        messages: Vec<(u64, KeyMessage)>,
-    ) {
-        if !requests.is_empty() || !messages.is_empty() {
+    /// Puts a key message into its connection's outbox.
+    fn post(&self, (connection, message): (u64, KeyMessage)) -> bool {
+        if let Some(outbox) = lock(&self.outboxes).get(&connection) {
+            let _ = outbox.send(Message::Keys(message));
+        }
+        true
+    }
+
+    fn carry(&self, keyring: &Keyring, origin: Origin, requests: Vec<Request>, said: bool) {
+        if said || !requests.is_empty() {
             self.timer.notify_one();
             self.changed.notify_waiters();
-        }
-        for (connection, message) in messages {
-            if let Some(outbox) = lock(&self.outboxes).get(&connection) {
-                let _ = outbox.send(Message::Keys(message));
-            }
         }
         for request in requests {
             keyring.submit(origin, request);

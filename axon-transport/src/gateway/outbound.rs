@@ -25,6 +25,7 @@ use super::{
 };
 use crate::{
     ids::Gid,
+    keys::NoKey,
     link::CloseCode,
     qos::{Qos, Reliability},
     session::Subscription,
@@ -310,6 +311,7 @@ impl Writer {
                     self.shared.counters.dropped("no_key", 1);
                     return false;
                 }
+                Err(NoKey::Detached) => return false,
                 Err(_) if carrier.connection.close_reason().is_some() => return false,
                 // The timeout only covers a connection that closes while no key comes.
                 Err(_) => {

@@ -90,7 +90,11 @@ impl Protection {
                 frame.extend_from_slice(&sample.payload);
                 Ok(())
             }
-            Self::Envelope { keyring, keys, .. } => keys.with_sender(keyring, |now, sender| {
+            Self::Envelope { keyring, keys, connection } => keys.with_sender(keyring, |now, sender| {
+                // A successor holds the keys by now: what it binds them to is not this connection.
+                if sender.attached() != Some(*connection) {
+                    return Err(NoKey::Detached);
+                }
                 let plain = header.len() + sample.payload.len();
                 frame.resize(LENGTH + sender.overhead() + plain, 0);
                 let slot = sender.slot(now, delivery)?;

@@ -1,10 +1,9 @@
 //! What two daemons must agree on before a link carries anything.
 
-use axon_tls::{Cipher, PskKex};
-
 use super::{CloseCode, message::Hello};
 use crate::{
-    config::{ClassicAuth, Config, KeyMode, Security},
+    config::{Config, Security},
+    discovery::Terms,
     ids::DaemonId,
 };
 
@@ -13,7 +12,7 @@ pub const PROTOCOL: u8 = 1;
 
 /// A setting in which two daemons differ.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{code}: {setting} here is {ours}, the peer's is {theirs}")]
+#[error("{setting} is {ours} on the side that refuses, {theirs} on the other")]
 pub struct Mismatch {
     /// The code that closes the link.
     pub code: CloseCode,
@@ -25,46 +24,13 @@ pub struct Mismatch {
     pub theirs: String,
 }
 
-/// Names of the numbers in HELLO and beacon.
-mod names {
-    pub(super) const MODE: &[&str] = &["classic", "qkd"];
-    pub(super) const KEY_MODE: &[&str] = &["none", "session", "messages10"];
-    pub(super) const KEX: &[&str] = &["X25519MLKEM768", "psk_ke", "psk_dhe_ke"];
-    pub(super) const CIPHER: &[&str] = &["chacha20-poly1305", "aes-256-gcm"];
-    pub(super) const AUTH: &[&str] = &["none", "pinned", "ca"];
-}
-
-fn name(names: &[&str], value: u8) -> String {
-    names.get(usize::from(value)).map_or_else(|| format!("unknown ({value})"), |n| (*n).into())
-}
-
 impl Hello {
     /// What `config` says of this daemon.
     pub fn new(config: &Config, daemon: DaemonId) -> Self {
-        let (mode, key_mode, kex, sae, auth) = match &config.security {
-            Security::Classic(c) => {
-                let auth = match c.auth {
-                    ClassicAuth::None => 0,
-                    ClassicAuth::Pinned => 1,
-                    ClassicAuth::Ca => 2,
-                };
-                (0, 0, 0, None, Some(auth))
-            }
-            Security::Qkd(q) => {
-                let key_mode = match q.key_mode {
-                    KeyMode::Session => 1,
-                    KeyMode::Messages10 => 2,
-                };
-                let kex = match q.kex {
-                    PskKex::PskKe => 1,
-                    PskKex::PskDheKe => 2,
-                };
-                (1, key_mode, kex, Some(q.sae_id.clone()), None)
-            }
-        };
-        let cipher = match config.cipher {
-            Cipher::ChaCha20Poly1305 => 0,
-            Cipher::Aes256Gcm => 1,
+        let Terms { mode, key_mode, kex, cipher, auth } = Terms::of(config);
+        let sae = match &config.security {
+            Security::Classic(_) => None,
+            Security::Qkd(qkd) => Some(qkd.sae_id.clone()),
         };
         let host = rustix::system::uname().nodename().to_string_lossy().chars().take(63).collect();
         Self {
@@ -82,6 +48,17 @@ impl Hello {
             replaces: None,
             expects: None,
             static_peer: false,
+        }
+    }
+
+    /// What both sides must have in common.
+    fn terms(&self) -> Terms {
+        Terms {
+            mode: self.mode,
+            key_mode: self.key_mode,
+            kex: self.kex,
+            cipher: self.cipher,
+            auth: self.auth,
         }
     }
 }
@@ -114,25 +91,15 @@ pub fn check(ours: &Hello, theirs: &Hello, psk_sae: Option<&str>) -> Result<(), 
         let (o, t) = (ours.domain.to_string(), theirs.domain.to_string());
         return differ(CloseCode::Domain, "ROS_DOMAIN_ID", o, t);
     }
-    let numbers = [
-        (CloseCode::Mode, "AXON_SECURITY_MODE", names::MODE, ours.mode, theirs.mode),
-        (CloseCode::KeyMode, "AXON_QKD_KEY_MODE", names::KEY_MODE, ours.key_mode, theirs.key_mode),
-        (CloseCode::Kex, "AXON_QKD_KEX", names::KEX, ours.kex, theirs.kex),
-        (CloseCode::Cipher, "AXON_QUIC_CIPHER", names::CIPHER, ours.cipher, theirs.cipher),
-    ];
-    for (code, setting, table, o, t) in numbers {
-        if o != t {
-            return differ(code, setting, name(table, o), name(table, t));
-        }
-    }
-    if ours.auth != theirs.auth {
-        let text = |a: Option<u8>| a.map_or_else(|| "absent".into(), |a| name(names::AUTH, a));
-        return differ(
-            CloseCode::Auth,
-            "AXON_CLASSIC_AUTH",
-            text(ours.auth),
-            text(theirs.auth),
-        );
+    if let Some(difference) = ours.terms().first_difference(&theirs.terms()) {
+        let code = match difference.setting {
+            "AXON_SECURITY_MODE" => CloseCode::Mode,
+            "AXON_QKD_KEY_MODE" => CloseCode::KeyMode,
+            "AXON_QKD_KEX" => CloseCode::Kex,
+            "AXON_QUIC_CIPHER" => CloseCode::Cipher,
+            _ => CloseCode::Auth,
+        };
+        return differ(code, difference.setting, difference.ours, difference.theirs);
     }
     if let Some(psk_sae) = psk_sae.filter(|s| theirs.sae.as_deref() != Some(*s)) {
         let theirs = theirs.sae.clone().unwrap_or_else(|| "absent".into());
