@@ -1,0 +1,132 @@
+//! What a session does with its own endpoints, without a daemon.
+
+use std::{path::Path, time::Duration};
+
+use axon_transport::{
+    config::{Config, DaemonPolicy, OsFiles},
+    qos::Qos,
+    session::{EndpointSpec, Publisher, Session, SessionError, SessionOptions, Subscription},
+};
+
+const PATIENCE: Duration = Duration::from_secs(60);
+
+fn session() -> Session {
+    let config = Config::resolve([], None, &OsFiles).unwrap();
+    let config = Config { daemon: DaemonPolicy::Off, ..config };
+    Session::open(&config, SessionOptions::new("test")).unwrap()
+}
+
+fn spec(qos: Qos) -> EndpointSpec {
+    EndpointSpec::new("/t", "test/Bytes", qos)
+}
+
+fn drain(subscription: &Subscription) -> Vec<i64> {
+    let mut bytes = Vec::new();
+    std::iter::from_fn(|| subscription.take(&mut bytes).map(|info| info.source_timestamp)).collect()
+}
+
+fn publishers(session: &Session, count: usize, qos: Qos) -> Vec<Publisher> {
+    (0..count).map(|_| session.create_publisher(spec(qos)).unwrap()).collect()
+}
+
+#[test]
+fn an_endpoint_out_of_bounds_is_refused() {
+    let session = session();
+    let nameless = EndpointSpec::new("", "test/Bytes", Qos::default());
+    let refused = session.create_publisher(nameless).unwrap_err();
+    assert!(matches!(refused, SessionError::Endpoint { .. }));
+    let bottomless = spec(Qos { depth: 0, ..Qos::default() });
+    assert!(session.create_subscription(bottomless).is_err());
+}
+
+#[test]
+fn publishers_are_merged_by_source_timestamp() {
+    let session = session();
+    let publishers = publishers(&session, 3, Qos::keep_all());
+    let subscription = session.create_subscription(spec(Qos::keep_all())).unwrap();
+    assert!(subscription.wait_matched(3, PATIENCE));
+    for round in 0..10 {
+        for (offset, publisher) in [2, 0, 1].iter().zip(&publishers) {
+            publisher.publish_at(round * 3 + offset, b"x").unwrap();
+        }
+    }
+    assert_eq!(drain(&subscription), (0..30).collect::<Vec<_>>());
+    assert_eq!((subscription.received(), subscription.lost()), (30, 0));
+}
+
+#[test]
+fn depth_counts_over_all_publishers_and_skipping_is_not_loss() {
+    let session = session();
+    let publishers = publishers(&session, 3, Qos::default());
+    let subscription =
+        session.create_subscription(spec(Qos { depth: 4, ..Qos::default() })).unwrap();
+    assert!(subscription.wait_matched(3, PATIENCE));
+    for time in 0..9 {
+        publishers[usize::try_from(time).unwrap() % 3].publish_at(time, b"x").unwrap();
+    }
+    assert_eq!(drain(&subscription), [5, 6, 7, 8]);
+    assert_eq!(subscription.lost(), 0);
+}
+
+#[test]
+fn what_a_publisher_left_is_taken_after_its_end() {
+    let session = session();
+    let subscription = session.create_subscription(spec(Qos::keep_all())).unwrap();
+    let publisher = session.create_publisher(spec(Qos::keep_all())).unwrap();
+    assert!(subscription.wait_matched(1, PATIENCE));
+    (0..5).for_each(|time| drop(publisher.publish_at(time, b"x").unwrap()));
+    drop(publisher);
+    assert!(session.wait_graph(PATIENCE, |graph| graph.endpoints.len() == 1));
+    assert!(subscription.matched().is_empty());
+    assert_eq!(drain(&subscription), [0, 1, 2, 3, 4]);
+}
+
+#[test]
+fn profiles_that_do_not_go_together_are_not_matched() {
+    let session = session();
+    let publisher = session.create_publisher(spec(Qos::sensor_data())).unwrap();
+    let reliable = session.create_subscription(spec(Qos::default())).unwrap();
+    let best_effort = session.create_subscription(spec(Qos::sensor_data())).unwrap();
+    assert!(best_effort.wait_matched(1, PATIENCE) && publisher.wait_matched(1, PATIENCE));
+    assert_eq!(publisher.matched(), [best_effort.gid()]);
+    assert!(reliable.matched().is_empty());
+}
+
+#[test]
+fn a_waiting_reader_is_woken_by_a_sample() {
+    let session = session();
+    let subscription = session.create_subscription(spec(Qos::default())).unwrap();
+    let publisher = session.create_publisher(spec(Qos::default())).unwrap();
+    assert!(subscription.wait_matched(1, PATIENCE));
+    std::thread::scope(|scope| {
+        let reader = scope.spawn(|| subscription.recv(&mut Vec::new(), Some(PATIENCE)).unwrap());
+        publisher.publish(b"x").unwrap();
+        assert_eq!(reader.join().unwrap().publisher, publisher.gid());
+    });
+    assert!(subscription.recv(&mut Vec::new(), Some(Duration::from_millis(1))).is_none());
+}
+
+#[test]
+fn no_signal_is_delivered_to_the_control_thread() {
+    // SIGKILL and SIGSTOP cannot be blocked, and the C library keeps 32 and 33.
+    let all = !((1u64 << 8) | (1 << 18) | (1 << 31) | (1 << 32));
+    let blocked = |task: &Path| {
+        let status = std::fs::read_to_string(task.join("status")).ok()?;
+        let mask = status.lines().find_map(|line| line.strip_prefix("SigBlk:"))?;
+        Some(u64::from_str_radix(mask.trim(), 16).unwrap() & all)
+    };
+    let here = Path::new("/proc/thread-self");
+    let before = blocked(here);
+    let session = session();
+    assert_eq!(blocked(here), before, "the mask of the thread that opened it");
+    // Once it has matched something, its control thread has long had its name.
+    let subscription = session.create_subscription(spec(Qos::default())).unwrap();
+    let _publisher = session.create_publisher(spec(Qos::default())).unwrap();
+    assert!(subscription.wait_matched(1, PATIENCE));
+    let tasks = std::fs::read_dir("/proc/self/task").unwrap().map(|task| task.unwrap().path());
+    let named = |task: &Path| {
+        std::fs::read_to_string(task.join("comm")).is_ok_and(|name| name.trim() == "axon-ctl")
+    };
+    let masks: Vec<u64> = tasks.filter(|t| named(t)).filter_map(|t| blocked(&t)).collect();
+    assert!(!masks.is_empty() && masks.iter().all(|mask| *mask == all), "{masks:x?}");
+}
