@@ -21,7 +21,7 @@ use super::{
     establish::{Established, Sealing, close, peer_text},
     inbound::Inbound,
     outbound::Carrier,
-    peer::{Peer, spawn_reader},
+    peer::{GraphChange, Peer, spawn_reader},
     pulse::Pulse,
     refusal::{Refusal, RefusedBy},
     routes,
@@ -445,8 +445,8 @@ impl Hub {
         let Some(peer) = self.peers.get_mut(&daemon).filter(|p| p.link == number) else { return };
         let result = match message {
             Message::Graph(graph) => match peer.take_graph(graph) {
-                Ok(Some((reset, added, removed))) => {
-                    self.remote_graph(daemon, reset, added, removed).await;
+                Ok(Some(change)) => {
+                    self.remote_graph(daemon, change).await;
                     Ok(())
                 }
                 Ok(None) => {
@@ -509,13 +509,8 @@ impl Hub {
         }
     }
 
-    async fn remote_graph(
-        &mut self,
-        daemon: DaemonId,
-        reset: bool,
-        added: Vec<Endpoint>,
-        removed: Vec<Gid>,
-    ) {
+    async fn remote_graph(&mut self, daemon: DaemonId, change: GraphChange) {
+        let GraphChange { reset, added, removed } = change;
         self.take_over(daemon, &added).await;
         if let Some(peer) = self.peers.get_mut(&daemon) {
             peer.want(routes::wanted(self.local.values(), peer.remote()), &self.shared);

@@ -51,6 +51,16 @@ pub(super) struct Peer {
     orders: mpsc::UnboundedSender<outbound::Order>,
 }
 
+/// What a GRAPH message changed.
+pub(super) struct GraphChange {
+    /// Whether it replaces everything that was known of the peer.
+    pub(super) reset: bool,
+    /// Endpoints that came or changed.
+    pub(super) added: Vec<Endpoint>,
+    /// Endpoints that went.
+    pub(super) removed: Vec<Gid>,
+}
+
 struct Asked {
     number: u32,
     subscribers: Vec<Subscriber>,
@@ -161,15 +171,14 @@ impl Peer {
         self.sent.clone_from(local);
     }
 
-    /// Takes a GRAPH in: what was added and removed, and whether it replaces everything; `None`
-    /// when a version is missing and the whole graph must be asked for.
+    /// Takes a GRAPH in; `None` when a version is missing and the whole graph must be asked for.
     ///
     /// # Errors
     /// The peer announces more endpoints than allowed.
     pub(super) fn take_graph(
         &mut self,
         graph: Graph,
-    ) -> Result<Option<(bool, Vec<Endpoint>, Vec<Gid>)>, &'static str> {
+    ) -> Result<Option<GraphChange>, &'static str> {
         let whole = graph.before == 0;
         if !whole && graph.before != self.remote_version {
             return Ok(None);
@@ -187,7 +196,7 @@ impl Peer {
             return Err("more endpoints than a peer may have");
         }
         self.remote_version = graph.version;
-        Ok(Some((whole, graph.added, graph.removed)))
+        Ok(Some(GraphChange { reset: whole, added: graph.added, removed: graph.removed }))
     }
 
     /// The version of the peer's graph that this side holds.
