@@ -1,1 +1,18 @@
-//! tests
+//! What the test processes and the tests that start them have in common.
+
+mod samples;
+mod words;
+
+pub use samples::{Sizes, payload};
+pub use words::{Tally, Word};
+
+use rustix::process::{Signal, getpid, kill_process};
+
+/// Ends this process, as SIGTERM would, when standard input ends. The kernel closes the pipe of a
+/// test that was killed, so none of its processes is left behind.
+pub fn end_with_stdin() {
+    let mut ignored = [0; 64];
+    while std::io::Read::read(&mut std::io::stdin(), &mut ignored).is_ok_and(|count| count > 0) {}
+    // To itself: that cannot fail while there is somebody to see it fail.
+    let _ = kill_process(getpid(), Signal::TERM);
+}

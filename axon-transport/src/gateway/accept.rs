@@ -1,7 +1,7 @@
 //! Answering dials: Retry for every unvalidated address, then the handshake, then
 //! [`establish`](super::establish).
 
-use std::sync::Arc;
+use std::{sync::Arc, time::Duration};
 
 use quinn::{Endpoint, Incoming};
 use tokio::sync::mpsc;
@@ -18,6 +18,8 @@ use crate::{
 
 /// Handshakes under way at once; further dials are refused and come again.
 const MAX_HANDSHAKES: usize = 64;
+/// A dialler that has its Retry is given this long for the rest of the handshake.
+const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// What came of an incoming dial.
 #[derive(Debug)]
@@ -85,9 +87,13 @@ async fn answer(context: &Arc<Context>, incoming: Incoming) -> Option<Incomer> {
         Ok(connecting) => connecting,
         Err(error) => return refused(Refusal::of(&error), resolver.as_deref()),
     };
-    let connection = match connecting.await {
-        Ok(connection) => connection,
-        Err(error) => {
+    let connection = match tokio::time::timeout(HANDSHAKE_TIMEOUT, connecting).await {
+        Ok(Ok(connection)) => connection,
+        Err(_) => {
+            let late = Refusal::network("the dialler did not finish its handshake within 10 s");
+            return refused(late, resolver.as_deref());
+        }
+        Ok(Err(error)) => {
             let mut refusal = Refusal::of(&error);
             let outcome = resolver.as_ref().and_then(|r| r.outcome());
             // How every bootstrap begins: the key is being fetched, and the dialler comes again.

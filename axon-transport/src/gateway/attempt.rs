@@ -228,8 +228,8 @@ impl Link {
             namespace: String::new(),
         };
         let graph = Graph { version: 1, before: 0, added: vec![endpoint], removed: vec![] };
-        let _ = self.established.outbox.send(Message::Elected(rand::random()));
-        let _ = self.established.outbox.send(Message::Graph(graph));
+        self.established.outbox.send(Message::Elected(rand::random()));
+        self.established.outbox.send(Message::Graph(graph));
     }
 
     async fn subscription(&mut self, topic: &str) -> Result<Subscribe, Refusal> {

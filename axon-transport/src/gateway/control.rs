@@ -1,7 +1,14 @@
 //! The control stream: whole, bounded messages over quinn's byte streams.
 
-use quinn::{RecvStream, SendStream};
+use std::sync::{
+    Arc,
+    atomic::{AtomicUsize, Ordering},
+};
 
+use quinn::{Connection, RecvStream, SendStream};
+use tokio::sync::mpsc;
+
+use super::establish::close;
 use crate::link::{
     CloseCode, FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, Message, read_length,
 };
@@ -59,6 +66,61 @@ impl ControlReader {
                 return Ok(message);
             }
         }
+    }
+}
+
+/// What may wait for a peer that does not read: about three graphs of the largest size.
+const MAX_QUEUED: usize = 200_000;
+
+/// Where control messages wait to be written. Cheap to clone.
+#[derive(Clone, Debug)]
+pub(super) struct Outbox {
+    messages: mpsc::UnboundedSender<Message>,
+    queued: Arc<AtomicUsize>,
+    connection: Connection,
+}
+
+impl Outbox {
+    /// Writes what is sent until the connection or the last outbox ends.
+    pub(super) fn spawn(connection: Connection, mut writer: ControlWriter) -> Self {
+        let (messages, mut receiver) = mpsc::unbounded_channel::<Message>();
+        let queued = Arc::new(AtomicUsize::new(0));
+        let outbox = Self { messages, queued: Arc::clone(&queued), connection: connection.clone() };
+        tokio::spawn(async move {
+            while let Some(message) = receiver.recv().await {
+                let result = writer.send(&message).await;
+                // Relaxed here and in `send`: a bound, not a hand-over.
+                queued.fetch_sub(weight(&message), Ordering::Relaxed);
+                if let Err(error) = result {
+                    if let Some(code) = error.code() {
+                        tracing::error!(%error, "a control message could not be sent");
+                        close(&connection, code, &error.to_string());
+                    }
+                    return;
+                }
+            }
+        });
+        outbox
+    }
+
+    /// Queues a message; one that comes too late is lost with the link. Closes the link when the
+    /// peer does not read what it is sent.
+    pub(super) fn send(&self, message: Message) {
+        let weight = weight(&message);
+        if self.queued.fetch_add(weight, Ordering::Relaxed) > MAX_QUEUED {
+            close(&self.connection, CloseCode::TooLarge, "control messages are not being read");
+        }
+        let _ = self.messages.send(message);
+    }
+}
+
+/// What a message counts for in the queue: its elements.
+fn weight(message: &Message) -> usize {
+    1 + match message {
+        Message::Graph(graph) => graph.added.len() + graph.removed.len(),
+        Message::Subscribe(subscribe) => subscribe.subscribers.len() + subscribe.last.len(),
+        Message::RouteReady(ready) => ready.publishers.len(),
+        _ => 0,
     }
 }
 

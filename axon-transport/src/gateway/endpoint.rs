@@ -22,11 +22,13 @@ const IDLE_TIMEOUT_MS: u32 = 20_000;
 /// Data streams a peer may open before its HELLO is checked; quinn allocates each of them.
 const STREAMS_BEFORE_HELLO: u32 = 128;
 /// Data streams of an open link: one per publisher and route, and best-effort messages in flight.
-pub(super) const STREAMS_OPEN: u32 = 4096;
+const STREAMS_OPEN: u32 = 4096;
 const SOCKET_BUFFER: usize = 8 << 20;
 const SEND_WINDOW: u64 = 16 << 20;
 const STREAM_WINDOW: (u64, u64) = (1 << 20, 32 << 20);
-const CONNECTION_WINDOW: u32 = 256 << 20;
+/// What a peer may have under way before its link is elected, and then.
+const WINDOW_BEFORE_ELECTION: u32 = 1 << 20;
+const WINDOW_OPEN: u32 = 256 << 20;
 
 /// The endpoints of a daemon: one per bound address, all on the same port.
 #[derive(Debug)]
@@ -165,11 +167,17 @@ pub(super) fn transport(config: &Config) -> Arc<TransportConfig> {
         .max_idle_timeout(Some(IdleTimeout::from(VarInt::from_u32(IDLE_TIMEOUT_MS))))
         .keep_alive_interval(Some(Duration::from_secs(4)))
         .stream_receive_window(VarInt::from_u64(window).unwrap_or(VarInt::MAX))
-        .receive_window(VarInt::from_u32(CONNECTION_WINDOW))
+        .receive_window(VarInt::from_u32(WINDOW_BEFORE_ELECTION))
         .send_window(SEND_WINDOW)
         .initial_mtu(1200)
         .mtu_discovery_config(Some(mtu));
     Arc::new(transport)
+}
+
+/// The link was elected: its peer may send as much as a peer may.
+pub(super) fn open_windows(connection: &quinn::Connection) {
+    connection.set_max_concurrent_uni_streams(VarInt::from_u32(STREAMS_OPEN));
+    connection.set_receive_window(VarInt::from_u32(WINDOW_OPEN));
 }
 
 /// The key of stateless resets: kept in the runtime directory, so that the daemon that takes over

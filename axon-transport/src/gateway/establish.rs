@@ -10,11 +10,10 @@ use axon_tls::{
 };
 use axon_envelope::{KeyId, KmeKey};
 use quinn::{Connection, VarInt};
-use tokio::sync::mpsc;
 
 use super::{
     context::Context,
-    control::{ControlError, ControlReader, ControlWriter},
+    control::{ControlError, ControlReader, ControlWriter, Outbox},
     keyring::{Keyring, PeerKeys},
     refusal::Refusal,
 };
@@ -43,7 +42,7 @@ pub(super) struct Established {
     /// Control messages from the peer.
     pub(super) reader: ControlReader,
     /// Control messages to the peer; written by a task of their own.
-    pub(super) outbox: mpsc::UnboundedSender<Message>,
+    pub(super) outbox: Outbox,
     /// What may come next.
     pub(super) order: Order,
     /// What seals its messages, in messages10.
@@ -170,7 +169,7 @@ async fn run(
         tokio::time::timeout(HELLO_TIMEOUT, hello).await.map_err(late)??;
     reader.hello_checked();
     order.hello_checked(theirs.daemon < ours.daemon);
-    let outbox = spawn_writer(connection.clone(), writer);
+    let outbox = Outbox::spawn(connection.clone(), writer);
 
     let sealing = match (&context.keyring, &theirs.sae) {
         (Some(keyring), Some(sae)) => {
@@ -260,33 +259,13 @@ async fn open_control(
     Ok((ControlWriter::new(send), ControlReader::new(receive)))
 }
 
-/// Writes what is put into the outbox until the connection or the outbox ends.
-fn spawn_writer(
-    connection: Connection,
-    mut writer: ControlWriter,
-) -> mpsc::UnboundedSender<Message> {
-    let (outbox, mut messages) = mpsc::unbounded_channel::<Message>();
-    tokio::spawn(async move {
-        while let Some(message) = messages.recv().await {
-            if let Err(error) = writer.send(&message).await {
-                if let Some(code) = error.code() {
-                    tracing::error!(%error, "a control message could not be sent");
-                    close(&connection, code, &error.to_string());
-                }
-                return;
-            }
-        }
-    });
-    outbox
-}
-
 /// The proof of the client's name, from either end.
 struct Proof<'a> {
     keyring: &'a Arc<Keyring>,
     connection: &'a Connection,
     number: u64,
     sae: &'a str,
-    outbox: &'a mpsc::UnboundedSender<Message>,
+    outbox: &'a Outbox,
 }
 
 impl Proof<'_> {
@@ -296,7 +275,7 @@ impl Proof<'_> {
     }
 
     fn say(&self, message: crate::keys::KeyMessage) {
-        let _ = self.outbox.send(Message::Keys(message));
+        self.outbox.send(Message::Keys(message));
     }
 
     /// In messages10: the keys of this peer, ready to receive on this connection.

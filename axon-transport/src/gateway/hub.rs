@@ -9,15 +9,15 @@ use std::{
     time::Duration,
 };
 
-use quinn::VarInt;
+use axon_tls::Negotiated;
 use tokio::sync::{Notify, mpsc};
 
 use super::{
     accept::Incomer,
     context::Context,
-    control::{ControlError, ControlReader},
+    control::{ControlError, ControlReader, Outbox},
     dial::{Target, dial},
-    endpoint::{Endpoints, STREAMS_OPEN},
+    endpoint::{Endpoints, open_windows},
     establish::{Established, Sealing, close, peer_text},
     inbound::Inbound,
     outbound::Carrier,
@@ -31,7 +31,7 @@ use crate::{
     daemon::bridge::{ToControl, ToGateway},
     graph::Endpoint,
     ids::{DaemonId, Gid},
-    link::{Candidate, CloseCode, GraphResync, Message, Side, keep},
+    link::{Candidate, CloseCode, GraphResync, Hello, Message, Side, keep},
     qos::Qos,
     session::Session,
 };
@@ -40,6 +40,9 @@ use crate::{
 const ELECTION_TIMEOUT: Duration = Duration::from_secs(10);
 /// A superseded connection may still carry the end of its streams for this long.
 const HAND_OVER: Duration = Duration::from_secs(5);
+
+/// Why somebody who claims a linked daemon's id gets no link.
+const TAKEN: &str = "this daemon id is linked already, under another identity";
 
 /// What the hub and the peers' tasks share.
 pub(super) struct Shared {
@@ -76,6 +79,8 @@ pub(super) enum Event {
     Unelected(u64),
     /// It is time for a successor under a new key.
     Renew(u64),
+    /// The link is as old as a link may get.
+    Expired(u64),
 }
 
 /// A connection between HELLO and its end.
@@ -84,7 +89,7 @@ struct Link {
     established: Summary,
     order: crate::link::Order,
     candidate: Candidate,
-    outbox: mpsc::UnboundedSender<Message>,
+    outbox: Outbox,
     carrier: Carrier,
     /// Until the election: what then lets it announce keys.
     sealing: Option<Sealing>,
@@ -97,11 +102,19 @@ struct Link {
 #[derive(Clone)]
 pub(super) struct Summary {
     /// The peer's HELLO.
-    pub(super) hello: crate::link::Hello,
+    pub(super) hello: Hello,
     /// What the handshake agreed on.
-    pub(super) negotiated: axon_tls::Negotiated,
+    pub(super) negotiated: Negotiated,
     /// As whom the peer proved itself.
     pub(super) authenticated_as: String,
+}
+
+impl Summary {
+    /// Whether `other` proved to be the same daemon: the same SAE, the same public key (which even
+    /// in `none` is one for a daemon's life).
+    fn same_peer(&self, hello: &Hello, negotiated: &Negotiated) -> bool {
+        self.hello.sae == hello.sae && self.negotiated.peer == negotiated.peer
+    }
 }
 
 /// The hub's state.
@@ -170,7 +183,7 @@ impl Hub {
             Event::Order(ToGateway::SendDatagram { to, bytes }) => self.endpoints.send(to, &bytes),
             Event::Order(ToGateway::Shutdown) => {}
             Event::Dialled(target, result) => match *result {
-                Ok(established) => self.established(established, target.replaces.is_some()).await,
+                Ok(established) => self.established(established, target.replaces).await,
                 Err(refusal) => {
                     self.refused(target.text(), refusal).await;
                     if let (Some(daemon), None) = (target.daemon, target.replaces) {
@@ -179,8 +192,8 @@ impl Hub {
                 }
             },
             Event::Incomer(Incomer::Established(established)) => {
-                let successor = established.hello.replaces.is_some();
-                self.established(*established, successor).await;
+                let replaces = established.hello.replaces;
+                self.established(*established, replaces).await;
             }
             Event::Incomer(Incomer::Refused { peer, refusal }) => {
                 self.refused(peer, refusal).await;
@@ -206,6 +219,13 @@ impl Hub {
                 }
             }
             Event::Renew(link) => self.renew(link),
+            Event::Expired(link) => {
+                let text = "AXON_QKD_SESSION_MAX_AGE is reached and no successor came";
+                if let Some(l) = self.links.get(&link) {
+                    close(&l.connection, CloseCode::KeySupply, text);
+                    self.link_ended(link, text).await;
+                }
+            }
         }
     }
 
@@ -220,19 +240,31 @@ impl Hub {
         });
     }
 
-    /// A connection completed HELLO and proof; the lower id elects.
-    async fn established(&mut self, established: Established, successor: bool) {
+    /// A connection completed HELLO and proof; the lower id elects. `replaces` names the link that
+    /// it succeeds.
+    async fn established(&mut self, established: Established, replaces: Option<[u8; 16]>) {
         let daemon = established.hello.daemon;
         let number = established.number;
-        let candidate = Candidate { side: established.side, successor };
         let current = self.peers.get(&daemon).and_then(|p| self.links.get(&p.link));
+        // Daemon ids are public: beacons carry them. Who has a link keeps it against anyone who
+        // proves to be somebody else.
+        let (hello, negotiated) = (&established.hello, &established.negotiated);
+        if current.is_some_and(|c| !c.established.same_peer(hello, negotiated)) {
+            close(&established.connection, CloseCode::NotAllowed, TAKEN);
+            self.forget(&established);
+            let peer = peer_text(
+                established.hello.sae.as_deref(),
+                established.connection.remote_address(),
+            );
+            return self.refused(peer, Refusal::here(CloseCode::NotAllowed, TAKEN)).await;
+        }
+        let successor = replaces.is_some() && current.is_some_and(|c| c.id == replaces);
+        let candidate = Candidate { side: established.side, successor };
         let we_elect = self.context.hello.daemon < daemon;
         let ours = self.context.hello.daemon;
         if we_elect && current.is_some_and(|c| !keep(ours, daemon, c.candidate, candidate)) {
             close(&established.connection, CloseCode::Duplicate, "another connection stands");
-            if let Some(keyring) = &self.context.keyring {
-                keyring.forget_connection(number);
-            }
+            self.forget(&established);
             if established.side == Side::Client {
                 let address = established.connection.remote_address();
                 self.tell(ToControl::LinkUp { daemon, address }).await;
@@ -249,6 +281,13 @@ impl Hub {
                 tokio::time::sleep(ELECTION_TIMEOUT).await;
                 let _ = events.send(Event::Unelected(number)).await;
             });
+        }
+    }
+
+    /// The connection does not become a link: its keys are let go.
+    fn forget(&self, established: &Established) {
+        if let Some(keyring) = &self.context.keyring {
+            keyring.forget_connection(established.number);
         }
     }
 
@@ -287,7 +326,7 @@ impl Hub {
     async fn elect(&mut self, number: u64) {
         let id: [u8; 16] = rand::random();
         if let Some(link) = self.links.get_mut(&number) {
-            let _ = link.outbox.send(Message::Elected(id));
+            link.outbox.send(Message::Elected(id));
             link.order.elected();
             self.open(number, id).await;
         }
@@ -295,9 +334,16 @@ impl Hub {
 
     /// The connection was elected: it becomes the peer's link.
     async fn open(&mut self, number: u64, id: [u8; 16]) {
+        let Some(link) = self.links.get(&number) else { return };
+        let daemon = link.established.hello.daemon;
+        // Another connection may have been elected while this one waited.
+        let current = self.peers.get(&daemon).and_then(|p| self.links.get(&p.link));
+        let Summary { hello, negotiated, .. } = &link.established;
+        if current.is_some_and(|c| !c.established.same_peer(hello, negotiated)) {
+            return self.violation(number, CloseCode::NotAllowed, TAKEN.into()).await;
+        }
         let Some(link) = self.links.get_mut(&number) else { return };
         link.id = Some(id);
-        let daemon = link.established.hello.daemon;
         let (connection, outbox) = (link.connection.clone(), link.outbox.clone());
         let (carrier, side) = (link.carrier.clone(), link.candidate.side);
         if let (Some(keyring), Some(sealing)) = (&self.context.keyring, link.sealing.take()) {
@@ -306,7 +352,7 @@ impl Hub {
                 tracing::error!(peer = %daemon, %error, "no message keys for this link");
             }
         }
-        connection.set_max_concurrent_uni_streams(VarInt::from_u32(STREAMS_OPEN));
+        open_windows(&connection);
         let new = match self.peers.get_mut(&daemon) {
             Some(peer) => {
                 let old = peer.link;
@@ -321,9 +367,7 @@ impl Hub {
             }
         };
         self.spawn_inbound(number, daemon, carrier);
-        if side == Side::Client {
-            self.plan_renewal(number);
-        }
+        self.plan_end(number, side);
         if let Some(peer) = self.peers.get_mut(&daemon) {
             peer.send_graph(&self.local, true);
         }
@@ -364,14 +408,19 @@ impl Hub {
     }
 
     /// In qkd a link lives no longer than AXON_QKD_SESSION_MAX_AGE: its dialler makes a successor
-    /// in time.
-    fn plan_renewal(&self, number: u64) {
+    /// in time, and should none come, both sides close it.
+    fn plan_end(&self, number: u64, side: Side) {
         let Some(keyring) = &self.context.keyring else { return };
-        let after = keyring.config.session_max_age.mul_f64(0.9);
+        let age = keyring.config.session_max_age;
         let events = self.events.clone();
         tokio::spawn(async move {
-            tokio::time::sleep(after).await;
-            let _ = events.send(Event::Renew(number)).await;
+            let renewal = age.mul_f64(0.9);
+            tokio::time::sleep(renewal).await;
+            if side == Side::Client && events.send(Event::Renew(number)).await.is_err() {
+                return;
+            }
+            tokio::time::sleep(age.saturating_sub(renewal)).await;
+            let _ = events.send(Event::Expired(number)).await;
         });
     }
 

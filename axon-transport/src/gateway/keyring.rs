@@ -14,6 +14,7 @@ use std::{
 use axon_envelope::{KeyId, KmeKey};
 use tokio::sync::{Notify, mpsc};
 
+use super::control::Outbox;
 use crate::{
     config::{Config, KeyMode, QkdConfig, Security},
     keys::{
@@ -255,7 +256,7 @@ pub(super) struct PeerKeys {
     sender: Mutex<Sender>,
     receiver: Mutex<Receiver>,
     /// Where the messages of a connection go.
-    outboxes: Mutex<HashMap<u64, mpsc::UnboundedSender<Message>>>,
+    outboxes: Mutex<HashMap<u64, Outbox>>,
     /// Wakes streams that wait for a key.
     pub(super) changed: Notify,
     timer: Notify,
@@ -268,7 +269,7 @@ impl PeerKeys {
         keyring: &Arc<Keyring>,
         connection: u64,
         exporters: &Exporters,
-        outbox: mpsc::UnboundedSender<Message>,
+        outbox: Outbox,
     ) -> Result<(), SupplyError> {
         lock(&self.outboxes).insert(connection, outbox);
         self.with_receiver(keyring, |now, r| r.attach(now, connection, exporters))?;
@@ -296,7 +297,7 @@ impl PeerKeys {
         for message in owed {
             let outboxes = lock(&self.outboxes);
             for outbox in outboxes.iter().filter(|(c, _)| **c != connection).map(|(_, o)| o) {
-                let _ = outbox.send(Message::Keys(message.clone()));
+                outbox.send(Message::Keys(message.clone()));
             }
         }
         Ok(())
@@ -399,7 +400,7 @@ impl PeerKeys {
     /// Puts a key message into its connection's outbox.
     fn post(&self, (connection, message): (u64, KeyMessage)) -> bool {
         if let Some(outbox) = lock(&self.outboxes).get(&connection) {
-            let _ = outbox.send(Message::Keys(message));
+            outbox.send(Message::Keys(message));
         }
         true
     }

@@ -10,6 +10,7 @@ use axon_envelope::{Kind, Route, TopicHash};
 use tokio::sync::mpsc;
 
 use super::{
+    control::Outbox,
     counters::Counters,
     hub::{Event, Shared},
     inbound::{Inbound, RouteIn, RoutesIn, StandIn},
@@ -35,7 +36,7 @@ pub(super) struct Peer {
     /// The number of the link in use.
     pub(super) link: u64,
     /// Control messages to it.
-    pub(super) outbox: mpsc::UnboundedSender<Message>,
+    pub(super) outbox: Outbox,
     /// What was carried and dropped.
     pub(super) counters: Arc<Counters>,
     remote: BTreeMap<Gid, Endpoint>,
@@ -71,7 +72,7 @@ impl Peer {
     /// A peer whose first link was elected.
     pub(super) fn new(
         link: u64,
-        outbox: mpsc::UnboundedSender<Message>,
+        outbox: Outbox,
         carrier: Carrier,
         shared: &Arc<Shared>,
     ) -> Self {
@@ -102,7 +103,7 @@ impl Peer {
     pub(super) fn succeed(
         &mut self,
         link: u64,
-        outbox: mpsc::UnboundedSender<Message>,
+        outbox: Outbox,
         carrier: Carrier,
     ) {
         self.link = link;
@@ -131,9 +132,9 @@ impl Peer {
         }
     }
 
-    /// Puts a message into the outbox; one that comes too late is lost with the link.
+    /// Puts a message into the outbox.
     pub(super) fn say(&self, message: Message) {
-        let _ = self.outbox.send(message);
+        self.outbox.send(message);
     }
 
     /// The endpoints that the peer announced.
@@ -273,7 +274,7 @@ impl Peer {
                 for stand_in in stand_ins {
                     wait_for_readers(&stand_in.publisher, count);
                 }
-                let _ = outbox.send(message);
+                outbox.send(message);
             });
         }
         self.asked.insert(key, asked);
@@ -341,7 +342,7 @@ impl Peer {
                 first.wait_matched(1, READY_TIMEOUT);
             }
             let publishers = relays.iter().flat_map(|r| r.matched()).collect();
-            let _ = outbox.send(Message::RouteReady(RouteReady { route, publishers }));
+            outbox.send(Message::RouteReady(RouteReady { route, publishers }));
         });
     }
 }

@@ -17,7 +17,7 @@ pub(super) fn authenticated_as(
     hello: &Hello,
     negotiated: &Negotiated,
 ) -> String {
-    if let Some(sae) = &hello.sae {
+    if let (Some(_), Some(sae)) = (&context.keyring, &hello.sae) {
         return format!("SAE {sae} (KME key)");
     }
     let Some(peer) = &negotiated.peer else { return "UNAUTHENTICATED".into() };

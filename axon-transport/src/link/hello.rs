@@ -63,7 +63,8 @@ impl Hello {
     }
 }
 
-/// Checks the peer's HELLO against ours. `psk_sae` is the peer's SAE as the PSK names it, in qkd.
+/// Checks the peer's HELLO against ours. `psk_sae` is the peer's SAE as the PSK names it; `None` in
+/// classic.
 ///
 /// # Errors
 /// The first [`Mismatch`].
@@ -101,9 +102,11 @@ pub fn check(ours: &Hello, theirs: &Hello, psk_sae: Option<&str>) -> Result<(), 
         };
         return differ(code, difference.setting, difference.ours, difference.theirs);
     }
-    if let Some(psk_sae) = psk_sae.filter(|s| theirs.sae.as_deref() != Some(*s)) {
-        let theirs = theirs.sae.clone().unwrap_or_else(|| "absent".into());
-        return differ(CloseCode::Sae, "SAE ID", format!("{psk_sae} (by the PSK)"), theirs);
+    // In classic nobody proves an SAE, so nobody may claim one.
+    if theirs.sae.as_deref() != psk_sae {
+        let text = |sae: Option<&str>| sae.unwrap_or("absent").to_owned();
+        let proven = format!("{} (by the PSK)", text(psk_sae));
+        return differ(CloseCode::Sae, "SAE ID", proven, text(theirs.sae.as_deref()));
     }
     Ok(())
 }

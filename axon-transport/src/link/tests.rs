@@ -120,6 +120,8 @@ fn bounds_are_enforced_before_anything_is_allocated() {
 fn a_hello_that_differs_is_refused_by_name() {
     let ours = hello();
     assert_eq!(check(&ours, &peer(), Some("sae-b")), Ok(()));
+    let claimed = check(&ours, &peer(), None).unwrap_err();
+    assert_eq!(claimed.code, CloseCode::Sae, "an SAE that no PSK names");
     let cases: [(Hello, CloseCode); 9] = [
         (Hello { protocol_min: 2, protocol_max: 3, ..peer() }, CloseCode::Protocol),
         (Hello { daemon: ours.daemon, ..peer() }, CloseCode::Self_),
