@@ -1,0 +1,229 @@
+//! Discovery datagrams, frames between daemons, packets between a session and its daemon.
+
+use axon_envelope::{IndexMask, KeyId};
+use axon_transport::{
+    discovery::{
+        Terms,
+        beacon::{self, Beacon, Datagram},
+    },
+    graph::{Endpoint, EndpointKind},
+    ids::{DaemonId, Gid, SessionId},
+    keys::KeyMessage,
+    link::{self, FrameError},
+    qos::Qos,
+    session::message::{self as session, CodecError, MAX_PACKET},
+};
+
+const TERMS: Terms = Terms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(1) };
+
+/// What decodes encodes to a datagram within bounds that decodes to the same.
+pub fn beacon(data: &[u8]) -> bool {
+    let Ok(datagram) = Datagram::decode(data) else { return false };
+    assert!(data.len() <= beacon::LONGEST, "a datagram over the bound was read");
+    if let Datagram::Beacon(beacon) = &datagram {
+        // Terms this release has no name for must still be nameable.
+        let difference = TERMS.first_difference(&beacon.terms);
+        assert_eq!(difference.is_none(), TERMS == beacon.terms);
+    }
+    let encoded = datagram.encode();
+    assert!(encoded.len() <= beacon::LONGEST, "encodes to {} bytes", encoded.len());
+    let again = Datagram::decode(&encoded).expect("what was encoded decodes");
+    assert_eq!(again, datagram);
+    true
+}
+
+/// What decodes encodes to a frame that decodes to the same, and compression changes nothing.
+pub fn link_frame(data: &[u8]) -> bool {
+    let decoded = link::Message::from_frame(data);
+    if let Some((&kind, map)) = data.split_first().filter(|(kind, _)| **kind & 0x80 == 0) {
+        let body = zstd::bulk::compress(map, 1).expect("zstd takes any bytes");
+        let length = u32::try_from(map.len()).expect("inputs are short").to_be_bytes();
+        let frame = [&[kind | 0x80][..], &length, &body].concat();
+        let inflated = link::Message::from_frame(&frame);
+        assert_eq!(inflated.as_ref().ok(), decoded.as_ref().ok(), "compression matters");
+    }
+    let Ok(Some(message)) = decoded else { return false };
+    match message.to_frame() {
+        Ok(frame) => {
+            let (prefix, body) = frame.split_first_chunk::<4>().expect("a frame has a length");
+            let length = link::read_length(*prefix, link::MAX_FRAME).expect("the length is right");
+            assert_eq!(length, body.len());
+            let again = link::Message::from_frame(body).expect("what was encoded decodes");
+            assert_eq!(again, Some(message));
+        }
+        // Only what came compressed can be as large.
+        Err(FrameError::TooLarge { .. }) => assert!(data[0] & 0x80 != 0),
+        Err(other) => panic!("does not encode: {other}"),
+    }
+    true
+}
+
+/// What decodes encodes to a packet that decodes to the same.
+pub fn session_message(data: &[u8]) -> bool {
+    let Ok(message) = session::Message::decode(data) else { return false };
+    match message.encode() {
+        Ok(packet) => {
+            let again = session::Message::decode(&packet).expect("what was encoded decodes");
+            assert_eq!(again, message);
+        }
+        // An array of indefinite length can be a byte shorter than its definite spelling.
+        Err(CodecError::TooLarge(_)) => assert!(data.len() > MAX_PACKET - 16),
+        Err(other) => panic!("does not encode: {other}"),
+    }
+    true
+}
+
+/// Every kind of datagram.
+pub fn beacon_seeds() -> Vec<Vec<u8>> {
+    let daemon = DaemonId([1; 16]);
+    let beacon = Beacon {
+        protocols: (1, 1),
+        domain: 7,
+        daemon,
+        terms: TERMS,
+        sae: None,
+        port: 61_300,
+        addresses: vec!["192.0.2.1".parse().unwrap(), "2001:db8::1".parse().unwrap()],
+        graph: 0x0123_4567_89ab_cdef,
+        answer_wanted: true,
+        localhost: false,
+    };
+    let qkd = Terms { mode: Terms::QKD, key_mode: 2, kex: 1, cipher: 0, auth: None };
+    let qkd = Beacon { terms: qkd, sae: Some("sae-a".into()), localhost: true, ..beacon.clone() };
+    let foreign = beacon::Foreign { protocols: (2, 9), domain: 7, daemon };
+    [
+        Datagram::Beacon(beacon),
+        Datagram::Beacon(qkd),
+        Datagram::Foreign(foreign),
+        Datagram::Goodbye { domain: 7, daemon },
+        Datagram::Probe { daemon, nonce: [2; 8] },
+        Datagram::Echo { daemon, nonce: [2; 8] },
+    ]
+    .iter()
+    .map(Datagram::encode)
+    .collect()
+}
+
+fn endpoint() -> Endpoint {
+    Endpoint {
+        gid: Gid([7; 16]),
+        kind: EndpointKind::Publisher,
+        topic: "/scan".into(),
+        type_name: "sensor_msgs/msg/LaserScan".into(),
+        type_hash: vec![1, 2, 3],
+        qos: Qos { deadline: Some(5), lifespan: Some(6), ..Qos::keep_all() },
+        node: "lidar".into(),
+        namespace: "/".into(),
+    }
+}
+
+/// Every message of the control stream, one of them large enough to be compressed.
+pub fn link_frame_seeds() -> Vec<Vec<u8>> {
+    use link::Message;
+    let hello = link::Hello {
+        protocol_min: 1,
+        protocol_max: 1,
+        domain: 0,
+        daemon: DaemonId([1; 16]),
+        mode: 1,
+        key_mode: 2,
+        kex: 1,
+        cipher: 0,
+        sae: Some("sae-a".into()),
+        host: "robot".into(),
+        auth: None,
+        replaces: Some([3; 16]),
+        expects: Some(DaemonId([4; 16])),
+        static_peer: true,
+    };
+    let gid = Gid([6; 16]);
+    let key_id = KeyId::new("bc490419-7d60-487f-adc1-4ddcc177c139").unwrap();
+    let graph = |endpoints| link::Graph {
+        version: 2,
+        before: 1,
+        added: vec![endpoint(); endpoints],
+        removed: vec![gid],
+    };
+    let mask = |bits| IndexMask::from_bits(bits).unwrap();
+    let messages = [
+        Message::Hello(hello),
+        Message::Elected([9; 16]),
+        Message::Graph(graph(1)),
+        Message::Graph(graph(64)),
+        Message::GraphResync(link::GraphResync { version: 2 }),
+        Message::Subscribe(link::Subscribe {
+            route: 1,
+            topic: "/scan".into(),
+            type_name: "sensor_msgs/msg/LaserScan".into(),
+            kind: 0,
+            subscribers: vec![link::Subscriber { gid, qos: Qos::default() }],
+            last: vec![link::LastSeen { publisher: gid, sequence: 42 }],
+        }),
+        Message::Unsubscribe(link::Unsubscribe { route: 1 }),
+        Message::RouteReady(link::RouteReady { route: 1, publishers: vec![gid] }),
+        Message::Keepalive,
+        Message::Keys(KeyMessage::Announce(vec![key_id.clone(), KeyId::new("k2").unwrap()])),
+        Message::Keys(KeyMessage::Ready { key_id: key_id.clone(), proof: [8; 32] }),
+        Message::Keys(KeyMessage::Failed { key_id: key_id.clone(), reason: "unknown".into() }),
+        Message::Keys(KeyMessage::Retire { key_id, used: mask(0x3ff), reliable: mask(0x155) }),
+    ];
+    messages.iter().map(|message| message.to_frame().unwrap().split_off(4)).collect()
+}
+
+/// Every message of the session socket.
+pub fn session_message_seeds() -> Vec<Vec<u8>> {
+    use session::{
+        Announce, Attach, EndpointRole, Gone, Granted, Graph, GraphItem, Hello, Message, PROTOCOL,
+        Pair, Refused, SessionRole, StatusPart, Unmatch, Welcome,
+    };
+    let (reader, writer) = (Gid([1; 16]), Gid([2; 16]));
+    let session = SessionId([3; 16]);
+    let daemon = DaemonId([4; 16]);
+    let messages = [
+        Message::Hello(Hello {
+            protocol: PROTOCOL,
+            session,
+            role: SessionRole::Application,
+            name: "talker".into(),
+            domain: 7,
+            settings: vec![("AXON_SECURITY_MODE".into(), "classic".into())],
+        }),
+        Message::Welcome(Welcome { protocol: PROTOCOL, daemon, pid: 12 }),
+        Message::Refused(Refused {
+            variable: "AXON_QUIC_CIPHER".into(),
+            ours: "chacha20-poly1305".into(),
+            theirs: "aes-256-gcm".into(),
+            text: "they differ".into(),
+        }),
+        Message::Endpoint(Announce {
+            endpoint: endpoint(),
+            role: EndpointRole::Relay,
+            stands_for: vec![reader, writer],
+        }),
+        Message::EndpointGone(Gone { gid: reader }),
+        Message::Graph(Graph {
+            version: 3,
+            whole: true,
+            added: vec![GraphItem { endpoint: endpoint(), daemon: Some(daemon) }],
+            removed: vec![writer],
+            more: false,
+        }),
+        Message::Match(Pair { reader, writer }),
+        Message::Attach(Attach {
+            reader,
+            writer,
+            lane: 4,
+            qos: Qos::default(),
+            session,
+            stands_for: vec![reader],
+        }),
+        Message::Grant(Granted { reader, writer, generation: 5, first: 6, session }),
+        Message::Detach(Pair { reader, writer }),
+        Message::Unmatch(Unmatch { reader, writer, reason: "gone".into() }),
+        Message::StatusRequest,
+        Message::Status(StatusPart { part: 0, parts: 1, text: b"{}".to_vec() }),
+        Message::Resync,
+        Message::Unknown(200),
+    ];
+    messages.iter().map(|message| message.encode().unwrap()).collect()
+}
