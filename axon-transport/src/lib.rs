@@ -1,4 +1,4 @@
-//! Shared memory on a host, QUIC between hosts: the transport under AXON.
+#![doc = include_str!("../README.md")]
 
 #![deny(unsafe_code)]
 
