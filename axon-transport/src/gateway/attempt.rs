@@ -296,12 +296,7 @@ impl Link {
 }
 
 fn greeting(publisher: Gid) -> Sample {
-    let info = MessageInfo {
-        publisher,
-        sequence: 1,
-        source_timestamp: 0,
-        received_timestamp: 0,
-    };
+    let info = MessageInfo { publisher, sequence: 1, source_timestamp: 0, received_timestamp: 0 };
     sample(info, b"an attempt".to_vec())
 }
 

@@ -82,7 +82,10 @@ impl Context {
     }
 
     /// The client's side of a qkd handshake on one PSK.
-    pub(super) fn qkd_client(&self, attempt: &Attempt) -> Result<quinn::ClientConfig, GatewayError> {
+    pub(super) fn qkd_client(
+        &self,
+        attempt: &Attempt,
+    ) -> Result<quinn::ClientConfig, GatewayError> {
         let Security::Qkd(qkd) = &self.config.security else {
             return Err(GatewayError::WrongMode);
         };

@@ -9,9 +9,7 @@ use quinn::{Connection, RecvStream, SendStream};
 use tokio::sync::mpsc;
 
 use super::establish::close;
-use crate::link::{
-    CloseCode, FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, Message, read_length,
-};
+use crate::link::{CloseCode, FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, Message, read_length};
 
 /// Why no further message came.
 #[derive(Debug, thiserror::Error)]

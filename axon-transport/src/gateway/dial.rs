@@ -173,9 +173,8 @@ async fn qkd(
                 let key_id = &attempt.key_id;
                 let error = match reach(endpoints, target, &client).await {
                     Ok(connection) => {
-                        let spent = |now, d: &mut crate::keys::Dialler| {
-                            d.succeeded(now, sae, key_id)
-                        };
+                        let spent =
+                            |now, d: &mut crate::keys::Dialler| d.succeeded(now, sae, key_id);
                         if keyring.with_dialler(spent) == Completion::Reused {
                             let text = "this PSK has completed a handshake before";
                             super::establish::close(&connection, CloseCode::KeyReused, text);

@@ -116,9 +116,7 @@ impl Endpoints {
     fn index_towards(&self, to: SocketAddr) -> Option<usize> {
         let family = |a: &SocketAddr| a.is_ipv4() == to.is_ipv4();
         let local = |a: &SocketAddr| a.ip().is_loopback() == to.ip().is_loopback();
-        self.senders
-            .iter()
-            .position(|(a, _)| family(a) && (local(a) || a.ip().is_unspecified()))
+        self.senders.iter().position(|(a, _)| family(a) && (local(a) || a.ip().is_unspecified()))
     }
 }
 

@@ -3,12 +3,12 @@
 
 use std::{net::SocketAddr, sync::Arc, time::Duration};
 
+use axon_envelope::{KeyId, KmeKey};
 use axon_tls::{
     KeyExchange, Negotiated, PskKex,
     qkd::PskIdentity,
     quic::{ALPN, negotiated},
 };
-use axon_envelope::{KeyId, KmeKey};
 use quinn::{Connection, VarInt};
 
 use super::{

@@ -161,7 +161,11 @@ impl Keyring {
     }
 
     /// One fresh key for the peer `slave`, outside every machine: for [`super::attempt`].
-    pub(super) async fn fetch_one(&self, slave: &str, link: u64) -> Result<(KeyId, KmeKey), String> {
+    pub(super) async fn fetch_one(
+        &self,
+        slave: &str,
+        link: u64,
+    ) -> Result<(KeyId, KmeKey), String> {
         let mut answers = self.proof_answers(link);
         let request = Request::Enc {
             slave: slave.to_owned(),
@@ -383,10 +387,8 @@ impl PeerKeys {
     async fn run_timers(self: Arc<Self>, keyring: Arc<Keyring>, connection: u64) {
         while lock(&self.outboxes).contains_key(&connection) {
             let now = keyring.clock.now();
-            let next = [
-                lock(&self.sender).poll_timeout(now),
-                lock(&self.receiver).poll_timeout(now),
-            ];
+            let next =
+                [lock(&self.sender).poll_timeout(now), lock(&self.receiver).poll_timeout(now)];
             let next = next.into_iter().flatten().min();
             let sleep = next
                 .map_or(Duration::from_secs(1), |at| at.saturating_sub(now))

@@ -168,8 +168,7 @@ fn apply(order: Order, routes: &mut HashMap<u32, Active>, carrier: &watch::Sende
                 relays.push(Relay { subscription, pending });
             }
             let streams = old.map(|o| o.streams).unwrap_or_default();
-            let active =
-                Active { route: route.route, specs, relays, seen: route.seen, streams };
+            let active = Active { route: route.route, specs, relays, seen: route.seen, streams };
             routes.insert(number, active);
         }
     }
@@ -206,12 +205,7 @@ impl Active {
     }
 
     /// Whether this relay is the one that sends the sample, and the peer lacks it.
-    fn wanted(
-        &self,
-        index: usize,
-        sample: &Sample,
-        offered: &impl Fn(Gid) -> Option<Qos>,
-    ) -> bool {
+    fn wanted(&self, index: usize, sample: &Sample, offered: &impl Fn(Gid) -> Option<Qos>) -> bool {
         let publisher = sample.info.publisher;
         let new = self.seen.get(&publisher).is_none_or(|last| sample.info.sequence > *last);
         // A publisher that is gone from the graph still drains through the relay that has it.
@@ -231,9 +225,10 @@ impl Active {
         if ended {
             self.streams.remove(&publisher);
         }
-        let stream = self.streams.entry(publisher).or_insert_with(|| {
-            Stream::start(number, route, publisher, &qos, Arc::clone(shared))
-        });
+        let stream = self
+            .streams
+            .entry(publisher)
+            .or_insert_with(|| Stream::start(number, route, publisher, &qos, Arc::clone(shared)));
         let offered = lock(&stream.queue).offer(sample);
         match offered {
             Offered::Full(sample) => Some(sample),

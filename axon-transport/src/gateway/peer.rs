@@ -70,12 +70,7 @@ struct Asked {
 
 impl Peer {
     /// A peer whose first link was elected.
-    pub(super) fn new(
-        link: u64,
-        outbox: Outbox,
-        carrier: Carrier,
-        shared: &Arc<Shared>,
-    ) -> Self {
+    pub(super) fn new(link: u64, outbox: Outbox, carrier: Carrier, shared: &Arc<Shared>) -> Self {
         let counters = Arc::new(Counters::default());
         let (orders, receiver) = mpsc::unbounded_channel();
         let graph = Arc::clone(&shared.local_qos);
@@ -100,12 +95,7 @@ impl Peer {
 
     /// A successor link takes over: samples go over it from now on, and both sides repeat what they
     /// said last, since it may have been lost with the old one.
-    pub(super) fn succeed(
-        &mut self,
-        link: u64,
-        outbox: Outbox,
-        carrier: Carrier,
-    ) {
+    pub(super) fn succeed(&mut self, link: u64, outbox: Outbox, carrier: Carrier) {
         self.link = link;
         self.outbox = outbox;
         let _ = self.orders.send(outbound::Order::Connection(carrier));
@@ -176,10 +166,7 @@ impl Peer {
     ///
     /// # Errors
     /// The peer announces more endpoints than allowed.
-    pub(super) fn take_graph(
-        &mut self,
-        graph: Graph,
-    ) -> Result<Option<GraphChange>, &'static str> {
+    pub(super) fn take_graph(&mut self, graph: Graph) -> Result<Option<GraphChange>, &'static str> {
         let whole = graph.before == 0;
         if !whole && graph.before != self.remote_version {
             return Ok(None);
@@ -318,8 +305,7 @@ impl Peer {
         self.announce_ready(subscribe.route, &current);
         self.relays.insert(subscribe.route, current.clone());
         let seen = subscribe.last.iter().map(|l| (l.publisher, l.sequence)).collect();
-        let route =
-            RouteOut { route: Route { kind: Kind::Topic, topic }, relays: current, seen };
+        let route = RouteOut { route: Route { kind: Kind::Topic, topic }, relays: current, seen };
         let _ = self.orders.send(outbound::Order::Route(subscribe.route, route));
         Ok(())
     }
@@ -330,11 +316,7 @@ impl Peer {
         let _ = self.orders.send(outbound::Order::End(route));
     }
 
-    fn announce_ready(
-        &self,
-        route: u32,
-        relays: &[(super::routes::RelaySpec, Arc<Subscription>)],
-    ) {
+    fn announce_ready(&self, route: u32, relays: &[(super::routes::RelaySpec, Arc<Subscription>)]) {
         let relays: Vec<_> = relays.iter().map(|(_, s)| Arc::clone(s)).collect();
         let outbox = self.outbox.clone();
         tokio::task::spawn_blocking(move || {
@@ -351,9 +333,7 @@ fn subscribe(key: &TopicKey, asked: &Asked) -> Message {
     let last = asked
         .stand_ins
         .iter()
-        .filter_map(|(gid, s)| {
-            Some(LastSeen { publisher: *gid, sequence: s.last_sequence()? })
-        })
+        .filter_map(|(gid, s)| Some(LastSeen { publisher: *gid, sequence: s.last_sequence()? }))
         .collect();
     Message::Subscribe(Subscribe {
         route: asked.number,

@@ -72,7 +72,8 @@ impl Queue {
             return Offered::Full(sample);
         }
         let mut dropped = 0;
-        while over(self) || matches!(self.policy, Policy::Depth(d) if self.samples.len() >= d.max(1))
+        while over(self)
+            || matches!(self.policy, Policy::Depth(d) if self.samples.len() >= d.max(1))
         {
             if self.pop().is_none() {
                 break;

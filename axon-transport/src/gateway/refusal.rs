@@ -132,7 +132,9 @@ fn transport_name(error: &ConnectionError) -> String {
 /// What an alert means between two AXON daemons.
 fn meaning(alert: u8) -> Option<&'static str> {
     Some(match alert {
-        40 => "no common key exchange or cipher: AXON offers X25519MLKEM768 and one cipher, no more",
+        40 => {
+            "no common key exchange or cipher: AXON offers X25519MLKEM768 and one cipher, no more"
+        }
         42 | 46 | 48 | 116 => "the peer's key or certificate is not trusted",
         51 => "the PSK binder does not fit: the two sides hold different keys",
         109 => "no PSK was offered to a daemon in qkd: AXON_SECURITY_MODE differs",

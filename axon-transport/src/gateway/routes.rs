@@ -88,10 +88,8 @@ pub(super) fn relays(subscribers: &[Subscriber]) -> Vec<RelaySpec> {
     let mut groups: BTreeMap<(bool, bool), RelaySpec> = BTreeMap::new();
     for subscriber in subscribers {
         let qos = subscriber.qos;
-        let key = (
-            qos.reliability == Reliability::BestEffort,
-            qos.durability == Durability::Volatile,
-        );
+        let key =
+            (qos.reliability == Reliability::BestEffort, qos.durability == Durability::Volatile);
         let group = groups.entry(key).or_insert_with(|| RelaySpec {
             // Deadline, lifespan and liveliness are judged where the subscription lives.
             qos: Qos {

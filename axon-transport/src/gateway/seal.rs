@@ -90,22 +90,24 @@ impl Protection {
                 frame.extend_from_slice(&sample.payload);
                 Ok(())
             }
-            Self::Envelope { keyring, keys, connection } => keys.with_sender(keyring, |now, sender| {
-                // A successor holds the keys by now: what it binds them to is not this connection.
-                if sender.attached() != Some(*connection) {
-                    return Err(NoKey::Detached);
-                }
-                let plain = header.len() + sample.payload.len();
-                frame.resize(LENGTH + sender.overhead() + plain, 0);
-                let slot = sender.slot(now, delivery)?;
-                let parts: [&[u8]; 2] = [&header, &sample.payload];
-                let sealed = slot.seal_into(route, &parts, &mut frame[LENGTH..]);
-                // The buffer has room for the longest header, and the payload is bounded.
-                let length = sealed.map_err(|_| NoKey::None)?;
-                frame.truncate(LENGTH + length);
-                frame[..LENGTH].copy_from_slice(&(length as u32).to_be_bytes());
-                Ok(())
-            }),
+            Self::Envelope { keyring, keys, connection } => {
+                keys.with_sender(keyring, |now, sender| {
+                    // A successor holds the keys by now: what it binds them to is not this connection.
+                    if sender.attached() != Some(*connection) {
+                        return Err(NoKey::Detached);
+                    }
+                    let plain = header.len() + sample.payload.len();
+                    frame.resize(LENGTH + sender.overhead() + plain, 0);
+                    let slot = sender.slot(now, delivery)?;
+                    let parts: [&[u8]; 2] = [&header, &sample.payload];
+                    let sealed = slot.seal_into(route, &parts, &mut frame[LENGTH..]);
+                    // The buffer has room for the longest header, and the payload is bounded.
+                    let length = sealed.map_err(|_| NoKey::None)?;
+                    frame.truncate(LENGTH + length);
+                    frame[..LENGTH].copy_from_slice(&(length as u32).to_be_bytes());
+                    Ok(())
+                })
+            }
         }
     }
 

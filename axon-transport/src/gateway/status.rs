@@ -6,10 +6,7 @@ use axon_tls::{Negotiated, identity::Auth};
 use quinn::Connection;
 
 use super::{context::Context, hub::Summary};
-use crate::{
-    daemon::status::LinkStatus,
-    link::Hello,
-};
+use crate::{daemon::status::LinkStatus, link::Hello};
 
 /// As whom the peer proved itself, in words.
 pub(super) fn authenticated_as(

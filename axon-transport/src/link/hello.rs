@@ -69,9 +69,8 @@ impl Hello {
 /// # Errors
 /// The first [`Mismatch`].
 pub fn check(ours: &Hello, theirs: &Hello, psk_sae: Option<&str>) -> Result<(), Mismatch> {
-    let differ = |code, setting, ours: String, theirs: String| {
-        Err(Mismatch { code, setting, ours, theirs })
-    };
+    let differ =
+        |code, setting, ours: String, theirs: String| Err(Mismatch { code, setting, ours, theirs });
     if theirs.protocol_min > ours.protocol_max || theirs.protocol_max < ours.protocol_min {
         let range = |h: &Hello| format!("{}..={}", h.protocol_min, h.protocol_max);
         return differ(CloseCode::Protocol, "protocol version", range(ours), range(theirs));

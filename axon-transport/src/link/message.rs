@@ -226,9 +226,10 @@ impl Message {
             6 => Self::Unsubscribe(from_map(kind, map)?),
             7 => Self::RouteReady(from_map(kind, map)?),
             8 => from_map::<Nothing>(kind, map).map(|_| Self::Keepalive)?,
-            16..=19 => Self::Keys(KeyMessage::decode(kind, map).map_err(|e| {
-                FrameError::Malformed { kind, reason: e.to_string() }
-            })?),
+            16..=19 => Self::Keys(
+                KeyMessage::decode(kind, map)
+                    .map_err(|e| FrameError::Malformed { kind, reason: e.to_string() })?,
+            ),
             _ => return Ok(None),
         };
         match message.bounds() {

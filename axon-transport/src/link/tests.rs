@@ -40,7 +40,11 @@ fn peer() -> Hello {
 fn messages() -> Vec<Message> {
     let qos = Qos { lifespan: Some(7), ..Qos::keep_all() };
     vec![
-        Message::Hello(Hello { replaces: Some([3; 16]), expects: Some(DaemonId([4; 16])), ..hello() }),
+        Message::Hello(Hello {
+            replaces: Some([3; 16]),
+            expects: Some(DaemonId([4; 16])),
+            ..hello()
+        }),
         Message::Elected([9; 16]),
         Message::Graph(Graph { version: 2, before: 1, added: vec![], removed: vec![Gid([5; 16])] }),
         Message::GraphResync(GraphResync { version: 2 }),
@@ -152,10 +156,9 @@ fn nothing_precedes_hello_proof_and_election() {
         for m in &others {
             let proof = match side {
                 Side::Client => matches!(m, Message::Keys(KeyMessage::Announce(_))),
-                Side::Server => matches!(
-                    m,
-                    Message::Keys(KeyMessage::Ready { .. } | KeyMessage::Failed { .. })
-                ),
+                Side::Server => {
+                    matches!(m, Message::Keys(KeyMessage::Ready { .. } | KeyMessage::Failed { .. }))
+                }
             };
             let allowed = proof || matches!(m, Message::Keepalive);
             assert_eq!(order.accept(m).is_ok(), allowed, "{} before the proof", m.name());

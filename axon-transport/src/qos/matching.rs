@@ -70,16 +70,8 @@ mod tests {
     fn each_policy_is_refused_when_less_is_offered_than_requested() {
         let q = Qos::default();
         let cases = [
-            (
-                Qos { reliability: Reliability::BestEffort, ..q },
-                q,
-                Err(Incompatible::Reliability),
-            ),
-            (
-                q,
-                Qos { durability: Durability::TransientLocal, ..q },
-                Err(Incompatible::Durability),
-            ),
+            (Qos { reliability: Reliability::BestEffort, ..q }, q, Err(Incompatible::Reliability)),
+            (q, Qos { durability: Durability::TransientLocal, ..q }, Err(Incompatible::Durability)),
             (q, Qos { deadline: Some(5), ..q }, Err(Incompatible::Deadline)),
             (
                 Qos { deadline: Some(6), ..q },
@@ -87,11 +79,7 @@ mod tests {
                 Err(Incompatible::Deadline),
             ),
             (Qos { deadline: Some(5), ..q }, Qos { deadline: Some(5), ..q }, Ok(())),
-            (
-                q,
-                Qos { liveliness: Liveliness::ManualByTopic, ..q },
-                Err(Incompatible::Liveliness),
-            ),
+            (q, Qos { liveliness: Liveliness::ManualByTopic, ..q }, Err(Incompatible::Liveliness)),
             (q, Qos { lease: Some(1), ..q }, Err(Incompatible::LivelinessLease)),
             (q, Qos::sensor_data(), Ok(())),
             (Qos::keep_all(), q, Ok(())),

@@ -1,0 +1,79 @@
+//! The graph across links: what peers are told, and the routes that follow from what they tell.
+
+use super::Hub;
+use crate::{
+    daemon::bridge::ToControl,
+    gateway::{peer::GraphChange, routes, status},
+    graph::Endpoint,
+    ids::DaemonId,
+};
+
+impl Hub {
+    /// The local graph changed: peers are told, and routes follow.
+    pub(super) async fn local_graph(&mut self) {
+        let view = self.shared.session.graph();
+        self.local = view
+            .endpoints
+            .values()
+            .filter(|e| e.daemon.is_none())
+            .map(|e| (e.endpoint.gid, (*e.endpoint).clone()))
+            .collect();
+        let qos = self.local.values().map(|e| (e.gid, e.qos)).collect();
+        *self.shared.local_qos.write().unwrap_or_else(std::sync::PoisonError::into_inner) = qos;
+        for peer in self.peers.values_mut() {
+            peer.send_graph(&self.local, false);
+            peer.want(routes::wanted(self.local.values(), peer.remote()), &self.shared);
+        }
+    }
+
+    pub(super) async fn remote_graph(&mut self, daemon: DaemonId, change: GraphChange) {
+        let GraphChange { reset, added, removed } = change;
+        self.take_over(daemon, &added).await;
+        if let Some(peer) = self.peers.get_mut(&daemon) {
+            peer.want(routes::wanted(self.local.values(), peer.remote()), &self.shared);
+        }
+        self.tell(ToControl::RemoteGraph { daemon, reset, added, removed }).await;
+    }
+
+    /// A restarted daemon announces the endpoints of its predecessor, whose link may not have timed
+    /// out yet: they are the new daemon's from now on, if it is the same host by what both proved.
+    pub(super) async fn take_over(&mut self, daemon: DaemonId, added: &[Endpoint]) {
+        let Some(owner) = self.identity_of(daemon) else { return };
+        let others: Vec<_> = self.peers.keys().filter(|d| **d != daemon).copied().collect();
+        for other in others {
+            let same_host = self.identity_of(other).is_some_and(|i| i == owner);
+            let Some(peer) = self.peers.get_mut(&other) else { continue };
+            let moved: Vec<_> = added
+                .iter()
+                .map(|e| e.gid)
+                .filter(|gid| peer.remote().any(|e| e.gid == *gid))
+                .collect();
+            if moved.is_empty() {
+                continue;
+            }
+            if !same_host {
+                tracing::warn!(peer = %daemon, endpoints = moved.len(),
+                    "a peer announces endpoints of another peer; they stay where they were");
+                if let Some(claimer) = self.peers.get_mut(&daemon) {
+                    claimer.forget(&moved);
+                }
+                continue;
+            }
+            peer.forget(&moved);
+            peer.want(routes::wanted(self.local.values(), peer.remote()), &self.shared);
+            let gone = ToControl::RemoteGraph {
+                daemon: other,
+                reset: false,
+                added: vec![],
+                removed: moved,
+            };
+            self.tell(gone).await;
+        }
+    }
+
+    /// What a peer proved to be, beyond its daemon id.
+    pub(super) fn identity_of(&self, daemon: DaemonId) -> Option<String> {
+        let link = self.links.get(&self.peers.get(&daemon)?.link)?;
+        Some(status::host_identity(&link.established, link.connection.remote_address()))
+    }
+}

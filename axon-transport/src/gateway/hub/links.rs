@@ -1,0 +1,277 @@
+//! Links: from a connection that proved its peer to the one that is in use, its successor, its end.
+
+use std::{sync::Arc, time::Duration};
+
+use tokio::sync::mpsc;
+
+use super::{Event, Hub, Link, Summary};
+use crate::{
+    daemon::bridge::ToControl,
+    gateway::{
+        control::ControlReader,
+        dial::{Target, dial},
+        endpoint::open_windows,
+        establish::{Established, Sealing, close, peer_text},
+        inbound::Inbound,
+        outbound::Carrier,
+        peer::{Peer, spawn_reader},
+        refusal::{Refusal, RefusedBy},
+        seal::Protection,
+        status,
+    },
+    ids::DaemonId,
+    link::{Candidate, CloseCode, Message, Side, keep},
+};
+
+/// A link that the lower id has not elected by then is closed.
+const ELECTION_TIMEOUT: Duration = Duration::from_secs(10);
+/// A superseded connection may still carry the end of its streams for this long.
+const HAND_OVER: Duration = Duration::from_secs(5);
+/// Why somebody who claims a linked daemon's id gets no link.
+const TAKEN: &str = "this daemon id is linked already, under another identity";
+
+impl Hub {
+    pub(super) fn dial(&self, target: Target) {
+        let (context, endpoints) = (Arc::clone(&self.context), Arc::clone(&self.endpoints));
+        let events = self.events.clone();
+        tokio::spawn(async move {
+            let result = dial(&context, &endpoints, &target).await;
+            let _ = events.send(Event::Dialled(target, Box::new(result))).await;
+        });
+    }
+
+    /// A connection completed HELLO and proof; the lower id elects. `replaces` names the link that
+    /// it succeeds.
+    pub(super) async fn established(
+        &mut self,
+        established: Established,
+        replaces: Option<[u8; 16]>,
+    ) {
+        let daemon = established.hello.daemon;
+        let number = established.number;
+        let current = self.peers.get(&daemon).and_then(|p| self.links.get(&p.link));
+        // Daemon ids are public: beacons carry them. Who has a link keeps it against anyone who
+        // proves to be somebody else.
+        let (hello, negotiated) = (&established.hello, &established.negotiated);
+        if current.is_some_and(|c| !c.established.same_peer(hello, negotiated)) {
+            close(&established.connection, CloseCode::NotAllowed, TAKEN);
+            self.forget(&established);
+            let peer = peer_text(
+                established.hello.sae.as_deref(),
+                established.connection.remote_address(),
+            );
+            return self.refused(peer, Refusal::here(CloseCode::NotAllowed, TAKEN)).await;
+        }
+        let successor = replaces.is_some() && current.is_some_and(|c| c.id == replaces);
+        let candidate = Candidate { side: established.side, successor };
+        let we_elect = self.context.hello.daemon < daemon;
+        let ours = self.context.hello.daemon;
+        if we_elect && current.is_some_and(|c| !keep(ours, daemon, c.candidate, candidate)) {
+            close(&established.connection, CloseCode::Duplicate, "another connection stands");
+            self.forget(&established);
+            if established.side == Side::Client {
+                let address = established.connection.remote_address();
+                self.tell(ToControl::LinkUp { daemon, address }).await;
+            }
+            return;
+        }
+        let reader = self.insert(established, candidate);
+        spawn_reader(number, reader, self.events.clone());
+        if we_elect {
+            self.elect(number).await;
+        } else {
+            let events = self.events.clone();
+            tokio::spawn(async move {
+                tokio::time::sleep(ELECTION_TIMEOUT).await;
+                let _ = events.send(Event::Unelected(number)).await;
+            });
+        }
+    }
+
+    /// The connection does not become a link: its keys are let go.
+    pub(super) fn forget(&self, established: &Established) {
+        if let Some(keyring) = &self.context.keyring {
+            keyring.forget_connection(established.number);
+        }
+    }
+
+    pub(super) fn insert(
+        &mut self,
+        established: Established,
+        candidate: Candidate,
+    ) -> ControlReader {
+        let protection = match (&self.context.keyring, &established.sealing) {
+            (Some(keyring), Some(sealing)) => Protection::Envelope {
+                keyring: Arc::clone(keyring),
+                keys: Arc::clone(&sealing.keys),
+                connection: established.number,
+            },
+            _ => Protection::Link,
+        };
+        let authenticated_as =
+            status::authenticated_as(&self.context, &established.hello, &established.negotiated);
+        let connection = established.connection;
+        let link = Link {
+            carrier: Carrier { connection: connection.clone(), protection },
+            connection,
+            established: Summary {
+                hello: established.hello,
+                negotiated: established.negotiated,
+                authenticated_as,
+            },
+            order: established.order,
+            candidate,
+            outbox: established.outbox,
+            sealing: established.sealing,
+            id: None,
+            since_unix_ms: crate::daemon::status::unix_ms(),
+        };
+        self.links.insert(established.number, link);
+        established.reader
+    }
+
+    /// This side has the lower id: the connection stays.
+    pub(super) async fn elect(&mut self, number: u64) {
+        let id: [u8; 16] = rand::random();
+        if let Some(link) = self.links.get_mut(&number) {
+            link.outbox.send(Message::Elected(id));
+            link.order.elected();
+            self.open(number, id).await;
+        }
+    }
+
+    /// The connection was elected: it becomes the peer's link.
+    pub(super) async fn open(&mut self, number: u64, id: [u8; 16]) {
+        let Some(link) = self.links.get(&number) else { return };
+        let daemon = link.established.hello.daemon;
+        // Another connection may have been elected while this one waited.
+        let current = self.peers.get(&daemon).and_then(|p| self.links.get(&p.link));
+        let Summary { hello, negotiated, .. } = &link.established;
+        if current.is_some_and(|c| !c.established.same_peer(hello, negotiated)) {
+            return self.violation(number, CloseCode::NotAllowed, TAKEN.into()).await;
+        }
+        let Some(link) = self.links.get_mut(&number) else { return };
+        link.id = Some(id);
+        let (connection, outbox) = (link.connection.clone(), link.outbox.clone());
+        let (carrier, side) = (link.carrier.clone(), link.candidate.side);
+        if let (Some(keyring), Some(sealing)) = (&self.context.keyring, link.sealing.take()) {
+            let Sealing { keys, exporters, first } = sealing;
+            if let Err(error) = keys.attach_sender(keyring, number, &exporters, first) {
+                tracing::error!(peer = %daemon, %error, "no message keys for this link");
+            }
+        }
+        open_windows(&connection);
+        let new = match self.peers.get_mut(&daemon) {
+            Some(peer) => {
+                let old = peer.link;
+                peer.succeed(number, outbox, carrier.clone());
+                self.hand_over(old);
+                false
+            }
+            None => {
+                let peer = Peer::new(number, outbox, carrier.clone(), &self.shared);
+                self.peers.insert(daemon, peer);
+                true
+            }
+        };
+        self.spawn_inbound(number, daemon, carrier);
+        self.plan_end(number, side);
+        if let Some(peer) = self.peers.get_mut(&daemon) {
+            peer.send_graph(&self.local, true);
+        }
+        let address = connection.remote_address();
+        tracing::info!(peer = %daemon, %address, new, "link up");
+        self.tell(ToControl::LinkUp { daemon, address }).await;
+        self.report().await;
+    }
+
+    pub(super) fn spawn_inbound(&self, number: u64, daemon: DaemonId, carrier: Carrier) {
+        let Some(peer) = self.peers.get(&daemon) else { return };
+        let (refused, mut violations) = mpsc::channel(1);
+        let inbound: Inbound = peer.inbound(carrier, &self.shared, refused);
+        tokio::spawn(inbound.run());
+        let events = self.events.clone();
+        tokio::spawn(async move {
+            if let Some((code, reason)) = violations.recv().await {
+                let _ = events.send(Event::Violation(number, code, reason)).await;
+            }
+        });
+    }
+
+    /// The old connection of a peer ends once its streams have been read.
+    pub(super) fn hand_over(&mut self, old: u64) {
+        if let Some(link) = self.links.remove(&old) {
+            let keyring = self.context.keyring.clone();
+            tokio::spawn(async move {
+                // All of it: dropping the outbox would end the control stream, and with it the
+                // link at the peer, before the successor's ELECTED is read there.
+                let link = link;
+                tokio::time::sleep(HAND_OVER).await;
+                close(&link.connection, CloseCode::Replaced, "a successor took over");
+                if let Some(keyring) = keyring {
+                    keyring.forget_connection(old);
+                }
+            });
+        }
+    }
+
+    /// In qkd a link lives no longer than AXON_QKD_SESSION_MAX_AGE: its dialler makes a successor
+    /// in time, and should none come, both sides close it.
+    pub(super) fn plan_end(&self, number: u64, side: Side) {
+        let Some(keyring) = &self.context.keyring else { return };
+        let age = keyring.config.session_max_age;
+        let events = self.events.clone();
+        tokio::spawn(async move {
+            let renewal = age.mul_f64(0.9);
+            tokio::time::sleep(renewal).await;
+            if side == Side::Client && events.send(Event::Renew(number)).await.is_err() {
+                return;
+            }
+            tokio::time::sleep(age.saturating_sub(renewal)).await;
+            let _ = events.send(Event::Expired(number)).await;
+        });
+    }
+
+    pub(super) fn renew(&self, number: u64) {
+        let Some(link) = self.links.get(&number) else { return };
+        self.dial(Target {
+            daemon: Some(link.established.hello.daemon),
+            sae: link.established.hello.sae.clone(),
+            addresses: vec![link.connection.remote_address()],
+            listed: false,
+            replaces: link.id,
+        });
+        // Should the dial fail, the next try is due before the key's age is reached.
+        let after = self.context.keyring.as_ref().map(|k| k.config.session_max_age.mul_f64(0.04));
+        let events = self.events.clone();
+        tokio::spawn(async move {
+            tokio::time::sleep(after.unwrap_or_default().max(Duration::from_secs(1))).await;
+            let _ = events.send(Event::Renew(number)).await;
+        });
+    }
+
+    pub(super) async fn link_ended(&mut self, number: u64, reason: &str) {
+        let Some(link) = self.links.remove(&number) else { return };
+        let refusal = link.connection.close_reason().map(|e| Refusal::of(&e));
+        let reason = refusal.as_ref().map_or_else(|| reason.to_owned(), ToString::to_string);
+        if let Some(keyring) = &self.context.keyring {
+            keyring.forget_connection(number);
+        }
+        let daemon = link.established.hello.daemon;
+        // Closing what is closed already changes nothing.
+        close(&link.connection, CloseCode::Goodbye, "the control stream ended");
+        if self.peers.get(&daemon).is_none_or(|p| p.link != number) {
+            return;
+        }
+        self.peers.remove(&daemon);
+        tracing::info!(peer = %daemon, reason, "link down");
+        if let Some(refusal) = refusal.filter(|r| r.by == RefusedBy::Peer) {
+            let ordinary = ["GOODBYE", "DUPLICATE", "REPLACED"];
+            if !ordinary.contains(&refusal.name.as_str()) {
+                let peer = self.peer_of(&link);
+                self.refused(peer, refusal).await;
+            }
+        }
+        self.tell(ToControl::LinkDown { daemon, reason }).await;
+    }
+}

@@ -1,0 +1,337 @@
+//! The gateway's centre: which links stand, who is a peer, and what each is told.
+//!
+//! One task owns this state; dialling, accepting and every stream run in tasks of their own and
+//! reach it by events.
+
+mod graph;
+mod links;
+
+use std::{
+    collections::{BTreeMap, HashMap},
+    sync::{Arc, RwLock, RwLockReadGuard},
+    time::Duration,
+};
+
+use axon_tls::Negotiated;
+use tokio::sync::{Notify, mpsc};
+
+use super::{
+    accept::Incomer,
+    context::Context,
+    control::{ControlError, Outbox},
+    dial::Target,
+    endpoint::Endpoints,
+    establish::{Established, Sealing, close, peer_text},
+    outbound::Carrier,
+    peer::Peer,
+    pulse::Pulse,
+    refusal::{Refusal, RefusedBy},
+    seal::Protection,
+    status,
+};
+use crate::{
+    daemon::bridge::{ToControl, ToGateway},
+    graph::Endpoint,
+    ids::{DaemonId, Gid},
+    link::{Candidate, CloseCode, GraphResync, Hello, Message},
+    qos::Qos,
+    session::Session,
+};
+
+/// What the hub and the peers' tasks share.
+pub(super) struct Shared {
+    /// The gateway's own session.
+    pub(super) session: Session,
+    /// Wakes tasks when rings change.
+    pub(super) pulse: Pulse,
+    /// What local publishers offer.
+    pub(super) local_qos: Arc<RwLock<HashMap<Gid, Qos>>>,
+    /// ROS domain.
+    pub(super) domain: u32,
+    /// Largest payload.
+    pub(super) max_message: u64,
+}
+
+/// Reads a lock; a panic elsewhere leaves nothing half-done.
+pub(super) fn read<T>(lock: &RwLock<T>) -> RwLockReadGuard<'_, T> {
+    lock.read().unwrap_or_else(std::sync::PoisonError::into_inner)
+}
+
+/// What the hub reacts to.
+pub(super) enum Event {
+    /// The control plane wants something.
+    Order(ToGateway),
+    /// A dial of ours came to an end.
+    Dialled(Target, Box<Result<Established, Refusal>>),
+    /// A dial of a peer came to an end.
+    Incomer(Incomer),
+    /// A control message, or the end of the control stream.
+    Control(u64, Result<Message, ControlError>),
+    /// A data stream broke the protocol.
+    Violation(u64, CloseCode, String),
+    /// A link was not elected in time.
+    Unelected(u64),
+    /// It is time for a successor under a new key.
+    Renew(u64),
+    /// The link is as old as a link may get.
+    Expired(u64),
+}
+
+/// A connection between HELLO and its end.
+struct Link {
+    connection: quinn::Connection,
+    established: Summary,
+    order: crate::link::Order,
+    candidate: Candidate,
+    outbox: Outbox,
+    carrier: Carrier,
+    /// Until the election: what then lets it announce keys.
+    sealing: Option<Sealing>,
+    /// The peer's link id, once elected.
+    id: Option<[u8; 16]>,
+    since_unix_ms: u64,
+}
+
+/// What is kept of a link's beginning.
+#[derive(Clone)]
+pub(super) struct Summary {
+    /// The peer's HELLO.
+    pub(super) hello: Hello,
+    /// What the handshake agreed on.
+    pub(super) negotiated: Negotiated,
+    /// As whom the peer proved itself.
+    pub(super) authenticated_as: String,
+}
+
+impl Summary {
+    /// Whether `other` proved to be the same daemon: the same SAE, the same public key (which even
+    /// in `none` is one for a daemon's life).
+    fn same_peer(&self, hello: &Hello, negotiated: &Negotiated) -> bool {
+        self.hello.sae == hello.sae && self.negotiated.peer == negotiated.peer
+    }
+}
+
+/// The hub's state.
+pub(super) struct Hub {
+    context: Arc<Context>,
+    endpoints: Arc<Endpoints>,
+    shared: Arc<Shared>,
+    control: mpsc::Sender<ToControl>,
+    events: mpsc::Sender<Event>,
+    links: HashMap<u64, Link>,
+    peers: HashMap<DaemonId, Peer>,
+    local: BTreeMap<Gid, Endpoint>,
+}
+
+impl Hub {
+    /// A hub without links.
+    pub(super) fn new(
+        context: Arc<Context>,
+        endpoints: Arc<Endpoints>,
+        shared: Arc<Shared>,
+        control: mpsc::Sender<ToControl>,
+        events: mpsc::Sender<Event>,
+    ) -> Self {
+        Self {
+            context,
+            endpoints,
+            shared,
+            control,
+            events,
+            links: HashMap::new(),
+            peers: HashMap::new(),
+            local: BTreeMap::new(),
+        }
+    }
+
+    /// Reacts to events until the control plane says `Shutdown` or is gone.
+    /// `graph` is notified when the local graph changed.
+    pub(super) async fn run(mut self, mut inbox: mpsc::Receiver<Event>, graph: &Notify) {
+        self.local_graph().await;
+        let mut second = tokio::time::interval(Duration::from_secs(1));
+        loop {
+            tokio::select! {
+                event = inbox.recv() => match event {
+                    None | Some(Event::Order(ToGateway::Shutdown)) => break,
+                    Some(event) => self.on_event(event).await,
+                },
+                () = graph.notified() => self.local_graph().await,
+                _ = second.tick() => self.report().await,
+            }
+        }
+        for link in self.links.values() {
+            close(&link.connection, CloseCode::Goodbye, "the daemon ends");
+        }
+        for endpoint in &self.endpoints.all {
+            // Lets the CONNECTION_CLOSE frames out.
+            let _ = tokio::time::timeout(Duration::from_millis(500), endpoint.wait_idle()).await;
+        }
+    }
+
+    async fn on_event(&mut self, event: Event) {
+        match event {
+            Event::Order(ToGateway::Dial { daemon, sae, addresses, listed }) => {
+                let daemon = Some(daemon);
+                self.dial(Target { daemon, sae, addresses, listed, replaces: None });
+            }
+            Event::Order(ToGateway::SendDatagram { to, bytes }) => self.endpoints.send(to, &bytes),
+            Event::Order(ToGateway::Shutdown) => {}
+            Event::Dialled(target, result) => match *result {
+                Ok(established) => self.established(established, target.replaces).await,
+                Err(refusal) => {
+                    self.refused(target.text(), refusal).await;
+                    if let (Some(daemon), None) = (target.daemon, target.replaces) {
+                        self.tell(ToControl::DialFailed { daemon }).await;
+                    }
+                }
+            },
+            Event::Incomer(Incomer::Established(established)) => {
+                let replaces = established.hello.replaces;
+                self.established(*established, replaces).await;
+            }
+            Event::Incomer(Incomer::Refused { peer, refusal }) => {
+                self.refused(peer, refusal).await;
+            }
+            Event::Control(link, Ok(message)) => self.on_message(link, message).await,
+            Event::Control(link, Err(error)) => {
+                if let (Some(code), Some(l)) = (error.code(), self.links.get(&link)) {
+                    close(&l.connection, code, &error.to_string());
+                }
+                self.link_ended(link, &error.to_string()).await;
+            }
+            Event::Violation(link, code, reason) => {
+                if let Some(l) = self.links.get(&link) {
+                    let peer = self.peer_of(l);
+                    self.refused(peer, Refusal::here(code, &reason)).await;
+                }
+                self.link_ended(link, &reason).await;
+            }
+            Event::Unelected(link) => {
+                if let Some(l) = self.links.get(&link).filter(|l| l.id.is_none()) {
+                    close(&l.connection, CloseCode::Duplicate, "not elected within 10 s");
+                    self.link_ended(link, "not elected").await;
+                }
+            }
+            Event::Renew(link) => self.renew(link),
+            Event::Expired(link) => {
+                let text = "AXON_QKD_SESSION_MAX_AGE is reached and no successor came";
+                if let Some(l) = self.links.get(&link) {
+                    close(&l.connection, CloseCode::KeySupply, text);
+                    self.link_ended(link, text).await;
+                }
+            }
+        }
+    }
+
+    async fn on_message(&mut self, number: u64, message: Message) {
+        let Some(link) = self.links.get_mut(&number) else { return };
+        if let Err(error) = link.order.accept(&message) {
+            return self.violation(number, CloseCode::OutOfOrder, error.to_string()).await;
+        }
+        let daemon = link.established.hello.daemon;
+        if let Message::Elected(id) = message {
+            link.order.elected();
+            return self.open(number, id).await;
+        }
+        if let Message::Keys(keys) = &message {
+            let Protection::Envelope { keyring, keys: peer, .. } = link.carrier.protection.clone()
+            else {
+                return;
+            };
+            if let Err(error) = peer.on_message(&keyring, number, keys) {
+                let code = CloseCode::from_code(error.code()).unwrap_or(CloseCode::Internal);
+                self.violation(number, code, error.to_string()).await;
+            }
+            return;
+        }
+        // What a superseded link still says was said again on its successor.
+        let Some(peer) = self.peers.get_mut(&daemon).filter(|p| p.link == number) else { return };
+        let result = match message {
+            Message::Graph(graph) => match peer.take_graph(graph) {
+                Ok(Some(change)) => {
+                    self.remote_graph(daemon, change).await;
+                    Ok(())
+                }
+                Ok(None) => {
+                    let version = peer.remote_version();
+                    peer.say(Message::GraphResync(GraphResync { version }));
+                    Ok(())
+                }
+                Err(reason) => Err((CloseCode::TooLarge, reason.to_owned())),
+            },
+            Message::GraphResync(_) => {
+                peer.send_graph(&self.local, true);
+                Ok(())
+            }
+            Message::Subscribe(subscribe) => {
+                peer.serve(subscribe, &self.shared).map_err(|e| (CloseCode::Malformed, e))
+            }
+            Message::Unsubscribe(unsubscribe) => {
+                peer.unserve(unsubscribe.route);
+                Ok(())
+            }
+            Message::RouteReady(ready) => {
+                tracing::debug!(peer = %daemon, route = ready.route,
+                    publishers = ready.publishers.len(), "route ready");
+                Ok(())
+            }
+            Message::Hello(_) | Message::Elected(_) | Message::Keys(_) | Message::Keepalive => {
+                Ok(())
+            }
+        };
+        if let Err((code, reason)) = result {
+            self.violation(number, code, reason).await;
+        }
+    }
+
+    async fn violation(&mut self, number: u64, code: CloseCode, reason: String) {
+        if let Some(link) = self.links.get(&number) {
+            close(&link.connection, code, &reason);
+            let peer = self.peer_of(link);
+            self.refused(peer, Refusal::here(code, &reason)).await;
+        }
+        self.link_ended(number, &reason).await;
+    }
+
+    fn peer_of(&self, link: &Link) -> String {
+        peer_text(link.established.hello.sae.as_deref(), link.connection.remote_address())
+    }
+
+    async fn refused(&self, peer: String, refusal: Refusal) {
+        if refusal.by == RefusedBy::Network {
+            tracing::debug!(peer, %refusal, "no link");
+        } else {
+            tracing::warn!(peer, %refusal, "link refused");
+        }
+        let by = match refusal.by {
+            RefusedBy::Here => "refused here",
+            RefusedBy::Peer => "refused by the peer",
+            RefusedBy::Network => "not reached",
+        };
+        let reason = format!("{by}: {}", refusal.reason);
+        self.tell(ToControl::Refusal { peer, what: refusal.name, reason }).await;
+    }
+
+    async fn report(&self) {
+        for peer in self.peers.values() {
+            if let Some(link) = self.links.get(&peer.link) {
+                let mut status =
+                    status::link(&link.established, &link.connection, link.since_unix_ms);
+                peer.counters.fill(&mut status);
+                self.tell(ToControl::Link(Box::new(status))).await;
+            }
+        }
+        if let Some(keyring) = &self.context.keyring {
+            self.tell(ToControl::Keys(keyring.status())).await;
+        }
+    }
+
+    /// Status and notices are dropped when the control plane is behind; graph and links are not.
+    async fn tell(&self, what: ToControl) {
+        if matches!(what, ToControl::Link(_) | ToControl::Keys(_) | ToControl::Refusal { .. }) {
+            let _ = self.control.try_send(what);
+        } else {
+            let _ = self.control.send(what).await;
+        }
+    }
+}
