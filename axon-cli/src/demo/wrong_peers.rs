@@ -197,11 +197,7 @@ impl Visit<'_> {
     }
 
     /// The daemon's record of a refusal with this name that is not among those `before`.
-    async fn recorded(
-        &self,
-        refusal: &str,
-        before: &[Value],
-    ) -> Result<Option<String>, DemoError> {
+    async fn recorded(&self, refusal: &str, before: &[Value]) -> Result<Option<String>, DemoError> {
         let deadline = Instant::now() + RECORD;
         loop {
             let is_it = |entry: &Value| entry["what"] == refusal && !before.contains(entry);
