@@ -9,7 +9,9 @@ use quinn::{Connection, RecvStream, SendStream};
 use tokio::sync::mpsc;
 
 use super::establish::close;
-use crate::link::{CloseCode, FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, Message, read_length};
+use crate::link::{
+    CloseCode, FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, Message, read_length,
+};
 
 /// Why no further message came.
 #[derive(Debug, thiserror::Error)]
@@ -39,16 +41,18 @@ impl ControlError {
 pub(super) struct ControlReader {
     stream: RecvStream,
     limit: usize,
+    inflated: usize,
 }
 
 impl ControlReader {
     pub(super) fn new(stream: RecvStream) -> Self {
-        Self { stream, limit: MAX_FRAME_BEFORE_HELLO }
+        Self { stream, limit: MAX_FRAME_BEFORE_HELLO, inflated: MAX_FRAME_BEFORE_HELLO }
     }
 
     /// Both HELLOs were checked: larger frames are allowed from now on.
     pub(super) fn hello_checked(&mut self) {
         self.limit = MAX_FRAME;
+        self.inflated = MAX_INFLATED;
     }
 
     /// The next message of a known type. Not cancel safe: a cancelled read loses its place.
@@ -60,7 +64,7 @@ impl ControlReader {
             let length = read_length(prefix, self.limit)?;
             let mut frame = vec![0; length];
             self.stream.read_exact(&mut frame).await.map_err(|e| ended(&e))?;
-            if let Some(message) = Message::from_frame(&frame)? {
+            if let Some(message) = Message::from_frame(&frame, self.inflated)? {
                 return Ok(message);
             }
         }
@@ -106,7 +110,7 @@ impl Outbox {
     pub(super) fn send(&self, message: Message) {
         let weight = weight(&message);
         if self.queued.fetch_add(weight, Ordering::Relaxed) > MAX_QUEUED {
-            close(&self.connection, CloseCode::TooLarge, "control messages are not being read");
+            return close(&self.connection, CloseCode::TooLarge, "control messages are not read");
         }
         let _ = self.messages.send(message);
     }

@@ -64,19 +64,18 @@ pub(super) async fn dial(
         ..context.hello.clone()
     };
     let connect = async {
-        let connection = match &context.keyring {
+        match &context.keyring {
             None => {
                 let client = context.classic_client().map_err(internal)?;
-                handshake(endpoints, target, &client).await?
+                handshake(endpoints, target, &client).await
             }
-            Some(_) => qkd(context, endpoints, target).await?,
-        };
-        establish(context, connection, Side::Client, hello, target.sae.as_deref()).await
+            Some(_) => qkd(context, endpoints, target).await,
+        }
     };
-    match tokio::time::timeout(DIAL_TIMEOUT, connect).await {
-        Ok(result) => result,
-        Err(_) => Err(Refusal::network("no answer within 20 s")),
-    }
+    // Not around `establish`, which has limits of its own and cleans up after itself.
+    let late = |_| Refusal::network("no answer within 20 s");
+    let connection = tokio::time::timeout(DIAL_TIMEOUT, connect).await.map_err(late)??;
+    establish(context, connection, Side::Client, hello, target.sae.as_deref()).await
 }
 
 fn internal(error: impl std::fmt::Display) -> Refusal {

@@ -40,6 +40,9 @@ pub enum GatewayError {
     /// The runtime.
     #[error("the gateway's runtime: {0}")]
     Runtime(#[from] std::io::Error),
+    /// The control plane dropped the gateway's session.
+    #[error("the control plane dropped the gateway's session; its log says why")]
+    SessionLost,
     /// Called for the mode that is not in force: a defect of AXON.
     #[error("a configuration for the other security mode was asked for")]
     WrongMode,

@@ -15,13 +15,13 @@ use super::{
     hub::{Event, Shared},
     inbound::{Inbound, RouteIn, RoutesIn, StandIn},
     outbound::{self, Carrier, RouteOut},
-    routes::{TopicKey, Wanted, relays},
+    routes::{RelaySpec, TopicKey, Wanted, relays},
 };
 use crate::{
     graph::{Endpoint, LIMITS},
     ids::Gid,
     link::{Graph, LastSeen, Message, RouteReady, Subscribe, Subscriber, Unsubscribe},
-    session::{EndpointSpec, Publisher, Subscription},
+    session::{EndpointSpec, Subscription},
 };
 
 /// Endpoints in one GRAPH message; a larger graph takes several.
@@ -30,6 +30,12 @@ const GRAPH_PART: usize = 512;
 const ATTACH_TIMEOUT: Duration = Duration::from_secs(1);
 /// How long ROUTE_READY waits for the first local publisher to attach.
 const READY_TIMEOUT: Duration = Duration::from_secs(2);
+/// How often readers are looked for meanwhile.
+const POLL: Duration = Duration::from_millis(5);
+/// Routes that a peer may ask for, and publishers of a peer that are shown here. Each costs a lane
+/// or a ring.
+const MAX_ROUTES: usize = 1024;
+const MAX_STAND_INS: usize = 1024;
 
 /// A peer with an elected link.
 pub(super) struct Peer {
@@ -47,8 +53,8 @@ pub(super) struct Peer {
     /// Routes that this side asked for.
     asked: BTreeMap<TopicKey, Asked>,
     routes_in: RoutesIn,
-    /// Relays of the routes that the peer asked for.
-    relays: HashMap<u32, Vec<(super::routes::RelaySpec, Arc<Subscription>)>>,
+    /// Routes that the peer asked for.
+    served: HashMap<u32, Served>,
     orders: mpsc::UnboundedSender<outbound::Order>,
 }
 
@@ -66,6 +72,16 @@ struct Asked {
     number: u32,
     subscribers: Vec<Subscriber>,
     stand_ins: HashMap<Gid, Arc<StandIn>>,
+    /// Sends SUBSCRIBE once the stand-ins have their readers.
+    asking: Option<OnDrop>,
+}
+
+/// A route that the peer asked for.
+struct Served {
+    key: TopicKey,
+    relays: Vec<(RelaySpec, Arc<Subscription>)>,
+    /// Sends ROUTE_READY once a publisher is attached.
+    _announcing: OnDrop,
 }
 
 impl Peer {
@@ -88,7 +104,7 @@ impl Peer {
             next_route: 1,
             asked: BTreeMap::new(),
             routes_in: RoutesIn::new(RwLock::default()),
-            relays: HashMap::new(),
+            served: HashMap::new(),
             orders,
         }
     }
@@ -130,6 +146,11 @@ impl Peer {
     /// The endpoints that the peer announced.
     pub(super) fn remote(&self) -> impl Iterator<Item = &Endpoint> {
         self.remote.values()
+    }
+
+    /// Whether the peer announced this endpoint.
+    pub(super) fn has(&self, gid: Gid) -> bool {
+        self.remote.contains_key(&gid)
     }
 
     // ---- graph ----
@@ -194,7 +215,9 @@ impl Peer {
 
     /// These endpoints are another daemon's.
     pub(super) fn forget(&mut self, gids: &[Gid]) {
-        self.remote.retain(|gid, _| !gids.contains(gid));
+        for gid in gids {
+            self.remote.remove(gid);
+        }
     }
 
     // ---- routes that this side asks for ----
@@ -220,16 +243,24 @@ impl Peer {
                 number: self.next_route - 1,
                 subscribers: Vec::new(),
                 stand_ins: HashMap::new(),
+                asking: None,
             }
         });
         let publishers: HashSet<_> = wanted.publishers.iter().map(|p| p.gid).collect();
         asked.stand_ins.retain(|gid, _| publishers.contains(gid));
+        let mut shown =
+            asked.stand_ins.len() + self.asked.values().map(|a| a.stand_ins.len()).sum::<usize>();
         let mut fresh = Vec::new();
         for publisher in wanted.publishers {
             let gid = publisher.gid;
             if asked.stand_ins.contains_key(&gid) {
                 continue;
             }
+            if shown >= MAX_STAND_INS {
+                tracing::warn!(topic = key.topic, "a peer has more publishers than are shown");
+                break;
+            }
+            shown += 1;
             match shared.session.create_stand_in(publisher) {
                 Ok(stand_in) => {
                     let stand_in = Arc::new(StandIn::new(stand_in));
@@ -257,12 +288,11 @@ impl Peer {
             let count = asked.subscribers.len();
             let (outbox, message) = (self.outbox.clone(), subscribe(&key, &asked));
             let stand_ins: Vec<_> = asked.stand_ins.values().cloned().collect();
-            tokio::task::spawn_blocking(move || {
-                for stand_in in stand_ins {
-                    wait_for_readers(&stand_in.publisher, count);
-                }
+            asked.asking = Some(OnDrop(tokio::spawn(async move {
+                let attached = || stand_ins.iter().all(|s| s.publisher.matched().len() >= count);
+                poll(attached, ATTACH_TIMEOUT).await;
                 outbox.send(message);
-            });
+            })));
         }
         self.asked.insert(key, asked);
     }
@@ -283,7 +313,20 @@ impl Peer {
         }
         let topic = TopicHash::new(shared.domain, &subscribe.topic, &subscribe.type_name)
             .map_err(|e| e.to_string())?;
-        let mut old = self.relays.remove(&subscribe.route).unwrap_or_default();
+        let key =
+            TopicKey { topic: subscribe.topic.clone(), type_name: subscribe.type_name.clone() };
+        let mut others = self.served.iter().filter(|(route, _)| **route != subscribe.route);
+        if others.any(|(_, served)| served.key == key) {
+            return Err(format!("{} has a route already", key.topic));
+        }
+        let mut old = match self.served.remove(&subscribe.route) {
+            Some(served) if served.key == key => served.relays,
+            Some(_) => return Err("a route number for two topics".into()),
+            None if self.served.len() >= MAX_ROUTES => {
+                return Err(format!("more than {MAX_ROUTES} routes"));
+            }
+            None => Vec::new(),
+        };
         let mut current = Vec::new();
         for spec in relays(&subscribe.subscribers) {
             let same = old.iter().position(|(o, _)| o.qos == spec.qos);
@@ -302,8 +345,9 @@ impl Peer {
                 }
             }
         }
-        self.announce_ready(subscribe.route, &current);
-        self.relays.insert(subscribe.route, current.clone());
+        let announcing = self.announce_ready(subscribe.route, &current);
+        let served = Served { key, relays: current.clone(), _announcing: announcing };
+        self.served.insert(subscribe.route, served);
         let seen = subscribe.last.iter().map(|l| (l.publisher, l.sequence)).collect();
         let route = RouteOut { route: Route { kind: Kind::Topic, topic }, relays: current, seen };
         let _ = self.orders.send(outbound::Order::Route(subscribe.route, route));
@@ -312,20 +356,18 @@ impl Peer {
 
     /// UNSUBSCRIBE.
     pub(super) fn unserve(&mut self, route: u32) {
-        self.relays.remove(&route);
+        self.served.remove(&route);
         let _ = self.orders.send(outbound::Order::End(route));
     }
 
-    fn announce_ready(&self, route: u32, relays: &[(super::routes::RelaySpec, Arc<Subscription>)]) {
+    fn announce_ready(&self, route: u32, relays: &[(RelaySpec, Arc<Subscription>)]) -> OnDrop {
         let relays: Vec<_> = relays.iter().map(|(_, s)| Arc::clone(s)).collect();
         let outbox = self.outbox.clone();
-        tokio::task::spawn_blocking(move || {
-            if let Some(first) = relays.first() {
-                first.wait_matched(1, READY_TIMEOUT);
-            }
+        OnDrop(tokio::spawn(async move {
+            poll(|| relays.iter().any(|r| !r.matched().is_empty()), READY_TIMEOUT).await;
             let publishers = relays.iter().flat_map(|r| r.matched()).collect();
             outbox.send(Message::RouteReady(RouteReady { route, publishers }));
-        });
+        }))
     }
 }
 
@@ -345,9 +387,21 @@ fn subscribe(key: &TopicKey, asked: &Asked) -> Message {
     })
 }
 
-fn wait_for_readers(publisher: &Publisher, count: usize) {
-    if !publisher.wait_matched(count, ATTACH_TIMEOUT) {
-        tracing::debug!(gid = %publisher.gid(), "a local reader has not attached in time");
+/// Looks until `reached`, or until `limit` has passed. A few milliseconds of latency, once a route,
+/// for no thread that a peer could keep busy.
+async fn poll(reached: impl Fn() -> bool, limit: Duration) {
+    let until = tokio::time::Instant::now() + limit;
+    while !reached() && tokio::time::Instant::now() < until {
+        tokio::time::sleep(POLL).await;
+    }
+}
+
+/// A task that ends with what it is for.
+struct OnDrop(tokio::task::JoinHandle<()>);
+
+impl Drop for OnDrop {
+    fn drop(&mut self) {
+        self.0.abort();
     }
 }
 

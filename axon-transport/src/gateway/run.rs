@@ -6,14 +6,14 @@ use std::{
     sync::{Arc, RwLock},
 };
 
-use tokio::sync::{Notify, mpsc};
+use tokio::sync::mpsc;
 
 use super::{
     accept::accept,
     context::Context,
     endpoint::{Endpoints, reset_key},
     error::GatewayError,
-    hub::{Event, Hub, Shared},
+    hub::{Event, Hub, Noticed, Shared},
     keyring::Keyring,
     pulse::Pulse,
 };
@@ -28,7 +28,8 @@ const WORKERS: usize = 2;
 /// Runs the gateway until the control plane shuts it down.
 ///
 /// # Errors
-/// [`GatewayError`], always before [`ToControl::Started`].
+/// [`GatewayError`]: before [`ToControl::Started`] why it cannot start, later that its session was
+/// dropped.
 pub fn run(parts: GatewayParts) -> Result<(), GatewayError> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(WORKERS)
@@ -54,8 +55,8 @@ async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
     let endpoints = Arc::new(Endpoints::bind(&config, &reset, Some(server), &datagrams)?);
 
     let (events, inbox) = mpsc::channel(CHANNEL);
-    let graph = Arc::new(Notify::new());
-    let session = open_session(socket, &config, Arc::clone(&graph)).await?;
+    let noticed = Arc::new(Noticed::default());
+    let session = open_session(socket, &config, Arc::clone(&noticed)).await?;
     let shared = Arc::new(Shared {
         pulse: Pulse::start(&session)?,
         session,
@@ -97,16 +98,16 @@ async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
         }
         let _ = ordered.send(Event::Order(crate::daemon::bridge::ToGateway::Shutdown)).await;
     });
-    Hub::new(context, endpoints, shared, control, events).run(inbox, &graph).await;
-    Ok(())
+    let hub = Hub::new(context, endpoints, shared, control, events);
+    if hub.run(inbox, &noticed).await { Ok(()) } else { Err(GatewayError::SessionLost) }
 }
 
-/// The gateway's own session; graph changes notify `graph`. Opening waits for the control plane, so
+/// The gateway's own session; what it notices goes to `noticed`. Opening waits for the control plane, so
 /// it must not hold up the runtime.
 async fn open_session(
     socket: std::os::fd::OwnedFd,
     config: &Arc<crate::config::Config>,
-    graph: Arc<Notify>,
+    noticed: Arc<Noticed>,
 ) -> Result<Session, GatewayError> {
     let config = Arc::clone(config);
     let opened = tokio::task::spawn_blocking(move || {
@@ -116,10 +117,10 @@ async fn open_session(
     .await
     .map_err(|e| std::io::Error::other(e.to_string()))?;
     let session = opened?;
-    session.set_listener(move |event| {
-        if matches!(event, SessionEvent::Graph) {
-            graph.notify_one();
-        }
+    session.set_listener(move |event| match event {
+        SessionEvent::Graph => noticed.graph.notify_one(),
+        SessionEvent::DaemonLost => noticed.lost.notify_one(),
+        _ => {}
     });
     Ok(session)
 }

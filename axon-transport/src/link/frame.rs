@@ -89,11 +89,11 @@ impl Message {
     }
 
     /// The message in `frame` (without its length), or `None` for a type this version does not
-    /// know.
+    /// know. A compressed map may have at most `inflated` bytes.
     ///
     /// # Errors
-    /// [`FrameError`]; never panics, and allocates no more than [`MAX_INFLATED`].
-    pub fn from_frame(frame: &[u8]) -> Result<Option<Self>, FrameError> {
+    /// [`FrameError`]; never panics, and allocates no more than `inflated` for the map.
+    pub fn from_frame(frame: &[u8], inflated: usize) -> Result<Option<Self>, FrameError> {
         let (&kind, body) = frame.split_first().ok_or(FrameError::Empty)?;
         if kind & COMPRESSED == 0 {
             return Self::decode(kind, body);
@@ -101,8 +101,8 @@ impl Message {
         let (length, body) =
             body.split_first_chunk::<4>().ok_or(FrameError::Compression("no length"))?;
         let length = u32::from_be_bytes(*length) as usize;
-        if length > MAX_INFLATED {
-            return Err(FrameError::TooLarge { length, limit: MAX_INFLATED });
+        if length > inflated {
+            return Err(FrameError::TooLarge { length, limit: inflated });
         }
         let map = zstd::bulk::decompress(body, length)
             .map_err(|_| FrameError::Compression("not one zstd frame of the stated length"))?;

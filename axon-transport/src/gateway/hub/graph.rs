@@ -27,7 +27,22 @@ impl Hub {
     }
 
     pub(super) async fn remote_graph(&mut self, daemon: DaemonId, change: GraphChange) {
-        let GraphChange { reset, added, removed } = change;
+        let GraphChange { reset, mut added, removed } = change;
+        // An endpoint is its host's: nobody elsewhere speaks for one of ours, or for the gateway.
+        let own = self.shared.session.id().0;
+        let ours: Vec<_> = added
+            .iter()
+            .map(|e| e.gid)
+            .filter(|gid| self.local.contains_key(gid) || gid.0[..12] == own[..12])
+            .collect();
+        if !ours.is_empty() {
+            tracing::warn!(peer = %daemon, endpoints = ours.len(),
+                "a peer announces endpoints of this host; they are ignored");
+            added.retain(|e| !ours.contains(&e.gid));
+            if let Some(peer) = self.peers.get_mut(&daemon) {
+                peer.forget(&ours);
+            }
+        }
         self.take_over(daemon, &added).await;
         if let Some(peer) = self.peers.get_mut(&daemon) {
             peer.want(routes::wanted(self.local.values(), peer.remote()), &self.shared);
@@ -43,11 +58,7 @@ impl Hub {
         for other in others {
             let same_host = self.identity_of(other).is_some_and(|i| i == owner);
             let Some(peer) = self.peers.get_mut(&other) else { continue };
-            let moved: Vec<_> = added
-                .iter()
-                .map(|e| e.gid)
-                .filter(|gid| peer.remote().any(|e| e.gid == *gid))
-                .collect();
+            let moved: Vec<_> = added.iter().map(|e| e.gid).filter(|gid| peer.has(*gid)).collect();
             if moved.is_empty() {
                 continue;
             }

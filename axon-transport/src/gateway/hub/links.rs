@@ -27,6 +27,8 @@ use crate::{
 const ELECTION_TIMEOUT: Duration = Duration::from_secs(10);
 /// A superseded connection may still carry the end of its streams for this long.
 const HAND_OVER: Duration = Duration::from_secs(5);
+/// Peers, and connections that await their election.
+const MAX_LINKS: usize = 128 + 32;
 /// Why somebody who claims a linked daemon's id gets no link.
 const TAKEN: &str = "this daemon id is linked already, under another identity";
 
@@ -61,6 +63,11 @@ impl Hub {
                 established.connection.remote_address(),
             );
             return self.refused(peer, Refusal::here(CloseCode::NotAllowed, TAKEN)).await;
+        }
+        if current.is_none() && self.links.len() >= MAX_LINKS {
+            let text = "this daemon has as many links as it may";
+            close(&established.connection, CloseCode::NotAllowed, text);
+            return self.forget(&established);
         }
         let successor = replaces.is_some() && current.is_some_and(|c| c.id == replaces);
         let candidate = Candidate { side: established.side, successor };

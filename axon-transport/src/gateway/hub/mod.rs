@@ -57,6 +57,15 @@ pub(super) fn read<T>(lock: &RwLock<T>) -> RwLockReadGuard<'_, T> {
     lock.read().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
 
+/// What the gateway's session notices.
+#[derive(Default)]
+pub(super) struct Noticed {
+    /// The local graph changed.
+    pub(super) graph: Notify,
+    /// The session with the control plane is over.
+    pub(super) lost: Notify,
+}
+
 /// What the hub reacts to.
 pub(super) enum Event {
     /// The control plane wants something.
@@ -144,18 +153,23 @@ impl Hub {
         }
     }
 
-    /// Reacts to events until the control plane says `Shutdown` or is gone.
-    /// `graph` is notified when the local graph changed.
-    pub(super) async fn run(mut self, mut inbox: mpsc::Receiver<Event>, graph: &Notify) {
+    /// Reacts to events until the control plane says `Shutdown`, or is gone, or dropped the
+    /// gateway's session (`lost`): then it returns false, and the gateway must be started again.
+    pub(super) async fn run(mut self, mut inbox: mpsc::Receiver<Event>, session: &Noticed) -> bool {
         self.local_graph().await;
         let mut second = tokio::time::interval(Duration::from_secs(1));
+        let mut kept = true;
         loop {
             tokio::select! {
                 event = inbox.recv() => match event {
                     None | Some(Event::Order(ToGateway::Shutdown)) => break,
                     Some(event) => self.on_event(event).await,
                 },
-                () = graph.notified() => self.local_graph().await,
+                () = session.graph.notified() => self.local_graph().await,
+                () = session.lost.notified() => {
+                    kept = false;
+                    break;
+                }
                 _ = second.tick() => self.report().await,
             }
         }
@@ -166,6 +180,7 @@ impl Hub {
             // Lets the CONNECTION_CLOSE frames out.
             let _ = tokio::time::timeout(Duration::from_millis(500), endpoint.wait_idle()).await;
         }
+        kept
     }
 
     async fn on_event(&mut self, event: Event) {

@@ -180,7 +180,8 @@ impl Dialler {
         held.refusals += 1;
         held.not_before = now + wait;
         // Only time between two refusals in a row counts, and a caller's own pauses do not.
-        let since = held.last_refusal.replace(now).map_or(Duration::ZERO, |last| now - last);
+        let since =
+            held.last_refusal.replace(now).map_or(Duration::ZERO, |last| now.saturating_sub(last));
         held.refused_for += since.min(2 * REDIAL[REDIAL.len() - 1]);
         if held.refused_for >= REFUSED_FOR {
             let why = format!("peer refused key_ID {key_id} for {REFUSED_FOR:?}");
