@@ -4,17 +4,22 @@ use std::{
     fmt,
     net::SocketAddr,
     sync::{
-        Arc,
+        Arc, Mutex,
         atomic::{AtomicU64, Ordering},
     },
+    time::SystemTime,
 };
 
 use axon_tls::{
-    identity::Auth,
+    identity::{Auth, SpkiDigest},
     quic::{ALPN, hybrid_client, hybrid_server, qkd_client, qkd_server},
 };
 
-use super::{GatewayError, endpoint::transport, keyring::Keyring};
+use super::{
+    GatewayError,
+    endpoint::transport,
+    keyring::{Keyring, lock},
+};
 use crate::{
     config::{ClassicAuth, ClassicConfig, Config, Security},
     ids::DaemonId,
@@ -32,6 +37,8 @@ pub(super) struct Context {
     pub(super) keyring: Option<Arc<Keyring>>,
     /// The classic identity; `None` in qkd.
     auth: Option<Auth>,
+    /// When the trust file was last written, as far as it was read.
+    trust_read: Mutex<Option<SystemTime>>,
     transport: Arc<quinn::TransportConfig>,
     next_link: AtomicU64,
 }
@@ -57,6 +64,7 @@ impl Context {
             hello: Hello::new(&config, daemon),
             transport: transport(&config),
             next_link: AtomicU64::new(1),
+            trust_read: Mutex::new(None),
             config,
             keyring,
             auth,
@@ -71,6 +79,33 @@ impl Context {
     /// The trust that was configured, for its names.
     pub(super) fn auth(&self) -> Option<&Auth> {
         self.auth.as_ref()
+    }
+
+    /// Reads the trust file again if it changed. One that cannot be read leaves what was trusted
+    /// before in force: it may be half written.
+    pub(super) fn reload_trust(&self) {
+        let Security::Classic(ClassicConfig { trust: path, .. }) = &self.config.security else {
+            return;
+        };
+        let (Some(Auth::Pinned { trust, .. }), Some(file)) = (&self.auth, path) else { return };
+        let written = std::fs::metadata(file).and_then(|m| m.modified()).ok();
+        let mut read = lock(&self.trust_read);
+        if written.is_none() || *read == written {
+            return;
+        }
+        match super::identity::trust(Some(file)) {
+            Ok(pins) => trust.replace(pins),
+            Err(error) => tracing::error!(%error, "the trust file is not used as it is now"),
+        }
+        *read = written;
+    }
+
+    /// Whether a linked peer's key is still trusted: a pin can be removed or run out.
+    pub(super) fn still_trusts(&self, peer: Option<&SpkiDigest>) -> bool {
+        match &self.auth {
+            Some(Auth::Pinned { trust, .. }) => peer.is_some_and(|p| trust.name_of(p).is_some()),
+            _ => true,
+        }
     }
 
     /// The client's side of a classic handshake.

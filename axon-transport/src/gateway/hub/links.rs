@@ -257,6 +257,21 @@ impl Hub {
         });
     }
 
+    /// A pin that was removed, or ran out, closes its live links within a second.
+    pub(super) async fn close_untrusted(&mut self) {
+        self.context.reload_trust();
+        let untrusted: Vec<_> = self
+            .links
+            .iter()
+            .filter(|(_, l)| !self.context.still_trusts(l.established.negotiated.peer.as_ref()))
+            .map(|(number, _)| *number)
+            .collect();
+        for number in untrusted {
+            let text = "its key is no longer pinned in AXON_CLASSIC_TRUST";
+            self.violation(number, CloseCode::NotAllowed, text.into()).await;
+        }
+    }
+
     pub(super) async fn link_ended(&mut self, number: u64, reason: &str) {
         let Some(link) = self.links.remove(&number) else { return };
         let refusal = link.connection.close_reason().map(|e| Refusal::of(&e));

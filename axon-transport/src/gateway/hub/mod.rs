@@ -170,7 +170,10 @@ impl Hub {
                     kept = false;
                     break;
                 }
-                _ = second.tick() => self.report().await,
+                _ = second.tick() => {
+                    self.close_untrusted().await;
+                    self.report().await;
+                }
             }
         }
         for link in self.links.values() {
