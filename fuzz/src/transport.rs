@@ -34,12 +34,12 @@ pub fn beacon(data: &[u8]) -> bool {
 
 /// What decodes encodes to a frame that decodes to the same, and compression changes nothing.
 pub fn link_frame(data: &[u8]) -> bool {
-    let decoded = link::Message::from_frame(data);
+    let decoded = link::Message::from_frame(data, link::MAX_INFLATED);
     if let Some((&kind, map)) = data.split_first().filter(|(kind, _)| **kind & 0x80 == 0) {
         let body = zstd::bulk::compress(map, 1).expect("zstd takes any bytes");
         let length = u32::try_from(map.len()).expect("inputs are short").to_be_bytes();
         let frame = [&[kind | 0x80][..], &length, &body].concat();
-        let inflated = link::Message::from_frame(&frame);
+        let inflated = link::Message::from_frame(&frame, link::MAX_INFLATED);
         assert_eq!(inflated.as_ref().ok(), decoded.as_ref().ok(), "compression matters");
     }
     let Ok(Some(message)) = decoded else { return false };
@@ -48,7 +48,7 @@ pub fn link_frame(data: &[u8]) -> bool {
             let (prefix, body) = frame.split_first_chunk::<4>().expect("a frame has a length");
             let length = link::read_length(*prefix, link::MAX_FRAME).expect("the length is right");
             assert_eq!(length, body.len());
-            let again = link::Message::from_frame(body).expect("what was encoded decodes");
+            let again = link::Message::from_frame(body, link::MAX_INFLATED).expect("what was encoded decodes");
             assert_eq!(again, Some(message));
         }
         // Only what came compressed can be as large.
