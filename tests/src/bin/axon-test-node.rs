@@ -1,0 +1,121 @@
+//! An application for tests, with its settings from the environment. It ends with its standard
+//! input.
+//!
+//! `publish TOPIC SIZES READERS COUNT`: waits for as many readers, then publishes; with a count of
+//! `stream` until the first line on standard input. `subscribe TOPIC SIZES`: takes, and compares.
+
+use std::{
+    error::Error,
+    io::{BufReader, Read},
+    sync::mpsc::{self, Receiver, TryRecvError},
+    thread,
+    time::{Duration, Instant},
+};
+
+use axon_tests::{Sizes, Tally, Word, payload};
+use axon_transport::{
+    config::Config,
+    qos::Qos,
+    session::{EndpointSpec, Session, SessionOptions},
+    shm::PublishError,
+};
+
+const PATIENCE: Duration = Duration::from_secs(90);
+const REPORT: Duration = Duration::from_millis(50);
+/// Between the samples of a stream.
+const PACE: Duration = Duration::from_millis(1);
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    let session = Session::open(&Config::from_env()?, SessionOptions::new("test node"))?;
+    let stdin = bytes_of_stdin();
+    match arguments[..] {
+        ["publish", topic, sizes, readers, count] => {
+            publish(&session, &stdin, topic, sizes.parse()?, readers.parse()?, count.parse().ok())
+        }
+        ["subscribe", topic, sizes] => subscribe(&session, &stdin, topic, sizes.parse()?),
+        _ => Err("publish TOPIC SIZES READERS COUNT, or subscribe TOPIC SIZES".into()),
+    }
+}
+
+fn spec(topic: &str) -> EndpointSpec {
+    EndpointSpec::new(topic, "test/Bytes", Qos::keep_all())
+}
+
+fn publish(
+    session: &Session,
+    stdin: &Receiver<u8>,
+    topic: &str,
+    sizes: Sizes,
+    readers: usize,
+    count: Option<u64>,
+) -> Result<(), Box<dyn Error>> {
+    let publisher = session.create_publisher(spec(topic))?;
+    if !publisher.wait_matched(readers, PATIENCE) {
+        return Err(format!("{} of {readers} readers", publisher.matched().len()).into());
+    }
+    Word::Ready.say()?;
+    let (mut bytes, mut sent, mut reported) = (Vec::new(), 0, Instant::now());
+    while count != Some(sent) && (count.is_some() || stdin.try_recv() == Err(TryRecvError::Empty)) {
+        payload(sizes, sent + 1, &mut bytes);
+        loop {
+            match publisher.publish(&bytes) {
+                Ok(sequence) if sequence == sent + 1 => break,
+                Ok(sequence) => return Err(format!("{sequence} after {sent}").into()),
+                // The reader is slow: this is what KEEP_ALL means.
+                Err(PublishError::Blocked { .. }) => {}
+                Err(error) => return Err(error.into()),
+            }
+        }
+        sent += 1;
+        if count.is_none() {
+            thread::sleep(PACE);
+        }
+        if reported.elapsed() >= REPORT {
+            reported = Instant::now();
+            Word::Published(sent).say()?;
+        }
+    }
+    Word::Sent(sent).say()?;
+    // It lives until the test has seen what it sent arrive.
+    while stdin.recv().is_ok() {}
+    Ok(())
+}
+
+fn subscribe(
+    session: &Session,
+    stdin: &Receiver<u8>,
+    topic: &str,
+    sizes: Sizes,
+) -> Result<(), Box<dyn Error>> {
+    let subscription = session.create_subscription(spec(topic))?;
+    Word::Ready.say()?;
+    let (mut bytes, mut expected) = (Vec::new(), Vec::new());
+    let (mut tally, mut told, mut reported) = (Tally::default(), Tally::default(), Instant::now());
+    while stdin.try_recv() != Err(TryRecvError::Disconnected) {
+        if let Some(info) = subscription.recv(&mut bytes, Some(REPORT / 2)) {
+            tally.count(sizes, info.sequence, &bytes, &mut expected);
+        }
+        if reported.elapsed() >= REPORT {
+            reported = Instant::now();
+            tally.lost = subscription.lost();
+            if tally != told {
+                told.clone_from(&tally);
+                Word::Taken(tally.clone()).say()?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// What comes on standard input; disconnected when it ends.
+fn bytes_of_stdin() -> Receiver<u8> {
+    let (sender, receiver) = mpsc::channel();
+    thread::spawn(move || {
+        for byte in BufReader::new(std::io::stdin()).bytes().map_while(Result::ok) {
+            let _ = sender.send(byte);
+        }
+    });
+    receiver
+}

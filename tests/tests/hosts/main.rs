@@ -1,0 +1,10 @@
+//! Two hosts as real processes on loopback addresses: a daemon each, applications of their own, and
+//! in qkd a KME each, simulated in the test's process.
+
+mod delivery;
+mod hostile;
+mod mismatch;
+mod mode;
+mod pair;
+mod process;
+mod rules;

@@ -1,0 +1,92 @@
+//! The ways in which two hosts may be set up.
+
+use std::{fs, os::unix::fs::PermissionsExt, path::Path};
+
+use axon_tls::identity::SigningKey;
+use etsi_qkd014::sim;
+
+/// Variables and their values.
+pub(crate) type Settings = Vec<(&'static str, String)>;
+
+pub(crate) const SAE: [&str; 2] = ["sae-a", "sae-b"];
+
+/// KMEs of the two hosts, and what they gave the SAEs.
+pub(crate) struct Kmes {
+    network: sim::Network,
+    dir: tempfile::TempDir,
+    _runtime: tokio::runtime::Runtime,
+}
+
+impl Kmes {
+    pub(crate) fn start() -> Self {
+        let runtime =
+            tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
+        let runtime = runtime.unwrap();
+        let network = sim::Network::builder()
+            .kme("kme-a", ([127, 0, 0, 1], 0).into(), [SAE[0]])
+            .kme("kme-b", ([127, 0, 0, 2], 0).into(), [SAE[1]]);
+        let network = runtime.block_on(network.start()).unwrap();
+        let dir = tempfile::tempdir().unwrap();
+        network.write_files(dir.path()).unwrap();
+        Self { network, dir, _runtime: runtime }
+    }
+
+    /// Settings of host 0 or 1 in qkd.
+    pub(crate) fn settings(&self, host: usize, more: &[(&'static str, &str)]) -> Settings {
+        let mut settings = self.network.sae(SAE[host]).unwrap().env(self.dir.path());
+        settings.push(("AXON_SECURITY_MODE", "qkd".into()));
+        settings.push(("AXON_QKD_PEERS", SAE[1 - host].into()));
+        set(&mut settings, more);
+        settings
+    }
+
+    /// Keys that SAEs got by asking for new ones, and by key_ID.
+    pub(crate) fn keys(&self) -> (u64, u64) {
+        let counters = self.network.kmes().iter().map(|kme| kme.counters());
+        counters.fold((0, 0), |(masters, slaves), c| {
+            (masters + c.keys_to_masters, slaves + c.keys_to_slaves)
+        })
+    }
+}
+
+fn set(settings: &mut Settings, more: &[(&'static str, &str)]) {
+    for (name, value) in more {
+        settings.retain(|(n, _)| n != name);
+        settings.push((name, (*value).into()));
+    }
+}
+
+/// Settings as they are written.
+pub(crate) fn classic(more: &[(&'static str, &str)]) -> Settings {
+    let mut settings = vec![("AXON_SECURITY_MODE", "classic".into())];
+    set(&mut settings, more);
+    settings
+}
+
+/// Two hosts with keys of their own, of which each trusts those in its row: `trusts[0][1]` says
+/// whether host 0 trusts host 1.
+pub(crate) fn pinned(dir: &Path, trusts: [[bool; 2]; 2]) -> [Settings; 2] {
+    let pems = [0, 1].map(|_| SigningKey::generate_pem().unwrap());
+    let pins: Vec<_> =
+        pems.iter().map(|p| SigningKey::from_pem(p).unwrap().spki_digest()).collect();
+    // A trust file names somebody, even where it is not the other host.
+    let stranger = SigningKey::generate().unwrap().spki_digest();
+    [0, 1].map(|host| {
+        let key = dir.join(format!("host-{host}.key"));
+        fs::write(&key, pems[host].as_bytes()).unwrap();
+        fs::set_permissions(&key, fs::Permissions::from_mode(0o600)).unwrap();
+        let mut lines = format!("stranger {stranger}\n");
+        for (peer, pin) in pins.iter().enumerate().filter(|(peer, _)| trusts[host][*peer]) {
+            lines += &format!("host-{peer} {pin}\n");
+        }
+        let trust = dir.join(format!("host-{host}.trust"));
+        fs::write(&trust, lines).unwrap();
+        let path = |path: &Path| path.to_str().unwrap().to_owned();
+        vec![
+            ("AXON_SECURITY_MODE", "classic".to_owned()),
+            ("AXON_CLASSIC_AUTH", "pinned".to_owned()),
+            ("AXON_CLASSIC_KEY", path(&key)),
+            ("AXON_CLASSIC_TRUST", path(&trust)),
+        ]
+    })
+}

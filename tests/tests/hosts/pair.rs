@@ -1,0 +1,226 @@
+//! Two hosts that list each other as peers, on addresses and in a domain of their own.
+
+use std::{
+    ffi::OsString,
+    fs,
+    net::Ipv4Addr,
+    process::{Command, Stdio},
+    sync::atomic::{AtomicU32, Ordering},
+};
+
+use axon_tests::Sizes;
+use axon_transport::{
+    config::{Config, OsFiles},
+    daemon::status::{LinkStatus, Status},
+    session::daemon_status,
+};
+use rustix::process::{Pid, Signal, kill_process};
+
+use super::{
+    mode::Settings,
+    process::{Kept, Node, until},
+};
+
+/// The topic of all these tests.
+const TOPIC: &str = "/numbers";
+
+/// What two hosts are started with.
+#[derive(Clone, Debug)]
+pub(crate) struct Plan {
+    /// Of host A and host B.
+    pub(crate) settings: [Settings; 2],
+    /// Seconds that a daemon outlives its last session.
+    pub(crate) grace_s: u32,
+    /// Whether host B is in another domain.
+    pub(crate) other_domain: bool,
+}
+
+impl Plan {
+    pub(crate) fn new(settings: [Settings; 2]) -> Self {
+        Self { settings, grace_s: 300, other_domain: false }
+    }
+
+    /// Starts both hosts.
+    pub(crate) fn start(self) -> [Host; 2] {
+        static PAIRS: AtomicU32 = AtomicU32::new(0);
+        let (pair, pid) = (PAIRS.fetch_add(1, Ordering::Relaxed), std::process::id());
+        // Where hardly anybody is; another run of these tests at the same time has its own.
+        let net = [(16 + pair % 200) as u8, (1 + pid % 250) as u8];
+        let domain = 1 + (pid.wrapping_mul(31) + 2 * pair) % 98;
+        let addresses = [1, 2].map(|host| Ipv4Addr::new(127, net[0], net[1], host));
+        let mut hosts = [0, 1].map(|host| {
+            let more = [
+                ("AXON_BIND_ADDRS", addresses[host].to_string()),
+                ("AXON_DAEMON_PEERS", addresses[1 - host].to_string()),
+                ("ROS_DOMAIN_ID", (domain + u32::from(self.other_domain && host == 1)).to_string()),
+            ];
+            let settings = self.settings[host].iter().cloned().chain(more);
+            Host::new(["A", "B"][host], addresses[host], settings, self.grace_s)
+        });
+        hosts.iter_mut().for_each(Host::start);
+        hosts
+    }
+}
+
+/// A host with its daemon.
+#[derive(Debug)]
+pub(crate) struct Host {
+    name: &'static str,
+    pub(crate) address: Ipv4Addr,
+    pub(crate) dir: tempfile::TempDir,
+    env: Vec<(String, String)>,
+    pub(crate) daemon: Option<Kept>,
+}
+
+impl Host {
+    fn new(
+        name: &'static str,
+        address: Ipv4Addr,
+        settings: impl IntoIterator<Item = (&'static str, String)>,
+        grace_s: u32,
+    ) -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        let path = |name: &str| dir.path().join(name).to_str().unwrap().to_owned();
+        fs::write(path("axon.toml"), format!("[link]\ngrace_s = {grace_s}\n")).unwrap();
+        let mut env = vec![
+            ("AXON_RUNTIME_DIR".to_owned(), path("run")),
+            ("AXON_CONFIG".to_owned(), path("axon.toml")),
+            ("AXON_DAEMON_PATH".to_owned(), env!("CARGO_BIN_EXE_axon-test-daemon").to_owned()),
+            ("AXON_LOG".to_owned(), "info,axon_transport=debug".to_owned()),
+            ("RUST_BACKTRACE".to_owned(), "1".to_owned()),
+        ];
+        env.extend(settings.into_iter().map(|(name, value)| (name.to_owned(), value)));
+        Self { name, address, dir, env, daemon: None }
+    }
+
+    fn start(&mut self) {
+        let mut command = self.command(env!("CARGO_BIN_EXE_axon-test-daemon"));
+        command.arg("--while-stdin").stdin(Stdio::piped()).stdout(Stdio::null());
+        self.daemon = Some(Kept(command.spawn().unwrap()));
+        until("the daemon stands", || {
+            let ended = self.daemon.as_mut().and_then(|d| d.0.try_wait().unwrap());
+            assert!(ended.is_none(), "the daemon of {} ended: {ended:?}", self.name);
+            self.try_status().is_some_and(|status| status.port.is_some())
+        });
+    }
+
+    fn command(&self, program: &str) -> Command {
+        let mut command = Command::new(program);
+        let ours = |name: &str| ["AXON_", "ROS_", "XDG_"].iter().any(|p| name.starts_with(p));
+        for (name, _) in std::env::vars().filter(|(name, _)| ours(name)) {
+            command.env_remove(name);
+        }
+        let log = fs::OpenOptions::new().create(true).append(true).open(self.log()).unwrap();
+        command.envs(self.env.iter().map(|(n, v)| (n, v))).stderr(log);
+        command
+    }
+
+    fn log(&self) -> std::path::PathBuf {
+        self.dir.path().join("host.txt")
+    }
+
+    pub(crate) fn domain(&self) -> u32 {
+        self.variable("ROS_DOMAIN_ID").parse().unwrap()
+    }
+
+    fn variable(&self, name: &str) -> &str {
+        &self.env.iter().find(|(n, _)| n == name).unwrap().1
+    }
+
+    /// The configuration that its processes have, for this very process.
+    pub(crate) fn config(&self) -> Config {
+        let env = self.env.iter().map(|(n, v)| (OsString::from(n), OsString::from(v)));
+        Config::resolve(env.filter(|(n, _)| n != "RUST_BACKTRACE"), None, &OsFiles).unwrap()
+    }
+
+    pub(crate) fn try_status(&self) -> Option<Status> {
+        let json = daemon_status(&self.config()).ok()?;
+        Some(serde_json::from_str(&json).unwrap())
+    }
+
+    /// What its daemon says, once there is one.
+    #[track_caller]
+    pub(crate) fn status(&self) -> Status {
+        let mut status = None;
+        until("a daemon answers", || {
+            status = self.try_status();
+            status.is_some()
+        });
+        status.unwrap()
+    }
+
+    /// The link to the one peer, once it stands.
+    #[track_caller]
+    pub(crate) fn link(&self) -> LinkStatus {
+        let mut links = Vec::new();
+        until("a link stands", || {
+            links = self.status().links;
+            links.iter().any(|link| link.state == "connected")
+        });
+        assert_eq!(links.len(), 1, "one peer, one link: {links:?}");
+        links.remove(0)
+    }
+
+    /// Waits for a refusal that `fits`.
+    #[track_caller]
+    pub(crate) fn wait_refusal(&self, what: &str, fits: impl Fn(&str) -> bool) {
+        until(what, || {
+            let refusals = self.status().refusals;
+            refusals.iter().any(|r| fits(&format!("{} {} {}", r.peer, r.what, r.reason)))
+        });
+    }
+
+    /// Whether its daemon is the process that it was started with.
+    pub(crate) fn is_first_daemon(&self) -> bool {
+        self.daemon.as_ref().is_some_and(|daemon| daemon.0.id() == self.status().pid)
+    }
+
+    /// A publisher that waits for as many readers; a stream without a count.
+    pub(crate) fn publish(&self, sizes: Sizes, readers: usize, count: Option<u64>) -> Node {
+        let count = count.map_or_else(|| "stream".to_owned(), |count| count.to_string());
+        let readers = readers.to_string();
+        self.node(&["publish", TOPIC, sizes.name(), &readers, &count])
+    }
+
+    /// A subscriber, once it is there.
+    pub(crate) fn subscribe(&self, sizes: Sizes) -> Node {
+        let mut node = self.node(&["subscribe", TOPIC, sizes.name()]);
+        node.wait_ready();
+        node
+    }
+
+    fn node(&self, arguments: &[&str]) -> Node {
+        let mut command = self.command(env!("CARGO_BIN_EXE_axon-test-node"));
+        command.args(arguments);
+        Node::start(command)
+    }
+
+    fn logs(&self) -> String {
+        let spawned = self.dir.path().join(format!("run/axon-{}.log", self.domain()));
+        let logs = [self.log(), spawned].map(|log| fs::read_to_string(log).unwrap_or_default());
+        let lines: Vec<&str> = logs.iter().flat_map(|log| log.lines()).collect();
+        lines[lines.len().saturating_sub(150)..].join("\n")
+    }
+}
+
+impl Drop for Host {
+    fn drop(&mut self) {
+        if let Some(status) = self.try_status() {
+            if std::thread::panicking() {
+                let (links, refusals, keys) = (status.links, status.refusals, status.keys);
+                eprintln!("--- host {}: {links:#?}\n{refusals:#?}\n{keys}", self.name);
+            }
+            // One that a session started is nobody's child.
+            kill(status.pid);
+        }
+        if std::thread::panicking() {
+            eprintln!("--- the log of host {}:\n{}", self.name, self.logs());
+        }
+    }
+}
+
+pub(crate) fn kill(pid: u32) {
+    let pid = Pid::from_raw(i32::try_from(pid).unwrap()).unwrap();
+    // It may have ended by itself meanwhile.
+    let _ = kill_process(pid, Signal::KILL);
+}
