@@ -194,13 +194,14 @@ impl Hub {
 
     pub(super) fn spawn_inbound(&self, number: u64, daemon: DaemonId, carrier: Carrier) {
         let Some(peer) = self.peers.get(&daemon) else { return };
+        let who = self.links.get(&number).map(|l| self.peer_of(l)).unwrap_or_default();
         let (refused, mut violations) = mpsc::channel(1);
         let inbound: Inbound = peer.inbound(carrier, &self.shared, refused);
         tokio::spawn(inbound.run());
         let events = self.events.clone();
         tokio::spawn(async move {
             if let Some((code, reason)) = violations.recv().await {
-                let _ = events.send(Event::Violation(number, code, reason)).await;
+                let _ = events.send(Event::Violation(number, who, code, reason)).await;
             }
         });
     }

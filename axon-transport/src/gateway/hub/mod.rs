@@ -76,8 +76,8 @@ pub(super) enum Event {
     Incomer(Incomer),
     /// A control message, or the end of the control stream.
     Control(u64, Result<Message, ControlError>),
-    /// A data stream broke the protocol.
-    Violation(u64, CloseCode, String),
+    /// A data stream of this link, with this peer, broke the protocol; the connection is closed.
+    Violation(u64, String, CloseCode, String),
     /// A link was not elected in time.
     Unelected(u64),
     /// It is time for a successor under a new key.
@@ -217,11 +217,9 @@ impl Hub {
                 }
                 self.link_ended(link, &error.to_string()).await;
             }
-            Event::Violation(link, code, reason) => {
-                if let Some(l) = self.links.get(&link) {
-                    let peer = self.peer_of(l);
-                    self.refused(peer, Refusal::here(code, &reason)).await;
-                }
+            // The end of the control stream may have been heard of first.
+            Event::Violation(link, peer, code, reason) => {
+                self.refused(peer, Refusal::here(code, &reason)).await;
                 self.link_ended(link, &reason).await;
             }
             Event::Unelected(link) => {
@@ -311,7 +309,7 @@ impl Hub {
         self.link_ended(number, &reason).await;
     }
 
-    fn peer_of(&self, link: &Link) -> String {
+    pub(super) fn peer_of(&self, link: &Link) -> String {
         peer_text(link.established.hello.sae.as_deref(), link.connection.remote_address())
     }
 
