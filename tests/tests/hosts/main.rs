@@ -7,4 +7,5 @@ mod mismatch;
 mod mode;
 mod pair;
 mod process;
+mod renewal;
 mod rules;
