@@ -8,4 +8,5 @@ mod mode;
 mod pair;
 mod process;
 mod renewal;
+mod restart;
 mod rules;
