@@ -163,6 +163,10 @@ pub struct Graph {
     /// Whether another part of the same change follows.
     #[n(4)]
     pub more: bool,
+    /// Those of this host's own endpoints that ended. Whoever is attached to one lets go of it; an
+    /// endpoint of another host is attached to by way of its stand-in, which ends by UNMATCH.
+    #[n(5)]
+    pub ended: Option<Vec<Gid>>,
 }
 
 /// A reader and a writer.
@@ -430,6 +434,7 @@ mod tests {
                 added: vec![GraphItem { endpoint: endpoint(), daemon: Some(DaemonId([9; 16])) }],
                 removed: vec![writer],
                 more: false,
+                ended: Some(vec![Gid([8; 16])]),
             }),
             Message::Match(Pair { reader, writer }),
             Message::Attach(Attach {
@@ -498,7 +503,8 @@ mod tests {
     #[test]
     fn a_message_larger_than_a_packet_is_refused_by_its_sender() {
         let removed = vec![Gid([1; 16]); 3000];
-        let graph = Graph { version: 1, whole: false, added: vec![], removed, more: false };
+        let graph =
+            Graph { version: 1, whole: false, added: vec![], removed, more: false, ended: None };
         assert!(matches!(Message::Graph(graph).encode(), Err(CodecError::TooLarge(_))));
     }
 

@@ -159,6 +159,11 @@ impl Shared {
         self.state().changes += 1;
         self.changed.notify_all();
         let Some(event) = event else { return };
+        if matches!(event, SessionEvent::Matched(_)) {
+            // A writer that died between its last sample and the doorbell leaves that sample to be
+            // found by who sleeps for samples.
+            self.segment.notify();
+        }
         let listener = self.listener.lock().unwrap_or_else(PoisonError::into_inner).clone();
         if let Some(listener) = listener {
             listener(event);

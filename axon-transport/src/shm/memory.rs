@@ -11,7 +11,7 @@ use std::{
 use rustix::{
     fs::{
         FallocateFlags, MemfdFlags, SealFlags, fallocate, fcntl_add_seals, fcntl_get_seals, fstat,
-        ftruncate, memfd_create,
+        fstatfs, ftruncate, memfd_create,
     },
     io::Errno,
     mm::{Advice, MapFlags, MprotectFlags, ProtFlags, madvise, mmap, mprotect, munlock, munmap},
@@ -92,6 +92,9 @@ pub(super) struct Map {
     owner: ForkToken,
 }
 
+/// What `fstatfs` says of an ordinary memfd (linux/magic.h).
+const TMPFS_MAGIC: i64 = 0x0102_1994;
+
 // SAFETY: the map is plain memory reached only through atomics; unmapping it works from any thread.
 unsafe impl Send for Map {}
 // SAFETY: as above: all access is atomic.
@@ -106,6 +109,11 @@ impl Map {
             fcntl_get_seals(fd).map_err(|_| ShmError::Refused { what: "it is not a memfd" })?;
         if !found.contains(seals()) {
             return Err(ShmError::Refused { what: "its seals are missing" });
+        }
+        // Huge pages can be sealed just so, and still be missing at the first access.
+        let system = fstatfs(fd).map_err(ShmError::system("sizing up a segment"))?;
+        if i64::from(system.f_type) != TMPFS_MAGIC {
+            return Err(ShmError::Refused { what: "it is not ordinary memory" });
         }
         let len = fstat(fd).map_err(ShmError::system("sizing up a segment"))?.st_size;
         let len = u64::try_from(len).unwrap_or(0);

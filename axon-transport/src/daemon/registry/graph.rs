@@ -1,5 +1,7 @@
 //! The graph that sessions are shown, and its changes.
 
+use std::collections::BTreeSet;
+
 use super::Registry;
 use crate::{
     graph::{Endpoint, LIMITS},
@@ -60,7 +62,8 @@ impl<F: Clone> Registry<F> {
         self.version += 1;
         let removed: Vec<Gid> = std::mem::take(&mut self.removed).into_iter().collect();
         let added = std::mem::take(&mut self.added).into_values();
-        let parts = parts(self.version, false, added, &removed, false);
+        let ended = std::mem::take(&mut self.ended);
+        let parts = parts(self.version, false, added, &removed, &ended, false);
         let sessions: Vec<_> = self
             .sessions
             .iter()
@@ -101,7 +104,8 @@ impl<F: Clone> Registry<F> {
             .remote_endpoints()
             .map(|(d, e)| GraphItem { endpoint: e.clone(), daemon: Some(*d) });
         let tombstones: Vec<Gid> = self.tombstones.iter().copied().collect();
-        parts(self.version, true, local.chain(remote), &tombstones, true)
+        let ended = self.tombstones.iter().copied().collect();
+        parts(self.version, true, local.chain(remote), &tombstones, &ended, true)
     }
 
     pub(super) fn graph_add_local(&mut self, endpoint: &Endpoint) {
@@ -121,7 +125,13 @@ impl<F: Clone> Registry<F> {
         self.added.insert(item.endpoint.gid, item);
     }
 
-    pub(super) fn graph_remove(&mut self, gid: Gid) {
+    /// An endpoint of this host ended.
+    pub(super) fn graph_end(&mut self, gid: Gid) {
+        self.graph_remove(gid);
+        self.ended.insert(gid);
+    }
+
+    fn graph_remove(&mut self, gid: Gid) {
         self.added.remove(&gid);
         self.removed.insert(gid);
     }
@@ -133,21 +143,26 @@ fn parts(
     whole: bool,
     added: impl Iterator<Item = GraphItem>,
     removed: &[Gid],
+    ended: &BTreeSet<Gid>,
     open: bool,
 ) -> Vec<Graph> {
     let empty =
-        |whole| Graph { version, whole, added: Vec::new(), removed: Vec::new(), more: true };
+        |whole| Graph { version, whole, added: vec![], removed: vec![], more: true, ended: None };
     let mut parts = Vec::new();
     let mut part = empty(whole);
     let mut size = 0;
     // Removals go first: a GID that was removed and is back must end up present.
     for gid in removed {
-        if size + 17 > PART {
+        if size + 34 > PART {
             parts.push(std::mem::replace(&mut part, empty(false)));
             size = 0;
         }
         size += 17;
         part.removed.push(*gid);
+        if ended.contains(gid) {
+            size += 17;
+            part.ended.get_or_insert_default().push(*gid);
+        }
     }
     for item in added {
         let e = &item.endpoint;

@@ -158,7 +158,7 @@ impl<F: Clone> Registry<F> {
                     self.tombstones.pop_front();
                 }
                 self.tombstones.push_back(gid);
-                self.graph_remove(gid);
+                self.graph_end(gid);
                 Ok(())
             }
             _ => Err(Violation::NotItsOwn(gid)),

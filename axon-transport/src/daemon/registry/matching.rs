@@ -82,7 +82,7 @@ impl<F: Clone> Registry<F> {
             self.unmatch(&pair, to_writer, to_reader, reason);
         }
         if local.role == EndpointRole::Application {
-            self.graph_remove(*gid);
+            self.graph_end(*gid);
         }
     }
 

@@ -41,6 +41,8 @@ pub struct Registry<F> {
     version: u64,
     added: BTreeMap<Gid, GraphItem>,
     removed: BTreeSet<Gid>,
+    /// Those of them that were this host's own.
+    ended: BTreeSet<Gid>,
     ready: BTreeSet<SessionId>,
 }
 
@@ -119,6 +121,7 @@ impl<F> Default for Registry<F> {
             version: 0,
             added: BTreeMap::new(),
             removed: BTreeSet::new(),
+            ended: BTreeSet::new(),
             ready: BTreeSet::new(),
         }
     }

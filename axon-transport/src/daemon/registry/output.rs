@@ -110,7 +110,8 @@ impl<F: Clone> Registry<F> {
             }
         }
         let (added, removed) = (Vec::new(), Vec::new());
-        let end = Graph { version: self.version, whole: false, added, removed, more: false };
+        let end =
+            Graph { version: self.version, whole: false, added, removed, more: false, ended: None };
         self.push(id, &Message::Graph(end), Vec::new());
         if let Some(entry) = self.sessions.get_mut(id) {
             entry.queue_limit = entry.queue.len() + MAX_QUEUE;

@@ -486,7 +486,7 @@ fn a_tombstone_reaches_those_who_come_later() {
     let mut removed = Vec::new();
     while let Some(output) = world.registry.next_output(&late) {
         if let Message::Graph(graph) = Message::decode(&output.packet).unwrap() {
-            removed.extend(graph.removed);
+            removed.extend(graph.ended.unwrap_or_default());
         }
     }
     assert!(removed.contains(&gid));
@@ -521,4 +521,35 @@ fn a_large_graph_is_told_in_packets_that_fit() {
     world.registry.remote_graph(DaemonId([1; 16]), true, added.collect(), vec![]);
     world.settle();
     assert_eq!(world.clients[&0].graph.len(), 3000);
+}
+
+#[test]
+fn a_remote_endpoint_that_comes_and_goes_ends_nothing_here() {
+    let mut world = connected(1);
+    let own = first(&world);
+    while world.registry.next_output(&own).is_some() {}
+    let gid = Gid([9; 16]);
+    let endpoint = Endpoint {
+        gid,
+        kind: EndpointKind::Publisher,
+        topic: "/a".into(),
+        type_name: "t".into(),
+        type_hash: vec![],
+        qos: Qos::default(),
+        node: String::new(),
+        namespace: String::new(),
+    };
+    // A successor link repeats the whole graph within one flush.
+    for _ in 0..2 {
+        world.registry.remote_graph(DaemonId([1; 16]), true, vec![endpoint.clone()], vec![]);
+    }
+    world.registry.flush();
+    let mut seen = false;
+    while let Some(output) = world.registry.next_output(&own) {
+        if let Message::Graph(graph) = Message::decode(&output.packet).unwrap() {
+            assert_eq!(graph.ended.unwrap_or_default(), vec![]);
+            seen |= graph.added.iter().any(|item| item.endpoint.gid == gid);
+        }
+    }
+    assert!(seen);
 }

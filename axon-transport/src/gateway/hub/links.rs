@@ -230,7 +230,7 @@ impl Hub {
         let age = keyring.config.session_max_age;
         let events = self.events.clone();
         tokio::spawn(async move {
-            let renewal = age.mul_f64(0.9);
+            let renewal = renewal_at(age);
             tokio::time::sleep(renewal).await;
             if side == Side::Client && events.send(Event::Renew(number)).await.is_err() {
                 return;
@@ -297,4 +297,10 @@ impl Hub {
         }
         self.tell(ToControl::LinkDown { daemon, reason }).await;
     }
+}
+
+/// When the successor of a link is dialled: a tenth of its age before the end, but at least ten
+/// seconds where that is no more than half of it, since the KMEs may be slow.
+fn renewal_at(age: Duration) -> Duration {
+    age - (age / 10).max(Duration::from_secs(10)).min(age / 2)
 }

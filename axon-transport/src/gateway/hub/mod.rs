@@ -309,7 +309,7 @@ impl Hub {
         self.link_ended(number, &reason).await;
     }
 
-    pub(super) fn peer_of(&self, link: &Link) -> String {
+    fn peer_of(&self, link: &Link) -> String {
         peer_text(link.established.hello.sae.as_deref(), link.connection.remote_address())
     }
 

@@ -60,13 +60,7 @@ impl Control {
         }
         let shared = self.shared.clone();
         let mut state = shared.state();
-        // A remote publisher's ring here is the gateway's, which ends when all has arrived.
-        let over: Vec<Gid> = graph
-            .removed
-            .iter()
-            .filter(|gid| state.graph.endpoints.get(gid).is_none_or(|e| e.daemon.is_none()))
-            .copied()
-            .collect();
+        let over = graph.ended.unwrap_or_default();
         for gid in &graph.removed {
             state.tombstones.remove(gid);
         }
