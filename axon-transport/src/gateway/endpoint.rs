@@ -12,6 +12,7 @@ use quinn::{
     Endpoint, EndpointConfig, IdleTimeout, MtuDiscoveryConfig, TokioRuntime, TransportConfig,
     VarInt,
 };
+use quinn_proto::HashedConnectionIdGenerator;
 use tokio::sync::mpsc;
 
 use super::socket::{Datagram, DemuxSocket};
@@ -146,7 +147,15 @@ fn bind_one(address: SocketAddr) -> io::Result<(SocketAddr, UdpSocket)> {
 
 fn endpoint_config(reset_key: &[u8; 32]) -> EndpointConfig {
     let key = aws_lc_rs::hmac::Key::new(aws_lc_rs::hmac::HMAC_SHA256, reset_key);
+    let derive = aws_lc_rs::hmac::Key::new(aws_lc_rs::hmac::HMAC_SHA256, reset_key);
     let mut config = EndpointConfig::new(Arc::new(key));
+    // Connection ids are checked before a stateless reset is sent, so those of the predecessor must
+    // pass: their key is derived from the one that is kept.
+    let tag = aws_lc_rs::hmac::sign(&derive, b"connection ids");
+    let mut seed = [0; 8];
+    seed.copy_from_slice(&tag.as_ref()[..8]);
+    let seed = u64::from_be_bytes(seed);
+    config.cid_generator(move || Box::new(HashedConnectionIdGenerator::from_key(seed)));
     // The first two bits tell QUIC from discovery, so the fixed bit stays what it is.
     config.grease_quic_bit(false);
     config.supported_versions(vec![1]);

@@ -2,10 +2,7 @@
 
 use std::{
     collections::HashMap,
-    sync::{
-        Arc, RwLock,
-        atomic::{AtomicU64, Ordering},
-    },
+    sync::{Arc, RwLock},
     time::Duration,
 };
 
@@ -17,6 +14,7 @@ use super::{
     establish::close,
     pulse::Pulse,
     seal::{MAX_OVERHEAD, Protection, RefusedMessage, publisher},
+    stand_in::StandIn,
 };
 use crate::{
     ids::Gid,
@@ -30,30 +28,6 @@ const RELIABLE: u8 = 1;
 const BEST_EFFORT: u8 = 2;
 /// A stream for a route that is gone is stopped with this.
 const NO_ROUTE: VarInt = VarInt::from_u32(CloseCode::OutOfOrder as u32);
-
-/// A remote publisher as local subscriptions see it.
-pub(super) struct StandIn {
-    /// Writes the ring that stands in for it.
-    pub(super) publisher: Publisher,
-    /// Held by the stream that feeds it: the stream of a successor waits until its predecessor's
-    /// is read to the end, so samples stay in order.
-    feeding: tokio::sync::Mutex<()>,
-    /// Sequence number of the newest sample written; 0 before the first.
-    last: AtomicU64,
-}
-
-impl StandIn {
-    /// A stand-in that nothing feeds yet.
-    pub(super) fn new(publisher: Publisher) -> Self {
-        Self { publisher, feeding: tokio::sync::Mutex::default(), last: AtomicU64::new(0) }
-    }
-
-    /// Sequence number of the newest sample written.
-    pub(super) fn last_sequence(&self) -> Option<u64> {
-        // Relaxed: only where a resumed route begins; sessions drop what they have seen.
-        Some(self.last.load(Ordering::Relaxed)).filter(|n| *n > 0)
-    }
-}
 
 /// A route that this side asked for.
 pub(super) struct RouteIn {
@@ -191,8 +165,8 @@ impl Inbound {
             sequence: opened.header.sequence,
             source_timestamp: opened.header.source_timestamp,
         };
-        if self.publish(&stand_in.publisher, meta, &opened.payload).await {
-            stand_in.last.store(meta.sequence, Ordering::Relaxed);
+        if self.publish(stand_in, meta, &opened.payload).await {
+            stand_in.wrote(meta.sequence);
         }
         Ok(true)
     }

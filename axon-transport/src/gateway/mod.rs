@@ -28,6 +28,7 @@ mod routes;
 mod run;
 mod seal;
 mod socket;
+mod stand_in;
 mod status;
 
 pub use endpoint::EndpointError;

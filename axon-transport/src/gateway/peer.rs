@@ -13,9 +13,10 @@ use super::{
     control::Outbox,
     counters::Counters,
     hub::{Event, Shared},
-    inbound::{Inbound, RouteIn, RoutesIn, StandIn},
+    inbound::{Inbound, RouteIn, RoutesIn},
     outbound::{self, Carrier, RouteOut},
     routes::{RelaySpec, TopicKey, Wanted, relays},
+    stand_in::StandIn,
 };
 use crate::{
     graph::{Endpoint, LIMITS},
@@ -261,9 +262,8 @@ impl Peer {
                 break;
             }
             shown += 1;
-            match shared.session.create_stand_in(publisher) {
+            match shared.stand_ins.get(&shared.session, &publisher) {
                 Ok(stand_in) => {
-                    let stand_in = Arc::new(StandIn::new(stand_in));
                     fresh.push(Arc::clone(&stand_in));
                     asked.stand_ins.insert(gid, stand_in);
                 }
@@ -289,7 +289,7 @@ impl Peer {
             let (outbox, message) = (self.outbox.clone(), subscribe(&key, &asked));
             let stand_ins: Vec<_> = asked.stand_ins.values().cloned().collect();
             asked.asking = Some(OnDrop(tokio::spawn(async move {
-                let attached = || stand_ins.iter().all(|s| s.publisher.matched().len() >= count);
+                let attached = || stand_ins.iter().all(|s| s.matched().len() >= count);
                 poll(attached, ATTACH_TIMEOUT).await;
                 outbox.send(message);
             })));

@@ -16,6 +16,7 @@ use super::{
     hub::{Event, Hub, Noticed, Shared},
     keyring::Keyring,
     pulse::Pulse,
+    stand_in::StandIns,
 };
 use crate::{
     daemon::bridge::{CHANNEL, GatewayParts, ToControl},
@@ -58,6 +59,7 @@ async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
     let noticed = Arc::new(Noticed::default());
     let session = open_session(socket, &config, Arc::clone(&noticed)).await?;
     let shared = Arc::new(Shared {
+        stand_ins: StandIns::default(),
         pulse: Pulse::start(&session)?,
         session,
         local_qos: Arc::new(RwLock::new(HashMap::new())),

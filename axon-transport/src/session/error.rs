@@ -9,6 +9,9 @@ use crate::{config::ConfigError, shm::ShmError};
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum SessionError {
+    /// A publisher of another description still has this GID.
+    #[error("the GID {0} is in use by a publisher of another description; it ends soon")]
+    InUse(crate::ids::Gid),
     /// `AXON_DAEMON=require`, and there is none.
     #[error("no daemon listens at {address}: start `axon_daemon`, or set AXON_DAEMON=spawn")]
     NoDaemon {

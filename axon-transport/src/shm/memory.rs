@@ -112,7 +112,7 @@ impl Map {
         }
         // Huge pages can be sealed just so, and still be missing at the first access.
         let system = fstatfs(fd).map_err(ShmError::system("sizing up a segment"))?;
-        if i64::from(system.f_type) != TMPFS_MAGIC {
+        if system.f_type != TMPFS_MAGIC {
             return Err(ShmError::Refused { what: "it is not ordinary memory" });
         }
         let len = fstat(fd).map_err(ShmError::system("sizing up a segment"))?.st_size;

@@ -88,6 +88,11 @@ fn runs(pid: u32) -> bool {
 }
 
 #[test]
+fn of_the_publisher_in_classic() {
+    kill([classic(&[]), classic(&[])], 0, None);
+}
+
+#[test]
 fn of_the_subscriber_in_classic() {
     kill([classic(&[]), classic(&[])], 1, None);
 }
@@ -99,8 +104,18 @@ fn kill_qkd(victim: usize, key_mode: &str) {
 }
 
 #[test]
+fn of_the_publisher_in_qkd_session() {
+    kill_qkd(0, "session");
+}
+
+#[test]
 fn of_the_subscriber_in_qkd_session() {
     kill_qkd(1, "session");
+}
+
+#[test]
+fn of_the_publisher_in_messages10() {
+    kill_qkd(0, "messages10");
 }
 
 #[test]

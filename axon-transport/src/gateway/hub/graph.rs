@@ -3,9 +3,10 @@
 use super::Hub;
 use crate::{
     daemon::bridge::ToControl,
-    gateway::{peer::GraphChange, routes, status},
+    gateway::{establish::close, peer::GraphChange, routes, status},
     graph::Endpoint,
     ids::DaemonId,
+    link::CloseCode,
 };
 
 impl Hub {
@@ -43,17 +44,27 @@ impl Hub {
                 peer.forget(&ours);
             }
         }
-        self.take_over(daemon, &added).await;
+        let dead = self.taken_over(daemon, &added);
+        // Before the dead links let go of their stand-ins: rings and readers stay as they are.
         if let Some(peer) = self.peers.get_mut(&daemon) {
             peer.want(routes::wanted(self.local.values(), peer.remote()), &self.shared);
+        }
+        for link in dead {
+            let text = "its host's daemon was restarted";
+            if let Some(l) = self.links.get(&link) {
+                close(&l.connection, CloseCode::Replaced, text);
+            }
+            self.link_ended(link, text).await;
         }
         self.tell(ToControl::RemoteGraph { daemon, reset, added, removed }).await;
     }
 
     /// A restarted daemon announces the endpoints of its predecessor, whose link may not have timed
-    /// out yet: they are the new daemon's from now on, if it is the same host by what both proved.
-    pub(super) async fn take_over(&mut self, daemon: DaemonId, added: &[Endpoint]) {
-        let Some(owner) = self.identity_of(daemon) else { return };
+    /// out yet: that link is dead, if both are the same host by what they proved. Somebody else's
+    /// claim is ignored.
+    fn taken_over(&mut self, daemon: DaemonId, added: &[Endpoint]) -> Vec<u64> {
+        let mut dead = Vec::new();
+        let Some(owner) = self.identity_of(daemon) else { return dead };
         let others: Vec<_> = self.peers.keys().filter(|d| **d != daemon).copied().collect();
         for other in others {
             let same_host = self.identity_of(other).is_some_and(|i| i == owner);
@@ -70,16 +81,9 @@ impl Hub {
                 }
                 continue;
             }
-            peer.forget(&moved);
-            peer.want(routes::wanted(self.local.values(), peer.remote()), &self.shared);
-            let gone = ToControl::RemoteGraph {
-                daemon: other,
-                reset: false,
-                added: vec![],
-                removed: moved,
-            };
-            self.tell(gone).await;
+            dead.push(peer.link);
         }
+        dead
     }
 
     /// What a peer proved to be, beyond its daemon id.

@@ -27,6 +27,7 @@ use super::{
     pulse::Pulse,
     refusal::{Refusal, RefusedBy},
     seal::Protection,
+    stand_in::StandIns,
     status,
 };
 use crate::{
@@ -42,6 +43,8 @@ use crate::{
 pub(super) struct Shared {
     /// The gateway's own session.
     pub(super) session: Session,
+    /// Remote publishers as they are seen here.
+    pub(super) stand_ins: StandIns,
     /// Wakes tasks when rings change.
     pub(super) pulse: Pulse,
     /// What local publishers offer.
