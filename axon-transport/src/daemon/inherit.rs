@@ -3,11 +3,9 @@
 
 #![allow(unsafe_code)]
 
-/// Closes every descriptor but the standard streams. To be called first thing in `main`, while
-/// the process has one thread and has opened nothing itself.
+/// Has every descriptor but the standard streams closed when this process execs, as it is about to.
 pub(super) fn close_inherited() {
-    // SAFETY: the system call takes plain integers. No value in this process owns any of these
-    // descriptors: it has opened none yet, and std takes no interest in those it was born with
-    // but the first three.
-    unsafe { libc::close_range(3, libc::c_uint::MAX, 0) };
+    // SAFETY: the system call takes plain integers and closes nothing: it only marks descriptors,
+    // which no owner of one can tell.
+    unsafe { libc::close_range(3, libc::c_uint::MAX, libc::CLOSE_RANGE_CLOEXEC as libc::c_int) };
 }

@@ -77,15 +77,20 @@ pub(super) async fn serve(
     control.borrow_mut().remove(&id, &bell);
 }
 
+/// Messages of unknown types that may come before HELLO.
+const UNKNOWN: u32 = 8;
+
 async fn first(socket: &AsyncFd<OwnedFd>) -> Option<(Hello, Vec<OwnedFd>)> {
     let mut buffer = Vec::new();
+    let mut unknown = 0;
     loop {
         let mut ready = socket.readable().await.ok()?;
         match socket::receive(socket.get_ref(), &mut buffer) {
             Ok(Received { message: Message::Hello(hello), descriptors }) => {
                 return Some((hello, descriptors));
             }
-            Ok(Received { message: Message::Unknown(_), .. }) => {}
+            // A later version may say something first; a flood would keep everybody else waiting.
+            Ok(Received { message: Message::Unknown(_), .. }) if unknown < UNKNOWN => unknown += 1,
             Err(SocketError::NotReady) => ready.clear_ready(),
             Ok(_) | Err(_) => return None,
         }
@@ -154,7 +159,7 @@ async fn converse(
 ) -> String {
     let mut buffer = Vec::new();
     loop {
-        let full = match send_all(control, socket, &id) {
+        let full = match send_all(control, socket, &id, bell) {
             Ok(full) => full,
             Err(error) => return error.to_string(),
         };
@@ -166,7 +171,7 @@ async fn converse(
             }
             ready = socket.writable(), if full => {
                 let Ok(mut ready) = ready else { return "its socket cannot be watched".into() };
-                match send_all(control, socket, &id) {
+                match send_all(control, socket, &id, bell) {
                     Ok(true) => ready.clear_ready(),
                     Ok(false) => {}
                     Err(error) => return error.to_string(),
@@ -192,8 +197,14 @@ fn send_all(
     control: &Rc<RefCell<Control>>,
     socket: &AsyncFd<OwnedFd>,
     id: &SessionId,
+    bell: &Rc<Notify>,
 ) -> Result<bool, SocketError> {
-    let registry = &mut control.borrow_mut().registry;
+    let control = &mut *control.borrow_mut();
+    // What waits is for the connection on which the session came back.
+    if !control.is_current(id, bell) {
+        return Ok(false);
+    }
+    let registry = &mut control.registry;
     while let Some(output) = registry.next_output(id) {
         let descriptors: Vec<BorrowedFd<'_>> =
             output.descriptors.iter().map(|d| d.as_fd()).collect();

@@ -17,6 +17,8 @@ use crate::{
 
 /// Publishers whose last sequence number is remembered after they are gone.
 const REMEMBERED: usize = 4096;
+/// Samples that one take passes over because they were taken before.
+const REPEATS: usize = 64;
 
 /// Receives the samples of a topic. Thread-safe.
 pub struct Subscription {
@@ -56,7 +58,7 @@ impl Subscription {
 
     /// As [`take`](Self::take), after waiting for a sample for at most `timeout`.
     pub fn recv(&self, out: &mut Vec<u8>, timeout: Option<Duration>) -> Option<MessageInfo> {
-        let deadline = timeout.map(|t| std::time::Instant::now() + t);
+        let deadline = timeout.and_then(|t| std::time::Instant::now().checked_add(t));
         loop {
             if let Some(info) = self.take(out) {
                 return Some(info);
@@ -253,7 +255,9 @@ impl Slots {
     }
 
     fn take(&mut self, out: &mut Vec<u8>, endpoint: &Endpoint) -> Option<MessageInfo> {
-        loop {
+        // A writer that repeats itself without end must not keep the lock: callers come back as
+        // long as there is something to take.
+        for _ in 0..REPEATS {
             if endpoint.qos.history == History::KeepLast && self.slots.len() > 1 {
                 self.skip_to_depth(u64::from(endpoint.qos.depth));
             }
@@ -285,6 +289,7 @@ impl Slots {
                 received_timestamp: now(),
             });
         }
+        None
     }
 
     /// The slot whose next sample is the oldest.
