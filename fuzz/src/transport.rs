@@ -207,6 +207,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             added: vec![GraphItem { endpoint: endpoint(), daemon: Some(daemon) }],
             removed: vec![writer],
             more: false,
+            ended: Some(vec![writer]),
         }),
         Message::Match(Pair { reader, writer }),
         Message::Attach(Attach {
