@@ -361,7 +361,7 @@ fn without_a_usable_runtime_directory_nothing_is_kept_and_everything_works() {
     let host = Host::new()
         .without("AXON_RUNTIME_DIR")
         .with("XDG_RUNTIME_DIR", "/proc/no-such-directory")
-        .with("ROS_DOMAIN_ID", "87");
+        .with("ROS_DOMAIN_ID", "170");
     let mut player = host.play("idle");
     let daemon = player.hear();
     let status = host.status().unwrap();

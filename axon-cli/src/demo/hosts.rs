@@ -19,7 +19,7 @@ const START: Duration = Duration::from_secs(20);
 /// Domains that ROS 2 users hardly use; which one, the process id says, so that two demos at the
 /// same time do not meet.
 pub(crate) fn domain() -> u32 {
-    100 + std::process::id() % 133
+    181 + std::process::id() % 52
 }
 
 /// What a host is started with.

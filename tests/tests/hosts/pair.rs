@@ -46,6 +46,7 @@ impl Plan {
         let (pair, pid) = (PAIRS.fetch_add(1, Ordering::Relaxed), std::process::id());
         // Where hardly anybody is; another run of these tests at the same time has its own.
         let net = [(16 + pair % 200) as u8, (1 + pid % 250) as u8];
+        // Below 100: the tool's tests, whose daemons may still be in their grace time, are above.
         let domain = 1 + (pid.wrapping_mul(31) + 2 * pair) % 98;
         let addresses = [1, 2].map(|host| Ipv4Addr::new(127, net[0], net[1], host));
         let mut hosts = [0, 1].map(|host| {
