@@ -69,12 +69,51 @@ fn retire_waits_for_the_reliable_and_five_seconds_for_the_rest() {
     assert_eq!(open(&mut opener, over, &envelopes[2]), Err(RefusalCause::Retired));
     assert_eq!(open(&mut opener, over, &envelopes[3]), Ok(()));
     assert_eq!(opener.expire(over).keys, 0);
-    // A reliable message is waited for as long as the connection lasts.
-    let much_later = START + Duration::from_secs(1_000_000);
+    // A reliable message is waited for long after that.
+    let much_later = START + opener.limits().max_age - Duration::from_nanos(1);
     assert_eq!(opener.expire(much_later).keys, 0);
     assert_eq!(open(&mut opener, much_later, &envelopes[5]), Ok(()));
     assert!(!opener.contains(b"key"));
     assert_eq!(open(&mut opener, much_later, &envelopes[4]), Err(RefusalCause::Retired));
+    // The second and the fourth best-effort message never came, whatever ended the key.
+    let expired = opener.expire(much_later);
+    assert_eq!((expired.keys, expired.messages_missing), (0, 2));
+    assert_eq!(opener.expire(much_later).messages_missing, 0, "counted twice");
+}
+
+#[test]
+fn a_reliable_message_that_never_comes_holds_its_key_for_a_while_only() {
+    let (mut opener, (envelopes, sealer)) = (opener("key", 1), six("key"));
+    let max_age = opener.limits().max_age;
+    let (retired_at, retirement) = (START * 7, sealer.retire());
+    let (used, reliable) = (retirement.used, retirement.reliable);
+    // Nothing has opened yet: the time counts from RETIRE, and only from the first.
+    opener.retire(retired_at, b"key", used, reliable).unwrap();
+    let last = retired_at + max_age - Duration::from_nanos(1);
+    opener.retire(last, b"key", used, reliable).unwrap();
+    assert_eq!(open(&mut opener, last, &envelopes[1]), Ok(()));
+    assert_eq!(opener.expire(last).keys, 0);
+
+    let over = retired_at + max_age;
+    assert_eq!(open(&mut opener, over, &envelopes[3]), Err(RefusalCause::Retired));
+    let expired = opener.expire(over);
+    assert_eq!((expired.keys, expired.messages_missing), (1, 5));
+    assert_eq!(opener.key_count(), 0);
+    assert_eq!(opener.add_key(key_id("key"), key(1)), Err(AddKeyError::Retired));
+}
+
+#[test]
+fn keys_pinned_by_lost_messages_make_room_again() {
+    let mut limits = Limits::default();
+    limits.max_keys = 3;
+    let mut opener: Opener = Opener::with_limits(channel(), limits).unwrap();
+    for name in ["a", "b", "c"] {
+        opener.add_key(key_id(name), key(1)).unwrap();
+        opener.retire(START, name.as_bytes(), mask(1), mask(1)).unwrap();
+    }
+    assert_eq!(opener.add_key(key_id("d"), key(1)), Err(AddKeyError::Full(3)));
+    assert_eq!(opener.expire(START + limits.max_age).keys, 3);
+    assert_eq!(opener.add_key(key_id("d"), key(1)), Ok(()));
 }
 
 #[test]

@@ -102,7 +102,7 @@ impl Held {
     fn may_open(&self, index: u8, now: Duration) -> bool {
         let in_time = match (self.retire, self.first) {
             (Some((at, used, _)), _) if now - at < GRACE => used.contains(index),
-            (Some((_, _, reliable)), _) => reliable.contains(index),
+            (Some((at, _, reliable)), _) => now - at < OPENER_AGE && reliable.contains(index),
             (None, Some(first)) => now - first < OPENER_AGE,
             (None, None) => true,
         };

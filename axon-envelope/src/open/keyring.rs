@@ -17,6 +17,8 @@ pub(super) struct Keyring<A> {
     /// Retired key_IDs, oldest first; those beyond the limit leave the map.
     retired: VecDeque<KeyId>,
     live: usize,
+    /// Messages that RETIRE called used and that had not opened when their key went.
+    missing: usize,
     limits: Limits,
 }
 
@@ -50,11 +52,20 @@ impl<A: Aead> Live<A> {
             (Some(retire), _) if now.saturating_sub(retire.at) < limits.best_effort_grace => {
                 retire.used
             }
+            // A stream that was stopped never delivers: without an end its key would stay for good.
+            (Some(retire), _) if now.saturating_sub(retire.at) >= limits.max_age => {
+                IndexMask::EMPTY
+            }
             (Some(retire), _) => retire.reliable,
             (None, Some(first)) if now.saturating_sub(first) >= limits.max_age => IndexMask::EMPTY,
             (None, _) => IndexMask::ALL,
         };
         expected.minus(self.opened)
+    }
+
+    /// How many messages were sealed, as RETIRE says, and have not opened.
+    fn missing(&self) -> usize {
+        self.retire.as_ref().map_or(0, |retire| retire.used.minus(self.opened).len())
     }
 
     /// Whether message `index` may open at `now`, its tag permitting.
@@ -71,7 +82,7 @@ impl<A: Aead> Live<A> {
 
 impl<A: Aead> Keyring<A> {
     pub(super) fn new(limits: Limits) -> Self {
-        Self { keys: BTreeMap::new(), retired: VecDeque::new(), live: 0, limits }
+        Self { keys: BTreeMap::new(), retired: VecDeque::new(), live: 0, missing: 0, limits }
     }
 
     pub(super) fn add(&mut self, id: KeyId, key: KmeKey, aead: A) -> Result<(), AddKeyError> {
@@ -154,14 +165,13 @@ impl<A: Aead> Keyring<A> {
                 continue;
             }
             expired.keys += 1;
-            if let Some(retire) = &live.retire {
-                expired.messages_missing += retire.used.minus(live.opened).len();
-            }
+            self.missing += live.missing();
             self.retired.push_back(live.id.clone());
             self.live -= 1;
             *slot = Slot::Retired;
         }
         self.forget_oldest();
+        expired.messages_missing = core::mem::take(&mut self.missing);
         expired
     }
 
@@ -201,6 +211,7 @@ impl<A: Aead> Keyring<A> {
         let Some(slot) = self.keys.get_mut(id) else { return };
         let Slot::Live(live) = slot else { return };
         if live.open_indexes(now, &self.limits).is_empty() {
+            self.missing += live.missing();
             self.retired.push_back(live.id.clone());
             self.live -= 1;
             *slot = Slot::Retired;

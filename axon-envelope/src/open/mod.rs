@@ -44,8 +44,9 @@ pub struct Limits {
     pub max_keys: usize,
     /// How long after RETIRE a best-effort message can still open; default 5 s.
     pub best_effort_grace: Duration,
-    /// How long after its first message a key opens without RETIRE; default [`KEY_MAX_AGE`] and
-    /// a minute for what is on its way.
+    /// How long after its first message a key opens without RETIRE, and how long after RETIRE a
+    /// reliable message can still open; default [`KEY_MAX_AGE`] and a minute for what is on its
+    /// way.
     pub max_age: Duration,
     /// Retired key_IDs remembered; default 16,384, at most some 100 bytes and the ID each.
     pub retired_memory: usize,
@@ -111,13 +112,14 @@ pub enum RetireError {
     },
 }
 
-/// What [`Opener::expire`] erased.
+/// What [`Opener::expire`] erased, and what never came.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Expired {
-    /// Keys erased.
+    /// Keys this call erased.
     pub keys: usize,
-    /// Best-effort messages that RETIRE called used and that never came.
+    /// Messages that RETIRE called used and that never came, under all keys that went since the
+    /// last call, whatever ended them.
     pub messages_missing: usize,
 }
 
@@ -218,8 +220,8 @@ impl<A: Aead> Opener<A> {
 
     /// Notes a RETIRE: the sender seals no more under `key_id`.
     ///
-    /// The key is kept until each index in `reliable` has opened; the others of `used` can still
-    /// open for [`Limits::best_effort_grace`].
+    /// The key is kept until each index in `reliable` has opened, but no longer than
+    /// [`Limits::max_age`]; the others of `used` can still open for [`Limits::best_effort_grace`].
     ///
     /// # Errors
     /// [`RetireError`] if the masks contradict each other or what has opened: the peer is broken
