@@ -62,7 +62,7 @@ pub enum Error {
         /// Why, and what to look at.
         reason: String,
     },
-    /// Status 400 (clause 5): the KME did not accept the request.
+    /// Status 400 (clauses 5.2 to 5.4): the KME did not accept the request.
     #[error("KME answered 400 Bad Request: {message}")]
     BadRequest {
         /// The KME's message; empty where its answer held none.
@@ -70,7 +70,7 @@ pub enum Error {
         /// The KME's details (clause 6.5).
         details: Vec<Value>,
     },
-    /// Status 401 (clause 5): this SAE may not do that.
+    /// Status 401 (clauses 5.2 to 5.4): this SAE may not do that.
     #[error("KME answered 401 Unauthorized: {message}")]
     Unauthorized {
         /// The KME's message; empty where its answer held none.
@@ -78,7 +78,7 @@ pub enum Error {
         /// The KME's details (clause 6.5).
         details: Vec<Value>,
     },
-    /// Status 503 (clause 5): an error of the server's side; an empty key store is one.
+    /// Status 503 (clauses 5.2 to 5.4): an error of the server's side; an empty key store is one.
     #[error("KME answered 503 Service Unavailable: {message}")]
     Unavailable {
         /// The KME's message; empty where its answer held none.

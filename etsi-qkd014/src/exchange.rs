@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use bytes::Bytes;
 use reqwest::header::{ACCEPT, CONTENT_TYPE, RETRY_AFTER};
 use reqwest::{Method, Response, StatusCode, Url, Version};
 use zeroize::Zeroize;
@@ -131,13 +132,14 @@ async fn receive(mut response: Response, limits: &Limits) -> Result<Body, Failur
     if response.version() < Version::HTTP_11 && !quirks.contains(Quirks::HTTP_1_0) {
         return Err(Failure::ambiguous(Error::Malformed {
             what: "HTTP version".to_owned(),
-            reason: "is older than 1.1 (quirk http-1.0 tolerates it)".to_owned(),
+            reason: "is older than 1.1, clause 5.1 (quirk http-1.0 tolerates it)".to_owned(),
         }));
     }
     if !quirks.contains(Quirks::ANY_MEDIA_TYPE) && !is_json(&response) {
         return Err(Failure::ambiguous(Error::Malformed {
             what: "Content-Type".to_owned(),
-            reason: "is not application/json (quirk any-media-type tolerates it)".to_owned(),
+            reason: "is not application/json, clause 5.1 (quirk any-media-type tolerates it)"
+                .to_owned(),
         }));
     }
     read_body(&mut response, limits.max_body).await.map_err(Failure::ambiguous)
@@ -155,7 +157,12 @@ async fn read_body(response: &mut Response, limit: usize) -> Result<Body, Error>
     if expected.is_some_and(|length| length > limit) {
         return Err(Error::BodyTooLarge { limit });
     }
+    // Header values share memory with the body's first chunk, which is cleared only when nothing
+    // else refers to it.
+    response.headers_mut().clear();
+    response.extensions_mut().clear();
     let mut body = SecretBuf::new(expected.unwrap_or(16 << 10), limit);
+    let mut held = Held(None);
     loop {
         let chunk = match response.chunk().await {
             Ok(Some(chunk)) => chunk,
@@ -163,11 +170,40 @@ async fn read_body(response: &mut Response, limit: usize) -> Result<Body, Error>
             Err(e) => return Err(Error::Interrupted { reason: innermost(&e) }),
         };
         let kept = body.extend(&chunk);
-        // hyper often still shares this memory, and then it cannot be cleared from here.
-        if let Ok(mut own) = chunk.try_into_mut() {
-            own.zeroize();
-        }
+        held.replace(chunk);
         kept.map_err(|_| Error::BodyTooLarge { limit })?;
+    }
+}
+
+/// The chunk read last. As long as it is held, hyper cannot reuse the memory below it and takes
+/// other memory for its next read; so when the next chunk comes, this one either is the last
+/// reference to its memory, or shares it with the next one, which then stands for both.
+struct Held(Option<Bytes>);
+
+impl Held {
+    fn replace(&mut self, next: Bytes) {
+        if let Some(last) = self.0.replace(next) {
+            clear(last);
+        }
+    }
+}
+
+impl Drop for Held {
+    fn drop(&mut self) {
+        if let Some(last) = self.0.take() {
+            clear(last);
+        }
+    }
+}
+
+/// Zeroizes all the memory that a chunk was cut from, where nothing else refers to it.
+fn clear(chunk: Bytes) {
+    if let Ok(mut own) = chunk.try_into_mut() {
+        own.clear();
+        // Asking for more than there is moves the start back to that of the memory.
+        let _ = own.try_reclaim(own.capacity() + 1);
+        own.resize(own.capacity(), 0);
+        own.zeroize();
     }
 }
 

@@ -103,7 +103,7 @@ impl<'c> EncKeys<'c> {
         }
         let simple = self.additional_slaves.is_empty() && extensions().next().is_none();
         if self.via_get && !simple {
-            return Err(refuse("GET carries only number and size; send it as POST (clause 5.3)"));
+            return Err(refuse("GET carries only number and size; send it as POST (clause 6.2)"));
         }
         Ok(())
     }
@@ -219,7 +219,7 @@ impl<'c> DecKeys<'c> {
             return Err(refuse("no key_ID was given"));
         }
         if self.via_get && self.ids.len() > 1 {
-            return Err(refuse("GET carries one key_ID; send it as POST (clause 5.4)"));
+            return Err(refuse("GET carries one key_ID; send it as POST (clause 6.4)"));
         }
         let sane =
             |id: &String| (1..=128).contains(&id.len()) && id.bytes().all(|c| c.is_ascii_graphic());
@@ -237,9 +237,9 @@ impl<'c> DecKeys<'c> {
 
 fn check_size(size: Option<u32>) -> Result<(), Error> {
     match size {
-        Some(bits) if bits == 0 || !bits.is_multiple_of(8) => {
-            Err(refuse(&format!("size {bits} is not a positive multiple of 8 bits (clause 6.2)")))
-        }
+        Some(bits) if bits == 0 || !bits.is_multiple_of(8) => Err(refuse(&format!(
+            "size {bits} is not a positive multiple of 8 bits; this client takes whole bytes only"
+        ))),
         _ => Ok(()),
     }
 }

@@ -108,7 +108,7 @@ fn check_sizes(keys: &[Key], size: Option<u32>) -> Result<(), Error> {
     };
     match keys.iter().find(|key| key.len() != expected) {
         Some(key) => Err(check(
-            "ETSI GS QKD 014 V1.1.1 clause 6.2 (size)",
+            "ETSI GS QKD 014 V1.1.1 clause 6.3 (key)",
             format!("keys of {} bits", expected * 8),
             format!("{} bits for {}", key.len() * 8, key.key_id()),
         )),
