@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use etsi_qkd014::sim::{Fault, Kme, Network};
-use etsi_qkd014::{Client, ClientBuilder, Error, KeyContainer, Quirks, RetryPolicy};
+use etsi_qkd014::{Client, ClientBuilder, Error, KeyContainer, Quirks, RefusedBy, RetryPolicy};
 
 async fn network() -> Network {
     Network::builder()
@@ -64,6 +64,8 @@ async fn answers_that_do_not_come_in_time_leave_keys_in_doubt() {
 #[tokio::test]
 async fn a_refused_handshake_consumes_nothing() {
     let error = enc(Fault::HandshakeRefused, |b| b).await;
+    assert!(matches!(error, Error::Tls { refused_by: RefusedBy::Kme, .. }), "{error}");
+    let error = enc(Fault::HandshakeDropped, |b| b).await;
     assert!(matches!(error, Error::Unreachable { .. } | Error::Tls { .. }), "{error}");
 }
 

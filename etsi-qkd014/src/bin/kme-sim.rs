@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
-use etsi_qkd014::sim::{Fault, FillRate, Layout, Network, NetworkBuilder, Pki, Site};
+use etsi_qkd014::sim::{Fault, FaultPlan, FillRate, Layout, Network, NetworkBuilder, Pki, Site};
 
 const HELP: &str = "\
 KMEs that share key material as a QKD link does, over real mutual TLS. For tests only.
@@ -126,7 +126,7 @@ fn run(dir: &Path, args: &[&str]) -> Outcome {
         let network = builder.start().await.map_err(other)?;
         for kme in network.kmes() {
             if let Some(latency) = latency {
-                kme.inject(Fault::Latency(latency), u32::MAX);
+                kme.plan(FaultPlan::new(Fault::Latency(latency)));
             }
             say(&format!("{} {}\n", kme.id(), kme.url()));
         }

@@ -11,6 +11,7 @@ use zeroize::Zeroizing;
 use super::fault::Fault;
 use super::http::{Answer, Request, percent_decode};
 use super::network::{KmeState, Shared};
+use super::plan::Method;
 use super::store::{Drawn, Refusal, uuid};
 
 /// A member of this name in a mandatory or optional extension is returned in
@@ -60,6 +61,12 @@ pub(super) fn answer(
         kme.count(|counters| counters.refused += 1);
     }
     answer
+}
+
+/// The method that a request names, whether or not it can be served.
+pub(super) fn method(request: &Request) -> Option<Method> {
+    let (_, name) = request.path.strip_prefix("/api/v1/keys/")?.split_once('/')?;
+    Method::named(name)
 }
 
 pub(super) fn error(status: u16, message: impl Into<String>, details: Vec<Value>) -> Answer {

@@ -1,94 +1,192 @@
-//! Faults on demand.
+//! Faults on demand: what a KME can do wrong, and how each is written.
 
-use std::collections::VecDeque;
+use std::fmt;
+use std::str::FromStr;
 use std::time::Duration;
 
-/// What a KME does wrong to a request. Injected by [`Kme::inject`](super::Kme::inject).
+/// What a KME does wrong to a request. Injected by [`Kme::inject`](super::Kme::inject), or with
+/// more say over when by [`Kme::plan`](super::Kme::plan).
 ///
 /// Except where it says otherwise the request is served first, so that keys asked for are gone.
+///
+/// As text it is a name, with a value where there is one: `cut`, `latency=250`, `status=500`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Fault {
-    /// The TCP connection is closed before the TLS handshake. Nothing is served. Meets new
-    /// connections only.
+    /// `handshake-refused`: the TLS handshake is refused with the alert handshake_failure. Nothing
+    /// is served. Meets new connections only.
     HandshakeRefused,
-    /// The answer comes this much later.
+    /// `handshake-dropped`: the TCP connection is closed before the TLS handshake, without a word.
+    /// Nothing is served. Meets new connections only.
+    HandshakeDropped,
+    /// `latency=MILLISECONDS`: the answer comes this much later. Adds to whatever else the request
+    /// meets.
     Latency(Duration),
-    /// The answer never comes.
+    /// `silence`: the answer never comes.
     Silence,
-    /// The answer comes a byte at a time, with this pause between two.
+    /// `drip=MILLISECONDS`: the answer comes a byte at a time, with this pause between two.
     Drip(Duration),
-    /// 503 as from an empty store. Nothing is served.
+    /// `empty`: 503 as from an empty store. Nothing is served.
     Empty,
-    /// 503 that asks to come back after so many seconds. Nothing is served.
+    /// `busy=SECONDS`: 503 that asks to come back after so long. Nothing is served.
     Busy(u64),
-    /// Another status, without a JSON body. Nothing is served.
+    /// `status=CODE`: another status, without a JSON body. Nothing is served.
     Status(u16),
-    /// The connection is reset after the request.
+    /// `reset`: the connection is reset after the request.
     ResetAfterRequest,
-    /// The connection is closed in the middle of the answer's body.
+    /// `cut`: the connection is closed in the middle of the answer's body.
     CutAnswer,
-    /// The answer's body is no JSON.
+    /// `garbage`: the answer's body is no JSON.
     Garbage,
-    /// The answer's body never ends, and has no Content-Length.
+    /// `endless`: the answer's body never ends, and has no Content-Length.
     Endless,
-    /// The Content-Length says more than any client should take.
+    /// `lying-length`: the Content-Length says more than any client should take.
     LyingLength,
-    /// Keys are one byte short.
+    /// `wrong-length`: keys are one byte short.
     WrongLength,
-    /// All keys have the first one's key_ID.
+    /// `repeat-key-id`: all keys of an answer have the first one's key_ID.
     RepeatKeyId,
-    /// The first key is missing.
+    /// `key-missing`: the first key is missing.
     KeyMissing,
-    /// key_IDs in upper case.
+    /// `upper-case-ids`: key_IDs in upper case.
     UpperCaseIds,
-    /// key_IDs that nobody asked for.
+    /// `other-ids`: key_IDs that nobody asked for.
     OtherIds,
-    /// The answer is labelled `text/plain`.
+    /// `media-type`: the answer is labelled `text/plain`.
     WrongMediaType,
-    /// The answer is HTTP/1.0 and ends with the connection.
+    /// `http-1.0`: the answer is HTTP/1.0 and ends with the connection.
     Http10,
 }
 
-/// Faults that wait for their requests, first in first out.
-#[derive(Debug, Default)]
-pub(super) struct Faults(VecDeque<(Fault, u32)>);
+/// What a fault meets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Meets {
+    Connection,
+    Request,
+}
 
-impl Faults {
-    pub(super) fn push(&mut self, fault: Fault, times: u32) {
-        if times > 0 {
-            self.0.push_back((fault, times));
+/// The faults whose name is all there is to them.
+const PLAIN: [(&str, Fault); 15] = [
+    ("handshake-refused", Fault::HandshakeRefused),
+    ("handshake-dropped", Fault::HandshakeDropped),
+    ("silence", Fault::Silence),
+    ("empty", Fault::Empty),
+    ("reset", Fault::ResetAfterRequest),
+    ("cut", Fault::CutAnswer),
+    ("garbage", Fault::Garbage),
+    ("endless", Fault::Endless),
+    ("lying-length", Fault::LyingLength),
+    ("wrong-length", Fault::WrongLength),
+    ("repeat-key-id", Fault::RepeatKeyId),
+    ("key-missing", Fault::KeyMissing),
+    ("upper-case-ids", Fault::UpperCaseIds),
+    ("other-ids", Fault::OtherIds),
+    ("media-type", Fault::WrongMediaType),
+];
+const HTTP_1_0: &str = "http-1.0";
+/// The faults that take a value, as the messages write them.
+const WITH_VALUE: &str = "latency=MILLISECONDS, drip=MILLISECONDS, busy=SECONDS, status=CODE";
+/// A day. Longer pauses are typing errors.
+const MAX_PAUSE_MS: u64 = 86_400_000;
+
+impl Fault {
+    pub(super) fn meets(&self) -> Meets {
+        match self {
+            Self::HandshakeRefused | Self::HandshakeDropped => Meets::Connection,
+            _ => Meets::Request,
         }
     }
 
-    pub(super) fn clear(&mut self) {
-        self.0.clear();
+    /// Every way to write a fault, for messages.
+    pub(super) fn all() -> String {
+        let plain: Vec<_> = PLAIN.iter().map(|(name, _)| *name).chain([HTTP_1_0]).collect();
+        format!("{}, {WITH_VALUE}", plain.join(", "))
+    }
+}
+
+impl fmt::Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Latency(time) => write!(f, "latency={}", time.as_millis()),
+            Self::Drip(pause) => write!(f, "drip={}", pause.as_millis()),
+            Self::Busy(seconds) => write!(f, "busy={seconds}"),
+            Self::Status(code) => write!(f, "status={code}"),
+            Self::Http10 => f.write_str(HTTP_1_0),
+            plain => {
+                let known = PLAIN.iter().find(|(_, fault)| fault == plain);
+                f.write_str(known.map_or("unnamed", |(name, _)| name))
+            }
+        }
+    }
+}
+
+impl FromStr for Fault {
+    type Err = String;
+
+    /// The error says what was read and what is accepted.
+    fn from_str(text: &str) -> Result<Self, String> {
+        let unknown = || format!("{text:?} is no fault; there are: {}", Self::all());
+        let Some((name, value)) = text.split_once('=') else {
+            if text == HTTP_1_0 {
+                return Ok(Self::Http10);
+            }
+            let known = PLAIN.iter().find(|(name, _)| *name == text);
+            return known.map(|(_, fault)| fault.clone()).ok_or_else(unknown);
+        };
+        let number = |max: u64| {
+            let number = value.parse::<u64>().ok().filter(|number| *number <= max);
+            number.ok_or_else(|| format!("{text:?}: the value is a whole number up to {max}"))
+        };
+        Ok(match name {
+            "latency" => Self::Latency(Duration::from_millis(number(MAX_PAUSE_MS)?)),
+            "drip" => Self::Drip(Duration::from_millis(number(MAX_PAUSE_MS)?)),
+            "busy" => Self::Busy(number(MAX_PAUSE_MS)?),
+            "status" => match u16::try_from(number(599)?) {
+                Ok(code @ 200..) => Self::Status(code),
+                _ => return Err(format!("{text:?}: status codes are 200 to 599")),
+            },
+            _ => return Err(unknown()),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn text_that_is_no_fault_is_refused_with_what_is() {
+        for wrong in [
+            "",
+            "Cut",
+            "cut ",
+            "cut=1",
+            "latency",
+            "latency=",
+            "latency=-1",
+            "latency=1s",
+            "latency=99999999999",
+            "status=7",
+            "status=999",
+            "=",
+        ] {
+            let why = wrong.parse::<Fault>().unwrap_err();
+            assert!(why.contains(&format!("{wrong:?}")), "{why}");
+        }
+        assert!("nonsense".parse::<Fault>().unwrap_err().contains("handshake-refused"));
     }
 
-    /// The fault for a new connection, if that is the next one.
-    pub(super) fn next_for_connection(&mut self) -> bool {
-        let next = matches!(self.0.front(), Some((Fault::HandshakeRefused, _)));
-        if next {
-            self.pop();
+    #[test]
+    fn each_fault_is_read_as_it_is_written() {
+        let valued = [
+            Fault::Http10,
+            Fault::Latency(Duration::from_millis(250)),
+            Fault::Drip(Duration::from_millis(0)),
+            Fault::Busy(7),
+            Fault::Status(500),
+        ];
+        for fault in valued.into_iter().chain(PLAIN.map(|(_, fault)| fault)) {
+            assert_eq!(fault.to_string().parse(), Ok(fault.clone()), "{fault}");
         }
-        next
-    }
-
-    /// The fault for a request.
-    pub(super) fn next_for_request(&mut self) -> Option<Fault> {
-        match self.0.front() {
-            Some((Fault::HandshakeRefused, _)) | None => None,
-            Some(_) => self.pop(),
-        }
-    }
-
-    fn pop(&mut self) -> Option<Fault> {
-        let (fault, times) = self.0.front_mut()?;
-        *times -= 1;
-        let (fault, left) = (fault.clone(), *times);
-        if left == 0 {
-            self.0.pop_front();
-        }
-        Some(fault)
     }
 }

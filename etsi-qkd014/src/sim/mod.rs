@@ -32,12 +32,14 @@ mod fault;
 mod http;
 mod network;
 mod pki;
+mod plan;
 mod server;
 mod store;
 
 pub use fault::Fault;
 pub use network::{Counters, Kme, Network, NetworkBuilder};
 pub use pki::{Layout, Pki, Sae, Site};
+pub use plan::{FaultPlan, Method};
 pub use store::FillRate;
 
 /// Why a simulator could not be set up.

@@ -9,8 +9,9 @@ use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 use zeroize::Zeroizing;
 
-use super::fault::{Fault, Faults};
+use super::fault::Fault;
 use super::pki::{Layout, Pair, Pki, Sae, Site, Validity};
+use super::plan::{FaultPlan, Faults};
 use super::store::{FillRate, Store};
 use super::{Error, server};
 use crate::{Client, ClientBuilder};
@@ -308,12 +309,23 @@ impl Kme {
         *lock(&self.state.counters)
     }
 
-    /// Lets the next `times` requests meet a fault, after those injected before.
+    /// Lets the next `times` requests (or connections) meet a fault, after those injected before.
     pub fn inject(&self, fault: Fault, times: u32) {
-        self.state.faults().push(fault, times);
+        self.plan(FaultPlan::new(fault).times(times));
     }
 
-    /// Forgets the faults that have not met a request.
+    /// Lets a fault happen as the plan says, after those that were there before.
+    pub fn plan(&self, plan: FaultPlan) {
+        self.state.faults().push(plan);
+    }
+
+    /// The faults that may still happen.
+    #[must_use]
+    pub fn plans(&self) -> Vec<FaultPlan> {
+        self.state.faults().iter().cloned().collect()
+    }
+
+    /// Forgets all faults.
     pub fn clear_faults(&self) {
         self.state.faults().clear();
     }

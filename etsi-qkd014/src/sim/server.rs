@@ -71,14 +71,18 @@ pub(super) async fn serve(
             tokio::time::sleep(Duration::from_millis(50)).await;
             continue;
         };
-        if kme.faults().next_for_connection() {
+        let fault = kme.faults().for_connection();
+        if fault == Some(Fault::HandshakeDropped) {
             continue;
         }
         let (acceptor, shared, kme) = (acceptor.clone(), Arc::clone(&shared), Arc::clone(&kme));
         connections.spawn(async move {
             let _permit = permit;
             // A client that breaks off is its own business.
-            let _ = connection(stream, &acceptor, &shared, &kme).await;
+            let _ = match fault {
+                Some(_) => refuse(stream).await,
+                None => connection(stream, &acceptor, &shared, &kme).await,
+            };
         });
     }
 }
@@ -113,10 +117,11 @@ async fn connection(
             }
             Ok(Err(NoRequest::Closed)) | Err(_) => return stream.shutdown().await,
         };
-        let fault = kme.faults().next_for_request();
+        let met = kme.faults().for_request(api::method(&request));
+        let fault = met.fault;
         let answer = api::answer(shared, kme, caller.as_deref(), &request, fault.as_ref());
+        tokio::time::sleep(met.delay).await;
         match fault {
-            Some(Fault::Latency(time)) => tokio::time::sleep(time).await,
             Some(Fault::Silence) => return std::future::pending().await,
             Some(Fault::ResetAfterRequest) => {
                 let _ = stream.get_ref().0.set_zero_linger();
@@ -131,6 +136,19 @@ async fn connection(
             return stream.shutdown().await;
         }
     }
+}
+
+/// Refuses the handshake as a TLS server does that shares nothing with its client: after the
+/// ClientHello, with a fatal alert (RFC 8446, 6.2).
+async fn refuse(mut stream: TcpStream) -> std::io::Result<()> {
+    const HANDSHAKE_FAILURE: [u8; 7] = [21, 3, 3, 0, 2, 2, 40];
+    let mut first = [0];
+    let read = stream.read(&mut first);
+    if !matches!(tokio::time::timeout(HANDSHAKE_TIME, read).await, Ok(Ok(1))) {
+        return Ok(());
+    }
+    stream.write_all(&HANDSHAKE_FAILURE).await?;
+    linger(stream).await
 }
 
 /// After a refused handshake: reads what the client has already sent, because closing over unread
