@@ -297,12 +297,10 @@ impl PeerKeys {
             }
             Ok::<_, SupplyError>(owed)
         })?;
-        // They belong to the previous connection, which a successor has not closed yet.
+        // They belong to the previous connection, which a successor has not closed yet. A third one
+        // that is not open yet would be closed over them.
         for message in owed {
-            let outboxes = lock(&self.outboxes);
-            for outbox in outboxes.iter().filter(|(c, _)| **c != connection).map(|(_, o)| o) {
-                outbox.send(Message::Keys(message.clone()));
-            }
+            self.post(message);
         }
         Ok(())
     }

@@ -4,7 +4,7 @@ use std::{collections::VecDeque, time::Duration};
 
 use axon_envelope::{KeyId, KmeKey};
 
-use super::request::{Answer, FailureKind, Fetched, Purpose, Request};
+use super::request::{Answer, Failure, FailureKind, Fetched, Purpose, Request};
 
 /// How often a batch is asked for.
 const TRIES: u8 = 3;
@@ -29,7 +29,7 @@ struct Batch {
 }
 
 /// How one key_ID ended.
-pub(super) type Outcome = (KeyId, Result<KmeKey, String>);
+pub(super) type Outcome = (KeyId, Result<KmeKey, Failure>);
 
 impl Fetches {
     pub(super) fn new(master: &str, purpose: Purpose) -> Self {
@@ -65,7 +65,9 @@ impl Fetches {
         let batch = self.in_flight.swap_remove(i);
         let failure = match answer.outcome {
             Ok(Fetched::Keys(keys)) => return given(batch.key_ids, keys),
-            Ok(Fetched::Stock(_)) => return failed(batch.key_ids, "the KME answered another call"),
+            Ok(Fetched::Stock(_)) => {
+                return failed(batch.key_ids, invalid("the KME answered another call"));
+            }
             Err(failure) => failure,
         };
         match failure.kind {
@@ -83,7 +85,7 @@ impl Fetches {
                 self.waiting.push_back(batch);
                 Vec::new()
             }
-            _ => failed(batch.key_ids, &failure.text),
+            _ => failed(batch.key_ids, failure),
         }
     }
 
@@ -98,11 +100,15 @@ impl Fetches {
 fn given(asked: Vec<KeyId>, mut keys: Vec<(KeyId, KmeKey)>) -> Vec<Outcome> {
     let outcome = |key_id: KeyId| match keys.iter().position(|(id, _)| *id == key_id) {
         Some(i) => (key_id, Ok(keys.swap_remove(i).1)),
-        None => (key_id, Err("the KME's answer does not hold it".to_owned())),
+        None => (key_id, Err(invalid("the KME's answer does not hold it"))),
     };
     asked.into_iter().map(outcome).collect()
 }
 
-fn failed(key_ids: Vec<KeyId>, reason: &str) -> Vec<Outcome> {
-    key_ids.into_iter().map(|key_id| (key_id, Err(reason.to_owned()))).collect()
+fn failed(key_ids: Vec<KeyId>, failure: Failure) -> Vec<Outcome> {
+    key_ids.into_iter().map(|key_id| (key_id, Err(failure.clone()))).collect()
+}
+
+fn invalid(text: &str) -> Failure {
+    Failure { kind: FailureKind::Invalid, text: text.to_owned() }
 }

@@ -117,6 +117,19 @@ impl fmt::Debug for Fetched {
 }
 
 impl FailureKind {
+    /// What a peer may know: nothing of where the KME is or what it said.
+    pub fn told(self) -> &'static str {
+        match self {
+            Self::Unreachable => "its KME is unreachable",
+            Self::Unavailable => "its KME has no key now",
+            Self::Refused => "its KME refused the request",
+            Self::Unauthorized => "its KME and it do not accept each other",
+            Self::Ambiguous => "its KME's answer was lost or unusable",
+            Self::Busy => "too many calls wait for its KME",
+            Self::Invalid => "the request could not be put",
+        }
+    }
+
     /// Whether the same call may succeed later by itself.
     pub fn is_transient(self) -> bool {
         matches!(self, Self::Unreachable | Self::Unavailable | Self::Ambiguous | Self::Busy)

@@ -36,8 +36,11 @@ const CACHED_SAES: usize = 256;
 const CACHED_FOR: Duration = Duration::from_secs(60);
 /// key_IDs that the KME does not know.
 const UNKNOWN: usize = 1024;
-/// How long they are remembered.
+/// How long one is not asked for again after it was unknown twice, and remembered at all.
 const UNKNOWN_FOR: Duration = Duration::from_secs(30);
+/// How long after the first time: KMEs that still relay a key answer as if there were none, and the
+/// dialler gives a key up after ten seconds.
+const MISSED_FOR: Duration = Duration::from_secs(1);
 /// Spent keys remembered.
 const SPENT: usize = 4096;
 /// Sources, and SAEs, remembered to have authenticated.
@@ -107,6 +110,9 @@ struct State {
     cached: HashMap<String, VecDeque<Cached>>,
     /// Calls that are queued or in flight.
     pending: Vec<Pending>,
+    /// Unknown to the KME once.
+    missed: Memory<Fingerprint>,
+    /// Unknown to it again.
     unknown: Memory<Fingerprint>,
     /// Keys whose last call failed, with the reason.
     failed: VecDeque<(Fingerprint, String)>,
@@ -141,6 +147,7 @@ impl Acceptor {
             state: Mutex::new(State {
                 cached: HashMap::new(),
                 pending: Vec::new(),
+                missed: Memory::new(UNKNOWN),
                 unknown: Memory::new(UNKNOWN),
                 failed: VecDeque::new(),
                 spent: Memory::new(SPENT),
@@ -242,7 +249,11 @@ impl Acceptor {
             },
             Ok(Fetched::Stock(_)) => "the KME answered another call".to_owned(),
             Err(failure) if failure.kind == FailureKind::Refused => {
-                state.unknown.insert(now, seen);
+                if state.missed.last_seen(&seen).is_some() {
+                    state.unknown.insert(now, seen);
+                } else {
+                    state.missed.insert(now, seen);
+                }
                 return;
             }
             Err(failure) => failure.text,
@@ -292,7 +303,9 @@ impl Acceptor {
             return (Lookup::Fetching, None);
         }
         let seen = fingerprint(identity);
-        if state.unknown.contains(&seen) {
+        let missed = state.missed.last_seen(&seen);
+        let missed = missed.is_some_and(|at| now.saturating_sub(at) < MISSED_FOR);
+        if missed || state.unknown.contains(&seen) {
             return (Lookup::UnknownKeyId, None);
         }
         let source = Source::from(source);
@@ -346,7 +359,10 @@ impl State {
         // Under `*` anyone can make names up, so those that never authenticated share a bucket.
         let own =
             matches!(allowed, QkdPeers::Listed(_)) || self.known_saes.contains(&sae.to_owned());
-        if !self.buckets.take(now, if own { sae } else { "" }) {
+        // Strangers who name an SAE must not empty the bucket of the address that is this SAE.
+        let sae = if own { sae } else { "" };
+        let bucket = format!("{} {sae}", if known { "known" } else { "new" });
+        if !self.buckets.take(now, &bucket) {
             return Some("5 a second for one SAE");
         }
         None
@@ -375,6 +391,7 @@ impl State {
         }
         self.cached.retain(|_, cached| !cached.is_empty());
         self.pending.retain(|p| young(p.since, LOST));
+        self.missed.forget_before(now.saturating_sub(UNKNOWN_FOR));
         self.unknown.forget_before(now.saturating_sub(UNKNOWN_FOR));
         self.buckets.expire(now);
     }

@@ -44,6 +44,11 @@ impl<K: Clone + Eq + std::hash::Hash> Memory<K> {
         self.seen.contains_key(key)
     }
 
+    /// When `key` was last seen, where it is remembered.
+    pub(super) fn last_seen(&self, key: &K) -> Option<Duration> {
+        self.seen.get(key).copied()
+    }
+
     /// Forgets what was last seen before `limit`.
     pub(super) fn forget_before(&mut self, limit: Duration) {
         while self.order.front().is_some_and(|(at, _)| *at < limit) {

@@ -17,6 +17,14 @@ const PAUSE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_
 /// Longest waits after such failures.
 const PAUSE_MAX: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(30));
 
+/// Pause after a key that the peer could not use, first and longest. Doubles with every
+/// [`REFUSALS`] of them that no READY makes up for: each costs a key that is gone for good.
+const REFUSED: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(30));
+/// See [`REFUSED`].
+const REFUSALS: u32 = 4;
+/// Refusals that are remembered, so that a peer that is well again is served again soon.
+const REFUSALS_MAX: u32 = 40;
+
 /// The calls of one sending direction.
 pub(super) struct Calls {
     /// Keys asked for, a number for each call in flight.
@@ -25,6 +33,10 @@ pub(super) struct Calls {
     size: u32,
     failures: u32,
     not_before: Duration,
+    /// Keys that the peer refused, less those that it readied.
+    refusals: u32,
+    /// The pause that follows from them.
+    refused_until: Duration,
     /// Since when keys were wanted without an answer.
     waiting_since: Option<Duration>,
     status_at: Duration,
@@ -38,6 +50,8 @@ impl Calls {
             size: PER_CALL,
             failures: 0,
             not_before: Duration::ZERO,
+            refusals: 0,
+            refused_until: Duration::ZERO,
             waiting_since: None,
             status_at: Duration::ZERO,
             status_asked: false,
@@ -46,6 +60,18 @@ impl Calls {
 
     pub(super) fn keys_asked(&self) -> usize {
         self.in_flight.iter().map(|&n| n as usize).sum()
+    }
+
+    /// The peer could not use a key, or did not answer for it.
+    pub(super) fn key_refused(&mut self, now: Duration) {
+        self.refusals = (self.refusals + 1).min(REFUSALS_MAX);
+        let pause = (REFUSED.0 * (1 << (self.refusals / REFUSALS))).min(REFUSED.1);
+        self.refused_until = self.refused_until.max(now + pause);
+    }
+
+    /// The peer readied a key.
+    pub(super) fn key_ready(&mut self) {
+        self.refusals = self.refusals.saturating_sub(1);
     }
 
     /// The next call, when `missing` keys are neither held nor (as counted here) asked for.
@@ -68,7 +94,7 @@ impl Calls {
             return None;
         }
         self.waiting_since.get_or_insert(now);
-        if self.in_flight.len() >= IN_FLIGHT || now < self.not_before {
+        if self.in_flight.len() >= IN_FLIGHT || now < self.begins() {
             return None;
         }
         let number = self.size.min(per_call).min(missing.try_into().unwrap_or(PER_CALL)).max(1);
@@ -115,11 +141,14 @@ impl Calls {
         Some(now.saturating_sub(self.waiting_since.replace(now).unwrap_or(now)))
     }
 
+    fn begins(&self) -> Duration {
+        self.not_before.max(self.refused_until)
+    }
+
     /// When [`poll`](Self::poll) may give something without an answer before.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         let status = (!self.status_asked).then_some(self.status_at);
-        let keys =
-            self.waiting_since.filter(|_| self.in_flight.is_empty()).map(|_| self.not_before);
+        let keys = self.waiting_since.filter(|_| self.in_flight.is_empty()).map(|_| self.begins());
         [status, keys].into_iter().flatten().min()
     }
 }

@@ -172,7 +172,7 @@ impl Receiver {
             match outcome {
                 Ok(key) if self.links.contains_key(&conn) => self.add(conn, key_id, key),
                 Ok(key) => self.keep(now, key_id, key),
-                Err(reason) => self.fail(conn, key_id, reason),
+                Err(failure) => self.fail(conn, key_id, failure.kind.told().to_owned()),
             }
         }
     }

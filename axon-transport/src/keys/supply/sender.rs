@@ -135,8 +135,8 @@ impl Sender {
     }
 
     /// Moves to a new connection. Keys under which nothing was sealed are announced again there;
-    /// a begun one is retired. Returns the RETIREs that are owed on the connection before, to be
-    /// sent there if it is open.
+    /// a begun one is retired. Returns the RETIREs that are owed on the connection before, each
+    /// with that connection: to be sent there, if it is open, and nowhere else.
     ///
     /// # Errors
     /// The SAE IDs make no channel.
@@ -145,11 +145,11 @@ impl Sender {
         now: Duration,
         conn: u64,
         exporters: &Exporters,
-    ) -> Result<Vec<KeyMessage>, SupplyError> {
+    ) -> Result<Vec<(u64, KeyMessage)>, SupplyError> {
         let channel = Channel::new(&self.local, &self.peer, exporters.envelope())?;
         self.unbind(now);
-        let owed = self.outbox.drain(..).map(|(_, message)| message);
-        let owed = owed.filter(|m| matches!(m, KeyMessage::Retire { .. })).collect();
+        let retire = |(_, m): &(u64, KeyMessage)| matches!(m, KeyMessage::Retire { .. });
+        let owed = self.outbox.drain(..).filter(retire).collect();
         self.link = Some(Link { conn, channel, ready: Zeroizing::new(*exporters.ready()) });
         Ok(owed)
     }
@@ -252,6 +252,7 @@ impl Sender {
                 let Some(Announced { key, asked, .. }) = self.announced.remove(key_id) else {
                     return Ok(());
                 };
+                self.calls.key_ready();
                 if let Some(asked) = asked {
                     self.demand.ready(now.saturating_sub(asked));
                 }
@@ -260,6 +261,7 @@ impl Sender {
             }
             KeyMessage::Failed { key_id, reason } => {
                 if self.announced.remove(key_id).is_some() {
+                    self.calls.key_refused(now);
                     self.failed(format!("peer could not fetch key_ID {key_id}: {reason}"));
                 }
                 Ok(())
@@ -370,6 +372,7 @@ impl Sender {
             self.announced.iter().filter(|(_, a)| late(a)).map(|(id, _)| id.clone()).collect();
         for key_id in late {
             self.announced.remove(&key_id);
+            self.calls.key_refused(now);
             self.failed(format!("peer did not answer ANNOUNCE of key_ID {key_id}"));
             let (used, reliable) = Default::default();
             self.tell(KeyMessage::Retire { key_id, used, reliable });

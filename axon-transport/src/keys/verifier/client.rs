@@ -53,7 +53,8 @@ pub enum ProofState {
 #[non_exhaustive]
 pub enum ProofFailure {
     /// Our KME gave no key for it.
-    #[error("no key to prove SAE {sae:?} with: enc_keys: {failure}")]
+    // The client is told this before its name is proven, so it holds nothing of what the KME said.
+    #[error("no key to prove SAE {sae:?} with: enc_keys: {}", failure.kind.told())]
     NoKey {
         /// The client.
         sae: String,

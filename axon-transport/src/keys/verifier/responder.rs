@@ -60,7 +60,10 @@ impl ProofResponder {
                     let proof = proof::compute(&key, &key_id, &self.ready);
                     (KeyMessage::Ready { key_id, proof }, Ok(()))
                 }
-                Err(reason) => (KeyMessage::Failed { key_id, reason: reason.clone() }, Err(reason)),
+                Err(failure) => {
+                    let reason = failure.kind.told().to_owned();
+                    (KeyMessage::Failed { key_id, reason }, Err(failure.text))
+                }
             };
             self.outbox = Some(message);
             self.answered = Some(answered);

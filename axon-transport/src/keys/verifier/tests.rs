@@ -106,6 +106,7 @@ fn enc_keys_is_repeated_only_where_no_key_can_be_lost() {
         }
         assert_eq!(made, calls, "{kind:?}");
         let ProofState::Failed(failure) = proof.state() else { panic!() };
+        assert!(failure.to_string().ends_with(kind.told()), "the KME's words stay here: {failure}");
         assert_eq!(failure.code(), 0x23);
     }
 }
@@ -134,8 +135,13 @@ fn a_client_without_the_key_says_so() {
     let mut client = ProofResponder::new("sae-b", &exporters());
     client.on_message(NOW, &KeyMessage::Announce(vec![id("k1")])).unwrap();
     let request = client.poll_request(NOW).unwrap();
-    client.on_answer(NOW, failed(request, FailureKind::Refused));
-    server.on_message(NOW, &client.poll_message().unwrap());
+    let outcome =
+        Err(Failure { kind: FailureKind::Refused, text: "kme.lan:8443 says 400".to_owned() });
+    client.on_answer(NOW, Answer { request, took: Duration::ZERO, outcome });
+    assert_eq!(client.answered(), Some(Err("kme.lan:8443 says 400".to_owned())), "for the log");
+    let message = client.poll_message().unwrap();
+    assert!(!format!("{message:?}").contains("kme.lan"), "not for the peer: {message:?}");
+    server.on_message(NOW, &message);
     let ProofState::Failed(failure) = server.state() else { panic!() };
     assert!(matches!(failure, ProofFailure::ClientHasNoKey { .. }), "{failure}");
 }

@@ -84,10 +84,15 @@ fn a_key_that_arrives_after_it_was_spent_is_not_kept() {
 }
 
 #[test]
-fn unknown_keys_are_not_asked_for_again_for_thirty_seconds() {
+fn a_key_unknown_twice_is_not_asked_for_again_for_thirty_seconds() {
     let (acceptor, clock) = new(listed(&["sae-a"]));
     let bytes = identity("sae-a", "k1");
     look_up(&acceptor, "10.0.0.1", &bytes);
+    acceptor.on_answer(failed(acceptor.poll_request().unwrap(), FailureKind::Refused));
+    assert_eq!(look_up(&acceptor, "10.0.0.1", &bytes), Lookup::UnknownKeyId);
+    assert!(acceptor.poll_request().is_none());
+    clock.advance(s(1));
+    assert_eq!(look_up(&acceptor, "10.0.0.1", &bytes), Lookup::Fetching, "relayed late");
     acceptor.on_answer(failed(acceptor.poll_request().unwrap(), FailureKind::Refused));
     clock.advance(s(29));
     assert_eq!(look_up(&acceptor, "10.0.0.1", &bytes), Lookup::UnknownKeyId);
@@ -150,6 +155,21 @@ fn an_address_that_authenticated_before_gets_through_a_flood() {
     let stranger = look_up(&acceptor, "10.8.8.8", &identity("sae-a", "k"));
     assert!(matches!(stranger, Lookup::Limited(_)));
     assert_eq!(look_up(&acceptor, "10.9.9.9", &identity("sae-c", "k")), Lookup::Fetching);
+}
+
+#[test]
+fn strangers_do_not_empty_the_bucket_of_an_address_that_authenticated() {
+    let (acceptor, _) = new(listed(&["sae-a"]));
+    acceptor.authenticated(ip("10.9.9.9"), "sae-a");
+    for i in 0..100 {
+        acceptor.prefetch(ip("10.0.0.1"), &identity("sae-a", &format!("made-up-{i}")));
+        while let Some(request) = acceptor.poll_request() {
+            acceptor.on_answer(failed(request, FailureKind::Refused));
+        }
+    }
+    let stranger = look_up(&acceptor, "10.0.0.2", &identity("sae-a", "k"));
+    assert!(matches!(stranger, Lookup::Limited(_)));
+    assert_eq!(look_up(&acceptor, "10.9.9.9", &identity("sae-a", "k")), Lookup::Fetching);
 }
 
 #[tokio::test]

@@ -111,8 +111,9 @@ impl Pair {
         self.conn += 1;
         let owed = self.sender.attach(self.now, self.conn, &exporters(self.conn)).unwrap();
         self.receiver.attach(self.now, self.conn, &exporters(self.conn)).unwrap();
-        for message in owed {
-            self.receiver.on_message(self.now, self.conn - 1, &message).unwrap();
+        for (conn, message) in owed {
+            assert_eq!(conn, self.conn - 1, "owed where it was announced");
+            self.receiver.on_message(self.now, conn, &message).unwrap();
             self.log.push(message);
         }
     }

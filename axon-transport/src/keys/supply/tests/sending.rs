@@ -154,8 +154,33 @@ fn a_restarted_receiver_costs_the_keys_and_no_more() {
     pair.connect();
     pair.run();
     assert_eq!(pair.failures(), 4, "the KME gave them to the receiver before");
+    pair.now += ms(200);
+    pair.run();
     let envelope = pair.seal(Delivery::Reliable).unwrap();
     pair.open(envelope).unwrap();
+}
+
+#[test]
+fn a_peer_that_refuses_every_key_burns_few() {
+    let mut pair = Pair::new();
+    for _ in 0..6_000 {
+        while let Some(request) = pair.sender.poll_request(pair.now) {
+            let answer = pair.kmes.answer(request);
+            pair.sender.on_answer(pair.now, answer);
+        }
+        while let Some((conn, message)) = pair.sender.poll_message(pair.now) {
+            let KeyMessage::Announce(key_ids) = message else { continue };
+            for key_id in key_ids {
+                let failed = KeyMessage::Failed { key_id, reason: String::new() };
+                pair.sender.on_message(pair.now, conn, &failed).unwrap();
+            }
+        }
+        pair.now += ms(10);
+    }
+    assert!(pair.kmes.issued <= 40, "{} keys in a minute", pair.kmes.issued);
+    pair.now += Duration::from_secs(30);
+    pair.run();
+    assert!(pair.seal(Delivery::Reliable).is_ok(), "well again");
 }
 
 #[test]
