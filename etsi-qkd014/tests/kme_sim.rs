@@ -66,7 +66,10 @@ async fn the_environment_it_prints_serves_a_client() {
     let printed = String::from_utf8(output.stdout).unwrap();
 
     let mut run = kme_sim();
-    run.arg("run").arg(&certs).args(["--rate", "0", "--stored", "1"]).stdout(Stdio::piped());
+    run.arg("run")
+        .arg(&certs)
+        .args(["--rate", "0", "--stored", "1", "--fault", "kme-a:reset,times=1,on=enc_keys"])
+        .stdout(Stdio::piped());
     let mut run = Killed(run.spawn().unwrap());
     let mut lines = BufReader::new(run.0.stdout.take().unwrap()).lines();
     for kme in ["kme-a https://", "kme-b https://"] {
@@ -94,6 +97,9 @@ async fn the_environment_it_prints_serves_a_client() {
             .unwrap()
     };
     let (master, slave) = (client(env("sae-a")), client(env("sae-b")));
+    master.status("sae-b").await.unwrap();
+    let error = master.enc_keys("nobody").send().await.err().expect("the fault");
+    assert!(error.keys_may_be_consumed(), "{error}");
     let key = master.enc_keys("sae-b").send().await.unwrap().into_single();
     let same = slave.dec_keys("sae-a").key_id(key.key_id()).send().await.unwrap().into_single();
     assert!(key == same);

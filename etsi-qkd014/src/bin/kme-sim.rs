@@ -17,8 +17,9 @@ kme-sim init DIR [--kme ID=ADDRESS:PORT=SAE[,SAE...]]...
     kme-b=127.0.0.2:8443=sae-b.
 
 kme-sim run DIR [--rate KEYS_PER_SECOND] [--max-stored KEYS] [--stored KEYS] [--key-size BITS]
-                [--max-per-request KEYS] [--latency MILLISECONDS]
-    Serves the KMEs of DIR until it is interrupted.
+                [--max-per-request KEYS] [--latency MILLISECONDS] [--fault KME:PLAN]...
+    Serves the KMEs of DIR until it is interrupted. A PLAN is a fault and when it
+    happens: cut, latency=250, status=500,probability=0.1 or reset,times=2,on=dec_keys.
 
 Exit status: 0, 1 on failure, 2 on wrong arguments.
 ";
@@ -120,14 +121,18 @@ fn run(dir: &Path, args: &[&str]) -> Outcome {
     let layout: Layout =
         serde_json::from_str(&text).map_err(|e| other(format!("{}: {e}", file.display())))?;
     let pki = Pki::load(dir, &layout).map_err(other)?;
-    let (builder, latency) = settings(Network::builder().layout(layout, pki), args)?;
+    let (builder, plans) = settings(Network::builder().layout(layout, pki), args)?;
     let runtime = tokio::runtime::Runtime::new().map_err(other)?;
     runtime.block_on(async {
         let network = builder.start().await.map_err(other)?;
+        if let Some(id) =
+            plans.iter().filter_map(|(id, _)| id.as_ref()).find(|id| network.kme(id).is_none())
+        {
+            return Err(Failure::Usage(format!("--fault: there is no KME {id:?}")));
+        }
         for kme in network.kmes() {
-            if let Some(latency) = latency {
-                kme.plan(FaultPlan::new(Fault::Latency(latency)));
-            }
+            let its = plans.iter().filter(|(id, _)| id.as_ref().is_none_or(|id| id == kme.id()));
+            its.for_each(|(_, plan)| kme.plan(plan.clone()));
             say(&format!("{} {}\n", kme.id(), kme.url()));
         }
         tokio::signal::ctrl_c().await.map_err(other)?;
@@ -138,11 +143,11 @@ fn run(dir: &Path, args: &[&str]) -> Outcome {
     })
 }
 
-fn settings(
-    mut builder: NetworkBuilder,
-    args: &[&str],
-) -> Outcome<(NetworkBuilder, Option<Duration>)> {
-    let mut latency = None;
+/// Faults from the start, of one KME or of all.
+type Plans = Vec<(Option<String>, FaultPlan)>;
+
+fn settings(mut builder: NetworkBuilder, args: &[&str]) -> Outcome<(NetworkBuilder, Plans)> {
+    let mut plans = Vec::new();
     for (option, value) in options(args)? {
         builder = match option {
             "--rate" => {
@@ -157,13 +162,22 @@ fn settings(
             "--key-size" => builder.key_size(number(option, value)?),
             "--max-per-request" => builder.max_keys_per_request(number(option, value)?),
             "--latency" => {
-                latency = Some(Duration::from_millis(number(option, value)?));
+                let fault = Fault::Latency(Duration::from_millis(number(option, value)?));
+                plans.push((None, FaultPlan::new(fault)));
+                builder
+            }
+            "--fault" => {
+                let (id, plan) = value
+                    .split_once(':')
+                    .ok_or_else(|| Failure::Usage(format!("--fault {value:?} is not KME:PLAN")))?;
+                let plan = plan.parse().map_err(|why| Failure::Usage(format!("--fault: {why}")))?;
+                plans.push((Some(id.to_owned()), plan));
                 builder
             }
             _ => return Err(Failure::Usage(format!("run does not know {option}"))),
         };
     }
-    Ok((builder, latency))
+    Ok((builder, plans))
 }
 
 fn number<T: std::str::FromStr>(option: &str, value: &str) -> Outcome<T> {
