@@ -1,4 +1,4 @@
-//! What is on the wire: the ClientHello of every mode, taken from the packets and parsed here.
+//! What is on the wire: the hellos of every mode, taken from records and packets and parsed here.
 #![cfg(feature = "quic")]
 
 mod common;
@@ -12,7 +12,7 @@ use aws_lc_rs::hkdf::{HKDF_SHA256, KeyType, Prk, Salt};
 use axon_tls::identity::{Auth, SigningKey};
 use axon_tls::quic::{ALPN, hybrid_client, qkd_client};
 use axon_tls::{Cipher, PskKex, hybrid, qkd};
-use common::psk;
+use common::{OneKey, psk};
 
 const SUPPORTED_GROUPS: u16 = 10;
 const SIGNATURE_ALGORITHMS: u16 = 13;
@@ -75,6 +75,75 @@ fn hybrid_mode() {
             assert_eq!(hello.extensions[&SERVER_CERTIFICATE_TYPE], [1, 2]);
         }
     }
+}
+
+/// What the server answers to each mode over TCP.
+#[test]
+fn server_hellos() {
+    let auth = Auth::None(SigningKey::generate().unwrap());
+    for cipher in Cipher::ALL {
+        for kex in PskKex::ALL {
+            let client = qkd::client_config(psk(1, cipher), kex, ALPN).unwrap();
+            let server =
+                qkd::server_config(OneKey::new(psk(1, cipher)), cipher, kex, ALPN).unwrap();
+            let mut client =
+                rustls_axon::ClientConnection::new(Arc::new(client), "axon".try_into().unwrap())
+                    .unwrap();
+            let mut server = rustls_axon::ServerConnection::new(Arc::new(server)).unwrap();
+            let (mut hello, mut answer) = (Vec::new(), Vec::new());
+            client.write_tls(&mut hello).unwrap();
+            server.read_tls(&mut &hello[..]).unwrap();
+            server.process_new_packets().unwrap();
+            server.write_tls(&mut answer).unwrap();
+            is_server_hello(&answer, cipher, Some(kex));
+        }
+
+        let client = hybrid::client_config(&auth, cipher, ALPN).unwrap();
+        let server = hybrid::server_config(&auth, cipher, ALPN).unwrap();
+        let mut client =
+            rustls::ClientConnection::new(Arc::new(client), "axon".try_into().unwrap()).unwrap();
+        let mut server = rustls::ServerConnection::new(Arc::new(server)).unwrap();
+        let (mut hello, mut answer) = (Vec::new(), Vec::new());
+        client.write_tls(&mut hello).unwrap();
+        server.read_tls(&mut &hello[..]).unwrap();
+        server.process_new_packets().unwrap();
+        server.write_tls(&mut answer).unwrap();
+        is_server_hello(&answer, cipher, None);
+    }
+}
+
+/// Exactly the extensions of the mode, and not a HelloRetryRequest, whose random is a fixed one.
+fn is_server_hello(record: &[u8], cipher: Cipher, kex: Option<PskKex>) {
+    let mut record = Reader(record);
+    assert_eq!(record.take(3), [22, 3, 3]);
+    let mut message = Reader(record.vector(2));
+    assert_eq!(message.take(1), [2], "a ServerHello");
+    let mut hello = Reader(message.vector(3));
+    assert!(message.0.is_empty());
+    assert_eq!(hello.take(2), [3, 3]);
+    assert_ne!(hello.take(32)[..4], [0xcf, 0x21, 0xad, 0x74], "a HelloRetryRequest");
+    hello.vector(1);
+    assert_eq!(hello.take(2), [0x13, if cipher == Cipher::Aes256Gcm { 2 } else { 3 }]);
+    assert_eq!(hello.take(1), [0]);
+    let mut list = Reader(hello.vector(2));
+    assert!(hello.0.is_empty());
+
+    let mut extensions = BTreeMap::new();
+    while !list.0.is_empty() {
+        let kind = list.number(2) as u16;
+        assert!(extensions.insert(kind, list.vector(2).to_vec()).is_none());
+    }
+    assert_eq!(extensions.remove(&SUPPORTED_VERSIONS).unwrap(), [3, 4]);
+    if kex.is_some() {
+        assert_eq!(extensions.remove(&PRE_SHARED_KEY).unwrap(), [0, 0], "the first identity");
+    }
+    if kex != Some(PskKex::PskKe) {
+        let share = extensions.remove(&KEY_SHARE).unwrap();
+        // 1,088 bytes of ML-KEM-768 and 32 of X25519
+        assert_eq!(share[..4], [0x11, 0xec, 0x04, 0x60]);
+        assert_eq!(share.len(), 4 + 1_120);
+    }
+    assert!(extensions.is_empty(), "and nothing else: {extensions:?}");
 }
 
 /// The ClientHello over TCP and the one over QUIC.
@@ -170,7 +239,7 @@ impl ClientHello {
 
     #[track_caller]
     fn has_one_group(&self) {
-        assert_eq!(self.extensions[&SUPPORTED_GROUPS][2..], X25519MLKEM768);
+        assert_eq!(self.extensions[&SUPPORTED_GROUPS], [0, 2, 0x11, 0xec]);
         let mut shares = Reader(&self.extensions[&KEY_SHARE]);
         let mut shares = Reader(shares.vector(2));
         assert_eq!(shares.take(2), X25519MLKEM768);

@@ -1,0 +1,16 @@
+//! The checked-in vectors are what the independent script makes.
+
+use std::process::Command;
+
+#[test]
+fn psk_vectors_are_what_the_script_makes() {
+    let directory = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("vectors");
+    std::fs::create_dir_all(&directory).unwrap();
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/vectors/make.py");
+    match Command::new("python3").arg(script).current_dir(&directory).status() {
+        Ok(status) => assert!(status.success(), "{status}"),
+        Err(err) => return eprintln!("skipped: no python3 ({err})"),
+    }
+    let made = std::fs::read_to_string(directory.join("psk.json")).unwrap();
+    assert!(made == include_str!("vectors/psk.json"), "make.py makes another psk.json");
+}
