@@ -1,11 +1,13 @@
-//! What the TLS layer reads: the identity a client offers, and the operator's pins.
+//! What the TLS layer reads: hellos, the identity a client offers, and the operator's pins.
 
-use std::time::SystemTime;
+use std::{sync::Arc, time::SystemTime};
 
 use axon_tls::{
+    Cipher, PskKex,
     identity::{SpkiDigest, TrustFile},
-    qkd::PskIdentity,
+    qkd::{self, Psk, PskIdentity, PskResolver},
 };
+use rustls_axon::{ClientConnection, ServerConnection};
 
 /// What parses is the one spelling of its two names; and any two names that make an identity come
 /// back from it.
@@ -44,6 +46,95 @@ pub fn trust_file(data: &[u8]) -> bool {
     }
     assert_eq!(file.is_empty(), pins == 0);
     true
+}
+
+fn psk(cipher: Cipher) -> Arc<Psk> {
+    Arc::new(qkd::derive_psk(&[7; 32], "key", "sae-a", "sae-b", cipher).unwrap())
+}
+
+#[derive(Debug)]
+struct OneKey(Cipher);
+
+impl PskResolver for OneKey {
+    fn resolve(&self, identity: &[u8]) -> Option<Arc<Psk>> {
+        Some(psk(self.0)).filter(|psk| psk.identity() == identity)
+    }
+}
+
+/// A byte chooses between the four configurations.
+fn mode(byte: u8) -> (Cipher, PskKex) {
+    (Cipher::ALL[usize::from(byte & 1)], PskKex::ALL[usize::from(byte >> 1 & 1)])
+}
+
+fn client(byte: u8) -> (ClientConnection, Vec<u8>) {
+    let (cipher, kex) = mode(byte);
+    let config = qkd::client_config(psk(cipher), kex, b"fuzz").unwrap();
+    let mut conn = ClientConnection::new(Arc::new(config), "peer".try_into().unwrap()).unwrap();
+    let mut hello = Vec::new();
+    conn.write_tls(&mut hello).unwrap();
+    (conn, hello)
+}
+
+fn server(byte: u8) -> ServerConnection {
+    let (cipher, kex) = mode(byte);
+    let config = qkd::server_config(Arc::new(OneKey(cipher)), cipher, kex, b"fuzz").unwrap();
+    ServerConnection::new(Arc::new(config)).unwrap()
+}
+
+/// After a first flight a server has agreed on nothing, and what it refuses it does not answer but
+/// with an alert.
+pub fn client_hello(data: &[u8]) -> bool {
+    let Some((&byte, records)) = data.split_first() else { return false };
+    let mut conn = server(byte);
+    let Ok(read) = conn.read_tls(&mut &records[..]) else { return false };
+    let processed = conn.process_new_packets();
+    assert!(qkd::negotiated(&conn).is_none(), "agreed on without a Finished");
+    assert!(conn.is_handshaking());
+    let mut answer = Vec::new();
+    while conn.wants_write() {
+        conn.write_tls(&mut answer).unwrap();
+    }
+    let said_hello = answer.first() == Some(&22);
+    assert!(processed.is_ok() || !said_hello, "an answer to what was refused");
+    read != 0 && said_hello
+}
+
+/// A client takes a ServerHello in plaintext and is then still not finished. Every connection has
+/// another session ID, which the server has to echo: it is put in, so that inputs get past it.
+pub fn server_hello(data: &[u8]) -> bool {
+    const SESSION_ID: std::ops::Range<usize> = 44..76;
+    let Some((&byte, record)) = data.split_first() else { return false };
+    let (mut conn, hello) = client(byte);
+    let mut record = record.to_vec();
+    if let Some(echoed) = record.get_mut(SESSION_ID) {
+        echoed.copy_from_slice(&hello[SESSION_ID]);
+    }
+    let Ok(read) = conn.read_tls(&mut &record[..]) else { return false };
+    let processed = conn.process_new_packets().is_ok();
+    assert!(qkd::negotiated(&conn).is_none(), "agreed on without a Finished");
+    assert!(conn.is_handshaking());
+    read != 0 && processed
+}
+
+/// A ClientHello of each configuration.
+pub fn client_hello_seeds() -> Vec<Vec<u8>> {
+    (0..4).map(|byte| [vec![byte], client(byte).1].concat()).collect()
+}
+
+/// The ServerHello to each of them, in its record.
+pub fn server_hello_seeds() -> Vec<Vec<u8>> {
+    (0..4)
+        .map(|byte| {
+            let mut conn = server(byte);
+            conn.read_tls(&mut &client(byte).1[..]).unwrap();
+            conn.process_new_packets().unwrap();
+            let mut answer = vec![byte];
+            conn.write_tls(&mut answer).unwrap();
+            let len = usize::from(u16::from_be_bytes([answer[4], answer[5]]));
+            answer.truncate(1 + 5 + len);
+            answer
+        })
+        .collect()
 }
 
 /// Plain names, and names that are percent-encoded.
