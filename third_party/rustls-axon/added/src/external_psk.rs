@@ -23,7 +23,8 @@
 //! [`PskKeyExchangeMode::PskDheKe`].
 //!
 //! A PSK must be known to exactly one client and one server, and never be used with the roles
-//! swapped (the Selfie attack, [RFC 9257 section 4.1]): derive it from inputs that name both ends.
+//! swapped (the Selfie attack, [RFC 9257 section 4.1]): derive it from inputs that name both ends,
+//! or import it with a context that does ([`ImportedPsk`]).
 //! It must have at least 128 bits of entropy: a password is open to an offline dictionary attack.
 //!
 //! The identity is sent in the clear.  Looking one up must have no side effect: anybody can send
@@ -55,6 +56,9 @@ use crate::msgs::handshake::PresharedKeyIdentity;
 use crate::sync::Arc;
 use crate::tls13::Tls13CipherSuite;
 
+mod imported;
+pub use imported::{ImportedIdentity, ImportedPsk};
+
 /// An external pre-shared key: an identity that is sent, a secret that is not, and the one hash
 /// function that the secret is used with.
 ///
@@ -64,6 +68,7 @@ pub struct ExternalPsk {
     identity: Vec<u8>,
     secret: Zeroizing<Vec<u8>>,
     hash: HashAlgorithm,
+    imported: bool,
 }
 
 impl ExternalPsk {
@@ -107,6 +112,7 @@ impl ExternalPsk {
             identity,
             secret,
             hash,
+            imported: false,
         })
     }
 
@@ -122,6 +128,11 @@ impl ExternalPsk {
 
     pub(crate) fn secret(&self) -> &[u8] {
         &self.secret
+    }
+
+    /// Whether this PSK was imported (see [`ImportedPsk`]), which gives it another binder.
+    pub fn is_imported(&self) -> bool {
+        self.imported
     }
 
     /// Whether this PSK and `suite` go together.

@@ -64,6 +64,18 @@ impl OfferedExternalPsks {
             ));
         }
 
+        // The server names a PSK by its identity: twice the same would leave open which is meant.
+        let twice = |(at, psk): (usize, &Arc<ExternalPsk>)| {
+            psks[..at]
+                .iter()
+                .any(|before| before.identity() == psk.identity())
+        };
+        if psks.iter().enumerate().any(twice) {
+            return Err(Error::General(
+                "external PSK: the same identity twice in one offer".into(),
+            ));
+        }
+
         let encoded_len = psks
             .iter()
             .map(|psk| psk.offered_identity_len())
@@ -172,7 +184,7 @@ impl OfferedExternalPsks {
             let suite = suite_for(config, psk.hash(), protocol).expect("checked in new()");
             let hash = transcript.hash_given(suite.common.hash_provider, &truncated_hello);
             let tag = KeyScheduleEarly::new(suite, psk.secret())
-                .external_psk_binder_key_and_sign_verify_data(&hash);
+                .external_psk_binder_key_and_sign_verify_data(psk.is_imported(), &hash);
             *binder = PresharedKeyBinder::from(tag.as_ref().to_vec());
         }
     }

@@ -360,7 +360,10 @@ fn binder_is_correct(
         .saturating_sub(parsed.total_binder_length())];
 
     let expected = KeyScheduleEarly::new(suite, psk.secret())
-        .external_psk_binder_key_and_sign_verify_data(&transcript.hash_given(truncated_hello));
+        .external_psk_binder_key_and_sign_verify_data(
+            psk.is_imported(),
+            &transcript.hash_given(truncated_hello),
+        );
     ConstantTimeEq::ct_eq(expected.as_ref(), binder).into()
 }
 
