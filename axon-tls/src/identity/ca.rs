@@ -2,25 +2,29 @@
 
 use std::sync::Arc;
 
-use rustls::client::WebPkiServerVerifier;
 use rustls::crypto::aws_lc_rs::default_provider;
 use rustls::pki_types::pem::PemObject;
-use rustls::pki_types::{CertificateDer, CertificateRevocationListDer, PrivatePkcs8KeyDer};
-use rustls::server::WebPkiClientVerifier;
+use rustls::pki_types::{CertificateDer, CertificateRevocationListDer, PrivateKeyDer};
 use rustls::sign::{CertifiedKey, SingleCertAndKey};
 use rustls::{ClientConfig, ConfigBuilder, RootCertStore, ServerConfig, WantsVerifier};
+use webpki::{CertRevocationList, OwnedCertRevocationList};
 
+use super::roots::{self, FromRoots};
+use super::verifier::Verifier;
+use super::{pem, signing_key};
 use crate::Error;
 
 /// Roots, our certificate and its key, and the certificates that were revoked.
 ///
-/// A client checks the server's name too, against the one it connects with. A server checks that
-/// the client's certificate is from the roots: which client it is, is for the application to check.
-/// With a revocation list, one for every issuer in the peer's chain is required.
+/// Each end checks that the other's certificate comes from the roots, is in date, is for the role of
+/// a client or a server if it is limited to one, and was not revoked. With a revocation list, every
+/// issuer in the peer's chain needs one that is in date. The name that a client connects with plays
+/// no part: what the peer calls itself is for the application to check, on both ends, with
+/// [`CaMaterial::is_for_host()`].
 pub struct CaMaterial {
     roots: Arc<RootCertStore>,
     ours: Arc<CertifiedKey>,
-    crls: Vec<CertificateRevocationListDer<'static>>,
+    crls: Arc<Vec<CertRevocationList<'static>>>,
 }
 
 impl CaMaterial {
@@ -47,10 +51,10 @@ impl CaMaterial {
         if chain.is_empty() {
             return Err(unusable("our certificate", "no PEM section `CERTIFICATE`"));
         }
-        let key = PrivatePkcs8KeyDer::from_pem_slice(key.as_bytes())
-            .map_err(|_| Error::PrivateKey("no PEM section `PRIVATE KEY` (PKCS#8)"))?;
-        let ours = CertifiedKey::from_der(chain, key.into(), &default_provider())
-            .map_err(|err| unusable("our certificate and key", err))?;
+        let key = pem::private_key(key)?;
+        let key = signing_key(&PrivateKeyDer::Pkcs8(key.as_slice().into()))?;
+        let ours = CertifiedKey::new(chain, key);
+        ours.keys_match().map_err(|err| unusable("our certificate and key", err))?;
 
         let crls = match crls {
             None => Vec::new(),
@@ -61,42 +65,51 @@ impl CaMaterial {
                 if crls.is_empty() {
                     return Err(unusable("revocation lists", "no PEM section `X509 CRL`"));
                 }
-                crls
+                crls.iter()
+                    .map(|crl| OwnedCertRevocationList::from_der(crl).map(Into::into))
+                    .collect::<Result<Vec<_>, _>>()
+                    .map_err(|err| unusable("revocation lists", err))?
             }
         };
-        Ok(Self { roots: Arc::new(store), ours: Arc::new(ours), crls })
+        Ok(Self { roots: Arc::new(store), ours: Arc::new(ours), crls: Arc::new(crls) })
+    }
+
+    /// Whether a peer that showed `certificate` may call itself `host`: one of the certificate's
+    /// DNS names is exactly that. A wildcard is not.
+    pub fn is_for_host(certificate: &CertificateDer<'_>, host: &str) -> bool {
+        roots::is_for_host(certificate, host)
+    }
+
+    /// The hosts that our own certificate is for: its DNS names without wildcards.
+    pub fn our_hosts(&self) -> Vec<String> {
+        roots::host_names(&self.ours.cert[0])
     }
 
     pub(super) fn client(
         &self,
         builder: ConfigBuilder<ClientConfig, WantsVerifier>,
-    ) -> Result<ClientConfig, Error> {
-        let verifier = WebPkiServerVerifier::builder_with_provider(
-            Arc::clone(&self.roots),
-            Arc::clone(builder.crypto_provider()),
-        )
-        .with_crls(self.crls.iter().cloned())
-        .build()
-        .map_err(|err| unusable("roots and revocation lists", err))?;
-        Ok(builder
-            .with_webpki_verifier(verifier)
-            .with_client_cert_resolver(Arc::new(SingleCertAndKey::from(Arc::clone(&self.ours)))))
+    ) -> ClientConfig {
+        builder
+            .dangerous()
+            .with_custom_certificate_verifier(Arc::new(self.verifier()))
+            .with_client_cert_resolver(Arc::new(SingleCertAndKey::from(Arc::clone(&self.ours))))
     }
 
     pub(super) fn server(
         &self,
         builder: ConfigBuilder<ServerConfig, WantsVerifier>,
-    ) -> Result<ServerConfig, Error> {
-        let verifier = WebPkiClientVerifier::builder_with_provider(
-            Arc::clone(&self.roots),
-            Arc::clone(builder.crypto_provider()),
-        )
-        .with_crls(self.crls.iter().cloned())
-        .build()
-        .map_err(|err| unusable("roots and revocation lists", err))?;
-        Ok(builder
-            .with_client_cert_verifier(verifier)
-            .with_cert_resolver(Arc::new(SingleCertAndKey::from(Arc::clone(&self.ours)))))
+    ) -> ServerConfig {
+        builder
+            .with_client_cert_verifier(Arc::new(self.verifier()))
+            .with_cert_resolver(Arc::new(SingleCertAndKey::from(Arc::clone(&self.ours))))
+    }
+
+    fn verifier(&self) -> Verifier<FromRoots> {
+        Verifier(FromRoots {
+            roots: Arc::clone(&self.roots),
+            crls: Arc::clone(&self.crls),
+            algorithms: default_provider().signature_verification_algorithms,
+        })
     }
 }
 

@@ -6,14 +6,13 @@ use aws_lc_rs::signature::{ML_DSA_65_SIGNING, PqdsaKeyPair};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use rustls::client::AlwaysResolvesClientRawPublicKeys;
-use rustls::crypto::aws_lc_rs::default_provider;
-use rustls::pki_types::pem::PemObject;
+use rustls::crypto::aws_lc_rs::sign::any_supported_type;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer, PrivatePkcs8KeyDer};
 use rustls::server::AlwaysResolvesServerRawPublicKeys;
 use rustls::sign::CertifiedKey;
 use zeroize::Zeroizing;
 
-use super::SpkiDigest;
+use super::{SpkiDigest, pem};
 use crate::Error;
 
 /// A private key that signs handshakes, shown to the peer as a raw public key.
@@ -49,16 +48,12 @@ impl SigningKey {
 
     /// Reads a PKCS#8 key in DER.
     pub fn from_pkcs8(der: &[u8]) -> Result<Self, Error> {
-        Self::load(PrivateKeyDer::Pkcs8(PrivatePkcs8KeyDer::from(der)))
+        Self::load(&PrivateKeyDer::Pkcs8(PrivatePkcs8KeyDer::from(der)))
     }
 
     /// Reads a PKCS#8 key in PEM: the first `PRIVATE KEY` in `text`.
     pub fn from_pem(text: &str) -> Result<Self, Error> {
-        let mut der = PrivatePkcs8KeyDer::from_pem_slice(text.as_bytes())
-            .map_err(|_| Error::PrivateKey("no PEM section `PRIVATE KEY` (PKCS#8)"))?;
-        let loaded = Self::from_pkcs8(der.secret_pkcs8_der());
-        zeroize::Zeroize::zeroize(&mut der);
-        loaded
+        Self::from_pkcs8(&pem::private_key(text)?)
     }
 
     /// The digest by which a peer pins this key.
@@ -66,12 +61,8 @@ impl SigningKey {
         SpkiDigest::of(&self.certified.cert[0])
     }
 
-    fn load(der: PrivateKeyDer<'_>) -> Result<Self, Error> {
-        // rustls asks for a key that it may keep, and copies it into the provider's own form
-        let key = default_provider()
-            .key_provider
-            .load_private_key(der.clone_key())
-            .map_err(|_| Error::PrivateKey("not a PKCS#8 key that can sign a TLS 1.3 handshake"))?;
+    fn load(der: &PrivateKeyDer<'_>) -> Result<Self, Error> {
+        let key = signing_key(der)?;
         let spki = key
             .public_key()
             .ok_or(Error::PrivateKey("the public key cannot be derived from it"))?
@@ -87,6 +78,15 @@ impl SigningKey {
     pub(super) fn server_resolver(&self) -> Arc<AlwaysResolvesServerRawPublicKeys> {
         Arc::new(AlwaysResolvesServerRawPublicKeys::new(Arc::clone(&self.certified)))
     }
+}
+
+/// Parses a key from where it lies: rustls's key provider asks for a copy of its own, which it does
+/// not erase.
+pub(super) fn signing_key(
+    der: &PrivateKeyDer<'_>,
+) -> Result<Arc<dyn rustls::sign::SigningKey>, Error> {
+    any_supported_type(der)
+        .map_err(|_| Error::PrivateKey("not a PKCS#8 key that can sign a TLS 1.3 handshake"))
 }
 
 fn generate_pkcs8() -> Result<Zeroizing<Vec<u8>>, Error> {

@@ -6,9 +6,12 @@
 
 mod ca;
 mod key;
+mod pem;
 mod raw_key;
+mod roots;
 mod spki;
 mod trust;
+mod verifier;
 
 use std::sync::Arc;
 
@@ -18,9 +21,11 @@ use rustls::{ClientConfig, ConfigBuilder, ServerConfig, WantsVerifier};
 
 pub use ca::CaMaterial;
 pub use key::SigningKey;
+use key::signing_key;
 use raw_key::RawKeys;
 pub use spki::SpkiDigest;
 pub use trust::{Trust, TrustFile, TrustFileError};
+use verifier::Verifier;
 
 use crate::Error;
 
@@ -60,12 +65,12 @@ impl Auth {
         let (key, trust) = match self {
             Self::None(key) => (key, None),
             Self::Pinned { key, trust } => (key, Some(trust.clone())),
-            Self::Ca(material) => return material.client(builder),
+            Self::Ca(material) => return Ok(material.client(builder)),
         };
         let ours: Arc<dyn ResolvesClientCert> = key.client_resolver();
         Ok(builder
             .dangerous()
-            .with_custom_certificate_verifier(Arc::new(RawKeys::new(trust)))
+            .with_custom_certificate_verifier(Arc::new(Verifier(RawKeys::new(trust))))
             .with_client_cert_resolver(ours))
     }
 
@@ -76,11 +81,11 @@ impl Auth {
         let (key, trust) = match self {
             Self::None(key) => (key, None),
             Self::Pinned { key, trust } => (key, Some(trust.clone())),
-            Self::Ca(material) => return material.server(builder),
+            Self::Ca(material) => return Ok(material.server(builder)),
         };
         let ours: Arc<dyn ResolvesServerCert> = key.server_resolver();
         Ok(builder
-            .with_client_cert_verifier(Arc::new(RawKeys::new(trust)))
+            .with_client_cert_verifier(Arc::new(Verifier(RawKeys::new(trust))))
             .with_cert_resolver(ours))
     }
 }

@@ -60,8 +60,12 @@ impl Context {
             Security::Classic(classic) => Some(load_identity(classic)?),
             Security::Qkd(_) => None,
         };
+        let mut hello = Hello::new(&config, daemon);
+        if let Security::Classic(classic) = &config.security {
+            hello.host = super::identity::host(auth.as_ref(), classic, &hello.host)?;
+        }
         Ok(Self {
-            hello: Hello::new(&config, daemon),
+            hello,
             transport: transport(&config),
             next_link: AtomicU64::new(1),
             trust_read: Mutex::new(None),

@@ -122,7 +122,8 @@ async fn reach(
             ));
             continue;
         };
-        // No SNI is sent: a peer is known by its key, its SAE or the SAN of its certificate.
+        // Neither sent nor checked: a peer is known by its key, its SAE, or its certificate and
+        // what it calls itself in HELLO.
         let connecting = match endpoint.connect_with(client.clone(), *address, "axon") {
             Ok(connecting) => connecting,
             Err(error) => {

@@ -6,10 +6,12 @@ use std::{net::SocketAddr, sync::Arc, time::Duration};
 use axon_envelope::{KeyId, KmeKey};
 use axon_tls::{
     KeyExchange, Negotiated, PskKex,
+    identity::{Auth, CaMaterial},
     qkd::PskIdentity,
     quic::{ALPN, negotiated},
 };
 use quinn::{Connection, VarInt};
+use rustls_pki_types::CertificateDer;
 
 use super::{
     context::Context,
@@ -159,6 +161,7 @@ async fn run(
         };
         check(&ours, &theirs, psk_sae.as_deref())
             .map_err(|m| Failure::Ours(m.code, m.to_string()))?;
+        is_who_it_says(context, connection, &theirs)?;
         if side == Side::Server {
             writer.send(&Message::Hello(ours.clone())).await?;
         }
@@ -221,6 +224,28 @@ fn agreed(context: &Context, connection: &Connection) -> Result<Negotiated, Fail
         return Err(internal("the handshake agreed on another protocol than axon/1"));
     }
     Ok(negotiated)
+}
+
+/// In `ca` a certificate stands for the hosts that it names: the peer must be one of them.
+fn is_who_it_says(
+    context: &Context,
+    connection: &Connection,
+    theirs: &Hello,
+) -> Result<(), Failure> {
+    if !matches!(context.auth(), Some(Auth::Ca(_))) {
+        return Ok(());
+    }
+    let shown =
+        connection.peer_identity().and_then(|i| i.downcast::<Vec<CertificateDer<'_>>>().ok());
+    if shown.and_then(|s| s.first().map(|c| CaMaterial::is_for_host(c, &theirs.host))) == Some(true)
+    {
+        return Ok(());
+    }
+    let text = format!(
+        "its certificate does not name the host {:?}; give it one with that DNS name (no wildcard)",
+        theirs.host
+    );
+    Err(Failure::Ours(CloseCode::NotAllowed, text))
 }
 
 /// The peer's SAE by the PSK, in qkd. A server spends the PSK here: the client's Finished was

@@ -46,6 +46,35 @@ pub(super) fn trust(path: Option<&Path>) -> Result<TrustFile, GatewayError> {
     })
 }
 
+/// What this host is called in HELLO under `auth`: `node`, its own name; in `ca` a name that its
+/// certificate has, since peers accept no other.
+///
+/// # Errors
+/// The certificate names several hosts, or none, and none of them is `node`.
+pub(super) fn host(
+    auth: Option<&Auth>,
+    classic: &ClassicConfig,
+    node: &str,
+) -> Result<String, GatewayError> {
+    let Some(Auth::Ca(material)) = auth else { return Ok(node.to_owned()) };
+    let names = material.our_hosts();
+    if names.iter().any(|name| name.eq_ignore_ascii_case(node)) {
+        return Ok(node.to_owned());
+    }
+    match &names[..] {
+        [name] => Ok(name.clone()),
+        _ => Err(GatewayError::File {
+            variable: "AXON_CLASSIC_CERT",
+            path: classic.cert.clone().unwrap_or_default(),
+            reason: format!(
+                "it names {}, so it does not say which host this is; it needs the DNS name {node}, \
+                 or one DNS name alone (wildcards do not count)",
+                if names.is_empty() { "no host".to_owned() } else { names.join(", ") }
+            ),
+        }),
+    }
+}
+
 fn ca(classic: &ClassicConfig) -> Result<Auth, GatewayError> {
     let roots = read("AXON_CLASSIC_CA", classic.ca.as_deref())?;
     let chain = read("AXON_CLASSIC_CERT", classic.cert.as_deref())?;

@@ -24,7 +24,7 @@ pub(super) fn authenticated_as(
             let name = trust.name_of(peer).unwrap_or_else(|| "unpinned".into());
             format!("{name} ({peer})")
         }
-        Some(Auth::Ca(_)) => format!("certificate ({peer})"),
+        Some(Auth::Ca(_)) => format!("{} (certificate, {peer})", hello.host),
         _ => format!("UNAUTHENTICATED (key {peer})"),
     }
 }

@@ -1,0 +1,59 @@
+//! A private key out of its PEM text, leaving no copy of it behind.
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use zeroize::Zeroizing;
+
+use crate::Error;
+
+const BEGIN: &str = "-----BEGIN PRIVATE KEY-----";
+const END: &str = "-----END PRIVATE KEY-----";
+
+/// The DER of the first `PRIVATE KEY` (PKCS#8).
+///
+/// Both buffers have their size from the start: one that grows leaves what it held behind.
+pub(super) fn private_key(text: &str) -> Result<Zeroizing<Vec<u8>>, Error> {
+    let section = || {
+        let (_, from) = text.split_once(BEGIN)?;
+        let (body, _) = from.split_once(END)?;
+        Some(body)
+    };
+    let body = section().ok_or(Error::PrivateKey("no PEM section `PRIVATE KEY` (PKCS#8)"))?;
+
+    let mut encoded = Zeroizing::new(Vec::with_capacity(body.len()));
+    encoded.extend(body.bytes().filter(|byte| !byte.is_ascii_whitespace()));
+    let mut der = Zeroizing::new(vec![0; encoded.len() / 4 * 3 + 3]);
+    let len = STANDARD
+        .decode_slice(&*encoded, &mut der)
+        .map_err(|_| Error::PrivateKey("the PEM section `PRIVATE KEY` is not base64"))?;
+    der.truncate(len);
+    Ok(der)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_no_pem_is_refused() {
+        let endless = format!("{BEGIN}\nAAAA\n");
+        let encrypted =
+            "-----BEGIN ENCRYPTED PRIVATE KEY-----\nAAAA\n-----END ENCRYPTED PRIVATE KEY-----";
+        let backwards = format!("{END}\nAAAA\n{BEGIN}");
+        let not_base64 = format!("{BEGIN}\nAA\u{e4}A\0\n{END}");
+        for text in ["", BEGIN, END, &endless, encrypted, &backwards, &not_base64] {
+            assert!(private_key(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn line_ends_do_not_matter() {
+        for text in [
+            format!("comment\r\n{BEGIN}\r\nAQID\r\nBAU=\r\n{END}\r\n"),
+            format!("{BEGIN}\nAQIDBAU=\n{END}"),
+            format!("{BEGIN}AQIDBAU={END}{BEGIN}AAAA{END}"),
+        ] {
+            assert_eq!(**private_key(&text).unwrap(), [1, 2, 3, 4, 5], "{text}");
+        }
+    }
+}

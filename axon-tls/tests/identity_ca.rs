@@ -1,0 +1,187 @@
+//! Certificates: who is accepted, in either direction, and for which host.
+
+use std::sync::Arc;
+
+use axon_tls::identity::{Auth, CaMaterial};
+use axon_tls::{Cipher, hybrid};
+use rcgen::{
+    BasicConstraints, CertificateParams, CertificateRevocationListParams, ExtendedKeyUsagePurpose,
+    IsCa, Issuer, KeyIdMethod, KeyPair, KeyUsagePurpose, RevokedCertParams, SerialNumber,
+    date_time_ymd,
+};
+use rustls::pki_types::CertificateDer;
+use rustls::{ClientConnection, ServerConnection};
+
+/// A CA, as its PEM and what signs with it.
+struct Ca {
+    pem: String,
+    issuer: Issuer<'static, KeyPair>,
+}
+
+/// A certificate with its key.
+struct Host {
+    der: CertificateDer<'static>,
+    cert: String,
+    key: String,
+}
+
+impl Ca {
+    fn new() -> Self {
+        let mut params = CertificateParams::new([]).unwrap();
+        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+        params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
+        let key = KeyPair::generate().unwrap();
+        let pem = params.self_signed(&key).unwrap().pem();
+        Self { pem, issuer: Issuer::new(params, key) }
+    }
+
+    fn host(&self, names: &[&str], usages: &[ExtendedKeyUsagePurpose], serial: u64) -> Host {
+        let names: Vec<_> = names.iter().map(|name| (*name).to_owned()).collect();
+        let mut params = CertificateParams::new(names).unwrap();
+        params.extended_key_usages = usages.to_vec();
+        params.serial_number = Some(SerialNumber::from(serial));
+        let key = KeyPair::generate().unwrap();
+        let cert = params.signed_by(&key, &self.issuer).unwrap();
+        Host { der: cert.der().clone(), cert: cert.pem(), key: key.serialize_pem() }
+    }
+
+    fn crl(&self, revoked: u64, until_year: i32) -> String {
+        CertificateRevocationListParams {
+            this_update: date_time_ymd(2020, 1, 1),
+            next_update: date_time_ymd(until_year, 1, 1),
+            crl_number: SerialNumber::from(1),
+            issuing_distribution_point: None,
+            revoked_certs: vec![RevokedCertParams {
+                serial_number: SerialNumber::from(revoked),
+                revocation_time: date_time_ymd(2020, 1, 1),
+                reason_code: None,
+                invalidity_date: None,
+            }],
+            key_identifier_method: KeyIdMethod::Sha256,
+        }
+        .signed_by(&self.issuer)
+        .unwrap()
+        .pem()
+        .unwrap()
+    }
+
+    fn auth(&self, host: &Host, crl: Option<&str>) -> Auth {
+        Auth::Ca(Arc::new(CaMaterial::from_pem(&self.pem, &host.cert, &host.key, crl).unwrap()))
+    }
+}
+
+/// A handshake in memory, to its end or the first error of either side.
+fn handshake(client: &Auth, server: &Auth) -> Result<(), rustls::Error> {
+    let config = hybrid::client_config(client, Cipher::default(), b"").unwrap();
+    let name = "whatever.example".try_into().unwrap();
+    let mut client = ClientConnection::new(Arc::new(config), name).unwrap();
+    let config = hybrid::server_config(server, Cipher::default(), b"").unwrap();
+    let mut server = ServerConnection::new(Arc::new(config)).unwrap();
+    while client.is_handshaking() || server.is_handshaking() {
+        let mut bytes = Vec::new();
+        while client.wants_write() {
+            client.write_tls(&mut bytes).unwrap();
+        }
+        let mut unread = &bytes[..];
+        while !unread.is_empty() {
+            server.read_tls(&mut unread).unwrap();
+            server.process_new_packets()?;
+        }
+        let mut bytes = Vec::new();
+        while server.wants_write() {
+            server.write_tls(&mut bytes).unwrap();
+        }
+        let mut unread = &bytes[..];
+        while !unread.is_empty() {
+            client.read_tls(&mut unread).unwrap();
+            client.process_new_packets()?;
+        }
+    }
+    Ok(())
+}
+
+/// What both directions say: `peer` as the server, and as the client.
+fn both(us: &Auth, peer: &Auth) -> [Result<(), String>; 2] {
+    [handshake(us, peer), handshake(peer, us)].map(|r| r.map_err(|error| format!("{error:?}")))
+}
+
+fn refused_for(us: &Auth, peer: &Auth, why: &str) {
+    for said in both(us, peer) {
+        let said = said.unwrap_err();
+        assert!(said.contains(why), "{why} expected: {said}");
+    }
+}
+
+#[test]
+fn a_stranger_is_refused_in_both_directions() {
+    let (ca, other) = (Ca::new(), Ca::new());
+    let us = ca.auth(&ca.host(&["a"], &[], 1), None);
+    let stranger = other.host(&["b"], &[], 2);
+    // it trusts our CA, so only we can refuse
+    let peer = Auth::Ca(Arc::new(
+        CaMaterial::from_pem(&ca.pem, &stranger.cert, &stranger.key, None).unwrap(),
+    ));
+    // the two CAs have the same name, so what tells them apart is the signature
+    refused_for(&us, &peer, "BadSignature");
+}
+
+#[test]
+fn a_revoked_certificate_is_refused_in_both_directions() {
+    let ca = Ca::new();
+    let crl = ca.crl(2, 2100);
+    let us = ca.auth(&ca.host(&["a"], &[], 1), Some(&crl));
+    refused_for(&us, &ca.auth(&ca.host(&["b"], &[], 2), None), "Revoked");
+    assert_eq!(both(&us, &ca.auth(&ca.host(&["c"], &[], 3), None)), [Ok(()), Ok(())]);
+}
+
+#[test]
+fn an_old_revocation_list_accepts_nobody() {
+    let ca = Ca::new();
+    let crl = ca.crl(2, 2021);
+    let us = ca.auth(&ca.host(&["a"], &[], 1), Some(&crl));
+    refused_for(&us, &ca.auth(&ca.host(&["c"], &[], 3), None), "ExpiredRevocationList");
+}
+
+#[test]
+fn a_certificate_for_one_role_is_no_good_for_the_other() {
+    let ca = Ca::new();
+    let us = ca.auth(&ca.host(&["a"], &[], 1), None);
+    let client = ca.auth(&ca.host(&["b"], &[ExtendedKeyUsagePurpose::ClientAuth], 2), None);
+    let server = ca.auth(&ca.host(&["b"], &[ExtendedKeyUsagePurpose::ServerAuth], 3), None);
+    assert!(handshake(&us, &client).is_err(), "dialled, it is the server");
+    assert_eq!(handshake(&client, &us), Ok(()));
+    assert!(handshake(&server, &us).is_err(), "dialling, it is the client");
+    assert_eq!(handshake(&us, &server), Ok(()));
+}
+
+#[test]
+fn a_certificate_is_for_the_hosts_that_it_names() {
+    let ca = Ca::new();
+    let host = ca.host(&["arm-2.example", "10.0.0.1"], &[], 1);
+    assert!(CaMaterial::is_for_host(&host.der, "arm-2.example"));
+    assert!(CaMaterial::is_for_host(&host.der, "ARM-2.example"));
+    for other in
+        ["arm-3.example", "arm-2", "example", "", "10.0.0.1", "arm-2.example\0", "*", "x y"]
+    {
+        assert!(!CaMaterial::is_for_host(&host.der, other), "{other:?}");
+    }
+    assert!(!CaMaterial::is_for_host(&CertificateDer::from(vec![0x30, 0]), "arm-2.example"));
+}
+
+#[test]
+fn a_wildcard_is_no_host() {
+    let ca = Ca::new();
+    let host = ca.host(&["*.example"], &[], 1);
+    for name in ["arm-2.example", "*.example"] {
+        assert!(!CaMaterial::is_for_host(&host.der, name), "{name}");
+    }
+    let material = CaMaterial::from_pem(&ca.pem, &host.cert, &host.key, None).unwrap();
+    assert!(material.our_hosts().is_empty());
+}
+
+#[test]
+fn a_key_of_another_certificate_is_refused() {
+    let ca = Ca::new();
+    let (a, b) = (ca.host(&["a"], &[], 1), ca.host(&["b"], &[], 2));
+    assert!(CaMaterial::from_pem(&ca.pem, &a.cert, &b.key, None).is_err());
+}
