@@ -65,8 +65,13 @@ impl Ca {
         .unwrap()
     }
 
+    fn material(&self, host: &Host, crl: Option<&str>) -> CaMaterial {
+        CaMaterial::from_pem(&self.pem, &host.cert, &host.key, crl).unwrap()
+    }
+
+    /// Of a protocol in which both ends say who they are.
     fn auth(&self, host: &Host, crl: Option<&str>) -> Auth {
-        Auth::Ca(Arc::new(CaMaterial::from_pem(&self.pem, &host.cert, &host.key, crl).unwrap()))
+        Auth::Ca(Arc::new(self.material(host, crl).with_names_checked_by_application()))
     }
 }
 
@@ -118,9 +123,7 @@ fn a_stranger_is_refused_in_both_directions() {
     let us = ca.auth(&ca.host(&["a"], &[], 1), None);
     let stranger = other.host(&["b"], &[], 2);
     // it trusts our CA, so only we can refuse
-    let peer = Auth::Ca(Arc::new(
-        CaMaterial::from_pem(&ca.pem, &stranger.cert, &stranger.key, None).unwrap(),
-    ));
+    let peer = ca.auth(&stranger, None);
     // the two CAs have the same name, so what tells them apart is the signature
     refused_for(&us, &peer, "BadSignature");
 }
@@ -140,6 +143,18 @@ fn an_old_revocation_list_accepts_nobody() {
     let crl = ca.crl(2, 2021);
     let us = ca.auth(&ca.host(&["a"], &[], 1), Some(&crl));
     refused_for(&us, &ca.auth(&ca.host(&["c"], &[], 3), None), "ExpiredRevocationList");
+}
+
+#[test]
+fn a_server_of_another_name_is_refused_unless_the_application_checks() {
+    let ca = Ca::new();
+    let (a, b) = (ca.host(&["a"], &[], 1), ca.host(&["b"], &[], 2));
+    let server = ca.auth(&b, None);
+    let error = handshake(&Auth::Ca(Arc::new(ca.material(&a, None))), &server).unwrap_err();
+    assert!(format!("{error:?}").contains("NotValidForName"), "{error:?}");
+    let called = ca.auth(&ca.host(&["whatever.example"], &[], 3), None);
+    assert_eq!(handshake(&Auth::Ca(Arc::new(ca.material(&a, None))), &called), Ok(()));
+    assert_eq!(handshake(&ca.auth(&a, None), &server), Ok(()));
 }
 
 #[test]

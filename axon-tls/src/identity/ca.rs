@@ -18,13 +18,14 @@ use crate::Error;
 ///
 /// Each end checks that the other's certificate comes from the roots, is in date, is for the role of
 /// a client or a server if it is limited to one, and was not revoked. With a revocation list, every
-/// issuer in the peer's chain needs one that is in date. The name that a client connects with plays
-/// no part: what the peer calls itself is for the application to check, on both ends, with
-/// [`CaMaterial::is_for_host()`].
+/// issuer in the peer's chain needs one that is in date. A client checks the server's name too,
+/// against the one it connects with. Which client it is, is for the application of the server to
+/// check, with [`CaMaterial::is_for_host()`].
 pub struct CaMaterial {
     roots: Arc<RootCertStore>,
     ours: Arc<CertifiedKey>,
     crls: Arc<Vec<CertRevocationList<'static>>>,
+    names_checked_later: bool,
 }
 
 impl CaMaterial {
@@ -71,7 +72,23 @@ impl CaMaterial {
                     .map_err(|err| unusable("revocation lists", err))?
             }
         };
-        Ok(Self { roots: Arc::new(store), ours: Arc::new(ours), crls: Arc::new(crls) })
+        Ok(Self {
+            roots: Arc::new(store),
+            ours: Arc::new(ours),
+            crls: Arc::new(crls),
+            names_checked_later: false,
+        })
+    }
+
+    /// Leaves the server's name to the application too, for protocols in which both ends say who
+    /// they are once they are connected.
+    ///
+    /// **Whoever calls this must check what each peer says with [`CaMaterial::is_for_host()`]**:
+    /// until then any holder of a certificate from the roots can be the server.
+    #[must_use]
+    pub fn with_names_checked_by_application(mut self) -> Self {
+        self.names_checked_later = true;
+        self
     }
 
     /// Whether a peer that showed `certificate` may call itself `host`: one of the certificate's
@@ -109,6 +126,7 @@ impl CaMaterial {
             roots: Arc::clone(&self.roots),
             crls: Arc::clone(&self.crls),
             algorithms: default_provider().signature_verification_algorithms,
+            names_checked_later: self.names_checked_later,
         })
     }
 }

@@ -30,7 +30,7 @@ impl Peers for RawKeys {
         &self,
         shown: &CertificateDer<'_>,
         others: &[CertificateDer<'_>],
-        _role: Role,
+        _role: Role<'_>,
         _now: UnixTime,
     ) -> Result<(), Error> {
         if !others.is_empty() {

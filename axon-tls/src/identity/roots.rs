@@ -24,6 +24,8 @@ pub(super) struct FromRoots {
     pub(super) roots: Arc<RootCertStore>,
     pub(super) crls: Arc<Vec<CertRevocationList<'static>>>,
     pub(super) algorithms: WebPkiSupportedAlgorithms,
+    /// Whether a client leaves the server's name to the application.
+    pub(super) names_checked_later: bool,
 }
 
 impl Peers for FromRoots {
@@ -33,7 +35,7 @@ impl Peers for FromRoots {
         &self,
         shown: &CertificateDer<'_>,
         others: &[CertificateDer<'_>],
-        role: Role,
+        role: Role<'_>,
         now: UnixTime,
     ) -> Result<(), Error> {
         let certificate = EndEntityCert::try_from(shown).map_err(refusal)?;
@@ -44,13 +46,18 @@ impl Peers for FromRoots {
             .map(|options| options.with_expiration_policy(ExpirationPolicy::Enforce).build());
         let usage = match role {
             Role::Client => KeyUsage::client_auth(),
-            Role::Server => KeyUsage::server_auth(),
+            Role::Server(_) => KeyUsage::server_auth(),
         };
         let (algorithms, roots) = (self.algorithms.all, &self.roots.roots);
         certificate
             .verify_for_usage(algorithms, roots, others, now, usage, revocation, None)
             .map_err(refusal)?;
-        Ok(())
+        match role {
+            Role::Server(name) if !self.names_checked_later => {
+                certificate.verify_is_valid_for_subject_name(name).map_err(refusal)
+            }
+            _ => Ok(()),
+        }
     }
 
     fn signed(
@@ -92,6 +99,7 @@ fn refusal(error: webpki::Error) -> Error {
         webpki::Error::CertExpired { .. } => CertificateError::Expired,
         webpki::Error::CertNotValidYet { .. } => CertificateError::NotValidYet,
         webpki::Error::CertRevoked => CertificateError::Revoked,
+        webpki::Error::CertNotValidForName(_) => CertificateError::NotValidForName,
         webpki::Error::InvalidSignatureForPublicKey => CertificateError::BadSignature,
         webpki::Error::UnknownIssuer => CertificateError::UnknownIssuer,
         webpki::Error::UnknownRevocationStatus => CertificateError::UnknownRevocationStatus,

@@ -8,11 +8,12 @@ use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
 use rustls::{DigitallySignedStruct, DistinguishedName, Error, PeerIncompatible, SignatureScheme};
 
-/// What the peer shows itself as.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Role {
+/// What the peer is, to whom it shows itself.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Role<'a> {
     Client,
-    Server,
+    /// By the name that the client connects with.
+    Server(&'a ServerName<'a>),
 }
 
 /// Whom to accept.
@@ -25,7 +26,7 @@ pub(super) trait Peers: Debug + Send + Sync {
         &self,
         shown: &CertificateDer<'_>,
         others: &[CertificateDer<'_>],
-        role: Role,
+        role: Role<'_>,
         now: UnixTime,
     ) -> Result<(), Error>;
 
@@ -41,7 +42,7 @@ pub(super) trait Peers: Debug + Send + Sync {
     fn schemes(&self) -> Vec<SignatureScheme>;
 }
 
-/// Both traits of rustls. The name that a client dials plays no part: see [`super::Auth`].
+/// Both traits of rustls.
 #[derive(Debug)]
 pub(super) struct Verifier<P>(pub(super) P);
 
@@ -55,11 +56,11 @@ impl<P: Peers> ServerCertVerifier for Verifier<P> {
         &self,
         end_entity: &CertificateDer<'_>,
         intermediates: &[CertificateDer<'_>],
-        _server_name: &ServerName<'_>,
+        server_name: &ServerName<'_>,
         _ocsp_response: &[u8],
         now: UnixTime,
     ) -> Result<ServerCertVerified, Error> {
-        self.0.accept(end_entity, intermediates, Role::Server, now)?;
+        self.0.accept(end_entity, intermediates, Role::Server(server_name), now)?;
         Ok(ServerCertVerified::assertion())
     }
 
