@@ -28,6 +28,7 @@
 //! It is no KME for production: its keys have never seen a quantum channel.
 
 mod api;
+mod control;
 mod fault;
 mod http;
 mod network;
@@ -36,6 +37,7 @@ mod plan;
 mod server;
 mod store;
 
+pub use control::Control;
 pub use fault::Fault;
 pub use network::{Counters, Kme, Network, NetworkBuilder};
 pub use pki::{Layout, Pki, Sae, Site};
