@@ -4,7 +4,8 @@ use std::collections::BTreeSet;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
-use serde::Deserialize;
+use serde::de::value::MapAccessDeserializer;
+use serde::de::{Deserialize, DeserializeOwned, Deserializer, MapAccess, Visitor};
 use serde_json::{Value, json};
 use zeroize::Zeroizing;
 
@@ -15,13 +16,24 @@ use super::plan::Method;
 use super::store::{Drawn, Refusal, uuid};
 
 /// A member of this name in a mandatory or optional extension is returned in
-/// `key_container_extension`; any other mandatory extension is refused.
+/// `key_container_extension`.
 const ECHO: &str = "kme_sim_echo";
 
-#[derive(Default, Deserialize)]
+/// A member of this name in a mandatory or optional extension asks for a kind of route, and every
+/// key says in its `key_extension` which it has: each two KMEs of a network have a link of their
+/// own, so there are [`DIRECT`] routes only.
+const ROUTE: &str = "kme_sim_route_type";
+const DIRECT: &str = "direct";
+
+/// The mandatory extensions that are not refused, as the `status_extension` says.
+const EXTENSIONS: [&str; 2] = [ECHO, ROUTE];
+
+#[derive(Default, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 struct KeyRequest {
+    #[serde(deserialize_with = "present")]
     number: Option<u64>,
+    #[serde(deserialize_with = "present")]
     size: Option<u64>,
     #[serde(rename = "additional_slave_SAE_IDs")]
     additional_slaves: Vec<String>,
@@ -29,22 +41,55 @@ struct KeyRequest {
     extension_optional: Vec<serde_json::Map<String, Value>>,
 }
 
-#[derive(Deserialize)]
+#[derive(serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 struct KeyIds {
     #[serde(rename = "key_IDs")]
-    ids: Vec<KeyIdItem>,
+    ids: Vec<Object<KeyIdItem>>,
     #[serde(default, rename = "key_IDs_extension")]
-    _extension: Option<Value>,
+    _extension: serde_json::Map<String, Value>,
 }
 
-#[derive(Deserialize)]
+#[derive(serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 struct KeyIdItem {
     #[serde(rename = "key_ID")]
     id: String,
     #[serde(default, rename = "key_ID_extension")]
-    _extension: Option<Value>,
+    _extension: serde_json::Map<String, Value>,
+}
+
+/// A JSON object and nothing else: a derived `Deserialize` takes an array of the members too.
+struct Object<T>(T);
+
+impl<'de, T: DeserializeOwned> Deserialize<'de> for Object<T> {
+    fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
+        struct Members<T>(std::marker::PhantomData<T>);
+
+        impl<'de, T: DeserializeOwned> Visitor<'de> for Members<T> {
+            type Value = Object<T>;
+
+            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str("an object")
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<Object<T>, A::Error> {
+                T::deserialize(MapAccessDeserializer::new(map)).map(Object)
+            }
+        }
+        from.deserialize_map(Members(std::marker::PhantomData))
+    }
+}
+
+/// A member that may be left out, but is not `null`.
+fn present<'de, D: Deserializer<'de>>(from: D) -> Result<Option<u64>, D::Error> {
+    u64::deserialize(from).map(Some)
+}
+
+/// The JSON object that a POST carries.
+fn posted<T: DeserializeOwned>(request: &Request) -> Result<T, Answer> {
+    let object = serde_json::from_slice::<Object<T>>(&request.body);
+    object.map(|Object(body)| body).map_err(|e| bad(format!("the body cannot be read: {e}")))
 }
 
 /// Answers one request of the SAE named by the client's certificate.
@@ -60,7 +105,7 @@ pub(super) fn answer(
     if answer.status != 200 {
         kme.count(|counters| counters.refused += 1);
     }
-    answer
+    Answer { close: request.close, ..answer }
 }
 
 /// The method that a request names, whether or not it can be served.
@@ -74,7 +119,7 @@ pub(super) fn error(status: u16, message: impl Into<String>, details: Vec<Value>
     if !details.is_empty() {
         body["details"] = details.into();
     }
-    Answer { status, body: body.to_string().into(), retry_after: None }
+    Answer { status, body: body.to_string().into(), retry_after: None, close: false }
 }
 
 fn bad(message: impl Into<String>) -> Answer {
@@ -119,28 +164,29 @@ fn route(
                 status: *code,
                 body: "out of order".to_owned().into(),
                 retry_after: None,
+                close: false,
             });
         }
         _ => {}
     }
+    if get && !request.body.is_empty() {
+        return Err(bad("a GET has no body"));
+    }
+    if !get && !request.json {
+        return Err(bad("the Content-Type is not application/json"));
+    }
     match method {
         "status" => status(shared, kme, caller, &sae),
         "enc_keys" => {
-            let asked = if get {
-                enc_query(&request.query)?
-            } else {
-                serde_json::from_slice(&request.body)
-                    .map_err(|e| bad(format!("the key request cannot be read: {e}")))?
-            };
+            let asked = if get { enc_query(&request.query)? } else { posted(request)? };
             enc_keys(shared, kme, caller, &sae, &asked, fault)
         }
         _ => {
             let ids = if get {
                 dec_query(&request.query)?
             } else {
-                let ids: KeyIds = serde_json::from_slice(&request.body)
-                    .map_err(|e| bad(format!("the key IDs cannot be read: {e}")))?;
-                ids.ids.into_iter().map(|item| item.id).collect()
+                let ids: KeyIds = posted(request)?;
+                ids.ids.into_iter().map(|Object(item)| item.id).collect()
             };
             dec_keys(shared, kme, caller, &sae, &ids, fault)
         }
@@ -196,8 +242,9 @@ fn status(shared: &Shared, kme: &KmeState, caller: &str, slave: &str) -> Result<
         "max_key_size": limits.max_key_size,
         "min_key_size": limits.min_key_size,
         "max_SAE_ID_count": limits.max_sae_ids,
+        "status_extension": { "kme_sim_extensions": EXTENSIONS },
     });
-    Ok(Answer { status: 200, body: body.to_string().into(), retry_after: None })
+    Ok(Answer { status: 200, body: body.to_string().into(), retry_after: None, close: false })
 }
 
 fn enc_keys(
@@ -215,42 +262,64 @@ fn enc_keys(
     }
     let size = asked.size.unwrap_or(limits.key_size.into());
     let (min, max) = (u64::from(limits.min_key_size), u64::from(limits.max_key_size));
-    if !(min..=max).contains(&size) || !size.is_multiple_of(8) {
-        return Err(bad(format!("size is not a multiple of 8 in {min}..={max}")));
+    if !size.is_multiple_of(8) {
+        return Err(bad("size shall be a multiple of 8"));
+    }
+    if !(min..=max).contains(&size) {
+        return Err(bad(format!("size is not in {min}..={max}")));
     }
     if asked.additional_slaves.len() as u64 > limits.max_sae_ids {
         return Err(bad(format!("more than {} additional slave SAEs", limits.max_sae_ids)));
     }
-    let unsupported: Vec<Value> = asked
-        .extension_mandatory
-        .iter()
-        .flat_map(|extension| extension.keys())
-        .filter(|name| *name != ECHO)
-        .map(|name| json!({ "extension_mandatory": name }))
-        .collect();
-    if !unsupported.is_empty() {
-        return Err(error(
-            400,
-            "not all extension_mandatory parameters are supported",
-            unsupported,
-        ));
-    }
-    let mut slaves = BTreeSet::from([slave.to_owned()]);
-    let target = site_of(shared, slave)?;
-    for additional in &asked.additional_slaves {
-        site_of(shared, additional)?;
-        slaves.insert(additional.clone());
+    mandatory(&asked.extension_mandatory)?;
+    let mut slaves = BTreeSet::new();
+    let mut links = BTreeSet::new();
+    for slave in asked.additional_slaves.iter().map(String::as_str).chain([slave]) {
+        links.insert((kme.index, site_of(shared, slave)?));
+        slaves.insert(slave.to_owned());
     }
     let cost = number * size.div_ceil(limits.key_size.into());
     let bytes = usize::try_from(size / 8).map_err(|_| bad("size"))?;
     let drawn = shared
         .store()
-        .draw((kme.index, target), number, bytes, cost, caller, &slaves)
+        .draw(&links, number, bytes, cost, caller, &slaves)
         .ok_or_else(|| error(503, "not enough keys are stored", Vec::new()))?;
     kme.count(|counters| counters.keys_to_masters += number);
-    let all = asked.extension_mandatory.iter().chain(&asked.extension_optional);
-    let echo = all.filter_map(|extension| extension.get(ECHO)).next_back();
-    Ok(container(drawn, echo, fault))
+    let named = |name: &str| {
+        let all = asked.extension_mandatory.iter().chain(&asked.extension_optional);
+        all.filter_map(|extension| extension.get(name)).next_back()
+    };
+    let extensions = Extensions {
+        container: named(ECHO).map(|echo| json!({ ECHO: echo }).to_string()),
+        key: named(ROUTE).map(|_| json!({ ROUTE: DIRECT }).to_string()),
+    };
+    Ok(container(drawn, &extensions, fault))
+}
+
+/// Refuses what is not supported, or supported and not to be had (clause 6.2).
+fn mandatory(extensions: &[serde_json::Map<String, Value>]) -> Result<(), Answer> {
+    let all = || extensions.iter().flatten();
+    let details = |what: &str, of: Vec<(&String, &str)>| -> Vec<Value> {
+        of.into_iter().map(|(name, why)| json!({ what: format!("{name} {why}") })).collect()
+    };
+    let unsupported: Vec<_> = all()
+        .filter(|(name, _)| !EXTENSIONS.contains(&name.as_str()))
+        .map(|(name, _)| (name, "is not supported"))
+        .collect();
+    if !unsupported.is_empty() {
+        let details = details("extension_mandatory_unsupported", unsupported);
+        return Err(error(400, "not all extension_mandatory parameters are supported", details));
+    }
+    let unmet: Vec<_> = all()
+        .filter(|(name, value)| *name == ROUTE && *value != DIRECT)
+        .map(|(name, _)| (name, "is direct for every key of this KME"))
+        .collect();
+    if !unmet.is_empty() {
+        let details = details("extension_mandatory_unmet", unmet);
+        let message = "not all extension_mandatory request options could be met";
+        return Err(error(400, message, details));
+    }
+    Ok(())
 }
 
 fn dec_keys(
@@ -268,15 +337,24 @@ fn dec_keys(
         Refusal::NotYours => error(401, "a key was not drawn by that master for this SAE", vec![]),
         Refusal::Unknown(ids) => {
             let details = ids.into_iter().map(|id| json!({ "key_ID": id })).collect();
-            error(400, "one or more keys are not found on the KME", details)
+            error(400, "one or more keys specified are not found on KME", details)
         }
     })?;
     kme.count(|counters| counters.keys_to_slaves += given.len() as u64);
-    Ok(container(given, None, fault))
+    Ok(container(given, &Extensions::default(), fault))
+}
+
+/// JSON texts that go with keys; nothing secret.
+#[derive(Default)]
+struct Extensions {
+    /// `key_container_extension`.
+    container: Option<String>,
+    /// `key_extension` of each key.
+    key: Option<String>,
 }
 
 /// Writes a key container without a copy of a key outside zeroized memory.
-fn container(mut keys: Vec<Drawn>, echo: Option<&Value>, fault: Option<&Fault>) -> Answer {
+fn container(mut keys: Vec<Drawn>, extensions: &Extensions, fault: Option<&Fault>) -> Answer {
     match fault {
         Some(Fault::WrongLength) => keys.iter_mut().for_each(|key| {
             key.1.pop();
@@ -293,9 +371,11 @@ fn container(mut keys: Vec<Drawn>, echo: Option<&Value>, fault: Option<&Fault>) 
         Some(Fault::OtherIds) => keys.iter_mut().for_each(|key| key.0 = uuid()),
         _ => {}
     }
-    let text_of_key = |key: &Drawn| key.1.len().div_ceil(3) * 4 + 80;
-    let echo = echo.map(ToString::to_string).unwrap_or_default();
-    let capacity = 128 + echo.len() + keys.iter().map(text_of_key).sum::<usize>();
+    let length = |text: &Option<String>| text.as_ref().map_or(0, |text| text.len() + 40);
+    let of_key = length(&extensions.key) + 80;
+    let text_of_key = |key: &Drawn| key.1.len().div_ceil(3) * 4 + of_key;
+    let of_container = length(&extensions.container) + 40;
+    let capacity = of_container + keys.iter().map(text_of_key).sum::<usize>();
     let mut body = Zeroizing::new(String::with_capacity(capacity));
     body.push_str("{\"keys\":[");
     for (index, (id, secret)) in keys.iter().enumerate() {
@@ -306,16 +386,19 @@ fn container(mut keys: Vec<Drawn>, echo: Option<&Value>, fault: Option<&Fault>) 
         body.push_str(id);
         body.push_str("\",\"key\":\"");
         STANDARD.encode_string(secret.as_slice(), &mut body);
-        body.push_str("\"}");
-    }
-    body.push(']');
-    if !echo.is_empty() {
-        body.push_str(",\"key_container_extension\":{\"");
-        body.push_str(ECHO);
-        body.push_str("\":");
-        body.push_str(&echo);
+        body.push('"');
+        if let Some(extension) = &extensions.key {
+            body.push_str(",\"key_extension\":");
+            body.push_str(extension);
+        }
         body.push('}');
     }
+    body.push(']');
+    if let Some(extension) = &extensions.container {
+        body.push_str(",\"key_container_extension\":");
+        body.push_str(extension);
+    }
     body.push('}');
-    Answer { status: 200, body, retry_after: None }
+    debug_assert!(body.len() <= capacity, "a grown string leaves a copy of the keys behind");
+    Answer { status: 200, body, retry_after: None, close: false }
 }

@@ -17,6 +17,10 @@ pub(super) struct Request {
     /// Path, without the query.
     pub(super) path: String,
     pub(super) query: String,
+    /// Whether the body is labelled application/json.
+    pub(super) json: bool,
+    /// Whether the client wants the connection closed after the answer.
+    pub(super) close: bool,
     pub(super) body: Vec<u8>,
 }
 
@@ -33,6 +37,8 @@ pub(super) struct Answer {
     pub(super) body: Zeroizing<String>,
     /// Seconds, for the header Retry-After.
     pub(super) retry_after: Option<u64>,
+    /// Closes the connection after it.
+    pub(super) close: bool,
 }
 
 /// Reads one request. `buffer` keeps what came after it.
@@ -66,7 +72,8 @@ pub(super) async fn read<S: AsyncRead + Unpin>(
     Ok(request)
 }
 
-/// Parses a request's head; the body's length with it.
+/// Parses a request's head; the body's length with it. A request of HTTP/1.1 names one host
+/// (RFC 9112, 3.2).
 fn head(bytes: &[u8]) -> Option<(Request, usize)> {
     let text = std::str::from_utf8(bytes).ok()?;
     let mut lines = text.split("\r\n");
@@ -76,6 +83,7 @@ fn head(bytes: &[u8]) -> Option<(Request, usize)> {
         return None;
     }
     let mut length = None;
+    let (mut hosts, mut media, mut close) = (0, None, false);
     for line in lines {
         let (name, value) = line.split_once(':')?;
         if name.eq_ignore_ascii_case("content-length") {
@@ -88,12 +96,27 @@ fn head(bytes: &[u8]) -> Option<(Request, usize)> {
         if name.eq_ignore_ascii_case("transfer-encoding") {
             return None;
         }
+        if name.eq_ignore_ascii_case("host") {
+            hosts += 1;
+        }
+        if name.eq_ignore_ascii_case("content-type") && media.replace(value).is_some() {
+            return None;
+        }
+        if name.eq_ignore_ascii_case("connection") {
+            close |= value.split(',').any(|option| option.trim().eq_ignore_ascii_case("close"));
+        }
     }
+    if hosts != 1 {
+        return None;
+    }
+    let media = media.and_then(|media| media.split(';').next()).unwrap_or_default().trim();
     let (path, query) = target.split_once('?').unwrap_or((target, ""));
     let request = Request {
         method: method.to_owned(),
         path: path.to_owned(),
         query: query.to_owned(),
+        json: media.eq_ignore_ascii_case("application/json"),
+        close,
         body: Vec::new(),
     };
     Some((request, length.unwrap_or(0)))
@@ -135,6 +158,9 @@ pub(super) async fn write<S: AsyncWrite + Unpin>(
     if let Some(seconds) = answer.retry_after {
         head.push_str(&format!("Retry-After: {seconds}\r\n"));
     }
+    if answer.close {
+        head.push_str("Connection: close\r\n");
+    }
     match fault {
         Some(Fault::Endless) => head.push_str("Transfer-Encoding: chunked\r\n\r\n"),
         Some(Fault::Http10) => head.push_str("\r\n"),
@@ -168,7 +194,7 @@ pub(super) async fn write<S: AsyncWrite + Unpin>(
     }
     bytes.zeroize();
     stream.flush().await?;
-    Ok(!matches!(fault, Some(Fault::LyingLength | Fault::Http10)))
+    Ok(!answer.close && !matches!(fault, Some(Fault::LyingLength | Fault::Http10)))
 }
 
 async fn drip<S: AsyncWrite + Unpin>(
@@ -211,15 +237,31 @@ mod tests {
             "GET / HTTP/1.0",
             "GET / HTTP/1.1 x",
             "GET http://x/ HTTP/1.1",
-            "POST / HTTP/1.1\r\nContent-Length: 1\r\nContent-Length: 1",
-            "POST / HTTP/1.1\r\nContent-Length: +1",
-            "POST / HTTP/1.1\r\nTransfer-Encoding: chunked",
-            "POST / HTTP/1.1\r\nno colon",
+            "GET / HTTP/1.1",
+            "GET / HTTP/1.1\r\nHost: a\r\nHost: a",
+            "POST / HTTP/1.1\r\nHost: a\r\nContent-Length: 1\r\nContent-Length: 1",
+            "POST / HTTP/1.1\r\nHost: a\r\nContent-Length: +1",
+            "POST / HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: chunked",
+            "POST / HTTP/1.1\r\nHost: a\r\nContent-Type: a/b\r\nContent-Type: a/b",
+            "POST / HTTP/1.1\r\nHost: a\r\nno colon",
         ] {
             assert!(head(bad.as_bytes()).is_none(), "{bad:?}");
         }
-        let (request, length) = head(b"POST /a?b=c HTTP/1.1\r\ncontent-length: 7").unwrap();
+        let text = b"POST /a?b=c HTTP/1.1\r\nhost: a\r\ncontent-length: 7";
+        let (request, length) = head(text).unwrap();
         assert_eq!((request.path.as_str(), request.query.as_str(), length), ("/a", "b=c", 7));
+        assert!(!request.json && !request.close);
+    }
+
+    #[test]
+    fn media_type_and_close_are_read_in_any_spelling() {
+        let text = "POST / HTTP/1.1\r\nHost: a\r\nCONTENT-TYPE: Application/JSON ; charset=utf-8\
+                    \r\nConnection: keep-alive, Close";
+        let (request, _) = head(text.as_bytes()).unwrap();
+        assert!(request.json && request.close);
+        let other = text.replace("JSON", "json-seq").replace("Close", "x-close");
+        let (request, _) = head(other.as_bytes()).unwrap();
+        assert!(!request.json && !request.close);
     }
 
     #[test]

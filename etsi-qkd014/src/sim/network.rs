@@ -82,7 +82,7 @@ impl NetworkBuilder {
         self
     }
 
-    /// Most keys in one request. Default 128.
+    /// Most keys in one request, 1 to 1024. Default 128.
     pub fn max_keys_per_request(mut self, keys: u64) -> Self {
         self.limits.max_keys_per_request = keys;
         self
@@ -119,6 +119,13 @@ impl NetworkBuilder {
             return Err(Error::Layout(format!(
                 "key_size {} is not a multiple of 8 from {} to {}",
                 limits.key_size, limits.min_key_size, limits.max_key_size
+            )));
+        }
+        // A full answer stays below the 1 MiB that a client takes by default.
+        if !(1..=1024).contains(&limits.max_keys_per_request) {
+            return Err(Error::Layout(format!(
+                "max_keys_per_request {} is not from 1 to 1024",
+                limits.max_keys_per_request
             )));
         }
         let pki = pki.map_or_else(|| Pki::create(&layout), Ok)?;

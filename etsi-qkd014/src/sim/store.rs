@@ -79,22 +79,23 @@ impl Store {
         level
     }
 
-    /// Draws `number` fresh keys of `bytes` each, at `cost` of the stock; `None` where it does not
-    /// hold that much.
+    /// Draws `number` fresh keys of `bytes` each, at `cost` of the stock of every link that carries
+    /// them; `None` where one does not hold that much, and then none is spent.
     pub(super) fn draw(
         &mut self,
-        link: (usize, usize),
+        links: &BTreeSet<(usize, usize)>,
         number: u64,
         bytes: usize,
         cost: u64,
         master: &str,
         slaves: &BTreeSet<String>,
     ) -> Option<Vec<Drawn>> {
-        let level = self.level(link.0, link.1);
-        if *level < cost as f64 {
+        if links.iter().any(|&(a, b)| *self.level(a, b) < cost as f64) {
             return None;
         }
-        *level -= cost as f64;
+        for &(a, b) in links {
+            *self.level(a, b) -= cost as f64;
+        }
         let mut drawn = Vec::new();
         for _ in 0..number {
             let mut secret = Zeroizing::new(vec![0; bytes]);
@@ -177,10 +178,14 @@ mod tests {
         names.iter().map(|name| (*name).to_owned()).collect()
     }
 
+    fn link(a: usize, b: usize) -> BTreeSet<(usize, usize)> {
+        BTreeSet::from([(a, b)])
+    }
+
     #[test]
     fn each_named_slave_gets_a_key_once_and_nobody_else_does() {
         let mut store = Store::new(FillRate::Unlimited, 10, 10);
-        let drawn = store.draw((0, 1), 1, 32, 1, "m", &slaves(&["s", "t"])).unwrap();
+        let drawn = store.draw(&link(0, 1), 1, 32, 1, "m", &slaves(&["s", "t"])).unwrap();
         let ids = [drawn[0].0.clone()];
         assert_eq!(store.give(&ids, "m", "x").unwrap_err(), Refusal::NotYours);
         assert_eq!(store.give(&ids, "x", "s").unwrap_err(), Refusal::NotYours);
@@ -193,7 +198,7 @@ mod tests {
     #[test]
     fn a_refused_batch_gives_and_consumes_nothing() {
         let mut store = Store::new(FillRate::Unlimited, 10, 10);
-        let drawn = store.draw((0, 1), 1, 32, 1, "m", &slaves(&["s"])).unwrap();
+        let drawn = store.draw(&link(0, 1), 1, 32, 1, "m", &slaves(&["s"])).unwrap();
         let id = drawn[0].0.clone();
         assert!(store.give(&[id.clone(), uuid()], "m", "s").is_err());
         assert!(store.give(&[id.clone(), id.to_uppercase()], "m", "s").is_err());
@@ -203,10 +208,21 @@ mod tests {
     #[test]
     fn a_store_that_does_not_fill_runs_out() {
         let mut store = Store::new(FillRate::PerSecond(0.0), 10, 3);
-        assert!(store.draw((0, 1), 4, 32, 4, "m", &slaves(&["s"])).is_none());
-        assert!(store.draw((0, 1), 3, 32, 3, "m", &slaves(&["s"])).is_some());
+        assert!(store.draw(&link(0, 1), 4, 32, 4, "m", &slaves(&["s"])).is_none());
+        assert!(store.draw(&link(0, 1), 3, 32, 3, "m", &slaves(&["s"])).is_some());
         assert_eq!(store.stored(1, 0), 0);
         assert_eq!(store.stored(0, 2), 3, "another link has its own stock");
+    }
+
+    #[test]
+    fn a_key_for_several_links_spends_the_stock_of_each_or_of_none() {
+        let mut store = Store::new(FillRate::PerSecond(0.0), 10, 3);
+        let both = BTreeSet::from([(0, 1), (0, 2)]);
+        assert!(store.draw(&both, 2, 32, 2, "m", &slaves(&["s", "t"])).is_some());
+        assert_eq!((store.stored(0, 1), store.stored(0, 2)), (1, 1));
+        assert!(store.draw(&link(0, 1), 1, 32, 1, "m", &slaves(&["s"])).is_some());
+        assert!(store.draw(&both, 1, 32, 1, "m", &slaves(&["s", "t"])).is_none());
+        assert_eq!((store.stored(0, 1), store.stored(0, 2)), (0, 1));
     }
 
     #[test]

@@ -130,7 +130,7 @@ def main():
     check(answer[1]["details"] == [unsupported], f"6.5: {answer[1]}")
     keys_of(enc({"extension_optional": [{"abc_max_age": 30000}]}), 1, size)
     wrong = [{"number": 0}, {"number": -1}, {"number": most + 1}, {"number": "1"}, {"number": 1.5}]
-    wrong += [{"number": None}, {"size": None}, {"number": True}, [], 1, None, {"size": 0}]
+    wrong += [{"number": None}, {"size": None}, {"number": True}, [], 1, b"null", {"size": 0}]
     wrong += [{"size": status["max_key_size"] + 8}, {"extension_mandatory": {}}]
     wrong += [{"additional_slave_SAE_IDs": "x"}, {"extension_optional": [1]}, b"{", b"\xff"]
     for body in wrong:
