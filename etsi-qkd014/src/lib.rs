@@ -48,6 +48,7 @@
 //! # Features
 //!
 //! - `blocking`: `blocking::Client`, which needs no async runtime of yours.
+//! - `pool`: `KeyPool`, which draws keys ahead for a peer and hands each out once, and its ledger.
 //! - `sim`: the module `sim`, KMEs in process for tests, and the binary `kme-sim`.
 //!
 //! [ETSI GS QKD 014 V1.1.1]: https://www.etsi.org/deliver/etsi_gs/QKD/001_099/014/01.01.01_60/gs_qkd014v010101p.pdf
@@ -65,6 +66,8 @@ mod exchange;
 pub mod fuzzing;
 mod key;
 mod parse;
+#[cfg(feature = "pool")]
+pub mod pool;
 mod quirks;
 mod request;
 mod retry;
@@ -79,6 +82,8 @@ pub use builder::ClientBuilder;
 pub use client::Client;
 pub use error::{Error, RefusedBy};
 pub use key::{Key, KeyContainer};
+#[cfg(feature = "pool")]
+pub use pool::KeyPool;
 pub use quirks::Quirks;
 pub use request::{DecKeys, EncKeys};
 pub use retry::RetryPolicy;

@@ -1,0 +1,416 @@
+//! When to ask a KME for keys, and for how many: the rules of a pool without I/O and without a
+//! clock.
+
+use std::collections::VecDeque;
+use std::fmt;
+use std::time::Duration;
+
+use super::supply::Supply;
+
+#[cfg(test)]
+mod tests;
+
+/// Time between two looks at the KME's stock.
+const STATUS_EVERY: Duration = Duration::from_secs(5);
+/// First and longest pause after a failure that cost no key.
+const PAUSE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(2));
+/// First and longest pause after a failure that may have cost keys.
+const PAUSE_LOST: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(30));
+
+/// The rules of a pool of keys for one peer, over any kind of key `K`.
+///
+/// It does no I/O, has no clock and no randomness of its own: the owner tells it what happens and
+/// when (`now`, time since any fixed moment, never going back), does what [`poll`](Self::poll)
+/// asks for, and reports how that ended. [`KeyPool`](super::KeyPool) is such an owner.
+///
+/// - No more keys are held and asked for together than the target, and no more than a quarter of
+///   the KME's `stored_key_count`, but always one. A count of 0 says nothing: some KMEs always
+///   say 0.
+/// - A call asks for at most [`batch`](Settings::batch) keys and at most the KME's
+///   `max_key_per_request`; 0 says nothing. Until a status was answered, for one.
+/// - A refill begins when a batch, or a quarter of the target, is missing.
+/// - An empty store halves the batch, since fewer keys may be had; a call that succeeds doubles it
+///   again.
+/// - After failures it waits: 100 ms to 2 s where they cost nothing, 1 s to 30 s where each may have
+///   cost keys. Waits double, and are drawn from the upper half of their length.
+///
+/// ```
+/// use std::time::Duration;
+/// use etsi_qkd014::pool::{Ask, Core, Settings, Stock};
+///
+/// let mut settings = Settings::default();
+/// settings.target = 4;
+/// let mut core = Core::new(settings, || 0);
+/// let now = Duration::ZERO;
+/// assert_eq!(core.poll(now), Some(Ask::Status));
+/// core.on_stock(now, Stock { stored_key_count: 1000, max_key_per_request: 3 });
+/// assert_eq!(core.poll(now), Some(Ask::Keys(3)));
+/// core.on_keys(now, 3, ["x", "y", "z"]);
+/// assert_eq!(core.take(now), Some("x"));
+/// ```
+pub struct Core<K> {
+    settings: Settings,
+    jitter: Box<dyn FnMut() -> u8 + Send>,
+    /// With the time at which each was asked for; the oldest first.
+    held: VecDeque<(Duration, K)>,
+    /// Keys asked for by each call in flight, and when.
+    in_flight: Vec<(u32, Duration)>,
+    /// Keys that the next call may ask for.
+    size: u32,
+    /// Failures since the last call that gave keys.
+    failures: u32,
+    not_before: Duration,
+    held_until: Duration,
+    /// Since when keys were wanted without an answer, for the supply's rate.
+    unanswered_since: Option<Duration>,
+    /// Since when keys were wanted and none came.
+    dry_since: Option<Duration>,
+    stock: Stocktaking,
+    supply: Supply,
+    counts: Counts,
+}
+
+#[derive(Default)]
+struct Stocktaking {
+    due: Duration,
+    asked: bool,
+    /// A status call has ended, well or not.
+    ended: bool,
+    last: Option<Stock>,
+}
+
+#[derive(Default)]
+struct Counts {
+    obtained: u64,
+    taken: u64,
+    expired: u64,
+    unusable: u64,
+}
+
+/// Settings of a [`Core`].
+#[derive(Clone, Debug)]
+#[non_exhaustive]
+pub struct Settings {
+    /// Keys to hold. Default 16.
+    pub target: usize,
+    /// Most keys that one call asks for, and so most that a call that is cut off can lose; 0 is
+    /// read as 1. Default 8.
+    pub batch: u32,
+    /// Most calls for keys at a time; 0 is read as 1. Default 4.
+    pub calls: usize,
+    /// Age, counted from when it was asked for, at which a key is dropped. Default ten minutes.
+    pub max_age: Duration,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self { target: 16, batch: 8, calls: 4, max_age: Duration::from_secs(600) }
+    }
+}
+
+/// A call that the owner of a [`Core`] is to make.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ask {
+    /// `status`. Ends with [`Core::on_stock`] or [`Core::on_failure`].
+    Status,
+    /// `enc_keys` for so many keys, made once. Ends with [`Core::on_keys`] or
+    /// [`Core::on_failure`].
+    Keys(u32),
+}
+
+/// What a failed call cost.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FailureClass {
+    /// The KME did not serve it: unreachable, or it does not accept this SAE. Costs nothing.
+    Unserved,
+    /// The KME answered and gave nothing, as from an empty store. Costs nothing; a smaller number
+    /// may be had.
+    Refused,
+    /// Cut off or unusable: its keys may be consumed.
+    KeysLost,
+}
+
+/// The part of the KME's status that a pool depends on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stock {
+    /// Keys that the KME stores; 0: unknown.
+    pub stored_key_count: u64,
+    /// Most keys that a call may ask for; 0: unknown.
+    pub max_key_per_request: u64,
+}
+
+/// How a pool stands.
+#[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
+pub struct PoolStatus {
+    /// Keys that can be taken now.
+    pub held: usize,
+    /// Keys asked for and not there.
+    pub asked: usize,
+    /// Keys that should be held or asked for: what was set, within the KME's stock.
+    pub target: usize,
+    /// Keys a second that the KME gives, where it was seen at its limit.
+    pub supply: Option<f64>,
+    /// How long keys have been wanted without any coming. See [`is_stalled`](Self::is_stalled).
+    pub waiting: Option<Duration>,
+    /// Failed calls for keys since the last one that gave some.
+    pub failures: u32,
+    /// Keys that came and could be taken.
+    pub obtained: u64,
+    /// Keys taken.
+    pub taken: u64,
+    /// Keys dropped because nobody took them in time.
+    pub expired: u64,
+    /// Keys that came and were refused, as under a key_ID that was there before.
+    pub unusable: u64,
+    /// What the KME last said of its stock.
+    pub stock: Option<Stock>,
+}
+
+impl PoolStatus {
+    /// Whether keys have been wanted for a second or more and none came.
+    #[must_use]
+    pub fn is_stalled(&self) -> bool {
+        self.waiting.is_some_and(|time| time >= Duration::from_secs(1))
+    }
+}
+
+impl<K> Core<K> {
+    /// An empty pool. `jitter` gives a random byte for each pause.
+    pub fn new(settings: Settings, jitter: impl FnMut() -> u8 + Send + 'static) -> Self {
+        let settings =
+            Settings { batch: settings.batch.max(1), calls: settings.calls.max(1), ..settings };
+        Self {
+            size: settings.batch,
+            settings,
+            jitter: Box::new(jitter),
+            held: VecDeque::new(),
+            in_flight: Vec::new(),
+            failures: 0,
+            not_before: Duration::ZERO,
+            held_until: Duration::ZERO,
+            unanswered_since: None,
+            dry_since: None,
+            stock: Stocktaking::default(),
+            supply: Supply::default(),
+            counts: Counts::default(),
+        }
+    }
+
+    /// The next call to make now, if any. To be repeated until it gives none, after every other
+    /// event and at [`poll_timeout`](Self::poll_timeout).
+    pub fn poll(&mut self, now: Duration) -> Option<Ask> {
+        self.expire(now);
+        if !self.stock.asked && now >= self.stock.due {
+            self.stock.asked = true;
+            return Some(Ask::Status);
+        }
+        if !self.refill_is_due() {
+            if self.in_flight.is_empty() {
+                self.unanswered_since = None;
+                self.dry_since = None;
+            }
+            return None;
+        }
+        self.unanswered_since.get_or_insert(now);
+        self.dry_since.get_or_insert(now);
+        if !self.may_call() || now < self.begins() {
+            return None;
+        }
+        let missing = u32::try_from(self.missing()).unwrap_or(u32::MAX);
+        let number = self.per_call().min(missing);
+        self.in_flight.push((number, now));
+        Some(Ask::Keys(number))
+    }
+
+    /// When [`poll`](Self::poll) may give something, or keys expire, without another event.
+    #[must_use]
+    pub fn poll_timeout(&self) -> Option<Duration> {
+        let status = (!self.stock.asked).then_some(self.stock.due);
+        let refill = (self.refill_is_due() && self.may_call()).then(|| self.begins());
+        let expiry = self.held.front().and_then(|(at, _)| at.checked_add(self.settings.max_age));
+        [status, refill, expiry].into_iter().flatten().min()
+    }
+
+    /// Whether [`poll`](Self::poll) would give a call for keys: for an owner whose calls are made
+    /// elsewhere, and who wakes that place only when it has something to do.
+    #[must_use]
+    pub fn wants_keys(&self, now: Duration) -> bool {
+        self.refill_is_due() && self.may_call() && now >= self.begins()
+    }
+
+    /// A call for `asked` keys gave `keys`, those that are usable. None at all counts as
+    /// [`FailureClass::KeysLost`].
+    pub fn on_keys(&mut self, now: Duration, asked: u32, keys: impl IntoIterator<Item = K>) {
+        let since = self.ended(asked).unwrap_or(now);
+        // Several calls may end in another order than they began.
+        let at = self.held.iter().rposition(|(held, _)| *held <= since).map_or(0, |i| i + 1);
+        let before = self.held.len();
+        self.held.extend(keys.into_iter().map(|key| (since, key)));
+        let came = self.held.len() - before;
+        self.held.make_contiguous()[at..].rotate_right(came);
+        self.counts.obtained += came as u64;
+        self.counts.unusable += u64::from(asked).saturating_sub(came as u64);
+        self.answered(now, came);
+        if came == 0 {
+            self.back_off(now, FailureClass::KeysLost);
+            return;
+        }
+        self.failures = 0;
+        self.not_before = now;
+        self.dry_since = None;
+        self.size = self.size.saturating_mul(2).min(self.settings.batch);
+    }
+
+    /// A call failed.
+    pub fn on_failure(&mut self, now: Duration, ask: Ask, class: FailureClass) {
+        match ask {
+            Ask::Status => self.status_ended(now),
+            Ask::Keys(asked) => {
+                self.ended(asked);
+                self.answered(now, 0);
+                self.back_off(now, class);
+                if class == FailureClass::Refused {
+                    self.size = (self.size / 2).max(1);
+                }
+            }
+        }
+    }
+
+    /// A status call was answered.
+    pub fn on_stock(&mut self, now: Duration, stock: Stock) {
+        self.status_ended(now);
+        self.stock.last = Some(stock);
+        self.supply.stocked(now, stock);
+    }
+
+    /// Hands out the oldest key. Each comes out once, and none past its age.
+    pub fn take(&mut self, now: Duration) -> Option<K> {
+        self.expire(now);
+        let (_, key) = self.held.pop_front()?;
+        self.counts.taken += 1;
+        Some(key)
+    }
+
+    /// How many keys to hold from now on. Keys beyond it stay until they are taken or too old.
+    pub fn set_target(&mut self, keys: usize) {
+        self.settings.target = keys;
+    }
+
+    /// Asks for no keys before `at`.
+    pub fn hold_until(&mut self, at: Duration) {
+        self.held_until = self.held_until.max(at);
+    }
+
+    /// Drops keys that are too old, and says how many.
+    pub fn expire(&mut self, now: Duration) -> usize {
+        let old = |at: &Duration| now.saturating_sub(*at) >= self.settings.max_age;
+        let mut dropped = 0;
+        while self.held.front().is_some_and(|(at, _)| old(at)) {
+            self.held.pop_front();
+            dropped += 1;
+        }
+        self.counts.expired += dropped as u64;
+        dropped
+    }
+
+    /// Drops every key.
+    pub fn clear(&mut self) {
+        self.held.clear();
+    }
+
+    /// How it stands.
+    #[must_use]
+    pub fn status(&self, now: Duration) -> PoolStatus {
+        let fresh = |(at, _): &&(Duration, K)| now.saturating_sub(*at) < self.settings.max_age;
+        PoolStatus {
+            held: self.held.iter().filter(fresh).count(),
+            asked: self.asked(),
+            target: self.target(),
+            supply: self.supply.rate(),
+            waiting: self.dry_since.map(|since| now.saturating_sub(since)),
+            failures: self.failures,
+            obtained: self.counts.obtained,
+            taken: self.counts.taken,
+            expired: self.counts.expired,
+            unusable: self.counts.unusable,
+            stock: self.stock.last,
+        }
+    }
+
+    fn asked(&self) -> usize {
+        self.in_flight.iter().map(|&(number, _)| number as usize).sum()
+    }
+
+    fn target(&self) -> usize {
+        match self.stock.last {
+            Some(Stock { stored_key_count: count @ 1.., .. }) => {
+                let quarter = usize::try_from(count / 4).unwrap_or(usize::MAX);
+                self.settings.target.min(quarter.max(1))
+            }
+            _ => self.settings.target,
+        }
+    }
+
+    fn missing(&self) -> usize {
+        self.target().saturating_sub(self.held.len() + self.asked())
+    }
+
+    fn per_call(&self) -> u32 {
+        let most = match self.stock.last {
+            None => 1,
+            Some(Stock { max_key_per_request: 0, .. }) => u32::MAX,
+            Some(stock) => u32::try_from(stock.max_key_per_request).unwrap_or(u32::MAX),
+        };
+        self.size.min(most)
+    }
+
+    fn refill_is_due(&self) -> bool {
+        let missing = self.missing();
+        missing > 0 && missing >= self.target().div_ceil(4).min(self.per_call() as usize)
+    }
+
+    fn may_call(&self) -> bool {
+        self.stock.ended && self.in_flight.len() < self.settings.calls
+    }
+
+    fn begins(&self) -> Duration {
+        self.not_before.max(self.held_until)
+    }
+
+    /// Ends a call for keys, and says when it began.
+    fn ended(&mut self, asked: u32) -> Option<Duration> {
+        let call = self.in_flight.iter().position(|&(number, _)| number == asked)?;
+        Some(self.in_flight.remove(call).1)
+    }
+
+    fn status_ended(&mut self, now: Duration) {
+        self.stock.asked = false;
+        self.stock.ended = true;
+        self.stock.due = now.saturating_add(STATUS_EVERY);
+    }
+
+    fn answered(&mut self, now: Duration, came: usize) {
+        let waited = now.saturating_sub(self.unanswered_since.replace(now).unwrap_or(now));
+        self.supply.answered(waited, came);
+    }
+
+    fn back_off(&mut self, now: Duration, class: FailureClass) {
+        let (first, longest) = if class == FailureClass::KeysLost { PAUSE_LOST } else { PAUSE };
+        let full = (first * (1 << self.failures.min(10))).min(longest);
+        let pause = full / 2 + full / 2 * u32::from((self.jitter)()) / 255;
+        self.not_before = self.not_before.max(now.saturating_add(pause));
+        self.failures = self.failures.saturating_add(1);
+    }
+}
+
+impl<K> fmt::Debug for Core<K> {
+    /// Counts only: `K` is a secret.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Core")
+            .field("settings", &self.settings)
+            .field("held", &self.held.len())
+            .field("asked", &self.asked())
+            .finish_non_exhaustive()
+    }
+}

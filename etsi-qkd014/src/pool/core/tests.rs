@@ -1,0 +1,312 @@
+//! The rules under a clock of the test's own, hostile orders of events first.
+
+use proptest::prelude::*;
+
+use super::*;
+
+const fn ms(millis: u64) -> Duration {
+    Duration::from_millis(millis)
+}
+
+fn stock(stored_key_count: u64, max_key_per_request: u64) -> Stock {
+    Stock { stored_key_count, max_key_per_request }
+}
+
+/// A pool with a target whose KME has told its stock.
+fn core(target: usize, stock: Stock) -> Core<u32> {
+    let mut core = Core::new(Settings { target, ..Settings::default() }, || 255);
+    assert_eq!(core.poll(ms(0)), Some(Ask::Status));
+    core.on_stock(ms(0), stock);
+    core
+}
+
+fn asks(core: &mut Core<u32>, now: Duration) -> Vec<Ask> {
+    std::iter::from_fn(|| core.poll(now)).collect()
+}
+
+#[derive(Clone, Debug)]
+enum Event {
+    Pass(u64),
+    /// The call in flight at this place gives so many of its keys.
+    Keys(usize, u32),
+    Fail(usize, FailureClass),
+    Stock(u64, u64),
+    Take,
+    Target(usize),
+    Hold(u64),
+}
+
+fn event() -> impl Strategy<Value = Event> {
+    use FailureClass::{KeysLost, Refused, Unserved};
+    prop_oneof![
+        (0..3_000u64).prop_map(Event::Pass),
+        (0..8usize, 0..10u32).prop_map(|(i, n)| Event::Keys(i, n)),
+        (0..8usize, Just(u32::MAX)).prop_map(|(i, n)| Event::Keys(i, n)),
+        (0..8usize, prop_oneof![Just(KeysLost), Just(Refused), Just(Unserved)])
+            .prop_map(|(i, class)| Event::Fail(i, class)),
+        (prop_oneof![Just(0), 0..200u64, Just(u64::MAX)], prop_oneof![Just(0), 0..20u64])
+            .prop_map(|(stored, most)| Event::Stock(stored, most)),
+        Just(Event::Take),
+        Just(Event::Take),
+        (0..40usize).prop_map(Event::Target),
+        (0..10_000u64).prop_map(Event::Hold),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(512))]
+
+    #[test]
+    fn whatever_happens_the_rules_hold(
+        events in proptest::collection::vec(event(), 0..200),
+        batch in 0..12u32,
+        calls in 0..6usize,
+        max_age in prop_oneof![1..20_000u64, Just(u64::MAX)],
+        jitter: u8,
+    ) {
+        let mut settings = Settings { target: 8, batch, calls, ..Settings::default() };
+        settings.max_age = if max_age == u64::MAX { Duration::MAX } else { ms(max_age) };
+        let max_age = settings.max_age;
+        let mut core = Core::new(settings, move || jitter);
+        let (mut now, mut target, mut held_until) = (ms(0), 8, ms(0));
+        let mut last_stock: Option<Stock> = None;
+        let mut flying: Vec<(u32, Duration)> = Vec::new();
+        let mut status_flying = false;
+        // Each key is (number, when it was asked for).
+        let mut made = 0u32;
+        let mut taken = std::collections::HashSet::new();
+        for event in events {
+            match event {
+                Event::Pass(millis) => now += ms(millis),
+                Event::Keys(i, given) if !flying.is_empty() => {
+                    let (n, _) = flying.remove(i % flying.len());
+                    // The core may have counted another call of the same size as ended: so the
+                    // age known here is the youngest possible one.
+                    let keys: Vec<(u32, Duration)> =
+                        (0..n.min(given)).map(|k| (made + k, now)).collect();
+                    made += n;
+                    core.on_keys(now, n, keys);
+                }
+                Event::Fail(i, class) if !flying.is_empty() => {
+                    let (n, _) = flying.remove(i % flying.len());
+                    core.on_failure(now, Ask::Keys(n), class);
+                }
+                Event::Stock(stored, most) if status_flying => {
+                    status_flying = false;
+                    let told = stock(stored, most);
+                    last_stock = Some(told);
+                    core.on_stock(now, told);
+                }
+                Event::Fail(_, class) if status_flying => {
+                    status_flying = false;
+                    core.on_failure(now, Ask::Status, class);
+                }
+                Event::Take => {
+                    if let Some((key, came)) = core.take(now) {
+                        prop_assert!(taken.insert(key), "taken twice");
+                        prop_assert!(now - came < max_age, "too old");
+                    }
+                }
+                Event::Target(keys) => {
+                    target = keys;
+                    core.set_target(keys);
+                }
+                Event::Hold(millis) => {
+                    held_until = held_until.max(now + ms(millis));
+                    core.hold_until(now + ms(millis));
+                }
+                _ => {}
+            }
+            while let Some(ask) = core.poll(now) {
+                match ask {
+                    Ask::Status => {
+                        prop_assert!(!status_flying, "one status call at a time");
+                        status_flying = true;
+                    }
+                    Ask::Keys(n) => {
+                        flying.push((n, now));
+                        let status = core.status(now);
+                        prop_assert!(n >= 1 && n <= batch.max(1));
+                        prop_assert!(flying.len() <= calls.max(1));
+                        prop_assert!(now >= held_until);
+                        prop_assert!(status.held + status.asked <= target);
+                        match last_stock {
+                            None => prop_assert_eq!(n, 1, "nothing is known"),
+                            Some(stock) => {
+                                let most = stock.max_key_per_request;
+                                prop_assert!(most == 0 || u64::from(n) <= most);
+                                let count = stock.stored_key_count;
+                                let ahead = (status.held + status.asked) as u64;
+                                prop_assert!(count == 0 || ahead <= (count / 4).max(1));
+                            }
+                        }
+                    }
+                }
+            }
+            let status = core.status(now);
+            let asked: u32 = flying.iter().map(|(n, _)| n).sum();
+            prop_assert_eq!(status.asked, asked as usize);
+            let gone = status.taken + status.expired + status.held as u64;
+            prop_assert_eq!(status.obtained, gone, "no key comes or goes unseen");
+            prop_assert_eq!(status.taken, taken.len() as u64);
+            if let Some(at) = core.poll_timeout() {
+                prop_assert!(at > now, "polled out, so the next thing is later");
+            }
+        }
+        // It never falls asleep while keys are missing.
+        if flying.is_empty() && !status_flying {
+            core.set_target(1000);
+            let at = core.poll_timeout().expect("something is to come");
+            let asked = asks_any(&mut core, at.max(now)) || {
+                let at = core.poll_timeout().expect("expiry or status came first");
+                asks_any(&mut core, at)
+            };
+            prop_assert!(asked);
+        }
+    }
+}
+
+fn asks_any<K>(core: &mut Core<K>, now: Duration) -> bool {
+    core.poll(now).is_some()
+}
+
+#[test]
+fn a_kme_that_tells_nothing_is_asked_for_one_key_at_a_time() {
+    let mut core: Core<u32> = Core::new(Settings::default(), || 0);
+    assert_eq!(asks(&mut core, ms(0)), [Ask::Status], "no key before the KME's limits are known");
+    core.on_failure(ms(0), Ask::Status, FailureClass::Unserved);
+    assert_eq!(asks(&mut core, ms(0)), [Ask::Keys(1); 4]);
+}
+
+#[test]
+fn zeros_in_a_status_say_nothing() {
+    let mut core = core(16, stock(0, 0));
+    assert_eq!(asks(&mut core, ms(0)), [Ask::Keys(8); 2]);
+}
+
+#[test]
+fn the_stock_and_the_limit_of_a_request_bound_what_is_asked() {
+    let mut small = core(16, stock(20, 3));
+    assert_eq!(asks(&mut small, ms(0)), [Ask::Keys(3), Ask::Keys(2)], "a quarter of 20");
+    let mut last = core(16, stock(1, 8));
+    assert_eq!(asks(&mut last, ms(0)), [Ask::Keys(1)]);
+    let mut none = core(0, stock(1000, 8));
+    assert_eq!(asks(&mut none, ms(0)), []);
+}
+
+#[test]
+fn an_empty_store_halves_the_batch_and_a_success_doubles_it() {
+    let mut core = core(8, stock(0, 0));
+    let mut now = ms(0);
+    for expected in [8, 4, 2, 1, 1] {
+        now = core.poll_timeout().unwrap().max(now);
+        assert_eq!(core.poll(now), Some(Ask::Keys(expected)));
+        core.on_failure(now, Ask::Keys(expected), FailureClass::Refused);
+        assert_eq!(core.poll(now), None, "not before the pause is over");
+    }
+    now = core.poll_timeout().unwrap();
+    assert_eq!(core.poll(now), Some(Ask::Keys(1)));
+    core.on_keys(now, 1, [0]);
+    core.take(now);
+    assert_eq!(core.poll(now), Some(Ask::Keys(2)));
+}
+
+#[test]
+fn failures_that_may_cost_keys_wait_longer_and_jitter_stays_in_the_upper_half() {
+    for (class, waits) in [
+        (FailureClass::Unserved, [100, 200, 400, 800, 1_600, 2_000, 2_000]),
+        (FailureClass::KeysLost, [1_000, 2_000, 4_000, 8_000, 16_000, 30_000, 30_000]),
+    ] {
+        for (jitter, share) in [(0, 2), (255, 1)] {
+            let settings = Settings { target: 1, ..Settings::default() };
+            let mut core: Core<u32> = Core::new(settings, move || jitter);
+            core.poll(ms(0));
+            core.on_stock(ms(0), stock(0, 0));
+            // The status calls stay out of the way: one is in flight all the time.
+            let mut now = ms(5_000);
+            assert_eq!(core.poll(now), Some(Ask::Status));
+            for wait in waits {
+                assert_eq!(core.poll(now), Some(Ask::Keys(1)));
+                core.on_failure(now, Ask::Keys(1), class);
+                assert_eq!(core.poll_timeout(), Some(now + ms(wait / share)));
+                now += ms(wait / share);
+            }
+        }
+    }
+}
+
+#[test]
+fn a_kme_that_gives_only_repeated_keys_is_not_asked_in_a_loop() {
+    let mut core = core(8, stock(0, 0));
+    assert_eq!(core.poll(ms(0)), Some(Ask::Keys(8)));
+    core.on_keys(ms(0), 8, []);
+    assert_eq!(core.poll(ms(999)), None);
+    let status = core.status(ms(1_000));
+    assert_eq!((status.unusable, status.failures, status.obtained), (8, 1, 0));
+    assert!(status.is_stalled());
+    assert_eq!(core.poll(ms(1_000)), Some(Ask::Keys(8)));
+}
+
+#[test]
+fn keys_that_nobody_takes_are_dropped_when_they_are_old() {
+    struct Counted(std::sync::Arc<()>);
+    let live = std::sync::Arc::new(());
+    let settings = Settings { target: 2, max_age: ms(1_000), ..Settings::default() };
+    let mut core: Core<Counted> = Core::new(settings, || 0);
+    core.poll(ms(0));
+    core.on_stock(ms(0), stock(0, 0));
+    assert_eq!(core.poll(ms(0)), Some(Ask::Keys(2)));
+    // The age counts from the asking: the KME wiped them that long after.
+    core.on_keys(ms(400), 2, [Counted(live.clone()), Counted(live.clone())]);
+    assert_eq!(core.poll_timeout(), Some(ms(1_000)));
+    assert!(core.take(ms(999)).is_some_and(|key| std::sync::Arc::ptr_eq(&key.0, &live)));
+    assert!(core.take(ms(1_000)).is_none());
+    assert_eq!(std::sync::Arc::strong_count(&live), 1, "dropped, not only hidden");
+    assert_eq!(core.status(ms(1_000)).expired, 1);
+}
+
+#[test]
+fn the_oldest_key_goes_first_though_answers_overtake_each_other() {
+    let mut core = core(12, stock(0, 0));
+    assert_eq!(core.poll(ms(0)), Some(Ask::Keys(8)));
+    assert_eq!(core.poll(ms(10)), Some(Ask::Keys(4)));
+    core.on_keys(ms(20), 4, 8..12);
+    core.on_keys(ms(30), 8, 0..8);
+    let taken: Vec<u32> = std::iter::from_fn(|| core.take(ms(40))).collect();
+    assert_eq!(taken, (0..12).collect::<Vec<_>>());
+}
+
+#[test]
+fn a_refill_waits_for_a_batch_to_be_missing() {
+    let mut core = core(16, stock(0, 0));
+    assert_eq!(asks(&mut core, ms(0)), [Ask::Keys(8); 2]);
+    core.on_keys(ms(0), 8, 0..8);
+    core.on_keys(ms(0), 8, 8..16);
+    for _ in 0..3 {
+        core.take(ms(1));
+        assert!(!core.wants_keys(ms(1)));
+        assert_eq!(core.poll(ms(1)), None);
+    }
+    core.take(ms(1));
+    assert!(core.wants_keys(ms(1)));
+    assert_eq!(core.poll(ms(1)), Some(Ask::Keys(4)));
+}
+
+#[test]
+fn a_stall_is_seen_while_calls_hang_and_ends_with_the_first_key() {
+    let mut core = core(1, stock(0, 0));
+    assert_eq!(core.poll(ms(0)), Some(Ask::Keys(1)));
+    assert!(!core.status(ms(999)).is_stalled());
+    assert!(core.status(ms(1_000)).is_stalled());
+    core.on_keys(ms(1_000), 1, [0]);
+    assert_eq!(core.poll(ms(1_000)), None);
+    assert_eq!(core.status(ms(9_000)).waiting, None);
+}
+
+#[test]
+fn nobody_but_its_owner_sees_a_key_in_debug() {
+    let mut core = Core::new(Settings::default(), || 0);
+    core.on_keys(ms(0), 1, ["secret"]);
+    let shown = format!("{core:?}");
+    assert!(!shown.contains("secret") && shown.contains("held: 1"), "{shown}");
+}

@@ -1,0 +1,265 @@
+//! A ledger in a file: a header of 32 bytes, then a SHA-256 for each key_ID.
+//!
+//! A batch is written after the last whole record and brought to stable storage before anybody may
+//! use its keys. What a crash leaves of a batch in between does no harm, whether part of it,
+//! zeros or nothing: its keys were never handed out.
+
+use std::collections::HashSet;
+use std::fs::{File, OpenOptions};
+use std::io::{self, BufReader, Read};
+use std::os::unix::fs::{FileExt, MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+
+use rustix::fs::{FlockOperation, OFlags, flock};
+use rustix::io::Errno;
+
+use super::{LedgerError, Sha, Short, short};
+
+/// As long as a record, so that no record crosses a block of the disk.
+const HEADER: &[u8; RECORD] = b"etsi-qkd014 ledger of key_IDs 1\n";
+const RECORD: usize = 32;
+
+pub(super) struct FileLedger {
+    path: PathBuf,
+    file: File,
+    /// Bytes of header and whole records that are on stable storage.
+    good: u64,
+    /// The file may hold more than `good`.
+    torn: bool,
+    /// The system failed to bring a write to stable storage. It may forget that it did, so that
+    /// another try proves nothing.
+    broken: bool,
+    seen: HashSet<Short>,
+}
+
+impl FileLedger {
+    pub(super) fn open(path: PathBuf) -> Result<Self, LedgerError> {
+        match Self::open_at(&path) {
+            Ok(opened) => opened,
+            Err(source) => Err(LedgerError::Open { path, source }),
+        }
+    }
+
+    fn open_at(path: &Path) -> io::Result<Result<Self, LedgerError>> {
+        let file = OpenOptions::new()
+            .read(true)
+            .write(true)
+            .create(true)
+            .truncate(false)
+            .mode(0o600)
+            .custom_flags((OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32)
+            .open(path)?;
+        let meta = file.metadata()?;
+        let path = path.to_owned();
+        if !meta.is_file() {
+            return Ok(Err(LedgerError::NotALedger { path, reason: "it is no regular file" }));
+        }
+        match flock(&file, FlockOperation::NonBlockingLockExclusive) {
+            Ok(()) => {}
+            Err(Errno::WOULDBLOCK) => return Ok(Err(LedgerError::Locked { path })),
+            Err(errno) => return Err(errno.into()),
+        }
+        if meta.mode() & 0o077 != 0 {
+            return Ok(Err(LedgerError::NotPrivate { path, mode: meta.mode() & 0o7777 }));
+        }
+        let mut this = Self::over(path, file);
+        if this.load()? {
+            return Ok(Ok(this));
+        }
+        Ok(Err(LedgerError::NotALedger { path: this.path, reason: "it begins otherwise" }))
+    }
+
+    fn over(path: PathBuf, file: File) -> Self {
+        Self { path, file, good: 0, torn: false, broken: false, seen: HashSet::new() }
+    }
+
+    /// Reads the file and cuts off what is torn; `false` where it is no ledger.
+    fn load(&mut self) -> io::Result<bool> {
+        let mut reader = BufReader::with_capacity(1 << 16, &self.file);
+        let mut begin = Vec::with_capacity(RECORD);
+        (&mut reader).take(RECORD as u64).read_to_end(&mut begin)?;
+        if !HEADER.starts_with(&begin) {
+            return Ok(false);
+        }
+        if begin.len() < RECORD {
+            // New, or torn when it was made.
+            self.file.write_all_at(HEADER, 0)?;
+            self.file.sync_all()?;
+            self.sync_directory()?;
+            self.good = RECORD as u64;
+            return Ok(true);
+        }
+        let mut good = RECORD as u64;
+        let mut record = [0; RECORD];
+        loop {
+            let mut have = 0;
+            while have < RECORD {
+                match reader.read(&mut record[have..])? {
+                    0 => break,
+                    n => have += n,
+                }
+            }
+            if have < RECORD {
+                break;
+            }
+            self.seen.insert(short(&record));
+            good += RECORD as u64;
+        }
+        self.good = good;
+        // What a crash left may be in the system's memory only, also whole records.
+        self.file.set_len(good)?;
+        self.file.sync_all()?;
+        Ok(true)
+    }
+
+    /// A new file's name must survive a crash too.
+    fn sync_directory(&self) -> io::Result<()> {
+        let parent = self.path.parent().filter(|parent| !parent.as_os_str().is_empty());
+        File::open(parent.unwrap_or(Path::new(".")))?.sync_all()
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.seen.len()
+    }
+
+    pub(super) fn record(&mut self, shas: &[Sha]) -> Result<Vec<bool>, LedgerError> {
+        if self.broken {
+            return Err(LedgerError::Broken { path: self.path.clone() });
+        }
+        let mut batch = HashSet::new();
+        let mut bytes = Vec::new();
+        let mut new = Vec::with_capacity(shas.len());
+        for sha in shas {
+            let is_new = !self.seen.contains(&short(sha)) && batch.insert(short(sha));
+            if is_new {
+                bytes.extend_from_slice(sha);
+            }
+            new.push(is_new);
+        }
+        if !bytes.is_empty() {
+            let written = self.append(&bytes);
+            written.map_err(|source| LedgerError::Write { path: self.path.clone(), source })?;
+            self.seen.extend(batch);
+        }
+        Ok(new)
+    }
+
+    fn append(&mut self, bytes: &[u8]) -> io::Result<()> {
+        if self.torn {
+            self.cut()?;
+        }
+        if let Err(error) = self.file.write_all_at(bytes, self.good) {
+            self.torn = true;
+            // Where this fails too, it is tried again before the next write.
+            let _ = self.cut();
+            return Err(error);
+        }
+        if let Err(error) = self.file.sync_data() {
+            self.broken = true;
+            return Err(error);
+        }
+        self.good += bytes.len() as u64;
+        Ok(())
+    }
+
+    fn cut(&mut self) -> io::Result<()> {
+        self.file.set_len(self.good)?;
+        self.torn = false;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Ledger, sha};
+    use super::*;
+
+    fn temp() -> (tempfile::TempDir, PathBuf) {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("ledger");
+        (dir, path)
+    }
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn a_device_that_takes_nothing_is_an_error_and_no_key_is_new() {
+        let full = OpenOptions::new().read(true).write(true).open("/dev/full").unwrap();
+        let mut ledger = FileLedger::over("/dev/full".into(), full);
+        for _ in 0..3 {
+            let error = ledger.record(&[sha("a")]).unwrap_err();
+            assert!(matches!(error, LedgerError::Write { .. }), "{error}");
+            assert_eq!(ledger.len(), 0);
+        }
+    }
+
+    #[test]
+    fn a_storage_that_lost_a_write_is_not_trusted_again() {
+        // The state that a failed fdatasync leaves.
+        let (_dir, path) = temp();
+        let mut ledger = FileLedger::open(path).unwrap();
+        ledger.broken = true;
+        assert!(matches!(ledger.record(&[sha("a")]), Err(LedgerError::Broken { .. })));
+    }
+
+    #[test]
+    fn a_ledger_cut_at_any_byte_opens_with_its_whole_records() {
+        let (_dir, path) = temp();
+        let ids = ["a", "b", "c"];
+        Ledger::file(&path).unwrap().record(ids).unwrap();
+        let whole = std::fs::read(&path).unwrap();
+        assert_eq!(whole.len(), 4 * RECORD);
+        for cut in 0..=whole.len() {
+            std::fs::write(&path, &whole[..cut]).unwrap();
+            let kept = (cut / RECORD).saturating_sub(1);
+            let ledger = Ledger::file(&path).unwrap();
+            assert_eq!(ledger.len(), kept, "cut at {cut}");
+            let new: Vec<bool> = (0..3).map(|i| i >= kept).collect();
+            assert_eq!(ledger.record(ids).unwrap(), new, "cut at {cut}");
+            drop(ledger);
+            assert_eq!(std::fs::read(&path).unwrap(), whole, "cut at {cut}");
+        }
+    }
+
+    #[test]
+    fn what_is_no_ledger_is_left_as_it_is() {
+        let (dir, path) = temp();
+        for text in ["x", "someone's diary, which is a good deal longer than the header is"] {
+            std::fs::write(&path, text).unwrap();
+            use std::os::unix::fs::PermissionsExt;
+            std::fs::set_permissions(&path, PermissionsExt::from_mode(0o600)).unwrap();
+            let error = Ledger::file(&path).unwrap_err();
+            assert!(matches!(error, LedgerError::NotALedger { .. }), "{error}");
+            assert_eq!(std::fs::read_to_string(&path).unwrap(), text);
+        }
+        let link = dir.path().join("link");
+        std::os::unix::fs::symlink(&path, &link).unwrap();
+        assert!(matches!(Ledger::file(&link), Err(LedgerError::Open { .. })));
+        assert!(matches!(Ledger::file(dir.path()), Err(LedgerError::Open { .. })));
+        assert!(matches!(Ledger::file("/dev/null"), Err(LedgerError::NotALedger { .. })));
+        assert!(matches!(Ledger::file(dir.path().join("no/where")), Err(LedgerError::Open { .. })));
+    }
+
+    #[test]
+    fn a_ledger_that_others_may_touch_is_refused_and_a_new_one_is_private() {
+        use std::os::unix::fs::PermissionsExt;
+        let (_dir, path) = temp();
+        drop(Ledger::file(&path).unwrap());
+        assert_eq!(std::fs::metadata(&path).unwrap().mode() & 0o7777, 0o600);
+        for mode in [0o640, 0o602, 0o604] {
+            std::fs::set_permissions(&path, PermissionsExt::from_mode(mode)).unwrap();
+            let error = Ledger::file(&path).unwrap_err();
+            assert!(error.to_string().contains("chmod 600"), "{error}");
+        }
+    }
+
+    #[test]
+    fn one_ledger_at_a_time_has_the_file_and_the_next_knows_all() {
+        let (_dir, path) = temp();
+        let first = Ledger::file(&path).unwrap();
+        first.record(["a"]).unwrap();
+        assert!(matches!(Ledger::file(&path), Err(LedgerError::Locked { .. })));
+        drop(first);
+        let second = Ledger::file(&path).unwrap();
+        assert_eq!(second.record(["A", "b"]).unwrap(), [false, true]);
+    }
+}

@@ -1,0 +1,223 @@
+//! A record of the key_IDs that were there before, so that no key is used twice.
+
+use std::collections::{HashSet, VecDeque};
+use std::fmt;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use sha2::{Digest, Sha256};
+
+#[cfg(unix)]
+mod file;
+
+/// Remembers key_IDs, so that a key is handed out once even where a KME repeats itself.
+///
+/// A key_ID is known by the SHA-256 of its text in lower case: a KME may answer in another letter
+/// case. Nothing of a key is kept. In memory 8 bytes of each digest are looked up; two key_IDs that
+/// share them, which one pair in 2^64 does, cost a key and never let one through.
+///
+/// Cheap to clone, and all clones are one ledger. Pools of one KME may share a ledger; where two
+/// KMEs count their keys instead of naming them by UUIDs, each needs its own.
+#[derive(Clone)]
+pub struct Ledger {
+    inner: Arc<Mutex<Inner>>,
+    in_file: bool,
+}
+
+enum Inner {
+    Memory(Memory),
+    #[cfg(unix)]
+    File(file::FileLedger),
+}
+
+/// Why a ledger cannot be opened, or cannot record.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum LedgerError {
+    /// The file cannot be opened, read, or brought into shape.
+    #[error("ledger {path}: {source}", path = path.display())]
+    Open {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// It is something else than a ledger. It was left as it is.
+    #[error("{path} is no ledger: {reason}; it was left as it is", path = path.display())]
+    NotALedger {
+        /// The file.
+        path: PathBuf,
+        /// What it is.
+        reason: &'static str,
+    },
+    /// Others than its owner may read or write it.
+    #[error("ledger {path} has mode {mode:o}: others could change it; chmod 600", path = path.display())]
+    NotPrivate {
+        /// The file.
+        path: PathBuf,
+        /// Its permission bits.
+        mode: u32,
+    },
+    /// Another process, or another [`Ledger`] of this one, has it open.
+    #[error("ledger {path} is in use by another process", path = path.display())]
+    Locked {
+        /// The file.
+        path: PathBuf,
+    },
+    /// Key_IDs could not be written to stable storage, so their keys must not be used.
+    #[error("ledger {path}: key_IDs could not be recorded: {source}", path = path.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// The system lost a write before. Nothing is recorded any more until the ledger is opened
+    /// anew.
+    #[error("ledger {path}: storage failed before; open it anew once that is repaired", path = path.display())]
+    Broken {
+        /// The file.
+        path: PathBuf,
+    },
+}
+
+/// First bytes of a digest.
+type Short = u64;
+type Sha = [u8; 32];
+
+impl Ledger {
+    /// Key_IDs that a ledger in memory remembers by default. About 32 bytes each: 2 MiB.
+    pub const DEFAULT_CAPACITY: usize = 65_536;
+
+    /// A ledger that ends with the process and remembers the last `capacity` key_IDs, at least
+    /// one; about 32 bytes each.
+    #[must_use]
+    pub fn memory(capacity: usize) -> Self {
+        let memory = Memory { capacity: capacity.max(1), ..Memory::default() };
+        Self { inner: Arc::new(Mutex::new(Inner::Memory(memory))), in_file: false }
+    }
+
+    /// A ledger in a file, which is made (mode 0600) where there is none. It forgets nothing: 32
+    /// bytes a key in the file and about 16 in memory. Key_IDs are on stable storage before
+    /// [`record`](Self::record) returns.
+    ///
+    /// The file is locked (`flock`) against a second ledger on it, for as long as a clone lives. A
+    /// record that a crash tore is cut off: its key was not handed out. Blocks on the disk.
+    ///
+    /// # Errors
+    /// [`LedgerError`]: it cannot be opened, is no ledger, is open to others, or is in use.
+    #[cfg(unix)]
+    pub fn file(path: impl Into<PathBuf>) -> Result<Self, LedgerError> {
+        let file = file::FileLedger::open(path.into())?;
+        Ok(Self { inner: Arc::new(Mutex::new(Inner::File(file))), in_file: true })
+    }
+
+    /// Records key_IDs and says of each whether it is new: only then may its key be used. All are
+    /// recorded, or none. A key_ID that is there twice is new once. With a file it blocks on the
+    /// disk, once for all.
+    ///
+    /// # Errors
+    /// [`LedgerError`]: nothing was recorded for certain, and none of the keys may be used.
+    pub fn record<I>(&self, key_ids: I) -> Result<Vec<bool>, LedgerError>
+    where
+        I: IntoIterator<Item: AsRef<str>>,
+    {
+        let shas: Vec<Sha> = key_ids.into_iter().map(|id| sha(id.as_ref())).collect();
+        match &mut *self.inner.lock().unwrap_or_else(PoisonError::into_inner) {
+            Inner::Memory(memory) => Ok(shas.iter().map(|sha| memory.insert(short(sha))).collect()),
+            #[cfg(unix)]
+            Inner::File(file) => file.record(&shas),
+        }
+    }
+
+    /// Key_IDs that it remembers.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        match &*self.inner.lock().unwrap_or_else(PoisonError::into_inner) {
+            Inner::Memory(memory) => memory.order.len(),
+            #[cfg(unix)]
+            Inner::File(file) => file.len(),
+        }
+    }
+
+    /// Whether it remembers none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Whether [`record`](Self::record) blocks on a disk.
+    pub(super) fn blocks(&self) -> bool {
+        self.in_file
+    }
+}
+
+impl Default for Ledger {
+    /// In memory, with [`DEFAULT_CAPACITY`](Self::DEFAULT_CAPACITY).
+    fn default() -> Self {
+        Self::memory(Self::DEFAULT_CAPACITY)
+    }
+}
+
+impl fmt::Debug for Ledger {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Ledger").field("in_file", &self.in_file).finish_non_exhaustive()
+    }
+}
+
+#[derive(Default)]
+struct Memory {
+    capacity: usize,
+    seen: HashSet<Short>,
+    /// The oldest first.
+    order: VecDeque<Short>,
+}
+
+impl Memory {
+    fn insert(&mut self, short: Short) -> bool {
+        if !self.seen.insert(short) {
+            return false;
+        }
+        if self.order.len() == self.capacity
+            && let Some(oldest) = self.order.pop_front()
+        {
+            self.seen.remove(&oldest);
+        }
+        self.order.push_back(short);
+        true
+    }
+}
+
+fn sha(key_id: &str) -> Sha {
+    Sha256::digest(key_id.to_ascii_lowercase()).into()
+}
+
+fn short(sha: &Sha) -> Short {
+    let [a, b, c, d, e, f, g, h, ..] = *sha;
+    Short::from_le_bytes([a, b, c, d, e, f, g, h])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_key_id_is_new_once_in_whatever_letter_case() {
+        let ledger = Ledger::default();
+        assert_eq!(ledger.record(["a", "b", "A"]).unwrap(), [true, true, false]);
+        assert_eq!(ledger.record(["B", "c"]).unwrap(), [false, true]);
+        assert_eq!(ledger.clone().record(["C"]).unwrap(), [false], "a clone is the same ledger");
+    }
+
+    #[test]
+    fn memory_is_bounded_and_forgets_the_oldest() {
+        let ledger = Ledger::memory(3);
+        for id in ["a", "b", "c", "d"] {
+            assert_eq!(ledger.record([id]).unwrap(), [true]);
+        }
+        assert_eq!(ledger.len(), 3);
+        assert_eq!(ledger.record(["b", "c", "d"]).unwrap(), [false; 3]);
+        assert_eq!(ledger.record(["a"]).unwrap(), [true], "forgotten");
+        assert_eq!(Ledger::memory(0).record(["x", "x"]).unwrap(), [true, false]);
+    }
+}
