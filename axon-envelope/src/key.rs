@@ -15,7 +15,7 @@ use crate::channel::{Channel, KeyId};
 /// ```compile_fail,E0599
 /// # use axon_envelope::KmeKey;
 /// let key = KmeKey::take(&mut [1; 32]);
-/// let copy = key.clone();
+/// let copy: KmeKey = key.clone();
 /// ```
 /// ```compile_fail,E0277
 /// # use axon_envelope::KmeKey;

@@ -45,7 +45,7 @@
 //! - **A refusal tells the sender nothing.** [`OpenError::Refused`] reads the same and does the
 //!   same work whether the key was unknown or retired, the index replayed or the tag wrong.
 //! - **Secrets are erased** on drop, are neither `Clone` nor `Debug`, and are not left behind by
-//!   moves, since they live behind a pointer.
+//!   moves, since they live behind a pointer. A [`Sealer`] or [`Opener`] prints names and counts.
 //!
 //! # Features
 //!
@@ -53,7 +53,8 @@
 //! crate is `no_std` and needs `alloc`. Every type is `Send + Sync`; sealing and opening take `&mut
 //! self`.
 //!
-//! Nothing allocates while a message is sealed or opened; adding a key does.
+//! Nothing allocates while a message is sealed or opened; adding a key does, and with `aws-lc-rs`
+//! the first refusal on a thread, for aws-lc's error queue.
 
 #![forbid(unsafe_code)]
 #![no_std]

@@ -47,6 +47,22 @@ pub const MAX_PLAINTEXT_LEN: u64 = (1 << 36) - 32;
 /// let slot = sealer.slot(now, Delivery::Reliable); // use of moved value
 /// # }
 /// ```
+/// ```compile_fail,E0382
+/// # use axon_envelope::*;
+/// # fn f(mut sealer: Sealer, now: std::time::Duration) {
+/// let key_for_another_connection = sealer.into_unused();
+/// let slot = sealer.slot(now, Delivery::Reliable); // use of moved value
+/// # }
+/// ```
+///
+/// It cannot be copied, or two would count from zero under one key:
+///
+/// ```compile_fail,E0599
+/// # use axon_envelope::*;
+/// # fn f(sealer: Sealer) {
+/// let twin: Sealer = sealer.clone();
+/// # }
+/// ```
 pub struct Sealer<A = DefaultAead>(Box<State<A>>);
 
 type Nonce = [u8; NONCE_LEN];
@@ -238,7 +254,15 @@ impl<A> fmt::Debug for Sealer<A> {
     }
 }
 
-/// A permit to seal one message under one index. Every way of sealing consumes it.
+/// A permit to seal one message under one index. Every way of sealing consumes it, and it cannot be
+/// copied:
+///
+/// ```compile_fail,E0599
+/// # use axon_envelope::*;
+/// # fn f(slot: Slot<'_>) {
+/// let twin: Slot<'_> = slot.clone();
+/// # }
+/// ```
 pub struct Slot<'a, A = DefaultAead> {
     state: &'a mut State<A>,
     delivery: Delivery,
@@ -248,6 +272,16 @@ impl<A: Aead> Slot<'_, A> {
     /// The index the message will have.
     pub fn index(&self) -> u8 {
         self.state.next
+    }
+
+    /// Bytes in front of the ciphertext, as [`Sealer::header_len`]: with another key it can differ.
+    pub fn header_len(&self) -> usize {
+        self.state.template.len()
+    }
+
+    /// Bytes the envelope will have more than its plaintext.
+    pub fn overhead(&self) -> usize {
+        self.header_len() + TAG_LEN
     }
 
     /// Seals a message where it lies: `frame` is `header_len` bytes of room, the plaintext, and
@@ -350,5 +384,31 @@ impl<A: Aead> Slot<'_, A> {
             state.reliable.insert(index);
         }
         Ok(tag)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Opener;
+    use alloc::format;
+
+    #[test]
+    fn printing_a_sealer_or_an_opener_shows_names_and_counts_alone() {
+        let channel = Channel::new("alice", "bob", b"exporter").unwrap();
+        let id = KeyId::new("id").unwrap();
+        let key = || KmeKey::take(&mut [0x6b; 32]);
+        let sealer = Sealer::new(&channel, id.clone(), key()).unwrap();
+        assert_eq!(
+            format!("{sealer:?}"),
+            "Sealer { key_id: KeyId(id), used: IndexMask(0b0000000000), \
+             reliable: IndexMask(0b0000000000), .. }"
+        );
+        let mut opener = Opener::new(channel).unwrap();
+        opener.add_key(id, key()).unwrap();
+        assert_eq!(
+            format!("{opener:?}"),
+            "Opener { channel: Channel { sender: alice, receiver: bob, .. }, keys: 1, .. }"
+        );
     }
 }

@@ -7,6 +7,21 @@ use crate::TAG_LEN;
 use crate::header::NONCE_LEN;
 
 /// AES-256-GCM by aws-lc-rs, which keeps the key behind a pointer and erases it when freed.
+///
+/// It can be neither copied nor printed:
+///
+/// ```compile_fail,E0599
+/// # use axon_envelope::aead::AwsLc;
+/// # fn f(aead: AwsLc) {
+/// let copy: AwsLc = aead.clone();
+/// # }
+/// ```
+/// ```compile_fail,E0277
+/// # use axon_envelope::aead::AwsLc;
+/// # fn f(aead: AwsLc) {
+/// println!("{aead:?}");
+/// # }
+/// ```
 // "Less safe" means that the caller answers for the nonces, which is what `Sealer` is for.
 pub struct AwsLc(LessSafeKey);
 

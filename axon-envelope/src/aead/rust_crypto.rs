@@ -10,6 +10,21 @@ use crate::TAG_LEN;
 use crate::header::NONCE_LEN;
 
 /// AES-256-GCM by RustCrypto, erased on drop.
+///
+/// It can be neither copied nor printed:
+///
+/// ```compile_fail,E0599
+/// # use axon_envelope::aead::RustCrypto;
+/// # fn f(aead: RustCrypto) {
+/// let copy: RustCrypto = aead.clone();
+/// # }
+/// ```
+/// ```compile_fail,E0277
+/// # use axon_envelope::aead::RustCrypto;
+/// # fn f(aead: RustCrypto) {
+/// println!("{aead:?}");
+/// # }
+/// ```
 // Boxed, so that a move copies a pointer and leaves no key schedule behind.
 pub struct RustCrypto(Box<Aes256Gcm>);
 

@@ -28,6 +28,15 @@ use crate::seal::KEY_MAX_AGE;
 /// retired key_IDs is bounded by [`Limits::retired_memory`]; beyond it, that a key comes once
 /// rests on the KME, which delivers each key_ID once, and on the channel's context, which is new
 /// with every connection.
+///
+/// It cannot be copied, or each copy would open every message once:
+///
+/// ```compile_fail,E0599
+/// # use axon_envelope::*;
+/// # fn f(opener: Opener) {
+/// let twin: Opener = opener.clone();
+/// # }
+/// ```
 pub struct Opener<A = DefaultAead> {
     channel: Channel,
     keys: Keyring<A>,
