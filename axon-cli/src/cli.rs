@@ -4,6 +4,8 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
+use crate::trust::cli::Trust;
+
 const ABOUT: &str = "Robot data between processes over shared memory and between hosts over QUIC, \
                      under post-quantum or quantum-distributed keys";
 
@@ -13,6 +15,7 @@ Start here:
   axon play log.mcap            replay a recorded log
   axon echo /scan               look at what arrives, here or on another host
   axon status                   the daemon's peers, links, keys and refusals
+  axon trust keygen host.key    a key for this host, for peers to pin
 
 Settings come from the environment (AXON_SECURITY_MODE, AXON_DAEMON_PEERS, ...) and from the file
 that AXON_CONFIG names; docs/configuration.md lists them. The first session on a host starts the
@@ -46,6 +49,9 @@ pub(crate) enum Command {
     /// Show the daemon: mode, peers, links, keys, topics, refusals
     #[command(after_help = STATUS_HELP)]
     Status(Status),
+    /// Make this host's key, and look at the keys of others
+    #[command(subcommand, after_help = crate::trust::cli::HELP)]
+    Trust(Trust),
     /// Run the daemon in the foreground
     #[command(after_help = DAEMON_HELP)]
     Daemon(Daemon),

@@ -13,6 +13,7 @@ mod play;
 mod session;
 mod status;
 mod text;
+mod trust;
 
 use std::process::ExitCode;
 
@@ -26,6 +27,7 @@ fn main() -> ExitCode {
         Command::Play(args) => play::run(args).map(done),
         Command::Echo(args) => echo::run(args).map(done),
         Command::Status(args) => status::run(args).map(done),
+        Command::Trust(args) => trust::run(args).map(done),
         Command::Daemon(args) => daemon::run(args),
         Command::DemoPlayer(args) => demo::run_player(args).map(done),
         Command::DemoSubscriber(args) => demo::run_subscriber(args).map(done),

@@ -2,7 +2,8 @@
 
 use std::sync::Arc;
 
-use aws_lc_rs::signature::{ML_DSA_65_SIGNING, PqdsaKeyPair};
+use aws_lc_rs::rand::SystemRandom;
+use aws_lc_rs::signature::{Ed25519KeyPair, ML_DSA_65_SIGNING, PqdsaKeyPair};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use rustls::client::AlwaysResolvesClientRawPublicKeys;
@@ -14,6 +15,17 @@ use zeroize::Zeroizing;
 
 use super::{SpkiDigest, pem};
 use crate::Error;
+
+/// What a key that is made here signs with.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum KeyAlgorithm {
+    /// ML-DSA-65 (FIPS 204), which a quantum computer does not forge.
+    #[default]
+    MlDsa65,
+    /// Ed25519 (RFC 8032), small and classical.
+    Ed25519,
+}
 
 /// A private key that signs handshakes, shown to the peer as a raw public key.
 ///
@@ -27,13 +39,18 @@ pub struct SigningKey {
 impl SigningKey {
     /// Makes a new ML-DSA-65 key.
     pub fn generate() -> Result<Self, Error> {
-        let pkcs8 = generate_pkcs8()?;
+        let pkcs8 = generate_pkcs8(KeyAlgorithm::MlDsa65)?;
         Self::from_pkcs8(&pkcs8)
     }
 
     /// Makes a new ML-DSA-65 key as a PEM file, to be read with [`SigningKey::from_pem()`].
     pub fn generate_pem() -> Result<Zeroizing<String>, Error> {
-        let pkcs8 = generate_pkcs8()?;
+        Self::generate_pem_with(KeyAlgorithm::MlDsa65)
+    }
+
+    /// The same with an algorithm of choice.
+    pub fn generate_pem_with(algorithm: KeyAlgorithm) -> Result<Zeroizing<String>, Error> {
+        let pkcs8 = generate_pkcs8(algorithm)?;
         let body = Zeroizing::new(STANDARD.encode(&*pkcs8));
         // room for every line end, so that the text is never moved and left behind
         let mut pem = Zeroizing::new(String::with_capacity(body.len() + body.len() / 64 + 80));
@@ -89,23 +106,35 @@ pub(super) fn signing_key(
         .map_err(|_| Error::PrivateKey("not a PKCS#8 key that can sign a TLS 1.3 handshake"))
 }
 
-fn generate_pkcs8() -> Result<Zeroizing<Vec<u8>>, Error> {
-    let document = PqdsaKeyPair::generate(&ML_DSA_65_SIGNING)
-        .and_then(|pair| pair.to_pkcs8v1())
-        .map_err(|_| Error::KeyGeneration)?;
+fn generate_pkcs8(algorithm: KeyAlgorithm) -> Result<Zeroizing<Vec<u8>>, Error> {
+    let document = match algorithm {
+        KeyAlgorithm::MlDsa65 => {
+            PqdsaKeyPair::generate(&ML_DSA_65_SIGNING).and_then(|pair| pair.to_pkcs8v1())
+        }
+        KeyAlgorithm::Ed25519 => Ed25519KeyPair::generate_pkcs8v1(&SystemRandom::new()),
+    };
+    let document = document.map_err(|_| Error::KeyGeneration)?;
     Ok(Zeroizing::new(document.as_ref().to_vec()))
 }
 
 #[cfg(test)]
 mod tests {
+    use rustls::SignatureScheme;
+
     use super::*;
 
     #[test]
     fn a_generated_key_reads_back_as_itself() {
-        let pem = SigningKey::generate_pem().unwrap();
-        let key = SigningKey::from_pem(&pem).unwrap();
-        assert_eq!(key.spki_digest(), SigningKey::from_pem(&pem).unwrap().spki_digest());
-        assert_ne!(key.spki_digest(), SigningKey::generate().unwrap().spki_digest());
+        for (algorithm, signs) in [
+            (KeyAlgorithm::MlDsa65, SignatureScheme::ML_DSA_65),
+            (KeyAlgorithm::Ed25519, SignatureScheme::ED25519),
+        ] {
+            let pem = SigningKey::generate_pem_with(algorithm).unwrap();
+            let key = SigningKey::from_pem(&pem).unwrap();
+            assert_eq!(key.spki_digest(), SigningKey::from_pem(&pem).unwrap().spki_digest());
+            assert_ne!(key.spki_digest(), SigningKey::generate().unwrap().spki_digest());
+            assert!(key.certified.key.choose_scheme(&[signs]).is_some(), "{algorithm:?}");
+        }
     }
 
     #[test]

@@ -20,11 +20,11 @@ use rustls::server::ResolvesServerCert;
 use rustls::{ClientConfig, ConfigBuilder, ServerConfig, WantsVerifier};
 
 pub use ca::CaMaterial;
-pub use key::SigningKey;
 use key::signing_key;
+pub use key::{KeyAlgorithm, SigningKey};
 use raw_key::RawKeys;
 pub use spki::SpkiDigest;
-pub use trust::{Trust, TrustFile, TrustFileError};
+pub use trust::{Pin, Trust, TrustFile, TrustFileError};
 use verifier::Verifier;
 
 use crate::Error;

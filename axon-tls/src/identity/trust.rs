@@ -26,11 +26,35 @@ pub struct TrustFile {
     pins: BTreeMap<SpkiDigest, Pin>,
 }
 
-#[derive(Clone, Debug)]
-struct Pin {
+/// A line of a trust file: who has which key, and until when.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Pin {
     name: String,
-    /// The first moment at which the pin no longer holds.
-    end: Option<SystemTime>,
+    key: SpkiDigest,
+    /// The last day as written, and the first moment after it.
+    last: Option<(String, SystemTime)>,
+}
+
+impl Pin {
+    /// Whose key it is.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The key.
+    pub fn key(&self) -> SpkiDigest {
+        self.key
+    }
+
+    /// The last day on which the pin holds (UTC), as `YYYY-MM-DD`.
+    pub fn last_day(&self) -> Option<&str> {
+        self.last.as_ref().map(|(day, _)| day.as_str())
+    }
+
+    /// Whether the pin holds at `now`.
+    pub fn holds(&self, now: SystemTime) -> bool {
+        self.last.as_ref().is_none_or(|(_, end)| now < *end)
+    }
 }
 
 /// A line of a trust file that cannot be used.
@@ -39,6 +63,18 @@ struct Pin {
 pub struct TrustFileError {
     line: usize,
     reason: &'static str,
+}
+
+impl TrustFileError {
+    /// The line, counted from 1.
+    pub fn line(&self) -> usize {
+        self.line
+    }
+
+    /// What is wrong with it.
+    pub fn reason(&self) -> &'static str {
+        self.reason
+    }
 }
 
 impl TrustFile {
@@ -62,7 +98,15 @@ impl TrustFile {
     /// The name that has the key, if it is valid at `now`.
     pub fn name_of(&self, key: &SpkiDigest, now: SystemTime) -> Option<&str> {
         let pin = self.pins.get(key)?;
-        pin.end.is_none_or(|end| now < end).then_some(pin.name.as_str())
+        pin.holds(now).then_some(pin.name.as_str())
+    }
+
+    /// Every key with its name, those of one name together, the one that ends first in front.
+    pub fn pins(&self) -> impl Iterator<Item = &Pin> {
+        let mut pins: Vec<_> = self.pins.values().collect();
+        let end = |pin: &Pin| pin.last.as_ref().map(|(_, end)| *end);
+        pins.sort_by_key(|pin| (pin.name.as_str(), end(pin).is_none(), end(pin)));
+        pins.into_iter()
     }
 
     /// Every name, sorted, once.
@@ -90,11 +134,14 @@ impl TrustFile {
         if name.len() > 255 || !name.bytes().all(|byte| byte.is_ascii_graphic()) {
             return Err("a name has at most 255 printable ASCII characters");
         }
-        let digest = digest
+        let key = digest
             .parse()
             .map_err(|_| "the key must be `spki-sha256:` and 44 characters of base64")?;
-        let end = match day {
-            Some(day) => Some(end_of_day(day).ok_or("the last day must be a date YYYY-MM-DD")?),
+        let last = match day {
+            Some(day) => {
+                let end = end_of_day(day).ok_or("the last day must be a date YYYY-MM-DD")?;
+                Some((day.to_owned(), end))
+            }
             None => None,
         };
 
@@ -102,7 +149,7 @@ impl TrustFile {
         if same_name == Self::MAX_PINS_PER_NAME {
             return Err("a name can have at most two keys");
         }
-        if self.pins.insert(digest, Pin { name: name.to_owned(), end }).is_some() {
+        if self.pins.insert(key, Pin { name: name.to_owned(), key, last }).is_some() {
             return Err("this key is in the file twice");
         }
         Ok(())
@@ -204,6 +251,15 @@ mod tests {
         assert_eq!(file.name_of(&key, midnight - Duration::from_nanos(1)), Some("a"));
         assert_eq!(file.name_of(&key, midnight), None);
         assert_eq!(file.name_of(&SpkiDigest([0; 32]), midnight), None);
+    }
+
+    #[test]
+    fn pins_say_what_their_lines_say() {
+        let [one, two, three] = [1, 2, 3].map(|byte| SpkiDigest([byte; 32]));
+        let text = format!("b {one}\nb {two} 2024-02-29 # old\na {three}");
+        let file = TrustFile::parse(&text).unwrap();
+        let pins: Vec<_> = file.pins().map(|p| (p.name(), p.key(), p.last_day())).collect();
+        assert_eq!(pins, [("a", three, None), ("b", two, Some("2024-02-29")), ("b", one, None)]);
     }
 
     #[test]

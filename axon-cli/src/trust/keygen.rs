@@ -1,0 +1,51 @@
+//! `axon trust keygen`: a key for this host.
+
+use std::{
+    fs::{self, File, OpenOptions},
+    io::{ErrorKind, Write as _},
+    os::unix::fs::OpenOptionsExt as _,
+    path::Path,
+};
+
+use axon_tls::identity::SigningKey;
+
+use super::{cli, files::failed, line::line};
+use crate::failure::Failure;
+
+/// Runs `axon trust keygen`.
+pub(super) fn run(args: &cli::Keygen) -> Result<(), Failure> {
+    let name = args.name.clone().unwrap_or_else(node_name);
+    let pem = SigningKey::generate_pem_with(args.algorithm.into()).map_err(Failure::failed)?;
+    let key = SigningKey::from_pem(&pem).map_err(Failure::failed)?;
+    // A name that no trust file can hold is refused before there is a file.
+    let line = line(&name, key.spki_digest())?;
+    create(&args.file, pem.as_bytes())?;
+    writeln!(std::io::stdout().lock(), "{line}")?;
+    Ok(())
+}
+
+/// Writes a file that did not exist, for its owner alone.
+fn create(path: &Path, content: &[u8]) -> Result<(), Failure> {
+    let mut options = OpenOptions::new();
+    options.write(true).create_new(true).mode(0o600);
+    let file = options.open(path).map_err(|error| match error.kind() {
+        ErrorKind::AlreadyExists => {
+            failed(path, &"exists, and is not overwritten; delete it, or name another file")
+        }
+        _ => failed(path, &error),
+    })?;
+    write(file, content).map_err(|error| {
+        // Half a key is of no use, and would be in the way of the next try.
+        let _ = fs::remove_file(path);
+        failed(path, &error)
+    })
+}
+
+fn write(mut file: File, content: &[u8]) -> std::io::Result<()> {
+    file.write_all(content)?;
+    file.sync_all()
+}
+
+fn node_name() -> String {
+    rustix::system::uname().nodename().to_string_lossy().into_owned()
+}

@@ -1,0 +1,97 @@
+//! `axon trust list`: the keys in a trust file.
+
+use std::{io::Write as _, path::PathBuf, time::SystemTime};
+
+use axon_tls::identity::{SpkiDigest, TrustFile};
+use axon_transport::config::{ClassicConfig, Config, Security};
+
+use super::{cli, files};
+use crate::{
+    failure::Failure,
+    logging,
+    text::{Table, printable},
+};
+
+/// Runs `axon trust list`.
+pub(super) fn run(args: &cli::List) -> Result<(), Failure> {
+    let (trust, key) = paths(args)?;
+    let file = files::trust(&trust)?;
+    let own = key.as_deref().map(files::key).transpose()?.map(|key| key.spki_digest());
+    let text = render(&file, own, SystemTime::now());
+    std::io::stdout().lock().write_all(text.as_bytes())?;
+    Ok(())
+}
+
+/// The trust file, and our own key if there is one: as given, else as the settings say.
+fn paths(args: &cli::List) -> Result<(PathBuf, Option<PathBuf>), Failure> {
+    if let Some(file) = &args.file {
+        // A file is looked at before the settings are complete, too.
+        let key = args.key.clone().or_else(|| match Config::from_env() {
+            Ok(config) => classic(config).and_then(|classic| classic.key),
+            Err(error) => {
+                let error = printable(&error.to_string());
+                eprintln!("axon: this host's key is not marked: {error}");
+                None
+            }
+        });
+        return Ok((file.clone(), key));
+    }
+    let configured = classic(logging::check()?);
+    let (trust, key) = configured.map_or((None, None), |classic| (classic.trust, classic.key));
+    let missing = "AXON_CLASSIC_TRUST: not set, accepted: the path of a trust file, or give it as \
+                   an argument";
+    let trust = trust.ok_or_else(|| Failure::Setting(missing.to_owned()))?;
+    Ok((trust, args.key.clone().or(key)))
+}
+
+fn classic(config: Config) -> Option<ClassicConfig> {
+    match config.security {
+        Security::Classic(classic) => Some(classic),
+        Security::Qkd(_) => None,
+    }
+}
+
+fn render(file: &TrustFile, own: Option<SpkiDigest>, now: SystemTime) -> String {
+    let mut table = Table::new(&["name", "key", "not after", "state"]);
+    for pin in file.pins() {
+        let state = if pin.holds(now) { "valid" } else { "expired" };
+        let mark = if own == Some(pin.key()) { ", this host" } else { "" };
+        table.row([
+            pin.name().to_owned(),
+            pin.key().to_string(),
+            pin.last_day().unwrap_or("-").to_owned(),
+            format!("{state}{mark}"),
+        ]);
+    }
+    let mut out = match table.is_empty() {
+        true => "no keys: nobody is trusted\n".to_owned(),
+        false => table.render(0),
+    };
+    if let Some(own) = own {
+        out += &format!("\nthis host: {own}\n");
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    #[test]
+    fn the_table_says_what_holds_now_and_which_key_is_ours() {
+        let [ours, theirs] = [1, 2].map(|byte| SpkiDigest([byte; 32]));
+        let text = format!("base {ours}\narm {theirs} 2024-02-29\n");
+        let file = TrustFile::parse(&text).unwrap();
+        let midnight = SystemTime::UNIX_EPOCH + Duration::from_secs(1_709_251_200);
+        let states = |now| {
+            let text = render(&file, Some(ours), now);
+            let cells = |line: &str| line.rsplit("  ").next().unwrap_or_default().trim().to_owned();
+            text.lines().skip(2).take(2).map(cells).collect::<Vec<_>>()
+        };
+        assert_eq!(states(midnight - Duration::from_secs(1)), ["valid", "valid, this host"]);
+        assert_eq!(states(midnight), ["expired", "valid, this host"]);
+        assert!(render(&TrustFile::default(), None, midnight).contains("nobody"));
+    }
+}

@@ -1,0 +1,18 @@
+//! `axon trust`: this host's key, and the keys of the hosts that it links with.
+
+pub(crate) mod cli;
+mod files;
+mod keygen;
+mod line;
+mod list;
+
+use self::cli::Trust;
+use crate::failure::Failure;
+
+/// Runs `axon trust`.
+pub(crate) fn run(args: &Trust) -> Result<(), Failure> {
+    match args {
+        Trust::Keygen(args) => keygen::run(args),
+        Trust::List(args) => list::run(args),
+    }
+}
