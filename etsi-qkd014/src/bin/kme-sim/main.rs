@@ -3,6 +3,7 @@
 
 mod fault;
 mod init;
+mod probe;
 mod run;
 
 use std::path::{Path, PathBuf};
@@ -25,6 +26,7 @@ enum Command {
     Init(init::Arguments),
     Run(run::Arguments),
     Fault(fault::Arguments),
+    Probe(probe::Arguments),
 }
 
 /// Why the program ends without success.
@@ -40,6 +42,7 @@ fn main() -> ExitCode {
         Command::Init(arguments) => init::init(&arguments),
         Command::Run(arguments) => run::run(arguments),
         Command::Fault(arguments) => fault::fault(&arguments),
+        Command::Probe(arguments) => probe::probe(arguments),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

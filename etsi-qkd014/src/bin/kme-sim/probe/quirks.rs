@@ -1,0 +1,91 @@
+//! Which quirks a KME needs.
+
+use etsi_qkd014::{Error, Quirks};
+
+/// What a call brought, and the names of the quirks that it could not do without.
+pub(super) struct Tolerated<T> {
+    pub(super) value: T,
+    pub(super) needed: Vec<&'static str>,
+}
+
+/// Makes a call strictly, then with all quirks, then without each that it does not need. The error
+/// is that of the strict call.
+///
+/// Sizes in bytes come last: that quirk changes what is asked for, not only what is accepted.
+pub(super) async fn least<T>(
+    mut call: impl AsyncFnMut(Quirks) -> Result<T, Error>,
+) -> Result<Tolerated<T>, Error> {
+    let strict = match call(Quirks::STRICT).await {
+        Ok(value) => return Ok(Tolerated { value, needed: Vec::new() }),
+        Err(error) => error,
+    };
+    // Quirks help only where an answer came and was not accepted.
+    let answered = matches!(
+        strict.cause(),
+        Error::Malformed { .. } | Error::Check { .. } | Error::BadRequest { .. }
+    );
+    if !answered {
+        return Err(strict);
+    }
+    let bytes = |name: &str| name == "size-in-bytes";
+    let all: Vec<_> = Quirks::NAMES.iter().map(|(name, _)| *name).collect();
+    let but_bytes: Vec<_> = all.iter().copied().filter(|name| !bytes(name)).collect();
+    for mut names in [but_bytes, all] {
+        let Ok(mut value) = call(sum(&names)).await else { continue };
+        for name in names.clone() {
+            let fewer: Vec<_> = names.iter().copied().filter(|other| *other != name).collect();
+            if let Ok(same) = call(sum(&fewer)).await {
+                (names, value) = (fewer, same);
+            }
+        }
+        return Ok(Tolerated { value, needed: names });
+    }
+    Err(strict)
+}
+
+/// The quirks of these names.
+pub(super) fn sum(names: &[&'static str]) -> Quirks {
+    let chosen = Quirks::NAMES.iter().filter(|(name, _)| names.contains(name));
+    chosen.fold(Quirks::STRICT, |all, (_, quirk)| all | *quirk)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn malformed() -> Error {
+        Error::Malformed { what: "x".into(), reason: "y".into() }
+    }
+
+    #[tokio::test]
+    async fn the_least_set_is_found() {
+        for needed in [vec![], vec!["extra-members"], vec!["any-key-id", "null-members"]] {
+            let wanted = sum(&needed);
+            let call = async |quirks: Quirks| {
+                if quirks.contains(wanted) { Ok(quirks) } else { Err(malformed()) }
+            };
+            let found = least(call).await.unwrap();
+            assert_eq!(found.needed, needed);
+            assert_eq!(found.value, wanted);
+        }
+        let found =
+            least(
+                async |quirks: Quirks| {
+                    if quirks.contains(Quirks::SIZE_IN_BYTES) { Ok(()) } else { Err(malformed()) }
+                },
+            );
+        assert_eq!(found.await.unwrap().needed, ["size-in-bytes"]);
+    }
+
+    #[tokio::test]
+    async fn what_no_quirk_helps_against_is_asked_once_or_reported() {
+        let mut calls = 0;
+        let error = least(async |_| {
+            calls += 1;
+            Err::<(), _>(Error::Interrupted { reason: "cut".into() })
+        });
+        assert!(matches!(error.await, Err(Error::Interrupted { .. })));
+        assert_eq!(calls, 1);
+        assert!(least(async |_| Err::<(), _>(malformed())).await.is_err());
+    }
+}

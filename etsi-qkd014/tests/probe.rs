@@ -1,0 +1,150 @@
+//! `kme-sim probe` against KMEs that hold to the specification and KMEs that do not.
+
+use std::path::Path;
+use std::process::Command;
+
+use etsi_qkd014::sim::Network;
+
+struct Site {
+    network: Network,
+    dir: tempfile::TempDir,
+}
+
+async fn site() -> Site {
+    let any = "127.0.0.1:0".parse().unwrap();
+    let builder = Network::builder().kme("kme-a", any, ["sae-a"]).kme("kme-b", any, ["sae-b"]);
+    let network = builder.start().await.unwrap();
+    let dir = tempfile::tempdir().unwrap();
+    network.write_files(dir.path()).unwrap();
+    Site { network, dir }
+}
+
+/// Whether the probe said that all passed, and its table.
+fn probe(env: &[(&str, String)], args: &[&str]) -> (bool, String) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_kme-sim"));
+    command.arg("probe").args(["--slave-sae", "sae-b"]).args(args).env_clear();
+    let output = command.envs(env.iter().map(|(name, value)| (name, value))).output().unwrap();
+    let text = String::from_utf8([output.stdout, output.stderr].concat()).unwrap();
+    assert!(matches!(output.status.code(), Some(0 | 1)), "{text}");
+    (output.status.success(), text)
+}
+
+impl Site {
+    fn env(&self, sae: &str) -> Vec<(&'static str, String)> {
+        self.network.sae(sae).unwrap().env(self.dir.path())
+    }
+
+    /// With `faults` at the master's KME.
+    fn probe(&self, faults: &[&str], args: &[&str]) -> (bool, String) {
+        let kme = self.network.kme("kme-a").unwrap();
+        kme.clear_faults();
+        faults.iter().for_each(|plan| kme.plan(plan.parse().unwrap()));
+        probe(&self.env("sae-a"), args)
+    }
+}
+
+/// The lines of a table that end with this verdict.
+fn verdicts<'t>(table: &'t str, verdict: &str) -> Vec<&'t str> {
+    table.lines().filter(|line| line.trim_end().ends_with(verdict)).collect()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_simulator_passes_and_gives_no_key() {
+    let site = site().await;
+    let (passed, table) = site.probe(&[], &[]);
+    assert!(passed, "{table}");
+    assert!(table.contains(", 0 failed, 0 tolerated"), "{table}");
+    assert!(verdicts(&table, "pass").len() > 25, "{table}");
+    for kme in site.network.kmes() {
+        let counters = kme.counters();
+        assert_eq!(counters.enc_keys_calls + counters.keys_to_slaves, 0);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn arguments_say_the_same_as_the_environment() {
+    let site = site().await;
+    let env = site.env("sae-a");
+    let of = |name: &str| env.iter().find(|(known, _)| *known == name).unwrap().1.as_str();
+    let (passed, table) = probe(
+        &[],
+        &[
+            of("AXON_KME_URL"),
+            "--ca",
+            of("AXON_KME_CA"),
+            "--cert",
+            of("AXON_SAE_CERT"),
+            "--key",
+            of("AXON_SAE_KEY"),
+            "--sae",
+            of("AXON_SAE_ID"),
+        ],
+    );
+    assert!(passed, "{table}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_faulty_kme_fails_where_it_is_at_fault() {
+    let site = site().await;
+    for (fault, clause, row) in [
+        ("garbage,on=status", "5.1", "a JSON object"),
+        ("status=500,on=status", "5.2", "status answered 200"),
+        ("status=404,on=dec_keys", "6.4", "dec_keys of an unknown key_ID by POST"),
+        ("cut,on=status", "5.2", "status answered 200"),
+        ("handshake-refused", "5.1", "certificate of the CA given"),
+    ] {
+        let (passed, table) = site.probe(&[fault], &["--timeout", "2"]);
+        let failed = verdicts(&table, "FAIL");
+        let named = failed.iter().any(|line| line.starts_with(clause) && line.contains(row));
+        assert!(!passed && named, "{fault}: {table}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_deviation_with_a_quirk_is_named_by_it() {
+    let site = site().await;
+    for (fault, quirk) in [("media-type,on=status", "any-media-type"), ("http-1.0", "http-1.0")] {
+        let (passed, table) = site.probe(&[fault], &[]);
+        let tolerated = verdicts(&table, &format!("tolerated by quirk {quirk}"));
+        assert!(!passed && tolerated.len() == 2, "{fault}: {table}");
+        assert!(verdicts(&table, "FAIL").is_empty(), "{fault}: {table}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn another_kme_than_the_one_named_is_not_asked_further() {
+    let site = site().await;
+    let (passed, table) = site.probe(&[], &["--kme-id", "kme-b"]);
+    assert!(!passed && table.contains("0 passed, 1 failed"), "{table}");
+    assert_eq!(site.network.kme("kme-a").unwrap().counters().status_calls, 0);
+}
+
+#[test]
+fn settings_that_cannot_work_are_said_before_anything_is_sent() {
+    let output = Command::new(env!("CARGO_BIN_EXE_kme-sim"))
+        .args(["probe", "https://127.0.0.1:1", "--slave-sae", "sae-b"])
+        .env_clear()
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(2));
+    let dir = tempfile::tempdir().unwrap();
+    let file = |name: &str| dir.path().join(name).display().to_string();
+    for name in ["ca", "cert", "key"] {
+        std::fs::write(Path::new(&file(name)), "no PEM").unwrap();
+    }
+    let (passed, text) = probe(
+        &[],
+        &[
+            "https://127.0.0.1:1",
+            "--sae",
+            "sae-a",
+            "--ca",
+            &file("ca"),
+            "--cert",
+            &file("cert"),
+            "--key",
+            &file("key"),
+        ],
+    );
+    assert!(!passed && text.contains("no usable CA"), "{text}");
+}
