@@ -91,3 +91,8 @@ pub use seal::{KEY_MAX_AGE, MAX_PLAINTEXT_LEN, Retirement, SealError, Sealer, Sl
 
 /// Bytes of the authentication tag at the end of every envelope.
 pub const TAG_LEN: usize = 16;
+
+/// Compiles and runs the README's example.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
