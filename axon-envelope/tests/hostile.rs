@@ -2,13 +2,15 @@
 
 mod common;
 
+use std::collections::HashSet;
 use std::time::Duration;
 
+use axon_envelope::aead::{Aead, AeadError};
 use axon_envelope::{
-    Delivery, Header, HeaderError, Kind, MESSAGES_PER_KEY, OpenError, RefusalCause, Route,
-    SealError, Spent, TAG_LEN, TopicHash,
+    Delivery, Header, HeaderError, Kind, Limits, MESSAGES_PER_KEY, OpenError, Opener, RefusalCause,
+    Route, SealError, Sealer, Spent, TAG_LEN, TopicHash,
 };
-use common::{ROUTE, START, opener, seal, sealer};
+use common::{ROUTE, START, channel, key, key_id, opener, seal, sealer};
 
 const PLAINTEXT: &[u8] = b"what the receiver acts on";
 
@@ -198,4 +200,117 @@ fn a_header_with_something_behind_it_is_malformed_when_given_apart() {
     }
     opener.open_detached(START, ROUTE, &header, &mut body, &tag).unwrap();
     assert_eq!(body, PLAINTEXT);
+}
+
+#[test]
+fn nonces_begin_at_random_and_stay_apart_by_index() {
+    let nonces = |envelopes: Vec<Vec<u8>>| -> Vec<[u8; 12]> {
+        envelopes.iter().map(|envelope| Header::parse(envelope).unwrap().0.nonce).collect()
+    };
+    // One key in the hands of several sealers is against the rules, and still repeats no nonce.
+    let mut all = HashSet::new();
+    for _ in 0..8 {
+        let mut sealer = sealer("key", 1);
+        let envelopes = (0..10).map(|_| seal(&mut sealer, ROUTE, Delivery::Reliable, PLAINTEXT));
+        let nonces = nonces(envelopes.collect());
+        assert!(nonces.iter().all(|nonce| nonce[..8] == nonces[0][..8]));
+        all.extend(nonces);
+    }
+    assert_eq!(all.len(), 80);
+}
+
+/// An AEAD that fails, and leaves something of its own in the buffer.
+struct Failing;
+
+const RUBBISH: u8 = 0xee;
+
+impl Aead for Failing {
+    const NAME: &'static str = "failing";
+
+    fn new(_: &[u8; 32]) -> Self {
+        Self
+    }
+
+    fn seal_in_place(
+        &self,
+        _: &[u8; 12],
+        _: &[u8],
+        in_out: &mut [u8],
+    ) -> Result<[u8; TAG_LEN], AeadError> {
+        in_out.fill(RUBBISH);
+        Err(AeadError)
+    }
+
+    fn seal_apart(
+        &self,
+        nonce: &[u8; 12],
+        aad: &[u8],
+        _: &[u8],
+        ciphertext: &mut [u8],
+    ) -> Result<[u8; TAG_LEN], AeadError> {
+        self.seal_in_place(nonce, aad, ciphertext)
+    }
+
+    fn open_in_place(
+        &self,
+        _: &[u8; 12],
+        _: &[u8],
+        in_out: &mut [u8],
+        _: &[u8; TAG_LEN],
+    ) -> Result<(), AeadError> {
+        in_out.fill(RUBBISH);
+        Err(AeadError)
+    }
+
+    fn open_apart(
+        &self,
+        nonce: &[u8; 12],
+        aad: &[u8],
+        _: &[u8],
+        tag: &[u8; TAG_LEN],
+        plaintext: &mut [u8],
+    ) -> Result<(), AeadError> {
+        self.open_in_place(nonce, aad, plaintext, tag)
+    }
+}
+
+#[test]
+fn an_index_whose_sealing_failed_stays_taken() {
+    let mut sealer = Sealer::<Failing>::with_aead(&channel(), key_id("key"), key(1)).unwrap();
+    let mut frame = vec![0; sealer.overhead() + PLAINTEXT.len()];
+    for index in 0..MESSAGES_PER_KEY {
+        let slot = sealer.slot(START, Delivery::Reliable).unwrap();
+        assert_eq!(slot.index(), index);
+        let error = match index % 2 {
+            0 => slot.seal_into(ROUTE, &[PLAINTEXT], &mut frame).unwrap_err(),
+            _ => slot.seal_in_place(ROUTE, &mut frame).unwrap_err(),
+        };
+        assert_eq!(error, SealError::Aead);
+    }
+    assert_eq!(sealer.slot(START, Delivery::Reliable).err(), Some(Spent::Messages));
+    // The receiver must not wait for what was never sent.
+    let retirement = sealer.retire();
+    assert!(retirement.used.is_empty() && retirement.reliable.is_empty());
+}
+
+#[test]
+fn a_key_whose_sealing_failed_is_not_given_to_another_connection() {
+    let mut sealer = Sealer::<Failing>::with_aead(&channel(), key_id("key"), key(1)).unwrap();
+    let slot = sealer.slot(START, Delivery::Reliable).unwrap();
+    slot.seal_into(ROUTE, &[PLAINTEXT], &mut [0; 200]).unwrap_err();
+    assert!(sealer.into_unused().is_err());
+}
+
+#[test]
+fn what_a_failing_aead_leaves_behind_is_erased() {
+    let mut opener = Opener::<Failing>::with_limits(channel(), Limits::default()).unwrap();
+    opener.add_key(key_id("key"), key(1)).unwrap();
+    let mut sealer = sealer("key", 1);
+    let header_len = sealer.header_len();
+    let mut envelope = seal(&mut sealer, ROUTE, Delivery::Reliable, PLAINTEXT);
+    let mut out = vec![0xaa; PLAINTEXT.len()];
+    opener.open_into(START, ROUTE, &envelope, &mut out).unwrap_err();
+    assert!(out.iter().all(|byte| *byte == 0));
+    opener.open_in_place(START, ROUTE, &mut envelope).unwrap_err();
+    assert!(envelope[header_len..][..PLAINTEXT.len()].iter().all(|byte| *byte == 0));
 }
