@@ -111,6 +111,68 @@ async fn a_deviation_with_a_quirk_is_named_by_it() {
     }
 }
 
+impl Site {
+    /// The slave's environment as `kme-sim init` prints it.
+    fn slave_env(&self) -> String {
+        let line = |(name, value): (&str, String)| format!("export {name}='{value}'\n");
+        let all = ["sae-a", "sae-b"].map(|sae| self.env(sae).into_iter().map(line).collect());
+        let file = self.dir.path().join("environment");
+        std::fs::write(&file, all.map(|of: String| of).concat()).unwrap();
+        file.display().to_string()
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_simulator_passes_with_its_keys_drawn_at_both_ends() {
+    let site = site().await;
+    let (passed, table) = site.probe(&[], &["--consume-keys", "--slave-env", &site.slave_env()]);
+    assert!(passed, "{table}");
+    assert!(table.contains("dec_keys by POST: the same 3 keys"), "{table}");
+    let [master, slave] = [0, 1].map(|at| site.network.kmes()[at].counters());
+    assert_eq!((master.keys_to_masters, slave.keys_to_slaves), (5, 4), "{table}");
+    // One end is enough for most of it.
+    let (passed, table) = site.probe(&[], &["--consume-keys"]);
+    assert!(passed && table.contains("skipped: no --slave-env"), "{table}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_kme_that_gives_keys_wrongly_fails_where_it_is_at_fault() {
+    let site = site().await;
+    let args = ["--consume-keys", "--slave-env", &site.slave_env(), "--timeout", "2"];
+    for (fault, clause, row) in [
+        ("wrong-length,on=enc_keys", "6.3", "enc_keys by POST: 3 keys of 256 bits"),
+        ("repeat-key-id,on=enc_keys", "6.3", "enc_keys by POST: 3 keys of 256 bits"),
+        ("key-missing,on=enc_keys", "6.3", "enc_keys by GET: 1 key of 256 bits"),
+        ("garbage,on=enc_keys", "6.3", "enc_keys by GET: 1 key of 256 bits"),
+        ("status=500,on=enc_keys", "6.2", "number over max_key_per_request: 400"),
+        ("reset,on=enc_keys", "6.2", "unsupported extension_mandatory: 400"),
+        ("other-ids,on=enc_keys", "5.4", "dec_keys by GET: the same key"),
+    ] {
+        let (passed, table) = site.probe(&[fault], &args);
+        let failed = verdicts(&table, "FAIL");
+        let named = failed.iter().any(|line| line.starts_with(clause) && line.contains(row));
+        assert!(!passed && named, "{fault}: {table}");
+    }
+    let (passed, table) = site.probe(&["media-type,on=enc_keys"], &args);
+    let tolerated = verdicts(&table, "tolerated by quirk any-media-type");
+    assert!(!passed && tolerated.len() == 2 && verdicts(&table, "FAIL").is_empty(), "{table}");
+
+    // The slave's KME is at fault.
+    let slave = site.network.kme("kme-b").unwrap();
+    for (fault, row) in [
+        ("wrong-length", "dec_keys by GET: the same key"),
+        ("other-ids", "dec_keys by POST: the same 3 keys"),
+        ("cut,on=dec_keys", "dec_keys by GET: the same key"),
+        ("empty", "dec_keys of the same key again: 400"),
+    ] {
+        slave.clear_faults();
+        slave.plan(fault.parse().unwrap());
+        let (passed, table) = site.probe(&[], &args);
+        let failed = verdicts(&table, "FAIL");
+        assert!(!passed && failed.iter().any(|line| line.contains(row)), "{fault}: {table}");
+    }
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn another_kme_than_the_one_named_is_not_asked_further() {
     let site = site().await;

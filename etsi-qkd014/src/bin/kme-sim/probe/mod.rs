@@ -1,7 +1,9 @@
 //! `kme-sim probe`: whether a KME holds to ETSI GS QKD 014 V1.1.1, seen from its wire.
 
+mod keys;
 mod party;
 mod quirks;
+mod refusals;
 mod report;
 mod status;
 mod tls;
@@ -102,7 +104,17 @@ async fn all(
     }
     let wire = Wire::new(master, tls::config(master, &VERSIONS, &GROUPS, Auth::Sae)?)?;
     let status = status::status(master, slave_sae, &wire, &mut report).await?;
-    status::refusals(master, slave_sae, &wire, &mut report).await?;
-    let _ = (slave, status, consume);
+    refusals::refusals(master, slave_sae, &wire, &mut report).await?;
+    match status {
+        _ if !consume => {
+            report.skip("5.3", "requests for keys, and their limits", "no --consume-keys");
+        }
+        Some(read) => {
+            let status = &read.value;
+            keys::refusals(master, slave_sae, status, &wire, &mut report).await?;
+            keys::delivery((master, slave), slave_sae, status, &wire, &mut report).await?;
+        }
+        None => report.skip("5.3", "requests for keys, and their limits", "no status"),
+    }
     Ok(report)
 }

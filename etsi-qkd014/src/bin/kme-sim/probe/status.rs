@@ -1,4 +1,4 @@
-//! Checks that read: the connection, the status, and what has to be refused.
+//! Checks that read: the connection and the status.
 
 use etsi_qkd014::{Error, Status};
 use serde_json::Value;
@@ -8,7 +8,7 @@ use super::quirks::{self, Tolerated};
 use super::report::{Report, Verdict};
 use super::tls::{self, Auth, GROUPS, VERSIONS};
 use super::wire::{Raw, Wire};
-use crate::{Failure, Outcome};
+use crate::Outcome;
 
 const IDS: [&str; 4] = ["source_KME_ID", "target_KME_ID", "master_SAE_ID", "slave_SAE_ID"];
 const NUMBERS: [&str; 7] = [
@@ -20,19 +20,6 @@ const NUMBERS: [&str; 7] = [
     "min_key_size",
     "max_SAE_ID_count",
 ];
-/// An ID that no KME has given to an SAE or key: it is new.
-pub(super) fn nobody() -> String {
-    format!("kme-sim-probe-{}", unknown_key_id())
-}
-
-fn unknown_key_id() -> String {
-    // Randomness from std, enough for an ID that must only be new.
-    use std::hash::{BuildHasher, Hasher};
-    let random = || std::hash::RandomState::new().build_hasher().finish();
-    let (a, b) = (random(), random());
-    let (c, d) = (a & 0xfff, b >> 16 & 0xfff);
-    format!("{:08x}-{:04x}-4{c:03x}-8{d:03x}-{:012x}", a >> 32, a >> 16 & 0xffff, b >> 16)
-}
 
 /// Whether the KME can be talked to at all; everything else stands on it.
 pub(super) async fn connection(party: &Party, slave: &str, report: &mut Report) -> Outcome<bool> {
@@ -187,92 +174,4 @@ fn raw_status(party: &Party, slave: &str, raw: &Raw, needed: &[&'static str], re
     let came = format!("{stored} of {count}");
     report.check("6.1", "stored_key_count <= max_key_count", came, stored <= count);
     report.check("6.1", "max_key_per_request at least 1", per.to_string(), per >= 1);
-}
-
-/// Requests that no KME may serve and that ask for no key that exists.
-pub(super) async fn refusals(
-    party: &Party,
-    slave: &str,
-    wire: &Wire,
-    report: &mut Report,
-) -> Outcome {
-    let raw = wire.get(party.method(&nobody(), "status")?).await;
-    refused(report, "5.2", "status of an unknown SAE: 400 or 401", &raw, &[400, 401]);
-    error_format(report, &raw);
-
-    let id = unknown_key_id();
-    let body = serde_json::json!({ "key_IDs": [{ "key_ID": id }] }).to_string();
-    let dec_keys = party.method(slave, "dec_keys")?;
-    let raw = wire.post(dec_keys.clone(), body).await;
-    refused(report, "6.4", "dec_keys of an unknown key_ID by POST: 400", &raw, &[400]);
-    message(report, "6.4", &raw, "one or more keys specified are not found on KME");
-    let mut url = dec_keys.clone();
-    url.query_pairs_mut().append_pair("key_ID", &unknown_key_id());
-    let raw = wire.get(url).await;
-    refused(report, "6.4", "dec_keys of an unknown key_ID by GET: 400", &raw, &[400]);
-    let raw = wire.post(dec_keys.clone(), "{\"key_IDs\":[".to_owned()).await;
-    refused(report, "5.4", "dec_keys with broken JSON: 400", &raw, &[400]);
-    let raw = wire.post(dec_keys, "{\"key_IDs\":7}".to_owned()).await;
-    refused(report, "5.4", "dec_keys with key_IDs of another type: 400", &raw, &[400]);
-    Ok(())
-}
-
-pub(super) fn refused(
-    report: &mut Report,
-    clause: &'static str,
-    expected: &str,
-    raw: &Result<Raw, String>,
-    codes: &[u16],
-) {
-    match raw {
-        Ok(raw) => report.check(clause, expected, raw.summary(), codes.contains(&raw.status)),
-        Err(why) => report.check(clause, expected, why, false),
-    }
-}
-
-/// The words that the specification gives for a refusal.
-pub(super) fn message(
-    report: &mut Report,
-    clause: &'static str,
-    raw: &Result<Raw, String>,
-    wanted: &str,
-) {
-    let expected = format!("message {wanted:?}");
-    match raw {
-        Ok(raw) if raw.status == 400 => {
-            let came = raw.message().unwrap_or_default();
-            report.check(clause, expected, &came, came == wanted);
-        }
-        _ => report.skip(clause, expected, "not refused with 400"),
-    }
-}
-
-/// Clause 6.5, where the answer is one that has a body.
-fn error_format(report: &mut Report, raw: &Result<Raw, String>) {
-    let expected = "an error: message, and details of objects or none";
-    let body = match raw {
-        Ok(raw) if raw.status == 400 => raw.json(),
-        Ok(raw) if raw.status == 401 => {
-            return report.skip("6.5", expected, "401 has no data model");
-        }
-        _ => return report.skip("6.5", expected, "not refused with 400"),
-    };
-    let Some(Value::Object(members)) = body else {
-        return report.check("6.5", expected, "no JSON object", false);
-    };
-    let message = members.get("message").is_some_and(Value::is_string);
-    let objects = |details: &Vec<Value>| details.iter().all(Value::is_object);
-    let details = members.get("details").is_none_or(|d| d.as_array().is_some_and(objects));
-    let came = match (message, details) {
-        (true, true) => "as expected",
-        (false, _) => "no message",
-        (true, false) => "other details",
-    };
-    report.check("6.5", expected, came, message && details);
-}
-
-impl From<Error> for Failure {
-    fn from(error: Error) -> Self {
-        Self::Other(error.to_string())
-    }
 }
