@@ -204,7 +204,7 @@ fn without_a_file_the_settings_say_which() {
 
 #[test]
 fn the_help_of_each_command_fits_a_page_and_shows_an_example() {
-    for command in ["keygen", "list"] {
+    for command in ["keygen", "scan", "list"] {
         let help = done(&[command, "--help"], &[]);
         assert!(help.contains(&format!("axon trust {command}")), "{help}");
         assert!(help.lines().all(|line| line.chars().count() <= 100), "{help}");

@@ -5,11 +5,14 @@ use std::path::PathBuf;
 use axon_tls::identity::KeyAlgorithm;
 use clap::{Args, Subcommand, ValueEnum};
 
+use super::target::Target;
+
 pub(crate) const HELP: &str = "\
 Two hosts that know each other by their keys:
 
   axon trust keygen /etc/axon/host.key     on each: makes its key, prints its line
   (put each host's line into the other's trust file)
+  axon trust scan robot-2                  the key that a running daemon shows, to compare
   export AXON_CLASSIC_KEY=/etc/axon/host.key AXON_CLASSIC_TRUST=/etc/axon/trust
   axon trust list                          what is trusted now";
 
@@ -19,6 +22,9 @@ pub(crate) enum Trust {
     /// Make a key for this host and print the line for the other hosts' trust files
     #[command(after_help = KEYGEN_HELP)]
     Keygen(Keygen),
+    /// Print the key that a host shows, to compare and confirm
+    #[command(after_help = SCAN_HELP)]
+    Scan(Scan),
     /// Print the keys in a trust file
     #[command(after_help = LIST_HELP)]
     List(List),
@@ -64,6 +70,34 @@ impl From<Algorithm> for KeyAlgorithm {
             Algorithm::Ed25519 => Self::Ed25519,
         }
     }
+}
+
+const SCAN_HELP: &str = "\
+Connects to the daemon there, takes the key that it signs the handshake with, and breaks off: no data
+is sent. Standard output has a line for a trust file; standard error says where it is from.
+
+NOTHING IS VERIFIED. Whoever answers in the host's place shows a key of their own. Compare the line
+with what keygen printed on the host before a trust file has it. The daemon there notes a refused
+handshake. No setting is read but ROS_DOMAIN_ID, for the ports to try.
+
+Examples:
+  axon trust scan robot.local
+  axon trust scan 10.0.0.7:61300 --name arm-2
+
+Exit status: 1 when no key was shown.";
+
+/// `axon trust scan`.
+#[derive(Args, Debug)]
+pub(crate) struct Scan {
+    /// The host; without a port the sixteen of the ROS domain are tried
+    #[arg(value_name = "HOST[:PORT]")]
+    pub(crate) target: Target,
+    /// What the line calls the host [default: as typed here]
+    #[arg(long)]
+    pub(crate) name: Option<String>,
+    /// Wait for this many seconds
+    #[arg(long, value_name = "S", default_value_t = 5, value_parser = clap::value_parser!(u64).range(1..=600))]
+    pub(crate) timeout: u64,
 }
 
 const LIST_HELP: &str = "\

@@ -5,6 +5,9 @@ mod files;
 mod keygen;
 mod line;
 mod list;
+mod look;
+mod scan;
+mod target;
 
 use self::cli::Trust;
 use crate::failure::Failure;
@@ -14,5 +17,6 @@ pub(crate) fn run(args: &Trust) -> Result<(), Failure> {
     match args {
         Trust::Keygen(args) => keygen::run(args),
         Trust::List(args) => list::run(args),
+        Trust::Scan(args) => scan::run(args),
     }
 }

@@ -1,0 +1,166 @@
+//! `axon trust scan`: the keys that a host's daemons show, for a person to confirm.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    fmt::Write as _,
+    io::Write as _,
+    net::SocketAddr,
+    time::Duration,
+};
+
+use axon_tls::identity::{Shown, SpkiDigest};
+use axon_transport::{
+    config::{Config, OsFiles},
+    discovery::quic_ports,
+};
+use quinn::Endpoint;
+use tokio::{
+    task::JoinSet,
+    time::{Instant, timeout, timeout_at},
+};
+
+use super::{
+    cli,
+    line::line,
+    look::{self, look},
+};
+use crate::{failure::Failure, text::printable};
+
+/// When one port has answered, the others have this long.
+const OTHERS: Duration = Duration::from_secs(1);
+
+const NOTHING_VERIFIED: &str = "\
+# Nothing was verified: whoever answers at an address can show a key of their own. Before a line goes
+# into a trust file, compare it with what `axon trust keygen` printed on that host. A host without
+# AXON_CLASSIC_KEY shows another key each time its daemon starts.";
+
+/// Runs `axon trust scan`.
+pub(super) fn run(args: &cli::Scan) -> Result<(), Failure> {
+    let name = args.name.as_deref().unwrap_or(&args.target.host);
+    // Before anybody is asked.
+    line(name, SpkiDigest([0; 32]))?;
+    let domain = domain()?;
+    let limit = Duration::from_secs(args.timeout);
+
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let (seen, asked) = runtime.block_on(async {
+        let addresses = args.target.addresses(quic_ports(domain)).await.map_err(|error| {
+            Failure::failed(format!("{}: {error}", printable(&args.target.host)))
+        })?;
+        let seen = scan(&addresses, limit).await;
+        Ok::<_, Failure>((seen, addresses))
+    })?;
+
+    let found = Found::of(&seen);
+    eprint!("{}", found.notes);
+    if found.keys.is_empty() {
+        return Err(Failure::failed(nobody(args, &asked, domain)));
+    }
+    let mut out = String::new();
+    for (key, names) in &found.keys {
+        let _ = match names {
+            None => writeln!(out, "{}", line(name, *key)?),
+            // No line of a trust file: such a host is known by its roots.
+            Some(names) => writeln!(
+                out,
+                "# {name} shows a certificate (AXON_CLASSIC_AUTH=ca) for {}: {key}",
+                if names.is_empty() { "no host".to_owned() } else { printable(&names.join(", ")) }
+            ),
+        };
+    }
+    eprintln!("{NOTHING_VERIFIED}");
+    std::io::stdout().lock().write_all(out.as_bytes())?;
+    Ok(())
+}
+
+/// This host's own keys need not be set up to look at others, so no other setting is read.
+fn domain() -> Result<u32, Failure> {
+    let env = std::env::vars_os().filter(|(name, _)| name == "ROS_DOMAIN_ID");
+    Ok(Config::resolve(env, None, &OsFiles)?.domain)
+}
+
+/// What was seen at an address, or why nothing was.
+type Seen = (SocketAddr, Result<Shown, String>);
+
+/// Looks at every address at once; those that answer in time.
+async fn scan(addresses: &[SocketAddr], limit: Duration) -> Vec<Seen> {
+    let mut endpoints: BTreeMap<bool, Endpoint> = BTreeMap::new();
+    let mut looks = JoinSet::new();
+    let mut seen = Vec::new();
+    for address in addresses.iter().copied() {
+        let endpoint = match endpoints.get(&address.is_ipv4()) {
+            Some(endpoint) => endpoint.clone(),
+            None => match look::endpoint(address) {
+                Ok(endpoint) => {
+                    endpoints.insert(address.is_ipv4(), endpoint.clone());
+                    endpoint
+                }
+                Err(error) => {
+                    seen.push((address, Err(error.to_string())));
+                    continue;
+                }
+            },
+        };
+        looks.spawn(async move { (address, look(&endpoint, address).await) });
+    }
+    let mut deadline = Instant::now() + limit;
+    while let Ok(Some(looked)) = timeout_at(deadline, looks.join_next()).await {
+        let Ok(one) = looked else { continue };
+        if one.1.is_ok() {
+            deadline = deadline.min(Instant::now() + OTHERS);
+        }
+        seen.push(one);
+    }
+    drop(looks);
+    // The daemons are told that it is over, and do not wait for the rest of a handshake.
+    for endpoint in endpoints.into_values() {
+        let _ = timeout(OTHERS, endpoint.wait_idle()).await;
+    }
+    seen.sort_by_key(|(address, _)| *address);
+    seen
+}
+
+/// What to say of a scan.
+struct Found {
+    /// Each key once, with the names in its certificate if it has one.
+    keys: BTreeSet<(SpkiDigest, Option<Vec<String>>)>,
+    /// A comment line for each address that answered.
+    notes: String,
+}
+
+impl Found {
+    fn of(seen: &[Seen]) -> Self {
+        let mut found = Self { keys: BTreeSet::new(), notes: String::new() };
+        for (address, seen) in seen {
+            let note = match seen {
+                Err(reason) => reason.clone(),
+                Ok(Shown { key, scheme, certificate_names, .. }) => {
+                    found.keys.insert((*key, certificate_names.clone()));
+                    let kind =
+                        certificate_names.as_ref().map_or("raw public key", |_| "certificate");
+                    format!("signed its handshake with a {kind}, {scheme:?}")
+                }
+            };
+            let _ = writeln!(found.notes, "# {address} {note}");
+        }
+        found
+    }
+}
+
+fn nobody(args: &cli::Scan, asked: &[SocketAddr], domain: u32) -> String {
+    let host = printable(&args.target.host);
+    let ports = match args.target.port {
+        Some(port) => format!("UDP port {port}"),
+        None => {
+            let ports = quic_ports(domain);
+            format!("the UDP ports {} to {} of domain {domain}", ports.start(), ports.end())
+        }
+    };
+    let count = asked.iter().map(SocketAddr::ip).collect::<BTreeSet<_>>().len();
+    let at = if count > 1 { format!(" at any of its {count} addresses") } else { String::new() };
+    format!(
+        "{host}: no key was shown{at} on {ports} within {} s; is a daemon running there, under \
+         the same ROS_DOMAIN_ID, and is UDP let through?",
+        args.timeout
+    )
+}
