@@ -1,9 +1,11 @@
 //! Error (clause 6.5). The most lenient parser here: whatever the body is, the status code has
 //! already said what happened.
 
+use serde::de::DeserializeOwned;
 use serde_json::Value;
 
-use super::json;
+use super::json::{self, Object};
+use crate::Quirks;
 
 /// Longest message passed on, bytes.
 const MAX_MESSAGE: usize = 512;
@@ -16,21 +18,20 @@ pub(crate) struct ErrorAnswer {
     pub(crate) details: Vec<Value>,
 }
 
+/// Only the two members that the specification lists are taken out of the text. The others, among
+/// which a confused KME may have put keys, are not copied.
 pub(crate) fn error_answer(body: &[u8]) -> ErrorAnswer {
-    let parsed = json::text(body, "body").ok().and_then(|text| serde_json::from_str(text).ok());
-    let Some(Value::Object(mut members)) = parsed else { return ErrorAnswer::default() };
-    let message = match members.remove("message") {
-        Some(Value::String(message)) => printable(&message),
-        _ => String::new(),
-    };
-    let details = match members.remove("details") {
-        Some(Value::Array(mut details)) => {
-            details.truncate(MAX_DETAILS);
-            details
-        }
-        _ => Vec::new(),
-    };
-    ErrorAnswer { message, details }
+    let object = json::text(body, "body")
+        .and_then(|text| Object::parse(text, String::new(), Quirks::NULL_MEMBERS));
+    let Ok(mut object) = object else { return ErrorAnswer::default() };
+    let message = member(&mut object, "message").map(|message: String| printable(&message));
+    let mut details: Vec<Value> = member(&mut object, "details").unwrap_or_default();
+    details.truncate(MAX_DETAILS);
+    ErrorAnswer { message: message.unwrap_or_default(), details }
+}
+
+fn member<T: DeserializeOwned>(object: &mut Object<'_>, name: &str) -> Option<T> {
+    serde_json::from_str(object.take(name).ok()??).ok()
 }
 
 /// The message goes to logs and terminals: no control characters, bounded.
