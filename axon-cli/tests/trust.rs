@@ -110,6 +110,28 @@ fn a_key_is_its_owners_alone_and_its_line_is_that_of_a_trust_file() {
 }
 
 #[test]
+fn no_mask_opens_the_key_and_half_a_key_is_not_left_behind() {
+    let dir = tempfile::tempdir().expect("directory");
+    let shell = |before: &str, name: &str| {
+        let key = dir.path().join(name);
+        let script = format!("{before}; exec \"$0\" trust keygen \"$1\" --name a");
+        let arguments = ["-c", &script, env!("CARGO_BIN_EXE_axon"), utf8(&key)];
+        let output = std::process::Command::new("sh").args(arguments).output().expect("a shell");
+        (output, key)
+    };
+    let (output, key) = shell("umask 0", "open");
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    let mode = fs::metadata(&key).expect("made").permissions().mode();
+    assert_eq!(mode & 0o7777, 0o600);
+
+    // No byte of it can be written.
+    let (output, key) = shell("trap '' XFSZ; ulimit -f 0", "full");
+    let stderr = text(&output.stderr);
+    assert_eq!((output.status.code(), &output.stdout[..]), (Some(1), &b""[..]), "{stderr}");
+    assert!(stderr.contains(utf8(&key)) && !key.exists(), "{stderr}");
+}
+
+#[test]
 fn the_key_is_the_one_that_openssl_reads() {
     let dir = tempfile::tempdir().expect("directory");
     let key = dir.path().join("host.key");

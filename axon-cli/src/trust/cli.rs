@@ -73,8 +73,8 @@ impl From<Algorithm> for KeyAlgorithm {
 }
 
 const SCAN_HELP: &str = "\
-Connects to the daemon there, takes the key that it signs the handshake with, and breaks off: no data
-is sent. Standard output has a line for a trust file; standard error says where it is from.
+Connects to the daemon there, takes the key that it signs the handshake with, and breaks off: no
+data is sent. Standard output has a line for a trust file, standard error where it is from.
 
 NOTHING IS VERIFIED. Whoever answers in the host's place shows a key of their own. Compare the line
 with what keygen printed on the host before a trust file has it. The daemon there notes a refused
