@@ -28,7 +28,8 @@ const PAUSE_LOST: (Duration, Duration) = (Duration::from_secs(1), Duration::from
 ///   say 0.
 /// - A call asks for at most [`batch`](Settings::batch) keys and at most the KME's
 ///   `max_key_per_request`; 0 says nothing. Until a status was answered, for one.
-/// - A refill begins when a batch, or a quarter of the target, is missing.
+/// - A refill begins when a batch, or a quarter of the target, is missing, and goes on until
+///   everything missing is asked for.
 /// - An empty store halves the batch, since fewer keys may be had; a call that succeeds doubles it
 ///   again.
 /// - After failures it waits: 100 ms to 2 s where they cost nothing, 1 s to 30 s where each may have
@@ -57,6 +58,8 @@ pub struct Core<K> {
     in_flight: Vec<(u32, Duration)>,
     /// Keys that the next call may ask for.
     size: u32,
+    /// A refill has begun, and goes on until everything missing is asked for.
+    refilling: bool,
     /// Failures since the last call that gave keys.
     failures: u32,
     not_before: Duration,
@@ -182,6 +185,7 @@ impl<K> Core<K> {
             Settings { batch: settings.batch.max(1), calls: settings.calls.max(1), ..settings };
         Self {
             size: settings.batch,
+            refilling: false,
             settings,
             jitter: Box::new(jitter),
             held: VecDeque::new(),
@@ -205,7 +209,8 @@ impl<K> Core<K> {
             self.stock.asked = true;
             return Some(Ask::Status);
         }
-        if !self.refill_is_due() {
+        self.refilling = self.refill_is_due();
+        if !self.refilling {
             if self.in_flight.is_empty() {
                 self.unanswered_since = None;
                 self.dry_since = None;
@@ -250,7 +255,9 @@ impl<K> Core<K> {
         let came = self.held.len() - before;
         self.held.make_contiguous()[at..].rotate_right(came);
         self.counts.obtained += came as u64;
-        self.counts.unusable += u64::from(asked).saturating_sub(came as u64);
+        let unusable = u64::from(asked).saturating_sub(came as u64);
+        self.counts.unusable += unusable;
+        self.refilling |= unusable > 0;
         self.answered(now, came);
         if came == 0 {
             self.back_off(now, FailureClass::KeysLost);
@@ -268,6 +275,7 @@ impl<K> Core<K> {
             Ask::Status => self.status_ended(now),
             Ask::Keys(asked) => {
                 self.ended(asked);
+                self.refilling = true;
                 self.answered(now, 0);
                 self.back_off(now, class);
                 if class == FailureClass::Refused {
@@ -367,7 +375,8 @@ impl<K> Core<K> {
 
     fn refill_is_due(&self) -> bool {
         let missing = self.missing();
-        missing > 0 && missing >= self.target().div_ceil(4).min(self.per_call() as usize)
+        let enough = self.target().div_ceil(4).min(self.per_call() as usize);
+        missing > 0 && (self.refilling || missing >= enough)
     }
 
     fn may_call(&self) -> bool {
