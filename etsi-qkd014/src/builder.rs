@@ -114,6 +114,11 @@ impl ClientBuilder {
 
     /// The KME's ID, which must be the common name in its certificate's subject, in addition to
     /// the check of the host name or address in the URL.
+    ///
+    /// Clause 5.1 asks an SAE to confirm the KME's ID from its certificate before anything else.
+    /// Left out, the host name or address stands for that ID: any certificate of the
+    /// [`ca`](Self::ca) for the host in the URL is taken. Give it wherever one CA issues
+    /// certificates to several KMEs, or to other servers.
     pub fn kme_id(mut self, id: impl Into<String>) -> Self {
         self.identity.kme_id = Some(id.into());
         self

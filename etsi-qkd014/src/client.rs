@@ -1,7 +1,8 @@
 //! The client: one call is one or more tries, within a deadline.
 
+use std::collections::HashMap;
 use std::fmt;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use reqwest::Url;
@@ -30,7 +31,12 @@ struct Inner {
     kme: String,
     connect_timeout: Duration,
     limits: Limits,
+    /// The default key size by slave SAE, bits, as the last status had it.
+    key_sizes: Mutex<HashMap<String, u32>>,
 }
+
+/// Peers whose key size is remembered.
+const MAX_PEERS: usize = 1024;
 
 impl Client {
     /// Starts the settings of a client.
@@ -40,12 +46,17 @@ impl Client {
 
     /// What the KME holds for keys between this SAE and `slave_sae` (clause 5.2).
     ///
+    /// The client and its clones remember the `key_size`, to which later answers of
+    /// [`enc_keys`](Self::enc_keys) without a size are held.
+    ///
     /// # Errors
     /// Any [`Error`] but [`KeyPossiblyConsumed`](Error::KeyPossiblyConsumed).
     pub async fn status(&self, slave_sae: &str) -> Result<Status, Error> {
         let prepared = Prepared::get(self.url(slave_sae, "status")?);
         let body = self.call(Call::Status, &prepared).await?;
-        parse::status(&body, slave_sae, self.limits().quirks)
+        let status = parse::status(&body, slave_sae, self.limits().quirks)?;
+        self.remember_key_size(&status);
+        Ok(status)
     }
 
     /// Asks for fresh keys to share with `slave_sae`, as their master (clause 5.3).
@@ -65,7 +76,21 @@ impl Client {
         connect_timeout: Duration,
         limits: Limits,
     ) -> Self {
-        Self { inner: Arc::new(Inner { http, base, kme, connect_timeout, limits }) }
+        let key_sizes = Mutex::default();
+        Self { inner: Arc::new(Inner { http, base, kme, connect_timeout, limits, key_sizes }) }
+    }
+
+    fn remember_key_size(&self, status: &Status) {
+        let mut sizes = self.inner.key_sizes.lock().unwrap_or_else(PoisonError::into_inner);
+        if sizes.len() < MAX_PEERS || sizes.contains_key(&status.slave_sae_id) {
+            sizes.insert(status.slave_sae_id.clone(), status.key_size);
+        }
+    }
+
+    /// The default key size in bits for a peer, where a status has told one of whole bytes.
+    pub(crate) fn key_size(&self, slave_sae: &str) -> Option<u32> {
+        let sizes = self.inner.key_sizes.lock().unwrap_or_else(PoisonError::into_inner);
+        sizes.get(slave_sae).copied().filter(|bits| *bits > 0 && bits.is_multiple_of(8))
     }
 
     pub(crate) fn limits(&self) -> &Limits {

@@ -166,7 +166,10 @@ async fn read_body(response: &mut Response, limit: usize) -> Result<Body, Error>
     loop {
         let chunk = match response.chunk().await {
             Ok(Some(chunk)) => chunk,
-            Ok(None) => return Ok(body),
+            Ok(None) => {
+                held.settle().await;
+                return Ok(body);
+            }
             Err(e) => return Err(Error::Interrupted { reason: innermost(&e) }),
         };
         let kept = body.extend(&chunk);
@@ -184,6 +187,18 @@ impl Held {
     fn replace(&mut self, next: Bytes) {
         if let Some(last) = self.0.replace(next) {
             clear(last);
+        }
+    }
+
+    /// Gives the connection's task the few turns that it takes to begin its next read, for which
+    /// it takes other memory. Only then can the last chunk be cleared. Where that task runs on
+    /// another thread it may still be late.
+    async fn settle(&self) {
+        for _ in 0..16 {
+            if self.0.as_ref().is_none_or(Bytes::is_unique) {
+                return;
+            }
+            tokio::task::yield_now().await;
         }
     }
 }

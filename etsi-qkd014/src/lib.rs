@@ -39,11 +39,27 @@
 //! # Secrets
 //!
 //! Zeroized when they are dropped, whether by success, error, timeout or cancellation: the
-//! assembled answer body, the base64 text taken from it, the decoded key, and the SAE's private
-//! key as read from bytes or file. Beyond the crate's reach: the receive buffers of hyper and
-//! rustls, which hold the answer for as long as a connection lives, and the private key inside
-//! rustls' signer. A program that must not leave these in freed memory needs an allocator that
-//! zeroizes on free, and should disable core dumps.
+//! assembled answer body and each block it outgrew, the base64 text taken from it, the decoded key,
+//! and the SAE's private key as read from bytes or file. The chunks that hyper hands over are
+//! cleared with all the memory below them, as soon as hyper reads on into other memory.
+//!
+//! Freed with key bytes in them, since nothing outside of rustls reaches them:
+//!
+//! - `rustls::msgs::deframer::buffers::DeframerVecBuffer::read`: records as they come from the
+//!   socket, deciphered in place; freed when the buffer grows and when the connection ends;
+//! - `rustls::msgs::base::Payload::into_vec`: the plaintext of a record, freed when it was read.
+//!
+//! And at times, where the runtime has several threads: hyper's last read buffer
+//! (`Buffered::poll_read_from_io`), if its connection does not read on before the call ends.
+//!
+//! A test with an allocator that keeps and searches what is freed holds the crate to this list,
+//! for `enc_keys` and `dec_keys`, on success, failed check, malformed answer, refusal with keys in
+//! its body, cut-off, timeout and cancellation. It does not see the stack, registers, memory
+//! that C code allocates (aws-lc holds the private key), or swap.
+//!
+//! What a KME puts into extensions and into the details of an error is no secret to this crate. A
+//! program that must leave nothing in freed memory needs a global allocator that zeroizes on
+//! free, which covers the rest, and should disable core dumps.
 //!
 //! # Features
 //!

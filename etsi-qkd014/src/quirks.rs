@@ -12,7 +12,7 @@ use crate::Error;
 /// | `null-members` | `null` where an optional member is meant to be absent |
 /// | `missing-status-numbers` | a status without some of its numbers, read as 0 |
 /// | `size-in-bytes` | a KME that counts key sizes in bytes where the specification says bits |
-/// | `any-case-members` | member names in another letter case, as `key_id` |
+/// | `any-case-members` | member names in another letter case: `key_id`, or `Keys`, as Table 11 has it where the examples have `keys` |
 /// | `any-media-type` | answers not labelled `application/json` |
 /// | `extra-members` | members that the specification does not list; they are ignored |
 /// | `http-1.0` | answers over HTTP/1.0 |

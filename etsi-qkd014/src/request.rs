@@ -42,7 +42,9 @@ impl<'c> EncKeys<'c> {
     }
 
     /// Size of each key in bits, a multiple of 8. Default the KME's
-    /// [`key_size`](crate::Status::key_size).
+    /// [`key_size`](crate::Status::key_size): where this client has asked for the peer's
+    /// [`status`](Client::status) before, the keys must be of the size it named last, otherwise
+    /// they need only be of one size.
     pub fn size(mut self, bits: u32) -> Self {
         self.size = Some(bits);
         self
@@ -88,7 +90,8 @@ impl<'c> EncKeys<'c> {
         let prepared = if self.via_get { self.get(url) } else { self.post(url) };
         let body = self.client.call(Call::EncKeys, &prepared).await?;
         let number = self.number.unwrap_or(1) as usize;
-        parse::key_container(&body, &Asked::Number(number), self.size, quirks)
+        let size = self.size.or_else(|| self.client.key_size(&self.slave_sae));
+        parse::key_container(&body, &Asked::Number(number), size, quirks)
             .map_err(|e| Call::EncKeys.consumed(e))
     }
 
@@ -155,18 +158,40 @@ pub struct DecKeys<'c> {
     client: &'c Client,
     master_sae: String,
     ids: Vec<String>,
+    id_extensions: Vec<(usize, Value)>,
+    extension: Option<Value>,
     size: Option<u32>,
     via_get: bool,
 }
 
 impl<'c> DecKeys<'c> {
     pub(crate) fn new(client: &'c Client, master_sae: String) -> Self {
-        Self { client, master_sae, ids: Vec::new(), size: None, via_get: false }
+        Self {
+            client,
+            master_sae,
+            ids: Vec::new(),
+            id_extensions: Vec::new(),
+            extension: None,
+            size: None,
+            via_get: false,
+        }
     }
 
     /// Adds a key_ID, exactly as the master gave it.
     pub fn key_id(mut self, id: impl Into<String>) -> Self {
         self.ids.push(id.into());
+        self
+    }
+
+    /// Adds a key_ID with a `key_ID_extension` (clause 6.4): a JSON object.
+    pub fn key_id_with_extension(mut self, id: impl Into<String>, extension: Value) -> Self {
+        self.id_extensions.push((self.ids.len(), extension));
+        self.key_id(id)
+    }
+
+    /// The `key_IDs_extension` of the request (clause 6.4): a JSON object.
+    pub fn key_ids_extension(mut self, extension: Value) -> Self {
+        self.extension = Some(extension);
         self
     }
 
@@ -205,16 +230,34 @@ impl<'c> DecKeys<'c> {
             url.query_pairs_mut().append_pair("key_ID", &self.ids[0]);
             Prepared::get(url)
         } else {
-            let ids: Vec<Value> = self.ids.iter().map(|id| json!({ "key_ID": id })).collect();
-            Prepared::post(url, &json!({ "key_IDs": ids }))
+            Prepared::post(url, &self.body())
         };
         let body = self.client.call(Call::DecKeys, &prepared).await?;
         parse::key_container(&body, &Asked::Ids(&self.ids), self.size, quirks)
             .map_err(|e| Call::DecKeys.consumed(e))
     }
 
+    fn body(&self) -> Value {
+        let mut ids: Vec<Value> = self.ids.iter().map(|id| json!({ "key_ID": id })).collect();
+        for (at, extension) in &self.id_extensions {
+            ids[*at]["key_ID_extension"] = extension.clone();
+        }
+        let mut body = json!({ "key_IDs": ids });
+        if let Some(extension) = &self.extension {
+            body["key_IDs_extension"] = extension.clone();
+        }
+        body
+    }
+
     fn check(&self) -> Result<(), Error> {
         check_size(self.size)?;
+        let mut extensions = self.id_extensions.iter().map(|(_, one)| one).chain(&self.extension);
+        if extensions.any(|extension| !extension.is_object()) {
+            return Err(refuse("an extension is a JSON object (clause 6.4)"));
+        }
+        if self.via_get && !(self.id_extensions.is_empty() && self.extension.is_none()) {
+            return Err(refuse("GET carries no extension; send it as POST (clause 6.4)"));
+        }
         if self.ids.is_empty() {
             return Err(refuse("no key_ID was given"));
         }

@@ -186,6 +186,10 @@ async fn requests_that_cannot_be_put_are_refused_before_they_are_sent() {
         master.dec_keys("sae-b").key_ids(["a", "A"]).send().await,
         master.dec_keys("sae-b").key_ids(["a", "b"]).via_get().send().await,
         master.dec_keys("sae-b").key_id("a").size(12).send().await,
+        master.dec_keys("sae-b").key_id_with_extension("a", json!(1)).send().await,
+        master.dec_keys("sae-b").key_id("a").key_ids_extension(json!([])).send().await,
+        master.dec_keys("sae-b").key_id("a").key_ids_extension(json!({})).via_get().send().await,
+        master.dec_keys("sae-b").key_id_with_extension("a", json!({})).via_get().send().await,
     ];
     for result in refused {
         let error = failed(result);

@@ -127,6 +127,20 @@ async fn broken_promises_name_their_clause() {
 }
 
 #[tokio::test]
+async fn the_default_size_is_the_one_that_the_last_status_named() {
+    let network = network().await;
+    let client = once(&network).build().unwrap();
+    kme_a(&network).inject(Fault::WrongLength, 1);
+    // Nobody has said yet what the size is.
+    client.enc_keys("sae-b").send().await.unwrap();
+    client.status("sae-b").await.unwrap();
+    kme_a(&network).inject(Fault::WrongLength, 1);
+    let error = failed(client.clone().enc_keys("sae-b").send().await);
+    assert!(matches!(error.cause(), Error::Check { .. }), "{error}");
+    client.enc_keys("sae-b").send().await.unwrap();
+}
+
+#[tokio::test]
 async fn dec_keys_with_other_keys_than_asked_for_is_refused() {
     let network = network().await;
     let kme_b = network.kme("kme-b").unwrap();
