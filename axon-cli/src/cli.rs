@@ -78,6 +78,10 @@ Examples:
   axon demo
   axon demo --json | jq .verdict
   axon demo --file camera.mcap --rate 1
+  axon demo --kme-env sae-1.env --kme-env sae-2.env --rate 1
+
+With --kme-env the keys come from KMEs that run already: the first FILE says which SAE host A is, the
+second host B, as kme-sim init prints it. docs/qukaydee.md does so with KMEs in the cloud.
 
 Exit status: 0 only when nothing was lost, all compared equal and every wrong peer was refused.";
 
@@ -90,6 +94,9 @@ pub(crate) struct Demo {
     /// Times the recorded pace; 0 is as fast as possible
     #[arg(long, default_value_t = 40.0, value_parser = rate)]
     pub(crate) rate: f64,
+    /// Take keys from KMEs that run already; given twice, for host A and for host B
+    #[arg(long, value_name = "FILE", value_parser = clap::value_parser!(PathBuf))]
+    pub(crate) kme_env: Vec<PathBuf>,
     /// Print the report as one JSON document
     #[arg(long)]
     pub(crate) json: bool,

@@ -1,4 +1,5 @@
-//! The demo's two KMEs: the simulator in this process, mutual TLS under a CA of its own.
+//! The demo's two KMEs: the simulator in this process, mutual TLS under a CA of its own, or KMEs
+//! that run elsewhere.
 
 use std::{
     ops::Sub,
@@ -8,22 +9,34 @@ use std::{
 use etsi_qkd014::sim;
 use serde::Serialize;
 
-use super::DemoError;
+use super::{DemoError, env_file};
 
-/// The SAE of host A.
-pub(crate) const SAE_A: &str = "sae-a";
-/// The SAE of host B.
-pub(crate) const SAE_B: &str = "sae-b";
-/// An SAE that host B takes as a peer, for the attempts of the wrong peers: theirs are refused for
-/// the one thing that is wrong with them and not for their name.
-pub(crate) const SAE_VISITOR: &str = "sae-visitor";
+/// Who asks a KME for keys.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Role {
+    /// Host A.
+    A,
+    /// Host B.
+    B,
+    /// The wrong peers. Host B takes this SAE as a peer, so that they are refused for the one thing
+    /// that is wrong with them and not for their name.
+    Visitor,
+}
 
+const SAES: [&str; 3] = ["sae-a", "sae-b", "sae-visitor"];
 const KMES: [&str; 2] = ["kme-a", "kme-b"];
 
-/// Two KMEs that share keys as a QKD link would let them.
-pub(crate) struct Kmes {
-    network: sim::Network,
-    dir: PathBuf,
+/// Two KMEs that share keys as a QKD link lets them.
+pub(crate) enum Kmes {
+    /// In this process.
+    Simulated {
+        /// The KMEs.
+        network: Box<sim::Network>,
+        /// Where their certificates are.
+        dir: PathBuf,
+    },
+    /// Elsewhere: the variables of host A and of host B.
+    External([Vec<(String, String)>; 2]),
 }
 
 /// Keys that the KMEs handed out.
@@ -49,28 +62,80 @@ impl Sub for KeysHandedOut {
 impl Kmes {
     /// Starts both; `dir` takes certificates and keys.
     pub(crate) async fn start(dir: &Path) -> Result<Self, DemoError> {
+        let failed = |error: sim::Error| DemoError::Kme(error.to_string());
+        let [a, b, visitor] = SAES;
         let network = sim::Network::builder()
-            .kme(KMES[0], ([127, 0, 0, 1], 0).into(), [SAE_A, SAE_VISITOR])
-            .kme(KMES[1], ([127, 0, 0, 2], 0).into(), [SAE_B])
+            .kme(KMES[0], ([127, 0, 0, 1], 0).into(), [a, visitor])
+            .kme(KMES[1], ([127, 0, 0, 2], 0).into(), [b])
             .start()
             .await
-            .map_err(|e| DemoError::Kme(e.to_string()))?;
-        network.write_files(dir).map_err(|e| DemoError::Kme(e.to_string()))?;
-        Ok(Self { network, dir: dir.to_owned() })
+            .map_err(failed)?;
+        network.write_files(dir).map_err(failed)?;
+        Ok(Self::Simulated { network: Box::new(network), dir: dir.to_owned() })
     }
 
-    /// What a host of `sae` is told of its KME.
-    pub(crate) fn identity(&self, sae: &str) -> Vec<(String, String)> {
-        let sae = self.network.sae(sae).map(|sae| sae.env(&self.dir)).unwrap_or_default();
-        sae.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
+    /// Takes KMEs that run elsewhere, as the files of host A and of host B say.
+    pub(crate) fn external(host_a: &Path, host_b: &Path) -> Result<Self, DemoError> {
+        let read = |path| env_file::read(path).map_err(DemoError::KmeEnv);
+        let kmes = Self::External([read(host_a)?, read(host_b)?]);
+        if kmes.sae(Role::A) == kmes.sae(Role::B) {
+            let why = format!("{} is both hosts' AXON_SAE_ID", kmes.sae(Role::A));
+            return Err(DemoError::KmeEnv(why));
+        }
+        Ok(kmes)
     }
 
-    /// Keys handed out since the start.
-    pub(crate) fn handed_out(&self) -> KeysHandedOut {
-        let counters = KMES.iter().filter_map(|id| self.network.kme(id)).map(|kme| kme.counters());
-        counters.fold(KeysHandedOut::default(), |sum, counters| KeysHandedOut {
+    /// The ID of an SAE. KMEs elsewhere are asked for two only: the wrong peers come under the name
+    /// of host A, when host A has ended.
+    pub(crate) fn sae(&self, role: Role) -> &str {
+        match self {
+            Self::Simulated { .. } => SAES[role as usize],
+            Self::External(_) => {
+                let id = self.variables(role).iter().find(|(name, _)| name == "AXON_SAE_ID");
+                id.map_or("", |(_, id)| id)
+            }
+        }
+    }
+
+    /// What a host is told of its KME.
+    pub(crate) fn identity(&self, role: Role) -> Vec<(String, String)> {
+        match self {
+            Self::Simulated { network, dir } => {
+                let sae = network.sae(self.sae(role)).map(|sae| sae.env(dir)).unwrap_or_default();
+                sae.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
+            }
+            Self::External(_) => self.variables(role).to_vec(),
+        }
+    }
+
+    /// The SAEs that host B takes as peers.
+    pub(crate) fn peers_of_b(&self) -> String {
+        match self {
+            Self::Simulated { .. } => [self.sae(Role::A), self.sae(Role::Visitor)].join(";"),
+            Self::External(_) => self.sae(Role::A).to_owned(),
+        }
+    }
+
+    /// Whether the wrong peers have an SAE to themselves.
+    pub(crate) fn has_visitor(&self) -> bool {
+        matches!(self, Self::Simulated { .. })
+    }
+
+    /// Keys handed out since the start, where the KMEs tell.
+    pub(crate) fn handed_out(&self) -> Option<KeysHandedOut> {
+        let Self::Simulated { network, .. } = self else { return None };
+        let counters = network.kmes().iter().map(sim::Kme::counters);
+        Some(counters.fold(KeysHandedOut::default(), |sum, counters| KeysHandedOut {
             to_masters: sum.to_masters + counters.keys_to_masters,
             to_slaves: sum.to_slaves + counters.keys_to_slaves,
-        })
+        }))
+    }
+
+    fn variables(&self, role: Role) -> &[(String, String)] {
+        match self {
+            Self::External([_, b]) if role == Role::B => b,
+            Self::External([a, _]) => a,
+            Self::Simulated { .. } => &[],
+        }
     }
 }

@@ -2,6 +2,7 @@
 //! get in.
 
 mod classical;
+mod env_file;
 mod events;
 mod hosts;
 mod kmes;
@@ -25,7 +26,7 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use self::{
     hosts::{Host, HostSpec},
-    kmes::Kmes,
+    kmes::{Kmes, Role},
     mode::Mode,
     progress::Progress,
     report::{LogSummary, Report},
@@ -55,6 +56,8 @@ pub(crate) enum DemoError {
     Log(#[from] LogError),
     #[error("the KME simulator: {0}")]
     Kme(String),
+    #[error("--kme-env: {0}")]
+    KmeEnv(String),
     #[error("cannot start {name}: {source}")]
     Start { name: String, source: std::io::Error },
     #[error("{name}: {reason}")]
@@ -83,7 +86,10 @@ pub(crate) fn run(args: &cli::Demo) -> Result<ExitCode, Failure> {
             stopped = interrupted() => Err(stopped),
         }
     });
-    let report = report.map_err(Failure::failed)?;
+    let report = report.map_err(|error| match error {
+        setting @ DemoError::KmeEnv(_) => Failure::Setting(setting.to_string()),
+        other => Failure::failed(other),
+    })?;
     let text = if args.json {
         serde_json::to_string_pretty(&report).map_err(Failure::failed)? + "\n"
     } else {
@@ -104,7 +110,15 @@ async fn show(args: &cli::Demo) -> Result<Report, DemoError> {
     };
     let survey = Survey::of(&file)?;
     let progress = Progress::new(survey.messages * Mode::ALL.len() as u64);
-    let kmes = Kmes::start(dir).await?;
+    let kmes = match args.kme_env.as_slice() {
+        [] => Kmes::start(dir).await?,
+        [host_a, host_b] => Kmes::external(host_a, host_b)?,
+        files => {
+            let times = files.len();
+            let why = format!("given {times} times, accepted: twice, for host A and for host B");
+            return Err(DemoError::KmeEnv(why));
+        }
+    };
 
     let replay = Replay { file: &file, rate: args.rate, messages: survey.messages };
     let mut routes = Vec::new();
@@ -119,9 +133,20 @@ async fn show(args: &cli::Demo) -> Result<Report, DemoError> {
         }
         routes.push(outcomes.remote);
         progress.step(mode.route(), "wrong peers");
-        let visit = Visit { mode, host: &pair.b, kmes: &kmes, dir, topic: &survey.topics[0] };
+        let Pair { a, b } = pair;
+        // Under the name of host A nobody else can come while it runs.
+        let host_a = if kmes.has_visitor() {
+            Some(a)
+        } else {
+            a.stop().await;
+            None
+        };
+        let visit = Visit { mode, host: &b, kmes: &kmes, dir, topic: &survey.topics[0] };
         refused.extend(visit.all().await?);
-        tokio::join!(pair.a.stop(), pair.b.stop());
+        if let Some(a) = host_a {
+            a.stop().await;
+        }
+        b.stop().await;
     }
     refused.push(wrong_peers::obsolete_variable().await?);
     progress.clear();
@@ -145,8 +170,8 @@ async fn start(mode: Mode, kmes: &Kmes, dir: &Path, logs: &Path) -> Result<Pair,
         address: "127.0.0.1",
         peer: "127.0.0.2",
         mode,
-        identity: kmes.identity(kmes::SAE_A),
-        peers: kmes::SAE_B.to_owned(),
+        identity: kmes.identity(Role::A),
+        peers: kmes.sae(Role::B).to_owned(),
     };
     let spec_b = HostSpec {
         name: "host B",
@@ -154,8 +179,8 @@ async fn start(mode: Mode, kmes: &Kmes, dir: &Path, logs: &Path) -> Result<Pair,
         address: "127.0.0.2",
         peer: "127.0.0.1",
         mode,
-        identity: kmes.identity(kmes::SAE_B),
-        peers: [kmes::SAE_A, kmes::SAE_VISITOR].join(";"),
+        identity: kmes.identity(Role::B),
+        peers: kmes.peers_of_b(),
     };
     let (a, b) =
         tokio::try_join!(Host::start(&spec_a, dir, logs), Host::start(&spec_b, dir, logs))?;

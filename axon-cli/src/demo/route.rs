@@ -57,7 +57,7 @@ pub(crate) async fn run(
     mode: Mode,
     pair: &Pair,
     kmes: &Kmes,
-    keys_before: KeysHandedOut,
+    keys_before: Option<KeysHandedOut>,
     replay: Replay<'_>,
     progress: &Progress,
 ) -> Result<Outcomes, DemoError> {
@@ -94,7 +94,8 @@ pub(crate) async fn run(
     for process in [player, local, remote] {
         process.stop().await;
     }
-    let keys = mode.is_qkd().then(|| kmes.handed_out() - keys_before);
+    let keys = kmes.handed_out().zip(keys_before).filter(|_| mode.is_qkd());
+    let keys = keys.map(|(now, before)| now - before);
     Ok(Outcomes {
         local: Row::new("shared memory", here, waits, None, None),
         remote: Row::new(mode.route(), there, waits, Some(link), keys),

@@ -20,7 +20,7 @@ use tokio::time::Instant;
 use super::{
     DemoError, classical,
     hosts::{Host, HostSpec, axon},
-    kmes::{self, Kmes},
+    kmes::{Kmes, Role},
     mode::Mode,
     report::Attempt,
 };
@@ -111,7 +111,7 @@ impl Visit<'_> {
     ) -> Result<Attempt, DemoError> {
         let before = self.refusals().await?;
         let target = self.target(wrong.peer).await?;
-        let sae = mode.is_qkd().then_some(kmes::SAE_B);
+        let sae = mode.is_qkd().then_some(self.kmes.sae(Role::B));
         let config = self.visitor(wrong.peer, mode)?;
         let outcome = attempt::link(&config, target, sae, bootstrap).await;
         self.judge(wrong, outcome.map(drop), &before).await
@@ -144,7 +144,8 @@ impl Visit<'_> {
     ) -> Result<Result<(), Refusal>, DemoError> {
         let target = self.target(peer).await?;
         let config = self.visitor(peer, self.mode)?;
-        let link = attempt::link(&config, target, Some(kmes::SAE_B), Bootstrap::Genuine).await;
+        let link =
+            attempt::link(&config, target, Some(self.kmes.sae(Role::B)), Bootstrap::Genuine).await;
         let link = link.map_err(|refusal| {
             let reason = format!("the link before it: {refusal}");
             DemoError::Attempt { attempt: peer, reason }
@@ -234,8 +235,8 @@ impl Visit<'_> {
             address: VISITOR,
             peer: "127.0.0.2",
             mode,
-            identity: self.kmes.identity(kmes::SAE_VISITOR),
-            peers: kmes::SAE_B.to_owned(),
+            identity: self.kmes.identity(Role::Visitor),
+            peers: self.kmes.sae(Role::B).to_owned(),
         };
         let settings = spec.settings(&self.dir.join("visitor"));
         let settings = settings.into_iter().map(|(name, value)| (name.into(), value));
