@@ -19,7 +19,7 @@ use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use serde_json::json;
 use tokio::runtime::Runtime;
 
-const ROUNDS: usize = 2000;
+const ROUNDS: usize = 1000;
 
 struct Bed {
     network: Network,
@@ -201,6 +201,9 @@ fn main() {
         runtime.block_on(memory(&bed));
         return;
     }
+    let mut criterion = Criterion::default().configure_from_args();
+    hand_out(&mut criterion, &runtime, &bed);
+    criterion.final_summary();
     runtime.block_on(async {
         memory(&bed).await;
         for number in [1, 8, 100] {
@@ -208,7 +211,4 @@ fn main() {
             dec_keys(&bed, number).await;
         }
     });
-    let mut criterion = Criterion::default().configure_from_args();
-    hand_out(&mut criterion, &runtime, &bed);
-    criterion.final_summary();
 }
