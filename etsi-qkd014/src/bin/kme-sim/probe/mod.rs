@@ -29,7 +29,7 @@ use crate::{Failure, Outcome, other, say};
 /// were skipped), 1 if one failed or was only tolerated, 2 on wrong arguments.
 #[derive(Args)]
 pub(crate) struct Arguments {
-    /// https://host[:port][/prefix] of the KME.
+    /// `https://host[:port][/prefix]` of the KME.
     #[arg(env = "AXON_KME_URL")]
     url: String,
     /// The CA of the KME's certificate, PEM or DER.
