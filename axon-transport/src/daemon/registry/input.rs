@@ -1,7 +1,7 @@
 //! What sessions say.
 
 use super::{
-    LocalEndpoint, MAX_SESSIONS, MAX_TOMBSTONES, Registry, SessionEntry, Violation,
+    Asked, LocalEndpoint, MAX_SESSIONS, MAX_TOMBSTONES, Registry, SessionEntry, Violation,
     output::session_entry,
 };
 use crate::{
@@ -171,15 +171,21 @@ impl<F: Clone> Registry<F> {
         }
         let pair = Pair { reader: attach.reader, writer: attach.writer };
         // The pair may have ended while the message was on its way.
-        let Some(state) = self.pairs.get_mut(&pair) else { return Ok(()) };
-        *state = Some(Attach { session: *id, ..attach });
-        self.forward_attach(&pair);
+        let Some(asked) = self.pairs.get_mut(&pair) else { return Ok(()) };
+        let attach = Some(Attach { session: *id, ..attach });
+        // A repetition is not passed on: whoever should know has been told, is about to be, or is
+        // behind. Sessions that are told everything anew would otherwise set each other back
+        // without end.
+        if asked.attach != attach {
+            *asked = Asked { attach, grant: None };
+            self.forward_attach(&pair);
+        }
         Ok(())
     }
 
     /// Tells the writer's session what the reader asked.
     pub(super) fn forward_attach(&mut self, pair: &Pair) {
-        let Some(Some(attach)) = self.pairs.get(pair) else { return };
+        let Some(attach) = self.pairs.get(pair).and_then(|p| p.attach.as_ref()) else { return };
         let Some(writer) = self.endpoints.get(&pair.writer) else { return };
         let (message, reader_session, to) =
             (Message::Attach(attach.clone()), attach.session, writer.session);
@@ -188,22 +194,34 @@ impl<F: Clone> Registry<F> {
     }
 
     fn grant(&mut self, id: &SessionId, grant: Granted) -> Result<(), Violation> {
-        let ring = match self.endpoints.get(&grant.writer) {
-            None => return Ok(()),
-            Some(writer) if writer.session != *id => {
-                return Err(Violation::NotItsOwn(grant.writer));
-            }
-            Some(writer) => writer.ring.clone(),
-        };
-        let pair = Pair { reader: grant.reader, writer: grant.writer };
-        if !matches!(self.pairs.get(&pair), Some(Some(_))) {
-            return Ok(());
+        if self.endpoints.get(&grant.writer).is_some_and(|w| w.session != *id) {
+            return Err(Violation::NotItsOwn(grant.writer));
         }
-        let Some(to) = self.endpoints.get(&grant.reader).map(|r| r.session) else { return Ok(()) };
-        let mut descriptors: Vec<F> = ring.into_iter().collect();
-        descriptors.extend(self.introduce(&to, id, &pair));
-        self.push(&to, &Message::Grant(Granted { session: *id, ..grant }), descriptors);
+        let pair = Pair { reader: grant.reader, writer: grant.writer };
+        let Some(asked) = self.pairs.get_mut(&pair).filter(|p| p.attach.is_some()) else {
+            return Ok(());
+        };
+        let grant = Some(Granted { session: *id, ..grant });
+        if asked.grant != grant {
+            asked.grant = grant;
+            self.forward_grant(&pair);
+        }
         Ok(())
+    }
+
+    /// Tells the reader's session what the writer granted. Whether there was something to tell.
+    pub(super) fn forward_grant(&mut self, pair: &Pair) -> bool {
+        let Some(grant) = self.pairs.get(pair).and_then(|p| p.grant) else { return false };
+        let (Some(reader), Some(writer)) =
+            (self.endpoints.get(&pair.reader), self.endpoints.get(&pair.writer))
+        else {
+            return false;
+        };
+        let to = reader.session;
+        let mut descriptors: Vec<F> = writer.ring.clone().into_iter().collect();
+        descriptors.extend(self.introduce(&to, &grant.session, pair));
+        self.push(&to, &Message::Grant(grant), descriptors);
+        true
     }
 
     fn detach(&mut self, id: &SessionId, pair: Pair) -> Result<(), Violation> {

@@ -1,6 +1,6 @@
 //! Who goes with whom.
 
-use super::{LocalEndpoint, Registry, Topic};
+use super::{Asked, LocalEndpoint, Registry, Topic};
 use crate::{
     graph::Endpoint,
     ids::{Gid, SessionId},
@@ -42,7 +42,7 @@ impl<F: Clone> Registry<F> {
             let (to_writer, to_reader) = (w.session, r.session);
             match compatible(&w.endpoint.qos, &r.endpoint.qos) {
                 Ok(()) => {
-                    self.pairs.insert(pair, None);
+                    self.pairs.insert(pair, Asked::default());
                     self.push(&to_reader, &Message::Match(pair), Vec::new());
                 }
                 Err(policy) => {

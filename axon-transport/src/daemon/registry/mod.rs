@@ -19,7 +19,7 @@ pub use output::Output;
 use crate::{
     graph::Endpoint,
     ids::{DaemonId, Gid, SessionId},
-    session::message::{Attach, EndpointRole, GraphItem, Pair, SessionRole},
+    session::message::{Attach, EndpointRole, Granted, GraphItem, Pair, SessionRole},
 };
 
 /// Packets that may wait for one session before it is told everything anew instead.
@@ -35,7 +35,7 @@ pub struct Registry<F> {
     sessions: BTreeMap<SessionId, SessionEntry<F>>,
     endpoints: HashMap<Gid, LocalEndpoint<F>>,
     topics: HashMap<Topic, Members>,
-    pairs: BTreeMap<Pair, Option<Attach>>,
+    pairs: BTreeMap<Pair, Asked>,
     remote: BTreeMap<DaemonId, BTreeMap<Gid, Endpoint>>,
     tombstones: VecDeque<Gid>,
     version: u64,
@@ -79,6 +79,15 @@ pub struct LocalEndpoint<F> {
     pub stands_for: Vec<Gid>,
     /// A writer's ring.
     pub ring: Option<F>,
+}
+
+/// How far a pair has come.
+#[derive(Debug, Default)]
+struct Asked {
+    /// What its reader asked.
+    attach: Option<Attach>,
+    /// What its writer answered.
+    grant: Option<Granted>,
 }
 
 /// A topic's or service's name and type.
@@ -155,7 +164,7 @@ impl<F: Clone> Registry<F> {
 
     /// The pairs whose reader has asked its writer.
     pub fn attached(&self) -> impl Iterator<Item = &Attach> {
-        self.pairs.values().flatten()
+        self.pairs.values().filter_map(|asked| asked.attach.as_ref())
     }
 
     /// The version that the next [`flush`](Self::flush) will exceed.

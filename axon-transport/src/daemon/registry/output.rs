@@ -23,8 +23,9 @@ pub struct Output<F> {
 impl<F: Clone> Registry<F> {
     /// The next packet for a session; `None` when there is none.
     ///
-    /// A session that is behind is told everything anew: the graph, its matches, and what readers
-    /// asked of its writers, closed by a GRAPH without `more`. What it does not hear again is over.
+    /// A session that is behind is told everything anew: the graph, its matches or what was granted
+    /// to its readers, and what readers asked of its writers, closed by a GRAPH without `more`. What
+    /// it does not hear again is over.
     pub fn next_output(&mut self, id: &SessionId) -> Option<Output<F>> {
         let entry = self.sessions.get_mut(id)?;
         if entry.behind && entry.queue.is_empty() {
@@ -102,7 +103,8 @@ impl<F: Clone> Registry<F> {
             .copied()
             .collect();
         for pair in own {
-            if self.owner(&pair.reader) == Some(*id) {
+            // A reader that is not served yet asks again; one that is learns how.
+            if self.owner(&pair.reader) == Some(*id) && !self.forward_grant(&pair) {
                 self.push(id, &Message::Match(pair), Vec::new());
             }
             if self.owner(&pair.writer) == Some(*id) {

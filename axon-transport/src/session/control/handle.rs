@@ -16,7 +16,7 @@ use crate::{
         state::{SessionEvent, StatusAnswer},
         subscription::{Accept, SubscriptionInner},
     },
-    shm::{Grant, Peer, Reader, ReaderInfo, ReaderOptions},
+    shm::{Grant, Peer, Reader, ReaderInfo, ReaderOptions, ShmError},
 };
 
 impl Control {
@@ -149,9 +149,18 @@ impl Control {
         };
         let segment = self.shared.segment.clone();
         let lane = subscription.lock().lane_for(pair.writer, || segment.allocate_lane());
+        self.ask_with(&subscription, pair.writer, lane);
+    }
+
+    fn ask_with(
+        &mut self,
+        subscription: &SubscriptionInner,
+        writer: Gid,
+        lane: Result<u32, ShmError>,
+    ) {
         match lane {
             Ok(lane) => {
-                let message = self.attach_message(&subscription, pair.writer, lane);
+                let message = self.attach_message(subscription, writer, lane);
                 self.outbox.push_back((message, Vec::new()));
             }
             Err(error) => {
@@ -210,19 +219,29 @@ impl Control {
     fn grant(&mut self, granted: Granted, mut descriptors: Vec<OwnedFd>) {
         let Granted { reader, writer, generation, first, session } = granted;
         let pair = Pair { reader, writer };
+        if let Some(repeated) = &mut self.repeated {
+            repeated.insert(pair);
+        }
         let others = if descriptors.is_empty() { Vec::new() } else { descriptors.split_off(1) };
         let peer = self.hold(session, pair, others);
         let Some(subscription) = self.shared.state().subscriptions.get(&reader).cloned() else {
             return;
         };
         let grant = Grant { generation, first };
-        // Bound to a name: a match on the temporary would hold the lock over its arms.
-        let accept = subscription.lock().accept(writer, grant);
-        let lane = match accept {
+        let mut slots = subscription.lock();
+        let lane = match slots.accept(writer, grant) {
             Accept::Stands => return,
-            Accept::AskAgain => return self.ask(&pair),
+            Accept::AskAgain => {
+                // Under the same lock: the lane of before is in use still, so this is another one,
+                // and what we ask is no repetition, which the daemon would not pass on.
+                let segment = &self.shared.segment;
+                let lane = slots.lane_for(writer, || segment.allocate_lane());
+                drop(slots);
+                return self.ask_with(&subscription, writer, lane);
+            }
             Accept::Map(lane) => lane,
         };
+        drop(slots);
         let mapped = match (peer, descriptors.pop()) {
             (Ok(peer), Some(ring)) => {
                 let options = ReaderOptions {
