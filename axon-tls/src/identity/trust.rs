@@ -1,6 +1,6 @@
 //! The keys of the peers: a file of pins, and the set in use, which can be replaced.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, PoisonError, RwLock};
 use std::time::{Duration, SystemTime};
 
@@ -89,8 +89,18 @@ impl TrustFile {
             return Err(TrustFileError { line: 1, reason: "the file is larger than 1 MiB" });
         }
         let mut file = Self::default();
+        let mut keys = HashMap::new();
         for (index, line) in text.lines().enumerate() {
-            file.parse_line(line).map_err(|reason| TrustFileError { line: index + 1, reason })?;
+            let error = |reason| TrustFileError { line: index + 1, reason };
+            let Some(pin) = parse_line(line).map_err(error)? else { continue };
+            let of_name: &mut usize = keys.entry(pin.name.clone()).or_default();
+            *of_name += 1;
+            if *of_name > Self::MAX_PINS_PER_NAME {
+                return Err(error("a name can have at most two keys"));
+            }
+            if file.pins.insert(pin.key, pin).is_some() {
+                return Err(error("this key is in the file twice"));
+            }
         }
         Ok(file)
     }
@@ -121,39 +131,33 @@ impl TrustFile {
     pub fn is_empty(&self) -> bool {
         self.pins.is_empty()
     }
+}
 
-    fn parse_line(&mut self, line: &str) -> Result<(), &'static str> {
-        let content = line.split('#').next().unwrap_or_default();
-        let fields: Vec<_> = content.split_ascii_whitespace().collect();
-        let (name, digest, day) = match fields[..] {
-            [] => return Ok(()),
-            [name, digest] => (name, digest, None),
-            [name, digest, day] => (name, digest, Some(day)),
-            _ => return Err("expected `name spki-sha256:BASE64 [YYYY-MM-DD]`"),
-        };
-        if name.len() > 255 || !name.bytes().all(|byte| byte.is_ascii_graphic()) {
-            return Err("a name has at most 255 printable ASCII characters");
-        }
-        let key = digest
-            .parse()
-            .map_err(|_| "the key must be `spki-sha256:` and 44 characters of base64")?;
-        let last = match day {
-            Some(day) => {
-                let end = end_of_day(day).ok_or("the last day must be a date YYYY-MM-DD")?;
-                Some((day.to_owned(), end))
-            }
-            None => None,
-        };
-
-        let same_name = self.pins.values().filter(|pin| pin.name == name).count();
-        if same_name == Self::MAX_PINS_PER_NAME {
-            return Err("a name can have at most two keys");
-        }
-        if self.pins.insert(key, Pin { name: name.to_owned(), key, last }).is_some() {
-            return Err("this key is in the file twice");
-        }
-        Ok(())
+/// The pin in a line, if it is not empty or a comment.
+fn parse_line(line: &str) -> Result<Option<Pin>, &'static str> {
+    let content = line.split('#').next().unwrap_or_default();
+    // One more than there may be, and no more than that of a line that goes on and on.
+    let fields: Vec<_> = content.split_ascii_whitespace().take(4).collect();
+    let (name, digest, day) = match fields[..] {
+        [] => return Ok(None),
+        [name, digest] => (name, digest, None),
+        [name, digest, day] => (name, digest, Some(day)),
+        _ => return Err("expected `name spki-sha256:BASE64 [YYYY-MM-DD]`"),
+    };
+    if name.len() > 255 || !name.bytes().all(|byte| byte.is_ascii_graphic()) {
+        return Err("a name has at most 255 printable ASCII characters");
     }
+    let key = digest
+        .parse()
+        .map_err(|_| "the key must be `spki-sha256:` and 44 characters of base64")?;
+    let last = match day {
+        Some(day) => {
+            let end = end_of_day(day).ok_or("the last day must be a date YYYY-MM-DD")?;
+            Some((day.to_owned(), end))
+        }
+        None => None,
+    };
+    Ok(Some(Pin { name: name.to_owned(), key, last }))
 }
 
 /// The moment after the last of a day in UTC, for years 1970 to 9999.
@@ -241,6 +245,48 @@ mod tests {
         let line = |byte: u8| format!("a {}\n", SpkiDigest([byte; 32]));
         assert!(TrustFile::parse(&(line(1) + &line(2))).is_ok());
         assert!(TrustFile::parse(&(line(1) + &line(2) + &line(3))).is_err());
+    }
+
+    #[test]
+    fn the_largest_file_is_read_whole() {
+        // As many lines as there is room for, each of a name of its own.
+        let line = |n: u32| {
+            let mut key = [0; 32];
+            key[..4].copy_from_slice(&n.to_be_bytes());
+            format!("{n} {}\n", SpkiDigest(key))
+        };
+        let mut text = String::new();
+        let mut lines = 0;
+        while text.len() + 64 <= TrustFile::MAX_LEN {
+            text += &line(lines);
+            lines += 1;
+        }
+        assert!(lines > 15_000);
+        let file = TrustFile::parse(&text).unwrap();
+        assert_eq!(file.pins().count(), lines as usize);
+        // The last of them counts as the first does.
+        text = line(0) + &text.replacen(&line(0), "", 1);
+        assert!(TrustFile::parse(&text).is_ok());
+        text.truncate(text.len() - 10);
+        assert_eq!(TrustFile::parse(&text).unwrap_err().line(), lines as usize);
+    }
+
+    #[test]
+    fn a_line_without_end_is_refused_by_its_first_words() {
+        let text = "a ".repeat(TrustFile::MAX_LEN / 2);
+        assert!(TrustFile::parse(&text).unwrap_err().reason().starts_with("expected"));
+    }
+
+    #[test]
+    fn a_file_cut_anywhere_pins_nothing_that_it_does_not_say() {
+        let text = format!("base {KEY} 2030-12-31\narm {} 2031-01-31\n", SpkiDigest([1; 32]));
+        let whole = TrustFile::parse(&text).unwrap();
+        for end in 0..text.len() {
+            let Ok(part) = TrustFile::parse(&text[..end]) else { continue };
+            for pin in part.pins() {
+                assert!(whole.pins().any(|p| (p.name(), p.key()) == (pin.name(), pin.key())));
+            }
+        }
     }
 
     #[test]
