@@ -6,6 +6,7 @@ use std::fmt;
 use std::time::Duration;
 
 use super::supply::Supply;
+use crate::Status;
 
 #[cfg(test)]
 mod tests;
@@ -25,7 +26,8 @@ const PAUSE_LOST: (Duration, Duration) = (Duration::from_secs(1), Duration::from
 ///
 /// - No more keys are held and asked for together than the target, and no more than a quarter of
 ///   the KME's `stored_key_count`, but always one. A count of 0 says nothing: some KMEs always
-///   say 0.
+///   say 0. Keys that the owner took and keeps ready count with them where it says so
+///   ([`set_elsewhere`](Self::set_elsewhere)).
 /// - A call asks for at most [`batch`](Settings::batch) keys and at most the KME's
 ///   `max_key_per_request`; 0 says nothing. Until a status was answered, for one.
 /// - A refill begins when a batch, or a quarter of the target, is missing, and goes on until
@@ -56,6 +58,8 @@ pub struct Core<K> {
     held: VecDeque<(Duration, K)>,
     /// Keys asked for by each call in flight, and when.
     in_flight: Vec<(u32, Duration)>,
+    /// Keys that the owner keeps ready.
+    elsewhere: usize,
     /// Keys that the next call may ask for.
     size: u32,
     /// A refill has begun, and goes on until everything missing is asked for.
@@ -85,6 +89,7 @@ struct Stocktaking {
 #[derive(Default)]
 struct Counts {
     obtained: u64,
+    put: u64,
     taken: u64,
     expired: u64,
     unusable: u64,
@@ -142,6 +147,15 @@ pub struct Stock {
     pub max_key_per_request: u64,
 }
 
+impl From<&Status> for Stock {
+    fn from(status: &Status) -> Self {
+        Self {
+            stored_key_count: status.stored_key_count,
+            max_key_per_request: status.max_key_per_request,
+        }
+    }
+}
+
 /// How a pool stands.
 #[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
@@ -150,6 +164,8 @@ pub struct PoolStatus {
     pub held: usize,
     /// Keys asked for and not there.
     pub asked: usize,
+    /// Keys that the owner keeps ready, as it last said.
+    pub elsewhere: usize,
     /// Keys that should be held or asked for: what was set, within the KME's stock.
     pub target: usize,
     /// Keys a second that the KME gives, where it was seen at its limit.
@@ -160,6 +176,8 @@ pub struct PoolStatus {
     pub failures: u32,
     /// Keys that came and could be taken.
     pub obtained: u64,
+    /// Keys put in by the owner.
+    pub put: u64,
     /// Keys taken.
     pub taken: u64,
     /// Keys dropped because nobody took them in time.
@@ -190,6 +208,7 @@ impl<K> Core<K> {
             jitter: Box::new(jitter),
             held: VecDeque::new(),
             in_flight: Vec::new(),
+            elsewhere: 0,
             failures: 0,
             not_before: Duration::ZERO,
             held_until: Duration::ZERO,
@@ -249,7 +268,7 @@ impl<K> Core<K> {
     pub fn on_keys(&mut self, now: Duration, asked: u32, keys: impl IntoIterator<Item = K>) {
         let since = self.ended(asked).unwrap_or(now);
         // Several calls may end in another order than they began.
-        let at = self.held.iter().rposition(|(held, _)| *held <= since).map_or(0, |i| i + 1);
+        let at = self.place(since);
         let before = self.held.len();
         self.held.extend(keys.into_iter().map(|key| (since, key)));
         let came = self.held.len() - before;
@@ -300,9 +319,36 @@ impl<K> Core<K> {
         Some(key)
     }
 
+    /// Puts a key in: one that was taken and then not used, or one that came another way. It is of
+    /// an age with keys asked for at `since`. No target holds it back, so the owner bounds how many
+    /// there are.
+    pub fn put(&mut self, since: Duration, key: K) {
+        let at = self.place(since);
+        self.held.insert(at, (since, key));
+        self.counts.put += 1;
+    }
+
     /// How many keys to hold from now on. Keys beyond it stay until they are taken or too old.
     pub fn set_target(&mut self, keys: usize) {
         self.settings.target = keys;
+    }
+
+    /// How many keys the owner took and keeps ready: they count towards the target as if they were
+    /// held here.
+    pub fn set_elsewhere(&mut self, keys: usize) {
+        self.elsewhere = keys;
+    }
+
+    /// Keys that should be held or asked for: what was set, within the KME's stock.
+    #[must_use]
+    pub fn target(&self) -> usize {
+        match self.stock.last {
+            Some(Stock { stored_key_count: count @ 1.., .. }) => {
+                let quarter = usize::try_from(count / 4).unwrap_or(usize::MAX);
+                self.settings.target.min(quarter.max(1))
+            }
+            _ => self.settings.target,
+        }
     }
 
     /// Asks for no keys before `at`.
@@ -334,11 +380,13 @@ impl<K> Core<K> {
         PoolStatus {
             held: self.held.iter().filter(fresh).count(),
             asked: self.asked(),
+            elsewhere: self.elsewhere,
             target: self.target(),
             supply: self.supply.rate(),
             waiting: self.dry_since.map(|since| now.saturating_sub(since)),
             failures: self.failures,
             obtained: self.counts.obtained,
+            put: self.counts.put,
             taken: self.counts.taken,
             expired: self.counts.expired,
             unusable: self.counts.unusable,
@@ -350,18 +398,14 @@ impl<K> Core<K> {
         self.in_flight.iter().map(|&(number, _)| number as usize).sum()
     }
 
-    fn target(&self) -> usize {
-        match self.stock.last {
-            Some(Stock { stored_key_count: count @ 1.., .. }) => {
-                let quarter = usize::try_from(count / 4).unwrap_or(usize::MAX);
-                self.settings.target.min(quarter.max(1))
-            }
-            _ => self.settings.target,
-        }
+    fn missing(&self) -> usize {
+        let here = self.held.len() + self.asked();
+        self.target().saturating_sub(here.saturating_add(self.elsewhere))
     }
 
-    fn missing(&self) -> usize {
-        self.target().saturating_sub(self.held.len() + self.asked())
+    /// Where a key asked for at `since` goes, so that the oldest stays first.
+    fn place(&self, since: Duration) -> usize {
+        self.held.iter().rposition(|(held, _)| *held <= since).map_or(0, |i| i + 1)
     }
 
     fn per_call(&self) -> u32 {

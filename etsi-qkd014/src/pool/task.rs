@@ -104,13 +104,7 @@ impl Shared {
         let now = self.now();
         let mut state = self.state();
         match ended {
-            Ended::Status(Ok(status)) => state.core.on_stock(
-                now,
-                Stock {
-                    stored_key_count: status.stored_key_count,
-                    max_key_per_request: status.max_key_per_request,
-                },
-            ),
+            Ended::Status(Ok(status)) => state.core.on_stock(now, Stock::from(&status)),
             Ended::Status(Err(error)) => {
                 state.core.on_failure(now, Ask::Status, class(&error));
                 state.last_failure = Some(format!("status: {error}"));

@@ -32,7 +32,10 @@ enum Event {
     Fail(usize, FailureClass),
     Stock(u64, u64),
     Take,
+    /// The key taken last comes back, so many milliseconds older than it is.
+    Put(u64),
     Target(usize),
+    Elsewhere(usize),
     Hold(u64),
 }
 
@@ -48,7 +51,9 @@ fn event() -> impl Strategy<Value = Event> {
             .prop_map(|(stored, most)| Event::Stock(stored, most)),
         Just(Event::Take),
         Just(Event::Take),
+        (0..2_000u64).prop_map(Event::Put),
         (0..40usize).prop_map(Event::Target),
+        prop_oneof![0..12usize, Just(usize::MAX)].prop_map(Event::Elsewhere),
         (0..10_000u64).prop_map(Event::Hold),
     ]
 }
@@ -75,6 +80,7 @@ proptest! {
         // Each key is (number, when it was asked for).
         let mut made = 0u32;
         let mut taken = std::collections::HashSet::new();
+        let (mut last_taken, mut takes, mut elsewhere) = (None, 0, 0);
         for event in events {
             match event {
                 Event::Pass(millis) => now += ms(millis),
@@ -105,7 +111,19 @@ proptest! {
                     if let Some((key, came)) = core.take(now) {
                         prop_assert!(taken.insert(key), "taken twice");
                         prop_assert!(now - came < max_age, "too old");
+                        last_taken = Some((key, came));
+                        takes += 1;
                     }
+                }
+                Event::Put(millis) => {
+                    if let Some((key, came)) = last_taken.take() {
+                        taken.remove(&key);
+                        core.put(came.saturating_sub(ms(millis)), (key, came));
+                    }
+                }
+                Event::Elsewhere(keys) => {
+                    elsewhere = keys;
+                    core.set_elsewhere(keys);
                 }
                 Event::Target(keys) => {
                     target = keys;
@@ -129,15 +147,15 @@ proptest! {
                         prop_assert!(n >= 1 && n <= batch.max(1));
                         prop_assert!(flying.len() <= calls.max(1));
                         prop_assert!(now >= held_until);
-                        prop_assert!(status.held + status.asked <= target);
+                        let ahead = status.held + status.asked + elsewhere;
+                        prop_assert!(ahead <= target);
                         match last_stock {
                             None => prop_assert_eq!(n, 1, "nothing is known"),
                             Some(stock) => {
                                 let most = stock.max_key_per_request;
                                 prop_assert!(most == 0 || u64::from(n) <= most);
                                 let count = stock.stored_key_count;
-                                let ahead = (status.held + status.asked) as u64;
-                                prop_assert!(count == 0 || ahead <= (count / 4).max(1));
+                                prop_assert!(count == 0 || ahead as u64 <= (count / 4).max(1));
                             }
                         }
                     }
@@ -147,8 +165,9 @@ proptest! {
             let asked: u32 = flying.iter().map(|(n, _)| n).sum();
             prop_assert_eq!(status.asked, asked as usize);
             let gone = status.taken + status.expired + status.held as u64;
-            prop_assert_eq!(status.obtained, gone, "no key comes or goes unseen");
-            prop_assert_eq!(status.taken, taken.len() as u64);
+            let came = status.obtained + status.put;
+            prop_assert_eq!(came, gone, "no key comes or goes unseen");
+            prop_assert_eq!(status.taken, takes);
             if let Some(at) = core.poll_timeout() {
                 prop_assert!(at > now, "polled out, so the next thing is later");
             }
@@ -156,6 +175,7 @@ proptest! {
         // It never falls asleep while keys are missing.
         if flying.is_empty() && !status_flying {
             core.set_target(1000);
+            core.set_elsewhere(0);
             // Keys may grow old before, each batch at its own time.
             let asked = (0..1000).any(|_| {
                 now = core.poll_timeout().expect("something is to come").max(now);
@@ -270,6 +290,50 @@ fn the_oldest_key_goes_first_though_answers_overtake_each_other() {
     core.on_keys(ms(30), 8, 0..8);
     let taken: Vec<u32> = std::iter::from_fn(|| core.take(ms(40))).collect();
     assert_eq!(taken, (0..12).collect::<Vec<_>>());
+}
+
+#[test]
+fn a_key_that_comes_back_takes_its_place_by_age_and_comes_out_once() {
+    let settings = Settings { max_age: ms(1_000), ..Settings::default() };
+    let mut core: Core<&str> = Core::new(settings, || 0);
+    core.poll(ms(0));
+    core.on_stock(ms(0), stock(0, 0));
+    assert_eq!(core.poll(ms(100)), Some(Ask::Keys(8)));
+    core.on_keys(ms(100), 8, ["b", "c"]);
+    core.put(ms(0), "a");
+    core.put(ms(200), "d");
+    core.put(ms(100), "b again");
+    let taken: Vec<&str> = std::iter::from_fn(|| core.take(ms(300))).collect();
+    assert_eq!(taken, ["a", "b", "c", "b again", "d"]);
+    core.set_target(2);
+    core.put(ms(0), "old");
+    core.put(ms(200), "d");
+    assert_eq!(core.poll_timeout(), Some(ms(1_000)));
+    assert_eq!(core.take(ms(1_000)), Some("d"));
+    assert_eq!(core.take(ms(1_000)), None);
+    let status = core.status(ms(1_000));
+    assert_eq!((status.obtained, status.put, status.taken, status.expired), (2, 5, 6, 1));
+}
+
+#[test]
+fn keys_that_the_owner_keeps_ready_count_towards_target_and_stock() {
+    let mut pool = core(16, stock(0, 0));
+    pool.set_elsewhere(10);
+    assert_eq!(asks(&mut pool, ms(0)), [Ask::Keys(6)]);
+    pool.on_keys(ms(0), 6, 0..6);
+    while pool.take(ms(0)).is_some() {}
+    pool.set_elsewhere(16);
+    assert_eq!(asks(&mut pool, ms(0)), []);
+    pool.set_elsewhere(13);
+    assert_eq!(asks(&mut pool, ms(0)), [], "a quarter of the target is not missing yet");
+    pool.set_elsewhere(usize::MAX);
+    assert_eq!(asks(&mut pool, ms(0)), []);
+    pool.set_elsewhere(12);
+    assert_eq!(asks(&mut pool, ms(0)), [Ask::Keys(4)]);
+
+    let mut small = core(16, stock(20, 0));
+    small.set_elsewhere(3);
+    assert_eq!(asks(&mut small, ms(0)), [Ask::Keys(2)], "a quarter of 20, with those elsewhere");
 }
 
 #[test]
