@@ -82,8 +82,9 @@ impl ExternalPsk {
     /// `hash` must be SHA-256 or SHA-384, and is the hash of the cipher suites that this PSK can
     /// be used with ([RFC 8446 section 4.2.11]).
     ///
-    /// Fails if `identity` is empty or longer than a ClientHello can carry, if `secret` is shorter
-    /// than [`Self::MIN_SECRET_LEN`], or if `hash` is another one.
+    /// Fails if `identity` is empty or longer than a list of identities can be, if `secret` is
+    /// shorter than [`Self::MIN_SECRET_LEN`], or if `hash` is another one.  Whether all that a
+    /// client offers fits into its ClientHello is seen when a connection is made.
     ///
     /// [RFC 8446 section 4.2.11]: https://datatracker.ietf.org/doc/html/rfc8446#section-4.2.11
     pub fn new(

@@ -14,16 +14,15 @@ use crate::client::ClientConfig;
 use crate::client::ClientConnectionData;
 use crate::client::common::ClientHelloDetails;
 use crate::client::hs::{ClientContext, ClientHelloInput};
-use crate::common_state::{HandshakeKind, Protocol, State};
+use crate::common_state::{CommonState, HandshakeKind, Protocol, State};
 use crate::conn::ConnectionRandoms;
 use crate::crypto::hash::HashAlgorithm;
 use crate::crypto::{ActiveKeyExchange, SharedSecret};
 use crate::enums::{AlertDescription, CipherSuite, HandshakeType};
 use crate::error::{Error, PeerMisbehaved};
-use crate::external_psk::{
-    ExternalPsk, MAX_IDENTITIES_LEN, NegotiatedExternalPsk, PskKeyExchangeMode,
-};
+use crate::external_psk::{ExternalPsk, NegotiatedExternalPsk, PskKeyExchangeMode};
 use crate::hash_hs::{HandshakeHash, HandshakeHashBuffer};
+use crate::msgs::codec::Codec;
 use crate::msgs::enums::NamedGroup;
 use crate::msgs::handshake::{
     ClientExtensions, HandshakeMessagePayload, HandshakePayload, PresharedKeyBinder,
@@ -76,16 +75,6 @@ impl OfferedExternalPsks {
             ));
         }
 
-        let encoded_len = psks
-            .iter()
-            .map(|psk| psk.offered_identity_len())
-            .fold(0, usize::saturating_add);
-        if encoded_len > MAX_IDENTITIES_LEN {
-            return Err(Error::General(
-                "external PSK: the identities do not fit into a ClientHello".into(),
-            ));
-        }
-
         for psk in &psks {
             if suite_for(config, psk.hash(), protocol).is_none() {
                 return Err(Error::General(
@@ -101,16 +90,18 @@ impl OfferedExternalPsks {
     }
 
     /// Makes a ClientHello offer these PSKs and nothing else.
+    ///
+    /// Fails if that does not fit into one.
     pub(in crate::client) fn prepare(
         &self,
         config: &ClientConfig,
-        protocol: Protocol,
+        common: &mut CommonState,
         exts: &mut ClientExtensions<'_>,
         cipher_suites: &mut Vec<CipherSuite>,
-    ) {
+    ) -> Result<(), Error> {
         cipher_suites.retain(|suite| {
             config
-                .find_cipher_suite(*suite, protocol)
+                .find_cipher_suite(*suite, common.protocol)
                 .and_then(|suite| suite.tls13())
                 .is_some_and(|suite| {
                     self.psks
@@ -140,6 +131,17 @@ impl OfferedExternalPsks {
             psk_dhe: self.mode == PskKeyExchangeMode::PskDheKe,
         });
 
+        let len = FIXED_CLIENT_HELLO_LEN
+            + 2 * cipher_suites.len()
+            + extensions_len(exts)
+            + self.offer_len();
+        if len > MAX_CLIENT_HELLO_LEN {
+            return Err(common.send_fatal_alert(
+                AlertDescription::InternalError,
+                Error::General("external PSK: the offer does not fit into a ClientHello".into()),
+            ));
+        }
+
         // "For identities established externally, an obfuscated_ticket_age of 0 SHOULD be used"
         // -- RFC 8446 4.2.11.
         exts.preshared_key_offer = Some(PresharedKeyOffer {
@@ -154,6 +156,18 @@ impl OfferedExternalPsks {
                 .map(|psk| PresharedKeyBinder::from(vec![0; hash_len(psk.hash())]))
                 .collect(),
         });
+        Ok(())
+    }
+
+    /// The bytes that these PSKs take in a ClientHello: type and length of the extension, the two
+    /// lists with their lengths.
+    fn offer_len(&self) -> usize {
+        let entries: usize = self
+            .psks
+            .iter()
+            .map(|psk| psk.offered_identity_len() + 1 + hash_len(psk.hash()))
+            .sum();
+        4 + 2 + 2 + entries
     }
 
     /// Fills in the binders of a ClientHello made with `prepare()`.
@@ -293,7 +307,7 @@ fn complete_key_exchange(
         (Some(ours), Some(theirs)) => (ours, theirs),
         (Some(_), None) => {
             return Err(cx.common.send_fatal_alert(
-                AlertDescription::MissingExtension,
+                AlertDescription::IllegalParameter,
                 PeerMisbehaved::MissingKeyShare,
             ));
         }
@@ -401,6 +415,20 @@ impl State<ClientConnectionData> for ExpectEncryptedExtensions {
     }
 }
 
+/// The bytes that `exts` take, without an offer.
+///
+/// The cookie of a HelloRetryRequest is counted by itself: with it, even this could be more than
+/// the extensions of one message can be.
+fn extensions_len(exts: &mut ClientExtensions<'_>) -> usize {
+    let cookie = exts.cookie.take();
+    let without_cookie = exts.get_encoding().len();
+    let cookie_len = cookie
+        .as_ref()
+        .map_or(0, |cookie| 4 + 2 + cookie.0.len());
+    exts.cookie = cookie;
+    without_cookie + cookie_len
+}
+
 /// A configured suite that uses `hash`.  Binders are the same for all of them.
 fn suite_for(
     config: &ClientConfig,
@@ -415,6 +443,14 @@ fn suite_for(
         .filter_map(|suite| suite.tls13())
         .find(|suite| suite.common.hash_provider.algorithm() == hash)
 }
+
+/// The longest handshake message that rustls takes from a peer, without its header.
+///
+/// It is less than what the lengths in a ClientHello can say.
+const MAX_CLIENT_HELLO_LEN: usize = 0xffff;
+
+/// Version, random, session ID, the length of the suites, compression.
+const FIXED_CLIENT_HELLO_LEN: usize = 2 + 32 + (1 + 32) + 2 + 2;
 
 fn hash_len(hash: HashAlgorithm) -> usize {
     match hash {

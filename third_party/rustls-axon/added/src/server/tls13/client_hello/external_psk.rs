@@ -220,6 +220,15 @@ fn check_offer_is_well_formed(
         ));
     }
 
+    // "If containing a "supported_groups" extension, it MUST also contain a "key_share" extension,
+    //  and vice versa." - RFC8446 9.2, whatever the mode
+    if client_hello.named_groups.is_some() != client_hello.key_shares.is_some() {
+        return Err(cx.common.send_fatal_alert(
+            AlertDescription::MissingExtension,
+            PeerIncompatible::KeyShareExtensionRequired,
+        ));
+    }
+
     if client_hello.has_keyshare_extension_with_duplicates() {
         return Err(cx.common.send_fatal_alert(
             AlertDescription::IllegalParameter,

@@ -1,0 +1,309 @@
+//! A server against a client that knows the PSK, and goes on as it likes after the ClientHello.
+
+use std::io::{Read, Write};
+use std::sync::Arc;
+
+use rustls_axon::crypto::aws_lc_rs::kx_group;
+use rustls_axon::external_psk::PskKeyExchangeMode;
+use rustls_axon::server::ServerSessionMemoryCache;
+use rustls_axon::{Error, PeerMisbehaved, ServerConnection};
+
+use crate::common::*;
+use crate::peer::{
+    digest, list16, list8, message, plaintext, records, ClientHello, Early, Offer, Peer,
+    Protection, Role, APPLICATION_DATA, HANDSHAKE,
+};
+
+const SECRET: [u8; 32] = [1; 32];
+
+fn offer() -> ClientHello {
+    ClientHello::new(vec![Offer::new("a", &SECRET)])
+}
+
+/// A server whose public fields ask for all that it must not do, and that has something to say.
+fn server_to(hello: &[u8]) -> (ServerConnection, Peer) {
+    let resolver = Known::new(vec![psk("a", 1, SHA256)]);
+    let mut config = server_config(&[SHA256], resolver, PskKeyExchangeMode::PskKe);
+    config.session_storage = ServerSessionMemoryCache::new(8);
+    config.send_tls13_tickets = 4;
+    config.max_early_data_size = 1_000;
+    config.send_half_rtt_data = true;
+    let mut server = server(config);
+    server.writer().write_all(b"only for who knows the key").unwrap();
+
+    feed(&mut server, &records(HANDSHAKE, hello)).unwrap();
+    let flight = written(&mut server);
+    let transcript = [hello, &plaintext(&flight)].concat();
+    let mut client = Peer::new(Role::Client, Some(&SECRET), None, transcript);
+    // which is all there is: half-RTT data would not open
+    assert_eq!(client.expect_finished(&flight), message(8, &[0, 0]));
+    (server, client)
+}
+
+fn after_server_finished() -> (ServerConnection, Peer) {
+    server_to(&offer().encode())
+}
+
+fn connected() -> (ServerConnection, Peer) {
+    let (mut server, mut client) = after_server_finished();
+    feed(&mut server, &client.finish()).unwrap();
+    assert!(!server.is_handshaking());
+    // and no tickets
+    let said = client.read.open_all(&written(&mut server));
+    assert_eq!(said, [(APPLICATION_DATA, b"only for who knows the key".to_vec())]);
+    (server, client)
+}
+
+/// The server gave up, said so, let nothing out, and has no PSK to spend.
+fn refused(mut server: ServerConnection, mut client: Peer, flight: &[u8], alert: u8, what: &str) {
+    let error = feed(&mut server, flight).unwrap_err();
+    assert!(server.is_handshaking() && server.external_psk().is_none(), "{what}");
+    let said = client.read.open_all(&written(&mut server));
+    assert_eq!(said, [(21, vec![2, alert])], "{what}: {error}");
+    assert!(server.process_new_packets().is_err(), "{what}: it stays that way");
+}
+
+/// Messages that make no difference between a handshake and later.
+fn never_expected() -> Vec<(&'static str, u8, Vec<u8>)> {
+    vec![
+        ("ClientHello", 1, offer().encode()[4..].to_vec()),
+        ("ServerHello", 2, [&[3, 3][..], &[7; 32], &[0, 0x13, 3, 0, 0, 0]].concat()),
+        (
+            "NewSessionTicket",
+            4,
+            [&[0; 8][..], &list8(b"n"), &list16(b"ticket"), &list16(&[])].concat(),
+        ),
+        ("EndOfEarlyData", 5, vec![]),
+        ("EncryptedExtensions", 8, vec![0, 0]),
+        ("Certificate", 11, vec![0, 0, 0, 0]),
+        ("CertificateRequest", 13, [&[0][..], &list16(&[0, 13, 0, 4, 0, 2, 8, 7])].concat()),
+        ("CertificateVerify", 15, vec![8, 7, 0, 1, 0]),
+        ("a message that does not exist", 99, vec![1, 2, 3]),
+    ]
+}
+
+#[test]
+fn server_refuses_all_but_finished() {
+    let mut cases = never_expected();
+    cases.push(("KeyUpdate", 24, vec![1]));
+    for (what, kind, body) in cases {
+        let (server, mut client) = after_server_finished();
+        let flight = [client.say(kind, &body), client.finish()].concat();
+        refused(server, client, &flight, 10, what);
+    }
+}
+
+#[test]
+fn server_refuses_a_wrong_finished() {
+    let wrong: &[(&str, &dyn Fn(&Peer) -> Vec<u8>)] = &[
+        ("one bit", &|client| {
+            let mut verify_data = client.verify_data();
+            verify_data[0] ^= 0x80;
+            verify_data.to_vec()
+        }),
+        ("the server's own", &|client| client.verify_data_of(Role::Server).to_vec()),
+        ("short", &|client| client.verify_data()[..31].to_vec()),
+        ("long", &|client| [&client.verify_data()[..], &[0]].concat()),
+        ("empty", &|_| Vec::new()),
+    ];
+    for (what, verify_data) in wrong {
+        let (server, mut client) = after_server_finished();
+        let flight = client.say(20, &verify_data(&client));
+        refused(server, client, &flight, 51, what);
+    }
+}
+
+#[test]
+fn server_refuses_application_data_before_finished() {
+    let (server, mut client) = after_server_finished();
+    let flight = client.write.seal(APPLICATION_DATA, b"too early");
+    refused(server, client, &flight, 10, "under handshake keys");
+
+    let (server, mut client) = after_server_finished();
+    // what would be the keys once Finished is said
+    let _ = client.finish();
+    let flight = client.write.seal(APPLICATION_DATA, b"too early");
+    refused(server, client, &flight, 20, "under application keys");
+}
+
+#[test]
+fn server_refuses_every_changed_or_shortened_flight() {
+    let len = after_server_finished().1.finish().len();
+    for at in 0..len {
+        let (mut server, mut client) = after_server_finished();
+        feed(&mut server, &client.finish()[..at]).unwrap();
+        assert!(server.is_handshaking() && server.external_psk().is_none(), "cut at {at}");
+
+        // rustls makes the additional data of what a header should be: of the header as it was
+        // received only the length counts
+        if at < 3 {
+            continue;
+        }
+        let (mut server, mut client) = after_server_finished();
+        let mut flight = client.finish();
+        flight[at] ^= 1;
+        let failed = feed(&mut server, &flight).is_err();
+        assert!(failed || server.is_handshaking(), "byte {at}");
+        assert!(server.external_psk().is_none(), "byte {at}");
+        // whatever it was: not a byte of data
+        let said = client.read.open_all(&written(&mut server));
+        assert!(said.iter().all(|(kind, _)| *kind == 21), "byte {at}");
+    }
+}
+
+#[test]
+fn server_refuses_handshake_messages_after_the_handshake() {
+    let mut cases = never_expected();
+    cases.push(("Finished", 20, vec![0; 32]));
+    for (what, kind, body) in cases {
+        let (mut server, mut client) = connected();
+        let error = feed(&mut server, &client.say(kind, &body)).unwrap_err();
+        assert_eq!(client.alert_in(&written(&mut server)), Some(10), "{what}: {error}");
+    }
+}
+
+#[test]
+fn server_follows_key_updates_but_not_a_flood() {
+    let (mut server, mut client) = connected();
+    feed(&mut server, &client.say(24, &[1])).unwrap();
+    client.write.update();
+    feed(&mut server, &client.write.seal(APPLICATION_DATA, b"under new keys")).unwrap();
+    let mut received = [0; 14];
+    server.reader().read_exact(&mut received).unwrap();
+    assert_eq!(&received, b"under new keys");
+
+    let mut flood = || {
+        let update = client.say(24, &[1]);
+        client.write.update();
+        feed(&mut server, &update)
+    };
+    let error = (0..100).find_map(|_| flood().err());
+    assert_eq!(error, Some(PeerMisbehaved::TooManyKeyUpdateRequests.into()));
+}
+
+/// 0-RTT data is neither acknowledged nor delivered: its records do not open, and are skipped, but
+/// only so many.
+#[test]
+fn server_skips_early_data() {
+    let hello = offer().with(42, &[]).encode();
+    let early_keys = || Protection::new(&Early::new(Some(&SECRET)).traffic(&digest(&hello)));
+
+    let (mut server, mut client) = server_to(&hello);
+    let mut early = early_keys();
+    feed(&mut server, &early.seal(APPLICATION_DATA, b"early")).unwrap();
+    feed(&mut server, &early.seal(HANDSHAKE, &message(5, &[]))).unwrap();
+    assert!(server.early_data().is_none());
+    feed(&mut server, &client.finish()).unwrap();
+    feed(&mut server, &client.write.seal(APPLICATION_DATA, b"later")).unwrap();
+    let mut received = [0; 5];
+    server.reader().read_exact(&mut received).unwrap();
+    assert_eq!(&received, b"later");
+
+    let (mut server, mut client) = server_to(&hello);
+    let mut early = early_keys();
+    let mut flood = || feed(&mut server, &early.seal(APPLICATION_DATA, &[0; 4_096]));
+    let error = (0..10).find_map(|_| flood().err());
+    assert_eq!(error, Some(Error::DecryptError));
+    assert_eq!(client.alert_in(&written(&mut server)), Some(20));
+
+    // who did not announce any has nothing skipped
+    let (server, client) = after_server_finished();
+    let early = early_keys().seal(APPLICATION_DATA, b"early");
+    refused(server, client, &early, 20, "not announced");
+}
+
+/// What a second ClientHello may not do, and one that does all right.
+#[test]
+fn server_refuses_second_client_hellos_that_break_the_rules() {
+    let client_hello = |share: &[u8]| {
+        let hello = offer().in_psk_dhe_ke(29, share);
+        let groups = list16(&[0, 23, 0, 29]);
+        hello.with(10, &groups)
+    };
+    let first = || {
+        let share = [&[0, 23][..], &list16(&[4; 65])].concat();
+        client_hello(&[]).with(51, &list16(&share))
+    };
+    let exchange = || kx_group::X25519.start().unwrap();
+    let retried = |first: &ClientHello| {
+        let resolver = Known::new(vec![psk("a", 1, SHA256), psk("b", 2, SHA256)]);
+        let mode = PskKeyExchangeMode::PskDheKe;
+        let config = server_config_over(&[SHA256], &[kx_group::X25519], resolver, mode);
+        let mut server = server(config);
+        let first = first.encode();
+        feed(&mut server, &records(HANDSHAKE, &first)).unwrap();
+        let retry = plaintext(&written(&mut server));
+        assert_eq!(&retry[6..10], [0xcf, 0x21, 0xad, 0x74], "a HelloRetryRequest");
+        (server, [message(254, &digest(&first)), retry].concat())
+    };
+
+    type Second<'a> = &'a dyn Fn(ClientHello) -> ClientHello;
+    let wrong: &[(&str, Second<'_>, u8)] = &[
+        (
+            "binder over the second ClientHello alone",
+            &|hello| ClientHello { before: vec![], ..hello },
+            51,
+        ),
+        ("early data", &|hello| hello.with(42, &[]), 47),
+        (
+            "no PSK",
+            &|hello| ClientHello { offers: vec![], ..hello }.with(13, &list16(&[4, 3])),
+            109,
+        ),
+        (
+            "the group that was not asked for",
+            &|hello| hello.with(51, &list16(&[&[0, 23][..], &list16(&[4; 65])].concat())),
+            47,
+        ),
+        ("no share at all", &|hello| hello.with(51, &list16(&[])), 47),
+        ("another mode", &|hello| hello.with(45, &[1, 0]), 40),
+        (
+            "another PSK under the binder of the first",
+            &|hello| ClientHello { offers: vec![Offer::new("b", &SECRET)], ..hello },
+            51,
+        ),
+        ("another suite", &|hello| ClientHello { suites: vec![0x1301], ..hello }, 40),
+    ];
+    for (what, change, alert) in wrong {
+        let (mut server, before) = retried(&first());
+        let second = ClientHello { before, ..client_hello(exchange().pub_key()) };
+        let error = feed(&mut server, &records(HANDSHAKE, &change(second).encode())).unwrap_err();
+        assert_eq!(written(&mut server).last(), Some(alert), "{what}: {error}");
+        assert!(server.external_psk().is_none());
+    }
+
+    // again the first one, which has no share of the group that was asked for
+    let (mut server, before) = retried(&first());
+    let again = ClientHello { before, ..first() };
+    let error = feed(&mut server, &records(HANDSHAKE, &again.encode())).unwrap_err();
+    assert_eq!(error, PeerMisbehaved::RefusedToFollowHelloRetryRequest.into());
+
+    let (mut server, before) = retried(&first());
+    let ours = exchange();
+    let second = ClientHello { before: before.clone(), ..client_hello(ours.pub_key()) }.encode();
+    feed(&mut server, &records(HANDSHAKE, &second)).unwrap();
+    let flight = written(&mut server);
+    let server_hello = plaintext(&flight);
+    let head = [0, 51, 0, 36, 0, 29, 0, 32];
+    let at = server_hello.windows(8).position(|window| window == head).unwrap() + 8;
+    let shared = ours.complete(&server_hello[at..at + 32]).unwrap();
+    let transcript = [before, second, server_hello].concat();
+    let mut client =
+        Peer::new(Role::Client, Some(&SECRET), Some(shared.secret_bytes()), transcript);
+    client.expect_finished(&flight);
+    feed(&mut server, &client.finish()).unwrap();
+    assert_eq!(server.external_psk().unwrap().identity(), b"a");
+}
+
+/// A look-up, a wrong Finished and a cut connection leave nothing that a caller would take for use.
+#[test]
+fn a_copied_client_hello_spends_nothing() {
+    let resolver = Known::new(vec![psk("a", 1, SHA256)]);
+    let config = Arc::new(server_config(&[SHA256], resolver, PskKeyExchangeMode::PskKe));
+    let hello = records(HANDSHAKE, &offer().encode());
+    for _ in 0..3 {
+        let mut server = ServerConnection::new(config.clone()).unwrap();
+        feed(&mut server, &hello).unwrap();
+        assert!(server.wants_write() && server.external_psk().is_none());
+    }
+}

@@ -1,0 +1,181 @@
+//! What a client makes of a ServerHello, or of a HelloRetryRequest.
+
+use rustls_axon::crypto::aws_lc_rs::kx_group;
+use rustls_axon::external_psk::PskKeyExchangeMode;
+use rustls_axon::{AlertDescription, ClientConnection, Error, PeerMisbehaved};
+
+use crate::common::*;
+use crate::peer::{
+    digest, ext, list16, message, plaintext, records, server_hello, Early, HANDSHAKE,
+};
+
+/// What the last alert in a flight says.
+fn alert_in(flight: &[u8]) -> Option<AlertDescription> {
+    match flight {
+        [.., 21, 3, 3, 0, 2, 2, alert] => Some(AlertDescription::from(*alert)),
+        _ => None,
+    }
+}
+
+/// The error of a client, and its alert, on a ServerHello made from the extensions given.
+fn client_on_server_hello(
+    mut client: ClientConnection,
+    suite: u16,
+    random: [u8; 32],
+    extensions: &[(u16, &[u8])],
+) -> (Error, Option<AlertDescription>) {
+    let client_hello = plaintext(&written(&mut client));
+    let list: Vec<_> = extensions.iter().map(|(kind, data)| ext(*kind, data)).collect();
+    let record = records(HANDSHAKE, &server_hello(&client_hello, suite, random, &list));
+    let error = feed(&mut client, &record).unwrap_err();
+    let flight = written(&mut client);
+    (error, alert_in(&flight))
+}
+
+const TLS13: (u16, &[u8]) = (43, &[3, 4]);
+const FIRST_PSK: (u16, &[u8]) = (41, &[0, 0]);
+const HELLO_RETRY_REQUEST: [u8; 32] = [
+    0xcf, 0x21, 0xad, 0x74, 0xe5, 0x9a, 0x61, 0x11, 0xbe, 0x1d, 0x8c, 0x02, 0x1e, 0x65, 0xb8, 0x91,
+    0xc2, 0xa2, 0x11, 0x16, 0x7a, 0xbb, 0x8c, 0x5e, 0x07, 0x9e, 0x09, 0xe2, 0xc8, 0xa8, 0x33, 0x9c,
+];
+
+#[test]
+fn client_refuses_hostile_server_hellos() {
+    use AlertDescription::{
+        DecodeError, HandshakeFailure, IllegalParameter, ProtocolVersion, UnsupportedExtension,
+    };
+
+    let x25519_share: Vec<u8> = [&[0, 29, 0, 32][..], &[9; 32]].concat();
+    let client = |mode| client(client_config(&[SHA256, SHA384], vec![psk("a", 1, SHA256)], mode));
+    let [psk_ke, psk_dhe_ke] = MODES;
+
+    for (mode, suite, extensions, alert) in [
+        // no PSK selected, so a certificate would follow
+        (psk_ke, 0x1303, &[TLS13][..], HandshakeFailure),
+        (psk_dhe_ke, 0x1303, &[TLS13, (51, &x25519_share)], HandshakeFailure),
+        // one that was not offered
+        (psk_ke, 0x1303, &[TLS13, (41, &[0, 1])], IllegalParameter),
+        (psk_ke, 0x1303, &[TLS13, (41, &[0xff, 0xff])], IllegalParameter),
+        // a suite that was not offered, as its hash is not the PSK's
+        (psk_ke, 0x1302, &[TLS13, FIRST_PSK], IllegalParameter),
+        // and one that does not exist
+        (psk_ke, 0x13fa, &[TLS13, FIRST_PSK], IllegalParameter),
+        // a key share where there must be none
+        (psk_ke, 0x1303, &[TLS13, FIRST_PSK, (51, &x25519_share)], UnsupportedExtension),
+        // none, or of another group, where there must be one
+        (psk_dhe_ke, 0x1303, &[TLS13, FIRST_PSK], IllegalParameter),
+        (psk_dhe_ke, 0x1303, &[TLS13, FIRST_PSK, (51, &x25519_share)], IllegalParameter),
+        // early data acknowledged where it cannot be
+        (psk_ke, 0x1303, &[TLS13, FIRST_PSK, (42, &[])], UnsupportedExtension),
+        // TLS 1.2
+        (psk_ke, 0x1303, &[], ProtocolVersion),
+        (psk_ke, 0xc02b, &[], ProtocolVersion),
+        (psk_ke, 0x1303, &[(43, &[3, 3]), FIRST_PSK], ProtocolVersion),
+        // an offer where the selection should be
+        (psk_ke, 0x1303, &[TLS13, (41, &[0, 7, 0, 1, b'a', 0, 0, 0, 0])], DecodeError),
+    ] {
+        let (error, sent) = client_on_server_hello(client(mode), suite, [7; 32], extensions);
+        assert_eq!(sent, Some(alert), "{mode:?} {suite:x} {extensions:?}: {error}");
+    }
+
+    // two hashes offered, and the PSK of one selected with the suite of the other
+    let both = vec![psk("a", 1, SHA256), psk("b", 2, SHA384)];
+    let client = self::client(client_config(&[SHA256, SHA384], both, psk_ke));
+    let (error, sent) = client_on_server_hello(client, 0x1302, [7; 32], &[TLS13, FIRST_PSK]);
+    assert_eq!(error, PeerMisbehaved::SelectedExternalPskWithIncompatibleCipherSuite.into());
+    assert_eq!(sent, Some(IllegalParameter));
+}
+
+#[test]
+fn client_refuses_hello_retry_request_without_cause() {
+    let [psk_ke, psk_dhe_ke] = MODES;
+    for (mode, extensions) in [
+        (psk_ke, &[TLS13, (51, &[0x11, 0xec])][..]),
+        (psk_ke, &[TLS13, (44, &[0, 1, 7])]),
+        (psk_ke, &[TLS13]),
+        (psk_dhe_ke, &[TLS13, (51, &[0x11, 0xec])]),
+        (psk_dhe_ke, &[TLS13, (51, &[0, 29])]),
+    ] {
+        let client = client(client_config(&[SHA256], vec![psk("a", 1, SHA256)], mode));
+        let (error, alert) =
+            client_on_server_hello(client, 0x1303, HELLO_RETRY_REQUEST, extensions);
+        assert_eq!(alert, Some(AlertDescription::IllegalParameter), "{mode:?}: {error}");
+    }
+}
+
+/// A client in psk_dhe_ke that answered a HelloRetryRequest for P-256 and the suite of `a`. Gives
+/// the transcript before its second ClientHello, and that.
+fn retried(extensions: &[(u16, &[u8])]) -> (ClientConnection, Vec<u8>, Vec<u8>) {
+    let groups = [kx_group::X25519, kx_group::SECP256R1];
+    let psks = vec![psk("a", 1, SHA256), psk("b", 2, SHA384)];
+    let mode = PskKeyExchangeMode::PskDheKe;
+    let mut client = client(client_config_over(&[SHA256, SHA384], &groups, psks, mode));
+    let first = plaintext(&written(&mut client));
+    let list: Vec<_> = extensions.iter().map(|(kind, data)| ext(*kind, data)).collect();
+    let retry = server_hello(&first, 0x1303, HELLO_RETRY_REQUEST, &list);
+    feed(&mut client, &records(HANDSHAKE, &retry)).unwrap();
+    let second = plaintext(&written(&mut client));
+    (client, [message(254, &digest(&first)), retry].concat(), second)
+}
+
+#[test]
+fn client_refuses_what_follows_a_retry() {
+    let retry = [TLS13, (51, &[0, 23])];
+    let share = |group: u16, len| [&group.to_be_bytes()[..], &list16(&vec![4; len])].concat();
+    let (right, first_group) = (share(23, 65), share(29, 32));
+
+    for (what, suite, random, extensions, alert) in [
+        ("the group of before", 0x1303, [7; 32], &[TLS13, FIRST_PSK, (51, &first_group)][..], 47),
+        ("another suite", 0x1302, [7; 32], &[TLS13, FIRST_PSK, (51, &right)], 47),
+        ("a PSK that was dropped", 0x1303, [7; 32], &[TLS13, (41, &[0, 1]), (51, &right)], 47),
+        ("no PSK", 0x1303, [7; 32], &[TLS13, (51, &right)], 40),
+        ("no share", 0x1303, [7; 32], &[TLS13, FIRST_PSK], 47),
+        ("a share that is none", 0x1303, [7; 32], &[TLS13, FIRST_PSK, (51, &right)], 47),
+        ("to retry again", 0x1303, HELLO_RETRY_REQUEST, &[TLS13, (51, &[0, 29])], 10),
+    ] {
+        let (mut client, _, second) = retried(&retry);
+        let list: Vec<_> = extensions.iter().map(|(kind, data)| ext(*kind, data)).collect();
+        let hello = server_hello(&second, suite, random, &list);
+        let error = feed(&mut client, &records(HANDSHAKE, &hello)).unwrap_err();
+        assert_eq!(written(&mut client).last(), Some(&alert), "{what}: {error}");
+        assert!(client.external_psk().is_none());
+    }
+}
+
+/// The offer of the second ClientHello: PSKs of the suite's hash, bound to all that was said.
+#[test]
+fn the_second_client_hello_is_bound_to_the_first() {
+    for extensions in [&[TLS13, (44, &[0, 3, 1, 2, 3])][..], &[TLS13, (51, &[0, 23])]] {
+        let (_, before, second) = retried(extensions);
+        let transcript = [before, second].concat();
+        let tail = [&[0, 41, 0, 44, 0, 7, 0, 1, b'a'][..], &[0; 4], &[0, 33, 32]].concat();
+        let end = transcript.len() - 32;
+        assert_eq!(&transcript[end - tail.len()..end], tail);
+        let binder =
+            Early::new(Some(&[1; 32])).binder("ext binder", &digest(&transcript[..end - 3]));
+        assert_eq!(&transcript[end..], binder);
+        let cookie = [0, 44, 0, 5, 0, 3, 1, 2, 3];
+        let echoed = transcript.windows(9).filter(|window| *window == cookie).count();
+        assert_eq!(echoed, if extensions[1].0 == 44 { 2 } else { 0 });
+    }
+}
+
+/// Nothing is cut short to make room for what a server wants to have echoed.
+#[test]
+fn client_refuses_a_cookie_it_cannot_carry() {
+    let mode = PskKeyExchangeMode::PskDheKe;
+    for len in [64_400, 65_000, 65_400] {
+        let cookie = list16(&vec![7; len]);
+        let client = client(client_config(&[SHA256], vec![psk("a", 1, SHA256)], mode));
+        let extensions = [TLS13, (44, &cookie[..])];
+        let (_, alert) = client_on_server_hello(client, 0x1303, HELLO_RETRY_REQUEST, &extensions);
+        assert_eq!(alert, Some(AlertDescription::InternalError), "{len}");
+    }
+
+    let mut client = client(client_config(&[SHA256], vec![psk("a", 1, SHA256)], mode));
+    let hello = plaintext(&written(&mut client));
+    let extensions = [ext(43, &[3, 4]), ext(44, &list16(&[7; 60_000]))];
+    let retry = server_hello(&hello, 0x1303, HELLO_RETRY_REQUEST, &extensions);
+    feed(&mut client, &records(HANDSHAKE, &retry)).unwrap();
+    assert!(written(&mut client).len() > 60_000, "what it can carry, it does");
+}
