@@ -33,7 +33,37 @@ pub enum Error {
     /// The system's random number generator or key generation failed.
     #[error("key generation failed")]
     KeyGeneration,
-    /// Roots, certificates or revocation lists that cannot be used.
-    #[error("certificates: {0}")]
-    Certificates(String),
+    /// A part of [`CaMaterial`](crate::identity::CaMaterial) that cannot be used.
+    #[error("{part}: {reason}")]
+    Certificates {
+        /// Which of the texts it was made from.
+        part: CaPart,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
+
+/// A text that [`CaMaterial`](crate::identity::CaMaterial) is made from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum CaPart {
+    /// The roots.
+    Roots,
+    /// Our certificate and the chain above it.
+    Chain,
+    /// The private key of our certificate.
+    Key,
+    /// The revocation lists.
+    RevocationLists,
+}
+
+impl std::fmt::Display for CaPart {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Roots => "roots",
+            Self::Chain => "our certificate",
+            Self::Key => "our private key",
+            Self::RevocationLists => "revocation lists",
+        })
+    }
 }

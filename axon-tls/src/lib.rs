@@ -36,7 +36,7 @@ pub mod qkd;
 #[cfg(feature = "quic")]
 pub mod quic;
 
-pub use error::Error;
+pub use error::{CaPart, Error};
 pub use negotiated::{Cipher, KeyExchange, Negotiated, PskKex, UnknownName};
 
 #[cfg(doctest)]

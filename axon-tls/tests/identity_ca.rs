@@ -3,11 +3,11 @@
 use std::sync::Arc;
 
 use axon_tls::identity::{Auth, CaMaterial};
-use axon_tls::{Cipher, hybrid};
+use axon_tls::{CaPart, Cipher, Error, hybrid};
 use rcgen::{
-    BasicConstraints, CertificateParams, CertificateRevocationListParams, ExtendedKeyUsagePurpose,
-    IsCa, Issuer, KeyIdMethod, KeyPair, KeyUsagePurpose, RevokedCertParams, SerialNumber,
-    date_time_ymd,
+    BasicConstraints, CertificateParams, CertificateRevocationListParams, DnType,
+    ExtendedKeyUsagePurpose, IsCa, Issuer, KeyIdMethod, KeyPair, KeyUsagePurpose,
+    RevokedCertParams, SerialNumber, date_time_ymd,
 };
 use rustls::pki_types::CertificateDer;
 use rustls::{ClientConnection, ServerConnection};
@@ -27,7 +27,12 @@ struct Host {
 
 impl Ca {
     fn new() -> Self {
+        Self::named("the CA")
+    }
+
+    fn named(name: &str) -> Self {
         let mut params = CertificateParams::new([]).unwrap();
+        params.distinguished_name.push(DnType::CommonName, name);
         params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
         params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
         let key = KeyPair::generate().unwrap();
@@ -146,6 +151,84 @@ fn an_old_revocation_list_accepts_nobody() {
 }
 
 #[test]
+fn of_two_lists_of_an_issuer_both_are_heeded() {
+    let ca = Ca::new();
+    let (revoked, other) = (ca.crl(2, 2100), ca.crl(9, 2100));
+    for lists in [format!("{other}{revoked}"), format!("{revoked}{other}")] {
+        let us = ca.auth(&ca.host(&["a"], &[], 1), Some(&lists));
+        refused_for(&us, &ca.auth(&ca.host(&["b"], &[], 2), None), "Revoked");
+        assert_eq!(both(&us, &ca.auth(&ca.host(&["c"], &[], 3), None)), [Ok(()), Ok(())]);
+    }
+}
+
+#[test]
+fn a_list_that_no_root_issued_is_refused_where_it_is_read() {
+    let (ca, other) = (Ca::new(), Ca::named("another CA"));
+    let host = ca.host(&["a"], &[], 1);
+    let read = |crl: &str| CaMaterial::from_pem(&ca.pem, &host.cert, &host.key, Some(crl));
+    let theirs = other.crl(2, 2100);
+    let not_der = "-----BEGIN X509 CRL-----\nAAAA\n-----END X509 CRL-----\n";
+    let half = &theirs[..theirs.len() / 2];
+    for (crl, said) in
+        [(&*theirs, "none is of one of the roots"), (not_der, ""), (half, ""), ("", "X509 CRL")]
+    {
+        let error = read(crl).err().expect(crl);
+        let Error::Certificates { part, reason } = &error else { panic!("{error}") };
+        assert_eq!(*part, CaPart::RevocationLists);
+        assert!(reason.contains(said), "{error}");
+    }
+    // Beside one of ours it is merely of no use.
+    assert!(read(&(theirs + &ca.crl(2, 2100))).is_ok());
+}
+
+#[test]
+fn a_list_signed_by_somebody_of_the_same_name_accepts_nobody() {
+    let (ca, impostor) = (Ca::new(), Ca::new());
+    let crl = impostor.crl(9, 2100);
+    let us = ca.auth(&ca.host(&["a"], &[], 1), Some(&crl));
+    let peer = ca.auth(&ca.host(&["c"], &[], 3), None);
+    refused_for(&us, &peer, "InvalidCertRevocationList(BadSignature)");
+}
+
+#[test]
+fn later_material_says_who_would_be_accepted_now() {
+    let (ca, other) = (Ca::new(), Ca::named("another CA"));
+    let (us, peer) = (ca.host(&["a"], &[], 1), ca.host(&["b"], &[], 2));
+    let chain = [peer.der.clone()];
+    let accepts = |material: &CaMaterial| {
+        let [client, server] = [material.accepts_client(&chain), material.accepts_server(&chain)];
+        assert_eq!(client.is_ok(), server.is_ok());
+        client.map_err(|error| error.to_string())
+    };
+    assert_eq!(accepts(&ca.material(&us, None)), Ok(()));
+    assert_eq!(accepts(&ca.material(&us, Some(&ca.crl(9, 2100)))), Ok(()));
+    for (material, why) in [
+        (ca.material(&us, Some(&ca.crl(2, 2100))), "revoked"),
+        (ca.material(&us, Some(&ca.crl(9, 2021))), "expired"),
+        (other.material(&other.host(&["a"], &[], 1), None), "UnknownIssuer"),
+    ] {
+        let said = accepts(&material).unwrap_err().to_lowercase();
+        assert!(said.contains(&why.to_lowercase()), "{why} expected: {said}");
+    }
+    assert!(ca.material(&us, None).accepts_client(&[]).is_err());
+    let one_role = ca.host(&["b"], &[ExtendedKeyUsagePurpose::ClientAuth], 2);
+    let chain = [one_role.der.clone()];
+    assert!(ca.material(&us, None).accepts_client(&chain).is_ok());
+    assert!(ca.material(&us, None).accepts_server(&chain).is_err());
+}
+
+#[test]
+fn what_others_will_say_of_us_is_known_beforehand() {
+    let ca = Ca::new();
+    let us = ca.host(&["a"], &[], 1);
+    assert!(ca.material(&us, Some(&ca.crl(9, 2100))).accepts_us().is_ok());
+    assert!(ca.material(&us, Some(&ca.crl(1, 2100))).accepts_us().is_err());
+    assert!(ca.material(&us, Some(&ca.crl(9, 2021))).accepts_us().is_err());
+    let client = ca.host(&["a"], &[ExtendedKeyUsagePurpose::ClientAuth], 1);
+    assert!(ca.material(&client, None).accepts_us().is_err());
+}
+
+#[test]
 fn a_server_of_another_name_is_refused_unless_the_application_checks() {
     let ca = Ca::new();
     let (a, b) = (ca.host(&["a"], &[], 1), ca.host(&["b"], &[], 2));
@@ -198,5 +281,16 @@ fn a_wildcard_is_no_host() {
 fn a_key_of_another_certificate_is_refused() {
     let ca = Ca::new();
     let (a, b) = (ca.host(&["a"], &[], 1), ca.host(&["b"], &[], 2));
-    assert!(CaMaterial::from_pem(&ca.pem, &a.cert, &b.key, None).is_err());
+    for (roots, cert, key, wrong) in [
+        (&*ca.pem, &*a.cert, &*b.key, CaPart::Key),
+        (&ca.pem, &a.cert, "", CaPart::Key),
+        (&ca.pem, "", &a.key, CaPart::Chain),
+        ("", &a.cert, &a.key, CaPart::Roots),
+    ] {
+        match CaMaterial::from_pem(roots, cert, key, None) {
+            Err(Error::Certificates { part, .. }) => assert_eq!(part, wrong),
+            Err(other) => panic!("{other}"),
+            Ok(_) => panic!("accepted without a good {wrong}"),
+        }
+    }
 }

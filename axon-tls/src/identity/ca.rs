@@ -4,21 +4,23 @@ use std::sync::Arc;
 
 use rustls::crypto::aws_lc_rs::default_provider;
 use rustls::pki_types::pem::PemObject;
-use rustls::pki_types::{CertificateDer, CertificateRevocationListDer, PrivateKeyDer};
-use rustls::sign::{CertifiedKey, SingleCertAndKey};
+use rustls::pki_types::{
+    CertificateDer, CertificateRevocationListDer, PrivateKeyDer, UnixTime,
+};
+use rustls::sign::{CertifiedKey, SigningKey, SingleCertAndKey};
 use rustls::{ClientConfig, ConfigBuilder, RootCertStore, ServerConfig, WantsVerifier};
 use webpki::{CertRevocationList, OwnedCertRevocationList};
 
 use super::roots::{self, FromRoots};
-use super::verifier::Verifier;
+use super::verifier::{Peers, Role, Verifier};
 use super::{pem, signing_key};
-use crate::Error;
+use crate::{CaPart, Error};
 
 /// Roots, our certificate and its key, and the certificates that were revoked.
 ///
 /// Each end checks that the other's certificate comes from the roots, is in date, is for the role of
 /// a client or a server if it is limited to one, and was not revoked. With a revocation list, every
-/// issuer in the peer's chain needs one that is in date. A client checks the server's name too,
+/// issuer in the peer's chain needs one that is in date, and of several each is heeded. A client checks the server's name too,
 /// against the one it connects with. Which client it is, is for the application of the server to
 /// check, with [`CaMaterial::is_for_host()`].
 pub struct CaMaterial {
@@ -31,6 +33,10 @@ pub struct CaMaterial {
 impl CaMaterial {
     /// Reads PEM texts: the roots, our certificate with the chain to a root, its PKCS#8 key, and
     /// revocation lists if there are any.
+    ///
+    /// # Errors
+    /// A text that cannot be used, a key that is not the certificate's, or revocation lists of which
+    /// none is of a root: with them nobody could be accepted.
     pub fn from_pem(
         roots: &str,
         chain: &str,
@@ -38,40 +44,15 @@ impl CaMaterial {
         crls: Option<&str>,
     ) -> Result<Self, Error> {
         let mut store = RootCertStore::empty();
-        for root in CertificateDer::pem_slice_iter(roots.as_bytes()) {
-            let root = root.map_err(|err| unusable("roots", err))?;
-            store.add(root).map_err(|err| unusable("roots", err))?;
+        for root in certificates(CaPart::Roots, roots)? {
+            store.add(root).map_err(|err| unusable(CaPart::Roots, err))?;
         }
-        if store.is_empty() {
-            return Err(unusable("roots", "no PEM section `CERTIFICATE`"));
-        }
-
-        let chain = CertificateDer::pem_slice_iter(chain.as_bytes())
-            .collect::<Result<Vec<_>, _>>()
-            .map_err(|err| unusable("our certificate", err))?;
-        if chain.is_empty() {
-            return Err(unusable("our certificate", "no PEM section `CERTIFICATE`"));
-        }
-        let key = pem::private_key(key)?;
-        let key = signing_key(&PrivateKeyDer::Pkcs8(key.as_slice().into()))?;
+        let chain = certificates(CaPart::Chain, chain)?;
+        let key = private_key(key).map_err(|err| unusable(CaPart::Key, err))?;
         let ours = CertifiedKey::new(chain, key);
-        ours.keys_match().map_err(|err| unusable("our certificate and key", err))?;
-
-        let crls = match crls {
-            None => Vec::new(),
-            Some(text) => {
-                let crls = CertificateRevocationListDer::pem_slice_iter(text.as_bytes())
-                    .collect::<Result<Vec<_>, _>>()
-                    .map_err(|err| unusable("revocation lists", err))?;
-                if crls.is_empty() {
-                    return Err(unusable("revocation lists", "no PEM section `X509 CRL`"));
-                }
-                crls.iter()
-                    .map(|crl| OwnedCertRevocationList::from_der(crl).map(Into::into))
-                    .collect::<Result<Vec<_>, _>>()
-                    .map_err(|err| unusable("revocation lists", err))?
-            }
-        };
+        ours.keys_match()
+            .map_err(|_| unusable(CaPart::Key, "it is not the key of our certificate"))?;
+        let crls = crls.map_or(Ok(Vec::new()), |text| revocation_lists(text, &store))?;
         Ok(Self {
             roots: Arc::new(store),
             ours: Arc::new(ours),
@@ -100,6 +81,29 @@ impl CaMaterial {
     /// The hosts that our own certificate is for: its DNS names without wildcards.
     pub fn our_hosts(&self) -> Vec<String> {
         roots::host_names(&self.ours.cert[0])
+    }
+
+    /// Whether a client that showed `chain` would be accepted now: certificates run out, and later
+    /// material has other roots and lists than that which accepted it.
+    ///
+    /// Its signature is not checked: that was the handshake's.
+    pub fn accepts_client(&self, chain: &[CertificateDer<'_>]) -> Result<(), Error> {
+        self.accepts(chain, Role::Client)
+    }
+
+    /// The same of a server, whose name is not checked.
+    pub fn accepts_server(&self, chain: &[CertificateDer<'_>]) -> Result<(), Error> {
+        self.accepts(chain, Role::Nameless)
+    }
+
+    /// Whether somebody with these roots and lists would accept us now, in both roles.
+    pub fn accepts_us(&self) -> Result<(), Error> {
+        self.accepts_client(&self.ours.cert).and_then(|()| self.accepts_server(&self.ours.cert))
+    }
+
+    fn accepts(&self, chain: &[CertificateDer<'_>], role: Role<'_>) -> Result<(), Error> {
+        let (shown, others) = chain.split_first().ok_or(rustls::Error::NoCertificatesPresented)?;
+        Ok(self.verifier().0.accept(shown, others, role, UnixTime::now())?)
     }
 
     pub(super) fn client(
@@ -131,6 +135,45 @@ impl CaMaterial {
     }
 }
 
-fn unusable(what: &str, why: impl std::fmt::Display) -> Error {
-    Error::Certificates(format!("{what}: {why}"))
+fn certificates(part: CaPart, text: &str) -> Result<Vec<CertificateDer<'static>>, Error> {
+    let certificates = CertificateDer::pem_slice_iter(text.as_bytes())
+        .collect::<Result<Vec<_>, _>>()
+        .map_err(|err| unusable(part, err))?;
+    if certificates.is_empty() {
+        return Err(unusable(part, "no PEM section `CERTIFICATE`"));
+    }
+    Ok(certificates)
+}
+
+fn private_key(text: &str) -> Result<Arc<dyn SigningKey>, Error> {
+    let der = pem::private_key(text)?;
+    signing_key(&PrivateKeyDer::Pkcs8(der.as_slice().into()))
+}
+
+fn revocation_lists(
+    text: &str,
+    roots: &RootCertStore,
+) -> Result<Vec<CertRevocationList<'static>>, Error> {
+    let part = CaPart::RevocationLists;
+    let mut lists = Vec::new();
+    for der in CertificateRevocationListDer::pem_slice_iter(text.as_bytes()) {
+        let der = der.map_err(|err| unusable(part, err))?;
+        let list = OwnedCertRevocationList::from_der(&der).map_err(|err| unusable(part, err))?;
+        lists.push(CertRevocationList::from(list));
+    }
+    if lists.is_empty() {
+        return Err(unusable(part, "no PEM section `X509 CRL`"));
+    }
+    // Every chain ends at a root, and every issuer in it needs a list.
+    let of_a_root = |list: &CertRevocationList<'_>| {
+        roots.roots.iter().any(|root| root.subject.as_ref() == list.issuer())
+    };
+    if !lists.iter().any(of_a_root) {
+        return Err(unusable(part, "none is of one of the roots, so nobody could be accepted"));
+    }
+    Ok(lists)
+}
+
+fn unusable(part: CaPart, why: impl std::fmt::Display) -> Error {
+    Error::Certificates { part, reason: why.to_string() }
 }

@@ -7,7 +7,7 @@ use rustls::client::danger::HandshakeSignatureValid;
 use rustls::crypto::{WebPkiSupportedAlgorithms, verify_tls13_signature};
 use rustls::pki_types::{CertificateDer, DnsName, ServerName, UnixTime};
 use rustls::{
-    CertificateError, DigitallySignedStruct, Error, OtherError, RootCertStore, SignatureScheme,
+    CertRevocationListError, CertificateError, DigitallySignedStruct, Error, OtherError, RootCertStore, SignatureScheme,
 };
 use webpki::{
     CertRevocationList, EndEntityCert, ExpirationPolicy, KeyUsage, RevocationOptionsBuilder,
@@ -46,12 +46,13 @@ impl Peers for FromRoots {
             .map(|options| options.with_expiration_policy(ExpirationPolicy::Enforce).build());
         let usage = match role {
             Role::Client => KeyUsage::client_auth(),
-            Role::Server(_) => KeyUsage::server_auth(),
+            Role::Server(_) | Role::Nameless => KeyUsage::server_auth(),
         };
         let (algorithms, roots) = (self.algorithms.all, &self.roots.roots);
         certificate
             .verify_for_usage(algorithms, roots, others, now, usage, revocation, None)
             .map_err(refusal)?;
+        self.revoked_nowhere(shown, others)?;
         match role {
             Role::Server(name) if !self.names_checked_later => {
                 certificate.verify_is_valid_for_subject_name(name).map_err(refusal)
@@ -71,6 +72,27 @@ impl Peers for FromRoots {
 
     fn schemes(&self) -> Vec<SignatureScheme> {
         self.algorithms.supported_schemes()
+    }
+}
+
+impl FromRoots {
+    /// Of several lists of one issuer, webpki asks the first that covers a certificate, which may be
+    /// the oldest. Here each is asked, about every certificate that was shown.
+    fn revoked_nowhere(
+        &self,
+        shown: &CertificateDer<'_>,
+        others: &[CertificateDer<'_>],
+    ) -> Result<(), Error> {
+        for certificate in std::iter::once(shown).chain(others) {
+            // One that is none is in no chain either.
+            let Ok(certificate) = EndEntityCert::try_from(certificate) else { continue };
+            for list in self.crls.iter().filter(|list| list.issuer() == certificate.issuer()) {
+                if list.find_serial(certificate.serial()).map_err(refusal)?.is_some() {
+                    return Err(refusal(webpki::Error::CertRevoked));
+                }
+            }
+        }
+        Ok(())
     }
 }
 
@@ -95,6 +117,9 @@ pub(super) fn host_names(certificate: &CertificateDer<'_>) -> Vec<String> {
 /// In rustls's words where it has them, for the alert that the peer is sent.
 fn refusal(error: webpki::Error) -> Error {
     match error {
+        webpki::Error::InvalidCrlSignatureForPublicKey => {
+            return CertRevocationListError::BadSignature.into();
+        }
         webpki::Error::BadDer => CertificateError::BadEncoding,
         webpki::Error::CertExpired { .. } => CertificateError::Expired,
         webpki::Error::CertNotValidYet { .. } => CertificateError::NotValidYet,

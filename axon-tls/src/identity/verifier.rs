@@ -14,6 +14,8 @@ pub(super) enum Role<'a> {
     Client,
     /// By the name that the client connects with.
     Server(&'a ServerName<'a>),
+    /// A server whose name is left to others.
+    Nameless,
 }
 
 /// Whom to accept.
