@@ -1,9 +1,9 @@
 //! Who is taken as a session.
 
-use std::os::fd::OwnedFd;
+use std::{os::fd::OwnedFd, sync::Arc};
 
 use crate::{
-    config::Config,
+    config::{Config, security_settings},
     session::{
         message::{Hello, PROTOCOL, Refused, SessionRole},
         socket::Peer,
@@ -15,25 +15,29 @@ use crate::{
 #[derive(Debug)]
 pub(super) struct Admission {
     uid: u32,
-    trusted: Vec<u32>,
-    domain: u32,
+    config: Arc<Config>,
     settings: Vec<(String, String)>,
 }
 
 impl Admission {
-    pub(super) fn new(config: &Config, settings: Vec<(String, String)>) -> Self {
+    pub(super) fn new(config: Arc<Config>, settings: Vec<(String, String)>) -> Self {
         let uid = rustix::process::geteuid().as_raw();
-        Self { uid, trusted: config.trusted_uids.clone(), domain: config.domain, settings }
+        Self { uid, config, settings }
+    }
+
+    /// The settings that the last session was compared with.
+    pub(super) fn settings(&self) -> &[(String, String)] {
+        &self.settings
     }
 
     /// Whether a process of this user may speak at all.
     pub(super) fn trusts(&self, uid: u32) -> bool {
-        uid == self.uid || self.trusted.contains(&uid)
+        uid == self.uid || self.config.trusted_uids.contains(&uid)
     }
 
     /// Checks a HELLO, and hands out its descriptors. `inside` is the daemon's own gateway.
     pub(super) fn check(
-        &self,
+        &mut self,
         hello: &Hello,
         descriptors: Vec<OwnedFd>,
         peer: Peer,
@@ -44,8 +48,8 @@ impl Admission {
                 format!("this daemon speaks session protocol {PROTOCOL}, not {}", hello.protocol);
             return Err(plain(text));
         }
-        if hello.domain != self.domain {
-            return Err(differs("ROS_DOMAIN_ID", &hello.domain, &self.domain));
+        if hello.domain != self.config.domain {
+            return Err(differs("ROS_DOMAIN_ID", &hello.domain, &self.config.domain));
         }
         if (hello.role == SessionRole::Gateway) != inside {
             return Err(plain("only the daemon's own gateway has that role".into()));
@@ -54,7 +58,10 @@ impl Admission {
         if hello.role == SessionRole::Tool {
             return Ok(None);
         }
-        self.compare(&hello.settings)?;
+        if self.compare(&hello.settings).is_err() {
+            self.read_files_again();
+            self.compare(&hello.settings)?;
+        }
         let count = descriptors.len();
         let Ok([segment, doorbell, pidfd]) = <[OwnedFd; 3]>::try_from(descriptors) else {
             return Err(plain(format!("HELLO came with {count} descriptors instead of three")));
@@ -65,6 +72,21 @@ impl Admission {
         }
         let PeerDescriptors { segment, doorbell, pidfd } = handed;
         Ok(Some([segment, doorbell, pidfd]))
+    }
+
+    /// The files of the classic identity may change while the daemon runs: its gateway reads them
+    /// again, and a session has read them as they are now.
+    fn read_files_again(&mut self) {
+        let Ok(now) = security_settings(&self.config) else { return };
+        let files = |name: &str, value: &str| {
+            name.starts_with("AXON_CLASSIC_") && value.starts_with("sha256:")
+        };
+        for (name, value) in &mut self.settings {
+            let same = |(n, v): &&(String, String)| n == name && files(n, v) && files(n, value);
+            if let Some((_, read)) = now.iter().find(same) {
+                value.clone_from(read);
+            }
+        }
     }
 
     fn compare(&self, theirs: &[(String, String)]) -> Result<(), Box<Refused>> {
@@ -104,7 +126,10 @@ mod tests {
     fn admission() -> Admission {
         let settings = [("AXON_SECURITY_MODE", "qkd"), ("AXON_SAE_ID", "alice")]
             .map(|(n, v)| (n.to_owned(), v.to_owned()));
-        Admission { uid: 1000, trusted: vec![1001], domain: 3, settings: settings.into() }
+        let env = [("ROS_DOMAIN_ID", "3"), ("AXON_TRUSTED_UIDS", "1001")];
+        let env = env.map(|(n, v)| (n.into(), v.into()));
+        let config = Config::resolve(env, None, &crate::config::OsFiles).unwrap();
+        Admission { uid: 1000, config: Arc::new(config), settings: settings.into() }
     }
 
     fn hello() -> Hello {
@@ -141,6 +166,37 @@ mod tests {
         assert_eq!(refusal(&extra).theirs, "unset");
 
         assert_eq!(refusal(&Hello { domain: 4, ..hello() }).variable, "ROS_DOMAIN_ID");
+    }
+
+    #[test]
+    fn a_file_of_the_identity_may_change_and_nothing_else_may() {
+        use std::os::unix::fs::PermissionsExt;
+        let dir = tempfile::tempdir().unwrap();
+        let [key, trust] = ["key", "trust"].map(|name| dir.path().join(name));
+        std::fs::write(&key, "").unwrap();
+        std::fs::set_permissions(&key, std::fs::Permissions::from_mode(0o600)).unwrap();
+        std::fs::write(&trust, "before").unwrap();
+        let env = [("AXON_CLASSIC_KEY", &key), ("AXON_CLASSIC_TRUST", &trust)];
+        let env = env.map(|(n, v)| (n.into(), v.into()));
+        let config = Config::resolve(env, None, &crate::config::OsFiles).unwrap();
+        let mut admission =
+            Admission::new(Arc::new(config.clone()), security_settings(&config).unwrap());
+        let mut why = |settings| {
+            let peer = Peer { uid: 1000, pid: std::process::id() };
+            let hello = Hello { domain: 0, settings, ..hello() };
+            admission.check(&hello, Vec::new(), peer, false).unwrap_err().text
+        };
+        let of_its_own = "0 descriptors";
+        let before = security_settings(&config).unwrap();
+        assert!(why(before.clone()).contains(of_its_own));
+        std::fs::write(&trust, "after").unwrap();
+        let after = security_settings(&config).unwrap();
+        assert!(why(after.clone()).contains(of_its_own), "as the file is now");
+        assert!(why(before).contains("AXON_CLASSIC_TRUST"), "as nobody has it any more");
+        let mut other = after;
+        let cipher = other.iter_mut().find(|(name, _)| name == "AXON_QUIC_CIPHER").unwrap();
+        cipher.1 = "aes-256-gcm".into();
+        assert!(why(other).contains("AXON_QUIC_CIPHER"));
     }
 
     #[test]

@@ -32,7 +32,6 @@ const STATUS_SLICE: usize = 24 * 1024;
 
 pub(super) struct Control {
     pub(super) config: Arc<Config>,
-    pub(super) settings: Vec<(String, String)>,
     pub(super) admission: Admission,
     pub(super) id: DaemonId,
     pub(super) started: Instant,
@@ -51,8 +50,7 @@ pub(super) struct Control {
 impl Control {
     pub(super) fn new(config: Arc<Config>, settings: Vec<(String, String)>) -> Self {
         Self {
-            admission: Admission::new(&config, settings.clone()),
-            settings,
+            admission: Admission::new(Arc::clone(&config), settings),
             id: DaemonId::random(),
             started: Instant::now(),
             address: Address::of(&config),

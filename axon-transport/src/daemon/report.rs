@@ -28,7 +28,7 @@ const LANE_LOST: u64 = 24;
 
 pub(super) fn status(control: &Control) -> Status {
     let config = &control.config;
-    let settings: BTreeMap<String, String> = control.settings.iter().cloned().collect();
+    let settings: BTreeMap<String, String> = control.admission.settings().iter().cloned().collect();
     let setting = |name: &str| settings.get(name).cloned();
     let (mode, key_mode, sae) = match &config.security {
         Security::Classic(_) => ("classic", None, None),

@@ -4,27 +4,26 @@ use std::{
     fmt,
     net::SocketAddr,
     sync::{
-        Arc, Mutex,
+        Arc,
         atomic::{AtomicU64, Ordering},
     },
-    time::SystemTime,
+    time::Instant,
 };
 
 use axon_tls::{
-    identity::{Auth, SpkiDigest},
+    Negotiated,
+    identity::Auth,
     quic::{ALPN, hybrid_client, hybrid_server, qkd_client, qkd_server},
 };
 
-use super::{
-    GatewayError,
-    endpoint::transport,
-    keyring::{Keyring, lock},
-};
+use rustls_pki_types::CertificateDer;
+
+use super::{GatewayError, endpoint::transport, identity::Identity, keyring::Keyring};
 use crate::{
     config::{ClassicAuth, ClassicConfig, Config, Security},
     ids::DaemonId,
     keys::{Attempt, Resolver},
-    link::Hello,
+    link::{Hello, Side},
 };
 
 /// Shared by dialling, accepting and the hub.
@@ -36,9 +35,7 @@ pub(super) struct Context {
     /// KME keys, in qkd.
     pub(super) keyring: Option<Arc<Keyring>>,
     /// The classic identity; `None` in qkd.
-    auth: Option<Auth>,
-    /// When the trust file was last written, as far as it was read.
-    trust_read: Mutex<Option<SystemTime>>,
+    identity: Option<Identity>,
     transport: Arc<quinn::TransportConfig>,
     next_link: AtomicU64,
 }
@@ -56,22 +53,21 @@ impl Context {
         daemon: DaemonId,
         keyring: Option<Arc<Keyring>>,
     ) -> Result<Self, GatewayError> {
-        let auth = match &config.security {
-            Security::Classic(classic) => Some(load_identity(classic)?),
+        let mut hello = Hello::new(&config, daemon);
+        let identity = match &config.security {
+            Security::Classic(classic) => Some(load_identity(classic, &hello.host)?),
             Security::Qkd(_) => None,
         };
-        let mut hello = Hello::new(&config, daemon);
-        if let Security::Classic(classic) = &config.security {
-            hello.host = super::identity::host(auth.as_ref(), classic, &hello.host)?;
+        if let Some(identity) = &identity {
+            identity.host().clone_into(&mut hello.host);
         }
         Ok(Self {
             hello,
             transport: transport(&config),
             next_link: AtomicU64::new(1),
-            trust_read: Mutex::new(None),
             config,
             keyring,
-            auth,
+            identity,
         })
     }
 
@@ -80,42 +76,59 @@ impl Context {
         self.next_link.fetch_add(1, Ordering::Relaxed)
     }
 
-    /// The trust that was configured, for its names.
-    pub(super) fn auth(&self) -> Option<&Auth> {
-        self.auth.as_ref()
+    /// The classic identity in force; `None` in qkd.
+    pub(super) fn auth(&self) -> Option<Auth> {
+        self.identity.as_ref().map(Identity::auth)
     }
 
-    /// Reads the trust file again if it changed. One that cannot be read leaves what was trusted
-    /// before in force: it may be half written.
-    pub(super) fn reload_trust(&self) {
-        let Security::Classic(ClassicConfig { trust: path, .. }) = &self.config.security else {
-            return;
-        };
-        let (Some(Auth::Pinned { trust, .. }), Some(file)) = (&self.auth, path) else { return };
-        let written = std::fs::metadata(file).and_then(|m| m.modified()).ok();
-        let mut read = lock(&self.trust_read);
-        if written.is_none() || *read == written {
-            return;
-        }
-        match super::identity::trust(Some(file)) {
-            Ok(pins) => trust.replace(pins),
-            Err(error) => tracing::error!(%error, "the trust file is not used as it is now"),
-        }
-        *read = written;
+    /// Why nobody new is let in, if so: this host does not know at present whom to trust.
+    pub(super) fn closed(&self) -> Option<String> {
+        self.identity.as_ref().and_then(Identity::closed)
     }
 
-    /// Whether a linked peer's key is still trusted: a pin can be removed or run out.
-    pub(super) fn still_trusts(&self, peer: Option<&SpkiDigest>) -> bool {
-        match &self.auth {
-            Some(Auth::Pinned { trust, .. }) => peer.is_some_and(|p| trust.name_of(p).is_some()),
-            _ => true,
+    /// Whether [`Context::look_at_files()`] is worth calling.
+    pub(super) fn has_files(&self) -> bool {
+        self.identity.as_ref().is_some_and(Identity::has_files)
+    }
+
+    /// Reads the files of the classic identity again if they changed; whether somebody may be
+    /// trusted now who was not, or the other way round. Blocks on the file system.
+    pub(super) fn look_at_files(&self) -> bool {
+        self.identity.as_ref().is_some_and(|identity| identity.look(Instant::now()))
+    }
+
+    /// Why a linked peer, of which this is the `side`, would not be accepted now: its pin was removed
+    /// or ran out, its certificate ran out or was revoked.
+    ///
+    /// Certificates are checked only if `certificates` says so: that costs signatures.
+    pub(super) fn distrust(
+        &self,
+        connection: &quinn::Connection,
+        negotiated: &Negotiated,
+        side: Side,
+        certificates: bool,
+    ) -> Option<String> {
+        match self.auth()? {
+            Auth::Pinned { trust, .. } => {
+                let pinned = negotiated.peer.is_some_and(|key| trust.name_of(&key).is_some());
+                (!pinned).then(|| "its key is no longer pinned in AXON_CLASSIC_TRUST".into())
+            }
+            Auth::Ca(material) if certificates => {
+                let chain = chain(connection);
+                let accepted = match side {
+                    Side::Client => material.accepts_server(&chain),
+                    Side::Server => material.accepts_client(&chain),
+                };
+                accepted.err().map(|error| format!("its certificate is no longer accepted: {error}"))
+            }
+            _ => None,
         }
     }
 
     /// The client's side of a classic handshake.
     pub(super) fn classic_client(&self) -> Result<quinn::ClientConfig, GatewayError> {
-        let auth = self.auth.as_ref().ok_or(GatewayError::WrongMode)?;
-        let mut client = hybrid_client(auth, self.config.cipher, ALPN)?;
+        let auth = self.auth().ok_or(GatewayError::WrongMode)?;
+        let mut client = hybrid_client(&auth, self.config.cipher, ALPN)?;
         client.transport_config(Arc::clone(&self.transport));
         Ok(client)
     }
@@ -139,13 +152,13 @@ impl Context {
         source: SocketAddr,
     ) -> Result<(quinn::ServerConfig, Option<Arc<Resolver>>), GatewayError> {
         let cipher = self.config.cipher;
-        let (mut server, resolver) = match (&self.config.security, &self.keyring, &self.auth) {
+        let (mut server, resolver) = match (&self.config.security, &self.keyring, self.auth()) {
             (Security::Qkd(qkd), Some(keyring), _) => {
                 let resolver = keyring.acceptor.resolver(source.ip());
                 let server = qkd_server(resolver.clone(), cipher, qkd.kex, ALPN)?;
                 (server, Some(resolver))
             }
-            (Security::Classic(_), _, Some(auth)) => (hybrid_server(auth, cipher, ALPN)?, None),
+            (Security::Classic(_), _, Some(auth)) => (hybrid_server(&auth, cipher, ALPN)?, None),
             _ => return Err(GatewayError::WrongMode),
         };
         server.transport_config(Arc::clone(&self.transport)).migration(true).max_incoming(256);
@@ -153,9 +166,15 @@ impl Context {
     }
 }
 
+/// What the peer showed in the handshake: certificates, or one raw public key.
+pub(super) fn chain(connection: &quinn::Connection) -> Vec<CertificateDer<'static>> {
+    let shown = connection.peer_identity().and_then(|shown| shown.downcast().ok());
+    shown.map(|shown| *shown).unwrap_or_default()
+}
+
 /// The classic identity that the settings name.
-fn load_identity(classic: &ClassicConfig) -> Result<Auth, GatewayError> {
-    super::identity::load(classic).inspect(|_| {
+fn load_identity(classic: &ClassicConfig, node: &str) -> Result<Identity, GatewayError> {
+    Identity::load(classic, node).inspect(|_| {
         if classic.auth == ClassicAuth::None {
             tracing::warn!(
                 "AXON_CLASSIC_AUTH=none: peers are UNAUTHENTICATED. A recording adversary learns \

@@ -11,10 +11,9 @@ use axon_tls::{
     quic::{ALPN, negotiated},
 };
 use quinn::{Connection, VarInt};
-use rustls_pki_types::CertificateDer;
 
 use super::{
-    context::Context,
+    context::{Context, chain},
     control::{ControlError, ControlReader, ControlWriter, Outbox},
     keyring::{Keyring, PeerKeys},
     refusal::Refusal,
@@ -92,9 +91,13 @@ pub(super) async fn establish(
         keyring.proof_over(number);
     }
     result.map_err(|failure| {
+        let told = match &failure {
+            Failure::Quietly { told, .. } => Some(*told),
+            _ => None,
+        };
         let refusal = failure.into_refusal(&connection);
         if let Some(code) = refusal.1 {
-            close(&connection, code, &refusal.0.reason);
+            close(&connection, code, told.unwrap_or(&refusal.0.reason));
         }
         if let Some(keyring) = &context.keyring {
             keyring.forget_connection(number);
@@ -107,6 +110,8 @@ pub(super) async fn establish(
 enum Failure {
     /// This side refuses.
     Ours(CloseCode, String),
+    /// This side refuses, and tells the peer less than its own people.
+    Quietly { told: &'static str, why: String },
     /// The peer closed, or the connection broke.
     Connection,
     /// The control stream said so; the connection may know more.
@@ -121,6 +126,10 @@ impl Failure {
         };
         match self {
             Self::Ours(code, reason) => (Refusal::here(code, reason), Some(code)),
+            Self::Quietly { why, .. } => {
+                let code = CloseCode::NotAllowed;
+                (Refusal::here(code, why), Some(code))
+            }
             Self::Connection => (lost("the connection broke".into()), None),
             Self::Control(error) => match error.code() {
                 Some(code) => (Refusal::here(code, &error), Some(code)),
@@ -145,6 +154,10 @@ async fn run(
     number: u64,
 ) -> Result<Established, Failure> {
     let negotiated = agreed(context, connection)?;
+    if let Some(why) = context.closed() {
+        let told = "this host cannot read whom it trusts, and takes nobody; its log says more";
+        return Err(Failure::Quietly { told, why });
+    }
     let psk_sae = psk_sae(context, side, &negotiated, dialled)?;
     let qkd = context.keyring.is_some();
     let mut order = Order::new(side, qkd);
@@ -226,7 +239,8 @@ fn agreed(context: &Context, connection: &Connection) -> Result<Negotiated, Fail
     Ok(negotiated)
 }
 
-/// In `ca` a certificate stands for the hosts that it names: the peer must be one of them.
+/// In `ca` a certificate stands for the hosts that it names: the peer must be one of them. In
+/// `pinned` the pin has the peer's name, and what it calls itself counts for nothing.
 fn is_who_it_says(
     context: &Context,
     connection: &Connection,
@@ -235,10 +249,7 @@ fn is_who_it_says(
     if !matches!(context.auth(), Some(Auth::Ca(_))) {
         return Ok(());
     }
-    let shown =
-        connection.peer_identity().and_then(|i| i.downcast::<Vec<CertificateDer<'_>>>().ok());
-    if shown.and_then(|s| s.first().map(|c| CaMaterial::is_for_host(c, &theirs.host))) == Some(true)
-    {
+    if chain(connection).first().is_some_and(|c| CaMaterial::is_for_host(c, &theirs.host)) {
         return Ok(());
     }
     let text = format!(

@@ -112,9 +112,13 @@ fn transport_name(error: &ConnectionError) -> String {
             let name = match alert {
                 40 => "handshake_failure",
                 42 => "bad_certificate",
+                43 => "unsupported_certificate",
+                44 => "certificate_revoked",
+                45 => "certificate_expired",
                 46 => "certificate_unknown",
                 47 => "illegal_parameter",
                 48 => "unknown_ca",
+                49 => "access_denied",
                 51 => "decrypt_error",
                 70 => "protocol_version",
                 109 => "missing_extension",
@@ -135,7 +139,11 @@ fn meaning(alert: u8) -> Option<&'static str> {
         40 => {
             "no common key exchange or cipher: AXON offers X25519MLKEM768 and one cipher, no more"
         }
-        42 | 46 | 48 | 116 => "the peer's key or certificate is not trusted",
+        42 | 43 | 46 | 48 => "the key or certificate is not trusted by the side that refuses",
+        44 => "the certificate was revoked",
+        45 => "the certificate has expired, or a clock is wrong",
+        49 => "somebody looked at this host's key, as `axon trust scan` does, and left",
+        116 => "the dialler showed no key or certificate",
         51 => "the PSK binder does not fit: the two sides hold different keys",
         109 => "no PSK was offered to a daemon in qkd: AXON_SECURITY_MODE differs",
         115 => "the PSK identity is not known: its KME key cannot be had",

@@ -4,6 +4,7 @@ use std::{
     collections::HashMap,
     net::{Ipv4Addr, SocketAddr},
     sync::{Arc, RwLock},
+    time::Duration,
 };
 
 use tokio::sync::mpsc;
@@ -25,6 +26,8 @@ use crate::{
 
 /// Worker threads: one that carries samples may be deep in an AEAD while another answers.
 const WORKERS: usize = 2;
+/// Between two looks at the files of the identity: a change is in force within a second.
+const LOOK: Duration = Duration::from_millis(250);
 
 /// Runs the gateway until the control plane shuts it down.
 ///
@@ -71,6 +74,9 @@ async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
     }
     let _ = control.send(ToControl::Started { port: endpoints.port }).await;
 
+    if context.has_files() {
+        tokio::spawn(watch_files(Arc::clone(&context), events.clone()));
+    }
     for endpoint in &endpoints.all {
         let (incomers, mut answered) = mpsc::channel(64);
         tokio::spawn(accept(Arc::clone(&context), endpoint.clone(), incomers));
@@ -102,6 +108,22 @@ async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
     });
     let hub = Hub::new(context, endpoints, shared, control, events);
     if hub.run(inbox, &noticed).await { Ok(()) } else { Err(GatewayError::SessionLost) }
+}
+
+/// Looks at the files of the identity until the hub is gone.
+async fn watch_files(context: Arc<Context>, events: mpsc::Sender<Event>) {
+    let mut looks = tokio::time::interval(LOOK);
+    // After a stall: two looks at once would see nothing of a write in between.
+    looks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    while !events.is_closed() {
+        looks.tick().await;
+        let context = Arc::clone(&context);
+        // On another thread: a file system can hang.
+        let looked = tokio::task::spawn_blocking(move || context.look_at_files()).await;
+        if looked.unwrap_or(false) && events.send(Event::Identity).await.is_err() {
+            return;
+        }
+    }
 }
 
 /// The gateway's own session; what it notices goes to `noticed`. Opening waits for the control plane, so

@@ -3,7 +3,7 @@
 use super::Hub;
 use crate::{
     daemon::bridge::ToControl,
-    gateway::{establish::close, peer::GraphChange, routes, status},
+    gateway::{establish::close, peer::GraphChange, routes},
     graph::Endpoint,
     ids::DaemonId,
     link::CloseCode,
@@ -89,6 +89,6 @@ impl Hub {
     /// What a peer proved to be, beyond its daemon id.
     pub(super) fn identity_of(&self, daemon: DaemonId) -> Option<String> {
         let link = self.links.get(&self.peers.get(&daemon)?.link)?;
-        Some(status::host_identity(&link.established, link.connection.remote_address()))
+        Some(link.established.who.host_identity(link.connection.remote_address()))
     }
 }

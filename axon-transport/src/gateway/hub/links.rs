@@ -17,7 +17,7 @@ use crate::{
         peer::{Peer, spawn_reader},
         refusal::{Refusal, RefusedBy},
         seal::Protection,
-        status,
+        status::Who,
     },
     ids::DaemonId,
     link::{Candidate, CloseCode, Message, Side, keep},
@@ -54,8 +54,8 @@ impl Hub {
         let current = self.peers.get(&daemon).and_then(|p| self.links.get(&p.link));
         // Daemon ids are public: beacons carry them. Who has a link keeps it against anyone who
         // proves to be somebody else.
-        let (hello, negotiated) = (&established.hello, &established.negotiated);
-        if current.is_some_and(|c| !c.established.same_peer(hello, negotiated)) {
+        let who = Who::of(&self.context, &established.hello, &established.negotiated);
+        if current.is_some_and(|c| !c.established.who.is(&who)) {
             close(&established.connection, CloseCode::NotAllowed, TAKEN);
             self.forget(&established);
             let peer = peer_text(
@@ -82,7 +82,7 @@ impl Hub {
             }
             return;
         }
-        let reader = self.insert(established, candidate);
+        let reader = self.insert(established, candidate, who);
         spawn_reader(number, reader, self.events.clone());
         if we_elect {
             self.elect(number).await;
@@ -106,6 +106,7 @@ impl Hub {
         &mut self,
         established: Established,
         candidate: Candidate,
+        who: Who,
     ) -> ControlReader {
         let protection = match (&self.context.keyring, &established.sealing) {
             (Some(keyring), Some(sealing)) => Protection::Envelope {
@@ -115,8 +116,6 @@ impl Hub {
             },
             _ => Protection::Link,
         };
-        let authenticated_as =
-            status::authenticated_as(&self.context, &established.hello, &established.negotiated);
         let connection = established.connection;
         let link = Link {
             carrier: Carrier { connection: connection.clone(), protection },
@@ -124,7 +123,7 @@ impl Hub {
             established: Summary {
                 hello: established.hello,
                 negotiated: established.negotiated,
-                authenticated_as,
+                who,
             },
             order: established.order,
             candidate,
@@ -153,8 +152,7 @@ impl Hub {
         let daemon = link.established.hello.daemon;
         // Another connection may have been elected while this one waited.
         let current = self.peers.get(&daemon).and_then(|p| self.links.get(&p.link));
-        let Summary { hello, negotiated, .. } = &link.established;
-        if current.is_some_and(|c| !c.established.same_peer(hello, negotiated)) {
+        if current.is_some_and(|c| !c.established.who.is(&link.established.who)) {
             return self.violation(number, CloseCode::NotAllowed, TAKEN.into()).await;
         }
         let Some(link) = self.links.get_mut(&number) else { return };
@@ -258,18 +256,17 @@ impl Hub {
         });
     }
 
-    /// A pin that was removed, or ran out, closes its live links within a second.
-    pub(super) async fn close_untrusted(&mut self) {
-        self.context.reload_trust();
-        let untrusted: Vec<_> = self
-            .links
-            .iter()
-            .filter(|(_, l)| !self.context.still_trusts(l.established.negotiated.peer.as_ref()))
-            .map(|(number, _)| *number)
-            .collect();
-        for number in untrusted {
-            let text = "its key is no longer pinned in AXON_CLASSIC_TRUST";
-            self.violation(number, CloseCode::NotAllowed, text.into()).await;
+    /// A pin that was removed, or ran out, closes its live links within a second; so does a
+    /// certificate that is no longer accepted, which is looked at if `certificates` says so.
+    pub(super) async fn close_untrusted(&mut self, certificates: bool) {
+        let distrust = |l: &Link| {
+            let (negotiated, side) = (&l.established.negotiated, l.candidate.side);
+            self.context.distrust(&l.connection, negotiated, side, certificates)
+        };
+        let links = self.links.iter();
+        let untrusted: Vec<_> = links.filter_map(|(n, l)| Some((*n, distrust(l)?))).collect();
+        for (number, why) in untrusted {
+            self.violation(number, CloseCode::NotAllowed, why).await;
         }
     }
 

@@ -28,7 +28,7 @@ use super::{
     refusal::{Refusal, RefusedBy},
     seal::Protection,
     stand_in::StandIns,
-    status,
+    status::{self, Who},
 };
 use crate::{
     daemon::bridge::{ToControl, ToGateway},
@@ -38,6 +38,9 @@ use crate::{
     qos::Qos,
     session::Session,
 };
+
+/// Seconds between two looks whether the certificate of a linked peer has run out.
+const CERTIFICATES_EVERY: u32 = 60;
 
 /// What the hub and the peers' tasks share.
 pub(super) struct Shared {
@@ -87,6 +90,8 @@ pub(super) enum Event {
     Renew(u64),
     /// The link is as old as a link may get.
     Expired(u64),
+    /// Other keys or certificates may be trusted than before.
+    Identity,
 }
 
 /// A connection between HELLO and its end.
@@ -112,15 +117,7 @@ pub(super) struct Summary {
     /// What the handshake agreed on.
     pub(super) negotiated: Negotiated,
     /// As whom the peer proved itself.
-    pub(super) authenticated_as: String,
-}
-
-impl Summary {
-    /// Whether `other` proved to be the same daemon: the same SAE, the same public key (which even
-    /// in `none` is one for a daemon's life).
-    fn same_peer(&self, hello: &Hello, negotiated: &Negotiated) -> bool {
-        self.hello.sae == hello.sae && self.negotiated.peer == negotiated.peer
-    }
+    pub(super) who: Who,
 }
 
 /// The hub's state.
@@ -161,6 +158,7 @@ impl Hub {
     pub(super) async fn run(mut self, mut inbox: mpsc::Receiver<Event>, session: &Noticed) -> bool {
         self.local_graph().await;
         let mut second = tokio::time::interval(Duration::from_secs(1));
+        let mut seconds = 0_u32;
         let mut kept = true;
         loop {
             tokio::select! {
@@ -174,7 +172,8 @@ impl Hub {
                     break;
                 }
                 _ = second.tick() => {
-                    self.close_untrusted().await;
+                    seconds = seconds.wrapping_add(1);
+                    self.close_untrusted(seconds.is_multiple_of(CERTIFICATES_EVERY)).await;
                     self.report().await;
                 }
             }
@@ -232,6 +231,7 @@ impl Hub {
                 }
             }
             Event::Renew(link) => self.renew(link),
+            Event::Identity => self.close_untrusted(true).await,
             Event::Expired(link) => {
                 let text = "AXON_QKD_SESSION_MAX_AGE is reached and no successor came";
                 if let Some(l) = self.links.get(&link) {
