@@ -1,4 +1,5 @@
 //! The importer of RFC 9258: hostile uses, vectors of an independent script, then handshakes.
+#![cfg(feature = "aws_lc_rs")]
 
 use std::process::Command;
 use std::sync::Arc;

@@ -212,6 +212,44 @@ fn server_skips_early_data() {
     refused(server, client, &early, 20, "not announced");
 }
 
+/// With a HelloRetryRequest there are no keys yet to tell early data by: all records of application
+/// data are skipped, up to the limit, until there is a second ClientHello.
+#[test]
+fn server_skips_early_data_before_a_second_client_hello() {
+    let retried = || {
+        let resolver = Known::new(vec![psk("a", 1, SHA256)]);
+        let mode = PskKeyExchangeMode::PskDheKe;
+        let config = server_config_over(&[SHA256], &[kx_group::X25519], resolver, mode);
+        let mut server = server(config);
+        let share = [&[0, 23][..], &list16(&[4; 65])].concat();
+        let first = offer()
+            .in_psk_dhe_ke(29, &[])
+            .with(10, &list16(&[0, 23, 0, 29]))
+            .with(51, &list16(&share))
+            .with(42, &[])
+            .encode();
+        feed(&mut server, &records(HANDSHAKE, &first)).unwrap();
+        let retry = plaintext(&written(&mut server));
+        let early = Protection::new(&Early::new(Some(&SECRET)).traffic(&digest(&first)));
+        (server, [message(254, &digest(&first)), retry].concat(), early)
+    };
+
+    let (mut server, before, mut early) = retried();
+    feed(&mut server, &early.seal(APPLICATION_DATA, b"early")).unwrap();
+    let ours = kx_group::X25519.start().unwrap();
+    let second = offer().in_psk_dhe_ke(29, ours.pub_key()).with(10, &list16(&[0, 23, 0, 29]));
+    let second = ClientHello { before, ..second }.encode();
+    feed(&mut server, &records(HANDSHAKE, &second)).unwrap();
+    assert!(server.wants_write() && server.early_data().is_none());
+    let mut nothing = Vec::new();
+    assert!(server.reader().read_to_end(&mut nothing).is_err(), "it would have to wait");
+
+    let (mut server, _, mut early) = retried();
+    let mut flood = || feed(&mut server, &early.seal(APPLICATION_DATA, &[0; 4_096]));
+    assert!((0..10).any(|_| flood().is_err()));
+    assert_eq!(written(&mut server).last(), Some(&10));
+}
+
 /// What a second ClientHello may not do, and one that does all right.
 #[test]
 fn server_refuses_second_client_hellos_that_break_the_rules() {

@@ -1,4 +1,5 @@
-//! Handshakes on external PSKs over a byte stream: hostile peers first, then those that work.
+//! Handshakes on external PSKs: hostile peers first, then those that work.
+#![cfg(feature = "aws_lc_rs")]
 
 mod client_hello;
 mod common;
@@ -7,5 +8,6 @@ mod handshakes;
 mod hostile_client;
 mod hostile_server;
 mod peer;
+mod quic;
 mod resumption;
 mod server_hello;

@@ -62,10 +62,16 @@ impl Peer {
         (Self::new(Role::Server, Some(psk), shared_secret, transcript), sent)
     }
 
-    /// A message under the keys of the moment, that the transcript takes in.
-    pub(crate) fn say(&mut self, kind: u8, body: &[u8]) -> Vec<u8> {
+    /// A message that the transcript takes in, as it is: what QUIC protects by itself.
+    pub(crate) fn add(&mut self, kind: u8, body: &[u8]) -> Vec<u8> {
         let message = message(kind, body);
         self.transcript.extend(&message);
+        message
+    }
+
+    /// The same under the keys of the moment, in a record.
+    pub(crate) fn say(&mut self, kind: u8, body: &[u8]) -> Vec<u8> {
+        let message = self.add(kind, body);
         self.write.seal(HANDSHAKE, &message)
     }
 
