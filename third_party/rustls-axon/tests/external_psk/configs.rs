@@ -14,12 +14,14 @@ use rustls_axon::external_psk::{
 use rustls_axon::pki_types::ServerName;
 use rustls_axon::server::ServerSessionMemoryCache;
 use rustls_axon::{
-    ClientConfig, ClientConnection, Error, HandshakeKind, KeyLog, ServerConnection,
-    SupportedCipherSuite,
+    ClientConfig, ClientConnection, Error, HandshakeKind, KeyLog, PeerIncompatible, PeerMisbehaved,
+    ServerConnection, SupportedCipherSuite,
 };
 use zeroize::Zeroizing;
 
 use crate::common::*;
+use crate::peer::{ext, plaintext, records, server_hello, HANDSHAKE};
+use crate::resumption::{stock_client, Unchecked};
 
 #[test]
 fn configs_that_cannot_work_are_refused() {
@@ -205,6 +207,31 @@ fn a_resolver_that_is_wrong_ends_the_handshake() {
     assert!(catch_unwind(AssertUnwindSafe(|| feed(&mut server, &hello).is_err())).is_err());
     assert!(server.is_handshaking() && server.external_psk().is_none());
     assert!(!server.wants_write());
+}
+
+/// A verifier and certificates can be put into a config that is built. They are not used.
+#[test]
+fn what_is_set_later_opens_no_way_to_certificates() {
+    for mode in MODES {
+        let mut config = client_config(&[SHA256], vec![psk("a", 1, SHA256)], mode);
+        config.dangerous().set_certificate_verifier(Unchecked::new());
+        let mut client = client(config);
+        let hello = plaintext(&written(&mut client));
+        // a ServerHello that a certificate would follow
+        let answer = server_hello(&hello, 0x1303, [7; 32], &[ext(43, &[3, 4])]);
+        let error = feed(&mut client, &records(HANDSHAKE, &answer)).unwrap_err();
+        assert_eq!(error, PeerMisbehaved::ServerIgnoredExternalPsks.into());
+        assert_eq!(written(&mut client).last(), Some(&40));
+
+        let resolver = Known::new(vec![psk("a", 1, SHA256)]);
+        let mut config = server_config(&[SHA256], resolver, mode);
+        config.cert_resolver = Unchecked::new();
+        let mut server = server(config);
+        let mut client = self::client(stock_client());
+        let error = pass(&mut client, &mut server).unwrap_err();
+        assert_eq!(error, PeerIncompatible::ExternalPskRequired.into());
+        assert_eq!(written(&mut server).last(), Some(&109));
+    }
 }
 
 #[derive(Debug)]

@@ -1,9 +1,11 @@
 //! Handshakes that work.
 
 use std::io::{Read, Write};
+use std::sync::Arc;
 
 use rustls_axon::crypto::aws_lc_rs::kx_group;
 use rustls_axon::external_psk::PskKeyExchangeMode;
+use rustls_axon::server::Acceptor;
 use rustls_axon::{ClientConfig, HandshakeKind, NamedGroup, ServerConfig};
 
 use crate::common::*;
@@ -80,5 +82,24 @@ fn hello_retry_request_works() {
             assert_eq!(kind, Some(HandshakeKind::FullWithHelloRetryRequest));
         }
         assert_eq!(client.external_psk().unwrap().identity(), known.as_bytes());
+    }
+}
+
+/// A server that looks at the ClientHello before it has a config.
+#[test]
+fn an_acceptor_works() {
+    for mode in MODES {
+        let mut client = client(client_config(&[SHA256], vec![psk("a", 1, SHA256)], mode));
+        let mut acceptor = Acceptor::default();
+        acceptor.read_tls(&mut &written(&mut client)[..]).unwrap();
+        let accepted = acceptor.accept().unwrap().unwrap();
+        assert_eq!(accepted.client_hello().server_name(), Some("example.com"));
+        let config = server_config(&[SHA256], Known::new(vec![psk("a", 1, SHA256)]), mode);
+        let Ok(mut server) = accepted.into_connection(Arc::new(config)) else {
+            panic!("refused");
+        };
+        pass(&mut server, &mut client).unwrap();
+        pass(&mut client, &mut server).unwrap();
+        assert_eq!(server.external_psk().unwrap().identity(), b"a");
     }
 }

@@ -3,7 +3,7 @@
 use std::io::{Read, Write};
 use std::sync::Arc;
 
-use rustls_axon::crypto::aws_lc_rs::kx_group;
+use rustls_axon::crypto::aws_lc_rs::{cipher_suite, kx_group};
 use rustls_axon::external_psk::PskKeyExchangeMode;
 use rustls_axon::server::ServerSessionMemoryCache;
 use rustls_axon::{Error, PeerMisbehaved, ServerConnection};
@@ -266,7 +266,8 @@ fn server_refuses_second_client_hellos_that_break_the_rules() {
     let retried = |first: &ClientHello| {
         let resolver = Known::new(vec![psk("a", 1, SHA256), psk("b", 2, SHA256)]);
         let mode = PskKeyExchangeMode::PskDheKe;
-        let config = server_config_over(&[SHA256], &[kx_group::X25519], resolver, mode);
+        let suites = [SHA256, cipher_suite::TLS13_AES_128_GCM_SHA256];
+        let config = server_config_over(&suites, &[kx_group::X25519], resolver, mode);
         let mut server = server(config);
         let first = first.encode();
         feed(&mut server, &records(HANDSHAKE, &first)).unwrap();
@@ -300,7 +301,7 @@ fn server_refuses_second_client_hellos_that_break_the_rules() {
             &|hello| ClientHello { offers: vec![Offer::new("b", &SECRET)], ..hello },
             51,
         ),
-        ("another suite", &|hello| ClientHello { suites: vec![0x1301], ..hello }, 40),
+        ("another suite that would do", &|hello| ClientHello { suites: vec![0x1301], ..hello }, 47),
     ];
     for (what, change, alert) in wrong {
         let (mut server, before) = retried(&first());

@@ -14,8 +14,8 @@ use rustls_axon::server::ServerSessionMemoryCache;
 use rustls_axon::server::{ClientHello as StockClientHello, ResolvesServerCert};
 use rustls_axon::sign::CertifiedKey;
 use rustls_axon::{
-    ClientConfig, ClientConnection, DigitallySignedStruct, Error, HandshakeKind, PeerMisbehaved,
-    ServerConfig, ServerConnection, SignatureScheme,
+    ClientConfig, ClientConnection, DigitallySignedStruct, Error, HandshakeKind, PeerIncompatible,
+    PeerMisbehaved, ServerConfig, ServerConnection, SignatureScheme,
 };
 use zeroize::Zeroizing;
 
@@ -26,10 +26,10 @@ use crate::peer::{
 
 /// A certificate that nobody here looks at, with a key that signs.
 #[derive(Debug)]
-struct Unchecked(Arc<CertifiedKey>);
+pub(crate) struct Unchecked(Arc<CertifiedKey>);
 
 impl Unchecked {
-    fn new() -> Arc<Self> {
+    pub(crate) fn new() -> Arc<Self> {
         use aws_lc_rs::rand::SystemRandom;
         use aws_lc_rs::signature::{EcdsaKeyPair, ECDSA_P256_SHA256_ASN1_SIGNING};
 
@@ -84,7 +84,7 @@ impl ServerCertVerifier for Unchecked {
 }
 
 /// A server as rustls has it, with certificates and tickets.
-fn stock_server() -> Arc<ServerConfig> {
+pub(crate) fn stock_server() -> Arc<ServerConfig> {
     let mut config = ServerConfig::builder_with_provider(provider(&[SHA256], &[kx_group::X25519]))
         .with_safe_default_protocol_versions()
         .unwrap()
@@ -94,7 +94,7 @@ fn stock_server() -> Arc<ServerConfig> {
     Arc::new(config)
 }
 
-fn stock_client() -> ClientConfig {
+pub(crate) fn stock_client() -> ClientConfig {
     ClientConfig::builder_with_provider(provider(&[SHA256], &[kx_group::X25519]))
         .with_safe_default_protocol_versions()
         .unwrap()
@@ -246,7 +246,10 @@ fn a_client_with_external_psks_takes_no_tickets() {
     // and what the other config learned about groups is not asked for
     let first_share = [0, 51, 0, 71, 0, 69, 0, 23];
     assert!(hello.windows(8).any(|window| window == first_share), "the first group configured");
-    assert!(feed(&mut server, &hello).is_err(), "which a server with certificates cannot take");
+    // which a server with certificates cannot take: there is no `signature_algorithms` in it
+    let error = feed(&mut server, &hello).unwrap_err();
+    assert_eq!(error, PeerIncompatible::SignatureAlgorithmsExtensionRequired.into());
+    assert_eq!(written(&mut server).last(), Some(&40));
 
     assert_eq!(connect_stock(), Some(HandshakeKind::Resumed), "nothing was taken or removed");
 }

@@ -86,6 +86,23 @@ fn client_refuses_hostile_server_hellos() {
     assert_eq!(sent, Some(IllegalParameter));
 }
 
+/// A share that is good, for a group that is not the one it says.
+#[test]
+fn client_refuses_a_share_under_another_name() {
+    let mode = PskKeyExchangeMode::PskDheKe;
+    for (group, alert) in [(29_u16, None), (0xfe00, Some(47)), (23, Some(47)), (0x11ec, Some(47))] {
+        let psks = vec![psk("a", 1, SHA256)];
+        let mut client = client(client_config_over(&[SHA256], &[kx_group::X25519], psks, mode));
+        let hello = plaintext(&written(&mut client));
+        let share = kx_group::X25519.start().unwrap();
+        let share = [&group.to_be_bytes()[..], &list16(share.pub_key())].concat();
+        let extensions = [ext(43, &[3, 4]), ext(41, &[0, 0]), ext(51, &share)];
+        let hello = server_hello(&hello, 0x1303, [7; 32], &extensions);
+        let refused = feed(&mut client, &records(HANDSHAKE, &hello)).is_err();
+        assert_eq!(refused.then(|| *written(&mut client).last().unwrap()), alert, "{group:x}");
+    }
+}
+
 #[test]
 fn client_refuses_hello_retry_request_without_cause() {
     let [psk_ke, psk_dhe_ke] = MODES;
