@@ -10,7 +10,7 @@ use rustls_axon::{Error, PeerMisbehaved, ServerConnection};
 
 use crate::common::*;
 use crate::peer::{
-    digest, list16, list8, message, plaintext, records, ClientHello, Early, Offer, Peer,
+    digest, list16, list8, message, plaintext, records, ClientHello, Early, Made, Offer, Peer,
     Protection, Role, APPLICATION_DATA, HANDSHAKE,
 };
 
@@ -95,7 +95,7 @@ fn server_refuses_all_but_finished() {
 
 #[test]
 fn server_refuses_a_wrong_finished() {
-    let wrong: &[(&str, &dyn Fn(&Peer) -> Vec<u8>)] = &[
+    let wrong: &[(&str, Made<'_>)] = &[
         ("one bit", &|client| {
             let mut verify_data = client.verify_data();
             verify_data[0] ^= 0x80;

@@ -14,8 +14,8 @@ use rustls_axon::{ClientConnection, Error, NamedGroup, PeerMisbehaved};
 
 use crate::common::*;
 use crate::peer::{
-    ext, list16, list8, message, plaintext, records, server_hello, Peer, Role, APPLICATION_DATA,
-    HANDSHAKE,
+    ext, list16, list8, message, plaintext, records, server_hello, Made, Peer, Role,
+    APPLICATION_DATA, HANDSHAKE,
 };
 
 const SECRET: [u8; 32] = [1; 32];
@@ -67,30 +67,30 @@ fn new_session_ticket(ticket: &[u8]) -> Vec<u8> {
 /// Everything but EncryptedExtensions, and then everything but Finished.
 #[test]
 fn client_refuses_all_but_the_expected_message() {
-    let unexpected: &[(&str, u8, &dyn Fn() -> Vec<u8>, u8)] = &[
-        ("HelloRequest", 0, &Vec::new, 10),
-        ("ClientHello", 1, &|| plaintext(&other_client_hello())[4..].to_vec(), 10),
-        ("NewSessionTicket", 4, &|| new_session_ticket(b"ticket"), 10),
-        ("EndOfEarlyData", 5, &Vec::new, 10),
-        ("Certificate", 11, &certificate, 10),
-        ("CertificateRequest", 13, &certificate_request, 10),
-        ("CertificateVerify", 15, &|| vec![8, 7, 0, 1, 0], 10),
-        ("KeyUpdate", 24, &|| vec![1], 10),
-        ("CompressedCertificate", 25, &|| vec![0, 1, 0, 0, 9, 0, 0, 1, 0], 10),
-        ("a message that does not exist", 99, &|| vec![1, 2, 3], 10),
+    let unexpected: &[(&str, u8, Vec<u8>)] = &[
+        ("HelloRequest", 0, vec![]),
+        ("ClientHello", 1, plaintext(&other_client_hello())[4..].to_vec()),
+        ("NewSessionTicket", 4, new_session_ticket(b"ticket")),
+        ("EndOfEarlyData", 5, vec![]),
+        ("Certificate", 11, certificate()),
+        ("CertificateRequest", 13, certificate_request()),
+        ("CertificateVerify", 15, vec![8, 7, 0, 1, 0]),
+        ("KeyUpdate", 24, vec![1]),
+        ("CompressedCertificate", 25, vec![0, 1, 0, 0, 9, 0, 0, 1, 0]),
+        ("a message that does not exist", 99, vec![1, 2, 3]),
     ];
 
     for after_encrypted_extensions in [false, true] {
-        for (what, kind, body, alert) in unexpected {
+        for (what, kind, body) in unexpected {
             let (mut client, mut server) = after_server_hello();
             let mut flight = Vec::new();
             if after_encrypted_extensions {
                 flight.extend(server.say(8, &[0, 0]));
             }
-            flight.extend(server.say(*kind, &body()));
+            flight.extend(server.say(*kind, body));
             // as if nothing were wrong
             flight.extend(server.finish());
-            refused(client_error(&mut client, &flight), client, server, *alert, what);
+            refused(client_error(&mut client, &flight), client, server, 10, what);
         }
     }
 
@@ -155,7 +155,7 @@ fn client_refuses_encrypted_extensions_it_did_not_ask_for() {
 
 #[test]
 fn client_refuses_a_wrong_finished() {
-    let wrong: &[(&str, &dyn Fn(&Peer) -> Vec<u8>)] = &[
+    let wrong: &[(&str, Made<'_>)] = &[
         ("one bit", &|server| {
             let mut verify_data = server.verify_data();
             verify_data[31] ^= 1;

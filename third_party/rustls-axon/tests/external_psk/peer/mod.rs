@@ -19,6 +19,9 @@ pub(crate) enum Role {
     Server,
 }
 
+/// Bytes that depend on how far the peer got.
+pub(crate) type Made<'a> = &'a dyn Fn(&Peer) -> Vec<u8>;
+
 /// A connection past the two hellos.
 pub(crate) struct Peer {
     pub(crate) transcript: Vec<u8>,
