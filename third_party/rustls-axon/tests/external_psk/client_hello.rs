@@ -208,6 +208,12 @@ fn server_takes_unusual_offers_that_are_right() {
         ("modes that do not exist", offer().with(45, &[3, 0x0b, 0, 0xff])),
         ("a version that does not exist", offer().with(43, &[4, 0x7a, 0x7a, 3, 4])),
         ("extensions that do not exist", offer().with(0xfafa, b"grease")),
+        ("types of certificates", offer().with(19, &[2, 2, 0]).with(20, &[2, 0, 2])),
+        ("raw public keys alone", offer().with(19, &[1, 2]).with(20, &[1, 2])),
+        ("OCSP, SCTs and compression", {
+            let hello = offer().with(5, &[1, 0, 0, 0, 0]).with(18, &[]);
+            hello.with(27, &[2, 0, 1]).with(28, &[0x40, 0])
+        }),
         ("groups and a share that psk_ke does not use", offer_with_share().with(45, &[2, 0, 1])),
         ("no share for its groups yet", offer_with_share().with(45, &[1, 0]).with(51, &[0, 0])),
         ("early data", offer().with(42, &[])),

@@ -120,19 +120,27 @@ fn client_refuses_hello_retry_request_without_cause() {
     }
 }
 
-/// A client in psk_dhe_ke that answered a HelloRetryRequest for P-256 and the suite of `a`. Gives
-/// the transcript before its second ClientHello, and that.
-fn retried(extensions: &[(u16, &[u8])]) -> (ClientConnection, Vec<u8>, Vec<u8>) {
-    let groups = [kx_group::X25519, kx_group::SECP256R1];
-    let psks = vec![psk("a", 1, SHA256), psk("b", 2, SHA384)];
-    let mode = PskKeyExchangeMode::PskDheKe;
-    let mut client = client(client_config_over(&[SHA256, SHA384], &groups, psks, mode));
-    let first = plaintext(&written(&mut client));
-    let list: Vec<_> = extensions.iter().map(|(kind, data)| ext(*kind, data)).collect();
-    let retry = server_hello(&first, 0x1303, HELLO_RETRY_REQUEST, &list);
-    feed(&mut client, &records(HANDSHAKE, &retry)).unwrap();
-    let second = plaintext(&written(&mut client));
-    (client, [message(254, &digest(&first)), retry].concat(), second)
+/// A client in psk_dhe_ke that answered a HelloRetryRequest for the suite of `a`.
+struct Retried {
+    client: ClientConnection,
+    first: Vec<u8>,
+    retry: Vec<u8>,
+    second: Vec<u8>,
+}
+
+impl Retried {
+    fn new(extensions: &[(u16, &[u8])]) -> Self {
+        let groups = [kx_group::X25519, kx_group::SECP256R1];
+        let psks = vec![psk("a", 1, SHA256), psk("b", 2, SHA384)];
+        let mode = PskKeyExchangeMode::PskDheKe;
+        let mut client = client(client_config_over(&[SHA256, SHA384], &groups, psks, mode));
+        let first = plaintext(&written(&mut client));
+        let list: Vec<_> = extensions.iter().map(|(kind, data)| ext(*kind, data)).collect();
+        let retry = server_hello(&first, 0x1303, HELLO_RETRY_REQUEST, &list);
+        feed(&mut client, &records(HANDSHAKE, &retry)).unwrap();
+        let second = plaintext(&written(&mut client));
+        Self { client, first, retry, second }
+    }
 }
 
 #[test]
@@ -150,7 +158,7 @@ fn client_refuses_what_follows_a_retry() {
         ("a share that is none", 0x1303, [7; 32], &[TLS13, FIRST_PSK, (51, &right)], 47),
         ("to retry again", 0x1303, HELLO_RETRY_REQUEST, &[TLS13, (51, &[0, 29])], 10),
     ] {
-        let (mut client, _, second) = retried(&retry);
+        let Retried { mut client, second, .. } = Retried::new(&retry);
         let list: Vec<_> = extensions.iter().map(|(kind, data)| ext(*kind, data)).collect();
         let hello = server_hello(&second, suite, random, &list);
         let error = feed(&mut client, &records(HANDSHAKE, &hello)).unwrap_err();
@@ -163,18 +171,55 @@ fn client_refuses_what_follows_a_retry() {
 #[test]
 fn the_second_client_hello_is_bound_to_the_first() {
     for extensions in [&[TLS13, (44, &[0, 3, 1, 2, 3])][..], &[TLS13, (51, &[0, 23])]] {
-        let (_, before, second) = retried(extensions);
-        let transcript = [before, second].concat();
+        let Retried { first, retry, second, .. } = Retried::new(extensions);
         let tail = [&[0, 41, 0, 44, 0, 7, 0, 1, b'a'][..], &[0; 4], &[0, 33, 32]].concat();
-        let end = transcript.len() - 32;
-        assert_eq!(&transcript[end - tail.len()..end], tail);
-        let binder =
-            Early::new(Some(&[1; 32])).binder("ext binder", &digest(&transcript[..end - 3]));
-        assert_eq!(&transcript[end..], binder);
-        let cookie = [0, 44, 0, 5, 0, 3, 1, 2, 3];
-        let echoed = transcript.windows(9).filter(|window| *window == cookie).count();
-        assert_eq!(echoed, if extensions[1].0 == 44 { 2 } else { 0 });
+        let end = second.len() - 32;
+        assert_eq!(&second[end - tail.len()..end], tail);
+        let bound = [message(254, &digest(&first)), retry, second[..end - 3].to_vec()].concat();
+        let binder = Early::new(Some(&[1; 32])).binder("ext binder", &digest(&bound));
+        assert_eq!(&second[end..], binder);
     }
+}
+
+/// RFC 8446 4.1.2 lists what may be another. The suites are not in that list.
+#[test]
+fn the_second_client_hello_is_the_first_but_for_what_was_asked() {
+    for (extensions, asked) in
+        [(&[TLS13, (44, &[0, 3, 1, 2, 3])][..], 44), (&[TLS13, (51, &[0, 23])], 51)]
+    {
+        let Retried { first, second, .. } = Retried::new(extensions);
+        let (first_fields, first) = parts(&first);
+        let (second_fields, second) = parts(&second);
+        assert_eq!(first_fields, second_fields, "version, random, session ID, suites, compression");
+        let unasked = |list: Vec<(u16, Vec<u8>)>| -> Vec<_> {
+            list.into_iter().filter(|(kind, _)| ![41, asked].contains(kind)).collect()
+        };
+        let answer = second.iter().find(|(kind, _)| *kind == asked).map(|(_, data)| &data[..]);
+        match asked {
+            44 => assert_eq!(answer, Some(&[0, 3, 1, 2, 3][..])),
+            // one share, of P-256
+            _ => assert_eq!(answer.map(|data| &data[..6]), Some(&[0, 69, 0, 23, 0, 65][..])),
+        }
+        assert_eq!(unasked(first), unasked(second), "extensions, and their order");
+    }
+}
+
+/// A ClientHello in front of its extensions, and those.
+fn parts(hello: &[u8]) -> (Vec<u8>, Vec<(u16, Vec<u8>)>) {
+    let number = |at: usize| u16::from_be_bytes([hello[at], hello[at + 1]]);
+    // handshake header 4, version 2, random 32
+    let suites = 38 + 1 + usize::from(hello[38]);
+    let compression = suites + 2 + usize::from(number(suites));
+    let start = compression + 1 + usize::from(hello[compression]);
+    let mut list = Vec::new();
+    let mut at = start + 2;
+    while at < hello.len() {
+        let end = at + 4 + usize::from(number(at + 2));
+        list.push((number(at), hello[at + 4..end].to_vec()));
+        at = end;
+    }
+    // without the header, which has the length
+    (hello[4..start].to_vec(), list)
 }
 
 /// Nothing is cut short to make room for what a server wants to have echoed.

@@ -37,6 +37,9 @@ use crate::verify::{HandshakeSignatureValid, ServerCertVerified};
 /// The external PSKs that one connection offers.
 pub(in crate::client) struct OfferedExternalPsks {
     psks: Vec<Arc<ExternalPsk>>,
+    /// Those of all PSKs at first.  A HelloRetryRequest leaves only PSKs of one hash, but it must
+    /// not change the cipher suites, which these decide (RFC 8446 4.1.2).
+    hashes: Vec<HashAlgorithm>,
     mode: PskKeyExchangeMode,
 }
 
@@ -84,6 +87,10 @@ impl OfferedExternalPsks {
         }
 
         Ok(Some(Self {
+            hashes: psks
+                .iter()
+                .map(|psk| psk.hash())
+                .collect(),
             psks,
             mode: configured.mode,
         }))
@@ -104,9 +111,8 @@ impl OfferedExternalPsks {
                 .find_cipher_suite(*suite, common.protocol)
                 .and_then(|suite| suite.tls13())
                 .is_some_and(|suite| {
-                    self.psks
-                        .iter()
-                        .any(|psk| psk.usable_with(suite))
+                    self.hashes
+                        .contains(&suite.common.hash_provider.algorithm())
                 })
         });
 
