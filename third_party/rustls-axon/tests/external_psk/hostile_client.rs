@@ -1,6 +1,7 @@
 //! A server against a client that knows the PSK, and goes on as it likes after the ClientHello.
 
 use std::io::{Read, Write};
+use std::sync::atomic::Ordering;
 use std::sync::Arc;
 
 use rustls_axon::crypto::aws_lc_rs::{cipher_suite, kx_group};
@@ -179,6 +180,22 @@ fn server_follows_key_updates_but_not_a_flood() {
     };
     let error = (0..100).find_map(|_| flood().err());
     assert_eq!(error, Some(PeerMisbehaved::TooManyKeyUpdateRequests.into()));
+}
+
+/// RFC 8446 5.1: a record that holds the last message under old keys ends with it.
+#[test]
+fn server_refuses_messages_across_a_change_of_keys() {
+    let resolver = Known::new(vec![psk("a", 1, SHA256)]);
+    let mut server = server(server_config(&[SHA256], resolver.clone(), PskKeyExchangeMode::PskKe));
+    let two = [offer().encode(), message(20, &[0; 32])].concat();
+    assert!(feed(&mut server, &records(HANDSHAKE, &two)).is_err());
+    assert_eq!(written(&mut server).last(), Some(&10));
+    assert_eq!(resolver.asked.load(Ordering::Relaxed), 0, "nobody was asked for a PSK");
+
+    let (server, mut client) = after_server_finished();
+    let content = [message(20, &client.verify_data()), message(24, &[0])].concat();
+    let flight = client.write.seal(HANDSHAKE, &content);
+    refused(server, client, &flight, 10, "Finished and KeyUpdate");
 }
 
 /// 0-RTT data is neither acknowledged nor delivered: its records do not open, and are skipped, but

@@ -261,6 +261,37 @@ fn client_refuses_every_changed_or_shortened_flight() {
     }
 }
 
+/// RFC 8446 5.1: a record that holds the last message under old keys ends with it.
+#[test]
+fn client_refuses_messages_across_a_change_of_keys() {
+    let mut client =
+        client(client_config(&[SHA256], vec![psk("a", 1, SHA256)], PskKeyExchangeMode::PskKe));
+    let hello = server_hello(&plaintext(&written(&mut client)), 0x1303, [7; 32], &psk_ke());
+    let record = records(HANDSHAKE, &[hello, message(8, &[0, 0])].concat());
+    assert!(feed(&mut client, &record).is_err());
+    assert_eq!(written(&mut client).last(), Some(&10));
+
+    let (mut client, mut server) = after_server_hello();
+    let _ = server.add(8, &[0, 0]);
+    let verify_data = server.verify_data();
+    let ticket = message(4, &new_session_ticket(b"under the keys of the handshake"));
+    let content = [message(8, &[0, 0]), message(20, &verify_data), ticket].concat();
+    let error = client_error(&mut client, &server.write.seal(HANDSHAKE, &content));
+    assert!(client.external_psk().is_none() && client.tls13_tickets_received() == 0);
+    assert!(matches!(error, Error::PeerMisbehaved(_)), "{error}");
+}
+
+#[test]
+fn client_refuses_malformed_tickets() {
+    let ticket = new_session_ticket(b"ticket");
+    for len in 0..ticket.len() {
+        let (client, server) = after_server_hello();
+        let (mut client, mut server) = connected(client, server);
+        let error = client_error(&mut client, &server.say(4, &ticket[..len]));
+        assert_eq!(server.alert_in(&written(&mut client)), Some(50), "{len}: {error}");
+    }
+}
+
 /// Each prefix of a ServerHello, once as a record cut short and once as a message that says so.
 #[test]
 fn client_refuses_every_shortened_server_hello() {
