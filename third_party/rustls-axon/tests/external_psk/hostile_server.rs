@@ -59,8 +59,9 @@ fn certificate_request() -> Vec<u8> {
 }
 
 fn new_session_ticket(ticket: &[u8]) -> Vec<u8> {
-    let early_data = [0, 42, 0, 4, 0xff, 0xff, 0xff, 0xff];
-    [&[0, 0, 0x1c, 0x20, 1, 2, 3, 4][..], &list8(b"nonce"), &list16(ticket), &list16(&early_data)]
+    // `early_data`, and one that does not exist
+    let extensions = [0, 42, 0, 4, 0xff, 0xff, 0xff, 0xff, 0xfa, 0xfa, 0, 1, 7];
+    [&[0, 0, 0x1c, 0x20, 1, 2, 3, 4][..], &list8(b"nonce"), &list16(ticket), &list16(&extensions)]
         .concat()
 }
 

@@ -110,6 +110,8 @@ impl<'a> ImportedIdentity<'a> {
     /// `context` must say how the base key came about, and should name both ends in their roles:
     /// then a reflected ClientHello finds no key ([RFC 9257 section 4.1]).  It may be empty.
     ///
+    /// Both are sent in the clear, so neither may hold anything that is secret.
+    ///
     /// [RFC 9257 section 4.1]: https://datatracker.ietf.org/doc/html/rfc9257#section-4.1
     pub fn new(
         external_identity: &'a [u8],
