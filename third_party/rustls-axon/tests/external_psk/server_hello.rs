@@ -112,6 +112,7 @@ fn client_refuses_hello_retry_request_without_cause() {
         (psk_ke, &[TLS13]),
         (psk_dhe_ke, &[TLS13, (51, &[0x11, 0xec])]),
         (psk_dhe_ke, &[TLS13, (51, &[0, 29])]),
+        (psk_dhe_ke, &[TLS13, (51, &[0x11, 0xec]), (44, &[0, 1, 7])]),
     ] {
         let client = client(client_config(&[SHA256], vec![psk("a", 1, SHA256)], mode));
         let (error, alert) =
