@@ -223,9 +223,10 @@ struct Fields {
     reliable: Option<IndexMask>,
 }
 
-/// Whether a key_ID can be announced at all: text of at most [`MAX_KEY_ID`] bytes.
-pub(super) fn announceable(key_id: &KeyId) -> bool {
-    key_id.as_bytes().len() <= MAX_KEY_ID && std::str::from_utf8(key_id.as_bytes()).is_ok()
+/// A key_ID's text, if it can be announced at all: text of at most [`MAX_KEY_ID`] bytes.
+pub(super) fn announceable(key_id: &KeyId) -> Option<&str> {
+    let fits = key_id.as_bytes().len() <= MAX_KEY_ID;
+    std::str::from_utf8(key_id.as_bytes()).ok().filter(|_| fits)
 }
 
 fn text(key_id: &KeyId) -> &str {

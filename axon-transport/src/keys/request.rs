@@ -4,6 +4,8 @@ use std::{fmt, time::Duration};
 
 use axon_envelope::{KeyId, KmeKey};
 
+pub use etsi_qkd014::pool::Stock;
+
 /// What a key is fetched for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Purpose {
@@ -67,15 +69,6 @@ pub enum Fetched {
     Keys(Vec<(KeyId, KmeKey)>),
     /// The answer to [`Request::Status`].
     Stock(Stock),
-}
-
-/// The part of the KME's status that the supply of keys depends on.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Stock {
-    /// Keys ready to be handed out. Some KMEs always say 0.
-    pub stored_key_count: u64,
-    /// Most keys a call may ask for.
-    pub max_key_per_request: u64,
 }
 
 /// Why a [`Request`] failed. Never holds anything of a key.

@@ -49,10 +49,7 @@ async fn call(client: &Client, request: &Request) -> Result<Fetched, Failure> {
         }
         Request::Status { slave } => {
             let status = client.status(slave).await.map_err(|e| failure(&e))?;
-            Ok(Fetched::Stock(Stock {
-                stored_key_count: status.stored_key_count,
-                max_key_per_request: status.max_key_per_request,
-            }))
+            Ok(Fetched::Stock(Stock::from(&status)))
         }
     }
 }

@@ -2,10 +2,11 @@
 //! (docs/formats.md, section 4).
 //!
 //! Each host is master for what it sends: its [`Sender`] asks for keys, the peer's [`Receiver`]
-//! fetches the same ones. There is one pair for each peer SAE, and it outlives connections.
+//! fetches the same ones. There is one pair for each peer SAE, and it outlives connections. When to
+//! draw from the KME, and how many, are the rules of [`etsi_qkd014::pool`].
 
-mod calls;
 mod demand;
+mod pool;
 mod receiver;
 mod sender;
 

@@ -5,7 +5,7 @@ use std::{
     time::Duration,
 };
 
-use axon_envelope::{Channel, ChannelError, KeyId, KmeKey, Opener};
+use axon_envelope::{Channel, ChannelError, Expired, KeyId, KmeKey, Opener};
 use serde::Serialize;
 use zeroize::Zeroizing;
 
@@ -47,6 +47,14 @@ struct Counts {
     failed: u64,
     retired: u64,
     expired: u64,
+    missing: u64,
+}
+
+impl Counts {
+    fn add(&mut self, expired: Expired) {
+        self.expired += expired.keys as u64;
+        self.missing += expired.messages_missing as u64;
+    }
 }
 
 /// How a [`Receiver`] stands, for status.
@@ -65,6 +73,8 @@ pub struct ReceiverStatistics {
     pub retired: u64,
     /// Keys that time retired.
     pub expired: u64,
+    /// Messages that the peer says it sealed and that never came, under keys that are retired.
+    pub messages_missing: u64,
 }
 
 impl Receiver {
@@ -108,6 +118,7 @@ impl Receiver {
     pub fn detach(&mut self, now: Duration, conn: u64) {
         let Some(mut link) = self.links.remove(&conn) else { return };
         self.outbox.retain(|(c, _)| *c != conn);
+        self.counts.add(link.opener.expire(now));
         let unused: Vec<KeyId> = link.opener.unused_keys().cloned().collect();
         for key_id in unused {
             if let Some((key_id, key)) = link.opener.take_unused(key_id.as_bytes()) {
@@ -185,7 +196,7 @@ impl Receiver {
     /// Erases what time has retired; to be called about once a second.
     pub fn expire(&mut self, now: Duration) {
         for link in self.links.values_mut() {
-            self.counts.expired += link.opener.expire(now).keys as u64;
+            self.counts.add(link.opener.expire(now));
         }
         self.kept.retain(|(since, ..)| now.saturating_sub(*since) < KEPT_FOR);
     }
@@ -199,6 +210,7 @@ impl Receiver {
             failed: self.counts.failed,
             retired: self.counts.retired,
             expired: self.counts.expired,
+            messages_missing: self.counts.missing,
         }
     }
 

@@ -1,7 +1,7 @@
 //! The sending direction: fetches keys ahead, announces them, and seals under those that are READY.
 
 use std::{
-    collections::{HashMap, HashSet, VecDeque},
+    collections::{HashMap, VecDeque},
     time::Duration,
 };
 
@@ -12,10 +12,14 @@ use axon_envelope::{
 use serde::Serialize;
 use zeroize::Zeroizing;
 
-use super::{MAX_UNRETIRED, SupplyError, SupplyWarning, calls::Calls, demand::Demand};
+use super::{
+    MAX_UNRETIRED, SupplyError, SupplyWarning,
+    demand::{self, Demand},
+    pool::{Fresh, Pool},
+};
 use crate::keys::{
     Exporters, KeyMessage, Violation, message, proof,
-    request::{Answer, Fetched, Request},
+    request::{Answer, Request},
 };
 
 /// How long an announced key waits for READY or FAILED: the receiver's tries, and more.
@@ -26,15 +30,14 @@ pub struct Sender {
     local: String,
     peer: String,
     link: Option<Link>,
-    /// Held, to be announced.
-    fresh: VecDeque<Fresh>,
+    /// Drawn or being drawn, to be announced.
+    pool: Pool,
     announced: HashMap<KeyId, Announced>,
     /// READY, in the order of use. Only the first may have sealed anything.
     ready: VecDeque<Sealer>,
     /// When the first of `ready` was first handed out.
     begun: Option<Duration>,
     outbox: VecDeque<(u64, KeyMessage)>,
-    calls: Calls,
     demand: Demand,
     counts: Counts,
 }
@@ -43,13 +46,6 @@ struct Link {
     conn: u64,
     channel: Channel,
     ready: Zeroizing<[u8; 32]>,
-}
-
-struct Fresh {
-    key_id: KeyId,
-    key: KmeKey,
-    /// When it was asked for, where its lead time is to be measured.
-    asked: Option<Duration>,
 }
 
 struct Announced {
@@ -92,7 +88,7 @@ pub struct SenderStatistics {
     pub announced: usize,
     /// Keys asked for and not there.
     pub asked: usize,
-    /// Keys that should be on their way or READY.
+    /// Keys that should be on their way or READY, within the KME's stock.
     pub target: usize,
     /// Keys that the messages need.
     pub demand: f64,
@@ -104,11 +100,11 @@ pub struct SenderStatistics {
     pub sealed: u64,
     /// Keys retired.
     pub retired: u64,
-    /// Keys that the peer could not fetch, or did not answer.
+    /// Keys that the peer could not fetch or did not answer, or that the KME gave before.
     pub failed: u64,
     /// How often a message was refused for want of a key.
     pub no_key: u64,
-    /// Why the last key failed.
+    /// Why the last key or call failed.
     pub last_failure: Option<String>,
 }
 
@@ -118,20 +114,30 @@ impl Sender {
     /// # Errors
     /// SAE IDs that make no channel: empty, too long, equal.
     pub fn new(local_sae: &str, peer_sae: &str) -> Result<Self, ChannelError> {
+        Self::with_jitter(local_sae, peer_sae, rand::random)
+    }
+
+    /// With `jitter` as a random byte for each pause after a failed call.
+    pub(super) fn with_jitter(
+        local_sae: &str,
+        peer_sae: &str,
+        jitter: impl FnMut() -> u8 + Send + 'static,
+    ) -> Result<Self, ChannelError> {
         Channel::new(local_sae, peer_sae, [])?;
-        Ok(Self {
+        let mut sender = Self {
             local: local_sae.to_owned(),
             peer: peer_sae.to_owned(),
             link: None,
-            fresh: VecDeque::new(),
+            pool: Pool::new(jitter),
             announced: HashMap::new(),
             ready: VecDeque::new(),
             begun: None,
             outbox: VecDeque::new(),
-            calls: Calls::new(),
             demand: Demand::new(),
             counts: Counts::default(),
-        })
+        };
+        sender.plan(Duration::ZERO);
+        Ok(sender)
     }
 
     /// Moves to a new connection. Keys under which nothing was sealed are announced again there;
@@ -168,23 +174,30 @@ impl Sender {
         self.link.as_ref().map(|link| link.conn)
     }
 
-    /// Takes on a key that the peer has proven to hold on `conn`, as READY.
+    /// Takes on a key that the peer has proven to hold on `conn`, as READY. One that was there
+    /// before, or is one too many, is dropped.
     ///
     /// # Errors
     /// The system gives no random bytes.
     pub fn adopt(
         &mut self,
-        _now: Duration,
+        now: Duration,
         conn: u64,
         key_id: KeyId,
         key: KmeKey,
     ) -> Result<(), SupplyError> {
+        if self.unretired(now) >= MAX_UNRETIRED {
+            return Ok(());
+        }
+        if let Err(why) = self.pool.admit(&key_id) {
+            self.failed(why);
+            return Ok(());
+        }
         match &self.link {
             Some(link) if link.conn == conn => {
                 self.ready.push_back(Sealer::new(&link.channel, key_id, key)?);
             }
-            _ if self.unretired() >= MAX_UNRETIRED => {}
-            _ => self.fresh.push_back(Fresh { key_id, key, asked: None }),
+            _ => self.pool.put(now, key_id, key),
         }
         Ok(())
     }
@@ -201,7 +214,8 @@ impl Sender {
     /// [`NoKey`]. Never an eleventh message under a key, never a key that is not READY.
     pub fn slot(&mut self, now: Duration, delivery: Delivery) -> Result<Slot<'_>, NoKey> {
         self.settle(now);
-        if let Err(no_key) = self.allowed(now, delivery) {
+        self.plan(now);
+        if let Err(no_key) = self.allowed(delivery) {
             self.counts.no_key += 1;
             return Err(no_key);
         }
@@ -217,14 +231,14 @@ impl Sender {
     }
 
     /// How many messages could be sealed now.
-    pub fn available(&self, now: Duration, delivery: Delivery) -> u32 {
-        if self.allowed(now, delivery).is_err() {
+    pub fn available(&self, delivery: Delivery) -> u32 {
+        if self.allowed(delivery).is_err() {
             return 0;
         }
         let all: u32 = self.ready.iter().map(|s| u32::from(s.remaining())).sum();
         let kept = match delivery {
             Delivery::Reliable => 0,
-            Delivery::BestEffort => self.demand.reserve(now) as u32 * u32::from(MESSAGES_PER_KEY),
+            Delivery::BestEffort => self.reserve() as u32 * u32::from(MESSAGES_PER_KEY),
         };
         all.saturating_sub(kept)
     }
@@ -252,7 +266,7 @@ impl Sender {
                 let Some(Announced { key, asked, .. }) = self.announced.remove(key_id) else {
                     return Ok(());
                 };
-                self.calls.key_ready();
+                self.pool.key_ready();
                 if let Some(asked) = asked {
                     self.demand.ready(now.saturating_sub(asked));
                 }
@@ -261,7 +275,7 @@ impl Sender {
             }
             KeyMessage::Failed { key_id, reason } => {
                 if self.announced.remove(key_id).is_some() {
-                    self.calls.key_refused(now);
+                    self.pool.key_refused(now);
                     self.failed(format!("peer could not fetch key_ID {key_id}: {reason}"));
                 }
                 Ok(())
@@ -274,42 +288,23 @@ impl Sender {
     pub fn poll_message(&mut self, now: Duration) -> Option<(u64, KeyMessage)> {
         self.settle(now);
         self.drop_unanswered(now);
-        self.outbox.pop_front().or_else(|| self.announce(now))
+        let message = self.outbox.pop_front().or_else(|| self.announce(now));
+        self.plan(now);
+        message
     }
 
     /// The next call to the KME, if any.
     pub fn poll_request(&mut self, now: Duration) -> Option<Request> {
         self.settle(now);
+        self.plan(now);
         self.link.as_ref()?;
-        let room = MAX_UNRETIRED.saturating_sub(self.unretired());
-        let ahead = self.fresh.len() + self.announced.len() + self.unbegun();
-        let target = self.demand.target(now).min(ahead + room);
-        self.calls.poll(now, &self.peer, target.saturating_sub(ahead), self.demand.per_call())
+        self.pool.poll(now, &self.peer)
     }
 
     /// The KME's answer to one of our requests.
     pub fn on_answer(&mut self, now: Duration, answer: Answer) {
-        let Some(waited) = self.calls.answered(now, &answer) else { return };
-        let asked = now.saturating_sub(answer.took);
-        match answer.outcome {
-            Ok(Fetched::Stock(stock)) => self.demand.stocked(now, stock),
-            Ok(Fetched::Keys(keys)) => {
-                self.demand.answered(waited, keys.len());
-                let held: HashSet<KeyId> = self.held().cloned().collect();
-                for (key_id, key) in keys {
-                    if held.contains(&key_id) {
-                        self.failed(format!("the KME gave key_ID {key_id} twice"));
-                    } else if !message::announceable(&key_id) {
-                        self.failed(format!("key_ID {key_id} is no text of at most 128 bytes"));
-                    } else {
-                        self.fresh.push_back(Fresh { key_id, key, asked: Some(asked) });
-                    }
-                }
-            }
-            Err(failure) => {
-                self.demand.answered(waited, 0);
-                self.counts.last_failure = Some(failure.text);
-            }
+        if let Some(failure) = self.pool.on_answer(now, answer) {
+            self.counts.last_failure = Some(failure);
         }
     }
 
@@ -317,23 +312,24 @@ impl Sender {
     pub fn poll_timeout(&self, _now: Duration) -> Option<Duration> {
         let used = self.begun.map(|at| at + KEY_MAX_AGE);
         let unanswered = self.announced.values().map(|a| a.since + ANSWER_WITHIN).min();
-        let calls = self.link.as_ref().and_then(|_| self.calls.poll_timeout());
+        let calls = self.link.as_ref().and_then(|_| self.pool.poll_timeout());
         [used, unanswered, calls].into_iter().flatten().min()
     }
 
     /// How it stands.
     pub fn statistics(&self, now: Duration) -> SenderStatistics {
+        let pool = self.pool.status(now);
         SenderStatistics {
             ready: self.ready.len(),
             announced: self.announced.len(),
-            asked: self.calls.keys_asked(),
-            target: self.demand.target(now),
+            asked: pool.asked,
+            target: pool.target,
             demand: self.demand.demand(now),
-            supply: self.demand.supply(),
+            supply: pool.supply,
             lead_ms: self.demand.lead_time().as_secs_f64() * 1e3,
             sealed: self.counts.sealed,
             retired: self.counts.retired,
-            failed: self.counts.failed,
+            failed: self.counts.failed + pool.unusable,
             no_key: self.counts.no_key,
             last_failure: self.counts.last_failure.clone(),
         }
@@ -341,16 +337,28 @@ impl Sender {
 
     /// Says that demand comes close to supply; at most every ten seconds.
     pub fn warning(&mut self, now: Duration) -> Option<SupplyWarning> {
-        self.demand.warning(now)
+        let supply = self.pool.status(now).supply?;
+        self.demand.warning(now, supply)
     }
 
-    fn allowed(&self, now: Duration, delivery: Delivery) -> Result<(), NoKey> {
+    /// Tells the pool how many keys to have ahead, and how many of them left it.
+    fn plan(&mut self, now: Duration) {
+        let elsewhere = self.announced.len() + self.unbegun();
+        self.pool.plan(self.demand.ahead(now), elsewhere);
+    }
+
+    /// READY keys that are kept for RELIABLE and services, as last planned.
+    fn reserve(&self) -> usize {
+        demand::reserve(self.pool.target())
+    }
+
+    fn allowed(&self, delivery: Delivery) -> Result<(), NoKey> {
         if self.link.is_none() {
             return Err(NoKey::Detached);
         }
         match (self.ready.len(), delivery) {
             (0, _) => Err(NoKey::None),
-            (n, Delivery::BestEffort) if n <= self.demand.reserve(now) => Err(NoKey::Reserved),
+            (n, Delivery::BestEffort) if n <= self.reserve() => Err(NoKey::Reserved),
             _ => Ok(()),
         }
     }
@@ -372,7 +380,7 @@ impl Sender {
             self.announced.iter().filter(|(_, a)| late(a)).map(|(id, _)| id.clone()).collect();
         for key_id in late {
             self.announced.remove(&key_id);
-            self.calls.key_refused(now);
+            self.pool.key_refused(now);
             self.failed(format!("peer did not answer ANNOUNCE of key_ID {key_id}"));
             let (used, reliable) = Default::default();
             self.tell(KeyMessage::Retire { key_id, used, reliable });
@@ -398,25 +406,22 @@ impl Sender {
     fn announce(&mut self, now: Duration) -> Option<(u64, KeyMessage)> {
         let conn = self.link.as_ref()?.conn;
         let room = MAX_UNRETIRED.saturating_sub(self.announced.len() + self.ready.len());
-        let count = self.fresh.len().min(message::MAX_ANNOUNCED).min(room);
-        if count == 0 {
-            return None;
-        }
-        let mut key_ids = Vec::with_capacity(count);
-        for Fresh { key_id, key, asked } in self.fresh.drain(..count) {
+        let mut key_ids = Vec::new();
+        while key_ids.len() < message::MAX_ANNOUNCED.min(room)
+            && let Some(Fresh { key_id, key, asked }) = self.pool.take(now)
+        {
             key_ids.push(key_id.clone());
             self.announced.insert(key_id, Announced { key, asked, since: now });
         }
-        Some((conn, KeyMessage::Announce(key_ids)))
+        (!key_ids.is_empty()).then_some((conn, KeyMessage::Announce(key_ids)))
     }
 
     /// Takes all keys off the connection: the begun one ends, the others are fresh again.
     fn unbind(&mut self, now: Duration) {
         self.settle(now);
-        let mut unused = VecDeque::new();
         while let Some(sealer) = self.ready.pop_front() {
             match sealer.into_unused() {
-                Ok((key_id, key)) => unused.push_back(Fresh { key_id, key, asked: None }),
+                Ok((key_id, key)) => self.pool.put_back(key_id, key),
                 Err(begun) => {
                     self.ready.push_front(begun);
                     self.retire_first();
@@ -425,10 +430,8 @@ impl Sender {
         }
         self.begun = None;
         for (key_id, Announced { key, .. }) in self.announced.drain() {
-            unused.push_back(Fresh { key_id, key, asked: None });
+            self.pool.put_back(key_id, key);
         }
-        unused.append(&mut self.fresh);
-        self.fresh = unused;
     }
 
     /// READY keys under which nothing was sealed.
@@ -436,13 +439,9 @@ impl Sender {
         self.ready.len() - usize::from(self.begun.is_some() && !self.ready.is_empty())
     }
 
-    fn unretired(&self) -> usize {
-        self.fresh.len() + self.announced.len() + self.ready.len() + self.calls.keys_asked()
-    }
-
-    fn held(&self) -> impl Iterator<Item = &KeyId> {
-        let fresh = self.fresh.iter().map(|f| &f.key_id);
-        fresh.chain(self.announced.keys()).chain(self.ready.iter().map(Sealer::key_id))
+    fn unretired(&self, now: Duration) -> usize {
+        let pool = self.pool.status(now);
+        pool.held + pool.asked + self.announced.len() + self.ready.len()
     }
 
     fn failed(&mut self, why: String) {

@@ -1,6 +1,7 @@
 //! A [`Sender`] and a [`Receiver`] with two KMEs between them, and a clock that stands still.
 
 mod any_order;
+mod drawing;
 mod receiving;
 mod sending;
 
@@ -97,7 +98,8 @@ impl Pair {
         let mut pair = Self {
             now: ms(0),
             kmes: Kmes::default(),
-            sender: Sender::new("sae-a", "sae-b").unwrap(),
+            // Every pause at its full length.
+            sender: Sender::with_jitter("sae-a", "sae-b", || 255).unwrap(),
             receiver: Receiver::new("sae-b", "sae-a").unwrap(),
             conn: 0,
             log: Vec::new(),
@@ -121,6 +123,14 @@ impl Pair {
     fn close(&mut self, conn: u64) {
         self.sender.detach(self.now, conn);
         self.receiver.detach(self.now, conn);
+    }
+
+    /// Makes the sender's calls and answers them until it makes no more.
+    fn draw(&mut self) {
+        while let Some(request) = self.sender.poll_request(self.now) {
+            let answer = self.kmes.answer(request);
+            self.sender.on_answer(self.now, answer);
+        }
     }
 
     /// Lets everything happen that can happen now.

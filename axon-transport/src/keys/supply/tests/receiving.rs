@@ -89,3 +89,32 @@ fn contradicting_masks_end_the_link() {
     pair.receiver.on_message(pair.now, 1, &retire("never-seen", 3, 1)).unwrap();
     assert!(pair.receiver.on_message(pair.now, 9, &retire(&key_id, 1, 1)).is_err(), "no such link");
 }
+
+#[test]
+fn messages_that_never_came_are_counted_once() {
+    let mut pair = Pair::new();
+    pair.run();
+    // Three are sealed under one key, and one of them arrives.
+    for arrives in [true, false, false] {
+        let envelope = pair.seal(Delivery::BestEffort).unwrap();
+        if arrives {
+            pair.open(envelope).unwrap();
+        }
+    }
+    let missing = |pair: &Pair| pair.receiver.statistics().messages_missing;
+    pair.connect();
+    pair.run();
+    pair.receiver.expire(pair.now);
+    assert_eq!(missing(&pair), 0, "they may still come");
+    pair.now += ms(5_000);
+    pair.receiver.expire(pair.now);
+    assert_eq!(missing(&pair), 2);
+    pair.seal(Delivery::BestEffort).unwrap();
+    pair.connect();
+    pair.now += ms(5_000);
+    // The connection closes before the next look.
+    pair.close(pair.conn - 1);
+    assert_eq!(missing(&pair), 3);
+    pair.receiver.expire(pair.now);
+    assert_eq!((missing(&pair), pair.receiver.statistics().expired), (3, 2));
+}

@@ -3,19 +3,13 @@ use std::time::Duration;
 use axon_envelope::Delivery;
 
 use super::{Pair, ROUTE, id, ms, retire};
-use crate::keys::{
-    KeyMessage, NoKey, Receiver, SupplyError, Violation,
-    request::{FailureKind, Request},
-};
+use crate::keys::{KeyMessage, NoKey, Receiver, SupplyError, Violation};
 
 #[test]
 fn nothing_is_sealed_before_ready() {
     let mut pair = Pair::new();
     assert_eq!(pair.seal(Delivery::Reliable), Err(NoKey::None));
-    while let Some(request) = pair.sender.poll_request(pair.now) {
-        let answer = pair.kmes.answer(request);
-        pair.sender.on_answer(pair.now, answer);
-    }
+    pair.draw();
     assert_eq!(pair.seal(Delivery::Reliable), Err(NoKey::None), "keys held, none announced");
     let (_, announce) = pair.sender.poll_message(pair.now).unwrap();
     assert_eq!(pair.seal(Delivery::Reliable), Err(NoKey::None), "announced, none READY");
@@ -28,10 +22,7 @@ fn nothing_is_sealed_before_ready() {
 #[test]
 fn a_wrong_proof_ends_the_link_and_readies_nothing() {
     let mut pair = Pair::new();
-    while let Some(request) = pair.sender.poll_request(pair.now) {
-        let answer = pair.kmes.answer(request);
-        pair.sender.on_answer(pair.now, answer);
-    }
+    pair.draw();
     let (_, KeyMessage::Announce(key_ids)) = pair.sender.poll_message(pair.now).unwrap() else {
         panic!()
     };
@@ -58,8 +49,8 @@ fn the_last_keys_are_kept_for_reliable() {
         best_effort += 1;
     }
     assert_eq!(best_effort, 20, "two keys of four");
-    assert_eq!(pair.sender.available(pair.now, Delivery::BestEffort), 0);
-    assert_eq!(pair.sender.available(pair.now, Delivery::Reliable), 20);
+    assert_eq!(pair.sender.available(Delivery::BestEffort), 0);
+    assert_eq!(pair.sender.available(Delivery::Reliable), 20);
     assert_eq!(pair.seal(Delivery::BestEffort), Err(NoKey::Reserved));
     let mut reliable = 0;
     while pair.seal(Delivery::Reliable).is_ok() {
@@ -67,43 +58,6 @@ fn the_last_keys_are_kept_for_reliable() {
     }
     assert_eq!(reliable, 20);
     assert_eq!(pair.seal(Delivery::Reliable), Err(NoKey::None));
-}
-
-#[test]
-fn an_empty_store_is_asked_for_less_and_less_often() {
-    let mut pair = Pair::new();
-    pair.kmes.left = Some(0);
-    pair.sender.demand(pair.now, 10_000);
-    let mut asked = Vec::new();
-    for _ in 0..10_000 {
-        while let Some(request) = pair.sender.poll_request(pair.now) {
-            if let Request::Enc { number, .. } = request {
-                asked.push(number);
-            }
-            let answer = pair.kmes.answer(request);
-            pair.sender.on_answer(pair.now, answer);
-        }
-        pair.now += ms(10);
-    }
-    assert!(asked.len() < 80, "{} calls in 100 s", asked.len());
-    assert_eq!(asked[0], 8);
-    assert_eq!(asked.last(), Some(&1));
-    pair.kmes.left = Some(3);
-    pair.now += ms(2000);
-    pair.run();
-    assert_eq!(pair.announced(), 3, "what there is, is had");
-}
-
-#[test]
-fn a_call_that_may_have_lost_keys_is_not_repeated_at_once() {
-    let mut pair = Pair::new();
-    pair.sender.poll_request(pair.now).map(|status| pair.kmes.answer(status)).unwrap();
-    let request = pair.sender.poll_request(pair.now).unwrap();
-    pair.kmes.failures = vec![FailureKind::Ambiguous];
-    let answer = pair.kmes.answer(request);
-    pair.sender.on_answer(pair.now, answer);
-    assert!(pair.sender.poll_request(pair.now + ms(999)).is_none());
-    assert!(pair.sender.poll_request(pair.now + ms(1000)).is_some());
 }
 
 #[test]
@@ -164,10 +118,7 @@ fn a_restarted_receiver_costs_the_keys_and_no_more() {
 fn a_peer_that_refuses_every_key_burns_few() {
     let mut pair = Pair::new();
     for _ in 0..6_000 {
-        while let Some(request) = pair.sender.poll_request(pair.now) {
-            let answer = pair.kmes.answer(request);
-            pair.sender.on_answer(pair.now, answer);
-        }
+        pair.draw();
         while let Some((conn, message)) = pair.sender.poll_message(pair.now) {
             let KeyMessage::Announce(key_ids) = message else { continue };
             for key_id in key_ids {
@@ -204,10 +155,7 @@ fn a_key_in_use_ends_after_an_hour() {
 #[test]
 fn an_announcement_that_nobody_answers_is_dropped() {
     let mut pair = Pair::new();
-    while let Some(request) = pair.sender.poll_request(pair.now) {
-        let answer = pair.kmes.answer(request);
-        pair.sender.on_answer(pair.now, answer);
-    }
+    pair.draw();
     assert!(matches!(pair.sender.poll_message(pair.now), Some((1, KeyMessage::Announce(_)))));
     assert_eq!(pair.sender.statistics(pair.now).announced, 4);
     pair.now += ms(60_000);

@@ -1,0 +1,184 @@
+//! Keys drawn from the KME and not yet announced. When to draw, and how many, are the rules of
+//! [`etsi_qkd014::pool`]; here its calls become [`Request`]s, and it is told what came of them.
+
+use std::time::Duration;
+
+use axon_envelope::{KeyId, KmeKey};
+use etsi_qkd014::pool::{Ask, Core, FailureClass, Ledger, PoolStatus, Settings};
+
+use crate::keys::{
+    message,
+    request::{Answer, FailureKind, Fetched, Purpose, Request},
+};
+
+/// Most keys a call asks for: what a call that is cut off can lose.
+const PER_CALL: u32 = 8;
+/// Calls for keys in flight.
+const IN_FLIGHT: usize = 4;
+/// How long a call may take.
+const TIMEOUT: Duration = Duration::from_secs(10);
+
+/// Pause after a key that the peer could not use, first and longest. Doubles with every
+/// [`REFUSALS`] of them that no READY makes up for: each costs a key that is gone for good.
+const REFUSED: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(30));
+/// See [`REFUSED`].
+const REFUSALS: u32 = 4;
+/// Refusals that are remembered, so that a peer that is well again is served again soon.
+const REFUSALS_MAX: u32 = 40;
+
+/// A key that no connection knows of.
+pub(super) struct Fresh {
+    pub(super) key_id: KeyId,
+    pub(super) key: KmeKey,
+    /// When it was asked for, where its lead time is to be measured.
+    pub(super) asked: Option<Duration>,
+}
+
+/// The keys of one sending direction before they are announced.
+pub(super) struct Pool {
+    core: Core<Fresh>,
+    /// Key_IDs of this direction, so that a KME that repeats itself has no key used twice.
+    seen: Ledger,
+    /// Keys that the peer refused, less those that it readied.
+    refusals: u32,
+}
+
+impl Pool {
+    /// `jitter` gives a random byte for each pause after a failure.
+    pub(super) fn new(jitter: impl FnMut() -> u8 + Send + 'static) -> Self {
+        let mut settings = Settings::default();
+        settings.batch = PER_CALL;
+        settings.calls = IN_FLIGHT;
+        // A key ages from its first use on, and that is the sender's to watch.
+        settings.max_age = Duration::MAX;
+        Self { core: Core::new(settings, jitter), seen: Ledger::default(), refusals: 0 }
+    }
+
+    /// `ahead` keys are to be on their way or ready, where `elsewhere` of them are the sender's.
+    pub(super) fn plan(&mut self, ahead: usize, elsewhere: usize) {
+        self.core.set_target(ahead);
+        self.core.set_elsewhere(elsewhere);
+    }
+
+    /// What was planned, within the KME's stock. At least 1.
+    pub(super) fn target(&self) -> usize {
+        self.core.target()
+    }
+
+    /// The next call, if any.
+    pub(super) fn poll(&mut self, now: Duration, peer: &str) -> Option<Request> {
+        let slave = peer.to_owned();
+        Some(match self.core.poll(now)? {
+            Ask::Status => Request::Status { slave },
+            Ask::Keys(number) => {
+                Request::Enc { slave, number, purpose: Purpose::Messages, timeout: TIMEOUT }
+            }
+        })
+    }
+
+    /// When [`poll`](Self::poll) may give something without an answer before.
+    pub(super) fn poll_timeout(&self) -> Option<Duration> {
+        self.core.poll_timeout()
+    }
+
+    /// Takes the answer to one of these calls. Says what was wrong with it, if anything was.
+    pub(super) fn on_answer(&mut self, now: Duration, answer: Answer) -> Option<String> {
+        let asked = now.saturating_sub(answer.took);
+        let ask = match answer.request {
+            Request::Status { .. } => Ask::Status,
+            Request::Enc { number, .. } => Ask::Keys(number),
+            Request::Dec { .. } => return None,
+        };
+        match (ask, answer.outcome) {
+            (Ask::Status, Ok(Fetched::Stock(stock))) => {
+                self.core.on_stock(now, stock);
+                None
+            }
+            (Ask::Keys(number), Ok(Fetched::Keys(keys))) => {
+                let (usable, refused) = self.usable(asked, keys);
+                self.core.on_keys(now, number, usable);
+                refused
+            }
+            (ask, Ok(_)) => {
+                self.core.on_failure(now, ask, FailureClass::KeysLost);
+                Some("the KME answered another call".to_owned())
+            }
+            (ask, Err(failure)) => {
+                self.core.on_failure(now, ask, class(failure.kind));
+                Some(failure.text)
+            }
+        }
+    }
+
+    /// Those of `keys` that may be announced, and why another may not.
+    fn usable(&self, asked: Duration, keys: Vec<(KeyId, KmeKey)>) -> (Vec<Fresh>, Option<String>) {
+        let mut refused = None;
+        let mut usable = Vec::with_capacity(keys.len());
+        for (key_id, key) in keys {
+            match self.admit(&key_id) {
+                Ok(()) => usable.push(Fresh { key_id, key, asked: Some(asked) }),
+                Err(why) => refused = Some(why),
+            }
+        }
+        (usable, refused)
+    }
+
+    /// Whether a key may be used: its key_ID can be announced, and was never there before.
+    ///
+    /// # Errors
+    /// Why not.
+    pub(super) fn admit(&self, key_id: &KeyId) -> Result<(), String> {
+        let text = message::announceable(key_id)
+            .ok_or_else(|| format!("key_ID {key_id} is no text of at most 128 bytes"))?;
+        match self.seen.record([text]).as_deref() {
+            Ok([true]) => Ok(()),
+            Ok(_) => Err(format!("the KME gave key_ID {key_id} twice")),
+            Err(e) => Err(e.to_string()),
+        }
+    }
+
+    /// Takes out the key to announce next.
+    pub(super) fn take(&mut self, now: Duration) -> Option<Fresh> {
+        self.core.take(now)
+    }
+
+    /// Takes in a key that was drawn elsewhere, as the newest.
+    pub(super) fn put(&mut self, now: Duration, key_id: KeyId, key: KmeKey) {
+        self.core.put(now, Fresh { key_id, key, asked: None });
+    }
+
+    /// Takes back a key that nothing was sealed under, to be announced before all others: the peer
+    /// may hold it already.
+    pub(super) fn put_back(&mut self, key_id: KeyId, key: KmeKey) {
+        self.core.put(Duration::ZERO, Fresh { key_id, key, asked: None });
+    }
+
+    /// The peer could not use a key, or did not answer for it.
+    pub(super) fn key_refused(&mut self, now: Duration) {
+        self.refusals = (self.refusals + 1).min(REFUSALS_MAX);
+        let pause = (REFUSED.0 * (1 << (self.refusals / REFUSALS))).min(REFUSED.1);
+        self.core.hold_until(now.saturating_add(pause));
+    }
+
+    /// The peer readied a key.
+    pub(super) fn key_ready(&mut self) {
+        self.refusals = self.refusals.saturating_sub(1);
+    }
+
+    /// How it stands.
+    pub(super) fn status(&self, now: Duration) -> PoolStatus {
+        self.core.status(now)
+    }
+}
+
+/// What a failed call cost.
+fn class(kind: FailureKind) -> FailureClass {
+    match kind {
+        FailureKind::Ambiguous => FailureClass::KeysLost,
+        FailureKind::Unavailable | FailureKind::Refused => FailureClass::Refused,
+        FailureKind::Unreachable
+        | FailureKind::Unauthorized
+        | FailureKind::Busy
+        | FailureKind::Invalid => FailureClass::Unserved,
+    }
+}
