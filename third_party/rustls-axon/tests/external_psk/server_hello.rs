@@ -86,6 +86,23 @@ fn client_refuses_hostile_server_hellos() {
     assert_eq!(sent, Some(IllegalParameter));
 }
 
+#[test]
+fn client_refuses_another_session_id() {
+    for change in [0, 31] {
+        let psks = vec![psk("a", 1, SHA256)];
+        let mut client = client(client_config(&[SHA256], psks, PskKeyExchangeMode::PskKe));
+        let mut hello = plaintext(&written(&mut client));
+        // what the server sees is not what was sent: handshake header 4, version 2, random 32,
+        // length 1, and then the session ID that it echoes
+        hello[39 + change] ^= 1;
+        let extensions = [ext(43, &[3, 4]), ext(41, &[0, 0])];
+        let hello = server_hello(&hello, 0x1303, [7; 32], &extensions);
+        let refused = feed(&mut client, &records(HANDSHAKE, &hello)).unwrap_err();
+        assert_eq!(refused, PeerMisbehaved::ServerHelloWithWrongSessionId.into());
+        assert_eq!(written(&mut client).last(), Some(&47));
+    }
+}
+
 /// A share that is good, for a group that is not the one it says.
 #[test]
 fn client_refuses_a_share_under_another_name() {

@@ -262,6 +262,15 @@ pub(in crate::client) fn handle_server_hello(
 ) -> hs::NextStateOrError<'static> {
     validate_server_hello(cx.common, server_hello)?;
 
+    // "A client which receives a legacy_session_id_echo field that does not match what it sent in
+    //  the ClientHello MUST abort the handshake with an "illegal_parameter" alert." - RFC8446 4.1.3
+    if server_hello.session_id != input.session_id {
+        return Err(cx.common.send_fatal_alert(
+            AlertDescription::IllegalParameter,
+            PeerMisbehaved::ServerHelloWithWrongSessionId,
+        ));
+    }
+
     let psk = offered.selected(cx, server_hello.preshared_key, suite)?;
     let shared_secret = complete_key_exchange(cx, server_hello, our_key_share)?;
 
