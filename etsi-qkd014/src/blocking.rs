@@ -19,7 +19,8 @@ use crate::{ClientBuilder, DecKeys, EncKeys, Error, KeyContainer, Status};
 
 /// A blocking client of one KME. Cheap to clone; calls may be made from several threads at once.
 ///
-/// Not for use inside an async runtime: a call there is refused with [`Error::Request`].
+/// Not for use inside an async runtime, nor on a thread of its `spawn_blocking`: a call there is
+/// refused with [`Error::Request`]. Use [`Client`](crate::Client) there.
 #[derive(Clone, Debug)]
 pub struct Client {
     client: crate::Client,

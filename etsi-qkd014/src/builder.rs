@@ -1,12 +1,14 @@
 //! Settings of a client.
 
 use std::fmt;
+use std::fs::File;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use reqwest::Url;
 use zeroize::Zeroizing;
 
+use crate::secret::SecretBuf;
 use crate::tls::{self, Identity};
 use crate::{Client, Error, Quirks, RetryPolicy};
 
@@ -16,16 +18,16 @@ use crate::{Client, Error, Quirks, RetryPolicy};
 const IDLE: Duration = Duration::from_secs(4);
 
 /// Largest file read as a certificate or key.
-const MAX_FILE: u64 = 1 << 20;
+const MAX_FILE: usize = 1 << 20;
 
 /// Sets up a [`Client`]. Required: [`kme_url`](Self::kme_url), [`ca`](Self::ca),
 /// [`sae_cert`](Self::sae_cert) and [`sae_key`](Self::sae_key), the last three also as files.
 #[must_use]
 pub struct ClientBuilder {
     kme_url: Option<String>,
-    ca: Option<Source<Vec<u8>>>,
-    sae_cert: Option<Source<Vec<u8>>>,
-    sae_key: Option<Source<Zeroizing<Vec<u8>>>>,
+    ca: Option<Source>,
+    sae_cert: Option<Source>,
+    sae_key: Option<Source>,
     identity: Identity,
     connect_timeout: Duration,
     limits: Limits,
@@ -41,8 +43,8 @@ pub(crate) struct Limits {
     pub(crate) quirks: Quirks,
 }
 
-enum Source<T> {
-    Bytes(T),
+enum Source {
+    Bytes(Zeroizing<Vec<u8>>),
     File(PathBuf),
 }
 
@@ -77,7 +79,7 @@ impl ClientBuilder {
     /// The CA that must have issued the KME's certificate, PEM (one or several) or DER. No other
     /// is trusted.
     pub fn ca(mut self, pem_or_der: impl Into<Vec<u8>>) -> Self {
-        self.ca = Some(Source::Bytes(pem_or_der.into()));
+        self.ca = Some(Source::Bytes(Zeroizing::new(pem_or_der.into())));
         self
     }
 
@@ -89,7 +91,7 @@ impl ClientBuilder {
 
     /// The SAE's certificate, PEM (with its intermediates, if any) or DER.
     pub fn sae_cert(mut self, pem_or_der: impl Into<Vec<u8>>) -> Self {
-        self.sae_cert = Some(Source::Bytes(pem_or_der.into()));
+        self.sae_cert = Some(Source::Bytes(Zeroizing::new(pem_or_der.into())));
         self
     }
 
@@ -217,7 +219,7 @@ impl ClientBuilder {
 impl fmt::Debug for ClientBuilder {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("ClientBuilder")
-            .field("kme_url", &self.kme_url)
+            .field("kme_url", &self.kme_url.as_deref().map(shown))
             .field("identity", &self.identity)
             .field("limits", &self.limits)
             .finish_non_exhaustive()
@@ -228,17 +230,22 @@ fn config(setting: &'static str, reason: impl Into<String>) -> Error {
     Error::Config { setting, reason: reason.into() }
 }
 
+/// A URL as errors show it: not where it may hold a password.
+fn shown(url: &str) -> &str {
+    if url.contains('@') { "(a URL with a user name, not shown)" } else { url }
+}
+
 /// The URL below which the methods lie, and host:port for errors.
 fn base_url(text: Option<String>) -> Result<(Url, String), Error> {
     let text = text.ok_or_else(|| config("kme_url", "is missing"))?;
     let accepted = "accepted: https://host[:port][/prefix]";
-    let mut url =
-        Url::parse(&text).map_err(|e| config("kme_url", format!("{text:?}: {e}; {accepted}")))?;
+    let mut url = Url::parse(&text)
+        .map_err(|e| config("kme_url", format!("{:?}: {e}; {accepted}", shown(&text))))?;
     let Some(host) = url.host_str().map(str::to_owned) else {
         return Err(config("kme_url", format!("has no host; {accepted}")));
     };
     if url.scheme() != "https" {
-        return Err(config("kme_url", format!("{text:?} is not https; {accepted}")));
+        return Err(config("kme_url", format!("{:?} is not https; {accepted}", shown(&text))));
     }
     if !url.username().is_empty() || url.password().is_some() {
         return Err(config("kme_url", format!("holds a user name or password; {accepted}")));
@@ -254,19 +261,18 @@ fn base_url(text: Option<String>) -> Result<(Url, String), Error> {
     Ok((url, kme))
 }
 
-fn read<T: From<Vec<u8>>>(source: Option<Source<T>>, setting: &'static str) -> Result<T, Error> {
-    match source {
-        None => Err(config(setting, "is missing")),
-        Some(Source::Bytes(bytes)) => Ok(bytes),
-        Some(Source::File(path)) => {
-            let fail = |reason: String| config(setting, format!("{}: {reason}", path.display()));
-            let length = std::fs::metadata(&path).map_err(|e| fail(e.to_string()))?.len();
-            if length > MAX_FILE {
-                return Err(fail(format!("is larger than {MAX_FILE} bytes")));
-            }
-            // `fs::read` allocates the file's length at once, so no copy is left by growing.
-            std::fs::read(&path).map(T::from).map_err(|e| fail(e.to_string()))
-        }
+fn read(source: Option<Source>, setting: &'static str) -> Result<Zeroizing<Vec<u8>>, Error> {
+    let path = match source {
+        None => return Err(config(setting, "is missing")),
+        Some(Source::Bytes(bytes)) => return Ok(bytes),
+        Some(Source::File(path)) => path,
+    };
+    let fail = |reason: String| config(setting, format!("{}: {reason}", path.display()));
+    // What is no regular file, as a pipe from a password manager, says no length beforehand.
+    let file = File::open(&path).map_err(|e| fail(e.to_string()))?;
+    match SecretBuf::read_from(file, MAX_FILE).map_err(|e| fail(e.to_string()))? {
+        Some(content) => Ok(content.into_bytes()),
+        None => Err(fail(format!("is larger than {MAX_FILE} bytes"))),
     }
 }
 

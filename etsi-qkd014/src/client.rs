@@ -10,7 +10,7 @@ use tokio::time::Instant;
 
 use crate::builder::Limits;
 use crate::exchange::{Body, Call, Failure, Prepared};
-use crate::{ClientBuilder, DecKeys, EncKeys, Error, Status, parse};
+use crate::{ClientBuilder, DecKeys, EncKeys, Error, RetryPolicy, Status, parse};
 
 /// A client of one KME, acting as one SAE.
 ///
@@ -32,7 +32,7 @@ struct Inner {
     connect_timeout: Duration,
     limits: Limits,
     /// The default key size by slave SAE, bits, as the last status had it.
-    key_sizes: Mutex<HashMap<String, u32>>,
+    key_sizes: Arc<Mutex<HashMap<String, u32>>>,
 }
 
 /// Peers whose key size is remembered.
@@ -69,6 +69,24 @@ impl Client {
         DecKeys::new(self, master_sae.into())
     }
 
+    /// This client under another policy of repeats; connections are shared, as with a clone.
+    ///
+    /// For a caller that repeats calls by rules of its own and wants each made once
+    /// ([`RetryPolicy::none`]): repeats within repeats would multiply.
+    #[must_use]
+    pub fn with_retry(&self, policy: RetryPolicy) -> Self {
+        let Inner { http, base, kme, connect_timeout, limits, key_sizes } = &*self.inner;
+        let inner = Inner {
+            http: http.clone(),
+            base: base.clone(),
+            kme: kme.clone(),
+            connect_timeout: *connect_timeout,
+            limits: Limits { retry: policy, ..limits.clone() },
+            key_sizes: Arc::clone(key_sizes),
+        };
+        Self { inner: Arc::new(inner) }
+    }
+
     pub(crate) fn new(
         http: reqwest::Client,
         base: Url,
@@ -76,7 +94,7 @@ impl Client {
         connect_timeout: Duration,
         limits: Limits,
     ) -> Self {
-        let key_sizes = Mutex::default();
+        let key_sizes = Arc::default();
         Self { inner: Arc::new(Inner { http, base, kme, connect_timeout, limits, key_sizes }) }
     }
 
@@ -99,13 +117,7 @@ impl Client {
 
     /// The URL of a method; the SAE ID becomes one path segment whatever it holds.
     pub(crate) fn url(&self, sae: &str, method: &str) -> Result<Url, Error> {
-        // "." and ".." would vanish from the path, and so name another resource.
-        let sane = !sae.is_empty() && sae.len() <= 255 && !matches!(sae, "." | "..");
-        if !sane || sae.chars().any(char::is_control) {
-            return Err(Error::Request {
-                reason: format!("SAE ID {sae:?}: 1 to 255 bytes without control characters"),
-            });
-        }
+        check_sae_id(sae)?;
         let mut url = self.inner.base.clone();
         url.path_segments_mut().expect("https URLs have a path").extend([sae, method]);
         Ok(url)
@@ -114,12 +126,13 @@ impl Client {
     /// Makes a call with its repeats.
     pub(crate) async fn call(&self, call: Call, prepared: &Prepared) -> Result<Body, Error> {
         let Inner { http, kme, connect_timeout, limits, .. } = &*self.inner;
-        let deadline = Instant::now() + limits.deadline;
+        // Durations, since a deadline may be set that no clock can tell.
+        let began = Instant::now();
+        let left = || limits.deadline.saturating_sub(began.elapsed());
         let mut repeat = 0;
         let mut consumed = false;
         loop {
-            let left = deadline.saturating_duration_since(Instant::now());
-            let time = limits.timeout.min(left);
+            let time = limits.timeout.min(left());
             let tried = prepared.attempt(http, kme, *connect_timeout, time, limits).await;
             let Failure { error, ambiguous } = match tried {
                 Ok(body) => return Ok(body),
@@ -127,14 +140,27 @@ impl Client {
             };
             consumed |= ambiguous;
             let pause = pause(limits, repeat, &error);
-            let time_left = deadline.saturating_duration_since(Instant::now()) > pause;
-            if !(time_left && may_repeat(call, limits, repeat, &error, ambiguous)) {
+            if !(left() > pause && may_repeat(call, limits, repeat, &error, ambiguous)) {
                 return Err(if consumed { call.consumed(error) } else { error });
             }
             tokio::time::sleep(pause).await;
             repeat += 1;
         }
     }
+}
+
+pub(crate) fn check_sae_id(sae: &str) -> Result<(), Error> {
+    // "." and ".." would vanish from a path, and so name another resource.
+    let sane = !sae.is_empty() && sae.len() <= 255 && !matches!(sae, "." | "..");
+    if sane && !sae.chars().any(char::is_control) {
+        return Ok(());
+    }
+    let shown: String = sae.chars().take(64).collect();
+    Err(Error::Request {
+        reason: format!(
+            "SAE ID {shown:?}: 1 to 255 bytes without control characters, no dots alone"
+        ),
+    })
 }
 
 impl fmt::Debug for Client {

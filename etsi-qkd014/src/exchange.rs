@@ -3,12 +3,13 @@
 use std::time::Duration;
 
 use bytes::Bytes;
-use reqwest::header::{ACCEPT, CONTENT_TYPE, RETRY_AFTER};
+use reqwest::header::{ACCEPT, ACCEPT_ENCODING, CONTENT_ENCODING, CONTENT_TYPE, RETRY_AFTER};
 use reqwest::{Method, Response, StatusCode, Url, Version};
-use zeroize::Zeroize;
+use serde::Serialize;
+use tokio::time::{Instant, timeout};
 
 use crate::builder::Limits;
-use crate::secret::SecretBuf;
+use crate::secret::{SecretBuf, wipe};
 use crate::{Error, Quirks, parse, tls};
 
 /// The answer of status 200, zeroized on drop.
@@ -41,7 +42,7 @@ impl Call {
 pub(crate) struct Prepared {
     method: Method,
     url: Url,
-    body: Option<String>,
+    body: Option<Bytes>,
 }
 
 pub(crate) struct Failure {
@@ -65,8 +66,9 @@ impl Prepared {
         Self { method: Method::GET, url, body: None }
     }
 
-    pub(crate) fn post(url: Url, json: &serde_json::Value) -> Self {
-        Self { method: Method::POST, url, body: Some(json.to_string()) }
+    pub(crate) fn post(url: Url, json: &impl Serialize) -> Self {
+        let body = serde_json::to_vec(json).expect("text, numbers and JSON have a JSON form");
+        Self { method: Method::POST, url, body: Some(body.into()) }
     }
 
     pub(crate) async fn attempt(
@@ -77,22 +79,26 @@ impl Prepared {
         time: Duration,
         limits: &Limits,
     ) -> Result<Body, Failure> {
-        let exchange = async {
-            let mut request = http
-                .request(self.method.clone(), self.url.clone())
-                .header(ACCEPT, "application/json");
-            if let Some(body) = &self.body {
-                request = request.header(CONTENT_TYPE, "application/json").body(body.clone());
-            }
-            let response =
-                request.send().await.map_err(|e| send_failure(&e, kme, connect_timeout))?;
-            receive(response, limits).await
-        };
-        match tokio::time::timeout(time, exchange).await {
-            Ok(result) => result,
-            // Connecting has its own, shorter time: the request is taken to have left.
-            Err(_) => Err(Failure::ambiguous(Error::Timeout { phase: "answer", after: time })),
+        // Without the second header any coding would do (RFC 7231, 5.3.4).
+        let mut request = http
+            .request(self.method.clone(), self.url.clone())
+            .header(ACCEPT, "application/json")
+            .header(ACCEPT_ENCODING, "identity");
+        if let Some(body) = &self.body {
+            request = request.header(CONTENT_TYPE, "application/json").body(body.clone());
         }
+        let began = Instant::now();
+        // Connecting has its own, shorter time: the request is taken to have left.
+        let late = || Failure::ambiguous(Error::Timeout { phase: "answer", after: time });
+        let response = timeout(time, request.send())
+            .await
+            .map_err(|_| late())?
+            .map_err(|e| send_failure(&e, kme, connect_timeout))?;
+        let left = time.saturating_sub(began.elapsed());
+        if response.status() != StatusCode::OK {
+            return Err(refused(response, left).await);
+        }
+        timeout(left, receive(response, limits)).await.map_err(|_| late())?
     }
 }
 
@@ -124,10 +130,6 @@ fn innermost(error: &reqwest::Error) -> String {
 }
 
 async fn receive(mut response: Response, limits: &Limits) -> Result<Body, Failure> {
-    let status = response.status();
-    if status != StatusCode::OK {
-        return Err(refused(response).await);
-    }
     let quirks = limits.quirks;
     if response.version() < Version::HTTP_11 && !quirks.contains(Quirks::HTTP_1_0) {
         return Err(Failure::ambiguous(Error::Malformed {
@@ -140,6 +142,13 @@ async fn receive(mut response: Response, limits: &Limits) -> Result<Body, Failur
             what: "Content-Type".to_owned(),
             reason: "is not application/json, clause 5.1 (quirk any-media-type tolerates it)"
                 .to_owned(),
+        }));
+    }
+    let coding = response.headers().get(CONTENT_ENCODING);
+    if coding.is_some_and(|coding| !coding.as_bytes().eq_ignore_ascii_case(b"identity")) {
+        return Err(Failure::ambiguous(Error::Malformed {
+            what: "Content-Encoding".to_owned(),
+            reason: "is not identity, the only one that was asked for".to_owned(),
         }));
     }
     read_body(&mut response, limits.max_body).await.map_err(Failure::ambiguous)
@@ -218,19 +227,20 @@ fn clear(chunk: Bytes) {
         // Asking for more than there is moves the start back to that of the memory.
         let _ = own.try_reclaim(own.capacity() + 1);
         own.resize(own.capacity(), 0);
-        own.zeroize();
+        wipe(&mut own);
     }
 }
 
-/// An answer of a status other than 200.
-async fn refused(mut response: Response) -> Failure {
+/// An answer of a status other than 200, which tells what happened whatever becomes of its body.
+async fn refused(mut response: Response, left: Duration) -> Failure {
     let status = response.status();
     let retry_after = response
         .headers()
         .get(RETRY_AFTER)
         .and_then(|value| value.to_str().ok()?.trim().parse().ok())
         .map(Duration::from_secs);
-    let body = read_body(&mut response, MAX_ERROR_BODY).await;
+    let body = timeout(left, read_body(&mut response, MAX_ERROR_BODY)).await;
+    let body = body.ok().and_then(Result::ok);
     let parse::ErrorAnswer { message, details } =
         body.map(|body| parse::error_answer(&body)).unwrap_or_default();
     match status.as_u16() {

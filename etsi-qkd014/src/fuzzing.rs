@@ -1,8 +1,11 @@
 //! Entry points for fuzz targets. Not part of the API: they may change in any release.
 //!
-//! Each returns whether the input was accepted.
+//! Each returns whether the input was accepted, and panics where what was accepted breaks a promise
+//! of this crate.
 
-use crate::Quirks;
+use std::collections::HashSet;
+
+use crate::{KeyContainer, Quirks};
 use crate::parse::{self, Asked};
 
 /// The quirks that `bits` select.
@@ -14,21 +17,51 @@ fn quirks(bits: u8) -> Quirks {
 /// The first byte selects quirks, the rest is the body.
 pub fn status_response(data: &[u8]) -> bool {
     let Some((&bits, body)) = data.split_first() else { return false };
-    parse::status(body, "sae-b", quirks(bits)).is_ok()
+    let status = parse::status(body, "sae-b", quirks(bits));
+    status.is_ok_and(|status| {
+        assert_eq!(status.slave_sae_id, "sae-b");
+        true
+    })
 }
 
 /// The first byte selects quirks, the second the number of keys asked for, the rest is the body.
 pub fn key_container(data: &[u8]) -> bool {
     let Some((&[bits, number], body)) = data.split_first_chunk::<2>() else { return false };
-    let by_number = parse::key_container(body, &Asked::Number(number.into()), None, quirks(bits));
-    let ids = ["bc490419-7d60-487f-adc1-4ddcc177c139".to_owned()];
-    let by_id = parse::key_container(body, &Asked::Ids(&ids), Some(256), quirks(bits));
+    let number = usize::from(number);
+    let by_number = parse::key_container(body, &Asked::Number(number), None, quirks(bits));
+    if let Ok(container) = &by_number {
+        check(container, number);
+    }
+    let ids = [
+        "bc490419-7d60-487f-adc1-4ddcc177c139".to_owned(),
+        "0a782fb5-3434-48fe-aa4d-14f41d46cf92".to_owned(),
+    ];
+    // One of them, or both in the other order.
+    let ids = if number % 2 == 1 { &ids[..1] } else { &ids[..] };
+    let by_id = parse::key_container(body, &Asked::Ids(ids), Some(256), quirks(bits));
+    if let Ok(container) = &by_id {
+        check(container, ids.len());
+        assert!(container.keys.iter().zip(ids).all(|(key, id)| key.key_id() == id));
+        assert!(container.keys.iter().all(|key| key.len() == 32));
+    }
     by_number.is_ok() || by_id.is_ok()
+}
+
+/// As many as asked for, of one size, under distinct and sane key_IDs.
+fn check(container: &KeyContainer, number: usize) {
+    let keys = &container.keys;
+    assert_eq!(keys.len(), number);
+    assert!(keys.iter().all(|key| key.len() == keys[0].len() && !key.expose().is_empty()));
+    let ids: HashSet<_> = keys.iter().map(|key| key.key_id().to_ascii_lowercase()).collect();
+    assert_eq!(ids.len(), number);
+    assert!(ids.iter().all(|id| parse::is_key_id(id)));
 }
 
 /// The body of an answer other than 200.
 pub fn error_response(data: &[u8]) -> bool {
-    !parse::error_answer(data).message.is_empty()
+    let answer = parse::error_answer(data);
+    assert!(answer.message.len() < 600 && !answer.message.contains(char::is_control));
+    !answer.message.is_empty()
 }
 
 /// The subject of a certificate.

@@ -40,8 +40,9 @@
 //!
 //! Zeroized when they are dropped, whether by success, error, timeout or cancellation: the
 //! assembled answer body and each block it outgrew, the base64 text taken from it, the decoded key,
-//! and the SAE's private key as read from bytes or file. The chunks that hyper hands over are
-//! cleared with all the memory below them, as soon as hyper reads on into other memory.
+//! all keys of a pool, and the SAE's private key as read from bytes or file, PEM or DER. The chunks
+//! that hyper hands over are cleared with all the memory below them, as soon as hyper reads on into
+//! other memory.
 //!
 //! Freed with key bytes in them, since nothing outside of rustls reaches them:
 //!
@@ -82,6 +83,7 @@ mod exchange;
 pub mod fuzzing;
 mod key;
 mod parse;
+mod pem;
 #[cfg(feature = "pool")]
 pub mod pool;
 mod quirks;

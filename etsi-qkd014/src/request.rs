@@ -1,8 +1,10 @@
 //! Requests for keys: `enc_keys` and `dec_keys`.
 
 use reqwest::Url;
-use serde_json::{Map, Value, json};
+use serde::Serialize;
+use serde_json::Value;
 
+use crate::client::check_sae_id;
 use crate::exchange::{Call, Prepared};
 use crate::parse::{self, Asked};
 use crate::{Client, Error, KeyContainer, Quirks};
@@ -84,13 +86,14 @@ impl<'c> EncKeys<'c> {
     /// See [`Error`]; with [`KeyPossiblyConsumed`](Error::KeyPossiblyConsumed) the KME may have
     /// spent keys on this call.
     pub async fn send(self) -> Result<KeyContainer, Error> {
+        let number = self.number.unwrap_or(1) as usize;
+        let size = self.size.or_else(|| self.client.key_size(&self.slave_sae));
         self.check()?;
+        check_answer(self.client, number, size)?;
         let quirks = self.client.limits().quirks;
         let url = self.client.url(&self.slave_sae, "enc_keys")?;
         let prepared = if self.via_get { self.get(url) } else { self.post(url) };
         let body = self.client.call(Call::EncKeys, &prepared).await?;
-        let number = self.number.unwrap_or(1) as usize;
-        let size = self.size.or_else(|| self.client.key_size(&self.slave_sae));
         parse::key_container(&body, &Asked::Number(number), size, quirks)
             .map_err(|e| Call::EncKeys.consumed(e))
     }
@@ -108,7 +111,7 @@ impl<'c> EncKeys<'c> {
         if self.via_get && !simple {
             return Err(refuse("GET carries only number and size; send it as POST (clause 6.2)"));
         }
-        Ok(())
+        self.additional_slaves.iter().try_for_each(|sae| check_sae_id(sae))
     }
 
     /// The size as the KME counts it.
@@ -131,24 +134,47 @@ impl<'c> EncKeys<'c> {
     }
 
     fn post(&self, url: Url) -> Prepared {
-        let mut body = Map::new();
-        if let Some(number) = self.number {
-            body.insert("number".into(), number.into());
-        }
-        if let Some(size) = self.wire_size() {
-            body.insert("size".into(), size.into());
-        }
-        if !self.additional_slaves.is_empty() {
-            body.insert("additional_slave_SAE_IDs".into(), json!(self.additional_slaves));
-        }
-        if !self.mandatory.is_empty() {
-            body.insert("extension_mandatory".into(), json!(self.mandatory));
-        }
-        if !self.optional.is_empty() {
-            body.insert("extension_optional".into(), json!(self.optional));
-        }
-        Prepared::post(url, &Value::Object(body))
+        let body = KeyRequest {
+            number: self.number,
+            size: self.wire_size(),
+            additional_slave_sae_ids: &self.additional_slaves,
+            extension_mandatory: &self.mandatory,
+            extension_optional: &self.optional,
+        };
+        Prepared::post(url, &body)
     }
+}
+
+/// Clause 6.2. What was not asked for is absent.
+#[derive(Serialize)]
+struct KeyRequest<'r> {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    number: Option<u32>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    size: Option<u32>,
+    #[serde(rename = "additional_slave_SAE_IDs", skip_serializing_if = "<[_]>::is_empty")]
+    additional_slave_sae_ids: &'r [String],
+    #[serde(skip_serializing_if = "<[_]>::is_empty")]
+    extension_mandatory: &'r [Value],
+    #[serde(skip_serializing_if = "<[_]>::is_empty")]
+    extension_optional: &'r [Value],
+}
+
+/// Clause 6.4.
+#[derive(Serialize)]
+struct KeyIds<'r> {
+    #[serde(rename = "key_IDs")]
+    key_ids: Vec<KeyId<'r>>,
+    #[serde(rename = "key_IDs_extension", skip_serializing_if = "Option::is_none")]
+    extension: Option<&'r Value>,
+}
+
+#[derive(Serialize)]
+struct KeyId<'r> {
+    #[serde(rename = "key_ID")]
+    key_id: &'r str,
+    #[serde(rename = "key_ID_extension", skip_serializing_if = "Option::is_none")]
+    extension: Option<&'r Value>,
 }
 
 /// A request for keys by their key_IDs (clauses 5.4 and 6.4). Sent by [`send`](DecKeys::send).
@@ -237,16 +263,13 @@ impl<'c> DecKeys<'c> {
             .map_err(|e| Call::DecKeys.consumed(e))
     }
 
-    fn body(&self) -> Value {
-        let mut ids: Vec<Value> = self.ids.iter().map(|id| json!({ "key_ID": id })).collect();
+    fn body(&self) -> KeyIds<'_> {
+        let plain = |id| KeyId { key_id: id, extension: None };
+        let mut key_ids: Vec<_> = self.ids.iter().map(|id| plain(id.as_str())).collect();
         for (at, extension) in &self.id_extensions {
-            ids[*at]["key_ID_extension"] = extension.clone();
+            key_ids[*at].extension = Some(extension);
         }
-        let mut body = json!({ "key_IDs": ids });
-        if let Some(extension) = &self.extension {
-            body["key_IDs_extension"] = extension.clone();
-        }
-        body
+        KeyIds { key_ids, extension: self.extension.as_ref() }
     }
 
     fn check(&self) -> Result<(), Error> {
@@ -264,18 +287,37 @@ impl<'c> DecKeys<'c> {
         if self.via_get && self.ids.len() > 1 {
             return Err(refuse("GET carries one key_ID; send it as POST (clause 6.4)"));
         }
-        let sane =
-            |id: &String| (1..=128).contains(&id.len()) && id.bytes().all(|c| c.is_ascii_graphic());
-        if !self.ids.iter().all(sane) {
+        if !self.ids.iter().all(|id| parse::is_key_id(id)) {
             return Err(refuse("a key_ID is 1 to 128 visible ASCII characters"));
         }
-        let mut folded: Vec<_> = self.ids.iter().map(|id| id.to_ascii_lowercase()).collect();
-        folded.sort_unstable();
-        match folded.windows(2).find(|pair| pair[0] == pair[1]) {
-            Some(pair) => Err(refuse(&format!("key_ID {} is asked for twice", pair[0]))),
-            None => Ok(()),
+        // The answer could not pass either, and the keys would be gone.
+        let any = self.client.limits().quirks.contains(Quirks::ANY_KEY_ID);
+        if let Some(id) = self.ids.iter().find(|id| !(any || parse::is_uuid(id))) {
+            return Err(refuse(&format!(
+                "key_ID {id} is not a UUID (clause 6.4; quirk any-key-id tolerates others)"
+            )));
+        }
+        match parse::repeated(self.ids.iter().map(String::as_str)) {
+            Some(id) => Err(refuse(&format!("key_ID {id} is asked for twice"))),
+            None => check_answer(self.client, self.ids.len(), self.size),
         }
     }
+}
+
+/// Refuses a request whose answer would be refused in any case, after its keys were consumed.
+fn check_answer(client: &Client, number: usize, size: Option<u32>) -> Result<(), Error> {
+    if number > parse::MAX_KEYS {
+        let most = parse::MAX_KEYS;
+        return Err(refuse(&format!("{number} keys; this client takes {most} at a time")));
+    }
+    let least = parse::least_length(number, size);
+    let limit = client.limits().max_body;
+    if least > limit as u64 {
+        return Err(refuse(&format!(
+            "the answer would have {least} bytes or more, over max_body ({limit}); ask for fewer keys"
+        )));
+    }
+    Ok(())
 }
 
 fn check_size(size: Option<u32>) -> Result<(), Error> {

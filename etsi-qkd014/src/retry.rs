@@ -86,7 +86,7 @@ impl RetryPolicy {
     /// The pause before repeat number `repeat` (from 0), `jitter` drawn from 0..=255.
     pub(crate) fn pause_before(&self, repeat: u32, jitter: u8) -> Duration {
         let full = self.pause.saturating_mul(1 << repeat.min(16)).min(self.pause_max);
-        full / 2 + full / 2 * u32::from(jitter) / 255
+        full / 2 + (full / 2).saturating_mul(jitter.into()) / 255
     }
 }
 
@@ -103,5 +103,7 @@ mod tests {
         assert_eq!(policy.pause_before(1, 255), Duration::from_millis(200));
         assert_eq!(policy.pause_before(2, 255), Duration::from_millis(300));
         assert_eq!(policy.pause_before(u32::MAX, 255), Duration::from_millis(300));
+        let endless = RetryPolicy::none().pause(Duration::MAX, Duration::MAX);
+        assert!(endless.pause_before(u32::MAX, 255) >= Duration::MAX / 2);
     }
 }

@@ -1,9 +1,11 @@
 //! A byte buffer that never leaves a copy behind: not when it grows, not when it is dropped.
 
-use zeroize::{Zeroize, Zeroizing};
+use std::io::{self, Read};
+
+use zeroize::Zeroizing;
 
 pub(crate) struct SecretBuf {
-    bytes: Zeroizing<Vec<u8>>,
+    bytes: Vec<u8>,
     limit: usize,
 }
 
@@ -15,7 +17,26 @@ impl SecretBuf {
     /// `expected` bytes are allocated at once, which the sender may have lied about: it is taken
     /// as a hint within the limit.
     pub(crate) fn new(expected: usize, limit: usize) -> Self {
-        Self { bytes: Zeroizing::new(Vec::with_capacity(expected.min(limit).min(64 << 10))), limit }
+        Self { bytes: Vec::with_capacity(expected.min(limit).min(64 << 10)), limit }
+    }
+
+    /// All that comes; `None` where that is more than `limit` bytes.
+    pub(crate) fn read_from(mut source: impl Read, limit: usize) -> io::Result<Option<Self>> {
+        let mut content = Self::new(0, limit);
+        let mut part = Zeroizing::new([0; 4096]);
+        loop {
+            match source.read(&mut part[..]) {
+                Ok(0) => return Ok(Some(content)),
+                Ok(length) if content.extend(&part[..length]).is_err() => return Ok(None),
+                Ok(_) => {}
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) => return Err(error),
+            }
+        }
+    }
+
+    pub(crate) fn into_bytes(mut self) -> Zeroizing<Vec<u8>> {
+        Zeroizing::new(std::mem::take(&mut self.bytes))
     }
 
     pub(crate) fn extend(&mut self, more: &[u8]) -> Result<(), LimitExceeded> {
@@ -27,12 +48,26 @@ impl SecretBuf {
             // `Vec` would grow by itself, and free the old block with the secret in it.
             let mut grown = Vec::with_capacity((len * 2).min(self.limit).max(len));
             grown.extend_from_slice(&self.bytes);
-            self.bytes.zeroize();
-            self.bytes = Zeroizing::new(grown);
+            wipe(&mut self.bytes);
+            self.bytes = grown;
         }
         self.bytes.extend_from_slice(more);
         Ok(())
     }
+}
+
+impl Drop for SecretBuf {
+    fn drop(&mut self) {
+        // Nothing was ever written beyond the length.
+        wipe(&mut self.bytes);
+    }
+}
+
+/// Zeroizes many bytes at once, where `Zeroize` goes byte by byte. The barrier keeps the compiler
+/// from leaving it out.
+pub(crate) fn wipe(bytes: &mut [u8]) {
+    bytes.fill(0);
+    zeroize::optimization_barrier(bytes);
 }
 
 impl std::ops::Deref for SecretBuf {

@@ -16,8 +16,8 @@ use rustls::{
     AlertDescription, CertificateError, ClientConfig, DigitallySignedStruct, RootCertStore,
     SignatureScheme,
 };
-use zeroize::Zeroizing;
 
+use crate::pem::PrivateKey;
 use crate::subject::common_name;
 use crate::{Error, RefusedBy};
 
@@ -40,7 +40,7 @@ pub(crate) struct Identity {
 pub(crate) fn client_config(
     ca: &[u8],
     sae_cert: &[u8],
-    sae_key: &Zeroizing<Vec<u8>>,
+    sae_key: &[u8],
     identity: Identity,
 ) -> Result<ClientConfig, Error> {
     let provider = provider();
@@ -87,7 +87,7 @@ pub(crate) fn certificates(
     Ok(all)
 }
 
-fn certified_key(cert: &[u8], key: &Zeroizing<Vec<u8>>) -> Result<CertifiedKey, Error> {
+fn certified_key(cert: &[u8], key: &[u8]) -> Result<CertifiedKey, Error> {
     let chain = certificates(cert, "sae_cert")?;
     // The reasons of these parsers are not passed on: they have seen the key.
     let unusable = || {
@@ -95,12 +95,10 @@ fn certified_key(cert: &[u8], key: &Zeroizing<Vec<u8>>) -> Result<CertifiedKey, 
         config("sae_key", format!("no usable private key; {accepted}"))
     };
     let signer = if is_pem(key) {
-        let mut der = PrivateKeyDer::from_pem_slice(key).map_err(|_| unusable())?;
-        let signer = aws_lc_rs::sign::any_supported_type(&der);
-        zeroize::Zeroize::zeroize(&mut der);
-        signer
+        let key = PrivateKey::from_pem(key).ok_or_else(unusable)?;
+        aws_lc_rs::sign::any_supported_type(&key.der())
     } else {
-        let der = PrivateKeyDer::try_from(key.as_slice()).map_err(|_| unusable())?;
+        let der = PrivateKeyDer::try_from(key).map_err(|_| unusable())?;
         aws_lc_rs::sign::any_supported_type(&der)
     };
     let certified = CertifiedKey::new(chain, signer.map_err(|_| unusable())?);
@@ -285,8 +283,7 @@ mod tests {
             format!("-----BEGIN PRIVATE KEY-----\n{secret}"),
             secret.to_owned(),
         ] {
-            let key = Zeroizing::new(text.into_bytes());
-            let error = certified_key(b"x", &key).unwrap_err();
+            let error = certified_key(b"x", text.as_bytes()).unwrap_err();
             assert!(!format!("{error} {error:?}").contains(secret));
         }
     }

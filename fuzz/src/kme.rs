@@ -22,20 +22,27 @@ pub fn certificate_subject(data: &[u8]) -> bool {
     fuzzing::certificate_subject(data)
 }
 
-/// Strict, and with every quirk.
+/// Strict, with every quirk, and with what quirks tolerate.
 pub fn status_seeds() -> Vec<Vec<u8>> {
-    let body = br#"{"source_KME_ID":"kme-a","target_KME_ID":"kme-b","master_SAE_ID":"sae-a","slave_SAE_ID":"sae-b","key_size":256,"stored_key_count":25000,"max_key_count":100000,"max_key_per_request":128,"max_key_size":1024,"min_key_size":64,"max_SAE_ID_count":0}"#;
-    [0, 0xff].into_iter().map(|quirks| [&[quirks][..], body].concat()).collect()
+    let body = r#"{"source_KME_ID":"kme-a","target_KME_ID":"kme-b","master_SAE_ID":"sae-a","slave_SAE_ID":"sae-b","key_size":256,"stored_key_count":25000,"max_key_count":100000,"max_key_per_request":128,"max_key_size":1024,"min_key_size":64,"max_SAE_ID_count":0}"#;
+    let odd = r#"{"SOURCE_kme_id":"kme-\u0061","target_KME_ID":"\ud83d\ude00","master_SAE_ID":"","slave_SAE_ID":"sae-b","key_size":32,"max_key_count":null,"vendor":[[{}],1e3,"\n"],"status_extension":{"a":[null,true,-1.5e-7,{"b":"\/"}]}}"#;
+    [(0, body), (0xff, body), (0xff, odd)]
+        .into_iter()
+        .map(|(quirks, body)| [&[quirks][..], body.as_bytes()].concat())
+        .collect()
 }
 
-/// The key that the target asks for by its ID, and two keys by number.
+/// The keys that the target asks for by their IDs, keys by number, and what is written otherwise
+/// than usual.
 pub fn container_seeds() -> Vec<Vec<u8>> {
     const KEY: &str = "QUFBQUFBQUFBQUFBQUFBQUFBQUFBQUFBQUFBQUFBQUE=";
     let first = format!(r#"{{"key_ID":"bc490419-7d60-487f-adc1-4ddcc177c139","key":"{KEY}"}}"#);
-    let second = format!(r#"{{"key_ID":"0a782fb5-3434-48fe-aa4d-14f41d46cf92","key":"{KEY}"}}"#);
+    let second = format!(r#"{{"key_ID":"0A782FB5-3434-48fe-aa4d-14f41d46cf92","key":"{KEY}"}}"#);
     let one = format!(r#"{{"keys":[{first}]}}"#);
     let two = format!(r#"{{"keys":[{first},{second}],"key_container_extension":{{"a":[1]}}}}"#);
-    [(0, 1, &one), (0xff, 1, &one), (0, 2, &two)]
+    let turned = format!(r#"{{"keys":[{second} , {first}]}}"#);
+    let odd = r#"{"Keys":[{"key_extension":null,"KEY":" QUFB\r\n\/\u002bE=","key_ID":"k\u0065y-7","key_ID_extension":{"a":[[]]},"x":{}}],"y":[[1]]}"#;
+    [(0, 1, &*one), (0xff, 1, &one), (0, 2, &two), (0, 2, &turned), (0xff, 1, odd)]
         .into_iter()
         .map(|(quirks, number, body)| [&[quirks, number][..], body.as_bytes()].concat())
         .collect()
@@ -46,6 +53,7 @@ pub fn error_seeds() -> Vec<Vec<u8>> {
     vec![
         br#"{"message":"not all mandatory extensions are supported","details":[{"a":"b"}]}"#.into(),
         br#"{"message":"KME is busy"}"#.into(),
+        br#"{"details":[{"a":[{"b":null}]},1e2],"x":{},"message":"\u001b[2J\u202e\ud83d\ude00\n"}"#.into(),
     ]
 }
 

@@ -2,7 +2,7 @@
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
-use zeroize::{Zeroize, Zeroizing};
+use zeroize::Zeroizing;
 
 /// Decodes the raw text of a JSON string, quotes included. Strict RFC 4648 base64 with padding;
 /// white space between the characters is allowed, and JSON escapes of base64 characters are
@@ -13,6 +13,27 @@ pub(super) fn decode(raw: &str) -> Result<Zeroizing<Box<[u8]>>, &'static str> {
         .and_then(|rest| rest.strip_suffix('"'))
         .ok_or("is not a string")?
         .as_bytes();
+    // Nearly every KME writes nothing but base64, which is decoded where it lies.
+    if inner.iter().any(|byte| is_space(*byte) || *byte == b'\\') {
+        decode_text(&plain(inner)?)
+    } else {
+        decode_text(inner)
+    }
+}
+
+/// Straight into the only block that will hold the key.
+pub(crate) fn decode_text(text: &[u8]) -> Result<Zeroizing<Box<[u8]>>, &'static str> {
+    let padding = text.iter().rev().take_while(|byte| **byte == b'=').count();
+    let length = (text.len() / 4 * 3).saturating_sub(padding);
+    let mut secret = Zeroizing::new(vec![0_u8; length].into_boxed_slice());
+    match STANDARD.decode_slice(text, &mut secret) {
+        Ok(written) if written == length => Ok(secret),
+        _ => Err("is not base64 with padding (RFC 4648 section 4)"),
+    }
+}
+
+/// The text without white space and escapes.
+fn plain(inner: &[u8]) -> Result<Zeroizing<Vec<u8>>, &'static str> {
     let mut text = Zeroizing::new(Vec::with_capacity(inner.len()));
     let mut at = 0;
     while at < inner.len() {
@@ -21,18 +42,15 @@ pub(super) fn decode(raw: &str) -> Result<Zeroizing<Box<[u8]>>, &'static str> {
             plain => (plain, 1),
         };
         at += taken;
-        if !matches!(byte, b' ' | b'\t' | b'\r' | b'\n') {
+        if !is_space(byte) {
             text.push(byte);
         }
     }
-    let mut bytes = Zeroizing::new(vec![0_u8; text.len().div_ceil(4) * 3]);
-    let length = STANDARD
-        .decode_slice(text.as_slice(), &mut bytes[..])
-        .map_err(|_| "is not base64 with padding (RFC 4648 section 4)")?;
-    let mut secret = Zeroizing::new(vec![0_u8; length].into_boxed_slice());
-    secret.copy_from_slice(&bytes[..length]);
-    bytes.zeroize();
-    Ok(secret)
+    Ok(text)
+}
+
+fn is_space(byte: u8) -> bool {
+    matches!(byte, b' ' | b'\t' | b'\r' | b'\n')
 }
 
 /// One JSON escape at the start of `text`: its byte, and how long the escape is.

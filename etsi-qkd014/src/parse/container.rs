@@ -1,11 +1,13 @@
 //! Key container (clause 6.3), and the checks of its promises.
 
-use super::json::{Object, items, text};
+use std::cmp::Ordering;
+
+use super::json::{Object, Place, objects, text};
 use super::{base64, malformed};
 use crate::{Error, Key, KeyContainer, Quirks};
 
 /// Most keys in one answer.
-const MAX_KEYS: usize = 16_384;
+pub(crate) const MAX_KEYS: usize = 16_384;
 /// Longest key_ID, bytes.
 const MAX_KEY_ID: usize = 128;
 
@@ -13,8 +15,17 @@ const MAX_KEY_ID: usize = 128;
 pub(crate) enum Asked<'a> {
     /// `enc_keys`: so many keys.
     Number(usize),
-    /// `dec_keys`: the keys with these IDs.
+    /// `dec_keys`: the keys with these IDs, which differ in more than letter case.
     Ids(&'a [String]),
+}
+
+/// The least bytes of an answer with so many keys of so many bits, where an ID has one character.
+pub(crate) fn least_length(number: usize, size: Option<u32>) -> u64 {
+    const AROUND: u64 = r#"{"keys":[]}"#.len() as u64;
+    const EACH: u64 = r#"{"key_ID":"x","key":""},"#.len() as u64;
+    let key = (u64::from(size.unwrap_or(8)) / 8).div_ceil(3) * 4;
+    // No comma after the last.
+    AROUND + (number as u64).saturating_mul(EACH + key).saturating_sub(1)
 }
 
 /// Reads a key container and checks it against what was asked. `size`: bits of every key, where
@@ -25,37 +36,36 @@ pub(crate) fn key_container(
     size: Option<u32>,
     quirks: Quirks,
 ) -> Result<KeyContainer, Error> {
-    let mut object = Object::parse(text(body, "body")?, String::new(), quirks)?;
-    let raw = items(object.need("keys")?, "keys", MAX_KEYS)?;
+    let mut object = Object::parse(text(body)?, quirks)?;
     let expected = match asked {
         Asked::Number(number) => *number,
         Asked::Ids(ids) => ids.len(),
     };
-    if raw.len() != expected {
+    let mut keys = Vec::with_capacity(expected.min(MAX_KEYS));
+    let came = objects(object.need("keys")?, (expected, MAX_KEYS), quirks, |place, object| {
+        keys.push(key(place, object, quirks)?);
+        Ok(())
+    })?;
+    if came != expected {
         return Err(check(
             "ETSI GS QKD 014 V1.1.1 clause 6.3 (keys)",
             format!("{expected} keys"),
-            format!("{}", raw.len()),
+            format!("{came}"),
         ));
-    }
-    let mut keys = Vec::with_capacity(raw.len());
-    for (index, item) in raw.iter().enumerate() {
-        keys.push(key(item.get(), index, quirks)?);
     }
     let extension = object.take_extension("key_container_extension")?;
     object.finish()?;
-    check_unique(&keys)?;
     check_sizes(&keys, size)?;
-    if let Asked::Ids(ids) = asked {
-        keys = in_order_asked(keys, ids)?;
+    match asked {
+        Asked::Number(_) => check_unique(&keys)?,
+        Asked::Ids(ids) => put_in_order(&mut keys, ids)?,
     }
     Ok(KeyContainer { keys, extension })
 }
 
-fn key(text: &str, index: usize, quirks: Quirks) -> Result<Key, Error> {
-    let mut object = Object::parse(text, format!("keys[{index}]"), quirks)?;
+fn key(place: Place, object: &mut Object<'_>, quirks: Quirks) -> Result<Key, Error> {
     let key_id = object.need_string("key_ID")?;
-    check_key_id(&key_id, &object.path("key_ID"), quirks)?;
+    check_key_id(&key_id, place, quirks)?;
     let secret =
         base64::decode(object.need("key")?).map_err(|why| malformed(object.path("key"), why))?;
     if secret.is_empty() {
@@ -67,21 +77,29 @@ fn key(text: &str, index: usize, quirks: Quirks) -> Result<Key, Error> {
     Ok(Key::new(key_id, secret, key_id_extension, extension))
 }
 
-fn check_key_id(id: &str, at: &str, quirks: Quirks) -> Result<(), Error> {
-    if id.is_empty() || id.len() > MAX_KEY_ID || !id.bytes().all(|c| c.is_ascii_graphic()) {
-        return Err(malformed(at, format!("is not 1 to {MAX_KEY_ID} visible ASCII characters")));
+fn check_key_id(id: &str, place: Place, quirks: Quirks) -> Result<(), Error> {
+    if !is_key_id(id) {
+        return Err(malformed(
+            format!("{place}.key_ID"),
+            format!("is not 1 to {MAX_KEY_ID} visible ASCII characters"),
+        ));
     }
     if !quirks.contains(Quirks::ANY_KEY_ID) && !is_uuid(id) {
         return Err(check(
             "ETSI GS QKD 014 V1.1.1 clause 6.3 (key_ID)",
-            format!("a UUID in {at} (quirk any-key-id tolerates others)"),
+            format!("a UUID in {place}.key_ID (quirk any-key-id tolerates others)"),
             format!("{} characters that are none", id.len()),
         ));
     }
     Ok(())
 }
 
-fn is_uuid(id: &str) -> bool {
+/// Whether it may be a key_ID at all, also with [`Quirks::ANY_KEY_ID`].
+pub(crate) fn is_key_id(id: &str) -> bool {
+    (1..=MAX_KEY_ID).contains(&id.len()) && id.bytes().all(|c| c.is_ascii_graphic())
+}
+
+pub(crate) fn is_uuid(id: &str) -> bool {
     id.len() == 36
         && id.bytes().enumerate().all(|(at, c)| match at {
             8 | 13 | 18 | 23 => c == b'-',
@@ -89,14 +107,25 @@ fn is_uuid(id: &str) -> bool {
         })
 }
 
+/// The order of key_IDs, in which letter case does not count.
+fn by_id(one: &str, other: &str) -> Ordering {
+    let lower = |c: u8| c.to_ascii_lowercase();
+    one.bytes().map(lower).cmp(other.bytes().map(lower))
+}
+
+/// A key_ID that is there twice, in any letter case.
+pub(crate) fn repeated<'i>(ids: impl Iterator<Item = &'i str>) -> Option<&'i str> {
+    let mut ids: Vec<&str> = ids.collect();
+    ids.sort_unstable_by(|one, other| by_id(one, other));
+    ids.windows(2).find(|pair| is_same(pair[0], pair[1])).map(|pair| pair[0])
+}
+
 fn check_unique(keys: &[Key]) -> Result<(), Error> {
-    let mut ids: Vec<String> = keys.iter().map(|key| key.key_id().to_ascii_lowercase()).collect();
-    ids.sort_unstable();
-    match ids.windows(2).find(|pair| pair[0] == pair[1]) {
-        Some(pair) => Err(check(
+    match repeated(keys.iter().map(Key::key_id)) {
+        Some(id) => Err(check(
             "ETSI GS QKD 014 V1.1.1 clause 6.3 (key_ID)",
             "each key_ID once".to_owned(),
-            format!("{} twice", pair[0]),
+            format!("{id} twice"),
         )),
         None => Ok(()),
     }
@@ -116,23 +145,36 @@ fn check_sizes(keys: &[Key], size: Option<u32>) -> Result<(), Error> {
     }
 }
 
-/// A KME may answer in another order and in another letter case: the caller's bytes count.
-fn in_order_asked(mut keys: Vec<Key>, ids: &[String]) -> Result<Vec<Key>, Error> {
-    let mut ordered = Vec::with_capacity(ids.len());
-    for id in ids {
-        let position = keys.iter().position(|key| key.key_id().eq_ignore_ascii_case(id));
-        let Some(position) = position else {
+/// A KME may answer in another order and in another letter case: the caller's bytes count. There
+/// are as many keys as IDs.
+fn put_in_order(keys: &mut Vec<Key>, ids: &[String]) -> Result<(), Error> {
+    let pairs = |keys: &[Key]| keys.iter().zip(ids).all(|(key, id)| is_same(key.key_id(), id));
+    if !pairs(keys) {
+        check_unique(keys)?;
+        keys.sort_unstable_by(|one, other| by_id(one.key_id(), other.key_id()));
+        let is_missing =
+            |id: &&String| keys.binary_search_by(|key| by_id(key.key_id(), id)).is_err();
+        if let Some(missing) = ids.iter().find(is_missing) {
             return Err(check(
                 "ETSI GS QKD 014 V1.1.1 clause 5.4 (key_IDs)",
-                format!("the key {id}, which was asked for"),
+                format!("the key {missing}, which was asked for"),
                 "another key in its place".to_owned(),
             ));
-        };
-        let mut key = keys.swap_remove(position);
-        key.set_key_id(id.clone());
-        ordered.push(key);
+        }
+        let mut places: Vec<usize> = (0..ids.len()).collect();
+        places.sort_unstable_by(|one, other| by_id(&ids[*one], &ids[*other]));
+        let mut placed: Vec<_> = places.into_iter().zip(keys.drain(..)).collect();
+        placed.sort_unstable_by_key(|(place, _)| *place);
+        keys.extend(placed.into_iter().map(|(_, key)| key));
     }
-    Ok(ordered)
+    for (key, id) in keys.iter_mut().zip(ids).filter(|(key, id)| key.key_id() != *id) {
+        key.set_key_id(id.clone());
+    }
+    Ok(())
+}
+
+fn is_same(one: &str, other: &str) -> bool {
+    one.eq_ignore_ascii_case(other)
 }
 
 fn check(clause: &'static str, expected: String, got: String) -> Error {

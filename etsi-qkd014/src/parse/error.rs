@@ -21,8 +21,7 @@ pub(crate) struct ErrorAnswer {
 /// Only the two members that the specification lists are taken out of the text. The others, among
 /// which a confused KME may have put keys, are not copied.
 pub(crate) fn error_answer(body: &[u8]) -> ErrorAnswer {
-    let object = json::text(body, "body")
-        .and_then(|text| Object::parse(text, String::new(), Quirks::NULL_MEMBERS));
+    let object = json::text(body).and_then(|text| Object::parse(text, Quirks::NULL_MEMBERS));
     let Ok(mut object) = object else { return ErrorAnswer::default() };
     let message = member(&mut object, "message").map(|message: String| printable(&message));
     let mut details: Vec<Value> = member(&mut object, "details").unwrap_or_default();
@@ -31,10 +30,12 @@ pub(crate) fn error_answer(body: &[u8]) -> ErrorAnswer {
 }
 
 fn member<T: DeserializeOwned>(object: &mut Object<'_>, name: &str) -> Option<T> {
-    serde_json::from_str(object.take(name).ok()??).ok()
+    let raw = object.take(name).ok()??;
+    json::is_shallow(raw).then(|| serde_json::from_str(raw).ok())?
 }
 
-/// The message goes to logs and terminals: no control characters, bounded.
+/// The message goes to logs and terminals: bounded, and without characters that move the cursor,
+/// begin a line or turn the direction of writing.
 fn printable(message: &str) -> String {
     let mut out = String::new();
     for c in message.chars() {
@@ -42,9 +43,13 @@ fn printable(message: &str) -> String {
             out.push('…');
             break;
         }
-        out.push(if c.is_control() { ' ' } else { c });
+        out.push(if c.is_control() || is_layout(c) { ' ' } else { c });
     }
     out
+}
+
+fn is_layout(c: char) -> bool {
+    matches!(c, '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
 }
 
 #[cfg(test)]
@@ -64,6 +69,8 @@ mod tests {
     fn messages_are_made_fit_for_a_terminal() {
         let answer = error_answer(br#"{"message":"no\u001b[2J key\n"}"#);
         assert_eq!(answer.message, "no [2J key ");
+        let turned = error_answer("{\"message\":\"a\u{202e}b\u{2028}c\u{2066}\"}".as_bytes());
+        assert_eq!(turned.message, "a b c ");
         let long = format!("{{\"message\":\"{}\"}}", "x".repeat(10_000));
         assert!(error_answer(long.as_bytes()).message.len() < 600);
     }

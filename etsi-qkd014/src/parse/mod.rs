@@ -10,7 +10,10 @@ mod error;
 mod json;
 mod status;
 
-pub(crate) use container::{Asked, key_container};
+pub(crate) use base64::decode_text as base64_text;
+pub(crate) use container::{
+    Asked, MAX_KEYS, is_key_id, is_uuid, key_container, least_length, repeated,
+};
 pub(crate) use error::{ErrorAnswer, error_answer};
 pub(crate) use status::status;
 

@@ -8,7 +8,7 @@ use crate::{Error, Quirks, Status};
 const MAX_SIZE: u64 = 1 << 30;
 
 pub(crate) fn status(body: &[u8], slave_sae: &str, quirks: Quirks) -> Result<Status, Error> {
-    let mut object = Object::parse(text(body, "body")?, String::new(), quirks)?;
+    let mut object = Object::parse(text(body)?, quirks)?;
     let status = Status {
         source_kme_id: object.need_string("source_KME_ID")?,
         target_kme_id: object.need_string("target_KME_ID")?,

@@ -1,0 +1,8 @@
+//! The client against whoever means it ill, and against whoever uses it wrongly: bytes that no KME
+//! should send, settings that no program should make, and calls dropped half way.
+
+mod cancellation;
+mod http;
+mod json;
+mod misuse;
+mod server;
