@@ -105,7 +105,8 @@ pub(super) fn answer(
     if answer.status != 200 {
         kme.count(|counters| counters.refused += 1);
     }
-    Answer { close: request.close, ..answer }
+    // The answer to a HEAD has no body, and this one has.
+    Answer { close: request.close || request.method == "HEAD", ..answer }
 }
 
 /// The method that a request names, whether or not it can be served.
@@ -198,8 +199,15 @@ fn pairs(query: &str) -> Result<Vec<(String, String)>, Answer> {
         let (name, value) = part.split_once('=')?;
         Some((percent_decode(name)?, percent_decode(value)?))
     };
-    let parts = query.split('&').filter(|part| !part.is_empty());
-    parts.map(|part| pair(part).ok_or_else(|| bad("the query cannot be read"))).collect()
+    let mut pairs = Vec::new();
+    for part in query.split('&').filter(|part| !part.is_empty()) {
+        let (name, value) = pair(part).ok_or_else(|| bad("the query cannot be read"))?;
+        if pairs.iter().any(|(other, _)| *other == name) {
+            return Err(bad("a parameter is given twice"));
+        }
+        pairs.push((name, value));
+    }
+    Ok(pairs)
 }
 
 fn enc_query(query: &str) -> Result<KeyRequest, Answer> {
@@ -280,11 +288,17 @@ fn enc_keys(
     }
     let cost = number * size.div_ceil(limits.key_size.into());
     let bytes = usize::try_from(size / 8).map_err(|_| bad("size"))?;
-    let drawn = shared
+    let mut drawn = shared
         .store()
         .draw(&links, number, bytes, cost, caller, &slaves)
         .ok_or_else(|| error(503, "not enough keys are stored", Vec::new()))?;
     kme.count(|counters| counters.keys_to_masters += number);
+    kme.last_key_id(|last| {
+        if let (Some(Fault::ReuseKeyId), Some(before)) = (fault, last.take()) {
+            drawn[0].0 = before;
+        }
+        *last = drawn.last().map(|(id, _)| id.clone());
+    });
     let named = |name: &str| {
         let all = asked.extension_mandatory.iter().chain(&asked.extension_optional);
         all.filter_map(|extension| extension.get(name)).next_back()
@@ -333,13 +347,17 @@ fn dec_keys(
     if ids.is_empty() || ids.len() as u64 > shared.limits.max_keys_per_request {
         return Err(bad(format!("1 to {} key IDs", shared.limits.max_keys_per_request)));
     }
-    let given = shared.store().give(ids, master, caller).map_err(|refusal| match refusal {
-        Refusal::NotYours => error(401, "a key was not drawn by that master for this SAE", vec![]),
-        Refusal::Unknown(ids) => {
-            let details = ids.into_iter().map(|id| json!({ "key_ID": id })).collect();
-            error(400, "one or more keys specified are not found on KME", details)
-        }
-    })?;
+    let keep = fault == Some(&Fault::KeyKept);
+    let given =
+        shared.store().give(ids, master, caller, keep).map_err(|refusal| match refusal {
+            Refusal::NotYours => {
+                error(401, "a key was not drawn by that master for this SAE", vec![])
+            }
+            Refusal::Unknown(ids) => {
+                let details = ids.into_iter().map(|id| json!({ "key_ID": id })).collect();
+                error(400, "one or more keys specified are not found on KME", details)
+            }
+        })?;
     kme.count(|counters| counters.keys_to_slaves += given.len() as u64);
     Ok(container(given, &Extensions::default(), fault))
 }

@@ -19,6 +19,12 @@ pub enum Fault {
     /// `handshake-dropped`: the TCP connection is closed before the TLS handshake, without a word.
     /// Nothing is served. Meets new connections only.
     HandshakeDropped,
+    /// `certificate-expired`: the KME shows a certificate that has expired. Meets new connections
+    /// only; a client that takes it all the same is served.
+    CertificateExpired,
+    /// `certificate-not-yet-valid`: the KME shows a certificate of the future. Meets new
+    /// connections only; a client that takes it all the same is served.
+    CertificateNotYetValid,
     /// `latency=MILLISECONDS`: the answer comes this much later. Adds to whatever else the request
     /// meets.
     Latency(Duration),
@@ -46,6 +52,11 @@ pub enum Fault {
     WrongLength,
     /// `repeat-key-id`: all keys of an answer have the first one's key_ID.
     RepeatKeyId,
+    /// `reuse-key-id`: the first key of an answer to `enc_keys` has a key_ID that the KME handed
+    /// out in an answer before: that of the last key then, where there is one.
+    ReuseKeyId,
+    /// `key-kept`: `dec_keys` gives keys and keeps them, so that they are given again.
+    KeyKept,
     /// `key-missing`: the first key is missing.
     KeyMissing,
     /// `upper-case-ids`: key_IDs in upper case.
@@ -66,9 +77,11 @@ pub(super) enum Meets {
 }
 
 /// The faults whose name is all there is to them.
-const PLAIN: [(&str, Fault); 15] = [
+const PLAIN: [(&str, Fault); 19] = [
     ("handshake-refused", Fault::HandshakeRefused),
     ("handshake-dropped", Fault::HandshakeDropped),
+    ("certificate-expired", Fault::CertificateExpired),
+    ("certificate-not-yet-valid", Fault::CertificateNotYetValid),
     ("silence", Fault::Silence),
     ("empty", Fault::Empty),
     ("reset", Fault::ResetAfterRequest),
@@ -78,6 +91,8 @@ const PLAIN: [(&str, Fault); 15] = [
     ("lying-length", Fault::LyingLength),
     ("wrong-length", Fault::WrongLength),
     ("repeat-key-id", Fault::RepeatKeyId),
+    ("reuse-key-id", Fault::ReuseKeyId),
+    ("key-kept", Fault::KeyKept),
     ("key-missing", Fault::KeyMissing),
     ("upper-case-ids", Fault::UpperCaseIds),
     ("other-ids", Fault::OtherIds),
@@ -92,7 +107,10 @@ const MAX_PAUSE_MS: u64 = 86_400_000;
 impl Fault {
     pub(super) fn meets(&self) -> Meets {
         match self {
-            Self::HandshakeRefused | Self::HandshakeDropped => Meets::Connection,
+            Self::HandshakeRefused
+            | Self::HandshakeDropped
+            | Self::CertificateExpired
+            | Self::CertificateNotYetValid => Meets::Connection,
             _ => Meets::Request,
         }
     }

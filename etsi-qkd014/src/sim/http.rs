@@ -1,5 +1,5 @@
-//! HTTP/1.1 as far as this interface needs it: requests with a Content-Length, answers that can
-//! also be wrong on purpose.
+//! HTTP/1.1 as far as this interface needs it: requests with a Content-Length, one after the other
+//! or pipelined, and answers that can also be wrong on purpose.
 
 use std::time::Duration;
 
@@ -10,6 +10,8 @@ use super::fault::Fault;
 
 const MAX_HEAD: usize = 16 << 10;
 const MAX_BODY: usize = 1 << 20;
+/// A buffer that has grown beyond it is given back when it is empty.
+const KEPT_BUFFER: usize = 32 << 10;
 
 #[derive(Debug)]
 pub(super) struct Request {
@@ -28,8 +30,8 @@ pub(super) struct Request {
 pub(super) enum NoRequest {
     /// The client is done, or gone.
     Closed,
-    /// What came is not accepted, with the status that says so.
-    Refused(u16),
+    /// What came is not accepted: the status and the message that say so.
+    Refused(u16, &'static str),
 }
 
 pub(super) struct Answer {
@@ -42,26 +44,41 @@ pub(super) struct Answer {
 }
 
 /// Reads one request. `buffer` keeps what came after it.
-pub(super) async fn read<S: AsyncRead + Unpin>(
+pub(super) async fn read<S: AsyncRead + AsyncWrite + Unpin>(
     stream: &mut S,
     buffer: &mut Vec<u8>,
 ) -> Result<Request, NoRequest> {
+    let mut searched = 0;
     let end = loop {
-        if let Some(at) = buffer.windows(4).position(|window| window == b"\r\n\r\n") {
-            break at;
+        // What ends a head may have begun in what was searched before.
+        let from = usize::saturating_sub(searched, 3);
+        if let Some(at) = buffer[from..].windows(4).position(|window| window == b"\r\n\r\n") {
+            break from + at;
         }
         if buffer.len() > MAX_HEAD {
-            return Err(NoRequest::Refused(431));
+            return Err(NoRequest::Refused(431, "the head is larger than 16 KiB"));
         }
+        searched = buffer.len();
         if stream.read_buf(buffer).await.unwrap_or(0) == 0 {
             return Err(NoRequest::Closed);
         }
     };
-    let (mut request, length) = head(&buffer[..end]).ok_or(NoRequest::Refused(400))?;
+    let Head { mut request, length, chunked, waits } = head(&buffer[..end])
+        .ok_or(NoRequest::Refused(400, "the head is not one of HTTP/1.1 with one Host"))?;
+    if chunked {
+        return Err(NoRequest::Refused(411, "a body needs a Content-Length"));
+    }
     if length > MAX_BODY {
-        return Err(NoRequest::Refused(413));
+        return Err(NoRequest::Refused(413, "the body is larger than 1 MiB"));
     }
     let total = end + 4 + length;
+    if waits && buffer.len() < total {
+        let go_on = async {
+            stream.write_all(b"HTTP/1.1 100 Continue\r\n\r\n").await?;
+            stream.flush().await
+        };
+        go_on.await.map_err(|_| NoRequest::Closed)?;
+    }
     while buffer.len() < total {
         if stream.read_buf(buffer).await.unwrap_or(0) == 0 {
             return Err(NoRequest::Closed);
@@ -69,12 +86,24 @@ pub(super) async fn read<S: AsyncRead + Unpin>(
     }
     request.body = buffer[end + 4..total].to_vec();
     buffer.drain(..total);
+    if buffer.is_empty() && buffer.capacity() > KEPT_BUFFER {
+        *buffer = Vec::new();
+    }
     Ok(request)
 }
 
-/// Parses a request's head; the body's length with it. A request of HTTP/1.1 names one host
-/// (RFC 9112, 3.2).
-fn head(bytes: &[u8]) -> Option<(Request, usize)> {
+struct Head {
+    request: Request,
+    /// Of the body.
+    length: usize,
+    /// Whether a transfer coding says where the body ends.
+    chunked: bool,
+    /// Whether the client sends the body only when it is told to (RFC 9110, 10.1.1).
+    waits: bool,
+}
+
+/// Parses a request's head. A request of HTTP/1.1 names one host (RFC 9112, 3.2).
+fn head(bytes: &[u8]) -> Option<Head> {
     let text = std::str::from_utf8(bytes).ok()?;
     let mut lines = text.split("\r\n");
     let mut first = lines.next()?.split(' ');
@@ -84,18 +113,23 @@ fn head(bytes: &[u8]) -> Option<(Request, usize)> {
     }
     let mut length = None;
     let (mut hosts, mut media, mut close) = (0, None, false);
+    let (mut chunked, mut waits) = (false, false);
     for line in lines {
         let (name, value) = line.split_once(':')?;
+        // No space beside a name, and so no folded line (RFC 9112, 5.1 and 5.2).
+        if name.is_empty() || name.contains([' ', '\t']) {
+            return None;
+        }
         if name.eq_ignore_ascii_case("content-length") {
             let value = value.trim();
-            if length.is_some() || !value.bytes().all(|c| c.is_ascii_digit()) {
+            if length.is_some() || value.is_empty() || !value.bytes().all(|c| c.is_ascii_digit()) {
                 return None;
             }
             length = Some(value.parse().ok()?);
         }
-        if name.eq_ignore_ascii_case("transfer-encoding") {
-            return None;
-        }
+        chunked |= name.eq_ignore_ascii_case("transfer-encoding");
+        waits |= name.eq_ignore_ascii_case("expect")
+            && value.trim().eq_ignore_ascii_case("100-continue");
         if name.eq_ignore_ascii_case("host") {
             hosts += 1;
         }
@@ -106,7 +140,8 @@ fn head(bytes: &[u8]) -> Option<(Request, usize)> {
             close |= value.split(',').any(|option| option.trim().eq_ignore_ascii_case("close"));
         }
     }
-    if hosts != 1 {
+    // Two ways to say where a body ends are one too many (RFC 9112, 6.1).
+    if hosts != 1 || (chunked && length.is_some()) {
         return None;
     }
     let media = media.and_then(|media| media.split(';').next()).unwrap_or_default().trim();
@@ -119,7 +154,7 @@ fn head(bytes: &[u8]) -> Option<(Request, usize)> {
         close,
         body: Vec::new(),
     };
-    Some((request, length.unwrap_or(0)))
+    Some(Head { request, length: length.unwrap_or(0), chunked, waits })
 }
 
 /// Undoes percent-encoding; `None` where it is broken or not UTF-8.
@@ -217,6 +252,7 @@ fn reason(status: u16) -> &'static str {
         401 => "Unauthorized",
         404 => "Not Found",
         405 => "Method Not Allowed",
+        411 => "Length Required",
         413 => "Content Too Large",
         431 => "Request Header Fields Too Large",
         503 => "Service Unavailable",
@@ -241,14 +277,16 @@ mod tests {
             "GET / HTTP/1.1\r\nHost: a\r\nHost: a",
             "POST / HTTP/1.1\r\nHost: a\r\nContent-Length: 1\r\nContent-Length: 1",
             "POST / HTTP/1.1\r\nHost: a\r\nContent-Length: +1",
-            "POST / HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: chunked",
+            "POST / HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: chunked\r\nContent-Length: 1",
+            "POST / HTTP/1.1\r\nHost: a\r\n Content-Length: 1",
+            "POST / HTTP/1.1\r\nHost: a\r\nContent-Length : 1",
             "POST / HTTP/1.1\r\nHost: a\r\nContent-Type: a/b\r\nContent-Type: a/b",
             "POST / HTTP/1.1\r\nHost: a\r\nno colon",
         ] {
             assert!(head(bad.as_bytes()).is_none(), "{bad:?}");
         }
         let text = b"POST /a?b=c HTTP/1.1\r\nhost: a\r\ncontent-length: 7";
-        let (request, length) = head(text).unwrap();
+        let Head { request, length, .. } = head(text).unwrap();
         assert_eq!((request.path.as_str(), request.query.as_str(), length), ("/a", "b=c", 7));
         assert!(!request.json && !request.close);
     }
@@ -257,10 +295,10 @@ mod tests {
     fn media_type_and_close_are_read_in_any_spelling() {
         let text = "POST / HTTP/1.1\r\nHost: a\r\nCONTENT-TYPE: Application/JSON ; charset=utf-8\
                     \r\nConnection: keep-alive, Close";
-        let (request, _) = head(text.as_bytes()).unwrap();
+        let request = head(text.as_bytes()).unwrap().request;
         assert!(request.json && request.close);
         let other = text.replace("JSON", "json-seq").replace("Close", "x-close");
-        let (request, _) = head(other.as_bytes()).unwrap();
+        let request = head(other.as_bytes()).unwrap().request;
         assert!(!request.json && !request.close);
     }
 

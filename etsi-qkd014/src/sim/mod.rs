@@ -30,6 +30,7 @@
 mod api;
 mod control;
 mod fault;
+mod handshake;
 mod http;
 mod network;
 mod pki;

@@ -10,6 +10,7 @@ use tokio::task::JoinHandle;
 use zeroize::Zeroizing;
 
 use super::fault::Fault;
+use super::handshake::Acceptors;
 use super::pki::{Layout, Pair, Pki, Sae, Site, Validity};
 use super::plan::{FaultPlan, Faults};
 use super::store::{FillRate, Store};
@@ -36,7 +37,6 @@ pub struct NetworkBuilder {
     limits: Limits,
     rate: FillRate,
     initially: Option<u64>,
-    validity: Validity,
     tls12_only: bool,
 }
 
@@ -70,7 +70,7 @@ impl NetworkBuilder {
         self
     }
 
-    /// Keys that each link stores at most. Default 10,000.
+    /// Keys that each link stores at most, up to 2^53. Default 10,000.
     pub fn max_stored(mut self, keys: u64) -> Self {
         self.limits.max_stored = keys;
         self
@@ -88,18 +88,6 @@ impl NetworkBuilder {
         self
     }
 
-    /// Gives the KMEs certificates that are not valid yet.
-    pub fn certificates_not_valid_yet(mut self) -> Self {
-        self.validity = Validity::Future;
-        self
-    }
-
-    /// Gives the KMEs certificates that have expired.
-    pub fn certificates_expired(mut self) -> Self {
-        self.validity = Validity::Past;
-        self
-    }
-
     /// Offers TLS 1.2 and nothing newer, as old KMEs do.
     pub fn tls12_only(mut self) -> Self {
         self.tls12_only = true;
@@ -112,7 +100,7 @@ impl NetworkBuilder {
     /// # Errors
     /// [`Error`] names the ID, setting or address that cannot be used.
     pub async fn start(self) -> Result<Network, Error> {
-        let Self { layout, pki, limits, rate, initially, validity, tls12_only } = self;
+        let Self { layout, pki, limits, rate, initially, tls12_only } = self;
         layout.check()?;
         let sizes = limits.min_key_size..=limits.max_key_size;
         if !sizes.contains(&limits.key_size) || !limits.key_size.is_multiple_of(8) {
@@ -128,6 +116,18 @@ impl NetworkBuilder {
                 limits.max_keys_per_request
             )));
         }
+        // Beyond it a status could not be true: stocks are counted in 64-bit floats.
+        if limits.max_stored > 1 << 53 {
+            return Err(Error::Layout(format!(
+                "max_stored {} is more than 2^53",
+                limits.max_stored
+            )));
+        }
+        if let FillRate::PerSecond(keys) = rate
+            && !(keys.is_finite() && keys >= 0.0)
+        {
+            return Err(Error::Layout(format!("fill_rate {keys} is not a number from 0")));
+        }
         let pki = pki.map_or_else(|| Pki::create(&layout), Ok)?;
         let initially = initially.unwrap_or(limits.max_stored);
         let shared = Arc::new(Shared {
@@ -139,21 +139,14 @@ impl NetworkBuilder {
         for (index, site) in layout.sites.iter().enumerate() {
             let listener = TcpListener::bind(site.bind).await.map_err(Error::io(site.bind))?;
             let addr = listener.local_addr().map_err(Error::io(site.bind))?;
-            let issued;
-            let pair = match validity {
-                Validity::Now => known(&pki, &site.kme)?,
-                other => {
-                    issued = pki.issue(&site.kme, Some(site.bind.ip()), other)?;
-                    &issued
-                }
-            };
-            let tls = server::tls_config(pki.ca_pem(), pair, tls12_only)?;
+            let tls = Acceptors::new(&pki, &site.kme, tls12_only)?;
             let state = Arc::new(KmeState {
                 id: site.kme.clone(),
                 index,
                 saes: site.saes.iter().cloned().collect(),
                 counters: Mutex::default(),
                 faults: Mutex::default(),
+                last_key_id: Mutex::default(),
             });
             let serving = server::serve(listener, tls, Arc::clone(&shared), Arc::clone(&state));
             let task = tokio::spawn(serving);
@@ -162,16 +155,12 @@ impl NetworkBuilder {
         let mut saes = Vec::new();
         for (site, kme) in layout.sites.iter().zip(&kmes) {
             for id in &site.saes {
-                let Pair { cert, key } = known(&pki, id)?;
+                let Pair { cert, key } = pki.known(id, Validity::Now)?;
                 saes.push(sae(id, kme, &pki, Pair { cert: cert.clone(), key: key.clone() }));
             }
         }
         Ok(Network { kmes, saes, pki })
     }
-}
-
-fn known<'p>(pki: &'p Pki, id: &str) -> Result<&'p Pair, Error> {
-    pki.pair(id).ok_or_else(|| Error::Certificates(format!("none was made for {id:?}")))
 }
 
 fn sae(id: &str, kme: &Kme, pki: &Pki, pair: Pair) -> Sae {
@@ -207,7 +196,6 @@ impl Network {
             },
             rate: FillRate::Unlimited,
             initially: None,
-            validity: Validity::Now,
             tls12_only: false,
         }
     }
@@ -396,9 +384,15 @@ pub(super) struct KmeState {
     pub(super) saes: BTreeSet<String>,
     counters: Mutex<Counters>,
     faults: Mutex<Faults>,
+    /// Of the last key that it gave a master.
+    last_key_id: Mutex<Option<String>>,
 }
 
 impl KmeState {
+    pub(super) fn last_key_id(&self, change: impl FnOnce(&mut Option<String>)) {
+        change(&mut lock(&self.last_key_id));
+    }
+
     pub(super) fn count(&self, change: impl FnOnce(&mut Counters)) {
         change(&mut lock(&self.counters));
     }

@@ -50,7 +50,11 @@ impl Layout {
                     "ID {id:?}: 1 to 64 of A-Z a-z 0-9 - _ . and no leading dot"
                 )));
             }
-            if seen.insert(id.to_ascii_lowercase(), ()).is_some() || id == "ca" {
+            let lower = id.to_ascii_lowercase();
+            if let Some(end) = ENDINGS.into_iter().find(|end| lower.ends_with(end)) {
+                return Err(Error::Layout(format!("ID {id:?}: an ID does not end in {end}")));
+            }
+            if seen.insert(lower, ()).is_some() || id == "ca" {
                 return Err(Error::Layout(format!("ID {id:?} is used twice")));
             }
         }
@@ -64,15 +68,41 @@ pub(super) struct Pair {
     pub(super) key: Zeroizing<String>,
 }
 
+/// When a certificate is valid.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Validity {
+    Now,
+    Future,
+    Past,
+}
+
+/// What is put after a KME's ID for its certificates that are not valid now.
+const ENDINGS: [&str; 2] = [".not-yet-valid", ".expired"];
+
+impl Validity {
+    const ALL: [Self; 3] = [Self::Now, Self::Future, Self::Past];
+
+    /// The name of a certificate, in files and here.
+    fn name(self, id: &str) -> String {
+        match self {
+            Self::Now => id.to_owned(),
+            Self::Future => format!("{id}{}", ENDINGS[0]),
+            Self::Past => format!("{id}{}", ENDINGS[1]),
+        }
+    }
+}
+
 /// The certificates of a network. The CA's key exists only as long as the `Pki` that made it.
 pub struct Pki {
     ca: String,
     issuer: Option<Issuer<'static, KeyPair>>,
+    /// By name; see [`Validity::name`].
     pairs: BTreeMap<String, Pair>,
 }
 
 impl Pki {
-    /// Makes a CA and a certificate for each KME and SAE.
+    /// Makes a CA and a certificate for each KME and SAE, and for each KME one that has expired and
+    /// one of the future.
     ///
     /// # Errors
     /// [`Error::Layout`] where the layout is unusable.
@@ -90,8 +120,10 @@ impl Pki {
         let issuer = Issuer::new(params, key);
         let mut pki = Self { ca, issuer: Some(issuer), pairs: BTreeMap::new() };
         for site in &layout.sites {
-            let pair = pki.issue(&site.kme, Some(site.bind.ip()), Validity::Now)?;
-            pki.pairs.insert(site.kme.clone(), pair);
+            for validity in Validity::ALL {
+                let pair = pki.issue(&site.kme, Some(site.bind.ip()), validity)?;
+                pki.pairs.insert(validity.name(&site.kme), pair);
+            }
             for sae in &site.saes {
                 let pair = pki.issue(sae, None, Validity::Now)?;
                 pki.pairs.insert(sae.clone(), pair);
@@ -111,16 +143,20 @@ impl Pki {
             fs::read_to_string(&path).map_err(Error::io(path.display()))
         };
         let mut pairs = BTreeMap::new();
-        for id in layout.sites.iter().flat_map(|site| site.saes.iter().chain([&site.kme])) {
-            let pair =
-                Pair { cert: read(format!("{id}.crt"))?, key: read(format!("{id}.key"))?.into() };
-            pairs.insert(id.clone(), pair);
+        let names = |site: &Site| {
+            let of_kme = Validity::ALL.map(|validity| validity.name(&site.kme));
+            site.saes.iter().cloned().chain(of_kme).collect::<Vec<_>>()
+        };
+        for name in layout.sites.iter().flat_map(names) {
+            let (cert, key) = (read(format!("{name}.crt"))?, read(format!("{name}.key"))?);
+            pairs.insert(name, Pair { cert, key: key.into() });
         }
         Ok(Self { ca: read("ca.pem".into())?, issuer: None, pairs })
     }
 
     /// Writes `ca.pem`, and `ID.crt` and `ID.key` (mode 0600) of each KME and SAE, into `dir`,
-    /// which is made if need be (mode 0700).
+    /// which is made if need be (mode 0700). Of each KME also `ID.expired` and `ID.not-yet-valid`,
+    /// which it shows as a [fault](super::Fault::CertificateExpired), or another server can.
     ///
     /// # Errors
     /// [`Error::Io`] names the file that cannot be written.
@@ -131,9 +167,9 @@ impl Pki {
             write_file(&path, text, secret).map_err(Error::io(path.display()))
         };
         write("ca.pem".into(), &self.ca, false)?;
-        for (id, pair) in &self.pairs {
-            write(format!("{id}.crt"), &pair.cert, false)?;
-            write(format!("{id}.key"), &pair.key, true)?;
+        for (name, pair) in &self.pairs {
+            write(format!("{name}.crt"), &pair.cert, false)?;
+            write(format!("{name}.key"), &pair.key, true)?;
         }
         Ok(())
     }
@@ -144,8 +180,9 @@ impl Pki {
         &self.ca
     }
 
-    pub(super) fn pair(&self, id: &str) -> Option<&Pair> {
-        self.pairs.get(id)
+    pub(super) fn known(&self, id: &str, validity: Validity) -> Result<&Pair, Error> {
+        let pair = self.pairs.get(&validity.name(id));
+        pair.ok_or_else(|| Error::Certificates(format!("none was made for {id:?}")))
     }
 
     /// A server certificate where `server` names its address, else a client certificate.
@@ -189,16 +226,8 @@ impl Pki {
 
 impl std::fmt::Debug for Pki {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Pki").field("ids", &self.pairs.keys()).finish_non_exhaustive()
+        f.debug_struct("Pki").field("names", &self.pairs.keys()).finish_non_exhaustive()
     }
-}
-
-/// When a certificate is valid.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Validity {
-    Now,
-    Future,
-    Past,
 }
 
 fn cert_error(error: rcgen::Error) -> Error {

@@ -1,72 +1,46 @@
 //! The sockets: TLS in front of [`http`](super::http) and [`api`](super::api).
 
+use std::collections::VecDeque;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use rustls::pki_types::PrivateKeyDer;
-use rustls::pki_types::pem::PemObject;
-use rustls::server::{ServerConfig, WebPkiClientVerifier};
-use rustls::version::{TLS12, TLS13};
-use rustls::{RootCertStore, SupportedProtocolVersion};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::Semaphore;
-use tokio::task::JoinSet;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::task::{AbortHandle, JoinSet};
+use tokio::time::{Instant, sleep_until, timeout};
 use tokio_rustls::TlsAcceptor;
+use tokio_rustls::server::TlsStream;
 
+use super::api;
 use super::fault::Fault;
+use super::handshake::{self, Acceptors, linger, refuse, until_gone};
 use super::http::{self, NoRequest};
 use super::network::{KmeState, Shared};
-use super::pki::Pair;
-use super::{Error, api};
-use crate::{subject, tls};
+use crate::subject;
 
 /// Open connections of one KME.
-const MAX_CONNECTIONS: usize = 256;
-const HANDSHAKE_TIME: Duration = Duration::from_secs(10);
+const MAX_CONNECTIONS: usize = 1024;
+/// Time for a handshake where others wait for a place.
+const PATIENCE: Duration = Duration::from_secs(1);
+/// Time for a request to come whole, and for its answer to be taken.
 const IDLE_TIME: Duration = Duration::from_secs(60);
-
-pub(super) fn tls_config(
-    ca: &str,
-    pair: &Pair,
-    tls12_only: bool,
-) -> Result<Arc<ServerConfig>, Error> {
-    let wrong = |e: &dyn std::fmt::Display| Error::Certificates(e.to_string());
-    let provider = tls::provider();
-    let mut roots = RootCertStore::empty();
-    for cert in tls::certificates(ca.as_bytes(), "ca").map_err(|e| wrong(&e))? {
-        roots.add(cert).map_err(|e| wrong(&e))?;
-    }
-    let verifier =
-        WebPkiClientVerifier::builder_with_provider(Arc::new(roots), Arc::clone(&provider))
-            .build()
-            .map_err(|e| wrong(&e))?;
-    let chain = tls::certificates(pair.cert.as_bytes(), "cert").map_err(|e| wrong(&e))?;
-    let key = PrivateKeyDer::from_pem_slice(pair.key.as_bytes()).map_err(|e| wrong(&e))?;
-    let versions: &[&SupportedProtocolVersion] =
-        if tls12_only { const { &[&TLS12] } } else { const { &[&TLS13, &TLS12] } };
-    ServerConfig::builder_with_provider(provider)
-        .with_protocol_versions(versions)
-        .map_err(|e| wrong(&e))?
-        .with_client_cert_verifier(verifier)
-        .with_single_cert(chain, key)
-        .map(Arc::new)
-        .map_err(|e| wrong(&e))
-}
+/// Bytes of further requests that are taken in before an answer has gone out.
+const MAX_AHEAD: usize = 64 << 10;
 
 /// Serves until it is aborted, and takes its connections with it then.
 pub(super) async fn serve(
     listener: TcpListener,
-    tls: Arc<ServerConfig>,
+    acceptors: Acceptors,
     shared: Arc<Shared>,
     kme: Arc<KmeState>,
 ) {
-    let acceptor = TlsAcceptor::from(tls);
-    let permits = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+    let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     let mut connections = JoinSet::new();
+    let mut strangers = Strangers::default();
     loop {
         while connections.try_join_next().is_some() {}
-        let Ok(permit) = Arc::clone(&permits).acquire_owned().await else { return };
         let Ok((stream, _)) = listener.accept().await else {
             tokio::time::sleep(Duration::from_millis(50)).await;
             continue;
@@ -75,31 +49,89 @@ pub(super) async fn serve(
         if fault == Some(Fault::HandshakeDropped) {
             continue;
         }
-        let (acceptor, shared, kme) = (acceptor.clone(), Arc::clone(&shared), Arc::clone(&kme));
-        connections.spawn(async move {
-            let _permit = permit;
-            // A client that breaks off is its own business.
-            let _ = match fault {
-                Some(_) => refuse(stream).await,
-                None => connection(stream, &acceptor, &shared, &kme).await,
-            };
-        });
+        let Some(place) = strangers.make_room(&places).await else { return };
+        let known = Arc::new(AtomicBool::new(false));
+        let task = {
+            let acceptor = acceptors.of(fault.as_ref()).clone();
+            let (shared, kme, known) = (Arc::clone(&shared), Arc::clone(&kme), Arc::clone(&known));
+            connections.spawn(async move {
+                let _place = place;
+                // A client that breaks off is its own business.
+                let _ = match fault {
+                    Some(Fault::HandshakeRefused) => refuse(stream).await,
+                    _ => connection(stream, &acceptor, &known, &shared, &kme).await,
+                };
+            })
+        };
+        strangers.add(task, known);
+    }
+}
+
+/// Connections that have not proved who they are, oldest first. Where all places are taken, one of
+/// these gives way after [`PATIENCE`], so that whoever has no certificate shuts nobody out for long.
+#[derive(Default)]
+struct Strangers(VecDeque<Stranger>);
+
+struct Stranger {
+    since: Instant,
+    task: AbortHandle,
+    known: Arc<AtomicBool>,
+}
+
+impl Stranger {
+    fn is_one(&self) -> bool {
+        !self.known.load(Ordering::Relaxed) && !self.task.is_finished()
+    }
+}
+
+impl Strangers {
+    fn add(&mut self, task: AbortHandle, known: Arc<AtomicBool>) {
+        if self.0.len() >= 2 * MAX_CONNECTIONS {
+            self.0.retain(Stranger::is_one);
+        }
+        self.0.push_back(Stranger { since: Instant::now(), task, known });
+    }
+
+    fn oldest(&mut self) -> Option<&Stranger> {
+        while self.0.front().is_some_and(|first| !first.is_one()) {
+            self.0.pop_front();
+        }
+        self.0.front()
+    }
+
+    /// A place for one more connection.
+    async fn make_room(&mut self, places: &Arc<Semaphore>) -> Option<OwnedSemaphorePermit> {
+        if let Ok(place) = Arc::clone(places).try_acquire_owned() {
+            return Some(place);
+        }
+        let place = Arc::clone(places).acquire_owned();
+        tokio::pin!(place);
+        if let Some(oldest) = self.oldest() {
+            tokio::select! {
+                biased;
+                place = &mut place => return place.ok(),
+                () = sleep_until(oldest.since + PATIENCE) => oldest.task.abort(),
+            }
+        }
+        place.await.ok()
     }
 }
 
 async fn connection(
     stream: TcpStream,
     acceptor: &TlsAcceptor,
+    known: &AtomicBool,
     shared: &Shared,
     kme: &KmeState,
 ) -> std::io::Result<()> {
     stream.set_nodelay(true)?;
     let accepted = acceptor.accept(stream).into_fallible();
-    let Ok(accepted) = tokio::time::timeout(HANDSHAKE_TIME, accepted).await else { return Ok(()) };
+    let Ok(accepted) = timeout(handshake::TIME, accepted).await else { return Ok(()) };
     let mut stream = match accepted {
         Ok(stream) => stream,
         Err((_, stream)) => return linger(stream).await,
     };
+    known.store(true, Ordering::Relaxed);
     let caller = stream
         .get_ref()
         .1
@@ -107,58 +139,59 @@ async fn connection(
         .and_then(|chain| subject::common_name(chain.first()?));
     let mut buffer = Vec::new();
     loop {
-        let read = http::read(&mut stream, &mut buffer);
-        let request = match tokio::time::timeout(IDLE_TIME, read).await {
+        let request = match timeout(IDLE_TIME, http::read(&mut stream, &mut buffer)).await {
             Ok(Ok(request)) => request,
-            Ok(Err(NoRequest::Refused(status))) => {
-                let answer = api::error(status, "the request cannot be read", Vec::new());
-                http::write(&mut stream, &answer, None).await?;
-                return stream.shutdown().await;
+            Ok(Err(NoRequest::Refused(status, why))) => {
+                let answer = api::error(status, why, Vec::new());
+                let write = http::write(&mut stream, &answer, None);
+                timeout(IDLE_TIME, write).await.unwrap_or(Ok(false))?;
+                return linger(stream).await;
             }
             Ok(Err(NoRequest::Closed)) | Err(_) => return stream.shutdown().await,
         };
         let met = kme.faults().for_request(api::method(&request));
         let fault = met.fault;
         let answer = api::answer(shared, kme, caller.as_deref(), &request, fault.as_ref());
-        tokio::time::sleep(met.delay).await;
+        if !met.delay.is_zero() && !delay(&mut stream, &mut buffer, met.delay).await {
+            return Ok(());
+        }
         match fault {
-            Some(Fault::Silence) => return std::future::pending().await,
+            Some(Fault::Silence) => return until_gone(&mut stream).await,
             Some(Fault::ResetAfterRequest) => {
                 let _ = stream.get_ref().0.set_zero_linger();
                 return Ok(());
             }
             _ => {}
         }
-        if !http::write(&mut stream, &answer, fault.as_ref()).await? {
+        let write = http::write(&mut stream, &answer, fault.as_ref());
+        let stays = match fault {
+            // A client that takes nothing does not stay for ever.
+            None => timeout(IDLE_TIME, write).await.unwrap_or(Ok(false))?,
+            Some(_) => write.await?,
+        };
+        if !stays {
             if fault == Some(Fault::LyingLength) {
-                return std::future::pending().await;
+                return until_gone(&mut stream).await;
             }
             return stream.shutdown().await;
         }
     }
 }
 
-/// Refuses the handshake as a TLS server does that shares nothing with its client: after the
-/// ClientHello, with a fatal alert (RFC 8446, 6.2).
-async fn refuse(mut stream: TcpStream) -> std::io::Result<()> {
-    const HANDSHAKE_FAILURE: [u8; 7] = [21, 3, 3, 0, 2, 2, 40];
-    let mut first = [0];
-    let read = stream.read(&mut first);
-    if !matches!(tokio::time::timeout(HANDSHAKE_TIME, read).await, Ok(Ok(1))) {
-        return Ok(());
+/// Waits before an answer. Returns whether the client is still there: one that is gone would take
+/// a place until the time is over.
+async fn delay(stream: &mut TlsStream<TcpStream>, buffer: &mut Vec<u8>, time: Duration) -> bool {
+    let until = Instant::now() + time;
+    while buffer.len() < MAX_AHEAD {
+        tokio::select! {
+            () = sleep_until(until) => return true,
+            read = stream.read_buf(buffer) => {
+                if !matches!(read, Ok(1..)) {
+                    return false;
+                }
+            }
+        }
     }
-    stream.write_all(&HANDSHAKE_FAILURE).await?;
-    linger(stream).await
-}
-
-/// After a refused handshake: reads what the client has already sent, because closing over unread
-/// bytes resets the connection, and the client may then never see the alert that says why.
-async fn linger(mut stream: TcpStream) -> std::io::Result<()> {
-    stream.shutdown().await?;
-    let mut sink = [0; 4096];
-    let drain = async {
-        while stream.read(&mut sink).await? > 0 {}
-        std::io::Result::Ok(())
-    };
-    tokio::time::timeout(Duration::from_secs(1), drain).await.unwrap_or(Ok(()))
+    sleep_until(until).await;
+    true
 }

@@ -1,6 +1,6 @@
 //! Key material that the KMEs of a network share: what a QKD link would have put into both.
 
-use std::collections::{BTreeSet, HashMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::time::Instant;
 
 use zeroize::Zeroizing;
@@ -27,12 +27,15 @@ pub(super) struct Store {
     links: HashMap<(usize, usize), (f64, Instant)>,
     initially: u64,
     waiting: HashMap<String, Waiting>,
-    /// In order of their drawing; may hold IDs that are gone.
-    order: VecDeque<String>,
+    /// The IDs of `waiting`, in order of their drawing.
+    order: BTreeMap<u64, String>,
+    drawn: u64,
 }
 
 /// A key that slaves may still draw.
 struct Waiting {
+    /// Its place in the order of drawing.
+    place: u64,
     secret: Zeroizing<Vec<u8>>,
     master: String,
     slaves: BTreeSet<String>,
@@ -57,7 +60,8 @@ impl Store {
             links: HashMap::new(),
             initially: initially.min(max_stored),
             waiting: HashMap::new(),
-            order: VecDeque::new(),
+            order: BTreeMap::new(),
+            drawn: 0,
         }
     }
 
@@ -102,25 +106,27 @@ impl Store {
             random(&mut secret);
             let id = uuid();
             let (master, slaves) = (master.to_owned(), slaves.clone());
-            let waiting = Waiting { secret: secret.clone(), master, slaves };
+            self.drawn += 1;
+            let waiting = Waiting { place: self.drawn, secret: secret.clone(), master, slaves };
             self.waiting.insert(id.clone(), waiting);
-            self.order.push_back(id.clone());
+            self.order.insert(self.drawn, id.clone());
             drawn.push((id, secret));
         }
         while self.order.len() > MAX_WAITING {
-            if let Some(oldest) = self.order.pop_front() {
+            if let Some((_, oldest)) = self.order.pop_first() {
                 self.waiting.remove(&oldest);
             }
         }
         Some(drawn)
     }
 
-    /// Gives keys to a slave, each once; all of them or none.
+    /// Gives keys to a slave, each once unless it is to `keep` them; all of them or none.
     pub(super) fn give(
         &mut self,
         ids: &[String],
         master: &str,
         slave: &str,
+        keep: bool,
     ) -> Result<Vec<Drawn>, Refusal> {
         let folded: Vec<String> = ids.iter().map(|id| id.to_ascii_lowercase()).collect();
         if folded.iter().collect::<BTreeSet<_>>().len() < folded.len() {
@@ -140,8 +146,11 @@ impl Store {
         let given = folded.into_iter().filter_map(|id| {
             let key = self.waiting.get_mut(&id)?;
             let secret = key.secret.clone();
-            key.slaves.remove(slave);
+            if !keep {
+                key.slaves.remove(slave);
+            }
             if key.slaves.is_empty() {
+                self.order.remove(&key.place);
                 self.waiting.remove(&id);
             }
             Some((id, secret))
@@ -187,12 +196,12 @@ mod tests {
         let mut store = Store::new(FillRate::Unlimited, 10, 10);
         let drawn = store.draw(&link(0, 1), 1, 32, 1, "m", &slaves(&["s", "t"])).unwrap();
         let ids = [drawn[0].0.clone()];
-        assert_eq!(store.give(&ids, "m", "x").unwrap_err(), Refusal::NotYours);
-        assert_eq!(store.give(&ids, "x", "s").unwrap_err(), Refusal::NotYours);
-        assert_eq!(store.give(&ids, "m", "s").unwrap(), drawn);
-        assert!(store.give(&ids, "m", "s").is_err());
-        assert_eq!(store.give(&ids, "m", "t").unwrap(), drawn);
-        assert!(matches!(store.give(&ids, "m", "t"), Err(Refusal::Unknown(_))));
+        assert_eq!(store.give(&ids, "m", "x", false).unwrap_err(), Refusal::NotYours);
+        assert_eq!(store.give(&ids, "x", "s", false).unwrap_err(), Refusal::NotYours);
+        assert_eq!(store.give(&ids, "m", "s", false).unwrap(), drawn);
+        assert!(store.give(&ids, "m", "s", false).is_err());
+        assert_eq!(store.give(&ids, "m", "t", false).unwrap(), drawn);
+        assert!(matches!(store.give(&ids, "m", "t", false), Err(Refusal::Unknown(_))));
     }
 
     #[test]
@@ -200,9 +209,50 @@ mod tests {
         let mut store = Store::new(FillRate::Unlimited, 10, 10);
         let drawn = store.draw(&link(0, 1), 1, 32, 1, "m", &slaves(&["s"])).unwrap();
         let id = drawn[0].0.clone();
-        assert!(store.give(&[id.clone(), uuid()], "m", "s").is_err());
-        assert!(store.give(&[id.clone(), id.to_uppercase()], "m", "s").is_err());
-        assert!(store.give(&[id], "m", "s").is_ok());
+        assert!(store.give(&[id.clone(), uuid()], "m", "s", false).is_err());
+        assert!(store.give(&[id.clone(), id.to_uppercase()], "m", "s", false).is_err());
+        assert!(store.give(&[id], "m", "s", false).is_ok());
+    }
+
+    #[test]
+    fn what_has_been_given_leaves_nothing_behind() {
+        let mut store = Store::new(FillRate::Unlimited, 10, 10);
+        let first = store.draw(&link(0, 1), 1, 32, 1, "m", &slaves(&["s"])).unwrap();
+        // More than may wait, but none of them does.
+        for _ in 0..MAX_WAITING / 64 + 1 {
+            let drawn = store.draw(&link(0, 1), 64, 32, 1, "m", &slaves(&["s", "t"])).unwrap();
+            let ids: Vec<_> = drawn.into_iter().map(|(id, _)| id).collect();
+            for slave in ["s", "t"] {
+                store.give(&ids, "m", slave, false).unwrap();
+            }
+        }
+        assert_eq!((store.waiting.len(), store.order.len()), (1, 1));
+        assert_eq!(store.give(std::slice::from_ref(&first[0].0), "m", "s", false).unwrap(), first);
+        assert_eq!((store.waiting.len(), store.order.len()), (0, 0));
+    }
+
+    #[test]
+    fn the_oldest_key_that_nobody_fetches_is_wiped_when_too_many_wait() {
+        let mut store = Store::new(FillRate::Unlimited, 10, 10);
+        let first = store.draw(&link(0, 1), 2, 32, 1, "m", &slaves(&["s"])).unwrap();
+        for _ in 0..(MAX_WAITING - 1) / 5 {
+            store.draw(&link(0, 1), 5, 32, 1, "m", &slaves(&["s"])).unwrap();
+        }
+        assert_eq!((store.waiting.len(), store.order.len()), (MAX_WAITING, MAX_WAITING));
+        let [(gone, _), (kept, _)] = first.try_into().unwrap();
+        let refused = store.give(std::slice::from_ref(&gone), "m", "s", false);
+        assert_eq!(refused, Err(Refusal::Unknown(vec![gone])));
+        assert!(store.give(&[kept], "m", "s", false).is_ok());
+    }
+
+    #[test]
+    fn a_key_that_is_kept_is_given_again() {
+        let mut store = Store::new(FillRate::Unlimited, 10, 10);
+        let drawn = store.draw(&link(0, 1), 1, 32, 1, "m", &slaves(&["s"])).unwrap();
+        let ids = [drawn[0].0.clone()];
+        assert_eq!(store.give(&ids, "m", "s", true).unwrap(), drawn);
+        assert_eq!(store.give(&ids, "m", "s", false).unwrap(), drawn);
+        assert!(store.give(&ids, "m", "s", false).is_err());
     }
 
     #[test]

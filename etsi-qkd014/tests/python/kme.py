@@ -3,12 +3,15 @@
 Shares nothing with the Rust code, so that a misreading there does not go unnoticed here. Clause
 numbers in comments are of that document. For tests: the keys come from os.urandom.
 
-usage: kme.py DIR STORED KME=ADDRESS=SAE[,SAE...]...
+usage: kme.py [--bend ANSWER.MEMBER=JSON]... [--old-tls] [--anyone] DIR STORED KME=ADDRESS=SAE[,SAE...]...
 
-DIR holds ca.pem and, for each KME, ID.crt and ID.key. STORED is the number of keys to give in all.
+--bend makes an answer wrong: ANSWER is status, enc_keys, dec_keys or error, MEMBER a path as
+keys.0.key_ID; without =JSON the member is left out. --old-tls accepts TLS of any version, --anyone
+asks for no client certificate and serves everybody as the KME's first SAE. DIR holds ca.pem and, for each KME, ID.crt and ID.key. STORED is the number of keys to give in all.
 Prints a line "KME PORT" for each KME once it listens. Ends when standard input ends.
 """
 
+import argparse
 import base64
 import http.server
 import json
@@ -43,6 +46,9 @@ class Keys:
         self.stored = stored
         self.home = home  # SAE ID: KME ID
         self.given = {}  # key_ID: (key, master, slaves that may have it, slaves that had it)
+
+    def first(self, kme):
+        return next(sae for sae, home in self.home.items() if home == kme)
 
     def draw(self, number, size, master, slaves):
         with self.lock:
@@ -95,8 +101,9 @@ class Handler(http.server.BaseHTTPRequestHandler):
         self.request.settimeout(self.timeout)
         self.request.do_handshake()
         super().setup()
-        subject = dict(pair for part in self.request.getpeercert()["subject"] for pair in part)
-        self.caller = subject.get("commonName")
+        shown = self.request.getpeercert() or {"subject": ()}
+        subject = dict(pair for part in shown["subject"] for pair in part)
+        self.caller = subject.get("commonName", self.server.anyone)
 
     def do_GET(self):
         self.answer(self.get)
@@ -111,6 +118,7 @@ class Handler(http.server.BaseHTTPRequestHandler):
             code, body = 200, method()
         except Refused as refused:
             code, body = refused.code, refused.body
+        self.bend("error" if code != 200 else urllib.parse.urlsplit(self.path).path.split("/")[5], body)
         raw = b"" if body is None else json.dumps(body, indent=4).encode()
         self.send_response(code)
         if raw:
@@ -118,6 +126,22 @@ class Handler(http.server.BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(raw)))
         self.end_headers()
         self.wfile.write(raw)
+
+    def bend(self, answer, body):
+        """Makes the body wrong in the ways that were asked for."""
+        for wanted, path, value in self.server.bends:
+            if wanted == answer:
+                *way, last = [int(part) if part.isdigit() else part for part in path]
+                at = body
+                try:
+                    for part in way:
+                        at = at[part]
+                    if value is None:
+                        del at[last]
+                    else:
+                        at[last] = json.loads(value)
+                except (IndexError, KeyError, TypeError):
+                    pass  # An answer without this member.
 
     def resource(self):
         """The SAE ID and the method name in the URL (clause 5.1, table 2), and the query."""
@@ -240,15 +264,19 @@ class Handler(http.server.BaseHTTPRequestHandler):
 class Server(http.server.ThreadingHTTPServer):
     daemon_threads = True
 
-    def __init__(self, kme, address, directory, keys):
+    def __init__(self, kme, address, directory, keys, wrong):
         super().__init__((address, 0), Handler)
-        self.kme, self.keys = kme, keys
+        self.kme, self.keys, self.bends = kme, keys, wrong.bend
+        self.anyone = keys.first(kme) if wrong.anyone else None
         # Clause 5.1: TLS 1.2 or higher, and both sides show a certificate.
         tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         tls.minimum_version = ssl.TLSVersion.TLSv1_2
         tls.load_cert_chain(directory / f"{kme}.crt", directory / f"{kme}.key")
         tls.load_verify_locations(directory / "ca.pem")
-        tls.verify_mode = ssl.CERT_REQUIRED
+        tls.verify_mode = ssl.CERT_NONE if wrong.anyone else ssl.CERT_REQUIRED
+        if wrong.old_tls:
+            tls.minimum_version = ssl.TLSVersion.MINIMUM_SUPPORTED
+            tls.set_ciphers("ALL:@SECLEVEL=0")
         self.socket = tls.wrap_socket(self.socket, server_side=True, do_handshake_on_connect=False)
 
     def handle_error(self, request, client_address):
@@ -257,13 +285,27 @@ class Server(http.server.ThreadingHTTPServer):
             super().handle_error(request, client_address)
 
 
+def bent(text):
+    """Of ANSWER.MEMBER=JSON the three parts."""
+    path, _, value = text.partition("=")
+    answer, *path = path.split(".")
+    return answer, path, value or None
+
+
 def main():
-    directory, stored, *sites = sys.argv[1:]
-    sites = [site.split("=") for site in sites]
+    arguments = argparse.ArgumentParser()
+    arguments.add_argument("--bend", action="append", default=[], type=bent)
+    arguments.add_argument("--old-tls", action="store_true")
+    arguments.add_argument("--anyone", action="store_true")
+    arguments.add_argument("directory", type=pathlib.Path)
+    arguments.add_argument("stored", type=int)
+    arguments.add_argument("sites", nargs="+")
+    arguments = arguments.parse_args()
+    sites = [site.split("=") for site in arguments.sites]
     home = {sae: kme for kme, _, saes in sites for sae in saes.split(",")}
-    keys = Keys(int(stored), home)
+    keys = Keys(arguments.stored, home)
     for kme, address, _ in sites:
-        server = Server(kme, address, pathlib.Path(directory), keys)
+        server = Server(kme, address, arguments.directory, keys, arguments)
         threading.Thread(target=server.serve_forever, daemon=True).start()
         print(kme, server.server_address[1], flush=True)
     sys.stdin.read()

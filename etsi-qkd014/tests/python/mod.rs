@@ -45,8 +45,13 @@ pub(crate) struct Server {
 impl Server {
     /// `sites` as `kme.py` takes them: `KME=ADDRESS=SAE,SAE`.
     pub(crate) fn start(dir: &Path, stored: u32, sites: &[&str]) -> Option<Self> {
+        Self::wrong(&[], dir, stored, sites)
+    }
+
+    /// With options of `kme.py` that make it wrong.
+    pub(crate) fn wrong(options: &[&str], dir: &Path, stored: u32, sites: &[&str]) -> Option<Self> {
         let mut command = python()?;
-        command.arg("kme.py").arg(dir).arg(stored.to_string()).args(sites);
+        command.arg("kme.py").args(options).arg(dir).arg(stored.to_string()).args(sites);
         let mut child =
             command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().expect("python3 runs");
         let mut lines = BufReader::new(child.stdout.take().expect("a pipe")).lines();

@@ -19,18 +19,20 @@ pub(super) async fn least<T>(
         Ok(value) => return Ok(Tolerated { value, needed: Vec::new() }),
         Err(error) => error,
     };
-    // Quirks help only where an answer came and was not accepted.
+    // Quirks help only where an answer came and was not accepted, or where the client would not ask
+    // for a key_ID that this KME has given.
     let answered = matches!(
         strict.cause(),
-        Error::Malformed { .. } | Error::Check { .. } | Error::BadRequest { .. }
+        Error::Malformed { .. }
+            | Error::Check { .. }
+            | Error::BadRequest { .. }
+            | Error::Request { .. }
     );
     if !answered {
         return Err(strict);
     }
-    let bytes = |name: &str| name == "size-in-bytes";
-    let all: Vec<_> = Quirks::NAMES.iter().map(|(name, _)| *name).collect();
-    let but_bytes: Vec<_> = all.iter().copied().filter(|name| !bytes(name)).collect();
-    for mut names in [but_bytes, all] {
+    let all = Quirks::NAMES.iter().map(|(name, _)| *name).collect();
+    for mut names in [but_bytes(), all] {
         let Ok(mut value) = call(sum(&names)).await else { continue };
         for name in names.clone() {
             let fewer: Vec<_> = names.iter().copied().filter(|other| *other != name).collect();
@@ -43,8 +45,19 @@ pub(super) async fn least<T>(
     Err(strict)
 }
 
+/// All names but that of sizes in bytes.
+fn but_bytes() -> Vec<&'static str> {
+    let names = Quirks::NAMES.iter().map(|(name, _)| *name);
+    names.filter(|name| *name != "size-in-bytes").collect()
+}
+
+/// All that only accept more than the specification allows.
+pub(super) fn lenient() -> Quirks {
+    sum(&but_bytes())
+}
+
 /// The quirks of these names.
-pub(super) fn sum(names: &[&'static str]) -> Quirks {
+fn sum(names: &[&'static str]) -> Quirks {
     let chosen = Quirks::NAMES.iter().filter(|(name, _)| names.contains(name));
     chosen.fold(Quirks::STRICT, |all, (_, quirk)| all | *quirk)
 }

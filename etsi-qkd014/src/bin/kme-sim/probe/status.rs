@@ -116,6 +116,9 @@ fn judge(passed: bool, helps: &[&'static str], needed: &[&'static str]) -> Verdi
 
 fn raw_status(party: &Party, slave: &str, raw: &Raw, needed: &[&'static str], report: &mut Report) {
     report.check("5.2", "status answered 200", raw.summary(), raw.status == 200);
+    if raw.status != 200 {
+        return;
+    }
     let http = judge(raw.version != "HTTP/1.0", &["http-1.0"], needed);
     report.row("5.1", "HTTP/1.1 (RFC 7230)", &raw.version, http);
     let media = raw.media.clone().unwrap_or_default();

@@ -1,0 +1,104 @@
+//! TLS as a KME speaks it: which certificate it shows, and how it refuses.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use rustls::pki_types::PrivateKeyDer;
+use rustls::pki_types::pem::PemObject;
+use rustls::server::{ServerConfig, WebPkiClientVerifier};
+use rustls::version::{TLS12, TLS13};
+use rustls::{RootCertStore, SupportedProtocolVersion};
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio::net::TcpStream;
+use tokio_rustls::TlsAcceptor;
+
+use super::Error;
+use super::fault::Fault;
+use super::pki::{Pair, Pki, Validity};
+use crate::tls;
+
+/// Time for a client to finish its handshake.
+pub(super) const TIME: Duration = Duration::from_secs(10);
+const LINGER: Duration = Duration::from_secs(1);
+
+/// One acceptor for each certificate that a KME can show.
+pub(super) struct Acceptors {
+    valid: TlsAcceptor,
+    expired: TlsAcceptor,
+    not_yet_valid: TlsAcceptor,
+}
+
+impl Acceptors {
+    pub(super) fn new(pki: &Pki, kme: &str, tls12_only: bool) -> Result<Self, Error> {
+        let of = |validity| {
+            let config = server_config(pki.ca_pem(), pki.known(kme, validity)?, tls12_only)?;
+            Ok::<_, Error>(TlsAcceptor::from(Arc::new(config)))
+        };
+        Ok(Self {
+            valid: of(Validity::Now)?,
+            expired: of(Validity::Past)?,
+            not_yet_valid: of(Validity::Future)?,
+        })
+    }
+
+    /// The one for a connection with this fault.
+    pub(super) fn of(&self, fault: Option<&Fault>) -> &TlsAcceptor {
+        match fault {
+            Some(Fault::CertificateExpired) => &self.expired,
+            Some(Fault::CertificateNotYetValid) => &self.not_yet_valid,
+            _ => &self.valid,
+        }
+    }
+}
+
+fn server_config(ca: &str, pair: &Pair, tls12_only: bool) -> Result<ServerConfig, Error> {
+    let wrong = |e: &dyn std::fmt::Display| Error::Certificates(e.to_string());
+    let provider = tls::provider();
+    let mut roots = RootCertStore::empty();
+    for cert in tls::certificates(ca.as_bytes(), "ca").map_err(|e| wrong(&e))? {
+        roots.add(cert).map_err(|e| wrong(&e))?;
+    }
+    let verifier =
+        WebPkiClientVerifier::builder_with_provider(Arc::new(roots), Arc::clone(&provider))
+            .build()
+            .map_err(|e| wrong(&e))?;
+    let chain = tls::certificates(pair.cert.as_bytes(), "cert").map_err(|e| wrong(&e))?;
+    let key = PrivateKeyDer::from_pem_slice(pair.key.as_bytes()).map_err(|e| wrong(&e))?;
+    let versions: &[&SupportedProtocolVersion] =
+        if tls12_only { const { &[&TLS12] } } else { const { &[&TLS13, &TLS12] } };
+    ServerConfig::builder_with_provider(provider)
+        .with_protocol_versions(versions)
+        .map_err(|e| wrong(&e))?
+        .with_client_cert_verifier(verifier)
+        .with_single_cert(chain, key)
+        .map_err(|e| wrong(&e))
+}
+
+/// Refuses the handshake as a TLS server does that shares nothing with its client: after the
+/// ClientHello, with a fatal alert (RFC 8446, 6.2).
+pub(super) async fn refuse(mut stream: TcpStream) -> std::io::Result<()> {
+    const HANDSHAKE_FAILURE: [u8; 7] = [21, 3, 3, 0, 2, 2, 40];
+    let mut first = [0];
+    let read = stream.read(&mut first);
+    if !matches!(tokio::time::timeout(TIME, read).await, Ok(Ok(1))) {
+        return Ok(());
+    }
+    stream.write_all(&HANDSHAKE_FAILURE).await?;
+    linger(stream).await
+}
+
+/// After a refusal: reads what the client has already sent, because closing over unread bytes
+/// resets the connection, and the client may then never see what says why.
+pub(super) async fn linger<S: AsyncRead + AsyncWrite + Unpin>(
+    mut stream: S,
+) -> std::io::Result<()> {
+    stream.shutdown().await?;
+    tokio::time::timeout(LINGER, until_gone(&mut stream)).await.unwrap_or(Ok(()))
+}
+
+/// Reads, and forgets, until the client is gone.
+pub(super) async fn until_gone<S: AsyncRead + Unpin>(stream: &mut S) -> std::io::Result<()> {
+    let mut sink = [0; 4096];
+    while stream.read(&mut sink).await? > 0 {}
+    Ok(())
+}
