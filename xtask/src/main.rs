@@ -3,6 +3,7 @@
 #![allow(clippy::print_stdout, reason = "a command line tool reports on its standard output")]
 
 use std::env;
+use std::path::Path;
 use std::process::ExitCode;
 
 mod rustls_axon;
@@ -12,8 +13,16 @@ usage: cargo xtask COMMAND
 
   patched-tree         make third_party/rustls-axon/patched/, which `cargo package` ships
   rustls-digests       after a change to patches/ or added/: write patched.sha256 anew
-  rustls-checkout DIR  make DIR a git repository with rustls's source and a commit a patch
-  rustls-export DIR    the way back: write the commits in DIR to patches/, and the digests";
+  rustls-checkout DIR [VERSION]
+                       make DIR a git repository with rustls's source and a commit a patch, and
+                       with VERSION on a branch to rebase them on
+  rustls-export DIR    the way back: write the commits in DIR to patches/, and the digests
+  rebase VERSION [--from DIR] [--suite DIR] [--dry-run]
+                       move rustls-axon to another release of rustls 0.23, or say what hinders it
+                         --from DIR   with the commits in DIR (rustls-checkout) as the patches
+                         --suite DIR  run rustls's own tests, from a checkout of its repository,
+                                      without and with the patches
+                         --dry-run    change nothing";
 
 fn main() -> ExitCode {
     let args: Vec<String> = env::args().skip(1).collect();
@@ -21,12 +30,14 @@ fn main() -> ExitCode {
     let result = match args[..] {
         ["patched-tree"] => rustls_axon::patched_tree(),
         ["rustls-digests"] => rustls_axon::digests(),
-        ["rustls-checkout", dir] => rustls_axon::checkout(dir.as_ref()),
+        ["rustls-checkout", dir] => rustls_axon::checkout(dir.as_ref(), None),
+        ["rustls-checkout", dir, version] => rustls_axon::checkout(dir.as_ref(), Some(version)),
         ["rustls-export", dir] => rustls_axon::export(dir.as_ref()),
-        _ => {
-            eprintln!("{USAGE}");
-            return ExitCode::from(2);
-        }
+        ["rebase", version, ref options @ ..] => match rebase_options(version, options) {
+            Some(options) => rustls_axon::rebase(&options),
+            None => return usage(),
+        },
+        _ => return usage(),
     };
     match result {
         Ok(report) => {
@@ -38,4 +49,31 @@ fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     }
+}
+
+fn usage() -> ExitCode {
+    eprintln!("{USAGE}");
+    ExitCode::from(2)
+}
+
+fn rebase_options<'a>(version: &'a str, mut args: &[&'a str]) -> Option<rustls_axon::Rebase<'a>> {
+    let mut options = rustls_axon::Rebase::new(version);
+    while !args.is_empty() {
+        args = match args {
+            ["--dry-run", rest @ ..] => {
+                options.dry_run = true;
+                rest
+            }
+            ["--from", dir, rest @ ..] => {
+                options.from = Some(Path::new(*dir));
+                rest
+            }
+            ["--suite", dir, rest @ ..] => {
+                options.suite = Some(Path::new(*dir));
+                rest
+            }
+            _ => return None,
+        };
+    }
+    Some(options)
 }

@@ -17,17 +17,37 @@ pub(crate) type Tree = BTreeMap<String, String>;
 pub(crate) fn assemble(upstream_src: &Path, crate_dir: &Path) -> Result<Tree, String> {
     let mut tree = read_dir(upstream_src)?;
     check(&tree, &crate_dir.join("upstream.sha256"))?;
+    change(&mut tree, &read_patches(crate_dir)?, &read_added(crate_dir)?)?;
+    adapt(tree)
+}
 
-    for (name, text) in read_flat(&crate_dir.join("patches"), "patch")? {
-        patch::apply(&mut tree, &text).map_err(|why| format!("patches/{name}: {why}"))?;
+/// The patches by their file names, in the order in which they apply.
+pub(crate) fn read_patches(crate_dir: &Path) -> Result<Tree, String> {
+    read_flat(&crate_dir.join("patches"), "patch")
+}
+
+/// The files that are new.
+pub(crate) fn read_added(crate_dir: &Path) -> Result<Tree, String> {
+    read_dir(&crate_dir.join("added/src"))
+}
+
+/// Applies the patches and adds the added files.
+///
+/// On an error the tree is as far as this got: it must not be used.
+pub(crate) fn change(tree: &mut Tree, patches: &Tree, added: &Tree) -> Result<(), String> {
+    for (name, text) in patches {
+        patch::apply(tree, text).map_err(|why| format!("patches/{name}: {why}"))?;
     }
-
-    for (path, text) in read_dir(&crate_dir.join("added/src"))? {
-        if tree.insert(path.clone(), text).is_some() {
+    for (path, text) in added {
+        if tree.insert(path.clone(), text.clone()).is_some() {
             return Err(format!("added/src/{path}: rustls has a file of that name"));
         }
     }
+    Ok(())
+}
 
+/// Makes rustls's changed source the source of a crate of another name.
+pub(crate) fn adapt(mut tree: Tree) -> Result<Tree, String> {
     let lib = tree.remove("lib.rs").ok_or("rustls has no src/lib.rs")?;
     tree.insert("lib_body.rs".into(), lib_body(&lib)?.into());
 

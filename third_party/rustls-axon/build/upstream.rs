@@ -6,21 +6,38 @@ use std::process::Command;
 
 use serde_json::Value;
 
-/// The releases that are asked for, as in the build dependency in `Cargo.toml`.
-const RANGE: &str = ">=0.23.46, <0.24";
-
 /// The `src` directory of the rustls that the workspace's lock file has.
 ///
 /// Asks cargo, offline: rustls is a build dependency, so by now cargo has it on this machine, from
-/// a registry or from a vendored copy. It is asked about a package in `scratch` that depends on
-/// rustls and nothing else, because a question about this workspace has no answer before the last
-/// optional dependency of its last member was downloaded.
+/// a registry or from a vendored copy.
 pub(crate) fn locate(
     cargo: &Path,
     crate_dir: &Path,
     host: &str,
     scratch: &Path,
 ) -> Result<PathBuf, String> {
+    let pinned = pinned_version(crate_dir)?;
+    // as in the build dependency in `Cargo.toml`
+    let range = format!(">={pinned}, <0.24");
+    let (found, src) = find(cargo, crate_dir, host, scratch, &range, &["--offline"])?;
+    check_version(&found, &pinned)?;
+    Ok(src)
+}
+
+/// Version and `src` directory of the rustls that cargo picks for `range`, which is the one in the
+/// workspace's lock file if that is in it.
+///
+/// Cargo is asked about a package in `scratch` that depends on rustls and nothing else, because a
+/// question about this workspace has no answer before the last optional dependency of its last
+/// member was downloaded.
+pub(crate) fn find(
+    cargo: &Path,
+    crate_dir: &Path,
+    host: &str,
+    scratch: &Path,
+    range: &str,
+    options: &[&str],
+) -> Result<(String, PathBuf), String> {
     let workspace =
         run(cargo, crate_dir, &["locate-project", "--workspace", "--message-format=plain"])?;
     let lock = Path::new(workspace.trim_end()).with_file_name("Cargo.lock");
@@ -36,7 +53,7 @@ pub(crate) fn locate(
         &manifest,
         &format!(
             "[package]\nname = \"where-is-rustls\"\nversion = \"0.0.0\"\nedition = \"2021\"\n\
-             [dependencies]\nrustls = {{ version = \"{RANGE}\", default-features = false }}\n\
+             [dependencies]\nrustls = {{ version = \"{range}\", default-features = false }}\n\
              [workspace]\n"
         ),
     )?;
@@ -46,17 +63,11 @@ pub(crate) fn locate(
     }
 
     let manifest_arg = format!("--manifest-path={}", manifest.display());
-    let metadata = run(
-        cargo,
-        crate_dir,
-        &["metadata", "--format-version=1", "--offline", "--filter-platform", host, &manifest_arg],
-    )?;
+    let ask = ["metadata", "--format-version=1", "--filter-platform", host, &manifest_arg];
+    let metadata = run(cargo, crate_dir, &[&ask, options].concat())?;
     let metadata: Value = serde_json::from_str(&metadata)
         .map_err(|err| format!("cannot read the output of cargo metadata: {err}"))?;
-
-    let (found, src) = rustls_in(&metadata).ok_or("cargo metadata does not list rustls")?;
-    check_version(&found, &pinned_version(crate_dir)?)?;
-    Ok(src)
+    rustls_in(&metadata).ok_or_else(|| "cargo metadata does not list rustls".into())
 }
 
 /// The version named in the first line of `upstream.sha256`: the only one the patches are for.
@@ -79,7 +90,7 @@ pub(crate) fn check_version(found: &str, pinned: &str) -> Result<(), String> {
         "rustls-axon is made from rustls {pinned}, and Cargo.lock has rustls {found}.\n\
          Its patches are not known to be right for any other version.\n\
          To build with the pinned one: cargo update -p rustls@{found} --precise {pinned}\n\
-         To move to a newer one: see the rebase checklist in docs/rustls-axon.md"
+         To move to a newer one: cargo xtask rebase {found}, and see docs/rustls-axon.md"
     ))
 }
 
