@@ -5,8 +5,8 @@
 
 use std::collections::HashSet;
 
-use crate::{KeyContainer, Quirks};
 use crate::parse::{self, Asked};
+use crate::{KeyContainer, Quirks};
 
 /// The quirks that `bits` select.
 fn quirks(bits: u8) -> Quirks {

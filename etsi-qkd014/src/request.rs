@@ -287,15 +287,17 @@ impl<'c> DecKeys<'c> {
         if self.via_get && self.ids.len() > 1 {
             return Err(refuse("GET carries one key_ID; send it as POST (clause 6.4)"));
         }
-        if !self.ids.iter().all(|id| parse::is_key_id(id)) {
-            return Err(refuse("a key_ID is 1 to 128 visible ASCII characters"));
-        }
-        // The answer could not pass either, and the keys would be gone.
         let any = self.client.limits().quirks.contains(Quirks::ANY_KEY_ID);
-        if let Some(id) = self.ids.iter().find(|id| !(any || parse::is_uuid(id))) {
-            return Err(refuse(&format!(
-                "key_ID {id} is not a UUID (clause 6.4; quirk any-key-id tolerates others)"
-            )));
+        for id in self.ids.iter().filter(|id| !parse::is_uuid(id)) {
+            if !parse::is_key_id(id) {
+                return Err(refuse("a key_ID is 1 to 128 visible ASCII characters"));
+            }
+            // The answer could not pass either, and the keys would be gone.
+            if !any {
+                return Err(refuse(&format!(
+                    "key_ID {id} is not a UUID (clause 6.4; quirk any-key-id tolerates others)"
+                )));
+            }
         }
         match parse::repeated(self.ids.iter().map(String::as_str)) {
             Some(id) => Err(refuse(&format!("key_ID {id} is asked for twice"))),

@@ -14,11 +14,13 @@ pub(super) fn decode(raw: &str) -> Result<Zeroizing<Box<[u8]>>, &'static str> {
         .ok_or("is not a string")?
         .as_bytes();
     // Nearly every KME writes nothing but base64, which is decoded where it lies.
-    if inner.iter().any(|byte| is_space(*byte) || *byte == b'\\') {
-        decode_text(&plain(inner)?)
-    } else {
-        decode_text(inner)
-    }
+    decode_text(inner).or_else(|why| {
+        if inner.iter().any(|byte| is_space(*byte) || *byte == b'\\') {
+            decode_text(&plain(inner)?)
+        } else {
+            Err(why)
+        }
+    })
 }
 
 /// Straight into the only block that will hold the key.

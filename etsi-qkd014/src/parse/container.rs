@@ -2,7 +2,7 @@
 
 use std::cmp::Ordering;
 
-use super::json::{Object, Place, objects, text};
+use super::json::{Object, Place, text};
 use super::{base64, malformed};
 use crate::{Error, Key, KeyContainer, Quirks};
 
@@ -36,16 +36,17 @@ pub(crate) fn key_container(
     size: Option<u32>,
     quirks: Quirks,
 ) -> Result<KeyContainer, Error> {
-    let mut object = Object::parse(text(body)?, quirks)?;
     let expected = match asked {
         Asked::Number(number) => *number,
         Asked::Ids(ids) => ids.len(),
     };
     let mut keys = Vec::with_capacity(expected.min(MAX_KEYS));
-    let came = objects(object.need("keys")?, (expected, MAX_KEYS), quirks, |place, object| {
-        keys.push(key(place, object, quirks)?);
-        Ok(())
-    })?;
+    let bounds = (expected, MAX_KEYS);
+    let (mut object, came) =
+        Object::parse_keys(text(body)?, bounds, quirks, &mut |place, object| {
+            keys.push(key(place, object, quirks)?);
+            Ok(())
+        })?;
     if came != expected {
         return Err(check(
             "ETSI GS QKD 014 V1.1.1 clause 6.3 (keys)",
@@ -78,20 +79,23 @@ fn key(place: Place, object: &mut Object<'_>, quirks: Quirks) -> Result<Key, Err
 }
 
 fn check_key_id(id: &str, place: Place, quirks: Quirks) -> Result<(), Error> {
+    if is_uuid(id) {
+        return Ok(());
+    }
     if !is_key_id(id) {
         return Err(malformed(
             format!("{place}.key_ID"),
             format!("is not 1 to {MAX_KEY_ID} visible ASCII characters"),
         ));
     }
-    if !quirks.contains(Quirks::ANY_KEY_ID) && !is_uuid(id) {
-        return Err(check(
-            "ETSI GS QKD 014 V1.1.1 clause 6.3 (key_ID)",
-            format!("a UUID in {place}.key_ID (quirk any-key-id tolerates others)"),
-            format!("{} characters that are none", id.len()),
-        ));
+    if quirks.contains(Quirks::ANY_KEY_ID) {
+        return Ok(());
     }
-    Ok(())
+    Err(check(
+        "ETSI GS QKD 014 V1.1.1 clause 6.3 (key_ID)",
+        format!("a UUID in {place}.key_ID (quirk any-key-id tolerates others)"),
+        format!("{} characters that are none", id.len()),
+    ))
 }
 
 /// Whether it may be a key_ID at all, also with [`Quirks::ANY_KEY_ID`].
@@ -115,9 +119,16 @@ fn by_id(one: &str, other: &str) -> Ordering {
 
 /// A key_ID that is there twice, in any letter case.
 pub(crate) fn repeated<'i>(ids: impl Iterator<Item = &'i str>) -> Option<&'i str> {
-    let mut ids: Vec<&str> = ids.collect();
-    ids.sort_unstable_by(|one, other| by_id(one, other));
-    ids.windows(2).find(|pair| is_same(pair[0], pair[1])).map(|pair| pair[0])
+    // Nearly always the first bytes differ, and are compared at once.
+    let first = |id: &str| {
+        let mut first = [0; 8];
+        first.iter_mut().zip(id.bytes()).for_each(|(to, c)| *to = c.to_ascii_lowercase());
+        u64::from_be_bytes(first)
+    };
+    let mut ids: Vec<(u64, &str)> = ids.map(|id| (first(id), id)).collect();
+    ids.sort_unstable_by(|one, other| one.0.cmp(&other.0).then_with(|| by_id(one.1, other.1)));
+    let mut pairs = ids.windows(2);
+    pairs.find(|pair| pair[0].0 == pair[1].0 && is_same(pair[0].1, pair[1].1)).map(|pair| pair[0].1)
 }
 
 fn check_unique(keys: &[Key]) -> Result<(), Error> {
@@ -174,7 +185,7 @@ fn put_in_order(keys: &mut Vec<Key>, ids: &[String]) -> Result<(), Error> {
 }
 
 fn is_same(one: &str, other: &str) -> bool {
-    one.eq_ignore_ascii_case(other)
+    one == other || one.eq_ignore_ascii_case(other)
 }
 
 fn check(clause: &'static str, expected: String, got: String) -> Error {

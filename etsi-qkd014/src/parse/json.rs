@@ -44,6 +44,9 @@ impl fmt::Display for Place {
 
 type Member<'a> = (Cow<'a, str>, &'a RawValue);
 
+/// What is done with each object of `keys`.
+pub(super) type Each<'f, 'a> = dyn FnMut(Place, &mut Object<'a>) -> Result<(), Error> + 'f;
+
 /// One JSON object. Members are taken out by name; [`finish`](Object::finish) complains of what
 /// is left.
 pub(super) struct Object<'a> {
@@ -55,12 +58,36 @@ pub(super) struct Object<'a> {
 impl<'a> Object<'a> {
     /// The object that is all of `text`.
     pub(super) fn parse(text: &'a str, quirks: Quirks) -> Result<Self, Error> {
+        Self::read(text, quirks, None)
+    }
+
+    /// The object that is all of `text`, but for its member `keys`, whose objects are handed to
+    /// `each` as they come: all but those after the first `wanted`. Says how many there are; of
+    /// more than `max` nothing is said.
+    pub(super) fn parse_keys(
+        text: &'a str,
+        (wanted, max): (usize, usize),
+        quirks: Quirks,
+        each: &mut Each<'_, 'a>,
+    ) -> Result<(Self, usize), Error> {
+        let mut keys = Keys { wanted, max, quirks, each, state: State::Absent };
+        let read = Self::read(text, quirks, Some(&mut keys));
+        match (keys.state, read) {
+            (State::Failed(failure), _) => Err(failure),
+            (State::Begun, Err(Error::Malformed { reason, .. })) => Err(malformed("keys", reason)),
+            (_, Err(error)) => Err(error),
+            (State::Counted(count), Ok(object)) => Ok((object, count)),
+            (State::Absent | State::Begun, Ok(_)) => Err(malformed("keys", "is missing")),
+        }
+    }
+
+    fn read(text: &'a str, quirks: Quirks, keys: Option<&mut Keys<'_, 'a>>) -> Result<Self, Error> {
         let mut members = Vec::new();
         let mut deserializer = serde_json::Deserializer::from_str(text);
-        Members(&mut members)
+        Members { found: &mut members, keys }
             .deserialize(&mut deserializer)
             .and_then(|()| deserializer.end())
-            .map_err(|e| malformed("body", why(&e, "a JSON object")))?;
+            .map_err(|e| malformed("body", why(&e, "what clause 6 describes")))?;
         Self::new(members, Place::Body, quirks)
     }
 
@@ -87,8 +114,7 @@ impl<'a> Object<'a> {
     }
 
     fn same(&self, one: &str, other: &str) -> bool {
-        one == other
-            || self.quirks.contains(Quirks::ANY_CASE_MEMBERS) && one.eq_ignore_ascii_case(other)
+        is_same(one, other, self.quirks)
     }
 
     /// The raw text of a member that may be absent.
@@ -116,7 +142,13 @@ impl<'a> Object<'a> {
         if raw.len() > MAX_TEXT {
             return Err(malformed(self.path(name), format!("is longer than {MAX_TEXT} bytes")));
         }
-        serde_json::from_str(raw).map_err(|e| malformed(self.path(name), why(&e, "a string")))
+        let plain = raw.strip_prefix('"').and_then(|rest| rest.strip_suffix('"'));
+        match plain {
+            // JSON that was read as such before, and has no escapes: it says what it is.
+            Some(plain) if !plain.contains('\\') => Ok(plain.to_owned()),
+            _ => serde_json::from_str(raw)
+                .map_err(|e| malformed(self.path(name), why(&e, "a string"))),
+        }
     }
 
     /// A count that may be absent.
@@ -145,25 +177,6 @@ impl<'a> Object<'a> {
                 "is no member that the specification lists (quirk extra-members ignores them)",
             )),
             _ => Ok(()),
-        }
-    }
-}
-
-/// Hands the objects of a JSON array to `each`, but for those after the first `wanted`, and says
-/// how many there are. What is larger than `max` is not looked through.
-pub(super) fn objects<'a>(
-    raw: &'a str,
-    (wanted, max): (usize, usize),
-    quirks: Quirks,
-    each: impl FnMut(Place, &mut Object<'a>) -> Result<(), Error>,
-) -> Result<usize, Error> {
-    let mut failure = None;
-    let mut items = Items { wanted, max, quirks, each, failure: &mut failure };
-    let counted = serde_json::Deserializer::from_str(raw).deserialize_seq(&mut items);
-    match (failure, counted) {
-        (Some(failure), _) => Err(failure),
-        (None, counted) => {
-            counted.map_err(|e| malformed("keys", why(&e, "an array of objects, not too long")))
         }
     }
 }
@@ -206,10 +219,18 @@ fn why(error: &serde_json::Error, expected: &str) -> String {
     }
 }
 
-/// Reads the members of an object.
-struct Members<'m, 'a>(&'m mut Vec<Member<'a>>);
+fn is_same(one: &str, other: &str, quirks: Quirks) -> bool {
+    one == other || quirks.contains(Quirks::ANY_CASE_MEMBERS) && one.eq_ignore_ascii_case(other)
+}
 
-impl<'a> DeserializeSeed<'a> for Members<'_, 'a> {
+/// Reads the members of an object.
+struct Members<'m, 'f, 'a> {
+    found: &'m mut Vec<Member<'a>>,
+    /// Where the object is the answer, what is to be done with its `keys`.
+    keys: Option<&'m mut Keys<'f, 'a>>,
+}
+
+impl<'a> DeserializeSeed<'a> for Members<'_, '_, 'a> {
     type Value = ();
 
     fn deserialize<D: Deserializer<'a>>(self, deserializer: D) -> Result<(), D::Error> {
@@ -217,19 +238,24 @@ impl<'a> DeserializeSeed<'a> for Members<'_, 'a> {
     }
 }
 
-impl<'a> Visitor<'a> for Members<'_, 'a> {
+impl<'a> Visitor<'a> for Members<'_, '_, 'a> {
     type Value = ();
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str("an object")
     }
 
-    fn visit_map<A: MapAccess<'a>>(self, mut map: A) -> Result<(), A::Error> {
+    fn visit_map<A: MapAccess<'a>>(mut self, mut map: A) -> Result<(), A::Error> {
         while let Some(name) = map.next_key_seed(Name)? {
-            if self.0.len() == MAX_MEMBERS {
-                return Err(A::Error::custom("too many members"));
+            match &mut self.keys {
+                Some(keys) if is_same(&name, "keys", keys.quirks) => {
+                    map.next_value_seed(&mut **keys)?;
+                }
+                _ if self.found.len() == MAX_MEMBERS => {
+                    return Err(A::Error::custom("too many members"));
+                }
+                _ => self.found.push((name, map.next_value()?)),
             }
-            self.0.push((name, map.next_value()?));
         }
         Ok(())
     }
@@ -262,47 +288,76 @@ impl<'a> Visitor<'a> for Name {
     }
 }
 
-struct Items<'f, F> {
+/// Reads the member `keys`.
+struct Keys<'f, 'a> {
     wanted: usize,
     max: usize,
     quirks: Quirks,
-    each: F,
-    failure: &'f mut Option<Error>,
+    each: &'f mut Each<'f, 'a>,
+    state: State,
 }
 
-impl<'a, F: FnMut(Place, &mut Object<'a>) -> Result<(), Error>> Visitor<'a> for &mut Items<'_, F> {
-    type Value = usize;
+enum State {
+    Absent,
+    Begun,
+    Failed(Error),
+    Counted(usize),
+}
+
+impl Keys<'_, '_> {
+    /// Ends the reading; what serde_json makes of it is not looked at.
+    fn fail<E: serde::de::Error>(&mut self, failure: Error) -> E {
+        self.state = State::Failed(failure);
+        E::custom("see the failure")
+    }
+}
+
+impl<'a> DeserializeSeed<'a> for &mut Keys<'_, 'a> {
+    type Value = ();
+
+    fn deserialize<D: Deserializer<'a>>(self, deserializer: D) -> Result<(), D::Error> {
+        if !matches!(self.state, State::Absent) {
+            return Err(self.fail(malformed("keys", "is there twice")));
+        }
+        self.state = State::Begun;
+        deserializer.deserialize_seq(self)
+    }
+}
+
+impl<'a> Visitor<'a> for &mut Keys<'_, 'a> {
+    type Value = ();
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str("an array")
     }
 
-    fn visit_seq<A: SeqAccess<'a>>(self, mut seq: A) -> Result<usize, A::Error> {
+    fn visit_seq<A: SeqAccess<'a>>(self, mut seq: A) -> Result<(), A::Error> {
         let mut count = 0;
         // One block for the members of all objects, one after the other.
         let mut members = Vec::new();
         while count < self.wanted {
-            if seq.next_element_seed(Members(&mut members))?.is_none() {
-                return Ok(count);
+            let next = Members { found: &mut members, keys: None };
+            if seq.next_element_seed(next)?.is_none() {
+                self.state = State::Counted(count);
+                return Ok(());
             }
             let place = Place::Key(count);
             let read = Object::new(members, place, self.quirks).and_then(|mut object| {
                 (self.each)(place, &mut object)?;
                 Ok(object.members)
             });
-            members = read.map_err(|failure| {
-                *self.failure = Some(failure);
-                A::Error::custom("see the failure")
-            })?;
+            members = read.map_err(|failure| self.fail(failure))?;
             members.clear();
             count += 1;
         }
         while seq.next_element::<IgnoredAny>()?.is_some() {
             count += 1;
             if count > self.max {
-                return Err(A::Error::custom("too many items"));
+                let reason = format!("has more than {} items", self.max);
+                return Err(self.fail(malformed("keys", reason)));
             }
         }
-        Ok(count)
+        self.state = State::Counted(count);
+        Ok(())
     }
 }

@@ -8,6 +8,11 @@ const ID_2: &str = "0a782fb5-3434-48fe-aa4d-14f41d46cf92";
 const KEY_1: &str = "wHHVxRwDJs3/bXd38GHP3oe4svTuRpZS0yCC7x4Ly+s=";
 const KEY_2: &str = "OeGMPxh1+2RpJpNCYixWHFLYRubpOKCw94FcCI7VdJA=";
 
+fn encode(bytes: &[u8]) -> String {
+    use ::base64::Engine;
+    ::base64::engine::general_purpose::STANDARD.encode(bytes)
+}
+
 fn two() -> Value {
     json!({"keys": [{"key_ID": ID_1, "key": KEY_1}, {"key_ID": ID_2, "key": KEY_2}]})
 }
@@ -170,7 +175,53 @@ fn keys_compare_by_their_secret_alone() {
     assert!(other.keys[0].expose_array::<16>().is_none());
 }
 
+#[test]
+fn no_answer_is_shorter_than_its_least_length() {
+    for number in 1..4 {
+        for bytes in [1, 2, 3, 4, 32, 100] {
+            let key = encode(&vec![0; bytes]);
+            let item = format!(r#"{{"key_ID":"x","key":"{key}"}}"#);
+            let shortest = format!(r#"{{"keys":[{}]}}"#, vec![item; number].join(","));
+            let least = least_length(number, Some(bytes as u32 * 8));
+            assert_eq!(least, shortest.len() as u64, "{shortest}");
+            assert!(least_length(number, None) <= least);
+        }
+    }
+}
+
+/// A key_ID and, as its key, the same number.
+fn numbered(number: u8, upper: bool) -> (String, Value) {
+    let id = format!("{number:02x}490419-7d60-487f-adc1-4ddcc177c139");
+    let shown = if upper { id.to_ascii_uppercase() } else { id.clone() };
+    (id, json!({"key_ID": shown, "key": encode(&[number; 4])}))
+}
+
 proptest! {
+    #[test]
+    fn keys_in_any_order_and_letter_case_come_back_as_asked(
+        order in Just((0..40_u8).map(|n| n.wrapping_mul(37)).collect::<Vec<_>>()).prop_shuffle(),
+        upper: [bool; 40],
+    ) {
+        let mut sorted = order.clone();
+        sorted.sort_unstable();
+        let ids: Vec<String> = sorted.iter().map(|n| numbered(*n, false).0).collect();
+        let came: Vec<Value> = order.iter().zip(upper).map(|(n, up)| numbered(*n, up).1).collect();
+        let container = parse(&json!({ "keys": came }), &Asked::Ids(&ids), Some(32)).unwrap();
+        for ((key, id), number) in container.keys.iter().zip(&ids).zip(&sorted) {
+            prop_assert_eq!(key.key_id(), id);
+            prop_assert_eq!(key.expose(), &[*number; 4]);
+        }
+        // One of them in another's place.
+        let mut other = came;
+        other[7]["key_ID"] = json!(ID_2);
+        let strange = parse(&json!({ "keys": other }), &Asked::Ids(&ids), Some(32));
+        prop_assert!(strange.is_err());
+        let again = other[8]["key_ID"].clone();
+        other[7]["key_ID"] = again;
+        let repeated = parse(&json!({ "keys": other }), &Asked::Ids(&ids), Some(32));
+        prop_assert!(repeated.is_err());
+    }
+
     #[test]
     fn any_bytes_are_parsed_without_panic(bytes: Vec<u8>) {
         let _ = key_container(&bytes, &Asked::Number(1), None, Quirks::STRICT);
