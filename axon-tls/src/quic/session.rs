@@ -307,3 +307,7 @@ fn transport_error(alert: Option<tls::AlertDescription>, err: &tls::Error) -> Tr
     };
     TransportError { code, frame: None, reason: err.to_string() }
 }
+
+#[cfg(test)]
+#[path = "rfc9001.rs"]
+mod rfc9001;
