@@ -29,6 +29,10 @@ impl Psk {
         self.cipher
     }
 
+    pub(super) fn new(psk: Arc<ExternalPsk>, cipher: Cipher) -> Self {
+        Self { psk, cipher }
+    }
+
     pub(crate) fn external(&self) -> Arc<ExternalPsk> {
         Arc::clone(&self.psk)
     }
@@ -62,7 +66,7 @@ pub fn derive_psk(
     };
     let secret = secret(key, [key_id, client_sae, server_sae, hash_name], len)?;
     let psk = ExternalPsk::new(identity.to_bytes(), secret, hash)?;
-    Ok(Psk { psk: Arc::new(psk), cipher })
+    Ok(Psk::new(Arc::new(psk), cipher))
 }
 
 fn secret(key: &[u8; 32], names: [&str; 4], len: usize) -> Result<Zeroizing<Vec<u8>>, Error> {

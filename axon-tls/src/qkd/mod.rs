@@ -8,6 +8,13 @@
 //!
 //! One key is for one connection.
 //!
+//! A peer that is not AXON, and knows nothing of that derivation, may speak the importer of RFC 9258
+//! instead: [`import_psk()`] makes the same kind of [`Psk`] that way, with the same binding to both
+//! names, and [`ImportedIdentity`] is what its server parses. A server that serves both kinds of
+//! clients looks at the first byte of an identity, which is `a` in one form and 0 in the other. Use
+//! [`derive_psk()`] wherever both ends are yours: its identity is printable, and AXON's daemons use
+//! no other. A key is used in one form, never in both.
+//!
 //! ```
 //! use axon_tls::qkd::{self, PskIdentity};
 //! use axon_tls::{Cipher, PskKex};
@@ -31,7 +38,9 @@
 mod config;
 mod derive;
 mod identity;
+mod imported;
 
 pub use config::{PskResolver, client_config, negotiated, server_config};
 pub use derive::{Psk, derive_psk};
 pub use identity::PskIdentity;
+pub use imported::{ImportedIdentity, import_psk};

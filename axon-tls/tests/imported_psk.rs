@@ -1,0 +1,113 @@
+//! A QKD key imported as RFC 9258 says: against rustls-axon's own importer, and never in place of the
+//! other form.
+
+use std::sync::Arc;
+
+use axon_tls::qkd::{
+    self, ImportedIdentity, Psk, PskIdentity, PskResolver, derive_psk, import_psk,
+};
+use axon_tls::{Cipher, KeyExchange, PskKex};
+use rustls_axon::crypto::CryptoProvider;
+use rustls_axon::crypto::aws_lc_rs::{cipher_suite, default_provider};
+use rustls_axon::crypto::hash::HashAlgorithm;
+use rustls_axon::external_psk::{ImportedIdentity as TlsIdentity, ImportedPsk, PskKeyExchangeMode};
+use rustls_axon::{ClientConfig, ClientConnection, Error, ServerConnection};
+use zeroize::Zeroizing;
+
+const KEY: [u8; 32] = [7; 32];
+const SERVER_SAE: &str = "base";
+
+/// A server that has one QKD key, and serves clients of both kinds.
+#[derive(Debug)]
+struct Base(Cipher);
+
+impl PskResolver for Base {
+    fn resolve(&self, identity: &[u8]) -> Option<Arc<Psk>> {
+        let psk = if identity.first() == Some(&0) {
+            let identity = ImportedIdentity::parse(identity).ok()?;
+            let wanted = (identity.key_id(), identity.server_sae(), identity.cipher());
+            if wanted != ("key-1", SERVER_SAE, self.0) {
+                return None;
+            }
+            import_psk(&KEY, "key-1", identity.client_sae(), SERVER_SAE, self.0)
+        } else {
+            let identity = PskIdentity::parse(identity).ok()?;
+            derive_psk(&KEY, identity.key_id(), identity.client_sae(), SERVER_SAE, self.0)
+        };
+        psk.ok().map(Arc::new)
+    }
+}
+
+fn handshake(client: ClientConfig, cipher: Cipher, kex: PskKex) -> Result<KeyExchange, Error> {
+    let name = "base".try_into().unwrap();
+    let mut client = ClientConnection::new(Arc::new(client), name).unwrap();
+    let server = qkd::server_config(Arc::new(Base(cipher)), cipher, kex, b"").unwrap();
+    let mut server = ServerConnection::new(Arc::new(server)).unwrap();
+    while client.is_handshaking() || server.is_handshaking() {
+        let mut records = Vec::new();
+        while client.wants_write() {
+            client.write_tls(&mut records).unwrap();
+        }
+        server.read_tls(&mut &records[..]).unwrap();
+        server.process_new_packets()?;
+        records.clear();
+        while server.wants_write() {
+            server.write_tls(&mut records).unwrap();
+        }
+        client.read_tls(&mut &records[..]).unwrap();
+        client.process_new_packets()?;
+    }
+    let [ours, theirs] = [qkd::negotiated(&client), qkd::negotiated(&server)];
+    assert_eq!(ours, theirs);
+    Ok(ours.unwrap().key_exchange)
+}
+
+#[test]
+fn both_kinds_of_clients_are_served() {
+    for cipher in Cipher::ALL {
+        for (kex, exchange) in
+            [(PskKex::PskKe, KeyExchange::PskKe), (PskKex::PskDheKe, KeyExchange::PskDheKe)]
+        {
+            for make in [derive_psk, import_psk] {
+                let psk = make(&KEY, "key-1", "robot", SERVER_SAE, cipher).unwrap();
+                let client = qkd::client_config(Arc::new(psk), kex, b"").unwrap();
+                assert_eq!(handshake(client, cipher, kex), Ok(exchange));
+            }
+        }
+    }
+}
+
+/// A stranger that knows RFC 9258 and the context alone, and nothing of this crate.
+#[test]
+fn a_stranger_imports_the_same() {
+    let import = |context: &[u8]| {
+        let identity = TlsIdentity::new(b"key-1", context, HashAlgorithm::SHA384).unwrap();
+        let suite = cipher_suite::TLS13_AES_128_GCM_SHA256.tls13().unwrap();
+        let psk = ImportedPsk::new(identity, &Zeroizing::new(KEY.to_vec()), suite).unwrap();
+        let provider = CryptoProvider {
+            cipher_suites: vec![cipher_suite::TLS13_AES_256_GCM_SHA384],
+            kx_groups: vec![],
+            ..default_provider()
+        };
+        ClientConfig::builder_with_provider(Arc::new(provider))
+            .with_external_psks(vec![psk.into()], PskKeyExchangeMode::PskKe)
+            .unwrap()
+    };
+    let run = |context| handshake(import(context), Cipher::Aes256Gcm, PskKex::PskKe);
+    for other in [&b""[..], b"\x00\x04base\x00\x05robot", b"\x00\x05robot\x00\x05other"] {
+        assert!(run(other).is_err(), "{}", other.escape_ascii());
+    }
+    assert_eq!(run(b"\x00\x05robot\x00\x04base"), Ok(KeyExchange::PskKe));
+}
+
+#[test]
+fn another_key_or_name_is_refused() {
+    let (cipher, kex) = (Cipher::default(), PskKex::PskKe);
+    for (key, key_id, server) in
+        [([8; 32], "key-1", "base"), (KEY, "key-2", "base"), (KEY, "key-1", "other")]
+    {
+        let psk = import_psk(&key, key_id, "robot", server, cipher).unwrap();
+        let client = qkd::client_config(Arc::new(psk), kex, b"").unwrap();
+        assert!(handshake(client, cipher, kex).is_err(), "{key_id}, {server}");
+    }
+}
