@@ -10,6 +10,8 @@ use axon_tls::identity::{Auth, CaMaterial, SigningKey, SpkiDigest, Trust, TrustF
 use axon_tls::qkd::{Psk, PskIdentity, PskResolver, derive_psk};
 use axon_tls::quic::{ALPN, hybrid_client, hybrid_server, qkd_client, qkd_server};
 use axon_tls::{Cipher, KeyExchange, PskKex};
+use common::pki::Authority;
+use common::stock;
 use common::{CLIENT_SAE, KEY_ID, OneKey, SERVER_SAE, connect, psk};
 use quinn::crypto::rustls::QuicClientConfig;
 use rustls::crypto::aws_lc_rs::{default_provider, kx_group};
@@ -213,6 +215,16 @@ async fn another_alpn_is_refused() {
     assert!(hybrid_server(&unauthenticated(), cipher, &[b'a'; 256]).is_err());
 }
 
+/// RFC 9001 section 8.1: a client that says nothing about ALPN is refused as one that says another.
+#[tokio::test]
+async fn no_alpn_is_refused() {
+    let ca = Authority::new();
+    let auth = ca.member(1, "axon", &ca, None);
+    let ours = hybrid_server(&auth, Cipher::default(), ALPN).unwrap();
+    let outcome = connect(stock::client(&ca, b"", false), ours).await;
+    assert_eq!(outcome.alert(), NO_APPLICATION_PROTOCOL);
+}
+
 #[tokio::test]
 async fn keys_that_are_not_pinned_are_refused() {
     let (ours, theirs, stranger) = (
@@ -230,53 +242,6 @@ async fn keys_that_are_not_pinned_are_refused() {
     let misled = hybrid_client(&pinned(&ours, stranger.spki_digest()), cipher, ALPN).unwrap();
     let outcome = connect(misled, server()).await;
     assert!(outcome.client.is_err() && outcome.server.is_err());
-}
-
-/// A certificate authority that signs end entities with the SAN that the tests connect with.
-struct Authority {
-    pem: String,
-    issuer: rcgen::Issuer<'static, rcgen::KeyPair>,
-}
-
-impl Authority {
-    fn new() -> Self {
-        let key = rcgen::KeyPair::generate().unwrap();
-        let mut params = rcgen::CertificateParams::new([]).unwrap();
-        params.is_ca = rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
-        params.key_usages =
-            vec![rcgen::KeyUsagePurpose::KeyCertSign, rcgen::KeyUsagePurpose::CrlSign];
-        let pem = params.self_signed(&key).unwrap().pem();
-        Self { pem, issuer: rcgen::Issuer::new(params, key) }
-    }
-
-    /// An end that trusts `roots` and shows a certificate of this authority.
-    fn member(&self, serial: u64, san: &str, roots: &Self, crl: Option<&str>) -> Auth {
-        let key = rcgen::KeyPair::generate().unwrap();
-        let mut params = rcgen::CertificateParams::new([san.to_owned()]).unwrap();
-        params.serial_number = Some(serial.into());
-        let certificate = params.signed_by(&key, &self.issuer).unwrap();
-        let material =
-            CaMaterial::from_pem(&roots.pem, &certificate.pem(), &key.serialize_pem(), crl);
-        Auth::Ca(Arc::new(material.unwrap()))
-    }
-
-    fn revoke(&self, serial: u64) -> String {
-        let year = |year| rcgen::date_time_ymd(year, 1, 1);
-        let params = rcgen::CertificateRevocationListParams {
-            this_update: year(2024),
-            next_update: year(2200),
-            crl_number: 1.into(),
-            issuing_distribution_point: None,
-            revoked_certs: vec![rcgen::RevokedCertParams {
-                serial_number: serial.into(),
-                revocation_time: year(2024),
-                reason_code: None,
-                invalidity_date: None,
-            }],
-            key_identifier_method: rcgen::KeyIdMethod::Sha256,
-        };
-        params.signed_by(&self.issuer).unwrap().pem().unwrap()
-    }
 }
 
 #[tokio::test]

@@ -1,6 +1,13 @@
 //! A quinn client and server in one process, and what the tests ask of them.
 #![allow(dead_code, reason = "each test file uses its own part")]
 
+pub(crate) mod hello;
+pub(crate) mod meddle;
+pub(crate) mod pair;
+pub(crate) mod pki;
+pub(crate) mod stock;
+pub(crate) mod wire;
+
 use std::fmt;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
