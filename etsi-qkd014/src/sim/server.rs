@@ -16,7 +16,7 @@ use tokio_rustls::server::TlsStream;
 use super::api;
 use super::fault::Fault;
 use super::handshake::{self, Acceptors, linger, refuse, until_gone};
-use super::http::{self, NoRequest};
+use super::http::{self, Answer, NoRequest};
 use super::network::{KmeState, Shared};
 use crate::subject;
 
@@ -42,6 +42,8 @@ pub(super) async fn serve(
     loop {
         while connections.try_join_next().is_some() {}
         let Ok((stream, _)) = listener.accept().await else {
+            // Most likely no more files may be open.
+            strangers.turn_away_old();
             tokio::time::sleep(Duration::from_millis(50)).await;
             continue;
         };
@@ -99,6 +101,13 @@ impl Strangers {
         self.0.front()
     }
 
+    fn turn_away_old(&mut self) {
+        while let Some(oldest) = self.oldest().filter(|oldest| oldest.since.elapsed() >= PATIENCE) {
+            oldest.task.abort();
+            self.0.pop_front();
+        }
+    }
+
     /// A place for one more connection.
     async fn make_room(&mut self, places: &Arc<Semaphore>) -> Option<OwnedSemaphorePermit> {
         if let Ok(place) = Arc::clone(places).try_acquire_owned() {
@@ -142,7 +151,7 @@ async fn connection(
         let request = match timeout(IDLE_TIME, http::read(&mut stream, &mut buffer)).await {
             Ok(Ok(request)) => request,
             Ok(Err(NoRequest::Refused(status, why))) => {
-                let answer = api::error(status, why, Vec::new());
+                let answer = Answer { close: true, ..api::error(status, why, Vec::new()) };
                 let write = http::write(&mut stream, &answer, None);
                 timeout(IDLE_TIME, write).await.unwrap_or(Ok(false))?;
                 return linger(stream).await;
