@@ -147,9 +147,8 @@ fn parse_line(line: &str) -> Result<Option<Pin>, &'static str> {
     if name.len() > 255 || !name.bytes().all(|byte| byte.is_ascii_graphic()) {
         return Err("a name has at most 255 printable ASCII characters");
     }
-    let key = digest
-        .parse()
-        .map_err(|_| "the key must be `spki-sha256:` and 44 characters of base64")?;
+    let key =
+        digest.parse().map_err(|_| "the key must be `spki-sha256:` and 44 characters of base64")?;
     let last = match day {
         Some(day) => {
             let end = end_of_day(day).ok_or("the last day must be a date YYYY-MM-DD")?;

@@ -119,7 +119,9 @@ impl Context {
                     Side::Client => material.accepts_server(&chain),
                     Side::Server => material.accepts_client(&chain),
                 };
-                accepted.err().map(|error| format!("its certificate is no longer accepted: {error}"))
+                accepted
+                    .err()
+                    .map(|error| format!("its certificate is no longer accepted: {error}"))
             }
             _ => None,
         }

@@ -69,9 +69,7 @@ impl Sources {
     pub(super) fn load(&self, before: Option<&Auth>) -> Result<Loaded, GatewayError> {
         Ok(match (&self.kind, before) {
             (Kind::None, Some(before)) => Loaded { auth: before.clone(), pins: None },
-            (Kind::None, None) => {
-                Loaded { auth: Auth::None(SigningKey::generate()?), pins: None }
-            }
+            (Kind::None, None) => Loaded { auth: Auth::None(SigningKey::generate()?), pins: None },
             (Kind::Pinned { key, trust }, before) => {
                 let pem = key.read()?;
                 let loaded = SigningKey::from_pem(text(key, &pem)?);
