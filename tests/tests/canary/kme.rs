@@ -6,6 +6,7 @@ use std::net::{TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, Command, Stdio};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use base64::Engine;
@@ -71,18 +72,22 @@ impl Kmes {
         self.settings(sae, &self.urls[usize::from(sae == "sae-b")])
     }
 
+    /// A file that the KMEs wrote, as `sae-a.key`.
+    pub(crate) fn file(&self, name: &str) -> PathBuf {
+        self.dir.path().join(name)
+    }
+
     /// Settings for the KME with the script.
     pub(crate) fn scripted(&self) -> ClientBuilder {
         self.settings("sae-a", &self.urls[2])
     }
 
     fn settings(&self, sae: &str, url: &str) -> ClientBuilder {
-        let file = |name: String| self.dir.path().join(name);
         Client::builder()
             .kme_url(url)
-            .ca_file(file("ca.pem".into()))
-            .sae_cert_file(file(format!("{sae}.crt")))
-            .sae_key_file(file(format!("{sae}.key")))
+            .ca_file(self.file("ca.pem"))
+            .sae_cert_file(self.file(&format!("{sae}.crt")))
+            .sae_key_file(self.file(&format!("{sae}.key")))
             .retry(RetryPolicy::none())
     }
 }
@@ -142,8 +147,10 @@ type Stream = StreamOwned<ServerConnection, TcpStream>;
 fn answer(mut stream: Stream) -> std::io::Result<()> {
     stream.sock.set_nodelay(true)?;
     loop {
-        let (script, keys) = request(&mut stream)?;
-        let body = container(&keys);
+        let (script, body) = match request(&mut stream)? {
+            Request::Status { script } => ("whole".to_owned(), status(&script)),
+            Request::Keys { script, keys } => (script, container(&keys)),
+        };
         let length = body.len();
         let mut head = "HTTP/1.1 200 OK\r\nContent-Type: application/json\r\n".to_owned();
         match script.as_str() {
@@ -156,7 +163,7 @@ fn answer(mut stream: Stream) -> std::io::Result<()> {
                 }
                 send(&mut stream, b"0\r\n\r\n")?;
             }
-            "cut" | "drip" => {
+            "cut" | "drip" | "new-drip" => {
                 head.push_str(&format!("Content-Length: {length}\r\n\r\n"));
                 head.push_str(&body[..length * 2 / 3]);
                 send(&mut stream, head.as_bytes())?;
@@ -189,8 +196,15 @@ fn send(stream: &mut Stream, bytes: &[u8]) -> std::io::Result<()> {
     stream.flush()
 }
 
-/// The script and the numbers of the keys to answer with.
-fn request(stream: &mut Stream) -> std::io::Result<(String, Vec<u64>)> {
+enum Request {
+    Status { script: String },
+    Keys { script: String, keys: Vec<u64> },
+}
+
+/// The script, and the numbers of the keys to answer with: the same in each call, or where the
+/// script asks for new ones, those that follow.
+fn request(stream: &mut Stream) -> std::io::Result<Request> {
+    static NEXT: AtomicU64 = AtomicU64::new(0);
     let mut head = Vec::new();
     while !head.ends_with(b"\r\n\r\n") {
         let mut byte = [0];
@@ -198,6 +212,10 @@ fn request(stream: &mut Stream) -> std::io::Result<(String, Vec<u64>)> {
         head.extend_from_slice(&byte);
     }
     let head = String::from_utf8(head).map_err(std::io::Error::other)?.to_ascii_lowercase();
+    let script = head.split('/').nth(4).unwrap_or_default().to_owned();
+    if head.starts_with("get ") {
+        return Ok(Request::Status { script });
+    }
     let length = head
         .lines()
         .find_map(|line| line.strip_prefix("content-length:")?.trim().parse().ok())
@@ -205,12 +223,21 @@ fn request(stream: &mut Stream) -> std::io::Result<(String, Vec<u64>)> {
     let mut body = vec![0; length];
     stream.read_exact(&mut body)?;
     let body: serde_json::Value = serde_json::from_slice(&body)?;
-    let script = head.split('/').nth(4).unwrap_or_default().to_owned();
     let number = match body["key_IDs"].as_array() {
         Some(ids) => ids.len() as u64,
         None => body["number"].as_u64().unwrap_or(1),
     };
-    Ok((script, (0..number).collect()))
+    let first =
+        if script.starts_with("new") { NEXT.fetch_add(number, Ordering::SeqCst) } else { 0 };
+    Ok(Request::Keys { script, keys: (first..first + number).collect() })
+}
+
+fn status(slave: &str) -> String {
+    format!(
+        r#"{{"source_KME_ID":"kme-a","target_KME_ID":"kme-b","master_SAE_ID":"sae-a",
+        "slave_SAE_ID":"{slave}","key_size":256,"stored_key_count":100000,"max_key_count":100000,
+        "max_key_per_request":1000,"max_key_size":256,"min_key_size":256,"max_SAE_ID_count":0}}"#
+    )
 }
 
 fn container(keys: &[u64]) -> String {

@@ -2,13 +2,16 @@
 //!
 //! Every block that is freed, or left behind by growing, between the making of a client and the
 //! end of its runtime is kept as it was and searched for each key of the call, raw and as base64.
+//! So is all that a pool held, and the private key of the SAE.
 //! None that etsi-qkd014 asked for may hold as much as eight bytes of one. Those of the TLS and
 //! HTTP libraries that do are listed by call site: a new one fails.
 //!
 //! Here and not with the crate, which forbids unsafe code: an allocator needs it.
 
 mod kme;
+mod pool;
 mod quarantine;
+mod sae_key;
 mod search;
 mod trace;
 
