@@ -1,11 +1,11 @@
 //! What a handshake costs: processor time of both ends, and bytes each way.
 //!
 //! ```text
-//! cargo bench -p axon-tls --features quic --bench handshake -- --out DIR
+//! cargo bench -p axon-tls --features quic --bench handshake -- --out ../docs/benchmarks
 //! ```
 //!
-//! prints the tables of `docs/benchmarks.md` and writes `handshake.json` and `handshake.svg` to `DIR`
-//! (the build's temporary directory if none is given). Client and server are in one thread and
+//! prints the tables of `docs/benchmarks.md` and writes `handshake.json` and `handshake.svg` to the
+//! directory, or to the build's temporary one if none is given. Client and server are in one thread and
 //! exchange buffers, so the time of a handshake is what both of them compute. All cases take turns
 //! within one run, batch by batch and beginning with another one each round, so that whatever
 //! disturbs the machine hits all of them; that is why this is no Criterion benchmark, which
