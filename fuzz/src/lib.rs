@@ -8,6 +8,7 @@
 pub mod config;
 pub mod envelope;
 pub mod kme;
+pub mod quic;
 pub mod tls;
 pub mod transport;
 
@@ -38,6 +39,11 @@ pub const TARGETS: &[Target] = &[
     Target { name: "trust_file", check: tls::trust_file, seeds: tls::trust_file_seeds },
     Target { name: "client_hello", check: tls::client_hello, seeds: tls::client_hello_seeds },
     Target { name: "server_hello", check: tls::server_hello, seeds: tls::server_hello_seeds },
+    Target {
+        name: "quic_handshake",
+        check: quic::quic_handshake,
+        seeds: quic::quic_handshake_seeds,
+    },
     Target { name: "status_response", check: kme::status_response, seeds: kme::status_seeds },
     Target { name: "key_container", check: kme::key_container, seeds: kme::container_seeds },
     Target { name: "error_response", check: kme::error_response, seeds: kme::error_seeds },

@@ -5,16 +5,22 @@ use std::{sync::Arc, time::SystemTime};
 use axon_tls::{
     Cipher, PskKex,
     identity::{SpkiDigest, TrustFile},
-    qkd::{self, Psk, PskIdentity, PskResolver},
+    qkd::{self, ImportedIdentity, Psk, PskIdentity, PskResolver},
 };
 use rustls_axon::{ClientConnection, ServerConnection};
 
-/// What parses is the one spelling of its two names; and any two names that make an identity come
-/// back from it.
+/// What parses, as an identity of either form, is the one spelling of its names; and any two names
+/// that make an identity come back from it.
 pub fn psk_identity(data: &[u8]) -> bool {
     let mut accepted = false;
     if let Ok(identity) = PskIdentity::parse(data) {
         assert_eq!(identity.to_bytes(), data);
+        accepted = true;
+    }
+    if let Ok(identity) = ImportedIdentity::parse(data) {
+        let names = (identity.key_id(), identity.client_sae(), identity.server_sae());
+        let psk = qkd::import_psk(&[7; 32], names.0, names.1, names.2, identity.cipher()).unwrap();
+        assert_eq!(psk.identity(), data, "an identity with a second spelling");
         accepted = true;
     }
     let Ok(text) = std::str::from_utf8(data) else { return accepted };
@@ -48,12 +54,12 @@ pub fn trust_file(data: &[u8]) -> bool {
     true
 }
 
-fn psk(cipher: Cipher) -> Arc<Psk> {
+pub(crate) fn psk(cipher: Cipher) -> Arc<Psk> {
     Arc::new(qkd::derive_psk(&[7; 32], "key", "sae-a", "sae-b", cipher).unwrap())
 }
 
 #[derive(Debug)]
-struct OneKey(Cipher);
+pub(crate) struct OneKey(pub(crate) Cipher);
 
 impl PskResolver for OneKey {
     fn resolve(&self, identity: &[u8]) -> Option<Arc<Psk>> {
@@ -137,11 +143,16 @@ pub fn server_hello_seeds() -> Vec<Vec<u8>> {
         .collect()
 }
 
-/// Plain names, and names that are percent-encoded.
+/// Plain names, names that are percent-encoded, and imported ones.
 pub fn psk_identity_seeds() -> Vec<Vec<u8>> {
+    let imported = Cipher::ALL.map(|cipher| {
+        let psk = qkd::import_psk(&[7; 32], "key", "sae-a", "sae-b", cipher).unwrap();
+        psk.identity().to_vec()
+    });
     [("sae-a", "bc490419-7d60-487f-adc1-4ddcc177c139"), ("robot 7:\u{f6}", "a/b=="), ("s", "k")]
         .into_iter()
         .map(|(sae, key_id)| PskIdentity::new(sae, key_id).unwrap().to_bytes())
+        .chain(imported)
         .collect()
 }
 
