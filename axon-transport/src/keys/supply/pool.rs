@@ -67,8 +67,9 @@ impl Pool {
 
     /// The next call, if any.
     pub(super) fn poll(&mut self, now: Duration, peer: &str) -> Option<Request> {
+        let ask = self.core.poll(now)?;
         let slave = peer.to_owned();
-        Some(match self.core.poll(now)? {
+        Some(match ask {
             Ask::Status => Request::Status { slave },
             Ask::Keys(number) => {
                 Request::Enc { slave, number, purpose: Purpose::Messages, timeout: TIMEOUT }

@@ -230,7 +230,7 @@ impl Sender {
         self.ready.iter().map(Sealer::overhead).max().unwrap_or(MAX_HEADER_LEN + TAG_LEN)
     }
 
-    /// How many messages could be sealed now.
+    /// How many messages could be sealed now, as the keys to keep were last planned.
     pub fn available(&self, delivery: Delivery) -> u32 {
         if self.allowed(delivery).is_err() {
             return 0;
