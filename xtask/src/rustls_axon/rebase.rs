@@ -13,6 +13,8 @@ mod fit;
 mod pin;
 mod review;
 mod suite;
+#[cfg(test)]
+mod tests;
 
 /// What to do.
 pub(crate) struct Options<'a> {

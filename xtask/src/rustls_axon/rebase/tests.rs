@@ -1,0 +1,259 @@
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use super::*;
+
+/// A release that is neither the pinned one nor refused, and that the patches do not fit.
+const OTHER: &str = "0.23.45";
+
+#[test]
+fn what_must_not_be_moved_to_is_refused_with_the_reason() {
+    for release in 13..=44 {
+        let error = admit(&format!("0.23.{release}")).unwrap_err();
+        assert!(error.contains("RUSTSEC-2026-0285"), "{error}");
+    }
+    for version in [
+        "",
+        "0.23",
+        "0.23.",
+        "0.23.x",
+        "0.23.046",
+        "0.23.46 ",
+        "0.23.46-rc.1",
+        "0.23.46+1",
+        "0.22.4",
+        "0.24.0",
+        "0.24.0-dev.2",
+        "1.0.0",
+        "=0.23.46",
+        "v0.23.46",
+        "0.23.-1",
+        "0.23.+46",
+        "0.23.99999999999",
+    ] {
+        let error = admit(version).unwrap_err();
+        assert!(error.contains("is not a release of rustls 0.23"), "{error}");
+    }
+    for version in ["0.23.0", "0.23.12", "0.23.45", "0.23.46", "0.23.100"] {
+        admit(version).unwrap();
+    }
+}
+
+const BEFORE: &str = "one\ntwo\nthree\nfour\nfive\nsix\nseven\n";
+const PATCH: &str = "\
+Why
+
+diff --git a/src/a.rs b/src/a.rs
+--- a/src/a.rs
++++ b/src/a.rs
+@@ -1,3 +1,4 @@
+ one
++one and a half
+ two
+ three
+@@ -5,3 +6,3 @@
+ five
+-six
++SIX
+ seven
+";
+
+fn misfits(before: &str) -> (Vec<String>, String) {
+    let mut tree = BTreeMap::from([("a.rs".to_owned(), before.to_owned())]);
+    let list = fit::misfits(&mut tree, "0001-x.patch", PATCH);
+    (list, tree.remove("a.rs").unwrap())
+}
+
+#[test]
+fn every_hunk_that_does_not_fit_is_listed_with_file_and_line() {
+    let after = BEFORE.replace("two", "one and a half\ntwo").replace("six", "SIX");
+    assert_eq!(misfits(BEFORE), (vec![], after.clone()));
+
+    let (list, moved) = misfits(&format!("zero\n{BEFORE}"));
+    assert_eq!(
+        list,
+        [
+            "patches/0001-x.patch, line 6: src/a.rs:1: has moved to line 2, unchanged",
+            "patches/0001-x.patch, line 11: src/a.rs:5: has moved to line 6, unchanged",
+        ]
+    );
+    assert_eq!(moved, format!("zero\n{after}"), "later patches are judged on this");
+
+    let (list, moved) = misfits(&BEFORE.replace("two", "2"));
+    assert_eq!(list, ["patches/0001-x.patch, line 6: src/a.rs:1: line 2 is `2`, not `two`"]);
+    assert_eq!(moved, BEFORE.replace("two", "2").replace("six", "SIX"));
+
+    let (list, _) = misfits("one\ntwo\nthree\nfour\nfive\nsix");
+    assert_eq!(
+        list,
+        ["patches/0001-x.patch, line 11: src/a.rs:5: the file ends before line 7, `seven`"]
+    );
+    let (list, _) = misfits(&format!("{BEFORE}{BEFORE}").replacen("one", "1", 1));
+    let first = "patches/0001-x.patch, line 6: src/a.rs:1: has moved to line 8, unchanged";
+    assert_eq!(list, [first]);
+    let (list, _) = misfits(&format!("0\n{BEFORE}{BEFORE}"));
+    assert!(list[0].ends_with("src/a.rs:1: fits 2 places, line 2 first"), "{list:?}");
+
+    let list = fit::misfits(&mut BTreeMap::new(), "0001-x.patch", PATCH);
+    assert_eq!(list, ["patches/0001-x.patch: src/a.rs does not exist"]);
+}
+
+#[test]
+fn a_failed_write_leaves_everything_as_it_was() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path();
+    for (name, contents) in [("a", "old a"), ("b", "old b"), ("Cargo.lock", "old lock")] {
+        fs::write(root.join(name), contents).unwrap();
+    }
+    let before = files(root);
+
+    let mut edits = pin::Edits::new(root);
+    assert!(edits.replace("a", "missing", "x").unwrap_err().contains("0 times"));
+    edits.replace("a", "old", "new").unwrap();
+    edits.replace("a", "new", "newer").unwrap();
+    edits.replace("b", "old b", "old b").unwrap();
+    assert_eq!(edits.names(), ["a"], "what is right already is no edit");
+    let written = edits.write().unwrap();
+    assert_eq!(fs::read_to_string(root.join("a")).unwrap(), "newer a");
+    fs::write(root.join("Cargo.lock"), "new lock").unwrap();
+    drop(written);
+    assert_eq!(files(root), before);
+
+    // the second of them cannot be written
+    let mut edits = pin::Edits::new(root);
+    edits.replace("a", "old", "new").unwrap();
+    edits.replace("b", "old", "new").unwrap();
+    fs::remove_file(root.join("b")).unwrap();
+    fs::create_dir(root.join("b")).unwrap();
+    assert!(edits.write().is_err());
+    assert_eq!(fs::read_to_string(root.join("a")).unwrap(), "old a");
+}
+
+#[test]
+fn outcomes_are_counted_by_name() {
+    let output = "\nrunning 4 tests\ntest a::b ... ok\ntest c - should panic ... ok\n\
+                  test d ... ignored, because\ntest a::b ... FAILED\n\ntest result: FAILED. 2 passed\n";
+    let outcomes = suite::parse(output);
+    assert_eq!(suite::counts(&outcomes), [2, 1, 1]);
+    assert_eq!(outcomes["a::b"].len(), 2);
+}
+
+/// Every file below `dir`, but what cargo keeps for itself.
+fn files(dir: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = BTreeMap::new();
+    for entry in fs::read_dir(dir).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            found.extend(files(&path));
+        } else {
+            let contents = fs::read(&path).unwrap();
+            found.insert(path, contents);
+        }
+    }
+    found
+}
+
+/// A workspace with rustls-axon alone, as it is here. `None` without a registry.
+fn small_workspace() -> Option<tempfile::TempDir> {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path();
+    let krate = workspace().join(CRATE);
+    for (path, contents) in files(&krate) {
+        let name = path.strip_prefix(&krate).unwrap();
+        if name.starts_with("patched") || name.starts_with("target") {
+            continue;
+        }
+        let to = root.join(CRATE).join(name);
+        fs::create_dir_all(to.parent().unwrap()).unwrap();
+        fs::write(to, contents).unwrap();
+    }
+    let manifest = fs::read_to_string(workspace().join("Cargo.toml")).unwrap();
+    let (_, rest) = manifest.split_once("[workspace.package]").unwrap();
+    let rest = rest.split("\n[workspace.lints").next().unwrap();
+    let members = format!("[workspace]\nresolver = \"3\"\nmembers = [\"{CRATE}\"]\n");
+    fs::write(root.join("Cargo.toml"), format!("{members}\n[workspace.package]{rest}\n")).unwrap();
+    fs::create_dir(root.join("docs")).unwrap();
+    for name in ["Cargo.lock", "docs/rustls-axon.md"] {
+        fs::copy(workspace().join(name), root.join(name)).unwrap();
+    }
+
+    let fetched = std::process::Command::new(cargo())
+        .args(["update", "--workspace", "--quiet"])
+        .current_dir(root)
+        .output()
+        .unwrap();
+    if fetched.status.success() && fetch(&root.join(CRATE), OTHER).is_ok() {
+        return Some(dir);
+    }
+    println!("skipped, no registry: {}", String::from_utf8_lossy(&fetched.stderr));
+    None
+}
+
+#[test]
+fn only_a_release_that_every_patch_fits_is_moved_to() {
+    let Some(dir) = small_workspace() else { return };
+    let root = dir.path();
+    let before = files(root);
+    let pinned = upstream::pinned_version(&root.join(CRATE)).unwrap();
+
+    let report = rebase_in(root, &Options::new(&pinned)).unwrap();
+    assert!(report.ends_with("nothing to change: this is the pinned release"), "{report}");
+
+    let error = rebase_in(root, &Options::new(OTHER)).unwrap_err();
+    assert!(error.contains("nothing was changed"), "{error}");
+    assert!(
+        error.contains("\n  patches/0007-") && error.contains(": src/client/tls13.rs:"),
+        "{error}"
+    );
+
+    let error = rebase_in(root, &Options::new("0.23.4000000000")).unwrap_err();
+    assert!(error.contains("cannot be had"), "{error}");
+    assert_eq!(files(root), before);
+}
+
+/// The way back and forth: a workspace that is pinned to another release comes out as this one is.
+#[test]
+fn a_move_to_the_pinned_release_gives_this_workspace() {
+    let Some(dir) = small_workspace() else { return };
+    let (root, here) = (dir.path(), files(dir.path()));
+    let pinned = upstream::pinned_version(&root.join(CRATE)).unwrap();
+    let other = tree::read_dir(&fetch(&root.join(CRATE), OTHER).unwrap()).unwrap();
+
+    // as if the patches had been made for the other release
+    let mut edits = pin::Edits::new(root);
+    let patches = tree::read_patches(&root.join(CRATE)).unwrap();
+    pin::plan(&mut edits, (&pinned, OTHER), &other, &Tree::new(), &patches).unwrap();
+    edits.write().unwrap().keep();
+    pin::update_locks(root, OTHER).unwrap();
+    let there = files(root);
+
+    let options = Options { dry_run: true, ..Options::new(&pinned) };
+    let report = rebase_in(root, &options).unwrap();
+    assert!(report.contains("dry run, nothing was changed"), "{report}");
+    assert_eq!(files(root), there);
+
+    // what the last step finds out puts back what the steps before did
+    let lock = root.join("fuzz/Cargo.lock");
+    fs::create_dir_all(lock.parent().unwrap()).unwrap();
+    fs::write(&lock, format!("\nname = \"rustls\"\nversion = \"{OTHER}\"\n")).unwrap();
+    let error = rebase_in(root, &Options::new(&pinned)).unwrap_err();
+    assert!(error.contains("fuzz/Cargo.lock cannot be moved"), "{error}");
+    fs::remove_dir_all(lock.parent().unwrap()).unwrap();
+    assert_eq!(files(root), there);
+
+    let report = rebase_in(root, &Options::new(&pinned)).unwrap();
+    for part in [
+        &*format!("review list, rustls {OTHER} to {pinned}"),
+        "  src/client/hs.rs  +",
+        "  patches 0005, 0006",
+        "src/client/tls13.rs:",
+    ] {
+        assert!(report.contains(part), "no {part}: {report}");
+    }
+    let now = files(root);
+    assert_eq!(now.keys().collect::<Vec<_>>(), here.keys().collect::<Vec<_>>());
+    for (path, contents) in here {
+        assert!(now[&path] == contents, "{}", path.display());
+    }
+}
