@@ -31,6 +31,15 @@ pub trait PskResolver: Debug + Send + Sync {
 /// is empty. The cipher is the one that the key was derived for.
 pub fn client_config(psk: Arc<Psk>, kex: PskKex, alpn: &[u8]) -> Result<ClientConfig, Error> {
     let provider = provider(psk.cipher(), kex);
+    client_config_with(provider, psk, kex, alpn)
+}
+
+pub(super) fn client_config_with(
+    provider: CryptoProvider,
+    psk: Arc<Psk>,
+    kex: PskKex,
+    alpn: &[u8],
+) -> Result<ClientConfig, Error> {
     let mut config = ClientConfig::builder_with_provider(Arc::new(provider))
         .with_external_psks(vec![psk.external()], mode(kex))?;
     config.alpn_protocols = protocols(alpn)?;
@@ -47,7 +56,16 @@ pub fn server_config(
     kex: PskKex,
     alpn: &[u8],
 ) -> Result<ServerConfig, Error> {
-    let mut config = ServerConfig::builder_with_provider(Arc::new(provider(cipher, kex)))
+    server_config_with(provider(cipher, kex), resolver, kex, alpn)
+}
+
+pub(super) fn server_config_with(
+    provider: CryptoProvider,
+    resolver: Arc<dyn PskResolver>,
+    kex: PskKex,
+    alpn: &[u8],
+) -> Result<ServerConfig, Error> {
+    let mut config = ServerConfig::builder_with_provider(Arc::new(provider))
         .with_external_psk_resolver(Arc::new(FirstKnown(resolver)), mode(kex))?;
     config.alpn_protocols = protocols(alpn)?;
     Ok(config)
@@ -76,7 +94,7 @@ pub fn negotiated(conn: &CommonState) -> Option<Negotiated> {
     })
 }
 
-fn provider(cipher: Cipher, kex: PskKex) -> CryptoProvider {
+pub(super) fn provider(cipher: Cipher, kex: PskKex) -> CryptoProvider {
     CryptoProvider {
         cipher_suites: vec![suite(cipher)],
         kx_groups: match kex {

@@ -38,6 +38,8 @@
 mod config;
 mod derive;
 mod identity;
+#[cfg(test)]
+mod recorded;
 mod imported;
 
 pub use config::{PskResolver, client_config, negotiated, server_config};
