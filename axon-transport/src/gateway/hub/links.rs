@@ -52,17 +52,16 @@ impl Hub {
         let daemon = established.hello.daemon;
         let number = established.number;
         let current = self.peers.get(&daemon).and_then(|p| self.links.get(&p.link));
+        // The handshake may have gone by files that have changed since.
+        let Established { connection, negotiated, side, .. } = &established;
+        if let Some(why) = self.context.distrust(connection, negotiated, *side, true) {
+            return self.turn_away(established, why).await;
+        }
         // Daemon ids are public: beacons carry them. Who has a link keeps it against anyone who
         // proves to be somebody else.
         let who = Who::of(&self.context, &established.hello, &established.negotiated);
         if current.is_some_and(|c| !c.established.who.is(&who)) {
-            close(&established.connection, CloseCode::NotAllowed, TAKEN);
-            self.forget(&established);
-            let peer = peer_text(
-                established.hello.sae.as_deref(),
-                established.connection.remote_address(),
-            );
-            return self.refused(peer, Refusal::here(CloseCode::NotAllowed, TAKEN)).await;
+            return self.turn_away(established, TAKEN.into()).await;
         }
         if current.is_none() && self.links.len() >= MAX_LINKS {
             let text = "this daemon has as many links as it may";
@@ -93,6 +92,14 @@ impl Hub {
                 let _ = events.send(Event::Unelected(number)).await;
             });
         }
+    }
+
+    async fn turn_away(&self, established: Established, why: String) {
+        close(&established.connection, CloseCode::NotAllowed, &why);
+        self.forget(&established);
+        let sae = established.hello.sae.as_deref();
+        let peer = peer_text(sae, established.connection.remote_address());
+        self.refused(peer, Refusal::here(CloseCode::NotAllowed, why)).await;
     }
 
     /// The connection does not become a link: its keys are let go.
