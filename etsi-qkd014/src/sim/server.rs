@@ -121,6 +121,8 @@ impl Strangers {
                 place = &mut place => return place.ok(),
                 () = sleep_until(oldest.since + PATIENCE) => oldest.task.abort(),
             }
+            // It is gone, even if its task does not say so yet.
+            self.0.pop_front();
         }
         place.await.ok()
     }
