@@ -136,17 +136,15 @@ pub fn quic_handshake(data: &[u8]) -> bool {
 
     let mut pair = Pair::new(server);
     pair.dial(client);
-    let mut datagrams = 0;
     // a lie may leave both ends with something to say to each other for long
-    for _ in 0..50 {
-        if input.change == Change::Datagram && datagrams == input.position {
+    for step in 0..50 {
+        if input.change == Change::Datagram && step == input.position {
             let (from, to) = match input.of {
                 Side::Client => (&pair.client, &mut pair.server),
                 Side::Server => (&pair.server, &mut pair.client),
             };
             to.receive(pair.now, from.address, input.data);
         }
-        datagrams += 1;
         if !pair.step(|_, _| {}) {
             break;
         }
