@@ -132,7 +132,9 @@ impl ClientProof {
         let invalid = |text: &str| Failure { kind: FailureKind::Invalid, text: text.to_owned() };
         let failure = match answer.outcome {
             Ok(Fetched::Keys(mut keys)) => match keys.pop() {
-                Some((key_id, key)) if keys.is_empty() && message::announceable(&key_id).is_some() => {
+                Some((key_id, key))
+                    if keys.is_empty() && message::announceable(&key_id).is_some() =>
+                {
                     self.step = Step::Announce(key_id, key);
                     return;
                 }
