@@ -1,5 +1,7 @@
 //! `kme-sim probe` against KMEs that hold to the specification and KMEs that do not.
 
+mod probing;
+
 use std::path::Path;
 use std::process::Command;
 
@@ -21,12 +23,8 @@ async fn site() -> Site {
 
 /// Whether the probe said that all passed, and its table.
 fn probe(env: &[(&str, String)], args: &[&str]) -> (bool, String) {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_kme-sim"));
-    command.arg("probe").args(["--slave-sae", "sae-b"]).args(args).env_clear();
-    let output = command.envs(env.iter().map(|(name, value)| (name, value))).output().unwrap();
-    let text = String::from_utf8([output.stdout, output.stderr].concat()).unwrap();
-    assert!(matches!(output.status.code(), Some(0 | 1)), "{text}");
-    (output.status.success(), text)
+    let probed = probing::probe(env, args);
+    (probed.passed, probed.text)
 }
 
 impl Site {
@@ -114,11 +112,7 @@ async fn a_deviation_with_a_quirk_is_named_by_it() {
 impl Site {
     /// The slave's environment as `kme-sim init` prints it.
     fn slave_env(&self) -> String {
-        let line = |(name, value): (&str, String)| format!("export {name}='{value}'\n");
-        let all = ["sae-a", "sae-b"].map(|sae| self.env(sae).into_iter().map(line).collect());
-        let file = self.dir.path().join("environment");
-        std::fs::write(&file, all.map(|of: String| of).concat()).unwrap();
-        file.display().to_string()
+        probing::env_file(self.dir.path(), &["sae-a", "sae-b"].map(|sae| self.env(sae)))
     }
 }
 

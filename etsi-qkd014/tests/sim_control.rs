@@ -128,6 +128,31 @@ async fn faults_are_set_added_listed_and_cleared_and_met() {
     assert!(kmes.contains("\"status_calls\":3") && kmes.contains(network.kmes()[1].url()));
 }
 
+#[tokio::test]
+async fn a_certificate_expires_and_is_renewed_at_run_time() {
+    let (network, addr) = network().await;
+    let status = async || {
+        // A connection that is open already would not be met.
+        let client = network.client_builder("sae-a").retry(etsi_qkd014::RetryPolicy::none());
+        client.build().unwrap().status("sae-b").await.map(drop).map_err(|error| error.to_string())
+    };
+    for (plan, said) in [
+        ("certificate-expired", "the KME's certificate has expired"),
+        ("certificate-not-yet-valid", "the KME's certificate is not valid yet"),
+    ] {
+        let set = request(addr, "PUT /faults/kme-a", &format!("[\"{plan}\"]"));
+        assert_eq!(send(addr, &set).await, (200, format!("[\"{plan}\"]")));
+        for _ in 0..2 {
+            let error = status().await.unwrap_err();
+            assert!(error.contains(said), "{error}");
+        }
+        assert_eq!(send(addr, &request(addr, "DELETE /faults/kme-a", "")).await.0, 200);
+        status().await.unwrap();
+        let on = request(addr, "PUT /faults/kme-a", &format!("[\"{plan},on=status\"]"));
+        assert_eq!(send(addr, &on).await.0, 400, "it meets connections, not methods");
+    }
+}
+
 struct Killed(Child);
 
 impl Drop for Killed {

@@ -1,44 +1,18 @@
 //! The simulator's answers byte by byte: the words of the specification, and no leniency that a
-//! client could come to rely on. A plain TLS connection asks, so that this crate's client corrects
-//! nothing on the way.
+//! client could come to rely on.
 
-use std::sync::Arc;
+mod raw;
 
 use etsi_qkd014::RetryPolicy;
 use etsi_qkd014::sim::{FillRate, Network, NetworkBuilder};
-use rustls_pki_types::pem::PemObject;
-use rustls_pki_types::{CertificateDer, PrivateKeyDer, ServerName};
+use raw::Answer;
 use serde_json::{Value, json};
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::TcpStream;
-use tokio_rustls::TlsConnector;
-use tokio_rustls::client::TlsStream;
 
 fn three() -> NetworkBuilder {
     Network::builder()
         .kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a", "sae-d"])
         .kme("kme-b", "127.0.0.2:0".parse().unwrap(), ["sae-b"])
         .kme("kme-c", "127.0.0.3:0".parse().unwrap(), ["sae-c"])
-}
-
-/// A TLS connection to the KME of an SAE, with that SAE's certificate.
-async fn connect(network: &Network, sae: &str) -> TlsStream<TcpStream> {
-    let sae = network.sae(sae).unwrap();
-    let certificate = |pem: &str| CertificateDer::from_pem_slice(pem.as_bytes()).unwrap();
-    let mut roots = rustls::RootCertStore::empty();
-    roots.add(certificate(sae.ca_pem())).unwrap();
-    let key = PrivateKeyDer::from_pem_slice(sae.key_pem().as_bytes()).unwrap();
-    let provider = Arc::new(rustls::crypto::aws_lc_rs::default_provider());
-    let config = rustls::ClientConfig::builder_with_provider(provider)
-        .with_safe_default_protocol_versions()
-        .unwrap()
-        .with_root_certificates(roots)
-        .with_client_auth_cert(vec![certificate(sae.cert_pem())], key)
-        .unwrap();
-    let addr = network.kme(sae.kme_id()).unwrap().addr();
-    let stream = TcpStream::connect(addr).await.unwrap();
-    let name = ServerName::from(addr.ip());
-    TlsConnector::from(Arc::new(config)).connect(name, stream).await.unwrap()
 }
 
 struct Got {
@@ -51,37 +25,17 @@ struct Got {
 
 /// Sends `request` as it is and reads one answer.
 async fn exchange(network: &Network, sae: &str, request: &str) -> Got {
-    let mut stream = connect(network, sae).await;
-    stream.write_all(request.as_bytes()).await.unwrap();
-    let mut bytes = Vec::new();
-    let (head, length, at) = loop {
-        assert!(stream.read_buf(&mut bytes).await.unwrap() > 0, "closed without an answer");
-        let text = String::from_utf8_lossy(&bytes).into_owned();
-        if let Some((head, _)) = text.split_once("\r\n\r\n") {
-            let header = |line: &str| line.strip_prefix("Content-Length: ")?.parse::<usize>().ok();
-            let length = head.lines().find_map(header).expect("Content-Length");
-            break (head.to_owned(), length, head.len() + 4);
-        }
-    };
-    while bytes.len() < at + length {
-        assert!(stream.read_buf(&mut bytes).await.unwrap() > 0, "cut");
-    }
-    let status = head.split(' ').nth(1).unwrap().parse().unwrap();
-    let body = serde_json::from_slice(&bytes[at..]).unwrap();
+    let mut connection = raw::connect(network, sae).await;
+    connection.send(request).await.unwrap();
+    let Answer { status, head, body } = connection.answer().await.expect("an answer");
     // A second request is answered where the connection lives on.
-    let again = format!("GET {} HTTP/1.1\r\nHost: x\r\n\r\n", "/api/v1/keys/sae-b/status");
-    let _ = stream.write_all(again.as_bytes()).await;
-    let closed = !matches!(stream.read(&mut [0; 16]).await, Ok(1..));
+    let _ = connection.send(&raw::get("sae-b/status")).await;
+    let closed = connection.answer().await.is_none();
     Got { status, head, body, closed }
 }
 
 async fn post(network: &Network, sae: &str, path: &str, body: &str) -> Got {
-    let length = body.len();
-    let request = format!(
-        "POST /api/v1/keys/{path} HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n\
-         Content-Length: {length}\r\n\r\n{body}"
-    );
-    exchange(network, sae, &request).await
+    exchange(network, sae, &raw::post(path, body)).await
 }
 
 async fn enc_keys(network: &Network, body: &str) -> Got {

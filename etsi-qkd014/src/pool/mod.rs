@@ -23,7 +23,7 @@ use tokio::time::{Instant, timeout_at};
 pub use self::core::{Ask, Core, FailureClass, PoolStatus, Settings, Stock};
 pub use ledger::{Ledger, LedgerError};
 
-use crate::{Client, Error, Key};
+use crate::{Client, Error, Key, RetryPolicy};
 
 /// Keys drawn ahead for one peer SAE, each handed out once.
 ///
@@ -35,8 +35,8 @@ use crate::{Client, Error, Key};
 /// Cheap to clone: all clones are one pool, usable from any task or thread. When the last clone is
 /// dropped, the task ends and keys that nobody took are dropped and zeroized.
 ///
-/// The task makes each call once and waits after failures by itself, so set no repeats of
-/// `enc_keys` in the client's [`RetryPolicy`](crate::RetryPolicy).
+/// The task makes each call once and waits after failures by rules of its own; the client's
+/// [`RetryPolicy`] does not apply.
 ///
 /// ```no_run
 /// # async fn example(client: etsi_qkd014::Client) -> Result<(), Box<dyn std::error::Error>> {
@@ -148,6 +148,8 @@ impl KeyPoolBuilder {
     /// outside a runtime.
     pub fn build(self) -> Result<KeyPool, Error> {
         let Self { client, peer, size, settings, ledger } = self;
+        // The pool repeats by its own rules; the client's within them would multiply.
+        let client = client.with_retry(RetryPolicy::none());
         client.url(&peer, "enc_keys")?;
         if size.is_some_and(|bits| bits == 0 || !bits.is_multiple_of(8)) {
             let reason = "size: a positive multiple of 8 bits".to_owned();
