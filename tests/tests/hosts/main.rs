@@ -3,6 +3,7 @@
 
 mod delivery;
 mod hostile;
+mod identity;
 mod mismatch;
 mod mode;
 mod pair;

@@ -1,9 +1,11 @@
 //! The ways in which two hosts may be set up.
 
-use std::{fs, os::unix::fs::PermissionsExt, path::Path};
+use std::{fs, path::Path};
 
 use axon_tls::identity::SigningKey;
 use etsi_qkd014::sim;
+
+use super::pair::write_key;
 
 /// Variables and their values.
 pub(crate) type Settings = Vec<(&'static str, String)>;
@@ -73,8 +75,7 @@ pub(crate) fn pinned(dir: &Path, trusts: [[bool; 2]; 2]) -> [Settings; 2] {
     let stranger = SigningKey::generate().unwrap().spki_digest();
     [0, 1].map(|host| {
         let key = dir.join(format!("host-{host}.key"));
-        fs::write(&key, pems[host].as_bytes()).unwrap();
-        fs::set_permissions(&key, fs::Permissions::from_mode(0o600)).unwrap();
+        write_key(&key, &pems[host]);
         let mut lines = format!("stranger {stranger}\n");
         for (peer, pin) in pins.iter().enumerate().filter(|(peer, _)| trusts[host][*peer]) {
             lines += &format!("host-{peer} {pin}\n");

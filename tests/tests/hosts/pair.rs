@@ -4,6 +4,8 @@ use std::{
     ffi::OsString,
     fs,
     net::Ipv4Addr,
+    os::unix::fs::PermissionsExt,
+    path::Path,
     process::{Command, Stdio},
     sync::atomic::{AtomicU32, Ordering},
 };
@@ -94,7 +96,8 @@ impl Host {
         Self { name, address, dir, env, daemon: None }
     }
 
-    fn start(&mut self) {
+    /// Starts its daemon, which has none.
+    pub(crate) fn start(&mut self) {
         let mut command = self.command(env!("CARGO_BIN_EXE_axon-test-daemon"));
         command.arg("--while-stdin").stdin(Stdio::piped()).stdout(Stdio::null());
         self.daemon = Some(Kept(command.spawn().unwrap()));
@@ -171,6 +174,15 @@ impl Host {
         });
     }
 
+    /// Waits for a line of its daemon's log that has all of this.
+    #[track_caller]
+    pub(crate) fn wait_log(&self, parts: &[&str]) {
+        until(&format!("{parts:?} in the log"), || {
+            let log = self.all_logs();
+            log.lines().any(|line| parts.iter().all(|part| line.contains(part)))
+        });
+    }
+
     /// Whether its daemon is the process that it was started with.
     pub(crate) fn is_first_daemon(&self) -> bool {
         self.daemon.as_ref().is_some_and(|daemon| daemon.0.id() == self.status().pid)
@@ -196,10 +208,14 @@ impl Host {
         Node::start(command)
     }
 
-    fn logs(&self) -> String {
+    fn all_logs(&self) -> String {
         let spawned = self.dir.path().join(format!("run/axon-{}.log", self.domain()));
-        let logs = [self.log(), spawned].map(|log| fs::read_to_string(log).unwrap_or_default());
-        let lines: Vec<&str> = logs.iter().flat_map(|log| log.lines()).collect();
+        [self.log(), spawned].map(|log| fs::read_to_string(log).unwrap_or_default()).concat()
+    }
+
+    fn logs(&self) -> String {
+        let logs = self.all_logs();
+        let lines: Vec<&str> = logs.lines().collect();
         lines[lines.len().saturating_sub(150)..].join("\n")
     }
 }
@@ -218,6 +234,12 @@ impl Drop for Host {
             eprintln!("--- the log of host {}:\n{}", self.name, self.logs());
         }
     }
+}
+
+/// A private key, for its owner alone.
+pub(crate) fn write_key(path: &Path, pem: &str) {
+    fs::write(path, pem).unwrap();
+    fs::set_permissions(path, fs::Permissions::from_mode(0o600)).unwrap();
 }
 
 pub(crate) fn kill(pid: u32) {

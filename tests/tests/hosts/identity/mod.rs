@@ -1,0 +1,15 @@
+//! Who a peer is, in `classic`: what is accepted, and what changes while the daemons run.
+
+mod authority;
+mod ca;
+mod pinned;
+mod replay;
+mod stranger;
+
+use axon_transport::ids::DaemonId;
+
+/// An id as status has it.
+fn daemon_id(text: &str) -> DaemonId {
+    let byte = |at: usize| u8::from_str_radix(&text[2 * at..2 * at + 2], 16).unwrap();
+    DaemonId(std::array::from_fn(byte))
+}
