@@ -48,7 +48,8 @@ pub fn link_frame(data: &[u8]) -> bool {
             let (prefix, body) = frame.split_first_chunk::<4>().expect("a frame has a length");
             let length = link::read_length(*prefix, link::MAX_FRAME).expect("the length is right");
             assert_eq!(length, body.len());
-            let again = link::Message::from_frame(body, link::MAX_INFLATED).expect("what was encoded decodes");
+            let again = link::Message::from_frame(body, link::MAX_INFLATED)
+                .expect("what was encoded decodes");
             assert_eq!(again, Some(message));
         }
         // Only what came compressed can be as large.
