@@ -1,6 +1,8 @@
 //! Who has which bytes of a ring's payload area: first fit from the bottom, so that a ring touches
 //! little more memory than what stands in it.
 
+use std::ops::Range;
+
 use super::layout::GRANULE;
 
 /// The free ranges of an area.
@@ -11,10 +13,10 @@ pub(super) struct Area {
 }
 
 impl Area {
-    /// An area of `size` bytes in which up to `pieces` pieces are expected at a time.
-    pub(super) fn new(size: u64, pieces: usize) -> Self {
+    /// An area in which up to `pieces` pieces are expected at a time.
+    pub(super) fn new(range: Range<u64>, pieces: usize) -> Self {
         let mut free = Vec::with_capacity(pieces + 1);
-        free.push((0, size));
+        free.push((range.start, range.end));
         Self { free }
     }
 
@@ -67,7 +69,7 @@ mod tests {
             keep in 0usize..20,
         ) {
             let size = 1 << 16;
-            let mut area = Area::new(size, 4);
+            let mut area = Area::new(0..size, 4);
             let mut live: VecDeque<(u64, u64)> = VecDeque::new();
             for len in lens {
                 let len = Area::rounded(len);
@@ -97,7 +99,7 @@ mod tests {
 
     #[test]
     fn the_bottom_is_reused_first() {
-        let mut area = Area::new(1 << 20, 4);
+        let mut area = Area::new(0..1 << 20, 4);
         let pieces: Vec<_> = (0..4).map(|_| area.allocate(128).unwrap()).collect();
         area.release(pieces[0], 128);
         area.release(pieces[1], 128);

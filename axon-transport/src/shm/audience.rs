@@ -2,7 +2,11 @@
 
 use std::sync::Arc;
 
-use super::{Grant, Peer, PeerSession, ReaderInfo};
+use super::{
+    Grant, Peer, PeerSession, ReaderInfo,
+    lane::{Standing, Tenancy},
+    seats::Seats,
+};
 use crate::{
     ids::Gid,
     qos::{Durability, History, Qos, Reliability},
@@ -17,6 +21,8 @@ pub(super) struct Audience {
     /// The most samples that can stand.
     capacity: u64,
     readers: Vec<Attached>,
+    /// Their lanes, and those of readers that were here and may hold samples still.
+    seats: Seats,
     /// Their sessions, each once, shared with publishes that ring after they have unlocked.
     peers: Arc<[Peer]>,
     window: u64,
@@ -24,9 +30,8 @@ pub(super) struct Audience {
 
 struct Attached {
     info: ReaderInfo,
+    tenancy: Tenancy,
     grant: Grant,
-    /// Whether the reader has opened its lane.
-    opened: bool,
     dead: bool,
 }
 
@@ -44,24 +49,33 @@ impl Attached {
         self.info.qos.history == History::KeepAll && !self.dead
     }
 
-    /// The next position that the reader takes; `None` when it has left.
-    fn cursor(&mut self, head: u64) -> Option<u64> {
-        match self.info.peer.cursor(self.info.lane, self.grant.generation) {
-            Some(cursor) => {
-                self.opened = true;
-                Some(cursor.clamp(self.grant.first, head))
-            }
-            None if self.opened => None,
-            // It has not seen its grant yet.
-            None => Some(self.grant.first),
+    /// The next position that the reader takes, as it says; `None` when it has left.
+    fn position(&self) -> Option<u64> {
+        let lane = self.info.peer.lane_words(self.info.lane);
+        match self.tenancy.standing(lane) {
+            // It may have left between the two looks, and then it holds nothing.
+            Standing::Open => self.tenancy.cursor(lane),
+            Standing::Asked => Some(self.grant.first),
+            Standing::Left => None,
         }
+    }
+
+    /// The same within what it may say.
+    fn cursor(&self, head: u64) -> Option<u64> {
+        self.position().map(|cursor| cursor.clamp(self.grant.first, head))
     }
 }
 
 impl Audience {
     pub(super) fn new(offered: Qos, capacity: u64) -> Self {
-        let mut audience =
-            Self { offered, capacity, readers: Vec::new(), peers: Arc::new([]), window: 0 };
+        let mut audience = Self {
+            offered,
+            capacity,
+            readers: Vec::new(),
+            seats: Seats::default(),
+            peers: Arc::new([]),
+            window: 0,
+        };
         audience.changed();
         audience
     }
@@ -87,7 +101,7 @@ impl Audience {
     }
 
     pub(super) fn attach(&mut self, info: ReaderInfo, tail: u64, head: u64) -> Grant {
-        let known = self.readers.iter_mut().position(|known| {
+        let known = self.readers.iter().position(|known| {
             let same = &known.info;
             same.gid == info.gid
                 && same.lane == info.lane
@@ -108,9 +122,9 @@ impl Audience {
         } else {
             head
         };
-        // Random, since a lane serves one publisher after another.
-        let grant = Grant { generation: rand::random_range(1..=u64::MAX), first };
-        self.readers.push(Attached { info, grant, opened: false, dead: false });
+        let tenancy = self.seats.admit(info.gid, &info.peer, info.lane);
+        let grant = Grant { generation: tenancy.generation(), first };
+        self.readers.push(Attached { info, tenancy, grant, dead: false });
         self.changed();
         grant
     }
@@ -122,6 +136,23 @@ impl Audience {
         self.readers.len() != before
     }
 
+    /// Adds to `found` the positions that any reader pins, after
+    /// [`about_to_scan`](super::pins::about_to_scan).
+    pub(super) fn scan(&mut self, found: &mut Vec<u64>) {
+        self.seats.scan(found);
+    }
+
+    /// A reader that pins one of `positions`, which keep the ring full; `None` when looking for it
+    /// found that some of those that did are dead.
+    pub(super) fn holder(&mut self, positions: &[u64]) -> Option<Gid> {
+        if self.seats.sweep(|_| true) { None } else { self.seats.holder(positions) }
+    }
+
+    #[cfg(test)]
+    pub(super) fn seats(&self) -> usize {
+        self.seats.len()
+    }
+
     /// Stops counting on readers whose process has ended; [`Self::drop_dead`] names them.
     pub(super) fn mark_dead(&mut self) {
         for reader in &mut self.readers {
@@ -131,25 +162,38 @@ impl Audience {
 
     pub(super) fn drop_dead(&mut self) -> Vec<Gid> {
         self.mark_dead();
-        let dead: Vec<_> = self
-            .readers
-            .iter()
-            .filter(|reader| reader.dead)
-            .map(|reader| reader.info.gid)
-            .collect();
-        if !dead.is_empty() {
-            self.readers.retain(|reader| !reader.dead);
+        self.drop_those(|reader| reader.dead)
+    }
+
+    /// Forgets those that have left, too, whether or not they keep samples.
+    pub(super) fn drop_gone(&mut self) -> Vec<Gid> {
+        self.mark_dead();
+        // A reader's cursor is at the end of all positions once it takes no more.
+        self.drop_those(|reader| reader.dead || matches!(reader.position(), None | Some(u64::MAX)))
+    }
+
+    fn drop_those(&mut self, gone: impl Fn(&Attached) -> bool) -> Vec<Gid> {
+        let mut gids = Vec::new();
+        self.readers.retain(|reader| {
+            let gone = gone(reader);
+            if gone {
+                gids.push(reader.info.gid);
+            }
+            !gone
+        });
+        if !gids.is_empty() {
             self.changed();
         }
-        dead
+        self.seats.sweep(|_| true);
+        gids
     }
 
     /// What of the ring is wanted now that `head` is the next position.
     #[inline]
-    pub(super) fn floors(&mut self, head: u64) -> Floors {
+    pub(super) fn floors(&self, head: u64) -> Floors {
         let holds = holds(&self.offered);
         let mut floors = Floors { retained: head.saturating_sub(self.window), held: u64::MAX };
-        for reader in self.readers.iter_mut().filter(|reader| reader.keeps_all()) {
+        for reader in self.readers.iter().filter(|reader| reader.keeps_all()) {
             if let Some(cursor) = reader.cursor(head) {
                 floors.retained = floors.retained.min(cursor);
                 if holds && reader.info.peer.remote().is_some() && self::holds(&reader.info.qos) {
@@ -161,14 +205,10 @@ impl Audience {
     }
 
     /// The reader that has most to take of those that hold `tail`, and the sessions of all these.
-    pub(super) fn laggards(
-        &mut self,
-        tail: u64,
-        head: u64,
-    ) -> Option<(Gid, Vec<Arc<PeerSession>>)> {
+    pub(super) fn laggards(&self, tail: u64, head: u64) -> Option<(Gid, Vec<Arc<PeerSession>>)> {
         let mut worst = None;
         let mut peers = Vec::new();
-        for reader in self.readers.iter_mut().filter(|reader| reader.keeps_all()) {
+        for reader in self.readers.iter().filter(|reader| reader.keeps_all()) {
             let Some(cursor) = reader.cursor(head).filter(|cursor| *cursor <= tail) else {
                 continue;
             };
@@ -203,6 +243,11 @@ impl Audience {
             }
         }
         self.peers = peers.into();
+        // Nobody watches the processes of those that are not attached any more.
+        let readers = &self.readers;
+        self.seats.sweep(|seat| {
+            readers.iter().all(|reader| reader.grant.generation != seat.tenancy.generation())
+        });
     }
 }
 

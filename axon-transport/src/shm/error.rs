@@ -103,6 +103,17 @@ pub enum PublishError {
         /// How many loans are out.
         loans: u32,
     },
+    /// Samples that a reader has not dropped hold the ring's memory.
+    #[error(
+        "reader {reader} keeps samples that hold the ring's memory ({samples} are kept in all): \
+         it must drop some, or end"
+    )]
+    Pinned {
+        /// A reader that keeps some.
+        reader: Gid,
+        /// Samples that are kept by readers although the publisher has given them up.
+        samples: usize,
+    },
     /// A loan was published before all of it was written.
     #[error("loan of {len} bytes published with {written} written")]
     Incomplete {
@@ -127,6 +138,19 @@ pub enum TakeError {
         writer: Gid,
         /// What was wrong.
         what: &'static str,
+    },
+    /// A sample is longer than the subscription expects. It was passed over and counts as lost.
+    #[error(
+        "sample of {len} bytes of publisher {writer} passed over: this process takes up to {max} \
+         (AXON_MAX_MESSAGE_MB)"
+    )]
+    TooLarge {
+        /// The publisher.
+        writer: Gid,
+        /// The sample's length in bytes.
+        len: u64,
+        /// The largest that is taken, in bytes.
+        max: u64,
     },
     /// The sample does not fit in this process's memory.
     #[error("no memory to take a sample of {len} bytes")]

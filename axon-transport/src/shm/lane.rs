@@ -1,9 +1,114 @@
 //! A reader's own words in its session's segment.
+//!
+//! The first of them says who uses the lane: 0 nobody; with its highest bit set, a reader that has
+//! not seen its grant yet; any other value is the grant's. No value is used twice, so a publisher
+//! that knows what the word was when the reader asked, and what it granted, knows when the lane
+//! has passed on to somebody else.
 
 use std::sync::{Arc, atomic::AtomicU64};
 
-use super::{Grant, SessionSegment, layout, sync::Ordering};
+use super::{
+    Grant, SessionSegment,
+    layout::{
+        self, LANE_WORDS,
+        lane::{CURSOR, GENERATION, LOST, READER, RECEIVED, SKIPPED, WRITER},
+    },
+    pins,
+    sync::{Ordering, Site, Word},
+};
 use crate::ids::Gid;
+
+/// Set in the generation word of a lane that is not open yet.
+const ASKED: u64 = 1 << 63;
+
+/// How a reader stands with the publisher that looks at its lane.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Standing {
+    /// It has not seen its grant yet.
+    Asked,
+    Open,
+    /// It has left, and has read all that it pinned.
+    Left,
+}
+
+/// What a publisher knows a reader's lane by.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Tenancy {
+    /// The generation word when the reader asked.
+    asked: u64,
+    /// The one that it was granted.
+    generation: u64,
+}
+
+impl Tenancy {
+    /// Publisher: gives a generation to the reader that asked with this lane.
+    pub(super) fn grant<W: Word>(lane: &[W]) -> Self {
+        let asked = lane[GENERATION].load(Site::GenerationLoad.order());
+        Self { asked, generation: rand::random_range(1..ASKED) }
+    }
+
+    /// Publisher: whether the lane is as it was when the reader asked.
+    pub(super) fn is_asked<W: Word>(&self, lane: &[W]) -> bool {
+        lane[GENERATION].load(Site::GenerationLoad.order()) == self.asked
+    }
+
+    pub(super) fn generation(&self) -> u64 {
+        self.generation
+    }
+
+    /// Publisher: what the lane says of the reader now.
+    #[inline]
+    pub(super) fn standing<W: Word>(&self, lane: &[W]) -> Standing {
+        // Pairs with `open`: who sees the lane open sees its cursor; and with `close`: who sees it
+        // closed, or in other hands, writes after all reads.
+        match lane[GENERATION].load(Site::GenerationLoad.order()) {
+            0 => Standing::Left,
+            word if word == self.generation => Standing::Open,
+            word if word == self.asked => Standing::Asked,
+            _ => Standing::Left,
+        }
+    }
+
+    /// Publisher: the next position that the reader takes, if it has opened the lane.
+    #[inline]
+    pub(super) fn cursor<W: Word>(&self, lane: &[W]) -> Option<u64> {
+        (self.standing(lane) == Standing::Open).then(|| {
+            // Pairs with `advance`: what the reader has copied is not written over before.
+            lane[CURSOR].load(Site::CursorLoad.order())
+        })
+    }
+}
+
+/// Reader: is about to ask with this lane for the `number`th time that the session uses one.
+pub(super) fn ask<W: Word>(lane: &[W], number: u64) {
+    // Pairs with `standing`, for the publisher of the reader that had the lane before.
+    lane[GENERATION].store(ASKED | number, Site::AskStore.order());
+}
+
+/// Reader: has seen its grant.
+pub(super) fn open<W: Word>(lane: &[W], grant: Grant) {
+    // The records are clear since the last pin was given up. To clear them once more could hide
+    // from the last reader's publisher that this one's reads come after that one's.
+    for word in [RECEIVED, LOST, SKIPPED] {
+        lane[word].store(0, Ordering::Relaxed);
+    }
+    lane[CURSOR].store(grant.first, Ordering::Relaxed);
+    // Pairs with `standing`.
+    lane[GENERATION].store(grant.generation, Site::OpenStore.order());
+}
+
+/// Reader: has taken, or will not take, what is below `cursor`.
+#[inline]
+pub(super) fn advance<W: Word>(lane: &[W], cursor: u64) {
+    // Pairs with `cursor`.
+    lane[CURSOR].store(cursor, Site::CursorStore.order());
+}
+
+/// Reader: has left, and pins nothing.
+pub(super) fn close<W: Word>(lane: &[W]) {
+    // Pairs with `standing`.
+    lane[GENERATION].store(0, Site::CloseStore.order());
+}
 
 /// A place in a session's segment where one reader tells its publisher how far it is.
 ///
@@ -14,8 +119,11 @@ pub struct Lane {
 }
 
 impl Lane {
-    pub(super) fn new(session: Arc<SessionSegment>, index: u32) -> Self {
-        Self { session, index }
+    /// The lane `index`, for the `number`th time that the session gives one out.
+    pub(super) fn new(session: Arc<SessionSegment>, index: u32, number: u64) -> Self {
+        let lane = Self { session, index };
+        ask(lane.words(), number);
+        lane
     }
 
     /// Its number, by which a publisher finds it.
@@ -24,37 +132,44 @@ impl Lane {
     }
 
     /// Whether the calling process is a fork of the lane's: it must not touch the lane.
+    #[inline]
     pub(super) fn is_forked(&self) -> bool {
         self.session.is_forked()
     }
 
     pub(super) fn open(&self, grant: Grant, reader: Gid, writer: Gid) {
-        let words = self.words();
-        layout::write_id(words, layout::lane::READER, reader.0);
-        layout::write_id(words, layout::lane::WRITER, writer.0);
-        words[layout::lane::RECEIVED].store(0, Ordering::Relaxed);
-        words[layout::lane::LOST].store(0, Ordering::Relaxed);
-        words[layout::lane::CURSOR].store(grant.first, Ordering::Relaxed);
-        // Release: a publisher that sees the generation sees its cursor.
-        words[layout::lane::GENERATION].store(grant.generation, Ordering::Release);
+        layout::write_id(self.words(), READER, reader.0);
+        layout::write_id(self.words(), WRITER, writer.0);
+        open(self.words(), grant);
     }
 
     /// All below `cursor` is done with.
     #[inline]
-    pub(super) fn advance(&self, cursor: u64, received: u64, lost: u64) {
+    pub(super) fn advance(&self, cursor: u64, received: u64, lost: u64, skipped: u64) {
         let words = self.words();
-        words[layout::lane::RECEIVED].store(received, Ordering::Relaxed);
-        words[layout::lane::LOST].store(lost, Ordering::Relaxed);
-        // Release: pairs with the publisher's acquire load before it reuses what was read.
-        words[layout::lane::CURSOR].store(cursor, Ordering::Release);
+        words[RECEIVED].store(received, Ordering::Relaxed);
+        words[LOST].store(lost, Ordering::Relaxed);
+        words[SKIPPED].store(skipped, Ordering::Relaxed);
+        advance(words, cursor);
     }
 
-    /// Tells a publisher that still counts on the reader that it is gone.
-    pub(super) fn close(&self) {
-        self.words()[layout::lane::GENERATION].store(0, Ordering::Release);
+    /// Takes no more; what is pinned stays pinned.
+    pub(super) fn leave(&self) {
+        advance(self.words(), u64::MAX);
     }
 
-    fn words(&self) -> &[AtomicU64] {
+    /// [Pins](pins::pin) `position`.
+    #[inline]
+    pub(super) fn pin(&self, record: usize, position: u64, tail: &AtomicU64) -> bool {
+        pins::pin(self.words(), record, position, tail)
+    }
+
+    #[inline]
+    pub(super) fn unpin(&self, record: usize) {
+        pins::unpin(self.words(), record);
+    }
+
+    fn words(&self) -> &[AtomicU64; LANE_WORDS] {
         self.session.lane_words(self.index)
     }
 }
@@ -62,7 +177,7 @@ impl Lane {
 impl Drop for Lane {
     fn drop(&mut self) {
         if !self.is_forked() {
-            self.close();
+            close(self.words());
             self.session.free_lane(self.index);
         }
     }

@@ -2,7 +2,7 @@
 
 use std::sync::atomic::AtomicU64;
 
-use super::{ShmError, ring::Geometry, sync::Ordering};
+use super::{ShmError, pins::RECORDS, ring::Geometry, sync::Ordering};
 use crate::ids::{Gid, SessionId};
 
 /// Segments are multiples of this many bytes, and memory is committed in them.
@@ -11,19 +11,23 @@ pub(super) const ALIGN: u64 = 64 << 10;
 pub(super) const MAX_MESSAGE: u64 = u32::MAX as u64 & !(GRANULE - 1);
 /// The most address space that one segment may take, in bytes.
 pub(super) const MAX_RING: u64 = 64 << 30;
-/// The most history that a ring may be asked to keep, in bytes: twice this is mapped.
+/// The most history that a ring may be asked to keep, in bytes: up to four times this is mapped.
 pub(super) const MAX_BUDGET: u64 = MAX_RING / 4;
 /// Samples in the payload area start at multiples of this many bytes.
 pub(super) const GRANULE: u64 = 64;
+/// Samples of more bytes than this are pinned while they are read, others are copied out.
+pub(super) const COPIED: u64 = 4096;
 /// Bytes of a sample that fit in its slot.
 pub(super) const INLINE: usize = 96;
 /// Lanes of a session: how many rings it can read at a time.
 pub(super) const LANES: u32 = 4096;
 
-const VERSION: u64 = 1;
+const VERSION: u64 = 2;
 const HEADER: u64 = 4096;
 const SLOT: u64 = 128;
 const LANE: u64 = 128;
+/// Words of a lane.
+pub(super) const LANE_WORDS: usize = LANE as usize / 8;
 const MAX_SLOTS: u64 = 1 << 20;
 
 const SESSION_MAGIC: u64 = u64::from_ne_bytes(*b"AXONSES1");
@@ -43,8 +47,11 @@ pub(super) mod lane {
     pub(in crate::shm) const CURSOR: usize = 1;
     pub(in crate::shm) const RECEIVED: usize = 2;
     pub(in crate::shm) const LOST: usize = 3;
-    pub(in crate::shm) const READER: usize = 4;
-    pub(in crate::shm) const WRITER: usize = 6;
+    pub(in crate::shm) const SKIPPED: usize = 4;
+    /// The first of the pin records.
+    pub(in crate::shm) const PINS: usize = 6;
+    pub(in crate::shm) const READER: usize = 12;
+    pub(in crate::shm) const WRITER: usize = 14;
 }
 
 pub(super) const fn session_bytes() -> u64 {
@@ -52,9 +59,9 @@ pub(super) const fn session_bytes() -> u64 {
 }
 
 /// The words of lane `index`.
-pub(super) fn lane_words(words: &[AtomicU64], index: u32) -> &[AtomicU64] {
-    let start = (HEADER as usize + index as usize * LANE as usize) / 8;
-    &words[start..start + LANE as usize / 8]
+pub(super) fn lane_words(words: &[AtomicU64], index: u32) -> &[AtomicU64; LANE_WORDS] {
+    let start = HEADER as usize / 8 + index as usize * LANE_WORDS;
+    words[start..].first_chunk().expect("the number of lanes was checked")
 }
 
 /// Bytes that must be committed for lane `index`.
@@ -107,17 +114,24 @@ pub(super) struct RingLayout {
     slots: u64,
     payload_at: u64,
     payload_bytes: u64,
+    /// Of these, the first for samples that readers copy. No reader needs to know.
+    copied_bytes: u64,
 }
 
 impl RingLayout {
-    /// A ring of at least `slots` slots and `payload` bytes.
-    pub(super) fn new(slots: u64, payload: u64) -> Self {
+    /// A ring of at least `slots` slots, for a history of `budget` bytes of samples of at most
+    /// `max_message` bytes. All of it is address space, not memory.
+    pub(super) fn new(slots: u64, budget: u64, max_message: u64) -> Self {
         let slots = slots.next_power_of_two().min(MAX_SLOTS);
-        Self {
-            slots,
-            payload_at: (HEADER + slots * SLOT).next_multiple_of(ALIGN),
-            payload_bytes: payload.next_multiple_of(ALIGN),
-        }
+        let payload_at = (HEADER + slots * SLOT).next_multiple_of(ALIGN);
+        // Twice the budget, so that pieces between samples seldom shorten the history.
+        let copied_bytes = (2 * budget).min(2 * COPIED * slots).max(1).next_multiple_of(ALIGN);
+        // Room for four of the largest, so that one of them always fits beside one that stands;
+        // and for as many as two readers can pin.
+        let largest = max_message.max(1).next_multiple_of(GRANULE);
+        let pinned = (4 * largest).max(2 * budget) + 2 * RECORDS as u64 * largest;
+        let pinned = pinned.next_multiple_of(ALIGN).min(MAX_RING - payload_at - copied_bytes);
+        Self { slots, payload_at, payload_bytes: copied_bytes + pinned, copied_bytes }
     }
 
     pub(super) fn slots(&self) -> u64 {
@@ -130,6 +144,10 @@ impl RingLayout {
 
     pub(super) fn payload_bytes(&self) -> u64 {
         self.payload_bytes
+    }
+
+    pub(super) fn copied_bytes(&self) -> u64 {
+        self.copied_bytes
     }
 
     pub(super) fn bytes(&self) -> u64 {
@@ -188,7 +206,7 @@ impl RingLayout {
         if read_id(words, 4) != writer.0 {
             return refuse("it belongs to another publisher");
         }
-        Ok(Self { slots, payload_at, payload_bytes })
+        Ok(Self { slots, payload_at, payload_bytes, copied_bytes: 0 })
     }
 }
 

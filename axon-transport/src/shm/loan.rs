@@ -1,89 +1,149 @@
-//! A sample that is written in place.
+//! A sample that is written before it is published.
 
-use std::io;
+use std::{
+    io,
+    ops::{Deref, DerefMut},
+    ptr::NonNull,
+    slice,
+    time::{Duration, SystemTime},
+};
 
-use super::{Meta, PublishError, Published, Writer, layout::INLINE, ring};
-use std::sync::atomic::AtomicU64;
+use super::{
+    Meta, PublishError, Published, Writer,
+    writer::{Numbering, PATIENCE, Payload},
+};
 
-/// Memory of a ring to be filled, from the front, and published. Dropping it gives it back.
+/// Memory to be filled and published: of the ring itself where it is longer than 4 KiB. Dropping
+/// it gives it back.
 ///
-/// Written through [`io::Write`], not as a slice: a reader that was overtaken may still look at
-/// the same memory, which must therefore be written by atomic words.
+/// Written from the front through [`io::Write`], or anywhere as the slice that it dereferences to;
+/// what the slice holds at first is zeros or bytes of earlier samples. In a forked child it is of
+/// no use: dereferencing it panics.
 pub struct Loan<'a> {
     writer: &'a Writer,
     len: usize,
     written: usize,
-    place: Place,
+    memory: Memory,
 }
 
-enum Place {
-    Inline([u8; INLINE]),
-    /// The offset in the payload area, and the bytes written since the last whole word.
-    Area {
-        at: u64,
-        partial: [u8; 8],
-    },
+enum Memory {
+    Own(Vec<u8>),
+    /// At this offset of the payload area.
+    Ring(u64),
     Published,
 }
 
 impl<'a> Loan<'a> {
-    pub(super) fn inline(writer: &'a Writer, len: usize) -> Self {
-        Self { writer, len, written: 0, place: Place::Inline([0; INLINE]) }
+    pub(super) fn copied(writer: &'a Writer, len: usize) -> Self {
+        Self { writer, len, written: 0, memory: Memory::Own(vec![0; len]) }
     }
 
+    /// `len` bytes at `at`, which have been lent.
     pub(super) fn placed(writer: &'a Writer, len: usize, at: u64) -> Self {
-        Self { writer, len, written: 0, place: Place::Area { at, partial: [0; 8] } }
+        Self { writer, len, written: 0, memory: Memory::Ring(at) }
     }
 
     /// Publishes it, waiting for a slot as [`Writer::publish`] does.
     ///
     /// # Errors
-    /// Not all of it was written, or as [`Writer::publish`]. The loan is given back.
-    pub fn publish(mut self, meta: Meta) -> Result<Published, PublishError> {
+    /// It was neither written to the end nor borrowed as a slice, or as [`Writer::publish`]. The
+    /// loan is given back.
+    pub fn publish(self, meta: Meta) -> Result<Published, PublishError> {
+        self.publish_as(Numbering::Given(meta)).map(|(_, published)| published)
+    }
+
+    /// As [`publish`](Self::publish), with the sequence number that follows the publisher's last,
+    /// which is returned.
+    ///
+    /// # Errors
+    /// As for [`publish`](Self::publish).
+    pub fn publish_next(self, source_timestamp: i64) -> Result<u64, PublishError> {
+        self.publish_as(Numbering::Next(source_timestamp)).map(|(sequence, _)| sequence)
+    }
+
+    /// As [`publish_next`](Self::publish_next), stamped with the current time.
+    ///
+    /// # Errors
+    /// As for [`publish`](Self::publish).
+    pub fn publish_now(self) -> Result<u64, PublishError> {
+        self.publish_next(now())
+    }
+
+    fn publish_as(self, numbering: Numbering) -> Result<(u64, Published), PublishError> {
         let (len, written) = (self.len as u64, self.written as u64);
         if written < len {
             return Err(PublishError::Incomplete { len, written });
         }
-        let published = match &self.place {
-            Place::Inline(bytes) => {
-                self.writer.publish_loan(meta, self.len, None, &bytes[..self.len])
-            }
-            Place::Area { at, .. } => self.writer.publish_loan(meta, self.len, Some(*at), &[]),
-            Place::Published => unreachable!("publishing takes the loan"),
-        }?;
-        self.place = Place::Published;
+        self.commit(numbering, PATIENCE)
+    }
+
+    pub(super) fn commit(
+        mut self,
+        numbering: Numbering,
+        patience: Duration,
+    ) -> Result<(u64, Published), PublishError> {
+        let payload = match &self.memory {
+            Memory::Own(bytes) => Payload::Bytes(bytes),
+            Memory::Ring(at) => Payload::Written { at: *at, len: self.len },
+            Memory::Published => unreachable!("publishing takes the loan"),
+        };
+        let published = self.writer.commit(numbering, payload, patience)?;
+        self.memory = Memory::Published;
         Ok(published)
+    }
+
+    /// The address of the ring's memory that is lent.
+    fn lent(&self, at: u64) -> NonNull<u8> {
+        assert!(!self.writer.is_forked(), "a loan of shared memory, used after fork");
+        self.writer.lent(at, self.len)
+    }
+}
+
+impl Deref for Loan<'_> {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        match &self.memory {
+            Memory::Own(bytes) => bytes,
+            // SAFETY: `len` bytes of the ring's map, which lives as long as the writer. They are
+            // memory from the system or bytes of earlier samples, so initialized. They are lent to
+            // this loan alone, and no reader reads them before they are published, which takes the
+            // loan: nothing writes to them while it is borrowed. The words of the whole map that
+            // exist beside are atomic and not touched here.
+            Memory::Ring(at) => unsafe { slice::from_raw_parts(self.lent(*at).as_ptr(), self.len) },
+            Memory::Published => &[],
+        }
+    }
+}
+
+impl DerefMut for Loan<'_> {
+    /// Whoever borrows it is taken to write all of it.
+    fn deref_mut(&mut self) -> &mut [u8] {
+        self.written = self.len;
+        if let Memory::Ring(at) = self.memory {
+            let start = self.lent(at).as_ptr();
+            // SAFETY: as in `deref`, and borrowed mutably like the loan itself. Other processes
+            // have the memory mapped; they cannot write to it, and those that keep to the protocol
+            // do not read it.
+            return unsafe { slice::from_raw_parts_mut(start, self.len) };
+        }
+        match &mut self.memory {
+            Memory::Own(bytes) => bytes,
+            Memory::Ring(_) | Memory::Published => &mut [],
+        }
     }
 }
 
 impl io::Write for Loan<'_> {
     /// Appends; writes nothing once the loan is full.
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        let mut bytes = &bytes[..bytes.len().min(self.len - self.written)];
-        let count = bytes.len();
-        match &mut self.place {
-            Place::Inline(all) => all[self.written..][..count].copy_from_slice(bytes),
-            Place::Area { at, partial } => {
-                let words = self.writer.payload(*at, self.len as u64);
-                let mut next = self.written / 8;
-                let filled = self.written % 8;
-                ring::about_to_write::<AtomicU64>();
-                if filled > 0 {
-                    let head = bytes.len().min(8 - filled);
-                    partial[filled..filled + head].copy_from_slice(&bytes[..head]);
-                    ring::copy_in(&words[next..], &partial[..filled + head]);
-                    next += usize::from(filled + head == 8);
-                    bytes = &bytes[head..];
-                }
-                if !bytes.is_empty() {
-                    ring::copy_in(&words[next..], bytes);
-                    let rest = bytes.len() % 8;
-                    partial[..rest].copy_from_slice(&bytes[bytes.len() - rest..]);
-                }
-            }
-            Place::Published => unreachable!("publishing takes the loan"),
+        if self.writer.is_forked() {
+            return Err(io::Error::other(PublishError::Forked));
         }
-        self.written += count;
+        let from = self.written;
+        let count = bytes.len().min(self.len - from);
+        self[from..from + count].copy_from_slice(&bytes[..count]);
+        self.written = from + count;
         Ok(count)
     }
 
@@ -94,8 +154,18 @@ impl io::Write for Loan<'_> {
 
 impl Drop for Loan<'_> {
     fn drop(&mut self) {
-        if let Place::Area { at, .. } = self.place {
-            self.writer.unreserve(at, self.len);
+        // The history of a forked child is a copy that nobody uses, and its lock may be held.
+        if let Memory::Ring(at) = self.memory
+            && !self.writer.is_forked()
+        {
+            self.writer.give_back(at, self.len);
         }
     }
+}
+
+/// Nanoseconds since the Unix epoch.
+pub(super) fn now() -> i64 {
+    SystemTime::now()
+        .duration_since(SystemTime::UNIX_EPOCH)
+        .map_or(0, |since| i64::try_from(since.as_nanos()).unwrap_or(i64::MAX))
 }

@@ -19,6 +19,9 @@ use rustix::{
 
 use super::{ShmError, fork::ForkToken, headroom, layout};
 
+/// Bytes that are committed at a time.
+const PIECE: u64 = 1 << 20;
+
 /// What no process can undo: the file keeps its size, and only maps made before can write to it.
 fn seals() -> SealFlags {
     SealFlags::SHRINK | SealFlags::GROW | SealFlags::FUTURE_WRITE | SealFlags::SEAL
@@ -51,19 +54,31 @@ impl Segment {
     /// Backs `range` with memory, so that touching it can neither fault nor get the process
     /// killed for exceeding its control group's limit.
     pub(super) fn commit(&self, from: u64, to: u64) -> Result<(), ShmError> {
-        let len = to - from;
-        headroom::check(len)?;
-        loop {
-            match fallocate(&self.fd, FallocateFlags::empty(), from, len) {
-                Ok(()) => return Ok(()),
+        headroom::check(to - from)?;
+        // In pieces, since older kernels undo a whole call on any signal: one that comes often
+        // could otherwise keep a large one from ever getting through.
+        let mut done = from;
+        while done < to {
+            let len = (to - done).min(PIECE);
+            match fallocate(&self.fd, FallocateFlags::empty(), done, len) {
+                Ok(()) => done += len,
                 Err(Errno::INTR) => {}
                 Err(Errno::NOSPC | Errno::NOMEM) => {
                     let available = headroom::available().unwrap_or(0);
-                    return Err(ShmError::NoMemory { needed: len, available });
+                    return Err(ShmError::NoMemory { needed: to - done, available });
                 }
                 Err(errno) => return Err(ShmError::system("committing shared memory")(errno)),
             }
         }
+        Ok(())
+    }
+
+    /// The address of `len` bytes at `at`, to be written otherwise than by words.
+    pub(super) fn bytes(&self, at: u64, len: usize) -> NonNull<u8> {
+        let at = usize::try_from(at).expect("a segment is mapped whole");
+        assert!(at.checked_add(len).is_some_and(|end| end <= self.map.bytes));
+        // SAFETY: inside the mapping, as was just checked.
+        unsafe { self.map.base.cast::<u8>().add(at) }
     }
 
     pub(super) fn words(&self) -> &[AtomicU64] {

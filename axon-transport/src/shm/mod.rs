@@ -1,43 +1,99 @@
-//! Shared memory between the sessions of one host: a ring per publisher in a sealed memfd, and a
-//! segment per session that holds its readers' cursors and the words by which it is woken.
+//! Shared memory between the processes of one host: a ring per publisher in a sealed memfd, and a
+//! segment per session that holds its readers' cursors and pins and the words by which it is woken.
+//!
+//! ```
+//! use std::{os::unix::net::UnixDatagram, thread, time::Duration};
+//!
+//! use axon_transport::{
+//!     qos::Qos,
+//!     shm::{Context, Publisher, PublisherOptions, Subscriber, SubscriberOptions},
+//! };
+//!
+//! // Two ends of a socket, usually in two processes. It is needed only to come together.
+//! let (ours, theirs) = UnixDatagram::pair()?;
+//! let patience = Some(Duration::from_secs(10));
+//! let publisher = Publisher::new(&Context::new()?, PublisherOptions::new(Qos::default()))?;
+//! let there = Context::new()?;
+//! let mut subscriber = thread::scope(|scope| {
+//!     scope.spawn(|| publisher.serve(&ours, patience));
+//!     Subscriber::connect(&there, &theirs, SubscriberOptions::new(Qos::default()), patience)
+//! })?;
+//!
+//! // A large sample is written and read in place.
+//! let mut image = publisher.loan(640 * 480 * 3)?;
+//! image.fill(0x7f);
+//! image.publish_now()?;
+//! let sample = subscriber.recv(patience)?.expect("the image");
+//! assert!(sample.is_borrowed());
+//! let mut pixel = [0; 3];
+//! sample.read_at(sample.len() - 3, &mut pixel);
+//! assert_eq!(pixel, [0x7f; 3]);
+//!
+//! // A small one is copied in and out.
+//! publisher.publish(b"hello")?;
+//! let mut text = Vec::new();
+//! subscriber.recv(patience)?.expect("the greeting").copy_to(&mut text)?;
+//! assert_eq!(text, b"hello");
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 //!
 //! Every shared word has exactly one writer process; there is no lock, reference count or
 //! compare-and-swap between processes, so a process that dies leaves only its own pages stale.
 //! Readers map read-only. What another process wrote is hostile input: layouts are checked and
-//! copied when they are mapped, each word is read once and range-checked, and payload is copied
-//! by atomic words with a check afterwards that it was not overwritten meanwhile.
+//! copied when they are mapped, and each word is read once and range-checked. Samples of up to
+//! 4 KiB are copied by atomic words, with a check afterwards that they were not overwritten
+//! meanwhile; longer ones are pinned, so that their publisher leaves them alone. A publisher waits
+//! for no reader but one that is, like itself, RELIABLE and KEEP_ALL.
 //!
-//! Nothing in here starts a thread or knows the daemon: two sessions that exchange descriptors
-//! over any unix socket can use it.
+//! Nothing in here starts a thread or knows the daemon. [`Context`], [`Publisher`] and
+//! [`Subscriber`] are for use over any unix socket; [`SessionSegment`], [`Writer`] and [`Reader`]
+//! are what they, and the sessions of the daemon, are made of.
 #![allow(unsafe_code)]
 
 #[cfg(not(all(target_pointer_width = "64", target_endian = "little")))]
 compile_error!("rings are laid out for 64-bit little-endian machines");
 
 mod area;
+mod attachment;
 mod audience;
+mod connect;
+mod context;
 mod error;
 mod fork;
 mod headroom;
 mod history;
 mod lane;
 mod layout;
+mod limbo;
 mod loan;
 mod memory;
 mod peer;
+mod pins;
+mod publisher;
 mod reader;
 mod ring;
+mod room;
+mod sample;
+mod seats;
 mod session;
+mod subscriber;
 pub(crate) mod sync;
+mod types;
 mod writer;
 
 #[cfg(test)]
 mod tests;
 
+pub use connect::ConnectError;
+pub use context::Context;
 pub use error::{PublishError, ShmError, TakeError};
 pub use lane::Lane;
 pub use loan::Loan;
 pub use peer::{Peer, PeerDescriptors, PeerSession};
-pub use reader::{Reader, ReaderOptions, Taken};
+pub use publisher::{Publisher, PublisherOptions};
+pub use reader::{Reader, ReaderOptions};
+pub use sample::{Sample, SampleReader};
 pub use session::SessionSegment;
-pub use writer::{Grant, Meta, Published, ReaderInfo, RingOptions, Writer};
+pub use subscriber::{Subscriber, SubscriberOptions};
+pub use types::{Grant, Meta, Published, ReaderInfo, RingOptions, Taken};
+pub use writer::Writer;

@@ -3,10 +3,7 @@
 use std::{
     fs, io,
     os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd},
-    sync::{
-        Arc,
-        atomic::{AtomicU64, Ordering},
-    },
+    sync::{Arc, atomic::AtomicU64},
 };
 
 use rustix::{
@@ -177,23 +174,10 @@ impl Peer {
         }
     }
 
-    pub(super) fn lane_words(&self, index: u32) -> &[AtomicU64] {
+    pub(super) fn lane_words(&self, index: u32) -> &[AtomicU64; layout::LANE_WORDS] {
         match self {
             Self::Local(session) => session.lane_words(index),
             Self::Remote(session) => layout::lane_words(session.map.words(), index),
         }
-    }
-
-    /// The lane's cursor, if the lane is at `generation`.
-    #[inline]
-    pub(super) fn cursor(&self, index: u32, generation: u64) -> Option<u64> {
-        let words = self.lane_words(index);
-        // Acquire: pairs with the reader's release store of the generation, after the cursor.
-        if words[layout::lane::GENERATION].load(Ordering::Acquire) != generation {
-            return None;
-        }
-        // Acquire: pairs with the reader's release store after it has copied a sample out, so that
-        // the sample's bytes are not overwritten before.
-        Some(words[layout::lane::CURSOR].load(Ordering::Acquire))
     }
 }

@@ -1,11 +1,14 @@
 //! The ring's protocol over plain words: what a publisher stores and what a reader believes.
 //!
-//! A reader copies first and checks afterwards. The publisher raises the tail above a position
-//! before it reuses that position's slot or payload; a reader that finds the tail still at or
-//! below its position after the copy has copied what was published. The head orders all that a
-//! sample consists of; a slot's stamp only tells a scribbled ring from an honest one.
+//! A reader copies first and checks afterwards, except for large samples, which it
+//! [pins](super::pins). The publisher raises the tail above a position before it reuses that
+//! position's slot or payload; a reader that finds the tail still at or below its position after
+//! the copy has copied what was published. The head orders all that a sample consists of; a slot's
+//! stamp only tells a scribbled ring from an honest one.
 
-use super::sync::{Ordering, Word};
+use std::ops::Range;
+
+use super::sync::{Ordering, Site, Word, fence_at};
 
 /// Words of a slot.
 pub(super) const SLOT_WORDS: usize = 16;
@@ -40,10 +43,20 @@ impl Geometry {
 
     /// The words of `len` bytes at `offset` bytes of the payload area, if they are inside it.
     pub(super) fn payload<'a, W>(&self, words: &'a [W], offset: u64, len: u64) -> Option<&'a [W]> {
+        words.get(self.range(offset, len)?)
+    }
+
+    /// Where the words of a record that is not in its slot are, if they are inside the area.
+    pub(super) fn placed<W>(&self, words: &[W], record: &Record) -> Option<Range<usize>> {
+        let Place::At(offset) = record.place else { return None };
+        self.range(offset, u64::from(record.len)).filter(|range| range.end <= words.len())
+    }
+
+    fn range(&self, offset: u64, len: u64) -> Option<Range<usize>> {
         let start = usize::try_from(offset / 8).ok()?;
         let count = usize::try_from(len.div_ceil(8)).ok()?;
-        let area = words.get(self.payload..self.payload.checked_add(self.payload_words)?)?;
-        area.get(start..start.checked_add(count)?)
+        let end = start.checked_add(count).filter(|end| *end <= self.payload_words)?;
+        Some(self.payload.checked_add(start)?..self.payload.checked_add(end)?)
     }
 }
 
@@ -67,8 +80,8 @@ pub(super) struct Record {
 
 /// Publisher: positions below `tail` are about to be reused.
 pub(super) fn retire<W: Word>(words: &[W], g: &Geometry, tail: u64) {
-    // Release: pairs with `bounds`; a reader that sees this tail sees a head at least as high.
-    words[g.tail].store(tail, Ordering::Release);
+    // Pairs with `bounds`: a reader that sees this tail sees a head at least as high.
+    words[g.tail].store(tail, Site::TailStore.order());
 }
 
 /// Publisher: stores to slots or payload follow on this thread. Whoever sees one of them sees the
@@ -76,7 +89,7 @@ pub(super) fn retire<W: Word>(words: &[W], g: &Geometry, tail: u64) {
 #[inline]
 pub(super) fn about_to_write<W: Word>() {
     // Pairs with the acquire fence of `stands`.
-    W::fence(Ordering::Release);
+    fence_at::<W>(Site::ReuseFence);
 }
 
 /// Publisher: makes `position` visible, after [`about_to_write`]. A sample outside the slot has
@@ -104,15 +117,15 @@ pub(super) fn publish<W: Word>(
     };
     slot[LENGTH].store(u64::from(record.len) | u64::from(flags) << 32, Ordering::Relaxed);
     slot[STAMP].store(2 * position + 2, Ordering::Relaxed);
-    // Release: pairs with `bounds`; whoever sees the head sees the sample.
-    words[g.head].store(position + 1, Ordering::Release);
+    // Pairs with `bounds`: whoever sees the head sees the sample.
+    words[g.head].store(position + 1, Site::HeadStore.order());
 }
 
 /// Reader: the oldest position that stands and the next position to come.
 pub(super) fn bounds<W: Word>(words: &[W], g: &Geometry) -> Result<(u64, u64), &'static str> {
     // In this order: a tail is never above the head that a later load sees.
-    let tail = words[g.tail].load(Ordering::Acquire);
-    let head = words[g.head].load(Ordering::Acquire);
+    let tail = words[g.tail].load(Site::TailLoad.order());
+    let head = words[g.head].load(Site::HeadLoad.order());
     if tail > head || head > MAX_POSITION {
         return Err("its head and tail make no sense");
     }
@@ -177,7 +190,7 @@ pub(super) fn data<'a, W>(
 pub(super) fn stands<W: Word>(words: &[W], g: &Geometry, position: u64) -> bool {
     // Pairs with the release fence of `about_to_write`: had one of the loads before seen a reuse, the
     // load after sees the tail that was stored ahead of it.
-    W::fence(Ordering::Acquire);
+    fence_at::<W>(Site::StandsFence);
     words[g.tail].load(Ordering::Relaxed) <= position
 }
 
@@ -191,6 +204,28 @@ pub(super) fn copy_in<W: Word>(words: &[W], bytes: &[u8]) {
         let mut last = [0; 8];
         last[..rest.len()].copy_from_slice(rest);
         words[whole.len()].store(u64::from_ne_bytes(last), Ordering::Relaxed);
+    }
+}
+
+/// Fills `out` with the bytes from `at` on, which are inside the words.
+pub(super) fn read_at<W: Word>(words: &[W], at: usize, out: &mut [u8]) {
+    let load = |index: usize| words[index].load(Ordering::Relaxed).to_ne_bytes();
+    let mut next = at / 8;
+    let skip = at % 8;
+    let mut out = out;
+    if skip > 0 && !out.is_empty() {
+        let (first, rest) = out.split_at_mut(out.len().min(8 - skip));
+        first.copy_from_slice(&load(next)[skip..][..first.len()]);
+        out = rest;
+        next += 1;
+    }
+    let (whole, rest) = out.as_chunks_mut::<8>();
+    for chunk in whole {
+        *chunk = load(next);
+        next += 1;
+    }
+    if !rest.is_empty() {
+        rest.copy_from_slice(&load(next)[..rest.len()]);
     }
 }
 

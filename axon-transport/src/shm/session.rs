@@ -31,6 +31,8 @@ struct Lanes {
     free: Vec<u32>,
     /// Lanes from here on have never been used.
     fresh: u32,
+    /// How many have been given out.
+    given: u64,
     /// Bytes of the segment that are backed by memory.
     committed: u64,
 }
@@ -51,7 +53,12 @@ impl SessionSegment {
             segment,
             doorbell: Doorbell::new().map_err(ShmError::system("creating a doorbell"))?,
             pidfd,
-            lanes: Mutex::new(Lanes { free: Vec::new(), fresh: 0, committed: layout::ALIGN }),
+            lanes: Mutex::new(Lanes {
+                free: Vec::new(),
+                fresh: 0,
+                given: 0,
+                committed: layout::ALIGN,
+            }),
             rung: Default::default(),
         }))
     }
@@ -91,8 +98,10 @@ impl SessionSegment {
             return Err(ShmError::Forked);
         }
         let mut lanes = self.lanes.lock().unwrap_or_else(PoisonError::into_inner);
+        lanes.given += 1;
+        let number = lanes.given;
         if let Some(index) = lanes.free.pop() {
-            return Ok(Lane::new(Arc::clone(self), index));
+            return Ok(Lane::new(Arc::clone(self), index, number));
         }
         let index = lanes.fresh;
         if index == layout::LANES {
@@ -105,7 +114,7 @@ impl SessionSegment {
             lanes.committed = upto;
         }
         lanes.fresh += 1;
-        Ok(Lane::new(Arc::clone(self), index))
+        Ok(Lane::new(Arc::clone(self), index, number))
     }
 
     /// Blocks until `ready`, which is asked again whenever a publisher or [`Self::notify`] rang,
@@ -121,14 +130,19 @@ impl SessionSegment {
 
     /// Makes every waiter of this session look again.
     pub fn notify(&self) {
-        self.doorbell.notify();
+        if !self.segment.is_forked() {
+            self.doorbell.notify();
+        }
     }
 
     /// Lets an event loop lead this session's waits.
     ///
     /// # Errors
-    /// There is one already.
+    /// There is one already, or this process is a fork of the session's.
     pub fn external_leader(self: &Arc<Self>) -> Result<ExternalLeader, ShmError> {
+        if self.segment.is_forked() {
+            return Err(ShmError::Forked);
+        }
         ExternalLeader::new(Arc::clone(self)).ok_or(ShmError::AlreadyLed(self.id))
     }
 
@@ -160,11 +174,12 @@ impl SessionSegment {
         }
     }
 
-    pub(super) fn lane_words(&self, index: u32) -> &[AtomicU64] {
+    pub(super) fn lane_words(&self, index: u32) -> &[AtomicU64; layout::LANE_WORDS] {
         layout::lane_words(self.segment.words(), index)
     }
 
-    pub(super) fn is_forked(&self) -> bool {
+    /// Whether the calling process is a fork of the session's.
+    pub(crate) fn is_forked(&self) -> bool {
         self.segment.is_forked()
     }
 

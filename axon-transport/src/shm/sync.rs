@@ -1,7 +1,12 @@
-//! The one place where the lock-free protocols get their atomics from.
+//! The one place where the lock-free protocols get their atomics and their orderings from.
 //!
 //! They are written over [`Word`], so that the code that runs over mapped memory is the code that
-//! the model checker explores.
+//! the model checker explores, and they name each ordering by its [`Site`], so that a test can
+//! weaken one at a time and see that a model notices (`tests/mutation.rs`).
+//!
+//! The language's memory model knows threads, not processes. Words of 64 bits are lock-free and
+//! free of addresses on the machines that this is built for, so what holds between threads holds
+//! between processes that map the same page.
 
 pub(crate) use std::sync::atomic::Ordering;
 use std::sync::atomic::{AtomicU64, fence};
@@ -15,6 +20,133 @@ pub(crate) trait Word {
     /// Stores the larger of the two and returns what was there. For words private to a process.
     fn fetch_max(&self, value: u64, order: Ordering) -> u64;
     fn fence(order: Ordering);
+}
+
+/// A place where the order of memory accesses matters. All others are relaxed.
+///
+/// | site | pairs with | so that |
+/// | --- | --- | --- |
+/// | `HeadStore` | `HeadLoad` | whoever sees the head sees the sample below it |
+/// | `TailStore` | `TailLoad` | a reader never sees a tail above the head that it loads next |
+/// | `ReuseFence` | `StandsFence` | a reader that saw a reuse sees the tail that announced it |
+/// | `ReclaimFence` | `PinFence` | the publisher sees the pin, or the reader sees the tail |
+/// | `PinStore`, `UnpinStore` | `ScanLoad` | a pinned sample is read before it is written over |
+/// | `OpenStore` | `GenerationLoad` | whoever sees a lane open sees its cursor |
+/// | `CloseStore`, `AskStore` | `GenerationLoad` | whoever sees a reader gone writes after it read |
+/// | `CursorStore` | `CursorLoad` | a sample is copied out before KEEP_ALL writes over it |
+/// | `ArmFence` | `SettleFence` | the sleeper sees the news, or the waker sees the ticket |
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Site {
+    HeadStore,
+    HeadLoad,
+    TailStore,
+    TailLoad,
+    ReuseFence,
+    StandsFence,
+    ReclaimFence,
+    PinFence,
+    PinStore,
+    UnpinStore,
+    ScanLoad,
+    AskStore,
+    OpenStore,
+    CloseStore,
+    GenerationLoad,
+    CursorStore,
+    CursorLoad,
+    ArmFence,
+    SettleFence,
+}
+
+impl Site {
+    /// The ordering to use there.
+    #[inline(always)]
+    pub(crate) fn order(self) -> Ordering {
+        #[cfg(test)]
+        if weakened() == Some(self) {
+            return self.weaker();
+        }
+        self.needed()
+    }
+
+    const fn needed(self) -> Ordering {
+        match self {
+            Self::HeadStore
+            | Self::TailStore
+            | Self::ReuseFence
+            | Self::PinStore
+            | Self::UnpinStore
+            | Self::AskStore
+            | Self::OpenStore
+            | Self::CloseStore
+            | Self::CursorStore => Ordering::Release,
+            Self::HeadLoad
+            | Self::TailLoad
+            | Self::StandsFence
+            | Self::ScanLoad
+            | Self::GenerationLoad
+            | Self::CursorLoad => Ordering::Acquire,
+            // Each side stores one word and loads another.
+            Self::ReclaimFence | Self::PinFence | Self::ArmFence | Self::SettleFence => {
+                Ordering::SeqCst
+            }
+        }
+    }
+}
+
+/// The fence of a site.
+#[inline(always)]
+pub(crate) fn fence_at<W: Word>(site: Site) {
+    let order = site.order();
+    // No fence at all is what remains of a weakened one.
+    if order != Ordering::Relaxed {
+        W::fence(order);
+    }
+}
+
+#[cfg(test)]
+impl Site {
+    pub(crate) const ALL: [Self; 19] = [
+        Self::HeadStore,
+        Self::HeadLoad,
+        Self::TailStore,
+        Self::TailLoad,
+        Self::ReuseFence,
+        Self::StandsFence,
+        Self::ReclaimFence,
+        Self::PinFence,
+        Self::PinStore,
+        Self::UnpinStore,
+        Self::ScanLoad,
+        Self::AskStore,
+        Self::OpenStore,
+        Self::CloseStore,
+        Self::GenerationLoad,
+        Self::CursorStore,
+        Self::CursorLoad,
+        Self::ArmFence,
+        Self::SettleFence,
+    ];
+    /// Names the site to weaken to a run of the models.
+    pub(crate) const WEAKEN: &str = "SHM_TEST_WEAKEN";
+
+    /// The next weaker ordering.
+    pub(crate) fn weaker(self) -> Ordering {
+        match self.needed() {
+            Ordering::SeqCst => Ordering::AcqRel,
+            _ => Ordering::Relaxed,
+        }
+    }
+}
+
+#[cfg(test)]
+fn weakened() -> Option<Site> {
+    static WEAKENED: std::sync::LazyLock<Option<Site>> = std::sync::LazyLock::new(|| {
+        let name = std::env::var(Site::WEAKEN).ok()?;
+        let site = Site::ALL.into_iter().find(|site| format!("{site:?}") == name);
+        Some(site.expect("the name of a site"))
+    });
+    *WEAKENED
 }
 
 impl Word for AtomicU64 {

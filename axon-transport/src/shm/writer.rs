@@ -2,85 +2,36 @@
 
 use std::{
     os::fd::OwnedFd,
+    ptr::NonNull,
     sync::{Arc, Mutex, MutexGuard, PoisonError, atomic::AtomicU64},
     time::{Duration, Instant},
 };
 
 use super::{
-    Loan, Peer, PeerSession, PublishError, SessionSegment, ShmError,
+    Grant, Loan, Meta, Peer, PeerSession, PublishError, Published, ReaderInfo, RingOptions,
+    SessionSegment, ShmError,
     area::Area,
     audience::Audience,
-    headroom,
-    history::{Full, History},
-    layout::{self, RingLayout},
+    history::History,
+    layout::{self, COPIED, RingLayout},
     memory::Segment,
     ring::{self, Place, Record},
+    room::{Committed, Refusal},
 };
 use crate::{
     ids::Gid,
-    qos::{History as Keep, Qos},
+    qos::History as Keep,
     wait::{Purpose, settle},
 };
 
 /// How long a publish waits for a KEEP_ALL reader.
-const PATIENCE: Duration = Duration::from_millis(100);
+pub(super) const PATIENCE: Duration = Duration::from_millis(100);
+/// How often a publish looks for the reader that is in its way before it gives up on the answer.
+pub(super) const LOOKS: u32 = 1000;
 /// Slots of a ring at least; a subscription's depth counts up to this.
 const SLOTS: u64 = 1024;
 /// Slots of a ring that keeps all that fits in its budget.
 const SLOTS_KEEP_ALL: u64 = 8192;
-
-/// What a ring is made for.
-#[derive(Clone, Copy, Debug)]
-pub struct RingOptions {
-    /// The publisher.
-    pub gid: Gid,
-    /// What it offers.
-    pub qos: Qos,
-    /// Bytes of samples to keep before the oldest go; one sample is always kept.
-    pub budget: u64,
-    /// The largest sample in bytes.
-    pub max_message: u64,
-}
-
-/// A reader that wants to attach.
-#[derive(Clone)]
-pub struct ReaderInfo {
-    /// The subscription.
-    pub gid: Gid,
-    /// Its lane in its session's segment.
-    pub lane: u32,
-    /// What it requests.
-    pub qos: Qos,
-    /// Its session.
-    pub peer: Peer,
-    /// The remote subscriptions that it stands for when it is a relay.
-    pub stands_for: Vec<Gid>,
-}
-
-/// What a reader is given when it attaches.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Grant {
-    /// Names this attachment; never 0.
-    pub generation: u64,
-    /// The first position that the reader takes.
-    pub first: u64,
-}
-
-/// What goes with a sample.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Meta {
-    /// The publisher's sequence number.
-    pub sequence: u64,
-    /// When it was published, in nanoseconds since the Unix epoch.
-    pub source_timestamp: i64,
-}
-
-/// A sample that was published.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Published {
-    /// Its position in the ring, counted from 0 without gaps.
-    pub position: u64,
-}
 
 /// A publisher's ring. All methods may be called from any thread.
 ///
@@ -134,41 +85,41 @@ pub struct Published {
 /// ```
 pub struct Writer {
     options: RingOptions,
-    layout: RingLayout,
+    pub(super) layout: RingLayout,
     session: Arc<SessionSegment>,
-    segment: Segment,
+    pub(super) segment: Segment,
     state: Mutex<State>,
 }
 
 pub(super) struct State {
     pub(super) history: History,
-    audience: Audience,
+    pub(super) audience: Audience,
     /// The tail as readers see it.
-    shown_tail: u64,
-    /// Ends of the slots and of the payload area that are backed by memory.
-    committed: [u64; 2],
+    pub(super) shown_tail: u64,
+    /// Ends of the slots and of the two parts of the payload area that are backed by memory.
+    pub(super) committed: Committed,
+    /// Positions that were found pinned, kept for their memory.
+    pub(super) found: Vec<u64>,
+    /// The last sample's sequence number.
+    last: u64,
 }
 
-/// Why an attempt to publish did not succeed.
-pub(super) enum Refusal {
-    /// A KEEP_ALL reader holds the oldest sample.
-    Held,
-    Error(PublishError),
+/// How samples are numbered.
+#[derive(Clone, Copy)]
+pub(super) enum Numbering {
+    /// As given.
+    Given(Meta),
+    /// One up from the last, with this source timestamp.
+    Next(i64),
 }
 
-impl From<PublishError> for Refusal {
-    fn from(error: PublishError) -> Self {
-        Self::Error(error)
-    }
-}
-
-impl From<Full> for Refusal {
-    fn from(full: Full) -> Self {
-        match full {
-            Full::Held => Self::Held,
-            Full::Loaned(loans) => Self::Error(PublishError::Loaned { loans }),
-        }
-    }
+/// A sample's bytes on their way into a ring.
+#[derive(Clone, Copy)]
+pub(super) enum Payload<'a> {
+    /// At most [`layout::COPIED`] bytes, copied in under the lock.
+    Bytes(&'a [u8]),
+    /// Written to memory that was lent: its offset and the sample's length.
+    Written { at: u64, len: usize },
 }
 
 impl Writer {
@@ -184,23 +135,23 @@ impl Writer {
         if max_message > layout::MAX_MESSAGE || budget > layout::MAX_BUDGET {
             return Err(ShmError::TooLarge { max_message, budget });
         }
-        // Twice the budget, so that pieces between samples seldom shorten the history; room for
-        // four of the largest, so that one of them always fits beside one that stands.
-        let area = (4 * Area::rounded(max_message)).max(2 * budget);
         let slots = match qos.history {
             Keep::KeepLast => (u64::from(qos.depth) + 1).max(SLOTS),
             Keep::KeepAll => SLOTS_KEEP_ALL,
         };
-        let layout = RingLayout::new(slots, area);
+        let layout = RingLayout::new(slots, budget, max_message);
         let segment = Segment::create("axon-ring", layout.bytes())?;
         segment.commit(0, layout::ALIGN)?;
         layout.write(segment.words(), options.gid);
-        let history = History::new(layout.slots(), layout.payload_bytes(), budget);
+        let history =
+            History::new(layout.slots(), layout.copied_bytes(), layout.payload_bytes(), budget);
         let state = State {
             audience: Audience::new(qos, history.capacity()),
             history,
             shown_tail: 0,
-            committed: [layout::ALIGN, layout.payload_at()],
+            committed: Committed::new(&layout),
+            found: Vec::new(),
+            last: 0,
         };
         Ok(Self { options, layout, session, segment, state: Mutex::new(state) })
     }
@@ -226,6 +177,9 @@ impl Writer {
     /// # Errors
     /// Its session has no such lane.
     pub fn attach(&self, reader: ReaderInfo) -> Result<Grant, ShmError> {
+        if self.segment.is_forked() {
+            return Err(ShmError::Forked);
+        }
         if reader.lane >= reader.peer.lanes() {
             return Err(ShmError::Refused { what: "it has no such lane" });
         }
@@ -234,24 +188,29 @@ impl Writer {
         Ok(audience.attach(reader, history.tail(), history.head()))
     }
 
-    /// Forgets a reader; false when it was not attached.
+    /// Forgets a reader; false when it was not attached. The samples that it keeps it may keep.
     pub fn detach(&self, reader: Gid) -> bool {
-        self.lock().audience.detach(reader)
+        !self.segment.is_forked() && self.lock().audience.detach(reader)
     }
 
     /// Forgets the readers whose process has ended, and names them.
     pub fn drop_dead(&self) -> Vec<Gid> {
-        self.lock().audience.drop_dead()
+        if self.segment.is_forked() { Vec::new() } else { self.lock().audience.drop_dead() }
+    }
+
+    /// As [`drop_dead`](Self::drop_dead), and those that have left without a word.
+    pub fn drop_gone(&self) -> Vec<Gid> {
+        if self.segment.is_forked() { Vec::new() } else { self.lock().audience.drop_gone() }
     }
 
     /// The subscriptions that are attached; a relay shows as those that it stands for.
     pub fn readers(&self) -> Vec<Gid> {
-        self.lock().audience.readers()
+        if self.segment.is_forked() { Vec::new() } else { self.lock().audience.readers() }
     }
 
     /// Whether any reader is attached.
     pub fn has_readers(&self) -> bool {
-        !self.lock().audience.is_empty()
+        !self.segment.is_forked() && !self.lock().audience.is_empty()
     }
 
     /// Publishes a sample. Where this publisher and a reader of another session are both RELIABLE
@@ -260,7 +219,8 @@ impl Writer {
     /// # Errors
     /// The sample was not published; what to do is in the error.
     pub fn publish(&self, meta: Meta, payload: &[u8]) -> Result<Published, PublishError> {
-        self.publish_within(meta, payload, PATIENCE)
+        self.publish_within(Numbering::Given(meta), payload, PATIENCE)
+            .map(|(_, published)| published)
     }
 
     /// As [`publish`](Self::publish), but does not wait: [`PublishError::Blocked`] at once.
@@ -268,70 +228,139 @@ impl Writer {
     /// # Errors
     /// As [`publish`](Self::publish).
     pub fn try_publish(&self, meta: Meta, payload: &[u8]) -> Result<Published, PublishError> {
-        self.publish_within(meta, payload, Duration::ZERO)
+        let numbering = Numbering::Given(meta);
+        self.publish_within(numbering, payload, Duration::ZERO).map(|(_, published)| published)
     }
 
-    /// Lends `len` bytes of the ring to be written in place and then published. May wait as
-    /// [`publish`](Self::publish) does.
+    /// As [`publish`](Self::publish), with the sequence number that follows the last, which is
+    /// returned.
+    ///
+    /// # Errors
+    /// As [`publish`](Self::publish).
+    pub fn publish_next(&self, source_timestamp: i64, payload: &[u8]) -> Result<u64, PublishError> {
+        let numbering = Numbering::Next(source_timestamp);
+        self.publish_within(numbering, payload, PATIENCE).map(|(sequence, _)| sequence)
+    }
+
+    /// As [`publish_next`](Self::publish_next), but does not wait.
+    ///
+    /// # Errors
+    /// As [`try_publish`](Self::try_publish).
+    pub fn try_publish_next(
+        &self,
+        source_timestamp: i64,
+        payload: &[u8],
+    ) -> Result<u64, PublishError> {
+        let numbering = Numbering::Next(source_timestamp);
+        self.publish_within(numbering, payload, Duration::ZERO).map(|(sequence, _)| sequence)
+    }
+
+    /// Lends `len` bytes to be written and then published: of the ring's own memory where it is
+    /// more than 4 KiB. May wait as [`publish`](Self::publish) does.
     ///
     /// # Errors
     /// As [`publish`](Self::publish).
     pub fn loan(&self, len: usize) -> Result<Loan<'_>, PublishError> {
         let bytes = self.check(len)?;
-        if len <= layout::INLINE {
-            return Ok(Loan::inline(self, len));
+        if len as u64 <= COPIED {
+            return Ok(Loan::copied(self, len));
         }
-        let at = self.patiently(PATIENCE, |state| self.reserve(state, bytes))?;
+        let at = self.patiently(PATIENCE, |state| self.lend(state, bytes))?;
         Ok(Loan::placed(self, len, at))
     }
 
     fn publish_within(
         &self,
-        meta: Meta,
+        numbering: Numbering,
         payload: &[u8],
         patience: Duration,
-    ) -> Result<Published, PublishError> {
+    ) -> Result<(u64, Published), PublishError> {
         let bytes = self.check(payload.len())?;
-        let (position, peers) = self.patiently(patience, |state| {
-            self.slot(state)?;
-            if payload.len() <= layout::INLINE {
-                return Ok(self.commit(state, meta, payload.len(), None, payload));
-            }
-            let at = self.reserve(state, bytes)?;
-            ring::about_to_write::<AtomicU64>();
-            ring::copy_in(self.payload(at, bytes), payload);
-            Ok(self.commit(state, meta, payload.len(), Some(at), &[]))
-        })?;
-        announce(&peers);
-        Ok(Published { position })
+        if payload.len() as u64 <= COPIED {
+            return self.commit(numbering, Payload::Bytes(payload), patience);
+        }
+        let start = Instant::now();
+        let at = self.patiently(patience, |state| self.lend(state, bytes))?;
+        // Copied outside the lock: nobody else knows of the place yet.
+        let mut loan = Loan::placed(self, payload.len(), at);
+        loan.copy_from_slice(payload);
+        loan.commit(numbering, patience.saturating_sub(start.elapsed()))
     }
 
-    /// Publishes what a loan holds.
-    pub(super) fn publish_loan(
+    /// Publishes what has been, or is here, copied in.
+    pub(super) fn commit(
         &self,
+        numbering: Numbering,
+        payload: Payload<'_>,
+        patience: Duration,
+    ) -> Result<(u64, Published), PublishError> {
+        // A loan may have been made before the fork.
+        if self.segment.is_forked() {
+            return Err(PublishError::Forked);
+        }
+        let (meta, position, peers) = self.patiently(patience, |state| {
+            self.slot(state)?;
+            let (len, place) = match payload {
+                Payload::Bytes(bytes) if bytes.len() <= layout::INLINE => {
+                    (bytes.len(), Place::Inline)
+                }
+                Payload::Bytes(bytes) => (bytes.len(), Place::At(self.copy_in(state, bytes)?)),
+                Payload::Written { at, len } => (len, Place::At(at)),
+            };
+            let meta = match numbering {
+                Numbering::Given(meta) => meta,
+                Numbering::Next(source_timestamp) => {
+                    Meta { sequence: state.last + 1, source_timestamp }
+                }
+            };
+            state.last = meta.sequence;
+            let position = self.show(state, meta, len, place, payload);
+            Ok((meta, position, state.audience.peers()))
+        })?;
+        announce(&peers);
+        Ok((meta.sequence, Published { position }))
+    }
+
+    fn show(
+        &self,
+        state: &mut State,
         meta: Meta,
         len: usize,
-        at: Option<u64>,
-        inline: &[u8],
-    ) -> Result<Published, PublishError> {
-        let (position, peers) = self.patiently(PATIENCE, |state| {
-            self.slot(state)?;
-            Ok(self.commit(state, meta, len, at, inline))
-        })?;
-        announce(&peers);
-        Ok(Published { position })
+        place: Place,
+        payload: Payload<'_>,
+    ) -> u64 {
+        let extent = match place {
+            Place::Inline => None,
+            Place::At(at) => Some((at, Area::rounded(len as u64))),
+        };
+        let inline = match (place, payload) {
+            (Place::Inline, Payload::Bytes(bytes)) => bytes,
+            _ => &[],
+        };
+        let position = state.history.push(extent);
+        let record = Record {
+            sequence: meta.sequence,
+            timestamp: meta.source_timestamp,
+            len: u32::try_from(len).expect("no longer than the largest message"),
+            place,
+        };
+        ring::about_to_write::<AtomicU64>();
+        let geometry = self.layout.geometry();
+        ring::publish(self.segment.words(), &geometry, position, &record, inline);
+        position
     }
 
-    pub(super) fn unreserve(&self, at: u64, len: usize) {
-        self.lock().history.unreserve(at, Area::rounded(len as u64));
+    pub(super) fn give_back(&self, at: u64, len: usize) {
+        self.lock().history.give_back(at, Area::rounded(len as u64));
     }
 
-    /// The words of `len` bytes at `at` of the payload area.
-    pub(super) fn payload(&self, at: u64, len: u64) -> &[AtomicU64] {
-        self.layout
-            .geometry()
-            .payload(self.segment.words(), at, len)
-            .expect("what was allocated lies inside the area")
+    pub(super) fn is_forked(&self) -> bool {
+        self.segment.is_forked()
+    }
+
+    /// The bytes of a loan.
+    pub(super) fn lent(&self, at: u64, len: usize) -> NonNull<u8> {
+        self.segment.bytes(self.layout.payload_at() + at, len)
     }
 
     fn check(&self, len: usize) -> Result<u64, PublishError> {
@@ -342,80 +371,6 @@ impl Writer {
         if len > max { Err(PublishError::TooLarge { len, max }) } else { Ok(Area::rounded(len)) }
     }
 
-    /// Makes sure that the next position has a slot.
-    fn slot(&self, state: &mut State) -> Result<(), Refusal> {
-        let State { history, audience, .. } = state;
-        let floors = audience.floors(history.head());
-        history.release_below(floors.retained);
-        history.slot(|position| position < floors.held)?;
-        let end = self.layout.slot_end(history.head());
-        self.back(&mut state.committed[0], end, self.layout.payload_at())?;
-        self.show_tail(state);
-        Ok(())
-    }
-
-    /// Takes `bytes` of the payload area.
-    fn reserve(&self, state: &mut State, bytes: u64) -> Result<u64, Refusal> {
-        let State { history, audience, .. } = state;
-        let floors = audience.floors(history.head());
-        history.release_below(floors.retained);
-        let at = history.reserve(bytes, |position| position < floors.held)?;
-        let end = self.layout.payload_at() + at + bytes;
-        if let Err(error) = self.back(&mut state.committed[1], end, self.layout.bytes()) {
-            state.history.unreserve(at, bytes);
-            return Err(error.into());
-        }
-        self.show_tail(state);
-        Ok(at)
-    }
-
-    /// Backs the segment with memory up to `end`, a little further when it keeps growing.
-    fn back(&self, committed: &mut u64, end: u64, limit: u64) -> Result<(), PublishError> {
-        if end <= *committed {
-            return Ok(());
-        }
-        let upto = end.max(*committed + *committed / 8).next_multiple_of(layout::ALIGN).min(limit);
-        self.segment.commit(*committed, upto).map_err(|error| match error {
-            ShmError::NoMemory { needed, available } => {
-                PublishError::NoMemory { needed, available }
-            }
-            _ => PublishError::NoMemory {
-                needed: upto - *committed,
-                available: headroom::available().unwrap_or(0),
-            },
-        })?;
-        *committed = upto;
-        Ok(())
-    }
-
-    fn show_tail(&self, state: &mut State) {
-        if state.shown_tail != state.history.tail() {
-            state.shown_tail = state.history.tail();
-            ring::retire(self.segment.words(), &self.layout.geometry(), state.shown_tail);
-        }
-    }
-
-    fn commit(
-        &self,
-        state: &mut State,
-        meta: Meta,
-        len: usize,
-        at: Option<u64>,
-        inline: &[u8],
-    ) -> (u64, Arc<[Peer]>) {
-        let position = state.history.push(at.map(|at| (at, Area::rounded(len as u64))));
-        let record = Record {
-            sequence: meta.sequence,
-            timestamp: meta.source_timestamp,
-            len: u32::try_from(len).expect("no longer than the largest message"),
-            place: at.map_or(Place::Inline, Place::At),
-        };
-        ring::about_to_write::<AtomicU64>();
-        let geometry = self.layout.geometry();
-        ring::publish(self.segment.words(), &geometry, position, &record, inline);
-        (position, state.audience.peers())
-    }
-
     /// Tries until it works or `patience` is at its end. The lock is not held in between.
     fn patiently<T>(
         &self,
@@ -423,8 +378,8 @@ impl Writer {
         mut attempt: impl FnMut(&mut State) -> Result<T, Refusal>,
     ) -> Result<T, PublishError> {
         let mut deadline = None;
-        loop {
-            let (reader, laggards) = {
+        for look in 0u32.. {
+            let laggards = {
                 let mut state = self.lock();
                 match attempt(&mut state) {
                     Ok(done) => return Ok(done),
@@ -432,19 +387,23 @@ impl Writer {
                     Err(Refusal::Held) => {}
                 }
                 let State { history, audience, .. } = &mut *state;
-                match audience.laggards(history.tail(), history.head()) {
-                    // It moved on meanwhile.
-                    None => continue,
-                    Some(found) => found,
-                }
+                audience.laggards(history.tail(), history.head())
             };
             let now = Instant::now();
             let left = deadline.get_or_insert(now + patience).saturating_duration_since(now);
-            if left.is_zero() {
-                return Err(PublishError::Blocked { reader });
+            match laggards {
+                Some((reader, _)) if left.is_zero() => {
+                    return Err(PublishError::Blocked { reader });
+                }
+                Some((_, peers)) => self.await_room(&peers, left),
+                // It moved on between the two looks. One that does so for ever is out for trouble.
+                None if left.is_zero() && look >= LOOKS => {
+                    return Err(PublishError::Blocked { reader: self.options.gid });
+                }
+                None => {}
             }
-            self.await_room(&laggards, left);
         }
+        unreachable!("the deadline comes first")
     }
 
     fn await_room(&self, laggards: &[Arc<PeerSession>], left: Duration) {
@@ -459,7 +418,7 @@ impl Writer {
         self.lock().audience.mark_dead();
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
+    pub(super) fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

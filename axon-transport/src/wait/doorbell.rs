@@ -102,8 +102,9 @@ impl Doorbell {
             return true;
         }
         let deadline = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
-        self.lock().waiting[purpose as usize] += 1;
-        let outcome = loop {
+        // Also when `ready` panics.
+        let _waiting = Waiting::new(self, word, purpose);
+        loop {
             let armed_at = {
                 let mut crowd = self.lock();
                 crowd.ticket += 1;
@@ -111,21 +112,14 @@ impl Doorbell {
                 crowd.epoch
             };
             if ready() {
-                break true;
+                return true;
             }
             let left = deadline.map(|deadline| deadline.saturating_duration_since(Instant::now()));
             if left.is_some_and(|left| left.is_zero()) {
-                break false;
+                return false;
             }
             self.sleep(armed_at, others, left);
-        };
-        let mut crowd = self.lock();
-        crowd.waiting[purpose as usize] -= 1;
-        crowd.disarm_idle(purpose, word);
-        // Whoever led may be gone: another one of the crowd takes over.
-        drop(crowd);
-        self.turn.notify_one();
-        outcome
+        }
     }
 
     /// Makes every waiter of this process look again.
@@ -176,6 +170,31 @@ impl Doorbell {
     }
 }
 
+/// One of the crowd, until it is dropped.
+struct Waiting<'a> {
+    doorbell: &'a Doorbell,
+    word: &'a AtomicU64,
+    purpose: Purpose,
+}
+
+impl<'a> Waiting<'a> {
+    fn new(doorbell: &'a Doorbell, word: &'a AtomicU64, purpose: Purpose) -> Self {
+        doorbell.lock().waiting[purpose as usize] += 1;
+        Self { doorbell, word, purpose }
+    }
+}
+
+impl Drop for Waiting<'_> {
+    fn drop(&mut self) {
+        let mut crowd = self.doorbell.lock();
+        crowd.waiting[self.purpose as usize] -= 1;
+        crowd.disarm_idle(self.purpose, self.word);
+        drop(crowd);
+        // Whoever led may be gone: another one of the crowd takes over.
+        self.doorbell.turn.notify_one();
+    }
+}
+
 impl Crowd {
     fn disarm_idle(&self, purpose: Purpose, word: &AtomicU64) {
         if self.waiting[purpose as usize] == 0 && !self.external[purpose as usize] {
@@ -205,7 +224,7 @@ fn poll_readable(bell: BorrowedFd<'_>, others: &[BorrowedFd<'_>], left: Option<D
 ///
 /// Each round: [`clear`](Self::clear), [`arm`](Self::arm), look for work; if there is some,
 /// [`disarm`](Self::disarm) and do it, else await that the descriptor is readable. Threads that
-/// wait meanwhile are woken by `clear`.
+/// wait meanwhile are woken by `clear`. In a forked child it does nothing.
 pub struct ExternalLeader {
     session: Arc<SessionSegment>,
 }
@@ -234,6 +253,9 @@ impl ExternalLeader {
 
     /// Takes the rings that came and makes the session's other waiters look again.
     pub fn clear(&self) {
+        if self.session.is_forked() {
+            return;
+        }
         let doorbell = self.session.doorbell_hub();
         let mut crowd = doorbell.lock();
         doorbell.take_rings(&mut crowd);
@@ -244,6 +266,9 @@ impl ExternalLeader {
     /// Arms a new ticket: whatever comes after it rings the doorbell. With `room`, so does room
     /// for a publish that gave [`PublishError::Blocked`](crate::shm::PublishError::Blocked).
     pub fn arm(&self, room: bool) {
+        if self.session.is_forked() {
+            return;
+        }
         let mut crowd = self.session.doorbell_hub().lock();
         crowd.ticket += 1;
         for purpose in PURPOSES {
@@ -256,6 +281,9 @@ impl ExternalLeader {
 
     /// Ends the round without a sleep.
     pub fn disarm(&self) {
+        if self.session.is_forked() {
+            return;
+        }
         let mut crowd = self.session.doorbell_hub().lock();
         crowd.external = [false; 2];
         for purpose in PURPOSES {
@@ -272,6 +300,9 @@ impl AsFd for ExternalLeader {
 
 impl Drop for ExternalLeader {
     fn drop(&mut self) {
+        if self.session.is_forked() {
+            return;
+        }
         self.disarm();
         let doorbell = self.session.doorbell_hub();
         doorbell.lock().leader = Leader::None;

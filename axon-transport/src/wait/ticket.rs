@@ -4,13 +4,13 @@
 //! waker makes that something visible, fences, and looks whether there is a ticket. One of the two
 //! sees the other. Neither fence can be weaker: each side stores one word and loads another.
 
-use crate::shm::sync::{Ordering, Word};
+use crate::shm::sync::{Ordering, Site, Word, fence_at};
 
 /// Sleeper: arms `word` with `ticket`, larger than any before. Look for work after it.
 pub(crate) fn arm<W: Word>(word: &W, ticket: u64) {
     word.store(ticket, Ordering::Relaxed);
     // Pairs with the fence of `settle`.
-    W::fence(Ordering::SeqCst);
+    fence_at::<W>(Site::ArmFence);
 }
 
 /// Sleeper: nobody sleeps any more.
@@ -22,7 +22,7 @@ pub(crate) fn disarm<W: Word>(word: &W) {
 #[inline]
 pub(crate) fn settle<W: Word>() {
     // Pairs with the fence of `arm`.
-    W::fence(Ordering::SeqCst);
+    fence_at::<W>(Site::SettleFence);
 }
 
 /// Waker, after [`settle`]: whether the doorbell must be rung, now that there is something. `rung`

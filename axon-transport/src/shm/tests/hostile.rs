@@ -31,7 +31,7 @@ impl Scribble {
         let session = session();
         let gid = Gid::new(session.id(), 1);
         let segment = Segment::create("test", BYTES).unwrap();
-        layout::RingLayout::new(16, BYTES - layout::ALIGN).write(segment.words(), gid);
+        layout::RingLayout::new(16, 0, 6000).write(segment.words(), gid);
         Self { segment, gid, session }
     }
 
@@ -140,11 +140,11 @@ fn headers_that_make_no_sense_are_refused() {
         (0, 0),
         (0, u64::from_ne_bytes(*b"AXONSES1")),
         (8, 16 << 32),
-        (8, 2 | 16 << 32),
-        (8, 1),
-        (8, 1 | 1 << 32),
-        (8, 1 | 17 << 32),
-        (8, 1 | 0x8000_0000 << 32),
+        (8, 1 | 16 << 32),
+        (8, 2),
+        (8, 2 | 1 << 32),
+        (8, 2 | 17 << 32),
+        (8, 2 | 0x8000_0000 << 32),
         (16, u64::MAX),
         (16, 4096),
         (24, u64::MAX - 63),
@@ -162,7 +162,7 @@ fn headers_that_make_no_sense_are_refused() {
 fn sessions_that_make_no_sense_are_refused() {
     let a = session();
     assert!(PeerSession::map(SessionId::random(), a.descriptors().unwrap()).is_err());
-    for (word, value) in [(0, 0), (1, 2), (1, 1 | 1 << 48), (1, 1 | u64::from(u32::MAX) << 32)] {
+    for (word, value) in [(0, 0), (1, 1), (1, 2 | 1 << 48), (1, 2 | u64::from(u32::MAX) << 32)] {
         let segment = Segment::create("test", layout::session_bytes()).unwrap();
         layout::write_session(segment.words(), a.id());
         segment.words()[word].store(value, Relaxed);
@@ -217,6 +217,7 @@ fn slots_that_make_no_sense_are_reported() {
         (97, 1, 0),
         (u32::MAX, 1, 0),
         (200, 0, area - 192),
+        (5000, 0, area - 4992),
         (1, 0, area),
         (1, 0, 3),
         (1, 0, u64::MAX),
@@ -229,6 +230,7 @@ fn slots_that_make_no_sense_are_reported() {
         scribble.slot(0, len, flags, data);
         let taken = reader.take(&mut Vec::new());
         assert!(matches!(taken, Err(TakeError::Corrupt { .. })), "{len} {flags} {data}");
+        assert!(matches!(reader.take_sample(), Err(TakeError::Corrupt { .. })));
     }
     // The same slot with what a publisher writes.
     let scribble = Scribble::new();
@@ -240,14 +242,19 @@ fn slots_that_make_no_sense_are_reported() {
 }
 
 #[test]
-fn a_sample_longer_than_the_reader_allows_is_refused_unread() {
+fn a_sample_longer_than_the_reader_allows_is_lost_and_the_next_is_not() {
     let session = session();
     let gid = Gid::new(session.id(), 1);
-    let options = RingOptions { gid, qos: keep_last(1), budget: 0, max_message: 4 * MAX };
+    let options = RingOptions { gid, qos: keep_last(2), budget: 8 * MAX, max_message: 4 * MAX };
     let writer = Writer::create(session.clone(), options).unwrap();
-    let mut reader = attach(&writer, &session, &session, keep_last(1));
+    let mut reader = attach(&writer, &session, &session, keep_last(2));
     writer.publish(meta(1), &vec![0; 2 * MAX as usize]).unwrap();
-    assert!(matches!(reader.take(&mut Vec::new()), Err(TakeError::Corrupt { .. })));
+    writer.publish(meta(2), b"small").unwrap();
+    let (len, max) = (2 * MAX, MAX);
+    let refused = TakeError::TooLarge { writer: gid, len, max };
+    assert_eq!(reader.take_sample().unwrap_err(), refused);
+    assert_eq!(reader.take(&mut Vec::new()).unwrap().unwrap().meta, meta(2));
+    assert_eq!((reader.received(), reader.lost()), (1, 1));
 }
 
 #[test]
@@ -285,13 +292,17 @@ proptest! {
             match word % 4 {
                 0 => scribble.set(128, value),
                 1 => scribble.set(256, value),
-                2 => scribble.slot(value % 64, value as u32 % 300, (value >> 8) as u32 & 1, value),
+                2 => scribble.slot(value % 64, value as u32 % 9000, (value >> 8) as u32 & 1, value),
                 _ => scribble.words()[4096 / 8 + word].store(value, Relaxed),
             }
             let _ = reader.peek();
             if let Ok(Some(taken)) = reader.take(&mut out) {
                 prop_assert!(out.len() as u64 <= BYTES);
                 prop_assert!(taken.position >= first);
+            }
+            if let Ok(Some(sample)) = reader.take_sample() {
+                prop_assert_eq!(sample.read_at(0, &mut [0; 8]), sample.len().min(8));
+                sample.copy_to(&mut out).unwrap();
             }
             let _ = reader.skip();
         }

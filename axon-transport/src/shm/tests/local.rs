@@ -270,9 +270,10 @@ fn attaching_again_changes_nothing_but_whom_a_relay_stands_for() {
     let (a, b) = (session(), session());
     let writer = writer(&a, keep_last(5), 1 << 20);
     let relayed: Vec<_> = (0..3).map(|number| Gid::new(SessionId::random(), number)).collect();
+    let lanes = [b.allocate_lane().unwrap(), b.allocate_lane().unwrap()];
     let mut info = ReaderInfo {
         gid: Gid::new(b.id(), 9),
-        lane: 4,
+        lane: lanes[0].index(),
         qos: keep_last(5),
         peer: peer(&a, &b),
         stands_for: Vec::new(),
@@ -285,7 +286,7 @@ fn attaching_again_changes_nothing_but_whom_a_relay_stands_for() {
     assert_eq!(writer.attach(info.clone()).unwrap(), grant);
     assert_eq!(writer.readers(), relayed);
     // Another lane is another attachment.
-    info.lane = 5;
+    info.lane = lanes[1].index();
     let other = writer.attach(info.clone()).unwrap();
     assert_ne!(other.generation, grant.generation);
     assert_eq!((other.first, writer.readers()), (1, relayed));

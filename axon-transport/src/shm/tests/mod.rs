@@ -1,9 +1,13 @@
 //! Two ends of a ring: in one process, in two, with a hostile one, and under the model checker.
 
+mod api;
 mod hostile;
 mod local;
 mod model;
+mod mutation;
+mod pins;
 mod processes;
+mod wire;
 
 use std::{
     sync::Arc,

@@ -1,162 +1,12 @@
 //! The two ends in two processes: this test binary runs itself as the other one, and the
 //! descriptors go over a socket pair as they do between sessions.
 
-use std::{
-    env,
-    io::{IoSlice, IoSliceMut, Write as _},
-    mem::MaybeUninit,
-    os::fd::{AsFd, BorrowedFd, OwnedFd},
-    process::{Child, Command, Stdio},
-    thread,
-    time::Duration,
+use std::{env, io::Write as _, os::fd::AsFd, thread, time::Duration};
+
+use super::{
+    wire::{LARGE, Other, PART, Wire},
+    *,
 };
-
-use rustix::net::{
-    AddressFamily, RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, SendAncillaryBuffer,
-    SendAncillaryMessage, SendFlags, SocketFlags, SocketType, recvmsg, sendmsg, socketpair,
-};
-
-use super::*;
-
-/// Tells this binary that it is the other process, and which part it plays.
-const PART: &str = "SHM_TEST_PART";
-const LARGE: u64 = 25_000_000;
-
-/// One end of the socket pair.
-struct Wire(OwnedFd);
-
-impl Wire {
-    fn send(&self, bytes: &[u8], fds: &[BorrowedFd<'_>]) {
-        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(4))];
-        let mut control = SendAncillaryBuffer::new(&mut space);
-        assert!(fds.is_empty() || control.push(SendAncillaryMessage::ScmRights(fds)));
-        sendmsg(&self.0, &[IoSlice::new(bytes)], &mut control, SendFlags::empty()).unwrap();
-    }
-
-    fn receive(&self) -> (Vec<u8>, Vec<OwnedFd>) {
-        let mut bytes = vec![0; 256];
-        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(4))];
-        let mut control = RecvAncillaryBuffer::new(&mut space);
-        let flags = RecvFlags::CMSG_CLOEXEC;
-        let got =
-            recvmsg(&self.0, &mut [IoSliceMut::new(&mut bytes)], &mut control, flags).unwrap();
-        bytes.truncate(got.bytes);
-        let mut fds = Vec::new();
-        for message in control.drain() {
-            if let RecvAncillaryMessage::ScmRights(rights) = message {
-                fds.extend(rights);
-            }
-        }
-        (bytes, fds)
-    }
-
-    fn send_numbers(&self, numbers: &[u64]) {
-        let bytes: Vec<u8> = numbers.iter().flat_map(|number| number.to_le_bytes()).collect();
-        self.send(&bytes, &[]);
-    }
-
-    fn receive_numbers(&self) -> Vec<u64> {
-        let bytes = self.receive().0;
-        bytes.as_chunks::<8>().0.iter().map(|chunk| u64::from_le_bytes(*chunk)).collect()
-    }
-
-    fn send_session(&self, session: &SessionSegment, more: &[u8], ring: Option<OwnedFd>) {
-        let descriptors = session.descriptors().unwrap();
-        let mut fds = vec![
-            descriptors.segment.as_fd(),
-            descriptors.doorbell.as_fd(),
-            descriptors.pidfd.as_fd(),
-        ];
-        fds.extend(ring.as_ref().map(AsFd::as_fd));
-        let mut bytes = session.id().0.to_vec();
-        bytes.extend_from_slice(more);
-        self.send(&bytes, &fds);
-    }
-
-    fn receive_session(&self) -> (Arc<PeerSession>, Vec<u8>, Option<OwnedFd>) {
-        let (bytes, fds) = self.receive();
-        let (id, more) = bytes.split_at(16);
-        let mut fds = fds.into_iter();
-        let mut next = || fds.next().expect("a descriptor");
-        let descriptors = PeerDescriptors { segment: next(), doorbell: next(), pidfd: next() };
-        assert!(descriptors.process().is_some_and(|pid| pid != std::process::id()));
-        let id = SessionId(id.try_into().unwrap());
-        (PeerSession::map(id, descriptors).unwrap(), more.to_vec(), fds.next())
-    }
-
-    /// The publisher's half of an attachment.
-    fn serve(&self, session: &SessionSegment, writer: &Writer, qos: Qos) {
-        self.send_session(session, &writer.gid().0, Some(writer.descriptor().unwrap()));
-        let (peer, lane, _) = self.receive_session();
-        let info = ReaderInfo {
-            gid: Gid::new(peer.id(), 1),
-            lane: u32::from_le_bytes(lane.try_into().unwrap()),
-            qos,
-            peer: Peer::Remote(peer),
-            stands_for: Vec::new(),
-        };
-        let grant = writer.attach(info).unwrap();
-        self.send_numbers(&[grant.generation, grant.first]);
-    }
-
-    /// The reader's half.
-    fn join(&self, session: &Arc<SessionSegment>, qos: Qos) -> Reader {
-        let (peer, writer, ring) = self.receive_session();
-        let lane = session.allocate_lane().unwrap();
-        self.send_session(session, &lane.index().to_le_bytes(), None);
-        let grant = self.receive_numbers();
-        let options = ReaderOptions {
-            reader: Gid::new(session.id(), 1),
-            writer: Gid(writer.try_into().unwrap()),
-            peer: Peer::Remote(peer),
-            lane,
-            grant: Grant { generation: grant[0], first: grant[1] },
-            qos,
-            max_message: LARGE,
-        };
-        Reader::map(ring.expect("a ring"), options).unwrap()
-    }
-}
-
-/// The other process; killed when dropped.
-struct Other {
-    child: Child,
-    wire: Wire,
-}
-
-impl Other {
-    fn start(part: &str) -> Self {
-        let (ours, theirs) =
-            socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None)
-                .unwrap();
-        // The harness names tests without the crate.
-        let (_, module) = module_path!().split_once("::").unwrap();
-        let child = Command::new(env::current_exe().unwrap())
-            .args(["--exact", &format!("{module}::the_other_process"), "--nocapture"])
-            .env(PART, part)
-            .stdin(Stdio::from(theirs))
-            .stdout(Stdio::null())
-            .spawn()
-            .unwrap();
-        Self { child, wire: Wire(ours) }
-    }
-
-    fn kill(&mut self) {
-        self.child.kill().unwrap();
-        self.child.wait().unwrap();
-    }
-
-    fn succeed(mut self) {
-        assert!(self.child.wait().unwrap().success());
-    }
-}
-
-impl Drop for Other {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
 
 fn large_writer(session: &Arc<SessionSegment>, qos: Qos, budget: u64) -> Writer {
     let gid = Gid::new(session.id(), 1);
@@ -224,6 +74,53 @@ fn the_other_process() {
             wire.send_numbers(&[]);
             thread::sleep(Duration::from_secs(600));
         }
+        "subscribe" => {
+            let context = Context::new().unwrap();
+            let options = SubscriberOptions::new(Qos::keep_all());
+            let mut subscriber =
+                Subscriber::connect(&context, &wire.0, options, Some(EVER)).unwrap();
+            let total = lengths().len() as u64;
+            for sequence in 1..=total {
+                let sample = subscriber.recv(Some(EVER)).unwrap().expect("a sample");
+                assert_eq!(sample.meta().sequence, sequence);
+                sample.copy_to(&mut out).unwrap();
+                assert!(out == pattern(sequence, out.len()), "sample {sequence} is torn");
+            }
+            wire.send_numbers(&[subscriber.received(), subscriber.lost()]);
+            // The publisher goes away, which ends the wait.
+            assert!(subscriber.recv(None).unwrap().is_none() && subscriber.publisher_ended());
+        }
+        "publish and go" => {
+            let context = Context::new().unwrap();
+            let options = PublisherOptions::new(Qos::keep_all());
+            let publisher = Publisher::new(&context, options).unwrap();
+            publisher.serve(&wire.0, Some(EVER)).unwrap();
+            for (sequence, len) in lengths().into_iter().enumerate() {
+                let payload = pattern(sequence as u64 + 1, len);
+                while let Err(error) = publisher.publish(&payload) {
+                    assert!(matches!(error, PublishError::Blocked { .. }), "{error}");
+                }
+            }
+            wire.receive();
+        }
+        "keep samples" => {
+            let mut reader = wire.join(&session, keep_last(1));
+            let mut kept = Vec::new();
+            for _ in 0..5 {
+                await_data(&session, &reader);
+                kept.push(reader.take_sample().unwrap().expect("the only one"));
+                wire.send_numbers(&[]);
+            }
+            // Asked what they hold, again and again.
+            while !wire.receive().0.is_empty() {
+                for sample in &kept {
+                    assert!(sample.is_borrowed());
+                    sample.copy_to(&mut out).unwrap();
+                    assert!(out == pattern(sample.meta().sequence, sample.len()));
+                }
+                wire.send_numbers(&[kept.len() as u64]);
+            }
+        }
         "publish for ever" => {
             let writer = large_writer(&session, keep_last(2), 1 << 20);
             wire.serve(&session, &writer, keep_last(2));
@@ -241,15 +138,21 @@ fn the_other_process() {
         "fork" => {
             let writer = large_writer(&session, keep_last(1), 1 << 20);
             let mut reader = attach(&writer, &session, &session, keep_last(1));
+            writer.publish(meta(7), &pattern(7, 9000)).unwrap();
+            let kept = reader.take_sample().unwrap().unwrap();
+            let loan = writer.loan(9000).unwrap();
             writer.publish(meta(0), b"before").unwrap();
             // SAFETY: the child makes no call but what follows, which takes no lock that another
             // thread may have held, and leaves by _exit.
             let child = unsafe { libc::fork() };
             if child == 0 {
                 let poisoned = writer.publish(meta(1), b"child") == Err(PublishError::Forked)
+                    && kept.read_at(0, &mut [0; 8]) == 0
+                    && writer.readers().is_empty()
                     && reader.take(&mut out) == Err(TakeError::Forked)
                     && matches!(session.allocate_lane(), Err(ShmError::Forked))
                     && !session.wait(|| false, None);
+                drop((kept, loan));
                 drop((reader, writer, session));
                 // SAFETY: ends the process without running anything else.
                 unsafe { libc::_exit(if poisoned { 0 } else { 1 }) };
@@ -259,6 +162,14 @@ fn the_other_process() {
             assert_eq!(unsafe { libc::waitpid(child, &mut status, 0) }, child);
             assert_eq!(status, 0, "the child was refused, and killed by nothing");
             // The parent goes on as if nothing had been.
+            for sequence in 8..40 {
+                writer.publish(meta(sequence), &pattern(sequence, 9000)).unwrap();
+                reader.take(&mut out).unwrap().unwrap();
+            }
+            kept.copy_to(&mut out).unwrap();
+            assert!(out == pattern(7, 9000), "the child did not give back what the parent keeps");
+            drop(loan);
+            writer.publish(meta(0), b"before").unwrap();
             assert_eq!(reader.take(&mut out).unwrap().unwrap().meta, meta(0));
             writer.publish(meta(1), b"after").unwrap();
             assert_eq!(reader.take(&mut out).unwrap().unwrap().meta, meta(1));
@@ -364,6 +275,100 @@ fn a_reader_killed_while_it_holds_the_publisher_lets_it_go() {
     assert!(!writer.has_readers());
     for sequence in 0..1000 {
         writer.try_publish(meta(sequence), &pattern(sequence, 1024)).unwrap();
+    }
+}
+
+#[test]
+fn two_processes_need_no_daemon() {
+    // The one publishes and goes, the other takes it all and finds that the first has gone.
+    let (publisher, subscriber) = (Other::start("publish and go"), Other::start("subscribe"));
+    for (from, to) in [(&subscriber, &publisher), (&publisher, &subscriber)] {
+        from.wire.pass_on(&to.wire);
+    }
+    assert_eq!(subscriber.wire.receive_numbers(), [lengths().len() as u64, 0]);
+    publisher.wire.send(b"done", &[]);
+    publisher.succeed();
+    subscriber.succeed();
+}
+
+/// A reader's process that keeps five samples, and their publisher.
+fn keeper(session: &Arc<SessionSegment>) -> (Other, Writer) {
+    let writer = large_writer(session, keep_last(1), 0);
+    let other = Other::start("keep samples");
+    other.wire.serve(session, &writer, keep_last(1));
+    for sequence in 0..5 {
+        publish(&writer, sequence, &pattern(sequence, KEPT));
+        other.wire.receive();
+    }
+    (other, writer)
+}
+
+const KEPT: usize = 100_000;
+
+fn in_limbo(writer: &Writer) -> usize {
+    writer.lock().history.pinned().retired().len()
+}
+
+#[test]
+fn what_another_process_keeps_is_not_written_over() {
+    let session = session();
+    let (other, writer) = keeper(&session);
+    for round in 0..20 {
+        for sequence in 0..10 {
+            let sequence = 5 + round * 10 + sequence;
+            writer.try_publish(meta(sequence), &pattern(sequence, KEPT)).unwrap();
+        }
+        if round == 10 {
+            // Whoever says so: the samples are in use all the same.
+            assert!(writer.detach(writer.readers()[0]));
+        }
+        other.wire.send_numbers(&[0]);
+        assert_eq!(other.wire.receive_numbers(), [5]);
+    }
+    assert!((5..=7).contains(&in_limbo(&writer)));
+    other.wire.send(b"", &[]);
+    other.succeed();
+    // Its process has ended: it told us, or we find out.
+    writer.drop_dead();
+    (0..4).for_each(|n| publish(&writer, 1000 + n, &pattern(1000 + n, KEPT)));
+    assert!(in_limbo(&writer) <= 1);
+}
+
+#[test]
+fn a_process_killed_with_samples_in_use_gives_them_back() {
+    let session = session();
+    let (mut other, writer) = keeper(&session);
+    let large = |sequence| {
+        writer.try_publish(meta(sequence), &pattern(sequence, KEPT)).unwrap();
+    };
+    // One that is stopped is as good as alive, and holds nobody up.
+    let pid = rustix::process::Pid::from_child(&other.child);
+    rustix::process::kill_process(pid, rustix::process::Signal::STOP).unwrap();
+    (5..200).for_each(large);
+    assert!((5..=7).contains(&in_limbo(&writer)));
+    other.kill();
+    assert_eq!(writer.drop_dead().len(), 1);
+    (200..210).for_each(large);
+    assert!(in_limbo(&writer) <= 1);
+    assert_eq!(writer.lock().audience.seats(), 0);
+}
+
+#[test]
+fn samples_outlive_the_process_that_published_them() {
+    let session = session();
+    let mut other = Other::start("publish for ever");
+    let mut reader = other.wire.join(&session, keep_last(2));
+    let mut kept = Vec::new();
+    while kept.len() < 5 {
+        await_data(&session, &reader);
+        kept.extend(reader.take_sample().unwrap().filter(Sample::is_borrowed));
+    }
+    other.kill();
+    drop(reader);
+    let mut out = Vec::new();
+    for sample in kept {
+        sample.copy_to(&mut out).unwrap();
+        assert!(out == pattern(sample.meta().sequence, out.len()), "a sample is torn");
     }
 }
 

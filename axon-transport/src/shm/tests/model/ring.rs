@@ -1,17 +1,20 @@
-//! The ring's protocol under the model checker: every interleaving and every reordering that the
-//! memory model allows, for a small ring.
+//! Samples that are copied out, by readers that are overtaken and by such that hold the publisher.
 
 use loom::{
     sync::{Arc, atomic::AtomicU64},
     thread,
 };
 
-use super::super::{
-    ring::{
-        Geometry, Look, Place, Record, about_to_write, bounds, copy_in, data, look, publish,
-        retire, stands,
+use super::{
+    super::super::{
+        lane,
+        ring::{
+            Geometry, Look, Place, Record, about_to_write, bounds, copy_in, data, look, publish,
+            retire, stands,
+        },
+        sync::{Ordering, Word},
     },
-    sync::{Ordering, Word},
+    Cell, check, granted, small,
 };
 
 const SLOTS: usize = 2;
@@ -56,12 +59,7 @@ fn read(words: &[AtomicU64], cursor: u64) -> bool {
     }
 }
 
-fn check(preemptions: usize, model: impl Fn() + Sync + Send + 'static) {
-    let mut builder = loom::model::Builder::new();
-    builder.preemption_bound = Some(preemptions);
-    builder.check(model);
-}
-
+/// `HeadStore`, `HeadLoad`, `ReuseFence`, `StandsFence`.
 #[test]
 fn a_reader_takes_whole_samples_or_none_while_it_is_overtaken() {
     check(3, || {
@@ -90,40 +88,43 @@ fn a_reader_takes_whole_samples_or_none_while_it_is_overtaken() {
     });
 }
 
+/// `CursorStore`, `CursorLoad`.
 #[test]
 fn a_publisher_that_waits_for_the_cursor_overwrites_nothing_unread() {
     check(3, || {
-        let words = words();
-        let cursor = Arc::new(AtomicU64::new(0));
-        write(&words, 0);
-        let (shared, seen) = (words.clone(), cursor.clone());
-        let publisher = thread::spawn(move || {
-            for position in 1..3u64 {
-                let tail = (position + 1).saturating_sub(SLOTS as u64);
-                while seen.load(Ordering::Acquire) < tail {
-                    thread::yield_now();
+        let (words, geometry) = small();
+        let (lane, tenancy) = granted(0);
+        let cells: Arc<[Cell; 2]> = Arc::new([Cell::new(0), Cell::new(0)]);
+        cells[0].set(1);
+        super::show(&words, &geometry, 0);
+        let publisher = {
+            let (words, lane, cells) = (words.clone(), lane.clone(), cells.clone());
+            thread::spawn(move || {
+                for position in 1..3u64 {
+                    let tail = (position + 1).saturating_sub(SLOTS as u64);
+                    while tenancy.cursor(&lane[..]).expect("an open lane") < tail {
+                        thread::yield_now();
+                    }
+                    if tail > 0 {
+                        retire(&words[..], &geometry, tail);
+                    }
+                    cells[(position % 2) as usize].set(position + 1);
+                    super::show(&words, &geometry, position);
                 }
-                if tail > 0 {
-                    retire(&shared, &GEOMETRY, tail);
-                }
-                write(&shared, position);
-            }
-        });
+            })
+        };
         for position in 0..2 {
-            loop {
-                let (_, head) = bounds(&words, &GEOMETRY).unwrap();
-                if position < head {
-                    break;
-                }
+            while bounds(&words[..], &geometry).unwrap().1 <= position {
                 thread::yield_now();
             }
-            assert!(read(&words, position), "nothing that was unread was given up");
-            cursor.store(position + 1, Ordering::Release);
+            assert_eq!(cells[position as usize].get(), position + 1, "nothing unread was given up");
+            lane::advance(&lane[..], position + 1);
         }
         publisher.join().unwrap();
     });
 }
 
+/// `TailStore`, `TailLoad`.
 #[test]
 fn a_reader_never_sees_a_tail_above_the_head() {
     check(3, || {

@@ -1,0 +1,123 @@
+//! What a reader shares with the samples that it lent out: the ring's map, the lane, and which of
+//! the lane's records are in use.
+
+use std::{
+    ops::Range,
+    sync::{Arc, Mutex, PoisonError, atomic::AtomicU64},
+};
+
+use super::{
+    Lane,
+    memory::Map,
+    pins::RECORDS,
+    ring::{Geometry, Record},
+};
+
+/// The record that is used while a sample is copied out; the others are for samples in use.
+const COPY: usize = RECORDS - 1;
+
+/// One reader's hold on one ring. It stands until the reader and all samples in use are dropped;
+/// only then does the lane say that the reader has left.
+pub(super) struct Attachment {
+    pub(super) map: Map,
+    pub(super) geometry: Geometry,
+    pub(super) lane: Lane,
+    /// The records in use, as bits. The lock also orders what one thread stored in a record before
+    /// what the next one stores there.
+    used: Mutex<u8>,
+}
+
+/// What came of pinning a sample.
+pub(super) enum Pinning<T> {
+    Pinned(T),
+    /// The publisher has given the sample up.
+    Overtaken,
+    /// All records are in use.
+    NoRecord,
+}
+
+impl Attachment {
+    pub(super) fn new(map: Map, geometry: Geometry, lane: Lane) -> Arc<Self> {
+        Arc::new(Self { map, geometry, lane, used: Mutex::new(0) })
+    }
+
+    pub(super) fn words(&self) -> &[AtomicU64] {
+        self.map.words()
+    }
+
+    /// Keeps the sample at `position` in place for as long as the pin lives.
+    pub(super) fn pin(self: &Arc<Self>, position: u64) -> Pinning<Pin> {
+        let record = {
+            let mut used = self.used();
+            let record = used.trailing_ones() as usize;
+            if record >= COPY {
+                return Pinning::NoRecord;
+            }
+            *used |= 1 << record;
+            record
+        };
+        // Gives the record back also when it is not used.
+        let pin = Pin { attachment: Arc::clone(self), record };
+        if self.lane.pin(record, position, self.tail()) {
+            Pinning::Pinned(pin)
+        } else {
+            Pinning::Overtaken
+        }
+    }
+
+    /// Runs `read` while the sample at `position` is kept in place; `None` when the publisher has
+    /// given it up. For the reader itself, which does one thing at a time.
+    pub(super) fn while_pinned<T>(&self, position: u64, read: impl FnOnce() -> T) -> Option<T> {
+        if !self.lane.pin(COPY, position, self.tail()) {
+            return None;
+        }
+        let unpin = Unpin(self);
+        let result = read();
+        drop(unpin);
+        Some(result)
+    }
+
+    /// Where the words of a record that is not in its slot are, if inside the payload area.
+    pub(super) fn placed(&self, record: &Record) -> Option<Range<usize>> {
+        self.geometry.placed(self.words(), record)
+    }
+
+    fn tail(&self) -> &AtomicU64 {
+        &self.words()[self.geometry.tail]
+    }
+
+    fn used(&self) -> std::sync::MutexGuard<'_, u8> {
+        self.used.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+struct Unpin<'a>(&'a Attachment);
+
+impl Drop for Unpin<'_> {
+    fn drop(&mut self) {
+        self.0.lane.unpin(COPY);
+    }
+}
+
+/// A sample that stays where it is.
+pub(super) struct Pin {
+    attachment: Arc<Attachment>,
+    record: usize,
+}
+
+impl Pin {
+    pub(super) fn attachment(&self) -> &Attachment {
+        &self.attachment
+    }
+}
+
+impl Drop for Pin {
+    fn drop(&mut self) {
+        // The parent's records are none of a forked child's business, and its lock may be held by
+        // a thread that the child does not have.
+        if !self.attachment.lane.is_forked() {
+            self.attachment.lane.unpin(self.record);
+            *self.attachment.used() &= !(1 << self.record);
+        }
+    }
+}

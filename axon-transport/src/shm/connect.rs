@@ -1,0 +1,259 @@
+//! How a subscriber and a publisher find each other over a connected socket, without a daemon: one
+//! packet there, one back (`docs/formats.md`, section 9).
+
+use std::{
+    io::{self, IoSlice, IoSliceMut},
+    mem::MaybeUninit,
+    os::fd::{AsFd, BorrowedFd, OwnedFd},
+    time::{Duration, Instant},
+};
+
+use minicbor::{Decode, Encode};
+use rustix::{
+    event::{PollFd, PollFlags, Timespec, poll},
+    io::Errno,
+    net::{
+        RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, ReturnFlags, SendAncillaryBuffer,
+        SendAncillaryMessage, SendFlags, recvmsg, sendmsg,
+    },
+};
+
+use super::{PeerDescriptors, ShmError, Writer};
+use crate::{
+    ids::{Gid, SessionId},
+    qos::{Incompatible, Qos},
+};
+
+/// First of each packet.
+const VERSION: u32 = 1;
+const MAX_PACKET: usize = 1024;
+const MAX_DESCRIPTORS: usize = 4;
+/// The longest reason that is told.
+const MAX_REASON: usize = 256;
+
+/// A subscriber and a publisher did not come together.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ConnectError {
+    /// Memory was not to be had, or what the other end handed over was refused.
+    #[error(transparent)]
+    Memory(#[from] ShmError),
+    /// The subscriber requests what the publisher does not offer.
+    #[error("the publisher does not offer the {0} that the subscriber requests")]
+    Incompatible(Incompatible),
+    /// The publisher refused, and said why.
+    #[error("the publisher refused: {0}")]
+    Refused(String),
+    /// The other end sent something else than it should.
+    #[error("the other end sent {0}")]
+    Protocol(&'static str),
+    /// The other end did nothing in time.
+    #[error("the other end did not answer in time")]
+    Timeout,
+    /// The other end of the socket was closed.
+    #[error("the other end of the socket was closed")]
+    Closed,
+    /// The socket failed.
+    #[error("the socket failed: {0}")]
+    Socket(#[source] io::Error),
+}
+
+impl From<Errno> for ConnectError {
+    fn from(errno: Errno) -> Self {
+        match errno {
+            Errno::PIPE | Errno::CONNRESET | Errno::CONNREFUSED | Errno::NOTCONN => Self::Closed,
+            other => Self::Socket(other.into()),
+        }
+    }
+}
+
+/// What a subscriber asks.
+#[derive(Clone, Copy, Debug, Encode, Decode)]
+pub(super) struct Asked {
+    #[n(0)]
+    pub(super) session: SessionId,
+    #[n(1)]
+    pub(super) reader: Gid,
+    #[n(2)]
+    pub(super) lane: u32,
+    #[n(3)]
+    pub(super) qos: Qos,
+}
+
+/// What a publisher answers.
+#[derive(Clone, Copy, Debug, Encode, Decode)]
+pub(super) struct Granted {
+    /// Who asked: an answer to a question that was given up is not one to the next.
+    #[n(0)]
+    pub(super) reader: Gid,
+    #[n(1)]
+    pub(super) session: SessionId,
+    #[n(2)]
+    pub(super) writer: Gid,
+    #[n(3)]
+    pub(super) generation: u64,
+    #[n(4)]
+    pub(super) first: u64,
+}
+
+#[derive(Debug, Encode, Decode)]
+struct Refused {
+    #[n(0)]
+    reader: Gid,
+    #[n(1)]
+    reason: String,
+}
+
+#[derive(Debug, Encode, Decode)]
+enum Packet {
+    #[n(0)]
+    Asked(#[n(0)] Asked),
+    #[n(1)]
+    Granted(#[n(0)] Granted),
+    #[n(2)]
+    Refused(#[n(0)] Refused),
+}
+
+/// One end of the socket, for as long as the two need to come together.
+pub(super) struct Channel<'a> {
+    socket: BorrowedFd<'a>,
+    deadline: Option<Instant>,
+}
+
+impl<'a> Channel<'a> {
+    pub(super) fn new(socket: BorrowedFd<'a>, timeout: Option<Duration>) -> Self {
+        Self { socket, deadline: timeout.and_then(|t| Instant::now().checked_add(t)) }
+    }
+
+    pub(super) fn ask(&self, asked: &Asked, own: &PeerDescriptors) -> Result<(), ConnectError> {
+        self.send(
+            &Packet::Asked(*asked),
+            &[own.segment.as_fd(), own.doorbell.as_fd(), own.pidfd.as_fd()],
+        )
+    }
+
+    pub(super) fn await_asked(&self) -> Result<(Asked, PeerDescriptors), ConnectError> {
+        match self.receive()? {
+            (Packet::Asked(asked), fds) => {
+                let [segment, doorbell, pidfd] = fds
+                    .try_into()
+                    .map_err(|_| ConnectError::Protocol("another number of descriptors"))?;
+                if asked.reader.0[..12] != asked.session.0[..12] {
+                    return Err(ConnectError::Protocol("a GID that is not its own"));
+                }
+                Ok((asked, PeerDescriptors { segment, doorbell, pidfd }))
+            }
+            _ => Err(ConnectError::Protocol("an answer where a question was due")),
+        }
+    }
+
+    pub(super) fn grant(
+        &self,
+        granted: &Granted,
+        own: &PeerDescriptors,
+        writer: &Writer,
+    ) -> Result<(), ConnectError> {
+        let ring = writer.descriptor()?;
+        let fds = [own.segment.as_fd(), own.doorbell.as_fd(), own.pidfd.as_fd(), ring.as_fd()];
+        self.send(&Packet::Granted(*granted), &fds)
+    }
+
+    /// The answer to what `reader` asked.
+    pub(super) fn await_granted(
+        &self,
+        reader: Gid,
+    ) -> Result<(Granted, PeerDescriptors, OwnedFd), ConnectError> {
+        loop {
+            match self.receive()? {
+                (Packet::Granted(granted), fds) if granted.reader == reader => {
+                    let [segment, doorbell, pidfd, ring] = fds
+                        .try_into()
+                        .map_err(|_| ConnectError::Protocol("another number of descriptors"))?;
+                    return Ok((granted, PeerDescriptors { segment, doorbell, pidfd }, ring));
+                }
+                (Packet::Refused(refused), _) if refused.reader == reader => {
+                    return Err(ConnectError::Refused(refused.reason));
+                }
+                (Packet::Granted(_) | Packet::Refused(_), _) => {}
+                (Packet::Asked(_), _) => {
+                    return Err(ConnectError::Protocol("a question where an answer was due"));
+                }
+            }
+        }
+    }
+
+    /// Tells the subscriber that it is not admitted, if it still listens.
+    pub(super) fn refuse(&self, reader: Gid, why: &ConnectError) {
+        let mut reason = why.to_string();
+        reason.truncate(reason.floor_char_boundary(MAX_REASON));
+        let _ = self.send(&Packet::Refused(Refused { reader, reason }), &[]);
+    }
+
+    fn send(&self, packet: &Packet, fds: &[BorrowedFd<'_>]) -> Result<(), ConnectError> {
+        let bytes = minicbor::to_vec((VERSION, packet))
+            .map_err(|_| ConnectError::Protocol("nothing: the packet cannot be written"))?;
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(MAX_DESCRIPTORS))];
+        loop {
+            let mut control = SendAncillaryBuffer::new(&mut space);
+            if !fds.is_empty() && !control.push(SendAncillaryMessage::ScmRights(fds)) {
+                return Err(ConnectError::Protocol("nothing: there are too many descriptors"));
+            }
+            let flags = SendFlags::DONTWAIT | SendFlags::NOSIGNAL;
+            match sendmsg(self.socket, &[IoSlice::new(&bytes)], &mut control, flags) {
+                Ok(_) => return Ok(()),
+                Err(Errno::INTR) => {}
+                Err(Errno::AGAIN) => self.until(PollFlags::OUT)?,
+                Err(errno) => return Err(errno.into()),
+            }
+        }
+    }
+
+    fn receive(&self) -> Result<(Packet, Vec<OwnedFd>), ConnectError> {
+        let mut bytes = [0; MAX_PACKET];
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(MAX_DESCRIPTORS))];
+        loop {
+            let mut control = RecvAncillaryBuffer::new(&mut space);
+            let flags = RecvFlags::DONTWAIT | RecvFlags::CMSG_CLOEXEC;
+            let mut into = [IoSliceMut::new(&mut bytes)];
+            let got = match recvmsg(self.socket, &mut into, &mut control, flags) {
+                Ok(got) => got,
+                Err(Errno::INTR) => continue,
+                Err(Errno::AGAIN) => {
+                    self.until(PollFlags::IN)?;
+                    continue;
+                }
+                Err(errno) => return Err(errno.into()),
+            };
+            let mut fds = Vec::new();
+            for message in control.drain() {
+                if let RecvAncillaryMessage::ScmRights(rights) = message {
+                    fds.extend(rights);
+                }
+            }
+            if got.bytes == 0 {
+                return Err(ConnectError::Closed);
+            }
+            if got.flags.intersects(ReturnFlags::TRUNC | ReturnFlags::CTRUNC) {
+                return Err(ConnectError::Protocol("more than belongs in a packet"));
+            }
+            return match minicbor::decode(&bytes[..got.bytes]) {
+                Ok((VERSION, packet)) => Ok((packet, fds)),
+                Ok(_) => Err(ConnectError::Protocol("a packet of another version")),
+                Err(_) => Err(ConnectError::Protocol("what is no packet")),
+            };
+        }
+    }
+
+    /// Waits until the socket is ready, and not beyond the deadline.
+    fn until(&self, events: PollFlags) -> Result<(), ConnectError> {
+        let left = self.deadline.map(|d| d.saturating_duration_since(Instant::now()));
+        if left.is_some_and(|left| left.is_zero()) {
+            return Err(ConnectError::Timeout);
+        }
+        let timeout = left.and_then(|left| Timespec::try_from(left).ok());
+        match poll(&mut [PollFd::from_borrowed_fd(self.socket, events)], timeout.as_ref()) {
+            Ok(_) | Err(Errno::INTR) => Ok(()),
+            Err(errno) => Err(errno.into()),
+        }
+    }
+}

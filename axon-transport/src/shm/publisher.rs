@@ -1,0 +1,166 @@
+//! Publishing without a daemon.
+
+use std::{fmt, os::fd::AsFd, time::Duration};
+
+use super::{
+    ConnectError, Context, Grant, Loan, Meta, PeerDescriptors, PublishError, ReaderInfo,
+    RingOptions, ShmError, Writer,
+    connect::{Asked, Channel, Granted},
+    loan,
+};
+use crate::{
+    ids::Gid,
+    qos::{Qos, compatible},
+};
+
+/// What a [`Publisher`] is made for.
+#[derive(Clone, Copy, Debug)]
+pub struct PublisherOptions {
+    qos: Qos,
+    budget: u64,
+    max_len: u64,
+}
+
+impl PublisherOptions {
+    /// A publisher that offers `qos`, keeps at most 64 MiB and publishes samples of up to 256 MiB.
+    /// Memory is taken as samples need it.
+    pub fn new(qos: Qos) -> Self {
+        Self { qos, budget: 64 << 20, max_len: 256 << 20 }
+    }
+
+    /// Bytes of samples to keep before the oldest go. One sample is always kept.
+    #[must_use]
+    pub fn budget(self, budget: u64) -> Self {
+        Self { budget, ..self }
+    }
+
+    /// The largest sample in bytes.
+    #[must_use]
+    pub fn max_len(self, max_len: u64) -> Self {
+        Self { max_len, ..self }
+    }
+}
+
+/// Publishes samples to the subscribers that it [serves](Self::serve). All methods may be called
+/// from any thread. When it is dropped, subscribers still take what it left.
+pub struct Publisher {
+    context: Context,
+    qos: Qos,
+    writer: Writer,
+}
+
+impl Publisher {
+    /// A publisher without subscribers.
+    ///
+    /// # Errors
+    /// The options exceed what a ring may take, or memory or descriptors are short.
+    pub fn new(context: &Context, options: PublisherOptions) -> Result<Self, ShmError> {
+        let PublisherOptions { qos, budget, max_len: max_message } = options;
+        let gid = context.next_gid();
+        let ring = RingOptions { gid, qos, budget, max_message };
+        let writer = Writer::create(context.session().clone(), ring)?;
+        Ok(Self { context: context.clone(), qos, writer })
+    }
+
+    /// Its GID.
+    pub fn gid(&self) -> Gid {
+        self.writer.gid()
+    }
+
+    /// Admits the one subscriber that [connects](super::Subscriber::connect) at the other end of
+    /// `socket`, a connected unix socket that keeps packets apart (`SOCK_SEQPACKET` or
+    /// `SOCK_DGRAM`), and returns its GID. Waits for it for at most `timeout`.
+    ///
+    /// Whoever holds the other end is trusted to be who it says. Memory that it shares is not.
+    ///
+    /// # Errors
+    /// It did not ask in time, asked for what this publisher does not offer, or handed over what
+    /// cannot be used; it is told.
+    pub fn serve(&self, socket: impl AsFd, timeout: Option<Duration>) -> Result<Gid, ConnectError> {
+        let channel = Channel::new(socket.as_fd(), timeout);
+        let (asked, descriptors) = channel.await_asked()?;
+        let gid = asked.reader;
+        let admitted = self.admit(asked, descriptors).and_then(|grant| {
+            let own = self.context.session().descriptors()?;
+            channel.grant(&grant, &own, &self.writer).inspect_err(|_| {
+                self.writer.detach(gid);
+            })
+        });
+        match admitted {
+            Ok(()) => Ok(gid),
+            Err(error) => {
+                channel.refuse(gid, &error);
+                Err(error)
+            }
+        }
+    }
+
+    fn admit(&self, asked: Asked, descriptors: PeerDescriptors) -> Result<Granted, ConnectError> {
+        let Asked { session, reader: gid, lane, qos } = asked;
+        compatible(&self.qos, &qos).map_err(ConnectError::Incompatible)?;
+        let peer = self.context.peer(session, descriptors)?;
+        let stands_for = Vec::new();
+        let grant = self.writer.attach(ReaderInfo { gid, lane, qos, peer, stands_for })?;
+        let Grant { generation, first } = grant;
+        let (session, writer) = (self.context.id(), self.gid());
+        Ok(Granted { reader: gid, session, writer, generation, first })
+    }
+
+    /// Publishes a sample, stamped with the current time, and returns its sequence number, which
+    /// counts from 1. Waits up to 100 ms where this publisher and a subscriber of another context
+    /// are both RELIABLE and KEEP_ALL and that one lags; never otherwise.
+    ///
+    /// # Errors
+    /// The sample was not published; what to do is in the error.
+    pub fn publish(&self, payload: &[u8]) -> Result<u64, PublishError> {
+        self.writer.publish_next(loan::now(), payload)
+    }
+
+    /// As [`publish`](Self::publish), but never waits: [`PublishError::Blocked`] at once.
+    ///
+    /// # Errors
+    /// As for [`publish`](Self::publish).
+    pub fn try_publish(&self, payload: &[u8]) -> Result<u64, PublishError> {
+        self.writer.try_publish_next(loan::now(), payload)
+    }
+
+    /// As [`publish`](Self::publish), with a number and a time of the caller's. Numbers must rise.
+    ///
+    /// # Errors
+    /// As for [`publish`](Self::publish).
+    pub fn publish_with(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
+        self.writer.publish(meta, payload).map(drop)
+    }
+
+    /// Memory for a sample of `len` bytes, to be filled and then published: of the ring itself
+    /// where it is more than 4 KiB, so that nothing is copied.
+    ///
+    /// # Errors
+    /// As for [`publish`](Self::publish).
+    pub fn loan(&self, len: usize) -> Result<Loan<'_>, PublishError> {
+        self.writer.loan(len)
+    }
+
+    /// The subscribers that it serves, among them such as have left since; see
+    /// [`reap`](Self::reap).
+    pub fn subscribers(&self) -> Vec<Gid> {
+        self.writer.readers()
+    }
+
+    /// Forgets a subscriber; false when it was not served. Samples that it keeps it may keep.
+    pub fn dismiss(&self, subscriber: Gid) -> bool {
+        self.writer.detach(subscriber)
+    }
+
+    /// Forgets the subscribers that have left or whose process has ended, and names them. Their
+    /// memory comes back with the next samples.
+    pub fn reap(&self) -> Vec<Gid> {
+        self.writer.drop_gone()
+    }
+}
+
+impl fmt::Debug for Publisher {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Publisher").field(&self.gid()).finish()
+    }
+}

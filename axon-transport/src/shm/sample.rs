@@ -1,0 +1,180 @@
+//! A sample that was taken without being copied.
+
+use std::{
+    collections::TryReserveError,
+    fmt,
+    io::{self, Read, Seek, SeekFrom},
+    ops::Range,
+    slice,
+    sync::atomic::AtomicU64,
+};
+
+use super::{Meta, Taken, attachment::Pin, ring};
+
+/// A sample, in the publisher's memory where it is longer than 4 KiB, else in a copy.
+///
+/// It stays as it was published for as long as this value lives, also after the subscription, the
+/// publisher and its process have ended; only then may the publisher use the memory again, which
+/// it never waits for. A subscription can have five such samples of one publisher; a sixth is
+/// copied. It may be read and dropped by any thread.
+///
+/// A publisher in another process that does not keep to the protocol can still change the bytes.
+/// They are therefore read as values ([`read_at`](Self::read_at), [`copy_to`](Self::copy_to),
+/// [`reader`](Self::reader)), and as a slice only where the caller vouches for the publisher.
+///
+/// A forked child has no share in it: it reads nothing there.
+pub struct Sample {
+    taken: Taken,
+    len: usize,
+    data: Data,
+}
+
+enum Data {
+    Copied(Vec<u8>),
+    Pinned { words: Range<usize>, pin: Pin },
+}
+
+impl Sample {
+    /// A sample of its own bytes.
+    pub(super) fn copied(taken: Taken, bytes: Vec<u8>) -> Self {
+        Self { taken, len: bytes.len(), data: Data::Copied(bytes) }
+    }
+
+    /// `len` bytes in the `words` of the map of what `pin` pins, which hold as many.
+    pub(super) fn pinned(taken: Taken, len: usize, words: Range<usize>, pin: Pin) -> Self {
+        debug_assert!(len <= words.len() * 8);
+        Self { taken, len, data: Data::Pinned { words, pin } }
+    }
+
+    /// What goes with it.
+    pub fn meta(&self) -> Meta {
+        self.taken.meta
+    }
+
+    /// Its position in the publisher's ring.
+    pub fn position(&self) -> u64 {
+        self.taken.position
+    }
+
+    /// Its length in bytes.
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Whether it has no bytes.
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// Whether it is in the publisher's memory.
+    pub fn is_borrowed(&self) -> bool {
+        matches!(self.data, Data::Pinned { .. })
+    }
+
+    /// Copies bytes from `at` on to the front of `out`, as many as there are and fit, and returns
+    /// how many.
+    pub fn read_at(&self, at: usize, out: &mut [u8]) -> usize {
+        let count = out.len().min(self.len.saturating_sub(at));
+        let out = &mut out[..count];
+        match &self.data {
+            Data::Copied(bytes) => out.copy_from_slice(&bytes[at.min(self.len)..][..count]),
+            Data::Pinned { pin, .. } if pin.attachment().lane.is_forked() => return 0,
+            Data::Pinned { .. } => ring::read_at(self.words(), at, out),
+        }
+        count
+    }
+
+    /// Replaces what `out` holds by the sample's bytes. In a forked child, by none.
+    ///
+    /// # Errors
+    /// There is no memory for them.
+    pub fn copy_to(&self, out: &mut Vec<u8>) -> Result<(), TryReserveError> {
+        match &self.data {
+            Data::Copied(bytes) => {
+                out.clear();
+                out.try_reserve(bytes.len())?;
+                out.extend_from_slice(bytes);
+                Ok(())
+            }
+            Data::Pinned { pin, .. } if pin.attachment().lane.is_forked() => {
+                out.clear();
+                Ok(())
+            }
+            Data::Pinned { .. } => ring::copy_out(self.words(), self.len, out),
+        }
+    }
+
+    /// Reads it from the front, for instance to deserialize it.
+    pub fn reader(&self) -> SampleReader<'_> {
+        SampleReader { sample: self, at: 0 }
+    }
+
+    /// Where its bytes are, aligned to at least 8 where it [is borrowed](Self::is_borrowed).
+    ///
+    /// They are readable for as long as the sample lives. A publisher that does not keep to the
+    /// protocol may change them at any time, so an access must be atomic or volatile.
+    pub fn as_ptr(&self) -> *const u8 {
+        match &self.data {
+            Data::Copied(bytes) => bytes.as_ptr(),
+            Data::Pinned { .. } => self.words().as_ptr().cast(),
+        }
+    }
+
+    /// Its bytes in place.
+    ///
+    /// # Safety
+    /// Where it [is borrowed](Self::is_borrowed), the publisher's process must be trusted not to
+    /// write to a sample that is pinned: what this crate publishes never does. And the slice must
+    /// not be used in a child that was forked while the sample lived.
+    pub unsafe fn as_slice(&self) -> &[u8] {
+        // SAFETY: `len` bytes from there on are initialized and readable for as long as `self`
+        // lives: those of the vector, or those of the map, which holds as many (`pinned`). That
+        // nobody writes to them meanwhile is the vector's nature, or the caller's promise.
+        unsafe { slice::from_raw_parts(self.as_ptr(), self.len) }
+    }
+
+    fn words(&self) -> &[AtomicU64] {
+        match &self.data {
+            Data::Copied(_) => &[],
+            Data::Pinned { words, pin } => &pin.attachment().words()[words.clone()],
+        }
+    }
+}
+
+impl fmt::Debug for Sample {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Sample")
+            .field("meta", &self.meta())
+            .field("len", &self.len)
+            .field("borrowed", &self.is_borrowed())
+            .finish_non_exhaustive()
+    }
+}
+
+/// Reads a [`Sample`] from the front.
+#[derive(Debug)]
+pub struct SampleReader<'a> {
+    sample: &'a Sample,
+    at: u64,
+}
+
+impl Read for SampleReader<'_> {
+    fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
+        let count = usize::try_from(self.at).map_or(0, |at| self.sample.read_at(at, out));
+        self.at += count as u64;
+        Ok(count)
+    }
+}
+
+impl Seek for SampleReader<'_> {
+    fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+        let (from, by) = match to {
+            SeekFrom::Start(at) => (at, 0),
+            SeekFrom::Current(by) => (self.at, by),
+            SeekFrom::End(by) => (self.sample.len as u64, by),
+        };
+        let outside = || io::Error::new(io::ErrorKind::InvalidInput, "before a sample's start");
+        self.at = from.checked_add_signed(by).ok_or_else(outside)?;
+        Ok(self.at)
+    }
+}

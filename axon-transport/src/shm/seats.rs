@@ -1,0 +1,94 @@
+//! The lanes that may pin samples of a ring, whether or not their readers still count for anything
+//! else.
+
+use std::sync::atomic::AtomicU64;
+
+use super::{
+    Peer,
+    lane::{Standing, Tenancy},
+    layout::LANE_WORDS,
+    pins,
+    sync::Word,
+};
+use crate::ids::Gid;
+
+/// Adds to `found` the positions that a reader pins, and says how it stands. After
+/// [`pins::about_to_scan`].
+#[inline]
+pub(super) fn scan<W: Word>(tenancy: &Tenancy, lane: &[W], found: &mut Vec<u64>) -> Standing {
+    let standing = tenancy.standing(lane);
+    // One that has not seen its grant pins nothing, and one that does from now on sees the tail.
+    if standing == Standing::Open {
+        found.extend(pins::scan(lane));
+    }
+    standing
+}
+
+/// One reader's lane, as its publisher knows it.
+pub(super) struct Seat {
+    reader: Gid,
+    peer: Peer,
+    lane: u32,
+    pub(super) tenancy: Tenancy,
+}
+
+impl Seat {
+    fn words(&self) -> &[AtomicU64; LANE_WORDS] {
+        self.peer.lane_words(self.lane)
+    }
+
+    #[inline]
+    fn standing(&self) -> Standing {
+        self.tenancy.standing(self.words())
+    }
+}
+
+/// All lanes to which a grant was given, until they say that their reader has left, or its process
+/// has ended. That a reader is detached, by whomever, ends nothing here: it may hold samples still.
+#[derive(Default)]
+pub(super) struct Seats(Vec<Seat>);
+
+impl Seats {
+    /// Takes in the reader that asks with `lane` of `peer`, before it hears of its grant. As long
+    /// as the lane stays as it is, the answer does, so that whoever asks for ever adds nothing.
+    pub(super) fn admit(&mut self, reader: Gid, peer: &Peer, lane: u32) -> Tenancy {
+        let same = |seat: &&Seat| {
+            seat.peer.id() == peer.id() && seat.lane == lane && seat.tenancy.is_asked(seat.words())
+        };
+        if let Some(seat) = self.0.iter().find(same) {
+            return seat.tenancy;
+        }
+        let tenancy = Tenancy::grant(peer.lane_words(lane));
+        self.0.push(Seat { reader, peer: peer.clone(), lane, tenancy });
+        tenancy
+    }
+
+    /// Adds to `found` the positions that are pinned, after [`pins::about_to_scan`].
+    pub(super) fn scan(&mut self, found: &mut Vec<u64>) {
+        self.0.retain(|seat| scan(&seat.tenancy, seat.words(), found) != Standing::Left);
+    }
+
+    /// A reader that pins one of `positions`.
+    pub(super) fn holder(&self, positions: &[u64]) -> Option<Gid> {
+        let holds = |seat: &&Seat| {
+            seat.standing() == Standing::Open
+                && pins::scan(seat.words()).any(|position| positions.contains(&position))
+        };
+        self.0.iter().find(holds).map(|seat| seat.reader)
+    }
+
+    /// Forgets those that have left, and those of `suspects` whose process has ended. Whether
+    /// there were any.
+    pub(super) fn sweep(&mut self, suspect: impl Fn(&Seat) -> bool) -> bool {
+        let before = self.0.len();
+        self.0.retain(|seat| {
+            seat.standing() != Standing::Left && !(suspect(seat) && seat.peer.is_dead())
+        });
+        self.0.len() != before
+    }
+
+    #[cfg(test)]
+    pub(super) fn len(&self) -> usize {
+        self.0.len()
+    }
+}

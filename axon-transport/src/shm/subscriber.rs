@@ -1,0 +1,167 @@
+//! Subscribing without a daemon.
+
+use std::{
+    fmt,
+    os::fd::AsFd,
+    time::{Duration, Instant},
+};
+
+use super::{
+    ConnectError, Context, Grant, Meta, Reader, ReaderOptions, Sample, TakeError,
+    connect::{Asked, Channel},
+};
+use crate::{ids::Gid, qos::Qos};
+
+/// No sleep is longer: what a publisher stored last and did not live to ring for is found then.
+const LONGEST_SLEEP: Duration = Duration::from_secs(1);
+
+/// What a [`Subscriber`] asks for.
+#[derive(Clone, Copy, Debug)]
+pub struct SubscriberOptions {
+    qos: Qos,
+    max_len: u64,
+}
+
+impl SubscriberOptions {
+    /// A subscriber that requests `qos` and takes samples of up to 256 MiB.
+    pub fn new(qos: Qos) -> Self {
+        Self { qos, max_len: 256 << 20 }
+    }
+
+    /// The largest sample in bytes. Longer ones count as lost.
+    #[must_use]
+    pub fn max_len(self, max_len: u64) -> Self {
+        Self { max_len, ..self }
+    }
+}
+
+/// Takes the samples of one publisher. Goes on after that one's end until nothing is left.
+pub struct Subscriber {
+    context: Context,
+    reader: Reader,
+    gid: Gid,
+}
+
+impl Subscriber {
+    /// Asks the publisher that [serves](super::Publisher::serve) at the other end of `socket`, and
+    /// waits for its answer for at most `timeout`. The socket is not needed any more after it.
+    ///
+    /// # Errors
+    /// It did not answer in time, refused, or handed over what cannot be used.
+    pub fn connect(
+        context: &Context,
+        socket: impl AsFd,
+        options: SubscriberOptions,
+        timeout: Option<Duration>,
+    ) -> Result<Self, ConnectError> {
+        let SubscriberOptions { qos, max_len: max_message } = options;
+        let channel = Channel::new(socket.as_fd(), timeout);
+        let lane = context.session().allocate_lane()?;
+        let gid = context.next_gid();
+        let asked = Asked { session: context.id(), reader: gid, lane: lane.index(), qos };
+        channel.ask(&asked, &context.session().descriptors()?)?;
+        let (granted, descriptors, ring) = channel.await_granted(gid)?;
+        let reader = Reader::map(
+            ring,
+            ReaderOptions {
+                reader: gid,
+                writer: granted.writer,
+                peer: context.peer(granted.session, descriptors)?,
+                lane,
+                grant: Grant { generation: granted.generation, first: granted.first },
+                qos,
+                max_message,
+            },
+        )?;
+        Ok(Self { context: context.clone(), reader, gid })
+    }
+
+    /// Its GID.
+    pub fn gid(&self) -> Gid {
+        self.gid
+    }
+
+    /// The publisher's GID.
+    pub fn publisher(&self) -> Gid {
+        self.reader.writer()
+    }
+
+    /// The next sample, or `None` when there is none. One of more than 4 KiB stays in the
+    /// publisher's memory for as long as it is kept.
+    ///
+    /// # Errors
+    /// See [`TakeError`]. After [`TakeError::Corrupt`] there will be no more samples.
+    pub fn take(&mut self) -> Result<Option<Sample>, TakeError> {
+        self.reader.take_sample()
+    }
+
+    /// As [`take`](Self::take), but into `out`, which it replaces: without an allocation where
+    /// `out` is large enough.
+    ///
+    /// # Errors
+    /// As for [`take`](Self::take).
+    pub fn take_into(&mut self, out: &mut Vec<u8>) -> Result<Option<Meta>, TakeError> {
+        Ok(self.reader.take(out)?.map(|taken| taken.meta))
+    }
+
+    /// As [`take`](Self::take), after waiting for a sample for at most `timeout`. `None` also when
+    /// the publisher's process has ended and nothing of it is left.
+    ///
+    /// # Errors
+    /// As for [`take`](Self::take).
+    pub fn recv(&mut self, timeout: Option<Duration>) -> Result<Option<Sample>, TakeError> {
+        let deadline = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
+        loop {
+            if let Some(sample) = self.take()? {
+                return Ok(Some(sample));
+            }
+            let left = deadline.map_or(LONGEST_SLEEP, |deadline| {
+                deadline.saturating_duration_since(Instant::now()).min(LONGEST_SLEEP)
+            });
+            if left.is_zero() {
+                return Ok(None);
+            }
+            let ended = self.publisher_ended();
+            if !self.context.wait(|| ended || self.reader.has_data(), Some(left)) {
+                continue;
+            }
+            if ended && !self.reader.has_data() {
+                return Ok(None);
+            }
+        }
+    }
+
+    /// Whether there is something to take: two loads. For [`Context::wait`] and event loops.
+    pub fn has_data(&self) -> bool {
+        self.reader.has_data()
+    }
+
+    /// Samples taken.
+    pub fn received(&self) -> u64 {
+        self.reader.received()
+    }
+
+    /// Samples overwritten before they could be taken, within the requested depth.
+    pub fn lost(&self) -> u64 {
+        self.reader.lost()
+    }
+
+    /// Samples passed over because more recent ones fill the requested depth.
+    pub fn skipped(&self) -> u64 {
+        self.reader.skipped()
+    }
+
+    /// Whether the publisher's process has ended: a system call. What it left can be taken still.
+    pub fn publisher_ended(&self) -> bool {
+        self.reader.writer_dead()
+    }
+}
+
+impl fmt::Debug for Subscriber {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Subscriber")
+            .field("gid", &self.gid)
+            .field("publisher", &self.publisher())
+            .finish_non_exhaustive()
+    }
+}

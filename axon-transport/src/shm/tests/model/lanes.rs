@@ -1,0 +1,101 @@
+//! Readers that attach and leave, and lanes that pass from one reader to another.
+
+use loom::{sync::Arc, thread};
+
+use super::{
+    super::super::{
+        Grant,
+        lane::{self, Standing, Tenancy},
+        layout::{LANE_WORDS, lane::CURSOR},
+        pins::{about_to_scan, pin, unpin},
+        ring::retire,
+        seats::scan,
+        sync::{Ordering, Word},
+    },
+    Cell, check, granted, show, small, zeros,
+};
+
+/// `OpenStore`, `GenerationLoad`: what the lane's last reader left is not taken for this one's.
+#[test]
+fn a_lane_that_is_open_shows_the_cursor_of_its_reader() {
+    check(3, || {
+        let lane = zeros(LANE_WORDS);
+        Word::store(&lane[CURSOR], 9, Ordering::Relaxed);
+        lane::ask(&lane[..], 1);
+        let tenancy = Tenancy::grant(&lane[..]);
+        let reader = {
+            let lane = lane.clone();
+            thread::spawn(move || {
+                lane::open(&lane[..], Grant { generation: tenancy.generation(), first: 3 });
+                lane::advance(&lane[..], 4);
+            })
+        };
+        match tenancy.cursor(&lane[..]) {
+            None => assert_ne!(tenancy.standing(&lane[..]), Standing::Left),
+            Some(cursor) => assert!((3..=4).contains(&cursor)),
+        }
+        reader.join().unwrap();
+    });
+}
+
+/// `CloseStore`, `AskStore`, `GenerationLoad`: a lane that is closed is not looked at for pins any
+/// more.
+#[test]
+fn a_reader_that_has_left_has_read_all() {
+    check(3, || {
+        let (words, geometry) = small();
+        let (lane, tenancy) = granted(0);
+        let cell = Arc::new(Cell::new(1));
+        show(&words, &geometry, 0);
+        let reader = {
+            let (words, lane, cell) = (words.clone(), lane.clone(), cell.clone());
+            thread::spawn(move || {
+                if pin(&lane[..], 0, 0, &words[geometry.tail]) {
+                    assert_eq!(cell.get(), 1);
+                    unpin(&lane[..], 0);
+                }
+                lane::close(&lane[..]);
+                // The next one that uses the lane, for another ring.
+                lane::ask(&lane[..], 2);
+            })
+        };
+        retire(&words[..], &geometry, 1);
+        about_to_scan::<loom::sync::atomic::AtomicU64>();
+        if scan(&tenancy, &lane[..], &mut Vec::new()) == Standing::Left {
+            cell.set(2);
+        }
+        reader.join().unwrap();
+    });
+}
+
+/// The fences of pins also cover the time before the publisher knows that the reader has seen its
+/// grant.
+#[test]
+fn a_reader_that_opens_its_lane_and_pins_is_seen() {
+    check(3, || {
+        let (words, geometry) = small();
+        let lane = zeros(LANE_WORDS);
+        lane::ask(&lane[..], 1);
+        let tenancy = Tenancy::grant(&lane[..]);
+        let cell = Arc::new(Cell::new(1));
+        show(&words, &geometry, 0);
+        let reader = {
+            let (words, lane, cell) = (words.clone(), lane.clone(), cell.clone());
+            thread::spawn(move || {
+                lane::open(&lane[..], Grant { generation: tenancy.generation(), first: 0 });
+                if pin(&lane[..], 0, 0, &words[geometry.tail]) {
+                    assert_eq!(cell.get(), 1);
+                    unpin(&lane[..], 0);
+                }
+            })
+        };
+        retire(&words[..], &geometry, 1);
+        about_to_scan::<loom::sync::atomic::AtomicU64>();
+        let mut found = Vec::new();
+        scan(&tenancy, &lane[..], &mut found);
+        if !found.contains(&0) {
+            cell.set(2);
+        }
+        reader.join().unwrap();
+    });
+}

@@ -1,0 +1,100 @@
+//! Samples that are read in place, and memory that is used again.
+
+use loom::{
+    sync::{Arc, atomic::AtomicU64},
+    thread,
+};
+
+use super::{
+    super::super::{
+        lane::Tenancy,
+        pins::{about_to_scan, pin, unpin},
+        ring::{Geometry, bounds, retire},
+        seats::scan,
+    },
+    Cell, check, granted, show, small,
+};
+
+/// Whether `position`, below the tail, may be written over.
+fn is_free(lane: &[AtomicU64], tenancy: &Tenancy, position: u64) -> bool {
+    about_to_scan::<AtomicU64>();
+    let mut found = Vec::new();
+    scan(tenancy, lane, &mut found);
+    !found.contains(&position)
+}
+
+/// Takes the next sample from `cursor` on in place, if there is one.
+fn take(
+    words: &[AtomicU64],
+    geometry: &Geometry,
+    lane: &[AtomicU64],
+    cursor: &mut u64,
+    read: impl Fn(u64),
+) {
+    let (tail, head) = bounds(words, geometry).unwrap();
+    *cursor = tail.max(*cursor);
+    if *cursor < head && pin(lane, 0, *cursor, &words[geometry.tail]) {
+        read(*cursor);
+        unpin(lane, 0);
+        *cursor += 1;
+    }
+}
+
+/// `ReclaimFence`, `PinFence`, `ScanLoad`, `UnpinStore`.
+#[test]
+fn a_sample_that_is_pinned_is_not_written_over() {
+    check(3, || {
+        let (words, geometry) = small();
+        let (lane, tenancy) = granted(0);
+        let cell = Arc::new(Cell::new(1));
+        show(&words, &geometry, 0);
+        let publisher = {
+            let (words, lane, cell) = (words.clone(), lane.clone(), cell.clone());
+            thread::spawn(move || {
+                retire(&words[..], &geometry, 1);
+                for _ in 0..2 {
+                    if is_free(&lane, &tenancy, 0) {
+                        cell.set(2);
+                        return show(&words, &geometry, 1);
+                    }
+                    thread::yield_now();
+                }
+            })
+        };
+        let mut cursor = 0;
+        for _ in 0..2 {
+            take(&words, &geometry, &lane, &mut cursor, |position| {
+                assert_eq!(cell.get(), position + 1);
+            });
+        }
+        publisher.join().unwrap();
+    });
+}
+
+/// `PinStore`: the publisher may learn that a sample was read from a later pin in the same record.
+#[test]
+fn a_record_that_pins_another_sample_says_that_the_last_was_read() {
+    check(3, || {
+        let (words, geometry) = small();
+        let (lane, tenancy) = granted(0);
+        let cells = Arc::new([Cell::new(1), Cell::new(2)]);
+        show(&words, &geometry, 0);
+        show(&words, &geometry, 1);
+        let publisher = {
+            let (words, lane, cells) = (words.clone(), lane.clone(), cells.clone());
+            thread::spawn(move || {
+                retire(&words[..], &geometry, 1);
+                if is_free(&lane, &tenancy, 0) {
+                    cells[0].set(3);
+                }
+            })
+        };
+        let mut cursor = 0;
+        for _ in 0..2 {
+            take(&words, &geometry, &lane, &mut cursor, |position| {
+                assert_eq!(cells[position as usize].get(), position + 1);
+            });
+        }
+        publisher.join().unwrap();
+    });
+}

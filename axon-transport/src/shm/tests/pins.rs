@@ -1,0 +1,345 @@
+//! Samples that are kept in place, by readers that come and go in any order.
+
+use std::{
+    io::{Read as _, Seek as _, SeekFrom, Write as _},
+    sync::atomic::Ordering,
+    thread,
+};
+
+use super::{super::pins::RECORDS, *};
+
+const LARGE: usize = 10_000;
+
+fn publish(writer: &Writer, sequence: u64, len: usize) {
+    writer.publish(meta(sequence), &pattern(sequence, len)).unwrap();
+}
+
+fn take(reader: &mut Reader) -> Sample {
+    reader.take_sample().unwrap().expect("a sample")
+}
+
+fn intact(sample: &Sample) {
+    let sequence = sample.meta().sequence;
+    assert_eq!(sample.meta(), meta(sequence));
+    let mut bytes = Vec::new();
+    sample.copy_to(&mut bytes).unwrap();
+    assert!(bytes == pattern(sequence, sample.len()), "sample {sequence} changed");
+}
+
+/// Samples that the publisher has given up, whose memory it has not used since.
+fn in_limbo(writer: &Writer) -> usize {
+    writer.lock().history.pinned().retired().len()
+}
+
+fn seats(writer: &Writer) -> usize {
+    writer.lock().audience.seats()
+}
+
+#[test]
+fn a_sample_in_use_stays_while_the_ring_goes_round() {
+    let (a, b) = (session(), session());
+    for other in [&a, &b] {
+        let writer = writer(&a, keep_last(1), 0);
+        let mut reader = attach(&writer, &a, other, keep_last(1));
+        for len in [LARGE, 4097, 65_536, MAX as usize] {
+            publish(&writer, 0, len);
+            let sample = take(&mut reader);
+            assert!(sample.is_borrowed() && sample.len() == len);
+            for sequence in 1..160 {
+                publish(&writer, sequence, len);
+            }
+            intact(&sample);
+            assert!(in_limbo(&writer) <= 2, "what is pinned, and the last that was given up");
+            drop(sample);
+            publish(&writer, 160, len);
+            publish(&writer, 161, len);
+            assert!(in_limbo(&writer) <= 1);
+            intact(&take(&mut reader));
+        }
+    }
+}
+
+#[test]
+fn small_samples_are_copies() {
+    let a = session();
+    let writer = writer(&a, keep_last(10), 1 << 20);
+    let mut reader = attach(&writer, &a, &a, keep_last(10));
+    for (sequence, len) in [0, 1, 96, 97, 4096].into_iter().enumerate() {
+        publish(&writer, sequence as u64, len);
+        let sample = take(&mut reader);
+        assert_eq!((sample.is_borrowed(), sample.len()), (false, len));
+        intact(&sample);
+    }
+    publish(&writer, 9, 4097);
+    let copy = reader.take_copy().unwrap().unwrap();
+    assert!(!copy.is_borrowed());
+    intact(&copy);
+}
+
+#[test]
+fn nothing_that_ends_ends_a_sample_in_use() {
+    let (a, b) = (session(), session());
+    let writer = writer(&a, keep_last(1), 0);
+    let mut reader = attach(&writer, &a, &b, keep_last(1));
+    publish(&writer, 0, LARGE);
+    let sample = take(&mut reader);
+    let (lane, gid) = (reader.lane(), writer.readers()[0]);
+
+    // The daemon, or whoever says so, unmatches the two.
+    assert!(writer.detach(gid));
+    (1..50).for_each(|sequence| publish(&writer, sequence, LARGE));
+    intact(&sample);
+    // The subscription ends, and its session goes with it.
+    drop(reader);
+    assert_ne!(b.allocate_lane().unwrap().index(), lane, "the lane is in use");
+    drop(b);
+    (50..100).for_each(|sequence| publish(&writer, sequence, LARGE));
+    intact(&sample);
+    assert_eq!(seats(&writer), 1);
+    // The publisher ends.
+    drop(writer);
+    intact(&sample);
+}
+
+#[test]
+fn what_is_dropped_is_forgotten() {
+    let (a, b) = (session(), session());
+    let writer = writer(&a, keep_last(1), 0);
+    let mut reader = attach(&writer, &a, &b, keep_last(1));
+    publish(&writer, 0, LARGE);
+    let sample = take(&mut reader);
+    let lane = reader.lane();
+    drop(reader);
+    drop(sample);
+    assert_eq!(b.allocate_lane().unwrap().index(), lane, "the lane is free again");
+    (1..4).for_each(|sequence| publish(&writer, sequence, LARGE));
+    assert_eq!(seats(&writer), 0);
+    assert!(in_limbo(&writer) <= 1);
+}
+
+#[test]
+fn the_sixth_sample_in_use_is_a_copy() {
+    let a = session();
+    let writer = writer(&a, keep_last(1), 0);
+    let mut reader = attach(&writer, &a, &a, keep_last(1));
+    let mut kept: Vec<_> = (0..8)
+        .map(|sequence| {
+            publish(&writer, sequence, LARGE);
+            take(&mut reader)
+        })
+        .collect();
+    let borrowed: Vec<_> = kept.iter().map(Sample::is_borrowed).collect();
+    assert_eq!(borrowed, [true, true, true, true, true, false, false, false]);
+    kept.iter().for_each(intact);
+    kept.remove(2);
+    publish(&writer, 8, LARGE);
+    assert!(take(&mut reader).is_borrowed());
+    kept.iter().for_each(intact);
+}
+
+#[test]
+fn samples_in_use_hold_no_publisher() {
+    let (a, b) = (session(), session());
+    // At depth one, with the largest samples.
+    let last = writer(&a, keep_last(1), 0);
+    let mut reader = attach(&last, &a, &b, keep_last(1));
+    let mut other = attach(&last, &a, &b, keep_last(1));
+    let mut kept = Vec::new();
+    for sequence in 0..5 {
+        publish(&last, sequence, MAX as usize);
+        kept.push(take(&mut reader));
+    }
+    for sequence in 5..20 {
+        last.try_publish(meta(sequence), &pattern(sequence, MAX as usize)).unwrap();
+        intact(&take(&mut other));
+    }
+    kept.iter().for_each(intact);
+    // KEEP_ALL: taken is taken.
+    let all = writer(&a, Qos::keep_all(), 4 * LARGE as u64);
+    let mut reader = attach(&all, &a, &b, Qos::keep_all());
+    let mut kept = Vec::new();
+    for sequence in 0..100 {
+        all.try_publish(meta(sequence), &pattern(sequence, LARGE)).unwrap();
+        kept.push(take(&mut reader));
+    }
+    kept.iter().for_each(intact);
+    assert_eq!((reader.received(), reader.lost(), reader.skipped()), (100, 0, 0));
+}
+
+#[test]
+fn memory_that_readers_keep_is_named_and_comes_back() {
+    let (a, b) = (session(), session());
+    let writer = writer(&a, keep_last(1), 0);
+    let mut readers: Vec<_> = (0..5).map(|_| attach(&writer, &a, &b, keep_last(1))).collect();
+    let mut kept = Vec::new();
+    let mut sequence = 0;
+    let mut error = None;
+    'full: for reader in &mut readers {
+        for _ in 0..5 {
+            match writer.publish(meta(sequence), &pattern(sequence, MAX as usize)) {
+                Ok(_) => kept.push(take(reader)),
+                Err(refused) => {
+                    error = Some(refused);
+                    break 'full;
+                }
+            }
+            sequence += 1;
+        }
+    }
+    let error = error.expect("an end of memory");
+    let PublishError::Pinned { reader, samples } = error else { panic!("{error}") };
+    assert!(writer.readers().contains(&reader) && samples >= 12, "{samples} samples");
+    kept.iter().for_each(intact);
+    // Small ones need none of it.
+    publish(&writer, sequence, 4096);
+    kept.clear();
+    publish(&writer, sequence + 1, MAX as usize);
+}
+
+#[test]
+fn a_sample_may_end_on_any_thread() {
+    let (a, b) = (session(), session());
+    let writer = writer(&a, keep_last(4), 4 * LARGE as u64);
+    let mut reader = attach(&writer, &a, &b, keep_last(4));
+    let (send, receive) = std::sync::mpsc::sync_channel::<Sample>(3);
+    let receive = std::sync::Mutex::new(receive);
+    let total = 4000;
+    thread::scope(|scope| {
+        for _ in 0..2 {
+            scope.spawn(|| {
+                while let Ok(sample) = { receive.lock().unwrap().recv() } {
+                    intact(&sample);
+                }
+            });
+        }
+        scope.spawn(|| (0..total).for_each(|sequence| publish(&writer, sequence, LARGE)));
+        let mut last = None;
+        while last != Some(total - 1) {
+            await_data(&b, &reader);
+            let Some(sample) = reader.take_sample().unwrap() else { continue };
+            let sequence = Some(sample.meta().sequence);
+            assert!(last < sequence, "in order");
+            last = sequence;
+            send.send(sample).unwrap();
+        }
+        drop(send);
+    });
+    assert_eq!(reader.received() + reader.skipped() + reader.lost(), total);
+    for sequence in total..total + 3 {
+        publish(&writer, sequence, LARGE);
+    }
+    assert!(in_limbo(&writer) <= 1, "all pins were given back");
+}
+
+#[test]
+fn a_sample_is_read_from_anywhere() {
+    let a = session();
+    let writer = writer(&a, keep_last(1), 0);
+    let mut reader = attach(&writer, &a, &a, keep_last(1));
+    for len in [100, LARGE + 3] {
+        publish(&writer, 7, len);
+        let (sample, expected) = (take(&mut reader), pattern(7, len));
+        for at in (0..20).chain(len - 20..len + 3) {
+            for count in 0..20 {
+                let mut out = vec![0; count];
+                let got = sample.read_at(at, &mut out);
+                assert_eq!(got, count.min(len.saturating_sub(at)));
+                assert_eq!(out[..got], expected[at.min(len)..][..got]);
+            }
+        }
+        let mut stream = sample.reader();
+        stream.seek(SeekFrom::End(-5)).unwrap();
+        let mut out = Vec::new();
+        stream.read_to_end(&mut out).unwrap();
+        assert_eq!(out, expected[len - 5..]);
+        assert!(stream.seek(SeekFrom::Current(-1 - len as i64)).is_err());
+        // SAFETY: the publisher is this test, and no child is forked.
+        assert!(unsafe { sample.as_slice() } == expected);
+    }
+}
+
+#[test]
+fn a_loan_is_a_slice_of_the_ring() {
+    let a = session();
+    let writer = writer(&a, keep_last(1), 0);
+    let mut reader = attach(&writer, &a, &a, keep_last(1));
+    for len in [0, 50, 1000, LARGE] {
+        let mut loan = writer.loan(len).unwrap();
+        loan.copy_from_slice(&pattern(3, len));
+        loan.publish(meta(3)).unwrap();
+        intact(&take(&mut reader));
+    }
+    let mut half = writer.loan(LARGE).unwrap();
+    half.write_all(&[0; LARGE - 1]).unwrap();
+    let (len, written) = (LARGE as u64, LARGE as u64 - 1);
+    assert_eq!(half.publish(meta(4)), Err(PublishError::Incomplete { len, written }));
+    assert!(reader.take_sample().unwrap().is_none());
+}
+
+#[test]
+fn scribbled_pins_keep_six_samples_at_most() {
+    let (a, b) = (session(), session());
+    let writer = writer(&a, keep_last(1), 0);
+    let reader = attach(&writer, &a, &b, keep_last(1));
+    let pins = &b.lane_words(reader.lane())[layout::lane::PINS..][..RECORDS];
+    for sequence in 0..300u64 {
+        for (record, pin) in pins.iter().enumerate() {
+            let absurd = [0, u64::MAX, 1 << 63, sequence + 1, sequence, 1];
+            pin.store(absurd[(record + sequence as usize) % 6], Ordering::Relaxed);
+        }
+        publish(&writer, sequence, LARGE);
+        assert!(in_limbo(&writer) <= RECORDS + 1);
+    }
+    pins.iter().enumerate().for_each(|(n, pin)| pin.store(290 + n as u64, Ordering::Relaxed));
+    (300..400).for_each(|sequence| publish(&writer, sequence, LARGE));
+    assert!(in_limbo(&writer) <= RECORDS + 1);
+}
+
+#[test]
+fn a_lane_that_passes_on_unseen_is_another_attachment() {
+    let (a, b) = (session(), session());
+    let writer = writer(&a, Qos::keep_all(), 1 << 20);
+    let lane = b.allocate_lane().unwrap();
+    let info = ReaderInfo {
+        gid: Gid::new(b.id(), 1),
+        lane: lane.index(),
+        qos: Qos::keep_all(),
+        peer: peer(&a, &b),
+        stands_for: Vec::new(),
+    };
+    let before = writer.attach(info.clone()).unwrap();
+    publish(&writer, 0, 10);
+    // Opened, closed, given to the next reader: the publisher looks only now.
+    lane.open(before, info.gid, writer.gid());
+    drop(lane);
+    let lane = b.allocate_lane().unwrap();
+    assert_eq!(lane.index(), info.lane);
+    let after = writer.attach(info).unwrap();
+    assert_ne!(before.generation, after.generation);
+    assert_eq!((before.first, after.first), (0, 1));
+    assert_eq!(writer.readers().len(), 1);
+}
+
+#[test]
+fn asking_for_ever_takes_no_memory() {
+    let (a, b) = (session(), session());
+    let writer = writer(&a, keep_last(1), 0);
+    let lanes: Vec<_> = (0..3).map(|_| b.allocate_lane().unwrap()).collect();
+    let mut grants = Vec::new();
+    for round in 0..300 {
+        let info = ReaderInfo {
+            gid: Gid::new(b.id(), 1),
+            lane: lanes[round % 3].index(),
+            qos: keep_last(1),
+            peer: peer(&a, &b),
+            stands_for: Vec::new(),
+        };
+        grants.push(writer.attach(info).unwrap());
+        assert!(writer.detach(Gid::new(b.id(), 1)));
+    }
+    assert_eq!(seats(&writer), 3);
+    assert_eq!(grants[0], grants[297]);
+    drop(lanes);
+    assert!(writer.drop_dead().is_empty());
+    assert_eq!(seats(&writer), 0);
+}

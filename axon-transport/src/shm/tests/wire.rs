@@ -1,0 +1,166 @@
+//! The other process of a test, and what goes over to it.
+
+use std::{
+    env,
+    io::{IoSlice, IoSliceMut},
+    mem::MaybeUninit,
+    os::fd::{AsFd, BorrowedFd, OwnedFd},
+    process::{Child, Command, Stdio},
+};
+
+use rustix::net::{
+    AddressFamily, RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, SendAncillaryBuffer,
+    SendAncillaryMessage, SendFlags, SocketFlags, SocketType, recvmsg, sendmsg, socketpair,
+};
+
+use super::*;
+
+/// Tells this binary that it is the other process, and which part it plays.
+pub(super) const PART: &str = "SHM_TEST_PART";
+/// The largest message of these tests.
+pub(super) const LARGE: u64 = 25_000_000;
+
+/// One end of the socket pair.
+pub(super) struct Wire(pub(super) OwnedFd);
+
+impl Wire {
+    pub(super) fn send(&self, bytes: &[u8], fds: &[BorrowedFd<'_>]) {
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(4))];
+        let mut control = SendAncillaryBuffer::new(&mut space);
+        assert!(fds.is_empty() || control.push(SendAncillaryMessage::ScmRights(fds)));
+        sendmsg(&self.0, &[IoSlice::new(bytes)], &mut control, SendFlags::empty()).unwrap();
+    }
+
+    pub(super) fn receive(&self) -> (Vec<u8>, Vec<OwnedFd>) {
+        let mut bytes = vec![0; 256];
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(4))];
+        let mut control = RecvAncillaryBuffer::new(&mut space);
+        let flags = RecvFlags::CMSG_CLOEXEC;
+        let got =
+            recvmsg(&self.0, &mut [IoSliceMut::new(&mut bytes)], &mut control, flags).unwrap();
+        bytes.truncate(got.bytes);
+        let mut fds = Vec::new();
+        for message in control.drain() {
+            if let RecvAncillaryMessage::ScmRights(rights) = message {
+                fds.extend(rights);
+            }
+        }
+        (bytes, fds)
+    }
+
+    /// Hands one packet with its descriptors over to another.
+    pub(super) fn pass_on(&self, to: &Self) {
+        let (bytes, fds) = self.receive();
+        to.send(&bytes, &fds.iter().map(AsFd::as_fd).collect::<Vec<_>>());
+    }
+
+    pub(super) fn send_numbers(&self, numbers: &[u64]) {
+        let bytes: Vec<u8> = numbers.iter().flat_map(|number| number.to_le_bytes()).collect();
+        self.send(&bytes, &[]);
+    }
+
+    pub(super) fn receive_numbers(&self) -> Vec<u64> {
+        let bytes = self.receive().0;
+        bytes.as_chunks::<8>().0.iter().map(|chunk| u64::from_le_bytes(*chunk)).collect()
+    }
+
+    pub(super) fn send_session(
+        &self,
+        session: &SessionSegment,
+        more: &[u8],
+        ring: Option<OwnedFd>,
+    ) {
+        let descriptors = session.descriptors().unwrap();
+        let mut fds = vec![
+            descriptors.segment.as_fd(),
+            descriptors.doorbell.as_fd(),
+            descriptors.pidfd.as_fd(),
+        ];
+        fds.extend(ring.as_ref().map(AsFd::as_fd));
+        let mut bytes = session.id().0.to_vec();
+        bytes.extend_from_slice(more);
+        self.send(&bytes, &fds);
+    }
+
+    pub(super) fn receive_session(&self) -> (Arc<PeerSession>, Vec<u8>, Option<OwnedFd>) {
+        let (bytes, fds) = self.receive();
+        let (id, more) = bytes.split_at(16);
+        let mut fds = fds.into_iter();
+        let mut next = || fds.next().expect("a descriptor");
+        let descriptors = PeerDescriptors { segment: next(), doorbell: next(), pidfd: next() };
+        assert!(descriptors.process().is_some_and(|pid| pid != std::process::id()));
+        let id = SessionId(id.try_into().unwrap());
+        (PeerSession::map(id, descriptors).unwrap(), more.to_vec(), fds.next())
+    }
+
+    /// The publisher's half of an attachment.
+    pub(super) fn serve(&self, session: &SessionSegment, writer: &Writer, qos: Qos) {
+        self.send_session(session, &writer.gid().0, Some(writer.descriptor().unwrap()));
+        let (peer, lane, _) = self.receive_session();
+        let info = ReaderInfo {
+            gid: Gid::new(peer.id(), 1),
+            lane: u32::from_le_bytes(lane.try_into().unwrap()),
+            qos,
+            peer: Peer::Remote(peer),
+            stands_for: Vec::new(),
+        };
+        let grant = writer.attach(info).unwrap();
+        self.send_numbers(&[grant.generation, grant.first]);
+    }
+
+    /// The reader's half.
+    pub(super) fn join(&self, session: &Arc<SessionSegment>, qos: Qos) -> Reader {
+        let (peer, writer, ring) = self.receive_session();
+        let lane = session.allocate_lane().unwrap();
+        self.send_session(session, &lane.index().to_le_bytes(), None);
+        let grant = self.receive_numbers();
+        let options = ReaderOptions {
+            reader: Gid::new(session.id(), 1),
+            writer: Gid(writer.try_into().unwrap()),
+            peer: Peer::Remote(peer),
+            lane,
+            grant: Grant { generation: grant[0], first: grant[1] },
+            qos,
+            max_message: LARGE,
+        };
+        Reader::map(ring.expect("a ring"), options).unwrap()
+    }
+}
+
+/// The other process; killed when dropped.
+pub(super) struct Other {
+    pub(super) child: Child,
+    pub(super) wire: Wire,
+}
+
+impl Other {
+    pub(super) fn start(part: &str) -> Self {
+        let (ours, theirs) =
+            socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None)
+                .unwrap();
+        let child = Command::new(env::current_exe().unwrap())
+            .args(["--exact", "shm::tests::processes::the_other_process", "--nocapture"])
+            .env(PART, part)
+            .stdin(Stdio::from(theirs))
+            .stdout(Stdio::null())
+            .spawn()
+            .unwrap();
+        Self { child, wire: Wire(ours) }
+    }
+
+    pub(super) fn kill(&mut self) {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+    }
+
+    pub(super) fn succeed(mut self) {
+        assert!(self.child.wait().unwrap().success());
+    }
+}
+
+impl Drop for Other {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}

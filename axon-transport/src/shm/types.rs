@@ -1,0 +1,66 @@
+//! What the two ends of a ring tell each other and their owners.
+
+use super::Peer;
+use crate::{ids::Gid, qos::Qos};
+
+/// What a ring is made for.
+#[derive(Clone, Copy, Debug)]
+pub struct RingOptions {
+    /// The publisher.
+    pub gid: Gid,
+    /// What it offers.
+    pub qos: Qos,
+    /// Bytes of samples to keep before the oldest go; one sample is always kept.
+    pub budget: u64,
+    /// The largest sample in bytes.
+    pub max_message: u64,
+}
+
+/// A reader that wants to attach.
+#[derive(Clone)]
+pub struct ReaderInfo {
+    /// The subscription.
+    pub gid: Gid,
+    /// Its lane in its session's segment.
+    pub lane: u32,
+    /// What it requests.
+    pub qos: Qos,
+    /// Its session.
+    pub peer: Peer,
+    /// The remote subscriptions that it stands for when it is a relay.
+    pub stands_for: Vec<Gid>,
+}
+
+/// What a reader is given when it attaches.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Grant {
+    /// Names this attachment; never 0.
+    pub generation: u64,
+    /// The first position that the reader takes.
+    pub first: u64,
+}
+
+/// What goes with a sample.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Meta {
+    /// The publisher's sequence number.
+    pub sequence: u64,
+    /// When it was published, in nanoseconds since the Unix epoch.
+    pub source_timestamp: i64,
+}
+
+/// A sample that was published.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Published {
+    /// Its position in the ring, counted from 0 without gaps.
+    pub position: u64,
+}
+
+/// A sample that was taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Taken {
+    /// What goes with it.
+    pub meta: Meta,
+    /// Its position in the publisher's ring.
+    pub position: u64,
+}
