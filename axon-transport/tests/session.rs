@@ -109,6 +109,42 @@ fn a_waiting_reader_is_woken_by_a_sample() {
 }
 
 #[test]
+fn a_sample_is_kept_beyond_all_that_it_came_from() {
+    let session = session();
+    let publisher = session.create_publisher(spec(Qos::default())).unwrap();
+    let subscription = session.create_subscription(spec(Qos::default())).unwrap();
+    assert!(subscription.wait_matched(1, PATIENCE));
+    let mut loan = publisher.loan(100_000).unwrap();
+    loan.fill(5);
+    assert_eq!(loan.publish().unwrap(), 1);
+    let (info, sample) = subscription.take_sample().unwrap();
+    assert_eq!((info.publisher, info.sequence, sample.len()), (publisher.gid(), 1, 100_000));
+    assert!(sample.is_borrowed());
+    for number in 2..50 {
+        assert_eq!(publisher.publish(&[6; 100_000]).unwrap(), number);
+    }
+    drop(subscription);
+    drop(publisher);
+    drop(session);
+    let mut bytes = Vec::new();
+    sample.copy_to(&mut bytes).unwrap();
+    assert!(bytes == [5; 100_000]);
+}
+
+#[test]
+fn samples_are_copied_where_the_settings_say_so() {
+    let config = Config::resolve([], None, &OsFiles).unwrap();
+    let config = Config { daemon: DaemonPolicy::Off, shm_copy: true, ..config };
+    let session = Session::open(&config, SessionOptions::new("test")).unwrap();
+    let publisher = session.create_publisher(spec(Qos::default())).unwrap();
+    let subscription = session.create_subscription(spec(Qos::default())).unwrap();
+    assert!(subscription.wait_matched(1, PATIENCE));
+    publisher.publish(&[1; 10_000]).unwrap();
+    let (_, sample) = subscription.take_sample().unwrap();
+    assert!(!sample.is_borrowed() && sample.len() == 10_000);
+}
+
+#[test]
 fn no_signal_is_delivered_to_the_control_thread() {
     // SIGKILL and SIGSTOP cannot be blocked, and the C library keeps 32 and 33.
     let all = !((1u64 << 8) | (1 << 18) | (1 << 31) | (1 << 32));

@@ -310,6 +310,10 @@ impl Session {
 
     /// An endpoint's handle is dropped.
     fn forget_endpoint(&self, gid: &Gid) {
+        // In a forked child it is the parent's still, and its locks may be held.
+        if self.shared().segment.is_forked() {
+            return;
+        }
         let mut state = self.shared().state();
         let stand_in =
             state.publishers.remove(gid).is_some_and(|p| p.role != EndpointRole::Application);
@@ -336,6 +340,11 @@ impl Session {
 
 impl Drop for Handle {
     fn drop(&mut self) {
+        // The thread, and what it has to say, stay with the parent of a forked child.
+        if self.shared.segment.is_forked() {
+            std::mem::forget(self.thread.take());
+            return;
+        }
         self.shared.stop();
         if let Some(thread) = self.thread.take() {
             // A listener may hold the last handle.

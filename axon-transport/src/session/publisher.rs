@@ -3,6 +3,7 @@
 use std::{
     collections::BTreeSet,
     fmt, io,
+    ops::{Deref, DerefMut},
     sync::{Arc, Mutex, MutexGuard, PoisonError},
     time::Duration,
 };
@@ -46,13 +47,7 @@ impl Publisher {
     /// # Errors
     /// As for [`publish`](Self::publish).
     pub fn publish_at(&self, source_timestamp: i64, payload: &[u8]) -> Result<u64, PublishError> {
-        // Sequence numbers stand in the ring in their order, so one is given under the lock under
-        // which it is used.
-        let mut last = self.inner.lock();
-        let sequence = *last + 1;
-        self.inner.writer.publish(Meta { sequence, source_timestamp }, payload)?;
-        *last = sequence;
-        Ok(sequence)
+        self.inner.writer.publish_next(source_timestamp, payload)
     }
 
     /// Publishes for a remote publisher, whose number and time the sample keeps.
@@ -60,10 +55,7 @@ impl Publisher {
     /// # Errors
     /// As for [`publish`](Self::publish).
     pub fn publish_with(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
-        let mut last = self.inner.lock();
-        self.inner.writer.publish(meta, payload)?;
-        *last = meta.sequence;
-        Ok(())
+        self.inner.writer.publish(meta, payload).map(drop)
     }
 
     /// As [`publish_with`](Self::publish_with), but never waits for room.
@@ -71,13 +63,11 @@ impl Publisher {
     /// # Errors
     /// [`PublishError::Blocked`] at once when there is none.
     pub fn try_publish_with(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
-        let mut last = self.inner.lock();
-        self.inner.writer.try_publish(meta, payload)?;
-        *last = meta.sequence;
-        Ok(())
+        self.inner.writer.try_publish(meta, payload).map(drop)
     }
 
-    /// Room for a sample of exactly `len` bytes in shared memory, to serialize into.
+    /// Room for a sample of exactly `len` bytes, to serialize into: in shared memory where it is
+    /// more than 4 KiB.
     ///
     /// # Errors
     /// As for [`publish`](Self::publish).
@@ -108,7 +98,8 @@ impl Drop for Publisher {
     }
 }
 
-/// A sample that is being written. Dropped without [`publish`](Self::publish), it never was.
+/// A sample that is being written, from the front or as a slice. Dropped without
+/// [`publish`](Self::publish), it never was.
 pub struct Loan<'a> {
     loan: crate::shm::Loan<'a>,
     publisher: &'a PublisherInner,
@@ -118,13 +109,23 @@ impl Loan<'_> {
     /// Publishes it, stamped with the current time, and returns its sequence number.
     ///
     /// # Errors
-    /// When fewer bytes were written than were asked for.
+    /// When fewer bytes were written than were asked for, and as for [`Publisher::publish`].
     pub fn publish(self) -> Result<u64, PublishError> {
-        let mut last = self.publisher.lock();
-        let sequence = *last + 1;
-        self.loan.publish(Meta { sequence, source_timestamp: now() })?;
-        *last = sequence;
-        Ok(sequence)
+        self.loan.publish_next(now())
+    }
+}
+
+impl Deref for Loan<'_> {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        &self.loan
+    }
+}
+
+impl DerefMut for Loan<'_> {
+    fn deref_mut(&mut self) -> &mut [u8] {
+        &mut self.loan
     }
 }
 
@@ -149,14 +150,13 @@ pub(super) struct PublisherInner {
     pub(super) endpoint: Endpoint,
     pub(super) role: EndpointRole,
     pub(super) writer: Writer,
-    last: Mutex<u64>,
     /// Readers that were granted; a relay as itself.
     attached: Mutex<BTreeSet<Gid>>,
 }
 
 impl PublisherInner {
     pub(super) fn new(endpoint: Endpoint, role: EndpointRole, writer: Writer) -> Self {
-        Self { endpoint, role, writer, last: Mutex::new(0), attached: Mutex::default() }
+        Self { endpoint, role, writer, attached: Mutex::default() }
     }
 
     pub(super) fn attach(&self, reader: ReaderInfo) -> Result<Grant, ShmError> {
@@ -184,9 +184,5 @@ impl PublisherInner {
 
     pub(super) fn attached(&self) -> MutexGuard<'_, BTreeSet<Gid>> {
         self.attached.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    fn lock(&self) -> MutexGuard<'_, u64> {
-        self.last.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

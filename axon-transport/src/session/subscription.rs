@@ -7,12 +7,16 @@ use std::{
     time::{Duration, SystemTime},
 };
 
-use super::{Session, message::EndpointRole};
+use super::{
+    Session,
+    message::{EndpointRole, Message, Pair},
+    state::Outgoing,
+};
 use crate::{
     graph::Endpoint,
     ids::Gid,
     qos::History,
-    shm::{Grant, Lane, Reader, TakeError},
+    shm::{Grant, Lane, Meta, Reader, Sample, TakeError},
 };
 
 /// Publishers whose last sequence number is remembered after they are gone.
@@ -53,7 +57,38 @@ impl Subscription {
     /// The oldest sample by source timestamp among all publishers, into `out`, which it replaces.
     /// `None` when there is none.
     pub fn take(&self, out: &mut Vec<u8>) -> Option<MessageInfo> {
-        self.inner.lock().take(out, &self.inner.endpoint)
+        self.take_with(|reader| Ok(reader.take(out)?.map(|taken| (taken.meta, ()))))
+            .map(|(info, ())| info)
+    }
+
+    /// As [`take`](Self::take), but a sample of more than 4 KiB stays in the publisher's memory for
+    /// as long as it is kept, unless `AXON_SHM_COPY` asks for copies.
+    pub fn take_sample(&self) -> Option<(MessageInfo, Sample)> {
+        let copy = self.session.shared().config.shm_copy;
+        self.take_with(|reader| {
+            let sample = if copy { reader.take_copy() } else { reader.take_sample() };
+            Ok(sample?.map(|sample| (sample.meta(), sample)))
+        })
+    }
+
+    fn take_with<T>(
+        &self,
+        take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
+    ) -> Option<(MessageInfo, T)> {
+        // A thread of the parent may have held the lock when this process was forked.
+        if self.session.shared().segment.is_forked() {
+            tracing::error!("a subscription of the parent process is used after fork");
+            return None;
+        }
+        let mut slots = self.inner.lock();
+        let taken = slots.take(take, &self.inner.endpoint);
+        let gone = std::mem::take(&mut slots.discarded);
+        drop(slots);
+        for writer in gone {
+            let detach = Message::Detach(Pair { reader: self.gid(), writer });
+            self.session.shared().tell(Outgoing::Message(Box::new(detach)));
+        }
+        taken
     }
 
     /// As [`take`](Self::take), after waiting for a sample for at most `timeout`.
@@ -72,7 +107,8 @@ impl Subscription {
 
     /// Whether there is something to take.
     pub fn has_data(&self) -> bool {
-        self.inner.lock().slots.iter().any(|s| s.reader.has_data())
+        let forked = self.session.shared().segment.is_forked();
+        !forked && self.inner.lock().slots.iter().any(|s| s.reader.has_data())
     }
 
     /// The publishers it receives from.
@@ -134,6 +170,8 @@ pub(super) struct Slots {
     last: HashMap<Gid, u64>,
     received: u64,
     lost: u64,
+    /// Writers whose memory was not usable, of which the others have to be told.
+    discarded: Vec<Gid>,
 }
 
 /// What a grant calls for.
@@ -150,6 +188,8 @@ struct Slot {
     reader: Reader,
     /// The writer is gone: take what it left, then unmap.
     over: bool,
+    /// Found nothing in the take that is under way, since the writer was faster.
+    overtaken: bool,
 }
 
 impl SubscriptionInner {
@@ -203,13 +243,14 @@ impl Slots {
             // The writer forgot us and granted anew, on a lane whose words we still use for what
             // it wrote before.
             slot.over = true;
+            self.sweep();
             return Accept::AskAgain;
         }
         self.pending.remove(&writer).map_or(Accept::Stands, Accept::Map)
     }
 
     pub(super) fn add(&mut self, reader: Reader) {
-        self.slots.push(Slot { reader, over: false });
+        self.slots.push(Slot { reader, over: false, overtaken: false });
     }
 
     /// The writer will not write any more. Whether that is news.
@@ -254,7 +295,12 @@ impl Slots {
         }
     }
 
-    fn take(&mut self, out: &mut Vec<u8>, endpoint: &Endpoint) -> Option<MessageInfo> {
+    fn take<T>(
+        &mut self,
+        mut take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
+        endpoint: &Endpoint,
+    ) -> Option<(MessageInfo, T)> {
+        self.slots.iter_mut().for_each(|slot| slot.overtaken = false);
         // A writer that repeats itself without end must not keep the lock: callers come back as
         // long as there is something to take.
         for _ in 0..REPEATS {
@@ -262,43 +308,61 @@ impl Slots {
                 self.skip_to_depth(u64::from(endpoint.qos.depth));
             }
             let index = self.oldest()?;
-            let reader = &mut self.slots[index].reader;
-            let writer = reader.writer();
-            let taken = match reader.take(out) {
+            let slot = &mut self.slots[index];
+            let writer = slot.reader.writer();
+            let (meta, taken) = match take(&mut slot.reader) {
                 Ok(Some(taken)) => taken,
-                // Overwritten again and again while we read: let the caller come back.
-                Ok(None) => return None,
+                // Overwritten again and again while we read: the others have their turn first.
+                Ok(None) => {
+                    slot.overtaken = true;
+                    continue;
+                }
+                Err(error @ TakeError::TooLarge { .. }) => {
+                    tracing::error!(topic = endpoint.topic, %error, "a sample is lost");
+                    continue;
+                }
+                // It stands, and may be taken when there is memory again.
+                Err(error @ TakeError::NoMemory { .. }) => {
+                    tracing::error!(topic = endpoint.topic, %error, "a sample is not taken yet");
+                    slot.overtaken = true;
+                    continue;
+                }
                 Err(error) => {
                     self.discard(index, &error, endpoint);
                     continue;
                 }
             };
+            let over = slot.over;
             let last = self.last.entry(writer).or_default();
-            if taken.meta.sequence <= *last {
-                continue;
+            let repeated = meta.sequence <= *last;
+            if !repeated {
+                *last = meta.sequence;
+                self.received += 1;
             }
-            *last = taken.meta.sequence;
-            self.received += 1;
-            if self.slots[index].over {
+            if over {
                 self.sweep();
             }
-            return Some(MessageInfo {
+            if repeated {
+                continue;
+            }
+            let info = MessageInfo {
                 publisher: writer,
-                sequence: taken.meta.sequence,
-                source_timestamp: taken.meta.source_timestamp,
+                sequence: meta.sequence,
+                source_timestamp: meta.source_timestamp,
                 received_timestamp: now(),
-            });
+            };
+            return Some((info, taken));
         }
         None
     }
 
-    /// The slot whose next sample is the oldest.
+    /// The slot whose next sample is the oldest, of those that are not faster than we are.
     fn oldest(&mut self) -> Option<usize> {
         if let [slot] = self.slots.as_slice() {
-            return slot.reader.has_data().then_some(0);
+            return (!slot.overtaken && slot.reader.has_data()).then_some(0);
         }
         let mut oldest = None;
-        for (index, slot) in self.slots.iter_mut().enumerate() {
+        for (index, slot) in self.slots.iter_mut().enumerate().filter(|(_, s)| !s.overtaken) {
             // A writer whose memory is corrupt is chosen, so that taking finds out.
             let stamp = match slot.reader.peek() {
                 Ok(Some(meta)) => meta.source_timestamp,
@@ -328,6 +392,9 @@ impl Slots {
         tracing::error!(topic = endpoint.topic, %error, "a publisher's memory is not usable");
         let slot = self.slots.remove(index);
         self.lost += slot.reader.lost();
+        if !slot.over {
+            self.discarded.push(slot.reader.writer());
+        }
     }
 }
 
