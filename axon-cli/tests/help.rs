@@ -4,6 +4,8 @@
 
 use std::process::Command;
 
+const TRUST: [[&str; 2]; 3] = [["trust", "keygen"], ["trust", "scan"], ["trust", "list"]];
+
 fn help(args: &[&str]) -> String {
     let output =
         Command::new(env!("CARGO_BIN_EXE_axon")).args(args).arg("--help").output().expect("runs");
@@ -14,7 +16,9 @@ fn help(args: &[&str]) -> String {
 #[test]
 fn the_first_page_names_every_command_and_the_exit_statuses() {
     let text = help(&[]);
-    for part in ["demo", "play", "echo", "status", "daemon", "Exit status:", "AXON_SECURITY_MODE"] {
+    for part in
+        ["demo", "play", "echo", "status", "trust", "daemon", "Exit status:", "AXON_SECURITY_MODE"]
+    {
         assert!(text.contains(part), "{part:?} is missing in:\n{text}");
     }
     assert!(!text.contains("demo-player"), "what the demo starts is not for people:\n{text}");
@@ -26,14 +30,30 @@ fn each_command_says_what_it_does_and_shows_an_example() {
         let text = help(&[command]);
         assert!(text.contains("Examples:") && text.contains(&format!("axon {command}")), "{text}");
     }
-    for status in ["demo", "status"] {
-        assert!(help(&[status]).contains("Exit status:"), "{status}");
+    for status in [&["demo"][..], &["status"], &["trust", "scan"]] {
+        assert!(help(status).contains("Exit status:"), "{status:?}");
+    }
+}
+
+#[test]
+fn trust_says_how_two_hosts_come_to_know_each_other() {
+    let text = help(&["trust"]);
+    for part in
+        ["axon trust keygen", "axon trust scan", "axon trust list", "AXON_CLASSIC_KEY", "_TRUST"]
+    {
+        assert!(text.contains(part), "{part:?} is missing in:\n{text}");
+    }
+    for command in TRUST {
+        let text = help(&command);
+        assert!(text.contains("Examples:") && text.contains(&command.join(" ")), "{text}");
     }
 }
 
 #[test]
 fn no_line_is_wider_than_a_page() {
-    for command in [&[][..], &["demo"], &["play"], &["echo"], &["status"], &["daemon"]] {
+    let others: [&[&str]; 7] =
+        [&[], &["demo"], &["play"], &["echo"], &["status"], &["trust"], &["daemon"]];
+    for command in others.into_iter().chain(TRUST.iter().map(|command| &command[..])) {
         for line in help(command).lines() {
             assert!(line.chars().count() <= 100, "{command:?}: {line}");
         }

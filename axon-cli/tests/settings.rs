@@ -6,8 +6,26 @@ mod common;
 
 use common::{LOG, axon};
 
-const COMMANDS: [&[&str]; 5] =
-    [&["demo"], &["play", LOG], &["echo", "/scan"], &["status"], &["daemon"]];
+const COMMANDS: [&[&str]; 6] =
+    [&["demo"], &["play", LOG], &["echo", "/scan"], &["status"], &["trust", "list"], &["daemon"]];
+
+/// What `axon trust` does before a host is set up, and in order to set it up.
+#[test]
+fn a_key_is_made_and_looked_at_whatever_the_settings_are() {
+    let dir = tempfile::tempdir().expect("temporary directory");
+    let key = dir.path().join("host.key");
+    let key = key.to_str().expect("UTF-8");
+    for settings in
+        [("AXON_TYPO", "x"), ("AXON_SECURITY_MODE", "qkd"), ("AXON_CLASSIC_KEY", "/nowhere/key")]
+    {
+        let made = axon([settings]).args(["trust", "keygen", key]).output().expect("runs");
+        assert!(made.status.success(), "{settings:?}: {}", String::from_utf8_lossy(&made.stderr));
+        std::fs::remove_file(key).expect("made");
+        let scan = ["trust", "scan", "127.0.0.1:9", "--timeout", "1"];
+        let looked = axon([settings]).args(scan).output().expect("runs");
+        assert_eq!(looked.status.code(), Some(1), "{settings:?}: nobody is there");
+    }
+}
 
 fn assert_refused(args: &[&str], settings: &[(&str, &str)], variable: &str) {
     let dir = tempfile::tempdir().expect("temporary directory");
@@ -52,8 +70,12 @@ fn bad_values_and_half_given_settings_name_the_variable() {
         (&[("AXON_LOG", "info=\nwarn=nonsense")], "AXON_LOG"),
         (&[("ROS_DOMAIN_ID", "-1")], "ROS_DOMAIN_ID"),
         (&[("AXON_DAEMON", "maybe")], "AXON_DAEMON"),
+        (&[("AXON_CLASSIC_AUTH", "pinned")], "AXON_CLASSIC_KEY"),
+        (&[("AXON_CLASSIC_AUTH", "ca")], "AXON_CLASSIC_CA"),
+        (&[("AXON_CLASSIC_TRUST", "/nowhere/trust")], "AXON_CLASSIC_"),
     ] {
         assert_refused(&["status"], settings, variable);
+        assert_refused(&["trust", "list"], settings, variable);
     }
 }
 

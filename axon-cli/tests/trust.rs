@@ -54,6 +54,7 @@ fn a_file_that_exists_is_never_overwritten() {
     let key = dir.path().join("host.key");
     fs::write(&key, "something dear").expect("writable");
     refused(&["keygen", utf8(&key)], &[], 1, utf8(&key));
+    refused(&["keygen", utf8(&key)], &[], 1, "exists, and is not overwritten; delete it");
     assert_eq!(fs::read_to_string(&key).expect("still there"), "something dear");
 
     // What a link leads to is not created either: somebody else may have put the link there.
@@ -67,8 +68,13 @@ fn a_file_that_exists_is_never_overwritten() {
 #[test]
 fn a_directory_that_cannot_be_written_is_named() {
     // Not by permissions, which do not hold for root.
-    for path in ["/proc/axon-host.key", "/nowhere/host.key", "/dev/null/host.key"] {
+    for (path, said) in [
+        ("/proc/axon-host.key", ""),
+        ("/nowhere/host.key", "its directory does not exist; make that first"),
+        ("/dev/null/host.key", ""),
+    ] {
         refused(&["keygen", path], &[], 1, path);
+        refused(&["keygen", path], &[], 1, said);
     }
 }
 
@@ -170,7 +176,8 @@ fn a_line_that_cannot_be_used_is_named_with_its_file() {
     fs::write(&file, vec![b'#'; TrustFile::MAX_LEN + 1]).expect("writable");
     refused(&["list", utf8(&file)], &[], 1, "larger than 1 MiB");
     refused(&["list", utf8(dir.path())], &[], 1, utf8(dir.path()));
-    refused(&["list", "/nowhere/trust"], &[], 1, "/nowhere/trust");
+    refused(&["list", utf8(dir.path())], &[], 1, "is a directory, not a file");
+    refused(&["list", "/nowhere/trust"], &[], 1, "/nowhere/trust: there is no such file");
     // Endless, and no text.
     refused(&["list", "/dev/zero"], &[], 1, "/dev/zero");
 }
@@ -188,6 +195,8 @@ fn what_is_no_key_is_named_and_not_repeated() {
         fs::write(&key, content).expect("writable");
         let args = ["list", utf8(&file), "--key", utf8(&key)];
         refused(&args, &[], 1, utf8(&key));
+        let made_by = if content.starts_with(b"\xff") { "utf-8" } else { "axon trust keygen" };
+        refused(&args, &[], 1, made_by);
         assert!(!text(&trust(&args, &[]).stderr).contains("hunter2"));
     }
     refused(&["list", utf8(&file), "--key", "/dev/zero"], &[], 1, "too large");

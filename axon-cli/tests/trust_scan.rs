@@ -10,6 +10,11 @@ use std::{
     process::{Child, Command, Output, Stdio},
 };
 
+use axon_tls::{
+    Cipher,
+    identity::{Auth, SigningKey},
+    quic::hybrid_server,
+};
 use common::{Host, axon, eventually};
 
 /// A daemon in the foreground; it ends with its standard input.
@@ -96,6 +101,63 @@ fn where_nobody_answers_no_key_is_printed() {
     assert_eq!((output.status.code(), output.stdout.as_slice()), (Some(1), &b""[..]));
     let stderr = text(&output.stderr);
     assert!(stderr.contains("no key was shown") && stderr.contains("127.0.0.1"), "{stderr}");
+}
+
+/// A server that speaks QUIC, and is no daemon.
+fn serve(runtime: &tokio::runtime::Runtime, config: quinn::ServerConfig) -> String {
+    let _entered = runtime.enter();
+    let server = quinn::Endpoint::server(config, ([127, 0, 0, 1], 0).into()).expect("endpoint");
+    let address = server.local_addr().expect("an address").to_string();
+    runtime.spawn(async move {
+        while let Some(incoming) = server.accept().await {
+            assert!(incoming.await.is_err(), "a connection");
+        }
+    });
+    address
+}
+
+#[test]
+fn a_server_that_is_no_daemon_is_told_from_silence() {
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().expect("tokio");
+    let auth = Auth::None(SigningKey::generate().expect("a key"));
+    let web = hybrid_server(&auth, Cipher::default(), b"h3").expect("a server");
+    // What most of the world has: a certificate, and X25519 alone.
+    let key = rcgen::KeyPair::generate().expect("a key");
+    let params = rcgen::CertificateParams::new(["robot".to_owned()]).expect("a name");
+    let certificate = params.self_signed(&key).expect("a certificate").der().clone();
+    let key = rustls::pki_types::PrivatePkcs8KeyDer::from(key.serialize_der());
+    let provider = rustls::crypto::CryptoProvider {
+        kx_groups: vec![rustls::crypto::aws_lc_rs::kx_group::X25519],
+        ..rustls::crypto::aws_lc_rs::default_provider()
+    };
+    let mut tls = rustls::ServerConfig::builder_with_provider(provider.into())
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .expect("TLS 1.3")
+        .with_no_client_auth()
+        .with_single_cert(vec![certificate], key.into())
+        .expect("a certificate and its key");
+    tls.alpn_protocols = vec![b"axon/1".to_vec()];
+    let tls = quinn::crypto::rustls::QuicServerConfig::try_from(tls).expect("QUIC");
+    let classical = quinn::ServerConfig::with_crypto(std::sync::Arc::new(tls));
+    for (config, said) in [(web, "not axon/1"), (classical, "refuses X25519MLKEM768")] {
+        let target = serve(&runtime, config);
+        let scan = ["trust", "scan", target.as_str(), "--timeout", "20"];
+        let output = axon([]).args(scan).output().expect("runs");
+        let stderr = text(&output.stderr);
+        assert_eq!((output.status.code(), output.stdout.as_slice()), (Some(1), &b""[..]));
+        let line = stderr.lines().find(|line| line.starts_with(&format!("# {target} ")));
+        assert!(line.is_some_and(|line| line.contains(said)), "{said}: {stderr}");
+        assert!(stderr.contains("who answered instead"), "{stderr}");
+        assert!(!stderr.contains("let through"), "the network is not to blame: {stderr}");
+    }
+
+    // TLS over TCP is another port to QUIC, whatever its number.
+    let tcp = std::net::TcpListener::bind(("127.0.0.1", 0)).expect("a socket");
+    let target = tcp.local_addr().expect("an address").to_string();
+    let scan = ["trust", "scan", target.as_str(), "--timeout", "1"];
+    let output = axon([]).args(scan).output().expect("runs");
+    assert_eq!((output.status.code(), output.stdout.as_slice()), (Some(1), &b""[..]));
+    assert!(text(&output.stderr).contains("UDP port"), "{}", text(&output.stderr));
 }
 
 #[test]

@@ -20,7 +20,7 @@ pub(super) fn trust(path: &Path) -> Result<TrustFile, Failure> {
     let limit = TrustFile::MAX_LEN as u64 + 1;
     File::open(path)
         .and_then(|file| file.take(limit).read_to_end(&mut bytes))
-        .map_err(|error| failed(path, &error))?;
+        .map_err(|error| unread(path, &error))?;
     let text = std::str::from_utf8(&bytes).map_err(|error| {
         let before = &bytes[..error.valid_up_to()];
         let line = before.iter().filter(|byte| **byte == b'\n').count() + 1;
@@ -35,9 +35,21 @@ pub(super) fn key(path: &Path) -> Result<SigningKey, Failure> {
     let mut bytes = Zeroizing::new(vec![0; LARGEST_KEY]);
     let len = File::open(path)
         .and_then(|file| fill(file, &mut bytes))
-        .map_err(|error| failed(path, &error))?;
+        .map_err(|error| unread(path, &error))?;
     let pem = std::str::from_utf8(&bytes[..len]).map_err(|error| failed(path, &error))?;
-    SigningKey::from_pem(pem).map_err(|error| failed(path, &error))
+    SigningKey::from_pem(pem).map_err(|error| {
+        failed(path, &format!("{error}; `axon trust keygen` makes a file that can be used"))
+    })
+}
+
+/// Why a file could not be opened or read, for somebody who has never seen this tool.
+pub(super) fn unread(path: &Path, error: &io::Error) -> Failure {
+    match error.kind() {
+        io::ErrorKind::NotFound => failed(path, &"there is no such file"),
+        io::ErrorKind::PermissionDenied => failed(path, &"this user may not read it"),
+        io::ErrorKind::IsADirectory => failed(path, &"is a directory, not a file"),
+        _ => failed(path, error),
+    }
 }
 
 /// A failure of the file at `path`.

@@ -32,6 +32,12 @@ fn create(path: &Path, content: &[u8]) -> Result<(), Failure> {
         ErrorKind::AlreadyExists => {
             failed(path, &"exists, and is not overwritten; delete it, or name another file")
         }
+        ErrorKind::NotFound => {
+            failed(path, &"its directory does not exist; make that first, or name another file")
+        }
+        ErrorKind::PermissionDenied => {
+            failed(path, &"this user may not make it there; name another file, or ask who may")
+        }
         _ => failed(path, &error),
     })?;
     write(file, content).map_err(|error| {

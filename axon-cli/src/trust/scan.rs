@@ -45,7 +45,8 @@ pub(super) fn run(args: &cli::Scan) -> Result<(), Failure> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let (seen, asked) = runtime.block_on(async {
         let addresses = args.target.addresses(quic_ports(domain)).await.map_err(|error| {
-            Failure::failed(format!("{}: {error}", printable(&args.target.host)))
+            let host = printable(&args.target.host);
+            Failure::failed(format!("{host}: no address is known for this name ({error})"))
         })?;
         let seen = scan(&addresses, limit).await;
         Ok::<_, Failure>((seen, addresses))
@@ -54,7 +55,8 @@ pub(super) fn run(args: &cli::Scan) -> Result<(), Failure> {
     let found = Found::of(&seen);
     eprint!("{}", found.notes);
     if found.keys.is_empty() {
-        return Err(Failure::failed(nobody(args, &asked, domain)));
+        let answered = !found.notes.is_empty();
+        return Err(Failure::failed(nobody(args, &asked, domain, answered)));
     }
     let mut out = String::new();
     for (key, names) in &found.keys {
@@ -147,7 +149,7 @@ impl Found {
     }
 }
 
-fn nobody(args: &cli::Scan, asked: &[SocketAddr], domain: u32) -> String {
+fn nobody(args: &cli::Scan, asked: &[SocketAddr], domain: u32, answered: bool) -> String {
     let host = printable(&args.target.host);
     let ports = match args.target.port {
         Some(port) => format!("UDP port {port}"),
@@ -158,6 +160,12 @@ fn nobody(args: &cli::Scan, asked: &[SocketAddr], domain: u32) -> String {
     };
     let count = asked.iter().map(SocketAddr::ip).collect::<BTreeSet<_>>().len();
     let at = if count > 1 { format!(" at any of its {count} addresses") } else { String::new() };
+    if answered {
+        return format!(
+            "{host}: no key was shown{at} on {ports}; the lines above say who answered instead, \
+             and with a port of its own, HOST:PORT, another one is asked"
+        );
+    }
     format!(
         "{host}: no key was shown{at} on {ports} within {} s; is a daemon running there, under \
          the same ROS_DOMAIN_ID, and is UDP let through?",

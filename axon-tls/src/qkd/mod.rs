@@ -38,9 +38,9 @@
 mod config;
 mod derive;
 mod identity;
+mod imported;
 #[cfg(test)]
 mod recorded;
-mod imported;
 
 pub use config::{PskResolver, client_config, negotiated, server_config};
 pub use derive::{Psk, derive_psk};
