@@ -185,7 +185,8 @@ impl<'a> Channel<'a> {
     /// Tells the subscriber that it is not admitted, if it still listens.
     pub(super) fn refuse(&self, reader: Gid, why: &ConnectError) {
         let mut reason = why.to_string();
-        reason.truncate(reason.floor_char_boundary(MAX_REASON));
+        let end = (0..=MAX_REASON.min(reason.len())).rev().find(|&i| reason.is_char_boundary(i));
+        reason.truncate(end.unwrap_or(0));
         let _ = self.send(&Packet::Refused(Refused { reader, reason }), &[]);
     }
 

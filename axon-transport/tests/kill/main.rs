@@ -7,6 +7,7 @@
 //! every instruction. The bounded run kills around the states, all of them where they are few, and at
 //! instructions chosen at random; the full run
 //! (`cargo test --release -p axon-transport --test kill -- --full`) at every single instruction.
+#![expect(clippy::print_stdout, reason = "what it prints is its result")]
 
 mod operation;
 mod survivor;

@@ -38,10 +38,13 @@ pub(crate) struct Scene<'a> {
 /// What the survivor holds.
 enum End {
     Nothing,
-    Waiting(Box<dyn FnOnce(&Wire) -> Option<Reader>>),
+    Waiting(Box<LateReader>),
     Reader(Reader),
-    Writer(Writer),
+    Writer(Box<Writer>),
 }
+
+/// Maps a reader once the publisher has granted it, if it has.
+type LateReader = dyn FnOnce(&Wire) -> Option<Reader>;
 
 impl<'a> Scene<'a> {
     pub(crate) fn set(case: &'a Case) -> Self {
@@ -129,7 +132,7 @@ fn serve(case: &Case, wire: &Wire, session: &Arc<SessionSegment>) -> (End, Vec<O
         wire.wait();
         wire.go();
     }
-    (End::Writer(writer), vec![seen])
+    (End::Writer(Box::new(writer)), vec![seen])
 }
 
 /// The next sample, which must be whole. Its sequence number.
