@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::Command;
 
 use super::super::git;
-use super::{Scratch, Tree, cargo, tree};
+use super::{Scratch, Tree, cargo};
 
 /// What is run. Features as upstream tests them, without FIPS.
 const TEST: [&str; 5] =
@@ -38,7 +38,7 @@ pub(super) fn compare(
     copy_tracked(repository, &copy)?;
     let src = copy.join("rustls/src");
     let run = |source: &Tree| -> Result<Outcomes, String> {
-        tree::write(source, &src)?;
+        replace_sources(source, &src)?;
         outcomes(&copy, &scratch.0.join("target"))
     };
     let (plain, patched) = (run(released)?, run(changed)?);
@@ -61,6 +61,23 @@ pub(super) fn compare(
         return Err(format!("{report}\n  not the same: {}", differ.join(", ")));
     }
     Ok(report + "\n  every test has the same outcome on both")
+}
+
+/// Makes `src` hold these Rust sources and no others. What tests read besides stays.
+fn replace_sources(source: &Tree, src: &Path) -> Result<(), String> {
+    let mut present = Vec::new();
+    walk(src, "", &mut present)?;
+    for name in present.iter().filter(|name| name.ends_with(".rs") && !source.contains_key(*name)) {
+        fs::remove_file(src.join(name)).map_err(|err| format!("cannot remove {name}: {err}"))?;
+    }
+    for (name, contents) in source {
+        let path = src.join(name);
+        path.parent()
+            .map_or(Ok(()), fs::create_dir_all)
+            .and_then(|()| fs::write(&path, contents))
+            .map_err(|err| format!("cannot write {}: {err}", path.display()))?;
+    }
+    Ok(())
 }
 
 /// Copies what `git` tracks in `repository`, or everything but `target/` where there is no git.
