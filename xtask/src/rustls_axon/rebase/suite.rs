@@ -145,7 +145,13 @@ pub(super) fn parse(output: &str) -> Outcomes {
         };
         // an ignored test may say why
         let outcome = outcome.split(',').next().unwrap_or(outcome);
-        let seen = outcomes.entry(name.to_owned()).or_default();
+        // where a documentation test stands is not the same on both
+        let name = match name.split_once(" (line ").map(|(item, rest)| (item, rest.split_once(')')))
+        {
+            Some((item, Some((_, how)))) => format!("{item}{how}"),
+            _ => name.to_owned(),
+        };
+        let seen = outcomes.entry(name).or_default();
         *seen.entry(outcome.to_owned()).or_default() += 1;
     }
     outcomes

@@ -139,6 +139,13 @@ fn outcomes_are_counted_by_name() {
     assert_eq!(outcomes["a::b"].len(), 2);
 }
 
+#[test]
+fn a_documentation_test_that_moved_is_the_same() {
+    let parse = |line| suite::parse(&format!("test x.rs - a::B (line {line}) - compile ... ok\n"));
+    assert_eq!(parse(795), parse(807));
+    assert_ne!(parse(795), suite::parse("test x.rs - a::B (line 795) ... ok\n"));
+}
+
 /// Every file below `dir`, but what cargo keeps for itself.
 fn files(dir: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = BTreeMap::new();
