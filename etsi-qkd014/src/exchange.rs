@@ -9,7 +9,7 @@ use serde::Serialize;
 use tokio::time::{Instant, timeout};
 
 use crate::builder::Limits;
-use crate::secret::{SecretBuf, wipe};
+use crate::secret::SecretBuf;
 use crate::{Error, Quirks, parse, tls};
 
 /// The answer of status 200, zeroized on drop.
@@ -227,7 +227,7 @@ fn clear(chunk: Bytes) {
         // Asking for more than there is moves the start back to that of the memory.
         let _ = own.try_reclaim(own.capacity() + 1);
         own.resize(own.capacity(), 0);
-        wipe(&mut own);
+        zeroize::optimization_barrier(&own[..]);
     }
 }
 

@@ -104,11 +104,13 @@ pub(crate) fn is_key_id(id: &str) -> bool {
 }
 
 pub(crate) fn is_uuid(id: &str) -> bool {
-    id.len() == 36
-        && id.bytes().enumerate().all(|(at, c)| match at {
-            8 | 13 | 18 | 23 => c == b'-',
-            _ => c.is_ascii_hexdigit(),
-        })
+    let Ok(id) = <&[u8; 36]>::try_from(id.as_bytes()) else { return false };
+    // Without a way out before the end, so that many characters are looked at at once.
+    let fits = |(at, c): (usize, &u8)| {
+        let dash = matches!(at, 8 | 13 | 18 | 23);
+        (dash & (*c == b'-')) | (!dash & c.is_ascii_hexdigit())
+    };
+    id.iter().enumerate().map(fits).fold(true, |all, fits| all & fits)
 }
 
 /// The order of key_IDs, in which letter case does not count.
@@ -118,17 +120,25 @@ fn by_id(one: &str, other: &str) -> Ordering {
 }
 
 /// A key_ID that is there twice, in any letter case.
-pub(crate) fn repeated<'i>(ids: impl Iterator<Item = &'i str>) -> Option<&'i str> {
-    // Nearly always the first bytes differ, and are compared at once.
-    let first = |id: &str| {
-        let mut first = [0; 8];
-        first.iter_mut().zip(id.bytes()).for_each(|(to, c)| *to = c.to_ascii_lowercase());
-        u64::from_be_bytes(first)
-    };
-    let mut ids: Vec<(u64, &str)> = ids.map(|id| (first(id), id)).collect();
-    ids.sort_unstable_by(|one, other| one.0.cmp(&other.0).then_with(|| by_id(one.1, other.1)));
-    let mut pairs = ids.windows(2);
-    pairs.find(|pair| pair[0].0 == pair[1].0 && is_same(pair[0].1, pair[1].1)).map(|pair| pair[0].1)
+pub(crate) fn repeated<'i>(ids: impl Iterator<Item = &'i str> + Clone) -> Option<&'i str> {
+    // Nearly always they differ in their first bytes already.
+    let mut starts: Vec<u64> = ids.clone().map(start).collect();
+    starts.sort_unstable();
+    if starts.windows(2).all(|pair| pair[0] != pair[1]) {
+        return None;
+    }
+    let mut ids: Vec<&str> = ids.collect();
+    ids.sort_unstable_by(|one, other| by_id(one, other));
+    ids.windows(2).find(|pair| is_same(pair[0], pair[1])).map(|pair| pair[0])
+}
+
+/// The first eight bytes, without letter case.
+fn start(id: &str) -> u64 {
+    let mut start = [0; 8];
+    let length = id.len().min(8);
+    start[..length].copy_from_slice(&id.as_bytes()[..length]);
+    start.make_ascii_lowercase();
+    u64::from_be_bytes(start)
 }
 
 fn check_unique(keys: &[Key]) -> Result<(), Error> {
