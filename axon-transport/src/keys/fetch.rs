@@ -10,6 +10,8 @@ use super::request::{Answer, Failure, FailureKind, Fetched, Purpose, Request};
 const TRIES: u8 = 3;
 /// How long a try takes: at most until its answer, and at least until the next one.
 const TRY: Duration = Duration::from_secs(2);
+/// Longest pause between two tries that a KME can ask for: whoever announced the keys waits too.
+const RETRY_AFTER_MAX: Duration = Duration::from_secs(10);
 /// Calls in flight at once.
 const IN_FLIGHT: usize = 4;
 
@@ -62,7 +64,7 @@ impl Fetches {
         let Some(i) = self.in_flight.iter().position(|b| b.key_ids == key_ids) else {
             return Vec::new();
         };
-        let batch = self.in_flight.swap_remove(i);
+        let mut batch = self.in_flight.swap_remove(i);
         let failure = match answer.outcome {
             Ok(Fetched::Keys(keys)) => return given(batch.key_ids, keys),
             Ok(Fetched::Stock(_)) => {
@@ -82,6 +84,8 @@ impl Fetches {
                 Vec::new()
             }
             kind if kind.is_transient() && batch.tries_left > 0 => {
+                // A try is over no later than the next may begin.
+                batch.not_before += failure.retry_after.unwrap_or_default().min(RETRY_AFTER_MAX);
                 self.waiting.push_back(batch);
                 Vec::new()
             }
@@ -110,5 +114,5 @@ fn failed(key_ids: Vec<KeyId>, failure: Failure) -> Vec<Outcome> {
 }
 
 fn invalid(text: &str) -> Failure {
-    Failure { kind: FailureKind::Invalid, text: text.to_owned() }
+    Failure::new(FailureKind::Invalid, text)
 }

@@ -78,6 +78,8 @@ pub struct Failure {
     pub kind: FailureKind,
     /// For log and status.
     pub text: String,
+    /// The pause that the KME asked for before it is asked again.
+    pub retry_after: Option<Duration>,
 }
 
 /// What can be done about a [`Failure`].
@@ -98,6 +100,13 @@ pub enum FailureKind {
     Busy,
     /// This host could not even put the request.
     Invalid,
+}
+
+impl Failure {
+    /// One after which the KME asked for no pause.
+    pub fn new(kind: FailureKind, text: impl Into<String>) -> Self {
+        Self { kind, text: text.into(), retry_after: None }
+    }
 }
 
 impl fmt::Debug for Fetched {

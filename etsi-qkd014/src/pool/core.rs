@@ -17,6 +17,8 @@ const STATUS_EVERY: Duration = Duration::from_secs(5);
 const PAUSE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(2));
 /// First and longest pause after a failure that may have cost keys.
 const PAUSE_LOST: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(30));
+/// Longest pause that a KME can ask for.
+const RETRY_AFTER_MAX: Duration = Duration::from_secs(60);
 
 /// The rules of a pool of keys for one peer, over any kind of key `K`.
 ///
@@ -35,7 +37,8 @@ const PAUSE_LOST: (Duration, Duration) = (Duration::from_secs(1), Duration::from
 /// - An empty store halves the batch, since fewer keys may be had; a call that succeeds doubles it
 ///   again.
 /// - After failures it waits: 100 ms to 2 s where they cost nothing, 1 s to 30 s where each may have
-///   cost keys. Waits double, and are drawn from the upper half of their length.
+///   cost keys. Waits double, and are drawn from the upper half of their length. Longer where the KME
+///   says so ([`retry_after`](Self::retry_after)).
 ///
 /// ```
 /// use std::time::Duration;
@@ -349,6 +352,12 @@ impl<K> Core<K> {
             }
             _ => self.settings.target,
         }
+    }
+
+    /// The KME asks for a pause (see [`Error::Unavailable`](crate::Error::Unavailable)): no call for keys meanwhile, for a minute
+    /// at most.
+    pub fn retry_after(&mut self, now: Duration, asked: Duration) {
+        self.hold_until(now.saturating_add(asked.min(RETRY_AFTER_MAX)));
     }
 
     /// Asks for no keys before `at`.

@@ -10,8 +10,6 @@ use super::core::{Ask, FailureClass, Stock};
 use super::{LedgerError, Shared};
 use crate::{Client, Error, Key, Status, tls};
 
-/// Longest pause that a KME can ask for with `Retry-After`.
-const RETRY_AFTER_MAX: Duration = Duration::from_secs(60);
 /// Sleep where nothing is to come by itself.
 const LONG: Duration = Duration::from_secs(3600);
 
@@ -119,7 +117,7 @@ impl Shared {
             Ended::Keys(number, Err(NoKeys::Kme(error))) => {
                 state.core.on_failure(now, Ask::Keys(number), class(&error));
                 if let Error::Unavailable { retry_after: Some(asked), .. } = error.cause() {
-                    state.core.hold_until(now + (*asked).min(RETRY_AFTER_MAX));
+                    state.core.retry_after(now, *asked);
                 }
                 state.last_failure = Some(error.to_string());
             }

@@ -39,9 +39,8 @@ async fn call(client: &Client, request: &Request) -> Result<Fetched, Failure> {
         Request::Dec { master, key_ids, .. } => {
             let mut names = Vec::with_capacity(key_ids.len());
             for key_id in key_ids {
-                names.push(std::str::from_utf8(key_id.as_bytes()).map_err(|_| Failure {
-                    kind: FailureKind::Invalid,
-                    text: format!("key_ID {key_id} is no text"),
+                names.push(std::str::from_utf8(key_id.as_bytes()).map_err(|_| {
+                    Failure::new(FailureKind::Invalid, format!("key_ID {key_id} is no text"))
                 })?);
             }
             let dec = client.dec_keys(master).key_ids(names).size(KEY_SIZE);
@@ -56,7 +55,7 @@ async fn call(client: &Client, request: &Request) -> Result<Fetched, Failure> {
 
 /// Moves the keys over; the client erases its own copies.
 fn keys(container: KeyContainer) -> Result<Fetched, Failure> {
-    let ambiguous = |text: String| Failure { kind: FailureKind::Ambiguous, text };
+    let ambiguous = |text: String| Failure::new(FailureKind::Ambiguous, text);
     let keys = container.keys.iter().map(|key| {
         let key_id = KeyId::new(key.key_id()).map_err(|e| ambiguous(format!("key_ID: {e}")))?;
         let kme_key = KmeKey::from_slice(key.expose())
@@ -76,7 +75,11 @@ fn failure(e: &Error) -> Failure {
         Error::Status { code: 404 | 410, .. } => FailureKind::Refused,
         _ => FailureKind::Invalid,
     };
-    Failure { kind, text: e.to_string() }
+    let retry_after = match e.cause() {
+        Error::Unavailable { retry_after, .. } => *retry_after,
+        _ => None,
+    };
+    Failure { kind, text: e.to_string(), retry_after }
 }
 
 /// The call was dropped in the middle: whether it reached the KME is not known.
@@ -86,5 +89,5 @@ fn timed_out(request: &Request, limit: Duration) -> Failure {
         Request::Dec { .. } => (FailureKind::Ambiguous, "dec_keys"),
         Request::Status { .. } => (FailureKind::Unavailable, "status"),
     };
-    Failure { kind, text: format!("{call}: no answer from the KME within {limit:?}") }
+    Failure::new(kind, format!("{call}: no answer from the KME within {limit:?}"))
 }

@@ -151,7 +151,7 @@ impl Kme {
         queue.try_send(Job { origin, request, since: Instant::now() }).map_err(|e| {
             let Job { origin, request, .. } = e.into_inner();
             let text = format!("{QUEUE} calls wait for the KME already");
-            let outcome = Err(Failure { kind: FailureKind::Busy, text });
+            let outcome = Err(Failure::new(FailureKind::Busy, text));
             Box::new(Event { origin, answer: Answer { request, took: Duration::ZERO, outcome } })
         })
     }
@@ -165,8 +165,7 @@ impl Kme {
         match calls::run(&self.0.client, &self.0.recorder, &request).await? {
             Fetched::Stock(stock) => Ok(stock),
             Fetched::Keys(_) => {
-                let text = "status answered with keys".to_owned();
-                Err(Failure { kind: FailureKind::Invalid, text })
+                Err(Failure::new(FailureKind::Invalid, "status answered with keys"))
             }
         }
     }

@@ -134,6 +134,12 @@ async fn failures_say_whether_keys_may_be_lost() {
     }
     assert_eq!(kme.statistics().keys_possibly_lost, 8);
 
+    sim.inject(Fault::Busy(7), 1);
+    kme.submit(Origin::Sender(0), enc(2, LONG)).unwrap();
+    let failure = events.recv().await.unwrap().answer.outcome.expect_err("busy");
+    assert_eq!(failure.kind, FailureKind::Unavailable, "{failure}");
+    assert_eq!(failure.retry_after, Some(Duration::from_secs(7)));
+
     sim.inject(Fault::Silence, 1);
     kme.submit(Origin::Sender(0), enc(2, Duration::from_millis(50))).unwrap();
     let failure = events.recv().await.unwrap().answer.outcome.expect_err("too slow");

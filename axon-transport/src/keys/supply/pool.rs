@@ -106,6 +106,9 @@ impl Pool {
             }
             (ask, Err(failure)) => {
                 self.core.on_failure(now, ask, class(failure.kind));
+                if let Some(asked) = failure.retry_after {
+                    self.core.retry_after(now, asked);
+                }
                 Some(failure.text)
             }
         }

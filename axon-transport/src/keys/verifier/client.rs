@@ -129,7 +129,7 @@ impl ClientProof {
         if !matches!(self.step, Step::Asked) {
             return;
         }
-        let invalid = |text: &str| Failure { kind: FailureKind::Invalid, text: text.to_owned() };
+        let invalid = |text: &str| Failure::new(FailureKind::Invalid, text);
         let failure = match answer.outcome {
             Ok(Fetched::Keys(mut keys)) => match keys.pop() {
                 Some((key_id, key))

@@ -28,7 +28,7 @@ fn given(request: Request, byte: u8) -> Answer {
 }
 
 fn failed(request: Request, kind: FailureKind) -> Answer {
-    let outcome = Err(Failure { kind, text: "no".to_owned() });
+    let outcome = Err(Failure::new(kind, "no"));
     Answer { request, took: Duration::ZERO, outcome }
 }
 
@@ -135,8 +135,7 @@ fn a_client_without_the_key_says_so() {
     let mut client = ProofResponder::new("sae-b", &exporters());
     client.on_message(NOW, &KeyMessage::Announce(vec![id("k1")])).unwrap();
     let request = client.poll_request(NOW).unwrap();
-    let outcome =
-        Err(Failure { kind: FailureKind::Refused, text: "kme.lan:8443 says 400".to_owned() });
+    let outcome = Err(Failure::new(FailureKind::Refused, "kme.lan:8443 says 400"));
     client.on_answer(NOW, Answer { request, took: Duration::ZERO, outcome });
     assert_eq!(client.answered(), Some(Err("kme.lan:8443 says 400".to_owned())), "for the log");
     let message = client.poll_message().unwrap();

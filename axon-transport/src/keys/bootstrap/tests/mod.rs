@@ -41,7 +41,7 @@ fn listed(saes: &[&str]) -> QkdPeers {
 }
 
 fn failed(request: Request, kind: FailureKind) -> Answer {
-    let outcome = Err(Failure { kind, text: "as the test says".to_owned() });
+    let outcome = Err(Failure::new(kind, "as the test says"));
     Answer { request, took: ms(5), outcome }
 }
 

@@ -7,7 +7,7 @@ use axon_envelope::{Delivery, KmeKey};
 use super::{Pair, id, ms};
 use crate::keys::{
     KeyMessage,
-    request::{Answer, FailureKind, Fetched, Request},
+    request::{Answer, Failure, FailureKind, Fetched, Request},
 };
 
 /// The number of a call for keys.
@@ -39,6 +39,33 @@ fn an_empty_store_is_asked_for_less_and_less_often() {
     pair.now += ms(2000);
     pair.run();
     assert_eq!(pair.announced(), 3, "what there is, is had");
+}
+
+#[test]
+fn a_kme_that_asks_for_a_pause_has_it_but_not_for_ever() {
+    for (asked, pause) in [(ms(7000), ms(7000)), (Duration::MAX, ms(60_000))] {
+        let mut pair = Pair::new();
+        let status = pair.sender.poll_request(pair.now).unwrap();
+        let answer = pair.kmes.answer(status);
+        pair.sender.on_answer(pair.now, answer);
+        let request = pair.sender.poll_request(pair.now).unwrap();
+        let busy = Failure {
+            retry_after: Some(asked),
+            ..Failure::new(FailureKind::Unavailable, "the KME is busy")
+        };
+        pair.sender.on_answer(pair.now, Answer { request, took: ms(10), outcome: Err(busy) });
+        while pair.now < pause {
+            if let Some(request) = pair.sender.poll_request(pair.now) {
+                assert!(matches!(request, Request::Status { .. }), "{:?}: {request:?}", pair.now);
+                let answer = pair.kmes.answer(request);
+                pair.sender.on_answer(pair.now, answer);
+            }
+            pair.now += ms(100);
+        }
+        assert_eq!(pair.now, pause);
+        pair.run();
+        assert!(pair.announced() > 0, "after {pause:?}");
+    }
 }
 
 #[test]

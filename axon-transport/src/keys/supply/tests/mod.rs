@@ -44,7 +44,7 @@ struct Kmes {
 
 impl Kmes {
     fn answer(&mut self, request: Request) -> Answer {
-        let failure = |kind| Err(Failure { kind, text: format!("{kind:?}") });
+        let failure = |kind| Err(Failure::new(kind, format!("{kind:?}")));
         let outcome = match (&request, self.failures.pop()) {
             (_, Some(kind)) => failure(kind),
             (Request::Status { .. }, _) => {

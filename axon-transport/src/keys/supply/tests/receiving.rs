@@ -1,7 +1,12 @@
+use std::time::Duration;
+
 use axon_envelope::{Delivery, KeyId};
 
 use super::{Pair, id, ms, retire};
-use crate::keys::{KeyMessage, request::FailureKind};
+use crate::keys::{
+    KeyMessage,
+    request::{Answer, Failure, FailureKind},
+};
 
 #[test]
 fn a_batch_with_an_unknown_key_is_fetched_one_by_one() {
@@ -52,6 +57,27 @@ fn dec_keys_is_tried_three_times_with_the_same_ids() {
     }
     assert_eq!(pair.kmes.failures.len(), 6);
     assert!(matches!(pair.receiver.poll_message(), Some((1, KeyMessage::Failed { .. }))));
+}
+
+#[test]
+fn the_next_try_of_dec_keys_is_when_the_kme_says() {
+    for (asked, pause) in [(ms(0), ms(2000)), (ms(3000), ms(5000)), (Duration::MAX, ms(12_000))] {
+        let mut pair = Pair::new();
+        let (key_id, _) = pair.kmes.issue();
+        pair.receiver.on_message(pair.now, 1, &KeyMessage::Announce(vec![key_id])).unwrap();
+        let request = pair.receiver.poll_request(pair.now).unwrap();
+        let busy = Failure {
+            retry_after: Some(asked),
+            ..Failure::new(FailureKind::Unavailable, "the KME is busy")
+        };
+        pair.receiver.on_answer(pair.now, Answer { request, took: ms(10), outcome: Err(busy) });
+        assert_eq!(pair.receiver.poll_timeout(pair.now), Some(pause));
+        assert!(pair.receiver.poll_request(pause - ms(1)).is_none());
+        let request = pair.receiver.poll_request(pause).unwrap();
+        let answer = pair.kmes.answer(request);
+        pair.receiver.on_answer(pause, answer);
+        assert!(matches!(pair.receiver.poll_message(), Some((1, KeyMessage::Ready { .. }))));
+    }
 }
 
 #[test]
