@@ -9,14 +9,15 @@ use crate::parse::{self, Asked};
 use crate::{KeyContainer, Quirks};
 
 /// The quirks that `bits` select.
-fn quirks(bits: u8) -> Quirks {
+fn quirks(bits: [u8; 2]) -> Quirks {
+    let bits = u16::from_le_bytes(bits);
     let chosen = Quirks::NAMES.iter().enumerate().filter(|(i, _)| bits >> i & 1 == 1);
     chosen.fold(Quirks::STRICT, |all, (_, (_, quirk))| all | *quirk)
 }
 
-/// The first byte selects quirks, the rest is the body.
+/// The first two bytes select quirks, the rest is the body.
 pub fn status_response(data: &[u8]) -> bool {
-    let Some((&bits, body)) = data.split_first() else { return false };
+    let Some((&bits, body)) = data.split_first_chunk::<2>() else { return false };
     let status = parse::status(body, "sae-b", quirks(bits));
     status.is_ok_and(|status| {
         assert_eq!(status.slave_sae_id, "sae-b");
@@ -24,9 +25,10 @@ pub fn status_response(data: &[u8]) -> bool {
     })
 }
 
-/// The first byte selects quirks, the second the number of keys asked for, the rest is the body.
+/// The first two bytes select quirks, the third the number of keys asked for, the rest is the body.
 pub fn key_container(data: &[u8]) -> bool {
-    let Some((&[bits, number], body)) = data.split_first_chunk::<2>() else { return false };
+    let Some((&[low, high, number], body)) = data.split_first_chunk::<3>() else { return false };
+    let bits = [low, high];
     let number = usize::from(number);
     let by_number = parse::key_container(body, &Asked::Number(number), None, quirks(bits));
     if let Ok(container) = &by_number {

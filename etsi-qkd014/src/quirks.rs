@@ -16,6 +16,7 @@ use crate::Error;
 /// | `any-media-type` | answers not labelled `application/json` |
 /// | `extra-members` | members that the specification does not list; they are ignored |
 /// | `http-1.0` | answers over HTTP/1.0 |
+/// | `any-extension` | vendor extensions that are not JSON objects |
 ///
 /// ```
 /// use etsi_qkd014::Quirks;
@@ -46,9 +47,11 @@ impl Quirks {
     pub const EXTRA_MEMBERS: Self = Self(1 << 6);
     /// HTTP/1.0.
     pub const HTTP_1_0: Self = Self(1 << 7);
+    /// Extensions of an answer that are not objects: a vendor's text, number or array.
+    pub const ANY_EXTENSION: Self = Self(1 << 8);
 
     /// Every quirk with its name.
-    pub const NAMES: [(&'static str, Self); 8] = [
+    pub const NAMES: [(&'static str, Self); 9] = [
         ("any-key-id", Self::ANY_KEY_ID),
         ("null-members", Self::NULL_MEMBERS),
         ("missing-status-numbers", Self::MISSING_STATUS_NUMBERS),
@@ -57,6 +60,7 @@ impl Quirks {
         ("any-media-type", Self::ANY_MEDIA_TYPE),
         ("extra-members", Self::EXTRA_MEMBERS),
         ("http-1.0", Self::HTTP_1_0),
+        ("any-extension", Self::ANY_EXTENSION),
     ];
 
     /// Whether all of `other` are tolerated.

@@ -147,7 +147,7 @@ const WRONG: [(&[&str], Rows); 11] = [
         &["4 IDs, strings", "7 sizes and counts", ACCEPTED],
     ),
     (&["--bend=status.additional=1"], &["no members that are not listed", ACCEPTED]),
-    (&["--bend=status.status_extension=[]"], &["status_extension"]),
+    (&["--bend=status.status_extension=[]"], &["status_extension", ACCEPTED]),
     (&["--bend=error.message"], &[ERROR, UNKNOWN_WORDS, ODD_SIZE, MANDATORY_WORDS]),
     // 352 bits, the same each time.
     (

@@ -2,12 +2,12 @@
 
 use etsi_qkd014::fuzzing;
 
-/// The first byte selects quirks, the rest is the body of a status answer.
+/// The first two bytes select quirks, the rest is the body of a status answer.
 pub fn status_response(data: &[u8]) -> bool {
     fuzzing::status_response(data)
 }
 
-/// The first byte selects quirks, the second the number of keys asked for, the rest is the body.
+/// The first two bytes select quirks, the third the number of keys asked for, the rest is the body.
 pub fn key_container(data: &[u8]) -> bool {
     fuzzing::key_container(data)
 }
@@ -28,7 +28,7 @@ pub fn status_seeds() -> Vec<Vec<u8>> {
     let odd = r#"{"SOURCE_kme_id":"kme-\u0061","target_KME_ID":"\ud83d\ude00","master_SAE_ID":"","slave_SAE_ID":"sae-b","key_size":32,"max_key_count":null,"vendor":[[{}],1e3,"\n"],"status_extension":{"a":[null,true,-1.5e-7,{"b":"\/"}]}}"#;
     [(0, body), (0xff, body), (0xff, odd)]
         .into_iter()
-        .map(|(quirks, body)| [&[quirks][..], body.as_bytes()].concat())
+        .map(|(quirks, body)| [&[quirks; 2][..], body.as_bytes()].concat())
         .collect()
 }
 
@@ -44,7 +44,7 @@ pub fn container_seeds() -> Vec<Vec<u8>> {
     let odd = r#"{"Keys":[{"key_extension":null,"KEY":" QUFB\r\n\/\u002bE=","key_ID":"k\u0065y-7","key_ID_extension":{"a":[[]]},"x":{}}],"y":[[1]]}"#;
     [(0, 1, &*one), (0xff, 1, &one), (0, 2, &two), (0, 2, &turned), (0xff, 1, odd)]
         .into_iter()
-        .map(|(quirks, number, body)| [&[quirks, number][..], body.as_bytes()].concat())
+        .map(|(quirks, number, body)| [&[quirks, quirks, number][..], body.as_bytes()].concat())
         .collect()
 }
 

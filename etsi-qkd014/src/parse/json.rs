@@ -159,9 +159,13 @@ impl<'a> Object<'a> {
             .map_err(|e| malformed(self.path(name), why(&e, "a whole number from 0")))
     }
 
-    /// Any JSON, which a vendor defines.
+    /// An object whose members a vendor defines.
     pub(super) fn take_extension(&mut self, name: &str) -> Result<Option<Value>, Error> {
         let Some(raw) = self.take(name)? else { return Ok(None) };
+        if !raw.starts_with('{') && !self.quirks.contains(Quirks::ANY_EXTENSION) {
+            let reason = "is not an object (quirk any-extension tolerates it)";
+            return Err(malformed(self.path(name), reason));
+        }
         if !is_shallow(raw) {
             let reason = format!("is nested deeper than {MAX_DEPTH} levels");
             return Err(malformed(self.path(name), reason));

@@ -113,6 +113,10 @@ mod tests {
         null["status_extension"] = json!(null);
         assert!(parse(&null, Quirks::STRICT).is_err());
         assert_eq!(parse(&null, Quirks::NULL_MEMBERS).unwrap().extension, None);
+        let mut odd = answer();
+        odd["status_extension"] = json!([1]);
+        assert!(parse(&odd, Quirks::STRICT).is_err());
+        assert_eq!(parse(&odd, Quirks::ANY_EXTENSION).unwrap().extension, Some(json!([1])));
         let lower = answer().to_string().to_ascii_lowercase();
         assert!(status(lower.as_bytes(), "sae-b", Quirks::STRICT).is_err());
         status(lower.as_bytes(), "sae-b", Quirks::ANY_CASE_MEMBERS).unwrap();

@@ -165,6 +165,35 @@ fn extensions_are_kept_as_json() {
 }
 
 #[test]
+fn extensions_are_objects_but_by_their_quirk() {
+    let key_extensions = ["/keys/0/key_ID_extension", "/keys/1/key_extension"];
+    for odd in [json!([1]), json!("abc"), json!(7)] {
+        for place in key_extensions.into_iter().chain(["/key_container_extension"]) {
+            let mut answer = two();
+            let (object, name) = place.rsplit_once('/').unwrap();
+            answer.pointer_mut(object).unwrap()[name] = odd.clone();
+            let text = answer.to_string();
+            let read = |quirks| key_container(text.as_bytes(), &Asked::Number(2), None, quirks);
+            let refused = read(Quirks::STRICT).err().unwrap().to_string();
+            assert!(refused.contains(name) && refused.contains("any-extension"), "{refused}");
+            read(Quirks::ANY_EXTENSION).unwrap();
+        }
+    }
+}
+
+#[test]
+fn a_repeated_id_is_found_among_such_as_begin_alike() {
+    let mut ids: Vec<_> = (0..50).map(|n| format!("00000000-0000-0000-0000-{n:012x}")).collect();
+    assert_eq!(repeated(ids.iter().map(String::as_str)), None);
+    ids.push(ids[0x2b].to_ascii_uppercase());
+    let found = repeated(ids.iter().map(String::as_str)).unwrap();
+    assert!(found.eq_ignore_ascii_case(&ids[0x2b]), "{found}");
+    // Short ones too, of which one begins another.
+    assert_eq!(repeated(["k", "key-1", "key-10", "key-100000", "key-10000"].into_iter()), None);
+    assert_eq!(repeated(["k", "key-1", "K"].into_iter()), Some("k"));
+}
+
+#[test]
 fn keys_compare_by_their_secret_alone() {
     let same = changed("/keys/1/key", json!(KEY_1));
     let container = parse(&same, &Asked::Number(2), Some(256)).unwrap();
