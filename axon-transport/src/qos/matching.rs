@@ -2,10 +2,10 @@
 
 use std::fmt;
 
-use super::{Durability, Liveliness, Qos, Reliability};
+use super::{Choice, Durability, Liveliness, Qos, QosRequest, Reliability};
 
-/// The first policy in which a publisher offers less than a subscription requests.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// A policy in which a publisher offers less than a subscription requests.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 #[non_exhaustive]
 pub enum Incompatible {
     /// BEST_EFFORT offered, RELIABLE requested.
@@ -18,6 +18,34 @@ pub enum Incompatible {
     Liveliness,
     /// A longer lease offered than requested.
     LivelinessLease,
+}
+
+impl Incompatible {
+    /// Every policy that can keep two endpoints apart, in the order in which they are looked at.
+    pub const ALL: [Self; 5] = [
+        Self::Reliability,
+        Self::Durability,
+        Self::Deadline,
+        Self::Liveliness,
+        Self::LivelinessLease,
+    ];
+
+    /// What is offered and what was requested, for people.
+    pub fn reason(self) -> &'static str {
+        match self {
+            Self::Reliability => "the publisher is BEST_EFFORT, the subscription wants RELIABLE",
+            Self::Durability => "the publisher is VOLATILE, the subscription wants TRANSIENT_LOCAL",
+            Self::Deadline => {
+                "the publisher's deadline is longer than the one the subscription wants"
+            }
+            Self::Liveliness => {
+                "the publisher's liveliness is AUTOMATIC, the subscription wants MANUAL_BY_TOPIC"
+            }
+            Self::LivelinessLease => {
+                "the publisher's liveliness lease is longer than the one the subscription wants"
+            }
+        }
+    }
 }
 
 impl fmt::Display for Incompatible {
@@ -37,55 +65,79 @@ impl fmt::Display for Incompatible {
 /// # Errors
 /// The first policy that does not go together.
 pub fn compatible(offered: &Qos, requested: &Qos) -> Result<(), Incompatible> {
-    let longer = |o: Option<u64>, r: Option<u64>| r.is_some_and(|r| o.is_none_or(|o| o > r));
-    if offered.reliability == Reliability::BestEffort
-        && requested.reliability == Reliability::Reliable
-    {
-        return Err(Incompatible::Reliability);
-    }
-    if offered.durability == Durability::Volatile
-        && requested.durability == Durability::TransientLocal
-    {
-        return Err(Incompatible::Durability);
-    }
-    if longer(offered.deadline, requested.deadline) {
-        return Err(Incompatible::Deadline);
-    }
-    if offered.liveliness == Liveliness::Automatic
-        && requested.liveliness == Liveliness::ManualByTopic
-    {
-        return Err(Incompatible::Liveliness);
-    }
-    if longer(offered.lease, requested.lease) {
-        return Err(Incompatible::LivelinessLease);
-    }
-    Ok(())
+    incompatibilities(offered, requested).next().map_or(Ok(()), Err)
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn each_policy_is_refused_when_less_is_offered_than_requested() {
-        let q = Qos::default();
-        let cases = [
-            (Qos { reliability: Reliability::BestEffort, ..q }, q, Err(Incompatible::Reliability)),
-            (q, Qos { durability: Durability::TransientLocal, ..q }, Err(Incompatible::Durability)),
-            (q, Qos { deadline: Some(5), ..q }, Err(Incompatible::Deadline)),
-            (
-                Qos { deadline: Some(6), ..q },
-                Qos { deadline: Some(5), ..q },
-                Err(Incompatible::Deadline),
-            ),
-            (Qos { deadline: Some(5), ..q }, Qos { deadline: Some(5), ..q }, Ok(())),
-            (q, Qos { liveliness: Liveliness::ManualByTopic, ..q }, Err(Incompatible::Liveliness)),
-            (q, Qos { lease: Some(1), ..q }, Err(Incompatible::LivelinessLease)),
-            (q, Qos::sensor_data(), Ok(())),
-            (Qos::keep_all(), q, Ok(())),
-        ];
-        for (offered, requested, expected) in cases {
-            assert_eq!(compatible(&offered, &requested), expected, "{offered:?} {requested:?}");
+/// Every policy in which `offered` is less than `requested`.
+pub fn incompatibilities(offered: &Qos, requested: &Qos) -> impl Iterator<Item = Incompatible> {
+    let (offered, requested) = (*offered, *requested);
+    Incompatible::ALL.into_iter().filter(move |policy| match policy {
+        Incompatible::Reliability => {
+            offered.reliability == Reliability::BestEffort
+                && requested.reliability == Reliability::Reliable
         }
+        Incompatible::Durability => {
+            offered.durability == Durability::Volatile
+                && requested.durability == Durability::TransientLocal
+        }
+        Incompatible::Deadline => longer(offered.deadline, requested.deadline),
+        Incompatible::Liveliness => {
+            offered.liveliness == Liveliness::Automatic
+                && requested.liveliness == Liveliness::ManualByTopic
+        }
+        Incompatible::LivelinessLease => longer(offered.lease, requested.lease),
+    })
+}
+
+/// Whether two profiles that nobody has resolved would go together.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Compatibility {
+    /// They would.
+    Compatible,
+    /// That hangs on policies that are left open.
+    Unknown(Vec<Incompatible>),
+    /// They would not, whatever is left open.
+    Incompatible(Vec<Incompatible>),
+}
+
+/// Whether two profiles would go together, where some policies may be left open.
+pub fn check(offered: &QosRequest, requested: &QosRequest) -> Compatibility {
+    let policies = |worst: bool| -> Vec<Incompatible> {
+        // The best offer meets the least request, or the least offer the highest request.
+        let offer = pick(offered, !worst);
+        let request = pick(requested, worst);
+        incompatibilities(&offer, &request).collect()
+    };
+    let certain = policies(false);
+    if !certain.is_empty() {
+        return Compatibility::Incompatible(certain);
     }
+    let possible = policies(true);
+    if possible.is_empty() { Compatibility::Compatible } else { Compatibility::Unknown(possible) }
+}
+
+/// The highest or the lowest profile that a request may stand for.
+fn pick(request: &QosRequest, highest: bool) -> Qos {
+    fn choose<T>(choice: Choice<T>, open: T) -> T {
+        if let Choice::Exactly(value) = choice { value } else { open }
+    }
+    let (reliability, durability, liveliness, time) = if highest {
+        let manual = Liveliness::ManualByTopic;
+        (Reliability::Reliable, Durability::TransientLocal, manual, Some(0))
+    } else {
+        (Reliability::BestEffort, Durability::Volatile, Liveliness::Automatic, None)
+    };
+    Qos {
+        reliability: choose(request.reliability, reliability),
+        durability: choose(request.durability, durability),
+        deadline: choose(request.deadline, time),
+        liveliness: choose(request.liveliness, liveliness),
+        lease: choose(request.lease, time),
+        ..Qos::default()
+    }
+}
+
+/// Whether the period offered is longer than the one requested; `None` is infinite.
+fn longer(offered: Option<u64>, requested: Option<u64>) -> bool {
+    requested.is_some_and(|r| offered.is_none_or(|o| o > r))
 }

@@ -5,6 +5,10 @@
 
 mod matching;
 mod policy;
+mod request;
+#[cfg(test)]
+mod tests;
 
-pub use matching::{Incompatible, compatible};
+pub use matching::{Compatibility, Incompatible, check, compatible, incompatibilities};
 pub use policy::{Durability, History, Liveliness, Qos, Reliability};
+pub use request::{Choice, QosRequest};
