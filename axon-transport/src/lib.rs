@@ -4,6 +4,7 @@
 pub mod config;
 pub mod daemon;
 pub mod discovery;
+pub mod events;
 pub mod gateway;
 pub mod graph;
 pub mod ids;

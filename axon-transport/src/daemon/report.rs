@@ -75,7 +75,7 @@ pub(super) fn status(control: &Control) -> Status {
 
 fn topics(registry: &Registry<Arc<OwnedFd>>) -> Vec<TopicStatus> {
     let mut topics: BTreeMap<(String, String), TopicStatus> = BTreeMap::new();
-    for local in registry.endpoints() {
+    for local in registry.endpoints().filter(|e| e.endpoint.kind != EndpointKind::Node) {
         let topic = entry(&mut topics, &local.endpoint);
         match (local.endpoint.kind, local.role) {
             (EndpointKind::Publisher, EndpointRole::Application) => {
@@ -87,12 +87,12 @@ fn topics(registry: &Registry<Arc<OwnedFd>>) -> Vec<TopicStatus> {
             _ => {}
         }
     }
-    for (_, endpoint) in registry.remote_endpoints() {
+    for (_, endpoint) in registry.remote_endpoints().filter(|(_, e)| e.kind != EndpointKind::Node) {
         let topic = entry(&mut topics, endpoint);
         match endpoint.kind {
             EndpointKind::Publisher => topic.remote_publishers += 1,
             EndpointKind::Subscription => topic.remote_subscriptions += 1,
-            EndpointKind::Server | EndpointKind::Client => {}
+            EndpointKind::Server | EndpointKind::Client | EndpointKind::Node => {}
         }
     }
     let locals: BTreeMap<_, _> = registry.endpoints().map(|e| (e.endpoint.gid, e)).collect();

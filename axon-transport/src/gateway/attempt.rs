@@ -226,6 +226,7 @@ impl Link {
             qos: Qos::keep_all(),
             node: String::new(),
             namespace: String::new(),
+            enclave: String::new(),
         };
         let graph = Graph { version: 1, before: 0, added: vec![endpoint], removed: vec![] };
         self.established.outbox.send(Message::Elected(rand::random()));

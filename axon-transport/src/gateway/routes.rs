@@ -131,6 +131,7 @@ mod tests {
             qos,
             node: String::new(),
             namespace: String::new(),
+            enclave: String::new(),
         }
     }
 

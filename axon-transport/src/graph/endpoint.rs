@@ -22,6 +22,9 @@ pub enum EndpointKind {
     /// Sends requests.
     #[n(3)]
     Client,
+    /// Is there: a node has a name, whether or not it has endpoints.
+    #[n(4)]
+    Node,
 }
 
 /// An endpoint as sessions, daemons and peers describe it to each other.
@@ -34,10 +37,10 @@ pub struct Endpoint {
     /// What it does.
     #[n(1)]
     pub kind: EndpointKind,
-    /// The full topic or service name.
+    /// The full topic or service name; empty for a node.
     #[n(2)]
     pub topic: String,
-    /// The type's name. Endpoints match on topic and type.
+    /// The type's name. Endpoints match on topic and type. Empty for a node.
     #[n(3)]
     pub type_name: String,
     /// The type's hash; empty when unknown.
@@ -52,6 +55,9 @@ pub struct Endpoint {
     /// That node's namespace.
     #[n(7)]
     pub namespace: String,
+    /// For a node, the security enclave that it runs in; else empty.
+    #[cbor(n(8), default)]
+    pub enclave: String,
 }
 
 /// Upper bounds on what a peer or session may describe.
@@ -69,11 +75,16 @@ pub struct Limits {
 pub const LIMITS: Limits = Limits { name: 512, type_hash: 64, endpoints: 65_536 };
 
 impl Endpoint {
-    /// Whether every field is within [`LIMITS`] and the depth is usable.
+    /// Whether every field is within [`LIMITS`], what must be named is, and the depth is usable.
     pub fn is_sane(&self) -> bool {
-        let names = [&self.topic, &self.type_name, &self.node, &self.namespace];
+        let names = [&self.topic, &self.type_name, &self.node, &self.namespace, &self.enclave];
+        let named = if self.kind == EndpointKind::Node {
+            !self.node.is_empty() && self.topic.is_empty() && self.type_name.is_empty()
+        } else {
+            !self.topic.is_empty() && self.enclave.is_empty()
+        };
         names.iter().all(|n| n.len() <= LIMITS.name && !n.contains('\0'))
-            && !self.topic.is_empty()
+            && named
             && self.type_hash.len() <= LIMITS.type_hash
             && self.qos.depth >= 1
     }

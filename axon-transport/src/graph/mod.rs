@@ -1,9 +1,11 @@
-//! The graph: which endpoints exist, on this host and on others.
+//! The graph: which nodes and endpoints exist, on this host and on others.
 //!
 //! Plain data in, data out; the daemon and the gateway move it.
 
 mod endpoint;
+mod query;
 mod view;
 
 pub use endpoint::{Endpoint, EndpointKind, LIMITS, Limits};
+pub use query::{NamesAndTypes, NodeName, SERVICE_KINDS, TOPIC_KINDS};
 pub use view::{GraphEntry, GraphView};

@@ -5,7 +5,7 @@ use std::{collections::HashMap, sync::Arc};
 use super::Endpoint;
 use crate::ids::{DaemonId, Gid};
 
-/// Every endpoint that a session's daemon knows, here and on other hosts.
+/// Every node and endpoint that a session's daemon knows, here and on other hosts.
 #[derive(Clone, Debug, Default)]
 pub struct GraphView {
     /// The version that the daemon gave this state.

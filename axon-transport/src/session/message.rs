@@ -400,6 +400,7 @@ mod tests {
             qos: Qos::keep_all(),
             node: "lidar".into(),
             namespace: "/".into(),
+            enclave: String::new(),
         }
     }
 

@@ -266,8 +266,17 @@ impl Session {
             state.next_entity
         };
         let EndpointSpec { topic, type_name, type_hash, qos, node, namespace } = spec;
-        let gid = Gid::new(self.shared().id, number);
-        let endpoint = Endpoint { gid, kind, topic, type_name, type_hash, qos, node, namespace };
+        let endpoint = Endpoint {
+            gid: Gid::new(self.shared().id, number),
+            kind,
+            topic,
+            type_name,
+            type_hash,
+            qos,
+            node,
+            namespace,
+            enclave: String::new(),
+        };
         if endpoint.is_sane() {
             Ok(endpoint)
         } else {

@@ -166,8 +166,8 @@ fn parts(
     }
     for item in added {
         let e = &item.endpoint;
-        let names = e.topic.len() + e.type_name.len() + e.node.len() + e.namespace.len();
-        let bytes = names + e.type_hash.len() + 160;
+        let names = [&e.topic, &e.type_name, &e.node, &e.namespace, &e.enclave];
+        let bytes = names.iter().map(|n| n.len()).sum::<usize>() + e.type_hash.len() + 160;
         if size + bytes > PART {
             parts.push(std::mem::replace(&mut part, empty(false)));
             size = 0;

@@ -34,6 +34,7 @@ fn endpoint(gid: Gid, kind: EndpointKind, topic: u8, qos: Qos) -> Endpoint {
         qos,
         node: String::new(),
         namespace: String::new(),
+        enclave: String::new(),
     }
 }
 
@@ -554,6 +555,7 @@ fn a_remote_endpoint_that_comes_and_goes_ends_nothing_here() {
         qos: Qos::default(),
         node: String::new(),
         namespace: String::new(),
+        enclave: String::new(),
     };
     // A successor link repeats the whole graph within one flush.
     for _ in 0..2 {

@@ -1,0 +1,81 @@
+//! The longest time between two samples.
+
+/// Watches one deadline. It runs from the first sample on: who has never sent anything has missed
+/// nothing (DDS 1.4, 2.2.3.7: the deadline is an instance's, which the first sample makes).
+#[derive(Clone, Copy, Debug)]
+pub struct Deadline {
+    period: u64,
+    /// When it runs out next.
+    due: Option<u64>,
+}
+
+impl Deadline {
+    /// A deadline of `period` nanoseconds; 0 is taken for 1.
+    pub fn new(period: u64) -> Self {
+        Self { period: period.max(1), due: None }
+    }
+
+    /// A sample was sent, or came, at `at`. One that is older than what is known changes nothing.
+    pub fn sample(&mut self, at: u64) {
+        let due = at.saturating_add(self.period);
+        self.due = Some(self.due.map_or(due, |known| known.max(due)));
+    }
+
+    /// How many deadlines have passed until `now`, since this was last asked: one for every period
+    /// without a sample.
+    pub fn missed(&mut self, now: u64) -> u64 {
+        let Some(due) = self.due.filter(|due| *due <= now) else { return 0 };
+        let missed = (now - due) / self.period + 1;
+        self.due = Some(due.saturating_add(missed.saturating_mul(self.period)));
+        missed
+    }
+
+    /// When to ask again; `None` before the first sample.
+    pub fn due(&self) -> Option<u64> {
+        self.due
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nothing_is_missed_before_the_first_sample() {
+        let mut deadline = Deadline::new(10);
+        assert_eq!((deadline.missed(u64::MAX), deadline.due()), (0, None));
+    }
+
+    #[test]
+    fn every_period_without_a_sample_is_one_missed() {
+        let mut deadline = Deadline::new(10);
+        deadline.sample(100);
+        assert_eq!((deadline.missed(109), deadline.due()), (0, Some(110)));
+        assert_eq!((deadline.missed(110), deadline.due()), (1, Some(120)));
+        assert_eq!(deadline.missed(110), 0);
+        // Asked late: all that passed meanwhile.
+        assert_eq!((deadline.missed(149), deadline.due()), (3, Some(150)));
+        deadline.sample(155);
+        assert_eq!((deadline.missed(164), deadline.due()), (0, Some(165)));
+    }
+
+    #[test]
+    fn a_sample_from_before_does_not_turn_the_clock_back() {
+        let mut deadline = Deadline::new(10);
+        deadline.sample(100);
+        deadline.sample(50);
+        assert_eq!(deadline.due(), Some(110));
+    }
+
+    #[test]
+    fn the_end_of_time_is_no_panic() {
+        let mut deadline = Deadline::new(0);
+        deadline.sample(0);
+        assert_eq!(deadline.missed(u64::MAX), u64::MAX);
+        deadline.sample(u64::MAX);
+        assert_eq!(deadline.missed(u64::MAX), 1);
+        let mut slow = Deadline::new(u64::MAX);
+        slow.sample(5);
+        assert_eq!(slow.missed(u64::MAX - 1), 0);
+    }
+}
