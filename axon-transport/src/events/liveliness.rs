@@ -75,8 +75,7 @@ impl Liveness {
 
     /// The leases that ran out until `now`.
     pub fn ran_out(&mut self, now: u64) -> (i64, i64) {
-        let over = self.leases.values_mut().filter_map(|lease| lease.ran_out(now).then_some(1i64));
-        let over = over.sum();
+        let over = self.leases.values_mut().map(|lease| i64::from(lease.ran_out(now))).sum::<i64>();
         (-over, over)
     }
 
