@@ -16,6 +16,7 @@ Start here:
   axon echo /scan               look at what arrives, here or on another host
   axon status                   the daemon's peers, links, keys and refusals
   axon trust keygen host.key    a key for this host, for peers to pin
+  axon bench shm                what shared memory costs on this machine
 
 Settings come from the environment (AXON_SECURITY_MODE, AXON_DAEMON_PEERS, ...) and from the file
 that AXON_CONFIG names; docs/configuration.md lists them. The first session on a host starts the
@@ -55,6 +56,13 @@ pub(crate) enum Command {
     /// Run the daemon in the foreground
     #[command(after_help = DAEMON_HELP)]
     Daemon(Daemon),
+    /// Measure on this machine what AXON costs
+    #[command(subcommand, after_help = BENCH_HELP)]
+    Bench(Bench),
+    #[command(hide = true)]
+    BenchAnswer,
+    #[command(hide = true)]
+    BenchRead,
     #[command(hide = true)]
     DemoPlayer(DemoPlayer),
     #[command(hide = true)]
@@ -216,6 +224,52 @@ pub(crate) struct Daemon {
     pub(crate) while_stdin: bool,
 }
 
+const BENCH_HELP: &str = "\
+Examples:
+  axon bench shm
+  axon bench shm --sizes 64,1048576 --out results";
+
+/// `axon bench`.
+#[derive(Debug, Subcommand)]
+pub(crate) enum Bench {
+    /// Shared memory between two processes, beside what the machine gives without any middleware
+    #[command(after_help = BENCH_SHM_HELP)]
+    Shm(BenchShm),
+}
+
+const BENCH_SHM_HELP: &str = "\
+Latency (p50, p99, p99.9) with a receiver that polls and one that sleeps, throughput, and what a
+publish costs by the number of readers, each as a ratio to the raw limit in the same run: a spin on
+a shared atomic, epoll and eventfd, one memcpy, two. Two processes, each on a CPU of its own, take
+turns with both; so the rest of the machine should be idle. About three minutes; --quick takes
+seconds and is only to see it run. Writes shm.json, with all percentiles, and shm.svg.
+
+Examples:
+  axon bench shm
+  axon bench shm --sizes 64,1048576 --out results
+  axon bench shm --quick --out results && jq .latency[].ratio results/shm.json";
+
+/// `axon bench shm`.
+#[derive(Args, Debug)]
+pub(crate) struct BenchShm {
+    /// Sizes of messages in bytes, from 8 to 64 MiB [default: ten from 8 B to 25 MB]
+    #[arg(long, value_name = "BYTES", value_delimiter = ',', value_parser = message_size)]
+    pub(crate) sizes: Vec<usize>,
+    /// Where to write shm.json and shm.svg
+    #[arg(long, value_name = "DIR", default_value = ".")]
+    pub(crate) out: PathBuf,
+    /// A few messages only: the figures are good for nothing
+    #[arg(long)]
+    pub(crate) quick: bool,
+}
+
+fn message_size(text: &str) -> Result<usize, String> {
+    match text.parse() {
+        Ok(size) if (8..=64 << 20).contains(&size) => Ok(size),
+        _ => Err("not a number of bytes from 8 to 67108864".to_owned()),
+    }
+}
+
 /// The demo's publisher, a process of host A.
 #[derive(Args, Debug)]
 pub(crate) struct DemoPlayer {
@@ -250,6 +304,14 @@ mod tests {
     #[test]
     fn the_command_line_is_consistent() {
         Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn a_size_holds_a_stamp_and_fits_in_memory() {
+        for wrong in ["7", "-1", "", "1k", "67108865"] {
+            assert!(message_size(wrong).is_err(), "{wrong}");
+        }
+        assert_eq!((message_size("8"), message_size("67108864")), (Ok(8), Ok(64 << 20)));
     }
 
     #[test]

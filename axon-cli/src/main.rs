@@ -1,7 +1,9 @@
 //! The tool `axon`.
 
-#![forbid(unsafe_code)]
+// But for the memory that `bench` shares between two processes by itself.
+#![deny(unsafe_code)]
 
+mod bench;
 mod cli;
 mod daemon;
 mod demo;
@@ -19,7 +21,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 
-use crate::cli::{Cli, Command};
+use crate::cli::{Bench, Cli, Command};
 
 fn main() -> ExitCode {
     let outcome = match &Cli::parse().command {
@@ -29,6 +31,9 @@ fn main() -> ExitCode {
         Command::Status(args) => status::run(args).map(done),
         Command::Trust(args) => trust::run(args).map(done),
         Command::Daemon(args) => daemon::run(args),
+        Command::Bench(Bench::Shm(args)) => bench::shm(args).map(done),
+        Command::BenchAnswer => bench::answer().map(done),
+        Command::BenchRead => bench::read().map(done),
         Command::DemoPlayer(args) => demo::run_player(args).map(done),
         Command::DemoSubscriber(args) => demo::run_subscriber(args).map(done),
     };

@@ -16,17 +16,27 @@ fn help(args: &[&str]) -> String {
 #[test]
 fn the_first_page_names_every_command_and_the_exit_statuses() {
     let text = help(&[]);
-    for part in
-        ["demo", "play", "echo", "status", "trust", "daemon", "Exit status:", "AXON_SECURITY_MODE"]
-    {
+    for part in [
+        "demo",
+        "play",
+        "echo",
+        "status",
+        "trust",
+        "daemon",
+        "bench",
+        "Exit status:",
+        "AXON_SECURITY_MODE",
+    ] {
         assert!(text.contains(part), "{part:?} is missing in:\n{text}");
     }
-    assert!(!text.contains("demo-player"), "what the demo starts is not for people:\n{text}");
+    for hidden in ["demo-player", "bench-answer", "bench-read"] {
+        assert!(!text.contains(hidden), "what the tool starts is not for people:\n{text}");
+    }
 }
 
 #[test]
 fn each_command_says_what_it_does_and_shows_an_example() {
-    for command in ["demo", "play", "echo", "status", "daemon"] {
+    for command in ["demo", "play", "echo", "status", "daemon", "bench"] {
         let text = help(&[command]);
         assert!(text.contains("Examples:") && text.contains(&format!("axon {command}")), "{text}");
     }
@@ -51,8 +61,17 @@ fn trust_says_how_two_hosts_come_to_know_each_other() {
 
 #[test]
 fn no_line_is_wider_than_a_page() {
-    let others: [&[&str]; 7] =
-        [&[], &["demo"], &["play"], &["echo"], &["status"], &["trust"], &["daemon"]];
+    let others: [&[&str]; 9] = [
+        &[],
+        &["demo"],
+        &["play"],
+        &["echo"],
+        &["status"],
+        &["trust"],
+        &["daemon"],
+        &["bench"],
+        &["bench", "shm"],
+    ];
     for command in others.into_iter().chain(TRUST.iter().map(|command| &command[..])) {
         for line in help(command).lines() {
             assert!(line.chars().count() <= 100, "{command:?}: {line}");

@@ -1,0 +1,48 @@
+//! What AXON may take at most, as ratios to the raw limit in the same run.
+
+use crate::bench::harness::{Load, Motion, Wake};
+
+/// Bytes that a descriptor holds.
+const INLINE: usize = 96;
+/// From here on a copy is judged by its bytes alone.
+const BYTES_ALONE: usize = 16 << 10;
+
+/// A publish to sixteen reader processes, by one to a single one.
+pub(super) const SIXTEEN_READERS: f64 = 1.3;
+
+/// How many times the latency of the raw limit is allowed.
+pub(super) fn latency(load: &Load) -> Option<f64> {
+    match (load.wake, load.motion) {
+        (Wake::Poll, Motion::Copy) if load.size <= INLINE => Some(1.3),
+        (Wake::Poll, Motion::Copy) if load.size >= BYTES_ALONE => Some(1.05),
+        (Wake::Poll, Motion::Touch) => Some(2.5),
+        (Wake::Event, Motion::Touch) => Some(1.1),
+        _ => None,
+    }
+}
+
+/// What is said of a ratio beside its budget.
+pub(super) fn verdict(ratio: f64, budget: f64) -> &'static str {
+    if ratio <= budget { "met" } else { "not met" }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_budget_has_its_loads() {
+        let of = |size, wake, motion| latency(&Load::ping_pong(size, wake, motion));
+        for size in [8, 96] {
+            assert_eq!(of(size, Wake::Poll, Motion::Copy), Some(1.3));
+        }
+        assert_eq!(of(97, Wake::Poll, Motion::Copy), None);
+        assert_eq!(of(16 << 10, Wake::Poll, Motion::Copy), Some(1.05));
+        for size in [8, 25_000_000] {
+            assert_eq!(of(size, Wake::Poll, Motion::Touch), Some(2.5));
+            assert_eq!(of(size, Wake::Event, Motion::Touch), Some(1.1));
+            assert_eq!(of(size, Wake::Poll, Motion::Fill), None);
+        }
+        assert_eq!((verdict(1.3, 1.3), verdict(1.31, 1.3)), ("met", "not met"));
+    }
+}

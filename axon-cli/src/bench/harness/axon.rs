@@ -1,0 +1,107 @@
+//! AXON's shared memory, used as its documentation says.
+
+use std::time::Duration;
+
+use axon_transport::{
+    qos::Qos,
+    shm::{Context, Publisher, PublisherOptions, Subscriber, SubscriberOptions},
+};
+
+use super::{Channel, End, Load, Medium, Motion, Result, Side, Wake, agree, stamp};
+
+/// Longer than any machine needs to connect.
+const PATIENCE: Option<Duration> = Some(Duration::from_secs(60));
+/// Up to here a sample is copied in any case, so that `publish` and `take_into` are the shorter
+/// way.
+const COPIED: usize = 4096;
+
+/// `axon_transport::shm` without a daemon, RELIABLE and KEEP_LAST.
+pub(crate) struct Axon;
+
+impl Medium for Axon {
+    fn name(&self) -> &'static str {
+        "AXON"
+    }
+
+    fn open(&self, load: &Load, side: Side, channel: &Channel) -> Result<Box<dyn End>> {
+        let context = Context::new()?;
+        let qos = qos(load.window)?;
+        let publisher = Publisher::new(&context, PublisherOptions::new(qos))?;
+        let connect =
+            || Subscriber::connect(&context, channel, SubscriberOptions::new(qos), PATIENCE);
+        let subscriber = match side {
+            Side::Near => {
+                publisher.serve(channel, PATIENCE)?;
+                connect()?
+            }
+            Side::Far => {
+                let subscriber = connect()?;
+                publisher.serve(channel, PATIENCE)?;
+                subscriber
+            }
+        };
+        let in_place = load.size > COPIED;
+        Ok(Box::new(AxonEnd {
+            publisher,
+            subscriber,
+            context,
+            size: load.size,
+            sleeps: load.wake == Wake::Event,
+            loans: in_place && load.motion == Motion::Touch,
+            copies: !in_place || load.motion == Motion::Copy,
+            out: vec![0x5a; load.size],
+            into: Vec::with_capacity(load.size),
+        }))
+    }
+}
+
+/// The default profile, with a history of `window` samples at least.
+pub(crate) fn qos(window: usize) -> Result<Qos> {
+    let qos = Qos::default();
+    Ok(Qos { depth: qos.depth.max(u32::try_from(window)?), ..qos })
+}
+
+struct AxonEnd {
+    publisher: Publisher,
+    subscriber: Subscriber,
+    context: Context,
+    size: usize,
+    sleeps: bool,
+    loans: bool,
+    copies: bool,
+    out: Vec<u8>,
+    into: Vec<u8>,
+}
+
+impl End for AxonEnd {
+    fn send(&mut self, number: u64) -> Result<()> {
+        if self.loans {
+            let mut loan = self.publisher.loan(self.size)?;
+            stamp(&mut loan, number);
+            loan.publish_now()?;
+        } else {
+            stamp(&mut self.out, number);
+            self.publisher.publish(&self.out)?;
+        }
+        Ok(())
+    }
+
+    fn receive(&mut self) -> Result<u64> {
+        loop {
+            if self.sleeps {
+                self.context.wait(|| self.subscriber.has_data(), None);
+            }
+            if self.copies {
+                if self.subscriber.take_into(&mut self.into)?.is_some() {
+                    let [first, last] = [self.into.first_chunk(), self.into.last_chunk()];
+                    return agree(*first.ok_or("too short")?, *last.ok_or("too short")?);
+                }
+            } else if let Some(sample) = self.subscriber.take()? {
+                let [mut first, mut last] = [[0; 8]; 2];
+                sample.read_at(0, &mut first);
+                sample.read_at(self.size - 8, &mut last);
+                return agree(first, last);
+            }
+        }
+    }
+}

@@ -1,0 +1,90 @@
+//! The socket by which the two processes agree on what comes next.
+
+use std::{
+    io::{IoSlice, IoSliceMut},
+    mem::MaybeUninit,
+    os::fd::{AsFd, BorrowedFd, OwnedFd},
+};
+
+use rustix::{
+    io::Errno,
+    net::{
+        AddressFamily, RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, SendAncillaryBuffer,
+        SendAncillaryMessage, SendFlags, SocketFlags, SocketType, recvmsg, sendmsg, socketpair,
+    },
+};
+use serde::{Serialize, de::DeserializeOwned};
+
+use super::Result;
+
+const LARGEST: usize = 4096;
+const MOST_DESCRIPTORS: usize = 4;
+
+/// One end of a connected socket that keeps packets apart.
+pub(crate) struct Channel(OwnedFd);
+
+impl Channel {
+    /// Both ends: ours, and one to be the standard input of the other process.
+    pub(crate) fn pair() -> Result<(Self, OwnedFd)> {
+        let flags = SocketFlags::CLOEXEC;
+        let (ours, theirs) = socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None)?;
+        Ok((Self(ours), theirs))
+    }
+
+    /// The end that this process was given as its standard input.
+    pub(crate) fn inherited() -> Result<Self> {
+        Ok(Self(std::io::stdin().as_fd().try_clone_to_owned()?))
+    }
+
+    /// Sends a packet.
+    pub(crate) fn tell(&self, what: &impl Serialize) -> Result<()> {
+        self.hand_over(what, &[])
+    }
+
+    /// Sends a packet that carries descriptors.
+    pub(crate) fn hand_over(&self, what: &impl Serialize, fds: &[BorrowedFd<'_>]) -> Result<()> {
+        let bytes = serde_json::to_vec(what)?;
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(MOST_DESCRIPTORS))];
+        let mut control = SendAncillaryBuffer::new(&mut space);
+        if !fds.is_empty() && !control.push(SendAncillaryMessage::ScmRights(fds)) {
+            return Err("too many descriptors for a packet".into());
+        }
+        sendmsg(&self.0, &[IoSlice::new(&bytes)], &mut control, SendFlags::NOSIGNAL)?;
+        Ok(())
+    }
+
+    /// Awaits a packet.
+    pub(crate) fn hear<T: DeserializeOwned>(&self) -> Result<T> {
+        self.take_over().map(|(packet, _)| packet)
+    }
+
+    /// Awaits a packet and what descriptors it carries.
+    pub(crate) fn take_over<T: DeserializeOwned>(&self) -> Result<(T, Vec<OwnedFd>)> {
+        let mut bytes = [0; LARGEST];
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(MOST_DESCRIPTORS))];
+        let mut control = RecvAncillaryBuffer::new(&mut space);
+        let got = loop {
+            let mut into = [IoSliceMut::new(&mut bytes)];
+            match recvmsg(&self.0, &mut into, &mut control, RecvFlags::CMSG_CLOEXEC) {
+                Err(Errno::INTR) => {}
+                other => break other?.bytes,
+            }
+        };
+        if got == 0 {
+            return Err("the other process has ended".into());
+        }
+        let mut fds = Vec::new();
+        for message in control.drain() {
+            if let RecvAncillaryMessage::ScmRights(rights) = message {
+                fds.extend(rights);
+            }
+        }
+        Ok((serde_json::from_slice(&bytes[..got])?, fds))
+    }
+}
+
+impl AsFd for Channel {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.0.as_fd()
+    }
+}

@@ -1,0 +1,95 @@
+//! What is sent, and by what.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Channel, Result};
+
+/// How a receiver learns that there is something.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Wake {
+    /// It looks all the time.
+    Poll,
+    /// It sleeps until it is woken.
+    Event,
+}
+
+/// What becomes of a message's bytes. In all of them both ends touch its first and last eight.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Motion {
+    /// Nothing: the message is made and read in place.
+    Touch,
+    /// The sender copies them in, the receiver reads in place.
+    Fill,
+    /// The sender copies them in and the receiver copies them out.
+    Copy,
+}
+
+/// One kind of traffic.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Load {
+    /// Bytes of a message, at least eight.
+    pub(crate) size: usize,
+    pub(crate) wake: Wake,
+    pub(crate) motion: Motion,
+    /// How many messages may be under way.
+    pub(crate) window: usize,
+}
+
+impl Load {
+    /// One message at a time.
+    pub(crate) fn ping_pong(size: usize, wake: Wake, motion: Motion) -> Self {
+        Self { size, wake, motion, window: 1 }
+    }
+
+    /// As many as 16 MiB hold, from 4 to 64.
+    pub(crate) fn stream(size: usize, motion: Motion) -> Self {
+        Self { size, wake: Wake::Poll, motion, window: ((16 << 20) / size).clamp(4, 64) }
+    }
+}
+
+/// Which of the two processes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Side {
+    /// The one that measures.
+    Near,
+    /// The one that answers.
+    Far,
+}
+
+/// A way to get bytes from one process to another and back.
+pub(crate) trait Medium {
+    /// Its name in tables, charts and files.
+    fn name(&self) -> &'static str;
+
+    /// This side's end for `load`. The other side opens its own at the same time, and both may
+    /// talk over `channel` until both are done.
+    fn open(&self, load: &Load, side: Side, channel: &Channel) -> Result<Box<dyn End>>;
+}
+
+/// One process's end of a medium.
+pub(crate) trait End {
+    /// Sends the next message. Stamps count from 1 in each direction.
+    fn send(&mut self, stamp: u64) -> Result<()>;
+
+    /// Awaits the next message and returns its stamp.
+    fn receive(&mut self) -> Result<u64>;
+}
+
+/// Writes `number` to the first and the last eight bytes.
+#[inline]
+pub(crate) fn stamp(bytes: &mut [u8], number: u64) {
+    let end = bytes.len() - 8;
+    bytes[..8].copy_from_slice(&number.to_ne_bytes());
+    bytes[end..].copy_from_slice(&number.to_ne_bytes());
+}
+
+/// The number in a message's first and last eight bytes, which must be the same.
+#[inline]
+pub(crate) fn agree(first: [u8; 8], last: [u8; 8]) -> Result<u64> {
+    if first != last {
+        return Err("a message's end does not belong to its beginning".into());
+    }
+    Ok(u64::from_ne_bytes(first))
+}

@@ -1,0 +1,182 @@
+//! The limits: what the machine gives two processes without any middleware.
+
+mod memory;
+
+use std::{
+    os::fd::{AsFd, OwnedFd},
+    sync::atomic::Ordering,
+};
+
+use rustix::{
+    buffer::spare_capacity,
+    event::{EventfdFlags, epoll, eventfd},
+    io::{Errno, read, write},
+};
+
+pub(crate) use memory::Shared;
+
+use super::{Channel, End, Load, Medium, Motion, Result, Side, Wake, agree, stamp};
+
+/// A message of up to this many bytes has room beside the word that announces it, so that its
+/// limit is the word alone.
+const INLINE: usize = 96;
+/// Bytes between two things that must not share a cache line, or two that are fetched together.
+const APART: usize = 256;
+const PAYLOADS: usize = 4096;
+
+/// A shared atomic that is spun on, or an eventfd and epoll; with as many plain copies as the load
+/// has. Messages of up to 96 bytes are not copied.
+pub(crate) struct Raw;
+
+impl Medium for Raw {
+    fn name(&self) -> &'static str {
+        "raw"
+    }
+
+    fn open(&self, load: &Load, side: Side, channel: &Channel) -> Result<Box<dyn End>> {
+        let slot = load.size.next_multiple_of(64);
+        let len = PAYLOADS + 2 * load.window * slot;
+        let (memory, bells) = match side {
+            Side::Near => {
+                let (memory, fd) = Shared::create(len)?;
+                let bell = || eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK);
+                let bells = [bell()?, bell()?];
+                let fds = [fd.as_fd(), bells[1].as_fd(), bells[0].as_fd()];
+                channel.hand_over(&(), &fds)?;
+                (memory, bells)
+            }
+            Side::Far => {
+                let ((), fds) = channel.take_over()?;
+                let [fd, first, second] =
+                    fds.try_into().map_err(|_| "another number of descriptors")?;
+                (Shared::map(&fd, len)?, [first, second])
+            }
+        };
+        let [out, into] = match side {
+            Side::Near => [0, 1],
+            Side::Far => [1, 0],
+        };
+        let direction = |index: usize| Direction {
+            word: index * APART,
+            payload: PAYLOADS + index * load.window * slot,
+            count: 0,
+        };
+        let moves = if load.size <= INLINE { Motion::Touch } else { load.motion };
+        let [ours, theirs] = bells;
+        Ok(Box::new(RawEnd {
+            memory,
+            load: Load { motion: moves, ..*load },
+            slot,
+            out: direction(out),
+            into: direction(into),
+            bell: theirs,
+            sleep: Sleep::new(ours)?,
+            bytes: vec![0x5a; load.size],
+        }))
+    }
+}
+
+struct RawEnd {
+    memory: Shared,
+    load: Load,
+    slot: usize,
+    out: Direction,
+    into: Direction,
+    /// Wakes the other side.
+    bell: OwnedFd,
+    sleep: Sleep,
+    bytes: Vec<u8>,
+}
+
+struct Direction {
+    /// Where the number of the last message is.
+    word: usize,
+    /// Where the messages are, one to a slot.
+    payload: usize,
+    /// How many there have been.
+    count: u64,
+}
+
+impl RawEnd {
+    fn at(&self, direction: &Direction) -> usize {
+        direction.payload + (direction.count % self.load.window as u64) as usize * self.slot
+    }
+}
+
+impl End for RawEnd {
+    fn send(&mut self, number: u64) -> Result<()> {
+        if self.load.motion != Motion::Touch {
+            stamp(&mut self.bytes, number);
+            self.memory.copy_in(self.at(&self.out), &self.bytes);
+        }
+        self.out.count += 1;
+        // Pairs with the load in `receive`.
+        self.memory.word(self.out.word).store(self.out.count, Ordering::Release);
+        if self.load.wake == Wake::Event {
+            write(&self.bell, &1u64.to_ne_bytes())?;
+        }
+        Ok(())
+    }
+
+    fn receive(&mut self) -> Result<u64> {
+        let next = self.into.count + 1;
+        if self.load.wake == Wake::Event {
+            self.sleep.until_rung()?;
+        }
+        let word = self.memory.word(self.into.word);
+        // Pairs with the store in `send`.
+        while word.load(Ordering::Acquire) < next {}
+        let at = self.at(&self.into);
+        let number = match self.load.motion {
+            Motion::Touch => next,
+            Motion::Fill => {
+                let [mut first, mut last] = [[0; 8]; 2];
+                self.memory.copy_out(at, &mut first);
+                self.memory.copy_out(at + self.load.size - 8, &mut last);
+                agree(first, last)?
+            }
+            Motion::Copy => {
+                self.memory.copy_out(at, &mut self.bytes);
+                let [first, last] = [self.bytes.first_chunk(), self.bytes.last_chunk()];
+                agree(*first.ok_or("too short")?, *last.ok_or("too short")?)?
+            }
+        };
+        self.into.count = next;
+        Ok(number)
+    }
+}
+
+/// An eventfd in an epoll set.
+struct Sleep {
+    bell: OwnedFd,
+    set: OwnedFd,
+    events: Vec<epoll::Event>,
+    /// Rings that came and have not been asked for.
+    rings: u64,
+}
+
+impl Sleep {
+    fn new(bell: OwnedFd) -> Result<Self> {
+        let set = epoll::create(epoll::CreateFlags::CLOEXEC)?;
+        epoll::add(&set, &bell, epoll::EventData::new_u64(0), epoll::EventFlags::IN)?;
+        Ok(Self { bell, set, events: Vec::with_capacity(1), rings: 0 })
+    }
+
+    fn until_rung(&mut self) -> Result<()> {
+        while self.rings == 0 {
+            self.events.clear();
+            match epoll::wait(&self.set, spare_capacity(&mut self.events), None) {
+                Ok(_) | Err(Errno::INTR) => {}
+                Err(errno) => return Err(errno.into()),
+            }
+            let mut counter = [0; 8];
+            match read(&self.bell, &mut counter) {
+                Ok(_) => self.rings = u64::from_ne_bytes(counter),
+                Err(Errno::AGAIN | Errno::INTR) => {}
+                Err(errno) => return Err(errno.into()),
+            }
+        }
+        self.rings -= 1;
+        Ok(())
+    }
+}

@@ -1,0 +1,60 @@
+//! What loads are called.
+
+use super::{Motion, Wake};
+use crate::text;
+
+/// How a receiver learns of a message, and what becomes of its bytes.
+pub(crate) fn kind(wake: Wake, how: Motion) -> String {
+    let wake = match wake {
+        Wake::Poll => "polling",
+        Wake::Event => "event-driven",
+    };
+    format!("{wake}, {}", motion(how))
+}
+
+/// What becomes of a message's bytes.
+pub(crate) fn motion(motion: Motion) -> &'static str {
+    match motion {
+        Motion::Touch => "in place",
+        Motion::Fill => "copied in",
+        Motion::Copy => "copied in and out",
+    }
+}
+
+/// What the raw limit consists of.
+pub(crate) fn limit(wake: Wake, motion: Motion) -> String {
+    let wake = match wake {
+        Wake::Poll => "a spin on a shared atomic",
+        Wake::Event => "epoll and eventfd",
+    };
+    match motion {
+        Motion::Touch => wake.to_owned(),
+        Motion::Fill => format!("{wake}, and a memcpy from 97 B on"),
+        Motion::Copy => format!("{wake}, and two memcpy from 97 B on"),
+    }
+}
+
+/// A size, in binary units where it is a round number of them.
+pub(crate) fn size(bytes: usize) -> String {
+    match bytes {
+        b if b >= 1 << 20 && b.is_multiple_of(1 << 20) => format!("{} MiB", b >> 20),
+        b if b >= 1 << 10 && b.is_multiple_of(1 << 10) => format!("{} KiB", b >> 10),
+        b => text::bytes(b as u64).replace(".0 MB", " MB"),
+    }
+}
+
+/// A time.
+pub(crate) fn nanoseconds(ns: f64) -> String {
+    text::duration(ns.max(0.0).round() as u64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_read_well() {
+        let sizes = [8, 1 << 10, 64 << 10, 1 << 20, 25_000_000, 100_000].map(size);
+        assert_eq!(sizes, ["8 B", "1 KiB", "64 KiB", "1 MiB", "25 MB", "100 kB"]);
+    }
+}

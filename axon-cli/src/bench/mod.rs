@@ -1,0 +1,130 @@
+//! `axon bench`: what AXON costs beside what the machine gives without it.
+
+mod budgets;
+mod chart;
+pub(crate) mod harness;
+mod readers;
+mod report;
+
+use std::{
+    fs,
+    io::{self, Write},
+};
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+use self::{
+    harness::{Axon, Effort, Load, Machine, Medium, Motion, Pair, Raw, Rounds, SIZES, Wake, words},
+    readers::{Cost, Crowd},
+};
+use crate::{cli, failure::Failure};
+
+/// Sizes of a quick run: inline, copied, in place.
+const QUICK_SIZES: [usize; 3] = [8, 4 << 10, 64 << 10];
+
+/// The kinds of latency that are measured, in the order of the tables.
+const KINDS: [(Wake, Motion); 5] = [
+    (Wake::Poll, Motion::Copy),
+    (Wake::Poll, Motion::Fill),
+    (Wake::Poll, Motion::Touch),
+    (Wake::Event, Motion::Touch),
+    (Wake::Event, Motion::Copy),
+];
+/// The kinds of streams.
+const STREAMS: [Motion; 3] = [Motion::Copy, Motion::Fill, Motion::Touch];
+
+/// The raw limit first.
+const MEDIA: [&dyn Medium; 2] = [&Raw, &Axon];
+
+const ANSWERING: &str = "bench-answer";
+const READING: &str = "bench-read";
+
+/// A load, and what the raw limit and AXON made of it.
+struct Compared {
+    load: Load,
+    raw: Rounds,
+    axon: Rounds,
+}
+
+/// All that was measured.
+struct Results {
+    machine: Machine,
+    quick: bool,
+    effort: Effort,
+    /// By kind, then by size.
+    latency: Vec<Compared>,
+    streams: Vec<Compared>,
+    publish: Vec<Cost>,
+}
+
+/// Runs `axon bench shm`.
+pub(crate) fn shm(args: &cli::BenchShm) -> Result<(), Failure> {
+    let sizes = match (&args.sizes[..], args.quick) {
+        ([], false) => &SIZES[..],
+        ([], true) => &QUICK_SIZES[..],
+        (sizes, _) => sizes,
+    };
+    let results = measure(sizes, args.quick).map_err(Failure::failed)?;
+    fs::create_dir_all(&args.out)?;
+    let file = |name: &str| args.out.join(name);
+    fs::write(file("shm.json"), report::json(&results))?;
+    fs::write(file("shm.svg"), chart::svg(&results))?;
+    let mut out = io::stdout().lock();
+    out.write_all(report::text(&results).as_bytes())?;
+    writeln!(out, "\nshm.json and shm.svg are in {}", args.out.display())?;
+    Ok(())
+}
+
+/// Is the process that answers one that measures.
+pub(crate) fn answer() -> Result<(), Failure> {
+    harness::serve(&MEDIA).map_err(Failure::failed)
+}
+
+/// Is one of the readers that a publish is measured with.
+pub(crate) fn read() -> Result<(), Failure> {
+    readers::attend().map_err(Failure::failed)
+}
+
+fn measure(sizes: &[usize], quick: bool) -> harness::Result<Results> {
+    let effort = if quick { Effort::QUICK } else { Effort::FULL };
+    let machine = Machine::look()?;
+    let bar = ProgressBar::new((sizes.len() * (KINDS.len() + STREAMS.len() + 1)) as u64);
+    if let Ok(style) = ProgressStyle::with_template("{msg:40!} [{bar:30}] {pos}/{len} {elapsed}") {
+        bar.set_style(style.progress_chars("=> "));
+    }
+    let step = |what: String| {
+        bar.inc(1);
+        bar.set_message(what);
+    };
+    let (mut latency, mut streams, mut publish) = (Vec::new(), Vec::new(), Vec::new());
+
+    let pair = Pair::start(&MEDIA, effort, &machine, &[ANSWERING])?;
+    for (wake, motion) in KINDS {
+        for size in sizes {
+            let load = Load::ping_pong(*size, wake, motion);
+            latency.push(compared(load, pair.latency(&load)?)?);
+            step(format!("latency, {}", words::kind(wake, motion)));
+        }
+    }
+    for motion in STREAMS {
+        for size in sizes {
+            let load = Load::stream(*size, motion);
+            streams.push(compared(load, pair.stream(&load)?)?);
+            step(format!("throughput, {}", words::motion(motion)));
+        }
+    }
+    drop(pair);
+
+    let crowd = Crowd::start(&[READING])?;
+    for size in sizes {
+        publish.push(crowd.measure(*size, effort)?);
+        step("publish by readers".to_owned());
+    }
+    bar.finish_and_clear();
+    Ok(Results { machine, quick, effort, latency, streams, publish })
+}
+
+fn compared(load: Load, rounds: Vec<Rounds>) -> harness::Result<Compared> {
+    let [raw, axon] = rounds.try_into().map_err(|_| "another number of media")?;
+    Ok(Compared { load, raw, axon })
+}

@@ -1,0 +1,182 @@
+//! `axon bench shm`: what it writes is complete and well-formed. No figure is looked at: other
+//! tests run at the same time.
+
+#![forbid(unsafe_code)]
+
+mod common;
+
+use std::{
+    fs,
+    process::Stdio,
+    thread::{self, available_parallelism},
+};
+
+use common::{Running, axon, eventually};
+use serde_json::Value;
+
+/// One for each way that AXON has with a sample: in its descriptor, copied, in place.
+const SIZES: [u64; 3] = [64, 4096, 16_384];
+const KINDS: [(&str, &str); 5] =
+    [("poll", "copy"), ("poll", "fill"), ("poll", "touch"), ("event", "touch"), ("event", "copy")];
+
+/// Two processes cannot poll for each other on one CPU.
+fn has_two_cpus() -> bool {
+    let enough = available_parallelism().is_ok_and(|cpus| cpus.get() > 1);
+    if !enough {
+        eprintln!("skipped: it takes two CPUs");
+    }
+    enough
+}
+
+fn rows(document: &Value, part: &str) -> Vec<Value> {
+    document[part].as_array().unwrap_or_else(|| panic!("{part} is a list")).clone()
+}
+
+/// All percentiles of the best round, in order, and how often it was measured.
+fn check_times(times: &Value) {
+    let best = &times["best_round"];
+    assert!(best["count"].as_u64() > Some(0), "{times}");
+    assert!(best["mean_ns"].is_f64() && times["median_of_p50_ns"].is_f64(), "{times}");
+    assert_eq!(times["rounds"], 3, "{times}");
+    let percents = [0.0, 1.0, 5.0, 10.0, 25.0, 50.0, 75.0, 90.0, 95.0, 99.0, 99.9, 99.99, 100.0];
+    let at = |percent: &f64| {
+        let value = best["percentiles_ns"][format!("p{percent}")].as_f64();
+        value.unwrap_or_else(|| panic!("p{percent} is missing: {times}"))
+    };
+    assert!(percents.iter().map(at).is_sorted(), "{times}");
+    assert_eq!(best["percentiles_ns"].as_object().map(|all| all.len()), Some(percents.len()));
+}
+
+fn check_ratio(ratio: &Value) -> f64 {
+    let [best, median] = ["of_best_rounds", "median_of_rounds"].map(|name| ratio[name].as_f64());
+    assert!(median.is_some_and(f64::is_finite), "{ratio}");
+    best.filter(|best| best.is_finite()).unwrap_or_else(|| panic!("{ratio}"))
+}
+
+fn check_budget(row: &Value, ratio: f64, at_most: Option<f64>) {
+    match at_most {
+        None => assert_eq!(row["budget"], Value::Null, "{row}"),
+        Some(at_most) => {
+            assert_eq!(row["budget"]["at_most"], at_most, "{row}");
+            assert_eq!(row["budget"]["met"], ratio <= at_most, "{row}");
+        }
+    }
+}
+
+#[test]
+fn a_quick_run_writes_every_figure_there_is() {
+    if !has_two_cpus() {
+        return;
+    }
+    let dir = tempfile::tempdir().expect("temporary directory");
+    let out = dir.path().join("made/for/it");
+    let sizes = SIZES.map(|size| size.to_string()).join(",");
+    let output = axon([])
+        .args(["bench", "shm", "--quick", "--sizes", &sizes, "--out"])
+        .arg(&out)
+        .output()
+        .expect("it runs");
+    let text = String::from_utf8(output.stdout).expect("text");
+    assert!(output.status.success(), "{text}\n{}", String::from_utf8_lossy(&output.stderr));
+
+    let document = fs::read(out.join("shm.json")).expect("a file");
+    let document: Value = serde_json::from_slice(&document).expect("JSON");
+    assert_eq!(document["version"], env!("CARGO_PKG_VERSION"));
+    assert_eq!(document["quick"], true);
+    let machine = &document["machine"];
+    for known in ["host", "kernel", "architecture", "cpu"] {
+        assert!(machine[known].as_str().is_some_and(|text| !text.is_empty()), "{known}: {machine}");
+    }
+    assert!(machine["pinned"][0] != machine["pinned"][1] && machine["clock_ns"].is_f64());
+
+    let latency = rows(&document, "latency");
+    let expected: Vec<_> = KINDS.iter().flat_map(|kind| SIZES.map(|size| (*kind, size))).collect();
+    assert_eq!(latency.len(), expected.len());
+    for (row, ((wake, motion), size)) in latency.iter().zip(expected) {
+        assert_eq!((&row["wake"], &row["motion"]), (&wake.into(), &motion.into()));
+        assert_eq!((&row["bytes"], &row["window"]), (&size.into(), &1.into()));
+        check_times(&row["raw"]);
+        check_times(&row["axon"]);
+        let at_most = match (wake, motion, size) {
+            ("poll", "copy", 64) => Some(1.3),
+            ("poll", "copy", 16_384) => Some(1.05),
+            ("poll", "touch", _) => Some(2.5),
+            ("event", "touch", _) => Some(1.1),
+            _ => None,
+        };
+        check_budget(row, check_ratio(&row["ratio"]), at_most);
+    }
+
+    let streams = rows(&document, "throughput");
+    assert_eq!(streams.len(), 3 * SIZES.len());
+    for row in &streams {
+        assert!(row["window"].as_u64() > Some(1), "{row}");
+        check_times(&row["raw"]);
+        check_times(&row["axon"]);
+        check_ratio(&row["ratio"]);
+    }
+
+    let publish = rows(&document, "publish");
+    assert_eq!(publish.len(), SIZES.len());
+    for row in &publish {
+        check_times(&row["raw"]);
+        let readers = rows(row, "readers");
+        let counts: Vec<_> = readers.iter().map(|of| of["readers"].as_u64()).collect();
+        assert_eq!(counts, [1, 2, 4, 8, 16].map(Some));
+        readers.iter().for_each(|of| check_times(&of["publish"]));
+        check_ratio(&row["ratio_of_1_to_raw"]);
+        check_budget(row, check_ratio(&row["ratio_of_16_to_1"]), Some(1.3));
+    }
+
+    // The same in the tables: as many rows as loads, and nothing without its title.
+    assert_eq!(text.matches("\nLatency, ").count(), KINDS.len(), "{text}");
+    assert_eq!(text.matches("\nThroughput, ").count(), 3, "{text}");
+    assert!(text.contains("A publish to 1 to 16") && text.contains("good for nothing"), "{text}");
+    for size in ["64 B", "4 KiB", "16 KiB"] {
+        let lines = text.lines().filter(|line| line.trim_start().starts_with(size)).count();
+        assert_eq!(lines, KINDS.len() + 3 + 1, "{size}: {text}");
+    }
+
+    let svg = fs::read_to_string(out.join("shm.svg")).expect("a file");
+    assert!(svg.starts_with("<svg ") && svg.trim_end().ends_with("</svg>"));
+    assert_eq!(svg.matches("<polyline").count(), 2 * (KINDS.len() + 3) + SIZES.len());
+    assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
+}
+
+#[test]
+fn it_ends_when_its_other_process_does() {
+    if !has_two_cpus() {
+        return;
+    }
+    let dir = tempfile::tempdir().expect("temporary directory");
+    let mut command = axon([]);
+    command.args(["bench", "shm", "--sizes", "8", "--out"]).arg(dir.path());
+    command.stdin(Stdio::null());
+    let running = Running::start(command);
+    let pid = running.0.id();
+    let mut other = None;
+    eventually("there is another process", || {
+        let children = fs::read_to_string(format!("/proc/{pid}/task/{pid}/children"));
+        let first = children.ok().and_then(|list| list.split(' ').next()?.parse().ok());
+        other = first.and_then(rustix::process::Pid::from_raw);
+        other.is_some()
+    });
+    // In the middle of the first round, or before it.
+    thread::sleep(std::time::Duration::from_millis(50));
+    rustix::process::kill_process(other.expect("found"), rustix::process::Signal::KILL)
+        .expect("it was there");
+    let output = running.finish();
+    let why = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{why}");
+    assert!(why.contains("ended"), "{why}");
+    assert!(!dir.path().join("shm.json").exists());
+}
+
+#[test]
+fn a_size_that_cannot_be_measured_is_refused() {
+    for wrong in ["7", "1k", "8,,9", "67108865"] {
+        let output = axon([]).args(["bench", "shm", "--sizes", wrong]).output().expect("it runs");
+        assert_eq!(output.status.code(), Some(2), "{wrong}");
+        assert!(String::from_utf8_lossy(&output.stderr).contains("number of bytes"), "{wrong}");
+    }
+}
