@@ -3,9 +3,11 @@
 //! Plain data in, data out; the daemon and the gateway move it.
 
 mod endpoint;
+mod pairing;
 mod query;
 mod view;
 
 pub use endpoint::{Endpoint, EndpointKind, LIMITS, Limits};
+pub use pairing::{Pairing, pairing, reads, writes};
 pub use query::{NamesAndTypes, NodeName, SERVICE_KINDS, TOPIC_KINDS};
 pub use view::{GraphEntry, GraphView};

@@ -1,0 +1,109 @@
+//! Which endpoints go together: one rule for the daemon that pairs them, the session that reports
+//! why they do not, and the gateway that carries samples between hosts.
+
+use super::{Endpoint, EndpointKind};
+use crate::qos::{Incompatible, compatible};
+
+/// What two endpoints are to each other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Pairing {
+    /// Nothing: other names, or kinds that do not speak with each other.
+    Unrelated,
+    /// One writes what the other reads.
+    Match,
+    /// They would, but for this policy.
+    IncompatibleQos(Incompatible),
+    /// They have the same name and mean different types by it.
+    IncompatibleType,
+}
+
+/// Whether an endpoint of this kind writes: a server its responses, a client its requests.
+pub fn writes(kind: EndpointKind) -> bool {
+    matches!(kind, EndpointKind::Publisher | EndpointKind::Server | EndpointKind::Client)
+}
+
+/// Whether an endpoint of this kind reads: a server requests, a client responses.
+pub fn reads(kind: EndpointKind) -> bool {
+    matches!(kind, EndpointKind::Subscription | EndpointKind::Server | EndpointKind::Client)
+}
+
+/// What `writer` is to `reader`. Types are the same when their names are, and their hashes where
+/// both are known.
+pub fn pairing(writer: &Endpoint, reader: &Endpoint) -> Pairing {
+    use EndpointKind::{Client, Publisher, Server, Subscription};
+    let kinds = (writer.kind, reader.kind);
+    let related = matches!(kinds, (Publisher, Subscription) | (Client, Server) | (Server, Client));
+    if !related || writer.topic != reader.topic {
+        return Pairing::Unrelated;
+    }
+    let hashes_differ = writer.type_hash != reader.type_hash
+        && !writer.type_hash.is_empty()
+        && !reader.type_hash.is_empty();
+    if writer.type_name != reader.type_name || hashes_differ {
+        return Pairing::IncompatibleType;
+    }
+    compatible(&writer.qos, &reader.qos).map_or_else(Pairing::IncompatibleQos, |()| Pairing::Match)
+}
+
+#[cfg(test)]
+mod tests {
+    use EndpointKind::{Client, Node, Publisher, Server, Subscription};
+
+    use super::*;
+    use crate::{ids::Gid, qos::Qos};
+
+    const KINDS: [EndpointKind; 5] = [Publisher, Subscription, Server, Client, Node];
+
+    fn endpoint(kind: EndpointKind) -> Endpoint {
+        let node = kind == Node;
+        Endpoint {
+            gid: Gid([1; 16]),
+            kind,
+            topic: if node { String::new() } else { "/t".into() },
+            type_name: if node { String::new() } else { "T".into() },
+            type_hash: vec![],
+            qos: Qos::default(),
+            node: "n".into(),
+            namespace: "/".into(),
+            enclave: String::new(),
+        }
+    }
+
+    #[test]
+    fn only_three_pairs_of_kinds_speak_with_each_other() {
+        let mut matched = Vec::new();
+        for writer in KINDS {
+            for reader in KINDS {
+                match pairing(&endpoint(writer), &endpoint(reader)) {
+                    Pairing::Match => {
+                        assert!(writes(writer) && reads(reader));
+                        matched.push((writer, reader));
+                    }
+                    other => assert_eq!(other, Pairing::Unrelated, "{writer:?} {reader:?}"),
+                }
+            }
+        }
+        assert_eq!(matched, [(Publisher, Subscription), (Server, Client), (Client, Server)]);
+    }
+
+    #[test]
+    fn a_type_is_its_name_and_its_hash_where_both_know_it() {
+        let hash = |bytes: &[u8]| Endpoint { type_hash: bytes.into(), ..endpoint(Publisher) };
+        let reader = Endpoint { type_hash: vec![1, 2], ..endpoint(Subscription) };
+        assert_eq!(pairing(&hash(&[1, 2]), &reader), Pairing::Match);
+        assert_eq!(pairing(&hash(&[]), &reader), Pairing::Match);
+        assert_eq!(pairing(&hash(&[1, 3]), &reader), Pairing::IncompatibleType);
+        let renamed = Endpoint { type_name: "U".into(), ..hash(&[1, 2]) };
+        assert_eq!(pairing(&renamed, &reader), Pairing::IncompatibleType);
+        // Of another topic, the type does not matter.
+        let elsewhere = Endpoint { topic: "/u".into(), ..renamed };
+        assert_eq!(pairing(&elsewhere, &reader), Pairing::Unrelated);
+    }
+
+    #[test]
+    fn a_policy_that_does_not_go_together_is_named() {
+        let writer = Endpoint { qos: Qos::sensor_data(), ..endpoint(Publisher) };
+        let verdict = pairing(&writer, &endpoint(Subscription));
+        assert_eq!(verdict, Pairing::IncompatibleQos(Incompatible::Reliability));
+    }
+}
