@@ -168,3 +168,60 @@ fn no_signal_is_delivered_to_the_control_thread() {
     let masks: Vec<u64> = tasks.filter(|t| named(t)).filter_map(|t| blocked(&t)).collect();
     assert!(!masks.is_empty() && masks.iter().all(|mask| *mask == all), "{masks:x?}");
 }
+
+#[test]
+fn a_forked_child_is_refused_by_whatever_it_asks_and_never_waits() {
+    use std::sync::atomic::{AtomicBool, Ordering};
+    let session = session();
+    let publisher = session.create_publisher(spec(Qos::keep_all())).unwrap();
+    let subscription = session.create_subscription(spec(Qos::keep_all())).unwrap();
+    assert!(subscription.wait_matched(1, PATIENCE));
+    let over = AtomicBool::new(false);
+    let forked =
+        |what: Result<(), SessionError>| what.is_err_and(|e| e.to_string().contains("fork"));
+    std::thread::scope(|scope| {
+        // Whose locks the child finds taken, and nobody to give them back.
+        for _ in 0..2 {
+            scope.spawn(|| {
+                while !over.load(Ordering::Relaxed) {
+                    session.graph();
+                    publisher.matched();
+                    subscription.matched();
+                    subscription.lost();
+                }
+            });
+        }
+        for _ in 0..40 {
+            // SAFETY: the child calls what must work in one, and leaves by _exit.
+            let child = unsafe { libc::fork() };
+            if child == 0 {
+                // SAFETY: has it killed if it hangs.
+                unsafe { libc::alarm(30) };
+                let mut bytes = Vec::new();
+                let refused = [
+                    forked(session.create_publisher(spec(Qos::default())).map(drop)),
+                    forked(session.create_subscription(spec(Qos::default())).map(drop)),
+                    forked(session.status_json().map(drop)),
+                    publisher.publish(b"x").is_err_and(|e| e.to_string().contains("fork")),
+                    publisher.loan(5000).is_err_and(|e| e.to_string().contains("fork")),
+                    subscription.take(&mut bytes).is_none(),
+                    subscription.recv(&mut bytes, Some(Duration::from_millis(1))).is_none(),
+                    !subscription.has_data() && subscription.matched().is_empty(),
+                    publisher.matched().is_empty() && !publisher.wait_matched(1, PATIENCE),
+                    session.daemon().is_none() && session.graph().endpoints.is_empty(),
+                    !session.wait_graph(PATIENCE, |graph| !graph.endpoints.is_empty()),
+                ];
+                let code = refused.iter().position(|refused| !refused).map_or(0, |n| n + 1);
+                // SAFETY: ends the process without running anything else.
+                unsafe { libc::_exit(i32::try_from(code).unwrap()) };
+            }
+            let mut status = -1;
+            // SAFETY: waits for the child just made; `status` outlives the call.
+            assert_eq!(unsafe { libc::waitpid(child, &mut status, 0) }, child);
+            assert_eq!(status, 0, "the child was refused all of it, and killed by nothing");
+        }
+        over.store(true, Ordering::Relaxed);
+    });
+    publisher.publish(b"x").unwrap();
+    assert!(subscription.recv(&mut Vec::new(), Some(PATIENCE)).is_some());
+}

@@ -14,7 +14,7 @@ pub mod message;
 mod options;
 mod peers;
 mod publisher;
-mod signals;
+pub(crate) mod signals;
 pub mod socket;
 mod state;
 mod subscription;
@@ -45,7 +45,7 @@ use crate::{
     config::{Config, DaemonPolicy},
     graph::{Endpoint, EndpointKind, GraphView},
     ids::{DaemonId, Gid, SessionId},
-    shm::{RingOptions, SessionSegment, Writer},
+    shm::{RingOptions, SessionSegment, ShmError, Writer},
 };
 
 /// How long a daemon may take to answer a question.
@@ -126,9 +126,9 @@ impl Session {
         self.shared().id
     }
 
-    /// The daemon it is connected to; `None` while there is none.
+    /// The daemon it is connected to; `None` while there is none, and in a forked child.
     pub fn daemon(&self) -> Option<DaemonId> {
-        self.shared().state().daemon
+        if self.is_forked() { None } else { self.shared().state().daemon }
     }
 
     /// A publisher. Readers are matched later; see [`Publisher::wait_matched`].
@@ -172,9 +172,9 @@ impl Session {
         Ok(self.add_subscription(endpoint, EndpointRole::Relay, stands_for))
     }
 
-    /// The graph as the daemon last described it.
+    /// The graph as the daemon last described it; empty in a forked child.
     pub fn graph(&self) -> Arc<GraphView> {
-        self.shared().state().graph.clone()
+        if self.is_forked() { Arc::default() } else { self.shared().state().graph.clone() }
     }
 
     /// Waits until the graph is as `reached` wants it; whether it is.
@@ -200,6 +200,9 @@ impl Session {
     /// Has `listener` called on the control thread for every event. It must not block, and must
     /// not hold this session, which would otherwise never end.
     pub fn set_listener(&self, listener: impl Fn(&SessionEvent) + Send + Sync + 'static) {
+        if self.is_forked() {
+            return;
+        }
         let mut slot = self.shared().listener.lock().unwrap_or_else(PoisonError::into_inner);
         *slot = Some(Arc::new(listener));
     }
@@ -210,6 +213,9 @@ impl Session {
     /// When there is no daemon or it does not answer in time.
     pub fn status_json(&self) -> Result<String, SessionError> {
         let shared = self.shared();
+        if self.is_forked() {
+            return Err(ShmError::Forked.into());
+        }
         let _asking = shared.asking.lock().unwrap_or_else(PoisonError::into_inner);
         if shared.config.daemon == DaemonPolicy::Off {
             return Err(SessionError::Off);
@@ -259,7 +265,16 @@ impl Session {
         &self.handle.shared
     }
 
+    /// Whether this is a forked child of the session's process. Of its locks some may be held for
+    /// ever then, by threads that were not forked with it.
+    fn is_forked(&self) -> bool {
+        self.shared().segment.is_forked()
+    }
+
     fn endpoint(&self, spec: EndpointSpec, kind: EndpointKind) -> Result<Endpoint, SessionError> {
+        if self.is_forked() {
+            return Err(ShmError::Forked.into());
+        }
         let number = {
             let mut state = self.shared().state();
             state.next_entity += 1;
@@ -290,6 +305,9 @@ impl Session {
         role: EndpointRole,
     ) -> Result<Publisher, SessionError> {
         let shared = self.shared();
+        if self.is_forked() {
+            return Err(ShmError::Forked.into());
+        }
         let gid = endpoint.gid;
         let options = RingOptions {
             gid,
@@ -320,7 +338,7 @@ impl Session {
     /// An endpoint's handle is dropped.
     fn forget_endpoint(&self, gid: &Gid) {
         // In a forked child it is the parent's still, and its locks may be held.
-        if self.shared().segment.is_forked() {
+        if self.is_forked() {
             return;
         }
         let mut state = self.shared().state();
@@ -339,10 +357,16 @@ impl Session {
 
     /// A relay stands for others than before: its writers and the daemon hear of it.
     fn renew(&self, gid: Gid) {
+        if self.is_forked() {
+            return;
+        }
         self.shared().tell(Outgoing::Announce(gid));
     }
 
-    fn wait_changed(&self, timeout: Duration, reached: impl FnMut() -> bool) -> bool {
+    fn wait_changed(&self, timeout: Duration, mut reached: impl FnMut() -> bool) -> bool {
+        if self.is_forked() {
+            return reached();
+        }
         self.shared().wait_changed(timeout, reached)
     }
 }

@@ -17,7 +17,7 @@ use rustix::{
     mm::{Advice, MapFlags, MprotectFlags, ProtFlags, madvise, mmap, mprotect, munlock, munmap},
 };
 
-use super::{ShmError, fork::ForkToken, headroom, layout};
+use super::{ShmError, atfork::Place, fork::ForkToken, headroom, layout};
 
 /// Bytes that are committed at a time.
 const PIECE: u64 = 1 << 20;
@@ -105,6 +105,8 @@ pub(super) struct Map {
     base: NonNull<c_void>,
     bytes: usize,
     owner: ForkToken,
+    /// Of a writable map.
+    place: Option<Place>,
 }
 
 /// What `fstatfs` says of an ordinary memfd (linux/magic.h).
@@ -160,7 +162,7 @@ impl Map {
         let base = NonNull::new(base)
             .ok_or(ShmError::Refused { what: "it was mapped at address zero" })?;
         // From here on dropping it unmaps.
-        let map = Self { base, bytes, owner };
+        let mut map = Self { base, bytes, owner, place: None };
         // SAFETY: the range is the mapping just made; locking has no effect on its contents.
         unsafe { munlock(base.as_ptr(), bytes) }
             .map_err(ShmError::system("unlocking a segment"))?;
@@ -171,6 +173,7 @@ impl Map {
             // SAFETY: as above; the map is not reached in a child (see `is_forked`).
             unsafe { madvise(base.as_ptr(), bytes, Advice::LinuxDontFork) }
                 .map_err(ShmError::system("keeping a segment from forks"))?;
+            map.place = Some(Place::keep(base, bytes)?);
         }
         let protection = match access {
             Access::Read => MprotectFlags::READ,
@@ -201,7 +204,9 @@ impl Map {
 
 impl Drop for Map {
     fn drop(&mut self) {
-        // In a forked child a writable map is absent, and something else may be at its address.
+        // Before the memory goes: its place must not be kept in a child that it is no longer in.
+        drop(self.place.take());
+        // In a forked child a writable map is absent, and what keeps its place stays there.
         if !self.is_forked() {
             // SAFETY: the range is ours, and no borrow of it outlives `self`.
             let _ = unsafe { munmap(self.base.as_ptr(), self.bytes) };

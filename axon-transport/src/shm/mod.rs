@@ -54,6 +54,7 @@
 compile_error!("rings are laid out for 64-bit little-endian machines");
 
 mod area;
+mod atfork;
 mod attachment;
 mod audience;
 mod connect;

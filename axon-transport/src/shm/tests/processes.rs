@@ -174,6 +174,33 @@ fn the_other_process() {
             writer.publish(meta(1), b"after").unwrap();
             assert_eq!(reader.take(&mut out).unwrap().unwrap().meta, meta(1));
         }
+        "fork with a slice" => {
+            let writer = large_writer(&session, keep_last(1), 1 << 20);
+            let mut loan = writer.loan(9000).unwrap();
+            let slice: &mut [u8] = &mut loan;
+            let page = (slice.as_mut_ptr() as usize & !4095) as *mut libc::c_void;
+            // SAFETY: the child makes system calls and one store.
+            let child = unsafe { libc::fork() };
+            if child == 0 {
+                let flags = libc::MAP_PRIVATE | libc::MAP_ANONYMOUS | libc::MAP_FIXED_NOREPLACE;
+                // SAFETY: it replaces nothing.
+                let found = unsafe { libc::mmap(page, 4096, libc::PROT_READ, flags, -1, 0) };
+                if found == page {
+                    // SAFETY: ends the process without running anything else.
+                    unsafe { libc::_exit(2) };
+                }
+                slice[100] = 1;
+                // SAFETY: as above.
+                unsafe { libc::_exit(3) };
+            }
+            let mut status = -1;
+            // SAFETY: waits for the child just made; `status` outlives the call.
+            assert_eq!(unsafe { libc::waitpid(child, &mut status, 0) }, child);
+            assert!(!libc::WIFEXITED(status), "status {}", libc::WEXITSTATUS(status));
+            assert_eq!(libc::WTERMSIG(status), libc::SIGSEGV);
+            slice[100] = 1;
+            loan.publish_next(1).unwrap();
+        }
         "echo" => {
             let mut ping = wire.join(&session, Qos::keep_all());
             let writer = large_writer(&session, Qos::keep_all(), 1 << 20);
@@ -415,4 +442,9 @@ fn no_wake_up_is_lost_between_two_that_sleep() {
 #[test]
 fn a_forked_child_is_refused_and_harms_nothing() {
     Other::start("fork").succeed();
+}
+
+#[test]
+fn a_slice_that_is_kept_over_a_fork_faults() {
+    Other::start("fork with a slice").succeed();
 }
