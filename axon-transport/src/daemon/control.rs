@@ -2,7 +2,6 @@
 
 use std::{
     collections::{BTreeMap, HashMap, VecDeque},
-    os::fd::OwnedFd,
     rc::Rc,
     sync::Arc,
     time::Instant,
@@ -13,12 +12,13 @@ use tokio::sync::Notify;
 use super::{
     admission::Admission,
     bridge::ToControl,
-    registry::Registry,
+    registry::{Registry, SessionEntry},
     status::{LinkStatus, RefusalStatus, unix_ms},
 };
 use crate::{
     config::Config,
     ids::{DaemonId, SessionId},
+    passed::PassedFd,
     session::{
         address::Address,
         message::{Message, StatusPart},
@@ -36,7 +36,7 @@ pub(super) struct Control {
     pub(super) id: DaemonId,
     pub(super) started: Instant,
     pub(super) address: Address,
-    pub(super) registry: Registry<Arc<OwnedFd>>,
+    pub(super) registry: Registry<Arc<PassedFd>>,
     pub(super) links: BTreeMap<String, LinkStatus>,
     pub(super) refusals: VecDeque<RefusalStatus>,
     pub(super) keys: serde_json::Value,
@@ -69,7 +69,10 @@ impl Control {
     /// The bell of a session's task.
     pub(super) fn add_waker(&mut self, id: SessionId) -> Rc<Notify> {
         let bell = Rc::new(Notify::new());
-        self.wakers.insert(id, bell.clone());
+        // The task of a connection that is replaced ends at once, and with it its descriptors.
+        if let Some(replaced) = self.wakers.insert(id, bell.clone()) {
+            replaced.notify_one();
+        }
         bell
     }
 
@@ -97,7 +100,11 @@ impl Control {
         self.changed.notify_one();
     }
 
+    /// Answers a session that asks for the status, once it has taken the last answer.
     pub(super) fn send_status(&mut self, id: &SessionId) {
+        if self.registry.session(id).is_none_or(SessionEntry::awaits_status) {
+            return;
+        }
         let text = match serde_json::to_vec(&super::report::status(self)) {
             Ok(text) => text,
             Err(error) => {

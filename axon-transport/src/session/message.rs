@@ -13,7 +13,7 @@ use crate::{
 };
 
 /// The version of the session protocol that this crate speaks.
-pub const PROTOCOL: u32 = 1;
+pub const PROTOCOL: u32 = 2;
 /// The largest packet, in bytes.
 pub const MAX_PACKET: usize = 32 * 1024;
 /// The most descriptors that one packet carries.
@@ -337,6 +337,11 @@ impl Message {
         packet.push(kind);
         packet.extend_from_slice(&body);
         Ok(packet)
+    }
+
+    /// Whether a packet is part of a status.
+    pub(crate) fn is_status(packet: &[u8]) -> bool {
+        packet.first() == Some(&13)
     }
 
     /// The message of one packet.

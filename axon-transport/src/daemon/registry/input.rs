@@ -1,8 +1,8 @@
 //! What sessions say.
 
 use super::{
-    Asked, LocalEndpoint, MAX_SESSIONS, MAX_TOMBSTONES, Registry, SessionEntry, Violation,
-    output::session_entry,
+    Asked, LocalEndpoint, MAX_PAIRS, MAX_SESSIONS, MAX_TOMBSTONES, Registry, SessionEntry,
+    Violation, output::session_entry,
 };
 use crate::{
     graph::LIMITS,
@@ -71,7 +71,11 @@ impl<F: Clone> Registry<F> {
             Message::Grant(grant) => self.grant(id, grant),
             Message::Detach(pair) => self.detach(id, pair),
             Message::Resync => {
-                self.mark_behind(id);
+                // Everything costs much more to tell than to ask for.
+                if let Some(entry) = self.sessions.get_mut(id) {
+                    entry.resync = true;
+                    self.ready.insert(*id);
+                }
                 Ok(())
             }
             _ => Err(Violation::Unexpected),
@@ -114,6 +118,8 @@ impl<F: Clone> Registry<F> {
             Some("a name, type hash or depth out of bounds")
         } else if entry.endpoints.len() >= LIMITS.endpoints {
             Some("too many endpoints in one session")
+        } else if entry.pairs + self.prospects(&endpoint) > MAX_PAIRS {
+            Some("its session would have too many pairs of publishers and subscriptions")
         } else {
             None
         };
@@ -177,7 +183,7 @@ impl<F: Clone> Registry<F> {
         // behind. Sessions that are told everything anew would otherwise set each other back
         // without end.
         if asked.attach != attach {
-            *asked = Asked { attach, grant: None };
+            *asked = Asked { attach, grant: None, by: asked.by };
             self.forward_attach(&pair);
         }
         Ok(())
@@ -228,7 +234,7 @@ impl<F: Clone> Registry<F> {
         if self.endpoints.get(&pair.reader).is_some_and(|r| r.session != *id) {
             return Err(Violation::NotItsOwn(pair.reader));
         }
-        if self.pairs.remove(&pair).is_none() {
+        if !self.remove_pair(&pair) {
             return Ok(());
         }
         if let Some(to) = self.endpoints.get(&pair.writer).map(|w| w.session)
@@ -281,5 +287,10 @@ impl<F> SessionEntry<F> {
     /// Packets that wait for it.
     pub fn queued(&self) -> usize {
         self.queue.len()
+    }
+
+    /// Whether part of a status waits for it.
+    pub fn awaits_status(&self) -> bool {
+        self.queue.iter().any(|output| Message::is_status(&output.packet))
     }
 }

@@ -42,7 +42,11 @@ impl<F: Clone> Registry<F> {
             let (to_writer, to_reader) = (w.session, r.session);
             match compatible(&w.endpoint.qos, &r.endpoint.qos) {
                 Ok(()) => {
-                    self.pairs.insert(pair, Asked::default());
+                    let by = if writes(kind) { to_writer } else { to_reader };
+                    self.pairs.insert(pair, Asked { by, attach: None, grant: None });
+                    if let Some(entry) = self.sessions.get_mut(&by) {
+                        entry.pairs += 1;
+                    }
                     self.push(&to_reader, &Message::Match(pair), Vec::new());
                 }
                 Err(policy) => {
@@ -70,7 +74,7 @@ impl<F: Clone> Registry<F> {
             }
         }
         for pair in pairs {
-            if self.pairs.remove(&pair).is_none() {
+            if !self.remove_pair(&pair) {
                 continue;
             }
             let other = if pair.writer == *gid { pair.reader } else { pair.writer };
@@ -84,6 +88,28 @@ impl<F: Clone> Registry<F> {
         if local.role == EndpointRole::Application {
             self.graph_end(*gid);
         }
+    }
+
+    /// How many pairs an endpoint would make at most.
+    pub(super) fn prospects(&self, endpoint: &Endpoint) -> usize {
+        self.topics.get(&topic(endpoint)).map_or(0, |members| {
+            if writes(endpoint.kind) {
+                members.readers.len()
+            } else if reads(endpoint.kind) {
+                members.writers.len()
+            } else {
+                0
+            }
+        })
+    }
+
+    /// Whether there was such a pair.
+    pub(super) fn remove_pair(&mut self, pair: &Pair) -> bool {
+        let Some(asked) = self.pairs.remove(pair) else { return false };
+        if let Some(entry) = self.sessions.get_mut(&asked.by) {
+            entry.pairs -= 1;
+        }
+        true
     }
 
     fn unmatch(&mut self, pair: &Pair, to_writer: SessionId, to_reader: SessionId, reason: &str) {

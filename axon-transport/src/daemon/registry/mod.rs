@@ -5,6 +5,8 @@
 //! stands for a descriptor. Matching is a function of the endpoints alone, so a session that
 //! could not be told in time is told everything anew ([`Registry::next_output`]).
 
+#[cfg(test)]
+mod bounds;
 mod graph;
 mod input;
 mod matching;
@@ -24,6 +26,10 @@ use crate::{
 
 /// Packets that may wait for one session before it is told everything anew instead.
 pub const MAX_QUEUE: usize = if cfg!(test) { 24 } else { 4096 };
+/// Their bytes, likewise.
+pub const MAX_QUEUE_BYTES: usize = if cfg!(test) { 64 << 10 } else { 4 << 20 };
+/// Pairs that the endpoints of one session may make when they are announced.
+pub const MAX_PAIRS: usize = 1 << 16;
 /// Sessions of one daemon.
 pub const MAX_SESSIONS: usize = 4096;
 /// Remembered GIDs of endpoints that ended while there was no daemon to tell.
@@ -63,7 +69,13 @@ pub struct SessionEntry<F> {
     known: HashMap<SessionId, HashSet<Pair>>,
     queue: VecDeque<Output<F>>,
     queue_limit: usize,
+    queued_bytes: usize,
+    bytes_limit: usize,
     behind: bool,
+    /// It asked to be told everything anew, and is once it has taken what waits for it.
+    resync: bool,
+    /// The pairs that its announcements made.
+    pairs: usize,
 }
 
 /// An endpoint of a session here.
@@ -82,8 +94,10 @@ pub struct LocalEndpoint<F> {
 }
 
 /// How far a pair has come.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Asked {
+    /// The session that announced the second of the two.
+    by: SessionId,
     /// What its reader asked.
     attach: Option<Attach>,
     /// What its writer answered.

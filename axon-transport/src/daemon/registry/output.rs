@@ -5,7 +5,7 @@ use std::{
     sync::Arc,
 };
 
-use super::{MAX_QUEUE, Registry, SessionEntry};
+use super::{MAX_QUEUE, MAX_QUEUE_BYTES, Registry, SessionEntry};
 use crate::{
     ids::SessionId,
     session::message::{Graph, Message, Pair, SessionRole},
@@ -28,13 +28,15 @@ impl<F: Clone> Registry<F> {
     /// it does not hear again is over.
     pub fn next_output(&mut self, id: &SessionId) -> Option<Output<F>> {
         let entry = self.sessions.get_mut(id)?;
-        if entry.behind && entry.queue.is_empty() {
+        if entry.queue.is_empty() && (entry.behind || std::mem::take(&mut entry.resync)) {
             self.tell_everything(id);
         }
         let entry = self.sessions.get_mut(id)?;
         let output = entry.queue.pop_front();
+        entry.queued_bytes -= output.as_ref().map_or(0, |output| output.packet.len());
         if entry.queue.is_empty() {
             entry.queue_limit = MAX_QUEUE;
+            entry.bytes_limit = MAX_QUEUE_BYTES;
         }
         output
     }
@@ -42,6 +44,7 @@ impl<F: Clone> Registry<F> {
     /// Puts a packet back that could not be sent.
     pub fn return_output(&mut self, id: &SessionId, output: Output<F>) {
         if let Some(entry) = self.sessions.get_mut(id) {
+            entry.queued_bytes += output.packet.len();
             entry.queue.push_front(output);
         }
     }
@@ -69,18 +72,21 @@ impl<F: Clone> Registry<F> {
         if entry.behind {
             return;
         }
-        if entry.queue.len() >= entry.queue_limit {
+        if entry.queue.len() >= entry.queue_limit || entry.queued_bytes >= entry.bytes_limit {
             self.mark_behind(to);
             return;
         }
+        entry.queued_bytes += output.packet.len();
         entry.queue.push_back(output);
         self.ready.insert(*to);
     }
 
     pub(super) fn mark_behind(&mut self, id: &SessionId) {
         if let Some(entry) = self.sessions.get_mut(id) {
-            entry.behind = true;
+            // There is no graph that a tool could be behind with.
+            entry.behind = entry.role != SessionRole::Tool;
             entry.queue.clear();
+            entry.queued_bytes = 0;
             self.ready.insert(*id);
         }
     }
@@ -93,6 +99,7 @@ impl<F: Clone> Registry<F> {
         entry.behind = false;
         entry.known.clear();
         entry.queue_limit = usize::MAX;
+        entry.bytes_limit = usize::MAX;
         for part in parts {
             self.push(id, &Message::Graph(part), Vec::new());
         }
@@ -117,6 +124,7 @@ impl<F: Clone> Registry<F> {
         self.push(id, &Message::Graph(end), Vec::new());
         if let Some(entry) = self.sessions.get_mut(id) {
             entry.queue_limit = entry.queue.len() + MAX_QUEUE;
+            entry.bytes_limit = entry.queued_bytes + MAX_QUEUE_BYTES;
         }
     }
 
@@ -140,7 +148,11 @@ pub(super) fn session_entry<F>(
         known: HashMap::new(),
         queue: VecDeque::new(),
         queue_limit: MAX_QUEUE,
+        queued_bytes: 0,
+        bytes_limit: MAX_QUEUE_BYTES,
         behind: false,
+        resync: false,
+        pairs: 0,
     }
 }
 
