@@ -10,6 +10,7 @@ pub mod graph;
 pub mod ids;
 pub mod keys;
 pub mod link;
+pub mod passed;
 pub mod qos;
 pub mod session;
 pub mod shm;

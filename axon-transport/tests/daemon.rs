@@ -2,7 +2,11 @@
 
 mod support;
 
-use std::{io::Write, os::fd::OwnedFd, time::Duration};
+use std::{
+    io::Write,
+    os::fd::{AsFd, OwnedFd},
+    time::Duration,
+};
 
 use axon_transport::{
     config::{Config, DaemonPolicy},
@@ -353,6 +357,73 @@ fn garbage_on_the_socket_hurts_nobody() {
     assert!(subscription.wait_matched(1, PATIENCE) && publisher.wait_matched(1, PATIENCE));
     publish(&publisher, 1);
     assert_eq!(receive(&subscription), 1);
+}
+
+/// A socket whose last close takes hours, since it lingers over what its peer does not read.
+fn reluctant() -> (OwnedFd, std::net::TcpStream) {
+    use rustix::net::sockopt;
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    sockopt::set_socket_recv_buffer_size(&listener, 4096).unwrap();
+    let mut ours = std::net::TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+    let (peer, _) = listener.accept().unwrap();
+    ours.set_nonblocking(true).unwrap();
+    sockopt::set_socket_send_buffer_size(&ours, 4096).unwrap();
+    while ours.write(&[0; 1 << 16]).is_ok() {}
+    sockopt::set_socket_linger(&ours, Some(Duration::from_secs(10_000))).unwrap();
+    (ours.into(), peer)
+}
+
+/// A packet whose last descriptor is from then on in nobody's hands but the receiver's.
+fn send_away(socket: &OwnedFd, bytes: &[u8], before: usize, fd: OwnedFd) {
+    use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg};
+    let null: OwnedFd = std::fs::File::open("/dev/null").unwrap().into();
+    let mut space = [std::mem::MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(8))];
+    let mut control = SendAncillaryBuffer::new(&mut space);
+    let mut rights = vec![null.as_fd(); before];
+    rights.push(fd.as_fd());
+    assert!(control.push(SendAncillaryMessage::ScmRights(&rights)));
+    let bytes = [std::io::IoSlice::new(bytes)];
+    sendmsg(socket, &bytes, &mut control, SendFlags::NOSIGNAL).unwrap();
+}
+
+#[test]
+fn descriptors_that_are_slow_to_close_do_not_stop_the_daemon() {
+    let host = Host::new();
+    let _daemon = host.daemon();
+    let address = Address::of(&host.config());
+    let tool = Message::Hello(Hello {
+        protocol: PROTOCOL,
+        session: axon_transport::ids::SessionId::random(),
+        role: SessionRole::Tool,
+        name: "tool".into(),
+        domain: 0,
+        settings: Vec::new(),
+    });
+    let (tool, unknown, garbage) = (tool.encode().unwrap(), [200, 0xa0], [1]);
+    // (said first, what the packet that carries it is, descriptors before it)
+    let ways: [(Option<&[u8]>, &[u8], usize); 5] = [
+        (None, &unknown, 0),
+        // More than belong into any packet.
+        (None, &unknown, 7),
+        (None, &tool, 0),
+        (Some(&tool), &unknown, 0),
+        // The connection is over before it is read.
+        (Some(&garbage), &unknown, 0),
+    ];
+    let mut peers = Vec::new();
+    for (first, carrier, before) in ways {
+        let stranger = address.connect().unwrap();
+        if let Some(first) = first {
+            socket::send(&stranger, first, &[]).unwrap();
+        }
+        let (fd, peer) = reluctant();
+        send_away(&stranger, carrier, before, fd);
+        peers.push((peer, stranger));
+    }
+    let session = host.session("witness").unwrap();
+    let publisher = session.create_publisher(spec("/t")).unwrap();
+    let subscription = host.session("b").unwrap().create_subscription(spec("/t")).unwrap();
+    assert!(subscription.wait_matched(1, PATIENCE) && publisher.wait_matched(1, PATIENCE));
 }
 
 #[test]

@@ -1,9 +1,10 @@
 //! Who is taken as a session.
 
-use std::{os::fd::OwnedFd, sync::Arc};
+use std::sync::Arc;
 
 use crate::{
     config::{Config, security_settings},
+    passed::PassedFd,
     session::{
         message::{Hello, PROTOCOL, Refused, SessionRole},
         socket::Peer,
@@ -39,10 +40,10 @@ impl Admission {
     pub(super) fn check(
         &mut self,
         hello: &Hello,
-        descriptors: Vec<OwnedFd>,
+        descriptors: Vec<PassedFd>,
         peer: Peer,
         inside: bool,
-    ) -> Result<Option<[OwnedFd; 3]>, Box<Refused>> {
+    ) -> Result<Option<[PassedFd; 3]>, Box<Refused>> {
         if hello.protocol != PROTOCOL {
             let text =
                 format!("this daemon speaks session protocol {PROTOCOL}, not {}", hello.protocol);
@@ -63,15 +64,26 @@ impl Admission {
             self.compare(&hello.settings)?;
         }
         let count = descriptors.len();
-        let Ok([segment, doorbell, pidfd]) = <[OwnedFd; 3]>::try_from(descriptors) else {
+        let Ok([segment, doorbell, pidfd]) = <[PassedFd; 3]>::try_from(descriptors) else {
             return Err(plain(format!("HELLO came with {count} descriptors instead of three")));
         };
+        if peer.pid == 0 {
+            return Err(plain(
+                "its process is in a PID namespace that this daemon does not see: run both in one \
+                 (containers: --pid=host)"
+                    .into(),
+            ));
+        }
+        // The daemon reads it, and a read of anything else may block.
+        if !segment.is_memfd() {
+            return Err(plain("the segment in HELLO is no memfd".into()));
+        }
         let handed = PeerDescriptors { segment, doorbell, pidfd };
         if handed.process() != Some(peer.pid) {
             return Err(plain("the pidfd in HELLO is not the sender's own".into()));
         }
         let PeerDescriptors { segment, doorbell, pidfd } = handed;
-        Ok(Some([segment, doorbell, pidfd]))
+        Ok(Some([segment, doorbell, pidfd.harmless()]))
     }
 
     /// The files of the classic identity may change while the daemon runs: its gateway reads them
@@ -120,6 +132,8 @@ fn plain(text: String) -> Box<Refused> {
 
 #[cfg(test)]
 mod tests {
+    use std::os::fd::OwnedFd;
+
     use super::*;
     use crate::ids::SessionId;
 
@@ -203,7 +217,7 @@ mod tests {
     fn nobody_else_is_the_gateway_and_strangers_are_not_heard() {
         let gateway = Hello { role: SessionRole::Gateway, ..hello() };
         assert!(refusal(&gateway).text.contains("gateway"));
-        assert!(refusal(&Hello { protocol: 2, ..hello() }).text.contains("protocol"));
+        assert!(refusal(&Hello { protocol: PROTOCOL + 1, ..hello() }).text.contains("protocol"));
         assert!(refusal(&hello()).text.contains("0 descriptors"));
         assert!(admission().trusts(1000) && admission().trusts(1001) && !admission().trusts(0));
     }
@@ -211,13 +225,26 @@ mod tests {
     #[test]
     fn a_pidfd_of_another_process_is_refused() {
         use rustix::process::{Pid, PidfdFlags, pidfd_open};
-        let null = || OwnedFd::from(std::fs::File::open("/dev/null").unwrap());
+        let null = || PassedFd::from(OwnedFd::from(std::fs::File::open("/dev/null").unwrap()));
         let parent = rustix::process::getppid().unwrap();
-        let of = |pid: Pid| pidfd_open(pid, PidfdFlags::empty()).unwrap();
+        let of = |pid: Pid| PassedFd::from(pidfd_open(pid, PidfdFlags::empty()).unwrap());
         let peer = Peer { uid: 1000, pid: std::process::id() };
-        let check = |pidfd| admission().check(&hello(), vec![null(), null(), pidfd], peer, false);
+        let memfd = || {
+            let flags = rustix::fs::MemfdFlags::CLOEXEC;
+            PassedFd::from(rustix::fs::memfd_create("test", flags).unwrap())
+        };
+        let check = |pidfd| admission().check(&hello(), vec![memfd(), null(), pidfd], peer, false);
         assert!(check(of(parent)).unwrap_err().text.contains("pidfd"));
         assert!(check(null()).unwrap_err().text.contains("pidfd"));
-        assert!(check(of(rustix::process::getpid())).unwrap().is_some());
+        let own = || of(rustix::process::getpid());
+        assert!(check(own()).unwrap().is_some());
+        let fds = vec![null(), null(), own()];
+        let refused = admission().check(&hello(), fds, peer, false).unwrap_err();
+        assert!(refused.text.contains("memfd"));
+        // As SO_PEERCRED shows who is in a PID namespace of its own.
+        let hidden = Peer { pid: 0, ..peer };
+        let fds = vec![memfd(), null(), own()];
+        let refused = admission().check(&hello(), fds, hidden, false).unwrap_err();
+        assert!(refused.text.contains("PID namespace"));
     }
 }

@@ -71,7 +71,7 @@ impl Running {
                 Err(_) => "panicked; the log says where".to_owned(),
             });
         })?;
-        spawn_local(serve(control.clone(), ours, true, || ()));
+        spawn_local(serve(control.clone(), ours.into(), true, || ()));
         Ok(Self { orders, events, end })
     }
 

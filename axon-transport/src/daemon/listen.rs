@@ -13,9 +13,10 @@ use tokio::{io::unix::AsyncFd, sync::Notify, task::spawn_local, time::timeout};
 
 use super::{control::Control, watch::watch};
 use crate::{
-    ids::SessionId,
+    ids::{Gid, SessionId},
+    passed::PassedFd,
     session::{
-        message::{Hello, Message, PROTOCOL, Welcome},
+        message::{Hello, Message, PROTOCOL, Refused, Welcome},
         socket::{self, Peer, Received, SocketError},
     },
 };
@@ -42,6 +43,7 @@ pub(super) async fn accept(control: Rc<RefCell<Control>>, listener: OwnedFd) {
         match accepted {
             Ok(Ok(socket)) => {
                 let control = control.clone();
+                let socket = PassedFd::received(socket);
                 spawn_local(async move {
                     serve(control, socket, false, move || drop(permit)).await;
                 });
@@ -59,7 +61,7 @@ pub(super) async fn accept(control: Rc<RefCell<Control>>, listener: OwnedFd) {
 /// Serves one connection to its end. `known` is called when it is a stranger no more.
 pub(super) async fn serve(
     control: Rc<RefCell<Control>>,
-    socket: OwnedFd,
+    socket: PassedFd,
     inside: bool,
     known: impl FnOnce(),
 ) {
@@ -80,7 +82,7 @@ pub(super) async fn serve(
 /// Messages of unknown types that may come before HELLO.
 const UNKNOWN: u32 = 8;
 
-async fn first(socket: &AsyncFd<OwnedFd>) -> Option<(Hello, Vec<OwnedFd>)> {
+async fn first(socket: &AsyncFd<PassedFd>) -> Option<(Hello, Vec<PassedFd>)> {
     let mut buffer = Vec::new();
     let mut unknown = 0;
     loop {
@@ -90,19 +92,23 @@ async fn first(socket: &AsyncFd<OwnedFd>) -> Option<(Hello, Vec<OwnedFd>)> {
                 return Some((hello, descriptors));
             }
             // A later version may say something first; a flood would keep everybody else waiting.
-            Ok(Received { message: Message::Unknown(_), .. }) if unknown < UNKNOWN => unknown += 1,
+            Ok(Received { message: Message::Unknown(_), descriptors })
+                if unknown < UNKNOWN && descriptors.is_empty() =>
+            {
+                unknown += 1;
+            }
             Err(SocketError::NotReady) => ready.clear_ready(),
             Ok(_) | Err(_) => return None,
         }
     }
 }
 
-type Admitted = (SessionId, Rc<Notify>, Option<AsyncFd<OwnedFd>>);
+type Admitted = (SessionId, Rc<Notify>, Option<AsyncFd<PassedFd>>);
 
 fn admit(
     control: &Rc<RefCell<Control>>,
-    socket: &AsyncFd<OwnedFd>,
-    (mut hello, descriptors): (Hello, Vec<OwnedFd>),
+    socket: &AsyncFd<PassedFd>,
+    (mut hello, descriptors): (Hello, Vec<PassedFd>),
     peer: Peer,
     inside: bool,
 ) -> Option<Admitted> {
@@ -125,24 +131,31 @@ fn admit(
             return None;
         }
     };
-    // The id is the session's secret, but a mistake in one must not end another.
-    if control.registry.session(&hello.session).is_some_and(|s| s.pid != peer.pid) {
-        tracing::warn!(pid = peer.pid, "a session with another process's id was closed");
+    let refuse = |control: &mut Control, text: String| {
+        control.refused(format!("pid {}", peer.pid), "session".into(), text.clone());
+        let [variable, ours, theirs] = [const { String::new() }; 3];
+        say(Message::Refused(Refused { variable, ours, theirs, text }));
+    };
+    // Endpoints are named after their session's id: who has another's could end them.
+    if let Some(pid) = taken_by(control, &hello.session, peer.pid) {
+        refuse(control, format!("process {pid} has a session with this one's id or one like it"));
         return None;
     }
     let death = match &handed {
         Some([_, _, pidfd]) => Some(watch(pidfd.try_clone().ok()?).ok()?),
         None => None,
     };
-    let pid = std::process::id();
-    if !say(Message::Welcome(Welcome { protocol: PROTOCOL, daemon: control.id, pid })) {
-        return None;
-    }
     let Hello { session, role, name, .. } = hello;
     tracing::debug!(%session, name, pid = peer.pid, "a session");
     let handed = handed.map(|fds| fds.map(Arc::new));
     if let Err(violation) = control.registry.connect(session, role, name, peer.pid, handed) {
-        control.refused(format!("pid {}", peer.pid), "session".into(), violation.to_string());
+        refuse(control, violation.to_string());
+        return None;
+    }
+    let pid = std::process::id();
+    if !say(Message::Welcome(Welcome { protocol: PROTOCOL, daemon: control.id, pid })) {
+        control.registry.disconnect(&session);
+        control.settle();
         return None;
     }
     let bell = control.add_waker(session);
@@ -150,12 +163,22 @@ fn admit(
     Some((session, bell, death))
 }
 
+/// The process of a session whose endpoints have the same GIDs as those of `session`, of process
+/// `pid`, would have. The session itself may come back.
+fn taken_by(control: &Control, session: &SessionId, pid: u32) -> Option<u32> {
+    let alike = |id: &SessionId| Gid::new(*id, 0) == Gid::new(*session, 0);
+    let mut others = control.registry.sessions();
+    others
+        .find(|(id, entry)| alike(id) && (*id != session || entry.pid != pid))
+        .map(|(_, entry)| entry.pid)
+}
+
 async fn converse(
     control: &Rc<RefCell<Control>>,
-    socket: &AsyncFd<OwnedFd>,
+    socket: &AsyncFd<PassedFd>,
     id: SessionId,
     bell: &Rc<Notify>,
-    death: Option<&AsyncFd<OwnedFd>>,
+    death: Option<&AsyncFd<PassedFd>>,
 ) -> String {
     let mut buffer = Vec::new();
     loop {
@@ -195,7 +218,7 @@ async fn converse(
 /// Sends what waits for a session; whether some is left because the socket is full.
 fn send_all(
     control: &Rc<RefCell<Control>>,
-    socket: &AsyncFd<OwnedFd>,
+    socket: &AsyncFd<PassedFd>,
     id: &SessionId,
     bell: &Rc<Notify>,
 ) -> Result<bool, SocketError> {
@@ -224,7 +247,7 @@ fn send_all(
 /// Takes a batch of packets; whether the socket is empty now.
 fn receive_some(
     control: &Rc<RefCell<Control>>,
-    socket: &AsyncFd<OwnedFd>,
+    socket: &AsyncFd<PassedFd>,
     id: &SessionId,
     bell: &Rc<Notify>,
     buffer: &mut Vec<u8>,
@@ -237,6 +260,13 @@ fn receive_some(
     for _ in 0..BATCH {
         match socket::receive(socket.get_ref(), buffer) {
             Ok(Received { message: Message::StatusRequest, .. }) => control.send_status(id),
+            // The one thing that is handed over after HELLO, and the only one that the daemon reads:
+            // reading anything else may block.
+            Ok(Received { descriptors, .. }) if !descriptors.iter().all(PassedFd::is_memfd) => {
+                tracing::warn!(session = %id, "a session that sent no memfd was disconnected");
+                outcome = Err("it sent a descriptor that is no memfd".into());
+                break;
+            }
             Ok(Received { message, descriptors }) => {
                 let descriptors = descriptors.into_iter().map(Arc::new).collect();
                 if let Err(violation) = control.registry.message(id, message, descriptors) {
@@ -262,7 +292,7 @@ fn receive_some(
     outcome
 }
 
-async fn ended(death: Option<&AsyncFd<OwnedFd>>) {
+async fn ended(death: Option<&AsyncFd<PassedFd>>) {
     match death {
         Some(pidfd) => drop(pidfd.readable().await),
         None => std::future::pending().await,

@@ -3,11 +3,7 @@
 //! Counters of samples are read from the rings' and segments' descriptors, at the offsets of
 //! `docs/formats.md`, section 9: the daemon maps no session's memory.
 
-use std::{
-    collections::BTreeMap,
-    os::fd::{AsFd, OwnedFd},
-    sync::Arc,
-};
+use std::{collections::BTreeMap, os::fd::AsFd, sync::Arc};
 
 use super::{
     control::Control,
@@ -17,6 +13,7 @@ use super::{
 use crate::{
     config::{KeyMode, Security},
     graph::{Endpoint, EndpointKind},
+    passed::PassedFd,
     session::message::{EndpointRole, PROTOCOL, SessionRole},
 };
 
@@ -73,7 +70,7 @@ pub(super) fn status(control: &Control) -> Status {
     }
 }
 
-fn topics(registry: &Registry<Arc<OwnedFd>>) -> Vec<TopicStatus> {
+fn topics(registry: &Registry<Arc<PassedFd>>) -> Vec<TopicStatus> {
     let mut topics: BTreeMap<(String, String), TopicStatus> = BTreeMap::new();
     for local in registry.endpoints().filter(|e| e.endpoint.kind != EndpointKind::Node) {
         let topic = entry(&mut topics, &local.endpoint);
@@ -125,12 +122,12 @@ fn entry<'a>(
     })
 }
 
-fn ring_head(local: &LocalEndpoint<Arc<OwnedFd>>) -> u64 {
+fn ring_head(local: &LocalEndpoint<Arc<PassedFd>>) -> u64 {
     local.ring.as_ref().map_or(0, |ring| word(ring, RING_HEAD))
 }
 
 /// A word of shared memory; 0 when it is not there.
-fn word(memory: &OwnedFd, offset: u64) -> u64 {
+fn word(memory: &PassedFd, offset: u64) -> u64 {
     let mut bytes = [0; 8];
     match rustix::io::pread(memory.as_fd(), &mut bytes, offset) {
         Ok(8) => u64::from_ne_bytes(bytes),

@@ -2,13 +2,15 @@
 
 #![allow(unsafe_code)]
 
-use std::{io, os::fd::OwnedFd};
+use std::io;
 
 use tokio::io::unix::AsyncFd;
 
+use crate::passed::PassedFd;
+
 /// Has the current runtime watch a descriptor.
-pub(crate) fn watch(fd: OwnedFd) -> io::Result<AsyncFd<OwnedFd>> {
-    // SAFETY: an `OwnedFd` is always the same open descriptor, nobody else closes it, and
+pub(crate) fn watch(fd: impl Into<PassedFd>) -> io::Result<AsyncFd<PassedFd>> {
+    // SAFETY: a `PassedFd` is always the same open descriptor, nobody else closes it, and
     // `AsyncFd` removes it from the reactor before it drops it.
-    unsafe { AsyncFd::register(fd) }.map_err(Into::into)
+    unsafe { AsyncFd::register(fd.into()) }.map_err(Into::into)
 }

@@ -1,18 +1,15 @@
 //! A session without a daemon (`AXON_DAEMON=off`): the registry that a daemon would keep, for this
 //! session alone, so that its own endpoints find each other in the usual way.
 
-use std::{
-    os::fd::{AsFd, OwnedFd},
-    sync::Arc,
-};
+use std::sync::Arc;
 
 use super::message::{Message, SessionRole};
-use crate::{daemon::registry::Registry, ids::SessionId};
+use crate::{daemon::registry::Registry, ids::SessionId, passed::PassedFd};
 
 #[derive(Debug)]
 pub(super) struct Local {
     id: SessionId,
-    registry: Registry<Arc<OwnedFd>>,
+    registry: Registry<Arc<PassedFd>>,
 }
 
 impl Local {
@@ -26,8 +23,8 @@ impl Local {
     /// What a daemon would answer to nothing, or to a message.
     pub(super) fn exchange(
         &mut self,
-        message: Option<(Message, Vec<OwnedFd>)>,
-    ) -> Vec<(Message, Vec<OwnedFd>)> {
+        message: Option<(Message, Vec<PassedFd>)>,
+    ) -> Vec<(Message, Vec<PassedFd>)> {
         if let Some((message, descriptors)) = message {
             let descriptors = descriptors.into_iter().map(Arc::new).collect();
             if let Err(violation) = self.registry.message(&self.id, message, descriptors) {
@@ -37,8 +34,8 @@ impl Local {
         self.registry.flush();
         let mut answers = Vec::new();
         while let Some(output) = self.registry.next_output(&self.id) {
-            let descriptors: std::io::Result<Vec<OwnedFd>> =
-                output.descriptors.iter().map(|d| d.as_fd().try_clone_to_owned()).collect();
+            let descriptors: std::io::Result<Vec<PassedFd>> =
+                output.descriptors.iter().map(|d| d.try_clone()).collect();
             match (Message::decode(&output.packet), descriptors) {
                 (Ok(message), Ok(descriptors)) => answers.push((message, descriptors)),
                 (message, descriptors) => {

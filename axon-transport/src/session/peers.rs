@@ -6,13 +6,13 @@
 
 use std::{
     collections::{HashMap, HashSet, hash_map::Entry as Slot},
-    os::fd::OwnedFd,
     sync::Arc,
 };
 
 use super::message::Pair;
 use crate::{
     ids::SessionId,
+    passed::PassedFd,
     shm::{Peer, PeerDescriptors, PeerSession, SessionSegment, ShmError},
 };
 
@@ -45,7 +45,7 @@ impl Peers {
         &mut self,
         id: SessionId,
         pair: Pair,
-        descriptors: Vec<OwnedFd>,
+        descriptors: Vec<PassedFd>,
     ) -> Result<Peer, PeerError> {
         if id == self.own.id() {
             return Ok(Peer::Local(self.own.clone()));
@@ -54,7 +54,7 @@ impl Peers {
             Slot::Occupied(held) => held.into_mut(),
             Slot::Vacant(slot) => {
                 let [segment, doorbell, pidfd] =
-                    <[OwnedFd; 3]>::try_from(descriptors).map_err(|_| PeerError::Missing)?;
+                    <[PassedFd; 3]>::try_from(descriptors).map_err(|_| PeerError::Missing)?;
                 let session = PeerSession::map(id, PeerDescriptors { segment, doorbell, pidfd })?;
                 slot.insert(Entry { session, pairs: HashSet::new() })
             }

@@ -1,20 +1,23 @@
 //! One packet of the session socket: bytes and descriptors, sent and received without blocking.
 
+#![allow(unsafe_code)]
+
 use std::{
     io::{IoSlice, IoSliceMut},
     mem::MaybeUninit,
-    os::fd::{AsFd, BorrowedFd, OwnedFd},
+    os::fd::{AsFd, AsRawFd, BorrowedFd},
 };
 
 use rustix::{
     io::Errno,
     net::{
         RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, ReturnFlags, SendAncillaryBuffer,
-        SendAncillaryMessage, SendFlags, recvmsg, sendmsg, sockopt,
+        SendAncillaryMessage, SendFlags, recvmsg, sendmsg,
     },
 };
 
 use super::message::{CodecError, MAX_DESCRIPTORS, MAX_PACKET, Message};
+use crate::passed::PassedFd;
 
 /// A message that arrived, and what came with it.
 #[derive(Debug)]
@@ -22,7 +25,7 @@ pub struct Received {
     /// The message.
     pub message: Message,
     /// Its descriptors, close-on-exec.
-    pub descriptors: Vec<OwnedFd>,
+    pub descriptors: Vec<PassedFd>,
 }
 
 /// Why a packet was not sent or received.
@@ -41,6 +44,12 @@ pub enum SocketError {
     /// More descriptors, or a longer packet, than the protocol allows.
     #[error("a packet with more bytes or descriptors than the protocol allows")]
     Truncated,
+    /// This process can hold no more descriptors, so that a packet lost some.
+    #[error(
+        "this process has no descriptors left for those that came with a packet: raise its \
+         RLIMIT_NOFILE (ulimit -n)"
+    )]
+    NoDescriptors,
     /// The system refused.
     #[error("{0}")]
     System(Errno),
@@ -62,18 +71,37 @@ impl From<Errno> for SocketError {
 pub struct Peer {
     /// Its user.
     pub uid: u32,
-    /// Its process.
+    /// Its process; 0 when that is in a PID namespace which this one does not see.
     pub pid: u32,
 }
+
+/// The most descriptors that the system lets a packet carry.
+const SCM_MAX_FD: usize = 253;
 
 /// Who is at the other end (SO_PEERCRED).
 ///
 /// # Errors
 /// What the system says.
 pub fn peer(socket: impl AsFd) -> Result<Peer, SocketError> {
-    let credentials = sockopt::socket_peercred(socket).map_err(SocketError::System)?;
-    let pid = u32::try_from(credentials.pid.as_raw_nonzero().get()).unwrap_or(0);
-    Ok(Peer { uid: credentials.uid.as_raw(), pid })
+    // Not rustix's: its process ids are never 0, as this one may be.
+    let mut found = libc::ucred { pid: 0, uid: u32::MAX, gid: u32::MAX };
+    let mut len = libc::socklen_t::try_from(size_of::<libc::ucred>()).expect("a few bytes");
+    // SAFETY: the option's value is a `ucred`, of which all bit patterns are valid; `len` says how
+    // long it is, and both live as long as the call.
+    let done = unsafe {
+        libc::getsockopt(
+            socket.as_fd().as_raw_fd(),
+            libc::SOL_SOCKET,
+            libc::SO_PEERCRED,
+            (&raw mut found).cast(),
+            &raw mut len,
+        )
+    };
+    if done != 0 {
+        let errno = std::io::Error::last_os_error().raw_os_error().unwrap_or(libc::EINVAL);
+        return Err(SocketError::System(Errno::from_raw_os_error(errno)));
+    }
+    Ok(Peer { uid: found.uid, pid: u32::try_from(found.pid).unwrap_or(0) })
 }
 
 /// Sends one packet.
@@ -109,7 +137,8 @@ pub fn send(
 /// [`SocketError::NotReady`] when there is none. Every other error is final for the connection.
 pub fn receive(socket: impl AsFd, buffer: &mut Vec<u8>) -> Result<Received, SocketError> {
     buffer.resize(MAX_PACKET + 1, 0);
-    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(MAX_DESCRIPTORS))];
+    // All that can come: what did not fit the kernel would close in this thread.
+    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(SCM_MAX_FD))];
     let mut control = RecvAncillaryBuffer::new(&mut space);
     let flags = RecvFlags::DONTWAIT | RecvFlags::CMSG_CLOEXEC;
     let got = loop {
@@ -121,11 +150,14 @@ pub fn receive(socket: impl AsFd, buffer: &mut Vec<u8>) -> Result<Received, Sock
     let mut descriptors = Vec::new();
     for message in control.drain() {
         if let RecvAncillaryMessage::ScmRights(received) = message {
-            descriptors.extend(received);
+            descriptors.extend(received.map(PassedFd::received));
         }
     }
-    if got.flags.intersects(ReturnFlags::TRUNC | ReturnFlags::CTRUNC) {
+    if got.flags.contains(ReturnFlags::TRUNC) || descriptors.len() > MAX_DESCRIPTORS {
         return Err(SocketError::Truncated);
+    }
+    if got.flags.contains(ReturnFlags::CTRUNC) {
+        return Err(SocketError::NoDescriptors);
     }
     if got.bytes == 0 {
         return Err(SocketError::Closed);
@@ -135,6 +167,8 @@ pub fn receive(socket: impl AsFd, buffer: &mut Vec<u8>) -> Result<Received, Sock
 
 #[cfg(test)]
 mod tests {
+    use std::os::fd::OwnedFd;
+
     use rustix::net::{AddressFamily, SocketFlags, SocketType, socketpair};
 
     use super::*;

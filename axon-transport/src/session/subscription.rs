@@ -17,6 +17,7 @@ use crate::{
     ids::Gid,
     qos::History,
     shm::{Grant, Lane, Meta, Reader, Sample, TakeError},
+    wait::Look,
 };
 
 /// Publishers whose last sequence number is remembered after they are gone.
@@ -76,7 +77,7 @@ impl Subscription {
         take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
     ) -> Option<(MessageInfo, T)> {
         // A thread of the parent may have held the lock when this process was forked.
-        if self.session.shared().segment.is_forked() {
+        if self.session.is_forked() {
             tracing::error!("a subscription of the parent process is used after fork");
             return None;
         }
@@ -99,7 +100,8 @@ impl Subscription {
                 return Some(info);
             }
             let left = deadline.map(|d| d.saturating_duration_since(std::time::Instant::now()));
-            if left.is_some_and(|l| l.is_zero()) || !self.session.wait(|| self.has_data(), left) {
+            let look = Arc::clone(&self.inner);
+            if left.is_some_and(|l| l.is_zero()) || !self.session.segment().wait_for(look, left) {
                 return None;
             }
         }
@@ -107,12 +109,14 @@ impl Subscription {
 
     /// Whether there is something to take.
     pub fn has_data(&self) -> bool {
-        let forked = self.session.shared().segment.is_forked();
-        !forked && self.inner.lock().slots.iter().any(|s| s.reader.has_data())
+        !self.session.is_forked() && self.inner.lock().has_data()
     }
 
     /// The publishers it receives from.
     pub fn matched(&self) -> Vec<Gid> {
+        if self.session.is_forked() {
+            return Vec::new();
+        }
         let slots = self.inner.lock();
         slots.slots.iter().filter(|s| !s.over).map(|s| s.reader.writer()).collect()
     }
@@ -124,17 +128,23 @@ impl Subscription {
 
     /// Samples that were overwritten before they were taken.
     pub fn lost(&self) -> u64 {
+        if self.session.is_forked() {
+            return 0;
+        }
         let slots = self.inner.lock();
         slots.lost + slots.slots.iter().map(|s| s.reader.lost()).sum::<u64>()
     }
 
     /// Samples taken.
     pub fn received(&self) -> u64 {
-        self.inner.lock().received
+        if self.session.is_forked() { 0 } else { self.inner.lock().received }
     }
 
     /// For a relay: the remote subscriptions that it stands for from now on.
     pub fn set_stands_for(&self, gids: Vec<Gid>) {
+        if self.session.is_forked() {
+            return;
+        }
         *lock(&self.inner.stands_for) = gids;
         self.session.renew(self.gid());
     }
@@ -207,7 +217,21 @@ impl SubscriptionInner {
     }
 }
 
+impl Look for SubscriptionInner {
+    fn ready(&self) -> bool {
+        match self.slots.try_lock() {
+            Ok(slots) => slots.has_data(),
+            // Whoever has it may be about to add something.
+            Err(_) => true,
+        }
+    }
+}
+
 impl Slots {
+    fn has_data(&self) -> bool {
+        self.slots.iter().any(|slot| slot.reader.has_data())
+    }
+
     /// The lane that is, or from now on will be, the one for `writer`.
     pub(super) fn lane_for<E>(
         &mut self,
@@ -356,8 +380,19 @@ impl Slots {
         None
     }
 
-    /// The slot whose next sample is the oldest, of those that are not faster than we are.
+    /// The slot whose next sample is the oldest, of those that are not faster than we are. What a
+    /// writer wrote before it granted anew comes before what it wrote since, whatever its clock
+    /// says: taken the other way round it would count as repeated.
     fn oldest(&mut self) -> Option<usize> {
+        let index = self.oldest_by_time()?;
+        let writer = self.slots[index].reader.writer();
+        let earlier = self.slots[..index].iter().position(|slot| {
+            slot.over && !slot.overtaken && slot.reader.writer() == writer && slot.reader.has_data()
+        });
+        Some(earlier.unwrap_or(index))
+    }
+
+    fn oldest_by_time(&mut self) -> Option<usize> {
         if let [slot] = self.slots.as_slice() {
             return (!slot.overtaken && slot.reader.has_data()).then_some(0);
         }

@@ -4,7 +4,7 @@
 use std::{
     io::{self, IoSlice, IoSliceMut},
     mem::MaybeUninit,
-    os::fd::{AsFd, BorrowedFd, OwnedFd},
+    os::fd::{AsFd, BorrowedFd},
     time::{Duration, Instant},
 };
 
@@ -21,13 +21,16 @@ use rustix::{
 use super::{PeerDescriptors, ShmError, Writer};
 use crate::{
     ids::{Gid, SessionId},
+    passed::PassedFd,
     qos::{Incompatible, Qos},
 };
 
 /// First of each packet.
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 const MAX_PACKET: usize = 1024;
 const MAX_DESCRIPTORS: usize = 4;
+/// The most descriptors that the system lets a packet carry.
+const SCM_MAX_FD: usize = 253;
 /// The longest reason that is told.
 const MAX_REASON: usize = 256;
 
@@ -162,7 +165,7 @@ impl<'a> Channel<'a> {
     pub(super) fn await_granted(
         &self,
         reader: Gid,
-    ) -> Result<(Granted, PeerDescriptors, OwnedFd), ConnectError> {
+    ) -> Result<(Granted, PeerDescriptors, PassedFd), ConnectError> {
         loop {
             match self.receive()? {
                 (Packet::Granted(granted), fds) if granted.reader == reader => {
@@ -209,9 +212,10 @@ impl<'a> Channel<'a> {
         }
     }
 
-    fn receive(&self) -> Result<(Packet, Vec<OwnedFd>), ConnectError> {
+    fn receive(&self) -> Result<(Packet, Vec<PassedFd>), ConnectError> {
         let mut bytes = [0; MAX_PACKET];
-        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(MAX_DESCRIPTORS))];
+        // All that can come: what did not fit the kernel would close in this thread.
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(SCM_MAX_FD))];
         loop {
             let mut control = RecvAncillaryBuffer::new(&mut space);
             let flags = RecvFlags::DONTWAIT | RecvFlags::CMSG_CLOEXEC;
@@ -228,7 +232,7 @@ impl<'a> Channel<'a> {
             let mut fds = Vec::new();
             for message in control.drain() {
                 if let RecvAncillaryMessage::ScmRights(rights) = message {
-                    fds.extend(rights);
+                    fds.extend(rights.map(PassedFd::received));
                 }
             }
             if got.bytes == 0 {

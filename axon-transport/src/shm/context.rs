@@ -61,7 +61,8 @@ impl Context {
         self.session().notify();
     }
 
-    /// A descriptor for an event loop, which becomes readable when there is something to look for.
+    /// A descriptor for an event loop, asynchronous ones too, which becomes readable when there is
+    /// something to look for. How to use it, with an example: [`ExternalLeader`].
     ///
     /// # Errors
     /// The context has one already.

@@ -2,18 +2,16 @@
 
 use std::{
     fs, io,
-    os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd},
+    os::fd::{AsFd, AsRawFd, BorrowedFd},
     sync::{Arc, atomic::AtomicU64},
 };
 
-use rustix::{
-    event::{PollFd, PollFlags, Timespec, poll},
-    fs::{OFlags, fcntl_getfl, fcntl_setfl},
-};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::{SessionSegment, ShmError, layout, memory::Map};
 use crate::{
     ids::SessionId,
+    passed::PassedFd,
     wait::{Bell, Purpose, due},
 };
 
@@ -22,11 +20,11 @@ use crate::{
 #[derive(Debug)]
 pub struct PeerDescriptors {
     /// Its session segment.
-    pub segment: OwnedFd,
-    /// The eventfd that wakes it.
-    pub doorbell: OwnedFd,
+    pub segment: PassedFd,
+    /// What wakes it: one end of a pair of unix sockets that keep packets apart.
+    pub doorbell: PassedFd,
     /// The pidfd of its process.
-    pub pidfd: OwnedFd,
+    pub pidfd: PassedFd,
 }
 
 impl PeerDescriptors {
@@ -45,7 +43,7 @@ impl PeerDescriptors {
     /// The process that the pidfd refers to, to be compared with the credentials of the socket
     /// it came over. `None` when it is no pidfd, or its process has ended.
     pub fn process(&self) -> Option<u32> {
-        let path = format!("/proc/self/fdinfo/{}", self.pidfd.as_raw_fd());
+        let path = format!("/proc/self/fdinfo/{}", self.pidfd.as_fd().as_raw_fd());
         let text = fs::read_to_string(path).ok()?;
         let pid = text.lines().find_map(|line| line.strip_prefix("Pid:"))?;
         // -1 once the process has been reaped.
@@ -59,7 +57,7 @@ pub struct PeerSession {
     map: Map,
     lanes: u32,
     bell: Bell,
-    pidfd: OwnedFd,
+    pidfd: PassedFd,
     /// The last ticket of each of its armed words that this process rang for.
     rung: [AtomicU64; 2],
 }
@@ -71,17 +69,12 @@ impl PeerSession {
     /// The descriptors are not those of a session, or not of this one.
     pub fn map(id: SessionId, descriptors: PeerDescriptors) -> Result<Arc<Self>, ShmError> {
         let PeerDescriptors { segment, doorbell, pidfd } = descriptors;
-        check_doorbell(&doorbell)?;
+        let bell = Bell::received(doorbell).ok_or(ShmError::Refused {
+            what: "its doorbell is no unix socket that keeps packets",
+        })?;
         let map = Map::open(segment.as_fd())?;
         let lanes = layout::read_session(map.words(), id)?;
-        Ok(Arc::new(Self {
-            id,
-            map,
-            lanes,
-            bell: Bell::new(doorbell),
-            pidfd,
-            rung: Default::default(),
-        }))
+        Ok(Arc::new(Self { id, map, lanes, bell, pidfd, rung: Default::default() }))
     }
 
     /// Its id.
@@ -109,20 +102,6 @@ impl PeerSession {
             self.bell.ring();
         }
     }
-}
-
-/// Ringing must never block, which it could on a descriptor of another kind.
-fn check_doorbell(fd: &OwnedFd) -> Result<(), ShmError> {
-    let kind = fs::read_link(format!("/proc/self/fd/{}", fd.as_raw_fd()));
-    if !kind.is_ok_and(|kind| kind.as_os_str() == "anon_inode:[eventfd]") {
-        return Err(ShmError::Refused { what: "its doorbell is not an eventfd" });
-    }
-    let flags = fcntl_getfl(fd).map_err(ShmError::system("reading a doorbell's flags"))?;
-    if !flags.contains(OFlags::NONBLOCK) {
-        fcntl_setfl(fd, flags | OFlags::NONBLOCK)
-            .map_err(ShmError::system("making a doorbell non-blocking"))?;
-    }
-    Ok(())
 }
 
 /// The session at the other end of a ring.

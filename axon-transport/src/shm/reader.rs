@@ -1,7 +1,7 @@
 //! The taking end of a ring.
 
 use std::{
-    os::fd::{AsFd, OwnedFd},
+    os::fd::AsFd,
     sync::{Arc, atomic::AtomicU64},
 };
 
@@ -70,7 +70,7 @@ impl Reader {
     ///
     /// # Errors
     /// The descriptor is not a ring, or not this publisher's.
-    pub fn map(ring: OwnedFd, options: ReaderOptions) -> Result<Self, ShmError> {
+    pub fn map(ring: impl AsFd, options: ReaderOptions) -> Result<Self, ShmError> {
         let ReaderOptions { reader, writer, peer, lane, grant, qos, max_message } = options;
         if lane.is_forked() {
             return Err(ShmError::Forked);

@@ -11,7 +11,8 @@ use rustix::process::{PidfdFlags, getpid, pidfd_open};
 use super::{Lane, PeerDescriptors, ShmError, layout, memory::Segment};
 use crate::{
     ids::SessionId,
-    wait::{Doorbell, ExternalLeader, Purpose, due},
+    passed::PassedFd,
+    wait::{Doorbell, ExternalLeader, Look, Purpose, due},
 };
 
 /// The memory, doorbell and identity by which other sessions know this one.
@@ -75,6 +76,7 @@ impl SessionSegment {
     pub fn descriptors(&self) -> Result<PeerDescriptors, ShmError> {
         let clone = |fd: BorrowedFd<'_>| {
             fd.try_clone_to_owned()
+                .map(PassedFd::from)
                 .map_err(|source| ShmError::System { what: "duplicating a descriptor", source })
         };
         Ok(PeerDescriptors {
@@ -84,9 +86,9 @@ impl SessionSegment {
         })
     }
 
-    /// The eventfd that is readable when this session was rung.
+    /// An epoll instance that is readable when this session was rung.
     pub fn doorbell(&self) -> BorrowedFd<'_> {
-        self.doorbell.bell().as_fd()
+        self.doorbell.as_fd()
     }
 
     /// A lane for a reader that is about to attach.
@@ -125,7 +127,17 @@ impl SessionSegment {
         if self.segment.is_forked() {
             return ready();
         }
-        self.doorbell.wait(self.armed_word(Purpose::Samples), Purpose::Samples, ready, &[], timeout)
+        self.doorbell.wait(self.armed_words(), Purpose::Samples, ready, None, &[], timeout)
+    }
+
+    /// As [`wait`](Self::wait), for something that other threads can look for too: this one is
+    /// woken only when it is there.
+    pub(crate) fn wait_for(&self, look: Arc<dyn Look>, timeout: Option<Duration>) -> bool {
+        if self.segment.is_forked() {
+            return look.ready();
+        }
+        let (words, ready) = (self.armed_words(), || look.ready());
+        self.doorbell.wait(words, Purpose::Samples, ready, Some(look.clone()), &[], timeout)
     }
 
     /// Makes every waiter of this session look again.
@@ -153,8 +165,8 @@ impl SessionSegment {
         others: &[BorrowedFd<'_>],
         timeout: Duration,
     ) -> bool {
-        let word = self.armed_word(Purpose::Room);
-        self.doorbell.wait(word, Purpose::Room, ready, others, Some(timeout))
+        let words = self.armed_words();
+        self.doorbell.wait(words, Purpose::Room, ready, None, others, Some(timeout))
     }
 
     pub(crate) fn doorbell_hub(&self) -> &Doorbell {
@@ -168,9 +180,13 @@ impl SessionSegment {
         }]
     }
 
+    pub(crate) fn armed_words(&self) -> [&AtomicU64; 2] {
+        [self.armed_word(Purpose::Samples), self.armed_word(Purpose::Room)]
+    }
+
     pub(super) fn ring_if(&self, purpose: Purpose) {
         if due(self.armed_word(purpose), &self.rung[purpose as usize]) {
-            self.doorbell.bell().ring();
+            self.doorbell.ring_own();
         }
     }
 

@@ -1,18 +1,18 @@
 //! The doorbell of a session and the threads that wait for it.
 
 use std::{
-    os::fd::{AsFd, BorrowedFd, OwnedFd},
+    os::fd::{AsFd, BorrowedFd},
     sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, atomic::AtomicU64},
     time::{Duration, Instant},
 };
 
-use rustix::{
-    event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll},
-    io::{Errno, read, write},
-};
+use rustix::{event::Timespec, io::Errno};
 
-use super::{arm, disarm};
-use crate::shm::SessionSegment;
+use super::{
+    Bell, arm, disarm,
+    ear::{CLOSED, Ear, Heard, LONGEST},
+    spin::Spin,
+};
 
 /// What a waiter waits for; each has its own armed word.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -23,38 +23,28 @@ pub(crate) enum Purpose {
     Room = 1,
 }
 
-const PURPOSES: [Purpose; 2] = [Purpose::Samples, Purpose::Room];
+pub(super) const PURPOSES: [Purpose; 2] = [Purpose::Samples, Purpose::Room];
 
-/// The ringing end of a doorbell: an eventfd, ours or another session's.
-pub(crate) struct Bell(OwnedFd);
+/// The armed words, in the order of [`PURPOSES`].
+pub(crate) type Words<'a> = [&'a AtomicU64; 2];
 
-impl Bell {
-    pub(crate) fn new(fd: OwnedFd) -> Self {
-        Self(fd)
-    }
-
-    /// Rings. That the counter is full is as good: then it is readable already.
-    pub(crate) fn ring(&self) {
-        let _ = write(&self.0, &1u64.to_ne_bytes());
-    }
+/// What another thread may ask for a waiter: whether there is what it waits for.
+pub(crate) trait Look: Send + Sync {
+    /// Must be quick, and must not wait for a thread that waits.
+    fn ready(&self) -> bool;
 }
 
-impl AsFd for Bell {
-    fn as_fd(&self) -> BorrowedFd<'_> {
-        self.0.as_fd()
-    }
-}
-
-/// The waiting end: who of this process sleeps, and who of them polls for all.
+/// Who of this process sleeps, and who of them listens for all.
 ///
-/// One waiter leads: it polls the eventfd, takes the rings that came and wakes the others, which
-/// sleep on a condition variable until something happened since they armed. All tickets are given
-/// out under the lock, so the armed words only rise and a ringer never mistakes a new ticket for
-/// one it has rung for.
+/// One waiter leads: it listens to the bell, and when it rang, wakes those of the others that may
+/// have something. These sleep until then. All tickets are given out under the lock, so the armed
+/// words only rise and a ringer never mistakes a new ticket for one it has rung for.
 pub(crate) struct Doorbell {
-    bell: Bell,
+    ear: Ear,
     crowd: Mutex<Crowd>,
-    turn: Condvar,
+    spin: Spin,
+    /// Where a leader that is to make way says that it has.
+    way: Condvar,
 }
 
 #[derive(Default)]
@@ -66,6 +56,14 @@ struct Crowd {
     leader: Leader,
     /// What the external leader has armed.
     external: [bool; 2],
+    followers: Vec<Arc<Follower>>,
+    /// Rings whose events have come stand in the queue. They are taken before the next ticket is
+    /// given out, which is before anybody can rely on an event of one that is taken with them.
+    queued: bool,
+    /// Another process closed the bell for all.
+    closed: bool,
+    /// An event loop is about to lead.
+    coming: bool,
 }
 
 #[derive(Default, PartialEq, Eq)]
@@ -76,25 +74,43 @@ enum Leader {
     External,
 }
 
+/// A waiter that sleeps while another one listens.
+struct Follower {
+    turn: Condvar,
+    look: Option<Arc<dyn Look>>,
+}
+
 impl Doorbell {
     pub(crate) fn new() -> Result<Self, Errno> {
-        let fd = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?;
-        Ok(Self { bell: Bell::new(fd), crowd: Mutex::default(), turn: Condvar::new() })
+        Ok(Self {
+            ear: Ear::new()?,
+            crowd: Mutex::default(),
+            spin: Spin::new(),
+            way: Condvar::new(),
+        })
     }
 
+    /// The end that others ring.
     pub(crate) fn bell(&self) -> &Bell {
-        &self.bell
+        self.ear.bell()
+    }
+
+    /// Rings from this very process, whatever others do to the bell.
+    pub(crate) fn ring_own(&self) {
+        self.ear.knock();
     }
 
     /// Waits until `ready`, asked again after each ring, each [`Doorbell::notify`] and each event
     /// on `others`, or until `timeout` has passed. Returns what `ready` said last.
     ///
-    /// `word` is the armed word of `purpose`. A thread that follows does not see `others`.
+    /// A thread that follows does not see `others`. With `look`, which must say what `ready` says,
+    /// it is woken for nothing else but its turn to lead.
     pub(crate) fn wait(
         &self,
-        word: &AtomicU64,
+        words: Words<'_>,
         purpose: Purpose,
         mut ready: impl FnMut() -> bool,
+        look: Option<Arc<dyn Look>>,
         others: &[BorrowedFd<'_>],
         timeout: Option<Duration>,
     ) -> bool {
@@ -102,23 +118,27 @@ impl Doorbell {
             return true;
         }
         let deadline = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
+        if self.spin.look(&mut ready, deadline) {
+            return true;
+        }
+        let start = Instant::now();
         // Also when `ready` panics.
-        let _waiting = Waiting::new(self, word, purpose);
+        let _waiting = Waiting::new(self, words, purpose);
         loop {
             let armed_at = {
                 let mut crowd = self.lock();
-                crowd.ticket += 1;
-                arm(word, crowd.ticket);
+                crowd.arm(&self.ear, &[words[purpose as usize]]);
                 crowd.epoch
             };
             if ready() {
+                self.spin.slept(start.elapsed());
                 return true;
             }
             let left = deadline.map(|deadline| deadline.saturating_duration_since(Instant::now()));
             if left.is_some_and(|left| left.is_zero()) {
                 return false;
             }
-            self.sleep(armed_at, others, left);
+            self.sleep(words, armed_at, look.as_ref(), others, left);
         }
     }
 
@@ -126,43 +146,157 @@ impl Doorbell {
     pub(crate) fn notify(&self) {
         let mut crowd = self.lock();
         crowd.epoch += 1;
-        let polled = crowd.leader != Leader::None;
+        crowd.followers.iter().for_each(|follower| follower.turn.notify_one());
+        let heard = crowd.leader != Leader::None;
         drop(crowd);
-        self.turn.notify_all();
-        if polled {
-            self.bell.ring();
+        if heard {
+            self.ear.knock();
         }
     }
 
     /// Sleeps until something happened after epoch `armed_at`, or for `left`.
-    fn sleep(&self, armed_at: u64, others: &[BorrowedFd<'_>], left: Option<Duration>) {
+    fn sleep(
+        &self,
+        words: Words<'_>,
+        armed_at: u64,
+        look: Option<&Arc<dyn Look>>,
+        others: &[BorrowedFd<'_>],
+        left: Option<Duration>,
+    ) {
         let mut crowd = self.lock();
         if crowd.epoch != armed_at {
             return;
         }
-        if crowd.leader != Leader::None {
-            match left {
-                Some(left) => drop(self.turn.wait_timeout(crowd, left)),
-                None => drop(self.turn.wait(crowd)),
-            }
+        if crowd.leader != Leader::None || crowd.coming {
+            self.follow(crowd, look, left);
             return;
         }
         crowd.leader = Leader::Thread;
         drop(crowd);
-        let rung = poll_readable(self.bell.as_fd(), others, left);
+        let heard = self.ear.listen(others, left);
         let mut crowd = self.lock();
         crowd.leader = Leader::None;
-        if rung {
-            self.take_rings(&mut crowd);
-        }
-        drop(crowd);
-        self.turn.notify_all();
+        self.way.notify_all();
+        self.spread(crowd, words, heard);
     }
 
-    fn take_rings(&self, crowd: &mut Crowd) {
-        let mut counter = [0; 8];
-        let _ = read(&self.bell, &mut counter);
+    fn follow(
+        &self,
+        mut crowd: MutexGuard<'_, Crowd>,
+        look: Option<&Arc<dyn Look>>,
+        left: Option<Duration>,
+    ) {
+        let follower = Arc::new(Follower { turn: Condvar::new(), look: look.cloned() });
+        crowd.followers.push(Arc::clone(&follower));
+        let left = match (left, LONGEST) {
+            (Some(left), Some(longest)) => Some(left.min(longest)),
+            (left, longest) => left.or(longest),
+        };
+        crowd = match left {
+            Some(left) => {
+                let woken = follower.turn.wait_timeout(crowd, left);
+                woken.unwrap_or_else(PoisonError::into_inner).0
+            }
+            None => follower.turn.wait(crowd).unwrap_or_else(PoisonError::into_inner),
+        };
+        crowd.followers.retain(|other| !Arc::ptr_eq(other, &follower));
+    }
+
+    /// Wakes those of the crowd that what was heard may concern.
+    fn spread(&self, mut crowd: MutexGuard<'_, Crowd>, words: Words<'_>, heard: Heard) {
+        if heard.closed && !crowd.closed {
+            crowd.closed = true;
+            self.ear.give_up();
+            self.pace(&crowd);
+            tracing::error!(
+                "another process closed this session's doorbell: from now on it looks for news \
+                 every few milliseconds"
+            );
+        }
+        crowd.queued = (crowd.queued || heard.queued) && !crowd.closed;
+        if !heard.rung && !(heard.tick && crowd.closed) {
+            return;
+        }
         crowd.epoch += 1;
+        if crowd.followers.is_empty() {
+            return;
+        }
+        let followers = crowd.followers.clone();
+        if followers.iter().any(|follower| follower.look.is_some()) {
+            // What comes after a look must ring again.
+            crowd.arm(&self.ear, &[words[Purpose::Samples as usize]]);
+        }
+        drop(crowd);
+        for follower in followers {
+            if follower.look.as_ref().is_none_or(|look| look.ready()) {
+                follower.turn.notify_one();
+            }
+        }
+    }
+
+    /// An event loop leads from now on; `false` when another one does already.
+    pub(super) fn lead_from_outside(&self) -> bool {
+        let mut crowd = self.lock();
+        if crowd.coming || crowd.leader == Leader::External {
+            return false;
+        }
+        crowd.coming = true;
+        while crowd.leader == Leader::Thread {
+            // It gives up the lead when it next wakes, which is now.
+            self.ear.knock();
+            crowd = self.way.wait(crowd).unwrap_or_else(PoisonError::into_inner);
+        }
+        crowd.coming = false;
+        crowd.leader = Leader::External;
+        self.pace(&crowd);
+        true
+    }
+
+    /// Has who listens woken for nothing as often as is needed.
+    fn pace(&self, crowd: &Crowd) {
+        let interval = match crowd.leader {
+            _ if crowd.closed => Some(CLOSED),
+            // Threads that listen see to it themselves.
+            Leader::External => LONGEST,
+            Leader::None | Leader::Thread => None,
+        };
+        self.ear.tick(interval);
+    }
+
+    /// The event loop takes what came.
+    pub(super) fn take_from_outside(&self, words: Words<'_>) {
+        let heard = self.ear.take(Some(&Timespec::default()));
+        self.spread(self.lock(), words, heard);
+    }
+
+    /// The event loop is about to sleep.
+    pub(super) fn arm_from_outside(&self, words: Words<'_>, purposes: &[Purpose]) {
+        let mut crowd = self.lock();
+        for &purpose in purposes {
+            crowd.external[purpose as usize] = true;
+            crowd.arm(&self.ear, &[words[purpose as usize]]);
+        }
+    }
+
+    /// The event loop is not going to sleep.
+    pub(super) fn disarm_from_outside(&self, words: Words<'_>) {
+        let mut crowd = self.lock();
+        crowd.external = [false; 2];
+        PURPOSES.iter().for_each(|&purpose| crowd.disarm_idle(purpose, words));
+    }
+
+    /// The event loop leads no more.
+    pub(super) fn leave_from_outside(&self) {
+        let mut crowd = self.lock();
+        crowd.leader = Leader::None;
+        self.pace(&crowd);
+        crowd.hand_over();
+    }
+
+    /// As where the kernel cannot keep descriptors out of the bell.
+    #[cfg(test)]
+    pub(super) fn let_rights_pass(&self) {
+        self.ear.let_rights_pass();
     }
 
     fn lock(&self) -> MutexGuard<'_, Crowd> {
@@ -170,17 +304,24 @@ impl Doorbell {
     }
 }
 
+impl AsFd for Doorbell {
+    /// Readable when it rang.
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.ear.as_fd()
+    }
+}
+
 /// One of the crowd, until it is dropped.
 struct Waiting<'a> {
     doorbell: &'a Doorbell,
-    word: &'a AtomicU64,
+    words: Words<'a>,
     purpose: Purpose,
 }
 
 impl<'a> Waiting<'a> {
-    fn new(doorbell: &'a Doorbell, word: &'a AtomicU64, purpose: Purpose) -> Self {
+    fn new(doorbell: &'a Doorbell, words: Words<'a>, purpose: Purpose) -> Self {
         doorbell.lock().waiting[purpose as usize] += 1;
-        Self { doorbell, word, purpose }
+        Self { doorbell, words, purpose }
     }
 }
 
@@ -188,124 +329,33 @@ impl Drop for Waiting<'_> {
     fn drop(&mut self) {
         let mut crowd = self.doorbell.lock();
         crowd.waiting[self.purpose as usize] -= 1;
-        crowd.disarm_idle(self.purpose, self.word);
-        drop(crowd);
-        // Whoever led may be gone: another one of the crowd takes over.
-        self.doorbell.turn.notify_one();
+        crowd.disarm_idle(self.purpose, self.words);
+        crowd.hand_over();
     }
 }
 
 impl Crowd {
-    fn disarm_idle(&self, purpose: Purpose, word: &AtomicU64) {
+    /// Gives out a new ticket.
+    fn arm(&mut self, ear: &Ear, words: &[&AtomicU64]) {
+        if self.queued {
+            self.queued = !ear.drain();
+        }
+        self.ticket += 1;
+        words.iter().for_each(|word| arm(*word, self.ticket));
+    }
+
+    fn disarm_idle(&self, purpose: Purpose, words: Words<'_>) {
         if self.waiting[purpose as usize] == 0 && !self.external[purpose as usize] {
-            disarm(word);
-        }
-    }
-}
-
-fn poll_readable(bell: BorrowedFd<'_>, others: &[BorrowedFd<'_>], left: Option<Duration>) -> bool {
-    let timeout = left.and_then(|left| Timespec::try_from(left).ok());
-    let poll_fd = |fd| PollFd::from_borrowed_fd(fd, PollFlags::IN);
-    let (mut alone, mut all);
-    let fds = if others.is_empty() {
-        alone = [poll_fd(bell)];
-        &mut alone[..]
-    } else {
-        all = Vec::with_capacity(1 + others.len());
-        all.extend([bell].iter().chain(others).map(|fd| poll_fd(*fd)));
-        &mut all[..]
-    };
-    // An interrupted poll counts as a spurious wake: the caller looks again and computes what
-    // remains of its time.
-    poll(fds, timeout.as_ref()).is_ok() && !fds[0].revents().is_empty()
-}
-
-/// Leads a session's waits from an event loop instead of a blocked thread.
-///
-/// Each round: [`clear`](Self::clear), [`arm`](Self::arm), look for work; if there is some,
-/// [`disarm`](Self::disarm) and do it, else await that the descriptor is readable. Threads that
-/// wait meanwhile are woken by `clear`. In a forked child it does nothing.
-pub struct ExternalLeader {
-    session: Arc<SessionSegment>,
-}
-
-impl ExternalLeader {
-    /// `None` when the session has an external leader already.
-    pub(crate) fn new(session: Arc<SessionSegment>) -> Option<Self> {
-        let doorbell = session.doorbell_hub();
-        let mut crowd = doorbell.lock();
-        if crowd.leader == Leader::External {
-            return None;
-        }
-        // A thread that leads gives up the lead when it next wakes, which is now.
-        while crowd.leader == Leader::Thread {
-            doorbell.bell.ring();
-            let waited = doorbell.turn.wait_timeout(crowd, Duration::from_millis(1));
-            crowd = waited.unwrap_or_else(PoisonError::into_inner).0;
-            if crowd.leader == Leader::External {
-                return None;
-            }
-        }
-        crowd.leader = Leader::External;
-        drop(crowd);
-        Some(Self { session })
-    }
-
-    /// Takes the rings that came and makes the session's other waiters look again.
-    pub fn clear(&self) {
-        if self.session.is_forked() {
-            return;
-        }
-        let doorbell = self.session.doorbell_hub();
-        let mut crowd = doorbell.lock();
-        doorbell.take_rings(&mut crowd);
-        drop(crowd);
-        doorbell.turn.notify_all();
-    }
-
-    /// Arms a new ticket: whatever comes after it rings the doorbell. With `room`, so does room
-    /// for a publish that gave [`PublishError::Blocked`](crate::shm::PublishError::Blocked).
-    pub fn arm(&self, room: bool) {
-        if self.session.is_forked() {
-            return;
-        }
-        let mut crowd = self.session.doorbell_hub().lock();
-        crowd.ticket += 1;
-        for purpose in PURPOSES {
-            if purpose == Purpose::Samples || room {
-                crowd.external[purpose as usize] = true;
-                arm(self.session.armed_word(purpose), crowd.ticket);
-            }
+            disarm(words[purpose as usize]);
         }
     }
 
-    /// Ends the round without a sleep.
-    pub fn disarm(&self) {
-        if self.session.is_forked() {
-            return;
+    /// Has one of those that sleep listen, when nobody does.
+    fn hand_over(&self) {
+        if self.leader == Leader::None
+            && let Some(follower) = self.followers.last()
+        {
+            follower.turn.notify_one();
         }
-        let mut crowd = self.session.doorbell_hub().lock();
-        crowd.external = [false; 2];
-        for purpose in PURPOSES {
-            crowd.disarm_idle(purpose, self.session.armed_word(purpose));
-        }
-    }
-}
-
-impl AsFd for ExternalLeader {
-    fn as_fd(&self) -> BorrowedFd<'_> {
-        self.session.doorbell()
-    }
-}
-
-impl Drop for ExternalLeader {
-    fn drop(&mut self) {
-        if self.session.is_forked() {
-            return;
-        }
-        self.disarm();
-        let doorbell = self.session.doorbell_hub();
-        doorbell.lock().leader = Leader::None;
-        doorbell.turn.notify_all();
     }
 }

@@ -2,14 +2,19 @@
 //!
 //! A waiter stores a new ticket in a shared word before it sleeps; whoever has something for it
 //! reads the word and rings the doorbell once per ticket, so a burst costs one system call. In a
-//! process one waiter polls the doorbell and the others follow it.
+//! process one waiter listens to the doorbell and the others follow it.
 
+mod bell;
 mod doorbell;
+mod ear;
+mod event;
+mod spin;
 mod ticket;
 
 #[cfg(test)]
 mod tests;
 
-pub use doorbell::ExternalLeader;
-pub(crate) use doorbell::{Bell, Doorbell, Purpose};
+pub(crate) use bell::Bell;
+pub(crate) use doorbell::{Doorbell, Look, Purpose};
+pub use event::ExternalLeader;
 pub(crate) use ticket::{arm, disarm, due, settle};

@@ -10,10 +10,21 @@ use std::{
     time::{Duration, Instant},
 };
 
-use rustix::event::{PollFd, PollFlags, poll};
+use rustix::{
+    event::{PollFd, PollFlags, poll},
+    fs::{OFlags, fcntl_getfl, fcntl_setfl},
+    net::{RecvFlags, Shutdown, recv, shutdown},
+};
 
-use super::{arm, disarm, due, settle};
-use crate::{ids::SessionId, shm::SessionSegment};
+use super::{Bell, Look, Purpose, arm, disarm, due, settle};
+use crate::{
+    ids::SessionId,
+    passed::{
+        PassedFd,
+        tests::{reluctant, send_away},
+    },
+    shm::SessionSegment,
+};
 
 /// Only a wake-up that was lost takes this long.
 const EVER: Duration = Duration::from_secs(60);
@@ -126,7 +137,6 @@ fn a_ring_that_another_thread_takes_is_not_slept_over() {
 
 #[test]
 fn a_wait_ends_with_its_time_and_disarms() {
-    use crate::wait::Purpose;
     let session = SessionSegment::create(SessionId::random()).unwrap();
     assert!(!session.wait(|| false, Some(Duration::from_millis(5))));
     assert!(!session.wait(|| false, Some(Duration::ZERO)));
@@ -176,4 +186,165 @@ fn an_external_leader_and_blocked_threads_share_the_doorbell() {
         await_woken(&session, || over.load(Ordering::Acquire));
     });
     assert!(Arc::clone(&session).external_leader().is_ok());
+}
+
+/// The end of a session's doorbell that others hold, as they may use it.
+fn handed_out(session: &SessionSegment) -> PassedFd {
+    session.descriptors().unwrap().doorbell
+}
+
+#[test]
+fn who_rings_never_waits_whatever_is_done_to_the_bell() {
+    let session = SessionSegment::create(SessionId::random()).unwrap();
+    let fd = handed_out(&session);
+    let flags = fcntl_getfl(&fd).unwrap();
+    // As of all that hold it.
+    fcntl_setfl(&fd, flags - OFlags::NONBLOCK).unwrap();
+    let bell = Bell::received(fd).unwrap();
+    for _ in 0..10_000 {
+        bell.ring();
+    }
+    // Nor does who listens, or notifies, while nobody takes the rings.
+    session.notify();
+    assert!(session.wait(|| true, None));
+    let looks = AtomicU64::new(0);
+    await_woken(&session, || looks.fetch_add(1, Ordering::Relaxed) == 2);
+}
+
+#[test]
+fn a_full_queue_swallows_no_ring() {
+    let session = SessionSegment::create(SessionId::random()).unwrap();
+    let bell = Bell::received(handed_out(&session)).unwrap();
+    let turn = AtomicU64::new(0);
+    let (rounds, over) = (2000, AtomicBool::new(false));
+    thread::scope(|scope| {
+        scope.spawn(|| {
+            for round in (0..rounds).map(|n| 2 * n + 1) {
+                while turn.load(Ordering::Acquire) != round {
+                    thread::yield_now();
+                }
+                // Not a ring of them may be the one that is missing.
+                let burst = if round % 100 == 1 { 1000 } else { 1 };
+                turn.store(round + 1, Ordering::Release);
+                (0..burst).for_each(|_| bell.ring());
+            }
+            over.store(true, Ordering::Release);
+        });
+        for round in (0..rounds).map(|n| 2 * n + 1) {
+            turn.store(round, Ordering::Release);
+            await_woken(&session, || turn.load(Ordering::Acquire) == round + 1);
+        }
+    });
+    assert!(over.load(Ordering::Acquire));
+}
+
+#[test]
+fn nobody_takes_rings_at_the_end_that_is_handed_out() {
+    let session = SessionSegment::create(SessionId::random()).unwrap();
+    let (bell, thief) = (Bell::received(handed_out(&session)).unwrap(), handed_out(&session));
+    let (looks, over) = (AtomicU64::new(0), AtomicBool::new(false));
+    thread::scope(|scope| {
+        scope.spawn(|| {
+            await_woken(&session, || {
+                looks.fetch_add(1, Ordering::AcqRel);
+                over.load(Ordering::Acquire)
+            });
+        });
+        while looks.load(Ordering::Acquire) < 2 {
+            thread::yield_now();
+        }
+        over.store(true, Ordering::Release);
+        bell.ring();
+        let mut bytes = [0; 8];
+        for _ in 0..1000 {
+            let stolen = recv(&thief, &mut bytes, RecvFlags::DONTWAIT);
+            assert!(stolen.is_err() || stolen.is_ok_and(|(got, _)| got == 0));
+        }
+    });
+}
+
+#[test]
+fn a_bell_that_was_closed_is_looked_after_by_time() {
+    let session = SessionSegment::create(SessionId::random()).unwrap();
+    let over = AtomicBool::new(false);
+    thread::scope(|scope| {
+        let waiters: Vec<_> = (0..3)
+            .map(|_| scope.spawn(|| await_woken(&session, || over.load(Ordering::Acquire))))
+            .collect();
+        shutdown(handed_out(&session), Shutdown::Both).unwrap();
+        // Nobody can ring.
+        over.store(true, Ordering::Release);
+        waiters.into_iter().for_each(|waiter| waiter.join().unwrap());
+    });
+    // An event loop is woken too.
+    let leader = session.external_leader().unwrap();
+    leader.clear();
+    leader.arm(false);
+    let mut fds = [PollFd::from_borrowed_fd(leader.as_fd(), PollFlags::IN)];
+    assert_eq!(poll(&mut fds, Some(&EVER.try_into().unwrap())), Ok(1));
+}
+
+#[test]
+fn descriptors_in_a_bell_keep_nobody_waiting() {
+    let session = SessionSegment::create(SessionId::random()).unwrap();
+    // As where the kernel cannot refuse them.
+    session.doorbell_hub().let_rights_pass();
+    let (bell, fd) = (Bell::received(handed_out(&session)).unwrap(), handed_out(&session));
+    let mut peers = Vec::new();
+    for _ in 0..4 {
+        let (reluctant, peer) = reluctant();
+        send_away(&fd, b"x", reluctant);
+        peers.push(peer);
+    }
+    let mut looks = 0;
+    await_woken(&session, || {
+        looks += 1;
+        bell.ring();
+        looks == 8
+    });
+}
+
+/// What a follower waits for, and how often it was asked for it.
+#[derive(Default)]
+struct Flag {
+    up: AtomicBool,
+    asked: AtomicU64,
+}
+
+impl Look for Flag {
+    fn ready(&self) -> bool {
+        self.asked.fetch_add(1, Ordering::AcqRel);
+        self.up.load(Ordering::Acquire)
+    }
+}
+
+#[test]
+fn of_those_that_follow_the_right_one_is_woken() {
+    let session = SessionSegment::create(SessionId::random()).unwrap();
+    let bell = Bell::received(handed_out(&session)).unwrap();
+    let flags: Vec<Arc<Flag>> = (0..4).map(|_| Arc::default()).collect();
+    let start = Instant::now();
+    thread::scope(|scope| {
+        let mut waiters: Vec<_> = flags
+            .iter()
+            .map(|flag| {
+                let (session, look) = (&session, Arc::clone(flag));
+                scope.spawn(move || session.wait_for(look, Some(EVER)))
+            })
+            .collect();
+        let armed = session.armed_word(Purpose::Samples);
+        // In another order than they came in; each time one leads that has nothing, or leaves.
+        for index in [2, 0, 2, 0] {
+            while armed.load(Ordering::Relaxed) == 0 {
+                thread::yield_now();
+            }
+            let index = index.min(waiters.len() - 1);
+            let flag = flags.iter().filter(|f| !f.up.load(Ordering::Acquire)).nth(index).unwrap();
+            flag.up.store(true, Ordering::Release);
+            settle::<AtomicU64>();
+            bell.ring();
+            assert!(waiters.remove(index).join().unwrap());
+        }
+    });
+    assert!(start.elapsed() < EVER, "a wake-up was lost");
 }

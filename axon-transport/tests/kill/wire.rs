@@ -9,6 +9,7 @@ use std::{
 
 use axon_transport::{
     ids::{Gid, SessionId},
+    passed::PassedFd,
     qos::Qos,
     shm::{
         Grant, Lane, Peer, PeerDescriptors, PeerSession, Reader, ReaderInfo, ReaderOptions,
@@ -134,9 +135,10 @@ impl Wire {
         let (bytes, fds) = self.receive();
         let (id, more) = bytes.split_at(16);
         let mut fds = fds.into_iter();
-        let mut next = || fds.next().expect("a descriptor");
+        let mut next = || PassedFd::from(fds.next().expect("a descriptor"));
         let descriptors = PeerDescriptors { segment: next(), doorbell: next(), pidfd: next() };
-        let mut others = vec![descriptors.segment.try_clone().expect("a descriptor")];
+        let segment = descriptors.segment.as_fd().try_clone_to_owned();
+        let mut others = vec![segment.expect("a descriptor")];
         others.extend(fds);
         let id = SessionId(id.try_into().expect("a session id"));
         (PeerSession::map(id, descriptors).expect("a session"), more.to_vec(), others)

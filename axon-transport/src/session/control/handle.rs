@@ -2,7 +2,6 @@
 
 use std::{
     collections::{HashMap, HashSet},
-    os::fd::OwnedFd,
     sync::Arc,
 };
 
@@ -10,6 +9,7 @@ use super::{Control, append, stands_for};
 use crate::{
     graph::{GraphEntry, GraphView},
     ids::{Gid, SessionId},
+    passed::PassedFd,
     session::{
         message::{Attach, Granted, Graph, Message, Pair, Unmatch},
         peers::PeerError,
@@ -20,7 +20,7 @@ use crate::{
 };
 
 impl Control {
-    pub(super) fn handle(&mut self, message: Message, descriptors: Vec<OwnedFd>) {
+    pub(super) fn handle(&mut self, message: Message, descriptors: Vec<PassedFd>) {
         match message {
             Message::Graph(graph) => self.graph(graph),
             Message::Match(pair) => self.matched(pair),
@@ -186,7 +186,7 @@ impl Control {
         })
     }
 
-    fn attach(&mut self, attach: Attach, descriptors: Vec<OwnedFd>) {
+    fn attach(&mut self, attach: Attach, descriptors: Vec<PassedFd>) {
         let pair = Pair { reader: attach.reader, writer: attach.writer };
         if let Some(repeated) = &mut self.repeated {
             repeated.insert(pair);
@@ -216,7 +216,7 @@ impl Control {
         }
     }
 
-    fn grant(&mut self, granted: Granted, mut descriptors: Vec<OwnedFd>) {
+    fn grant(&mut self, granted: Granted, mut descriptors: Vec<PassedFd>) {
         let Granted { reader, writer, generation, first, session } = granted;
         let pair = Pair { reader, writer };
         if let Some(repeated) = &mut self.repeated {
@@ -277,7 +277,7 @@ impl Control {
         &mut self,
         session: SessionId,
         pair: Pair,
-        descriptors: Vec<OwnedFd>,
+        descriptors: Vec<PassedFd>,
     ) -> Result<Peer, PeerError> {
         let held = self.peers.hold(session, pair, descriptors);
         if matches!(held, Err(PeerError::Missing)) {

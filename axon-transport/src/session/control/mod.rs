@@ -25,7 +25,7 @@ use super::{
     socket::{self, SocketError},
     state::{Outgoing, SessionEvent, Shared, StatusAnswer},
 };
-use crate::{graph::GraphView, ids::Gid};
+use crate::{graph::GraphView, ids::Gid, passed::PassedFd};
 
 /// The longest status that is put together.
 const MAX_STATUS: usize = 64 << 20;
@@ -39,7 +39,7 @@ pub(super) struct Control {
     link: Link,
     reconnects: bool,
     peers: Peers,
-    outbox: VecDeque<(Message, Vec<OwnedFd>)>,
+    outbox: VecDeque<(Message, Vec<PassedFd>)>,
     buffer: Vec<u8>,
     /// A whole graph of which parts are still to come.
     building: Option<GraphView>,
@@ -50,7 +50,7 @@ pub(super) struct Control {
 }
 
 enum Link {
-    Socket(OwnedFd),
+    Socket(PassedFd),
     Local(Box<Local>),
     Reconnecting(Receiver<Connected>),
     Ended,
@@ -110,7 +110,7 @@ impl Control {
             let gone = gone.into_iter().map(|gid| Message::EndpointGone(Gone { gid }));
             state.outgoing.extend(gone.map(|m| Outgoing::Message(Box::new(m))));
         }
-        self.link = Link::Socket(connected.socket);
+        self.link = Link::Socket(PassedFd::received(connected.socket));
         self.shared.notify(Some(&SessionEvent::DaemonFound(daemon)));
     }
 
@@ -195,7 +195,8 @@ impl Control {
                         };
                         match publisher.writer.descriptor() {
                             Ok(ring) => {
-                                self.outbox.push_back((Message::Endpoint(announce), vec![ring]));
+                                self.outbox
+                                    .push_back((Message::Endpoint(announce), vec![ring.into()]));
                             }
                             Err(error) => {
                                 let topic = &publisher.endpoint.topic;

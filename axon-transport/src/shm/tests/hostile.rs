@@ -9,6 +9,7 @@ use std::{
 use proptest::prelude::*;
 use rustix::{
     fs::{MemfdFlags, SealFlags, fcntl_add_seals, ftruncate, memfd_create},
+    net::{AddressFamily, SocketType},
     pipe::pipe,
 };
 
@@ -116,7 +117,7 @@ fn a_segment_must_be_a_sealed_memfd_of_a_sane_size() {
         };
         assert_eq!(refusal(Reader::map(fd.try_clone().unwrap(), options)), reason);
         let mut descriptors = scribble.session.descriptors().unwrap();
-        descriptors.segment = fd;
+        descriptors.segment = fd.into();
         assert!(PeerSession::map(scribble.session.id(), descriptors).is_err());
     }
 }
@@ -125,7 +126,7 @@ fn a_segment_must_be_a_sealed_memfd_of_a_sane_size() {
 fn what_is_handed_over_cannot_be_changed_by_whoever_gets_it() {
     let a = session();
     let writer = writer(&a, keep_last(1), 0);
-    for fd in [writer.descriptor().unwrap(), a.descriptors().unwrap().segment] {
+    for fd in [writer.descriptor().unwrap().into(), a.descriptors().unwrap().segment] {
         assert!(ftruncate(&fd, 0).is_err());
         assert!(rustix::io::write(&fd, b"x").is_err());
         assert!(fcntl_add_seals(&fd, SealFlags::WRITE).is_err());
@@ -167,20 +168,32 @@ fn sessions_that_make_no_sense_are_refused() {
         layout::write_session(segment.words(), a.id());
         segment.words()[word].store(value, Relaxed);
         let mut descriptors = a.descriptors().unwrap();
-        descriptors.segment = segment.fd().try_clone_to_owned().unwrap();
+        descriptors.segment = segment.fd().try_clone_to_owned().unwrap().into();
         assert!(PeerSession::map(a.id(), descriptors).is_err());
     }
-    // A pipe for a doorbell could block whoever rings it.
-    let mut descriptors = a.descriptors().unwrap();
-    descriptors.doorbell = pipe().unwrap().1;
-    assert!(PeerSession::map(a.id(), descriptors).is_err());
+    // Whoever rings a pipe or an eventfd could be made to wait, and a stream be told something.
+    let flags = rustix::event::EventfdFlags::NONBLOCK;
+    let socket = |family, kind| {
+        let flags = rustix::net::SocketFlags::CLOEXEC;
+        rustix::net::socket_with(family, kind, flags, None).unwrap()
+    };
+    for other in [
+        pipe().unwrap().1,
+        rustix::event::eventfd(0, flags).unwrap(),
+        socket(AddressFamily::UNIX, SocketType::STREAM),
+        socket(AddressFamily::INET, SocketType::DGRAM),
+    ] {
+        let mut descriptors = a.descriptors().unwrap();
+        descriptors.doorbell = other.into();
+        assert!(PeerSession::map(a.id(), descriptors).is_err());
+    }
 }
 
 #[test]
 fn a_descriptor_that_is_no_pidfd_names_no_process() {
     let descriptors = session().descriptors().unwrap();
     assert_eq!(descriptors.process(), Some(std::process::id()));
-    let peer = PeerDescriptors { pidfd: pipe().unwrap().0, ..descriptors };
+    let peer = PeerDescriptors { pidfd: pipe().unwrap().0.into(), ..descriptors };
     assert_eq!(peer.process(), None);
     assert!(peer.doorbell.as_fd().try_clone_to_owned().is_ok());
 }

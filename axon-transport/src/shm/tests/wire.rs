@@ -14,6 +14,7 @@ use rustix::net::{
 };
 
 use super::*;
+use crate::passed::PassedFd;
 
 /// Tells this binary that it is the other process, and which part it plays.
 pub(super) const PART: &str = "SHM_TEST_PART";
@@ -86,7 +87,7 @@ impl Wire {
         let (bytes, fds) = self.receive();
         let (id, more) = bytes.split_at(16);
         let mut fds = fds.into_iter();
-        let mut next = || fds.next().expect("a descriptor");
+        let mut next = || PassedFd::received(fds.next().expect("a descriptor"));
         let descriptors = PeerDescriptors { segment: next(), doorbell: next(), pidfd: next() };
         assert!(descriptors.process().is_some_and(|pid| pid != std::process::id()));
         let id = SessionId(id.try_into().unwrap());

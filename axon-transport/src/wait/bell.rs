@@ -1,0 +1,37 @@
+//! The ringing end of a doorbell.
+
+use std::os::fd::{AsFd, BorrowedFd};
+
+use rustix::net::{AddressFamily, SendFlags, SocketType, send, sockopt};
+
+use crate::passed::PassedFd;
+
+/// One end of a pair of unix sockets. Whoever holds it can ring, and nothing worse: it cannot take
+/// rings away, nor keep another from ringing but by closing the bell for all, which is noticed.
+pub(crate) struct Bell(PassedFd);
+
+impl Bell {
+    pub(super) fn new(fd: PassedFd) -> Self {
+        Self(fd)
+    }
+
+    /// The end that another session handed over, if it is what it should be.
+    pub(crate) fn received(fd: PassedFd) -> Option<Self> {
+        // Neither question reaches a file system, nor does ringing what answers so.
+        let unix = sockopt::socket_domain(&fd) == Ok(AddressFamily::UNIX);
+        let packets = sockopt::socket_type(&fd) == Ok(SocketType::SEQPACKET);
+        (unix && packets).then_some(Self(fd))
+    }
+
+    /// Rings. Never blocks, whatever became of the other end. That there is no room is as good: then
+    /// rings stand there that nobody has heard yet.
+    pub(crate) fn ring(&self) {
+        let _ = send(&self.0, &[1], SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
+    }
+}
+
+impl AsFd for Bell {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.0.as_fd()
+    }
+}

@@ -1,0 +1,206 @@
+//! The hearing end of a doorbell: what the kernel tells one who sleeps.
+
+#![allow(unsafe_code)]
+
+use std::{
+    io::IoSliceMut,
+    mem::MaybeUninit,
+    os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd},
+    time::Duration,
+};
+
+use rustix::{
+    event::{EventfdFlags, PollFd, PollFlags, Timespec, epoll, eventfd, poll},
+    io::{Errno, read, write},
+    net::{
+        AddressFamily, RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, Shutdown, SocketFlags,
+        SocketType, recvmsg, shutdown, socketpair,
+    },
+    time::{
+        Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, timerfd_create,
+        timerfd_settime,
+    },
+};
+
+use super::Bell;
+use crate::passed::PassedFd;
+
+/// How long who listens sleeps at most. What another process could not, or would not, ring for is
+/// found then. Tests sleep for ever, so that they notice.
+pub(super) const LONGEST: Option<Duration> =
+    if cfg!(test) { None } else { Some(Duration::from_secs(1)) };
+/// How often there is a look once the bell has been closed.
+pub(super) const CLOSED: Duration = Duration::from_millis(5);
+/// Rings that are taken at a time.
+const FLOOD: u32 = 512;
+/// The most descriptors that the system lets a packet carry.
+const SCM_MAX_FD: usize = 253;
+
+const BELL: u64 = 0;
+const KNOCK: u64 = 1;
+const TICK: u64 = 2;
+
+/// A pair of sockets, of which one end rings, and what else wakes this process.
+///
+/// The ends are of packets and edge-triggered: each ring is an event, whether those before it have
+/// been taken or not. So who is woken need not take any, and is back in one system call.
+pub(super) struct Ear {
+    set: OwnedFd,
+    heard: OwnedFd,
+    bell: Bell,
+    /// Never handed out: an eventfd that this process wakes itself with.
+    knock: OwnedFd,
+    tick: OwnedFd,
+}
+
+/// What came.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Heard {
+    /// A ring of the bell, or a knock.
+    pub(super) rung: bool,
+    /// A ring of the bell, which stands in its queue.
+    pub(super) queued: bool,
+    /// The bell was closed, by another process.
+    pub(super) closed: bool,
+    /// Only its time.
+    pub(super) tick: bool,
+}
+
+impl Ear {
+    pub(super) fn new() -> Result<Self, Errno> {
+        let (heard, given) =
+            socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None)?;
+        // Nobody can take rings at the end that is handed out, nor put anything into its queue.
+        shutdown(&given, Shutdown::Read)?;
+        pass_rights(heard.as_fd(), false);
+        let flags = EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK;
+        let knock = eventfd(0, flags)?;
+        let flags = TimerfdFlags::CLOEXEC | TimerfdFlags::NONBLOCK;
+        let tick = timerfd_create(TimerfdClockId::Monotonic, flags)?;
+        let set = epoll::create(epoll::CreateFlags::CLOEXEC)?;
+        let edge = epoll::EventFlags::IN | epoll::EventFlags::RDHUP | epoll::EventFlags::ET;
+        epoll::add(&set, &heard, epoll::EventData::new_u64(BELL), edge)?;
+        epoll::add(&set, &knock, epoll::EventData::new_u64(KNOCK), edge)?;
+        let level = epoll::EventFlags::IN;
+        epoll::add(&set, &tick, epoll::EventData::new_u64(TICK), level)?;
+        Ok(Self { set, heard, bell: Bell::new(given.into()), knock, tick })
+    }
+
+    /// The end that rings.
+    pub(super) fn bell(&self) -> &Bell {
+        &self.bell
+    }
+
+    /// Wakes whoever listens, from this very process.
+    pub(super) fn knock(&self) {
+        // A counter that is full, after 2^64 of them, would be the only error.
+        let _ = write(&self.knock, &1u64.to_ne_bytes());
+    }
+
+    /// Has whoever listens woken at intervals; `None` ends it.
+    pub(super) fn tick(&self, interval: Option<Duration>) {
+        let interval = Timespec::try_from(interval.unwrap_or_default()).unwrap_or_default();
+        let timer = Itimerspec { it_interval: interval, it_value: interval };
+        let _ = timerfd_settime(&self.tick, TimerfdTimerFlags::empty(), &timer);
+    }
+
+    /// Sleeps until something comes, for at most `left`. Events of `others` end it too.
+    pub(super) fn listen(&self, others: &[BorrowedFd<'_>], left: Option<Duration>) -> Heard {
+        let left = match (left, LONGEST) {
+            (Some(left), Some(longest)) => Some(left.min(longest)),
+            (left, longest) => left.or(longest),
+        };
+        let timeout = left.and_then(|left| Timespec::try_from(left).ok());
+        if others.is_empty() {
+            return self.take(timeout.as_ref());
+        }
+        let all = [self.set.as_fd()];
+        let mut fds: Vec<PollFd<'_>> = all
+            .iter()
+            .chain(others)
+            .map(|fd| PollFd::from_borrowed_fd(*fd, PollFlags::IN))
+            .collect();
+        // An interrupted poll counts as a spurious wake: the caller looks again and computes what
+        // remains of its time.
+        let _ = poll(&mut fds, timeout.as_ref());
+        self.take(Some(&Timespec::default()))
+    }
+
+    /// What came, if it comes within `timeout`.
+    pub(super) fn take(&self, timeout: Option<&Timespec>) -> Heard {
+        let mut heard = Heard::default();
+        let mut events = [MaybeUninit::<epoll::Event>::uninit(); 4];
+        let Ok((events, _)) = epoll::wait(&self.set, &mut events, timeout) else { return heard };
+        for event in events {
+            let flags = event.flags;
+            match event.data.u64() {
+                TICK => heard.tick = read(&self.tick, &mut [0; 8]).is_ok(),
+                BELL => {
+                    heard.rung = true;
+                    heard.queued = true;
+                    let over = epoll::EventFlags::RDHUP | epoll::EventFlags::HUP;
+                    heard.closed = flags.intersects(over);
+                }
+                _ => heard.rung = true,
+            }
+        }
+        heard
+    }
+
+    /// Listens to a bell that was closed no more.
+    pub(super) fn give_up(&self) {
+        let _ = epoll::delete(&self.set, &self.heard);
+    }
+
+    #[cfg(test)]
+    pub(super) fn let_rights_pass(&self) {
+        pass_rights(self.heard.as_fd(), true);
+    }
+
+    /// Takes the rings that stand in the queue; whether it is empty then.
+    pub(super) fn drain(&self) -> bool {
+        // Descriptors that should not be there are taken too: the kernel would close in this thread
+        // what did not fit.
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(SCM_MAX_FD))];
+        for _ in 0..FLOOD {
+            let mut byte = [0];
+            let mut control = RecvAncillaryBuffer::new(&mut space);
+            let flags = RecvFlags::DONTWAIT | RecvFlags::CMSG_CLOEXEC;
+            match recvmsg(&self.heard, &mut [IoSliceMut::new(&mut byte)], &mut control, flags) {
+                Ok(_) | Err(Errno::INTR) => {}
+                Err(_) => return true,
+            }
+            for message in control.drain() {
+                if let RecvAncillaryMessage::ScmRights(rights) = message {
+                    rights.map(PassedFd::received).for_each(drop);
+                }
+            }
+        }
+        false
+    }
+}
+
+impl AsFd for Ear {
+    /// Readable when there is something to take.
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.set.as_fd()
+    }
+}
+
+/// Whether packets may carry descriptors. Older kernels (Linux 6.16 is the first) let them.
+fn pass_rights(socket: BorrowedFd<'_>, may: bool) {
+    const SO_PASSRIGHTS: libc::c_int = 83;
+    let value = libc::c_int::from(may);
+    let len = libc::socklen_t::try_from(size_of::<libc::c_int>()).expect("a few bytes");
+    // SAFETY: the option's value is an int; it is read during the call only. Older kernels say that
+    // they do not know the option.
+    unsafe {
+        libc::setsockopt(
+            socket.as_raw_fd(),
+            libc::SOL_SOCKET,
+            SO_PASSRIGHTS,
+            (&raw const value).cast(),
+            len,
+        )
+    };
+}
