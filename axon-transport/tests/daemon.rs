@@ -401,7 +401,8 @@ fn descriptors_that_are_slow_to_close_do_not_stop_the_daemon() {
     });
     let (tool, unknown, garbage) = (tool.encode().unwrap(), [200, 0xa0], [1]);
     // (said first, what the packet that carries it is, descriptors before it)
-    let ways: [(Option<&[u8]>, &[u8], usize); 5] = [
+    type Way<'a> = (Option<&'a [u8]>, &'a [u8], usize);
+    let ways: [Way<'_>; 5] = [
         (None, &unknown, 0),
         // More than belong into any packet.
         (None, &unknown, 7),

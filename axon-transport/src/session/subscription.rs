@@ -57,6 +57,9 @@ impl Subscription {
 
     /// The oldest sample by source timestamp among all publishers, into `out`, which it replaces.
     /// `None` when there is none.
+    ///
+    /// Clocks are taken at their word. Where KEEP_LAST's depth passes samples over, they are those
+    /// with the oldest timestamps: a publisher whose clock is ahead has the others' passed over.
     pub fn take(&self, out: &mut Vec<u8>) -> Option<MessageInfo> {
         self.take_with(|reader| Ok(reader.take(out)?.map(|taken| (taken.meta, ()))))
             .map(|(info, ())| info)

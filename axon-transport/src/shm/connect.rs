@@ -238,8 +238,13 @@ impl<'a> Channel<'a> {
             if got.bytes == 0 {
                 return Err(ConnectError::Closed);
             }
-            if got.flags.intersects(ReturnFlags::TRUNC | ReturnFlags::CTRUNC) {
+            if got.flags.contains(ReturnFlags::TRUNC) || fds.len() > MAX_DESCRIPTORS {
                 return Err(ConnectError::Protocol("more than belongs in a packet"));
+            }
+            // There was room for whatever can come.
+            if got.flags.contains(ReturnFlags::CTRUNC) {
+                let what = "receiving descriptors";
+                return Err(ShmError::System { what, source: Errno::MFILE.into() }.into());
             }
             return match minicbor::decode(&bytes[..got.bytes]) {
                 Ok((VERSION, packet)) => Ok((packet, fds)),

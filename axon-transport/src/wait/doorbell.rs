@@ -214,7 +214,8 @@ impl Doorbell {
             );
         }
         crowd.queued = (crowd.queued || heard.queued) && !crowd.closed;
-        if !heard.rung && !(heard.tick && crowd.closed) {
+        let rung = heard.rung || (heard.tick && crowd.closed);
+        if !rung {
             return;
         }
         crowd.epoch += 1;

@@ -39,6 +39,7 @@ fn announce(registry: &mut Registry<Label>, session: u8, number: u32, kind: Endp
         qos: Qos::default(),
         node: String::new(),
         namespace: String::new(),
+        enclave: String::new(),
     };
     let fds = if kind == EndpointKind::Publisher { vec!["ring"] } else { vec![] };
     let role = EndpointRole::Application;
