@@ -3,7 +3,7 @@
 
 #![cfg(target_os = "linux")]
 
-use std::io::{BufRead, BufReader, ErrorKind, Read};
+use std::io::{BufRead, BufReader};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -103,12 +103,6 @@ fn raise_limit() {
     setrlimit(Resource::Nofile, Rlimit { current: limit.maximum, ..limit }).unwrap();
 }
 
-/// Whether the KME has turned a stranger away.
-fn is_gone(stranger: &mut TcpStream) -> bool {
-    stranger.set_nonblocking(true).unwrap();
-    !matches!(stranger.read(&mut [0]), Err(error) if error.kind() == ErrorKind::WouldBlock)
-}
-
 async fn strangers_shut_nobody_out(limits: &str, floods: usize) {
     raise_limit();
     let dir = tempfile::tempdir().unwrap();
@@ -125,19 +119,11 @@ async fn strangers_shut_nobody_out(limits: &str, floods: usize) {
         asked += 1;
         tokio::time::sleep(Duration::from_millis(50)).await;
     }
-    let mut strangers: Vec<_> =
-        floods.into_iter().flat_map(|flood| flood.join().unwrap()).collect();
+    let strangers: Vec<_> = floods.into_iter().flat_map(|flood| flood.join().unwrap()).collect();
     let number = strangers.len();
     // One that was there before, and one that comes now.
     known.enc_keys("sae-b").send().await.unwrap();
     client(dir.path(), addr).enc_keys("sae-b").send().await.unwrap();
-    // Strangers gave way to it, the oldest. The others still have time to say who they are: were it
-    // that which had run out, they would all be gone.
-    let gone = strangers.iter_mut().map(is_gone).filter(|gone| *gone).count();
-    if limits.is_empty() {
-        assert!(gone >= (number + 1).saturating_sub(PLACES), "{gone} of {number} are gone");
-        assert!(number - gone >= PLACES / 2, "{gone} of {number} are gone");
-    }
     let grown = run.memory().saturating_sub(before);
     assert!(grown < 64 << 10, "{grown} KiB more with {number} connections");
     assert!(run.files() < 2000, "{} files", run.files());
@@ -152,6 +138,7 @@ async fn more_strangers_than_places_shut_nobody_out() {
     strangers_shut_nobody_out("", PLACES.div_ceil(CONNECTIONS)).await;
 }
 
+/// Were it not for those that give way, the last of them would wait for ten handshakes to time out.
 #[tokio::test]
 #[ignore = "ten thousand connections: cargo test -p etsi-qkd014 --test sim_connections -- --ignored"]
 async fn ten_thousand_strangers_shut_nobody_out() {

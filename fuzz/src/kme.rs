@@ -53,7 +53,8 @@ pub fn error_seeds() -> Vec<Vec<u8>> {
     vec![
         br#"{"message":"not all mandatory extensions are supported","details":[{"a":"b"}]}"#.into(),
         br#"{"message":"KME is busy"}"#.into(),
-        br#"{"details":[{"a":[{"b":null}]},1e2],"x":{},"message":"\u001b[2J\u202e\ud83d\ude00\n"}"#.into(),
+        br#"{"details":[{"a":[{"b":null}]},1e2],"x":{},"message":"\u001b[2J\u202e\ud83d\ude00\n"}"#
+            .into(),
     ]
 }
 

@@ -206,3 +206,35 @@ async fn delay(stream: &mut TlsStream<TcpStream>, buffer: &mut Vec<u8>, time: Du
     sleep_until(until).await;
     true
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Connections that never end, of which the first has proved who it is. The clock goes on where
+    /// all wait.
+    #[tokio::test(start_paused = true)]
+    async fn strangers_give_way_one_after_the_other_and_who_is_known_stays() {
+        const PLACES: usize = 4;
+        let places = Arc::new(Semaphore::new(PLACES));
+        let (mut strangers, mut tasks) = (Strangers::default(), JoinSet::new());
+        let mut handles = Vec::new();
+        let began = Instant::now();
+        for number in 0..20 {
+            let room = timeout(PATIENCE * 60, strangers.make_room(&places)).await;
+            let place = room.expect("a stranger gives way").unwrap();
+            let task = tasks.spawn(async move {
+                let _place = place;
+                std::future::pending::<()>().await;
+            });
+            handles.push(task.clone());
+            strangers.add(task, Arc::new(AtomicBool::new(number == 0)));
+        }
+        // Sixteen too many, three at a time.
+        assert!(began.elapsed() >= PATIENCE * 6 && began.elapsed() < PATIENCE * 7);
+        let still: Vec<bool> = handles.iter().map(|task| !task.is_finished()).collect();
+        let newest = handles.len() + 1 - PLACES;
+        let expected: Vec<bool> = (0..handles.len()).map(|at| at == 0 || at >= newest).collect();
+        assert_eq!(still, expected);
+    }
+}
