@@ -12,23 +12,18 @@ use tokio::sync::Notify;
 use super::{
     admission::Admission,
     bridge::ToControl,
-    registry::{Registry, SessionEntry},
+    registry::Registry,
     status::{LinkStatus, RefusalStatus, unix_ms},
 };
 use crate::{
     config::Config,
     ids::{DaemonId, SessionId},
     passed::PassedFd,
-    session::{
-        address::Address,
-        message::{Message, StatusPart},
-    },
+    session::address::Address,
 };
 
 /// Refusals that are remembered.
 const REFUSALS: usize = 32;
-/// Bytes of the status in one packet.
-const STATUS_SLICE: usize = 24 * 1024;
 
 pub(super) struct Control {
     pub(super) config: Arc<Config>,
@@ -92,6 +87,13 @@ impl Control {
 
     /// Wakes the tasks of sessions that got something to be told.
     pub(super) fn settle(&mut self) {
+        for (id, why) in self.registry.take_refused() {
+            let who = self.registry.session(&id).map_or_else(
+                || format!("session {id}"),
+                |session| format!("session {} (pid {})", session.name, session.pid),
+            );
+            self.refused(who, "endpoint".into(), why);
+        }
         for id in self.registry.take_ready() {
             if let Some(bell) = self.wakers.get(&id) {
                 bell.notify_one();
@@ -100,9 +102,10 @@ impl Control {
         self.changed.notify_one();
     }
 
-    /// Answers a session that asks for the status, once it has taken the last answer.
+    /// Answers a session that asks for the status. One that asks again before it has taken the
+    /// answer gets the same one from its beginning.
     pub(super) fn send_status(&mut self, id: &SessionId) {
-        if self.registry.session(id).is_none_or(SessionEntry::awaits_status) {
+        if self.registry.repeat_status(id) {
             return;
         }
         let text = match serde_json::to_vec(&super::report::status(self)) {
@@ -112,13 +115,7 @@ impl Control {
                 Vec::new()
             }
         };
-        let slices: Vec<&[u8]> =
-            if text.is_empty() { vec![&[]] } else { text.chunks(STATUS_SLICE).collect() };
-        let parts = u32::try_from(slices.len()).unwrap_or(u32::MAX);
-        for (part, slice) in (0u32..).zip(slices) {
-            let message = Message::Status(StatusPart { part, parts, text: slice.to_vec() });
-            self.registry.push(id, &message, Vec::new());
-        }
+        self.registry.tell_status(id, text.into());
     }
 
     pub(super) fn refused(&mut self, peer: String, what: String, reason: String) {

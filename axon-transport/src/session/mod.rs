@@ -225,7 +225,7 @@ impl Session {
             if state.daemon.is_none() {
                 return Err(SessionError::Disconnected);
             }
-            state.status = StatusAnswer::Parts(Vec::new());
+            state.status = StatusAnswer::Parts(Default::default());
         }
         shared.tell(Outgoing::Message(Box::new(Message::StatusRequest)));
         shared.wait_changed(ANSWER, || !matches!(shared.state().status, StatusAnswer::Parts(_)));

@@ -29,9 +29,9 @@ fn drain(registry: &mut Registry<Label>, number: u8) -> Vec<Message> {
         .collect()
 }
 
-fn announce(registry: &mut Registry<Label>, session: u8, number: u32, kind: EndpointKind) {
-    let endpoint = Endpoint {
-        gid: Gid::new(id(session), number),
+fn endpoint(gid: Gid, kind: EndpointKind) -> Endpoint {
+    Endpoint {
+        gid,
         kind,
         topic: "/t".into(),
         type_name: "T".into(),
@@ -40,9 +40,21 @@ fn announce(registry: &mut Registry<Label>, session: u8, number: u32, kind: Endp
         node: String::new(),
         namespace: String::new(),
         enclave: String::new(),
-    };
-    let fds = if kind == EndpointKind::Publisher { vec!["ring"] } else { vec![] };
-    let role = EndpointRole::Application;
+    }
+}
+
+fn announce(registry: &mut Registry<Label>, session: u8, number: u32, kind: EndpointKind) {
+    let endpoint = endpoint(Gid::new(id(session), number), kind);
+    announce_as(registry, session, endpoint, EndpointRole::Application);
+}
+
+fn announce_as(
+    registry: &mut Registry<Label>,
+    session: u8,
+    endpoint: Endpoint,
+    role: EndpointRole,
+) {
+    let fds = if endpoint.kind == EndpointKind::Publisher { vec!["ring"] } else { vec![] };
     let message = Message::Endpoint(Announce { endpoint, role, stands_for: vec![] });
     registry.message(&id(session), message, fds).unwrap();
 }
@@ -54,24 +66,63 @@ fn whole_graphs(messages: &[Message]) -> usize {
 #[test]
 fn the_pairs_that_a_session_makes_are_bounded_and_others_make_theirs() {
     let mut registry = registry(&[SessionRole::Application; 2]);
-    for number in 0..256 {
+    for number in 0..32 {
         announce(&mut registry, 1, number, EndpointKind::Publisher);
     }
-    for number in 256..512 {
+    for number in 32..64 {
         announce(&mut registry, 1, number, EndpointKind::Subscription);
     }
     assert_eq!(registry.pairs.len(), MAX_PAIRS);
     drain(&mut registry, 1);
-    announce(&mut registry, 1, 512, EndpointKind::Subscription);
+    assert!(registry.take_refused().is_empty());
+    for number in 64..66 {
+        announce(&mut registry, 1, number, EndpointKind::Subscription);
+    }
     assert_eq!(registry.pairs.len(), MAX_PAIRS, "one too many");
     let refused = drain(&mut registry, 1);
     assert!(refused.iter().any(|m| matches!(m, Message::Refused(r) if r.text.contains("pairs"))));
+    let shown = registry.take_refused();
+    assert!(matches!(&shown[..], [(of, why)] if *of == id(1) && why.contains("pairs")), "once");
 
     announce(&mut registry, 2, 1, EndpointKind::Subscription);
-    assert_eq!(registry.pairs.len(), MAX_PAIRS + 256);
+    assert_eq!(registry.pairs.len(), MAX_PAIRS + 32);
     registry.disconnect(&id(1));
     assert!(registry.pairs.is_empty());
     assert_eq!(registry.session(&id(2)).unwrap().pairs, 0, "what is gone does not count");
+}
+
+#[test]
+fn the_gateway_brings_the_publishers_of_other_hosts_to_every_reader() {
+    let mut registry = registry(&[SessionRole::Gateway, SessionRole::Application]);
+    let (readers, remote) = (200, 600);
+    for number in 0..readers {
+        announce(&mut registry, 2, number, EndpointKind::Subscription);
+    }
+    let stand_in = |number: u32| {
+        let mut gid = [9; 16];
+        gid[12..].copy_from_slice(&number.to_be_bytes());
+        Gid(gid)
+    };
+    for number in 0..remote {
+        let endpoint = endpoint(stand_in(number), EndpointKind::Publisher);
+        announce_as(&mut registry, 1, endpoint, EndpointRole::StandIn);
+    }
+    assert_eq!(registry.pairs.len(), (readers * remote) as usize);
+    assert!(registry.pairs.len() > MAX_PAIRS && registry.take_refused().is_empty());
+
+    // What all of them may make is bounded, and the gateway is told and stays.
+    for number in remote..=u32::try_from(MAX_ALL_PAIRS).unwrap() / readers {
+        let endpoint = endpoint(stand_in(number), EndpointKind::Publisher);
+        announce_as(&mut registry, 1, endpoint, EndpointRole::StandIn);
+    }
+    assert!(registry.pairs.len() <= MAX_ALL_PAIRS);
+    assert_eq!(registry.take_refused().len(), 1);
+    let last = stand_in(u32::try_from(MAX_ALL_PAIRS).unwrap() / readers);
+    assert!(!registry.endpoints.contains_key(&last), "it was refused");
+    let gone = |gid| Message::EndpointGone(crate::session::message::Gone { gid });
+    assert_eq!(registry.message(&id(1), gone(last), vec![]), Ok(()));
+    let other = registry.message(&id(2), gone(last), vec![]);
+    assert_eq!(other, Err(Violation::NotItsOwn(last)), "nobody else speaks for other hosts");
 }
 
 #[test]
@@ -100,16 +151,52 @@ fn what_waits_for_a_session_is_bounded_in_bytes() {
     assert_eq!(registry.session(&id(1)).unwrap().queued_bytes, 0);
 }
 
-#[test]
-fn a_tool_that_does_not_listen_is_not_told_the_graph() {
-    let mut registry = registry(&[SessionRole::Tool]);
-    let part = Message::Status(StatusPart { part: 0, parts: 1, text: vec![0; 24 << 10] });
-    assert!(!registry.session(&id(1)).unwrap().awaits_status());
-    registry.push(&id(1), &part, vec![]);
-    assert!(registry.session(&id(1)).unwrap().awaits_status());
-    for _ in 0..1000 {
-        registry.push(&id(1), &part, vec![]);
+/// What a session puts together of the parts that it is sent.
+fn put_together(messages: &[Message]) -> Vec<u8> {
+    let mut text = Vec::new();
+    for (number, message) in (0..).zip(messages) {
+        let Message::Status(part) = message else { panic!("{message:?}") };
+        assert_eq!(part.part, number);
+        text.extend_from_slice(&part.text);
+        assert_eq!(number + 1 == part.parts, text.len() == 6_000_000, "the last is the last");
     }
-    assert!(drain(&mut registry, 1).iter().all(|m| matches!(m, Message::Status(_))));
-    assert!(!registry.session(&id(1)).unwrap().awaits_status());
+    text
+}
+
+#[test]
+fn a_status_larger_than_the_queue_is_told_whole() {
+    for role in [SessionRole::Tool, SessionRole::Application] {
+        let mut registry = registry(&[role]);
+        // As 40,000 pairs make.
+        let status: Vec<u8> = (0..6_000_000u32).map(|n| (n % 251) as u8).collect();
+        assert!(status.len() > MAX_QUEUE_BYTES);
+        registry.tell_status(&id(1), status.clone().into());
+        assert_eq!(registry.take_ready(), [id(1)].into());
+        assert_eq!(registry.session(&id(1)).unwrap().queued(), 0, "it waits in no queue");
+        // A socket that has no room for one of the parts, and for the last.
+        let first = registry.next_output(&id(1)).unwrap();
+        registry.return_output(&id(1), first);
+        let mut all = Vec::new();
+        while let Some(output) = registry.next_output(&id(1)) {
+            registry.return_output(&id(1), output);
+            let output = registry.next_output(&id(1)).unwrap();
+            all.push(Message::decode(&output.packet).unwrap());
+        }
+        assert!(put_together(&all) == status);
+        assert!(!registry.repeat_status(&id(1)), "it has been told");
+    }
+}
+
+#[test]
+fn who_asks_again_is_told_the_same_status_from_its_beginning() {
+    let mut registry = registry(&[SessionRole::Tool]);
+    registry.tell_status(&id(1), vec![7; 6_000_000].into());
+    for _ in 0..20 {
+        registry.next_output(&id(1)).unwrap();
+    }
+    assert!(registry.repeat_status(&id(1)));
+    assert_eq!(put_together(&drain(&mut registry, 1)).len(), 6_000_000);
+    registry.tell_status(&id(1), Vec::new().into());
+    let one = drain(&mut registry, 1);
+    assert!(matches!(&one[..], [Message::Status(part)] if part.parts == 1));
 }

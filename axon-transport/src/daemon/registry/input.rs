@@ -1,11 +1,11 @@
 //! What sessions say.
 
 use super::{
-    Asked, LocalEndpoint, MAX_PAIRS, MAX_SESSIONS, MAX_TOMBSTONES, Registry, SessionEntry,
-    Violation, output::session_entry,
+    Asked, LocalEndpoint, MAX_ALL_PAIRS, MAX_PAIRS, MAX_SESSIONS, MAX_TOMBSTONES, Registry,
+    SessionEntry, Violation, output::session_entry,
 };
 use crate::{
-    graph::LIMITS,
+    graph::{Endpoint, LIMITS},
     ids::{Gid, SessionId},
     session::message::{
         Announce, Attach, EndpointRole, Granted, Message, Pair, Refused, SessionRole, Unmatch,
@@ -118,13 +118,12 @@ impl<F: Clone> Registry<F> {
             Some("a name, type hash or depth out of bounds")
         } else if entry.endpoints.len() >= LIMITS.endpoints {
             Some("too many endpoints in one session")
-        } else if entry.pairs + self.prospects(&endpoint) > MAX_PAIRS {
-            Some("its session would have too many pairs of publishers and subscriptions")
         } else {
-            None
+            self.too_many_pairs(entry, &endpoint)
         };
         if let Some(text) = refusal {
-            let text = format!("endpoint {gid}: {text}");
+            let text = format!("endpoint {gid} of topic {:?}: {text}", endpoint.topic);
+            self.note_refused(id, &text);
             let refused = Refused {
                 variable: String::new(),
                 ours: String::new(),
@@ -148,6 +147,32 @@ impl<F: Clone> Registry<F> {
         Ok(())
     }
 
+    /// Why the pairs of a new endpoint are more than there may be.
+    fn too_many_pairs(&self, of: &SessionEntry<F>, endpoint: &Endpoint) -> Option<&'static str> {
+        let new = self.prospects(endpoint);
+        if of.role != SessionRole::Gateway && of.pairs + new > MAX_PAIRS {
+            Some("its session would have too many pairs of publishers and subscriptions")
+        } else if self.pairs.len() + new > MAX_ALL_PAIRS {
+            Some("there would be too many pairs of publishers and subscriptions")
+        } else {
+            None
+        }
+    }
+
+    /// Keeps the first refusal of a session for the status; it is told all of them.
+    fn note_refused(&mut self, id: &SessionId, text: &str) {
+        if let Some(entry) = self.sessions.get_mut(id)
+            && !std::mem::replace(&mut entry.refused, true)
+        {
+            self.refused.push((*id, text.to_owned()));
+        }
+    }
+
+    /// The refused endpoints since the last call, the first of each session.
+    pub fn take_refused(&mut self) -> Vec<(SessionId, String)> {
+        std::mem::take(&mut self.refused)
+    }
+
     fn gone(&mut self, id: &SessionId, gid: Gid) -> Result<(), Violation> {
         match self.endpoints.get(&gid) {
             Some(local) if local.session == *id => {
@@ -167,6 +192,8 @@ impl<F: Clone> Registry<F> {
                 self.graph_end(gid);
                 Ok(())
             }
+            // A stand-in that was refused, or that another one took the place of.
+            None if self.sessions.get(id).is_some_and(|s| s.role == SessionRole::Gateway) => Ok(()),
             _ => Err(Violation::NotItsOwn(gid)),
         }
     }
@@ -287,10 +314,5 @@ impl<F> SessionEntry<F> {
     /// Packets that wait for it.
     pub fn queued(&self) -> usize {
         self.queue.len()
-    }
-
-    /// Whether part of a status waits for it.
-    pub fn awaits_status(&self) -> bool {
-        self.queue.iter().any(|output| Message::is_status(&output.packet))
     }
 }

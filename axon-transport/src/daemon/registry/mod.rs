@@ -14,7 +14,10 @@ mod output;
 #[cfg(test)]
 mod tests;
 
-use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
+use std::{
+    collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque},
+    sync::Arc,
+};
 
 pub use output::Output;
 
@@ -28,8 +31,13 @@ use crate::{
 pub const MAX_QUEUE: usize = if cfg!(test) { 24 } else { 4096 };
 /// Their bytes, likewise.
 pub const MAX_QUEUE_BYTES: usize = if cfg!(test) { 64 << 10 } else { 4 << 20 };
-/// Pairs that the endpoints of one session may make when they are announced.
-pub const MAX_PAIRS: usize = 1 << 16;
+/// Pairs that the endpoints of one session may make when they are announced: what a thousand
+/// publishers and as many subscriptions make. The gateway's stand-ins are bounded by its links.
+pub const MAX_PAIRS: usize = if cfg!(test) { 1 << 10 } else { 1 << 20 };
+/// Pairs of all sessions.
+pub const MAX_ALL_PAIRS: usize = if cfg!(test) { 1 << 18 } else { 1 << 22 };
+/// Bytes of the status in one packet.
+const STATUS_SLICE: usize = 24 * 1024;
 /// Sessions of one daemon.
 pub const MAX_SESSIONS: usize = 4096;
 /// Remembered GIDs of endpoints that ended while there was no daemon to tell.
@@ -50,6 +58,8 @@ pub struct Registry<F> {
     /// Those of them that were this host's own.
     ended: BTreeSet<Gid>,
     ready: BTreeSet<SessionId>,
+    /// The first endpoint of each session that was refused, and why.
+    refused: Vec<(SessionId, String)>,
 }
 
 /// A session as the registry knows it.
@@ -76,6 +86,10 @@ pub struct SessionEntry<F> {
     resync: bool,
     /// The pairs that its announcements made.
     pairs: usize,
+    /// What it asked about, and the next part of it.
+    status: Option<(Arc<[u8]>, u32)>,
+    /// An endpoint of its was refused.
+    refused: bool,
 }
 
 /// An endpoint of a session here.
@@ -146,6 +160,7 @@ impl<F> Default for Registry<F> {
             removed: BTreeSet::new(),
             ended: BTreeSet::new(),
             ready: BTreeSet::new(),
+            refused: Vec::new(),
         }
     }
 }

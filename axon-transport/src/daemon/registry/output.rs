@@ -5,10 +5,10 @@ use std::{
     sync::Arc,
 };
 
-use super::{MAX_QUEUE, MAX_QUEUE_BYTES, Registry, SessionEntry};
+use super::{MAX_QUEUE, MAX_QUEUE_BYTES, Registry, STATUS_SLICE, SessionEntry};
 use crate::{
     ids::SessionId,
-    session::message::{Graph, Message, Pair, SessionRole},
+    session::message::{Graph, Message, Pair, SessionRole, StatusPart},
 };
 
 /// A packet for a session.
@@ -28,7 +28,7 @@ impl<F: Clone> Registry<F> {
     /// it does not hear again is over.
     pub fn next_output(&mut self, id: &SessionId) -> Option<Output<F>> {
         let entry = self.sessions.get_mut(id)?;
-        if entry.queue.is_empty() && (entry.behind || std::mem::take(&mut entry.resync)) {
+        if entry.queue.is_empty() && (entry.behind || entry.resync) {
             self.tell_everything(id);
         }
         let entry = self.sessions.get_mut(id)?;
@@ -38,12 +38,37 @@ impl<F: Clone> Registry<F> {
             entry.queue_limit = MAX_QUEUE;
             entry.bytes_limit = MAX_QUEUE_BYTES;
         }
-        output
+        output.or_else(|| next_part(&mut entry.status))
+    }
+
+    /// Tells a session the status, part by part, as it takes them. It need not fit the queue: a
+    /// large system's is of many megabytes.
+    pub fn tell_status(&mut self, id: &SessionId, text: Arc<[u8]>) {
+        if let Some(entry) = self.sessions.get_mut(id) {
+            entry.status = Some((text, 0));
+            self.ready.insert(*id);
+        }
+    }
+
+    /// Tells a session that asks once more the same status from its beginning; whether one is
+    /// being told to it.
+    pub fn repeat_status(&mut self, id: &SessionId) -> bool {
+        let entry = self.sessions.get_mut(id);
+        let status = entry.and_then(|entry| entry.status.as_mut());
+        status.is_some_and(|(_, next)| {
+            *next = 0;
+            true
+        })
     }
 
     /// Puts a packet back that could not be sent.
     pub fn return_output(&mut self, id: &SessionId, output: Output<F>) {
-        if let Some(entry) = self.sessions.get_mut(id) {
+        let Some(entry) = self.sessions.get_mut(id) else { return };
+        if Message::is_status(&output.packet) {
+            if let Some((_, next)) = &mut entry.status {
+                *next = next.saturating_sub(1);
+            }
+        } else {
             entry.queued_bytes += output.packet.len();
             entry.queue.push_front(output);
         }
@@ -97,6 +122,7 @@ impl<F: Clone> Registry<F> {
         let parts = self.whole_graph();
         let Some(entry) = self.sessions.get_mut(id) else { return };
         entry.behind = false;
+        entry.resync = false;
         entry.known.clear();
         entry.queue_limit = usize::MAX;
         entry.bytes_limit = usize::MAX;
@@ -133,6 +159,21 @@ impl<F: Clone> Registry<F> {
     }
 }
 
+/// The next part of a status, of which one without text has one, too.
+fn next_part<F>(status: &mut Option<(Arc<[u8]>, u32)>) -> Option<Output<F>> {
+    let (text, next) = status.as_mut()?;
+    let parts = u32::try_from(text.len().div_ceil(STATUS_SLICE).max(1)).ok()?;
+    if *next == parts {
+        *status = None;
+        return None;
+    }
+    let from = *next as usize * STATUS_SLICE;
+    let slice = &text[from..text.len().min(from + STATUS_SLICE)];
+    let part = Message::Status(StatusPart { part: *next, parts, text: slice.to_vec() });
+    *next += 1;
+    Some(Output { packet: encode(&part)?, descriptors: Vec::new() })
+}
+
 pub(super) fn session_entry<F>(
     role: SessionRole,
     name: String,
@@ -153,6 +194,8 @@ pub(super) fn session_entry<F>(
         behind: false,
         resync: false,
         pairs: 0,
+        status: None,
+        refused: false,
     }
 }
 

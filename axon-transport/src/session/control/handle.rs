@@ -5,7 +5,7 @@ use std::{
     sync::Arc,
 };
 
-use super::{Control, append, stands_for};
+use super::{Control, stands_for};
 use crate::{
     graph::{GraphEntry, GraphView},
     ids::{Gid, SessionId},
@@ -34,9 +34,9 @@ impl Control {
             Message::Status(part) => {
                 let mut state = self.shared.state();
                 if let StatusAnswer::Parts(text) = &mut state.status
-                    && append(text, &part)
+                    && let Some(whole) = text.add(&part)
                 {
-                    state.status = StatusAnswer::Whole(std::mem::take(text));
+                    state.status = StatusAnswer::Whole(whole);
                     drop(state);
                     self.shared.notify(None);
                 }

@@ -20,15 +20,13 @@ use super::{
     connect::{Caller, Connected},
     error::SessionError,
     local::Local,
-    message::{Announce, EndpointRole, Gone, Message, Pair, StatusPart},
+    message::{Announce, EndpointRole, Gone, Message, Pair},
     peers::Peers,
     socket::{self, SocketError},
-    state::{Outgoing, SessionEvent, Shared, StatusAnswer},
+    state::{Outgoing, SessionEvent, Shared, StatusAnswer, StatusText},
 };
 use crate::{graph::GraphView, ids::Gid, passed::PassedFd};
 
-/// The longest status that is put together.
-const MAX_STATUS: usize = 64 << 20;
 /// Packets handled before queued ones are sent: neither direction starves the other.
 const BATCH: usize = 64;
 /// A relay stands for at most this many remote subscriptions by name; one packet holds no more.
@@ -330,14 +328,14 @@ pub(super) fn ask_status(
     let protocol = |e: SocketError| SessionError::Protocol(e.to_string());
     let deadline = Instant::now() + patience;
     socket::send(socket, &Message::StatusRequest.encode()?, &[]).map_err(protocol)?;
-    let (mut text, mut buffer) = (Vec::new(), Vec::new());
+    let (mut text, mut buffer) = (StatusText::default(), Vec::new());
     loop {
         match socket::receive(socket, &mut buffer) {
             Ok(received) => {
                 if let Message::Status(part) = received.message
-                    && append(&mut text, &part)
+                    && let Some(whole) = text.add(&part)
                 {
-                    return Ok(text);
+                    return Ok(whole);
                 }
             }
             Err(SocketError::NotReady) => {
@@ -352,12 +350,4 @@ pub(super) fn ask_status(
             Err(error) => return Err(protocol(error)),
         }
     }
-}
-
-/// Adds a slice of the status; whether it was the last.
-fn append(text: &mut Vec<u8>, part: &StatusPart) -> bool {
-    if text.len() + part.text.len() <= MAX_STATUS {
-        text.extend_from_slice(&part.text);
-    }
-    part.part.saturating_add(1) >= part.parts
 }
