@@ -11,7 +11,11 @@ use std::{
     thread,
 };
 
-use rustix::fs::{fcntl_get_seals, fstat};
+use rustix::{
+    fs::{fcntl_get_seals, fstat},
+    io::Errno,
+    process::{WaitId, WaitIdOptions, waitid},
+};
 
 use crate::session::signals;
 
@@ -44,6 +48,12 @@ impl PassedFd {
     /// Whether it is memory that can be sealed. Asks no file system.
     pub(crate) fn is_memfd(&self) -> bool {
         fcntl_get_seals(self).is_ok()
+    }
+
+    /// Whether it stands for a process. Takes no lock of what it is, which whoever sent it could
+    /// keep.
+    pub(crate) fn is_pidfd(&self) -> bool {
+        is_pidfd(self.as_fd())
     }
 
     /// Closing it has turned out not to block.
@@ -87,6 +97,12 @@ impl Drop for PassedFd {
             close_elsewhere(fd);
         }
     }
+}
+
+/// Only a pidfd can be waited for, though by nobody but the process's parent (Linux 5.4).
+fn is_pidfd(fd: BorrowedFd<'_>) -> bool {
+    let look = WaitIdOptions::EXITED | WaitIdOptions::NOHANG | WaitIdOptions::NOWAIT;
+    matches!(waitid(WaitId::PidFd(fd), look), Ok(_) | Err(Errno::CHILD))
 }
 
 /// Whether it is a memfd that gives little memory back. Asks nothing that a file system of somebody
@@ -238,5 +254,29 @@ pub(crate) mod tests {
         rustix::io::write(&memfd, &vec![1; 2 << 20]).unwrap();
         assert!(!closes_at_once(&memfd), "it gives much memory back");
         assert!(!closes_at_once(&tempfile::tempfile().unwrap().into()));
+    }
+
+    #[test]
+    fn only_a_pidfd_is_one() {
+        use rustix::{
+            event::{EventfdFlags, epoll, eventfd},
+            process::{PidfdFlags, getpid, getppid, pidfd_open},
+        };
+        let of = |pid| PassedFd::received(pidfd_open(pid, PidfdFlags::empty()).unwrap());
+        assert!(of(getpid()).is_pidfd() && of(getppid().unwrap()).is_pidfd());
+        let mut child = std::process::Command::new("true").spawn().unwrap();
+        let ended = of(rustix::process::Pid::from_child(&child));
+        assert!(ended.is_pidfd());
+        child.wait().unwrap();
+        assert!(ended.is_pidfd(), "also of one that has ended");
+        let others: [OwnedFd; 5] = [
+            epoll::create(epoll::CreateFlags::CLOEXEC).unwrap(),
+            eventfd(0, EventfdFlags::CLOEXEC).unwrap(),
+            std::fs::File::open("/dev/null").unwrap().into(),
+            // Its directory names a process, too.
+            std::fs::File::open("/proc/self").unwrap().into(),
+            pair().0,
+        ];
+        others.map(PassedFd::received).iter().for_each(|fd| assert!(!fd.is_pidfd(), "{fd:?}"));
     }
 }

@@ -43,6 +43,10 @@ impl PeerDescriptors {
     /// The process that the pidfd refers to, to be compared with the credentials of the socket
     /// it came over. `None` when it is no pidfd, or its process has ended.
     pub fn process(&self) -> Option<u32> {
+        // What some things tell of themselves there takes locks that others can keep.
+        if !self.pidfd.is_pidfd() {
+            return None;
+        }
         let path = format!("/proc/self/fdinfo/{}", self.pidfd.as_fd().as_raw_fd());
         let text = fs::read_to_string(path).ok()?;
         let pid = text.lines().find_map(|line| line.strip_prefix("Pid:"))?;
