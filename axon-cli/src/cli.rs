@@ -241,7 +241,7 @@ const BENCH_SHM_HELP: &str = "\
 Latency (p50, p99, p99.9) with a receiver that polls and one that sleeps, throughput, and what a
 publish costs by the number of readers, each as a ratio to the raw limit in the same run: a spin on
 a shared atomic, epoll and eventfd, one memcpy, two. Two processes, each on a CPU of its own, take
-turns with both; so the rest of the machine should be idle. About three minutes; --quick takes
+turns with both; so the rest of the machine should be idle. About two minutes; --quick takes
 seconds and is only to see it run. Writes shm.json, with all percentiles, and shm.svg.
 
 Examples:

@@ -16,7 +16,7 @@ pub(super) fn latency(load: &Load) -> Option<f64> {
         (Wake::Poll, Motion::Copy) if load.size <= INLINE => Some(1.3),
         (Wake::Poll, Motion::Copy) if load.size >= BYTES_ALONE => Some(1.05),
         (Wake::Poll, Motion::Touch) => Some(2.5),
-        (Wake::Event, Motion::Touch) => Some(1.1),
+        (Wake::Event | Wake::EventOneCpu, Motion::Touch) => Some(1.1),
         _ => None,
     }
 }
@@ -41,6 +41,7 @@ mod tests {
         for size in [8, 25_000_000] {
             assert_eq!(of(size, Wake::Poll, Motion::Touch), Some(2.5));
             assert_eq!(of(size, Wake::Event, Motion::Touch), Some(1.1));
+            assert_eq!(of(size, Wake::EventOneCpu, Motion::Touch), Some(1.1));
             assert_eq!(of(size, Wake::Poll, Motion::Fill), None);
         }
         assert_eq!((verdict(1.3, 1.3), verdict(1.31, 1.3)), ("met", "not met"));

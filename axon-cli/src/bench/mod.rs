@@ -11,10 +11,11 @@ use std::{
     io::{self, Write},
 };
 
-use indicatif::{ProgressBar, ProgressStyle};
-
 use self::{
-    harness::{Axon, Effort, Load, Machine, Medium, Motion, Pair, Raw, Rounds, SIZES, Wake, words},
+    harness::{
+        Axon, Effort, Load, Machine, Medium, Motion, Pair, Progress, Raw, Rounds, SIZES, Wake,
+        words,
+    },
     readers::{Cost, Crowd},
 };
 use crate::{cli, failure::Failure};
@@ -23,11 +24,12 @@ use crate::{cli, failure::Failure};
 const QUICK_SIZES: [usize; 3] = [8, 4 << 10, 64 << 10];
 
 /// The kinds of latency that are measured, in the order of the tables.
-const KINDS: [(Wake, Motion); 5] = [
+const KINDS: [(Wake, Motion); 6] = [
     (Wake::Poll, Motion::Copy),
     (Wake::Poll, Motion::Fill),
     (Wake::Poll, Motion::Touch),
     (Wake::Event, Motion::Touch),
+    (Wake::EventOneCpu, Motion::Touch),
     (Wake::Event, Motion::Copy),
 ];
 /// The kinds of streams.
@@ -88,39 +90,34 @@ pub(crate) fn read() -> Result<(), Failure> {
 fn measure(sizes: &[usize], quick: bool) -> harness::Result<Results> {
     let effort = if quick { Effort::QUICK } else { Effort::FULL };
     let machine = Machine::look()?;
-    let bar = ProgressBar::new((sizes.len() * (KINDS.len() + STREAMS.len() + 1)) as u64);
-    if let Ok(style) = ProgressStyle::with_template("{msg:40!} [{bar:30}] {pos}/{len} {elapsed}") {
-        bar.set_style(style.progress_chars("=> "));
-    }
-    let step = |what: String| {
-        bar.inc(1);
-        bar.set_message(what);
-    };
+    let progress = Progress::new(sizes.len() * (KINDS.len() + STREAMS.len() + 1));
     let (mut latency, mut streams, mut publish) = (Vec::new(), Vec::new(), Vec::new());
 
     let pair = Pair::start(&MEDIA, effort, &machine, &[ANSWERING])?;
     for (wake, motion) in KINDS {
+        progress.step(&format!("latency, {}", words::kind(wake, motion)));
         for size in sizes {
             let load = Load::ping_pong(*size, wake, motion);
             latency.push(compared(load, pair.latency(&load)?)?);
-            step(format!("latency, {}", words::kind(wake, motion)));
+            progress.advance();
         }
     }
     for motion in STREAMS {
+        progress.step(&format!("throughput, {}", words::motion(motion)));
         for size in sizes {
             let load = Load::stream(*size, motion);
             streams.push(compared(load, pair.stream(&load)?)?);
-            step(format!("throughput, {}", words::motion(motion)));
+            progress.advance();
         }
     }
     drop(pair);
 
+    progress.step("a publish by its readers");
     let crowd = Crowd::start(&[READING])?;
     for size in sizes {
         publish.push(crowd.measure(*size, effort)?);
-        step("publish by readers".to_owned());
+        progress.advance();
     }
-    bar.finish_and_clear();
     Ok(Results { machine, quick, effort, latency, streams, publish })
 }
 

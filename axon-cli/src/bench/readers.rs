@@ -6,7 +6,7 @@ use axon_transport::shm::{Context, Publisher, PublisherOptions, Subscriber, Subs
 use rustix::process::{Signal, set_parent_process_death_signal};
 use serde::{Deserialize, Serialize};
 
-use super::harness::{Channel, Effort, Other, Result, Rounds, Shared, qos, spawn, summarize};
+use super::harness::{Channel, Effort, Other, Result, Rounds, Shared, qos, spawn};
 
 /// How many readers are compared.
 pub(super) const READERS: [usize; 5] = [1, 2, 4, 8, 16];
@@ -72,17 +72,22 @@ impl Crowd {
         let contestants = 1 + READERS.len();
         let mut counts = Vec::new();
         for which in 0..contestants {
-            // The first ones find the memory.
-            turn(which, 64)?;
-            counts.push(effort.count(64, turn(which, 64)?));
+            let mut count = 4;
+            counts.push(loop {
+                let elapsed = turn(which, count)?.min(turn(which, count)?);
+                if elapsed * 4 >= effort.turn || count >= effort.messages[1] {
+                    break effort.count(count, elapsed);
+                }
+                count *= 4;
+            });
         }
-        let mut rounds: Vec<Rounds> = (0..contestants).map(|_| Rounds(Vec::new())).collect();
+        let mut rounds: Vec<Rounds> = (0..contestants).map(|_| Rounds::default()).collect();
         for round in 0..effort.rounds {
             for next in 0..contestants {
                 let which = (round + next) % contestants;
                 let elapsed = turn(which, counts[which])?;
                 let each = elapsed.as_secs_f64() * 1e9 / counts[which] as f64;
-                rounds[which].0.push(summarize(&mut [each]));
+                rounds[which].add(vec![each]);
             }
         }
         for reader in &self.0 {

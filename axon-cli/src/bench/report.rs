@@ -12,9 +12,10 @@ use super::{
 use crate::text::{self, Table};
 
 /// How figures are taken from rounds; in every output.
-const REPORTED: &str = "Raw and AXON take turns. Times are one way (half a round trip), of the \
-                        round with the least median. Ratios: of these medians, and the median of \
-                        the rounds' ratios. A budget is judged by the first.";
+const REPORTED: &str = "Raw and AXON take turns. Times are one way (half a round trip): p50 of the \
+                        round in which it was least, p99 and p99.9 of all rounds together. Ratios: \
+                        of these p50, and the median of the rounds' ratios. A budget is judged by \
+                        the first.";
 
 pub(super) fn text(results: &Results) -> String {
     let mut out = format!("{}\n{REPORTED}\n", results.machine.line());
@@ -65,10 +66,10 @@ fn latency_table<'a>(rows: impl Iterator<Item = &'a Compared>) -> String {
         let ratio = axon.to(raw);
         let mut row = vec![words::size(load.size)];
         for rounds in [raw, axon] {
-            let best = rounds.best();
-            row.push(words::nanoseconds(best.p50()));
+            let all = rounds.all();
+            row.push(words::nanoseconds(rounds.best().p50()));
             row.extend(
-                [99.0, 99.9].map(|p| best.tail(p).map_or("-".to_owned(), words::nanoseconds)),
+                [99.0, 99.9].map(|p| all.tail(p).map_or("-".to_owned(), words::nanoseconds)),
             );
         }
         row.extend(ratio_cells(ratio));

@@ -7,7 +7,7 @@ use axon_transport::{
     shm::{Context, Publisher, PublisherOptions, Subscriber, SubscriberOptions},
 };
 
-use super::{Channel, End, Load, Medium, Motion, Result, Side, Wake, agree, stamp};
+use super::{Channel, End, Load, Medium, Motion, Result, Side, agree, stamp};
 
 /// Longer than any machine needs to connect.
 const PATIENCE: Option<Duration> = Some(Duration::from_secs(60));
@@ -26,7 +26,10 @@ impl Medium for Axon {
     fn open(&self, load: &Load, side: Side, channel: &Channel) -> Result<Box<dyn End>> {
         let context = Context::new()?;
         let qos = qos(load.window)?;
-        let publisher = Publisher::new(&context, PublisherOptions::new(qos))?;
+        // All that may be under way must fit, or the oldest go.
+        let budget = (load.window * load.size).max(64 << 20) as u64;
+        let options = PublisherOptions::new(qos).budget(budget);
+        let publisher = Publisher::new(&context, options)?;
         let connect =
             || Subscriber::connect(&context, channel, SubscriberOptions::new(qos), PATIENCE);
         let subscriber = match side {
@@ -46,7 +49,7 @@ impl Medium for Axon {
             subscriber,
             context,
             size: load.size,
-            sleeps: load.wake == Wake::Event,
+            sleeps: load.wake.sleeps(),
             loans: in_place && load.motion == Motion::Touch,
             copies: !in_place || load.motion == Motion::Copy,
             out: vec![0x5a; load.size],

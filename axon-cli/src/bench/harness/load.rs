@@ -10,8 +10,18 @@ use super::{Channel, Result};
 pub(crate) enum Wake {
     /// It looks all the time.
     Poll,
-    /// It sleeps until it is woken.
+    /// It sleeps until it is woken, from another CPU.
     Event,
+    /// As [`Event`](Self::Event), with both processes on one CPU, so that a wake-up is a switch
+    /// from one to the other and takes nothing from the machine between CPUs.
+    EventOneCpu,
+}
+
+impl Wake {
+    /// Whether the receiver sleeps.
+    pub(crate) fn sleeps(self) -> bool {
+        self != Self::Poll
+    }
 }
 
 /// What becomes of a message's bytes. In all of them both ends touch its first and last eight.

@@ -19,6 +19,9 @@ pub(crate) struct Machine {
     pub(crate) cpu: String,
     /// How many CPUs this process may use.
     pub(crate) cpus: usize,
+    /// Which.
+    #[serde(skip)]
+    pub(super) allowed: Vec<usize>,
     /// The CPU of the process that measures and that of the other one.
     pub(crate) pinned: [usize; 2],
     /// Processes that ran or wanted to in the minute before.
@@ -46,6 +49,7 @@ impl Machine {
             architecture: text(system.machine()),
             cpu: cpu_model(),
             cpus: cpus.len(),
+            allowed: cpus,
             pinned: [near, far],
             load_before: load_average().unwrap_or(0.0),
             clock_ns: super::clock_cost(),

@@ -23,7 +23,7 @@ pub(crate) struct Effort {
 impl Effort {
     /// For figures.
     pub(crate) const FULL: Self =
-        Self { rounds: 21, turn: Duration::from_millis(10), messages: [8, 50_000] };
+        Self { rounds: 21, turn: Duration::from_millis(10), messages: [3, 50_000] };
     /// To see it run.
     pub(crate) const QUICK: Self =
         Self { rounds: 3, turn: Duration::from_millis(1), messages: [4, 1_000] };
@@ -60,8 +60,25 @@ impl Summary {
     }
 }
 
-/// Sums a turn up. Sorts `times`.
-pub(crate) fn summarize(times: &mut [f64]) -> Summary {
+impl Summary {
+    fn json(&self) -> Value {
+        let percentiles: Map<String, Value> = PERCENTILES
+            .iter()
+            .zip(self.at)
+            .map(|(percent, ns)| (format!("p{percent}"), json!(tenths(ns))))
+            .collect();
+        json!({
+            "count": self.count, "mean_ns": tenths(self.mean), "percentiles_ns": percentiles,
+        })
+    }
+}
+
+fn tenths(ns: f64) -> f64 {
+    (ns * 10.0).round() / 10.0
+}
+
+/// Sums times up, and sorts them.
+fn summarize(times: &mut [f64]) -> Summary {
     times.sort_by(f64::total_cmp);
     let last = times.len() - 1;
     let at =
@@ -70,42 +87,49 @@ pub(crate) fn summarize(times: &mut [f64]) -> Summary {
 }
 
 /// All turns of one medium under one load.
-#[derive(Clone, Debug)]
-pub(crate) struct Rounds(pub(crate) Vec<Summary>);
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Rounds {
+    turns: Vec<Summary>,
+    /// The times of all turns.
+    times: Vec<f64>,
+}
 
 impl Rounds {
+    /// Adds a turn's times.
+    pub(crate) fn add(&mut self, mut times: Vec<f64>) {
+        self.turns.push(summarize(&mut times));
+        self.times.append(&mut times);
+    }
+
+    /// All times together, whatever disturbed the machine meanwhile among them.
+    pub(crate) fn all(&self) -> Summary {
+        summarize(&mut self.times.clone())
+    }
+
     /// The turn with the least median: the one that was disturbed least.
     pub(crate) fn best(&self) -> &Summary {
         let least = |a: &&Summary, b: &&Summary| a.p50().total_cmp(&b.p50());
-        self.0.iter().min_by(least).expect("there is a round at least")
+        self.turns.iter().min_by(least).expect("there is a round at least")
     }
 
     /// The median of the turns' medians.
     pub(crate) fn typical(&self) -> f64 {
-        median(self.0.iter().map(Summary::p50).collect())
+        median(self.turns.iter().map(Summary::p50).collect())
     }
 
-    /// The best turn whole, and how the others went.
+    /// The best turn, and all of them.
     pub(crate) fn json(&self) -> Value {
-        let round = |ns: f64| (ns * 10.0).round() / 10.0;
-        let best = self.best();
-        let percentiles: Map<String, Value> = PERCENTILES
-            .iter()
-            .zip(best.at)
-            .map(|(percent, ns)| (format!("p{percent}"), json!(round(ns))))
-            .collect();
         json!({
-            "best_round": {
-                "count": best.count, "mean_ns": round(best.mean), "percentiles_ns": percentiles,
-            },
-            "median_of_p50_ns": round(self.typical()),
-            "rounds": self.0.len(),
+            "best_round": self.best().json(),
+            "all_rounds": self.all().json(),
+            "median_of_p50_ns": tenths(self.typical()),
+            "rounds": self.turns.len(),
         })
     }
 
     /// How many times what `limit` took this one took.
     pub(crate) fn to(&self, limit: &Self) -> Ratio {
-        let rounds = self.0.iter().zip(&limit.0).map(|(own, of)| own.p50() / of.p50());
+        let rounds = self.turns.iter().zip(&limit.turns).map(|(own, of)| own.p50() / of.p50());
         Ratio { best: self.best().p50() / limit.best().p50(), median: median(rounds.collect()) }
     }
 }
@@ -156,9 +180,14 @@ mod tests {
 
     #[test]
     fn a_ratio_of_the_best_turns_and_the_median_of_the_rounds() {
-        let turn = |times: &[f64]| summarize(&mut times.to_vec());
-        let own = Rounds(vec![turn(&[20.0]), turn(&[90.0]), turn(&[30.0])]);
-        let limit = Rounds(vec![turn(&[10.0]), turn(&[10.0]), turn(&[5.0])]);
+        let rounds = |turns: [&[f64]; 3]| {
+            let mut rounds = Rounds::default();
+            turns.iter().for_each(|times| rounds.add(times.to_vec()));
+            rounds
+        };
+        let own = rounds([&[20.0], &[90.0], &[30.0]]);
+        let limit = rounds([&[10.0], &[10.0], &[5.0]]);
+        assert_eq!((own.all().count, own.all().mean), (3, 140.0 / 3.0));
         let ratio = own.to(&limit);
         assert_eq!((ratio.best, ratio.median), (4.0, 6.0));
         assert_eq!((own.best().p50(), own.typical()), (20.0, 30.0));

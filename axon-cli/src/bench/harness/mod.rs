@@ -12,6 +12,7 @@ mod load;
 mod machine;
 mod measure;
 mod pair;
+mod progress;
 mod raw;
 pub(crate) mod words;
 
@@ -20,8 +21,9 @@ pub(crate) use channel::Channel;
 pub(crate) use chart::{Chart, Line, page};
 pub(crate) use load::{End, Load, Medium, Motion, Side, Wake, agree, stamp};
 pub(crate) use machine::Machine;
-pub(crate) use measure::{Effort, Ratio, Rounds, clock_cost, summarize};
+pub(crate) use measure::{Effort, Ratio, Rounds, clock_cost};
 pub(crate) use pair::{Other, Pair, serve, spawn};
+pub(crate) use progress::Progress;
 pub(crate) use raw::{Raw, Shared};
 
 /// Whatever stops a measurement.

@@ -8,6 +8,7 @@ pub(crate) fn kind(wake: Wake, how: Motion) -> String {
     let wake = match wake {
         Wake::Poll => "polling",
         Wake::Event => "event-driven",
+        Wake::EventOneCpu => "event-driven on one CPU",
     };
     format!("{wake}, {}", motion(how))
 }
@@ -25,7 +26,7 @@ pub(crate) fn motion(motion: Motion) -> &'static str {
 pub(crate) fn limit(wake: Wake, motion: Motion) -> String {
     let wake = match wake {
         Wake::Poll => "a spin on a shared atomic",
-        Wake::Event => "epoll and eventfd",
+        Wake::Event | Wake::EventOneCpu => "epoll and eventfd",
     };
     match motion {
         Motion::Touch => wake.to_owned(),
