@@ -162,7 +162,7 @@ fn it_ends_when_its_other_process_does() {
     let mut command = axon([]);
     command.args(["bench", "shm", "--sizes", "8", "--out"]).arg(dir.path());
     command.stdin(Stdio::null());
-    let running = Running::start(command);
+    let mut running = Running::start(command);
     let pid = running.0.id();
     let mut other = None;
     eventually("there is another process", || {
@@ -175,6 +175,7 @@ fn it_ends_when_its_other_process_does() {
     thread::sleep(std::time::Duration::from_millis(50));
     rustix::process::kill_process(other.expect("found"), rustix::process::Signal::KILL)
         .expect("it was there");
+    eventually("it ends", || running.0.try_wait().expect("its status").is_some());
     let output = running.finish();
     let why = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{why}");

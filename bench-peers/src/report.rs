@@ -95,7 +95,7 @@ fn table<'a>(results: &Results, rows: impl Iterator<Item = &'a Compared>, cell: 
                 Cell::Rate => {
                     let rate = 1e9 / best.p50();
                     row.push(text::grouped(rate as u64));
-                    row.push(text::bytes((rate * compared.load.size as f64) as u64));
+                    row.push(words::throughput(&compared.load, rate));
                 }
             }
         }
@@ -137,15 +137,12 @@ pub(crate) fn json(results: &Results) -> String {
 }
 
 pub(crate) fn svg(results: &Results) -> String {
-    let lines = |rows: Vec<&Compared>, value: fn(usize, f64) -> f64| {
+    let lines = |rows: Vec<&Compared>, value: fn(f64) -> f64| {
         let line = |(index, name): (usize, &&str)| Line {
             name: (*name).to_owned(),
             points: rows
                 .iter()
-                .map(|c| {
-                    let p50 = c.rounds[index].best().p50().max(1.0);
-                    (c.load.size as f64, value(c.load.size, p50))
-                })
+                .map(|c| (c.load.size as f64, value(c.rounds[index].best().p50().max(1.0))))
                 .collect(),
         };
         results.media.iter().enumerate().map(line).collect::<Vec<_>>()
@@ -154,19 +151,18 @@ pub(crate) fn svg(results: &Results) -> String {
         let of_kind = |c: &&Compared| (c.load.wake, c.load.motion) == (*wake, *motion);
         Chart {
             title: format!("Latency (p50), {}", words::kind(*wake, *motion)),
-            lines: lines(results.latency.iter().filter(of_kind).collect(), |_, ns| ns),
+            lines: lines(results.latency.iter().filter(of_kind).collect(), |ns| ns),
             across: |bytes| words::size(bytes as usize),
             upwards: |ns| text::duration(ns as u64),
         }
     });
     let streams = STREAMS.iter().map(|motion| Chart {
-        title: format!("Throughput, {}", words::motion(*motion)),
-        lines: lines(
-            results.streams.iter().filter(|c| c.load.motion == *motion).collect(),
-            |size, ns| size as f64 * 1e9 / ns,
-        ),
+        title: format!("Messages a second, {}", words::motion(*motion)),
+        lines: lines(results.streams.iter().filter(|c| c.load.motion == *motion).collect(), |ns| {
+            1e9 / ns
+        }),
         across: |bytes| words::size(bytes as usize),
-        upwards: |rate| format!("{}/s", text::bytes(rate as u64)),
+        upwards: |rate| text::grouped(rate as u64),
     });
     let charts: Vec<Chart> = latency.chain(streams).collect();
     let machine = &results.machine;

@@ -17,7 +17,7 @@ pub(super) fn svg(results: &Results) -> String {
         };
         charts.push(Chart {
             title: format!("Latency (p50), {}", words::kind(wake, motion)),
-            lines: raw_and_axon(rows, |_, rounds| rounds.best().p50()),
+            lines: raw_and_axon(rows, |rounds| rounds.best().p50()),
             across: bytes,
             upwards: time,
         });
@@ -25,10 +25,10 @@ pub(super) fn svg(results: &Results) -> String {
     for motion in STREAMS {
         let rows = || results.streams.iter().filter(move |c| c.load.motion == motion);
         charts.push(Chart {
-            title: format!("Throughput, {}", words::motion(motion)),
-            lines: raw_and_axon(rows, |size, rounds| size as f64 * 1e9 / rounds.best().p50()),
+            title: format!("Messages a second, {}", words::motion(motion)),
+            lines: raw_and_axon(rows, |rounds| 1e9 / rounds.best().p50()),
             across: bytes,
-            upwards: |rate| format!("{}/s", text::bytes(rate as u64)),
+            upwards: |rate| text::grouped(rate as u64),
         });
     }
     let by_readers = |cost: &super::Cost| Line {
@@ -53,11 +53,11 @@ pub(super) fn svg(results: &Results) -> String {
 
 fn raw_and_axon<'a, I: Iterator<Item = &'a Compared>>(
     rows: impl Fn() -> I,
-    value: fn(usize, &Rounds) -> f64,
+    value: fn(&Rounds) -> f64,
 ) -> Vec<Line> {
     let line = |name: &str, of: fn(&Compared) -> &Rounds| Line {
         name: name.to_owned(),
-        points: rows().map(|c| (c.load.size as f64, value(c.load.size, of(c)).max(1.0))).collect(),
+        points: rows().map(|c| (c.load.size as f64, value(of(c)).max(1.0))).collect(),
     };
     vec![line("raw", |c| &c.raw), line("AXON", |c| &c.axon)]
 }

@@ -94,7 +94,7 @@ fn stream_table<'a>(rows: impl Iterator<Item = &'a Compared>) -> String {
         for rounds in [raw, axon] {
             let rate = 1e9 / rounds.best().p50();
             row.push(text::grouped(rate as u64));
-            row.push(text::bytes((rate * load.size as f64) as u64));
+            row.push(words::throughput(load, rate));
         }
         row.extend(ratio_cells(axon.to(raw)));
         table.row(row);

@@ -1,6 +1,6 @@
 //! What loads are called.
 
-use super::{Motion, Wake};
+use super::{Load, Motion, Wake};
 use crate::text;
 
 /// How a receiver learns of a message, and what becomes of its bytes.
@@ -41,6 +41,14 @@ pub(crate) fn size(bytes: usize) -> String {
         b if b >= 1 << 20 && b.is_multiple_of(1 << 20) => format!("{} MiB", b >> 20),
         b if b >= 1 << 10 && b.is_multiple_of(1 << 10) => format!("{} KiB", b >> 10),
         b => text::bytes(b as u64).replace(".0 MB", " MB"),
+    }
+}
+
+/// Bytes a second at `rate` messages a second, where they are moved.
+pub(crate) fn throughput(load: &Load, rate: f64) -> String {
+    match load.motion {
+        Motion::Touch => "-".to_owned(),
+        Motion::Fill | Motion::Copy => text::bytes((rate * load.size as f64) as u64),
     }
 }
 
