@@ -12,6 +12,7 @@ use axon_transport::{
     link::{self, FrameError},
     qos::Qos,
     session::message::{self as session, CodecError, MAX_PACKET},
+    shm::Location,
 };
 
 const TERMS: Terms = Terms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(1) };
@@ -175,9 +176,12 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
 pub fn session_message_seeds() -> Vec<Vec<u8>> {
     use session::{
         Announce, Attach, EndpointRole, Gone, Granted, Graph, GraphItem, Hello, Message, PROTOCOL,
-        Pair, Refused, SessionRole, StatusPart, Unmatch, Welcome,
+        Pair, Refused, Segment, SegmentName, SegmentOpened, SessionRole, StatusPart, Unmatch,
+        Welcome,
     };
     let (reader, writer) = (Gid([1; 16]), Gid([2; 16]));
+    let place = Location { segment: 3, offset: 4096 };
+    let segment = Segment { number: 3, publisher: Some(writer) };
     let session = SessionId([3; 16]);
     let daemon = DaemonId([4; 16]);
     let messages = [
@@ -200,6 +204,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             endpoint: endpoint(),
             role: EndpointRole::Relay,
             stands_for: vec![reader, writer],
+            ring: Some(place),
         }),
         Message::EndpointGone(Gone { gid: reader }),
         Message::Graph(Graph {
@@ -214,17 +219,29 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
         Message::Attach(Attach {
             reader,
             writer,
-            lane: 4,
+            lane: place,
             qos: Qos::default(),
             session,
             stands_for: vec![reader],
+            segments: vec![segment],
         }),
-        Message::Grant(Granted { reader, writer, generation: 5, first: 6, session }),
+        Message::Grant(Granted {
+            reader,
+            writer,
+            generation: 5,
+            first: 6,
+            session,
+            ring: place,
+            segments: vec![segment],
+        }),
         Message::Detach(Pair { reader, writer }),
         Message::Unmatch(Unmatch { reader, writer, reason: "gone".into() }),
         Message::StatusRequest,
         Message::Status(StatusPart { part: 0, parts: 1, text: b"{}".to_vec() }),
         Message::Resync,
+        Message::Segment(SegmentOpened { session, segment }),
+        Message::SegmentGone(SegmentName { session, number: 3 }),
+        Message::Need(SegmentName { session, number: 3 }),
         Message::Unknown(200),
     ];
     messages.iter().map(|message| message.encode().unwrap()).collect()

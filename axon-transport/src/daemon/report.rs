@@ -1,13 +1,13 @@
 //! Puts the status together.
 //!
-//! Counters of samples are read from the rings' and segments' descriptors, at the offsets of
+//! Counters of samples are read from the descriptors of sessions' segments, at the offsets of
 //! `docs/formats.md`, section 9: the daemon maps no session's memory.
 
 use std::{collections::BTreeMap, os::fd::AsFd, sync::Arc};
 
 use super::{
     control::Control,
-    registry::{LocalEndpoint, Registry},
+    registry::{LocalEndpoint, Registry, SessionEntry},
     status::{ReaderStatus, SessionStatus, Status, TopicStatus},
 };
 use crate::{
@@ -15,11 +15,10 @@ use crate::{
     graph::{Endpoint, EndpointKind},
     passed::PassedFd,
     session::message::{EndpointRole, PROTOCOL, SessionRole},
+    shm::Location,
 };
 
-const RING_HEAD: u64 = 128;
-const LANES: u64 = 4096;
-const LANE: u64 = 128;
+const RING_PUBLISHED: u64 = 136;
 const LANE_RECEIVED: u64 = 16;
 const LANE_LOST: u64 = 24;
 
@@ -77,9 +76,9 @@ fn topics(registry: &Registry<Arc<PassedFd>>) -> Vec<TopicStatus> {
         match (local.endpoint.kind, local.role) {
             (EndpointKind::Publisher, EndpointRole::Application) => {
                 topic.publishers += 1;
-                topic.published += ring_head(local);
+                topic.published += published(registry, local);
             }
-            (EndpointKind::Publisher, _) => topic.arrived += ring_head(local),
+            (EndpointKind::Publisher, _) => topic.arrived += published(registry, local),
             (EndpointKind::Subscription, EndpointRole::Application) => topic.subscriptions += 1,
             _ => {}
         }
@@ -96,15 +95,13 @@ fn topics(registry: &Registry<Arc<PassedFd>>) -> Vec<TopicStatus> {
     for attach in registry.attached() {
         let Some(reader) = locals.get(&attach.reader) else { continue };
         let Some(session) = registry.session(&attach.session) else { continue };
-        let Some([segment, ..]) = &session.descriptors else { continue };
-        let lane = LANES + LANE * u64::from(attach.lane);
         entry(&mut topics, &reader.endpoint).readers.push(ReaderStatus {
             pid: session.pid,
             reader: attach.reader.to_string(),
             writer: attach.writer.to_string(),
             relay: reader.role == EndpointRole::Relay,
-            received: word(segment, lane + LANE_RECEIVED),
-            lost: word(segment, lane + LANE_LOST),
+            received: word(session, attach.lane, LANE_RECEIVED),
+            lost: word(session, attach.lane, LANE_LOST),
         });
     }
     topics.into_values().collect()
@@ -122,12 +119,21 @@ fn entry<'a>(
     })
 }
 
-fn ring_head(local: &LocalEndpoint<Arc<PassedFd>>) -> u64 {
-    local.ring.as_ref().map_or(0, |ring| word(ring, RING_HEAD))
+/// What a publisher has published.
+fn published(registry: &Registry<Arc<PassedFd>>, local: &LocalEndpoint) -> u64 {
+    match (registry.session(&local.session), local.ring) {
+        (Some(session), Some(ring)) => word(session, ring, RING_PUBLISHED),
+        _ => 0,
+    }
 }
 
-/// A word of shared memory; 0 when it is not there.
-fn word(memory: &PassedFd, offset: u64) -> u64 {
+/// A word of an object in a session's memory; 0 when it is not there.
+fn word(session: &SessionEntry<Arc<PassedFd>>, at: Location, offset: u64) -> u64 {
+    let memory = match (at.segment, &session.descriptors) {
+        (0, Some([first, ..])) => Some(first),
+        (number, _) => session.segments.get(&number).map(|segment| &segment.descriptor),
+    };
+    let (Some(memory), Some(offset)) = (memory, at.offset.checked_add(offset)) else { return 0 };
     let mut bytes = [0; 8];
     match rustix::io::pread(memory.as_fd(), &mut bytes, offset) {
         Ok(8) => u64::from_ne_bytes(bytes),

@@ -10,6 +10,7 @@ use crate::{
     graph::{Endpoint, EndpointKind},
     ids::{DaemonId, Gid, SessionId},
     qos::Qos,
+    shm::{Location, SegmentInfo, SegmentKind},
 };
 
 /// The version of the session protocol that this crate speaks.
@@ -17,7 +18,7 @@ pub const PROTOCOL: u32 = 2;
 /// The largest packet, in bytes.
 pub const MAX_PACKET: usize = 32 * 1024;
 /// The most descriptors that one packet carries.
-pub const MAX_DESCRIPTORS: usize = 4;
+pub const MAX_DESCRIPTORS: usize = 8;
 
 /// What kind of session this is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode, Serialize)]
@@ -121,6 +122,9 @@ pub struct Announce {
     /// The remote subscriptions that a relay stands for.
     #[n(2)]
     pub stands_for: Vec<Gid>,
+    /// Where a writer's ring is in its session's memory.
+    #[n(3)]
+    pub ring: Option<Location>,
 }
 
 /// An endpoint is gone.
@@ -191,9 +195,9 @@ pub struct Attach {
     /// The writer's GID.
     #[n(1)]
     pub writer: Gid,
-    /// The reader's lane in its session's segment.
+    /// The reader's lane in its session's memory.
     #[n(2)]
-    pub lane: u32,
+    pub lane: Location,
     /// What the reader requests.
     #[n(3)]
     pub qos: Qos,
@@ -203,10 +207,13 @@ pub struct Attach {
     /// The remote subscriptions that the reader stands for.
     #[n(5)]
     pub stands_for: Vec<Gid>,
+    /// The segments of the reader's session that come along.
+    #[n(6)]
+    pub segments: Vec<Segment>,
 }
 
 /// The writer serves the reader.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct Granted {
     /// The reader's GID.
@@ -224,6 +231,64 @@ pub struct Granted {
     /// The writer's session.
     #[n(4)]
     pub session: SessionId,
+    /// The writer's ring in its session's memory.
+    #[n(5)]
+    pub ring: Location,
+    /// The segments of the writer's session that come along.
+    #[n(6)]
+    pub segments: Vec<Segment>,
+}
+
+/// A segment of a session's memory, besides the first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+pub struct Segment {
+    /// Its number.
+    #[n(0)]
+    pub number: u32,
+    /// The publisher whose samples are in it, where it is only one's.
+    #[n(1)]
+    pub publisher: Option<Gid>,
+}
+
+impl From<SegmentInfo> for Segment {
+    fn from(info: SegmentInfo) -> Self {
+        let publisher = match info.kind {
+            SegmentKind::Samples(gid) => Some(gid),
+            SegmentKind::Session | SegmentKind::Heap => None,
+        };
+        Self { number: info.number, publisher }
+    }
+}
+
+impl From<Segment> for SegmentInfo {
+    fn from(segment: Segment) -> Self {
+        let kind = segment.publisher.map_or(SegmentKind::Heap, SegmentKind::Samples);
+        Self { number: segment.number, kind }
+    }
+}
+
+/// A session has one segment more.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct SegmentOpened {
+    /// The session.
+    #[n(0)]
+    pub session: SessionId,
+    /// The segment.
+    #[n(1)]
+    pub segment: Segment,
+}
+
+/// One segment of a session: that is gone, or that another one needs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct SegmentName {
+    /// The session.
+    #[n(0)]
+    pub session: SessionId,
+    /// The segment's number.
+    #[n(1)]
+    pub number: u32,
 }
 
 /// A reader and a writer have nothing to do with each other any more.
@@ -278,6 +343,9 @@ pub enum Message {
     StatusRequest,
     Status(StatusPart),
     Resync,
+    Segment(SegmentOpened),
+    SegmentGone(SegmentName),
+    Need(SegmentName),
     /// A type that this version does not know; to be skipped.
     Unknown(u8),
 }
@@ -326,6 +394,9 @@ impl Message {
             Self::StatusRequest => (12, minicbor::to_vec(Empty {})),
             Self::Status(m) => (13, minicbor::to_vec(m)),
             Self::Resync => (14, minicbor::to_vec(Empty {})),
+            Self::Segment(m) => (15, minicbor::to_vec(m)),
+            Self::SegmentGone(m) => (16, minicbor::to_vec(m)),
+            Self::Need(m) => (17, minicbor::to_vec(m)),
             Self::Unknown(kind) => (*kind, minicbor::to_vec(Empty {})),
         };
         // Encoding into a Vec has no way to fail.
@@ -368,6 +439,9 @@ impl Message {
             12 => map::<Empty>(kind, body).map(|_| Self::StatusRequest)?,
             13 => Self::Status(map(kind, body)?),
             14 => map::<Empty>(kind, body).map(|_| Self::Resync)?,
+            15 => Self::Segment(map(kind, body)?),
+            16 => Self::SegmentGone(map(kind, body)?),
+            17 => Self::Need(map(kind, body)?),
             _ => Self::Unknown(kind),
         })
     }
@@ -432,6 +506,7 @@ mod tests {
                 endpoint: endpoint(),
                 role: EndpointRole::Relay,
                 stands_for: vec![reader, writer],
+                ring: Some(Location { segment: 0, offset: 4096 }),
             }),
             Message::EndpointGone(Gone { gid: reader }),
             Message::Graph(Graph {
@@ -446,17 +521,32 @@ mod tests {
             Message::Attach(Attach {
                 reader,
                 writer,
-                lane: 4,
+                lane: Location { segment: 3, offset: 1 << 33 },
                 qos: Qos::default(),
                 session,
                 stands_for: vec![],
+                segments: vec![Segment { number: 3, publisher: None }],
             }),
-            Message::Grant(Granted { reader, writer, generation: 5, first: 6, session }),
+            Message::Grant(Granted {
+                reader,
+                writer,
+                generation: 5,
+                first: 6,
+                session,
+                ring: Location { segment: 0, offset: 4096 },
+                segments: vec![Segment { number: 7, publisher: Some(writer) }],
+            }),
             Message::Detach(Pair { reader, writer }),
             Message::Unmatch(Unmatch { reader, writer, reason: "gone".into() }),
             Message::StatusRequest,
             Message::Status(StatusPart { part: 0, parts: 1, text: b"{}".to_vec() }),
             Message::Resync,
+            Message::Segment(SegmentOpened {
+                session,
+                segment: Segment { number: 9, publisher: Some(writer) },
+            }),
+            Message::SegmentGone(SegmentName { session, number: 9 }),
+            Message::Need(SegmentName { session, number: 9 }),
         ]
     }
 
@@ -522,7 +612,7 @@ mod tests {
 
         #[test]
         fn no_mutated_packet_panics(
-            which in 0usize..14, at in any::<prop::sample::Index>(), byte: u8,
+            which in 0usize..17, at in any::<prop::sample::Index>(), byte: u8,
         ) {
             let mut packet = messages()[which].encode().unwrap();
             let at = at.index(packet.len());

@@ -314,6 +314,7 @@ impl Session {
             qos: endpoint.qos,
             budget: shared.config.ring_bytes,
             max_message: shared.config.max_message,
+            expected: 0,
         };
         let writer = Writer::create(shared.segment.clone(), options)?;
         let inner = Arc::new(PublisherInner::new(endpoint, role, writer));

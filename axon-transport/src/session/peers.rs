@@ -9,7 +9,10 @@ use std::{
     sync::Arc,
 };
 
-use super::message::Pair;
+use super::{
+    message::{Pair, Segment},
+    state::MemoryNews,
+};
 use crate::{
     ids::SessionId,
     passed::PassedFd,
@@ -18,6 +21,7 @@ use crate::{
 
 pub(super) struct Peers {
     own: Arc<SessionSegment>,
+    news: Arc<MemoryNews>,
     peers: HashMap<SessionId, Entry>,
 }
 
@@ -36,31 +40,45 @@ pub(super) enum PeerError {
 }
 
 impl Peers {
-    pub(super) fn new(own: Arc<SessionSegment>) -> Self {
-        Self { own, peers: HashMap::new() }
+    pub(super) fn new(own: Arc<SessionSegment>, news: Arc<MemoryNews>) -> Self {
+        Self { own, news, peers: HashMap::new() }
     }
 
-    /// The session `id`, for `pair`, with the descriptors that came along, if any.
+    /// The session `id`, for `pair`, with the descriptors that came along, if any: those of its
+    /// introduction, and of these segments of its memory.
     pub(super) fn hold(
         &mut self,
         id: SessionId,
         pair: Pair,
-        descriptors: Vec<PassedFd>,
+        mut descriptors: Vec<PassedFd>,
+        segments: &[Segment],
     ) -> Result<Peer, PeerError> {
         if id == self.own.id() {
             return Ok(Peer::Local(self.own.clone()));
         }
+        let introduced = descriptors.len().saturating_sub(segments.len());
+        let maps = descriptors.split_off(introduced);
         let entry = match self.peers.entry(id) {
             Slot::Occupied(held) => held.into_mut(),
             Slot::Vacant(slot) => {
                 let [segment, doorbell, pidfd] =
                     <[PassedFd; 3]>::try_from(descriptors).map_err(|_| PeerError::Missing)?;
                 let session = PeerSession::map(id, PeerDescriptors { segment, doorbell, pidfd })?;
+                let news = self.news.clone();
+                session.on_wanted(move || news.wake());
                 slot.insert(Entry { session, pairs: HashSet::new() })
             }
         };
         entry.pairs.insert(pair);
+        for (segment, descriptor) in segments.iter().zip(&maps) {
+            entry.session.add_segment((*segment).into(), descriptor)?;
+        }
         Ok(Peer::Remote(entry.session.clone()))
+    }
+
+    /// A session that is held, or `None`.
+    pub(super) fn get(&self, id: &SessionId) -> Option<&Arc<PeerSession>> {
+        self.peers.get(id).map(|entry| &entry.session)
     }
 
     /// The daemon said that `pair` is over.

@@ -66,6 +66,16 @@ impl Publisher {
         self.inner.writer.try_publish(meta, payload).map(drop)
     }
 
+    /// If a sample would be read by nobody, now or later, uses up the next sequence number and
+    /// returns it; `None` when somebody would. Where nobody reads, publishing does the same, but
+    /// whoever has to serialize first can save itself the work.
+    ///
+    /// # Errors
+    /// [`PublishError::Forked`].
+    pub fn skip_unread(&self) -> Result<Option<u64>, PublishError> {
+        self.inner.writer.skip_unread()
+    }
+
     /// Room for a sample of exactly `len` bytes, to serialize into: in shared memory where it is
     /// more than 4 KiB.
     ///

@@ -21,7 +21,7 @@ use crate::{
     config::Config,
     graph::GraphView,
     ids::{DaemonId, Gid, SessionId},
-    shm::SessionSegment,
+    shm::{SegmentEvent, SessionSegment},
 };
 
 /// Something that a session's owner may want to hear of.
@@ -46,7 +46,8 @@ pub(super) struct Shared {
     pub(super) id: SessionId,
     pub(super) segment: Arc<SessionSegment>,
     /// Wakes the control thread (an eventfd).
-    pub(super) wake: OwnedFd,
+    pub(super) wake: Arc<OwnedFd>,
+    pub(super) memory: Arc<MemoryNews>,
     pub(super) stopping: AtomicBool,
     pub(super) listener: Mutex<Option<Listener>>,
     /// One status request at a time.
@@ -68,6 +69,41 @@ pub(super) struct State {
     pub(super) status: StatusAnswer,
     /// Counts what those who wait may want to look at.
     pub(super) changes: u64,
+}
+
+/// What changed in the session's own memory, and whether other sessions' is missing. Of use under any
+/// lock.
+pub(super) struct MemoryNews {
+    wake: Arc<OwnedFd>,
+    changes: Mutex<Vec<SegmentChange>>,
+}
+
+/// A segment of the session's own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum SegmentChange {
+    Opened(u32),
+    Gone(u32),
+}
+
+impl MemoryNews {
+    fn note(&self, event: SegmentEvent<'_>) {
+        let change = match event {
+            SegmentEvent::Opened(info, _) => SegmentChange::Opened(info.number),
+            SegmentEvent::Gone(number) => SegmentChange::Gone(number),
+        };
+        self.changes.lock().unwrap_or_else(PoisonError::into_inner).push(change);
+        self.wake();
+    }
+
+    pub(super) fn take(&self) -> Vec<SegmentChange> {
+        std::mem::take(&mut *self.changes.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// Has the control thread look around.
+    pub(super) fn wake(&self) {
+        // An eventfd whose counter is full is readable, which is all that is wanted.
+        let _ = rustix::io::write(&self.wake, &1u64.to_ne_bytes());
+    }
 }
 
 /// Something for the daemon to be told.
@@ -121,12 +157,17 @@ impl Shared {
         segment: Arc<SessionSegment>,
         wake: OwnedFd,
     ) -> Self {
+        let wake = Arc::new(wake);
+        let memory = Arc::new(MemoryNews { wake: wake.clone(), changes: Mutex::default() });
+        let listener = memory.clone();
+        segment.on_segment(move |event| listener.note(event));
         Self {
             config,
             options,
             id: segment.id(),
             segment,
             wake,
+            memory,
             stopping: AtomicBool::new(false),
             listener: Mutex::new(None),
             asking: Mutex::new(()),
@@ -146,8 +187,7 @@ impl Shared {
     }
 
     pub(super) fn wake(&self) {
-        // An eventfd whose counter is full is readable, which is all that is wanted.
-        let _ = rustix::io::write(&self.wake, &1u64.to_ne_bytes());
+        self.memory.wake();
     }
 
     pub(super) fn stop(&self) {

@@ -16,7 +16,7 @@ use crate::{
     graph::Endpoint,
     ids::Gid,
     qos::History,
-    shm::{Grant, Lane, Meta, Reader, Sample, TakeError},
+    shm::{Grant, Lane, Location, Meta, Reader, Sample, TakeError},
     wait::Look,
 };
 
@@ -240,25 +240,25 @@ impl Slots {
         &mut self,
         writer: Gid,
         allocate: impl FnOnce() -> Result<Lane, E>,
-    ) -> Result<u32, E> {
+    ) -> Result<Location, E> {
         if let Some(slot) = self.slots.iter().find(|s| s.reader.writer() == writer && !s.over) {
             return Ok(slot.reader.lane());
         }
         if let Some(lane) = self.pending.get(&writer) {
-            return Ok(lane.index());
+            return Ok(lane.location());
         }
         let lane = allocate()?;
-        let index = lane.index();
+        let location = lane.location();
         self.pending.insert(writer, lane);
-        Ok(index)
+        Ok(location)
     }
 
     /// The lanes of all that are attached, or asked to be: what is repeated when `stands_for`
     /// changes.
-    pub(super) fn lanes(&self) -> Vec<(Gid, u32)> {
+    pub(super) fn lanes(&self) -> Vec<(Gid, Location)> {
         let attached = self.slots.iter().filter(|s| !s.over);
         let attached = attached.map(|s| (s.reader.writer(), s.reader.lane()));
-        attached.chain(self.pending.iter().map(|(gid, lane)| (*gid, lane.index()))).collect()
+        attached.chain(self.pending.iter().map(|(gid, lane)| (*gid, lane.location()))).collect()
     }
 
     /// What a grant of `writer` calls for.
@@ -310,7 +310,7 @@ impl Slots {
     fn sweep(&mut self) {
         let lost = &mut self.lost;
         self.slots.retain(|s| {
-            let keep = !s.over || s.reader.has_data();
+            let keep = !s.over || !s.reader.is_drained();
             if !keep {
                 *lost += s.reader.lost();
             }

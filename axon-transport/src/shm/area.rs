@@ -1,12 +1,12 @@
-//! Who has which bytes of a ring's payload area: first fit from the bottom, so that a ring touches
-//! little more memory than what stands in it.
+//! Who has which bytes of a segment: first fit from the bottom, so that little more memory is
+//! touched than what is in use.
 
 use std::ops::Range;
 
-use super::layout::GRANULE;
+use super::layout::LINE;
 
 /// The free ranges of an area.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Area {
     /// Start and end in bytes, ascending, never touching each other.
     free: Vec<(u64, u64)>,
@@ -20,12 +20,17 @@ impl Area {
         Self { free }
     }
 
-    /// Bytes that a sample of `len` bytes takes.
+    /// Bytes that `len` bytes take.
     pub(super) fn rounded(len: u64) -> u64 {
-        len.max(1).next_multiple_of(GRANULE)
+        len.max(1).next_multiple_of(LINE)
     }
 
-    /// The lowest place for `len` bytes, a multiple of the granule.
+    /// Whether there is a place for `len` bytes.
+    pub(super) fn fits(&self, len: u64) -> bool {
+        self.free.iter().any(|&(start, end)| end - start >= len)
+    }
+
+    /// The lowest place for `len` bytes, which are whole lines.
     pub(super) fn allocate(&mut self, len: u64) -> Option<u64> {
         let index = self.free.iter().position(|&(start, end)| end - start >= len)?;
         let (start, end) = &mut self.free[index];
@@ -80,7 +85,7 @@ mod tests {
                     let (at, len) = live.pop_front().expect("one piece fits in an empty area");
                     area.release(at, len);
                 };
-                prop_assert!(at % GRANULE == 0 && at + len <= size);
+                prop_assert!(at % LINE == 0 && at + len <= size);
                 for &(other, length) in &live {
                     prop_assert!(at + len <= other || other + length <= at);
                 }
@@ -104,6 +109,6 @@ mod tests {
         area.release(pieces[0], 128);
         area.release(pieces[1], 128);
         assert_eq!(area.allocate(256), Some(0));
-        assert_eq!(area.allocate(64), Some(512));
+        assert_eq!(area.allocate(128), Some(512));
     }
 }

@@ -1,17 +1,12 @@
-//! What a reader shares with the samples that it lent out: the ring's map, the lane, and which of
-//! the lane's records are in use.
+//! What a reader shares with the samples that it lent out: the ring's header, the lane, and which
+//! of the lane's records are in use.
 
 use std::{
     ops::Range,
     sync::{Arc, Mutex, PoisonError, atomic::AtomicU64},
 };
 
-use super::{
-    Lane,
-    memory::Map,
-    pins::RECORDS,
-    ring::{Geometry, Record},
-};
+use super::{Lane, layout::ring::TAIL, memory::Map, pins::RECORDS};
 
 /// The record that is used while a sample is copied out; the others are for samples in use.
 const COPY: usize = RECORDS - 1;
@@ -19,8 +14,9 @@ const COPY: usize = RECORDS - 1;
 /// One reader's hold on one ring. It stands until the reader and all samples in use are dropped;
 /// only then does the lane say that the reader has left.
 pub(super) struct Attachment {
-    pub(super) map: Map,
-    pub(super) geometry: Geometry,
+    map: Arc<Map>,
+    /// Where the ring's header is in it.
+    ring: Range<usize>,
     pub(super) lane: Lane,
     /// The records in use, as bits. The lock also orders what one thread stored in a record before
     /// what the next one stores there.
@@ -37,12 +33,22 @@ pub(super) enum Pinning<T> {
 }
 
 impl Attachment {
-    pub(super) fn new(map: Map, geometry: Geometry, lane: Lane) -> Arc<Self> {
-        Arc::new(Self { map, geometry, lane, used: Mutex::new(0) })
+    /// A hold on the ring whose header is in these words of `map`.
+    pub(super) fn new(map: Arc<Map>, ring: Range<usize>, lane: Lane) -> Arc<Self> {
+        Arc::new(Self { map, ring, lane, used: Mutex::new(0) })
     }
 
-    pub(super) fn words(&self) -> &[AtomicU64] {
-        self.map.words()
+    /// The ring's header.
+    #[inline]
+    pub(super) fn ring(&self) -> &[AtomicU64] {
+        &self.map.words()[self.ring.clone()]
+    }
+
+    /// The publisher's segments up to `number` are mapped.
+    pub(super) fn set_mapped(&self, number: u32) {
+        if !self.lane.is_forked() {
+            self.lane.set_mapped(number);
+        }
     }
 
     /// Keeps the sample at `position` in place for as long as the pin lives.
@@ -77,13 +83,8 @@ impl Attachment {
         Some(result)
     }
 
-    /// Where the words of a record that is not in its slot are, if inside the payload area.
-    pub(super) fn placed(&self, record: &Record) -> Option<Range<usize>> {
-        self.geometry.placed(self.words(), record)
-    }
-
     fn tail(&self) -> &AtomicU64 {
-        &self.words()[self.geometry.tail]
+        &self.ring()[TAIL]
     }
 
     fn used(&self) -> std::sync::MutexGuard<'_, u8> {

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::{
     Grant, Peer, PeerSession, ReaderInfo,
-    lane::{Standing, Tenancy},
+    lane::{self, LaneView, Standing, Tenancy},
     seats::Seats,
 };
 use crate::{
@@ -18,7 +18,7 @@ const BURST: u64 = 16;
 /// The readers of one ring.
 pub(super) struct Audience {
     offered: Qos,
-    /// The most samples that can stand.
+    /// The most samples that can ever stand.
     capacity: u64,
     readers: Vec<Attached>,
     /// Their lanes, and those of readers that were here and may hold samples still.
@@ -30,6 +30,7 @@ pub(super) struct Audience {
 
 struct Attached {
     info: ReaderInfo,
+    lane: LaneView,
     tenancy: Tenancy,
     grant: Grant,
     dead: bool,
@@ -51,7 +52,7 @@ impl Attached {
 
     /// The next position that the reader takes, as it says; `None` when it has left.
     fn position(&self) -> Option<u64> {
-        let lane = self.info.peer.lane_words(self.info.lane);
+        let lane = self.lane.words();
         match self.tenancy.standing(lane) {
             // It may have left between the two looks, and then it holds nothing.
             Standing::Open => self.tenancy.cursor(lane),
@@ -100,7 +101,14 @@ impl Audience {
         gids
     }
 
-    pub(super) fn attach(&mut self, info: ReaderInfo, tail: u64, head: u64) -> Grant {
+    /// Adds a reader, whose lane is `lane`.
+    pub(super) fn attach(
+        &mut self,
+        info: ReaderInfo,
+        lane: LaneView,
+        tail: u64,
+        head: u64,
+    ) -> Grant {
         let known = self.readers.iter().position(|known| {
             let same = &known.info;
             same.gid == info.gid
@@ -122,11 +130,29 @@ impl Audience {
         } else {
             head
         };
-        let tenancy = self.seats.admit(info.gid, &info.peer, info.lane);
+        let tenancy = self.seats.admit(info.gid, &info.peer, info.lane, &lane);
         let grant = Grant { generation: tenancy.generation(), first };
-        self.readers.push(Attached { info, tenancy, grant, dead: false });
+        self.readers.push(Attached { info, lane, tenancy, grant, dead: false });
         self.changed();
         grant
+    }
+
+    /// Samples that are kept at least.
+    pub(super) fn window(&self) -> u64 {
+        self.window
+    }
+
+    /// Whether all readers have the publisher's segments up to `number`.
+    pub(super) fn has_mapped(&self, number: u32) -> bool {
+        self.readers.iter().filter(|reader| !reader.dead).all(|reader| {
+            reader.info.peer.remote().is_none()
+                || lane::mapped(reader.lane.words()) >= u64::from(number)
+        })
+    }
+
+    /// The lanes of those that may be reading still.
+    pub(super) fn into_seats(self) -> Seats {
+        self.seats
     }
 
     pub(super) fn detach(&mut self, reader: Gid) -> bool {

@@ -1,10 +1,10 @@
 //! How a subscriber and a publisher find each other over a connected socket, without a daemon: one
-//! packet there, one back (`docs/formats.md`, section 9).
+//! packet there, one back, and one for each segment of memory (`docs/formats.md`, section 9).
 
 use std::{
     io::{self, IoSlice, IoSliceMut},
     mem::MaybeUninit,
-    os::fd::{AsFd, BorrowedFd},
+    os::fd::{AsFd, BorrowedFd, OwnedFd},
     time::{Duration, Instant},
 };
 
@@ -18,7 +18,7 @@ use rustix::{
     },
 };
 
-use super::{PeerDescriptors, ShmError, Writer};
+use super::{Location, PeerDescriptors, SegmentInfo, SegmentKind, ShmError};
 use crate::{
     ids::{Gid, SessionId},
     passed::PassedFd,
@@ -78,7 +78,7 @@ pub(super) struct Asked {
     #[n(1)]
     pub(super) reader: Gid,
     #[n(2)]
-    pub(super) lane: u32,
+    pub(super) lane: Location,
     #[n(3)]
     pub(super) qos: Qos,
 }
@@ -97,6 +97,35 @@ pub(super) struct Granted {
     pub(super) generation: u64,
     #[n(4)]
     pub(super) first: u64,
+    #[n(5)]
+    pub(super) ring: Location,
+}
+
+/// A segment of a publisher's session, with its descriptor.
+#[derive(Clone, Copy, Debug, Encode, Decode)]
+pub(super) struct Handed {
+    #[n(0)]
+    pub(super) session: SessionId,
+    #[n(1)]
+    number: u32,
+    /// Whose samples are in it, where they are one publisher's.
+    #[n(2)]
+    publisher: Option<Gid>,
+}
+
+impl Handed {
+    fn new(session: SessionId, info: SegmentInfo) -> Self {
+        let publisher = match info.kind {
+            SegmentKind::Samples(gid) => Some(gid),
+            SegmentKind::Session | SegmentKind::Heap => None,
+        };
+        Self { session, number: info.number, publisher }
+    }
+
+    pub(super) fn info(&self) -> SegmentInfo {
+        let kind = self.publisher.map_or(SegmentKind::Heap, SegmentKind::Samples);
+        SegmentInfo { number: self.number, kind }
+    }
 }
 
 #[derive(Debug, Encode, Decode)]
@@ -115,6 +144,8 @@ enum Packet {
     Granted(#[n(0)] Granted),
     #[n(2)]
     Refused(#[n(0)] Refused),
+    #[n(3)]
+    Handed(#[n(0)] Handed),
 }
 
 /// One end of the socket, for as long as the two need to come together.
@@ -154,33 +185,61 @@ impl<'a> Channel<'a> {
         &self,
         granted: &Granted,
         own: &PeerDescriptors,
-        writer: &Writer,
     ) -> Result<(), ConnectError> {
-        let ring = writer.descriptor()?;
-        let fds = [own.segment.as_fd(), own.doorbell.as_fd(), own.pidfd.as_fd(), ring.as_fd()];
+        let fds = [own.segment.as_fd(), own.doorbell.as_fd(), own.pidfd.as_fd()];
         self.send(&Packet::Granted(*granted), &fds)
     }
 
-    /// The answer to what `reader` asked.
+    /// The socket once more, to be kept.
+    pub(super) fn keep(&self) -> Result<OwnedFd, ConnectError> {
+        self.socket.try_clone_to_owned().map_err(ConnectError::Socket)
+    }
+
+    /// The answer to what `reader` asked. Segments that come before it are for `segment`.
     pub(super) fn await_granted(
         &self,
         reader: Gid,
-    ) -> Result<(Granted, PeerDescriptors, PassedFd), ConnectError> {
+        mut segment: impl FnMut(Handed, PassedFd),
+    ) -> Result<(Granted, PeerDescriptors), ConnectError> {
+        let number = |_| ConnectError::Protocol("another number of descriptors");
         loop {
             match self.receive()? {
                 (Packet::Granted(granted), fds) if granted.reader == reader => {
-                    let [segment, doorbell, pidfd, ring] = fds
-                        .try_into()
-                        .map_err(|_| ConnectError::Protocol("another number of descriptors"))?;
-                    return Ok((granted, PeerDescriptors { segment, doorbell, pidfd }, ring));
+                    let [segment, doorbell, pidfd] = fds.try_into().map_err(number)?;
+                    return Ok((granted, PeerDescriptors { segment, doorbell, pidfd }));
                 }
                 (Packet::Refused(refused), _) if refused.reader == reader => {
                     return Err(ConnectError::Refused(refused.reason));
                 }
                 (Packet::Granted(_) | Packet::Refused(_), _) => {}
+                (Packet::Handed(handed), fds) => {
+                    let [fd] = fds.try_into().map_err(number)?;
+                    segment(handed, fd);
+                }
                 (Packet::Asked(_), _) => {
                     return Err(ConnectError::Protocol("a question where an answer was due"));
                 }
+            }
+        }
+    }
+
+    /// Hands a segment over.
+    pub(super) fn hand(
+        &self,
+        session: SessionId,
+        info: SegmentInfo,
+        fd: BorrowedFd<'_>,
+    ) -> Result<(), ConnectError> {
+        self.send(&Packet::Handed(Handed::new(session, info)), &[fd])
+    }
+
+    /// The next segment that is handed over.
+    pub(super) fn take_handed(&self) -> Result<(Handed, PassedFd), ConnectError> {
+        loop {
+            if let (Packet::Handed(handed), mut fds) = self.receive()?
+                && let (Some(fd), true) = (fds.pop(), fds.is_empty())
+            {
+                return Ok((handed, fd));
             }
         }
     }

@@ -3,6 +3,7 @@
 use std::{
     collections::HashMap,
     fmt,
+    os::fd::{AsFd, BorrowedFd, OwnedFd},
     sync::{
         Arc, Mutex, PoisonError, Weak,
         atomic::{AtomicU32, Ordering},
@@ -10,7 +11,11 @@ use std::{
     time::Duration,
 };
 
-use super::{Peer, PeerDescriptors, PeerSession, SessionSegment, ShmError};
+use super::{
+    ConnectError, Peer, PeerDescriptors, PeerSession, SegmentEvent, SegmentInfo, SegmentKind,
+    SessionSegment, ShmError,
+    connect::{Channel, Granted, Handed},
+};
 use crate::{
     ids::{Gid, SessionId},
     wait::ExternalLeader,
@@ -28,6 +33,37 @@ struct Inner {
     entities: AtomicU32,
     /// The other contexts, each mapped once.
     peers: Mutex<HashMap<SessionId, Weak<PeerSession>>>,
+    served: Arc<Mutex<Vec<Served>>>,
+}
+
+/// A subscriber that is to be told of segments.
+struct Served {
+    session: SessionId,
+    reader: Gid,
+    writer: Gid,
+    socket: OwnedFd,
+    /// The socket had no room.
+    behind: bool,
+}
+
+impl Served {
+    /// Whether what is in the segment may concern the subscriber.
+    fn reads(&self, kind: SegmentKind) -> bool {
+        match kind {
+            SegmentKind::Session => false,
+            SegmentKind::Heap => true,
+            SegmentKind::Samples(gid) => gid == self.writer,
+        }
+    }
+
+    fn hand(&mut self, info: SegmentInfo, fd: BorrowedFd<'_>) {
+        if self.reads(info.kind) {
+            let channel = Channel::new(self.socket.as_fd(), Some(Duration::ZERO));
+            // A subscriber that is gone needs nothing.
+            let handed = channel.hand(self.session, info, fd);
+            self.behind |= matches!(handed, Err(ConnectError::Timeout));
+        }
+    }
 }
 
 impl Context {
@@ -41,7 +77,74 @@ impl Context {
 
     fn of(session: Arc<SessionSegment>) -> Self {
         let (entities, peers) = (AtomicU32::new(1), Mutex::default());
-        Self { inner: Arc::new(Inner { session, entities, peers }) }
+        let served = Arc::<Mutex<Vec<Served>>>::default();
+        let told = Arc::clone(&served);
+        session.on_segment(move |event| {
+            // Of one that is gone nobody reads any more, and the map goes with the context.
+            let SegmentEvent::Opened(info, fd) = event else { return };
+            let mut served = told.lock().unwrap_or_else(PoisonError::into_inner);
+            served.iter_mut().for_each(|served| served.hand(info, fd));
+        });
+        Self { inner: Arc::new(Inner { session, entities, peers, served }) }
+    }
+
+    /// Hands a subscriber the segments that there are, and from then on those to come.
+    pub(super) fn hand_over(&self, socket: OwnedFd, granted: &Granted) -> Result<(), ConnectError> {
+        let Granted { reader, writer, .. } = *granted;
+        let session = self.id();
+        // In the list first, so that none that comes now is missed; one that comes twice is one.
+        self.served().push(Served { session, reader, writer, socket, behind: true });
+        self.catch_up();
+        if self.served().iter().any(|served| served.reader == reader && served.behind) {
+            self.forget(reader);
+            return Err(ConnectError::Timeout);
+        }
+        Ok(())
+    }
+
+    /// Hands all segments to those that could not be told of some.
+    fn catch_up(&self) {
+        if self.served().iter().all(|served| !served.behind) {
+            return;
+        }
+        let all: Vec<_> = self
+            .session()
+            .segments()
+            .into_iter()
+            .filter_map(|info| self.session().segment(info.number).ok().flatten())
+            .collect();
+        for served in self.served().iter_mut().filter(|served| served.behind) {
+            served.behind = false;
+            all.iter().for_each(|(info, fd)| served.hand(*info, fd.as_fd()));
+        }
+    }
+
+    /// A subscriber is served no more.
+    pub(super) fn forget(&self, reader: Gid) {
+        if !self.session().is_forked() {
+            self.served().retain(|served| served.reader != reader);
+            self.catch_up();
+        }
+    }
+
+    /// A publisher is gone.
+    pub(super) fn forget_publisher(&self, writer: Gid) {
+        if !self.session().is_forked() {
+            self.served().retain(|served| served.writer != writer);
+        }
+    }
+
+    /// A segment of another context was handed over.
+    pub(super) fn add_segment(&self, handed: &Handed, fd: impl AsFd) {
+        let peers = self.inner.peers.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(peer) = peers.get(&handed.session).and_then(Weak::upgrade) {
+            // One that is refused shows when it is read.
+            let _ = peer.add_segment(handed.info(), fd);
+        }
+    }
+
+    fn served(&self) -> std::sync::MutexGuard<'_, Vec<Served>> {
+        self.inner.served.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Its id.

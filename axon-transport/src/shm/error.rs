@@ -33,7 +33,7 @@ pub enum ShmError {
         /// What was wrong with it.
         what: &'static str,
     },
-    /// The ring would need more address space than one may take.
+    /// The samples would need more address space than a publisher may take.
     #[error(
         "a ring for messages of {max_message} bytes and {budget} bytes of history is too large: \
          messages may take {} bytes and histories {} bytes",
@@ -54,6 +54,9 @@ pub enum ShmError {
         /// How many lanes it has.
         lanes: u32,
     },
+    /// The session has given out all numbers for segments of its memory.
+    #[error("session {0} has opened as many segments as a session may: open another session")]
+    NoNumber(SessionId),
     /// A second waiter asked to lead the session's waits.
     #[error("session {0} already has an external leader of its waits")]
     AlreadyLed(SessionId),

@@ -1,24 +1,38 @@
 //! Which samples of a ring stand, and how room is made for the next: plain data, no shared memory.
 
-use super::{area::Area, layout::COPIED, limbo::Limbo};
+use super::{blocks::Blocks, heap::Block, limbo::Limbo};
 
-/// The samples that stand, oldest to newest, and what they take of the payload area.
+/// The samples that stand, oldest to newest, and what they take of memory.
 ///
-/// The area has two parts. Samples that readers copy out are in one; it is written over as soon as
-/// a sample is given up, for the readers find out. Samples that readers pin are in the other.
+/// Samples that readers copy out are in blocks, which are written over as soon as a sample is given
+/// up, for the readers find out. Samples that readers pin are in slots.
 #[derive(Debug)]
 pub(super) struct History {
     head: u64,
     tail: u64,
-    /// Offset and length by slot; length 0 for a sample inside its slot.
-    extents: Box<[(u64, u64)]>,
-    copied: Area,
+    /// By descriptor.
+    extents: Box<[Extent]>,
+    blocks: Blocks,
     pinned: Limbo,
-    /// Bytes of the area that samples and loans take; what is in limbo does not count.
+    /// Bytes that samples and loans take; what is in limbo does not count.
     used: u64,
-    /// Samples in the area.
+    /// Samples in blocks and slots.
     placed: u64,
     budget: u64,
+}
+
+/// What memory a sample takes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) enum Extent {
+    /// None but its descriptor.
+    #[default]
+    Inline,
+    Block(Block),
+    /// In the publisher's own segment.
+    Slot {
+        at: u64,
+        len: u64,
+    },
 }
 
 /// The oldest sample may not be given up.
@@ -26,16 +40,14 @@ pub(super) struct History {
 pub(super) struct Held;
 
 impl History {
-    /// A history of samples in `slots` slots and in a payload area of which the first `copied`
-    /// bytes are for samples that are copied, the rest, up to `area`, for those that are pinned.
-    pub(super) fn new(slots: u64, copied: u64, area: u64, budget: u64) -> Self {
-        let slots = slots as usize;
+    /// A history of samples in `descriptors` descriptors.
+    pub(super) fn new(descriptors: u64, budget: u64) -> Self {
         Self {
             head: 0,
             tail: 0,
-            extents: vec![(0, 0); slots].into_boxed_slice(),
-            copied: Area::new(0..copied, slots + 1),
-            pinned: Limbo::new(copied..area, slots + 1),
+            extents: vec![Extent::Inline; descriptors as usize].into_boxed_slice(),
+            blocks: Blocks::default(),
+            pinned: Limbo::default(),
             used: 0,
             placed: 0,
             budget,
@@ -57,32 +69,63 @@ impl History {
         self.extents.len() as u64 - 1
     }
 
-    /// What of the area readers pin.
+    /// Whether the next position has no descriptor.
+    pub(super) fn is_full(&self) -> bool {
+        self.head - self.tail > self.capacity()
+    }
+
+    /// Twice as many descriptors.
+    pub(super) fn grow(&mut self) {
+        let mut extents = vec![Extent::Inline; 2 * self.extents.len()].into_boxed_slice();
+        for position in self.tail..self.head {
+            extents[index(&extents, position)] = self.extents[index(&self.extents, position)];
+        }
+        self.extents = extents;
+    }
+
+    /// The blocks for the next samples.
+    pub(super) fn blocks(&mut self) -> &mut Blocks {
+        &mut self.blocks
+    }
+
+    /// The slots.
     pub(super) fn pinned(&mut self) -> &mut Limbo {
         &mut self.pinned
+    }
+
+    /// All blocks, of samples that stand and of those to come.
+    pub(super) fn all_blocks(&mut self) -> Vec<Block> {
+        let standing = self.extents.iter().filter_map(|extent| match extent {
+            Extent::Block(block) => Some(*block),
+            Extent::Inline | Extent::Slot { .. } => None,
+        });
+        standing.chain(self.blocks.drain()).collect()
     }
 
     /// Gives up all samples below `floor`.
     pub(super) fn release_below(&mut self, floor: u64) {
         while self.tail < floor.min(self.head) {
-            let index = self.index(self.tail);
-            let (at, len) = std::mem::take(&mut self.extents[index]);
-            if len > 0 {
-                if is_pinned(len) {
-                    self.pinned.retire(self.tail, at, len);
-                } else {
-                    self.copied.release(at, len);
+            let at = index(&self.extents, self.tail);
+            match std::mem::take(&mut self.extents[at]) {
+                Extent::Inline => {}
+                Extent::Block(block) => {
+                    self.blocks.put(block);
+                    self.used -= block.len;
+                    self.placed -= 1;
                 }
-                self.used -= len;
-                self.placed -= 1;
+                Extent::Slot { at, len } => {
+                    self.pinned.retire(self.tail, at, len);
+                    self.used -= len;
+                    self.placed -= 1;
+                }
             }
             self.tail += 1;
         }
     }
 
-    /// Makes sure that the next position has a slot, giving up the oldest that `may_go`.
-    pub(super) fn slot(&mut self, may_go: impl Fn(u64) -> bool) -> Result<(), Held> {
-        while self.head - self.tail > self.capacity() {
+    /// Makes sure that the next position has a descriptor, giving up the oldest that `may_go`.
+    pub(super) fn make_place(&mut self, may_go: impl Fn(u64) -> bool) -> Result<(), Held> {
+        while self.is_full() {
             self.give_up_oldest(&may_go)?;
         }
         Ok(())
@@ -97,32 +140,13 @@ impl History {
         Ok(())
     }
 
-    /// Gives up the oldest sample, if another one stands in the area. Whether it did.
+    /// Gives up the oldest sample, if another one is in a block or slot. Whether it did.
     pub(super) fn shrink(&mut self, may_go: impl Fn(u64) -> bool) -> Result<bool, Held> {
         if self.placed <= 1 {
             return Ok(false);
         }
         self.give_up_oldest(&may_go)?;
         Ok(true)
-    }
-
-    /// Takes `len` bytes for a sample that is copied, giving up the oldest that `may_go`. It must
-    /// be [pushed](Self::push) before anything else.
-    pub(super) fn place(&mut self, len: u64, may_go: impl Fn(u64) -> bool) -> Result<u64, Held> {
-        self.make_room(len, &may_go)?;
-        loop {
-            if let Some(at) = self.copied.allocate(len) {
-                self.used += len;
-                return Ok(at);
-            }
-            self.give_up_oldest(&may_go)?;
-        }
-    }
-
-    /// Takes it back.
-    pub(super) fn displace(&mut self, at: u64, len: u64) {
-        self.copied.release(at, len);
-        self.used -= len;
     }
 
     /// Takes `len` bytes that nobody reads for a loan.
@@ -138,18 +162,21 @@ impl History {
         self.used -= len;
     }
 
-    /// The next position is taken by a sample, at `extent` where it is in the area. There must be
-    /// a [slot](Self::slot) for it.
-    pub(super) fn push(&mut self, extent: Option<(u64, u64)>) -> u64 {
+    /// The next position is taken by a sample. There must be a [place](Self::make_place) for it.
+    pub(super) fn push(&mut self, extent: Extent) -> u64 {
         let position = self.head;
-        let index = self.index(position);
-        self.extents[index] = extent.unwrap_or_default();
-        if let Some((_, len)) = extent {
-            self.placed += 1;
-            if is_pinned(len) {
+        match extent {
+            Extent::Inline => {}
+            Extent::Block(block) => {
+                self.placed += 1;
+                self.used += block.len;
+            }
+            Extent::Slot { .. } => {
+                self.placed += 1;
                 self.pinned.published();
             }
         }
+        self.extents[index(&self.extents, position)] = extent;
         self.head += 1;
         position
     }
@@ -161,90 +188,92 @@ impl History {
         self.release_below(self.tail + 1);
         Ok(())
     }
-
-    fn index(&self, position: u64) -> usize {
-        (position & (self.extents.len() as u64 - 1)) as usize
-    }
 }
 
-/// Whether readers pin a sample that takes `len` bytes of the area, rather than copy it.
-fn is_pinned(len: u64) -> bool {
-    len > COPIED
+fn index(extents: &[Extent], position: u64) -> usize {
+    (position & (extents.len() as u64 - 1)) as usize
 }
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use super::{super::layout::Location, *};
 
-    const SMALL: u64 = 1 << 16;
+    fn history(descriptors: u64, slots: u64, budget: u64) -> History {
+        let mut history = History::new(descriptors, budget);
+        history.pinned().open(0..slots);
+        history
+    }
 
     #[test]
     fn depth_one_holds_the_last_sample_while_the_largest_is_written() {
         let max = 1 << 20;
-        let mut history = History::new(16, SMALL, SMALL + 4 * max, 4096);
+        let mut history = history(16, 4 * max, 4096);
         let mut places = Vec::new();
         for position in 0..100 {
-            history.slot(|_| true).unwrap();
+            history.make_place(|_| true).unwrap();
             history.make_room(max, |_| true).unwrap();
             history.pinned().reclaim(|_| false);
             let at = history.lend(max).unwrap();
             if position > 0 {
                 assert!(history.tail() < position, "the last one stands");
             }
-            history.push(Some((at, max)));
+            history.push(Extent::Slot { at, len: max });
             places.push(at);
         }
-        assert!(places.iter().all(|at| *at <= SMALL + max), "memory stays near the live window");
+        assert!(places.iter().all(|at| *at <= max), "memory stays near the live window");
     }
 
     #[test]
     fn what_may_not_go_is_kept() {
-        let mut history = History::new(4, SMALL, 2 * SMALL, SMALL);
+        let mut history = History::new(4, 0);
         for _ in 0..3 {
-            history.slot(|_| false).unwrap();
-            history.push(None);
+            history.make_place(|_| false).unwrap();
+            history.push(Extent::Inline);
         }
-        history.push(None);
-        assert_eq!(history.slot(|position| position > 0), Err(Held));
-        assert_eq!(history.slot(|_| true), Ok(()));
+        history.push(Extent::Inline);
+        assert_eq!(history.make_place(|position| position > 0), Err(Held));
+        assert_eq!(history.make_place(|_| true), Ok(()));
         assert_eq!((history.tail(), history.head()), (1, 4));
     }
 
     #[test]
     fn a_place_is_not_given_out_again_while_it_is_pinned() {
-        let mut history = History::new(4, SMALL, SMALL + 2 * SMALL, 0);
-        let first = history.lend(SMALL).unwrap();
-        let position = history.push(Some((first, SMALL)));
+        let size = 1 << 16;
+        let mut history = history(4, 2 * size, 0);
+        let first = history.lend(size).unwrap();
+        let position = history.push(Extent::Slot { at: first, len: size });
         history.release_below(1);
-        let second = history.lend(SMALL).unwrap();
+        let second = history.lend(size).unwrap();
         assert_ne!(first, second, "nobody has looked at the pins");
         history.pinned().reclaim(|pinned| pinned == position);
-        assert_eq!(history.lend(SMALL), None);
+        assert_eq!(history.lend(size), None);
         assert_eq!(history.pinned().retired().collect::<Vec<_>>(), [position]);
         assert_eq!(history.pinned().loans(), 1);
         history.pinned().reclaim(|_| false);
-        assert_eq!(history.lend(SMALL), Some(first));
+        assert_eq!(history.lend(size), Some(first));
     }
 
     #[test]
-    fn what_is_copied_and_what_is_pinned_never_share_memory() {
-        let mut history = History::new(64, SMALL, 2 * SMALL, 1 << 20);
-        for round in 0..1000u64 {
-            history.slot(|_| true).unwrap();
-            if round % 3 == 0 {
-                let at = history.lend(COPIED + 64).unwrap_or_else(|| {
-                    while history.shrink(|_| true).unwrap() {}
-                    history.release_below(u64::MAX);
-                    history.pinned().reclaim(|_| false);
-                    history.lend(COPIED + 64).unwrap()
-                });
-                assert!(at >= SMALL && at + COPIED + 64 <= 2 * SMALL);
-                history.push(Some((at, COPIED + 64)));
-            } else {
-                let at = history.place(COPIED, |_| true).unwrap();
-                assert!(at + COPIED <= SMALL);
-                history.push(Some((at, COPIED)));
+    fn growing_changes_nothing_of_what_stands() {
+        let mut history = history(4, 1 << 20, 1 << 20);
+        let mut expected = std::collections::VecDeque::new();
+        for round in 0..100u64 {
+            if round % 30 == 29 {
+                history.grow();
             }
+            history.make_place(|_| true).unwrap();
+            let at = Location { segment: 0, offset: round * 128 };
+            expected.push_back(Block { at, len: 128 });
+            history.push(Extent::Block(expected[expected.len() - 1]));
+            while (expected.len() as u64) > history.head() - history.tail() {
+                expected.pop_front();
+            }
+        }
+        assert_eq!(history.capacity(), 31);
+        history.release_below(u64::MAX);
+        // The last that was given up is the first to be used again.
+        while let Some(block) = expected.pop_back() {
+            assert_eq!(history.blocks().take(128), Some(block));
         }
     }
 }

@@ -9,10 +9,12 @@ use std::sync::{Arc, atomic::AtomicU64};
 
 use super::{
     Grant, SessionSegment,
+    heap::Object,
     layout::{
-        self, LANE_WORDS,
-        lane::{CURSOR, GENERATION, LOST, READER, RECEIVED, SKIPPED, WRITER},
+        self, LANE_WORDS, Location,
+        lane::{CURSOR, GENERATION, LOST, MAPPED, READER, RECEIVED, SKIPPED, WRITER},
     },
+    memory::Map,
     pins,
     sync::{Ordering, Site, Word},
 };
@@ -79,8 +81,22 @@ impl Tenancy {
     }
 }
 
+/// Publisher: the highest number of its segments that the reader has.
+#[inline]
+pub(super) fn mapped<W: Word>(lane: &[W]) -> u64 {
+    // Pairs with `set_mapped`: what is told of the segment from now on finds it there.
+    lane[MAPPED].load(Site::MappedLoad.order())
+}
+
+/// Reader: has all segments of its publisher up to this number.
+pub(super) fn set_mapped<W: Word>(lane: &[W], number: u64) {
+    // Pairs with `mapped`.
+    lane[MAPPED].store(number, Site::MappedStore.order());
+}
+
 /// Reader: is about to ask with this lane for the `number`th time that the session uses one.
 pub(super) fn ask<W: Word>(lane: &[W], number: u64) {
+    lane[MAPPED].store(0, Ordering::Relaxed);
     // Pairs with `standing`, for the publisher of the reader that had the lane before.
     lane[GENERATION].store(ASKED | number, Site::AskStore.order());
 }
@@ -110,25 +126,46 @@ pub(super) fn close<W: Word>(lane: &[W]) {
     lane[GENERATION].store(0, Site::CloseStore.order());
 }
 
-/// A place in a session's segment where one reader tells its publisher how far it is.
+/// Another session's lane, or one of our own, as a publisher sees it.
+#[derive(Clone)]
+pub(super) struct LaneView {
+    map: Arc<Map>,
+    /// The lane's first word.
+    start: usize,
+}
+
+impl LaneView {
+    /// The lane at an offset of a map, if there can be one.
+    pub(super) fn new(map: &Arc<Map>, at: Location) -> Option<Self> {
+        let start = at.words(layout::LANE, map.words().len())?.start;
+        Some(Self { map: Arc::clone(map), start })
+    }
+
+    #[inline]
+    pub(super) fn words(&self) -> &[AtomicU64; LANE_WORDS] {
+        self.map.words()[self.start..].first_chunk().expect("a lane is inside its map")
+    }
+}
+
+/// A place in a session's memory where one reader tells its publisher how far it is.
 ///
 /// Freed when dropped.
 pub struct Lane {
     session: Arc<SessionSegment>,
-    index: u32,
+    object: Object,
 }
 
 impl Lane {
-    /// The lane `index`, for the `number`th time that the session gives one out.
-    pub(super) fn new(session: Arc<SessionSegment>, index: u32, number: u64) -> Self {
-        let lane = Self { session, index };
+    /// The lane in `object`, for the `number`th time that the session gives one out.
+    pub(super) fn new(session: Arc<SessionSegment>, object: Object, number: u64) -> Self {
+        let lane = Self { session, object };
         ask(lane.words(), number);
         lane
     }
 
-    /// Its number, by which a publisher finds it.
-    pub fn index(&self) -> u32 {
-        self.index
+    /// Where it is, by which a publisher finds it.
+    pub fn location(&self) -> Location {
+        self.object.block.at
     }
 
     /// Whether the calling process is a fork of the lane's: it must not touch the lane.
@@ -153,6 +190,11 @@ impl Lane {
         advance(words, cursor);
     }
 
+    /// The publisher's segments up to `number` are mapped.
+    pub(super) fn set_mapped(&self, number: u32) {
+        set_mapped(self.words(), number.into());
+    }
+
     /// Takes no more; what is pinned stays pinned.
     pub(super) fn leave(&self) {
         advance(self.words(), u64::MAX);
@@ -169,8 +211,9 @@ impl Lane {
         pins::unpin(self.words(), record);
     }
 
-    fn words(&self) -> &[AtomicU64; LANE_WORDS] {
-        self.session.lane_words(self.index)
+    #[inline]
+    pub(super) fn words(&self) -> &[AtomicU64] {
+        self.object.words()
     }
 }
 
@@ -178,7 +221,7 @@ impl Drop for Lane {
     fn drop(&mut self) {
         if !self.is_forked() {
             close(self.words());
-            self.session.free_lane(self.index);
+            self.session.free_lane(self.object.clone());
         }
     }
 }

@@ -2,38 +2,59 @@
 
 use std::sync::atomic::AtomicU64;
 
-use super::{ShmError, pins::RECORDS, ring::Geometry, sync::Ordering};
+use super::{ShmError, sync::Ordering};
 use crate::ids::{Gid, SessionId};
 
 /// Segments are multiples of this many bytes, and memory is committed in them.
 pub(super) const ALIGN: u64 = 64 << 10;
-/// The largest message in bytes: its length has 32 bits, rounded down to a sample's alignment.
-pub(super) const MAX_MESSAGE: u64 = u32::MAX as u64 & !(GRANULE - 1);
+/// Objects are whole lines: no two processes write to one, nor does a processor fetch two at once.
+pub(super) const LINE: u64 = 128;
+/// The largest message in bytes: its length has 32 bits, rounded down to whole lines.
+pub(super) const MAX_MESSAGE: u64 = u32::MAX as u64 & !(LINE - 1);
 /// The most address space that one segment may take, in bytes.
-pub(super) const MAX_RING: u64 = 64 << 30;
+pub(super) const MAX_SEGMENT: u64 = 64 << 30;
 /// The most history that a ring may be asked to keep, in bytes: up to four times this is mapped.
-pub(super) const MAX_BUDGET: u64 = MAX_RING / 4;
-/// Samples in the payload area start at multiples of this many bytes.
-pub(super) const GRANULE: u64 = 64;
+pub(super) const MAX_BUDGET: u64 = MAX_SEGMENT / 4;
 /// Samples of more bytes than this are pinned while they are read, others are copied out.
 pub(super) const COPIED: u64 = 4096;
-/// Bytes of a sample that fit in its slot.
+/// Bytes of a sample that fit in its descriptor.
 pub(super) const INLINE: usize = 96;
 /// Lanes of a session: how many rings it can read at a time.
 pub(super) const LANES: u32 = 4096;
 
-const VERSION: u64 = 2;
-const HEADER: u64 = 4096;
-const SLOT: u64 = 128;
-const LANE: u64 = 128;
+/// Bytes of a session's first segment, and where its objects begin.
+pub(super) const SESSION_BYTES: u64 = 512 << 10;
+/// Bytes of a further one, which holds no object of more than [`HEAP_BYTES_MAX`] less a header.
+pub(super) const HEAP_BYTES: u64 = 8 << 20;
+pub(super) const HEAP_BYTES_MAX: u64 = 64 << 20;
+/// Where the objects of either begin, and where the slots of a publisher's segment do.
+pub(super) const HEAP_AT: u64 = 4096;
+pub(super) const SLOTS_AT: u64 = ALIGN;
+
+/// Numbers of segments have 24 bits.
+pub(super) const MAX_NUMBER: u32 = (1 << 24) - 1;
+/// A ring starts with this many descriptors and doubles.
+pub(super) const FIRST_DESCRIPTORS: u64 = 16;
+pub(super) const MAX_DESCRIPTORS: u64 = 1 << 18;
+
+pub(super) const DESCRIPTOR: u64 = 128;
+/// Words of a descriptor.
+pub(super) const DESCRIPTOR_WORDS: usize = DESCRIPTOR as usize / 8;
+pub(super) const LANE: u64 = 128;
 /// Words of a lane.
 pub(super) const LANE_WORDS: usize = LANE as usize / 8;
-const MAX_SLOTS: u64 = 1 << 20;
+pub(super) const RING: u64 = 384;
+/// Words of a ring's header.
+#[cfg(test)]
+pub(super) const RING_WORDS: usize = RING as usize / 8;
 
-const SESSION_MAGIC: u64 = u64::from_ne_bytes(*b"AXONSES1");
-const RING_MAGIC: u64 = u64::from_ne_bytes(*b"AXONRNG1");
+const VERSION: u32 = 2;
+/// Reads otherwise on a machine of another byte order.
+const ORDER: u32 = 0x0a0b_0c0d;
+const SEGMENT_MAGIC: u64 = u64::from_ne_bytes(*b"AXONSEG2");
+const RING_MAGIC: u64 = u64::from_ne_bytes(*b"AXONRNG2");
 
-/// Words of a session segment.
+/// Words of a session's first segment.
 pub(super) mod session {
     /// Ticket of the wait for samples.
     pub(in crate::shm) const ARMED: usize = 128 / 8;
@@ -48,25 +69,101 @@ pub(super) mod lane {
     pub(in crate::shm) const RECEIVED: usize = 2;
     pub(in crate::shm) const LOST: usize = 3;
     pub(in crate::shm) const SKIPPED: usize = 4;
+    /// The highest number of the publisher's segments that the reader has.
+    pub(in crate::shm) const MAPPED: usize = 5;
     /// The first of the pin records.
     pub(in crate::shm) const PINS: usize = 6;
     pub(in crate::shm) const READER: usize = 12;
     pub(in crate::shm) const WRITER: usize = 14;
 }
 
-pub(super) const fn session_bytes() -> u64 {
-    (HEADER + LANES as u64 * LANE).next_multiple_of(ALIGN)
+/// Words of a ring's header.
+pub(super) mod ring {
+    pub(in crate::shm) const WRITER: usize = 2;
+    pub(in crate::shm) const HEAD: usize = 128 / 8;
+    /// Samples published, those that nobody was there to read among them.
+    pub(in crate::shm) const PUBLISHED: usize = 136 / 8;
+    pub(in crate::shm) const TAIL: usize = 256 / 8;
+    /// Where the descriptors are, and how many.
+    pub(in crate::shm) const ARRAY: usize = 264 / 8;
 }
 
-/// The words of lane `index`.
-pub(super) fn lane_words(words: &[AtomicU64], index: u32) -> &[AtomicU64; LANE_WORDS] {
-    let start = HEADER as usize / 8 + index as usize * LANE_WORDS;
-    words[start..].first_chunk().expect("the number of lanes was checked")
+/// What a segment is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SegmentKind {
+    /// A session's first: the words by which it is woken, and objects.
+    Session,
+    /// More room for objects.
+    Heap,
+    /// Samples of more than 4 KiB of this publisher.
+    Samples(Gid),
 }
 
-/// Bytes that must be committed for lane `index`.
-pub(super) fn lane_end(index: u32) -> u64 {
-    HEADER + (u64::from(index) + 1) * LANE
+impl SegmentKind {
+    fn number(self) -> u32 {
+        match self {
+            Self::Session => 0,
+            Self::Heap => 1,
+            Self::Samples(_) => 2,
+        }
+    }
+
+    fn publisher(self) -> Gid {
+        match self {
+            Self::Session | Self::Heap => Gid([0; 16]),
+            Self::Samples(gid) => gid,
+        }
+    }
+}
+
+/// Where an object of a session is.
+#[derive(
+    Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, minicbor::Encode, minicbor::Decode,
+)]
+pub struct Location {
+    /// The number of the session's segment.
+    #[n(0)]
+    pub segment: u32,
+    /// The offset in it, in bytes: a multiple of 128.
+    #[n(1)]
+    pub offset: u64,
+}
+
+impl Location {
+    /// The first word and the one after the last of `bytes` bytes there, if a segment of `limit`
+    /// words has them.
+    pub(super) fn words(&self, bytes: u64, limit: usize) -> Option<std::ops::Range<usize>> {
+        if !self.offset.is_multiple_of(LINE) || self.offset < HEAP_AT {
+            return None;
+        }
+        let start = usize::try_from(self.offset / 8).ok()?;
+        let count = usize::try_from(bytes.div_ceil(8)).ok()?;
+        let end = start.checked_add(count).filter(|end| *end <= limit)?;
+        Some(start..end)
+    }
+}
+
+/// Where a ring's descriptors are. One word, so that growing is one store.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Array {
+    pub(super) at: Location,
+    /// A power of two.
+    pub(super) descriptors: u64,
+}
+
+impl Array {
+    pub(super) fn word(&self) -> u64 {
+        let log2 = u64::from(self.descriptors.trailing_zeros());
+        u64::from(self.at.segment) << 40 | (self.at.offset / LINE) << 6 | log2
+    }
+
+    /// `None` when the word makes no sense.
+    pub(super) fn from_word(word: u64) -> Option<Self> {
+        let offset = (word >> 6 & ((1 << 34) - 1)) * LINE;
+        let descriptors = 1u64.checked_shl((word & 63) as u32)?;
+        let at = Location { segment: (word >> 40) as u32, offset };
+        (2..=MAX_DESCRIPTORS).contains(&descriptors).then_some(Self { at, descriptors })
+    }
 }
 
 pub(super) fn write_id(words: &[AtomicU64], at: usize, id: [u8; 16]) {
@@ -83,134 +180,87 @@ fn read_id(words: &[AtomicU64], at: usize) -> [u8; 16] {
     id
 }
 
-pub(super) fn write_session(words: &[AtomicU64], id: SessionId) {
-    words[1].store(VERSION | u64::from(LANES) << 32, Ordering::Relaxed);
-    write_id(words, 2, id.0);
-    words[0].store(SESSION_MAGIC, Ordering::Release);
+/// Says what a new segment is, before any other process has its descriptor.
+pub(super) fn write_segment(
+    words: &[AtomicU64],
+    session: SessionId,
+    number: u32,
+    kind: SegmentKind,
+) {
+    let pair = |low: u32, high: u32| u64::from(low) | u64::from(high) << 32;
+    words[0].store(SEGMENT_MAGIC, Ordering::Relaxed);
+    words[1].store(pair(VERSION, ORDER), Ordering::Relaxed);
+    write_id(words, 2, session.0);
+    words[4].store(pair(number, kind.number()), Ordering::Relaxed);
+    words[5].store(words.len() as u64 * 8, Ordering::Relaxed);
+    write_id(words, 6, kind.publisher().0);
 }
 
-/// Checks another session's header and returns its number of lanes.
-pub(super) fn read_session(words: &[AtomicU64], id: SessionId) -> Result<u32, ShmError> {
+/// Checks that another session's segment is the one that it was announced as.
+pub(super) fn check_segment(
+    words: &[AtomicU64],
+    session: SessionId,
+    number: u32,
+    kind: SegmentKind,
+) -> Result<(), ShmError> {
     let refuse = |what| Err(ShmError::Refused { what });
-    if words[0].load(Ordering::Acquire) != SESSION_MAGIC {
-        return refuse("it is not a session segment");
+    if words[0].load(Ordering::Relaxed) != SEGMENT_MAGIC {
+        return refuse("it is not a segment of AXON");
     }
-    let (version, lanes) = halves(words[1].load(Ordering::Relaxed));
-    if u64::from(version) != VERSION {
-        return refuse("its version is another one");
+    let (version, order) = halves(words[1].load(Ordering::Relaxed));
+    if order != ORDER {
+        return refuse("it was written in another byte order");
     }
-    if HEADER + u64::from(lanes) * LANE > words.len() as u64 * 8 {
-        return refuse("its lanes do not fit in it");
+    if version != VERSION {
+        return refuse("it is laid out by another version of AXON");
     }
-    if read_id(words, 2) != id.0 {
+    if read_id(words, 2) != session.0 {
         return refuse("it belongs to another session");
     }
-    Ok(lanes)
+    if halves(words[4].load(Ordering::Relaxed)) != (number, kind.number()) {
+        return refuse("it is another one of the session's segments");
+    }
+    if words[5].load(Ordering::Relaxed) != words.len() as u64 * 8 {
+        return refuse("it is not as large as it says");
+    }
+    if read_id(words, 6) != kind.publisher().0 {
+        return refuse("it belongs to another publisher");
+    }
+    Ok(())
 }
 
-/// How a ring is laid out.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct RingLayout {
-    slots: u64,
-    payload_at: u64,
-    payload_bytes: u64,
-    /// Of these, the first for samples that readers copy. No reader needs to know.
-    copied_bytes: u64,
+/// Writes the header of an empty ring, which nobody knows of yet.
+pub(super) fn write_ring(words: &[AtomicU64], writer: Gid, array: &Array) {
+    words.iter().for_each(|word| word.store(0, Ordering::Relaxed));
+    write_id(words, ring::WRITER, writer.0);
+    words[ring::ARRAY].store(array.word(), Ordering::Relaxed);
+    words[0].store(RING_MAGIC, Ordering::Relaxed);
 }
 
-impl RingLayout {
-    /// A ring of at least `slots` slots, for a history of `budget` bytes of samples of at most
-    /// `max_message` bytes. All of it is address space, not memory.
-    pub(super) fn new(slots: u64, budget: u64, max_message: u64) -> Self {
-        let slots = slots.next_power_of_two().min(MAX_SLOTS);
-        let payload_at = (HEADER + slots * SLOT).next_multiple_of(ALIGN);
-        // Twice the budget, so that pieces between samples seldom shorten the history.
-        let copied_bytes = (2 * budget).min(2 * COPIED * slots).max(1).next_multiple_of(ALIGN);
-        // Room for four of the largest, so that one of them always fits beside one that stands;
-        // and for as many as two readers can pin.
-        let largest = max_message.max(1).next_multiple_of(GRANULE);
-        let pinned = (4 * largest).max(2 * budget) + 2 * RECORDS as u64 * largest;
-        let pinned = pinned.next_multiple_of(ALIGN).min(MAX_RING - payload_at - copied_bytes);
-        Self { slots, payload_at, payload_bytes: copied_bytes + pinned, copied_bytes }
+/// Checks the header of another process's ring.
+pub(super) fn check_ring(words: &[AtomicU64], writer: Gid) -> Result<(), ShmError> {
+    let refuse = |what| Err(ShmError::Refused { what });
+    if words[0].load(Ordering::Relaxed) != RING_MAGIC {
+        return refuse("it has no ring there");
     }
-
-    pub(super) fn slots(&self) -> u64 {
-        self.slots
+    if read_id(words, ring::WRITER) != writer.0 {
+        return refuse("the ring belongs to another publisher");
     }
-
-    pub(super) fn payload_at(&self) -> u64 {
-        self.payload_at
-    }
-
-    pub(super) fn payload_bytes(&self) -> u64 {
-        self.payload_bytes
-    }
-
-    pub(super) fn copied_bytes(&self) -> u64 {
-        self.copied_bytes
-    }
-
-    pub(super) fn bytes(&self) -> u64 {
-        self.payload_at + self.payload_bytes
-    }
-
-    /// Bytes that must be committed for the slot of `position`.
-    pub(super) fn slot_end(&self, position: u64) -> u64 {
-        HEADER + ((position & (self.slots - 1)) + 1) * SLOT
-    }
-
-    pub(super) fn geometry(&self) -> Geometry {
-        Geometry {
-            head: 128 / 8,
-            tail: 256 / 8,
-            slots: HEADER as usize / 8,
-            mask: self.slots - 1,
-            payload: self.payload_at as usize / 8,
-            payload_words: self.payload_bytes as usize / 8,
-        }
-    }
-
-    pub(super) fn write(&self, words: &[AtomicU64], writer: Gid) {
-        words[1].store(VERSION | self.slots << 32, Ordering::Relaxed);
-        words[2].store(self.payload_at, Ordering::Relaxed);
-        words[3].store(self.payload_bytes, Ordering::Relaxed);
-        write_id(words, 4, writer.0);
-        words[0].store(RING_MAGIC, Ordering::Release);
-    }
-
-    /// Checks another process's ring and copies its layout.
-    pub(super) fn read(words: &[AtomicU64], writer: Gid) -> Result<Self, ShmError> {
-        let refuse = |what| Err(ShmError::Refused { what });
-        if words[0].load(Ordering::Acquire) != RING_MAGIC {
-            return refuse("it is not a ring");
-        }
-        let (version, slots) = halves(words[1].load(Ordering::Relaxed));
-        if u64::from(version) != VERSION {
-            return refuse("its version is another one");
-        }
-        let slots = u64::from(slots);
-        if !slots.is_power_of_two() || !(2..=MAX_SLOTS).contains(&slots) {
-            return refuse("its number of slots is absurd");
-        }
-        let payload_at = words[2].load(Ordering::Relaxed);
-        let payload_bytes = words[3].load(Ordering::Relaxed);
-        let fits = payload_at >= HEADER + slots * SLOT
-            && payload_at.is_multiple_of(GRANULE)
-            && payload_bytes.is_multiple_of(GRANULE)
-            && payload_at
-                .checked_add(payload_bytes)
-                .is_some_and(|end| end <= words.len() as u64 * 8);
-        if !fits {
-            return refuse("its payload area does not fit in it");
-        }
-        if read_id(words, 4) != writer.0 {
-            return refuse("it belongs to another publisher");
-        }
-        Ok(Self { slots, payload_at, payload_bytes, copied_bytes: 0 })
-    }
+    Ok(())
 }
 
 /// Two 32-bit fields that share a word.
 pub(super) fn halves(word: u64) -> (u32, u32) {
     (word as u32, (word >> 32) as u32)
+}
+
+/// Bytes of a publisher's segment for a history of `budget` bytes of samples of at most
+/// `max_message` bytes. All of it is address space, not memory.
+pub(super) fn samples_bytes(budget: u64, max_message: u64, pins: u64) -> u64 {
+    // Room for four of the largest, so that one of them always fits beside one that stands; and
+    // for as many as two readers can pin. Twice the budget, so that pieces between samples seldom
+    // shorten the history.
+    let largest = max_message.max(1).next_multiple_of(LINE);
+    let bytes = (4 * largest).max(2 * budget) + 2 * pins * largest;
+    (SLOTS_AT + bytes).next_multiple_of(ALIGN).min(MAX_SEGMENT)
 }

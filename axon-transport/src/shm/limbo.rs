@@ -1,12 +1,12 @@
-//! The part of a ring's payload area that readers read in place: samples that were given up stay in
-//! limbo until no reader pins them. Plain data, no shared memory.
+//! The segment of a publisher's samples that readers read in place: samples that were given up stay
+//! in limbo until no reader pins them. Plain data, no shared memory.
 
 use std::ops::Range;
 
 use super::area::Area;
 
-/// Who has which bytes of it.
-#[derive(Debug)]
+/// Who has which bytes of it. None until it is [opened](Self::open).
+#[derive(Debug, Default)]
 pub(super) struct Limbo {
     area: Area,
     retired: Vec<Retired>,
@@ -22,8 +22,9 @@ struct Retired {
 }
 
 impl Limbo {
-    pub(super) fn new(range: Range<u64>, pieces: usize) -> Self {
-        Self { area: Area::new(range, pieces), retired: Vec::new(), loans: 0 }
+    /// Has places in `range` from now on.
+    pub(super) fn open(&mut self, range: Range<u64>) {
+        self.area = Area::new(range, 16);
     }
 
     /// A place that nobody reads, for a loan.

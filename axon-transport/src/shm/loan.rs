@@ -5,15 +5,17 @@ use std::{
     ops::{Deref, DerefMut},
     ptr::NonNull,
     slice,
+    sync::Arc,
     time::{Duration, SystemTime},
 };
 
 use super::{
-    Meta, PublishError, Published, Writer,
+    Location, Meta, PublishError, Published, Writer,
+    segments::OwnSegment,
     writer::{Numbering, PATIENCE, Payload},
 };
 
-/// Memory to be filled and published: of the ring itself where it is longer than 4 KiB. Dropping
+/// Memory to be filled and published: shared memory where it is longer than 4 KiB. Dropping
 /// it gives it back.
 ///
 /// Written from the front through [`io::Write`], or anywhere as the slice that it dereferences to;
@@ -28,9 +30,21 @@ pub struct Loan<'a> {
 
 enum Memory {
     Own(Vec<u8>),
-    /// At this offset of the payload area.
-    Ring(u64),
+    Shared(Place),
     Published,
+}
+
+/// Shared memory that was lent.
+pub(super) struct Place {
+    pub(super) segment: Arc<OwnSegment>,
+    /// Where it is in the segment, in bytes.
+    pub(super) at: u64,
+}
+
+impl Place {
+    fn location(&self) -> Location {
+        Location { segment: self.segment.number(), offset: self.at }
+    }
 }
 
 impl<'a> Loan<'a> {
@@ -38,9 +52,9 @@ impl<'a> Loan<'a> {
         Self { writer, len, written: 0, memory: Memory::Own(vec![0; len]) }
     }
 
-    /// `len` bytes at `at`, which have been lent.
-    pub(super) fn placed(writer: &'a Writer, len: usize, at: u64) -> Self {
-        Self { writer, len, written: 0, memory: Memory::Ring(at) }
+    /// `len` bytes there, which have been lent.
+    pub(super) fn placed(writer: &'a Writer, len: usize, place: Place) -> Self {
+        Self { writer, len, written: 0, memory: Memory::Shared(place) }
     }
 
     /// Publishes it, waiting for a slot as [`Writer::publish`] does.
@@ -84,18 +98,21 @@ impl<'a> Loan<'a> {
     ) -> Result<(u64, Published), PublishError> {
         let payload = match &self.memory {
             Memory::Own(bytes) => Payload::Bytes(bytes),
-            Memory::Ring(at) => Payload::Written { at: *at, len: self.len },
+            Memory::Shared(place) => Payload::Written { at: place.location(), len: self.len },
             Memory::Published => unreachable!("publishing takes the loan"),
         };
-        let published = self.writer.commit(numbering, payload, patience)?;
-        self.memory = Memory::Published;
-        Ok(published)
+        let (sequence, published) = self.writer.commit(numbering, payload, patience)?;
+        // What nobody reads has not become a sample, and its memory is given back.
+        if published.position.is_some() {
+            self.memory = Memory::Published;
+        }
+        Ok((sequence, published))
     }
 
-    /// The address of the ring's memory that is lent.
-    fn lent(&self, at: u64) -> NonNull<u8> {
+    /// The address of the memory that is lent.
+    fn lent(&self, place: &Place) -> NonNull<u8> {
         assert!(!self.writer.is_forked(), "a loan of shared memory, used after fork");
-        self.writer.lent(at, self.len)
+        place.segment.memory.address(place.at, self.len)
     }
 }
 
@@ -105,12 +122,14 @@ impl Deref for Loan<'_> {
     fn deref(&self) -> &[u8] {
         match &self.memory {
             Memory::Own(bytes) => bytes,
-            // SAFETY: `len` bytes of the ring's map, which lives as long as the writer. They are
+            // SAFETY: `len` bytes of the segment's map, which lives as long as the loan. They are
             // memory from the system or bytes of earlier samples, so initialized. They are lent to
             // this loan alone, and no reader reads them before they are published, which takes the
             // loan: nothing writes to them while it is borrowed. The words of the whole map that
             // exist beside are atomic and not touched here.
-            Memory::Ring(at) => unsafe { slice::from_raw_parts(self.lent(*at).as_ptr(), self.len) },
+            Memory::Shared(place) => unsafe {
+                slice::from_raw_parts(self.lent(place).as_ptr(), self.len)
+            },
             Memory::Published => &[],
         }
     }
@@ -120,8 +139,8 @@ impl DerefMut for Loan<'_> {
     /// Whoever borrows it is taken to write all of it.
     fn deref_mut(&mut self) -> &mut [u8] {
         self.written = self.len;
-        if let Memory::Ring(at) = self.memory {
-            let start = self.lent(at).as_ptr();
+        if let Memory::Shared(place) = &self.memory {
+            let start = self.lent(place).as_ptr();
             // SAFETY: as in `deref`, and borrowed mutably like the loan itself. Other processes
             // have the memory mapped; they cannot write to it, and those that keep to the protocol
             // do not read it.
@@ -129,7 +148,7 @@ impl DerefMut for Loan<'_> {
         }
         match &mut self.memory {
             Memory::Own(bytes) => bytes,
-            Memory::Ring(_) | Memory::Published => &mut [],
+            Memory::Shared(_) | Memory::Published => &mut [],
         }
     }
 }
@@ -155,10 +174,10 @@ impl io::Write for Loan<'_> {
 impl Drop for Loan<'_> {
     fn drop(&mut self) {
         // The history of a forked child is a copy that nobody uses, and its lock may be held.
-        if let Memory::Ring(at) = self.memory
+        if let Memory::Shared(place) = &self.memory
             && !self.writer.is_forked()
         {
-            self.writer.give_back(at, self.len);
+            self.writer.give_back(place.location(), self.len);
         }
     }
 }

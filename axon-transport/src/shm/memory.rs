@@ -5,7 +5,7 @@ use std::{
     os::fd::{AsFd, BorrowedFd, OwnedFd},
     ptr::{self, NonNull},
     slice,
-    sync::atomic::AtomicU64,
+    sync::{Arc, atomic::AtomicU64},
 };
 
 use rustix::{
@@ -30,7 +30,7 @@ fn seals() -> SealFlags {
 /// Memory that this process alone writes, sparse until [`Segment::commit`].
 pub(super) struct Segment {
     fd: OwnedFd,
-    map: Map,
+    map: Arc<Map>,
 }
 
 impl Segment {
@@ -48,7 +48,7 @@ impl Segment {
         // FUTURE_WRITE forbids writable maps from then on, so ours is made first.
         let map = Map::new(fd.as_fd(), len, Access::Write)?;
         fcntl_add_seals(&fd, seals()).map_err(ShmError::system("sealing a memfd"))?;
-        Ok(Self { fd, map })
+        Ok(Self { fd, map: Arc::new(map) })
     }
 
     /// Backs `range` with memory, so that touching it can neither fault nor get the process
@@ -74,7 +74,7 @@ impl Segment {
     }
 
     /// The address of `len` bytes at `at`, to be written otherwise than by words.
-    pub(super) fn bytes(&self, at: u64, len: usize) -> NonNull<u8> {
+    pub(super) fn address(&self, at: u64, len: usize) -> NonNull<u8> {
         let at = usize::try_from(at).expect("a segment is mapped whole");
         assert!(at.checked_add(len).is_some_and(|end| end <= self.map.bytes));
         // SAFETY: inside the mapping, as was just checked.
@@ -91,6 +91,14 @@ impl Segment {
 
     pub(super) fn fd(&self) -> BorrowedFd<'_> {
         self.fd.as_fd()
+    }
+
+    pub(super) fn map(&self) -> &Arc<Map> {
+        &self.map
+    }
+
+    pub(super) fn bytes(&self) -> u64 {
+        self.map.bytes as u64
     }
 }
 
@@ -134,7 +142,8 @@ impl Map {
         }
         let len = fstat(fd).map_err(ShmError::system("sizing up a segment"))?.st_size;
         let len = u64::try_from(len).unwrap_or(0);
-        if !(layout::ALIGN..=layout::MAX_RING).contains(&len) || !len.is_multiple_of(layout::ALIGN)
+        if !(layout::ALIGN..=layout::MAX_SEGMENT).contains(&len)
+            || !len.is_multiple_of(layout::ALIGN)
         {
             return Err(ShmError::Refused { what: "its size is not a segment's" });
         }

@@ -1,5 +1,7 @@
-//! Shared memory between the processes of one host: a ring per publisher in a sealed memfd, and a
-//! segment per session that holds its readers' cursors and pins and the words by which it is woken.
+//! Shared memory between the processes of one host. Each session has a segment of memory, a sealed
+//! memfd that holds the words by which it is woken, the rings of its publishers, their samples of up
+//! to 4 KiB, and its readers' cursors and pins. A publisher of longer samples has a segment for
+//! them, and a session that needs more room has further ones. Others map what they read from.
 //!
 //! ```
 //! use std::{os::unix::net::UnixDatagram, thread, time::Duration};
@@ -57,17 +59,20 @@ mod area;
 mod atfork;
 mod attachment;
 mod audience;
+mod blocks;
 mod connect;
 mod context;
 mod error;
 mod fork;
 mod headroom;
+mod heap;
 mod history;
 mod lane;
 mod layout;
 mod limbo;
 mod loan;
 mod memory;
+mod orphans;
 mod peer;
 mod pins;
 mod publisher;
@@ -76,6 +81,7 @@ mod ring;
 mod room;
 mod sample;
 mod seats;
+mod segments;
 mod session;
 mod subscriber;
 pub(crate) mod sync;
@@ -89,11 +95,13 @@ pub use connect::ConnectError;
 pub use context::Context;
 pub use error::{PublishError, ShmError, TakeError};
 pub use lane::Lane;
+pub use layout::{Location, SegmentKind};
 pub use loan::Loan;
 pub use peer::{Peer, PeerDescriptors, PeerSession};
 pub use publisher::{Publisher, PublisherOptions};
 pub use reader::{Reader, ReaderOptions};
 pub use sample::{Sample, SampleReader};
+pub use segments::{SegmentEvent, SegmentInfo};
 pub use session::SessionSegment;
 pub use subscriber::{Subscriber, SubscriberOptions};
 pub use types::{Grant, Meta, Published, ReaderInfo, RingOptions, Taken};

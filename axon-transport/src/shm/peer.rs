@@ -1,14 +1,21 @@
-//! Another session as seen from this one: its segment, its doorbell, and whether it lives.
+//! Another session as seen from this one: its segments, its doorbell, and whether it lives.
 
 use std::{
+    collections::{BTreeMap, BTreeSet},
     fs, io,
     os::fd::{AsFd, AsRawFd, BorrowedFd},
-    sync::{Arc, atomic::AtomicU64},
+    sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, Weak, atomic::AtomicU64},
 };
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
-use super::{SessionSegment, ShmError, layout, memory::Map};
+use super::{
+    Location, SegmentInfo, SessionSegment, ShmError,
+    attachment::Attachment,
+    lane::LaneView,
+    layout::{self, SegmentKind},
+    memory::Map,
+};
 use crate::{
     ids::SessionId,
     passed::PassedFd,
@@ -19,7 +26,7 @@ use crate::{
 /// descriptors are sent.
 #[derive(Debug)]
 pub struct PeerDescriptors {
-    /// Its session segment.
+    /// The first segment of its memory.
     pub segment: PassedFd,
     /// What wakes it: one end of a pair of unix sockets that keep packets apart.
     pub doorbell: PassedFd,
@@ -55,19 +62,46 @@ impl PeerDescriptors {
     }
 }
 
+/// Segments of another session that are kept at most, whatever it opens.
+const MAX_SEGMENTS: usize = 4096;
+
 /// Another session, mapped read-only.
 pub struct PeerSession {
     id: SessionId,
-    map: Map,
-    lanes: u32,
+    /// Its first segment.
+    first: Arc<Map>,
+    further: Mutex<Further>,
+    wanting: OnceLock<Box<dyn Fn() + Send + Sync>>,
     bell: Bell,
     pidfd: PassedFd,
     /// The last ticket of each of its armed words that this process rang for.
     rung: [AtomicU64; 2],
 }
 
+/// What is known of the segments besides the first.
+#[derive(Default)]
+struct Further {
+    /// `None` for one that could not be used.
+    maps: BTreeMap<u32, Option<Arc<Map>>>,
+    /// The highest number of those that came.
+    highest: u32,
+    /// Those that a reader has met and nobody has been asked for yet.
+    wanted: BTreeSet<u32>,
+    /// The readers, whose lanes tell the session which of its segments they have.
+    readers: Vec<Weak<Attachment>>,
+}
+
+/// What became of the look for a segment of another session.
+pub(super) enum Found {
+    Map(Arc<Map>),
+    /// It was not as it must be.
+    Refused,
+    /// It has not come yet.
+    Absent,
+}
+
 impl PeerSession {
-    /// Checks and maps the segment of session `id`.
+    /// Checks and maps the first segment of session `id`.
     ///
     /// # Errors
     /// The descriptors are not those of a session, or not of this one.
@@ -76,9 +110,108 @@ impl PeerSession {
         let bell = Bell::received(doorbell).ok_or(ShmError::Refused {
             what: "its doorbell is no unix socket that keeps packets",
         })?;
-        let map = Map::open(segment.as_fd())?;
-        let lanes = layout::read_session(map.words(), id)?;
-        Ok(Arc::new(Self { id, map, lanes, bell, pidfd, rung: Default::default() }))
+        let first = Map::open(segment.as_fd())?;
+        layout::check_segment(first.words(), id, 0, SegmentKind::Session)?;
+        Ok(Arc::new(Self {
+            id,
+            first: Arc::new(first),
+            further: Mutex::default(),
+            wanting: OnceLock::new(),
+            bell,
+            pidfd,
+            rung: Default::default(),
+        }))
+    }
+
+    /// Checks and maps a further segment of the session. One that is mapped already stays.
+    ///
+    /// # Errors
+    /// It is not what it was said to be. Rings that use it cannot be read.
+    pub fn add_segment(&self, info: SegmentInfo, segment: impl AsFd) -> Result<(), ShmError> {
+        let mut further = self.further();
+        let known = further.maps.contains_key(&info.number);
+        if known || info.number == 0 || info.number > layout::MAX_NUMBER {
+            return Ok(());
+        }
+        if further.maps.len() >= MAX_SEGMENTS {
+            return Err(ShmError::Refused { what: "its session has too many segments" });
+        }
+        let map = Map::open(segment.as_fd()).and_then(|map| {
+            layout::check_segment(map.words(), self.id, info.number, info.kind)?;
+            Ok(Arc::new(map))
+        });
+        let (map, result) = match map {
+            Ok(map) => (Some(map), Ok(())),
+            Err(error) => (None, Err(error)),
+        };
+        further.maps.insert(info.number, map);
+        further.wanted.remove(&info.number);
+        further.highest = further.highest.max(info.number);
+        let highest = further.highest;
+        further.readers.retain(|reader| match reader.upgrade() {
+            Some(reader) => {
+                reader.set_mapped(highest);
+                true
+            }
+            None => false,
+        });
+        result
+    }
+
+    /// Forgets a segment that its session has given up. Samples in it stay for as long as they are
+    /// in use.
+    pub fn remove_segment(&self, number: u32) {
+        self.further().maps.remove(&number);
+    }
+
+    /// Has `ask` called when a reader finds that a segment is missing, which then
+    /// [`take_wanted`](Self::take_wanted) names. It must not block.
+    pub fn on_wanted(&self, ask: impl Fn() + Send + Sync + 'static) {
+        let _ = self.wanting.set(Box::new(ask));
+    }
+
+    /// The segments that readers have met and that have not come, each once.
+    pub fn take_wanted(&self) -> BTreeSet<u32> {
+        std::mem::take(&mut self.further().wanted)
+    }
+
+    /// Whether a segment has come.
+    pub fn has_segment(&self, number: u32) -> bool {
+        !matches!(self.find(number), Found::Absent)
+    }
+
+    pub(super) fn find(&self, number: u32) -> Found {
+        if number == 0 {
+            return Found::Map(Arc::clone(&self.first));
+        }
+        match self.further().maps.get(&number) {
+            Some(Some(map)) => Found::Map(Arc::clone(map)),
+            Some(None) => Found::Refused,
+            None => Found::Absent,
+        }
+    }
+
+    /// A reader has met a segment that is missing.
+    pub(super) fn want(&self, number: u32) {
+        let mut further = self.further();
+        if !further.maps.contains_key(&number) && further.wanted.insert(number) {
+            drop(further);
+            if let Some(ask) = self.wanting.get() {
+                ask();
+            }
+        }
+    }
+
+    /// Has a reader tell the session which of its segments are mapped.
+    pub(super) fn keep_told(&self, reader: &Arc<Attachment>) {
+        let mut further = self.further();
+        further.readers.retain(|reader| reader.strong_count() > 0);
+        further.readers.push(Arc::downgrade(reader));
+        reader.set_mapped(further.highest);
+    }
+
+    fn further(&self) -> MutexGuard<'_, Further> {
+        self.further.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Its id.
@@ -102,7 +235,7 @@ impl PeerSession {
             Purpose::Samples => layout::session::ARMED,
             Purpose::Room => layout::session::BLOCKED,
         };
-        if due(&self.map.words()[word], &self.rung[purpose as usize]) {
+        if due(&self.first.words()[word], &self.rung[purpose as usize]) {
             self.bell.ring();
         }
     }
@@ -150,17 +283,19 @@ impl Peer {
         }
     }
 
-    pub(super) fn lanes(&self) -> u32 {
-        match self {
-            Self::Local(_) => layout::LANES,
-            Self::Remote(session) => session.lanes,
+    /// The lane that the session has there.
+    pub(super) fn lane(&self, at: Location) -> Result<LaneView, ShmError> {
+        match self.find(at.segment) {
+            Found::Map(map) => LaneView::new(&map, at),
+            Found::Refused | Found::Absent => None,
         }
+        .ok_or(ShmError::Refused { what: "it has no such lane" })
     }
 
-    pub(super) fn lane_words(&self, index: u32) -> &[AtomicU64; layout::LANE_WORDS] {
+    pub(super) fn find(&self, number: u32) -> Found {
         match self {
-            Self::Local(session) => session.lane_words(index),
-            Self::Remote(session) => layout::lane_words(session.map.words(), index),
+            Self::Local(session) => session.map(number).map_or(Found::Absent, Found::Map),
+            Self::Remote(session) => session.find(number),
         }
     }
 }

@@ -19,13 +19,14 @@ pub struct PublisherOptions {
     qos: Qos,
     budget: u64,
     max_len: u64,
+    expected_len: u64,
 }
 
 impl PublisherOptions {
     /// A publisher that offers `qos`, keeps at most 64 MiB and publishes samples of up to 256 MiB.
     /// Memory is taken as samples need it.
     pub fn new(qos: Qos) -> Self {
-        Self { qos, budget: 64 << 20, max_len: 256 << 20 }
+        Self { qos, budget: 64 << 20, max_len: 256 << 20, expected_len: 0 }
     }
 
     /// Bytes of samples to keep before the oldest go. One sample is always kept.
@@ -38,6 +39,13 @@ impl PublisherOptions {
     #[must_use]
     pub fn max_len(self, max_len: u64) -> Self {
         Self { max_len, ..self }
+    }
+
+    /// The length of most samples in bytes. Where it is more than 4 KiB, subscribers get the memory
+    /// for such samples when they connect, and not with the first of them.
+    #[must_use]
+    pub fn expected_len(self, expected_len: u64) -> Self {
+        Self { expected_len, ..self }
     }
 }
 
@@ -55,9 +63,10 @@ impl Publisher {
     /// # Errors
     /// The options exceed what a ring may take, or memory or descriptors are short.
     pub fn new(context: &Context, options: PublisherOptions) -> Result<Self, ShmError> {
-        let PublisherOptions { qos, budget, max_len: max_message } = options;
+        let PublisherOptions { qos, budget, max_len: max_message, expected_len: expected } =
+            options;
         let gid = context.next_gid();
-        let ring = RingOptions { gid, qos, budget, max_message };
+        let ring = RingOptions { gid, qos, budget, max_message, expected };
         let writer = Writer::create(context.session().clone(), ring)?;
         Ok(Self { context: context.clone(), qos, writer })
     }
@@ -71,7 +80,9 @@ impl Publisher {
     /// `socket`, a connected unix socket that keeps packets apart (`SOCK_SEQPACKET` or
     /// `SOCK_DGRAM`), and returns its GID. Waits for it for at most `timeout`.
     ///
-    /// Whoever holds the other end is trusted to be who it says. Memory that it shares is not.
+    /// Whoever holds the other end is trusted to be who it says. Memory that it shares is not. The
+    /// publisher keeps a duplicate of the socket, over which the subscriber is handed memory that
+    /// comes into use later.
     ///
     /// # Errors
     /// It did not ask in time, asked for what this publisher does not offer, or handed over what
@@ -80,9 +91,8 @@ impl Publisher {
         let channel = Channel::new(socket.as_fd(), timeout);
         let (asked, descriptors) = channel.await_asked()?;
         let gid = asked.reader;
-        let admitted = self.admit(asked, descriptors).and_then(|grant| {
-            let own = self.context.session().descriptors()?;
-            channel.grant(&grant, &own, &self.writer).inspect_err(|_| {
+        let admitted = self.admit(asked, descriptors).and_then(|granted| {
+            self.hand_over(&channel, &granted).inspect_err(|_| {
                 self.writer.detach(gid);
             })
         });
@@ -103,7 +113,15 @@ impl Publisher {
         let grant = self.writer.attach(ReaderInfo { gid, lane, qos, peer, stands_for })?;
         let Grant { generation, first } = grant;
         let (session, writer) = (self.context.id(), self.gid());
-        Ok(Granted { reader: gid, session, writer, generation, first })
+        let ring = self.writer.location();
+        Ok(Granted { reader: gid, session, writer, generation, first, ring })
+    }
+
+    /// Answers, and hands over the memory that is in use and, from then on, what comes into use.
+    fn hand_over(&self, channel: &Channel<'_>, granted: &Granted) -> Result<(), ConnectError> {
+        let own = self.context.session().descriptors()?;
+        channel.grant(granted, &own)?;
+        self.context.hand_over(channel.keep()?, granted)
     }
 
     /// Publishes a sample, stamped with the current time, and returns its sequence number, which
@@ -132,8 +150,18 @@ impl Publisher {
         self.writer.publish(meta, payload).map(drop)
     }
 
-    /// Memory for a sample of `len` bytes, to be filled and then published: of the ring itself
-    /// where it is more than 4 KiB, so that nothing is copied.
+    /// If a sample would be read by nobody, now or later, uses up the next sequence number and
+    /// returns it; `None` when somebody would. Where nobody reads, publishing does the same, but
+    /// whoever has to serialize first can save itself the work.
+    ///
+    /// # Errors
+    /// [`PublishError::Forked`].
+    pub fn skip_unread(&self) -> Result<Option<u64>, PublishError> {
+        self.writer.skip_unread()
+    }
+
+    /// Memory for a sample of `len` bytes, to be filled and then published: shared memory where it
+    /// is more than 4 KiB, so that nothing is copied.
     ///
     /// # Errors
     /// As for [`publish`](Self::publish).
@@ -149,13 +177,22 @@ impl Publisher {
 
     /// Forgets a subscriber; false when it was not served. Samples that it keeps it may keep.
     pub fn dismiss(&self, subscriber: Gid) -> bool {
+        self.context.forget(subscriber);
         self.writer.detach(subscriber)
     }
 
     /// Forgets the subscribers that have left or whose process has ended, and names them. Their
     /// memory comes back with the next samples.
     pub fn reap(&self) -> Vec<Gid> {
-        self.writer.drop_gone()
+        let gone = self.writer.drop_gone();
+        gone.iter().for_each(|gid| self.context.forget(*gid));
+        gone
+    }
+}
+
+impl Drop for Publisher {
+    fn drop(&mut self) {
+        self.context.forget_publisher(self.gid());
     }
 }
 

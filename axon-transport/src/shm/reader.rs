@@ -1,17 +1,19 @@
 //! The taking end of a ring.
 
 use std::{
-    os::fd::AsFd,
-    sync::{Arc, atomic::AtomicU64},
+    ops::Range,
+    sync::{Arc, Weak, atomic::AtomicU64},
+    time::{Duration, Instant},
 };
 
 use super::{
-    Grant, Lane, Meta, Peer, Sample, ShmError, TakeError, Taken,
+    Grant, Lane, Location, Meta, Peer, Sample, ShmError, TakeError, Taken,
     attachment::{Attachment, Pinning},
     audience::{depth, holds},
-    layout::{COPIED, RingLayout},
+    layout::{self, Array, COPIED},
     memory::Map,
-    ring::{self, Look, Record},
+    peer::Found,
+    ring::{self, Look, MAX_POSITION, Place, Record, State, View},
 };
 use crate::{
     ids::Gid,
@@ -21,6 +23,11 @@ use crate::{
 
 /// How often a take follows a publisher that keeps overtaking it before it lets go.
 const ATTEMPTS: u32 = 16;
+/// How often a reader asks for memory that has not come, and how long it hopes for that of a
+/// publisher whose process has ended.
+const MISSING: Duration = Duration::from_secs(1);
+/// Segments of samples that a reader finds without a lock.
+const KNOWN: usize = 4;
 
 /// What a reader must know of the ring that it is granted.
 pub struct ReaderOptions {
@@ -30,6 +37,8 @@ pub struct ReaderOptions {
     pub writer: Gid,
     /// The publisher's session.
     pub peer: Peer,
+    /// Where the ring is in that session's memory.
+    pub ring: Location,
     /// The lane by which the reader attached.
     pub lane: Lane,
     /// The publisher's answer.
@@ -47,11 +56,48 @@ pub struct ReaderOptions {
 pub struct Reader {
     reads: Reads,
     attachment: Arc<Attachment>,
+    /// Absent until they were looked for.
+    descriptors: Option<Descriptors>,
+    /// Segments that samples were in.
+    maps: Vec<(u32, Weak<Map>)>,
+    missing: Option<Missing>,
     cursor: u64,
+    /// The head as it was seen last.
+    seen: u64,
     received: u64,
     lost: u64,
     skipped: u64,
     corrupt: Option<&'static str>,
+}
+
+/// Where a ring's descriptors were found.
+struct Descriptors {
+    /// What the ring said.
+    word: u64,
+    map: Arc<Map>,
+    words: Range<usize>,
+}
+
+impl Descriptors {
+    #[inline]
+    fn view<'a>(&'a self, attachment: &'a Attachment) -> View<'a, AtomicU64> {
+        let array = &self.map.words()[self.words.clone()];
+        View { ring: attachment.ring(), word: self.word, array }
+    }
+}
+
+/// A segment that is needed to go on.
+#[derive(Clone, Copy)]
+struct Missing {
+    segment: u32,
+    since: Instant,
+    asked: Instant,
+}
+
+/// What is in the way of a reader.
+enum Obstacle {
+    Missing(u32),
+    Corrupt(&'static str),
 }
 
 /// What does not change.
@@ -66,22 +112,40 @@ struct Reads {
 }
 
 impl Reader {
-    /// Checks and maps a ring, and opens the lane.
+    /// Checks a ring and opens the lane.
     ///
     /// # Errors
-    /// The descriptor is not a ring, or not this publisher's.
-    pub fn map(ring: impl AsFd, options: ReaderOptions) -> Result<Self, ShmError> {
-        let ReaderOptions { reader, writer, peer, lane, grant, qos, max_message } = options;
+    /// There is no ring of this publisher's in that place, or the segment that it is in has not
+    /// come.
+    pub fn map(options: ReaderOptions) -> Result<Self, ShmError> {
+        let ReaderOptions { reader, writer, peer, ring, lane, grant, qos, max_message } = options;
         if lane.is_forked() {
             return Err(ShmError::Forked);
         }
-        let map = Map::open(ring.as_fd())?;
-        let layout = RingLayout::read(map.words(), writer)?;
+        let refuse = |what| Err(ShmError::Refused { what });
+        let Found::Map(map) = peer.find(ring.segment) else {
+            return refuse("the segment that its ring is in did not come");
+        };
+        let Some(words) = ring.words(layout::RING, map.words().len()) else {
+            return refuse("its ring is outside its memory");
+        };
+        layout::check_ring(&map.words()[words.clone()], writer)?;
+        if grant.first > MAX_POSITION {
+            return refuse("its ring is too far");
+        }
         lane.open(grant, reader, writer);
         let holds = holds(&qos) && peer.remote().is_some();
+        let attachment = Attachment::new(map, words, lane);
+        if let Some(session) = peer.remote() {
+            session.keep_told(&attachment);
+        }
         Ok(Self {
-            attachment: Attachment::new(map, layout.geometry(), lane),
+            attachment,
+            descriptors: None,
+            maps: Vec::new(),
+            missing: None,
             cursor: grant.first,
+            seen: 0,
             received: 0,
             lost: 0,
             skipped: 0,
@@ -90,16 +154,49 @@ impl Reader {
         })
     }
 
-    /// Whether there is something to take: two loads.
+    /// Whether there is something to take: a look at one line that the publisher writes with each
+    /// sample, and one that it seldom writes.
     pub fn has_data(&self) -> bool {
-        self.unread() > 0
+        // A publisher of the same session is not there in a forked child.
+        if self.corrupt.is_some() || self.attachment.lane.is_forked() {
+            return false;
+        }
+        if let Some(missing) = &self.missing {
+            let more = |(_, head): (u64, u64)| head.saturating_sub(self.cursor) > self.reads.depth;
+            return !matches!(self.reads.peer.find(missing.segment), Found::Absent)
+                // It may not be needed any more.
+                || ring::bounds(self.attachment.ring()).is_ok_and(more)
+                || self.is_over(missing);
+        }
+        let word = ring::array(self.attachment.ring());
+        let found;
+        let descriptors = match &self.descriptors {
+            Some(known) if known.word == word => known,
+            _ => match self.resolve(word) {
+                Ok(resolved) => {
+                    found = resolved;
+                    &found
+                }
+                // The next take asks for it, or says what is wrong.
+                Err(_) => return true,
+            },
+        };
+        match descriptors.view(&self.attachment).state(self.cursor) {
+            State::Ahead => self.cursor < self.seen,
+            State::Here | State::Gone => true,
+        }
     }
 
     /// How many samples are to be taken; at most the subscription's depth.
     pub fn unread(&self) -> u64 {
-        match (self.corrupt, ring::bounds(self.attachment.words(), &self.attachment.geometry)) {
+        if self.attachment.lane.is_forked() {
+            return 0;
+        }
+        match (self.corrupt, ring::bounds(self.attachment.ring())) {
             (None, Ok((tail, head))) => {
-                head.saturating_sub(self.cursor.max(tail)).min(self.reads.depth)
+                // The stamp of the last one may have come before the head.
+                let unread = head.saturating_sub(self.cursor.max(tail));
+                unread.max(u64::from(self.has_data())).min(self.reads.depth)
             }
             // The next take says what is wrong.
             (None, Err(_)) => 1,
@@ -127,8 +224,8 @@ impl Reader {
     /// useful.
     pub fn take(&mut self, out: &mut Vec<u8>) -> Result<Option<Taken>, TakeError> {
         for _ in 0..ATTEMPTS {
-            let Some(record) = self.find_fitting()? else { break };
-            if self.copy_out(&record, out)? {
+            let Some((record, bytes)) = self.find_whole()? else { break };
+            if self.copy_out(&record, &bytes, out)? {
                 return Ok(Some(self.taken(&record)));
             }
         }
@@ -142,20 +239,20 @@ impl Reader {
     /// As for [`take`](Self::take).
     pub fn take_sample(&mut self) -> Result<Option<Sample>, TakeError> {
         for _ in 0..ATTEMPTS {
-            let Some(record) = self.find_fitting()? else { break };
-            if u64::from(record.len) > COPIED {
-                let words = self.attachment.placed(&record).ok_or_else(|| self.outside())?;
+            let Some((record, bytes)) = self.find_whole()? else { break };
+            if let Bytes::Slot(map, words) = &bytes {
                 match self.attachment.pin(self.cursor) {
                     Pinning::Pinned(pin) => {
                         let len = record.len as usize;
-                        return Ok(Some(Sample::pinned(self.taken(&record), len, words, pin)));
+                        let place = (Arc::clone(map), words.clone());
+                        return Ok(Some(Sample::pinned(self.taken(&record), len, place, pin)));
                     }
                     Pinning::Overtaken => continue,
                     Pinning::NoRecord => {}
                 }
             }
             let mut out = Vec::new();
-            if self.copy_out(&record, &mut out)? {
+            if self.copy_out(&record, &bytes, &mut out)? {
                 return Ok(Some(Sample::copied(self.taken(&record), out)));
             }
         }
@@ -176,6 +273,7 @@ impl Reader {
     pub fn skip(&mut self) -> bool {
         match self.find() {
             Ok(Some(_)) => {
+                self.missing = None;
                 self.skipped += 1;
                 self.advance(self.cursor + 1);
                 true
@@ -209,9 +307,21 @@ impl Reader {
         self.reads.grant
     }
 
-    /// Its lane's number.
-    pub fn lane(&self) -> u32 {
-        self.attachment.lane.index()
+    /// Where its lane is.
+    pub fn lane(&self) -> Location {
+        self.attachment.lane.location()
+    }
+
+    /// The number of the segment of the publisher's session that is needed to go on and has not
+    /// come.
+    pub fn missing(&self) -> Option<u32> {
+        self.missing.map(|missing| missing.segment)
+    }
+
+    /// Whether there is nothing to take now, nor will be when the segments come that are on their
+    /// way. For one whose publisher is gone.
+    pub fn is_drained(&self) -> bool {
+        self.missing.is_none() && !self.has_data()
     }
 
     /// Whether the publisher's process has ended: a system call. Drain before dropping.
@@ -227,71 +337,246 @@ impl Reader {
         if let Some(what) = self.corrupt {
             return Err(TakeError::Corrupt { writer: self.reads.writer, what });
         }
-        match self.find_sane() {
-            Ok(found) => Ok(found),
-            Err(what) => {
-                self.corrupt = Some(what);
-                Err(TakeError::Corrupt { writer: self.reads.writer, what })
-            }
-        }
-    }
-
-    fn find_sane(&mut self) -> Result<Option<Record>, &'static str> {
         for _ in 0..ATTEMPTS {
-            let (tail, head) = ring::bounds(self.attachment.words(), &self.attachment.geometry)?;
-            let Some(unread) = head.checked_sub(self.cursor) else {
-                return Err("its head went back");
-            };
-            if unread > self.reads.depth {
-                self.skipped += unread - self.reads.depth;
-                self.advance(head - self.reads.depth);
-            }
-            if self.cursor < tail {
-                self.lost += tail - self.cursor;
-                self.advance(tail);
-            }
-            if self.cursor == head {
-                return Ok(None);
-            }
-            match ring::look(self.attachment.words(), &self.attachment.geometry, self.cursor) {
-                Look::Sample(record) => return Ok(Some(record)),
-                Look::Lapped => {}
-                Look::Corrupt(what) => return Err(what),
+            match self.find_sane() {
+                Ok(found) => {
+                    return Ok(found);
+                }
+                Err(Obstacle::Missing(segment)) => {
+                    if !self.lacks(segment) {
+                        return Ok(None);
+                    }
+                    // None of what is there will ever be found.
+                    if let Err(what) = self.give_all_up() {
+                        return Err(self.corrupt(what));
+                    }
+                }
+                Err(Obstacle::Corrupt(what)) => return Err(self.corrupt(what)),
             }
         }
         Ok(None)
     }
 
-    /// As [`find`](Self::find), without what is longer than the subscription expects.
-    fn find_fitting(&mut self) -> Result<Option<Record>, TakeError> {
-        let Some(record) = self.find()? else { return Ok(None) };
-        let (len, max) = (u64::from(record.len), self.reads.max_message);
-        if len > max {
-            self.lost += 1;
-            self.advance(self.cursor + 1);
-            return Err(TakeError::TooLarge { writer: self.reads.writer, len, max });
+    fn find_sane(&mut self) -> Result<Option<Record>, Obstacle> {
+        for _ in 0..ATTEMPTS {
+            let word = ring::array(self.attachment.ring());
+            let known = self.descriptors.take().filter(|known| known.word == word);
+            let known = match known {
+                Some(known) => known,
+                None => self.resolve(word)?,
+            };
+            let (cursor, depth) = (self.cursor, self.reads.depth);
+            let view = self.descriptors.insert(known).view(&self.attachment);
+            match view.state(cursor) {
+                State::Ahead if cursor >= self.seen => return Ok(None),
+                State::Here => {
+                    // One look tells whether more than the depth is unread, if that many can be.
+                    let descriptors = (view.array.len() / layout::DESCRIPTOR_WORDS) as u64;
+                    let late = depth < descriptors && view.state(cursor + depth) != State::Ahead;
+                    let mut head = 0;
+                    if late {
+                        // The head may not say so yet, or never, if the publisher died.
+                        head = if view.stands(cursor) { cursor + depth + 1 } else { 0 };
+                    } else {
+                        match view.look(cursor) {
+                            Look::Sample(record) => return Ok(Some(record)),
+                            Look::Lapped => {}
+                            Look::Corrupt(what) => return Err(Obstacle::Corrupt(what)),
+                        }
+                    }
+                    self.count(head)?;
+                }
+                State::Ahead | State::Gone => {
+                    let wrong = view.stands(cursor);
+                    self.count(0)?;
+                    if wrong && self.cursor == cursor {
+                        let what = "a descriptor that stands carries another position";
+                        return Err(Obstacle::Corrupt(what));
+                    }
+                }
+            }
         }
-        Ok(Some(record))
+        Ok(None)
+    }
+
+    /// Counts what is skipped and what is lost, by what the head, which is at least `least`, and
+    /// the tail say.
+    fn count(&mut self, least: u64) -> Result<(), Obstacle> {
+        let (tail, head) = ring::bounds(self.attachment.ring()).map_err(Obstacle::Corrupt)?;
+        let head = head.max(least);
+        // A sample may be taken by its stamp before the head says so.
+        if head + 1 < self.cursor {
+            return Err(Obstacle::Corrupt("its head went back"));
+        }
+        self.seen = head;
+        let unread = head.saturating_sub(self.cursor);
+        if unread > self.reads.depth {
+            self.skipped += unread - self.reads.depth;
+            self.advance(head - self.reads.depth);
+        }
+        if self.cursor < tail {
+            self.lost += tail - self.cursor;
+            self.advance(tail);
+        }
+        Ok(())
+    }
+
+    /// Where the descriptors are that the ring's word speaks of.
+    fn resolve(&self, word: u64) -> Result<Descriptors, Obstacle> {
+        let wrong = Obstacle::Corrupt("its descriptors are nowhere");
+        let Some(Array { at, descriptors }) = Array::from_word(word) else { return Err(wrong) };
+        let map = match self.reads.peer.find(at.segment) {
+            Found::Map(map) => map,
+            Found::Refused => return Err(wrong),
+            Found::Absent => return Err(Obstacle::Missing(at.segment)),
+        };
+        match at.words(descriptors * layout::DESCRIPTOR, map.words().len()) {
+            Some(words) => Ok(Descriptors { word, map, words }),
+            None => Err(wrong),
+        }
+    }
+
+    /// As [`find`](Self::find), and where its bytes are; without what is longer than the
+    /// subscription expects.
+    fn find_whole(&mut self) -> Result<Option<(Record, Bytes)>, TakeError> {
+        for _ in 0..ATTEMPTS {
+            let Some(record) = self.find()? else { return Ok(None) };
+            let (len, max) = (u64::from(record.len), self.reads.max_message);
+            if len > max {
+                self.lose();
+                return Err(TakeError::TooLarge { writer: self.reads.writer, len, max });
+            }
+            match self.locate(&record) {
+                Ok(bytes) => {
+                    self.missing = None;
+                    return Ok(Some((record, bytes)));
+                }
+                Err(Obstacle::Missing(segment)) => {
+                    if !self.lacks(segment) {
+                        return Ok(None);
+                    }
+                    self.lose();
+                }
+                Err(Obstacle::Corrupt(what)) => return Err(self.corrupt(what)),
+            }
+        }
+        Ok(None)
+    }
+
+    /// Where the bytes of a record that stood are.
+    fn locate(&mut self, record: &Record) -> Result<Bytes, Obstacle> {
+        let (at, slot) = match record.place {
+            Place::Inline => return Ok(Bytes::Inline),
+            Place::Block(at) => (at, false),
+            Place::Slot(at) => (at, true),
+        };
+        let len = u64::from(record.len);
+        if slot != (len > COPIED) {
+            return Err(Obstacle::Corrupt("a sample is in the wrong kind of place"));
+        }
+        let known = self.maps.iter().find(|(number, _)| *number == at.segment);
+        let map = match known.and_then(|(_, map)| map.upgrade()) {
+            Some(map) => map,
+            None => match self.reads.peer.find(at.segment) {
+                Found::Map(map) => {
+                    // Few are in use at a time, and one that is not here is found again.
+                    self.maps.retain(|(number, _)| *number != at.segment);
+                    if self.maps.len() >= KNOWN {
+                        self.maps.remove(0);
+                    }
+                    self.maps.push((at.segment, Arc::downgrade(&map)));
+                    map
+                }
+                Found::Refused => {
+                    return Err(Obstacle::Corrupt("a sample is in memory that was refused"));
+                }
+                Found::Absent => return Err(Obstacle::Missing(at.segment)),
+            },
+        };
+        match at.words(len, map.words().len()) {
+            Some(words) if slot => Ok(Bytes::Slot(map, words)),
+            Some(words) => Ok(Bytes::Block(map, words)),
+            None => Err(Obstacle::Corrupt("a sample lies outside its segment")),
+        }
     }
 
     /// Copies the payload at the cursor; false when the publisher was faster.
-    fn copy_out(&self, record: &Record, out: &mut Vec<u8>) -> Result<bool, TakeError> {
-        let Attachment { geometry, .. } = &*self.attachment;
-        let words = self.attachment.words();
-        let data =
-            ring::data(words, geometry, self.cursor, record).ok_or_else(|| self.outside())?;
+    fn copy_out(
+        &self,
+        record: &Record,
+        bytes: &Bytes,
+        out: &mut Vec<u8>,
+    ) -> Result<bool, TakeError> {
         let len = record.len as usize;
-        let mut copy =
-            || ring::copy_out(data, len, out).map_err(|_| TakeError::NoMemory { len: len as u64 });
-        if len as u64 > COPIED {
-            return self
-                .attachment
-                .while_pinned(self.cursor, copy)
-                .transpose()
-                .map(|c| c.is_some());
+        let Some(descriptors) = &self.descriptors else { return Ok(false) };
+        let view = descriptors.view(&self.attachment);
+        let mut copy = |words: &[AtomicU64]| {
+            ring::copy_out(words, len, out).map_err(|_| TakeError::NoMemory { len: len as u64 })
+        };
+        match bytes {
+            Bytes::Inline => copy(view.inline(self.cursor))?,
+            Bytes::Block(map, words) => copy(&map.words()[words.clone()])?,
+            Bytes::Slot(map, words) => {
+                let copy = || copy(&map.words()[words.clone()]);
+                let pinned = self.attachment.while_pinned(self.cursor, copy);
+                return pinned.transpose().map(|copied| copied.is_some());
+            }
         }
-        copy()?;
-        Ok(ring::stands(words, geometry, self.cursor))
+        Ok(view.stands(self.cursor))
+    }
+
+    /// Notes that `segment` has not come, and has it asked for now and then. True when it never
+    /// will.
+    fn lacks(&mut self, segment: u32) -> bool {
+        let now = Instant::now();
+        match &mut self.missing {
+            Some(missing) if missing.segment == segment => {
+                let missing = *missing;
+                if self.is_over(&missing) {
+                    self.missing = None;
+                    return true;
+                }
+                if now.duration_since(missing.asked) < MISSING {
+                    return false;
+                }
+                self.missing = Some(Missing { asked: now, ..missing });
+            }
+            _ => self.missing = Some(Missing { segment, since: now, asked: now }),
+        }
+        if let Some(session) = self.reads.peer.remote() {
+            session.want(segment);
+        }
+        false
+    }
+
+    /// Whether a segment that has not come will not come any more.
+    fn is_over(&self, missing: &Missing) -> bool {
+        missing.since.elapsed() >= MISSING && self.writer_dead()
+    }
+
+    /// All that is published is lost.
+    fn give_all_up(&mut self) -> Result<(), &'static str> {
+        let (_, head) = ring::bounds(self.attachment.ring())?;
+        self.lost += head.saturating_sub(self.cursor);
+        self.advance(head.max(self.cursor));
+        Ok(())
+    }
+
+    /// The sample at the cursor is lost.
+    fn lose(&mut self) {
+        self.lost += 1;
+        self.advance(self.cursor + 1);
+    }
+
+    /// Takes samples of up to `max` bytes from now on.
+    #[cfg(test)]
+    pub(super) fn expect(&mut self, max: u64) {
+        self.reads.max_message = max;
+    }
+
+    fn corrupt(&mut self, what: &'static str) -> TakeError {
+        self.corrupt = Some(what);
+        TakeError::Corrupt { writer: self.reads.writer, what }
     }
 
     /// The sample at the cursor is the caller's.
@@ -315,11 +600,16 @@ impl Reader {
             self.reads.peer.ring_if(Purpose::Room);
         }
     }
+}
 
-    fn outside(&self) -> TakeError {
-        let what = "a sample lies outside the payload area";
-        TakeError::Corrupt { writer: self.reads.writer, what }
-    }
+/// Where a sample's bytes are.
+enum Bytes {
+    /// In its descriptor.
+    Inline,
+    /// To be copied, and checked afterwards.
+    Block(Arc<Map>, Range<usize>),
+    /// To be pinned.
+    Slot(Arc<Map>, Range<usize>),
 }
 
 impl Drop for Reader {

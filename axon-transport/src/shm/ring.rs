@@ -1,75 +1,58 @@
 //! The ring's protocol over plain words: what a publisher stores and what a reader believes.
 //!
+//! A descriptor's stamp says which position stands in it; whoever sees the stamp sees the sample,
+//! so that one who waits for the next sample looks at one line. The head says the same of all
+//! below it, to those that have fallen behind.
+//!
 //! A reader copies first and checks afterwards, except for large samples, which it
 //! [pins](super::pins). The publisher raises the tail above a position before it reuses that
-//! position's slot or payload; a reader that finds the tail still at or below its position after
-//! the copy has copied what was published. The head orders all that a sample consists of; a slot's
-//! stamp only tells a scribbled ring from an honest one.
+//! position's descriptor or block; a reader that finds the tail still at or below its position
+//! after the copy has copied what was published. In the same way it finds out that the descriptors
+//! have moved to a larger array, and the memory of the old one has gone to others.
 
 use std::ops::Range;
 
-use super::sync::{Ordering, Site, Word, fence_at};
+use super::{
+    layout::{
+        DESCRIPTOR_WORDS, Location, halves,
+        ring::{ARRAY, HEAD, TAIL},
+    },
+    sync::{Ordering, Site, Word, fence_at},
+};
 
-/// Words of a slot.
-pub(super) const SLOT_WORDS: usize = 16;
 const STAMP: usize = 0;
 const SEQUENCE: usize = 1;
 const TIMESTAMP: usize = 2;
-const LENGTH: usize = 3;
+/// Length in bytes, and in what kind of place of which segment.
+const PLACE: usize = 3;
 const DATA: usize = 4;
-const FLAG_INLINE: u32 = 1;
-const INLINE_WORDS: usize = SLOT_WORDS - DATA;
+const INLINE_WORDS: usize = DESCRIPTOR_WORDS - DATA;
 
 /// No ring gets this far; a head beyond it was scribbled.
-const MAX_POSITION: u64 = 1 << 62;
-
-/// Where things are, as indices of words.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Geometry {
-    pub(super) head: usize,
-    pub(super) tail: usize,
-    pub(super) slots: usize,
-    /// Number of slots, less one.
-    pub(super) mask: u64,
-    pub(super) payload: usize,
-    pub(super) payload_words: usize,
-}
-
-impl Geometry {
-    fn slot<'a, W>(&self, words: &'a [W], position: u64) -> &'a [W] {
-        let start = self.slots + (position & self.mask) as usize * SLOT_WORDS;
-        &words[start..start + SLOT_WORDS]
-    }
-
-    /// The words of `len` bytes at `offset` bytes of the payload area, if they are inside it.
-    pub(super) fn payload<'a, W>(&self, words: &'a [W], offset: u64, len: u64) -> Option<&'a [W]> {
-        words.get(self.range(offset, len)?)
-    }
-
-    /// Where the words of a record that is not in its slot are, if they are inside the area.
-    pub(super) fn placed<W>(&self, words: &[W], record: &Record) -> Option<Range<usize>> {
-        let Place::At(offset) = record.place else { return None };
-        self.range(offset, u64::from(record.len)).filter(|range| range.end <= words.len())
-    }
-
-    fn range(&self, offset: u64, len: u64) -> Option<Range<usize>> {
-        let start = usize::try_from(offset / 8).ok()?;
-        let count = usize::try_from(len.div_ceil(8)).ok()?;
-        let end = start.checked_add(count).filter(|end| *end <= self.payload_words)?;
-        Some(self.payload.checked_add(start)?..self.payload.checked_add(end)?)
-    }
-}
+pub(super) const MAX_POSITION: u64 = 1 << 62;
 
 /// Where a sample's bytes are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Place {
-    /// In the slot.
+    /// In the descriptor.
     Inline,
-    /// At this offset of the payload area, in bytes.
-    At(u64),
+    /// In memory that is written over as soon as the sample is given up.
+    Block(Location),
+    /// In memory that stays as it is while it is pinned.
+    Slot(Location),
 }
 
-/// What a slot says of its sample.
+impl Place {
+    fn word(self) -> (u32, u64) {
+        match self {
+            Self::Inline => (0, 0),
+            Self::Block(at) => (1 | at.segment << 8, at.offset),
+            Self::Slot(at) => (2 | at.segment << 8, at.offset),
+        }
+    }
+}
+
+/// What a descriptor says of its sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Record {
     pub(super) sequence: u64,
@@ -78,120 +61,176 @@ pub(super) struct Record {
     pub(super) place: Place,
 }
 
-/// Publisher: positions below `tail` are about to be reused.
-pub(super) fn retire<W: Word>(words: &[W], g: &Geometry, tail: u64) {
-    // Pairs with `bounds`: a reader that sees this tail sees a head at least as high.
-    words[g.tail].store(tail, Site::TailStore.order());
+fn descriptor<W>(array: &[W], position: u64) -> &[W] {
+    &array[words_of(array.len(), position)]
 }
 
-/// Publisher: stores to slots or payload follow on this thread. Whoever sees one of them sees the
-/// tail that was retired before, by this thread or one that this thread synchronized with.
+/// The words of a position's descriptor in an array of `len` words.
+fn words_of(len: usize, position: u64) -> Range<usize> {
+    let mask = (len / DESCRIPTOR_WORDS) as u64 - 1;
+    let start = (position & mask) as usize * DESCRIPTOR_WORDS;
+    start..start + DESCRIPTOR_WORDS
+}
+
+/// Publisher: positions below `tail` are about to be reused.
+pub(super) fn retire<W: Word>(ring: &[W], tail: u64) {
+    // Pairs with `bounds`: a reader that sees this tail sees a head at least as high.
+    ring[TAIL].store(tail, Site::TailStore.order());
+}
+
+/// Publisher: stores to descriptors, blocks or whatever else the heap gave out follow on this
+/// thread. Whoever sees one of them sees the tail that was retired, and the array that was
+/// replaced before, by this thread or one that this thread synchronized with.
 #[inline]
 pub(super) fn about_to_write<W: Word>() {
     // Pairs with the acquire fence of `stands`.
     fence_at::<W>(Site::ReuseFence);
 }
 
-/// Publisher: makes `position` visible, after [`about_to_write`]. A sample outside the slot has
-/// been copied in already.
+/// Publisher: makes `position` visible, after [`about_to_write`]. A sample outside the descriptor
+/// has been copied in already.
 pub(super) fn publish<W: Word>(
-    words: &[W],
-    g: &Geometry,
+    ring: &[W],
+    array: &[W],
     position: u64,
     record: &Record,
     inline: &[u8],
 ) {
-    let slot = g.slot(words, position);
-    slot[STAMP].store(2 * position + 1, Ordering::Relaxed);
+    let slot = descriptor(array, position);
     slot[SEQUENCE].store(record.sequence, Ordering::Relaxed);
     slot[TIMESTAMP].store(record.timestamp.cast_unsigned(), Ordering::Relaxed);
-    let flags = match record.place {
-        Place::Inline => {
-            copy_in(&slot[DATA..], inline);
-            FLAG_INLINE
+    let (place, offset) = record.place.word();
+    slot[PLACE].store(u64::from(record.len) | u64::from(place) << 32, Ordering::Relaxed);
+    match record.place {
+        Place::Inline => copy_in(&slot[DATA..], inline),
+        Place::Block(_) | Place::Slot(_) => slot[DATA].store(offset, Ordering::Relaxed),
+    }
+    // Pairs with `state`: whoever sees the stamp sees the sample.
+    slot[STAMP].store(2 * position + 2, Site::StampStore.order());
+    // Pairs with `bounds`: whoever sees the head sees the stamp.
+    ring[HEAD].store(position + 1, Site::HeadStore.order());
+}
+
+/// Publisher: fills a new array with what stands, from `tail` up to `head`, in the old one. After
+/// [`about_to_write`]; [`replace`] follows.
+pub(super) fn copy_descriptors<W: Word>(old: &[W], new: &[W], tail: u64, head: u64) {
+    let descriptors = (new.len() / DESCRIPTOR_WORDS) as u64;
+    // As if each had been used last time round: a reader that asks for a position that was given
+    // up must find that it is late, and one that asks for the next must wait.
+    for next in head..head + descriptors {
+        let stamp = next.checked_sub(descriptors).map_or(0, |last| 2 * last + 2);
+        descriptor(new, next)[STAMP].store(stamp, Ordering::Relaxed);
+    }
+    for position in tail..head {
+        for (to, from) in descriptor(new, position).iter().zip(descriptor(old, position)) {
+            to.store(from.load(Ordering::Relaxed), Ordering::Relaxed);
         }
-        Place::At(offset) => {
-            slot[DATA].store(offset, Ordering::Relaxed);
-            0
-        }
-    };
-    slot[LENGTH].store(u64::from(record.len) | u64::from(flags) << 32, Ordering::Relaxed);
-    slot[STAMP].store(2 * position + 2, Ordering::Relaxed);
-    // Pairs with `bounds`: whoever sees the head sees the sample.
-    words[g.head].store(position + 1, Site::HeadStore.order());
+    }
+}
+
+/// Publisher: from now on the descriptors are in another array. The old one may be used for
+/// something else, after [`about_to_write`].
+pub(super) fn replace<W: Word>(ring: &[W], array: u64) {
+    // Pairs with `array`: whoever sees it sees the descriptors there.
+    ring[ARRAY].store(array, Site::ArrayStore.order());
+}
+
+/// Reader: the word that says where the descriptors are.
+#[inline]
+pub(super) fn array<W: Word>(ring: &[W]) -> u64 {
+    // Pairs with `replace`.
+    ring[ARRAY].load(Site::ArrayLoad.order())
 }
 
 /// Reader: the oldest position that stands and the next position to come.
-pub(super) fn bounds<W: Word>(words: &[W], g: &Geometry) -> Result<(u64, u64), &'static str> {
+pub(super) fn bounds<W: Word>(ring: &[W]) -> Result<(u64, u64), &'static str> {
     // In this order: a tail is never above the head that a later load sees.
-    let tail = words[g.tail].load(Site::TailLoad.order());
-    let head = words[g.head].load(Site::HeadLoad.order());
+    let tail = ring[TAIL].load(Site::TailLoad.order());
+    let head = ring[HEAD].load(Site::HeadLoad.order());
     if tail > head || head > MAX_POSITION {
         return Err("its head and tail make no sense");
     }
     Ok((tail, head))
 }
 
+/// Reader: how a position's descriptor looks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum State {
+    /// The position is not published yet.
+    Ahead,
+    /// It stands, or has just been given up.
+    Here,
+    /// A later one has its place.
+    Gone,
+}
+
 /// Reader: what a look at a published position gave.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Look {
     Sample(Record),
-    /// The publisher has reused the slot: look at the tail again.
+    /// The publisher has reused the descriptor: look at the tail again.
     Lapped,
     Corrupt(&'static str),
 }
 
-/// Reader: the record at `position`, which is below the head. Good only if [`stands`] afterwards.
-pub(super) fn look<W: Word>(words: &[W], g: &Geometry, position: u64) -> Look {
-    let slot = g.slot(words, position);
-    if slot[STAMP].load(Ordering::Relaxed) != 2 * position + 2 {
-        return if stands(words, g, position) {
-            Look::Corrupt("a slot that stands carries another position")
-        } else {
-            Look::Lapped
+/// A ring as a reader sees it.
+pub(super) struct View<'a, W> {
+    /// Its header.
+    pub(super) ring: &'a [W],
+    /// What [`array`] said, and the descriptors there.
+    pub(super) word: u64,
+    pub(super) array: &'a [W],
+}
+
+impl<'a, W: Word> View<'a, W> {
+    #[inline]
+    pub(super) fn state(&self, position: u64) -> State {
+        let stamp = descriptor(self.array, position)[STAMP].load(Site::StampLoad.order());
+        // Pairs with `publish`.
+        match stamp.cmp(&(2 * position + 2)) {
+            std::cmp::Ordering::Less => State::Ahead,
+            std::cmp::Ordering::Equal => State::Here,
+            std::cmp::Ordering::Greater => State::Gone,
+        }
+    }
+
+    /// The record at `position`, whose descriptor is [here](State::Here). Where its bytes are has
+    /// not been checked.
+    pub(super) fn look(&self, position: u64) -> Look {
+        let slot = descriptor(self.array, position);
+        let sequence = slot[SEQUENCE].load(Ordering::Relaxed);
+        let timestamp = slot[TIMESTAMP].load(Ordering::Relaxed).cast_signed();
+        let (len, place) = halves(slot[PLACE].load(Ordering::Relaxed));
+        let offset = slot[DATA].load(Ordering::Relaxed);
+        if !self.stands(position) {
+            return Look::Lapped;
+        }
+        let at = Location { segment: place >> 8, offset };
+        let place = match place & 0xff {
+            0 if len as usize > INLINE_WORDS * 8 => {
+                return Look::Corrupt("a sample in a descriptor is longer than that");
+            }
+            0 => Place::Inline,
+            1 => Place::Block(at),
+            2 => Place::Slot(at),
+            _ => return Look::Corrupt("a sample is in no known kind of place"),
         };
+        Look::Sample(Record { sequence, timestamp, len, place })
     }
-    let sequence = slot[SEQUENCE].load(Ordering::Relaxed);
-    let timestamp = slot[TIMESTAMP].load(Ordering::Relaxed).cast_signed();
-    let length = slot[LENGTH].load(Ordering::Relaxed);
-    let offset = slot[DATA].load(Ordering::Relaxed);
-    if !stands(words, g, position) {
-        return Look::Lapped;
-    }
-    let (len, flags) = super::layout::halves(length);
-    let place = if flags & FLAG_INLINE != 0 {
-        if len as usize > INLINE_WORDS * 8 {
-            return Look::Corrupt("a sample in a slot is longer than the slot");
-        }
-        Place::Inline
-    } else {
-        if !offset.is_multiple_of(8) || g.payload(words, offset, u64::from(len)).is_none() {
-            return Look::Corrupt("a sample lies outside the payload area");
-        }
-        Place::At(offset)
-    };
-    Look::Sample(Record { sequence, timestamp, len, place })
-}
 
-/// Reader: the words of a record at `position`.
-pub(super) fn data<'a, W>(
-    words: &'a [W],
-    g: &Geometry,
-    position: u64,
-    record: &Record,
-) -> Option<&'a [W]> {
-    match record.place {
-        Place::Inline => g.slot(words, position).get(DATA..),
-        Place::At(offset) => g.payload(words, offset, u64::from(record.len)),
+    /// The words of a sample that is in its descriptor.
+    pub(super) fn inline(&self, position: u64) -> &'a [W] {
+        &descriptor(self.array, position)[DATA..]
     }
-}
 
-/// Reader: whether all that was loaded of `position` so far is what was published.
-pub(super) fn stands<W: Word>(words: &[W], g: &Geometry, position: u64) -> bool {
-    // Pairs with the release fence of `about_to_write`: had one of the loads before seen a reuse, the
-    // load after sees the tail that was stored ahead of it.
-    fence_at::<W>(Site::StandsFence);
-    words[g.tail].load(Ordering::Relaxed) <= position
+    /// Whether all that was loaded of `position` so far is what was published.
+    pub(super) fn stands(&self, position: u64) -> bool {
+        // Pairs with the release fence of `about_to_write`: had one of the loads before seen a
+        // reuse, the loads after see the tail and the array that were stored ahead of it.
+        fence_at::<W>(Site::StandsFence);
+        self.ring[TAIL].load(Ordering::Relaxed) <= position
+            && self.ring[ARRAY].load(Ordering::Relaxed) == self.word
+    }
 }
 
 /// Copies `bytes` into words; the last is filled up with zeros.

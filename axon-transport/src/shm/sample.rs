@@ -6,10 +6,10 @@ use std::{
     io::{self, Read, Seek, SeekFrom},
     ops::Range,
     slice,
-    sync::atomic::AtomicU64,
+    sync::{Arc, atomic::AtomicU64},
 };
 
-use super::{Meta, Taken, attachment::Pin, ring};
+use super::{Meta, Taken, attachment::Pin, memory::Map, ring};
 
 /// A sample, in the publisher's memory where it is longer than 4 KiB, else in a copy.
 ///
@@ -31,7 +31,7 @@ pub struct Sample {
 
 enum Data {
     Copied(Vec<u8>),
-    Pinned { words: Range<usize>, pin: Pin },
+    Pinned { map: Arc<Map>, words: Range<usize>, pin: Pin },
 }
 
 impl Sample {
@@ -40,10 +40,15 @@ impl Sample {
         Self { taken, len: bytes.len(), data: Data::Copied(bytes) }
     }
 
-    /// `len` bytes in the `words` of the map of what `pin` pins, which hold as many.
-    pub(super) fn pinned(taken: Taken, len: usize, words: Range<usize>, pin: Pin) -> Self {
-        debug_assert!(len <= words.len() * 8);
-        Self { taken, len, data: Data::Pinned { words, pin } }
+    /// `len` bytes in these words of `map`, which hold as many and which `pin` pins.
+    pub(super) fn pinned(
+        taken: Taken,
+        len: usize,
+        (map, words): (Arc<Map>, Range<usize>),
+        pin: Pin,
+    ) -> Self {
+        debug_assert!(len <= words.len() * 8 && words.end <= map.words().len());
+        Self { taken, len, data: Data::Pinned { map, words, pin } }
     }
 
     /// What goes with it.
@@ -136,7 +141,7 @@ impl Sample {
     fn words(&self) -> &[AtomicU64] {
         match &self.data {
             Data::Copied(_) => &[],
-            Data::Pinned { words, pin } => &pin.attachment().words()[words.clone()],
+            Data::Pinned { map, words, .. } => &map.words()[words.clone()],
         }
     }
 }

@@ -1,16 +1,16 @@
 //! The lanes that may pin samples of a ring, whether or not their readers still count for anything
 //! else.
 
-use std::sync::atomic::AtomicU64;
+use std::sync::{Arc, atomic::AtomicU64};
 
 use super::{
-    Peer,
-    lane::{Standing, Tenancy},
-    layout::LANE_WORDS,
+    Peer, PeerSession,
+    lane::{LaneView, Standing, Tenancy},
+    layout::{LANE_WORDS, Location},
     pins,
     sync::Word,
 };
-use crate::ids::Gid;
+use crate::ids::{Gid, SessionId};
 
 /// Adds to `found` the positions that a reader pins, and says how it stands. After
 /// [`pins::about_to_scan`].
@@ -27,14 +27,21 @@ pub(super) fn scan<W: Word>(tenancy: &Tenancy, lane: &[W], found: &mut Vec<u64>)
 /// One reader's lane, as its publisher knows it.
 pub(super) struct Seat {
     reader: Gid,
-    peer: Peer,
-    lane: u32,
+    session: SessionId,
+    /// Absent where the session is our own.
+    peer: Option<Arc<PeerSession>>,
+    at: Location,
+    lane: LaneView,
     pub(super) tenancy: Tenancy,
 }
 
 impl Seat {
     fn words(&self) -> &[AtomicU64; LANE_WORDS] {
-        self.peer.lane_words(self.lane)
+        self.lane.words()
+    }
+
+    fn is_dead(&self) -> bool {
+        self.peer.as_ref().is_some_and(|peer| peer.is_dead())
     }
 
     #[inline]
@@ -49,17 +56,26 @@ impl Seat {
 pub(super) struct Seats(Vec<Seat>);
 
 impl Seats {
-    /// Takes in the reader that asks with `lane` of `peer`, before it hears of its grant. As long
-    /// as the lane stays as it is, the answer does, so that whoever asks for ever adds nothing.
-    pub(super) fn admit(&mut self, reader: Gid, peer: &Peer, lane: u32) -> Tenancy {
+    /// Takes in the reader that asks with the lane that `peer` has `at` some place, before it hears
+    /// of its grant. As long as the lane stays as it is, the answer does, so that whoever asks for
+    /// ever adds nothing.
+    pub(super) fn admit(
+        &mut self,
+        reader: Gid,
+        peer: &Peer,
+        at: Location,
+        lane: &LaneView,
+    ) -> Tenancy {
+        let session = peer.id();
         let same = |seat: &&Seat| {
-            seat.peer.id() == peer.id() && seat.lane == lane && seat.tenancy.is_asked(seat.words())
+            seat.session == session && seat.at == at && seat.tenancy.is_asked(seat.words())
         };
         if let Some(seat) = self.0.iter().find(same) {
             return seat.tenancy;
         }
-        let tenancy = Tenancy::grant(peer.lane_words(lane));
-        self.0.push(Seat { reader, peer: peer.clone(), lane, tenancy });
+        let tenancy = Tenancy::grant(lane.words());
+        let peer = peer.remote().cloned();
+        self.0.push(Seat { reader, session, peer, at, lane: lane.clone(), tenancy });
         tenancy
     }
 
@@ -81,10 +97,13 @@ impl Seats {
     /// there were any.
     pub(super) fn sweep(&mut self, suspect: impl Fn(&Seat) -> bool) -> bool {
         let before = self.0.len();
-        self.0.retain(|seat| {
-            seat.standing() != Standing::Left && !(suspect(seat) && seat.peer.is_dead())
-        });
+        self.0
+            .retain(|seat| seat.standing() != Standing::Left && !(suspect(seat) && seat.is_dead()));
         self.0.len() != before
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.0.is_empty()
     }
 
     #[cfg(test)]

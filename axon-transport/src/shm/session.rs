@@ -1,16 +1,27 @@
-//! This process's own session segment: the lanes of its readers and the words that say who sleeps.
+//! This process's own session: its memory and what is in it, the words that say who sleeps, and by
+//! what others know it.
 
 use std::{
     os::fd::{AsFd, BorrowedFd, OwnedFd},
-    sync::{Arc, Mutex, PoisonError, atomic::AtomicU64},
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicU64, Ordering},
+    },
     time::Duration,
 };
 
 use rustix::process::{PidfdFlags, getpid, pidfd_open};
 
-use super::{Lane, PeerDescriptors, ShmError, layout, memory::Segment};
+use super::{
+    Lane, PeerDescriptors, SegmentEvent, SegmentInfo, ShmError,
+    heap::{Block, Heap, Need, Object},
+    layout::{self, SegmentKind},
+    memory::Map,
+    orphans::{Orphan, Orphans},
+    segments::{OwnSegment, Segments},
+};
 use crate::{
-    ids::SessionId,
+    ids::{Gid, SessionId},
     passed::PassedFd,
     wait::{Doorbell, ExternalLeader, Look, Purpose, due},
 };
@@ -20,7 +31,11 @@ use crate::{
 /// One per session; a process may have several. All methods may be called from any thread.
 pub struct SessionSegment {
     id: SessionId,
-    segment: Segment,
+    /// The first of the segments.
+    first: Arc<OwnSegment>,
+    segments: Segments,
+    heap: Heap,
+    orphans: Orphans,
     doorbell: Doorbell,
     pidfd: OwnedFd,
     lanes: Mutex<Lanes>,
@@ -28,38 +43,36 @@ pub struct SessionSegment {
     rung: [AtomicU64; 2],
 }
 
+#[derive(Default)]
 struct Lanes {
-    free: Vec<u32>,
-    /// Lanes from here on have never been used.
-    fresh: u32,
-    /// How many have been given out.
+    /// Those that nobody uses. Their memory never becomes something else: who looks at a lane that
+    /// has passed on must see that it has.
+    free: Vec<Object>,
+    /// How many there are.
+    made: u32,
+    /// How often one has been given out.
     given: u64,
-    /// Bytes of the segment that are backed by memory.
-    committed: u64,
 }
 
 impl SessionSegment {
-    /// Makes the segment of a new session.
+    /// Makes the memory of a new session.
     ///
     /// # Errors
     /// The system has no memory or descriptors left, or lacks sealed memfds or pidfds (Linux 5.3).
     pub fn create(id: SessionId) -> Result<Arc<Self>, ShmError> {
-        let segment = Segment::create("axon-session", layout::session_bytes())?;
-        segment.commit(0, layout::ALIGN)?;
-        layout::write_session(segment.words(), id);
+        let segments = Segments::new(id);
+        let first = segments.open(SegmentKind::Session, layout::SESSION_BYTES)?;
         let pidfd = pidfd_open(getpid(), PidfdFlags::empty())
             .map_err(ShmError::system("opening a pidfd of this process"))?;
         Ok(Arc::new(Self {
             id,
-            segment,
+            heap: Heap::new(Arc::clone(&first)),
+            first,
+            segments,
+            orphans: Orphans::default(),
             doorbell: Doorbell::new().map_err(ShmError::system("creating a doorbell"))?,
             pidfd,
-            lanes: Mutex::new(Lanes {
-                free: Vec::new(),
-                fresh: 0,
-                given: 0,
-                committed: layout::ALIGN,
-            }),
+            lanes: Mutex::default(),
             rung: Default::default(),
         }))
     }
@@ -80,7 +93,7 @@ impl SessionSegment {
                 .map_err(|source| ShmError::System { what: "duplicating a descriptor", source })
         };
         Ok(PeerDescriptors {
-            segment: clone(self.segment.fd())?,
+            segment: self.first.descriptor()?.into(),
             doorbell: clone(self.doorbell.bell().as_fd())?,
             pidfd: clone(self.pidfd.as_fd())?,
         })
@@ -91,32 +104,62 @@ impl SessionSegment {
         self.doorbell.as_fd()
     }
 
+    /// Has `listener` hear of all further segments of this session: other sessions must be told of
+    /// them, and given their descriptors. False when there is a listener already.
+    ///
+    /// It is called while locks are held: it must neither block nor call into this session.
+    pub fn on_segment(&self, listener: impl Fn(SegmentEvent<'_>) + Send + Sync + 'static) -> bool {
+        self.segments.listen(Box::new(listener))
+    }
+
+    /// The segments that there are besides the first, by their numbers.
+    pub fn segments(&self) -> Vec<SegmentInfo> {
+        self.segments.further().iter().map(|segment| segment.info).collect()
+    }
+
+    /// What the segment `number` is and a duplicate of its descriptor; `None` when it is gone.
+    ///
+    /// # Errors
+    /// The process has no descriptors left.
+    pub fn segment(&self, number: u32) -> Result<Option<(SegmentInfo, OwnedFd)>, ShmError> {
+        self.segments
+            .get(number)
+            .map(|segment| Ok((segment.info, segment.descriptor()?)))
+            .transpose()
+    }
+
+    /// Takes back the memory of publishers that are gone and that nobody reads any more.
+    pub fn tidy(&self) {
+        if !self.is_forked() {
+            self.orphans.sweep(&self.heap, &self.segments);
+        }
+    }
+
     /// A lane for a reader that is about to attach.
     ///
     /// # Errors
     /// All lanes are taken, or memory is short.
     pub fn allocate_lane(self: &Arc<Self>) -> Result<Lane, ShmError> {
-        if self.segment.is_forked() {
+        if self.is_forked() {
             return Err(ShmError::Forked);
         }
         let mut lanes = self.lanes.lock().unwrap_or_else(PoisonError::into_inner);
+        let object = match lanes.free.pop() {
+            Some(object) => object,
+            None if lanes.made == layout::LANES => {
+                return Err(ShmError::NoLane { session: self.id, lanes: layout::LANES });
+            }
+            None => {
+                // A publisher is told of the segment with the lane.
+                let object = self.allocate(layout::LANE, Need::Now, |_| true)?;
+                let object = object.expect("there is always one that will do");
+                object.words().iter().for_each(|word| word.store(0, Ordering::Relaxed));
+                lanes.made += 1;
+                object
+            }
+        };
         lanes.given += 1;
-        let number = lanes.given;
-        if let Some(index) = lanes.free.pop() {
-            return Ok(Lane::new(Arc::clone(self), index, number));
-        }
-        let index = lanes.fresh;
-        if index == layout::LANES {
-            return Err(ShmError::NoLane { session: self.id, lanes: layout::LANES });
-        }
-        let end = layout::lane_end(index);
-        if end > lanes.committed {
-            let upto = end.next_multiple_of(layout::ALIGN);
-            self.segment.commit(lanes.committed, upto)?;
-            lanes.committed = upto;
-        }
-        lanes.fresh += 1;
-        Ok(Lane::new(Arc::clone(self), index, number))
+        Ok(Lane::new(Arc::clone(self), object, lanes.given))
     }
 
     /// Blocks until `ready`, which is asked again whenever a publisher or [`Self::notify`] rang,
@@ -124,7 +167,7 @@ impl SessionSegment {
     ///
     /// Any number of threads may wait; none of our locks is held while `ready` runs.
     pub fn wait(&self, mut ready: impl FnMut() -> bool, timeout: Option<Duration>) -> bool {
-        if self.segment.is_forked() {
+        if self.is_forked() {
             return ready();
         }
         self.doorbell.wait(self.armed_words(), Purpose::Samples, ready, None, &[], timeout)
@@ -133,7 +176,7 @@ impl SessionSegment {
     /// As [`wait`](Self::wait), for something that other threads can look for too: this one is
     /// woken only when it is there.
     pub(crate) fn wait_for(&self, look: Arc<dyn Look>, timeout: Option<Duration>) -> bool {
-        if self.segment.is_forked() {
+        if self.is_forked() {
             return look.ready();
         }
         let (words, ready) = (self.armed_words(), || look.ready());
@@ -142,7 +185,7 @@ impl SessionSegment {
 
     /// Makes every waiter of this session look again.
     pub fn notify(&self) {
-        if !self.segment.is_forked() {
+        if !self.is_forked() {
             self.doorbell.notify();
         }
     }
@@ -152,7 +195,7 @@ impl SessionSegment {
     /// # Errors
     /// There is one already, or this process is a fork of the session's.
     pub fn external_leader(self: &Arc<Self>) -> Result<ExternalLeader, ShmError> {
-        if self.segment.is_forked() {
+        if self.is_forked() {
             return Err(ShmError::Forked);
         }
         ExternalLeader::new(Arc::clone(self)).ok_or(ShmError::AlreadyLed(self.id))
@@ -174,7 +217,7 @@ impl SessionSegment {
     }
 
     pub(crate) fn armed_word(&self, purpose: Purpose) -> &AtomicU64 {
-        &self.segment.words()[match purpose {
+        &self.first.memory.words()[match purpose {
             Purpose::Samples => layout::session::ARMED,
             Purpose::Room => layout::session::BLOCKED,
         }]
@@ -190,16 +233,44 @@ impl SessionSegment {
         }
     }
 
-    pub(super) fn lane_words(&self, index: u32) -> &[AtomicU64; layout::LANE_WORDS] {
-        layout::lane_words(self.segment.words(), index)
-    }
-
     /// Whether the calling process is a fork of the session's.
     pub(crate) fn is_forked(&self) -> bool {
-        self.segment.is_forked()
+        self.first.memory.is_forked()
     }
 
-    pub(super) fn free_lane(&self, index: u32) {
-        self.lanes.lock().unwrap_or_else(PoisonError::into_inner).free.push(index);
+    pub(super) fn free_lane(&self, lane: Object) {
+        self.lanes.lock().unwrap_or_else(PoisonError::into_inner).free.push(lane);
+    }
+
+    /// [Allocates](Heap::allocate) an object of this session.
+    pub(super) fn allocate(
+        &self,
+        len: u64,
+        need: Need,
+        mapped: impl Fn(u32) -> bool,
+    ) -> Result<Option<Object>, ShmError> {
+        self.heap.allocate(&self.segments, len, need, mapped)
+    }
+
+    pub(super) fn release(&self, block: Block) {
+        self.heap.release(block);
+    }
+
+    /// A segment for the large samples of a publisher.
+    pub(super) fn open_samples(&self, gid: Gid, bytes: u64) -> Result<Arc<OwnSegment>, ShmError> {
+        self.segments.open(SegmentKind::Samples(gid), bytes)
+    }
+
+    /// Keeps what a publisher leaves for as long as somebody reads it.
+    pub(super) fn adopt(&self, orphan: Orphan) {
+        self.orphans.adopt(orphan);
+        self.tidy();
+    }
+
+    pub(super) fn map(&self, number: u32) -> Option<Arc<Map>> {
+        if number == 0 {
+            return Some(Arc::clone(self.first.map()));
+        }
+        self.segments.get(number).map(|segment| Arc::clone(segment.map()))
     }
 }

@@ -2,12 +2,12 @@
 
 use std::{
     fmt,
-    os::fd::AsFd,
+    os::fd::{AsFd, OwnedFd},
     time::{Duration, Instant},
 };
 
 use super::{
-    ConnectError, Context, Grant, Meta, Reader, ReaderOptions, Sample, TakeError,
+    ConnectError, Context, Grant, Meta, Peer, Reader, ReaderOptions, Sample, TakeError,
     connect::{Asked, Channel},
 };
 use crate::{ids::Gid, qos::Qos};
@@ -40,11 +40,15 @@ pub struct Subscriber {
     context: Context,
     reader: Reader,
     gid: Gid,
+    /// Over which memory of the publisher's comes that is in use only later; absent where the
+    /// publisher is in the same context.
+    socket: Option<OwnedFd>,
 }
 
 impl Subscriber {
     /// Asks the publisher that [serves](super::Publisher::serve) at the other end of `socket`, and
-    /// waits for its answer for at most `timeout`. The socket is not needed any more after it.
+    /// waits for its answer for at most `timeout`. Keeps a duplicate of the socket, over which it is
+    /// handed memory that comes into use later.
     ///
     /// # Errors
     /// It did not answer in time, refused, or handed over what cannot be used.
@@ -58,22 +62,32 @@ impl Subscriber {
         let channel = Channel::new(socket.as_fd(), timeout);
         let lane = context.session().allocate_lane()?;
         let gid = context.next_gid();
-        let asked = Asked { session: context.id(), reader: gid, lane: lane.index(), qos };
+        let asked = Asked { session: context.id(), reader: gid, lane: lane.location(), qos };
         channel.ask(&asked, &context.session().descriptors()?)?;
-        let (granted, descriptors, ring) = channel.await_granted(gid)?;
-        let reader = Reader::map(
+        let (granted, descriptors) =
+            channel.await_granted(gid, |handed, fd| context.add_segment(&handed, fd))?;
+        let peer = context.peer(granted.session, descriptors)?;
+        let ring = granted.ring;
+        let mut socket = None;
+        if let Peer::Remote(peer) = &peer {
+            socket = Some(channel.keep()?);
+            // A ring that is not in the first segment: its own follows.
+            while !peer.has_segment(ring.segment) {
+                let (handed, fd) = channel.take_handed()?;
+                context.add_segment(&handed, fd);
+            }
+        }
+        let reader = Reader::map(ReaderOptions {
+            reader: gid,
+            writer: granted.writer,
+            peer,
             ring,
-            ReaderOptions {
-                reader: gid,
-                writer: granted.writer,
-                peer: context.peer(granted.session, descriptors)?,
-                lane,
-                grant: Grant { generation: granted.generation, first: granted.first },
-                qos,
-                max_message,
-            },
-        )?;
-        Ok(Self { context: context.clone(), reader, gid })
+            lane,
+            grant: Grant { generation: granted.generation, first: granted.first },
+            qos,
+            max_message,
+        })?;
+        Ok(Self { context: context.clone(), reader, gid, socket })
     }
 
     /// Its GID.
@@ -92,7 +106,7 @@ impl Subscriber {
     /// # Errors
     /// See [`TakeError`]. After [`TakeError::Corrupt`] there will be no more samples.
     pub fn take(&mut self) -> Result<Option<Sample>, TakeError> {
-        self.reader.take_sample()
+        self.take_with(Reader::take_sample)
     }
 
     /// As [`take`](Self::take), but into `out`, which it replaces: without an allocation where
@@ -101,7 +115,35 @@ impl Subscriber {
     /// # Errors
     /// As for [`take`](Self::take).
     pub fn take_into(&mut self, out: &mut Vec<u8>) -> Result<Option<Meta>, TakeError> {
-        Ok(self.reader.take(out)?.map(|taken| taken.meta))
+        Ok(self.take_with(|reader| reader.take(out))?.map(|taken| taken.meta))
+    }
+
+    fn take_with<T>(
+        &mut self,
+        mut take: impl FnMut(&mut Reader) -> Result<Option<T>, TakeError>,
+    ) -> Result<Option<T>, TakeError> {
+        loop {
+            let taken = take(&mut self.reader)?;
+            if taken.is_some() || !self.fetch() {
+                return Ok(taken);
+            }
+        }
+    }
+
+    /// Takes in the memory that the reader lacks, if it has come. Whether it has.
+    fn fetch(&self) -> bool {
+        let (Some(missing), Some(socket)) = (self.reader.missing(), &self.socket) else {
+            return false;
+        };
+        let channel = Channel::new(socket.as_fd(), Some(Duration::ZERO));
+        while let Ok((handed, fd)) = channel.take_handed() {
+            self.context.add_segment(&handed, fd);
+            if handed.info().number == missing {
+                return true;
+            }
+        }
+        // Another subscriber at the same socket may have taken it in.
+        self.reader.has_data()
     }
 
     /// As [`take`](Self::take), after waiting for a sample for at most `timeout`. `None` also when

@@ -26,9 +26,12 @@ pub(crate) trait Word {
 ///
 /// | site | pairs with | so that |
 /// | --- | --- | --- |
-/// | `HeadStore` | `HeadLoad` | whoever sees the head sees the sample below it |
+/// | `StampStore` | `StampLoad` | whoever sees the stamp sees the sample |
+/// | `HeadStore` | `HeadLoad` | whoever sees the head sees the stamp of the sample below it |
 /// | `TailStore` | `TailLoad` | a reader never sees a tail above the head that it loads next |
-/// | `ReuseFence` | `StandsFence` | a reader that saw a reuse sees the tail that announced it |
+/// | `ReuseFence` | `StandsFence` | a reader that saw a reuse sees the tail or array that announced it |
+/// | `ArrayStore` | `ArrayLoad` | whoever sees the new array sees the descriptors in it |
+/// | `MappedStore` | `MappedLoad` | what moves to a segment that is mapped is found there |
 /// | `ReclaimFence` | `PinFence` | the publisher sees the pin, or the reader sees the tail |
 /// | `PinStore`, `UnpinStore` | `ScanLoad` | a pinned sample is read before it is written over |
 /// | `OpenStore` | `GenerationLoad` | whoever sees a lane open sees its cursor |
@@ -37,12 +40,18 @@ pub(crate) trait Word {
 /// | `ArmFence` | `SettleFence` | the sleeper sees the news, or the waker sees the ticket |
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Site {
+    StampStore,
+    StampLoad,
     HeadStore,
     HeadLoad,
     TailStore,
     TailLoad,
     ReuseFence,
     StandsFence,
+    ArrayStore,
+    ArrayLoad,
+    MappedStore,
+    MappedLoad,
     ReclaimFence,
     PinFence,
     PinStore,
@@ -71,18 +80,24 @@ impl Site {
 
     const fn needed(self) -> Ordering {
         match self {
-            Self::HeadStore
+            Self::StampStore
+            | Self::HeadStore
             | Self::TailStore
             | Self::ReuseFence
+            | Self::ArrayStore
+            | Self::MappedStore
             | Self::PinStore
             | Self::UnpinStore
             | Self::AskStore
             | Self::OpenStore
             | Self::CloseStore
             | Self::CursorStore => Ordering::Release,
-            Self::HeadLoad
+            Self::StampLoad
+            | Self::HeadLoad
             | Self::TailLoad
             | Self::StandsFence
+            | Self::ArrayLoad
+            | Self::MappedLoad
             | Self::ScanLoad
             | Self::GenerationLoad
             | Self::CursorLoad => Ordering::Acquire,
@@ -106,13 +121,19 @@ pub(crate) fn fence_at<W: Word>(site: Site) {
 
 #[cfg(test)]
 impl Site {
-    pub(crate) const ALL: [Self; 19] = [
+    pub(crate) const ALL: [Self; 25] = [
+        Self::StampStore,
+        Self::StampLoad,
         Self::HeadStore,
         Self::HeadLoad,
         Self::TailStore,
         Self::TailLoad,
         Self::ReuseFence,
         Self::StandsFence,
+        Self::ArrayStore,
+        Self::ArrayLoad,
+        Self::MappedStore,
+        Self::MappedLoad,
         Self::ReclaimFence,
         Self::PinFence,
         Self::PinStore,

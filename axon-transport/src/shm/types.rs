@@ -1,6 +1,6 @@
 //! What the two ends of a ring tell each other and their owners.
 
-use super::Peer;
+use super::{Location, Peer};
 use crate::{ids::Gid, qos::Qos};
 
 /// What a ring is made for.
@@ -14,6 +14,9 @@ pub struct RingOptions {
     pub budget: u64,
     /// The largest sample in bytes.
     pub max_message: u64,
+    /// The length in bytes that is expected of samples. Where it is more than 4 KiB, readers have
+    /// the memory for such samples before the first of them comes.
+    pub expected: u64,
 }
 
 /// A reader that wants to attach.
@@ -21,8 +24,8 @@ pub struct RingOptions {
 pub struct ReaderInfo {
     /// The subscription.
     pub gid: Gid,
-    /// Its lane in its session's segment.
-    pub lane: u32,
+    /// Its lane in its session's memory.
+    pub lane: Location,
     /// What it requests.
     pub qos: Qos,
     /// Its session.
@@ -52,8 +55,9 @@ pub struct Meta {
 /// A sample that was published.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Published {
-    /// Its position in the ring, counted from 0 without gaps.
-    pub position: u64,
+    /// Its position in the ring, counted from 0 without gaps. None where nobody reads: then only
+    /// its number is used up.
+    pub position: Option<u64>,
 }
 
 /// A sample that was taken.

@@ -1,26 +1,27 @@
 //! The publishing end of a ring.
 
 use std::{
-    os::fd::OwnedFd,
-    ptr::NonNull,
     sync::{Arc, Mutex, MutexGuard, PoisonError, atomic::AtomicU64},
     time::{Duration, Instant},
 };
 
 use super::{
-    Grant, Loan, Meta, Peer, PeerSession, PublishError, Published, ReaderInfo, RingOptions,
-    SessionSegment, ShmError,
+    Grant, Loan, Location, Meta, Peer, PeerSession, PublishError, Published, ReaderInfo,
+    RingOptions, SessionSegment, ShmError,
     area::Area,
     audience::Audience,
-    history::History,
-    layout::{self, COPIED, RingLayout},
-    memory::Segment,
+    heap::{Need, Object},
+    history::{Extent, History},
+    layout::{self, Array, COPIED, INLINE},
+    loan::Place as LoanPlace,
+    orphans::Orphan,
     ring::{self, Place, Record},
-    room::{Committed, Refusal},
+    room::{Maps, Refusal, Samples},
+    sync::{Ordering, Word},
 };
 use crate::{
     ids::Gid,
-    qos::History as Keep,
+    qos::{Durability, History as Keep},
     wait::{Purpose, settle},
 };
 
@@ -28,10 +29,10 @@ use crate::{
 pub(super) const PATIENCE: Duration = Duration::from_millis(100);
 /// How often a publish looks for the reader that is in its way before it gives up on the answer.
 pub(super) const LOOKS: u32 = 1000;
-/// Slots of a ring at least; a subscription's depth counts up to this.
-const SLOTS: u64 = 1024;
-/// Slots of a ring that keeps all that fits in its budget.
-const SLOTS_KEEP_ALL: u64 = 8192;
+/// Descriptors up to which a ring grows for its readers' depths.
+const DESCRIPTORS: u64 = 1 << 14;
+/// Descriptors up to which one grows that keeps all that fits in its budget.
+const DESCRIPTORS_KEEP_ALL: u64 = 1 << 13;
 
 /// A publisher's ring. All methods may be called from any thread.
 ///
@@ -52,6 +53,7 @@ const SLOTS_KEEP_ALL: u64 = 8192;
 ///     qos: Qos::default(),
 ///     budget: 1 << 20,
 ///     max_message: 1 << 20,
+///     expected: 0,
 /// };
 /// let writer = Writer::create(session.clone(), options)?;
 ///
@@ -59,23 +61,21 @@ const SLOTS_KEEP_ALL: u64 = 8192;
 /// let peer = Peer::Local(session.clone());
 /// let grant = writer.attach(ReaderInfo {
 ///     gid: reader_gid,
-///     lane: lane.index(),
+///     lane: lane.location(),
 ///     qos: Qos::default(),
 ///     peer: peer.clone(),
 ///     stands_for: Vec::new(),
 /// })?;
-/// let mut reader = Reader::map(
-///     writer.descriptor()?,
-///     ReaderOptions {
-///         reader: reader_gid,
-///         writer: writer_gid,
-///         peer,
-///         lane,
-///         grant,
-///         qos: Qos::default(),
-///         max_message: 1 << 20,
-///     },
-/// )?;
+/// let mut reader = Reader::map(ReaderOptions {
+///     reader: reader_gid,
+///     writer: writer_gid,
+///     peer,
+///     ring: writer.location(),
+///     lane,
+///     grant,
+///     qos: Qos::default(),
+///     max_message: 1 << 20,
+/// })?;
 ///
 /// writer.publish(Meta { sequence: 1, source_timestamp: 0 }, b"hello")?;
 /// let mut payload = Vec::new();
@@ -85,23 +85,31 @@ const SLOTS_KEEP_ALL: u64 = 8192;
 /// ```
 pub struct Writer {
     options: RingOptions,
-    pub(super) layout: RingLayout,
-    session: Arc<SessionSegment>,
-    pub(super) segment: Segment,
+    pub(super) session: Arc<SessionSegment>,
+    /// The ring's header.
+    pub(super) ring: Object,
+    /// The most descriptors.
+    pub(super) limit: u64,
     state: Mutex<State>,
 }
 
 pub(super) struct State {
     pub(super) history: History,
     pub(super) audience: Audience,
+    /// The descriptors.
+    pub(super) array: Object,
+    /// The segments that blocks are in.
+    pub(super) maps: Maps,
+    /// Where samples that readers pin are, once there has been one.
+    pub(super) samples: Option<Samples>,
     /// The tail as readers see it.
     pub(super) shown_tail: u64,
-    /// Ends of the slots and of the two parts of the payload area that are backed by memory.
-    pub(super) committed: Committed,
     /// Positions that were found pinned, kept for their memory.
     pub(super) found: Vec<u64>,
     /// The last sample's sequence number.
     last: u64,
+    /// Samples published, read or not.
+    published: u64,
 }
 
 /// How samples are numbered.
@@ -116,10 +124,10 @@ pub(super) enum Numbering {
 /// A sample's bytes on their way into a ring.
 #[derive(Clone, Copy)]
 pub(super) enum Payload<'a> {
-    /// At most [`layout::COPIED`] bytes, copied in under the lock.
+    /// At most [`COPIED`] bytes, copied in under the lock.
     Bytes(&'a [u8]),
-    /// Written to memory that was lent: its offset and the sample's length.
-    Written { at: u64, len: usize },
+    /// Written to memory that was lent: where, and the sample's length.
+    Written { at: Location, len: usize },
 }
 
 impl Writer {
@@ -131,29 +139,49 @@ impl Writer {
         if session.is_forked() {
             return Err(ShmError::Forked);
         }
-        let RingOptions { qos, budget, max_message, .. } = options;
+        let RingOptions { qos, budget, max_message, expected, .. } = options;
         if max_message > layout::MAX_MESSAGE || budget > layout::MAX_BUDGET {
             return Err(ShmError::TooLarge { max_message, budget });
         }
-        let slots = match qos.history {
-            Keep::KeepLast => (u64::from(qos.depth) + 1).max(SLOTS),
-            Keep::KeepAll => SLOTS_KEEP_ALL,
+        session.tidy();
+        let limit = match qos.history {
+            Keep::KeepLast => (u64::from(qos.depth) + 1).next_power_of_two().max(DESCRIPTORS),
+            Keep::KeepAll => DESCRIPTORS_KEEP_ALL,
+        }
+        .min(layout::MAX_DESCRIPTORS);
+        // Readers are told of the segments with the ring.
+        let allocate = |len| {
+            let object = session.allocate(len, Need::Now, |_| true)?;
+            Ok::<Object, ShmError>(object.expect("there is always one that will do"))
         };
-        let layout = RingLayout::new(slots, budget, max_message);
-        let segment = Segment::create("axon-ring", layout.bytes())?;
-        segment.commit(0, layout::ALIGN)?;
-        layout.write(segment.words(), options.gid);
-        let history =
-            History::new(layout.slots(), layout.copied_bytes(), layout.payload_bytes(), budget);
+        let ring = allocate(layout::RING)?;
+        let descriptors = layout::FIRST_DESCRIPTORS;
+        let array = match allocate(descriptors * layout::DESCRIPTOR) {
+            Ok(array) => array,
+            Err(error) => {
+                session.release(ring.block);
+                return Err(error);
+            }
+        };
+        ring::copy_descriptors(array.words(), array.words(), 0, 0);
+        let at = Array { at: array.block.at, descriptors };
+        layout::write_ring(ring.words(), options.gid, &at);
         let state = State {
-            audience: Audience::new(qos, history.capacity()),
-            history,
+            audience: Audience::new(qos, limit - 1),
+            history: History::new(descriptors, budget),
+            array,
+            maps: Maps::default(),
+            samples: None,
             shown_tail: 0,
-            committed: Committed::new(&layout),
             found: Vec::new(),
             last: 0,
+            published: 0,
         };
-        Ok(Self { options, layout, session, segment, state: Mutex::new(state) })
+        let writer = Self { options, session, ring, limit, state: Mutex::new(state) };
+        if expected > COPIED {
+            writer.open_samples(&mut writer.lock())?;
+        }
+        Ok(writer)
     }
 
     /// The publisher's GID.
@@ -161,15 +189,9 @@ impl Writer {
         self.options.gid
     }
 
-    /// A duplicate of the ring's descriptor, for readers.
-    ///
-    /// # Errors
-    /// The process has no descriptors left.
-    pub fn descriptor(&self) -> Result<OwnedFd, ShmError> {
-        self.segment
-            .fd()
-            .try_clone_to_owned()
-            .map_err(|source| ShmError::System { what: "duplicating a descriptor", source })
+    /// Where the ring is in its session's memory, for readers.
+    pub fn location(&self) -> Location {
+        self.ring.block.at
     }
 
     /// Adds a reader, or answers with the grant that stands when it is attached by the same lane.
@@ -177,40 +199,52 @@ impl Writer {
     /// # Errors
     /// Its session has no such lane.
     pub fn attach(&self, reader: ReaderInfo) -> Result<Grant, ShmError> {
-        if self.segment.is_forked() {
+        if self.is_forked() {
             return Err(ShmError::Forked);
         }
-        if reader.lane >= reader.peer.lanes() {
-            return Err(ShmError::Refused { what: "it has no such lane" });
-        }
+        let lane = reader.peer.lane(reader.lane)?;
         let mut state = self.lock();
         let State { audience, history, .. } = &mut *state;
-        Ok(audience.attach(reader, history.tail(), history.head()))
+        Ok(audience.attach(reader, lane, history.tail(), history.head()))
     }
 
     /// Forgets a reader; false when it was not attached. The samples that it keeps it may keep.
     pub fn detach(&self, reader: Gid) -> bool {
-        !self.segment.is_forked() && self.lock().audience.detach(reader)
+        !self.is_forked() && self.lock().audience.detach(reader)
     }
 
     /// Forgets the readers whose process has ended, and names them.
     pub fn drop_dead(&self) -> Vec<Gid> {
-        if self.segment.is_forked() { Vec::new() } else { self.lock().audience.drop_dead() }
+        if self.is_forked() { Vec::new() } else { self.lock().audience.drop_dead() }
     }
 
     /// As [`drop_dead`](Self::drop_dead), and those that have left without a word.
     pub fn drop_gone(&self) -> Vec<Gid> {
-        if self.segment.is_forked() { Vec::new() } else { self.lock().audience.drop_gone() }
+        if self.is_forked() { Vec::new() } else { self.lock().audience.drop_gone() }
     }
 
     /// The subscriptions that are attached; a relay shows as those that it stands for.
     pub fn readers(&self) -> Vec<Gid> {
-        if self.segment.is_forked() { Vec::new() } else { self.lock().audience.readers() }
+        if self.is_forked() { Vec::new() } else { self.lock().audience.readers() }
     }
 
     /// Whether any reader is attached.
     pub fn has_readers(&self) -> bool {
-        !self.segment.is_forked() && !self.lock().audience.is_empty()
+        !self.is_forked() && !self.lock().audience.is_empty()
+    }
+
+    /// If a sample would be read by nobody, now or later, uses up the next sequence number as if one
+    /// had been published, and returns it. `None` when somebody would. So whoever has to serialize
+    /// first can save itself the work.
+    ///
+    /// # Errors
+    /// The process forked.
+    pub fn skip_unread(&self) -> Result<Option<u64>, PublishError> {
+        if self.is_forked() {
+            return Err(PublishError::Forked);
+        }
+        let mut state = self.lock();
+        Ok(self.is_unread(&state).then(|| self.pass(&mut state, Numbering::Next(0)).sequence))
     }
 
     /// Publishes a sample. Where this publisher and a reader of another session are both RELIABLE
@@ -255,8 +289,8 @@ impl Writer {
         self.publish_within(numbering, payload, Duration::ZERO).map(|(sequence, _)| sequence)
     }
 
-    /// Lends `len` bytes to be written and then published: of the ring's own memory where it is
-    /// more than 4 KiB. May wait as [`publish`](Self::publish) does.
+    /// Lends `len` bytes to be written and then published: of shared memory where it is more than
+    /// 4 KiB. May wait as [`publish`](Self::publish) does.
     ///
     /// # Errors
     /// As [`publish`](Self::publish).
@@ -265,8 +299,8 @@ impl Writer {
         if len as u64 <= COPIED {
             return Ok(Loan::copied(self, len));
         }
-        let at = self.patiently(PATIENCE, |state| self.lend(state, bytes))?;
-        Ok(Loan::placed(self, len, at))
+        let place = self.patiently(PATIENCE, |state| self.lend(state, bytes))?;
+        Ok(Loan::placed(self, len, place))
     }
 
     fn publish_within(
@@ -280,14 +314,24 @@ impl Writer {
             return self.commit(numbering, Payload::Bytes(payload), patience);
         }
         let start = Instant::now();
-        let at = self.patiently(patience, |state| self.lend(state, bytes))?;
+        let lent: Result<LoanPlace, Meta> = self.patiently(patience, |state| {
+            if self.is_unread(state) {
+                return Ok(Err(self.pass(state, numbering)));
+            }
+            self.lend(state, bytes).map(Ok)
+        })?;
+        let place = match lent {
+            Ok(place) => place,
+            Err(passed) => return Ok((passed.sequence, Published { position: None })),
+        };
         // Copied outside the lock: nobody else knows of the place yet.
-        let mut loan = Loan::placed(self, payload.len(), at);
+        let mut loan = Loan::placed(self, payload.len(), place);
         loan.copy_from_slice(payload);
         loan.commit(numbering, patience.saturating_sub(start.elapsed()))
     }
 
-    /// Publishes what has been, or is here, copied in.
+    /// Publishes what has been, or is here, copied in. Memory that was lent and that no sample
+    /// takes is given back by whoever borrowed it.
     pub(super) fn commit(
         &self,
         numbering: Numbering,
@@ -295,48 +339,79 @@ impl Writer {
         patience: Duration,
     ) -> Result<(u64, Published), PublishError> {
         // A loan may have been made before the fork.
-        if self.segment.is_forked() {
+        if self.is_forked() {
             return Err(PublishError::Forked);
         }
         let (meta, position, peers) = self.patiently(patience, |state| {
-            self.slot(state)?;
-            let (len, place) = match payload {
-                Payload::Bytes(bytes) if bytes.len() <= layout::INLINE => {
-                    (bytes.len(), Place::Inline)
+            if self.is_unread(state) {
+                return Ok((self.pass(state, numbering), None, None));
+            }
+            self.make_place(state)?;
+            let (extent, place) = match payload {
+                Payload::Bytes(bytes) if bytes.len() <= INLINE => (Extent::Inline, Place::Inline),
+                Payload::Bytes(bytes) => {
+                    let block = self.copy_in(state, bytes)?;
+                    (Extent::Block(block), Place::Block(block.at))
                 }
-                Payload::Bytes(bytes) => (bytes.len(), Place::At(self.copy_in(state, bytes)?)),
-                Payload::Written { at, len } => (len, Place::At(at)),
-            };
-            let meta = match numbering {
-                Numbering::Given(meta) => meta,
-                Numbering::Next(source_timestamp) => {
-                    Meta { sequence: state.last + 1, source_timestamp }
+                Payload::Written { at, len } => {
+                    let len = Area::rounded(len as u64);
+                    (Extent::Slot { at: at.offset, len }, Place::Slot(at))
                 }
             };
-            state.last = meta.sequence;
-            let position = self.show(state, meta, len, place, payload);
-            Ok((meta, position, state.audience.peers()))
+            let meta = self.number(state, numbering);
+            let position = self.show(state, meta, extent, place, payload);
+            Ok((meta, Some(position), Some(state.audience.peers())))
         })?;
-        announce(&peers);
+        if let Some(peers) = peers {
+            announce(&peers);
+        }
         Ok((meta.sequence, Published { position }))
+    }
+
+    /// Whether nobody will ever read what is published now.
+    fn is_unread(&self, state: &State) -> bool {
+        state.audience.is_empty() && self.options.qos.durability == Durability::Volatile
+    }
+
+    /// A sample that nobody reads.
+    fn pass(&self, state: &mut State, numbering: Numbering) -> Meta {
+        let meta = self.number(state, numbering);
+        self.count(state);
+        // No sample to come asks for the memory of those that were in use.
+        self.reclaim(state);
+        meta
+    }
+
+    fn number(&self, state: &mut State, numbering: Numbering) -> Meta {
+        let meta = match numbering {
+            Numbering::Given(meta) => meta,
+            Numbering::Next(source_timestamp) => {
+                Meta { sequence: state.last + 1, source_timestamp }
+            }
+        };
+        state.last = meta.sequence;
+        meta
+    }
+
+    fn count(&self, state: &mut State) {
+        state.published += 1;
+        let published = &self.ring.words()[layout::ring::PUBLISHED];
+        Word::store(published, state.published, Ordering::Relaxed);
     }
 
     fn show(
         &self,
         state: &mut State,
         meta: Meta,
-        len: usize,
+        extent: Extent,
         place: Place,
         payload: Payload<'_>,
     ) -> u64 {
-        let extent = match place {
-            Place::Inline => None,
-            Place::At(at) => Some((at, Area::rounded(len as u64))),
+        let (len, inline) = match payload {
+            Payload::Bytes(bytes) => (bytes.len(), bytes),
+            Payload::Written { len, .. } => (len, &[][..]),
         };
-        let inline = match (place, payload) {
-            (Place::Inline, Payload::Bytes(bytes)) => bytes,
-            _ => &[],
-        };
+        self.count(state);
         let position = state.history.push(extent);
         let record = Record {
             sequence: meta.sequence,
@@ -345,26 +420,24 @@ impl Writer {
             place,
         };
         ring::about_to_write::<AtomicU64>();
-        let geometry = self.layout.geometry();
-        ring::publish(self.segment.words(), &geometry, position, &record, inline);
+        ring::publish(self.ring.words(), state.array.words(), position, &record, inline);
         position
     }
 
-    pub(super) fn give_back(&self, at: u64, len: usize) {
-        self.lock().history.give_back(at, Area::rounded(len as u64));
+    pub(super) fn give_back(&self, at: Location, len: usize) {
+        self.lock().history.give_back(at.offset, Area::rounded(len as u64));
     }
 
     pub(super) fn is_forked(&self) -> bool {
-        self.segment.is_forked()
+        self.session.is_forked()
     }
 
-    /// The bytes of a loan.
-    pub(super) fn lent(&self, at: u64, len: usize) -> NonNull<u8> {
-        self.segment.bytes(self.layout.payload_at() + at, len)
+    pub(super) fn options(&self) -> &RingOptions {
+        &self.options
     }
 
     fn check(&self, len: usize) -> Result<u64, PublishError> {
-        if self.segment.is_forked() {
+        if self.is_forked() {
             return Err(PublishError::Forked);
         }
         let (len, max) = (len as u64, self.options.max_message);
@@ -420,6 +493,35 @@ impl Writer {
 
     pub(super) fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Drop for Writer {
+    fn drop(&mut self) {
+        // In a forked child all of it is the parent's.
+        if self.is_forked() {
+            return;
+        }
+        let State { mut history, array, audience, samples, .. } = {
+            let mut state = self.lock();
+            let empty = State {
+                history: History::new(1, 0),
+                audience: Audience::new(self.options.qos, 0),
+                array: self.ring.clone(),
+                maps: Maps::default(),
+                samples: None,
+                shown_tail: 0,
+                found: Vec::new(),
+                last: 0,
+                published: 0,
+            };
+            std::mem::replace(&mut *state, empty)
+        };
+        // Readers drain what stands. After them nobody looks at any of it.
+        let mut blocks = vec![self.ring.block, array.block];
+        blocks.extend(history.all_blocks());
+        let samples = samples.map(|samples| samples.number());
+        self.session.adopt(Orphan { seats: audience.into_seats(), blocks, samples });
     }
 }
 

@@ -4,7 +4,7 @@ use std::{io::Write as _, sync::Arc};
 
 use axon_transport::{
     ids::{Gid, SessionId},
-    qos::{History, Qos},
+    qos::{Durability, History, Qos},
     shm::{Meta, Reader, RingOptions, SessionSegment, Writer},
 };
 
@@ -76,23 +76,32 @@ pub(crate) fn cases() -> Vec<Case> {
     use Operation::*;
     let last = |depth| Qos { history: History::KeepLast, depth, ..Qos::default() };
     let all = Qos::keep_all();
+    let latched = |depth| Qos { durability: Durability::TransientLocal, ..last(depth) };
     let case = |name, operation, reader: Qos, (before, taken), len| {
         let publisher = if reader.history == History::KeepAll { all } else { last(1) };
+        let publisher = Qos { durability: reader.durability, ..publisher };
         Case { name, operation, publisher, reader, before, len, taken }
     };
     vec![
         case("create a ring", Create, last(4), (0, 0), 0),
-        case("attach a reader", Attach, last(4), (2, 0), 40),
+        case("attach a reader", Attach, last(4), (0, 0), 40),
+        case("attach a reader that gets history", Attach, latched(1), (2, 1), 40),
         case("publish nothing", Publish, last(4), (0, 0), 0),
         case("publish inline, the first", Publish, last(4), (0, 0), 96),
         case("publish inline", Publish, last(4), (3, 1), 8),
         case("publish inline to a reader with all unread", Publish, last(20), (30, 0), 96),
-        case("publish inline over the ring's end", Publish, last(4), (1024, 2), 52),
-        case("publish over the first slot of all", Publish, last(20), (1040, 15), 52),
+        case("publish inline over the ring's end", Publish, last(4), (32, 2), 52),
+        case("publish over the first descriptor", Publish, last(20), (32, 15), 52),
+        case("publish and grow", Publish, last(4), (16, 2), 52),
+        case("publish and grow, all unread", Publish, last(20), (16, 0), 96),
+        case("publish and grow, by copy", Publish, all, (16, 10), 300),
+        case("publish and open a segment for descriptors", Publish, last(3000), (1024, 1000), 8),
+        case("publish and move to that segment", Publish, last(3000), (1025, 1000), 8),
         case("publish by copy, the first", Publish, last(4), (0, 0), 97),
         case("publish by copy", Publish, last(4), (3, 1), 1024),
         case("publish by copy in place of the oldest", Publish, last(20), (8, 0), 1024),
         case("publish by copy in place of many", Publish, last(20), (40, 20), 200),
+        case("publish a large one, the first", Publish, last(1), (0, 0), 5000),
         case("publish a large one", Publish, last(1), (2, 1), 5000),
         case("publish, KEEP_ALL", Publish, all, (3, 3), 300),
         case("publish, KEEP_ALL and held", PublishHeld, all, (8, 0), 1024),
@@ -105,6 +114,7 @@ pub(crate) fn cases() -> Vec<Case> {
         case("take inline", Take, last(4), (3, 1), 60),
         case("take by copy", Take, last(4), (3, 1), 1024),
         case("take a large one", Take, last(1), (2, 0), 5000),
+        case("take from a ring that grew", Take, last(20), (20, 3), 60),
         case("take over what its depth skips", Take, last(2), (9, 0), 100),
         case("take over what is lost", Take, last(20), (12, 0), 1024),
         case("take, KEEP_ALL, held publisher", Take, all, (8, 0), 1024),
@@ -122,7 +132,8 @@ pub(crate) fn session() -> Arc<SessionSegment> {
 
 pub(crate) fn writer(session: &Arc<SessionSegment>, qos: Qos) -> Writer {
     let gid = Gid::new(session.id(), 1);
-    let options = RingOptions { gid, qos, budget: BUDGET, max_message: LARGEST };
+    let (budget, max_message) = (BUDGET, LARGEST);
+    let options = RingOptions { gid, qos, budget, max_message, expected: 0 };
     Writer::create(session.clone(), options).expect("a ring")
 }
 
@@ -205,9 +216,11 @@ impl Case {
             let _reader = granted.map();
             return mark();
         }
+        let peer = granted.peer.clone();
         let mut reader: Reader = granted.map();
         wire.go();
         wire.wait();
+        wire.take_segments(&peer);
         let mut out = Vec::with_capacity(self.len);
         for _ in 0..self.taken {
             reader.take(&mut out).expect("a ring").expect("a sample");

@@ -5,7 +5,7 @@ use std::{fs, os::fd::OwnedFd, sync::Arc};
 use axon_transport::{
     ids::Gid,
     qos::Qos,
-    shm::{Peer, Reader, ReaderInfo, ReaderOptions, SessionSegment, Writer},
+    shm::{Peer, PeerSession, Reader, ReaderInfo, ReaderOptions, SessionSegment, Writer},
 };
 
 use crate::{
@@ -39,7 +39,7 @@ pub(crate) struct Scene<'a> {
 enum End {
     Nothing,
     Waiting(Box<LateReader>),
-    Reader(Reader),
+    Reader(Reader, Arc<PeerSession>),
     Writer(Box<Writer>),
 }
 
@@ -57,7 +57,8 @@ impl<'a> Scene<'a> {
             (wire, session, end, written)
         });
         let mut scene = Self { case, wire, session, tracee, end, written, done: false };
-        if let End::Reader(reader) = &mut scene.end {
+        scene.look_for_segments();
+        if let End::Reader(reader, _) = &mut scene.end {
             for _ in 0..case.taken {
                 check_next(case, reader).expect("a sample");
             }
@@ -71,10 +72,18 @@ impl<'a> Scene<'a> {
         self.done
     }
 
+    /// Takes in the segments that the doomed process has opened.
+    pub(crate) fn look_for_segments(&mut self) {
+        if let End::Reader(_, peer) = &self.end {
+            self.written.extend(self.wire.take_segments(peer));
+        }
+    }
+
     /// Kills it and checks all that must hold.
-    pub(crate) fn kill(self) -> Outcome {
-        let Self { case, wire, session, tracee, end, written, done } = self;
-        tracee.kill();
+    pub(crate) fn kill(mut self) -> Outcome {
+        self.tracee.end();
+        self.look_for_segments();
+        let Self { case, wire, session, end, written, done, .. } = self;
         drop(written);
         let shown = match end {
             End::Nothing => false,
@@ -82,7 +91,7 @@ impl<'a> Scene<'a> {
                 Some(reader) => drain(case, done, reader),
                 None => false,
             },
-            End::Reader(reader) => drain(case, done, reader),
+            End::Reader(reader, _) => drain(case, done, reader),
             End::Writer(writer) => {
                 go_on(case, &session, &writer);
                 false
@@ -104,14 +113,17 @@ fn join(case: &Case, wire: &Wire, session: &Arc<SessionSegment>) -> (End, Vec<Ow
             let (session, qos) = (session.clone(), case.reader);
             let map = move |wire: &Wire| {
                 let grant = wire.take_grant()?;
-                let options = options(&session, offer.peer, offer.writer, lane, grant, qos);
-                Some(Reader::map(offer.ring, options).expect("a ring"))
+                wire.take_segments(&offer.peer);
+                let (peer, writer, ring) = (offer.peer, offer.writer, offer.ring);
+                let options = options(&session, peer, writer, ring, lane, grant, qos);
+                Some(Reader::map(options).expect("a ring"))
             };
-            (End::Waiting(Box::new(map)), offer.seen.into())
+            (End::Waiting(Box::new(map)), offer.seen)
         }
         _ => {
             let (granted, seen) = wire.join(session, case.reader);
-            (End::Reader(granted.map()), seen.into())
+            let peer = granted.peer.clone();
+            (End::Reader(granted.map(), peer), seen)
         }
     }
 }
@@ -132,7 +144,7 @@ fn serve(case: &Case, wire: &Wire, session: &Arc<SessionSegment>) -> (End, Vec<O
         wire.wait();
         wire.go();
     }
-    (End::Writer(Box::new(writer)), vec![seen])
+    (End::Writer(Box::new(writer)), seen)
 }
 
 /// The next sample, which must be whole. Its sequence number.
@@ -154,7 +166,7 @@ fn drain(case: &Case, done: bool, mut reader: Reader) -> bool {
         assert!(last < Some(sequence), "{sequence} after {last:?}");
         last = Some(sequence);
     }
-    assert!(!reader.has_data());
+    assert!(reader.is_drained());
     let counted = first + reader.received() + reader.lost() + reader.skipped();
     let shown = counted > case.before;
     assert_eq!(counted - u64::from(shown), case.before, "every sample is counted once");
@@ -205,15 +217,16 @@ fn attach(session: &Arc<SessionSegment>, writer: &Writer, qos: Qos) -> Reader {
     let (reader, peer) = (Gid::new(session.id(), 2), Peer::Local(session.clone()));
     let info = ReaderInfo {
         gid: reader,
-        lane: lane.index(),
+        lane: lane.location(),
         qos,
         peer: peer.clone(),
         stands_for: Vec::new(),
     };
     let grant = writer.attach(info).expect("an attachment");
     let (writer_gid, max_message) = (writer.gid(), LARGEST);
-    let options = ReaderOptions { reader, writer: writer_gid, peer, lane, grant, qos, max_message };
-    Reader::map(writer.descriptor().expect("a ring"), options).expect("a ring")
+    let (writer, ring) = (writer_gid, writer.location());
+    let options = ReaderOptions { reader, writer, peer, ring, lane, grant, qos, max_message };
+    Reader::map(options).expect("a ring")
 }
 
 /// Descriptors that this process holds, and memfds that it maps.

@@ -86,11 +86,7 @@ impl Tracee {
     }
 
     /// Kills it where it stands.
-    pub(crate) fn kill(mut self) {
-        self.end();
-    }
-
-    fn end(&mut self) {
+    pub(crate) fn end(&mut self) {
         if !mem::replace(&mut self.gone, true) {
             let _ = kill(self.pid, Signal::SIGKILL);
             while !matches!(

@@ -1,10 +1,11 @@
 //! What two sessions say to each other to share memory, over a socket pair instead of a daemon.
 
 use std::{
+    cell::RefCell,
     io::{IoSlice, IoSliceMut},
     mem::MaybeUninit,
     os::fd::{AsFd, BorrowedFd, OwnedFd},
-    sync::Arc,
+    sync::{Arc, Mutex},
 };
 
 use axon_transport::{
@@ -12,10 +13,11 @@ use axon_transport::{
     passed::PassedFd,
     qos::Qos,
     shm::{
-        Grant, Lane, Peer, PeerDescriptors, PeerSession, Reader, ReaderInfo, ReaderOptions,
-        SessionSegment, Writer,
+        Grant, Lane, Location, Peer, PeerDescriptors, PeerSession, Reader, ReaderInfo,
+        ReaderOptions, SegmentEvent, SegmentInfo, SegmentKind, SessionSegment, Writer,
     },
 };
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::net::{
     AddressFamily, RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, SendAncillaryBuffer,
     SendAncillaryMessage, SendFlags, SocketFlags, SocketType, recvmsg, sendmsg, socketpair,
@@ -24,21 +26,25 @@ use rustix::net::{
 use crate::operation::LARGEST;
 
 /// One end of the socket pair.
-pub(crate) struct Wire(OwnedFd);
+pub(crate) struct Wire {
+    socket: OwnedFd,
+    /// Segments that were handed over and not taken in yet.
+    pending: RefCell<Vec<(Vec<u8>, OwnedFd)>>,
+}
 
 /// A publisher as its reader's process knows it before it asks.
 pub(crate) struct Offer {
     pub(crate) peer: Arc<PeerSession>,
     pub(crate) writer: Gid,
-    pub(crate) ring: OwnedFd,
+    pub(crate) ring: Location,
     /// The publisher's segments once more, to be looked at from outside.
-    pub(crate) seen: [OwnedFd; 2],
+    pub(crate) seen: Vec<OwnedFd>,
 }
 
 /// A reader that may be mapped.
 pub(crate) struct Granted {
-    pub(crate) ring: OwnedFd,
-    pub(crate) options: ReaderOptions,
+    pub(crate) peer: Arc<PeerSession>,
+    options: ReaderOptions,
 }
 
 impl Wire {
@@ -46,7 +52,11 @@ impl Wire {
         let (a, b) =
             socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None)
                 .expect("a socket pair");
-        (Self(a), Self(b))
+        (Self::of(a), Self::of(b))
+    }
+
+    fn of(socket: OwnedFd) -> Self {
+        Self { socket, pending: RefCell::default() }
     }
 
     /// Sends a word that means "go on".
@@ -59,35 +69,34 @@ impl Wire {
         self.receive();
     }
 
-    /// The publisher's first word: its session and its ring.
+    /// The publisher's first word: its session and its ring. What segments it opens from then on
+    /// follow at once, as a daemon would pass them on.
     pub(crate) fn offer(&self, session: &SessionSegment, writer: &Writer) {
-        self.introduce(session, &writer.gid().0, Some(writer.descriptor().expect("a ring")));
+        self.introduce(session, writer.gid(), writer.location());
+        let to = Self::of(self.socket.try_clone().expect("a descriptor"));
+        let to = Mutex::new(to);
+        session.on_segment(move |event| {
+            if let SegmentEvent::Opened(info, fd) = event {
+                to.lock().expect("a wire").hand(info, fd);
+            }
+        });
     }
 
     pub(crate) fn take_offer(&self) -> Offer {
-        let (peer, writer, mut others) = self.meet();
-        let ring = others.pop().expect("a ring");
-        let segment = others.pop().expect("a session segment");
-        let seen = [segment, ring.try_clone().expect("a descriptor")];
-        Offer { peer, writer: Gid(writer.try_into().expect("a GID")), ring, seen }
+        let (peer, writer, ring, seen) = self.meet();
+        Offer { peer, writer, ring, seen }
     }
 
     /// The reader's answer: its session and the lane that it reads by.
     pub(crate) fn ask(&self, session: &SessionSegment, lane: &Lane) {
-        self.introduce(session, &lane.index().to_le_bytes(), None);
+        self.introduce(session, Gid::new(session.id(), 1), lane.location());
     }
 
-    /// What the publisher attaches; with it the reader's segment, to be looked at from outside.
-    pub(crate) fn take_request(&self, qos: Qos) -> (ReaderInfo, OwnedFd) {
-        let (peer, lane, mut others) = self.meet();
-        let info = ReaderInfo {
-            gid: Gid::new(peer.id(), 1),
-            lane: u32::from_le_bytes(lane.try_into().expect("a lane")),
-            qos,
-            peer: Peer::Remote(peer),
-            stands_for: Vec::new(),
-        };
-        (info, others.pop().expect("a session segment"))
+    /// What the publisher attaches; with it the reader's segments, to be looked at from outside.
+    pub(crate) fn take_request(&self, qos: Qos) -> (ReaderInfo, Vec<OwnedFd>) {
+        let (peer, gid, lane, seen) = self.meet();
+        let (peer, stands_for) = (Peer::Remote(peer), Vec::new());
+        (ReaderInfo { gid, lane, qos, peer, stands_for }, seen)
     }
 
     pub(crate) fn grant(&self, grant: Grant) {
@@ -102,46 +111,90 @@ impl Wire {
         Some(Grant { generation, first })
     }
 
-    /// The publisher's half of an attachment, whole. The reader's segment.
-    pub(crate) fn serve(&self, session: &SessionSegment, writer: &Writer, qos: Qos) -> OwnedFd {
+    /// The publisher's half of an attachment, whole. The reader's segments.
+    pub(crate) fn serve(
+        &self,
+        session: &SessionSegment,
+        writer: &Writer,
+        qos: Qos,
+    ) -> Vec<OwnedFd> {
         self.offer(session, writer);
-        let (info, segment) = self.take_request(qos);
+        let (info, segments) = self.take_request(qos);
         self.grant(writer.attach(info).expect("an attachment"));
-        segment
+        segments
     }
 
-    /// The reader's half, but for the last step. The publisher's segments.
-    pub(crate) fn join(&self, session: &Arc<SessionSegment>, qos: Qos) -> (Granted, [OwnedFd; 2]) {
+    /// The reader's half, but for the last step. The publisher's session and its segments.
+    pub(crate) fn join(&self, session: &Arc<SessionSegment>, qos: Qos) -> (Granted, Vec<OwnedFd>) {
         let Offer { peer, writer, ring, seen } = self.take_offer();
         let lane = session.allocate_lane().expect("a lane");
         self.ask(session, &lane);
         let grant = self.take_grant().expect("a grant");
-        (Granted { ring, options: options(session, peer, writer, lane, grant, qos) }, seen)
+        let options = options(session, peer.clone(), writer, ring, lane, grant, qos);
+        (Granted { peer, options }, seen)
     }
 
-    fn introduce(&self, session: &SessionSegment, more: &[u8], ring: Option<OwnedFd>) {
+    /// Hands a segment over.
+    fn hand(&self, info: SegmentInfo, fd: BorrowedFd<'_>) {
+        let publisher = match info.kind {
+            SegmentKind::Samples(gid) => gid,
+            SegmentKind::Session | SegmentKind::Heap => Gid([0; 16]),
+        };
+        self.send(&[&info.number.to_le_bytes()[..], &publisher.0].concat(), &[fd]);
+    }
+
+    /// Takes in the segments that were handed over, all that have come; their descriptors.
+    pub(crate) fn take_segments(&self, peer: &PeerSession) -> Vec<OwnedFd> {
+        while self.is_ready() {
+            let (bytes, mut fds) = self.receive_any();
+            let Some(fd) = fds.pop() else { break };
+            self.pending.borrow_mut().push((bytes, fd));
+        }
+        let pending = self.pending.take();
+        pending.into_iter().map(|(bytes, fd)| take_in(peer, &bytes, fd)).collect()
+    }
+
+    fn is_ready(&self) -> bool {
+        let mut fds = [PollFd::new(&self.socket, PollFlags::IN)];
+        poll(&mut fds, Some(&Timespec::default())).is_ok_and(|ready| ready > 0)
+    }
+
+    /// A session with its segments, and where something is in it.
+    fn introduce(&self, session: &SessionSegment, gid: Gid, at: Location) {
         let descriptors = session.descriptors().expect("descriptors");
-        let mut fds = vec![
-            descriptors.segment.as_fd(),
-            descriptors.doorbell.as_fd(),
-            descriptors.pidfd.as_fd(),
-        ];
-        fds.extend(ring.as_ref().map(AsFd::as_fd));
-        self.send(&[&session.id().0, more].concat(), &fds);
+        let fds =
+            [descriptors.segment.as_fd(), descriptors.doorbell.as_fd(), descriptors.pidfd.as_fd()];
+        let place = [&at.segment.to_le_bytes()[..], &at.offset.to_le_bytes()].concat();
+        self.send(&[&session.id().0[..], &gid.0, &place].concat(), &fds);
+        for info in session.segments() {
+            let (info, fd) = session.segment(info.number).expect("a descriptor").expect("it");
+            self.hand(info, fd.as_fd());
+        }
+        self.go();
     }
 
-    /// A session, what it said, its segment and what else it sent.
-    fn meet(&self) -> (Arc<PeerSession>, Vec<u8>, Vec<OwnedFd>) {
+    /// A session, what it named and where, and its segments once more.
+    fn meet(&self) -> (Arc<PeerSession>, Gid, Location, Vec<OwnedFd>) {
         let (bytes, fds) = self.receive();
-        let (id, more) = bytes.split_at(16);
+        let (ids, place) = bytes.split_at(32);
+        let (segment, offset) = place.split_at(4);
+        let at = Location {
+            segment: u32::from_le_bytes(segment.try_into().expect("a number")),
+            offset: u64::from_le_bytes(offset.try_into().expect("an offset")),
+        };
         let mut fds = fds.into_iter();
         let mut next = || PassedFd::from(fds.next().expect("a descriptor"));
         let descriptors = PeerDescriptors { segment: next(), doorbell: next(), pidfd: next() };
         let segment = descriptors.segment.as_fd().try_clone_to_owned();
-        let mut others = vec![segment.expect("a descriptor")];
-        others.extend(fds);
-        let id = SessionId(id.try_into().expect("a session id"));
-        (PeerSession::map(id, descriptors).expect("a session"), more.to_vec(), others)
+        let mut seen = vec![segment.expect("a descriptor")];
+        let id = SessionId(ids[..16].try_into().expect("a session id"));
+        let peer = PeerSession::map(id, descriptors).expect("a session");
+        loop {
+            let (bytes, mut fds) = self.receive_any();
+            let Some(fd) = fds.pop() else { break };
+            seen.push(take_in(&peer, &bytes, fd));
+        }
+        (peer, Gid(ids[16..].try_into().expect("a GID")), at, seen)
     }
 
     fn send(&self, bytes: &[u8], fds: &[BorrowedFd<'_>]) {
@@ -149,15 +202,29 @@ impl Wire {
         let mut control = SendAncillaryBuffer::new(&mut space);
         assert!(fds.is_empty() || control.push(SendAncillaryMessage::ScmRights(fds)));
         let flags = SendFlags::NOSIGNAL;
-        sendmsg(&self.0, &[IoSlice::new(bytes)], &mut control, flags).expect("a packet sent");
+        sendmsg(&self.socket, &[IoSlice::new(bytes)], &mut control, flags).expect("a packet sent");
     }
 
+    /// The next packet that is not a segment.
     fn receive(&self) -> (Vec<u8>, Vec<OwnedFd>) {
+        loop {
+            let (bytes, mut fds) = self.receive_any();
+            match fds.pop() {
+                Some(fd) if fds.is_empty() => self.pending.borrow_mut().push((bytes, fd)),
+                last => {
+                    fds.extend(last);
+                    return (bytes, fds);
+                }
+            }
+        }
+    }
+
+    fn receive_any(&self) -> (Vec<u8>, Vec<OwnedFd>) {
         let mut bytes = vec![0; 64];
         let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(4))];
         let mut control = RecvAncillaryBuffer::new(&mut space);
         let flags = RecvFlags::CMSG_CLOEXEC;
-        let got = recvmsg(&self.0, &mut [IoSliceMut::new(&mut bytes)], &mut control, flags)
+        let got = recvmsg(&self.socket, &mut [IoSliceMut::new(&mut bytes)], &mut control, flags)
             .expect("a packet");
         bytes.truncate(got.bytes);
         let mut fds = Vec::new();
@@ -170,22 +237,34 @@ impl Wire {
     }
 }
 
+/// Maps a segment that was handed over.
+fn take_in(peer: &PeerSession, bytes: &[u8], fd: OwnedFd) -> OwnedFd {
+    let (number, publisher) = bytes.split_at(4);
+    let number = u32::from_le_bytes(number.try_into().expect("a number"));
+    let publisher = Gid(publisher.try_into().expect("a GID"));
+    let kind =
+        if publisher.0 == [0; 16] { SegmentKind::Heap } else { SegmentKind::Samples(publisher) };
+    peer.add_segment(SegmentInfo { number, kind }, &fd).expect("a segment");
+    fd
+}
+
 /// What it takes to map a reader of `writer`.
 pub(crate) fn options(
     session: &SessionSegment,
     peer: Arc<PeerSession>,
     writer: Gid,
+    ring: Location,
     lane: Lane,
     grant: Grant,
     qos: Qos,
 ) -> ReaderOptions {
     let reader = Gid::new(session.id(), 1);
     let (peer, max_message) = (Peer::Remote(peer), LARGEST);
-    ReaderOptions { reader, writer, peer, lane, grant, qos, max_message }
+    ReaderOptions { reader, writer, peer, ring, lane, grant, qos, max_message }
 }
 
 impl Granted {
     pub(crate) fn map(self) -> Reader {
-        Reader::map(self.ring, self.options).expect("a ring")
+        Reader::map(self.options).expect("a ring")
     }
 }

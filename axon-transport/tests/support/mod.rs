@@ -3,7 +3,7 @@
 
 use std::{
     ffi::OsString,
-    io::{BufRead, BufReader, Lines},
+    io::{BufRead, BufReader, Lines, Write as _},
     path::Path,
     process::{Child, ChildStdout, Command, Stdio},
     time::{Duration, Instant},
@@ -146,6 +146,13 @@ impl Player {
 
     pub(crate) fn pid(&self) -> u32 {
         self.child.0.id()
+    }
+
+    /// Tells it to go on.
+    #[allow(dead_code, reason = "what the sizes are measured with")]
+    pub(crate) fn go(&mut self) {
+        let mut stdin = self.child.0.stdin.as_ref().expect("its input");
+        stdin.write_all(b"go\n").unwrap();
     }
 
     /// Closes its standard input, on which it waits, and waits for its end.

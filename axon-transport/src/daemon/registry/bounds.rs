@@ -4,7 +4,9 @@ use super::*;
 use crate::{
     graph::EndpointKind,
     qos::Qos,
-    session::message::{Announce, EndpointRole, Message, StatusPart},
+    session::message::{
+        Announce, EndpointRole, Message, Segment, SegmentName, SegmentOpened, StatusPart,
+    },
 };
 
 type Label = &'static str;
@@ -54,9 +56,10 @@ fn announce_as(
     endpoint: Endpoint,
     role: EndpointRole,
 ) {
-    let fds = if endpoint.kind == EndpointKind::Publisher { vec!["ring"] } else { vec![] };
-    let message = Message::Endpoint(Announce { endpoint, role, stands_for: vec![] });
-    registry.message(&id(session), message, fds).unwrap();
+    let place = Location { segment: 0, offset: 4096 };
+    let ring = (endpoint.kind == EndpointKind::Publisher).then_some(place);
+    let message = Message::Endpoint(Announce { endpoint, role, stands_for: vec![], ring });
+    registry.message(&id(session), message, vec![]).unwrap();
 }
 
 fn whole_graphs(messages: &[Message]) -> usize {
@@ -199,4 +202,21 @@ fn who_asks_again_is_told_the_same_status_from_its_beginning() {
     registry.tell_status(&id(1), Vec::new().into());
     let one = drain(&mut registry, 1);
     assert!(matches!(&one[..], [Message::Status(part)] if part.parts == 1));
+}
+
+#[test]
+fn the_segments_of_a_session_are_bounded_and_it_is_told() {
+    let mut registry = registry(&[SessionRole::Application]);
+    let session = id(1);
+    for number in 1..=MAX_SEGMENTS as u32 + 1 {
+        let segment = Segment { number, publisher: None };
+        let opened = Message::Segment(SegmentOpened { session, segment });
+        registry.message(&session, opened, vec!["map"]).unwrap();
+    }
+    assert_eq!(registry.session(&session).unwrap().segments.len(), MAX_SEGMENTS);
+    let refused = drain(&mut registry, 1);
+    assert!(refused.iter().any(|m| matches!(m, Message::Refused(r) if r.text.contains("memory"))));
+    let gone = Message::SegmentGone(SegmentName { session, number: 1 });
+    registry.message(&session, gone, vec![]).unwrap();
+    assert_eq!(registry.session(&session).unwrap().segments.len(), MAX_SEGMENTS - 1);
 }

@@ -58,14 +58,23 @@ impl<F: Clone> Registry<F> {
         descriptors: Vec<F>,
     ) -> Result<(), Violation> {
         let tool = self.sessions.get(id).is_none_or(|s| s.role == SessionRole::Tool);
-        let carries = matches!(message, Message::Endpoint(_) | Message::Unknown(_));
+        let carries = matches!(message, Message::Segment(_) | Message::Unknown(_));
         if !descriptors.is_empty() && !carries {
             return Err(Violation::Descriptors(descriptors.len()));
         }
         match message {
             Message::Unknown(_) => Ok(()),
             _ if tool => Err(Violation::Unexpected),
-            Message::Endpoint(announce) => self.announce(id, announce, descriptors),
+            Message::Endpoint(announce) => self.announce(id, announce),
+            Message::Segment(opened) => self.open_segment(id, opened.segment, descriptors),
+            Message::SegmentGone(gone) => {
+                self.close_segment(id, gone.number);
+                Ok(())
+            }
+            Message::Need(need) => {
+                self.need_segment(id, &need.session, need.number);
+                Ok(())
+            }
             Message::EndpointGone(gone) => self.gone(id, gone.gid),
             Message::Attach(attach) => self.attach(id, attach),
             Message::Grant(grant) => self.grant(id, grant),
@@ -82,17 +91,11 @@ impl<F: Clone> Registry<F> {
         }
     }
 
-    fn announce(
-        &mut self,
-        id: &SessionId,
-        announce: Announce,
-        mut descriptors: Vec<F>,
-    ) -> Result<(), Violation> {
-        let Announce { endpoint, role, stands_for } = announce;
+    fn announce(&mut self, id: &SessionId, announce: Announce) -> Result<(), Violation> {
+        let Announce { endpoint, role, stands_for, ring } = announce;
         let gid = endpoint.gid;
-        let expected = usize::from(writes(endpoint.kind));
-        if descriptors.len() != expected {
-            return Err(Violation::Descriptors(descriptors.len()));
+        if ring.is_some() != writes(endpoint.kind) {
+            return Err(Violation::Unexpected);
         }
         let Some(entry) = self.sessions.get(id) else { return Ok(()) };
         let may = match role {
@@ -139,7 +142,6 @@ impl<F: Clone> Registry<F> {
         if role == EndpointRole::Application {
             self.graph_add_local(&endpoint);
         }
-        let ring = descriptors.pop();
         let local = LocalEndpoint { session: *id, endpoint, role, stands_for, ring };
         self.index(&local);
         self.endpoints.insert(gid, local);
@@ -205,7 +207,7 @@ impl<F: Clone> Registry<F> {
         let pair = Pair { reader: attach.reader, writer: attach.writer };
         // The pair may have ended while the message was on its way.
         let Some(asked) = self.pairs.get_mut(&pair) else { return Ok(()) };
-        let attach = Some(Attach { session: *id, ..attach });
+        let attach = Some(Attach { session: *id, segments: Vec::new(), ..attach });
         // A repetition is not passed on: whoever should know has been told, is about to be, or is
         // behind. Sessions that are told everything anew would otherwise set each other back
         // without end.
@@ -220,10 +222,12 @@ impl<F: Clone> Registry<F> {
     pub(super) fn forward_attach(&mut self, pair: &Pair) {
         let Some(attach) = self.pairs.get(pair).and_then(|p| p.attach.as_ref()) else { return };
         let Some(writer) = self.endpoints.get(&pair.writer) else { return };
-        let (message, reader_session, to) =
-            (Message::Attach(attach.clone()), attach.session, writer.session);
-        let descriptors = self.introduce(&to, &reader_session, pair);
-        self.push(&to, &message, descriptors);
+        let (mut attach, to) = (attach.clone(), writer.session);
+        let (of, lane) = (attach.session, attach.lane.segment);
+        let mut descriptors = self.introduce(&to, &of, pair);
+        // The publisher looks at nothing but the lane.
+        attach.segments = self.hand_over(&to, &of, [lane], &mut descriptors);
+        self.push(&to, &Message::Attach(attach), descriptors);
     }
 
     fn grant(&mut self, id: &SessionId, grant: Granted) -> Result<(), Violation> {
@@ -234,7 +238,7 @@ impl<F: Clone> Registry<F> {
         let Some(asked) = self.pairs.get_mut(&pair).filter(|p| p.attach.is_some()) else {
             return Ok(());
         };
-        let grant = Some(Granted { session: *id, ..grant });
+        let grant = Some(Granted { session: *id, segments: Vec::new(), ..grant });
         if asked.grant != grant {
             asked.grant = grant;
             self.forward_grant(&pair);
@@ -244,16 +248,22 @@ impl<F: Clone> Registry<F> {
 
     /// Tells the reader's session what the writer granted. Whether there was something to tell.
     pub(super) fn forward_grant(&mut self, pair: &Pair) -> bool {
-        let Some(grant) = self.pairs.get(pair).and_then(|p| p.grant) else { return false };
-        let (Some(reader), Some(writer)) =
-            (self.endpoints.get(&pair.reader), self.endpoints.get(&pair.writer))
+        let Some(mut grant) = self.pairs.get(pair).and_then(|p| p.grant.clone()) else {
+            return false;
+        };
+        let (Some(reader), true) =
+            (self.endpoints.get(&pair.reader), self.endpoints.contains_key(&pair.writer))
         else {
             return false;
         };
-        let to = reader.session;
-        let mut descriptors: Vec<F> = writer.ring.clone().into_iter().collect();
-        descriptors.extend(self.introduce(&to, &grant.session, pair));
+        let (to, of) = (reader.session, grant.session);
+        let mut descriptors = self.introduce(&to, &of, pair);
+        // The ring's own first: those that do not fit follow.
+        let numbers = self.segments_for(&of, &pair.writer);
+        let numbers = [grant.ring.segment].into_iter().chain(numbers);
+        grant.segments = self.hand_over(&to, &of, numbers, &mut descriptors);
         self.push(&to, &Message::Grant(grant), descriptors);
+        self.hand_over_rest(&to, &of, &pair.writer);
         true
     }
 
@@ -286,7 +296,7 @@ impl<F: Clone> Registry<F> {
             return Vec::new();
         };
         let Some(entry) = self.sessions.get_mut(to) else { return Vec::new() };
-        let held = entry.known.entry(*of).or_default();
+        let held = &mut entry.known.entry(*of).or_default().pairs;
         let first = held.is_empty();
         held.insert(*pair);
         if first { descriptors.into() } else { Vec::new() }
@@ -297,8 +307,8 @@ impl<F: Clone> Registry<F> {
         if let Some(entry) = self.sessions.get_mut(at)
             && let Some(held) = entry.known.get_mut(of)
         {
-            held.remove(pair);
-            if held.is_empty() {
+            held.pairs.remove(pair);
+            if held.pairs.is_empty() {
                 entry.known.remove(of);
             }
         }

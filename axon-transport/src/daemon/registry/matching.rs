@@ -9,7 +9,7 @@ use crate::{
 };
 
 impl<F: Clone> Registry<F> {
-    pub(super) fn index(&mut self, local: &LocalEndpoint<F>) {
+    pub(super) fn index(&mut self, local: &LocalEndpoint) {
         let members = self.topics.entry(topic(&local.endpoint)).or_default();
         if writes(local.endpoint.kind) {
             members.writers.insert(local.endpoint.gid);

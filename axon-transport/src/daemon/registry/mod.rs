@@ -11,6 +11,7 @@ mod graph;
 mod input;
 mod matching;
 mod output;
+mod segments;
 #[cfg(test)]
 mod tests;
 
@@ -24,13 +25,16 @@ pub use output::Output;
 use crate::{
     graph::Endpoint,
     ids::{DaemonId, Gid, SessionId},
-    session::message::{Attach, EndpointRole, Granted, GraphItem, Pair, SessionRole},
+    session::message::{Attach, EndpointRole, Granted, GraphItem, Pair, Segment, SessionRole},
+    shm::Location,
 };
 
 /// Packets that may wait for one session before it is told everything anew instead.
 pub const MAX_QUEUE: usize = if cfg!(test) { 24 } else { 4096 };
 /// Their bytes, likewise.
 pub const MAX_QUEUE_BYTES: usize = if cfg!(test) { 64 << 10 } else { 4 << 20 };
+/// Segments of one session's memory: as many descriptors of the daemon's.
+pub const MAX_SEGMENTS: usize = if cfg!(test) { 256 } else { 1024 };
 /// Pairs that the endpoints of one session may make when they are announced: what a thousand
 /// publishers and as many subscriptions make. The gateway's stand-ins are bounded by its links.
 pub const MAX_PAIRS: usize = if cfg!(test) { 1 << 10 } else { 1 << 20 };
@@ -47,7 +51,7 @@ const MAX_TOMBSTONES: usize = 4096;
 #[derive(Debug)]
 pub struct Registry<F> {
     sessions: BTreeMap<SessionId, SessionEntry<F>>,
-    endpoints: HashMap<Gid, LocalEndpoint<F>>,
+    endpoints: HashMap<Gid, LocalEndpoint>,
     topics: HashMap<Topic, Members>,
     pairs: BTreeMap<Pair, Asked>,
     remote: BTreeMap<DaemonId, BTreeMap<Gid, Endpoint>>,
@@ -75,8 +79,10 @@ pub struct SessionEntry<F> {
     pub endpoints: BTreeSet<Gid>,
     /// Segment, doorbell and pidfd; a tool has none.
     pub descriptors: Option<[F; 3]>,
-    /// Other sessions whose descriptors it holds, and the pairs for which it does.
-    known: HashMap<SessionId, HashSet<Pair>>,
+    /// The segments of its memory besides the first, by number.
+    pub segments: BTreeMap<u32, SessionSegment<F>>,
+    /// Other sessions whose descriptors it holds.
+    known: HashMap<SessionId, Known>,
     queue: VecDeque<Output<F>>,
     queue_limit: usize,
     queued_bytes: usize,
@@ -92,9 +98,27 @@ pub struct SessionEntry<F> {
     refused: bool,
 }
 
+/// A segment of a session's memory.
+#[derive(Clone, Debug)]
+pub struct SessionSegment<F> {
+    /// What it is.
+    pub segment: Segment,
+    /// Its descriptor.
+    pub descriptor: F,
+}
+
+/// What a session holds of another.
+#[derive(Debug, Default)]
+struct Known {
+    /// The pairs for which it does.
+    pairs: HashSet<Pair>,
+    /// The numbers of the segments that it was handed.
+    segments: BTreeSet<u32>,
+}
+
 /// An endpoint of a session here.
 #[derive(Debug)]
-pub struct LocalEndpoint<F> {
+pub struct LocalEndpoint {
     /// Whose it is.
     pub session: SessionId,
     /// The endpoint.
@@ -103,8 +127,8 @@ pub struct LocalEndpoint<F> {
     pub role: EndpointRole,
     /// A relay's remote subscriptions.
     pub stands_for: Vec<Gid>,
-    /// A writer's ring.
-    pub ring: Option<F>,
+    /// Where a writer's ring is.
+    pub ring: Option<Location>,
 }
 
 /// How far a pair has come.
@@ -141,6 +165,9 @@ pub enum Violation {
     /// An endpoint of another session, or a role that is not the session's.
     #[error("endpoint {0} is not its own")]
     NotItsOwn(Gid),
+    /// A segment of memory that it announced before, or with its introduction.
+    #[error("segment {0} of its memory")]
+    Segments(u32),
     /// Too many sessions.
     #[error("more than {MAX_SESSIONS} sessions")]
     Sessions,
@@ -182,7 +209,7 @@ impl<F: Clone> Registry<F> {
     }
 
     /// The endpoints of sessions here.
-    pub fn endpoints(&self) -> impl Iterator<Item = &LocalEndpoint<F>> {
+    pub fn endpoints(&self) -> impl Iterator<Item = &LocalEndpoint> {
         self.endpoints.values()
     }
 

@@ -1,7 +1,7 @@
 //! What sessions are told.
 
 use std::{
-    collections::{BTreeSet, HashMap, VecDeque},
+    collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
     sync::Arc,
 };
 
@@ -186,6 +186,7 @@ pub(super) fn session_entry<F>(
         pid,
         endpoints: BTreeSet::new(),
         descriptors,
+        segments: BTreeMap::new(),
         known: HashMap::new(),
         queue: VecDeque::new(),
         queue_limit: MAX_QUEUE,

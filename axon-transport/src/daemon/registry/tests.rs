@@ -10,7 +10,9 @@ use super::*;
 use crate::{
     graph::EndpointKind,
     qos::{Qos, Reliability, compatible},
-    session::message::{Announce, Gone, Granted, Message, Unmatch},
+    session::message::{
+        Announce, Gone, Granted, Message, Segment, SegmentName, SegmentOpened, Unmatch,
+    },
 };
 
 /// A descriptor in these tests: whose it is, and which.
@@ -38,8 +40,15 @@ fn endpoint(gid: Gid, kind: EndpointKind, topic: u8, qos: Qos) -> Endpoint {
     }
 }
 
+const PLACE: Location = Location { segment: 0, offset: 4096 };
+
 fn announce(endpoint: Endpoint) -> Message {
-    Message::Endpoint(Announce { endpoint, role: EndpointRole::Application, stands_for: vec![] })
+    announce_as(endpoint, EndpointRole::Application)
+}
+
+fn announce_as(endpoint: Endpoint, role: EndpointRole) -> Message {
+    let ring = (endpoint.kind == EndpointKind::Publisher).then_some(PLACE);
+    Message::Endpoint(Announce { endpoint, role, stands_for: vec![], ring })
 }
 
 /// A session that does what the client does, without rings.
@@ -51,6 +60,9 @@ struct Client {
     endpoints: BTreeMap<Gid, Endpoint>,
     attached: BTreeSet<Pair>,
     held: HashMap<SessionId, HashSet<Pair>>,
+    /// Segments of its own, and those of the sessions that it holds.
+    segments: BTreeMap<u32, Segment>,
+    mapped: HashMap<SessionId, BTreeSet<u32>>,
     graph: BTreeMap<Gid, Option<DaemonId>>,
     building: Option<BTreeMap<Gid, Option<DaemonId>>>,
     repeated: Option<HashSet<Pair>>,
@@ -59,7 +71,11 @@ struct Client {
 }
 
 impl Client {
-    fn hold(&mut self, of: SessionId, pair: Pair, came: &[Label]) {
+    fn hold(&mut self, of: SessionId, pair: Pair, came: &[Label], segments: &[Segment]) {
+        let (came, maps) = came.split_at(came.len() - segments.len());
+        for (segment, label) in segments.iter().zip(maps) {
+            self.map(of, segment, label);
+        }
         if of == self.id {
             assert!(came.is_empty(), "one's own descriptors");
             return;
@@ -73,9 +89,17 @@ impl Client {
         pairs.insert(pair);
     }
 
+    fn map(&mut self, of: SessionId, segment: &Segment, label: &Label) {
+        assert_eq!(*label, (of, "map"));
+        self.mapped.entry(of).or_default().insert(segment.number);
+    }
+
     fn release(&mut self, pair: &Pair) {
-        self.held.retain(|_, pairs| {
+        self.held.retain(|of, pairs| {
             pairs.remove(pair);
+            if pairs.is_empty() {
+                self.mapped.remove(of);
+            }
             !pairs.is_empty()
         });
     }
@@ -112,10 +136,11 @@ impl Client {
                     let attach = Attach {
                         reader: pair.reader,
                         writer: pair.writer,
-                        lane: 0,
+                        lane: PLACE,
                         qos: reader.qos,
                         session: self.id,
                         stands_for: vec![],
+                        segments: vec![],
                     };
                     self.outgoing.push((Message::Attach(attach), vec![]));
                 }
@@ -125,12 +150,20 @@ impl Client {
                 if let Some(repeated) = &mut self.repeated {
                     repeated.insert(pair);
                 }
-                self.hold(attach.session, pair, fds);
+                self.hold(attach.session, pair, fds, &attach.segments);
                 if self.endpoints.contains_key(&pair.writer) {
                     self.attached.insert(pair);
                     let Pair { reader, writer } = pair;
                     let session = self.id;
-                    let grant = Granted { reader, writer, generation: 1, first: 0, session };
+                    let grant = Granted {
+                        reader,
+                        writer,
+                        generation: 1,
+                        first: 0,
+                        session,
+                        ring: PLACE,
+                        segments: vec![],
+                    };
                     self.outgoing.push((Message::Grant(grant), vec![]));
                 }
             }
@@ -139,8 +172,7 @@ impl Client {
                 if let Some(repeated) = &mut self.repeated {
                     repeated.insert(pair);
                 }
-                assert_eq!(fds[0], (grant.session, "ring"));
-                self.hold(grant.session, pair, &fds[1..]);
+                self.hold(grant.session, pair, fds, &grant.segments);
                 if self.endpoints.contains_key(&pair.reader) {
                     self.attached.insert(pair);
                 }
@@ -152,6 +184,14 @@ impl Client {
             Message::Detach(pair) => {
                 self.release(&pair);
                 self.attached.remove(&pair);
+            }
+            Message::Segment(SegmentOpened { session, segment }) => {
+                self.map(session, &segment, &fds[0]);
+            }
+            Message::SegmentGone(SegmentName { session, number }) => {
+                if let Some(mapped) = self.mapped.get_mut(&session) {
+                    mapped.remove(&number);
+                }
             }
             other => panic!("a session is never told {other:?}"),
         }
@@ -185,6 +225,21 @@ enum Step {
         remove: u8,
     },
     RemoteGone(u8),
+    /// More memory, of all publishers or of one.
+    Open {
+        session: u8,
+        which: Option<prop::sample::Index>,
+    },
+    Close {
+        session: u8,
+        which: prop::sample::Index,
+    },
+    /// Asks for a segment of another that may be there or not.
+    Need {
+        session: u8,
+        of: u8,
+        number: u32,
+    },
 }
 
 const SESSIONS: u8 = 5;
@@ -202,7 +257,13 @@ fn step() -> impl Strategy<Value = Step> {
         8 => session.clone().prop_map(Step::Up),
         8 => (session.clone(), 0u8..40).prop_map(|(s, n)| Step::Down(s, n)),
         4 => Just(Step::Flush),
-        1 => session.prop_map(Step::Resync),
+        1 => session.clone().prop_map(Step::Resync),
+        4 => (session.clone(), prop::option::of(any::<prop::sample::Index>()))
+            .prop_map(|(session, which)| Step::Open { session, which }),
+        2 => (session.clone(), any::<prop::sample::Index>())
+            .prop_map(|(session, which)| Step::Close { session, which }),
+        1 => (session.clone(), session, 0u32..9)
+            .prop_map(|(session, of, number)| Step::Need { session, of, number }),
         2 => (0u8..3, any::<bool>(), 0u8..8, 0u8..8)
             .prop_map(|(daemon, reset, add, remove)| Step::Remote { daemon, reset, add, remove }),
         1 => (0u8..3).prop_map(Step::RemoteGone),
@@ -269,8 +330,7 @@ impl World {
                     if reliable { Reliability::Reliable } else { Reliability::BestEffort };
                 let new = endpoint(gid, kind, topic, Qos { reliability, ..Qos::default() });
                 client.endpoints.insert(gid, new.clone());
-                let fds = if writes { vec![(client.id, "ring")] } else { vec![] };
-                client.outgoing.push((announce(new), fds));
+                client.outgoing.push((announce(new), vec![]));
             }
             Step::Remove { session, which } => {
                 let Some(client) = self.clients.get_mut(&session) else { return };
@@ -297,6 +357,35 @@ impl World {
                 let added = vec![endpoint(gid(add), kind, 0, Qos::default())];
                 let id = DaemonId([daemon; 16]);
                 self.registry.remote_graph(id, reset, added, vec![gid(remove)]);
+            }
+            Step::Open { session, which } => {
+                let Some(client) = self.clients.get_mut(&session) else { return };
+                client.number += 1;
+                let own = |at: prop::sample::Index| {
+                    let all = &client.endpoints;
+                    (!all.is_empty()).then(|| *all.keys().nth(at.index(all.len())).unwrap())
+                };
+                let segment = Segment { number: client.number, publisher: which.and_then(own) };
+                client.segments.insert(segment.number, segment);
+                let opened = SegmentOpened { session: client.id, segment };
+                client.outgoing.push((Message::Segment(opened), vec![(client.id, "map")]));
+            }
+            Step::Close { session, which } => {
+                let Some(client) = self.clients.get_mut(&session) else { return };
+                if client.segments.is_empty() {
+                    return;
+                }
+                let at = which.index(client.segments.len());
+                let number = *client.segments.keys().nth(at).unwrap();
+                client.segments.remove(&number);
+                let gone = SegmentName { session: client.id, number };
+                client.outgoing.push((Message::SegmentGone(gone), vec![]));
+            }
+            Step::Need { session, of, number } => {
+                let Some(of) = self.clients.get(&of).map(|client| client.id) else { return };
+                let Some(client) = self.clients.get_mut(&session) else { return };
+                let need = SegmentName { session: of, number };
+                client.outgoing.push((Message::Need(need), vec![]));
             }
             Step::RemoteGone(daemon) => self.registry.remote_gone(&DaemonId([daemon; 16])),
         }
@@ -342,11 +431,37 @@ impl World {
             let expected = pairs.remove(&client.id).unwrap_or_default();
             assert_eq!(client.attached, expected, "the pairs of {}", client.id);
             let entry = self.registry.session(&client.id).unwrap();
-            assert_eq!(entry.known, client.held, "what {} holds", client.id);
+            let known: HashMap<_, _> =
+                entry.known.iter().map(|(of, known)| (*of, known.pairs.clone())).collect();
+            assert_eq!(known, client.held, "what {} holds", client.id);
+            for pair in client.attached.iter().filter(|p| client.endpoints.contains_key(&p.reader))
+            {
+                self.check_mapped(client, pair);
+            }
         }
         assert_eq!(self.registry.endpoints.len(), all.len());
         assert!(self.registry.topics.values().all(|m| m.writers.len() + m.readers.len() > 0));
         assert_eq!(self.registry.sessions.len(), self.clients.len());
+    }
+}
+
+impl World {
+    /// A reader has all the memory in which its writer's samples may be.
+    fn check_mapped(&self, client: &Client, pair: &Pair) {
+        let owner = |c: &&Client| c.endpoints.contains_key(&pair.writer);
+        let of = self.clients.values().find(owner).expect("a writer that is attached to");
+        if of.id == client.id {
+            return;
+        }
+        let none = BTreeSet::new();
+        let mapped = client.mapped.get(&of.id).unwrap_or(&none);
+        for segment in of.segments.values() {
+            if segment.publisher.is_none_or(|publisher| publisher == pair.writer) {
+                let number = segment.number;
+                assert!(mapped.contains(&number), "{} lacks {number} of {}", client.id, of.id);
+            }
+        }
+        assert!(mapped.iter().all(|number| of.segments.contains_key(number)), "gone is gone");
     }
 }
 
@@ -390,11 +505,21 @@ fn what_no_session_does_is_a_violation() {
     assert_eq!(gone, Err(Violation::NotItsOwn(foreign.gid)));
 
     let writer = endpoint(Gid::new(own, 1), EndpointKind::Publisher, 0, Qos::default());
-    let without = registry.message(&own, announce(writer.clone()), vec![]);
-    assert_eq!(without, Err(Violation::Descriptors(0)));
+    let role = EndpointRole::Application;
+    let placeless = Announce { endpoint: writer.clone(), role, stands_for: vec![], ring: None };
+    let placeless = registry.message(&own, Message::Endpoint(placeless), vec![]);
+    assert_eq!(placeless, Err(Violation::Unexpected));
+    let segment = Segment { number: 3, publisher: None };
+    let opened = Message::Segment(SegmentOpened { session: own, segment });
+    for fds in [vec![], vec![(own, "map"); 2]] {
+        let opened = registry.message(&own, opened.clone(), fds);
+        assert!(matches!(opened, Err(Violation::Descriptors(_))));
+    }
+    registry.message(&own, opened.clone(), vec![(own, "map")]).unwrap();
+    let twice = registry.message(&own, opened, vec![(own, "map")]);
+    assert_eq!(twice, Err(Violation::Segments(3)));
     for role in [EndpointRole::StandIn, EndpointRole::Relay] {
-        let announce = Announce { endpoint: writer.clone(), role, stands_for: vec![] };
-        let taken = registry.message(&own, Message::Endpoint(announce), vec![(own, "ring")]);
+        let taken = registry.message(&own, announce_as(writer.clone(), role), vec![]);
         assert_eq!(taken, Err(Violation::NotItsOwn(writer.gid)), "{role:?}");
     }
     let littered = registry.message(&own, Message::Resync, vec![(own, "ring")]);
@@ -433,12 +558,7 @@ fn a_sample_never_goes_back_to_where_it_came_from() {
     let local = endpoint(Gid::new(own, 1), EndpointKind::Subscription, 0, Qos::default());
     let talker = endpoint(Gid::new(own, 2), EndpointKind::Publisher, 0, Qos::default());
     let say = |registry: &mut Registry<Label>, who, endpoint: &Endpoint, role| {
-        let fds = match endpoint.kind {
-            EndpointKind::Publisher => vec![(who, "ring")],
-            _ => vec![],
-        };
-        let announce = Announce { endpoint: endpoint.clone(), role, stands_for: vec![] };
-        registry.message(&who, Message::Endpoint(announce), fds).unwrap();
+        registry.message(&who, announce_as(endpoint.clone(), role), vec![]).unwrap();
     };
     say(&mut world.registry, gateway, &remote, EndpointRole::StandIn);
     say(&mut world.registry, gateway, &relay, EndpointRole::Relay);

@@ -11,12 +11,12 @@ use crate::{
     ids::{Gid, SessionId},
     passed::PassedFd,
     session::{
-        message::{Attach, Granted, Graph, Message, Pair, Unmatch},
+        message::{Attach, Granted, Graph, Message, Pair, Segment, SegmentOpened, Unmatch},
         peers::PeerError,
         state::{SessionEvent, StatusAnswer},
         subscription::{Accept, SubscriptionInner},
     },
-    shm::{Grant, Peer, Reader, ReaderInfo, ReaderOptions, ShmError},
+    shm::{Grant, Location, Peer, Reader, ReaderInfo, ReaderOptions, ShmError},
 };
 
 impl Control {
@@ -31,6 +31,12 @@ impl Control {
                 self.detach_reader(&pair);
             }
             Message::Unmatch(unmatch) => self.unmatch(&unmatch),
+            Message::Segment(opened) => self.segment(&opened, &descriptors),
+            Message::SegmentGone(gone) => {
+                if let Some(peer) = self.peers.get(&gone.session) {
+                    peer.remove_segment(gone.number);
+                }
+            }
             Message::Status(part) => {
                 let mut state = self.shared.state();
                 if let StatusAnswer::Parts(text) = &mut state.status
@@ -156,7 +162,7 @@ impl Control {
         &mut self,
         subscription: &SubscriptionInner,
         writer: Gid,
-        lane: Result<u32, ShmError>,
+        lane: Result<Location, ShmError>,
     ) {
         match lane {
             Ok(lane) => {
@@ -174,7 +180,7 @@ impl Control {
         &self,
         subscription: &SubscriptionInner,
         writer: Gid,
-        lane: u32,
+        lane: Location,
     ) -> Message {
         Message::Attach(Attach {
             reader: subscription.endpoint.gid,
@@ -183,6 +189,7 @@ impl Control {
             qos: subscription.endpoint.qos,
             session: self.shared.id,
             stands_for: stands_for(subscription),
+            segments: Vec::new(),
         })
     }
 
@@ -192,7 +199,7 @@ impl Control {
             repeated.insert(pair);
         }
         // Counted whether or not it comes to anything, as the daemon does.
-        let peer = self.hold(attach.session, pair, descriptors);
+        let peer = self.hold(attach.session, pair, descriptors, &attach.segments);
         let Some(publisher) = self.shared.state().publishers.get(&attach.writer).cloned() else {
             return;
         };
@@ -205,7 +212,9 @@ impl Control {
             Ok(Grant { generation, first }) => {
                 let Pair { reader, writer } = pair;
                 let session = self.shared.id;
-                let grant = Granted { reader, writer, generation, first, session };
+                let ring = publisher.writer.location();
+                let segments = Vec::new();
+                let grant = Granted { reader, writer, generation, first, session, ring, segments };
                 self.outbox.push_back((Message::Grant(grant), Vec::new()));
                 self.shared.notify(Some(&SessionEvent::Matched(writer)));
             }
@@ -216,14 +225,13 @@ impl Control {
         }
     }
 
-    fn grant(&mut self, granted: Granted, mut descriptors: Vec<PassedFd>) {
-        let Granted { reader, writer, generation, first, session } = granted;
+    fn grant(&mut self, granted: Granted, descriptors: Vec<PassedFd>) {
+        let Granted { reader, writer, generation, first, session, ring, segments } = granted;
         let pair = Pair { reader, writer };
         if let Some(repeated) = &mut self.repeated {
             repeated.insert(pair);
         }
-        let others = if descriptors.is_empty() { Vec::new() } else { descriptors.split_off(1) };
-        let peer = self.hold(session, pair, others);
+        let peer = self.hold(session, pair, descriptors, &segments);
         let Some(subscription) = self.shared.state().subscriptions.get(&reader).cloned() else {
             return;
         };
@@ -242,22 +250,19 @@ impl Control {
             Accept::Map(lane) => lane,
         };
         drop(slots);
-        let mapped = match (peer, descriptors.pop()) {
-            (Ok(peer), Some(ring)) => {
-                let options = ReaderOptions {
-                    reader,
-                    writer,
-                    peer,
-                    lane,
-                    grant,
-                    qos: subscription.endpoint.qos,
-                    max_message: self.shared.config.max_message,
-                };
-                Reader::map(ring, options).map_err(|e| e.to_string())
-            }
-            (Err(error), _) => Err(error.to_string()),
-            (_, None) => Err("its ring did not come".to_owned()),
-        };
+        let mapped = peer.map_err(|e| e.to_string()).and_then(|peer| {
+            let options = ReaderOptions {
+                reader,
+                writer,
+                peer,
+                ring,
+                lane,
+                grant,
+                qos: subscription.endpoint.qos,
+                max_message: self.shared.config.max_message,
+            };
+            Reader::map(options).map_err(|e| e.to_string())
+        });
         match mapped {
             Ok(mapped) => {
                 subscription.lock().add(mapped);
@@ -278,13 +283,26 @@ impl Control {
         session: SessionId,
         pair: Pair,
         descriptors: Vec<PassedFd>,
+        segments: &[Segment],
     ) -> Result<Peer, PeerError> {
-        let held = self.peers.hold(session, pair, descriptors);
+        let held = self.peers.hold(session, pair, descriptors, segments);
         if matches!(held, Err(PeerError::Missing)) {
             // The daemon takes us to hold what we do not: have it start over.
             self.outbox.push_back((Message::Resync, Vec::new()));
         }
         held
+    }
+
+    fn segment(&self, opened: &SegmentOpened, descriptors: &[PassedFd]) {
+        let (Some(peer), [descriptor]) = (self.peers.get(&opened.session), descriptors) else {
+            return;
+        };
+        if let Err(error) = peer.add_segment(opened.segment.into(), descriptor) {
+            let (session, number) = (opened.session, opened.segment.number);
+            tracing::error!(%session, number, %error, "memory of another process is not usable");
+        }
+        // Those who wait for what is in it.
+        self.shared.segment.notify();
     }
 
     fn unmatch(&mut self, unmatch: &Unmatch) {
@@ -307,6 +325,7 @@ impl Control {
         if publisher.is_some_and(|p| p.detach(pair.reader)) {
             self.shared.notify(Some(&SessionEvent::Matched(pair.writer)));
         }
+        self.shared.segment.tidy();
     }
 
     #[allow(clippy::type_complexity)]

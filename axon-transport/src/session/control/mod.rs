@@ -4,7 +4,7 @@
 mod handle;
 
 use std::{
-    collections::{HashSet, VecDeque},
+    collections::{BTreeSet, HashSet, VecDeque},
     os::fd::{AsFd, BorrowedFd, OwnedFd},
     sync::{
         Arc,
@@ -20,10 +20,10 @@ use super::{
     connect::{Caller, Connected},
     error::SessionError,
     local::Local,
-    message::{Announce, EndpointRole, Gone, Message, Pair},
+    message::{Announce, EndpointRole, Gone, Message, Pair, SegmentName, SegmentOpened},
     peers::Peers,
     socket::{self, SocketError},
-    state::{Outgoing, SessionEvent, Shared, StatusAnswer, StatusText},
+    state::{Outgoing, SegmentChange, SessionEvent, Shared, StatusAnswer, StatusText},
 };
 use crate::{graph::GraphView, ids::Gid, passed::PassedFd};
 
@@ -45,6 +45,8 @@ pub(super) struct Control {
     repeated: Option<HashSet<Pair>>,
     /// Whether this connection has brought a whole graph already.
     told: bool,
+    /// The segments of our memory that this connection was told of.
+    segments: BTreeSet<u32>,
 }
 
 enum Link {
@@ -56,7 +58,7 @@ enum Link {
 
 impl Control {
     pub(super) fn new(shared: Arc<Shared>, connected: Option<Connected>, reconnects: bool) -> Self {
-        let peers = Peers::new(shared.segment.clone());
+        let peers = Peers::new(shared.segment.clone(), shared.memory.clone());
         let mut control = Self {
             shared,
             link: Link::Ended,
@@ -67,6 +69,7 @@ impl Control {
             building: None,
             repeated: None,
             told: false,
+            segments: BTreeSet::new(),
         };
         match connected {
             Some(connected) => control.connected(connected),
@@ -88,7 +91,10 @@ impl Control {
             self.receive();
             self.bury();
         }
-        // What was queued last, such as ENDPOINT_GONE, is said by the end of the connection.
+        // What was queued last, such as ENDPOINT_GONE, is said by the end of the connection. Only
+        // of memory, in which readers may find the last samples, nobody else could tell.
+        self.tell_segments();
+        self.send();
     }
 
     fn connected(&mut self, connected: Connected) {
@@ -96,6 +102,7 @@ impl Control {
         self.building = None;
         self.repeated = None;
         self.told = false;
+        self.segments.clear();
         let daemon = connected.welcome.daemon;
         {
             let mut state = self.shared.state();
@@ -109,6 +116,9 @@ impl Control {
             state.outgoing.extend(gone.map(|m| Outgoing::Message(Box::new(m))));
         }
         self.link = Link::Socket(PassedFd::received(connected.socket));
+        for info in self.shared.segment.segments() {
+            self.tell_segment(SegmentChange::Opened(info.number));
+        }
         self.shared.notify(Some(&SessionEvent::DaemonFound(daemon)));
     }
 
@@ -172,9 +182,48 @@ impl Control {
         }
     }
 
+    /// Takes what changed in the session's memory, and what its readers lack of others'.
+    fn tell_segments(&mut self) {
+        for change in self.shared.memory.take() {
+            self.tell_segment(change);
+        }
+        for session in self.peers.sessions() {
+            for number in session.take_wanted() {
+                let need = SegmentName { session: session.id(), number };
+                self.outbox.push_back((Message::Need(need), Vec::new()));
+            }
+        }
+    }
+
+    fn tell_segment(&mut self, change: SegmentChange) {
+        let session = self.shared.id;
+        match change {
+            // Found here and noted there.
+            SegmentChange::Opened(number) if self.segments.contains(&number) => {}
+            SegmentChange::Opened(number) => match self.shared.segment.segment(number) {
+                Ok(Some((info, descriptor))) => {
+                    self.segments.insert(number);
+                    let opened = SegmentOpened { session, segment: info.into() };
+                    self.outbox.push_back((Message::Segment(opened), vec![descriptor.into()]));
+                }
+                // It is gone again.
+                Ok(None) => {}
+                Err(error) => tracing::error!(%error, "samples stay unseen by other processes"),
+            },
+            SegmentChange::Gone(number) => {
+                self.segments.remove(&number);
+                let gone = SegmentName { session, number };
+                self.outbox.push_back((Message::SegmentGone(gone), Vec::new()));
+            }
+        }
+    }
+
     /// Takes what the handles queued.
     fn collect(&mut self) {
         let shared = self.shared.clone();
+        if matches!(self.link, Link::Socket(_) | Link::Local(_)) {
+            self.tell_segments();
+        }
         let mut state = shared.state();
         if matches!(self.link, Link::Reconnecting(_) | Link::Ended) {
             // All of it is said to the next daemon from what stands then.
@@ -190,22 +239,15 @@ impl Control {
                             endpoint: publisher.endpoint.clone(),
                             role: publisher.role,
                             stands_for: Vec::new(),
+                            ring: Some(publisher.writer.location()),
                         };
-                        match publisher.writer.descriptor() {
-                            Ok(ring) => {
-                                self.outbox
-                                    .push_back((Message::Endpoint(announce), vec![ring.into()]));
-                            }
-                            Err(error) => {
-                                let topic = &publisher.endpoint.topic;
-                                tracing::error!(topic, %error, "a publisher stays unannounced");
-                            }
-                        }
+                        self.outbox.push_back((Message::Endpoint(announce), Vec::new()));
                     } else if let Some(subscription) = state.subscriptions.get(&gid) {
                         let announce = Announce {
                             endpoint: subscription.endpoint.clone(),
                             role: subscription.role,
                             stands_for: stands_for(subscription),
+                            ring: None,
                         };
                         self.outbox.push_back((Message::Endpoint(announce), Vec::new()));
                         if subscription.role == EndpointRole::Relay {

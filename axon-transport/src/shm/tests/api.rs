@@ -145,7 +145,7 @@ fn what_another_end_may_do_wrong_is_refused() {
     let closed = Subscriber::connect(&context, &ours, options, soon);
     assert!(matches!(closed, Err(ConnectError::Closed)));
     // Noise: packets, and a stream.
-    for noise in [&b""[..], b"x", &[0x82, 2, 0], &[0x82, 1, 0x82, 7, 0x80], &[0xff; 2000]] {
+    for noise in [&b""[..], b"x", &[0x82, 3, 0], &[0x82, 2, 0x82, 7, 0x80], &[0xff; 2000]] {
         let (ours, theirs) = UnixDatagram::pair().unwrap();
         theirs.send(noise).unwrap();
         let served = publisher.serve(&ours, soon);
@@ -161,12 +161,13 @@ fn what_another_end_may_do_wrong_is_refused() {
     let (ours, theirs) = UnixDatagram::pair().unwrap();
     let (a, b) = (SessionId::random(), SessionId::random());
     for reader in [Gid::new(a, 1), Gid::new(b, 1)] {
-        let asked = connect::Asked { session: a, reader, lane: 0, qos: Qos::default() };
+        let lane = Location { segment: 0, offset: 4096 };
+        let asked = connect::Asked { session: a, reader, lane, qos: Qos::default() };
         let channel = connect::Channel::new(theirs.as_fd(), soon);
         channel.ask(&asked, &context.session().descriptors().unwrap()).unwrap();
         assert!(publisher.serve(&ours, soon).is_err());
         // It is told.
-        assert!(channel.await_granted(reader).is_err());
+        assert!(channel.await_granted(reader, |_, _| ()).is_err());
     }
     assert!(publisher.subscribers().is_empty());
 }

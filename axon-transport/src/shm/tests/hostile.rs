@@ -13,35 +13,58 @@ use rustix::{
     pipe::pipe,
 };
 
-use super::{
-    super::{memory::Segment, ring::SLOT_WORDS},
-    *,
-};
+use super::{super::memory::Segment, *};
 
-const BYTES: u64 = layout::ALIGN * 4;
+const RING: u64 = layout::HEAP_AT;
+const ARRAY: u64 = RING + 512;
+const SLOTS: u64 = 16;
+const BLOCK: u64 = 32 << 10;
 
-/// A ring whose every word a test may scribble on.
+/// A session whose every word a test may scribble on, with a ring in it.
 struct Scribble {
     segment: Segment,
+    id: SessionId,
     gid: Gid,
-    session: Arc<SessionSegment>,
+    reader: Arc<SessionSegment>,
 }
 
 impl Scribble {
     fn new() -> Self {
-        let session = session();
-        let gid = Gid::new(session.id(), 1);
-        let segment = Segment::create("test", BYTES).unwrap();
-        layout::RingLayout::new(16, 0, 6000).write(segment.words(), gid);
-        Self { segment, gid, session }
+        let id = SessionId::random();
+        let gid = Gid::new(id, 1);
+        let segment = Segment::create("test", layout::SESSION_BYTES).unwrap();
+        layout::write_segment(segment.words(), id, 0, SegmentKind::Session);
+        let at = Location { segment: 0, offset: ARRAY };
+        let array = layout::Array { at, descriptors: SLOTS };
+        let ring = &segment.words()[RING as usize / 8..][..layout::RING_WORDS];
+        layout::write_ring(ring, gid, &array);
+        Self { segment, id, gid, reader: session() }
     }
 
     fn words(&self) -> &[AtomicU64] {
         self.segment.words()
     }
 
-    fn set(&self, byte: usize, value: u64) {
-        self.words()[byte / 8].store(value, Relaxed);
+    fn set(&self, byte: u64, value: u64) {
+        self.words()[byte as usize / 8].store(value, Relaxed);
+    }
+
+    fn set_tail(&self, tail: u64) {
+        self.set(RING + 256, tail);
+    }
+
+    fn set_head(&self, head: u64) {
+        self.set(RING + 128, head);
+    }
+
+    fn set_array(&self, word: u64) {
+        self.set(RING + 264, word);
+    }
+
+    fn peer(&self) -> Result<Arc<PeerSession>, ShmError> {
+        let segment = self.segment.fd().try_clone_to_owned().unwrap();
+        let segment = segment.into();
+        PeerSession::map(self.id, PeerDescriptors { segment, ..self.reader.descriptors().unwrap() })
     }
 
     fn map(&self, first: u64) -> Result<Reader, ShmError> {
@@ -49,26 +72,32 @@ impl Scribble {
     }
 
     fn map_as(&self, first: u64, qos: Qos) -> Result<Reader, ShmError> {
+        self.map_at(Location { segment: 0, offset: RING }, first, qos)
+    }
+
+    fn map_at(&self, ring: Location, first: u64, qos: Qos) -> Result<Reader, ShmError> {
         let options = ReaderOptions {
-            reader: Gid::new(self.session.id(), 2),
+            reader: Gid::new(self.reader.id(), 2),
             writer: self.gid,
-            peer: Peer::Local(self.session.clone()),
-            lane: self.session.allocate_lane().unwrap(),
+            peer: Peer::Remote(self.peer()?),
+            ring,
+            lane: self.reader.allocate_lane().unwrap(),
             grant: Grant { generation: 1, first },
             qos,
             max_message: MAX,
         };
-        Reader::map(self.segment.fd().try_clone_to_owned().unwrap(), options)
+        Reader::map(options)
     }
 
-    /// A slot as a publisher leaves it, but for what the test changes.
-    fn slot(&self, position: u64, len: u32, flags: u32, data: u64) {
-        let start = 4096 / 8 + (position % 16) as usize * SLOT_WORDS;
-        let fields = [2 * position + 2, 5, 6, u64::from(len) | u64::from(flags) << 32, data];
+    /// A descriptor as a publisher leaves it, but for what the test changes.
+    fn descriptor(&self, position: u64, len: u32, place: u32, data: u64) {
+        let start = ARRAY as usize / 8 + (position % SLOTS) as usize * layout::DESCRIPTOR_WORDS;
+        let stamp = position.wrapping_mul(2).wrapping_add(2);
+        let fields = [stamp, 5, 6, u64::from(len) | u64::from(place) << 32, data];
         for (word, value) in self.words()[start..].iter().zip(fields) {
             word.store(value, Relaxed);
         }
-        self.set(128, position + 1);
+        self.set_head(position + 1);
     }
 }
 
@@ -99,34 +128,35 @@ fn a_segment_must_be_a_sealed_memfd_of_a_sane_size() {
         (memfd(4096, good), size),
         (memfd(layout::ALIGN + 8, good), size),
         (memfd(1 << 60, good), size),
-        (memfd(BYTES, good), "it is not a ring"),
+        (memfd(layout::SESSION_BYTES, good), "it is not a segment of AXON"),
     ];
     for missing in [SealFlags::SHRINK, SealFlags::GROW, SealFlags::FUTURE_WRITE, SealFlags::SEAL] {
-        bad.push((memfd(BYTES, good - missing), "its seals are missing"));
+        bad.push((memfd(layout::SESSION_BYTES, good - missing), "its seals are missing"));
     }
     for (fd, reason) in bad {
-        let scribble = Scribble::new();
-        let options = ReaderOptions {
-            reader: scribble.gid,
-            writer: scribble.gid,
-            peer: Peer::Local(scribble.session.clone()),
-            lane: scribble.session.allocate_lane().unwrap(),
-            grant: Grant { generation: 1, first: 0 },
-            qos: Qos::default(),
-            max_message: MAX,
-        };
-        assert_eq!(refusal(Reader::map(fd.try_clone().unwrap(), options)), reason);
-        let mut descriptors = scribble.session.descriptors().unwrap();
-        descriptors.segment = fd.into();
-        assert!(PeerSession::map(scribble.session.id(), descriptors).is_err());
+        let mut descriptors = session().descriptors().unwrap();
+        descriptors.segment = fd.try_clone().unwrap().into();
+        match PeerSession::map(SessionId::random(), descriptors) {
+            Err(ShmError::Refused { what }) => assert_eq!(what, reason),
+            other => panic!("{:?}", other.map(|peer| peer.id())),
+        }
+        // As a further segment of a session that is sound otherwise: refused, and for good.
+        let a = session();
+        let peer = PeerSession::map(a.id(), a.descriptors().unwrap()).unwrap();
+        let info = SegmentInfo { number: 1, kind: SegmentKind::Heap };
+        assert!(peer.add_segment(info, &fd).is_err());
+        assert!(peer.has_segment(1));
+        assert!(Peer::Remote(peer).lane(Location { segment: 1, offset: 4096 }).is_err());
     }
 }
 
 #[test]
 fn what_is_handed_over_cannot_be_changed_by_whoever_gets_it() {
     let a = session();
-    let writer = writer(&a, keep_last(1), 0);
-    for fd in [writer.descriptor().unwrap().into(), a.descriptors().unwrap().segment] {
+    let writer = writer(&a, transient(keep_last(1)), 0);
+    writer.publish(meta(0), &[0; 5000]).unwrap();
+    let (_, samples) = a.segment(1).unwrap().unwrap();
+    for fd in [samples.into(), a.descriptors().unwrap().segment] {
         assert!(ftruncate(&fd, 0).is_err());
         assert!(rustix::io::write(&fd, b"x").is_err());
         assert!(fcntl_add_seals(&fd, SealFlags::WRITE).is_err());
@@ -136,40 +166,62 @@ fn what_is_handed_over_cannot_be_changed_by_whoever_gets_it() {
 }
 
 #[test]
-fn headers_that_make_no_sense_are_refused() {
-    let cases: [(usize, u64); 12] = [
-        (0, 0),
-        (0, u64::from_ne_bytes(*b"AXONSES1")),
-        (8, 16 << 32),
-        (8, 1 | 16 << 32),
-        (8, 2),
-        (8, 2 | 1 << 32),
-        (8, 2 | 17 << 32),
-        (8, 2 | 0x8000_0000 << 32),
-        (16, u64::MAX),
-        (16, 4096),
-        (24, u64::MAX - 63),
-        (32, 0x0123_4567),
-    ];
-    for (byte, value) in cases {
+fn rings_that_make_no_sense_are_refused() {
+    for (byte, value) in [(0, 0), (0, u64::from_ne_bytes(*b"AXONRNG1")), (16, 7)] {
         let scribble = Scribble::new();
-        scribble.set(byte, value);
+        scribble.set(RING + byte, value);
         refusal(scribble.map(0));
     }
+    for (segment, offset) in [
+        (0, 0),
+        (0, 128),
+        (0, RING + 8),
+        (0, layout::SESSION_BYTES - 256),
+        (0, u64::MAX),
+        (1, RING),
+    ] {
+        refusal(Scribble::new().map_at(Location { segment, offset }, 0, Qos::default()));
+    }
+    refusal(Scribble::new().map(u64::MAX));
     assert!(Scribble::new().map(0).is_ok());
+}
+
+#[test]
+fn segments_of_others_versions_and_machines_are_refused_by_name() {
+    let cases: [(u64, u64, &str); 9] = [
+        (0, u64::from_ne_bytes(*b"AXONSES1"), "not a segment"),
+        (8, 1 | 0x0a0b_0c0d << 32, "another version"),
+        (8, 3 | 0x0a0b_0c0d << 32, "another version"),
+        (8, 2 | 0x0d0c_0b0a << 32, "another byte order"),
+        (8, u64::from(2u32.swap_bytes()) | 0x0d0c_0b0a << 32, "another byte order"),
+        (16, 7, "another session"),
+        (32, 1, "another one"),
+        (32, 1 << 32, "another one"),
+        (40, layout::SESSION_BYTES - layout::ALIGN, "not as large"),
+    ];
+    for (byte, value, reason) in cases {
+        let scribble = Scribble::new();
+        scribble.set(byte, value);
+        match scribble.peer() {
+            Err(ShmError::Refused { what }) => assert!(what.contains(reason), "{what}"),
+            other => panic!("{reason}: {:?}", other.map(|peer| peer.id())),
+        }
+    }
 }
 
 #[test]
 fn sessions_that_make_no_sense_are_refused() {
     let a = session();
     assert!(PeerSession::map(SessionId::random(), a.descriptors().unwrap()).is_err());
-    for (word, value) in [(0, 0), (1, 1), (1, 2 | 1 << 48), (1, 2 | u64::from(u32::MAX) << 32)] {
-        let segment = Segment::create("test", layout::session_bytes()).unwrap();
-        layout::write_session(segment.words(), a.id());
-        segment.words()[word].store(value, Relaxed);
-        let mut descriptors = a.descriptors().unwrap();
-        descriptors.segment = segment.fd().try_clone_to_owned().unwrap().into();
-        assert!(PeerSession::map(a.id(), descriptors).is_err());
+    // A publisher's segment is not another's, nor one for everybody.
+    let writer = writer(&a, transient(keep_last(1)), 0);
+    writer.publish(meta(0), &[0; 5000]).unwrap();
+    let (info, fd) = a.segment(1).unwrap().unwrap();
+    assert_eq!(info.kind, SegmentKind::Samples(writer.gid()));
+    let other = SegmentKind::Samples(Gid::new(a.id(), 9));
+    for (number, kind) in [(1, SegmentKind::Heap), (1, other), (2, info.kind)] {
+        let peer = PeerSession::map(a.id(), a.descriptors().unwrap()).unwrap();
+        assert!(peer.add_segment(SegmentInfo { number, kind }, &fd).is_err());
     }
     // Whoever rings a pipe or an eventfd could be made to wait, and a stream be told something.
     let flags = rustix::event::EventfdFlags::NONBLOCK;
@@ -204,12 +256,14 @@ fn control_words_that_make_no_sense_are_reported_and_stay_so() {
     for (tail, head) in [(0, huge), (5, 4), (huge, 0), (huge, huge), (0, 1 << 63)] {
         let scribble = Scribble::new();
         let mut reader = scribble.map(0).unwrap();
-        scribble.set(256, tail);
-        scribble.set(128, head);
+        // One that is late looks at them.
+        scribble.descriptor(SLOTS, 1, 0, 0);
+        scribble.set_tail(tail);
+        scribble.set_head(head);
         let mut out = Vec::new();
         assert!(matches!(reader.take(&mut out), Err(TakeError::Corrupt { .. })));
-        scribble.set(256, 0);
-        scribble.set(128, 0);
+        scribble.set_tail(0);
+        scribble.set_head(0);
         assert!(matches!(reader.peek(), Err(TakeError::Corrupt { .. })));
         assert!(!reader.has_data());
     }
@@ -219,46 +273,107 @@ fn control_words_that_make_no_sense_are_reported_and_stay_so() {
 fn a_head_that_goes_back_is_reported() {
     let scribble = Scribble::new();
     let mut reader = scribble.map(7).unwrap();
-    scribble.set(128, 3);
+    scribble.descriptor(7 + SLOTS, 1, 0, 0);
+    scribble.set_head(3);
     assert!(matches!(reader.take(&mut Vec::new()), Err(TakeError::Corrupt { .. })));
 }
 
 #[test]
-fn slots_that_make_no_sense_are_reported() {
-    let area = BYTES - layout::ALIGN;
-    let cases = [
-        (97, 1, 0),
-        (u32::MAX, 1, 0),
-        (200, 0, area - 192),
-        (5000, 0, area - 4992),
-        (1, 0, area),
-        (1, 0, 3),
-        (1, 0, u64::MAX),
-        (u32::MAX, 0, 0),
-        (u32::MAX, 0, u64::MAX - 7),
-    ];
-    for (len, flags, data) in cases {
+fn descriptors_in_places_that_make_no_sense_are_reported() {
+    let mut words = vec![0, 1, 18, 30, 63, u64::MAX, !63 | 4];
+    // Behind the header's end but for the last line, before it, and beside it.
+    for offset in [0, 128, layout::SESSION_BYTES - 16 * 128 + 128, 1 << 40] {
+        words.push((offset / 128) << 6 | 4);
+    }
+    for word in words {
         let scribble = Scribble::new();
         let mut reader = scribble.map(0).unwrap();
-        scribble.slot(0, len, flags, data);
+        scribble.set_array(word);
+        assert!(reader.has_data(), "so that somebody looks");
         let taken = reader.take(&mut Vec::new());
-        assert!(matches!(taken, Err(TakeError::Corrupt { .. })), "{len} {flags} {data}");
-        assert!(matches!(reader.take_sample(), Err(TakeError::Corrupt { .. })));
+        let missing = word >> 40 != 0 && (1..=18).contains(&(word & 63));
+        if missing {
+            assert_eq!(taken, Ok(None));
+            assert!(reader.missing().is_some() && !reader.has_data());
+        } else {
+            assert!(matches!(taken, Err(TakeError::Corrupt { .. })), "{word:x}");
+        }
     }
-    // The same slot with what a publisher writes.
+    // Of its own accord it is as good elsewhere.
     let scribble = Scribble::new();
     let mut reader = scribble.map(0).unwrap();
-    scribble.slot(0, 200, 0, area - 256);
+    scribble.descriptor(0, 1, 0, 0);
+    for word in [ARRAY >> 7 << 6 | 3, ARRAY >> 7 << 6 | 1] {
+        scribble.set_array(word);
+        assert_eq!(reader.peek().unwrap(), Some(Meta { sequence: 5, source_timestamp: 6 }));
+    }
+}
+
+#[test]
+fn samples_in_places_that_make_no_sense_are_reported() {
+    let end = layout::SESSION_BYTES;
+    let cases = [
+        (97, 0, 0),
+        (u32::MAX, 0, 0),
+        (200, 1, end - 128),
+        (4096, 1, end - 4096 + 128),
+        (5000, 2, end - 4992),
+        (1, 1, end),
+        (1, 1, BLOCK + 8),
+        (1, 1, 0),
+        (1, 1, !127),
+        (5000, 2, !127),
+        (u32::MAX, 2, BLOCK),
+        // Too long to be copied, too short to be pinned, nowhere.
+        (4097, 1, BLOCK),
+        (4096, 2, BLOCK),
+        (1, 3, BLOCK),
+        (1, 0xff, BLOCK),
+    ];
+    for (len, place, data) in cases {
+        let scribble = Scribble::new();
+        let mut reader = scribble.map(0).unwrap();
+        reader.expect(u64::MAX);
+        scribble.descriptor(0, len, place, data);
+        let taken = reader.take(&mut Vec::new());
+        assert!(matches!(taken, Err(TakeError::Corrupt { .. })), "{len} {place} {data}");
+        assert!(matches!(reader.take_sample(), Err(TakeError::Corrupt { .. })));
+    }
+    // The same descriptor with what a publisher writes.
+    let scribble = Scribble::new();
+    let mut reader = scribble.map(0).unwrap();
+    scribble.descriptor(0, 200, 1, end - 256);
     let mut out = Vec::new();
     assert_eq!(reader.take(&mut out).unwrap().unwrap().meta.sequence, 5);
     assert_eq!(out, [0; 200]);
 }
 
 #[test]
+fn a_segment_that_never_comes_holds_no_reader_for_ever() {
+    let scribble = Scribble::new();
+    let mut reader = scribble.map_as(0, keep_last(2)).unwrap();
+    scribble.descriptor(0, 1, 1 | 77 << 8, BLOCK);
+    assert!(reader.has_data());
+    assert_eq!(reader.take(&mut Vec::new()), Ok(None));
+    assert_eq!(
+        (reader.missing(), reader.has_data(), reader.is_drained()),
+        (Some(77), false, false)
+    );
+    // What is more recent and fills the depth is there.
+    for position in 1..3 {
+        scribble.descriptor(position, 1, 0, 0);
+    }
+    assert!(reader.has_data());
+    assert_eq!(reader.take(&mut Vec::new()).unwrap().unwrap().position, 1);
+    assert_eq!((reader.missing(), reader.skipped()), (None, 1));
+}
+
+#[test]
 fn a_sample_longer_than_the_reader_allows_is_lost_and_the_next_is_not() {
     let session = session();
     let gid = Gid::new(session.id(), 1);
-    let options = RingOptions { gid, qos: keep_last(2), budget: 8 * MAX, max_message: 4 * MAX };
+    let options =
+        RingOptions { gid, qos: keep_last(2), budget: 8 * MAX, max_message: 4 * MAX, expected: 0 };
     let writer = Writer::create(session.clone(), options).unwrap();
     let mut reader = attach(&writer, &session, &session, keep_last(2));
     writer.publish(meta(1), &vec![0; 2 * MAX as usize]).unwrap();
@@ -275,7 +390,8 @@ fn lanes_that_make_no_sense_hold_nobody_for_ever() {
     let (a, b) = (session(), session());
     let writer = writer(&a, Qos::keep_all(), 8 * 1024);
     let reader = attach(&writer, &a, &b, Qos::keep_all());
-    let lane = b.lane_words(reader.lane());
+    let lane = peer(&b, &b).lane(reader.lane()).unwrap();
+    let lane = lane.words();
     for cursor in [u64::MAX, 1 << 63, 0] {
         lane[layout::lane::CURSOR].store(cursor, Relaxed);
         for sequence in 0..20 {
@@ -303,14 +419,18 @@ proptest! {
             // Small values make plausible heads, tails and lengths.
             let value = value >> (shift % 64);
             match word % 4 {
-                0 => scribble.set(128, value),
-                1 => scribble.set(256, value),
-                2 => scribble.slot(value % 64, value as u32 % 9000, (value >> 8) as u32 & 1, value),
-                _ => scribble.words()[4096 / 8 + word].store(value, Relaxed),
+                0 => scribble.set_head(value),
+                1 => scribble.set_tail(value),
+                2 => {
+                    let place = (value >> 8) as u32 & 0x1ff;
+                    let offset = (value % layout::SESSION_BYTES) & !127;
+                    scribble.descriptor(value % 64, value as u32 % 9000, place, offset);
+                }
+                _ => scribble.words()[RING as usize / 8 + word].store(value, Relaxed),
             }
             let _ = reader.peek();
             if let Ok(Some(taken)) = reader.take(&mut out) {
-                prop_assert!(out.len() as u64 <= BYTES);
+                prop_assert!(out.len() as u64 <= layout::SESSION_BYTES);
                 prop_assert!(taken.position >= first);
             }
             if let Ok(Some(sample)) = reader.take_sample() {

@@ -83,7 +83,7 @@ fn what_is_too_long_is_refused() {
     assert!(writer.loan(long.len()).is_err());
     for (budget, max_message) in [(u64::MAX, 1), (0, 1 << 32), (0, u64::MAX), (1 << 40, 1)] {
         let gid = writer.gid();
-        let options = RingOptions { gid, qos: Qos::default(), budget, max_message };
+        let options = RingOptions { gid, qos: Qos::default(), budget, max_message, expected: 0 };
         let refused = Writer::create(a.clone(), options);
         assert!(matches!(refused, Err(ShmError::TooLarge { .. })));
     }
@@ -93,12 +93,13 @@ fn what_is_too_long_is_refused() {
 fn the_largest_fits_at_depth_one_whatever_the_budget() {
     let (a, b) = (session(), session());
     let gid = Gid::new(a.id(), 1);
-    let options = RingOptions { gid, qos: keep_last(1), budget: 1 << 20, max_message: 25_000_000 };
+    let max_message = 25_000_000;
+    let options = RingOptions { gid, qos: keep_last(1), budget: 1 << 20, max_message, expected: 0 };
     let writer = Writer::create(a.clone(), options).unwrap();
     let lane = b.allocate_lane().unwrap();
     let info = ReaderInfo {
         gid: Gid::new(b.id(), 1),
-        lane: lane.index(),
+        lane: lane.location(),
         qos: keep_last(1),
         peer: peer(&a, &b),
         stands_for: Vec::new(),
@@ -108,12 +109,13 @@ fn the_largest_fits_at_depth_one_whatever_the_budget() {
         reader: Gid::new(b.id(), 1),
         writer: gid,
         peer: peer(&b, &a),
+        ring: writer.location(),
         lane,
         grant,
         qos: keep_last(1),
-        max_message: 25_000_000,
+        max_message,
     };
-    let mut reader = Reader::map(writer.descriptor().unwrap(), options).unwrap();
+    let mut reader = Reader::map(options).unwrap();
     for sequence in 0..3 {
         let payload = pattern(sequence, 25_000_000);
         writer.publish(meta(sequence), &payload).unwrap();
@@ -189,7 +191,7 @@ fn keep_all_holds_the_publisher_until_a_sample_is_taken() {
     let mut sequence = 0;
     let error = loop {
         match writer.try_publish(meta(sequence), &pattern(sequence, 1024)) {
-            Ok(published) => assert_eq!(published.position, sequence),
+            Ok(published) => assert_eq!(published.position, Some(sequence)),
             Err(error) => break error,
         }
         sequence += 1;
@@ -273,7 +275,7 @@ fn attaching_again_changes_nothing_but_whom_a_relay_stands_for() {
     let lanes = [b.allocate_lane().unwrap(), b.allocate_lane().unwrap()];
     let mut info = ReaderInfo {
         gid: Gid::new(b.id(), 9),
-        lane: lanes[0].index(),
+        lane: lanes[0].location(),
         qos: keep_last(5),
         peer: peer(&a, &b),
         stands_for: Vec::new(),
@@ -286,15 +288,19 @@ fn attaching_again_changes_nothing_but_whom_a_relay_stands_for() {
     assert_eq!(writer.attach(info.clone()).unwrap(), grant);
     assert_eq!(writer.readers(), relayed);
     // Another lane is another attachment.
-    info.lane = lanes[1].index();
+    info.lane = lanes[1].location();
     let other = writer.attach(info.clone()).unwrap();
     assert_ne!(other.generation, grant.generation);
     assert_eq!((other.first, writer.readers()), (1, relayed));
     assert!(writer.drop_dead().is_empty());
     assert!(writer.detach(info.gid));
     assert!(!writer.detach(info.gid));
-    info.lane = u32::MAX;
-    assert!(writer.attach(info).is_err());
+    let far = Location { segment: 0, offset: layout::SESSION_BYTES };
+    let odd = Location { segment: 0, offset: 5000 };
+    let elsewhere = Location { segment: 77, offset: 4096 };
+    for lane in [far, odd, elsewhere, Location { segment: 0, offset: 0 }] {
+        assert!(writer.attach(ReaderInfo { lane, ..info.clone() }).is_err());
+    }
 }
 
 #[test]
@@ -320,7 +326,7 @@ fn lanes_are_reused_and_bounded() {
     assert!(matches!(a.allocate_lane(), Err(ShmError::NoLane { .. })));
     drop(lanes);
     let lane = a.allocate_lane().unwrap();
-    assert!(lane.index() < layout::LANES);
+    assert!(lane.location().offset > 0);
 }
 
 #[test]

@@ -3,6 +3,7 @@
 mod api;
 mod hostile;
 mod local;
+mod memory;
 mod model;
 mod mutation;
 mod pins;
@@ -10,7 +11,7 @@ mod processes;
 mod wire;
 
 use std::{
-    sync::Arc,
+    sync::{Arc, Mutex, Weak, atomic::Ordering::Relaxed},
     time::{Duration, Instant},
 };
 
@@ -36,6 +37,14 @@ fn await_data(session: &SessionSegment, reader: &Reader) {
 }
 
 fn session() -> Arc<SessionSegment> {
+    let session = silent_session();
+    let id = session.id();
+    session.on_segment(move |event| tell_views(id, event));
+    session
+}
+
+/// A session that tells nobody of its segments.
+fn silent_session() -> Arc<SessionSegment> {
     SessionSegment::create(SessionId::random()).unwrap()
 }
 
@@ -49,15 +58,35 @@ fn transient(qos: Qos) -> Qos {
 
 fn writer(session: &Arc<SessionSegment>, qos: Qos, budget: u64) -> Writer {
     let gid = Gid::new(session.id(), 1);
-    Writer::create(session.clone(), RingOptions { gid, qos, budget, max_message: MAX }).unwrap()
+    let options = RingOptions { gid, qos, budget, max_message: MAX, expected: 0 };
+    Writer::create(session.clone(), options).unwrap()
 }
+
+/// Those who see a session, to be told of its segments.
+static VIEWS: Mutex<Vec<Weak<PeerSession>>> = Mutex::new(Vec::new());
 
 /// How `of` looks to `from`.
 fn peer(from: &SessionSegment, of: &Arc<SessionSegment>) -> Peer {
-    if from.id() == of.id() {
-        Peer::Local(of.clone())
-    } else {
-        Peer::Remote(PeerSession::map(of.id(), of.descriptors().unwrap()).unwrap())
+    if from.id() == of.id() { Peer::Local(of.clone()) } else { Peer::Remote(view(of)) }
+}
+
+/// How a session looks to another that is told of its segments, as a daemon would.
+fn view(of: &SessionSegment) -> Arc<PeerSession> {
+    let view = PeerSession::map(of.id(), of.descriptors().unwrap()).unwrap();
+    VIEWS.lock().unwrap().push(Arc::downgrade(&view));
+    for info in of.segments() {
+        let (info, fd) = of.segment(info.number).unwrap().unwrap();
+        view.add_segment(info, fd).unwrap();
+    }
+    view
+}
+
+fn tell_views(of: SessionId, event: SegmentEvent<'_>) {
+    let SegmentEvent::Opened(info, fd) = event else { return };
+    let mut views = VIEWS.lock().unwrap();
+    views.retain(|view| view.strong_count() > 0);
+    for view in views.iter().filter_map(Weak::upgrade).filter(|view| view.id() == of) {
+        view.add_segment(info, fd).unwrap();
     }
 }
 
@@ -68,12 +97,23 @@ fn attach(
     reader: &Arc<SessionSegment>,
     qos: Qos,
 ) -> Reader {
+    attach_to(writer, publisher, reader, peer(reader, publisher), qos)
+}
+
+/// As [`attach`], where `from` is how the reader's session sees the publisher's.
+fn attach_to(
+    writer: &Writer,
+    publisher: &Arc<SessionSegment>,
+    reader: &Arc<SessionSegment>,
+    from: Peer,
+    qos: Qos,
+) -> Reader {
     let lane = reader.allocate_lane().unwrap();
-    let gid = Gid::new(reader.id(), 100 + lane.index());
+    let gid = Gid::new(reader.id(), 100 + (lane.location().offset / layout::LANE) as u32);
     let grant = writer
         .attach(ReaderInfo {
             gid,
-            lane: lane.index(),
+            lane: lane.location(),
             qos,
             peer: peer(publisher, reader),
             stands_for: Vec::new(),
@@ -82,13 +122,14 @@ fn attach(
     let options = ReaderOptions {
         reader: gid,
         writer: writer.gid(),
-        peer: peer(reader, publisher),
+        peer: from,
+        ring: writer.location(),
         lane,
         grant,
         qos,
         max_message: MAX,
     };
-    Reader::map(writer.descriptor().unwrap(), options).unwrap()
+    Reader::map(options).unwrap()
 }
 
 fn meta(sequence: u64) -> Meta {

@@ -15,8 +15,15 @@ use super::super::sync::Site;
 fn caught_by(site: Site) -> &'static str {
     use Site::*;
     match site {
-        HeadStore | HeadLoad | ReuseFence | StandsFence => {
+        StampStore | StampLoad | ReuseFence | StandsFence => {
             "shm::tests::model::ring::a_reader_takes_whole_samples_or_none_while_it_is_overtaken"
+        }
+        HeadStore | HeadLoad => "shm::tests::model::ring::the_head_is_never_ahead_of_the_stamps",
+        ArrayStore | ArrayLoad => {
+            "shm::tests::model::growth::what_stands_stays_while_the_ring_grows"
+        }
+        MappedStore | MappedLoad => {
+            "shm::tests::model::growth::a_segment_that_is_said_to_be_mapped_is"
         }
         TailStore | TailLoad => {
             "shm::tests::model::ring::a_reader_never_sees_a_tail_above_the_head"

@@ -2,7 +2,6 @@
 
 use std::{
     io::{Read as _, Seek as _, SeekFrom, Write as _},
-    sync::atomic::Ordering,
     thread,
 };
 
@@ -91,7 +90,7 @@ fn nothing_that_ends_ends_a_sample_in_use() {
     intact(&sample);
     // The subscription ends, and its session goes with it.
     drop(reader);
-    assert_ne!(b.allocate_lane().unwrap().index(), lane, "the lane is in use");
+    assert_ne!(b.allocate_lane().unwrap().location(), lane, "the lane is in use");
     drop(b);
     (50..100).for_each(|sequence| publish(&writer, sequence, LARGE));
     intact(&sample);
@@ -111,7 +110,7 @@ fn what_is_dropped_is_forgotten() {
     let lane = reader.lane();
     drop(reader);
     drop(sample);
-    assert_eq!(b.allocate_lane().unwrap().index(), lane, "the lane is free again");
+    assert_eq!(b.allocate_lane().unwrap().location(), lane, "the lane is free again");
     (1..4).for_each(|sequence| publish(&writer, sequence, LARGE));
     assert_eq!(seats(&writer), 0);
     assert!(in_limbo(&writer) <= 1);
@@ -202,7 +201,7 @@ fn a_sample_may_end_on_any_thread() {
     let writer = writer(&a, keep_last(4), 4 * LARGE as u64);
     let mut reader = attach(&writer, &a, &b, keep_last(4));
     let (send, receive) = std::sync::mpsc::sync_channel::<Sample>(3);
-    let receive = std::sync::Mutex::new(receive);
+    let receive = Mutex::new(receive);
     let total = 4000;
     thread::scope(|scope| {
         for _ in 0..2 {
@@ -281,16 +280,17 @@ fn scribbled_pins_keep_six_samples_at_most() {
     let (a, b) = (session(), session());
     let writer = writer(&a, keep_last(1), 0);
     let reader = attach(&writer, &a, &b, keep_last(1));
-    let pins = &b.lane_words(reader.lane())[layout::lane::PINS..][..RECORDS];
+    let lane = peer(&b, &b).lane(reader.lane()).unwrap();
+    let pins = &lane.words()[layout::lane::PINS..][..RECORDS];
     for sequence in 0..300u64 {
         for (record, pin) in pins.iter().enumerate() {
             let absurd = [0, u64::MAX, 1 << 63, sequence + 1, sequence, 1];
-            pin.store(absurd[(record + sequence as usize) % 6], Ordering::Relaxed);
+            pin.store(absurd[(record + sequence as usize) % 6], Relaxed);
         }
         publish(&writer, sequence, LARGE);
         assert!(in_limbo(&writer) <= RECORDS + 1);
     }
-    pins.iter().enumerate().for_each(|(n, pin)| pin.store(290 + n as u64, Ordering::Relaxed));
+    pins.iter().enumerate().for_each(|(n, pin)| pin.store(290 + n as u64, Relaxed));
     (300..400).for_each(|sequence| publish(&writer, sequence, LARGE));
     assert!(in_limbo(&writer) <= RECORDS + 1);
 }
@@ -302,7 +302,7 @@ fn a_lane_that_passes_on_unseen_is_another_attachment() {
     let lane = b.allocate_lane().unwrap();
     let info = ReaderInfo {
         gid: Gid::new(b.id(), 1),
-        lane: lane.index(),
+        lane: lane.location(),
         qos: Qos::keep_all(),
         peer: peer(&a, &b),
         stands_for: Vec::new(),
@@ -313,7 +313,7 @@ fn a_lane_that_passes_on_unseen_is_another_attachment() {
     lane.open(before, info.gid, writer.gid());
     drop(lane);
     let lane = b.allocate_lane().unwrap();
-    assert_eq!(lane.index(), info.lane);
+    assert_eq!(lane.location(), info.lane);
     let after = writer.attach(info).unwrap();
     assert_ne!(before.generation, after.generation);
     assert_eq!((before.first, after.first), (0, 1));
@@ -329,7 +329,7 @@ fn asking_for_ever_takes_no_memory() {
     for round in 0..300 {
         let info = ReaderInfo {
             gid: Gid::new(b.id(), 1),
-            lane: lanes[round % 3].index(),
+            lane: lanes[round % 3].location(),
             qos: keep_last(1),
             peer: peer(&a, &b),
             stands_for: Vec::new(),

@@ -26,7 +26,7 @@ pub(super) struct Wire(pub(super) OwnedFd);
 
 impl Wire {
     pub(super) fn send(&self, bytes: &[u8], fds: &[BorrowedFd<'_>]) {
-        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(4))];
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(8))];
         let mut control = SendAncillaryBuffer::new(&mut space);
         assert!(fds.is_empty() || control.push(SendAncillaryMessage::ScmRights(fds)));
         sendmsg(&self.0, &[IoSlice::new(bytes)], &mut control, SendFlags::empty()).unwrap();
@@ -34,7 +34,7 @@ impl Wire {
 
     pub(super) fn receive(&self) -> (Vec<u8>, Vec<OwnedFd>) {
         let mut bytes = vec![0; 256];
-        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(4))];
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(8))];
         let mut control = RecvAncillaryBuffer::new(&mut space);
         let flags = RecvFlags::CMSG_CLOEXEC;
         let got =
@@ -65,66 +65,71 @@ impl Wire {
         bytes.as_chunks::<8>().0.iter().map(|chunk| u64::from_le_bytes(*chunk)).collect()
     }
 
-    pub(super) fn send_session(
-        &self,
-        session: &SessionSegment,
-        more: &[u8],
-        ring: Option<OwnedFd>,
-    ) {
+    /// A session with all its segments.
+    pub(super) fn send_session(&self, session: &SessionSegment, at: Location, gid: Gid) {
         let descriptors = session.descriptors().unwrap();
-        let mut fds = vec![
-            descriptors.segment.as_fd(),
-            descriptors.doorbell.as_fd(),
-            descriptors.pidfd.as_fd(),
-        ];
-        fds.extend(ring.as_ref().map(AsFd::as_fd));
+        let mut fds = vec![descriptors.segment, descriptors.doorbell, descriptors.pidfd];
         let mut bytes = session.id().0.to_vec();
-        bytes.extend_from_slice(more);
-        self.send(&bytes, &fds);
+        bytes.extend_from_slice(&gid.0);
+        bytes.extend_from_slice(&at.segment.to_le_bytes());
+        bytes.extend_from_slice(&at.offset.to_le_bytes());
+        for info in session.segments() {
+            fds.push(session.segment(info.number).unwrap().unwrap().1.into());
+            bytes.extend_from_slice(&info.number.to_le_bytes());
+        }
+        self.send(&bytes, &fds.iter().map(AsFd::as_fd).collect::<Vec<_>>());
     }
 
-    pub(super) fn receive_session(&self) -> (Arc<PeerSession>, Vec<u8>, Option<OwnedFd>) {
+    /// The same, received: the session, what it names, and where.
+    pub(super) fn receive_session(&self) -> (Arc<PeerSession>, Location, Gid) {
         let (bytes, fds) = self.receive();
-        let (id, more) = bytes.split_at(16);
+        let (ids, bytes) = bytes.as_slice().split_at(32);
+        let (at, numbers) = bytes.split_at(12);
+        let (id, gid) = (ids[..16].try_into().unwrap(), Gid(ids[16..].try_into().unwrap()));
+        let at = Location {
+            segment: u32::from_le_bytes(at[..4].try_into().unwrap()),
+            offset: u64::from_le_bytes(at[4..].try_into().unwrap()),
+        };
         let mut fds = fds.into_iter();
         let mut next = || PassedFd::received(fds.next().expect("a descriptor"));
         let descriptors = PeerDescriptors { segment: next(), doorbell: next(), pidfd: next() };
         assert!(descriptors.process().is_some_and(|pid| pid != std::process::id()));
-        let id = SessionId(id.try_into().unwrap());
-        (PeerSession::map(id, descriptors).unwrap(), more.to_vec(), fds.next())
+        let peer = PeerSession::map(SessionId(id), descriptors).unwrap();
+        for number in numbers.as_chunks::<4>().0 {
+            let (number, kind) = (u32::from_le_bytes(*number), SegmentKind::Samples(gid));
+            peer.add_segment(SegmentInfo { number, kind }, next()).unwrap();
+        }
+        (peer, at, gid)
     }
 
     /// The publisher's half of an attachment.
     pub(super) fn serve(&self, session: &SessionSegment, writer: &Writer, qos: Qos) {
-        self.send_session(session, &writer.gid().0, Some(writer.descriptor().unwrap()));
-        let (peer, lane, _) = self.receive_session();
-        let info = ReaderInfo {
-            gid: Gid::new(peer.id(), 1),
-            lane: u32::from_le_bytes(lane.try_into().unwrap()),
-            qos,
-            peer: Peer::Remote(peer),
-            stands_for: Vec::new(),
-        };
+        self.send_session(session, writer.location(), writer.gid());
+        let (peer, lane, gid) = self.receive_session();
+        let stands_for = Vec::new();
+        let info = ReaderInfo { gid, lane, qos, peer: Peer::Remote(peer), stands_for };
         let grant = writer.attach(info).unwrap();
         self.send_numbers(&[grant.generation, grant.first]);
     }
 
     /// The reader's half.
     pub(super) fn join(&self, session: &Arc<SessionSegment>, qos: Qos) -> Reader {
-        let (peer, writer, ring) = self.receive_session();
+        let (peer, ring, writer) = self.receive_session();
         let lane = session.allocate_lane().unwrap();
-        self.send_session(session, &lane.index().to_le_bytes(), None);
+        let reader = Gid::new(session.id(), 1);
+        self.send_session(session, lane.location(), reader);
         let grant = self.receive_numbers();
         let options = ReaderOptions {
-            reader: Gid::new(session.id(), 1),
-            writer: Gid(writer.try_into().unwrap()),
+            reader,
+            writer,
             peer: Peer::Remote(peer),
+            ring,
             lane,
             grant: Grant { generation: grant[0], first: grant[1] },
             qos,
             max_message: LARGE,
         };
-        Reader::map(ring.expect("a ring"), options).unwrap()
+        Reader::map(options).unwrap()
     }
 }
 

@@ -12,7 +12,7 @@ use super::{
         seats::scan,
         sync::{Ordering, Word},
     },
-    Cell, check, granted, show, small, zeros,
+    Cell, Ring, check, granted, zeros,
 };
 
 /// `OpenStore`, `GenerationLoad`: what the lane's last reader left is not taken for this one's.
@@ -43,14 +43,14 @@ fn a_lane_that_is_open_shows_the_cursor_of_its_reader() {
 #[test]
 fn a_reader_that_has_left_has_read_all() {
     check(3, || {
-        let (words, geometry) = small();
+        let ring = Ring::new();
         let (lane, tenancy) = granted(0);
         let cell = Arc::new(Cell::new(1));
-        show(&words, &geometry, 0);
+        ring.show(0);
         let reader = {
-            let (words, lane, cell) = (words.clone(), lane.clone(), cell.clone());
+            let (ring, lane, cell) = (ring.clone(), lane.clone(), cell.clone());
             thread::spawn(move || {
-                if pin(&lane[..], 0, 0, &words[geometry.tail]) {
+                if pin(&lane[..], 0, 0, ring.tail()) {
                     assert_eq!(cell.get(), 1);
                     unpin(&lane[..], 0);
                 }
@@ -59,7 +59,7 @@ fn a_reader_that_has_left_has_read_all() {
                 lane::ask(&lane[..], 2);
             })
         };
-        retire(&words[..], &geometry, 1);
+        retire(&ring.header, 1);
         about_to_scan::<loom::sync::atomic::AtomicU64>();
         if scan(&tenancy, &lane[..], &mut Vec::new()) == Standing::Left {
             cell.set(2);
@@ -73,23 +73,23 @@ fn a_reader_that_has_left_has_read_all() {
 #[test]
 fn a_reader_that_opens_its_lane_and_pins_is_seen() {
     check(3, || {
-        let (words, geometry) = small();
+        let ring = Ring::new();
         let lane = zeros(LANE_WORDS);
         lane::ask(&lane[..], 1);
         let tenancy = Tenancy::grant(&lane[..]);
         let cell = Arc::new(Cell::new(1));
-        show(&words, &geometry, 0);
+        ring.show(0);
         let reader = {
-            let (words, lane, cell) = (words.clone(), lane.clone(), cell.clone());
+            let (ring, lane, cell) = (ring.clone(), lane.clone(), cell.clone());
             thread::spawn(move || {
                 lane::open(&lane[..], Grant { generation: tenancy.generation(), first: 0 });
-                if pin(&lane[..], 0, 0, &words[geometry.tail]) {
+                if pin(&lane[..], 0, 0, ring.tail()) {
                     assert_eq!(cell.get(), 1);
                     unpin(&lane[..], 0);
                 }
             })
         };
-        retire(&words[..], &geometry, 1);
+        retire(&ring.header, 1);
         about_to_scan::<loom::sync::atomic::AtomicU64>();
         let mut found = Vec::new();
         scan(&tenancy, &lane[..], &mut found);

@@ -5,6 +5,7 @@
 //! The checker runs the loads of a thread in their order. That a read comes before the store that
 //! says so therefore shows only where what is read is a [`Cell`], on which it sees any race.
 
+mod growth;
 mod lanes;
 mod pins;
 mod ring;
@@ -14,8 +15,8 @@ use loom::sync::{Arc, atomic::AtomicU64};
 use super::super::{
     Grant,
     lane::{self, Tenancy},
-    layout::LANE_WORDS,
-    ring::{Geometry, Place, Record, about_to_write, publish},
+    layout::{DESCRIPTOR_WORDS, LANE_WORDS, RING_WORDS, ring::TAIL},
+    ring::{Place, Record, View, about_to_write, publish},
 };
 
 /// Payload that is read and written like any memory.
@@ -52,17 +53,40 @@ fn zeros(count: usize) -> Arc<Vec<AtomicU64>> {
     Arc::new((0..count).map(|_| AtomicU64::new(0)).collect())
 }
 
-/// A ring of two slots, whose payload is elsewhere.
-fn small() -> (Arc<Vec<AtomicU64>>, Geometry) {
-    let geometry = Geometry { head: 0, tail: 1, slots: 2, mask: 1, payload: 34, payload_words: 0 };
-    (zeros(34), geometry)
+/// A ring and its descriptors.
+#[derive(Clone)]
+struct Ring {
+    header: Arc<Vec<AtomicU64>>,
+    array: Arc<Vec<AtomicU64>>,
 }
 
-/// Publishes a sample whose payload is elsewhere.
-fn show(words: &[AtomicU64], geometry: &Geometry, position: u64) {
-    let record = Record { sequence: position, timestamp: 0, len: 0, place: Place::Inline };
-    about_to_write::<AtomicU64>();
-    publish(words, geometry, position, &record, &[]);
+impl Ring {
+    /// Of two descriptors.
+    fn new() -> Self {
+        Self { header: zeros(RING_WORDS), array: zeros(2 * DESCRIPTOR_WORDS) }
+    }
+
+    fn view(&self) -> View<'_, AtomicU64> {
+        View { ring: &self.header, word: 0, array: &self.array }
+    }
+
+    fn tail(&self) -> &AtomicU64 {
+        &self.header[TAIL]
+    }
+
+    /// Publishes a sample whose payload is elsewhere.
+    fn show(&self, position: u64) {
+        self.publish(position, Place::Inline);
+    }
+
+    fn publish(&self, position: u64, place: Place) {
+        about_to_write::<AtomicU64>();
+        publish(&self.header, &self.array, position, &record(position, place), &[]);
+    }
+}
+
+fn record(position: u64, place: Place) -> Record {
+    Record { sequence: 10 + position, timestamp: 0, len: 0, place }
 }
 
 /// A lane that a reader has opened to take `first` next.

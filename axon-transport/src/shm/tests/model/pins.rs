@@ -9,10 +9,10 @@ use super::{
     super::super::{
         lane::Tenancy,
         pins::{about_to_scan, pin, unpin},
-        ring::{Geometry, bounds, retire},
+        ring::{bounds, retire},
         seats::scan,
     },
-    Cell, check, granted, show, small,
+    Cell, Ring, check, granted,
 };
 
 /// Whether `position`, below the tail, may be written over.
@@ -24,16 +24,10 @@ fn is_free(lane: &[AtomicU64], tenancy: &Tenancy, position: u64) -> bool {
 }
 
 /// Takes the next sample from `cursor` on in place, if there is one.
-fn take(
-    words: &[AtomicU64],
-    geometry: &Geometry,
-    lane: &[AtomicU64],
-    cursor: &mut u64,
-    read: impl Fn(u64),
-) {
-    let (tail, head) = bounds(words, geometry).unwrap();
+fn take(ring: &Ring, lane: &[AtomicU64], cursor: &mut u64, read: impl Fn(u64)) {
+    let (tail, head) = bounds(&ring.header).unwrap();
     *cursor = tail.max(*cursor);
-    if *cursor < head && pin(lane, 0, *cursor, &words[geometry.tail]) {
+    if *cursor < head && pin(lane, 0, *cursor, ring.tail()) {
         read(*cursor);
         unpin(lane, 0);
         *cursor += 1;
@@ -44,18 +38,18 @@ fn take(
 #[test]
 fn a_sample_that_is_pinned_is_not_written_over() {
     check(3, || {
-        let (words, geometry) = small();
+        let ring = Ring::new();
         let (lane, tenancy) = granted(0);
         let cell = Arc::new(Cell::new(1));
-        show(&words, &geometry, 0);
+        ring.show(0);
         let publisher = {
-            let (words, lane, cell) = (words.clone(), lane.clone(), cell.clone());
+            let (ring, lane, cell) = (ring.clone(), lane.clone(), cell.clone());
             thread::spawn(move || {
-                retire(&words[..], &geometry, 1);
+                retire(&ring.header, 1);
                 for _ in 0..2 {
                     if is_free(&lane, &tenancy, 0) {
                         cell.set(2);
-                        return show(&words, &geometry, 1);
+                        return ring.show(1);
                     }
                     thread::yield_now();
                 }
@@ -63,7 +57,7 @@ fn a_sample_that_is_pinned_is_not_written_over() {
         };
         let mut cursor = 0;
         for _ in 0..2 {
-            take(&words, &geometry, &lane, &mut cursor, |position| {
+            take(&ring, &lane, &mut cursor, |position| {
                 assert_eq!(cell.get(), position + 1);
             });
         }
@@ -75,15 +69,15 @@ fn a_sample_that_is_pinned_is_not_written_over() {
 #[test]
 fn a_record_that_pins_another_sample_says_that_the_last_was_read() {
     check(3, || {
-        let (words, geometry) = small();
+        let ring = Ring::new();
         let (lane, tenancy) = granted(0);
         let cells = Arc::new([Cell::new(1), Cell::new(2)]);
-        show(&words, &geometry, 0);
-        show(&words, &geometry, 1);
+        ring.show(0);
+        ring.show(1);
         let publisher = {
-            let (words, lane, cells) = (words.clone(), lane.clone(), cells.clone());
+            let (ring, lane, cells) = (ring.clone(), lane.clone(), cells.clone());
             thread::spawn(move || {
-                retire(&words[..], &geometry, 1);
+                retire(&ring.header, 1);
                 if is_free(&lane, &tenancy, 0) {
                     cells[0].set(3);
                 }
@@ -91,7 +85,7 @@ fn a_record_that_pins_another_sample_says_that_the_last_was_read() {
         };
         let mut cursor = 0;
         for _ in 0..2 {
-            take(&words, &geometry, &lane, &mut cursor, |position| {
+            take(&ring, &lane, &mut cursor, |position| {
                 assert_eq!(cells[position as usize].get(), position + 1);
             });
         }

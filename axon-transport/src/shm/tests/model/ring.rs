@@ -8,81 +8,99 @@ use loom::{
 use super::{
     super::super::{
         lane,
-        ring::{
-            Geometry, Look, Place, Record, about_to_write, bounds, copy_in, data, look, publish,
-            retire, stands,
-        },
+        layout::Location,
+        ring::{Look, Place, State, about_to_write, bounds, copy_in, retire},
         sync::{Ordering, Word},
     },
-    Cell, check, granted, small,
+    Cell, Ring, check, granted, record, zeros,
 };
 
-const SLOTS: usize = 2;
-const GEOMETRY: Geometry =
-    Geometry { head: 0, tail: 1, slots: 2, mask: 1, payload: 34, payload_words: 4 };
+const DESCRIPTORS: u64 = 2;
 
-fn words() -> Arc<Vec<AtomicU64>> {
-    Arc::new((0..38).map(|_| AtomicU64::new(0)).collect())
+fn place(position: u64) -> Place {
+    Place::Block(Location { segment: 0, offset: position % 2 * 16 })
 }
 
-fn record(position: u64) -> Record {
-    let place = Place::At(position % 2 * 16);
-    Record { sequence: 10 + position, timestamp: 0, len: 16, place }
+/// Two words for every other sample.
+fn block(blocks: &[AtomicU64], position: u64) -> &[AtomicU64] {
+    let start = (position % 2) as usize * 2;
+    &blocks[start..start + 2]
 }
 
-fn write(words: &[AtomicU64], position: u64) {
+fn write(ring: &Ring, blocks: &[AtomicU64], position: u64) {
     about_to_write::<AtomicU64>();
-    let byte = position as u8 + 1;
-    let place = GEOMETRY.payload(words, position % 2 * 16, 16).unwrap();
-    copy_in(place, &[byte; 16]);
-    publish(words, &GEOMETRY, position, &record(position), &[]);
+    copy_in(block(blocks, position), &[position as u8 + 1; 16]);
+    ring.publish(position, place(position));
 }
 
-/// What a reader that stands at `cursor` finds there: `Ok(true)` for a whole sample.
-fn read(words: &[AtomicU64], cursor: u64) -> bool {
-    match look(words, &GEOMETRY, cursor) {
+/// What a reader that stands at `cursor` finds there: whether a whole sample.
+fn read(ring: &Ring, blocks: &[AtomicU64], cursor: u64) -> bool {
+    match ring.view().look(cursor) {
         Look::Lapped => false,
         Look::Corrupt(what) => panic!("{what}"),
         Look::Sample(found) => {
-            let payload: Vec<u64> = data(words, &GEOMETRY, cursor, &found)
-                .unwrap()
+            let payload: Vec<u64> = block(blocks, cursor)
                 .iter()
                 .map(|word| Word::load(word, Ordering::Relaxed))
                 .collect();
-            if !stands(words, &GEOMETRY, cursor) {
+            if !ring.view().stands(cursor) {
                 return false;
             }
-            assert_eq!(found, record(cursor));
+            assert_eq!(found, record(cursor, place(cursor)));
             assert_eq!(payload, [u64::from_ne_bytes([cursor as u8 + 1; 8]); 2]);
             true
         }
     }
 }
 
-/// `HeadStore`, `HeadLoad`, `ReuseFence`, `StandsFence`.
+fn overtake(ring: &Ring, blocks: &[AtomicU64]) {
+    for position in 1..3u64 {
+        let tail = (position + 1).saturating_sub(DESCRIPTORS);
+        if tail > 0 {
+            retire(&ring.header, tail);
+        }
+        write(ring, blocks, position);
+    }
+}
+
+/// `StampStore`, `StampLoad`, `ReuseFence`, `StandsFence`: a reader that looks at stamps alone.
 #[test]
 fn a_reader_takes_whole_samples_or_none_while_it_is_overtaken() {
     check(3, || {
-        let words = words();
-        write(&words, 0);
-        let shared = words.clone();
-        let publisher = thread::spawn(move || {
-            for position in 1..3u64 {
-                let tail = (position + 1).saturating_sub(SLOTS as u64);
-                if tail > 0 {
-                    retire(&shared, &GEOMETRY, tail);
-                }
-                write(&shared, position);
-            }
-        });
+        let (ring, blocks) = (Ring::new(), zeros(4));
+        write(&ring, &blocks, 0);
+        let publisher = {
+            let (ring, blocks) = (ring.clone(), blocks.clone());
+            thread::spawn(move || overtake(&ring, &blocks))
+        };
         let mut cursor = 0;
         for _ in 0..3 {
-            let (tail, head) = bounds(&words, &GEOMETRY).unwrap();
-            assert!(tail <= head);
-            cursor = cursor.max(tail);
-            if cursor < head && read(&words, cursor) {
-                cursor += 1;
+            match ring.view().state(cursor) {
+                State::Here if read(&ring, &blocks, cursor) => cursor += 1,
+                State::Here | State::Gone => {
+                    let (tail, head) = bounds(&ring.header).unwrap();
+                    assert!(tail <= head);
+                    cursor = cursor.max(tail);
+                }
+                State::Ahead => {}
             }
+        }
+        publisher.join().unwrap();
+    });
+}
+
+/// `HeadStore`, `HeadLoad`: what the head says to be there is.
+#[test]
+fn the_head_is_never_ahead_of_the_stamps() {
+    check(3, || {
+        let ring = Ring::new();
+        let publisher = {
+            let ring = ring.clone();
+            thread::spawn(move || (0..2).for_each(|position| ring.show(position)))
+        };
+        let (_, head) = bounds(&ring.header).unwrap();
+        for position in 0..head {
+            assert_eq!(ring.view().state(position), State::Here);
         }
         publisher.join().unwrap();
     });
@@ -92,29 +110,29 @@ fn a_reader_takes_whole_samples_or_none_while_it_is_overtaken() {
 #[test]
 fn a_publisher_that_waits_for_the_cursor_overwrites_nothing_unread() {
     check(3, || {
-        let (words, geometry) = small();
+        let ring = Ring::new();
         let (lane, tenancy) = granted(0);
         let cells: Arc<[Cell; 2]> = Arc::new([Cell::new(0), Cell::new(0)]);
         cells[0].set(1);
-        super::show(&words, &geometry, 0);
+        ring.show(0);
         let publisher = {
-            let (words, lane, cells) = (words.clone(), lane.clone(), cells.clone());
+            let (ring, lane, cells) = (ring.clone(), lane.clone(), cells.clone());
             thread::spawn(move || {
                 for position in 1..3u64 {
-                    let tail = (position + 1).saturating_sub(SLOTS as u64);
+                    let tail = (position + 1).saturating_sub(DESCRIPTORS);
                     while tenancy.cursor(&lane[..]).expect("an open lane") < tail {
                         thread::yield_now();
                     }
                     if tail > 0 {
-                        retire(&words[..], &geometry, tail);
+                        retire(&ring.header, tail);
                     }
                     cells[(position % 2) as usize].set(position + 1);
-                    super::show(&words, &geometry, position);
+                    ring.show(position);
                 }
             })
         };
         for position in 0..2 {
-            while bounds(&words[..], &geometry).unwrap().1 <= position {
+            while ring.view().state(position) == State::Ahead {
                 thread::yield_now();
             }
             assert_eq!(cells[position as usize].get(), position + 1, "nothing unread was given up");
@@ -128,14 +146,15 @@ fn a_publisher_that_waits_for_the_cursor_overwrites_nothing_unread() {
 #[test]
 fn a_reader_never_sees_a_tail_above_the_head() {
     check(3, || {
-        let words = words();
-        let shared = words.clone();
-        let publisher = thread::spawn(move || {
-            write(&shared, 0);
-            write(&shared, 1);
-            retire(&shared, &GEOMETRY, 2);
-        });
-        bounds(&words, &GEOMETRY).unwrap();
+        let ring = Ring::new();
+        let publisher = {
+            let ring = ring.clone();
+            thread::spawn(move || {
+                (0..2).for_each(|position| ring.show(position));
+                retire(&ring.header, 2);
+            })
+        };
+        bounds(&ring.header).unwrap();
         publisher.join().unwrap();
     });
 }

@@ -1,0 +1,141 @@
+//! The segments of sessions' memory, and who is handed which.
+//!
+//! A session that reads from another is handed those that hold objects, and those that hold the
+//! samples of the publishers that it reads from: with what introduces the two to each other, and
+//! as they come into being. It asks for one that it misses all the same.
+
+use super::{MAX_SEGMENTS, Registry, SessionSegment, Violation};
+use crate::{
+    ids::{Gid, SessionId},
+    session::message::{MAX_DESCRIPTORS, Message, Refused, Segment, SegmentName, SegmentOpened},
+};
+
+impl<F: Clone> Registry<F> {
+    /// A session has one segment more.
+    pub(super) fn open_segment(
+        &mut self,
+        id: &SessionId,
+        segment: Segment,
+        mut descriptors: Vec<F>,
+    ) -> Result<(), Violation> {
+        let (Some(descriptor), true) = (descriptors.pop(), descriptors.is_empty()) else {
+            return Err(Violation::Descriptors(descriptors.len()));
+        };
+        let Some(entry) = self.sessions.get_mut(id) else { return Ok(()) };
+        let number = segment.number;
+        if number == 0 || entry.segments.contains_key(&number) {
+            return Err(Violation::Segments(number));
+        }
+        if entry.segments.len() >= MAX_SEGMENTS {
+            let text = format!("segment {number} of its memory: a session has {MAX_SEGMENTS}");
+            let none = String::new;
+            let refused = Refused { variable: none(), ours: none(), theirs: none(), text };
+            self.push(id, &Message::Refused(refused), Vec::new());
+            return Ok(());
+        }
+        entry.segments.insert(number, SessionSegment { segment, descriptor });
+        let readers: Vec<SessionId> = self
+            .sessions
+            .iter()
+            .filter(|(_, s)| s.known.contains_key(id))
+            .map(|(reader, _)| *reader)
+            .filter(|reader| self.reads(reader, id, &segment))
+            .collect();
+        for reader in readers {
+            self.hand(&reader, id, number);
+        }
+        Ok(())
+    }
+
+    /// A session has given a segment up.
+    pub(super) fn close_segment(&mut self, id: &SessionId, number: u32) {
+        let Some(entry) = self.sessions.get_mut(id) else { return };
+        if entry.segments.remove(&number).is_none() {
+            return;
+        }
+        let gone = Message::SegmentGone(SegmentName { session: *id, number });
+        let mut readers = Vec::new();
+        for (reader, entry) in &mut self.sessions {
+            if entry.known.get_mut(id).is_some_and(|known| known.segments.remove(&number)) {
+                readers.push(*reader);
+            }
+        }
+        self.push_shared(&readers, &gone);
+    }
+
+    /// A session misses a segment of another, which it reads from.
+    pub(super) fn need_segment(&mut self, id: &SessionId, of: &SessionId, number: u32) {
+        let known = self.sessions.get_mut(id).and_then(|entry| entry.known.get_mut(of));
+        if let Some(known) = known {
+            known.segments.remove(&number);
+            self.hand(id, of, number);
+        }
+    }
+
+    /// The segments of session `of` in which a reader of `writer` looks.
+    pub(super) fn segments_for(&self, of: &SessionId, writer: &Gid) -> Vec<u32> {
+        let Some(entry) = self.sessions.get(of) else { return Vec::new() };
+        let concerns = |s: &&SessionSegment<F>| s.segment.publisher.is_none_or(|p| p == *writer);
+        entry.segments.values().filter(concerns).map(|s| s.segment.number).collect()
+    }
+
+    /// Adds the descriptors of those segments that `to` lacks, as many as go into one packet.
+    pub(super) fn hand_over(
+        &mut self,
+        to: &SessionId,
+        of: &SessionId,
+        numbers: impl IntoIterator<Item = u32>,
+        descriptors: &mut Vec<F>,
+    ) -> Vec<Segment> {
+        let mut handed = Vec::new();
+        for number in numbers {
+            if descriptors.len() == MAX_DESCRIPTORS {
+                break;
+            }
+            if let Some(SessionSegment { segment, descriptor }) = self.lacking(to, of, number) {
+                handed.push(segment);
+                descriptors.push(descriptor);
+            }
+        }
+        handed
+    }
+
+    /// Hands over those that did not go into the packet.
+    pub(super) fn hand_over_rest(&mut self, to: &SessionId, of: &SessionId, writer: &Gid) {
+        for number in self.segments_for(of, writer) {
+            self.hand(to, of, number);
+        }
+    }
+
+    fn hand(&mut self, to: &SessionId, of: &SessionId, number: u32) {
+        if let Some(SessionSegment { segment, descriptor }) = self.lacking(to, of, number) {
+            let opened = SegmentOpened { session: *of, segment };
+            self.push(to, &Message::Segment(opened), vec![descriptor]);
+        }
+    }
+
+    /// A segment of `of` that `to` was not handed, and now is.
+    fn lacking(
+        &mut self,
+        to: &SessionId,
+        of: &SessionId,
+        number: u32,
+    ) -> Option<SessionSegment<F>> {
+        let segment = self.sessions.get(of)?.segments.get(&number)?.clone();
+        let known = self.sessions.get_mut(to)?.known.get_mut(of)?;
+        known.segments.insert(number).then_some(segment)
+    }
+
+    /// Whether a session reads from another what is in this segment of its memory.
+    fn reads(&self, reader: &SessionId, of: &SessionId, segment: &Segment) -> bool {
+        let Some(known) = self.sessions.get(reader).and_then(|s| s.known.get(of)) else {
+            return false;
+        };
+        let owns = |gid: &Gid| self.endpoints.get(gid).is_some_and(|e| e.session == *reader);
+        known
+            .pairs
+            .iter()
+            .filter(|pair| owns(&pair.reader))
+            .any(|pair| segment.publisher.is_none_or(|publisher| publisher == pair.writer))
+    }
+}

@@ -1,0 +1,204 @@
+//! A session's memory for objects: lanes, rings, their descriptors, and samples of up to 4 KiB. In
+//! the session's first segment for as long as that has room, then in further ones.
+//!
+//! Used when something attaches or grows, not by a steady publish.
+
+use std::{
+    sync::{Arc, Mutex, MutexGuard, PoisonError, atomic::AtomicU64},
+    time::{Duration, Instant},
+};
+
+use super::{
+    ShmError,
+    area::Area,
+    layout::{self, HEAP_AT, HEAP_BYTES, HEAP_BYTES_MAX, Location, SegmentKind},
+    memory::Map,
+    ring::about_to_write,
+    segments::{OwnSegment, Segments},
+};
+
+/// Readers may take this long to map a segment before objects that they read move there without
+/// them: one that is stopped must not keep a ring small.
+const PATIENCE: Duration = Duration::from_secs(1);
+
+/// Memory of one object.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Block {
+    pub(super) at: Location,
+    pub(super) len: u64,
+}
+
+/// A block, and the map that it is in. Not given back when dropped.
+#[derive(Clone)]
+pub(super) struct Object {
+    pub(super) block: Block,
+    pub(super) map: Arc<Map>,
+}
+
+impl Object {
+    #[inline]
+    pub(super) fn words(&self) -> &[AtomicU64] {
+        let start = self.block.at.offset as usize / 8;
+        &self.map.words()[start..start + self.block.len as usize / 8]
+    }
+}
+
+/// Whether an object may be where its readers do not look yet.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Need {
+    /// If there is no other place.
+    Now,
+    /// It may not: rather none.
+    Mapped,
+}
+
+/// The segments that hold objects, and what of them is free.
+pub(super) struct Heap(Mutex<Vec<Part>>);
+
+struct Part {
+    segment: Arc<OwnSegment>,
+    area: Area,
+    /// Bytes from the segment's start that are backed by memory.
+    committed: u64,
+    since: Instant,
+}
+
+impl Part {
+    fn new(segment: Arc<OwnSegment>) -> Self {
+        let area = Area::new(HEAP_AT..segment.memory.bytes(), 16);
+        Self { segment, area, committed: layout::ALIGN, since: Instant::now() }
+    }
+
+    fn allocate(&mut self, len: u64) -> Result<Option<Object>, ShmError> {
+        let Some(offset) = self.area.allocate(len) else { return Ok(None) };
+        let end = offset + len;
+        if end > self.committed {
+            let upto = end.next_multiple_of(layout::ALIGN);
+            if let Err(error) = self.segment.memory.commit(self.committed, upto) {
+                self.area.release(offset, len);
+                return Err(error);
+            }
+            self.committed = upto;
+        }
+        let at = Location { segment: self.segment.number(), offset };
+        Ok(Some(Object { block: Block { at, len }, map: Arc::clone(self.segment.map()) }))
+    }
+}
+
+impl Heap {
+    /// A heap in a session's first segment.
+    pub(super) fn new(first: Arc<OwnSegment>) -> Self {
+        Self(Mutex::new(vec![Part::new(first)]))
+    }
+
+    /// `len` bytes, best in a segment that is `mapped` by those that will read there. `None` when
+    /// there is room only where it is not, and that will not do: ask again later.
+    ///
+    /// What is there may be what another object left, which somebody may still be reading, only to
+    /// find out that it is not good any more: it is to be written by words.
+    pub(super) fn allocate(
+        &self,
+        segments: &Segments,
+        len: u64,
+        need: Need,
+        mapped: impl Fn(u32) -> bool,
+    ) -> Result<Option<Object>, ShmError> {
+        let len = Area::rounded(len);
+        let mut parts = self.parts();
+        let usable = |part: &Part| {
+            let number = part.segment.number();
+            number == 0 || mapped(number) || part.since.elapsed() >= PATIENCE
+        };
+        let mut found = None;
+        let mut elsewhere = false;
+        for part in &mut *parts {
+            if !usable(part) {
+                elsewhere |= part.area.fits(len);
+            } else if let Some(object) = part.allocate(len)? {
+                found = Some(object);
+                break;
+            }
+        }
+        if found.is_none() && !elsewhere {
+            if len > HEAP_BYTES_MAX - HEAP_AT {
+                return Err(ShmError::NoMemory { needed: len, available: HEAP_BYTES_MAX });
+            }
+            let bytes = (HEAP_AT + len).next_multiple_of(HEAP_BYTES);
+            let mut part = Part::new(segments.open(SegmentKind::Heap, bytes)?);
+            if usable(&part) {
+                found = part.allocate(len)?;
+            }
+            parts.push(part);
+        }
+        if found.is_none() && need == Need::Now {
+            for part in &mut *parts {
+                found = part.allocate(len)?;
+                if found.is_some() {
+                    break;
+                }
+            }
+        }
+        drop(parts);
+        // Whoever gave this memory back did so after it raised a tail or replaced an array, and
+        // under the lock: readers that see what is written there now see that too.
+        about_to_write::<AtomicU64>();
+        Ok(found)
+    }
+
+    /// Takes a block back. Those who read there must have been told already.
+    pub(super) fn release(&self, block: Block) {
+        let mut parts = self.parts();
+        if let Some(part) = parts.iter_mut().find(|p| p.segment.number() == block.at.segment) {
+            part.area.release(block.at.offset, block.len);
+        }
+    }
+
+    fn parts(&self) -> MutexGuard<'_, Vec<Part>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ids::SessionId;
+
+    fn heap() -> (Segments, Heap) {
+        let segments = Segments::new(SessionId::random());
+        let first = segments.open(SegmentKind::Session, layout::SESSION_BYTES).unwrap();
+        (segments, Heap::new(first))
+    }
+
+    #[test]
+    fn another_segment_is_used_once_it_is_mapped_or_nothing_else_will_do() {
+        let (segments, heap) = heap();
+        let nobody = |_| false;
+        let first = heap.allocate(&segments, 400 << 10, Need::Mapped, nobody).unwrap().unwrap();
+        assert_eq!(first.block.at.segment, 0);
+        for _ in 0..2 {
+            let none = heap.allocate(&segments, 400 << 10, Need::Mapped, nobody).unwrap();
+            assert!(none.is_none());
+        }
+        let now = heap.allocate(&segments, 400 << 10, Need::Now, nobody).unwrap().unwrap();
+        assert_eq!(now.block.at.segment, 1);
+        let small = heap.allocate(&segments, 1, Need::Now, nobody).unwrap().unwrap();
+        assert_eq!((small.block.at.segment, small.block.len), (0, 128));
+        let mapped = heap.allocate(&segments, 400 << 10, Need::Mapped, |_| true).unwrap().unwrap();
+        assert_eq!(mapped.block.at.segment, 1);
+        assert_eq!(segments.further().len(), 1);
+        heap.release(first.block);
+        let again = heap.allocate(&segments, 400 << 10, Need::Mapped, nobody).unwrap().unwrap();
+        assert_eq!(again.block, first.block);
+    }
+
+    #[test]
+    fn what_fits_nowhere_is_refused() {
+        let (segments, heap) = heap();
+        let error = heap.allocate(&segments, HEAP_BYTES_MAX, Need::Now, |_| true).err();
+        assert!(matches!(error, Some(ShmError::NoMemory { .. })), "{error:?}");
+        let most = HEAP_BYTES_MAX - HEAP_AT;
+        let object = heap.allocate(&segments, most, Need::Now, |_| true);
+        assert!(matches!(object, Ok(Some(_)) | Err(ShmError::NoMemory { .. })));
+        assert_eq!(segments.further()[0].memory.bytes(), HEAP_BYTES_MAX);
+    }
+}

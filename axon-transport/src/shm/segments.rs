@@ -1,0 +1,134 @@
+//! This session's own segments, by their numbers.
+
+use std::{
+    collections::BTreeMap,
+    fmt,
+    os::fd::{BorrowedFd, OwnedFd},
+    sync::{Arc, OnceLock, PoisonError, RwLock},
+};
+
+use super::{
+    ShmError,
+    layout::{self, SegmentKind},
+    memory::{Map, Segment},
+};
+use crate::ids::SessionId;
+
+/// A segment as other sessions are told of it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SegmentInfo {
+    /// Its number in its session: from 0, never used again.
+    pub number: u32,
+    /// What it is for.
+    pub kind: SegmentKind,
+}
+
+/// What a session's owner passes on to the others, in this order.
+#[derive(Clone, Copy, Debug)]
+pub enum SegmentEvent<'a> {
+    /// A segment came into being, in which there will be what others read.
+    Opened(SegmentInfo, BorrowedFd<'a>),
+    /// The segment of this number is given up.
+    Gone(u32),
+}
+
+type Listener = Box<dyn Fn(SegmentEvent<'_>) + Send + Sync>;
+
+/// One of them.
+pub(super) struct OwnSegment {
+    pub(super) info: SegmentInfo,
+    pub(super) memory: Segment,
+}
+
+impl OwnSegment {
+    pub(super) fn number(&self) -> u32 {
+        self.info.number
+    }
+
+    pub(super) fn map(&self) -> &Arc<Map> {
+        self.memory.map()
+    }
+
+    pub(super) fn descriptor(&self) -> Result<OwnedFd, ShmError> {
+        self.memory
+            .fd()
+            .try_clone_to_owned()
+            .map_err(|source| ShmError::System { what: "duplicating a descriptor", source })
+    }
+}
+
+/// All of them.
+pub(super) struct Segments {
+    session: SessionId,
+    table: RwLock<Table>,
+    listener: OnceLock<Listener>,
+}
+
+#[derive(Default)]
+struct Table {
+    live: BTreeMap<u32, Arc<OwnSegment>>,
+    next: u32,
+}
+
+impl Segments {
+    pub(super) fn new(session: SessionId) -> Self {
+        Self { session, table: RwLock::default(), listener: OnceLock::new() }
+    }
+
+    /// Has `listener` hear of each segment from now on, in the order of their numbers. It is called
+    /// while locks are held: it must not block, nor call into the session.
+    pub(super) fn listen(&self, listener: Listener) -> bool {
+        self.listener.set(listener).is_ok()
+    }
+
+    /// A new segment of `bytes` bytes, of which the first [`layout::ALIGN`] are backed by memory.
+    pub(super) fn open(&self, kind: SegmentKind, bytes: u64) -> Result<Arc<OwnSegment>, ShmError> {
+        let name = match kind {
+            SegmentKind::Session => "axon-session",
+            SegmentKind::Heap => "axon-heap",
+            SegmentKind::Samples(_) => "axon-samples",
+        };
+        let memory = Segment::create(name, bytes)?;
+        memory.commit(0, layout::ALIGN)?;
+        let mut table = self.table.write().unwrap_or_else(PoisonError::into_inner);
+        let number = table.next;
+        if number > layout::MAX_NUMBER {
+            return Err(ShmError::NoNumber(self.session));
+        }
+        table.next += 1;
+        layout::write_segment(memory.words(), self.session, number, kind);
+        let segment = Arc::new(OwnSegment { info: SegmentInfo { number, kind }, memory });
+        table.live.insert(number, Arc::clone(&segment));
+        if let Some(listener) = self.listener.get() {
+            listener(SegmentEvent::Opened(segment.info, segment.memory.fd()));
+        }
+        Ok(segment)
+    }
+
+    /// Nothing in the segment is of use to anybody any more.
+    pub(super) fn close(&self, number: u32) {
+        let mut table = self.table.write().unwrap_or_else(PoisonError::into_inner);
+        if table.live.remove(&number).is_some()
+            && let Some(listener) = self.listener.get()
+        {
+            listener(SegmentEvent::Gone(number));
+        }
+    }
+
+    pub(super) fn get(&self, number: u32) -> Option<Arc<OwnSegment>> {
+        self.table.read().unwrap_or_else(PoisonError::into_inner).live.get(&number).cloned()
+    }
+
+    /// What there is besides the first, by number.
+    pub(super) fn further(&self) -> Vec<Arc<OwnSegment>> {
+        let table = self.table.read().unwrap_or_else(PoisonError::into_inner);
+        table.live.values().filter(|s| s.info.kind != SegmentKind::Session).cloned().collect()
+    }
+}
+
+impl fmt::Debug for Segments {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let table = self.table.read().unwrap_or_else(PoisonError::into_inner);
+        f.debug_tuple("Segments").field(&table.live.keys().collect::<Vec<_>>()).finish()
+    }
+}

@@ -1,0 +1,138 @@
+//! What many processes of many endpoints take: each of these publishes on and subscribes to the same
+//! ten topics, so each reads from each.
+//!
+//! In the full size: `SIZING=50 cargo test --release -p axon-transport --test sizing -- --nocapture`
+#![expect(clippy::print_stdout, reason = "what it prints is its result")]
+
+#[allow(dead_code, reason = "what other tests need of it")]
+mod support;
+
+use std::{fs, os::unix::fs::MetadataExt as _};
+
+use axon_transport::{
+    config::{Config, OsFiles},
+    qos::Qos,
+    session::{EndpointSpec, Session, SessionOptions},
+};
+use support::{Host, PATIENCE, say, until, wait_for_the_end};
+
+/// Topics: a publisher and a subscription of each process for each.
+const TOPICS: usize = 10;
+/// Processes of an ordinary run.
+const FEW: usize = 8;
+
+fn spec(topic: usize) -> EndpointSpec {
+    EndpointSpec::new(format!("/topic{topic}"), "test/Bytes", Qos::default())
+}
+
+/// What a process holds, as the system counts it.
+#[derive(Debug, Default)]
+struct Held {
+    descriptors: u64,
+    maps: u64,
+    /// Bytes of memory that back its own segments.
+    committed: u64,
+    page_tables_kib: u64,
+}
+
+impl Held {
+    fn here() -> Self {
+        let entries = fs::read_dir("/proc/self/fd").unwrap().map(|entry| entry.unwrap().path());
+        let mut held = Self::default();
+        for path in entries {
+            held.descriptors += 1;
+            let target = fs::read_link(&path).unwrap_or_default();
+            if target.to_string_lossy().starts_with("/memfd:axon-")
+                && let Ok(file) = fs::metadata(&path)
+            {
+                held.committed += file.blocks() * 512;
+            }
+        }
+        let maps = fs::read_to_string("/proc/self/maps").unwrap();
+        held.maps = maps.lines().filter(|line| line.contains("/memfd:axon-")).count() as u64;
+        let status = fs::read_to_string("/proc/self/status").unwrap();
+        let tables = status.lines().find_map(|line| line.strip_prefix("VmPTE:")).unwrap();
+        held.page_tables_kib = tables.trim().trim_end_matches(" kB").parse().unwrap();
+        held
+    }
+
+    fn parse(line: &str) -> Self {
+        let numbers: Vec<u64> = line.split(' ').map(|n| n.parse().unwrap()).collect();
+        let [descriptors, maps, committed, page_tables_kib] = numbers[..] else { panic!("{line}") };
+        Self { descriptors, maps, committed, page_tables_kib }
+    }
+}
+
+impl std::fmt::Display for Held {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { descriptors, maps, committed, page_tables_kib } = self;
+        write!(f, "{descriptors} {maps} {committed} {page_tables_kib}")
+    }
+}
+
+/// Not a test of its own: what each of the processes does.
+#[test]
+fn child() {
+    let Ok(part) = std::env::var("PLAY") else { return };
+    let processes: usize = part.parse().unwrap();
+    let config = Config::resolve(std::env::vars_os(), None, &OsFiles).unwrap();
+    let session = Session::open(&config, SessionOptions::new("sizing")).unwrap();
+    let publishers: Vec<_> =
+        (0..TOPICS).map(|topic| session.create_publisher(spec(topic)).unwrap()).collect();
+    let subscriptions: Vec<_> =
+        (0..TOPICS).map(|topic| session.create_subscription(spec(topic)).unwrap()).collect();
+    for subscription in &subscriptions {
+        assert!(subscription.wait_matched(processes, PATIENCE));
+    }
+    for publisher in &publishers {
+        assert!(publisher.wait_matched(processes, PATIENCE));
+    }
+    say("matched");
+    let mut line = String::new();
+    std::io::stdin().read_line(&mut line).unwrap();
+    for publisher in &publishers {
+        publisher.publish(&[7; 52]).unwrap();
+    }
+    let mut bytes = Vec::new();
+    for subscription in &subscriptions {
+        until("a sample of each", || {
+            while subscription.take(&mut bytes).is_some() {}
+            subscription.received() >= 1
+        });
+    }
+    say(Held::here());
+    wait_for_the_end();
+}
+
+#[test]
+fn a_process_maps_each_other_process_once() {
+    if std::env::var("PLAY").is_ok() {
+        return;
+    }
+    let processes = std::env::var("SIZING").ok().map_or(FEW, |n| n.parse().unwrap());
+    let host = Host::new().with("AXON_LOG", "warn");
+    let daemon = host.daemon();
+    let mut players: Vec<_> = (0..processes).map(|_| host.play(&processes.to_string())).collect();
+    for player in &mut players {
+        assert_eq!(player.hear(), "matched");
+    }
+    players.iter_mut().for_each(support::Player::go);
+    let held: Vec<Held> = players.iter_mut().map(|player| Held::parse(&player.hear())).collect();
+
+    let largest = |what: fn(&Held) -> u64| held.iter().map(what).max().unwrap();
+    let committed: u64 = held.iter().map(|held| held.committed).sum();
+    println!("{processes} processes of {} endpoints, each reads from each:", 2 * TOPICS);
+    println!("  descriptors, most of a process  {:>8}", largest(|held| held.descriptors));
+    println!("  maps of segments, most          {:>8}", largest(|held| held.maps));
+    println!("  page tables, most            {:>8} KiB", largest(|held| held.page_tables_kib));
+    println!("  committed in all             {:>8} KiB", committed >> 10);
+    let descriptors = fs::read_dir(format!("/proc/{}/fd", daemon.0.id())).unwrap().count();
+    println!("  descriptors of the daemon       {descriptors:>8}");
+
+    let processes = processes as u64;
+    // One map for each process, and two descriptors: its doorbell and its pidfd.
+    assert_eq!(largest(|held| held.maps), processes);
+    assert!(largest(|held| held.descriptors) <= 2 * processes + 24);
+    assert!(committed <= processes * (128 << 10));
+    players.into_iter().for_each(support::Player::finish);
+}
