@@ -39,7 +39,7 @@ pub(crate) struct Scene<'a> {
 enum End {
     Nothing,
     Waiting(Box<LateReader>),
-    Reader(Reader, Arc<PeerSession>),
+    Reader(Box<Reader>, Arc<PeerSession>),
     Writer(Box<Writer>),
 }
 
@@ -91,7 +91,7 @@ impl<'a> Scene<'a> {
                 Some(reader) => drain(case, done, reader),
                 None => false,
             },
-            End::Reader(reader, _) => drain(case, done, reader),
+            End::Reader(reader, _) => drain(case, done, *reader),
             End::Writer(writer) => {
                 go_on(case, &session, &writer);
                 false
@@ -123,7 +123,7 @@ fn join(case: &Case, wire: &Wire, session: &Arc<SessionSegment>) -> (End, Vec<Ow
         _ => {
             let (granted, seen) = wire.join(session, case.reader);
             let peer = granted.peer.clone();
-            (End::Reader(granted.map(), peer), seen)
+            (End::Reader(Box::new(granted.map()), peer), seen)
         }
     }
 }
