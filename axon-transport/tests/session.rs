@@ -4,6 +4,7 @@ use std::{path::Path, time::Duration};
 
 use axon_transport::{
     config::{Config, DaemonPolicy, OsFiles},
+    graph::EndpointKind,
     qos::Qos,
     session::{EndpointSpec, Publisher, Session, SessionError, SessionOptions, Subscription},
 };
@@ -14,6 +15,17 @@ fn session() -> Session {
     let config = Config::resolve([], None, &OsFiles).unwrap();
     let config = Config { daemon: DaemonPolicy::Off, ..config };
     Session::open(&config, SessionOptions::new("test")).unwrap()
+}
+
+/// The nodes that `session` sees, with the topics that each publishes.
+fn nodes(session: &Session) -> Vec<(String, Vec<String>)> {
+    let graph = session.graph();
+    let names = graph.nodes().into_iter().map(|node| {
+        let published =
+            graph.names_and_types_of(&node.name, &node.namespace, &[EndpointKind::Publisher]);
+        (node.name, published.unwrap().into_keys().collect())
+    });
+    names.collect()
 }
 
 fn spec(qos: Qos) -> EndpointSpec {
@@ -37,6 +49,35 @@ fn an_endpoint_out_of_bounds_is_refused() {
     assert!(matches!(refused, SessionError::Endpoint { .. }));
     let bottomless = spec(Qos { depth: 0, ..Qos::default() });
     assert!(session.create_subscription(bottomless).is_err());
+}
+
+#[test]
+fn a_node_is_in_the_graph_from_its_creation_to_its_end() {
+    let session = session();
+    for (name, namespace) in [("", "/"), ("n", &"x".repeat(513)), ("a\0b", "/")] {
+        let refused = session.create_node(name, namespace, "/").unwrap_err();
+        assert!(matches!(refused, SessionError::Node { .. }), "{refused}");
+    }
+    let idle = session.create_node("idle", "/", "/").unwrap();
+    let twins = [0, 1].map(|_| session.create_node("twin", "/", "/").unwrap());
+    let publisher = twins[1].create_publisher(spec(Qos::default())).unwrap();
+    let expect = |expected: &[(&str, &[&str])]| {
+        let expected: Vec<(String, Vec<String>)> = expected
+            .iter()
+            .map(|(n, topics)| ((*n).into(), topics.iter().map(|t| (*t).into()).collect()))
+            .collect();
+        let reached = session.wait_graph(PATIENCE, |_| nodes(&session) == expected);
+        assert!(reached, "{:?} instead of {expected:?}", nodes(&session));
+    };
+    // A query by name unites nodes of one name.
+    expect(&[("idle", &[]), ("twin", &["/t"]), ("twin", &["/t"])]);
+    let [first, second] = twins;
+    drop(first);
+    expect(&[("idle", &[]), ("twin", &["/t"])]);
+    drop((idle, publisher));
+    expect(&[("twin", &[])]);
+    drop(second);
+    expect(&[]);
 }
 
 #[test]

@@ -12,6 +12,16 @@ pub enum SessionError {
     /// A publisher of another description still has this GID.
     #[error("the GID {0} is in use by a publisher of another description; it ends soon")]
     InUse(crate::ids::Gid),
+    /// A node's name or namespace is empty or too long.
+    #[error(
+        "node {name:?}: its name is empty, or it, its namespace or its enclave is longer than {} bytes \
+         or holds a NUL",
+        crate::graph::LIMITS.name
+    )]
+    Node {
+        /// The name.
+        name: String,
+    },
     /// `AXON_DAEMON=require`, and there is none.
     #[error("no daemon listens at {address}: start `axon_daemon`, or set AXON_DAEMON=spawn")]
     NoDaemon {

@@ -11,6 +11,7 @@ mod control;
 mod error;
 mod local;
 pub mod message;
+mod node;
 mod options;
 mod peers;
 mod publisher;
@@ -28,6 +29,7 @@ use std::{
 
 pub use error::SessionError;
 pub use message::SessionRole;
+pub use node::Node;
 pub use options::{DaemonCommand, EndpointSpec, SessionOptions};
 pub use publisher::{Loan, Publisher};
 pub use state::SessionEvent;
@@ -45,6 +47,7 @@ use crate::{
     config::{Config, DaemonPolicy},
     graph::{Endpoint, EndpointKind, GraphView},
     ids::{DaemonId, Gid, SessionId},
+    qos::Qos,
     shm::{RingOptions, SessionSegment, ShmError, Writer},
 };
 
@@ -147,6 +150,33 @@ impl Session {
     pub fn create_subscription(&self, spec: EndpointSpec) -> Result<Subscription, SessionError> {
         let endpoint = self.endpoint(spec, EndpointKind::Subscription)?;
         Ok(self.add_subscription(endpoint, EndpointRole::Application, Vec::new()))
+    }
+
+    /// A node, which is in the graph until it is dropped.
+    ///
+    /// # Errors
+    /// When the name is empty, or a name is out of bounds.
+    pub fn create_node(
+        &self,
+        name: &str,
+        namespace: &str,
+        enclave: &str,
+    ) -> Result<Node, SessionError> {
+        // What a node has no use for is as it is by default.
+        let spec = EndpointSpec {
+            node: name.to_owned(),
+            namespace: namespace.to_owned(),
+            ..EndpointSpec::new("", "", Qos::default())
+        };
+        let described =
+            Endpoint { enclave: enclave.to_owned(), ..self.describe(spec, EndpointKind::Node)? };
+        if !described.is_sane() {
+            return Err(SessionError::Node { name: described.node });
+        }
+        let gid = described.gid;
+        self.shared().state().nodes.insert(gid, described.clone());
+        self.shared().tell(Outgoing::Announce(gid));
+        Ok(Node::new(described, self.clone()))
     }
 
     /// A local ring for a publisher on another host, under that publisher's own GID. For the
@@ -272,6 +302,16 @@ impl Session {
     }
 
     fn endpoint(&self, spec: EndpointSpec, kind: EndpointKind) -> Result<Endpoint, SessionError> {
+        let endpoint = self.describe(spec, kind)?;
+        if endpoint.is_sane() {
+            Ok(endpoint)
+        } else {
+            Err(SessionError::Endpoint { topic: endpoint.topic })
+        }
+    }
+
+    /// An endpoint with a GID of its own.
+    fn describe(&self, spec: EndpointSpec, kind: EndpointKind) -> Result<Endpoint, SessionError> {
         if self.is_forked() {
             return Err(ShmError::Forked.into());
         }
@@ -281,7 +321,7 @@ impl Session {
             state.next_entity
         };
         let EndpointSpec { topic, type_name, type_hash, qos, node, namespace } = spec;
-        let endpoint = Endpoint {
+        Ok(Endpoint {
             gid: Gid::new(self.shared().id, number),
             kind,
             topic,
@@ -291,12 +331,7 @@ impl Session {
             node,
             namespace,
             enclave: String::new(),
-        };
-        if endpoint.is_sane() {
-            Ok(endpoint)
-        } else {
-            Err(SessionError::Endpoint { topic: endpoint.topic })
-        }
+        })
     }
 
     fn add_publisher(
@@ -336,13 +371,14 @@ impl Session {
         Subscription { inner, session: self.clone() }
     }
 
-    /// An endpoint's handle is dropped.
+    /// An endpoint's or a node's handle is dropped.
     fn forget_endpoint(&self, gid: &Gid) {
         // In a forked child it is the parent's still, and its locks may be held.
         if self.is_forked() {
             return;
         }
         let mut state = self.shared().state();
+        state.nodes.remove(gid);
         let stand_in =
             state.publishers.remove(gid).is_some_and(|p| p.role != EndpointRole::Application);
         let relay =

@@ -19,7 +19,7 @@ use super::{
 };
 use crate::{
     config::Config,
-    graph::GraphView,
+    graph::{Endpoint, GraphView},
     ids::{DaemonId, Gid, SessionId},
     shm::{SegmentEvent, SessionSegment},
 };
@@ -59,6 +59,7 @@ pub(super) struct Shared {
 #[derive(Default)]
 pub(super) struct State {
     pub(super) next_entity: u32,
+    pub(super) nodes: HashMap<Gid, Endpoint>,
     pub(super) publishers: HashMap<Gid, Arc<PublisherInner>>,
     pub(super) subscriptions: HashMap<Gid, Arc<SubscriptionInner>>,
     pub(super) outgoing: VecDeque<Outgoing>,

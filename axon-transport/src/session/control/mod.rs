@@ -108,8 +108,8 @@ impl Control {
             let mut state = self.shared.state();
             state.daemon = Some(daemon);
             state.outgoing.clear();
-            let gids: Vec<Gid> =
-                state.publishers.keys().chain(state.subscriptions.keys()).copied().collect();
+            let endpoints = state.publishers.keys().chain(state.subscriptions.keys());
+            let gids: Vec<Gid> = state.nodes.keys().chain(endpoints).copied().collect();
             let gone: Vec<Gid> = state.tombstones.iter().copied().collect();
             state.outgoing.extend(gids.into_iter().map(Outgoing::Announce));
             let gone = gone.into_iter().map(|gid| Message::EndpointGone(Gone { gid }));
@@ -257,6 +257,14 @@ impl Control {
                                 self.outbox.push_back((attach, Vec::new()));
                             }
                         }
+                    } else if let Some(node) = state.nodes.get(&gid) {
+                        let announce = Announce {
+                            endpoint: node.clone(),
+                            role: EndpointRole::Application,
+                            stands_for: Vec::new(),
+                            ring: None,
+                        };
+                        self.outbox.push_back((Message::Endpoint(announce), Vec::new()));
                     }
                 }
             }
