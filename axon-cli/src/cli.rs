@@ -86,7 +86,7 @@ Examples:
   axon demo
   axon demo --json | jq .verdict
   axon demo --file camera.mcap --rate 1
-  axon demo --kme-env sae-1.env --kme-env sae-2.env --rate 1
+  axon demo --kme-env sae-1.env --kme-env sae-2.env --rate 10
 
 With --kme-env the keys come from KMEs that run already: the first FILE says which SAE host A is, the
 second host B, as kme-sim init prints it. docs/qukaydee.md does so with KMEs in the cloud.
