@@ -1,6 +1,6 @@
 //! What a publish costs with 1 to 16 reader processes.
 
-use std::{sync::atomic::Ordering, time::Instant};
+use std::{os::fd::AsFd, sync::atomic::Ordering, time::Instant};
 
 use axon_transport::shm::{Context, Publisher, PublisherOptions, Subscriber, SubscriberOptions};
 use rustix::process::{Signal, set_parent_process_death_signal};
@@ -40,13 +40,14 @@ impl Crowd {
     /// topic: what is measured is the publisher.
     pub(super) fn measure(&self, size: usize, effort: Effort) -> Result<Cost> {
         let context = Context::new()?;
-        let options = PublisherOptions::new(qos(1)?);
+        let options = PublisherOptions::new(qos(1)?).expected_len(size as u64);
         let mut publishers = Vec::new();
         for readers in READERS {
             let publisher = Publisher::new(&context, options)?;
             for reader in &self.0[..readers] {
-                reader.channel().tell(&Order::Connect)?;
-                publisher.serve(reader.channel(), None)?;
+                let (ours, theirs) = Channel::pair()?;
+                reader.channel().hand_over(&Order::Connect, &[theirs.as_fd()])?;
+                publisher.serve(&ours, None)?;
                 reader.channel().hear::<()>()?;
             }
             publishers.push(publisher);
@@ -106,11 +107,12 @@ pub(super) fn attend() -> Result<()> {
     let channel = Channel::inherited()?;
     let context = Context::new()?;
     let mut subscribers = Vec::new();
-    while let Ok(order) = channel.hear() {
+    while let Ok((order, fds)) = channel.take_over() {
         match order {
             Order::Connect => {
+                let [socket] = fds.try_into().map_err(|_| "another number of descriptors")?;
                 let options = SubscriberOptions::new(qos(1)?);
-                subscribers.push(Subscriber::connect(&context, &channel, options, None)?);
+                subscribers.push(Subscriber::connect(&context, &socket, options, None)?);
             }
             Order::Drop => subscribers.clear(),
         }

@@ -1,6 +1,9 @@
 //! AXON's shared memory, used as its documentation says.
 
-use std::time::Duration;
+use std::{
+    os::fd::{AsFd, OwnedFd},
+    time::Duration,
+};
 
 use axon_transport::{
     qos::Qos,
@@ -11,6 +14,8 @@ use super::{Channel, End, Load, Medium, Motion, Result, Side, agree, stamp};
 
 /// Longer than any machine needs to connect.
 const PATIENCE: Option<Duration> = Some(Duration::from_secs(60));
+/// As `Subscriber::recv` sleeps.
+const LONGEST_SLEEP: Option<Duration> = Some(Duration::from_secs(1));
 /// Up to here a sample is copied in any case, so that `publish` and `take_into` are the shorter
 /// way.
 const COPIED: usize = 4096;
@@ -28,18 +33,24 @@ impl Medium for Axon {
         let qos = qos(load.window)?;
         // All that may be under way must fit, or the oldest go.
         let budget = (load.window * load.size).max(64 << 20) as u64;
-        let options = PublisherOptions::new(qos).budget(budget);
+        let options = PublisherOptions::new(qos).budget(budget).expected_len(load.size as u64);
         let publisher = Publisher::new(&context, options)?;
-        let connect =
-            || Subscriber::connect(&context, channel, SubscriberOptions::new(qos), PATIENCE);
+        let connect = |socket: &OwnedFd| {
+            Subscriber::connect(&context, socket, SubscriberOptions::new(qos), PATIENCE)
+        };
+        // A socket for each direction, which the two keep.
         let subscriber = match side {
             Side::Near => {
-                publisher.serve(channel, PATIENCE)?;
-                connect()?
+                let [(there, first), (back, second)] = [Channel::pair()?, Channel::pair()?];
+                channel.hand_over(&(), &[first.as_fd(), second.as_fd()])?;
+                publisher.serve(&there, PATIENCE)?;
+                connect(&back.into())?
             }
             Side::Far => {
-                let subscriber = connect()?;
-                publisher.serve(channel, PATIENCE)?;
+                let ((), fds) = channel.take_over()?;
+                let [there, back] = fds.try_into().map_err(|_| "another number of descriptors")?;
+                let subscriber = connect(&there)?;
+                publisher.serve(&back, PATIENCE)?;
                 subscriber
             }
         };
@@ -92,7 +103,7 @@ impl End for AxonEnd {
     fn receive(&mut self) -> Result<u64> {
         loop {
             if self.sleeps {
-                self.context.wait(|| self.subscriber.has_data(), None);
+                self.context.wait(|| self.subscriber.has_data(), LONGEST_SLEEP);
             }
             if self.copies {
                 if self.subscriber.take_into(&mut self.into)?.is_some() {
