@@ -373,6 +373,16 @@ fn reluctant() -> (OwnedFd, std::net::TcpStream) {
     (ours.into(), peer)
 }
 
+/// A unix socket in whose queue such a one waits, where nobody finds it before it is closed.
+fn hiding() -> (OwnedFd, std::net::TcpStream) {
+    use rustix::net::{AddressFamily, SocketFlags, SocketType, socketpair};
+    let (unix, packets) = (AddressFamily::UNIX, SocketType::SEQPACKET);
+    let (ours, theirs) = socketpair(unix, packets, SocketFlags::CLOEXEC, None).unwrap();
+    let (fd, peer) = reluctant();
+    send_away(&theirs, b"x", 0, fd);
+    (ours, peer)
+}
+
 /// A packet whose last descriptor is from then on in nobody's hands but the receiver's.
 fn send_away(socket: &OwnedFd, bytes: &[u8], before: usize, fd: OwnedFd) {
     use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg};
@@ -412,15 +422,22 @@ fn descriptors_that_are_slow_to_close_do_not_stop_the_daemon() {
         (Some(&garbage), &unknown, 0),
     ];
     let mut peers = Vec::new();
-    for (first, carrier, before) in ways {
+    // More than the daemon has threads that close.
+    for (first, carrier, before) in ways.into_iter().cycle().take(45) {
         let stranger = address.connect().unwrap();
         if let Some(first) = first {
             socket::send(&stranger, first, &[]).unwrap();
         }
-        let (fd, peer) = reluctant();
+        let (fd, peer) = hiding();
         send_away(&stranger, carrier, before, fd);
         peers.push((peer, stranger));
     }
+    // Who is put out hears of it.
+    let other = address.connect().unwrap();
+    socket::send(&other, &garbage, &[]).unwrap();
+    until("the connection is over", || {
+        matches!(socket::receive(&other, &mut Vec::new()), Err(socket::SocketError::Closed))
+    });
     let session = host.session("witness").unwrap();
     let publisher = session.create_publisher(spec("/t")).unwrap();
     let subscription = host.session("b").unwrap().create_subscription(spec("/t")).unwrap();

@@ -83,7 +83,7 @@ impl Admission {
             return Err(plain("the pidfd in HELLO is not the sender's own".into()));
         }
         let PeerDescriptors { segment, doorbell, pidfd } = handed;
-        Ok(Some([segment, doorbell, pidfd.harmless()]))
+        Ok(Some([segment, doorbell, pidfd]))
     }
 
     /// The files of the classic identity may change while the daemon runs: its gateway reads them

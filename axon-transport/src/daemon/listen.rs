@@ -11,10 +11,14 @@ use std::{
 use rustix::net::{SocketFlags, accept_with};
 use tokio::{io::unix::AsyncFd, sync::Notify, task::spawn_local, time::timeout};
 
-use super::{control::Control, watch::watch};
+use super::{
+    control::Control,
+    registry::{MAX_OF_PROCESS, SessionEntry},
+    watch::watch,
+};
 use crate::{
     ids::{Gid, SessionId},
-    passed::PassedFd,
+    passed::{self, PassedFd},
     session::{
         message::{Hello, Message, PROTOCOL, Refused, Welcome},
         socket::{self, Peer, Received, SocketError},
@@ -25,6 +29,8 @@ use crate::{
 const HELLO: Duration = Duration::from_secs(5);
 /// Connections that may be without a HELLO at a time.
 const STRANGERS: usize = 256;
+/// Between attempts when no connection can be accepted.
+const PAUSE: Duration = Duration::from_millis(50);
 /// Packets taken from one session before the others have their turn.
 const BATCH: usize = 64;
 
@@ -35,15 +41,25 @@ pub(super) async fn accept(control: Rc<RefCell<Control>>, listener: OwnedFd) {
         Err(error) => return tracing::error!(%error, "the session socket cannot be watched"),
     };
     let strangers = Arc::new(tokio::sync::Semaphore::new(STRANGERS));
+    let mut full = false;
     loop {
         let Ok(permit) = strangers.clone().acquire_owned().await else { return };
         let Ok(mut ready) = listener.readable().await else { return };
+        if passed::is_short() || passed::has_too_many_strangers() {
+            // Those that have a session keep it.
+            if !std::mem::replace(&mut full, true) {
+                tracing::error!("too many descriptors are open: no more sessions are accepted");
+            }
+            tokio::time::sleep(PAUSE).await;
+            continue;
+        }
+        full = false;
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
         let accepted = ready.try_io(|l| Ok(accept_with(l.get_ref(), flags)?));
         match accepted {
             Ok(Ok(socket)) => {
                 let control = control.clone();
-                let socket = PassedFd::received(socket);
+                let socket = PassedFd::connection(socket);
                 spawn_local(async move {
                     serve(control, socket, false, move || drop(permit)).await;
                 });
@@ -51,7 +67,7 @@ pub(super) async fn accept(control: Rc<RefCell<Control>>, listener: OwnedFd) {
             Ok(Err(error)) => {
                 // Out of descriptors, or the caller has gone: neither ends the daemon.
                 tracing::warn!(%error, "a session could not be accepted");
-                tokio::time::sleep(Duration::from_millis(50)).await;
+                tokio::time::sleep(PAUSE).await;
             }
             Err(_not_ready) => {}
         }
@@ -70,7 +86,7 @@ pub(super) async fn serve(
         tracing::warn!(uid = peer.uid, pid = peer.pid, "a stranger's connection was closed");
         return;
     }
-    let Ok(socket) = watch(socket) else { return };
+    let Ok(socket) = watch(socket.trusted()) else { return };
     let Ok(Some(hello)) = timeout(HELLO, first(&socket)).await else { return };
     known();
     let Some((id, bell, death)) = admit(&control, &socket, hello, peer, inside) else { return };
@@ -87,7 +103,7 @@ async fn first(socket: &AsyncFd<PassedFd>) -> Option<(Hello, Vec<PassedFd>)> {
     let mut unknown = 0;
     loop {
         let mut ready = socket.readable().await.ok()?;
-        match socket::receive(socket.get_ref(), &mut buffer) {
+        match receive(socket.get_ref(), &mut buffer) {
             Ok(Received { message: Message::Hello(hello), descriptors }) => {
                 return Some((hello, descriptors));
             }
@@ -139,6 +155,11 @@ fn admit(
     // Endpoints are named after their session's id: who has another's could end them.
     if let Some(pid) = taken_by(control, &hello.session, peer.pid) {
         refuse(control, format!("process {pid} has a session with this one's id or one like it"));
+        return None;
+    }
+    let same = |(_, entry): &(&SessionId, &SessionEntry<_>)| entry.pid == peer.pid;
+    if !inside && control.registry.sessions().filter(same).count() >= MAX_OF_PROCESS {
+        refuse(control, format!("its process has {MAX_OF_PROCESS} sessions already"));
         return None;
     }
     let death = match &handed {
@@ -244,6 +265,14 @@ fn send_all(
     Ok(false)
 }
 
+/// Receives one packet, unless it has descriptors for which there may be no room.
+fn receive(socket: &PassedFd, buffer: &mut Vec<u8>) -> Result<Received, SocketError> {
+    if passed::is_short() && passed::carries_descriptors(socket) {
+        return Err(SocketError::NoDescriptors);
+    }
+    socket::receive(socket, buffer)
+}
+
 /// Takes a batch of packets; whether the socket is empty now.
 fn receive_some(
     control: &Rc<RefCell<Control>>,
@@ -258,13 +287,22 @@ fn receive_some(
     }
     let mut outcome = Ok(false);
     for _ in 0..BATCH {
-        match socket::receive(socket.get_ref(), buffer) {
+        match receive(socket.get_ref(), buffer) {
             Ok(Received { message: Message::StatusRequest, .. }) => control.send_status(id),
             // The one thing that is handed over after HELLO, and the only one that the daemon reads:
             // reading anything else may block.
             Ok(Received { descriptors, .. }) if !descriptors.iter().all(PassedFd::is_memfd) => {
                 tracing::warn!(session = %id, "a session that sent no memfd was disconnected");
                 outcome = Err("it sent a descriptor that is no memfd".into());
+                break;
+            }
+            Ok(Received { descriptors, .. })
+                if !descriptors.is_empty()
+                    && control.registry.holds_as_many_as(id, passed::share()) =>
+            {
+                tracing::warn!(session = %id, "a session with too many publishers for this \
+                    daemon's RLIMIT_NOFILE was disconnected");
+                outcome = Err("the daemon holds as many descriptors of it as it can".into());
                 break;
             }
             Ok(Received { message, descriptors }) => {

@@ -3,21 +3,18 @@
 #![allow(unsafe_code)]
 
 use std::{
-    io::{IoSlice, IoSliceMut},
+    io::IoSlice,
     mem::MaybeUninit,
     os::fd::{AsFd, AsRawFd, BorrowedFd},
 };
 
 use rustix::{
     io::Errno,
-    net::{
-        RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, ReturnFlags, SendAncillaryBuffer,
-        SendAncillaryMessage, SendFlags, recvmsg, sendmsg,
-    },
+    net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg},
 };
 
 use super::message::{CodecError, MAX_DESCRIPTORS, MAX_PACKET, Message};
-use crate::passed::PassedFd;
+use crate::passed::{self, Packet, PassedFd};
 
 /// A message that arrived, and what came with it.
 #[derive(Debug)]
@@ -75,9 +72,6 @@ pub struct Peer {
     pub pid: u32,
 }
 
-/// The most descriptors that the system lets a packet carry.
-const SCM_MAX_FD: usize = 253;
-
 /// Who is at the other end (SO_PEERCRED).
 ///
 /// # Errors
@@ -134,35 +128,21 @@ pub fn send(
 /// Receives one packet. `buffer` is room to reuse; it need not have any length.
 ///
 /// # Errors
-/// [`SocketError::NotReady`] when there is none. Every other error is final for the connection.
+/// [`SocketError::NotReady`] when there is none. Every other error is final for the connection, but
+/// for [`SocketError::NoDescriptors`]: the packet is gone, and the next ones may come whole.
 pub fn receive(socket: impl AsFd, buffer: &mut Vec<u8>) -> Result<Received, SocketError> {
     buffer.resize(MAX_PACKET + 1, 0);
-    // All that can come: what did not fit the kernel would close in this thread.
-    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(SCM_MAX_FD))];
-    let mut control = RecvAncillaryBuffer::new(&mut space);
-    let flags = RecvFlags::DONTWAIT | RecvFlags::CMSG_CLOEXEC;
-    let got = loop {
-        match recvmsg(&socket, &mut [IoSliceMut::new(buffer)], &mut control, flags) {
-            Err(Errno::INTR) => {}
-            other => break other?,
-        }
-    };
-    let mut descriptors = Vec::new();
-    for message in control.drain() {
-        if let RecvAncillaryMessage::ScmRights(received) = message {
-            descriptors.extend(received.map(PassedFd::received));
-        }
-    }
-    if got.flags.contains(ReturnFlags::TRUNC) || descriptors.len() > MAX_DESCRIPTORS {
+    let Packet { bytes, truncated, lost, descriptors } = passed::receive(socket, buffer)?;
+    if truncated || descriptors.len() > MAX_DESCRIPTORS {
         return Err(SocketError::Truncated);
     }
-    if got.flags.contains(ReturnFlags::CTRUNC) {
+    if lost {
         return Err(SocketError::NoDescriptors);
     }
-    if got.bytes == 0 {
+    if bytes == 0 {
         return Err(SocketError::Closed);
     }
-    Ok(Received { message: Message::decode(&buffer[..got.bytes])?, descriptors })
+    Ok(Received { message: Message::decode(&buffer[..bytes])?, descriptors })
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 //! packet there, one back, and one for each segment of memory (`docs/formats.md`, section 9).
 
 use std::{
-    io::{self, IoSlice, IoSliceMut},
+    io::{self, IoSlice},
     mem::MaybeUninit,
     os::fd::{AsFd, BorrowedFd, OwnedFd},
     time::{Duration, Instant},
@@ -12,16 +12,13 @@ use minicbor::{Decode, Encode};
 use rustix::{
     event::{PollFd, PollFlags, Timespec, poll},
     io::Errno,
-    net::{
-        RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, ReturnFlags, SendAncillaryBuffer,
-        SendAncillaryMessage, SendFlags, recvmsg, sendmsg,
-    },
+    net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg},
 };
 
 use super::{Location, PeerDescriptors, SegmentInfo, SegmentKind, ShmError};
 use crate::{
     ids::{Gid, SessionId},
-    passed::PassedFd,
+    passed::{self, PassedFd},
     qos::{Incompatible, Qos},
 };
 
@@ -29,8 +26,6 @@ use crate::{
 const VERSION: u32 = 2;
 const MAX_PACKET: usize = 1024;
 const MAX_DESCRIPTORS: usize = 4;
-/// The most descriptors that the system lets a packet carry.
-const SCM_MAX_FD: usize = 253;
 /// The longest reason that is told.
 const MAX_REASON: usize = 256;
 
@@ -273,35 +268,23 @@ impl<'a> Channel<'a> {
 
     fn receive(&self) -> Result<(Packet, Vec<PassedFd>), ConnectError> {
         let mut bytes = [0; MAX_PACKET];
-        // All that can come: what did not fit the kernel would close in this thread.
-        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(SCM_MAX_FD))];
         loop {
-            let mut control = RecvAncillaryBuffer::new(&mut space);
-            let flags = RecvFlags::DONTWAIT | RecvFlags::CMSG_CLOEXEC;
-            let mut into = [IoSliceMut::new(&mut bytes)];
-            let got = match recvmsg(self.socket, &mut into, &mut control, flags) {
+            let got = match passed::receive(self.socket, &mut bytes) {
                 Ok(got) => got,
-                Err(Errno::INTR) => continue,
                 Err(Errno::AGAIN) => {
                     self.until(PollFlags::IN)?;
                     continue;
                 }
                 Err(errno) => return Err(errno.into()),
             };
-            let mut fds = Vec::new();
-            for message in control.drain() {
-                if let RecvAncillaryMessage::ScmRights(rights) = message {
-                    fds.extend(rights.map(PassedFd::received));
-                }
-            }
+            let fds = got.descriptors;
             if got.bytes == 0 {
                 return Err(ConnectError::Closed);
             }
-            if got.flags.contains(ReturnFlags::TRUNC) || fds.len() > MAX_DESCRIPTORS {
+            if got.truncated || fds.len() > MAX_DESCRIPTORS {
                 return Err(ConnectError::Protocol("more than belongs in a packet"));
             }
-            // There was room for whatever can come.
-            if got.flags.contains(ReturnFlags::CTRUNC) {
+            if got.lost {
                 let what = "receiving descriptors";
                 return Err(ShmError::System { what, source: Errno::MFILE.into() }.into());
             }

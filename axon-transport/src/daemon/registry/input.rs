@@ -161,6 +161,11 @@ impl<F: Clone> Registry<F> {
         }
     }
 
+    /// Whether the daemon holds `most` descriptors of a session's memory.
+    pub fn holds_as_many_as(&self, id: &SessionId, most: usize) -> bool {
+        self.sessions.get(id).is_some_and(|entry| entry.segments.len() >= most)
+    }
+
     /// Keeps the first refusal of a session for the status; it is told all of them.
     fn note_refused(&mut self, id: &SessionId, text: &str) {
         if let Some(entry) = self.sessions.get_mut(id)

@@ -44,6 +44,8 @@ pub const MAX_ALL_PAIRS: usize = if cfg!(test) { 1 << 18 } else { 1 << 22 };
 const STATUS_SLICE: usize = 24 * 1024;
 /// Sessions of one daemon.
 pub const MAX_SESSIONS: usize = 4096;
+/// Those of one process.
+pub const MAX_OF_PROCESS: usize = 256;
 /// Remembered GIDs of endpoints that ended while there was no daemon to tell.
 const MAX_TOMBSTONES: usize = 4096;
 
