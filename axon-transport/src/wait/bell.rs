@@ -23,8 +23,9 @@ impl Bell {
         (unix && packets).then_some(Self(fd))
     }
 
-    /// Rings. Never blocks, whatever became of the other end. That there is no room is as good: then
-    /// rings stand there that nobody has heard yet.
+    /// Rings, without waiting for whoever is at the other end; kernels before 6.9 may first look for
+    /// sockets that nobody can reach any more. That there is no room is as good: then rings stand
+    /// there that nobody has heard yet.
     pub(crate) fn ring(&self) {
         let _ = send(&self.0, &[1], SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
     }

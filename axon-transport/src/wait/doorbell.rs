@@ -10,7 +10,7 @@ use rustix::{event::Timespec, io::Errno};
 
 use super::{
     Bell, arm, disarm,
-    ear::{CLOSED, Ear, Heard, LONGEST},
+    ear::{CLOSED, Drained, Ear, Heard, LONGEST, not_too_long},
     spin::Spin,
 };
 
@@ -188,11 +188,7 @@ impl Doorbell {
     ) {
         let follower = Arc::new(Follower { turn: Condvar::new(), look: look.cloned() });
         crowd.followers.push(Arc::clone(&follower));
-        let left = match (left, LONGEST) {
-            (Some(left), Some(longest)) => Some(left.min(longest)),
-            (left, longest) => left.or(longest),
-        };
-        crowd = match left {
+        crowd = match not_too_long(left) {
             Some(left) => {
                 let woken = follower.turn.wait_timeout(crowd, left);
                 woken.unwrap_or_else(PoisonError::into_inner).0
@@ -205,13 +201,7 @@ impl Doorbell {
     /// Wakes those of the crowd that what was heard may concern.
     fn spread(&self, mut crowd: MutexGuard<'_, Crowd>, words: Words<'_>, heard: Heard) {
         if heard.closed && !crowd.closed {
-            crowd.closed = true;
-            self.ear.give_up();
-            self.pace(&crowd);
-            tracing::error!(
-                "another process closed this session's doorbell: from now on it looks for news \
-                 every few milliseconds"
-            );
+            crowd.give_up(&self.ear, "closed this session's doorbell");
         }
         crowd.queued = (crowd.queued || heard.queued) && !crowd.closed;
         let rung = heard.rung || (heard.tick && crowd.closed);
@@ -249,19 +239,8 @@ impl Doorbell {
         }
         crowd.coming = false;
         crowd.leader = Leader::External;
-        self.pace(&crowd);
+        crowd.pace(&self.ear);
         true
-    }
-
-    /// Has who listens woken for nothing as often as is needed.
-    fn pace(&self, crowd: &Crowd) {
-        let interval = match crowd.leader {
-            _ if crowd.closed => Some(CLOSED),
-            // Threads that listen see to it themselves.
-            Leader::External => LONGEST,
-            Leader::None | Leader::Thread => None,
-        };
-        self.ear.tick(interval);
     }
 
     /// The event loop takes what came.
@@ -290,13 +269,13 @@ impl Doorbell {
     pub(super) fn leave_from_outside(&self) {
         let mut crowd = self.lock();
         crowd.leader = Leader::None;
-        self.pace(&crowd);
+        crowd.pace(&self.ear);
         crowd.hand_over();
     }
 
     /// As where the kernel cannot keep descriptors out of the bell.
     #[cfg(test)]
-    pub(super) fn let_rights_pass(&self) {
+    pub(crate) fn let_rights_pass(&mut self) {
         self.ear.let_rights_pass();
     }
 
@@ -339,10 +318,41 @@ impl Crowd {
     /// Gives out a new ticket.
     fn arm(&mut self, ear: &Ear, words: &[&AtomicU64]) {
         if self.queued {
-            self.queued = !ear.drain();
+            let drained = ear.drain();
+            self.queued = drained == Drained::Some;
+            match drained {
+                Drained::All => {}
+                // A ring whose event was still to come may have been taken with the others, and
+                // somebody sleeps who relies on it.
+                Drained::Some => ear.knock(),
+                Drained::Rights => {
+                    self.give_up(ear, "put descriptors into this session's doorbell")
+                }
+            }
         }
         self.ticket += 1;
         words.iter().for_each(|word| arm(*word, self.ticket));
+    }
+
+    /// The bell is of no use any more: there is a look for news by time.
+    fn give_up(&mut self, ear: &Ear, what: &str) {
+        self.closed = true;
+        ear.give_up();
+        self.pace(ear);
+        tracing::error!(
+            "another process {what}: from now on it looks for news every few milliseconds"
+        );
+    }
+
+    /// Has who listens woken for nothing as often as is needed.
+    fn pace(&self, ear: &Ear) {
+        let interval = match self.leader {
+            _ if self.closed => Some(CLOSED),
+            // Threads that listen see to it themselves.
+            Leader::External => LONGEST,
+            Leader::None | Leader::Thread => None,
+        };
+        ear.tick(interval);
     }
 
     fn disarm_idle(&self, purpose: Purpose, words: Words<'_>) {

@@ -3,7 +3,6 @@
 #![allow(unsafe_code)]
 
 use std::{
-    io::IoSliceMut,
     mem::MaybeUninit,
     os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd},
     time::Duration,
@@ -12,10 +11,7 @@ use std::{
 use rustix::{
     event::{EventfdFlags, PollFd, PollFlags, Timespec, epoll, eventfd, poll},
     io::{Errno, read, write},
-    net::{
-        AddressFamily, RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, Shutdown, SocketFlags,
-        SocketType, recvmsg, shutdown, socketpair,
-    },
+    net::{AddressFamily, RecvFlags, SocketFlags, SocketType, recv, socketpair},
     time::{
         Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, timerfd_create,
         timerfd_settime,
@@ -23,7 +19,7 @@ use rustix::{
 };
 
 use super::Bell;
-use crate::passed::PassedFd;
+use crate::passed::{PassedFd, carries_descriptors};
 
 /// How long who listens sleeps at most. What another process could not, or would not, ring for is
 /// found then. Tests sleep for ever, so that they notice.
@@ -33,8 +29,6 @@ pub(super) const LONGEST: Option<Duration> =
 pub(super) const CLOSED: Duration = Duration::from_millis(5);
 /// Rings that are taken at a time.
 const FLOOD: u32 = 512;
-/// The most descriptors that the system lets a packet carry.
-const SCM_MAX_FD: usize = 253;
 
 const BELL: u64 = 0;
 const KNOCK: u64 = 1;
@@ -46,7 +40,10 @@ const TICK: u64 = 2;
 /// been taken or not. So who is woken need not take any, and is back in one system call.
 pub(super) struct Ear {
     set: OwnedFd,
-    heard: OwnedFd,
+    /// Where the kernel cannot keep descriptors out of it, it closes like one of another process.
+    heard: PassedFd,
+    /// Packets may carry descriptors.
+    rights: bool,
     bell: Bell,
     /// Never handed out: an eventfd that this process wakes itself with.
     knock: OwnedFd,
@@ -70,9 +67,8 @@ impl Ear {
     pub(super) fn new() -> Result<Self, Errno> {
         let (heard, given) =
             socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None)?;
-        // Nobody can take rings at the end that is handed out, nor put anything into its queue.
-        shutdown(&given, Shutdown::Read)?;
-        pass_rights(heard.as_fd(), false);
+        let rights = !pass_rights(heard.as_fd(), false);
+        let heard = if rights { PassedFd::received(heard) } else { heard.into() };
         let flags = EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK;
         let knock = eventfd(0, flags)?;
         let flags = TimerfdFlags::CLOEXEC | TimerfdFlags::NONBLOCK;
@@ -83,7 +79,7 @@ impl Ear {
         epoll::add(&set, &knock, epoll::EventData::new_u64(KNOCK), edge)?;
         let level = epoll::EventFlags::IN;
         epoll::add(&set, &tick, epoll::EventData::new_u64(TICK), level)?;
-        Ok(Self { set, heard, bell: Bell::new(given.into()), knock, tick })
+        Ok(Self { set, heard, rights, bell: Bell::new(given.into()), knock, tick })
     }
 
     /// The end that rings.
@@ -106,12 +102,10 @@ impl Ear {
 
     /// Sleeps until something comes, for at most `left`. Events of `others` end it too.
     pub(super) fn listen(&self, others: &[BorrowedFd<'_>], left: Option<Duration>) -> Heard {
-        let left = match (left, LONGEST) {
-            (Some(left), Some(longest)) => Some(left.min(longest)),
-            (left, longest) => left.or(longest),
-        };
-        let timeout = left.and_then(|left| Timespec::try_from(left).ok());
-        if others.is_empty() {
+        let timeout = not_too_long(left).and_then(|left| Timespec::try_from(left).ok());
+        // epoll counts in milliseconds, and would be late by up to one.
+        let in_millis = timeout.is_none_or(|timeout| timeout.tv_nsec % 1_000_000 == 0);
+        if others.is_empty() && in_millis {
             return self.take(timeout.as_ref());
         }
         let all = [self.set.as_fd()];
@@ -153,30 +147,44 @@ impl Ear {
     }
 
     #[cfg(test)]
-    pub(super) fn let_rights_pass(&self) {
+    pub(super) fn let_rights_pass(&mut self) {
         pass_rights(self.heard.as_fd(), true);
+        self.rights = true;
     }
 
-    /// Takes the rings that stand in the queue; whether it is empty then.
-    pub(super) fn drain(&self) -> bool {
-        // Descriptors that should not be there are taken too: the kernel would close in this thread
-        // what did not fit.
-        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(SCM_MAX_FD))];
+    /// Takes the rings that stand in the queue.
+    pub(super) fn drain(&self) -> Drained {
         for _ in 0..FLOOD {
-            let mut byte = [0];
-            let mut control = RecvAncillaryBuffer::new(&mut space);
-            let flags = RecvFlags::DONTWAIT | RecvFlags::CMSG_CLOEXEC;
-            match recvmsg(&self.heard, &mut [IoSliceMut::new(&mut byte)], &mut control, flags) {
-                Ok(_) | Err(Errno::INTR) => {}
-                Err(_) => return true,
+            // They stay where they are: taken, they would fill this process's table, and the kernel
+            // would close in this thread what did not fit.
+            if self.rights && carries_descriptors(&self.heard) {
+                return Drained::Rights;
             }
-            for message in control.drain() {
-                if let RecvAncillaryMessage::ScmRights(rights) = message {
-                    rights.map(PassedFd::received).for_each(drop);
-                }
+            match recv(&self.heard, &mut [0; 1], RecvFlags::DONTWAIT) {
+                Ok(_) | Err(Errno::INTR) => {}
+                Err(_) => return Drained::All,
             }
         }
-        false
+        Drained::Some
+    }
+}
+
+/// What became of the rings in a queue.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum Drained {
+    /// None is left.
+    All,
+    /// There may be more: somebody rings without end.
+    Some,
+    /// One carries descriptors, as no ring does.
+    Rights,
+}
+
+/// At most as long as who listens sleeps.
+pub(super) fn not_too_long(left: Option<Duration>) -> Option<Duration> {
+    match (left, LONGEST) {
+        (Some(left), Some(longest)) => Some(left.min(longest)),
+        (left, longest) => left.or(longest),
     }
 }
 
@@ -187,8 +195,9 @@ impl AsFd for Ear {
     }
 }
 
-/// Whether packets may carry descriptors. Older kernels (Linux 6.16 is the first) let them.
-fn pass_rights(socket: BorrowedFd<'_>, may: bool) {
+/// Whether packets may carry descriptors. Older kernels (Linux 6.16 is the first) let them; whether
+/// this one did as it was told.
+fn pass_rights(socket: BorrowedFd<'_>, may: bool) -> bool {
     const SO_PASSRIGHTS: libc::c_int = 83;
     let value = libc::c_int::from(may);
     let len = libc::socklen_t::try_from(size_of::<libc::c_int>()).expect("a few bytes");
@@ -201,6 +210,6 @@ fn pass_rights(socket: BorrowedFd<'_>, may: bool) {
             SO_PASSRIGHTS,
             (&raw const value).cast(),
             len,
-        )
-    };
+        ) == 0
+    }
 }

@@ -16,12 +16,12 @@ use rustix::{
     net::{RecvFlags, Shutdown, recv, shutdown},
 };
 
-use super::{Bell, Look, Purpose, arm, disarm, due, settle};
+use super::{Bell, Doorbell, Look, Purpose, arm, disarm, due, settle};
 use crate::{
     ids::SessionId,
     passed::{
         PassedFd,
-        tests::{reluctant, send_away},
+        tests::{pair, reluctant, send_away},
     },
     shm::SessionSegment,
 };
@@ -239,31 +239,6 @@ fn a_full_queue_swallows_no_ring() {
 }
 
 #[test]
-fn nobody_takes_rings_at_the_end_that_is_handed_out() {
-    let session = SessionSegment::create(SessionId::random()).unwrap();
-    let (bell, thief) = (Bell::received(handed_out(&session)).unwrap(), handed_out(&session));
-    let (looks, over) = (AtomicU64::new(0), AtomicBool::new(false));
-    thread::scope(|scope| {
-        scope.spawn(|| {
-            await_woken(&session, || {
-                looks.fetch_add(1, Ordering::AcqRel);
-                over.load(Ordering::Acquire)
-            });
-        });
-        while looks.load(Ordering::Acquire) < 2 {
-            thread::yield_now();
-        }
-        over.store(true, Ordering::Release);
-        bell.ring();
-        let mut bytes = [0; 8];
-        for _ in 0..1000 {
-            let stolen = recv(&thief, &mut bytes, RecvFlags::DONTWAIT);
-            assert!(stolen.is_err() || stolen.is_ok_and(|(got, _)| got == 0));
-        }
-    });
-}
-
-#[test]
 fn a_bell_that_was_closed_is_looked_after_by_time() {
     let session = SessionSegment::create(SessionId::random()).unwrap();
     let over = AtomicBool::new(false);
@@ -285,23 +260,48 @@ fn a_bell_that_was_closed_is_looked_after_by_time() {
 }
 
 #[test]
-fn descriptors_in_a_bell_keep_nobody_waiting() {
-    let session = SessionSegment::create(SessionId::random()).unwrap();
+fn descriptors_in_a_bell_are_not_taken_and_keep_nobody_waiting() {
+    let mut doorbell = Doorbell::new().unwrap();
     // As where the kernel cannot refuse them.
-    session.doorbell_hub().let_rights_pass();
-    let (bell, fd) = (Bell::received(handed_out(&session)).unwrap(), handed_out(&session));
+    doorbell.let_rights_pass();
+    let words = [AtomicU64::new(0), AtomicU64::new(0)];
+    let words = words.each_ref();
+    let (kept, sent) = pair();
+    send_away(doorbell.bell(), b"x", sent);
     let mut peers = Vec::new();
     for _ in 0..4 {
         let (reluctant, peer) = reluctant();
-        send_away(&fd, b"x", reluctant);
+        send_away(doorbell.bell(), b"x", reluctant);
         peers.push(peer);
     }
-    let mut looks = 0;
-    await_woken(&session, || {
+    let (mut looks, start) = (0, Instant::now());
+    let ready = || {
         looks += 1;
-        bell.ring();
+        doorbell.bell().ring();
         looks == 8
+    };
+    assert!(doorbell.wait(words, Purpose::Samples, ready, None, &[], Some(EVER)));
+    // Nobody listens to the bell any more: it is looked for news by time.
+    let deaf = || start.elapsed() > Duration::from_millis(50);
+    assert!(doorbell.wait(words, Purpose::Samples, deaf, None, &[], Some(EVER)));
+    assert!(start.elapsed() < EVER, "a wake-up was lost");
+    // What was sent is nobody's but the queue's still, as its other end shows.
+    let stands = recv(&kept, &mut [0; 1], RecvFlags::DONTWAIT);
+    assert_eq!(stands.err(), Some(rustix::io::Errno::AGAIN));
+}
+
+#[test]
+fn a_wait_is_not_rounded_up_to_milliseconds() {
+    let session = SessionSegment::create(SessionId::random()).unwrap();
+    let waits = (0..200).map(|_| {
+        let start = Instant::now();
+        session.wait(|| false, Some(Duration::from_micros(200)));
+        start.elapsed()
     });
+    let shortest = waits.min().unwrap();
+    assert!(shortest >= Duration::from_micros(200), "it waits as long as it was told");
+    // However busy the machine is, one of so many was on time.
+    assert!(shortest < Duration::from_millis(1), "{shortest:?}");
 }
 
 /// What a follower waits for, and how often it was asked for it.
