@@ -217,6 +217,8 @@ fn a_forked_child_is_refused_by_whatever_it_asks_and_never_waits() {
     let publisher = session.create_publisher(spec(Qos::keep_all())).unwrap();
     let subscription = session.create_subscription(spec(Qos::keep_all())).unwrap();
     assert!(subscription.wait_matched(1, PATIENCE));
+    // One that stands there unread, and that the child must not be told of.
+    publisher.publish(b"x").unwrap();
     let over = AtomicBool::new(false);
     let forked =
         |what: Result<(), SessionError>| what.is_err_and(|e| e.to_string().contains("fork"));
@@ -247,6 +249,7 @@ fn a_forked_child_is_refused_by_whatever_it_asks_and_never_waits() {
                     publisher.loan(5000).is_err_and(|e| e.to_string().contains("fork")),
                     subscription.take(&mut bytes).is_none(),
                     subscription.recv(&mut bytes, Some(Duration::from_millis(1))).is_none(),
+                    subscription.recv(&mut bytes, None).is_none(),
                     !subscription.has_data() && subscription.matched().is_empty(),
                     publisher.matched().is_empty() && !publisher.wait_matched(1, PATIENCE),
                     session.daemon().is_none() && session.graph().endpoints.is_empty(),

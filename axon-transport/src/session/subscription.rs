@@ -99,6 +99,10 @@ impl Subscription {
     pub fn recv(&self, out: &mut Vec<u8>, timeout: Option<Duration>) -> Option<MessageInfo> {
         let deadline = timeout.and_then(|t| std::time::Instant::now().checked_add(t));
         loop {
+            // Nothing comes to a forked child, however long it waits.
+            if self.session.is_forked() {
+                return None;
+            }
             if let Some(info) = self.take(out) {
                 return Some(info);
             }

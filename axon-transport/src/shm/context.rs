@@ -190,6 +190,10 @@ impl Context {
         if id == self.id() {
             return Ok(Peer::Local(Arc::clone(self.session())));
         }
+        // A thread of the parent may have held the lock below when this process was forked.
+        if self.session().is_forked() {
+            return Err(ShmError::Forked);
+        }
         if descriptors.process().is_none() {
             return Err(ShmError::Refused { what: "its pidfd names no process" });
         }

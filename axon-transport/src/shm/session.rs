@@ -177,7 +177,7 @@ impl SessionSegment {
     /// woken only when it is there.
     pub(crate) fn wait_for(&self, look: Arc<dyn Look>, timeout: Option<Duration>) -> bool {
         if self.is_forked() {
-            return look.ready();
+            return false;
         }
         let (words, ready) = (self.armed_words(), || look.ready());
         self.doorbell.wait(words, Purpose::Samples, ready, Some(look.clone()), &[], timeout)

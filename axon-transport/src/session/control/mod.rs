@@ -29,6 +29,13 @@ use crate::{graph::GraphView, ids::Gid, passed::PassedFd};
 
 /// Packets handled before queued ones are sent: neither direction starves the other.
 const BATCH: usize = 64;
+/// Between attempts to find a daemon.
+const MIN_PAUSE: Duration = Duration::from_millis(100);
+const MAX_PAUSE: Duration = Duration::from_secs(2);
+/// A connection that lasted less was as good as refused.
+const BRIEF: Duration = Duration::from_secs(1);
+/// Until a process that had no descriptors left tries again.
+const RETRY: Duration = Duration::from_secs(2);
 /// A relay stands for at most this many remote subscriptions by name; one packet holds no more.
 const MAX_STANDS_FOR: usize = 1024;
 
@@ -47,6 +54,12 @@ pub(super) struct Control {
     told: bool,
     /// The segments of our memory that this connection was told of.
     segments: BTreeSet<u32>,
+    /// When this connection was made, and how long the search for the next one waits first: one
+    /// that does not last is not to be had at once again, at the cost of everybody else.
+    since: Instant,
+    pause: Duration,
+    /// This process had no descriptors left: when it asks to be told everything anew.
+    retry: Option<Instant>,
 }
 
 enum Link {
@@ -70,6 +83,9 @@ impl Control {
             repeated: None,
             told: false,
             segments: BTreeSet::new(),
+            since: Instant::now(),
+            pause: Duration::ZERO,
+            retry: None,
         };
         match connected {
             Some(connected) => control.connected(connected),
@@ -85,6 +101,7 @@ impl Control {
         // Pairs with the release store in `Shared::stop`.
         while !self.shared.stopping.load(Ordering::Acquire) {
             self.try_reconnected();
+            self.try_again();
             self.collect();
             self.send();
             self.sleep();
@@ -103,6 +120,8 @@ impl Control {
         self.repeated = None;
         self.told = false;
         self.segments.clear();
+        self.since = Instant::now();
+        self.retry = None;
         let daemon = connected.welcome.daemon;
         {
             let mut state = self.shared.state();
@@ -115,7 +134,7 @@ impl Control {
             let gone = gone.into_iter().map(|gid| Message::EndpointGone(Gone { gid }));
             state.outgoing.extend(gone.map(|m| Outgoing::Message(Box::new(m))));
         }
-        self.link = Link::Socket(PassedFd::received(connected.socket));
+        self.link = Link::Socket(PassedFd::connection(connected.socket).trusted());
         for info in self.shared.segment.segments() {
             self.tell_segment(SegmentChange::Opened(info.number));
         }
@@ -132,6 +151,11 @@ impl Control {
                 state.status = StatusAnswer::Lost;
             }
         }
+        self.pause = if self.since.elapsed() < BRIEF {
+            (self.pause * 2).clamp(MIN_PAUSE, MAX_PAUSE)
+        } else {
+            Duration::ZERO
+        };
         self.link = if self.reconnects { self.reconnect() } else { Link::Ended };
         self.shared.notify(Some(&SessionEvent::DaemonLost));
     }
@@ -140,8 +164,10 @@ impl Control {
     fn reconnect(&self) -> Link {
         let shared = self.shared.clone();
         let (found, receiver) = sync_channel(1);
+        let first = self.pause;
         let search = move || {
-            let mut pause = Duration::from_millis(100);
+            std::thread::sleep(first);
+            let mut pause = MIN_PAUSE;
             // Pairs with the release store in `Shared::stop`.
             while !shared.stopping.load(Ordering::Acquire) {
                 let caller = Caller {
@@ -161,7 +187,7 @@ impl Control {
                     Err(error) => tracing::error!(%error, "no daemon took this session"),
                 }
                 std::thread::sleep(pause);
-                pause = (pause * 2).min(Duration::from_secs(2));
+                pause = (pause * 2).min(MAX_PAUSE);
             }
         };
         match std::thread::Builder::new().name("axon-connect".into()).spawn(search) {
@@ -215,6 +241,13 @@ impl Control {
                 let gone = SegmentName { session, number };
                 self.outbox.push_back((Message::SegmentGone(gone), Vec::new()));
             }
+        }
+    }
+
+    fn try_again(&mut self) {
+        if self.retry.is_some_and(|retry| retry <= Instant::now()) {
+            self.retry = None;
+            self.outbox.push_back((Message::Resync, Vec::new()));
         }
     }
 
@@ -320,8 +353,10 @@ impl Control {
         // A socket without room becomes writable, but one that is short of descriptors in flight
         // does not say when that passes.
         let nap = Timespec { tv_sec: 0, tv_nsec: 20_000_000 };
-        let timeout = (!self.outbox.is_empty()).then_some(&nap);
-        let _ = poll(&mut fds, timeout);
+        let nap = (!self.outbox.is_empty()).then_some(nap);
+        let retry = self.retry.map(|retry| retry.saturating_duration_since(Instant::now()));
+        let timeout = nap.or_else(|| retry.and_then(|retry| Timespec::try_from(retry).ok()));
+        let _ = poll(&mut fds, timeout.as_ref());
         let mut count = [0; 8];
         let _ = rustix::io::read(&self.shared.wake, &mut count);
     }
@@ -332,6 +367,11 @@ impl Control {
             match socket::receive(socket, &mut self.buffer) {
                 Ok(received) => self.handle(received.message, received.descriptors),
                 Err(SocketError::NotReady) => return,
+                Err(error @ SocketError::NoDescriptors) => {
+                    // Others would have to match anew what a new connection has it announce.
+                    tracing::error!(%error, "what the daemon said is asked for again");
+                    self.retry.get_or_insert_with(|| Instant::now() + RETRY);
+                }
                 Err(error) => return self.lost(&error),
             }
         }
