@@ -10,11 +10,21 @@ use std::{
 /// A sleep and the ring that ends it cost both sides about as much together.
 const MOST: Duration = Duration::from_micros(20);
 
+/// Short sleeps, at most, that have to follow a look in vain before the next look.
+const PATIENCE: u32 = 1023;
+
 /// Looks for as long as that has lately been worth its while: a sleep that turns out shorter than
-/// [`MOST`] makes it look longer, one that does not, and looking in vain, half as long.
+/// [`MOST`] makes it look longer, one that does not half as long. A look in vain ends it, and the
+/// more of them follow each other, the more short sleeps it takes to look again: who is waited for
+/// may be on this very processor, and not run for as long as somebody looks out for it.
 pub(super) struct Spin {
-    /// Nanoseconds to look for. Relaxed everywhere: a guess, whose loss under a race costs nothing.
+    /// Nanoseconds to look for. Relaxed here as below: guesses, whose loss under a race costs
+    /// nothing.
     now: AtomicU32,
+    /// Short sleeps still to come before the next look.
+    pause: AtomicU32,
+    /// Short sleeps that the next look in vain asks for.
+    patience: AtomicU32,
     most: u32,
 }
 
@@ -27,7 +37,8 @@ impl Spin {
 
     fn up_to(most: Duration) -> Self {
         let most = u32::try_from(most.as_nanos()).unwrap_or(u32::MAX);
-        Self { now: AtomicU32::new(0), most }
+        let [now, pause, patience] = [0, 0, 1].map(AtomicU32::new);
+        Self { now, pause, patience, most }
     }
 
     /// Whether `ready` came true, looked at again and again until `deadline` at the latest.
@@ -43,16 +54,25 @@ impl Spin {
                 spin_loop();
             }
             if ready() {
+                self.patience.store(1, Ordering::Relaxed);
                 return true;
             }
         }
-        self.now.store(budget / 2, Ordering::Relaxed);
+        let patience = self.patience.load(Ordering::Relaxed);
+        self.now.store(0, Ordering::Relaxed);
+        self.pause.store(patience, Ordering::Relaxed);
+        self.patience.store((patience * 2 + 1).min(PATIENCE), Ordering::Relaxed);
         false
     }
 
     /// A sleep that was ended by what it waited for took this long.
     pub(super) fn slept(&self, time: Duration) {
         let time = u32::try_from(time.as_nanos()).unwrap_or(u32::MAX);
+        let pause = self.pause.load(Ordering::Relaxed);
+        if time <= self.most && pause > 0 {
+            self.pause.store(pause - 1, Ordering::Relaxed);
+            return;
+        }
         let now = self.now.load(Ordering::Relaxed);
         let next = if time <= self.most { now.max(time).saturating_mul(2) } else { now / 2 };
         self.now.store(next.min(self.most), Ordering::Relaxed);
@@ -62,6 +82,37 @@ impl Spin {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Both ends on one processor: nothing comes while one looks, and soon after one sleeps.
+    #[test]
+    fn who_cannot_run_meanwhile_is_hardly_looked_out_for() {
+        let spin = Spin::up_to(Duration::from_micros(1));
+        let mut vain = 0;
+        for _ in 0..10_000 {
+            let mut looked = false;
+            spin.look(
+                || {
+                    looked = true;
+                    false
+                },
+                None,
+            );
+            vain += u32::from(looked);
+            spin.slept(Duration::from_nanos(500));
+        }
+        assert!(vain <= 20, "{vain} looks");
+        // The other end moves to a processor of its own: the next look finds something, and so
+        // do all that follow.
+        let mut found = 0;
+        for _ in 0..10_000 {
+            let one = spin.look(|| true, None);
+            found += u32::from(one);
+            if !one {
+                spin.slept(Duration::from_nanos(500));
+            }
+        }
+        assert!(found > 8_000, "{found} looks");
+    }
 
     #[test]
     fn looks_only_where_sleeps_are_short_and_never_on_one_processor() {
@@ -81,6 +132,10 @@ mod tests {
         assert_eq!(look(&spin), 0, "not before it is known to help");
         spin.slept(Duration::from_millis(10));
         assert!(look(&spin) > 0);
+        assert_eq!(look(&spin), 0, "that was in vain");
+        spin.slept(Duration::from_millis(10));
+        assert_eq!(look(&spin), 0, "and is not forgotten at once");
+        spin.slept(Duration::from_millis(10));
         for _ in 0..40 {
             spin.slept(Duration::from_secs(2));
         }
