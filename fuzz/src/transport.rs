@@ -116,6 +116,7 @@ fn endpoint() -> Endpoint {
         qos: Qos { deadline: Some(5), lifespan: Some(6), ..Qos::keep_all() },
         node: "lidar".into(),
         namespace: "/".into(),
+        enclave: String::new(),
     }
 }
 
