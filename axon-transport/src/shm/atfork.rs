@@ -38,10 +38,11 @@ impl Place {
     /// Of the map at `base`, which children do not get.
     pub(super) fn keep(base: NonNull<c_void>, bytes: usize) -> Result<Self, ShmError> {
         static HANDLER: OnceLock<i32> = OnceLock::new();
-        // SAFETY: the handler is a function that lives as long as the program, or the library that
-        // registers it here, with which glibc and musl forget it.
-        let failed =
-            *HANDLER.get_or_init(|| unsafe { libc::pthread_atfork(None, None, Some(in_child)) });
+        let failed = *HANDLER.get_or_init(|| {
+            // SAFETY: the handler is a function that lives as long as the program, or the library
+            // that registers it here, with which glibc and musl forget it.
+            unsafe { libc::pthread_atfork(None, None, Some(in_child)) }
+        });
         if failed != 0 {
             let what = "registering what a forked child begins with";
             return Err(ShmError::system(what)(Errno::from_raw_os_error(failed)));

@@ -525,7 +525,7 @@ impl Reader {
         Ok(view.stands(self.cursor))
     }
 
-    /// Notes that `segment` has not come, and has it asked for now and then. True when it never
+    /// Notes that `segment` has not come, and has it asked for again at times. True when it never
     /// will.
     fn lacks(&mut self, segment: u32) -> bool {
         let now = Instant::now();
