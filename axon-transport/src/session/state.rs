@@ -79,18 +79,21 @@ pub(super) struct MemoryNews {
     changes: Mutex<Vec<SegmentChange>>,
 }
 
-/// A segment of the session's own.
+/// What became of the session's own memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum SegmentChange {
     Opened(u32),
     Gone(u32),
+    /// This publisher has no memory ready for its next large sample.
+    Low(Gid),
 }
 
 impl MemoryNews {
     fn note(&self, event: SegmentEvent<'_>) {
         let change = match event {
             SegmentEvent::Opened(info, _) => SegmentChange::Opened(info.number),
-            SegmentEvent::Gone(number) => SegmentChange::Gone(number),
+            SegmentEvent::Gone(info) => SegmentChange::Gone(info.number),
+            SegmentEvent::Low(publisher) => SegmentChange::Low(publisher),
         };
         self.changes.lock().unwrap_or_else(PoisonError::into_inner).push(change);
         self.wake();

@@ -304,6 +304,7 @@ impl Slots {
         let mut news = false;
         for slot in self.slots.iter_mut().filter(|s| !s.over && which(&s.reader)) {
             slot.over = true;
+            slot.reader.end();
             news = true;
         }
         self.sweep();
@@ -338,7 +339,13 @@ impl Slots {
             if endpoint.qos.history == History::KeepLast && self.slots.len() > 1 {
                 self.skip_to_depth(u64::from(endpoint.qos.depth));
             }
-            let index = self.oldest()?;
+            let Some(index) = self.oldest() else {
+                // What was skipped may have been the last of a writer that is gone.
+                if self.slots.iter().any(|slot| slot.over) {
+                    self.sweep();
+                }
+                return None;
+            };
             let slot = &mut self.slots[index];
             let writer = slot.reader.writer();
             let (meta, taken) = match take(&mut slot.reader) {

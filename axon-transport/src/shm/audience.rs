@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::{
     Grant, Peer, PeerSession, ReaderInfo,
     lane::{self, LaneView, Standing, Tenancy},
-    seats::Seats,
+    seats::{Holder, Seats},
 };
 use crate::{
     ids::Gid,
@@ -168,15 +168,20 @@ impl Audience {
         self.seats.scan(found);
     }
 
-    /// A reader that pins one of `positions`, which keep the ring full; `None` when looking for it
-    /// found that some of those that did are dead.
-    pub(super) fn holder(&mut self, positions: &[u64]) -> Option<Gid> {
+    /// A reader that pins one of `positions`, and its session where that is not our own; `None` when
+    /// looking for it found that some of those that did are dead.
+    pub(super) fn holder(&mut self, positions: &[u64]) -> Option<Holder> {
         if self.seats.sweep(|_| true) { None } else { self.seats.holder(positions) }
     }
 
     #[cfg(test)]
     pub(super) fn seats(&self) -> usize {
         self.seats.len()
+    }
+
+    /// Forgets those that may keep samples no longer, as they have left or their process has ended.
+    pub(super) fn sweep(&mut self) {
+        self.seats.sweep(|_| true);
     }
 
     /// Stops counting on readers whose process has ended; [`Self::drop_dead`] names them.
@@ -228,6 +233,16 @@ impl Audience {
             }
         }
         floors
+    }
+
+    /// Below this every reader has taken what it wanted, and whoever comes later gets nothing: so
+    /// nobody asks for it again.
+    pub(super) fn consumed(&self, head: u64) -> u64 {
+        if self.offered.durability == Durability::TransientLocal {
+            return 0;
+        }
+        let cursors = self.readers.iter().filter(|reader| !reader.dead);
+        cursors.filter_map(|reader| reader.cursor(head)).min().unwrap_or(head)
     }
 
     /// The reader that has most to take of those that hold `tail`, and the sessions of all these.

@@ -123,6 +123,22 @@ impl Handed {
     }
 }
 
+/// A segment that nobody reads any more.
+#[derive(Clone, Copy, Debug, Encode, Decode)]
+pub(super) struct Withdrawn {
+    #[n(0)]
+    pub(super) session: SessionId,
+    #[n(1)]
+    pub(super) number: u32,
+}
+
+/// What became of a publisher's memory.
+#[derive(Debug)]
+pub(super) enum News {
+    Handed(Handed, PassedFd),
+    Withdrawn(Withdrawn),
+}
+
 #[derive(Debug, Encode, Decode)]
 struct Refused {
     #[n(0)]
@@ -141,6 +157,8 @@ enum Packet {
     Refused(#[n(0)] Refused),
     #[n(3)]
     Handed(#[n(0)] Handed),
+    #[n(4)]
+    Withdrawn(#[n(0)] Withdrawn),
 }
 
 /// One end of the socket, for as long as the two need to come together.
@@ -206,7 +224,7 @@ impl<'a> Channel<'a> {
                 (Packet::Refused(refused), _) if refused.reader == reader => {
                     return Err(ConnectError::Refused(refused.reason));
                 }
-                (Packet::Granted(_) | Packet::Refused(_), _) => {}
+                (Packet::Granted(_) | Packet::Refused(_) | Packet::Withdrawn(_), _) => {}
                 (Packet::Handed(handed), fds) => {
                     let [fd] = fds.try_into().map_err(number)?;
                     segment(handed, fd);
@@ -228,13 +246,22 @@ impl<'a> Channel<'a> {
         self.send(&Packet::Handed(Handed::new(session, info)), &[fd])
     }
 
-    /// The next segment that is handed over.
-    pub(super) fn take_handed(&self) -> Result<(Handed, PassedFd), ConnectError> {
+    /// Says that a segment is given up.
+    pub(super) fn withdraw(&self, session: SessionId, number: u32) -> Result<(), ConnectError> {
+        self.send(&Packet::Withdrawn(Withdrawn { session, number }), &[])
+    }
+
+    /// The next segment that is handed over or given up.
+    pub(super) fn take_news(&self) -> Result<News, ConnectError> {
         loop {
-            if let (Packet::Handed(handed), mut fds) = self.receive()?
-                && let (Some(fd), true) = (fds.pop(), fds.is_empty())
-            {
-                return Ok((handed, fd));
+            match self.receive()? {
+                (Packet::Handed(handed), mut fds) => {
+                    if let (Some(fd), true) = (fds.pop(), fds.is_empty()) {
+                        return Ok(News::Handed(handed, fd));
+                    }
+                }
+                (Packet::Withdrawn(withdrawn), _) => return Ok(News::Withdrawn(withdrawn)),
+                (Packet::Asked(_) | Packet::Granted(_) | Packet::Refused(_), _) => {}
             }
         }
     }

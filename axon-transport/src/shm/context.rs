@@ -14,7 +14,7 @@ use std::{
 use super::{
     ConnectError, Peer, PeerDescriptors, PeerSession, SegmentEvent, SegmentInfo, SegmentKind,
     SessionSegment, ShmError,
-    connect::{Channel, Granted, Handed},
+    connect::{Channel, Granted, Handed, News},
 };
 use crate::{
     ids::{Gid, SessionId},
@@ -64,6 +64,14 @@ impl Served {
             self.behind |= matches!(handed, Err(ConnectError::Timeout));
         }
     }
+
+    fn withdraw(&self, info: SegmentInfo) {
+        if self.reads(info.kind) {
+            let channel = Channel::new(self.socket.as_fd(), Some(Duration::ZERO));
+            // One that cannot be told keeps its map for as long as it reads from here.
+            let _ = channel.withdraw(self.session, info.number);
+        }
+    }
 }
 
 impl Context {
@@ -80,10 +88,15 @@ impl Context {
         let served = Arc::<Mutex<Vec<Served>>>::default();
         let told = Arc::clone(&served);
         session.on_segment(move |event| {
-            // Of one that is gone nobody reads any more, and the map goes with the context.
-            let SegmentEvent::Opened(info, fd) = event else { return };
             let mut served = told.lock().unwrap_or_else(PoisonError::into_inner);
-            served.iter_mut().for_each(|served| served.hand(info, fd));
+            match event {
+                SegmentEvent::Opened(info, fd) => {
+                    served.iter_mut().for_each(|served| served.hand(info, fd));
+                }
+                SegmentEvent::Gone(info) => served.iter().for_each(|served| served.withdraw(info)),
+                // Nobody prepares publishers here but their owner.
+                SegmentEvent::Low(_) => {}
+            }
         });
         Self { inner: Arc::new(Inner { session, entities, peers, served }) }
     }
@@ -136,11 +149,27 @@ impl Context {
 
     /// A segment of another context was handed over.
     pub(super) fn add_segment(&self, handed: &Handed, fd: impl AsFd) {
-        let peers = self.inner.peers.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(peer) = peers.get(&handed.session).and_then(Weak::upgrade) {
+        if let Some(peer) = self.known(&handed.session) {
             // One that is refused shows when it is read.
             let _ = peer.add_segment(handed.info(), fd);
         }
+    }
+
+    /// A segment of another context was handed over or given up.
+    pub(super) fn hear(&self, news: &News) {
+        match news {
+            News::Handed(handed, fd) => self.add_segment(handed, fd),
+            News::Withdrawn(withdrawn) => {
+                if let Some(peer) = self.known(&withdrawn.session) {
+                    peer.remove_segment(withdrawn.number);
+                }
+            }
+        }
+    }
+
+    fn known(&self, session: &SessionId) -> Option<Arc<PeerSession>> {
+        let peers = self.inner.peers.lock().unwrap_or_else(PoisonError::into_inner);
+        peers.get(session).and_then(Weak::upgrade)
     }
 
     fn served(&self) -> std::sync::MutexGuard<'_, Vec<Served>> {

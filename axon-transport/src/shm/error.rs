@@ -1,6 +1,6 @@
 //! What can go wrong, for whom, and what to do about it.
 
-use std::io;
+use std::{fmt, io};
 
 use crate::ids::{Gid, SessionId};
 
@@ -91,14 +91,23 @@ pub enum PublishError {
     },
     /// Memory to hold the sample is not available.
     #[error(
-        "no memory for the sample: {needed} bytes more needed, {available} available: \
-         free memory or raise the memory limit of this process's control group"
+        "no memory for the sample: {needed} bytes more needed, {available} available{}: \
+         free memory or raise the memory limit of this process's control group",
+        held_by(keeper.as_ref())
     )]
     NoMemory {
         /// Bytes that were needed.
         needed: u64,
         /// Bytes available to this process when it asked.
         available: u64,
+        /// A reader that keeps samples which would do.
+        keeper: Option<Keeper>,
+    },
+    /// The system refused a segment for large samples.
+    #[error("no segment for the sample: {reason}")]
+    Segment {
+        /// What the system refused, and why.
+        reason: String,
     },
     /// Loans that were neither published nor dropped hold the ring's memory.
     #[error("{loans} loans hold the ring's memory: publish or drop them first")]
@@ -107,15 +116,10 @@ pub enum PublishError {
         loans: u32,
     },
     /// Samples that a reader has not dropped hold the ring's memory.
-    #[error(
-        "reader {reader} keeps samples that hold the ring's memory ({samples} are kept in all): \
-         it must drop some, or end"
-    )]
+    #[error("the ring's memory is full{}: it must drop some, or end", held_by(Some(keeper)))]
     Pinned {
         /// A reader that keeps some.
-        reader: Gid,
-        /// Samples that are kept by readers although the publisher has given them up.
-        samples: usize,
+        keeper: Keeper,
     },
     /// A loan was published before all of it was written.
     #[error("loan of {len} bytes published with {written} written")]
@@ -128,6 +132,32 @@ pub enum PublishError {
     /// The process forked: the publisher belongs to the parent.
     #[error("used after fork: a child process must open a session of its own")]
     Forked,
+}
+
+/// Who keeps samples that their publisher has given up.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Keeper {
+    /// A reader that keeps some.
+    pub reader: Gid,
+    /// Its process, where that is known and has not ended.
+    pub process: Option<u32>,
+    /// Samples that readers keep in all.
+    pub samples: usize,
+}
+
+impl fmt::Display for Keeper {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { reader, process, samples } = self;
+        write!(f, "reader {reader}")?;
+        if let Some(process) = process {
+            write!(f, " (pid {process})")?;
+        }
+        write!(f, " among those that keep {samples} samples")
+    }
+}
+
+fn held_by(keeper: Option<&Keeper>) -> String {
+    keeper.map_or_else(String::new, |keeper| format!(", held by {keeper}"))
 }
 
 /// A ring could not be read.

@@ -45,6 +45,12 @@ impl ForkToken {
         Ok(Self { page, value: page.load(Ordering::Relaxed) })
     }
 
+    /// Another in each process of a line of forks, and never 0.
+    #[inline]
+    pub(super) fn value(&self) -> u64 {
+        self.value
+    }
+
     /// Whether the calling process is a fork of the one that took the token.
     #[inline]
     pub(super) fn is_forked(&self) -> bool {

@@ -1,6 +1,6 @@
 //! Which samples of a ring stand, and how room is made for the next: plain data, no shared memory.
 
-use super::{blocks::Blocks, heap::Block, limbo::Limbo};
+use super::{blocks::Blocks, heap::Block, layout::Location, limbo::Limbo};
 
 /// The samples that stand, oldest to newest, and what they take of memory.
 ///
@@ -28,9 +28,9 @@ pub(super) enum Extent {
     #[default]
     Inline,
     Block(Block),
-    /// In the publisher's own segment.
+    /// In a segment of the publisher's own.
     Slot {
-        at: u64,
+        at: Location,
         len: u64,
     },
 }
@@ -150,15 +150,21 @@ impl History {
     }
 
     /// Takes `len` bytes that nobody reads for a loan.
-    pub(super) fn lend(&mut self, len: u64) -> Option<u64> {
+    pub(super) fn lend(&mut self, len: u64) -> Option<Location> {
         let at = self.pinned.lend(len)?;
         self.used += len;
         Some(at)
     }
 
     /// Gives back a loan.
-    pub(super) fn give_back(&mut self, at: u64, len: u64) {
+    pub(super) fn give_back(&mut self, at: Location, len: u64) {
         self.pinned.give_back(at, len);
+        self.used -= len;
+    }
+
+    /// There is no memory for a loan.
+    pub(super) fn withdraw(&mut self, at: Location, len: u64) {
+        self.pinned.withdraw(at, len);
         self.used -= len;
     }
 
@@ -196,11 +202,13 @@ fn index(extents: &[Extent], position: u64) -> usize {
 
 #[cfg(test)]
 mod tests {
-    use super::{super::layout::Location, *};
+    use super::*;
+
+    const SEGMENT: u32 = 3;
 
     fn history(descriptors: u64, slots: u64, budget: u64) -> History {
         let mut history = History::new(descriptors, budget);
-        history.pinned().open(0..slots);
+        history.pinned().open(SEGMENT, 0..slots);
         history
     }
 
@@ -220,7 +228,7 @@ mod tests {
             history.push(Extent::Slot { at, len: max });
             places.push(at);
         }
-        assert!(places.iter().all(|at| *at <= max), "memory stays near the live window");
+        assert!(places.iter().all(|at| at.offset <= max), "memory stays near the live window");
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use std::sync::atomic::AtomicU64;
 
-use super::{ShmError, sync::Ordering};
+use super::{ShmError, classes, sync::Ordering};
 use crate::ids::{Gid, SessionId};
 
 /// Segments are multiples of this many bytes, and memory is committed in them.
@@ -260,7 +260,7 @@ pub(super) fn samples_bytes(budget: u64, max_message: u64, pins: u64) -> u64 {
     // Room for four of the largest, so that one of them always fits beside one that stands; and
     // for as many as two readers can pin. Twice the budget, so that pieces between samples seldom
     // shorten the history.
-    let largest = max_message.max(1).next_multiple_of(LINE);
+    let largest = classes::rounded(max_message);
     let bytes = (4 * largest).max(2 * budget) + 2 * pins * largest;
     (SLOTS_AT + bytes).next_multiple_of(ALIGN).min(MAX_SEGMENT)
 }

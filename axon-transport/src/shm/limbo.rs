@@ -1,42 +1,97 @@
-//! The segment of a publisher's samples that readers read in place: samples that were given up stay
+//! The memory of a publisher's samples that readers read in place: samples that were given up stay
 //! in limbo until no reader pins them. Plain data, no shared memory.
 
 use std::ops::Range;
 
-use super::area::Area;
+use super::{layout::Location, slots::Slots};
 
-/// Who has which bytes of it. None until it is [opened](Self::open).
+/// Who has which bytes of which segments. One at a time takes samples in; those that have been
+/// left are [vacated](Self::vacated) once the last of theirs has gone.
 #[derive(Debug, Default)]
 pub(super) struct Limbo {
-    area: Area,
+    /// The one that takes samples in is the last of them.
+    stores: Vec<Store>,
     retired: Vec<Retired>,
     /// Places that were handed out and not published yet.
     loans: u32,
 }
 
+/// One segment.
+#[derive(Debug)]
+struct Store {
+    number: u32,
+    slots: Slots,
+    left: bool,
+}
+
 #[derive(Debug)]
 struct Retired {
     position: u64,
-    at: u64,
+    at: Location,
     len: u64,
 }
 
 impl Limbo {
-    /// Has places in `range` from now on.
-    pub(super) fn open(&mut self, range: Range<u64>) {
-        self.area = Area::new(range, 16);
+    /// The segment of this number, of which `range` is for samples, takes them in from now on.
+    pub(super) fn open(&mut self, number: u32, range: Range<u64>) {
+        self.leave();
+        self.stores.push(Store { number, slots: Slots::new(range, 16), left: false });
+    }
+
+    /// No segment takes samples in, until another is opened.
+    pub(super) fn leave(&mut self) {
+        self.stores.iter_mut().for_each(|store| store.left = true);
+    }
+
+    /// The slots of the segment where something was lent.
+    pub(super) fn slots(&mut self, at: Location) -> &mut Slots {
+        slots(&mut self.stores, at)
+    }
+
+    /// Bytes in use of the segment that takes samples in, and bytes that are backed by memory.
+    pub(super) fn extent(&self) -> Option<(u64, u64)> {
+        let store = self.stores.last().filter(|store| !store.left)?;
+        Some((store.slots.used(), store.slots.backed()))
+    }
+
+    /// The numbers of all segments.
+    pub(super) fn segments(&self) -> impl ExactSizeIterator<Item = u32> + '_ {
+        self.stores.iter().map(|store| store.number)
+    }
+
+    /// A place that nobody reads.
+    pub(super) fn take(&mut self, len: u64) -> Option<Location> {
+        let store = self.stores.last_mut().filter(|store| !store.left)?;
+        let offset = store.slots.take(len)?;
+        Some(Location { segment: store.number, offset })
+    }
+
+    /// What was taken is free again: no reader has heard of it.
+    pub(super) fn put_back(&mut self, at: Location, len: u64) {
+        slots(&mut self.stores, at).release(at.offset, len);
+    }
+
+    /// There is no memory for what was taken.
+    pub(super) fn forgo(&mut self, at: Location, len: u64) {
+        slots(&mut self.stores, at).forgo(at.offset, len);
     }
 
     /// A place that nobody reads, for a loan.
-    pub(super) fn lend(&mut self, len: u64) -> Option<u64> {
-        let at = self.area.allocate(len)?;
+    pub(super) fn lend(&mut self, len: u64) -> Option<Location> {
+        let at = self.take(len)?;
         self.loans += 1;
         Some(at)
     }
 
-    /// The loan was not published, so no reader has heard of it.
-    pub(super) fn give_back(&mut self, at: u64, len: u64) {
-        self.area.release(at, len);
+    /// The loan was not published.
+    pub(super) fn give_back(&mut self, at: Location, len: u64) {
+        self.put_back(at, len);
+        self.loans -= 1;
+    }
+
+    /// There is no memory for the loan.
+    pub(super) fn withdraw(&mut self, at: Location, len: u64) {
+        self.forgo(at, len);
         self.loans -= 1;
     }
 
@@ -46,18 +101,18 @@ impl Limbo {
     }
 
     /// The sample at `position` has been given up; readers may still be at it.
-    pub(super) fn retire(&mut self, position: u64, at: u64, len: u64) {
+    pub(super) fn retire(&mut self, position: u64, at: Location, len: u64) {
         self.retired.push(Retired { position, at, len });
     }
 
     /// Frees what no reader pins. The tail must have been raised above all that is here before
     /// the pins were looked at.
     pub(super) fn reclaim(&mut self, pinned: impl Fn(u64) -> bool) {
-        let area = &mut self.area;
+        let stores = &mut self.stores;
         self.retired.retain(|retired| {
             let keep = pinned(retired.position);
             if !keep {
-                area.release(retired.at, retired.len);
+                slots(stores, retired.at).release(retired.at.offset, retired.len);
             }
             keep
         });
@@ -70,5 +125,57 @@ impl Limbo {
 
     pub(super) fn loans(&self) -> u32 {
         self.loans
+    }
+
+    /// Forgets the segments that were left and hold nothing any more, and names them.
+    pub(super) fn vacated(&mut self) -> Vec<u32> {
+        let vacant = |store: &Store| store.left && store.slots.used() == 0;
+        let numbers = self.stores.iter().filter(|store| vacant(store)).map(|store| store.number);
+        let numbers = numbers.collect();
+        self.stores.retain(|store| !vacant(store));
+        numbers
+    }
+}
+
+fn slots(stores: &mut [Store], at: Location) -> &mut Slots {
+    let store = stores.iter_mut().find(|store| store.number == at.segment);
+    // A segment is only forgotten once it holds nothing.
+    &mut store.expect("the segment of what is in use").slots
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LEN: u64 = 8192;
+
+    #[test]
+    fn a_segment_that_was_left_goes_with_the_last_that_it_holds() {
+        let mut limbo = Limbo::default();
+        limbo.open(1, 0..4 * LEN);
+        let [sample, loan] = [(); 2].map(|()| limbo.lend(LEN).unwrap());
+        limbo.published();
+        limbo.open(2, 0..4 * LEN);
+        assert_eq!(limbo.lend(LEN).unwrap().segment, 2, "the new one takes over");
+        assert!(limbo.vacated().is_empty());
+
+        limbo.retire(7, sample, LEN);
+        limbo.reclaim(|position| position == 7);
+        limbo.give_back(loan, LEN);
+        assert!(limbo.vacated().is_empty(), "a reader is still at it");
+        limbo.reclaim(|_| false);
+        assert_eq!(limbo.vacated(), [1]);
+        assert_eq!(limbo.segments().collect::<Vec<_>>(), [2]);
+    }
+
+    #[test]
+    fn a_segment_that_takes_samples_in_stays_though_it_is_empty() {
+        let mut limbo = Limbo::default();
+        assert_eq!(limbo.lend(LEN), None);
+        limbo.open(1, 0..4 * LEN);
+        assert!(limbo.vacated().is_empty());
+        limbo.leave();
+        assert!(limbo.extent().is_none());
+        assert_eq!((limbo.lend(LEN), limbo.vacated()), (None, vec![1]));
     }
 }

@@ -73,6 +73,17 @@ impl Segment {
         Ok(())
     }
 
+    /// Makes ready to be written what has been committed, so that writing it for the first time
+    /// costs no fault a page.
+    pub(super) fn touch(&self, from: u64, to: u64) {
+        let len = usize::try_from(to - from).expect("a segment is mapped whole");
+        let start = self.address(from, len);
+        // Kernels before 5.14 do not know the advice; then each page is touched in its turn.
+        // SAFETY: inside the mapping, as was just checked, which is ours to write; what is in it
+        // stays as it is.
+        let _ = unsafe { madvise(start.as_ptr().cast(), len, Advice::LinuxPopulateWrite) };
+    }
+
     /// The address of `len` bytes at `at`, to be written otherwise than by words.
     pub(super) fn address(&self, at: u64, len: usize) -> NonNull<u8> {
         let at = usize::try_from(at).expect("a segment is mapped whole");

@@ -13,8 +13,8 @@ pub(super) struct Orphan {
     /// Those who may be reading it.
     pub(super) seats: Seats,
     pub(super) blocks: Vec<Block>,
-    /// The number of the segment of its large samples.
-    pub(super) samples: Option<u32>,
+    /// The numbers of the segments of its large samples.
+    pub(super) samples: Vec<u32>,
 }
 
 /// The memory of a session's publishers that are gone.
@@ -26,8 +26,8 @@ impl Orphans {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).push(orphan);
     }
 
-    /// Takes back what nobody reads any more.
-    pub(super) fn sweep(&self, heap: &Heap, segments: &Segments) {
+    /// Takes back what nobody reads any more. Whether something is left.
+    pub(super) fn sweep(&self, heap: &Heap, segments: &Segments) -> bool {
         let mut orphans = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         orphans.retain_mut(|orphan| {
             orphan.seats.sweep(|_| true);
@@ -35,8 +35,9 @@ impl Orphans {
                 return true;
             }
             orphan.blocks.drain(..).for_each(|block| heap.release(block));
-            orphan.samples.take().into_iter().for_each(|number| segments.close(number));
+            orphan.samples.drain(..).for_each(|number| segments.close(number));
             false
         });
+        !orphans.is_empty()
     }
 }

@@ -50,16 +50,20 @@ impl PeerDescriptors {
     /// The process that the pidfd refers to, to be compared with the credentials of the socket
     /// it came over. `None` when it is no pidfd, or its process has ended.
     pub fn process(&self) -> Option<u32> {
-        // What some things tell of themselves there takes locks that others can keep.
-        if !self.pidfd.is_pidfd() {
-            return None;
-        }
-        let path = format!("/proc/self/fdinfo/{}", self.pidfd.as_fd().as_raw_fd());
-        let text = fs::read_to_string(path).ok()?;
-        let pid = text.lines().find_map(|line| line.strip_prefix("Pid:"))?;
-        // -1 once the process has been reaped.
-        pid.trim().parse().ok().filter(|pid| *pid > 0)
+        process(&self.pidfd)
     }
+}
+
+fn process(pidfd: &PassedFd) -> Option<u32> {
+    // What some things tell of themselves there takes locks that others can keep.
+    if !pidfd.is_pidfd() {
+        return None;
+    }
+    let path = format!("/proc/self/fdinfo/{}", pidfd.as_fd().as_raw_fd());
+    let text = fs::read_to_string(path).ok()?;
+    let pid = text.lines().find_map(|line| line.strip_prefix("Pid:"))?;
+    // -1 once the process has been reaped.
+    pid.trim().parse().ok().filter(|pid| *pid > 0)
 }
 
 /// Segments of another session that are kept at most, whatever it opens.
@@ -223,6 +227,11 @@ impl PeerSession {
     pub fn is_dead(&self) -> bool {
         let mut fds = [PollFd::from_borrowed_fd(self.pidfd.as_fd(), PollFlags::IN)];
         poll(&mut fds, Some(&Timespec::default())).is_ok_and(|ready| ready > 0)
+    }
+
+    /// The number of its process; `None` once that has ended.
+    pub fn process(&self) -> Option<u32> {
+        process(&self.pidfd)
     }
 
     /// Its process: readable once that has ended.

@@ -1,6 +1,10 @@
 //! Publishing without a daemon.
 
-use std::{fmt, os::fd::AsFd, time::Duration};
+use std::{
+    fmt,
+    os::fd::AsFd,
+    time::{Duration, Instant},
+};
 
 use super::{
     ConnectError, Context, Grant, Loan, Meta, PeerDescriptors, PublishError, ReaderInfo,
@@ -9,7 +13,7 @@ use super::{
     loan,
 };
 use crate::{
-    ids::Gid,
+    ids::{Gid, SessionId},
     qos::{Qos, compatible},
 };
 
@@ -90,9 +94,9 @@ impl Publisher {
     pub fn serve(&self, socket: impl AsFd, timeout: Option<Duration>) -> Result<Gid, ConnectError> {
         let channel = Channel::new(socket.as_fd(), timeout);
         let (asked, descriptors) = channel.await_asked()?;
-        let gid = asked.reader;
+        let (gid, session) = (asked.reader, asked.session);
         let admitted = self.admit(asked, descriptors).and_then(|granted| {
-            self.hand_over(&channel, &granted).inspect_err(|_| {
+            self.hand_over(&channel, session, &granted).inspect_err(|_| {
                 self.writer.detach(gid);
             })
         });
@@ -118,9 +122,18 @@ impl Publisher {
     }
 
     /// Answers, and hands over the memory that is in use and, from then on, what comes into use.
-    fn hand_over(&self, channel: &Channel<'_>, granted: &Granted) -> Result<(), ConnectError> {
+    fn hand_over(
+        &self,
+        channel: &Channel<'_>,
+        to: SessionId,
+        granted: &Granted,
+    ) -> Result<(), ConnectError> {
         let own = self.context.session().descriptors()?;
         channel.grant(granted, &own)?;
+        if to == self.context.id() {
+            // It finds all of it here, and would take none of it from the socket.
+            return Ok(());
+        }
         self.context.hand_over(channel.keep()?, granted)
     }
 
@@ -167,6 +180,23 @@ impl Publisher {
     /// As for [`publish`](Self::publish).
     pub fn loan(&self, len: usize) -> Result<Loan<'_>, PublishError> {
         self.writer.loan(len)
+    }
+
+    /// Has memory ready for one more sample as long as the last of more than 4 KiB, so that
+    /// publishing it waits for none. For a thread that has time between samples.
+    ///
+    /// # Errors
+    /// There is no memory, or the process forked.
+    pub fn prepare(&self) -> Result<(), ShmError> {
+        self.writer.prepare()
+    }
+
+    /// Gives memory back that samples of more than 4 KiB took and that is not needed any more: all
+    /// of it ten seconds after the last that anybody wants, else what is more than four times what
+    /// was needed for as long. To be called about once a second for as long as it returns true.
+    pub fn tend(&self) -> bool {
+        let more = self.writer.tend(Instant::now());
+        self.context.session().tidy() || more
     }
 
     /// The subscribers that it serves, among them such as have left since; see

@@ -61,6 +61,8 @@ pub struct Reader {
     /// Segments that samples were in.
     maps: Vec<(u32, Weak<Map>)>,
     missing: Option<Missing>,
+    /// Whether the publisher is known to be gone.
+    ended: bool,
     cursor: u64,
     /// The head as it was seen last.
     seen: u64,
@@ -144,6 +146,7 @@ impl Reader {
             descriptors: None,
             maps: Vec::new(),
             missing: None,
+            ended: false,
             cursor: grant.first,
             seen: 0,
             received: 0,
@@ -162,7 +165,9 @@ impl Reader {
             return false;
         }
         if let Some(missing) = &self.missing {
-            let more = |(_, head): (u64, u64)| head.saturating_sub(self.cursor) > self.reads.depth;
+            let more = |(tail, head): (u64, u64)| {
+                tail > self.cursor || head.saturating_sub(self.cursor) > self.reads.depth
+            };
             return !matches!(self.reads.peer.find(missing.segment), Found::Absent)
                 // It may not be needed any more.
                 || ring::bounds(self.attachment.ring()).is_ok_and(more)
@@ -324,6 +329,12 @@ impl Reader {
         self.missing.is_none() && !self.has_data()
     }
 
+    /// Notes that the publisher is gone, though its process may not be: memory of it that does not
+    /// come soon never will.
+    pub fn end(&mut self) {
+        self.ended = true;
+    }
+
     /// Whether the publisher's process has ended: a system call. Drain before dropping.
     pub fn writer_dead(&self) -> bool {
         self.reads.peer.is_dead()
@@ -340,6 +351,10 @@ impl Reader {
         for _ in 0..ATTEMPTS {
             match self.find_sane() {
                 Ok(found) => {
+                    if found.is_none() {
+                        // Nothing at the cursor needs it.
+                        self.missing = None;
+                    }
                     return Ok(found);
                 }
                 Err(Obstacle::Missing(segment)) => {
@@ -533,7 +548,7 @@ impl Reader {
             Some(missing) if missing.segment == segment => {
                 let missing = *missing;
                 if self.is_over(&missing) {
-                    self.missing = None;
+                    // So are all samples that are in it.
                     return true;
                 }
                 if now.duration_since(missing.asked) < MISSING {
@@ -551,7 +566,7 @@ impl Reader {
 
     /// Whether a segment that has not come will not come any more.
     fn is_over(&self, missing: &Missing) -> bool {
-        missing.since.elapsed() >= MISSING && self.writer_dead()
+        missing.since.elapsed() >= MISSING && (self.ended || self.writer_dead())
     }
 
     /// All that is published is lost.

@@ -1,21 +1,19 @@
-//! How a publisher gets room for the next sample: descriptors, memory, and what it gives up for
-//! them.
+//! How a publisher gets room for the next sample: descriptors, blocks, and what it gives up for
+//! them. Large samples have [memory of their own](super::samples).
 
 use std::sync::{Arc, atomic::AtomicU64};
 
 use super::{
     PublishError, ShmError, Writer,
     area::Area,
-    headroom,
+    error::Keeper,
     heap::{Block, Need, Object},
     history::Held,
-    layout::{self, Array, COPIED, SLOTS_AT},
-    loan::Place,
+    layout::{self, Array, COPIED},
     memory::Map,
-    pins::{self, RECORDS},
     ring,
-    segments::OwnSegment,
-    writer::{LOOKS, State},
+    seats::Holder,
+    writer::State,
 };
 
 /// Why an attempt to publish did not succeed.
@@ -23,6 +21,31 @@ pub(super) enum Refusal {
     /// A KEEP_ALL reader holds the oldest sample.
     Held,
     Error(PublishError),
+    /// Readers keep what memory there is.
+    Kept(Kept),
+}
+
+/// Who keeps it.
+pub(super) struct Kept {
+    pub(super) holder: Holder,
+    pub(super) samples: usize,
+    /// Why there is no more of it, where it is not that the segments are full.
+    pub(super) short: Option<PublishError>,
+}
+
+impl Kept {
+    /// As whoever publishes is told. Looks the process up, so not to be called under a lock.
+    pub(super) fn into_error(self) -> PublishError {
+        let Self { holder, samples, short } = self;
+        let keeper = Keeper { reader: holder.reader, process: holder.process(), samples };
+        match short {
+            Some(PublishError::NoMemory { needed, available, .. }) => {
+                PublishError::NoMemory { needed, available, keeper: Some(keeper) }
+            }
+            Some(other) => other,
+            None => PublishError::Pinned { keeper },
+        }
+    }
 }
 
 impl From<PublishError> for Refusal {
@@ -60,37 +83,13 @@ impl Maps {
     }
 }
 
-/// The segment of a publisher's samples that readers pin.
-pub(super) struct Samples {
-    segment: Arc<OwnSegment>,
-    /// Bytes from its start that are backed by memory.
-    committed: u64,
-}
-
-impl Samples {
-    pub(super) fn number(&self) -> u32 {
-        self.segment.number()
-    }
-
-    /// Backs it with memory up to `end`, a little further when it keeps growing.
-    fn back(&mut self, end: u64) -> Result<(), PublishError> {
-        if end <= self.committed {
-            return Ok(());
-        }
-        let ahead = self.committed + (self.committed - SLOTS_AT) / 8;
-        let limit = self.segment.memory.bytes();
-        let upto = end.max(ahead).next_multiple_of(layout::ALIGN).min(limit);
-        let needed = upto - self.committed;
-        self.segment.memory.commit(self.committed, upto).map_err(|e| no_memory(e, needed))?;
-        self.committed = upto;
-        Ok(())
-    }
-}
-
-fn no_memory(error: ShmError, needed: u64) -> PublishError {
+/// As whoever publishes is told.
+pub(super) fn no_memory(error: ShmError) -> PublishError {
     match error {
-        ShmError::NoMemory { needed, available } => PublishError::NoMemory { needed, available },
-        _ => PublishError::NoMemory { needed, available: headroom::available().unwrap_or(0) },
+        ShmError::NoMemory { needed, available } => {
+            PublishError::NoMemory { needed, available, keeper: None }
+        }
+        other => PublishError::Segment { reason: other.to_string() },
     }
 }
 
@@ -173,7 +172,7 @@ impl Writer {
         let object = self
             .session
             .allocate(bytes, Need::Now, mapped)
-            .map_err(|error| no_memory(error, bytes))?
+            .map_err(no_memory)?
             .expect("there is always one that will do");
         state.maps.add(&object);
         Ok(object.block)
@@ -185,77 +184,8 @@ impl Writer {
         state.history.blocks().drain().for_each(|block| self.session.release(block));
     }
 
-    /// Has a segment for samples that readers pin.
-    pub(super) fn open_samples(&self, state: &mut State) -> Result<(), ShmError> {
-        if state.samples.is_none() {
-            let options = self.options();
-            let bytes = layout::samples_bytes(options.budget, options.max_message, RECORDS as u64);
-            let segment = self.session.open_samples(options.gid, bytes)?;
-            state.history.pinned().open(SLOTS_AT..bytes);
-            state.samples = Some(Samples { segment, committed: SLOTS_AT });
-        }
-        Ok(())
-    }
-
-    /// Takes `bytes`, more than [`COPIED`], that no reader reads.
-    pub(super) fn lend(&self, state: &mut State, bytes: u64) -> Result<Place, Refusal> {
-        debug_assert!(bytes > COPIED);
-        self.open_samples(state).map_err(|error| no_memory(error, bytes))?;
-        let floors = state.audience.floors(state.history.head());
-        let may_go = |position| position < floors.held;
-        state.history.release_below(floors.retained);
-        state.history.make_room(bytes, may_go)?;
-        let mut short = None;
-        for look in 0.. {
-            self.reclaim(state);
-            if let (Some(at), Some(samples)) = (state.history.lend(bytes), &mut state.samples) {
-                match samples.back(at + bytes) {
-                    Ok(()) => return Ok(Place { segment: Arc::clone(&samples.segment), at }),
-                    Err(error) => {
-                        state.history.give_back(at, bytes);
-                        short = Some(error);
-                    }
-                }
-            }
-            // What stands lower may be large enough, or backed already.
-            match (state.history.shrink(may_go), short.take()) {
-                (Ok(true), _) => continue,
-                (_, Some(error)) => return Err(error.into()),
-                (Err(Held), None) => return Err(Refusal::Held),
-                (Ok(false), None) => {}
-            }
-            let retired: Vec<u64> = state.history.pinned().retired().collect();
-            if retired.is_empty() {
-                let loans = state.history.pinned().loans();
-                return Err(PublishError::Loaned { loans }.into());
-            }
-            let samples = retired.len();
-            match state.audience.holder(&retired) {
-                Some(reader) => return Err(PublishError::Pinned { reader, samples }.into()),
-                // Whoever pinned them has let go, or died, just now. One that does so for ever is
-                // out for trouble.
-                None if look < LOOKS => {}
-                None => return Err(PublishError::Pinned { reader: self.gid(), samples }.into()),
-            }
-        }
-        unreachable!("the looks are counted")
-    }
-
-    /// Frees what was given up and is not read by anybody.
-    pub(super) fn reclaim(&self, state: &mut State) {
-        if state.history.pinned().retired().len() == 0 {
-            return;
-        }
-        self.show_tail(state);
-        pins::about_to_scan::<AtomicU64>();
-        let State { history, audience, found, .. } = state;
-        found.clear();
-        audience.scan(found);
-        history.pinned().reclaim(|position| found.contains(&position));
-    }
-
     /// Tells readers what has been given up. Before any of it is written over.
-    fn show_tail(&self, state: &mut State) {
+    pub(super) fn show_tail(&self, state: &mut State) {
         if state.shown_tail != state.history.tail() {
             state.shown_tail = state.history.tail();
             ring::retire(self.ring.words(), state.shown_tail);

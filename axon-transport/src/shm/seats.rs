@@ -24,6 +24,20 @@ pub(super) fn scan<W: Word>(tenancy: &Tenancy, lane: &[W], found: &mut Vec<u64>)
     standing
 }
 
+/// A reader that keeps samples.
+pub(super) struct Holder {
+    pub(super) reader: Gid,
+    /// Its session, where that is not our own.
+    pub(super) peer: Option<Arc<PeerSession>>,
+}
+
+impl Holder {
+    /// Its process: read from the file system.
+    pub(super) fn process(&self) -> Option<u32> {
+        self.peer.as_ref().map_or(Some(std::process::id()), |peer| peer.process())
+    }
+}
+
 /// One reader's lane, as its publisher knows it.
 pub(super) struct Seat {
     reader: Gid,
@@ -85,12 +99,15 @@ impl Seats {
     }
 
     /// A reader that pins one of `positions`.
-    pub(super) fn holder(&self, positions: &[u64]) -> Option<Gid> {
+    pub(super) fn holder(&self, positions: &[u64]) -> Option<Holder> {
         let holds = |seat: &&Seat| {
             seat.standing() == Standing::Open
                 && pins::scan(seat.words()).any(|position| positions.contains(&position))
         };
-        self.0.iter().find(holds).map(|seat| seat.reader)
+        self.0
+            .iter()
+            .find(holds)
+            .map(|seat| Holder { reader: seat.reader, peer: seat.peer.clone() })
     }
 
     /// Forgets those that have left, and those of `suspects` whose process has ended. Whether

@@ -12,7 +12,7 @@ use super::{
     layout::{self, SegmentKind},
     memory::{Map, Segment},
 };
-use crate::ids::SessionId;
+use crate::ids::{Gid, SessionId};
 
 /// A segment as other sessions are told of it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -28,8 +28,11 @@ pub struct SegmentInfo {
 pub enum SegmentEvent<'a> {
     /// A segment came into being, in which there will be what others read.
     Opened(SegmentInfo, BorrowedFd<'a>),
-    /// The segment of this number is given up.
-    Gone(u32),
+    /// A segment is given up: nobody reads it any more.
+    Gone(SegmentInfo),
+    /// This publisher would be glad if somebody [prepared](super::Writer::prepare) it for its next
+    /// sample. Nobody else needs to know.
+    Low(Gid),
 }
 
 type Listener = Box<dyn Fn(SegmentEvent<'_>) + Send + Sync>;
@@ -81,6 +84,13 @@ impl Segments {
         self.listener.set(listener).is_ok()
     }
 
+    /// Tells the listener.
+    pub(super) fn tell(&self, event: SegmentEvent<'_>) {
+        if let Some(listener) = self.listener.get() {
+            listener(event);
+        }
+    }
+
     /// A new segment of `bytes` bytes, of which the first [`layout::ALIGN`] are backed by memory.
     pub(super) fn open(&self, kind: SegmentKind, bytes: u64) -> Result<Arc<OwnSegment>, ShmError> {
         let name = match kind {
@@ -99,19 +109,15 @@ impl Segments {
         layout::write_segment(memory.words(), self.session, number, kind);
         let segment = Arc::new(OwnSegment { info: SegmentInfo { number, kind }, memory });
         table.live.insert(number, Arc::clone(&segment));
-        if let Some(listener) = self.listener.get() {
-            listener(SegmentEvent::Opened(segment.info, segment.memory.fd()));
-        }
+        self.tell(SegmentEvent::Opened(segment.info, segment.memory.fd()));
         Ok(segment)
     }
 
     /// Nothing in the segment is of use to anybody any more.
     pub(super) fn close(&self, number: u32) {
         let mut table = self.table.write().unwrap_or_else(PoisonError::into_inner);
-        if table.live.remove(&number).is_some()
-            && let Some(listener) = self.listener.get()
-        {
-            listener(SegmentEvent::Gone(number));
+        if let Some(segment) = table.live.remove(&number) {
+            self.tell(SegmentEvent::Gone(segment.info));
         }
     }
 

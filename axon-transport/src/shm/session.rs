@@ -128,11 +128,10 @@ impl SessionSegment {
             .transpose()
     }
 
-    /// Takes back the memory of publishers that are gone and that nobody reads any more.
-    pub fn tidy(&self) {
-        if !self.is_forked() {
-            self.orphans.sweep(&self.heap, &self.segments);
-        }
+    /// Takes back the memory of publishers that are gone and that nobody reads any more. Whether
+    /// some is left that somebody reads.
+    pub fn tidy(&self) -> bool {
+        !self.is_forked() && self.orphans.sweep(&self.heap, &self.segments)
     }
 
     /// A lane for a reader that is about to attach.
@@ -259,6 +258,16 @@ impl SessionSegment {
     /// A segment for the large samples of a publisher.
     pub(super) fn open_samples(&self, gid: Gid, bytes: u64) -> Result<Arc<OwnSegment>, ShmError> {
         self.segments.open(SegmentKind::Samples(gid), bytes)
+    }
+
+    /// Nobody reads a segment of large samples any more.
+    pub(super) fn close_samples(&self, number: u32) {
+        self.segments.close(number);
+    }
+
+    /// Tells this session's owner.
+    pub(super) fn tell(&self, event: SegmentEvent<'_>) {
+        self.segments.tell(event);
     }
 
     /// Keeps what a publisher leaves for as long as somebody reads it.

@@ -8,7 +8,7 @@ use std::{
 
 use super::{
     ConnectError, Context, Grant, Meta, Peer, Reader, ReaderOptions, Sample, TakeError,
-    connect::{Asked, Channel},
+    connect::{Asked, Channel, News},
 };
 use crate::{ids::Gid, qos::Qos};
 
@@ -73,8 +73,7 @@ impl Subscriber {
             socket = Some(channel.keep()?);
             // A ring that is not in the first segment: its own follows.
             while !peer.has_segment(ring.segment) {
-                let (handed, fd) = channel.take_handed()?;
-                context.add_segment(&handed, fd);
+                context.hear(&channel.take_news()?);
             }
         }
         let reader = Reader::map(ReaderOptions {
@@ -130,15 +129,16 @@ impl Subscriber {
         }
     }
 
-    /// Takes in the memory that the reader lacks, if it has come. Whether it has.
+    /// Takes in the memory that the reader lacks, if it has come, and lets go of what the publisher
+    /// gave up. Whether it has come.
     fn fetch(&self) -> bool {
         let (Some(missing), Some(socket)) = (self.reader.missing(), &self.socket) else {
             return false;
         };
         let channel = Channel::new(socket.as_fd(), Some(Duration::ZERO));
-        while let Ok((handed, fd)) = channel.take_handed() {
-            self.context.add_segment(&handed, fd);
-            if handed.info().number == missing {
+        while let Ok(news) = channel.take_news() {
+            self.context.hear(&news);
+            if matches!(news, News::Handed(handed, _) if handed.info().number == missing) {
                 return true;
             }
         }

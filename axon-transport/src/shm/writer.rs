@@ -1,7 +1,7 @@
 //! The publishing end of a ring.
 
 use std::{
-    sync::{Arc, Mutex, MutexGuard, PoisonError, atomic::AtomicU64},
+    sync::{Arc, atomic::AtomicU64},
     time::{Duration, Instant},
 };
 
@@ -15,8 +15,10 @@ use super::{
     layout::{self, Array, COPIED, INLINE},
     loan::Place as LoanPlace,
     orphans::Orphan,
+    pi_mutex::{PiGuard, PiMutex},
     ring::{self, Place, Record},
-    room::{Maps, Refusal, Samples},
+    room::{Maps, Refusal},
+    samples::Samples,
     sync::{Ordering, Word},
 };
 use crate::{
@@ -90,7 +92,7 @@ pub struct Writer {
     pub(super) ring: Object,
     /// The most descriptors.
     pub(super) limit: u64,
-    state: Mutex<State>,
+    state: PiMutex<State>,
 }
 
 pub(super) struct State {
@@ -100,7 +102,7 @@ pub(super) struct State {
     pub(super) array: Object,
     /// The segments that blocks are in.
     pub(super) maps: Maps,
-    /// Where samples that readers pin are, once there has been one.
+    /// Where the next samples go that readers pin, once there has been one.
     pub(super) samples: Option<Samples>,
     /// The tail as readers see it.
     pub(super) shown_tail: u64,
@@ -177,7 +179,7 @@ impl Writer {
             last: 0,
             published: 0,
         };
-        let writer = Self { options, session, ring, limit, state: Mutex::new(state) };
+        let writer = Self { options, session, ring, limit, state: PiMutex::new(state)? };
         if expected > COPIED {
             writer.open_samples(&mut writer.lock())?;
         }
@@ -355,7 +357,7 @@ impl Writer {
                 }
                 Payload::Written { at, len } => {
                     let len = Area::rounded(len as u64);
-                    (Extent::Slot { at: at.offset, len }, Place::Slot(at))
+                    (Extent::Slot { at, len }, Place::Slot(at))
                 }
             };
             let meta = self.number(state, numbering);
@@ -386,7 +388,7 @@ impl Writer {
         let meta = match numbering {
             Numbering::Given(meta) => meta,
             Numbering::Next(source_timestamp) => {
-                Meta { sequence: state.last + 1, source_timestamp }
+                Meta { sequence: state.last.saturating_add(1), source_timestamp }
             }
         };
         state.last = meta.sequence;
@@ -425,7 +427,7 @@ impl Writer {
     }
 
     pub(super) fn give_back(&self, at: Location, len: usize) {
-        self.lock().history.give_back(at.offset, Area::rounded(len as u64));
+        self.lock().history.give_back(at, Area::rounded(len as u64));
     }
 
     pub(super) fn is_forked(&self) -> bool {
@@ -457,6 +459,10 @@ impl Writer {
                 match attempt(&mut state) {
                     Ok(done) => return Ok(done),
                     Err(Refusal::Error(error)) => return Err(error),
+                    Err(Refusal::Kept(kept)) => {
+                        drop(state);
+                        return Err(kept.into_error());
+                    }
                     Err(Refusal::Held) => {}
                 }
                 let State { history, audience, .. } = &mut *state;
@@ -491,8 +497,8 @@ impl Writer {
         self.lock().audience.mark_dead();
     }
 
-    pub(super) fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    pub(super) fn lock(&self) -> PiGuard<'_, State> {
+        self.state.lock()
     }
 }
 
@@ -502,7 +508,7 @@ impl Drop for Writer {
         if self.is_forked() {
             return;
         }
-        let State { mut history, array, audience, samples, .. } = {
+        let State { mut history, array, audience, .. } = {
             let mut state = self.lock();
             let empty = State {
                 history: History::new(1, 0),
@@ -520,7 +526,7 @@ impl Drop for Writer {
         // Readers drain what stands. After them nobody looks at any of it.
         let mut blocks = vec![self.ring.block, array.block];
         blocks.extend(history.all_blocks());
-        let samples = samples.map(|samples| samples.number());
+        let samples = history.pinned().segments().collect();
         self.session.adopt(Orphan { seats: audience.into_seats(), blocks, samples });
     }
 }

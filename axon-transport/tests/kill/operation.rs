@@ -1,6 +1,10 @@
 //! What the doomed process does.
 
-use std::{io::Write as _, sync::Arc};
+use std::{
+    io::Write as _,
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use axon_transport::{
     ids::{Gid, SessionId},
@@ -40,6 +44,10 @@ pub(crate) enum Operation {
     LoanAndDrop,
     Detach,
     DropWriter,
+    /// Memory is made ready for the next large sample.
+    Prepare,
+    /// Memory of large samples that nobody needs any more is given up.
+    Tend,
     // The reader dies in these.
     Map,
     Take,
@@ -51,7 +59,8 @@ pub(crate) enum Operation {
 impl Operation {
     pub(crate) fn kills_publisher(self) -> bool {
         use Operation::{
-            Attach, Create, Detach, DropWriter, LoanAndDrop, LoanAndPublish, Publish, PublishHeld,
+            Attach, Create, Detach, DropWriter, LoanAndDrop, LoanAndPublish, Prepare, Publish,
+            PublishHeld, Tend,
         };
         matches!(
             self,
@@ -63,6 +72,8 @@ impl Operation {
                 | LoanAndDrop
                 | Detach
                 | DropWriter
+                | Prepare
+                | Tend
         )
     }
 
@@ -103,6 +114,10 @@ pub(crate) fn cases() -> Vec<Case> {
         case("publish by copy in place of many", Publish, last(20), (40, 20), 200),
         case("publish a large one, the first", Publish, last(1), (0, 0), 5000),
         case("publish a large one", Publish, last(1), (2, 1), 5000),
+        case("publish a large one, the first", Publish, last(4), (0, 0), 5000),
+        case("publish a large one in place of one that was taken", Publish, last(4), (4, 1), 5000),
+        case("have memory ready for a large one", Prepare, last(4), (1, 1), 5000),
+        case("give the memory of large ones up", Tend, last(4), (2, 2), 5000),
         case("publish, KEEP_ALL", Publish, all, (3, 3), 300),
         case("publish, KEEP_ALL and held", PublishHeld, all, (8, 0), 1024),
         case("loan, write, publish inline", LoanAndPublish, last(4), (3, 1), 60),
@@ -178,6 +193,8 @@ impl Case {
             writer.publish(meta(sequence), &payload(sequence, self.len)).expect("room");
         }
         let bytes = payload(self.before, self.len);
+        let start = Instant::now();
+        writer.tend(start);
         mark();
         match self.operation {
             Operation::Attach => {
@@ -201,6 +218,8 @@ impl Case {
             }
             Operation::Detach => assert!(writer.detach(reader.expect("a reader"))),
             Operation::DropWriter => drop(writer),
+            Operation::Prepare => writer.prepare().expect("memory"),
+            Operation::Tend => assert!(!writer.tend(start + Duration::from_secs(60))),
             other => unreachable!("{other:?} is the reader's"),
         }
         mark();

@@ -76,8 +76,14 @@ impl Wire {
         let to = Self::of(self.socket.try_clone().expect("a descriptor"));
         let to = Mutex::new(to);
         session.on_segment(move |event| {
-            if let SegmentEvent::Opened(info, fd) = event {
-                to.lock().expect("a wire").hand(info, fd);
+            let to = to.lock().expect("a wire");
+            match event {
+                SegmentEvent::Opened(info, fd) => to.hand(info, fd),
+                SegmentEvent::Gone(info) => {
+                    // Whoever is dead need not know.
+                    let _ = to.try_send(&info.number.to_le_bytes(), &[]);
+                }
+                SegmentEvent::Low(_) => {}
             }
         });
     }
@@ -147,8 +153,11 @@ impl Wire {
     pub(crate) fn take_segments(&self, peer: &PeerSession) -> Vec<OwnedFd> {
         while self.is_ready() {
             let (bytes, mut fds) = self.receive_any();
-            let Some(fd) = fds.pop() else { break };
-            self.pending.borrow_mut().push((bytes, fd));
+            match (fds.pop(), bytes.try_into()) {
+                (Some(fd), Err(bytes)) => self.pending.borrow_mut().push((bytes, fd)),
+                (None, Ok(gone)) => peer.remove_segment(u32::from_le_bytes(gone)),
+                _ => break,
+            }
         }
         let pending = self.pending.take();
         pending.into_iter().map(|(bytes, fd)| take_in(peer, &bytes, fd)).collect()
@@ -198,11 +207,15 @@ impl Wire {
     }
 
     fn send(&self, bytes: &[u8], fds: &[BorrowedFd<'_>]) {
+        self.try_send(bytes, fds).expect("a packet sent");
+    }
+
+    fn try_send(&self, bytes: &[u8], fds: &[BorrowedFd<'_>]) -> rustix::io::Result<usize> {
         let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(4))];
         let mut control = SendAncillaryBuffer::new(&mut space);
         assert!(fds.is_empty() || control.push(SendAncillaryMessage::ScmRights(fds)));
         let flags = SendFlags::NOSIGNAL;
-        sendmsg(&self.socket, &[IoSlice::new(bytes)], &mut control, flags).expect("a packet sent");
+        sendmsg(&self.socket, &[IoSlice::new(bytes)], &mut control, flags)
     }
 
     /// The next packet that is not a segment.

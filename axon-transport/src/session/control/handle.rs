@@ -320,12 +320,14 @@ impl Control {
         }
     }
 
-    fn detach_reader(&self, pair: &Pair) {
+    fn detach_reader(&mut self, pair: &Pair) {
         let publisher = self.shared.state().publishers.get(&pair.writer).cloned();
         if publisher.is_some_and(|p| p.detach(pair.reader)) {
             self.shared.notify(Some(&SessionEvent::Matched(pair.writer)));
         }
-        self.shared.segment.tidy();
+        if self.shared.segment.tidy() {
+            self.look_after_memory();
+        }
     }
 
     #[allow(clippy::type_complexity)]

@@ -36,6 +36,8 @@ const MAX_PAUSE: Duration = Duration::from_secs(2);
 const BRIEF: Duration = Duration::from_secs(1);
 /// Until a process that had no descriptors left tries again.
 const RETRY: Duration = Duration::from_secs(2);
+/// How often the memory of large samples is looked after.
+const TEND: Duration = Duration::from_secs(1);
 /// A relay stands for at most this many remote subscriptions by name; one packet holds no more.
 const MAX_STANDS_FOR: usize = 1024;
 
@@ -52,6 +54,8 @@ pub(super) struct Control {
     repeated: Option<HashSet<Pair>>,
     /// Whether this connection has brought a whole graph already.
     told: bool,
+    /// When to look after the memory of large samples, while there is any.
+    tend: Option<Instant>,
     /// The segments of our memory that this connection was told of.
     segments: BTreeSet<u32>,
     /// When this connection was made, and how long the search for the next one waits first: one
@@ -82,6 +86,7 @@ impl Control {
             building: None,
             repeated: None,
             told: false,
+            tend: None,
             segments: BTreeSet::new(),
             since: Instant::now(),
             pause: Duration::ZERO,
@@ -107,6 +112,7 @@ impl Control {
             self.sleep();
             self.receive();
             self.bury();
+            self.tend();
         }
         // What was queued last, such as ENDPOINT_GONE, is said by the end of the connection. Only
         // of memory, in which readers may find the last samples, nobody else could tell.
@@ -208,6 +214,10 @@ impl Control {
         }
     }
 
+    fn is_linked(&self) -> bool {
+        matches!(self.link, Link::Socket(_) | Link::Local(_))
+    }
+
     /// Takes what changed in the session's memory, and what its readers lack of others'.
     fn tell_segments(&mut self) {
         for change in self.shared.memory.take() {
@@ -241,6 +251,14 @@ impl Control {
                 let gone = SegmentName { session, number };
                 self.outbox.push_back((Message::SegmentGone(gone), Vec::new()));
             }
+            SegmentChange::Low(gid) => {
+                let publisher = self.shared.state().publishers.get(&gid).cloned();
+                if let Some(publisher) = publisher {
+                    // What lacks then, its next publish says.
+                    let _ = publisher.writer.prepare();
+                    self.look_after_memory();
+                }
+            }
         }
     }
 
@@ -254,7 +272,7 @@ impl Control {
     /// Takes what the handles queued.
     fn collect(&mut self) {
         let shared = self.shared.clone();
-        if matches!(self.link, Link::Socket(_) | Link::Local(_)) {
+        if self.is_linked() {
             self.tell_segments();
         }
         let mut state = shared.state();
@@ -352,10 +370,12 @@ impl Control {
         fds.extend(sessions.iter().map(|s| PollFd::from_borrowed_fd(s.pidfd(), PollFlags::IN)));
         // A socket without room becomes writable, but one that is short of descriptors in flight
         // does not say when that passes.
-        let nap = Timespec { tv_sec: 0, tv_nsec: 20_000_000 };
-        let nap = (!self.outbox.is_empty()).then_some(nap);
-        let retry = self.retry.map(|retry| retry.saturating_duration_since(Instant::now()));
-        let timeout = nap.or_else(|| retry.and_then(|retry| Timespec::try_from(retry).ok()));
+        let nap = (!self.outbox.is_empty()).then_some(Duration::from_millis(20));
+        let tend = self.tend.filter(|_| self.is_linked());
+        let due = tend.into_iter().chain(self.retry).min();
+        let due = due.map(|due| due.saturating_duration_since(Instant::now()));
+        let timeout = nap.into_iter().chain(due).min();
+        let timeout = timeout.and_then(|timeout| Timespec::try_from(timeout).ok());
         let _ = poll(&mut fds, timeout.as_ref());
         let mut count = [0; 8];
         let _ = rustix::io::read(&self.shared.wake, &mut count);
@@ -376,6 +396,24 @@ impl Control {
             }
         }
         self.shared.wake();
+    }
+
+    /// There is memory that may have to be given back.
+    pub(super) fn look_after_memory(&mut self) {
+        self.tend.get_or_insert_with(|| Instant::now() + TEND);
+    }
+
+    /// Looks after the memory of large samples and of publishers that are gone. Memory that is given up may have to be opened anew,
+    /// and only a daemon can say so to the readers: so not while there is none.
+    fn tend(&mut self) {
+        let now = Instant::now();
+        if !self.is_linked() || self.tend.is_none_or(|due| now < due) {
+            return;
+        }
+        let publishers: Vec<_> = self.shared.state().publishers.values().cloned().collect();
+        let more = publishers.iter().filter(|publisher| publisher.writer.tend(now)).count();
+        let more = self.shared.segment.tidy() || more > 0;
+        self.tend = more.then(|| now + TEND);
     }
 
     /// Looks for peers that died.

@@ -8,6 +8,7 @@ mod model;
 mod mutation;
 mod pins;
 mod processes;
+mod samples;
 mod wire;
 
 use std::{
@@ -82,11 +83,16 @@ fn view(of: &SessionSegment) -> Arc<PeerSession> {
 }
 
 fn tell_views(of: SessionId, event: SegmentEvent<'_>) {
-    let SegmentEvent::Opened(info, fd) = event else { return };
     let mut views = VIEWS.lock().unwrap();
     views.retain(|view| view.strong_count() > 0);
     for view in views.iter().filter_map(Weak::upgrade).filter(|view| view.id() == of) {
-        view.add_segment(info, fd).unwrap();
+        match event {
+            SegmentEvent::Opened(info, fd) => {
+                view.add_segment(info, fd).unwrap();
+            }
+            SegmentEvent::Gone(info) => view.remove_segment(info.number),
+            SegmentEvent::Low(_) => {}
+        }
     }
 }
 

@@ -167,15 +167,18 @@ fn samples_in_use_hold_no_publisher() {
 
 #[test]
 fn memory_that_readers_keep_is_named_and_comes_back() {
+    const LEN: usize = 1 << 16;
     let (a, b) = (session(), session());
-    let writer = writer(&a, keep_last(1), 0);
-    let mut readers: Vec<_> = (0..5).map(|_| attach(&writer, &a, &b, keep_last(1))).collect();
+    let (gid, max_message) = (Gid::new(a.id(), 1), LEN as u64);
+    let options = RingOptions { gid, qos: keep_last(1), budget: 0, max_message, expected: 0 };
+    let writer = Writer::create(a.clone(), options).unwrap();
+    let mut readers: Vec<_> = (0..60).map(|_| attach(&writer, &a, &b, keep_last(1))).collect();
     let mut kept = Vec::new();
     let mut sequence = 0;
     let mut error = None;
     'full: for reader in &mut readers {
         for _ in 0..5 {
-            match writer.publish(meta(sequence), &pattern(sequence, MAX as usize)) {
+            match writer.publish(meta(sequence), &pattern(sequence, LEN)) {
                 Ok(_) => kept.push(take(reader)),
                 Err(refused) => {
                     error = Some(refused);
@@ -186,13 +189,15 @@ fn memory_that_readers_keep_is_named_and_comes_back() {
         }
     }
     let error = error.expect("an end of memory");
-    let PublishError::Pinned { reader, samples } = error else { panic!("{error}") };
-    assert!(writer.readers().contains(&reader) && samples >= 12, "{samples} samples");
+    let PublishError::Pinned { keeper } = error else { panic!("{error}") };
+    assert!(writer.readers().contains(&keeper.reader) && keeper.samples >= 40, "{keeper}");
+    let named = format!("held by reader {} (pid {})", keeper.reader, std::process::id());
+    assert!(error.to_string().contains(&named), "{error}");
     kept.iter().for_each(intact);
     // Small ones need none of it.
     publish(&writer, sequence, 4096);
     kept.clear();
-    publish(&writer, sequence + 1, MAX as usize);
+    publish(&writer, sequence + 1, LEN);
 }
 
 #[test]
