@@ -1,5 +1,5 @@
 //! How a subscriber and a publisher find each other over a connected socket, without a daemon: one
-//! packet there, one back, and one for each segment of memory (`docs/formats.md`, section 9).
+//! packet there, one back, and over a socket of their own one for each segment of memory (`docs/formats.md`, section 9).
 
 use std::{
     io::{self, IoSlice},
@@ -12,7 +12,10 @@ use minicbor::{Decode, Encode};
 use rustix::{
     event::{PollFd, PollFlags, Timespec, poll},
     io::Errno,
-    net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg},
+    net::{
+        AddressFamily, SendAncillaryBuffer, SendAncillaryMessage, SendFlags, SocketFlags,
+        SocketType, sendmsg, socketpair, sockopt,
+    },
 };
 
 use super::{Location, PeerDescriptors, SegmentInfo, SegmentKind, ShmError};
@@ -161,6 +164,13 @@ enum Packet {
     Withdrawn(#[n(0)] Withdrawn),
 }
 
+/// The two ends over which a publisher hands segments to a subscriber: theirs alone, so that what
+/// else is said over the socket by which they met stays apart.
+pub(super) fn line() -> Result<(OwnedFd, OwnedFd), ConnectError> {
+    let (family, kind) = (AddressFamily::UNIX, SocketType::SEQPACKET);
+    Ok(socketpair(family, kind, SocketFlags::CLOEXEC, None)?)
+}
+
 /// One end of the socket, for as long as the two need to come together.
 pub(super) struct Channel<'a> {
     socket: BorrowedFd<'a>,
@@ -172,23 +182,33 @@ impl<'a> Channel<'a> {
         Self { socket, deadline: timeout.and_then(|t| Instant::now().checked_add(t)) }
     }
 
-    pub(super) fn ask(&self, asked: &Asked, own: &PeerDescriptors) -> Result<(), ConnectError> {
-        self.send(
-            &Packet::Asked(*asked),
-            &[own.segment.as_fd(), own.doorbell.as_fd(), own.pidfd.as_fd()],
-        )
+    /// Asks, and hands over the end of a [line] over which segments are to come.
+    pub(super) fn ask(
+        &self,
+        asked: &Asked,
+        own: &PeerDescriptors,
+        line: impl AsFd,
+    ) -> Result<(), ConnectError> {
+        let fds = [own.segment.as_fd(), own.doorbell.as_fd(), own.pidfd.as_fd(), line.as_fd()];
+        self.send(&Packet::Asked(*asked), &fds)
     }
 
-    pub(super) fn await_asked(&self) -> Result<(Asked, PeerDescriptors), ConnectError> {
+    pub(super) fn await_asked(&self) -> Result<(Asked, PeerDescriptors, PassedFd), ConnectError> {
         match self.receive()? {
             (Packet::Asked(asked), fds) => {
-                let [segment, doorbell, pidfd] = fds
+                let [segment, doorbell, pidfd, line] = fds
                     .try_into()
                     .map_err(|_| ConnectError::Protocol("another number of descriptors"))?;
                 if asked.reader.0[..12] != asked.session.0[..12] {
                     return Err(ConnectError::Protocol("a GID that is not its own"));
                 }
-                Ok((asked, PeerDescriptors { segment, doorbell, pidfd }))
+                // Sending to anything else could block.
+                if sockopt::socket_domain(&line) != Ok(AddressFamily::UNIX)
+                    || sockopt::socket_type(&line) != Ok(SocketType::SEQPACKET)
+                {
+                    return Err(ConnectError::Protocol("no unix socket for its segments"));
+                }
+                Ok((asked, PeerDescriptors { segment, doorbell, pidfd }, line))
             }
             _ => Err(ConnectError::Protocol("an answer where a question was due")),
         }
@@ -203,32 +223,24 @@ impl<'a> Channel<'a> {
         self.send(&Packet::Granted(*granted), &fds)
     }
 
-    /// The socket once more, to be kept.
-    pub(super) fn keep(&self) -> Result<OwnedFd, ConnectError> {
-        self.socket.try_clone_to_owned().map_err(ConnectError::Socket)
-    }
-
-    /// The answer to what `reader` asked. Segments that come before it are for `segment`.
+    /// The answer to what `reader` asked.
     pub(super) fn await_granted(
         &self,
         reader: Gid,
-        mut segment: impl FnMut(Handed, PassedFd),
     ) -> Result<(Granted, PeerDescriptors), ConnectError> {
-        let number = |_| ConnectError::Protocol("another number of descriptors");
         loop {
             match self.receive()? {
                 (Packet::Granted(granted), fds) if granted.reader == reader => {
-                    let [segment, doorbell, pidfd] = fds.try_into().map_err(number)?;
+                    let [segment, doorbell, pidfd] = fds
+                        .try_into()
+                        .map_err(|_| ConnectError::Protocol("another number of descriptors"))?;
                     return Ok((granted, PeerDescriptors { segment, doorbell, pidfd }));
                 }
                 (Packet::Refused(refused), _) if refused.reader == reader => {
                     return Err(ConnectError::Refused(refused.reason));
                 }
-                (Packet::Granted(_) | Packet::Refused(_) | Packet::Withdrawn(_), _) => {}
-                (Packet::Handed(handed), fds) => {
-                    let [fd] = fds.try_into().map_err(number)?;
-                    segment(handed, fd);
-                }
+                (Packet::Granted(_) | Packet::Refused(_), _) => {}
+                (Packet::Handed(_) | Packet::Withdrawn(_), _) => {}
                 (Packet::Asked(_), _) => {
                     return Err(ConnectError::Protocol("a question where an answer was due"));
                 }

@@ -3,7 +3,7 @@
 use std::{
     collections::HashMap,
     fmt,
-    os::fd::{AsFd, BorrowedFd, OwnedFd},
+    os::fd::{AsFd, BorrowedFd},
     sync::{
         Arc, Mutex, PoisonError, Weak,
         atomic::{AtomicU32, Ordering},
@@ -18,6 +18,7 @@ use super::{
 };
 use crate::{
     ids::{Gid, SessionId},
+    passed::PassedFd,
     wait::ExternalLeader,
 };
 
@@ -41,8 +42,8 @@ struct Served {
     session: SessionId,
     reader: Gid,
     writer: Gid,
-    socket: OwnedFd,
-    /// The socket had no room.
+    line: PassedFd,
+    /// The line had no room.
     behind: bool,
 }
 
@@ -58,7 +59,7 @@ impl Served {
 
     fn hand(&mut self, info: SegmentInfo, fd: BorrowedFd<'_>) {
         if self.reads(info.kind) {
-            let channel = Channel::new(self.socket.as_fd(), Some(Duration::ZERO));
+            let channel = Channel::new(self.line.as_fd(), Some(Duration::ZERO));
             // A subscriber that is gone needs nothing.
             let handed = channel.hand(self.session, info, fd);
             self.behind |= matches!(handed, Err(ConnectError::Timeout));
@@ -67,7 +68,7 @@ impl Served {
 
     fn withdraw(&self, info: SegmentInfo) {
         if self.reads(info.kind) {
-            let channel = Channel::new(self.socket.as_fd(), Some(Duration::ZERO));
+            let channel = Channel::new(self.line.as_fd(), Some(Duration::ZERO));
             // One that cannot be told keeps its map for as long as it reads from here.
             let _ = channel.withdraw(self.session, info.number);
         }
@@ -102,11 +103,11 @@ impl Context {
     }
 
     /// Hands a subscriber the segments that there are, and from then on those to come.
-    pub(super) fn hand_over(&self, socket: OwnedFd, granted: &Granted) -> Result<(), ConnectError> {
+    pub(super) fn hand_over(&self, line: PassedFd, granted: &Granted) -> Result<(), ConnectError> {
         let Granted { reader, writer, .. } = *granted;
         let session = self.id();
         // In the list first, so that none that comes now is missed; one that comes twice is one.
-        self.served().push(Served { session, reader, writer, socket, behind: true });
+        self.served().push(Served { session, reader, writer, line, behind: true });
         self.catch_up();
         if self.served().iter().any(|served| served.reader == reader && served.behind) {
             self.forget(reader);

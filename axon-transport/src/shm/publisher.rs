@@ -14,6 +14,7 @@ use super::{
 };
 use crate::{
     ids::{Gid, SessionId},
+    passed::PassedFd,
     qos::{Qos, compatible},
 };
 
@@ -85,18 +86,17 @@ impl Publisher {
     /// `SOCK_DGRAM`), and returns its GID. Waits for it for at most `timeout`.
     ///
     /// Whoever holds the other end is trusted to be who it says. Memory that it shares is not. The
-    /// publisher keeps a duplicate of the socket, over which the subscriber is handed memory that
-    /// comes into use later.
+    /// socket is not needed any more after it.
     ///
     /// # Errors
     /// It did not ask in time, asked for what this publisher does not offer, or handed over what
     /// cannot be used; it is told.
     pub fn serve(&self, socket: impl AsFd, timeout: Option<Duration>) -> Result<Gid, ConnectError> {
         let channel = Channel::new(socket.as_fd(), timeout);
-        let (asked, descriptors) = channel.await_asked()?;
+        let (asked, descriptors, line) = channel.await_asked()?;
         let (gid, session) = (asked.reader, asked.session);
         let admitted = self.admit(asked, descriptors).and_then(|granted| {
-            self.hand_over(&channel, session, &granted).inspect_err(|_| {
+            self.hand_over(&channel, (session, line), &granted).inspect_err(|_| {
                 self.writer.detach(gid);
             })
         });
@@ -125,16 +125,16 @@ impl Publisher {
     fn hand_over(
         &self,
         channel: &Channel<'_>,
-        to: SessionId,
+        (to, line): (SessionId, PassedFd),
         granted: &Granted,
     ) -> Result<(), ConnectError> {
         let own = self.context.session().descriptors()?;
         channel.grant(granted, &own)?;
         if to == self.context.id() {
-            // It finds all of it here, and would take none of it from the socket.
+            // It finds all of it here, and would take none of it from the line.
             return Ok(());
         }
-        self.context.hand_over(channel.keep()?, granted)
+        self.context.hand_over(line, granted)
     }
 
     /// Publishes a sample, stamped with the current time, and returns its sequence number, which

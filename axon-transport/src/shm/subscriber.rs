@@ -8,7 +8,7 @@ use std::{
 
 use super::{
     ConnectError, Context, Grant, Meta, Peer, Reader, ReaderOptions, Sample, TakeError,
-    connect::{Asked, Channel, News},
+    connect::{Asked, Channel, News, line},
 };
 use crate::{ids::Gid, qos::Qos};
 
@@ -42,13 +42,12 @@ pub struct Subscriber {
     gid: Gid,
     /// Over which memory of the publisher's comes that is in use only later; absent where the
     /// publisher is in the same context.
-    socket: Option<OwnedFd>,
+    line: Option<OwnedFd>,
 }
 
 impl Subscriber {
     /// Asks the publisher that [serves](super::Publisher::serve) at the other end of `socket`, and
-    /// waits for its answer for at most `timeout`. Keeps a duplicate of the socket, over which it is
-    /// handed memory that comes into use later.
+    /// waits for its answer for at most `timeout`. The socket is not needed any more after it.
     ///
     /// # Errors
     /// It did not answer in time, refused, or handed over what cannot be used.
@@ -63,18 +62,20 @@ impl Subscriber {
         let lane = context.session().allocate_lane()?;
         let gid = context.next_gid();
         let asked = Asked { session: context.id(), reader: gid, lane: lane.location(), qos };
-        channel.ask(&asked, &context.session().descriptors()?)?;
-        let (granted, descriptors) =
-            channel.await_granted(gid, |handed, fd| context.add_segment(&handed, fd))?;
+        let (ours, theirs) = line()?;
+        channel.ask(&asked, &context.session().descriptors()?, &theirs)?;
+        drop(theirs);
+        let (granted, descriptors) = channel.await_granted(gid)?;
         let peer = context.peer(granted.session, descriptors)?;
         let ring = granted.ring;
-        let mut socket = None;
+        let mut kept = None;
         if let Peer::Remote(peer) = &peer {
-            socket = Some(channel.keep()?);
+            let channel = Channel::new(ours.as_fd(), timeout);
             // A ring that is not in the first segment: its own follows.
             while !peer.has_segment(ring.segment) {
                 context.hear(&channel.take_news()?);
             }
+            kept = Some(ours);
         }
         let reader = Reader::map(ReaderOptions {
             reader: gid,
@@ -86,7 +87,7 @@ impl Subscriber {
             qos,
             max_message,
         })?;
-        Ok(Self { context: context.clone(), reader, gid, socket })
+        Ok(Self { context: context.clone(), reader, gid, line: kept })
     }
 
     /// Its GID.
@@ -132,17 +133,17 @@ impl Subscriber {
     /// Takes in the memory that the reader lacks, if it has come, and lets go of what the publisher
     /// gave up. Whether it has come.
     fn fetch(&self) -> bool {
-        let (Some(missing), Some(socket)) = (self.reader.missing(), &self.socket) else {
+        let (Some(missing), Some(line)) = (self.reader.missing(), &self.line) else {
             return false;
         };
-        let channel = Channel::new(socket.as_fd(), Some(Duration::ZERO));
+        let channel = Channel::new(line.as_fd(), Some(Duration::ZERO));
         while let Ok(news) = channel.take_news() {
             self.context.hear(&news);
             if matches!(news, News::Handed(handed, _) if handed.info().number == missing) {
                 return true;
             }
         }
-        // Another subscriber at the same socket may have taken it in.
+        // It may have come to another subscriber of this context.
         self.reader.has_data()
     }
 

@@ -164,10 +164,11 @@ fn what_another_end_may_do_wrong_is_refused() {
         let lane = Location { segment: 0, offset: 4096 };
         let asked = connect::Asked { session: a, reader, lane, qos: Qos::default() };
         let channel = connect::Channel::new(theirs.as_fd(), soon);
-        channel.ask(&asked, &context.session().descriptors().unwrap()).unwrap();
+        let (_, line) = connect::line().unwrap();
+        channel.ask(&asked, &context.session().descriptors().unwrap(), line).unwrap();
         assert!(publisher.serve(&ours, soon).is_err());
         // It is told.
-        assert!(channel.await_granted(reader, |_, _| ()).is_err());
+        assert!(channel.await_granted(reader).is_err());
     }
     assert!(publisher.subscribers().is_empty());
 }
