@@ -44,7 +44,7 @@ impl Attachment {
         &self.map.words()[self.ring.clone()]
     }
 
-    /// The publisher's segments up to `number` are mapped.
+    /// The highest number of the publisher's segments that came is `number`.
     pub(super) fn set_mapped(&self, number: u32) {
         if !self.lane.is_forked() {
             self.lane.set_mapped(number);

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::{
-    Grant, Peer, PeerSession, ReaderInfo,
+    Grant, Peer, PeerSession, ReaderInfo, ShmError,
     lane::{self, LaneView, Standing, Tenancy},
     seats::{Holder, Seats},
 };
@@ -102,13 +102,16 @@ impl Audience {
     }
 
     /// Adds a reader, whose lane is `lane`.
+    ///
+    /// # Errors
+    /// Its process has too many. It, or the one that it takes the place of, stays as it was.
     pub(super) fn attach(
         &mut self,
         info: ReaderInfo,
         lane: LaneView,
         tail: u64,
         head: u64,
-    ) -> Grant {
+    ) -> Result<Grant, ShmError> {
         let known = self.readers.iter().position(|known| {
             let same = &known.info;
             same.gid == info.gid
@@ -120,9 +123,8 @@ impl Audience {
         if let Some(index) = known {
             let known = &mut self.readers[index];
             known.info.stands_for = info.stands_for;
-            return known.grant;
+            return Ok(known.grant);
         }
-        self.readers.retain(|known| known.info.gid != info.gid);
         let transient =
             [&self.offered, &info.qos].iter().all(|q| q.durability == Durability::TransientLocal);
         let first = if transient {
@@ -130,11 +132,12 @@ impl Audience {
         } else {
             head
         };
-        let tenancy = self.seats.admit(info.gid, &info.peer, info.lane, &lane);
+        let tenancy = self.seats.admit(info.gid, &info.peer, info.lane, &lane)?;
+        self.readers.retain(|known| known.info.gid != info.gid);
         let grant = Grant { generation: tenancy.generation(), first };
         self.readers.push(Attached { info, lane, tenancy, grant, dead: false });
         self.changed();
-        grant
+        Ok(grant)
     }
 
     /// Samples that are kept at least.
@@ -142,7 +145,8 @@ impl Audience {
         self.window
     }
 
-    /// Whether all readers have the publisher's segments up to `number`.
+    /// Whether all readers have got one of the publisher's segments of this number or a later one:
+    /// most likely that one, too.
     pub(super) fn has_mapped(&self, number: u32) -> bool {
         self.readers.iter().filter(|reader| !reader.dead).all(|reader| {
             reader.info.peer.remote().is_none()

@@ -33,6 +33,19 @@ pub enum ShmError {
         /// What was wrong with it.
         what: &'static str,
     },
+    /// Other processes' memory takes as much of this one's address space as it may.
+    #[error(
+        "shared memory not mapped: that of {whose} takes up to {maps} maps and {bytes} bytes of \
+         this process's address space"
+    )]
+    AddressSpace {
+        /// Whose memory that is.
+        whose: &'static str,
+        /// The most maps.
+        maps: u64,
+        /// The most bytes.
+        bytes: u64,
+    },
     /// The samples would need more address space than a publisher may take.
     #[error(
         "a ring for messages of {max_message} bytes and {budget} bytes of history is too large: \

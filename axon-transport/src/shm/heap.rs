@@ -69,6 +69,14 @@ impl Part {
         Self { segment, area, committed: layout::ALIGN, since: Instant::now() }
     }
 
+    /// As [`allocate`](Self::allocate); what is in its way is noted, if it is the first.
+    fn give(&mut self, len: u64, short: &mut Option<ShmError>) -> Option<Object> {
+        self.allocate(len).unwrap_or_else(|error| {
+            short.get_or_insert(error);
+            None
+        })
+    }
+
     fn allocate(&mut self, len: u64) -> Result<Option<Object>, ShmError> {
         let Some(offset) = self.area.allocate(len) else { return Ok(None) };
         let end = offset + len;
@@ -111,38 +119,57 @@ impl Heap {
         };
         let mut found = None;
         let mut elsewhere = false;
+        // Where one lacks memory, another may have some.
+        let mut short = None;
         for part in &mut *parts {
-            if !usable(part) {
+            if usable(part) {
+                found = part.give(len, &mut short);
+            } else {
                 elsewhere |= part.area.fits(len);
-            } else if let Some(object) = part.allocate(len)? {
-                found = Some(object);
+            }
+            if found.is_some() {
                 break;
             }
         }
-        if found.is_none() && !elsewhere {
-            if len > HEAP_BYTES_MAX - HEAP_AT {
-                return Err(ShmError::NoMemory { needed: len, available: HEAP_BYTES_MAX });
-            }
-            let bytes = (HEAP_AT + len).next_multiple_of(HEAP_BYTES);
-            let mut part = Part::new(segments.open(SegmentKind::Heap, bytes)?);
+        if found.is_none() && !elsewhere && short.is_none() {
+            let mut part = Self::another(segments, len)?;
             if usable(&part) {
-                found = part.allocate(len)?;
+                found = part.give(len, &mut short);
             }
             parts.push(part);
         }
         if found.is_none() && need == Need::Now {
-            for part in &mut *parts {
-                found = part.allocate(len)?;
-                if found.is_some() {
-                    break;
-                }
-            }
+            found = parts.iter_mut().find_map(|part| part.give(len, &mut short));
         }
         drop(parts);
         // Whoever gave this memory back did so after it raised a tail or replaced an array, and
         // under the lock: readers that see what is written there now see that too.
         about_to_write::<AtomicU64>();
-        Ok(found)
+        match (found, short) {
+            (None, Some(error)) => Err(error),
+            (found, _) => Ok(found),
+        }
+    }
+
+    /// Has a segment with room for `len` bytes, so that others have it, too, by the time that they
+    /// are needed.
+    pub(super) fn foresee(&self, segments: &Segments, len: u64) {
+        let len = Area::rounded(len);
+        let mut parts = self.parts();
+        if !parts.iter().any(|part| part.area.fits(len))
+            // What lacks now, whoever needs it then is told.
+            && let Ok(part) = Self::another(segments, len)
+        {
+            parts.push(part);
+        }
+    }
+
+    fn another(segments: &Segments, len: u64) -> Result<Part, ShmError> {
+        if len > HEAP_BYTES_MAX - HEAP_AT {
+            return Err(ShmError::NoMemory { needed: len, available: HEAP_BYTES_MAX });
+        }
+        let bytes = (HEAP_AT + len).next_multiple_of(HEAP_BYTES);
+        Ok(Part::new(segments.open(SegmentKind::Heap, bytes)?))
     }
 
     /// Takes a block back. Those who read there must have been told already.
@@ -189,6 +216,27 @@ mod tests {
         heap.release(first.block);
         let again = heap.allocate(&segments, 400 << 10, Need::Mapped, nobody).unwrap().unwrap();
         assert_eq!(again.block, first.block);
+    }
+
+    #[test]
+    fn a_segment_that_lacks_memory_is_passed_over() {
+        let (segments, heap) = heap();
+        let most = HEAP_BYTES - HEAP_AT;
+        let second = heap.allocate(&segments, most, Need::Now, |_| true).unwrap().unwrap();
+        heap.release(second.block);
+        // Of what it says is free, no byte can be backed.
+        let end = layout::SESSION_BYTES;
+        heap.parts()[0].area = Area::new(end..2 * end, 16);
+        heap.parts()[0].committed = end;
+        for mapped in [true, false] {
+            let object = heap.allocate(&segments, 128, Need::Now, |_| mapped).unwrap().unwrap();
+            assert_eq!(object.block.at.segment, 1);
+        }
+        heap.parts()[1].area = Area::new(HEAP_BYTES..2 * HEAP_BYTES, 16);
+        heap.parts()[1].committed = HEAP_BYTES;
+        let error = heap.allocate(&segments, 128, Need::Now, |_| true).err();
+        assert!(matches!(error, Some(ShmError::System { .. })), "{error:?}");
+        assert_eq!(segments.further().len(), 1, "a third would lack it, too");
     }
 
     #[test]

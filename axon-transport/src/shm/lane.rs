@@ -23,6 +23,12 @@ use crate::ids::Gid;
 /// Set in the generation word of a lane that is not open yet.
 const ASKED: u64 = 1 << 63;
 
+/// Whether a grant may be of this generation: any other leaves the lane with nobody, or in the hands
+/// of one who asks.
+pub(super) fn is_generation(word: u64) -> bool {
+    (1..ASKED).contains(&word)
+}
+
 /// How a reader stands with the publisher that looks at its lane.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Standing {
@@ -81,14 +87,14 @@ impl Tenancy {
     }
 }
 
-/// Publisher: the highest number of its segments that the reader has.
+/// Publisher: the highest number of its segments that came to the reader.
 #[inline]
 pub(super) fn mapped<W: Word>(lane: &[W]) -> u64 {
     // Pairs with `set_mapped`: what is told of the segment from now on finds it there.
     lane[MAPPED].load(Site::MappedLoad.order())
 }
 
-/// Reader: has all segments of its publisher up to this number.
+/// Reader: this is the highest number of the segments of its publisher that came.
 pub(super) fn set_mapped<W: Word>(lane: &[W], number: u64) {
     // Pairs with `mapped`.
     lane[MAPPED].store(number, Site::MappedStore.order());
@@ -190,7 +196,7 @@ impl Lane {
         advance(words, cursor);
     }
 
-    /// The publisher's segments up to `number` are mapped.
+    /// The highest number of the publisher's segments that came is `number`.
     pub(super) fn set_mapped(&self, number: u32) {
         set_mapped(self.words(), number.into());
     }

@@ -69,7 +69,8 @@ pub(super) mod lane {
     pub(in crate::shm) const RECEIVED: usize = 2;
     pub(in crate::shm) const LOST: usize = 3;
     pub(in crate::shm) const SKIPPED: usize = 4;
-    /// The highest number of the publisher's segments that the reader has.
+    /// The highest number of the publisher's segments that came to the reader. Lower ones may not
+    /// have: those of other publishers do not, and one that was short of something comes later.
     pub(in crate::shm) const MAPPED: usize = 5;
     /// The first of the pin records.
     pub(in crate::shm) const PINS: usize = 6;

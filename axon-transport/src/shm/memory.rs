@@ -17,7 +17,13 @@ use rustix::{
     mm::{Advice, MapFlags, MprotectFlags, ProtFlags, madvise, mmap, mprotect, munlock, munmap},
 };
 
-use super::{ShmError, atfork::Place, fork::ForkToken, headroom, layout};
+use super::{
+    ShmError,
+    atfork::Place,
+    fork::ForkToken,
+    headroom, layout,
+    quota::{Quota, Share},
+};
 
 /// Bytes that are committed at a time.
 const PIECE: u64 = 1 << 20;
@@ -126,6 +132,8 @@ pub(super) struct Map {
     owner: ForkToken,
     /// Of a writable map.
     place: Option<Place>,
+    /// Of another session's memory.
+    share: Option<Share>,
 }
 
 /// What `fstatfs` says of an ordinary memfd (linux/magic.h).
@@ -138,8 +146,9 @@ unsafe impl Sync for Map {}
 
 impl Map {
     /// Maps another process's segment read-only once its seals and its size hold: it can then
-    /// never shrink under the map, which would turn a read into a SIGBUS.
-    pub(super) fn open(fd: BorrowedFd<'_>) -> Result<Self, ShmError> {
+    /// never shrink under the map, which would turn a read into a SIGBUS. For as long as it is
+    /// mapped it counts towards `quota`.
+    pub(super) fn open(fd: BorrowedFd<'_>, quota: &Arc<Quota>) -> Result<Self, ShmError> {
         // The call fails on anything but a memfd.
         let found =
             fcntl_get_seals(fd).map_err(|_| ShmError::Refused { what: "it is not a memfd" })?;
@@ -158,7 +167,10 @@ impl Map {
         {
             return Err(ShmError::Refused { what: "its size is not a segment's" });
         }
-        Self::new(fd, len, Access::Read)
+        let share = quota.take(len)?;
+        let mut map = Self::new(fd, len, Access::Read)?;
+        map.share = Some(share);
+        Ok(map)
     }
 
     fn new(fd: BorrowedFd<'_>, len: u64, access: Access) -> Result<Self, ShmError> {
@@ -182,7 +194,7 @@ impl Map {
         let base = NonNull::new(base)
             .ok_or(ShmError::Refused { what: "it was mapped at address zero" })?;
         // From here on dropping it unmaps.
-        let mut map = Self { base, bytes, owner, place: None };
+        let mut map = Self { base, bytes, owner, place: None, share: None };
         // SAFETY: the range is the mapping just made; locking has no effect on its contents.
         unsafe { munlock(base.as_ptr(), bytes) }
             .map_err(ShmError::system("unlocking a segment"))?;

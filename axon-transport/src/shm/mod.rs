@@ -78,6 +78,7 @@ mod peer;
 mod pi_mutex;
 mod pins;
 mod publisher;
+mod quota;
 mod reader;
 mod ring;
 mod room;

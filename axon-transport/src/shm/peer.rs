@@ -15,6 +15,7 @@ use super::{
     lane::LaneView,
     layout::{self, SegmentKind},
     memory::Map,
+    quota::Quota,
 };
 use crate::{
     ids::SessionId,
@@ -66,12 +67,16 @@ fn process(pidfd: &PassedFd) -> Option<u32> {
     pid.trim().parse().ok().filter(|pid| *pid > 0)
 }
 
-/// Segments of another session that are kept at most, whatever it opens.
+/// Segments of another session that are kept in mind at most, whatever it opens.
 const MAX_SEGMENTS: usize = 4096;
 
 /// Another session, mapped read-only.
 pub struct PeerSession {
     id: SessionId,
+    /// Its process, as it was at first.
+    process: Option<u32>,
+    /// What its memory may take here.
+    quota: Arc<Quota>,
     /// Its first segment.
     first: Arc<Map>,
     further: Mutex<Further>,
@@ -114,10 +119,13 @@ impl PeerSession {
         let bell = Bell::received(doorbell).ok_or(ShmError::Refused {
             what: "its doorbell is no unix socket that keeps packets",
         })?;
-        let first = Map::open(segment.as_fd())?;
+        let quota = Quota::of_session();
+        let first = Map::open(segment.as_fd(), &quota)?;
         layout::check_segment(first.words(), id, 0, SegmentKind::Session)?;
         Ok(Arc::new(Self {
             id,
+            process: process(&pidfd),
+            quota,
             first: Arc::new(first),
             further: Mutex::default(),
             wanting: OnceLock::new(),
@@ -130,7 +138,8 @@ impl PeerSession {
     /// Checks and maps a further segment of the session. One that is mapped already stays.
     ///
     /// # Errors
-    /// It is not what it was said to be. Rings that use it cannot be read.
+    /// It is not what it was said to be: rings that use it cannot be read. Or it cannot be mapped
+    /// now: it counts as missing, and readers that need it ask for it again.
     pub fn add_segment(&self, info: SegmentInfo, segment: impl AsFd) -> Result<(), ShmError> {
         let mut further = self.further();
         let known = further.maps.contains_key(&info.number);
@@ -140,13 +149,15 @@ impl PeerSession {
         if further.maps.len() >= MAX_SEGMENTS {
             return Err(ShmError::Refused { what: "its session has too many segments" });
         }
-        let map = Map::open(segment.as_fd()).and_then(|map| {
+        let map = Map::open(segment.as_fd(), &self.quota).and_then(|map| {
             layout::check_segment(map.words(), self.id, info.number, info.kind)?;
             Ok(Arc::new(map))
         });
         let (map, result) = match map {
             Ok(map) => (Some(map), Ok(())),
-            Err(error) => (None, Err(error)),
+            Err(error @ ShmError::Refused { .. }) => (None, Err(error)),
+            // It was none of its session's doing.
+            Err(error) => return Err(error),
         };
         further.maps.insert(info.number, map);
         further.wanted.remove(&info.number);
@@ -198,7 +209,8 @@ impl PeerSession {
     /// A reader has met a segment that is missing.
     pub(super) fn want(&self, number: u32) {
         let mut further = self.further();
-        if !further.maps.contains_key(&number) && further.wanted.insert(number) {
+        let known = further.maps.contains_key(&number) || further.wanted.len() >= MAX_SEGMENTS;
+        if !known && further.wanted.insert(number) {
             drop(further);
             if let Some(ask) = self.wanting.get() {
                 ask();
@@ -232,6 +244,11 @@ impl PeerSession {
     /// The number of its process; `None` once that has ended.
     pub fn process(&self) -> Option<u32> {
         process(&self.pidfd)
+    }
+
+    /// Whether the two are sessions of one process.
+    pub(super) fn is_akin_to(&self, other: &Self) -> bool {
+        self.id == other.id || (self.process.is_some() && self.process == other.process)
     }
 
     /// Its process: readable once that has ended.

@@ -104,7 +104,9 @@ impl Writer {
             let surplus = floors.retained.saturating_sub(state.history.tail());
             let wanted = window.saturating_add((window / 4).max(4));
             if surplus == 0 || state.history.capacity() < wanted {
-                self.grow(state);
+                // A publish that waits for readers leaves them the time to map what they lack.
+                let need = if floors.held < u64::MAX { Need::Now } else { Need::Mapped };
+                self.grow(state, need);
             }
             let history = &mut state.history;
             if history.is_full() && surplus > 0 {
@@ -116,9 +118,9 @@ impl Writer {
         Ok(())
     }
 
-    /// Moves to twice as many descriptors, if they are to be had where all readers look. If not, the
+    /// Moves to twice as many descriptors, if they are to be had where they are needed. If not, the
     /// oldest samples go, and the next publish tries again.
-    fn grow(&self, state: &mut State) {
+    fn grow(&self, state: &mut State, need: Need) {
         let descriptors = 2 * (state.history.capacity() + 1);
         if descriptors > self.limit {
             return;
@@ -126,7 +128,7 @@ impl Writer {
         let audience = &state.audience;
         let bytes = descriptors * layout::DESCRIPTOR;
         let mapped = |number| audience.has_mapped(number);
-        let Ok(Some(array)) = self.session.allocate(bytes, Need::Mapped, mapped) else { return };
+        let Ok(Some(array)) = self.session.allocate(bytes, need, mapped) else { return };
         // Only what stands moves, so readers must not take more for standing.
         self.show_tail(state);
         let history = &mut state.history;
@@ -137,6 +139,9 @@ impl Writer {
         history.grow();
         let old = std::mem::replace(&mut state.array, array);
         self.session.release(old.block);
+        if 2 * descriptors <= self.limit {
+            self.session.foresee(2 * bytes);
+        }
     }
 
     /// Copies at most [`COPIED`] bytes in for the next position, which has a descriptor.

@@ -4,13 +4,17 @@
 use std::sync::{Arc, atomic::AtomicU64};
 
 use super::{
-    Peer, PeerSession,
+    Peer, PeerSession, ShmError,
     lane::{LaneView, Standing, Tenancy},
     layout::{LANE_WORDS, Location},
     pins,
     sync::Word,
 };
 use crate::ids::{Gid, SessionId};
+
+/// Lanes of one other process at most: each pins up to six samples, which their publisher then does
+/// without for as long as that process likes.
+pub(super) const OF_PROCESS: usize = 256;
 
 /// Adds to `found` the positions that a reader pins, and says how it stands. After
 /// [`pins::about_to_scan`].
@@ -73,24 +77,36 @@ impl Seats {
     /// Takes in the reader that asks with the lane that `peer` has `at` some place, before it hears
     /// of its grant. As long as the lane stays as it is, the answer does, so that whoever asks for
     /// ever adds nothing.
+    ///
+    /// # Errors
+    /// Its process has [as many](OF_PROCESS) as it may.
     pub(super) fn admit(
         &mut self,
         reader: Gid,
         peer: &Peer,
         at: Location,
         lane: &LaneView,
-    ) -> Tenancy {
+    ) -> Result<Tenancy, ShmError> {
         let session = peer.id();
         let same = |seat: &&Seat| {
             seat.session == session && seat.at == at && seat.tenancy.is_asked(seat.words())
         };
         if let Some(seat) = self.0.iter().find(same) {
-            return seat.tenancy;
+            return Ok(seat.tenancy);
+        }
+        if let Some(peer) = peer.remote() {
+            let akin = |seat: &&Seat| seat.peer.as_ref().is_some_and(|p| p.is_akin_to(peer));
+            let is_full = |seats: &[Seat]| seats.iter().filter(akin).count() >= OF_PROCESS;
+            // Some may have left.
+            if is_full(&self.0) && (!self.sweep(|_| true) || is_full(&self.0)) {
+                let what = "its process has as many readers of one publisher as it may";
+                return Err(ShmError::Refused { what });
+            }
         }
         let tenancy = Tenancy::grant(lane.words());
         let peer = peer.remote().cloned();
         self.0.push(Seat { reader, session, peer, at, lane: lane.clone(), tenancy });
-        tenancy
+        Ok(tenancy)
     }
 
     /// Adds to `found` the positions that are pinned, after [`pins::about_to_scan`].

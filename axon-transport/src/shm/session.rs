@@ -251,6 +251,11 @@ impl SessionSegment {
         self.heap.allocate(&self.segments, len, need, mapped)
     }
 
+    /// Has [room](Heap::foresee) for an object of this session.
+    pub(super) fn foresee(&self, len: u64) {
+        self.heap.foresee(&self.segments, len);
+    }
+
     pub(super) fn release(&self, block: Block) {
         self.heap.release(block);
     }

@@ -31,7 +31,7 @@ pub(crate) trait Word {
 /// | `TailStore` | `TailLoad` | a reader never sees a tail above the head that it loads next |
 /// | `ReuseFence` | `StandsFence` | a reader that saw a reuse sees the tail or array that announced it |
 /// | `ArrayStore` | `ArrayLoad` | whoever sees the new array sees the descriptors in it |
-/// | `MappedStore` | `MappedLoad` | what moves to a segment that is mapped is found there |
+/// | `MappedStore` | `MappedLoad` | what moves to a segment that came is found there |
 /// | `ReclaimFence` | `PinFence` | the publisher sees the pin, or the reader sees the tail |
 /// | `PinStore`, `UnpinStore` | `ScanLoad` | a pinned sample is read before it is written over |
 /// | `OpenStore` | `GenerationLoad` | whoever sees a lane open sees its cursor |

@@ -154,6 +154,43 @@ fn a_ring_does_not_move_to_where_a_reader_cannot_follow() {
 }
 
 #[test]
+fn memory_to_grow_into_is_there_before_it_is_needed() {
+    let (a, b) = (silent_session(), session());
+    let writer = writer(&a, keep_last(1), 64 << 20);
+    let (mut reader, from) = attach_untold(&writer, &a, &b, keep_last(10_000));
+    let total = 10_000;
+    for sequence in 0..total {
+        publish(&writer, sequence, 8);
+        if !a.segments().is_empty() && !from.has_segment(1) {
+            assert!(descriptors(&writer) < 4096, "it comes ahead of what moves there");
+            hand(&a, 1, &from);
+        }
+    }
+    for sequence in 0..total {
+        assert_eq!(take(&mut reader), Some(sequence));
+    }
+    assert_eq!(reader.lost() + reader.skipped(), 0);
+}
+
+#[test]
+fn a_publish_that_waits_for_readers_goes_where_they_do_not_look_yet() {
+    let (a, b) = (silent_session(), session());
+    let writer = writer(&a, Qos::keep_all(), 64 << 20);
+    let (mut reader, from) = attach_untold(&writer, &a, &b, Qos::keep_all());
+    let total = 6000;
+    for sequence in 0..total {
+        writer.try_publish(meta(sequence), &pattern(sequence, 8)).unwrap();
+    }
+    assert_eq!(take(&mut reader), None, "not yet");
+    assert_eq!(reader.missing(), Some(1));
+    hand(&a, 1, &from);
+    for sequence in 0..total {
+        assert_eq!(take(&mut reader), Some(sequence));
+    }
+    assert_eq!(reader.lost() + reader.skipped(), 0);
+}
+
+#[test]
 fn a_sample_whose_memory_has_not_come_waits_for_it() {
     let (a, b) = (silent_session(), session());
     let writer = writer(&a, keep_last(1), 1 << 20);

@@ -1,31 +1,24 @@
 //! The publishing end of a ring.
 
-use std::{
-    sync::{Arc, atomic::AtomicU64},
-    time::{Duration, Instant},
-};
+mod commit;
+
+use std::{sync::Arc, time::Duration};
 
 use super::{
-    Grant, Loan, Location, Meta, Peer, PeerSession, PublishError, Published, ReaderInfo,
-    RingOptions, SessionSegment, ShmError,
+    Grant, Loan, Location, Meta, PublishError, Published, ReaderInfo, RingOptions, SessionSegment,
+    ShmError,
     area::Area,
     audience::Audience,
     heap::{Need, Object},
-    history::{Extent, History},
-    layout::{self, Array, COPIED, INLINE},
-    loan::Place as LoanPlace,
+    history::History,
+    layout::{self, Array, COPIED},
     orphans::Orphan,
     pi_mutex::{PiGuard, PiMutex},
-    ring::{self, Place, Record},
-    room::{Maps, Refusal},
+    ring,
+    room::Maps,
     samples::Samples,
-    sync::{Ordering, Word},
 };
-use crate::{
-    ids::Gid,
-    qos::{Durability, History as Keep},
-    wait::{Purpose, settle},
-};
+use crate::{ids::Gid, qos::History as Keep};
 
 /// How long a publish waits for a KEEP_ALL reader.
 pub(super) const PATIENCE: Duration = Duration::from_millis(100);
@@ -114,6 +107,22 @@ pub(super) struct State {
     published: u64,
 }
 
+impl State {
+    fn new(audience: Audience, history: History, array: Object) -> Self {
+        Self {
+            history,
+            audience,
+            array,
+            maps: Maps::default(),
+            samples: None,
+            shown_tail: 0,
+            found: Vec::new(),
+            last: 0,
+            published: 0,
+        }
+    }
+}
+
 /// How samples are numbered.
 #[derive(Clone, Copy)]
 pub(super) enum Numbering {
@@ -168,17 +177,8 @@ impl Writer {
         ring::copy_descriptors(array.words(), array.words(), 0, 0);
         let at = Array { at: array.block.at, descriptors };
         layout::write_ring(ring.words(), options.gid, &at);
-        let state = State {
-            audience: Audience::new(qos, limit - 1),
-            history: History::new(descriptors, budget),
-            array,
-            maps: Maps::default(),
-            samples: None,
-            shown_tail: 0,
-            found: Vec::new(),
-            last: 0,
-            published: 0,
-        };
+        let history = History::new(descriptors, budget);
+        let state = State::new(Audience::new(qos, limit - 1), history, array);
         let writer = Self { options, session, ring, limit, state: PiMutex::new(state)? };
         if expected > COPIED {
             writer.open_samples(&mut writer.lock())?;
@@ -199,7 +199,7 @@ impl Writer {
     /// Adds a reader, or answers with the grant that stands when it is attached by the same lane.
     ///
     /// # Errors
-    /// Its session has no such lane.
+    /// Its session has no such lane, or its process as many readers of this publisher as it may.
     pub fn attach(&self, reader: ReaderInfo) -> Result<Grant, ShmError> {
         if self.is_forked() {
             return Err(ShmError::Forked);
@@ -207,7 +207,7 @@ impl Writer {
         let lane = reader.peer.lane(reader.lane)?;
         let mut state = self.lock();
         let State { audience, history, .. } = &mut *state;
-        Ok(audience.attach(reader, lane, history.tail(), history.head()))
+        audience.attach(reader, lane, history.tail(), history.head())
     }
 
     /// Forgets a reader; false when it was not attached. The samples that it keeps it may keep.
@@ -305,127 +305,6 @@ impl Writer {
         Ok(Loan::placed(self, len, place))
     }
 
-    fn publish_within(
-        &self,
-        numbering: Numbering,
-        payload: &[u8],
-        patience: Duration,
-    ) -> Result<(u64, Published), PublishError> {
-        let bytes = self.check(payload.len())?;
-        if payload.len() as u64 <= COPIED {
-            return self.commit(numbering, Payload::Bytes(payload), patience);
-        }
-        let start = Instant::now();
-        let lent: Result<LoanPlace, Meta> = self.patiently(patience, |state| {
-            if self.is_unread(state) {
-                return Ok(Err(self.pass(state, numbering)));
-            }
-            self.lend(state, bytes).map(Ok)
-        })?;
-        let place = match lent {
-            Ok(place) => place,
-            Err(passed) => return Ok((passed.sequence, Published { position: None })),
-        };
-        // Copied outside the lock: nobody else knows of the place yet.
-        let mut loan = Loan::placed(self, payload.len(), place);
-        loan.copy_from_slice(payload);
-        loan.commit(numbering, patience.saturating_sub(start.elapsed()))
-    }
-
-    /// Publishes what has been, or is here, copied in. Memory that was lent and that no sample
-    /// takes is given back by whoever borrowed it.
-    pub(super) fn commit(
-        &self,
-        numbering: Numbering,
-        payload: Payload<'_>,
-        patience: Duration,
-    ) -> Result<(u64, Published), PublishError> {
-        // A loan may have been made before the fork.
-        if self.is_forked() {
-            return Err(PublishError::Forked);
-        }
-        let (meta, position, peers) = self.patiently(patience, |state| {
-            if self.is_unread(state) {
-                return Ok((self.pass(state, numbering), None, None));
-            }
-            self.make_place(state)?;
-            let (extent, place) = match payload {
-                Payload::Bytes(bytes) if bytes.len() <= INLINE => (Extent::Inline, Place::Inline),
-                Payload::Bytes(bytes) => {
-                    let block = self.copy_in(state, bytes)?;
-                    (Extent::Block(block), Place::Block(block.at))
-                }
-                Payload::Written { at, len } => {
-                    let len = Area::rounded(len as u64);
-                    (Extent::Slot { at, len }, Place::Slot(at))
-                }
-            };
-            let meta = self.number(state, numbering);
-            let position = self.show(state, meta, extent, place, payload);
-            Ok((meta, Some(position), Some(state.audience.peers())))
-        })?;
-        if let Some(peers) = peers {
-            announce(&peers);
-        }
-        Ok((meta.sequence, Published { position }))
-    }
-
-    /// Whether nobody will ever read what is published now.
-    fn is_unread(&self, state: &State) -> bool {
-        state.audience.is_empty() && self.options.qos.durability == Durability::Volatile
-    }
-
-    /// A sample that nobody reads.
-    fn pass(&self, state: &mut State, numbering: Numbering) -> Meta {
-        let meta = self.number(state, numbering);
-        self.count(state);
-        // No sample to come asks for the memory of those that were in use.
-        self.reclaim(state);
-        meta
-    }
-
-    fn number(&self, state: &mut State, numbering: Numbering) -> Meta {
-        let meta = match numbering {
-            Numbering::Given(meta) => meta,
-            Numbering::Next(source_timestamp) => {
-                Meta { sequence: state.last.saturating_add(1), source_timestamp }
-            }
-        };
-        state.last = meta.sequence;
-        meta
-    }
-
-    fn count(&self, state: &mut State) {
-        state.published += 1;
-        let published = &self.ring.words()[layout::ring::PUBLISHED];
-        Word::store(published, state.published, Ordering::Relaxed);
-    }
-
-    fn show(
-        &self,
-        state: &mut State,
-        meta: Meta,
-        extent: Extent,
-        place: Place,
-        payload: Payload<'_>,
-    ) -> u64 {
-        let (len, inline) = match payload {
-            Payload::Bytes(bytes) => (bytes.len(), bytes),
-            Payload::Written { len, .. } => (len, &[][..]),
-        };
-        self.count(state);
-        let position = state.history.push(extent);
-        let record = Record {
-            sequence: meta.sequence,
-            timestamp: meta.source_timestamp,
-            len: u32::try_from(len).expect("no longer than the largest message"),
-            place,
-        };
-        ring::about_to_write::<AtomicU64>();
-        ring::publish(self.ring.words(), state.array.words(), position, &record, inline);
-        position
-    }
-
     pub(super) fn give_back(&self, at: Location, len: usize) {
         self.lock().history.give_back(at, Area::rounded(len as u64));
     }
@@ -446,57 +325,6 @@ impl Writer {
         if len > max { Err(PublishError::TooLarge { len, max }) } else { Ok(Area::rounded(len)) }
     }
 
-    /// Tries until it works or `patience` is at its end. The lock is not held in between.
-    fn patiently<T>(
-        &self,
-        patience: Duration,
-        mut attempt: impl FnMut(&mut State) -> Result<T, Refusal>,
-    ) -> Result<T, PublishError> {
-        let mut deadline = None;
-        for look in 0u32.. {
-            let laggards = {
-                let mut state = self.lock();
-                match attempt(&mut state) {
-                    Ok(done) => return Ok(done),
-                    Err(Refusal::Error(error)) => return Err(error),
-                    Err(Refusal::Kept(kept)) => {
-                        drop(state);
-                        return Err(kept.into_error());
-                    }
-                    Err(Refusal::Held) => {}
-                }
-                let State { history, audience, .. } = &mut *state;
-                audience.laggards(history.tail(), history.head())
-            };
-            let now = Instant::now();
-            let left = deadline.get_or_insert(now + patience).saturating_duration_since(now);
-            match laggards {
-                Some((reader, _)) if left.is_zero() => {
-                    return Err(PublishError::Blocked { reader });
-                }
-                Some((_, peers)) => self.await_room(&peers, left),
-                // It moved on between the two looks. One that does so for ever is out for trouble.
-                None if left.is_zero() && look >= LOOKS => {
-                    return Err(PublishError::Blocked { reader: self.options.gid });
-                }
-                None => {}
-            }
-        }
-        unreachable!("the deadline comes first")
-    }
-
-    fn await_room(&self, laggards: &[Arc<PeerSession>], left: Duration) {
-        let ready = || {
-            let mut state = self.lock();
-            let State { history, audience, .. } = &mut *state;
-            audience.floors(history.head()).held > history.tail()
-                || laggards.iter().any(|peer| peer.is_dead())
-        };
-        let pidfds: Vec<_> = laggards.iter().map(|peer| peer.pidfd()).collect();
-        self.session.wait_for_room(ready, &pidfds, left);
-        self.lock().audience.mark_dead();
-    }
-
     pub(super) fn lock(&self) -> PiGuard<'_, State> {
         self.state.lock()
     }
@@ -510,17 +338,8 @@ impl Drop for Writer {
         }
         let State { mut history, array, audience, .. } = {
             let mut state = self.lock();
-            let empty = State {
-                history: History::new(1, 0),
-                audience: Audience::new(self.options.qos, 0),
-                array: self.ring.clone(),
-                maps: Maps::default(),
-                samples: None,
-                shown_tail: 0,
-                found: Vec::new(),
-                last: 0,
-                published: 0,
-            };
+            let nobody = Audience::new(self.options.qos, 0);
+            let empty = State::new(nobody, History::new(1, 0), self.ring.clone());
             std::mem::replace(&mut *state, empty)
         };
         // Readers drain what stands. After them nobody looks at any of it.
@@ -528,13 +347,5 @@ impl Drop for Writer {
         blocks.extend(history.all_blocks());
         let samples = history.pinned().segments().collect();
         self.session.adopt(Orphan { seats: audience.into_seats(), blocks, samples });
-    }
-}
-
-/// Wakes those that sleep: a system call for each session that does, none for the others.
-fn announce(peers: &[Peer]) {
-    settle::<AtomicU64>();
-    for peer in peers {
-        peer.ring_if(Purpose::Samples);
     }
 }

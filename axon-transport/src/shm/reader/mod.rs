@@ -1,19 +1,22 @@
 //! The taking end of a ring.
 
+mod find;
+
 use std::{
     ops::Range,
     sync::{Arc, Weak, atomic::AtomicU64},
     time::{Duration, Instant},
 };
 
+use self::find::Bytes;
 use super::{
     Grant, Lane, Location, Meta, Peer, Sample, ShmError, TakeError, Taken,
     attachment::{Attachment, Pinning},
     audience::{depth, holds},
-    layout::{self, Array, COPIED},
+    lane, layout,
     memory::Map,
     peer::Found,
-    ring::{self, Look, MAX_POSITION, Place, Record, State, View},
+    ring::{self, MAX_POSITION, Record, State, View},
 };
 use crate::{
     ids::Gid,
@@ -125,6 +128,9 @@ impl Reader {
             return Err(ShmError::Forked);
         }
         let refuse = |what| Err(ShmError::Refused { what });
+        if !lane::is_generation(grant.generation) {
+            return refuse("its grant is none");
+        }
         let Found::Map(map) = peer.find(ring.segment) else {
             return refuse("the segment that its ring is in did not come");
         };
@@ -340,249 +346,6 @@ impl Reader {
         self.reads.peer.is_dead()
     }
 
-    /// The record at the cursor, once that is past all that is skipped or lost.
-    fn find(&mut self) -> Result<Option<Record>, TakeError> {
-        if self.attachment.lane.is_forked() {
-            return Err(TakeError::Forked);
-        }
-        if let Some(what) = self.corrupt {
-            return Err(TakeError::Corrupt { writer: self.reads.writer, what });
-        }
-        for _ in 0..ATTEMPTS {
-            match self.find_sane() {
-                Ok(found) => {
-                    if found.is_none() {
-                        // Nothing at the cursor needs it.
-                        self.missing = None;
-                    }
-                    return Ok(found);
-                }
-                Err(Obstacle::Missing(segment)) => {
-                    if !self.lacks(segment) {
-                        return Ok(None);
-                    }
-                    // None of what is there will ever be found.
-                    if let Err(what) = self.give_all_up() {
-                        return Err(self.corrupt(what));
-                    }
-                }
-                Err(Obstacle::Corrupt(what)) => return Err(self.corrupt(what)),
-            }
-        }
-        Ok(None)
-    }
-
-    fn find_sane(&mut self) -> Result<Option<Record>, Obstacle> {
-        for _ in 0..ATTEMPTS {
-            let word = ring::array(self.attachment.ring());
-            let known = self.descriptors.take().filter(|known| known.word == word);
-            let known = match known {
-                Some(known) => known,
-                None => self.resolve(word)?,
-            };
-            let (cursor, depth) = (self.cursor, self.reads.depth);
-            let view = self.descriptors.insert(known).view(&self.attachment);
-            match view.state(cursor) {
-                State::Ahead if cursor >= self.seen => return Ok(None),
-                State::Here => {
-                    // One look tells whether more than the depth is unread, if that many can be.
-                    let descriptors = (view.array.len() / layout::DESCRIPTOR_WORDS) as u64;
-                    let late = depth < descriptors && view.state(cursor + depth) != State::Ahead;
-                    let mut head = 0;
-                    if late {
-                        // The head may not say so yet, or never, if the publisher died.
-                        head = if view.stands(cursor) { cursor + depth + 1 } else { 0 };
-                    } else {
-                        match view.look(cursor) {
-                            Look::Sample(record) => return Ok(Some(record)),
-                            Look::Lapped => {}
-                            Look::Corrupt(what) => return Err(Obstacle::Corrupt(what)),
-                        }
-                    }
-                    self.count(head)?;
-                }
-                State::Ahead | State::Gone => {
-                    let wrong = view.stands(cursor);
-                    self.count(0)?;
-                    if wrong && self.cursor == cursor {
-                        let what = "a descriptor that stands carries another position";
-                        return Err(Obstacle::Corrupt(what));
-                    }
-                }
-            }
-        }
-        Ok(None)
-    }
-
-    /// Counts what is skipped and what is lost, by what the head, which is at least `least`, and
-    /// the tail say.
-    fn count(&mut self, least: u64) -> Result<(), Obstacle> {
-        let (tail, head) = ring::bounds(self.attachment.ring()).map_err(Obstacle::Corrupt)?;
-        let head = head.max(least);
-        // A sample may be taken by its stamp before the head says so.
-        if head + 1 < self.cursor {
-            return Err(Obstacle::Corrupt("its head went back"));
-        }
-        self.seen = head;
-        let unread = head.saturating_sub(self.cursor);
-        if unread > self.reads.depth {
-            self.skipped += unread - self.reads.depth;
-            self.advance(head - self.reads.depth);
-        }
-        if self.cursor < tail {
-            self.lost += tail - self.cursor;
-            self.advance(tail);
-        }
-        Ok(())
-    }
-
-    /// Where the descriptors are that the ring's word speaks of.
-    fn resolve(&self, word: u64) -> Result<Descriptors, Obstacle> {
-        let wrong = Obstacle::Corrupt("its descriptors are nowhere");
-        let Some(Array { at, descriptors }) = Array::from_word(word) else { return Err(wrong) };
-        let map = match self.reads.peer.find(at.segment) {
-            Found::Map(map) => map,
-            Found::Refused => return Err(wrong),
-            Found::Absent => return Err(Obstacle::Missing(at.segment)),
-        };
-        match at.words(descriptors * layout::DESCRIPTOR, map.words().len()) {
-            Some(words) => Ok(Descriptors { word, map, words }),
-            None => Err(wrong),
-        }
-    }
-
-    /// As [`find`](Self::find), and where its bytes are; without what is longer than the
-    /// subscription expects.
-    fn find_whole(&mut self) -> Result<Option<(Record, Bytes)>, TakeError> {
-        for _ in 0..ATTEMPTS {
-            let Some(record) = self.find()? else { return Ok(None) };
-            let (len, max) = (u64::from(record.len), self.reads.max_message);
-            if len > max {
-                self.lose();
-                return Err(TakeError::TooLarge { writer: self.reads.writer, len, max });
-            }
-            match self.locate(&record) {
-                Ok(bytes) => {
-                    self.missing = None;
-                    return Ok(Some((record, bytes)));
-                }
-                Err(Obstacle::Missing(segment)) => {
-                    if !self.lacks(segment) {
-                        return Ok(None);
-                    }
-                    self.lose();
-                }
-                Err(Obstacle::Corrupt(what)) => return Err(self.corrupt(what)),
-            }
-        }
-        Ok(None)
-    }
-
-    /// Where the bytes of a record that stood are.
-    fn locate(&mut self, record: &Record) -> Result<Bytes, Obstacle> {
-        let (at, slot) = match record.place {
-            Place::Inline => return Ok(Bytes::Inline),
-            Place::Block(at) => (at, false),
-            Place::Slot(at) => (at, true),
-        };
-        let len = u64::from(record.len);
-        if slot != (len > COPIED) {
-            return Err(Obstacle::Corrupt("a sample is in the wrong kind of place"));
-        }
-        let known = self.maps.iter().find(|(number, _)| *number == at.segment);
-        let map = match known.and_then(|(_, map)| map.upgrade()) {
-            Some(map) => map,
-            None => match self.reads.peer.find(at.segment) {
-                Found::Map(map) => {
-                    // Few are in use at a time, and one that is not here is found again.
-                    self.maps.retain(|(number, _)| *number != at.segment);
-                    if self.maps.len() >= KNOWN {
-                        self.maps.remove(0);
-                    }
-                    self.maps.push((at.segment, Arc::downgrade(&map)));
-                    map
-                }
-                Found::Refused => {
-                    return Err(Obstacle::Corrupt("a sample is in memory that was refused"));
-                }
-                Found::Absent => return Err(Obstacle::Missing(at.segment)),
-            },
-        };
-        match at.words(len, map.words().len()) {
-            Some(words) if slot => Ok(Bytes::Slot(map, words)),
-            Some(words) => Ok(Bytes::Block(map, words)),
-            None => Err(Obstacle::Corrupt("a sample lies outside its segment")),
-        }
-    }
-
-    /// Copies the payload at the cursor; false when the publisher was faster.
-    fn copy_out(
-        &self,
-        record: &Record,
-        bytes: &Bytes,
-        out: &mut Vec<u8>,
-    ) -> Result<bool, TakeError> {
-        let len = record.len as usize;
-        let Some(descriptors) = &self.descriptors else { return Ok(false) };
-        let view = descriptors.view(&self.attachment);
-        let mut copy = |words: &[AtomicU64]| {
-            ring::copy_out(words, len, out).map_err(|_| TakeError::NoMemory { len: len as u64 })
-        };
-        match bytes {
-            Bytes::Inline => copy(view.inline(self.cursor))?,
-            Bytes::Block(map, words) => copy(&map.words()[words.clone()])?,
-            Bytes::Slot(map, words) => {
-                let copy = || copy(&map.words()[words.clone()]);
-                let pinned = self.attachment.while_pinned(self.cursor, copy);
-                return pinned.transpose().map(|copied| copied.is_some());
-            }
-        }
-        Ok(view.stands(self.cursor))
-    }
-
-    /// Notes that `segment` has not come, and has it asked for again at times. True when it never
-    /// will.
-    fn lacks(&mut self, segment: u32) -> bool {
-        let now = Instant::now();
-        match &mut self.missing {
-            Some(missing) if missing.segment == segment => {
-                let missing = *missing;
-                if self.is_over(&missing) {
-                    // So are all samples that are in it.
-                    return true;
-                }
-                if now.duration_since(missing.asked) < MISSING {
-                    return false;
-                }
-                self.missing = Some(Missing { asked: now, ..missing });
-            }
-            _ => self.missing = Some(Missing { segment, since: now, asked: now }),
-        }
-        if let Some(session) = self.reads.peer.remote() {
-            session.want(segment);
-        }
-        false
-    }
-
-    /// Whether a segment that has not come will not come any more.
-    fn is_over(&self, missing: &Missing) -> bool {
-        missing.since.elapsed() >= MISSING && (self.ended || self.writer_dead())
-    }
-
-    /// All that is published is lost.
-    fn give_all_up(&mut self) -> Result<(), &'static str> {
-        let (_, head) = ring::bounds(self.attachment.ring())?;
-        self.lost += head.saturating_sub(self.cursor);
-        self.advance(head.max(self.cursor));
-        Ok(())
-    }
-
-    /// The sample at the cursor is lost.
-    fn lose(&mut self) {
-        self.lost += 1;
-        self.advance(self.cursor + 1);
-    }
-
     /// Takes samples of up to `max` bytes from now on.
     #[cfg(test)]
     pub(super) fn expect(&mut self, max: u64) {
@@ -615,16 +378,6 @@ impl Reader {
             self.reads.peer.ring_if(Purpose::Room);
         }
     }
-}
-
-/// Where a sample's bytes are.
-enum Bytes {
-    /// In its descriptor.
-    Inline,
-    /// To be copied, and checked afterwards.
-    Block(Arc<Map>, Range<usize>),
-    /// To be pinned.
-    Slot(Arc<Map>, Range<usize>),
 }
 
 impl Drop for Reader {

@@ -1,0 +1,113 @@
+//! Messages as bytes of a packet.
+
+use minicbor::{Decode, Encode};
+
+use super::{MAX_PACKET, Message};
+
+/// Why bytes are not a message, or a message has no bytes.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum CodecError {
+    /// Nothing at all.
+    #[error("an empty packet")]
+    Empty,
+    /// More than a packet holds.
+    #[error("a message of {0} bytes; a packet holds {MAX_PACKET}")]
+    TooLarge(usize),
+    /// Not the map that the type calls for.
+    #[error("message type {kind}: {source}")]
+    Malformed {
+        /// The message's type byte.
+        kind: u8,
+        /// What the decoder found.
+        source: minicbor::decode::Error,
+    },
+    /// Bytes after the map.
+    #[error("message type {0}: bytes after the map")]
+    Trailing(u8),
+}
+
+/// What a message without content consists of.
+#[derive(Clone, Copy, Debug, Encode, Decode)]
+#[cbor(map)]
+struct Empty {}
+
+impl Message {
+    /// The packet's bytes.
+    ///
+    /// # Errors
+    /// [`CodecError::TooLarge`] when they do not fit into one packet.
+    pub fn encode(&self) -> Result<Vec<u8>, CodecError> {
+        let (kind, body) = match self {
+            Self::Hello(m) => (1, minicbor::to_vec(m)),
+            Self::Welcome(m) => (2, minicbor::to_vec(m)),
+            Self::Refused(m) => (3, minicbor::to_vec(m)),
+            Self::Endpoint(m) => (4, minicbor::to_vec(m)),
+            Self::EndpointGone(m) => (5, minicbor::to_vec(m)),
+            Self::Graph(m) => (6, minicbor::to_vec(m)),
+            Self::Match(m) => (7, minicbor::to_vec(m)),
+            Self::Attach(m) => (8, minicbor::to_vec(m)),
+            Self::Grant(m) => (9, minicbor::to_vec(m)),
+            Self::Detach(m) => (10, minicbor::to_vec(m)),
+            Self::Unmatch(m) => (11, minicbor::to_vec(m)),
+            Self::StatusRequest => (12, minicbor::to_vec(Empty {})),
+            Self::Status(m) => (13, minicbor::to_vec(m)),
+            Self::Resync => (14, minicbor::to_vec(Empty {})),
+            Self::Segment(m) => (15, minicbor::to_vec(m)),
+            Self::SegmentGone(m) => (16, minicbor::to_vec(m)),
+            Self::Need(m) => (17, minicbor::to_vec(m)),
+            Self::Unknown(kind) => (*kind, minicbor::to_vec(Empty {})),
+        };
+        // Encoding into a Vec has no way to fail.
+        let body = body.unwrap_or_default();
+        if body.len() + 1 > MAX_PACKET {
+            return Err(CodecError::TooLarge(body.len() + 1));
+        }
+        let mut packet = Vec::with_capacity(body.len() + 1);
+        packet.push(kind);
+        packet.extend_from_slice(&body);
+        Ok(packet)
+    }
+
+    /// Whether a packet is part of a status.
+    pub(crate) fn is_status(packet: &[u8]) -> bool {
+        packet.first() == Some(&13)
+    }
+
+    /// The message of one packet.
+    ///
+    /// # Errors
+    /// When it is empty, too large, or not the map its type calls for.
+    pub fn decode(packet: &[u8]) -> Result<Self, CodecError> {
+        if packet.len() > MAX_PACKET {
+            return Err(CodecError::TooLarge(packet.len()));
+        }
+        let (&kind, body) = packet.split_first().ok_or(CodecError::Empty)?;
+        Ok(match kind {
+            1 => Self::Hello(map(kind, body)?),
+            2 => Self::Welcome(map(kind, body)?),
+            3 => Self::Refused(map(kind, body)?),
+            4 => Self::Endpoint(map(kind, body)?),
+            5 => Self::EndpointGone(map(kind, body)?),
+            6 => Self::Graph(map(kind, body)?),
+            7 => Self::Match(map(kind, body)?),
+            8 => Self::Attach(map(kind, body)?),
+            9 => Self::Grant(map(kind, body)?),
+            10 => Self::Detach(map(kind, body)?),
+            11 => Self::Unmatch(map(kind, body)?),
+            12 => map::<Empty>(kind, body).map(|_| Self::StatusRequest)?,
+            13 => Self::Status(map(kind, body)?),
+            14 => map::<Empty>(kind, body).map(|_| Self::Resync)?,
+            15 => Self::Segment(map(kind, body)?),
+            16 => Self::SegmentGone(map(kind, body)?),
+            17 => Self::Need(map(kind, body)?),
+            _ => Self::Unknown(kind),
+        })
+    }
+}
+
+fn map<'b, T: Decode<'b, ()>>(kind: u8, body: &'b [u8]) -> Result<T, CodecError> {
+    let mut decoder = minicbor::Decoder::new(body);
+    let value = decoder.decode().map_err(|source| CodecError::Malformed { kind, source })?;
+    if decoder.position() == body.len() { Ok(value) } else { Err(CodecError::Trailing(kind)) }
+}

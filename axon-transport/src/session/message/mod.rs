@@ -1,0 +1,362 @@
+//! The control messages between sessions and their daemon (`docs/formats.md`, section 8).
+//!
+//! A packet is a type byte and one CBOR map. Unknown keys are skipped; a packet of unknown type
+//! decodes to [`Message::Unknown`]; everything else that does not fit is an error.
+
+mod codec;
+#[cfg(test)]
+mod tests;
+
+pub use codec::CodecError;
+use minicbor::{Decode, Encode};
+use serde::Serialize;
+
+use crate::{
+    graph::{Endpoint, EndpointKind},
+    ids::{DaemonId, Gid, SessionId},
+    qos::Qos,
+    shm::{Location, SegmentInfo, SegmentKind},
+};
+
+/// The version of the session protocol that this crate speaks.
+pub const PROTOCOL: u32 = 2;
+/// The largest packet, in bytes.
+pub const MAX_PACKET: usize = 32 * 1024;
+/// The most descriptors that one packet carries.
+pub const MAX_DESCRIPTORS: usize = 8;
+
+/// What kind of session this is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode, Serialize)]
+#[cbor(index_only)]
+#[serde(rename_all = "snake_case")]
+pub enum SessionRole {
+    /// A program with publishers and subscriptions.
+    #[n(0)]
+    Application,
+    /// The daemon's own gateway to other hosts.
+    #[n(1)]
+    Gateway,
+    /// A program that only asks, such as for the status; it may have no endpoints.
+    #[n(2)]
+    Tool,
+}
+
+/// For whom an endpoint stands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Encode, Decode, Serialize)]
+#[cbor(index_only)]
+#[serde(rename_all = "snake_case")]
+pub enum EndpointRole {
+    /// For itself.
+    #[n(0)]
+    Application,
+    /// A local ring that stands in for a publisher on another host.
+    #[n(1)]
+    StandIn,
+    /// A local reader that carries samples to subscriptions on another host.
+    #[n(2)]
+    Relay,
+}
+
+/// The first message of a session.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Hello {
+    /// The protocol that the session speaks.
+    #[n(0)]
+    pub protocol: u32,
+    /// The session.
+    #[n(1)]
+    pub session: SessionId,
+    /// What kind it is.
+    #[n(2)]
+    pub role: SessionRole,
+    /// The process's name, for people.
+    #[n(3)]
+    pub name: String,
+    /// `ROS_DOMAIN_ID`.
+    #[n(4)]
+    pub domain: u32,
+    /// Effective security settings: variable, and value or digest.
+    #[n(5)]
+    pub settings: Vec<(String, String)>,
+}
+
+/// The daemon takes the session.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Welcome {
+    /// The protocol that the daemon speaks.
+    #[n(0)]
+    pub protocol: u32,
+    /// The daemon.
+    #[n(1)]
+    pub daemon: DaemonId,
+    /// Its process.
+    #[n(2)]
+    pub pid: u32,
+}
+
+/// The daemon does not take the session, or one of its endpoints.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Refused {
+    /// The variable that differs; empty when none does.
+    #[n(0)]
+    pub variable: String,
+    /// Its value in the session.
+    #[n(1)]
+    pub ours: String,
+    /// Its value in the daemon.
+    #[n(2)]
+    pub theirs: String,
+    /// What is wrong.
+    #[n(3)]
+    pub text: String,
+}
+
+/// An endpoint exists. Repeating it changes only for whom it stands.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Announce {
+    /// The endpoint.
+    #[n(0)]
+    pub endpoint: Endpoint,
+    /// Its role.
+    #[n(1)]
+    pub role: EndpointRole,
+    /// The remote subscriptions that a relay stands for.
+    #[n(2)]
+    pub stands_for: Vec<Gid>,
+    /// Where a writer's ring is in its session's memory.
+    #[n(3)]
+    pub ring: Option<Location>,
+}
+
+/// An endpoint is gone.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Gone {
+    /// Which.
+    #[n(0)]
+    pub gid: Gid,
+}
+
+/// One endpoint of the graph.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct GraphItem {
+    /// The endpoint.
+    #[n(0)]
+    pub endpoint: Endpoint,
+    /// The daemon it belongs to when that is another host's.
+    #[n(1)]
+    pub daemon: Option<DaemonId>,
+}
+
+/// A change of the graph, or a part of the whole of it.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Graph {
+    /// The version after this change.
+    #[n(0)]
+    pub version: u64,
+    /// Set in the first part of a whole graph: forget what was known.
+    #[n(1)]
+    pub whole: bool,
+    /// Endpoints that are new.
+    #[n(2)]
+    pub added: Vec<GraphItem>,
+    /// Endpoints that are gone.
+    #[n(3)]
+    pub removed: Vec<Gid>,
+    /// Whether another part of the same change follows.
+    #[n(4)]
+    pub more: bool,
+    /// Those of this host's own endpoints that ended. Whoever is attached to one lets go of it; an
+    /// endpoint of another host is attached to by way of its stand-in, which ends by UNMATCH.
+    #[n(5)]
+    pub ended: Option<Vec<Gid>>,
+}
+
+/// A reader and a writer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Encode, Decode)]
+#[cbor(map)]
+pub struct Pair {
+    /// The reader's GID.
+    #[n(0)]
+    pub reader: Gid,
+    /// The writer's GID.
+    #[n(1)]
+    pub writer: Gid,
+}
+
+/// A reader asks a writer to serve it.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Attach {
+    /// The reader's GID.
+    #[n(0)]
+    pub reader: Gid,
+    /// The writer's GID.
+    #[n(1)]
+    pub writer: Gid,
+    /// The reader's lane in its session's memory.
+    #[n(2)]
+    pub lane: Location,
+    /// What the reader requests.
+    #[n(3)]
+    pub qos: Qos,
+    /// The reader's session.
+    #[n(4)]
+    pub session: SessionId,
+    /// The remote subscriptions that the reader stands for.
+    #[n(5)]
+    pub stands_for: Vec<Gid>,
+    /// The segments of the reader's session that come along.
+    #[n(6)]
+    pub segments: Vec<Segment>,
+}
+
+/// The writer serves the reader.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Granted {
+    /// The reader's GID.
+    #[n(0)]
+    pub reader: Gid,
+    /// The writer's GID.
+    #[n(1)]
+    pub writer: Gid,
+    /// The grant's generation.
+    #[n(2)]
+    pub generation: u64,
+    /// The first position to take.
+    #[n(3)]
+    pub first: u64,
+    /// The writer's session.
+    #[n(4)]
+    pub session: SessionId,
+    /// The writer's ring in its session's memory.
+    #[n(5)]
+    pub ring: Location,
+    /// The segments of the writer's session that come along.
+    #[n(6)]
+    pub segments: Vec<Segment>,
+}
+
+/// A segment of a session's memory, besides the first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+pub struct Segment {
+    /// Its number.
+    #[n(0)]
+    pub number: u32,
+    /// The publisher whose samples are in it, where it is only one's.
+    #[n(1)]
+    pub publisher: Option<Gid>,
+}
+
+impl From<SegmentInfo> for Segment {
+    fn from(info: SegmentInfo) -> Self {
+        let publisher = match info.kind {
+            SegmentKind::Samples(gid) => Some(gid),
+            SegmentKind::Session | SegmentKind::Heap => None,
+        };
+        Self { number: info.number, publisher }
+    }
+}
+
+impl From<Segment> for SegmentInfo {
+    fn from(segment: Segment) -> Self {
+        let kind = segment.publisher.map_or(SegmentKind::Heap, SegmentKind::Samples);
+        Self { number: segment.number, kind }
+    }
+}
+
+/// A session has one segment more.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct SegmentOpened {
+    /// The session.
+    #[n(0)]
+    pub session: SessionId,
+    /// The segment.
+    #[n(1)]
+    pub segment: Segment,
+}
+
+/// One segment of a session: that is gone, or that another one needs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct SegmentName {
+    /// The session.
+    #[n(0)]
+    pub session: SessionId,
+    /// The segment's number.
+    #[n(1)]
+    pub number: u32,
+}
+
+/// A reader and a writer have nothing to do with each other any more.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Unmatch {
+    /// The reader's GID.
+    #[n(0)]
+    pub reader: Gid,
+    /// The writer's GID.
+    #[n(1)]
+    pub writer: Gid,
+    /// Why.
+    #[n(2)]
+    pub reason: String,
+}
+
+/// A slice of the status.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct StatusPart {
+    /// Its number, from 0.
+    #[n(0)]
+    pub part: u32,
+    /// How many there are.
+    #[n(1)]
+    pub parts: u32,
+    /// The bytes of the JSON text.
+    #[cbor(n(2), with = "minicbor::bytes")]
+    pub text: Vec<u8>,
+}
+
+/// A message of the session socket.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub enum Message {
+    Hello(Hello),
+    Welcome(Welcome),
+    Refused(Refused),
+    Endpoint(Announce),
+    EndpointGone(Gone),
+    Graph(Graph),
+    Match(Pair),
+    Attach(Attach),
+    Grant(Granted),
+    Detach(Pair),
+    Unmatch(Unmatch),
+    StatusRequest,
+    Status(StatusPart),
+    Resync,
+    Segment(SegmentOpened),
+    SegmentGone(SegmentName),
+    Need(SegmentName),
+    /// A type that this version does not know; to be skipped.
+    Unknown(u8),
+}
+
+/// Whether an endpoint of this kind owns a ring that readers map.
+pub(crate) fn writes(kind: EndpointKind) -> bool {
+    matches!(kind, EndpointKind::Publisher)
+}
+
+/// Whether an endpoint of this kind attaches to rings.
+pub(crate) fn reads(kind: EndpointKind) -> bool {
+    matches!(kind, EndpointKind::Subscription)
+}

@@ -1,0 +1,204 @@
+//! A sample's way into the ring.
+
+use std::{
+    sync::{Arc, atomic::AtomicU64},
+    time::{Duration, Instant},
+};
+
+use super::{LOOKS, Numbering, Payload, State};
+use crate::{
+    qos::Durability,
+    shm::{
+        Loan, Meta, Peer, PeerSession, PublishError, Published, Writer,
+        area::Area,
+        history::Extent,
+        layout::{self, COPIED, INLINE},
+        loan::Place as LoanPlace,
+        ring::{self, Place, Record},
+        room::Refusal,
+        sync::{Ordering, Word},
+    },
+    wait::{Purpose, settle},
+};
+
+impl Writer {
+    pub(super) fn publish_within(
+        &self,
+        numbering: Numbering,
+        payload: &[u8],
+        patience: Duration,
+    ) -> Result<(u64, Published), PublishError> {
+        let bytes = self.check(payload.len())?;
+        if payload.len() as u64 <= COPIED {
+            return self.commit(numbering, Payload::Bytes(payload), patience);
+        }
+        let start = Instant::now();
+        let lent: Result<LoanPlace, Meta> = self.patiently(patience, |state| {
+            if self.is_unread(state) {
+                return Ok(Err(self.pass(state, numbering)));
+            }
+            self.lend(state, bytes).map(Ok)
+        })?;
+        let place = match lent {
+            Ok(place) => place,
+            Err(passed) => return Ok((passed.sequence, Published { position: None })),
+        };
+        // Copied outside the lock: nobody else knows of the place yet.
+        let mut loan = Loan::placed(self, payload.len(), place);
+        loan.copy_from_slice(payload);
+        loan.commit(numbering, patience.saturating_sub(start.elapsed()))
+    }
+
+    /// Publishes what has been, or is here, copied in. Memory that was lent and that no sample
+    /// takes is given back by whoever borrowed it.
+    pub(in crate::shm) fn commit(
+        &self,
+        numbering: Numbering,
+        payload: Payload<'_>,
+        patience: Duration,
+    ) -> Result<(u64, Published), PublishError> {
+        // A loan may have been made before the fork.
+        if self.is_forked() {
+            return Err(PublishError::Forked);
+        }
+        let (meta, position, peers) = self.patiently(patience, |state| {
+            if self.is_unread(state) {
+                return Ok((self.pass(state, numbering), None, None));
+            }
+            self.make_place(state)?;
+            let (extent, place) = match payload {
+                Payload::Bytes(bytes) if bytes.len() <= INLINE => (Extent::Inline, Place::Inline),
+                Payload::Bytes(bytes) => {
+                    let block = self.copy_in(state, bytes)?;
+                    (Extent::Block(block), Place::Block(block.at))
+                }
+                Payload::Written { at, len } => {
+                    let len = Area::rounded(len as u64);
+                    (Extent::Slot { at, len }, Place::Slot(at))
+                }
+            };
+            let meta = self.number(state, numbering);
+            let position = self.show(state, meta, extent, place, payload);
+            Ok((meta, Some(position), Some(state.audience.peers())))
+        })?;
+        if let Some(peers) = peers {
+            announce(&peers);
+        }
+        Ok((meta.sequence, Published { position }))
+    }
+
+    /// Whether nobody will ever read what is published now.
+    pub(super) fn is_unread(&self, state: &State) -> bool {
+        state.audience.is_empty() && self.options.qos.durability == Durability::Volatile
+    }
+
+    /// A sample that nobody reads.
+    pub(super) fn pass(&self, state: &mut State, numbering: Numbering) -> Meta {
+        let meta = self.number(state, numbering);
+        self.count(state);
+        // No sample to come asks for the memory of those that were in use.
+        self.reclaim(state);
+        meta
+    }
+
+    fn number(&self, state: &mut State, numbering: Numbering) -> Meta {
+        let meta = match numbering {
+            Numbering::Given(meta) => meta,
+            Numbering::Next(source_timestamp) => {
+                Meta { sequence: state.last.saturating_add(1), source_timestamp }
+            }
+        };
+        state.last = meta.sequence;
+        meta
+    }
+
+    fn count(&self, state: &mut State) {
+        state.published += 1;
+        let published = &self.ring.words()[layout::ring::PUBLISHED];
+        Word::store(published, state.published, Ordering::Relaxed);
+    }
+
+    fn show(
+        &self,
+        state: &mut State,
+        meta: Meta,
+        extent: Extent,
+        place: Place,
+        payload: Payload<'_>,
+    ) -> u64 {
+        let (len, inline) = match payload {
+            Payload::Bytes(bytes) => (bytes.len(), bytes),
+            Payload::Written { len, .. } => (len, &[][..]),
+        };
+        self.count(state);
+        let position = state.history.push(extent);
+        let record = Record {
+            sequence: meta.sequence,
+            timestamp: meta.source_timestamp,
+            len: u32::try_from(len).expect("no longer than the largest message"),
+            place,
+        };
+        ring::about_to_write::<AtomicU64>();
+        ring::publish(self.ring.words(), state.array.words(), position, &record, inline);
+        position
+    }
+
+    /// Tries until it works or `patience` is at its end. The lock is not held in between.
+    pub(super) fn patiently<T>(
+        &self,
+        patience: Duration,
+        mut attempt: impl FnMut(&mut State) -> Result<T, Refusal>,
+    ) -> Result<T, PublishError> {
+        let mut deadline = None;
+        for look in 0u32.. {
+            let laggards = {
+                let mut state = self.lock();
+                match attempt(&mut state) {
+                    Ok(done) => return Ok(done),
+                    Err(Refusal::Error(error)) => return Err(error),
+                    Err(Refusal::Kept(kept)) => {
+                        drop(state);
+                        return Err(kept.into_error());
+                    }
+                    Err(Refusal::Held) => {}
+                }
+                let State { history, audience, .. } = &mut *state;
+                audience.laggards(history.tail(), history.head())
+            };
+            let now = Instant::now();
+            let left = deadline.get_or_insert(now + patience).saturating_duration_since(now);
+            match laggards {
+                Some((reader, _)) if left.is_zero() => {
+                    return Err(PublishError::Blocked { reader });
+                }
+                Some((_, peers)) => self.await_room(&peers, left),
+                // It moved on between the two looks. One that does so for ever is out for trouble.
+                None if left.is_zero() && look >= LOOKS => {
+                    return Err(PublishError::Blocked { reader: self.options.gid });
+                }
+                None => {}
+            }
+        }
+        unreachable!("the deadline comes first")
+    }
+
+    fn await_room(&self, laggards: &[Arc<PeerSession>], left: Duration) {
+        let ready = || {
+            let mut state = self.lock();
+            let State { history, audience, .. } = &mut *state;
+            audience.floors(history.head()).held > history.tail()
+                || laggards.iter().any(|peer| peer.is_dead())
+        };
+        let pidfds: Vec<_> = laggards.iter().map(|peer| peer.pidfd()).collect();
+        self.session.wait_for_room(ready, &pidfds, left);
+        self.lock().audience.mark_dead();
+    }
+}
+
+/// Wakes those that sleep: a system call for each session that does, none for the others.
+fn announce(peers: &[Peer]) {
+    settle::<AtomicU64>();
+    for peer in peers {
+        peer.ring_if(Purpose::Samples);
+    }
+}
