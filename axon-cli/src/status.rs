@@ -1,9 +1,9 @@
 //! `axon status`: what the daemon says of itself, as tables.
 
-use std::{fmt::Write as _, io::Write as _};
+use std::{collections::BTreeMap, fmt::Write as _, io::Write as _};
 
 use axon_transport::{
-    daemon::status::{LinkStatus, Status},
+    daemon::status::{LinkStatus, Status, TopicStatus},
     session,
 };
 use serde_json::Value;
@@ -98,14 +98,14 @@ fn links(links: &[LinkStatus]) -> Table {
             text::duration(link.rtt_us.saturating_mul(1_000)),
             traffic(link.samples_in, link.bytes_in),
             traffic(link.samples_out, link.bytes_out),
-            dropped(link),
+            causes(&link.dropped),
         ]);
     }
     table
 }
 
-fn dropped(link: &LinkStatus) -> String {
-    let causes = link.dropped.iter().filter(|(_, count)| **count > 0);
+fn causes(dropped: &BTreeMap<String, u64>) -> String {
+    let causes = dropped.iter().filter(|(_, count)| **count > 0);
     let causes: Vec<String> =
         causes.map(|(cause, count)| format!("{} {cause}", grouped(*count))).collect();
     if causes.is_empty() { "0".to_owned() } else { causes.join(", ") }
@@ -145,12 +145,14 @@ fn topics(status: &Status) -> Table {
         ">elsewhere",
         ">subscriptions",
         ">elsewhere",
+        ">depth",
+        ">memory",
         ">published",
         ">arrived",
-        ">lost",
+        ">dropped",
+        "stalled readers",
     ]);
     for topic in &status.topics {
-        let lost = topic.readers.iter().map(|reader| reader.lost).sum();
         table.row([
             topic.topic.clone(),
             topic.type_name.clone(),
@@ -158,12 +160,42 @@ fn topics(status: &Status) -> Table {
             topic.remote_publishers.to_string(),
             topic.subscriptions.to_string(),
             topic.remote_subscriptions.to_string(),
+            depth(topic),
+            text::bytes(topic.bytes_committed),
             grouped(topic.published),
             grouped(topic.arrived),
-            grouped(lost),
+            causes(&topic.dropped),
+            stalled(topic),
         ]);
     }
     table
+}
+
+/// The depths of the publishers here: one, or from the least to the most.
+fn depth(topic: &TopicStatus) -> String {
+    let depths = topic.writers.iter().map(|writer| writer.depth.map_or(u64::MAX, u64::from));
+    let name = |depth| if depth == u64::MAX { "all".to_owned() } else { grouped(depth) };
+    match (depths.clone().min(), depths.max()) {
+        (Some(least), Some(most)) if least == most => name(least),
+        (Some(least), Some(most)) => format!("{} to {}", name(least), name(most)),
+        _ => dash(),
+    }
+}
+
+/// Processes with a reader that leaves samples lie, and for how long the oldest has lain.
+fn stalled(topic: &TopicStatus) -> String {
+    let mut longest: BTreeMap<u32, (u64, bool)> = BTreeMap::new();
+    for reader in topic.readers.iter().filter(|reader| reader.is_stalled()) {
+        let entry = longest.entry(reader.pid).or_default();
+        *entry = (entry.0.max(reader.waiting_ms.unwrap_or(0)), reader.stopped);
+    }
+    let named = longest.into_iter().map(|(pid, (waiting, stopped))| {
+        let stopped = if stopped { "stopped, " } else { "" };
+        let waiting = text::duration(waiting.saturating_mul(1_000_000));
+        format!("pid {pid} ({stopped}{waiting})")
+    });
+    let named: Vec<String> = named.collect();
+    if named.is_empty() { dash() } else { named.join(", ") }
 }
 
 fn sessions(status: &Status) -> Table {
@@ -215,9 +247,7 @@ fn section(out: &mut String, title: &str, none: &str, table: Table) {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeMap;
-
-    use axon_transport::daemon::status::{RefusalStatus, TopicStatus};
+    use axon_transport::daemon::status::{ReaderStatus, RefusalStatus, WriterStatus};
     use serde_json::json;
 
     use super::*;
@@ -241,7 +271,17 @@ mod tests {
             port: Some(61_348),
             gateway: "running".to_owned(),
             sessions: Vec::new(),
-            topics: vec![TopicStatus { topic: "/scan".to_owned(), ..TopicStatus::default() }],
+            topics: vec![TopicStatus {
+                topic: "/scan".to_owned(),
+                bytes_committed: 3 << 20,
+                dropped: BTreeMap::from([("overwritten".to_owned(), 5)]),
+                writers: vec![
+                    WriterStatus { depth: Some(10), ..WriterStatus::default() },
+                    WriterStatus::default(),
+                ],
+                readers: vec![reader(41, Some(12_000), true), reader(42, Some(999), true)],
+                ..TopicStatus::default()
+            }],
             links: vec![LinkStatus {
                 host: "evil\x1b[2J".to_owned(),
                 dropped: BTreeMap::from([("no_key".to_owned(), 1_000), ("other".to_owned(), 0)]),
@@ -255,6 +295,10 @@ mod tests {
                 reason: "wrong PSK".to_owned(),
             }],
         }
+    }
+
+    fn reader(pid: u32, waiting_ms: Option<u64>, stopped: bool) -> ReaderStatus {
+        ReaderStatus { pid, waiting_ms, stopped, ..ReaderStatus::default() }
     }
 
     #[test]
@@ -272,11 +316,16 @@ mod tests {
             "kme enc calls",
             "peers 1 ready",
             "/scan",
+            "10 to all",
+            "3.15 MB",
+            "5 overwritten",
+            "pid 41 (stopped, 12.0 s)",
             "wrong PSK",
             "Sessions\n  none\n",
         ] {
             assert!(text.contains(part), "{part:?} is missing in:\n{text}");
         }
+        assert!(!text.contains("pid 42"), "what has just come is no sign of a stall:\n{text}");
         assert!(!text.contains("other"), "a cause that never happened is not shown:\n{text}");
     }
 }

@@ -17,6 +17,7 @@ mod report;
 mod run;
 pub mod spawn;
 pub mod status;
+mod topics;
 pub(crate) mod watch;
 
 pub use gateway::GatewayEntry;

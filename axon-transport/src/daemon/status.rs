@@ -86,12 +86,45 @@ pub struct TopicStatus {
     pub published: u64,
     /// Samples that came from other hosts.
     pub arrived: u64,
+    /// Bytes of memory that its publishers on this host, stand-ins for remote ones among them, have
+    /// committed.
+    pub bytes_committed: u64,
+    /// Samples that were not delivered on this host, by why: `overwritten` before a reader took
+    /// them within its depth; `blocked`, `no_memory`, `pinned` as for [`WriterStatus`].
+    pub dropped: BTreeMap<String, u64>,
+    /// The publishers on this host, stand-ins for remote ones among them.
+    pub writers: Vec<WriterStatus>,
     /// What each reader on this host took and lost, relays to other hosts among them.
     pub readers: Vec<ReaderStatus>,
 }
 
+/// A publisher's ring.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub struct WriterStatus {
+    /// The publisher's process.
+    pub pid: u32,
+    /// The publisher's GID.
+    pub writer: String,
+    /// Whether it stands in for a publisher on another host.
+    pub stand_in: bool,
+    /// Its history's depth; `null` for KEEP_ALL.
+    pub depth: Option<u32>,
+    /// Samples that it keeps at least, for its own depth and those of its readers.
+    pub window: u64,
+    /// Bytes of memory that it has committed: descriptors, small samples, segments of large ones.
+    pub bytes_committed: u64,
+    /// Samples published.
+    pub published: u64,
+    /// Publishes that failed since a KEEP_ALL reader left no room for as long as they could wait.
+    pub blocked: u64,
+    /// Publishes that failed for want of memory or descriptors.
+    pub no_memory: u64,
+    /// Publishes that failed since readers or loans keep all of its memory.
+    pub pinned: u64,
+}
+
 /// A reader's share of one writer's samples.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct ReaderStatus {
     /// The reader's process.
     pub pid: u32,
@@ -101,10 +134,28 @@ pub struct ReaderStatus {
     pub writer: String,
     /// Whether it carries samples to other hosts.
     pub relay: bool,
+    /// Its history's depth; `null` for KEEP_ALL.
+    pub depth: Option<u32>,
+    /// Samples that it can take, at most its depth.
+    pub unread: u64,
     /// Samples taken.
     pub received: u64,
-    /// Samples overwritten before they were taken.
+    /// Samples overwritten before they were taken, within its depth.
     pub lost: u64,
+    /// Samples passed over because more recent ones filled its depth: no loss.
+    pub skipped: u64,
+    /// How long ago the oldest sample that it has not taken was published, in milliseconds, by the
+    /// clocks of both hosts where the publisher is on another one. `null` when it has taken all.
+    pub waiting_ms: Option<u64>,
+    /// Whether its process is stopped, by a signal or a debugger.
+    pub stopped: bool,
+}
+
+impl ReaderStatus {
+    /// Whether it has not taken a sample that has been there for a second.
+    pub fn is_stalled(&self) -> bool {
+        self.waiting_ms.is_some_and(|waiting| waiting >= 1000)
+    }
 }
 
 /// A link to another host's daemon.

@@ -12,7 +12,7 @@ use super::{
     heap::Object,
     layout::{
         self, LANE_WORDS, Location,
-        lane::{CURSOR, GENERATION, LOST, MAPPED, READER, RECEIVED, SKIPPED, WRITER},
+        lane::{CURSOR, GENERATION, LOST, MAPPED, READER, RECEIVED, SKIPPED, TAKEN},
     },
     memory::Map,
     pins,
@@ -111,7 +111,7 @@ pub(super) fn ask<W: Word>(lane: &[W], number: u64) {
 pub(super) fn open<W: Word>(lane: &[W], grant: Grant) {
     // The records are clear since the last pin was given up. To clear them once more could hide
     // from the last reader's publisher that this one's reads come after that one's.
-    for word in [RECEIVED, LOST, SKIPPED] {
+    for word in [RECEIVED, LOST, SKIPPED, TAKEN] {
         lane[word].store(0, Ordering::Relaxed);
     }
     lane[CURSOR].store(grant.first, Ordering::Relaxed);
@@ -180,10 +180,15 @@ impl Lane {
         self.session.is_forked()
     }
 
-    pub(super) fn open(&self, grant: Grant, reader: Gid, writer: Gid) {
+    pub(super) fn open(&self, grant: Grant, reader: Gid) {
         layout::write_id(self.words(), READER, reader.0);
-        layout::write_id(self.words(), WRITER, writer.0);
         open(self.words(), grant);
+    }
+
+    /// The sample that is taken now carries this source timestamp.
+    #[inline]
+    pub(super) fn taken(&self, timestamp: i64) {
+        self.words()[TAKEN].store(timestamp.cast_unsigned(), Ordering::Relaxed);
     }
 
     /// All below `cursor` is done with.

@@ -75,12 +75,21 @@ pub(super) mod lane {
     /// The first of the pin records.
     pub(in crate::shm) const PINS: usize = 6;
     pub(in crate::shm) const READER: usize = 12;
-    pub(in crate::shm) const WRITER: usize = 14;
+    /// The source timestamp of the sample that was taken last.
+    pub(in crate::shm) const TAKEN: usize = 14;
 }
 
 /// Words of a ring's header.
 pub(super) mod ring {
     pub(in crate::shm) const WRITER: usize = 2;
+    /// Samples that are kept at least.
+    pub(in crate::shm) const WINDOW: usize = 4;
+    /// Bytes of the session's memory that the ring, its descriptors and its blocks take.
+    pub(in crate::shm) const BYTES: usize = 5;
+    /// Publishes that failed, by why.
+    pub(in crate::shm) const BLOCKED: usize = 6;
+    pub(in crate::shm) const NO_MEMORY: usize = 7;
+    pub(in crate::shm) const PINNED: usize = 8;
     pub(in crate::shm) const HEAD: usize = 128 / 8;
     /// Samples published, those that nobody was there to read among them.
     pub(in crate::shm) const PUBLISHED: usize = 136 / 8;

@@ -72,6 +72,13 @@ fn words_of(len: usize, position: u64) -> Range<usize> {
     start..start + DESCRIPTOR_WORDS
 }
 
+/// The source timestamp in a descriptor's words, as they were read at some time, if it was
+/// `position`'s.
+pub(super) fn timestamp_of(words: &[u64; DESCRIPTOR_WORDS], position: u64) -> Option<i64> {
+    let stamp = position.checked_mul(2)?.checked_add(2)?;
+    (words[STAMP] == stamp).then_some(words[TIMESTAMP].cast_signed())
+}
+
 /// Publisher: positions below `tail` are about to be reused.
 pub(super) fn retire<W: Word>(ring: &[W], tail: u64) {
     // Pairs with `bounds`: a reader that sees this tail sees a head at least as high.

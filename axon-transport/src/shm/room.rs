@@ -138,6 +138,8 @@ impl Writer {
         ring::replace(self.ring.words(), word);
         history.grow();
         let old = std::mem::replace(&mut state.array, array);
+        self.add_bytes(bytes);
+        self.subtract_bytes(old.block.len);
         self.session.release(old.block);
         if 2 * descriptors <= self.limit {
             self.session.foresee(2 * bytes);
@@ -180,13 +182,17 @@ impl Writer {
             .map_err(no_memory)?
             .expect("there is always one that will do");
         state.maps.add(&object);
+        self.add_bytes(object.block.len);
         Ok(object.block)
     }
 
     fn give_blocks_back(&self, state: &mut State) {
         // Others write there from now on.
         self.show_tail(state);
-        state.history.blocks().drain().for_each(|block| self.session.release(block));
+        for block in state.history.blocks().drain() {
+            self.subtract_bytes(block.len);
+            self.session.release(block);
+        }
     }
 
     /// Tells readers what has been given up. Before any of it is written over.

@@ -141,7 +141,7 @@ impl Reader {
         if grant.first > MAX_POSITION {
             return refuse("its ring is too far");
         }
-        lane.open(grant, reader, writer);
+        lane.open(grant, reader);
         let holds = holds(&qos) && peer.remote().is_some();
         let attachment = Attachment::new(map, words, lane);
         if let Some(session) = peer.remote() {
@@ -361,6 +361,7 @@ impl Reader {
     fn taken(&mut self, record: &Record) -> Taken {
         let taken = Taken { meta: meta(record), position: self.cursor };
         self.received += 1;
+        self.attachment.lane.taken(record.timestamp);
         self.advance(self.cursor + 1);
         taken
     }

@@ -212,7 +212,7 @@ fn a_process_gets_no_more_lanes_of_a_ring_than_it_may() {
         let which = lanes.len() % 2;
         let lane = sessions[which].allocate_lane().unwrap();
         match ask(&lane, which) {
-            Ok(grant) => lane.open(grant, Gid::new(sessions[which].id(), 7), writer.gid()),
+            Ok(grant) => lane.open(grant, Gid::new(sessions[which].id(), 7)),
             Err(error) => break error,
         }
         lanes.push(lane);

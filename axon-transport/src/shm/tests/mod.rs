@@ -2,6 +2,7 @@
 
 mod api;
 mod hostile;
+mod inspect;
 mod local;
 mod memory;
 mod model;

@@ -315,7 +315,7 @@ fn a_lane_that_passes_on_unseen_is_another_attachment() {
     let before = writer.attach(info.clone()).unwrap();
     publish(&writer, 0, 10);
     // Opened, closed, given to the next reader: the publisher looks only now.
-    lane.open(before, info.gid, writer.gid());
+    lane.open(before, info.gid);
     drop(lane);
     let lane = b.allocate_lane().unwrap();
     assert_eq!(lane.location(), info.lane);

@@ -147,6 +147,18 @@ impl Writer {
     pub(super) fn patiently<T>(
         &self,
         patience: Duration,
+        attempt: impl FnMut(&mut State) -> Result<T, Refusal>,
+    ) -> Result<T, PublishError> {
+        let tried = self.try_for(patience, attempt);
+        if let Err(error) = &tried {
+            self.count_failure(error, patience);
+        }
+        tried
+    }
+
+    fn try_for<T>(
+        &self,
+        patience: Duration,
         mut attempt: impl FnMut(&mut State) -> Result<T, Refusal>,
     ) -> Result<T, PublishError> {
         let mut deadline = None;

@@ -180,6 +180,8 @@ impl Writer {
         let history = History::new(descriptors, budget);
         let state = State::new(Audience::new(qos, limit - 1), history, array);
         let writer = Self { options, session, ring, limit, state: PiMutex::new(state)? };
+        writer.add_bytes(layout::RING + descriptors * layout::DESCRIPTOR);
+        writer.show_window(&writer.lock());
         if expected > COPIED {
             writer.open_samples(&mut writer.lock())?;
         }
@@ -207,22 +209,31 @@ impl Writer {
         let lane = reader.peer.lane(reader.lane)?;
         let mut state = self.lock();
         let State { audience, history, .. } = &mut *state;
-        audience.attach(reader, lane, history.tail(), history.head())
+        let granted = audience.attach(reader, lane, history.tail(), history.head());
+        self.show_window(&state);
+        granted
     }
 
     /// Forgets a reader; false when it was not attached. The samples that it keeps it may keep.
     pub fn detach(&self, reader: Gid) -> bool {
-        !self.is_forked() && self.lock().audience.detach(reader)
+        !self.is_forked() && self.change(|audience| audience.detach(reader))
     }
 
     /// Forgets the readers whose process has ended, and names them.
     pub fn drop_dead(&self) -> Vec<Gid> {
-        if self.is_forked() { Vec::new() } else { self.lock().audience.drop_dead() }
+        if self.is_forked() { Vec::new() } else { self.change(Audience::drop_dead) }
     }
 
     /// As [`drop_dead`](Self::drop_dead), and those that have left without a word.
     pub fn drop_gone(&self) -> Vec<Gid> {
-        if self.is_forked() { Vec::new() } else { self.lock().audience.drop_gone() }
+        if self.is_forked() { Vec::new() } else { self.change(Audience::drop_gone) }
+    }
+
+    fn change<T>(&self, by: impl FnOnce(&mut Audience) -> T) -> T {
+        let mut state = self.lock();
+        let changed = by(&mut state.audience);
+        self.show_window(&state);
+        changed
     }
 
     /// The subscriptions that are attached; a relay shows as those that it stands for.
