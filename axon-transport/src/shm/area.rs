@@ -25,14 +25,23 @@ impl Area {
         len.max(1).next_multiple_of(LINE)
     }
 
-    /// Whether there is a place for `len` bytes.
-    pub(super) fn fits(&self, len: u64) -> bool {
-        self.free.iter().any(|&(start, end)| end - start >= len)
+    /// Whether there is a place for `len` bytes below `limit`.
+    pub(super) fn fits_below(&self, limit: u64, len: u64) -> bool {
+        self.find(limit, len).is_some()
+    }
+
+    fn find(&self, limit: u64, len: u64) -> Option<usize> {
+        self.free.iter().position(|&(start, end)| end.min(limit).saturating_sub(start) >= len)
     }
 
     /// The lowest place for `len` bytes, which are whole lines.
     pub(super) fn allocate(&mut self, len: u64) -> Option<u64> {
-        let index = self.free.iter().position(|&(start, end)| end - start >= len)?;
+        self.allocate_below(u64::MAX, len)
+    }
+
+    /// As [`allocate`](Self::allocate), if it ends below `limit`.
+    pub(super) fn allocate_below(&mut self, limit: u64, len: u64) -> Option<u64> {
+        let index = self.find(limit, len)?;
         let (start, end) = &mut self.free[index];
         let at = *start;
         *start += len;
@@ -100,6 +109,16 @@ mod tests {
             }
             prop_assert_eq!(area.free, vec![(0, size)]);
         }
+    }
+
+    #[test]
+    fn nothing_goes_beyond_the_limit() {
+        let mut area = Area::new(0..1024, 4);
+        assert_eq!(area.allocate_below(256, 384), None);
+        assert_eq!(area.allocate_below(256, 256), Some(0));
+        assert!(!area.fits_below(256, 128));
+        assert_eq!(area.allocate(128), Some(256));
+        assert_eq!(area.allocate_below(256, 128), None);
     }
 
     #[test]

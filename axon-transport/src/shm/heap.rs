@@ -11,7 +11,7 @@ use std::{
 use super::{
     ShmError,
     area::Area,
-    layout::{self, HEAP_AT, HEAP_BYTES, HEAP_BYTES_MAX, Location, SegmentKind},
+    layout::{self, HEAP_AT, HEAP_BYTES, HEAP_BYTES_MAX, LANES_AT, Location, SegmentKind},
     memory::Map,
     ring::about_to_write,
     segments::{OwnSegment, Segments},
@@ -58,6 +58,8 @@ pub(super) struct Heap(Mutex<Vec<Part>>);
 struct Part {
     segment: Arc<OwnSegment>,
     area: Area,
+    /// Where objects end that are no lanes.
+    limit: u64,
     /// Bytes from the segment's start that are backed by memory.
     committed: u64,
     since: Instant,
@@ -65,8 +67,14 @@ struct Part {
 
 impl Part {
     fn new(segment: Arc<OwnSegment>) -> Self {
-        let area = Area::new(HEAP_AT..segment.memory.bytes(), 16);
-        Self { segment, area, committed: layout::ALIGN, since: Instant::now() }
+        let bytes = segment.memory.bytes();
+        let limit = if segment.number() == 0 { LANES_AT } else { bytes };
+        let area = Area::new(HEAP_AT..bytes, 16);
+        Self { segment, area, limit, committed: layout::ALIGN, since: Instant::now() }
+    }
+
+    fn fits(&self, len: u64) -> bool {
+        self.area.fits_below(self.limit, len)
     }
 
     /// As [`allocate`](Self::allocate); what is in its way is noted, if it is the first.
@@ -78,7 +86,11 @@ impl Part {
     }
 
     fn allocate(&mut self, len: u64) -> Result<Option<Object>, ShmError> {
-        let Some(offset) = self.area.allocate(len) else { return Ok(None) };
+        self.allocate_below(self.limit, len)
+    }
+
+    fn allocate_below(&mut self, limit: u64, len: u64) -> Result<Option<Object>, ShmError> {
+        let Some(offset) = self.area.allocate_below(limit, len) else { return Ok(None) };
         let end = offset + len;
         if end > self.committed {
             let upto = end.next_multiple_of(layout::ALIGN);
@@ -125,7 +137,7 @@ impl Heap {
             if usable(part) {
                 found = part.give(len, &mut short);
             } else {
-                elsewhere |= part.area.fits(len);
+                elsewhere |= part.fits(len);
             }
             if found.is_some() {
                 break;
@@ -156,7 +168,7 @@ impl Heap {
     pub(super) fn foresee(&self, segments: &Segments, len: u64) {
         let len = Area::rounded(len);
         let mut parts = self.parts();
-        if !parts.iter().any(|part| part.area.fits(len))
+        if !parts.iter().any(|part| part.fits(len))
             // What lacks now, whoever needs it then is told.
             && let Ok(part) = Self::another(segments, len)
         {
@@ -170,6 +182,15 @@ impl Heap {
         }
         let bytes = (HEAP_AT + len).next_multiple_of(HEAP_BYTES);
         Ok(Part::new(segments.open(SegmentKind::Heap, bytes)?))
+    }
+
+    /// Memory for a lane, which is always in the first segment: who is asked by a reader there has
+    /// no other yet.
+    pub(super) fn allocate_lane(&self) -> Result<Object, ShmError> {
+        let object = self.parts()[0].allocate_below(layout::SESSION_BYTES, layout::LANE)?;
+        // As for `allocate`: another object may have been there.
+        about_to_write::<AtomicU64>();
+        Ok(object.expect("there is room for all lanes"))
     }
 
     /// Takes a block back. Those who read there must have been told already.
@@ -228,15 +249,31 @@ mod tests {
         let end = layout::SESSION_BYTES;
         heap.parts()[0].area = Area::new(end..2 * end, 16);
         heap.parts()[0].committed = end;
+        heap.parts()[0].limit = 2 * end;
         for mapped in [true, false] {
             let object = heap.allocate(&segments, 128, Need::Now, |_| mapped).unwrap().unwrap();
             assert_eq!(object.block.at.segment, 1);
         }
         heap.parts()[1].area = Area::new(HEAP_BYTES..2 * HEAP_BYTES, 16);
         heap.parts()[1].committed = HEAP_BYTES;
+        heap.parts()[1].limit = 2 * HEAP_BYTES;
         let error = heap.allocate(&segments, 128, Need::Now, |_| true).err();
         assert!(matches!(error, Some(ShmError::System { .. })), "{error:?}");
         assert_eq!(segments.further().len(), 1, "a third would lack it, too");
+    }
+
+    #[test]
+    fn lanes_have_room_in_the_first_segment_whatever_else_there_is() {
+        let (segments, heap) = heap();
+        let allocate = || heap.allocate(&segments, 1, Need::Now, |_| true).unwrap().unwrap().block;
+        let mut last = allocate();
+        while last.at.segment == 0 {
+            last = allocate();
+        }
+        for _ in 0..layout::LANES {
+            let lane = heap.allocate_lane().unwrap().block;
+            assert_eq!((lane.at.segment, lane.len), (0, layout::LANE));
+        }
     }
 
     #[test]

@@ -22,8 +22,10 @@ pub(super) const INLINE: usize = 96;
 /// Lanes of a session: how many rings it can read at a time.
 pub(super) const LANES: u32 = 4096;
 
-/// Bytes of a session's first segment, and where its objects begin.
-pub(super) const SESSION_BYTES: u64 = 512 << 10;
+/// Bytes of a session's first segment. In its upper half there is nothing but lanes, so that there is
+/// room for all of them whatever else the session has.
+pub(super) const SESSION_BYTES: u64 = 1 << 20;
+pub(super) const LANES_AT: u64 = SESSION_BYTES - LANES as u64 * LANE;
 /// Bytes of a further one, which holds no object of more than [`HEAP_BYTES_MAX`] less a header.
 pub(super) const HEAP_BYTES: u64 = 8 << 20;
 pub(super) const HEAP_BYTES_MAX: u64 = 64 << 20;

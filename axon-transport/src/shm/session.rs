@@ -114,7 +114,7 @@ impl SessionSegment {
 
     /// The segments that there are besides the first, by their numbers.
     pub fn segments(&self) -> Vec<SegmentInfo> {
-        self.segments.further().iter().map(|segment| segment.info).collect()
+        self.further().iter().map(|segment| segment.info).collect()
     }
 
     /// What the segment `number` is and a duplicate of its descriptor; `None` when it is gone.
@@ -149,9 +149,7 @@ impl SessionSegment {
                 return Err(ShmError::NoLane { session: self.id, lanes: layout::LANES });
             }
             None => {
-                // A publisher is told of the segment with the lane.
-                let object = self.allocate(layout::LANE, Need::Now, |_| true)?;
-                let object = object.expect("there is always one that will do");
+                let object = self.heap.allocate_lane()?;
                 object.words().iter().for_each(|word| word.store(0, Ordering::Relaxed));
                 lanes.made += 1;
                 object
@@ -258,6 +256,11 @@ impl SessionSegment {
 
     pub(super) fn release(&self, block: Block) {
         self.heap.release(block);
+    }
+
+    /// The segments that there are besides the first.
+    pub(super) fn further(&self) -> Vec<Arc<OwnSegment>> {
+        self.segments.further()
     }
 
     /// A segment for the large samples of a publisher.
