@@ -96,6 +96,13 @@ impl PassedFd {
         fcntl_get_seals(self).is_ok()
     }
 
+    /// Which file it is, by device and inode, where it is a memfd. Others could take their time to
+    /// tell.
+    pub(crate) fn memory(&self) -> Option<(u64, u64)> {
+        let found = self.is_memfd().then(|| fstat(self).ok()).flatten()?;
+        Some((found.st_dev, found.st_ino))
+    }
+
     /// Whether it stands for a process. Takes no lock of what it is, which whoever sent it could
     /// keep. Only a pidfd can be waited for, though by nobody but the process's parent (Linux 5.4).
     pub(crate) fn is_pidfd(&self) -> bool {

@@ -2,6 +2,7 @@
 //! packet there, one back, and over a socket of their own one for each segment of memory (`docs/formats.md`, section 9).
 
 use std::{
+    cell::Cell,
     io::{self, IoSlice},
     mem::MaybeUninit,
     os::fd::{AsFd, BorrowedFd, OwnedFd},
@@ -18,11 +19,12 @@ use rustix::{
     },
 };
 
-use super::{Location, PeerDescriptors, SegmentInfo, SegmentKind, ShmError};
+use super::{Location, PeerDescriptors, SegmentInfo, ShmError};
 use crate::{
     ids::{Gid, SessionId},
     passed::{self, PassedFd},
     qos::{Incompatible, Qos},
+    session::message::{SegmentName, SegmentOpened},
 };
 
 /// First of each packet.
@@ -40,19 +42,26 @@ pub enum ConnectError {
     #[error(transparent)]
     Memory(#[from] ShmError),
     /// The subscriber requests what the publisher does not offer.
-    #[error("the publisher does not offer the {0} that the subscriber requests")]
+    #[error(
+        "the publisher does not offer the {0} that the subscriber requests: \
+         offer more, or request less"
+    )]
     Incompatible(Incompatible),
     /// The publisher refused, and said why.
     #[error("the publisher refused: {0}")]
     Refused(String),
     /// The other end sent something else than it should.
-    #[error("the other end sent {0}")]
+    #[error(
+        "the other end sent {0}: is there a publisher at one end and a subscriber at the other?"
+    )]
     Protocol(&'static str),
     /// The other end did nothing in time.
-    #[error("the other end did not answer in time")]
+    #[error(
+        "the other end did not answer in time: a publisher must serve while a subscriber connects"
+    )]
     Timeout,
     /// The other end of the socket was closed.
-    #[error("the other end of the socket was closed")]
+    #[error("the other end of the socket was closed: connect by a new one")]
     Closed,
     /// The socket failed.
     #[error("the socket failed: {0}")]
@@ -99,47 +108,11 @@ pub(super) struct Granted {
     pub(super) ring: Location,
 }
 
-/// A segment of a publisher's session, with its descriptor.
-#[derive(Clone, Copy, Debug, Encode, Decode)]
-pub(super) struct Handed {
-    #[n(0)]
-    pub(super) session: SessionId,
-    #[n(1)]
-    number: u32,
-    /// Whose samples are in it, where they are one publisher's.
-    #[n(2)]
-    publisher: Option<Gid>,
-}
-
-impl Handed {
-    fn new(session: SessionId, info: SegmentInfo) -> Self {
-        let publisher = match info.kind {
-            SegmentKind::Samples(gid) => Some(gid),
-            SegmentKind::Session | SegmentKind::Heap => None,
-        };
-        Self { session, number: info.number, publisher }
-    }
-
-    pub(super) fn info(&self) -> SegmentInfo {
-        let kind = self.publisher.map_or(SegmentKind::Heap, SegmentKind::Samples);
-        SegmentInfo { number: self.number, kind }
-    }
-}
-
-/// A segment that nobody reads any more.
-#[derive(Clone, Copy, Debug, Encode, Decode)]
-pub(super) struct Withdrawn {
-    #[n(0)]
-    pub(super) session: SessionId,
-    #[n(1)]
-    pub(super) number: u32,
-}
-
 /// What became of a publisher's memory.
 #[derive(Debug)]
 pub(super) enum News {
-    Handed(Handed, PassedFd),
-    Withdrawn(Withdrawn),
+    Opened(SegmentOpened, PassedFd),
+    Gone(SegmentName),
 }
 
 #[derive(Debug, Encode, Decode)]
@@ -159,9 +132,9 @@ enum Packet {
     #[n(2)]
     Refused(#[n(0)] Refused),
     #[n(3)]
-    Handed(#[n(0)] Handed),
+    Opened(#[n(0)] SegmentOpened),
     #[n(4)]
-    Withdrawn(#[n(0)] Withdrawn),
+    Gone(#[n(0)] SegmentName),
 }
 
 /// The two ends over which a publisher hands segments to a subscriber: theirs alone, so that what
@@ -175,11 +148,14 @@ pub(super) fn line() -> Result<(OwnedFd, OwnedFd), ConnectError> {
 pub(super) struct Channel<'a> {
     socket: BorrowedFd<'a>,
     deadline: Option<Instant>,
+    /// Whether it has received something.
+    heard: Cell<bool>,
 }
 
 impl<'a> Channel<'a> {
     pub(super) fn new(socket: BorrowedFd<'a>, timeout: Option<Duration>) -> Self {
-        Self { socket, deadline: timeout.and_then(|t| Instant::now().checked_add(t)) }
+        let deadline = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
+        Self { socket, deadline, heard: Cell::new(false) }
     }
 
     /// Asks, and hands over the end of a [line] over which segments are to come.
@@ -240,7 +216,7 @@ impl<'a> Channel<'a> {
                     return Err(ConnectError::Refused(refused.reason));
                 }
                 (Packet::Granted(_) | Packet::Refused(_), _) => {}
-                (Packet::Handed(_) | Packet::Withdrawn(_), _) => {}
+                (Packet::Opened(_) | Packet::Gone(_), _) => {}
                 (Packet::Asked(_), _) => {
                     return Err(ConnectError::Protocol("a question where an answer was due"));
                 }
@@ -255,24 +231,24 @@ impl<'a> Channel<'a> {
         info: SegmentInfo,
         fd: BorrowedFd<'_>,
     ) -> Result<(), ConnectError> {
-        self.send(&Packet::Handed(Handed::new(session, info)), &[fd])
+        self.send(&Packet::Opened(SegmentOpened { session, segment: info.into() }), &[fd])
     }
 
     /// Says that a segment is given up.
     pub(super) fn withdraw(&self, session: SessionId, number: u32) -> Result<(), ConnectError> {
-        self.send(&Packet::Withdrawn(Withdrawn { session, number }), &[])
+        self.send(&Packet::Gone(SegmentName { session, number }), &[])
     }
 
     /// The next segment that is handed over or given up.
     pub(super) fn take_news(&self) -> Result<News, ConnectError> {
         loop {
             match self.receive()? {
-                (Packet::Handed(handed), mut fds) => {
+                (Packet::Opened(opened), mut fds) => {
                     if let (Some(fd), true) = (fds.pop(), fds.is_empty()) {
-                        return Ok(News::Handed(handed, fd));
+                        return Ok(News::Opened(opened, fd));
                     }
                 }
-                (Packet::Withdrawn(withdrawn), _) => return Ok(News::Withdrawn(withdrawn)),
+                (Packet::Gone(gone), _) => return Ok(News::Gone(gone)),
                 (Packet::Asked(_) | Packet::Granted(_) | Packet::Refused(_), _) => {}
             }
         }
@@ -305,7 +281,12 @@ impl<'a> Channel<'a> {
         }
     }
 
+    /// The next packet. One that is there is taken whatever the time, but only the first: another end
+    /// that sends without pause gains none.
     fn receive(&self) -> Result<(Packet, Vec<PassedFd>), ConnectError> {
+        if self.heard.replace(true) && self.left().is_some_and(|left| left.is_zero()) {
+            return Err(ConnectError::Timeout);
+        }
         let mut bytes = [0; MAX_PACKET];
         loop {
             let got = match passed::receive(self.socket, &mut bytes) {
@@ -335,9 +316,13 @@ impl<'a> Channel<'a> {
         }
     }
 
+    fn left(&self) -> Option<Duration> {
+        self.deadline.map(|deadline| deadline.saturating_duration_since(Instant::now()))
+    }
+
     /// Waits until the socket is ready, and not beyond the deadline.
     fn until(&self, events: PollFlags) -> Result<(), ConnectError> {
-        let left = self.deadline.map(|d| d.saturating_duration_since(Instant::now()));
+        let left = self.left();
         if left.is_some_and(|left| left.is_zero()) {
             return Err(ConnectError::Timeout);
         }

@@ -3,7 +3,6 @@
 use std::{
     collections::HashMap,
     fmt,
-    os::fd::{AsFd, BorrowedFd},
     sync::{
         Arc, Mutex, PoisonError, Weak,
         atomic::{AtomicU32, Ordering},
@@ -12,13 +11,11 @@ use std::{
 };
 
 use super::{
-    ConnectError, Peer, PeerDescriptors, PeerSession, SegmentEvent, SegmentInfo, SegmentKind,
-    SessionSegment, ShmError,
-    connect::{Channel, Granted, Handed, News},
+    Peer, PeerDescriptors, PeerSession, SessionSegment, ShmError, connect::News, lines::Lines,
 };
 use crate::{
     ids::{Gid, SessionId},
-    passed::PassedFd,
+    session::message::{SegmentName, SegmentOpened},
     wait::ExternalLeader,
 };
 
@@ -33,46 +30,15 @@ struct Inner {
     session: Arc<SessionSegment>,
     entities: AtomicU32,
     /// The other contexts, each mapped once.
-    peers: Mutex<HashMap<SessionId, Weak<PeerSession>>>,
-    served: Arc<Mutex<Vec<Served>>>,
+    peers: Mutex<HashMap<SessionId, Known>>,
+    lines: Arc<Lines>,
 }
 
-/// A subscriber that is to be told of segments.
-struct Served {
-    session: SessionId,
-    reader: Gid,
-    writer: Gid,
-    line: PassedFd,
-    /// The line had no room.
-    behind: bool,
-}
-
-impl Served {
-    /// Whether what is in the segment may concern the subscriber.
-    fn reads(&self, kind: SegmentKind) -> bool {
-        match kind {
-            SegmentKind::Session => false,
-            SegmentKind::Heap => true,
-            SegmentKind::Samples(gid) => gid == self.writer,
-        }
-    }
-
-    fn hand(&mut self, info: SegmentInfo, fd: BorrowedFd<'_>) {
-        if self.reads(info.kind) {
-            let channel = Channel::new(self.line.as_fd(), Some(Duration::ZERO));
-            // A subscriber that is gone needs nothing.
-            let handed = channel.hand(self.session, info, fd);
-            self.behind |= matches!(handed, Err(ConnectError::Timeout));
-        }
-    }
-
-    fn withdraw(&self, info: SegmentInfo) {
-        if self.reads(info.kind) {
-            let channel = Channel::new(self.line.as_fd(), Some(Duration::ZERO));
-            // One that cannot be told keeps its map for as long as it reads from here.
-            let _ = channel.withdraw(self.session, info.number);
-        }
-    }
+/// Another context.
+struct Known {
+    session: Weak<PeerSession>,
+    /// Device and inode of its first segment.
+    memory: (u64, u64),
 }
 
 impl Context {
@@ -86,95 +52,30 @@ impl Context {
 
     fn of(session: Arc<SessionSegment>) -> Self {
         let (entities, peers) = (AtomicU32::new(1), Mutex::default());
-        let served = Arc::<Mutex<Vec<Served>>>::default();
-        let told = Arc::clone(&served);
-        session.on_segment(move |event| {
-            let mut served = told.lock().unwrap_or_else(PoisonError::into_inner);
-            match event {
-                SegmentEvent::Opened(info, fd) => {
-                    served.iter_mut().for_each(|served| served.hand(info, fd));
-                }
-                SegmentEvent::Gone(info) => served.iter().for_each(|served| served.withdraw(info)),
-                // Nobody prepares publishers here but their owner.
-                SegmentEvent::Low(_) => {}
-            }
-        });
-        Self { inner: Arc::new(Inner { session, entities, peers, served }) }
+        let lines = Arc::new(Lines::new(session.id()));
+        let told = Arc::clone(&lines);
+        session.on_segment(move |event| told.tell(event));
+        Self { inner: Arc::new(Inner { session, entities, peers, lines }) }
     }
 
-    /// Hands a subscriber the segments that there are, and from then on those to come.
-    pub(super) fn hand_over(&self, line: PassedFd, granted: &Granted) -> Result<(), ConnectError> {
-        let Granted { reader, writer, .. } = *granted;
-        let session = self.id();
-        // In the list first, so that none that comes now is missed; one that comes twice is one.
-        self.served().push(Served { session, reader, writer, line, behind: true });
-        self.catch_up();
-        if self.served().iter().any(|served| served.reader == reader && served.behind) {
-            self.forget(reader);
-            return Err(ConnectError::Timeout);
-        }
-        Ok(())
-    }
-
-    /// Hands all segments to those that could not be told of some.
-    fn catch_up(&self) {
-        if self.served().iter().all(|served| !served.behind) {
-            return;
-        }
-        let all: Vec<_> = self
-            .session()
-            .segments()
-            .into_iter()
-            .filter_map(|info| self.session().segment(info.number).ok().flatten())
-            .collect();
-        for served in self.served().iter_mut().filter(|served| served.behind) {
-            served.behind = false;
-            all.iter().for_each(|(info, fd)| served.hand(*info, fd.as_fd()));
-        }
-    }
-
-    /// A subscriber is served no more.
-    pub(super) fn forget(&self, reader: Gid) {
-        if !self.session().is_forked() {
-            self.served().retain(|served| served.reader != reader);
-            self.catch_up();
-        }
-    }
-
-    /// A publisher is gone.
-    pub(super) fn forget_publisher(&self, writer: Gid) {
-        if !self.session().is_forked() {
-            self.served().retain(|served| served.writer != writer);
-        }
-    }
-
-    /// A segment of another context was handed over.
-    pub(super) fn add_segment(&self, handed: &Handed, fd: impl AsFd) {
-        if let Some(peer) = self.known(&handed.session) {
-            // One that is refused shows when it is read.
-            let _ = peer.add_segment(handed.info(), fd);
-        }
-    }
-
-    /// A segment of another context was handed over or given up.
+    /// Another context has opened a segment or given one up.
     pub(super) fn hear(&self, news: &News) {
+        let (News::Opened(SegmentOpened { session, .. }, _)
+        | News::Gone(SegmentName { session, .. })) = news;
+        let peers = self.inner.peers.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some(peer) = peers.get(session).and_then(|known| known.session.upgrade()) else {
+            return;
+        };
+        drop(peers);
         match news {
-            News::Handed(handed, fd) => self.add_segment(handed, fd),
-            News::Withdrawn(withdrawn) => {
-                if let Some(peer) = self.known(&withdrawn.session) {
-                    peer.remove_segment(withdrawn.number);
-                }
-            }
+            // One that is refused shows when it is read.
+            News::Opened(opened, fd) => drop(peer.add_segment(opened.segment.into(), fd)),
+            News::Gone(gone) => peer.remove_segment(gone.number),
         }
     }
 
-    fn known(&self, session: &SessionId) -> Option<Arc<PeerSession>> {
-        let peers = self.inner.peers.lock().unwrap_or_else(PoisonError::into_inner);
-        peers.get(session).and_then(Weak::upgrade)
-    }
-
-    fn served(&self) -> std::sync::MutexGuard<'_, Vec<Served>> {
-        self.inner.served.lock().unwrap_or_else(PoisonError::into_inner)
+    pub(super) fn lines(&self) -> &Lines {
+        &self.inner.lines
     }
 
     /// Its id.
@@ -224,16 +125,26 @@ impl Context {
         if self.session().is_forked() {
             return Err(ShmError::Forked);
         }
-        if descriptors.process().is_none() {
-            return Err(ShmError::Refused { what: "its pidfd names no process" });
-        }
+        let refuse = |what| Err(ShmError::Refused { what });
+        let Some(process) = descriptors.process() else {
+            return refuse("its pidfd names no process");
+        };
+        let Some(memory) = descriptors.segment.memory() else {
+            return refuse("its first segment is no memfd");
+        };
         let mut peers = self.inner.peers.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(known) = peers.get(&id).and_then(Weak::upgrade) {
-            return Ok(Peer::Remote(known));
+        peers.retain(|_, known| known.session.strong_count() > 0);
+        if let Some(known) = peers.get(&id)
+            && let Some(session) = known.session.upgrade()
+        {
+            // Ids are no secret. Whoever comes first with another's would else be taken for it.
+            if known.memory != memory || session.process() != Some(process) {
+                return refuse("another process has this context's id");
+            }
+            return Ok(Peer::Remote(session));
         }
         let session = PeerSession::map(id, descriptors)?;
-        peers.retain(|_, peer| peer.strong_count() > 0);
-        peers.insert(id, Arc::downgrade(&session));
+        peers.insert(id, Known { session: Arc::downgrade(&session), memory });
         Ok(Peer::Remote(session))
     }
 }

@@ -11,7 +11,8 @@
 //!     shm::{Context, Publisher, PublisherOptions, Subscriber, SubscriberOptions},
 //! };
 //!
-//! // Two ends of a socket, usually in two processes. It is needed only to come together.
+//! // Two ends of a socket, usually in two processes. It is needed only to come together. Any socket
+//! // of unix that keeps packets apart will do, of a pair, or accepted from a listener.
 //! let (ours, theirs) = UnixDatagram::pair()?;
 //! let patience = Some(Duration::from_secs(10));
 //! let publisher = Publisher::new(&Context::new()?, PublisherOptions::new(Qos::default()))?;
@@ -47,6 +48,11 @@
 //! meanwhile; longer ones are pinned, so that their publisher leaves them alone. A publisher waits
 //! for no reader but one that is, like itself, RELIABLE and KEEP_ALL.
 //!
+//! Who does what when: a publisher calls [`Publisher::reap`] now and then to forget subscribers that
+//! have left, and [`Publisher::tend`] about once a second to give memory back; a subscriber that does
+//! not [`recv`](Subscriber::recv) calls [`Subscriber::tend`] as often. The example `two_processes`
+//! has the two ends in two processes, [`ExternalLeader`](crate::wait::ExternalLeader) one in tokio.
+//!
 //! Nothing in here starts a thread or knows the daemon. [`Context`], [`Publisher`] and
 //! [`Subscriber`] are for use over any unix socket; [`SessionSegment`], [`Writer`] and [`Reader`]
 //! are what they, and the sessions of the daemon, are made of.
@@ -72,6 +78,7 @@ pub(crate) mod inspect;
 mod lane;
 mod layout;
 mod limbo;
+mod lines;
 mod loan;
 mod memory;
 mod orphans;

@@ -7,13 +7,13 @@ use std::{
 };
 
 use super::{
-    ConnectError, Context, Grant, Loan, Meta, PeerDescriptors, PublishError, ReaderInfo,
+    ConnectError, Context, Grant, Loan, Meta, Peer, PeerDescriptors, PublishError, ReaderInfo,
     RingOptions, ShmError, Writer,
     connect::{Asked, Channel, Granted},
     loan,
 };
 use crate::{
-    ids::{Gid, SessionId},
+    ids::Gid,
     passed::PassedFd,
     qos::{Qos, compatible},
 };
@@ -55,7 +55,9 @@ impl PublisherOptions {
 }
 
 /// Publishes samples to the subscribers that it [serves](Self::serve). All methods may be called
-/// from any thread. When it is dropped, subscribers still take what it left.
+/// from any thread, at the same time too. When it is dropped, subscribers still take what it left;
+/// the memory of that comes back as other publishers of the context [tend](Self::tend) theirs, or
+/// with the context.
 pub struct Publisher {
     context: Context,
     qos: Qos,
@@ -94,9 +96,9 @@ impl Publisher {
     pub fn serve(&self, socket: impl AsFd, timeout: Option<Duration>) -> Result<Gid, ConnectError> {
         let channel = Channel::new(socket.as_fd(), timeout);
         let (asked, descriptors, line) = channel.await_asked()?;
-        let (gid, session) = (asked.reader, asked.session);
-        let admitted = self.admit(asked, descriptors).and_then(|granted| {
-            self.hand_over(&channel, (session, line), &granted).inspect_err(|_| {
+        let gid = asked.reader;
+        let admitted = self.admit(asked, descriptors).and_then(|(granted, peer)| {
+            self.answer(&channel, &granted, peer, line).inspect_err(|_| {
                 self.writer.detach(gid);
             })
         });
@@ -109,32 +111,43 @@ impl Publisher {
         }
     }
 
-    fn admit(&self, asked: Asked, descriptors: PeerDescriptors) -> Result<Granted, ConnectError> {
+    fn admit(
+        &self,
+        asked: Asked,
+        descriptors: PeerDescriptors,
+    ) -> Result<(Granted, Peer), ConnectError> {
         let Asked { session, reader: gid, lane, qos } = asked;
         compatible(&self.qos, &qos).map_err(ConnectError::Incompatible)?;
         let peer = self.context.peer(session, descriptors)?;
         let stands_for = Vec::new();
-        let grant = self.writer.attach(ReaderInfo { gid, lane, qos, peer, stands_for })?;
-        let Grant { generation, first } = grant;
+        let info = ReaderInfo { gid, lane, qos, peer: peer.clone(), stands_for };
+        let Grant { generation, first } = self.writer.attach(info)?;
         let (session, writer) = (self.context.id(), self.gid());
         let ring = self.writer.location();
-        Ok(Granted { reader: gid, session, writer, generation, first, ring })
+        Ok((Granted { reader: gid, session, writer, generation, first, ring }, peer))
     }
 
     /// Answers, and hands over the memory that is in use and, from then on, what comes into use.
-    fn hand_over(
+    fn answer(
         &self,
         channel: &Channel<'_>,
-        (to, line): (SessionId, PassedFd),
         granted: &Granted,
+        peer: Peer,
+        line: PassedFd,
     ) -> Result<(), ConnectError> {
-        let own = self.context.session().descriptors()?;
-        channel.grant(granted, &own)?;
-        if to == self.context.id() {
+        let session = self.context.session();
+        channel.grant(granted, &session.descriptors()?)?;
+        match peer {
             // It finds all of it here, and would take none of it from the line.
-            return Ok(());
+            Peer::Local(_) => Ok(()),
+            Peer::Remote(_) => self.context.lines().add(session, peer, granted, line),
         }
-        self.context.hand_over(line, granted)
+    }
+
+    /// Hands over what could not be handed over when it came into use.
+    #[inline]
+    fn keep_up(&self) {
+        self.context.lines().keep_up(self.context.session());
     }
 
     /// Publishes a sample, stamped with the current time, and returns its sequence number, which
@@ -144,7 +157,9 @@ impl Publisher {
     /// # Errors
     /// The sample was not published; what to do is in the error.
     pub fn publish(&self, payload: &[u8]) -> Result<u64, PublishError> {
-        self.writer.publish_next(loan::now(), payload)
+        let published = self.writer.publish_next(loan::now(), payload);
+        self.keep_up();
+        published
     }
 
     /// As [`publish`](Self::publish), but never waits: [`PublishError::Blocked`] at once.
@@ -152,7 +167,9 @@ impl Publisher {
     /// # Errors
     /// As for [`publish`](Self::publish).
     pub fn try_publish(&self, payload: &[u8]) -> Result<u64, PublishError> {
-        self.writer.try_publish_next(loan::now(), payload)
+        let published = self.writer.try_publish_next(loan::now(), payload);
+        self.keep_up();
+        published
     }
 
     /// As [`publish`](Self::publish), with a number and a time of the caller's. Numbers must rise.
@@ -160,7 +177,9 @@ impl Publisher {
     /// # Errors
     /// As for [`publish`](Self::publish).
     pub fn publish_with(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
-        self.writer.publish(meta, payload).map(drop)
+        let published = self.writer.publish(meta, payload);
+        self.keep_up();
+        published.map(drop)
     }
 
     /// If a sample would be read by nobody, now or later, uses up the next sequence number and
@@ -179,7 +198,9 @@ impl Publisher {
     /// # Errors
     /// As for [`publish`](Self::publish).
     pub fn loan(&self, len: usize) -> Result<Loan<'_>, PublishError> {
-        self.writer.loan(len)
+        let loan = self.writer.loan(len);
+        self.keep_up();
+        loan
     }
 
     /// Has memory ready for one more sample as long as the last of more than 4 KiB, so that
@@ -188,7 +209,9 @@ impl Publisher {
     /// # Errors
     /// There is no memory, or the process forked.
     pub fn prepare(&self) -> Result<(), ShmError> {
-        self.writer.prepare()
+        let prepared = self.writer.prepare();
+        self.keep_up();
+        prepared
     }
 
     /// Gives memory back that samples of more than 4 KiB took and that is not needed any more: all
@@ -196,7 +219,9 @@ impl Publisher {
     /// was needed for as long. To be called about once a second for as long as it returns true.
     pub fn tend(&self) -> bool {
         let more = self.writer.tend(Instant::now());
-        self.context.session().tidy() || more
+        let more = self.context.session().tidy() || more;
+        self.keep_up();
+        more
     }
 
     /// The subscribers that it serves, among them such as have left since; see
@@ -207,22 +232,28 @@ impl Publisher {
 
     /// Forgets a subscriber; false when it was not served. Samples that it keeps it may keep.
     pub fn dismiss(&self, subscriber: Gid) -> bool {
-        self.context.forget(subscriber);
-        self.writer.detach(subscriber)
+        let served = self.writer.detach(subscriber);
+        if !self.context.session().is_forked() {
+            self.context.lines().end(subscriber);
+        }
+        served
     }
 
     /// Forgets the subscribers that have left or whose process has ended, and names them. Their
     /// memory comes back with the next samples.
     pub fn reap(&self) -> Vec<Gid> {
         let gone = self.writer.drop_gone();
-        gone.iter().for_each(|gid| self.context.forget(*gid));
+        gone.iter().for_each(|gid| self.context.lines().forget(*gid));
+        self.keep_up();
         gone
     }
 }
 
 impl Drop for Publisher {
     fn drop(&mut self) {
-        self.context.forget_publisher(self.gid());
+        if !self.context.session().is_forked() {
+            self.context.lines().end(self.gid());
+        }
     }
 }
 

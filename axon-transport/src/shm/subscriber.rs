@@ -2,18 +2,20 @@
 
 use std::{
     fmt,
-    os::fd::{AsFd, OwnedFd},
+    os::fd::AsFd,
     time::{Duration, Instant},
 };
 
 use super::{
     ConnectError, Context, Grant, Meta, Peer, Reader, ReaderOptions, Sample, TakeError,
-    connect::{Asked, Channel, News, line},
+    connect::{Asked, Channel, line},
 };
-use crate::{ids::Gid, qos::Qos};
+use crate::{ids::Gid, passed::PassedFd, qos::Qos};
 
 /// No sleep is longer: what a publisher stored last and did not live to ring for is found then.
 const LONGEST_SLEEP: Duration = Duration::from_secs(1);
+/// More than can stand in a line, unless its other end fills it all the time.
+const NEWS: u32 = 64;
 
 /// What a [`Subscriber`] asks for.
 #[derive(Clone, Copy, Debug)]
@@ -36,13 +38,44 @@ impl SubscriberOptions {
 }
 
 /// Takes the samples of one publisher. Goes on after that one's end until nothing is left.
+///
+/// It may be moved to another thread, and taking is for one thread at a time; the samples that were
+/// taken are no part of it, so they may go anywhere and outlive it.
+///
+/// ```
+/// # use axon_transport::shm::{Context, Publisher, Sample, Subscriber};
+/// # fn may_be_shared<T: Send + Sync>() {}
+/// # fn may_be_sent<T: Send>() {}
+/// # may_be_shared::<Context>();
+/// # may_be_shared::<Publisher>();
+/// # may_be_shared::<Sample>();
+/// # may_be_sent::<Subscriber>();
+/// fn keep_one(mut subscriber: Subscriber) -> Option<Sample> {
+///     let sample = subscriber.take().ok()?;
+///     drop(subscriber);
+///     sample
+/// }
+/// ```
+///
+/// ```compile_fail,E0499
+/// # use axon_transport::shm::Subscriber;
+/// fn twice_at_once(subscriber: &mut Subscriber) {
+///     std::thread::scope(|scope| {
+///         scope.spawn(|| subscriber.take());
+///         scope.spawn(|| subscriber.take());
+///     });
+/// }
+/// ```
+///
+/// Three ways to wait: [`recv`](Self::recv) blocks; [`Context::wait`] blocks on any number of
+/// subscribers; [`Context::event`] has a descriptor for an event loop, such as that of tokio.
 pub struct Subscriber {
     context: Context,
     reader: Reader,
     gid: Gid,
     /// Over which memory of the publisher's comes that is in use only later; absent where the
     /// publisher is in the same context.
-    line: Option<OwnedFd>,
+    line: Option<PassedFd>,
 }
 
 impl Subscriber {
@@ -75,7 +108,8 @@ impl Subscriber {
             while !peer.has_segment(ring.segment) {
                 context.hear(&channel.take_news()?);
             }
-            kept = Some(ours);
+            // Whoever has the other end decides what stands in it, and how long that takes to close.
+            kept = Some(PassedFd::connection(ours).trusted());
         }
         let reader = Reader::map(ReaderOptions {
             reader: gid,
@@ -100,8 +134,10 @@ impl Subscriber {
         self.reader.writer()
     }
 
-    /// The next sample, or `None` when there is none. One of more than 4 KiB stays in the
-    /// publisher's memory for as long as it is kept.
+    /// The next sample, or `None` when there is none. Never waits. One of more than 4 KiB stays in
+    /// the publisher's memory for as long as it is kept.
+    ///
+    /// Where more is unread than the requested depth, the oldest are [skipped](Self::skipped).
     ///
     /// # Errors
     /// See [`TakeError`]. After [`TakeError::Corrupt`] there will be no more samples.
@@ -122,29 +158,29 @@ impl Subscriber {
         &mut self,
         mut take: impl FnMut(&mut Reader) -> Result<Option<T>, TakeError>,
     ) -> Result<Option<T>, TakeError> {
-        loop {
-            let taken = take(&mut self.reader)?;
-            if taken.is_some() || !self.fetch() {
-                return Ok(taken);
+        let taken = take(&mut self.reader)?;
+        if taken.is_some() || self.reader.missing().is_none() {
+            return Ok(taken);
+        }
+        self.hear();
+        take(&mut self.reader)
+    }
+
+    /// Takes in what the publisher said of its memory.
+    fn hear(&self) {
+        let Some(line) = &self.line else { return };
+        for _ in 0..NEWS {
+            match Channel::new(line.as_fd(), Some(Duration::ZERO)).take_news() {
+                Ok(news) => self.context.hear(&news),
+                Err(_) => return,
             }
         }
     }
 
-    /// Takes in the memory that the reader lacks, if it has come, and lets go of what the publisher
-    /// gave up. Whether it has come.
-    fn fetch(&self) -> bool {
-        let (Some(missing), Some(line)) = (self.reader.missing(), &self.line) else {
-            return false;
-        };
-        let channel = Channel::new(line.as_fd(), Some(Duration::ZERO));
-        while let Ok(news) = channel.take_news() {
-            self.context.hear(&news);
-            if matches!(news, News::Handed(handed, _) if handed.info().number == missing) {
-                return true;
-            }
-        }
-        // It may have come to another subscriber of this context.
-        self.reader.has_data()
+    /// Lets go of memory that the publisher gave up. To be called about once a second where samples
+    /// of more than 4 KiB are taken now and then; [`recv`](Self::recv) does it while it waits.
+    pub fn tend(&self) {
+        self.hear();
     }
 
     /// As [`take`](Self::take), after waiting for a sample for at most `timeout`. `None` also when
@@ -161,22 +197,27 @@ impl Subscriber {
             let left = deadline.map_or(LONGEST_SLEEP, |deadline| {
                 deadline.saturating_duration_since(Instant::now()).min(LONGEST_SLEEP)
             });
-            if left.is_zero() {
+            // In this order: what it published before it ended is seen by the look.
+            if left.is_zero() || (self.publisher_ended() && self.reader.is_drained()) {
                 return Ok(None);
             }
-            let ended = self.publisher_ended();
-            if !self.context.wait(|| ended || self.reader.has_data(), Some(left)) {
-                continue;
-            }
-            if ended && !self.reader.has_data() {
-                return Ok(None);
+            if !self.context.wait(|| self.has_data(), Some(left)) {
+                self.tend();
             }
         }
     }
 
-    /// Whether there is something to take: two loads. For [`Context::wait`] and event loops.
+    /// Whether there is something to take: two loads, and a system call only while memory of the
+    /// publisher's is missing. For [`Context::wait`] and event loops.
     pub fn has_data(&self) -> bool {
-        self.reader.has_data()
+        if self.reader.has_data() {
+            return true;
+        }
+        // What is missing may stand in the line.
+        self.reader.missing().is_some() && {
+            self.hear();
+            self.reader.has_data()
+        }
     }
 
     /// Samples taken.

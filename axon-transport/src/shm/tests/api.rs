@@ -16,13 +16,13 @@ use rustix::{
 use super::*;
 use crate::qos::Reliability;
 
-const SOON: Option<Duration> = Some(EVER);
+pub(super) const SOON: Option<Duration> = Some(EVER);
 
-fn pair() -> (OwnedFd, OwnedFd) {
+pub(super) fn pair() -> (OwnedFd, OwnedFd) {
     socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None).unwrap()
 }
 
-fn together(
+pub(super) fn together(
     publisher: &Publisher,
     context: &Context,
     qos: Qos,
@@ -35,7 +35,7 @@ fn together(
     })
 }
 
-fn publisher(context: &Context, qos: Qos) -> Publisher {
+pub(super) fn publisher(context: &Context, qos: Qos) -> Publisher {
     Publisher::new(context, PublisherOptions::new(qos).max_len(MAX)).unwrap()
 }
 

@@ -3,6 +3,7 @@
 mod api;
 mod hostile;
 mod inspect;
+mod lines;
 mod local;
 mod memory;
 mod model;

@@ -1,0 +1,240 @@
+//! How subscribers hear of their publisher's memory where there is no daemon.
+
+use std::{
+    collections::BTreeSet,
+    os::fd::{AsFd, BorrowedFd, OwnedFd},
+    process::Command,
+    sync::atomic::AtomicBool,
+    thread,
+};
+
+use rustix::process::{Pid, PidfdFlags, pidfd_open};
+
+use super::{
+    api::{SOON, pair, publisher, together},
+    *,
+};
+use crate::{
+    passed::PassedFd,
+    shm::{
+        connect::{Asked, Channel, Granted, News},
+        heap::Need,
+    },
+};
+
+fn contexts() -> (Context, Context) {
+    (Context::new().unwrap(), Context::new().unwrap())
+}
+
+fn at_once(socket: &impl AsFd) -> Channel<'_> {
+    Channel::new(socket.as_fd(), Some(Duration::ZERO))
+}
+
+/// A subscriber of a publisher that tells it nothing, and the line over which the test may.
+fn untold(
+    (session, writer): (&Arc<SessionSegment>, &Writer),
+    context: &Context,
+    process: Option<OwnedFd>,
+) -> (PassedFd, Subscriber) {
+    let (ours, theirs) = pair();
+    let options = SubscriberOptions::new(keep_last(5));
+    thread::scope(|scope| {
+        let subscriber = scope.spawn(|| Subscriber::connect(context, theirs, options, SOON));
+        let channel = Channel::new(ours.as_fd(), SOON);
+        let (asked, descriptors, line) = channel.await_asked().unwrap();
+        let Asked { session: id, reader, lane, qos } = asked;
+        let peer = Peer::Remote(PeerSession::map(id, descriptors).unwrap());
+        let info = ReaderInfo { gid: reader, lane, qos, peer, stands_for: Vec::new() };
+        let Grant { generation, first } = writer.attach(info).unwrap();
+        let (session_id, ring) = (session.id(), writer.location());
+        let writer = writer.gid();
+        let granted = Granted { reader, session: session_id, writer, generation, first, ring };
+        let mut own = session.descriptors().unwrap();
+        if let Some(process) = process {
+            own.pidfd = process.into();
+        }
+        channel.grant(&granted, &own).unwrap();
+        (line, subscriber.join().unwrap().unwrap())
+    })
+}
+
+#[test]
+fn a_first_segment_that_is_full_keeps_nobody_from_connecting() {
+    let (here, there) = contexts();
+    let publisher = publisher(&here, keep_last(1));
+    let full = |context: &Context| {
+        let block = context.session().allocate(1, Need::Now, |_| true).unwrap().unwrap().block;
+        block.at.segment != 0
+    };
+    for context in [&here, &there] {
+        while !full(context) {}
+    }
+    let mut subscriber = together(&publisher, &there, keep_last(1)).1.unwrap();
+    publisher.publish(&pattern(1, 1000)).unwrap();
+    assert_eq!(subscriber.recv(SOON).unwrap().unwrap().len(), 1000);
+}
+
+#[test]
+fn a_subscriber_whose_line_was_full_is_told_later() {
+    let (here, there) = contexts();
+    let publisher = publisher(&here, keep_last(1));
+    let mut subscriber = together(&publisher, &there, keep_last(1)).1.unwrap();
+    let open = || here.session().open_samples(publisher.gid(), 2 * layout::ALIGN).unwrap();
+    let _many: Vec<_> = (0..100).map(|_| open()).collect();
+    publisher.publish(&pattern(1, 5000)).unwrap();
+    assert!(subscriber.take().unwrap().is_none());
+    let over = AtomicBool::new(false);
+    thread::scope(|scope| {
+        scope.spawn(|| {
+            while !over.load(Relaxed) {
+                publisher.tend();
+                thread::yield_now();
+            }
+        });
+        let taken = subscriber.recv(SOON);
+        over.store(true, Relaxed);
+        assert_eq!(taken.unwrap().expect("it was told").len(), 5000);
+    });
+    assert_eq!(subscriber.lost(), 0);
+}
+
+#[test]
+fn what_was_given_up_does_not_pile_up_in_a_line_that_nobody_reads() {
+    let (here, there) = contexts();
+    let publisher = publisher(&here, keep_last(1));
+    let lane = there.session().allocate_lane().unwrap();
+    let (ours, theirs) = pair();
+    let (line, far) = connect::line().unwrap();
+    let reader = Gid::new(there.id(), 1);
+    let asked = Asked { session: there.id(), reader, lane: lane.location(), qos: keep_last(1) };
+    let descriptors = there.session().descriptors().unwrap();
+    Channel::new(theirs.as_fd(), SOON).ask(&asked, &descriptors, far).unwrap();
+    publisher.serve(ours, SOON).unwrap();
+    for _ in 0..500 {
+        let segment = here.session().open_samples(publisher.gid(), 2 * layout::ALIGN).unwrap();
+        here.session().close_samples(segment.number());
+    }
+    let mut kept = BTreeSet::new();
+    let mut drain = || {
+        let mut packets = 0;
+        while let Ok(news) = at_once(&line).take_news() {
+            packets += 1;
+            match news {
+                News::Opened(opened, _) => assert!(kept.insert(opened.segment.number)),
+                News::Gone(gone) => assert!(kept.remove(&gone.number)),
+            }
+        }
+        (packets, kept.len())
+    };
+    let (packets, _) = drain();
+    assert!((1..50).contains(&packets), "{packets} packets stood in the line");
+    // In the end it knows that all are gone.
+    let start = Instant::now();
+    while drain().1 > 0 {
+        assert!(start.elapsed() < EVER);
+        publisher.tend();
+    }
+}
+
+#[test]
+fn memory_of_a_publisher_that_is_gone_is_let_go_of() {
+    let (here, there) = contexts();
+    let [first, second] = [(); 2].map(|()| publisher(&here, keep_last(1)));
+    let mut readers = [&first, &second].map(|publisher| {
+        let subscriber = together(publisher, &there, keep_last(1)).1.unwrap();
+        publisher.publish(&pattern(1, 5000)).unwrap();
+        subscriber
+    });
+    for subscriber in &mut readers {
+        assert_eq!(subscriber.recv(SOON).unwrap().unwrap().len(), 5000);
+    }
+    let number = |publisher: &Publisher| {
+        let of = |info: &SegmentInfo| info.kind == SegmentKind::Samples(publisher.gid());
+        here.session().segments().into_iter().find(of).unwrap().number
+    };
+    let (gone, stays) = (number(&first), number(&second));
+    let seen = there.peer(here.id(), here.session().descriptors().unwrap()).unwrap();
+    let seen = Arc::clone(seen.remote().unwrap());
+    drop(first);
+    let [left, right] = readers;
+    assert!(seen.has_segment(gone), "it may be read still");
+    drop(left);
+    let start = Instant::now();
+    while seen.has_segment(gone) {
+        assert!(start.elapsed() < EVER);
+        second.tend();
+        right.tend();
+    }
+    assert!(seen.has_segment(stays));
+}
+
+#[test]
+fn samples_whose_memory_never_came_are_lost_with_their_publishers_process() {
+    let (session, there) = (silent_session(), Context::new().unwrap());
+    let writer = writer(&session, keep_last(5), 1 << 20);
+    let mut process = Command::new("sleep").arg("600").spawn().unwrap();
+    let pidfd = pidfd_open(Pid::from_child(&process), PidfdFlags::empty()).unwrap();
+    let (_line, mut subscriber) = untold((&session, &writer), &there, Some(pidfd));
+    for sequence in 1..=3 {
+        writer.publish(meta(sequence), &pattern(sequence, 5000)).unwrap();
+    }
+    assert!(subscriber.take().unwrap().is_none());
+    process.kill().unwrap();
+    process.wait().unwrap();
+    assert!(subscriber.recv(SOON).unwrap().is_none());
+    assert_eq!((subscriber.received(), subscriber.lost()), (0, 3));
+}
+
+/// Sends without pause until `over`; whether that came in time.
+fn flood(socket: BorrowedFd<'_>, over: &AtomicBool) -> bool {
+    let start = Instant::now();
+    while !over.load(Relaxed) {
+        let _ =
+            Channel::new(socket, Some(Duration::from_millis(1))).withdraw(SessionId([7; 16]), 9);
+        if start.elapsed() > EVER {
+            return false;
+        }
+    }
+    true
+}
+
+#[test]
+fn whoever_sends_without_pause_holds_nobody_up() {
+    let (session, there) = (silent_session(), Context::new().unwrap());
+    let writer = writer(&session, keep_last(5), 1 << 20);
+    let (ours, theirs) = pair();
+    let over = AtomicBool::new(false);
+    thread::scope(|scope| {
+        let flooding = scope.spawn(|| flood(ours.as_fd(), &over));
+        let (options, soon) = (SubscriberOptions::new(Qos::default()), Duration::from_millis(20));
+        let connected = Subscriber::connect(&there, &theirs, options, Some(soon));
+        over.store(true, Relaxed);
+        assert!(matches!(connected, Err(ConnectError::Timeout)), "{connected:?}");
+        assert!(flooding.join().unwrap());
+    });
+    let (line, mut subscriber) = untold((&session, &writer), &there, None);
+    writer.publish(meta(1), &pattern(1, 5000)).unwrap();
+    let over = AtomicBool::new(false);
+    thread::scope(|scope| {
+        let flooding = scope.spawn(|| flood(line.as_fd(), &over));
+        for _ in 0..100 {
+            assert!(subscriber.take().unwrap().is_none());
+            subscriber.tend();
+        }
+        over.store(true, Relaxed);
+        assert!(flooding.join().unwrap());
+    });
+}
+
+#[test]
+fn who_comes_first_with_anothers_id_is_not_taken_for_it() {
+    let (here, there) = contexts();
+    let hostile = SessionSegment::create(there.id()).unwrap();
+    let first = here.peer(there.id(), hostile.descriptors().unwrap()).unwrap();
+    let publisher = publisher(&here, keep_last(1));
+    let (served, connected) = together(&publisher, &there, keep_last(1));
+    assert!(matches!(served, Err(ConnectError::Memory(ShmError::Refused { .. }))), "{served:?}");
+    assert!(matches!(connected, Err(ConnectError::Refused(_))), "{connected:?}");
+    drop(first);
+    assert!(together(&publisher, &there, keep_last(1)).1.is_ok());
+}
