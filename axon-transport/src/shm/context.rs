@@ -4,7 +4,7 @@ use std::{
     collections::HashMap,
     fmt,
     sync::{
-        Arc, Mutex, PoisonError, Weak,
+        Arc, Mutex, MutexGuard, PoisonError, Weak,
         atomic::{AtomicU32, Ordering},
     },
     time::Duration,
@@ -15,9 +15,13 @@ use super::{
 };
 use crate::{
     ids::{Gid, SessionId},
+    passed::PassedFd,
     session::message::{SegmentName, SegmentOpened},
     wait::ExternalLeader,
 };
+
+/// Segments of others that are kept to be mapped later, at most.
+const MANY: usize = 64;
 
 /// The memory, doorbell and identity that publishers and subscribers of a process share. Starts no
 /// thread. Clones are the same context; all methods may be called from any thread.
@@ -32,6 +36,8 @@ struct Inner {
     /// The other contexts, each mapped once.
     peers: Mutex<HashMap<SessionId, Known>>,
     lines: Arc<Lines>,
+    /// What other contexts handed over and could not be mapped then.
+    unmapped: Mutex<Vec<(SegmentOpened, PassedFd)>>,
 }
 
 /// Another context.
@@ -55,23 +61,48 @@ impl Context {
         let lines = Arc::new(Lines::new(session.id()));
         let told = Arc::clone(&lines);
         session.on_segment(move |event| told.tell(event));
-        Self { inner: Arc::new(Inner { session, entities, peers, lines }) }
+        let unmapped = Mutex::default();
+        Self { inner: Arc::new(Inner { session, entities, peers, lines, unmapped }) }
     }
 
     /// Another context has opened a segment or given one up.
-    pub(super) fn hear(&self, news: &News) {
+    pub(super) fn hear(&self, news: News) {
         let (News::Opened(SegmentOpened { session, .. }, _)
-        | News::Gone(SegmentName { session, .. })) = news;
-        let peers = self.inner.peers.lock().unwrap_or_else(PoisonError::into_inner);
-        let Some(peer) = peers.get(session).and_then(|known| known.session.upgrade()) else {
-            return;
-        };
-        drop(peers);
+        | News::Gone(SegmentName { session, .. })) = &news;
+        let Some(peer) = self.known(session) else { return };
         match news {
-            // One that is refused shows when it is read.
-            News::Opened(opened, fd) => drop(peer.add_segment(opened.segment.into(), fd)),
-            News::Gone(gone) => peer.remove_segment(gone.number),
+            News::Opened(opened, fd) => match peer.add_segment(opened.segment.into(), &fd) {
+                // One that is refused shows when it is read.
+                Ok(()) | Err(ShmError::Refused { .. }) => {}
+                Err(_) => {
+                    let mut unmapped = self.unmapped();
+                    if unmapped.len() < MANY {
+                        unmapped.push((opened, fd));
+                    }
+                }
+            },
+            News::Gone(gone) => {
+                self.unmapped().retain(|(opened, _)| {
+                    (opened.session, opened.segment.number) != (gone.session, gone.number)
+                });
+                peer.remove_segment(gone.number);
+            }
         }
+    }
+
+    /// Maps what could not be mapped when it came, if it can be now.
+    pub(super) fn hear_again(&self) {
+        let unmapped = std::mem::take(&mut *self.unmapped());
+        unmapped.into_iter().for_each(|(opened, fd)| self.hear(News::Opened(opened, fd)));
+    }
+
+    fn known(&self, session: &SessionId) -> Option<Arc<PeerSession>> {
+        let peers = self.inner.peers.lock().unwrap_or_else(PoisonError::into_inner);
+        peers.get(session).and_then(|known| known.session.upgrade())
+    }
+
+    fn unmapped(&self) -> MutexGuard<'_, Vec<(SegmentOpened, PassedFd)>> {
+        self.inner.unmapped.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     pub(super) fn lines(&self) -> &Lines {

@@ -21,6 +21,28 @@ use super::{
 /// Written from the front through [`io::Write`], or anywhere as the slice that it dereferences to;
 /// what the slice holds at first is zeros or bytes of earlier samples. In a forked child it is of
 /// no use: dereferencing it panics.
+///
+/// It borrows its publisher, and to publish it is the end of it:
+///
+/// ```compile_fail,E0505
+/// # use axon_transport::shm::{PublishError, Publisher};
+/// fn too_late(publisher: Publisher) -> Result<(), PublishError> {
+///     let loan = publisher.loan(10_000)?;
+///     drop(publisher);
+///     loan.publish_now().map(drop)
+/// }
+/// ```
+///
+/// ```compile_fail,E0382
+/// # use axon_transport::shm::{PublishError, Publisher};
+/// fn written_while_it_is_read(publisher: &Publisher) -> Result<(), PublishError> {
+///     let mut loan = publisher.loan(10_000)?;
+///     loan.fill(1);
+///     loan.publish_now()?;
+///     loan.fill(2);
+///     Ok(())
+/// }
+/// ```
 pub struct Loan<'a> {
     writer: &'a Writer,
     len: usize,

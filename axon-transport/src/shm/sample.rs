@@ -22,6 +22,20 @@ use super::{Meta, Taken, attachment::Pin, memory::Map, ring};
 /// They are therefore read as values ([`read_at`](Self::read_at), [`copy_to`](Self::copy_to),
 /// [`reader`](Self::reader)), and as a slice only where the caller vouches for the publisher.
 ///
+/// What is read in place borrows the sample:
+///
+/// ```compile_fail,E0505
+/// # use axon_transport::shm::{Subscriber, TakeError};
+/// fn first(subscriber: &mut Subscriber) -> Result<(), TakeError> {
+///     if let Some(sample) = subscriber.take()? {
+///         let reader = sample.reader();
+///         drop(sample); // The publisher may write here from now on.
+///         std::io::copy(&mut { reader }, &mut std::io::sink()).unwrap();
+///     }
+///     Ok(())
+/// }
+/// ```
+///
 /// A forked child has no share in it: it reads nothing there.
 pub struct Sample {
     taken: Taken,

@@ -106,7 +106,7 @@ impl Subscriber {
             let channel = Channel::new(ours.as_fd(), timeout);
             // A ring that is not in the first segment: its own follows.
             while !peer.has_segment(ring.segment) {
-                context.hear(&channel.take_news()?);
+                context.hear(channel.take_news()?);
             }
             // Whoever has the other end decides what stands in it, and how long that takes to close.
             kept = Some(PassedFd::connection(ours).trusted());
@@ -171,10 +171,11 @@ impl Subscriber {
         let Some(line) = &self.line else { return };
         for _ in 0..NEWS {
             match Channel::new(line.as_fd(), Some(Duration::ZERO)).take_news() {
-                Ok(news) => self.context.hear(&news),
-                Err(_) => return,
+                Ok(news) => self.context.hear(news),
+                Err(_) => break,
             }
         }
+        self.context.hear_again();
     }
 
     /// Lets go of memory that the publisher gave up. To be called about once a second where samples

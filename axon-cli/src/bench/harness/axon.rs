@@ -38,7 +38,7 @@ impl Medium for Axon {
         let connect = |socket: &OwnedFd| {
             Subscriber::connect(&context, socket, SubscriberOptions::new(qos), PATIENCE)
         };
-        // A socket for each direction, which the two keep.
+        // A socket for each direction.
         let subscriber = match side {
             Side::Near => {
                 let [(there, first), (back, second)] = [Channel::pair()?, Channel::pair()?];

@@ -169,6 +169,30 @@ fn memory_of_a_publisher_that_is_gone_is_let_go_of() {
 }
 
 #[test]
+fn memory_that_could_not_be_mapped_is_mapped_when_there_is_room() {
+    let (here, there) = contexts();
+    let publisher = publisher(&here, keep_last(1));
+    let mut subscriber = together(&publisher, &there, keep_last(1)).1.unwrap();
+    // All the address space that one context may take of another, but for a mebibyte.
+    let open = |bytes| here.session().open_samples(publisher.gid(), bytes).unwrap().number();
+    let mut numbers: Vec<_> = (0..63).map(|_| open(layout::MAX_SEGMENT)).collect();
+    numbers.push(open(layout::MAX_SEGMENT - layout::SESSION_BYTES - (1 << 20)));
+    let seen = there.peer(here.id(), here.session().descriptors().unwrap()).unwrap();
+    let seen = seen.remote().unwrap();
+    let start = Instant::now();
+    while !numbers.iter().all(|number| seen.has_segment(*number)) {
+        assert!(start.elapsed() < EVER);
+        subscriber.tend();
+        publisher.reap();
+    }
+    publisher.publish(&pattern(1, 5000)).unwrap();
+    assert!(subscriber.take().unwrap().is_none() && subscriber.take().unwrap().is_none());
+    here.session().close_samples(numbers[0]);
+    let sample = subscriber.take().unwrap().expect("there is room for it now");
+    assert_eq!(sample.len(), 5000);
+}
+
+#[test]
 fn samples_whose_memory_never_came_are_lost_with_their_publishers_process() {
     let (session, there) = (silent_session(), Context::new().unwrap());
     let writer = writer(&session, keep_last(5), 1 << 20);
