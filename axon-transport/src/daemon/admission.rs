@@ -79,7 +79,10 @@ impl Admission {
             return Err(plain("the segment in HELLO is no memfd".into()));
         }
         let handed = PeerDescriptors { segment, doorbell, pidfd };
-        if handed.process() != Some(peer.pid) {
+        let process = handed
+            .process()
+            .map_err(|error| plain(format!("the pidfd in HELLO cannot be looked up: {error}")))?;
+        if process != Some(peer.pid) {
             return Err(plain("the pidfd in HELLO is not the sender's own".into()));
         }
         let PeerDescriptors { segment, doorbell, pidfd } = handed;

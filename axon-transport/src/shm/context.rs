@@ -157,9 +157,10 @@ impl Context {
             return Err(ShmError::Forked);
         }
         let refuse = |what| Err(ShmError::Refused { what });
-        let Some(process) = descriptors.process() else {
-            return refuse("its pidfd names no process");
-        };
+        let process = descriptors
+            .process()
+            .map_err(|source| ShmError::System { what: "looking up a process", source })?;
+        let Some(process) = process else { return refuse("its pidfd names no process") };
         let Some(memory) = descriptors.segment.memory() else {
             return refuse("its first segment is no memfd");
         };

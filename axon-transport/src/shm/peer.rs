@@ -50,21 +50,24 @@ impl PeerDescriptors {
 
     /// The process that the pidfd refers to, to be compared with the credentials of the socket
     /// it came over. `None` when it is no pidfd, or its process has ended.
-    pub fn process(&self) -> Option<u32> {
+    ///
+    /// # Errors
+    /// The process has no descriptors left to look it up with.
+    pub fn process(&self) -> io::Result<Option<u32>> {
         process(&self.pidfd)
     }
 }
 
-fn process(pidfd: &PassedFd) -> Option<u32> {
+fn process(pidfd: &PassedFd) -> io::Result<Option<u32>> {
     // What some things tell of themselves there takes locks that others can keep.
     if !pidfd.is_pidfd() {
-        return None;
+        return Ok(None);
     }
     let path = format!("/proc/self/fdinfo/{}", pidfd.as_fd().as_raw_fd());
-    let text = fs::read_to_string(path).ok()?;
-    let pid = text.lines().find_map(|line| line.strip_prefix("Pid:"))?;
+    let text = fs::read_to_string(path)?;
+    let pid = text.lines().find_map(|line| line.strip_prefix("Pid:"));
     // -1 once the process has been reaped.
-    pid.trim().parse().ok().filter(|pid| *pid > 0)
+    Ok(pid.and_then(|pid| pid.trim().parse().ok()).filter(|pid| *pid > 0))
 }
 
 /// Segments of another session that are kept in mind at most, whatever it opens.
@@ -124,7 +127,7 @@ impl PeerSession {
         layout::check_segment(first.words(), id, 0, SegmentKind::Session)?;
         Ok(Arc::new(Self {
             id,
-            process: process(&pidfd),
+            process: process(&pidfd).ok().flatten(),
             quota,
             first: Arc::new(first),
             further: Mutex::default(),
@@ -241,9 +244,9 @@ impl PeerSession {
         poll(&mut fds, Some(&Timespec::default())).is_ok_and(|ready| ready > 0)
     }
 
-    /// The number of its process; `None` once that has ended.
+    /// The number of its process; `None` once that has ended, or when it cannot be looked up.
     pub fn process(&self) -> Option<u32> {
-        process(&self.pidfd)
+        process(&self.pidfd).ok().flatten()
     }
 
     /// Whether the two are sessions of one process.

@@ -93,7 +93,7 @@ impl Wire {
         let mut fds = fds.into_iter();
         let mut next = || PassedFd::received(fds.next().expect("a descriptor"));
         let descriptors = PeerDescriptors { segment: next(), doorbell: next(), pidfd: next() };
-        assert!(descriptors.process().is_some_and(|pid| pid != std::process::id()));
+        assert!(descriptors.process().unwrap().is_some_and(|pid| pid != std::process::id()));
         let peer = PeerSession::map(SessionId(id), descriptors).unwrap();
         for number in numbers.as_chunks::<4>().0 {
             let (number, kind) = (u32::from_le_bytes(*number), SegmentKind::Samples(gid));
