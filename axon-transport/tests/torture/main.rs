@@ -1,0 +1,59 @@
+//! Eight processes publish to each other while some of them are killed, stopped and continued at
+//! random, and the daemon is killed under them.
+//!
+//! Samples are of 0 bytes to 8 MiB and carry their number and a pattern of it. What must hold: every
+//! sample is whole; a KEEP_ALL subscription misses none of a publisher that lives, repeats none of any,
+//! and what it misses of one that was killed it counts; no process fails or stands still; the memory they hold together stays below a ceiling. At the end
+//! the disturbances cease, and every process must come to have the last sample of every other.
+//!
+//! One round of some seconds by default. For longer, `cargo test --release -p axon-transport --test
+//! torture -- --minutes 60`: rounds of half a minute, each of another seed, and a line of a table for
+//! each. `--seed N` begins with that one: the same disturbances again, though not the same moments.
+#![expect(clippy::print_stdout, reason = "what it prints is its result")]
+
+mod child;
+mod conductor;
+mod sample;
+
+use std::{
+    env,
+    process::ExitCode,
+    time::{Duration, Instant},
+};
+
+use conductor::Round;
+
+/// How long the eight are disturbed in an ordinary run.
+const SHORT: Duration = Duration::from_secs(6);
+/// The same of each round of a long run.
+const LONG: Duration = Duration::from_secs(25);
+
+fn main() -> ExitCode {
+    let arguments: Vec<String> = env::args().skip(1).collect();
+    if let Ok(seed) = env::var(child::ROLE) {
+        child::run(seed.parse().expect("a seed"));
+        return ExitCode::SUCCESS;
+    }
+    if arguments.iter().any(|a| a == "--list") {
+        println!("torture: test");
+        return ExitCode::SUCCESS;
+    }
+    let value = |name: &str| {
+        let at = arguments.iter().position(|a| a == name)?;
+        arguments.get(at + 1)?.parse::<u64>().ok()
+    };
+    let seed = value("--seed").unwrap_or(1);
+    println!("{}", Round::heading());
+    let Some(minutes) = value("--minutes") else {
+        println!("{}", conductor::run(SHORT, seed));
+        return ExitCode::SUCCESS;
+    };
+    let (start, time) = (Instant::now(), Duration::from_secs(60 * minutes));
+    for seed in seed.. {
+        println!("{}", conductor::run(LONG, seed));
+        if start.elapsed() >= time {
+            break;
+        }
+    }
+    ExitCode::SUCCESS
+}

@@ -1,0 +1,52 @@
+//! Samples that say who they are, byte by byte.
+
+/// The longest.
+pub(crate) const LONGEST: usize = 8 << 20;
+
+/// Numbers that follow from a seed (splitmix64).
+pub(crate) struct Random(pub(crate) u64);
+
+impl Random {
+    pub(crate) fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^ (z >> 31)
+    }
+
+    pub(crate) fn below(&mut self, bound: u64) -> u64 {
+        self.next() % bound
+    }
+
+    /// 0 to [`LONGEST`], each power of two as often as the next.
+    pub(crate) fn length(&mut self) -> usize {
+        let power = self.below(25);
+        let most = if power == 24 { 0 } else { 1_u64 << power };
+        usize::try_from(self.below(most + 1)).expect("at most eight million")
+    }
+}
+
+/// The pattern's word at `index` of the sample `sequence` of the publisher whose GID begins so.
+fn word(publisher: u64, sequence: u64, index: u64) -> u64 {
+    (publisher ^ sequence.rotate_left(32)).wrapping_add(index.wrapping_mul(0x9e37_79b9_7f4a_7c15))
+}
+
+pub(crate) fn fill(publisher: u64, sequence: u64, out: &mut [u8]) {
+    let (words, rest) = out.as_chunks_mut::<8>();
+    let last = word(publisher, sequence, words.len() as u64).to_le_bytes();
+    rest.copy_from_slice(&last[..rest.len()]);
+    for (index, chunk) in (0..).zip(words) {
+        *chunk = word(publisher, sequence, index).to_le_bytes();
+    }
+}
+
+/// Whether `bytes`, which begin at byte `at`, a multiple of 8, are those of the sample.
+pub(crate) fn is_whole(publisher: u64, sequence: u64, at: usize, bytes: &[u8]) -> bool {
+    let (words, rest) = bytes.as_chunks::<8>();
+    let first = at as u64 / 8;
+    let expected = |index: usize| word(publisher, sequence, first + index as u64);
+    let whole = |(index, chunk): (usize, &[u8; 8])| u64::from_le_bytes(*chunk) == expected(index);
+    words.iter().enumerate().all(whole)
+        && *rest == expected(words.len()).to_le_bytes()[..rest.len()]
+}
