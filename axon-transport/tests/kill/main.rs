@@ -6,10 +6,25 @@
 //! two such states leaves the first of them, so killing once in each state stands for killing at
 //! every instruction. The bounded run kills around the states, all of them where they are few, and at
 //! instructions chosen at random; the full run
-//! (`cargo test --release -p axon-transport --test kill -- --full`) at every single instruction.
+//! (`cargo test --release -p axon-transport --test kill -- --full`) at every single instruction, or
+//! evenly over an operation of very many and around its states. A part of a name runs the cases that
+//! have it in theirs.
+//!
+//! Some cases have something else around them: a fork of the doomed process that keeps its
+//! descriptors, `mlockall`, no descriptors, no memory; or it is stopped where it would be killed, and
+//! goes on later. The daemon is killed before and after each of its system calls.
 #![expect(clippy::print_stdout, reason = "what it prints is its result")]
 
+mod around;
+mod cases;
+mod daemon;
+#[path = "../support/group.rs"]
+mod group;
 mod operation;
+mod report;
+#[path = "../support/mod.rs"]
+#[allow(dead_code, reason = "what other tests need of it")]
+mod support;
 mod survivor;
 mod trace;
 mod wire;
@@ -24,14 +39,19 @@ use std::{
     time::Instant,
 };
 
-use operation::cases;
-use worker::{Plan, Report};
+use cases::cases;
+use report::Report;
+use worker::Plan;
 
 fn main() -> ExitCode {
     let arguments: Vec<String> = env::args().skip(1).collect();
     // Before any thread is made: a worker forks.
     if let Some(share) = arguments.iter().find_map(|a| a.strip_prefix("--worker=")) {
         worker::run(&Plan::parse(share));
+        return ExitCode::SUCCESS;
+    }
+    if let Some(full) = arguments.iter().find_map(|a| a.strip_prefix("--daemon=")) {
+        println!("{}", daemon::run(full == "true").line());
         return ExitCode::SUCCESS;
     }
     if arguments.iter().any(|a| a == "--list") {
@@ -48,25 +68,28 @@ fn main() -> ExitCode {
     }
     let full = arguments.iter().any(|a| a == "--full");
     let filter = arguments.iter().find(|a| !a.starts_with('-'));
-    let chosen: Vec<usize> = cases()
-        .iter()
-        .enumerate()
-        .filter(|(_, case)| filter.is_none_or(|f| case.name.contains(f.as_str())))
-        .map(|(index, _)| index)
-        .collect();
-    conduct(&chosen, full)
+    let is_meant = |name: &str| filter.is_none_or(|part| name.contains(part.as_str()));
+    let cases = cases();
+    let chosen = cases.iter().enumerate().filter(|(_, case)| is_meant(case.name));
+    let chosen: Vec<usize> = chosen.map(|(index, _)| index).collect();
+    conduct(&chosen, is_meant(daemon::NAME), full)
 }
 
 /// Shares the cases out among as many workers as there are processors, and prints what they found.
-fn conduct(chosen: &[usize], full: bool) -> ExitCode {
+fn conduct(chosen: &[usize], daemon: bool, full: bool) -> ExitCode {
     let start = Instant::now();
-    let workers = thread::available_parallelism().map_or(1, usize::from).min(chosen.len().max(1));
+    let workers = thread::available_parallelism().map_or(1, usize::from).min(chosen.len());
+    let share = |worker| chosen.iter().copied().skip(worker).step_by(workers).collect();
+    let plan = |worker| format!("--worker={}", Plan { full, cases: share(worker) });
+    let mut plans: Vec<String> = (0..workers).map(plan).collect();
+    if daemon {
+        plans.push(format!("--daemon={full}"));
+    }
     let (sender, reports) = mpsc::channel();
     let mut running: Vec<Child> = Vec::new();
-    for worker in 0..workers {
-        let share = chosen.iter().copied().skip(worker).step_by(workers).collect();
+    for (worker, plan) in plans.iter().enumerate() {
         let mut child = Command::new(env::current_exe().expect("its own path"))
-            .arg(format!("--worker={}", Plan { full, cases: share }))
+            .arg(plan)
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .spawn()
@@ -81,11 +104,8 @@ fn conduct(chosen: &[usize], full: bool) -> ExitCode {
         running.push(child);
     }
     drop(sender);
-    println!(
-        "{:<44} {:>9} {:>12} {:>7} {:>7} {:>7}",
-        "operation", "dies", "instructions", "states", "kills", "shown"
-    );
-    let mut at = vec![String::new(); workers];
+    println!("{}", Report::heading());
+    let mut at = vec![String::new(); plans.len()];
     let mut kills = 0;
     for (worker, line) in reports {
         match Report::parse(&line) {

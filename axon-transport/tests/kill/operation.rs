@@ -8,16 +8,18 @@ use std::{
 
 use axon_transport::{
     ids::{Gid, SessionId},
-    qos::{Durability, History, Qos},
+    qos::Qos,
     shm::{Meta, Reader, RingOptions, SessionSegment, Writer},
 };
 
-use crate::{trace::mark, wire::Wire};
+use crate::{around::Around, trace::mark, wire::Wire};
 
 /// The largest message of any case, in bytes.
 pub(crate) const LARGEST: u64 = 1 << 16;
 /// Bytes of history that a publisher may keep.
 const BUDGET: u64 = 8 << 10;
+/// Samples that a publisher which was stopped publishes once it goes on.
+pub(crate) const MORE: u64 = 5;
 
 /// One operation in one situation.
 pub(crate) struct Case {
@@ -30,6 +32,11 @@ pub(crate) struct Case {
     pub(crate) len: usize,
     /// Samples taken before the operation.
     pub(crate) taken: u64,
+    /// Samples taken after those, and kept pinned by the survivor.
+    pub(crate) pinned: u64,
+    pub(crate) around: Around,
+    /// Whether it has so many instructions that a bounded run does not look for its states.
+    pub(crate) long: bool,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,8 +45,12 @@ pub(crate) enum Operation {
     Create,
     Attach,
     Publish,
+    /// To a reader that sleeps.
+    Wake,
     /// Of which a KEEP_ALL reader has no room for more.
     PublishHeld,
+    /// For which something is short.
+    PublishRefused,
     LoanAndPublish,
     LoanAndDrop,
     Detach,
@@ -51,6 +62,11 @@ pub(crate) enum Operation {
     // The reader dies in these.
     Map,
     Take,
+    /// A large sample is taken where it is.
+    Pin,
+    Unpin,
+    /// The same when the reader is gone already.
+    UnpinLast,
     Peek,
     Skip,
     DropReader,
@@ -58,87 +74,14 @@ pub(crate) enum Operation {
 
 impl Operation {
     pub(crate) fn kills_publisher(self) -> bool {
-        use Operation::{
-            Attach, Create, Detach, DropWriter, LoanAndDrop, LoanAndPublish, Prepare, Publish,
-            PublishHeld, Tend,
-        };
-        matches!(
-            self,
-            Create
-                | Attach
-                | Publish
-                | PublishHeld
-                | LoanAndPublish
-                | LoanAndDrop
-                | Detach
-                | DropWriter
-                | Prepare
-                | Tend
-        )
+        use Operation::{DropReader, Map, Peek, Pin, Skip, Take, Unpin, UnpinLast};
+        !matches!(self, Map | Take | Pin | Unpin | UnpinLast | Peek | Skip | DropReader)
     }
 
     /// Samples that the operation publishes.
     pub(crate) fn publishes(self) -> u64 {
-        u64::from(matches!(self, Self::Publish | Self::LoanAndPublish))
+        u64::from(matches!(self, Self::Publish | Self::Wake | Self::LoanAndPublish))
     }
-}
-
-pub(crate) fn cases() -> Vec<Case> {
-    use Operation::*;
-    let last = |depth| Qos { history: History::KeepLast, depth, ..Qos::default() };
-    let all = Qos::keep_all();
-    let latched = |depth| Qos { durability: Durability::TransientLocal, ..last(depth) };
-    let case = |name, operation, reader: Qos, (before, taken), len| {
-        let publisher = if reader.history == History::KeepAll { all } else { last(1) };
-        let publisher = Qos { durability: reader.durability, ..publisher };
-        Case { name, operation, publisher, reader, before, len, taken }
-    };
-    vec![
-        case("create a ring", Create, last(4), (0, 0), 0),
-        case("attach a reader", Attach, last(4), (0, 0), 40),
-        case("attach a reader that gets history", Attach, latched(1), (2, 1), 40),
-        case("publish nothing", Publish, last(4), (0, 0), 0),
-        case("publish inline, the first", Publish, last(4), (0, 0), 96),
-        case("publish inline", Publish, last(4), (3, 1), 8),
-        case("publish inline to a reader with all unread", Publish, last(20), (30, 0), 96),
-        case("publish inline over the ring's end", Publish, last(4), (32, 2), 52),
-        case("publish over the first descriptor", Publish, last(20), (32, 15), 52),
-        case("publish and grow", Publish, last(4), (16, 2), 52),
-        case("publish and grow, all unread", Publish, last(20), (16, 0), 96),
-        case("publish and grow, by copy", Publish, all, (16, 10), 300),
-        case("publish and open a segment for descriptors", Publish, last(3000), (1024, 1000), 8),
-        case("publish and move to that segment", Publish, last(3000), (1025, 1000), 8),
-        case("publish by copy, the first", Publish, last(4), (0, 0), 97),
-        case("publish by copy", Publish, last(4), (3, 1), 1024),
-        case("publish by copy in place of the oldest", Publish, last(20), (8, 0), 1024),
-        case("publish by copy in place of many", Publish, last(20), (40, 20), 200),
-        case("publish a large one, the first", Publish, last(1), (0, 0), 5000),
-        case("publish a large one", Publish, last(1), (2, 1), 5000),
-        case("publish a large one, the first", Publish, last(4), (0, 0), 5000),
-        case("publish a large one in place of one that was taken", Publish, last(4), (4, 1), 5000),
-        case("have memory ready for a large one", Prepare, last(4), (1, 1), 5000),
-        case("give the memory of large ones up", Tend, last(4), (2, 2), 5000),
-        case("publish, KEEP_ALL", Publish, all, (3, 3), 300),
-        case("publish, KEEP_ALL and held", PublishHeld, all, (8, 0), 1024),
-        case("loan, write, publish inline", LoanAndPublish, last(4), (3, 1), 60),
-        case("loan, write, publish", LoanAndPublish, last(4), (3, 1), 2000),
-        case("loan, drop", LoanAndDrop, last(4), (3, 1), 2000),
-        case("detach a reader", Detach, last(4), (3, 1), 300),
-        case("drop the publisher", DropWriter, last(4), (3, 1), 300),
-        case("map a ring", Map, last(4), (3, 0), 300),
-        case("take inline", Take, last(4), (3, 1), 60),
-        case("take by copy", Take, last(4), (3, 1), 1024),
-        case("take a large one", Take, last(1), (2, 0), 5000),
-        case("take from a ring that grew", Take, last(20), (20, 3), 60),
-        case("take over what its depth skips", Take, last(2), (9, 0), 100),
-        case("take over what is lost", Take, last(20), (12, 0), 1024),
-        case("take, KEEP_ALL, held publisher", Take, all, (8, 0), 1024),
-        case("take nothing", Take, last(4), (2, 2), 10),
-        case("peek", Peek, last(4), (3, 1), 1024),
-        case("skip", Skip, last(4), (3, 1), 1024),
-        case("drop the reader", DropReader, last(4), (3, 1), 300),
-        case("drop the reader, KEEP_ALL", DropReader, all, (8, 2), 1024),
-    ]
 }
 
 pub(crate) fn session() -> Arc<SessionSegment> {
@@ -171,6 +114,7 @@ impl Case {
     pub(crate) fn publish(&self, wire: &Wire) {
         let session = session();
         if self.operation == Operation::Create {
+            self.around.begin();
             mark();
             let writer = writer(&session, self.publisher);
             wire.offer(&session, &writer);
@@ -178,15 +122,12 @@ impl Case {
             return;
         }
         let writer = writer(&session, self.publisher);
-        let mut request = None;
-        let mut reader = None;
-        if self.operation == Operation::Attach {
-            wire.offer(&session, &writer);
-            request = Some(wire.take_request(self.reader).0);
-        } else {
-            wire.offer(&session, &writer);
-            let (info, _) = wire.take_request(self.reader);
-            reader = Some(info.gid);
+        wire.offer(&session, &writer);
+        let (info, _) = wire.take_request(self.reader);
+        let reader = info.gid;
+        let mut request = Some(info);
+        if self.operation != Operation::Attach {
+            let info = request.take().expect("a request");
             wire.grant(writer.attach(info).expect("an attachment"));
         }
         for sequence in 0..self.before {
@@ -195,17 +136,21 @@ impl Case {
         let bytes = payload(self.before, self.len);
         let start = Instant::now();
         writer.tend(start);
+        self.around.begin();
         mark();
         match self.operation {
             Operation::Attach => {
                 let request = request.expect("a request");
                 wire.grant(writer.attach(request).expect("an attachment"));
             }
-            Operation::Publish => {
+            Operation::Publish | Operation::Wake => {
                 writer.publish(meta(self.before), &bytes).expect("room");
             }
             Operation::PublishHeld => {
                 writer.try_publish(meta(self.before), &bytes).expect_err("a held publisher");
+            }
+            Operation::PublishRefused => {
+                writer.publish(meta(self.before), &bytes).expect_err("what is short");
             }
             Operation::LoanAndPublish => {
                 let mut loan = writer.loan(self.len).expect("a loan");
@@ -216,12 +161,26 @@ impl Case {
                 let mut loan = writer.loan(self.len).expect("a loan");
                 loan.write_all(&bytes).expect("room in a loan");
             }
-            Operation::Detach => assert!(writer.detach(reader.expect("a reader"))),
-            Operation::DropWriter => drop(writer),
+            Operation::Detach => assert!(writer.detach(reader)),
+            Operation::DropWriter => return self.drop_writer(writer),
             Operation::Prepare => writer.prepare().expect("memory"),
-            Operation::Tend => assert!(!writer.tend(start + Duration::from_secs(60))),
+            Operation::Tend => {
+                let kept = writer.tend(start + Duration::from_secs(60));
+                assert_eq!(kept, self.pinned > 0);
+            }
             other => unreachable!("{other:?} is the reader's"),
         }
+        mark();
+        // Only one that was stopped comes here.
+        wire.wait();
+        let next = self.before + self.operation.publishes();
+        for sequence in next..next + MORE {
+            writer.publish(meta(sequence), &payload(sequence, self.len)).expect("room");
+        }
+    }
+
+    fn drop_writer(&self, writer: Writer) {
+        drop(writer);
         mark();
     }
 
@@ -231,9 +190,11 @@ impl Case {
         let (granted, _) = wire.join(&session, self.reader);
         if self.operation == Operation::Map {
             wire.wait();
+            self.around.begin();
             mark();
-            let _reader = granted.map();
-            return mark();
+            let reader = granted.map();
+            mark();
+            return self.read_on(wire, reader);
         }
         let peer = granted.peer.clone();
         let mut reader: Reader = granted.map();
@@ -244,16 +205,40 @@ impl Case {
         for _ in 0..self.taken {
             reader.take(&mut out).expect("a ring").expect("a sample");
         }
+        let unpins = matches!(self.operation, Operation::Unpin | Operation::UnpinLast);
+        let mut sample = unpins.then(|| reader.take_sample().expect("a ring").expect("a sample"));
+        let mut reader = Some(reader);
+        if self.operation == Operation::UnpinLast {
+            reader = None;
+        }
         wire.go();
         wire.wait();
+        self.around.begin();
         mark();
-        match self.operation {
-            Operation::Take => drop(reader.take(&mut out).expect("a ring")),
-            Operation::Peek => drop(reader.peek().expect("a ring")),
-            Operation::Skip => assert!(reader.skip()),
-            Operation::DropReader => drop(reader),
-            other => unreachable!("{other:?} is the publisher's"),
+        match (self.operation, &mut reader) {
+            (Operation::Take, Some(reader)) => drop(reader.take(&mut out).expect("a ring")),
+            (Operation::Pin, Some(reader)) => sample = reader.take_sample().expect("a ring"),
+            (Operation::Unpin | Operation::UnpinLast, _) => sample = None,
+            (Operation::Peek, Some(reader)) => drop(reader.peek().expect("a ring")),
+            (Operation::Skip, Some(reader)) => assert!(reader.skip()),
+            (Operation::DropReader, reader) => *reader = None,
+            (other, _) => unreachable!("{other:?} is the publisher's"),
         }
         mark();
+        assert!(sample.is_none_or(|sample| sample.is_borrowed()));
+        if let Some(reader) = reader {
+            self.read_on(wire, reader);
+        }
+    }
+
+    /// What a reader that was stopped does once it goes on: it takes all, and says how much that was.
+    fn read_on(&self, wire: &Wire, mut reader: Reader) {
+        wire.wait();
+        let mut out = Vec::new();
+        while let Some(taken) = reader.take(&mut out).expect("a ring") {
+            assert!(out == payload(taken.meta.sequence, self.len), "{taken:?} is torn");
+        }
+        let first = reader.grant().first;
+        wire.count([first, reader.received(), reader.lost(), reader.skipped()]);
     }
 }

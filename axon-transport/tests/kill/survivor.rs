@@ -1,18 +1,34 @@
 //! The process at the other end: what it does before the kill, and what must hold for it after.
 
-use std::{fs, os::fd::OwnedFd, sync::Arc};
+use std::{
+    fs,
+    os::fd::{AsFd as _, BorrowedFd, OwnedFd},
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use axon_transport::{
     ids::Gid,
     qos::Qos,
-    shm::{Peer, PeerSession, Reader, ReaderInfo, ReaderOptions, SessionSegment, Writer},
+    shm::{
+        Peer, PeerSession, Reader, ReaderInfo, ReaderOptions, Sample, SegmentInfo, SegmentKind,
+        SessionSegment, Writer,
+    },
+    wait::ExternalLeader,
+};
+use rustix::{
+    event::{PollFd, PollFlags, Timespec, poll},
+    fs::fstat,
 };
 
 use crate::{
-    operation::{Case, LARGEST, Operation, meta, payload, session, writer},
+    operation::{Case, LARGEST, MORE, Operation, meta, payload, session, writer},
     trace::Tracee,
     wire::{Wire, options},
 };
+
+/// A survivor that sleeps for so long would sleep for ever.
+const SLEEP: Timespec = Timespec { tv_sec: 30, tv_nsec: 0 };
 
 /// What a scene shows once the doomed process is dead.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -32,6 +48,12 @@ pub(crate) struct Scene<'a> {
     end: End,
     /// Those segments that the doomed process writes.
     pub(crate) written: Vec<OwnedFd>,
+    /// Samples that the survivor keeps where they are.
+    pinned: Vec<Sample>,
+    /// The survivor's sleep.
+    leader: Option<ExternalLeader>,
+    /// Bytes of memory that the survivor's segments had before the operation.
+    memory: u64,
     done: bool,
 }
 
@@ -56,12 +78,21 @@ impl<'a> Scene<'a> {
             let (end, written) = set(case, &wire, &session);
             (wire, session, end, written)
         });
-        let mut scene = Self { case, wire, session, tracee, end, written, done: false };
+        let (pinned, leader, memory) = (Vec::new(), None, memory(&session));
+        let mut scene =
+            Self { case, wire, session, tracee, end, written, pinned, leader, memory, done: false };
         scene.look_for_segments();
         if let End::Reader(reader, _) = &mut scene.end {
             for _ in 0..case.taken {
                 check_next(case, reader).expect("a sample");
             }
+            let mut pin = || reader.take_sample().expect("a ring").expect("a sample");
+            scene.pinned.extend((0..case.pinned).map(|_| pin()));
+        }
+        if case.operation == Operation::Wake {
+            let leader = scene.session.external_leader().expect("the only one");
+            leader.arm(false);
+            scene.leader = Some(leader);
         }
         scene
     }
@@ -83,8 +114,8 @@ impl<'a> Scene<'a> {
     pub(crate) fn kill(mut self) -> Outcome {
         self.tracee.end();
         self.look_for_segments();
-        let Self { case, wire, session, end, written, done, .. } = self;
-        drop(written);
+        // What it forked lives until the very end.
+        let Self { case, wire, session, end, tracee: _tracee, pinned, leader, done, .. } = self;
         let shown = match end {
             End::Nothing => false,
             End::Waiting(map) => match map(&wire) {
@@ -93,12 +124,64 @@ impl<'a> Scene<'a> {
             },
             End::Reader(reader, _) => drain(case, done, *reader),
             End::Writer(writer) => {
-                go_on(case, &session, &writer);
+                assert_eq!(memory(&session), self.memory, "a reader takes no memory");
+                go_on(case, &session, &writer, case.before);
                 false
             }
         };
+        pinned.iter().for_each(|sample| check(case, sample));
+        if shown && let Some(leader) = &leader {
+            // It did not live to ring, perhaps.
+            let mut fds = [PollFd::new(leader, PollFlags::IN)];
+            assert_eq!(poll(&mut fds, Some(&SLEEP)), Ok(1), "the survivor sleeps for ever");
+        }
         another_pair(&session);
         Outcome { shown, done }
+    }
+
+    /// Leaves it where it stands for a while, in which others must get on without it, and then lets
+    /// it go on to its end, where it must have all that it would have had otherwise.
+    pub(crate) fn stop(mut self) -> Outcome {
+        let case = self.case;
+        let mut published = case.before + case.operation.publishes();
+        if !self.done {
+            if let End::Writer(writer) = &self.end {
+                for _ in 0..3 * 16 {
+                    let bytes = payload(published, case.len);
+                    writer.publish(meta(published), &bytes).expect("nobody waits for it");
+                    published += 1;
+                }
+            }
+            another_pair(&self.session);
+            self.tracee.advance_to_end();
+        }
+        self.look_for_segments();
+        let Self { case, wire, session, end, mut tracee, .. } = self;
+        tracee.release();
+        match end {
+            End::Nothing => {}
+            End::Waiting(map) => {
+                let reader = map(&wire).expect("a grant");
+                wire.go();
+                tracee.finish();
+                drain_all(case, reader, published + MORE);
+            }
+            End::Reader(reader, peer) => {
+                wire.go();
+                tracee.finish();
+                wire.take_segments(&peer);
+                drain_all(case, *reader, published + MORE);
+            }
+            End::Writer(writer) => {
+                wire.go();
+                let counted: u64 = wire.take_count().iter().sum();
+                assert_eq!(counted, published, "every sample is counted once");
+                tracee.finish();
+                go_on(case, &session, &writer, published);
+            }
+        }
+        another_pair(&session);
+        Outcome { shown: case.operation.publishes() > 0, done: true }
     }
 }
 
@@ -112,7 +195,8 @@ fn join(case: &Case, wire: &Wire, session: &Arc<SessionSegment>) -> (End, Vec<Ow
             wire.ask(session, &lane);
             let (session, qos) = (session.clone(), case.reader);
             let map = move |wire: &Wire| {
-                let grant = wire.take_grant()?;
+                // A fork of it may keep the socket open, so its end is none.
+                let grant = if wire.is_empty() { None } else { wire.take_grant() }?;
                 wire.take_segments(&offer.peer);
                 let (peer, writer, ring) = (offer.peer, offer.writer, offer.ring);
                 let options = options(&session, peer, writer, ring, lane, grant, qos);
@@ -157,17 +241,31 @@ fn check_next(case: &Case, reader: &mut Reader) -> Option<u64> {
     Some(sequence)
 }
 
-/// Takes all that the dead publisher left, and counts. Whether the operation's sample was there.
-fn drain(case: &Case, done: bool, mut reader: Reader) -> bool {
+/// A sample that is kept must stay what it was.
+fn check(case: &Case, sample: &Sample) {
+    let mut bytes = Vec::new();
+    sample.copy_to(&mut bytes).expect("memory");
+    assert!(sample.is_borrowed(), "it is not where it was");
+    let sequence = sample.meta().sequence;
+    assert!(bytes == payload(sequence, case.len), "sample {sequence} is torn while it is pinned");
+}
+
+/// Takes all that is left, and counts. How many there were of the publisher in all, and the last.
+fn take_rest(case: &Case, reader: &mut Reader) -> (u64, Option<u64>) {
     assert!(reader.writer_dead(), "its pidfd says so");
     let first = reader.grant().first;
     let mut last = None;
-    while let Some(sequence) = check_next(case, &mut reader) {
+    while let Some(sequence) = check_next(case, reader) {
         assert!(last < Some(sequence), "{sequence} after {last:?}");
         last = Some(sequence);
     }
     assert!(reader.is_drained());
-    let counted = first + reader.received() + reader.lost() + reader.skipped();
+    (first + reader.received() + reader.lost() + reader.skipped(), last)
+}
+
+/// Takes all that the dead publisher left. Whether the operation's sample was there.
+fn drain(case: &Case, done: bool, mut reader: Reader) -> bool {
+    let (counted, last) = take_rest(case, &mut reader);
     let shown = counted > case.before;
     assert_eq!(counted - u64::from(shown), case.before, "every sample is counted once");
     if shown {
@@ -180,9 +278,16 @@ fn drain(case: &Case, done: bool, mut reader: Reader) -> bool {
     shown
 }
 
-/// The publisher goes on without its dead reader.
-fn go_on(case: &Case, session: &Arc<SessionSegment>, writer: &Writer) {
-    let mut sequence = case.before;
+/// Takes all that a publisher left which came to its end.
+fn drain_all(case: &Case, mut reader: Reader, published: u64) {
+    let (counted, last) = take_rest(case, &mut reader);
+    assert_eq!(counted, published, "every sample is counted once");
+    assert_eq!(last, Some(published - 1));
+}
+
+/// The publisher goes on from `sequence` without its dead reader.
+fn go_on(case: &Case, session: &Arc<SessionSegment>, writer: &Writer, sequence: u64) {
+    let mut sequence = sequence;
     let mut publish = |count: u64| {
         for _ in 0..count {
             writer.publish(meta(sequence), &payload(sequence, case.len)).expect("it is not held");
@@ -199,6 +304,14 @@ fn go_on(case: &Case, session: &Arc<SessionSegment>, writer: &Writer) {
     assert_eq!(check_next(case, &mut reader), Some(end - 1));
     assert_eq!(check_next(case, &mut reader), None);
     assert_eq!((reader.received(), reader.lost(), reader.skipped()), (1, 0, 0));
+    drop(reader);
+    assert_eq!(writer.drop_gone().len(), 1);
+    // What the dead one pinned has come back, too.
+    let start = Instant::now();
+    writer.tend(start);
+    assert!(!writer.tend(start + Duration::from_secs(60)), "memory of large samples is kept");
+    let samples = |info: &SegmentInfo| matches!(info.kind, SegmentKind::Samples(_));
+    assert!(!session.segments().iter().any(samples));
 }
 
 /// The survivor's session still serves.
@@ -229,9 +342,38 @@ fn attach(session: &Arc<SessionSegment>, writer: &Writer, qos: Qos) -> Reader {
     Reader::map(options).expect("a ring")
 }
 
-/// Descriptors that this process holds, and memfds that it maps.
-pub(crate) fn holdings() -> (usize, usize) {
-    let descriptors = fs::read_dir("/proc/self/fd").expect("procfs").count();
-    let maps = fs::read_to_string("/proc/self/maps").expect("procfs");
-    (descriptors, maps.lines().filter(|line| line.contains("/memfd:")).count())
+/// Bytes of memory that a session's segments have.
+fn memory(session: &SessionSegment) -> u64 {
+    let first = session.descriptors().expect("descriptors").segment;
+    let bytes = |fd: BorrowedFd<'_>| fstat(fd).expect("a segment").st_blocks.cast_unsigned() * 512;
+    let further = session.segments().into_iter().map(|info| {
+        let (_, fd) = session.segment(info.number).expect("a descriptor").expect("it");
+        bytes(fd.as_fd())
+    });
+    bytes(first.as_fd()) + further.sum::<u64>()
+}
+
+/// What this process holds of the system's.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) struct Holdings {
+    descriptors: usize,
+    /// Maps of memfds.
+    maps: usize,
+    /// Its share of shared memory, in KiB, where the system tells.
+    shared: Option<u64>,
+    children: usize,
+}
+
+impl Holdings {
+    pub(crate) fn now() -> Self {
+        let maps = fs::read_to_string("/proc/self/maps").expect("procfs");
+        let maps = maps.lines().filter(|line| line.contains("/memfd:")).count();
+        let memory = fs::read_to_string("/proc/self/smaps_rollup").unwrap_or_default();
+        let shared = memory.lines().find_map(|line| line.strip_prefix("Pss_Shmem:"));
+        let shared = shared.and_then(|text| text.trim().strip_suffix(" kB")?.parse().ok());
+        let children = fs::read_to_string("/proc/thread-self/children").unwrap_or_default();
+        let children = children.split_ascii_whitespace().count();
+        let descriptors = fs::read_dir("/proc/self/fd").expect("procfs").count();
+        Self { descriptors, maps, shared, children }
+    }
 }

@@ -11,13 +11,13 @@ use nix::{
     libc,
     sys::{
         ptrace::{self, Options},
-        signal::{Signal, kill, raise},
+        signal::{Signal, kill, killpg, raise},
         wait::{WaitStatus, waitpid},
     },
-    unistd::{ForkResult, Pid, fork},
+    unistd::{ForkResult, Pid, fork, setpgid},
 };
 
-/// The traced process; killed and reaped when dropped.
+/// The traced process; killed and reaped when dropped, with what it forked.
 pub(crate) struct Tracee {
     pid: Pid,
     gone: bool,
@@ -51,6 +51,8 @@ impl Tracee {
         match unsafe { fork() }.expect("a fork") {
             ForkResult::Child => {
                 drop(ours);
+                // What it forks is of the same group, which can be killed as a whole.
+                let _ = setpgid(Pid::from_raw(0), Pid::from_raw(0));
                 let traced = ptrace::traceme().is_ok();
                 let well = traced && catch_unwind(AssertUnwindSafe(|| life(theirs))).is_ok();
                 // SAFETY: ends the process at once; nothing of the parent's may be dropped here.
@@ -85,7 +87,27 @@ impl Tracee {
         (0..count).any(|_| self.step() == Step::Done)
     }
 
-    /// Kills it where it stands.
+    /// Lets it run on to the operation's end.
+    pub(crate) fn advance_to_end(&mut self) {
+        ptrace::cont(self.pid, None).expect("a stopped tracee");
+        match waitpid(self.pid, None).expect("a child") {
+            WaitStatus::Stopped(_, Signal::SIGSTOP) => {}
+            other => panic!("it ended in its operation: {other:?}"),
+        }
+    }
+
+    /// Lets it go its own way from the operation's end.
+    pub(crate) fn release(&mut self) {
+        ptrace::detach(self.pid, None).expect("a stopped tracee");
+    }
+
+    /// Waits until it has come to its own end, which must be a good one.
+    pub(crate) fn finish(&mut self) {
+        self.gone = true;
+        assert_eq!(waitpid(self.pid, None), Ok(WaitStatus::Exited(self.pid, 0)));
+    }
+
+    /// Kills it where it stands. What it forked lives on.
     pub(crate) fn end(&mut self) {
         if !mem::replace(&mut self.gone, true) {
             let _ = kill(self.pid, Signal::SIGKILL);
@@ -100,6 +122,10 @@ impl Tracee {
 impl Drop for Tracee {
     fn drop(&mut self) {
         self.end();
+        // Its forks are this process's to reap, which is a subreaper.
+        if killpg(self.pid, Signal::SIGKILL).is_ok() {
+            while waitpid(Pid::from_raw(-self.pid.as_raw()), None).is_ok() {}
+        }
     }
 }
 

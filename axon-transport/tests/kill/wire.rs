@@ -117,6 +117,22 @@ impl Wire {
         Some(Grant { generation, first })
     }
 
+    /// Whether nothing is to be received: that of a dead process, a fork of which keeps the socket.
+    pub(crate) fn is_empty(&self) -> bool {
+        !self.is_ready()
+    }
+
+    /// What a reader has counted.
+    pub(crate) fn count(&self, counts: [u64; 4]) {
+        self.send(counts.map(u64::to_le_bytes).as_flattened(), &[]);
+    }
+
+    pub(crate) fn take_count(&self) -> [u64; 4] {
+        let (bytes, _) = self.receive();
+        let words = bytes.as_chunks::<8>().0.iter().map(|word| u64::from_le_bytes(*word));
+        words.collect::<Vec<_>>().try_into().expect("four numbers")
+    }
+
     /// The publisher's half of an attachment, whole. The reader's segments.
     pub(crate) fn serve(
         &self,

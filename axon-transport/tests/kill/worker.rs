@@ -7,23 +7,30 @@ use std::{
     os::fd::{AsFd, OwnedFd},
 };
 
-use nix::unistd::alarm;
+use nix::{sys::prctl, unistd::alarm};
 use rustix::{
     fs::{SeekFrom, seek},
     io::pread,
 };
 
 use crate::{
-    operation::{Case, cases},
-    survivor::{Outcome, Scene, holdings},
+    around::{Around, Tidy},
+    cases::cases,
+    operation::Case,
+    report::Report,
+    survivor::{Holdings, Outcome, Scene},
 };
 
 /// Kills that a bounded run makes in all, if there are so many instructions.
 const BOUNDED: usize = 1000;
-/// Instructions of an operation that a bounded run leaves to the full one.
-const LONG: u64 = 20_000;
-/// Where such an operation is killed in a bounded run.
+/// Where a long operation is killed in a bounded run.
 const BLIND: [u64; 8] = [0, 100, 1000, 5000, 10_000, 20_000, 40_000, u64::MAX];
+/// Steps that a full run takes at most to kill an operation at each of its instructions, or at each
+/// so many of a long one.
+const STEPS: u64 = 2_000_000;
+/// States of a long operation around which a full run kills it, and the last ones of them.
+const STATES: usize = 100;
+const LAST: usize = 50;
 /// A scene that takes longer is wedged, in seconds.
 const PATIENCE: u32 = 60;
 
@@ -33,16 +40,10 @@ pub(crate) struct Plan {
     pub(crate) cases: Vec<usize>,
 }
 
-/// What came of a case.
-pub(crate) struct Report {
-    case: usize,
-    instructions: u64,
-    states: usize,
-    pub(crate) kills: usize,
-    shown: usize,
-}
-
 pub(crate) fn run(plan: &Plan) {
+    // What a doomed process forked is this one's to reap.
+    prctl::set_child_subreaper(true).expect("a subreaper");
+    let _tidy = Tidy;
     let all = cases();
     for &index in &plan.cases {
         let case = &all[index];
@@ -50,11 +51,14 @@ pub(crate) fn run(plan: &Plan) {
             let mut out = stdout().lock();
             writeln!(out, "{what}").and_then(|()| out.flush()).expect("somebody who listens");
         };
+        if let Some(why) = case.around.refused() {
+            say(&Report::skipped(case.name, &why).line());
+            continue;
+        }
         say(&format!("\"{}\", walking", case.name));
-        let limit = if plan.full { u64::MAX } else { LONG };
         // A long one is killed at some points all the same; the states are for the full run.
-        let walked = walk(case, limit);
-        let (instructions, states) = walked.unwrap_or_default();
+        let (instructions, states) =
+            if case.long && !plan.full { Default::default() } else { walk(case) };
         let points = match instructions {
             0 => BLIND.into(),
             _ => points(plan.full, instructions, &states, BOUNDED.div_ceil(all.len())),
@@ -64,36 +68,45 @@ pub(crate) fn run(plan: &Plan) {
             say(&format!("\"{}\", instruction {point}", case.name));
             outcomes.push((point, at(case, point)));
         }
-        assert!(!outcomes[0].1.shown, "{}: shown before it begins", case.name);
+        let begun = outcomes[0].1.shown && case.around != Around::Stopped;
+        assert!(!begun, "{}: shown before it begins", case.name);
         assert!(outcomes.last().is_some_and(|(_, o)| o.done), "the last point is the end");
         let shown = outcomes.iter().filter(|(_, outcome)| outcome.shown).count();
-        let kills = outcomes.len();
-        let states = states.len();
-        say(&Report { case: index, instructions, states, kills, shown }.line());
+        let many = instructions == 0;
+        let counted = |count: u64| if many { "many".to_owned() } else { count.to_string() };
+        let report = Report {
+            name: case.name.to_owned(),
+            dies: if case.operation.kills_publisher() { "publisher" } else { "reader" }.to_owned(),
+            instructions: counted(instructions),
+            states: counted(states.len() as u64),
+            kills: outcomes.len(),
+            shown,
+            skipped: String::new(),
+        };
+        say(&report.line());
     }
 }
 
 /// Kills after `point` instructions.
 fn at(case: &Case, point: u64) -> Outcome {
     alarm::set(PATIENCE);
-    let before = holdings();
+    let before = Holdings::now();
     let mut scene = Scene::set(case);
     scene.advance(point);
-    let outcome = scene.kill();
-    assert_eq!(holdings(), before, "descriptors and maps are left");
+    let outcome = if case.around == Around::Stopped { scene.stop() } else { scene.kill() };
+    assert_eq!(Holdings::now(), before, "something is left");
     alarm::cancel();
     outcome
 }
 
 /// Steps through the operation: its instructions, and those after which a segment had changed.
-/// `None` where it has more than `limit`.
-fn walk(case: &Case, limit: u64) -> Option<(u64, Vec<u64>)> {
-    alarm::set(10 * PATIENCE);
+fn walk(case: &Case) -> (u64, Vec<u64>) {
+    alarm::set(20 * PATIENCE);
     let mut scene = Scene::set(case);
     let mut last = contents(&scene.written);
-    let (mut steps, mut states) = (0, Vec::new());
-    while steps < limit {
-        let done = scene.advance(1);
+    let (mut steps, mut states, mut done) = (0, Vec::new(), false);
+    while !done {
+        done = scene.advance(1);
         steps += 1;
         scene.look_for_segments();
         let now = contents(&scene.written);
@@ -101,13 +114,9 @@ fn walk(case: &Case, limit: u64) -> Option<(u64, Vec<u64>)> {
             states.push(steps);
             last = now;
         }
-        if done {
-            alarm::cancel();
-            return Some((steps, states));
-        }
     }
     alarm::cancel();
-    None
+    (steps, states)
 }
 
 /// What memory backs the segments with. Read without mapping: that would back their holes.
@@ -132,22 +141,30 @@ fn points(full: bool, instructions: u64, states: &[u64], share: usize) -> Vec<u6
     let mut points = BTreeSet::from([0, instructions]);
     // The end may come later in another run: addresses and the allocator's state differ.
     points.insert(2 * instructions + 10_000);
+    let around = |state: &u64| [state - 1, *state];
+    if full {
+        // To come to an instruction takes all those before it: of many, only each so many.
+        let every = (instructions * instructions).div_ceil(2 * STEPS).max(1);
+        points.extend((0..=instructions).step_by(usize::try_from(every).expect("a step")));
+        // Most of many states are words of a payload that nobody sees yet.
+        let many = states.len().div_ceil(STATES);
+        points.extend(states.iter().step_by(many.max(1)).flat_map(around));
+        points.extend(states.iter().rev().take(LAST).flat_map(around));
+        return points.into_iter().collect();
+    }
     let mut random = instructions;
     let mut below = |bound: u64| {
         random = random.wrapping_mul(0x5851_f42d_4c95_7f2d).wrapping_add(0x1405_7b7e_f767_814f);
         (random >> 32) % bound
     };
-    if full {
-        points.extend(0..=instructions);
-    } else if 2 * states.len() < share {
-        points.extend(states.iter().flat_map(|&state| [state - 1, state]));
+    if 2 * states.len() < share {
+        points.extend(states.iter().flat_map(around));
     } else {
-        // Most of many states are words of a payload that nobody sees yet; the last publish it.
-        let last = &states[states.len() - share / 4..];
-        points.extend(last.iter().flat_map(|&state| [state - 1, state]));
+        // The last of many publish what the others prepared.
+        points.extend(states[states.len() - share / 4..].iter().flat_map(around));
     }
     let share = share.min(usize::try_from(instructions / 2).unwrap_or(share));
-    while points.len() < share && !full {
+    while points.len() < share {
         points.insert(match states {
             [] => below(instructions),
             _ if below(2) == 0 => below(instructions),
@@ -170,40 +187,5 @@ impl fmt::Display for Plan {
         f.write_str(if self.full { "full:" } else { "bounded:" })?;
         let cases: Vec<String> = self.cases.iter().map(ToString::to_string).collect();
         f.write_str(&cases.join(","))
-    }
-}
-
-impl Report {
-    fn line(&self) -> String {
-        let Self { case, instructions, states, kills, shown } = self;
-        format!("done {case} {instructions} {states} {kills} {shown}")
-    }
-
-    pub(crate) fn parse(line: &str) -> Option<Self> {
-        let mut numbers = line.strip_prefix("done ")?.split(' ').map(str::parse::<usize>);
-        let mut next = || numbers.next()?.ok();
-        let (case, instructions) = (next()?, next()? as u64);
-        Some(Self { case, instructions, states: next()?, kills: next()?, shown: next()? })
-    }
-}
-
-impl fmt::Display for Report {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let case = &cases()[self.case];
-        let dies = if case.operation.kills_publisher() { "publisher" } else { "reader" };
-        let Self { instructions, states, kills, shown, .. } = self;
-        if *instructions == 0 {
-            let long = format!("> {LONG}");
-            return write!(
-                f,
-                "{:<44} {dies:>9} {long:>12} {:>7} {kills:>7} {shown:>7}",
-                case.name, ""
-            );
-        }
-        write!(
-            f,
-            "{:<44} {dies:>9} {instructions:>12} {states:>7} {kills:>7} {shown:>7}",
-            case.name
-        )
     }
 }
