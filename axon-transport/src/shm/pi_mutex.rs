@@ -26,7 +26,11 @@ use rustix::{
     thread::{futex, gettid},
 };
 
-use super::{ShmError, fork::ForkToken};
+use super::{
+    ShmError,
+    fork::ForkToken,
+    sync::{LockWord, Site},
+};
 
 /// How often a thread yields before it naps, where the kernel does not wait for it.
 const YIELDS: u32 = 10;
@@ -63,8 +67,7 @@ impl<T> PiMutex<T> {
     pub(super) fn lock(&self) -> PiGuard<'_, T> {
         debug_assert!(!self.process.is_forked(), "a mutex of the parent process");
         let thread = thread_id(self.process);
-        // Pairs with the release in `unlock`: what the last holder wrote is visible.
-        if self.word.compare_exchange(0, thread, Ordering::Acquire, Ordering::Relaxed).is_err() {
+        if !take(&self.word, thread) {
             self.wait(thread);
         }
         PiGuard { mutex: self, thread, _stays: PhantomData }
@@ -88,9 +91,7 @@ impl<T> PiMutex<T> {
                 Err(_) if look < YIELDS => thread::yield_now(),
                 Err(_) => thread::sleep(NAP),
             }
-            // Pairs with `unlock`, as in `lock`.
-            let taken = self.word.compare_exchange(0, thread, Ordering::Acquire, Ordering::Relaxed);
-            if taken.is_ok() {
+            if take(&self.word, thread) {
                 return;
             }
         }
@@ -98,8 +99,7 @@ impl<T> PiMutex<T> {
 
     #[inline]
     fn unlock(&self, thread: u32) {
-        // Pairs with the acquires in `lock` and `wait`.
-        if self.word.compare_exchange(thread, 0, Ordering::Release, Ordering::Relaxed).is_err() {
+        if !let_go(&self.word, thread) {
             self.hand_on();
         }
     }
@@ -110,6 +110,18 @@ impl<T> PiMutex<T> {
         let handed = futex::unlock_pi(&self.word, futex::Flags::PRIVATE);
         debug_assert!(handed.is_ok(), "a mutex was not held: {handed:?}");
     }
+}
+
+/// Takes a lock that is free; false when it is not. Pairs with [`let_go`].
+#[inline(always)]
+pub(super) fn take(word: &impl LockWord, thread: u32) -> bool {
+    word.swap_if(0, thread, Site::TakeSwap.order())
+}
+
+/// Lets go of a lock that nobody waits for; false when somebody does. Pairs with [`take`].
+#[inline(always)]
+pub(super) fn let_go(word: &impl LockWord, thread: u32) -> bool {
+    word.swap_if(thread, 0, Site::LetGoSwap.order())
 }
 
 impl<T> fmt::Debug for PiMutex<T> {

@@ -9,7 +9,7 @@
 //! between processes that map the same page.
 
 pub(crate) use std::sync::atomic::Ordering;
-use std::sync::atomic::{AtomicU64, fence};
+use std::sync::atomic::{AtomicU32, AtomicU64, fence};
 
 /// A 64-bit atomic word, in mapped memory or in a model.
 ///
@@ -20,6 +20,12 @@ pub(crate) trait Word {
     /// Stores the larger of the two and returns what was there. For words private to a process.
     fn fetch_max(&self, value: u64, order: Ordering) -> u64;
     fn fence(order: Ordering);
+}
+
+/// A 32-bit atomic word that says who holds a lock of this process.
+pub(crate) trait LockWord {
+    /// Stores `to` if `from` is there; whether it was.
+    fn swap_if(&self, from: u32, to: u32, order: Ordering) -> bool;
 }
 
 /// A place where the order of memory accesses matters. All others are relaxed.
@@ -38,6 +44,7 @@ pub(crate) trait Word {
 /// | `CloseStore`, `AskStore` | `GenerationLoad` | whoever sees a reader gone writes after it read |
 /// | `CursorStore` | `CursorLoad` | a sample is copied out before KEEP_ALL writes over it |
 /// | `ArmFence` | `SettleFence` | the sleeper sees the news, or the waker sees the ticket |
+/// | `LetGoSwap` | `TakeSwap` | whoever takes a lock sees what its last holder did |
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Site {
     StampStore,
@@ -65,6 +72,8 @@ pub(crate) enum Site {
     CursorLoad,
     ArmFence,
     SettleFence,
+    LetGoSwap,
+    TakeSwap,
 }
 
 impl Site {
@@ -91,7 +100,8 @@ impl Site {
             | Self::AskStore
             | Self::OpenStore
             | Self::CloseStore
-            | Self::CursorStore => Ordering::Release,
+            | Self::CursorStore
+            | Self::LetGoSwap => Ordering::Release,
             Self::StampLoad
             | Self::HeadLoad
             | Self::TailLoad
@@ -100,7 +110,8 @@ impl Site {
             | Self::MappedLoad
             | Self::ScanLoad
             | Self::GenerationLoad
-            | Self::CursorLoad => Ordering::Acquire,
+            | Self::CursorLoad
+            | Self::TakeSwap => Ordering::Acquire,
             // Each side stores one word and loads another.
             Self::ReclaimFence | Self::PinFence | Self::ArmFence | Self::SettleFence => {
                 Ordering::SeqCst
@@ -121,7 +132,7 @@ pub(crate) fn fence_at<W: Word>(site: Site) {
 
 #[cfg(test)]
 impl Site {
-    pub(crate) const ALL: [Self; 25] = [
+    pub(crate) const ALL: [Self; 27] = [
         Self::StampStore,
         Self::StampLoad,
         Self::HeadStore,
@@ -147,6 +158,8 @@ impl Site {
         Self::CursorLoad,
         Self::ArmFence,
         Self::SettleFence,
+        Self::LetGoSwap,
+        Self::TakeSwap,
     ];
     /// Names the site to weaken to a run of the models.
     pub(crate) const WEAKEN: &str = "SHM_TEST_WEAKEN";
@@ -208,5 +221,19 @@ impl Word for loom::sync::atomic::AtomicU64 {
 
     fn fence(order: Ordering) {
         loom::sync::atomic::fence(order);
+    }
+}
+
+impl LockWord for AtomicU32 {
+    #[inline]
+    fn swap_if(&self, from: u32, to: u32, order: Ordering) -> bool {
+        self.compare_exchange(from, to, order, Ordering::Relaxed).is_ok()
+    }
+}
+
+#[cfg(test)]
+impl LockWord for loom::sync::atomic::AtomicU32 {
+    fn swap_if(&self, from: u32, to: u32, order: Ordering) -> bool {
+        self.compare_exchange(from, to, order, Ordering::Relaxed).is_ok()
     }
 }

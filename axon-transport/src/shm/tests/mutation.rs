@@ -43,6 +43,9 @@ fn caught_by(site: Site) -> &'static str {
         AskStore | CloseStore | GenerationLoad => {
             "shm::tests::model::lanes::a_reader_that_has_left_has_read_all"
         }
+        LetGoSwap | TakeSwap => {
+            "shm::tests::model::lock::whoever_takes_a_lock_sees_what_its_last_holder_did"
+        }
         ArmFence | SettleFence => "wait::tests::the_last_look_or_the_ring_finds_what_came",
     }
 }

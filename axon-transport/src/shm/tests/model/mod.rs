@@ -7,6 +7,7 @@
 
 mod growth;
 mod lanes;
+mod lock;
 mod pins;
 mod ring;
 

@@ -7,7 +7,7 @@ use loom::{
 
 use super::{
     super::super::{
-        lane::Tenancy,
+        lane::{self, Tenancy},
         pins::{about_to_scan, pin, unpin},
         ring::{bounds, retire},
         seats::scan,
@@ -88,6 +88,35 @@ fn a_record_that_pins_another_sample_says_that_the_last_was_read() {
             take(&ring, &lane, &mut cursor, |position| {
                 assert_eq!(cells[position as usize].get(), position + 1);
             });
+        }
+        publisher.join().unwrap();
+    });
+}
+
+/// `ReclaimFence`, `PinFence`: a publisher gives up what a reader has gone beyond, which that one may
+/// still keep.
+#[test]
+fn a_sample_that_is_kept_beyond_the_cursor_is_not_written_over() {
+    check(3, || {
+        let ring = Ring::new();
+        let (lane, tenancy) = granted(0);
+        let cell = Arc::new(Cell::new(1));
+        ring.show(0);
+        let publisher = {
+            let (ring, lane, cell) = (ring.clone(), lane.clone(), cell.clone());
+            thread::spawn(move || {
+                if tenancy.cursor(&lane[..]) == Some(1) {
+                    retire(&ring.header, 1);
+                    if is_free(&lane, &tenancy, 0) {
+                        cell.set(2);
+                    }
+                }
+            })
+        };
+        if pin(&lane, 0, 0, ring.tail()) {
+            lane::advance(&lane[..], 1);
+            assert_eq!(cell.get(), 1);
+            unpin(&lane, 0);
         }
         publisher.join().unwrap();
     });
