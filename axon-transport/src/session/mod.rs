@@ -18,7 +18,10 @@ mod publisher;
 pub(crate) mod signals;
 pub mod socket;
 mod state;
+mod status;
 mod subscription;
+#[cfg(test)]
+mod tests;
 
 use std::{
     os::fd::OwnedFd,
@@ -442,7 +445,7 @@ pub fn daemon_status(config: &Config) -> Result<String, SessionError> {
     };
     let connected = caller.connect()?;
     let address = address::Address::of(&config).to_string();
-    status_text(control::ask_status(&connected.socket, &address, ANSWER)?)
+    status_text(status::ask(&connected.socket, &address, ANSWER)?)
 }
 
 fn status_text(bytes: Vec<u8>) -> Result<String, SessionError> {

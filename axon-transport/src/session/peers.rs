@@ -5,7 +5,7 @@
 //! does, so that both agree on what this session holds.
 
 use std::{
-    collections::{HashMap, HashSet, hash_map::Entry as Slot},
+    collections::{BTreeSet, HashMap, HashSet, hash_map::Entry as Slot},
     sync::Arc,
 };
 
@@ -14,9 +14,9 @@ use super::{
     state::MemoryNews,
 };
 use crate::{
-    ids::SessionId,
+    ids::{Gid, SessionId},
     passed::PassedFd,
-    shm::{Peer, PeerDescriptors, PeerSession, SessionSegment, ShmError},
+    shm::{Peer, PeerDescriptors, PeerSession, SegmentInfo, SegmentKind, SessionSegment, ShmError},
 };
 
 pub(super) struct Peers {
@@ -28,6 +28,19 @@ pub(super) struct Peers {
 struct Entry {
     session: Arc<PeerSession>,
     pairs: HashSet<Pair>,
+    /// The segments that came or were named since the daemon began to tell everything: of others it
+    /// does not know that they are here, so it will not say when they are gone.
+    named: BTreeSet<u32>,
+}
+
+impl Entry {
+    fn add(&mut self, segment: Segment, descriptor: &PassedFd) {
+        self.named.insert(segment.number);
+        if let Err(error) = self.session.add_segment(segment.into(), descriptor) {
+            let (session, number) = (self.session.id(), segment.number);
+            tracing::error!(%session, number, %error, "memory of another process is not usable");
+        }
+    }
 }
 
 /// Why a peer session cannot be used.
@@ -66,19 +79,62 @@ impl Peers {
                 let session = PeerSession::map(id, PeerDescriptors { segment, doorbell, pidfd })?;
                 let news = self.news.clone();
                 session.on_wanted(move || news.wake());
-                slot.insert(Entry { session, pairs: HashSet::new() })
+                let (pairs, named) = (HashSet::new(), BTreeSet::new());
+                slot.insert(Entry { session, pairs, named })
             }
         };
         entry.pairs.insert(pair);
         for (segment, descriptor) in segments.iter().zip(&maps) {
-            entry.session.add_segment((*segment).into(), descriptor)?;
+            entry.add(*segment, descriptor);
         }
         Ok(Peer::Remote(entry.session.clone()))
     }
 
-    /// A session that is held, or `None`.
-    pub(super) fn get(&self, id: &SessionId) -> Option<&Arc<PeerSession>> {
-        self.peers.get(id).map(|entry| &entry.session)
+    /// A session that is held has one segment more.
+    pub(super) fn opened(&mut self, id: &SessionId, segment: Segment, descriptor: &PassedFd) {
+        if let Some(entry) = self.peers.get_mut(id) {
+            entry.add(segment, descriptor);
+        }
+    }
+
+    /// A session that is held has given a segment up.
+    pub(super) fn gone(&mut self, id: &SessionId, number: u32) {
+        if let Some(entry) = self.peers.get_mut(id) {
+            entry.named.remove(&number);
+            entry.session.remove_segment(number);
+        }
+    }
+
+    /// Lets go of a session's memory for samples of `writer` that was not named, now that all of it
+    /// has been.
+    pub(super) fn drop_unnamed(&mut self, id: &SessionId, writer: Gid) {
+        if let Some(Entry { session, named, .. }) = self.peers.get(id) {
+            for SegmentInfo { number, kind } in session.segments() {
+                if kind == SegmentKind::Samples(writer) && !named.contains(&number) {
+                    session.remove_segment(number);
+                }
+            }
+        }
+    }
+
+    /// Lets go of sessions that nobody has to do with, and of memory for samples that neither was
+    /// named nor is of a writer that is `read`. What of it is read though it was not named is
+    /// returned.
+    pub(super) fn drop_unread(&mut self, read: impl Fn(&Gid) -> bool) -> Vec<(SessionId, u32)> {
+        // Readers and publishers hold the sessions that they have to do with.
+        self.peers.retain(|_, e| !e.pairs.is_empty() || Arc::strong_count(&e.session) > 1);
+        let mut unnamed = Vec::new();
+        for (id, Entry { session, named, .. }) in &self.peers {
+            for SegmentInfo { number, kind } in session.segments() {
+                match kind {
+                    SegmentKind::Samples(_) if named.contains(&number) => {}
+                    SegmentKind::Samples(writer) if read(&writer) => unnamed.push((*id, number)),
+                    SegmentKind::Samples(_) => session.remove_segment(number),
+                    SegmentKind::Session | SegmentKind::Heap => {}
+                }
+            }
+        }
+        unnamed
     }
 
     /// The daemon said that `pair` is over.
@@ -88,7 +144,10 @@ impl Peers {
 
     /// The daemon starts to count anew. What is mapped stays, for the pairs that it will repeat.
     pub(super) fn recount(&mut self) {
-        self.peers.values_mut().for_each(|entry| entry.pairs.clear());
+        for entry in self.peers.values_mut() {
+            entry.pairs.clear();
+            entry.named.clear();
+        }
     }
 
     /// Forgets and returns the sessions whose process is dead.

@@ -275,13 +275,16 @@ impl Slots {
             // it wrote before.
             slot.over = true;
             self.sweep();
+            self.forget_older(writer);
             return Accept::AskAgain;
         }
         self.pending.remove(&writer).map_or(Accept::Stands, Accept::Map)
     }
 
     pub(super) fn add(&mut self, reader: Reader) {
+        let writer = reader.writer();
         self.slots.push(Slot { reader, over: false, overtaken: false });
+        self.forget_older(writer);
     }
 
     /// The writer will not write any more. Whether that is news.
@@ -309,6 +312,29 @@ impl Slots {
         }
         self.sweep();
         news
+    }
+
+    /// Gives up all but the last of what a writer left: one that begins anew and anew would otherwise
+    /// take all lanes. What comes after is read by the later grant, too.
+    fn forget_older(&mut self, writer: Gid) {
+        while let [older, newer, ..] = self.slots_of(writer)[..]
+            && self.slots[newer].over
+        {
+            let later = self.slots[newer].reader.grant().first;
+            let slot = self.slots.remove(older);
+            self.lost += slot.reader.lost() + slot.reader.unread_below(later);
+        }
+    }
+
+    /// Where this writer's are, in the order in which it granted them.
+    fn slots_of(&self, writer: Gid) -> Vec<usize> {
+        let of = |index: &usize| self.slots[*index].reader.writer() == writer;
+        (0..self.slots.len()).filter(of).collect()
+    }
+
+    /// Whether anything of this writer's is read, or may be soon.
+    pub(super) fn reads(&self, writer: &Gid) -> bool {
+        self.pending.contains_key(writer) || self.slots.iter().any(|s| s.reader.writer() == *writer)
     }
 
     /// Unmaps writers that are gone and drained.

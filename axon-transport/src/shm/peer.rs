@@ -93,14 +93,21 @@ pub struct PeerSession {
 /// What is known of the segments besides the first.
 #[derive(Default)]
 struct Further {
-    /// `None` for one that could not be used.
-    maps: BTreeMap<u32, Option<Arc<Map>>>,
+    /// By their numbers.
+    maps: BTreeMap<u32, Told>,
     /// The highest number of those that came.
     highest: u32,
     /// Those that a reader has met and nobody has been asked for yet.
     wanted: BTreeSet<u32>,
     /// The readers, whose lanes tell the session which of its segments they have.
     readers: Vec<Weak<Attachment>>,
+}
+
+/// A segment that the session was said to have.
+struct Told {
+    kind: SegmentKind,
+    /// Absent for one that could not be used.
+    map: Option<Arc<Map>>,
 }
 
 /// What became of the look for a segment of another session.
@@ -162,7 +169,7 @@ impl PeerSession {
             // It was none of its session's doing.
             Err(error) => return Err(error),
         };
-        further.maps.insert(info.number, map);
+        further.maps.insert(info.number, Told { kind: info.kind, map });
         further.wanted.remove(&info.number);
         further.highest = further.highest.max(info.number);
         let highest = further.highest;
@@ -180,6 +187,13 @@ impl PeerSession {
     /// in use.
     pub fn remove_segment(&self, number: u32) {
         self.further().maps.remove(&number);
+    }
+
+    /// The segments that came, besides the first.
+    pub fn segments(&self) -> Vec<SegmentInfo> {
+        let further = self.further();
+        let info = |(number, told): (&u32, &Told)| SegmentInfo { number: *number, kind: told.kind };
+        further.maps.iter().map(info).collect()
     }
 
     /// Has `ask` called when a reader finds that a segment is missing, which then
@@ -203,8 +217,8 @@ impl PeerSession {
             return Found::Map(Arc::clone(&self.first));
         }
         match self.further().maps.get(&number) {
-            Some(Some(map)) => Found::Map(Arc::clone(map)),
-            Some(None) => Found::Refused,
+            Some(Told { map: Some(map), .. }) => Found::Map(Arc::clone(map)),
+            Some(Told { map: None, .. }) => Found::Refused,
             None => Found::Absent,
         }
     }

@@ -103,9 +103,7 @@ impl Ear {
     /// Sleeps until something comes, for at most `left`. Events of `others` end it too.
     pub(super) fn listen(&self, others: &[BorrowedFd<'_>], left: Option<Duration>) -> Heard {
         let timeout = not_too_long(left).and_then(|left| Timespec::try_from(left).ok());
-        // epoll counts in milliseconds, and would be late by up to one.
-        let in_millis = timeout.is_none_or(|timeout| timeout.tv_nsec % 1_000_000 == 0);
-        if others.is_empty() && in_millis {
+        if others.is_empty() && is_for_epoll(timeout.as_ref()) {
             return self.take(timeout.as_ref());
         }
         let all = [self.set.as_fd()];
@@ -167,6 +165,11 @@ impl Ear {
         }
         Drained::Some
     }
+}
+
+/// Whether epoll ends such a wait on time: it counts in milliseconds, and would be late by up to one.
+pub(super) fn is_for_epoll(timeout: Option<&Timespec>) -> bool {
+    timeout.is_none_or(|timeout| timeout.tv_nsec % 1_000_000 == 0)
 }
 
 /// What became of the rings in a queue.

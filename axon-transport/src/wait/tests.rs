@@ -11,12 +11,12 @@ use std::{
 };
 
 use rustix::{
-    event::{PollFd, PollFlags, poll},
+    event::{PollFd, PollFlags, Timespec, poll},
     fs::{OFlags, fcntl_getfl, fcntl_setfl},
     net::{RecvFlags, Shutdown, recv, shutdown},
 };
 
-use super::{Bell, Doorbell, Look, Purpose, arm, disarm, due, settle};
+use super::{Bell, Doorbell, Look, Purpose, arm, disarm, due, ear::is_for_epoll, settle};
 use crate::{
     ids::SessionId,
     passed::{
@@ -291,17 +291,25 @@ fn descriptors_in_a_bell_are_not_taken_and_keep_nobody_waiting() {
 }
 
 #[test]
-fn a_wait_is_not_rounded_up_to_milliseconds() {
+fn what_epoll_would_round_is_not_left_to_it() {
+    let is = |time: Duration| is_for_epoll(Some(&Timespec::try_from(time).unwrap()));
+    for odd in [1, 999, 200_000, 1_000_001, 1_500_000, 1_000_000_001, 2_999_999_999] {
+        assert!(!is(Duration::from_nanos(odd)), "{odd} ns");
+    }
+    for even in [0, 1, 7, 999, 1000, 1001, 60_000] {
+        assert!(is(Duration::from_millis(even)), "{even} ms");
+    }
+    assert!(is_for_epoll(None), "for ever");
+}
+
+#[test]
+fn a_wait_is_as_long_as_it_was_told() {
     let session = SessionSegment::create(SessionId::random()).unwrap();
-    let waits = (0..200).map(|_| {
-        let start = Instant::now();
-        session.wait(|| false, Some(Duration::from_micros(200)));
-        start.elapsed()
-    });
-    let shortest = waits.min().unwrap();
-    assert!(shortest >= Duration::from_micros(200), "it waits as long as it was told");
-    // However busy the machine is, one of so many was on time.
-    assert!(shortest < Duration::from_millis(1), "{shortest:?}");
+    for micros in [1, 200, 1000, 1700] {
+        let (start, time) = (Instant::now(), Duration::from_micros(micros));
+        assert!(!session.wait(|| false, Some(time)));
+        assert!(start.elapsed() >= time, "{micros} us");
+    }
 }
 
 /// What a follower waits for, and how often it was asked for it.

@@ -11,7 +11,10 @@ use crate::{
     ids::{Gid, SessionId},
     passed::PassedFd,
     session::{
-        message::{Attach, Granted, Graph, Message, Pair, Segment, SegmentOpened, Unmatch},
+        message::{
+            Attach, Granted, Graph, MAX_DESCRIPTORS, Message, Pair, Segment, SegmentName,
+            SegmentOpened, Unmatch,
+        },
         peers::PeerError,
         state::{SessionEvent, StatusAnswer},
         subscription::{Accept, SubscriptionInner},
@@ -33,9 +36,7 @@ impl Control {
             Message::Unmatch(unmatch) => self.unmatch(&unmatch),
             Message::Segment(opened) => self.segment(&opened, &descriptors),
             Message::SegmentGone(gone) => {
-                if let Some(peer) = self.peers.get(&gone.session) {
-                    peer.remove_segment(gone.number);
-                }
+                self.peers.gone(&gone.session, gone.number);
             }
             Message::Status(part) => {
                 let mut state = self.shared.state();
@@ -92,9 +93,11 @@ impl Control {
             self.endpoint_over(gid);
         }
         if !graph.more {
-            if let Some(repeated) = self.repeated.take() {
-                self.drop_unrepeated(&repeated);
+            let repeated = self.repeated.take();
+            if let Some(repeated) = &repeated {
+                self.drop_unrepeated(repeated);
             }
+            self.drop_unread(repeated.is_some());
             self.shared.notify(Some(&SessionEvent::Graph));
         }
     }
@@ -140,6 +143,22 @@ impl Control {
         }
     }
 
+    /// Lets go of memory of others that nobody here reads any more, of which the daemon did not say
+    /// so as it does not know of it: it was given up while there was no daemon, or while this
+    /// session was too slow to be told. After everything has been `told` anew the daemon hears of
+    /// what is read, so that it will say when that is given up.
+    fn drop_unread(&mut self, told: bool) {
+        let shared = self.shared.clone();
+        let read = |writer: &Gid| {
+            let subscriptions: Vec<_> = shared.state().subscriptions.values().cloned().collect();
+            subscriptions.iter().any(|subscription| subscription.lock().reads(writer))
+        };
+        let unnamed = self.peers.drop_unread(read);
+        for (session, number) in unnamed.into_iter().filter(|_| told) {
+            self.say(Message::Need(SegmentName { session, number }));
+        }
+    }
+
     fn matched(&mut self, pair: Pair) {
         if let Some(repeated) = &mut self.repeated {
             repeated.insert(pair);
@@ -167,7 +186,7 @@ impl Control {
         match lane {
             Ok(lane) => {
                 let message = self.attach_message(subscription, writer, lane);
-                self.outbox.push_back((message, Vec::new()));
+                self.say(message);
             }
             Err(error) => {
                 let topic = &subscription.endpoint.topic;
@@ -200,6 +219,10 @@ impl Control {
         }
         // Counted whether or not it comes to anything, as the daemon does.
         let peer = self.hold(attach.session, pair, descriptors, &attach.segments);
+        if attach.session == self.shared.id && !self.has_lane(&pair, attach.lane) {
+            tracing::error!(reader = %pair.reader, "a lane of this session that it has not");
+            return;
+        }
         let Some(publisher) = self.shared.state().publishers.get(&attach.writer).cloned() else {
             return;
         };
@@ -215,7 +238,7 @@ impl Control {
                 let ring = publisher.writer.location();
                 let segments = Vec::new();
                 let grant = Granted { reader, writer, generation, first, session, ring, segments };
-                self.outbox.push_back((Message::Grant(grant), Vec::new()));
+                self.say(Message::Grant(grant));
                 self.shared.notify(Some(&SessionEvent::Matched(writer)));
             }
             Err(error) => {
@@ -231,7 +254,16 @@ impl Control {
         if let Some(repeated) = &mut self.repeated {
             repeated.insert(pair);
         }
+        // In a packet that is full not all of them were named.
+        let all = descriptors.len() < MAX_DESCRIPTORS;
         let peer = self.hold(session, pair, descriptors, &segments);
+        if all {
+            self.peers.drop_unnamed(&session, writer);
+        }
+        if session == self.shared.id && !self.has_ring(&writer, ring) {
+            tracing::error!(%writer, "a ring of this session that it has not");
+            return;
+        }
         let Some(subscription) = self.shared.state().subscriptions.get(&reader).cloned() else {
             return;
         };
@@ -290,19 +322,33 @@ impl Control {
             // The daemon takes us to hold what we do not: have it start over.
             self.outbox.push_back((Message::Resync, Vec::new()));
         }
+        if !segments.is_empty() {
+            // Those who wait for what is in them.
+            self.shared.segment.notify();
+        }
         held
     }
 
-    fn segment(&self, opened: &SegmentOpened, descriptors: &[PassedFd]) {
-        let (Some(peer), [descriptor]) = (self.peers.get(&opened.session), descriptors) else {
-            return;
-        };
-        if let Err(error) = peer.add_segment(opened.segment.into(), descriptor) {
-            let (session, number) = (opened.session, opened.segment.number);
-            tracing::error!(%session, number, %error, "memory of another process is not usable");
+    /// Whether a subscription of ours has that lane for the writer. A lane is written to, and a ring
+    /// taken at its word, wherever the daemon says that they are; here that could be the bytes of a
+    /// sample.
+    fn has_lane(&self, pair: &Pair, lane: Location) -> bool {
+        let subscription = self.shared.state().subscriptions.get(&pair.reader).cloned();
+        subscription.is_some_and(|s| s.lock().lanes().contains(&(pair.writer, lane)))
+    }
+
+    /// Whether a publisher of ours has that ring.
+    fn has_ring(&self, writer: &Gid, ring: Location) -> bool {
+        let state = self.shared.state();
+        state.publishers.get(writer).is_some_and(|p| p.writer.location() == ring)
+    }
+
+    fn segment(&mut self, opened: &SegmentOpened, descriptors: &[PassedFd]) {
+        if let [descriptor] = descriptors {
+            self.peers.opened(&opened.session, opened.segment, descriptor);
+            // Those who wait for what is in it.
+            self.shared.segment.notify();
         }
-        // Those who wait for what is in it.
-        self.shared.segment.notify();
     }
 
     fn unmatch(&mut self, unmatch: &Unmatch) {

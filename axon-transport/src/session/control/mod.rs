@@ -5,7 +5,7 @@ mod handle;
 
 use std::{
     collections::{BTreeSet, HashSet, VecDeque},
-    os::fd::{AsFd, BorrowedFd, OwnedFd},
+    os::fd::{AsFd, BorrowedFd},
     sync::{
         Arc,
         atomic::Ordering,
@@ -23,7 +23,7 @@ use super::{
     message::{Announce, EndpointRole, Gone, Message, Pair, SegmentName, SegmentOpened},
     peers::Peers,
     socket::{self, SocketError},
-    state::{Outgoing, SegmentChange, SessionEvent, Shared, StatusAnswer, StatusText},
+    state::{Outgoing, SegmentChange, SessionEvent, Shared, StatusAnswer},
 };
 use crate::{graph::GraphView, ids::Gid, passed::PassedFd};
 
@@ -58,6 +58,10 @@ pub(super) struct Control {
     tend: Option<Instant>,
     /// The segments of our memory that this connection was told of.
     segments: BTreeSet<u32>,
+    /// Those that it could not be told of, for want of descriptors.
+    untold: BTreeSet<u32>,
+    /// Publishers that have no memory ready for their next large sample.
+    low: BTreeSet<Gid>,
     /// When this connection was made, and how long the search for the next one waits first: one
     /// that does not last is not to be had at once again, at the cost of everybody else.
     since: Instant,
@@ -88,6 +92,8 @@ impl Control {
             told: false,
             tend: None,
             segments: BTreeSet::new(),
+            untold: BTreeSet::new(),
+            low: BTreeSet::new(),
             since: Instant::now(),
             pause: Duration::ZERO,
             retry: None,
@@ -109,6 +115,7 @@ impl Control {
             self.try_again();
             self.collect();
             self.send();
+            self.prepare();
             self.sleep();
             self.receive();
             self.bury();
@@ -126,6 +133,7 @@ impl Control {
         self.repeated = None;
         self.told = false;
         self.segments.clear();
+        self.untold.clear();
         self.since = Instant::now();
         self.retry = None;
         let daemon = connected.welcome.daemon;
@@ -218,8 +226,18 @@ impl Control {
         matches!(self.link, Link::Socket(_) | Link::Local(_))
     }
 
+    /// Queues a message for the daemon, behind what it must know of memory that the message may
+    /// speak of.
+    fn say(&mut self, message: Message) {
+        self.tell_segments();
+        self.outbox.push_back((message, Vec::new()));
+    }
+
     /// Takes what changed in the session's memory, and what its readers lack of others'.
     fn tell_segments(&mut self) {
+        for number in self.untold.clone() {
+            self.tell_segment(SegmentChange::Opened(number));
+        }
         for change in self.shared.memory.take() {
             self.tell_segment(change);
         }
@@ -239,25 +257,40 @@ impl Control {
             SegmentChange::Opened(number) => match self.shared.segment.segment(number) {
                 Ok(Some((info, descriptor))) => {
                     self.segments.insert(number);
+                    self.untold.remove(&number);
                     let opened = SegmentOpened { session, segment: info.into() };
                     self.outbox.push_back((Message::Segment(opened), vec![descriptor.into()]));
                 }
                 // It is gone again.
-                Ok(None) => {}
-                Err(error) => tracing::error!(%error, "samples stay unseen by other processes"),
+                Ok(None) => {
+                    self.untold.remove(&number);
+                }
+                Err(error) => {
+                    if self.untold.insert(number) {
+                        tracing::error!(%error, "samples stay unseen by others until there is one");
+                    }
+                }
             },
             SegmentChange::Gone(number) => {
                 self.segments.remove(&number);
+                self.untold.remove(&number);
                 let gone = SegmentName { session, number };
                 self.outbox.push_back((Message::SegmentGone(gone), Vec::new()));
             }
             SegmentChange::Low(gid) => {
-                let publisher = self.shared.state().publishers.get(&gid).cloned();
-                if let Some(publisher) = publisher {
-                    // What lacks then, its next publish says.
-                    let _ = publisher.writer.prepare();
-                    self.look_after_memory();
-                }
+                self.low.insert(gid);
+            }
+        }
+    }
+
+    /// Has memory ready for those that publish large samples.
+    fn prepare(&mut self) {
+        for gid in std::mem::take(&mut self.low) {
+            let publisher = self.shared.state().publishers.get(&gid).cloned();
+            if let Some(publisher) = publisher {
+                // What lacks then, its next publish says.
+                let _ = publisher.writer.prepare();
+                self.look_after_memory();
             }
         }
     }
@@ -283,7 +316,7 @@ impl Control {
         }
         while let Some(outgoing) = state.outgoing.pop_front() {
             match outgoing {
-                Outgoing::Message(message) => self.outbox.push_back((*message, Vec::new())),
+                Outgoing::Message(message) => self.say(*message),
                 Outgoing::Announce(gid) => {
                     if let Some(publisher) = state.publishers.get(&gid) {
                         let announce = Announce {
@@ -292,7 +325,7 @@ impl Control {
                             stands_for: Vec::new(),
                             ring: Some(publisher.writer.location()),
                         };
-                        self.outbox.push_back((Message::Endpoint(announce), Vec::new()));
+                        self.say(Message::Endpoint(announce));
                     } else if let Some(subscription) = state.subscriptions.get(&gid) {
                         let announce = Announce {
                             endpoint: subscription.endpoint.clone(),
@@ -305,7 +338,7 @@ impl Control {
                             let lanes = subscription.lock().lanes();
                             for (writer, lane) in lanes {
                                 let attach = self.attach_message(subscription, writer, lane);
-                                self.outbox.push_back((attach, Vec::new()));
+                                self.say(attach);
                             }
                         }
                     } else if let Some(node) = state.nodes.get(&gid) {
@@ -370,7 +403,8 @@ impl Control {
         fds.extend(sessions.iter().map(|s| PollFd::from_borrowed_fd(s.pidfd(), PollFlags::IN)));
         // A socket without room becomes writable, but one that is short of descriptors in flight
         // does not say when that passes.
-        let nap = (!self.outbox.is_empty()).then_some(Duration::from_millis(20));
+        let blocked = !self.outbox.is_empty() || !self.untold.is_empty();
+        let nap = blocked.then_some(Duration::from_millis(20));
         let tend = self.tend.filter(|_| self.is_linked());
         let due = tend.into_iter().chain(self.retry).min();
         let due = due.map(|due| due.saturating_duration_since(Instant::now()));
@@ -444,38 +478,4 @@ fn stands_for(subscription: &super::subscription::SubscriptionInner) -> Vec<Gid>
     let mut gids = subscription.stands_for();
     gids.truncate(MAX_STANDS_FOR);
     gids
-}
-
-/// Asks for the status over a connection that does nothing else.
-pub(super) fn ask_status(
-    socket: &OwnedFd,
-    address: &str,
-    patience: Duration,
-) -> Result<Vec<u8>, SessionError> {
-    let silent = || SessionError::Silent { address: address.to_owned() };
-    let protocol = |e: SocketError| SessionError::Protocol(e.to_string());
-    let deadline = Instant::now() + patience;
-    socket::send(socket, &Message::StatusRequest.encode()?, &[]).map_err(protocol)?;
-    let (mut text, mut buffer) = (StatusText::default(), Vec::new());
-    loop {
-        match socket::receive(socket, &mut buffer) {
-            Ok(received) => {
-                if let Message::Status(part) = received.message
-                    && let Some(whole) = text.add(&part)
-                {
-                    return Ok(whole);
-                }
-            }
-            Err(SocketError::NotReady) => {
-                let left = deadline.saturating_duration_since(Instant::now());
-                let timeout = Timespec::try_from(left).unwrap_or_default();
-                let mut fds = [PollFd::new(socket, PollFlags::IN)];
-                if left.is_zero() || poll(&mut fds, Some(&timeout)) == Ok(0) {
-                    return Err(silent());
-                }
-            }
-            Err(SocketError::Closed) => return Err(SessionError::Disconnected),
-            Err(error) => return Err(protocol(error)),
-        }
-    }
 }

@@ -215,6 +215,11 @@ impl Reader {
         }
     }
 
+    /// Those of them that are below a position.
+    pub(crate) fn unread_below(&self, position: u64) -> u64 {
+        self.unread().min(position.saturating_sub(self.cursor))
+    }
+
     /// What goes with the next sample, without taking it.
     ///
     /// # Errors

@@ -1,7 +1,9 @@
 //! Two ends of a ring: in one process, in two, with a hostile one, and under the model checker.
 
 mod api;
+mod bounds;
 mod hostile;
+mod images;
 mod inspect;
 mod lines;
 mod local;
