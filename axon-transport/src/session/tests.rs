@@ -19,7 +19,7 @@ use rustix::{
 };
 
 use super::{
-    message::{Attach, Granted, Graph, PROTOCOL, Pair, Segment, SegmentOpened, Welcome},
+    message::{Attach, Granted, Graph, PROTOCOL, Pair, Segment, SegmentOpened, Unmatch, Welcome},
     socket::{Received, SocketError},
     *,
 };
@@ -363,6 +363,27 @@ fn what_a_writer_left_is_asked_for_by_who_was_behind_and_taken() {
     assert!(subscription.matched().is_empty());
     assert_eq!(take(&subscription), Some(1));
     assert_eq!(subscription.lost(), 0);
+}
+
+#[test]
+fn memory_that_a_writer_did_not_leave_is_given_up_with_what_is_in_it() {
+    let (session, daemon) = session();
+    let far = Far::new(&daemon);
+    let (subscription, _) = far.matched(&session, &daemon);
+    let lane = subscription.inner.lock().lanes()[0].1;
+    // Nobody is told of the memory of those that are large, and the writer ends; its process lives.
+    for sequence in 1..=20 {
+        far.publish(sequence, &vec![1; if sequence == 1 { 1 } else { LARGE }]);
+    }
+    let Pair { reader, writer } = far.pair(&subscription);
+    let unmatch = Unmatch { reader, writer, reason: "gone".into() };
+    daemon.say(Message::Unmatch(unmatch), &[]);
+    until("it is over", || subscription.matched().is_empty());
+    assert_eq!(take(&subscription), Some(1), "what is there");
+    until("the others are lost", || take(&subscription).is_none() && subscription.lost() == 19);
+    // All of them at once, not one by one as each is waited for.
+    assert!(!subscription.has_data());
+    assert_eq!(session.segment().allocate_lane().unwrap().location(), lane, "nor is it kept");
 }
 
 #[test]

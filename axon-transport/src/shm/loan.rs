@@ -20,7 +20,7 @@ use super::{
 ///
 /// Written from the front through [`io::Write`], or anywhere as the slice that it dereferences to;
 /// what the slice holds at first is zeros or bytes of earlier samples. In a forked child it is of
-/// no use: dereferencing it panics.
+/// no use: dereferencing it panics, and using a slice that was borrowed before ends the child.
 ///
 /// It borrows its publisher, and to publish it is the end of it:
 ///

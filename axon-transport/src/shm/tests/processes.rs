@@ -151,6 +151,9 @@ fn the_other_process() {
                     && kept.read_at(0, &mut [0; 8]) == 0
                     && writer.readers().is_empty()
                     && reader.take(&mut out) == Err(TakeError::Forked)
+                    // The publisher's memory is not there, as it is of the same session.
+                    && !reader.has_data()
+                    && (reader.unread(), reader.is_drained()) == (0, true)
                     && matches!(session.allocate_lane(), Err(ShmError::Forked))
                     && !session.wait(|| false, None);
                 drop((kept, loan));
