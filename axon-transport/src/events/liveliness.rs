@@ -79,6 +79,11 @@ impl Liveness {
         (-over, over)
     }
 
+    /// Whether a lease has run out and was not asserted again.
+    pub fn any_dead(&self) -> bool {
+        self.leases.values().any(|lease| !lease.alive)
+    }
+
     /// When the next lease runs out.
     pub fn due(&self) -> Option<u64> {
         self.leases.values().filter_map(Lease::due).min()
@@ -169,6 +174,7 @@ mod tests {
                 prop_assert_eq!(not_alive, model.len() as i64 - expected);
                 let due = model.values().filter(|m| is_alive(m)).filter_map(|(l, a)| l.map(|l| a + l)).min();
                 prop_assert_eq!(liveness.due(), due);
+                prop_assert_eq!(liveness.any_dead(), not_alive > 0);
             }
         }
     }

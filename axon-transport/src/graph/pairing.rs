@@ -42,7 +42,12 @@ pub fn pairing(writer: &Endpoint, reader: &Endpoint) -> Pairing {
     if writer.type_name != reader.type_name || hashes_differ {
         return Pairing::IncompatibleType;
     }
-    compatible(&writer.qos, &reader.qos).map_or_else(Pairing::IncompatibleQos, |()| Pairing::Match)
+    let mut offered = compatible(&writer.qos, &reader.qos);
+    if reader.kind != Subscription {
+        // Requests and responses go together, or neither goes.
+        offered = offered.and(compatible(&reader.qos, &writer.qos));
+    }
+    offered.map_or_else(Pairing::IncompatibleQos, |()| Pairing::Match)
 }
 
 #[cfg(test)]
@@ -105,5 +110,15 @@ mod tests {
         let writer = Endpoint { qos: Qos::sensor_data(), ..endpoint(Publisher) };
         let verdict = pairing(&writer, &endpoint(Subscription));
         assert_eq!(verdict, Pairing::IncompatibleQos(Incompatible::Reliability));
+    }
+
+    #[test]
+    fn a_service_and_a_client_match_in_both_directions_or_in_none() {
+        let weak = Endpoint { qos: Qos::sensor_data(), ..endpoint(Client) };
+        let reliability = Pairing::IncompatibleQos(Incompatible::Reliability);
+        assert_eq!(pairing(&weak, &endpoint(Server)), reliability);
+        assert_eq!(pairing(&endpoint(Server), &weak), reliability);
+        let server = Endpoint { kind: Server, ..weak.clone() };
+        assert_eq!(pairing(&server, &weak), Pairing::Match);
     }
 }

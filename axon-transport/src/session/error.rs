@@ -22,6 +22,9 @@ pub enum SessionError {
         /// The name.
         name: String,
     },
+    /// Something to wait for belongs to another session.
+    #[error("what is waited for belongs to another session: each waits for its own")]
+    OtherSession,
     /// `AXON_DAEMON=require`, and there is none.
     #[error("no daemon listens at {address}: start `axon_daemon`, or set AXON_DAEMON=spawn")]
     NoDaemon {

@@ -6,9 +6,14 @@
 //! finds or starts another and repeats what the first one knew.
 
 pub mod address;
+mod arrivals;
+mod callback;
+mod clock;
 mod connect;
 mod control;
 mod error;
+mod events;
+mod guard;
 mod local;
 pub mod message;
 mod node;
@@ -22,6 +27,7 @@ mod status;
 mod subscription;
 #[cfg(test)]
 mod tests;
+mod waiting;
 
 use std::{
     os::fd::OwnedFd,
@@ -30,13 +36,17 @@ use std::{
     time::Duration,
 };
 
+pub use callback::OnNew;
 pub use error::SessionError;
+pub use events::Event;
+pub use guard::GuardCondition;
 pub use message::SessionRole;
 pub use node::Node;
 pub use options::{DaemonCommand, EndpointSpec, SessionOptions};
 pub use publisher::{Loan, Publisher};
 pub use state::SessionEvent;
 pub use subscription::{MessageInfo, Subscription};
+pub use waiting::Waitable;
 
 use self::{
     connect::{Caller, Connected},
@@ -48,7 +58,7 @@ use self::{
 };
 use crate::{
     config::{Config, DaemonPolicy},
-    graph::{Endpoint, EndpointKind, GraphView},
+    graph::{Endpoint, EndpointKind, GraphView, Pairing, pairing},
     ids::{DaemonId, Gid, SessionId},
     qos::Qos,
     shm::{RingOptions, SessionSegment, ShmError, Writer},
@@ -56,6 +66,8 @@ use crate::{
 
 /// How long a daemon may take to answer a question.
 const ANSWER: Duration = Duration::from_secs(5);
+/// How long a new endpoint waits for those that it is matched with.
+const PAIRS: Duration = Duration::from_millis(50);
 
 /// A process's session. Cheap to clone; thread-safe. It ends when the last clone and the last of
 /// its publishers and subscriptions are gone.
@@ -137,22 +149,30 @@ impl Session {
         if self.is_forked() { None } else { self.shared().state().daemon }
     }
 
-    /// A publisher. Readers are matched later; see [`Publisher::wait_matched`].
+    /// A publisher. It is matched with those readers that the graph shows, unless they take more
+    /// than some milliseconds; others are matched later: see [`Publisher::wait_matched`].
     ///
     /// # Errors
     /// When the specification is out of bounds or there is no memory.
     pub fn create_publisher(&self, spec: EndpointSpec) -> Result<Publisher, SessionError> {
         let endpoint = self.endpoint(spec, EndpointKind::Publisher)?;
-        self.add_publisher(endpoint, EndpointRole::Application)
+        let publisher = self.add_publisher(endpoint, EndpointRole::Application)?;
+        let inner = &publisher.inner;
+        self.await_pairs(&inner.endpoint, |other| inner.events.is_matched(other));
+        Ok(publisher)
     }
 
-    /// A subscription. Publishers are matched later; see [`Subscription::wait_matched`].
+    /// A subscription. It is matched with those publishers that the graph shows, unless they take
+    /// more than some milliseconds; others are matched later: see [`Subscription::wait_matched`].
     ///
     /// # Errors
     /// When the specification is out of bounds.
     pub fn create_subscription(&self, spec: EndpointSpec) -> Result<Subscription, SessionError> {
         let endpoint = self.endpoint(spec, EndpointKind::Subscription)?;
-        Ok(self.add_subscription(endpoint, EndpointRole::Application, Vec::new()))
+        let subscription = self.add_subscription(endpoint, EndpointRole::Application, Vec::new());
+        let inner = &subscription.inner;
+        self.await_pairs(&inner.endpoint, |other| inner.events.is_matched(other));
+        Ok(subscription)
     }
 
     /// A node, which is in the graph until it is dropped.
@@ -177,9 +197,15 @@ impl Session {
             return Err(SessionError::Node { name: described.node });
         }
         let gid = described.gid;
-        self.shared().state().nodes.insert(gid, described.clone());
+        let changed = self.create_guard_condition();
+        self.shared().state().nodes.insert(gid, (described.clone(), changed.clone()));
         self.shared().tell(Outgoing::Announce(gid));
-        Ok(Node::new(described, self.clone()))
+        Ok(Node::new(described, changed, self.clone()))
+    }
+
+    /// A condition that the program triggers itself, for wait sets of this session.
+    pub fn create_guard_condition(&self) -> GuardCondition {
+        GuardCondition::new(self.shared().segment.clone())
     }
 
     /// A local ring for a publisher on another host, under that publisher's own GID. For the
@@ -356,7 +382,13 @@ impl Session {
         };
         let writer = Writer::create(shared.segment.clone(), options)?;
         let inner = Arc::new(PublisherInner::new(endpoint, role, writer));
-        shared.state().publishers.insert(gid, inner.clone());
+        {
+            let mut state = shared.state();
+            if role == EndpointRole::Application {
+                state.index(&inner.endpoint);
+            }
+            state.publishers.insert(gid, inner.clone());
+        }
         shared.tell(Outgoing::Announce(gid));
         Ok(Publisher { inner, session: self.clone() })
     }
@@ -369,7 +401,13 @@ impl Session {
     ) -> Subscription {
         let gid = endpoint.gid;
         let inner = Arc::new(SubscriptionInner::new(endpoint, role, stands_for));
-        self.shared().state().subscriptions.insert(gid, inner.clone());
+        {
+            let mut state = self.shared().state();
+            if role == EndpointRole::Application {
+                state.index(&inner.endpoint);
+            }
+            state.subscriptions.insert(gid, inner.clone());
+        }
         self.shared().tell(Outgoing::Announce(gid));
         Subscription { inner, session: self.clone() }
     }
@@ -382,12 +420,17 @@ impl Session {
         }
         let mut state = self.shared().state();
         state.nodes.remove(gid);
-        let stand_in =
-            state.publishers.remove(gid).is_some_and(|p| p.role != EndpointRole::Application);
-        let relay =
-            state.subscriptions.remove(gid).is_some_and(|s| s.role != EndpointRole::Application);
-        if !stand_in && !relay {
-            state.tombstones.insert(*gid);
+        let publisher = state.publishers.remove(gid);
+        let subscription = state.subscriptions.remove(gid);
+        let publisher = publisher.as_ref().map(|p| (&p.endpoint, p.role));
+        let subscription = subscription.as_ref().map(|s| (&s.endpoint, s.role));
+        match publisher.or(subscription) {
+            Some((_, EndpointRole::StandIn | EndpointRole::Relay)) => {}
+            Some((endpoint, EndpointRole::Application)) => {
+                state.unindex(endpoint);
+                state.tombstones.insert(*gid);
+            }
+            None => drop(state.tombstones.insert(*gid)),
         }
         let gone = message::Gone { gid: *gid };
         state.outgoing.push_back(Outgoing::Message(Box::new(Message::EndpointGone(gone))));
@@ -401,6 +444,48 @@ impl Session {
             return;
         }
         self.shared().tell(Outgoing::Announce(gid));
+    }
+
+    /// Waits until a new endpoint is matched with all that the graph shows and that go with it: whoever
+    /// counts them reaches them. Not for long, and not where nobody could do it.
+    fn await_pairs(&self, own: &Endpoint, matched: impl Fn(&Gid) -> bool) {
+        let shared = self.shared();
+        if shared.control.get() == Some(&std::thread::current().id()) {
+            return;
+        }
+        let goes = |other: &Endpoint| {
+            pairing(own, other) == Pairing::Match || pairing(other, own) == Pairing::Match
+        };
+        // Of its own session's endpoints it is sure, and both ends are waited for.
+        let (mut others, mut publishers, mut subscriptions) = (Vec::new(), Vec::new(), Vec::new());
+        let graph = {
+            let state = shared.state();
+            if state.daemon.is_none() && shared.config.daemon != DaemonPolicy::Off {
+                return;
+            }
+            for gid in state.topics.get(&own.topic).into_iter().flatten() {
+                publishers.extend(state.publishers.get(gid).filter(|p| goes(&p.endpoint)).cloned());
+                subscriptions
+                    .extend(state.subscriptions.get(gid).filter(|s| goes(&s.endpoint)).cloned());
+            }
+            state.graph.clone()
+        };
+        let foreign = graph.endpoints.values().map(|other| &other.endpoint);
+        let foreign = foreign.filter(|other| other.gid.0[..12] != own.gid.0[..12] && goes(other));
+        others.extend(foreign.map(|other| other.gid));
+        drop(graph);
+        let there = |other: &Gid| shared.state().graph.endpoints.contains_key(other);
+        let stands = |other: &Gid, theirs: &events::EndpointEvents| {
+            let ends = matched(other) && theirs.is_matched(&own.gid);
+            let state = shared.state();
+            ends || !(state.publishers.contains_key(other)
+                || state.subscriptions.contains_key(other))
+        };
+        shared.wait_changed(PAIRS, || {
+            publishers.iter().all(|p| stands(&p.endpoint.gid, &p.events))
+                && subscriptions.iter().all(|s| stands(&s.endpoint.gid, &s.events))
+                && others.iter().all(|other| matched(other) || !there(other))
+        });
     }
 
     fn wait_changed(&self, timeout: Duration, mut reached: impl FnMut() -> bool) -> bool {

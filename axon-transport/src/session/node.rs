@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use super::{EndpointSpec, Publisher, Session, SessionError, Subscription};
+use super::{EndpointSpec, GuardCondition, Publisher, Session, SessionError, Subscription};
 use crate::{graph::Endpoint, ids::Gid};
 
 /// A node of a session. It is in the graph for as long as this stands, with endpoints or without;
@@ -27,12 +27,19 @@ use crate::{graph::Endpoint, ids::Gid};
 /// ```
 pub struct Node {
     endpoint: Endpoint,
+    graph: GuardCondition,
     session: Session,
 }
 
 impl Node {
-    pub(super) fn new(endpoint: Endpoint, session: Session) -> Self {
-        Self { endpoint, session }
+    pub(super) fn new(endpoint: Endpoint, graph: GuardCondition, session: Session) -> Self {
+        Self { endpoint, graph, session }
+    }
+
+    /// Triggered after every change of the graph, once [`Session::graph`] shows it; and when a
+    /// service or a client of this session finds, or loses, its other end.
+    pub fn graph_changed(&self) -> &GuardCondition {
+        &self.graph
     }
 
     /// Its GID.

@@ -8,10 +8,16 @@ use std::{
     time::Duration,
 };
 
-use super::{Session, message::EndpointRole, subscription::now};
+use super::{
+    Session, clock,
+    events::{Changes, EndpointEvents, Event, Source},
+    message::EndpointRole,
+};
 use crate::{
+    events::EventKind,
     graph::Endpoint,
     ids::Gid,
+    qos::{Liveliness, Qos},
     shm::{Grant, Meta, PublishError, ReaderInfo, ShmError, Writer},
 };
 
@@ -38,7 +44,7 @@ impl Publisher {
     /// [`PublishError::Blocked`] after 100 ms when a KEEP_ALL reader makes no room; the others say
     /// what does not fit. A sample that was refused has no sequence number: nobody counts it lost.
     pub fn publish(&self, payload: &[u8]) -> Result<u64, PublishError> {
-        self.publish_at(now(), payload)
+        self.publish_at(clock::wall(), payload)
     }
 
     /// As [`publish`](Self::publish), with a source timestamp of the caller's, in nanoseconds since
@@ -47,7 +53,7 @@ impl Publisher {
     /// # Errors
     /// As for [`publish`](Self::publish).
     pub fn publish_at(&self, source_timestamp: i64, payload: &[u8]) -> Result<u64, PublishError> {
-        self.inner.writer.publish_next(source_timestamp, payload)
+        self.inner.published(self.inner.writer.publish_next(source_timestamp, payload))
     }
 
     /// Publishes for a remote publisher, whose number and time the sample keeps.
@@ -55,7 +61,7 @@ impl Publisher {
     /// # Errors
     /// As for [`publish`](Self::publish).
     pub fn publish_with(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
-        self.inner.writer.publish(meta, payload).map(drop)
+        self.inner.published(self.inner.writer.publish(meta, payload)).map(drop)
     }
 
     /// As [`publish_with`](Self::publish_with), but never waits for room.
@@ -63,7 +69,7 @@ impl Publisher {
     /// # Errors
     /// [`PublishError::Blocked`] at once when there is none.
     pub fn try_publish_with(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
-        self.inner.writer.try_publish(meta, payload).map(drop)
+        self.inner.published(self.inner.writer.try_publish(meta, payload)).map(drop)
     }
 
     /// If a sample would be read by nobody, now or later, uses up the next sequence number and
@@ -73,7 +79,28 @@ impl Publisher {
     /// # Errors
     /// [`PublishError::Forked`].
     pub fn skip_unread(&self) -> Result<Option<u64>, PublishError> {
-        self.inner.writer.skip_unread()
+        let skipped = self.inner.writer.skip_unread()?;
+        if skipped.is_some() { self.inner.published(Ok(skipped)) } else { Ok(None) }
+    }
+
+    /// Says that it is alive. Where its liveliness is MANUAL_BY_TOPIC, so does every publication;
+    /// where it is AUTOMATIC, its session says so.
+    ///
+    /// # Errors
+    /// [`PublishError::Forked`].
+    pub fn assert_liveliness(&self) -> Result<(), PublishError> {
+        if self.session.is_forked() {
+            return Err(PublishError::Forked);
+        }
+        if self.inner.asserts {
+            self.inner.writer.assert(clock::monotonic());
+        }
+        Ok(())
+    }
+
+    /// One of its events; `None` where `kind` is a subscription's.
+    pub fn event(&self, kind: EventKind) -> Option<Event> {
+        Event::new(Source::Publisher(self.inner.clone()), kind, self.session.clone())
     }
 
     /// Room for a sample of exactly `len` bytes, to serialize into: in shared memory where it is
@@ -121,7 +148,7 @@ impl Loan<'_> {
     /// # Errors
     /// When fewer bytes were written than were asked for, and as for [`Publisher::publish`].
     pub fn publish(self) -> Result<u64, PublishError> {
-        self.loan.publish_next(now())
+        self.publisher.published(self.loan.publish_next(clock::wall()))
     }
 }
 
@@ -160,13 +187,19 @@ pub(super) struct PublisherInner {
     pub(super) endpoint: Endpoint,
     pub(super) role: EndpointRole,
     pub(super) writer: Writer,
+    pub(super) events: EndpointEvents,
+    /// A publication says that the publisher is alive.
+    asserts: bool,
     /// Readers that were granted; a relay as itself.
     attached: Mutex<BTreeSet<Gid>>,
 }
 
 impl PublisherInner {
     pub(super) fn new(endpoint: Endpoint, role: EndpointRole, writer: Writer) -> Self {
-        Self { endpoint, role, writer, attached: Mutex::default() }
+        let Qos { liveliness, lease, .. } = endpoint.qos;
+        let asserts = liveliness == Liveliness::ManualByTopic && lease.is_some();
+        let events = EndpointEvents::of_publisher(&endpoint.qos, clock::monotonic());
+        Self { endpoint, role, writer, events, asserts, attached: Mutex::default() }
     }
 
     pub(super) fn attach(&self, reader: ReaderInfo) -> Result<Grant, ShmError> {
@@ -194,5 +227,43 @@ impl PublisherInner {
 
     pub(super) fn attached(&self) -> MutexGuard<'_, BTreeSet<Gid>> {
         self.attached.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// What became of its matches since it was asked last.
+    pub(super) fn rematch(&self) -> Changes {
+        self.events.readers(self.writer.readers().into_iter().collect())
+    }
+
+    /// Counts the deadlines that passed, and asserts or watches the lease. When to look again, and
+    /// whether something happened.
+    pub(super) fn look_at_time(&self, now: u64) -> (Option<u64>, bool) {
+        let qos = &self.endpoint.qos;
+        let times = self.writer.times();
+        let (due, news) = self.events.offered(qos, &times, now);
+        let Some(lease) = qos.lease.filter(|_| qos.liveliness == Liveliness::Automatic) else {
+            return (due, news);
+        };
+        let third = (lease / 3).max(1_000_000);
+        let mut next = times.asserted.map_or(now, |asserted| asserted.saturating_add(third));
+        if next <= now {
+            self.writer.assert(now);
+            next = now.saturating_add(third);
+        }
+        (Some(due.map_or(next, |due| due.min(next))), news)
+    }
+
+    /// Notes what was published, where somebody watches the time.
+    fn published<T>(&self, result: Result<T, PublishError>) -> Result<T, PublishError> {
+        let deadline = self.endpoint.qos.deadline.is_some();
+        if result.is_ok() && (deadline || self.asserts) {
+            let now = clock::monotonic();
+            if deadline {
+                self.writer.note_sample(now);
+            }
+            if self.asserts {
+                self.writer.assert(now);
+            }
+        }
+        result
     }
 }

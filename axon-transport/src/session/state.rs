@@ -5,14 +5,16 @@ use std::{
     fmt,
     os::fd::OwnedFd,
     sync::{
-        Arc, Condvar, Mutex, MutexGuard, PoisonError,
+        Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError,
         atomic::{AtomicBool, Ordering},
     },
+    thread::ThreadId,
     time::{Duration, Instant},
 };
 
 use super::{
     SessionOptions,
+    guard::GuardCondition,
     message::{Message, StatusPart},
     publisher::PublisherInner,
     subscription::SubscriptionInner,
@@ -21,7 +23,8 @@ use crate::{
     config::Config,
     graph::{Endpoint, GraphView},
     ids::{DaemonId, Gid, SessionId},
-    shm::{SegmentEvent, SessionSegment},
+    shm::{SegmentEvent, SessionSegment, ShmError},
+    wait::ExternalLeader,
 };
 
 /// Something that a session's owner may want to hear of.
@@ -49,6 +52,10 @@ pub(super) struct Shared {
     pub(super) wake: Arc<OwnedFd>,
     pub(super) memory: Arc<MemoryNews>,
     pub(super) stopping: AtomicBool,
+    /// The control thread, once it runs.
+    pub(super) control: OnceLock<ThreadId>,
+    /// By which the control thread hears of samples, and for how many subscriptions it does.
+    listening: Mutex<(usize, Option<Arc<ExternalLeader>>)>,
     pub(super) listener: Mutex<Option<Listener>>,
     /// One status request at a time.
     pub(super) asking: Mutex<()>,
@@ -59,9 +66,12 @@ pub(super) struct Shared {
 #[derive(Default)]
 pub(super) struct State {
     pub(super) next_entity: u32,
-    pub(super) nodes: HashMap<Gid, Endpoint>,
+    /// With what tells of changes of the graph.
+    pub(super) nodes: HashMap<Gid, (Endpoint, GuardCondition)>,
     pub(super) publishers: HashMap<Gid, Arc<PublisherInner>>,
     pub(super) subscriptions: HashMap<Gid, Arc<SubscriptionInner>>,
+    /// Applications' endpoints of both kinds by topic or service.
+    pub(super) topics: HashMap<String, BTreeSet<Gid>>,
     pub(super) outgoing: VecDeque<Outgoing>,
     /// Endpoints that are gone, until a daemon has said so to everybody.
     pub(super) tombstones: BTreeSet<Gid>,
@@ -70,6 +80,21 @@ pub(super) struct State {
     pub(super) status: StatusAnswer,
     /// Counts what those who wait may want to look at.
     pub(super) changes: u64,
+}
+
+impl State {
+    pub(super) fn index(&mut self, endpoint: &Endpoint) {
+        self.topics.entry(endpoint.topic.clone()).or_default().insert(endpoint.gid);
+    }
+
+    pub(super) fn unindex(&mut self, endpoint: &Endpoint) {
+        if let Some(gids) = self.topics.get_mut(&endpoint.topic) {
+            gids.remove(&endpoint.gid);
+            if gids.is_empty() {
+                self.topics.remove(&endpoint.topic);
+            }
+        }
+    }
 }
 
 /// What changed in the session's own memory, and whether other sessions' is missing. Of use under any
@@ -173,6 +198,8 @@ impl Shared {
             wake,
             memory,
             stopping: AtomicBool::new(false),
+            control: OnceLock::new(),
+            listening: Mutex::default(),
             listener: Mutex::new(None),
             asking: Mutex::new(()),
             state: Mutex::default(),
@@ -182,6 +209,33 @@ impl Shared {
 
     pub(super) fn state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Has the control thread listen for samples on behalf of one subscription more.
+    pub(super) fn listen(&self) -> Result<(), ShmError> {
+        let mut listening = self.listening.lock().unwrap_or_else(PoisonError::into_inner);
+        if listening.1.is_none() {
+            listening.1 = Some(Arc::new(self.segment.external_leader()?));
+        }
+        listening.0 += 1;
+        drop(listening);
+        self.wake();
+        Ok(())
+    }
+
+    /// One subscription has nobody any more who would hear.
+    pub(super) fn listen_no_more(&self) {
+        let mut listening = self.listening.lock().unwrap_or_else(PoisonError::into_inner);
+        listening.0 -= 1;
+        if listening.0 == 0 {
+            listening.1 = None;
+        }
+        drop(listening);
+        self.wake();
+    }
+
+    pub(super) fn listening(&self) -> Option<Arc<ExternalLeader>> {
+        self.listening.lock().unwrap_or_else(PoisonError::into_inner).1.clone()
     }
 
     /// Queues something for the daemon.
@@ -229,8 +283,15 @@ impl Shared {
 
     /// Tells those who wait, and the listener.
     pub(super) fn notify(&self, event: Option<&SessionEvent>) {
-        self.state().changes += 1;
+        let guards: Vec<GuardCondition> = {
+            let mut state = self.state();
+            state.changes += 1;
+            let graph = matches!(event, Some(SessionEvent::Graph));
+            let guards = state.nodes.values().filter(|_| graph);
+            guards.map(|(_, guard)| guard.clone()).collect()
+        };
         self.changed.notify_all();
+        guards.iter().for_each(GuardCondition::trigger);
         let Some(event) = event else { return };
         if matches!(event, SessionEvent::Matched(_)) {
             // A writer that died between its last sample and the doorbell leaves that sample to be

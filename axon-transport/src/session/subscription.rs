@@ -1,22 +1,26 @@
 //! A reader of every matched publisher of a topic, merged into one stream.
 
 use std::{
-    collections::HashMap,
+    collections::{BTreeMap, HashMap},
     fmt,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
-    time::{Duration, SystemTime},
+    time::Duration,
 };
 
 use super::{
-    Session,
+    OnNew, Session, SessionError,
+    callback::Callback,
+    clock,
+    events::{Changes, EndpointEvents, Event, Source},
     message::{EndpointRole, Message, Pair},
-    state::Outgoing,
+    state::{Outgoing, Shared},
 };
 use crate::{
+    events::EventKind,
     graph::Endpoint,
     ids::Gid,
     qos::History,
-    shm::{Grant, Lane, Location, Meta, Reader, Sample, TakeError},
+    shm::{Grant, Lane, Location, Meta, Reader, Sample, ShmError, TakeError},
     wait::Look,
 };
 
@@ -87,7 +91,9 @@ impl Subscription {
         let mut slots = self.inner.lock();
         let taken = slots.take(take, &self.inner.endpoint);
         let gone = std::mem::take(&mut slots.discarded);
+        let lost = slots.new_losses();
         drop(slots);
+        self.inner.events.lost(lost);
         for writer in gone {
             let detach = Message::Detach(Pair { reader: self.gid(), writer });
             self.session.shared().tell(Outgoing::Message(Box::new(detach)));
@@ -116,7 +122,7 @@ impl Subscription {
 
     /// Whether there is something to take.
     pub fn has_data(&self) -> bool {
-        !self.session.is_forked() && self.inner.lock().has_data()
+        !self.session.is_forked() && self.inner.has_data()
     }
 
     /// The publishers it receives from.
@@ -138,8 +144,32 @@ impl Subscription {
         if self.session.is_forked() {
             return 0;
         }
-        let slots = self.inner.lock();
-        slots.lost + slots.slots.iter().map(|s| s.reader.lost()).sum::<u64>()
+        self.inner.lock().losses()
+    }
+
+    /// Samples that were older than their publisher's lifespan when they would have been taken.
+    pub fn expired(&self) -> u64 {
+        if self.session.is_forked() { 0 } else { self.inner.lock().expired }
+    }
+
+    /// Has `callback` told of new samples from now on, in place of the one before, which is not
+    /// called any more once this returns. Those that are there to be taken it is told at once, on
+    /// this thread; others as they come, on the control thread. It must neither block nor panic, nor
+    /// hold the session.
+    ///
+    /// # Errors
+    /// In a forked child, or when an event loop of the program's listens already
+    /// ([`SessionSegment::external_leader`](crate::shm::SessionSegment::external_leader)).
+    pub fn set_on_new_sample(&self, callback: Option<OnNew>) -> Result<(), SessionError> {
+        if self.session.is_forked() {
+            return Err(ShmError::Forked.into());
+        }
+        Ok(self.inner.set_on_new_sample(callback, self.session.shared())?)
+    }
+
+    /// One of its events; `None` where `kind` is a publisher's.
+    pub fn event(&self, kind: EventKind) -> Option<Event> {
+        Event::new(Source::Subscription(self.inner.clone()), kind, self.session.clone())
     }
 
     /// Samples taken.
@@ -165,6 +195,10 @@ impl fmt::Debug for Subscription {
 
 impl Drop for Subscription {
     fn drop(&mut self) {
+        if !self.session.is_forked() {
+            // Only listening may fail, not ceasing to.
+            let _ = self.inner.set_on_new_sample(None, self.session.shared());
+        }
         self.session.forget_endpoint(&self.gid());
     }
 }
@@ -173,8 +207,12 @@ impl Drop for Subscription {
 pub(super) struct SubscriptionInner {
     pub(super) endpoint: Endpoint,
     pub(super) role: EndpointRole,
+    pub(super) events: EndpointEvents,
     stands_for: Mutex<Vec<Gid>>,
     slots: Mutex<Slots>,
+    arrived: Callback,
+    /// Whether the control thread listens for it.
+    listens: Mutex<bool>,
 }
 
 #[derive(Default)]
@@ -186,7 +224,13 @@ pub(super) struct Slots {
     /// comes back, as a remote one does with its link, must not be heard twice.
     last: HashMap<Gid, u64>,
     received: u64,
+    expired: u64,
     lost: u64,
+    /// Losses that were reported.
+    lost_before: u64,
+    /// Samples that came from writers that are gone, and all that somebody was told of.
+    arrived: u64,
+    arrived_before: u64,
     /// Writers whose memory was not usable, of which the others have to be told.
     discarded: Vec<Gid>,
 }
@@ -203,6 +247,10 @@ pub(super) enum Accept {
 
 struct Slot {
     reader: Reader,
+    /// When it was mapped: what was published before is no news. By the monotonic clock.
+    since: u64,
+    /// The age at which its samples are not delivered any more.
+    lifespan: Option<i64>,
     /// The writer is gone: take what it left, then unmap.
     over: bool,
     /// Found nothing in the take that is under way, since the writer was faster.
@@ -212,7 +260,95 @@ struct Slot {
 impl SubscriptionInner {
     pub(super) fn new(endpoint: Endpoint, role: EndpointRole, stands_for: Vec<Gid>) -> Self {
         let (stands_for, slots) = (Mutex::new(stands_for), Mutex::default());
-        Self { endpoint, role, stands_for, slots }
+        let events = EndpointEvents::of_subscription(&endpoint.qos);
+        let (arrived, listens) = (Callback::default(), Mutex::new(false));
+        Self { endpoint, role, events, stands_for, slots, arrived, listens }
+    }
+
+    pub(super) fn has_data(&self) -> bool {
+        self.lock().has_data()
+    }
+
+    pub(super) fn set_on_new_sample(
+        &self,
+        callback: Option<OnNew>,
+        shared: &Shared,
+    ) -> Result<(), ShmError> {
+        let mut listens = lock(&self.listens);
+        let there = match (*listens, callback.is_some()) {
+            (false, true) => {
+                shared.listen()?;
+                true
+            }
+            (listens, there) => {
+                if listens && !there {
+                    shared.listen_no_more();
+                }
+                there
+            }
+        };
+        *listens = there;
+        drop(listens);
+        let untold = {
+            let mut slots = self.lock();
+            slots.new_arrivals();
+            slots.unread(&self.endpoint)
+        };
+        self.arrived.replace(callback, Some(untold));
+        Ok(())
+    }
+
+    /// Tells of samples that came, where somebody wants to hear of them.
+    pub(super) fn tell_arrived(&self) {
+        if self.arrived.is_set() {
+            let new = self.lock().new_arrivals();
+            self.arrived.add(new);
+        }
+    }
+
+    /// What became of its matches since it was asked last.
+    pub(super) fn rematch(&self) -> Changes {
+        let leases: BTreeMap<Gid, Option<u64>> = {
+            let slots = self.lock();
+            let active = slots.slots.iter().filter(|slot| !slot.over);
+            active.map(|slot| (slot.reader.writer(), slot.reader.times().lease)).collect()
+        };
+        self.events.writers(&leases, clock::monotonic())
+    }
+
+    /// Counts the deadlines that passed and looks who is alive. When to look again, and whether
+    /// something happened.
+    pub(super) fn look_at_time(&self, now: u64) -> (Option<u64>, bool) {
+        let times: Vec<_> = {
+            let slots = self.lock();
+            let active = slots.slots.iter().filter(|slot| !slot.over);
+            let times = active.map(|slot| {
+                let mut times = slot.reader.times();
+                times.sampled = times.sampled.filter(|sampled| *sampled >= slot.since);
+                (slot.reader.writer(), times)
+            });
+            times.collect()
+        };
+        self.events.requested(&self.endpoint.qos, &times, now)
+    }
+
+    /// The same for who must not wait for a thread that takes.
+    pub(super) fn may_have_losses(&self) -> bool {
+        let Ok(mut slots) = self.slots.try_lock() else { return true };
+        slots.slots.iter_mut().for_each(|slot| drop(slot.reader.peek()));
+        slots.losses() != slots.lost_before
+    }
+
+    /// Counts what would be found lost by taking now.
+    pub(super) fn look_for_losses(&self) {
+        let mut slots = self.lock();
+        for slot in &mut slots.slots {
+            // What is wrong with its memory, the next take says.
+            let _ = slot.reader.peek();
+        }
+        let lost = slots.new_losses();
+        drop(slots);
+        self.events.lost(lost);
     }
 
     pub(super) fn lock(&self) -> MutexGuard<'_, Slots> {
@@ -237,6 +373,38 @@ impl Look for SubscriptionInner {
 impl Slots {
     fn has_data(&self) -> bool {
         self.slots.iter().any(|slot| slot.reader.has_data())
+    }
+
+    /// Whether the lease of one of the writers may run out.
+    pub(super) fn offers_lease(&self) -> bool {
+        self.slots.iter().any(|slot| !slot.over && slot.reader.times().lease.is_some())
+    }
+
+    fn losses(&self) -> u64 {
+        self.lost + self.slots.iter().map(|slot| slot.reader.lost()).sum::<u64>()
+    }
+
+    /// Samples that came since this was last asked.
+    fn new_arrivals(&mut self) -> u64 {
+        let present = self.slots.iter().map(|slot| slot.reader.arrived()).sum::<u64>();
+        let arrived = self.arrived + present;
+        // A writer whose memory is corrupt takes its numbers with it.
+        arrived.saturating_sub(std::mem::replace(&mut self.arrived_before, arrived))
+    }
+
+    /// Samples to be taken.
+    fn unread(&self, endpoint: &Endpoint) -> u64 {
+        let unread = self.slots.iter().map(|slot| slot.reader.unread()).sum::<u64>();
+        match endpoint.qos.history {
+            History::KeepLast => unread.min(endpoint.qos.depth.into()),
+            History::KeepAll => unread,
+        }
+    }
+
+    /// Losses since this was last asked.
+    fn new_losses(&mut self) -> u64 {
+        let losses = self.losses();
+        losses - std::mem::replace(&mut self.lost_before, losses)
     }
 
     /// The lane that is, or from now on will be, the one for `writer`.
@@ -283,7 +451,9 @@ impl Slots {
 
     pub(super) fn add(&mut self, reader: Reader) {
         let writer = reader.writer();
-        self.slots.push(Slot { reader, over: false, overtaken: false });
+        let since = clock::monotonic();
+        let lifespan = reader.times().lifespan.map(|age| i64::try_from(age).unwrap_or(i64::MAX));
+        self.slots.push(Slot { reader, since, lifespan, over: false, overtaken: false });
         self.forget_older(writer);
     }
 
@@ -323,6 +493,7 @@ impl Slots {
             let later = self.slots[newer].reader.grant().first;
             let slot = self.slots.remove(older);
             self.lost += slot.reader.lost() + slot.reader.unread_below(later);
+            self.arrived += slot.reader.arrived();
         }
     }
 
@@ -339,11 +510,12 @@ impl Slots {
 
     /// Unmaps writers that are gone and drained.
     fn sweep(&mut self) {
-        let lost = &mut self.lost;
+        let (lost, arrived) = (&mut self.lost, &mut self.arrived);
         self.slots.retain(|s| {
             let keep = !s.over || !s.reader.is_drained();
             if !keep {
                 *lost += s.reader.lost();
+                *arrived += s.reader.arrived();
             }
             keep
         });
@@ -397,23 +569,31 @@ impl Slots {
                 }
             };
             let over = slot.over;
+            let received_timestamp = clock::wall();
+            let expired = slot.lifespan.is_some_and(|lifespan| {
+                meta.source_timestamp.saturating_add(lifespan) < received_timestamp
+            });
             let last = self.last.entry(writer).or_default();
             let repeated = meta.sequence <= *last;
             if !repeated {
                 *last = meta.sequence;
-                self.received += 1;
+                if expired {
+                    self.expired += 1;
+                } else {
+                    self.received += 1;
+                }
             }
             if over {
                 self.sweep();
             }
-            if repeated {
+            if repeated || expired {
                 continue;
             }
             let info = MessageInfo {
                 publisher: writer,
                 sequence: meta.sequence,
                 source_timestamp: meta.source_timestamp,
-                received_timestamp: now(),
+                received_timestamp,
             };
             return Some((info, taken));
         }
@@ -467,17 +647,11 @@ impl Slots {
         tracing::error!(topic = endpoint.topic, %error, "a publisher's memory is not usable");
         let slot = self.slots.remove(index);
         self.lost += slot.reader.lost();
+        self.arrived += slot.reader.arrived();
         if !slot.over {
             self.discarded.push(slot.reader.writer());
         }
     }
-}
-
-/// Nanoseconds since the Unix epoch.
-pub(super) fn now() -> i64 {
-    SystemTime::now()
-        .duration_since(SystemTime::UNIX_EPOCH)
-        .map_or(0, |d| i64::try_from(d.as_nanos()).unwrap_or(i64::MAX))
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {

@@ -95,9 +95,16 @@ pub(super) mod ring {
     pub(in crate::shm) const HEAD: usize = 128 / 8;
     /// Samples published, those that nobody was there to read among them.
     pub(in crate::shm) const PUBLISHED: usize = 136 / 8;
+    /// When the publisher said last that it is alive, where its lease is finite.
+    pub(in crate::shm) const ASSERTED: usize = 144 / 8;
+    /// When it published last, where its deadline is finite.
+    pub(in crate::shm) const SAMPLED: usize = 152 / 8;
     pub(in crate::shm) const TAIL: usize = 256 / 8;
     /// Where the descriptors are, and how many.
     pub(in crate::shm) const ARRAY: usize = 264 / 8;
+    /// The lease and the lifespan that it offers, in nanoseconds; 0 where they never end.
+    pub(in crate::shm) const LEASE: usize = 272 / 8;
+    pub(in crate::shm) const LIFESPAN: usize = 280 / 8;
 }
 
 /// What a segment is for.

@@ -100,6 +100,7 @@ mod subscriber;
 pub(crate) mod sync;
 mod tally;
 mod tenure;
+mod times;
 mod types;
 mod writer;
 
@@ -119,5 +120,6 @@ pub use sample::{Sample, SampleReader};
 pub use segments::{SegmentEvent, SegmentInfo};
 pub use session::SessionSegment;
 pub use subscriber::{Subscriber, SubscriberOptions};
+pub(crate) use times::Times;
 pub use types::{Grant, Meta, Published, ReaderInfo, RingOptions, Taken};
 pub use writer::Writer;

@@ -187,6 +187,13 @@ impl SessionSegment {
         }
     }
 
+    /// Makes whoever listens look again, and have those look who follow. Async-signal-safe.
+    pub(crate) fn knock(&self) {
+        if !self.is_forked() {
+            self.doorbell.ring_own();
+        }
+    }
+
     /// Lets an event loop lead this session's waits.
     ///
     /// # Errors

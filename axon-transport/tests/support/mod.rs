@@ -40,12 +40,14 @@ impl Host {
         Self { env: env.map(|(n, v)| (n.to_owned(), v.to_owned())).into(), dir }
     }
 
+    #[allow(dead_code, reason = "not every test needs it")]
     pub(crate) fn with(mut self, name: &str, value: &str) -> Self {
         self.env.retain(|(n, _)| n != name);
         self.env.push((name.to_owned(), value.to_owned()));
         self
     }
 
+    #[allow(dead_code, reason = "not every test needs it")]
     pub(crate) fn without(mut self, name: &str) -> Self {
         self.env.retain(|(n, _)| n != name);
         self
@@ -149,7 +151,7 @@ impl Player {
     }
 
     /// Tells it to go on.
-    #[allow(dead_code, reason = "what the sizes are measured with")]
+    #[allow(dead_code, reason = "not every test needs it")]
     pub(crate) fn go(&mut self) {
         let mut stdin = self.child.0.stdin.as_ref().expect("its input");
         stdin.write_all(b"go\n").unwrap();

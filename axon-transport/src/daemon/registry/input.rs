@@ -5,11 +5,10 @@ use super::{
     SessionEntry, Violation, output::session_entry,
 };
 use crate::{
-    graph::{Endpoint, LIMITS},
+    graph::{Endpoint, EndpointKind, LIMITS},
     ids::{Gid, SessionId},
     session::message::{
         Announce, Attach, EndpointRole, Granted, Message, Pair, Refused, SessionRole, Unmatch,
-        writes,
     },
 };
 
@@ -94,17 +93,23 @@ impl<F: Clone> Registry<F> {
     fn announce(&mut self, id: &SessionId, announce: Announce) -> Result<(), Violation> {
         let Announce { endpoint, role, stands_for, ring } = announce;
         let gid = endpoint.gid;
-        if ring.is_some() != writes(endpoint.kind) {
+        // A server has a ring for each of its clients, of which GRANT speaks.
+        if ring.is_some() != matches!(endpoint.kind, EndpointKind::Publisher | EndpointKind::Client)
+        {
             return Err(Violation::Unexpected);
         }
         let Some(entry) = self.sessions.get(id) else { return Ok(()) };
         let may = match role {
             EndpointRole::Application => in_session(&gid, id),
             EndpointRole::StandIn => {
-                entry.role == SessionRole::Gateway && writes(endpoint.kind) && !in_session(&gid, id)
+                entry.role == SessionRole::Gateway
+                    && endpoint.kind == EndpointKind::Publisher
+                    && !in_session(&gid, id)
             }
             EndpointRole::Relay => {
-                entry.role == SessionRole::Gateway && in_session(&gid, id) && !writes(endpoint.kind)
+                entry.role == SessionRole::Gateway
+                    && endpoint.kind == EndpointKind::Subscription
+                    && in_session(&gid, id)
             }
         };
         if !may {

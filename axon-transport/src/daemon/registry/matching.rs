@@ -1,11 +1,10 @@
 //! Who goes with whom.
 
-use super::{Asked, LocalEndpoint, Registry, Topic};
+use super::{Asked, LocalEndpoint, Members, Registry, Topic};
 use crate::{
-    graph::Endpoint,
+    graph::{Endpoint, EndpointKind, Pairing, pairing, reads, writes},
     ids::{Gid, SessionId},
-    qos::compatible,
-    session::message::{EndpointRole, Message, Pair, Unmatch, reads, writes},
+    session::message::{EndpointRole, Message, Pair, Unmatch},
 };
 
 impl<F: Clone> Registry<F> {
@@ -13,7 +12,8 @@ impl<F: Clone> Registry<F> {
         let members = self.topics.entry(topic(&local.endpoint)).or_default();
         if writes(local.endpoint.kind) {
             members.writers.insert(local.endpoint.gid);
-        } else if reads(local.endpoint.kind) {
+        }
+        if reads(local.endpoint.kind) {
             members.readers.insert(local.endpoint.gid);
         }
     }
@@ -21,15 +21,8 @@ impl<F: Clone> Registry<F> {
     /// Pairs a new endpoint with what is there.
     pub(super) fn match_endpoint(&mut self, gid: &Gid) {
         let Some(local) = self.endpoints.get(gid) else { return };
-        let kind = local.endpoint.kind;
         let Some(members) = self.topics.get(&topic(&local.endpoint)) else { return };
-        let pairs: Vec<Pair> = if writes(kind) {
-            members.readers.iter().map(|&reader| Pair { reader, writer: *gid }).collect()
-        } else if reads(kind) {
-            members.writers.iter().map(|&writer| Pair { reader: *gid, writer }).collect()
-        } else {
-            return;
-        };
+        let pairs = members.pairs_of(gid, local.endpoint.kind);
         for pair in pairs {
             let (Some(w), Some(r)) =
                 (self.endpoints.get(&pair.writer), self.endpoints.get(&pair.reader))
@@ -40,18 +33,22 @@ impl<F: Clone> Registry<F> {
                 continue;
             }
             let (to_writer, to_reader) = (w.session, r.session);
-            match compatible(&w.endpoint.qos, &r.endpoint.qos) {
-                Ok(()) => {
-                    let by = if writes(kind) { to_writer } else { to_reader };
+            match pairing(&w.endpoint, &r.endpoint) {
+                Pairing::Match => {
+                    let by = if pair.writer == *gid { to_writer } else { to_reader };
                     self.pairs.insert(pair, Asked { by, attach: None, grant: None });
                     if let Some(entry) = self.sessions.get_mut(&by) {
                         entry.pairs += 1;
                     }
                     self.push(&to_reader, &Message::Match(pair), Vec::new());
                 }
-                Err(policy) => {
+                Pairing::IncompatibleQos(policy) => {
                     self.unmatch(&pair, to_writer, to_reader, &format!("incompatible {policy}"));
                 }
+                Pairing::IncompatibleType => {
+                    self.unmatch(&pair, to_writer, to_reader, "their types have other hashes");
+                }
+                Pairing::Unrelated => {}
             }
         }
     }
@@ -64,11 +61,7 @@ impl<F: Clone> Registry<F> {
         if let Some(members) = self.topics.get_mut(&topic) {
             members.writers.remove(gid);
             members.readers.remove(gid);
-            if writes(local.endpoint.kind) {
-                pairs.extend(members.readers.iter().map(|&reader| Pair { reader, writer: *gid }));
-            } else {
-                pairs.extend(members.writers.iter().map(|&writer| Pair { reader: *gid, writer }));
-            }
+            pairs = members.pairs_of(gid, local.endpoint.kind);
             if members.writers.is_empty() && members.readers.is_empty() {
                 self.topics.remove(&topic);
             }
@@ -92,15 +85,9 @@ impl<F: Clone> Registry<F> {
 
     /// How many pairs an endpoint would make at most.
     pub(super) fn prospects(&self, endpoint: &Endpoint) -> usize {
-        self.topics.get(&topic(endpoint)).map_or(0, |members| {
-            if writes(endpoint.kind) {
-                members.readers.len()
-            } else if reads(endpoint.kind) {
-                members.writers.len()
-            } else {
-                0
-            }
-        })
+        self.topics
+            .get(&topic(endpoint))
+            .map_or(0, |members| members.pairs_of(&endpoint.gid, endpoint.kind).len())
     }
 
     /// Whether there was such a pair.
@@ -119,6 +106,22 @@ impl<F: Clone> Registry<F> {
         if to_writer != to_reader {
             self.push(&to_writer, &message, Vec::new());
         }
+    }
+}
+
+impl Members {
+    /// The pairs that an endpoint of this kind makes with the others, if they go together.
+    fn pairs_of(&self, gid: &Gid, kind: EndpointKind) -> Vec<Pair> {
+        let mut pairs = Vec::new();
+        if writes(kind) {
+            let readers = self.readers.iter().filter(|reader| *reader != gid);
+            pairs.extend(readers.map(|&reader| Pair { reader, writer: *gid }));
+        }
+        if reads(kind) {
+            let writers = self.writers.iter().filter(|writer| *writer != gid);
+            pairs.extend(writers.map(|&writer| Pair { reader: *gid, writer }));
+        }
+        pairs
     }
 }
 

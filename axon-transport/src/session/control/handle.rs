@@ -1,22 +1,19 @@
 //! What the daemon says, and what a session does about it.
 
-use std::{
-    collections::{HashMap, HashSet},
-    sync::Arc,
-};
+use std::{collections::HashSet, sync::Arc};
 
 use super::{Control, stands_for};
 use crate::{
-    graph::{GraphEntry, GraphView},
     ids::{Gid, SessionId},
     passed::PassedFd,
     session::{
         message::{
-            Attach, Granted, Graph, MAX_DESCRIPTORS, Message, Pair, Segment, SegmentName,
-            SegmentOpened, Unmatch,
+            Attach, Granted, MAX_DESCRIPTORS, Message, Pair, Segment, SegmentName, SegmentOpened,
+            Unmatch,
         },
         peers::PeerError,
-        state::{SessionEvent, StatusAnswer},
+        publisher::PublisherInner,
+        state::StatusAnswer,
         subscription::{Accept, SubscriptionInner},
     },
     shm::{Grant, Location, Peer, Reader, ReaderInfo, ReaderOptions, ShmError},
@@ -56,80 +53,35 @@ impl Control {
         }
     }
 
-    fn graph(&mut self, graph: Graph) {
-        if graph.whole {
-            self.building = Some(GraphView::default());
-            self.peers.recount();
-            // A daemon that tells everything to a session it knew repeats every pair. A new daemon
-            // learns of the pairs from us, one by one.
-            self.repeated = self.told.then(HashSet::new);
-            self.told = true;
-        }
-        let shared = self.shared.clone();
-        let mut state = shared.state();
-        let over = graph.ended.unwrap_or_default();
-        for gid in &graph.removed {
-            state.tombstones.remove(gid);
-        }
-        let view = match &mut self.building {
-            Some(view) => view,
-            None => Arc::make_mut(&mut state.graph),
-        };
-        view.version = graph.version;
-        for gid in graph.removed {
-            view.endpoints.remove(&gid);
-        }
-        for item in graph.added {
-            let entry = GraphEntry { endpoint: Arc::new(item.endpoint), daemon: item.daemon };
-            view.endpoints.insert(entry.endpoint.gid, entry);
-        }
-        if !graph.more
-            && let Some(view) = self.building.take()
-        {
-            state.graph = Arc::new(view);
-        }
-        drop(state);
-        for gid in over {
-            self.endpoint_over(gid);
-        }
-        if !graph.more {
-            let repeated = self.repeated.take();
-            if let Some(repeated) = &repeated {
-                self.drop_unrepeated(repeated);
-            }
-            self.drop_unread(repeated.is_some());
-            self.shared.notify(Some(&SessionEvent::Graph));
-        }
-    }
-
     /// An endpoint ended, perhaps while there was no daemon to say who was attached to it.
-    fn endpoint_over(&mut self, gid: Gid) {
+    pub(super) fn endpoint_over(&mut self, gid: Gid) {
         let (publishers, subscriptions) = self.endpoints();
-        for (own, publisher) in publishers {
+        for publisher in publishers {
             if publisher.detach(gid) {
-                self.shared.notify(Some(&SessionEvent::Matched(own)));
+                self.writer_changed(&publisher);
             }
         }
-        for (own, subscription) in subscriptions {
+        for subscription in subscriptions {
             if subscription.lock().end(&gid) {
-                self.shared.notify(Some(&SessionEvent::Matched(own)));
+                self.reader_changed(&subscription);
             }
         }
     }
 
     /// What the daemon did not say again is over: it was unmatched while this session was too slow
     /// to be told.
-    fn drop_unrepeated(&mut self, repeated: &HashSet<Pair>) {
+    pub(super) fn drop_unrepeated(&mut self, repeated: &HashSet<Pair>) {
         let (publishers, subscriptions) = self.endpoints();
-        for (writer, publisher) in publishers {
-            let attached = publisher.attached().clone();
+        for publisher in publishers {
+            let (writer, attached) = (publisher.endpoint.gid, publisher.attached().clone());
             for reader in attached {
                 if !repeated.contains(&Pair { reader, writer }) && publisher.detach(reader) {
-                    self.shared.notify(Some(&SessionEvent::Matched(writer)));
+                    self.writer_changed(&publisher);
                 }
             }
         }
-        for (reader, subscription) in subscriptions {
+        for subscription in subscriptions {
+            let reader = subscription.endpoint.gid;
             let mut slots = subscription.lock();
             let gone = slots
                 .writers()
@@ -138,7 +90,7 @@ impl Control {
             let news = gone.collect::<Vec<_>>().iter().filter(|writer| slots.end(writer)).count();
             drop(slots);
             if news > 0 {
-                self.shared.notify(Some(&SessionEvent::Matched(reader)));
+                self.reader_changed(&subscription);
             }
         }
     }
@@ -147,7 +99,7 @@ impl Control {
     /// so as it does not know of it: it was given up while there was no daemon, or while this
     /// session was too slow to be told. After everything has been `told` anew the daemon hears of
     /// what is read, so that it will say when that is given up.
-    fn drop_unread(&mut self, told: bool) {
+    pub(super) fn drop_unread(&mut self, told: bool) {
         let shared = self.shared.clone();
         let read = |writer: &Gid| {
             let subscriptions: Vec<_> = shared.state().subscriptions.values().cloned().collect();
@@ -239,7 +191,7 @@ impl Control {
                 let segments = Vec::new();
                 let grant = Granted { reader, writer, generation, first, session, ring, segments };
                 self.say(Message::Grant(grant));
-                self.shared.notify(Some(&SessionEvent::Matched(writer)));
+                self.writer_changed(&publisher);
             }
             Err(error) => {
                 let topic = &publisher.endpoint.topic;
@@ -298,7 +250,7 @@ impl Control {
         match mapped {
             Ok(mapped) => {
                 subscription.lock().add(mapped);
-                self.shared.notify(Some(&SessionEvent::Matched(reader)));
+                self.reader_changed(&subscription);
                 // It may have history to take.
                 self.shared.segment.notify();
             }
@@ -359,7 +311,7 @@ impl Control {
         let subscription = self.shared.state().subscriptions.get(reader).cloned();
         if let Some(subscription) = subscription {
             if subscription.lock().end(writer) {
-                self.shared.notify(Some(&SessionEvent::Matched(*reader)));
+                self.reader_changed(&subscription);
             }
             let topic = &subscription.endpoint.topic;
             tracing::debug!(topic, %writer, reason, "a publisher is not received from");
@@ -368,22 +320,17 @@ impl Control {
 
     fn detach_reader(&mut self, pair: &Pair) {
         let publisher = self.shared.state().publishers.get(&pair.writer).cloned();
-        if publisher.is_some_and(|p| p.detach(pair.reader)) {
-            self.shared.notify(Some(&SessionEvent::Matched(pair.writer)));
+        if let Some(publisher) = publisher.filter(|p| p.detach(pair.reader)) {
+            self.writer_changed(&publisher);
         }
         if self.shared.segment.tidy() {
             self.look_after_memory();
         }
     }
 
-    #[allow(clippy::type_complexity)]
-    fn endpoints(
-        &self,
-    ) -> (
-        HashMap<Gid, Arc<crate::session::publisher::PublisherInner>>,
-        HashMap<Gid, Arc<SubscriptionInner>>,
-    ) {
+    pub(super) fn endpoints(&self) -> (Vec<Arc<PublisherInner>>, Vec<Arc<SubscriptionInner>>) {
         let state = self.shared.state();
-        (state.publishers.clone(), state.subscriptions.clone())
+        let publishers = state.publishers.values().cloned().collect();
+        (publishers, state.subscriptions.values().cloned().collect())
     }
 }

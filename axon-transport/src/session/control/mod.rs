@@ -1,7 +1,9 @@
 //! The control thread: sends what the handles queue, handles what the daemon says, watches peers
 //! for their death, and finds another daemon when the old one is gone.
 
+mod graph;
 mod handle;
+mod time;
 
 use std::{
     collections::{BTreeSet, HashSet, VecDeque},
@@ -17,15 +19,17 @@ use std::{
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::{
+    arrivals::Arrivals,
     connect::{Caller, Connected},
     error::SessionError,
+    events::Source,
     local::Local,
     message::{Announce, EndpointRole, Gone, Message, Pair, SegmentName, SegmentOpened},
     peers::Peers,
     socket::{self, SocketError},
     state::{Outgoing, SegmentChange, SessionEvent, Shared, StatusAnswer},
 };
-use crate::{graph::GraphView, ids::Gid, passed::PassedFd};
+use crate::{graph::GraphView, ids::Gid, passed::PassedFd, wait::ExternalLeader};
 
 /// Packets handled before queued ones are sent: neither direction starves the other.
 const BATCH: usize = 64;
@@ -68,6 +72,13 @@ pub(super) struct Control {
     pause: Duration,
     /// This process had no descriptors left: when it asks to be told everything anew.
     retry: Option<Instant>,
+    arrivals: Arrivals,
+    /// The graph is another one than was last told.
+    graph_changed: bool,
+    /// Endpoints of whom somebody watches the time, unless they are to be looked for anew.
+    timed: Option<Vec<Source>>,
+    /// When to look at them, by the monotonic clock.
+    alarm: Option<u64>,
 }
 
 enum Link {
@@ -97,6 +108,10 @@ impl Control {
             since: Instant::now(),
             pause: Duration::ZERO,
             retry: None,
+            arrivals: Arrivals::default(),
+            graph_changed: false,
+            timed: None,
+            alarm: None,
         };
         match connected {
             Some(connected) => control.connected(connected),
@@ -109,6 +124,7 @@ impl Control {
     }
 
     pub(super) fn run(mut self) {
+        let _ = self.shared.control.set(std::thread::current().id());
         // Pairs with the release store in `Shared::stop`.
         while !self.shared.stopping.load(Ordering::Acquire) {
             self.try_reconnected();
@@ -116,6 +132,8 @@ impl Control {
             self.collect();
             self.send();
             self.prepare();
+            self.look_at_time();
+            self.tell_graph();
             self.sleep();
             self.receive();
             self.bury();
@@ -142,7 +160,7 @@ impl Control {
             state.daemon = Some(daemon);
             state.outgoing.clear();
             let endpoints = state.publishers.keys().chain(state.subscriptions.keys());
-            let gids: Vec<Gid> = state.nodes.keys().chain(endpoints).copied().collect();
+            let gids: BTreeSet<Gid> = state.nodes.keys().chain(endpoints).copied().collect();
             let gone: Vec<Gid> = state.tombstones.iter().copied().collect();
             state.outgoing.extend(gids.into_iter().map(Outgoing::Announce));
             let gone = gone.into_iter().map(|gid| Message::EndpointGone(Gone { gid }));
@@ -308,7 +326,11 @@ impl Control {
         if self.is_linked() {
             self.tell_segments();
         }
+        let mut gone = Vec::new();
         let mut state = shared.state();
+        if !state.outgoing.is_empty() {
+            self.timed = None;
+        }
         if matches!(self.link, Link::Reconnecting(_) | Link::Ended) {
             // All of it is said to the next daemon from what stands then.
             state.outgoing.clear();
@@ -316,7 +338,12 @@ impl Control {
         }
         while let Some(outgoing) = state.outgoing.pop_front() {
             match outgoing {
-                Outgoing::Message(message) => self.say(*message),
+                Outgoing::Message(message) => {
+                    if let Message::EndpointGone(Gone { gid }) = *message {
+                        gone.push(gid);
+                    }
+                    self.say(*message);
+                }
                 Outgoing::Announce(gid) => {
                     if let Some(publisher) = state.publishers.get(&gid) {
                         let announce = Announce {
@@ -341,7 +368,7 @@ impl Control {
                                 self.say(attach);
                             }
                         }
-                    } else if let Some(node) = state.nodes.get(&gid) {
+                    } else if let Some((node, _)) = state.nodes.get(&gid) {
                         let announce = Announce {
                             endpoint: node.clone(),
                             role: EndpointRole::Application,
@@ -353,6 +380,8 @@ impl Control {
                 }
             }
         }
+        drop(state);
+        gone.iter().for_each(|gid| self.own_gone(gid));
     }
 
     fn send(&mut self) {
@@ -401,18 +430,31 @@ impl Control {
             fds.push(PollFd::new(socket, PollFlags::IN | waits));
         }
         fds.extend(sessions.iter().map(|s| PollFd::from_borrowed_fd(s.pidfd(), PollFlags::IN)));
+        let listening = self.shared.listening();
+        if let Some(listening) = &listening {
+            fds.push(PollFd::new(listening, PollFlags::IN));
+            self.tell_arrived(listening);
+        }
         // A socket without room becomes writable, but one that is short of descriptors in flight
         // does not say when that passes.
         let blocked = !self.outbox.is_empty() || !self.untold.is_empty();
         let nap = blocked.then_some(Duration::from_millis(20));
         let tend = self.tend.filter(|_| self.is_linked());
-        let due = tend.into_iter().chain(self.retry).min();
+        let due = tend.into_iter().chain(self.retry).chain(self.arrivals.due()).min();
         let due = due.map(|due| due.saturating_duration_since(Instant::now()));
-        let timeout = nap.into_iter().chain(due).min();
+        let timeout = nap.into_iter().chain(due).chain(self.until_alarm()).min();
         let timeout = timeout.and_then(|timeout| Timespec::try_from(timeout).ok());
         let _ = poll(&mut fds, timeout.as_ref());
         let mut count = [0; 8];
         let _ = rustix::io::read(&self.shared.wake, &mut count);
+    }
+
+    /// Tells those who want to hear of samples as they come. What comes later rings.
+    fn tell_arrived(&self, listening: &ExternalLeader) {
+        listening.clear();
+        listening.arm(false);
+        let (_, subscriptions) = self.endpoints();
+        subscriptions.iter().for_each(|subscription| subscription.tell_arrived());
     }
 
     fn receive(&mut self) {
@@ -455,20 +497,15 @@ impl Control {
         if self.peers.take_dead().is_empty() {
             return;
         }
-        let (publishers, subscriptions) = {
-            let state = self.shared.state();
-            let publishers: Vec<_> = state.publishers.values().cloned().collect();
-            let subscriptions: Vec<_> = state.subscriptions.values().cloned().collect();
-            (publishers, subscriptions)
-        };
+        let (publishers, subscriptions) = self.endpoints();
         for publisher in publishers {
             if publisher.drop_dead() {
-                self.shared.notify(Some(&SessionEvent::Matched(publisher.endpoint.gid)));
+                self.writer_changed(&publisher);
             }
         }
         for subscription in subscriptions {
             if subscription.lock().end_dead() {
-                self.shared.notify(Some(&SessionEvent::Matched(subscription.endpoint.gid)));
+                self.reader_changed(&subscription);
             }
         }
     }

@@ -12,7 +12,7 @@ use minicbor::{Decode, Encode};
 use serde::Serialize;
 
 use crate::{
-    graph::{Endpoint, EndpointKind},
+    graph::Endpoint,
     ids::{DaemonId, Gid, SessionId},
     qos::Qos,
     shm::{Location, SegmentInfo, SegmentKind},
@@ -349,14 +349,4 @@ pub enum Message {
     Need(SegmentName),
     /// A type that this version does not know; to be skipped.
     Unknown(u8),
-}
-
-/// Whether an endpoint of this kind owns a ring that readers map.
-pub(crate) fn writes(kind: EndpointKind) -> bool {
-    matches!(kind, EndpointKind::Publisher)
-}
-
-/// Whether an endpoint of this kind attaches to rings.
-pub(crate) fn reads(kind: EndpointKind) -> bool {
-    matches!(kind, EndpointKind::Subscription)
 }

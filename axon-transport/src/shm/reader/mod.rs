@@ -346,6 +346,21 @@ impl Reader {
         self.ended = true;
     }
 
+    /// How many samples have come since the grant, whatever became of them.
+    pub(crate) fn arrived(&self) -> u64 {
+        if self.corrupt.is_some() || self.attachment.lane.is_forked() {
+            return 0;
+        }
+        let head = ring::bounds(self.attachment.ring()).map_or(self.cursor, |(_, head)| head);
+        // A sample may be taken by its stamp before the head says so.
+        head.max(self.cursor).saturating_sub(self.reads.grant.first)
+    }
+
+    /// The ring's header, which is not there in a forked child of the publisher's.
+    pub(super) fn ring_words(&self) -> Option<&[AtomicU64]> {
+        (!self.attachment.lane.is_forked()).then(|| self.attachment.ring())
+    }
+
     /// Whether the publisher's process has ended: a system call. Drain before dropping.
     pub fn writer_dead(&self) -> bool {
         self.reads.peer.is_dead()

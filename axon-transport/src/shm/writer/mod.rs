@@ -17,6 +17,7 @@ use super::{
     ring,
     room::Maps,
     samples::Samples,
+    times,
 };
 use crate::{ids::Gid, qos::History as Keep};
 
@@ -177,6 +178,7 @@ impl Writer {
         ring::copy_descriptors(array.words(), array.words(), 0, 0);
         let at = Array { at: array.block.at, descriptors };
         layout::write_ring(ring.words(), options.gid, &at);
+        times::offer(ring.words(), &options.qos);
         let history = History::new(descriptors, budget);
         let state = State::new(Audience::new(qos, limit - 1), history, array);
         let writer = Self { options, session, ring, limit, state: PiMutex::new(state)? };

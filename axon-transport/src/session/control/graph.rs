@@ -1,0 +1,226 @@
+//! The graph as this session shows it, and what its own endpoints are to the others in it.
+
+use std::{
+    collections::{BTreeSet, HashSet},
+    sync::Arc,
+    time::Instant,
+};
+
+use super::Control;
+use crate::{
+    graph::{Endpoint, EndpointKind, GraphEntry, GraphView, Pairing, pairing},
+    ids::Gid,
+    session::{
+        events::Source,
+        message::{Graph, Pair},
+        publisher::PublisherInner,
+        state::SessionEvent,
+        subscription::SubscriptionInner,
+    },
+};
+
+impl Control {
+    /// The daemon tells of a change, or a part of the whole.
+    pub(super) fn graph(&mut self, graph: Graph) {
+        if graph.whole {
+            self.building = Some(GraphView::default());
+            self.arrivals.restart();
+            self.peers.recount();
+            // A daemon that tells everything to a session it knew repeats every pair. A new daemon
+            // learns of the pairs from us, one by one.
+            self.repeated = self.told.then(HashSet::new);
+            self.told = true;
+        }
+        let over = graph.ended.unwrap_or_default();
+        {
+            let mut state = self.shared.state();
+            graph.removed.iter().for_each(|gid| {
+                state.tombstones.remove(gid);
+            });
+        }
+        for gid in graph.removed {
+            self.disappear(&gid);
+        }
+        for item in graph.added {
+            self.appear(GraphEntry { endpoint: Arc::new(item.endpoint), daemon: item.daemon });
+        }
+        self.view(|view| view.version = graph.version);
+        if !graph.more
+            && let Some(view) = self.building.take()
+        {
+            self.shared.state().graph = Arc::new(view);
+        }
+        for gid in over {
+            self.endpoint_over(gid);
+        }
+        if !graph.more {
+            let repeated = self.repeated.take();
+            if let Some(repeated) = &repeated {
+                self.drop_unrepeated(repeated);
+            }
+            self.drop_unread(repeated.is_some());
+            self.graph_changed = true;
+        }
+    }
+
+    /// A publisher's, server's or client's readers changed.
+    pub(super) fn writer_changed(&mut self, publisher: &PublisherInner) {
+        let writer = publisher.endpoint.gid;
+        let changes = publisher.rematch();
+        for reader in changes.added {
+            self.stands(&Pair { reader, writer });
+        }
+        self.tell_matched(&publisher.endpoint);
+    }
+
+    /// A subscription's, server's or client's writers changed.
+    pub(super) fn reader_changed(&mut self, subscription: &SubscriptionInner) {
+        let reader = subscription.endpoint.gid;
+        let changes = subscription.rematch();
+        for writer in changes.added {
+            self.stands(&Pair { reader, writer });
+        }
+        self.timed = None;
+        self.tell_matched(&subscription.endpoint);
+    }
+
+    fn tell_matched(&mut self, own: &Endpoint) {
+        // Whether a service is available is no more than that.
+        self.graph_changed |= matches!(own.kind, EndpointKind::Server | EndpointKind::Client);
+        self.shared.notify(Some(&SessionEvent::Matched(own.gid)));
+    }
+
+    /// An endpoint of this session is gone: nobody waits for its pairs.
+    pub(super) fn own_gone(&mut self, gid: &Gid) {
+        for entry in self.arrivals.own_gone(gid) {
+            self.show(entry);
+        }
+    }
+
+    /// Shows what has been held back for long enough, and tells of the graph where it changed.
+    pub(super) fn tell_graph(&mut self) {
+        for entry in self.arrivals.overdue(Instant::now()) {
+            self.show(entry);
+        }
+        if std::mem::take(&mut self.graph_changed) {
+            self.shared.notify(Some(&SessionEvent::Graph));
+        }
+    }
+
+    fn stands(&mut self, pair: &Pair) {
+        if let Some(entry) = self.arrivals.pair_up(pair) {
+            self.show(entry);
+        }
+    }
+
+    fn appear(&mut self, entry: GraphEntry) {
+        let endpoint = &entry.endpoint;
+        let own = endpoint.gid.0[..12] == self.shared.id.0[..12];
+        self.relate(endpoint);
+        let shown = self.building.is_some()
+            && self.shared.state().graph.endpoints.contains_key(&endpoint.gid);
+        let missing = if own || shown { BTreeSet::new() } else { self.missing(endpoint) };
+        if missing.is_empty() {
+            self.show(entry);
+        } else {
+            self.arrivals.hold(entry, missing, Instant::now());
+        }
+    }
+
+    fn disappear(&mut self, gid: &Gid) {
+        self.arrivals.remove(gid);
+        let mut entry = None;
+        self.view(|view| entry = view.endpoints.remove(gid));
+        let Some(entry) = entry else { return };
+        for own in self.own(&entry.endpoint.topic) {
+            own.events().forget(gid);
+        }
+    }
+
+    fn show(&mut self, entry: GraphEntry) {
+        self.graph_changed = true;
+        self.view(|view| drop(view.endpoints.insert(entry.endpoint.gid, entry)));
+    }
+
+    /// Changes the view that is being built, or else the one that is shown.
+    fn view(&mut self, change: impl FnOnce(&mut GraphView)) {
+        match &mut self.building {
+            Some(view) => change(view),
+            None => change(Arc::make_mut(&mut self.shared.state().graph)),
+        }
+    }
+
+    /// The pairs that an endpoint makes with this session's own and that do not stand yet.
+    fn missing(&self, other: &Endpoint) -> BTreeSet<Pair> {
+        let state = self.shared.state();
+        let mut missing = BTreeSet::new();
+        for own in state.topics.get(&other.topic).into_iter().flatten() {
+            if let Some(writer) = state.publishers.get(own)
+                && pairing(&writer.endpoint, other) == Pairing::Match
+                && !writer.events.is_matched(&other.gid)
+            {
+                missing.insert(Pair { reader: other.gid, writer: *own });
+            }
+            if let Some(reader) = state.subscriptions.get(own)
+                && pairing(other, &reader.endpoint) == Pairing::Match
+                && !reader.events.is_matched(&other.gid)
+            {
+                missing.insert(Pair { reader: *own, writer: other.gid });
+            }
+        }
+        missing
+    }
+
+    /// Reports to this session's endpoints that one does not go with them, and, if it is of this
+    /// session, to it that others do not. Whoever comes second finds the first.
+    fn relate(&self, endpoint: &Endpoint) {
+        let here = self.own(&endpoint.topic);
+        // One of its own may have ended since it was announced, and others begun that never met it.
+        let is_own = |gid: &Gid| gid.0[..12] == self.shared.id.0[..12];
+        let ended = |gid: &Gid| is_own(gid) && here.iter().all(|own| own.endpoint().gid != *gid);
+        if ended(&endpoint.gid) {
+            return;
+        }
+        for source in here.iter().filter(|source| source.endpoint().gid != endpoint.gid) {
+            self.report(source, endpoint);
+        }
+        let Some(source) = here.iter().find(|source| source.endpoint().gid == endpoint.gid) else {
+            return;
+        };
+        let shown = self.shared.state().graph.clone();
+        let shown = self.building.as_ref().unwrap_or(&shown);
+        for other in shown.endpoints.values().chain(self.arrivals.entries()) {
+            if !ended(&other.endpoint.gid) {
+                self.report(source, &other.endpoint);
+            }
+        }
+    }
+
+    fn report(&self, own: &Source, other: &Endpoint) {
+        let verdict = match own {
+            Source::Publisher(writer) => pairing(&writer.endpoint, other),
+            Source::Subscription(reader) => pairing(other, &reader.endpoint),
+        };
+        if own.events().incompatible(other.gid, verdict) {
+            self.shared.segment.notify();
+        }
+    }
+
+    /// This session's publishers and subscriptions of a topic.
+    fn own(&self, topic: &str) -> Vec<Source> {
+        let state = self.shared.state();
+        let mut own = Vec::new();
+        for gid in state.topics.get(topic).into_iter().flatten() {
+            let publisher = state.publishers.get(gid);
+            if let Some(inner) = publisher.filter(|p| p.endpoint.kind == EndpointKind::Publisher) {
+                own.push(Source::Publisher(inner.clone()));
+            }
+            let subscription = state.subscriptions.get(gid);
+            let is = |s: &&Arc<SubscriptionInner>| s.endpoint.kind == EndpointKind::Subscription;
+            if let Some(inner) = subscription.filter(is) {
+                own.push(Source::Subscription(inner.clone()));
+            }
+        }
+        own
+    }
+}

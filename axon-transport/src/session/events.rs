@@ -1,0 +1,417 @@
+//! What an endpoint reports of itself: statuses, and who is told of them.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    fmt,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+};
+
+use super::{
+    Session,
+    callback::{Callback, OnNew},
+    publisher::PublisherInner,
+    subscription::SubscriptionInner,
+};
+use crate::{
+    events::{Deadline, EventKind, EventStatus, Lease, Liveness, Statuses},
+    graph::{Endpoint, Pairing},
+    ids::Gid,
+    qos::{Liveliness, Qos},
+    shm::Times,
+};
+
+/// One event of a publisher or subscription. Thread-safe; it may outlive its endpoint, and then
+/// never occurs again.
+///
+/// ```
+/// use std::time::Duration;
+///
+/// use axon_transport::{
+///     config::{Config, DaemonPolicy, OsFiles},
+///     events::{EventKind, EventStatus},
+///     qos::Qos,
+///     session::{EndpointSpec, Session, SessionOptions},
+/// };
+///
+/// let config = Config { daemon: DaemonPolicy::Off, ..Config::resolve([], None, &OsFiles)? };
+/// let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// let publisher = session.create_publisher(EndpointSpec::new("/t", "T", Qos::default()))?;
+/// let matched = publisher.event(EventKind::PublicationMatched).expect("publishers have it");
+/// let _reader = session.create_subscription(EndpointSpec::new("/t", "T", Qos::default()))?;
+/// assert!(publisher.wait_matched(1, Duration::from_secs(10)));
+/// let EventStatus::Matched(status) = matched.take() else { unreachable!() };
+/// assert_eq!((status.total, status.current_change), (1, 1));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+pub struct Event {
+    pub(super) source: Source,
+    kind: EventKind,
+    pub(super) session: Session,
+}
+
+/// Whose event it is.
+#[derive(Clone)]
+pub(super) enum Source {
+    Publisher(Arc<PublisherInner>),
+    Subscription(Arc<SubscriptionInner>),
+}
+
+impl Source {
+    pub(super) fn events(&self) -> &EndpointEvents {
+        match self {
+            Self::Publisher(inner) => &inner.events,
+            Self::Subscription(inner) => &inner.events,
+        }
+    }
+
+    pub(super) fn endpoint(&self) -> &Endpoint {
+        match self {
+            Self::Publisher(inner) => &inner.endpoint,
+            Self::Subscription(inner) => &inner.endpoint,
+        }
+    }
+
+    /// Counts what has passed until `now`. When to look again, and whether something happened.
+    pub(super) fn look_at_time(&self, now: u64) -> (Option<u64>, bool) {
+        match self {
+            Self::Publisher(inner) => inner.look_at_time(now),
+            Self::Subscription(inner) => inner.look_at_time(now),
+        }
+    }
+
+    /// Whether `kind` occurred since its status was taken.
+    pub(super) fn has(&self, kind: EventKind) -> bool {
+        if let (Self::Subscription(inner), EventKind::MessageLost) = (self, kind) {
+            inner.look_for_losses();
+        }
+        self.events().unread(kind) > 0
+    }
+
+    /// The same for others than who waits: where somebody is taking, it may.
+    pub(super) fn may_have(&self, kind: EventKind) -> bool {
+        let losing = match (self, kind) {
+            (Self::Subscription(inner), EventKind::MessageLost) => inner.may_have_losses(),
+            _ => false,
+        };
+        losing || self.events().unread(kind) > 0
+    }
+}
+
+impl Event {
+    pub(super) fn new(source: Source, kind: EventKind, session: Session) -> Option<Self> {
+        let publishers = matches!(source, Source::Publisher(_));
+        (kind.is_publishers() == publishers).then_some(Self { source, kind, session })
+    }
+
+    /// Which it is.
+    pub fn kind(&self) -> EventKind {
+        self.kind
+    }
+
+    /// Whether it occurred since its status was last taken. False in a forked child.
+    pub fn is_ready(&self) -> bool {
+        !self.session.is_forked() && self.source.has(self.kind)
+    }
+
+    /// The status; its changes are counted anew from here. In a forked child, one of which nothing
+    /// ever happened.
+    pub fn take(&self) -> EventStatus {
+        if self.session.is_forked() {
+            let mut nothing = match self.source {
+                Source::Publisher(_) => Statuses::of_publisher(),
+                Source::Subscription(_) => Statuses::of_subscription(),
+            };
+            return nothing.take(self.kind).expect("checked when the event was made");
+        }
+        self.source.events().take(self.kind)
+    }
+
+    /// Has `callback` told of it from now on, in place of the one before, which is not called any
+    /// more once this returns. What happened since the status was last taken, and nobody was told
+    /// of, it is told at once, on this thread; the rest mostly on the control thread. It must
+    /// neither block nor panic, nor hold the session.
+    pub fn set_callback(&self, callback: Option<OnNew>) {
+        if !self.session.is_forked() {
+            self.source.events().callback(self.kind).set(callback);
+        }
+    }
+
+    /// What a wait set looks at.
+    pub(super) fn parts(&self) -> (Source, EventKind) {
+        (self.source.clone(), self.kind)
+    }
+}
+
+impl fmt::Debug for Event {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Event").field(&self.kind).finish()
+    }
+}
+
+/// Who is matched that was not, and who is not that was.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub(super) struct Changes {
+    pub(super) added: Vec<Gid>,
+    pub(super) removed: Vec<Gid>,
+}
+
+impl Changes {
+    pub(super) fn is_empty(&self) -> bool {
+        self.added.is_empty() && self.removed.is_empty()
+    }
+}
+
+/// The events of one endpoint.
+pub(super) struct EndpointEvents {
+    inner: Mutex<Inner>,
+}
+
+struct Inner {
+    statuses: Statuses,
+    callbacks: BTreeMap<EventKind, Arc<Callback>>,
+    matched: BTreeSet<Gid>,
+    /// Those of the topic that do not go with this one, and have been counted.
+    incompatible: BTreeSet<Gid>,
+    /// A subscription's publishers.
+    liveness: Liveness,
+    /// A publisher's own lease, where it may run out.
+    lease: Option<Lease>,
+    deadline: Option<Deadline>,
+}
+
+/// The shortest time between two looks at deadlines and leases.
+const SHORTEST: u64 = 1_000_000;
+
+impl EndpointEvents {
+    pub(super) fn of_publisher(qos: &Qos, now: u64) -> Self {
+        let manual = qos.liveliness == Liveliness::ManualByTopic && qos.lease.is_some();
+        let lease = manual.then(|| Lease::new(qos.lease, now));
+        Self::new(Statuses::of_publisher(), qos, lease)
+    }
+
+    pub(super) fn of_subscription(qos: &Qos) -> Self {
+        Self::new(Statuses::of_subscription(), qos, None)
+    }
+
+    fn new(statuses: Statuses, qos: &Qos, lease: Option<Lease>) -> Self {
+        let inner = Inner {
+            statuses,
+            callbacks: BTreeMap::new(),
+            matched: BTreeSet::new(),
+            incompatible: BTreeSet::new(),
+            liveness: Liveness::default(),
+            lease,
+            deadline: qos.deadline.map(Deadline::new),
+        };
+        Self { inner: Mutex::new(inner) }
+    }
+
+    pub(super) fn unread(&self, kind: EventKind) -> u64 {
+        self.lock().statuses.unread(kind)
+    }
+
+    fn take(&self, kind: EventKind) -> EventStatus {
+        let mut inner = self.lock();
+        if let Some(callback) = inner.callbacks.get(&kind) {
+            callback.forget();
+        }
+        inner.statuses.take(kind).expect("checked when the event was made")
+    }
+
+    fn callback(&self, kind: EventKind) -> Arc<Callback> {
+        let mut inner = self.lock();
+        let untold = inner.statuses.unread(kind);
+        inner.callbacks.entry(kind).or_insert_with(|| Arc::new(Callback::new(untold))).clone()
+    }
+
+    pub(super) fn is_matched(&self, gid: &Gid) -> bool {
+        self.lock().matched.contains(gid)
+    }
+
+    /// Those that a publisher sends to are these now.
+    pub(super) fn readers(&self, now: BTreeSet<Gid>) -> Changes {
+        self.rematch(now, |_, _| {})
+    }
+
+    /// Those that a subscription receives from are these now, with the leases that they offer.
+    pub(super) fn writers(&self, now: &BTreeMap<Gid, Option<u64>>, time: u64) -> Changes {
+        self.rematch(now.keys().copied().collect(), |inner, changes| {
+            let (mut alive, mut not_alive) = (0, 0);
+            let mut add = |change: (i64, i64)| {
+                alive += change.0;
+                not_alive += change.1;
+            };
+            for gid in &changes.removed {
+                add(inner.liveness.unmatched(gid));
+            }
+            for gid in &changes.added {
+                add(inner.liveness.matched(*gid, now[gid], time));
+            }
+            inner.statuses.liveliness_changed(alive, not_alive);
+        })
+    }
+
+    fn rematch(&self, now: BTreeSet<Gid>, liveness: impl FnOnce(&mut Inner, &Changes)) -> Changes {
+        let mut changes = Changes::default();
+        self.change(|inner| {
+            changes.removed = inner.matched.difference(&now).copied().collect();
+            changes.added = now.difference(&inner.matched).copied().collect();
+            if changes.is_empty() {
+                return;
+            }
+            inner.matched = now;
+            changes.removed.iter().for_each(|_| {
+                inner.statuses.unmatched();
+            });
+            changes.added.iter().for_each(|_| {
+                inner.statuses.matched();
+            });
+            liveness(inner, &changes);
+        });
+        changes
+    }
+
+    /// An endpoint of the topic is not matched, for this reason. Whether that is news.
+    pub(super) fn incompatible(&self, other: Gid, why: Pairing) -> bool {
+        let mut news = false;
+        self.change(|inner| {
+            news = match why {
+                Pairing::IncompatibleQos(_) | Pairing::IncompatibleType => {
+                    inner.incompatible.insert(other)
+                }
+                Pairing::Match | Pairing::Unrelated => false,
+            };
+            if !news {
+                return;
+            }
+            if let Pairing::IncompatibleQos(policy) = why {
+                inner.statuses.incompatible_qos(policy);
+            } else {
+                inner.statuses.incompatible_type();
+            }
+        });
+        news
+    }
+
+    /// An endpoint that was incompatible is gone.
+    pub(super) fn forget(&self, other: &Gid) {
+        self.lock().incompatible.remove(other);
+    }
+
+    pub(super) fn lost(&self, count: u64) {
+        if count > 0 {
+            self.change(|inner| {
+                inner.statuses.lost(count);
+            });
+        }
+    }
+
+    /// What has passed for a publisher until `now`. When to look again.
+    pub(super) fn offered(&self, qos: &Qos, times: &Times, now: u64) -> (Option<u64>, bool) {
+        let mut due = None;
+        let news = self.change(|inner| {
+            if let Some(lease) = &mut inner.lease {
+                if let Some(asserted) = times.asserted {
+                    lease.assert(asserted.min(now));
+                }
+                if lease.ran_out(now) {
+                    inner.statuses.liveliness_lost();
+                }
+                // Where it has run out, one looks whether it is asserted again.
+                due = earlier(due, lease.due().or(third(qos.lease, now)));
+            }
+            due = earlier(due, inner.deadlines(qos, times.sampled, now));
+        });
+        (due.map(|due| due.max(now + SHORTEST)), news)
+    }
+
+    /// What has passed for a subscription until `now`, where its publishers say this of themselves.
+    /// When to look again.
+    pub(super) fn requested(
+        &self,
+        qos: &Qos,
+        writers: &[(Gid, Times)],
+        now: u64,
+    ) -> (Option<u64>, bool) {
+        let mut due = None;
+        let news = self.change(|inner| {
+            let (mut alive, mut not_alive) = (0, 0);
+            let mut add = |change: (i64, i64)| {
+                alive += change.0;
+                not_alive += change.1;
+            };
+            for (gid, times) in writers {
+                if let Some(asserted) = times.asserted {
+                    add(inner.liveness.assert(gid, asserted.min(now)));
+                }
+            }
+            add(inner.liveness.ran_out(now));
+            if (alive, not_alive) != (0, 0) {
+                inner.statuses.liveliness_changed(alive, not_alive);
+            }
+            due = inner.liveness.due();
+            // One that is not alive may be so again.
+            let leases = writers.iter().filter_map(|(_, times)| times.lease).min();
+            if inner.liveness.any_dead() {
+                due = earlier(due, third(leases, now));
+            }
+            if writers.is_empty() {
+                // It runs from the first sample of the next one on.
+                inner.deadline = qos.deadline.map(Deadline::new);
+            } else {
+                let sampled = writers.iter().filter_map(|(_, times)| times.sampled).max();
+                due = earlier(due, inner.deadlines(qos, sampled, now));
+            }
+        });
+        (due.map(|due| due.max(now + SHORTEST)), news)
+    }
+
+    /// Changes statuses and tells those who are to be told. Whether anything occurred.
+    fn change(&self, change: impl FnOnce(&mut Inner)) -> bool {
+        let mut told = Vec::new();
+        let mut news = false;
+        {
+            let mut inner = self.lock();
+            let unread = |inner: &Inner| EventKind::ALL.map(|kind| inner.statuses.unread(kind));
+            let before = unread(&inner);
+            change(&mut inner);
+            for ((kind, before), after) in EventKind::ALL.iter().zip(before).zip(unread(&inner)) {
+                if after > before {
+                    news = true;
+                    told.extend(inner.callbacks.get(kind).map(|c| (c.clone(), after - before)));
+                }
+            }
+        }
+        told.iter().for_each(|(callback, count)| callback.add(*count));
+        news
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Inner> {
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Inner {
+    /// Counts the deadlines that have passed, where the newest sample is of `sampled`. When to look
+    /// again.
+    fn deadlines(&mut self, qos: &Qos, sampled: Option<u64>, now: u64) -> Option<u64> {
+        let deadline = self.deadline.as_mut()?;
+        if let Some(sampled) = sampled {
+            deadline.sample(sampled.min(now));
+        }
+        let missed = deadline.missed(now);
+        if missed > 0 {
+            self.statuses.deadlines_missed(missed);
+        }
+        // The first sample, from which it runs, may come at any time.
+        deadline.due().or(qos.deadline.map(|period| now.saturating_add(period)))
+    }
+}
+
+fn earlier(one: Option<u64>, other: Option<u64>) -> Option<u64> {
+    one.into_iter().chain(other).min()
+}
+
+fn third(period: Option<u64>, now: u64) -> Option<u64> {
+    period.map(|period| now.saturating_add(period / 3))
+}

@@ -1,0 +1,73 @@
+//! Conditions that a program triggers itself.
+
+use std::{
+    fmt,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+};
+
+use crate::shm::SessionSegment;
+
+/// A condition that stands from when it is triggered until a wait has seen it. Thread-safe; cheap to
+/// clone, and all clones are the same condition.
+#[derive(Clone)]
+pub struct GuardCondition {
+    inner: Arc<Guard>,
+}
+
+pub(super) struct Guard {
+    triggered: AtomicBool,
+    segment: Arc<SessionSegment>,
+}
+
+impl GuardCondition {
+    pub(super) fn new(segment: Arc<SessionSegment>) -> Self {
+        Self { inner: Arc::new(Guard { triggered: AtomicBool::new(false), segment }) }
+    }
+
+    /// Triggers it. Async-signal-safe: a signal handler may, too. In a forked child it wakes nobody.
+    pub fn trigger(&self) {
+        self.inner.trigger();
+    }
+
+    /// Whether it stands.
+    pub fn is_triggered(&self) -> bool {
+        self.inner.is_triggered()
+    }
+
+    pub(super) fn guard(&self) -> &Arc<Guard> {
+        &self.inner
+    }
+}
+
+impl Guard {
+    /// One load, one exchange, and a system call where it did not stand.
+    pub(super) fn trigger(&self) {
+        // Release pairs with the acquire of `is_triggered` and `take`: who sees it sees what was
+        // done before. A waiter that looked before this is woken by the knock.
+        if !self.triggered.swap(true, Ordering::AcqRel) {
+            self.segment.knock();
+        }
+    }
+
+    pub(super) fn segment(&self) -> &Arc<SessionSegment> {
+        &self.segment
+    }
+
+    pub(super) fn is_triggered(&self) -> bool {
+        self.triggered.load(Ordering::Acquire)
+    }
+
+    /// Whether it stood; it does no more.
+    pub(super) fn take(&self) -> bool {
+        self.is_triggered() && self.triggered.swap(false, Ordering::AcqRel)
+    }
+}
+
+impl fmt::Debug for GuardCondition {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("GuardCondition").field(&self.is_triggered()).finish()
+    }
+}

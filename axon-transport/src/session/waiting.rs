@@ -1,0 +1,126 @@
+//! Waiting for any of several things.
+
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use super::{
+    Event, GuardCondition, Session, SessionError, Subscription, events::Source, guard::Guard,
+    subscription::SubscriptionInner,
+};
+use crate::{events::EventKind, shm::ShmError, wait::Look};
+
+/// Something to wait for.
+#[derive(Clone, Copy, Debug)]
+#[non_exhaustive]
+pub enum Waitable<'a> {
+    /// Ready while there is something to take.
+    Subscription(&'a Subscription),
+    /// Ready once it was triggered. The wait that finds it so resets it.
+    GuardCondition(&'a GuardCondition),
+    /// Ready while it occurred and its status was not taken since.
+    Event(&'a Event),
+}
+
+/// The part of a [`Waitable`] that may be looked at by whoever listens for all.
+pub(super) enum Part {
+    Data(Arc<SubscriptionInner>),
+    Guard(Arc<Guard>),
+    Event(Source, EventKind),
+}
+
+struct Watch(Vec<Part>);
+
+impl Session {
+    /// Waits until at least one of `waitables` is ready, for at most `timeout`: for ever where it is
+    /// `None`, and not at all where it is zero. The indices of all that are ready then, in order; none
+    /// if the time is over.
+    ///
+    /// Any number of threads may wait at the same time. One that waits for what another waits for,
+    /// too, is no error, but a guard condition then stands for one of them only.
+    ///
+    /// ```
+    /// use std::time::Duration;
+    ///
+    /// use axon_transport::{
+    ///     config::{Config, DaemonPolicy, OsFiles},
+    ///     qos::Qos,
+    ///     session::{EndpointSpec, Session, SessionOptions, Waitable},
+    /// };
+    ///
+    /// let config = Config { daemon: DaemonPolicy::Off, ..Config::resolve([], None, &OsFiles)? };
+    /// let session = Session::open(&config, SessionOptions::new("robot"))?;
+    /// let spec = || EndpointSpec::new("/t", "T", Qos::default());
+    /// let subscription = session.create_subscription(spec())?;
+    /// let publisher = session.create_publisher(spec())?;
+    /// let stop = session.create_guard_condition();
+    /// assert!(subscription.wait_matched(1, Duration::from_secs(10)));
+    /// publisher.publish(b"hello")?;
+    /// let all = [Waitable::GuardCondition(&stop), Waitable::Subscription(&subscription)];
+    /// assert_eq!(session.wait_for(&all, None)?, [1]);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    ///
+    /// # Errors
+    /// [`SessionError::OtherSession`] when one is another session's, and in a forked child.
+    pub fn wait_for(
+        &self,
+        waitables: &[Waitable<'_>],
+        timeout: Option<Duration>,
+    ) -> Result<Vec<usize>, SessionError> {
+        if self.is_forked() {
+            return Err(ShmError::Forked.into());
+        }
+        let parts: Option<Vec<Part>> = waitables.iter().map(|one| self.part(one)).collect();
+        let watch = Arc::new(Watch(parts.ok_or(SessionError::OtherSession)?));
+        let deadline = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
+        loop {
+            let ready = watch.collect();
+            let left = deadline.map(|deadline| deadline.saturating_duration_since(Instant::now()));
+            if !ready.is_empty() || left.is_some_and(|left| left.is_zero()) {
+                return Ok(ready);
+            }
+            // That something may be ready is enough for it to return: the next look is exact.
+            self.segment().wait_for(watch.clone(), left);
+        }
+    }
+
+    fn part(&self, waitable: &Waitable<'_>) -> Option<Part> {
+        let (part, segment) = match waitable {
+            Waitable::Subscription(subscription) => {
+                (Part::Data(subscription.inner.clone()), subscription.session.segment())
+            }
+            Waitable::GuardCondition(guard) => {
+                (Part::Guard(guard.guard().clone()), guard.guard().segment())
+            }
+            Waitable::Event(event) => {
+                let (source, kind) = event.parts();
+                (Part::Event(source, kind), event.session.segment())
+            }
+        };
+        Arc::ptr_eq(segment, self.segment()).then_some(part)
+    }
+}
+
+impl Watch {
+    /// What is ready. Guard conditions that are stand no more.
+    fn collect(&self) -> Vec<usize> {
+        let ready = |part: &Part| match part {
+            Part::Data(inner) => inner.has_data(),
+            Part::Guard(guard) => guard.take(),
+            Part::Event(source, kind) => source.has(*kind),
+        };
+        self.0.iter().enumerate().filter(|(_, part)| ready(part)).map(|(index, _)| index).collect()
+    }
+}
+
+impl Look for Watch {
+    fn ready(&self) -> bool {
+        self.0.iter().any(|part| match part {
+            Part::Data(inner) => inner.ready(),
+            Part::Guard(guard) => guard.is_triggered(),
+            Part::Event(source, kind) => source.may_have(*kind),
+        })
+    }
+}

@@ -1,0 +1,198 @@
+//! The graph is exact: who is counted is reached, and who is gone is not counted.
+
+mod support;
+
+use std::time::Duration;
+
+use axon_transport::{
+    config::Config,
+    events::{EventKind, EventStatus},
+    graph::EndpointKind,
+    qos::Qos,
+    session::{EndpointSpec, Session, SessionOptions, Waitable},
+};
+use rustix::process::Signal;
+use support::{Host, PATIENCE, say, signal, until, wait_for_the_end};
+
+const ROUNDS: usize = 20;
+
+fn spec(topic: &str) -> EndpointSpec {
+    EndpointSpec::new(topic, "T", Qos::default())
+}
+
+/// What the children of the tests do. In a run of the tests themselves it does nothing.
+#[test]
+fn child() {
+    let Ok(part) = std::env::var("PLAY") else { return };
+    let config = Config::from_env().unwrap();
+    let session = Session::open(&config, SessionOptions::new(&*part)).unwrap();
+    match part.as_str() {
+        // Answers on /answer what comes on any of its topics.
+        "echo" => {
+            let answer = session.create_publisher(spec("/answer")).unwrap();
+            assert!(answer.wait_matched(1, PATIENCE));
+            for round in 0..ROUNDS {
+                let subscription =
+                    session.create_subscription(spec(&format!("/t{round}"))).unwrap();
+                let mut bytes = Vec::new();
+                assert!(subscription.recv(&mut bytes, Some(PATIENCE)).is_some());
+                answer.publish(&bytes).unwrap();
+            }
+            wait_for_the_end();
+        }
+        "node" => {
+            let node = session.create_node("lonely", "/far", "/enclave").unwrap();
+            say(node.gid());
+            wait_for_the_end();
+        }
+        "leased" => {
+            let lease = Some(300_000_000);
+            let qos = Qos { lease, ..Qos::default() };
+            let publisher = session.create_publisher(EndpointSpec::new("/t", "T", qos)).unwrap();
+            assert!(publisher.wait_matched(1, PATIENCE));
+            say("matched");
+            wait_for_the_end();
+        }
+        "resting" => {
+            let publisher = session.create_publisher(spec("/t")).unwrap();
+            assert!(publisher.wait_matched(1, PATIENCE));
+            // What there was to do has been done.
+            std::thread::sleep(Duration::from_millis(500));
+            let before = switches();
+            std::thread::sleep(Duration::from_millis(1500));
+            say(switches() - before);
+            wait_for_the_end();
+        }
+        _ => unreachable!("no such part: {part}"),
+    }
+}
+
+/// How often the threads of this process besides the calling one went to sleep.
+fn switches() -> u64 {
+    let mut switches = 0;
+    for task in std::fs::read_dir("/proc/self/task").unwrap() {
+        let task = task.unwrap().path();
+        let name = std::fs::read_to_string(task.join("comm")).unwrap();
+        if name.trim() == "axon-ctl" {
+            let status = std::fs::read_to_string(task.join("status")).unwrap();
+            let line = status.lines().find(|l| l.starts_with("voluntary_ctxt")).unwrap();
+            switches += line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap();
+        }
+    }
+    switches
+}
+
+#[test]
+fn a_subscription_that_is_counted_gets_what_is_published_next() {
+    let host = Host::new();
+    let _daemon = host.daemon();
+    let session = host.session("counting").unwrap();
+    let answers = session.create_subscription(spec("/answer")).unwrap();
+    let node = session.create_node("counting", "/", "/").unwrap();
+    let publishers: Vec<_> = (0..ROUNDS)
+        .map(|round| session.create_publisher(spec(&format!("/t{round}"))).unwrap())
+        .collect();
+    let echo = host.play("echo");
+    let mut bytes = Vec::new();
+    for (round, publisher) in publishers.iter().enumerate() {
+        let topic = &publisher.endpoint().topic;
+        // The guard condition alone tells that there is something to be seen.
+        while session.graph().count(EndpointKind::Subscription, topic) == 0 {
+            let graph = Waitable::GuardCondition(node.graph_changed());
+            assert_eq!(session.wait_for(&[graph], Some(PATIENCE)).unwrap(), [0]);
+        }
+        assert_eq!(publisher.matched().len(), 1);
+        publisher.publish(&round.to_le_bytes()).unwrap();
+        assert!(answers.recv(&mut bytes, Some(PATIENCE)).is_some(), "round {round} was lost");
+        assert_eq!(bytes, round.to_le_bytes());
+    }
+    echo.finish();
+}
+
+#[test]
+fn a_publisher_reaches_at_once_whom_it_could_count_when_it_was_made() {
+    let host = Host::new();
+    let _daemon = host.daemon();
+    let (here, there) = (host.session("here").unwrap(), host.session("there").unwrap());
+    for round in 0..ROUNDS {
+        let topic = format!("/t{round}");
+        let subscription = there.create_subscription(spec(&topic)).unwrap();
+        let counted = |graph: &axon_transport::graph::GraphView| {
+            graph.count(EndpointKind::Subscription, &topic) == 1
+        };
+        assert!(here.wait_graph(PATIENCE, counted));
+        let publisher = here.create_publisher(spec(&topic)).unwrap();
+        assert_eq!(publisher.matched(), [subscription.gid()], "round {round}");
+        publisher.publish(b"x").unwrap();
+        assert!(subscription.recv(&mut Vec::new(), Some(PATIENCE)).is_some());
+    }
+}
+
+#[test]
+fn a_node_outlives_its_daemon() {
+    let host = Host::new();
+    let mut daemon = host.daemon();
+    let session = host.session("witness").unwrap();
+    let witness = session.create_node("witness", "/", "/").unwrap();
+    let mut player = host.play("node");
+    let gid = player.hear();
+    let there = || {
+        session.graph().endpoints.iter().any(|(g, entry)| {
+            g.to_string() == gid
+                && entry.endpoint.node == "lonely"
+                && entry.endpoint.namespace == "/far"
+                && entry.endpoint.enclave == "/enclave"
+        })
+    };
+    until("the node is seen", there);
+    for _ in 0..3 {
+        let before = session.daemon();
+        daemon.0.kill().unwrap();
+        daemon.0.wait().unwrap();
+        daemon = host.daemon();
+        until("another daemon", || session.daemon().is_some_and(|now| Some(now) != before));
+        until("the nodes are seen again", || {
+            there() && session.graph().has_node(witness.name(), "/")
+        });
+        assert_eq!(session.graph().nodes().len(), 2);
+    }
+    signal(player.pid(), Signal::KILL);
+    until("a dead process's node is gone", || session.graph().nodes().len() == 1);
+}
+
+#[test]
+fn a_stopped_process_is_not_alive_and_is_again_when_it_goes_on() {
+    let host = Host::new();
+    let _daemon = host.daemon();
+    let session = host.session("witness").unwrap();
+    let subscription = session.create_subscription(spec("/t")).unwrap();
+    let changed = subscription.event(EventKind::LivelinessChanged).unwrap();
+    let mut player = host.play("leased");
+    assert_eq!(player.hear(), "matched");
+    let becomes = |alive: u64| {
+        until(&format!("{alive} alive"), || {
+            let all = [Waitable::Event(&changed)];
+            session.wait_for(&all, Some(Duration::from_millis(100))).unwrap();
+            matches!(changed.take(), EventStatus::LivelinessChanged(now)
+                if (now.alive, now.not_alive) == (alive, 1 - alive))
+        });
+    };
+    becomes(1);
+    signal(player.pid(), Signal::STOP);
+    becomes(0);
+    assert_eq!(subscription.matched().len(), 1, "it is there still");
+    signal(player.pid(), Signal::CONT);
+    becomes(1);
+    player.finish();
+}
+
+#[test]
+fn who_has_no_deadline_and_no_lease_is_never_woken() {
+    let host = Host::new();
+    let _daemon = host.daemon();
+    let session = host.session("witness").unwrap();
+    let _subscription = session.create_subscription(spec("/t")).unwrap();
+    let mut player = host.play("resting");
+    assert_eq!(player.hear(), "0");
+    player.finish();
+}

@@ -1,0 +1,253 @@
+//! Waiting for several things at once, and being told of samples.
+
+use std::{
+    sync::{
+        Arc, OnceLock,
+        atomic::{AtomicBool, AtomicU64, Ordering},
+    },
+    thread,
+    time::Duration,
+};
+
+use axon_transport::{
+    config::{Config, DaemonPolicy, OsFiles},
+    qos::Qos,
+    session::{
+        EndpointSpec, GuardCondition, Publisher, Session, SessionError, SessionOptions,
+        Subscription, Waitable,
+    },
+};
+
+const PATIENCE: Duration = Duration::from_secs(60);
+const NOT_AT_ALL: Option<Duration> = Some(Duration::ZERO);
+
+fn session() -> Session {
+    let config = Config::resolve([], None, &OsFiles).unwrap();
+    let config = Config { daemon: DaemonPolicy::Off, ..config };
+    Session::open(&config, SessionOptions::new("test")).unwrap()
+}
+
+fn spec(topic: &str) -> EndpointSpec {
+    EndpointSpec::new(topic, "T", Qos::default())
+}
+
+fn pair(session: &Session, topic: &str) -> (Publisher, Subscription) {
+    let publisher = session.create_publisher(spec(topic)).unwrap();
+    let subscription = session.create_subscription(spec(topic)).unwrap();
+    assert!(subscription.wait_matched(1, PATIENCE));
+    (publisher, subscription)
+}
+
+#[test]
+fn a_guard_condition_stands_until_a_wait_has_seen_it() {
+    let session = session();
+    let guard = session.create_guard_condition();
+    let all = [Waitable::GuardCondition(&guard)];
+    assert!(session.wait_for(&all, NOT_AT_ALL).unwrap().is_empty());
+    guard.trigger();
+    guard.trigger();
+    assert!(guard.is_triggered());
+    assert_eq!(session.wait_for(&all, NOT_AT_ALL).unwrap(), [0]);
+    assert!(!guard.is_triggered());
+    assert!(session.wait_for(&all, Some(Duration::from_millis(20))).unwrap().is_empty());
+    thread::scope(|scope| {
+        let waiter = scope.spawn(|| session.wait_for(&all, None).unwrap());
+        guard.trigger();
+        assert_eq!(waiter.join().unwrap(), [0]);
+    });
+}
+
+#[test]
+fn nothing_at_all_is_waited_for_until_the_time_is_over() {
+    let session = session();
+    assert!(session.wait_for(&[], NOT_AT_ALL).unwrap().is_empty());
+    assert!(session.wait_for(&[], Some(Duration::from_millis(10))).unwrap().is_empty());
+}
+
+#[test]
+fn all_that_is_ready_is_named_and_a_sample_that_stays_is_named_again() {
+    let session = session();
+    let (publisher, subscription) = pair(&session, "/t");
+    let (_silent, idle) = pair(&session, "/u");
+    let guards = [(); 2].map(|()| session.create_guard_condition());
+    let all = [
+        Waitable::Subscription(&idle),
+        Waitable::GuardCondition(&guards[0]),
+        Waitable::Subscription(&subscription),
+        Waitable::GuardCondition(&guards[1]),
+    ];
+    publisher.publish(b"x").unwrap();
+    guards[1].trigger();
+    assert_eq!(session.wait_for(&all, None).unwrap(), [2, 3]);
+    assert_eq!(session.wait_for(&all, None).unwrap(), [2]);
+    subscription.take(&mut Vec::new()).unwrap();
+    assert!(session.wait_for(&all, NOT_AT_ALL).unwrap().is_empty());
+}
+
+#[test]
+fn what_belongs_to_another_session_is_refused() {
+    let (session, other) = (session(), session());
+    let foreign = other.create_guard_condition();
+    let (_publisher, subscription) = pair(&other, "/t");
+    for waitable in [Waitable::GuardCondition(&foreign), Waitable::Subscription(&subscription)] {
+        let refused = session.wait_for(&[waitable], None).unwrap_err();
+        assert!(matches!(refused, SessionError::OtherSession), "{refused}");
+    }
+}
+
+#[test]
+fn one_of_thousands_is_found() {
+    let session = session();
+    let pairs: Vec<_> = (0..300).map(|number| pair(&session, &format!("/t{number}"))).collect();
+    let guards: Vec<_> = (0..4000).map(|_| session.create_guard_condition()).collect();
+    let mut all: Vec<Waitable<'_>> = guards.iter().map(Waitable::GuardCondition).collect();
+    all.extend(pairs.iter().map(|(_, subscription)| Waitable::Subscription(subscription)));
+    thread::scope(|scope| {
+        let waiter = scope.spawn(|| session.wait_for(&all, None).unwrap());
+        pairs[123].0.publish(b"x").unwrap();
+        assert_eq!(waiter.join().unwrap(), [4123]);
+    });
+    pairs[123].1.take(&mut Vec::new()).unwrap();
+    thread::scope(|scope| {
+        let waiter = scope.spawn(|| session.wait_for(&all, None).unwrap());
+        guards[3999].trigger();
+        assert_eq!(waiter.join().unwrap(), [3999]);
+    });
+}
+
+#[test]
+fn many_threads_wait_each_for_its_own() {
+    let session = session();
+    let rounds = 300;
+    thread::scope(|scope| {
+        for number in 0..6 {
+            let session = &session;
+            scope.spawn(move || {
+                let (publisher, subscription) = pair(session, &format!("/t{number}"));
+                let guard = session.create_guard_condition();
+                thread::scope(|scope| {
+                    scope.spawn(|| {
+                        for round in 0..rounds {
+                            if round % 2 == 0 {
+                                publisher.publish(b"x").unwrap();
+                            } else {
+                                guard.trigger();
+                            }
+                            // One at a time: the other side says that it has had it.
+                            while guard.is_triggered() || subscription.has_data() {
+                                thread::yield_now();
+                            }
+                        }
+                    });
+                    let all =
+                        [Waitable::Subscription(&subscription), Waitable::GuardCondition(&guard)];
+                    for round in 0..rounds {
+                        let ready = session.wait_for(&all, Some(PATIENCE)).unwrap();
+                        assert_eq!(ready, [round % 2], "thread {number}, round {round}");
+                        if round % 2 == 0 {
+                            assert!(subscription.take(&mut Vec::new()).is_some());
+                        }
+                    }
+                });
+            });
+        }
+    });
+}
+
+static HANDLED: OnceLock<GuardCondition> = OnceLock::new();
+
+extern "C" fn handle(_: libc::c_int) {
+    if let Some(guard) = HANDLED.get() {
+        guard.trigger();
+    }
+}
+
+#[test]
+fn a_signal_handler_may_trigger() {
+    let session = session();
+    let guard = HANDLED.get_or_init(|| session.create_guard_condition()).clone();
+    // SAFETY: the handler does nothing that is not async-signal-safe.
+    unsafe { libc::signal(libc::SIGUSR2, handle as *const () as libc::sighandler_t) };
+    let all = [Waitable::GuardCondition(&guard)];
+    let over = AtomicBool::new(false);
+    let pid = i32::try_from(std::process::id()).unwrap();
+    thread::scope(|scope| {
+        // Signals arrive in any thread, in the middle of anything.
+        scope.spawn(|| {
+            while !over.load(Ordering::SeqCst) {
+                // SAFETY: sends this process a signal that it handles.
+                unsafe { libc::kill(pid, libc::SIGUSR2) };
+                while guard.is_triggered() && !over.load(Ordering::SeqCst) {
+                    thread::yield_now();
+                }
+            }
+        });
+        for _ in 0..2000 {
+            assert_eq!(session.wait_for(&all, Some(PATIENCE)).unwrap(), [0]);
+        }
+        over.store(true, Ordering::SeqCst);
+    });
+}
+
+#[test]
+fn new_samples_are_told_of_each_once_and_those_that_wait_at_once() {
+    let session = session();
+    let (publisher, subscription) = pair(&session, "/t");
+    for _ in 0..3 {
+        publisher.publish(b"x").unwrap();
+    }
+    subscription.take(&mut Vec::new()).unwrap();
+    let told = Arc::new(AtomicU64::new(0));
+    let count = told.clone();
+    let add = move |new| {
+        count.fetch_add(new, Ordering::SeqCst);
+    };
+    subscription.set_on_new_sample(Some(Arc::new(add))).unwrap();
+    assert_eq!(told.load(Ordering::SeqCst), 2, "what is still to be taken");
+    let wait = |expected: u64| {
+        let deadline = std::time::Instant::now() + PATIENCE;
+        while told.load(Ordering::SeqCst) != expected {
+            assert!(std::time::Instant::now() < deadline, "{told:?} instead of {expected}");
+            thread::sleep(Duration::from_millis(1));
+        }
+    };
+    for number in 0..200 {
+        publisher.publish(b"x").unwrap();
+        if number % 20 == 0 {
+            wait(3 + number);
+        }
+    }
+    wait(202);
+    // Threads that wait are woken all the same.
+    while subscription.take(&mut Vec::new()).is_some() {}
+    thread::scope(|scope| {
+        let all = [Waitable::Subscription(&subscription)];
+        let waiter = scope.spawn(move || session.wait_for(&all, None).unwrap());
+        thread::sleep(Duration::from_millis(10));
+        publisher.publish(b"x").unwrap();
+        assert_eq!(waiter.join().unwrap(), [0]);
+    });
+    wait(203);
+    subscription.set_on_new_sample(None).unwrap();
+    publisher.publish(b"x").unwrap();
+    thread::sleep(Duration::from_millis(20));
+    assert_eq!(told.load(Ordering::SeqCst), 203);
+}
+
+#[test]
+fn an_event_loop_and_callbacks_do_not_listen_at_once() {
+    let session = session();
+    let (_publisher, subscription) = pair(&session, "/t");
+    let leader = session.segment().external_leader().unwrap();
+    assert!(subscription.set_on_new_sample(Some(Arc::new(|_| {}))).is_err());
+    drop(leader);
+    subscription.set_on_new_sample(Some(Arc::new(|_| {}))).unwrap();
+    assert!(session.segment().external_leader().is_err());
+    drop(subscription);
+    let deadline = std::time::Instant::now() + PATIENCE;
+    // The control thread lets go of it when it next looks.
+    while session.segment().external_leader().is_err() {
+        assert!(std::time::Instant::now() < deadline);
+        thread::yield_now();
+    }
+}
