@@ -139,6 +139,11 @@ impl Doorbell {
                 return false;
             }
             self.sleep(words, armed_at, look.as_ref(), others, left);
+            // Most sleeps end with what they were for, which is not kept waiting for another ticket.
+            if ready() {
+                self.spin.slept(start.elapsed());
+                return true;
+            }
         }
     }
 
@@ -176,7 +181,9 @@ impl Doorbell {
         let heard = self.ear.listen(others, left);
         let mut crowd = self.lock();
         crowd.leader = Leader::None;
-        self.way.notify_all();
+        if crowd.coming {
+            self.way.notify_all();
+        }
         self.spread(crowd, words, heard);
     }
 

@@ -25,10 +25,12 @@ use crate::passed::{PassedFd, carries_descriptors};
 /// found then. Tests sleep for ever, so that they notice.
 pub(super) const LONGEST: Option<Duration> =
     if cfg!(test) { None } else { Some(Duration::from_secs(1)) };
+/// Rings that one system call takes.
+const BATCH: usize = 8;
 /// How often there is a look once the bell has been closed.
 pub(super) const CLOSED: Duration = Duration::from_millis(5);
 /// Rings that are taken at a time.
-const FLOOD: u32 = 512;
+const FLOOD: usize = 512;
 
 const BELL: u64 = 0;
 const KNOCK: u64 = 1;
@@ -152,10 +154,23 @@ impl Ear {
 
     /// Takes the rings that stand in the queue.
     pub(super) fn drain(&self) -> Drained {
+        if self.rights {
+            return self.drain_with_care();
+        }
+        for _ in 0..FLOOD / BATCH {
+            match receive_many(self.heard.as_fd()) {
+                BATCH => {}
+                _ => return Drained::All,
+            }
+        }
+        Drained::Some
+    }
+
+    /// Takes one ring at a time, and none with descriptors. These stay where they are: taken, they
+    /// would fill this process's table, and the kernel would close in this thread what did not fit.
+    fn drain_with_care(&self) -> Drained {
         for _ in 0..FLOOD {
-            // They stay where they are: taken, they would fill this process's table, and the kernel
-            // would close in this thread what did not fit.
-            if self.rights && carries_descriptors(&self.heard) {
+            if carries_descriptors(&self.heard) {
                 return Drained::Rights;
             }
             match recv(&self.heard, &mut [0; 1], RecvFlags::DONTWAIT) {
@@ -196,6 +211,26 @@ impl AsFd for Ear {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.set.as_fd()
     }
+}
+
+/// Takes up to [`BATCH`] packets without looking at them. How many there were: fewer if no more stood
+/// there, or the call was interrupted.
+fn receive_many(socket: BorrowedFd<'_>) -> usize {
+    let mut byte = 0u8;
+    let mut place = libc::iovec { iov_base: (&raw mut byte).cast(), iov_len: 1 };
+    // SAFETY: integers and pointers, all of which may be zero: no name, no control data.
+    let mut messages: [libc::mmsghdr; BATCH] = unsafe { MaybeUninit::zeroed().assume_init() };
+    for message in &mut messages {
+        message.msg_hdr.msg_iov = &raw mut place;
+        message.msg_hdr.msg_iovlen = 1;
+    }
+    // SAFETY: each of the `BATCH` headers has one place of one byte, which they may share as they
+    // are filled one after the other. `byte`, `place` and `messages` outlive the call.
+    let received = unsafe {
+        let (flags, no_timeout) = (libc::MSG_DONTWAIT, std::ptr::null_mut());
+        libc::recvmmsg(socket.as_raw_fd(), messages.as_mut_ptr(), BATCH as u32, flags, no_timeout)
+    };
+    usize::try_from(received).unwrap_or(0)
 }
 
 /// Whether packets may carry descriptors. Older kernels (Linux 6.16 is the first) let them; whether
