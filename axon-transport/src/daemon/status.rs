@@ -92,10 +92,16 @@ pub struct TopicStatus {
     /// Samples that were not delivered on this host, by why: `overwritten` before a reader took
     /// them within its depth; `blocked`, `no_memory`, `pinned` as for [`WriterStatus`].
     pub dropped: BTreeMap<String, u64>,
-    /// The publishers on this host, stand-ins for remote ones among them.
+    /// The publishers on this host, stand-ins for remote ones among them: up to 64, those with the
+    /// most memory first.
     pub writers: Vec<WriterStatus>,
-    /// What each reader on this host took and lost, relays to other hosts among them.
+    /// How many more there are.
+    pub more_writers: usize,
+    /// What each reader on this host took and lost, relays to other hosts among them: up to 64,
+    /// those that wait longest and lost most first.
     pub readers: Vec<ReaderStatus>,
+    /// How many more there are.
+    pub more_readers: usize,
 }
 
 /// A publisher's ring.

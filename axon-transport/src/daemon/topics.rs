@@ -4,6 +4,7 @@
 //! daemon maps no session's memory.
 
 use std::{
+    cmp::Reverse,
     collections::{BTreeMap, HashMap},
     os::fd::{AsFd, BorrowedFd},
     sync::Arc,
@@ -25,6 +26,11 @@ use crate::{
     },
 };
 
+/// Publishers, and readers, of a topic that the status lists.
+const LISTED: usize = 64;
+/// Readers that are looked at for one status: so many that it still takes a fraction of a second.
+const LOOKED_AT: usize = 1 << 16;
+
 type Sessions = Registry<Arc<PassedFd>>;
 type Session = SessionEntry<Arc<PassedFd>>;
 
@@ -40,9 +46,9 @@ pub(super) fn topics(registry: &Sessions) -> Vec<TopicStatus> {
                 let published = ring.as_ref().map_or(0, |(_, counts)| counts.published);
                 if local.role == EndpointRole::Application {
                     topic.publishers += 1;
-                    topic.published += published;
+                    add(&mut topic.published, published);
                 } else {
-                    topic.arrived += published;
+                    add(&mut topic.arrived, published);
                 }
                 if let Some((session, counts)) = ring {
                     topic.writers.push(writer(session, local, &counts));
@@ -65,7 +71,7 @@ pub(super) fn topics(registry: &Sessions) -> Vec<TopicStatus> {
     }
     let locals: HashMap<_, _> = registry.endpoints().map(|e| (e.endpoint.gid, e)).collect();
     let mut processes = HashMap::new();
-    for attach in registry.attached() {
+    for attach in registry.attached().take(LOOKED_AT) {
         let Some(local) = locals.get(&attach.reader) else { continue };
         let Some(session) = registry.session(&attach.session) else { continue };
         let stopped = *processes.entry(session.pid).or_insert_with(|| is_stopped(session.pid));
@@ -91,7 +97,8 @@ fn entry<'a>(
 fn writer(session: &Session, local: &LocalEndpoint, counts: &RingCounts) -> WriterStatus {
     let gid = local.endpoint.gid;
     let own = session.segments.values().filter(|s| s.segment.publisher == Some(gid));
-    let own: u64 = own.map(|segment| inspect::committed(segment.descriptor.as_fd())).sum();
+    let own = own.map(|segment| inspect::committed(segment.descriptor.as_fd()));
+    let own = own.fold(0, u64::saturating_add);
     WriterStatus {
         pid: session.pid,
         writer: gid.to_string(),
@@ -155,10 +162,12 @@ fn oldest_unread(writer: &Session, counts: &RingCounts, lane: &LaneCounts) -> Op
 }
 
 fn summed_up(mut topic: TopicStatus) -> TopicStatus {
-    topic.bytes_committed = topic.writers.iter().map(|writer| writer.bytes_committed).sum();
+    for writer in &topic.writers {
+        add(&mut topic.bytes_committed, writer.bytes_committed);
+    }
     let mut drop = |cause: &str, count: u64| {
         if count > 0 {
-            *topic.dropped.entry(cause.to_owned()).or_default() += count;
+            add(topic.dropped.entry(cause.to_owned()).or_default(), count);
         }
     };
     for reader in &topic.readers {
@@ -169,7 +178,20 @@ fn summed_up(mut topic: TopicStatus) -> TopicStatus {
         drop("no_memory", writer.no_memory);
         drop("pinned", writer.pinned);
     }
+    let worst_first = |reader: &ReaderStatus| Reverse((reader.waiting_ms, reader.lost));
+    topic.readers.sort_by_key(worst_first);
+    topic.more_readers = topic.readers.len().saturating_sub(LISTED);
+    topic.readers.truncate(LISTED);
+    let largest_first = |writer: &WriterStatus| Reverse(writer.bytes_committed);
+    topic.writers.sort_by_key(largest_first);
+    topic.more_writers = topic.writers.len().saturating_sub(LISTED);
+    topic.writers.truncate(LISTED);
     topic
+}
+
+/// Whatever another process says that it counted.
+fn add(sum: &mut u64, count: u64) {
+    *sum = sum.saturating_add(count);
 }
 
 /// `None` for KEEP_ALL.
@@ -197,4 +219,30 @@ fn is_stopped(pid: u32) -> bool {
     // The name before it may hold anything.
     let state = stat.iter().rposition(|byte| *byte == b')').and_then(|end| stat.get(end + 2));
     matches!(state, Some(b'T' | b't'))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_others_count_is_summed_up_whatever_it_is_and_the_worst_are_listed() {
+        let mut topic = TopicStatus::default();
+        for number in 0..100 {
+            let mut reader = ReaderStatus { lost: u64::MAX, ..ReaderStatus::default() };
+            reader.waiting_ms = (number % 2 == 0).then_some(number);
+            topic.readers.push(reader);
+            let bytes_committed = u64::MAX - number;
+            let writer = WriterStatus { bytes_committed, blocked: u64::MAX, ..Default::default() };
+            topic.writers.push(writer);
+        }
+        let topic = summed_up(topic);
+        assert_eq!(topic.bytes_committed, u64::MAX);
+        assert!(topic.dropped.values().all(|count| *count == u64::MAX));
+        assert_eq!((topic.readers.len(), topic.more_readers), (LISTED, 36));
+        assert_eq!((topic.writers.len(), topic.more_writers), (LISTED, 36));
+        assert_eq!(topic.readers[0].waiting_ms, Some(98));
+        assert!(topic.readers[..50].iter().all(|reader| reader.waiting_ms.is_some()));
+        assert_eq!(topic.writers[0].bytes_committed, u64::MAX);
+    }
 }
