@@ -104,9 +104,11 @@ impl Ear {
 
     /// Sleeps until something comes, for at most `left`. Events of `others` end it too.
     pub(super) fn listen(&self, others: &[BorrowedFd<'_>], left: Option<Duration>) -> Heard {
-        let timeout = not_too_long(left).and_then(|left| Timespec::try_from(left).ok());
-        if others.is_empty() && is_for_epoll(timeout.as_ref()) {
-            return self.take(timeout.as_ref());
+        let left = not_too_long(left);
+        let whole = whole_millis(left);
+        let timespec = |time| Timespec::try_from(time).ok();
+        if others.is_empty() && whole != Some(Duration::ZERO) {
+            return self.take(whole.and_then(timespec).as_ref());
         }
         let all = [self.set.as_fd()];
         let mut fds: Vec<PollFd<'_>> = all
@@ -116,7 +118,7 @@ impl Ear {
             .collect();
         // An interrupted poll counts as a spurious wake: the caller looks again and computes what
         // remains of its time.
-        let _ = poll(&mut fds, timeout.as_ref());
+        let _ = poll(&mut fds, left.and_then(timespec).as_ref());
         self.take(Some(&Timespec::default()))
     }
 
@@ -182,9 +184,10 @@ impl Ear {
     }
 }
 
-/// Whether epoll ends such a wait on time: it counts in milliseconds, and would be late by up to one.
-pub(super) fn is_for_epoll(timeout: Option<&Timespec>) -> bool {
-    timeout.is_none_or(|timeout| timeout.tv_nsec % 1_000_000 == 0)
+/// What epoll may take of a wait. It counts in milliseconds and would be late by up to one, so the
+/// rest, for which the caller is back, is waited for in a way that takes longer to begin.
+pub(super) fn whole_millis(left: Option<Duration>) -> Option<Duration> {
+    left.map(|left| left - Duration::from_nanos(u64::from(left.subsec_nanos()) % 1_000_000))
 }
 
 /// What became of the rings in a queue.

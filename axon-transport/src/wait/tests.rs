@@ -11,12 +11,12 @@ use std::{
 };
 
 use rustix::{
-    event::{PollFd, PollFlags, Timespec, poll},
+    event::{PollFd, PollFlags, poll},
     fs::{OFlags, fcntl_getfl, fcntl_setfl},
     net::{RecvFlags, Shutdown, recv, shutdown},
 };
 
-use super::{Bell, Doorbell, Look, Purpose, arm, disarm, due, ear::is_for_epoll, settle};
+use super::{Bell, Doorbell, Look, Purpose, arm, disarm, due, ear::whole_millis, settle};
 use crate::{
     ids::SessionId,
     passed::{
@@ -292,14 +292,20 @@ fn descriptors_in_a_bell_are_not_taken_and_keep_nobody_waiting() {
 
 #[test]
 fn what_epoll_would_round_is_not_left_to_it() {
-    let is = |time: Duration| is_for_epoll(Some(&Timespec::try_from(time).unwrap()));
-    for odd in [1, 999, 200_000, 1_000_001, 1_500_000, 1_000_000_001, 2_999_999_999] {
-        assert!(!is(Duration::from_nanos(odd)), "{odd} ns");
+    let whole = |time: Duration| whole_millis(Some(time)).unwrap();
+    for short in [0, 1, 999, 200_000, 999_999] {
+        assert!(whole(Duration::from_nanos(short)).is_zero(), "{short} ns");
     }
-    for even in [0, 1, 7, 999, 1000, 1001, 60_000] {
-        assert!(is(Duration::from_millis(even)), "{even} ms");
+    for odd in [1_000_001, 1_500_000, 1_000_000_001, 2_999_999_999] {
+        let odd = Duration::from_nanos(odd);
+        let left = odd - whole(odd);
+        assert!(!left.is_zero() && left < Duration::from_millis(1), "{odd:?}");
+        assert!(whole(odd).subsec_nanos().is_multiple_of(1_000_000), "{odd:?}");
     }
-    assert!(is_for_epoll(None), "for ever");
+    for even in [1, 7, 999, 1000, 1001, 60_000].map(Duration::from_millis) {
+        assert_eq!(whole(even), even);
+    }
+    assert_eq!(whole_millis(None), None, "for ever");
 }
 
 #[test]
