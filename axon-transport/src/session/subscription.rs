@@ -4,7 +4,7 @@ use std::{
     collections::{BTreeMap, HashMap},
     fmt,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use super::{
@@ -28,6 +28,8 @@ use crate::{
 const REMEMBERED: usize = 4096;
 /// Samples that one take passes over because they were taken before.
 const REPEATS: usize = 64;
+/// How long nobody is woken for a sample that there was no memory to take.
+const SHORT: Duration = Duration::from_secs(1);
 
 /// Receives the samples of a topic. Thread-safe.
 pub struct Subscription {
@@ -103,7 +105,7 @@ impl Subscription {
 
     /// As [`take`](Self::take), after waiting for a sample for at most `timeout`.
     pub fn recv(&self, out: &mut Vec<u8>, timeout: Option<Duration>) -> Option<MessageInfo> {
-        let deadline = timeout.and_then(|t| std::time::Instant::now().checked_add(t));
+        let deadline = timeout.and_then(|t| Instant::now().checked_add(t));
         loop {
             // Nothing comes to a forked child, however long it waits.
             if self.session.is_forked() {
@@ -112,7 +114,7 @@ impl Subscription {
             if let Some(info) = self.take(out) {
                 return Some(info);
             }
-            let left = deadline.map(|d| d.saturating_duration_since(std::time::Instant::now()));
+            let left = deadline.map(|d| d.saturating_duration_since(Instant::now()));
             let look = Arc::clone(&self.inner);
             if left.is_some_and(|l| l.is_zero()) || !self.session.segment().wait_for(look, left) {
                 return None;
@@ -231,6 +233,8 @@ pub(super) struct Slots {
     /// Samples that came from writers that are gone, and all that somebody was told of.
     arrived: u64,
     arrived_before: u64,
+    /// When there was no memory to take a sample last.
+    short: Option<Instant>,
     /// Writers whose memory was not usable, of which the others have to be told.
     discarded: Vec<Gid>,
 }
@@ -372,7 +376,11 @@ impl Look for SubscriptionInner {
 
 impl Slots {
     fn has_data(&self) -> bool {
-        self.slots.iter().any(|slot| slot.reader.has_data())
+        !self.is_short() && self.slots.iter().any(|slot| slot.reader.has_data())
+    }
+
+    fn is_short(&self) -> bool {
+        self.short.is_some_and(|since| since.elapsed() < SHORT)
     }
 
     /// Whether the lease of one of the writers may run out.
@@ -559,8 +567,11 @@ impl Slots {
                 }
                 // It stands, and may be taken when there is memory again.
                 Err(error @ TakeError::NoMemory { .. }) => {
-                    tracing::error!(topic = endpoint.topic, %error, "a sample is not taken yet");
                     slot.overtaken = true;
+                    if !self.is_short() {
+                        tracing::error!(topic = endpoint.topic, %error, "a sample is not taken yet");
+                    }
+                    self.short = Some(Instant::now());
                     continue;
                 }
                 Err(error) => {
@@ -656,4 +667,53 @@ impl Slots {
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{
+        graph::EndpointKind,
+        ids::SessionId,
+        qos::Qos,
+        shm::{Peer, ReaderInfo, ReaderOptions, RingOptions, SessionSegment, Writer},
+    };
+
+    #[test]
+    fn nobody_is_woken_at_once_for_a_sample_that_there_is_no_memory_for() {
+        let session = SessionSegment::create(SessionId::random()).unwrap();
+        let [writer, reader] = [1, 2].map(|number| Gid::new(session.id(), number));
+        let (qos, peer) = (Qos::default(), Peer::Local(session.clone()));
+        let options = RingOptions { gid: writer, qos, budget: 0, max_message: 10, expected: 0 };
+        let publisher = Writer::create(session.clone(), options).unwrap();
+        let lane = session.allocate_lane().unwrap();
+        let at = lane.location();
+        let info =
+            ReaderInfo { gid: reader, lane: at, qos, peer: peer.clone(), stands_for: Vec::new() };
+        let (grant, ring) = (publisher.attach(info).unwrap(), publisher.location());
+        let mut slots = Slots::default();
+        let options =
+            ReaderOptions { reader, writer, peer, ring, lane, grant, qos, max_message: 10 };
+        slots.add(Reader::map(options).unwrap());
+        publisher.publish_next(0, b"sample").unwrap();
+        assert!(slots.has_data());
+        let endpoint = Endpoint {
+            gid: reader,
+            kind: EndpointKind::Subscription,
+            topic: "/t".into(),
+            type_name: "T".into(),
+            type_hash: Vec::new(),
+            qos,
+            node: String::new(),
+            namespace: String::new(),
+            enclave: String::new(),
+        };
+        let none = |_: &mut Reader| Err::<Option<(Meta, ())>, _>(TakeError::NoMemory { len: 6 });
+        assert!(slots.take(none, &endpoint).is_none() && !slots.has_data());
+        // Whoever asks nevertheless gets it, if it can be had.
+        let mut out = Vec::new();
+        let take = |reader: &mut Reader| Ok(reader.take(&mut out)?.map(|taken| (taken.meta, ())));
+        assert!(slots.take(take, &endpoint).is_some());
+        assert_eq!(out, b"sample");
+    }
 }
