@@ -1,8 +1,12 @@
 //! What becomes of writable maps in a forked child.
 //!
 //! They are absent there, so that a child cannot be a second writer. But a slice of one may have been
-//! borrowed before the fork, and whatever the child maps next may come to lie under it. The child
-//! therefore begins by putting inaccessible pages in their places: using such a slice ends it.
+//! borrowed before the fork, and whatever the child maps next may come to lie under it. A child of
+//! `fork` therefore begins by putting inaccessible pages in their places: using such a slice ends it.
+//!
+//! A child of `_Fork`, or of `clone` without shared memory, runs no handler, and where one that was
+//! registered earlier has mapped something there, that stays. There such a slice shows what it should
+//! not: this is a net, and what is safe without it asks whether it is in a child.
 
 use std::{
     ffi::c_void,
@@ -25,6 +29,9 @@ struct Entry {
     bytes: AtomicUsize,
     next: *const Entry,
 }
+
+// SAFETY: all of it is atomic but for `next`, which stays as it is once others can see the entry.
+unsafe impl Sync for Entry {}
 
 /// No map begins there.
 const TAKEN: usize = 1;

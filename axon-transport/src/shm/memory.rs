@@ -139,7 +139,8 @@ pub(super) struct Map {
 /// What `fstatfs` says of an ordinary memfd (linux/magic.h).
 const TMPFS_MAGIC: i64 = 0x0102_1994;
 
-// SAFETY: the map is plain memory reached only through atomics; unmapping it works from any thread.
+// SAFETY: what `base` points to is plain memory reached only through atomics, and unmapping it works
+// from any thread. The other fields may go anywhere by themselves.
 unsafe impl Send for Map {}
 // SAFETY: as above: all access is atomic.
 unsafe impl Sync for Map {}

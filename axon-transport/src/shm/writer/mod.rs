@@ -233,8 +233,12 @@ impl Writer {
 
     fn change<T>(&self, by: impl FnOnce(&mut Audience) -> T) -> T {
         let mut state = self.lock();
+        // A session of which this was the last part is unmapped after the lock, and not under it.
+        let peers = state.audience.peers();
         let changed = by(&mut state.audience);
         self.show_window(&state);
+        drop(state);
+        drop(peers);
         changed
     }
 
