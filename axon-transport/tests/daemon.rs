@@ -9,22 +9,26 @@ use std::{
 };
 
 use axon_transport::{
-    config::{Config, DaemonPolicy},
+    config::{Config, DaemonPolicy, security_settings},
     daemon::{
         self, DaemonOptions, GatewayEntry,
         bridge::{GatewayParts, ToControl},
         status::Status,
     },
+    ids::SessionId,
     qos::Qos,
     session::{
         EndpointSpec, Publisher, Session, SessionError, SessionOptions, Subscription,
         address::Address,
-        message::{Hello, Message, PROTOCOL, SessionRole},
+        message::{Hello, Message, PROTOCOL, Segment, SegmentOpened, SessionRole},
         socket,
     },
-    shm::PublishError,
+    shm::{PublishError, SessionSegment},
 };
-use rustix::process::Signal;
+use rustix::{
+    fs::{MemfdFlags, memfd_create},
+    process::Signal,
+};
 use support::{Host, PATIENCE, say, signal, until, wait_for_the_end};
 
 fn spec(topic: &str) -> EndpointSpec {
@@ -306,7 +310,7 @@ fn garbage_on_the_socket_hurts_nobody() {
     let hello = |name: &str, settings| {
         Message::Hello(Hello {
             protocol: PROTOCOL,
-            session: axon_transport::ids::SessionId::random(),
+            session: SessionId::random(),
             role: SessionRole::Application,
             name: name.into(),
             domain: 0,
@@ -341,7 +345,7 @@ fn garbage_on_the_socket_hurts_nobody() {
     let tool = address.connect().unwrap();
     let packet = Message::Hello(Hello {
         protocol: PROTOCOL,
-        session: axon_transport::ids::SessionId::random(),
+        session: SessionId::random(),
         role: SessionRole::Tool,
         name: "tool".into(),
         domain: 0,
@@ -357,6 +361,50 @@ fn garbage_on_the_socket_hurts_nobody() {
     assert!(subscription.wait_matched(1, PATIENCE) && publisher.wait_matched(1, PATIENCE));
     publish(&publisher, 1);
     assert_eq!(receive(&subscription), 1);
+}
+
+/// The daemon's status shows counters that it reads from what sessions handed over.
+#[test]
+fn the_daemon_is_handed_nothing_that_a_read_could_wait_for() {
+    let host = Host::new();
+    let _daemon = host.daemon();
+    let settings = security_settings(&host.config()).unwrap();
+    let flags = MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING;
+    let memory = memfd_create("test", flags).unwrap();
+    let (pipe, _held) = rustix::pipe::pipe().unwrap();
+    for (name, descriptor) in [("memory", &memory), ("pipe", &pipe)] {
+        let segment = SessionSegment::create(SessionId::random()).unwrap();
+        let session = segment.id();
+        let hello = Message::Hello(Hello {
+            protocol: PROTOCOL,
+            session,
+            role: SessionRole::Application,
+            name: name.into(),
+            domain: 0,
+            settings: settings.clone(),
+        });
+        let socket = Address::of(&host.config()).connect().unwrap();
+        let handed = segment.descriptors().unwrap();
+        let handed = [&handed.segment, &handed.doorbell, &handed.pidfd].map(AsFd::as_fd);
+        socket::send(&socket, &hello.encode().unwrap(), &handed).unwrap();
+        let opened = SegmentOpened { session, segment: Segment { number: 1, publisher: None } };
+        let packet = Message::Segment(opened).encode().unwrap();
+        socket::send(&socket, &packet, &[descriptor.as_fd()]).unwrap();
+        let over = || loop {
+            match socket::receive(&socket, &mut Vec::new()) {
+                Ok(_) => {}
+                Err(socket::SocketError::Closed) => return true,
+                Err(_) => return false,
+            }
+        };
+        if name == "pipe" {
+            until("it is put out", over);
+        } else {
+            until("it is taken", || host.status().unwrap().sessions.iter().any(|s| s.name == name));
+            assert!(!over());
+        }
+    }
+    host.status().unwrap();
 }
 
 /// A socket whose last close takes hours, since it lingers over what its peer does not read.
@@ -403,7 +451,7 @@ fn descriptors_that_are_slow_to_close_do_not_stop_the_daemon() {
     let address = Address::of(&host.config());
     let tool = Message::Hello(Hello {
         protocol: PROTOCOL,
-        session: axon_transport::ids::SessionId::random(),
+        session: SessionId::random(),
         role: SessionRole::Tool,
         name: "tool".into(),
         domain: 0,

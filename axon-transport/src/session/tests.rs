@@ -412,7 +412,8 @@ fn a_daemon_cannot_have_a_session_read_its_own_samples_as_rings_and_lanes() {
 
     daemon.say(Message::Match(Pair { reader, writer }), &[]);
     let asked = daemon.hear_attach();
-    let (generation, segments) = (5, Vec::new());
+    // As a publisher would to the first that asks.
+    let (generation, segments) = (5 << 24 | 1, Vec::new());
     let granted =
         Granted { reader, writer, generation, first: 0, session: own, ring: sample, segments };
     daemon.say(Message::Grant(granted), &[]);

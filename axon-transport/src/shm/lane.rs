@@ -23,10 +23,14 @@ use crate::ids::Gid;
 /// Set in the generation word of a lane that is not open yet.
 const ASKED: u64 = 1 << 63;
 
-/// Whether a grant may be of this generation: any other leaves the lane with nobody, or in the hands
-/// of one who asks.
-pub(super) fn is_generation(word: u64) -> bool {
-    (1..ASKED).contains(&word)
+/// The part of a generation that says which time of the lane's use it is for: a grant of another
+/// time would bring back, for the publisher that gave it then, a reader that has left.
+const TIME: u64 = (1 << 24) - 1;
+
+/// Whether a grant of this generation is for the `number`th time that the session uses a lane.
+fn is_for(generation: u64, number: u64) -> bool {
+    // Any other value leaves the lane with nobody, or in the hands of one who asks.
+    (1..ASKED).contains(&generation) && generation & TIME == number & TIME
 }
 
 /// How a reader stands with the publisher that looks at its lane.
@@ -52,7 +56,8 @@ impl Tenancy {
     /// Publisher: gives a generation to the reader that asked with this lane.
     pub(super) fn grant<W: Word>(lane: &[W]) -> Self {
         let asked = lane[GENERATION].load(Site::GenerationLoad.order());
-        Self { asked, generation: rand::random_range(1..ASKED) }
+        let generation = rand::random_range(1..ASKED >> 24) << 24 | asked & TIME;
+        Self { asked, generation }
     }
 
     /// Publisher: whether the lane is as it was when the reader asked.
@@ -159,12 +164,14 @@ impl LaneView {
 pub struct Lane {
     session: Arc<SessionSegment>,
     object: Object,
+    /// Which time it is that the session uses one.
+    number: u64,
 }
 
 impl Lane {
     /// The lane in `object`, for the `number`th time that the session gives one out.
     pub(super) fn new(session: Arc<SessionSegment>, object: Object, number: u64) -> Self {
-        let lane = Self { session, object };
+        let lane = Self { session, object, number };
         ask(lane.words(), number);
         lane
     }
@@ -178,6 +185,11 @@ impl Lane {
     #[inline]
     pub(super) fn is_forked(&self) -> bool {
         self.session.is_forked()
+    }
+
+    /// Whether a grant may be the answer to this reader.
+    pub(super) fn is_meant_by(&self, grant: Grant) -> bool {
+        is_for(grant.generation, self.number)
     }
 
     pub(super) fn open(&self, grant: Grant, reader: Gid) {

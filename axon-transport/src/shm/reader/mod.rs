@@ -13,7 +13,7 @@ use super::{
     Grant, Lane, Location, Meta, Peer, Sample, ShmError, TakeError, Taken,
     attachment::{Attachment, Pinning},
     audience::{depth, holds},
-    lane, layout,
+    layout,
     memory::Map,
     peer::Found,
     ring::{self, MAX_POSITION, Record, State, View},
@@ -128,8 +128,8 @@ impl Reader {
             return Err(ShmError::Forked);
         }
         let refuse = |what| Err(ShmError::Refused { what });
-        if !lane::is_generation(grant.generation) {
-            return refuse("its grant is none");
+        if !lane.is_meant_by(grant) {
+            return refuse("its grant is not for this reader");
         }
         let Found::Map(map) = peer.find(ring.segment) else {
             return refuse("the segment that its ring is in did not come");

@@ -191,13 +191,14 @@ fn rings_that_make_no_sense_are_refused() {
 #[test]
 fn grants_that_make_no_sense_are_refused() {
     // With 0 nobody would have the lane, and with the others somebody who asks.
-    for generation in [0, 1 << 63, 1 << 63 | 1, u64::MAX] {
+    // Nor is one for an earlier or later reader with the same lane for this one.
+    for generation in [0, 1 << 63, 1 << 63 | 1, u64::MAX, 2, 7 << 24, 7 << 24 | 2] {
         let mut scribble = Scribble::new();
         scribble.generation = generation;
         refusal(scribble.map(0));
     }
     let mut scribble = Scribble::new();
-    scribble.generation = (1 << 63) - 1;
+    scribble.generation = 1 << 62 | 1;
     assert!(scribble.map(0).is_ok());
 }
 

@@ -319,6 +319,30 @@ fn a_reader_that_left_and_comes_back_starts_anew() {
 }
 
 #[test]
+fn what_was_granted_to_who_had_the_lane_before_is_refused() {
+    let (a, b) = (session(), session());
+    let writer = writer(&a, keep_last(1), 1 << 20);
+    let reader = attach(&writer, &a, &b, keep_last(1));
+    let (before, grant) = (reader.lane(), reader.grant());
+    drop(reader);
+    // Its publisher has not looked since, and would take the next reader for it.
+    let lane = b.allocate_lane().unwrap();
+    assert_eq!(lane.location(), before);
+    let options = ReaderOptions {
+        reader: Gid::new(b.id(), 2),
+        writer: writer.gid(),
+        peer: peer(&b, &a),
+        ring: writer.location(),
+        lane,
+        grant,
+        qos: keep_last(1),
+        max_message: MAX,
+    };
+    assert!(matches!(Reader::map(options), Err(ShmError::Refused { .. })));
+    assert!(attach(&writer, &a, &b, keep_last(1)).grant() != grant);
+}
+
+#[test]
 fn lanes_are_reused_and_bounded() {
     let a = session();
     let lanes: Vec<_> = std::iter::from_fn(|| a.allocate_lane().ok()).collect();
