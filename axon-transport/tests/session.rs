@@ -1,12 +1,15 @@
 //! What a session does with its own endpoints, without a daemon.
 
-use std::{path::Path, time::Duration};
+use std::{path::Path, sync::Arc, thread, time::Duration};
 
 use axon_transport::{
     config::{Config, DaemonPolicy, OsFiles},
+    events::{EventKind, EventStatus},
     graph::EndpointKind,
     qos::Qos,
-    session::{EndpointSpec, Publisher, Session, SessionError, SessionOptions, Subscription},
+    session::{
+        EndpointSpec, Publisher, Session, SessionError, SessionOptions, Subscription, Waitable,
+    },
 };
 
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -141,7 +144,7 @@ fn a_waiting_reader_is_woken_by_a_sample() {
     let subscription = session.create_subscription(spec(Qos::default())).unwrap();
     let publisher = session.create_publisher(spec(Qos::default())).unwrap();
     assert!(subscription.wait_matched(1, PATIENCE));
-    std::thread::scope(|scope| {
+    thread::scope(|scope| {
         let reader = scope.spawn(|| subscription.recv(&mut Vec::new(), Some(PATIENCE)).unwrap());
         publisher.publish(b"x").unwrap();
         assert_eq!(reader.join().unwrap().publisher, publisher.gid());
@@ -219,10 +222,17 @@ fn a_forked_child_is_refused_by_whatever_it_asks_and_never_waits() {
     assert!(subscription.wait_matched(1, PATIENCE));
     // One that stands there unread, and that the child must not be told of.
     publisher.publish(b"x").unwrap();
+    let service = || EndpointSpec::new("/s", "S", Qos::default());
+    let server = session.create_server(service()).unwrap();
+    let client = session.create_client(service()).unwrap();
+    let number = client.send_request(b"x").unwrap();
+    let matched = publisher.event(EventKind::PublicationMatched).unwrap();
+    let lost = subscription.event(EventKind::MessageLost).unwrap();
+    let guard = session.create_guard_condition();
     let over = AtomicBool::new(false);
     let forked =
         |what: Result<(), SessionError>| what.is_err_and(|e| e.to_string().contains("fork"));
-    std::thread::scope(|scope| {
+    thread::scope(|scope| {
         // Whose locks the child finds taken, and nobody to give them back.
         for _ in 0..2 {
             scope.spawn(|| {
@@ -231,6 +241,10 @@ fn a_forked_child_is_refused_by_whatever_it_asks_and_never_waits() {
                     publisher.matched();
                     subscription.matched();
                     subscription.lost();
+                    matched.is_ready();
+                    lost.is_ready();
+                    client.is_available();
+                    server.has_request();
                 }
             });
         }
@@ -254,6 +268,28 @@ fn a_forked_child_is_refused_by_whatever_it_asks_and_never_waits() {
                     publisher.matched().is_empty() && !publisher.wait_matched(1, PATIENCE),
                     session.daemon().is_none() && session.graph().endpoints.is_empty(),
                     !session.wait_graph(PATIENCE, |graph| !graph.endpoints.is_empty()),
+                    forked(session.create_server(service()).map(drop)),
+                    forked(session.create_client(service()).map(drop)),
+                    forked(session.create_node("n", "/", "/").map(drop)),
+                    forked(
+                        session.wait_for(&[Waitable::Subscription(&subscription)], None).map(drop),
+                    ),
+                    forked(subscription.set_on_new_sample(Some(Arc::new(|_| {})))),
+                    forked(server.set_on_new_request(None)),
+                    client.send_request(b"x").is_err_and(|e| e.to_string().contains("fork")),
+                    server
+                        .send_response(client.gid(), number, b"x")
+                        .is_err_and(|e| e.to_string().contains("fork")),
+                    server.take_request(&mut bytes).is_none() && !server.has_request(),
+                    client.recv_response(&mut bytes, None).is_none() && !client.is_available(),
+                    !matched.is_ready() && !lost.is_ready(),
+                    matches!(matched.take(), EventStatus::Matched(status) if status.total == 0),
+                    publisher.assert_liveliness().is_err_and(|e| e.to_string().contains("fork")),
+                    {
+                        guard.trigger();
+                        matched.set_callback(Some(Arc::new(|_| {})));
+                        true
+                    },
                 ];
                 let code = refused.iter().position(|refused| !refused).map_or(0, |n| n + 1);
                 // SAFETY: ends the process without running anything else.
@@ -268,4 +304,102 @@ fn a_forked_child_is_refused_by_whatever_it_asks_and_never_waits() {
     });
     publisher.publish(b"x").unwrap();
     assert!(subscription.recv(&mut Vec::new(), Some(PATIENCE)).is_some());
+    assert!(server.recv_request(&mut Vec::new(), Some(PATIENCE)).is_some());
+    assert!(matched.is_ready() && !guard.is_triggered());
+}
+
+/// Threads that share everything and ask nobody.
+#[test]
+fn whatever_thread_creates_uses_and_ends_endpoints_in_whatever_order() {
+    let session = session();
+    let guard = session.create_guard_condition();
+    thread::scope(|scope| {
+        for thread in 0..4_u64 {
+            let (session, guard) = (session.clone(), guard.clone());
+            scope.spawn(move || {
+                let mut random = 0x9e37_79b9_7f4a_7c15_u64.wrapping_mul(thread + 1);
+                let mut next = |below: u64| {
+                    random ^= random << 13;
+                    random ^= random >> 7;
+                    random ^= random << 17;
+                    random % below
+                };
+                let spec = |n: u64| EndpointSpec::new(format!("/t{n}"), "T", Qos::default());
+                let mut publishers = Vec::new();
+                let mut subscriptions: Vec<Subscription> = Vec::new();
+                let (mut servers, mut clients, mut events) = (Vec::new(), Vec::new(), Vec::new());
+                let mut bytes = Vec::new();
+                for _ in 0..400 {
+                    match next(12) {
+                        0 => publishers.push(session.create_publisher(spec(next(3))).unwrap()),
+                        1 => {
+                            let new = session.create_subscription(spec(next(3))).unwrap();
+                            events.extend(new.event(EventKind::SubscriptionMatched));
+                            new.set_on_new_sample(Some(Arc::new(|_| {}))).unwrap();
+                            subscriptions.push(new);
+                        }
+                        2 => servers.push(session.create_server(spec(next(3))).unwrap()),
+                        3 => clients.push(session.create_client(spec(next(3))).unwrap()),
+                        4 => drop(publishers.pop()),
+                        5 if !subscriptions.is_empty() => {
+                            subscriptions.swap_remove(next(subscriptions.len() as u64) as usize);
+                        }
+                        6 => drop(servers.pop()),
+                        7 => drop(clients.pop()),
+                        8 => {
+                            for publisher in &publishers {
+                                publisher.publish(&[1; 5000]).unwrap();
+                            }
+                            for client in &clients {
+                                client.send_request(b"x").unwrap();
+                            }
+                        }
+                        9 => {
+                            for server in &servers {
+                                while let Some(request) = server.take_request(&mut bytes) {
+                                    let (client, number) = (request.publisher, request.sequence);
+                                    server.send_response(client, number, b"y").unwrap();
+                                }
+                            }
+                        }
+                        10 => {
+                            guard.trigger();
+                            while clients.iter().any(|c| c.take_response(&mut bytes).is_some()) {}
+                            while subscriptions.iter().any(|s| s.take(&mut bytes).is_some()) {}
+                        }
+                        _ => {
+                            let mut all = vec![Waitable::GuardCondition(&guard)];
+                            all.extend(subscriptions.iter().map(Waitable::Subscription));
+                            all.extend(servers.iter().map(Waitable::Server));
+                            all.extend(clients.iter().map(Waitable::Client));
+                            all.extend(events.iter().map(Waitable::Event));
+                            session.wait_for(&all, Some(Duration::from_millis(2))).unwrap();
+                        }
+                    }
+                }
+                // The session's handles go before its endpoints.
+                drop(session);
+            });
+        }
+    });
+    assert!(session.wait_graph(PATIENCE, |graph| graph.endpoints.is_empty()));
+    // Nothing stays matched with what is gone.
+    let publisher =
+        session.create_publisher(EndpointSpec::new("/t0", "T", Qos::default())).unwrap();
+    assert!(publisher.matched().is_empty());
+}
+
+#[test]
+fn a_session_may_end_while_its_endpoints_wait() {
+    for _ in 0..50 {
+        let session = session();
+        let subscription = session.create_subscription(spec(Qos::default())).unwrap();
+        let publisher = session.create_publisher(spec(Qos::default())).unwrap();
+        drop(session);
+        thread::scope(|scope| {
+            let waiter = scope.spawn(move || subscription.recv(&mut Vec::new(), Some(PATIENCE)));
+            scope.spawn(move || publisher.publish(b"x").unwrap());
+            assert!(waiter.join().unwrap().is_some());
+        });
+    }
 }

@@ -53,8 +53,8 @@ impl Arrivals {
     }
 
     /// An endpoint is gone before it arrived.
-    pub(super) fn remove(&mut self, gid: &Gid) {
-        self.arriving.remove(gid);
+    pub(super) fn remove(&mut self, gid: &Gid) -> Option<GraphEntry> {
+        self.arriving.remove(gid).map(|arriving| arriving.entry)
     }
 
     /// An endpoint of this session's own is gone. Those that waited for nothing else.
@@ -154,7 +154,7 @@ mod tests {
         assert!(arrivals.due().is_none());
         arrivals.hold(entry(9), [pair(1, 9)].into(), now + PATIENCE);
         assert_eq!(arrivals.due(), Some(now + PATIENCE / 2 + PATIENCE));
-        arrivals.remove(&gid(9));
+        assert_eq!(shown(arrivals.remove(&gid(9))), [gid(9)]);
         assert!(arrivals.pair_up(&pair(1, 9)).is_none());
     }
 }

@@ -228,6 +228,10 @@ impl EndpointEvents {
         self.lock().matched.contains(gid)
     }
 
+    pub(super) fn matched_now(&self) -> Vec<Gid> {
+        self.lock().matched.iter().copied().collect()
+    }
+
     /// Those that a publisher sends to are these now.
     pub(super) fn readers(&self, now: BTreeSet<Gid>) -> Changes {
         self.rematch(now, |_, _| {})

@@ -11,6 +11,7 @@ mod callback;
 mod clock;
 mod connect;
 mod control;
+mod create;
 mod error;
 mod events;
 mod guard;
@@ -20,6 +21,8 @@ mod node;
 mod options;
 mod peers;
 mod publisher;
+mod rings;
+mod service;
 pub(crate) mod signals;
 pub mod socket;
 mod state;
@@ -44,6 +47,7 @@ pub use message::SessionRole;
 pub use node::Node;
 pub use options::{DaemonCommand, EndpointSpec, SessionOptions};
 pub use publisher::{Loan, Publisher};
+pub use service::{Client, Server};
 pub use state::SessionEvent;
 pub use subscription::{MessageInfo, Subscription};
 pub use waiting::Waitable;
@@ -52,22 +56,18 @@ use self::{
     connect::{Caller, Connected},
     control::Control,
     message::{EndpointRole, Message},
-    publisher::PublisherInner,
     state::{Outgoing, Shared, StatusAnswer},
-    subscription::SubscriptionInner,
 };
 use crate::{
     config::{Config, DaemonPolicy},
-    graph::{Endpoint, EndpointKind, GraphView, Pairing, pairing},
+    graph::{Endpoint, EndpointKind, GraphView},
     ids::{DaemonId, Gid, SessionId},
     qos::Qos,
-    shm::{RingOptions, SessionSegment, ShmError, Writer},
+    shm::{SessionSegment, ShmError},
 };
 
 /// How long a daemon may take to answer a question.
 const ANSWER: Duration = Duration::from_secs(5);
-/// How long a new endpoint waits for those that it is matched with.
-const PAIRS: Duration = Duration::from_millis(50);
 
 /// A process's session. Cheap to clone; thread-safe. It ends when the last clone and the last of
 /// its publishers and subscriptions are gone.
@@ -173,6 +173,23 @@ impl Session {
         let inner = &subscription.inner;
         self.await_pairs(&inner.endpoint, |other| inner.events.is_matched(other));
         Ok(subscription)
+    }
+
+    /// A server of a service. Its clients are matched as a publisher's readers are.
+    ///
+    /// # Errors
+    /// When the specification is out of bounds.
+    pub fn create_server(&self, spec: EndpointSpec) -> Result<Server, SessionError> {
+        self.add_server(spec)
+    }
+
+    /// A client of a service. Its servers are matched as a publisher's readers are; see
+    /// [`Client::wait_available`].
+    ///
+    /// # Errors
+    /// When the specification is out of bounds or there is no memory.
+    pub fn create_client(&self, spec: EndpointSpec) -> Result<Client, SessionError> {
+        self.add_client(spec)
     }
 
     /// A node, which is in the graph until it is dropped.
@@ -328,164 +345,6 @@ impl Session {
     /// ever then, by threads that were not forked with it.
     fn is_forked(&self) -> bool {
         self.shared().segment.is_forked()
-    }
-
-    fn endpoint(&self, spec: EndpointSpec, kind: EndpointKind) -> Result<Endpoint, SessionError> {
-        let endpoint = self.describe(spec, kind)?;
-        if endpoint.is_sane() {
-            Ok(endpoint)
-        } else {
-            Err(SessionError::Endpoint { topic: endpoint.topic })
-        }
-    }
-
-    /// An endpoint with a GID of its own.
-    fn describe(&self, spec: EndpointSpec, kind: EndpointKind) -> Result<Endpoint, SessionError> {
-        if self.is_forked() {
-            return Err(ShmError::Forked.into());
-        }
-        let number = {
-            let mut state = self.shared().state();
-            state.next_entity += 1;
-            state.next_entity
-        };
-        let EndpointSpec { topic, type_name, type_hash, qos, node, namespace } = spec;
-        Ok(Endpoint {
-            gid: Gid::new(self.shared().id, number),
-            kind,
-            topic,
-            type_name,
-            type_hash,
-            qos,
-            node,
-            namespace,
-            enclave: String::new(),
-        })
-    }
-
-    fn add_publisher(
-        &self,
-        endpoint: Endpoint,
-        role: EndpointRole,
-    ) -> Result<Publisher, SessionError> {
-        let shared = self.shared();
-        if self.is_forked() {
-            return Err(ShmError::Forked.into());
-        }
-        let gid = endpoint.gid;
-        let options = RingOptions {
-            gid,
-            qos: endpoint.qos,
-            budget: shared.config.ring_bytes,
-            max_message: shared.config.max_message,
-            expected: 0,
-        };
-        let writer = Writer::create(shared.segment.clone(), options)?;
-        let inner = Arc::new(PublisherInner::new(endpoint, role, writer));
-        {
-            let mut state = shared.state();
-            if role == EndpointRole::Application {
-                state.index(&inner.endpoint);
-            }
-            state.publishers.insert(gid, inner.clone());
-        }
-        shared.tell(Outgoing::Announce(gid));
-        Ok(Publisher { inner, session: self.clone() })
-    }
-
-    fn add_subscription(
-        &self,
-        endpoint: Endpoint,
-        role: EndpointRole,
-        stands_for: Vec<Gid>,
-    ) -> Subscription {
-        let gid = endpoint.gid;
-        let inner = Arc::new(SubscriptionInner::new(endpoint, role, stands_for));
-        {
-            let mut state = self.shared().state();
-            if role == EndpointRole::Application {
-                state.index(&inner.endpoint);
-            }
-            state.subscriptions.insert(gid, inner.clone());
-        }
-        self.shared().tell(Outgoing::Announce(gid));
-        Subscription { inner, session: self.clone() }
-    }
-
-    /// An endpoint's or a node's handle is dropped.
-    fn forget_endpoint(&self, gid: &Gid) {
-        // In a forked child it is the parent's still, and its locks may be held.
-        if self.is_forked() {
-            return;
-        }
-        let mut state = self.shared().state();
-        state.nodes.remove(gid);
-        let publisher = state.publishers.remove(gid);
-        let subscription = state.subscriptions.remove(gid);
-        let publisher = publisher.as_ref().map(|p| (&p.endpoint, p.role));
-        let subscription = subscription.as_ref().map(|s| (&s.endpoint, s.role));
-        match publisher.or(subscription) {
-            Some((_, EndpointRole::StandIn | EndpointRole::Relay)) => {}
-            Some((endpoint, EndpointRole::Application)) => {
-                state.unindex(endpoint);
-                state.tombstones.insert(*gid);
-            }
-            None => drop(state.tombstones.insert(*gid)),
-        }
-        let gone = message::Gone { gid: *gid };
-        state.outgoing.push_back(Outgoing::Message(Box::new(Message::EndpointGone(gone))));
-        drop(state);
-        self.shared().wake();
-    }
-
-    /// A relay stands for others than before: its writers and the daemon hear of it.
-    fn renew(&self, gid: Gid) {
-        if self.is_forked() {
-            return;
-        }
-        self.shared().tell(Outgoing::Announce(gid));
-    }
-
-    /// Waits until a new endpoint is matched with all that the graph shows and that go with it: whoever
-    /// counts them reaches them. Not for long, and not where nobody could do it.
-    fn await_pairs(&self, own: &Endpoint, matched: impl Fn(&Gid) -> bool) {
-        let shared = self.shared();
-        if shared.control.get() == Some(&std::thread::current().id()) {
-            return;
-        }
-        let goes = |other: &Endpoint| {
-            pairing(own, other) == Pairing::Match || pairing(other, own) == Pairing::Match
-        };
-        // Of its own session's endpoints it is sure, and both ends are waited for.
-        let (mut others, mut publishers, mut subscriptions) = (Vec::new(), Vec::new(), Vec::new());
-        let graph = {
-            let state = shared.state();
-            if state.daemon.is_none() && shared.config.daemon != DaemonPolicy::Off {
-                return;
-            }
-            for gid in state.topics.get(&own.topic).into_iter().flatten() {
-                publishers.extend(state.publishers.get(gid).filter(|p| goes(&p.endpoint)).cloned());
-                subscriptions
-                    .extend(state.subscriptions.get(gid).filter(|s| goes(&s.endpoint)).cloned());
-            }
-            state.graph.clone()
-        };
-        let foreign = graph.endpoints.values().map(|other| &other.endpoint);
-        let foreign = foreign.filter(|other| other.gid.0[..12] != own.gid.0[..12] && goes(other));
-        others.extend(foreign.map(|other| other.gid));
-        drop(graph);
-        let there = |other: &Gid| shared.state().graph.endpoints.contains_key(other);
-        let stands = |other: &Gid, theirs: &events::EndpointEvents| {
-            let ends = matched(other) && theirs.is_matched(&own.gid);
-            let state = shared.state();
-            ends || !(state.publishers.contains_key(other)
-                || state.subscriptions.contains_key(other))
-        };
-        shared.wait_changed(PAIRS, || {
-            publishers.iter().all(|p| stands(&p.endpoint.gid, &p.events))
-                && subscriptions.iter().all(|s| stands(&s.endpoint.gid, &s.events))
-                && others.iter().all(|other| matched(other) || !there(other))
-        });
     }
 
     fn wait_changed(&self, timeout: Duration, mut reached: impl FnMut() -> bool) -> bool {

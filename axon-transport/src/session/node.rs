@@ -2,7 +2,9 @@
 
 use std::fmt;
 
-use super::{EndpointSpec, GuardCondition, Publisher, Session, SessionError, Subscription};
+use super::{
+    Client, EndpointSpec, GuardCondition, Publisher, Server, Session, SessionError, Subscription,
+};
 use crate::{graph::Endpoint, ids::Gid};
 
 /// A node of a session. It is in the graph for as long as this stands, with endpoints or without;
@@ -81,6 +83,22 @@ impl Node {
     /// When the specification is out of bounds.
     pub fn create_subscription(&self, spec: EndpointSpec) -> Result<Subscription, SessionError> {
         self.session.create_subscription(self.own(spec))
+    }
+
+    /// As [`Session::create_server`], of this node, whatever node `spec` names.
+    ///
+    /// # Errors
+    /// When the specification is out of bounds.
+    pub fn create_server(&self, spec: EndpointSpec) -> Result<Server, SessionError> {
+        self.session.create_server(self.own(spec))
+    }
+
+    /// As [`Session::create_client`], of this node, whatever node `spec` names.
+    ///
+    /// # Errors
+    /// When the specification is out of bounds or there is no memory.
+    pub fn create_client(&self, spec: EndpointSpec) -> Result<Client, SessionError> {
+        self.session.create_client(self.own(spec))
     }
 
     fn own(&self, spec: EndpointSpec) -> EndpointSpec {

@@ -12,18 +12,20 @@ use super::{
     Session, clock,
     events::{Changes, EndpointEvents, Event, Source},
     message::EndpointRole,
+    rings::Rings,
 };
 use crate::{
     events::EventKind,
     graph::Endpoint,
     ids::Gid,
     qos::{Liveliness, Qos},
-    shm::{Grant, Meta, PublishError, ReaderInfo, ShmError, Writer},
+    shm::{Grant, Location, Meta, PublishError, ReaderInfo, ShmError, Writer},
 };
 
 /// Sends the samples of a topic. Thread-safe. When it is dropped, readers still take what it left.
 pub struct Publisher {
     pub(super) inner: Arc<PublisherInner>,
+    pub(super) writer: Arc<Writer>,
     pub(super) session: Session,
 }
 
@@ -53,7 +55,7 @@ impl Publisher {
     /// # Errors
     /// As for [`publish`](Self::publish).
     pub fn publish_at(&self, source_timestamp: i64, payload: &[u8]) -> Result<u64, PublishError> {
-        self.inner.published(self.inner.writer.publish_next(source_timestamp, payload))
+        self.inner.published(self.writer.publish_next(source_timestamp, payload))
     }
 
     /// Publishes for a remote publisher, whose number and time the sample keeps.
@@ -61,7 +63,7 @@ impl Publisher {
     /// # Errors
     /// As for [`publish`](Self::publish).
     pub fn publish_with(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
-        self.inner.published(self.inner.writer.publish(meta, payload)).map(drop)
+        self.inner.published(self.writer.publish(meta, payload)).map(drop)
     }
 
     /// As [`publish_with`](Self::publish_with), but never waits for room.
@@ -69,7 +71,7 @@ impl Publisher {
     /// # Errors
     /// [`PublishError::Blocked`] at once when there is none.
     pub fn try_publish_with(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
-        self.inner.published(self.inner.writer.try_publish(meta, payload)).map(drop)
+        self.inner.published(self.writer.try_publish(meta, payload)).map(drop)
     }
 
     /// If a sample would be read by nobody, now or later, uses up the next sequence number and
@@ -79,7 +81,7 @@ impl Publisher {
     /// # Errors
     /// [`PublishError::Forked`].
     pub fn skip_unread(&self) -> Result<Option<u64>, PublishError> {
-        let skipped = self.inner.writer.skip_unread()?;
+        let skipped = self.writer.skip_unread()?;
         if skipped.is_some() { self.inner.published(Ok(skipped)) } else { Ok(None) }
     }
 
@@ -93,7 +95,7 @@ impl Publisher {
             return Err(PublishError::Forked);
         }
         if self.inner.asserts {
-            self.inner.writer.assert(clock::monotonic());
+            self.writer.assert(clock::monotonic());
         }
         Ok(())
     }
@@ -109,12 +111,12 @@ impl Publisher {
     /// # Errors
     /// As for [`publish`](Self::publish).
     pub fn loan(&self, len: usize) -> Result<Loan<'_>, PublishError> {
-        Ok(Loan { loan: self.inner.writer.loan(len)?, publisher: &self.inner })
+        Ok(Loan { loan: self.writer.loan(len)?, publisher: &self.inner })
     }
 
     /// The readers that receive from it; a relay shows as the remote ones it stands for.
     pub fn matched(&self) -> Vec<Gid> {
-        self.inner.writer.readers()
+        self.writer.readers()
     }
 
     /// Waits until at least `count` readers receive from it; whether they do.
@@ -182,11 +184,12 @@ impl io::Write for Loan<'_> {
     }
 }
 
-/// What the session's control thread shares with the handle.
+/// The writing side of a publisher, client or server, which the session's control thread shares with
+/// the handle.
 pub(super) struct PublisherInner {
     pub(super) endpoint: Endpoint,
     pub(super) role: EndpointRole,
-    pub(super) writer: Writer,
+    pub(super) rings: Rings,
     pub(super) events: EndpointEvents,
     /// A publication says that the publisher is alive.
     asserts: bool,
@@ -195,29 +198,30 @@ pub(super) struct PublisherInner {
 }
 
 impl PublisherInner {
-    pub(super) fn new(endpoint: Endpoint, role: EndpointRole, writer: Writer) -> Self {
+    pub(super) fn new(endpoint: Endpoint, role: EndpointRole, rings: Rings) -> Self {
         let Qos { liveliness, lease, .. } = endpoint.qos;
         let asserts = liveliness == Liveliness::ManualByTopic && lease.is_some();
         let events = EndpointEvents::of_publisher(&endpoint.qos, clock::monotonic());
-        Self { endpoint, role, writer, events, asserts, attached: Mutex::default() }
+        Self { endpoint, role, rings, events, asserts, attached: Mutex::default() }
     }
 
-    pub(super) fn attach(&self, reader: ReaderInfo) -> Result<Grant, ShmError> {
+    /// Serves a reader: what it is granted, and in which ring.
+    pub(super) fn attach(&self, reader: ReaderInfo) -> Result<(Grant, Location), ShmError> {
         let gid = reader.gid;
-        let grant = self.writer.attach(reader)?;
+        let granted = self.rings.attach(reader)?;
         self.attached().insert(gid);
-        Ok(grant)
+        Ok(granted)
     }
 
     /// Whether it was attached.
     pub(super) fn detach(&self, reader: Gid) -> bool {
         self.attached().remove(&reader);
-        self.writer.detach(reader)
+        self.rings.detach(reader)
     }
 
     /// Whether any reader's process was dead.
     pub(super) fn drop_dead(&self) -> bool {
-        let dead = self.writer.drop_dead();
+        let dead = self.rings.drop_dead();
         let mut attached = self.attached();
         dead.iter().for_each(|gid| {
             attached.remove(gid);
@@ -231,14 +235,15 @@ impl PublisherInner {
 
     /// What became of its matches since it was asked last.
     pub(super) fn rematch(&self) -> Changes {
-        self.events.readers(self.writer.readers().into_iter().collect())
+        self.events.readers(self.rings.readers().into_iter().collect())
     }
 
     /// Counts the deadlines that passed, and asserts or watches the lease. When to look again, and
     /// whether something happened.
     pub(super) fn look_at_time(&self, now: u64) -> (Option<u64>, bool) {
         let qos = &self.endpoint.qos;
-        let times = self.writer.times();
+        let Rings::Shared(writer) = &self.rings else { return (None, false) };
+        let times = writer.times();
         let (due, news) = self.events.offered(qos, &times, now);
         let Some(lease) = qos.lease.filter(|_| qos.liveliness == Liveliness::Automatic) else {
             return (due, news);
@@ -246,7 +251,7 @@ impl PublisherInner {
         let third = (lease / 3).max(1_000_000);
         let mut next = times.asserted.map_or(now, |asserted| asserted.saturating_add(third));
         if next <= now {
-            self.writer.assert(now);
+            writer.assert(now);
             next = now.saturating_add(third);
         }
         (Some(due.map_or(next, |due| due.min(next))), news)
@@ -255,13 +260,16 @@ impl PublisherInner {
     /// Notes what was published, where somebody watches the time.
     fn published<T>(&self, result: Result<T, PublishError>) -> Result<T, PublishError> {
         let deadline = self.endpoint.qos.deadline.is_some();
-        if result.is_ok() && (deadline || self.asserts) {
+        if result.is_ok()
+            && (deadline || self.asserts)
+            && let Rings::Shared(writer) = &self.rings
+        {
             let now = clock::monotonic();
             if deadline {
-                self.writer.note_sample(now);
+                writer.note_sample(now);
             }
             if self.asserts {
-                self.writer.assert(now);
+                writer.assert(now);
             }
         }
         result

@@ -17,9 +17,9 @@ use super::{
 };
 use crate::{
     events::EventKind,
-    graph::Endpoint,
+    graph::{Endpoint, EndpointKind},
     ids::Gid,
-    qos::History,
+    qos::{History, Qos},
     shm::{Grant, Lane, Location, Meta, Reader, Sample, ShmError, TakeError},
     wait::Look,
 };
@@ -67,59 +67,23 @@ impl Subscription {
     /// Clocks are taken at their word. Where KEEP_LAST's depth passes samples over, they are those
     /// with the oldest timestamps: a publisher whose clock is ahead has the others' passed over.
     pub fn take(&self, out: &mut Vec<u8>) -> Option<MessageInfo> {
-        self.take_with(|reader| Ok(reader.take(out)?.map(|taken| (taken.meta, ()))))
-            .map(|(info, ())| info)
+        let take = |reader: &mut Reader| Ok(reader.take(out)?.map(|taken| (taken.meta, ())));
+        take_from(&self.inner, &self.session, take).map(|(info, ())| info)
     }
 
     /// As [`take`](Self::take), but a sample of more than 4 KiB stays in the publisher's memory for
     /// as long as it is kept, unless `AXON_SHM_COPY` asks for copies.
     pub fn take_sample(&self) -> Option<(MessageInfo, Sample)> {
         let copy = self.session.shared().config.shm_copy;
-        self.take_with(|reader| {
+        take_from(&self.inner, &self.session, |reader| {
             let sample = if copy { reader.take_copy() } else { reader.take_sample() };
             Ok(sample?.map(|sample| (sample.meta(), sample)))
         })
     }
 
-    fn take_with<T>(
-        &self,
-        take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
-    ) -> Option<(MessageInfo, T)> {
-        // A thread of the parent may have held the lock when this process was forked.
-        if self.session.is_forked() {
-            tracing::error!("a subscription of the parent process is used after fork");
-            return None;
-        }
-        let mut slots = self.inner.lock();
-        let taken = slots.take(take, &self.inner.endpoint);
-        let gone = std::mem::take(&mut slots.discarded);
-        let lost = slots.new_losses();
-        drop(slots);
-        self.inner.events.lost(lost);
-        for writer in gone {
-            let detach = Message::Detach(Pair { reader: self.gid(), writer });
-            self.session.shared().tell(Outgoing::Message(Box::new(detach)));
-        }
-        taken
-    }
-
     /// As [`take`](Self::take), after waiting for a sample for at most `timeout`.
     pub fn recv(&self, out: &mut Vec<u8>, timeout: Option<Duration>) -> Option<MessageInfo> {
-        let deadline = timeout.and_then(|t| Instant::now().checked_add(t));
-        loop {
-            // Nothing comes to a forked child, however long it waits.
-            if self.session.is_forked() {
-                return None;
-            }
-            if let Some(info) = self.take(out) {
-                return Some(info);
-            }
-            let left = deadline.map(|d| d.saturating_duration_since(Instant::now()));
-            let look = Arc::clone(&self.inner);
-            if left.is_some_and(|l| l.is_zero()) || !self.session.segment().wait_for(look, left) {
-                return None;
-            }
-        }
+        recv_from(&self.inner, &self.session, timeout, || self.take(out))
     }
 
     /// Whether there is something to take.
@@ -205,9 +169,63 @@ impl Drop for Subscription {
     }
 }
 
-/// What the session's control thread shares with the handle.
+/// The oldest of what one may take.
+pub(super) fn take_from<T>(
+    inner: &SubscriptionInner,
+    session: &Session,
+    take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
+) -> Option<(MessageInfo, T)> {
+    // A thread of the parent may have held the lock when this process was forked.
+    if session.is_forked() {
+        tracing::error!("an endpoint of the parent process is used after fork");
+        return None;
+    }
+    let mut slots = inner.lock();
+    let taken = slots.take(take, inner);
+    let gone = std::mem::take(&mut slots.discarded);
+    let lost = slots.new_losses();
+    drop(slots);
+    inner.events.lost(lost);
+    for writer in gone {
+        let detach = Message::Detach(Pair { reader: inner.endpoint.gid, writer });
+        session.shared().tell(Outgoing::Message(Box::new(detach)));
+    }
+    taken
+}
+
+/// What `take` finds, after waiting for at most `timeout`.
+pub(super) fn recv_from<T>(
+    inner: &Arc<SubscriptionInner>,
+    session: &Session,
+    timeout: Option<Duration>,
+    mut take: impl FnMut() -> Option<T>,
+) -> Option<T> {
+    let deadline = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
+    loop {
+        // Nothing comes to a forked child, however long it waits.
+        if session.is_forked() {
+            return None;
+        }
+        if let Some(taken) = take() {
+            return Some(taken);
+        }
+        let left = deadline.map(|deadline| deadline.saturating_duration_since(Instant::now()));
+        let look = Arc::clone(inner);
+        if left.is_some_and(|left| left.is_zero()) || !session.segment().wait_for(look, left) {
+            return None;
+        }
+    }
+}
+
+/// The reading side of a subscription, client or server, which the session's control thread shares
+/// with the handle.
 pub(super) struct SubscriptionInner {
     pub(super) endpoint: Endpoint,
+    /// What its readers request: what the endpoint does, but for a client's or a server's, which
+    /// lose nothing.
+    pub(super) qos: Qos,
+    /// Whether a writer's numbers rise: the responses of a server come in whatever order it likes.
+    rising: bool,
     pub(super) role: EndpointRole,
     pub(super) events: EndpointEvents,
     stands_for: Mutex<Vec<Gid>>,
@@ -266,7 +284,10 @@ impl SubscriptionInner {
         let (stands_for, slots) = (Mutex::new(stands_for), Mutex::default());
         let events = EndpointEvents::of_subscription(&endpoint.qos);
         let (arrived, listens) = (Callback::default(), Mutex::new(false));
-        Self { endpoint, role, events, stands_for, slots, arrived, listens }
+        let service = matches!(endpoint.kind, EndpointKind::Server | EndpointKind::Client);
+        let qos = if service { Qos::keep_all() } else { endpoint.qos };
+        let rising = endpoint.kind != EndpointKind::Client;
+        Self { endpoint, qos, rising, role, events, stands_for, slots, arrived, listens }
     }
 
     pub(super) fn has_data(&self) -> bool {
@@ -296,7 +317,7 @@ impl SubscriptionInner {
         let untold = {
             let mut slots = self.lock();
             slots.new_arrivals();
-            slots.unread(&self.endpoint)
+            slots.unread(&self.qos)
         };
         self.arrived.replace(callback, Some(untold));
         Ok(())
@@ -333,7 +354,7 @@ impl SubscriptionInner {
             });
             times.collect()
         };
-        self.events.requested(&self.endpoint.qos, &times, now)
+        self.events.requested(&self.qos, &times, now)
     }
 
     /// The same for who must not wait for a thread that takes.
@@ -401,10 +422,10 @@ impl Slots {
     }
 
     /// Samples to be taken.
-    fn unread(&self, endpoint: &Endpoint) -> u64 {
+    fn unread(&self, qos: &Qos) -> u64 {
         let unread = self.slots.iter().map(|slot| slot.reader.unread()).sum::<u64>();
-        match endpoint.qos.history {
-            History::KeepLast => unread.min(endpoint.qos.depth.into()),
+        match qos.history {
+            History::KeepLast => unread.min(qos.depth.into()),
             History::KeepAll => unread,
         }
     }
@@ -536,14 +557,15 @@ impl Slots {
     fn take<T>(
         &mut self,
         mut take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
-        endpoint: &Endpoint,
+        of: &SubscriptionInner,
     ) -> Option<(MessageInfo, T)> {
+        let endpoint = &of.endpoint;
         self.slots.iter_mut().for_each(|slot| slot.overtaken = false);
         // A writer that repeats itself without end must not keep the lock: callers come back as
         // long as there is something to take.
         for _ in 0..REPEATS {
-            if endpoint.qos.history == History::KeepLast && self.slots.len() > 1 {
-                self.skip_to_depth(u64::from(endpoint.qos.depth));
+            if of.qos.history == History::KeepLast && self.slots.len() > 1 {
+                self.skip_to_depth(u64::from(of.qos.depth));
             }
             let Some(index) = self.oldest() else {
                 // What was skipped may have been the last of a writer that is gone.
@@ -585,7 +607,7 @@ impl Slots {
                 meta.source_timestamp.saturating_add(lifespan) < received_timestamp
             });
             let last = self.last.entry(writer).or_default();
-            let repeated = meta.sequence <= *last;
+            let repeated = of.rising && meta.sequence <= *last;
             if !repeated {
                 *last = meta.sequence;
                 if expired {
@@ -673,9 +695,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 mod tests {
     use super::*;
     use crate::{
-        graph::EndpointKind,
         ids::SessionId,
-        qos::Qos,
         shm::{Peer, ReaderInfo, ReaderOptions, RingOptions, SessionSegment, Writer},
     };
 
@@ -708,12 +728,13 @@ mod tests {
             namespace: String::new(),
             enclave: String::new(),
         };
+        let inner = SubscriptionInner::new(endpoint, EndpointRole::Application, Vec::new());
         let none = |_: &mut Reader| Err::<Option<(Meta, ())>, _>(TakeError::NoMemory { len: 6 });
-        assert!(slots.take(none, &endpoint).is_none() && !slots.has_data());
+        assert!(slots.take(none, &inner).is_none() && !slots.has_data());
         // Whoever asks nevertheless gets it, if it can be had.
         let mut out = Vec::new();
         let take = |reader: &mut Reader| Ok(reader.take(&mut out)?.map(|taken| (taken.meta, ())));
-        assert!(slots.take(take, &endpoint).is_some());
+        assert!(slots.take(take, &inner).is_some());
         assert_eq!(out, b"sample");
     }
 }

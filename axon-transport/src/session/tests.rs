@@ -27,8 +27,8 @@ use crate::{
     config::OsFiles,
     qos::Durability,
     shm::{
-        Grant, Location, Meta, Peer, PeerDescriptors, PeerSession, ReaderInfo, SegmentInfo,
-        SegmentKind,
+        Grant, Location, Meta, Peer, PeerDescriptors, PeerSession, ReaderInfo, RingOptions,
+        SegmentInfo, SegmentKind, Writer,
     },
     wait::Purpose,
 };

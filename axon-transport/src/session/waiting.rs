@@ -6,8 +6,8 @@ use std::{
 };
 
 use super::{
-    Event, GuardCondition, Session, SessionError, Subscription, events::Source, guard::Guard,
-    subscription::SubscriptionInner,
+    Client, Event, GuardCondition, Server, Session, SessionError, Subscription, events::Source,
+    guard::Guard, subscription::SubscriptionInner,
 };
 use crate::{events::EventKind, shm::ShmError, wait::Look};
 
@@ -17,6 +17,10 @@ use crate::{events::EventKind, shm::ShmError, wait::Look};
 pub enum Waitable<'a> {
     /// Ready while there is something to take.
     Subscription(&'a Subscription),
+    /// Ready while there is a request to take.
+    Server(&'a Server),
+    /// Ready while there is a response to take.
+    Client(&'a Client),
     /// Ready once it was triggered. The wait that finds it so resets it.
     GuardCondition(&'a GuardCondition),
     /// Ready while it occurred and its status was not taken since.
@@ -90,6 +94,12 @@ impl Session {
         let (part, segment) = match waitable {
             Waitable::Subscription(subscription) => {
                 (Part::Data(subscription.inner.clone()), subscription.session.segment())
+            }
+            Waitable::Server(server) => {
+                (Part::Data(server.requests.clone()), server.session.segment())
+            }
+            Waitable::Client(client) => {
+                (Part::Data(client.responses.clone()), client.session.segment())
             }
             Waitable::GuardCondition(guard) => {
                 (Part::Guard(guard.guard().clone()), guard.guard().segment())

@@ -128,9 +128,8 @@ impl Control {
     }
 
     fn disappear(&mut self, gid: &Gid) {
-        self.arrivals.remove(gid);
-        let mut entry = None;
-        self.view(|view| entry = view.endpoints.remove(gid));
+        let mut entry = self.arrivals.remove(gid);
+        self.view(|view| entry = view.endpoints.remove(gid).or(entry.take()));
         let Some(entry) = entry else { return };
         for own in self.own(&entry.endpoint.topic) {
             own.events().forget(gid);

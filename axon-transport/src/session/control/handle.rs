@@ -157,7 +157,7 @@ impl Control {
             reader: subscription.endpoint.gid,
             writer,
             lane,
-            qos: subscription.endpoint.qos,
+            qos: subscription.qos,
             session: self.shared.id,
             stands_for: stands_for(subscription),
             segments: Vec::new(),
@@ -184,10 +184,9 @@ impl Control {
             publisher.attach(reader).map_err(|e| e.to_string())
         });
         match grant {
-            Ok(Grant { generation, first }) => {
+            Ok((Grant { generation, first }, ring)) => {
                 let Pair { reader, writer } = pair;
                 let session = self.shared.id;
-                let ring = publisher.writer.location();
                 let segments = Vec::new();
                 let grant = Granted { reader, writer, generation, first, session, ring, segments };
                 self.say(Message::Grant(grant));
@@ -242,7 +241,7 @@ impl Control {
                 ring,
                 lane,
                 grant,
-                qos: subscription.endpoint.qos,
+                qos: subscription.qos,
                 max_message: self.shared.config.max_message,
             };
             Reader::map(options).map_err(|e| e.to_string())
@@ -292,7 +291,7 @@ impl Control {
     /// Whether a publisher of ours has that ring.
     fn has_ring(&self, writer: &Gid, ring: Location) -> bool {
         let state = self.shared.state();
-        state.publishers.get(writer).is_some_and(|p| p.writer.location() == ring)
+        state.publishers.get(writer).is_some_and(|p| p.rings.has(ring))
     }
 
     fn segment(&mut self, opened: &SegmentOpened, descriptors: &[PassedFd]) {

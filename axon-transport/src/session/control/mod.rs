@@ -307,7 +307,7 @@ impl Control {
             let publisher = self.shared.state().publishers.get(&gid).cloned();
             if let Some(publisher) = publisher {
                 // What lacks then, its next publish says.
-                let _ = publisher.writer.prepare();
+                publisher.rings.prepare();
                 self.look_after_memory();
             }
         }
@@ -350,7 +350,7 @@ impl Control {
                             endpoint: publisher.endpoint.clone(),
                             role: publisher.role,
                             stands_for: Vec::new(),
-                            ring: Some(publisher.writer.location()),
+                            ring: publisher.rings.shared().map(|writer| writer.location()),
                         };
                         self.say(Message::Endpoint(announce));
                     } else if let Some(subscription) = state.subscriptions.get(&gid) {
@@ -487,7 +487,7 @@ impl Control {
             return;
         }
         let publishers: Vec<_> = self.shared.state().publishers.values().cloned().collect();
-        let more = publishers.iter().filter(|publisher| publisher.writer.tend(now)).count();
+        let more = publishers.iter().filter(|publisher| publisher.rings.tend(now)).count();
         let more = self.shared.segment.tidy() || more > 0;
         self.tend = more.then(|| now + TEND);
     }

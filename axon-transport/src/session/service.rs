@@ -1,0 +1,266 @@
+//! Services: requests that clients send to all servers, and responses that each server sends to the
+//! client that asked, and to nobody else.
+//!
+//! A client has one ring, which its servers read; a server has a ring for each of its clients. Both
+//! keep all that was not taken: nothing of it is ever dropped to make room while its reader lives.
+
+use std::{fmt, sync::Arc, time::Duration};
+
+use super::{
+    MessageInfo, OnNew, Session, SessionError, clock,
+    publisher::PublisherInner,
+    rings::Lanes,
+    subscription::{SubscriptionInner, recv_from, take_from},
+};
+use crate::{
+    graph::Endpoint,
+    ids::Gid,
+    shm::{Meta, PublishError, Reader, ShmError, Writer},
+};
+
+/// How long a response waits for a client whose request came before it could be answered.
+const PATIENCE: Duration = Duration::from_millis(100);
+
+/// Answers requests. Thread-safe.
+pub struct Server {
+    responses: Arc<PublisherInner>,
+    lanes: Arc<Lanes>,
+    pub(super) requests: Arc<SubscriptionInner>,
+    pub(super) session: Session,
+}
+
+/// Sends requests. Thread-safe.
+///
+/// ```
+/// use std::time::Duration;
+///
+/// use axon_transport::{
+///     config::{Config, DaemonPolicy, OsFiles},
+///     qos::Qos,
+///     session::{EndpointSpec, Session, SessionOptions},
+/// };
+///
+/// let config = Config { daemon: DaemonPolicy::Off, ..Config::resolve([], None, &OsFiles)? };
+/// let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// let spec = || EndpointSpec::new("/add", "AddTwoInts", Qos::default());
+/// let server = session.create_server(spec())?;
+/// let client = session.create_client(spec())?;
+/// assert!(client.wait_available(Duration::from_secs(10)));
+///
+/// let number = client.send_request(b"1 + 2")?;
+/// let mut bytes = Vec::new();
+/// let request = server.recv_request(&mut bytes, None).expect("the request");
+/// server.send_response(request.publisher, request.sequence, b"3")?;
+/// let response = client.recv_response(&mut bytes, None).expect("the response");
+/// assert_eq!((response.sequence, &bytes[..]), (number, &b"3"[..]));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+pub struct Client {
+    requests: Arc<PublisherInner>,
+    ring: Arc<Writer>,
+    pub(super) responses: Arc<SubscriptionInner>,
+    pub(super) session: Session,
+}
+
+impl Server {
+    pub(super) fn new(
+        responses: Arc<PublisherInner>,
+        requests: Arc<SubscriptionInner>,
+        lanes: Arc<Lanes>,
+        session: Session,
+    ) -> Self {
+        Self { responses, lanes, requests, session }
+    }
+
+    /// Its GID.
+    pub fn gid(&self) -> Gid {
+        self.responses.endpoint.gid
+    }
+
+    /// Itself, as others see it.
+    pub fn endpoint(&self) -> &Endpoint {
+        &self.responses.endpoint
+    }
+
+    /// The next request, into `out`, which it replaces. `None` when there is none. What is known of
+    /// it names the client, and the number that the response must carry.
+    pub fn take_request(&self, out: &mut Vec<u8>) -> Option<MessageInfo> {
+        let take = |reader: &mut Reader| Ok(reader.take(out)?.map(|taken| (taken.meta, ())));
+        take_from(&self.requests, &self.session, take).map(|(info, ())| info)
+    }
+
+    /// As [`take_request`](Self::take_request), after waiting for at most `timeout`.
+    pub fn recv_request(
+        &self,
+        out: &mut Vec<u8>,
+        timeout: Option<Duration>,
+    ) -> Option<MessageInfo> {
+        recv_from(&self.requests, &self.session, timeout, || self.take_request(out))
+    }
+
+    /// Answers request `sequence` of `client`. A client that is gone is no error.
+    ///
+    /// # Errors
+    /// [`PublishError::Blocked`] after 100 ms when the client does not take its responses and there
+    /// is no room for more; the others say what does not fit.
+    pub fn send_response(
+        &self,
+        client: Gid,
+        sequence: u64,
+        payload: &[u8],
+    ) -> Result<(), PublishError> {
+        if self.session.is_forked() {
+            return Err(PublishError::Forked);
+        }
+        let ring = || self.lanes.ring(&client);
+        // Its request may have come before it could be answered.
+        let settled = || ring().is_some() || !self.requests.lock().writers().contains(&client);
+        if !settled() {
+            self.session.wait_changed(PATIENCE, settled);
+        }
+        let Some(ring) = ring() else { return Ok(()) };
+        let meta = Meta { sequence, source_timestamp: clock::wall() };
+        ring.publish(meta, payload).map(drop)
+    }
+
+    /// The clients that reach it and that it reaches.
+    pub fn clients(&self) -> Vec<Gid> {
+        both(&self.responses, &self.requests, &self.session)
+    }
+
+    /// Whether there is a request to be taken.
+    pub fn has_request(&self) -> bool {
+        !self.session.is_forked() && self.requests.has_data()
+    }
+
+    /// As [`Subscription::set_on_new_sample`](super::Subscription::set_on_new_sample), of requests.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn set_on_new_request(&self, callback: Option<OnNew>) -> Result<(), SessionError> {
+        set_callback(&self.requests, callback, &self.session)
+    }
+}
+
+impl Client {
+    pub(super) fn new(
+        requests: Arc<PublisherInner>,
+        responses: Arc<SubscriptionInner>,
+        ring: Arc<Writer>,
+        session: Session,
+    ) -> Self {
+        Self { requests, ring, responses, session }
+    }
+
+    /// Its GID.
+    pub fn gid(&self) -> Gid {
+        self.requests.endpoint.gid
+    }
+
+    /// Itself, as others see it.
+    pub fn endpoint(&self) -> &Endpoint {
+        &self.requests.endpoint
+    }
+
+    /// Sends a request to every server that is there, and returns its number. Where there is none,
+    /// nobody will answer: see [`is_available`](Self::is_available).
+    ///
+    /// # Errors
+    /// [`PublishError::Blocked`] after 100 ms when a server does not take its requests and there is
+    /// no room for more; the others say what does not fit.
+    pub fn send_request(&self, payload: &[u8]) -> Result<u64, PublishError> {
+        self.ring.publish_next(clock::wall(), payload)
+    }
+
+    /// The next response, into `out`, which it replaces. `None` when there is none. What is known of
+    /// it names the server, and the number of the request that it answers.
+    pub fn take_response(&self, out: &mut Vec<u8>) -> Option<MessageInfo> {
+        let take = |reader: &mut Reader| Ok(reader.take(out)?.map(|taken| (taken.meta, ())));
+        take_from(&self.responses, &self.session, take).map(|(info, ())| info)
+    }
+
+    /// As [`take_response`](Self::take_response), after waiting for at most `timeout`.
+    pub fn recv_response(
+        &self,
+        out: &mut Vec<u8>,
+        timeout: Option<Duration>,
+    ) -> Option<MessageInfo> {
+        recv_from(&self.responses, &self.session, timeout, || self.take_response(out))
+    }
+
+    /// Whether there is a server that a request sent now reaches, and whose response reaches this
+    /// client.
+    pub fn is_available(&self) -> bool {
+        !self.servers().is_empty()
+    }
+
+    /// Waits until a server [is available](Self::is_available); whether one is.
+    pub fn wait_available(&self, timeout: Duration) -> bool {
+        self.session.wait_changed(timeout, || self.is_available())
+    }
+
+    /// The servers that it reaches and that reach it.
+    pub fn servers(&self) -> Vec<Gid> {
+        both(&self.requests, &self.responses, &self.session)
+    }
+
+    /// Whether there is a response to be taken.
+    pub fn has_response(&self) -> bool {
+        !self.session.is_forked() && self.responses.has_data()
+    }
+
+    /// As [`Subscription::set_on_new_sample`](super::Subscription::set_on_new_sample), of responses.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn set_on_new_response(&self, callback: Option<OnNew>) -> Result<(), SessionError> {
+        set_callback(&self.responses, callback, &self.session)
+    }
+}
+
+/// Those with whom both directions stand.
+fn both(writes: &PublisherInner, reads: &SubscriptionInner, session: &Session) -> Vec<Gid> {
+    if session.is_forked() {
+        return Vec::new();
+    }
+    let mut gids = reads.events.matched_now();
+    gids.retain(|gid| writes.events.is_matched(gid));
+    gids
+}
+
+fn set_callback(
+    inner: &SubscriptionInner,
+    callback: Option<OnNew>,
+    session: &Session,
+) -> Result<(), SessionError> {
+    if session.is_forked() {
+        return Err(ShmError::Forked.into());
+    }
+    Ok(inner.set_on_new_sample(callback, session.shared())?)
+}
+
+impl fmt::Debug for Server {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Server").field(self.endpoint()).finish()
+    }
+}
+
+impl fmt::Debug for Client {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Client").field(self.endpoint()).finish()
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        let _ = set_callback(&self.requests, None, &self.session);
+        self.session.forget_endpoint(&self.gid());
+    }
+}
+
+impl Drop for Client {
+    fn drop(&mut self) {
+        let _ = set_callback(&self.responses, None, &self.session);
+        self.session.forget_endpoint(&self.gid());
+    }
+}
