@@ -34,7 +34,8 @@ impl PublisherOptions {
         Self { qos, budget: 64 << 20, max_len: 256 << 20, expected_len: 0 }
     }
 
-    /// Bytes of samples to keep before the oldest go. One sample is always kept.
+    /// Bytes of samples to keep before the oldest go. One sample is always kept. Each counts
+    /// as a multiple of 128 bytes.
     #[must_use]
     pub fn budget(self, budget: u64) -> Self {
         Self { budget, ..self }

@@ -31,8 +31,8 @@ impl Medium for Axon {
     fn open(&self, load: &Load, side: Side, channel: &Channel) -> Result<Box<dyn End>> {
         let context = Context::new()?;
         let qos = qos(load.window)?;
-        // All that may be under way must fit, or the oldest go.
-        let budget = (load.window * load.size).max(64 << 20) as u64;
+        // All that may be under way must fit, or the oldest go. Samples count in whole lines.
+        let budget = (load.window * load.size * 5 / 4).max(64 << 20) as u64;
         let options = PublisherOptions::new(qos).budget(budget).expected_len(load.size as u64);
         let publisher = Publisher::new(&context, options)?;
         let connect = |socket: &OwnedFd| {
