@@ -3,7 +3,7 @@
 use std::{collections::BTreeMap, fmt::Write as _, io::Write as _};
 
 use axon_transport::{
-    daemon::status::{LinkStatus, Status, TopicStatus},
+    daemon::status::{LinkStatus, RelayStatus, Status, TopicStatus},
     session,
 };
 use serde_json::Value;
@@ -199,12 +199,26 @@ fn stalled(topic: &TopicStatus) -> String {
 }
 
 fn sessions(status: &Status) -> Table {
-    let mut table = Table::new(&[">process", "name", "role", ">endpoints"]);
+    let mut table = Table::new(&[">process", "name", "role", ">endpoints", "memory"]);
     for session in &status.sessions {
         let (pid, endpoints) = (session.pid.to_string(), session.endpoints.to_string());
-        table.row([pid, session.name.clone(), session.role.clone(), endpoints]);
+        let (name, role) = (session.name.clone(), session.role.clone());
+        table.row([pid, name, role, endpoints, memory(session.relay.as_ref())]);
     }
     table
+}
+
+/// Whether a session shares memory, and if not why, and what that costs.
+fn memory(relay: Option<&RelayStatus>) -> String {
+    let Some(relay) = relay else { return "shared".to_owned() };
+    let traffic = |samples, bytes| format!("{} ({})", grouped(samples), text::bytes(bytes));
+    format!(
+        "relayed: {}; in {}, out {}, lost {}",
+        relay.reason,
+        traffic(relay.samples_in, relay.bytes_in),
+        traffic(relay.samples_out, relay.bytes_out),
+        grouped(relay.lost)
+    )
 }
 
 fn refusals(status: &Status) -> Table {
@@ -327,5 +341,21 @@ mod tests {
         }
         assert!(!text.contains("pid 42"), "what has just come is no sign of a stall:\n{text}");
         assert!(!text.contains("other"), "a cause that never happened is not shown:\n{text}");
+    }
+
+    #[test]
+    fn a_session_says_whether_it_shares_memory() {
+        assert_eq!(memory(None), "shared");
+        let relay = RelayStatus {
+            reason: "AXON_SHM is off".to_owned(),
+            samples_in: 1,
+            bytes_in: 2048,
+            samples_out: 0,
+            bytes_out: 0,
+            lost: 3,
+        };
+        let text = memory(Some(&relay));
+        assert!(text.starts_with("relayed: AXON_SHM is off; in 1 ("), "{text}");
+        assert!(text.ends_with("lost 3"), "{text}");
     }
 }

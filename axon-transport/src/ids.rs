@@ -76,4 +76,9 @@ impl Gid {
         gid[12..].copy_from_slice(&number.to_be_bytes());
         Self(gid)
     }
+
+    /// Whether it is one that `session` may give to an endpoint of its own.
+    pub fn is_of(&self, session: &SessionId) -> bool {
+        self.0[..12] == session.0[..12]
+    }
 }

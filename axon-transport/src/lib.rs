@@ -12,6 +12,7 @@ pub mod keys;
 pub mod link;
 pub mod passed;
 pub mod qos;
+pub mod relay;
 pub mod session;
 pub mod shm;
 pub mod wait;

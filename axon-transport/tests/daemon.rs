@@ -315,6 +315,7 @@ fn garbage_on_the_socket_hurts_nobody() {
             name: name.into(),
             domain: 0,
             settings,
+            relay: None,
         })
         .encode()
         .unwrap()
@@ -350,6 +351,7 @@ fn garbage_on_the_socket_hurts_nobody() {
         name: "tool".into(),
         domain: 0,
         settings: Vec::new(),
+        relay: None,
     });
     socket::send(&tool, &packet.encode().unwrap(), &[]).unwrap();
     socket::send(&tool, &Message::Resync.encode().unwrap(), &[]).unwrap();
@@ -382,6 +384,7 @@ fn the_daemon_is_handed_nothing_that_a_read_could_wait_for() {
             name: name.into(),
             domain: 0,
             settings: settings.clone(),
+            relay: None,
         });
         let socket = Address::of(&host.config()).connect().unwrap();
         let handed = segment.descriptors().unwrap();
@@ -456,6 +459,7 @@ fn descriptors_that_are_slow_to_close_do_not_stop_the_daemon() {
         name: "tool".into(),
         domain: 0,
         settings: Vec::new(),
+        relay: None,
     });
     let (tool, unknown, garbage) = (tool.encode().unwrap(), [200, 0xa0], [1]);
     // (said first, what the packet that carries it is, descriptors before it)

@@ -192,6 +192,7 @@ fn child() {
                 name: "stranger".into(),
                 domain: 171,
                 settings: Vec::new(),
+                relay: None,
             });
             let _ = socket::send(&socket, &hello.encode().unwrap(), &[]);
             let mut buffer = Vec::new();

@@ -31,6 +31,11 @@ pub const TARGETS: &[Target] = &[
         check: transport::session_message,
         seeds: transport::session_message_seeds,
     },
+    Target {
+        name: "relay_pieces",
+        check: transport::relay_pieces,
+        seeds: transport::relay_pieces_seeds,
+    },
     Target { name: "envelope_header", check: envelope::header, seeds: envelope::open_seeds },
     Target { name: "envelope_inner", check: envelope::inner, seeds: envelope::inner_seeds },
     Target { name: "envelope_open", check: envelope::open, seeds: envelope::open_seeds },

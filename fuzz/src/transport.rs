@@ -11,6 +11,7 @@ use axon_transport::{
     keys::KeyMessage,
     link::{self, FrameError},
     qos::Qos,
+    relay::flow::{Incoming, Pool, WINDOW},
     session::message::{self as session, CodecError, MAX_PACKET},
     shm::Location,
 };
@@ -72,6 +73,43 @@ pub fn session_message(data: &[u8]) -> bool {
         Err(CodecError::TooLarge(_)) => assert!(data.len() > MAX_PACKET - 16),
         Err(other) => panic!("does not encode: {other}"),
     }
+    true
+}
+
+/// Packets of a relayed session, each behind its length: whatever their pieces say, no more is kept
+/// than the session was given credit for, and all of it is given back.
+pub fn relay_pieces(data: &[u8]) -> bool {
+    const MAX: u64 = 100_000;
+    let pool = Pool::new(MAX);
+    let mut incoming = Incoming::new(MAX, pool.clone());
+    let channels = [Gid([1; 16]), Gid([2; 16])];
+    for channel in channels {
+        assert!(incoming.open(channel).is_some_and(|credit| credit.bytes == WINDOW));
+    }
+    let mut kept = Vec::new();
+    let mut packets = data;
+    while let Some((length, rest)) = packets.split_first_chunk::<2>() {
+        let length = usize::from(u16::from_be_bytes(*length)).min(rest.len());
+        let (packet, rest) = rest.split_at(length);
+        packets = rest;
+        let Ok(session::Message::Piece(piece)) = session::Message::decode(packet) else {
+            return false;
+        };
+        match incoming.piece(piece) {
+            Ok(Some(sample)) => kept.push(sample),
+            Ok(None) => {}
+            Err(_) => return false,
+        }
+        incoming.grants();
+        let bytes: usize = kept.iter().map(|sample| sample.payload.len()).sum();
+        assert!(bytes as u64 <= channels.len() as u64 * WINDOW + pool.held(), "{bytes} are kept");
+        if kept.len() > 3 {
+            incoming.done(&kept.remove(0));
+        }
+    }
+    kept.iter().for_each(|sample| drop(incoming.done(sample)));
+    drop(incoming);
+    assert_eq!(pool.held(), 0, "something is kept for ever");
     true
 }
 
@@ -173,11 +211,27 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
     messages.iter().map(|message| message.to_frame().unwrap().split_off(4)).collect()
 }
 
+/// One sample in one piece, two at a time in several, and one longer than a channel's window.
+pub fn relay_pieces_seeds() -> Vec<Vec<u8>> {
+    use session::{Head, Message, Piece};
+    let piece = |channel, length: Option<u32>, bytes: usize| {
+        let head = length.map(|length| Head { length, sequence: 1, source_timestamp: 2, lost: 3 });
+        let publisher = Gid([channel; 16]);
+        let packet =
+            Message::Piece(Piece { publisher, head, bytes: vec![0; bytes] }).encode().unwrap();
+        let length = u16::try_from(packet.len()).unwrap().to_be_bytes();
+        [&length[..], &packet].concat()
+    };
+    let both = [piece(1, Some(9), 4), piece(2, Some(8), 0), piece(1, None, 5), piece(2, None, 8)];
+    let long = [piece(1, Some(40_000), 30_000), piece(1, None, 10_000)];
+    vec![piece(1, Some(3), 3), both.concat(), long.concat()]
+}
+
 /// Every message of the session socket.
 pub fn session_message_seeds() -> Vec<Vec<u8>> {
     use session::{
-        Announce, Attach, EndpointRole, Gone, Granted, Graph, GraphItem, Hello, Message, PROTOCOL,
-        Pair, Refused, Segment, SegmentName, SegmentOpened, SessionRole, StatusPart, Unmatch,
+        Announce, Attach, Credit, EndpointRole, Gone, Granted, Graph, GraphItem, Head, Hello, Matched,
+        Message, PROTOCOL, Pair, Piece, Refused, Segment, SegmentName, SegmentOpened, SessionRole, StatusPart, Unmatch,
         Welcome,
     };
     let (reader, writer) = (Gid([1; 16]), Gid([2; 16]));
@@ -193,6 +247,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             name: "talker".into(),
             domain: 7,
             settings: vec![("AXON_SECURITY_MODE".into(), "classic".into())],
+            relay: Some("AXON_SHM is off".into()),
         }),
         Message::Welcome(Welcome { protocol: PROTOCOL, daemon, pid: 12 }),
         Message::Refused(Refused {
@@ -243,6 +298,13 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
         Message::Segment(SegmentOpened { session, segment }),
         Message::SegmentGone(SegmentName { session, number: 3 }),
         Message::Need(SegmentName { session, number: 3 }),
+        Message::Matched(Matched { gid: reader, others: vec![writer] }),
+        Message::Piece(Piece {
+            publisher: writer,
+            head: Some(Head { length: 3, sequence: 7, source_timestamp: -1, lost: 2 }),
+            bytes: vec![1, 2],
+        }),
+        Message::Credit(Credit { publisher: writer, bytes: 128, opens: true }),
         Message::Unknown(200),
     ];
     messages.iter().map(|message| message.encode().unwrap()).collect()

@@ -37,6 +37,8 @@ pub struct Config {
     pub max_message: u64,
     /// `AXON_RELIABLE_QUEUE_MB` in bytes: the daemon's reliable queue.
     pub reliable_queue: u64,
+    /// `AXON_SHM`: whether sessions share memory; their samples pass through the daemon otherwise.
+    pub shm: bool,
     /// `AXON_SHM_COPY`.
     pub shm_copy: bool,
     /// `AXON_TRUSTED_UIDS`.

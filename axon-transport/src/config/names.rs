@@ -32,6 +32,7 @@ pub(super) const SETTINGS: &[&str] = &[
     "AXON_RING_BUFFER_SIZE_MB",
     "AXON_MAX_MESSAGE_MB",
     "AXON_RELIABLE_QUEUE_MB",
+    "AXON_SHM",
     "AXON_SHM_COPY",
     "AXON_TRUSTED_UIDS",
     "AXON_LOG",

@@ -83,6 +83,7 @@ pub(super) fn resolve(
         // The length of a message is a u32 on every wire.
         max_message: megabytes("AXON_MAX_MESSAGE_MB", 4_095, 256)?,
         reliable_queue: megabytes("AXON_RELIABLE_QUEUE_MB", 65_536, 256)?,
+        shm: values.choice("AXON_SHM", &[("on", true), ("off", false)])?.unwrap_or(true),
         shm_copy: values.choice("AXON_SHM_COPY", &[("0", false), ("1", true)])?.unwrap_or(false),
         trusted_uids: values.uids("AXON_TRUSTED_UIDS")?,
         log: values.log_filter("AXON_LOG")?.unwrap_or_else(|| "warn".to_owned()),

@@ -6,10 +6,11 @@ use crate::{
     config::{Config, security_settings},
     passed::PassedFd,
     session::{
+        connect::SHM,
         message::{Hello, PROTOCOL, Refused, SessionRole},
         socket::Peer,
     },
-    shm::PeerDescriptors,
+    shm::{PeerDescriptors, probe::out_of_reach},
 };
 
 /// What a daemon compares sessions with.
@@ -55,6 +56,9 @@ impl Admission {
         if (hello.role == SessionRole::Gateway) != inside {
             return Err(plain("only the daemon's own gateway has that role".into()));
         }
+        if hello.relay.is_some() && hello.role != SessionRole::Application {
+            return Err(plain("only an application's session is relayed".into()));
+        }
         // A tool only asks, also why others are refused.
         if hello.role == SessionRole::Tool {
             return Ok(None);
@@ -64,11 +68,17 @@ impl Admission {
             self.compare(&hello.settings)?;
         }
         let count = descriptors.len();
+        if hello.relay.is_some() {
+            return match count {
+                0 => Ok(None),
+                _ => Err(plain("a relayed session came with descriptors".into())),
+            };
+        }
         let Ok([segment, doorbell, pidfd]) = <[PassedFd; 3]>::try_from(descriptors) else {
-            return Err(plain(format!("HELLO came with {count} descriptors instead of three")));
+            return Err(unshared(format!("HELLO came with {count} descriptors instead of three")));
         };
         if peer.pid == 0 {
-            return Err(plain(
+            return Err(unshared(
                 "its process is in a PID namespace that this daemon does not see: run both in one \
                  (containers: --pid=host)"
                     .into(),
@@ -77,6 +87,9 @@ impl Admission {
         // The daemon reads it, and a read of anything else may block.
         if !segment.is_memfd() {
             return Err(plain("the segment in HELLO is no memfd".into()));
+        }
+        if let Some(error) = out_of_reach(&segment) {
+            return Err(unshared(format!("the session's memory cannot be mapped: {error}")));
         }
         let handed = PeerDescriptors { segment, doorbell, pidfd };
         let process = handed
@@ -129,6 +142,12 @@ fn differs(
     Box::new(Refused { variable, ours, theirs, text })
 }
 
+/// No memory can be shared with it: it may come back to be relayed.
+pub(super) fn unshared(text: String) -> Box<Refused> {
+    let [ours, theirs] = ["on", "off"].map(str::to_owned);
+    Box::new(Refused { variable: SHM.into(), ours, theirs, text })
+}
+
 fn plain(text: String) -> Box<Refused> {
     Box::new(Refused { variable: String::new(), ours: String::new(), theirs: String::new(), text })
 }
@@ -157,6 +176,7 @@ mod tests {
             name: "test".into(),
             domain: 3,
             settings: admission().settings,
+            relay: None,
         }
     }
 

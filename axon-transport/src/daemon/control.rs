@@ -2,6 +2,7 @@
 
 use std::{
     collections::{BTreeMap, HashMap, VecDeque},
+    os::fd::OwnedFd,
     rc::Rc,
     sync::Arc,
     time::Instant,
@@ -19,7 +20,9 @@ use crate::{
     config::Config,
     ids::{DaemonId, SessionId},
     passed::PassedFd,
+    relay::Pool,
     session::address::Address,
+    shm::probe::probe,
 };
 
 /// Refusals that are remembered.
@@ -37,6 +40,10 @@ pub(super) struct Control {
     pub(super) keys: serde_json::Value,
     pub(super) port: Option<u16>,
     pub(super) gateway: String,
+    /// For the samples that arrive over relays.
+    pub(super) pool: Arc<Pool>,
+    /// Memory that sessions try whether they can map it.
+    pub(super) probe: Option<OwnedFd>,
     wakers: HashMap<SessionId, Rc<Notify>>,
     /// Wakes the task that flushes the graph, and the one that counts sessions.
     pub(super) changed: Rc<Notify>,
@@ -49,14 +56,16 @@ impl Control {
             id: DaemonId::random(),
             started: Instant::now(),
             address: Address::of(&config),
-            config,
             registry: Registry::default(),
             links: BTreeMap::new(),
             refusals: VecDeque::new(),
             keys: serde_json::Value::Null,
             port: None,
             gateway: "off".into(),
+            pool: Pool::new(config.reliable_queue),
+            probe: probe().inspect_err(|error| tracing::error!(%error, "no memory to try")).ok(),
             wakers: HashMap::new(),
+            config,
             changed: Rc::default(),
         }
     }

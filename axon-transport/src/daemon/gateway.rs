@@ -21,7 +21,7 @@ use tokio::{
 use super::{
     bridge::{CHANNEL, GatewayParts, ToControl, ToGateway},
     control::Control,
-    listen::serve,
+    listen::{Inside, serve},
 };
 
 /// What runs on the gateway's thread.
@@ -71,7 +71,7 @@ impl Running {
                 Err(_) => "panicked; the log says where".to_owned(),
             });
         })?;
-        spawn_local(serve(control.clone(), ours.into(), true, || ()));
+        spawn_local(serve(control.clone(), ours.into(), Inside::Gateway, || ()));
         Ok(Self { orders, events, end })
     }
 
@@ -82,6 +82,8 @@ impl Running {
     pub(super) async fn stands(&mut self, control: &Rc<RefCell<Control>>) -> Result<(), String> {
         let started = async {
             tokio::select! {
+                // One that stood and failed since then did stand.
+                biased;
                 event = self.events.recv() => event,
                 why = &mut self.end => return Err(why.unwrap_or_else(|_| "ended".into())),
             }

@@ -8,10 +8,11 @@ use std::{
     time::Duration,
 };
 
-use rustix::net::{SocketFlags, accept_with};
+use rustix::net::{AddressFamily, SocketFlags, SocketType, accept_with, socketpair};
 use tokio::{io::unix::AsyncFd, sync::Notify, task::spawn_local, time::timeout};
 
 use super::{
+    admission::unshared,
     control::Control,
     registry::{MAX_OF_PROCESS, SessionEntry},
     watch::watch,
@@ -19,6 +20,7 @@ use super::{
 use crate::{
     ids::{Gid, SessionId},
     passed::{self, PassedFd},
+    relay::{Tally, far::Far},
     session::{
         message::{Hello, Message, PROTOCOL, Refused, Welcome},
         socket::{self, Peer, Received, SocketError},
@@ -61,7 +63,7 @@ pub(super) async fn accept(control: Rc<RefCell<Control>>, listener: OwnedFd) {
                 let control = control.clone();
                 let socket = PassedFd::connection(socket);
                 spawn_local(async move {
-                    serve(control, socket, false, move || drop(permit)).await;
+                    serve(control, socket, Inside::No, move || drop(permit)).await;
                 });
             }
             Ok(Err(error)) => {
@@ -74,11 +76,21 @@ pub(super) async fn accept(control: Rc<RefCell<Control>>, listener: OwnedFd) {
     }
 }
 
+/// Whose end of a socket pair it is that the daemon serves.
+pub(super) enum Inside {
+    /// Nobody's: somebody connected.
+    No,
+    /// The gateway's.
+    Gateway,
+    /// That of a relayed session of process `pid`.
+    Relay { pid: u32, tally: Arc<Tally> },
+}
+
 /// Serves one connection to its end. `known` is called when it is a stranger no more.
 pub(super) async fn serve(
     control: Rc<RefCell<Control>>,
     socket: PassedFd,
-    inside: bool,
+    inside: Inside,
     known: impl FnOnce(),
 ) {
     let Ok(peer) = socket::peer(&socket) else { return };
@@ -89,7 +101,10 @@ pub(super) async fn serve(
     let Ok(socket) = watch(socket.trusted()) else { return };
     let Ok(Some(hello)) = timeout(HELLO, first(&socket)).await else { return };
     known();
-    let Some((id, bell, death)) = admit(&control, &socket, hello, peer, inside) else { return };
+    if hello.0.relay.is_some() {
+        return relay(&control, socket, hello, peer);
+    }
+    let Some((id, bell, death)) = admit(&control, &socket, hello, peer, &inside) else { return };
     let why = converse(&control, &socket, id, &bell, death.as_ref()).await;
     tracing::debug!(session = %id, why, "a session ended");
     control.borrow_mut().remove(&id, &bell);
@@ -114,8 +129,90 @@ async fn first(socket: &AsyncFd<PassedFd>) -> Option<(Hello, Vec<PassedFd>)> {
                 unknown += 1;
             }
             Err(SocketError::NotReady) => ready.clear_ready(),
+            // Not for want of room here: somebody keeps them back.
+            Err(SocketError::NoDescriptors) if !passed::is_short() => {
+                let text = "its descriptors do not arrive".to_owned();
+                say(socket, Message::Refused(*unshared(text)), &[]);
+                return None;
+            }
             Ok(_) | Err(_) => return None,
         }
+    }
+}
+
+/// Says something to somebody new, whose socket has room; whether it was said.
+fn say(socket: &AsyncFd<PassedFd>, message: Message, descriptors: &[BorrowedFd<'_>]) -> bool {
+    let packet = message.encode();
+    let sent = packet.map(|packet| socket::send(socket.get_ref(), &packet, descriptors));
+    matches!(sent, Ok(Ok(())))
+}
+
+/// Refuses somebody, and shows it.
+fn refuse(
+    control: &mut Control,
+    socket: &AsyncFd<PassedFd>,
+    name: &str,
+    peer: Peer,
+    refused: Refused,
+) {
+    let what = if refused.variable.is_empty() { "session" } else { &refused.variable }.to_owned();
+    let who = format!("session {name} (pid {})", peer.pid);
+    control.refused(who, what, refused.text.clone());
+    say(socket, Message::Refused(refused), &[]);
+}
+
+fn because(text: String) -> Refused {
+    let [variable, ours, theirs] = [const { String::new() }; 3];
+    Refused { variable, ours, theirs, text }
+}
+
+/// What is shown of a session in log and status.
+fn shown(name: &str) -> String {
+    name.chars().filter(|c| !c.is_control()).take(64).collect()
+}
+
+/// Has a session relayed whose memory is not shared.
+fn relay(
+    control: &Rc<RefCell<Control>>,
+    socket: AsyncFd<PassedFd>,
+    (mut hello, descriptors): (Hello, Vec<PassedFd>),
+    peer: Peer,
+) {
+    hello.name = shown(&hello.name);
+    let mut state = control.borrow_mut();
+    let reason = hello.relay.clone().unwrap_or_default();
+    let pair = || {
+        let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+        socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None)
+    };
+    let checked = match state.admission.check(&hello, descriptors, peer, false) {
+        Err(refused) => Err(*refused),
+        Ok(_) if state.registry.relayed() >= crate::relay::MAX_SESSIONS => Err(because(format!(
+            "{} sessions are relayed already; one that shares memory is served",
+            crate::relay::MAX_SESSIONS
+        ))),
+        Ok(_) => pair().map_err(|error| because(format!("no socket to relay it by: {error}"))),
+    };
+    let (ours, theirs) = match checked {
+        Ok(pair) => pair,
+        Err(refused) => return refuse(&mut state, &socket, &hello.name, peer, refused),
+    };
+    let tally = Arc::new(Tally::new(&reason));
+    tracing::info!(name = hello.name, pid = peer.pid, reason, "a session is relayed");
+    let inside = Inside::Relay { pid: peer.pid, tally: Arc::clone(&tally) };
+    spawn_local(serve(control.clone(), ours.into(), inside, || ()));
+    let far = Far {
+        socket: socket.into_inner(),
+        inside: theirs,
+        config: Arc::clone(&state.config),
+        name: hello.name,
+        id: hello.session,
+        pid: peer.pid,
+        tally,
+        pool: Arc::clone(&state.pool),
+    };
+    if let Err(error) = far.start() {
+        tracing::error!(%error, "no thread to relay a session");
     }
 }
 
@@ -126,40 +223,29 @@ fn admit(
     socket: &AsyncFd<PassedFd>,
     (mut hello, descriptors): (Hello, Vec<PassedFd>),
     peer: Peer,
-    inside: bool,
+    inside: &Inside,
 ) -> Option<Admitted> {
-    // It is shown in log and status.
-    hello.name = hello.name.chars().filter(|c| !c.is_control()).take(64).collect();
+    hello.name = shown(&hello.name);
     let control = &mut *control.borrow_mut();
-    let say = |message: Message| {
-        // The socket is new: its buffer has room.
-        let sent = message.encode().map(|packet| socket::send(socket.get_ref(), &packet, &[]));
-        matches!(sent, Ok(Ok(())))
-    };
-    let handed = match control.admission.check(&hello, descriptors, peer, inside) {
+    let gateway = matches!(inside, Inside::Gateway);
+    let handed = match control.admission.check(&hello, descriptors, peer, gateway) {
         Ok(handed) => handed,
         Err(refused) => {
-            let what =
-                if refused.variable.is_empty() { "session" } else { &refused.variable }.to_owned();
-            let who = format!("session {} (pid {})", hello.name, peer.pid);
-            control.refused(who, what, refused.text.clone());
-            say(Message::Refused(*refused));
+            refuse(control, socket, &hello.name, peer, *refused);
             return None;
         }
     };
-    let refuse = |control: &mut Control, text: String| {
-        control.refused(format!("pid {}", peer.pid), "session".into(), text.clone());
-        let [variable, ours, theirs] = [const { String::new() }; 3];
-        say(Message::Refused(Refused { variable, ours, theirs, text }));
-    };
+    let pid = if let Inside::Relay { pid, .. } = inside { *pid } else { peer.pid };
     // Endpoints are named after their session's id: who has another's could end them.
-    if let Some(pid) = taken_by(control, &hello.session, peer.pid) {
-        refuse(control, format!("process {pid} has a session with this one's id or one like it"));
+    if let Some(pid) = taken_by(control, &hello.session, pid) {
+        let text = format!("process {pid} has a session with this one's id or one like it");
+        refuse(control, socket, &hello.name, peer, because(text));
         return None;
     }
-    let same = |(_, entry): &(&SessionId, &SessionEntry<_>)| entry.pid == peer.pid;
-    if !inside && control.registry.sessions().filter(same).count() >= MAX_OF_PROCESS {
-        refuse(control, format!("its process has {MAX_OF_PROCESS} sessions already"));
+    let same = |(_, entry): &(&SessionId, &SessionEntry<_>)| entry.pid == pid;
+    if !gateway && control.registry.sessions().filter(same).count() >= MAX_OF_PROCESS {
+        let text = format!("its process has {MAX_OF_PROCESS} sessions already");
+        refuse(control, socket, &hello.name, peer, because(text));
         return None;
     }
     let death = match &handed {
@@ -167,14 +253,19 @@ fn admit(
         None => None,
     };
     let Hello { session, role, name, .. } = hello;
-    tracing::debug!(%session, name, pid = peer.pid, "a session");
+    tracing::debug!(%session, name, pid, "a session");
     let handed = handed.map(|fds| fds.map(Arc::new));
-    if let Err(violation) = control.registry.connect(session, role, name, peer.pid, handed) {
-        refuse(control, violation.to_string());
+    if let Err(violation) = control.registry.connect(session, role, name.clone(), pid, handed) {
+        refuse(control, socket, &name, peer, because(violation.to_string()));
         return None;
     }
+    if let Inside::Relay { tally, .. } = inside {
+        control.registry.set_relayed(&session, Arc::clone(tally));
+    }
     let pid = std::process::id();
-    if !say(Message::Welcome(Welcome { protocol: PROTOCOL, daemon: control.id, pid })) {
+    let welcome = Welcome { protocol: PROTOCOL, daemon: control.id, pid };
+    let probe: Vec<BorrowedFd<'_>> = control.probe.iter().map(AsFd::as_fd).collect();
+    if !say(socket, Message::Welcome(welcome), &probe) {
         control.registry.disconnect(&session);
         control.settle();
         return None;
@@ -190,7 +281,8 @@ fn taken_by(control: &Control, session: &SessionId, pid: u32) -> Option<u32> {
     let alike = |id: &SessionId| Gid::new(*id, 0) == Gid::new(*session, 0);
     let mut others = control.registry.sessions();
     others
-        .find(|(id, entry)| alike(id) && (*id != session || entry.pid != pid))
+        // A process that cannot be seen could be any.
+        .find(|(id, entry)| alike(id) && (*id != session || entry.pid != pid || pid == 0))
         .map(|(_, entry)| entry.pid)
 }
 

@@ -33,6 +33,7 @@ pub(super) fn status(control: &Control) -> Status {
         role: if s.role == SessionRole::Gateway { "gateway" } else { "application" }.into(),
         endpoints: s.endpoints.len(),
         queued: s.queued(),
+        relay: s.relay.as_deref().map(crate::relay::Tally::show),
     });
     Status {
         daemon: control.id.to_string(),

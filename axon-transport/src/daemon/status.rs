@@ -65,6 +65,27 @@ pub struct SessionStatus {
     pub endpoints: usize,
     /// Control packets that wait for it.
     pub queued: usize,
+    /// Present where it shares no memory: its samples pass through the daemon.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub relay: Option<RelayStatus>,
+}
+
+/// What passes through the daemon for a session that shares no memory.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RelayStatus {
+    /// Why memory is not shared.
+    pub reason: String,
+    /// Samples that came from the session.
+    pub samples_in: u64,
+    /// Their bytes.
+    pub bytes_in: u64,
+    /// Samples that went to it.
+    pub samples_out: u64,
+    /// Their bytes.
+    pub bytes_out: u64,
+    /// Samples of its publishers that were overwritten before they had crossed, or for which there
+    /// was no memory.
+    pub lost: u64,
 }
 
 /// A topic.

@@ -19,34 +19,41 @@ use crate::{
     config::{Config, DaemonPolicy, security_settings},
     daemon::spawn::{Outcome, spawn},
     ids::SessionId,
-    shm::SessionSegment,
+    passed::PassedFd,
+    shm::{SessionSegment, probe::out_of_reach},
 };
 
 /// How long a daemon may take to come up and answer.
 const PATIENCE: Duration = Duration::from_secs(20);
+/// What a daemon names that cannot share memory with a session.
+pub(crate) const SHM: &str = "AXON_SHM";
 
 /// A daemon that took the session.
 #[derive(Debug)]
-pub(super) struct Connected {
-    pub(super) socket: OwnedFd,
-    pub(super) welcome: Welcome,
+pub(crate) struct Connected {
+    pub(crate) socket: OwnedFd,
+    pub(crate) welcome: Welcome,
+    /// What came with it.
+    descriptors: Vec<PassedFd>,
 }
 
 /// Who asks.
 #[derive(Clone, Copy)]
-pub(super) struct Caller<'a> {
-    pub(super) config: &'a Config,
-    pub(super) options: &'a SessionOptions,
-    pub(super) id: SessionId,
-    /// Absent for a tool.
-    pub(super) segment: Option<&'a SessionSegment>,
+pub(crate) struct Caller<'a> {
+    pub(crate) config: &'a Config,
+    pub(crate) options: &'a SessionOptions,
+    pub(crate) id: SessionId,
+    /// Absent for a tool, and for one that is relayed.
+    pub(crate) segment: Option<&'a SessionSegment>,
+    /// Why it is relayed, if so.
+    pub(crate) relay: Option<&'a str>,
     /// Set when the answer is no longer wanted.
-    pub(super) cancel: Option<&'a AtomicBool>,
+    pub(crate) cancel: Option<&'a AtomicBool>,
 }
 
 impl Caller<'_> {
     /// Connects to the daemon, which is started when there is none and the policy says so.
-    pub(super) fn connect(&self) -> Result<Connected, SessionError> {
+    pub(crate) fn connect(&self) -> Result<Connected, SessionError> {
         let address = Address::of(self.config);
         let deadline = Instant::now() + PATIENCE;
         let mut pause = Duration::from_millis(2);
@@ -95,7 +102,11 @@ impl Caller<'_> {
             let address = address.to_string();
             return Err(Attempt::Final(SessionError::Untrusted { address, uid: peer.uid }));
         }
-        self.greet(socket, &address.to_string(), peer.pid, deadline)
+        let connected = self.greet(socket, &address.to_string(), peer.pid, deadline)?;
+        if self.segment.is_some() {
+            look_into(&connected.descriptors)?;
+        }
+        Ok(connected)
     }
 
     /// HELLO and its answer, over a socket that is connected.
@@ -128,6 +139,7 @@ impl Caller<'_> {
             name: self.options.name.clone(),
             domain: self.config.domain,
             settings,
+            relay: self.relay.map(str::to_owned),
         });
         let packet = hello.encode().map_err(SessionError::from)?;
         let descriptors = match self.segment {
@@ -157,13 +169,18 @@ impl Caller<'_> {
                     continue;
                 }
                 Err(SocketError::Closed) => return Err(Attempt::Again),
+                Err(SocketError::NoDescriptors) if self.segment.is_some() => {
+                    let text = "descriptors of the daemon do not arrive: a security module keeps \
+                                them back, or this process can hold no more (ulimit -n)";
+                    return Err(SessionError::NotShared(text.into()).into());
+                }
                 Err(error) => {
                     return Err(Attempt::Final(SessionError::Protocol(error.to_string())));
                 }
             };
             return match received.message {
                 Message::Welcome(welcome) if welcome.protocol == PROTOCOL => {
-                    Ok(Connected { socket, welcome })
+                    Ok(Connected { socket, welcome, descriptors: received.descriptors })
                 }
                 Message::Welcome(welcome) => Err(Attempt::Final(SessionError::Refused {
                     address: address.to_owned(),
@@ -172,6 +189,9 @@ impl Caller<'_> {
                 Message::Refused(refused) if refused.variable.is_empty() => {
                     let address = address.to_owned();
                     Err(Attempt::Final(SessionError::Refused { address, text: refused.text }))
+                }
+                Message::Refused(refused) if refused.variable == SHM => {
+                    Err(Attempt::Final(SessionError::NotShared(refused.text)))
                 }
                 Message::Refused(refused) => Err(Attempt::Final(SessionError::Mismatch {
                     variable: refused.variable,
@@ -211,6 +231,20 @@ impl Caller<'_> {
                 Err(Attempt::Final(SessionError::System { what: "poll", source: errno.into() }))
             }
         }
+    }
+}
+
+/// Looks whether the daemon's memory comes and can be mapped: as its does, so does that of others.
+fn look_into(descriptors: &[PassedFd]) -> Result<(), SessionError> {
+    let Some(probe) = descriptors.first() else {
+        return Err(SessionError::NotShared("descriptors of the daemon do not arrive".into()));
+    };
+    match out_of_reach(probe) {
+        Some(error) => {
+            let text = format!("the daemon's memory cannot be mapped: {error}");
+            Err(SessionError::NotShared(text))
+        }
+        None => Ok(()),
     }
 }
 

@@ -51,6 +51,9 @@ pub enum SessionError {
         /// What it said.
         text: String,
     },
+    /// Memory cannot be shared, so that the session has to be relayed.
+    #[error("memory cannot be shared with the daemon: {0}")]
+    NotShared(String),
     /// The daemon's settings are not the session's.
     #[error(
         "{variable} is {ours} here but {theirs} in the daemon at {address} (pid {pid}); use the \

@@ -1,23 +1,87 @@
-//! A session without a daemon (`AXON_DAEMON=off`): the registry that a daemon would keep, for this
-//! session alone, so that its own endpoints find each other in the usual way.
+//! The registry of a process without a daemon of its own to ask: that of the one session under
+//! `AXON_DAEMON=off`, whose endpoints find each other in the usual way; and that of a relayed session,
+//! where a second one stands for the world outside (`relay`).
 
-use std::sync::Arc;
+use std::{
+    collections::HashMap,
+    os::fd::OwnedFd,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+};
 
-use super::message::{Message, SessionRole};
-use crate::{daemon::registry::Registry, ids::SessionId, passed::PassedFd};
+use super::{message::Message, state::Shared};
+use crate::{
+    daemon::registry::Registry,
+    graph::Endpoint,
+    ids::{DaemonId, Gid, SessionId},
+    passed::PassedFd,
+    shm::ShmError,
+};
 
+/// Brings the sessions of one process together.
+#[derive(Debug, Default)]
+pub(crate) struct House(Mutex<Inside>);
+
+#[derive(Debug, Default)]
+struct Inside {
+    registry: Registry<Arc<PassedFd>>,
+    /// What wakes the control thread of each session.
+    wakers: HashMap<SessionId, Arc<OwnedFd>>,
+}
+
+/// A session's end of it.
 #[derive(Debug)]
 pub(super) struct Local {
     id: SessionId,
-    registry: Registry<Arc<PassedFd>>,
+    house: Arc<House>,
+}
+
+impl House {
+    /// What the world outside has: endpoints of `daemon` that are new, and those that are gone.
+    pub(crate) fn outside(&self, daemon: DaemonId, added: Vec<Endpoint>, removed: Vec<Gid>) {
+        let mut inside = self.lock();
+        inside.registry.remote_graph(daemon, false, added, removed);
+        inside.settle(None);
+    }
+
+    /// There is no world outside any more, as far as `daemon` spoke for it.
+    pub(crate) fn outside_gone(&self, daemon: &DaemonId) {
+        let mut inside = self.lock();
+        inside.registry.remote_gone(daemon);
+        inside.settle(None);
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Inside> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Inside {
+    /// Wakes the sessions that have something to hear, but the one that is about to listen.
+    fn settle(&mut self, listening: Option<&SessionId>) {
+        self.registry.flush();
+        for id in self.registry.take_ready() {
+            if Some(&id) != listening
+                && let Some(wake) = self.wakers.get(&id)
+            {
+                // An eventfd whose counter is full is readable, which is all that is wanted.
+                let _ = rustix::io::write(wake, &1u64.to_ne_bytes());
+            }
+        }
+    }
 }
 
 impl Local {
-    pub(super) fn new(id: SessionId, name: String) -> Self {
-        let mut registry = Registry::default();
-        // The first session is never one too many.
-        let _ = registry.connect(id, SessionRole::Application, name, std::process::id(), None);
-        Self { id, registry }
+    /// Joins `house`.
+    pub(super) fn new(house: Arc<House>, session: &Shared) -> Result<Self, ShmError> {
+        let (id, role, name) = (session.id, session.options.role, session.options.name.clone());
+        let handed = session.segment.descriptors()?;
+        let handed = [handed.segment, handed.doorbell, handed.pidfd].map(Arc::new);
+        let mut inside = house.lock();
+        inside.wakers.insert(id, session.wake.clone());
+        // There are at most two, which is never too many.
+        let _ = inside.registry.connect(id, role, name, std::process::id(), Some(handed));
+        drop(inside);
+        Ok(Self { id, house })
     }
 
     /// What a daemon would answer to nothing, or to a message.
@@ -25,15 +89,16 @@ impl Local {
         &mut self,
         message: Option<(Message, Vec<PassedFd>)>,
     ) -> Vec<(Message, Vec<PassedFd>)> {
+        let mut inside = self.house.lock();
         if let Some((message, descriptors)) = message {
             let descriptors = descriptors.into_iter().map(Arc::new).collect();
-            if let Err(violation) = self.registry.message(&self.id, message, descriptors) {
+            if let Err(violation) = inside.registry.message(&self.id, message, descriptors) {
                 tracing::error!(%violation, "a message to no daemon");
             }
         }
-        self.registry.flush();
+        inside.settle(Some(&self.id));
         let mut answers = Vec::new();
-        while let Some(output) = self.registry.next_output(&self.id) {
+        while let Some(output) = inside.registry.next_output(&self.id) {
             let descriptors: std::io::Result<Vec<PassedFd>> =
                 output.descriptors.iter().map(|d| d.try_clone()).collect();
             match (Message::decode(&output.packet), descriptors) {
@@ -44,5 +109,14 @@ impl Local {
             }
         }
         answers
+    }
+}
+
+impl Drop for Local {
+    fn drop(&mut self) {
+        let mut inside = self.house.lock();
+        inside.wakers.remove(&self.id);
+        inside.registry.disconnect(&self.id);
+        inside.settle(None);
     }
 }

@@ -9,13 +9,13 @@ pub mod address;
 mod arrivals;
 mod callback;
 mod clock;
-mod connect;
+pub(crate) mod connect;
 mod control;
 mod create;
 mod error;
 mod events;
 mod guard;
-mod local;
+pub(crate) mod local;
 pub mod message;
 mod node;
 mod options;
@@ -49,20 +49,23 @@ pub use options::{DaemonCommand, EndpointSpec, SessionOptions};
 pub use publisher::{Loan, Publisher};
 pub use service::{Client, Server};
 pub use state::SessionEvent;
+pub(crate) use state::Shared;
 pub use subscription::{MessageInfo, Subscription};
 pub use waiting::Waitable;
 
 use self::{
-    connect::{Caller, Connected},
-    control::Control,
+    connect::Caller,
+    control::{Control, Start},
+    local::House,
     message::{EndpointRole, Message},
-    state::{Outgoing, Shared, StatusAnswer},
+    state::{Outgoing, StatusAnswer},
 };
 use crate::{
     config::{Config, DaemonPolicy},
     graph::{Endpoint, EndpointKind, GraphView},
     ids::{DaemonId, Gid, SessionId},
     qos::Qos,
+    relay::near::Near,
     shm::{SessionSegment, ShmError},
 };
 
@@ -95,6 +98,8 @@ pub struct Session {
 struct Handle {
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
+    /// What carries its samples, where it shares no memory.
+    relay: Option<Near>,
 }
 
 impl Session {
@@ -106,16 +111,65 @@ impl Session {
     /// When the daemon cannot be reached or started, or has other security settings: the error
     /// names the variable.
     pub fn open(config: &Config, options: SessionOptions) -> Result<Self, SessionError> {
-        let segment = SessionSegment::create(SessionId::random())?;
-        let connected = if config.daemon == DaemonPolicy::Off {
-            None
+        let id = SessionId::random();
+        if config.daemon == DaemonPolicy::Off {
+            let house = Start::House(Arc::default());
+            let segment = SessionSegment::create(id)?;
+            return Ok(Self::of(Self::start(config, options, segment, house)?));
+        }
+        let reason = if config.shm {
+            let segment = SessionSegment::create(id)?;
+            let caller = Caller {
+                config,
+                options: &options,
+                id,
+                segment: Some(&segment),
+                relay: None,
+                cancel: None,
+            };
+            match caller.connect() {
+                Ok(daemon) => {
+                    let start = Start::Daemon(daemon);
+                    return Ok(Self::of(Self::start(config, options, segment, start)?));
+                }
+                Err(SessionError::NotShared(reason)) => reason,
+                Err(error) => return Err(error),
+            }
         } else {
-            let id = segment.id();
-            let caller =
-                Caller { config, options: &options, id, segment: Some(&segment), cancel: None };
-            Some(caller.connect()?)
+            "AXON_SHM is off".to_owned()
         };
-        Self::start(config, options, segment, connected, true)
+        Self::relayed(config, options, id, reason)
+    }
+
+    /// A session whose samples pass through the daemon. It has the world outside in its own process:
+    /// a session that stands for it, and a registry that brings the two together.
+    fn relayed(
+        config: &Config,
+        options: SessionOptions,
+        id: SessionId,
+        reason: String,
+    ) -> Result<Self, SessionError> {
+        tracing::info!(reason, "samples pass through the daemon");
+        let caller = Caller {
+            config,
+            options: &options,
+            id,
+            segment: None,
+            relay: Some(&reason),
+            cancel: None,
+        };
+        let connected = caller.connect()?;
+        let house = Arc::<House>::default();
+        let segment = SessionSegment::create(id)?;
+        let start = Start::House(Arc::clone(&house));
+        let mut handle = Self::start(config, options, segment, start)?;
+        let outside = SessionOptions::new("relay").role(SessionRole::Gateway);
+        let segment = SessionSegment::create(SessionId::random())?;
+        let start = Start::House(Arc::clone(&house));
+        let outside = Self::of(Self::start(config, outside, segment, start)?);
+        handle.relay =
+            Some(Near::start(Arc::clone(&handle.shared), house, outside, connected, reason)?);
+        Ok(Self::of(handle))
     }
 
     /// A session over a socket that is connected to a daemon. It ends with that connection.
@@ -127,16 +181,28 @@ impl Session {
         config: &Config,
         options: SessionOptions,
     ) -> Result<Self, SessionError> {
-        let segment = SessionSegment::create(SessionId::random())?;
+        Self::over_as(SessionId::random(), socket, config, options)
+    }
+
+    /// As [`over`](Self::over), under a given id: for the daemon, in whose memory the endpoints of a
+    /// relayed session are.
+    pub(crate) fn over_as(
+        id: SessionId,
+        socket: OwnedFd,
+        config: &Config,
+        options: SessionOptions,
+    ) -> Result<Self, SessionError> {
+        let segment = SessionSegment::create(id)?;
         let caller = Caller {
             config,
             options: &options,
-            id: segment.id(),
+            id,
             segment: Some(&segment),
+            relay: None,
             cancel: None,
         };
         let connected = caller.greet_over(socket)?;
-        Self::start(config, options, segment, Some(connected), false)
+        Ok(Self::of(Self::start(config, options, segment, Start::Socket(connected))?))
     }
 
     /// Its id.
@@ -213,11 +279,7 @@ impl Session {
         if !described.is_sane() {
             return Err(SessionError::Node { name: described.node });
         }
-        let gid = described.gid;
-        let changed = self.create_guard_condition();
-        self.shared().state().nodes.insert(gid, (described.clone(), changed.clone()));
-        self.shared().tell(Outgoing::Announce(gid));
-        Ok(Node::new(described, changed, self.clone()))
+        Ok(self.adopt_node(described))
     }
 
     /// A condition that the program triggers itself, for wait sets of this session.
@@ -232,6 +294,25 @@ impl Session {
     /// When there is no memory.
     pub fn create_stand_in(&self, remote: Endpoint) -> Result<Publisher, SessionError> {
         self.add_publisher(remote, EndpointRole::StandIn)
+    }
+
+    /// A publisher as another process of this session describes it, under its GID there.
+    pub(crate) fn adopt_publisher(&self, endpoint: Endpoint) -> Result<Publisher, SessionError> {
+        self.add_publisher(endpoint, EndpointRole::Application)
+    }
+
+    /// As [`adopt_publisher`](Self::adopt_publisher), a subscription.
+    pub(crate) fn adopt_subscription(&self, endpoint: Endpoint) -> Subscription {
+        self.add_subscription(endpoint, EndpointRole::Application, Vec::new())
+    }
+
+    /// As [`adopt_publisher`](Self::adopt_publisher), a node.
+    pub(crate) fn adopt_node(&self, endpoint: Endpoint) -> Node {
+        let gid = endpoint.gid;
+        let changed = self.create_guard_condition();
+        self.shared().state().nodes.insert(gid, (endpoint.clone(), changed.clone()));
+        self.shared().tell(Outgoing::Announce(gid));
+        Node::new(endpoint, changed, self.clone())
     }
 
     /// A local reader that carries samples to subscriptions on another host, `stands_for`. For the
@@ -296,6 +377,9 @@ impl Session {
         if shared.config.daemon == DaemonPolicy::Off {
             return Err(SessionError::Off);
         }
+        if self.handle.relay.is_some() {
+            return daemon_status(&shared.config);
+        }
         {
             let mut state = shared.state();
             if state.daemon.is_none() {
@@ -319,22 +403,25 @@ impl Session {
         config: &Config,
         options: SessionOptions,
         segment: Arc<SessionSegment>,
-        connected: Option<Connected>,
-        reconnects: bool,
-    ) -> Result<Self, SessionError> {
+        start: Start,
+    ) -> Result<Handle, SessionError> {
         let flags = rustix::event::EventfdFlags::CLOEXEC | rustix::event::EventfdFlags::NONBLOCK;
         let system = |what| move |source: std::io::Error| SessionError::System { what, source };
         let wake = rustix::event::eventfd(0, flags)
             .map_err(|e| system("creating an eventfd")(e.into()))?;
         let shared = Arc::new(Shared::new(config.clone(), options, segment, wake));
-        let control = Control::new(shared.clone(), connected, reconnects);
+        let control = Control::new(shared.clone(), start)?;
         let blocked = signals::Blocked::all();
         let thread = std::thread::Builder::new()
             .name("axon-ctl".into())
             .spawn(move || control.run())
             .map_err(system("starting the control thread"))?;
         drop(blocked);
-        Ok(Self { handle: Arc::new(Handle { shared, thread: Some(thread) }) })
+        Ok(Handle { shared, thread: Some(thread), relay: None })
+    }
+
+    fn of(handle: Handle) -> Self {
+        Self { handle: Arc::new(handle) }
     }
 
     fn shared(&self) -> &Shared {
@@ -360,8 +447,11 @@ impl Drop for Handle {
         // The thread, and what it has to say, stay with the parent of a forked child.
         if self.shared.segment.is_forked() {
             std::mem::forget(self.thread.take());
+            std::mem::forget(self.relay.take());
             return;
         }
+        // First: it carries on what the session's publishers left.
+        drop(self.relay.take());
         self.shared.stop();
         if let Some(thread) = self.thread.take() {
             // A listener may hold the last handle.
@@ -385,6 +475,7 @@ pub fn daemon_status(config: &Config) -> Result<String, SessionError> {
         options: &options,
         id: SessionId::random(),
         segment: None,
+        relay: None,
         cancel: None,
     };
     let connected = caller.connect()?;

@@ -43,15 +43,15 @@ pub enum SessionEvent {
 
 type Listener = Arc<dyn Fn(&SessionEvent) + Send + Sync>;
 
-pub(super) struct Shared {
-    pub(super) config: Config,
-    pub(super) options: SessionOptions,
-    pub(super) id: SessionId,
+pub(crate) struct Shared {
+    pub(crate) config: Config,
+    pub(crate) options: SessionOptions,
+    pub(crate) id: SessionId,
     pub(super) segment: Arc<SessionSegment>,
     /// Wakes the control thread (an eventfd).
     pub(super) wake: Arc<OwnedFd>,
     pub(super) memory: Arc<MemoryNews>,
-    pub(super) stopping: AtomicBool,
+    pub(crate) stopping: AtomicBool,
     /// The control thread, once it runs.
     pub(super) control: OnceLock<ThreadId>,
     /// By which the control thread hears of samples, and for how many subscriptions it does.
@@ -205,6 +205,19 @@ impl Shared {
             state: Mutex::default(),
             changed: Condvar::new(),
         }
+    }
+
+    /// For a relay: there is a daemon now, or none any more.
+    pub(crate) fn set_daemon(&self, daemon: Option<DaemonId>) {
+        self.state().daemon = daemon;
+        self.notify(Some(&daemon.map_or(SessionEvent::DaemonLost, SessionEvent::DaemonFound)));
+    }
+
+    /// For a relay: so many samples of `writer` were lost on their way to this session's
+    /// subscriptions.
+    pub(crate) fn lost(&self, writer: &Gid, samples: u64) {
+        let subscriptions: Vec<_> = self.state().subscriptions.values().cloned().collect();
+        subscriptions.iter().for_each(|s| s.lock().lost_elsewhere(writer, samples));
     }
 
     pub(super) fn state(&self) -> MutexGuard<'_, State> {

@@ -143,6 +143,20 @@ impl Subscription {
         if self.session.is_forked() { 0 } else { self.inner.lock().received }
     }
 
+    /// For a relay: the next sample of one publisher, and how many of that publisher's this
+    /// subscription has lost by then.
+    pub(crate) fn take_from(&self, writer: &Gid) -> Option<(Sample, u64)> {
+        if self.session.is_forked() {
+            return None;
+        }
+        self.inner.lock().take_from(writer, &self.inner)
+    }
+
+    /// Whether there is something to take of this publisher.
+    pub(crate) fn has_from(&self, writer: &Gid) -> bool {
+        !self.session.is_forked() && self.inner.lock().has_from(writer)
+    }
+
     /// For a relay: the remote subscriptions that it stands for from now on.
     pub fn set_stands_for(&self, gids: Vec<Gid>) {
         if self.session.is_forked() {
@@ -631,6 +645,42 @@ impl Slots {
             return Some((info, taken));
         }
         None
+    }
+
+    fn take_from(&mut self, writer: &Gid, of: &SubscriptionInner) -> Option<(Sample, u64)> {
+        let endpoint = &of.endpoint;
+        let index = self.slots.iter().position(|slot| {
+            slot.reader.writer() == *writer && (!slot.over || slot.reader.has_data())
+        })?;
+        let reader = &mut self.slots[index].reader;
+        match reader.take_sample() {
+            Ok(sample) => {
+                // What a relay passes over, nobody asked it to.
+                let skipped = if of.role == EndpointRole::Relay { reader.skipped() } else { 0 };
+                let taken = sample.map(|sample| (sample, reader.lost() + skipped));
+                self.sweep();
+                taken
+            }
+            Err(error @ (TakeError::TooLarge { .. } | TakeError::NoMemory { .. })) => {
+                tracing::error!(topic = endpoint.topic, %error, "a sample is not taken");
+                None
+            }
+            Err(error) => {
+                self.discard(index, &error, endpoint);
+                None
+            }
+        }
+    }
+
+    fn has_from(&self, writer: &Gid) -> bool {
+        self.slots.iter().any(|slot| slot.reader.writer() == *writer && slot.reader.has_data())
+    }
+
+    /// Samples of `writer` that were lost before they came to its ring here.
+    pub(super) fn lost_elsewhere(&mut self, writer: &Gid, samples: u64) {
+        if self.slots.iter().any(|slot| slot.reader.writer() == *writer) {
+            self.lost += samples;
+        }
     }
 
     /// The slot whose next sample is the oldest, of those that are not faster than we are. What a

@@ -85,6 +85,7 @@ mod orphans;
 mod peer;
 mod pi_mutex;
 mod pins;
+pub(crate) mod probe;
 mod publisher;
 mod quota;
 mod reader;

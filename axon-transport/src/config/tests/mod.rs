@@ -163,6 +163,7 @@ fn every_setting_takes_effect() {
             ("AXON_RING_BUFFER_SIZE_MB", "1"),
             ("AXON_MAX_MESSAGE_MB", "4095"),
             ("AXON_RELIABLE_QUEUE_MB", "2"),
+            ("AXON_SHM", "off"),
             ("AXON_SHM_COPY", "1"),
             ("AXON_TRUSTED_UIDS", "0;1000"),
             ("AXON_LOG", "info,axon_transport::link=trace"),

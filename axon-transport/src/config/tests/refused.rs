@@ -159,6 +159,7 @@ fn bad_values_are_refused_by_name() {
         (&[], "AXON_RING_BUFFER_SIZE_MB", &["0", "65537", "64M", "0x40", " 64"]),
         (&[], "AXON_MAX_MESSAGE_MB", &["0", "4096", "big"]),
         (&[], "AXON_RELIABLE_QUEUE_MB", &["0", "65537", "-1"]),
+        (&[], "AXON_SHM", &["0", "no", "OFF"]),
         (&[], "AXON_SHM_COPY", &["2", "true", "yes"]),
         (&[], "AXON_TRUSTED_UIDS", &["root", "-1", "4294967296", "1;;2"]),
         (&[], "AXON_LOG", &["loud", "axon=", "=info", "info,"]),

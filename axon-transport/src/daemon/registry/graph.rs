@@ -138,7 +138,7 @@ impl<F: Clone> Registry<F> {
 }
 
 /// Splits a change into packets. `open` leaves `more` set in the last.
-fn parts(
+pub(crate) fn parts(
     version: u64,
     whole: bool,
     added: impl Iterator<Item = GraphItem>,

@@ -100,16 +100,16 @@ impl<F: Clone> Registry<F> {
         }
         let Some(entry) = self.sessions.get(id) else { return Ok(()) };
         let may = match role {
-            EndpointRole::Application => in_session(&gid, id),
+            EndpointRole::Application => gid.is_of(id),
             EndpointRole::StandIn => {
                 entry.role == SessionRole::Gateway
                     && endpoint.kind == EndpointKind::Publisher
-                    && !in_session(&gid, id)
+                    && !gid.is_of(id)
             }
             EndpointRole::Relay => {
                 entry.role == SessionRole::Gateway
                     && endpoint.kind == EndpointKind::Subscription
-                    && in_session(&gid, id)
+                    && gid.is_of(id)
             }
         };
         if !may {
@@ -196,7 +196,7 @@ impl<F: Clone> Registry<F> {
             }
             // It ended while there was no daemon. Its peers may still be attached to it, and those
             // that have not come back yet have to hear of it too.
-            None if in_session(&gid, id) => {
+            None if gid.is_of(id) => {
                 if self.tombstones.len() == MAX_TOMBSTONES {
                     self.tombstones.pop_front();
                 }
@@ -323,11 +323,6 @@ impl<F: Clone> Registry<F> {
             }
         }
     }
-}
-
-/// Whether `gid` is one that `session` may give to an endpoint of its own.
-fn in_session(gid: &Gid, session: &SessionId) -> bool {
-    gid.0[..12] == session.0[..12]
 }
 
 impl<F> SessionEntry<F> {

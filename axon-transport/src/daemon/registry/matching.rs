@@ -33,6 +33,10 @@ impl<F: Clone> Registry<F> {
                 continue;
             }
             let (to_writer, to_reader) = (w.session, r.session);
+            let relayed = |id| self.sessions.get(id).is_some_and(|s| s.relay.is_some());
+            if to_writer == to_reader && relayed(&to_writer) {
+                continue;
+            }
             match pairing(&w.endpoint, &r.endpoint) {
                 Pairing::Match => {
                     let by = if pair.writer == *gid { to_writer } else { to_reader };

@@ -20,11 +20,13 @@ use std::{
     sync::Arc,
 };
 
+pub(crate) use graph::parts;
 pub use output::Output;
 
 use crate::{
     graph::Endpoint,
     ids::{DaemonId, Gid, SessionId},
+    relay::Tally,
     session::message::{Attach, EndpointRole, Granted, GraphItem, Pair, Segment, SessionRole},
     shm::Location,
 };
@@ -98,6 +100,8 @@ pub struct SessionEntry<F> {
     status: Option<(Arc<[u8]>, u32)>,
     /// An endpoint of its was refused.
     refused: bool,
+    /// What is shown of its relay, where it is relayed. Pairs within it are its own process's.
+    pub(crate) relay: Option<Arc<Tally>>,
 }
 
 /// A segment of a session's memory.
@@ -203,6 +207,18 @@ impl<F: Clone> Registry<F> {
     /// One session.
     pub fn session(&self, id: &SessionId) -> Option<&SessionEntry<F>> {
         self.sessions.get(id)
+    }
+
+    /// A session is relayed.
+    pub(crate) fn set_relayed(&mut self, id: &SessionId, relay: Arc<Tally>) {
+        if let Some(entry) = self.sessions.get_mut(id) {
+            entry.relay = Some(relay);
+        }
+    }
+
+    /// How many are.
+    pub(crate) fn relayed(&self) -> usize {
+        self.sessions.values().filter(|s| s.relay.is_some()).count()
     }
 
     /// How many application sessions there are.

@@ -197,6 +197,7 @@ pub(super) fn session_entry<F>(
         pairs: 0,
         status: None,
         refused: false,
+        relay: None,
     }
 }
 

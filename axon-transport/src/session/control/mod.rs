@@ -23,7 +23,7 @@ use super::{
     connect::{Caller, Connected},
     error::SessionError,
     events::Source,
-    local::Local,
+    local::{House, Local},
     message::{Announce, EndpointRole, Gone, Message, Pair, SegmentName, SegmentOpened},
     peers::Peers,
     socket::{self, SocketError},
@@ -81,15 +81,26 @@ pub(super) struct Control {
     alarm: Option<u64>,
 }
 
+/// With whom a session speaks first.
+pub(super) enum Start {
+    /// A daemon; another one when it is gone.
+    Daemon(Connected),
+    /// Whoever is at the other end of a socket, and nobody after it.
+    Socket(Connected),
+    /// The registry of its own process.
+    House(Arc<House>),
+}
+
 enum Link {
     Socket(PassedFd),
-    Local(Box<Local>),
+    Local(Local),
     Reconnecting(Receiver<Connected>),
     Ended,
 }
 
 impl Control {
-    pub(super) fn new(shared: Arc<Shared>, connected: Option<Connected>, reconnects: bool) -> Self {
+    pub(super) fn new(shared: Arc<Shared>, start: Start) -> Result<Self, SessionError> {
+        let reconnects = matches!(start, Start::Daemon(_));
         let peers = Peers::new(shared.segment.clone(), shared.memory.clone());
         let mut control = Self {
             shared,
@@ -113,14 +124,13 @@ impl Control {
             timed: None,
             alarm: None,
         };
-        match connected {
-            Some(connected) => control.connected(connected),
-            None => {
-                let local = Local::new(control.shared.id, control.shared.options.name.clone());
-                control.link = Link::Local(Box::new(local));
+        match start {
+            Start::Daemon(connected) | Start::Socket(connected) => control.connected(connected),
+            Start::House(house) => {
+                control.link = Link::Local(Local::new(house, &control.shared)?);
             }
         }
-        control
+        Ok(control)
     }
 
     pub(super) fn run(mut self) {
@@ -207,6 +217,7 @@ impl Control {
                     options: &shared.options,
                     id: shared.id,
                     segment: Some(&shared.segment),
+                    relay: None,
                     cancel: Some(&shared.stopping),
                 };
                 match caller.connect() {
@@ -458,6 +469,11 @@ impl Control {
     }
 
     fn receive(&mut self) {
+        if let Link::Local(local) = &mut self.link {
+            for (message, descriptors) in local.exchange(None) {
+                self.handle(message, descriptors);
+            }
+        }
         for _ in 0..BATCH {
             let Link::Socket(socket) = &self.link else { return };
             match socket::receive(socket, &mut self.buffer) {

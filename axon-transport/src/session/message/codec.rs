@@ -56,6 +56,9 @@ impl Message {
             Self::Segment(m) => (15, minicbor::to_vec(m)),
             Self::SegmentGone(m) => (16, minicbor::to_vec(m)),
             Self::Need(m) => (17, minicbor::to_vec(m)),
+            Self::Matched(m) => (24, minicbor::to_vec(m)),
+            Self::Piece(m) => (25, minicbor::to_vec(m)),
+            Self::Credit(m) => (26, minicbor::to_vec(m)),
             Self::Unknown(kind) => (*kind, minicbor::to_vec(Empty {})),
         };
         // Encoding into a Vec has no way to fail.
@@ -101,6 +104,9 @@ impl Message {
             15 => Self::Segment(map(kind, body)?),
             16 => Self::SegmentGone(map(kind, body)?),
             17 => Self::Need(map(kind, body)?),
+            24 => Self::Matched(map(kind, body)?),
+            25 => Self::Piece(map(kind, body)?),
+            26 => Self::Credit(map(kind, body)?),
             _ => Self::Unknown(kind),
         })
     }

@@ -79,6 +79,9 @@ pub struct Hello {
     /// Effective security settings: variable, and value or digest.
     #[n(5)]
     pub settings: Vec<(String, String)>,
+    /// Why it shares no memory, if so: then it is relayed, and has no descriptors.
+    #[n(6)]
+    pub relay: Option<String>,
 }
 
 /// The daemon takes the session.
@@ -326,6 +329,65 @@ pub struct StatusPart {
     pub text: Vec<u8>,
 }
 
+/// With whom an endpoint of a relayed session is matched outside of its process.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Matched {
+    /// The endpoint.
+    #[n(0)]
+    pub gid: Gid,
+    /// The others.
+    #[n(1)]
+    pub others: Vec<Gid>,
+}
+
+/// A part of a sample that crosses a relay.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Piece {
+    /// Its publisher, which is the channel.
+    #[n(0)]
+    pub publisher: Gid,
+    /// In the first part.
+    #[n(1)]
+    pub head: Option<Head>,
+    /// The bytes that follow those of the part before.
+    #[cbor(n(2), with = "minicbor::bytes")]
+    pub bytes: Vec<u8>,
+}
+
+/// What goes with a sample that crosses a relay.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+pub struct Head {
+    /// Its length in bytes.
+    #[n(0)]
+    pub length: u32,
+    /// The publication's number.
+    #[n(1)]
+    pub sequence: u64,
+    /// When it was published.
+    #[n(2)]
+    pub source_timestamp: i64,
+    /// Samples of its publisher that were lost since the one before.
+    #[n(3)]
+    pub lost: u64,
+}
+
+/// The receiver of a channel has room.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Credit {
+    /// The channel.
+    #[n(0)]
+    pub publisher: Gid,
+    /// For so many bytes more.
+    #[n(1)]
+    pub bytes: u64,
+    /// It is the first that it says of this channel.
+    #[n(2)]
+    pub opens: bool,
+}
+
 /// A message of the session socket.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[allow(missing_docs)]
@@ -347,6 +409,9 @@ pub enum Message {
     Segment(SegmentOpened),
     SegmentGone(SegmentName),
     Need(SegmentName),
+    Matched(Matched),
+    Piece(Piece),
+    Credit(Credit),
     /// A type that this version does not know; to be skipped.
     Unknown(u8),
 }

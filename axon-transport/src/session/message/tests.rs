@@ -30,6 +30,7 @@ fn messages() -> Vec<Message> {
             name: "talker".into(),
             domain: 7,
             settings: vec![("AXON_SECURITY_MODE".into(), "classic".into())],
+            relay: Some("AXON_SHM is off".into()),
         }),
         Message::Welcome(Welcome { protocol: 1, daemon: DaemonId([4; 16]), pid: 12 }),
         Message::Refused(Refused {
@@ -83,6 +84,14 @@ fn messages() -> Vec<Message> {
         }),
         Message::SegmentGone(SegmentName { session, number: 9 }),
         Message::Need(SegmentName { session, number: 9 }),
+        Message::Matched(Matched { gid: reader, others: vec![writer] }),
+        Message::Piece(Piece {
+            publisher: writer,
+            head: Some(Head { length: 3, sequence: 7, source_timestamp: -1, lost: 2 }),
+            bytes: vec![1, 2],
+        }),
+        Message::Piece(Piece { publisher: writer, head: None, bytes: vec![3] }),
+        Message::Credit(Credit { publisher: writer, bytes: 128, opens: true }),
     ]
 }
 
@@ -148,7 +157,7 @@ proptest! {
 
     #[test]
     fn no_mutated_packet_panics(
-        which in 0usize..17, at in any::<prop::sample::Index>(), byte: u8,
+        which in 0usize..21, at in any::<prop::sample::Index>(), byte: u8,
     ) {
         let mut packet = messages()[which].encode().unwrap();
         let at = at.index(packet.len());

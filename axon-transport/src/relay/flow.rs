@@ -1,0 +1,425 @@
+//! Samples in pieces, and who may send how many of them: plain data in, data out.
+//!
+//! There is a channel for each publisher whose samples cross. Its receiver lets the sender have so
+//! many bytes under way, and gives them back when samples have gone to where they belong: whoever is
+//! not read leaves its samples in the ring they come from, where their publisher's QoS says what
+//! becomes of them, and holds up no other channel. Pieces of all channels take turns, so that an image
+//! does not keep a small sample waiting.
+
+use std::{
+    collections::{BTreeMap, HashMap, VecDeque},
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+    },
+};
+
+use crate::{
+    ids::Gid,
+    session::message::{Credit, Head, Piece},
+    shm::Meta,
+};
+
+/// Bytes that a channel may have under way without asking.
+pub const WINDOW: u64 = 32 << 10;
+/// What a sample counts for besides its bytes.
+pub const OVERHEAD: u64 = 128;
+/// Most bytes of a sample in one packet.
+pub const PIECE: usize = 31 << 10;
+/// Bytes beyond the windows of its channels that one session's arriving samples may take; one sample
+/// may always.
+const SESSION: u64 = 64 << 20;
+
+/// A sample's bytes.
+pub trait Content {
+    /// How many there are.
+    fn len(&self) -> usize;
+    /// Whether there are none.
+    fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+    /// Copies those from `at` on to the front of `out`, as many as there are and fit.
+    fn read_at(&self, at: usize, out: &mut [u8]) -> usize;
+}
+
+impl Content for crate::shm::Sample {
+    fn len(&self) -> usize {
+        self.len()
+    }
+
+    fn read_at(&self, at: usize, out: &mut [u8]) -> usize {
+        self.read_at(at, out)
+    }
+}
+
+impl Content for Vec<u8> {
+    fn len(&self) -> usize {
+        self.len()
+    }
+
+    fn read_at(&self, at: usize, out: &mut [u8]) -> usize {
+        let count = out.len().min(self.len().saturating_sub(at));
+        out[..count].copy_from_slice(&self[at..][..count]);
+        count
+    }
+}
+
+/// A sample to be sent.
+#[derive(Debug)]
+pub struct Departing<S> {
+    /// Its number and time.
+    pub meta: Meta,
+    /// Samples of its publisher that were lost since the one before.
+    pub lost: u64,
+    /// Its bytes, which may stay where they are.
+    pub content: S,
+}
+
+/// The sending end.
+#[derive(Debug)]
+pub struct Outgoing<S> {
+    channels: BTreeMap<Gid, Sending<S>>,
+    /// Channels that may send a piece, in their order.
+    turns: VecDeque<Gid>,
+}
+
+#[derive(Debug)]
+struct Sending<S> {
+    /// Bytes that may still be sent; `None` until the receiver opened its end.
+    credit: Option<u64>,
+    /// What it was when the receiver opened its end: all of it is back when nothing is under way.
+    window: u64,
+    /// What is sent piece by piece, and how far.
+    current: Option<(Departing<S>, Option<usize>)>,
+    in_turn: bool,
+}
+
+impl<S> Default for Outgoing<S> {
+    fn default() -> Self {
+        Self { channels: BTreeMap::new(), turns: VecDeque::new() }
+    }
+}
+
+impl<S: Content> Outgoing<S> {
+    /// Opens a channel, which waits for its receiver.
+    pub fn open(&mut self, publisher: Gid) {
+        let closed = Sending { credit: None, window: 0, current: None, in_turn: false };
+        self.channels.entry(publisher).or_insert(closed);
+    }
+
+    /// Closes a channel; the rest of a sample that is under way is not sent.
+    pub fn close(&mut self, publisher: &Gid) {
+        self.channels.remove(publisher);
+        self.turns.retain(|gid| gid != publisher);
+    }
+
+    /// What the receiver of a channel says.
+    pub fn credit(&mut self, credit: &Credit) {
+        let Credit { publisher, bytes, opens } = *credit;
+        let Some(channel) = self.channels.get_mut(&publisher) else { return };
+        match (&mut channel.credit, opens) {
+            (none @ None, true) => {
+                *none = Some(bytes);
+                channel.window = bytes;
+            }
+            (Some(credit), false) => *credit = credit.saturating_add(bytes),
+            // Of a channel that this one came after.
+            (None, false) | (Some(_), true) => {}
+        }
+        self.enqueue(publisher);
+    }
+
+    /// Whether all that was sent on a channel has gone to where it belongs.
+    pub fn is_idle(&self, publisher: &Gid) -> bool {
+        self.channels.get(publisher).is_none_or(|channel| {
+            channel.current.is_none()
+                && channel.credit.is_none_or(|credit| credit == channel.window)
+        })
+    }
+
+    /// Asks for the next sample of each channel that has none under way and may send one. Whether
+    /// there was any.
+    pub fn fill(&mut self, mut take: impl FnMut(&Gid) -> Option<Departing<S>>) -> bool {
+        let mut found = Vec::new();
+        for (gid, channel) in &mut self.channels {
+            if channel.current.is_none() && channel.credit >= Some(OVERHEAD) {
+                channel.current = take(gid).map(|sample| (sample, None));
+                found.extend(channel.current.is_some().then_some(*gid));
+            }
+        }
+        found.iter().for_each(|gid| self.enqueue(*gid));
+        !found.is_empty()
+    }
+
+    /// The next piece, of the channel whose turn it is.
+    pub fn next_piece(&mut self) -> Option<Piece> {
+        loop {
+            let publisher = self.turns.pop_front()?;
+            let Some(channel) = self.channels.get_mut(&publisher) else { continue };
+            channel.in_turn = false;
+            let (Some((sample, at)), Some(credit)) = (&mut channel.current, &mut channel.credit)
+            else {
+                continue;
+            };
+            let mut cost = 0;
+            let mut head = None;
+            let from = match at {
+                Some(at) => *at,
+                None if *credit < OVERHEAD => continue,
+                None => {
+                    cost = OVERHEAD;
+                    let Meta { sequence, source_timestamp } = sample.meta;
+                    // No sample is longer than AXON_MAX_MESSAGE_MB allows, which is below 4 GiB.
+                    let length = u32::try_from(sample.content.len()).unwrap_or(u32::MAX);
+                    head = Some(Head { length, sequence, source_timestamp, lost: sample.lost });
+                    0
+                }
+            };
+            let left = sample.content.len() - from;
+            let may = usize::try_from(*credit - cost).unwrap_or(usize::MAX);
+            let mut bytes = vec![0; left.min(PIECE).min(may)];
+            if bytes.is_empty() && head.is_none() {
+                // It waits for credit.
+                continue;
+            }
+            sample.content.read_at(from, &mut bytes);
+            cost += bytes.len() as u64;
+            *credit -= cost;
+            *at = Some(from + bytes.len());
+            if bytes.len() == left {
+                channel.current = None;
+            } else {
+                self.enqueue(publisher);
+            }
+            return Some(Piece { publisher, head, bytes });
+        }
+    }
+
+    fn enqueue(&mut self, publisher: Gid) {
+        if let Some(channel) = self.channels.get_mut(&publisher)
+            && channel.current.is_some()
+            && !std::mem::replace(&mut channel.in_turn, true)
+        {
+            self.turns.push_back(publisher);
+        }
+    }
+}
+
+/// A sample that has come whole.
+#[derive(Debug, PartialEq, Eq)]
+pub struct Arrived {
+    /// Its publisher.
+    pub publisher: Gid,
+    /// Its number and time.
+    pub meta: Meta,
+    /// Samples of its publisher that were lost since the one before.
+    pub lost: u64,
+    /// Its bytes.
+    pub payload: Vec<u8>,
+}
+
+impl Arrived {
+    fn cost(&self) -> u64 {
+        OVERHEAD + self.payload.len() as u64
+    }
+}
+
+/// What no sender does. The connection is closed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum Violation {
+    /// A sample longer than any may be.
+    #[error("a sample of {0} bytes, which is more than AXON_MAX_MESSAGE_MB allows")]
+    TooLarge(u32),
+    /// More bytes than there was credit for.
+    #[error("more bytes of samples than it was given credit for")]
+    Overrun,
+    /// A piece that does not follow the one before.
+    #[error("a piece of a sample that does not follow the one before")]
+    OutOfPlace,
+}
+
+/// The memory that the arriving samples of all of a daemon's relayed sessions share.
+#[derive(Debug)]
+pub struct Pool {
+    held: AtomicU64,
+    limit: u64,
+}
+
+impl Pool {
+    /// A pool of `limit` bytes.
+    pub fn new(limit: u64) -> Arc<Self> {
+        Arc::new(Self { held: AtomicU64::new(0), limit })
+    }
+
+    /// Bytes that are taken.
+    pub fn held(&self) -> u64 {
+        self.held.load(Ordering::Relaxed)
+    }
+
+    /// One sample may always: what is larger than the pool must pass, too.
+    fn take(&self, bytes: u64) -> bool {
+        let fits = |held: u64| {
+            (held == 0 || held + bytes <= self.limit).then(|| held.saturating_add(bytes))
+        };
+        // Relaxed: the count guards nothing but itself.
+        self.held.fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits).is_ok()
+    }
+
+    fn give(&self, bytes: u64) {
+        self.held.fetch_sub(bytes, Ordering::Relaxed);
+    }
+}
+
+/// The receiving end.
+#[derive(Debug)]
+pub struct Incoming {
+    channels: HashMap<Gid, Receiving>,
+    max_message: u64,
+    /// Channels whose sample is longer than their window, until there is room.
+    waiting: VecDeque<Gid>,
+    /// Bytes that were granted beyond the windows.
+    reserved: u64,
+    pool: Arc<Pool>,
+}
+
+#[derive(Debug, Default)]
+struct Receiving {
+    /// Bytes that came and have not gone to where they belong.
+    held: u64,
+    /// Bytes granted beyond the window, for these samples.
+    granted: u64,
+    partial: Option<Partial>,
+}
+
+#[derive(Debug)]
+struct Partial {
+    head: Head,
+    payload: Vec<u8>,
+}
+
+impl Incoming {
+    /// An end that takes samples of at most `max_message` bytes, and memory beyond its windows out of
+    /// `pool`.
+    pub fn new(max_message: u64, pool: Arc<Pool>) -> Self {
+        Self { channels: HashMap::new(), max_message, waiting: VecDeque::new(), reserved: 0, pool }
+    }
+
+    /// Opens a channel, unless it is open: what its sender is to be told.
+    pub fn open(&mut self, publisher: Gid) -> Option<Credit> {
+        if self.channels.contains_key(&publisher) {
+            return None;
+        }
+        self.channels.insert(publisher, Receiving::default());
+        Some(Credit { publisher, bytes: WINDOW, opens: true })
+    }
+
+    /// Closes a channel and forgets what came on it.
+    pub fn close(&mut self, publisher: &Gid) {
+        if let Some(channel) = self.channels.remove(publisher) {
+            self.release(channel.granted);
+        }
+        self.waiting.retain(|gid| gid != publisher);
+    }
+
+    /// Takes a piece; the sample, if it was the last.
+    ///
+    /// # Errors
+    /// [`Violation`].
+    pub fn piece(&mut self, piece: Piece) -> Result<Option<Arrived>, Violation> {
+        let Piece { publisher, head, bytes } = piece;
+        // Of a channel that was closed meanwhile.
+        let Some(channel) = self.channels.get_mut(&publisher) else { return Ok(None) };
+        let opens = head.is_some();
+        let partial = match (head, channel.partial.take()) {
+            (Some(head), None) if u64::from(head.length) > self.max_message => {
+                return Err(Violation::TooLarge(head.length));
+            }
+            (Some(head), None) => Partial { head, payload: Vec::new() },
+            (None, Some(partial)) if !bytes.is_empty() => partial,
+            _ => return Err(Violation::OutOfPlace),
+        };
+        let length = partial.head.length as usize;
+        if bytes.len() > length - partial.payload.len() {
+            return Err(Violation::OutOfPlace);
+        }
+        channel.held += bytes.len() as u64 + if opens { OVERHEAD } else { 0 };
+        if channel.held > WINDOW + channel.granted {
+            return Err(Violation::Overrun);
+        }
+        let Partial { head, mut payload } = partial;
+        // Grows with what really arrives.
+        payload.extend_from_slice(&bytes);
+        if payload.len() < length {
+            channel.partial = Some(Partial { head, payload });
+            if opens && extra(length) > 0 {
+                self.waiting.push_back(publisher);
+            }
+            return Ok(None);
+        }
+        let Head { sequence, source_timestamp, lost, .. } = head;
+        let meta = Meta { sequence, source_timestamp };
+        Ok(Some(Arrived { publisher, meta, lost, payload }))
+    }
+
+    /// For whom there is room now.
+    pub fn grants(&mut self) -> Vec<Credit> {
+        let mut granted = Vec::new();
+        while let Some(publisher) = self.waiting.front().copied() {
+            let channel = self.channels.get_mut(&publisher);
+            let Some((channel, length)) = channel.and_then(|c| {
+                let length = c.partial.as_ref()?.head.length as usize;
+                Some((c, length))
+            }) else {
+                self.waiting.pop_front();
+                continue;
+            };
+            let more = extra(length);
+            if self.reserved > 0 && self.reserved + more > SESSION || !self.pool.take(more) {
+                break;
+            }
+            channel.granted += more;
+            self.reserved += more;
+            self.waiting.pop_front();
+            granted.push(Credit { publisher, bytes: more, opens: false });
+        }
+        granted
+    }
+
+    /// Whether somebody waits for room.
+    pub fn is_short(&self) -> bool {
+        !self.waiting.is_empty()
+    }
+
+    /// A sample has gone to where it belongs, or nowhere: what its sender is given back.
+    pub fn done(&mut self, sample: &Arrived) -> Option<Credit> {
+        let publisher = sample.publisher;
+        let channel = self.channels.get_mut(&publisher)?;
+        let (cost, more) = (sample.cost(), extra(sample.payload.len()));
+        channel.held = channel.held.saturating_sub(cost);
+        // One that was not asked for can have come within the window, by the grant for another.
+        let more = more.min(channel.granted);
+        channel.granted -= more;
+        self.release(more);
+        Some(Credit { publisher, bytes: cost - more, opens: false })
+    }
+
+    fn release(&mut self, bytes: u64) {
+        self.reserved -= bytes;
+        self.pool.give(bytes);
+    }
+}
+
+impl Drop for Incoming {
+    fn drop(&mut self) {
+        self.pool.give(self.reserved);
+    }
+}
+
+/// What a sample takes beyond its channel's window.
+fn extra(length: usize) -> u64 {
+    (OVERHEAD + length as u64).saturating_sub(WINDOW)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,226 @@
+//! Both ends without a socket in between.
+
+use std::collections::{HashMap, VecDeque};
+
+use proptest::prelude::*;
+
+use super::*;
+
+const MAX: u64 = 1 << 20;
+
+fn gid(number: u8) -> Gid {
+    Gid([number; 16])
+}
+
+fn incoming() -> Incoming {
+    Incoming::new(MAX, Pool::new(MAX))
+}
+
+fn departing(sequence: u64, len: usize) -> Departing<Vec<u8>> {
+    let meta = Meta { sequence, source_timestamp: -(sequence as i64) };
+    let content = (0..len).map(|at| (at as u64 * 31 + sequence) as u8).collect();
+    Departing { meta, lost: sequence, content }
+}
+
+fn head(length: u32) -> Option<Head> {
+    Some(Head { length, sequence: 1, source_timestamp: 0, lost: 0 })
+}
+
+fn piece(channel: u8, head: Option<Head>, len: usize) -> Piece {
+    Piece { publisher: gid(channel), head, bytes: vec![0; len] }
+}
+
+#[test]
+fn what_no_sender_does_is_refused() {
+    let open = || {
+        let mut incoming = incoming();
+        incoming.open(gid(1));
+        incoming
+    };
+    let refused = |pieces: &[Piece]| {
+        let mut incoming = open();
+        let (last, before) = pieces.split_last().unwrap();
+        for piece in before {
+            assert_eq!(incoming.piece(piece.clone()), Ok(None));
+        }
+        incoming.piece(last.clone()).unwrap_err()
+    };
+    assert_eq!(refused(&[piece(1, head(MAX as u32 + 1), 0)]), Violation::TooLarge(MAX as u32 + 1));
+    assert_eq!(refused(&[piece(1, None, 10)]), Violation::OutOfPlace);
+    assert_eq!(refused(&[piece(1, head(10), 11)]), Violation::OutOfPlace);
+    assert_eq!(refused(&[piece(1, head(10), 5), piece(1, None, 6)]), Violation::OutOfPlace);
+    assert_eq!(refused(&[piece(1, head(10), 5), piece(1, head(10), 5)]), Violation::OutOfPlace);
+    assert_eq!(refused(&[piece(1, head(10), 5), piece(1, None, 0)]), Violation::OutOfPlace);
+    let long = WINDOW as usize;
+    assert_eq!(refused(&[piece(1, head(MAX as u32), long)]), Violation::Overrun);
+    let mut samples = open();
+    for _ in 0..WINDOW / OVERHEAD {
+        assert!(samples.piece(piece(1, head(0), 0)).unwrap().is_some());
+    }
+    assert_eq!(samples.piece(piece(1, head(0), 0)), Err(Violation::Overrun), "empty ones count");
+    assert_eq!(open().piece(piece(2, None, 10)), Ok(None), "of a channel that was closed");
+}
+
+#[test]
+fn a_long_sample_waits_for_room_and_gives_it_back() {
+    let pool = Pool::new(100_000);
+    let mut ends = [(); 2].map(|()| Incoming::new(MAX, Arc::clone(&pool)));
+    for incoming in &mut ends {
+        incoming.open(gid(1));
+        assert_eq!(incoming.piece(piece(1, head(100_000), 0)), Ok(None));
+    }
+    let [first, second] = &mut ends;
+    let more = OVERHEAD + 100_000 - WINDOW;
+    let credit = Credit { publisher: gid(1), bytes: more, opens: false };
+    assert_eq!(first.grants(), [credit]);
+    assert_eq!(second.grants(), [], "the pool is one for all");
+    assert!(second.is_short() && !first.is_short());
+    let arrived = first.piece(piece(1, None, 100_000)).unwrap().unwrap();
+    assert_eq!(pool.held(), more);
+    let credit = Credit { bytes: WINDOW, ..credit };
+    assert_eq!(first.done(&arrived), Some(credit), "what was granted is not given back");
+    assert_eq!(pool.held(), 0);
+    assert_eq!(second.grants().len(), 1);
+    second.close(&gid(1));
+    assert_eq!(pool.held(), 0);
+    second.open(gid(1));
+    assert_eq!(second.piece(piece(1, head(100_000), 0)), Ok(None));
+    assert_eq!(second.grants().len(), 1);
+    drop(ends);
+    assert_eq!(pool.held(), 0, "whoever ends holds nothing");
+}
+
+#[test]
+fn one_sample_may_be_longer_than_the_pool() {
+    let mut incoming = Incoming::new(MAX, Pool::new(1));
+    incoming.open(gid(1));
+    assert_eq!(incoming.piece(piece(1, head(MAX as u32), 0)), Ok(None));
+    assert_eq!(incoming.grants().len(), 1);
+}
+
+#[test]
+fn an_image_does_not_hold_a_small_sample_up() {
+    let mut outgoing = Outgoing::default();
+    for channel in [1, 2] {
+        outgoing.open(gid(channel));
+        outgoing.credit(&Credit { publisher: gid(channel), bytes: MAX, opens: true });
+    }
+    assert!(outgoing.fill(|of| (*of == gid(1)).then(|| departing(1, 500_000))));
+    assert_eq!(outgoing.next_piece().unwrap().publisher, gid(1));
+    assert!(outgoing.fill(|of| (*of == gid(2)).then(|| departing(1, 52))));
+    let next = [(); 2].map(|()| outgoing.next_piece().unwrap().publisher);
+    assert!(next.contains(&gid(2)));
+    assert_eq!(outgoing.next_piece().unwrap().publisher, gid(1));
+}
+
+#[test]
+fn a_channel_without_its_receiver_sends_nothing() {
+    let mut outgoing = Outgoing::default();
+    outgoing.open(gid(1));
+    outgoing.credit(&Credit { publisher: gid(1), bytes: 1000, opens: false });
+    assert!(!outgoing.fill(|_| Some(departing(1, 1))), "of a channel before it");
+    outgoing.credit(&Credit { publisher: gid(1), bytes: 1000, opens: true });
+    assert!(outgoing.fill(|_| Some(departing(1, 1))));
+    assert!(!outgoing.is_idle(&gid(1)));
+    let sent = outgoing.next_piece().unwrap();
+    assert_eq!(outgoing.next_piece(), None);
+    assert!(!outgoing.is_idle(&gid(1)), "nobody has said that it is where it belongs");
+    let mut incoming = incoming();
+    incoming.open(gid(1));
+    let arrived = incoming.piece(sent).unwrap().unwrap();
+    outgoing.credit(&incoming.done(&arrived).unwrap());
+    assert!(outgoing.is_idle(&gid(1)));
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+
+    /// Samples of any sizes on several channels, of which some are not read for a while: all arrive
+    /// whole and in order, and nobody holds more than there is credit for.
+    #[test]
+    fn all_arrive_whole_in_order_and_within_bounds(
+        sizes in prop::collection::vec((0u8..4, 0usize..200_000), 1..40),
+        stuck in 0u8..4,
+        order in any::<u64>(),
+    ) {
+        let pool = Pool::new(300_000);
+        let mut incoming = Incoming::new(MAX, Arc::clone(&pool));
+        let mut outgoing = Outgoing::default();
+        let mut queues: HashMap<Gid, VecDeque<Departing<Vec<u8>>>> = HashMap::new();
+        let mut expected: HashMap<Gid, VecDeque<Vec<u8>>> = HashMap::new();
+        for channel in 0..4 {
+            outgoing.open(gid(channel));
+            outgoing.credit(&incoming.open(gid(channel)).unwrap());
+        }
+        for (number, (channel, len)) in sizes.iter().enumerate() {
+            let sample = departing(number as u64, *len);
+            expected.entry(gid(*channel)).or_default().push_back(sample.content.clone());
+            queues.entry(gid(*channel)).or_default().push_back(sample);
+        }
+        let mut held: Vec<Arrived> = Vec::new();
+        let mut random = order;
+        for round in 0.. {
+            let all_there = queues.values().all(VecDeque::is_empty)
+                && (0..4).all(|channel| outgoing.is_idle(&gid(channel)));
+            if all_there {
+                break;
+            }
+            prop_assert!(round < 100_000, "nothing moves any more");
+            outgoing.fill(|of| queues.get_mut(of)?.pop_front());
+            for credit in incoming.grants() {
+                outgoing.credit(&credit);
+            }
+            prop_assert!(pool.held() <= 300_000);
+            let mut sent = false;
+            while let Some(piece) = outgoing.next_piece() {
+                sent = true;
+                prop_assert!(piece.bytes.len() <= PIECE);
+                held.extend(incoming.piece(piece).unwrap());
+                random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+                if random >> 62 == 0 {
+                    break;
+                }
+            }
+            // What is stuck goes on only when nothing else does.
+            let keep = held
+                .iter()
+                .any(|sample| sample.publisher != gid(stuck)) || sent;
+            let (go, stay): (Vec<_>, Vec<_>) =
+                held.into_iter().partition(|sample| sample.publisher != gid(stuck) || !keep);
+            held = stay;
+            for sample in go {
+                let next = expected.get_mut(&sample.publisher).unwrap().pop_front();
+                prop_assert_eq!(Some(&sample.payload), next.as_ref());
+                prop_assert_eq!(sample.lost, sample.meta.sequence);
+                outgoing.credit(&incoming.done(&sample).unwrap());
+            }
+        }
+        prop_assert_eq!(pool.held(), 0);
+        prop_assert!(expected.values().all(VecDeque::is_empty));
+    }
+
+    #[test]
+    fn no_sequence_of_pieces_panics_or_is_kept_beyond_the_bounds(
+        pieces in prop::collection::vec(
+            (0u8..3, prop::option::of(0u32..100_000), 0usize..40_000, any::<bool>()), 0..60),
+    ) {
+        let pool = Pool::new(50_000);
+        let mut incoming = Incoming::new(90_000, Arc::clone(&pool));
+        incoming.open(gid(0));
+        incoming.open(gid(1));
+        let mut kept = 0;
+        for (channel, length, len, gone) in pieces {
+            let arrived = incoming.piece(piece(channel, length.and_then(head), len));
+            incoming.grants();
+            match arrived {
+                Ok(Some(sample)) if gone => drop(incoming.done(&sample)),
+                Ok(Some(sample)) => kept += sample.payload.len() as u64,
+                Ok(None) => {}
+                Err(_) => break,
+            }
+            prop_assert!(kept <= 2 * WINDOW + pool.held());
+        }
+        drop(incoming);
+        prop_assert_eq!(pool.held(), 0);
+    }
+}

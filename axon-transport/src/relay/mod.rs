@@ -1,0 +1,29 @@
+//! Sessions that share no memory: their samples pass through the daemon, over the session socket.
+//!
+//! To its daemon such a session is much what another host is. In its own process a registry and a
+//! gateway session of their own stand for the world outside ([`near`]): relays read what the
+//! application publishes, stand-ins write what it subscribes to, and all else works as with shared
+//! memory. In the daemon a session of the same id has the application's endpoints, in memory that
+//! everybody maps ([`far`]): to others, on this host and elsewhere, it is a session like any.
+//!
+//! [`flow`] is plain data: samples in pieces, and who may send how many of them. [`pipe`] moves them
+//! over the socket (`docs/formats.md`, section 10).
+
+pub(crate) mod far;
+pub mod flow;
+pub(crate) mod near;
+mod news;
+mod pipe;
+mod status;
+
+pub(crate) use flow::Pool;
+pub(crate) use status::Tally;
+
+/// Relayed sessions of one daemon: each costs it two threads and memory of its own.
+pub(crate) const MAX_SESSIONS: usize = 32;
+/// Publishers, and subscriptions, of a relayed session.
+const MAX_ENDPOINTS: usize = 1024;
+/// Others that one endpoint is said to be matched with; one packet holds no more.
+const MAX_MATCHED: usize = 1024;
+/// Bytes of the reason for which a session is relayed.
+pub(crate) const MAX_REASON: usize = 200;

@@ -1,0 +1,60 @@
+//! What the control thread of a session notices, for a thread that sleeps in `poll`.
+
+use std::{
+    os::fd::{AsFd, BorrowedFd, OwnedFd},
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+};
+
+use rustix::event::{EventfdFlags, eventfd};
+
+use crate::session::{Session, SessionEvent};
+
+/// Becomes readable when something happened.
+#[derive(Debug)]
+pub(super) struct News {
+    wake: OwnedFd,
+    lost: AtomicBool,
+}
+
+impl News {
+    pub(super) fn new() -> std::io::Result<Arc<Self>> {
+        let wake = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?;
+        Ok(Arc::new(Self { wake, lost: AtomicBool::new(false) }))
+    }
+
+    /// Has `session` tell of whatever changes.
+    pub(super) fn of(self: &Arc<Self>, session: &Session) {
+        let news = Arc::clone(self);
+        session.set_listener(move |event| {
+            if *event == SessionEvent::DaemonLost {
+                // Pairs with the load in `is_lost`.
+                news.lost.store(true, Ordering::Release);
+            }
+            news.wake();
+        });
+    }
+
+    /// Whether the session has no daemon any more.
+    pub(super) fn is_lost(&self) -> bool {
+        self.lost.load(Ordering::Acquire)
+    }
+
+    pub(super) fn wake(&self) {
+        // An eventfd whose counter is full is readable, which is all that is wanted.
+        let _ = rustix::io::write(&self.wake, &1u64.to_ne_bytes());
+    }
+
+    /// Takes the news; whether there was any.
+    pub(super) fn take(&self) -> bool {
+        rustix::io::read(&self.wake, &mut [0; 8]).is_ok()
+    }
+}
+
+impl AsFd for News {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.wake.as_fd()
+    }
+}

@@ -1,0 +1,220 @@
+//! The socket of a relay, as either end uses it: control messages first, then pieces of samples.
+
+use std::{
+    collections::{BTreeMap, VecDeque},
+    os::fd::BorrowedFd,
+    sync::Arc,
+};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+use super::{
+    Tally,
+    flow::{Arrived, Departing, Incoming, Outgoing, Violation},
+    news::News,
+};
+use crate::{
+    ids::Gid,
+    passed::PassedFd,
+    session::{
+        Publisher,
+        message::Message,
+        socket::{self, Received, SocketError},
+    },
+    shm::{PublishError, Sample},
+    wait::ExternalLeader,
+};
+
+/// Bytes of control messages that may wait for an end that does not read.
+const MAX_WAITING: usize = 32 << 20;
+/// Packets sent, and received, before the other direction has its turn.
+const BATCH: usize = 64;
+
+/// Why a relay ends.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum End {
+    #[error("{0}")]
+    Socket(#[from] SocketError),
+    #[error("the other end sent {0}")]
+    Violation(#[from] Violation),
+    #[error("the other end sent descriptors")]
+    Descriptors,
+    #[error("the other end does not read")]
+    Deaf,
+    #[error("{0}")]
+    Other(String),
+}
+
+pub(super) struct Pipe {
+    socket: PassedFd,
+    buffer: Vec<u8>,
+    /// Packets that go before any piece.
+    waiting: VecDeque<Vec<u8>>,
+    waiting_bytes: usize,
+    pub(super) outgoing: Outgoing<Sample>,
+    pub(super) incoming: Incoming,
+    /// Samples that came and are not published yet.
+    arrived: BTreeMap<Gid, VecDeque<Arrived>>,
+    /// Whether one of them waits for a reader.
+    pub(super) blocked: bool,
+    tally: Arc<Tally>,
+}
+
+impl Pipe {
+    pub(super) fn new(socket: PassedFd, incoming: Incoming, tally: Arc<Tally>) -> Self {
+        Self {
+            socket,
+            buffer: Vec::new(),
+            waiting: VecDeque::new(),
+            waiting_bytes: 0,
+            outgoing: Outgoing::default(),
+            incoming,
+            arrived: BTreeMap::new(),
+            blocked: false,
+            tally,
+        }
+    }
+
+    /// Queues a control message.
+    pub(super) fn say(&mut self, message: &Message) -> Result<(), End> {
+        let packet = message.encode().map_err(|e| End::Other(e.to_string()))?;
+        self.waiting_bytes += packet.len();
+        self.waiting.push_back(packet);
+        if self.waiting_bytes > MAX_WAITING { Err(End::Deaf) } else { Ok(()) }
+    }
+
+    /// Whether there is something that the socket had no room for.
+    pub(super) fn is_full(&self) -> bool {
+        !self.waiting.is_empty()
+    }
+
+    /// Opens a channel for samples that come.
+    pub(super) fn open(&mut self, publisher: Gid) -> Result<(), End> {
+        match self.incoming.open(publisher) {
+            Some(credit) => self.say(&Message::Credit(credit)),
+            None => Ok(()),
+        }
+    }
+
+    /// Closes it again.
+    pub(super) fn close(&mut self, publisher: &Gid) {
+        self.incoming.close(publisher);
+        self.arrived.remove(publisher);
+    }
+
+    /// Takes packets; the control messages among them, and whether there may be more.
+    pub(super) fn receive(&mut self) -> Result<(Vec<Message>, bool), End> {
+        let mut messages = Vec::new();
+        for _ in 0..BATCH {
+            let message = match socket::receive(&self.socket, &mut self.buffer) {
+                Ok(Received { message, descriptors }) if descriptors.is_empty() => message,
+                Ok(_) => return Err(End::Descriptors),
+                Err(SocketError::NotReady) => return Ok((messages, false)),
+                Err(error) => return Err(error.into()),
+            };
+            match message {
+                Message::Piece(piece) => {
+                    if let Some(sample) = self.incoming.piece(piece)? {
+                        self.arrived.entry(sample.publisher).or_default().push_back(sample);
+                    }
+                }
+                Message::Credit(credit) => self.outgoing.credit(&credit),
+                other => messages.push(other),
+            }
+        }
+        Ok((messages, true))
+    }
+
+    /// Publishes what came, as far as readers make room; `lost` hears of samples that did not come.
+    pub(super) fn publish<'a>(
+        &mut self,
+        find: impl Fn(&Gid) -> Option<&'a Publisher>,
+        mut lost: impl FnMut(&Gid, u64),
+    ) -> Result<(), End> {
+        self.blocked = false;
+        let mut credits = Vec::new();
+        for (gid, samples) in &mut self.arrived {
+            while let Some(sample) = samples.front_mut() {
+                let Some(publisher) = find(gid) else { break };
+                match std::mem::take(&mut sample.lost) {
+                    0 => {}
+                    count => lost(gid, count),
+                }
+                match publisher.try_publish_with(sample.meta, &sample.payload) {
+                    Ok(()) => self.tally.arrived(sample.payload.len()),
+                    Err(PublishError::Blocked { .. }) => {
+                        self.blocked = true;
+                        break;
+                    }
+                    Err(error) => {
+                        tracing::error!(%gid, %error, "a relayed sample is lost");
+                        lost(gid, 1);
+                    }
+                }
+                if let Some(sample) = samples.pop_front() {
+                    credits.extend(self.incoming.done(&sample));
+                }
+            }
+        }
+        self.arrived.retain(|_, samples| !samples.is_empty());
+        credits.into_iter().try_for_each(|credit| self.say(&Message::Credit(credit)))
+    }
+
+    /// Sends what there is, as far as the socket has room: what `take` has of each channel that may
+    /// send. Whether anything was sent.
+    pub(super) fn send(
+        &mut self,
+        mut take: impl FnMut(&Gid) -> Option<Departing<Sample>>,
+    ) -> Result<bool, End> {
+        for credit in self.incoming.grants() {
+            self.say(&Message::Credit(credit))?;
+        }
+        let tally = Arc::clone(&self.tally);
+        let mut take = |gid: &Gid| take(gid).inspect(|sample| tally.departed(sample.content.len()));
+        self.outgoing.fill(&mut take);
+        let mut sent = false;
+        for _ in 0..BATCH {
+            if self.waiting.is_empty() {
+                let piece = self.outgoing.next_piece().or_else(|| {
+                    self.outgoing.fill(&mut take);
+                    self.outgoing.next_piece()
+                });
+                let Some(piece) = piece else { break };
+                self.say(&Message::Piece(piece))?;
+            }
+            let Some(packet) = self.waiting.front() else { break };
+            match socket::send(&self.socket, packet, &[]) {
+                Ok(()) => {
+                    sent = true;
+                    self.waiting_bytes -= packet.len();
+                    self.waiting.pop_front();
+                }
+                Err(SocketError::NotReady) => break,
+                Err(error) => return Err(error.into()),
+            }
+        }
+        Ok(sent)
+    }
+}
+
+impl Pipe {
+    /// Sleeps until there is something to do; whether `end` became readable.
+    pub(super) fn sleep(
+        &self,
+        leader: &ExternalLeader,
+        news: &News,
+        end: Option<BorrowedFd<'_>>,
+    ) -> bool {
+        let out = if self.is_full() { PollFlags::OUT } else { PollFlags::empty() };
+        let mut fds = vec![
+            PollFd::new(&self.socket, PollFlags::IN | out),
+            PollFd::new(leader, PollFlags::IN),
+            PollFd::new(news, PollFlags::IN),
+        ];
+        fds.extend(end.map(|end| PollFd::from_borrowed_fd(end, PollFlags::IN)));
+        // Nobody says when others have left room in the pool.
+        let nap = Timespec { tv_sec: 0, tv_nsec: 5_000_000 };
+        let _ = poll(&mut fds, self.incoming.is_short().then_some(&nap));
+        fds.get(3).is_some_and(|end| !end.revents().is_empty())
+    }
+}

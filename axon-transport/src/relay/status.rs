@@ -1,0 +1,52 @@
+//! What a daemon shows of a relayed session.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use crate::daemon::status::RelayStatus;
+
+/// Counts what crosses a relay's socket.
+#[derive(Debug, Default)]
+pub(crate) struct Tally {
+    reason: String,
+    samples_in: AtomicU64,
+    bytes_in: AtomicU64,
+    samples_out: AtomicU64,
+    bytes_out: AtomicU64,
+    lost: AtomicU64,
+}
+
+impl Tally {
+    /// Of a session that is relayed for this reason.
+    pub(crate) fn new(reason: &str) -> Self {
+        let reason = reason.chars().filter(|c| !c.is_control()).take(super::MAX_REASON).collect();
+        Self { reason, ..Self::default() }
+    }
+
+    // Relaxed throughout: each count stands for itself alone.
+
+    pub(super) fn arrived(&self, bytes: usize) {
+        self.samples_in.fetch_add(1, Ordering::Relaxed);
+        self.bytes_in.fetch_add(bytes as u64, Ordering::Relaxed);
+    }
+
+    pub(super) fn departed(&self, bytes: usize) {
+        self.samples_out.fetch_add(1, Ordering::Relaxed);
+        self.bytes_out.fetch_add(bytes as u64, Ordering::Relaxed);
+    }
+
+    /// Samples of the session's publishers that did not get here.
+    pub(super) fn lost(&self, samples: u64) {
+        self.lost.fetch_add(samples, Ordering::Relaxed);
+    }
+
+    pub(crate) fn show(&self) -> RelayStatus {
+        RelayStatus {
+            reason: self.reason.clone(),
+            samples_in: self.samples_in.load(Ordering::Relaxed),
+            bytes_in: self.bytes_in.load(Ordering::Relaxed),
+            samples_out: self.samples_out.load(Ordering::Relaxed),
+            bytes_out: self.bytes_out.load(Ordering::Relaxed),
+            lost: self.lost.load(Ordering::Relaxed),
+        }
+    }
+}

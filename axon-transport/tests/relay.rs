@@ -1,0 +1,663 @@
+//! Sessions that share no memory, beside those that do.
+
+#[allow(dead_code, reason = "for the tests of daemons too")]
+mod support;
+
+use std::{
+    os::fd::{AsFd, OwnedFd},
+    sync::atomic::{AtomicBool, Ordering},
+    time::{Duration, Instant},
+};
+
+use axon_transport::{
+    config::{Config, DaemonPolicy, security_settings},
+    daemon::status::{RelayStatus, Status},
+    graph::{Endpoint, EndpointKind},
+    ids::{Gid, SessionId},
+    qos::{Durability, History, Qos, Reliability},
+    session::{
+        EndpointSpec, Publisher, Session, SessionOptions, Subscription,
+        address::Address,
+        message::{
+            Announce, EndpointRole, Head, Hello, Message, PROTOCOL, Piece, Refused, SessionRole,
+        },
+        socket::{self, SocketError},
+    },
+    shm::PublishError,
+};
+use rustix::process::Signal;
+use support::{Host, PATIENCE, say, signal, until, wait_for_the_end};
+
+/// Around each border of how samples are kept and carried, and an image.
+const SIZES: [usize; 10] = [0, 1, 96, 97, 4096, 4097, 31 << 10, 32 << 10, 64 << 10, 25_000_000];
+
+fn spec(topic: &str, qos: Qos) -> EndpointSpec {
+    EndpointSpec::new(topic, "test/Bytes", qos)
+}
+
+fn best_effort(depth: u32) -> Qos {
+    Qos { reliability: Reliability::BestEffort, depth, ..Qos::default() }
+}
+
+fn latched(depth: u32) -> Qos {
+    Qos { durability: Durability::TransientLocal, depth, ..Qos::default() }
+}
+
+/// Its publishers keep little, so that what lies in between is soon full.
+fn host() -> Host {
+    Host::new().with("AXON_RING_BUFFER_SIZE_MB", "4")
+}
+
+/// A session that shares memory with the daemon of `host`, or does not.
+fn session(host: &Host, name: &str, shm: bool) -> Session {
+    let config = Config { daemon: DaemonPolicy::Require, shm, ..host.config() };
+    Session::open(&config, SessionOptions::new(name)).unwrap()
+}
+
+fn pattern(sequence: u64, len: usize) -> Vec<u8> {
+    (0..len as u64).map(|at| (at ^ sequence) as u8).collect()
+}
+
+fn publish(publisher: &Publisher, payload: &[u8]) -> u64 {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        match publisher.publish(payload) {
+            Ok(sequence) => return sequence,
+            // The reader is slow: this is what KEEP_ALL means.
+            Err(PublishError::Blocked { .. }) => assert!(Instant::now() < deadline, "for ever"),
+            Err(error) => panic!("{error}"),
+        }
+    }
+}
+
+fn connect(from: &Session, to: &Session, topic: &str, qos: Qos) -> (Publisher, Subscription) {
+    let publisher = from.create_publisher(spec(topic, qos)).unwrap();
+    let subscription = to.create_subscription(spec(topic, qos)).unwrap();
+    await_pair(&publisher, &subscription);
+    (publisher, subscription)
+}
+
+fn await_pair(publisher: &Publisher, subscription: &Subscription) {
+    until("the publisher counts the subscription", || {
+        publisher.matched().contains(&subscription.gid())
+    });
+    until("the subscription counts the publisher", || {
+        subscription.matched().contains(&publisher.gid())
+    });
+}
+
+/// The sequence numbers that are taken until `last`.
+fn take_until(subscription: &Subscription, last: u64) -> Vec<u64> {
+    let (mut taken, mut bytes) = (Vec::new(), Vec::new());
+    while taken.last() != Some(&last) {
+        let info = subscription.recv(&mut bytes, Some(PATIENCE)).expect("a sample in time");
+        assert_eq!(bytes, pattern(info.sequence, bytes.len()));
+        taken.push(info.sequence);
+    }
+    taken
+}
+
+fn relays(status: &Status) -> Vec<RelayStatus> {
+    status.sessions.iter().filter_map(|s| s.relay.clone()).collect()
+}
+
+/// What the children of the tests do. In a run of the tests themselves it does nothing.
+#[test]
+fn child() {
+    let Ok(part) = std::env::var("PLAY") else { return };
+    let session = Session::open(&Config::from_env().unwrap(), SessionOptions::new(&*part)).unwrap();
+    match part.as_str() {
+        // Publishes without an end.
+        "talker" => {
+            let publisher = session.create_publisher(spec("/t", Qos::keep_all())).unwrap();
+            assert!(publisher.wait_matched(1, PATIENCE));
+            for sequence in 1.. {
+                publish(&publisher, &pattern(sequence, sequence as usize % 10_000));
+            }
+        }
+        // Publishes a little and ends.
+        "brief" => {
+            let publisher = session.create_publisher(spec("/t", Qos::keep_all())).unwrap();
+            assert!(publisher.wait_matched(1, PATIENCE));
+            for sequence in 1..=300 {
+                publish(&publisher, &pattern(sequence, 10_000));
+            }
+        }
+        // Takes nothing.
+        "deaf" => {
+            let subscription = session.create_subscription(spec("/t", Qos::keep_all())).unwrap();
+            assert!(subscription.wait_matched(1, PATIENCE));
+            say("matched");
+            wait_for_the_end();
+        }
+        _ => unreachable!("no such part: {part}"),
+    }
+}
+
+#[test]
+fn samples_of_all_sizes_cross_whole_and_in_order_whoever_shares_memory() {
+    let host = host();
+    let _daemon = host.daemon();
+    for (from, to) in [(false, true), (true, false), (false, false)] {
+        let (from, to) = (session(&host, "from", from), session(&host, "to", to));
+        let (publisher, subscription) = connect(&from, &to, "/t", Qos::keep_all());
+        let mut bytes = Vec::new();
+        for (number, len) in (0..).zip(SIZES.iter().chain(SIZES.iter().rev())) {
+            let payload = pattern(number, *len);
+            let time = 1_000 + number as i64;
+            assert_eq!(publisher.publish_at(time, &payload).unwrap(), number + 1);
+            let info = subscription.recv(&mut bytes, Some(PATIENCE)).expect("a sample in time");
+            assert!(bytes == payload, "{len} bytes");
+            let expected = (publisher.gid(), number + 1, time);
+            assert_eq!((info.publisher, info.sequence, info.source_timestamp), expected);
+        }
+        assert_eq!(subscription.lost(), 0);
+    }
+}
+
+#[test]
+fn keep_all_holds_its_publisher_back_and_loses_nothing() {
+    let host = host();
+    let _daemon = host.daemon();
+    for (from, to) in [(false, true), (true, false), (false, false)] {
+        let (from, to) = (session(&host, "from", from), session(&host, "to", to));
+        let (publisher, subscription) = connect(&from, &to, "/t", Qos::keep_all());
+        let len = 50_000;
+        // As much as all that lies in between may hold is there before the first is taken.
+        let mut last = 0;
+        loop {
+            match publisher.publish(&pattern(last + 1, len)) {
+                Ok(sequence) => last = sequence,
+                Err(PublishError::Blocked { .. }) => break,
+                Err(error) => panic!("{error}"),
+            }
+            assert!(last < 20_000, "nothing holds it back");
+        }
+        let more = last + 200;
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                for sequence in last + 1..=more {
+                    assert_eq!(publish(&publisher, &pattern(sequence, len)), sequence);
+                }
+            });
+            assert!(take_until(&subscription, more).into_iter().eq(1..=more));
+        });
+        assert_eq!(subscription.lost(), 0);
+    }
+}
+
+#[test]
+fn a_late_joiner_gets_the_history_once() {
+    let host = host();
+    let _daemon = host.daemon();
+    for (from, to) in [(false, true), (true, false), (false, false)] {
+        let from = session(&host, "from", from);
+        let (one, two) = (session(&host, "one", to), session(&host, "two", to));
+        let publisher = from.create_publisher(spec("/t", latched(3))).unwrap();
+        for sequence in 1..=5 {
+            publish(&publisher, &pattern(sequence, 5_000));
+        }
+        let joiner = one.create_subscription(spec("/t", latched(10))).unwrap();
+        await_pair(&publisher, &joiner);
+        assert_eq!(take_until(&joiner, 5), [3, 4, 5]);
+        let volatile = two.create_subscription(spec("/t", Qos::keep_all())).unwrap();
+        await_pair(&publisher, &volatile);
+        publish(&publisher, &pattern(6, 5_000));
+        assert_eq!((take_until(&joiner, 6), take_until(&volatile, 6)), (vec![6], vec![6]));
+        assert_eq!((joiner.lost(), volatile.lost()), (0, 0));
+    }
+}
+
+#[test]
+fn best_effort_waits_for_nobody_and_what_is_lost_is_counted() {
+    let host = host();
+    let _daemon = host.daemon();
+    for (from, to) in [(false, true), (true, false), (false, false)] {
+        let (from, to) = (session(&host, "from", from), session(&host, "to", to));
+        let keeps = Qos { history: History::KeepAll, ..best_effort(1) };
+        let publisher = from.create_publisher(spec("/t", best_effort(4))).unwrap();
+        let slow = to.create_subscription(spec("/t", keeps)).unwrap();
+        await_pair(&publisher, &slow);
+        let published = 400;
+        for sequence in 1..=published {
+            assert_eq!(publisher.publish(&pattern(sequence, 50_000)).unwrap(), sequence);
+        }
+        let lost_on_the_way =
+            || relays(&host.status().unwrap()).iter().map(|r| r.lost).sum::<u64>();
+        // The last ones arrive for certain, and with them the count of those before.
+        let taken = take_until(&slow, published).len() as u64;
+        assert!(taken < published, "nothing was lost that could be counted");
+        assert_eq!(taken + slow.lost() + lost_on_the_way(), published);
+        drop((from, to, publisher, slow));
+        until("both are gone", || host.status().unwrap().sessions.len() == 1);
+    }
+}
+
+#[test]
+fn a_reader_that_takes_nothing_holds_nobody_else_up() {
+    let host = host();
+    let _daemon = host.daemon();
+    let (from, to) = (session(&host, "from", true), session(&host, "to", false));
+    let (stuck, never) = connect(&from, &to, "/stuck", Qos::keep_all());
+    while publish_once(&stuck, 1_000_000) {}
+    let (image, slow) = connect(&from, &to, "/image", best_effort(1));
+    let (twist, quick) = connect(&from, &to, "/twist", Qos::keep_all());
+    for sequence in 1..=100 {
+        assert_eq!(image.publish(&pattern(sequence, 2_000_000)).unwrap(), sequence);
+        publish(&twist, &pattern(sequence, 52));
+        assert_eq!(take_until(&quick, sequence), [sequence]);
+    }
+    assert_eq!(take_until(&slow, 100).last(), Some(&100));
+    let mut bytes = Vec::new();
+    assert!(never.recv(&mut bytes, Some(PATIENCE)).is_some(), "and it may still go on");
+}
+
+fn publish_once(publisher: &Publisher, len: usize) -> bool {
+    match publisher.publish(&vec![0; len]) {
+        Ok(_) => true,
+        Err(PublishError::Blocked { .. }) => false,
+        Err(error) => panic!("{error}"),
+    }
+}
+
+#[test]
+fn what_is_within_a_process_stays_there_and_crosses_once_for_all() {
+    let host = host();
+    let _daemon = host.daemon();
+    let (relayed, other) = (session(&host, "relayed", false), session(&host, "other", true));
+    let (publisher, subscription) = connect(&relayed, &relayed, "/inside", Qos::keep_all());
+    publish(&publisher, &pattern(1, 10));
+    assert_eq!(take_until(&subscription, 1), [1]);
+    let count = |of: fn(&RelayStatus) -> u64| relays(&host.status().unwrap()).iter().map(of).sum();
+    assert_eq!((count(|r| r.samples_in), count(|r| r.samples_out)), (0, 0));
+
+    // Its readers inside and outside get the same.
+    let outside = other.create_subscription(spec("/inside", Qos::keep_all())).unwrap();
+    await_pair(&publisher, &outside);
+    publish(&publisher, &pattern(2, 10));
+    assert_eq!(take_until(&subscription, 2), [2]);
+    assert_eq!(take_until(&outside, 2), [2]);
+
+    let (publisher, first) = connect(&other, &relayed, "/outside", Qos::keep_all());
+    let second = relayed.create_subscription(spec("/outside", best_effort(10))).unwrap();
+    await_pair(&publisher, &second);
+    publish(&publisher, &pattern(1, 10));
+    assert_eq!((take_until(&first, 1), take_until(&second, 1)), (vec![1], vec![1]));
+    assert_eq!((count(|r| r.samples_in), count(|r| r.samples_out)), (1, 1));
+    drop(first);
+    until("one is gone", || publisher.matched() == [second.gid()]);
+    publish(&publisher, &pattern(2, 10));
+    assert_eq!(take_until(&second, 2), [2]);
+}
+
+#[test]
+fn the_graph_is_the_same_for_all() {
+    let host = host();
+    let _daemon = host.daemon();
+    let relayed = session(&host, "relayed", false);
+    let other = session(&host, "other", true);
+    let _node = relayed.create_node("inside", "/", "/").unwrap();
+    let _other_node = other.create_node("outside", "/", "/").unwrap();
+    let publisher = relayed.create_publisher(spec("/p", Qos::default())).unwrap();
+    let subscription = other.create_subscription(spec("/s", Qos::default())).unwrap();
+    for session in [&relayed, &other] {
+        let all = session.wait_graph(PATIENCE, |graph| {
+            graph.nodes().len() == 2
+                && [publisher.gid(), subscription.gid()]
+                    .iter()
+                    .all(|gid| graph.endpoints.contains_key(gid))
+        });
+        assert!(all);
+    }
+    let (published, subscribed) = (publisher.gid(), subscription.gid());
+    drop((publisher, subscription));
+    for session in [&relayed, &other] {
+        assert!(session.wait_graph(PATIENCE, |graph| {
+            ![published, subscribed].iter().any(|gid| graph.endpoints.contains_key(gid))
+        }));
+    }
+    let text = relayed.status_json().unwrap();
+    assert!(text.contains("AXON_SHM is off"), "{text}");
+}
+
+#[test]
+fn the_status_says_who_is_relayed_and_why() {
+    let host = host();
+    let _daemon = host.daemon();
+    let _sharing = session(&host, "sharing", true);
+    let _relayed = session(&host, "relayed", false);
+    let status = host.status().unwrap();
+    let of = |name: &str| status.sessions.iter().find(|s| s.name == name).unwrap();
+    assert_eq!(of("sharing").relay, None);
+    assert_eq!(of("relayed").pid, std::process::id());
+    assert_eq!(of("relayed").relay.as_ref().unwrap().reason, "AXON_SHM is off");
+}
+
+#[test]
+fn a_process_that_is_killed_leaves_whole_samples_and_nothing_else() {
+    let host = host();
+    let _daemon = host.daemon();
+    let relaying = Host { env: host.env.clone(), dir: tempfile::tempdir().unwrap() };
+    let relaying = relaying.with("AXON_SHM", "off").with("AXON_DAEMON", "require");
+
+    let listener = session(&host, "listener", true);
+    let subscription = listener.create_subscription(spec("/t", Qos::keep_all())).unwrap();
+    let talker = relaying.play("talker");
+    assert_eq!(take_until(&subscription, 100).len(), 100);
+    signal(talker.pid(), Signal::KILL);
+    until("it is gone", || subscription.matched().is_empty());
+    let mut bytes = Vec::new();
+    let mut next = 101;
+    while let Some(info) = subscription.take(&mut bytes) {
+        assert_eq!((info.sequence, bytes.len()), (next, next as usize % 10_000));
+        next += 1;
+    }
+    drop(talker);
+
+    let publisher = listener.create_publisher(spec("/t", Qos::keep_all())).unwrap();
+    drop(subscription);
+    let mut deaf = relaying.play("deaf");
+    assert_eq!(deaf.hear(), "matched");
+    while publish_once(&publisher, 1_000_000) {}
+    signal(deaf.pid(), Signal::KILL);
+    until("nobody holds it back", || publish_once(&publisher, 1_000_000));
+    until("nobody is relayed any more", || relays(&host.status().unwrap()).is_empty());
+}
+
+#[test]
+fn what_was_published_last_arrives_though_the_process_ends() {
+    let host = host();
+    let _daemon = host.daemon();
+    let relaying = Host { env: host.env.clone(), dir: tempfile::tempdir().unwrap() };
+    let relaying = relaying.with("AXON_SHM", "off").with("AXON_DAEMON", "require");
+    let listener = session(&host, "listener", true);
+    let subscription = listener.create_subscription(spec("/t", Qos::keep_all())).unwrap();
+    let brief = relaying.play("brief");
+    brief.finish();
+    assert!(take_until(&subscription, 300).into_iter().eq(1..=300));
+    assert_eq!(subscription.lost(), 0);
+}
+
+#[test]
+fn another_daemon_takes_over() {
+    let host = host();
+    let daemon = host.daemon();
+    let (a, b, c) =
+        (session(&host, "a", false), session(&host, "b", false), session(&host, "c", true));
+    let publisher = a.create_publisher(spec("/t", latched(2))).unwrap();
+    let readers = [&b, &c].map(|s| s.create_subscription(spec("/t", latched(2))).unwrap());
+    readers.iter().for_each(|reader| await_pair(&publisher, reader));
+    for sequence in 1..=2 {
+        publish(&publisher, &pattern(sequence, 100));
+    }
+    readers.iter().for_each(|reader| assert_eq!(take_until(reader, 2), [1, 2]));
+    let before = a.daemon();
+    drop(daemon);
+    until("it is noticed", || a.daemon() != before);
+    until("the path is gone", || publisher.matched().is_empty());
+    publish(&publisher, &pattern(3, 100));
+
+    let _daemon = host.daemon();
+    readers.iter().for_each(|reader| await_pair(&publisher, reader));
+    publish(&publisher, &pattern(4, 100));
+    for reader in &readers {
+        assert_eq!(take_until(reader, 4), [3, 4], "nothing is repeated");
+        assert_eq!(reader.lost(), 0);
+    }
+}
+
+#[test]
+fn without_a_daemon_to_be_relayed_by_it_is_an_error() {
+    let host = host();
+    let config = Config { daemon: DaemonPolicy::Require, shm: false, ..host.config() };
+    assert!(Session::open(&config, SessionOptions::new("alone")).is_err());
+    let config = Config { daemon: DaemonPolicy::Off, ..config };
+    let alone = Session::open(&config, SessionOptions::new("alone")).unwrap();
+    let (publisher, subscription) = connect(&alone, &alone, "/t", Qos::default());
+    publish(&publisher, &pattern(1, 10));
+    assert_eq!(take_until(&subscription, 1), [1]);
+    assert!(alone.wait_graph(Duration::ZERO, |graph| graph.endpoints.len() == 2));
+}
+
+/// What a session under the id of nines says first.
+fn hello(host: &Host) -> Hello {
+    Hello {
+        protocol: PROTOCOL,
+        session: SessionId([9; 16]),
+        role: SessionRole::Application,
+        name: "by hand".into(),
+        domain: 0,
+        settings: security_settings(&host.config()).unwrap(),
+        relay: Some("written by hand".into()),
+    }
+}
+
+fn say_to(socket: &OwnedFd, message: &Message) {
+    let packet = message.encode().unwrap();
+    while let Err(SocketError::NotReady) = socket::send(socket, &packet, &[]) {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
+
+/// The next message that `want` wants; `None` at the end of the connection.
+fn hear(socket: &OwnedFd, want: impl Fn(&Message) -> bool) -> Option<Message> {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        match socket::receive(socket, &mut Vec::new()) {
+            Ok(received) if want(&received.message) => return Some(received.message),
+            Ok(_) => {}
+            Err(SocketError::NotReady) => {
+                assert!(Instant::now() < deadline, "nothing is said, and nobody hangs up");
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            Err(_) => return None,
+        }
+    }
+}
+
+fn refused(host: &Host, hello: Hello) -> Refused {
+    let socket = Address::of(&host.config()).connect().unwrap();
+    say_to(&socket, &Message::Hello(hello));
+    match hear(&socket, |_| true) {
+        Some(Message::Refused(refused)) => refused,
+        other => panic!("instead of a refusal: {other:?}"),
+    }
+}
+
+/// A relayed session that does as the test does.
+fn by_hand(host: &Host, hello: Hello) -> OwnedFd {
+    let socket = Address::of(&host.config()).connect().unwrap();
+    say_to(&socket, &Message::Hello(hello));
+    assert!(matches!(hear(&socket, |_| true), Some(Message::Welcome(_))));
+    socket
+}
+
+fn announce(gid: Gid, kind: EndpointKind, role: EndpointRole) -> Message {
+    let endpoint = Endpoint {
+        gid,
+        kind,
+        topic: "/t".into(),
+        type_name: "test/Bytes".into(),
+        type_hash: Vec::new(),
+        qos: Qos::keep_all(),
+        node: String::new(),
+        namespace: String::new(),
+        enclave: String::new(),
+    };
+    Message::Endpoint(Announce { endpoint, role, stands_for: Vec::new(), ring: None })
+}
+
+fn piece(publisher: Gid, length: Option<u32>, bytes: usize) -> Message {
+    let head = length.map(|length| Head { length, sequence: 1, source_timestamp: 0, lost: 0 });
+    Message::Piece(Piece { publisher, head, bytes: vec![0; bytes] })
+}
+
+#[test]
+fn who_is_not_to_be_relayed_is_refused() {
+    let host = host();
+    let _daemon = host.daemon();
+    let of = |role| Hello { role, ..hello(&host) };
+    assert!(refused(&host, of(SessionRole::Tool)).text.contains("application"));
+    assert!(refused(&host, of(SessionRole::Gateway)).text.contains("gateway"));
+    let mut other = hello(&host);
+    other.settings[0].1 = "other".into();
+    assert_eq!(refused(&host, other).variable, hello(&host).settings[0].0);
+    let empty = Hello { relay: None, ..hello(&host) };
+    assert_eq!(refused(&host, empty).variable, "AXON_SHM", "it may come back to be relayed");
+
+    // An id that another process has, or one like it, and one session too many.
+    let witness = session(&host, "witness", false);
+    let theirs = Hello { session: witness.id(), ..hello(&host) };
+    let alike = {
+        let mut id = witness.id();
+        id.0[15] ^= 1;
+        id
+    };
+    assert!(refused(&host, Hello { session: alike, ..theirs }).text.contains("id"));
+    let many: Vec<OwnedFd> = (1..32)
+        .map(|number| by_hand(&host, Hello { session: SessionId([number; 16]), ..hello(&host) }))
+        .collect();
+    let more = Hello { session: SessionId([77; 16]), ..hello(&host) };
+    assert!(refused(&host, more).text.contains("32 sessions"));
+    drop(many);
+    until("they are gone", || relays(&host.status().unwrap()).len() == 1);
+}
+
+#[test]
+fn hostile_frames_end_their_own_relay_and_nothing_else() {
+    let host = host();
+    let _daemon = host.daemon();
+    let (from, to) = (session(&host, "from", true), session(&host, "to", false));
+    let (publisher, subscription) = connect(&from, &to, "/t", Qos::keep_all());
+    let own = Gid::new(SessionId([9; 16]), 1);
+    let (application, stand_in) = (EndpointRole::Application, EndpointRole::StandIn);
+    let kind = EndpointKind::Publisher;
+    let credited = || {
+        let socket = by_hand(&host, hello(&host));
+        say_to(&socket, &announce(own, kind, application));
+        let credit = |m: &Message| matches!(m, Message::Credit(c) if c.publisher == own);
+        assert!(hear(&socket, credit).is_some());
+        socket
+    };
+    for message in [
+        Message::Resync,
+        announce(publisher.gid(), kind, application),
+        announce(own, kind, stand_in),
+        announce(Gid([7; 16]), EndpointKind::Subscription, application),
+    ] {
+        let socket = by_hand(&host, hello(&host));
+        say_to(&socket, &message);
+        assert!(hear(&socket, |_| false).is_none(), "{message:?}");
+    }
+    for pieces in [
+        &[piece(own, None, 10)][..],
+        &[piece(own, Some(10), 11)],
+        &[piece(own, Some(u32::MAX), 0)],
+        &[piece(own, Some(10), 5), piece(own, Some(10), 5)],
+        &[piece(own, Some(100_000), 31_000), piece(own, None, 31_000)],
+    ] {
+        let socket = credited();
+        // It may hang up before all is said.
+        let packets = pieces.iter().map(|piece| piece.encode().unwrap());
+        packets.for_each(|packet| drop(socket::send(&socket, &packet, &[])));
+        assert!(hear(&socket, |_| false).is_none(), "{pieces:?}");
+    }
+    for packet in [&[][..], &[25], &[25, 0xff, 0xff], &[0xff; 32 * 1024]] {
+        let socket = by_hand(&host, hello(&host));
+        let _ = socket::send(&socket, packet, &[]);
+        // What it does not know it passes over.
+        let _ = socket::send(&socket, &Message::Resync.encode().unwrap(), &[]);
+        assert!(hear(&socket, |_| false).is_none());
+    }
+    let socket = by_hand(&host, hello(&host));
+    let null = std::fs::File::open("/dev/null").unwrap();
+    let descriptor = [null.as_fd()];
+    socket::send(&socket, &Message::Resync.encode().unwrap(), &descriptor).unwrap();
+    assert!(hear(&socket, |_| false).is_none(), "descriptors");
+
+    // Samples of another's publisher go nowhere.
+    let socket = credited();
+    say_to(&socket, &piece(publisher.gid(), Some(4), 4));
+    // Samples that nobody reads are done with at once, however many they are.
+    (0..600).for_each(|_| say_to(&socket, &piece(own, Some(0), 0)));
+    publish(&publisher, &pattern(1, 10));
+    assert_eq!(take_until(&subscription, 1), [1]);
+    assert_eq!(subscription.received(), 1);
+    until("all of it is read", || {
+        relays(&host.status().unwrap()).iter().any(|relay| relay.samples_in == 600)
+    });
+}
+
+/// Stands between sessions and their daemon, and keeps descriptors back.
+fn keep_descriptors_back(listener: &OwnedFd, daemon: &Address, end: &AtomicBool) {
+    let mut pairs: Vec<[OwnedFd; 2]> = Vec::new();
+    while !end.load(Ordering::Relaxed) {
+        let flags = rustix::net::SocketFlags::CLOEXEC | rustix::net::SocketFlags::NONBLOCK;
+        if let Ok(caller) = rustix::net::accept_with(listener, flags) {
+            pairs.push([caller, daemon.connect().unwrap()]);
+        }
+        pairs.retain(|[a, b]| pass_on(a, b) && pass_on(b, a));
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
+
+/// Whether the connection goes on.
+fn pass_on(from: &OwnedFd, to: &OwnedFd) -> bool {
+    for _ in 0..16 {
+        match socket::receive(from, &mut Vec::new()) {
+            Ok(received) => say_to(to, &received.message),
+            Err(SocketError::NotReady) => return true,
+            Err(_) => return false,
+        }
+    }
+    true
+}
+
+#[test]
+fn where_descriptors_do_not_arrive_a_session_is_relayed_by_itself() {
+    let host = host();
+    let _daemon = host.daemon();
+    let behind = Host { env: host.env.clone(), dir: tempfile::tempdir().unwrap() };
+    let run = behind.dir.path().join("run");
+    let behind = behind.with("AXON_RUNTIME_DIR", run.to_str().unwrap());
+    let (listener, _lock) = Address::of(&behind.config()).bind().unwrap().into_parts();
+    let (daemon, end) = (Address::of(&host.config()), AtomicBool::new(false));
+    std::thread::scope(|scope| {
+        scope.spawn(|| keep_descriptors_back(&listener, &daemon, &end));
+        let outcome = std::panic::catch_unwind(|| {
+            let far = session(&behind, "behind", true);
+            let near = session(&host, "near", true);
+            let (publisher, subscription) = connect(&far, &near, "/t", Qos::keep_all());
+            publish(&publisher, &pattern(1, 100_000));
+            assert_eq!(take_until(&subscription, 1), [1]);
+            let relayed = relays(&host.status().unwrap());
+            assert!(relayed[0].reason.contains("descriptors"), "{relayed:?}");
+        });
+        end.store(true, Ordering::Relaxed);
+        outcome.unwrap();
+    });
+}
+
+#[test]
+fn another_host_reaches_a_relayed_session_and_is_reached() {
+    let pid = std::process::id();
+    let net = 1 + pid % 250;
+    let hosts = [1, 2].map(|number| {
+        host()
+            .with("AXON_BIND_ADDRS", &format!("127.98.{net}.{number}"))
+            .with("AXON_DAEMON_PEERS", &format!("127.98.{net}.{}", 3 - number))
+            .with("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+            .with("ROS_DOMAIN_ID", &(1 + pid % 98).to_string())
+    });
+    let _daemons = [hosts[0].daemon(), hosts[1].daemon()];
+    let (here, there) = (session(&hosts[0], "here", false), session(&hosts[1], "there", false));
+    for (from, to) in [(&here, &there), (&there, &here)] {
+        let topic = format!("/of/{}", from.id());
+        let (publisher, subscription) = connect(from, to, &topic, Qos::keep_all());
+        for (number, len) in (1..).zip([0, 96, 5_000, 1_000_000]) {
+            publish(&publisher, &pattern(number, len));
+            assert_eq!(take_until(&subscription, number), [number]);
+        }
+        assert_eq!(subscription.lost(), 0);
+    }
+}
