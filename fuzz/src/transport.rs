@@ -107,7 +107,9 @@ pub fn relay_pieces(data: &[u8]) -> bool {
             incoming.done(&kept.remove(0));
         }
     }
-    kept.iter().for_each(|sample| drop(incoming.done(sample)));
+    for sample in &kept {
+        incoming.done(sample);
+    }
     drop(incoming);
     assert_eq!(pool.held(), 0, "something is kept for ever");
     true
