@@ -91,7 +91,7 @@ pub(super) struct Asked {
 }
 
 /// What a publisher answers.
-#[derive(Clone, Copy, Debug, Encode, Decode)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 pub(super) struct Granted {
     /// Who asked: an answer to a question that was given up is not one to the next.
     #[n(0)]

@@ -11,7 +11,9 @@ use std::{
 };
 
 use super::{
-    Peer, PeerDescriptors, PeerSession, SessionSegment, ShmError, connect::News, lines::Lines,
+    Location, Peer, PeerDescriptors, PeerSession, SessionSegment, ShmError,
+    connect::{Granted, News},
+    lines::Lines,
 };
 use crate::{
     ids::{Gid, SessionId},
@@ -37,7 +39,42 @@ struct Inner {
     peers: Mutex<HashMap<SessionId, Known>>,
     lines: Arc<Lines>,
     /// What other contexts handed over and could not be mapped then.
-    unmapped: Mutex<Vec<(SegmentOpened, PassedFd)>>,
+    unmapped: Mutex<Vec<Unmapped>>,
+    /// What subscribers of this context ask for, and what its own publishers answered.
+    own: Mutex<HashMap<Gid, Own>>,
+}
+
+type Unmapped = (Weak<PeerSession>, SegmentOpened, PassedFd);
+
+/// A question of this context's.
+struct Own {
+    lane: Location,
+    granted: Option<Granted>,
+}
+
+/// That a subscriber asks, until it has its answer.
+pub(super) struct Asking<'a> {
+    context: &'a Context,
+    reader: Gid,
+}
+
+impl Asking<'_> {
+    /// The end that answered `granted` as this very context. Our id, memory and pidfd prove
+    /// nothing, as every peer has them: a publisher of ours must have granted just that.
+    pub(super) fn answered(&self, granted: &Granted) -> Result<Peer, ShmError> {
+        match self.context.own()?.get(&self.reader) {
+            Some(own) if own.granted.as_ref() == Some(granted) => Ok(self.context.local()),
+            _ => Err(ShmError::Refused { what: "no publisher of this context has granted that" }),
+        }
+    }
+}
+
+impl Drop for Asking<'_> {
+    fn drop(&mut self) {
+        if let Ok(mut own) = self.context.own() {
+            own.remove(&self.reader);
+        }
+    }
 }
 
 /// Another context.
@@ -61,31 +98,34 @@ impl Context {
         let lines = Arc::new(Lines::new(session.id()));
         let told = Arc::clone(&lines);
         session.on_segment(move |event| told.tell(event));
-        let unmapped = Mutex::default();
-        Self { inner: Arc::new(Inner { session, entities, peers, lines, unmapped }) }
+        let (unmapped, own) = (Mutex::default(), Mutex::default());
+        Self { inner: Arc::new(Inner { session, entities, peers, lines, unmapped, own }) }
     }
 
-    /// Another context has opened a segment or given one up.
-    pub(super) fn hear(&self, news: News) {
+    /// Another context says over its own line that it has opened a segment or given one up. What
+    /// it says of others is not listened to.
+    pub(super) fn hear(&self, from: &Arc<PeerSession>, news: News) {
         let (News::Opened(SegmentOpened { session, .. }, _)
         | News::Gone(SegmentName { session, .. })) = &news;
-        let Some(peer) = self.known(session) else { return };
+        if *session != from.id() {
+            return;
+        }
         match news {
-            News::Opened(opened, fd) => match peer.add_segment(opened.segment.into(), &fd) {
+            News::Opened(opened, fd) => match from.add_segment(opened.segment.into(), &fd) {
                 // One that is refused shows when it is read.
                 Ok(()) | Err(ShmError::Refused { .. }) => {}
                 Err(_) => {
                     let mut unmapped = self.unmapped();
                     if unmapped.len() < MANY {
-                        unmapped.push((opened, fd));
+                        unmapped.push((Arc::downgrade(from), opened, fd));
                     }
                 }
             },
             News::Gone(gone) => {
-                self.unmapped().retain(|(opened, _)| {
+                self.unmapped().retain(|(_, opened, _)| {
                     (opened.session, opened.segment.number) != (gone.session, gone.number)
                 });
-                peer.remove_segment(gone.number);
+                from.remove_segment(gone.number);
             }
         }
     }
@@ -93,15 +133,14 @@ impl Context {
     /// Maps what could not be mapped when it came, if it can be now.
     pub(super) fn hear_again(&self) {
         let unmapped = std::mem::take(&mut *self.unmapped());
-        unmapped.into_iter().for_each(|(opened, fd)| self.hear(News::Opened(opened, fd)));
+        for (from, opened, fd) in unmapped {
+            if let Some(from) = from.upgrade() {
+                self.hear(&from, News::Opened(opened, fd));
+            }
+        }
     }
 
-    fn known(&self, session: &SessionId) -> Option<Arc<PeerSession>> {
-        let peers = self.inner.peers.lock().unwrap_or_else(PoisonError::into_inner);
-        peers.get(session).and_then(|known| known.session.upgrade())
-    }
-
-    fn unmapped(&self) -> MutexGuard<'_, Vec<(SegmentOpened, PassedFd)>> {
+    fn unmapped(&self) -> MutexGuard<'_, Vec<Unmapped>> {
         self.inner.unmapped.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -143,15 +182,46 @@ impl Context {
         Gid::new(self.id(), self.inner.entities.fetch_add(1, Ordering::Relaxed))
     }
 
-    /// The context `id` as seen from this one.
+    /// A subscriber of this context is about to ask with `lane`.
+    pub(super) fn asking(&self, reader: Gid, lane: Location) -> Result<Asking<'_>, ShmError> {
+        self.own()?.insert(reader, Own { lane, granted: None });
+        Ok(Asking { context: self, reader })
+    }
+
+    /// This very context, if it has asked so.
+    pub(super) fn asked_itself(&self, reader: Gid, lane: Location) -> Result<Peer, ShmError> {
+        match self.own()?.get(&reader) {
+            Some(own) if own.lane == lane => Ok(self.local()),
+            _ => Err(ShmError::Refused { what: "no subscriber of this context asks for that" }),
+        }
+    }
+
+    /// A publisher of this context answers a subscriber of it.
+    pub(super) fn granted_itself(&self, granted: &Granted) -> Result<(), ShmError> {
+        if let Some(own) = self.own()?.get_mut(&granted.reader) {
+            own.granted = Some(*granted);
+        }
+        Ok(())
+    }
+
+    fn local(&self) -> Peer {
+        Peer::Local(Arc::clone(self.session()))
+    }
+
+    fn own(&self) -> Result<MutexGuard<'_, HashMap<Gid, Own>>, ShmError> {
+        // A thread of the parent may have held the lock when this process was forked.
+        if self.session().is_forked() {
+            return Err(ShmError::Forked);
+        }
+        Ok(self.inner.own.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// Another context, `id`, as seen from this one.
     pub(super) fn peer(
         &self,
         id: SessionId,
         descriptors: PeerDescriptors,
     ) -> Result<Peer, ShmError> {
-        if id == self.id() {
-            return Ok(Peer::Local(Arc::clone(self.session())));
-        }
         // A thread of the parent may have held the lock below when this process was forked.
         if self.session().is_forked() {
             return Err(ShmError::Forked);

@@ -170,6 +170,8 @@ impl Lines {
             Err(error) if !has_ring || matches!(error, ConnectError::Closed) => return Err(error),
             told => self.note(told.is_ok()),
         }
+        // Who asks once more hears over the new line alone.
+        state.lines.retain(|line| (line.reader, line.writer) != (reader, writer));
         state.lines.push(line);
         Ok(())
     }

@@ -119,13 +119,21 @@ impl Publisher {
     ) -> Result<(Granted, Peer), ConnectError> {
         let Asked { session, reader: gid, lane, qos } = asked;
         compatible(&self.qos, &qos).map_err(ConnectError::Incompatible)?;
-        let peer = self.context.peer(session, descriptors)?;
+        let peer = if session == self.context.id() {
+            self.context.asked_itself(gid, lane)?
+        } else {
+            self.context.peer(session, descriptors)?
+        };
         let stands_for = Vec::new();
         let info = ReaderInfo { gid, lane, qos, peer: peer.clone(), stands_for };
         let Grant { generation, first } = self.writer.attach(info)?;
         let (session, writer) = (self.context.id(), self.gid());
         let ring = self.writer.location();
-        Ok((Granted { reader: gid, session, writer, generation, first, ring }, peer))
+        let granted = Granted { reader: gid, session, writer, generation, first, ring };
+        if let Peer::Local(_) = peer {
+            self.context.granted_itself(&granted)?;
+        }
+        Ok((granted, peer))
     }
 
     /// Answers, and hands over the memory that is in use and, from then on, what comes into use.

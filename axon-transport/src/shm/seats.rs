@@ -89,7 +89,8 @@ impl Seats {
     ) -> Result<Tenancy, ShmError> {
         let session = peer.id();
         let same = |seat: &&Seat| {
-            seat.session == session && seat.at == at && seat.tenancy.is_asked(seat.words())
+            (seat.session, seat.reader, seat.at) == (session, reader, at)
+                && seat.tenancy.is_asked(seat.words())
         };
         if let Some(seat) = self.0.iter().find(same) {
             return Ok(seat.tenancy);

@@ -6,6 +6,8 @@ use std::{
     time::{Duration, Instant},
 };
 
+use rustix::net::{Shutdown, shutdown};
+
 use super::{
     ConnectError, Context, Grant, Meta, Peer, Reader, ReaderOptions, Sample, TakeError,
     connect::{Asked, Channel, line},
@@ -95,21 +97,26 @@ impl Subscriber {
         let lane = context.session().allocate_lane()?;
         let gid = context.next_gid();
         let asked = Asked { session: context.id(), reader: gid, lane: lane.location(), qos };
+        let asking = context.asking(gid, lane.location())?;
         let (ours, theirs) = line()?;
         channel.ask(&asked, &context.session().descriptors()?, &theirs)?;
         drop(theirs);
         let (granted, descriptors) = channel.await_granted(gid)?;
-        let peer = context.peer(granted.session, descriptors)?;
+        let peer = if granted.session == context.id() {
+            asking.answered(&granted)?
+        } else {
+            context.peer(granted.session, descriptors)?
+        };
         let ring = granted.ring;
         let mut kept = None;
         if let Peer::Remote(peer) = &peer {
             let channel = Channel::new(ours.as_fd(), timeout);
             // A ring that is not in the first segment: its own follows.
             while !peer.has_segment(ring.segment) {
-                context.hear(channel.take_news()?);
+                context.hear(peer, channel.take_news()?);
             }
             // Whoever has the other end decides what stands in it, and how long that takes to close.
-            kept = Some(PassedFd::connection(ours).trusted());
+            kept = Some(PassedFd::received(ours));
         }
         let reader = Reader::map(ReaderOptions {
             reader: gid,
@@ -168,10 +175,16 @@ impl Subscriber {
 
     /// Takes in what the publisher said of its memory.
     fn hear(&self) {
-        let Some(line) = &self.line else { return };
+        let (Some(line), Some(publisher)) = (&self.line, self.reader.peer().remote()) else {
+            return;
+        };
+        // What a child takes its parent never hears.
+        if self.context.session().is_forked() {
+            return;
+        }
         for _ in 0..NEWS {
             match Channel::new(line.as_fd(), Some(Duration::ZERO)).take_news() {
-                Ok(news) => self.context.hear(news),
+                Ok(news) => self.context.hear(publisher, news),
                 Err(_) => break,
             }
         }
@@ -239,6 +252,16 @@ impl Subscriber {
     /// Whether the publisher's process has ended: a system call. What it left can be taken still.
     pub fn publisher_ended(&self) -> bool {
         self.reader.writer_dead()
+    }
+}
+
+impl Drop for Subscriber {
+    fn drop(&mut self) {
+        // The publisher hears at once that nobody listens, so that what it says is not lost. A
+        // forked child's end of the line is its parent's, too.
+        if let (Some(line), false) = (&self.line, self.context.session().is_forked()) {
+            let _ = shutdown(line, Shutdown::Both);
+        }
     }
 }
 

@@ -24,28 +24,24 @@ impl Reader {
         if let Some(what) = self.corrupt {
             return Err(TakeError::Corrupt { writer: self.reads.writer, what });
         }
-        for _ in 0..ATTEMPTS {
-            match self.find_sane() {
-                Ok(found) => {
-                    if found.is_none() {
-                        // Nothing at the cursor needs it.
-                        self.missing = None;
-                    }
-                    return Ok(found);
-                }
-                Err(Obstacle::Missing(segment)) => {
-                    if !self.lacks(segment) {
-                        return Ok(None);
-                    }
-                    // None of what is there will ever be found.
-                    if let Err(what) = self.give_all_up() {
-                        return Err(self.corrupt(what));
-                    }
-                }
-                Err(Obstacle::Corrupt(what)) => return Err(self.corrupt(what)),
-            }
+        if self.given_up {
+            return Ok(None);
         }
-        Ok(None)
+        match self.find_sane() {
+            Ok(found) => {
+                if found.is_none() {
+                    // Nothing at the cursor needs it.
+                    self.missing = None;
+                }
+                Ok(found)
+            }
+            Err(Obstacle::Missing(segment)) if self.lacks(segment) => {
+                // None of what is there will ever be found.
+                self.give_all_up().map_err(|what| self.corrupt(what)).map(|()| None)
+            }
+            Err(Obstacle::Missing(_)) => Ok(None),
+            Err(Obstacle::Corrupt(what)) => Err(self.corrupt(what)),
+        }
     }
 
     fn find_sane(&mut self) -> Result<Option<Record>, Obstacle> {
@@ -245,9 +241,11 @@ impl Reader {
         missing.since.elapsed() >= MISSING && (self.ended || self.writer_dead())
     }
 
-    /// All that is published is lost.
+    /// All that is published is lost, and nothing else will be.
     fn give_all_up(&mut self) -> Result<(), &'static str> {
         let (_, head) = ring::bounds(self.attachment.ring())?;
+        self.given_up = true;
+        self.missing = None;
         self.lost += head.saturating_sub(self.cursor);
         self.advance(head.max(self.cursor));
         Ok(())

@@ -73,6 +73,8 @@ pub struct Reader {
     lost: u64,
     skipped: u64,
     corrupt: Option<&'static str>,
+    /// The publisher is gone, and its descriptors are in memory that never came.
+    given_up: bool,
 }
 
 /// Where a ring's descriptors were found.
@@ -159,6 +161,7 @@ impl Reader {
             lost: 0,
             skipped: 0,
             corrupt: None,
+            given_up: false,
             reads: Reads { writer, peer, grant, depth: depth(&qos), max_message, holds },
         })
     }
@@ -167,7 +170,7 @@ impl Reader {
     /// sample, and one that it seldom writes.
     pub fn has_data(&self) -> bool {
         // A publisher of the same session is not there in a forked child.
-        if self.corrupt.is_some() || self.attachment.lane.is_forked() {
+        if self.corrupt.is_some() || self.given_up || self.attachment.lane.is_forked() {
             return false;
         }
         if let Some(missing) = &self.missing {
@@ -200,7 +203,7 @@ impl Reader {
 
     /// How many samples are to be taken; at most the subscription's depth.
     pub fn unread(&self) -> u64 {
-        if self.attachment.lane.is_forked() {
+        if self.given_up || self.attachment.lane.is_forked() {
             return 0;
         }
         match (self.corrupt, ring::bounds(self.attachment.ring())) {
@@ -316,6 +319,11 @@ impl Reader {
     /// The publisher.
     pub fn writer(&self) -> Gid {
         self.reads.writer
+    }
+
+    /// The publisher's session.
+    pub(super) fn peer(&self) -> &Peer {
+        &self.reads.peer
     }
 
     /// The grant by which it reads.

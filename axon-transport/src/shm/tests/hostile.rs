@@ -385,6 +385,27 @@ fn a_segment_that_never_comes_holds_no_reader_for_ever() {
 }
 
 #[test]
+fn descriptors_that_never_come_are_given_up_once_the_writer_is_gone() {
+    let scribble = Scribble::new();
+    let mut reader = scribble.map_as(0, keep_last(2)).unwrap();
+    scribble.descriptor(0, 1, 0, 0);
+    scribble.set(RING + 8 * layout::ring::HEAD as u64, 1);
+    scribble.set_array(77 << 40 | ARRAY >> 7 << 6 | 4);
+    assert_eq!(reader.take(&mut Vec::new()), Ok(None));
+    assert_eq!((reader.missing(), reader.is_drained()), (Some(77), false));
+    reader.end();
+    let start = Instant::now();
+    while !reader.has_data() {
+        assert!(start.elapsed() < EVER, "it is hoped for without end");
+        std::thread::yield_now();
+    }
+    assert_eq!(reader.take(&mut Vec::new()), Ok(None));
+    assert_eq!((reader.lost(), reader.unread(), reader.missing()), (1, 0, None));
+    assert!(!reader.has_data() && reader.is_drained(), "who waits for it would not sleep again");
+    assert_eq!(reader.take(&mut Vec::new()), Ok(None));
+}
+
+#[test]
 fn a_sample_longer_than_the_reader_allows_is_lost_and_the_next_is_not() {
     let session = session();
     let gid = Gid::new(session.id(), 1);

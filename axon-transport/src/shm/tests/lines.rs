@@ -248,3 +248,103 @@ fn who_comes_first_with_anothers_id_is_not_taken_for_it() {
     drop(first);
     assert!(together(&publisher, &there, keep_last(1)).1.is_ok());
 }
+
+#[test]
+fn who_answers_as_ourselves_is_believed_only_what_we_granted() {
+    let (here, _) = contexts();
+    let ring = writer(here.session(), keep_last(5), MAX);
+    let (ours, theirs) = pair();
+    let options = SubscriberOptions::new(keep_last(5));
+    let refused = thread::scope(|scope| {
+        let subscriber = scope.spawn(|| Subscriber::connect(&here, theirs, options, SOON));
+        let channel = Channel::new(ours.as_fd(), SOON);
+        let (asked, descriptors, _line) = channel.await_asked().unwrap();
+        let (reader, session) = (asked.reader, here.id());
+        let (generation, first) = (1, 0);
+        let (writer, ring) = (ring.gid(), ring.location());
+        let granted = Granted { reader, session, writer, generation, first, ring };
+        channel.grant(&granted, &descriptors).unwrap();
+        subscriber.join().unwrap().map(drop)
+    });
+    assert!(matches!(refused, Err(ConnectError::Memory(ShmError::Refused { .. }))), "{refused:?}");
+}
+
+#[test]
+fn who_asks_as_ourselves_is_served_only_if_we_ask() {
+    let (here, _) = contexts();
+    let publisher = publisher(&here, keep_last(1));
+    let lane = here.session().allocate_lane().unwrap();
+    let (ours, theirs) = pair();
+    let (_line, far) = connect::line().unwrap();
+    let (session, reader) = (here.id(), Gid::new(here.id(), 77));
+    let asked = Asked { session, reader, lane: lane.location(), qos: keep_last(1) };
+    let descriptors = here.session().descriptors().unwrap();
+    Channel::new(theirs.as_fd(), SOON).ask(&asked, &descriptors, far).unwrap();
+    let served = publisher.serve(ours, SOON);
+    assert!(matches!(served, Err(ConnectError::Memory(ShmError::Refused { .. }))), "{served:?}");
+    assert!(publisher.subscribers().is_empty());
+    // Those that do ask are served, and leave nothing behind.
+    let mut subscriber = together(&publisher, &here, keep_last(1)).1.unwrap();
+    publisher.publish(b"own").unwrap();
+    assert_eq!(subscriber.recv(SOON).unwrap().unwrap().len(), 3);
+}
+
+#[test]
+fn what_one_publisher_says_of_anothers_memory_is_not_listened_to() {
+    let (here, there) = contexts();
+    let publisher = publisher(&here, keep_last(1));
+    let mut subscriber = together(&publisher, &there, keep_last(1)).1.unwrap();
+    publisher.publish(&pattern(1, 5000)).unwrap();
+    assert_eq!(subscriber.recv(SOON).unwrap().unwrap().len(), 5000);
+
+    let hostile = session();
+    let ring = writer(&hostile, keep_last(1), MAX);
+    let (line, mut other) = untold((&hostile, &ring), &there, None);
+    for number in 1..8 {
+        at_once(&line).withdraw(here.id(), number).unwrap();
+    }
+    // Memory of its own, as another's.
+    let forged = SessionSegment::create(here.id()).unwrap();
+    let segment = forged.open_samples(publisher.gid(), 2 * layout::ALIGN).unwrap();
+    let (info, fd) = forged.segment(segment.number()).unwrap().unwrap();
+    at_once(&line).hand(here.id(), info, fd.as_fd()).unwrap();
+    ring.publish(meta(1), &pattern(1, 5000)).unwrap();
+    assert!(other.take().unwrap().is_none(), "it is told nothing of its publisher's memory");
+
+    publisher.publish(&pattern(2, 5000)).unwrap();
+    let sample = subscriber.take().unwrap().expect("its memory is where it was");
+    let mut bytes = Vec::new();
+    sample.copy_to(&mut bytes).unwrap();
+    assert_eq!(bytes, pattern(2, 5000));
+}
+
+#[test]
+fn a_forked_child_cuts_no_line_of_its_parents_and_takes_nothing_from_it() {
+    let (here, there) = contexts();
+    let publisher = publisher(&here, keep_last(1));
+    let mut subscriber = together(&publisher, &there, keep_last(1)).1.unwrap();
+    // News of memory stands in the line when the process forks.
+    publisher.publish(&pattern(1, 5000)).unwrap();
+    // SAFETY: the child makes no call but what follows, which takes no lock that another thread may
+    // have held, and leaves by _exit.
+    let child = unsafe { libc::fork() };
+    if child == 0 {
+        subscriber.tend();
+        let idle = !subscriber.has_data();
+        drop(subscriber);
+        // SAFETY: ends the process without running anything else.
+        unsafe { libc::_exit(i32::from(!idle)) };
+    }
+    let mut status = -1;
+    // SAFETY: waits for the child just made; `status` outlives the call.
+    assert_eq!(unsafe { libc::waitpid(child, &mut status, 0) }, child);
+    assert_eq!(status, 0);
+    assert_eq!(subscriber.recv(SOON).unwrap().expect("the news are there").len(), 5000);
+    // And so is the line: more memory comes over it.
+    let _more = here.session().open_samples(publisher.gid(), 2 * layout::ALIGN).unwrap();
+    publisher.tend();
+    subscriber.tend();
+    let peer = there.peer(here.id(), here.session().descriptors().unwrap()).unwrap();
+    let numbers: Vec<u32> = here.session().segments().iter().map(|info| info.number).collect();
+    assert!(peer.remote().is_some_and(|peer| numbers.iter().all(|n| peer.has_segment(*n))));
+}
