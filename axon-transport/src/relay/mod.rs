@@ -1,12 +1,12 @@
 //! Sessions that share no memory: their samples pass through the daemon, over the session socket.
 //!
 //! To its daemon such a session is much what another host is. In its own process a registry and a
-//! gateway session of their own stand for the world outside ([`near`]): relays read what the
+//! gateway session of their own stand for the world outside (`near`): relays read what the
 //! application publishes, stand-ins write what it subscribes to, and all else works as with shared
 //! memory. In the daemon a session of the same id has the application's endpoints, in memory that
-//! everybody maps ([`far`]): to others, on this host and elsewhere, it is a session like any.
+//! everybody maps (`far`): to others, on this host and elsewhere, it is a session like any.
 //!
-//! [`flow`] is plain data: samples in pieces, and who may send how many of them. [`pipe`] moves them
+//! [`flow`] is plain data: samples in pieces, and who may send how many of them. `pipe` moves them
 //! over the socket (`docs/formats.md`, section 10).
 
 pub(crate) mod far;
