@@ -150,7 +150,7 @@ impl Common {
             match caller.connect() {
                 Ok(connected) => return Some(connected),
                 Err(SessionError::NoDaemon { .. }) => {}
-                Err(error) => tracing::error!(%error, "no daemon took this session"),
+                Err(error) => tracing::error!(%error, "no daemon took the session"),
             }
         }
         None
@@ -330,7 +330,7 @@ impl<'a> Served<'a> {
         daemons.iter().for_each(|daemon| self.common.house.outside_gone(daemon));
     }
 
-    /// Brings what the daemon knows of this session, and this session of the world, up to date.
+    /// Brings what the daemon knows of the session, and the session of the world, up to date.
     fn update(&mut self) -> Result<(), End> {
         self.tell_endpoints()?;
         self.update_relays();

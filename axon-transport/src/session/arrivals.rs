@@ -1,5 +1,5 @@
 //! Endpoints of others that the graph does not show yet: whoever counts one shall reach it, so it
-//! appears once every pair that it makes with this session's own endpoints stands.
+//! appears once every pair that it makes with the session's own endpoints stands.
 //!
 //! Plain data. None is held back for longer than [`PATIENCE`]: a stopped process must not hide what
 //! others may use.
@@ -57,7 +57,7 @@ impl Arrivals {
         self.arriving.remove(gid).map(|arriving| arriving.entry)
     }
 
-    /// An endpoint of this session's own is gone. Those that waited for nothing else.
+    /// An endpoint of the session's own is gone. Those that waited for nothing else.
     pub(super) fn own_gone(&mut self, own: &Gid) -> Vec<GraphEntry> {
         self.take_where(|arriving| {
             arriving.missing.retain(|pair| pair.reader != *own && pair.writer != *own);

@@ -1,4 +1,4 @@
-//! The graph as this session shows it, and what its own endpoints are to the others in it.
+//! The graph as the session shows it, and what its own endpoints are to the others in it.
 
 use std::{
     collections::{BTreeSet, HashSet},
@@ -90,7 +90,7 @@ impl Control {
         self.shared.notify(Some(&SessionEvent::Matched(own.gid)));
     }
 
-    /// An endpoint of this session is gone: nobody waits for its pairs.
+    /// An endpoint of the session is gone: nobody waits for its pairs.
     pub(super) fn own_gone(&mut self, gid: &Gid) {
         for entry in self.arrivals.own_gone(gid) {
             self.show(entry);
@@ -149,7 +149,7 @@ impl Control {
         }
     }
 
-    /// The pairs that an endpoint makes with this session's own and that do not stand yet.
+    /// The pairs that an endpoint makes with the session's own and that do not stand yet.
     fn missing(&self, other: &Endpoint) -> BTreeSet<Pair> {
         let state = self.shared.state();
         let mut missing = BTreeSet::new();
@@ -170,7 +170,7 @@ impl Control {
         missing
     }
 
-    /// Reports to this session's endpoints that one does not go with them, and, if it is of this
+    /// Reports to the session's endpoints that one does not go with them, and, if it is of this
     /// session, to it that others do not. Whoever comes second finds the first.
     fn relate(&self, endpoint: &Endpoint) {
         let here = self.own(&endpoint.topic);
@@ -205,7 +205,7 @@ impl Control {
         }
     }
 
-    /// This session's publishers and subscriptions of a topic.
+    /// The session's publishers and subscriptions of a topic.
     fn own(&self, topic: &str) -> Vec<Source> {
         let state = self.shared.state();
         let mut own = Vec::new();
