@@ -6,7 +6,7 @@ use std::ops::Range;
 use super::layout::LINE;
 
 /// The free ranges of an area.
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default)]
 pub(super) struct Area {
     /// Start and end in bytes, ascending, never touching each other.
     free: Vec<(u64, u64)>,

@@ -4,8 +4,9 @@ use std::sync::Arc;
 
 use super::{
     Grant, Peer, PeerSession, ReaderInfo, ShmError,
+    allowance::Pool,
     lane::{self, LaneView, Standing, Tenancy},
-    seats::{Holder, Seats},
+    seats::{Holder, Pinned, Seats},
 };
 use crate::{
     ids::Gid,
@@ -68,12 +69,12 @@ impl Attached {
 }
 
 impl Audience {
-    pub(super) fn new(offered: Qos, capacity: u64) -> Self {
+    pub(super) fn new(offered: Qos, capacity: u64, pool: Pool) -> Self {
         let mut audience = Self {
             offered,
             capacity,
             readers: Vec::new(),
-            seats: Seats::default(),
+            seats: Seats::new(pool),
             peers: Arc::new([]),
             window: 0,
         };
@@ -168,7 +169,7 @@ impl Audience {
 
     /// Adds to `found` the positions that any reader pins, after
     /// [`about_to_scan`](super::pins::about_to_scan).
-    pub(super) fn scan(&mut self, found: &mut Vec<u64>) {
+    pub(super) fn scan(&mut self, found: &mut Pinned) {
         self.seats.scan(found);
     }
 

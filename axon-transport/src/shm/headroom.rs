@@ -23,8 +23,18 @@ pub(super) fn check(needed: u64) -> Result<(), ShmError> {
     }
 }
 
+#[cfg(test)]
+thread_local! {
+    /// What a test has this thread believe to be available.
+    pub(super) static PRETENDED: std::cell::Cell<Option<u64>> = const { std::cell::Cell::new(None) };
+}
+
 /// Bytes available to this process, or `None` where the system does not tell.
 pub(super) fn available() -> Option<u64> {
+    #[cfg(test)]
+    if let Some(pretended) = PRETENDED.get() {
+        return Some(pretended);
+    }
     available_in(Path::new("/proc"), Path::new("/sys/fs/cgroup"))
 }
 

@@ -1,6 +1,6 @@
 //! Which samples of a ring stand, and how room is made for the next: plain data, no shared memory.
 
-use super::{blocks::Blocks, heap::Block, layout::Location, limbo::Limbo};
+use super::{blocks::Blocks, classes, heap::Block, layout::Location, limbo::Limbo};
 
 /// The samples that stand, oldest to newest, and what they take of memory.
 ///
@@ -149,6 +149,32 @@ impl History {
         Ok(true)
     }
 
+    /// Whether it would be in vain to give up samples for one of `len` bytes, as the budget asks for,
+    /// without more memory. Takes its time where samples differ in length.
+    pub(super) fn is_short_of(&self, len: u64) -> bool {
+        let alike = match self.extents[index(&self.extents, self.tail)] {
+            Extent::Slot { len: oldest, .. } => {
+                oldest >= len && classes::class(oldest) == classes::class(len)
+            }
+            Extent::Inline | Extent::Block(_) => false,
+        };
+        self.placed > 1 && self.used + len > self.budget && !alike && !self.would_hold(len, false)
+    }
+
+    /// Whether there would be a slot of `len` bytes if all samples were given up but one, and nothing
+    /// that readers keep: with no more memory than there is, unless it can `grow`. Takes its time.
+    pub(super) fn would_hold(&self, len: u64, grow: bool) -> bool {
+        let placed = (self.tail..self.head)
+            .map(|position| self.extents[index(&self.extents, position)])
+            .filter(|extent| *extent != Extent::Inline)
+            .take(self.placed.saturating_sub(1) as usize);
+        let slots = placed.filter_map(|extent| match extent {
+            Extent::Slot { at, len } => Some((at, len)),
+            Extent::Inline | Extent::Block(_) => None,
+        });
+        self.pinned.would_hold(len, slots, grow)
+    }
+
     /// Takes `len` bytes that nobody reads for a loan.
     pub(super) fn lend(&mut self, len: u64) -> Option<Location> {
         let at = self.pinned.lend(len)?;
@@ -220,7 +246,7 @@ mod tests {
         for position in 0..100 {
             history.make_place(|_| true).unwrap();
             history.make_room(max, |_| true).unwrap();
-            history.pinned().reclaim(|_| false);
+            history.pinned().reclaim(|_, _| false);
             let at = history.lend(max).unwrap();
             if position > 0 {
                 assert!(history.tail() < position, "the last one stands");
@@ -253,11 +279,11 @@ mod tests {
         history.release_below(1);
         let second = history.lend(size).unwrap();
         assert_ne!(first, second, "nobody has looked at the pins");
-        history.pinned().reclaim(|pinned| pinned == position);
+        history.pinned().reclaim(|pinned, _| pinned == position);
         assert_eq!(history.lend(size), None);
         assert_eq!(history.pinned().retired().collect::<Vec<_>>(), [position]);
         assert_eq!(history.pinned().loans(), 1);
-        history.pinned().reclaim(|_| false);
+        history.pinned().reclaim(|_, _| false);
         assert_eq!(history.lend(size), Some(first));
     }
 

@@ -9,6 +9,7 @@ use std::sync::{Arc, atomic::AtomicU64};
 
 use super::{
     Grant, SessionSegment,
+    allowance::Allowance,
     heap::Object,
     layout::{
         self, LANE_WORDS, Location,
@@ -54,10 +55,15 @@ pub(super) struct Tenancy {
 
 impl Tenancy {
     /// Publisher: gives a generation to the reader that asked with this lane.
-    pub(super) fn grant<W: Word>(lane: &[W]) -> Self {
+    pub(super) fn grant<W: Word>(lane: &[W], allowance: Allowance) -> Self {
         let asked = lane[GENERATION].load(Site::GenerationLoad.order());
-        let generation = rand::random_range(1..ASKED >> 24) << 24 | asked & TIME;
-        Self { asked, generation }
+        let random = rand::random_range(1..ASKED >> 30) << 30;
+        Self { asked, generation: random | allowance.bits() | asked & TIME }
+    }
+
+    /// What its reader may pin.
+    pub(super) fn allowance(&self) -> Allowance {
+        Allowance::of(self.generation)
     }
 
     /// Publisher: whether the lane is as it was when the reader asked.

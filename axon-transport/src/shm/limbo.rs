@@ -7,7 +7,7 @@ use super::{layout::Location, slots::Slots};
 
 /// Who has which bytes of which segments. One at a time takes samples in; those that have been
 /// left are [vacated](Self::vacated) once the last of theirs has gone.
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default)]
 pub(super) struct Limbo {
     /// The one that takes samples in is the last of them.
     stores: Vec<Store>,
@@ -17,14 +17,14 @@ pub(super) struct Limbo {
 }
 
 /// One segment.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 struct Store {
     number: u32,
     slots: Slots,
     left: bool,
 }
 
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 struct Retired {
     position: u64,
     at: Location,
@@ -59,7 +59,7 @@ impl Limbo {
         self.stores.iter().map(|store| store.number)
     }
 
-    /// A place that nobody reads.
+    /// A place that nobody reads, where samples are taken in.
     pub(super) fn take(&mut self, len: u64) -> Option<Location> {
         let store = self.stores.last_mut().filter(|store| !store.left)?;
         let offset = store.slots.take(len)?;
@@ -76,11 +76,34 @@ impl Limbo {
         slots(&mut self.stores, at).forgo(at.offset, len);
     }
 
-    /// A place that nobody reads, for a loan.
+    /// A place that nobody reads, for a loan: in a segment that was left only if nowhere else.
     pub(super) fn lend(&mut self, len: u64) -> Option<Location> {
-        let at = self.take(len)?;
+        let at = self.take(len).or_else(|| {
+            let mut left = self.stores.iter_mut().filter(|store| store.left);
+            left.find_map(|store| {
+                let offset = store.slots.take(len)?;
+                Some(Location { segment: store.number, offset })
+            })
+        })?;
         self.loans += 1;
         Some(at)
+    }
+
+    /// Whether there would be room for `len` bytes if these samples were given up, and nothing that
+    /// readers keep: with no more memory than there is, unless it can `grow`.
+    pub(super) fn would_hold(
+        &self,
+        len: u64,
+        samples: impl Iterator<Item = (Location, u64)>,
+        grow: bool,
+    ) -> bool {
+        let mut stores = self.stores.clone();
+        for (at, len) in samples {
+            slots(&mut stores, at).release(at.offset, len);
+        }
+        stores.iter_mut().any(|Store { slots, .. }| {
+            slots.take(len).is_some_and(|at| grow || slots.end(at, len) <= slots.backed())
+        })
     }
 
     /// The loan was not published.
@@ -107,10 +130,10 @@ impl Limbo {
 
     /// Frees what no reader pins. The tail must have been raised above all that is here before
     /// the pins were looked at.
-    pub(super) fn reclaim(&mut self, pinned: impl Fn(u64) -> bool) {
+    pub(super) fn reclaim(&mut self, pinned: impl Fn(u64, u64) -> bool) {
         let stores = &mut self.stores;
         self.retired.retain(|retired| {
-            let keep = pinned(retired.position);
+            let keep = pinned(retired.position, retired.len);
             if !keep {
                 slots(stores, retired.at).release(retired.at.offset, retired.len);
             }
@@ -160,10 +183,10 @@ mod tests {
         assert!(limbo.vacated().is_empty());
 
         limbo.retire(7, sample, LEN);
-        limbo.reclaim(|position| position == 7);
+        limbo.reclaim(|position, _| position == 7);
         limbo.give_back(loan, LEN);
         assert!(limbo.vacated().is_empty(), "a reader is still at it");
-        limbo.reclaim(|_| false);
+        limbo.reclaim(|_, _| false);
         assert_eq!(limbo.vacated(), [1]);
         assert_eq!(limbo.segments().collect::<Vec<_>>(), [2]);
     }
@@ -176,6 +199,21 @@ mod tests {
         assert!(limbo.vacated().is_empty());
         limbo.leave();
         assert!(limbo.extent().is_none());
-        assert_eq!((limbo.lend(LEN), limbo.vacated()), (None, vec![1]));
+        assert_eq!((limbo.take(LEN), limbo.vacated()), (None, vec![1]));
+        assert_eq!(limbo.lend(LEN), None);
+    }
+
+    #[test]
+    fn a_segment_that_was_left_helps_out_while_it_is_there() {
+        let mut limbo = Limbo::default();
+        limbo.open(1, 0..2 * LEN);
+        let kept = limbo.lend(LEN).unwrap();
+        limbo.open(2, 0..LEN);
+        let places = [(); 3].map(|()| limbo.lend(LEN).map(|at| at.segment));
+        assert_eq!(places, [Some(2), Some(1), None]);
+        assert!(limbo.would_hold(LEN, [(kept, LEN)].into_iter(), true));
+        assert!(!limbo.would_hold(LEN, [(kept, LEN)].into_iter(), false), "it is not backed");
+        assert!(!limbo.would_hold(LEN, std::iter::empty(), true));
+        assert_eq!(limbo.loans(), 3, "to ask takes nothing");
     }
 }

@@ -61,6 +61,7 @@
 #[cfg(not(all(target_pointer_width = "64", target_endian = "little")))]
 compile_error!("rings are laid out for 64-bit little-endian machines");
 
+mod allowance;
 mod area;
 mod atfork;
 mod attachment;

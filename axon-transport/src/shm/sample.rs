@@ -16,7 +16,8 @@ use super::{Meta, Taken, attachment::Pin, memory::Map, ring};
 /// It stays as it was published for as long as this value lives, also after the subscription, the
 /// publisher and its process have ended; only then may the publisher use the memory again, which
 /// it never waits for. A subscription can have five such samples of one publisher; a sixth is
-/// copied. It may be read and dropped by any thread.
+/// copied, and so is one that is longer than its share of what the publisher can spare. It may be
+/// read and dropped by any thread.
 ///
 /// A publisher in another process that does not keep to the protocol can still change the bytes.
 /// They are therefore read as values ([`read_at`](Self::read_at), [`copy_to`](Self::copy_to),

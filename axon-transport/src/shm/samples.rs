@@ -9,9 +9,10 @@ use std::{
 use super::{
     PublishError, ShmError, Writer,
     history::Held,
-    layout::{self, COPIED, SLOTS_AT},
+    layout::{self, COPIED, Location, SLOTS_AT},
     loan::Place,
     pins::{self, RECORDS},
+    ring,
     room::{Kept, Refusal, no_memory},
     seats::Holder,
     segments::{OwnSegment, SegmentEvent},
@@ -32,16 +33,14 @@ pub(super) struct Samples {
     ahead: Option<u64>,
 }
 
-impl Samples {
-    /// Backs it with memory up to `end`, a little further when it keeps growing. Up to where.
-    fn back(&self, backed: u64, end: u64) -> Result<u64, PublishError> {
-        let ahead = backed + ((backed - SLOTS_AT) / 8).min(AHEAD);
-        let memory = &self.segment.memory;
-        let upto = end.max(ahead).next_multiple_of(layout::ALIGN).min(memory.bytes());
-        memory.commit(backed, upto).map_err(no_memory)?;
-        memory.touch(backed, upto);
-        Ok(upto)
-    }
+/// Backs a segment with memory up to `end`, a little further when it keeps growing. Up to where.
+fn back(segment: &OwnSegment, backed: u64, end: u64) -> Result<u64, PublishError> {
+    let ahead = backed + ((backed - SLOTS_AT) / 8).min(AHEAD);
+    let memory = &segment.memory;
+    let upto = end.max(ahead).next_multiple_of(layout::ALIGN).min(memory.bytes());
+    memory.commit(backed, upto).map_err(no_memory)?;
+    memory.touch(backed, upto);
+    Ok(upto)
 }
 
 impl Writer {
@@ -140,28 +139,59 @@ impl Writer {
         // What all readers have taken goes first: its memory is the warmest.
         let consumed = state.audience.consumed(state.history.head());
         state.history.release_below(floors.retained.max(consumed));
-        state.history.make_room(bytes, may_go)?;
         let mut short = None;
+        if state.history.is_short_of(bytes) {
+            // It takes more memory in any case, so that is had before anything is given up for it.
+            self.reclaim(state);
+            match self.place(state, bytes, true) {
+                Ok(Some(place)) => {
+                    return match state.history.make_room(0, may_go) {
+                        Ok(()) => Ok(place),
+                        Err(held) => {
+                            let at = Location { segment: place.segment.number(), offset: place.at };
+                            state.history.give_back(at, bytes);
+                            Err(held.into())
+                        }
+                    };
+                }
+                Ok(None) => {}
+                Err(error) => short = Some(error),
+            }
+        }
+        if short.is_none() {
+            state.history.make_room(bytes, may_go)?;
+        }
+        let mut worthwhile = None;
         for look in 0.. {
             self.reclaim(state);
             // Asked once: from then on only memory that there is.
             match self.place(state, bytes, short.is_none()) {
                 Ok(Some(place)) => return Ok(place),
                 Ok(None) => {}
-                Err(error) => short = Some(error),
+                Err(error) => {
+                    short = Some(error);
+                    worthwhile = None;
+                }
             }
             let kept: Vec<u64> = state.history.pinned().retired().collect();
             // Readers keep what there is of it, which is their right.
             let segments = state.history.pinned().segments().len();
             if short.is_none() && !kept.is_empty() && segments < SEGMENTS {
-                self.open_another(state).map_err(no_memory)?;
+                match self.open_another(state).map_err(no_memory) {
+                    Ok(()) => {}
+                    Err(error) => short = Some(error),
+                }
                 continue;
             }
-            // What stands lower may be large enough, or backed already.
-            match state.history.shrink(may_go) {
-                Ok(true) => continue,
-                Err(Held) if short.is_none() => return Err(Refusal::Held),
-                Ok(false) | Err(Held) => {}
+            // What stands lower may be large enough, or backed already. But nothing is given up for
+            // a sample that not even all of it makes room for.
+            let history = &mut state.history;
+            if *worthwhile.get_or_insert_with(|| history.would_hold(bytes, short.is_none())) {
+                match history.shrink(may_go) {
+                    Ok(true) => continue,
+                    Err(Held) if short.is_none() => return Err(Refusal::Held),
+                    Ok(false) | Err(Held) => {}
+                }
             }
             if kept.is_empty() {
                 let loans = state.history.pinned().loans();
@@ -192,8 +222,16 @@ impl Writer {
         let Some(at) = history.lend(bytes) else { return Ok(None) };
         let slots = history.pinned().slots(at);
         let end = slots.end(at.offset, bytes);
+        let is_open = at.segment == samples.segment.number();
+        let segment = match is_open {
+            true => Arc::clone(&samples.segment),
+            false => self.session.own(at.segment).expect("a segment that was left is not closed"),
+        };
         if end > slots.backed() {
-            let backed = if grow { samples.back(slots.backed(), end).map(Some) } else { Ok(None) };
+            let backed = match grow {
+                true => back(&segment, slots.backed(), end).map(Some),
+                false => Ok(None),
+            };
             match backed {
                 Ok(Some(upto)) => slots.back(upto),
                 other => {
@@ -202,12 +240,16 @@ impl Writer {
                 }
             }
         }
-        samples.tenure.used(slots.used());
-        if samples.ahead.is_none() && !slots.has_another(bytes) {
-            samples.ahead = Some(bytes);
-            self.session.tell(SegmentEvent::Low(self.gid()));
+        if is_open {
+            samples.tenure.used(slots.used());
+            if samples.ahead.is_none() && !slots.has_another(bytes) {
+                samples.ahead = Some(bytes);
+                self.session.tell(SegmentEvent::Low(self.gid()));
+            }
         }
-        Ok(Some(Place { segment: Arc::clone(&samples.segment), at: at.offset }))
+        // Readers that copy without a pin find out by this that it is written over.
+        ring::about_to_write::<AtomicU64>();
+        Ok(Some(Place { segment, at: at.offset }))
     }
 
     /// Frees what was given up and is not read by anybody.
@@ -215,10 +257,9 @@ impl Writer {
         if state.history.pinned().retired().len() > 0 {
             self.show_tail(state);
             pins::about_to_scan::<AtomicU64>();
-            let State { history, audience, found, .. } = state;
-            found.clear();
-            audience.scan(found);
-            history.pinned().reclaim(|position| found.contains(&position));
+            let State { history, audience, pinned, .. } = state;
+            pinned.refresh(|pinned| audience.scan(pinned));
+            history.pinned().reclaim(|position, len| pinned.keeps(position, len));
         }
         self.close_vacated(state);
     }

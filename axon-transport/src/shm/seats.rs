@@ -5,6 +5,7 @@ use std::sync::{Arc, atomic::AtomicU64};
 
 use super::{
     Peer, PeerSession, ShmError,
+    allowance::{Allowance, Pool},
     lane::{LaneView, Standing, Tenancy},
     layout::{LANE_WORDS, Location},
     pins,
@@ -12,18 +13,39 @@ use super::{
 };
 use crate::ids::{Gid, SessionId};
 
-/// Lanes of one other process at most: each pins up to six samples, which their publisher then does
-/// without for as long as that process likes.
-pub(super) const OF_PROCESS: usize = 256;
+/// Lanes of one other process at most, each of which a publish may have to look at. What may be
+/// pinned over them is [bounded](super::allowance) apart from it.
+pub(super) const OF_PROCESS: usize = 1024;
+
+/// What readers pin: positions, and the longest sample that each pin keeps.
+#[derive(Default)]
+pub(super) struct Pinned(Vec<(u64, u64)>);
+
+impl Pinned {
+    /// Finds out anew, by `look`.
+    pub(super) fn refresh(&mut self, look: impl FnOnce(&mut Self)) {
+        self.0.clear();
+        look(self);
+        self.0.sort_unstable();
+    }
+
+    /// Whether a sample of `len` bytes is kept.
+    pub(super) fn keeps(&self, position: u64, len: u64) -> bool {
+        // The pin of it that keeps the longest comes last.
+        let end = self.0.partition_point(|(pinned, _)| *pinned <= position);
+        self.0[..end].last().is_some_and(|pin| pin.0 == position && len <= pin.1)
+    }
+}
 
 /// Adds to `found` the positions that a reader pins, and says how it stands. After
 /// [`pins::about_to_scan`].
 #[inline]
-pub(super) fn scan<W: Word>(tenancy: &Tenancy, lane: &[W], found: &mut Vec<u64>) -> Standing {
+pub(super) fn scan<W: Word>(tenancy: &Tenancy, lane: &[W], found: &mut Pinned) -> Standing {
     let standing = tenancy.standing(lane);
+    let longest = tenancy.allowance().longest();
     // One that has not seen its grant pins nothing, and one that does from now on sees the tail.
-    if standing == Standing::Open {
-        found.extend(pins::scan(lane));
+    if standing == Standing::Open && longest > 0 {
+        found.0.extend(pins::scan(lane).map(|position| (position, longest)));
     }
     standing
 }
@@ -70,10 +92,17 @@ impl Seat {
 
 /// All lanes to which a grant was given, until they say that their reader has left, or its process
 /// has ended. That a reader is detached, by whomever, ends nothing here: it may hold samples still.
-#[derive(Default)]
-pub(super) struct Seats(Vec<Seat>);
+pub(super) struct Seats {
+    all: Vec<Seat>,
+    /// What they may keep.
+    pool: Pool,
+}
 
 impl Seats {
+    pub(super) fn new(pool: Pool) -> Self {
+        Self { all: Vec::new(), pool }
+    }
+
     /// Takes in the reader that asks with the lane that `peer` has `at` some place, before it hears
     /// of its grant. As long as the lane stays as it is, the answer does, so that whoever asks for
     /// ever adds nothing.
@@ -92,27 +121,33 @@ impl Seats {
             (seat.session, seat.reader, seat.at) == (session, reader, at)
                 && seat.tenancy.is_asked(seat.words())
         };
-        if let Some(seat) = self.0.iter().find(same) {
+        if let Some(seat) = self.all.iter().find(same) {
             return Ok(seat.tenancy);
         }
+        let mut allowance = Allowance::ALL;
         if let Some(peer) = peer.remote() {
             let akin = |seat: &&Seat| seat.peer.as_ref().is_some_and(|p| p.is_akin_to(peer));
             let is_full = |seats: &[Seat]| seats.iter().filter(akin).count() >= OF_PROCESS;
             // Some may have left.
-            if is_full(&self.0) && (!self.sweep(|_| true) || is_full(&self.0)) {
+            self.sweep(|_| false);
+            if is_full(&self.all) && (!self.sweep(|_| true) || is_full(&self.all)) {
                 let what = "its process has as many readers of one publisher as it may";
                 return Err(ShmError::Refused { what });
             }
+            let cost = |seat: &Seat| self.pool.cost(seat.tenancy.allowance());
+            let others = self.all.iter().filter(|seat| seat.peer.is_some());
+            let taken = others.map(cost).sum();
+            allowance = self.pool.share(taken, self.all.iter().filter(akin).map(cost).sum());
         }
-        let tenancy = Tenancy::grant(lane.words());
+        let tenancy = Tenancy::grant(lane.words(), allowance);
         let peer = peer.remote().cloned();
-        self.0.push(Seat { reader, session, peer, at, lane: lane.clone(), tenancy });
+        self.all.push(Seat { reader, session, peer, at, lane: lane.clone(), tenancy });
         Ok(tenancy)
     }
 
     /// Adds to `found` the positions that are pinned, after [`pins::about_to_scan`].
-    pub(super) fn scan(&mut self, found: &mut Vec<u64>) {
-        self.0.retain(|seat| scan(&seat.tenancy, seat.words(), found) != Standing::Left);
+    pub(super) fn scan(&mut self, found: &mut Pinned) {
+        self.all.retain(|seat| scan(&seat.tenancy, seat.words(), found) != Standing::Left);
     }
 
     /// A reader that pins one of `positions`.
@@ -121,7 +156,7 @@ impl Seats {
             seat.standing() == Standing::Open
                 && pins::scan(seat.words()).any(|position| positions.contains(&position))
         };
-        self.0
+        self.all
             .iter()
             .find(holds)
             .map(|seat| Holder { reader: seat.reader, peer: seat.peer.clone() })
@@ -130,18 +165,18 @@ impl Seats {
     /// Forgets those that have left, and those of `suspects` whose process has ended. Whether
     /// there were any.
     pub(super) fn sweep(&mut self, suspect: impl Fn(&Seat) -> bool) -> bool {
-        let before = self.0.len();
-        self.0
+        let before = self.all.len();
+        self.all
             .retain(|seat| seat.standing() != Standing::Left && !(suspect(seat) && seat.is_dead()));
-        self.0.len() != before
+        self.all.len() != before
     }
 
     pub(super) fn is_empty(&self) -> bool {
-        self.0.is_empty()
+        self.all.is_empty()
     }
 
     #[cfg(test)]
     pub(super) fn len(&self) -> usize {
-        self.0.len()
+        self.all.len()
     }
 }

@@ -275,6 +275,11 @@ impl SessionSegment {
         self.segments.open(SegmentKind::Samples(gid), bytes)
     }
 
+    /// A segment of this session.
+    pub(super) fn own(&self, number: u32) -> Option<Arc<OwnSegment>> {
+        self.segments.get(number)
+    }
+
     /// Nobody reads a segment of large samples any more.
     pub(super) fn close_samples(&self, number: u32) {
         self.segments.close(number);

@@ -17,7 +17,7 @@ use super::{
 const HELPERS: usize = 4;
 
 /// The slots of one segment.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct Slots {
     /// Free slots by class, the one that came back last on top.
     free: Vec<Vec<u64>>,

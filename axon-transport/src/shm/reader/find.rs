@@ -187,6 +187,11 @@ impl Reader {
         }
     }
 
+    /// Whether a pin keeps the sample in place; else it is copied as one in a block is.
+    pub(super) fn may_pin(&self, record: &Record) -> bool {
+        u64::from(record.len) <= self.reads.in_place
+    }
+
     /// Copies the payload at the cursor; false when the publisher was faster.
     pub(super) fn copy_out(
         &self,
@@ -203,11 +208,12 @@ impl Reader {
         match bytes {
             Bytes::Inline => copy(view.inline(self.cursor))?,
             Bytes::Block(map, words) => copy(&map.words()[words.clone()])?,
-            Bytes::Slot(map, words) => {
+            Bytes::Slot(map, words) if self.may_pin(record) => {
                 let copy = || copy(&map.words()[words.clone()]);
                 let pinned = self.attachment.while_pinned(self.cursor, copy);
                 return pinned.transpose().map(|copied| copied.is_some());
             }
+            Bytes::Slot(map, words) => copy(&map.words()[words.clone()])?,
         }
         Ok(view.stands(self.cursor))
     }
@@ -264,6 +270,6 @@ pub(super) enum Bytes {
     Inline,
     /// To be copied, and checked afterwards.
     Block(Arc<Map>, Range<usize>),
-    /// To be pinned.
+    /// To be pinned, if the reader [may](Reader::may_pin).
     Slot(Arc<Map>, Range<usize>),
 }

@@ -11,6 +11,7 @@ use std::{
 use self::find::Bytes;
 use super::{
     Grant, Lane, Location, Meta, Peer, Sample, ShmError, TakeError, Taken,
+    allowance::Allowance,
     attachment::{Attachment, Pinning},
     audience::{depth, holds},
     layout,
@@ -114,6 +115,8 @@ struct Reads {
     grant: Grant,
     depth: u64,
     max_message: u64,
+    /// The longest sample that may be pinned, in bytes.
+    in_place: u64,
     /// Whether a publisher may wait for it.
     holds: bool,
 }
@@ -145,6 +148,7 @@ impl Reader {
         }
         lane.open(grant, reader);
         let holds = holds(&qos) && peer.remote().is_some();
+        let (depth, in_place) = (depth(&qos), Allowance::of(grant.generation).longest());
         let attachment = Attachment::new(map, words, lane);
         if let Some(session) = peer.remote() {
             session.keep_told(&attachment);
@@ -162,7 +166,7 @@ impl Reader {
             skipped: 0,
             corrupt: None,
             given_up: false,
-            reads: Reads { writer, peer, grant, depth: depth(&qos), max_message, holds },
+            reads: Reads { writer, peer, grant, depth, max_message, in_place, holds },
         })
     }
 
@@ -259,7 +263,9 @@ impl Reader {
     pub fn take_sample(&mut self) -> Result<Option<Sample>, TakeError> {
         for _ in 0..ATTEMPTS {
             let Some((record, bytes)) = self.find_whole()? else { break };
-            if let Bytes::Slot(map, words) = &bytes {
+            if let Bytes::Slot(map, words) = &bytes
+                && self.may_pin(&record)
+            {
                 match self.attachment.pin(self.cursor) {
                     Pinning::Pinned(pin) => {
                         let len = record.len as usize;

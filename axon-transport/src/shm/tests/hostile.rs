@@ -19,6 +19,8 @@ const RING: u64 = layout::HEAP_AT;
 const ARRAY: u64 = RING + 512;
 const SLOTS: u64 = 16;
 const BLOCK: u64 = 32 << 10;
+/// Of a generation: samples of any length may be pinned.
+const ALL: u64 = 63 << 24;
 
 /// A session whose every word a test may scribble on, with a ring in it.
 struct Scribble {
@@ -40,7 +42,7 @@ impl Scribble {
         let array = layout::Array { at, descriptors: SLOTS };
         let ring = &segment.words()[RING as usize / 8..][..layout::RING_WORDS];
         layout::write_ring(ring, gid, &array);
-        Self { segment, id, gid, reader: session(), generation: 1 }
+        Self { segment, id, gid, reader: session(), generation: ALL | 1 }
     }
 
     fn words(&self) -> &[AtomicU64] {

@@ -168,11 +168,12 @@ fn samples_in_use_hold_no_publisher() {
 #[test]
 fn memory_that_readers_keep_is_named_and_comes_back() {
     const LEN: usize = 1 << 16;
-    let (a, b) = (session(), session());
+    // The publisher's own session may keep what it likes.
+    let a = session();
     let (gid, max_message) = (Gid::new(a.id(), 1), LEN as u64);
     let options = RingOptions { gid, qos: keep_last(1), budget: 0, max_message, expected: 0 };
     let writer = Writer::create(a.clone(), options).unwrap();
-    let mut readers: Vec<_> = (0..60).map(|_| attach(&writer, &a, &b, keep_last(1))).collect();
+    let mut readers: Vec<_> = (0..60).map(|_| attach(&writer, &a, &a, keep_last(1))).collect();
     let mut kept = Vec::new();
     let mut sequence = 0;
     let mut error = None;
@@ -198,6 +199,57 @@ fn memory_that_readers_keep_is_named_and_comes_back() {
     publish(&writer, sequence, 4096);
     kept.clear();
     publish(&writer, sequence + 1, LEN);
+}
+
+#[test]
+fn readers_of_other_processes_leave_room_whatever_they_pin() {
+    const LEN: usize = 1 << 16;
+    let (a, b) = (session(), session());
+    let (gid, max_message) = (Gid::new(a.id(), 1), LEN as u64);
+    let options = RingOptions { gid, qos: keep_last(1), budget: 0, max_message, expected: 0 };
+    let writer = Writer::create(a.clone(), options).unwrap();
+    // One half keeps to the protocol, and as much as it can; the other pins whatever there is.
+    let pair = || [(); 2].map(|()| attach(&writer, &a, &b, keep_last(1))).into();
+    let (mut readers, hostile): (Vec<_>, Vec<_>) = (0..100).map(|_| -> (_, _) { pair() }).unzip();
+    let view = peer(&b, &b);
+    let lanes: Vec<_> = hostile.iter().map(|reader| view.lane(reader.lane()).unwrap()).collect();
+    let mut kept = Vec::new();
+    for sequence in 0..600u64 {
+        let len = if sequence % 3 == 0 { LEN } else { 5000 + 97 * sequence as usize };
+        publish(&writer, sequence, len);
+        let pins = &lanes[sequence as usize / 6].words()[layout::lane::PINS..];
+        pins[sequence as usize % 6].store(sequence + 1, Relaxed);
+        if sequence < 500 {
+            kept.push(take(&mut readers[sequence as usize / 5]));
+        }
+    }
+    kept.iter().for_each(intact);
+    assert!(kept[..5].iter().all(Sample::is_borrowed), "the first keeps what it likes");
+    assert!(!kept.iter().all(Sample::is_borrowed));
+}
+
+#[test]
+fn a_sample_that_may_not_be_pinned_is_copied_whole_or_not_at_all() {
+    const LEN: usize = 1 << 16;
+    let (a, b) = (session(), session());
+    let (gid, max_message) = (Gid::new(a.id(), 1), LEN as u64);
+    let options = RingOptions { gid, qos: keep_last(1), budget: 0, max_message, expected: 0 };
+    let writer = Writer::create(a.clone(), options).unwrap();
+    let _others = [(); 2].map(|()| attach(&writer, &a, &b, keep_last(1)));
+    let mut reader = attach(&writer, &a, &b, keep_last(1));
+    let total = 5000;
+    thread::scope(|scope| {
+        scope.spawn(|| (0..total).for_each(|sequence| publish(&writer, sequence, LEN)));
+        let mut last = None;
+        while last != Some(total - 1) {
+            await_data(&b, &reader);
+            let Some(sample) = reader.take_sample().unwrap() else { continue };
+            assert!(!sample.is_borrowed());
+            intact(&sample);
+            last = Some(sample.meta().sequence);
+        }
+    });
+    assert_eq!(reader.received() + reader.skipped() + reader.lost(), total);
 }
 
 #[test]

@@ -222,13 +222,13 @@ fn a_slot_is_ready_ahead_of_the_next_sample() {
 
 #[test]
 fn readers_that_keep_all_they_can_are_given_way_and_named_at_the_end() {
-    let (a, b) = (session(), session());
+    let a = session();
     let writer = writer(&a, keep_last(1), 0);
     let mut kept = Vec::new();
     let mut sequence = 0;
-    // More than the first segment has room for.
+    // More than the first segment has room for, of which their own session may keep all.
     for _ in 0..8 {
-        let mut reader = attach(&writer, &a, &b, keep_last(1));
+        let mut reader = attach(&writer, &a, &a, keep_last(1));
         for _ in 0..5 {
             publish(&writer, sequence, MAX as usize);
             kept.push(reader.take_sample().unwrap().unwrap());
@@ -242,6 +242,31 @@ fn readers_that_keep_all_they_can_are_given_way_and_named_at_the_end() {
     publish(&writer, sequence, MAX as usize);
     assert!(tend(&writer, Instant::now(), 1));
     assert_eq!(samples_of(&a).len(), 1, "the others went with what was kept in them");
+}
+
+#[test]
+fn nothing_is_given_up_for_a_sample_that_there_is_no_memory_for() {
+    let (a, b) = (session(), session());
+    let qos = transient(keep_last(5));
+    let writer = writer(&a, qos, 1 << 20);
+    for sequence in 0..5 {
+        publish(&writer, sequence, IMAGE);
+    }
+    let standing = |expected: &[u64]| {
+        let mut late = attach(&writer, &a, &b, qos);
+        let taken = std::iter::from_fn(|| late.take_sample().unwrap());
+        let sequences: Vec<u64> = taken.map(|sample| sample.meta().sequence).collect();
+        assert_eq!(sequences, expected);
+    };
+    headroom::PRETENDED.set(Some(0));
+    // The budget is full, so that all but one would go for it.
+    let refused = writer.loan(MAX as usize).map(drop);
+    assert!(matches!(refused, Err(PublishError::NoMemory { .. })), "{refused:?}");
+    standing(&[0, 1, 2, 3, 4]);
+    // What stands makes room for its like.
+    publish(&writer, 5, IMAGE);
+    publish(&writer, 6, IMAGE);
+    standing(&[2, 3, 4, 5, 6]);
 }
 
 #[test]

@@ -7,6 +7,7 @@ use std::{sync::Arc, time::Duration};
 use super::{
     Grant, Loan, Location, Meta, PublishError, Published, ReaderInfo, RingOptions, SessionSegment,
     ShmError,
+    allowance::Pool,
     area::Area,
     audience::Audience,
     heap::{Need, Object},
@@ -17,6 +18,7 @@ use super::{
     ring,
     room::Maps,
     samples::Samples,
+    seats::Pinned,
     times,
 };
 use crate::{ids::Gid, qos::History as Keep};
@@ -100,8 +102,8 @@ pub(super) struct State {
     pub(super) samples: Option<Samples>,
     /// The tail as readers see it.
     pub(super) shown_tail: u64,
-    /// Positions that were found pinned, kept for their memory.
-    pub(super) found: Vec<u64>,
+    /// What was found pinned, kept for its memory.
+    pub(super) pinned: Pinned,
     /// The last sample's sequence number.
     last: u64,
     /// Samples published, read or not.
@@ -117,7 +119,7 @@ impl State {
             maps: Maps::default(),
             samples: None,
             shown_tail: 0,
-            found: Vec::new(),
+            pinned: Pinned::default(),
             last: 0,
             published: 0,
         }
@@ -180,7 +182,8 @@ impl Writer {
         layout::write_ring(ring.words(), options.gid, &at);
         times::offer(ring.words(), &options.qos);
         let history = History::new(descriptors, budget);
-        let state = State::new(Audience::new(qos, limit - 1), history, array);
+        let audience = Audience::new(qos, limit - 1, Pool::new(budget, max_message));
+        let state = State::new(audience, history, array);
         let writer = Self { options, session, ring, limit, state: PiMutex::new(state)? };
         writer.add_bytes(layout::RING + descriptors * layout::DESCRIPTOR);
         writer.show_window(&writer.lock());
@@ -355,7 +358,7 @@ impl Drop for Writer {
         }
         let State { mut history, array, audience, .. } = {
             let mut state = self.lock();
-            let nobody = Audience::new(self.options.qos, 0);
+            let nobody = Audience::new(self.options.qos, 0, Pool::default());
             let empty = State::new(nobody, History::new(1, 0), self.ring.clone());
             std::mem::replace(&mut *state, empty)
         };

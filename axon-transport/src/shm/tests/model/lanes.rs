@@ -5,11 +5,12 @@ use loom::{sync::Arc, thread};
 use super::{
     super::super::{
         Grant,
+        allowance::Allowance,
         lane::{self, Standing, Tenancy},
         layout::{LANE_WORDS, lane::CURSOR},
         pins::{about_to_scan, pin, unpin},
         ring::retire,
-        seats::scan,
+        seats::{Pinned, scan},
         sync::{Ordering, Word},
     },
     Cell, Ring, check, granted, zeros,
@@ -22,7 +23,7 @@ fn a_lane_that_is_open_shows_the_cursor_of_its_reader() {
         let lane = zeros(LANE_WORDS);
         Word::store(&lane[CURSOR], 9, Ordering::Relaxed);
         lane::ask(&lane[..], 1);
-        let tenancy = Tenancy::grant(&lane[..]);
+        let tenancy = Tenancy::grant(&lane[..], Allowance::ALL);
         let reader = {
             let lane = lane.clone();
             thread::spawn(move || {
@@ -61,7 +62,7 @@ fn a_reader_that_has_left_has_read_all() {
         };
         retire(&ring.header, 1);
         about_to_scan::<loom::sync::atomic::AtomicU64>();
-        if scan(&tenancy, &lane[..], &mut Vec::new()) == Standing::Left {
+        if scan(&tenancy, &lane[..], &mut Pinned::default()) == Standing::Left {
             cell.set(2);
         }
         reader.join().unwrap();
@@ -76,7 +77,7 @@ fn a_reader_that_opens_its_lane_and_pins_is_seen() {
         let ring = Ring::new();
         let lane = zeros(LANE_WORDS);
         lane::ask(&lane[..], 1);
-        let tenancy = Tenancy::grant(&lane[..]);
+        let tenancy = Tenancy::grant(&lane[..], Allowance::ALL);
         let cell = Arc::new(Cell::new(1));
         ring.show(0);
         let reader = {
@@ -91,9 +92,9 @@ fn a_reader_that_opens_its_lane_and_pins_is_seen() {
         };
         retire(&ring.header, 1);
         about_to_scan::<loom::sync::atomic::AtomicU64>();
-        let mut found = Vec::new();
-        scan(&tenancy, &lane[..], &mut found);
-        if !found.contains(&0) {
+        let mut found = Pinned::default();
+        found.refresh(|found| _ = scan(&tenancy, &lane[..], found));
+        if !found.keeps(0, 1) {
             cell.set(2);
         }
         reader.join().unwrap();

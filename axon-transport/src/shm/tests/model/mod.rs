@@ -15,6 +15,7 @@ use loom::sync::{Arc, atomic::AtomicU64};
 
 use super::super::{
     Grant,
+    allowance::Allowance,
     lane::{self, Tenancy},
     layout::{DESCRIPTOR_WORDS, LANE_WORDS, RING_WORDS, ring::TAIL},
     ring::{Place, Record, View, about_to_write, publish},
@@ -94,7 +95,7 @@ fn record(position: u64, place: Place) -> Record {
 fn granted(first: u64) -> (Arc<Vec<AtomicU64>>, Tenancy) {
     let lane = zeros(LANE_WORDS);
     lane::ask(&lane[..], 1);
-    let tenancy = Tenancy::grant(&lane[..]);
+    let tenancy = Tenancy::grant(&lane[..], Allowance::ALL);
     lane::open(&lane[..], Grant { generation: tenancy.generation(), first });
     (lane, tenancy)
 }

@@ -10,7 +10,7 @@ use super::{
         lane::{self, Tenancy},
         pins::{about_to_scan, pin, unpin},
         ring::{bounds, retire},
-        seats::scan,
+        seats::{Pinned, scan},
     },
     Cell, Ring, check, granted,
 };
@@ -18,9 +18,9 @@ use super::{
 /// Whether `position`, below the tail, may be written over.
 fn is_free(lane: &[AtomicU64], tenancy: &Tenancy, position: u64) -> bool {
     about_to_scan::<AtomicU64>();
-    let mut found = Vec::new();
-    scan(tenancy, lane, &mut found);
-    !found.contains(&position)
+    let mut found = Pinned::default();
+    found.refresh(|found| _ = scan(tenancy, lane, found));
+    !found.keeps(position, 1)
 }
 
 /// Takes the next sample from `cursor` on in place, if there is one.
