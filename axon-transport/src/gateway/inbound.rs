@@ -1,11 +1,8 @@
-//! Samples from a peer: data streams in, stand-in publishers out (`docs/formats.md`, section 7).
+//! Samples from a peer: data streams in, stand-ins out (`docs/formats.md`, section 7).
 
-use std::{
-    collections::HashMap,
-    sync::{Arc, RwLock},
-    time::Duration,
-};
+use std::{sync::Arc, time::Duration};
 
+use axon_envelope::Route;
 use quinn::{Connection, RecvStream, VarInt};
 use tokio::sync::mpsc;
 
@@ -13,13 +10,13 @@ use super::{
     counters::Counters,
     establish::close,
     pulse::Pulse,
-    seal::{MAX_OVERHEAD, Protection, RefusedMessage, publisher},
-    stand_in::StandIn,
+    routes_in::RoutesIn,
+    seal::{MAX_OVERHEAD, Protection, RefusedMessage, writer},
+    stand_in::{StandIn, Written},
 };
 use crate::{
     ids::Gid,
     link::CloseCode,
-    session::Publisher,
     shm::{Meta, PublishError},
 };
 
@@ -29,24 +26,13 @@ const BEST_EFFORT: u8 = 2;
 /// A stream for a route that is gone is stopped with this.
 const NO_ROUTE: VarInt = VarInt::from_u32(CloseCode::OutOfOrder as u32);
 
-/// A route that this side asked for.
-pub(super) struct RouteIn {
-    /// Topic and kind, for the envelope.
-    pub(super) route: axon_envelope::Route,
-    /// The remote publishers that feed it.
-    pub(super) publishers: HashMap<Gid, Arc<StandIn>>,
-}
-
-/// The routes of a peer by this side's numbers for them.
-pub(super) type RoutesIn = Arc<RwLock<HashMap<u32, RouteIn>>>;
-
 /// Everything a data stream of one connection needs.
 #[derive(Clone)]
 pub(super) struct Inbound {
     /// The connection.
     pub(super) connection: Connection,
     /// Its routes.
-    pub(super) routes: RoutesIn,
+    pub(super) routes: Arc<RoutesIn>,
     /// How its messages are protected.
     pub(super) protection: Protection,
     /// What arrives.
@@ -95,17 +81,18 @@ impl Inbound {
             Ok(parsed) => parsed,
             Err(reason) => return End::Violation(CloseCode::Malformed, reason.into()),
         };
-        let Some((route, stand_in)) = self.find(number, gid) else {
+        let Some((route, feeding)) = self.routes.stream(number, gid).await else {
             // Unsubscribed, or the publisher is gone from the graph: its samples may still be
             // under way.
             self.counters.dropped("no_route", 1);
             let _ = stream.stop(NO_ROUTE);
             return End::Finished;
         };
-        let _feeding = stand_in.feeding.lock().await;
+        let _feeding = feeding.lock().await;
+        let from = From { number, route, gid };
         let mut body = Vec::new();
         loop {
-            match self.message(&mut stream, &mut body, route, gid, &stand_in).await {
+            match self.message(&mut stream, &mut body, from).await {
                 Ok(true) if kind == RELIABLE => {}
                 Ok(_) => return End::Finished,
                 Err((code, reason)) => return End::Violation(code, reason),
@@ -113,20 +100,12 @@ impl Inbound {
         }
     }
 
-    fn find(&self, number: u32, gid: Gid) -> Option<(axon_envelope::Route, Arc<StandIn>)> {
-        let routes = self.routes.read().unwrap_or_else(std::sync::PoisonError::into_inner);
-        let route = routes.get(&number)?;
-        Some((route.route, Arc::clone(route.publishers.get(&gid)?)))
-    }
-
     /// Reads and publishes one message; false when the stream ended before it.
     async fn message(
         &self,
         stream: &mut RecvStream,
         body: &mut Vec<u8>,
-        route: axon_envelope::Route,
-        gid: Gid,
-        stand_in: &StandIn,
+        from: From,
     ) -> Result<bool, (CloseCode, String)> {
         let mut prefix = [0; 4];
         if stream.read_exact(&mut prefix).await.is_err() {
@@ -150,39 +129,36 @@ impl Inbound {
                 Ok(None) | Err(_) => return Ok(false),
             }
         }
-        let opened = self.protection.open(body, route, self.max_message).map_err(|e| {
+        let opened = self.protection.open(body, from.route, self.max_message).map_err(|e| {
             let code = match e {
                 RefusedMessage::Envelope { .. } => CloseCode::Envelope,
                 RefusedMessage::Malformed(_) => CloseCode::Malformed,
             };
             (code, e.to_string())
         })?;
-        if publisher(&opened.header) != gid {
-            let text = "a message names another publisher than its stream";
-            return Err((CloseCode::Malformed, text.into()));
-        }
+        let gid = writer(from.route.kind, from.gid, &opened.header)
+            .map_err(|text| (CloseCode::Malformed, text.to_owned()))?;
         let meta = Meta {
             sequence: opened.header.sequence,
             source_timestamp: opened.header.source_timestamp,
         };
-        if self.publish(stand_in, meta, &opened.payload).await {
-            stand_in.wrote(meta.sequence);
+        match self.routes.writer(from.number, gid).await {
+            Some(stand_in) => self.publish(&stand_in, &from.gid, meta, &opened.payload).await,
+            None => self.counters.dropped("no_route", 1),
         }
         Ok(true)
     }
 
-    /// Writes into the stand-in's ring; waits for a KEEP_ALL reader as long as the link stands,
-    /// which in turn holds the peer's stream back. False when the sample was dropped.
-    async fn publish(&self, publisher: &Publisher, meta: Meta, payload: &[u8]) -> bool {
+    /// Writes into the stand-in's ring; waits for a reader that keeps all as long as the link stands,
+    /// which in turn holds the peer's stream back.
+    async fn publish(&self, stand_in: &StandIn, client: &Gid, meta: Meta, payload: &[u8]) {
         let mut waiting = None;
         let mut beat = self.pulse.subscribe();
         loop {
             beat.mark_unchanged();
-            match publisher.try_publish_with(meta, payload) {
-                Ok(()) => {
-                    self.counters.arrived(payload.len());
-                    return true;
-                }
+            match stand_in.try_write(client, meta, payload) {
+                Ok(Written::Yes) => return self.counters.arrived(payload.len()),
+                Ok(Written::Nobody) => return self.counters.dropped("no_client", 1),
                 Err(PublishError::Blocked { .. }) if self.connection.close_reason().is_none() => {
                     waiting.get_or_insert_with(|| self.pulse.wait_for_room());
                     // The timeout only covers a link that ends meanwhile.
@@ -190,12 +166,21 @@ impl Inbound {
                 }
                 Err(error) => {
                     self.counters.dropped("ring", 1);
-                    tracing::warn!(gid = %publisher.gid(), %error, "a sample from a peer is lost");
-                    return false;
+                    let gid = stand_in.gid();
+                    return tracing::warn!(%gid, %error, "a sample from a peer is lost");
                 }
             }
         }
     }
+}
+
+/// Where a stream says that it comes from.
+#[derive(Clone, Copy)]
+struct From {
+    number: u32,
+    route: Route,
+    /// A publisher; of a service the client.
+    gid: Gid,
 }
 
 fn parse_header(header: &[u8; STREAM_HEADER]) -> Result<(u8, u32, Gid), &'static str> {

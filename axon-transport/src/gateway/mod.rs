@@ -25,6 +25,7 @@ mod pulse;
 mod queue;
 mod refusal;
 mod routes;
+mod routes_in;
 mod run;
 mod seal;
 mod socket;

@@ -7,6 +7,7 @@
 use std::collections::VecDeque;
 
 use crate::{
+    ids::Gid,
     qos::{History, Qos, Reliability},
     session::MessageInfo,
 };
@@ -16,6 +17,8 @@ use crate::{
 pub(super) struct Sample {
     /// Publisher, sequence number and timestamps.
     pub(super) info: MessageInfo,
+    /// Whose call it is, where it is a request or a response.
+    pub(super) client: Option<Gid>,
     /// The payload.
     pub(super) payload: Vec<u8>,
     /// When it was copied out of the ring, on the monotonic clock.
@@ -96,7 +99,6 @@ impl Queue {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ids::Gid;
 
     fn sample(sequence: u64, size: usize) -> Sample {
         let info = MessageInfo {
@@ -105,7 +107,7 @@ mod tests {
             source_timestamp: 0,
             received_timestamp: 0,
         };
-        Sample { info, payload: vec![0; size], since: std::time::Instant::now() }
+        Sample { info, client: None, payload: vec![0; size], since: std::time::Instant::now() }
     }
 
     fn offer(queue: &mut Queue, sequence: u64, size: usize) -> Result<u64, u64> {

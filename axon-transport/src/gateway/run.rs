@@ -65,7 +65,7 @@ async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
         stand_ins: StandIns::default(),
         pulse: Pulse::start(&session)?,
         session,
-        local_qos: Arc::new(RwLock::new(HashMap::new())),
+        offered: Arc::new(RwLock::new(HashMap::new())),
         domain: config.domain,
         max_message: config.max_message,
     });

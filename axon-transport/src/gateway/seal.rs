@@ -3,7 +3,7 @@
 
 use std::{sync::Arc, time::Instant};
 
-use axon_envelope::{Delivery, OpenError, Route, TAG_LEN, inner};
+use axon_envelope::{Delivery, Kind, OpenError, Route, TAG_LEN, inner};
 
 use super::{
     keyring::{Keyring, PeerKeys},
@@ -56,16 +56,25 @@ pub(super) enum RefusedMessage {
 
 fn header(sample: &Sample) -> inner::Header {
     let age = sample.since.elapsed().as_millis();
+    let request_id = sample.client.map_or_else(inner::RequestId::default, |client| {
+        inner::RequestId { client: client.0, sequence: number(sample.info.sequence) }
+    });
     inner::Header {
         gid: sample.info.publisher.0,
         sequence: sample.info.sequence,
         source_timestamp: sample.info.source_timestamp,
-        request_id: inner::RequestId::default(),
+        request_id,
         compressed: false,
         age_ms: u32::try_from(age).unwrap_or(u32::MAX),
         // Bounded by AXON_MAX_MESSAGE_MB, which is far below 4 GiB.
         uncompressed_len: u32::try_from(sample.payload.len()).unwrap_or(u32::MAX),
     }
+}
+
+/// The number of a call as its request id has it.
+fn number(sequence: u64) -> i64 {
+    // From 1 on, and one at a time.
+    i64::try_from(sequence).unwrap_or(i64::MAX)
 }
 
 impl Protection {
@@ -176,10 +185,52 @@ fn cause(error: &OpenError) -> String {
 
 /// A sample as it was taken from a relay.
 pub(super) fn sample(info: crate::session::MessageInfo, payload: Vec<u8>) -> Sample {
-    Sample { info, payload, since: Instant::now() }
+    Sample { info, client: None, payload, since: Instant::now() }
 }
 
-/// The publisher that the inner header names.
-pub(super) fn publisher(header: &inner::Header) -> Gid {
-    Gid(header.gid)
+/// Who wrote a message that came in the stream of `of`: the publisher that the stream is of, the
+/// client whose requests are in it, or a server that answers the client whose responses are in it.
+///
+/// # Errors
+/// The inner header says that it belongs elsewhere.
+pub(super) fn writer(kind: Kind, of: Gid, header: &inner::Header) -> Result<Gid, &'static str> {
+    let writer = Gid(header.gid);
+    let call = inner::RequestId { client: of.0, sequence: number(header.sequence) };
+    let fits = match kind {
+        Kind::Topic => writer == of && header.request_id == inner::RequestId::default(),
+        Kind::Request => writer == of && header.request_id == call,
+        Kind::Response => header.request_id == call,
+    };
+    if fits { Ok(writer) } else { Err("a message names another publisher or call than its stream") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::session::MessageInfo;
+
+    #[test]
+    fn what_belongs_to_another_stream_or_call_is_refused() {
+        let (client, server) = (Gid([1; 16]), Gid([2; 16]));
+        let info = |publisher| MessageInfo {
+            publisher,
+            sequence: 7,
+            source_timestamp: 0,
+            received_timestamp: 0,
+        };
+        let topic = header(&sample(info(client), Vec::new()));
+        let call = |of| header(&Sample { client: Some(client), ..sample(info(of), Vec::new()) });
+        let (request, response) = (call(client), call(server));
+        assert_eq!(writer(Kind::Topic, client, &topic), Ok(client));
+        assert_eq!(writer(Kind::Request, client, &request), Ok(client));
+        assert_eq!(writer(Kind::Response, client, &response), Ok(server));
+        assert!(writer(Kind::Topic, server, &topic).is_err());
+        assert!(writer(Kind::Topic, client, &request).is_err());
+        assert!(writer(Kind::Request, client, &response).is_err());
+        assert!(writer(Kind::Request, client, &topic).is_err());
+        assert!(writer(Kind::Response, server, &response).is_err());
+        let sequence = 8;
+        let other = inner::Header { sequence, ..response };
+        assert!(writer(Kind::Response, client, &other).is_err());
+    }
 }

@@ -1,12 +1,15 @@
-//! Stand-ins: remote publishers as local subscriptions see them.
+//! Stand-ins: what writes on other hosts, as those who read here see it.
 //!
 //! There is one a GID, whatever link its samples come over: the daemon of a host can be restarted,
-//! and its successor announces the same publishers while the last samples of the old link are still
+//! and its successor announces the same endpoints while the last samples of the old link are still
 //! being read. They go to the same ring, to which the readers stay attached.
+//!
+//! That of a client or server reads, too: a client's is given the responses that go to its host, and a
+//! server's the requests.
 
 use std::{
     collections::HashMap,
-    ops::Deref,
+    fmt,
     sync::{
         Arc, Mutex, Weak,
         atomic::{AtomicU64, Ordering},
@@ -14,11 +17,12 @@ use std::{
     time::Duration,
 };
 
-use super::keyring::lock;
+use super::{keyring::lock, queue::Sample, seal::sample};
 use crate::{
-    graph::Endpoint,
+    graph::{Endpoint, EndpointKind},
     ids::Gid,
-    session::{Publisher, Session, SessionError},
+    session::{Client, Publisher, Server, Session, SessionError},
+    shm::{Meta, PublishError},
 };
 
 type Known = Arc<Mutex<HashMap<Gid, Weak<StandIn>>>>;
@@ -27,24 +31,39 @@ type Known = Arc<Mutex<HashMap<Gid, Weak<StandIn>>>>;
 #[derive(Clone, Default)]
 pub(super) struct StandIns(Known);
 
-/// A remote publisher as local subscriptions see it.
+/// Something remote that writes, as those see it that read here.
 pub(super) struct StandIn {
-    /// Writes the ring that stands in for it. Taken only by `drop`.
-    publisher: Option<Publisher>,
+    /// Taken only by `drop`.
+    face: Option<Face>,
     /// Held by the stream that feeds it: the stream of a successor waits until its predecessor's
     /// is read to the end, so samples stay in order.
-    pub(super) feeding: tokio::sync::Mutex<()>,
+    pub(super) feeding: Arc<tokio::sync::Mutex<()>>,
     /// Sequence number of the newest sample written; 0 before the first.
     last: AtomicU64,
     gid: Gid,
     known: Known,
 }
 
+enum Face {
+    Publisher(Publisher),
+    Client(Client),
+    Server(Server),
+}
+
+/// What became of a message that was to be written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Written {
+    /// Its readers have it.
+    Yes,
+    /// The client that it answers is gone.
+    Nobody,
+}
+
 impl StandIns {
     /// The stand-in for `remote`: the one that there is, or a new one.
     ///
     /// # Errors
-    /// It cannot be made, or another publisher under this GID still has readers to be drained.
+    /// It cannot be made, or another one under this GID still has readers to be drained.
     pub(super) fn get(
         &self,
         session: &Session,
@@ -68,10 +87,9 @@ impl StandIns {
                     std::thread::sleep(Duration::from_micros(100));
                 }
                 None => {
-                    let publisher = session.create_stand_in(remote.clone())?;
                     let stand_in = Arc::new(StandIn {
-                        publisher: Some(publisher),
-                        feeding: tokio::sync::Mutex::default(),
+                        face: Some(Face::new(session, remote.clone())?),
+                        feeding: Arc::default(),
                         last: AtomicU64::new(0),
                         gid: remote.gid,
                         known: Arc::clone(&self.0),
@@ -84,33 +102,104 @@ impl StandIns {
     }
 }
 
-impl StandIn {
-    /// A sample of this sequence number was written.
-    pub(super) fn wrote(&self, sequence: u64) {
-        // Relaxed: only where a resumed route begins; sessions drop what they have seen.
-        self.last.store(sequence, Ordering::Relaxed);
-    }
-
-    /// Sequence number of the newest sample written.
-    pub(super) fn last_sequence(&self) -> Option<u64> {
-        Some(self.last.load(Ordering::Relaxed)).filter(|n| *n > 0)
+impl Face {
+    fn new(session: &Session, remote: Endpoint) -> Result<Self, SessionError> {
+        Ok(match remote.kind {
+            EndpointKind::Client => Self::Client(session.create_stand_in_client(remote)?),
+            EndpointKind::Server => Self::Server(session.create_stand_in_server(remote)),
+            _ => Self::Publisher(session.create_stand_in(remote)?),
+        })
     }
 }
 
-impl Deref for StandIn {
-    type Target = Publisher;
+impl StandIn {
+    /// Whom it stands for.
+    pub(super) fn gid(&self) -> Gid {
+        self.gid
+    }
 
-    fn deref(&self) -> &Publisher {
-        // Only `drop` takes it, and nobody derefs what is being dropped.
-        self.publisher.as_ref().expect("a stand-in has its publisher until it is dropped")
+    fn endpoint(&self) -> &Endpoint {
+        match self.face() {
+            Face::Publisher(publisher) => publisher.endpoint(),
+            Face::Client(client) => client.endpoint(),
+            Face::Server(server) => server.endpoint(),
+        }
+    }
+
+    /// Those here whom it reaches and who, where it is of a service, reach it.
+    pub(super) fn partners(&self) -> Vec<Gid> {
+        match self.face() {
+            Face::Publisher(publisher) => publisher.matched(),
+            Face::Client(client) => client.servers(),
+            Face::Server(server) => server.clients(),
+        }
+    }
+
+    /// Writes a sample, a request, or a response to `client`, without waiting for room.
+    ///
+    /// # Errors
+    /// [`PublishError::Blocked`] when there is none; the others say what does not fit.
+    pub(super) fn try_write(
+        &self,
+        client: &Gid,
+        meta: Meta,
+        payload: &[u8],
+    ) -> Result<Written, PublishError> {
+        let there = match self.face() {
+            Face::Publisher(publisher) => {
+                publisher.try_publish_with(meta, payload)?;
+                true
+            }
+            Face::Client(client) => {
+                client.try_forward(meta, payload)?;
+                true
+            }
+            Face::Server(server) => server.try_respond(client, meta, payload)?,
+        };
+        // Relaxed: only where a resumed route begins; sessions drop what they have seen.
+        self.last.store(meta.sequence, Ordering::Relaxed);
+        Ok(if there { Written::Yes } else { Written::Nobody })
+    }
+
+    /// What goes to its host: the next request to a server, or response to a client.
+    pub(super) fn take(&self) -> Option<Sample> {
+        let mut payload = Vec::new();
+        match self.face() {
+            Face::Publisher(_) => None,
+            Face::Client(client) => {
+                let info = client.take_response(&mut payload)?;
+                Some(Sample { client: Some(self.gid), ..sample(info, payload) })
+            }
+            Face::Server(server) => {
+                let info = server.take_request(&mut payload)?;
+                Some(Sample { client: Some(info.publisher), ..sample(info, payload) })
+            }
+        }
+    }
+
+    /// Sequence number of the newest sample of a publisher that was written.
+    pub(super) fn last_sequence(&self) -> Option<u64> {
+        let publisher = matches!(self.face(), Face::Publisher(_));
+        Some(self.last.load(Ordering::Relaxed)).filter(|n| publisher && *n > 0)
+    }
+
+    fn face(&self) -> &Face {
+        // Only `drop` takes it, and nobody looks at what is being dropped.
+        self.face.as_ref().expect("a stand-in has its face until it is dropped")
+    }
+}
+
+impl fmt::Debug for StandIn {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("StandIn").field(&self.gid).finish()
     }
 }
 
 impl Drop for StandIn {
     fn drop(&mut self) {
-        // Under the lock: the GID is free for another stand-in once this publisher is gone.
+        // Under the lock: the GID is free for another stand-in once this one is gone.
         let mut known = lock(&self.known);
-        drop(self.publisher.take());
+        drop(self.face.take());
         known.remove(&self.gid);
     }
 }

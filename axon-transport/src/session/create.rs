@@ -88,35 +88,34 @@ impl Session {
         Subscription { inner, session: self.clone() }
     }
 
-    pub(super) fn add_client(&self, spec: EndpointSpec) -> Result<Client, SessionError> {
-        let endpoint = self.endpoint(spec, EndpointKind::Client)?;
+    pub(super) fn add_client(
+        &self,
+        endpoint: Endpoint,
+        role: EndpointRole,
+    ) -> Result<Client, SessionError> {
         let options = self.ring(&endpoint, Qos::keep_all());
         let writer = Arc::new(Writer::create(self.shared().segment.clone(), options)?);
-        let (requests, responses) = self.add_both(endpoint, Rings::Shared(writer.clone()));
+        let (requests, responses) = self.add_both(endpoint, role, Rings::Shared(writer.clone()));
         Ok(Client::new(requests, responses, writer, self.clone()))
     }
 
-    pub(super) fn add_server(&self, spec: EndpointSpec) -> Result<Server, SessionError> {
-        let endpoint = self.endpoint(spec, EndpointKind::Server)?;
+    pub(super) fn add_server(&self, endpoint: Endpoint, role: EndpointRole) -> Server {
         let options = self.ring(&endpoint, Qos::keep_all());
         let lanes = Arc::new(Lanes::new(self.shared().segment.clone(), options));
-        let (responses, requests) = self.add_both(endpoint, Rings::Each(lanes.clone()));
-        Ok(Server::new(responses, requests, lanes, self.clone()))
+        let (responses, requests) = self.add_both(endpoint, role, Rings::Each(lanes.clone()));
+        Server::new(responses, requests, lanes, self.clone())
     }
 
     /// The two sides of an endpoint that writes and reads.
     fn add_both(
         &self,
         endpoint: Endpoint,
+        role: EndpointRole,
         rings: Rings,
     ) -> (Arc<PublisherInner>, Arc<SubscriptionInner>) {
-        let role = EndpointRole::Application;
         let writes = Arc::new(PublisherInner::new(endpoint.clone(), role, rings));
         let reads = Arc::new(SubscriptionInner::new(endpoint, role, Vec::new()));
         self.announce(Some(&writes), Some(&reads));
-        self.await_pairs(&writes.endpoint, |other| {
-            writes.events.is_matched(other) && reads.events.is_matched(other)
-        });
         (writes, reads)
     }
 

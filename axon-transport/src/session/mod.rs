@@ -246,7 +246,10 @@ impl Session {
     /// # Errors
     /// When the specification is out of bounds.
     pub fn create_server(&self, spec: EndpointSpec) -> Result<Server, SessionError> {
-        self.add_server(spec)
+        let endpoint = self.endpoint(spec, EndpointKind::Server)?;
+        let server = self.add_server(endpoint, EndpointRole::Application);
+        server.await_clients();
+        Ok(server)
     }
 
     /// A client of a service. Its servers are matched as a publisher's readers are; see
@@ -255,7 +258,10 @@ impl Session {
     /// # Errors
     /// When the specification is out of bounds or there is no memory.
     pub fn create_client(&self, spec: EndpointSpec) -> Result<Client, SessionError> {
-        self.add_client(spec)
+        let endpoint = self.endpoint(spec, EndpointKind::Client)?;
+        let client = self.add_client(endpoint, EndpointRole::Application)?;
+        client.await_servers();
+        Ok(client)
     }
 
     /// A node, which is in the graph until it is dropped.
@@ -294,6 +300,16 @@ impl Session {
     /// When there is no memory.
     pub fn create_stand_in(&self, remote: Endpoint) -> Result<Publisher, SessionError> {
         self.add_publisher(remote, EndpointRole::StandIn)
+    }
+
+    /// A client of another host as the servers here see it, under its own GID. For the gateway alone.
+    pub(crate) fn create_stand_in_client(&self, remote: Endpoint) -> Result<Client, SessionError> {
+        self.add_client(remote, EndpointRole::StandIn)
+    }
+
+    /// A server of another host as the clients here see it, under its own GID. For the gateway alone.
+    pub(crate) fn create_stand_in_server(&self, remote: Endpoint) -> Server {
+        self.add_server(remote, EndpointRole::StandIn)
     }
 
     /// A publisher as another process of this session describes it, under its GID there.

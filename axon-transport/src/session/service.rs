@@ -123,6 +123,22 @@ impl Server {
         ring.publish(meta, payload).map(drop)
     }
 
+    /// For the gateway: gives `client` a response without waiting for room. `false` when there is no
+    /// such client any more.
+    pub(crate) fn try_respond(
+        &self,
+        client: &Gid,
+        meta: Meta,
+        payload: &[u8],
+    ) -> Result<bool, PublishError> {
+        let Some(ring) = self.lanes.ring(client) else { return Ok(false) };
+        ring.try_publish(meta, payload).map(|_| true)
+    }
+
+    pub(super) fn await_clients(&self) {
+        await_both(&self.responses, &self.requests, &self.session);
+    }
+
     /// The clients that reach it and that it reaches.
     pub fn clients(&self) -> Vec<Gid> {
         both(&self.responses, &self.requests, &self.session)
@@ -172,6 +188,15 @@ impl Client {
         self.ring.publish_next(clock::wall(), payload)
     }
 
+    /// For the gateway: a request under the number that it has on its host, without waiting for room.
+    pub(crate) fn try_forward(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
+        self.ring.try_publish(meta, payload).map(drop)
+    }
+
+    pub(super) fn await_servers(&self) {
+        await_both(&self.requests, &self.responses, &self.session);
+    }
+
     /// The next response, into `out`, which it replaces. `None` when there is none. What is known of
     /// it names the server, and the number of the request that it answers.
     pub fn take_response(&self, out: &mut Vec<u8>) -> Option<MessageInfo> {
@@ -216,6 +241,12 @@ impl Client {
     pub fn set_on_new_response(&self, callback: Option<OnNew>) -> Result<(), SessionError> {
         set_callback(&self.responses, callback, &self.session)
     }
+}
+
+fn await_both(writes: &PublisherInner, reads: &SubscriptionInner, session: &Session) {
+    session.await_pairs(&writes.endpoint, |other| {
+        writes.events.is_matched(other) && reads.events.is_matched(other)
+    });
 }
 
 /// Those with whom both directions stand.

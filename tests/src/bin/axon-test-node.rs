@@ -3,6 +3,8 @@
 //!
 //! `publish TOPIC SIZES READERS COUNT`: waits for as many readers, then publishes; with a count of
 //! `stream` until the first line on standard input. `subscribe TOPIC SIZES`: takes, and compares.
+//! `serve SERVICE COUNT`: answers as many requests with their bytes reversed, and takes one more.
+//! `ask SERVICE COUNT`: sends as many requests, and takes no response.
 
 use std::{
     error::Error,
@@ -35,7 +37,12 @@ fn main() -> Result<(), Box<dyn Error>> {
             publish(&session, &stdin, topic, sizes.parse()?, readers.parse()?, count.parse().ok())
         }
         ["subscribe", topic, sizes] => subscribe(&session, &stdin, topic, sizes.parse()?),
-        _ => Err("publish TOPIC SIZES READERS COUNT, or subscribe TOPIC SIZES".into()),
+        ["serve", service, count] => serve(&session, &stdin, service, count.parse()?),
+        ["ask", service, count] => ask(&session, &stdin, service, count.parse()?),
+        _ => Err(
+            "publish TOPIC SIZES READERS COUNT, subscribe TOPIC SIZES, serve or ask SERVICE COUNT"
+                .into(),
+        ),
     }
 }
 
@@ -106,6 +113,45 @@ fn subscribe(
             }
         }
     }
+    Ok(())
+}
+
+fn serve(
+    session: &Session,
+    stdin: &Receiver<u8>,
+    service: &str,
+    count: u64,
+) -> Result<(), Box<dyn Error>> {
+    let server = session.create_server(EndpointSpec::new(service, "test/Echo", Qos::default()))?;
+    Word::Ready.say()?;
+    let mut bytes = Vec::new();
+    for _ in 0..count {
+        let request = server.recv_request(&mut bytes, Some(PATIENCE)).ok_or("no request")?;
+        bytes.reverse();
+        server.send_response(request.publisher, request.sequence, &bytes)?;
+    }
+    server.recv_request(&mut bytes, Some(PATIENCE)).ok_or("no further request")?;
+    Word::Sent(count).say()?;
+    while stdin.recv().is_ok() {}
+    Ok(())
+}
+
+fn ask(
+    session: &Session,
+    stdin: &Receiver<u8>,
+    service: &str,
+    count: u64,
+) -> Result<(), Box<dyn Error>> {
+    let client = session.create_client(EndpointSpec::new(service, "test/Echo", Qos::default()))?;
+    if !client.wait_available(PATIENCE) {
+        return Err("no server".into());
+    }
+    Word::Ready.say()?;
+    for _ in 0..count {
+        client.send_request(b"and never takes")?;
+    }
+    Word::Sent(count).say()?;
+    while stdin.recv().is_ok() {}
     Ok(())
 }
 

@@ -2,9 +2,12 @@
 
 use axon_tests::{Sizes, Tally};
 
+use axon_transport::{qos::Qos, session::EndpointSpec};
+
 use super::{
     mode::{Kmes, Settings, classic, pinned},
     pair::{Host, Plan},
+    process::PATIENCE,
 };
 
 const MESSAGES: u64 = 300;
@@ -32,6 +35,23 @@ fn deliver(settings: [Settings; 2], key_exchange: &str, cipher: &str) -> [Host; 
         node.finish();
     }
     hosts
+}
+
+#[test]
+fn a_publisher_that_counts_a_reader_elsewhere_reaches_it() {
+    let [a, b] = Plan::new([classic(&[]), classic(&[])]).start();
+    let (here, there) = (a.session("publishers"), b.session("subscription"));
+    let spec = || EndpointSpec::new("/counted", "test/Bytes", Qos::default());
+    let subscription = there.create_subscription(spec()).unwrap();
+    // The route is there from the second one on, and its publishers are in it at once.
+    for number in 0..20_u8 {
+        let publisher = here.create_publisher(spec()).unwrap();
+        assert!(publisher.wait_matched(1, PATIENCE));
+        publisher.publish(&[number]).unwrap();
+        let mut bytes = Vec::new();
+        let info = subscription.recv(&mut bytes, Some(PATIENCE)).expect("what was published");
+        assert_eq!((info.publisher, &bytes[..]), (publisher.gid(), &[number][..]));
+    }
 }
 
 #[test]

@@ -11,3 +11,4 @@ mod process;
 mod renewal;
 mod restart;
 mod rules;
+mod services;

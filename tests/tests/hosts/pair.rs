@@ -14,7 +14,7 @@ use axon_tests::Sizes;
 use axon_transport::{
     config::{Config, OsFiles},
     daemon::status::{LinkStatus, Status},
-    session::daemon_status,
+    session::{Session, SessionOptions, daemon_status},
 };
 use rustix::process::{Pid, Signal, kill_process};
 
@@ -202,7 +202,12 @@ impl Host {
         node
     }
 
-    fn node(&self, arguments: &[&str]) -> Node {
+    /// A session of this very process on this host.
+    pub(crate) fn session(&self, name: &str) -> Session {
+        Session::open(&self.config(), SessionOptions::new(name)).unwrap()
+    }
+
+    pub(crate) fn node(&self, arguments: &[&str]) -> Node {
         let mut command = self.command(env!("CARGO_BIN_EXE_axon-test-node"));
         command.args(arguments);
         Node::start(command)
@@ -243,7 +248,11 @@ pub(crate) fn write_key(path: &Path, pem: &str) {
 }
 
 pub(crate) fn kill(pid: u32) {
+    signal(pid, Signal::KILL);
+}
+
+pub(crate) fn signal(pid: u32, signal: Signal) {
     let pid = Pid::from_raw(i32::try_from(pid).unwrap()).unwrap();
     // It may have ended by itself meanwhile.
-    let _ = kill_process(pid, Signal::KILL);
+    let _ = kill_process(pid, signal);
 }

@@ -78,6 +78,10 @@ impl Node {
         self.said.lock().unwrap().clone()
     }
 
+    pub(crate) fn pid(&self) -> u32 {
+        self.child.0.id()
+    }
+
     #[track_caller]
     pub(crate) fn wait_ready(&mut self) {
         until("a node is ready", || self.said().ready);

@@ -5,7 +5,7 @@ use super::{
     SessionEntry, Violation, output::session_entry,
 };
 use crate::{
-    graph::{Endpoint, EndpointKind, LIMITS},
+    graph::{Endpoint, EndpointKind, LIMITS, writes},
     ids::{Gid, SessionId},
     session::message::{
         Announce, Attach, EndpointRole, Granted, Message, Pair, Refused, SessionRole, Unmatch,
@@ -102,9 +102,7 @@ impl<F: Clone> Registry<F> {
         let may = match role {
             EndpointRole::Application => gid.is_of(id),
             EndpointRole::StandIn => {
-                entry.role == SessionRole::Gateway
-                    && endpoint.kind == EndpointKind::Publisher
-                    && !gid.is_of(id)
+                entry.role == SessionRole::Gateway && writes(endpoint.kind) && !gid.is_of(id)
             }
             EndpointRole::Relay => {
                 entry.role == SessionRole::Gateway

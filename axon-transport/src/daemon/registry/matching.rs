@@ -129,14 +129,11 @@ impl Members {
     }
 }
 
-/// A relay carries local samples away and a stand-in brings remote ones here; the two together
-/// would send a sample back to where it came from.
+/// A relay carries local samples away and a stand-in brings remote ones here, one of a service does
+/// both; two of them together would send a sample back to where it came from.
 fn roles_match(writer: EndpointRole, reader: EndpointRole) -> bool {
-    matches!(
-        (writer, reader),
-        (EndpointRole::Application | EndpointRole::StandIn, EndpointRole::Application)
-            | (EndpointRole::Application, EndpointRole::Relay)
-    )
+    writer == EndpointRole::Application
+        || (writer == EndpointRole::StandIn && reader == EndpointRole::Application)
 }
 
 fn topic(endpoint: &Endpoint) -> Topic {

@@ -47,7 +47,8 @@ fn announce(endpoint: Endpoint) -> Message {
 }
 
 fn announce_as(endpoint: Endpoint, role: EndpointRole) -> Message {
-    let ring = (endpoint.kind == EndpointKind::Publisher).then_some(PLACE);
+    let has = matches!(endpoint.kind, EndpointKind::Publisher | EndpointKind::Client);
+    let ring = has.then_some(PLACE);
     Message::Endpoint(Announce { endpoint, role, stands_for: vec![], ring })
 }
 
@@ -580,6 +581,36 @@ fn a_sample_never_goes_back_to_where_it_came_from() {
         .flat_map(|g| g.added.iter().map(|i| i.endpoint.gid))
         .collect();
     assert_eq!(shown, [local.gid, talker.gid].into());
+}
+
+#[test]
+fn ends_of_a_service_elsewhere_meet_those_here_and_never_each_other() {
+    let mut world = connected(1);
+    let gateway = session_id(200);
+    let name = String::new();
+    world.registry.connect(gateway, SessionRole::Gateway, name, 1, Some(handed(gateway))).unwrap();
+    let own = first(&world);
+    let of = |gid, kind| endpoint(gid, kind, 0, Qos::default());
+    let (client, server) =
+        (of(Gid::new(own, 1), EndpointKind::Client), of(Gid::new(own, 2), EndpointKind::Server));
+    let there = [(7, EndpointKind::Client), (8, EndpointKind::Server)];
+    let there = there.map(|(number, kind)| of(Gid([number; 16]), kind));
+    let registry = &mut world.registry;
+    for stand_in in &there {
+        let message = announce_as(stand_in.clone(), EndpointRole::StandIn);
+        let claimed = registry.message(&own, message.clone(), vec![]);
+        assert_eq!(claimed, Err(Violation::NotItsOwn(stand_in.gid)));
+        registry.message(&gateway, message, vec![]).unwrap();
+    }
+    for endpoint in [&client, &server] {
+        registry.message(&own, announce(endpoint.clone()), vec![]).unwrap();
+    }
+    let both = |one: &Endpoint, other: &Endpoint| {
+        [(one.gid, other.gid), (other.gid, one.gid)].map(|(reader, writer)| Pair { reader, writer })
+    };
+    let expected = [both(&client, &server), both(&there[0], &server), both(&client, &there[1])];
+    let pairs: BTreeSet<Pair> = registry.pairs.keys().copied().collect();
+    assert_eq!(pairs, expected.into_iter().flatten().collect());
 }
 
 #[test]

@@ -3,8 +3,8 @@
 use super::Hub;
 use crate::{
     daemon::bridge::ToControl,
-    gateway::{establish::close, peer::GraphChange, routes},
-    graph::Endpoint,
+    gateway::{establish::close, peer::GraphChange, routes::Offered},
+    graph::{Endpoint, EndpointKind},
     ids::DaemonId,
     link::CloseCode,
 };
@@ -19,11 +19,13 @@ impl Hub {
             .filter(|e| e.daemon.is_none())
             .map(|e| (e.endpoint.gid, (*e.endpoint).clone()))
             .collect();
-        let qos = self.local.values().map(|e| (e.gid, e.qos)).collect();
-        *self.shared.local_qos.write().unwrap_or_else(std::sync::PoisonError::into_inner) = qos;
+        let publishers = self.local.values().filter(|e| e.kind == EndpointKind::Publisher);
+        let offers = |e: &Endpoint| Offered { qos: e.qos, type_hash: e.type_hash.clone() };
+        let offered = publishers.map(|e| (e.gid, offers(e))).collect();
+        *self.shared.offered.write().unwrap_or_else(std::sync::PoisonError::into_inner) = offered;
         for peer in self.peers.values_mut() {
             peer.send_graph(&self.local, false);
-            peer.want(routes::wanted(self.local.values(), peer.remote()), &self.shared);
+            peer.update(&self.local, &self.shared);
         }
     }
 
@@ -47,7 +49,7 @@ impl Hub {
         let dead = self.taken_over(daemon, &added);
         // Before the dead links let go of their stand-ins: rings and readers stay as they are.
         if let Some(peer) = self.peers.get_mut(&daemon) {
-            peer.want(routes::wanted(self.local.values(), peer.remote()), &self.shared);
+            peer.update(&self.local, &self.shared);
         }
         for link in dead {
             let text = "its host's daemon was restarted";

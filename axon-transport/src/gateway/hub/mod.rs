@@ -26,6 +26,7 @@ use super::{
     peer::Peer,
     pulse::Pulse,
     refusal::{Refusal, RefusedBy},
+    routes::Offered,
     seal::Protection,
     stand_in::StandIns,
     status::{self, Who},
@@ -35,7 +36,6 @@ use crate::{
     graph::Endpoint,
     ids::{DaemonId, Gid},
     link::{Candidate, CloseCode, GraphResync, Hello, Message},
-    qos::Qos,
     session::Session,
 };
 
@@ -51,7 +51,7 @@ pub(super) struct Shared {
     /// Wakes tasks when rings change.
     pub(super) pulse: Pulse,
     /// What local publishers offer.
-    pub(super) local_qos: Arc<RwLock<HashMap<Gid, Qos>>>,
+    pub(super) offered: Arc<RwLock<HashMap<Gid, Offered>>>,
     /// ROS domain.
     pub(super) domain: u32,
     /// Largest payload.
@@ -283,10 +283,13 @@ impl Hub {
                 Ok(())
             }
             Message::Subscribe(subscribe) => {
-                peer.serve(subscribe, &self.shared).map_err(|e| (CloseCode::Malformed, e))
+                let served = peer.serve(subscribe, &self.shared);
+                peer.update_services(&self.local, &self.shared);
+                served.map_err(|e| (CloseCode::Malformed, e))
             }
             Message::Unsubscribe(unsubscribe) => {
                 peer.unserve(unsubscribe.route);
+                peer.update_services(&self.local, &self.shared);
                 Ok(())
             }
             Message::RouteReady(ready) => {

@@ -1,0 +1,225 @@
+//! One linked peer: its graph, the routes in both directions, and the tasks that carry samples.
+
+mod asking;
+mod serving;
+
+use std::{
+    collections::{BTreeMap, BTreeSet, HashMap},
+    sync::Arc,
+    time::Duration,
+};
+
+use tokio::sync::mpsc;
+
+use self::{asking::Asked, serving::Served};
+use super::{
+    control::Outbox,
+    counters::Counters,
+    hub::{Event, Shared},
+    inbound::Inbound,
+    outbound::{self, Carrier},
+    routes::RouteKey,
+    routes_in::RoutesIn,
+};
+use crate::{
+    graph::{Endpoint, LIMITS},
+    ids::Gid,
+    link::{Graph, Message},
+};
+
+/// Endpoints in one GRAPH message; a larger graph takes several.
+const GRAPH_PART: usize = 512;
+/// How often readers are looked for meanwhile.
+const POLL: Duration = Duration::from_millis(5);
+
+/// A peer with an elected link.
+pub(super) struct Peer {
+    /// The number of the link in use.
+    pub(super) link: u64,
+    /// Control messages to it.
+    pub(super) outbox: Outbox,
+    /// What was carried and dropped.
+    pub(super) counters: Arc<Counters>,
+    remote: BTreeMap<Gid, Endpoint>,
+    remote_version: u64,
+    sent: BTreeMap<Gid, Endpoint>,
+    sent_version: u64,
+    next_route: u32,
+    /// Routes that this side asked for.
+    asked: BTreeMap<RouteKey, Asked>,
+    routes_in: Arc<RoutesIn>,
+    /// Routes that the peer asked for.
+    served: HashMap<u32, Served>,
+    /// Servers there whose host takes requests for them.
+    answering: BTreeSet<Gid>,
+    orders: mpsc::UnboundedSender<outbound::Order>,
+}
+
+/// What a GRAPH message changed.
+pub(super) struct GraphChange {
+    /// Whether it replaces everything that was known of the peer.
+    pub(super) reset: bool,
+    /// Endpoints that came or changed.
+    pub(super) added: Vec<Endpoint>,
+    /// Endpoints that went.
+    pub(super) removed: Vec<Gid>,
+}
+
+impl Peer {
+    /// A peer whose first link was elected.
+    pub(super) fn new(link: u64, outbox: Outbox, carrier: Carrier, shared: &Arc<Shared>) -> Self {
+        let counters = Arc::new(Counters::default());
+        let (orders, receiver) = mpsc::unbounded_channel();
+        let graph = Arc::clone(&shared.offered);
+        let offered = move |gid| super::hub::read(&graph).get(&gid).cloned();
+        let pulse = shared.pulse.clone();
+        tokio::spawn(outbound::run(carrier, receiver, Arc::clone(&counters), pulse, offered));
+        Self {
+            link,
+            outbox,
+            counters,
+            remote: BTreeMap::new(),
+            remote_version: 0,
+            sent: BTreeMap::new(),
+            sent_version: 0,
+            next_route: 1,
+            asked: BTreeMap::new(),
+            routes_in: Arc::default(),
+            served: HashMap::new(),
+            answering: BTreeSet::new(),
+            orders,
+        }
+    }
+
+    /// A successor link takes over: samples go over it from now on, and both sides repeat what they
+    /// said last, since it may have been lost with the old one.
+    pub(super) fn succeed(&mut self, link: u64, outbox: Outbox, carrier: Carrier) {
+        self.link = link;
+        self.outbox = outbox;
+        let _ = self.orders.send(outbound::Order::Connection(carrier));
+        for (key, asked) in &self.asked {
+            self.say(asked.message(key));
+        }
+    }
+
+    /// What a data stream of `connection` needs.
+    pub(super) fn inbound(
+        &self,
+        carrier: Carrier,
+        shared: &Shared,
+        refused: mpsc::Sender<(crate::link::CloseCode, String)>,
+    ) -> Inbound {
+        Inbound {
+            connection: carrier.connection,
+            protection: carrier.protection,
+            routes: Arc::clone(&self.routes_in),
+            counters: Arc::clone(&self.counters),
+            pulse: shared.pulse.clone(),
+            max_message: shared.max_message,
+            refused,
+        }
+    }
+
+    /// Puts a message into the outbox.
+    pub(super) fn say(&self, message: Message) {
+        self.outbox.send(message);
+    }
+
+    /// Whether the peer announced this endpoint.
+    pub(super) fn has(&self, gid: Gid) -> bool {
+        self.remote.contains_key(&gid)
+    }
+
+    // ---- graph ----
+
+    /// Sends what changed since the last time, or all of it.
+    pub(super) fn send_graph(&mut self, local: &BTreeMap<Gid, Endpoint>, whole: bool) {
+        if whole {
+            self.sent.clear();
+        }
+        let added: Vec<_> =
+            local.values().filter(|e| self.sent.get(&e.gid) != Some(e)).cloned().collect();
+        let removed: Vec<_> =
+            self.sent.keys().filter(|gid| !local.contains_key(gid)).copied().collect();
+        if !whole && added.is_empty() && removed.is_empty() {
+            return;
+        }
+        let mut before = if whole { 0 } else { self.sent_version };
+        let mut removed = Some(removed);
+        let mut parts: Vec<_> = added.chunks(GRAPH_PART).map(<[_]>::to_vec).collect();
+        if parts.is_empty() {
+            parts.push(Vec::new());
+        }
+        for part in parts {
+            self.sent_version += 1;
+            let removed = removed.take().unwrap_or_default();
+            let graph = Graph { version: self.sent_version, before, added: part, removed };
+            self.say(Message::Graph(graph));
+            before = self.sent_version;
+        }
+        self.sent.clone_from(local);
+    }
+
+    /// Takes a GRAPH in; `None` when a version is missing and the whole graph must be asked for.
+    ///
+    /// # Errors
+    /// The peer announces more endpoints than allowed.
+    pub(super) fn take_graph(&mut self, graph: Graph) -> Result<Option<GraphChange>, &'static str> {
+        let whole = graph.before == 0;
+        if !whole && graph.before != self.remote_version {
+            return Ok(None);
+        }
+        if whole {
+            self.remote.clear();
+        }
+        for gid in &graph.removed {
+            self.remote.remove(gid);
+        }
+        for endpoint in &graph.added {
+            self.remote.insert(endpoint.gid, endpoint.clone());
+        }
+        if self.remote.len() > LIMITS.endpoints {
+            return Err("more endpoints than a peer may have");
+        }
+        self.remote_version = graph.version;
+        Ok(Some(GraphChange { reset: whole, added: graph.added, removed: graph.removed }))
+    }
+
+    /// The version of the peer's graph that this side holds.
+    pub(super) fn remote_version(&self) -> u64 {
+        self.remote_version
+    }
+
+    /// These endpoints are another daemon's.
+    pub(super) fn forget(&mut self, gids: &[Gid]) {
+        for gid in gids {
+            self.remote.remove(gid);
+        }
+    }
+}
+
+/// A task that ends with what it is for.
+struct OnDrop(tokio::task::JoinHandle<()>);
+
+impl Drop for OnDrop {
+    fn drop(&mut self) {
+        self.0.abort();
+    }
+}
+
+/// What the hub hears from the tasks of a peer.
+pub(super) fn spawn_reader(
+    link: u64,
+    mut reader: super::control::ControlReader,
+    events: mpsc::Sender<Event>,
+) {
+    tokio::spawn(async move {
+        loop {
+            let next = reader.next().await;
+            let ended = next.is_err();
+            if events.send(Event::Control(link, next)).await.is_err() || ended {
+                return;
+            }
+        }
+    });
+}

@@ -1,0 +1,167 @@
+//! Routes that the peer asks for, and what they are fed from.
+
+use std::{collections::HashMap, sync::Arc, time::Duration};
+
+use axon_envelope::{Kind, Route, TopicHash};
+
+use super::{OnDrop, POLL, Peer};
+use crate::{
+    gateway::{
+        hub::Shared,
+        outbound::{Order, RouteOut, Source},
+        routes::{RelaySpec, RouteKey, relays},
+    },
+    ids::Gid,
+    link::{Message, RouteReady, Subscribe, Subscriber},
+    session::EndpointSpec,
+};
+
+/// How long ROUTE_READY waits for the first local publisher to attach.
+const READY_TIMEOUT: Duration = Duration::from_secs(2);
+/// Routes that a peer may ask for. Each costs a lane.
+const MAX_ROUTES: usize = 1024;
+
+/// A route that the peer asked for.
+pub(super) struct Served {
+    pub(super) key: RouteKey,
+    route: Route,
+    /// Its readers there.
+    pub(super) subscribers: Vec<Gid>,
+    sources: Vec<Source>,
+    /// Sends ROUTE_READY once a publisher is attached.
+    _announcing: OnDrop,
+}
+
+impl Peer {
+    /// SUBSCRIBE: opens a route, or changes it. One for requests may have made servers reachable:
+    /// [`update`](Self::update) sees to it.
+    ///
+    /// # Errors
+    /// Text for the peer: what is wrong with the request.
+    pub(in crate::gateway) fn serve(
+        &mut self,
+        subscribe: Subscribe,
+        shared: &Arc<Shared>,
+    ) -> Result<(), String> {
+        let Subscribe { route: number, topic, type_name, kind, subscribers, last } = subscribe;
+        let hash = TopicHash::new(shared.domain, &topic, &type_name).map_err(|e| e.to_string())?;
+        let kind = match kind {
+            0 => Kind::Topic,
+            1 => Kind::Request,
+            2 => Kind::Response,
+            other => return Err(format!("a route of kind {other}")),
+        };
+        let key = RouteKey { kind, topic, type_name };
+        let mut others = self.served.iter().filter(|(route, _)| **route != number);
+        if others.any(|(_, served)| served.key == key) {
+            return Err(format!("{} has a route already", key.topic));
+        }
+        let old = match self.served.remove(&number) {
+            Some(served) if served.key == key => served.sources,
+            Some(_) => return Err("a route number for two topics".into()),
+            None if self.served.len() >= MAX_ROUTES => {
+                return Err(format!("more than {MAX_ROUTES} routes"));
+            }
+            None => Vec::new(),
+        };
+        let sources = match kind {
+            Kind::Topic => self.open_relays(&key, &subscribers, old, shared),
+            Kind::Request | Kind::Response => self.of_service(&key),
+        };
+        let _announcing = self.announce_ready(number, &sources);
+        let route = Route { kind, topic: hash };
+        let seen = last.iter().map(|l| (l.publisher, l.sequence)).collect();
+        let out = RouteOut { route, sources: sources.clone(), seen };
+        let _ = self.orders.send(Order::Route(number, out));
+        let subscribers = subscribers.iter().map(|subscriber| subscriber.gid).collect();
+        self.served.insert(number, Served { key, route, subscribers, sources, _announcing });
+        Ok(())
+    }
+
+    /// UNSUBSCRIBE.
+    pub(in crate::gateway) fn unserve(&mut self, route: u32) {
+        self.served.remove(&route);
+        let _ = self.orders.send(Order::End(route));
+    }
+
+    fn open_relays(
+        &self,
+        key: &RouteKey,
+        subscribers: &[Subscriber],
+        mut old: Vec<Source>,
+        shared: &Arc<Shared>,
+    ) -> Vec<Source> {
+        let hash = |gid: &Gid| self.remote.get(gid).map_or_else(Vec::new, |e| e.type_hash.clone());
+        let mut sources = Vec::new();
+        for spec in relays(subscribers, hash) {
+            let RelaySpec { qos, ref type_hash, ref stands_for } = spec;
+            let same = |source: &Source| matches!(source, Source::Relay(o, _) if o.qos == qos && o.type_hash == *type_hash);
+            if let Some(at) = old.iter().position(same)
+                && let Source::Relay(_, subscription) = old.swap_remove(at)
+            {
+                subscription.set_stands_for(stands_for.clone());
+                sources.push(Source::Relay(spec, subscription));
+                continue;
+            }
+            let endpoint = EndpointSpec {
+                type_hash: type_hash.clone(),
+                ..EndpointSpec::new(&*key.topic, &*key.type_name, qos)
+            };
+            match shared.session.create_relay(endpoint, stands_for.clone()) {
+                Ok(subscription) => sources.push(Source::Relay(spec, Arc::new(subscription))),
+                Err(error) => {
+                    let topic = &key.topic;
+                    tracing::error!(topic, %error, "a topic is not sent to a peer");
+                }
+            }
+        }
+        sources
+    }
+
+    /// What stands in for the peer's end of a service takes what is for it.
+    fn of_service(&self, key: &RouteKey) -> Vec<Source> {
+        let asked = self.asked.get(&key.other_way());
+        let stand_ins = asked.into_iter().flat_map(|asked| asked.stand_ins.values());
+        let mut sources: Vec<_> = stand_ins.cloned().collect();
+        sources.sort_by_key(|stand_in| stand_in.gid());
+        sources.into_iter().map(Source::StandIn).collect()
+    }
+
+    /// Services are fed from the stand-ins that there are now.
+    pub(super) fn feed_services(&mut self) {
+        let services = self.served.iter().filter(|(_, served)| served.key.kind != Kind::Topic);
+        let mut changes = Vec::new();
+        for (number, served) in services {
+            let now = self.of_service(&served.key);
+            let same = now.len() == served.sources.len()
+                && now.iter().zip(&served.sources).all(|(one, other)| one.is(other));
+            if !same {
+                changes.push((*number, now));
+            }
+        }
+        for (number, sources) in changes {
+            let Some(served) = self.served.get_mut(&number) else { continue };
+            served.sources.clone_from(&sources);
+            let out = RouteOut { route: served.route, sources, seen: HashMap::new() };
+            let _ = self.orders.send(Order::Route(number, out));
+        }
+    }
+
+    fn announce_ready(&self, route: u32, sources: &[Source]) -> OnDrop {
+        let (sources, outbox) = (sources.to_vec(), self.outbox.clone());
+        OnDrop(tokio::spawn(async move {
+            poll(|| sources.iter().any(|s| !s.writers().is_empty()), READY_TIMEOUT).await;
+            let publishers = sources.iter().flat_map(Source::writers).collect();
+            outbox.send(Message::RouteReady(RouteReady { route, publishers }));
+        }))
+    }
+}
+
+/// Looks until `reached`, or until `limit` has passed. A few milliseconds of latency, once a route,
+/// for no thread that a peer could keep busy.
+async fn poll(reached: impl Fn() -> bool, limit: Duration) {
+    let until = tokio::time::Instant::now() + limit;
+    while !reached() && tokio::time::Instant::now() < until {
+        tokio::time::sleep(POLL).await;
+    }
+}

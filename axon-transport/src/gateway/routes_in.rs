@@ -1,0 +1,89 @@
+//! The routes that this side asked a peer for, as its data streams find them.
+
+use std::{
+    collections::HashMap,
+    sync::{Arc, PoisonError, RwLock, RwLockWriteGuard},
+    time::Duration,
+};
+
+use axon_envelope::{Kind, Route};
+use tokio::sync::{Mutex, Notify};
+
+use super::{hub::read, stand_in::StandIn};
+use crate::ids::Gid;
+
+/// How long a stream waits for its publisher: samples may be here before the graph that tells of it,
+/// and the readers here have to be attached first.
+const ARRIVAL: Duration = Duration::from_secs(2);
+
+/// A route.
+pub(super) struct RouteIn {
+    /// Topic and kind, for the envelope.
+    pub(super) route: Route,
+    /// What writes on the other side, once its readers here are attached.
+    pub(super) writers: HashMap<Gid, Arc<StandIn>>,
+    /// Of a route of responses: the clients here, and what the stream of each holds while it is read.
+    pub(super) clients: HashMap<Gid, Arc<Mutex<()>>>,
+}
+
+/// The routes of a peer by this side's numbers for them.
+#[derive(Default)]
+pub(super) struct RoutesIn {
+    routes: RwLock<HashMap<u32, RouteIn>>,
+    changed: Notify,
+}
+
+impl RouteIn {
+    pub(super) fn new(route: Route) -> Self {
+        Self { route, writers: HashMap::new(), clients: HashMap::new() }
+    }
+}
+
+impl RoutesIn {
+    /// Changes the routes, and has the streams look again that wait for one.
+    pub(super) fn change<T>(&self, change: impl FnOnce(&mut HashMap<u32, RouteIn>) -> T) -> T {
+        let changed = change(&mut self.write());
+        self.changed.notify_waiters();
+        changed
+    }
+
+    /// The route of a stream that says that it is of `gid`, and what it holds while it is read.
+    pub(super) async fn stream(&self, number: u32, gid: Gid) -> Option<(Route, Arc<Mutex<()>>)> {
+        self.find(number, |route| {
+            let feeding = match route.route.kind {
+                Kind::Response => route.clients.get(&gid),
+                Kind::Topic | Kind::Request => route.writers.get(&gid).map(|w| &w.feeding),
+            };
+            Some((route.route, Arc::clone(feeding?)))
+        })
+        .await
+    }
+
+    /// Who writes for `gid` here.
+    pub(super) async fn writer(&self, number: u32, gid: Gid) -> Option<Arc<StandIn>> {
+        self.find(number, |route| route.writers.get(&gid).cloned()).await
+    }
+
+    /// Looks, for a while, as long as there is such a route.
+    async fn find<T>(&self, number: u32, look: impl Fn(&RouteIn) -> Option<T>) -> Option<T> {
+        let found = async {
+            loop {
+                let changed = self.changed.notified();
+                tokio::pin!(changed);
+                // Registered before the look, so that no change in between is missed.
+                changed.as_mut().enable();
+                match read(&self.routes).get(&number).map(&look) {
+                    Some(None) => {}
+                    Some(found) => return found,
+                    None => return None,
+                }
+                changed.await;
+            }
+        };
+        tokio::time::timeout(ARRIVAL, found).await.ok().flatten()
+    }
+
+    fn write(&self) -> RwLockWriteGuard<'_, HashMap<u32, RouteIn>> {
+        self.routes.write().unwrap_or_else(PoisonError::into_inner)
+    }
+}
