@@ -70,6 +70,7 @@ mod blocks;
 mod classes;
 mod connect;
 mod context;
+mod copy;
 mod error;
 mod fork;
 mod headroom;

@@ -9,7 +9,7 @@ use std::{
     sync::{Arc, atomic::AtomicU64},
 };
 
-use super::{Meta, Taken, attachment::Pin, memory::Map, ring};
+use super::{Meta, Taken, attachment::Pin, copy, memory::Map};
 
 /// A sample, in the publisher's memory where it is longer than 4 KiB, else in a copy.
 ///
@@ -99,7 +99,7 @@ impl Sample {
         match &self.data {
             Data::Copied(bytes) => out.copy_from_slice(&bytes[at.min(self.len)..][..count]),
             Data::Pinned { pin, .. } if pin.attachment().lane.is_forked() => return 0,
-            Data::Pinned { .. } => ring::read_at(self.words(), at, out),
+            Data::Pinned { .. } => copy::read_at(self.words(), at, out),
         }
         count
     }
@@ -120,7 +120,7 @@ impl Sample {
                 out.clear();
                 Ok(())
             }
-            Data::Pinned { .. } => ring::copy_out(self.words(), self.len, out),
+            Data::Pinned { .. } => copy::copy_out(self.words(), self.len, out),
         }
     }
 

@@ -8,7 +8,7 @@ use std::{
 
 use super::{ATTEMPTS, Descriptors, KNOWN, MISSING, Missing, Obstacle, Reader};
 use crate::shm::{
-    TakeError,
+    TakeError, copy,
     layout::{self, Array, COPIED},
     memory::Map,
     peer::Found,
@@ -203,7 +203,7 @@ impl Reader {
         let Some(descriptors) = &self.descriptors else { return Ok(false) };
         let view = descriptors.view(&self.attachment);
         let mut copy = |words: &[AtomicU64]| {
-            ring::copy_out(words, len, out).map_err(|_| TakeError::NoMemory { len: len as u64 })
+            copy::copy_out(words, len, out).map_err(|_| TakeError::NoMemory { len: len as u64 })
         };
         match bytes {
             Bytes::Inline => copy(view.inline(self.cursor))?,
