@@ -1,9 +1,8 @@
-//! What a reader shares with the samples that it lent out: the ring's header, the lane, and which
-//! of the lane's records are in use.
+//! What a reader shares with the samples that it lent out: the ring's header and the lane.
 
 use std::{
     ops::Range,
-    sync::{Arc, Mutex, PoisonError, atomic::AtomicU64},
+    sync::{Arc, atomic::AtomicU64},
 };
 
 use super::{Lane, layout::ring::TAIL, memory::Map, pins::RECORDS};
@@ -18,9 +17,6 @@ pub(super) struct Attachment {
     /// Where the ring's header is in it.
     ring: Range<usize>,
     pub(super) lane: Lane,
-    /// The records in use, as bits. The lock also orders what one thread stored in a record before
-    /// what the next one stores there.
-    used: Mutex<u8>,
 }
 
 /// What came of pinning a sample.
@@ -35,7 +31,7 @@ pub(super) enum Pinning<T> {
 impl Attachment {
     /// A hold on the ring whose header is in these words of `map`.
     pub(super) fn new(map: Arc<Map>, ring: Range<usize>, lane: Lane) -> Arc<Self> {
-        Arc::new(Self { map, ring, lane, used: Mutex::new(0) })
+        Arc::new(Self { map, ring, lane })
     }
 
     /// The ring's header.
@@ -51,21 +47,12 @@ impl Attachment {
         }
     }
 
-    /// Keeps the sample at `position` in place for as long as the pin lives.
+    /// Keeps the sample at `position` in place for as long as the pin lives. For the reader itself,
+    /// which does one thing at a time: no other thread takes a record meanwhile.
     pub(super) fn pin(self: &Arc<Self>, position: u64) -> Pinning<Pin> {
-        let record = {
-            let mut used = self.used();
-            let record = used.trailing_ones() as usize;
-            if record >= COPY {
-                return Pinning::NoRecord;
-            }
-            *used |= 1 << record;
-            record
-        };
-        // Gives the record back also when it is not used.
-        let pin = Pin { attachment: Arc::clone(self), record };
+        let Some(record) = self.lane.free_record(COPY) else { return Pinning::NoRecord };
         if self.lane.pin(record, position, self.tail()) {
-            Pinning::Pinned(pin)
+            Pinning::Pinned(Pin { attachment: Arc::clone(self), record })
         } else {
             Pinning::Overtaken
         }
@@ -85,10 +72,6 @@ impl Attachment {
 
     fn tail(&self) -> &AtomicU64 {
         &self.ring()[TAIL]
-    }
-
-    fn used(&self) -> std::sync::MutexGuard<'_, u8> {
-        self.used.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -114,11 +97,9 @@ impl Pin {
 
 impl Drop for Pin {
     fn drop(&mut self) {
-        // The parent's records are none of a forked child's business, and its lock may be held by
-        // a thread that the child does not have.
+        // The parent's records are none of a forked child's business.
         if !self.attachment.lane.is_forked() {
             self.attachment.lane.unpin(self.record);
-            *self.attachment.used() &= !(1 << self.record);
         }
     }
 }

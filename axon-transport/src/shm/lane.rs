@@ -229,6 +229,12 @@ impl Lane {
         advance(self.words(), u64::MAX);
     }
 
+    /// A record [that pins nothing](pins::free), of the first `count`.
+    #[inline]
+    pub(super) fn free_record(&self, count: usize) -> Option<usize> {
+        pins::free(self.words(), count)
+    }
+
     /// [Pins](pins::pin) `position`.
     #[inline]
     pub(super) fn pin(&self, record: usize, position: u64, tail: &AtomicU64) -> bool {

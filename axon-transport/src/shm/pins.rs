@@ -21,6 +21,15 @@ use super::{
 /// Records of a lane: how many samples of one publisher a reader can pin.
 pub(super) const RECORDS: usize = 6;
 
+/// Reader: a record, of the first `count`, that pins nothing. It stays free until this thread uses
+/// it: only one at a time pins, though any may unpin.
+#[inline]
+pub(super) fn free<W: Word>(lane: &[W], count: usize) -> Option<usize> {
+    let mut records = lane[PINS..PINS + count].iter();
+    // Pairs with `unpin`: what another thread read comes before the pin that this one stores there.
+    records.position(|record| record.load(Site::FreeLoad.order()) == 0)
+}
+
 /// Reader: pins `position` in a record that is not in use. False when the publisher has given the
 /// sample up already: then it is not pinned.
 #[inline]
@@ -39,7 +48,7 @@ pub(super) fn pin<W: Word>(lane: &[W], record: usize, position: u64, tail: &W) -
 /// Reader: nothing is read any more of what the record pins.
 #[inline]
 pub(super) fn unpin<W: Word>(lane: &[W], record: usize) {
-    // Pairs with `scan`: all reads come before the write that follows it.
+    // Pairs with `scan`: all reads come before the write that follows it; and with `free`.
     lane[PINS + record].store(0, Site::UnpinStore.order());
 }
 

@@ -40,6 +40,7 @@ pub(crate) trait LockWord {
 /// | `MappedStore` | `MappedLoad` | what moves to a segment that came is found there |
 /// | `ReclaimFence` | `PinFence` | the publisher sees the pin, or the reader sees the tail |
 /// | `PinStore`, `UnpinStore` | `ScanLoad` | a pinned sample is read before it is written over |
+/// | `UnpinStore` | `FreeLoad` | who sees the next pin in a record knows that the last was read |
 /// | `OpenStore` | `GenerationLoad` | whoever sees a lane open sees its cursor |
 /// | `CloseStore`, `AskStore` | `GenerationLoad` | whoever sees a reader gone writes after it read |
 /// | `CursorStore` | `CursorLoad` | a sample is copied out before KEEP_ALL writes over it |
@@ -63,6 +64,7 @@ pub(crate) enum Site {
     PinFence,
     PinStore,
     UnpinStore,
+    FreeLoad,
     ScanLoad,
     AskStore,
     OpenStore,
@@ -108,6 +110,7 @@ impl Site {
             | Self::StandsFence
             | Self::ArrayLoad
             | Self::MappedLoad
+            | Self::FreeLoad
             | Self::ScanLoad
             | Self::GenerationLoad
             | Self::CursorLoad
@@ -132,7 +135,7 @@ pub(crate) fn fence_at<W: Word>(site: Site) {
 
 #[cfg(test)]
 impl Site {
-    pub(crate) const ALL: [Self; 27] = [
+    pub(crate) const ALL: [Self; 28] = [
         Self::StampStore,
         Self::StampLoad,
         Self::HeadStore,
@@ -149,6 +152,7 @@ impl Site {
         Self::PinFence,
         Self::PinStore,
         Self::UnpinStore,
+        Self::FreeLoad,
         Self::ScanLoad,
         Self::AskStore,
         Self::OpenStore,

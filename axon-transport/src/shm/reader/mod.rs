@@ -263,19 +263,19 @@ impl Reader {
     pub fn take_sample(&mut self) -> Result<Option<Sample>, TakeError> {
         for _ in 0..ATTEMPTS {
             let Some((record, bytes)) = self.find_whole()? else { break };
-            if let Bytes::Slot(map, words) = &bytes
-                && self.may_pin(&record)
-            {
-                match self.attachment.pin(self.cursor) {
-                    Pinning::Pinned(pin) => {
-                        let len = record.len as usize;
-                        let place = (Arc::clone(map), words.clone());
-                        return Ok(Some(Sample::pinned(self.taken(&record), len, place, pin)));
+            let bytes = match bytes {
+                Bytes::Slot(map, words) if self.may_pin(&record) => {
+                    match self.attachment.pin(self.cursor) {
+                        Pinning::Pinned(pin) => {
+                            let (taken, len) = (self.taken(&record), record.len as usize);
+                            return Ok(Some(Sample::pinned(taken, len, (map, words), pin)));
+                        }
+                        Pinning::Overtaken => continue,
+                        Pinning::NoRecord => Bytes::Slot(map, words),
                     }
-                    Pinning::Overtaken => continue,
-                    Pinning::NoRecord => {}
                 }
-            }
+                copied => copied,
+            };
             let mut out = Vec::new();
             if self.copy_out(&record, &bytes, &mut out)? {
                 return Ok(Some(Sample::copied(self.taken(&record), out)));

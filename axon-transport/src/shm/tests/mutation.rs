@@ -39,6 +39,9 @@ fn caught_by(site: Site) -> &'static str {
             "shm::tests::model::pins::\
              a_record_that_pins_another_sample_says_that_the_last_was_read"
         }
+        FreeLoad => {
+            "shm::tests::model::pins::a_record_that_another_thread_freed_says_that_it_has_read"
+        }
         OpenStore => "shm::tests::model::lanes::a_lane_that_is_open_shows_the_cursor_of_its_reader",
         AskStore | CloseStore | GenerationLoad => {
             "shm::tests::model::lanes::a_reader_that_has_left_has_read_all"

@@ -8,7 +8,7 @@ use loom::{
 use super::{
     super::super::{
         lane::{self, Tenancy},
-        pins::{about_to_scan, pin, unpin},
+        pins::{about_to_scan, free, pin, unpin},
         ring::{bounds, retire},
         seats::{Pinned, scan},
     },
@@ -89,6 +89,40 @@ fn a_record_that_pins_another_sample_says_that_the_last_was_read() {
                 assert_eq!(cells[position as usize].get(), position + 1);
             });
         }
+        publisher.join().unwrap();
+    });
+}
+
+/// `FreeLoad`: a sample is dropped by one thread while another takes the next.
+#[test]
+fn a_record_that_another_thread_freed_says_that_it_has_read() {
+    check(3, || {
+        let ring = Ring::new();
+        let (lane, tenancy) = granted(0);
+        let cell = Arc::new(Cell::new(1));
+        ring.show(0);
+        ring.show(1);
+        assert!(pin(&lane, 0, 0, ring.tail()));
+        let holder = {
+            let (lane, cell) = (lane.clone(), cell.clone());
+            thread::spawn(move || {
+                assert_eq!(cell.get(), 1);
+                unpin(&lane, 0);
+            })
+        };
+        let publisher = {
+            let (ring, lane, cell) = (ring.clone(), lane.clone(), cell.clone());
+            thread::spawn(move || {
+                retire(&ring.header, 1);
+                if is_free(&lane, &tenancy, 0) {
+                    cell.set(3);
+                }
+            })
+        };
+        if let Some(record) = free(&lane, 1) {
+            assert!(pin(&lane, record, 1, ring.tail()));
+        }
+        holder.join().unwrap();
         publisher.join().unwrap();
     });
 }
