@@ -134,7 +134,7 @@ impl History {
     /// Gives up the oldest samples that `may_go` until `len` bytes more are within the budget. One
     /// sample always stays, whatever its length.
     pub(super) fn make_room(&mut self, len: u64, may_go: impl Fn(u64) -> bool) -> Result<(), Held> {
-        while self.placed > 1 && self.used + len > self.budget {
+        while !self.has_room(len) {
             self.give_up_oldest(&may_go)?;
         }
         Ok(())
@@ -180,6 +180,20 @@ impl History {
         let at = self.pinned.lend(len)?;
         self.used += len;
         Some(at)
+    }
+
+    /// The same, where it is within the budget as it is and slots [take turns](Limbo::lend_turn).
+    pub(super) fn lend_turn(&mut self, len: u64) -> Option<Location> {
+        if !self.has_room(len) {
+            return None;
+        }
+        let at = self.pinned.lend_turn(len)?;
+        self.used += len;
+        Some(at)
+    }
+
+    fn has_room(&self, len: u64) -> bool {
+        self.placed <= 1 || self.used + len <= self.budget
     }
 
     /// Gives back a loan.

@@ -61,8 +61,12 @@ impl Limbo {
 
     /// A place that nobody reads, where samples are taken in.
     pub(super) fn take(&mut self, len: u64) -> Option<Location> {
+        self.take_by(|slots| slots.take(len))
+    }
+
+    fn take_by(&mut self, take: impl FnOnce(&mut Slots) -> Option<u64>) -> Option<Location> {
         let store = self.stores.last_mut().filter(|store| !store.left)?;
-        let offset = store.slots.take(len)?;
+        let offset = take(&mut store.slots)?;
         Some(Location { segment: store.number, offset })
     }
 
@@ -85,6 +89,13 @@ impl Limbo {
                 Some(Location { segment: store.number, offset })
             })
         })?;
+        self.loans += 1;
+        Some(at)
+    }
+
+    /// As [`lend`](Self::lend), while slots [take turns](Slots::take_turn).
+    pub(super) fn lend_turn(&mut self, len: u64) -> Option<Location> {
+        let at = self.take_by(|slots| slots.take_turn(len))?;
         self.loans += 1;
         Some(at)
     }
@@ -131,14 +142,12 @@ impl Limbo {
     /// Frees what no reader pins. The tail must have been raised above all that is here before
     /// the pins were looked at.
     pub(super) fn reclaim(&mut self, pinned: impl Fn(u64, u64) -> bool) {
-        let stores = &mut self.stores;
-        self.retired.retain(|retired| {
-            let keep = pinned(retired.position, retired.len);
-            if !keep {
-                slots(stores, retired.at).release(retired.at.offset, retired.len);
-            }
-            keep
-        });
+        let keeps = |retired: &Retired| pinned(retired.position, retired.len);
+        // The last ones first, so that the ones that were read longest ago are taken first.
+        for Retired { at, len, .. } in self.retired.iter().rev().filter(|retired| !keeps(retired)) {
+            slots(&mut self.stores, *at).release(at.offset, *len);
+        }
+        self.retired.retain(keeps);
     }
 
     /// The positions of samples that were given up and not reclaimed.

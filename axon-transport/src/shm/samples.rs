@@ -16,6 +16,7 @@ use super::{
     room::{Kept, Refusal, no_memory},
     seats::Holder,
     segments::{OwnSegment, SegmentEvent},
+    slots::TURNS,
     tenure::Tenure,
     writer::{LOOKS, State},
 };
@@ -31,6 +32,8 @@ pub(super) struct Samples {
     tenure: Tenure,
     /// The length in bytes of the last sample, when no slot is ready for another like it.
     ahead: Option<u64>,
+    /// Slots that may be taken before readers are looked at again.
+    turns: u32,
 }
 
 /// Backs a segment with memory up to `end`, a little further when it keeps growing. Up to where.
@@ -126,7 +129,7 @@ impl Writer {
         let segment = self.session.open_samples(options.gid, bytes)?;
         state.history.pinned().open(segment.number(), SLOTS_AT..bytes);
         let tenure = Tenure::begin(Instant::now());
-        state.samples = Some(Samples { segment, tenure, ahead: None });
+        state.samples = Some(Samples { segment, tenure, ahead: None, turns: 0 });
         Ok(())
     }
 
@@ -134,6 +137,9 @@ impl Writer {
     pub(super) fn lend(&self, state: &mut State, bytes: u64) -> Result<Place, Refusal> {
         debug_assert!(bytes > COPIED);
         self.open_samples(state).map_err(no_memory)?;
+        if let Some(place) = self.next_turn(state, bytes) {
+            return Ok(place);
+        }
         let floors = state.audience.floors(state.history.head());
         let may_go = |position| position < floors.held;
         // What all readers have taken goes first: its memory is the warmest.
@@ -210,6 +216,20 @@ impl Writer {
         unreachable!("the looks are counted")
     }
 
+    /// A slot at hand, as long as slots take turns: to find out what readers have taken costs lines
+    /// that they have just written to, and need not be done for each sample.
+    fn next_turn(&self, state: &mut State, bytes: u64) -> Option<Place> {
+        let State { history, samples: Some(samples), .. } = state else { return None };
+        let Some(turns) = samples.turns.checked_sub(1) else {
+            samples.turns = TURNS - 1;
+            return None;
+        };
+        let at = history.lend_turn(bytes)?;
+        samples.turns = turns;
+        // That there is no memory for it only ends the turns.
+        self.settled(state, at, bytes, true).ok().flatten()
+    }
+
     /// A place in the segment that takes samples in; `None` when that is full, or has none that is
     /// backed and must not `grow`.
     fn place(
@@ -218,8 +238,21 @@ impl Writer {
         bytes: u64,
         grow: bool,
     ) -> Result<Option<Place>, PublishError> {
+        match state.history.lend(bytes) {
+            Some(at) => self.settled(state, at, bytes, grow),
+            None => Ok(None),
+        }
+    }
+
+    /// What was lent, in memory that there is.
+    fn settled(
+        &self,
+        state: &mut State,
+        at: Location,
+        bytes: u64,
+        grow: bool,
+    ) -> Result<Option<Place>, PublishError> {
         let State { history, samples: Some(samples), .. } = state else { return Ok(None) };
-        let Some(at) = history.lend(bytes) else { return Ok(None) };
         let slots = history.pinned().slots(at);
         let end = slots.end(at.offset, bytes);
         let is_open = at.segment == samples.segment.number();

@@ -5,6 +5,10 @@
 //! none, memory that is backed and in no list serves, then a slot of one of the next larger
 //! classes. Only when all of that fails are the lists given up, what touches is joined, and the
 //! lowest place that is large enough is taken, so that memory grows last.
+//!
+//! Slots that fit in a core's own cache are [taken in turns](Slots::take_turn) as well: to write to
+//! the one that was read last, the writer would have to wait for the reader's core to hand over each
+//! line of it.
 
 use std::ops::Range;
 
@@ -15,6 +19,10 @@ use super::{
 
 /// How many of the next larger classes may help out: slots up to twice as large.
 const HELPERS: usize = 4;
+/// How many slots take turns.
+pub(super) const TURNS: u32 = 4;
+/// Slots of up to so many bytes do. With larger ones the memory of all four is slower than the wait.
+const TURNING: u64 = 512 << 10;
 
 /// The slots of one segment.
 #[derive(Clone, Debug)]
@@ -25,8 +33,12 @@ pub(super) struct Slots {
     rest: Area,
     /// Slots in use that are of a larger class than their samples: start and class.
     larger: Vec<(u64, usize)>,
+    /// Where the first slot can be.
+    start: u64,
     /// Up to here there is memory.
     backed: u64,
+    /// Memory was short once.
+    short: bool,
     /// Bytes of the slots in use.
     used: u64,
 }
@@ -36,7 +48,9 @@ impl Slots {
     pub(super) fn new(range: Range<u64>, pieces: usize) -> Self {
         Self {
             free: vec![Vec::new(); CLASSES],
+            start: range.start,
             backed: range.start,
+            short: false,
             rest: Area::new(range, pieces),
             larger: Vec::new(),
             used: 0,
@@ -60,6 +74,23 @@ impl Slots {
         Some(at)
     }
 
+    /// As [`take`](Self::take), where that helps turns and disturbs nothing: a slot that is free, or
+    /// of memory that is in no list. To have as many as take turns, memory grows, unless it was
+    /// short once.
+    pub(super) fn take_turn(&mut self, len: u64) -> Option<u64> {
+        let class = classes::class(len);
+        let bytes = classes::size(class);
+        if bytes > TURNING {
+            return None;
+        }
+        let first = if self.short { 0 } else { self.start + u64::from(TURNS) * bytes };
+        let at = self.free[class]
+            .pop()
+            .or_else(|| self.rest.allocate_below(self.backed.max(first), bytes))?;
+        self.used += bytes;
+        Some(at)
+    }
+
     /// Gives back the slot at `at`, which was taken for `len` bytes.
     pub(super) fn release(&mut self, at: u64, len: u64) {
         let mut class = classes::class(len);
@@ -76,6 +107,7 @@ impl Slots {
         let bytes = classes::rounded(len);
         self.used -= bytes;
         self.rest.release(at, bytes);
+        self.short = true;
     }
 
     /// Whether another slot like that of `len` bytes is at hand.
@@ -105,12 +137,7 @@ impl Slots {
 
     /// A slot of memory that is in no list.
     fn cut_backed(&mut self, bytes: u64) -> Option<u64> {
-        let at = self.rest.allocate(bytes)?;
-        if at + bytes > self.backed {
-            self.rest.release(at, bytes);
-            return None;
-        }
-        Some(at)
+        self.rest.allocate_below(self.backed, bytes)
     }
 
     /// The smallest free slot of the next larger classes.
@@ -165,6 +192,33 @@ mod tests {
         slots.release(third, MIB);
         assert_eq!([(); 3].map(|()| take(&mut slots, MIB - 9).unwrap()), [third, first, second]);
         assert_eq!(slots.backed(), 3 * MIB);
+    }
+
+    #[test]
+    fn four_small_slots_take_turns() {
+        let len = 64 << 10;
+        let mut slots = slots(16 * MIB);
+        let first: Vec<_> = (0..4).map(|_| slots.take_turn(len).unwrap()).collect();
+        assert_eq!(slots.end(first[3], len), 4 * len);
+        slots.back(4 * len);
+        assert_eq!(slots.take_turn(len), None, "memory grows no further for that");
+        // They come back as a publisher finds them to be read: the one published last first.
+        first.iter().rev().for_each(|at| slots.release(*at, len));
+        let again: Vec<_> = (0..4).map(|_| slots.take_turn(len).unwrap()).collect();
+        assert_eq!(again, first);
+        assert_eq!(slots.take_turn(MIB), None, "a large one is best written where it is warm");
+    }
+
+    #[test]
+    fn memory_that_is_short_does_not_grow_for_turns() {
+        let len = 64 << 10;
+        let mut slots = slots(16 * MIB);
+        let low = take(&mut slots, len).unwrap();
+        let unbacked = slots.take_turn(len).unwrap();
+        slots.forgo(unbacked, len);
+        assert_eq!(slots.take_turn(len), None);
+        slots.release(low, len);
+        assert_eq!((slots.take_turn(len), slots.used()), (Some(low), len));
     }
 
     #[test]

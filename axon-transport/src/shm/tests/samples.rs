@@ -161,7 +161,7 @@ fn what_all_have_taken_is_written_over_first() {
         publish(&writer, sequence, IMAGE);
         readers.iter_mut().for_each(|reader| whole(&reader.take_sample().unwrap().unwrap()));
     }
-    assert!(backed(&a) < 4 * IMAGE as u64, "{} bytes", backed(&a));
+    assert!(backed(&a) < 6 * IMAGE as u64, "{} bytes", backed(&a));
     // A reader that is late has its history all the same.
     for sequence in 100..110 {
         publish(&writer, sequence, IMAGE);
