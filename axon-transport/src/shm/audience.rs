@@ -11,6 +11,7 @@ use super::{
 use crate::{
     ids::Gid,
     qos::{Durability, History, Qos, Reliability},
+    wait::Purpose,
 };
 
 /// The history that is kept at least, for readers that are late by a burst.
@@ -88,6 +89,12 @@ impl Audience {
 
     pub(super) fn peers(&self) -> Arc<[Peer]> {
         Arc::clone(&self.peers)
+    }
+
+    /// The sessions, if anybody there waits for a sample, after [`settle`](crate::wait::settle).
+    #[inline]
+    pub(super) fn waiting(&self) -> Option<Arc<[Peer]>> {
+        self.peers.iter().any(|peer| peer.waits(Purpose::Samples)).then(|| self.peers())
     }
 
     pub(super) fn readers(&self) -> Vec<Gid> {

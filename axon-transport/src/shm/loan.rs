@@ -6,13 +6,13 @@ use std::{
     ptr::NonNull,
     slice,
     sync::Arc,
-    time::{Duration, SystemTime},
+    time::SystemTime,
 };
 
 use super::{
     Location, Meta, PublishError, Published, Writer,
     segments::OwnSegment,
-    writer::{Numbering, PATIENCE, Payload},
+    writer::{Numbering, PATIENCE, Patience, Payload},
 };
 
 /// Memory to be filled and published: shared memory where it is longer than 4 KiB. Dropping
@@ -110,13 +110,13 @@ impl<'a> Loan<'a> {
         if written < len {
             return Err(PublishError::Incomplete { len, written });
         }
-        self.commit(numbering, PATIENCE)
+        self.commit(numbering, Patience::new(PATIENCE))
     }
 
     pub(super) fn commit(
         mut self,
         numbering: Numbering,
-        patience: Duration,
+        patience: Patience,
     ) -> Result<(u64, Published), PublishError> {
         let payload = match &self.memory {
             Memory::Own(bytes) => Payload::Bytes(bytes),

@@ -20,7 +20,7 @@ use super::{
 use crate::{
     ids::SessionId,
     passed::PassedFd,
-    wait::{Bell, Purpose, due},
+    wait::{Bell, Purpose, due, waits},
 };
 
 /// What a session hands over so that others can share memory with it, in the order in which the
@@ -273,12 +273,21 @@ impl PeerSession {
         self.pidfd.as_fd()
     }
 
-    fn ring_if(&self, purpose: Purpose) {
-        let word = match purpose {
+    #[inline]
+    fn ticket(&self, purpose: Purpose) -> &AtomicU64 {
+        &self.first.words()[match purpose {
             Purpose::Samples => layout::session::ARMED,
             Purpose::Room => layout::session::BLOCKED,
-        };
-        if due(&self.first.words()[word], &self.rung[purpose as usize]) {
+        }]
+    }
+
+    #[inline]
+    fn waits(&self, purpose: Purpose) -> bool {
+        waits(self.ticket(purpose), &self.rung[purpose as usize])
+    }
+
+    fn ring_if(&self, purpose: Purpose) {
+        if due(self.ticket(purpose), &self.rung[purpose as usize]) {
             self.bell.ring();
         }
     }
@@ -314,6 +323,15 @@ impl Peer {
         match self {
             Self::Local(_) => None,
             Self::Remote(session) => Some(session),
+        }
+    }
+
+    /// Whether somebody there waits for `purpose` and this process has not rung for it yet.
+    #[inline]
+    pub(super) fn waits(&self, purpose: Purpose) -> bool {
+        match self {
+            Self::Local(session) => session.waits(purpose),
+            Self::Remote(session) => session.waits(purpose),
         }
     }
 

@@ -23,7 +23,7 @@ use super::{
 use crate::{
     ids::{Gid, SessionId},
     passed::PassedFd,
-    wait::{Doorbell, ExternalLeader, Look, Purpose, due},
+    wait::{Doorbell, ExternalLeader, Look, Purpose, due, waits},
 };
 
 /// The memory, doorbell and identity by which other sessions know this one.
@@ -229,6 +229,11 @@ impl SessionSegment {
 
     pub(crate) fn armed_words(&self) -> [&AtomicU64; 2] {
         [self.armed_word(Purpose::Samples), self.armed_word(Purpose::Room)]
+    }
+
+    #[inline]
+    pub(super) fn waits(&self, purpose: Purpose) -> bool {
+        waits(self.armed_word(purpose), &self.rung[purpose as usize])
     }
 
     pub(super) fn ring_if(&self, purpose: Purpose) {

@@ -17,4 +17,4 @@ mod tests;
 pub(crate) use bell::Bell;
 pub(crate) use doorbell::{Doorbell, Look, Purpose};
 pub use event::ExternalLeader;
-pub(crate) use ticket::{arm, disarm, due, settle};
+pub(crate) use ticket::{arm, disarm, due, settle, waits};

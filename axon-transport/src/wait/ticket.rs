@@ -25,12 +25,21 @@ pub(crate) fn settle<W: Word>() {
     fence_at::<W>(Site::SettleFence);
 }
 
-/// Waker, after [`settle`]: whether the doorbell must be rung, now that there is something. `rung`
-/// is the last ticket that this process rang for; it is no concern of another process.
+/// Waker, after [`settle`]: whether somebody is to be woken, now that there is something. `rung` is
+/// the last ticket that this process rang for; it is no concern of another process.
+#[inline]
+pub(crate) fn waits<W: Word>(word: &W, rung: &W) -> bool {
+    unrung(word, rung).is_some()
+}
+
+/// Waker, after [`settle`]: whether the doorbell must be rung, by the one who is told so.
 #[inline]
 pub(crate) fn due<W: Word>(word: &W, rung: &W) -> bool {
+    unrung(word, rung).is_some_and(|ticket| rung.fetch_max(ticket, Ordering::Relaxed) < ticket)
+}
+
+#[inline]
+fn unrung<W: Word>(word: &W, rung: &W) -> Option<u64> {
     let ticket = word.load(Ordering::Relaxed);
-    ticket != 0
-        && rung.load(Ordering::Relaxed) < ticket
-        && rung.fetch_max(ticket, Ordering::Relaxed) < ticket
+    (ticket != 0 && rung.load(Ordering::Relaxed) < ticket).then_some(ticket)
 }

@@ -9,7 +9,7 @@ use super::{LOOKS, Numbering, Payload, State};
 use crate::{
     qos::Durability,
     shm::{
-        Loan, Meta, Peer, PeerSession, PublishError, Published, Writer,
+        Loan, Meta, PeerSession, PublishError, Published, Writer,
         area::Area,
         history::Extent,
         layout::{self, COPIED, INLINE},
@@ -21,6 +21,23 @@ use crate::{
     wait::{Purpose, settle},
 };
 
+/// How long a publish waits altogether, from the first time on that it has to.
+pub(in crate::shm) struct Patience {
+    whole: Duration,
+    end: Option<Instant>,
+}
+
+impl Patience {
+    pub(in crate::shm) fn new(whole: Duration) -> Self {
+        Self { whole, end: None }
+    }
+
+    fn left(&mut self) -> Duration {
+        let now = Instant::now();
+        self.end.get_or_insert(now + self.whole).saturating_duration_since(now)
+    }
+}
+
 impl Writer {
     pub(super) fn publish_within(
         &self,
@@ -29,11 +46,11 @@ impl Writer {
         patience: Duration,
     ) -> Result<(u64, Published), PublishError> {
         let bytes = self.check(payload.len())?;
+        let mut patience = Patience::new(patience);
         if payload.len() as u64 <= COPIED {
             return self.commit(numbering, Payload::Bytes(payload), patience);
         }
-        let start = Instant::now();
-        let lent: Result<LoanPlace, Meta> = self.patiently(patience, |state| {
+        let lent: Result<LoanPlace, Meta> = self.patiently(&mut patience, |state| {
             if self.is_unread(state) {
                 return Ok(Err(self.pass(state, numbering)));
             }
@@ -46,7 +63,7 @@ impl Writer {
         // Copied outside the lock: nobody else knows of the place yet.
         let mut loan = Loan::placed(self, payload.len(), place);
         loan.copy_from_slice(payload);
-        loan.commit(numbering, patience.saturating_sub(start.elapsed()))
+        loan.commit(numbering, patience)
     }
 
     /// Publishes what has been, or is here, copied in. Memory that was lent and that no sample
@@ -55,13 +72,13 @@ impl Writer {
         &self,
         numbering: Numbering,
         payload: Payload<'_>,
-        patience: Duration,
+        mut patience: Patience,
     ) -> Result<(u64, Published), PublishError> {
         // A loan may have been made before the fork.
         if self.is_forked() {
             return Err(PublishError::Forked);
         }
-        let (meta, position, peers) = self.patiently(patience, |state| {
+        let (meta, position, waiting) = self.patiently(&mut patience, |state| {
             if self.is_unread(state) {
                 return Ok((self.pass(state, numbering), None, None));
             }
@@ -79,10 +96,12 @@ impl Writer {
             };
             let meta = self.number(state, numbering);
             let position = self.show(state, meta, extent, place, payload);
-            Ok((meta, Some(position), Some(state.audience.peers())))
+            settle::<AtomicU64>();
+            Ok((meta, Some(position), state.audience.waiting()))
         })?;
-        if let Some(peers) = peers {
-            announce(&peers);
+        // A system call for each session that sleeps, without the lock.
+        for peer in waiting.iter().flat_map(|peers| &**peers) {
+            peer.ring_if(Purpose::Samples);
         }
         Ok((meta.sequence, Published { position }))
     }
@@ -146,22 +165,21 @@ impl Writer {
     /// Tries until it works or `patience` is at its end. The lock is not held in between.
     pub(super) fn patiently<T>(
         &self,
-        patience: Duration,
+        patience: &mut Patience,
         attempt: impl FnMut(&mut State) -> Result<T, Refusal>,
     ) -> Result<T, PublishError> {
         let tried = self.try_for(patience, attempt);
         if let Err(error) = &tried {
-            self.count_failure(error, patience);
+            self.count_failure(error, patience.whole);
         }
         tried
     }
 
     fn try_for<T>(
         &self,
-        patience: Duration,
+        patience: &mut Patience,
         mut attempt: impl FnMut(&mut State) -> Result<T, Refusal>,
     ) -> Result<T, PublishError> {
-        let mut deadline = None;
         for look in 0u32.. {
             let laggards = {
                 let mut state = self.lock();
@@ -177,8 +195,7 @@ impl Writer {
                 let State { history, audience, .. } = &mut *state;
                 audience.laggards(history.tail(), history.head())
             };
-            let now = Instant::now();
-            let left = deadline.get_or_insert(now + patience).saturating_duration_since(now);
+            let left = patience.left();
             match laggards {
                 Some((reader, _)) if left.is_zero() => {
                     return Err(PublishError::Blocked { reader });
@@ -204,13 +221,5 @@ impl Writer {
         let pidfds: Vec<_> = laggards.iter().map(|peer| peer.pidfd()).collect();
         self.session.wait_for_room(ready, &pidfds, left);
         self.lock().audience.mark_dead();
-    }
-}
-
-/// Wakes those that sleep: a system call for each session that does, none for the others.
-fn announce(peers: &[Peer]) {
-    settle::<AtomicU64>();
-    for peer in peers {
-        peer.ring_if(Purpose::Samples);
     }
 }

@@ -4,6 +4,8 @@ mod commit;
 
 use std::{sync::Arc, time::Duration};
 
+pub(super) use self::commit::Patience;
+
 use super::{
     Grant, Loan, Location, Meta, PublishError, Published, ReaderInfo, RingOptions, SessionSegment,
     ShmError,
@@ -321,7 +323,8 @@ impl Writer {
         if len as u64 <= COPIED {
             return Ok(Loan::copied(self, len));
         }
-        let place = self.patiently(PATIENCE, |state| self.lend(state, bytes))?;
+        let place =
+            self.patiently(&mut Patience::new(PATIENCE), |state| self.lend(state, bytes))?;
         Ok(Loan::placed(self, len, place))
     }
 
