@@ -19,7 +19,7 @@ use axon_transport::{
     config::Config,
     qos::{Durability, Qos},
     session::{
-        EndpointSpec, Session, SessionOptions,
+        EndpointSpec, Session, SessionEvent, SessionOptions,
         address::Address,
         message::{Hello, Message, PROTOCOL, SessionRole},
         socket,
@@ -124,6 +124,27 @@ fn child() {
             }
             say("whole");
         }
+        "starved" => {
+            let few = Rlimit { current: Some(256), maximum: Some(256) };
+            setrlimit(Resource::Nofile, few).unwrap();
+            let context = Context::new().unwrap();
+            let socket = meet(&place(), false);
+            let options = SubscriberOptions::new(Qos::keep_all());
+            let mut subscriber =
+                Subscriber::connect(&context, &socket, options, Some(PATIENCE)).unwrap();
+            let open = || fs::File::open("/dev/null").ok();
+            let all: Vec<_> = std::iter::from_fn(open).collect();
+            say("starved");
+            let mut line = String::new();
+            std::io::stdin().read_line(&mut line).unwrap();
+            for _ in 0..3 {
+                assert!(subscriber.recv(Some(Duration::from_millis(20))).unwrap().is_none());
+                subscriber.tend();
+            }
+            drop(all);
+            say(subscriber.recv(Some(PATIENCE)).unwrap().map_or(0, |sample| sample.len()));
+            wait_for_the_end();
+        }
         "many publishers" => {
             let few = Rlimit { current: Some(256), maximum: Some(256) };
             setrlimit(Resource::Nofile, few).unwrap();
@@ -147,6 +168,29 @@ fn child() {
             assert!(publishers[0].wait_matched(1, PATIENCE));
             until("there are descriptors again", || publishers[0].publish(b"still").is_ok());
             say("published");
+            wait_for_the_end();
+        }
+        "much memory" => {
+            let session =
+                Session::open(&Config::from_env().unwrap(), SessionOptions::new("much")).unwrap();
+            session.set_listener(|event| {
+                if *event == SessionEvent::DaemonLost {
+                    say("disconnected");
+                }
+            });
+            let all: Vec<_> = (0..100)
+                .map(|number| {
+                    let publisher = session.create_publisher(latched(&format!("/t{number}")));
+                    let publisher = publisher.unwrap();
+                    publisher.publish(&[1; 5000]).unwrap();
+                    publisher
+                })
+                .collect();
+            say("published");
+            let mut line = String::new();
+            std::io::stdin().read_line(&mut line).unwrap();
+            // What is small needs no memory of its own.
+            all[0].publish(b"small").unwrap();
             wait_for_the_end();
         }
         "confined" => {
@@ -276,6 +320,47 @@ fn a_process_without_descriptors_left_says_so_and_goes_on() {
     }
     assert_eq!(reader.hear(), "whole");
     reader.finish();
+}
+
+#[test]
+fn memory_that_a_subscriber_had_no_descriptor_for_comes_when_it_has_one() {
+    let host = Host::new();
+    let place = at(&host, "m");
+    let host = host.with("PLACE", &place);
+    let mut reader = host.play("starved");
+    let context = Context::new().unwrap();
+    let publisher = Publisher::new(&context, PublisherOptions::new(Qos::keep_all())).unwrap();
+    publisher.serve(meet(&place, true), Some(PATIENCE)).unwrap();
+    assert_eq!(reader.hear(), "starved");
+    publisher.publish(&[1; 100_000]).unwrap();
+    reader.go();
+    assert_eq!(reader.hear(), "100000");
+    reader.finish();
+}
+
+#[test]
+fn a_session_with_more_memory_than_the_daemon_can_hold_is_told_once_and_stays() {
+    let host = Host::new();
+    let daemon = host.daemon();
+    let few = Rlimit { current: Some(500), maximum: Some(500) };
+    let pid = rustix::process::Pid::from_child(&daemon.0);
+    rustix::process::prlimit(Some(pid), Resource::Nofile, few).unwrap();
+    let session = host.session("witness").unwrap();
+    let mut much = host.play("much memory");
+    assert_eq!(much.hear(), "published");
+    let told = |text: &str| {
+        let refusals = host.status().unwrap().refusals;
+        refusals.iter().filter(|refusal| refusal.reason.contains(text)).count()
+    };
+    until("it is told", || told("RLIMIT_NOFILE") > 0);
+    let first = session.create_subscription(latched("/t0")).unwrap();
+    let mut bytes = Vec::new();
+    assert!(first.recv(&mut bytes, Some(PATIENCE)).is_some(), "what the daemon has is seen");
+    much.go();
+    assert!(first.recv(&mut bytes, Some(PATIENCE)).is_some());
+    assert_eq!((&bytes[..], told("RLIMIT_NOFILE")), (&b"small"[..], 1));
+    // It was never disconnected.
+    much.finish_silently();
 }
 
 #[test]

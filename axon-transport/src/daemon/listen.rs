@@ -388,14 +388,19 @@ fn receive_some(
                 outcome = Err("it sent a descriptor that is no memfd".into());
                 break;
             }
-            Ok(Received { descriptors, .. })
-                if !descriptors.is_empty()
-                    && control.registry.holds_as_many_as(id, passed::share()) =>
+            // Without a segment it goes on; without its connection it would have to come back, with
+            // all that it has.
+            Ok(Received { message: Message::Segment(_), .. })
+                if control.registry.holds_as_many_as(id, passed::share()) =>
             {
-                tracing::warn!(session = %id, "a session with too many publishers for this \
-                    daemon's RLIMIT_NOFILE was disconnected");
-                outcome = Err("the daemon holds as many descriptors of it as it can".into());
-                break;
+                let share = passed::share();
+                control.registry.refuse_segment(
+                    id,
+                    &format!(
+                        "the daemon holds {share} descriptors of it, one session's share of its \
+                         RLIMIT_NOFILE (raise that: ulimit -n, LimitNOFILE)"
+                    ),
+                );
             }
             Ok(Received { message, descriptors }) => {
                 let descriptors = descriptors.into_iter().map(Arc::new).collect();

@@ -207,9 +207,13 @@ pub(crate) struct Packet {
 
 /// Receives one packet without waiting, with all descriptors that can come with it.
 pub(crate) fn receive(socket: impl AsFd, buffer: &mut [u8]) -> Result<Packet, Errno> {
+    receive_with(&socket, buffer, RecvFlags::empty())
+}
+
+fn receive_with(socket: impl AsFd, buffer: &mut [u8], how: RecvFlags) -> Result<Packet, Errno> {
     let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(SCM_MAX_FD))];
     let mut control = RecvAncillaryBuffer::new(&mut space);
-    let flags = RecvFlags::DONTWAIT | RecvFlags::CMSG_CLOEXEC;
+    let flags = RecvFlags::DONTWAIT | RecvFlags::CMSG_CLOEXEC | how;
     let got = loop {
         match recvmsg(&socket, &mut [IoSliceMut::new(buffer)], &mut control, flags) {
             Err(Errno::INTR) => {}
@@ -229,6 +233,22 @@ pub(crate) fn receive(socket: impl AsFd, buffer: &mut [u8]) -> Result<Packet, Er
         lost: got.flags.contains(ReturnFlags::CTRUNC),
         descriptors,
     })
+}
+
+/// As [`receive`], but a packet for whose descriptors there is no room stays where it is.
+pub(crate) fn receive_whole(socket: impl AsFd, buffer: &mut [u8]) -> Result<Packet, Errno> {
+    // To look gives descriptors of the same things.
+    let packet = receive_with(&socket, buffer, RecvFlags::PEEK)?;
+    if packet.lost {
+        return Err(Errno::MFILE);
+    }
+    // So what goes with the packet is not closed for the last time here.
+    let mut none = RecvAncillaryBuffer::default();
+    let mut byte = [0];
+    while let Err(Errno::INTR) =
+        recvmsg(&socket, &mut [IoSliceMut::new(&mut byte)], &mut none, RecvFlags::DONTWAIT)
+    {}
+    Ok(packet)
 }
 
 /// Whether the next packet of a socket has descriptors, which stay where they are: nothing is closed

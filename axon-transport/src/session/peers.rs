@@ -71,12 +71,17 @@ impl Peers {
         }
         let introduced = descriptors.len().saturating_sub(segments.len());
         let maps = descriptors.split_off(introduced);
+        let others: Vec<_> = match self.peers.contains_key(&id) {
+            true => Vec::new(),
+            false => self.sessions().cloned().collect(),
+        };
         let entry = match self.peers.entry(id) {
             Slot::Occupied(held) => held.into_mut(),
             Slot::Vacant(slot) => {
                 let [segment, doorbell, pidfd] =
                     <[PassedFd; 3]>::try_from(descriptors).map_err(|_| PeerError::Missing)?;
-                let session = PeerSession::map(id, PeerDescriptors { segment, doorbell, pidfd })?;
+                let descriptors = PeerDescriptors { segment, doorbell, pidfd };
+                let session = PeerSession::map_among(id, descriptors, &others)?;
                 let news = self.news.clone();
                 session.on_wanted(move || news.wake());
                 let (pairs, named) = (HashSet::new(), BTreeSet::new());

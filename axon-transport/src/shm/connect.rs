@@ -144,6 +144,10 @@ pub(super) fn line() -> Result<(OwnedFd, OwnedFd), ConnectError> {
     Ok(socketpair(family, kind, SocketFlags::CLOEXEC, None)?)
 }
 
+fn no_descriptors() -> ConnectError {
+    ShmError::System { what: "receiving descriptors", source: Errno::MFILE.into() }.into()
+}
+
 /// One end of the socket, for as long as the two need to come together.
 pub(super) struct Channel<'a> {
     socket: BorrowedFd<'a>,
@@ -239,10 +243,11 @@ impl<'a> Channel<'a> {
         self.send(&Packet::Gone(SegmentName { session, number }), &[])
     }
 
-    /// The next segment that is handed over or given up.
+    /// The next segment that is handed over or given up. One for whose descriptor there is no room
+    /// stays where it is. For one thread at a time.
     pub(super) fn take_news(&self) -> Result<News, ConnectError> {
         loop {
-            match self.receive()? {
+            match self.receive_by(passed::receive_whole)? {
                 (Packet::Opened(opened), mut fds) => {
                     if let (Some(fd), true) = (fds.pop(), fds.is_empty()) {
                         return Ok(News::Opened(opened, fd));
@@ -284,17 +289,25 @@ impl<'a> Channel<'a> {
     /// The next packet. One that is there is taken whatever the time, but only the first: another end
     /// that sends without pause gains none.
     fn receive(&self) -> Result<(Packet, Vec<PassedFd>), ConnectError> {
+        self.receive_by(passed::receive)
+    }
+
+    fn receive_by(
+        &self,
+        receive: impl Fn(BorrowedFd<'a>, &mut [u8]) -> Result<passed::Packet, Errno>,
+    ) -> Result<(Packet, Vec<PassedFd>), ConnectError> {
         if self.heard.replace(true) && self.left().is_some_and(|left| left.is_zero()) {
             return Err(ConnectError::Timeout);
         }
         let mut bytes = [0; MAX_PACKET];
         loop {
-            let got = match passed::receive(self.socket, &mut bytes) {
+            let got = match receive(self.socket, &mut bytes) {
                 Ok(got) => got,
                 Err(Errno::AGAIN) => {
                     self.until(PollFlags::IN)?;
                     continue;
                 }
+                Err(Errno::MFILE) => return Err(no_descriptors()),
                 Err(errno) => return Err(errno.into()),
             };
             let fds = got.descriptors;
@@ -305,8 +318,7 @@ impl<'a> Channel<'a> {
                 return Err(ConnectError::Protocol("more than belongs in a packet"));
             }
             if got.lost {
-                let what = "receiving descriptors";
-                return Err(ShmError::System { what, source: Errno::MFILE.into() }.into());
+                return Err(no_descriptors());
             }
             return match minicbor::decode(&bytes[..got.bytes]) {
                 Ok((VERSION, packet)) => Ok((packet, fds)),

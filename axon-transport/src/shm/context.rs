@@ -22,7 +22,7 @@ use crate::{
     wait::ExternalLeader,
 };
 
-/// Segments of others that are kept to be mapped later, at most.
+/// Segments of one other context that are kept to be mapped later, at most.
 const MANY: usize = 64;
 
 /// The memory, doorbell and identity that publishers and subscribers of a process share. Starts no
@@ -116,7 +116,10 @@ impl Context {
                 Ok(()) | Err(ShmError::Refused { .. }) => {}
                 Err(_) => {
                     let mut unmapped = self.unmapped();
-                    if unmapped.len() < MANY {
+                    let of = |other: &&Unmapped| other.0.as_ptr() == Arc::as_ptr(from);
+                    // Each of its lines tells of it.
+                    let known = unmapped.iter().filter(of).any(|(_, other, _)| *other == opened);
+                    if !known && unmapped.iter().filter(of).count() < MANY {
                         unmapped.push((Arc::downgrade(from), opened, fd));
                     }
                 }
@@ -132,12 +135,14 @@ impl Context {
 
     /// Maps what could not be mapped when it came, if it can be now.
     pub(super) fn hear_again(&self) {
-        let unmapped = std::mem::take(&mut *self.unmapped());
-        for (from, opened, fd) in unmapped {
-            if let Some(from) = from.upgrade() {
-                self.hear(&from, News::Opened(opened, fd));
-            }
-        }
+        // Under the lock: one that is given up meanwhile is found here, or mapped already.
+        self.unmapped().retain(|(from, opened, fd)| {
+            let mapped = |from: Arc<PeerSession>| from.add_segment(opened.segment.into(), fd);
+            !matches!(
+                from.upgrade().map(mapped),
+                None | Some(Ok(()) | Err(ShmError::Refused { .. }))
+            )
+        });
     }
 
     fn unmapped(&self) -> MutexGuard<'_, Vec<Unmapped>> {
@@ -230,7 +235,11 @@ impl Context {
         let process = descriptors
             .process()
             .map_err(|source| ShmError::System { what: "looking up a process", source })?;
-        let Some(process) = process else { return refuse("its pidfd names no process") };
+        let Some(process) = process else {
+            return refuse(
+                "its pidfd names no process here: containers must share their processes (--pid)",
+            );
+        };
         let Some(memory) = descriptors.segment.memory() else {
             return refuse("its first segment is no memfd");
         };
@@ -240,12 +249,13 @@ impl Context {
             && let Some(session) = known.session.upgrade()
         {
             // Ids are no secret. Whoever comes first with another's would else be taken for it.
-            if known.memory != memory || session.process() != Some(process) {
+            if known.memory != memory || !session.is_of(process) {
                 return refuse("another process has this context's id");
             }
             return Ok(Peer::Remote(session));
         }
-        let session = PeerSession::map(id, descriptors)?;
+        let others: Vec<_> = peers.values().filter_map(|other| other.session.upgrade()).collect();
+        let session = PeerSession::map_among(id, descriptors, &others)?;
         peers.insert(id, Known { session: Arc::downgrade(&session), memory });
         Ok(Peer::Remote(session))
     }

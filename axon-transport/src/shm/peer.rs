@@ -18,7 +18,7 @@ use super::{
     quota::Quota,
 };
 use crate::{
-    ids::SessionId,
+    ids::{Gid, SessionId},
     passed::PassedFd,
     wait::{Bell, Purpose, due, waits},
 };
@@ -78,7 +78,7 @@ pub struct PeerSession {
     id: SessionId,
     /// Its process, as it was at first.
     process: Option<u32>,
-    /// What its memory may take here.
+    /// What the memory of its process may take here.
     quota: Arc<Quota>,
     /// Its first segment.
     first: Arc<Map>,
@@ -101,6 +101,8 @@ struct Further {
     wanted: BTreeSet<u32>,
     /// The readers, whose lanes tell the session which of its segments they have.
     readers: Vec<Weak<Attachment>>,
+    /// How many subscribers a publisher has here, where nobody else looks after its memory.
+    subscribed: BTreeMap<Gid, usize>,
 }
 
 /// A segment that the session was said to have.
@@ -123,18 +125,36 @@ impl PeerSession {
     /// Checks and maps the first segment of session `id`.
     ///
     /// # Errors
-    /// The descriptors are not those of a session, or not of this one.
+    /// The descriptors are not those of a session, or not of this one. Or there are too few of them,
+    /// or too little address space, to make use of them now.
     pub fn map(id: SessionId, descriptors: PeerDescriptors) -> Result<Arc<Self>, ShmError> {
+        Self::map_among(id, descriptors, [])
+    }
+
+    /// As [`map`](Self::map), where `others` are mapped already: all sessions of one process together
+    /// get the address space of one.
+    ///
+    /// # Errors
+    /// As for [`map`](Self::map).
+    pub fn map_among<'a>(
+        id: SessionId,
+        descriptors: PeerDescriptors,
+        others: impl IntoIterator<Item = &'a Arc<Self>>,
+    ) -> Result<Arc<Self>, ShmError> {
         let PeerDescriptors { segment, doorbell, pidfd } = descriptors;
         let bell = Bell::received(doorbell).ok_or(ShmError::Refused {
             what: "its doorbell is no unix socket that keeps packets",
         })?;
-        let quota = Quota::of_session();
+        let process = process(&pidfd)
+            .map_err(|source| ShmError::System { what: "looking up a process", source })?;
+        let mut others = others.into_iter();
+        let akin = others.find(|other| process.is_some() && other.process == process);
+        let quota = akin.map_or_else(Quota::of_process, |akin| Arc::clone(&akin.quota));
         let first = Map::open(segment.as_fd(), &quota)?;
         layout::check_segment(first.words(), id, 0, SegmentKind::Session)?;
         Ok(Arc::new(Self {
             id,
-            process: process(&pidfd).ok().flatten(),
+            process,
             quota,
             first: Arc::new(first),
             further: Mutex::default(),
@@ -261,6 +281,27 @@ impl PeerSession {
     /// The number of its process; `None` once that has ended, or when it cannot be looked up.
     pub fn process(&self) -> Option<u32> {
         process(&self.pidfd).ok().flatten()
+    }
+
+    /// Whether it was `process`'s when it was mapped.
+    pub(super) fn is_of(&self, process: u32) -> bool {
+        self.process == Some(process)
+    }
+
+    /// One more subscriber needs the memory of a publisher's large samples.
+    pub(super) fn subscribe(&self, publisher: Gid) {
+        *self.further().subscribed.entry(publisher).or_default() += 1;
+    }
+
+    /// One less does. With the last of them that memory goes, but for samples that are in use.
+    pub(super) fn unsubscribe(&self, publisher: Gid) {
+        let mut further = self.further();
+        let Some(count) = further.subscribed.get_mut(&publisher) else { return };
+        *count -= 1;
+        if *count == 0 {
+            further.subscribed.remove(&publisher);
+            further.maps.retain(|_, told| told.kind != SegmentKind::Samples(publisher));
+        }
     }
 
     /// Whether the two are sessions of one process.

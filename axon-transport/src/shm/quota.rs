@@ -1,4 +1,4 @@
-//! How much address space the memory of other sessions may take: whatever they hand over is mapped
+//! How much address space the memory of other processes may take: whatever they hand over is mapped
 //! before anybody uses it, and a process that can map nothing more is at its end.
 
 use std::sync::{
@@ -15,11 +15,25 @@ struct Amount {
     bytes: u64,
 }
 
-/// Of one session: the memory of a thousand publishers of large samples as they usually are.
-const OF_SESSION: Amount = Amount { maps: 1 << 10, bytes: 4 << 40 };
+/// Of one process: the memory of a thousand publishers of large samples as they usually are.
+const OF_PROCESS: Amount = Amount { maps: 1 << 10, bytes: 4 << 40 };
 /// Of all of them: a quarter of the maps that Linux gives to a process (vm.max_map_count), and of an
 /// address space of 47 bits.
 const OF_ALL: Amount = Amount { maps: 16 << 10, bytes: 32 << 40 };
+
+/// The same in an address space of `space` bytes, of which all get half at most, and one process a
+/// quarter of that: 39 bits, as on some small machines, are 512 GiB.
+fn bounds(space: u64) -> (Amount, Amount) {
+    let all = OF_ALL.bytes.min(space / 2);
+    let process = OF_PROCESS.bytes.min(all / 4);
+    (Amount { bytes: all, ..OF_ALL }, Amount { bytes: process, ..OF_PROCESS })
+}
+
+/// The address space of this process: stacks are in its upper half.
+fn space() -> u64 {
+    let here = 0u8;
+    (&raw const here as u64).next_power_of_two()
+}
 
 /// What may be mapped, and what is.
 pub(super) struct Quota {
@@ -29,7 +43,7 @@ pub(super) struct Quota {
     bytes: AtomicU64,
 }
 
-/// What all sessions take of this process.
+/// What all others take of this process.
 static ALL: Quota = Quota::new("all other processes", OF_ALL);
 
 impl Quota {
@@ -37,23 +51,23 @@ impl Quota {
         Self { whose, most, maps: AtomicU64::new(0), bytes: AtomicU64::new(0) }
     }
 
-    /// For the memory of one session.
-    pub(super) fn of_session() -> Arc<Self> {
-        Arc::new(Self::new("another process", OF_SESSION))
+    /// For the memory of one process.
+    pub(super) fn of_process() -> Arc<Self> {
+        Arc::new(Self::new("another process", bounds(space()).1))
     }
 
     /// A map of `bytes` bytes.
     pub(super) fn take(self: &Arc<Self>, bytes: u64) -> Result<Share, ShmError> {
-        self.reserve(bytes)?;
-        if let Err(error) = ALL.reserve(bytes) {
+        self.reserve(bytes, self.most)?;
+        if let Err(error) = ALL.reserve(bytes, bounds(space()).0) {
             self.give_back(bytes);
             return Err(error);
         }
         Ok(Share { of: Arc::clone(self), bytes })
     }
 
-    fn reserve(&self, bytes: u64) -> Result<(), ShmError> {
-        let Self { whose, most, .. } = *self;
+    fn reserve(&self, bytes: u64, most: Amount) -> Result<(), ShmError> {
+        let whose = self.whose;
         let full = || ShmError::AddressSpace { whose, maps: most.maps, bytes: most.bytes };
         // Counters alone: nothing is reached by what they say.
         let add = |count: &AtomicU64, more: u64, most: u64| {
@@ -110,6 +124,17 @@ mod tests {
         assert!(is_full(quota.take(51)));
         drop((rest, quota.take(50).unwrap()));
         assert!(quota.take(100).is_ok(), "what was refused took nothing");
+    }
+
+    #[test]
+    fn a_small_address_space_is_shared_out_too() {
+        let bytes = |bits: u32| {
+            let (all, process) = bounds(1 << bits);
+            (all.bytes >> 30, process.bytes >> 30)
+        };
+        assert_eq!(bytes(39), (256, 64));
+        assert_eq!([bytes(47), bytes(48), bytes(57)], [(32 << 10, 4 << 10); 3]);
+        assert!(space() >= 1 << 38, "{:x}", space());
     }
 
     #[test]

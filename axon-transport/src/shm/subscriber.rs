@@ -3,13 +3,15 @@
 use std::{
     fmt,
     os::fd::AsFd,
+    sync::{Arc, Mutex, PoisonError},
     time::{Duration, Instant},
 };
 
 use rustix::net::{Shutdown, shutdown};
 
 use super::{
-    ConnectError, Context, Grant, Meta, Peer, Reader, ReaderOptions, Sample, TakeError,
+    ConnectError, Context, Grant, Meta, Peer, PeerSession, Reader, ReaderOptions, Sample,
+    TakeError,
     connect::{Asked, Channel, line},
 };
 use crate::{ids::Gid, passed::PassedFd, qos::Qos};
@@ -77,7 +79,34 @@ pub struct Subscriber {
     gid: Gid,
     /// Over which memory of the publisher's comes that is in use only later; absent where the
     /// publisher is in the same context.
-    line: Option<PassedFd>,
+    line: Option<Mutex<PassedFd>>,
+    /// Keeps the publisher's memory, where that is in another context.
+    _hold: Option<Hold>,
+    /// When the line was read last.
+    tended: Instant,
+}
+
+/// Keeps the memory of a publisher's large samples mapped.
+struct Hold {
+    context: Context,
+    peer: Arc<PeerSession>,
+    publisher: Gid,
+}
+
+impl Hold {
+    fn new(context: &Context, peer: &Arc<PeerSession>, publisher: Gid) -> Self {
+        peer.subscribe(publisher);
+        Self { context: context.clone(), peer: Arc::clone(peer), publisher }
+    }
+}
+
+impl Drop for Hold {
+    fn drop(&mut self) {
+        // A thread of the parent may have held the lock when a child was forked.
+        if !self.context.session().is_forked() {
+            self.peer.unsubscribe(self.publisher);
+        }
+    }
 }
 
 impl Subscriber {
@@ -93,6 +122,7 @@ impl Subscriber {
         timeout: Option<Duration>,
     ) -> Result<Self, ConnectError> {
         let SubscriberOptions { qos, max_len: max_message } = options;
+        let start = Instant::now();
         let channel = Channel::new(socket.as_fd(), timeout);
         let lane = context.session().allocate_lane()?;
         let gid = context.next_gid();
@@ -108,15 +138,17 @@ impl Subscriber {
             context.peer(granted.session, descriptors)?
         };
         let ring = granted.ring;
-        let mut kept = None;
+        let (mut kept, mut hold) = (None, None);
         if let Peer::Remote(peer) = &peer {
-            let channel = Channel::new(ours.as_fd(), timeout);
+            hold = Some(Hold::new(context, peer, granted.writer));
+            let left = timeout.map(|timeout| timeout.saturating_sub(start.elapsed()));
+            let channel = Channel::new(ours.as_fd(), left);
             // A ring that is not in the first segment: its own follows.
             while !peer.has_segment(ring.segment) {
                 context.hear(peer, channel.take_news()?);
             }
             // Whoever has the other end decides what stands in it, and how long that takes to close.
-            kept = Some(PassedFd::received(ours));
+            kept = Some(Mutex::new(PassedFd::received(ours)));
         }
         let reader = Reader::map(ReaderOptions {
             reader: gid,
@@ -128,7 +160,8 @@ impl Subscriber {
             qos,
             max_message,
         })?;
-        Ok(Self { context: context.clone(), reader, gid, line: kept })
+        let (context, tended) = (context.clone(), Instant::now());
+        Ok(Self { context, reader, gid, line: kept, _hold: hold, tended })
     }
 
     /// Its GID.
@@ -182,9 +215,11 @@ impl Subscriber {
         if self.context.session().is_forked() {
             return;
         }
+        let line = line.lock().unwrap_or_else(PoisonError::into_inner);
         for _ in 0..NEWS {
             match Channel::new(line.as_fd(), Some(Duration::ZERO)).take_news() {
                 Ok(news) => self.context.hear(publisher, news),
+                // What finds no room here is there the next time, too.
                 Err(_) => break,
             }
         }
@@ -205,6 +240,11 @@ impl Subscriber {
     pub fn recv(&mut self, timeout: Option<Duration>) -> Result<Option<Sample>, TakeError> {
         let deadline = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
         loop {
+            // Not only once there is nothing to take, which may never be.
+            if self.line.is_some() && self.tended.elapsed() >= LONGEST_SLEEP {
+                self.tended = Instant::now();
+                self.tend();
+            }
             if let Some(sample) = self.take()? {
                 return Ok(Some(sample));
             }
@@ -259,8 +299,9 @@ impl Drop for Subscriber {
     fn drop(&mut self) {
         // The publisher hears at once that nobody listens, so that what it says is not lost. A
         // forked child's end of the line is its parent's, too.
-        if let (Some(line), false) = (&self.line, self.context.session().is_forked()) {
-            let _ = shutdown(line, Shutdown::Both);
+        if let (Some(line), false) = (&mut self.line, self.context.session().is_forked()) {
+            let line = line.get_mut().unwrap_or_else(PoisonError::into_inner);
+            let _ = shutdown(&*line, Shutdown::Both);
         }
     }
 }

@@ -146,6 +146,15 @@ impl Player {
         }
     }
 
+    /// As [`finish`](Self::finish), and it says nothing more.
+    #[allow(dead_code, reason = "not every test needs it")]
+    pub(crate) fn finish_silently(mut self) {
+        drop(self.child.0.stdin.take());
+        let said: Vec<_> = self.lines.by_ref().map(Result::unwrap).collect();
+        assert!(said.iter().all(|line| !line.contains(MARK)), "{said:?}");
+        self.finish();
+    }
+
     pub(crate) fn pid(&self) -> u32 {
         self.child.0.id()
     }

@@ -5,7 +5,8 @@ use crate::{
     graph::EndpointKind,
     qos::Qos,
     session::message::{
-        Announce, EndpointRole, Message, Segment, SegmentName, SegmentOpened, StatusPart,
+        Announce, Attach, EndpointRole, Granted, Message, Segment, SegmentName, SegmentOpened,
+        StatusPart,
     },
 };
 
@@ -202,6 +203,42 @@ fn who_asks_again_is_told_the_same_status_from_its_beginning() {
     registry.tell_status(&id(1), Vec::new().into());
     let one = drain(&mut registry, 1);
     assert!(matches!(&one[..], [Message::Status(part)] if part.parts == 1));
+}
+
+#[test]
+fn memory_that_is_given_up_does_not_wait_for_who_is_stopped() {
+    let mut registry = registry(&[SessionRole::Application; 2]);
+    announce(&mut registry, 1, 1, EndpointKind::Publisher);
+    announce(&mut registry, 2, 1, EndpointKind::Subscription);
+    let (writer, reader) = (Gid::new(id(1), 1), Gid::new(id(2), 1));
+    let (lane, qos) = (Location { segment: 0, offset: 4096 }, Qos::default());
+    let (stands_for, segments) = (vec![], vec![]);
+    let attach = Attach { reader, writer, lane, qos, session: id(2), stands_for, segments };
+    registry.message(&id(2), Message::Attach(attach), vec![]).unwrap();
+    let (generation, first, segments) = (1, 0, vec![]);
+    let granted =
+        Granted { reader, writer, generation, first, session: id(1), ring: lane, segments };
+    registry.message(&id(1), Message::Grant(granted), vec![]).unwrap();
+    drain(&mut registry, 2);
+    let mut turn = |number| {
+        let (session, publisher) = (id(1), Some(writer));
+        let segment = Segment { number, publisher };
+        let opened = Message::Segment(SegmentOpened { session, segment });
+        registry.message(&session, opened, vec!["map"]).unwrap();
+        // The first is taken before it is given up.
+        let taken = (number == 1).then(|| drain(&mut registry, 2).len());
+        let gone = Message::SegmentGone(SegmentName { session, number });
+        registry.message(&session, gone, vec![]).unwrap();
+        taken
+    };
+    assert_eq!(turn(1), Some(1));
+    (2..1000).for_each(|number| assert_eq!(turn(number), None));
+    let waiting = drain(&mut registry, 2);
+    assert!(
+        matches!(&waiting[..], [Message::SegmentGone(gone)] if gone.number == 1),
+        "{} packets wait",
+        waiting.len()
+    );
 }
 
 #[test]

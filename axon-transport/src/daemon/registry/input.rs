@@ -170,7 +170,7 @@ impl<F: Clone> Registry<F> {
     }
 
     /// Keeps the first refusal of a session for the status; it is told all of them.
-    fn note_refused(&mut self, id: &SessionId, text: &str) {
+    pub(super) fn note_refused(&mut self, id: &SessionId, text: &str) {
         if let Some(entry) = self.sessions.get_mut(id)
             && !std::mem::replace(&mut entry.refused, true)
         {

@@ -100,6 +100,8 @@ pub struct SessionEntry<F> {
     status: Option<(Arc<[u8]>, u32)>,
     /// An endpoint of its was refused.
     refused: bool,
+    /// It was told that no more segments of its memory are taken.
+    short: bool,
     /// What is shown of its relay, where it is relayed. Pairs within it are its own process's.
     pub(crate) relay: Option<Arc<Tally>>,
 }

@@ -18,6 +18,8 @@ pub struct Output<F> {
     pub packet: Arc<[u8]>,
     /// What goes with it.
     pub descriptors: Vec<F>,
+    /// The session's segment that it hands over and nothing else.
+    pub(super) segment: Option<(SessionId, u32)>,
 }
 
 impl<F: Clone> Registry<F> {
@@ -82,13 +84,18 @@ impl<F: Clone> Registry<F> {
     /// Queues a message for one session.
     pub fn push(&mut self, to: &SessionId, message: &Message, descriptors: Vec<F>) {
         let Some(packet) = encode(message) else { return };
-        self.push_packet(to, Output { packet, descriptors });
+        let segment = match message {
+            Message::Segment(opened) => Some((opened.session, opened.segment.number)),
+            _ => None,
+        };
+        self.push_packet(to, Output { packet, descriptors, segment });
     }
 
     pub(super) fn push_shared(&mut self, to: &[SessionId], message: &Message) {
         let Some(packet) = encode(message) else { return };
         for id in to {
-            self.push_packet(id, Output { packet: packet.clone(), descriptors: Vec::new() });
+            let packet = packet.clone();
+            self.push_packet(id, Output { packet, descriptors: Vec::new(), segment: None });
         }
     }
 
@@ -104,6 +111,18 @@ impl<F: Clone> Registry<F> {
         entry.queued_bytes += output.packet.len();
         entry.queue.push_back(output);
         self.ready.insert(*to);
+    }
+
+    /// Takes back what hands a segment over and waits for a session still. Whether there was any.
+    pub(super) fn take_back(&mut self, to: &SessionId, of: &SessionId, number: u32) -> bool {
+        let Some(entry) = self.sessions.get_mut(to) else { return false };
+        let before = entry.queue.len();
+        entry.queue.retain(|output| output.segment != Some((*of, number)));
+        let taken = entry.queue.len() < before;
+        if taken {
+            entry.queued_bytes = entry.queue.iter().map(|output| output.packet.len()).sum();
+        }
+        taken
     }
 
     pub(super) fn mark_behind(&mut self, id: &SessionId) {
@@ -171,7 +190,7 @@ fn next_part<F>(status: &mut Option<(Arc<[u8]>, u32)>) -> Option<Output<F>> {
     let slice = &text[from..text.len().min(from + STATUS_SLICE)];
     let part = Message::Status(StatusPart { part: *next, parts, text: slice.to_vec() });
     *next += 1;
-    Some(Output { packet: encode(&part)?, descriptors: Vec::new() })
+    Some(Output { packet: encode(&part)?, descriptors: Vec::new(), segment: None })
 }
 
 pub(super) fn session_entry<F>(
@@ -197,6 +216,7 @@ pub(super) fn session_entry<F>(
         pairs: 0,
         status: None,
         refused: false,
+        short: false,
         relay: None,
     }
 }

@@ -27,10 +27,7 @@ impl<F: Clone> Registry<F> {
             return Err(Violation::Segments(number));
         }
         if entry.segments.len() >= MAX_SEGMENTS {
-            let text = format!("segment {number} of its memory: a session has {MAX_SEGMENTS}");
-            let none = String::new;
-            let refused = Refused { variable: none(), ours: none(), theirs: none(), text };
-            self.push(id, &Message::Refused(refused), Vec::new());
+            self.refuse_segment(id, &format!("a session has {MAX_SEGMENTS}"));
             return Ok(());
         }
         entry.segments.insert(number, SessionSegment { segment, descriptor });
@@ -47,12 +44,30 @@ impl<F: Clone> Registry<F> {
         Ok(())
     }
 
+    /// A segment of a session's memory is not taken, since `there_are` as many as may be. The session
+    /// goes on, and is told once until it gives another one up.
+    pub fn refuse_segment(&mut self, id: &SessionId, there_are: &str) {
+        let Some(entry) = self.sessions.get_mut(id) else { return };
+        if std::mem::replace(&mut entry.short, true) {
+            return;
+        }
+        let text = format!(
+            "more memory of it: {there_are}. Other processes do not see the samples in it: have \
+             fewer publishers of samples over 4 KiB in one process"
+        );
+        self.note_refused(id, &text);
+        let none = String::new;
+        let refused = Refused { variable: none(), ours: none(), theirs: none(), text };
+        self.push(id, &Message::Refused(refused), Vec::new());
+    }
+
     /// A session has given a segment up.
     pub(super) fn close_segment(&mut self, id: &SessionId, number: u32) {
         let Some(entry) = self.sessions.get_mut(id) else { return };
         if entry.segments.remove(&number).is_none() {
             return;
         }
+        entry.short = false;
         let gone = Message::SegmentGone(SegmentName { session: *id, number });
         let mut readers = Vec::new();
         for (reader, entry) in &mut self.sessions {
@@ -60,6 +75,8 @@ impl<F: Clone> Registry<F> {
                 readers.push(*reader);
             }
         }
+        // Who has not taken it, a stopped one among them, need not hear of it, nor keep its memory.
+        readers.retain(|reader| !self.take_back(reader, id, number));
         self.push_shared(&readers, &gone);
     }
 

@@ -46,7 +46,10 @@ impl Control {
                 }
             }
             Message::Refused(refused) => {
-                tracing::error!(reason = refused.text, "the daemon refuses an endpoint");
+                tracing::error!(
+                    reason = refused.text,
+                    "the daemon refuses something of this session"
+                );
             }
             // What a daemon never says is not worth more than not being heard.
             _ => {}

@@ -448,7 +448,7 @@ impl Control {
         }
         // A socket without room becomes writable, but one that is short of descriptors in flight
         // does not say when that passes.
-        let blocked = !self.outbox.is_empty() || !self.untold.is_empty();
+        let blocked = self.is_linked() && !(self.outbox.is_empty() && self.untold.is_empty());
         let nap = blocked.then_some(Duration::from_millis(20));
         let tend = self.tend.filter(|_| self.is_linked());
         let due = tend.into_iter().chain(self.retry).chain(self.arrivals.due()).min();

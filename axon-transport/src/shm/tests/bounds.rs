@@ -35,6 +35,22 @@ fn a_session_fills_no_address_space_but_its_share() {
 }
 
 #[test]
+fn sessions_of_one_process_share_its_address_space() {
+    let (a, b) = (session(), session());
+    let one = PeerSession::map(a.id(), a.descriptors().unwrap()).unwrap();
+    let other = PeerSession::map_among(b.id(), b.descriptors().unwrap(), [&one]).unwrap();
+    let add = |to: &PeerSession, of: &SessionSegment, number| {
+        let info = SegmentInfo { number, kind: SegmentKind::Heap };
+        to.add_segment(info, sparse(of, number, layout::MAX_SEGMENT).fd())
+    };
+    (1..40).for_each(|number| add(&one, &a, number).unwrap());
+    let first = (1..64).find(|&number| add(&other, &b, number).is_err());
+    assert_eq!(first, Some(25), "63 are of both");
+    drop(one);
+    add(&other, &b, 25).unwrap();
+}
+
+#[test]
 fn a_reader_that_asks_for_all_numbers_is_kept_short() {
     let a = session();
     let peer = PeerSession::map(a.id(), a.descriptors().unwrap()).unwrap();

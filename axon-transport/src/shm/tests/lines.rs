@@ -169,6 +169,37 @@ fn memory_of_a_publisher_that_is_gone_is_let_go_of() {
 }
 
 #[test]
+fn memory_of_a_publisher_without_subscribers_here_is_let_go_of_though_others_read_us() {
+    let (here, there) = contexts();
+    let (ours, theirs) = (publisher(&here, keep_last(1)), publisher(&there, keep_last(1)));
+    // The other way round.
+    let _back = together(&theirs, &here, keep_last(1)).1.unwrap();
+    let mut readers = [(); 2].map(|()| together(&ours, &there, keep_last(1)).1.unwrap());
+    let mut take = |reader: &mut Subscriber| {
+        ours.publish(&pattern(1, 5000)).unwrap();
+        reader.recv(SOON).unwrap().expect("a sample")
+    };
+    let kept = readers.each_mut().map(&mut take);
+    let seen = there.peer(here.id(), here.session().descriptors().unwrap()).unwrap();
+    let seen = Arc::clone(seen.remote().unwrap());
+    let of = |info: &SegmentInfo| info.kind == SegmentKind::Samples(ours.gid());
+    let number = here.session().segments().into_iter().find(of).unwrap().number;
+    let [first, second] = readers;
+    drop(first);
+    assert!(seen.has_segment(number), "one still reads it");
+    drop(second);
+    assert!(!seen.has_segment(number));
+    let mut out = Vec::new();
+    for sample in &kept {
+        sample.copy_to(&mut out).unwrap();
+        assert!(out == pattern(1, 5000), "what is in use stays");
+    }
+    // And it comes back with the next.
+    let mut late = together(&ours, &there, keep_last(1)).1.unwrap();
+    take(&mut late);
+}
+
+#[test]
 fn memory_that_could_not_be_mapped_is_mapped_when_there_is_room() {
     let (here, there) = contexts();
     let publisher = publisher(&here, keep_last(1));
