@@ -3,16 +3,14 @@
 
 mod graph;
 mod handle;
+mod link;
+mod memory;
 mod time;
 
 use std::{
     collections::{BTreeSet, HashSet, VecDeque},
     os::fd::{AsFd, BorrowedFd},
-    sync::{
-        Arc,
-        atomic::Ordering,
-        mpsc::{Receiver, TryRecvError, sync_channel},
-    },
+    sync::{Arc, atomic::Ordering, mpsc::Receiver},
     time::{Duration, Instant},
 };
 
@@ -20,28 +18,21 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::{
     arrivals::Arrivals,
-    connect::{Caller, Connected},
+    connect::Connected,
     error::SessionError,
     events::Source,
     local::{House, Local},
-    message::{Announce, EndpointRole, Gone, Message, Pair, SegmentName, SegmentOpened},
+    message::{Announce, EndpointRole, Gone, Message, Pair},
     peers::Peers,
     socket::{self, SocketError},
-    state::{Outgoing, SegmentChange, SessionEvent, Shared, StatusAnswer},
+    state::{Outgoing, Shared},
 };
 use crate::{graph::GraphView, ids::Gid, passed::PassedFd, wait::ExternalLeader};
 
 /// Packets handled before queued ones are sent: neither direction starves the other.
 const BATCH: usize = 64;
-/// Between attempts to find a daemon.
-const MIN_PAUSE: Duration = Duration::from_millis(100);
-const MAX_PAUSE: Duration = Duration::from_secs(2);
-/// A connection that lasted less was as good as refused.
-const BRIEF: Duration = Duration::from_secs(1);
 /// Until a process that had no descriptors left tries again.
 const RETRY: Duration = Duration::from_secs(2);
-/// How often the memory of large samples is looked after.
-const TEND: Duration = Duration::from_secs(1);
 /// A relay stands for at most this many remote subscriptions by name; one packet holds no more.
 const MAX_STANDS_FOR: usize = 1024;
 
@@ -155,173 +146,11 @@ impl Control {
         self.send();
     }
 
-    fn connected(&mut self, connected: Connected) {
-        self.outbox.clear();
-        self.building = None;
-        self.repeated = None;
-        self.told = false;
-        self.segments.clear();
-        self.untold.clear();
-        self.since = Instant::now();
-        self.retry = None;
-        let daemon = connected.welcome.daemon;
-        {
-            let mut state = self.shared.state();
-            state.daemon = Some(daemon);
-            state.outgoing.clear();
-            let endpoints = state.publishers.keys().chain(state.subscriptions.keys());
-            let gids: BTreeSet<Gid> = state.nodes.keys().chain(endpoints).copied().collect();
-            let gone: Vec<Gid> = state.tombstones.iter().copied().collect();
-            state.outgoing.extend(gids.into_iter().map(Outgoing::Announce));
-            let gone = gone.into_iter().map(|gid| Message::EndpointGone(Gone { gid }));
-            state.outgoing.extend(gone.map(|m| Outgoing::Message(Box::new(m))));
-        }
-        self.link = Link::Socket(PassedFd::connection(connected.socket).trusted());
-        for info in self.shared.segment.segments() {
-            self.tell_segment(SegmentChange::Opened(info.number));
-        }
-        self.shared.notify(Some(&SessionEvent::DaemonFound(daemon)));
-    }
-
-    fn lost(&mut self, why: &dyn std::fmt::Display) {
-        tracing::warn!(%why, "the connection to the daemon is lost");
-        self.outbox.clear();
-        {
-            let mut state = self.shared.state();
-            state.daemon = None;
-            if matches!(state.status, StatusAnswer::Parts(_)) {
-                state.status = StatusAnswer::Lost;
-            }
-        }
-        self.pause = if self.since.elapsed() < BRIEF {
-            (self.pause * 2).clamp(MIN_PAUSE, MAX_PAUSE)
-        } else {
-            Duration::ZERO
-        };
-        self.link = if self.reconnects { self.reconnect() } else { Link::Ended };
-        self.shared.notify(Some(&SessionEvent::DaemonLost));
-    }
-
-    /// Looks for a daemon on a thread of its own: meanwhile peers may die.
-    fn reconnect(&self) -> Link {
-        let shared = self.shared.clone();
-        let (found, receiver) = sync_channel(1);
-        let first = self.pause;
-        let search = move || {
-            std::thread::sleep(first);
-            let mut pause = MIN_PAUSE;
-            // Pairs with the release store in `Shared::stop`.
-            while !shared.stopping.load(Ordering::Acquire) {
-                let caller = Caller {
-                    config: &shared.config,
-                    options: &shared.options,
-                    id: shared.id,
-                    segment: Some(&shared.segment),
-                    relay: None,
-                    cancel: Some(&shared.stopping),
-                };
-                match caller.connect() {
-                    Ok(connected) => {
-                        let _ = found.send(connected);
-                        shared.wake();
-                        return;
-                    }
-                    Err(SessionError::NoDaemon { .. }) => {}
-                    Err(error) => tracing::error!(%error, "no daemon took this session"),
-                }
-                std::thread::sleep(pause);
-                pause = (pause * 2).min(MAX_PAUSE);
-            }
-        };
-        match std::thread::Builder::new().name("axon-connect".into()).spawn(search) {
-            Ok(_) => Link::Reconnecting(receiver),
-            Err(error) => {
-                tracing::error!(%error, "no thread to look for a daemon with");
-                Link::Ended
-            }
-        }
-    }
-
-    fn try_reconnected(&mut self) {
-        let Link::Reconnecting(receiver) = &self.link else { return };
-        match receiver.try_recv() {
-            Ok(connected) => self.connected(connected),
-            Err(TryRecvError::Empty) => {}
-            Err(TryRecvError::Disconnected) => self.link = Link::Ended,
-        }
-    }
-
-    fn is_linked(&self) -> bool {
-        matches!(self.link, Link::Socket(_) | Link::Local(_))
-    }
-
     /// Queues a message for the daemon, behind what it must know of memory that the message may
     /// speak of.
     fn say(&mut self, message: Message) {
         self.tell_segments();
         self.outbox.push_back((message, Vec::new()));
-    }
-
-    /// Takes what changed in the session's memory, and what its readers lack of others'.
-    fn tell_segments(&mut self) {
-        for number in self.untold.clone() {
-            self.tell_segment(SegmentChange::Opened(number));
-        }
-        for change in self.shared.memory.take() {
-            self.tell_segment(change);
-        }
-        for session in self.peers.sessions() {
-            for number in session.take_wanted() {
-                let need = SegmentName { session: session.id(), number };
-                self.outbox.push_back((Message::Need(need), Vec::new()));
-            }
-        }
-    }
-
-    fn tell_segment(&mut self, change: SegmentChange) {
-        let session = self.shared.id;
-        match change {
-            // Found here and noted there.
-            SegmentChange::Opened(number) if self.segments.contains(&number) => {}
-            SegmentChange::Opened(number) => match self.shared.segment.segment(number) {
-                Ok(Some((info, descriptor))) => {
-                    self.segments.insert(number);
-                    self.untold.remove(&number);
-                    let opened = SegmentOpened { session, segment: info.into() };
-                    self.outbox.push_back((Message::Segment(opened), vec![descriptor.into()]));
-                }
-                // It is gone again.
-                Ok(None) => {
-                    self.untold.remove(&number);
-                }
-                Err(error) => {
-                    if self.untold.insert(number) {
-                        tracing::error!(%error, "samples stay unseen by others until there is one");
-                    }
-                }
-            },
-            SegmentChange::Gone(number) => {
-                self.segments.remove(&number);
-                self.untold.remove(&number);
-                let gone = SegmentName { session, number };
-                self.outbox.push_back((Message::SegmentGone(gone), Vec::new()));
-            }
-            SegmentChange::Low(gid) => {
-                self.low.insert(gid);
-            }
-        }
-    }
-
-    /// Has memory ready for those that publish large samples.
-    fn prepare(&mut self) {
-        for gid in std::mem::take(&mut self.low) {
-            let publisher = self.shared.state().publishers.get(&gid).cloned();
-            if let Some(publisher) = publisher {
-                // What lacks then, its next publish says.
-                publisher.rings.prepare();
-                self.look_after_memory();
-            }
-        }
     }
 
     fn try_again(&mut self) {
@@ -488,24 +317,6 @@ impl Control {
             }
         }
         self.shared.wake();
-    }
-
-    /// There is memory that may have to be given back.
-    pub(super) fn look_after_memory(&mut self) {
-        self.tend.get_or_insert_with(|| Instant::now() + TEND);
-    }
-
-    /// Looks after the memory of large samples and of publishers that are gone. Memory that is given up may have to be opened anew,
-    /// and only a daemon can say so to the readers: so not while there is none.
-    fn tend(&mut self) {
-        let now = Instant::now();
-        if !self.is_linked() || self.tend.is_none_or(|due| now < due) {
-            return;
-        }
-        let publishers: Vec<_> = self.shared.state().publishers.values().cloned().collect();
-        let more = publishers.iter().filter(|publisher| publisher.rings.tend(now)).count();
-        let more = self.shared.segment.tidy() || more > 0;
-        self.tend = more.then(|| now + TEND);
     }
 
     /// Looks for peers that died.

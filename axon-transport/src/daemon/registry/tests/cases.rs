@@ -1,0 +1,243 @@
+//! What the daemon does with single messages.
+
+use super::*;
+
+fn connected(sessions: u8) -> World {
+    let mut world = World::default();
+    (0..sessions).for_each(|s| world.take(Step::Connect(s)));
+    world
+}
+
+fn first(world: &World) -> SessionId {
+    world.clients[&0].id
+}
+
+#[test]
+fn what_no_session_does_is_a_violation() {
+    let mut world = connected(2);
+    let (own, other) = (first(&world), world.clients[&1].id);
+    let registry = &mut world.registry;
+    let foreign = endpoint(Gid::new(other, 1), EndpointKind::Subscription, 0, Qos::default());
+    let stolen = registry.message(&own, announce(foreign.clone()), vec![]);
+    assert_eq!(stolen, Err(Violation::NotItsOwn(foreign.gid)));
+    registry.message(&other, announce(foreign.clone()), vec![]).unwrap();
+    let gone = registry.message(&own, Message::EndpointGone(Gone { gid: foreign.gid }), vec![]);
+    assert_eq!(gone, Err(Violation::NotItsOwn(foreign.gid)));
+
+    let writer = endpoint(Gid::new(own, 1), EndpointKind::Publisher, 0, Qos::default());
+    let role = EndpointRole::Application;
+    let placeless = Announce { endpoint: writer.clone(), role, stands_for: vec![], ring: None };
+    let placeless = registry.message(&own, Message::Endpoint(placeless), vec![]);
+    assert_eq!(placeless, Err(Violation::Unexpected));
+    let segment = Segment { number: 3, publisher: None };
+    let opened = Message::Segment(SegmentOpened { session: own, segment });
+    for fds in [vec![], vec![(own, "map"); 2]] {
+        let opened = registry.message(&own, opened.clone(), fds);
+        assert!(matches!(opened, Err(Violation::Descriptors(_))));
+    }
+    registry.message(&own, opened.clone(), vec![(own, "map")]).unwrap();
+    let twice = registry.message(&own, opened, vec![(own, "map")]);
+    assert_eq!(twice, Err(Violation::Segments(3)));
+    for role in [EndpointRole::StandIn, EndpointRole::Relay] {
+        let taken = registry.message(&own, announce_as(writer.clone(), role), vec![]);
+        assert_eq!(taken, Err(Violation::NotItsOwn(writer.gid)), "{role:?}");
+    }
+    let littered = registry.message(&own, Message::Resync, vec![(own, "ring")]);
+    assert_eq!(littered, Err(Violation::Descriptors(1)));
+    assert_eq!(registry.message(&own, Message::StatusRequest, vec![]), Err(Violation::Unexpected));
+    let pair = Pair { reader: foreign.gid, writer: writer.gid };
+    assert_eq!(registry.message(&own, Message::Match(pair), vec![]), Err(Violation::Unexpected));
+    assert_eq!(
+        registry.message(&own, Message::Detach(pair), vec![]),
+        Err(Violation::NotItsOwn(foreign.gid))
+    );
+}
+
+#[test]
+fn an_endpoint_out_of_bounds_is_refused_and_the_session_goes_on() {
+    let mut world = connected(1);
+    let own = first(&world);
+    while world.registry.next_output(&own).is_some() {}
+    let mut huge = endpoint(Gid::new(own, 1), EndpointKind::Subscription, 0, Qos::default());
+    huge.topic = "x".repeat(1000);
+    world.registry.message(&own, announce(huge), vec![]).unwrap();
+    let answer = world.registry.next_output(&own).unwrap();
+    assert!(matches!(Message::decode(&answer.packet).unwrap(), Message::Refused(_)));
+    assert_eq!(world.registry.endpoints().count(), 0);
+}
+
+#[test]
+fn a_sample_never_goes_back_to_where_it_came_from() {
+    let mut world = connected(1);
+    let gateway = session_id(200);
+    let name = String::new();
+    world.registry.connect(gateway, SessionRole::Gateway, name, 1, Some(handed(gateway))).unwrap();
+    let own = first(&world);
+    let remote = endpoint(Gid([9; 16]), EndpointKind::Publisher, 0, Qos::default());
+    let relay = endpoint(Gid::new(gateway, 1), EndpointKind::Subscription, 0, Qos::default());
+    let local = endpoint(Gid::new(own, 1), EndpointKind::Subscription, 0, Qos::default());
+    let talker = endpoint(Gid::new(own, 2), EndpointKind::Publisher, 0, Qos::default());
+    let say = |registry: &mut Registry<Label>, who, endpoint: &Endpoint, role| {
+        registry.message(&who, announce_as(endpoint.clone(), role), vec![]).unwrap();
+    };
+    say(&mut world.registry, gateway, &remote, EndpointRole::StandIn);
+    say(&mut world.registry, gateway, &relay, EndpointRole::Relay);
+    say(&mut world.registry, own, &local, EndpointRole::Application);
+    say(&mut world.registry, own, &talker, EndpointRole::Application);
+    let pairs: Vec<Pair> = world.registry.pairs.keys().copied().collect();
+    let expected = [
+        Pair { reader: local.gid, writer: remote.gid },
+        Pair { reader: local.gid, writer: talker.gid },
+        Pair { reader: relay.gid, writer: talker.gid },
+    ];
+    assert_eq!(pairs.iter().collect::<BTreeSet<_>>(), expected.iter().collect());
+    // Neither is an endpoint of this host in the eyes of its sessions.
+    world.registry.flush();
+    let shown: BTreeSet<Gid> = world
+        .registry
+        .whole_graph()
+        .iter()
+        .flat_map(|g| g.added.iter().map(|i| i.endpoint.gid))
+        .collect();
+    assert_eq!(shown, [local.gid, talker.gid].into());
+}
+
+#[test]
+fn ends_of_a_service_elsewhere_meet_those_here_and_never_each_other() {
+    let mut world = connected(1);
+    let gateway = session_id(200);
+    let name = String::new();
+    world.registry.connect(gateway, SessionRole::Gateway, name, 1, Some(handed(gateway))).unwrap();
+    let own = first(&world);
+    let of = |gid, kind| endpoint(gid, kind, 0, Qos::default());
+    let (client, server) =
+        (of(Gid::new(own, 1), EndpointKind::Client), of(Gid::new(own, 2), EndpointKind::Server));
+    let there = [(7, EndpointKind::Client), (8, EndpointKind::Server)];
+    let there = there.map(|(number, kind)| of(Gid([number; 16]), kind));
+    let registry = &mut world.registry;
+    for stand_in in &there {
+        let message = announce_as(stand_in.clone(), EndpointRole::StandIn);
+        let claimed = registry.message(&own, message.clone(), vec![]);
+        assert_eq!(claimed, Err(Violation::NotItsOwn(stand_in.gid)));
+        registry.message(&gateway, message, vec![]).unwrap();
+    }
+    for endpoint in [&client, &server] {
+        registry.message(&own, announce(endpoint.clone()), vec![]).unwrap();
+    }
+    let both = |one: &Endpoint, other: &Endpoint| {
+        [(one.gid, other.gid), (other.gid, one.gid)].map(|(reader, writer)| Pair { reader, writer })
+    };
+    let expected = [both(&client, &server), both(&there[0], &server), both(&client, &there[1])];
+    let pairs: BTreeSet<Pair> = registry.pairs.keys().copied().collect();
+    assert_eq!(pairs, expected.into_iter().flatten().collect());
+}
+
+#[test]
+fn a_gid_that_is_taken_is_nobody_elses() {
+    let mut world = connected(1);
+    let own = first(&world);
+    let local = endpoint(Gid::new(own, 1), EndpointKind::Subscription, 0, Qos::default());
+    let (a, b) = (DaemonId([1; 16]), DaemonId([2; 16]));
+    let remote = endpoint(Gid([9; 16]), EndpointKind::Publisher, 0, Qos::default());
+    // Another host claims the GID before its session announces it.
+    world.registry.remote_graph(a, true, vec![local.clone(), remote.clone()], vec![]);
+    world.registry.message(&own, announce(local.clone()), vec![]).unwrap();
+    world.registry.remote_graph(b, true, vec![local.clone(), remote.clone()], vec![]);
+    let of: Vec<_> = world.registry.remote_endpoints().map(|(d, e)| (*d, e.gid)).collect();
+    assert_eq!(of, [(a, remote.gid)]);
+    // Nor can the one take away what is the other's.
+    world.registry.remote_graph(b, false, vec![], vec![remote.gid]);
+    assert_eq!(world.registry.remote_endpoints().count(), 1);
+}
+
+#[test]
+fn a_tombstone_reaches_those_who_come_later() {
+    let mut world = connected(1);
+    let own = first(&world);
+    let gid = Gid::new(own, 7);
+    world.registry.message(&own, Message::EndpointGone(Gone { gid }), vec![]).unwrap();
+    world.take(Step::Connect(1));
+    let late = world.clients[&1].id;
+    let mut removed = Vec::new();
+    while let Some(output) = world.registry.next_output(&late) {
+        if let Message::Graph(graph) = Message::decode(&output.packet).unwrap() {
+            removed.extend(graph.ended.unwrap_or_default());
+        }
+    }
+    assert!(removed.contains(&gid));
+}
+
+#[test]
+fn a_detached_pair_is_over_at_both_ends() {
+    let mut world = connected(2);
+    world.take(Step::Add { session: 0, topic: 0, writes: true, reliable: true });
+    world.take(Step::Add { session: 1, topic: 0, writes: false, reliable: true });
+    world.settle();
+    let pair = *world.clients[&1].attached.first().unwrap();
+    let reader = world.clients.get_mut(&1).unwrap();
+    reader.outgoing.push((Message::Detach(pair), vec![]));
+    world.settle();
+    for client in world.clients.values() {
+        assert!(client.attached.is_empty() && client.held.is_empty());
+        assert!(world.registry.session(&client.id).unwrap().known.is_empty());
+    }
+}
+
+#[test]
+fn sessions_with_more_pairs_than_their_queues_hold_come_to_rest() {
+    let mut world = connected(2);
+    world.settle();
+    for number in 0..32 {
+        let (session, writes) = (number % 2, number % 4 < 2);
+        world.take(Step::Add { session, topic: 0, writes, reliable: true });
+    }
+    world.settle();
+    world.check_settled();
+}
+
+#[test]
+fn a_large_graph_is_told_in_packets_that_fit() {
+    let mut world = connected(1);
+    let added = (0..3000u32).map(|n| {
+        let gid = Gid::new(session_id(77), n);
+        Endpoint {
+            topic: "t".repeat(400),
+            ..endpoint(gid, EndpointKind::Publisher, 0, Qos::default())
+        }
+    });
+    world.registry.remote_graph(DaemonId([1; 16]), true, added.collect(), vec![]);
+    world.settle();
+    assert_eq!(world.clients[&0].graph.len(), 3000);
+}
+
+#[test]
+fn a_remote_endpoint_that_comes_and_goes_ends_nothing_here() {
+    let mut world = connected(1);
+    let own = first(&world);
+    while world.registry.next_output(&own).is_some() {}
+    let gid = Gid([9; 16]);
+    let endpoint = Endpoint {
+        gid,
+        kind: EndpointKind::Publisher,
+        topic: "/a".into(),
+        type_name: "t".into(),
+        type_hash: vec![],
+        qos: Qos::default(),
+        node: String::new(),
+        namespace: String::new(),
+        enclave: String::new(),
+    };
+    // A successor link repeats the whole graph within one flush.
+    for _ in 0..2 {
+        world.registry.remote_graph(DaemonId([1; 16]), true, vec![endpoint.clone()], vec![]);
+    }
+    world.registry.flush();
+    let mut seen = false;
+    while let Some(output) = world.registry.next_output(&own) {
+        if let Message::Graph(graph) = Message::decode(&output.packet).unwrap() {
+            assert_eq!(graph.ended.unwrap_or_default(), vec![]);
+            seen |= graph.added.iter().any(|item| item.endpoint.gid == gid);
+        }
+    }
+    assert!(seen);
+}

@@ -1,0 +1,153 @@
+//! What the application publishes, as the daemon is to get it: relays that take it, as many as there are
+//! kinds of QoS on a topic.
+
+use std::{
+    collections::{BTreeMap, BTreeSet, HashMap},
+    sync::Arc,
+};
+
+use super::Served;
+use crate::{
+    graph::{Endpoint, EndpointKind},
+    ids::Gid,
+    qos::{Durability, History, Liveliness, Qos, Reliability},
+    relay::{MAX_MATCHED, flow::Departing},
+    session::{EndpointSpec, Subscription},
+    shm::Sample,
+};
+
+/// Samples of one pair that are passed over before others have their turn.
+const BATCH: usize = 64;
+
+/// Publishers whose samples are taken by one relay.
+#[derive(Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Group {
+    topic: String,
+    type_name: String,
+    best_effort: bool,
+    volatile: bool,
+}
+
+impl Group {
+    pub(super) fn of(endpoint: &Endpoint) -> Self {
+        Self {
+            topic: endpoint.topic.clone(),
+            type_name: endpoint.type_name.clone(),
+            best_effort: endpoint.qos.reliability == Reliability::BestEffort,
+            volatile: endpoint.qos.durability == Durability::Volatile,
+        }
+    }
+
+    /// What a relay requests to get all that its publishers offer: whether one is held back is up to
+    /// the publisher's QoS, as ever.
+    fn qos(&self, depth: u32) -> Qos {
+        Qos {
+            reliability: if self.best_effort {
+                Reliability::BestEffort
+            } else {
+                Reliability::Reliable
+            },
+            durability: if self.volatile {
+                Durability::Volatile
+            } else {
+                Durability::TransientLocal
+            },
+            history: if self.best_effort { History::KeepLast } else { History::KeepAll },
+            depth,
+            deadline: None,
+            lifespan: None,
+            liveliness: Liveliness::Automatic,
+            lease: None,
+        }
+    }
+}
+
+/// What is wanted of a relay.
+#[derive(Default)]
+struct Wanted {
+    depth: u32,
+    stands_for: BTreeSet<Gid>,
+}
+
+pub(super) struct Relay {
+    subscription: Subscription,
+    stands_for: BTreeSet<Gid>,
+}
+
+impl Served<'_> {
+    pub(super) fn update_relays(&mut self) {
+        let mut wanted: BTreeMap<Group, Wanted> = BTreeMap::new();
+        for endpoint in self.own.values().filter(|e| e.kind == EndpointKind::Publisher) {
+            let group = Group::of(endpoint);
+            let readers = self.matched.get(&endpoint.gid).map_or(&[][..], Vec::as_slice);
+            // History goes ahead of those who will ask for it; what is left is carried to its end.
+            let rest = self.ending.contains(&endpoint.gid) && self.relays.contains_key(&group);
+            if readers.is_empty() && group.volatile && !rest {
+                continue;
+            }
+            let wanted = wanted.entry(group).or_default();
+            wanted.depth = wanted.depth.max(endpoint.qos.depth);
+            wanted.stands_for.extend(readers);
+        }
+        self.relays.retain(|group, _| wanted.contains_key(group));
+        for (group, Wanted { depth, stands_for }) in wanted {
+            let gids: Vec<Gid> = stands_for.iter().take(MAX_MATCHED).copied().collect();
+            if let Some(relay) = self.relays.get_mut(&group) {
+                if relay.stands_for != stands_for {
+                    relay.subscription.set_stands_for(gids);
+                    relay.stands_for = stands_for;
+                }
+                continue;
+            }
+            let spec = EndpointSpec::new(&*group.topic, &*group.type_name, group.qos(depth));
+            match self.common.outside.create_relay(spec, gids) {
+                Ok(subscription) => {
+                    self.relays.insert(group, Relay { subscription, stands_for });
+                }
+                Err(error) => tracing::error!(topic = group.topic, %error, "nothing is relayed"),
+            }
+        }
+    }
+
+    /// Whether all that a publisher has published is with the daemon.
+    pub(super) fn has_left(&self, publisher: &Endpoint) -> bool {
+        let relay = self.relays.get(&Group::of(publisher));
+        relay.is_none_or(|relay| !relay.subscription.has_from(&publisher.gid))
+            && self.pipe.outgoing.is_idle(&publisher.gid)
+    }
+
+    /// Takes what goes by way of another relay; whether there was any.
+    pub(super) fn pass_over(&self) -> bool {
+        let mut any = false;
+        for (group, relay) in &self.relays {
+            for publisher in self.own.values().filter(|e| {
+                e.kind == EndpointKind::Publisher
+                    && e.topic == group.topic
+                    && e.type_name == group.type_name
+                    && Group::of(e) != *group
+            }) {
+                for _ in 0..BATCH {
+                    if relay.subscription.take_from(&publisher.gid).is_none() {
+                        break;
+                    }
+                    any = true;
+                }
+            }
+        }
+        any
+    }
+}
+
+pub(super) fn take(
+    own: &BTreeMap<Gid, Arc<Endpoint>>,
+    relays: &BTreeMap<Group, Relay>,
+    lost: &mut HashMap<Gid, u64>,
+    publisher: &Gid,
+) -> Option<Departing<Sample>> {
+    let relay = relays.get(&Group::of(own.get(publisher)?))?;
+    let (content, now) = relay.subscription.take_from(publisher)?;
+    let before = lost.insert(*publisher, now).unwrap_or(0);
+    // A relay that attached anew counts from 0.
+    let lost = now.checked_sub(before).unwrap_or(now);
+    Some(Departing { meta: content.meta(), lost, content })
+}

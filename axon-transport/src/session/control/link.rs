@@ -1,0 +1,130 @@
+//! The connection to a daemon, and the search for another.
+
+use std::{
+    collections::BTreeSet,
+    sync::{
+        atomic::Ordering,
+        mpsc::{TryRecvError, sync_channel},
+    },
+    time::{Duration, Instant},
+};
+
+use super::{Control, Link};
+use crate::{
+    ids::Gid,
+    passed::PassedFd,
+    session::{
+        connect::{Caller, Connected},
+        error::SessionError,
+        message::{Gone, Message},
+        state::{Outgoing, SegmentChange, SessionEvent, StatusAnswer},
+    },
+};
+
+/// Between attempts to find a daemon.
+const MIN_PAUSE: Duration = Duration::from_millis(100);
+const MAX_PAUSE: Duration = Duration::from_secs(2);
+/// A connection that lasted less was as good as refused.
+const BRIEF: Duration = Duration::from_secs(1);
+
+impl Control {
+    pub(super) fn connected(&mut self, connected: Connected) {
+        self.outbox.clear();
+        self.building = None;
+        self.repeated = None;
+        self.told = false;
+        self.segments.clear();
+        self.untold.clear();
+        self.since = Instant::now();
+        self.retry = None;
+        let daemon = connected.welcome.daemon;
+        {
+            let mut state = self.shared.state();
+            state.daemon = Some(daemon);
+            state.outgoing.clear();
+            let endpoints = state.publishers.keys().chain(state.subscriptions.keys());
+            let gids: BTreeSet<Gid> = state.nodes.keys().chain(endpoints).copied().collect();
+            let gone: Vec<Gid> = state.tombstones.iter().copied().collect();
+            state.outgoing.extend(gids.into_iter().map(Outgoing::Announce));
+            let gone = gone.into_iter().map(|gid| Message::EndpointGone(Gone { gid }));
+            state.outgoing.extend(gone.map(|m| Outgoing::Message(Box::new(m))));
+        }
+        self.link = Link::Socket(PassedFd::connection(connected.socket).trusted());
+        for info in self.shared.segment.segments() {
+            self.tell_segment(SegmentChange::Opened(info.number));
+        }
+        self.shared.notify(Some(&SessionEvent::DaemonFound(daemon)));
+    }
+
+    pub(super) fn lost(&mut self, why: &dyn std::fmt::Display) {
+        tracing::warn!(%why, "the connection to the daemon is lost");
+        self.outbox.clear();
+        {
+            let mut state = self.shared.state();
+            state.daemon = None;
+            if matches!(state.status, StatusAnswer::Parts(_)) {
+                state.status = StatusAnswer::Lost;
+            }
+        }
+        self.pause = if self.since.elapsed() < BRIEF {
+            (self.pause * 2).clamp(MIN_PAUSE, MAX_PAUSE)
+        } else {
+            Duration::ZERO
+        };
+        self.link = if self.reconnects { self.reconnect() } else { Link::Ended };
+        self.shared.notify(Some(&SessionEvent::DaemonLost));
+    }
+
+    /// Looks for a daemon on a thread of its own: meanwhile peers may die.
+    pub(super) fn reconnect(&self) -> Link {
+        let shared = self.shared.clone();
+        let (found, receiver) = sync_channel(1);
+        let first = self.pause;
+        let search = move || {
+            std::thread::sleep(first);
+            let mut pause = MIN_PAUSE;
+            // Pairs with the release store in `Shared::stop`.
+            while !shared.stopping.load(Ordering::Acquire) {
+                let caller = Caller {
+                    config: &shared.config,
+                    options: &shared.options,
+                    id: shared.id,
+                    segment: Some(&shared.segment),
+                    relay: None,
+                    cancel: Some(&shared.stopping),
+                };
+                match caller.connect() {
+                    Ok(connected) => {
+                        let _ = found.send(connected);
+                        shared.wake();
+                        return;
+                    }
+                    Err(SessionError::NoDaemon { .. }) => {}
+                    Err(error) => tracing::error!(%error, "no daemon took this session"),
+                }
+                std::thread::sleep(pause);
+                pause = (pause * 2).min(MAX_PAUSE);
+            }
+        };
+        match std::thread::Builder::new().name("axon-connect".into()).spawn(search) {
+            Ok(_) => Link::Reconnecting(receiver),
+            Err(error) => {
+                tracing::error!(%error, "no thread to look for a daemon with");
+                Link::Ended
+            }
+        }
+    }
+
+    pub(super) fn try_reconnected(&mut self) {
+        let Link::Reconnecting(receiver) = &self.link else { return };
+        match receiver.try_recv() {
+            Ok(connected) => self.connected(connected),
+            Err(TryRecvError::Empty) => {}
+            Err(TryRecvError::Disconnected) => self.link = Link::Ended,
+        }
+    }
+
+    pub(super) fn is_linked(&self) -> bool {
+        matches!(self.link, Link::Socket(_) | Link::Local(_))
+    }
+}

@@ -1,0 +1,94 @@
+//! This session's memory: what others are told of it, and what is given back.
+
+use std::time::{Duration, Instant};
+
+use super::Control;
+use crate::session::{
+    message::{Message, SegmentName, SegmentOpened},
+    state::SegmentChange,
+};
+
+/// How often the memory of large samples is looked after.
+const TEND: Duration = Duration::from_secs(1);
+
+impl Control {
+    /// Takes what changed in the session's memory, and what its readers lack of others'.
+    pub(super) fn tell_segments(&mut self) {
+        for number in self.untold.clone() {
+            self.tell_segment(SegmentChange::Opened(number));
+        }
+        for change in self.shared.memory.take() {
+            self.tell_segment(change);
+        }
+        for session in self.peers.sessions() {
+            for number in session.take_wanted() {
+                let need = SegmentName { session: session.id(), number };
+                self.outbox.push_back((Message::Need(need), Vec::new()));
+            }
+        }
+    }
+
+    pub(super) fn tell_segment(&mut self, change: SegmentChange) {
+        let session = self.shared.id;
+        match change {
+            // Found here and noted there.
+            SegmentChange::Opened(number) if self.segments.contains(&number) => {}
+            SegmentChange::Opened(number) => match self.shared.segment.segment(number) {
+                Ok(Some((info, descriptor))) => {
+                    self.segments.insert(number);
+                    self.untold.remove(&number);
+                    let opened = SegmentOpened { session, segment: info.into() };
+                    self.outbox.push_back((Message::Segment(opened), vec![descriptor.into()]));
+                }
+                // It is gone again.
+                Ok(None) => {
+                    self.untold.remove(&number);
+                }
+                Err(error) => {
+                    if self.untold.insert(number) {
+                        tracing::error!(%error, "samples stay unseen by others until there is one");
+                    }
+                }
+            },
+            SegmentChange::Gone(number) => {
+                self.segments.remove(&number);
+                self.untold.remove(&number);
+                let gone = SegmentName { session, number };
+                self.outbox.push_back((Message::SegmentGone(gone), Vec::new()));
+            }
+            SegmentChange::Low(gid) => {
+                self.low.insert(gid);
+            }
+        }
+    }
+
+    /// Has memory ready for those that publish large samples.
+    pub(super) fn prepare(&mut self) {
+        for gid in std::mem::take(&mut self.low) {
+            let publisher = self.shared.state().publishers.get(&gid).cloned();
+            if let Some(publisher) = publisher {
+                // What lacks then, its next publish says.
+                publisher.rings.prepare();
+                self.look_after_memory();
+            }
+        }
+    }
+
+    /// There is memory that may have to be given back.
+    pub(super) fn look_after_memory(&mut self) {
+        self.tend.get_or_insert_with(|| Instant::now() + TEND);
+    }
+
+    /// Looks after the memory of large samples and of publishers that are gone. Memory that is given up may have to be opened anew,
+    /// and only a daemon can say so to the readers: so not while there is none.
+    pub(super) fn tend(&mut self) {
+        let now = Instant::now();
+        if !self.is_linked() || self.tend.is_none_or(|due| now < due) {
+            return;
+        }
+        let publishers: Vec<_> = self.shared.state().publishers.values().cloned().collect();
+        let more = publishers.iter().filter(|publisher| publisher.rings.tend(now)).count();
+        let more = self.shared.segment.tidy() || more > 0;
+        self.tend = more.then(|| now + TEND);
+    }
+}

@@ -1,0 +1,165 @@
+//! What the session's control thread shares with a subscription's handle.
+
+use std::{
+    collections::BTreeMap,
+    sync::{Mutex, MutexGuard, PoisonError},
+};
+
+use super::slots::Slots;
+use crate::{
+    graph::{Endpoint, EndpointKind},
+    ids::Gid,
+    qos::Qos,
+    session::{
+        OnNew,
+        callback::Callback,
+        clock,
+        events::{Changes, EndpointEvents},
+        message::EndpointRole,
+        state::Shared,
+    },
+    shm::ShmError,
+    wait::Look,
+};
+
+/// The reading side of a subscription, client or server, which the session's control thread shares
+/// with the handle.
+pub(in crate::session) struct SubscriptionInner {
+    pub(in crate::session) endpoint: Endpoint,
+    /// What its readers request: what the endpoint does, but for a client's or a server's, which
+    /// lose nothing.
+    pub(in crate::session) qos: Qos,
+    /// Whether a writer's numbers rise: the responses of a server come in whatever order it likes.
+    pub(super) rising: bool,
+    pub(in crate::session) role: EndpointRole,
+    pub(in crate::session) events: EndpointEvents,
+    pub(super) stands_for: Mutex<Vec<Gid>>,
+    slots: Mutex<Slots>,
+    arrived: Callback,
+    /// Whether the control thread listens for it.
+    listens: Mutex<bool>,
+}
+
+impl SubscriptionInner {
+    pub(in crate::session) fn new(
+        endpoint: Endpoint,
+        role: EndpointRole,
+        stands_for: Vec<Gid>,
+    ) -> Self {
+        let (stands_for, slots) = (Mutex::new(stands_for), Mutex::default());
+        let events = EndpointEvents::of_subscription(&endpoint.qos);
+        let (arrived, listens) = (Callback::default(), Mutex::new(false));
+        let service = matches!(endpoint.kind, EndpointKind::Server | EndpointKind::Client);
+        let qos = if service { Qos::keep_all() } else { endpoint.qos };
+        let rising = endpoint.kind != EndpointKind::Client;
+        Self { endpoint, qos, rising, role, events, stands_for, slots, arrived, listens }
+    }
+
+    pub(in crate::session) fn has_data(&self) -> bool {
+        self.lock().has_data()
+    }
+
+    pub(in crate::session) fn set_on_new_sample(
+        &self,
+        callback: Option<OnNew>,
+        shared: &Shared,
+    ) -> Result<(), ShmError> {
+        let mut listens = lock(&self.listens);
+        let there = match (*listens, callback.is_some()) {
+            (false, true) => {
+                shared.listen()?;
+                true
+            }
+            (listens, there) => {
+                if listens && !there {
+                    shared.listen_no_more();
+                }
+                there
+            }
+        };
+        *listens = there;
+        drop(listens);
+        let untold = {
+            let mut slots = self.lock();
+            slots.new_arrivals();
+            slots.unread(&self.qos)
+        };
+        self.arrived.replace(callback, Some(untold));
+        Ok(())
+    }
+
+    /// Tells of samples that came, where somebody wants to hear of them.
+    pub(in crate::session) fn tell_arrived(&self) {
+        if self.arrived.is_set() {
+            let new = self.lock().new_arrivals();
+            self.arrived.add(new);
+        }
+    }
+
+    /// What became of its matches since it was asked last.
+    pub(in crate::session) fn rematch(&self) -> Changes {
+        let leases: BTreeMap<Gid, Option<u64>> = {
+            let slots = self.lock();
+            let active = slots.slots.iter().filter(|slot| !slot.over);
+            active.map(|slot| (slot.reader.writer(), slot.reader.times().lease)).collect()
+        };
+        self.events.writers(&leases, clock::monotonic())
+    }
+
+    /// Counts the deadlines that passed and looks who is alive. When to look again, and whether
+    /// something happened.
+    pub(in crate::session) fn look_at_time(&self, now: u64) -> (Option<u64>, bool) {
+        let times: Vec<_> = {
+            let slots = self.lock();
+            let active = slots.slots.iter().filter(|slot| !slot.over);
+            let times = active.map(|slot| {
+                let mut times = slot.reader.times();
+                times.sampled = times.sampled.filter(|sampled| *sampled >= slot.since);
+                (slot.reader.writer(), times)
+            });
+            times.collect()
+        };
+        self.events.requested(&self.qos, &times, now)
+    }
+
+    /// The same for who must not wait for a thread that takes.
+    pub(in crate::session) fn may_have_losses(&self) -> bool {
+        let Ok(mut slots) = self.slots.try_lock() else { return true };
+        slots.slots.iter_mut().for_each(|slot| drop(slot.reader.peek()));
+        slots.losses() != slots.lost_before
+    }
+
+    /// Counts what would be found lost by taking now.
+    pub(in crate::session) fn look_for_losses(&self) {
+        let mut slots = self.lock();
+        for slot in &mut slots.slots {
+            // What is wrong with its memory, the next take says.
+            let _ = slot.reader.peek();
+        }
+        let lost = slots.new_losses();
+        drop(slots);
+        self.events.lost(lost);
+    }
+
+    pub(in crate::session) fn lock(&self) -> MutexGuard<'_, Slots> {
+        lock(&self.slots)
+    }
+
+    pub(in crate::session) fn stands_for(&self) -> Vec<Gid> {
+        lock(&self.stands_for).clone()
+    }
+}
+
+impl Look for SubscriptionInner {
+    fn ready(&self) -> bool {
+        match self.slots.try_lock() {
+            Ok(slots) => slots.has_data(),
+            // Whoever has it may be about to add something.
+            Err(_) => true,
+        }
+    }
+}
+
+pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

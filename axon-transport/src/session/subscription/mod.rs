@@ -1,0 +1,226 @@
+//! A reader of every matched publisher of a topic, merged into one stream.
+
+mod inner;
+mod slots;
+mod taking;
+
+use std::{
+    fmt,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use self::inner::lock;
+pub(super) use self::{inner::SubscriptionInner, slots::Accept};
+use super::{
+    OnNew, Session, SessionError,
+    events::{Event, Source},
+    message::{Message, Pair},
+    state::Outgoing,
+};
+use crate::{
+    events::EventKind,
+    graph::Endpoint,
+    ids::Gid,
+    shm::{Meta, Reader, Sample, ShmError, TakeError},
+};
+
+/// Receives the samples of a topic. Thread-safe.
+pub struct Subscription {
+    pub(super) inner: Arc<SubscriptionInner>,
+    pub(super) session: Session,
+}
+
+/// What is known of a sample besides its bytes. Times are nanoseconds since the Unix epoch.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct MessageInfo {
+    /// Who published it.
+    pub publisher: Gid,
+    /// The publication's number, from 1.
+    pub sequence: u64,
+    /// When it was published, by the publisher's clock.
+    pub source_timestamp: i64,
+    /// When it was taken, by this host's clock.
+    pub received_timestamp: i64,
+}
+
+impl Subscription {
+    /// Its GID.
+    pub fn gid(&self) -> Gid {
+        self.inner.endpoint.gid
+    }
+
+    /// Itself, as others see it.
+    pub fn endpoint(&self) -> &Endpoint {
+        &self.inner.endpoint
+    }
+
+    /// The oldest sample by source timestamp among all publishers, into `out`, which it replaces.
+    /// `None` when there is none.
+    ///
+    /// Clocks are taken at their word. Where KEEP_LAST's depth passes samples over, they are those
+    /// with the oldest timestamps: a publisher whose clock is ahead has the others' passed over.
+    pub fn take(&self, out: &mut Vec<u8>) -> Option<MessageInfo> {
+        let take = |reader: &mut Reader| Ok(reader.take(out)?.map(|taken| (taken.meta, ())));
+        take_from(&self.inner, &self.session, take).map(|(info, ())| info)
+    }
+
+    /// As [`take`](Self::take), but a sample of more than 4 KiB stays in the publisher's memory for
+    /// as long as it is kept, unless `AXON_SHM_COPY` asks for copies.
+    pub fn take_sample(&self) -> Option<(MessageInfo, Sample)> {
+        let copy = self.session.shared().config.shm_copy;
+        take_from(&self.inner, &self.session, |reader| {
+            let sample = if copy { reader.take_copy() } else { reader.take_sample() };
+            Ok(sample?.map(|sample| (sample.meta(), sample)))
+        })
+    }
+
+    /// As [`take`](Self::take), after waiting for a sample for at most `timeout`.
+    pub fn recv(&self, out: &mut Vec<u8>, timeout: Option<Duration>) -> Option<MessageInfo> {
+        recv_from(&self.inner, &self.session, timeout, || self.take(out))
+    }
+
+    /// Whether there is something to take.
+    pub fn has_data(&self) -> bool {
+        !self.session.is_forked() && self.inner.has_data()
+    }
+
+    /// The publishers it receives from.
+    pub fn matched(&self) -> Vec<Gid> {
+        if self.session.is_forked() {
+            return Vec::new();
+        }
+        let slots = self.inner.lock();
+        slots.slots.iter().filter(|s| !s.over).map(|s| s.reader.writer()).collect()
+    }
+
+    /// Waits until it receives from at least `count` publishers; whether it does.
+    pub fn wait_matched(&self, count: usize, timeout: Duration) -> bool {
+        self.session.wait_changed(timeout, || self.matched().len() >= count)
+    }
+
+    /// Samples that were overwritten before they were taken.
+    pub fn lost(&self) -> u64 {
+        if self.session.is_forked() {
+            return 0;
+        }
+        self.inner.lock().losses()
+    }
+
+    /// Samples that were older than their publisher's lifespan when they would have been taken.
+    pub fn expired(&self) -> u64 {
+        if self.session.is_forked() { 0 } else { self.inner.lock().expired }
+    }
+
+    /// Has `callback` told of new samples from now on, in place of the one before, which is not
+    /// called any more once this returns. Those that are there to be taken it is told at once, on
+    /// this thread; others as they come, on the control thread. It must neither block nor panic, nor
+    /// hold the session.
+    ///
+    /// # Errors
+    /// In a forked child, or when an event loop of the program's listens already
+    /// ([`SessionSegment::external_leader`](crate::shm::SessionSegment::external_leader)).
+    pub fn set_on_new_sample(&self, callback: Option<OnNew>) -> Result<(), SessionError> {
+        if self.session.is_forked() {
+            return Err(ShmError::Forked.into());
+        }
+        Ok(self.inner.set_on_new_sample(callback, self.session.shared())?)
+    }
+
+    /// One of its events; `None` where `kind` is a publisher's.
+    pub fn event(&self, kind: EventKind) -> Option<Event> {
+        Event::new(Source::Subscription(self.inner.clone()), kind, self.session.clone())
+    }
+
+    /// Samples taken.
+    pub fn received(&self) -> u64 {
+        if self.session.is_forked() { 0 } else { self.inner.lock().received }
+    }
+
+    /// For a relay: the next sample of one publisher, and how many of that publisher's this
+    /// subscription has lost by then.
+    pub(crate) fn take_from(&self, writer: &Gid) -> Option<(Sample, u64)> {
+        if self.session.is_forked() {
+            return None;
+        }
+        self.inner.lock().take_from(writer, &self.inner)
+    }
+
+    /// Whether there is something to take of this publisher.
+    pub(crate) fn has_from(&self, writer: &Gid) -> bool {
+        !self.session.is_forked() && self.inner.lock().has_from(writer)
+    }
+
+    /// For a relay: the remote subscriptions that it stands for from now on.
+    pub fn set_stands_for(&self, gids: Vec<Gid>) {
+        if self.session.is_forked() {
+            return;
+        }
+        *lock(&self.inner.stands_for) = gids;
+        self.session.renew(self.gid());
+    }
+}
+
+impl fmt::Debug for Subscription {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Subscription").field(self.endpoint()).finish()
+    }
+}
+
+impl Drop for Subscription {
+    fn drop(&mut self) {
+        if !self.session.is_forked() {
+            // Only listening may fail, not ceasing to.
+            let _ = self.inner.set_on_new_sample(None, self.session.shared());
+        }
+        self.session.forget_endpoint(&self.gid());
+    }
+}
+
+/// The oldest of what one may take.
+pub(super) fn take_from<T>(
+    inner: &SubscriptionInner,
+    session: &Session,
+    take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
+) -> Option<(MessageInfo, T)> {
+    // A thread of the parent may have held the lock when this process was forked.
+    if session.is_forked() {
+        tracing::error!("an endpoint of the parent process is used after fork");
+        return None;
+    }
+    let mut slots = inner.lock();
+    let taken = slots.take(take, inner);
+    let gone = std::mem::take(&mut slots.discarded);
+    let lost = slots.new_losses();
+    drop(slots);
+    inner.events.lost(lost);
+    for writer in gone {
+        let detach = Message::Detach(Pair { reader: inner.endpoint.gid, writer });
+        session.shared().tell(Outgoing::Message(Box::new(detach)));
+    }
+    taken
+}
+
+/// What `take` finds, after waiting for at most `timeout`.
+pub(super) fn recv_from<T>(
+    inner: &Arc<SubscriptionInner>,
+    session: &Session,
+    timeout: Option<Duration>,
+    mut take: impl FnMut() -> Option<T>,
+) -> Option<T> {
+    let deadline = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
+    loop {
+        // Nothing comes to a forked child, however long it waits.
+        if session.is_forked() {
+            return None;
+        }
+        if let Some(taken) = take() {
+            return Some(taken);
+        }
+        let left = deadline.map(|deadline| deadline.saturating_duration_since(Instant::now()));
+        let look = Arc::clone(inner);
+        if left.is_some_and(|left| left.is_zero()) || !session.segment().wait_for(look, left) {
+            return None;
+        }
+    }
+}

@@ -1,0 +1,222 @@
+//! The readers of a subscription, one for each publisher: how they come and go.
+
+use std::{
+    collections::HashMap,
+    time::{Duration, Instant},
+};
+
+use crate::{
+    ids::Gid,
+    qos::{History, Qos},
+    session::clock,
+    shm::{Grant, Lane, Location, Reader},
+};
+
+/// Publishers whose last sequence number is remembered after they are gone.
+const REMEMBERED: usize = 4096;
+/// How long nobody is woken for a sample that there was no memory to take.
+const SHORT: Duration = Duration::from_secs(1);
+
+#[derive(Default)]
+pub(in crate::session) struct Slots {
+    pub(super) slots: Vec<Slot>,
+    /// Lanes given to writers that have not granted yet.
+    pub(super) pending: HashMap<Gid, Lane>,
+    /// The last sequence number taken of each publisher, also of those that are gone: one that
+    /// comes back, as a remote one does with its link, must not be heard twice.
+    pub(super) last: HashMap<Gid, u64>,
+    pub(super) received: u64,
+    pub(super) expired: u64,
+    pub(super) lost: u64,
+    /// Losses that were reported.
+    pub(super) lost_before: u64,
+    /// Samples that came from writers that are gone, and all that somebody was told of.
+    pub(super) arrived: u64,
+    pub(super) arrived_before: u64,
+    /// When there was no memory to take a sample last.
+    pub(super) short: Option<Instant>,
+    /// Writers whose memory was not usable, of which the others have to be told.
+    pub(super) discarded: Vec<Gid>,
+}
+
+/// What a grant calls for.
+pub(in crate::session) enum Accept {
+    /// Nothing: it repeats the one that stands, or nobody asked.
+    Stands,
+    /// Map the ring with this lane.
+    Map(Lane),
+    /// Ask again, with a fresh lane.
+    AskAgain,
+}
+
+pub(super) struct Slot {
+    pub(super) reader: Reader,
+    /// When it was mapped: what was published before is no news. By the monotonic clock.
+    pub(super) since: u64,
+    /// The age at which its samples are not delivered any more.
+    pub(super) lifespan: Option<i64>,
+    /// The writer is gone: take what it left, then unmap.
+    pub(super) over: bool,
+    /// Found nothing in the take that is under way, since the writer was faster.
+    pub(super) overtaken: bool,
+}
+
+impl Slots {
+    pub(super) fn has_data(&self) -> bool {
+        !self.is_short() && self.slots.iter().any(|slot| slot.reader.has_data())
+    }
+
+    pub(super) fn is_short(&self) -> bool {
+        self.short.is_some_and(|since| since.elapsed() < SHORT)
+    }
+
+    /// Whether the lease of one of the writers may run out.
+    pub(in crate::session) fn offers_lease(&self) -> bool {
+        self.slots.iter().any(|slot| !slot.over && slot.reader.times().lease.is_some())
+    }
+
+    pub(super) fn losses(&self) -> u64 {
+        self.lost + self.slots.iter().map(|slot| slot.reader.lost()).sum::<u64>()
+    }
+
+    /// Samples that came since this was last asked.
+    pub(super) fn new_arrivals(&mut self) -> u64 {
+        let present = self.slots.iter().map(|slot| slot.reader.arrived()).sum::<u64>();
+        let arrived = self.arrived + present;
+        // A writer whose memory is corrupt takes its numbers with it.
+        arrived.saturating_sub(std::mem::replace(&mut self.arrived_before, arrived))
+    }
+
+    /// Samples to be taken.
+    pub(super) fn unread(&self, qos: &Qos) -> u64 {
+        let unread = self.slots.iter().map(|slot| slot.reader.unread()).sum::<u64>();
+        match qos.history {
+            History::KeepLast => unread.min(qos.depth.into()),
+            History::KeepAll => unread,
+        }
+    }
+
+    /// Losses since this was last asked.
+    pub(super) fn new_losses(&mut self) -> u64 {
+        let losses = self.losses();
+        losses - std::mem::replace(&mut self.lost_before, losses)
+    }
+
+    /// The lane that is, or from now on will be, the one for `writer`.
+    pub(in crate::session) fn lane_for<E>(
+        &mut self,
+        writer: Gid,
+        allocate: impl FnOnce() -> Result<Lane, E>,
+    ) -> Result<Location, E> {
+        if let Some(slot) = self.slots.iter().find(|s| s.reader.writer() == writer && !s.over) {
+            return Ok(slot.reader.lane());
+        }
+        if let Some(lane) = self.pending.get(&writer) {
+            return Ok(lane.location());
+        }
+        let lane = allocate()?;
+        let location = lane.location();
+        self.pending.insert(writer, lane);
+        Ok(location)
+    }
+
+    /// The lanes of all that are attached, or asked to be: what is repeated when `stands_for`
+    /// changes.
+    pub(in crate::session) fn lanes(&self) -> Vec<(Gid, Location)> {
+        let attached = self.slots.iter().filter(|s| !s.over);
+        let attached = attached.map(|s| (s.reader.writer(), s.reader.lane()));
+        attached.chain(self.pending.iter().map(|(gid, lane)| (*gid, lane.location()))).collect()
+    }
+
+    /// What a grant of `writer` calls for.
+    pub(in crate::session) fn accept(&mut self, writer: Gid, grant: Grant) -> Accept {
+        if let Some(slot) = self.slots.iter_mut().find(|s| !s.over && s.reader.writer() == writer) {
+            if slot.reader.grant() == grant {
+                return Accept::Stands;
+            }
+            // The writer forgot us and granted anew, on a lane whose words we still use for what
+            // it wrote before.
+            slot.over = true;
+            self.sweep();
+            self.forget_older(writer);
+            return Accept::AskAgain;
+        }
+        self.pending.remove(&writer).map_or(Accept::Stands, Accept::Map)
+    }
+
+    pub(in crate::session) fn add(&mut self, reader: Reader) {
+        let writer = reader.writer();
+        let since = clock::monotonic();
+        let lifespan = reader.times().lifespan.map(|age| i64::try_from(age).unwrap_or(i64::MAX));
+        self.slots.push(Slot { reader, since, lifespan, over: false, overtaken: false });
+        self.forget_older(writer);
+    }
+
+    /// The writer will not write any more. Whether that is news.
+    pub(in crate::session) fn end(&mut self, writer: &Gid) -> bool {
+        self.pending.remove(writer);
+        self.end_where(|reader| reader.writer() == *writer)
+    }
+
+    /// Writers whose process is dead will not write any more. Whether there are any.
+    pub(in crate::session) fn end_dead(&mut self) -> bool {
+        self.end_where(Reader::writer_dead)
+    }
+
+    /// The writers that are attached, or asked to be.
+    pub(in crate::session) fn writers(&self) -> Vec<Gid> {
+        self.lanes().into_iter().map(|(gid, _)| gid).collect()
+    }
+
+    fn end_where(&mut self, which: impl Fn(&Reader) -> bool) -> bool {
+        let mut news = false;
+        for slot in self.slots.iter_mut().filter(|s| !s.over && which(&s.reader)) {
+            slot.over = true;
+            slot.reader.end();
+            news = true;
+        }
+        self.sweep();
+        news
+    }
+
+    /// Gives up all but the last of what a writer left: one that begins anew and anew would otherwise
+    /// take all lanes. What comes after is read by the later grant, too.
+    fn forget_older(&mut self, writer: Gid) {
+        while let [older, newer, ..] = self.slots_of(writer)[..]
+            && self.slots[newer].over
+        {
+            let later = self.slots[newer].reader.grant().first;
+            let slot = self.slots.remove(older);
+            self.lost += slot.reader.lost() + slot.reader.unread_below(later);
+            self.arrived += slot.reader.arrived();
+        }
+    }
+
+    /// Where this writer's are, in the order in which it granted them.
+    fn slots_of(&self, writer: Gid) -> Vec<usize> {
+        let of = |index: &usize| self.slots[*index].reader.writer() == writer;
+        (0..self.slots.len()).filter(of).collect()
+    }
+
+    /// Whether anything of this writer's is read, or may be soon.
+    pub(in crate::session) fn reads(&self, writer: &Gid) -> bool {
+        self.pending.contains_key(writer) || self.slots.iter().any(|s| s.reader.writer() == *writer)
+    }
+
+    /// Unmaps writers that are gone and drained.
+    pub(super) fn sweep(&mut self) {
+        let (lost, arrived) = (&mut self.lost, &mut self.arrived);
+        self.slots.retain(|s| {
+            let keep = !s.over || !s.reader.is_drained();
+            if !keep {
+                *lost += s.reader.lost();
+                *arrived += s.reader.arrived();
+            }
+            keep
+        });
+        if self.last.len() > REMEMBERED {
+            let slots = &self.slots;
+            self.last.retain(|gid, _| slots.iter().any(|s| s.reader.writer() == *gid));
+        }
+    }
+}

@@ -1,0 +1,239 @@
+//! Which of a subscription's publishers is taken from next.
+
+use std::time::Instant;
+
+use super::{MessageInfo, inner::SubscriptionInner, slots::Slots};
+use crate::{
+    graph::Endpoint,
+    ids::Gid,
+    qos::History,
+    session::{clock, message::EndpointRole},
+    shm::{Meta, Reader, Sample, TakeError},
+};
+
+/// Samples that one take passes over because they were taken before.
+const REPEATS: usize = 64;
+
+impl Slots {
+    pub(super) fn take<T>(
+        &mut self,
+        mut take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
+        of: &SubscriptionInner,
+    ) -> Option<(MessageInfo, T)> {
+        let endpoint = &of.endpoint;
+        self.slots.iter_mut().for_each(|slot| slot.overtaken = false);
+        // A writer that repeats itself without end must not keep the lock: callers come back as
+        // long as there is something to take.
+        for _ in 0..REPEATS {
+            if of.qos.history == History::KeepLast && self.slots.len() > 1 {
+                self.skip_to_depth(u64::from(of.qos.depth));
+            }
+            let Some(index) = self.oldest() else {
+                // What was skipped may have been the last of a writer that is gone.
+                if self.slots.iter().any(|slot| slot.over) {
+                    self.sweep();
+                }
+                return None;
+            };
+            let slot = &mut self.slots[index];
+            let writer = slot.reader.writer();
+            let (meta, taken) = match take(&mut slot.reader) {
+                Ok(Some(taken)) => taken,
+                // Overwritten again and again while we read: the others have their turn first.
+                Ok(None) => {
+                    slot.overtaken = true;
+                    continue;
+                }
+                Err(error @ TakeError::TooLarge { .. }) => {
+                    tracing::error!(topic = endpoint.topic, %error, "a sample is lost");
+                    continue;
+                }
+                // It stands, and may be taken when there is memory again.
+                Err(error @ TakeError::NoMemory { .. }) => {
+                    slot.overtaken = true;
+                    if !self.is_short() {
+                        tracing::error!(topic = endpoint.topic, %error, "a sample is not taken yet");
+                    }
+                    self.short = Some(Instant::now());
+                    continue;
+                }
+                Err(error) => {
+                    self.discard(index, &error, endpoint);
+                    continue;
+                }
+            };
+            let over = slot.over;
+            let received_timestamp = clock::wall();
+            let expired = slot.lifespan.is_some_and(|lifespan| {
+                meta.source_timestamp.saturating_add(lifespan) < received_timestamp
+            });
+            let last = self.last.entry(writer).or_default();
+            let repeated = of.rising && meta.sequence <= *last;
+            if !repeated {
+                *last = meta.sequence;
+                if expired {
+                    self.expired += 1;
+                } else {
+                    self.received += 1;
+                }
+            }
+            if over {
+                self.sweep();
+            }
+            if repeated || expired {
+                continue;
+            }
+            let info = MessageInfo {
+                publisher: writer,
+                sequence: meta.sequence,
+                source_timestamp: meta.source_timestamp,
+                received_timestamp,
+            };
+            return Some((info, taken));
+        }
+        None
+    }
+
+    pub(super) fn take_from(
+        &mut self,
+        writer: &Gid,
+        of: &SubscriptionInner,
+    ) -> Option<(Sample, u64)> {
+        let endpoint = &of.endpoint;
+        let index = self.slots.iter().position(|slot| {
+            slot.reader.writer() == *writer && (!slot.over || slot.reader.has_data())
+        })?;
+        let reader = &mut self.slots[index].reader;
+        match reader.take_sample() {
+            Ok(sample) => {
+                // What a relay passes over, nobody asked it to.
+                let skipped = if of.role == EndpointRole::Relay { reader.skipped() } else { 0 };
+                let taken = sample.map(|sample| (sample, reader.lost() + skipped));
+                self.sweep();
+                taken
+            }
+            Err(error @ (TakeError::TooLarge { .. } | TakeError::NoMemory { .. })) => {
+                tracing::error!(topic = endpoint.topic, %error, "a sample is not taken");
+                None
+            }
+            Err(error) => {
+                self.discard(index, &error, endpoint);
+                None
+            }
+        }
+    }
+
+    pub(super) fn has_from(&self, writer: &Gid) -> bool {
+        self.slots.iter().any(|slot| slot.reader.writer() == *writer && slot.reader.has_data())
+    }
+
+    /// Samples of `writer` that were lost before they came to its ring here.
+    pub(in crate::session) fn lost_elsewhere(&mut self, writer: &Gid, samples: u64) {
+        if self.slots.iter().any(|slot| slot.reader.writer() == *writer) {
+            self.lost += samples;
+        }
+    }
+
+    /// The slot whose next sample is the oldest, of those that are not faster than we are. What a
+    /// writer wrote before it granted anew comes before what it wrote since, whatever its clock
+    /// says: taken the other way round it would count as repeated.
+    fn oldest(&mut self) -> Option<usize> {
+        let index = self.oldest_by_time()?;
+        let writer = self.slots[index].reader.writer();
+        let earlier = self.slots[..index].iter().position(|slot| {
+            slot.over && !slot.overtaken && slot.reader.writer() == writer && slot.reader.has_data()
+        });
+        Some(earlier.unwrap_or(index))
+    }
+
+    fn oldest_by_time(&mut self) -> Option<usize> {
+        if let [slot] = self.slots.as_slice() {
+            return (!slot.overtaken && slot.reader.has_data()).then_some(0);
+        }
+        let mut oldest = None;
+        for (index, slot) in self.slots.iter_mut().enumerate().filter(|(_, s)| !s.overtaken) {
+            // A writer whose memory is corrupt is chosen, so that taking finds out.
+            let stamp = match slot.reader.peek() {
+                Ok(Some(meta)) => meta.source_timestamp,
+                Ok(None) => continue,
+                Err(_) => i64::MIN,
+            };
+            if oldest.is_none_or(|(least, _)| stamp < least) {
+                oldest = Some((stamp, index));
+            }
+        }
+        oldest.map(|(_, index)| index)
+    }
+
+    /// KEEP_LAST(depth) counts over all publishers together.
+    fn skip_to_depth(&mut self, depth: u64) {
+        let mut unread: u64 = self.slots.iter().map(|s| s.reader.unread()).sum();
+        while unread > depth {
+            let Some(index) = self.oldest() else { return };
+            if !self.slots[index].reader.skip() {
+                return;
+            }
+            unread -= 1;
+        }
+    }
+
+    fn discard(&mut self, index: usize, error: &TakeError, endpoint: &Endpoint) {
+        tracing::error!(topic = endpoint.topic, %error, "a publisher's memory is not usable");
+        let slot = self.slots.remove(index);
+        self.lost += slot.reader.lost();
+        self.arrived += slot.reader.arrived();
+        if !slot.over {
+            self.discarded.push(slot.reader.writer());
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{
+        graph::EndpointKind,
+        ids::SessionId,
+        qos::Qos,
+        shm::{Peer, ReaderInfo, ReaderOptions, RingOptions, SessionSegment, Writer},
+    };
+
+    #[test]
+    fn nobody_is_woken_at_once_for_a_sample_that_there_is_no_memory_for() {
+        let session = SessionSegment::create(SessionId::random()).unwrap();
+        let [writer, reader] = [1, 2].map(|number| Gid::new(session.id(), number));
+        let (qos, peer) = (Qos::default(), Peer::Local(session.clone()));
+        let options = RingOptions { gid: writer, qos, budget: 0, max_message: 10, expected: 0 };
+        let publisher = Writer::create(session.clone(), options).unwrap();
+        let lane = session.allocate_lane().unwrap();
+        let at = lane.location();
+        let info =
+            ReaderInfo { gid: reader, lane: at, qos, peer: peer.clone(), stands_for: Vec::new() };
+        let (grant, ring) = (publisher.attach(info).unwrap(), publisher.location());
+        let mut slots = Slots::default();
+        let options =
+            ReaderOptions { reader, writer, peer, ring, lane, grant, qos, max_message: 10 };
+        slots.add(Reader::map(options).unwrap());
+        publisher.publish_next(0, b"sample").unwrap();
+        assert!(slots.has_data());
+        let endpoint = Endpoint {
+            gid: reader,
+            kind: EndpointKind::Subscription,
+            topic: "/t".into(),
+            type_name: "T".into(),
+            type_hash: Vec::new(),
+            qos,
+            node: String::new(),
+            namespace: String::new(),
+            enclave: String::new(),
+        };
+        let inner = SubscriptionInner::new(endpoint, EndpointRole::Application, Vec::new());
+        let none = |_: &mut Reader| Err::<Option<(Meta, ())>, _>(TakeError::NoMemory { len: 6 });
+        assert!(slots.take(none, &inner).is_none() && !slots.has_data());
+        // Whoever asks nevertheless gets it, if it can be had.
+        let mut out = Vec::new();
+        let take = |reader: &mut Reader| Ok(reader.take(&mut out)?.map(|taken| (taken.meta, ())));
+        assert!(slots.take(take, &inner).is_some());
+        assert_eq!(out, b"sample");
+    }
+}

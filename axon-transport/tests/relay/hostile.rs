@@ -1,0 +1,172 @@
+//! Who says what no session says.
+
+use super::*;
+
+/// What a session under the id of nines says first.
+fn hello(host: &Host) -> Hello {
+    Hello {
+        protocol: PROTOCOL,
+        session: SessionId([9; 16]),
+        role: SessionRole::Application,
+        name: "by hand".into(),
+        domain: 0,
+        settings: security_settings(&host.config()).unwrap(),
+        relay: Some("written by hand".into()),
+    }
+}
+
+pub(crate) fn say_to(socket: &OwnedFd, message: &Message) {
+    let packet = message.encode().unwrap();
+    while let Err(SocketError::NotReady) = socket::send(socket, &packet, &[]) {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
+
+/// The next message that `want` wants; `None` at the end of the connection.
+fn hear(socket: &OwnedFd, want: impl Fn(&Message) -> bool) -> Option<Message> {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        match socket::receive(socket, &mut Vec::new()) {
+            Ok(received) if want(&received.message) => return Some(received.message),
+            Ok(_) => {}
+            Err(SocketError::NotReady) => {
+                assert!(Instant::now() < deadline, "nothing is said, and nobody hangs up");
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            Err(_) => return None,
+        }
+    }
+}
+
+fn refused(host: &Host, hello: Hello) -> Refused {
+    let socket = Address::of(&host.config()).connect().unwrap();
+    say_to(&socket, &Message::Hello(hello));
+    match hear(&socket, |_| true) {
+        Some(Message::Refused(refused)) => refused,
+        other => panic!("instead of a refusal: {other:?}"),
+    }
+}
+
+/// A relayed session that does as the test does.
+fn by_hand(host: &Host, hello: Hello) -> OwnedFd {
+    let socket = Address::of(&host.config()).connect().unwrap();
+    say_to(&socket, &Message::Hello(hello));
+    assert!(matches!(hear(&socket, |_| true), Some(Message::Welcome(_))));
+    socket
+}
+
+fn announce(gid: Gid, kind: EndpointKind, role: EndpointRole) -> Message {
+    let endpoint = Endpoint {
+        gid,
+        kind,
+        topic: "/t".into(),
+        type_name: "test/Bytes".into(),
+        type_hash: Vec::new(),
+        qos: Qos::keep_all(),
+        node: String::new(),
+        namespace: String::new(),
+        enclave: String::new(),
+    };
+    Message::Endpoint(Announce { endpoint, role, stands_for: Vec::new(), ring: None })
+}
+
+fn piece(publisher: Gid, length: Option<u32>, bytes: usize) -> Message {
+    let head = length.map(|length| Head { length, sequence: 1, source_timestamp: 0, lost: 0 });
+    Message::Piece(Piece { publisher, head, bytes: vec![0; bytes] })
+}
+
+#[test]
+fn who_is_not_to_be_relayed_is_refused() {
+    let host = host();
+    let _daemon = host.daemon();
+    let of = |role| Hello { role, ..hello(&host) };
+    assert!(refused(&host, of(SessionRole::Tool)).text.contains("application"));
+    assert!(refused(&host, of(SessionRole::Gateway)).text.contains("gateway"));
+    let mut other = hello(&host);
+    other.settings[0].1 = "other".into();
+    assert_eq!(refused(&host, other).variable, hello(&host).settings[0].0);
+    let empty = Hello { relay: None, ..hello(&host) };
+    assert_eq!(refused(&host, empty).variable, "AXON_SHM", "it may come back to be relayed");
+
+    // An id that another process has, or one like it, and one session too many.
+    let witness = session(&host, "witness", false);
+    let theirs = Hello { session: witness.id(), ..hello(&host) };
+    let alike = {
+        let mut id = witness.id();
+        id.0[15] ^= 1;
+        id
+    };
+    assert!(refused(&host, Hello { session: alike, ..theirs }).text.contains("id"));
+    let many: Vec<OwnedFd> = (1..32)
+        .map(|number| by_hand(&host, Hello { session: SessionId([number; 16]), ..hello(&host) }))
+        .collect();
+    let more = Hello { session: SessionId([77; 16]), ..hello(&host) };
+    assert!(refused(&host, more).text.contains("32 sessions"));
+    drop(many);
+    until("they are gone", || relays(&host.status().unwrap()).len() == 1);
+}
+
+#[test]
+fn hostile_frames_end_their_own_relay_and_nothing_else() {
+    let host = host();
+    let _daemon = host.daemon();
+    let (from, to) = (session(&host, "from", true), session(&host, "to", false));
+    let (publisher, subscription) = connect(&from, &to, "/t", Qos::keep_all());
+    let own = Gid::new(SessionId([9; 16]), 1);
+    let (application, stand_in) = (EndpointRole::Application, EndpointRole::StandIn);
+    let kind = EndpointKind::Publisher;
+    let credited = || {
+        let socket = by_hand(&host, hello(&host));
+        say_to(&socket, &announce(own, kind, application));
+        let credit = |m: &Message| matches!(m, Message::Credit(c) if c.publisher == own);
+        assert!(hear(&socket, credit).is_some());
+        socket
+    };
+    for message in [
+        Message::Resync,
+        announce(publisher.gid(), kind, application),
+        announce(own, kind, stand_in),
+        announce(Gid([7; 16]), EndpointKind::Subscription, application),
+    ] {
+        let socket = by_hand(&host, hello(&host));
+        say_to(&socket, &message);
+        assert!(hear(&socket, |_| false).is_none(), "{message:?}");
+    }
+    for pieces in [
+        &[piece(own, None, 10)][..],
+        &[piece(own, Some(10), 11)],
+        &[piece(own, Some(u32::MAX), 0)],
+        &[piece(own, Some(10), 5), piece(own, Some(10), 5)],
+        &[piece(own, Some(100_000), 31_000), piece(own, None, 31_000)],
+    ] {
+        let socket = credited();
+        // It may hang up before all is said.
+        let packets = pieces.iter().map(|piece| piece.encode().unwrap());
+        packets.for_each(|packet| drop(socket::send(&socket, &packet, &[])));
+        assert!(hear(&socket, |_| false).is_none(), "{pieces:?}");
+    }
+    for packet in [&[][..], &[25], &[25, 0xff, 0xff], &[0xff; 32 * 1024]] {
+        let socket = by_hand(&host, hello(&host));
+        let _ = socket::send(&socket, packet, &[]);
+        // What it does not know it passes over.
+        let _ = socket::send(&socket, &Message::Resync.encode().unwrap(), &[]);
+        assert!(hear(&socket, |_| false).is_none());
+    }
+    let socket = by_hand(&host, hello(&host));
+    let null = std::fs::File::open("/dev/null").unwrap();
+    let descriptor = [null.as_fd()];
+    socket::send(&socket, &Message::Resync.encode().unwrap(), &descriptor).unwrap();
+    assert!(hear(&socket, |_| false).is_none(), "descriptors");
+
+    // Samples of another's publisher go nowhere.
+    let socket = credited();
+    say_to(&socket, &piece(publisher.gid(), Some(4), 4));
+    // Samples that nobody reads are done with at once, however many they are.
+    (0..600).for_each(|_| say_to(&socket, &piece(own, Some(0), 0)));
+    publish(&publisher, &pattern(1, 10));
+    assert_eq!(take_until(&subscription, 1), [1]);
+    assert_eq!(subscription.received(), 1);
+    until("all of it is read", || {
+        relays(&host.status().unwrap()).iter().any(|relay| relay.samples_in == 600)
+    });
+}

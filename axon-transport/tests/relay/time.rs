@@ -1,0 +1,93 @@
+//! Deadlines, leases and lifespans where samples pass through the daemon: each is judged where its endpoint
+//! lives.
+
+use axon_transport::{
+    events::{Counted, EventKind, EventStatus, LivelinessChanged},
+    qos::Liveliness,
+    session::{Event, Waitable},
+};
+
+use super::*;
+
+const MILLI: u64 = 1_000_000;
+
+/// Both ways to be relayed, and both at once: who shares memory of publisher and subscription.
+const ENDS: [(bool, bool); 3] = [(false, true), (true, false), (false, false)];
+
+fn await_counted(session: &Session, event: &Event) -> Counted {
+    let ready = session.wait_for(&[Waitable::Event(event)], Some(PATIENCE)).unwrap();
+    assert_eq!(ready, [0], "{event:?}");
+    let EventStatus::Counted(counted) = event.take() else { panic!("{event:?}") };
+    counted
+}
+
+/// How many publishers are alive, and how many are not.
+fn alive(event: &Event) -> (u64, u64) {
+    let EventStatus::LivelinessChanged(LivelinessChanged { alive, not_alive, .. }) = event.take()
+    else {
+        panic!("{event:?}")
+    };
+    (alive, not_alive)
+}
+
+#[test]
+fn deadlines_are_missed_at_both_ends_of_a_relay() {
+    let host = host();
+    let _daemon = host.daemon();
+    for (shares, other_shares) in ENDS {
+        let (from, to) = (session(&host, "from", shares), session(&host, "to", other_shares));
+        let timed = Qos { deadline: Some(50 * MILLI), ..Qos::default() };
+        let (publisher, subscription) = connect(&from, &to, "/t", timed);
+        let offered = publisher.event(EventKind::OfferedDeadlineMissed).unwrap();
+        let requested = subscription.event(EventKind::RequestedDeadlineMissed).unwrap();
+        publisher.publish(b"x").unwrap();
+        for (session, event) in [(&from, &offered), (&to, &requested)] {
+            let first = await_counted(session, event).total;
+            assert!(await_counted(session, event).total > first, "one for every period");
+        }
+        assert!(subscription.recv(&mut Vec::new(), Some(PATIENCE)).is_some());
+    }
+}
+
+#[test]
+fn a_lease_runs_out_beyond_a_relay_and_a_sample_renews_it() {
+    let host = host();
+    let _daemon = host.daemon();
+    for (shares, other_shares) in ENDS {
+        let (from, to) = (session(&host, "from", shares), session(&host, "to", other_shares));
+        let manual = Qos {
+            liveliness: Liveliness::ManualByTopic,
+            lease: Some(100 * MILLI),
+            ..Qos::default()
+        };
+        let (publisher, subscription) = connect(&from, &to, "/t", manual);
+        let changed = subscription.event(EventKind::LivelinessChanged).unwrap();
+        until("it counts as not alive", || alive(&changed) == (0, 1));
+        until("it is alive again", || {
+            publisher.publish(b"x").unwrap();
+            alive(&changed) == (1, 0)
+        });
+        until("it runs out again", || alive(&changed) == (0, 1));
+        drop(publisher);
+        until("it is forgotten", || alive(&changed) == (0, 0));
+    }
+}
+
+#[test]
+fn a_sample_that_outlived_its_lifespan_is_not_delivered_beyond_a_relay() {
+    let host = host();
+    let _daemon = host.daemon();
+    for (shares, other_shares) in ENDS {
+        let (from, to) = (session(&host, "from", shares), session(&host, "to", other_shares));
+        let mortal = Qos { lifespan: Some(3_600_000 * MILLI), ..Qos::default() };
+        let (publisher, subscription) = connect(&from, &to, "/t", mortal);
+        // Published by a clock that is far too late.
+        publisher.publish_at(1_000_000_000, b"old").unwrap();
+        publisher.publish(b"new").unwrap();
+        let mut bytes = Vec::new();
+        let info = subscription.recv(&mut bytes, Some(PATIENCE)).unwrap();
+        assert_eq!((info.sequence, &bytes[..]), (2, &b"new"[..]));
+        let counts = (subscription.expired(), subscription.received(), subscription.lost());
+        assert_eq!(counts, (1, 1, 0));
+    }
+}
