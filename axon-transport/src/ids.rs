@@ -77,6 +77,11 @@ impl Gid {
         Self(gid)
     }
 
+    /// Whether it and `other` are of the same session.
+    pub(crate) fn is_of_session_of(&self, other: &Self) -> bool {
+        self.0[..12] == other.0[..12]
+    }
+
     /// Whether it is one that `session` may give to an endpoint of its own.
     pub fn is_of(&self, session: &SessionId) -> bool {
         self.0[..12] == session.0[..12]

@@ -5,6 +5,7 @@ pub mod config;
 pub mod daemon;
 pub mod discovery;
 pub mod events;
+pub mod ffi;
 pub mod gateway;
 pub mod graph;
 pub mod ids;

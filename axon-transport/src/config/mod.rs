@@ -7,7 +7,8 @@
 #![forbid(unsafe_code)]
 
 use std::{
-    ffi::OsString,
+    collections::BTreeMap,
+    ffi::{OsStr, OsString},
     path::{Path, PathBuf},
 };
 
@@ -34,18 +35,34 @@ impl Config {
     /// The configuration of this process: its environment, and the `axon.toml` that `AXON_CONFIG`
     /// names, else the one beside the daemon (`AXON_DAEMON_PATH`, or this very program), if any.
     pub fn from_env() -> Result<Self, ConfigError> {
-        Self::with_default_file(std::env::current_exe().ok())
+        Self::from_env_with([], None)
     }
 
     /// As [`from_env`](Self::from_env), for a library that knows where its daemon is installed.
     pub fn from_env_beside(daemon: &Path) -> Result<Self, ConfigError> {
-        Self::with_default_file(Some(daemon.to_path_buf()))
+        Self::from_env_with([], Some(daemon))
     }
 
-    fn with_default_file(daemon: Option<PathBuf>) -> Result<Self, ConfigError> {
-        let named = std::env::var_os("AXON_DAEMON_PATH").map(PathBuf::from);
-        let file = named.or(daemon).map(|daemon| daemon.with_file_name("axon.toml"));
-        Self::resolve(std::env::vars_os(), file.as_deref(), &OsFiles)
+    /// As [`from_env`](Self::from_env), where these variables have another value than the
+    /// environment's, or none; for a library that may know where its daemon is installed.
+    pub fn from_env_with(
+        overrides: impl IntoIterator<Item = (&'static str, Option<OsString>)>,
+        daemon: Option<&Path>,
+    ) -> Result<Self, ConfigError> {
+        let mut variables: BTreeMap<OsString, OsString> = std::env::vars_os().collect();
+        for (name, value) in overrides {
+            match value {
+                Some(value) => variables.insert(name.into(), value),
+                None => variables.remove(OsStr::new(name)),
+            };
+        }
+        let named = variables.get(OsStr::new("AXON_DAEMON_PATH")).map(PathBuf::from);
+        let beside = named.or_else(|| match daemon {
+            Some(daemon) => Some(daemon.to_path_buf()),
+            None => std::env::current_exe().ok(),
+        });
+        let file = beside.map(|daemon| daemon.with_file_name("axon.toml"));
+        Self::resolve(variables, file.as_deref(), &OsFiles)
     }
 
     /// The configuration that an environment makes, with `default_file` where it names no file.

@@ -17,7 +17,7 @@ use std::{
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use crate::{
-    config::Config,
+    config::{Config, DiscoveryRange},
     session::{DaemonCommand, SessionError, address::private_directory},
 };
 
@@ -54,6 +54,8 @@ pub(crate) fn spawn(
         .arg(SPAWNED)
         .env_clear()
         .envs(std::env::vars_os().filter(|(name, _)| inherited(name)))
+        .env_remove("ROS_LOCALHOST_ONLY")
+        .envs(chosen(config))
         .stdin(Stdio::null())
         .stdout(writer)
         .stderr(Stdio::null())
@@ -125,6 +127,20 @@ fn inherited(name: &OsString) -> bool {
     name.to_str().is_some_and(|name| {
         NAMES.contains(&name) || PREFIXES.iter().any(|prefix| name.starts_with(prefix))
     })
+}
+
+/// What a session may have been opened with in place of the environment's.
+fn chosen(config: &Config) -> [(&'static str, String); 3] {
+    let range = match config.range {
+        DiscoveryRange::Off => "OFF",
+        DiscoveryRange::Localhost => "LOCALHOST",
+        DiscoveryRange::Subnet => "SUBNET",
+    };
+    [
+        ("ROS_DOMAIN_ID", config.domain.to_string()),
+        ("ROS_AUTOMATIC_DISCOVERY_RANGE", range.to_owned()),
+        ("ROS_STATIC_PEERS", config.static_peers.join(";")),
+    ]
 }
 
 fn read_report(pipe: OwnedFd, cancelled: &dyn Fn() -> bool) -> String {

@@ -106,6 +106,7 @@ mod tests {
             sequence,
             source_timestamp: 0,
             received_timestamp: 0,
+            reception: sequence,
         };
         Sample { info, client: None, payload: vec![0; size], since: std::time::Instant::now() }
     }

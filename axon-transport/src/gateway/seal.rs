@@ -217,6 +217,7 @@ mod tests {
             sequence: 7,
             source_timestamp: 0,
             received_timestamp: 0,
+            reception: 1,
         };
         let topic = header(&sample(info(client), Vec::new()));
         let call = |of| header(&Sample { client: Some(client), ..sample(info(of), Vec::new()) });

@@ -50,7 +50,7 @@ impl Session {
             state.next_entity += 1;
             state.next_entity
         };
-        let EndpointSpec { topic, type_name, type_hash, qos, node, namespace } = spec;
+        let EndpointSpec { topic, type_name, type_hash, qos, node, namespace, .. } = spec;
         Ok(Endpoint {
             gid: Gid::new(self.shared().id, number),
             kind,
@@ -83,7 +83,11 @@ impl Session {
         role: EndpointRole,
         stands_for: Vec<Gid>,
     ) -> Subscription {
-        let inner = Arc::new(SubscriptionInner::new(endpoint, role, stands_for));
+        self.add_reader(SubscriptionInner::new(endpoint, role, stands_for))
+    }
+
+    pub(super) fn add_reader(&self, inner: SubscriptionInner) -> Subscription {
+        let inner = Arc::new(inner);
         self.announce(None, Some(&inner));
         Subscription { inner, session: self.clone() }
     }
@@ -202,10 +206,12 @@ impl Session {
             if state.daemon.is_none() && shared.config.daemon != DaemonPolicy::Off {
                 return;
             }
-            for gid in state.topics.get(&own.topic).into_iter().flatten() {
+            let ignores = state.subscriptions.get(&own.gid).is_some_and(|s| s.ignores_local);
+            let others = state.topics.get(&own.topic).filter(|_| !ignores);
+            for gid in others.into_iter().flatten() {
                 publishers.extend(state.publishers.get(gid).filter(|p| goes(&p.endpoint)).cloned());
-                subscriptions
-                    .extend(state.subscriptions.get(gid).filter(|s| goes(&s.endpoint)).cloned());
+                let hears = |s: &&Arc<SubscriptionInner>| goes(&s.endpoint) && !s.ignores_local;
+                subscriptions.extend(state.subscriptions.get(gid).filter(hears).cloned());
             }
             state.graph.clone()
         };

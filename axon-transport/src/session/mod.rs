@@ -46,6 +46,7 @@ pub use guard::GuardCondition;
 pub use message::SessionRole;
 pub use node::Node;
 pub use options::{DaemonCommand, EndpointSpec, SessionOptions};
+pub(crate) use publisher::OwnedLoan;
 pub use publisher::{Loan, Publisher};
 pub use service::{Client, Server};
 pub use state::SessionEvent;
@@ -59,6 +60,7 @@ use self::{
     local::House,
     message::{EndpointRole, Message},
     state::{Outgoing, StatusAnswer},
+    subscription::SubscriptionInner,
 };
 use crate::{
     config::{Config, DaemonPolicy},
@@ -210,6 +212,16 @@ impl Session {
         self.shared().id
     }
 
+    /// The domain that it is in.
+    pub fn domain(&self) -> u32 {
+        self.shared().config.domain
+    }
+
+    /// What it does about its daemon.
+    pub fn daemon_policy(&self) -> DaemonPolicy {
+        self.shared().config.daemon
+    }
+
     /// The daemon it is connected to; `None` while there is none, and in a forked child.
     pub fn daemon(&self) -> Option<DaemonId> {
         if self.is_forked() { None } else { self.shared().state().daemon }
@@ -234,8 +246,11 @@ impl Session {
     /// # Errors
     /// When the specification is out of bounds.
     pub fn create_subscription(&self, spec: EndpointSpec) -> Result<Subscription, SessionError> {
+        let ignores_local = spec.ignore_local;
         let endpoint = self.endpoint(spec, EndpointKind::Subscription)?;
-        let subscription = self.add_subscription(endpoint, EndpointRole::Application, Vec::new());
+        let mut inner = SubscriptionInner::new(endpoint, EndpointRole::Application, Vec::new());
+        inner.ignores_local = ignores_local;
+        let subscription = self.add_reader(inner);
         let inner = &subscription.inner;
         self.await_pairs(&inner.endpoint, |other| inner.events.is_matched(other));
         Ok(subscription)

@@ -78,6 +78,8 @@ pub struct EndpointSpec {
     pub node: String,
     /// That node's namespace.
     pub namespace: String,
+    /// A subscription: whether it receives nothing from publishers of its own session.
+    pub ignore_local: bool,
 }
 
 impl EndpointSpec {
@@ -90,6 +92,7 @@ impl EndpointSpec {
             qos,
             node: String::new(),
             namespace: String::new(),
+            ignore_local: false,
         }
     }
 }

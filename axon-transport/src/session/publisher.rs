@@ -125,6 +125,13 @@ impl Publisher {
     }
 }
 
+impl Publisher {
+    /// As [`loan`](Self::loan), of `len` bytes at most, for who cannot borrow the publisher.
+    pub(crate) fn loan_owned(&self, len: usize) -> Result<OwnedLoan, PublishError> {
+        Ok(OwnedLoan { loan: self.writer.loan_owned(len)?, publisher: self.inner.clone() })
+    }
+}
+
 impl fmt::Debug for Publisher {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_tuple("Publisher").field(self.endpoint()).finish()
@@ -181,6 +188,30 @@ impl io::Write for Loan<'_> {
 
     fn flush(&mut self) -> io::Result<()> {
         Ok(())
+    }
+}
+
+/// A sample that is being written, of which nothing but its start may be published.
+pub(crate) struct OwnedLoan {
+    loan: crate::shm::Loan<'static>,
+    publisher: Arc<PublisherInner>,
+}
+
+impl OwnedLoan {
+    /// Where it is written, aligned to 8. It stays there.
+    pub(crate) fn as_mut_ptr(&mut self) -> *mut u8 {
+        self.loan.as_mut_ptr()
+    }
+
+    /// Publishes the first `len` bytes, with a time of the caller's or the current one, and returns
+    /// the sequence number.
+    pub(crate) fn publish(
+        self,
+        len: usize,
+        source_timestamp: Option<i64>,
+    ) -> Result<u64, PublishError> {
+        let time = source_timestamp.unwrap_or_else(clock::wall);
+        self.publisher.published(self.loan.publish_front(len, time))
     }
 }
 

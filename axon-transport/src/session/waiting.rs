@@ -34,7 +34,8 @@ pub(super) enum Part {
     Event(Source, EventKind),
 }
 
-struct Watch(Vec<Part>);
+/// What is waited for, without keeping it from ending.
+pub(crate) struct Watch(Vec<Part>);
 
 impl Session {
     /// Waits until at least one of `waitables` is ready, for at most `timeout`: for ever where it is
@@ -73,11 +74,24 @@ impl Session {
         waitables: &[Waitable<'_>],
         timeout: Option<Duration>,
     ) -> Result<Vec<usize>, SessionError> {
+        self.wait_watch(&self.watch(waitables)?, timeout)
+    }
+
+    /// What [`wait_watch`](Self::wait_watch) waits for.
+    pub(crate) fn watch(&self, waitables: &[Waitable<'_>]) -> Result<Arc<Watch>, SessionError> {
+        let parts: Option<Vec<Part>> = waitables.iter().map(|one| self.part(one)).collect();
+        Ok(Arc::new(Watch(parts.ok_or(SessionError::OtherSession)?)))
+    }
+
+    /// As [`wait_for`](Self::wait_for).
+    pub(crate) fn wait_watch(
+        &self,
+        watch: &Arc<Watch>,
+        timeout: Option<Duration>,
+    ) -> Result<Vec<usize>, SessionError> {
         if self.is_forked() {
             return Err(ShmError::Forked.into());
         }
-        let parts: Option<Vec<Part>> = waitables.iter().map(|one| self.part(one)).collect();
-        let watch = Arc::new(Watch(parts.ok_or(SessionError::OtherSession)?));
         let deadline = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
         loop {
             let ready = watch.collect();

@@ -23,14 +23,14 @@ const PAGE: usize = 4096;
 
 /// Names the process that took it; a forked child no longer matches it.
 #[derive(Clone, Copy)]
-pub(super) struct ForkToken {
+pub(crate) struct ForkToken {
     page: &'static AtomicU64,
     value: u64,
 }
 
 impl ForkToken {
     /// The token of the calling process.
-    pub(super) fn current() -> Result<Self, ShmError> {
+    pub(crate) fn current() -> Result<Self, ShmError> {
         // Inherited over a fork, so that a child never reuses a value of its ancestors.
         static LAST: AtomicU64 = AtomicU64::new(0);
         static WIPED: OnceLock<Result<&'static AtomicU64, Errno>> = OnceLock::new();
@@ -47,13 +47,13 @@ impl ForkToken {
 
     /// Another in each process of a line of forks, and never 0.
     #[inline]
-    pub(super) fn value(&self) -> u64 {
+    pub(crate) fn value(&self) -> u64 {
         self.value
     }
 
     /// Whether the calling process is a fork of the one that took the token.
     #[inline]
-    pub(super) fn is_forked(&self) -> bool {
+    pub(crate) fn is_forked(&self) -> bool {
         self.page.load(Ordering::Relaxed) != self.value
     }
 }

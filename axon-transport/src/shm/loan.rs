@@ -11,6 +11,7 @@ use std::{
 
 use super::{
     Location, Meta, PublishError, Published, Writer,
+    layout::COPIED,
     segments::OwnSegment,
     writer::{Numbering, PATIENCE, Patience, Payload},
 };
@@ -44,10 +45,27 @@ use super::{
 /// }
 /// ```
 pub struct Loan<'a> {
-    writer: &'a Writer,
+    writer: Lender<'a>,
     len: usize,
     written: usize,
     memory: Memory,
+}
+
+/// Whose memory it is.
+pub(super) enum Lender<'a> {
+    Borrowed(&'a Writer),
+    Shared(Arc<Writer>),
+}
+
+impl Deref for Lender<'_> {
+    type Target = Writer;
+
+    fn deref(&self) -> &Writer {
+        match self {
+            Self::Borrowed(writer) => writer,
+            Self::Shared(writer) => writer,
+        }
+    }
 }
 
 enum Memory {
@@ -70,12 +88,12 @@ impl Place {
 }
 
 impl<'a> Loan<'a> {
-    pub(super) fn copied(writer: &'a Writer, len: usize) -> Self {
+    pub(super) fn copied(writer: Lender<'a>, len: usize) -> Self {
         Self { writer, len, written: 0, memory: Memory::Own(vec![0; len]) }
     }
 
     /// `len` bytes there, which have been lent.
-    pub(super) fn placed(writer: &'a Writer, len: usize, place: Place) -> Self {
+    pub(super) fn placed(writer: Lender<'a>, len: usize, place: Place) -> Self {
         Self { writer, len, written: 0, memory: Memory::Shared(place) }
     }
 
@@ -105,27 +123,51 @@ impl<'a> Loan<'a> {
         self.publish_next(now())
     }
 
+    /// As [`publish_next`](Self::publish_next), of its first `len` bytes.
+    pub(crate) fn publish_front(
+        self,
+        len: usize,
+        source_timestamp: i64,
+    ) -> Result<u64, PublishError> {
+        let (most, written) = (self.len as u64, self.written as u64);
+        if self.written < len {
+            return Err(PublishError::Incomplete { len: most, written });
+        }
+        let numbering = Numbering::Next(source_timestamp);
+        self.commit(len, numbering, Patience::new(PATIENCE)).map(|(sequence, _)| sequence)
+    }
+
     fn publish_as(self, numbering: Numbering) -> Result<(u64, Published), PublishError> {
-        let (len, written) = (self.len as u64, self.written as u64);
-        if written < len {
+        let len = self.len;
+        if self.written < len {
+            let (len, written) = (len as u64, self.written as u64);
             return Err(PublishError::Incomplete { len, written });
         }
-        self.commit(numbering, Patience::new(PATIENCE))
+        self.commit(len, numbering, Patience::new(PATIENCE))
     }
 
     pub(super) fn commit(
         mut self,
+        len: usize,
         numbering: Numbering,
         patience: Patience,
     ) -> Result<(u64, Published), PublishError> {
+        if self.writer.is_forked() {
+            return Err(PublishError::Forked);
+        }
+        let lent = self.len;
         let payload = match &self.memory {
-            Memory::Own(bytes) => Payload::Bytes(bytes),
-            Memory::Shared(place) => Payload::Written { at: place.location(), len: self.len },
+            Memory::Shared(place) if len as u64 > COPIED => {
+                Payload::Written { at: place.location(), len, lent }
+            }
+            // What has become short is copied from where it was written.
+            Memory::Own(_) | Memory::Shared(_) => Payload::Bytes(&self[..len]),
             Memory::Published => unreachable!("publishing takes the loan"),
         };
+        let taken = matches!(payload, Payload::Written { .. });
         let (sequence, published) = self.writer.commit(numbering, payload, patience)?;
         // What nobody reads has not become a sample, and its memory is given back.
-        if published.position.is_some() {
+        if taken && published.position.is_some() {
             self.memory = Memory::Published;
         }
         Ok((sequence, published))

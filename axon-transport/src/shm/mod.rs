@@ -113,6 +113,7 @@ mod tests;
 pub use connect::ConnectError;
 pub use context::Context;
 pub use error::{Keeper, PublishError, ShmError, TakeError};
+pub(crate) use fork::ForkToken;
 pub use lane::Lane;
 pub use layout::{Location, SegmentKind};
 pub use loan::Loan;

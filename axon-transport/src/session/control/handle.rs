@@ -127,6 +127,9 @@ impl Control {
         else {
             return;
         };
+        if subscription.ignores_local && pair.writer.is_of(&self.shared.id) {
+            return;
+        }
         let segment = self.shared.segment.clone();
         let lane = subscription.lock().lane_for(pair.writer, || segment.allocate_lane());
         self.ask_with(&subscription, pair.writer, lane);

@@ -29,6 +29,8 @@ pub(in crate::session) struct SubscriptionInner {
     /// What its readers request: what the endpoint does, but for a client's or a server's, which
     /// lose nothing.
     pub(in crate::session) qos: Qos,
+    /// Whether it is never matched with publishers of its own session.
+    pub(in crate::session) ignores_local: bool,
     /// Whether a writer's numbers rise: the responses of a server come in whatever order it likes.
     pub(super) rising: bool,
     pub(in crate::session) role: EndpointRole,
@@ -52,7 +54,18 @@ impl SubscriptionInner {
         let service = matches!(endpoint.kind, EndpointKind::Server | EndpointKind::Client);
         let qos = if service { Qos::keep_all() } else { endpoint.qos };
         let rising = endpoint.kind != EndpointKind::Client;
-        Self { endpoint, qos, rising, role, events, stands_for, slots, arrived, listens }
+        Self {
+            endpoint,
+            qos,
+            ignores_local: false,
+            rising,
+            role,
+            events,
+            stands_for,
+            slots,
+            arrived,
+            listens,
+        }
     }
 
     pub(in crate::session) fn has_data(&self) -> bool {

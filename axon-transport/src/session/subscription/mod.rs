@@ -42,6 +42,8 @@ pub struct MessageInfo {
     pub source_timestamp: i64,
     /// When it was taken, by this host's clock.
     pub received_timestamp: i64,
+    /// Its number among those that the endpoint has taken, from 1.
+    pub reception: u64,
 }
 
 impl Subscription {

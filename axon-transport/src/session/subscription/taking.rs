@@ -88,6 +88,7 @@ impl Slots {
                 sequence: meta.sequence,
                 source_timestamp: meta.source_timestamp,
                 received_timestamp,
+                reception: self.received,
             };
             return Some((info, taken));
         }

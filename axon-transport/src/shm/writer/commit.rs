@@ -13,7 +13,7 @@ use crate::{
         area::Area,
         history::Extent,
         layout::{self, COPIED, INLINE},
-        loan::Place as LoanPlace,
+        loan::{Lender, Place as LoanPlace},
         ring::{self, Place, Record},
         room::Refusal,
         sync::{Ordering, Word},
@@ -61,9 +61,9 @@ impl Writer {
             Err(passed) => return Ok((passed.sequence, Published { position: None })),
         };
         // Copied outside the lock: nobody else knows of the place yet.
-        let mut loan = Loan::placed(self, payload.len(), place);
+        let mut loan = Loan::placed(Lender::Borrowed(self), payload.len(), place);
         loan.copy_from_slice(payload);
-        loan.commit(numbering, patience)
+        loan.commit(payload.len(), numbering, patience)
     }
 
     /// Publishes what has been, or is here, copied in. Memory that was lent and that no sample
@@ -89,8 +89,8 @@ impl Writer {
                     let block = self.copy_in(state, bytes)?;
                     (Extent::Block(block), Place::Block(block.at))
                 }
-                Payload::Written { at, len } => {
-                    let len = Area::rounded(len as u64);
+                Payload::Written { at, lent, .. } => {
+                    let len = Area::rounded(lent as u64);
                     (Extent::Slot { at, len }, Place::Slot(at))
                 }
             };

@@ -15,6 +15,7 @@ use super::{
     heap::{Need, Object},
     history::History,
     layout::{self, Array, COPIED},
+    loan::Lender,
     orphans::Orphan,
     pi_mutex::{PiGuard, PiMutex},
     ring,
@@ -142,8 +143,8 @@ pub(super) enum Numbering {
 pub(super) enum Payload<'a> {
     /// At most [`COPIED`] bytes, copied in under the lock.
     Bytes(&'a [u8]),
-    /// Written to memory that was lent: where, and the sample's length.
-    Written { at: Location, len: usize },
+    /// Written to memory that was lent: where, the sample's length, and how much was lent.
+    Written { at: Location, len: usize, lent: usize },
 }
 
 impl Writer {
@@ -319,13 +320,22 @@ impl Writer {
     /// # Errors
     /// As [`publish`](Self::publish).
     pub fn loan(&self, len: usize) -> Result<Loan<'_>, PublishError> {
+        self.lend_to(Lender::Borrowed(self), len)
+    }
+
+    /// As [`loan`](Self::loan), for who keeps the writer with it.
+    pub(crate) fn loan_owned(self: &Arc<Self>, len: usize) -> Result<Loan<'static>, PublishError> {
+        self.lend_to(Lender::Shared(Arc::clone(self)), len)
+    }
+
+    fn lend_to<'a>(&self, lender: Lender<'a>, len: usize) -> Result<Loan<'a>, PublishError> {
         let bytes = self.check(len)?;
         if len as u64 <= COPIED {
-            return Ok(Loan::copied(self, len));
+            return Ok(Loan::copied(lender, len));
         }
         let place =
             self.patiently(&mut Patience::new(PATIENCE), |state| self.lend(state, bytes))?;
-        Ok(Loan::placed(self, len, place))
+        Ok(Loan::placed(lender, len, place))
     }
 
     pub(super) fn give_back(&self, at: Location, len: usize) {

@@ -1,0 +1,1564 @@
+/* The C interface of AXON: sessions, in which publishers, subscriptions, services and clients meet those of
+ * other processes and hosts.
+ *
+ * The rules, for a function that says nothing else of itself:
+ *
+ * - It may be called from any thread at any time, also at the same time with the same handle.
+ * - It does not block, but for locks that are held for microseconds.
+ * - It returns AXON_RET_OK, or why it did not do what it was asked; then it did nothing, wrote to none of
+ *   the places that it was given, and axon_session_last_error says in words what is wrong.
+ * - It keeps no pointer that it was given. Strings are UTF-8 and end with a 0 byte.
+ * - What it calls back must neither throw nor longjmp out of the call.
+ *
+ * Handles are numbers, never pointers, and may be copied freely: one that is 0, stale, destroyed twice, of
+ * another kind or made up gives AXON_RET_INVALID_HANDLE, one that a forked child inherited
+ * AXON_RET_FORKED; whichever the function, both are among what it returns, and so are
+ * AXON_RET_INVALID_ARGUMENT for null where there must be something, AXON_RET_BAD_ALLOC where a new
+ * handle finds no room, and AXON_RET_PANIC. An object may be destroyed by one thread while others use it:
+ * calls that are under way end as they would have. A handle that is never destroyed keeps what it names.
+ *
+ * Made by cbindgen from src/ffi: edit it there. */
+
+
+#ifndef AXON_H
+#define AXON_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+/**
+ * The most bytes that the hash of a type may have.
+ */
+#define AXON_TYPE_HASH_SIZE 64
+
+/**
+ * Of a subscription: a publisher became alive or ceased to be.
+ */
+#define AXON_EVENT_LIVELINESS_CHANGED 0
+
+/**
+ * Of a subscription: no sample came for longer than its deadline.
+ */
+#define AXON_EVENT_REQUESTED_DEADLINE_MISSED 1
+
+/**
+ * Of a subscription: a publisher offers less than it requests.
+ */
+#define AXON_EVENT_REQUESTED_QOS_INCOMPATIBLE 2
+
+/**
+ * Of a subscription: samples were lost before they could be taken.
+ */
+#define AXON_EVENT_MESSAGE_LOST 3
+
+/**
+ * Of a subscription: a publisher of the topic has another type.
+ */
+#define AXON_EVENT_SUBSCRIPTION_INCOMPATIBLE_TYPE 4
+
+/**
+ * Of a subscription: a publisher was matched or unmatched.
+ */
+#define AXON_EVENT_SUBSCRIPTION_MATCHED 5
+
+/**
+ * Of a publisher: it did not assert its liveliness within its lease.
+ */
+#define AXON_EVENT_LIVELINESS_LOST 6
+
+/**
+ * Of a publisher: it did not publish within its deadline.
+ */
+#define AXON_EVENT_OFFERED_DEADLINE_MISSED 7
+
+/**
+ * Of a publisher: a subscription requests more than it offers.
+ */
+#define AXON_EVENT_OFFERED_QOS_INCOMPATIBLE 8
+
+/**
+ * Of a publisher: a subscription of the topic has another type.
+ */
+#define AXON_EVENT_PUBLISHER_INCOMPATIBLE_TYPE 9
+
+/**
+ * Of a publisher: a subscription was matched or unmatched.
+ */
+#define AXON_EVENT_PUBLICATION_MATCHED 10
+
+/**
+ * The version of this interface. It rises whenever a program that was compiled against the former
+ * header would not work any more.
+ */
+#define AXON_SESSION_ABI 1
+
+/**
+ * The time at which the call is made, as a sample's source timestamp.
+ */
+#define AXON_TIME_NOW INT64_MIN
+
+/**
+ * Left to AXON, in any policy: RELIABLE, VOLATILE, KEEP_LAST, AUTOMATIC.
+ */
+#define AXON_CHOICE_DEFAULT 0
+
+/**
+ * In reliability, durability and liveliness: what matches most of the endpoints that the graph
+ * holds when the endpoint is created, at the highest level that does.
+ */
+#define AXON_CHOICE_BEST_AVAILABLE 255
+
+/**
+ * Samples arrive, within the bounds of the history.
+ */
+#define AXON_RELIABILITY_RELIABLE 1
+
+/**
+ * Samples may be lost.
+ */
+#define AXON_RELIABILITY_BEST_EFFORT 2
+
+/**
+ * A subscription that joins late receives the publisher's history first.
+ */
+#define AXON_DURABILITY_TRANSIENT_LOCAL 1
+
+/**
+ * It receives samples from then on.
+ */
+#define AXON_DURABILITY_VOLATILE 2
+
+/**
+ * The newest `depth` samples are kept.
+ */
+#define AXON_HISTORY_KEEP_LAST 1
+
+/**
+ * All are kept, up to the memory budget; then the publisher waits.
+ */
+#define AXON_HISTORY_KEEP_ALL 2
+
+/**
+ * The session asserts that a publisher is alive.
+ */
+#define AXON_LIVELINESS_AUTOMATIC 1
+
+/**
+ * The publisher does, by publishing or asserting.
+ */
+#define AXON_LIVELINESS_MANUAL_BY_TOPIC 3
+
+/**
+ * A time that is left to AXON, which takes it to be infinite.
+ */
+#define AXON_DURATION_DEFAULT 0
+
+/**
+ * As AXON_CHOICE_BEST_AVAILABLE, for a deadline or a lease.
+ */
+#define AXON_DURATION_BEST_AVAILABLE 18446744073709551614ull
+
+/**
+ * No end.
+ */
+#define AXON_DURATION_INFINITE 18446744073709551615ull
+
+/**
+ * The two profiles go together.
+ */
+#define AXON_QOS_COMPATIBLE 0
+
+/**
+ * That hangs on policies that are left open, as default or as best available.
+ */
+#define AXON_QOS_UNKNOWN 1
+
+/**
+ * They do not.
+ */
+#define AXON_QOS_INCOMPATIBLE 2
+
+/**
+ * No policy.
+ */
+#define AXON_POLICY_NONE 0
+
+/**
+ * Which policy keeps two endpoints apart: reliability.
+ */
+#define AXON_POLICY_RELIABILITY 1
+
+/**
+ * Durability.
+ */
+#define AXON_POLICY_DURABILITY 2
+
+/**
+ * Deadline.
+ */
+#define AXON_POLICY_DEADLINE 3
+
+/**
+ * Liveliness.
+ */
+#define AXON_POLICY_LIVELINESS 4
+
+/**
+ * The liveliness lease.
+ */
+#define AXON_POLICY_LIVELINESS_LEASE 5
+
+/**
+ * The domain is what `ROS_DOMAIN_ID` says, else 0.
+ */
+#define AXON_DOMAIN_ENVIRONMENT 4294967295
+
+/**
+ * Discovery reaches as far as `ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_STATIC_PEERS` and
+ * `ROS_LOCALHOST_ONLY` say.
+ */
+#define AXON_DISCOVERY_ENVIRONMENT 0
+
+/**
+ * Nowhere, not even to peers that are listed.
+ */
+#define AXON_DISCOVERY_OFF 1
+
+/**
+ * This host, and the peers that are listed.
+ */
+#define AXON_DISCOVERY_LOCALHOST 2
+
+/**
+ * What multicast reaches, and the peers that are listed.
+ */
+#define AXON_DISCOVERY_SUBNET 3
+
+/**
+ * What multicast reaches; the list is passed over.
+ */
+#define AXON_DISCOVERY_SYSTEM_DEFAULT 4
+
+/**
+ * As a timeout: for ever.
+ */
+#define AXON_WAIT_FOREVER -1
+
+/**
+ * What a call returns: `AXON_RET_OK`, or why it did not do what it was asked.
+ */
+typedef int32_t axon_ret_t;
+
+/**
+ * Sends the samples of a topic.
+ */
+typedef struct axon_publisher_t {
+    /**
+     * 0 where it is none.
+     */
+    uint64_t id;
+} axon_publisher_t;
+
+/**
+ * One event of a publisher or a subscription.
+ */
+typedef struct axon_event_t {
+    /**
+     * 0 where it is none.
+     */
+    uint64_t id;
+} axon_event_t;
+
+/**
+ * Receives the samples of a topic.
+ */
+typedef struct axon_subscription_t {
+    /**
+     * 0 where it is none.
+     */
+    uint64_t id;
+} axon_subscription_t;
+
+/**
+ * What is known of an event. Changes are since the status was last taken.
+ */
+typedef struct axon_event_status_t {
+    /**
+     * AXON_EVENT_*.
+     */
+    uint32_t kind;
+    /**
+     * Of incompatible QoS: AXON_POLICY_*, one that kept the last endpoint apart.
+     */
+    uint32_t last_policy;
+    /**
+     * How often it happened in all; of `matched`, endpoints matched ever.
+     */
+    uint64_t total;
+    /**
+     * How much of that is new.
+     */
+    uint64_t total_change;
+    /**
+     * Of `matched`, endpoints matched now; of liveliness changed, publishers that are alive now.
+     */
+    uint64_t current;
+    /**
+     * By how many that changed.
+     */
+    int64_t current_change;
+    /**
+     * Of liveliness changed, publishers that are matched and not alive now.
+     */
+    uint64_t not_alive;
+    /**
+     * By how many that changed.
+     */
+    int64_t not_alive_change;
+} axon_event_status_t;
+
+/**
+ * Told how often something happened since it was told last; at least once. It may be called on the
+ * session's thread, must not block, and may call any function of this interface that does not block.
+ */
+typedef void (*axon_callback_t)(const void *user, size_t count);
+
+/**
+ * Memory that a publisher lent, to be published or abandoned.
+ */
+typedef struct axon_loan_t {
+    /**
+     * 0 where it is none.
+     */
+    uint64_t id;
+} axon_loan_t;
+
+/**
+ * A session: a process's membership of a domain. Destroyed by `axon_session_close`.
+ */
+typedef struct axon_session_t {
+    /**
+     * 0 where it is none.
+     */
+    uint64_t id;
+} axon_session_t;
+
+/**
+ * A node: a name in the graph to which endpoints belong.
+ */
+typedef struct axon_node_t {
+    /**
+     * 0 where it is none.
+     */
+    uint64_t id;
+} axon_node_t;
+
+/**
+ * A guard condition: stands from when it is triggered until a wait has seen it.
+ */
+typedef struct axon_guard_t {
+    /**
+     * 0 where it is none.
+     */
+    uint64_t id;
+} axon_guard_t;
+
+/**
+ * What an endpoint offers or requests. All zeros is the default profile: RELIABLE, VOLATILE,
+ * KEEP_LAST(10). What AXON says of an endpoint that there is holds no default and nothing best
+ * available.
+ */
+typedef struct axon_qos_t {
+    /**
+     * AXON_RELIABILITY_*, or AXON_CHOICE_*.
+     */
+    uint32_t reliability;
+    /**
+     * AXON_DURABILITY_*, or AXON_CHOICE_*.
+     */
+    uint32_t durability;
+    /**
+     * AXON_HISTORY_*, or AXON_CHOICE_DEFAULT.
+     */
+    uint32_t history;
+    /**
+     * Samples kept by KEEP_LAST; 0 is the default.
+     */
+    uint32_t depth;
+    /**
+     * AXON_LIVELINESS_*, or AXON_CHOICE_*.
+     */
+    uint32_t liveliness;
+    /**
+     * 0.
+     */
+    uint32_t reserved;
+    /**
+     * Longest time between two samples, in nanoseconds, or AXON_DURATION_*.
+     */
+    uint64_t deadline;
+    /**
+     * Age at which a sample is not delivered any more, in nanoseconds, or AXON_DURATION_*.
+     */
+    uint64_t lifespan;
+    /**
+     * Time without an assertion after which a publisher counts as not alive, in nanoseconds, or
+     * AXON_DURATION_*.
+     */
+    uint64_t lease;
+} axon_qos_t;
+
+/**
+ * What an endpoint is created with. All zeros but the two names is a usual one.
+ */
+typedef struct axon_endpoint_options_t {
+    /**
+     * The full name of the topic or service, of at most 512 bytes. AXON gives it no meaning.
+     */
+    const char *topic;
+    /**
+     * The type's name. Endpoints match on topic and type.
+     */
+    const char *type_name;
+    /**
+     * The type's hash, of at most AXON_TYPE_HASH_SIZE bytes. Where both ends know it, it must be the
+     * same.
+     */
+    const uint8_t *type_hash;
+    /**
+     * 0: it is not known.
+     */
+    size_t type_hash_size;
+    /**
+     * What it offers or requests.
+     */
+    struct axon_qos_t qos;
+    /**
+     * A subscription: not 0 to receive nothing from publishers of its own session.
+     */
+    uint8_t ignore_local;
+    /**
+     * 0.
+     */
+    uint8_t reserved[7];
+} axon_endpoint_options_t;
+
+/**
+ * Names an endpoint or a node: no other anywhere has the same.
+ */
+typedef struct axon_gid_t {
+    /**
+     * In the order in which they are shown.
+     */
+    uint8_t bytes[16];
+} axon_gid_t;
+
+/**
+ * How a session is opened. `axon_session_options_init` fills it in; what is to be otherwise is
+ * changed then. Everything that it does not say, the environment and `axon.toml` do.
+ */
+typedef struct axon_session_options_t {
+    /**
+     * The interface that the program was compiled against.
+     */
+    uint32_t abi;
+    /**
+     * 0 to 232, or AXON_DOMAIN_ENVIRONMENT.
+     */
+    uint32_t domain;
+    /**
+     * AXON_DISCOVERY_*: how far a daemon looks that this session starts.
+     */
+    uint32_t discovery;
+    /**
+     * 0.
+     */
+    uint32_t reserved;
+    /**
+     * Addresses or host names of other hosts, for any discovery but AXON_DISCOVERY_ENVIRONMENT.
+     */
+    const char *const *static_peers;
+    /**
+     * How many there are.
+     */
+    size_t static_peer_count;
+    /**
+     * Shown to people; null or empty: the program's name.
+     */
+    const char *name;
+    /**
+     * The daemon's program, where `AXON_DAEMON_PATH` names none; null: `axon_daemon` beside this
+     * program or the library. An `axon.toml` beside it is read.
+     */
+    const char *daemon_path;
+} axon_session_options_t;
+
+/**
+ * Says where a message of `len` bytes is to be put: room for as many, or null where there is none.
+ * It runs in the call that takes the message, and must not take one of the same endpoint itself.
+ */
+typedef uint8_t *(*axon_room_t)(void *user, size_t len);
+
+/**
+ * What is known of a message besides its bytes. Times are nanoseconds since the Unix epoch.
+ */
+typedef struct axon_message_info_t {
+    /**
+     * Who sent it: a publisher, a client of a request, or a server of a response.
+     */
+    struct axon_gid_t sender;
+    /**
+     * The publication's number, from 1; of a response, that of the request that it answers.
+     */
+    uint64_t publication_sequence;
+    /**
+     * Its number among the messages that this endpoint has taken, from 1.
+     */
+    uint64_t reception_sequence;
+    /**
+     * When it was sent, by the sender's clock.
+     */
+    int64_t source_timestamp;
+    /**
+     * When it was taken, by this host's clock.
+     */
+    int64_t received_timestamp;
+    /**
+     * 1 where the sender is an endpoint of the same session, else 0.
+     */
+    uint8_t own_session;
+    /**
+     * 0.
+     */
+    uint8_t reserved[7];
+} axon_message_info_t;
+
+/**
+ * A sample that was taken in place, to be given back by `axon_session_sample_release`.
+ */
+typedef struct axon_sample_t {
+    /**
+     * 0 where it is none.
+     */
+    uint64_t id;
+} axon_sample_t;
+
+/**
+ * Answers the requests of a service.
+ */
+typedef struct axon_server_t {
+    /**
+     * 0 where it is none.
+     */
+    uint64_t id;
+} axon_server_t;
+
+/**
+ * Sends requests to a service.
+ */
+typedef struct axon_client_t {
+    /**
+     * 0 where it is none.
+     */
+    uint64_t id;
+} axon_client_t;
+
+/**
+ * What to wait for: arrays of handles, each of which may be empty, and then null. A handle that is
+ * 0 is passed over.
+ */
+typedef struct axon_wait_set_t {
+    /**
+     * Ready while there is something to take.
+     */
+    struct axon_subscription_t *subscriptions;
+    /**
+     * How many they are.
+     */
+    size_t subscription_count;
+    /**
+     * Ready once it was triggered. The wait that finds it so resets it.
+     */
+    struct axon_guard_t *guards;
+    /**
+     * How many they are.
+     */
+    size_t guard_count;
+    /**
+     * Ready while there is a request to take.
+     */
+    struct axon_server_t *servers;
+    /**
+     * How many they are.
+     */
+    size_t server_count;
+    /**
+     * Ready while there is a response to take.
+     */
+    struct axon_client_t *clients;
+    /**
+     * How many they are.
+     */
+    size_t client_count;
+    /**
+     * Ready while it happened and its status was not taken since.
+     */
+    struct axon_event_t *events;
+    /**
+     * How many they are.
+     */
+    size_t event_count;
+} axon_wait_set_t;
+
+/**
+ * It worked.
+ */
+#define AXON_RET_OK 0
+
+/**
+ * It did not, for a reason that only the text tells.
+ */
+#define AXON_RET_ERROR 1
+
+/**
+ * The time was over first.
+ */
+#define AXON_RET_TIMEOUT 2
+
+/**
+ * An argument is null where it must not be, not UTF-8, or out of bounds.
+ */
+#define AXON_RET_INVALID_ARGUMENT 3
+
+/**
+ * A handle names nothing: it is 0, was destroyed, or is of another kind.
+ */
+#define AXON_RET_INVALID_HANDLE 4
+
+/**
+ * Memory, descriptors or handles are short.
+ */
+#define AXON_RET_BAD_ALLOC 5
+
+/**
+ * A setting is wrong; the text names the variable.
+ */
+#define AXON_RET_CONFIG 6
+
+/**
+ * The handle belongs to a process of which this one is a fork. A child opens a session of its own.
+ */
+#define AXON_RET_FORKED 7
+
+/**
+ * The program was compiled against another version of this header than the library's.
+ */
+#define AXON_RET_ABI 8
+
+/**
+ * There is no node of that name.
+ */
+#define AXON_RET_NO_NODE 9
+
+/**
+ * A defect of the library was caught. What the call should have done may be half done.
+ */
+#define AXON_RET_PANIC 10
+
+#ifdef __cplusplus
+extern "C" {
+#endif // __cplusplus
+
+/**
+ * What went wrong in the last call of this thread that failed: what, of which topic and node, why,
+ * and what to do. Empty where none has. The text stands until the next call that fails in this
+ * thread; it is null in a thread that is ending.
+ */
+const char *axon_session_last_error(void);
+
+/**
+ * One event of a publisher: AXON_RET_INVALID_ARGUMENT where `kind` is not one of its. It may be used
+ * after the publisher has ended, and then does not happen again.
+ *
+ * # Safety
+ * `event` points to room for a handle.
+ */
+axon_ret_t axon_session_publisher_event(struct axon_publisher_t publisher,
+                                        uint32_t kind,
+                                        struct axon_event_t *event);
+
+/**
+ * One event of a subscription, as `axon_session_publisher_event`.
+ *
+ * # Safety
+ * As there.
+ */
+axon_ret_t axon_session_subscription_event(struct axon_subscription_t subscription,
+                                           uint32_t kind,
+                                           struct axon_event_t *event);
+
+/**
+ * Gives an event's handle up. The callback that was set by it has returned, and is not called any
+ * more, when this returns.
+ */
+axon_ret_t axon_session_event_destroy(struct axon_event_t event);
+
+/**
+ * The status. Its changes are counted anew from here, and the event is not ready any more until it
+ * happens again.
+ *
+ * # Safety
+ * `status` points to room for one.
+ */
+axon_ret_t axon_session_event_take(struct axon_event_t event, struct axon_event_status_t *status);
+
+/**
+ * Has `callback` told of the event from now on, in place of the one before, which has returned and is
+ * not called any more when this returns, unless this is called from within it. Null: nobody is
+ * told. What happened since the status was last taken, and nobody was told of, it is told at once,
+ * in this call.
+ *
+ * # Safety
+ * `callback` may be called with `user` from any thread until it is replaced or the event is
+ * destroyed.
+ */
+axon_ret_t axon_session_event_set_callback(struct axon_event_t event,
+                                           axon_callback_t callback,
+                                           const void *user);
+
+/**
+ * Lends `len` bytes to be written and then published: in shared memory where they are more than
+ * 4 KiB, so that nothing is copied. They are at `data`, aligned to 8, and hold zeros or bytes of
+ * earlier samples. Fewer than `len` may be published, so that what is serialized can be given its
+ * upper bound. Blocks and fails as `axon_session_publisher_publish`.
+ *
+ * One thread at a time may write. The bytes may be used until the loan is published or abandoned;
+ * memory of a loan that is neither is lost to the publisher.
+ *
+ * # Safety
+ * `loan` and `data` point to room for a handle and a pointer.
+ */
+axon_ret_t axon_session_publisher_loan(struct axon_publisher_t publisher,
+                                       size_t len,
+                                       struct axon_loan_t *loan,
+                                       uint8_t **data);
+
+/**
+ * Publishes the first `len` bytes of a loan, as `axon_session_publisher_publish` does. The loan is
+ * over, whatever this returns, but for AXON_RET_INVALID_ARGUMENT: `len` is more than was lent.
+ *
+ * # Safety
+ * `sequence` is null or points to room for a number. Nobody uses the loan's bytes any more.
+ */
+axon_ret_t axon_session_loan_publish(struct axon_loan_t loan,
+                                     size_t len,
+                                     int64_t source_timestamp,
+                                     uint64_t *sequence);
+
+/**
+ * Gives a loan back without publishing it.
+ */
+axon_ret_t axon_session_loan_abandon(struct axon_loan_t loan);
+
+/**
+ * The version of the interface that the library has. `axon_session_options_init` compares it with
+ * the header's, so that no session is opened where they differ.
+ */
+uint32_t axon_session_abi(void);
+
+/**
+ * What went wrong in the last call of this thread that failed: what, of which topic and node, why,
+ * and what to do. Empty where none has. The text stands until the next call that fails in this
+ * thread; it is null in a thread that is ending.
+ */
+const char *axon_session_last_error(void);
+
+/**
+ * One event of a publisher: AXON_RET_INVALID_ARGUMENT where `kind` is not one of its. It may be used
+ * after the publisher has ended, and then does not happen again.
+ *
+ * # Safety
+ * `event` points to room for a handle.
+ */
+axon_ret_t axon_session_publisher_event(struct axon_publisher_t publisher,
+                                        uint32_t kind,
+                                        struct axon_event_t *event);
+
+/**
+ * One event of a subscription, as `axon_session_publisher_event`.
+ *
+ * # Safety
+ * As there.
+ */
+axon_ret_t axon_session_subscription_event(struct axon_subscription_t subscription,
+                                           uint32_t kind,
+                                           struct axon_event_t *event);
+
+/**
+ * Gives an event's handle up. The callback that was set by it has returned, and is not called any
+ * more, when this returns.
+ */
+axon_ret_t axon_session_event_destroy(struct axon_event_t event);
+
+/**
+ * The status. Its changes are counted anew from here, and the event is not ready any more until it
+ * happens again.
+ *
+ * # Safety
+ * `status` points to room for one.
+ */
+axon_ret_t axon_session_event_take(struct axon_event_t event, struct axon_event_status_t *status);
+
+/**
+ * Has `callback` told of the event from now on, in place of the one before, which has returned and is
+ * not called any more when this returns, unless this is called from within it. Null: nobody is
+ * told. What happened since the status was last taken, and nobody was told of, it is told at once,
+ * in this call.
+ *
+ * # Safety
+ * `callback` may be called with `user` from any thread until it is replaced or the event is
+ * destroyed.
+ */
+axon_ret_t axon_session_event_set_callback(struct axon_event_t event,
+                                           axon_callback_t callback,
+                                           const void *user);
+
+/**
+ * Lends `len` bytes to be written and then published: in shared memory where they are more than
+ * 4 KiB, so that nothing is copied. They are at `data`, aligned to 8, and hold zeros or bytes of
+ * earlier samples. Fewer than `len` may be published, so that what is serialized can be given its
+ * upper bound. Blocks and fails as `axon_session_publisher_publish`.
+ *
+ * One thread at a time may write. The bytes may be used until the loan is published or abandoned;
+ * memory of a loan that is neither is lost to the publisher.
+ *
+ * # Safety
+ * `loan` and `data` point to room for a handle and a pointer.
+ */
+axon_ret_t axon_session_publisher_loan(struct axon_publisher_t publisher,
+                                       size_t len,
+                                       struct axon_loan_t *loan,
+                                       uint8_t **data);
+
+/**
+ * Publishes the first `len` bytes of a loan, as `axon_session_publisher_publish` does. The loan is
+ * over, whatever this returns, but for AXON_RET_INVALID_ARGUMENT: `len` is more than was lent.
+ *
+ * # Safety
+ * `sequence` is null or points to room for a number. Nobody uses the loan's bytes any more.
+ */
+axon_ret_t axon_session_loan_publish(struct axon_loan_t loan,
+                                     size_t len,
+                                     int64_t source_timestamp,
+                                     uint64_t *sequence);
+
+/**
+ * Gives a loan back without publishing it.
+ */
+axon_ret_t axon_session_loan_abandon(struct axon_loan_t loan);
+
+/**
+ * A node, which is in the graph until it is destroyed; its endpoints do not end with it. Two nodes
+ * may have the same name. It keeps its session open.
+ *
+ * AXON_RET_INVALID_ARGUMENT: the name is empty, or a name is longer than 512 bytes.
+ *
+ * # Safety
+ * The three names are strings; `node` points to room for a handle.
+ */
+axon_ret_t axon_session_node_create(struct axon_session_t session,
+                                    const char *name,
+                                    const char *namespace_,
+                                    const char *enclave,
+                                    struct axon_node_t *node);
+
+/**
+ * Takes a node out of the graph. It may block for milliseconds, as `axon_session_close` says.
+ */
+axon_ret_t axon_session_node_destroy(struct axon_node_t node);
+
+/**
+ * The guard condition that is triggered after every change of the graph, once what one asks of the
+ * graph shows it, and when a service or a client of this session finds or loses its other end. It
+ * is a handle of its own, to be destroyed like one that was created, and lasts as long as the
+ * session.
+ *
+ * # Safety
+ * `guard` points to room for a handle.
+ */
+axon_ret_t axon_session_node_graph_guard(struct axon_node_t node, struct axon_guard_t *guard);
+
+/**
+ * A publisher of a node. When it returns, the publisher is matched with those subscriptions that the
+ * graph shows, unless they take longer than 50 ms.
+ *
+ * AXON_RET_INVALID_ARGUMENT: a name, the hash or a policy is out of bounds. AXON_RET_BAD_ALLOC: shared
+ * memory is short.
+ *
+ * # Safety
+ * `options` points to options whose pointers point to what they say; `publisher` points to room for
+ * a handle.
+ */
+axon_ret_t axon_session_publisher_create(struct axon_node_t node,
+                                         const struct axon_endpoint_options_t *options,
+                                         struct axon_publisher_t *publisher);
+
+/**
+ * Ends a publisher. Subscriptions still take what it left. What it lent can only be abandoned then.
+ */
+axon_ret_t axon_session_publisher_destroy(struct axon_publisher_t publisher);
+
+/**
+ * What the publisher is: its GID, and the profile that it has. Null where one is not wanted.
+ *
+ * # Safety
+ * `gid` and `qos` are null or point to room for one.
+ */
+axon_ret_t axon_session_publisher_describe(struct axon_publisher_t publisher,
+                                           struct axon_gid_t *gid,
+                                           struct axon_qos_t *qos);
+
+/**
+ * Publishes a sample of `len` bytes at `data`, which are copied. `source_timestamp` is in
+ * nanoseconds since the Unix epoch, or AXON_TIME_NOW. Its sequence number, from 1, is stored at
+ * `sequence`, which may be null.
+ *
+ * Where the publisher and a subscription are both RELIABLE and KEEP_ALL, it may block for 100 ms for
+ * room: AXON_RET_TIMEOUT where none came. Never else. AXON_RET_INVALID_ARGUMENT: the sample is longer
+ * than `AXON_MAX_MESSAGE_MB` allows. AXON_RET_BAD_ALLOC: memory is short. A sample that was refused
+ * has no number: nobody counts it lost.
+ *
+ * # Safety
+ * `data` points to `len` bytes, or is null and `len` 0; `sequence` is null or points to room for a
+ * number.
+ */
+axon_ret_t axon_session_publisher_publish(struct axon_publisher_t publisher,
+                                          const uint8_t *data,
+                                          size_t len,
+                                          int64_t source_timestamp,
+                                          uint64_t *sequence);
+
+/**
+ * If a sample would be read by nobody, now or later, uses up the next sequence number and stores it
+ * at `sequence`; stores 0 where somebody would. Publishing does the same where nobody reads, but
+ * whoever has to serialize first can save itself the work.
+ *
+ * # Safety
+ * `sequence` points to room for a number.
+ */
+axon_ret_t axon_session_publisher_skip_unread(struct axon_publisher_t publisher,
+                                              uint64_t *sequence);
+
+/**
+ * How many subscriptions receive from the publisher, on this host and on others.
+ *
+ * # Safety
+ * `count` points to room for a number.
+ */
+axon_ret_t axon_session_publisher_matched(struct axon_publisher_t publisher, size_t *count);
+
+/**
+ * Blocks until at least `count` subscriptions receive from the publisher, for at most `timeout`
+ * nanoseconds (negative: for ever): AXON_RET_TIMEOUT where they do not.
+ */
+axon_ret_t axon_session_publisher_wait_matched(struct axon_publisher_t publisher,
+                                               size_t count,
+                                               int64_t timeout);
+
+/**
+ * Says that the publisher is alive. Where its liveliness is MANUAL_BY_TOPIC, so does every
+ * publication; where it is AUTOMATIC, its session says so.
+ */
+axon_ret_t axon_session_publisher_assert_liveliness(struct axon_publisher_t publisher);
+
+/**
+ * Whether a publisher with the one profile serves a subscription with the other: AXON_QOS_* at
+ * `verdict`. Why not, or on what it hangs, is put into `reason` in words, cut to `reason_size`
+ * bytes with the 0 at its end; null and 0 where that is not wanted.
+ *
+ * # Safety
+ * `offered` and `requested` point to a profile each, `verdict` to room for a number, and `reason` to
+ * room for `reason_size` bytes.
+ */
+axon_ret_t axon_session_qos_check(const struct axon_qos_t *offered,
+                                  const struct axon_qos_t *requested,
+                                  uint32_t *verdict,
+                                  char *reason,
+                                  size_t reason_size);
+
+/**
+ * The name of a policy as ROS 2 spells it, for instance `RELIABILITY`; null where there is none of
+ * that number. It stands for ever.
+ */
+const char *axon_session_policy_name(uint32_t policy);
+
+/**
+ * Fills options in with what is usual. `abi` is the program's AXON_SESSION_ABI: AXON_RET_ABI where
+ * the library has another, and nothing is written then.
+ *
+ * # Safety
+ * `options` points to room for them, as the program's header declares them.
+ */
+axon_ret_t axon_session_options_init(struct axon_session_options_t *options, uint32_t abi);
+
+/**
+ * Checks the settings as `axon_session_open` does, and opens nothing.
+ *
+ * AXON_RET_CONFIG: one is wrong; the text names the variable, what was read, and what is accepted.
+ *
+ * # Safety
+ * As for `axon_session_open`.
+ */
+axon_ret_t axon_session_options_check(const struct axon_session_options_t *options);
+
+/**
+ * Opens a session, and starts a daemon where none runs and `AXON_DAEMON` lets it. A process may have
+ * any number of them.
+ *
+ * Blocks until the daemon has answered: milliseconds, or up to 20 s where one is started.
+ *
+ * AXON_RET_CONFIG: a setting is wrong, or the daemon that runs has other security settings; the text
+ * names the variable. AXON_RET_ERROR: there is no daemon and none can be started, or it does not
+ * answer. AXON_RET_BAD_ALLOC: shared memory is short.
+ *
+ * # Safety
+ * `options` points to options that `axon_session_options_init` filled in, whose pointers are null or
+ * point to what they say; `session` points to room for a handle.
+ */
+axon_ret_t axon_session_open(const struct axon_session_options_t *options,
+                             struct axon_session_t *session);
+
+/**
+ * Gives a session's handle up. The session ends when the last of its nodes, endpoints, guard
+ * conditions and events is destroyed, which then blocks for milliseconds while its thread ends.
+ */
+axon_ret_t axon_session_close(struct axon_session_t session);
+
+/**
+ * The domain that the session is in.
+ *
+ * # Safety
+ * `domain` points to room for a number.
+ */
+axon_ret_t axon_session_domain(struct axon_session_t session, uint32_t *domain);
+
+/**
+ * Whether the session reaches its daemon: 1, or 0 while there is none, as after it died, until
+ * another has taken over. Where `AXON_DAEMON` is `off` there is none to reach: 1. What is attached
+ * flows on either way.
+ *
+ * # Safety
+ * `connected` points to room for a number.
+ */
+axon_ret_t axon_session_is_connected(struct axon_session_t session, uint8_t *connected);
+
+/**
+ * A subscription of a node. When it returns, the subscription is matched with those publishers that
+ * the graph shows, unless they take longer than 50 ms. There are no content filters.
+ *
+ * Returns as `axon_session_publisher_create`.
+ *
+ * # Safety
+ * `options` points to options whose pointers point to what they say; `subscription` points to room
+ * for a handle.
+ */
+axon_ret_t axon_session_subscription_create(struct axon_node_t node,
+                                            const struct axon_endpoint_options_t *options,
+                                            struct axon_subscription_t *subscription);
+
+/**
+ * Ends a subscription. Samples that were taken in place stay until they are released. Its callback
+ * has returned, and is not called any more, when this returns.
+ */
+axon_ret_t axon_session_subscription_destroy(struct axon_subscription_t subscription);
+
+/**
+ * What the subscription is: its GID, and the profile that it has. Null where one is not wanted.
+ *
+ * # Safety
+ * `gid` and `qos` are null or point to room for one.
+ */
+axon_ret_t axon_session_subscription_describe(struct axon_subscription_t subscription,
+                                              struct axon_gid_t *gid,
+                                              struct axon_qos_t *qos);
+
+/**
+ * How many publishers the subscription receives from, on this host and on others.
+ *
+ * # Safety
+ * `count` points to room for a number.
+ */
+axon_ret_t axon_session_subscription_matched(struct axon_subscription_t subscription,
+                                             size_t *count);
+
+/**
+ * Blocks until the subscription receives from at least `count` publishers, for at most `timeout`
+ * nanoseconds (negative: for ever): AXON_RET_TIMEOUT where it does not.
+ */
+axon_ret_t axon_session_subscription_wait_matched(struct axon_subscription_t subscription,
+                                                  size_t count,
+                                                  int64_t timeout);
+
+/**
+ * Copies the oldest sample, by source timestamp among all publishers, to where `room` says, and
+ * stores what is known of it at `info`, which may be null. `taken` is 0 where there was none, and
+ * then `room` is not called.
+ *
+ * AXON_RET_BAD_ALLOC: `room` gave none; the sample is gone.
+ *
+ * # Safety
+ * `room` gives null, or room for as many bytes as it is asked for; `info` is null or points to room
+ * for one; `taken` points to room for a number.
+ */
+axon_ret_t axon_session_subscription_take(struct axon_subscription_t subscription,
+                                          axon_room_t room,
+                                          void *user,
+                                          struct axon_message_info_t *info,
+                                          uint8_t *taken);
+
+/**
+ * Takes the oldest sample, by source timestamp among all publishers, in place: `len` bytes at `data`,
+ * aligned to 8, which stand until `axon_session_sample_release`. One of more than 4 KiB is in the
+ * publisher's memory, of which a subscription can keep five for each publisher; a sixth is copied.
+ * Where there is none the handle is 0, and nothing else is stored.
+ *
+ * Nobody may write to the bytes. A publisher in another process that does not keep to the protocol
+ * could change them meanwhile: whoever parses them reads each once, and checks what it read.
+ * `AXON_SHM_COPY=1` has all of them copied.
+ *
+ * # Safety
+ * `sample`, `data` and `len` point to room for one each; `info` is null or does.
+ */
+axon_ret_t axon_session_subscription_take_sample(struct axon_subscription_t subscription,
+                                                 struct axon_sample_t *sample,
+                                                 const uint8_t **data,
+                                                 size_t *len,
+                                                 struct axon_message_info_t *info);
+
+/**
+ * Gives a sample that was taken in place back: of a subscription, a server or a client. It may be
+ * released after these have ended.
+ */
+axon_ret_t axon_session_sample_release(struct axon_sample_t sample);
+
+/**
+ * Samples of the subscription that were lost: overwritten before they were taken, or lost on their
+ * way from another host.
+ *
+ * # Safety
+ * `lost` points to room for a number.
+ */
+axon_ret_t axon_session_subscription_lost(struct axon_subscription_t subscription, uint64_t *lost);
+
+/**
+ * Has `callback` told of new samples from now on, in place of the one before, which has returned and
+ * is not called any more when this returns, unless this is called from within it. Null: nobody is
+ * told. What is there to be taken it is told at once, in this call; the rest on the session's
+ * thread.
+ *
+ * AXON_RET_ERROR: an event loop of the program's listens already.
+ *
+ * # Safety
+ * `callback` may be called with `user` from any thread until it is replaced or the subscription is
+ * destroyed.
+ */
+axon_ret_t axon_session_subscription_set_callback(struct axon_subscription_t subscription,
+                                                  axon_callback_t callback,
+                                                  const void *user);
+
+/**
+ * A guard condition of a session, which keeps the session open.
+ *
+ * # Safety
+ * `guard` points to room for a handle.
+ */
+axon_ret_t axon_session_guard_create(struct axon_session_t session, struct axon_guard_t *guard);
+
+/**
+ * Gives a guard condition's handle up. A wait that waits for it goes on without.
+ */
+axon_ret_t axon_session_guard_destroy(struct axon_guard_t guard);
+
+/**
+ * Triggers a guard condition. Async-signal-safe: it takes no lock and no memory, and a signal handler
+ * may call it at any time. It leaves errno and the text of the last error alone.
+ *
+ * AXON_RET_INVALID_HANDLE: it names none, or is being destroyed.
+ */
+axon_ret_t axon_session_guard_trigger(struct axon_guard_t guard);
+
+/**
+ * Blocks until at least one of what is in `set` is ready, for at most `timeout` nanoseconds: 0 not at
+ * all, AXON_WAIT_FOREVER (any negative number) without end, also where the set is empty. Then sets
+ * all handles in the arrays to 0 that are not ready.
+ *
+ * AXON_RET_TIMEOUT: none was ready in time; all handles are 0. Every other failure leaves the arrays
+ * as they were: AXON_RET_INVALID_HANDLE where one names nothing, AXON_RET_INVALID_ARGUMENT where one is
+ * of another session.
+ *
+ * Any number of threads may wait at once, each with arrays of its own. What is destroyed meanwhile is
+ * out of the graph at once; the wait goes on.
+ *
+ * # Safety
+ * `set` points to a set whose arrays hold as many handles as it says, which nobody else uses during
+ * the call.
+ */
+axon_ret_t axon_session_wait(struct axon_session_t session,
+                             const struct axon_wait_set_t *set,
+                             int64_t timeout);
+
+/**
+ * A node, which is in the graph until it is destroyed; its endpoints do not end with it. Two nodes
+ * may have the same name. It keeps its session open.
+ *
+ * AXON_RET_INVALID_ARGUMENT: the name is empty, or a name is longer than 512 bytes.
+ *
+ * # Safety
+ * The three names are strings; `node` points to room for a handle.
+ */
+axon_ret_t axon_session_node_create(struct axon_session_t session,
+                                    const char *name,
+                                    const char *namespace_,
+                                    const char *enclave,
+                                    struct axon_node_t *node);
+
+/**
+ * Takes a node out of the graph. It may block for milliseconds, as `axon_session_close` says.
+ */
+axon_ret_t axon_session_node_destroy(struct axon_node_t node);
+
+/**
+ * The guard condition that is triggered after every change of the graph, once what one asks of the
+ * graph shows it, and when a service or a client of this session finds or loses its other end. It
+ * is a handle of its own, to be destroyed like one that was created, and lasts as long as the
+ * session.
+ *
+ * # Safety
+ * `guard` points to room for a handle.
+ */
+axon_ret_t axon_session_node_graph_guard(struct axon_node_t node, struct axon_guard_t *guard);
+
+/**
+ * A publisher of a node. When it returns, the publisher is matched with those subscriptions that the
+ * graph shows, unless they take longer than 50 ms.
+ *
+ * AXON_RET_INVALID_ARGUMENT: a name, the hash or a policy is out of bounds. AXON_RET_BAD_ALLOC: shared
+ * memory is short.
+ *
+ * # Safety
+ * `options` points to options whose pointers point to what they say; `publisher` points to room for
+ * a handle.
+ */
+axon_ret_t axon_session_publisher_create(struct axon_node_t node,
+                                         const struct axon_endpoint_options_t *options,
+                                         struct axon_publisher_t *publisher);
+
+/**
+ * Ends a publisher. Subscriptions still take what it left. What it lent can only be abandoned then.
+ */
+axon_ret_t axon_session_publisher_destroy(struct axon_publisher_t publisher);
+
+/**
+ * What the publisher is: its GID, and the profile that it has. Null where one is not wanted.
+ *
+ * # Safety
+ * `gid` and `qos` are null or point to room for one.
+ */
+axon_ret_t axon_session_publisher_describe(struct axon_publisher_t publisher,
+                                           struct axon_gid_t *gid,
+                                           struct axon_qos_t *qos);
+
+/**
+ * Publishes a sample of `len` bytes at `data`, which are copied. `source_timestamp` is in
+ * nanoseconds since the Unix epoch, or AXON_TIME_NOW. Its sequence number, from 1, is stored at
+ * `sequence`, which may be null.
+ *
+ * Where the publisher and a subscription are both RELIABLE and KEEP_ALL, it may block for 100 ms for
+ * room: AXON_RET_TIMEOUT where none came. Never else. AXON_RET_INVALID_ARGUMENT: the sample is longer
+ * than `AXON_MAX_MESSAGE_MB` allows. AXON_RET_BAD_ALLOC: memory is short. A sample that was refused
+ * has no number: nobody counts it lost.
+ *
+ * # Safety
+ * `data` points to `len` bytes, or is null and `len` 0; `sequence` is null or points to room for a
+ * number.
+ */
+axon_ret_t axon_session_publisher_publish(struct axon_publisher_t publisher,
+                                          const uint8_t *data,
+                                          size_t len,
+                                          int64_t source_timestamp,
+                                          uint64_t *sequence);
+
+/**
+ * If a sample would be read by nobody, now or later, uses up the next sequence number and stores it
+ * at `sequence`; stores 0 where somebody would. Publishing does the same where nobody reads, but
+ * whoever has to serialize first can save itself the work.
+ *
+ * # Safety
+ * `sequence` points to room for a number.
+ */
+axon_ret_t axon_session_publisher_skip_unread(struct axon_publisher_t publisher,
+                                              uint64_t *sequence);
+
+/**
+ * How many subscriptions receive from the publisher, on this host and on others.
+ *
+ * # Safety
+ * `count` points to room for a number.
+ */
+axon_ret_t axon_session_publisher_matched(struct axon_publisher_t publisher, size_t *count);
+
+/**
+ * Blocks until at least `count` subscriptions receive from the publisher, for at most `timeout`
+ * nanoseconds (negative: for ever): AXON_RET_TIMEOUT where they do not.
+ */
+axon_ret_t axon_session_publisher_wait_matched(struct axon_publisher_t publisher,
+                                               size_t count,
+                                               int64_t timeout);
+
+/**
+ * Says that the publisher is alive. Where its liveliness is MANUAL_BY_TOPIC, so does every
+ * publication; where it is AUTOMATIC, its session says so.
+ */
+axon_ret_t axon_session_publisher_assert_liveliness(struct axon_publisher_t publisher);
+
+/**
+ * Whether a publisher with the one profile serves a subscription with the other: AXON_QOS_* at
+ * `verdict`. Why not, or on what it hangs, is put into `reason` in words, cut to `reason_size`
+ * bytes with the 0 at its end; null and 0 where that is not wanted.
+ *
+ * # Safety
+ * `offered` and `requested` point to a profile each, `verdict` to room for a number, and `reason` to
+ * room for `reason_size` bytes.
+ */
+axon_ret_t axon_session_qos_check(const struct axon_qos_t *offered,
+                                  const struct axon_qos_t *requested,
+                                  uint32_t *verdict,
+                                  char *reason,
+                                  size_t reason_size);
+
+/**
+ * The name of a policy as ROS 2 spells it, for instance `RELIABILITY`; null where there is none of
+ * that number. It stands for ever.
+ */
+const char *axon_session_policy_name(uint32_t policy);
+
+/**
+ * Fills options in with what is usual. `abi` is the program's AXON_SESSION_ABI: AXON_RET_ABI where
+ * the library has another, and nothing is written then.
+ *
+ * # Safety
+ * `options` points to room for them, as the program's header declares them.
+ */
+axon_ret_t axon_session_options_init(struct axon_session_options_t *options, uint32_t abi);
+
+/**
+ * Checks the settings as `axon_session_open` does, and opens nothing.
+ *
+ * AXON_RET_CONFIG: one is wrong; the text names the variable, what was read, and what is accepted.
+ *
+ * # Safety
+ * As for `axon_session_open`.
+ */
+axon_ret_t axon_session_options_check(const struct axon_session_options_t *options);
+
+/**
+ * Opens a session, and starts a daemon where none runs and `AXON_DAEMON` lets it. A process may have
+ * any number of them.
+ *
+ * Blocks until the daemon has answered: milliseconds, or up to 20 s where one is started.
+ *
+ * AXON_RET_CONFIG: a setting is wrong, or the daemon that runs has other security settings; the text
+ * names the variable. AXON_RET_ERROR: there is no daemon and none can be started, or it does not
+ * answer. AXON_RET_BAD_ALLOC: shared memory is short.
+ *
+ * # Safety
+ * `options` points to options that `axon_session_options_init` filled in, whose pointers are null or
+ * point to what they say; `session` points to room for a handle.
+ */
+axon_ret_t axon_session_open(const struct axon_session_options_t *options,
+                             struct axon_session_t *session);
+
+/**
+ * Gives a session's handle up. The session ends when the last of its nodes, endpoints, guard
+ * conditions and events is destroyed, which then blocks for milliseconds while its thread ends.
+ */
+axon_ret_t axon_session_close(struct axon_session_t session);
+
+/**
+ * The domain that the session is in.
+ *
+ * # Safety
+ * `domain` points to room for a number.
+ */
+axon_ret_t axon_session_domain(struct axon_session_t session, uint32_t *domain);
+
+/**
+ * Whether the session reaches its daemon: 1, or 0 while there is none, as after it died, until
+ * another has taken over. Where `AXON_DAEMON` is `off` there is none to reach: 1. What is attached
+ * flows on either way.
+ *
+ * # Safety
+ * `connected` points to room for a number.
+ */
+axon_ret_t axon_session_is_connected(struct axon_session_t session, uint8_t *connected);
+
+/**
+ * A subscription of a node. When it returns, the subscription is matched with those publishers that
+ * the graph shows, unless they take longer than 50 ms. There are no content filters.
+ *
+ * Returns as `axon_session_publisher_create`.
+ *
+ * # Safety
+ * `options` points to options whose pointers point to what they say; `subscription` points to room
+ * for a handle.
+ */
+axon_ret_t axon_session_subscription_create(struct axon_node_t node,
+                                            const struct axon_endpoint_options_t *options,
+                                            struct axon_subscription_t *subscription);
+
+/**
+ * Ends a subscription. Samples that were taken in place stay until they are released. Its callback
+ * has returned, and is not called any more, when this returns.
+ */
+axon_ret_t axon_session_subscription_destroy(struct axon_subscription_t subscription);
+
+/**
+ * What the subscription is: its GID, and the profile that it has. Null where one is not wanted.
+ *
+ * # Safety
+ * `gid` and `qos` are null or point to room for one.
+ */
+axon_ret_t axon_session_subscription_describe(struct axon_subscription_t subscription,
+                                              struct axon_gid_t *gid,
+                                              struct axon_qos_t *qos);
+
+/**
+ * How many publishers the subscription receives from, on this host and on others.
+ *
+ * # Safety
+ * `count` points to room for a number.
+ */
+axon_ret_t axon_session_subscription_matched(struct axon_subscription_t subscription,
+                                             size_t *count);
+
+/**
+ * Blocks until the subscription receives from at least `count` publishers, for at most `timeout`
+ * nanoseconds (negative: for ever): AXON_RET_TIMEOUT where it does not.
+ */
+axon_ret_t axon_session_subscription_wait_matched(struct axon_subscription_t subscription,
+                                                  size_t count,
+                                                  int64_t timeout);
+
+/**
+ * Copies the oldest sample, by source timestamp among all publishers, to where `room` says, and
+ * stores what is known of it at `info`, which may be null. `taken` is 0 where there was none, and
+ * then `room` is not called.
+ *
+ * AXON_RET_BAD_ALLOC: `room` gave none; the sample is gone.
+ *
+ * # Safety
+ * `room` gives null, or room for as many bytes as it is asked for; `info` is null or points to room
+ * for one; `taken` points to room for a number.
+ */
+axon_ret_t axon_session_subscription_take(struct axon_subscription_t subscription,
+                                          axon_room_t room,
+                                          void *user,
+                                          struct axon_message_info_t *info,
+                                          uint8_t *taken);
+
+/**
+ * Takes the oldest sample, by source timestamp among all publishers, in place: `len` bytes at `data`,
+ * aligned to 8, which stand until `axon_session_sample_release`. One of more than 4 KiB is in the
+ * publisher's memory, of which a subscription can keep five for each publisher; a sixth is copied.
+ * Where there is none the handle is 0, and nothing else is stored.
+ *
+ * Nobody may write to the bytes. A publisher in another process that does not keep to the protocol
+ * could change them meanwhile: whoever parses them reads each once, and checks what it read.
+ * `AXON_SHM_COPY=1` has all of them copied.
+ *
+ * # Safety
+ * `sample`, `data` and `len` point to room for one each; `info` is null or does.
+ */
+axon_ret_t axon_session_subscription_take_sample(struct axon_subscription_t subscription,
+                                                 struct axon_sample_t *sample,
+                                                 const uint8_t **data,
+                                                 size_t *len,
+                                                 struct axon_message_info_t *info);
+
+/**
+ * Gives a sample that was taken in place back: of a subscription, a server or a client. It may be
+ * released after these have ended.
+ */
+axon_ret_t axon_session_sample_release(struct axon_sample_t sample);
+
+/**
+ * Samples of the subscription that were lost: overwritten before they were taken, or lost on their
+ * way from another host.
+ *
+ * # Safety
+ * `lost` points to room for a number.
+ */
+axon_ret_t axon_session_subscription_lost(struct axon_subscription_t subscription, uint64_t *lost);
+
+/**
+ * Has `callback` told of new samples from now on, in place of the one before, which has returned and
+ * is not called any more when this returns, unless this is called from within it. Null: nobody is
+ * told. What is there to be taken it is told at once, in this call; the rest on the session's
+ * thread.
+ *
+ * AXON_RET_ERROR: an event loop of the program's listens already.
+ *
+ * # Safety
+ * `callback` may be called with `user` from any thread until it is replaced or the subscription is
+ * destroyed.
+ */
+axon_ret_t axon_session_subscription_set_callback(struct axon_subscription_t subscription,
+                                                  axon_callback_t callback,
+                                                  const void *user);
+
+/**
+ * A guard condition of a session, which keeps the session open.
+ *
+ * # Safety
+ * `guard` points to room for a handle.
+ */
+axon_ret_t axon_session_guard_create(struct axon_session_t session, struct axon_guard_t *guard);
+
+/**
+ * Gives a guard condition's handle up. A wait that waits for it goes on without.
+ */
+axon_ret_t axon_session_guard_destroy(struct axon_guard_t guard);
+
+/**
+ * Triggers a guard condition. Async-signal-safe: it takes no lock and no memory, and a signal handler
+ * may call it at any time. It leaves errno and the text of the last error alone.
+ *
+ * AXON_RET_INVALID_HANDLE: it names none, or is being destroyed.
+ */
+axon_ret_t axon_session_guard_trigger(struct axon_guard_t guard);
+
+/**
+ * Blocks until at least one of what is in `set` is ready, for at most `timeout` nanoseconds: 0 not at
+ * all, AXON_WAIT_FOREVER (any negative number) without end, also where the set is empty. Then sets
+ * all handles in the arrays to 0 that are not ready.
+ *
+ * AXON_RET_TIMEOUT: none was ready in time; all handles are 0. Every other failure leaves the arrays
+ * as they were: AXON_RET_INVALID_HANDLE where one names nothing, AXON_RET_INVALID_ARGUMENT where one is
+ * of another session.
+ *
+ * Any number of threads may wait at once, each with arrays of its own. What is destroyed meanwhile is
+ * out of the graph at once; the wait goes on.
+ *
+ * # Safety
+ * `set` points to a set whose arrays hold as many handles as it says, which nobody else uses during
+ * the call.
+ */
+axon_ret_t axon_session_wait(struct axon_session_t session,
+                             const struct axon_wait_set_t *set,
+                             int64_t timeout);
+
+#ifdef __cplusplus
+}  // extern "C"
+#endif  // __cplusplus
+
+#endif  /* AXON_H */

@@ -1,0 +1,32 @@
+//! Functions of the program that are told how often something happened.
+
+use std::{ffi::c_void, sync::Arc};
+
+use crate::session::OnNew;
+
+/// Told how often something happened since it was told last; at least once. It may be called on the
+/// session's thread, must not block, and may call any function of this interface that does not block.
+pub type axon_callback_t = Option<unsafe extern "C" fn(user: *const c_void, count: usize)>;
+
+/// What a function is to be called with. The program says that any thread may.
+#[derive(Clone, Copy)]
+struct User(*const c_void);
+
+// SAFETY: it is never dereferenced here, and whoever sets a callback says that it may be called with
+// it from any thread.
+unsafe impl Send for User {}
+// SAFETY: as above.
+unsafe impl Sync for User {}
+
+/// A function of the program as the session calls it.
+pub(super) fn told(callback: axon_callback_t, user: *const c_void) -> Option<OnNew> {
+    let function = callback?;
+    let user = User(user);
+    Some(Arc::new(move |count: u64| {
+        let User(pointer) = { user };
+        let count = usize::try_from(count).unwrap_or(usize::MAX);
+        // SAFETY: whoever set it says that it may be called with this until it is replaced or its
+        // object destroyed, and neither returns before this call does.
+        unsafe { function(pointer, count) };
+    }))
+}

@@ -1,0 +1,277 @@
+//! The kinds of handles, and what each of them names.
+
+use std::{
+    ptr,
+    sync::{
+        Arc,
+        atomic::{AtomicPtr, Ordering},
+    },
+};
+
+use super::{
+    error::{AXON_RET_BAD_ALLOC, AXON_RET_FORKED, AXON_RET_INVALID_HANDLE, Failure, axon_ret_t},
+    event::NamedEvent,
+    loan::NamedLoan,
+    memory::store,
+    table::{Process, Table, Unknown},
+};
+use crate::{
+    session::{Client, GuardCondition, Node, Publisher, Server, Session, Subscription},
+    shm::{ForkToken, Sample},
+};
+
+/// A session: a process's membership of a domain. Destroyed by `axon_session_close`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_session_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// A node: a name in the graph to which endpoints belong.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_node_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// Sends the samples of a topic.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_publisher_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// Receives the samples of a topic.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_subscription_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// Answers the requests of a service.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_server_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// Sends requests to a service.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_client_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// A guard condition: stands from when it is triggered until a wait has seen it.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_guard_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// One event of a publisher or a subscription.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_event_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// A sample that was taken in place, to be given back by `axon_session_sample_release`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_sample_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// Memory that a publisher lent, to be published or abandoned.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_loan_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// A type of handle, and what it names.
+pub(super) trait Handle: Copy {
+    type Object;
+    const WHAT: &'static str;
+
+    fn id(self) -> u64;
+    fn of(id: u64) -> Self;
+    fn table(tables: &Tables) -> &Table<Self::Object>;
+}
+
+macro_rules! handles {
+    ($($number:literal $table:ident: $handle:ident => $object:ty, $what:literal;)+) => {
+        /// What the handles of a process name.
+        pub(super) struct Tables {
+            token: ForkToken,
+            /// Those of the process that it was forked from. Their locks may be held for ever.
+            before: Option<&'static Tables>,
+            process: Process,
+            $($table: Table<$object>,)+
+        }
+
+        impl Tables {
+            fn new(token: ForkToken, before: Option<&'static Tables>) -> Self {
+                let process = Process::new(token.value());
+                Self { token, before, process, $($table: Table::new($number, process),)+ }
+            }
+        }
+
+        /// What a handle of this kind names.
+        fn what(kind: u8) -> &'static str {
+            match kind {
+                $($number => $what,)+
+                _ => "nothing",
+            }
+        }
+
+        $(impl Handle for $handle {
+            type Object = $object;
+            const WHAT: &'static str = $what;
+
+            fn id(self) -> u64 {
+                self.id
+            }
+
+            fn of(id: u64) -> Self {
+                Self { id }
+            }
+
+            fn table(tables: &Tables) -> &Table<$object> {
+                &tables.$table
+            }
+        })+
+    };
+}
+
+handles! {
+    1 sessions: axon_session_t => Session, "session";
+    2 nodes: axon_node_t => Node, "node";
+    3 publishers: axon_publisher_t => Publisher, "publisher";
+    4 subscriptions: axon_subscription_t => Subscription, "subscription";
+    5 servers: axon_server_t => Server, "server";
+    6 clients: axon_client_t => Client, "client";
+    7 guards: axon_guard_t => GuardCondition, "guard condition";
+    8 events: axon_event_t => NamedEvent, "event";
+    9 samples: axon_sample_t => Sample, "sample";
+    10 loans: axon_loan_t => NamedLoan, "loan";
+}
+
+const _: () = {
+    const fn shared_by_threads<T: Send + Sync>() {}
+    shared_by_threads::<Tables>();
+};
+
+/// This process's, or those of one that it is a fork of.
+static CURRENT: AtomicPtr<Tables> = AtomicPtr::new(ptr::null_mut());
+
+impl Tables {
+    /// This process's. A forked child begins with new ones.
+    fn current() -> Result<&'static Self, Failure> {
+        loop {
+            let before = Self::latest();
+            if let Some(tables) = before.filter(|tables| !tables.token.is_forked()) {
+                return Ok(tables);
+            }
+            let token =
+                ForkToken::current().map_err(|error| Failure::new(AXON_RET_BAD_ALLOC, error))?;
+            let tables = Box::into_raw(Box::new(Self::new(token, before)));
+            let seen = before.map_or(ptr::null_mut(), |tables| ptr::from_ref(tables).cast_mut());
+            // Release pairs with the acquire of `latest`: whoever sees them sees them whole.
+            let (made, other) = (Ordering::AcqRel, Ordering::Acquire);
+            if CURRENT.compare_exchange(seen, tables, made, other).is_err() {
+                // SAFETY: made by `into_raw` above, and nobody else has seen it.
+                drop(unsafe { Box::from_raw(tables) });
+            }
+        }
+    }
+
+    /// Whether this process is a fork of that one, as far as handles can tell.
+    fn descends_from(&self, process: Process) -> bool {
+        let ancestors = std::iter::successors(self.before, |tables| tables.before);
+        ancestors.into_iter().any(|tables| tables.process == process)
+    }
+
+    /// The last that were made, in this process or in one that it is a fork of.
+    fn latest() -> Option<&'static Self> {
+        // SAFETY: null, or made by `Box::into_raw` and never freed once it is in `CURRENT`.
+        unsafe { CURRENT.load(Ordering::Acquire).as_ref() }
+    }
+}
+
+/// What a handle names.
+pub(super) fn named<H: Handle>(handle: H) -> Result<Arc<H::Object>, Failure> {
+    let tables = Tables::current()?;
+    H::table(tables).get(handle.id()).map_err(|why| tables.unknown(handle, why))
+}
+
+/// A handle for something new, stored at `out`.
+///
+/// # Safety
+/// As [`store`].
+pub(super) unsafe fn give<H: Handle>(object: H::Object, out: *mut H) -> Result<(), Failure> {
+    let id = H::table(Tables::current()?).insert(object).ok_or_else(|| {
+        let what = H::WHAT;
+        Failure::new(AXON_RET_BAD_ALLOC, format_args!("no {what} more: there are a million"))
+    })?;
+    // SAFETY: the caller's word.
+    unsafe { store(out, H::of(id), "the place of the handle") }
+}
+
+/// Gives a handle up: what it named ends when no call uses it any more.
+pub(super) fn revoke<H: Handle>(handle: H) -> Result<Arc<H::Object>, Failure> {
+    let tables = Tables::current()?;
+    H::table(tables).remove(handle.id()).map_err(|why| tables.unknown(handle, why))
+}
+
+/// Does something with what a handle names, as a signal handler may: see [`Table::visit`].
+pub(super) fn visit<H: Handle>(
+    handle: H,
+    visit: impl FnOnce(&H::Object),
+) -> Result<(), axon_ret_t> {
+    let Some(tables) = Tables::latest() else { return Err(AXON_RET_INVALID_HANDLE) };
+    if tables.token.is_forked() {
+        return Err(AXON_RET_FORKED);
+    }
+    H::table(tables).visit(handle.id(), visit).map_err(|why| tables.code(why))
+}
+
+impl Tables {
+    fn code(&self, why: Unknown) -> axon_ret_t {
+        match why {
+            Unknown::Foreign(process) if self.descends_from(process) => AXON_RET_FORKED,
+            _ => AXON_RET_INVALID_HANDLE,
+        }
+    }
+
+    fn unknown<H: Handle>(&self, handle: H, why: Unknown) -> Failure {
+        let (id, what) = (handle.id(), H::WHAT);
+        let code = self.code(why);
+        let text = match why {
+            Unknown::Null => format!("the handle of the {what} is 0"),
+            Unknown::OtherKind(kind) => {
+                let other = self::what(kind);
+                format!("the handle {id:#x} names a {other} where a {what} is expected")
+            }
+            Unknown::Foreign(_) if code == AXON_RET_FORKED => format!(
+                "the {what} belongs to the process of which this one is a fork: \
+                 open a session here"
+            ),
+            Unknown::Foreign(_) | Unknown::Gone => {
+                format!("the handle {id:#x} names no {what}: it was destroyed")
+            }
+        };
+        Failure::new(code, text)
+    }
+}

@@ -1,0 +1,270 @@
+//! Quality of service, as C has it.
+
+use std::os::raw::c_char;
+
+use super::{
+    error::{Failure, axon_ret_t},
+    guarded,
+    memory::{elements_mut, present, store, store_if_wanted, value},
+};
+use crate::qos::{
+    Choice, Compatibility, Durability, History, Incompatible, Liveliness, Qos, QosRequest,
+    Reliability, check,
+};
+
+/// Left to AXON, in any policy: RELIABLE, VOLATILE, KEEP_LAST, AUTOMATIC.
+pub const AXON_CHOICE_DEFAULT: u32 = 0;
+/// In reliability, durability and liveliness: what matches most of the endpoints that the graph
+/// holds when the endpoint is created, at the highest level that does.
+pub const AXON_CHOICE_BEST_AVAILABLE: u32 = 255;
+
+/// Samples arrive, within the bounds of the history.
+pub const AXON_RELIABILITY_RELIABLE: u32 = 1;
+/// Samples may be lost.
+pub const AXON_RELIABILITY_BEST_EFFORT: u32 = 2;
+
+/// A subscription that joins late receives the publisher's history first.
+pub const AXON_DURABILITY_TRANSIENT_LOCAL: u32 = 1;
+/// It receives samples from then on.
+pub const AXON_DURABILITY_VOLATILE: u32 = 2;
+
+/// The newest `depth` samples are kept.
+pub const AXON_HISTORY_KEEP_LAST: u32 = 1;
+/// All are kept, up to the memory budget; then the publisher waits.
+pub const AXON_HISTORY_KEEP_ALL: u32 = 2;
+
+/// The session asserts that a publisher is alive.
+pub const AXON_LIVELINESS_AUTOMATIC: u32 = 1;
+/// The publisher does, by publishing or asserting.
+pub const AXON_LIVELINESS_MANUAL_BY_TOPIC: u32 = 3;
+
+/// A time that is left to AXON, which takes it to be infinite.
+pub const AXON_DURATION_DEFAULT: u64 = 0;
+/// As AXON_CHOICE_BEST_AVAILABLE, for a deadline or a lease.
+pub const AXON_DURATION_BEST_AVAILABLE: u64 = 0xffff_ffff_ffff_fffe;
+/// No end.
+pub const AXON_DURATION_INFINITE: u64 = 0xffff_ffff_ffff_ffff;
+
+/// What an endpoint offers or requests. All zeros is the default profile: RELIABLE, VOLATILE,
+/// KEEP_LAST(10). What AXON says of an endpoint that there is holds no default and nothing best
+/// available.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_qos_t {
+    /// AXON_RELIABILITY_*, or AXON_CHOICE_*.
+    pub reliability: u32,
+    /// AXON_DURABILITY_*, or AXON_CHOICE_*.
+    pub durability: u32,
+    /// AXON_HISTORY_*, or AXON_CHOICE_DEFAULT.
+    pub history: u32,
+    /// Samples kept by KEEP_LAST; 0 is the default.
+    pub depth: u32,
+    /// AXON_LIVELINESS_*, or AXON_CHOICE_*.
+    pub liveliness: u32,
+    /// 0.
+    pub reserved: u32,
+    /// Longest time between two samples, in nanoseconds, or AXON_DURATION_*.
+    pub deadline: u64,
+    /// Age at which a sample is not delivered any more, in nanoseconds, or AXON_DURATION_*.
+    pub lifespan: u64,
+    /// Time without an assertion after which a publisher counts as not alive, in nanoseconds, or
+    /// AXON_DURATION_*.
+    pub lease: u64,
+}
+
+/// The two profiles go together.
+pub const AXON_QOS_COMPATIBLE: u32 = 0;
+/// That hangs on policies that are left open, as default or as best available.
+pub const AXON_QOS_UNKNOWN: u32 = 1;
+/// They do not.
+pub const AXON_QOS_INCOMPATIBLE: u32 = 2;
+
+/// No policy.
+pub const AXON_POLICY_NONE: u32 = 0;
+/// Which policy keeps two endpoints apart: reliability.
+pub const AXON_POLICY_RELIABILITY: u32 = 1;
+/// Durability.
+pub const AXON_POLICY_DURABILITY: u32 = 2;
+/// Deadline.
+pub const AXON_POLICY_DEADLINE: u32 = 3;
+/// Liveliness.
+pub const AXON_POLICY_LIVELINESS: u32 = 4;
+/// The liveliness lease.
+pub const AXON_POLICY_LIVELINESS_LEASE: u32 = 5;
+
+impl axon_qos_t {
+    pub(super) fn request(&self) -> Result<QosRequest, Failure> {
+        let wrong = |policy: &str, value: u32| {
+            Err(Failure::argument(format_args!("there is no {policy} {value}")))
+        };
+        let (default, best) = (Choice::SystemDefault, Choice::BestAvailable);
+        let reliability = match self.reliability {
+            AXON_CHOICE_DEFAULT => default,
+            AXON_CHOICE_BEST_AVAILABLE => best,
+            AXON_RELIABILITY_RELIABLE => Choice::Exactly(Reliability::Reliable),
+            AXON_RELIABILITY_BEST_EFFORT => Choice::Exactly(Reliability::BestEffort),
+            other => return wrong("reliability", other),
+        };
+        let (default, best) = (Choice::SystemDefault, Choice::BestAvailable);
+        let durability = match self.durability {
+            AXON_CHOICE_DEFAULT => default,
+            AXON_CHOICE_BEST_AVAILABLE => best,
+            AXON_DURABILITY_TRANSIENT_LOCAL => Choice::Exactly(Durability::TransientLocal),
+            AXON_DURABILITY_VOLATILE => Choice::Exactly(Durability::Volatile),
+            other => return wrong("durability", other),
+        };
+        let (default, best) = (Choice::SystemDefault, Choice::BestAvailable);
+        let liveliness = match self.liveliness {
+            AXON_CHOICE_DEFAULT => default,
+            AXON_CHOICE_BEST_AVAILABLE => best,
+            AXON_LIVELINESS_AUTOMATIC => Choice::Exactly(Liveliness::Automatic),
+            AXON_LIVELINESS_MANUAL_BY_TOPIC => Choice::Exactly(Liveliness::ManualByTopic),
+            other => return wrong("liveliness", other),
+        };
+        let history = match self.history {
+            AXON_CHOICE_DEFAULT => None,
+            AXON_HISTORY_KEEP_LAST => Some(History::KeepLast),
+            AXON_HISTORY_KEEP_ALL => Some(History::KeepAll),
+            other => return wrong("history", other),
+        };
+        let lifespan = match self.lifespan {
+            AXON_DURATION_DEFAULT | AXON_DURATION_INFINITE => None,
+            AXON_DURATION_BEST_AVAILABLE => {
+                return Err(Failure::argument("there is no best available lifespan"));
+            }
+            nanoseconds => Some(nanoseconds),
+        };
+        let period = |period: u64| match period {
+            AXON_DURATION_DEFAULT => Choice::SystemDefault,
+            AXON_DURATION_BEST_AVAILABLE => Choice::BestAvailable,
+            AXON_DURATION_INFINITE => Choice::Exactly(None),
+            nanoseconds => Choice::Exactly(Some(nanoseconds)),
+        };
+        let (deadline, lease, depth) = (period(self.deadline), period(self.lease), self.depth);
+        Ok(QosRequest {
+            reliability,
+            durability,
+            history,
+            depth,
+            deadline,
+            lifespan,
+            liveliness,
+            lease,
+        })
+    }
+}
+
+impl From<&Qos> for axon_qos_t {
+    fn from(qos: &Qos) -> Self {
+        let period = |period: Option<u64>| period.unwrap_or(AXON_DURATION_INFINITE);
+        Self {
+            reliability: match qos.reliability {
+                Reliability::Reliable => AXON_RELIABILITY_RELIABLE,
+                Reliability::BestEffort => AXON_RELIABILITY_BEST_EFFORT,
+            },
+            durability: match qos.durability {
+                Durability::TransientLocal => AXON_DURABILITY_TRANSIENT_LOCAL,
+                Durability::Volatile => AXON_DURABILITY_VOLATILE,
+            },
+            history: match qos.history {
+                History::KeepLast => AXON_HISTORY_KEEP_LAST,
+                History::KeepAll => AXON_HISTORY_KEEP_ALL,
+            },
+            depth: qos.depth,
+            liveliness: match qos.liveliness {
+                Liveliness::Automatic => AXON_LIVELINESS_AUTOMATIC,
+                Liveliness::ManualByTopic => AXON_LIVELINESS_MANUAL_BY_TOPIC,
+            },
+            reserved: 0,
+            deadline: period(qos.deadline),
+            lifespan: period(qos.lifespan),
+            lease: period(qos.lease),
+        }
+    }
+}
+
+pub(super) fn policy(incompatible: Option<Incompatible>) -> u32 {
+    match incompatible {
+        None => AXON_POLICY_NONE,
+        Some(Incompatible::Reliability) => AXON_POLICY_RELIABILITY,
+        Some(Incompatible::Durability) => AXON_POLICY_DURABILITY,
+        Some(Incompatible::Deadline) => AXON_POLICY_DEADLINE,
+        Some(Incompatible::Liveliness) => AXON_POLICY_LIVELINESS,
+        Some(Incompatible::LivelinessLease) => AXON_POLICY_LIVELINESS_LEASE,
+    }
+}
+
+/// Whether a publisher with the one profile serves a subscription with the other: AXON_QOS_* at
+/// `verdict`. Why not, or on what it hangs, is put into `reason` in words, cut to `reason_size`
+/// bytes with the 0 at its end; null and 0 where that is not wanted.
+///
+/// # Safety
+/// `offered` and `requested` point to a profile each, `verdict` to room for a number, and `reason` to
+/// room for `reason_size` bytes.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn axon_session_qos_check(
+    offered: *const axon_qos_t,
+    requested: *const axon_qos_t,
+    verdict: *mut u32,
+    reason: *mut c_char,
+    reason_size: usize,
+) -> axon_ret_t {
+    guarded(|| {
+        present(verdict, "the place of the verdict")?;
+        // SAFETY: the caller's word.
+        let offered = unsafe { value(offered, "the profile that is offered") }?.request()?;
+        // SAFETY: the caller's word.
+        let requested = unsafe { value(requested, "the profile that is requested") }?.request()?;
+        // SAFETY: the caller's word.
+        let room = unsafe { elements_mut(reason.cast::<u8>(), reason_size, "the reason") }?;
+        let (found, policies) = match check(&offered, &requested) {
+            Compatibility::Compatible => (AXON_QOS_COMPATIBLE, Vec::new()),
+            Compatibility::Unknown(policies) => (AXON_QOS_UNKNOWN, policies),
+            Compatibility::Incompatible(policies) => (AXON_QOS_INCOMPATIBLE, policies),
+        };
+        let reasons: Vec<String> = policies
+            .iter()
+            .map(|policy| {
+                let may = if found == AXON_QOS_UNKNOWN { "it may be that " } else { "" };
+                format!("{policy}: {may}{}", policy.reason())
+            })
+            .collect();
+        write_text(room, &reasons.join("; "));
+        // SAFETY: the caller's word.
+        unsafe { store(verdict, found, "the place of the verdict") }
+    })
+}
+
+/// The name of a policy as ROS 2 spells it, for instance `RELIABILITY`; null where there is none of
+/// that number. It stands for ever.
+#[unsafe(no_mangle)]
+pub extern "C" fn axon_session_policy_name(policy: u32) -> *const c_char {
+    match policy {
+        AXON_POLICY_RELIABILITY => c"RELIABILITY".as_ptr(),
+        AXON_POLICY_DURABILITY => c"DURABILITY".as_ptr(),
+        AXON_POLICY_DEADLINE => c"DEADLINE".as_ptr(),
+        AXON_POLICY_LIVELINESS => c"LIVELINESS".as_ptr(),
+        AXON_POLICY_LIVELINESS_LEASE => c"LIVELINESS_LEASE_DURATION".as_ptr(),
+        _ => std::ptr::null(),
+    }
+}
+
+/// Stores an endpoint's profile where it is wanted.
+///
+/// # Safety
+/// `out` is null or points to room for a profile.
+pub(super) unsafe fn store_qos(out: *mut axon_qos_t, qos: &Qos) -> Result<(), Failure> {
+    // SAFETY: the caller's word.
+    unsafe { store_if_wanted(out, axon_qos_t::from(qos)) }
+}
+
+/// As much of `text` as fits before the 0 at the end, without half characters.
+fn write_text(room: &mut [u8], text: &str) {
+    let Some(most) = room.len().checked_sub(1) else { return };
+    let mut len = text.len().min(most);
+    while !text.is_char_boundary(len) {
+        len -= 1;
+    }
+    room[..len].copy_from_slice(&text.as_bytes()[..len]);
+    room[len] = 0;
+}

@@ -1,0 +1,210 @@
+//! The C interface: that the header is the code's, and a C program that uses every function, wrongly
+//! too, built by plain `cc` and run as it is, under valgrind, and under AddressSanitizer.
+
+use std::{
+    ffi::OsStr,
+    fs,
+    path::{Path, PathBuf},
+    process::Command,
+    sync::Once,
+    time::SystemTime,
+};
+
+const HERE: &str = env!("CARGO_MANIFEST_DIR");
+/// What a static library of Rust needs of the system.
+const SYSTEM: &[&str] = &["-lgcc_s", "-lutil", "-lrt", "-lpthread", "-lm", "-ldl", "-lc"];
+const WARNINGS: &[&str] = &["-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O1", "-g"];
+
+fn path(within: &str) -> PathBuf {
+    Path::new(HERE).join(within)
+}
+
+/// A library of the C interface. `cargo test` builds it with the examples; where only this test is
+/// asked for, it is built here.
+fn library(name: &str) -> PathBuf {
+    static BUILT: Once = Once::new();
+    let program = std::env::current_exe().unwrap();
+    let profile = program.parent().and_then(Path::parent).unwrap();
+    let library = profile.join("examples").join(name);
+    BUILT.call_once(|| {
+        let changed = |path: &Path| fs::metadata(path).and_then(|facts| facts.modified()).ok();
+        // The test program was linked after the crate, and the library is as old as it or younger.
+        let source = newest(&path("src"));
+        if changed(&library).is_some_and(|built| built >= source) {
+            return;
+        }
+        let mut cargo = Command::new(env!("CARGO"));
+        cargo.args(["build", "--offline", "-p", "axon-transport", "--example", "axon_c"]);
+        cargo.arg("--target-dir").arg(profile.parent().unwrap());
+        if profile.file_name() == Some(OsStr::new("release")) {
+            cargo.arg("--release");
+        }
+        run(&mut cargo);
+    });
+    library
+}
+
+/// When the newest file in a directory was changed.
+fn newest(directory: &Path) -> SystemTime {
+    let entries = fs::read_dir(directory).unwrap().map(|entry| entry.unwrap().path());
+    let times = entries.map(|path| match path.is_dir() {
+        true => newest(&path),
+        false => fs::metadata(&path).unwrap().modified().unwrap(),
+    });
+    times.max().unwrap_or(SystemTime::UNIX_EPOCH)
+}
+
+fn files(directory: &str, extension: &str) -> Vec<PathBuf> {
+    let entries = fs::read_dir(path(directory)).unwrap();
+    let of = |path: &PathBuf| path.extension() == Some(OsStr::new(extension));
+    let mut files: Vec<PathBuf> = entries.map(|entry| entry.unwrap().path()).filter(of).collect();
+    files.sort();
+    assert!(!files.is_empty());
+    files
+}
+
+fn run(command: &mut Command) -> String {
+    let output = command.output().unwrap_or_else(|error| panic!("{command:?}: {error}"));
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    let (out, err) = (text(&output.stdout), text(&output.stderr));
+    assert!(output.status.success(), "{command:?}: {}\n{out}\n{err}", output.status);
+    out
+}
+
+/// Whether a program runs; what needs it is skipped where it does not.
+fn has(program: &str) -> bool {
+    let found = Command::new(program).arg("--version").output().is_ok_and(|o| o.status.success());
+    if !found {
+        eprintln!("skipped: {program} is not installed");
+    }
+    found
+}
+
+/// The test program, with these flags more.
+fn build(directory: &Path, flags: &[&str]) -> PathBuf {
+    let program = directory.join("ffi");
+    let mut cc = Command::new("cc");
+    cc.args(["-std=c99", "-D_GNU_SOURCE"]).args(WARNINGS).args(flags);
+    cc.arg("-I").arg(path("include")).args(files("tests/ffi", "c"));
+    cc.arg(library("libaxon_c.a")).args(SYSTEM).arg("-o").arg(&program);
+    run(&mut cc);
+    program
+}
+
+/// Where the program's sessions are in one process, without a daemon.
+fn alone(program: impl AsRef<OsStr>) -> Command {
+    let mut command = Command::new(program);
+    let ours = |name: &str| name.starts_with("AXON_") || name.starts_with("ROS_");
+    for (name, _) in std::env::vars().filter(|(name, _)| ours(name)) {
+        command.env_remove(name);
+    }
+    command.env("AXON_DAEMON", "off");
+    command
+}
+
+/// As the code says it. `WRITE_HEADER=1` in the environment writes it.
+#[test]
+fn the_header_is_the_codes() {
+    let config = cbindgen::Config::from_file(path("cbindgen.toml")).unwrap();
+    let builder = files("src/ffi", "rs")
+        .iter()
+        .fold(cbindgen::Builder::new().with_config(config), cbindgen::Builder::with_src);
+    let mut header = Vec::new();
+    builder.generate().unwrap().write(&mut header);
+    let header = String::from_utf8(header).unwrap();
+    let checked_in = path("include/axon.h");
+    if std::env::var_os("WRITE_HEADER").is_some() {
+        fs::write(&checked_in, &header).unwrap();
+    }
+    let there = fs::read_to_string(&checked_in).unwrap_or_default();
+    assert!(
+        there == header,
+        "include/axon.h is not what src/ffi says: WRITE_HEADER=1 cargo test -p axon-transport --test ffi"
+    );
+}
+
+#[test]
+fn the_header_is_plain_c_and_plain_cpp() {
+    let directory = tempfile::tempdir().unwrap();
+    let cases = [("cc", "-std=c99", "header.c"), ("c++", "-std=c++17", "header.cpp")];
+    for (compiler, standard, name) in cases {
+        let source = directory.path().join(name);
+        // Twice: it guards itself.
+        fs::write(&source, "#include <axon.h>\n#include <axon.h>\nint main(void);\n").unwrap();
+        let mut compile = Command::new(compiler);
+        compile.args([standard, "-fsyntax-only"]).args(WARNINGS).arg("-I").arg(path("include"));
+        run(compile.arg(source));
+    }
+}
+
+/// Names of the functions that the library has for C.
+fn exported() -> Vec<String> {
+    let mut names = Vec::new();
+    for file in files("src/ffi", "rs") {
+        let text = fs::read_to_string(file).unwrap();
+        let mut lines = text.lines();
+        while let Some(line) = lines.next() {
+            if line.trim() == "#[unsafe(no_mangle)]" {
+                let declaration = lines.next().unwrap();
+                let name = declaration.split("fn ").nth(1).unwrap();
+                names.push(name.split('(').next().unwrap().to_owned());
+            }
+        }
+    }
+    names
+}
+
+#[test]
+fn the_test_program_uses_every_function() {
+    let sources: Vec<String> =
+        files("tests/ffi", "c").iter().map(|file| fs::read_to_string(file).unwrap()).collect();
+    let unused: Vec<String> = exported()
+        .into_iter()
+        .filter(|name| !sources.iter().any(|source| source.contains(&format!("{name}("))))
+        .collect();
+    assert!(exported().len() > 30 && unused.is_empty(), "not used: {unused:?}");
+}
+
+#[test]
+fn a_c_program_uses_every_function() {
+    let directory = tempfile::tempdir().unwrap();
+    run(&mut alone(build(directory.path(), &[])));
+}
+
+#[test]
+fn a_c_program_uses_every_function_under_address_sanitizer() {
+    let directory = tempfile::tempdir().unwrap();
+    let probe = directory.path().join("probe.c");
+    fs::write(&probe, "int main(void) { return 0; }\n").unwrap();
+    let mut cc = Command::new("cc");
+    cc.arg("-fsanitize=address").arg(&probe).arg("-o").arg(directory.path().join("probe"));
+    if !cc.output().is_ok_and(|output| output.status.success()) {
+        eprintln!("skipped: cc has no AddressSanitizer");
+        return;
+    }
+    let program = build(directory.path(), &["-fsanitize=address", "-fno-omit-frame-pointer"]);
+    run(&mut alone(program));
+}
+
+#[test]
+fn a_c_program_uses_every_function_under_valgrind() {
+    if !has("valgrind") {
+        return;
+    }
+    let directory = tempfile::tempdir().unwrap();
+    let (source, probe) = (directory.path().join("probe.c"), directory.path().join("probe"));
+    let pidfd = "#include <unistd.h>\n#include <sys/syscall.h>\n\
+                 int main(void) { return syscall(SYS_pidfd_open, getpid(), 0) < 0; }\n";
+    fs::write(&source, pidfd).unwrap();
+    run(Command::new("cc").arg(&source).arg("-o").arg(&probe));
+    if !Command::new("valgrind").arg(&probe).output().unwrap().status.success() {
+        eprintln!(
+            "skipped: this valgrind does not know pidfd_open, without which there is no session"
+        );
+        return;
+    }
+    let program = build(directory.path(), &[]);
+    let mut valgrind = alone("valgrind");
+    valgrind.args(["--quiet", "--error-exitcode=99", "--leak-check=full"]);
+    run(valgrind.args(["--errors-for-leak-kinds=definite"]).arg(program));
+}
