@@ -45,8 +45,11 @@ pub(super) struct Control {
     /// Memory that sessions try whether they can map it.
     pub(super) probe: Option<OwnedFd>,
     wakers: HashMap<SessionId, Rc<Notify>>,
-    /// Wakes the task that flushes the graph, and the one that counts sessions.
+    /// Wakes the task that flushes the graph.
     pub(super) changed: Rc<Notify>,
+    /// Whether there is an application, and what wakes the task that waits for that to change.
+    needed: bool,
+    pub(super) need: Rc<Notify>,
 }
 
 impl Control {
@@ -67,6 +70,8 @@ impl Control {
             wakers: HashMap::new(),
             config,
             changed: Rc::default(),
+            needed: false,
+            need: Rc::default(),
         }
     }
 
@@ -109,6 +114,9 @@ impl Control {
             }
         }
         self.changed.notify_one();
+        if std::mem::replace(&mut self.needed, self.registry.is_needed()) != self.needed {
+            self.need.notify_one();
+        }
     }
 
     /// Answers a session that asks for the status. One that asks again before it has taken the

@@ -1,13 +1,6 @@
 //! A daemon's life: from its first system call to its exit status.
 
-use std::{
-    cell::RefCell,
-    os::fd::OwnedFd,
-    process::ExitCode,
-    rc::Rc,
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::{cell::RefCell, os::fd::OwnedFd, process::ExitCode, rc::Rc, sync::Arc, time::Duration};
 
 use rustix::process::{
     DumpableBehavior, Resource, Rlimit, getrlimit, set_dumpable_behavior, setrlimit,
@@ -272,16 +265,13 @@ async fn flush(control: Rc<RefCell<Control>>, digests: Option<mpsc::Sender<Event
 /// Ends when there was no application for the grace time.
 async fn unneeded(control: &Rc<RefCell<Control>>) {
     let grace = control.borrow().config.link.grace;
-    let mut idle_since = Instant::now();
+    let changed = control.borrow().need.clone();
     loop {
-        if control.borrow().registry.applications() > 0 {
-            idle_since = Instant::now();
-        }
-        let left = grace.saturating_sub(idle_since.elapsed());
-        if left.is_zero() {
+        if control.borrow().registry.is_needed() {
+            changed.notified().await;
+        } else if tokio::time::timeout(grace, changed.notified()).await.is_err() {
             return;
         }
-        tokio::time::sleep(left.min(Duration::from_millis(500))).await;
     }
 }
 

@@ -78,6 +78,7 @@ pub async fn run(
     let mut names = interval(NAMES_EVERY);
     names.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut lookups = JoinSet::new();
+    let listed = listed(config);
 
     loop {
         let wakeup = shell.peers.next_wakeup().map(|at| shell.start + at);
@@ -97,9 +98,9 @@ pub async fn run(
                 }
             },
             () = sleep_until_some(wakeup) => {}
-            _ = look.tick() => shell.look_at_interfaces(),
-            _ = names.tick(), if lookups.is_empty() => {
-                lookups.spawn(look_up(listed(config)));
+            _ = look.tick(), if config.range != DiscoveryRange::Off => shell.look_at_interfaces(),
+            _ = names.tick(), if lookups.is_empty() && !listed.is_empty() => {
+                lookups.spawn(look_up(listed.clone()));
             }
             Some(found) = lookups.join_next() => if let Ok(found) = found {
                 let now = shell.start.elapsed();

@@ -78,6 +78,8 @@ pub(super) struct State {
     pub(super) graph: Arc<GraphView>,
     pub(super) daemon: Option<DaemonId>,
     pub(super) status: StatusAnswer,
+    /// When those who wait shall look again, whether or not anything comes.
+    pub(super) again: Option<Instant>,
     /// Counts what those who wait may want to look at.
     pub(super) changes: u64,
 }
@@ -249,6 +251,14 @@ impl Shared {
 
     pub(super) fn listening(&self) -> Option<Arc<ExternalLeader>> {
         self.listening.lock().unwrap_or_else(PoisonError::into_inner).1.clone()
+    }
+
+    /// Has those who wait look again then.
+    pub(super) fn look_again(&self, at: Instant) {
+        let mut state = self.state();
+        state.again = Some(state.again.map_or(at, |before| before.min(at)));
+        drop(state);
+        self.wake();
     }
 
     /// Queues something for the daemon.

@@ -4,7 +4,10 @@ use std::{
     collections::{BTreeMap, BTreeSet},
     fs, io,
     os::fd::{AsFd, AsRawFd, BorrowedFd},
-    sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, Weak, atomic::AtomicU64},
+    sync::{
+        Arc, Mutex, MutexGuard, OnceLock, PoisonError, Weak,
+        atomic::{AtomicU64, Ordering},
+    },
 };
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -328,8 +331,10 @@ impl PeerSession {
     }
 
     fn ring_if(&self, purpose: Purpose) {
-        if due(self.ticket(purpose), &self.rung[purpose as usize]) {
-            self.bell.ring();
+        let rung = &self.rung[purpose as usize];
+        if due(self.ticket(purpose), rung) && !self.bell.ring() {
+            // Relaxed: whoever comes next rings for any ticket, or another one has.
+            rung.store(0, Ordering::Relaxed);
         }
     }
 }

@@ -1,10 +1,20 @@
 //! The ringing end of a doorbell.
 
-use std::os::fd::{AsFd, BorrowedFd};
+use std::{
+    os::fd::{AsFd, BorrowedFd},
+    time::Duration,
+};
 
-use rustix::net::{AddressFamily, SendFlags, SocketType, send, sockopt};
+use rustix::{
+    io::Errno,
+    net::{AddressFamily, SendFlags, SocketType, send, sockopt},
+};
 
 use crate::passed::PassedFd;
+
+/// How often, and after how long each time, a ring that the kernel has no memory for is tried again.
+const TRIES: u32 = 100;
+const NAP: Duration = Duration::from_millis(1);
 
 /// One end of a pair of unix sockets. Whoever holds it can ring, and nothing worse: it cannot take
 /// rings away, nor keep another from ringing but by closing the bell for all, which is noticed.
@@ -25,9 +35,18 @@ impl Bell {
 
     /// Rings, without waiting for whoever is at the other end; kernels before 6.9 may first look for
     /// sockets that nobody can reach any more. That there is no room is as good: then rings stand
-    /// there that nobody has heard yet.
-    pub(crate) fn ring(&self) {
-        let _ = send(&self.0, &[1], SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
+    /// there that nobody has heard yet. `false` when the kernel had no memory for it for as long as a
+    /// publish may wait, and nobody was woken.
+    pub(crate) fn ring(&self) -> bool {
+        for _ in 0..TRIES {
+            match send(&self.0, &[1], SendFlags::DONTWAIT | SendFlags::NOSIGNAL) {
+                Err(Errno::NOBUFS | Errno::NOMEM) => std::thread::sleep(NAP),
+                Err(Errno::INTR) => {}
+                _ => return true,
+            }
+        }
+        tracing::error!("the kernel has no memory to wake a process: it hears of the next sample");
+        false
     }
 }
 

@@ -10,9 +10,13 @@ use rustix::{event::Timespec, io::Errno};
 
 use super::{
     Bell, arm, disarm,
-    ear::{CLOSED, Drained, Ear, Heard, LONGEST, not_too_long},
+    ear::{CLOSED, Drained, Ear, Heard},
     spin::Spin,
 };
+
+/// How long who waits sleeps at most where nobody watches the processes that are to ring: what one of
+/// them did not live to ring for is found then. Tests sleep for ever, so that they notice.
+const LONGEST: Option<Duration> = if cfg!(test) { None } else { Some(Duration::from_secs(1)) };
 
 /// What a waiter waits for; each has its own armed word.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -64,6 +68,8 @@ struct Crowd {
     closed: bool,
     /// An event loop is about to lead.
     coming: bool,
+    /// Somebody notifies when a process ends that might have rung.
+    watched: bool,
 }
 
 #[derive(Default, PartialEq, Eq)]
@@ -147,6 +153,12 @@ impl Doorbell {
         }
     }
 
+    /// Whoever says so [notifies](Self::notify) when a process ends that might have rung: from now on
+    /// waiters sleep for as long as nothing comes.
+    pub(crate) fn is_watched(&self) {
+        self.lock().watched = true;
+    }
+
     /// Makes every waiter of this process look again.
     pub(crate) fn notify(&self) {
         let mut crowd = self.lock();
@@ -177,6 +189,7 @@ impl Doorbell {
             return;
         }
         crowd.leader = Leader::Thread;
+        let left = crowd.not_too_long(left);
         drop(crowd);
         let heard = self.ear.listen(others, left);
         let mut crowd = self.lock();
@@ -195,7 +208,7 @@ impl Doorbell {
     ) {
         let follower = Arc::new(Follower { turn: Condvar::new(), look: look.cloned() });
         crowd.followers.push(Arc::clone(&follower));
-        crowd = match not_too_long(left) {
+        crowd = match crowd.not_too_long(left) {
             Some(left) => {
                 let woken = follower.turn.wait_timeout(crowd, left);
                 woken.unwrap_or_else(PoisonError::into_inner).0
@@ -356,10 +369,18 @@ impl Crowd {
         let interval = match self.leader {
             _ if self.closed => Some(CLOSED),
             // Threads that listen see to it themselves.
-            Leader::External => LONGEST,
+            Leader::External => self.longest(),
             Leader::None | Leader::Thread => None,
         };
         ear.tick(interval);
+    }
+
+    fn longest(&self) -> Option<Duration> {
+        LONGEST.filter(|_| !self.watched)
+    }
+
+    fn not_too_long(&self, left: Option<Duration>) -> Option<Duration> {
+        left.into_iter().chain(self.longest()).min()
     }
 
     fn disarm_idle(&self, purpose: Purpose, words: Words<'_>) {

@@ -21,10 +21,6 @@ use rustix::{
 use super::Bell;
 use crate::passed::{PassedFd, carries_descriptors};
 
-/// How long who listens sleeps at most. What another process could not, or would not, ring for is
-/// found then. Tests sleep for ever, so that they notice.
-pub(super) const LONGEST: Option<Duration> =
-    if cfg!(test) { None } else { Some(Duration::from_secs(1)) };
 /// Rings that one system call takes.
 const BATCH: usize = 8;
 /// How often there is a look once the bell has been closed.
@@ -104,7 +100,6 @@ impl Ear {
 
     /// Sleeps until something comes, for at most `left`. Events of `others` end it too.
     pub(super) fn listen(&self, others: &[BorrowedFd<'_>], left: Option<Duration>) -> Heard {
-        let left = not_too_long(left);
         let whole = whole_millis(left);
         let timespec = |time| Timespec::try_from(time).ok();
         if others.is_empty() && whole != Some(Duration::ZERO) {
@@ -199,14 +194,6 @@ pub(super) enum Drained {
     Some,
     /// One carries descriptors, as no ring does.
     Rights,
-}
-
-/// At most as long as who listens sleeps.
-pub(super) fn not_too_long(left: Option<Duration>) -> Option<Duration> {
-    match (left, LONGEST) {
-        (Some(left), Some(longest)) => Some(left.min(longest)),
-        (left, longest) => left.or(longest),
-    }
 }
 
 impl AsFd for Ear {

@@ -63,8 +63,9 @@ use crate::shm::SessionSegment;
 /// # }
 /// ```
 ///
-/// The descriptor is an epoll instance, which any event loop takes, edge- or level-triggered. Once
-/// a second it is readable for nothing, for the sake of what a process did not live to ring for.
+/// The descriptor is an epoll instance, which any event loop takes, edge- or level-triggered. That of
+/// a [`Context`](crate::shm::Context), which has no thread to watch other processes, is readable for
+/// nothing once a second, for the sake of what one of them did not live to ring for.
 pub struct ExternalLeader {
     session: Arc<SessionSegment>,
 }

@@ -223,9 +223,9 @@ impl<F: Clone> Registry<F> {
         self.sessions.values().filter(|s| s.relay.is_some()).count()
     }
 
-    /// How many application sessions there are.
-    pub fn applications(&self) -> usize {
-        self.sessions.values().filter(|s| s.role == SessionRole::Application).count()
+    /// Whether there is an application's session.
+    pub fn is_needed(&self) -> bool {
+        self.sessions.values().any(|s| s.role == SessionRole::Application)
     }
 
     /// The endpoints of sessions here.

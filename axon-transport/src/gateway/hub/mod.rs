@@ -158,6 +158,7 @@ impl Hub {
     pub(super) async fn run(mut self, mut inbox: mpsc::Receiver<Event>, session: &Noticed) -> bool {
         self.local_graph().await;
         let mut second = tokio::time::interval(Duration::from_secs(1));
+        second.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         let mut seconds = 0_u32;
         let mut kept = true;
         loop {
@@ -171,7 +172,8 @@ impl Hub {
                     kept = false;
                     break;
                 }
-                _ = second.tick() => {
+                // Without a link, and keys, there is nothing that time would change.
+                _ = second.tick(), if !self.links.is_empty() || self.context.keyring.is_some() => {
                     seconds = seconds.wrapping_add(1);
                     self.close_untrusted(seconds.is_multiple_of(CERTIFICATES_EVERY)).await;
                     self.report().await;

@@ -92,6 +92,7 @@ enum Link {
 impl Control {
     pub(super) fn new(shared: Arc<Shared>, start: Start) -> Result<Self, SessionError> {
         let reconnects = matches!(start, Start::Daemon(_));
+        shared.segment.doorbell_hub().is_watched();
         let peers = Peers::new(shared.segment.clone(), shared.memory.clone());
         let mut control = Self {
             shared,
@@ -280,7 +281,8 @@ impl Control {
         let blocked = self.is_linked() && !(self.outbox.is_empty() && self.untold.is_empty());
         let nap = blocked.then_some(Duration::from_millis(20));
         let tend = self.tend.filter(|_| self.is_linked());
-        let due = tend.into_iter().chain(self.retry).chain(self.arrivals.due()).min();
+        let again = self.look_again();
+        let due = tend.into_iter().chain(self.retry).chain(self.arrivals.due()).chain(again).min();
         let due = due.map(|due| due.saturating_duration_since(Instant::now()));
         let timeout = nap.into_iter().chain(due).chain(self.until_alarm()).min();
         let timeout = timeout.and_then(|timeout| Timespec::try_from(timeout).ok());

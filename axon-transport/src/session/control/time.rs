@@ -1,6 +1,6 @@
 //! Deadlines and leases: looked at when the next one may run out, and never where none is finite.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use super::Control;
 use crate::session::{clock, events::Source};
@@ -28,6 +28,18 @@ impl Control {
             self.shared.segment.notify();
         }
         self.timed = Some(timed);
+    }
+
+    /// Has those who wait look again, where the time for it has come. When it will, else.
+    pub(super) fn look_again(&self) -> Option<Instant> {
+        let mut state = self.shared.state();
+        let again = state.again.take_if(|again| *again <= Instant::now());
+        let next = state.again;
+        drop(state);
+        if again.is_some() {
+            self.shared.segment.notify();
+        }
+        next
     }
 
     /// How long until the next look.

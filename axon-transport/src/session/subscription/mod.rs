@@ -194,7 +194,11 @@ pub(super) fn take_from<T>(
     let taken = slots.take(take, inner);
     let gone = std::mem::take(&mut slots.discarded);
     let lost = slots.new_losses();
+    let again = if taken.is_none() { slots.short_until() } else { None };
     drop(slots);
+    if let Some(again) = again {
+        session.shared().look_again(again);
+    }
     inner.events.lost(lost);
     for writer in gone {
         let detach = Message::Detach(Pair { reader: inner.endpoint.gid, writer });

@@ -67,7 +67,12 @@ impl Slots {
     }
 
     pub(super) fn is_short(&self) -> bool {
-        self.short.is_some_and(|since| since.elapsed() < SHORT)
+        self.short_until().is_some()
+    }
+
+    /// Until when there is nothing to take, as there is no memory to take it.
+    pub(super) fn short_until(&self) -> Option<Instant> {
+        self.short.map(|since| since + SHORT).filter(|until| *until > Instant::now())
     }
 
     /// Whether the lease of one of the writers may run out.
