@@ -6,7 +6,7 @@ use crate::{
     qos::Qos,
     session::message::{
         Announce, Attach, EndpointRole, Granted, Message, Segment, SegmentName, SegmentOpened,
-        StatusPart,
+        StatusPart, Unmatch,
     },
 };
 
@@ -203,6 +203,39 @@ fn who_asks_again_is_told_the_same_status_from_its_beginning() {
     registry.tell_status(&id(1), Vec::new().into());
     let one = drain(&mut registry, 1);
     assert!(matches!(&one[..], [Message::Status(part)] if part.parts == 1));
+}
+
+#[test]
+fn a_pair_that_cannot_share_memory_is_shown_with_the_reason() {
+    let mut registry = registry(&[SessionRole::Application; 3]);
+    announce(&mut registry, 1, 1, EndpointKind::Publisher);
+    announce(&mut registry, 2, 1, EndpointKind::Subscription);
+    let (writer, reader) = (Gid::new(id(1), 1), Gid::new(id(2), 1));
+    let fail = |registry: &mut Registry<Label>, session| {
+        let reason = "not \u{1b}[1mmapped".to_owned() + &"!".repeat(10_000);
+        let unmatch = Message::Unmatch(Unmatch { reader, writer, reason });
+        registry.message(&id(session), unmatch, vec![])
+    };
+    assert_eq!(fail(&mut registry, 3), Err(Violation::NotItsOwn(reader)));
+    assert!(registry.take_refused().is_empty());
+    // The publisher's side says so; its reader may ask again.
+    fail(&mut registry, 1).unwrap();
+    assert_eq!(registry.pairs.len(), 1);
+    let shown = registry.take_refused();
+    assert_eq!(shown[0].0, id(1));
+    let text = &shown[0].1;
+    assert!(text.contains("\"/t\"") && text.contains("AXON_SHM") && text.contains("not [1mmapped"));
+    assert!(text.len() < 600 && !text.contains('\u{1b}'), "{text}");
+    // The reader's side ends it.
+    drain(&mut registry, 1);
+    fail(&mut registry, 2).unwrap();
+    assert!(registry.pairs.is_empty());
+    assert_eq!(registry.take_refused()[0].0, id(2));
+    let over = drain(&mut registry, 1);
+    assert!(over.iter().any(|m| matches!(m, Message::Detach(pair) if pair.reader == reader)));
+    // And says nothing of what is no pair.
+    fail(&mut registry, 2).unwrap();
+    assert!(registry.take_refused().is_empty());
 }
 
 #[test]

@@ -78,6 +78,7 @@ impl<F: Clone> Registry<F> {
             Message::Attach(attach) => self.attach(id, attach),
             Message::Grant(grant) => self.grant(id, grant),
             Message::Detach(pair) => self.detach(id, pair),
+            Message::Unmatch(unmatch) => self.fail(id, unmatch),
             Message::Resync => {
                 // Everything costs much more to tell than to ask for.
                 if let Some(entry) = self.sessions.get_mut(id) {
@@ -273,6 +274,30 @@ impl<F: Clone> Registry<F> {
         self.push(&to, &Message::Grant(grant), descriptors);
         self.hand_over_rest(&to, &of, &pair.writer);
         true
+    }
+
+    /// A session cannot map what one of its endpoints needs of another's session.
+    fn fail(&mut self, id: &SessionId, unmatch: Unmatch) -> Result<(), Violation> {
+        let Unmatch { reader, writer, reason } = unmatch;
+        let owns = |gid: &Gid| self.endpoints.get(gid).is_some_and(|e| e.session == *id);
+        let pair = Pair { reader, writer };
+        if !self.pairs.contains_key(&pair) {
+            return Ok(());
+        }
+        let reads = owns(&reader);
+        if !reads && !owns(&writer) {
+            return Err(Violation::NotItsOwn(reader));
+        }
+        let topic = self.endpoints.get(&writer).map_or("", |writer| &writer.endpoint.topic);
+        let reason: String =
+            reason.chars().filter(|c| !c.is_control()).take(crate::relay::MAX_REASON).collect();
+        let text = format!(
+            "topic {topic:?}: reader {reader} and publisher {writer} do not meet: {reason}. \
+             AXON_SHM=off for the process of one of them has samples pass through the daemon"
+        );
+        self.note_refused(id, &text);
+        // A writer may be asked again.
+        if reads { self.detach(id, pair) } else { Ok(()) }
     }
 
     fn detach(&mut self, id: &SessionId, pair: Pair) -> Result<(), Violation> {

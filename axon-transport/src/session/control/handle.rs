@@ -201,8 +201,15 @@ impl Control {
             Err(error) => {
                 let topic = &publisher.endpoint.topic;
                 tracing::error!(topic, reader = %pair.reader, error, "a reader is not served");
+                self.tell_failure(&pair, error);
             }
         }
+    }
+
+    /// Tells the daemon, which shows it, why a pair that it matched does not come about.
+    fn tell_failure(&mut self, pair: &Pair, reason: String) {
+        let Pair { reader, writer } = *pair;
+        self.say(Message::Unmatch(Unmatch { reader, writer, reason }));
     }
 
     fn grant(&mut self, granted: Granted, descriptors: Vec<PassedFd>) {
@@ -262,7 +269,7 @@ impl Control {
             Err(error) => {
                 let topic = &subscription.endpoint.topic;
                 tracing::error!(topic, %writer, error, "a publisher cannot be received from");
-                self.outbox.push_back((Message::Detach(pair), Vec::new()));
+                self.tell_failure(&pair, error);
             }
         }
     }
