@@ -87,6 +87,26 @@
 #define AXON_EVENT_PUBLICATION_MATCHED 10
 
 /**
+ * A kind of endpoint: publishers.
+ */
+#define AXON_KIND_PUBLISHER 1
+
+/**
+ * Subscriptions.
+ */
+#define AXON_KIND_SUBSCRIPTION 2
+
+/**
+ * Servers.
+ */
+#define AXON_KIND_SERVER 4
+
+/**
+ * Clients.
+ */
+#define AXON_KIND_CLIENT 8
+
+/**
  * The version of this interface. It rises whenever a program that was compiled against the former
  * header would not work any more.
  */
@@ -250,100 +270,6 @@
 typedef int32_t axon_ret_t;
 
 /**
- * Sends the samples of a topic.
- */
-typedef struct axon_publisher_t {
-    /**
-     * 0 where it is none.
-     */
-    uint64_t id;
-} axon_publisher_t;
-
-/**
- * One event of a publisher or a subscription.
- */
-typedef struct axon_event_t {
-    /**
-     * 0 where it is none.
-     */
-    uint64_t id;
-} axon_event_t;
-
-/**
- * Receives the samples of a topic.
- */
-typedef struct axon_subscription_t {
-    /**
-     * 0 where it is none.
-     */
-    uint64_t id;
-} axon_subscription_t;
-
-/**
- * What is known of an event. Changes are since the status was last taken.
- */
-typedef struct axon_event_status_t {
-    /**
-     * AXON_EVENT_*.
-     */
-    uint32_t kind;
-    /**
-     * Of incompatible QoS: AXON_POLICY_*, one that kept the last endpoint apart.
-     */
-    uint32_t last_policy;
-    /**
-     * How often it happened in all; of `matched`, endpoints matched ever.
-     */
-    uint64_t total;
-    /**
-     * How much of that is new.
-     */
-    uint64_t total_change;
-    /**
-     * Of `matched`, endpoints matched now; of liveliness changed, publishers that are alive now.
-     */
-    uint64_t current;
-    /**
-     * By how many that changed.
-     */
-    int64_t current_change;
-    /**
-     * Of liveliness changed, publishers that are matched and not alive now.
-     */
-    uint64_t not_alive;
-    /**
-     * By how many that changed.
-     */
-    int64_t not_alive_change;
-} axon_event_status_t;
-
-/**
- * Told how often something happened since it was told last; at least once. It may be called on the
- * session's thread, must not block, and may call any function of this interface that does not block.
- */
-typedef void (*axon_callback_t)(const void *user, size_t count);
-
-/**
- * Memory that a publisher lent, to be published or abandoned.
- */
-typedef struct axon_loan_t {
-    /**
-     * 0 where it is none.
-     */
-    uint64_t id;
-} axon_loan_t;
-
-/**
- * A session: a process's membership of a domain. Destroyed by `axon_session_close`.
- */
-typedef struct axon_session_t {
-    /**
-     * 0 where it is none.
-     */
-    uint64_t id;
-} axon_session_t;
-
-/**
  * A node: a name in the graph to which endpoints belong.
  */
 typedef struct axon_node_t {
@@ -352,16 +278,6 @@ typedef struct axon_node_t {
      */
     uint64_t id;
 } axon_node_t;
-
-/**
- * A guard condition: stands from when it is triggered until a wait has seen it.
- */
-typedef struct axon_guard_t {
-    /**
-     * 0 where it is none.
-     */
-    uint64_t id;
-} axon_guard_t;
 
 /**
  * What an endpoint offers or requests. All zeros is the default profile: RELIABLE, VOLATILE,
@@ -444,6 +360,16 @@ typedef struct axon_endpoint_options_t {
 } axon_endpoint_options_t;
 
 /**
+ * Sends requests to a service.
+ */
+typedef struct axon_client_t {
+    /**
+     * 0 where it is none.
+     */
+    uint64_t id;
+} axon_client_t;
+
+/**
  * Names an endpoint or a node: no other anywhere has the same.
  */
 typedef struct axon_gid_t {
@@ -452,46 +378,6 @@ typedef struct axon_gid_t {
      */
     uint8_t bytes[16];
 } axon_gid_t;
-
-/**
- * How a session is opened. `axon_session_options_init` fills it in; what is to be otherwise is
- * changed then. Everything that it does not say, the environment and `axon.toml` do.
- */
-typedef struct axon_session_options_t {
-    /**
-     * The interface that the program was compiled against.
-     */
-    uint32_t abi;
-    /**
-     * 0 to 232, or AXON_DOMAIN_ENVIRONMENT.
-     */
-    uint32_t domain;
-    /**
-     * AXON_DISCOVERY_*: how far a daemon looks that this session starts.
-     */
-    uint32_t discovery;
-    /**
-     * 0.
-     */
-    uint32_t reserved;
-    /**
-     * Addresses or host names of other hosts, for any discovery but AXON_DISCOVERY_ENVIRONMENT.
-     */
-    const char *const *static_peers;
-    /**
-     * How many there are.
-     */
-    size_t static_peer_count;
-    /**
-     * Shown to people; null or empty: the program's name.
-     */
-    const char *name;
-    /**
-     * The daemon's program, where `AXON_DAEMON_PATH` names none; null: `axon_daemon` beside this
-     * program or the library. An `axon.toml` beside it is read.
-     */
-    const char *daemon_path;
-} axon_session_options_t;
 
 /**
  * Says where a message of `len` bytes is to be put: room for as many, or null where there is none.
@@ -544,6 +430,177 @@ typedef struct axon_sample_t {
 } axon_sample_t;
 
 /**
+ * Told how often something happened since it was told last; at least once. It may be called on the
+ * session's thread, must not block, and may call any function of this interface that does not block.
+ */
+typedef void (*axon_callback_t)(const void *user, size_t count);
+
+/**
+ * Sends the samples of a topic.
+ */
+typedef struct axon_publisher_t {
+    /**
+     * 0 where it is none.
+     */
+    uint64_t id;
+} axon_publisher_t;
+
+/**
+ * One event of a publisher or a subscription.
+ */
+typedef struct axon_event_t {
+    /**
+     * 0 where it is none.
+     */
+    uint64_t id;
+} axon_event_t;
+
+/**
+ * Receives the samples of a topic.
+ */
+typedef struct axon_subscription_t {
+    /**
+     * 0 where it is none.
+     */
+    uint64_t id;
+} axon_subscription_t;
+
+/**
+ * What is known of an event. Changes are since the status was last taken.
+ */
+typedef struct axon_event_status_t {
+    /**
+     * AXON_EVENT_*.
+     */
+    uint32_t kind;
+    /**
+     * Of incompatible QoS: AXON_POLICY_*, one that kept the last endpoint apart.
+     */
+    uint32_t last_policy;
+    /**
+     * How often it happened in all; of `matched`, endpoints matched ever.
+     */
+    uint64_t total;
+    /**
+     * How much of that is new.
+     */
+    uint64_t total_change;
+    /**
+     * Of `matched`, endpoints matched now; of liveliness changed, publishers that are alive now.
+     */
+    uint64_t current;
+    /**
+     * By how many that changed.
+     */
+    int64_t current_change;
+    /**
+     * Of liveliness changed, publishers that are matched and not alive now.
+     */
+    uint64_t not_alive;
+    /**
+     * By how many that changed.
+     */
+    int64_t not_alive_change;
+} axon_event_status_t;
+
+/**
+ * A session: a process's membership of a domain. Destroyed by `axon_session_close`.
+ */
+typedef struct axon_session_t {
+    /**
+     * 0 where it is none.
+     */
+    uint64_t id;
+} axon_session_t;
+
+/**
+ * Told of a node.
+ */
+typedef void (*axon_node_visitor_t)(void *user,
+                                    const char *name,
+                                    const char *namespace_,
+                                    const char *enclave);
+
+/**
+ * Told of a topic or service and the types that its endpoints have, of which there is at least one.
+ */
+typedef void (*axon_name_visitor_t)(void *user,
+                                    const char *name,
+                                    const char *const *types,
+                                    size_t type_count);
+
+/**
+ * An endpoint of the graph. What it points to stands during the call that it is given to.
+ */
+typedef struct axon_endpoint_t {
+    /**
+     * Its GID.
+     */
+    struct axon_gid_t gid;
+    /**
+     * AXON_KIND_*.
+     */
+    uint32_t kind;
+    /**
+     * 1 where it is on another host, else 0.
+     */
+    uint32_t remote;
+    /**
+     * The name of its topic or service.
+     */
+    const char *topic;
+    /**
+     * The type's name.
+     */
+    const char *type_name;
+    /**
+     * The type's hash.
+     */
+    const uint8_t *type_hash;
+    /**
+     * 0 where it is not known.
+     */
+    size_t type_hash_size;
+    /**
+     * What it offers or requests.
+     */
+    struct axon_qos_t qos;
+    /**
+     * The node that it belongs to; empty where it belongs to none.
+     */
+    const char *node;
+    /**
+     * That node's namespace.
+     */
+    const char *namespace_;
+} axon_endpoint_t;
+
+/**
+ * Told of an endpoint.
+ */
+typedef void (*axon_endpoint_visitor_t)(void *user, const struct axon_endpoint_t *endpoint);
+
+/**
+ * Memory that a publisher lent, to be published or abandoned.
+ */
+typedef struct axon_loan_t {
+    /**
+     * 0 where it is none.
+     */
+    uint64_t id;
+} axon_loan_t;
+
+/**
+ * A guard condition: stands from when it is triggered until a wait has seen it.
+ */
+typedef struct axon_guard_t {
+    /**
+     * 0 where it is none.
+     */
+    uint64_t id;
+} axon_guard_t;
+
+/**
  * Answers the requests of a service.
  */
 typedef struct axon_server_t {
@@ -554,14 +611,44 @@ typedef struct axon_server_t {
 } axon_server_t;
 
 /**
- * Sends requests to a service.
+ * How a session is opened. `axon_session_options_init` fills it in; what is to be otherwise is
+ * changed then. Everything that it does not say, the environment and `axon.toml` do.
  */
-typedef struct axon_client_t {
+typedef struct axon_session_options_t {
     /**
-     * 0 where it is none.
+     * The interface that the program was compiled against.
      */
-    uint64_t id;
-} axon_client_t;
+    uint32_t abi;
+    /**
+     * 0 to 232, or AXON_DOMAIN_ENVIRONMENT.
+     */
+    uint32_t domain;
+    /**
+     * AXON_DISCOVERY_*: how far a daemon looks that this session starts.
+     */
+    uint32_t discovery;
+    /**
+     * 0.
+     */
+    uint32_t reserved;
+    /**
+     * Addresses or host names of other hosts, for any discovery but AXON_DISCOVERY_ENVIRONMENT.
+     */
+    const char *const *static_peers;
+    /**
+     * How many there are.
+     */
+    size_t static_peer_count;
+    /**
+     * Shown to people; null or empty: the program's name.
+     */
+    const char *name;
+    /**
+     * The daemon's program, where `AXON_DAEMON_PATH` names none; null: `axon_daemon` beside this
+     * program or the library. An `axon.toml` beside it is read.
+     */
+    const char *daemon_path;
+} axon_session_options_t;
 
 /**
  * What to wait for: arrays of handles, each of which may be empty, and then null. A handle that is
@@ -670,6 +757,103 @@ extern "C" {
 #endif // __cplusplus
 
 /**
+ * A client of a node: `topic` in the options is the service's name. When it returns, the client is
+ * matched with those servers that the graph shows, unless they take longer than 50 ms.
+ *
+ * Returns as `axon_session_publisher_create`.
+ *
+ * # Safety
+ * `options` points to options whose pointers point to what they say; `client` points to room for a
+ * handle.
+ */
+axon_ret_t axon_session_client_create(struct axon_node_t node,
+                                      const struct axon_endpoint_options_t *options,
+                                      struct axon_client_t *client);
+
+/**
+ * Ends a client. Its callback has returned, and is not called any more, when this returns.
+ */
+axon_ret_t axon_session_client_destroy(struct axon_client_t client);
+
+/**
+ * What the client is: its GID, and the profile that it has for requests and for responses. Null
+ * where one is not wanted.
+ *
+ * # Safety
+ * `gid` and `qos` are null or point to room for one.
+ */
+axon_ret_t axon_session_client_describe(struct axon_client_t client,
+                                        struct axon_gid_t *gid,
+                                        struct axon_qos_t *qos);
+
+/**
+ * How many servers a request that is sent now reaches, and whose responses reach the client: the
+ * service is available where there is one.
+ *
+ * # Safety
+ * `count` points to room for a number.
+ */
+axon_ret_t axon_session_client_matched(struct axon_client_t client, size_t *count);
+
+/**
+ * Blocks until the service is available, for at most `timeout` nanoseconds (negative: for ever):
+ * AXON_RET_TIMEOUT where it is not.
+ */
+axon_ret_t axon_session_client_wait_available(struct axon_client_t client, int64_t timeout);
+
+/**
+ * Sends a request of `len` bytes at `data`, which are copied, to every server that is there, and
+ * stores its number, from 1, at `sequence`, which may be null. Where there is no server, nobody will
+ * answer.
+ *
+ * May block for 100 ms where a server does not take its requests: AXON_RET_TIMEOUT when it made no
+ * room. The rest is as for `axon_session_publisher_publish`.
+ *
+ * # Safety
+ * `data` points to `len` bytes, or is null and `len` 0; `sequence` is null or points to room for a
+ * number.
+ */
+axon_ret_t axon_session_client_request(struct axon_client_t client,
+                                       const uint8_t *data,
+                                       size_t len,
+                                       uint64_t *sequence);
+
+/**
+ * Copies the next response to where `room` says, as `axon_session_subscription_take`. The
+ * publication's number in `info` is that of the request.
+ *
+ * # Safety
+ * As there.
+ */
+axon_ret_t axon_session_client_take(struct axon_client_t client,
+                                    axon_room_t room,
+                                    void *user,
+                                    struct axon_message_info_t *info,
+                                    uint8_t *taken);
+
+/**
+ * Takes the next response in place, as `axon_session_subscription_take_sample`.
+ *
+ * # Safety
+ * As there.
+ */
+axon_ret_t axon_session_client_take_sample(struct axon_client_t client,
+                                           struct axon_sample_t *sample,
+                                           const uint8_t **data,
+                                           size_t *len,
+                                           struct axon_message_info_t *info);
+
+/**
+ * Has `callback` told of new responses, as `axon_session_subscription_set_callback`.
+ *
+ * # Safety
+ * As there.
+ */
+axon_ret_t axon_session_client_set_callback(struct axon_client_t client,
+                                            axon_callback_t callback,
+                                            const void *user);
+
+/**
  * What went wrong in the last call of this thread that failed: what, of which topic and node, why,
  * and what to do. Empty where none has. The text stands until the next call that fails in this
  * thread; it is null in a thread that is ending.
@@ -725,6 +909,58 @@ axon_ret_t axon_session_event_take(struct axon_event_t event, struct axon_event_
 axon_ret_t axon_session_event_set_callback(struct axon_event_t event,
                                            axon_callback_t callback,
                                            const void *user);
+
+/**
+ * Calls `visitor` with every node of the graph, in order of namespace and name: as often as nodes of
+ * one name are there. What it is given stands until it returns; no lock is held meanwhile.
+ *
+ * # Safety
+ * `visitor` may be called with `user`.
+ */
+axon_ret_t axon_session_graph_nodes(struct axon_session_t session,
+                                    axon_node_visitor_t visitor,
+                                    void *user);
+
+/**
+ * Calls `visitor` with the names that endpoints of these kinds (the sum of AXON_KIND_*) have, in
+ * order, each with its types: of all endpoints, or, where `node` is not null, of those of the node of
+ * this name and namespace.
+ *
+ * AXON_RET_NO_NODE: there is none.
+ *
+ * # Safety
+ * `node` and `namespace_` are strings, or `node` is null; `visitor` may be called with `user`.
+ */
+axon_ret_t axon_session_graph_names(struct axon_session_t session,
+                                    uint32_t kinds,
+                                    const char *node,
+                                    const char *namespace_,
+                                    axon_name_visitor_t visitor,
+                                    void *user);
+
+/**
+ * Calls `visitor` with every endpoint of a kind (AXON_KIND_*) under a topic's or service's name.
+ *
+ * # Safety
+ * `topic` is a string; `visitor` may be called with `user`.
+ */
+axon_ret_t axon_session_graph_endpoints(struct axon_session_t session,
+                                        uint32_t kind,
+                                        const char *topic,
+                                        axon_endpoint_visitor_t visitor,
+                                        void *user);
+
+/**
+ * How many endpoints of a kind (AXON_KIND_*) are under a topic's or service's name. One that is
+ * counted is one that gets data.
+ *
+ * # Safety
+ * `topic` is a string; `count` points to room for a number.
+ */
+axon_ret_t axon_session_graph_count(struct axon_session_t session,
+                                    uint32_t kind,
+                                    const char *topic,
+                                    size_t *count);
 
 /**
  * Lends `len` bytes to be written and then published: in shared memory where they are more than
@@ -767,6 +1003,103 @@ axon_ret_t axon_session_loan_abandon(struct axon_loan_t loan);
 uint32_t axon_session_abi(void);
 
 /**
+ * A client of a node: `topic` in the options is the service's name. When it returns, the client is
+ * matched with those servers that the graph shows, unless they take longer than 50 ms.
+ *
+ * Returns as `axon_session_publisher_create`.
+ *
+ * # Safety
+ * `options` points to options whose pointers point to what they say; `client` points to room for a
+ * handle.
+ */
+axon_ret_t axon_session_client_create(struct axon_node_t node,
+                                      const struct axon_endpoint_options_t *options,
+                                      struct axon_client_t *client);
+
+/**
+ * Ends a client. Its callback has returned, and is not called any more, when this returns.
+ */
+axon_ret_t axon_session_client_destroy(struct axon_client_t client);
+
+/**
+ * What the client is: its GID, and the profile that it has for requests and for responses. Null
+ * where one is not wanted.
+ *
+ * # Safety
+ * `gid` and `qos` are null or point to room for one.
+ */
+axon_ret_t axon_session_client_describe(struct axon_client_t client,
+                                        struct axon_gid_t *gid,
+                                        struct axon_qos_t *qos);
+
+/**
+ * How many servers a request that is sent now reaches, and whose responses reach the client: the
+ * service is available where there is one.
+ *
+ * # Safety
+ * `count` points to room for a number.
+ */
+axon_ret_t axon_session_client_matched(struct axon_client_t client, size_t *count);
+
+/**
+ * Blocks until the service is available, for at most `timeout` nanoseconds (negative: for ever):
+ * AXON_RET_TIMEOUT where it is not.
+ */
+axon_ret_t axon_session_client_wait_available(struct axon_client_t client, int64_t timeout);
+
+/**
+ * Sends a request of `len` bytes at `data`, which are copied, to every server that is there, and
+ * stores its number, from 1, at `sequence`, which may be null. Where there is no server, nobody will
+ * answer.
+ *
+ * May block for 100 ms where a server does not take its requests: AXON_RET_TIMEOUT when it made no
+ * room. The rest is as for `axon_session_publisher_publish`.
+ *
+ * # Safety
+ * `data` points to `len` bytes, or is null and `len` 0; `sequence` is null or points to room for a
+ * number.
+ */
+axon_ret_t axon_session_client_request(struct axon_client_t client,
+                                       const uint8_t *data,
+                                       size_t len,
+                                       uint64_t *sequence);
+
+/**
+ * Copies the next response to where `room` says, as `axon_session_subscription_take`. The
+ * publication's number in `info` is that of the request.
+ *
+ * # Safety
+ * As there.
+ */
+axon_ret_t axon_session_client_take(struct axon_client_t client,
+                                    axon_room_t room,
+                                    void *user,
+                                    struct axon_message_info_t *info,
+                                    uint8_t *taken);
+
+/**
+ * Takes the next response in place, as `axon_session_subscription_take_sample`.
+ *
+ * # Safety
+ * As there.
+ */
+axon_ret_t axon_session_client_take_sample(struct axon_client_t client,
+                                           struct axon_sample_t *sample,
+                                           const uint8_t **data,
+                                           size_t *len,
+                                           struct axon_message_info_t *info);
+
+/**
+ * Has `callback` told of new responses, as `axon_session_subscription_set_callback`.
+ *
+ * # Safety
+ * As there.
+ */
+axon_ret_t axon_session_client_set_callback(struct axon_client_t client,
+                                            axon_callback_t callback,
+                                            const void *user);
+
+/**
  * What went wrong in the last call of this thread that failed: what, of which topic and node, why,
  * and what to do. Empty where none has. The text stands until the next call that fails in this
  * thread; it is null in a thread that is ending.
@@ -822,6 +1155,58 @@ axon_ret_t axon_session_event_take(struct axon_event_t event, struct axon_event_
 axon_ret_t axon_session_event_set_callback(struct axon_event_t event,
                                            axon_callback_t callback,
                                            const void *user);
+
+/**
+ * Calls `visitor` with every node of the graph, in order of namespace and name: as often as nodes of
+ * one name are there. What it is given stands until it returns; no lock is held meanwhile.
+ *
+ * # Safety
+ * `visitor` may be called with `user`.
+ */
+axon_ret_t axon_session_graph_nodes(struct axon_session_t session,
+                                    axon_node_visitor_t visitor,
+                                    void *user);
+
+/**
+ * Calls `visitor` with the names that endpoints of these kinds (the sum of AXON_KIND_*) have, in
+ * order, each with its types: of all endpoints, or, where `node` is not null, of those of the node of
+ * this name and namespace.
+ *
+ * AXON_RET_NO_NODE: there is none.
+ *
+ * # Safety
+ * `node` and `namespace_` are strings, or `node` is null; `visitor` may be called with `user`.
+ */
+axon_ret_t axon_session_graph_names(struct axon_session_t session,
+                                    uint32_t kinds,
+                                    const char *node,
+                                    const char *namespace_,
+                                    axon_name_visitor_t visitor,
+                                    void *user);
+
+/**
+ * Calls `visitor` with every endpoint of a kind (AXON_KIND_*) under a topic's or service's name.
+ *
+ * # Safety
+ * `topic` is a string; `visitor` may be called with `user`.
+ */
+axon_ret_t axon_session_graph_endpoints(struct axon_session_t session,
+                                        uint32_t kind,
+                                        const char *topic,
+                                        axon_endpoint_visitor_t visitor,
+                                        void *user);
+
+/**
+ * How many endpoints of a kind (AXON_KIND_*) are under a topic's or service's name. One that is
+ * counted is one that gets data.
+ *
+ * # Safety
+ * `topic` is a string; `count` points to room for a number.
+ */
+axon_ret_t axon_session_graph_count(struct axon_session_t session,
+                                    uint32_t kind,
+                                    const char *topic,
+                                    size_t *count);
 
 /**
  * Lends `len` bytes to be written and then published: in shared memory where they are more than
@@ -966,6 +1351,14 @@ axon_ret_t axon_session_publisher_wait_matched(struct axon_publisher_t publisher
                                                int64_t timeout);
 
 /**
+ * Blocks until every sample published so far is acknowledged, for at most `timeout` nanoseconds
+ * (negative: for ever): AXON_RET_TIMEOUT where one is not. A sample that is to be read on this host is
+ * so at once, and one for another host when the daemon has taken it over.
+ */
+axon_ret_t axon_session_publisher_wait_acknowledged(struct axon_publisher_t publisher,
+                                                    int64_t timeout);
+
+/**
  * Says that the publisher is alive. Where its liveliness is MANUAL_BY_TOPIC, so does every
  * publication; where it is AUTOMATIC, its session says so.
  */
@@ -991,6 +1384,96 @@ axon_ret_t axon_session_qos_check(const struct axon_qos_t *offered,
  * that number. It stands for ever.
  */
 const char *axon_session_policy_name(uint32_t policy);
+
+/**
+ * A server of a node: `topic` in the options is the service's name. Requests and responses are
+ * never dropped to make room, whatever the history. When it returns, the server is matched with
+ * those clients that the graph shows, unless they take longer than 50 ms.
+ *
+ * Returns as `axon_session_publisher_create`.
+ *
+ * # Safety
+ * `options` points to options whose pointers point to what they say; `server` points to room for a
+ * handle.
+ */
+axon_ret_t axon_session_server_create(struct axon_node_t node,
+                                      const struct axon_endpoint_options_t *options,
+                                      struct axon_server_t *server);
+
+/**
+ * Ends a server. Its callback has returned, and is not called any more, when this returns.
+ */
+axon_ret_t axon_session_server_destroy(struct axon_server_t server);
+
+/**
+ * What the server is: its GID, and the profile that it has for requests and for responses. Null
+ * where one is not wanted.
+ *
+ * # Safety
+ * `gid` and `qos` are null or point to room for one.
+ */
+axon_ret_t axon_session_server_describe(struct axon_server_t server,
+                                        struct axon_gid_t *gid,
+                                        struct axon_qos_t *qos);
+
+/**
+ * How many clients reach the server, and are reached by it.
+ *
+ * # Safety
+ * `count` points to room for a number.
+ */
+axon_ret_t axon_session_server_matched(struct axon_server_t server, size_t *count);
+
+/**
+ * Copies the next request to where `room` says, as `axon_session_subscription_take`. The sender and
+ * the publication's number in `info` are what the response must carry.
+ *
+ * # Safety
+ * As there.
+ */
+axon_ret_t axon_session_server_take(struct axon_server_t server,
+                                    axon_room_t room,
+                                    void *user,
+                                    struct axon_message_info_t *info,
+                                    uint8_t *taken);
+
+/**
+ * Takes the next request in place, as `axon_session_subscription_take_sample`.
+ *
+ * # Safety
+ * As there.
+ */
+axon_ret_t axon_session_server_take_sample(struct axon_server_t server,
+                                           struct axon_sample_t *sample,
+                                           const uint8_t **data,
+                                           size_t *len,
+                                           struct axon_message_info_t *info);
+
+/**
+ * Answers request `sequence` of `client` with `len` bytes at `data`, which are copied. Nobody else
+ * receives it. A client that is gone is no error.
+ *
+ * May block for 100 ms where the client does not take its responses: AXON_RET_TIMEOUT when it made no
+ * room. The rest is as for `axon_session_publisher_publish`.
+ *
+ * # Safety
+ * `client` points to a GID; `data` points to `len` bytes, or is null and `len` 0.
+ */
+axon_ret_t axon_session_server_respond(struct axon_server_t server,
+                                       const struct axon_gid_t *client,
+                                       uint64_t sequence,
+                                       const uint8_t *data,
+                                       size_t len);
+
+/**
+ * Has `callback` told of new requests, as `axon_session_subscription_set_callback`.
+ *
+ * # Safety
+ * As there.
+ */
+axon_ret_t axon_session_server_set_callback(struct axon_server_t server,
+                                            axon_callback_t callback,
+                                            const void *user);
 
 /**
  * Fills options in with what is usual. `abi` is the program's AXON_SESSION_ABI: AXON_RET_ABI where
@@ -1316,6 +1799,14 @@ axon_ret_t axon_session_publisher_wait_matched(struct axon_publisher_t publisher
                                                int64_t timeout);
 
 /**
+ * Blocks until every sample published so far is acknowledged, for at most `timeout` nanoseconds
+ * (negative: for ever): AXON_RET_TIMEOUT where one is not. A sample that is to be read on this host is
+ * so at once, and one for another host when the daemon has taken it over.
+ */
+axon_ret_t axon_session_publisher_wait_acknowledged(struct axon_publisher_t publisher,
+                                                    int64_t timeout);
+
+/**
  * Says that the publisher is alive. Where its liveliness is MANUAL_BY_TOPIC, so does every
  * publication; where it is AUTOMATIC, its session says so.
  */
@@ -1341,6 +1832,96 @@ axon_ret_t axon_session_qos_check(const struct axon_qos_t *offered,
  * that number. It stands for ever.
  */
 const char *axon_session_policy_name(uint32_t policy);
+
+/**
+ * A server of a node: `topic` in the options is the service's name. Requests and responses are
+ * never dropped to make room, whatever the history. When it returns, the server is matched with
+ * those clients that the graph shows, unless they take longer than 50 ms.
+ *
+ * Returns as `axon_session_publisher_create`.
+ *
+ * # Safety
+ * `options` points to options whose pointers point to what they say; `server` points to room for a
+ * handle.
+ */
+axon_ret_t axon_session_server_create(struct axon_node_t node,
+                                      const struct axon_endpoint_options_t *options,
+                                      struct axon_server_t *server);
+
+/**
+ * Ends a server. Its callback has returned, and is not called any more, when this returns.
+ */
+axon_ret_t axon_session_server_destroy(struct axon_server_t server);
+
+/**
+ * What the server is: its GID, and the profile that it has for requests and for responses. Null
+ * where one is not wanted.
+ *
+ * # Safety
+ * `gid` and `qos` are null or point to room for one.
+ */
+axon_ret_t axon_session_server_describe(struct axon_server_t server,
+                                        struct axon_gid_t *gid,
+                                        struct axon_qos_t *qos);
+
+/**
+ * How many clients reach the server, and are reached by it.
+ *
+ * # Safety
+ * `count` points to room for a number.
+ */
+axon_ret_t axon_session_server_matched(struct axon_server_t server, size_t *count);
+
+/**
+ * Copies the next request to where `room` says, as `axon_session_subscription_take`. The sender and
+ * the publication's number in `info` are what the response must carry.
+ *
+ * # Safety
+ * As there.
+ */
+axon_ret_t axon_session_server_take(struct axon_server_t server,
+                                    axon_room_t room,
+                                    void *user,
+                                    struct axon_message_info_t *info,
+                                    uint8_t *taken);
+
+/**
+ * Takes the next request in place, as `axon_session_subscription_take_sample`.
+ *
+ * # Safety
+ * As there.
+ */
+axon_ret_t axon_session_server_take_sample(struct axon_server_t server,
+                                           struct axon_sample_t *sample,
+                                           const uint8_t **data,
+                                           size_t *len,
+                                           struct axon_message_info_t *info);
+
+/**
+ * Answers request `sequence` of `client` with `len` bytes at `data`, which are copied. Nobody else
+ * receives it. A client that is gone is no error.
+ *
+ * May block for 100 ms where the client does not take its responses: AXON_RET_TIMEOUT when it made no
+ * room. The rest is as for `axon_session_publisher_publish`.
+ *
+ * # Safety
+ * `client` points to a GID; `data` points to `len` bytes, or is null and `len` 0.
+ */
+axon_ret_t axon_session_server_respond(struct axon_server_t server,
+                                       const struct axon_gid_t *client,
+                                       uint64_t sequence,
+                                       const uint8_t *data,
+                                       size_t len);
+
+/**
+ * Has `callback` told of new requests, as `axon_session_subscription_set_callback`.
+ *
+ * # Safety
+ * As there.
+ */
+axon_ret_t axon_session_server_set_callback(struct axon_server_t server,
+                                            axon_callback_t callback,
+                                            const void *user);
 
 /**
  * Fills options in with what is usual. `abi` is the program's AXON_SESSION_ABI: AXON_RET_ABI where

@@ -16,15 +16,18 @@
 #![allow(unsafe_code, non_camel_case_types)]
 
 mod callback;
+mod client;
 mod endpoint;
 mod error;
 mod event;
+mod graph;
 mod handle;
 mod loan;
 mod memory;
 mod node;
 mod publisher;
 mod qos;
+mod server;
 mod session;
 mod subscription;
 mod table;
@@ -33,14 +36,17 @@ mod wait;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 pub use callback::*;
+pub use client::*;
 pub use endpoint::*;
 pub use error::*;
 pub use event::*;
+pub use graph::*;
 pub use handle::*;
 pub use loan::*;
 pub use node::*;
 pub use publisher::*;
 pub use qos::*;
+pub use server::*;
 pub use session::*;
 pub use subscription::*;
 pub use wait::*;

@@ -158,6 +158,23 @@ pub extern "C" fn axon_session_publisher_wait_matched(
     })
 }
 
+/// Blocks until every sample published so far is acknowledged, for at most `timeout` nanoseconds
+/// (negative: for ever): AXON_RET_TIMEOUT where one is not. A sample that is to be read on this host is
+/// so at once, and one for another host when the daemon has taken it over.
+#[unsafe(no_mangle)]
+pub extern "C" fn axon_session_publisher_wait_acknowledged(
+    publisher: axon_publisher_t,
+    timeout: i64,
+) -> axon_ret_t {
+    guarded(|| {
+        let publisher = named(publisher)?;
+        if publisher.wait_acknowledged(duration(timeout)) {
+            return Ok(());
+        }
+        Err(Failure::timeout("a sample is not acknowledged").of_endpoint(publisher.endpoint()))
+    })
+}
+
 /// Says that the publisher is alive. Where its liveliness is MANUAL_BY_TOPIC, so does every
 /// publication; where it is AUTOMATIC, its session says so.
 #[unsafe(no_mangle)]

@@ -160,7 +160,7 @@ pub unsafe extern "C" fn axon_session_subscription_take(
         let subscription = named(subscription)?;
         // SAFETY: the caller's word.
         let place = unsafe { Place::new(room, user, info, taken) }?;
-        place.put(subscription.take_sample(), subscription.endpoint())
+        place.put(|| subscription.take_sample(), subscription.endpoint())
     })
 }
 
@@ -282,9 +282,10 @@ impl Place {
     /// Copies what was taken there.
     pub(super) fn put(
         self,
-        message: Option<(MessageInfo, Sample)>,
+        take: impl FnOnce() -> Option<(MessageInfo, Sample)>,
         endpoint: &Endpoint,
     ) -> Result<(), Failure> {
+        let message = take();
         let found = message.is_some();
         if let Some((info, sample)) = message {
             let len = sample.len();

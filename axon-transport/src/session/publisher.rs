@@ -5,7 +5,7 @@ use std::{
     fmt, io,
     ops::{Deref, DerefMut},
     sync::{Arc, Mutex, MutexGuard, PoisonError},
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use super::{
@@ -98,6 +98,25 @@ impl Publisher {
             self.writer.assert(clock::monotonic());
         }
         Ok(())
+    }
+
+    /// Waits until every sample published so far is acknowledged; whether it is. One that is to be
+    /// read on this host is so at once, and one for another host when the daemon has taken it over.
+    pub fn wait_acknowledged(&self, timeout: Duration) -> bool {
+        let deadline = Instant::now().checked_add(timeout);
+        let (published, mut taken) = self.writer.handed_over();
+        let mut pause = Duration::from_micros(200);
+        while taken < published && !self.session.is_forked() {
+            let left = deadline.map(|deadline| deadline.saturating_duration_since(Instant::now()));
+            if left.is_some_and(|left| left.is_zero()) {
+                return false;
+            }
+            // Nobody tells a publisher what was taken, and few ask.
+            std::thread::sleep(left.map_or(pause, |left| pause.min(left)));
+            pause = (2 * pause).min(Duration::from_millis(10));
+            taken = self.writer.handed_over().1;
+        }
+        true
     }
 
     /// One of its events; `None` where `kind` is a subscription's.

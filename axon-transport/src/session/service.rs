@@ -10,12 +10,12 @@ use super::{
     MessageInfo, OnNew, Session, SessionError, clock,
     publisher::PublisherInner,
     rings::Lanes,
-    subscription::{SubscriptionInner, recv_from, take_from},
+    subscription::{SubscriptionInner, recv_from, take_from, take_sample_from},
 };
 use crate::{
     graph::Endpoint,
     ids::Gid,
-    shm::{Meta, PublishError, Reader, ShmError, Writer},
+    shm::{Meta, PublishError, Reader, Sample, ShmError, Writer},
 };
 
 /// How long a response waits for a client whose request came before it could be answered.
@@ -87,6 +87,12 @@ impl Server {
     pub fn take_request(&self, out: &mut Vec<u8>) -> Option<MessageInfo> {
         let take = |reader: &mut Reader| Ok(reader.take(out)?.map(|taken| (taken.meta, ())));
         take_from(&self.requests, &self.session, take).map(|(info, ())| info)
+    }
+
+    /// As [`take_request`](Self::take_request), in place, as
+    /// [`Subscription::take_sample`](super::Subscription::take_sample).
+    pub fn take_request_sample(&self) -> Option<(MessageInfo, Sample)> {
+        take_sample_from(&self.requests, &self.session)
     }
 
     /// As [`take_request`](Self::take_request), after waiting for at most `timeout`.
@@ -202,6 +208,12 @@ impl Client {
     pub fn take_response(&self, out: &mut Vec<u8>) -> Option<MessageInfo> {
         let take = |reader: &mut Reader| Ok(reader.take(out)?.map(|taken| (taken.meta, ())));
         take_from(&self.responses, &self.session, take).map(|(info, ())| info)
+    }
+
+    /// As [`take_response`](Self::take_response), in place, as
+    /// [`Subscription::take_sample`](super::Subscription::take_sample).
+    pub fn take_response_sample(&self) -> Option<(MessageInfo, Sample)> {
+        take_sample_from(&self.responses, &self.session)
     }
 
     /// As [`take_response`](Self::take_response), after waiting for at most `timeout`.

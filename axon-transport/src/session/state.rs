@@ -242,15 +242,18 @@ impl Shared {
     pub(super) fn listen_no_more(&self) {
         let mut listening = self.listening.lock().unwrap_or_else(PoisonError::into_inner);
         listening.0 -= 1;
-        if listening.0 == 0 {
-            listening.1 = None;
-        }
         drop(listening);
         self.wake();
     }
 
+    /// For the control thread, which has nothing left of what this gave it before.
     pub(super) fn listening(&self) -> Option<Arc<ExternalLeader>> {
-        self.listening.lock().unwrap_or_else(PoisonError::into_inner).1.clone()
+        let mut listening = self.listening.lock().unwrap_or_else(PoisonError::into_inner);
+        if listening.0 == 0 {
+            // Here, where it ends at once: whoever listens next would find that one leads still.
+            listening.1 = None;
+        }
+        listening.1.clone()
     }
 
     /// Has those who wait look again then.

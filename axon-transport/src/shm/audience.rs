@@ -257,6 +257,12 @@ impl Audience {
         cursors.filter_map(|reader| reader.cursor(head)).min().unwrap_or(head)
     }
 
+    /// Below this every reader that stands for others, elsewhere, has taken what it wanted.
+    pub(super) fn handed_over(&self, head: u64) -> u64 {
+        let relays = self.readers.iter().filter(|reader| !reader.dead && reader.info.is_relay());
+        relays.filter_map(|reader| reader.cursor(head)).min().unwrap_or(head)
+    }
+
     /// The reader that has most to take of those that hold `tail`, and the sessions of all these.
     pub(super) fn laggards(&self, tail: u64, head: u64) -> Option<(Gid, Vec<Arc<PeerSession>>)> {
         let mut worst = None;

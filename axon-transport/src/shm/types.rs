@@ -34,6 +34,13 @@ pub struct ReaderInfo {
     pub stands_for: Vec<Gid>,
 }
 
+impl ReaderInfo {
+    /// Whether it reads for subscriptions elsewhere.
+    pub(super) fn is_relay(&self) -> bool {
+        !self.stands_for.is_empty()
+    }
+}
+
 /// What a reader is given when it attaches.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Grant {

@@ -3,6 +3,7 @@
 
 #include <pthread.h>
 #include <signal.h>
+#include <unistd.h>
 
 static axon_guard_t signalled;
 
@@ -95,6 +96,11 @@ static void add(const void *user, size_t count) {
     *(size_t *)user += count;
 }
 
+/* On the session's thread. */
+static void hear(const void *user, size_t count) {
+    __atomic_fetch_add((size_t *)user, count, __ATOMIC_SEQ_CST);
+}
+
 void case_events(void) {
     struct place place = open_place("events");
     axon_endpoint_options_t weak = endpoint("/events");
@@ -159,6 +165,20 @@ void case_events(void) {
     OK(axon_session_subscription_set_callback(listener, add, &samples));
     OK(axon_session_subscription_set_callback(listener, NULL, NULL));
     CHECK(samples == 3);
+    /* As often as one likes, also while the session's thread still listens for the last one. */
+    static size_t heard;
+    for (int i = 0; i < 50; i++) {
+        struct message message;
+        while (take(listener, &message)) {
+        }
+        OK(axon_session_subscription_set_callback(listener, hear, &heard));
+        size_t before = __atomic_load_n(&heard, __ATOMIC_SEQ_CST);
+        OK(axon_session_publisher_publish(talker, (const uint8_t *)"x", 1, AXON_TIME_NOW, NULL));
+        while (__atomic_load_n(&heard, __ATOMIC_SEQ_CST) == before) {
+            usleep(100);
+        }
+        OK(axon_session_subscription_set_callback(listener, NULL, NULL));
+    }
     OK(axon_session_event_set_callback(matched, add, &told));
     OK(axon_session_event_destroy(matched));
     NO_HANDLE(axon_session_event_take(matched, &status));

@@ -70,11 +70,7 @@ impl Subscription {
     /// As [`take`](Self::take), but a sample of more than 4 KiB stays in the publisher's memory for
     /// as long as it is kept, unless `AXON_SHM_COPY` asks for copies.
     pub fn take_sample(&self) -> Option<(MessageInfo, Sample)> {
-        let copy = self.session.shared().config.shm_copy;
-        take_from(&self.inner, &self.session, |reader| {
-            let sample = if copy { reader.take_copy() } else { reader.take_sample() };
-            Ok(sample?.map(|sample| (sample.meta(), sample)))
-        })
+        take_sample_from(&self.inner, &self.session)
     }
 
     /// As [`take`](Self::take), after waiting for a sample for at most `timeout`.
@@ -177,6 +173,18 @@ impl Drop for Subscription {
         }
         self.session.forget_endpoint(&self.gid());
     }
+}
+
+/// The oldest of what one may take, in place.
+pub(super) fn take_sample_from(
+    inner: &SubscriptionInner,
+    session: &Session,
+) -> Option<(MessageInfo, Sample)> {
+    let copy = session.shared().config.shm_copy;
+    take_from(inner, session, |reader| {
+        let sample = if copy { reader.take_copy() } else { reader.take_sample() };
+        Ok(sample?.map(|sample| (sample.meta(), sample)))
+    })
 }
 
 /// The oldest of what one may take.

@@ -1,0 +1,233 @@
+//! What one asks of the graph.
+
+use std::{
+    ffi::{CString, c_void},
+    os::raw::c_char,
+};
+
+use super::{
+    endpoint::axon_gid_t,
+    error::{AXON_RET_NO_NODE, Failure, axon_ret_t},
+    guarded,
+    handle::{axon_session_t, named},
+    memory::{store, text},
+    qos::axon_qos_t,
+};
+use crate::graph::{EndpointKind, GraphEntry};
+
+/// A kind of endpoint: publishers.
+pub const AXON_KIND_PUBLISHER: u32 = 1;
+/// Subscriptions.
+pub const AXON_KIND_SUBSCRIPTION: u32 = 2;
+/// Servers.
+pub const AXON_KIND_SERVER: u32 = 4;
+/// Clients.
+pub const AXON_KIND_CLIENT: u32 = 8;
+
+/// An endpoint of the graph. What it points to stands during the call that it is given to.
+#[repr(C)]
+#[derive(Clone, Copy, Debug)]
+pub struct axon_endpoint_t {
+    /// Its GID.
+    pub gid: axon_gid_t,
+    /// AXON_KIND_*.
+    pub kind: u32,
+    /// 1 where it is on another host, else 0.
+    pub remote: u32,
+    /// The name of its topic or service.
+    pub topic: *const c_char,
+    /// The type's name.
+    pub type_name: *const c_char,
+    /// The type's hash.
+    pub type_hash: *const u8,
+    /// 0 where it is not known.
+    pub type_hash_size: usize,
+    /// What it offers or requests.
+    pub qos: axon_qos_t,
+    /// The node that it belongs to; empty where it belongs to none.
+    pub node: *const c_char,
+    /// That node's namespace.
+    pub namespace_: *const c_char,
+}
+
+/// Told of a node.
+pub type axon_node_visitor_t = Option<
+    unsafe extern "C" fn(
+        user: *mut c_void,
+        name: *const c_char,
+        namespace_: *const c_char,
+        enclave: *const c_char,
+    ),
+>;
+
+/// Told of a topic or service and the types that its endpoints have, of which there is at least one.
+pub type axon_name_visitor_t = Option<
+    unsafe extern "C" fn(
+        user: *mut c_void,
+        name: *const c_char,
+        types: *const *const c_char,
+        type_count: usize,
+    ),
+>;
+
+/// Told of an endpoint.
+pub type axon_endpoint_visitor_t =
+    Option<unsafe extern "C" fn(user: *mut c_void, endpoint: *const axon_endpoint_t)>;
+
+/// Calls `visitor` with every node of the graph, in order of namespace and name: as often as nodes of
+/// one name are there. What it is given stands until it returns; no lock is held meanwhile.
+///
+/// # Safety
+/// `visitor` may be called with `user`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn axon_session_graph_nodes(
+    session: axon_session_t,
+    visitor: axon_node_visitor_t,
+    user: *mut c_void,
+) -> axon_ret_t {
+    guarded(|| {
+        let visitor = visitor.ok_or_else(no_visitor)?;
+        for node in named(session)?.graph().nodes() {
+            let (name, namespace) = (string(&node.name)?, string(&node.namespace)?);
+            let enclave = string(&node.enclave)?;
+            // SAFETY: the caller's word; the strings stand until it returns.
+            unsafe { visitor(user, name.as_ptr(), namespace.as_ptr(), enclave.as_ptr()) };
+        }
+        Ok(())
+    })
+}
+
+/// Calls `visitor` with the names that endpoints of these kinds (the sum of AXON_KIND_*) have, in
+/// order, each with its types: of all endpoints, or, where `node` is not null, of those of the node of
+/// this name and namespace.
+///
+/// AXON_RET_NO_NODE: there is none.
+///
+/// # Safety
+/// `node` and `namespace_` are strings, or `node` is null; `visitor` may be called with `user`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn axon_session_graph_names(
+    session: axon_session_t,
+    kinds: u32,
+    node: *const c_char,
+    namespace_: *const c_char,
+    visitor: axon_name_visitor_t,
+    user: *mut c_void,
+) -> axon_ret_t {
+    guarded(|| {
+        let visitor = visitor.ok_or_else(no_visitor)?;
+        let kinds = of_sum(kinds)?;
+        let graph = named(session)?.graph();
+        let names = if node.is_null() {
+            graph.names_and_types(&kinds)
+        } else {
+            // SAFETY: the caller's word.
+            let node = unsafe { text(node, "the node's name") }?;
+            // SAFETY: the caller's word.
+            let namespace = unsafe { text(namespace_, "the node's namespace") }?;
+            graph.names_and_types_of(node, namespace, &kinds).ok_or_else(|| {
+                let text = format_args!("there is no node {node} in namespace {namespace}");
+                Failure::new(AXON_RET_NO_NODE, text)
+            })?
+        };
+        for (name, types) in names {
+            let name = string(&name)?;
+            let types = types.iter().map(|one| string(one)).collect::<Result<Vec<_>, _>>()?;
+            let types: Vec<*const c_char> = types.iter().map(|one| one.as_ptr()).collect();
+            // SAFETY: the caller's word; the strings stand until it returns.
+            unsafe { visitor(user, name.as_ptr(), types.as_ptr(), types.len()) };
+        }
+        Ok(())
+    })
+}
+
+/// Calls `visitor` with every endpoint of a kind (AXON_KIND_*) under a topic's or service's name.
+///
+/// # Safety
+/// `topic` is a string; `visitor` may be called with `user`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn axon_session_graph_endpoints(
+    session: axon_session_t,
+    kind: u32,
+    topic: *const c_char,
+    visitor: axon_endpoint_visitor_t,
+    user: *mut c_void,
+) -> axon_ret_t {
+    guarded(|| {
+        let visitor = visitor.ok_or_else(no_visitor)?;
+        let known = of_number(kind)?;
+        // SAFETY: the caller's word.
+        let topic = unsafe { text(topic, "the topic") }?;
+        let graph = named(session)?.graph();
+        for GraphEntry { endpoint, daemon } in graph.endpoints_of(known, topic) {
+            let (name, type_name) = (string(&endpoint.topic)?, string(&endpoint.type_name)?);
+            let (node, namespace) = (string(&endpoint.node)?, string(&endpoint.namespace)?);
+            let shown = axon_endpoint_t {
+                gid: endpoint.gid.into(),
+                kind,
+                remote: u32::from(daemon.is_some()),
+                topic: name.as_ptr(),
+                type_name: type_name.as_ptr(),
+                type_hash: endpoint.type_hash.as_ptr(),
+                type_hash_size: endpoint.type_hash.len(),
+                qos: axon_qos_t::from(&endpoint.qos),
+                node: node.as_ptr(),
+                namespace_: namespace.as_ptr(),
+            };
+            // SAFETY: the caller's word; what it points to stands until it returns.
+            unsafe { visitor(user, &raw const shown) };
+        }
+        Ok(())
+    })
+}
+
+/// How many endpoints of a kind (AXON_KIND_*) are under a topic's or service's name. One that is
+/// counted is one that gets data.
+///
+/// # Safety
+/// `topic` is a string; `count` points to room for a number.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn axon_session_graph_count(
+    session: axon_session_t,
+    kind: u32,
+    topic: *const c_char,
+    count: *mut usize,
+) -> axon_ret_t {
+    guarded(|| {
+        let kind = of_number(kind)?;
+        // SAFETY: the caller's word.
+        let topic = unsafe { text(topic, "the topic") }?;
+        let found = named(session)?.graph().count(kind, topic);
+        // SAFETY: the caller's word.
+        unsafe { store(count, found, "the place of the number") }
+    })
+}
+
+const KINDS: [(u32, EndpointKind); 4] = [
+    (AXON_KIND_PUBLISHER, EndpointKind::Publisher),
+    (AXON_KIND_SUBSCRIPTION, EndpointKind::Subscription),
+    (AXON_KIND_SERVER, EndpointKind::Server),
+    (AXON_KIND_CLIENT, EndpointKind::Client),
+];
+
+fn of_number(number: u32) -> Result<EndpointKind, Failure> {
+    let found = KINDS.iter().find(|(of, _)| *of == number).map(|(_, kind)| *kind);
+    found.ok_or_else(|| Failure::argument(format_args!("there is no kind of endpoint {number}")))
+}
+
+fn of_sum(sum: u32) -> Result<Vec<EndpointKind>, Failure> {
+    let all = KINDS.iter().fold(0, |all, (of, _)| all | of);
+    if sum == 0 || sum & !all != 0 {
+        return Err(Failure::argument(format_args!("{sum} is no sum of kinds of endpoints")));
+    }
+    Ok(KINDS.iter().filter(|(of, _)| sum & of != 0).map(|(_, kind)| *kind).collect())
+}
+
+fn no_visitor() -> Failure {
+    Failure::argument("the visitor is null")
+}
+
+/// Names of the graph hold no 0: every one of them was checked when it came.
+fn string(text: &str) -> Result<CString, Failure> {
+    CString::new(text).map_err(|_| Failure::argument("a name in the graph holds a NUL"))
+}
