@@ -4,7 +4,7 @@
 
 use super::{
     classes,
-    layout::{self, COPIED, SLOTS_AT},
+    layout::{self, COPIED_ALWAYS, SLOTS_AT},
     pins::RECORDS,
 };
 
@@ -33,8 +33,8 @@ impl Allowance {
 
     /// For samples of up to `len` bytes, rounded down.
     fn at_most(len: u64) -> Self {
-        // Samples of up to `COPIED` bytes are never pinned.
-        if len > COPIED { Self { power: len.ilog2() } } else { Self::NONE }
+        // Shorter samples are never pinned.
+        if len > COPIED_ALWAYS { Self { power: len.ilog2() } } else { Self::NONE }
     }
 
     pub(super) fn of(generation: u64) -> Self {
@@ -101,7 +101,10 @@ mod tests {
         }
         assert_eq!(Allowance::at_most(25 * MIB).longest(), 16 * MIB);
         assert_eq!(Allowance::at_least(25 * MIB).longest(), 32 * MIB);
-        assert_eq!((Allowance::NONE.longest(), Allowance::at_most(COPIED)), (0, Allowance::NONE));
+        assert_eq!(
+            (Allowance::NONE.longest(), Allowance::at_most(COPIED_ALWAYS)),
+            (0, Allowance::NONE)
+        );
     }
 
     /// What `readers` get one after the other, each of a process of its own or all of one.
@@ -134,7 +137,7 @@ mod tests {
             let of_one = shares(pool, 5000, true);
             assert!(of_one[1] >= max_message && of_one[4999] == 0);
             let taken = of_one.iter().map(|longest| 6 * longest.min(&pool.largest)).sum();
-            assert!(pool.share(taken, 0).longest() > COPIED, "the next process has its own");
+            assert!(pool.share(taken, 0).longest() > COPIED_ALWAYS, "the next process has its own");
         }
     }
 }

@@ -15,8 +15,12 @@ pub(super) const MAX_MESSAGE: u64 = u32::MAX as u64 & !(LINE - 1);
 pub(super) const MAX_SEGMENT: u64 = 64 << 30;
 /// The most history that a ring may be asked to keep, in bytes: up to four times this is mapped.
 pub(super) const MAX_BUDGET: u64 = MAX_SEGMENT / 4;
-/// Samples of more bytes than this are pinned while they are read, others are copied out.
+/// Samples of more bytes than this are pinned while they are read, others are copied out: so that
+/// small topics do with the memory that their session has, and each reader of it maps once.
 pub(super) const COPIED: u64 = 4096;
+/// The same for loans of a publisher that has memory for large samples in any case. It costs about
+/// as much to pin a sample of so many bytes as to copy it.
+pub(super) const COPIED_ALWAYS: u64 = 512;
 /// Bytes of a sample that fit in its descriptor.
 pub(super) const INLINE: usize = 96;
 /// Lanes of a session: how many rings it can read at a time.
@@ -114,7 +118,7 @@ pub enum SegmentKind {
     Session,
     /// More room for objects.
     Heap,
-    /// Samples of more than 4 KiB of this publisher.
+    /// Large samples of this publisher.
     Samples(Gid),
 }
 

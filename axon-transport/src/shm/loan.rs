@@ -6,17 +6,17 @@ use std::{
     ptr::NonNull,
     slice,
     sync::Arc,
-    time::SystemTime,
 };
+
+use rustix::time::{ClockId, clock_gettime};
 
 use super::{
     Location, Meta, PublishError, Published, Writer,
-    layout::COPIED,
     segments::OwnSegment,
     writer::{Numbering, PATIENCE, Patience, Payload},
 };
 
-/// Memory to be filled and published: shared memory where it is longer than 4 KiB. Dropping
+/// Memory to be filled and published: shared memory where such a sample is read in place. Dropping
 /// it gives it back.
 ///
 /// Written from the front through [`io::Write`], or anywhere as the slice that it dereferences to;
@@ -157,7 +157,7 @@ impl<'a> Loan<'a> {
         }
         let lent = self.len;
         let payload = match &self.memory {
-            Memory::Shared(place) if len as u64 > COPIED => {
+            Memory::Shared(place) if len as u64 > self.writer.longest_copied() => {
                 Payload::Written { at: place.location(), len, lent }
             }
             // What has become short is copied from where it was written.
@@ -248,7 +248,6 @@ impl Drop for Loan<'_> {
 
 /// Nanoseconds since the Unix epoch.
 pub(super) fn now() -> i64 {
-    SystemTime::now()
-        .duration_since(SystemTime::UNIX_EPOCH)
-        .map_or(0, |since| i64::try_from(since.as_nanos()).unwrap_or(i64::MAX))
+    let now = clock_gettime(ClockId::Realtime);
+    now.tv_sec.saturating_mul(1_000_000_000).saturating_add(now.tv_nsec).max(0)
 }

@@ -1,7 +1,8 @@
 //! Shared memory between the processes of one host. Each session has a segment of memory, a sealed
 //! memfd that holds the words by which it is woken, the rings of its publishers, their samples of up
 //! to 4 KiB, and its readers' cursors and pins. A publisher of longer samples has a segment for
-//! them, and a session that needs more room has further ones. Others map what they read from.
+//! them (and for loans of more than 512 bytes, if it [expects](PublisherOptions::expected_len)
+//! such), and a session that needs more room has further ones. Others map what they read from.
 //!
 //! ```
 //! use std::{os::unix::net::UnixDatagram, thread, time::Duration};
@@ -43,9 +44,9 @@
 //! Every shared word has exactly one writer process; there is no lock, reference count or
 //! compare-and-swap between processes, so a process that dies leaves only its own pages stale.
 //! Readers map read-only. What another process wrote is hostile input: layouts are checked and
-//! copied when they are mapped, and each word is read once and range-checked. Samples of up to
-//! 4 KiB are copied by atomic words, with a check afterwards that they were not overwritten
-//! meanwhile; longer ones are pinned, so that their publisher leaves them alone. A publisher waits
+//! copied when they are mapped, and each word is read once and range-checked. Samples in
+//! a session's segment are copied, with a check afterwards that they were not overwritten
+//! meanwhile; those in a publisher's own are pinned, so that it leaves them alone. A publisher waits
 //! for no reader but one that is, like itself, RELIABLE and KEEP_ALL.
 //!
 //! Who does what when: a publisher calls [`Publisher::reap`] now and then to forget subscribers that

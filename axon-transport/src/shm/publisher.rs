@@ -47,8 +47,10 @@ impl PublisherOptions {
         Self { max_len, ..self }
     }
 
-    /// The length of most samples in bytes. Where it is more than 4 KiB, subscribers get the memory
-    /// for such samples when they connect, and not with the first of them.
+    /// The length of most samples in bytes. Where it is more than 512, the publisher has memory of
+    /// its own for samples from the start: subscribers get it when they connect, and [loans](Publisher::loan)
+    /// of more than 512 bytes are in place there, like all samples of more than 4 KiB. Otherwise only
+    /// the latter are, in memory that comes with the first of them.
     #[must_use]
     pub fn expected_len(self, expected_len: u64) -> Self {
         Self { expected_len, ..self }
@@ -202,7 +204,8 @@ impl Publisher {
     }
 
     /// Memory for a sample of `len` bytes, to be filled and then published: shared memory where it
-    /// is more than 4 KiB, so that nothing is copied.
+    /// is more than 4 KiB, or more than 512 bytes if [so many are
+    /// expected](PublisherOptions::expected_len), so that nothing is copied.
     ///
     /// # Errors
     /// As for [`publish`](Self::publish).
@@ -212,7 +215,7 @@ impl Publisher {
         loan
     }
 
-    /// Has memory ready for one more sample as long as the last of more than 4 KiB, so that
+    /// Has memory ready for one more sample as long as the last that was in place, so that
     /// publishing it waits for none. For a thread that has time between samples.
     ///
     /// # Errors
@@ -223,7 +226,7 @@ impl Publisher {
         prepared
     }
 
-    /// Gives memory back that samples of more than 4 KiB took and that is not needed any more: all
+    /// Gives memory back that samples in place took and that is not needed any more: all
     /// of it ten seconds after the last that anybody wants, else what is more than four times what
     /// was needed for as long. To be called about once a second for as long as it returns true.
     pub fn tend(&self) -> bool {

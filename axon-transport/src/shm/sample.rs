@@ -11,7 +11,7 @@ use std::{
 
 use super::{Meta, Taken, attachment::Pin, copy, memory::Map};
 
-/// A sample, in the publisher's memory where it is longer than 4 KiB, else in a copy.
+/// A sample, in the publisher's memory where it is long enough for that to pay, else in a copy.
 ///
 /// It stays as it was published for as long as this value lives, also after the subscription, the
 /// publisher and its process have ended; only then may the publisher use the memory again, which

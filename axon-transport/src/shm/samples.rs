@@ -9,7 +9,7 @@ use std::{
 use super::{
     PublishError, ShmError, Writer,
     history::Held,
-    layout::{self, COPIED, Location, SLOTS_AT},
+    layout::{self, COPIED_ALWAYS, Location, SLOTS_AT},
     loan::Place,
     pins::{self, RECORDS},
     ring,
@@ -133,9 +133,9 @@ impl Writer {
         Ok(())
     }
 
-    /// Takes `bytes`, more than [`COPIED`], that no reader reads.
+    /// Takes `bytes`, more than [`COPIED_ALWAYS`], that no reader reads.
     pub(super) fn lend(&self, state: &mut State, bytes: u64) -> Result<Place, Refusal> {
-        debug_assert!(bytes > COPIED);
+        debug_assert!(bytes > COPIED_ALWAYS);
         self.open_samples(state).map_err(no_memory)?;
         if let Some(place) = self.next_turn(state, bytes) {
             return Ok(place);

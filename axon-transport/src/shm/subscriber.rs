@@ -174,8 +174,9 @@ impl Subscriber {
         self.reader.writer()
     }
 
-    /// The next sample, or `None` when there is none. Never waits. One of more than 4 KiB stays in
-    /// the publisher's memory for as long as it is kept.
+    /// The next sample, or `None` when there is none. Never waits. One of more than 4 KiB, or a loan of
+    /// more than 512 bytes if its publisher [expects](super::PublisherOptions::expected_len) such,
+    /// stays in the publisher's memory for as long as it is kept.
     ///
     /// Where more is unread than the requested depth, the oldest are [skipped](Self::skipped).
     ///
@@ -227,7 +228,7 @@ impl Subscriber {
     }
 
     /// Lets go of memory that the publisher gave up. To be called about once a second where samples
-    /// of more than 4 KiB are taken now and then; [`recv`](Self::recv) does it while it waits.
+    /// in place are taken now and then; [`recv`](Self::recv) does it while it waits.
     pub fn tend(&self) {
         self.hear();
     }

@@ -14,8 +14,9 @@ pub struct RingOptions {
     pub budget: u64,
     /// The largest sample in bytes.
     pub max_message: u64,
-    /// The length in bytes that is expected of samples. Where it is more than 4 KiB, readers have
-    /// the memory for such samples before the first of them comes.
+    /// The length in bytes that is expected of samples. Where it is more than 512, readers have
+    /// memory of the publisher's own before the first of them comes, in which there are all
+    /// samples of more than 4 KiB, and loans of more than 512 bytes.
     pub expected: u64,
 }
 

@@ -16,9 +16,10 @@ use super::{Channel, End, Load, Medium, Motion, Result, Side, agree, stamp};
 const PATIENCE: Option<Duration> = Some(Duration::from_secs(60));
 /// As `Subscriber::recv` sleeps.
 const LONGEST_SLEEP: Option<Duration> = Some(Duration::from_secs(1));
-/// Up to here a sample is copied in any case, so that `publish` and `take_into` are the shorter
-/// way.
+/// Up to here what is published is copied in any case, so that `take_into` is the shorter way.
 const COPIED: usize = 4096;
+/// Up to here what is loaned is copied, too, so that `publish` is the shorter way.
+const LOANS_COPIED: usize = 512;
 
 /// `axon_transport::shm` without a daemon, RELIABLE and KEEP_LAST.
 pub(crate) struct Axon;
@@ -54,14 +55,15 @@ impl Medium for Axon {
                 subscriber
             }
         };
-        let in_place = load.size > COPIED;
+        let loans = load.motion == Motion::Touch && load.size > LOANS_COPIED;
+        let in_place = loans || load.size > COPIED;
         Ok(Box::new(AxonEnd {
             publisher,
             subscriber,
             context,
             size: load.size,
             sleeps: load.wake.sleeps(),
-            loans: in_place && load.motion == Motion::Touch,
+            loans,
             copies: !in_place || load.motion == Motion::Copy,
             out: vec![0x5a; load.size],
             into: Vec::with_capacity(load.size),

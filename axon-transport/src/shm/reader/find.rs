@@ -9,7 +9,7 @@ use std::{
 use super::{ATTEMPTS, Descriptors, KNOWN, MISSING, Missing, Obstacle, Reader};
 use crate::shm::{
     TakeError, copy,
-    layout::{self, Array, COPIED},
+    layout::{self, Array, COPIED, COPIED_ALWAYS},
     memory::Map,
     peer::Found,
     ring::{self, Look, Place, Record, State},
@@ -47,13 +47,13 @@ impl Reader {
     fn find_sane(&mut self) -> Result<Option<Record>, Obstacle> {
         for _ in 0..ATTEMPTS {
             let word = ring::array(self.attachment.ring());
-            let known = self.descriptors.take().filter(|known| known.word == word);
-            let known = match known {
-                Some(known) => known,
-                None => self.resolve(word)?,
-            };
+            if self.descriptors.as_ref().is_none_or(|known| known.word != word) {
+                self.descriptors = None;
+                self.descriptors = Some(self.resolve(word)?);
+            }
+            let Some(descriptors) = &self.descriptors else { return Ok(None) };
             let (cursor, depth) = (self.cursor, self.reads.depth);
-            let view = self.descriptors.insert(known).view(&self.attachment);
+            let view = descriptors.view(&self.attachment);
             match view.state(cursor) {
                 State::Ahead if cursor >= self.seen => return Ok(None),
                 State::Here => {
@@ -158,7 +158,7 @@ impl Reader {
             Place::Slot(at) => (at, true),
         };
         let len = u64::from(record.len);
-        if slot != (len > COPIED) {
+        if slot && len <= COPIED_ALWAYS || !slot && len > COPIED {
             return Err(Obstacle::Corrupt("a sample is in the wrong kind of place"));
         }
         let known = self.maps.iter().find(|(number, _)| *number == at.segment);

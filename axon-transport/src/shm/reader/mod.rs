@@ -256,7 +256,7 @@ impl Reader {
         Ok(None)
     }
 
-    /// As [`take`](Self::take), but a sample of more than 4 KiB stays where it is.
+    /// As [`take`](Self::take), but a large sample stays where it is.
     ///
     /// # Errors
     /// As for [`take`](Self::take).

@@ -344,7 +344,7 @@ fn samples_in_places_that_make_no_sense_are_reported() {
         (u32::MAX, 2, BLOCK),
         // Too long to be copied, too short to be pinned, nowhere.
         (4097, 1, BLOCK),
-        (4096, 2, BLOCK),
+        (512, 2, BLOCK),
         (1, 3, BLOCK),
         (1, 0xff, BLOCK),
     ];

@@ -76,6 +76,35 @@ fn small_samples_are_copies() {
 }
 
 #[test]
+fn who_expects_them_has_shorter_loans_in_place() {
+    let (a, b) = (session(), session());
+    let gid = Gid::new(a.id(), 1);
+    let options =
+        RingOptions { gid, qos: keep_last(10), budget: 1 << 20, max_message: MAX, expected: 513 };
+    let writer = Writer::create(a.clone(), options).unwrap();
+    let mut readers = [&a, &b].map(|session| attach(&writer, &a, session, keep_last(10)));
+    let lens = [0, 96, 512, 513, 4096, 4097].map(|len| [(len, true), (len, false)]);
+    for (sequence, (len, loaned)) in lens.into_iter().flatten().enumerate() {
+        let meta = meta(sequence as u64);
+        let bytes = pattern(meta.sequence, len);
+        if loaned {
+            let mut loan = writer.loan(len).unwrap();
+            loan.copy_from_slice(&bytes);
+            loan.publish(meta).unwrap();
+        } else {
+            writer.publish(meta, &bytes).unwrap();
+        }
+        let mut copy = Vec::new();
+        readers[0].take(&mut copy).unwrap().unwrap();
+        assert_eq!(copy, bytes);
+        let sample = take(&mut readers[1]);
+        let longest = if loaned { 512 } else { 4096 };
+        assert_eq!((sample.is_borrowed(), sample.len()), (len > longest, len));
+        intact(&sample);
+    }
+}
+
+#[test]
 fn nothing_that_ends_ends_a_sample_in_use() {
     let (a, b) = (session(), session());
     let writer = writer(&a, keep_last(1), 0);

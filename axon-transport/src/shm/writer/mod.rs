@@ -14,7 +14,7 @@ use super::{
     audience::Audience,
     heap::{Need, Object},
     history::History,
-    layout::{self, Array, COPIED},
+    layout::{self, Array, COPIED, COPIED_ALWAYS},
     loan::Lender,
     orphans::Orphan,
     pi_mutex::{PiGuard, PiMutex},
@@ -190,7 +190,7 @@ impl Writer {
         let writer = Self { options, session, ring, limit, state: PiMutex::new(state)? };
         writer.add_bytes(layout::RING + descriptors * layout::DESCRIPTOR);
         writer.show_window(&writer.lock());
-        if expected > COPIED {
+        if expected > COPIED_ALWAYS {
             writer.open_samples(&mut writer.lock())?;
         }
         Ok(writer)
@@ -326,7 +326,7 @@ impl Writer {
     }
 
     /// Lends `len` bytes to be written and then published: of shared memory where it is more than
-    /// 4 KiB. May wait as [`publish`](Self::publish) does.
+    /// 4 KiB, or 512 bytes if so many are [expected](RingOptions::expected). May wait as [`publish`](Self::publish) does.
     ///
     /// # Errors
     /// As [`publish`](Self::publish).
@@ -339,9 +339,14 @@ impl Writer {
         self.lend_to(Lender::Shared(Arc::clone(self)), len)
     }
 
+    /// The longest loan in bytes that is copied after all.
+    pub(super) fn longest_copied(&self) -> u64 {
+        if self.options.expected > COPIED_ALWAYS { COPIED_ALWAYS } else { COPIED }
+    }
+
     fn lend_to<'a>(&self, lender: Lender<'a>, len: usize) -> Result<Loan<'a>, PublishError> {
         let bytes = self.check(len)?;
-        if len as u64 <= COPIED {
+        if len as u64 <= self.longest_copied() {
             return Ok(Loan::copied(lender, len));
         }
         let place =
