@@ -1,5 +1,4 @@
-// Copyright 2026 The AXON authors
-// SPDX-License-Identifier: Apache-2.0
+// SPDX-License-Identifier: MIT OR Apache-2.0
 
 // The codec against the streams of another implementation (Fast-CDR behind rosidl's generated code), in C
 // and in C++, and against streams that nobody should send.

@@ -1,5 +1,4 @@
-// Copyright 2026 The AXON authors
-// SPDX-License-Identifier: Apache-2.0
+// SPDX-License-Identifier: MIT OR Apache-2.0
 
 // Messages to CDR streams and back: plain CDR (OMG DDSI-RTPS 2.5, clause 10.2; Common Data Representation,
 // CORBA 3.3 part 2, clause 9.3) behind its encapsulation header of four bytes. Written in the machine's

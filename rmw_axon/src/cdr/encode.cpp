@@ -1,5 +1,4 @@
-// Copyright 2026 The AXON authors
-// SPDX-License-Identifier: Apache-2.0
+// SPDX-License-Identifier: MIT OR Apache-2.0
 
 #include <cfloat>
 #include <cstring>

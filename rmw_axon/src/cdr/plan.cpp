@@ -1,5 +1,4 @@
-// Copyright 2026 The AXON authors
-// SPDX-License-Identifier: Apache-2.0
+// SPDX-License-Identifier: MIT OR Apache-2.0
 
 #include "cdr/plan.hpp"
 
@@ -232,6 +231,8 @@ Plan build(const Members & members)
   find_runs(plan.fields);
   for (const Field & field : plan.fields) {
     plan.least += least_of(field);
+    const size_t alignment = field.message ? field.message->alignment : field.alignment;
+    plan.alignment = std::max(plan.alignment, alignment);
   }
   if (all_fixed(plan)) {
     plan.plain = true;

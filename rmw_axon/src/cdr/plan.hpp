@@ -1,5 +1,4 @@
-// Copyright 2026 The AXON authors
-// SPDX-License-Identifier: Apache-2.0
+// SPDX-License-Identifier: MIT OR Apache-2.0
 
 // How a message lies in memory and how it lies in a CDR stream, worked out once per type from its
 // introspection, in C and in C++. Encoding and decoding walk a plan; no generated code takes part.
@@ -82,6 +81,8 @@ struct Plan
   // As `ros2 interface show` takes it: std_msgs/msg/String
   std::string type;
   size_t size_of = 0;
+  // Of a plain type: where a message may lie.
+  size_t alignment = 1;
   std::vector<Field> fields;
   // The fewest bytes that one can have in a stream. At least 1.
   size_t least = 0;

@@ -1,0 +1,40 @@
+// SPDX-License-Identifier: MIT OR Apache-2.0
+
+// What the ROS distributions differ in, read off their headers: Humble (rmw 6.1), Iron (7.1), Jazzy (7.3),
+// Kilted (7.8), Lyrical and Rolling. Nothing else in this package asks which one it is built for.
+
+#ifndef FEATURES_HPP_
+#define FEATURES_HPP_
+
+#include "rmw/rmw.h"
+
+// Iron: discovery options instead of localhost_only, best-available policies, type hashes, matched and
+// incompatible-type events, clients' GIDs, counts of clients and services.
+#if __has_include("rmw/discovery_options.h")
+#define AXON_RMW_IRON 1
+#else
+#define AXON_RMW_IRON 0
+#endif
+
+// Iron to Jazzy: localhost_only is there beside the discovery options. Humble: alone.
+#if __has_include("rmw/localhost.h")
+#define AXON_RMW_LOCALHOST_ONLY 1
+#else
+#define AXON_RMW_LOCALHOST_ONLY 0
+#endif
+
+// Messages of types that are known at run time only.
+#if __has_include("rmw/dynamic_message_type_support.h")
+#define AXON_RMW_DYNAMIC_MESSAGES 1
+#else
+#define AXON_RMW_DYNAMIC_MESSAGES 0
+#endif
+
+// Lyrical: what is known of every client and server of a service.
+#if __has_include("rmw/get_service_endpoint_info.h")
+#define AXON_RMW_SERVICE_ENDPOINT_INFO 1
+#else
+#define AXON_RMW_SERVICE_ENDPOINT_INFO 0
+#endif
+
+#endif  // FEATURES_HPP_

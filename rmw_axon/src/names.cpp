@@ -1,0 +1,55 @@
+// SPDX-License-Identifier: MIT OR Apache-2.0
+
+#include "names.hpp"
+
+#include "error.hpp"
+#include "rmw/validate_full_topic_name.h"
+
+namespace rmw_axon
+{
+
+namespace
+{
+
+std::string full_name(const char * name, const char * what)
+{
+  int result = RMW_TOPIC_VALID;
+  if (rmw_validate_full_topic_name(name, &result, nullptr) != RMW_RET_OK) {
+    throw Failure(RMW_RET_ERROR, std::string(what) + " '" + name + "' could not be validated");
+  }
+  if (result != RMW_TOPIC_VALID) {
+    const char * reason = rmw_full_topic_name_validation_result_string(result);
+    throw Failure(
+            RMW_RET_INVALID_ARGUMENT,
+            std::string(what) + " '" + name + "' is no full name: " + reason);
+  }
+  return name;
+}
+
+}  // namespace
+
+std::string topic_name(const char * name, bool avoid_ros_namespace_conventions)
+{
+  require(name, "topic_name");
+  if (!avoid_ros_namespace_conventions) {
+    return full_name(name, "topic");
+  }
+  const std::string bare = name[0] == '/' ? name + 1 : name;
+  if (bare.empty()) {
+    throw Failure(RMW_RET_INVALID_ARGUMENT, "topic_name is empty");
+  }
+  return bare;
+}
+
+std::string service_name(const char * name)
+{
+  require(name, "service_name");
+  return full_name(name, "service");
+}
+
+bool is_ros_name(const char * topic)
+{
+  return topic[0] == '/';
+}
+
+}  // namespace rmw_axon
