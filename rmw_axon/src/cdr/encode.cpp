@@ -14,6 +14,19 @@ namespace rmw_axon::cdr
 namespace
 {
 
+[[noreturn, gnu::cold, gnu::noinline]] void changed()
+{
+  throw Error("the message changed while it was written");
+}
+
+[[noreturn, gnu::cold, gnu::noinline]] void too_long(
+  const Field & field, size_t length, size_t most, const char * what)
+{
+  throw Error(
+          std::string(field.name) + ": " + std::to_string(length) + " " + what + ", at most " +
+          std::to_string(most) + " are allowed");
+}
+
 size_t aligned(size_t position, size_t alignment)
 {
   return (position + alignment - 1) & ~(alignment - 1);
@@ -61,7 +74,7 @@ private:
   {
     // A message that another thread makes longer while it is published.
     if (size > capacity_ - position_) {
-      throw Error("the message changed while it was written");
+      changed();
     }
     uint8_t * at = body_ + position_;
     position_ += size;
@@ -84,7 +97,7 @@ template<typename Sink>
 void put_length(Sink & sink, size_t length, const Field & field)
 {
   if (length > std::numeric_limits<uint32_t>::max()) {
-    throw Error(std::string(field.name) + ": too long for CDR, which counts to 2^32 - 1");
+    too_long(field, length, std::numeric_limits<uint32_t>::max(), "items");
   }
   put(sink, static_cast<uint32_t>(length));
 }
@@ -92,9 +105,7 @@ void put_length(Sink & sink, size_t length, const Field & field)
 void check(size_t length, size_t most, const char * what, const Field & field)
 {
   if (length > most) {
-    throw Error(
-            std::string(field.name) + ": " + std::to_string(length) + " " + what + ", at most " +
-            std::to_string(most) + " are allowed");
+    too_long(field, length, most, what);
   }
 }
 
@@ -108,6 +119,13 @@ void put_long_doubles(Sink & sink, const uint8_t * from, size_t count, const Fie
     sink.copy(from + i * field.stride, value);
     sink.zeros(field.width - value);
   }
+}
+
+// Whether messages that lie one after another are written by one copy: no byte is between their fields,
+// where something of the program's might be that is nobody's business.
+bool dense(const Plan & plan)
+{
+  return plan.plain && plan.fields.front().run_bytes == plan.size_of;
 }
 
 template<typename In, typename Sink>
@@ -152,6 +170,10 @@ void put_items(const Field & field, const uint8_t * from, size_t count, Sink & s
       }
       return;
     case Item::Message:
+      if (dense(*field.message) && sink.position() % field.message->alignment == 0) {
+        sink.copy(from, count * field.stride);
+        return;
+      }
       for (size_t i = 0; i < count; ++i) {
         put_message<In>(*field.message, from + i * field.stride, sink);
       }
@@ -184,7 +206,7 @@ void put_message(const Plan & plan, const uint8_t * message, Sink & sink)
     const Field & field = plan.fields[i];
     if (field.run_fields > 1) {
       sink.align(field.alignment);
-      if (sink.position() % field.run_alignment == field.offset % field.run_alignment) {
+      if (((sink.position() ^ field.offset) & (field.run_alignment - 1)) == 0) {
         sink.copy(message + field.offset, field.run_bytes);
         i += field.run_fields;
         continue;
