@@ -68,6 +68,12 @@ Client::~Client()
   axon_session_client_destroy(handle);
 }
 
+std::string label(const char * what, const char * name, const Node & node)
+{
+  const char * slash = node.name_space == "/" ? "" : "/";
+  return std::string(what) + " " + name + " (node " + node.name_space + slash + node.name + ")";
+}
+
 Publisher & publisher_of(const rmw_publisher_t * publisher)
 {
   require_object(publisher, "publisher");

@@ -62,6 +62,7 @@ struct Publisher
   rmw_qos_profile_t qos{};
   cdr::Plan plan;
   std::string topic;
+  std::string label;
   EventSources events;
   // Messages that are lent, by where they lie.
   std::mutex loans_mutex;
@@ -77,6 +78,7 @@ struct Subscription
   rmw_qos_profile_t qos{};
   cdr::Plan plan;
   std::string topic;
+  std::string label;
   EventSources events;
   // Messages that are lent, by where they lie: a sample in place, or 0 where it is a copy.
   std::mutex loans_mutex;
@@ -92,6 +94,7 @@ struct Service
   rmw_qos_profile_t qos{};
   cdr::ServicePlans plans;
   std::string name;
+  std::string label;
 
   ~Service();
 };
@@ -104,9 +107,13 @@ struct Client
   rmw_qos_profile_t qos{};
   cdr::ServicePlans plans;
   std::string name;
+  std::string label;
 
   ~Client();
 };
+
+// How errors speak of an endpoint: topic /scan (node /robot/lidar)
+std::string label(const char * what, const char * name, const Node & node);
 
 // What is behind rmw's, judged as every function that is given one must.
 Publisher & publisher_of(const rmw_publisher_t * publisher);

@@ -21,7 +21,7 @@ void require_plain(const Publisher & publisher)
 {
   if (!publisher.plan.plain) {
     throw Failure(
-            RMW_RET_UNSUPPORTED, "topic " + publisher.topic + ": a " + publisher.plan.type +
+            RMW_RET_UNSUPPORTED, publisher.label + ": a " + publisher.plan.type +
             " is not of a fixed size and cannot be lent");
   }
 }
@@ -33,7 +33,7 @@ axon_loan_t take_off(Publisher & publisher, void * message)
   const auto found = publisher.loans.find(message);
   if (found == publisher.loans.end()) {
     throw Failure(
-            RMW_RET_INVALID_ARGUMENT, "topic " + publisher.topic + ": the message is not lent");
+            RMW_RET_INVALID_ARGUMENT, publisher.label + ": the message is not lent");
   }
   const axon_loan_t loan = found->second;
   publisher.loans.erase(found);

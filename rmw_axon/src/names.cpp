@@ -26,25 +26,28 @@ std::string full_name(const char * name, const char * what)
   return name;
 }
 
+// The name of one that is no ROS name: without the slash in front.
+std::string bare(const char * name, const char * what)
+{
+  const std::string without = name[0] == '/' ? name + 1 : name;
+  if (without.empty()) {
+    throw Failure(RMW_RET_INVALID_ARGUMENT, std::string(what) + " is empty");
+  }
+  return without;
+}
+
 }  // namespace
 
 std::string topic_name(const char * name, bool avoid_ros_namespace_conventions)
 {
   require(name, "topic_name");
-  if (!avoid_ros_namespace_conventions) {
-    return full_name(name, "topic");
-  }
-  const std::string bare = name[0] == '/' ? name + 1 : name;
-  if (bare.empty()) {
-    throw Failure(RMW_RET_INVALID_ARGUMENT, "topic_name is empty");
-  }
-  return bare;
+  return avoid_ros_namespace_conventions ? bare(name, "topic_name") : full_name(name, "topic");
 }
 
-std::string service_name(const char * name)
+std::string service_name(const char * name, bool avoid_ros_namespace_conventions)
 {
   require(name, "service_name");
-  return full_name(name, "service");
+  return avoid_ros_namespace_conventions ? bare(name, "service_name") : full_name(name, "service");
 }
 
 bool is_ros_name(const char * topic)

@@ -92,6 +92,7 @@ rmw_publisher_t * rmw_create_publisher(
       publisher->qos = rmw_axon::from_core(qos);
       publisher->qos.avoid_ros_namespace_conventions = avoid;
       publisher->topic = topic_name;
+      publisher->label = rmw_axon::label("topic", topic_name, of);
       publisher->rmw.implementation_identifier = rmw_axon::identifier;
       publisher->rmw.data = publisher.get();
       publisher->rmw.topic_name = publisher->topic.c_str();
@@ -120,7 +121,7 @@ rmw_ret_t rmw_publish(
       try {
         rmw_axon::publish(of, ros_message);
       } catch (const rmw_axon::cdr::Error & error) {
-        throw Failure(RMW_RET_ERROR, "topic " + of.topic + ", " + of.plan.type + ": " + error.what());
+        throw Failure(RMW_RET_ERROR, of.label + ", " + of.plan.type + ": " + error.what());
       }
     });
 }

@@ -62,14 +62,14 @@ uint32_t reliability(rmw_qos_reliability_policy_t policy)
 {
   switch (policy) {
     case RMW_QOS_POLICY_RELIABILITY_SYSTEM_DEFAULT:
-      return AXON_POLICY_DEFAULT;
+      return AXON_CHOICE_DEFAULT;
     case RMW_QOS_POLICY_RELIABILITY_RELIABLE:
       return AXON_RELIABILITY_RELIABLE;
     case RMW_QOS_POLICY_RELIABILITY_BEST_EFFORT:
       return AXON_RELIABILITY_BEST_EFFORT;
 #if AXON_RMW_IRON
     case RMW_QOS_POLICY_RELIABILITY_BEST_AVAILABLE:
-      return AXON_POLICY_BEST_AVAILABLE;
+      return AXON_CHOICE_BEST_AVAILABLE;
 #endif
     default:
       unknown("reliability", policy);
@@ -80,14 +80,14 @@ uint32_t durability(rmw_qos_durability_policy_t policy)
 {
   switch (policy) {
     case RMW_QOS_POLICY_DURABILITY_SYSTEM_DEFAULT:
-      return AXON_POLICY_DEFAULT;
+      return AXON_CHOICE_DEFAULT;
     case RMW_QOS_POLICY_DURABILITY_TRANSIENT_LOCAL:
       return AXON_DURABILITY_TRANSIENT_LOCAL;
     case RMW_QOS_POLICY_DURABILITY_VOLATILE:
       return AXON_DURABILITY_VOLATILE;
 #if AXON_RMW_IRON
     case RMW_QOS_POLICY_DURABILITY_BEST_AVAILABLE:
-      return AXON_POLICY_BEST_AVAILABLE;
+      return AXON_CHOICE_BEST_AVAILABLE;
 #endif
     default:
       unknown("durability", policy);
@@ -98,7 +98,7 @@ uint32_t history(rmw_qos_history_policy_t policy)
 {
   switch (policy) {
     case RMW_QOS_POLICY_HISTORY_SYSTEM_DEFAULT:
-      return AXON_POLICY_DEFAULT;
+      return AXON_CHOICE_DEFAULT;
     case RMW_QOS_POLICY_HISTORY_KEEP_LAST:
       return AXON_HISTORY_KEEP_LAST;
     case RMW_QOS_POLICY_HISTORY_KEEP_ALL:
@@ -112,14 +112,14 @@ uint32_t liveliness(rmw_qos_liveliness_policy_t policy)
 {
   switch (policy) {
     case RMW_QOS_POLICY_LIVELINESS_SYSTEM_DEFAULT:
-      return AXON_POLICY_DEFAULT;
+      return AXON_CHOICE_DEFAULT;
     case RMW_QOS_POLICY_LIVELINESS_AUTOMATIC:
       return AXON_LIVELINESS_AUTOMATIC;
     case RMW_QOS_POLICY_LIVELINESS_MANUAL_BY_TOPIC:
       return AXON_LIVELINESS_MANUAL_BY_TOPIC;
 #if AXON_RMW_IRON
     case RMW_QOS_POLICY_LIVELINESS_BEST_AVAILABLE:
-      return AXON_POLICY_BEST_AVAILABLE;
+      return AXON_CHOICE_BEST_AVAILABLE;
 #endif
     default:
       // MANUAL_BY_NODE among them, which ROS took back.

@@ -66,6 +66,7 @@ rmw_subscription_t * rmw_create_subscription(
       subscription->qos = rmw_axon::from_core(qos);
       subscription->qos.avoid_ros_namespace_conventions = avoid;
       subscription->topic = topic_name;
+      subscription->label = rmw_axon::label("topic", topic_name, of);
       subscription->rmw.implementation_identifier = rmw_axon::identifier;
       subscription->rmw.data = subscription.get();
       subscription->rmw.topic_name = subscription->topic.c_str();

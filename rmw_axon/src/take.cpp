@@ -13,6 +13,7 @@
 #include "error.hpp"
 #include "gid.hpp"
 #include "rmw/rmw.h"
+#include "stream.hpp"
 
 namespace rmw_axon
 {
@@ -48,13 +49,7 @@ bool take_message(Subscription & subscription, void * message, rmw_message_info_
   if (!taken) {
     return false;
   }
-  try {
-    cdr::decode(subscription.plan, taken.data, taken.size, message);
-  } catch (const cdr::Error & error) {
-    throw Failure(
-            RMW_RET_ERROR, "topic " + subscription.topic + ": a message that is no " +
-            subscription.plan.type + ": " + error.what());
-  }
+  read(subscription.plan, subscription.label, taken, message);
   fill(taken.info, info);
   return true;
 }
@@ -71,7 +66,7 @@ void take_serialized(
   }
   const rmw_ret_t resized = rmw_serialized_message_resize(into, taken.size);
   if (resized != RMW_RET_OK) {
-    throw Failure(resized, "topic " + subscription.topic + ": no memory for the serialized message");
+    throw Failure(resized, subscription.label + ": no memory for the serialized message");
   }
   std::memcpy(into->buffer, taken.data, taken.size);
   into->buffer_length = taken.size;
@@ -80,12 +75,13 @@ void take_serialized(
 }
 
 // A message of the heap with what was taken: where it cannot be looked at in place.
-void * copied(const cdr::Plan & plan, const Taken & taken)
+void * copied(const Subscription & subscription, const Taken & taken)
 {
+  const cdr::Plan & plan = subscription.plan;
   void * message = ::operator new(plan.size_of);
   plan.init(message);
   try {
-    cdr::decode(plan, taken.data, taken.size, message);
+    read(plan, subscription.label, taken, message);
   } catch (...) {
     plan.fini(message);
     ::operator delete(message);
@@ -99,7 +95,7 @@ void take_loaned(
 {
   if (!subscription.plan.plain) {
     throw Failure(
-            RMW_RET_UNSUPPORTED, "topic " + subscription.topic + ": a " + subscription.plan.type +
+            RMW_RET_UNSUPPORTED, subscription.label + ": a " + subscription.plan.type +
             " is not of a fixed size and cannot be lent");
   }
   *taken_any = false;
@@ -111,7 +107,7 @@ void take_loaned(
   auto * body = const_cast<uint8_t *>(taken.data) + cdr::HEADER;
   const bool in_place = reinterpret_cast<uintptr_t>(body) % subscription.plan.alignment == 0 &&
     cdr::readable_in_place(subscription.plan, taken.data, taken.size);
-  void * lent = in_place ? body : copied(subscription.plan, taken);
+  void * lent = in_place ? body : copied(subscription, taken);
   const axon_sample_t sample = in_place ? taken.sample : axon_sample_t{};
   try {
     const std::lock_guard<std::mutex> lock(subscription.loans_mutex);
@@ -273,12 +269,12 @@ rmw_ret_t rmw_return_loaned_message_from_subscription(
       Subscription & of = subscription_of(subscription);
       require(loaned_message, "loaned_message");
       if (!of.plan.plain) {
-        throw Failure(RMW_RET_UNSUPPORTED, "topic " + of.topic + ": its messages cannot be lent");
+        throw Failure(RMW_RET_UNSUPPORTED, of.label + ": its messages cannot be lent");
       }
       std::unique_lock<std::mutex> lock(of.loans_mutex);
       const auto found = of.loans.find(loaned_message);
       if (found == of.loans.end()) {
-        throw Failure(RMW_RET_INVALID_ARGUMENT, "topic " + of.topic + ": loaned_message is not lent");
+        throw Failure(RMW_RET_INVALID_ARGUMENT, of.label + ": loaned_message is not lent");
       }
       const axon_sample_t sample = found->second;
       of.loans.erase(found);
