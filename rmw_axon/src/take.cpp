@@ -274,7 +274,7 @@ rmw_ret_t rmw_return_loaned_message_from_subscription(
       std::unique_lock<std::mutex> lock(of.loans_mutex);
       const auto found = of.loans.find(loaned_message);
       if (found == of.loans.end()) {
-        throw Failure(RMW_RET_INVALID_ARGUMENT, of.label + ": loaned_message is not lent");
+        throw Failure(RMW_RET_ERROR, of.label + ": loaned_message is not lent");
       }
       const axon_sample_t sample = found->second;
       of.loans.erase(found);

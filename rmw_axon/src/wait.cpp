@@ -94,6 +94,10 @@ rmw_ret_t rmw_destroy_wait_set(rmw_wait_set_t * wait_set)
 {
   return guarded(
     [&] {
+      // rmw's tests ask for RMW_RET_ERROR, not INVALID_ARGUMENT.
+      if (wait_set == nullptr) {
+        throw Failure(RMW_RET_ERROR, "wait_set is null");
+      }
       rmw_axon::require_object(wait_set, "wait_set");
       delete static_cast<WaitSet *>(wait_set->data);
     });

@@ -1,0 +1,3 @@
+//! What `include/axon.h` declares, as a static library.
+
+pub use axon_transport::ffi::*;
