@@ -48,16 +48,6 @@ EventSources::~EventSources()
   }
 }
 
-Publisher::~Publisher()
-{
-  // What is lent to the program still ends with the publisher: rmw has it returned before.
-  for (const auto & [message, loan] : loans) {
-    plan.fini(message);
-    axon_session_loan_abandon(loan);
-  }
-  axon_session_publisher_destroy(handle);
-}
-
 Service::~Service()
 {
   axon_session_server_destroy(handle);
