@@ -134,9 +134,9 @@ rmw_ret_t rmw_service_server_is_available(
       rmw_axon::node_of(node);
       Client & of = client_of(client);
       require(is_available, "is_available");
-      uint8_t available = 0;
-      check(axon_session_client_available(of.handle, &available));
-      *is_available = available != 0;
+      size_t servers = 0;
+      check(axon_session_client_matched(of.handle, &servers));
+      *is_available = servers != 0;
     });
 }
 

@@ -1,0 +1,498 @@
+// SPDX-License-Identifier: MIT OR Apache-2.0
+
+// What one asks of the graph: nodes, names with their types, endpoints, counts.
+
+#include <algorithm>
+#include <exception>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "axon.h"
+#include "context.hpp"
+#include "error.hpp"
+#include "features.hpp"
+#include "gid.hpp"
+#include "names.hpp"
+#include "qos.hpp"
+#include "rcutils/strdup.h"
+#include "rcutils/types/string_array.h"
+#include "rmw/get_node_info_and_types.h"
+#include "rmw/get_service_names_and_types.h"
+#include "rmw/get_topic_endpoint_info.h"
+#include "rmw/get_topic_names_and_types.h"
+#include "rmw/names_and_types.h"
+#include "rmw/rmw.h"
+#include "rmw/sanity_checks.h"
+#include "rmw/topic_endpoint_info_array.h"
+#include "rmw/validate_namespace.h"
+#include "rmw/validate_node_name.h"
+
+namespace rmw_axon
+{
+
+namespace
+{
+
+// What the core shows one by one. No exception may leave a visitor: the first is kept, and thrown when the
+// core has returned.
+template<typename Item>
+struct Seen
+{
+  std::vector<Item> items;
+  std::exception_ptr error;
+
+  template<typename Make>
+  static void add(void * user, Make make) noexcept
+  {
+    auto & seen = *static_cast<Seen *>(user);
+    if (seen.error) {
+      return;
+    }
+    try {
+      make(seen.items);
+    } catch (...) {
+      seen.error = std::current_exception();
+    }
+  }
+
+  std::vector<Item> take()
+  {
+    if (error) {
+      std::rethrow_exception(error);
+    }
+    return std::move(items);
+  }
+};
+
+struct NodeNames
+{
+  std::string name;
+  std::string name_space;
+  std::string enclave;
+};
+
+struct NameAndTypes
+{
+  std::string name;
+  std::vector<std::string> types;
+};
+
+struct EndpointInfo
+{
+  axon_gid_t gid{};
+  axon_qos_t qos{};
+  std::string node;
+  std::string name_space;
+  std::string type;
+  std::vector<uint8_t> hash;
+};
+
+axon_session_t session_of(const Node & node)
+{
+  return node.rmw.context->impl->session;
+}
+
+std::vector<NodeNames> nodes(const Node & node)
+{
+  Seen<NodeNames> seen;
+  const auto visitor =
+    [](void * user, const char * name, const char * name_space, const char * enclave) {
+      Seen<NodeNames>::add(
+        user, [&](auto & items) {items.push_back({name, name_space, enclave});});
+    };
+  check(axon_session_graph_nodes(session_of(node), visitor, &seen));
+  return seen.take();
+}
+
+// Of one node where its name is given, else of all.
+std::vector<NameAndTypes> names(
+  const Node & node, uint32_t kinds, const char * of_node, const char * of_namespace, bool all_names)
+{
+  Seen<NameAndTypes> seen;
+  const auto visitor =
+    [](void * user, const char * name, const char * const * types, size_t count) {
+      Seen<NameAndTypes>::add(
+        user, [&](auto & items) {items.push_back({name, {types, types + count}});});
+    };
+  check(
+    axon_session_graph_names(session_of(node), kinds, of_node, of_namespace, visitor, &seen));
+  std::vector<NameAndTypes> found = seen.take();
+  if (!all_names) {
+    const auto strange = [](const NameAndTypes & one) {return !is_ros_name(one.name.c_str());};
+    found.erase(std::remove_if(found.begin(), found.end(), strange), found.end());
+  }
+  return found;
+}
+
+std::vector<EndpointInfo> endpoints(const Node & node, uint32_t kind, const std::string & topic)
+{
+  Seen<EndpointInfo> seen;
+  const auto visitor = [](void * user, const axon_endpoint_t * endpoint) {
+      Seen<EndpointInfo>::add(
+        user, [&](auto & items) {
+          items.push_back(
+            {endpoint->gid, endpoint->qos, endpoint->node, endpoint->namespace_,
+              endpoint->type_name,
+              {endpoint->type_hash, endpoint->type_hash + endpoint->type_hash_size}});
+        });
+    };
+  check(axon_session_graph_endpoints(session_of(node), kind, topic.c_str(), visitor, &seen));
+  return seen.take();
+}
+
+void require_allocator(const rcutils_allocator_t * allocator)
+{
+  require(allocator, "allocator");
+  if (!rcutils_allocator_is_valid(allocator)) {
+    throw Failure(RMW_RET_INVALID_ARGUMENT, "allocator is not one");
+  }
+}
+
+void require_empty(rmw_names_and_types_t * names_and_types, const char * name)
+{
+  require(names_and_types, name);
+  if (rmw_names_and_types_check_zero(names_and_types) != RMW_RET_OK) {
+    throw Failure(RMW_RET_INVALID_ARGUMENT, std::string(name) + " is not zero-initialised");
+  }
+}
+
+void require_node_name(const char * name, const char * name_space)
+{
+  require(name, "node_name");
+  require(name_space, "node_namespace");
+  int result = RMW_NODE_NAME_VALID;
+  if (rmw_validate_node_name(name, &result, nullptr) != RMW_RET_OK || result != RMW_NODE_NAME_VALID) {
+    throw Failure(RMW_RET_INVALID_ARGUMENT, std::string("node_name '") + name + "' is none");
+  }
+  result = RMW_NAMESPACE_VALID;
+  if (rmw_validate_namespace(name_space, &result, nullptr) != RMW_RET_OK ||
+    result != RMW_NAMESPACE_VALID)
+  {
+    throw Failure(
+            RMW_RET_INVALID_ARGUMENT, std::string("node_namespace '") + name_space + "' is none");
+  }
+}
+
+void require_done(bool done)
+{
+  if (!done) {
+    throw std::bad_alloc();
+  }
+}
+
+char * duplicate(const std::string & text, rcutils_allocator_t allocator)
+{
+  char * copy = rcutils_strdup(text.c_str(), allocator);
+  require_done(copy != nullptr);
+  return copy;
+}
+
+// Fills rmw's list in, or leaves it as it was.
+void give(
+  const std::vector<NameAndTypes> & found, rcutils_allocator_t * allocator,
+  rmw_names_and_types_t * out)
+{
+  if (found.empty()) {
+    return;
+  }
+  const rmw_ret_t made = rmw_names_and_types_init(out, found.size(), allocator);
+  if (made != RMW_RET_OK) {
+    throw Failure(made, "no memory for the names");
+  }
+  try {
+    for (size_t i = 0; i < found.size(); ++i) {
+      out->names.data[i] = duplicate(found[i].name, *allocator);
+      const auto & types = found[i].types;
+      require_done(
+        rcutils_string_array_init(&out->types[i], types.size(), allocator) == RCUTILS_RET_OK);
+      for (size_t j = 0; j < types.size(); ++j) {
+        out->types[i].data[j] = duplicate(types[j], *allocator);
+      }
+    }
+  } catch (...) {
+    (void)rmw_names_and_types_fini(out);
+    throw;
+  }
+}
+
+void names_of_node(
+  const rmw_node_t * node, rcutils_allocator_t * allocator, const char * node_name,
+  const char * node_namespace, uint32_t kind, bool all_names, rmw_names_and_types_t * out,
+  const char * out_name)
+{
+  const Node & of = node_of(node);
+  require_allocator(allocator);
+  require_node_name(node_name, node_namespace);
+  require_empty(out, out_name);
+  give(names(of, kind, node_name, node_namespace, all_names), allocator, out);
+}
+
+void fill(
+  const EndpointInfo & from, rmw_endpoint_type_t type, rcutils_allocator_t * allocator,
+  rmw_topic_endpoint_info_t * to)
+{
+  const auto done = [](rmw_ret_t returned) {require_done(returned == RMW_RET_OK);};
+  done(rmw_topic_endpoint_info_set_node_name(to, from.node.c_str(), allocator));
+  done(rmw_topic_endpoint_info_set_node_namespace(to, from.name_space.c_str(), allocator));
+  done(rmw_topic_endpoint_info_set_topic_type(to, from.type.c_str(), allocator));
+  done(rmw_topic_endpoint_info_set_endpoint_type(to, type));
+  const rmw_qos_profile_t qos = from_core(from.qos);
+  done(rmw_topic_endpoint_info_set_qos_profile(to, &qos));
+  const rmw_gid_t gid = from_core(from.gid);
+  done(rmw_topic_endpoint_info_set_gid(to, gid.data, sizeof(gid.data)));
+#if AXON_RMW_IRON
+  rosidl_type_hash_t hash = rosidl_get_zero_initialized_type_hash();
+  if (from.hash.size() == sizeof(hash.value)) {
+    hash.version = 1;
+    std::copy(from.hash.begin(), from.hash.end(), hash.value);
+  }
+  done(rmw_topic_endpoint_info_set_topic_type_hash(to, &hash));
+#endif
+}
+
+rmw_ret_t info_by_topic(
+  const rmw_node_t * node, rcutils_allocator_t * allocator, const char * topic_name,
+  bool no_mangle, uint32_t kind, rmw_endpoint_type_t type, rmw_topic_endpoint_info_array_t * out)
+{
+  return guarded(
+    [&] {
+      const Node & of = node_of(node);
+      require_allocator(allocator);
+      require(topic_name, "topic_name");
+      require(out, "the array of infos");
+      if (rmw_topic_endpoint_info_array_check_zero(out) != RMW_RET_OK) {
+        throw Failure(RMW_RET_INVALID_ARGUMENT, "the array of infos is not zero-initialised");
+      }
+      const auto found = endpoints(of, kind, no_mangle ? topic_name : rmw_axon::topic_name(topic_name, false));
+      if (found.empty()) {
+        return;
+      }
+      const rmw_ret_t made =
+      rmw_topic_endpoint_info_array_init_with_size(out, found.size(), allocator);
+      if (made != RMW_RET_OK) {
+        throw Failure(made, "no memory for the infos");
+      }
+      for (size_t i = 0; i < found.size(); ++i) {
+        out->info_array[i] = rmw_get_zero_initialized_topic_endpoint_info();
+      }
+      try {
+        for (size_t i = 0; i < found.size(); ++i) {
+          fill(found[i], type, allocator, &out->info_array[i]);
+        }
+      } catch (...) {
+        (void)rmw_topic_endpoint_info_array_fini(out, allocator);
+        throw;
+      }
+    });
+}
+
+rmw_ret_t count(const rmw_node_t * node, const char * name, uint32_t kind, size_t * count)
+{
+  return guarded(
+    [&] {
+      const Node & of = node_of(node);
+      const std::string topic = topic_name(name, false);
+      require(count, "count");
+      check(axon_session_graph_count(session_of(of), kind, topic.c_str(), count));
+    });
+}
+
+void require_zero(const rcutils_string_array_t * array, const char * name)
+{
+  require(array, name);
+  if (array->size != 0 || array->data != nullptr) {
+    throw Failure(RMW_RET_INVALID_ARGUMENT, std::string(name) + " is not zero-initialised");
+  }
+}
+
+// Node names as up to three lists, or none of them where memory is short.
+rmw_ret_t node_names(
+  const rmw_node_t * node, rcutils_string_array_t * names, rcutils_string_array_t * namespaces,
+  rcutils_string_array_t * enclaves)
+{
+  return guarded(
+    [&] {
+      const auto found = nodes(node_of(node));
+      rcutils_allocator_t allocator = rcutils_get_default_allocator();
+      const auto give = [&](rcutils_string_array_t * out, std::string NodeNames::* part) {
+        if (out == nullptr) {
+          return;
+        }
+        require_done(rcutils_string_array_init(out, found.size(), &allocator) == RCUTILS_RET_OK);
+        for (size_t i = 0; i < found.size(); ++i) {
+          out->data[i] = duplicate(found[i].*part, allocator);
+        }
+      };
+      try {
+        give(names, &NodeNames::name);
+        give(namespaces, &NodeNames::name_space);
+        give(enclaves, &NodeNames::enclave);
+      } catch (...) {
+        for (rcutils_string_array_t * out : {names, namespaces, enclaves}) {
+          if (out != nullptr && out->data != nullptr) {
+            (void)rcutils_string_array_fini(out);
+          }
+        }
+        throw;
+      }
+    });
+}
+
+}  // namespace
+
+}  // namespace rmw_axon
+
+using rmw_axon::guarded;
+using rmw_axon::node_of;
+
+extern "C" {
+
+rmw_ret_t rmw_get_node_names(
+  const rmw_node_t * node, rcutils_string_array_t * node_names,
+  rcutils_string_array_t * node_namespaces)
+{
+  const rmw_ret_t judged = guarded(
+    [&] {
+      node_of(node);
+      rmw_axon::require_zero(node_names, "node_names");
+      rmw_axon::require_zero(node_namespaces, "node_namespaces");
+    });
+  return judged != RMW_RET_OK ? judged :
+         rmw_axon::node_names(node, node_names, node_namespaces, nullptr);
+}
+
+rmw_ret_t rmw_get_node_names_with_enclaves(
+  const rmw_node_t * node, rcutils_string_array_t * node_names,
+  rcutils_string_array_t * node_namespaces, rcutils_string_array_t * enclaves)
+{
+  const rmw_ret_t judged = guarded(
+    [&] {
+      node_of(node);
+      rmw_axon::require_zero(node_names, "node_names");
+      rmw_axon::require_zero(node_namespaces, "node_namespaces");
+      rmw_axon::require_zero(enclaves, "enclaves");
+    });
+  return judged != RMW_RET_OK ? judged :
+         rmw_axon::node_names(node, node_names, node_namespaces, enclaves);
+}
+
+rmw_ret_t rmw_get_topic_names_and_types(
+  const rmw_node_t * node, rcutils_allocator_t * allocator, bool no_demangle,
+  rmw_names_and_types_t * topic_names_and_types)
+{
+  return guarded(
+    [&] {
+      const auto & of = node_of(node);
+      rmw_axon::require_allocator(allocator);
+      rmw_axon::require_empty(topic_names_and_types, "topic_names_and_types");
+      const uint32_t kinds = AXON_KIND_PUBLISHER | AXON_KIND_SUBSCRIPTION;
+      const auto found = rmw_axon::names(of, kinds, nullptr, nullptr, no_demangle);
+      rmw_axon::give(found, allocator, topic_names_and_types);
+    });
+}
+
+rmw_ret_t rmw_get_service_names_and_types(
+  const rmw_node_t * node, rcutils_allocator_t * allocator,
+  rmw_names_and_types_t * service_names_and_types)
+{
+  return guarded(
+    [&] {
+      const auto & of = node_of(node);
+      rmw_axon::require_allocator(allocator);
+      rmw_axon::require_empty(service_names_and_types, "service_names_and_types");
+      const uint32_t kinds = AXON_KIND_SERVER | AXON_KIND_CLIENT;
+      const auto found = rmw_axon::names(of, kinds, nullptr, nullptr, false);
+      rmw_axon::give(found, allocator, service_names_and_types);
+    });
+}
+
+rmw_ret_t rmw_get_publisher_names_and_types_by_node(
+  const rmw_node_t * node, rcutils_allocator_t * allocator, const char * node_name,
+  const char * node_namespace, bool no_demangle, rmw_names_and_types_t * topic_names_and_types)
+{
+  return guarded(
+    [&] {
+      rmw_axon::names_of_node(
+        node, allocator, node_name, node_namespace, AXON_KIND_PUBLISHER, no_demangle,
+        topic_names_and_types, "topic_names_and_types");
+    });
+}
+
+rmw_ret_t rmw_get_subscriber_names_and_types_by_node(
+  const rmw_node_t * node, rcutils_allocator_t * allocator, const char * node_name,
+  const char * node_namespace, bool no_demangle, rmw_names_and_types_t * topic_names_and_types)
+{
+  return guarded(
+    [&] {
+      rmw_axon::names_of_node(
+        node, allocator, node_name, node_namespace, AXON_KIND_SUBSCRIPTION, no_demangle,
+        topic_names_and_types, "topic_names_and_types");
+    });
+}
+
+rmw_ret_t rmw_get_service_names_and_types_by_node(
+  const rmw_node_t * node, rcutils_allocator_t * allocator, const char * node_name,
+  const char * node_namespace, rmw_names_and_types_t * service_names_and_types)
+{
+  return guarded(
+    [&] {
+      rmw_axon::names_of_node(
+        node, allocator, node_name, node_namespace, AXON_KIND_SERVER, false,
+        service_names_and_types, "service_names_and_types");
+    });
+}
+
+rmw_ret_t rmw_get_client_names_and_types_by_node(
+  const rmw_node_t * node, rcutils_allocator_t * allocator, const char * node_name,
+  const char * node_namespace, rmw_names_and_types_t * service_names_and_types)
+{
+  return guarded(
+    [&] {
+      rmw_axon::names_of_node(
+        node, allocator, node_name, node_namespace, AXON_KIND_CLIENT, false,
+        service_names_and_types, "service_names_and_types");
+    });
+}
+
+rmw_ret_t rmw_get_publishers_info_by_topic(
+  const rmw_node_t * node, rcutils_allocator_t * allocator, const char * topic_name,
+  bool no_mangle, rmw_topic_endpoint_info_array_t * publishers_info)
+{
+  return rmw_axon::info_by_topic(
+    node, allocator, topic_name, no_mangle, AXON_KIND_PUBLISHER, RMW_ENDPOINT_PUBLISHER,
+    publishers_info);
+}
+
+rmw_ret_t rmw_get_subscriptions_info_by_topic(
+  const rmw_node_t * node, rcutils_allocator_t * allocator, const char * topic_name,
+  bool no_mangle, rmw_topic_endpoint_info_array_t * subscriptions_info)
+{
+  return rmw_axon::info_by_topic(
+    node, allocator, topic_name, no_mangle, AXON_KIND_SUBSCRIPTION, RMW_ENDPOINT_SUBSCRIPTION,
+    subscriptions_info);
+}
+
+rmw_ret_t rmw_count_publishers(const rmw_node_t * node, const char * topic_name, size_t * count)
+{
+  return rmw_axon::count(node, topic_name, AXON_KIND_PUBLISHER, count);
+}
+
+rmw_ret_t rmw_count_subscribers(const rmw_node_t * node, const char * topic_name, size_t * count)
+{
+  return rmw_axon::count(node, topic_name, AXON_KIND_SUBSCRIPTION, count);
+}
+
+#if AXON_RMW_IRON
+rmw_ret_t rmw_count_clients(const rmw_node_t * node, const char * service_name, size_t * count)
+{
+  return rmw_axon::count(node, service_name, AXON_KIND_CLIENT, count);
+}
+
+rmw_ret_t rmw_count_services(const rmw_node_t * node, const char * service_name, size_t * count)
+{
+  return rmw_axon::count(node, service_name, AXON_KIND_SERVER, count);
+}
+#endif
+
+}
