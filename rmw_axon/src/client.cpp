@@ -13,6 +13,7 @@
 #include "stream.hpp"
 
 using rmw_axon::Client;
+using rmw_axon::Failure;
 using rmw_axon::check;
 using rmw_axon::client_of;
 using rmw_axon::guarded;
@@ -131,9 +132,12 @@ rmw_ret_t rmw_service_server_is_available(
 {
   return guarded(
     [&] {
+      // rmw's tests ask for RMW_RET_ERROR where one is null.
+      if (node == nullptr || client == nullptr || is_available == nullptr) {
+        throw Failure(RMW_RET_ERROR, "node, client or is_available is null");
+      }
       rmw_axon::node_of(node);
       Client & of = client_of(client);
-      require(is_available, "is_available");
       size_t servers = 0;
       check(axon_session_client_matched(of.handle, &servers));
       *is_available = servers != 0;

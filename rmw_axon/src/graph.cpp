@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <exception>
 #include <string>
+#include <tuple>
 #include <utility>
 #include <vector>
 
@@ -211,7 +212,7 @@ void give(
       }
     }
   } catch (...) {
-    (void)rmw_names_and_types_fini(out);
+    std::ignore = rmw_names_and_types_fini(out);
     throw;
   }
 }
@@ -281,7 +282,7 @@ rmw_ret_t info_by_topic(
           fill(found[i], type, allocator, &out->info_array[i]);
         }
       } catch (...) {
-        (void)rmw_topic_endpoint_info_array_fini(out, allocator);
+        std::ignore = rmw_topic_endpoint_info_array_fini(out, allocator);
         throw;
       }
     });
@@ -331,7 +332,7 @@ rmw_ret_t node_names(
       } catch (...) {
         for (rcutils_string_array_t * out : {names, namespaces, enclaves}) {
           if (out != nullptr && out->data != nullptr) {
-            (void)rcutils_string_array_fini(out);
+            std::ignore = rcutils_string_array_fini(out);
           }
         }
         throw;

@@ -6,6 +6,7 @@
 
 #include <memory>
 #include <string>
+#include <tuple>
 #include <vector>
 
 #include "axon.h"
@@ -171,7 +172,7 @@ rmw_ret_t rmw_init_options_copy(const rmw_init_options_t * src, rmw_init_options
       }
 #endif
       if (copied != RMW_RET_OK) {
-        (void)rmw_init_options_fini(&copy);
+        std::ignore = rmw_init_options_fini(&copy);
         throw Failure(copied, "init options could not be copied");
       }
       *dst = copy;

@@ -173,7 +173,7 @@ rmw_ret_t rmw_publisher_wait_for_all_acked(
   return guarded(
     [&] {
       const int64_t timeout = rmw_axon::timeout(&wait_timeout);
-      check(axon_session_publisher_wait_for_all_acked(publisher_of(publisher).handle, timeout));
+      check(axon_session_publisher_wait_acknowledged(publisher_of(publisher).handle, timeout));
     });
 }
 
