@@ -13,7 +13,6 @@
 
 #include "cdr/codec.hpp"
 #include "fastcdr/Cdr.h"
-#include "rosidl_typesupport_c/identifier.h"
 #include "rosidl_typesupport_cpp/message_type_support.hpp"
 #include "rosidl_typesupport_fastrtps_cpp/identifier.hpp"
 #include "rosidl_typesupport_fastrtps_cpp/message_type_support.h"
