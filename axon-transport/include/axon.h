@@ -939,10 +939,11 @@ axon_ret_t axon_session_graph_names(struct axon_session_t session,
                                     void *user);
 
 /**
- * Calls `visitor` with every endpoint of a kind (AXON_KIND_*) under a topic's or service's name.
+ * Calls `visitor` with every endpoint of a kind (AXON_KIND_*) under a topic's or service's name, or,
+ * where `topic` is null, of that kind.
  *
  * # Safety
- * `topic` is a string; `visitor` may be called with `user`.
+ * `topic` is null or a string; `visitor` may be called with `user`.
  */
 axon_ret_t axon_session_graph_endpoints(struct axon_session_t session,
                                         uint32_t kind,
@@ -1185,10 +1186,11 @@ axon_ret_t axon_session_graph_names(struct axon_session_t session,
                                     void *user);
 
 /**
- * Calls `visitor` with every endpoint of a kind (AXON_KIND_*) under a topic's or service's name.
+ * Calls `visitor` with every endpoint of a kind (AXON_KIND_*) under a topic's or service's name, or,
+ * where `topic` is null, of that kind.
  *
  * # Safety
- * `topic` is a string; `visitor` may be called with `user`.
+ * `topic` is null or a string; `visitor` may be called with `user`.
  */
 axon_ret_t axon_session_graph_endpoints(struct axon_session_t session,
                                         uint32_t kind,

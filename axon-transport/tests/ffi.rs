@@ -5,9 +5,9 @@ use std::{
     ffi::OsStr,
     fs,
     path::{Path, PathBuf},
-    process::Command,
+    process::{Child, Command},
     sync::Once,
-    time::SystemTime,
+    time::{Duration, SystemTime},
 };
 
 const HERE: &str = env!("CARGO_MANIFEST_DIR");
@@ -163,6 +163,80 @@ fn the_test_program_uses_every_function() {
         .filter(|name| !sources.iter().any(|source| source.contains(&format!("{name}("))))
         .collect();
     assert!(exported().len() > 30 && unused.is_empty(), "not used: {unused:?}");
+}
+
+/// Ends with the test.
+struct Kept(Child);
+
+impl Drop for Kept {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// The programs of the README, as processes of one host.
+#[test]
+fn the_examples_are_built_by_plain_cc_and_meet() {
+    let directory = tempfile::tempdir().unwrap();
+    let readme = fs::read_to_string(path("README.md")).unwrap();
+    let build = |name: &str| {
+        let source = path("examples/c").join(name).with_extension("c");
+        let text = fs::read_to_string(&source).unwrap();
+        assert!(
+            readme.contains(&format!("```c\n{text}```\n")),
+            "the README shows another {name}.c"
+        );
+        let program = directory.path().join(name);
+        let mut cc = Command::new("cc");
+        cc.args(WARNINGS).arg(source).arg("-I").arg(path("include"));
+        run(cc.arg(library("libaxon_c.a")).args(SYSTEM).arg("-o").arg(&program));
+        program
+    };
+    let there = |program: &Path| {
+        let mut command = alone(program);
+        command.env("AXON_DAEMON", "require").env("AXON_BIND_ADDRS", "127.0.0.1");
+        command.env("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF");
+        command.env("AXON_RUNTIME_DIR", directory.path());
+        command
+    };
+    let (talker, listener, service) = (build("talker"), build("listener"), build("service"));
+    let daemon = Path::new(env!("CARGO_BIN_EXE_axon_daemon"));
+    let _daemon = Kept(there(daemon).env_remove("AXON_DAEMON").spawn().unwrap());
+    // Once it has the address.
+    while !directory.path().join("axon-0.sock").exists() {
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    let _talker = Kept(there(&talker).spawn().unwrap());
+    let heard = run(&mut there(&listener));
+    let numbers: Vec<u32> = heard
+        .lines()
+        .map(|line| line.strip_prefix("heard hello ").unwrap().parse().unwrap())
+        .collect();
+    assert!(numbers.len() == 3 && numbers.windows(2).all(|pair| pair[0] < pair[1]), "{heard}");
+    let _service = Kept(there(&service).spawn().unwrap());
+    assert_eq!(run(there(&service).arg("a question")), "A QUESTION\n");
+}
+
+/// What `cargo xtask install-c` fills in and installs.
+#[test]
+fn the_pkg_config_file_says_how_to_build() {
+    if !has("pkg-config") {
+        return;
+    }
+    let directory = tempfile::tempdir().unwrap();
+    let template = fs::read_to_string(path("axon-transport.pc.in")).unwrap();
+    let file = template.replace("@prefix@", "/opt/axon").replace("@version@", "1.2.3");
+    fs::write(directory.path().join("axon-transport.pc"), file).unwrap();
+    let ask = |option: &str| {
+        let mut command = Command::new("pkg-config");
+        command.env("PKG_CONFIG_PATH", directory.path());
+        run(command.args(["axon-transport", option])).trim().to_owned()
+    };
+    assert_eq!(ask("--cflags"), "-I/opt/axon/include");
+    assert_eq!(ask("--libs"), "-L/opt/axon/lib -laxon_transport");
+    assert_eq!(ask("--modversion"), "1.2.3");
+    assert_eq!(ask("--variable=daemon"), "/opt/axon/bin/axon_daemon");
 }
 
 #[test]

@@ -6,11 +6,15 @@ use std::env;
 use std::path::Path;
 use std::process::ExitCode;
 
+mod install_c;
 mod rustls_axon;
 
 const USAGE: &str = "\
 usage: cargo xtask COMMAND
 
+  install-c PREFIX [PROFILE]
+                       build axon-transport's C libraries and daemon, in release unless told
+                       otherwise, and install them with header and pkg-config file
   patched-tree         make third_party/rustls-axon/patched/, which `cargo package` ships
   rustls-digests       after a change to patches/ or added/: write patched.sha256 anew
   rustls-checkout DIR [VERSION]
@@ -28,6 +32,8 @@ fn main() -> ExitCode {
     let args: Vec<String> = env::args().skip(1).collect();
     let args: Vec<&str> = args.iter().map(String::as_str).collect();
     let result = match args[..] {
+        ["install-c", prefix] => install_c::install(prefix.as_ref(), "release"),
+        ["install-c", prefix, profile] => install_c::install(prefix.as_ref(), profile),
         ["patched-tree"] => rustls_axon::patched_tree(),
         ["rustls-digests"] => rustls_axon::digests(),
         ["rustls-checkout", dir] => rustls_axon::checkout(dir.as_ref(), None),

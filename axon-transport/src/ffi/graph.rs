@@ -141,10 +141,11 @@ pub unsafe extern "C" fn axon_session_graph_names(
     })
 }
 
-/// Calls `visitor` with every endpoint of a kind (AXON_KIND_*) under a topic's or service's name.
+/// Calls `visitor` with every endpoint of a kind (AXON_KIND_*) under a topic's or service's name, or,
+/// where `topic` is null, of that kind.
 ///
 /// # Safety
-/// `topic` is a string; `visitor` may be called with `user`.
+/// `topic` is null or a string; `visitor` may be called with `user`.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_graph_endpoints(
     session: axon_session_t,
@@ -156,10 +157,14 @@ pub unsafe extern "C" fn axon_session_graph_endpoints(
     guarded(|| {
         let visitor = visitor.ok_or_else(no_visitor)?;
         let known = of_number(kind)?;
-        // SAFETY: the caller's word.
-        let topic = unsafe { text(topic, "the topic") }?;
         let graph = named(session)?.graph();
-        for GraphEntry { endpoint, daemon } in graph.endpoints_of(known, topic) {
+        let endpoints = if topic.is_null() {
+            graph.endpoints_of_kind(known)
+        } else {
+            // SAFETY: the caller's word.
+            graph.endpoints_of(known, unsafe { text(topic, "the topic") }?)
+        };
+        for GraphEntry { endpoint, daemon } in endpoints {
             let (name, type_name) = (string(&endpoint.topic)?, string(&endpoint.type_name)?);
             let (node, namespace) = (string(&endpoint.node)?, string(&endpoint.namespace)?);
             let shown = axon_endpoint_t {

@@ -68,6 +68,13 @@ impl GraphView {
         entries
     }
 
+    /// The endpoints of a kind, by topic or service name and GID.
+    pub fn endpoints_of_kind(&self, kind: EndpointKind) -> Vec<&GraphEntry> {
+        let mut entries: Vec<&GraphEntry> = self.of(&[kind]).collect();
+        entries.sort_by_key(|entry| (&entry.endpoint.topic, entry.endpoint.gid));
+        entries
+    }
+
     /// How many endpoints of a kind are under a topic or service name.
     pub fn count(&self, kind: EndpointKind, topic: &str) -> usize {
         self.of(&[kind]).filter(|entry| entry.endpoint.topic == topic).count()

@@ -106,8 +106,11 @@ void case_graph(void) {
             axon_session_graph_names(place.session, 1, "graph", NULL, on_name, &told), "null");
     RETURNS(AXON_RET_INVALID_ARGUMENT,
             axon_session_graph_endpoints(place.session, 3, "/graph", on_endpoint, &told), "kind");
+    told.text[0] = 0, told.count = 0;
+    OK(axon_session_graph_endpoints(place.session, AXON_KIND_PUBLISHER, NULL, on_endpoint, &told));
+    CHECK(told.count == 1);
     RETURNS(AXON_RET_INVALID_ARGUMENT,
-            axon_session_graph_endpoints(place.session, 1, NULL, on_endpoint, &told), "null");
+            axon_session_graph_endpoints(place.session, 1, NULL, NULL, &told), "null");
     RETURNS(AXON_RET_INVALID_ARGUMENT,
             axon_session_graph_count(place.session, 1, "/graph", NULL), "null");
 

@@ -306,7 +306,8 @@ static void *wait_for_shared(void *argument) {
     set.guards = &guard;
     set.guard_count = 1;
     pthread_barrier_wait(&shared.start);
-    worked_or_gone(axon_session_wait(shared.place.session, &set, PATIENCE));
+    /* What would end it may be another's who waits, or gone. */
+    worked_or_gone(axon_session_wait(shared.place.session, &set, SECOND / 20));
     return argument;
 }
 

@@ -174,7 +174,8 @@ void case_events(void) {
         OK(axon_session_subscription_set_callback(listener, hear, &heard));
         size_t before = __atomic_load_n(&heard, __ATOMIC_SEQ_CST);
         OK(axon_session_publisher_publish(talker, (const uint8_t *)"x", 1, AXON_TIME_NOW, NULL));
-        while (__atomic_load_n(&heard, __ATOMIC_SEQ_CST) == before) {
+        for (int wait = 0; __atomic_load_n(&heard, __ATOMIC_SEQ_CST) == before; wait++) {
+            CHECK(wait < 600000);
             usleep(100);
         }
         OK(axon_session_subscription_set_callback(listener, NULL, NULL));
