@@ -64,6 +64,8 @@ fn kill(settings: [Settings; 2], victim: usize, kmes: Option<&Kmes>) {
     let remote = there.tally();
     assert_eq!((remote.repeated, remote.corrupt, remote.first), (0, 0, 1), "{remote:?}");
     assert_eq!(remote.taken + remote.missing, sent, "{remote:?}");
+    // What was under way when the link broke is known to be lost.
+    until("the losses are reported", || there.tally().lost == remote.missing);
     for node in [publisher, here, there] {
         node.finish();
     }

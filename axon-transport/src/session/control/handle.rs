@@ -2,8 +2,9 @@
 
 use std::{collections::HashSet, sync::Arc};
 
-use super::{Control, stands_for};
+use super::{Control, Link, stands_for};
 use crate::{
+    graph::EndpointKind,
     ids::{Gid, SessionId},
     passed::PassedFd,
     session::{
@@ -261,7 +262,10 @@ impl Control {
         });
         match mapped {
             Ok(mapped) => {
-                subscription.lock().add(mapped);
+                // Under `off` and in a relayed process what was lost on the way is said aloud.
+                let linked = matches!(self.link, Link::Socket(_)) && !writer.is_of(&session);
+                let stands_in = linked && subscription.endpoint.kind == EndpointKind::Subscription;
+                subscription.lock().add(mapped, stands_in);
                 self.reader_changed(&subscription);
                 // It may have history to take.
                 self.shared.segment.notify();

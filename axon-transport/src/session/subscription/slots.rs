@@ -59,6 +59,47 @@ pub(super) struct Slot {
     pub(super) over: bool,
     /// Found nothing in the take that is under way, since the writer was faster.
     pub(super) overtaken: bool,
+    /// What is missing of its numbers, where that tells of losses on the way to its ring.
+    pub(super) gaps: Option<Gaps>,
+}
+
+/// Samples of a publisher on another host that never came to the ring that stands in for it here:
+/// numbers that no position of the ring has.
+#[derive(Default)]
+pub(super) struct Gaps {
+    /// Sequence number of the newest sample, and the position after that of the last one.
+    before: Option<(u64, u64)>,
+    lost: u64,
+}
+
+impl Gaps {
+    /// A sample of this number was at this position.
+    fn pass(&mut self, sequence: u64, position: u64) {
+        let newest = self.before.map_or(sequence, |(newest, next)| {
+            // What was overwritten on this side is counted there, by its positions.
+            let missing = sequence.saturating_sub(newest).saturating_sub(1);
+            self.lost += missing.saturating_sub(position.saturating_sub(next));
+            newest.max(sequence)
+        });
+        self.before = Some((newest, position.saturating_add(1)));
+    }
+}
+
+impl Slot {
+    /// A sample was taken; `last` is the number of the newest one that came by way of any slot.
+    pub(super) fn passed(&mut self, sequence: u64, last: Option<u64>) {
+        let Some(gaps) = &mut self.gaps else { return };
+        let position = self.reader.position().saturating_sub(1);
+        if let (None, Some(last)) = (gaps.before, last) {
+            gaps.before = Some((last, self.reader.grant().first));
+        }
+        gaps.pass(sequence, position);
+    }
+
+    /// Its samples that were lost, here and before they came here.
+    pub(super) fn lost(&self) -> u64 {
+        self.reader.lost() + self.gaps.as_ref().map_or(0, |gaps| gaps.lost)
+    }
 }
 
 impl Slots {
@@ -81,7 +122,7 @@ impl Slots {
     }
 
     pub(super) fn losses(&self) -> u64 {
-        self.lost + self.slots.iter().map(|slot| slot.reader.lost()).sum::<u64>()
+        self.lost + self.slots.iter().map(Slot::lost).sum::<u64>()
     }
 
     /// Samples that came since this was last asked.
@@ -149,11 +190,13 @@ impl Slots {
         self.pending.remove(&writer).map_or(Accept::Stands, Accept::Map)
     }
 
-    pub(in crate::session) fn add(&mut self, reader: Reader) {
+    /// A writer granted. If it `stands_in` for one elsewhere, its numbers tell what was lost on the way.
+    pub(in crate::session) fn add(&mut self, reader: Reader, stands_in: bool) {
         let writer = reader.writer();
         let since = clock::monotonic();
         let lifespan = reader.times().lifespan.map(|age| i64::try_from(age).unwrap_or(i64::MAX));
-        self.slots.push(Slot { reader, since, lifespan, over: false, overtaken: false });
+        let gaps = stands_in.then(Gaps::default);
+        self.slots.push(Slot { reader, since, lifespan, over: false, overtaken: false, gaps });
         self.forget_older(writer);
     }
 
@@ -192,7 +235,7 @@ impl Slots {
         {
             let later = self.slots[newer].reader.grant().first;
             let slot = self.slots.remove(older);
-            self.lost += slot.reader.lost() + slot.reader.unread_below(later);
+            self.lost += slot.lost() + slot.reader.unread_below(later);
             self.arrived += slot.reader.arrived();
         }
     }
@@ -214,7 +257,7 @@ impl Slots {
         self.slots.retain(|s| {
             let keep = !s.over || !s.reader.is_drained();
             if !keep {
-                *lost += s.reader.lost();
+                *lost += s.lost();
                 *arrived += s.reader.arrived();
             }
             keep
@@ -223,5 +266,29 @@ impl Slots {
             let slots = &self.slots;
             self.last.retain(|gid, _| slots.iter().any(|s| s.reader.writer() == *gid));
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_number_without_a_position_was_lost_on_the_way() {
+        let mut gaps = Gaps::default();
+        for (sequence, position) in [(5, 0), (6, 1), (9, 2)] {
+            gaps.pass(sequence, position);
+        }
+        assert_eq!(gaps.lost, 2, "7 and 8");
+        // Overwritten here: numbers and positions are missing alike.
+        gaps.pass(19, 12);
+        assert_eq!(gaps.lost, 2);
+        gaps.pass(30, 20);
+        assert_eq!(gaps.lost, 5, "three of ten were lost on the way");
+        // What comes again has a position, and makes up for no number.
+        gaps.pass(29, 21);
+        gaps.pass(30, 22);
+        gaps.pass(32, 23);
+        assert_eq!(gaps.lost, 6);
     }
 }

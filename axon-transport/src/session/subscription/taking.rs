@@ -67,6 +67,7 @@ impl Slots {
             let expired = slot.lifespan.is_some_and(|lifespan| {
                 meta.source_timestamp.saturating_add(lifespan) < received_timestamp
             });
+            slot.passed(meta.sequence, self.last.get(&writer).copied());
             let last = self.last.entry(writer).or_default();
             let repeated = of.rising && meta.sequence <= *last;
             if !repeated {
@@ -104,12 +105,16 @@ impl Slots {
         let index = self.slots.iter().position(|slot| {
             slot.reader.writer() == *writer && (!slot.over || slot.reader.has_data())
         })?;
-        let reader = &mut self.slots[index].reader;
-        match reader.take_sample() {
+        let slot = &mut self.slots[index];
+        match slot.reader.take_sample() {
             Ok(sample) => {
+                if let Some(sample) = &sample {
+                    slot.passed(sample.meta().sequence, None);
+                }
                 // What a relay passes over, nobody asked it to.
-                let skipped = if of.role == EndpointRole::Relay { reader.skipped() } else { 0 };
-                let taken = sample.map(|sample| (sample, reader.lost() + skipped));
+                let relay = of.role == EndpointRole::Relay;
+                let skipped = if relay { slot.reader.skipped() } else { 0 };
+                let taken = sample.map(|sample| (sample, slot.lost() + skipped));
                 self.sweep();
                 taken
             }
@@ -181,7 +186,7 @@ impl Slots {
     fn discard(&mut self, index: usize, error: &TakeError, endpoint: &Endpoint) {
         tracing::error!(topic = endpoint.topic, %error, "a publisher's memory is not usable");
         let slot = self.slots.remove(index);
-        self.lost += slot.reader.lost();
+        self.lost += slot.lost();
         self.arrived += slot.reader.arrived();
         if !slot.over {
             self.discarded.push(slot.reader.writer());
@@ -214,7 +219,7 @@ mod tests {
         let mut slots = Slots::default();
         let options =
             ReaderOptions { reader, writer, peer, ring, lane, grant, qos, max_message: 10 };
-        slots.add(Reader::map(options).unwrap());
+        slots.add(Reader::map(options).unwrap(), false);
         publisher.publish_next(0, b"sample").unwrap();
         assert!(slots.has_data());
         let endpoint = Endpoint {

@@ -337,6 +337,11 @@ impl Reader {
         self.reads.grant
     }
 
+    /// The position that it takes next.
+    pub(crate) fn position(&self) -> u64 {
+        self.cursor
+    }
+
     /// Where its lane is.
     pub fn lane(&self) -> Location {
         self.attachment.lane.location()
