@@ -128,6 +128,12 @@ class Host:
         assert status == 0, f'{" ".join(process.command)} ended with {status}:\n{process.output}'
         return process.output
 
+    def shows(self, part, *command):
+        """Whether a command that asks the graph shows `part` by now; it may fail meanwhile."""
+        process = self.start(*command)
+        process.wait()
+        return part in process.output
+
     def daemons(self):
         """Process IDs of this host's AXON daemons."""
         found = []

@@ -44,7 +44,8 @@ def test_a_listener_that_is_killed_leaves_the_others_alone(host):
     heard = len(listeners[1].lines)
     listeners[1].said('I heard', count=3, since=heard)
     until(
-        lambda: 'Subscription count: 2' in host.run('ros2', 'topic', 'info', '/chatter', '--no-daemon'),
+        lambda: host.shows(
+            'Subscription count: 2', 'ros2', 'topic', 'info', '/chatter', '--no-daemon'),
         'the graph has two listeners')
     assert talker.running
 
@@ -54,7 +55,7 @@ def test_a_latched_message_reaches_who_comes_late(host):
         'ros2', 'topic', 'pub', '--qos-durability', 'transient_local', '--rate', '0.2',
         '/map', 'std_msgs/msg/String', '{data: the map}')
     until(
-        lambda: 'Publisher count: 1' in host.run('ros2', 'topic', 'info', '/map', '--no-daemon'),
+        lambda: host.shows('Publisher count: 1', 'ros2', 'topic', 'info', '/map', '--no-daemon'),
         'the publisher is there')
     heard = host.run(
         'ros2', 'topic', 'echo', '--no-daemon', '--once', '--qos-durability', 'transient_local',
