@@ -970,7 +970,7 @@ axon_ret_t axon_session_graph_count(struct axon_session_t session,
  * upper bound. Blocks and fails as `axon_session_publisher_publish`.
  *
  * One thread at a time may write. The bytes may be used until the loan is published or abandoned;
- * memory of a loan that is neither is lost to the publisher.
+ * memory of a loan that is neither is lost to the publisher. A forked child may not use them.
  *
  * # Safety
  * `loan` and `data` point to room for a handle and a pointer.
@@ -1217,7 +1217,7 @@ axon_ret_t axon_session_graph_count(struct axon_session_t session,
  * upper bound. Blocks and fails as `axon_session_publisher_publish`.
  *
  * One thread at a time may write. The bytes may be used until the loan is published or abandoned;
- * memory of a loan that is neither is lost to the publisher.
+ * memory of a loan that is neither is lost to the publisher. A forked child may not use them.
  *
  * # Safety
  * `loan` and `data` point to room for a handle and a pointer.
@@ -1607,7 +1607,7 @@ axon_ret_t axon_session_subscription_take(struct axon_subscription_t subscriptio
  * publisher's memory, of which a subscription can keep five for each publisher; a sixth is copied.
  * Where there is none the handle is 0, and nothing else is stored.
  *
- * Nobody may write to the bytes. A publisher in another process that does not keep to the protocol
+ * Nobody may write to the bytes, and a forked child may not read them. A publisher in another process that does not keep to the protocol
  * could change them meanwhile: whoever parses them reads each once, and checks what it read.
  * `AXON_SHM_COPY=1` has all of them copied.
  *
@@ -2055,7 +2055,7 @@ axon_ret_t axon_session_subscription_take(struct axon_subscription_t subscriptio
  * publisher's memory, of which a subscription can keep five for each publisher; a sixth is copied.
  * Where there is none the handle is 0, and nothing else is stored.
  *
- * Nobody may write to the bytes. A publisher in another process that does not keep to the protocol
+ * Nobody may write to the bytes, and a forked child may not read them. A publisher in another process that does not keep to the protocol
  * could change them meanwhile: whoever parses them reads each once, and checks what it read.
  * `AXON_SHM_COPY=1` has all of them copied.
  *

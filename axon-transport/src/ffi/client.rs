@@ -8,7 +8,7 @@ use super::{
     error::{Failure, axon_ret_t},
     guarded,
     handle::{axon_client_t, axon_node_t, axon_sample_t, give, named, revoke},
-    memory::{elements, present, store, store_if_wanted},
+    memory::{elements, present, present_if_wanted, store, store_if_wanted},
     qos::{axon_qos_t, store_qos},
     subscription::{Place, SamplePlace, axon_message_info_t, axon_room_t},
     wait::duration,
@@ -62,6 +62,8 @@ pub unsafe extern "C" fn axon_session_client_describe(
     qos: *mut axon_qos_t,
 ) -> axon_ret_t {
     guarded(|| {
+        present_if_wanted(gid)?;
+        present_if_wanted(qos)?;
         let client = named(client)?;
         // SAFETY: the caller's word.
         unsafe { store_if_wanted(gid, client.gid().into()) }?;
@@ -121,6 +123,7 @@ pub unsafe extern "C" fn axon_session_client_request(
     sequence: *mut u64,
 ) -> axon_ret_t {
     guarded(|| {
+        present_if_wanted(sequence)?;
         let client = named(client)?;
         // SAFETY: the caller's word.
         let payload = unsafe { elements(data, len, "the request") }?;

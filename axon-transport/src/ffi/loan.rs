@@ -6,7 +6,7 @@ use super::{
     error::{AXON_RET_INVALID_HANDLE, Failure, axon_ret_t},
     guarded,
     handle::{axon_loan_t, axon_publisher_t, give, named, revoke},
-    memory::{present, store, store_if_wanted},
+    memory::{present, present_if_wanted, store, store_if_wanted},
     wait::time,
 };
 use crate::session::{OwnedLoan, Publisher};
@@ -25,7 +25,7 @@ pub(super) struct NamedLoan {
 /// upper bound. Blocks and fails as `axon_session_publisher_publish`.
 ///
 /// One thread at a time may write. The bytes may be used until the loan is published or abandoned;
-/// memory of a loan that is neither is lost to the publisher.
+/// memory of a loan that is neither is lost to the publisher. A forked child may not use them.
 ///
 /// # Safety
 /// `loan` and `data` point to room for a handle and a pointer.
@@ -65,6 +65,7 @@ pub unsafe extern "C" fn axon_session_loan_publish(
     sequence: *mut u64,
 ) -> axon_ret_t {
     guarded(|| {
+        present_if_wanted(sequence)?;
         let lent = named(loan)?.len;
         if len > lent {
             let text = format_args!("{len} bytes of a loan of {lent} cannot be published");

@@ -93,6 +93,11 @@ pub(super) unsafe fn store_if_wanted<T>(out: *mut T, value: T) -> Result<(), Fai
     unsafe { store(out, value, "the place of a result") }
 }
 
+/// As [`present`], where null says that it is not wanted.
+pub(super) fn present_if_wanted<T>(data: *const T) -> Result<(), Failure> {
+    if data.is_null() { Ok(()) } else { present(data, "the place of a result") }
+}
+
 /// Checks that there can be something at `data`, before anything is done.
 pub(super) fn present<T>(data: *const T, what: &str) -> Result<(), Failure> {
     if data.is_null() || !data.is_aligned() {

@@ -5,7 +5,7 @@ use super::{
     error::{Failure, axon_ret_t},
     guarded,
     handle::{axon_node_t, axon_publisher_t, give, named, revoke},
-    memory::{elements, present, store, store_if_wanted},
+    memory::{elements, present, present_if_wanted, store, store_if_wanted},
     qos::{axon_qos_t, store_qos},
     wait::{duration, time},
 };
@@ -61,6 +61,8 @@ pub unsafe extern "C" fn axon_session_publisher_describe(
     qos: *mut axon_qos_t,
 ) -> axon_ret_t {
     guarded(|| {
+        present_if_wanted(gid)?;
+        present_if_wanted(qos)?;
         let publisher = named(publisher)?;
         // SAFETY: the caller's word.
         unsafe { store_if_wanted(gid, publisher.gid().into()) }?;
@@ -90,6 +92,7 @@ pub unsafe extern "C" fn axon_session_publisher_publish(
     sequence: *mut u64,
 ) -> axon_ret_t {
     guarded(|| {
+        present_if_wanted(sequence)?;
         let publisher = named(publisher)?;
         // SAFETY: the caller's word.
         let payload = unsafe { elements(data, len, "the sample") }?;

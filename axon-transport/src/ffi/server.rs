@@ -8,7 +8,7 @@ use super::{
     error::{Failure, axon_ret_t},
     guarded,
     handle::{axon_node_t, axon_sample_t, axon_server_t, give, named, revoke},
-    memory::{elements, present, store, store_if_wanted, value},
+    memory::{elements, present, present_if_wanted, store, store_if_wanted, value},
     qos::{axon_qos_t, store_qos},
     subscription::{Place, SamplePlace, axon_message_info_t, axon_room_t},
 };
@@ -63,6 +63,8 @@ pub unsafe extern "C" fn axon_session_server_describe(
     qos: *mut axon_qos_t,
 ) -> axon_ret_t {
     guarded(|| {
+        present_if_wanted(gid)?;
+        present_if_wanted(qos)?;
         let server = named(server)?;
         // SAFETY: the caller's word.
         unsafe { store_if_wanted(gid, server.gid().into()) }?;

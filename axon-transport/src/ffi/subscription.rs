@@ -8,7 +8,7 @@ use super::{
     error::{AXON_RET_BAD_ALLOC, Failure, axon_ret_t},
     guarded,
     handle::{axon_node_t, axon_sample_t, axon_subscription_t, give, named, revoke},
-    memory::{present, store, store_if_wanted},
+    memory::{present, present_if_wanted, store, store_if_wanted},
     qos::{axon_qos_t, store_qos},
     wait::duration,
 };
@@ -97,6 +97,8 @@ pub unsafe extern "C" fn axon_session_subscription_describe(
     qos: *mut axon_qos_t,
 ) -> axon_ret_t {
     guarded(|| {
+        present_if_wanted(gid)?;
+        present_if_wanted(qos)?;
         let subscription = named(subscription)?;
         // SAFETY: the caller's word.
         unsafe { store_if_wanted(gid, subscription.gid().into()) }?;
@@ -169,7 +171,7 @@ pub unsafe extern "C" fn axon_session_subscription_take(
 /// publisher's memory, of which a subscription can keep five for each publisher; a sixth is copied.
 /// Where there is none the handle is 0, and nothing else is stored.
 ///
-/// Nobody may write to the bytes. A publisher in another process that does not keep to the protocol
+/// Nobody may write to the bytes, and a forked child may not read them. A publisher in another process that does not keep to the protocol
 /// could change them meanwhile: whoever parses them reads each once, and checks what it read.
 /// `AXON_SHM_COPY=1` has all of them copied.
 ///
@@ -273,9 +275,7 @@ impl Place {
     ) -> Result<Self, Failure> {
         let room = room.ok_or_else(|| Failure::argument("the function that makes room is null"))?;
         present(taken, "the place of the answer")?;
-        if !info.is_null() {
-            present(info, "the place of what is known of it")?;
-        }
+        present_if_wanted(info)?;
         Ok(Self { room, user, info, taken })
     }
 
@@ -326,9 +326,7 @@ impl SamplePlace {
         present(self.sample, "the place of the sample")?;
         present(self.data, "the place of the pointer")?;
         present(self.len, "the place of the length")?;
-        if !self.info.is_null() {
-            present(self.info, "the place of what is known of it")?;
-        }
+        present_if_wanted(self.info)?;
         let Some((info, sample)) = take() else {
             // SAFETY: the caller's word.
             return unsafe { store(self.sample, axon_sample_t { id: 0 }, "the place") };

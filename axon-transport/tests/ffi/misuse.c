@@ -208,6 +208,17 @@ void case_misuse(void) {
     options.type_hash_size = 3;
     REFUSED(axon_session_publisher_create(place.node, &options, &made));
 
+    /* Not aligned: nothing is done, and nothing published. */
+    uint64_t sequence = 0;
+    union {
+        uint64_t aligned;
+        unsigned char bytes[16];
+    } raw;
+    REFUSED(axon_session_publisher_publish(talker, &byte, 1, AXON_TIME_NOW,
+                                           (uint64_t *)(void *)(raw.bytes + 1)));
+    OK(axon_session_publisher_publish(talker, &byte, 1, AXON_TIME_NOW, &sequence));
+    CHECK(sequence == 1);
+
     /* More than there can be, and what is not there. */
     RETURNS(AXON_RET_INVALID_ARGUMENT,
             axon_session_publisher_publish(talker, &byte, SIZE_MAX, AXON_TIME_NOW, NULL), "more than");
