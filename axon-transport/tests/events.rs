@@ -1,5 +1,8 @@
 //! What endpoints report of themselves: the eleven events, by status and by callback.
 
+#[path = "support/alone.rs"]
+mod alone;
+
 use std::{
     collections::BTreeMap,
     sync::{
@@ -9,26 +12,18 @@ use std::{
     time::Duration,
 };
 
+use alone::alone;
 use axon_transport::{
-    config::{Config, DaemonPolicy, OsFiles},
     events::{Counted, EventKind, EventStatus, LivelinessChanged, Matched},
     graph::{Pairing, pairing},
     ids::Gid,
     qos::{Durability, Incompatible, Liveliness, Qos, Reliability},
-    session::{
-        EndpointSpec, Event, OnNew, Publisher, Session, SessionOptions, Subscription, Waitable,
-    },
+    session::{EndpointSpec, Event, OnNew, Publisher, Session, Subscription, Waitable},
 };
 use proptest::prelude::*;
 
 const PATIENCE: Duration = Duration::from_secs(60);
 const MILLI: u64 = 1_000_000;
-
-fn session() -> Session {
-    let config = Config::resolve([], None, &OsFiles).unwrap();
-    let config = Config { daemon: DaemonPolicy::Off, ..config };
-    Session::open(&config, SessionOptions::new("test")).unwrap()
-}
 
 fn spec(qos: Qos) -> EndpointSpec {
     EndpointSpec::new("/t", "T", qos)
@@ -83,7 +78,7 @@ fn until(what: &str, mut reached: impl FnMut() -> bool) {
 
 #[test]
 fn an_endpoint_has_the_events_of_its_kind_and_no_others() {
-    let session = session();
+    let session = alone();
     let publisher = session.create_publisher(spec(Qos::default())).unwrap();
     let subscription = session.create_subscription(spec(Qos::default())).unwrap();
     for kind in EventKind::ALL {
@@ -94,7 +89,7 @@ fn an_endpoint_has_the_events_of_its_kind_and_no_others() {
 
 #[test]
 fn matches_are_counted_at_both_ends_with_what_changed() {
-    let session = session();
+    let session = alone();
     let publisher = session.create_publisher(spec(Qos::default())).unwrap();
     let publication = of_publisher(&publisher, EventKind::PublicationMatched);
     assert_eq!(matched(&publication), Matched::default());
@@ -121,7 +116,7 @@ fn matches_are_counted_at_both_ends_with_what_changed() {
 
 #[test]
 fn a_callback_is_told_of_the_backlog_and_then_of_each() {
-    let session = session();
+    let session = alone();
     let publisher = session.create_publisher(spec(Qos::default())).unwrap();
     let event = of_publisher(&publisher, EventKind::PublicationMatched);
     let subscriptions: Vec<_> =
@@ -142,7 +137,7 @@ fn a_callback_is_told_of_the_backlog_and_then_of_each() {
 
 #[test]
 fn incompatible_profiles_are_reported_at_both_ends_with_the_policy() {
-    let session = session();
+    let session = alone();
     let publisher = session.create_publisher(spec(Qos::sensor_data())).unwrap();
     let latched = Qos { durability: Durability::TransientLocal, ..Qos::sensor_data() };
     for (number, (qos, policy)) in
@@ -167,7 +162,7 @@ fn incompatible_profiles_are_reported_at_both_ends_with_the_policy() {
 
 #[test]
 fn another_type_under_the_same_name_is_reported_at_both_ends() {
-    let session = session();
+    let session = alone();
     let hashed = |hash: &[u8]| EndpointSpec { type_hash: hash.into(), ..spec(Qos::default()) };
     let publisher = session.create_publisher(hashed(&[1; 32])).unwrap();
     let named = EndpointSpec::new("/t", "U", Qos::default());
@@ -187,7 +182,7 @@ fn another_type_under_the_same_name_is_reported_at_both_ends() {
 
 #[test]
 fn every_lost_sample_is_counted_whether_or_not_somebody_takes() {
-    let session = session();
+    let session = alone();
     let publisher = session.create_publisher(spec(Qos::sensor_data())).unwrap();
     let all = Qos { reliability: Reliability::BestEffort, ..Qos::keep_all() };
     let subscription = session.create_subscription(spec(all)).unwrap();
@@ -210,7 +205,7 @@ fn every_lost_sample_is_counted_whether_or_not_somebody_takes() {
 
 #[test]
 fn deadlines_are_missed_at_both_ends_from_the_first_sample_on() {
-    let session = session();
+    let session = alone();
     let timed = Qos { deadline: Some(20 * MILLI), ..Qos::default() };
     let publisher = session.create_publisher(spec(timed)).unwrap();
     let subscription = session.create_subscription(spec(timed)).unwrap();
@@ -235,7 +230,7 @@ fn deadlines_are_missed_at_both_ends_from_the_first_sample_on() {
 
 #[test]
 fn a_lease_that_is_not_asserted_runs_out_and_comes_back() {
-    let session = session();
+    let session = alone();
     let manual =
         Qos { liveliness: Liveliness::ManualByTopic, lease: Some(50 * MILLI), ..Qos::default() };
     let publisher = session.create_publisher(spec(manual)).unwrap();
@@ -277,7 +272,7 @@ fn a_lease_that_is_not_asserted_runs_out_and_comes_back() {
 
 #[test]
 fn a_sample_older_than_its_lifespan_is_not_delivered() {
-    let session = session();
+    let session = alone();
     let mortal = Qos { lifespan: Some(3_600_000 * MILLI), ..Qos::default() };
     let publisher = session.create_publisher(spec(mortal)).unwrap();
     let subscription = session.create_subscription(spec(Qos::default())).unwrap();
@@ -401,7 +396,7 @@ proptest! {
     fn whatever_comes_and_goes_the_statuses_say_so(
         steps in prop::collection::vec(step(), 1..24),
     ) {
-        let session = session();
+        let session = alone();
         let mut living: Vec<Living> = Vec::new();
         let mut model: BTreeMap<Gid, Expected> = BTreeMap::new();
         for step in steps {

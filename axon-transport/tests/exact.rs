@@ -5,14 +5,13 @@ mod support;
 use std::time::Duration;
 
 use axon_transport::{
-    config::Config,
     events::{EventKind, EventStatus},
     graph::EndpointKind,
     qos::Qos,
-    session::{EndpointSpec, Session, SessionOptions, Waitable},
+    session::{EndpointSpec, Waitable},
 };
 use rustix::process::Signal;
-use support::{Host, PATIENCE, say, signal, until, wait_for_the_end};
+use support::{Host, PATIENCE, of_child, say, signal, until, wait_for_the_end};
 
 const ROUNDS: usize = 20;
 
@@ -24,8 +23,7 @@ fn spec(topic: &str) -> EndpointSpec {
 #[test]
 fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
-    let config = Config::from_env().unwrap();
-    let session = Session::open(&config, SessionOptions::new(&*part)).unwrap();
+    let session = of_child(&part);
     match part.as_str() {
         // Answers on /answer what comes on any of its topics.
         "echo" => {

@@ -16,10 +16,9 @@ use std::{
 };
 
 use axon_transport::{
-    config::Config,
     qos::{Durability, Qos},
     session::{
-        EndpointSpec, Session, SessionEvent, SessionOptions,
+        EndpointSpec, Session, SessionEvent,
         address::Address,
         message::{Hello, Message, PROTOCOL, SessionRole},
         socket,
@@ -31,7 +30,7 @@ use axon_transport::{
 };
 use group::Group;
 use rustix::process::{Resource, Rlimit, Signal, setrlimit};
-use support::{Host, PATIENCE, say, signal, until, wait_for_the_end};
+use support::{Host, PATIENCE, of_child, say, signal, until, wait_for_the_end};
 
 fn spec(topic: &str) -> EndpointSpec {
     EndpointSpec::new(topic, "test/Bytes", Qos::keep_all())
@@ -148,8 +147,7 @@ fn child() {
         "many publishers" => {
             let few = Rlimit { current: Some(256), maximum: Some(256) };
             setrlimit(Resource::Nofile, few).unwrap();
-            let session =
-                Session::open(&Config::from_env().unwrap(), SessionOptions::new("many")).unwrap();
+            let session = of_child("many");
             // A publisher takes a descriptor with its first large sample.
             let mut publishers = Vec::new();
             let error = loop {
@@ -171,8 +169,7 @@ fn child() {
             wait_for_the_end();
         }
         "much memory" => {
-            let session =
-                Session::open(&Config::from_env().unwrap(), SessionOptions::new("much")).unwrap();
+            let session = of_child("much");
             session.set_listener(|event| {
                 if *event == SessionEvent::DaemonLost {
                     say("disconnected");
@@ -247,8 +244,7 @@ fn child() {
             say(if matches!(end, Err(socket::SocketError::Closed)) { "put out" } else { "heard" });
         }
         "listener" => {
-            let config = Config::from_env().unwrap();
-            let session = Session::open(&config, SessionOptions::new("listener")).unwrap();
+            let session = of_child("listener");
             let subscription = session.create_subscription(spec("/t")).unwrap();
             let got = subscription.recv(&mut Vec::new(), Some(PATIENCE));
             say(if got.is_some() { "heard" } else { "nothing" });

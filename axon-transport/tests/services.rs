@@ -1,5 +1,7 @@
 //! Services: requests, the responses that are each client's own, and who is there for whom.
 
+#[path = "support/alone.rs"]
+mod alone;
 mod support;
 
 use std::{
@@ -9,27 +11,21 @@ use std::{
     time::Duration,
 };
 
+use alone::alone;
 use axon_transport::{
-    config::{Config, DaemonPolicy, OsFiles},
     graph::EndpointKind,
     qos::Qos,
-    session::{Client, EndpointSpec, OnNew, Server, Session, SessionOptions, Waitable},
+    session::{Client, EndpointSpec, OnNew, Server, Waitable},
     shm::PublishError,
 };
 use rustix::process::Signal;
-use support::{Host, PATIENCE, say, signal, until, wait_for_the_end};
+use support::{Host, PATIENCE, of_child, say, signal, until, wait_for_the_end};
 
 const CLIENTS: usize = 20;
 const CALLS: u64 = 50;
 
 fn spec() -> EndpointSpec {
     EndpointSpec::new("/add", "Add", Qos::default())
-}
-
-fn alone() -> Session {
-    let config = Config::resolve([], None, &OsFiles).unwrap();
-    let config = Config { daemon: DaemonPolicy::Off, ..config };
-    Session::open(&config, SessionOptions::new("test")).unwrap()
 }
 
 /// Answers one request with its bytes reversed.
@@ -58,8 +54,7 @@ fn text(number: u64) -> Vec<u8> {
 #[test]
 fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
-    let config = Config::from_env().unwrap();
-    let session = Session::open(&config, SessionOptions::new(&*part)).unwrap();
+    let session = of_child(&part);
     match part.as_str() {
         "caller" => {
             let client = session.create_client(spec()).unwrap();

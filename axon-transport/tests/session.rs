@@ -1,7 +1,11 @@
 //! What a session does with its own endpoints, without a daemon.
 
+#[path = "support/alone.rs"]
+mod alone;
+
 use std::{path::Path, sync::Arc, thread, time::Duration};
 
+use alone::alone;
 use axon_transport::{
     config::{Config, DaemonPolicy, OsFiles},
     events::{EventKind, EventStatus},
@@ -13,12 +17,6 @@ use axon_transport::{
 };
 
 const PATIENCE: Duration = Duration::from_secs(60);
-
-fn session() -> Session {
-    let config = Config::resolve([], None, &OsFiles).unwrap();
-    let config = Config { daemon: DaemonPolicy::Off, ..config };
-    Session::open(&config, SessionOptions::new("test")).unwrap()
-}
 
 /// The nodes that `session` sees, with the topics that each publishes.
 fn nodes(session: &Session) -> Vec<(String, Vec<String>)> {
@@ -46,7 +44,7 @@ fn publishers(session: &Session, count: usize, qos: Qos) -> Vec<Publisher> {
 
 #[test]
 fn an_endpoint_out_of_bounds_is_refused() {
-    let session = session();
+    let session = alone();
     let nameless = EndpointSpec::new("", "test/Bytes", Qos::default());
     let refused = session.create_publisher(nameless).unwrap_err();
     assert!(matches!(refused, SessionError::Endpoint { .. }));
@@ -56,7 +54,7 @@ fn an_endpoint_out_of_bounds_is_refused() {
 
 #[test]
 fn a_node_is_in_the_graph_from_its_creation_to_its_end() {
-    let session = session();
+    let session = alone();
     for (name, namespace) in [("", "/"), ("n", &"x".repeat(513)), ("a\0b", "/")] {
         let refused = session.create_node(name, namespace, "/").unwrap_err();
         assert!(matches!(refused, SessionError::Node { .. }), "{refused}");
@@ -85,7 +83,7 @@ fn a_node_is_in_the_graph_from_its_creation_to_its_end() {
 
 #[test]
 fn publishers_are_merged_by_source_timestamp() {
-    let session = session();
+    let session = alone();
     let publishers = publishers(&session, 3, Qos::keep_all());
     let subscription = session.create_subscription(spec(Qos::keep_all())).unwrap();
     assert!(subscription.wait_matched(3, PATIENCE));
@@ -100,7 +98,7 @@ fn publishers_are_merged_by_source_timestamp() {
 
 #[test]
 fn depth_counts_over_all_publishers_and_skipping_is_not_loss() {
-    let session = session();
+    let session = alone();
     let publishers = publishers(&session, 3, Qos::default());
     let subscription =
         session.create_subscription(spec(Qos { depth: 4, ..Qos::default() })).unwrap();
@@ -114,7 +112,7 @@ fn depth_counts_over_all_publishers_and_skipping_is_not_loss() {
 
 #[test]
 fn what_a_publisher_left_is_taken_after_its_end() {
-    let session = session();
+    let session = alone();
     let subscription = session.create_subscription(spec(Qos::keep_all())).unwrap();
     let publisher = session.create_publisher(spec(Qos::keep_all())).unwrap();
     assert!(subscription.wait_matched(1, PATIENCE));
@@ -129,7 +127,7 @@ fn what_a_publisher_left_is_taken_after_its_end() {
 
 #[test]
 fn profiles_that_do_not_go_together_are_not_matched() {
-    let session = session();
+    let session = alone();
     let publisher = session.create_publisher(spec(Qos::sensor_data())).unwrap();
     let reliable = session.create_subscription(spec(Qos::default())).unwrap();
     let best_effort = session.create_subscription(spec(Qos::sensor_data())).unwrap();
@@ -140,7 +138,7 @@ fn profiles_that_do_not_go_together_are_not_matched() {
 
 #[test]
 fn a_waiting_reader_is_woken_by_a_sample() {
-    let session = session();
+    let session = alone();
     let subscription = session.create_subscription(spec(Qos::default())).unwrap();
     let publisher = session.create_publisher(spec(Qos::default())).unwrap();
     assert!(subscription.wait_matched(1, PATIENCE));
@@ -154,7 +152,7 @@ fn a_waiting_reader_is_woken_by_a_sample() {
 
 #[test]
 fn a_sample_is_kept_beyond_all_that_it_came_from() {
-    let session = session();
+    let session = alone();
     let publisher = session.create_publisher(spec(Qos::default())).unwrap();
     let subscription = session.create_subscription(spec(Qos::default())).unwrap();
     assert!(subscription.wait_matched(1, PATIENCE));
@@ -199,7 +197,7 @@ fn no_signal_is_delivered_to_the_control_thread() {
     };
     let here = Path::new("/proc/thread-self");
     let before = blocked(here);
-    let session = session();
+    let session = alone();
     assert_eq!(blocked(here), before, "the mask of the thread that opened it");
     // Once it has matched something, its control thread has long had its name.
     let subscription = session.create_subscription(spec(Qos::default())).unwrap();
@@ -216,7 +214,7 @@ fn no_signal_is_delivered_to_the_control_thread() {
 #[test]
 fn a_forked_child_is_refused_by_whatever_it_asks_and_never_waits() {
     use std::sync::atomic::{AtomicBool, Ordering};
-    let session = session();
+    let session = alone();
     let publisher = session.create_publisher(spec(Qos::keep_all())).unwrap();
     let subscription = session.create_subscription(spec(Qos::keep_all())).unwrap();
     assert!(subscription.wait_matched(1, PATIENCE));
@@ -311,7 +309,7 @@ fn a_forked_child_is_refused_by_whatever_it_asks_and_never_waits() {
 /// Threads that share everything and ask nobody.
 #[test]
 fn whatever_thread_creates_uses_and_ends_endpoints_in_whatever_order() {
-    let session = session();
+    let session = alone();
     let guard = session.create_guard_condition();
     thread::scope(|scope| {
         for thread in 0..4_u64 {
@@ -392,7 +390,7 @@ fn whatever_thread_creates_uses_and_ends_endpoints_in_whatever_order() {
 #[test]
 fn a_session_may_end_while_its_endpoints_wait() {
     for _ in 0..50 {
-        let session = session();
+        let session = alone();
         let subscription = session.create_subscription(spec(Qos::default())).unwrap();
         let publisher = session.create_publisher(spec(Qos::default())).unwrap();
         drop(session);

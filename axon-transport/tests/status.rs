@@ -5,14 +5,13 @@
 mod support;
 
 use axon_transport::{
-    config::Config,
     daemon::status::{ReaderStatus, TopicStatus},
     qos::{Qos, Reliability},
-    session::{EndpointSpec, Session, SessionOptions},
+    session::EndpointSpec,
     shm::PublishError,
 };
 use rustix::process::Signal;
-use support::{Host, PATIENCE, say, signal, until, wait_for_the_end};
+use support::{Host, PATIENCE, of_child, say, signal, until, wait_for_the_end};
 
 const IMAGE: usize = 1 << 20;
 
@@ -28,8 +27,7 @@ fn best_effort(depth: u32) -> Qos {
 #[test]
 fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
-    let config = Config::from_env().unwrap();
-    let session = Session::open(&config, SessionOptions::new(&*part)).unwrap();
+    let session = of_child(&part);
     let qos = if part == "keeper" { Qos::keep_all() } else { best_effort(5) };
     let subscription = session.create_subscription(spec("/images", qos)).unwrap();
     assert!(subscription.wait_matched(1, PATIENCE));

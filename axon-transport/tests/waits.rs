@@ -1,5 +1,8 @@
 //! Waiting for several things at once, and being told of samples.
 
+#[path = "support/alone.rs"]
+mod alone;
+
 use std::{
     sync::{
         Arc, OnceLock,
@@ -9,23 +12,16 @@ use std::{
     time::Duration,
 };
 
+use alone::alone;
 use axon_transport::{
-    config::{Config, DaemonPolicy, OsFiles},
     qos::Qos,
     session::{
-        EndpointSpec, GuardCondition, Publisher, Session, SessionError, SessionOptions,
-        Subscription, Waitable,
+        EndpointSpec, GuardCondition, Publisher, Session, SessionError, Subscription, Waitable,
     },
 };
 
 const PATIENCE: Duration = Duration::from_secs(60);
 const NOT_AT_ALL: Option<Duration> = Some(Duration::ZERO);
-
-fn session() -> Session {
-    let config = Config::resolve([], None, &OsFiles).unwrap();
-    let config = Config { daemon: DaemonPolicy::Off, ..config };
-    Session::open(&config, SessionOptions::new("test")).unwrap()
-}
 
 fn spec(topic: &str) -> EndpointSpec {
     EndpointSpec::new(topic, "T", Qos::default())
@@ -40,7 +36,7 @@ fn pair(session: &Session, topic: &str) -> (Publisher, Subscription) {
 
 #[test]
 fn a_guard_condition_stands_until_a_wait_has_seen_it() {
-    let session = session();
+    let session = alone();
     let guard = session.create_guard_condition();
     let all = [Waitable::GuardCondition(&guard)];
     assert!(session.wait_for(&all, NOT_AT_ALL).unwrap().is_empty());
@@ -59,14 +55,14 @@ fn a_guard_condition_stands_until_a_wait_has_seen_it() {
 
 #[test]
 fn nothing_at_all_is_waited_for_until_the_time_is_over() {
-    let session = session();
+    let session = alone();
     assert!(session.wait_for(&[], NOT_AT_ALL).unwrap().is_empty());
     assert!(session.wait_for(&[], Some(Duration::from_millis(10))).unwrap().is_empty());
 }
 
 #[test]
 fn all_that_is_ready_is_named_and_a_sample_that_stays_is_named_again() {
-    let session = session();
+    let session = alone();
     let (publisher, subscription) = pair(&session, "/t");
     let (_silent, idle) = pair(&session, "/u");
     let guards = [(); 2].map(|()| session.create_guard_condition());
@@ -86,7 +82,7 @@ fn all_that_is_ready_is_named_and_a_sample_that_stays_is_named_again() {
 
 #[test]
 fn what_belongs_to_another_session_is_refused() {
-    let (session, other) = (session(), session());
+    let (session, other) = (alone(), alone());
     let foreign = other.create_guard_condition();
     let (_publisher, subscription) = pair(&other, "/t");
     for waitable in [Waitable::GuardCondition(&foreign), Waitable::Subscription(&subscription)] {
@@ -97,7 +93,7 @@ fn what_belongs_to_another_session_is_refused() {
 
 #[test]
 fn one_of_thousands_is_found() {
-    let session = session();
+    let session = alone();
     let pairs: Vec<_> = (0..300).map(|number| pair(&session, &format!("/t{number}"))).collect();
     let guards: Vec<_> = (0..4000).map(|_| session.create_guard_condition()).collect();
     let mut all: Vec<Waitable<'_>> = guards.iter().map(Waitable::GuardCondition).collect();
@@ -117,7 +113,7 @@ fn one_of_thousands_is_found() {
 
 #[test]
 fn many_threads_wait_each_for_its_own() {
-    let session = session();
+    let session = alone();
     let rounds = 300;
     thread::scope(|scope| {
         for number in 0..6 {
@@ -164,7 +160,7 @@ extern "C" fn handle(_: libc::c_int) {
 
 #[test]
 fn a_signal_handler_may_trigger() {
-    let session = session();
+    let session = alone();
     let guard = HANDLED.get_or_init(|| session.create_guard_condition()).clone();
     // SAFETY: the handler does nothing that is not async-signal-safe.
     unsafe { libc::signal(libc::SIGUSR2, handle as *const () as libc::sighandler_t) };
@@ -191,7 +187,7 @@ fn a_signal_handler_may_trigger() {
 
 #[test]
 fn new_samples_are_told_of_each_once_and_those_that_wait_at_once() {
-    let session = session();
+    let session = alone();
     let (publisher, subscription) = pair(&session, "/t");
     for _ in 0..3 {
         publisher.publish(b"x").unwrap();
@@ -236,7 +232,7 @@ fn new_samples_are_told_of_each_once_and_those_that_wait_at_once() {
 
 #[test]
 fn an_event_loop_and_callbacks_do_not_listen_at_once() {
-    let session = session();
+    let session = alone();
     let (_publisher, subscription) = pair(&session, "/t");
     let leader = session.segment().external_leader().unwrap();
     assert!(subscription.set_on_new_sample(Some(Arc::new(|_| {}))).is_err());

@@ -228,7 +228,9 @@ impl Publisher {
 
     /// Gives memory back that samples in place took and that is not needed any more: all
     /// of it ten seconds after the last that anybody wants, else what is more than four times what
-    /// was needed for as long. To be called about once a second for as long as it returns true.
+    /// was needed for as long. And hands over what a subscriber had no room for when it came into use,
+    /// which the last sample before a pause may be in. To be called about once a second for as long as
+    /// it returns true, and after the last sample before a pause.
     pub fn tend(&self) -> bool {
         let more = self.writer.tend(Instant::now());
         let more = self.context.session().tidy() || more;

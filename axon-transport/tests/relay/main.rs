@@ -30,7 +30,7 @@ use axon_transport::{
 };
 use hostile::say_to;
 use rustix::process::Signal;
-use support::{Host, PATIENCE, say, signal, until, wait_for_the_end};
+use support::{Host, PATIENCE, of_child, say, signal, until, wait_for_the_end};
 
 /// Around each border of how samples are kept and carried, and an image.
 const SIZES: [usize; 10] = [0, 1, 96, 97, 4096, 4097, 31 << 10, 32 << 10, 64 << 10, 25_000_000];
@@ -109,7 +109,7 @@ fn relays(status: &Status) -> Vec<RelayStatus> {
 #[test]
 fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
-    let session = Session::open(&Config::from_env().unwrap(), SessionOptions::new(&*part)).unwrap();
+    let session = of_child(&part);
     match part.as_str() {
         // Publishes without an end.
         "talker" => {

@@ -180,6 +180,12 @@ pub(crate) fn say(text: impl std::fmt::Display) {
     println!("{MARK}{text}");
 }
 
+/// The session of a child, which starts a daemon where there is none and the test lets it.
+#[allow(dead_code, reason = "not every test needs it")]
+pub(crate) fn of_child(name: &str) -> Session {
+    Session::open(&Config::from_env().unwrap(), SessionOptions::new(name)).unwrap()
+}
+
 /// Waits for the test, in a child.
 pub(crate) fn wait_for_the_end() {
     let mut line = String::new();

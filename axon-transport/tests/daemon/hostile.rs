@@ -1,0 +1,205 @@
+//! Who says what no session says, or hands over what nobody should read.
+
+use super::*;
+
+#[test]
+fn garbage_on_the_socket_hurts_nobody() {
+    let host = Host::new();
+    let _daemon = host.daemon();
+    let session = host.session("witness").unwrap();
+    let publisher = session.create_publisher(spec("/t")).unwrap();
+    let address = Address::of(&host.config());
+    let hello = |name: &str, settings| {
+        Message::Hello(Hello {
+            protocol: PROTOCOL,
+            session: SessionId::random(),
+            role: SessionRole::Application,
+            name: name.into(),
+            domain: 0,
+            settings,
+            relay: None,
+        })
+        .encode()
+        .unwrap()
+    };
+    let packets: Vec<Vec<u8>> = vec![
+        vec![1],
+        vec![0xff; 32 * 1024],
+        vec![0xff; 40 * 1024],
+        Message::Resync.encode().unwrap(),
+        hello("without settings", vec![]),
+        hello(&"n".repeat(20_000), vec![]),
+        vec![],
+    ];
+    for packet in &packets {
+        let stranger = address.connect().unwrap();
+        let _ = socket::send(&stranger, packet, &[]);
+        until("the stranger is put out", || {
+            !matches!(
+                socket::receive(&stranger, &mut Vec::new()),
+                Ok(_) | Err(socket::SocketError::NotReady)
+            )
+        });
+    }
+    // A crowd that says nothing at all.
+    let crowd: Vec<OwnedFd> = (0..300).filter_map(|_| address.connect().ok()).collect();
+    drop(crowd);
+    // A tool that speaks out of turn.
+    let tool = address.connect().unwrap();
+    let packet = Message::Hello(Hello {
+        protocol: PROTOCOL,
+        session: SessionId::random(),
+        role: SessionRole::Tool,
+        name: "tool".into(),
+        domain: 0,
+        settings: Vec::new(),
+        relay: None,
+    });
+    socket::send(&tool, &packet.encode().unwrap(), &[]).unwrap();
+    socket::send(&tool, &Message::Resync.encode().unwrap(), &[]).unwrap();
+    until("the tool is put out", || {
+        matches!(socket::receive(&tool, &mut Vec::new()), Err(socket::SocketError::Closed))
+    });
+    // All the while the daemon serves.
+    let subscription = host.session("b").unwrap().create_subscription(spec("/t")).unwrap();
+    assert!(subscription.wait_matched(1, PATIENCE) && publisher.wait_matched(1, PATIENCE));
+    publish(&publisher, 1);
+    assert_eq!(receive(&subscription), 1);
+}
+
+/// The daemon's status shows counters that it reads from what sessions handed over.
+#[test]
+fn the_daemon_is_handed_nothing_that_a_read_could_wait_for() {
+    let host = Host::new();
+    let _daemon = host.daemon();
+    let settings = security_settings(&host.config()).unwrap();
+    let flags = MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING;
+    let memory = memfd_create("test", flags).unwrap();
+    let (pipe, _held) = rustix::pipe::pipe().unwrap();
+    for (name, descriptor) in [("memory", &memory), ("pipe", &pipe)] {
+        let segment = SessionSegment::create(SessionId::random()).unwrap();
+        let session = segment.id();
+        let hello = Message::Hello(Hello {
+            protocol: PROTOCOL,
+            session,
+            role: SessionRole::Application,
+            name: name.into(),
+            domain: 0,
+            settings: settings.clone(),
+            relay: None,
+        });
+        let socket = Address::of(&host.config()).connect().unwrap();
+        let handed = segment.descriptors().unwrap();
+        let handed = [&handed.segment, &handed.doorbell, &handed.pidfd].map(AsFd::as_fd);
+        socket::send(&socket, &hello.encode().unwrap(), &handed).unwrap();
+        let opened = SegmentOpened { session, segment: Segment { number: 1, publisher: None } };
+        let packet = Message::Segment(opened).encode().unwrap();
+        socket::send(&socket, &packet, &[descriptor.as_fd()]).unwrap();
+        let over = || loop {
+            match socket::receive(&socket, &mut Vec::new()) {
+                Ok(_) => {}
+                Err(socket::SocketError::Closed) => return true,
+                Err(_) => return false,
+            }
+        };
+        if name == "pipe" {
+            until("it is put out", over);
+        } else {
+            until("it is taken", || host.status().unwrap().sessions.iter().any(|s| s.name == name));
+            assert!(!over());
+        }
+    }
+    host.status().unwrap();
+}
+
+/// A socket whose last close takes hours, since it lingers over what its peer does not read.
+fn reluctant() -> (OwnedFd, std::net::TcpStream) {
+    use rustix::net::sockopt;
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    sockopt::set_socket_recv_buffer_size(&listener, 4096).unwrap();
+    let mut ours = std::net::TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+    let (peer, _) = listener.accept().unwrap();
+    ours.set_nonblocking(true).unwrap();
+    sockopt::set_socket_send_buffer_size(&ours, 4096).unwrap();
+    while ours.write(&[0; 1 << 16]).is_ok() {}
+    sockopt::set_socket_linger(&ours, Some(Duration::from_secs(10_000))).unwrap();
+    (ours.into(), peer)
+}
+
+/// A unix socket in whose queue such a one waits, where nobody finds it before it is closed.
+fn hiding() -> (OwnedFd, std::net::TcpStream) {
+    use rustix::net::{AddressFamily, SocketFlags, SocketType, socketpair};
+    let (unix, packets) = (AddressFamily::UNIX, SocketType::SEQPACKET);
+    let (ours, theirs) = socketpair(unix, packets, SocketFlags::CLOEXEC, None).unwrap();
+    let (fd, peer) = reluctant();
+    send_away(&theirs, b"x", 0, fd);
+    (ours, peer)
+}
+
+/// A packet whose last descriptor is from then on in nobody's hands but the receiver's.
+fn send_away(socket: &OwnedFd, bytes: &[u8], before: usize, fd: OwnedFd) {
+    use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg};
+    let null: OwnedFd = std::fs::File::open("/dev/null").unwrap().into();
+    let mut space = [std::mem::MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(8))];
+    let mut control = SendAncillaryBuffer::new(&mut space);
+    let mut rights = vec![null.as_fd(); before];
+    rights.push(fd.as_fd());
+    assert!(control.push(SendAncillaryMessage::ScmRights(&rights)));
+    let bytes = [std::io::IoSlice::new(bytes)];
+    sendmsg(socket, &bytes, &mut control, SendFlags::NOSIGNAL).unwrap();
+}
+
+#[test]
+fn descriptors_that_are_slow_to_close_do_not_stop_the_daemon() {
+    let host = Host::new();
+    let daemon = host.daemon();
+    let address = Address::of(&host.config());
+    let tool = Message::Hello(Hello {
+        protocol: PROTOCOL,
+        session: SessionId::random(),
+        role: SessionRole::Tool,
+        name: "tool".into(),
+        domain: 0,
+        settings: Vec::new(),
+        relay: None,
+    });
+    // The daemon receives nothing before all is sent: one that had closed a descriptor already would leave
+    // its last close to this thread.
+    signal(daemon.0.id(), Signal::STOP);
+    let pid = Pid::from_raw(i32::try_from(daemon.0.id()).unwrap()).unwrap();
+    waitid(WaitId::Pid(pid), WaitIdOptions::STOPPED).unwrap();
+    let (tool, unknown, garbage) = (tool.encode().unwrap(), [200, 0xa0], [1]);
+    // (said first, what the packet that carries it is, descriptors before it)
+    type Way<'a> = (Option<&'a [u8]>, &'a [u8], usize);
+    let ways: [Way<'_>; 5] = [
+        (None, &unknown, 0),
+        // More than belong into any packet.
+        (None, &unknown, 7),
+        (None, &tool, 0),
+        (Some(&tool), &unknown, 0),
+        // The connection is over before it is read.
+        (Some(&garbage), &unknown, 0),
+    ];
+    let mut peers = Vec::new();
+    // More than the daemon has threads that close.
+    for (first, carrier, before) in ways.into_iter().cycle().take(45) {
+        let stranger = address.connect().unwrap();
+        if let Some(first) = first {
+            socket::send(&stranger, first, &[]).unwrap();
+        }
+        let (fd, peer) = hiding();
+        send_away(&stranger, carrier, before, fd);
+        peers.push((peer, stranger));
+    }
+    signal(daemon.0.id(), Signal::CONT);
+    // Who is put out hears of it.
+    let other = address.connect().unwrap();
+    socket::send(&other, &garbage, &[]).unwrap();
+    until("the connection is over", || {
+        matches!(socket::receive(&other, &mut Vec::new()), Err(socket::SocketError::Closed))
+    });
+    let session = host.session("witness").unwrap();
+    let publisher = session.create_publisher(spec("/t")).unwrap();
+    let subscription = host.session("b").unwrap().create_subscription(spec("/t")).unwrap();
+    assert!(subscription.wait_matched(1, PATIENCE) && publisher.wait_matched(1, PATIENCE));
+}
