@@ -1,16 +1,26 @@
 //! What many processes of many endpoints take: each of these publishes on and subscribes to the same
 //! ten topics, so each reads from each.
 //!
+//! And how long it takes until every session of many knows all endpoints of all, and again after the
+//! daemon was killed.
+//!
 //! In the full size: `SIZING=50 cargo test --release -p axon-transport --test sizing -- --nocapture`
 #![expect(clippy::print_stdout, reason = "what it prints is its result")]
 
 #[allow(dead_code, reason = "what other tests need of it")]
 mod support;
 
-use std::{fs, os::unix::fs::MetadataExt as _};
+use std::{
+    fs,
+    os::unix::fs::MetadataExt as _,
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use axon_transport::{
     config::{Config, OsFiles},
+    graph::{GraphEntry, GraphView},
+    ids::Gid,
     qos::Qos,
     session::{EndpointSpec, Session, SessionOptions},
 };
@@ -18,6 +28,8 @@ use support::{Host, PATIENCE, say, until, wait_for_the_end};
 
 /// Topics: a publisher and a subscription of each process for each.
 const TOPICS: usize = 10;
+/// How long they are left alone.
+const REST: Duration = Duration::from_secs(2);
 /// Processes of an ordinary run.
 const FEW: usize = 8;
 
@@ -74,6 +86,9 @@ impl std::fmt::Display for Held {
 #[test]
 fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
+    if let Some(total) = part.strip_prefix("graph ") {
+        return know_all(total.parse().unwrap());
+    }
     let processes: usize = part.parse().unwrap();
     let config = Config::resolve(std::env::vars_os(), None, &OsFiles).unwrap();
     let session = Session::open(&config, SessionOptions::new("sizing")).unwrap();
@@ -137,5 +152,109 @@ fn a_process_maps_each_other_process_once() {
     // from, in pieces of 64 KiB.
     let lanes = TOPICS as u64 * processes * 128;
     assert!(committed <= processes * ((64 << 10) + lanes).next_multiple_of(64 << 10));
+    players.into_iter().for_each(support::Player::finish);
+}
+
+/// Sessions of each process that is to know the whole graph.
+const SESSIONS: usize = 4;
+
+/// Sessions with endpoints of their own topics, which each shall know `total`.
+fn know_all(total: usize) {
+    let config = Config::resolve(std::env::vars_os(), None, &OsFiles).unwrap();
+    let mut sessions = Vec::new();
+    let mut endpoints = Vec::new();
+    for _ in 0..SESSIONS {
+        let session = Session::open(&config, SessionOptions::new("graph")).unwrap();
+        for topic in 0..TOPICS {
+            let name = format!("/of{}/topic{topic}", session.id());
+            let spec = || EndpointSpec::new(&*name, "test/Bytes", Qos::default());
+            let publisher = session.create_publisher(spec()).unwrap();
+            endpoints.push((publisher, session.create_subscription(spec()).unwrap()));
+        }
+        sessions.push(session);
+    }
+    say("created");
+    for session in &sessions {
+        assert!(session.wait_graph(PATIENCE, |graph| graph.endpoints.len() == total));
+    }
+    let before: Vec<_> = sessions.iter().map(|s| (s.daemon(), s.graph())).collect();
+    say("whole");
+    for (session, (daemon, _)) in sessions.iter().zip(&before) {
+        // Not by looking now and then: they are to be at rest.
+        let another = || session.daemon().is_some_and(|now| Some(now) != *daemon);
+        assert!(session.wait_graph(PATIENCE, |_| another()));
+    }
+    say("found");
+    for (session, (_, before)) in sessions.iter().zip(&before) {
+        // Each of them was told of by the new one.
+        let anew = |(gid, entry): (&Gid, &GraphEntry)| {
+            !before
+                .endpoints
+                .get(gid)
+                .is_some_and(|old| Arc::ptr_eq(&old.endpoint, &entry.endpoint))
+        };
+        let whole =
+            |graph: &GraphView| graph.endpoints.len() == total && graph.endpoints.iter().all(anew);
+        assert!(session.wait_graph(PATIENCE, whole));
+    }
+    say("whole again");
+    wait_for_the_end();
+}
+
+/// Seconds of the processor that a process has had.
+fn processor(pid: u32) -> f64 {
+    let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap();
+    let (_, fields) = stat.rsplit_once(") ").unwrap();
+    let ticks = |at: usize| fields.split(' ').nth(at).unwrap().parse::<f64>().unwrap();
+    // User and system time, in hundredths of a second.
+    (ticks(11) + ticks(12)) / 100.0
+}
+
+#[test]
+fn every_session_of_many_knows_all_endpoints() {
+    if std::env::var("PLAY").is_ok() {
+        return;
+    }
+    let processes = std::env::var("SIZING").ok().map_or(FEW / 2, |n| n.parse().unwrap());
+    let total = processes * SESSIONS * 2 * TOPICS;
+    let host = Host::new().with("AXON_LOG", "warn");
+    let mut daemon = host.daemon();
+    let part = format!("graph {total}");
+    let mut players: Vec<_> = (0..processes).map(|_| host.play(&part)).collect();
+    let all = |players: &mut [support::Player], what: &str| {
+        players.iter_mut().for_each(|player| assert_eq!(player.hear(), what));
+        Instant::now()
+    };
+    let created = all(&mut players, "created");
+    let whole = all(&mut players, "whole");
+    let busy = |players: &[support::Player]| -> f64 {
+        players.iter().map(|player| processor(player.pid())).sum()
+    };
+    let start_up = (processor(daemon.0.id()), busy(&players));
+    std::thread::sleep(REST);
+    let before = (processor(daemon.0.id()), busy(&players));
+    std::thread::sleep(REST);
+    let rest = (processor(daemon.0.id()) - before.0, busy(&players) - before.1);
+    daemon.0.kill().unwrap();
+    daemon.0.wait().unwrap();
+    // One of them starts the next.
+    let again = Instant::now();
+    all(&mut players, "found");
+    let found = Instant::now();
+    let whole_again = all(&mut players, "whole again");
+    println!("{processes} processes, {SESSIONS} sessions each, {total} endpoints in all:");
+    println!("  whole after the last creation   {:>8.2} s", (whole - created).as_secs_f64());
+    println!("  processor, daemon and others    {:>8.2} s {:>8.2} s", start_up.0, start_up.1);
+    let share = 100.0 / REST.as_secs_f64();
+    println!(
+        "  at rest                         {:>8.2} % {:>8.2} %",
+        rest.0 * share,
+        rest.1 * share
+    );
+    println!("  a new daemon found by all       {:>8.2} s", (found - again).as_secs_f64());
+    println!("  and the graph whole             {:>8.2} s", (whole_again - again).as_secs_f64());
+    let descriptors =
+        fs::read_dir(format!("/proc/{}/fd", host.status().unwrap().pid)).unwrap().count();
+    println!("  descriptors of the daemon       {descriptors:>8}");
     players.into_iter().for_each(support::Player::finish);
 }
