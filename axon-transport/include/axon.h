@@ -624,7 +624,7 @@ typedef struct axon_session_options_t {
      */
     uint32_t domain;
     /**
-     * AXON_DISCOVERY_*: how far a daemon looks that this session starts.
+     * AXON_DISCOVERY_*: how far a daemon looks that the session starts.
      */
     uint32_t discovery;
     /**
@@ -1025,7 +1025,7 @@ axon_ret_t axon_session_node_destroy(struct axon_node_t node);
 
 /**
  * The guard condition that is triggered after every change of the graph, once what one asks of the
- * graph shows it, and when a service or a client of this session finds or loses its other end. It
+ * graph shows it, and when a service or a client of the session finds or loses its other end. It
  * is a handle of its own, to be destroyed like one that was created, and lasts as long as the
  * session.
  *

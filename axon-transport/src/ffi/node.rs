@@ -46,7 +46,7 @@ pub extern "C" fn axon_session_node_destroy(node: axon_node_t) -> axon_ret_t {
 }
 
 /// The guard condition that is triggered after every change of the graph, once what one asks of the
-/// graph shows it, and when a service or a client of this session finds or loses its other end. It
+/// graph shows it, and when a service or a client of the session finds or loses its other end. It
 /// is a handle of its own, to be destroyed like one that was created, and lasts as long as the
 /// session.
 ///

@@ -38,7 +38,7 @@ pub struct axon_session_options_t {
     pub abi: u32,
     /// 0 to 232, or AXON_DOMAIN_ENVIRONMENT.
     pub domain: u32,
-    /// AXON_DISCOVERY_*: how far a daemon looks that this session starts.
+    /// AXON_DISCOVERY_*: how far a daemon looks that the session starts.
     pub discovery: u32,
     /// 0.
     pub reserved: u32,

@@ -49,7 +49,7 @@ impl Control {
             Message::Refused(refused) => {
                 tracing::error!(
                     reason = refused.text,
-                    "the daemon refuses something of this session"
+                    "the daemon refuses something of the session"
                 );
             }
             // What a daemon never says is not worth more than not being heard.
@@ -72,7 +72,7 @@ impl Control {
         }
     }
 
-    /// What the daemon did not say again is over: it was unmatched while this session was too slow
+    /// What the daemon did not say again is over: it was unmatched while the session was too slow
     /// to be told.
     pub(super) fn drop_unrepeated(&mut self, repeated: &HashSet<Pair>) {
         let (publishers, subscriptions) = self.endpoints();
@@ -179,7 +179,7 @@ impl Control {
         // Counted whether or not it comes to anything, as the daemon does.
         let peer = self.hold(attach.session, pair, descriptors, &attach.segments);
         if attach.session == self.shared.id && !self.has_lane(&pair, attach.lane) {
-            tracing::error!(reader = %pair.reader, "a lane of this session that it has not");
+            tracing::error!(reader = %pair.reader, "a lane of the session that it has not");
             return;
         }
         let Some(publisher) = self.shared.state().publishers.get(&attach.writer).cloned() else {
@@ -226,7 +226,7 @@ impl Control {
             self.peers.drop_unnamed(&session, writer);
         }
         if session == self.shared.id && !self.has_ring(&writer, ring) {
-            tracing::error!(%writer, "a ring of this session that it has not");
+            tracing::error!(%writer, "a ring of the session that it has not");
             return;
         }
         let Some(subscription) = self.shared.state().subscriptions.get(&reader).cloned() else {
