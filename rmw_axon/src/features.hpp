@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// What the ROS distributions differ in, read off their headers: Humble (rmw 6.1), Iron (7.1), Jazzy (7.3),
-// Kilted (7.8), Lyrical and Rolling. Nothing else in this package asks which one it is built for.
+// What the ROS distributions differ in, read off their headers: Humble (rmw 6.1), Iron (7.1), Jazzy (7.3)
+// and Rolling (7.5). Nothing else in this package asks which one it is built for.
 
 #ifndef FEATURES_HPP_
 #define FEATURES_HPP_
@@ -28,13 +28,6 @@
 #define AXON_RMW_DYNAMIC_MESSAGES 1
 #else
 #define AXON_RMW_DYNAMIC_MESSAGES 0
-#endif
-
-// Lyrical: what is known of every client and server of a service.
-#if __has_include("rmw/get_service_endpoint_info.h")
-#define AXON_RMW_SERVICE_ENDPOINT_INFO 1
-#else
-#define AXON_RMW_SERVICE_ENDPOINT_INFO 0
 #endif
 
 #endif  // FEATURES_HPP_

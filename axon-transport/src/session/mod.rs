@@ -106,7 +106,7 @@ struct Handle {
 
 impl Session {
     /// Opens a session with the daemon of this user and domain, which is started when there is
-    /// none and `AXON_DAEMON` is `spawn`. Under `off`, endpoints of this session reach each other
+    /// none and `AXON_DAEMON` is `spawn`. Under `off`, endpoints of the session reach each other
     /// and nobody else.
     ///
     /// # Errors
@@ -303,7 +303,7 @@ impl Session {
         Ok(self.adopt_node(described))
     }
 
-    /// A condition that the program triggers itself, for wait sets of this session.
+    /// A condition that the program triggers itself, for wait sets of the session.
     pub fn create_guard_condition(&self) -> GuardCondition {
         GuardCondition::new(self.shared().segment.clone())
     }
@@ -327,7 +327,7 @@ impl Session {
         self.add_server(remote, EndpointRole::StandIn)
     }
 
-    /// A publisher as another process of this session describes it, under its GID there.
+    /// A publisher as another process of the session describes it, under its GID there.
     pub(crate) fn adopt_publisher(&self, endpoint: Endpoint) -> Result<Publisher, SessionError> {
         self.add_publisher(endpoint, EndpointRole::Application)
     }
@@ -386,7 +386,7 @@ impl Session {
     }
 
     /// Has `listener` called on the control thread for every event. It must not block, and must
-    /// not hold this session, which would otherwise never end.
+    /// not hold the session, which would otherwise never end.
     pub fn set_listener(&self, listener: impl Fn(&SessionEvent) + Send + Sync + 'static) {
         if self.is_forked() {
             return;

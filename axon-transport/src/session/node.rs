@@ -39,7 +39,7 @@ impl Node {
     }
 
     /// Triggered after every change of the graph, once [`Session::graph`] shows it; and when a
-    /// service or a client of this session finds, or loses, its other end.
+    /// service or a client of the session finds, or loses, its other end.
     pub fn graph_changed(&self) -> &GuardCondition {
         &self.graph
     }

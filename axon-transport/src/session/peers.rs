@@ -2,7 +2,7 @@
 //!
 //! The daemon hands a session's descriptors over once, with the first pair that needs them, and
 //! again only when the last such pair was over. This table counts the pairs exactly as the daemon
-//! does, so that both agree on what this session holds.
+//! does, so that both agree on what the session holds.
 
 use std::{
     collections::{BTreeSet, HashMap, HashSet, hash_map::Entry as Slot},

@@ -100,7 +100,7 @@ impl Control {
                         return;
                     }
                     Err(SessionError::NoDaemon { .. }) => {}
-                    Err(error) => tracing::error!(%error, "no daemon took this session"),
+                    Err(error) => tracing::error!(%error, "no daemon took the session"),
                 }
                 std::thread::sleep(pause);
                 pause = (pause * 2).min(MAX_PAUSE);

@@ -1,4 +1,4 @@
-//! This session's memory: what others are told of it, and what is given back.
+//! A session's own memory: what others are told of it, and what is given back.
 
 use std::time::{Duration, Instant};
 
