@@ -190,7 +190,7 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
     let mask = |bits| IndexMask::from_bits(bits).unwrap();
     let messages = [
         Message::Hello(hello),
-        Message::Elected([9; 16]),
+        Message::Elected(link::Elected { link: [9; 16], election: 3 }),
         Message::Graph(graph(1)),
         Message::Graph(graph(64)),
         Message::GraphResync(link::GraphResync { version: 2 }),

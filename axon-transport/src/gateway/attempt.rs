@@ -26,7 +26,7 @@ use crate::{
     graph::{Endpoint, EndpointKind},
     ids::{DaemonId, Gid, SessionId},
     keys,
-    link::{CloseCode, Graph, Message, Side, Subscribe},
+    link::{CloseCode, Elected, Graph, Message, Side, Subscribe},
     qos::Qos,
     session::MessageInfo,
 };
@@ -229,7 +229,9 @@ impl Link {
             enclave: String::new(),
         };
         let graph = Graph { version: 1, before: 0, added: vec![endpoint], removed: vec![] };
-        self.established.outbox.send(Message::Elected(rand::random()));
+        self.established
+            .outbox
+            .send(Message::Elected(Elected { link: rand::random(), election: 1 }));
         self.established.outbox.send(Message::Graph(graph));
     }
 

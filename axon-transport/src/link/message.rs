@@ -59,12 +59,16 @@ pub struct Hello {
 }
 
 /// The connection that the lower daemon id keeps.
-#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
-struct Elected {
+pub struct Elected {
     /// Names the link, for a successor's HELLO.
     #[cbor(n(0), with = "minicbor::bytes")]
-    link: [u8; 16],
+    pub link: [u8; 16],
+    /// Larger than that of any link elected before it: on two connections, what was said first may be
+    /// read last.
+    #[n(1)]
+    pub election: u64,
 }
 
 /// What changed in the sender's graph.
@@ -177,8 +181,8 @@ const MAX_SAE: usize = 63;
 pub enum Message {
     /// Who I am.
     Hello(Hello),
-    /// This connection stays, under this link id.
-    Elected([u8; 16]),
+    /// This connection stays.
+    Elected(Elected),
     /// Graph changes.
     Graph(Graph),
     /// Send the whole graph.
@@ -200,7 +204,7 @@ impl Message {
     pub(super) fn encode(&self) -> (u8, Vec<u8>) {
         match self {
             Self::Hello(m) => (1, to_map(m)),
-            Self::Elected(link) => (2, to_map(&Elected { link: *link })),
+            Self::Elected(m) => (2, to_map(m)),
             Self::Graph(m) => (3, to_map(m)),
             Self::GraphResync(m) => (4, to_map(m)),
             Self::Subscribe(m) => (5, to_map(m)),
@@ -219,7 +223,7 @@ impl Message {
     pub(super) fn decode(kind: u8, map: &[u8]) -> Result<Option<Self>, FrameError> {
         let message = match kind {
             1 => Self::Hello(from_map(kind, map)?),
-            2 => Self::Elected(from_map::<Elected>(kind, map)?.link),
+            2 => Self::Elected(from_map(kind, map)?),
             3 => Self::Graph(from_map(kind, map)?),
             4 => Self::GraphResync(from_map(kind, map)?),
             5 => Self::Subscribe(from_map(kind, map)?),

@@ -41,6 +41,10 @@ fn peer() -> Hello {
     Hello { daemon: DaemonId([2; 16]), sae: Some("sae-b".into()), ..hello() }
 }
 
+fn elected() -> Message {
+    Message::Elected(Elected { link: [9; 16], election: 3 })
+}
+
 fn messages() -> Vec<Message> {
     let qos = Qos { lifespan: Some(7), ..Qos::keep_all() };
     vec![
@@ -49,7 +53,7 @@ fn messages() -> Vec<Message> {
             expects: Some(DaemonId([4; 16])),
             ..hello()
         }),
-        Message::Elected([9; 16]),
+        elected(),
         Message::Graph(Graph { version: 2, before: 1, added: vec![], removed: vec![Gid([5; 16])] }),
         Message::GraphResync(GraphResync { version: 2 }),
         Message::Subscribe(Subscribe {
@@ -169,10 +173,10 @@ fn nothing_precedes_hello_proof_and_election() {
         }
         order.proven();
         assert!(order.accept(&Message::Graph(Graph::default())).is_err());
-        order.accept(&Message::Elected([0; 16])).unwrap();
+        order.accept(&elected()).unwrap();
         order.elected();
         order.accept(&Message::Graph(Graph::default())).unwrap();
-        assert!(order.accept(&Message::Elected([0; 16])).is_err(), "a second ELECTED");
+        assert!(order.accept(&elected()).is_err(), "a second ELECTED");
     }
 }
 
@@ -181,7 +185,7 @@ fn the_higher_id_cannot_elect_and_classic_knows_no_keys() {
     let mut order = Order::new(Side::Server, false);
     order.accept(&messages()[0]).unwrap();
     order.hello_checked(false);
-    assert!(order.accept(&Message::Elected([0; 16])).is_err());
+    assert!(order.accept(&elected()).is_err());
     order.elected();
     assert!(order.accept(&Message::Keys(KeyMessage::Announce(vec![key_id("k")]))).is_err());
 }

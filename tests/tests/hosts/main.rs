@@ -2,6 +2,7 @@
 //! in qkd a KME each, simulated in the test's process.
 
 mod delivery;
+mod election;
 mod hostile;
 mod identity;
 mod mismatch;
@@ -12,3 +13,4 @@ mod renewal;
 mod restart;
 mod rules;
 mod services;
+mod stranger;

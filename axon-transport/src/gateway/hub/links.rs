@@ -1,6 +1,12 @@
 //! Links: from a connection that proved its peer to the one that is in use, its successor, its end.
 
-use std::{sync::Arc, time::Duration};
+use std::{
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+    },
+    time::Duration,
+};
 
 use tokio::sync::mpsc;
 
@@ -20,7 +26,7 @@ use crate::{
         status::Who,
     },
     ids::DaemonId,
-    link::{Candidate, CloseCode, Message, Side, keep},
+    link::{Candidate, CloseCode, Elected, Message, Side, keep},
 };
 
 /// A link that the lower id has not elected by then is closed.
@@ -29,6 +35,8 @@ const ELECTION_TIMEOUT: Duration = Duration::from_secs(10);
 const HAND_OVER: Duration = Duration::from_secs(5);
 /// Peers, and connections that await their election.
 const MAX_LINKS: usize = 128 + 32;
+/// Elections of this process. A daemon outlives its gateway, and its peers know its elections by its id.
+static ELECTIONS: AtomicU64 = AtomicU64::new(1);
 /// Why somebody who claims a linked daemon's id gets no link.
 const TAKEN: &str = "this daemon id is linked already, under another identity";
 
@@ -68,7 +76,8 @@ impl Hub {
             close(&established.connection, CloseCode::NotAllowed, text);
             return self.forget(&established);
         }
-        let successor = replaces.is_some() && current.is_some_and(|c| c.id == replaces);
+        let successor =
+            replaces.is_some() && current.is_some_and(|c| c.elected.map(|e| e.link) == replaces);
         let candidate = Candidate { side: established.side, successor };
         let we_elect = self.context.hello.daemon < daemon;
         let ours = self.context.hello.daemon;
@@ -136,7 +145,7 @@ impl Hub {
             candidate,
             outbox: established.outbox,
             sealing: established.sealing,
-            id: None,
+            elected: None,
             since_unix_ms: crate::daemon::status::unix_ms(),
         };
         self.links.insert(established.number, link);
@@ -145,16 +154,18 @@ impl Hub {
 
     /// This side has the lower id: the connection stays.
     pub(super) async fn elect(&mut self, number: u64) {
-        let id: [u8; 16] = rand::random();
+        // Relaxed: a number, not a hand-over.
+        let election = ELECTIONS.fetch_add(1, Ordering::Relaxed);
+        let elected = Elected { link: rand::random(), election };
         if let Some(link) = self.links.get_mut(&number) {
-            link.outbox.send(Message::Elected(id));
+            link.outbox.send(Message::Elected(elected));
             link.order.elected();
-            self.open(number, id).await;
+            self.open(number, elected).await;
         }
     }
 
-    /// The connection was elected: it becomes the peer's link.
-    pub(super) async fn open(&mut self, number: u64, id: [u8; 16]) {
+    /// The connection was elected: it becomes the peer's link, if none was elected after it.
+    pub(super) async fn open(&mut self, number: u64, elected: Elected) {
         let Some(link) = self.links.get(&number) else { return };
         let daemon = link.established.hello.daemon;
         // Another connection may have been elected while this one waited.
@@ -162,8 +173,12 @@ impl Hub {
         if current.is_some_and(|c| !c.established.who.is(&link.established.who)) {
             return self.violation(number, CloseCode::NotAllowed, TAKEN.into()).await;
         }
+        if current.and_then(|c| c.elected).is_some_and(|c| c.election > elected.election) {
+            tracing::debug!(peer = %daemon, "superseded before its election was heard of");
+            return self.hand_over(number);
+        }
         let Some(link) = self.links.get_mut(&number) else { return };
-        link.id = Some(id);
+        link.elected = Some(elected);
         let (connection, outbox) = (link.connection.clone(), link.outbox.clone());
         let (carrier, side) = (link.carrier.clone(), link.candidate.side);
         if let (Some(keyring), Some(sealing)) = (&self.context.keyring, link.sealing.take()) {
@@ -252,7 +267,7 @@ impl Hub {
             sae: link.established.hello.sae.clone(),
             addresses: vec![link.connection.remote_address()],
             listed: false,
-            replaces: link.id,
+            replaces: link.elected.map(|e| e.link),
         });
         // Should the dial fail, the next try is due before the key's age is reached.
         let after = self.context.keyring.as_ref().map(|k| k.config.session_max_age.mul_f64(0.04));

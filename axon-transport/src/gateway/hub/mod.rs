@@ -35,7 +35,7 @@ use crate::{
     daemon::bridge::{ToControl, ToGateway},
     graph::Endpoint,
     ids::{DaemonId, Gid},
-    link::{Candidate, CloseCode, GraphResync, Hello, Message},
+    link::{Candidate, CloseCode, Elected, GraphResync, Hello, Message},
     session::Session,
 };
 
@@ -104,8 +104,8 @@ struct Link {
     carrier: Carrier,
     /// Until the election: what then lets it announce keys.
     sealing: Option<Sealing>,
-    /// The peer's link id, once elected.
-    id: Option<[u8; 16]>,
+    /// What the lower id said of it, once elected.
+    elected: Option<Elected>,
     since_unix_ms: u64,
 }
 
@@ -227,7 +227,7 @@ impl Hub {
                 self.link_ended(link, &reason).await;
             }
             Event::Unelected(link) => {
-                if let Some(l) = self.links.get(&link).filter(|l| l.id.is_none()) {
+                if let Some(l) = self.links.get(&link).filter(|l| l.elected.is_none()) {
                     close(&l.connection, CloseCode::Duplicate, "not elected within 10 s");
                     self.link_ended(link, "not elected").await;
                 }
@@ -250,9 +250,9 @@ impl Hub {
             return self.violation(number, CloseCode::OutOfOrder, error.to_string()).await;
         }
         let daemon = link.established.hello.daemon;
-        if let Message::Elected(id) = message {
+        if let Message::Elected(elected) = message {
             link.order.elected();
-            return self.open(number, id).await;
+            return self.open(number, elected).await;
         }
         if let Message::Keys(keys) = &message {
             let Protection::Envelope { keyring, keys: peer, .. } = link.carrier.protection.clone()

@@ -100,6 +100,9 @@ impl Peer {
         for (key, asked) in &self.asked {
             self.say(asked.message(key));
         }
+        for served in self.served.values_mut() {
+            served.repeated = false;
+        }
     }
 
     /// What a data stream of `connection` needs.
@@ -171,6 +174,7 @@ impl Peer {
         }
         if whole {
             self.remote.clear();
+            self.unserve_unrepeated();
         }
         for gid in &graph.removed {
             self.remote.remove(gid);

@@ -28,6 +28,8 @@ pub(super) struct Served {
     /// Its readers there.
     pub(super) subscribers: Vec<Gid>,
     sources: Vec<Source>,
+    /// Whether it was asked for on the link in use.
+    pub(super) repeated: bool,
     /// Sends ROUTE_READY once a publisher is attached.
     _announcing: OnDrop,
 }
@@ -53,8 +55,11 @@ impl Peer {
         };
         let key = RouteKey { kind, topic, type_name };
         let mut others = self.served.iter().filter(|(route, _)| **route != number);
-        if others.any(|(_, served)| served.key == key) {
-            return Err(format!("{} has a route already", key.topic));
+        match others.find(|(_, served)| served.key == key).map(|(other, s)| (*other, s.repeated)) {
+            // Its UNSUBSCRIBE was lost with an old link.
+            Some((other, false)) => self.unserve(other),
+            Some(_) => return Err(format!("{} has a route already", key.topic)),
+            None => {}
         }
         let old = match self.served.remove(&number) {
             Some(served) if served.key == key => served.sources,
@@ -74,7 +79,9 @@ impl Peer {
         let out = RouteOut { route, sources: sources.clone(), seen };
         let _ = self.orders.send(Order::Route(number, out));
         let subscribers = subscribers.iter().map(|subscriber| subscriber.gid).collect();
-        self.served.insert(number, Served { key, route, subscribers, sources, _announcing });
+        let repeated = true;
+        let served = Served { key, route, subscribers, sources, repeated, _announcing };
+        self.served.insert(number, served);
         Ok(())
     }
 
@@ -82,6 +89,13 @@ impl Peer {
     pub(in crate::gateway) fn unserve(&mut self, route: u32) {
         self.served.remove(&route);
         let _ = self.orders.send(Order::End(route));
+    }
+
+    /// The peer has said on this link what it wants: the UNSUBSCRIBE of the rest was lost.
+    pub(super) fn unserve_unrepeated(&mut self) {
+        let unrepeated = self.served.iter().filter(|(_, served)| !served.repeated);
+        let lost: Vec<_> = unrepeated.map(|(route, _)| *route).collect();
+        lost.into_iter().for_each(|route| self.unserve(route));
     }
 
     fn open_relays(

@@ -9,9 +9,9 @@ use super::{
     super::{
         pair::{Host, Plan},
         process::until,
+        stranger::{Claim, Stranger},
     },
     authority::{Authority, Certificate, settings},
-    stranger::{Claim, Stranger},
 };
 
 /// Serial numbers of host A, of host B and of nobody.

@@ -4,7 +4,6 @@ mod authority;
 mod ca;
 mod pinned;
 mod replay;
-mod stranger;
 
 use axon_transport::ids::DaemonId;
 

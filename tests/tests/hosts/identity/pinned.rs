@@ -8,12 +8,10 @@ use std::{
 use axon_tests::Sizes;
 use axon_tls::identity::{Auth, KeyAlgorithm, SigningKey, SpkiDigest, Trust, TrustFile};
 
-use super::{
-    super::{
-        mode::pinned,
-        pair::{Host, Plan, write_key},
-        process::until,
-    },
+use super::super::{
+    mode::pinned,
+    pair::{Host, Plan, write_key},
+    process::until,
     stranger::{Claim, Stranger},
 };
 

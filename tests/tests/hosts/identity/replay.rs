@@ -13,8 +13,10 @@ use std::{
 
 use axon_tls::identity::{Auth, KeyAlgorithm, SigningKey, Trust, TrustFile};
 
-use super::{
-    super::{mode::pinned, pair::Plan, process::until},
+use super::super::{
+    mode::pinned,
+    pair::Plan,
+    process::until,
     stranger::{Claim, Stranger},
 };
 

@@ -1,0 +1,171 @@
+//! Somebody who speaks the link protocol and is no daemon: what a hostile peer would say.
+
+use std::{
+    net::{Ipv4Addr, SocketAddr},
+    time::Duration,
+};
+
+use axon_tls::{
+    Cipher,
+    identity::Auth,
+    quic::{ALPN, hybrid_client},
+};
+use axon_transport::{
+    ids::DaemonId,
+    link::{Hello, MAX_FRAME, Message, read_length},
+};
+use quinn::{Connection, Endpoint, RecvStream, SendStream};
+
+use super::{pair::Host, process::PATIENCE};
+
+/// Its daemon's id: the highest there is, so that elections are the other side's.
+const ID: DaemonId = DaemonId([0xff; 16]);
+
+pub(crate) struct Stranger {
+    runtime: tokio::runtime::Runtime,
+}
+
+/// A connection on which it said HELLO and was answered.
+#[derive(Debug)]
+pub(crate) struct Met {
+    pub(crate) connection: Connection,
+    send: SendStream,
+    receive: RecvStream,
+}
+
+/// What it says of itself.
+pub(crate) struct Claim<'a> {
+    pub(crate) host: &'a str,
+    pub(crate) daemon: DaemonId,
+    /// `AXON_CLASSIC_AUTH` as HELLO has it.
+    pub(crate) auth: u8,
+}
+
+impl<'a> Claim<'a> {
+    pub(crate) fn pinned(host: &'a str) -> Self {
+        Self { host, daemon: ID, auth: 1 }
+    }
+
+    pub(crate) fn ca(host: &'a str) -> Self {
+        Self { host, daemon: ID, auth: 2 }
+    }
+}
+
+impl Stranger {
+    pub(crate) fn new() -> Self {
+        let mut builder = tokio::runtime::Builder::new_multi_thread();
+        Self { runtime: builder.worker_threads(1).enable_all().build().unwrap() }
+    }
+
+    /// Dials the daemon of `host` and waits to be elected; why it was closed on, if it was.
+    pub(crate) fn dial(&self, host: &Host, auth: &Auth, claim: &Claim<'_>) -> Result<Met, String> {
+        let to = SocketAddr::from((host.address, host.status().port.unwrap()));
+        self.dial_at(to, host.domain(), auth, claim)
+    }
+
+    pub(crate) fn dial_at(
+        &self,
+        to: SocketAddr,
+        domain: u32,
+        auth: &Auth,
+        claim: &Claim<'_>,
+    ) -> Result<Met, String> {
+        let mut met = self.meet(to, domain, auth, claim)?;
+        self.hear(&mut met, |message| matches!(message, Message::Elected(_)))?;
+        Ok(met)
+    }
+
+    /// Dials and exchanges HELLOs.
+    pub(crate) fn meet(
+        &self,
+        to: SocketAddr,
+        domain: u32,
+        auth: &Auth,
+        claim: &Claim<'_>,
+    ) -> Result<Met, String> {
+        let config = hybrid_client(auth, Cipher::default(), ALPN).unwrap();
+        let mut met = self.limited(async {
+            let endpoint = Endpoint::client((Ipv4Addr::UNSPECIFIED, 0).into()).unwrap();
+            let connection = endpoint.connect_with(config, to, "axon").unwrap().await;
+            let connection = connection.map_err(|error| error.to_string())?;
+            match connection.open_bi().await {
+                Ok((send, receive)) => Ok(Met { connection, send, receive }),
+                Err(error) => Err(error.to_string()),
+            }
+        })?;
+        self.say(&mut met, &Message::Hello(hello(domain, claim)));
+        self.hear(&mut met, |message| matches!(message, Message::Hello(_)))?;
+        Ok(met)
+    }
+
+    /// Says something; whether it arrives is for what comes next to tell.
+    pub(crate) fn say(&self, met: &mut Met, message: &Message) {
+        let frame = message.to_frame().unwrap();
+        let _ = self.limited(met.send.write_all(&frame));
+    }
+
+    /// Reads until the message is the one waited for; why the other side closed, if it did.
+    pub(crate) fn hear(
+        &self,
+        met: &mut Met,
+        awaited: impl Fn(&Message) -> bool,
+    ) -> Result<Message, String> {
+        self.limited(async {
+            loop {
+                match next(&mut met.receive).await {
+                    Some(message) if awaited(&message) => return Ok(message),
+                    Some(_) => {}
+                    None => return Err(met.connection.closed().await.to_string()),
+                }
+            }
+        })
+    }
+
+    /// Why the other side closed the connection.
+    pub(crate) fn closed(&self, met: &Met) -> String {
+        self.limited(met.connection.closed()).to_string()
+    }
+
+    /// Leaves, and waits until the other side knows.
+    pub(crate) fn leave(&self, met: &Met) {
+        met.connection.close(0_u32.into(), b"");
+        self.runtime.block_on(async { tokio::time::sleep(Duration::from_millis(100)).await });
+    }
+
+    fn limited<T>(&self, future: impl Future<Output = T>) -> T {
+        let limited = async { tokio::time::timeout(PATIENCE, future).await };
+        self.runtime.block_on(limited).expect("an answer")
+    }
+}
+
+fn hello(domain: u32, claim: &Claim<'_>) -> Hello {
+    Hello {
+        protocol_min: 1,
+        protocol_max: 1,
+        domain,
+        daemon: claim.daemon,
+        mode: 0,
+        key_mode: 0,
+        kex: 0,
+        cipher: 0,
+        sae: None,
+        host: claim.host.to_owned(),
+        auth: Some(claim.auth),
+        replaces: None,
+        expects: None,
+        static_peer: false,
+    }
+}
+
+/// The next message of a known type, `None` at the end of the stream.
+async fn next(receive: &mut RecvStream) -> Option<Message> {
+    loop {
+        let mut length = [0; 4];
+        receive.read_exact(&mut length).await.ok()?;
+        let mut frame = vec![0; read_length(length, MAX_FRAME).unwrap()];
+        receive.read_exact(&mut frame).await.ok()?;
+        if let Some(message) = Message::from_frame(&frame, MAX_FRAME).unwrap() {
+            return Some(message);
+        }
+    }
+}
