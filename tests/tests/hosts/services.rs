@@ -153,6 +153,7 @@ fn a_client_that_dies_with_responses_pending_harms_nobody() {
         for number in 0..CALLS {
             requests.push(take(&server, &mut bytes));
             if number == CALLS / 2 {
+                asker.wait_sent();
                 kill(asker.pid());
             }
             let request = &requests[requests.len() - 1];
