@@ -3,10 +3,7 @@
 //! Exceeding a control group's limit gets a process killed rather than an error, so rings ask
 //! before they grow.
 
-use std::{
-    fs,
-    path::{Path, PathBuf},
-};
+use std::{fs::File, io::Read as _, path::Path};
 
 use super::ShmError;
 
@@ -15,10 +12,9 @@ const RESERVE: u64 = 8 << 20;
 
 /// Whether `needed` bytes more can be taken without starving the host or the control group.
 pub(super) fn check(needed: u64) -> Result<(), ShmError> {
-    match available() {
-        Some(available) if available < needed.saturating_add(RESERVE) => {
-            Err(ShmError::NoMemory { needed, available })
-        }
+    let enough = needed.saturating_add(RESERVE);
+    match at_most(enough) {
+        Some(available) if available < enough => Err(ShmError::NoMemory { needed, available }),
         _ => Ok(()),
     }
 }
@@ -31,19 +27,23 @@ thread_local! {
 
 /// Bytes available to this process, or `None` where the system does not tell.
 pub(super) fn available() -> Option<u64> {
+    at_most(u64::MAX)
+}
+
+/// The same, though whether it is more than `enough` is not looked at closely.
+fn at_most(enough: u64) -> Option<u64> {
     #[cfg(test)]
     if let Some(pretended) = PRETENDED.get() {
         return Some(pretended);
     }
-    available_in(Path::new("/proc"), Path::new("/sys/fs/cgroup"))
+    available_in(Path::new("/proc"), Path::new("/sys/fs/cgroup"), enough)
 }
 
-fn available_in(proc: &Path, cgroup: &Path) -> Option<u64> {
-    let host = fs::read_to_string(proc.join("meminfo"))
-        .ok()
+fn available_in(proc: &Path, cgroup: &Path, enough: u64) -> Option<u64> {
+    let host = read(&proc.join("meminfo"))
         .and_then(|text| field(&text, "MemAvailable:"))
         .map(|kib| kib.saturating_mul(1024));
-    let groups = fs::read_to_string(proc.join("self/cgroup")).unwrap_or_default();
+    let groups = read(&proc.join("self/cgroup")).unwrap_or_default();
     groups
         .lines()
         .filter_map(|line| {
@@ -51,9 +51,9 @@ fn available_in(proc: &Path, cgroup: &Path) -> Option<u64> {
             let (_, controllers, path) = (parts.next()?, parts.next()?, parts.next()?);
             let path = path.trim_start_matches('/');
             if controllers.is_empty() {
-                lowest(cgroup, path, &V2)
+                lowest(cgroup, path, &V2, enough)
             } else if controllers.split(',').any(|c| c == "memory") {
-                lowest(&cgroup.join("memory"), path, &V1)
+                lowest(&cgroup.join("memory"), path, &V1, enough)
             } else {
                 None
             }
@@ -69,47 +69,53 @@ struct Files {
 }
 
 const V2: Files =
-    Files { limit: "memory.max", usage: "memory.current", reclaimable: "inactive_file" };
+    Files { limit: "memory.max", usage: "memory.current", reclaimable: "inactive_file " };
 const V1: Files = Files {
     limit: "memory.limit_in_bytes",
     usage: "memory.usage_in_bytes",
-    reclaimable: "total_inactive_file",
+    reclaimable: "total_inactive_file ",
 };
 
-/// The tightest of the limits of a group and its ancestors.
-fn lowest(root: &Path, group: &str, files: &Files) -> Option<u64> {
-    let mut directory: PathBuf = root.join(group);
-    let mut lowest = None;
-    loop {
-        lowest = lowest.into_iter().chain(room(&directory, files)).min();
-        if directory == root || !directory.pop() || !directory.starts_with(root) {
-            return lowest;
-        }
-    }
+/// What is left to a group and its ancestors, by the tightest of their limits.
+fn lowest(root: &Path, group: &str, files: &Files, enough: u64) -> Option<u64> {
+    let groups = Path::new(group).ancestors();
+    groups.filter_map(|group| room(&root.join(group), files, enough)).min()
 }
 
-fn room(directory: &Path, files: &Files) -> Option<u64> {
-    let number = |name| fs::read_to_string(directory.join(name)).ok()?.trim().parse::<u64>().ok();
+fn room(directory: &Path, files: &Files, enough: u64) -> Option<u64> {
+    let number = |name| read(&directory.join(name))?.trim_ascii().parse::<u64>().ok();
     // A group without a limit says "max", which is no number.
     let limit = number(files.limit)?;
     let usage = number(files.usage)?;
-    let reclaimable = fs::read_to_string(directory.join("memory.stat"))
-        .ok()
+    let left = limit.saturating_sub(usage);
+    if left >= enough {
+        // The kernel adds up all processors' counters for what follows.
+        return Some(left);
+    }
+    let reclaimable = read(&directory.join("memory.stat"))
         .and_then(|text| field(&text, files.reclaimable))
         .unwrap_or(0);
     Some(limit.saturating_sub(usage.saturating_sub(reclaimable)))
 }
 
+/// What a file of the kernel's says, which gives no length beforehand.
+fn read(path: &Path) -> Option<String> {
+    let mut text = String::with_capacity(4096);
+    File::open(path).ok()?.read_to_string(&mut text).ok()?;
+    Some(text)
+}
+
 /// The number after `name` at the start of a line.
 fn field(text: &str, name: &str) -> Option<u64> {
-    text.lines().find_map(|line| {
-        let mut words = line.split_whitespace();
-        (words.next()? == name).then(|| words.next()?.parse().ok())?
-    })
+    let starts_line = |at: usize| at == 0 || text.as_bytes()[at - 1] == b'\n';
+    let (at, _) = text.match_indices(name).find(|(at, _)| starts_line(*at))?;
+    text[at + name.len()..].split_ascii_whitespace().next()?.parse().ok()
 }
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     fn write(root: &Path, path: &str, text: &str) {
@@ -123,22 +129,39 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let root = directory.path();
         let (proc, cgroup) = (root.join("proc"), root.join("cgroup"));
-        assert_eq!(available_in(&proc, &cgroup), None);
+        assert_eq!(available_in(&proc, &cgroup, u64::MAX), None);
 
         write(&proc, "meminfo", "MemTotal: 9000 kB\nMemAvailable:   4000 kB\n");
         write(&proc, "self/cgroup", "9:name=systemd:/\n4:cpu,memory:/x\n0::/a/b\ngarbage\n");
-        assert_eq!(available_in(&proc, &cgroup), Some(4_096_000));
+        assert_eq!(available_in(&proc, &cgroup, u64::MAX), Some(4_096_000));
 
         write(&cgroup, "a/b/memory.max", "max\n");
         write(&cgroup, "a/b/memory.current", "1\n");
         write(&cgroup, "a/memory.max", "1000000\n");
         write(&cgroup, "a/memory.current", "400000\n");
         write(&cgroup, "a/memory.stat", "anon 5\ninactive_file 100000\n");
-        assert_eq!(available_in(&proc, &cgroup), Some(700_000));
+        assert_eq!(available_in(&proc, &cgroup, u64::MAX), Some(700_000));
+        assert_eq!(available_in(&proc, &cgroup, 600_001), Some(700_000));
+        assert_eq!(
+            available_in(&proc, &cgroup, 600_000),
+            Some(600_000),
+            "enough without the cache"
+        );
 
         write(&cgroup, "memory/x/memory.limit_in_bytes", "500000\n");
         write(&cgroup, "memory/x/memory.usage_in_bytes", "600000\n");
-        assert_eq!(available_in(&proc, &cgroup), Some(0));
+        assert_eq!(available_in(&proc, &cgroup, u64::MAX), Some(0));
+    }
+
+    #[test]
+    fn a_field_is_the_whole_word_that_a_line_begins_with() {
+        let text = "total_inactive_file 1\ninactive_file 2\ninactive_file 3\nlast 4";
+        assert_eq!(field(text, "inactive_file "), Some(2));
+        assert_eq!(field(text, "total_inactive_file "), Some(1));
+        assert_eq!(field(text, "last "), Some(4));
+        for absent in ["file ", "total ", "1", "other ", "last 4"] {
+            assert_eq!(field(text, absent), None, "{absent}");
+        }
     }
 
     #[test]
