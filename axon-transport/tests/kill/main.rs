@@ -4,8 +4,9 @@
 //! Each case is first walked: one process is stepped through the operation, and wherever a segment
 //! that it writes has changed there is a new state that a death may leave behind. A death between
 //! two such states leaves the first of them, so killing once in each state stands for killing at
-//! every instruction. The bounded run kills around the states, all of them where they are few, and at
-//! instructions chosen at random; the full run
+//! every instruction. One that copies thousands of bytes may be stopped after each of them: after a
+//! few hundred, a kill at its end stands for the rest. The bounded run kills around the states, all of
+//! them where they are few, and at instructions chosen at random; the full run
 //! (`cargo test --release -p axon-transport --test kill -- --full`) at every single instruction, or
 //! evenly over an operation of very many and around its states. A part of a name runs the cases that
 //! have it in theirs.

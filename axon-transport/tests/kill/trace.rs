@@ -21,7 +21,13 @@ use nix::{
 pub(crate) struct Tracee {
     pid: Pid,
     gone: bool,
+    steps: u64,
+    /// The instruction at which the last [look](LOOK) found it, if that repeats itself.
+    repeats: Option<u64>,
 }
+
+/// So often it is looked whether the instruction is one that repeats itself.
+const LOOK: u64 = 256;
 
 /// What a step led to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -60,7 +66,7 @@ impl Tracee {
             }
             ForkResult::Parent { child } => {
                 drop(theirs);
-                let tracee = Self { pid: child, gone: false };
+                let tracee = Self { pid: child, gone: false, steps: 0, repeats: None };
                 let result = meanwhile(ours);
                 match waitpid(child, None).expect("a child") {
                     WaitStatus::Stopped(_, Signal::SIGSTOP) => {}
@@ -73,13 +79,74 @@ impl Tracee {
     }
 
     /// Lets it execute one instruction, or one system call.
+    ///
+    /// An instruction that copies megabytes stops after each byte. Of such a one that two looks on
+    /// end found, which are 256 steps apart, the rest is one step.
     pub(crate) fn step(&mut self) -> Step {
+        self.steps += 1;
+        if self.steps.is_multiple_of(LOOK) && self.finish_repeating() {
+            return Step::Next;
+        }
         ptrace::step(self.pid, None).expect("a stopped tracee");
         match waitpid(self.pid, None).expect("a child") {
             WaitStatus::Stopped(_, Signal::SIGTRAP) => Step::Next,
             WaitStatus::Stopped(_, Signal::SIGSTOP) => Step::Done,
             other => panic!("it ended in its operation: {other:?}"),
         }
+    }
+
+    /// Whether it stood in the middle of an instruction that repeats itself, and has now done it to
+    /// its end.
+    #[cfg(target_arch = "x86_64")]
+    fn finish_repeating(&mut self) -> bool {
+        let at = ptrace::getregs(self.pid).expect("a stopped tracee").rip;
+        // REP MOVS and REP STOS, with REX.W before the opcode or without.
+        let len = match [0, 1, 2].map(|n| self.byte(at + n)) {
+            [0xf2 | 0xf3, 0xa4 | 0xa5 | 0xaa | 0xab, _] => 2,
+            [0xf2 | 0xf3, 0x48, 0xa4 | 0xa5 | 0xaa | 0xab] => 3,
+            _ => {
+                self.repeats = None;
+                return false;
+            }
+        };
+        if self.repeats.replace(at) != Some(at) {
+            return false;
+        }
+        self.repeats = None;
+        self.run_to(at + len);
+        true
+    }
+
+    /// Other architectures have none.
+    #[cfg(not(target_arch = "x86_64"))]
+    fn finish_repeating(&mut self) -> bool {
+        self.repeats = None;
+        false
+    }
+
+    /// Lets it run until it comes to the instruction at `end`.
+    #[cfg(target_arch = "x86_64")]
+    fn run_to(&mut self, end: u64) {
+        let (address, shift) = word_of(end);
+        let word = ptrace::read(self.pid, address).expect("its code");
+        // INT3 stops it once it is executed.
+        let stop = word & !(0xff << shift) | (0xcc << shift);
+        ptrace::write(self.pid, address, stop).expect("its code");
+        ptrace::cont(self.pid, None).expect("a stopped tracee");
+        let stopped = waitpid(self.pid, None).expect("a child");
+        assert_eq!(stopped, WaitStatus::Stopped(self.pid, Signal::SIGTRAP));
+        ptrace::write(self.pid, address, word).expect("its code");
+        let mut registers = ptrace::getregs(self.pid).expect("a stopped tracee");
+        assert_eq!(registers.rip, end + 1, "it stopped elsewhere");
+        registers.rip = end;
+        ptrace::setregs(self.pid, registers).expect("a stopped tracee");
+    }
+
+    /// A byte of its code; that of no instruction beyond the end of what is mapped.
+    #[cfg(target_arch = "x86_64")]
+    fn byte(&self, at: u64) -> u8 {
+        let (address, shift) = word_of(at);
+        ptrace::read(self.pid, address).map_or(0, |word| (word >> shift) as u8)
     }
 
     /// Takes up to `count` steps. Whether the operation came to its end.
@@ -127,6 +194,13 @@ impl Drop for Tracee {
             while waitpid(Pid::from_raw(-self.pid.as_raw()), None).is_ok() {}
         }
     }
+}
+
+/// The word that a byte of a tracee's is in, which no page's end divides, and where it is in it in
+/// bits.
+#[cfg(target_arch = "x86_64")]
+fn word_of(address: u64) -> (ptrace::AddressType, u64) {
+    ((address & !7) as ptrace::AddressType, 8 * (address & 7))
 }
 
 /// Why no process can be traced here, if none can.
