@@ -34,11 +34,16 @@ pub(super) fn resolve(
     default_file: Option<&Path>,
     files: &impl Files,
 ) -> Result<Config, ConfigError> {
-    let sources = Sources::collect(env, default_file, files)?;
+    let mut sources = Sources::collect(env, default_file, files)?;
+    let modes = [("classic", Mode::Classic), ("qkd", Mode::Qkd)];
+    let mode = Values { sources: &sources, files }.choice("AXON_SECURITY_MODE", &modes)?;
+    let mode = mode.unwrap_or(Mode::Classic);
+    if matches!(mode, Mode::Qkd) {
+        sources.enter_qkd();
+    }
     let values = Values { sources: &sources, files };
 
-    let modes = [("classic", Mode::Classic), ("qkd", Mode::Qkd)];
-    let security = match values.choice("AXON_SECURITY_MODE", &modes)?.unwrap_or(Mode::Classic) {
+    let security = match mode {
         Mode::Classic => {
             refuse_all(&values, names::QKD_ONLY, "qkd")?;
             Security::Classic(classic(&values)?)

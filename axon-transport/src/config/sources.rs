@@ -32,6 +32,8 @@ pub(super) struct Sources {
     pub(super) settings: BTreeMap<&'static str, Setting>,
     /// `ROS_*` and `XDG_RUNTIME_DIR`, from the environment alone.
     pub(super) foreign: BTreeMap<&'static str, String>,
+    /// `[qkd]` of the file: settings that count once the mode is `qkd`.
+    of_qkd: BTreeMap<&'static str, Setting>,
     /// `[link]` of the file.
     pub(super) link: toml::Table,
     pub(super) file: Option<Rc<PathBuf>>,
@@ -130,6 +132,7 @@ impl Sources {
         })?;
 
         let path = Rc::new(path);
+        let mut from_file = BTreeMap::new();
         for (key, value) in table {
             if key == "link" {
                 let toml::Value::Table(link) = value else {
@@ -138,16 +141,54 @@ impl Sources {
                 self.link = link;
                 continue;
             }
-            let place = format!("{key} in {shown}");
-            let name = setting_of_key(&key).map_err(|e| e.at(&*place))?;
-            let text = text_of(name, value).map_err(|e| e.at(&*place))?;
-            self.settings
-                .entry(name)
-                .or_insert(Setting { text, origin: Origin::File(Rc::clone(&path)) });
+            if key == "qkd" {
+                let toml::Value::Table(qkd) = value else {
+                    return Err(ConfigError::name("qkd", "a section, [qkd]").at(shown));
+                };
+                for (key, value) in qkd {
+                    let (name, setting) = setting_of_file(&key, value, &path)?;
+                    if !names::QKD_ONLY.contains(&name) {
+                        let accepted =
+                            "the settings of qkd in [qkd]; put this one above all sections";
+                        let place = format!("{key} in {shown}");
+                        return Err(ConfigError::name(name, accepted).at(place));
+                    }
+                    self.of_qkd.insert(name, setting);
+                }
+                continue;
+            }
+            let (name, setting) = setting_of_file(&key, value, &path)?;
+            from_file.insert(name, setting);
+        }
+        if let Some(name) = self.of_qkd.keys().find(|name| from_file.contains_key(*name)) {
+            let accepted = "one of the two, in [qkd] or above all sections";
+            return Err(ConfigError::name(name, accepted).at(shown));
+        }
+        for (name, setting) in from_file {
+            self.settings.entry(name).or_insert(setting);
         }
         self.file = Some(path);
         Ok(())
     }
+
+    /// The mode is `qkd`: its section of the file counts, where the environment says nothing else.
+    pub(super) fn enter_qkd(&mut self) {
+        for (name, setting) in std::mem::take(&mut self.of_qkd) {
+            self.settings.entry(name).or_insert(setting);
+        }
+    }
+}
+
+/// A key of the file, and its value as the environment would spell it.
+fn setting_of_file(
+    key: &str,
+    value: toml::Value,
+    file: &Rc<PathBuf>,
+) -> Result<(&'static str, Setting), ConfigError> {
+    let place = format!("{key} in {}", file.display());
+    let name = setting_of_key(key).map_err(|e| e.at(&*place))?;
+    let text = text_of(name, value).map_err(|e| e.at(&*place))?;
+    Ok((name, Setting { text, origin: Origin::File(Rc::clone(file)) }))
 }
 
 fn is_ours(name: &OsStr) -> bool {

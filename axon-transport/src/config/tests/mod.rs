@@ -261,6 +261,35 @@ fn the_environment_wins_over_the_file() {
 }
 
 #[test]
+fn the_section_of_qkd_counts_in_qkd_alone() {
+    let section = "
+        [qkd]
+        qkd_peers = ['sae-b']
+        qkd_key_mode = 'session'
+        kme_url = 'https://kme'
+        kme_ca = 'ca.pem'
+        sae_id = 'sae-a'
+        sae_cert = 'cert.pem'
+        sae_key = 'key.pem'
+    ";
+    let file = format!("security_mode = 'qkd'\n{section}");
+    let config = with_file(&[], &file).unwrap();
+    assert_eq!(qkd(&config).sae_key, Path::new("/f/key.pem"), "relative to the file");
+    assert_eq!(qkd(&config).key_mode, KeyMode::Session);
+    let config = with_file(&[("AXON_QKD_KEY_MODE", "messages10")], &file).unwrap();
+    assert_eq!(qkd(&config).key_mode, KeyMode::Messages10, "the environment wins");
+    let config = with_file(&[("AXON_SECURITY_MODE", "classic")], &file).unwrap();
+    assert_eq!(classic(&config).auth, ClassicAuth::None);
+    let error =
+        with_file(&[("AXON_SECURITY_MODE", "classic"), ("AXON_SAE_ID", "a")], &file).unwrap_err();
+    assert_eq!(error.variable(), "AXON_SAE_ID", "what the environment says is never ignored");
+
+    // Without a mode in the file it is the default's, and the section waits for the other one.
+    classic(&with_file(&[], section).unwrap());
+    qkd(&with_file(&[("AXON_SECURITY_MODE", "qkd")], section).unwrap());
+}
+
+#[test]
 fn real_files_are_judged_as_they_are() {
     use std::os::unix::fs::PermissionsExt;
     let dir = tempfile::tempdir().unwrap();
