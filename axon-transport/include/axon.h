@@ -971,8 +971,9 @@ axon_ret_t axon_session_graph_count(struct axon_session_t session,
 
 /**
  * Lends `len` bytes to be written and then published: in shared memory where they are more than
- * 4 KiB, so that nothing is copied. They are at `data`, aligned to 8, and hold zeros or bytes of
- * earlier samples. Fewer than `len` may be published, so that what is serialized can be given its
+ * 4 KiB, so that nothing is copied. They are at `data` and hold zeros or bytes of earlier samples.
+ * Aligned to 16 is what is behind the first `header` of them, here and where they are taken in place:
+ * 0 for all of them, 4 for a structure that follows a header of four bytes. Fewer than `len` may be published, so that what is serialized can be given its
  * upper bound. Blocks and fails as `axon_session_publisher_publish`.
  *
  * One thread at a time may write. The bytes may be used until the loan is published or abandoned;
@@ -982,6 +983,7 @@ axon_ret_t axon_session_graph_count(struct axon_session_t session,
  * `loan` and `data` point to room for a handle and a pointer.
  */
 axon_ret_t axon_session_publisher_loan(struct axon_publisher_t publisher,
+                                       size_t header,
                                        size_t len,
                                        struct axon_loan_t *loan,
                                        uint8_t **data);

@@ -3,7 +3,6 @@
 // Messages that a publisher lends, to be written in the memory that its subscriptions read: a stream's
 // header, and behind it the message itself, whose memory is the stream's body.
 
-#include <memory>
 #include <string>
 
 #include "cdr/codec.hpp"
@@ -15,27 +14,12 @@
 namespace rmw_axon
 {
 
-namespace
-{
-
-// Gives back the memory of a message that was lent, or was to be: a loan's, or where that is 0 the heap's.
-void end_loan(void * message, axon_loan_t loan)
-{
-  if (loan.id != 0) {
-    axon_session_loan_abandon(loan);
-  } else {
-    ::operator delete(message);
-  }
-}
-
-}  // namespace
-
 Publisher::~Publisher()
 {
   // What is lent to the program still ends with the publisher: rmw has it returned before.
   for (const auto & [message, loan] : loans) {
     plan.fini(message);
-    end_loan(message, loan);
+    axon_session_loan_abandon(loan);
   }
   axon_session_publisher_destroy(handle);
 }
@@ -71,20 +55,14 @@ void * borrow(Publisher & publisher)
   axon_loan_t loan{};
   uint8_t * stream = nullptr;
   const size_t size = cdr::HEADER + publisher.plan.size_of;
-  check(axon_session_publisher_loan(publisher.handle, size, &loan, &stream));
+  check(axon_session_publisher_loan(publisher.handle, cdr::HEADER, size, &loan, &stream));
   void * message = stream + cdr::HEADER;
-  if (reinterpret_cast<uintptr_t>(message) % publisher.plan.alignment != 0) {
-    // Behind the header it would lie where its type may not: it is lent by the heap, and copied.
-    check(axon_session_loan_abandon(loan));
-    loan = axon_loan_t{};
-    message = ::operator new(publisher.plan.size_of);
-  }
   try {
     publisher.plan.init(message);
     const std::lock_guard<std::mutex> lock(publisher.loans_mutex);
     publisher.loans.emplace(message, loan);
   } catch (...) {
-    end_loan(message, loan);
+    axon_session_loan_abandon(loan);
     throw;
   }
   return message;
@@ -92,14 +70,6 @@ void * borrow(Publisher & publisher)
 
 void publish(Publisher & publisher, void * message, axon_loan_t loan)
 {
-  if (loan.id == 0) {
-    const Stream stream(publisher.plan, publisher.label, message);
-    ::operator delete(message);
-    check(
-      axon_session_publisher_publish(
-        publisher.handle, stream.data(), stream.size(), AXON_TIME_NOW, nullptr));
-    return;
-  }
   cdr::write_header(static_cast<uint8_t *>(message) - cdr::HEADER);
   const size_t size = cdr::HEADER + publisher.plan.size_of;
   check(axon_session_loan_publish(loan, size, AXON_TIME_NOW, nullptr));
@@ -145,7 +115,7 @@ rmw_ret_t rmw_return_loaned_message_from_publisher(
       require(loaned_message, "loaned_message");
       const axon_loan_t loan = rmw_axon::take_off(of, loaned_message);
       of.plan.fini(loaned_message);
-      rmw_axon::end_loan(loaned_message, loan);
+      axon_session_loan_abandon(loan);
     });
 }
 

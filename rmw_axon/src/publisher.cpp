@@ -36,7 +36,7 @@ void publish(Publisher & publisher, const void * message)
   }
   axon_loan_t loan{};
   uint8_t * stream = nullptr;
-  check(axon_session_publisher_loan(publisher.handle, size, &loan, &stream));
+  check(axon_session_publisher_loan(publisher.handle, 0, size, &loan, &stream));
   try {
     cdr::encode(publisher.plan, message, stream, size);
   } catch (...) {

@@ -20,8 +20,9 @@ pub(super) struct NamedLoan {
 }
 
 /// Lends `len` bytes to be written and then published: in shared memory where they are more than
-/// 4 KiB, so that nothing is copied. They are at `data`, aligned to 8, and hold zeros or bytes of
-/// earlier samples. Fewer than `len` may be published, so that what is serialized can be given its
+/// 4 KiB, so that nothing is copied. They are at `data` and hold zeros or bytes of earlier samples.
+/// Aligned to 16 is what is behind the first `header` of them, here and where they are taken in place:
+/// 0 for all of them, 4 for a structure that follows a header of four bytes. Fewer than `len` may be published, so that what is serialized can be given its
 /// upper bound. Blocks and fails as `axon_session_publisher_publish`.
 ///
 /// One thread at a time may write. The bytes may be used until the loan is published or abandoned;
@@ -32,6 +33,7 @@ pub(super) struct NamedLoan {
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_publisher_loan(
     publisher: axon_publisher_t,
+    header: usize,
     len: usize,
     loan: *mut axon_loan_t,
     data: *mut *mut u8,
@@ -40,7 +42,7 @@ pub unsafe extern "C" fn axon_session_publisher_loan(
         present(loan, "the place of the loan")?;
         present(data, "the place of the pointer")?;
         let publisher = named(publisher)?;
-        let lent = publisher.loan_owned(len);
+        let lent = publisher.loan_owned(header, len);
         let mut lent = lent.map_err(|e| Failure::from(e).of_endpoint(publisher.endpoint()))?;
         let at = lent.as_mut_ptr();
         let publisher = std::sync::Arc::downgrade(&publisher);

@@ -145,9 +145,10 @@ impl Publisher {
 }
 
 impl Publisher {
-    /// As [`loan`](Self::loan), of `len` bytes at most, for who cannot borrow the publisher.
-    pub(crate) fn loan_owned(&self, len: usize) -> Result<OwnedLoan, PublishError> {
-        Ok(OwnedLoan { loan: self.writer.loan_owned(len)?, publisher: self.inner.clone() })
+    /// As [`loan`](Self::loan), of `len` bytes at most, for who cannot borrow the publisher. What is
+    /// behind the first `header` bytes is aligned to 16.
+    pub(crate) fn loan_owned(&self, header: usize, len: usize) -> Result<OwnedLoan, PublishError> {
+        Ok(OwnedLoan { loan: self.writer.loan_owned(header, len)?, publisher: self.inner.clone() })
     }
 }
 
@@ -217,7 +218,7 @@ pub(crate) struct OwnedLoan {
 }
 
 impl OwnedLoan {
-    /// Where it is written, aligned to 8. It stays there.
+    /// Where it is written. It stays there.
     pub(crate) fn as_mut_ptr(&mut self) -> *mut u8 {
         self.loan.as_mut_ptr()
     }

@@ -26,7 +26,7 @@ pub(super) fn read_at(words: &[AtomicU64], at: usize, out: &mut [u8]) {
     copy(words, at, out);
 }
 
-/// Replaces `out` by the first `len` bytes of `words`.
+/// Replaces `out` by the `len` bytes of `words` from `at` on.
 ///
 /// # Errors
 /// Memory for them is not to be had.
@@ -35,12 +35,13 @@ pub(super) fn read_at(words: &[AtomicU64], at: usize, out: &mut [u8]) {
 /// The words have fewer.
 pub(super) fn copy_out(
     words: &[AtomicU64],
+    at: usize,
     len: usize,
     out: &mut Vec<u8>,
 ) -> Result<(), TryReserveError> {
     out.clear();
     out.try_reserve(len)?;
-    copy(words, 0, &mut out.spare_capacity_mut()[..len]);
+    copy(words, at, &mut out.spare_capacity_mut()[..len]);
     // SAFETY: within the reserved capacity, and `copy` wrote each of the `len` bytes.
     unsafe { out.set_len(len) };
     Ok(())
@@ -139,8 +140,10 @@ mod tests {
         let (words, bytes) = words(longest + 9);
         let mut out = vec![1; 3];
         for len in [0, 1, 8, 9, 1023, 1024, 1025, 5000, longest - 1, longest, longest + 1, 7] {
-            copy_out(&words, len, &mut out).unwrap();
-            assert!(out == bytes[..len], "{len}");
+            for at in [0, 4] {
+                copy_out(&words, at, len, &mut out).unwrap();
+                assert!(out == bytes[at..at + len], "{len} from {at} on");
+            }
         }
     }
 
@@ -152,7 +155,7 @@ mod tests {
             let read = || read_at(&words, at, &mut vec![0; len]);
             assert!(std::panic::catch_unwind(read).is_err(), "{len} from {at} on");
         }
-        assert!(copy_out(&words, 1 << 60, &mut Vec::new()).is_err());
+        assert!(copy_out(&words, 0, 1 << 60, &mut Vec::new()).is_err());
         read_at(&words, 2048, &mut []);
     }
 }

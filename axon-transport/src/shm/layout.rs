@@ -2,7 +2,7 @@
 
 use std::sync::atomic::AtomicU64;
 
-use super::{ShmError, classes, sync::Ordering};
+use super::{ShmError, classes, loan::ALIGNED, sync::Ordering};
 use crate::ids::{Gid, SessionId};
 
 /// Segments are multiples of this many bytes, and memory is committed in them.
@@ -156,11 +156,16 @@ impl Location {
     /// The first word and the one after the last of `bytes` bytes there, if a segment of `limit`
     /// words has them.
     pub(super) fn words(&self, bytes: u64, limit: usize) -> Option<std::ops::Range<usize>> {
-        if !self.offset.is_multiple_of(LINE) || self.offset < HEAP_AT {
+        if !self.offset.is_multiple_of(LINE) { None } else { self.words_of(bytes, limit) }
+    }
+
+    /// As [`words`](Self::words), of bytes that begin anywhere, also within the first word.
+    pub(super) fn words_of(&self, bytes: u64, limit: usize) -> Option<std::ops::Range<usize>> {
+        if self.offset < HEAP_AT {
             return None;
         }
         let start = usize::try_from(self.offset / 8).ok()?;
-        let count = usize::try_from(bytes.div_ceil(8)).ok()?;
+        let count = usize::try_from((self.offset % 8).checked_add(bytes)?.div_ceil(8)).ok()?;
         let end = start.checked_add(count).filter(|end| *end <= limit)?;
         Some(start..end)
     }
@@ -283,7 +288,8 @@ pub(super) fn samples_bytes(budget: u64, max_message: u64, pins: u64) -> u64 {
     // Room for four of the largest, so that one of them always fits beside one that stands; and
     // for as many as two readers can pin. Twice the budget, so that pieces between samples seldom
     // shorten the history.
-    let largest = classes::rounded(max_message);
+    // One that is lent behind a header may begin so much later.
+    let largest = classes::rounded(max_message + ALIGNED as u64);
     let bytes = (4 * largest).max(2 * budget) + 2 * pins * largest;
     (SLOTS_AT + bytes).next_multiple_of(ALIGN).min(MAX_SEGMENT)
 }

@@ -46,10 +46,15 @@ use super::{
 /// ```
 pub struct Loan<'a> {
     writer: Lender<'a>,
+    /// Bytes of the memory before the first that is lent.
+    lead: usize,
     len: usize,
     written: usize,
     memory: Memory,
 }
+
+/// What is lent is aligned to so many bytes, or what is behind its header: as any type of C is at least.
+pub(super) const ALIGNED: usize = align_of::<u128>();
 
 /// Whose memory it is.
 pub(super) enum Lender<'a> {
@@ -69,7 +74,8 @@ impl Deref for Lender<'_> {
 }
 
 enum Memory {
-    Own(Vec<u8>),
+    /// Of words that are [aligned](ALIGNED).
+    Own(Vec<u128>),
     Shared(Place),
     Published,
 }
@@ -88,13 +94,14 @@ impl Place {
 }
 
 impl<'a> Loan<'a> {
-    pub(super) fn copied(writer: Lender<'a>, len: usize) -> Self {
-        Self { writer, len, written: 0, memory: Memory::Own(vec![0; len]) }
+    pub(super) fn copied(writer: Lender<'a>, lead: usize, len: usize) -> Self {
+        let words = vec![0; (lead + len).div_ceil(ALIGNED)];
+        Self { writer, lead, len, written: 0, memory: Memory::Own(words) }
     }
 
-    /// `len` bytes there, which have been lent.
-    pub(super) fn placed(writer: Lender<'a>, len: usize, place: Place) -> Self {
-        Self { writer, len, written: 0, memory: Memory::Shared(place) }
+    /// `len` bytes there behind the first `lead`, all of which have been lent.
+    pub(super) fn placed(writer: Lender<'a>, lead: usize, len: usize, place: Place) -> Self {
+        Self { writer, lead, len, written: 0, memory: Memory::Shared(place) }
     }
 
     /// Publishes it, waiting for a slot as [`Writer::publish`] does.
@@ -155,10 +162,10 @@ impl<'a> Loan<'a> {
         if self.writer.is_forked() {
             return Err(PublishError::Forked);
         }
-        let lent = self.len;
         let payload = match &self.memory {
             Memory::Shared(place) if len as u64 > self.writer.longest_copied() => {
-                Payload::Written { at: place.location(), len, lent }
+                let (lead, lent) = (self.lead, self.lead + self.len);
+                Payload::Written { at: place.location(), lead, len, lent }
             }
             // What has become short is copied from where it was written.
             Memory::Own(_) | Memory::Shared(_) => Payload::Bytes(&self[..len]),
@@ -176,7 +183,7 @@ impl<'a> Loan<'a> {
     /// The address of the memory that is lent.
     fn lent(&self, place: &Place) -> NonNull<u8> {
         assert!(!self.writer.is_forked(), "a loan of shared memory, used after fork");
-        place.segment.memory.address(place.at, self.len)
+        place.segment.memory.address(place.at + self.lead as u64, self.len)
     }
 }
 
@@ -185,7 +192,7 @@ impl Deref for Loan<'_> {
 
     fn deref(&self) -> &[u8] {
         match &self.memory {
-            Memory::Own(bytes) => bytes,
+            Memory::Own(words) => &bytes_of(words)[self.lead..][..self.len],
             // SAFETY: `len` bytes of the segment's map, which lives as long as the loan. They are
             // memory from the system or bytes of earlier samples, so initialized. They are lent to
             // this loan alone, and no reader reads them before they are published, which takes the
@@ -211,7 +218,7 @@ impl DerefMut for Loan<'_> {
             return unsafe { slice::from_raw_parts_mut(start, self.len) };
         }
         match &mut self.memory {
-            Memory::Own(bytes) => bytes,
+            Memory::Own(words) => &mut bytes_of_mut(words)[self.lead..][..self.len],
             Memory::Shared(_) | Memory::Published => &mut [],
         }
     }
@@ -241,9 +248,19 @@ impl Drop for Loan<'_> {
         if let Memory::Shared(place) = &self.memory
             && !self.writer.is_forked()
         {
-            self.writer.give_back(place.location(), self.len);
+            self.writer.give_back(place.location(), self.lead + self.len);
         }
     }
+}
+
+fn bytes_of(words: &[u128]) -> &[u8] {
+    // SAFETY: the same memory, borrowed as long; any byte of a word is a byte.
+    unsafe { slice::from_raw_parts(words.as_ptr().cast(), size_of_val(words)) }
+}
+
+fn bytes_of_mut(words: &mut [u128]) -> &mut [u8] {
+    // SAFETY: the same memory, borrowed as long and mutably; any bytes are a word.
+    unsafe { slice::from_raw_parts_mut(words.as_mut_ptr().cast(), size_of_val(words)) }
 }
 
 /// Nanoseconds since the Unix epoch.

@@ -205,12 +205,21 @@ impl Publisher {
 
     /// Memory for a sample of `len` bytes, to be filled and then published: shared memory where it
     /// is more than 4 KiB, or more than 512 bytes if [so many are
-    /// expected](PublisherOptions::expected_len), so that nothing is copied.
+    /// expected](PublisherOptions::expected_len), so that nothing is copied. It is aligned to 16.
     ///
     /// # Errors
     /// As for [`publish`](Self::publish).
     pub fn loan(&self, len: usize) -> Result<Loan<'_>, PublishError> {
-        let loan = self.writer.loan(len);
+        self.loan_behind(0, len)
+    }
+
+    /// As [`loan`](Self::loan), but what is aligned to 16 is not its first byte but that behind the first
+    /// `header`, for whoever takes it in place too: a structure that follows a header of four bytes, say.
+    ///
+    /// # Errors
+    /// As for [`publish`](Self::publish).
+    pub fn loan_behind(&self, header: usize, len: usize) -> Result<Loan<'_>, PublishError> {
+        let loan = self.writer.loan_behind(header, len);
         self.keep_up();
         loan
     }

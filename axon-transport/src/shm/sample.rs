@@ -46,7 +46,20 @@ pub struct Sample {
 
 enum Data {
     Copied(Vec<u8>),
-    Pinned { map: Arc<Map>, words: Range<usize>, pin: Pin },
+    Pinned { there: Extract, pin: Pin },
+}
+
+/// Bytes of a map: from the one behind the first `skip` of these words on.
+pub(super) struct Extract {
+    pub(super) map: Arc<Map>,
+    pub(super) words: Range<usize>,
+    pub(super) skip: usize,
+}
+
+impl Extract {
+    pub(super) fn words(&self) -> &[AtomicU64] {
+        &self.map.words()[self.words.clone()]
+    }
 }
 
 impl Sample {
@@ -55,15 +68,10 @@ impl Sample {
         Self { taken, len: bytes.len(), data: Data::Copied(bytes) }
     }
 
-    /// `len` bytes in these words of `map`, which hold as many and which `pin` pins.
-    pub(super) fn pinned(
-        taken: Taken,
-        len: usize,
-        (map, words): (Arc<Map>, Range<usize>),
-        pin: Pin,
-    ) -> Self {
-        debug_assert!(len <= words.len() * 8 && words.end <= map.words().len());
-        Self { taken, len, data: Data::Pinned { map, words, pin } }
+    /// `len` bytes there, which the words hold and which `pin` pins.
+    pub(super) fn pinned(taken: Taken, len: usize, there: Extract, pin: Pin) -> Self {
+        debug_assert!(there.skip + len <= there.words().len() * 8);
+        Self { taken, len, data: Data::Pinned { there, pin } }
     }
 
     /// What goes with it.
@@ -99,7 +107,7 @@ impl Sample {
         match &self.data {
             Data::Copied(bytes) => out.copy_from_slice(&bytes[at.min(self.len)..][..count]),
             Data::Pinned { pin, .. } if pin.attachment().lane.is_forked() => return 0,
-            Data::Pinned { .. } => copy::read_at(self.words(), at, out),
+            Data::Pinned { there, .. } => copy::read_at(there.words(), there.skip + at, out),
         }
         count
     }
@@ -120,7 +128,7 @@ impl Sample {
                 out.clear();
                 Ok(())
             }
-            Data::Pinned { .. } => copy::copy_out(self.words(), self.len, out),
+            Data::Pinned { there, .. } => copy::copy_out(there.words(), there.skip, self.len, out),
         }
     }
 
@@ -129,14 +137,17 @@ impl Sample {
         SampleReader { sample: self, at: 0 }
     }
 
-    /// Where its bytes are, aligned to at least 8 where it [is borrowed](Self::is_borrowed).
+    /// Where its bytes are. Where it [is borrowed](Self::is_borrowed) they are aligned to 16, or those behind
+    /// the header that its publisher's [loan](super::Publisher::loan_behind) had.
     ///
     /// They are readable for as long as the sample lives. A publisher that does not keep to the
     /// protocol may change them at any time, so an access must be atomic or volatile.
     pub fn as_ptr(&self) -> *const u8 {
         match &self.data {
             Data::Copied(bytes) => bytes.as_ptr(),
-            Data::Pinned { .. } => self.words().as_ptr().cast(),
+            Data::Pinned { there, .. } => {
+                there.words().as_ptr().cast::<u8>().wrapping_add(there.skip)
+            }
         }
     }
 
@@ -148,16 +159,10 @@ impl Sample {
     /// not be used in a child that was forked while the sample lived.
     pub unsafe fn as_slice(&self) -> &[u8] {
         // SAFETY: `len` bytes from there on are initialized and readable for as long as `self`
-        // lives: those of the vector, or those of the map, which holds as many (`pinned`). That
+        // lives: those of the vector, or those of the map, which holds as many behind those
+        // that are skipped (`pinned`). That
         // nobody writes to them meanwhile is the vector's nature, or the caller's promise.
         unsafe { slice::from_raw_parts(self.as_ptr(), self.len) }
-    }
-
-    fn words(&self) -> &[AtomicU64] {
-        match &self.data {
-            Data::Copied(_) => &[],
-            Data::Pinned { map, words, .. } => &map.words()[words.clone()],
-        }
     }
 }
 

@@ -116,7 +116,7 @@ static void use(uint64_t id) {
     NO_HANDLE(axon_session_publisher_matched(publisher, &size));
     NO_HANDLE(axon_session_publisher_wait_matched(publisher, 1, AXON_WAIT_FOREVER));
     NO_HANDLE(axon_session_publisher_assert_liveliness(publisher));
-    NO_HANDLE(axon_session_publisher_loan(publisher, 1, &loan, &data));
+    NO_HANDLE(axon_session_publisher_loan(publisher, 0, 1, &loan, &data));
     NO_HANDLE(axon_session_publisher_event(publisher, AXON_EVENT_LIVELINESS_LOST, &event));
     NO_HANDLE(axon_session_loan_publish(loan, 0, AXON_TIME_NOW, NULL));
     NO_HANDLE(axon_session_loan_abandon(loan));
@@ -181,8 +181,8 @@ void case_misuse(void) {
     REFUSED(axon_session_publisher_publish(talker, NULL, 1, AXON_TIME_NOW, NULL));
     REFUSED(axon_session_publisher_skip_unread(talker, NULL));
     REFUSED(axon_session_publisher_matched(talker, NULL));
-    REFUSED(axon_session_publisher_loan(talker, 1, NULL, &data));
-    REFUSED(axon_session_publisher_loan(talker, 1, &loan, NULL));
+    REFUSED(axon_session_publisher_loan(talker, 0, 1, NULL, &data));
+    REFUSED(axon_session_publisher_loan(talker, 0, 1, &loan, NULL));
     REFUSED(axon_session_publisher_event(talker, AXON_EVENT_LIVELINESS_LOST, NULL));
     REFUSED(axon_session_subscription_event(listener, AXON_EVENT_MESSAGE_LOST, NULL));
     REFUSED(axon_session_subscription_take(listener, NULL, &message, NULL, &byte));
@@ -291,7 +291,7 @@ static void *use_shared(void *argument) {
         set.guard_count = 1;
         going = worked_or_gone(
             axon_session_publisher_publish(shared.talker, &byte, 1, AXON_TIME_NOW, NULL));
-        if (worked_or_gone(axon_session_publisher_loan(shared.talker, 5000, &loan, &lent))) {
+        if (worked_or_gone(axon_session_publisher_loan(shared.talker, 0, 5000, &loan, &lent))) {
             lent[0] = 1;
             worked_or_gone(axon_session_loan_publish(loan, 4999, AXON_TIME_NOW, NULL));
         }
@@ -354,7 +354,7 @@ void case_fork(void) {
     OK(axon_session_publisher_wait_matched(talker, 1, PATIENCE));
     axon_loan_t loan;
     uint8_t *lent;
-    OK(axon_session_publisher_loan(talker, 10, &loan, &lent));
+    OK(axon_session_publisher_loan(talker, 0, 10, &loan, &lent));
     axon_guard_t guard;
     OK(axon_session_guard_create(place.session, &guard));
     fflush(NULL);

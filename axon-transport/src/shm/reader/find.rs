@@ -1,7 +1,6 @@
 //! How a reader finds the next sample: past what is skipped or lost, in memory that may not have come.
 
 use std::{
-    ops::Range,
     sync::{Arc, atomic::AtomicU64},
     time::Instant,
 };
@@ -10,9 +9,9 @@ use super::{ATTEMPTS, Descriptors, KNOWN, MISSING, Missing, Obstacle, Reader};
 use crate::shm::{
     TakeError, copy,
     layout::{self, Array, COPIED, COPIED_ALWAYS},
-    memory::Map,
     peer::Found,
     ring::{self, Look, Place, Record, State},
+    sample::Extract,
 };
 
 impl Reader {
@@ -180,11 +179,15 @@ impl Reader {
                 Found::Absent => return Err(Obstacle::Missing(at.segment)),
             },
         };
-        match at.words(len, map.words().len()) {
-            Some(words) if slot => Ok(Bytes::Slot(map, words)),
-            Some(words) => Ok(Bytes::Block(map, words)),
-            None => Err(Obstacle::Corrupt("a sample lies outside its segment")),
+        let outside = Obstacle::Corrupt("a sample lies outside its segment");
+        let limit = map.words().len();
+        if slot {
+            let words = at.words_of(len, limit).ok_or(outside)?;
+            let skip = (at.offset % 8) as usize;
+            return Ok(Bytes::Slot(Extract { map, words, skip }));
         }
+        let words = at.words(len, limit).ok_or(outside)?;
+        Ok(Bytes::Block(Extract { map, words, skip: 0 }))
     }
 
     /// Whether a pin keeps the sample in place; else it is copied as one in a block is.
@@ -202,18 +205,18 @@ impl Reader {
         let len = record.len as usize;
         let Some(descriptors) = &self.descriptors else { return Ok(false) };
         let view = descriptors.view(&self.attachment);
-        let mut copy = |words: &[AtomicU64]| {
-            copy::copy_out(words, len, out).map_err(|_| TakeError::NoMemory { len: len as u64 })
+        let mut copy = |words: &[AtomicU64], skip| {
+            copy::copy_out(words, skip, len, out)
+                .map_err(|_| TakeError::NoMemory { len: len as u64 })
         };
         match bytes {
-            Bytes::Inline => copy(view.inline(self.cursor))?,
-            Bytes::Block(map, words) => copy(&map.words()[words.clone()])?,
-            Bytes::Slot(map, words) if self.may_pin(record) => {
-                let copy = || copy(&map.words()[words.clone()]);
+            Bytes::Inline => copy(view.inline(self.cursor), 0)?,
+            Bytes::Slot(there) if self.may_pin(record) => {
+                let copy = || copy(there.words(), there.skip);
                 let pinned = self.attachment.while_pinned(self.cursor, copy);
                 return pinned.transpose().map(|copied| copied.is_some());
             }
-            Bytes::Slot(map, words) => copy(&map.words()[words.clone()])?,
+            Bytes::Block(there) | Bytes::Slot(there) => copy(there.words(), there.skip)?,
         }
         Ok(view.stands(self.cursor))
     }
@@ -269,7 +272,7 @@ pub(super) enum Bytes {
     /// In its descriptor.
     Inline,
     /// To be copied, and checked afterwards.
-    Block(Arc<Map>, Range<usize>),
+    Block(Extract),
     /// To be pinned, if the reader [may](Reader::may_pin).
-    Slot(Arc<Map>, Range<usize>),
+    Slot(Extract),
 }

@@ -264,14 +264,14 @@ impl Reader {
         for _ in 0..ATTEMPTS {
             let Some((record, bytes)) = self.find_whole()? else { break };
             let bytes = match bytes {
-                Bytes::Slot(map, words) if self.may_pin(&record) => {
+                Bytes::Slot(there) if self.may_pin(&record) => {
                     match self.attachment.pin(self.cursor) {
                         Pinning::Pinned(pin) => {
                             let (taken, len) = (self.taken(&record), record.len as usize);
-                            return Ok(Some(Sample::pinned(taken, len, (map, words), pin)));
+                            return Ok(Some(Sample::pinned(taken, len, there, pin)));
                         }
                         Pinning::Overtaken => continue,
-                        Pinning::NoRecord => Bytes::Slot(map, words),
+                        Pinning::NoRecord => Bytes::Slot(there),
                     }
                 }
                 copied => copied,

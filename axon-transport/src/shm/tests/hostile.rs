@@ -341,6 +341,10 @@ fn samples_in_places_that_make_no_sense_are_reported() {
         (1, 1, 0),
         (1, 1, !127),
         (5000, 2, !127),
+        (5000, 2, !0),
+        // In place, it may begin within a word.
+        (5000, 2, end - 4999),
+        (5000, 2, 0),
         (u32::MAX, 2, BLOCK),
         // Too long to be copied, too short to be pinned, nowhere.
         (4097, 1, BLOCK),
@@ -364,6 +368,9 @@ fn samples_in_places_that_make_no_sense_are_reported() {
     let mut out = Vec::new();
     assert_eq!(reader.take(&mut out).unwrap().unwrap().meta.sequence, 5);
     assert_eq!(out, [0; 200]);
+    scribble.descriptor(1, 5000, 2, end - 5000);
+    assert_eq!(reader.take(&mut out).unwrap().unwrap().meta.sequence, 5);
+    assert_eq!(out, [0; 5000]);
 }
 
 #[test]

@@ -105,6 +105,41 @@ fn who_expects_them_has_shorter_loans_in_place() {
 }
 
 #[test]
+fn what_follows_a_header_is_aligned_for_all_who_see_it() {
+    let (a, b) = (session(), session());
+    let writer = writer(&a, keep_last(2), 0);
+    let mut readers = [&a, &b].map(|session| attach(&writer, &a, session, keep_last(2)));
+    let lens = [0, 1, 16, 500, 4096, 4097, 60_000, MAX as usize];
+    let headers = [0, 1, 4, 8, 15, 16, 17, usize::MAX];
+    let cases = lens.into_iter().flat_map(|len| headers.map(|header| (header, len)));
+    for (sequence, (header, len)) in cases.enumerate() {
+        let aligned = |at: *const u8| at.addr().wrapping_add(header).is_multiple_of(16);
+        let bytes = pattern(sequence as u64, len);
+        let mut loan = writer.loan_behind(header, len).unwrap();
+        assert!(aligned(loan.as_ptr()) && loan.len() == len, "{header} {len}");
+        loan.copy_from_slice(&bytes);
+        loan.publish(meta(sequence as u64)).unwrap();
+
+        let sample = take(&mut readers[0]);
+        assert_eq!((sample.is_borrowed(), sample.len()), (len > 4096, len));
+        assert!(!sample.is_borrowed() || aligned(sample.as_ptr()), "{header} {len}");
+        intact(&sample);
+        let mut part = vec![0; 40];
+        let at = len / 3;
+        let count = sample.read_at(at, &mut part);
+        assert_eq!(part[..count], bytes[at..][..count]);
+        assert_eq!(count, 40.min(len - at));
+        // SAFETY: the writer is this test's, and does not write to what is pinned.
+        assert_eq!(unsafe { sample.as_slice() }, bytes);
+        let mut copy = Vec::new();
+        readers[1].take(&mut copy).unwrap().unwrap();
+        assert_eq!(copy, bytes);
+    }
+    // As much is given back as was lent.
+    (0..100).for_each(|_| drop(writer.loan_behind(4, MAX as usize).unwrap()));
+}
+
+#[test]
 fn nothing_that_ends_ends_a_sample_in_use() {
     let (a, b) = (session(), session());
     let writer = writer(&a, keep_last(1), 0);

@@ -9,7 +9,7 @@ use super::{LOOKS, Numbering, Payload, State};
 use crate::{
     qos::Durability,
     shm::{
-        Loan, Meta, PeerSession, PublishError, Published, Writer,
+        Loan, Location, Meta, PeerSession, PublishError, Published, Writer,
         area::Area,
         history::Extent,
         layout::{self, COPIED, INLINE},
@@ -61,7 +61,7 @@ impl Writer {
             Err(passed) => return Ok((passed.sequence, Published { position: None })),
         };
         // Copied outside the lock: nobody else knows of the place yet.
-        let mut loan = Loan::placed(Lender::Borrowed(self), payload.len(), place);
+        let mut loan = Loan::placed(Lender::Borrowed(self), 0, payload.len(), place);
         loan.copy_from_slice(payload);
         loan.commit(payload.len(), numbering, patience)
     }
@@ -89,9 +89,10 @@ impl Writer {
                     let block = self.copy_in(state, bytes)?;
                     (Extent::Block(block), Place::Block(block.at))
                 }
-                Payload::Written { at, lent, .. } => {
+                Payload::Written { at, lead, lent, .. } => {
                     let len = Area::rounded(lent as u64);
-                    (Extent::Slot { at, len }, Place::Slot(at))
+                    let first = Location { offset: at.offset + lead as u64, ..at };
+                    (Extent::Slot { at, len }, Place::Slot(first))
                 }
             };
             let meta = self.number(state, numbering);

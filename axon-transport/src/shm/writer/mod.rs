@@ -15,7 +15,7 @@ use super::{
     heap::{Need, Object},
     history::History,
     layout::{self, Array, COPIED, COPIED_ALWAYS},
-    loan::Lender,
+    loan::{ALIGNED, Lender},
     orphans::Orphan,
     pi_mutex::{PiGuard, PiMutex},
     ring,
@@ -143,8 +143,9 @@ pub(super) enum Numbering {
 pub(super) enum Payload<'a> {
     /// At most [`COPIED`] bytes, copied in under the lock.
     Bytes(&'a [u8]),
-    /// Written to memory that was lent: where, the sample's length, and how much was lent.
-    Written { at: Location, len: usize, lent: usize },
+    /// Written to memory that was lent: where, how far behind its start, the sample's length, and how
+    /// much was lent.
+    Written { at: Location, lead: usize, len: usize, lent: usize },
 }
 
 impl Writer {
@@ -326,17 +327,30 @@ impl Writer {
     }
 
     /// Lends `len` bytes to be written and then published: of shared memory where it is more than
-    /// 4 KiB, or 512 bytes if so many are [expected](RingOptions::expected). May wait as [`publish`](Self::publish) does.
+    /// 4 KiB, or 512 bytes if so many are [expected](RingOptions::expected). May wait as
+    /// [`publish`](Self::publish) does.
     ///
     /// # Errors
     /// As [`publish`](Self::publish).
     pub fn loan(&self, len: usize) -> Result<Loan<'_>, PublishError> {
-        self.lend_to(Lender::Borrowed(self), len)
+        self.loan_behind(0, len)
     }
 
-    /// As [`loan`](Self::loan), for who keeps the writer with it.
-    pub(crate) fn loan_owned(self: &Arc<Self>, len: usize) -> Result<Loan<'static>, PublishError> {
-        self.lend_to(Lender::Shared(Arc::clone(self)), len)
+    /// As [`loan`](Self::loan); aligned to [`ALIGNED`] is what is behind the first `header` bytes.
+    ///
+    /// # Errors
+    /// As [`publish`](Self::publish).
+    pub fn loan_behind(&self, header: usize, len: usize) -> Result<Loan<'_>, PublishError> {
+        self.lend_to(Lender::Borrowed(self), header, len)
+    }
+
+    /// As [`loan_behind`](Self::loan_behind), for who keeps the writer with it.
+    pub(crate) fn loan_owned(
+        self: &Arc<Self>,
+        header: usize,
+        len: usize,
+    ) -> Result<Loan<'static>, PublishError> {
+        self.lend_to(Lender::Shared(Arc::clone(self)), header, len)
     }
 
     /// The longest loan in bytes that is copied after all.
@@ -344,14 +358,21 @@ impl Writer {
         if self.options.expected > COPIED_ALWAYS { COPIED_ALWAYS } else { COPIED }
     }
 
-    fn lend_to<'a>(&self, lender: Lender<'a>, len: usize) -> Result<Loan<'a>, PublishError> {
-        let bytes = self.check(len)?;
+    fn lend_to<'a>(
+        &self,
+        lender: Lender<'a>,
+        header: usize,
+        len: usize,
+    ) -> Result<Loan<'a>, PublishError> {
+        self.check(len)?;
+        let lead = header.wrapping_neg() % ALIGNED;
         if len as u64 <= self.longest_copied() {
-            return Ok(Loan::copied(lender, len));
+            return Ok(Loan::copied(lender, lead, len));
         }
+        let bytes = Area::rounded((lead + len) as u64);
         let place =
             self.patiently(&mut Patience::new(PATIENCE), |state| self.lend(state, bytes))?;
-        Ok(Loan::placed(lender, len, place))
+        Ok(Loan::placed(lender, lead, len, place))
     }
 
     pub(super) fn give_back(&self, at: Location, len: usize) {
