@@ -91,6 +91,8 @@ class LanHost(Host):
     def __init__(self, directory, namespace, **variables):
         super().__init__(directory, ROS_AUTOMATIC_DISCOVERY_RANGE='SUBNET', **variables)
         self._namespace = namespace
+        # What AXON's tool is told beside the host's settings.
+        self.tool_env = {}
 
     def start(self, *command):
         return super().start(*self._namespace.enter, *command)
@@ -99,7 +101,7 @@ class LanHost(Host):
         """What this host's daemon says of itself; None where there is no daemon."""
         asked = subprocess.run(
             [*self._namespace.enter, tool('axon'), 'status', '--json'],
-            env=self.env, capture_output=True, text=True)
+            env={**self.env, **self.tool_env}, capture_output=True, text=True)
         return json.loads(asked.stdout) if asked.returncode == 0 else None
 
     def linked(self):
@@ -117,13 +119,16 @@ class LanHost(Host):
         for pid in self.daemons():
             os.kill(pid, signal.SIGKILL)
 
-    def close(self):
+    def end(self):
+        """Ends all that runs on it, the daemon too, whose grace time is not waited for."""
         for process in self.processes:
             process.kill()
-        # Its grace time is not waited for.
         for pid in self.daemons():
             os.kill(pid, signal.SIGTERM)
         super().close()
+
+    def close(self):
+        self.end()
 
 
 def tool(name):
