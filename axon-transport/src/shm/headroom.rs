@@ -40,10 +40,12 @@ fn at_most(enough: u64) -> Option<u64> {
 }
 
 fn available_in(proc: &Path, cgroup: &Path, enough: u64) -> Option<u64> {
-    let host = read(&proc.join("meminfo"))
-        .and_then(|text| field(&text, "MemAvailable:"))
+    let mut text = String::with_capacity(4096);
+    let host = read(&proc.join("meminfo"), &mut text)
+        .and_then(|text| field(text, "MemAvailable:"))
         .map(|kib| kib.saturating_mul(1024));
-    let groups = read(&proc.join("self/cgroup")).unwrap_or_default();
+    let mut groups = String::with_capacity(1024);
+    read(&proc.join("self/cgroup"), &mut groups);
     groups
         .lines()
         .filter_map(|line| {
@@ -51,9 +53,9 @@ fn available_in(proc: &Path, cgroup: &Path, enough: u64) -> Option<u64> {
             let (_, controllers, path) = (parts.next()?, parts.next()?, parts.next()?);
             let path = path.trim_start_matches('/');
             if controllers.is_empty() {
-                lowest(cgroup, path, &V2, enough)
+                lowest(cgroup, path, &V2, enough, &mut text)
             } else if controllers.split(',').any(|c| c == "memory") {
-                lowest(&cgroup.join("memory"), path, &V1, enough)
+                lowest(&cgroup.join("memory"), path, &V1, enough, &mut text)
             } else {
                 None
             }
@@ -77,13 +79,13 @@ const V1: Files = Files {
 };
 
 /// What is left to a group and its ancestors, by the tightest of their limits.
-fn lowest(root: &Path, group: &str, files: &Files, enough: u64) -> Option<u64> {
+fn lowest(root: &Path, group: &str, files: &Files, enough: u64, text: &mut String) -> Option<u64> {
     let groups = Path::new(group).ancestors();
-    groups.filter_map(|group| room(&root.join(group), files, enough)).min()
+    groups.filter_map(|group| room(&root.join(group), files, enough, text)).min()
 }
 
-fn room(directory: &Path, files: &Files, enough: u64) -> Option<u64> {
-    let number = |name| read(&directory.join(name))?.trim_ascii().parse::<u64>().ok();
+fn room(directory: &Path, files: &Files, enough: u64, text: &mut String) -> Option<u64> {
+    let mut number = |name| read(&directory.join(name), text)?.trim_ascii().parse::<u64>().ok();
     // A group without a limit says "max", which is no number.
     let limit = number(files.limit)?;
     let usage = number(files.usage)?;
@@ -92,16 +94,16 @@ fn room(directory: &Path, files: &Files, enough: u64) -> Option<u64> {
         // The kernel adds up all processors' counters for what follows.
         return Some(left);
     }
-    let reclaimable = read(&directory.join("memory.stat"))
-        .and_then(|text| field(&text, files.reclaimable))
+    let reclaimable = read(&directory.join("memory.stat"), text)
+        .and_then(|text| field(text, files.reclaimable))
         .unwrap_or(0);
     Some(limit.saturating_sub(usage.saturating_sub(reclaimable)))
 }
 
-/// What a file of the kernel's says, which gives no length beforehand.
-fn read(path: &Path) -> Option<String> {
-    let mut text = String::with_capacity(4096);
-    File::open(path).ok()?.read_to_string(&mut text).ok()?;
+/// Reads a file of the kernel's, which gives no length beforehand, into `text`.
+fn read<'a>(path: &Path, text: &'a mut String) -> Option<&'a str> {
+    text.clear();
+    File::open(path).ok()?.read_to_string(text).ok()?;
     Some(text)
 }
 
