@@ -201,22 +201,35 @@ impl Lines {
         }
     }
 
-    /// Tells those that are behind what they lack.
+    /// Tells those that are behind what they lack, if anybody is and not all the time. Waits for
+    /// nobody else who tells: the next call does what is left then.
     #[inline]
     pub(super) fn keep_up(&self, session: &SessionSegment) {
         if self.behind.load(Ordering::Relaxed) && !session.is_forked() {
-            self.catch_up(session);
+            match self.state.try_lock() {
+                Ok(state) => self.retry(state, session),
+                Err(TryLockError::Poisoned(state)) => self.retry(state.into_inner(), session),
+                Err(TryLockError::WouldBlock) => {}
+            }
+        }
+    }
+
+    /// The same at once, for a caller that may be the last.
+    pub(super) fn keep_up_now(&self, session: &SessionSegment) {
+        if self.behind.load(Ordering::Relaxed) && !session.is_forked() {
+            self.catch_up(self.lock(), session);
         }
     }
 
     #[cold]
-    fn catch_up(&self, session: &SessionSegment) {
-        let mut state = self.lock();
-        let now = Instant::now();
-        if state.tried.is_some_and(|tried| now.duration_since(tried) < PAUSE) {
-            return;
+    fn retry(&self, state: MutexGuard<'_, State>, session: &SessionSegment) {
+        if state.tried.is_none_or(|tried| tried.elapsed() >= PAUSE) {
+            self.catch_up(state, session);
         }
-        state.tried = Some(now);
+    }
+
+    fn catch_up(&self, mut state: MutexGuard<'_, State>, session: &SessionSegment) {
+        state.tried = Some(Instant::now());
         // Before the looks at what there is. What comes after such a look finds the lock taken, and
         // by the lock of the segments' table stores its `true` after this.
         self.behind.store(false, Ordering::Relaxed);
@@ -247,5 +260,23 @@ impl Lines {
 
     fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_publish_does_not_wait_for_a_thread_that_tells() {
+        let session = SessionSegment::create(SessionId::random()).unwrap();
+        let lines = Lines::new(session.id());
+        lines.note(false);
+        let telling = lines.lock();
+        lines.keep_up(&session);
+        assert!(lines.behind.load(Ordering::Relaxed), "it is left for the next call");
+        drop(telling);
+        lines.keep_up(&session);
+        assert!(!lines.behind.load(Ordering::Relaxed));
     }
 }

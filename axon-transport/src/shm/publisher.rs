@@ -243,7 +243,7 @@ impl Publisher {
     pub fn tend(&self) -> bool {
         let more = self.writer.tend(Instant::now());
         let more = self.context.session().tidy() || more;
-        self.keep_up();
+        self.context.lines().keep_up_now(self.context.session());
         more
     }
 
