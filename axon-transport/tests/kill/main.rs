@@ -9,7 +9,8 @@
 //! them where they are few, and at instructions chosen at random; the full run
 //! (`cargo test --release -p axon-transport --test kill -- --full`) at every single instruction, or
 //! evenly over an operation of very many and around its states. A part of a name runs the cases that
-//! have it in theirs.
+//! have it in theirs. `--steps=200000` is a full run that takes so many steps at about each operation,
+//! not 2,000,000: for a slow machine.
 //!
 //! Some cases have something else around them: a fork of the doomed process that keeps its
 //! descriptors, `mlockall`, no descriptors, no memory; or it is stopped where it would be killed, and
@@ -42,7 +43,7 @@ use std::{
 
 use cases::cases;
 use report::Report;
-use worker::Plan;
+use worker::{Plan, STEPS};
 
 fn main() -> ExitCode {
     let arguments: Vec<String> = env::args().skip(1).collect();
@@ -67,24 +68,26 @@ fn main() -> ExitCode {
         println!("skipped: {why}");
         return ExitCode::SUCCESS;
     }
-    let full = arguments.iter().any(|a| a == "--full");
+    let full = arguments.iter().any(|a| a == "--full").then_some(STEPS);
+    let told = arguments.iter().find_map(|a| a.strip_prefix("--steps="));
+    let steps = told.map(|steps| steps.parse().expect("a number of steps")).or(full);
     let filter = arguments.iter().find(|a| !a.starts_with('-'));
     let is_meant = |name: &str| filter.is_none_or(|part| name.contains(part.as_str()));
     let cases = cases();
     let chosen = cases.iter().enumerate().filter(|(_, case)| is_meant(case.name));
     let chosen: Vec<usize> = chosen.map(|(index, _)| index).collect();
-    conduct(&chosen, is_meant(daemon::NAME), full)
+    conduct(&chosen, is_meant(daemon::NAME), steps)
 }
 
 /// Shares the cases out among as many workers as there are processors, and prints what they found.
-fn conduct(chosen: &[usize], daemon: bool, full: bool) -> ExitCode {
+fn conduct(chosen: &[usize], daemon: bool, steps: Option<u64>) -> ExitCode {
     let start = Instant::now();
     let workers = thread::available_parallelism().map_or(1, usize::from).min(chosen.len());
     let share = |worker| chosen.iter().copied().skip(worker).step_by(workers).collect();
-    let plan = |worker| format!("--worker={}", Plan { full, cases: share(worker) });
+    let plan = |worker| format!("--worker={}", Plan { steps, cases: share(worker) });
     let mut plans: Vec<String> = (0..workers).map(plan).collect();
     if daemon {
-        plans.push(format!("--daemon={full}"));
+        plans.push(format!("--daemon={}", steps.is_some()));
     }
     let (sender, reports) = mpsc::channel();
     let mut running: Vec<Child> = Vec::new();

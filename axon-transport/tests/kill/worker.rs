@@ -25,18 +25,24 @@ use crate::{
 const BOUNDED: usize = 1000;
 /// Where a long operation is killed in a bounded run.
 const BLIND: [u64; 8] = [0, 100, 1000, 5000, 10_000, 20_000, 40_000, u64::MAX];
-/// Steps that a full run takes at most to kill an operation at each of its instructions, or at each
-/// so many of a long one.
-const STEPS: u64 = 2_000_000;
-/// States of a long operation around which a full run kills it, and the last ones of them.
-const STATES: usize = 100;
-const LAST: usize = 50;
-/// A scene that takes longer is wedged, in seconds.
+/// Steps that a full run takes, unless it is told otherwise, to kill an operation at each of its
+/// instructions, or at each so many of a long one; about as many again go into its states.
+pub(crate) const STEPS: u64 = 2_000_000;
+/// States of a long operation around which a full run kills it, and half as many are the last ones.
+const STATES: u64 = 100;
+/// So many at least, however long it is.
+const FEW_STATES: u64 = 8;
+/// Whoever takes longer for [so many steps](STRIDE), to set a scene or to get over a death, is
+/// wedged; in seconds.
 const PATIENCE: u32 = 60;
+const STRIDE: u64 = 1000;
+/// An operation of more instructions goes round in circles.
+const ENDLESS: u64 = 20_000_000;
 
 /// What a worker is to do.
 pub(crate) struct Plan {
-    pub(crate) full: bool,
+    /// Those of a full run; `None` for a bounded one.
+    pub(crate) steps: Option<u64>,
     pub(crate) cases: Vec<usize>,
 }
 
@@ -58,10 +64,10 @@ pub(crate) fn run(plan: &Plan) {
         say(&format!("\"{}\", walking", case.name));
         // A long one is killed at some points all the same; the states are for the full run.
         let (instructions, states) =
-            if case.long && !plan.full { Default::default() } else { walk(case) };
+            if case.long && plan.steps.is_none() { Default::default() } else { walk(case) };
         let points = match instructions {
             0 => BLIND.into(),
-            _ => points(plan.full, instructions, &states, BOUNDED.div_ceil(all.len())),
+            _ => points(plan.steps, instructions, &states, BOUNDED.div_ceil(all.len())),
         };
         let mut outcomes = Vec::with_capacity(points.len());
         for &point in &points {
@@ -92,22 +98,39 @@ fn at(case: &Case, point: u64) -> Outcome {
     alarm::set(PATIENCE);
     let before = Holdings::now();
     let mut scene = Scene::set(case);
-    scene.advance(point);
+    advance(&mut scene, point);
     let outcome = if case.around == Around::Stopped { scene.stop() } else { scene.kill() };
     assert_eq!(Holdings::now(), before, "something is left");
     alarm::cancel();
     outcome
 }
 
+/// Takes up to `count` steps, however slow the machine is.
+fn advance(scene: &mut Scene<'_>, count: u64) {
+    let (mut taken, mut done) = (0, false);
+    while taken < count && !done {
+        assert!(taken < ENDLESS, "it goes round in circles");
+        alarm::set(PATIENCE);
+        let some = STRIDE.min(count - taken);
+        done = scene.advance(some);
+        taken += some;
+    }
+    alarm::set(PATIENCE);
+}
+
 /// Steps through the operation: its instructions, and those after which a segment had changed.
 fn walk(case: &Case) -> (u64, Vec<u64>) {
-    alarm::set(20 * PATIENCE);
+    alarm::set(PATIENCE);
     let mut scene = Scene::set(case);
     let mut last = contents(&scene.written);
     let (mut steps, mut states, mut done) = (0, Vec::new(), false);
     while !done {
         done = scene.advance(1);
         steps += 1;
+        if steps % STRIDE == 0 {
+            assert!(steps < ENDLESS, "it goes round in circles");
+            alarm::set(PATIENCE);
+        }
         scene.look_for_segments();
         let now = contents(&scene.written);
         if now != last {
@@ -137,19 +160,21 @@ fn contents(segments: &[OwnedFd]) -> Vec<(u64, Vec<u8>)> {
 }
 
 /// The instructions after which to kill, in order.
-fn points(full: bool, instructions: u64, states: &[u64], share: usize) -> Vec<u64> {
+fn points(steps: Option<u64>, instructions: u64, states: &[u64], share: usize) -> Vec<u64> {
     let mut points = BTreeSet::from([0, instructions]);
     // The end may come later in another run: addresses and the allocator's state differ.
     points.insert(2 * instructions + 10_000);
     let around = |state: &u64| [state - 1, *state];
-    if full {
+    if let Some(steps) = steps {
         // To come to an instruction takes all those before it: of many, only each so many.
-        let every = (instructions * instructions).div_ceil(2 * STEPS).max(1);
+        let every = (instructions * instructions).div_ceil(2 * steps).max(1);
         points.extend((0..=instructions).step_by(usize::try_from(every).expect("a step")));
         // Most of many states are words of a payload that nobody sees yet.
-        let many = states.len().div_ceil(STATES);
+        let share = (steps / instructions).clamp(FEW_STATES, STATES);
+        let share = usize::try_from(share).expect("a number of states");
+        let many = states.len().div_ceil(share);
         points.extend(states.iter().step_by(many.max(1)).flat_map(around));
-        points.extend(states.iter().rev().take(LAST).flat_map(around));
+        points.extend(states.iter().rev().take(share / 2).flat_map(around));
         return points.into_iter().collect();
     }
     let mut random = instructions;
@@ -176,15 +201,18 @@ fn points(full: bool, instructions: u64, states: &[u64], share: usize) -> Vec<u6
 
 impl Plan {
     pub(crate) fn parse(text: &str) -> Self {
-        let (full, cases) = text.split_once(':').expect("a plan");
+        let (steps, cases) = text.split_once(':').expect("a plan");
         let cases = cases.split(',').filter_map(|n| n.parse().ok()).collect();
-        Self { full: full == "full", cases }
+        Self { steps: steps.parse().ok(), cases }
     }
 }
 
 impl fmt::Display for Plan {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(if self.full { "full:" } else { "bounded:" })?;
+        match self.steps {
+            Some(steps) => write!(f, "{steps}:")?,
+            None => f.write_str("bounded:")?,
+        }
         let cases: Vec<String> = self.cases.iter().map(ToString::to_string).collect();
         f.write_str(&cases.join(","))
     }
