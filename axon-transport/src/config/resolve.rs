@@ -37,7 +37,15 @@ pub(super) fn resolve(
     let mut sources = Sources::collect(env, default_file, files)?;
     let modes = [("classic", Mode::Classic), ("qkd", Mode::Qkd)];
     let mode = Values { sources: &sources, files }.choice("AXON_SECURITY_MODE", &modes)?;
-    let mode = mode.unwrap_or(Mode::Classic);
+    let mode = match mode {
+        Some(mode) => mode,
+        // Whoever wrote the section believes in it.
+        None if sources.has_qkd() => {
+            let accepted = "classic or qkd: a file with a section [qkd] needs security_mode";
+            return Err(ConfigError::missing("AXON_SECURITY_MODE", accepted));
+        }
+        None => Mode::Classic,
+    };
     if matches!(mode, Mode::Qkd) {
         sources.enter_qkd();
     }

@@ -32,8 +32,8 @@ pub(super) struct Sources {
     pub(super) settings: BTreeMap<&'static str, Setting>,
     /// `ROS_*` and `XDG_RUNTIME_DIR`, from the environment alone.
     pub(super) foreign: BTreeMap<&'static str, String>,
-    /// `[qkd]` of the file: settings that count once the mode is `qkd`.
-    of_qkd: BTreeMap<&'static str, Setting>,
+    /// `[qkd]` of the file, where there is one: settings that count once the mode is `qkd`.
+    of_qkd: Option<BTreeMap<&'static str, Setting>>,
     /// `[link]` of the file.
     pub(super) link: toml::Table,
     pub(super) file: Option<Rc<PathBuf>>,
@@ -145,6 +145,7 @@ impl Sources {
                 let toml::Value::Table(qkd) = value else {
                     return Err(ConfigError::name("qkd", "a section, [qkd]").at(shown));
                 };
+                let of_qkd = self.of_qkd.insert(BTreeMap::new());
                 for (key, value) in qkd {
                     let (name, setting) = setting_of_file(&key, value, &path)?;
                     if !names::QKD_ONLY.contains(&name) {
@@ -153,14 +154,15 @@ impl Sources {
                         let place = format!("{key} in {shown}");
                         return Err(ConfigError::name(name, accepted).at(place));
                     }
-                    self.of_qkd.insert(name, setting);
+                    of_qkd.insert(name, setting);
                 }
                 continue;
             }
             let (name, setting) = setting_of_file(&key, value, &path)?;
             from_file.insert(name, setting);
         }
-        if let Some(name) = self.of_qkd.keys().find(|name| from_file.contains_key(*name)) {
+        let of_qkd = self.of_qkd.iter().flat_map(BTreeMap::keys);
+        if let Some(name) = of_qkd.copied().find(|name| from_file.contains_key(name)) {
             let accepted = "one of the two, in [qkd] or above all sections";
             return Err(ConfigError::name(name, accepted).at(shown));
         }
@@ -171,9 +173,14 @@ impl Sources {
         Ok(())
     }
 
+    /// Whether the file has a section `[qkd]`.
+    pub(super) fn has_qkd(&self) -> bool {
+        self.of_qkd.is_some()
+    }
+
     /// The mode is `qkd`: its section of the file counts, where the environment says nothing else.
     pub(super) fn enter_qkd(&mut self) {
-        for (name, setting) in std::mem::take(&mut self.of_qkd) {
+        for (name, setting) in self.of_qkd.take().unwrap_or_default() {
             self.settings.entry(name).or_insert(setting);
         }
     }

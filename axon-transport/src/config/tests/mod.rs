@@ -284,8 +284,13 @@ fn the_section_of_qkd_counts_in_qkd_alone() {
         with_file(&[("AXON_SECURITY_MODE", "classic"), ("AXON_SAE_ID", "a")], &file).unwrap_err();
     assert_eq!(error.variable(), "AXON_SAE_ID", "what the environment says is never ignored");
 
-    // Without a mode in the file it is the default's, and the section waits for the other one.
-    classic(&with_file(&[], section).unwrap());
+    // The mode is said outright, here or there: whoever wrote the section believes in it.
+    for section in [section, "[qkd]"] {
+        let error = with_file(&[], section).unwrap_err();
+        assert_eq!(error.variable(), "AXON_SECURITY_MODE");
+        assert!(error.accepted().contains("security_mode"), "{error}");
+    }
+    classic(&with_file(&[("AXON_SECURITY_MODE", "classic")], section).unwrap());
     qkd(&with_file(&[("AXON_SECURITY_MODE", "qkd")], section).unwrap());
 }
 
