@@ -19,9 +19,13 @@ impl Lease {
         Self { duration: duration.map(|d| d.max(1)), asserted: now, alive: true }
     }
 
-    /// It was asserted at `at`. Whether that brings it back to life.
+    /// It was asserted at `at`. Whether that brings it back to life: one that is known already does
+    /// not.
     pub fn assert(&mut self, at: u64) -> bool {
-        self.asserted = self.asserted.max(at);
+        if at <= self.asserted {
+            return false;
+        }
+        self.asserted = at;
         !std::mem::replace(&mut self.alive, true)
     }
 
@@ -104,6 +108,8 @@ mod tests {
         assert!(lease.ran_out(110));
         assert!(!lease.ran_out(200), "not alive stays not alive");
         assert_eq!(lease.due(), None);
+        assert!(!lease.assert(100), "the assertion that ran out is none");
+        assert!(!lease.ran_out(201));
         assert!(lease.assert(205));
         assert!(!lease.assert(206));
         assert_eq!(lease.due(), Some(216));
