@@ -81,14 +81,61 @@ fn all_that_is_ready_is_named_and_a_sample_that_stays_is_named_again() {
 }
 
 #[test]
-fn what_belongs_to_another_session_is_refused() {
+fn what_belongs_to_other_sessions_is_waited_for_too() {
+    let (session, others) = (alone(), [alone(), alone()]);
+    let [one, two] = &others;
+    let (foreign, own) = (one.create_guard_condition(), session.create_guard_condition());
+    let (publisher, subscription) = pair(two, "/t");
+    let all = [
+        Waitable::GuardCondition(&foreign),
+        Waitable::Subscription(&subscription),
+        Waitable::GuardCondition(&own),
+    ];
+    assert!(session.wait_for(&all, NOT_AT_ALL).unwrap().is_empty());
+    assert!(session.wait_for(&all, Some(Duration::from_millis(10))).unwrap().is_empty());
+    for round in 0..300 {
+        thread::scope(|scope| {
+            let waiter = scope.spawn(|| session.wait_for(&all, None).unwrap());
+            if round % 2 == 0 {
+                // Sometimes it sleeps by now.
+                thread::sleep(Duration::from_micros(round * 3));
+            }
+            match round % 3 {
+                0 => foreign.trigger(),
+                1 => publisher.publish(b"x").map(drop).unwrap(),
+                _ => own.trigger(),
+            }
+            assert_eq!(waiter.join().unwrap(), [(round % 3) as usize]);
+        });
+        assert_eq!(subscription.take(&mut Vec::new()).is_some(), round % 3 == 1);
+    }
+}
+
+#[test]
+fn sessions_that_wait_for_each_other_hear_of_both() {
+    let (one, two) = (alone(), alone());
+    let guards = [one.create_guard_condition(), two.create_guard_condition()];
+    let (publisher, subscription) = pair(&two, "/t");
+    thread::scope(|scope| {
+        let waiters = [(&one, &guards[1]), (&two, &guards[0])].map(|(session, guard)| {
+            let all = [Waitable::GuardCondition(guard), Waitable::Subscription(&subscription)];
+            scope.spawn(move || session.wait_for(&all, None).unwrap())
+        });
+        thread::sleep(Duration::from_millis(20));
+        publisher.publish(b"x").unwrap();
+        for waiter in waiters {
+            assert_eq!(waiter.join().unwrap(), [1]);
+        }
+    });
+}
+
+#[test]
+fn at_a_session_that_is_closed_nobody_waits() {
     let (session, other) = (alone(), alone());
     let foreign = other.create_guard_condition();
-    let (_publisher, subscription) = pair(&other, "/t");
-    for waitable in [Waitable::GuardCondition(&foreign), Waitable::Subscription(&subscription)] {
-        let refused = session.wait_for(&[waitable], None).unwrap_err();
-        assert!(matches!(refused, SessionError::OtherSession), "{refused}");
-    }
+    drop(other);
+    let refused = session.wait_for(&[Waitable::GuardCondition(&foreign)], None).unwrap_err();
+    assert!(matches!(refused, SessionError::OtherSession), "{refused}");
 }
 
 #[test]

@@ -82,7 +82,8 @@ pub struct axon_wait_set_t {
 ///
 /// AXON_RET_TIMEOUT: none was ready in time; all handles are 0. Every other failure leaves the arrays
 /// as they were: AXON_RET_INVALID_HANDLE where one names nothing, AXON_RET_INVALID_ARGUMENT where one is
-/// of another session.
+/// of another session that is closed. What is of another session of this process can be waited for
+/// too, and takes a thread more on its way.
 ///
 /// Any number of threads may wait at once, each with arrays of its own. What is destroyed meanwhile is
 /// out of the graph at once; the wait goes on.

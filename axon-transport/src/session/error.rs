@@ -22,8 +22,8 @@ pub enum SessionError {
         /// The name.
         name: String,
     },
-    /// Something to wait for belongs to another session.
-    #[error("what is waited for belongs to another session: each waits for its own")]
+    /// Something to wait for belongs to another session, at which one cannot wait.
+    #[error("what is waited for belongs to a session that is closed or led by an event loop")]
     OtherSession,
     /// `AXON_DAEMON=require`, and there is none.
     #[error("no daemon listens at {address}: start `axon_daemon`, or set AXON_DAEMON=spawn")]

@@ -3,11 +3,12 @@
 use std::{
     fmt,
     sync::{
-        Arc,
+        Arc, Weak,
         atomic::{AtomicBool, Ordering},
     },
 };
 
+use super::state::Shared;
 use crate::shm::SessionSegment;
 
 /// A condition that stands from when it is triggered until a wait has seen it. Thread-safe; cheap to
@@ -20,11 +21,13 @@ pub struct GuardCondition {
 pub(super) struct Guard {
     triggered: AtomicBool,
     segment: Arc<SessionSegment>,
+    session: Weak<Shared>,
 }
 
 impl GuardCondition {
-    pub(super) fn new(segment: Arc<SessionSegment>) -> Self {
-        Self { inner: Arc::new(Guard { triggered: AtomicBool::new(false), segment }) }
+    pub(super) fn new(session: &Arc<Shared>) -> Self {
+        let (segment, session) = (session.segment.clone(), Arc::downgrade(session));
+        Self { inner: Arc::new(Guard { triggered: AtomicBool::new(false), segment, session }) }
     }
 
     /// Triggers it. Async-signal-safe: a signal handler may, too. In a forked child it wakes nobody.
@@ -54,6 +57,11 @@ impl Guard {
 
     pub(super) fn segment(&self) -> &Arc<SessionSegment> {
         &self.segment
+    }
+
+    /// Its session, where that is open still.
+    pub(super) fn session(&self) -> Option<Arc<Shared>> {
+        self.session.upgrade()
     }
 
     pub(super) fn is_triggered(&self) -> bool {

@@ -305,7 +305,7 @@ impl Session {
 
     /// A condition that the program triggers itself, for wait sets of the session.
     pub fn create_guard_condition(&self) -> GuardCondition {
-        GuardCondition::new(self.shared().segment.clone())
+        GuardCondition::new(&self.handle.shared)
     }
 
     /// A local ring for a publisher on another host, under that publisher's own GID. For the
@@ -455,7 +455,7 @@ impl Session {
         Self { handle: Arc::new(handle) }
     }
 
-    fn shared(&self) -> &Shared {
+    fn shared(&self) -> &Arc<Shared> {
         &self.handle.shared
     }
 

@@ -7,9 +7,13 @@ use std::{
 
 use super::{
     Client, Event, GuardCondition, Server, Session, SessionError, Subscription, events::Source,
-    guard::Guard, subscription::SubscriptionInner,
+    guard::Guard, state::Shared, subscription::SubscriptionInner,
 };
-use crate::{events::EventKind, shm::ShmError, wait::Look};
+use crate::{
+    events::EventKind,
+    shm::{SessionSegment, ShmError},
+    wait::{Look, PassedOn},
+};
 
 /// Something to wait for.
 #[derive(Clone, Copy, Debug)]
@@ -35,7 +39,30 @@ pub(super) enum Part {
 }
 
 /// What is waited for, without keeping it from ending.
-pub(crate) struct Watch(Vec<Part>);
+pub(crate) struct Watch {
+    parts: Vec<Part>,
+    /// The sessions that it belongs to, but for the one that waits.
+    others: Vec<Arc<Shared>>,
+}
+
+/// While another session is waited at, its control thread listens for it, and passes on what comes.
+struct Visit<'a> {
+    other: &'a Shared,
+    _passed: PassedOn<'a>,
+}
+
+impl<'a> Visit<'a> {
+    fn new(other: &'a Shared, watch: &Arc<Watch>, waits: &Shared) -> Result<Self, ShmError> {
+        other.listen()?;
+        Ok(Self { other, _passed: other.segment.pass_on(watch.clone(), &waits.segment) })
+    }
+}
+
+impl Drop for Visit<'_> {
+    fn drop(&mut self) {
+        self.other.listen_no_more();
+    }
+}
 
 impl Session {
     /// Waits until at least one of `waitables` is ready, for at most `timeout`: for ever where it is
@@ -43,7 +70,8 @@ impl Session {
     /// if the time is over.
     ///
     /// Any number of threads may wait at the same time. One that waits for what another waits for,
-    /// too, is no error, but a guard condition then stands for one of them only.
+    /// too, is no error, but a guard condition then stands for one of them only. What belongs to
+    /// another session of this process can be waited for as well, and takes a thread more on its way.
     ///
     /// ```
     /// use std::time::Duration;
@@ -68,7 +96,8 @@ impl Session {
     /// ```
     ///
     /// # Errors
-    /// [`SessionError::OtherSession`] when one is another session's, and in a forked child.
+    /// [`SessionError::OtherSession`] when one is of another session that is closed or led by an event
+    /// loop, and in a forked child.
     pub fn wait_for(
         &self,
         waitables: &[Waitable<'_>],
@@ -79,8 +108,18 @@ impl Session {
 
     /// What [`wait_watch`](Self::wait_watch) waits for.
     pub(crate) fn watch(&self, waitables: &[Waitable<'_>]) -> Result<Arc<Watch>, SessionError> {
-        let parts: Option<Vec<Part>> = waitables.iter().map(|one| self.part(one)).collect();
-        Ok(Arc::new(Watch(parts.ok_or(SessionError::OtherSession)?)))
+        let (mut parts, mut others) = (Vec::with_capacity(waitables.len()), Vec::new());
+        for waitable in waitables {
+            let (part, segment) = waitable.part();
+            parts.push(part);
+            if !Arc::ptr_eq(segment, self.segment()) {
+                let session = waitable.session().ok_or(SessionError::OtherSession)?;
+                if !others.iter().any(|known| Arc::ptr_eq(known, &session)) {
+                    others.push(session);
+                }
+            }
+        }
+        Ok(Arc::new(Watch { parts, others }))
     }
 
     /// As [`wait_for`](Self::wait_for).
@@ -93,6 +132,9 @@ impl Session {
             return Err(ShmError::Forked.into());
         }
         let deadline = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
+        let visit = |other| Visit::new(other, watch, self.shared());
+        let visits: Result<Vec<_>, _> = watch.others.iter().map(|one| visit(one)).collect();
+        let _visits = visits.map_err(|_| SessionError::OtherSession)?;
         loop {
             let ready = watch.collect();
             let left = deadline.map(|deadline| deadline.saturating_duration_since(Instant::now()));
@@ -103,9 +145,12 @@ impl Session {
             self.segment().wait_for(watch.clone(), left);
         }
     }
+}
 
-    fn part(&self, waitable: &Waitable<'_>) -> Option<Part> {
-        let (part, segment) = match waitable {
+impl Waitable<'_> {
+    /// What is looked at, and the segment of the session that it belongs to.
+    fn part(&self) -> (Part, &Arc<SessionSegment>) {
+        match self {
             Waitable::Subscription(subscription) => {
                 (Part::Data(subscription.inner.clone()), subscription.session.segment())
             }
@@ -122,8 +167,19 @@ impl Session {
                 let (source, kind) = event.parts();
                 (Part::Event(source, kind), event.session.segment())
             }
+        }
+    }
+
+    /// Its session, where that is open.
+    fn session(&self) -> Option<Arc<Shared>> {
+        let session = match self {
+            Waitable::Subscription(subscription) => &subscription.session,
+            Waitable::Server(server) => &server.session,
+            Waitable::Client(client) => &client.session,
+            Waitable::GuardCondition(guard) => return guard.guard().session(),
+            Waitable::Event(event) => &event.session,
         };
-        Arc::ptr_eq(segment, self.segment()).then_some(part)
+        Some(session.shared().clone())
     }
 }
 
@@ -135,13 +191,18 @@ impl Watch {
             Part::Guard(guard) => guard.take(),
             Part::Event(source, kind) => source.has(*kind),
         };
-        self.0.iter().enumerate().filter(|(_, part)| ready(part)).map(|(index, _)| index).collect()
+        self.parts
+            .iter()
+            .enumerate()
+            .filter(|(_, part)| ready(part))
+            .map(|(index, _)| index)
+            .collect()
     }
 }
 
 impl Look for Watch {
     fn ready(&self) -> bool {
-        self.0.iter().any(|part| match part {
+        self.parts.iter().any(|part| match part {
             Part::Data(inner) => inner.ready(),
             Part::Guard(guard) => guard.is_triggered(),
             Part::Event(source, kind) => source.may_have(*kind),

@@ -23,7 +23,7 @@ use super::{
 use crate::{
     ids::{Gid, SessionId},
     passed::PassedFd,
-    wait::{Doorbell, ExternalLeader, Look, Purpose, due, waits},
+    wait::{Doorbell, ExternalLeader, Look, PassedOn, Purpose, due, waits},
 };
 
 /// The memory, doorbell and identity by which other sessions know this one.
@@ -178,6 +178,16 @@ impl SessionSegment {
         }
         let (words, ready) = (self.armed_words(), || look.ready());
         self.doorbell.wait(words, Purpose::Samples, ready, Some(look.clone()), &[], timeout)
+    }
+
+    /// Has `elsewhere`, another session of this process where a thread waits, look again when `look` may
+    /// be ready, until what this returns is dropped. Somebody must listen for this session meanwhile.
+    pub(crate) fn pass_on(
+        &self,
+        look: Arc<dyn Look>,
+        elsewhere: &Arc<SessionSegment>,
+    ) -> PassedOn<'_> {
+        self.doorbell.pass_on(self.armed_words(), look, elsewhere.clone())
     }
 
     /// Makes every waiter of this session look again.

@@ -13,6 +13,7 @@ use super::{
     ear::{CLOSED, Drained, Ear, Heard},
     spin::Spin,
 };
+use crate::shm::SessionSegment;
 
 /// How long who waits sleeps at most where nobody watches the processes that are to ring: what one of
 /// them did not live to ring for is found then. Tests sleep for ever, so that they notice.
@@ -84,6 +85,17 @@ enum Leader {
 struct Follower {
     turn: Condvar,
     look: Option<Arc<dyn Look>>,
+    /// It sleeps at this session's doorbell.
+    elsewhere: Option<Arc<SessionSegment>>,
+}
+
+impl Follower {
+    fn wake(&self) {
+        match &self.elsewhere {
+            Some(segment) => segment.knock(),
+            None => self.turn.notify_one(),
+        }
+    }
 }
 
 impl Doorbell {
@@ -163,7 +175,7 @@ impl Doorbell {
     pub(crate) fn notify(&self) {
         let mut crowd = self.lock();
         crowd.epoch += 1;
-        crowd.followers.iter().for_each(|follower| follower.turn.notify_one());
+        crowd.followers.iter().for_each(|follower| follower.wake());
         let heard = crowd.leader != Leader::None;
         drop(crowd);
         if heard {
@@ -206,7 +218,8 @@ impl Doorbell {
         look: Option<&Arc<dyn Look>>,
         left: Option<Duration>,
     ) {
-        let follower = Arc::new(Follower { turn: Condvar::new(), look: look.cloned() });
+        let (turn, look) = (Condvar::new(), look.cloned());
+        let follower = Arc::new(Follower { turn, look, elsewhere: None });
         crowd.followers.push(Arc::clone(&follower));
         crowd = match crowd.not_too_long(left) {
             Some(left) => {
@@ -240,9 +253,26 @@ impl Doorbell {
         drop(crowd);
         for follower in followers {
             if follower.look.as_ref().is_none_or(|look| look.ready()) {
-                follower.turn.notify_one();
+                follower.wake();
             }
         }
+    }
+
+    /// Has the doorbell of `elsewhere`, where a thread of this process sleeps, rung when `look` may be
+    /// ready, until what this returns is dropped. Somebody must listen here meanwhile.
+    pub(crate) fn pass_on<'a>(
+        &'a self,
+        words: Words<'a>,
+        look: Arc<dyn Look>,
+        elsewhere: Arc<SessionSegment>,
+    ) -> PassedOn<'a> {
+        let waiting = Waiting::new(self, words, Purpose::Samples);
+        let (look, elsewhere) = (Some(look), Some(elsewhere));
+        let follower = Arc::new(Follower { turn: Condvar::new(), look, elsewhere });
+        let mut crowd = self.lock();
+        crowd.followers.push(follower.clone());
+        crowd.arm(&self.ear, &[words[Purpose::Samples as usize]]);
+        PassedOn { follower, waiting }
     }
 
     /// An event loop leads from now on; `false` when another one does already.
@@ -308,6 +338,19 @@ impl AsFd for Doorbell {
     /// Readable when it rang.
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.ear.as_fd()
+    }
+}
+
+/// A follower that sleeps elsewhere, until it is dropped.
+pub(crate) struct PassedOn<'a> {
+    follower: Arc<Follower>,
+    waiting: Waiting<'a>,
+}
+
+impl Drop for PassedOn<'_> {
+    fn drop(&mut self) {
+        let mut crowd = self.waiting.doorbell.lock();
+        crowd.followers.retain(|other| !Arc::ptr_eq(other, &self.follower));
     }
 }
 
@@ -392,9 +435,9 @@ impl Crowd {
     /// Has one of those that sleep listen, when nobody does.
     fn hand_over(&self) {
         if self.leader == Leader::None
-            && let Some(follower) = self.followers.last()
+            && let Some(follower) = self.followers.iter().rfind(|one| one.elsewhere.is_none())
         {
-            follower.turn.notify_one();
+            follower.wake();
         }
     }
 }

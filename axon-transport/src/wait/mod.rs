@@ -15,6 +15,6 @@ mod ticket;
 mod tests;
 
 pub(crate) use bell::Bell;
-pub(crate) use doorbell::{Doorbell, Look, Purpose};
+pub(crate) use doorbell::{Doorbell, Look, PassedOn, Purpose};
 pub use event::ExternalLeader;
 pub(crate) use ticket::{arm, disarm, due, settle, waits};
