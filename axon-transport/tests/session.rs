@@ -59,6 +59,13 @@ fn a_node_is_in_the_graph_from_its_creation_to_its_end() {
         let refused = session.create_node(name, namespace, "/").unwrap_err();
         assert!(matches!(refused, SessionError::Node { .. }), "{refused}");
     }
+    for _ in 0..20 {
+        let brief = session.create_node("brief", "/", "/").unwrap();
+        assert_eq!(nodes(&session), [("brief".into(), Vec::new())], "at once");
+        drop(brief);
+        let over = session.wait_graph(PATIENCE, |graph| graph.endpoints.is_empty());
+        assert!(over, "{:?}", nodes(&session));
+    }
     let idle = session.create_node("idle", "/", "/").unwrap();
     let twins = [0, 1].map(|_| session.create_node("twin", "/", "/").unwrap());
     let publisher = twins[1].create_publisher(spec(Qos::default())).unwrap();

@@ -162,7 +162,10 @@ impl Session {
             return;
         }
         let mut state = self.shared().state();
-        state.nodes.remove(gid);
+        if state.nodes.remove(gid).is_some() {
+            // The daemon may never have heard of it, and will then not say that it is gone.
+            Arc::make_mut(&mut state.graph).endpoints.remove(gid);
+        }
         let publisher = state.publishers.remove(gid);
         let subscription = state.subscriptions.remove(gid);
         let publisher = publisher.as_ref().map(|p| (&p.endpoint, p.role));

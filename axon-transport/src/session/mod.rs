@@ -64,7 +64,7 @@ use self::{
 };
 use crate::{
     config::{Config, DaemonPolicy},
-    graph::{Endpoint, EndpointKind, GraphView},
+    graph::{Endpoint, EndpointKind, GraphEntry, GraphView},
     ids::{DaemonId, Gid, SessionId},
     qos::Qos,
     relay::near::Near,
@@ -341,7 +341,13 @@ impl Session {
     pub(crate) fn adopt_node(&self, endpoint: Endpoint) -> Node {
         let gid = endpoint.gid;
         let changed = self.create_guard_condition();
-        self.shared().state().nodes.insert(gid, (endpoint.clone(), changed.clone()));
+        {
+            let mut state = self.shared().state();
+            state.nodes.insert(gid, (endpoint.clone(), changed.clone()));
+            // Who makes a node finds it in the graph, whatever the daemon does meanwhile.
+            let entry = GraphEntry { endpoint: Arc::new(endpoint.clone()), daemon: None };
+            Arc::make_mut(&mut state.graph).endpoints.insert(gid, entry);
+        }
         self.shared().tell(Outgoing::Announce(gid));
         Node::new(endpoint, changed, self.clone())
     }

@@ -46,9 +46,15 @@ impl Control {
         }
         self.view(|view| view.version = graph.version);
         if !graph.more
-            && let Some(view) = self.building.take()
+            && let Some(mut view) = self.building.take()
         {
-            self.shared.state().graph = Arc::new(view);
+            let mut state = self.shared.state();
+            // The daemon may have told of the whole before it heard of the newest of them.
+            for (gid, (node, _)) in &state.nodes {
+                let entry = || GraphEntry { endpoint: Arc::new(node.clone()), daemon: None };
+                view.endpoints.entry(*gid).or_insert_with(entry);
+            }
+            state.graph = Arc::new(view);
         }
         for gid in over {
             self.endpoint_over(gid);
