@@ -246,7 +246,16 @@ TEST(Codec, a_bool_is_true_or_false)
   test_msgs::msg::BasicTypes message;
   Bytes stream = ours(plan, &message);
   stream[cdr::HEADER] = 2;
-  EXPECT_THROW(cdr::decode(plan, stream.data(), stream.size(), &message), cdr::Error);
+  cdr::decode(plan, stream.data(), stream.size(), &message);
+  uint8_t memory = 0;
+  std::memcpy(&memory, &message.bool_value, 1);
+  EXPECT_EQ(memory, 1);
+
+  // What a program left there before it set any value.
+  memory = 0x7f;
+  std::memcpy(static_cast<void *>(&message.bool_value), &memory, 1);
+  stream = ours(plan, &message);
+  EXPECT_EQ(stream[cdr::HEADER], 1);
 }
 
 TEST(Codec, an_unknown_representation_is_refused_by_number)

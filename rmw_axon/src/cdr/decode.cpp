@@ -102,13 +102,10 @@ private:
   size_t position_ = 0;
 };
 
-bool flag(const uint8_t * at, const Field & field)
+// Any byte but 0 is true, so that no other one gets into a bool.
+uint8_t flag(const uint8_t * at)
 {
-  const uint8_t value = once(*at);
-  if (value > 1) {
-    fail(field, "a bool that is neither true nor false");
-  }
-  return value == 1;
+  return once(*at) != 0;
 }
 
 char16_t wide_character(Reader & reader, const Field & field)
@@ -173,7 +170,7 @@ void get_items(const Field & field, uint8_t * into, size_t count, Reader & reade
     case Item::Bool: {
         const uint8_t * from = reader.bytes(count, 1, field);
         for (size_t i = 0; i < count; ++i) {
-          into[i] = flag(from + i, field);
+          into[i] = flag(from + i);
         }
         return;
       }
@@ -237,7 +234,7 @@ void get_sequence(const Field & field, uint8_t * sequence, Reader & reader)
   if (field.item == Item::Bool) {
     const uint8_t * from = reader.bytes(size, 1, field);
     for (size_t i = 0; i < size; ++i) {
-      In::set_flag(field, sequence, i, flag(from + i, field));
+      In::set_flag(field, sequence, i, flag(from + i) != 0);
     }
     return;
   }

@@ -137,9 +137,14 @@ void put_items(const Field & field, const uint8_t * from, size_t count, Sink & s
 {
   switch (field.item) {
     case Item::Number:
-    case Item::Bool:
       sink.align(field.alignment);
       sink.copy(from, count * field.width);
+      return;
+    case Item::Bool:
+      // A C program that did not set one leaves any byte there, and it is true.
+      for (size_t i = 0; i < count; ++i) {
+        put(sink, static_cast<uint8_t>(from[i] != 0));
+      }
       return;
     case Item::LongDouble:
       return put_long_doubles(sink, from, count, field);
