@@ -172,10 +172,10 @@ rmw_qos_policy_kind_t policy_kind(uint32_t policy)
       return RMW_QOS_POLICY_DURABILITY;
     case AXON_POLICY_DEADLINE:
       return RMW_QOS_POLICY_DEADLINE;
+    // To DDS, and so to ROS, they are one policy.
     case AXON_POLICY_LIVELINESS:
-      return RMW_QOS_POLICY_LIVELINESS;
     case AXON_POLICY_LIVELINESS_LEASE:
-      return RMW_QOS_POLICY_LIVELINESS_LEASE_DURATION;
+      return RMW_QOS_POLICY_LIVELINESS;
     default:
       return RMW_QOS_POLICY_INVALID;
   }
