@@ -30,4 +30,11 @@
 #define AXON_RMW_DYNAMIC_MESSAGES 0
 #endif
 
+// After Kilted: the endpoints of a service, as those of a topic.
+#if __has_include("rmw/get_service_endpoint_info.h")
+#define AXON_RMW_SERVICE_ENDPOINT_INFO 1
+#else
+#define AXON_RMW_SERVICE_ENDPOINT_INFO 0
+#endif
+
 #endif  // FEATURES_HPP_

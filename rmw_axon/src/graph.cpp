@@ -1,9 +1,8 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// What one asks of the graph: nodes, names with their types, endpoints, counts.
+// What one asks of the graph: nodes, names with their types, counts.
 
 #include <algorithm>
-#include <exception>
 #include <string>
 #include <tuple>
 #include <utility>
@@ -13,19 +12,16 @@
 #include "context.hpp"
 #include "error.hpp"
 #include "features.hpp"
-#include "gid.hpp"
+#include "graph.hpp"
 #include "names.hpp"
-#include "qos.hpp"
 #include "rcutils/strdup.h"
 #include "rcutils/types/string_array.h"
 #include "rmw/get_node_info_and_types.h"
 #include "rmw/get_service_names_and_types.h"
-#include "rmw/get_topic_endpoint_info.h"
 #include "rmw/get_topic_names_and_types.h"
 #include "rmw/names_and_types.h"
 #include "rmw/rmw.h"
 #include "rmw/sanity_checks.h"
-#include "rmw/topic_endpoint_info_array.h"
 #include "rmw/validate_namespace.h"
 #include "rmw/validate_node_name.h"
 
@@ -34,37 +30,6 @@ namespace rmw_axon
 
 namespace
 {
-
-// What the core shows one by one. No exception may leave a visitor: the first is kept, and thrown when the
-// core has returned.
-template<typename Item>
-struct Seen
-{
-  std::vector<Item> items;
-  std::exception_ptr error;
-
-  template<typename Make>
-  static void add(void * user, Make make) noexcept
-  {
-    auto & seen = *static_cast<Seen *>(user);
-    if (seen.error) {
-      return;
-    }
-    try {
-      make(seen.items);
-    } catch (...) {
-      seen.error = std::current_exception();
-    }
-  }
-
-  std::vector<Item> take()
-  {
-    if (error) {
-      std::rethrow_exception(error);
-    }
-    return std::move(items);
-  }
-};
 
 struct NodeNames
 {
@@ -78,21 +43,6 @@ struct NameAndTypes
   std::string name;
   std::vector<std::string> types;
 };
-
-struct EndpointInfo
-{
-  axon_gid_t gid{};
-  axon_qos_t qos{};
-  std::string node;
-  std::string name_space;
-  std::string type;
-  std::vector<uint8_t> hash;
-};
-
-axon_session_t session_of(const Node & node)
-{
-  return node.rmw.context->impl->session;
-}
 
 std::vector<NodeNames> nodes(const Node & node)
 {
@@ -126,30 +76,6 @@ std::vector<NameAndTypes> names(
   return found;
 }
 
-std::vector<EndpointInfo> endpoints(const Node & node, uint32_t kind, const std::string & topic)
-{
-  Seen<EndpointInfo> seen;
-  const auto visitor = [](void * user, const axon_endpoint_t * endpoint) {
-      Seen<EndpointInfo>::add(
-        user, [&](auto & items) {
-          items.push_back(
-            {endpoint->gid, endpoint->qos, endpoint->node, endpoint->namespace_,
-              endpoint->type_name,
-              {endpoint->type_hash, endpoint->type_hash + endpoint->type_hash_size}});
-        });
-    };
-  check(axon_session_graph_endpoints(session_of(node), kind, topic.c_str(), visitor, &seen));
-  return seen.take();
-}
-
-void require_allocator(const rcutils_allocator_t * allocator)
-{
-  require(allocator, "allocator");
-  if (!rcutils_allocator_is_valid(allocator)) {
-    throw Failure(RMW_RET_INVALID_ARGUMENT, "allocator is not one");
-  }
-}
-
 void require_empty(rmw_names_and_types_t * names_and_types, const char * name)
 {
   require(names_and_types, name);
@@ -172,13 +98,6 @@ void require_node_name(const char * name, const char * name_space)
   {
     throw Failure(
             RMW_RET_INVALID_ARGUMENT, std::string("node_namespace '") + name_space + "' is none");
-  }
-}
-
-void require_done(bool done)
-{
-  if (!done) {
-    throw std::bad_alloc();
   }
 }
 
@@ -227,65 +146,6 @@ void names_of_node(
   require_node_name(node_name, node_namespace);
   require_empty(out, out_name);
   give(names(of, kind, node_name, node_namespace, all_names), allocator, out);
-}
-
-void fill(
-  const EndpointInfo & from, rmw_endpoint_type_t type, rcutils_allocator_t * allocator,
-  rmw_topic_endpoint_info_t * to)
-{
-  const auto done = [](rmw_ret_t returned) {require_done(returned == RMW_RET_OK);};
-  done(rmw_topic_endpoint_info_set_node_name(to, from.node.c_str(), allocator));
-  done(rmw_topic_endpoint_info_set_node_namespace(to, from.name_space.c_str(), allocator));
-  done(rmw_topic_endpoint_info_set_topic_type(to, from.type.c_str(), allocator));
-  done(rmw_topic_endpoint_info_set_endpoint_type(to, type));
-  const rmw_qos_profile_t qos = from_core(from.qos);
-  done(rmw_topic_endpoint_info_set_qos_profile(to, &qos));
-  const rmw_gid_t gid = from_core(from.gid);
-  done(rmw_topic_endpoint_info_set_gid(to, gid.data, sizeof(gid.data)));
-#if AXON_RMW_IRON
-  rosidl_type_hash_t hash = rosidl_get_zero_initialized_type_hash();
-  if (from.hash.size() == sizeof(hash.value)) {
-    hash.version = 1;
-    std::copy(from.hash.begin(), from.hash.end(), hash.value);
-  }
-  done(rmw_topic_endpoint_info_set_topic_type_hash(to, &hash));
-#endif
-}
-
-rmw_ret_t info_by_topic(
-  const rmw_node_t * node, rcutils_allocator_t * allocator, const char * topic_name,
-  bool no_mangle, uint32_t kind, rmw_endpoint_type_t type, rmw_topic_endpoint_info_array_t * out)
-{
-  return guarded(
-    [&] {
-      const Node & of = node_of(node);
-      require_allocator(allocator);
-      require(topic_name, "topic_name");
-      require(out, "the array of infos");
-      if (rmw_topic_endpoint_info_array_check_zero(out) != RMW_RET_OK) {
-        throw Failure(RMW_RET_INVALID_ARGUMENT, "the array of infos is not zero-initialised");
-      }
-      const auto found = endpoints(of, kind, no_mangle ? topic_name : rmw_axon::topic_name(topic_name, false));
-      if (found.empty()) {
-        return;
-      }
-      const rmw_ret_t made =
-      rmw_topic_endpoint_info_array_init_with_size(out, found.size(), allocator);
-      if (made != RMW_RET_OK) {
-        throw Failure(made, "no memory for the infos");
-      }
-      for (size_t i = 0; i < found.size(); ++i) {
-        out->info_array[i] = rmw_get_zero_initialized_topic_endpoint_info();
-      }
-      try {
-        for (size_t i = 0; i < found.size(); ++i) {
-          fill(found[i], type, allocator, &out->info_array[i]);
-        }
-      } catch (...) {
-        std::ignore = rmw_topic_endpoint_info_array_fini(out, allocator);
-        throw;
-      }
-    });
 }
 
 rmw_ret_t count(const rmw_node_t * node, const char * name, uint32_t kind, size_t * count)
@@ -454,24 +314,6 @@ rmw_ret_t rmw_get_client_names_and_types_by_node(
         node, allocator, node_name, node_namespace, AXON_KIND_CLIENT, false,
         service_names_and_types, "service_names_and_types");
     });
-}
-
-rmw_ret_t rmw_get_publishers_info_by_topic(
-  const rmw_node_t * node, rcutils_allocator_t * allocator, const char * topic_name,
-  bool no_mangle, rmw_topic_endpoint_info_array_t * publishers_info)
-{
-  return rmw_axon::info_by_topic(
-    node, allocator, topic_name, no_mangle, AXON_KIND_PUBLISHER, RMW_ENDPOINT_PUBLISHER,
-    publishers_info);
-}
-
-rmw_ret_t rmw_get_subscriptions_info_by_topic(
-  const rmw_node_t * node, rcutils_allocator_t * allocator, const char * topic_name,
-  bool no_mangle, rmw_topic_endpoint_info_array_t * subscriptions_info)
-{
-  return rmw_axon::info_by_topic(
-    node, allocator, topic_name, no_mangle, AXON_KIND_SUBSCRIPTION, RMW_ENDPOINT_SUBSCRIPTION,
-    subscriptions_info);
 }
 
 rmw_ret_t rmw_count_publishers(const rmw_node_t * node, const char * topic_name, size_t * count)
