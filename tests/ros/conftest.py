@@ -8,13 +8,17 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 import threading
 import time
 
 import pytest
 
-# How long anything may take before a test fails: never a measure of speed.
-PATIENCE = 60
+# How long anything may take before a test fails: never a measure of speed, but what a machine that is busy
+# with other things may need.
+PATIENCE = 180
+
+NODES = pathlib.Path(__file__).parent / 'nodes'
 
 _domains = itertools.cycle(range(20, 80))
 
@@ -90,6 +94,11 @@ class Process:
         self._reader.join(5)
         return status
 
+    def complete(self):
+        """What it said until its end, whatever its status is."""
+        self.wait()
+        return self.output
+
     def kill(self):
         self.signal(signal.SIGKILL)
         self._child.wait()
@@ -102,6 +111,9 @@ class Host:
     def __init__(self, directory, **variables):
         self.runtime = directory / 'run'
         self.runtime.mkdir(mode=0o700)
+        # A daemon that nobody needs would stay for longer.
+        settings = directory / 'axon.toml'
+        settings.write_text('[link]\ngrace_s = 2\n', encoding='utf-8')
         self.env = {
             **os.environ,
             'RMW_IMPLEMENTATION': os.environ.get('RMW_IMPLEMENTATION', 'rmw_axon'),
@@ -110,6 +122,7 @@ class Host:
             'ROS_HOME': str(directory / 'ros'),
             'ROS_LOG_DIR': str(directory / 'log'),
             'AXON_RUNTIME_DIR': str(self.runtime),
+            'AXON_CONFIG': str(settings),
             'PYTHONUNBUFFERED': '1',
             'RCUTILS_LOGGING_BUFFERED_STREAM': '0',
             **variables,
@@ -121,6 +134,10 @@ class Host:
         self.processes.append(process)
         return process
 
+    def node(self, name, *arguments):
+        """Start one of the programs in nodes/."""
+        return self.start(sys.executable, NODES / f'{name}.py', *arguments)
+
     def run(self, *command, patience=PATIENCE):
         """Run a command to its end; returns what it said."""
         process = self.start(*command)
@@ -130,31 +147,42 @@ class Host:
 
     def shows(self, part, *command):
         """Whether a command that asks the graph shows `part` by now; it may fail meanwhile."""
-        process = self.start(*command)
-        process.wait()
-        return part in process.output
+        return part in self.start(*command).complete()
 
-    def daemons(self):
-        """Process IDs of this host's AXON daemons."""
-        found = []
+    def everything(self):
+        """What runs in this host's environment: process IDs and the names of their programs."""
+        ours = f'AXON_RUNTIME_DIR={self.runtime}'.encode()
+        found = {}
         for entry in pathlib.Path('/proc').iterdir():
             if not entry.name.isdigit():
                 continue
             try:
-                program = os.readlink(entry / 'exe')
-                environment = (entry / 'environ').read_bytes().split(b'\0')
+                if ours in (entry / 'environ').read_bytes().split(b'\0'):
+                    found[int(entry.name)] = os.path.basename(os.readlink(entry / 'exe'))
             except OSError:
                 continue
-            ours = f'AXON_RUNTIME_DIR={self.runtime}'.encode()
-            if program.endswith('/axon_daemon') and ours in environment:
-                found.append(int(entry.name))
         return found
 
-    def close(self):
+    def daemons(self):
+        """Process IDs of this host's AXON daemons."""
+        return [pid for pid, program in self.everything().items() if program == 'axon_daemon']
+
+    def end_all(self):
+        """Kill what was started, and all that this started in turn but the AXON daemon."""
         for process in self.processes:
             process.kill()
+        # The daemon of ros2's command line is in a session of its own.
+        for pid, program in self.everything().items():
+            if program != 'axon_daemon':
+                try:
+                    os.kill(pid, signal.SIGKILL)
+                except ProcessLookupError:
+                    pass
+
+    def close(self):
+        self.end_all()
         # Nobody needs the daemon any more: it ends by itself.
-        until(lambda: not self.daemons(), 'the daemon ends when nobody needs it')
+        until(lambda: not self.everything(), 'the daemon ends when nobody needs it')
         assert not list(self.runtime.glob('*.sock')), 'a socket is left behind'
 
 
@@ -171,6 +199,11 @@ def host(tmp_path):
     made = Host(tmp_path)
     yield made
     made.close()
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        '--full', action='store_true', help='kill at random for minutes instead of a sample')
 
 
 def pytest_collection_modifyitems(items):
