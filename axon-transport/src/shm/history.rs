@@ -32,6 +32,8 @@ pub(super) enum Extent {
     Slot {
         at: Location,
         len: u64,
+        /// Bytes of the sample itself.
+        sample: u64,
     },
 }
 
@@ -113,8 +115,8 @@ impl History {
                     self.used -= block.len;
                     self.placed -= 1;
                 }
-                Extent::Slot { at, len } => {
-                    self.pinned.retire(self.tail, at, len);
+                Extent::Slot { at, len, sample } => {
+                    self.pinned.retire(self.tail, at, len, sample);
                     self.used -= len;
                     self.placed -= 1;
                 }
@@ -169,7 +171,7 @@ impl History {
             .filter(|extent| *extent != Extent::Inline)
             .take(self.placed.saturating_sub(1) as usize);
         let slots = placed.filter_map(|extent| match extent {
-            Extent::Slot { at, len } => Some((at, len)),
+            Extent::Slot { at, len, .. } => Some((at, len)),
             Extent::Inline | Extent::Block(_) => None,
         });
         self.pinned.would_hold(len, slots, grow)
@@ -265,7 +267,7 @@ mod tests {
             if position > 0 {
                 assert!(history.tail() < position, "the last one stands");
             }
-            history.push(Extent::Slot { at, len: max });
+            history.push(Extent::Slot { at, len: max, sample: max });
             places.push(at);
         }
         assert!(places.iter().all(|at| at.offset <= max), "memory stays near the live window");
@@ -289,7 +291,7 @@ mod tests {
         let size = 1 << 16;
         let mut history = history(4, 2 * size, 0);
         let first = history.lend(size).unwrap();
-        let position = history.push(Extent::Slot { at: first, len: size });
+        let position = history.push(Extent::Slot { at: first, len: size, sample: size });
         history.release_below(1);
         let second = history.lend(size).unwrap();
         assert_ne!(first, second, "nobody has looked at the pins");

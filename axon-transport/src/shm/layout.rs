@@ -147,7 +147,7 @@ pub struct Location {
     /// The number of the session's segment.
     #[n(0)]
     pub segment: u32,
-    /// The offset in it, in bytes: a multiple of 128.
+    /// The offset in it, in bytes: a multiple of 128, but for a sample that was lent behind a header.
     #[n(1)]
     pub offset: u64,
 }

@@ -29,6 +29,7 @@ struct Retired {
     position: u64,
     at: Location,
     len: u64,
+    sample: u64,
 }
 
 impl Limbo {
@@ -134,15 +135,17 @@ impl Limbo {
         self.loans -= 1;
     }
 
-    /// The sample at `position` has been given up; readers may still be at it.
-    pub(super) fn retire(&mut self, position: u64, at: Location, len: u64) {
-        self.retired.push(Retired { position, at, len });
+    /// The sample at `position`, of `sample` bytes in a slot of `len`, has been given up; readers may
+    /// still be at it.
+    pub(super) fn retire(&mut self, position: u64, at: Location, len: u64, sample: u64) {
+        self.retired.push(Retired { position, at, len, sample });
     }
 
-    /// Frees what no reader pins. The tail must have been raised above all that is here before
+    /// Frees what no reader pins, by position and length of the sample: that is what a reader goes by, so
+    /// one that was lent more keeps all of it. The tail must have been raised above all that is here before
     /// the pins were looked at.
     pub(super) fn reclaim(&mut self, pinned: impl Fn(u64, u64) -> bool) {
-        let keeps = |retired: &Retired| pinned(retired.position, retired.len);
+        let keeps = |retired: &Retired| pinned(retired.position, retired.sample);
         // The last ones first, so that the ones that were read longest ago are taken first.
         for Retired { at, len, .. } in self.retired.iter().rev().filter(|retired| !keeps(retired)) {
             slots(&mut self.stores, *at).release(at.offset, *len);
@@ -191,7 +194,7 @@ mod tests {
         assert_eq!(limbo.lend(LEN).unwrap().segment, 2, "the new one takes over");
         assert!(limbo.vacated().is_empty());
 
-        limbo.retire(7, sample, LEN);
+        limbo.retire(7, sample, LEN, LEN);
         limbo.reclaim(|position, _| position == 7);
         limbo.give_back(loan, LEN);
         assert!(limbo.vacated().is_empty(), "a reader is still at it");

@@ -103,6 +103,9 @@ impl Sample {
     /// how many.
     pub fn read_at(&self, at: usize, out: &mut [u8]) -> usize {
         let count = out.len().min(self.len.saturating_sub(at));
+        if count == 0 {
+            return 0;
+        }
         let out = &mut out[..count];
         match &self.data {
             Data::Copied(bytes) => out.copy_from_slice(&bytes[at.min(self.len)..][..count]),

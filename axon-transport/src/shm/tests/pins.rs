@@ -3,9 +3,16 @@
 use std::{
     io::{Read as _, Seek as _, SeekFrom, Write as _},
     thread,
+    time::Duration,
 };
 
-use super::{super::pins::RECORDS, *};
+use super::{
+    super::{
+        pins::RECORDS,
+        writer::{Numbering, Patience},
+    },
+    *,
+};
 
 const LARGE: usize = 10_000;
 
@@ -131,12 +138,41 @@ fn what_follows_a_header_is_aligned_for_all_who_see_it() {
         assert_eq!(count, 40.min(len - at));
         // SAFETY: the writer is this test's, and does not write to what is pinned.
         assert_eq!(unsafe { sample.as_slice() }, bytes);
+        assert_eq!(sample.read_at(len, &mut part) + sample.read_at(usize::MAX, &mut part), 0);
         let mut copy = Vec::new();
         readers[1].take(&mut copy).unwrap().unwrap();
         assert_eq!(copy, bytes);
     }
     // As much is given back as was lent.
     (0..100).for_each(|_| drop(writer.loan_behind(4, MAX as usize).unwrap()));
+}
+
+#[test]
+fn a_slot_longer_than_its_sample_is_kept_as_long() {
+    let (a, b) = (session(), session());
+    for (header, lent) in [(4, MAX as usize), (0, MAX as usize), (0, MAX as usize / 2)] {
+        let writer = writer(&a, keep_last(1), 0);
+        let mut readers: Vec<_> = (0..20).map(|_| attach(&writer, &a, &b, keep_last(1))).collect();
+        let publish = |sequence: u64, len: usize| {
+            let mut loan = writer.loan_behind(header, lent).unwrap();
+            loan[..len].copy_from_slice(&pattern(sequence, len));
+            let patience = Patience::new(Duration::ZERO);
+            loan.commit(len, Numbering::Given(meta(sequence)), patience).unwrap();
+        };
+        // The later they come, the shorter is what they may keep in place.
+        let mut kept = 0;
+        for (reader, len) in (0..20).flat_map(|at| (13..21).map(move |power| (at, 1 << power))) {
+            let reader: &mut Reader = &mut readers[reader];
+            let len = lent.min(len);
+            publish(1, len);
+            let sample = take(reader);
+            kept += usize::from(sample.is_borrowed());
+            (2..6).for_each(|sequence| publish(sequence, len));
+            intact(&sample);
+            while reader.take_copy().unwrap().is_some() {}
+        }
+        assert!(kept > 20, "{kept}");
+    }
 }
 
 #[test]

@@ -89,10 +89,10 @@ impl Writer {
                     let block = self.copy_in(state, bytes)?;
                     (Extent::Block(block), Place::Block(block.at))
                 }
-                Payload::Written { at, lead, lent, .. } => {
+                Payload::Written { at, lead, len: sample, lent } => {
                     let len = Area::rounded(lent as u64);
                     let first = Location { offset: at.offset + lead as u64, ..at };
-                    (Extent::Slot { at, len }, Place::Slot(first))
+                    (Extent::Slot { at, len, sample: sample as u64 }, Place::Slot(first))
                 }
             };
             let meta = self.number(state, numbering);
