@@ -73,6 +73,8 @@ fn the_last_elected_stands_when_it_is_heard_of_first() {
     elector.elect(&mut last, 2);
     elector.linked(&mut last);
     elector.elect(&mut first, 1);
+    // What was sent over it before is read.
+    elector.stranger.open(&first).expect("room for a stream");
     let why = elector.stranger.closed(&first);
     assert!(why.contains("a successor took over"), "{why}");
     assert_eq!(last.connection.close_reason(), None);
@@ -123,4 +125,19 @@ fn a_route_whose_end_was_lost_with_a_link_ends_or_gives_way_to_its_successor() {
     assert_eq!(publisher.matched().len(), 1);
     elector.stranger.say(&mut last, &Message::Graph(Graph { version: 1, ..Graph::default() }));
     until("nobody reads", || publisher.matched().is_empty());
+}
+
+#[test]
+fn one_peer_has_so_many_connections_and_leaves_room_for_others() {
+    let elector = Elector::new();
+    let mut met: Vec<_> = (0..16).map(|_| elector.meet()).collect();
+    let more = elector.meet();
+    let why = elector.stranger.closed(&more);
+    assert!(why.contains("as many connections as it may"), "{why}");
+    // Those that it has, it has; and who is somebody else is not kept out.
+    elector.elect(&mut met[7], 1);
+    elector.linked(&mut met[7]);
+    let other = Elector { auth: Auth::None(SigningKey::generate().unwrap()), ..elector };
+    let claim = Claim { host: "other", daemon: DaemonId([0xff; 16]), auth: 0 };
+    other.stranger.dial(&other.host, &other.auth, &claim).expect("another one's link");
 }

@@ -121,6 +121,11 @@ impl Stranger {
         })
     }
 
+    /// Opens a stream for samples, once the other side lets it.
+    pub(crate) fn open(&self, met: &Met) -> Result<SendStream, String> {
+        self.limited(met.connection.open_uni()).map_err(|error| error.to_string())
+    }
+
     /// Why the other side closed the connection.
     pub(crate) fn closed(&self, met: &Met) -> String {
         self.limited(met.connection.closed()).to_string()

@@ -5,7 +5,7 @@ use std::{
         Arc,
         atomic::{AtomicU64, Ordering},
     },
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use tokio::sync::mpsc;
@@ -35,6 +35,8 @@ const ELECTION_TIMEOUT: Duration = Duration::from_secs(10);
 const HAND_OVER: Duration = Duration::from_secs(5);
 /// Peers, and connections that await their election.
 const MAX_LINKS: usize = 128 + 32;
+/// Connections of one peer: its link, one from each side in its place, and what these supersede.
+const MAX_LINKS_OF_PEER: usize = 16;
 /// Elections of this process. A daemon outlives its gateway, and its peers know its elections by its id.
 static ELECTIONS: AtomicU64 = AtomicU64::new(1);
 /// Why somebody who claims a linked daemon's id gets no link.
@@ -71,8 +73,17 @@ impl Hub {
         if current.is_some_and(|c| !c.established.who.is(&who)) {
             return self.turn_away(established, TAKEN.into()).await;
         }
-        if current.is_none() && self.links.len() >= MAX_LINKS {
-            let text = "this daemon has as many links as it may";
+        self.handed_over.retain(|(_, since)| since.elapsed() < HAND_OVER);
+        let theirs = self.links.values().map(|link| &link.established.who);
+        let theirs = theirs.chain(self.handed_over.iter().map(|(who, _)| who));
+        let too_many = if theirs.filter(|other| other.is(&who)).count() >= MAX_LINKS_OF_PEER {
+            Some("this peer has as many connections as it may")
+        } else if current.is_none() && self.links.len() >= MAX_LINKS {
+            Some("this daemon has as many links as it may")
+        } else {
+            None
+        };
+        if let Some(text) = too_many {
             close(&established.connection, CloseCode::NotAllowed, text);
             return self.forget(&established);
         }
@@ -175,6 +186,9 @@ impl Hub {
         }
         if current.and_then(|c| c.elected).is_some_and(|c| c.election > elected.election) {
             tracing::debug!(peer = %daemon, "superseded before its election was heard of");
+            // The peer may have sent samples over it before it elected the next.
+            open_windows(&link.connection);
+            self.spawn_inbound(number, daemon, link.carrier.clone());
             return self.hand_over(number);
         }
         let Some(link) = self.links.get_mut(&number) else { return };
@@ -229,6 +243,7 @@ impl Hub {
     /// The old connection of a peer ends once its streams have been read.
     pub(super) fn hand_over(&mut self, old: u64) {
         if let Some(link) = self.links.remove(&old) {
+            self.handed_over.push((link.established.who.clone(), Instant::now()));
             let keyring = self.context.keyring.clone();
             tokio::spawn(async move {
                 // All of it: dropping the outbox would end the control stream, and with it the

@@ -9,7 +9,7 @@ mod links;
 use std::{
     collections::{BTreeMap, HashMap},
     sync::{Arc, RwLock, RwLockReadGuard},
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use axon_tls::Negotiated;
@@ -128,6 +128,8 @@ pub(super) struct Hub {
     control: mpsc::Sender<ToControl>,
     events: mpsc::Sender<Event>,
     links: HashMap<u64, Link>,
+    /// Whose superseded connections still carry the end of their streams, and since when.
+    handed_over: Vec<(Who, Instant)>,
     peers: HashMap<DaemonId, Peer>,
     local: BTreeMap<Gid, Endpoint>,
 }
@@ -148,6 +150,7 @@ impl Hub {
             control,
             events,
             links: HashMap::new(),
+            handed_over: Vec::new(),
             peers: HashMap::new(),
             local: BTreeMap::new(),
         }

@@ -56,10 +56,13 @@ impl Peer {
         let key = RouteKey { kind, topic, type_name };
         let mut others = self.served.iter().filter(|(route, _)| **route != number);
         match others.find(|(_, served)| served.key == key).map(|(other, s)| (*other, s.repeated)) {
-            // Its UNSUBSCRIBE was lost with an old link.
+            // Its UNSUBSCRIBE was lost with an old link, as it may have been where a number is new.
             Some((other, false)) => self.unserve(other),
             Some(_) => return Err(format!("{} has a route already", key.topic)),
             None => {}
+        }
+        if self.served.get(&number).is_some_and(|old| !old.repeated && old.key != key) {
+            self.unserve(number);
         }
         let old = match self.served.remove(&number) {
             Some(served) if served.key == key => served.sources,
