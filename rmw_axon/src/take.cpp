@@ -111,7 +111,10 @@ void take_loaned(
   const axon_sample_t sample = in_place ? taken.sample : axon_sample_t{};
   try {
     const std::lock_guard<std::mutex> lock(subscription.loans_mutex);
-    subscription.loans.emplace(lent, sample);
+    if (!subscription.loans.emplace(lent, sample).second) {
+      // Only a publisher that breaks the protocol has two samples in one place.
+      throw Failure(RMW_RET_ERROR, subscription.label + ": a sample where another one is lent");
+    }
   } catch (...) {
     if (!in_place) {
       end_loan(subscription, lent, sample);
