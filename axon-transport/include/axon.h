@@ -30,7 +30,7 @@
  * The version of this interface. It rises whenever a program that was compiled against the former
  * header would not work any more.
  */
-#define AXON_SESSION_ABI 1
+#define AXON_SESSION_ABI 2
 
 /**
  * The most bytes that the hash of a type may have.
@@ -1364,12 +1364,13 @@ axon_ret_t axon_session_subscription_take(struct axon_subscription_t subscriptio
 
 /**
  * Takes the oldest sample, by source timestamp among all publishers, in place: `len` bytes at `data`,
- * aligned to 8, which stand until `axon_session_sample_release`. One of more than 4 KiB is in the
+ * which stand until `axon_session_sample_release`. A copy is aligned to 8; what was lent is aligned as
+ * it was, and what a publisher wrote that does not keep to the protocol anyhow. One of more than 4 KiB is in the
  * publisher's memory, of which a subscription can keep five for each publisher; a sixth is copied.
  * Where there is none the handle is 0, and nothing else is stored.
  *
- * Nobody may write to the bytes, and a forked child may not read them. A publisher in another process that does not keep to the protocol
- * could change them meanwhile: whoever parses them reads each once, and checks what it read.
+ * Nobody may write to the bytes, and a forked child may not read them. Such a publisher, in another
+ * process, could change them meanwhile: whoever parses them reads each once, and checks what it read.
  * `AXON_SHM_COPY=1` has all of them copied.
  *
  * # Safety

@@ -167,12 +167,13 @@ pub unsafe extern "C" fn axon_session_subscription_take(
 }
 
 /// Takes the oldest sample, by source timestamp among all publishers, in place: `len` bytes at `data`,
-/// aligned to 8, which stand until `axon_session_sample_release`. One of more than 4 KiB is in the
+/// which stand until `axon_session_sample_release`. A copy is aligned to 8; what was lent is aligned as
+/// it was, and what a publisher wrote that does not keep to the protocol anyhow. One of more than 4 KiB is in the
 /// publisher's memory, of which a subscription can keep five for each publisher; a sixth is copied.
 /// Where there is none the handle is 0, and nothing else is stored.
 ///
-/// Nobody may write to the bytes, and a forked child may not read them. A publisher in another process that does not keep to the protocol
-/// could change them meanwhile: whoever parses them reads each once, and checks what it read.
+/// Nobody may write to the bytes, and a forked child may not read them. Such a publisher, in another
+/// process, could change them meanwhile: whoever parses them reads each once, and checks what it read.
 /// `AXON_SHM_COPY=1` has all of them copied.
 ///
 /// # Safety
