@@ -8,7 +8,7 @@ use axon_transport::{
     events::{EventKind, EventStatus},
     graph::EndpointKind,
     qos::Qos,
-    session::{EndpointSpec, Waitable},
+    session::{EndpointSpec, Event, Waitable},
 };
 use rustix::process::Signal;
 use support::{Host, PATIENCE, of_child, say, signal, until, wait_for_the_end};
@@ -124,6 +124,71 @@ fn a_publisher_reaches_at_once_whom_it_could_count_when_it_was_made() {
         publisher.publish(b"x").unwrap();
         assert!(subscription.recv(&mut Vec::new(), Some(PATIENCE)).is_some());
     }
+}
+
+#[test]
+fn within_a_session_pairs_come_and_go_without_the_daemon() {
+    let host = Host::new();
+    let daemon = host.daemon();
+    let session = host.session("here").unwrap();
+    let matched = |event: &Event| {
+        let EventStatus::Matched(status) = event.take() else { unreachable!() };
+        (status.current, status.current_change, status.total_change)
+    };
+    // Whatever it would have to say, it does not now.
+    signal(daemon.0.id(), Signal::STOP);
+    let subscription = session.create_subscription(spec("/t")).unwrap();
+    let theirs = subscription.event(EventKind::SubscriptionMatched).unwrap();
+    let publisher = session.create_publisher(spec("/t")).unwrap();
+    let ours = publisher.event(EventKind::PublicationMatched).unwrap();
+    assert_eq!(publisher.matched(), [subscription.gid()]);
+    assert_eq!(subscription.matched(), [publisher.gid()]);
+    assert_eq!((matched(&ours), matched(&theirs)), ((1, 1, 1), (1, 1, 1)));
+    publisher.publish(b"x").unwrap();
+    assert!(subscription.take(&mut Vec::new()).is_some());
+    // What a publisher leaves is still taken.
+    let brief = session.create_publisher(spec("/t")).unwrap();
+    brief.publish(b"y").unwrap();
+    drop(brief);
+    assert_eq!(subscription.matched(), [publisher.gid()]);
+    assert_eq!(matched(&theirs), (1, 0, 1));
+    assert!(subscription.take(&mut Vec::new()).is_some());
+    drop(session.create_subscription(spec("/t")).unwrap());
+    assert_eq!(publisher.matched(), [subscription.gid()]);
+    assert_eq!(matched(&ours), (1, 0, 1));
+
+    let client = session.create_client(spec("/s")).unwrap();
+    let server = session.create_server(spec("/s")).unwrap();
+    assert!(client.is_available());
+    client.send_request(b"?").unwrap();
+    let request = server.take_request(&mut Vec::new()).expect("the request");
+    server.send_response(request.publisher, request.sequence, b"!").unwrap();
+    assert!(client.take_response(&mut Vec::new()).is_some());
+    drop(server);
+    assert!(!client.is_available());
+
+    // It finds them as they are, and nothing comes or goes again.
+    signal(daemon.0.id(), Signal::CONT);
+    assert!(session.wait_graph(PATIENCE, |graph| graph.endpoints.len() == 3));
+    until("nothing more is to be said", || {
+        let status = host.status().unwrap();
+        status.sessions.iter().any(|s| s.name == "here" && s.endpoints == 3 && s.queued == 0)
+    });
+    publisher.publish(b"z").unwrap();
+    assert!(subscription.recv(&mut Vec::new(), Some(PATIENCE)).is_some());
+    assert_eq!((matched(&ours), matched(&theirs)), ((1, 0, 0), (1, 0, 0)));
+    // Who is gone is not counted either, whatever the daemon says.
+    signal(daemon.0.id(), Signal::STOP);
+    drop(subscription);
+    assert!(
+        !session
+            .graph()
+            .endpoints
+            .values()
+            .any(|e| { e.endpoint.kind == EndpointKind::Subscription })
+    );
+    assert_eq!(matched(&ours), (0, -1, 0));
+    signal(daemon.0.id(), Signal::CONT);
 }
 
 #[test]

@@ -1,238 +1,165 @@
-//! Endpoints come and go.
+//! What a session makes: endpoints, nodes and conditions.
 
-use std::{sync::Arc, time::Duration};
+use std::sync::Arc;
 
 use super::{
-    Client, EndpointSpec, Publisher, Server, Session, SessionError, Subscription,
-    events::EndpointEvents,
-    message::{self, EndpointRole, Message},
-    publisher::PublisherInner,
-    rings::{Lanes, Rings},
-    state::Outgoing,
-    subscription::SubscriptionInner,
+    Client, EndpointSpec, GuardCondition, Node, Publisher, Server, Session, SessionError,
+    Subscription, message::EndpointRole, state::Outgoing, subscription::SubscriptionInner,
 };
 use crate::{
-    config::DaemonPolicy,
-    graph::{Endpoint, EndpointKind, Pairing, pairing},
+    graph::{Endpoint, EndpointKind, GraphEntry},
     ids::Gid,
     qos::Qos,
-    shm::{RingOptions, ShmError, Writer},
 };
 
-/// How long a new endpoint waits for those that it is matched with.
-const PAIRS: Duration = Duration::from_millis(50);
-
 impl Session {
-    pub(super) fn endpoint(
-        &self,
-        spec: EndpointSpec,
-        kind: EndpointKind,
-    ) -> Result<Endpoint, SessionError> {
-        let endpoint = self.describe(spec, kind)?;
-        if endpoint.is_sane() {
-            Ok(endpoint)
-        } else {
-            Err(SessionError::Endpoint { topic: endpoint.topic })
-        }
+    /// A publisher. It is matched with those readers that the graph shows, unless they take more
+    /// than some milliseconds; others are matched later: see [`Publisher::wait_matched`].
+    ///
+    /// # Errors
+    /// When the specification is out of bounds or there is no memory.
+    pub fn create_publisher(&self, spec: EndpointSpec) -> Result<Publisher, SessionError> {
+        let endpoint = self.endpoint(spec, EndpointKind::Publisher)?;
+        let publisher = self.add_publisher(endpoint, EndpointRole::Application)?;
+        let inner = &publisher.inner;
+        self.shared().meet(&inner.endpoint.gid);
+        self.await_pairs(&inner.endpoint, |other| inner.events.is_matched(other));
+        Ok(publisher)
     }
 
-    /// An endpoint with a GID of its own.
-    pub(super) fn describe(
+    /// A subscription. It is matched with those publishers that the graph shows, unless they take
+    /// more than some milliseconds; others are matched later: see [`Subscription::wait_matched`].
+    ///
+    /// # Errors
+    /// When the specification is out of bounds.
+    pub fn create_subscription(&self, spec: EndpointSpec) -> Result<Subscription, SessionError> {
+        let ignores_local = spec.ignore_local;
+        let endpoint = self.endpoint(spec, EndpointKind::Subscription)?;
+        let mut inner = SubscriptionInner::new(endpoint, EndpointRole::Application, Vec::new());
+        inner.ignores_local = ignores_local;
+        let subscription = self.add_reader(inner);
+        let inner = &subscription.inner;
+        self.shared().meet(&inner.endpoint.gid);
+        self.await_pairs(&inner.endpoint, |other| inner.events.is_matched(other));
+        Ok(subscription)
+    }
+
+    /// A server of a service. Its clients are matched as a publisher's readers are.
+    ///
+    /// # Errors
+    /// When the specification is out of bounds.
+    pub fn create_server(&self, spec: EndpointSpec) -> Result<Server, SessionError> {
+        let endpoint = self.endpoint(spec, EndpointKind::Server)?;
+        let server = self.add_server(endpoint, EndpointRole::Application);
+        self.shared().meet(&server.gid());
+        server.await_clients();
+        Ok(server)
+    }
+
+    /// A client of a service. Its servers are matched as a publisher's readers are; see
+    /// [`Client::wait_available`].
+    ///
+    /// # Errors
+    /// When the specification is out of bounds or there is no memory.
+    pub fn create_client(&self, spec: EndpointSpec) -> Result<Client, SessionError> {
+        let endpoint = self.endpoint(spec, EndpointKind::Client)?;
+        let client = self.add_client(endpoint, EndpointRole::Application)?;
+        self.shared().meet(&client.gid());
+        client.await_servers();
+        Ok(client)
+    }
+
+    /// A node, which is in the graph until it is dropped.
+    ///
+    /// # Errors
+    /// When the name is empty, or a name is out of bounds.
+    pub fn create_node(
         &self,
-        spec: EndpointSpec,
-        kind: EndpointKind,
-    ) -> Result<Endpoint, SessionError> {
-        if self.is_forked() {
-            return Err(ShmError::Forked.into());
-        }
-        let number = {
-            let mut state = self.shared().state();
-            state.next_entity += 1;
-            state.next_entity
+        name: &str,
+        namespace: &str,
+        enclave: &str,
+    ) -> Result<Node, SessionError> {
+        // What a node has no use for is as it is by default.
+        let spec = EndpointSpec {
+            node: name.to_owned(),
+            namespace: namespace.to_owned(),
+            ..EndpointSpec::new("", "", Qos::default())
         };
-        let EndpointSpec { topic, type_name, type_hash, qos, node, namespace, .. } = spec;
-        Ok(Endpoint {
-            gid: Gid::new(self.shared().id, number),
-            kind,
-            topic,
-            type_name,
-            type_hash,
-            qos,
-            node,
-            namespace,
-            enclave: String::new(),
-        })
-    }
-
-    pub(super) fn add_publisher(
-        &self,
-        endpoint: Endpoint,
-        role: EndpointRole,
-    ) -> Result<Publisher, SessionError> {
-        let options = self.ring(&endpoint, endpoint.qos);
-        let writer = Arc::new(Writer::create(self.shared().segment.clone(), options)?);
-        let rings = Rings::Shared(writer.clone());
-        let inner = Arc::new(PublisherInner::new(endpoint, role, rings));
-        self.announce(Some(&inner), None);
-        Ok(Publisher { inner, writer, session: self.clone() })
-    }
-
-    pub(super) fn add_subscription(
-        &self,
-        endpoint: Endpoint,
-        role: EndpointRole,
-        stands_for: Vec<Gid>,
-    ) -> Subscription {
-        self.add_reader(SubscriptionInner::new(endpoint, role, stands_for))
-    }
-
-    pub(super) fn add_reader(&self, inner: SubscriptionInner) -> Subscription {
-        let inner = Arc::new(inner);
-        self.announce(None, Some(&inner));
-        Subscription { inner, session: self.clone() }
-    }
-
-    pub(super) fn add_client(
-        &self,
-        endpoint: Endpoint,
-        role: EndpointRole,
-    ) -> Result<Client, SessionError> {
-        let options = self.ring(&endpoint, Qos::keep_all());
-        let writer = Arc::new(Writer::create(self.shared().segment.clone(), options)?);
-        let (requests, responses) = self.add_both(endpoint, role, Rings::Shared(writer.clone()));
-        Ok(Client::new(requests, responses, writer, self.clone()))
-    }
-
-    pub(super) fn add_server(&self, endpoint: Endpoint, role: EndpointRole) -> Server {
-        let options = self.ring(&endpoint, Qos::keep_all());
-        let lanes = Arc::new(Lanes::new(self.shared().segment.clone(), options));
-        let (responses, requests) = self.add_both(endpoint, role, Rings::Each(lanes.clone()));
-        Server::new(responses, requests, lanes, self.clone())
-    }
-
-    /// The two sides of an endpoint that writes and reads.
-    fn add_both(
-        &self,
-        endpoint: Endpoint,
-        role: EndpointRole,
-        rings: Rings,
-    ) -> (Arc<PublisherInner>, Arc<SubscriptionInner>) {
-        let writes = Arc::new(PublisherInner::new(endpoint.clone(), role, rings));
-        let reads = Arc::new(SubscriptionInner::new(endpoint, role, Vec::new()));
-        self.announce(Some(&writes), Some(&reads));
-        (writes, reads)
-    }
-
-    fn ring(&self, endpoint: &Endpoint, qos: Qos) -> RingOptions {
-        let config = &self.shared().config;
-        let (budget, max_message) = (config.ring_bytes, config.max_message);
-        RingOptions { gid: endpoint.gid, qos, budget, max_message, expected: 0 }
-    }
-
-    /// Keeps an endpoint's sides for the control thread, and has it told of.
-    fn announce(
-        &self,
-        writes: Option<&Arc<PublisherInner>>,
-        reads: Option<&Arc<SubscriptionInner>>,
-    ) {
-        let shared = self.shared();
-        let mut state = shared.state();
-        let (mut endpoint, mut role) = (None, EndpointRole::Application);
-        if let Some(inner) = writes {
-            state.publishers.insert(inner.endpoint.gid, inner.clone());
-            (endpoint, role) = (Some(&inner.endpoint), inner.role);
+        let described =
+            Endpoint { enclave: enclave.to_owned(), ..self.describe(spec, EndpointKind::Node)? };
+        if !described.is_sane() {
+            return Err(SessionError::Node { name: described.node });
         }
-        if let Some(inner) = reads {
-            state.subscriptions.insert(inner.endpoint.gid, inner.clone());
-            (endpoint, role) = (Some(&inner.endpoint), inner.role);
-        }
-        let Some(endpoint) = endpoint else { return };
-        if role == EndpointRole::Application {
-            state.index(endpoint);
-        }
-        state.outgoing.push_back(Outgoing::Announce(endpoint.gid));
-        drop(state);
-        shared.wake();
+        Ok(self.adopt_node(described))
     }
 
-    /// An endpoint's or a node's handle is dropped.
-    pub(super) fn forget_endpoint(&self, gid: &Gid) {
-        // In a forked child it is the parent's still, and its locks may be held.
-        if self.is_forked() {
-            return;
-        }
-        let mut state = self.shared().state();
-        if state.nodes.remove(gid).is_some() {
-            // The daemon may never have heard of it, and will then not say that it is gone.
-            Arc::make_mut(&mut state.graph).endpoints.remove(gid);
-        }
-        let publisher = state.publishers.remove(gid);
-        let subscription = state.subscriptions.remove(gid);
-        let publisher = publisher.as_ref().map(|p| (&p.endpoint, p.role));
-        let subscription = subscription.as_ref().map(|s| (&s.endpoint, s.role));
-        match publisher.or(subscription) {
-            Some((_, EndpointRole::StandIn | EndpointRole::Relay)) => {}
-            Some((endpoint, EndpointRole::Application)) => {
-                state.unindex(endpoint);
-                state.tombstones.insert(*gid);
-            }
-            None => drop(state.tombstones.insert(*gid)),
-        }
-        let gone = message::Gone { gid: *gid };
-        state.outgoing.push_back(Outgoing::Message(Box::new(Message::EndpointGone(gone))));
-        drop(state);
-        self.shared().wake();
+    /// A condition that the program triggers itself, for wait sets of the session.
+    pub fn create_guard_condition(&self) -> GuardCondition {
+        GuardCondition::new(self.shared())
     }
 
-    /// A relay stands for others than before: its writers and the daemon hear of it.
-    pub(super) fn renew(&self, gid: Gid) {
-        if self.is_forked() {
-            return;
+    /// A local ring for a publisher on another host, under that publisher's own GID. Where it has a
+    /// lease it is alive when a sample of it comes or [`Publisher::assert_liveliness`] says so. For the
+    /// gateway alone; a daemon refuses it from anybody else.
+    ///
+    /// # Errors
+    /// When there is no memory.
+    pub fn create_stand_in(&self, remote: Endpoint) -> Result<Publisher, SessionError> {
+        self.add_stand_in(remote)
+    }
+
+    /// The same in a relayed process, for any publisher outside: AUTOMATIC ones are alive as long as
+    /// their daemon speaks of them.
+    pub(crate) fn create_outsider(&self, outside: Endpoint) -> Result<Publisher, SessionError> {
+        self.add_publisher(outside, EndpointRole::StandIn)
+    }
+
+    /// A client of another host as the servers here see it, under its own GID. For the gateway alone.
+    pub(crate) fn create_stand_in_client(&self, remote: Endpoint) -> Result<Client, SessionError> {
+        self.add_client(remote, EndpointRole::StandIn)
+    }
+
+    /// A server of another host as the clients here see it, under its own GID. For the gateway alone.
+    pub(crate) fn create_stand_in_server(&self, remote: Endpoint) -> Server {
+        self.add_server(remote, EndpointRole::StandIn)
+    }
+
+    /// A publisher as another process of the session describes it, under its GID there.
+    pub(crate) fn adopt_publisher(&self, endpoint: Endpoint) -> Result<Publisher, SessionError> {
+        self.add_publisher(endpoint, EndpointRole::Application)
+    }
+
+    /// As [`adopt_publisher`](Self::adopt_publisher), a subscription.
+    pub(crate) fn adopt_subscription(&self, endpoint: Endpoint) -> Subscription {
+        self.add_subscription(endpoint, EndpointRole::Application, Vec::new())
+    }
+
+    /// As [`adopt_publisher`](Self::adopt_publisher), a node.
+    pub(crate) fn adopt_node(&self, endpoint: Endpoint) -> Node {
+        let gid = endpoint.gid;
+        let changed = self.create_guard_condition();
+        {
+            let mut state = self.shared().state();
+            state.nodes.insert(gid, (endpoint.clone(), changed.clone()));
+            // Who makes a node finds it in the graph, whatever the daemon does meanwhile.
+            let entry = GraphEntry { endpoint: Arc::new(endpoint.clone()), daemon: None };
+            Arc::make_mut(&mut state.graph).endpoints.insert(gid, entry);
         }
         self.shared().tell(Outgoing::Announce(gid));
+        Node::new(endpoint, changed, self.clone())
     }
 
-    /// Waits until a new endpoint is matched with all that the graph shows and that go with it: whoever
-    /// counts them reaches them. Not for long, and not where nobody could do it.
-    pub(super) fn await_pairs(&self, own: &Endpoint, matched: impl Fn(&Gid) -> bool) {
-        let shared = self.shared();
-        if shared.control.get() == Some(&std::thread::current().id()) {
-            return;
-        }
-        let goes = |other: &Endpoint| {
-            pairing(own, other) == Pairing::Match || pairing(other, own) == Pairing::Match
-        };
-        // Of its own session's endpoints it is sure, and both ends are waited for.
-        let (mut others, mut publishers, mut subscriptions) = (Vec::new(), Vec::new(), Vec::new());
-        let graph = {
-            let state = shared.state();
-            if state.daemon.is_none() && shared.config.daemon != DaemonPolicy::Off {
-                return;
-            }
-            let ignores = state.subscriptions.get(&own.gid).is_some_and(|s| s.ignores_local);
-            let others = state.topics.get(&own.topic).filter(|_| !ignores);
-            for gid in others.into_iter().flatten() {
-                publishers.extend(state.publishers.get(gid).filter(|p| goes(&p.endpoint)).cloned());
-                let hears = |s: &&Arc<SubscriptionInner>| goes(&s.endpoint) && !s.ignores_local;
-                subscriptions.extend(state.subscriptions.get(gid).filter(hears).cloned());
-            }
-            state.graph.clone()
-        };
-        let foreign = graph.endpoints.values().map(|other| &other.endpoint);
-        let foreign = foreign.filter(|other| other.gid.0[..12] != own.gid.0[..12] && goes(other));
-        others.extend(foreign.map(|other| other.gid));
-        drop(graph);
-        let there = |other: &Gid| shared.state().graph.endpoints.contains_key(other);
-        let stands = |other: &Gid, theirs: &EndpointEvents| {
-            let ends = matched(other) && theirs.is_matched(&own.gid);
-            let state = shared.state();
-            ends || !(state.publishers.contains_key(other)
-                || state.subscriptions.contains_key(other))
-        };
-        shared.wait_changed(PAIRS, || {
-            publishers.iter().all(|p| stands(&p.endpoint.gid, &p.events))
-                && subscriptions.iter().all(|s| stands(&s.endpoint.gid, &s.events))
-                && others.iter().all(|other| matched(other) || !there(other))
-        });
+    /// A local reader that carries samples to subscriptions on another host, `stands_for`. For the
+    /// gateway alone; a daemon refuses it from anybody else.
+    ///
+    /// # Errors
+    /// When the specification is out of bounds.
+    pub fn create_relay(
+        &self,
+        spec: EndpointSpec,
+        stands_for: Vec<Gid>,
+    ) -> Result<Subscription, SessionError> {
+        let endpoint = self.endpoint(spec, EndpointKind::Subscription)?;
+        Ok(self.add_subscription(endpoint, EndpointRole::Relay, stands_for))
     }
 }

@@ -71,6 +71,14 @@ impl Source {
         }
     }
 
+    /// What became of its matches since it was asked last.
+    pub(super) fn rematch(&self) -> Changes {
+        match self {
+            Self::Publisher(inner) => inner.rematch(),
+            Self::Subscription(inner) => inner.rematch(),
+        }
+    }
+
     /// Counts what has passed until `now`. When to look again, and whether something happened.
     pub(super) fn look_at_time(&self, now: u64) -> (Option<u64>, bool) {
         match self {
@@ -128,7 +136,8 @@ impl Event {
 
     /// Has `callback` told of it from now on, in place of the one before, which is not called any
     /// more once this returns. What happened since the status was last taken, and nobody was told
-    /// of, it is told at once, on this thread; the rest mostly on the control thread. It must
+    /// of, it is told at once, on this thread; the rest on the control thread, or where another endpoint of the
+    /// session comes or goes. It must
     /// neither block nor panic, nor hold the session.
     pub fn set_callback(&self, callback: Option<OnNew>) {
         if !self.session.is_forked() {
@@ -232,14 +241,20 @@ impl EndpointEvents {
         self.lock().matched.iter().copied().collect()
     }
 
-    /// Those that a publisher sends to are these now.
-    pub(super) fn readers(&self, now: BTreeSet<Gid>) -> Changes {
-        self.rematch(now, |_, _| {})
+    /// Those that a publisher sends to are these now. They are looked up under the lock: of two
+    /// threads that do so, the later one knows the later state.
+    pub(super) fn readers(&self, now: impl FnOnce() -> Vec<Gid>) -> Changes {
+        self.rematch(|| now().into_iter().map(|gid| (gid, None)).collect(), |_, _, _| {})
     }
 
-    /// Those that a subscription receives from are these now, with the leases that they offer.
-    pub(super) fn writers(&self, now: &BTreeMap<Gid, Option<u64>>, time: u64) -> Changes {
-        self.rematch(now.keys().copied().collect(), |inner, changes| {
+    /// As [`readers`](Self::readers), those that a subscription receives from, with the leases that
+    /// they offer.
+    pub(super) fn writers(
+        &self,
+        now: impl FnOnce() -> BTreeMap<Gid, Option<u64>>,
+        time: u64,
+    ) -> Changes {
+        self.rematch(now, |inner, changes, leases| {
             let (mut alive, mut not_alive) = (0, 0);
             let mut add = |change: (i64, i64)| {
                 alive += change.0;
@@ -249,15 +264,21 @@ impl EndpointEvents {
                 add(inner.liveness.unmatched(gid));
             }
             for gid in &changes.added {
-                add(inner.liveness.matched(*gid, now[gid], time));
+                add(inner.liveness.matched(*gid, leases[gid], time));
             }
             inner.statuses.liveliness_changed(alive, not_alive);
         })
     }
 
-    fn rematch(&self, now: BTreeSet<Gid>, liveness: impl FnOnce(&mut Inner, &Changes)) -> Changes {
+    fn rematch(
+        &self,
+        now: impl FnOnce() -> BTreeMap<Gid, Option<u64>>,
+        liveness: impl FnOnce(&mut Inner, &Changes, &BTreeMap<Gid, Option<u64>>),
+    ) -> Changes {
         let mut changes = Changes::default();
         self.change(|inner| {
+            let leases = now();
+            let now: BTreeSet<Gid> = leases.keys().copied().collect();
             changes.removed = inner.matched.difference(&now).copied().collect();
             changes.added = now.difference(&inner.matched).copied().collect();
             if changes.is_empty() {
@@ -270,7 +291,7 @@ impl EndpointEvents {
             changes.added.iter().for_each(|_| {
                 inner.statuses.matched();
             });
-            liveness(inner, &changes);
+            liveness(inner, &changes, &leases);
         });
         changes
     }

@@ -5,7 +5,7 @@ use std::{
     fmt, io,
     ops::{Deref, DerefMut},
     sync::{Arc, Mutex, MutexGuard, PoisonError},
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use super::{
@@ -100,23 +100,14 @@ impl Publisher {
         Ok(())
     }
 
-    /// Waits until every sample published so far is acknowledged; whether it is. One that is to be
-    /// read on this host is so at once, and one for another host when the daemon has taken it over.
+    /// Waits until every sample published so far is acknowledged; whether it is.
+    ///
+    /// One that is to be read on this host is so at once, whether or not it has been taken. One for
+    /// another host is when this host's daemon has taken it over: it is sealed and sent from then on
+    /// whatever becomes of the publisher, but the other host has not said that it came. Where a link
+    /// breaks, what was on its way is lost, and the subscriptions there count it.
     pub fn wait_acknowledged(&self, timeout: Duration) -> bool {
-        let deadline = Instant::now().checked_add(timeout);
-        let (published, mut taken) = self.writer.handed_over();
-        let mut pause = Duration::from_micros(200);
-        while taken < published && !self.session.is_forked() {
-            let left = deadline.map(|deadline| deadline.saturating_duration_since(Instant::now()));
-            if left.is_some_and(|left| left.is_zero()) {
-                return false;
-            }
-            // Nobody tells a publisher what was taken, and few ask.
-            std::thread::sleep(left.map_or(pause, |left| pause.min(left)));
-            pause = (2 * pause).min(Duration::from_millis(10));
-            taken = self.writer.handed_over().1;
-        }
-        true
+        self.session.is_forked() || self.writer.wait_handed_over(timeout)
     }
 
     /// One of its events; `None` where `kind` is a subscription's.
@@ -242,7 +233,7 @@ pub(super) struct PublisherInner {
     pub(super) role: EndpointRole,
     pub(super) rings: Rings,
     pub(super) events: EndpointEvents,
-    /// A publication says that the publisher is alive.
+    /// A publication says that the publisher is alive, and nothing else but the program does.
     asserts: bool,
     /// Readers that were granted; a relay as itself.
     attached: Mutex<BTreeSet<Gid>>,
@@ -254,6 +245,12 @@ impl PublisherInner {
         let asserts = liveliness == Liveliness::ManualByTopic && lease.is_some();
         let events = EndpointEvents::of_publisher(&endpoint.qos, clock::monotonic());
         Self { endpoint, role, rings, events, asserts, attached: Mutex::default() }
+    }
+
+    /// Has it be alive when it is said to be, whatever its liveliness: its process is elsewhere.
+    pub(super) fn asserted(mut self) -> Self {
+        self.asserts = self.endpoint.qos.lease.is_some();
+        self
     }
 
     /// Serves a reader: what it is granted, and in which ring.
@@ -286,7 +283,7 @@ impl PublisherInner {
 
     /// What became of its matches since it was asked last.
     pub(super) fn rematch(&self) -> Changes {
-        self.events.readers(self.rings.readers().into_iter().collect())
+        self.events.readers(|| self.rings.readers())
     }
 
     /// Counts the deadlines that passed, and asserts or watches the lease. When to look again, and
@@ -296,7 +293,7 @@ impl PublisherInner {
         let Rings::Shared(writer) = &self.rings else { return (None, false) };
         let times = writer.times();
         let (due, news) = self.events.offered(qos, &times, now);
-        let Some(lease) = qos.lease.filter(|_| qos.liveliness == Liveliness::Automatic) else {
+        let Some(lease) = qos.lease.filter(|_| !self.asserts) else {
             return (due, news);
         };
         let third = (lease / 3).max(1_000_000);

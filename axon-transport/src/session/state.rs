@@ -14,8 +14,9 @@ use std::{
 
 use super::{
     SessionOptions,
+    events::{Changes, Source},
     guard::GuardCondition,
-    message::{Message, StatusPart},
+    message::{Gone, Message, StatusPart},
     publisher::PublisherInner,
     subscription::SubscriptionInner,
 };
@@ -59,6 +60,8 @@ pub(crate) struct Shared {
     pub(super) listener: Mutex<Option<Listener>>,
     /// One status request at a time.
     pub(super) asking: Mutex<()>,
+    /// Held while pairs of the session's own endpoints come or go.
+    pub(super) home: Mutex<()>,
     state: Mutex<State>,
     changed: Condvar,
 }
@@ -80,6 +83,10 @@ pub(super) struct State {
     pub(super) status: StatusAnswer,
     /// When those who wait shall look again, whether or not anything comes.
     pub(super) again: Option<Instant>,
+    /// Pairs that came or went on other threads than the control thread, which has yet to tell.
+    pub(super) rematched: Vec<(Changes, Source)>,
+    /// The graph is another one than the control thread has told of.
+    pub(super) regraphed: bool,
     /// Counts what those who wait may want to look at.
     pub(super) changes: u64,
 }
@@ -87,6 +94,21 @@ pub(super) struct State {
 impl State {
     pub(super) fn index(&mut self, endpoint: &Endpoint) {
         self.topics.entry(endpoint.topic.clone()).or_default().insert(endpoint.gid);
+    }
+
+    /// One of its own is gone: nobody here counts it any more, whatever the daemon has heard.
+    pub(super) fn bury(&mut self, gid: &Gid) {
+        self.tombstones.insert(*gid);
+        if self.graph.endpoints.contains_key(gid) {
+            Arc::make_mut(&mut self.graph).endpoints.remove(gid);
+            self.regraphed = true;
+        }
+        self.tell_gone(gid);
+    }
+
+    pub(super) fn tell_gone(&mut self, gid: &Gid) {
+        let gone = Message::EndpointGone(Gone { gid: *gid });
+        self.outgoing.push_back(Outgoing::Message(Box::new(gone)));
     }
 
     pub(super) fn unindex(&mut self, endpoint: &Endpoint) {
@@ -204,6 +226,7 @@ impl Shared {
             listening: Mutex::default(),
             listener: Mutex::new(None),
             asking: Mutex::new(()),
+            home: Mutex::default(),
             state: Mutex::default(),
             changed: Condvar::new(),
         }

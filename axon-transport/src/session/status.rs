@@ -1,25 +1,95 @@
-//! The daemon's status, asked for over a connection that does nothing else.
+//! The daemon's status, asked for over the session's connection or one that does nothing else.
 
 use std::{
     os::fd::OwnedFd,
+    sync::PoisonError,
     time::{Duration, Instant},
 };
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::{
+    Session, SessionOptions, SessionRole,
+    address::Address,
+    connect::Caller,
     error::SessionError,
     message::Message,
     socket::{self, SocketError},
-    state::StatusText,
+    state::{Outgoing, StatusAnswer, StatusText},
+};
+use crate::{
+    config::{Config, DaemonPolicy},
+    ids::SessionId,
+    shm::ShmError,
 };
 
+/// How long a daemon may take to answer.
+const ANSWER: Duration = Duration::from_secs(5);
+
+impl Session {
+    /// The daemon's status: the JSON of [`Status`](crate::daemon::status::Status).
+    ///
+    /// # Errors
+    /// When there is no daemon or it does not answer in time.
+    pub fn status_json(&self) -> Result<String, SessionError> {
+        let shared = self.shared();
+        if self.is_forked() {
+            return Err(ShmError::Forked.into());
+        }
+        let _asking = shared.asking.lock().unwrap_or_else(PoisonError::into_inner);
+        if shared.config.daemon == DaemonPolicy::Off {
+            return Err(SessionError::Off);
+        }
+        if self.handle.relay.is_some() {
+            return daemon_status(&shared.config);
+        }
+        {
+            let mut state = shared.state();
+            if state.daemon.is_none() {
+                return Err(SessionError::Disconnected);
+            }
+            state.status = StatusAnswer::Parts(Default::default());
+        }
+        shared.tell(Outgoing::Message(Box::new(Message::StatusRequest)));
+        shared.wait_changed(ANSWER, || !matches!(shared.state().status, StatusAnswer::Parts(_)));
+        let answer = std::mem::take(&mut shared.state().status);
+        match answer {
+            StatusAnswer::Whole(bytes) => status_text(bytes),
+            StatusAnswer::Lost => Err(SessionError::Disconnected),
+            StatusAnswer::None | StatusAnswer::Parts(_) => {
+                Err(SessionError::Silent { address: Address::of(&shared.config).to_string() })
+            }
+        }
+    }
+}
+
+/// The status of the daemon of this user and domain. Starts none, and is answered whatever the
+/// security settings.
+///
+/// # Errors
+/// [`SessionError::NoDaemon`] when there is none.
+pub fn daemon_status(config: &Config) -> Result<String, SessionError> {
+    let config = Config { daemon: DaemonPolicy::Require, ..config.clone() };
+    let options = SessionOptions::new("status").role(SessionRole::Tool);
+    let caller = Caller {
+        config: &config,
+        options: &options,
+        id: SessionId::random(),
+        segment: None,
+        relay: None,
+        cancel: None,
+    };
+    let connected = caller.connect()?;
+    let address = Address::of(&config).to_string();
+    status_text(ask(&connected.socket, &address, ANSWER)?)
+}
+
+fn status_text(bytes: Vec<u8>) -> Result<String, SessionError> {
+    String::from_utf8(bytes).map_err(|e| SessionError::Protocol(format!("status: {e}")))
+}
+
 /// The text of the status.
-pub(super) fn ask(
-    socket: &OwnedFd,
-    address: &str,
-    patience: Duration,
-) -> Result<Vec<u8>, SessionError> {
+fn ask(socket: &OwnedFd, address: &str, patience: Duration) -> Result<Vec<u8>, SessionError> {
     let silent = || SessionError::Silent { address: address.to_owned() };
     let protocol = |e: SocketError| SessionError::Protocol(e.to_string());
     let deadline = Instant::now() + patience;

@@ -1,6 +1,8 @@
 //! A session whose daemon is played by the test: what it makes of what it is told, and in which
 //! order it says what.
 
+mod played;
+
 use std::{
     env, fs,
     io::Write as _,
@@ -19,13 +21,17 @@ use rustix::{
 };
 
 use super::{
-    message::{Attach, Granted, Graph, PROTOCOL, Pair, Segment, SegmentOpened, Unmatch, Welcome},
+    message::{
+        Attach, Granted, Graph, Message, PROTOCOL, Pair, Segment, SegmentOpened, Unmatch, Welcome,
+    },
     socket::{Received, SocketError},
     *,
 };
 use crate::{
-    config::OsFiles,
-    qos::Durability,
+    config::{Config, OsFiles},
+    graph::EndpointKind,
+    ids::Gid,
+    qos::{Durability, Qos},
     shm::{
         Grant, Location, Meta, Peer, PeerDescriptors, PeerSession, ReaderInfo, RingOptions,
         SegmentInfo, SegmentKind, Writer,
@@ -392,7 +398,10 @@ fn a_daemon_cannot_have_a_session_read_its_own_samples_as_rings_and_lanes() {
     let latched = Qos { durability: Durability::TransientLocal, ..Qos::default() };
     let publisher =
         session.create_publisher(EndpointSpec::new("/t", "test/Bytes", latched)).unwrap();
-    let subscription = subscription(&session);
+    // Of those that it makes itself, the daemon has no part in the pair.
+    let spec = EndpointSpec::new("/t", "test/Bytes", latched);
+    let described = session.describe(spec, EndpointKind::Subscription).unwrap();
+    let subscription = session.adopt_subscription(described);
     let (reader, writer, own) = (subscription.gid(), publisher.gid(), session.id());
     // A sample that looks like the ring.
     let mut forged = [0u8; 4096];

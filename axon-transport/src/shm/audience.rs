@@ -263,6 +263,12 @@ impl Audience {
         relays.filter_map(|reader| reader.cursor(head)).min().unwrap_or(head)
     }
 
+    /// The sessions of those that do.
+    pub(super) fn relays(&self) -> Vec<Arc<PeerSession>> {
+        let relays = self.readers.iter().filter(|reader| !reader.dead && reader.info.is_relay());
+        relays.filter_map(|reader| reader.info.peer.remote().cloned()).collect()
+    }
+
     /// The reader that has most to take of those that hold `tail`, and the sessions of all these.
     pub(super) fn laggards(&self, tail: u64, head: u64) -> Option<(Gid, Vec<Arc<PeerSession>>)> {
         let mut worst = None;

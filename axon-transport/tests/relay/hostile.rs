@@ -1,5 +1,7 @@
 //! Who says what no session says.
 
+use rustix::process::{Pid, WaitId, WaitIdOptions, waitid};
+
 use super::*;
 
 /// What a session under the id of nines says first.
@@ -109,7 +111,7 @@ fn who_is_not_to_be_relayed_is_refused() {
 #[test]
 fn hostile_frames_end_their_own_relay_and_nothing_else() {
     let host = host();
-    let _daemon = host.daemon();
+    let daemon = host.daemon();
     let (from, to) = (session(&host, "from", true), session(&host, "to", false));
     let (publisher, subscription) = connect(&from, &to, "/t", Qos::keep_all());
     let own = Gid::new(SessionId([9; 16]), 1);
@@ -140,9 +142,14 @@ fn hostile_frames_end_their_own_relay_and_nothing_else() {
         &[piece(own, Some(100_000), 31_000), piece(own, None, 31_000)],
     ] {
         let socket = credited();
-        // It may hang up before all is said.
+        // It hears them together: after the first of a long sample alone it would make room for it.
+        let pid = daemon.0.id();
+        signal(pid, Signal::STOP);
+        let id = WaitId::Pid(Pid::from_raw(pid.cast_signed()).unwrap());
+        waitid(id, WaitIdOptions::STOPPED).unwrap();
         let packets = pieces.iter().map(|piece| piece.encode().unwrap());
-        packets.for_each(|packet| drop(socket::send(&socket, &packet, &[])));
+        packets.for_each(|packet| socket::send(&socket, &packet, &[]).unwrap());
+        signal(pid, Signal::CONT);
         assert!(hear(&socket, |_| false).is_none(), "{pieces:?}");
     }
     for packet in [&[][..], &[25], &[25, 0xff, 0xff], &[0xff; 32 * 1024]] {

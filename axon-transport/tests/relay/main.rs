@@ -420,7 +420,7 @@ fn without_a_daemon_to_be_relayed_by_it_is_an_error() {
     let (publisher, subscription) = connect(&alone, &alone, "/t", Qos::default());
     publish(&publisher, &pattern(1, 10));
     assert_eq!(take_until(&subscription, 1), [1]);
-    assert!(alone.wait_graph(Duration::ZERO, |graph| graph.endpoints.len() == 2));
+    assert!(alone.wait_graph(PATIENCE, |graph| graph.endpoints.len() == 2));
 }
 
 /// Stands between sessions and their daemon, and keeps descriptors back.

@@ -370,7 +370,7 @@ impl<'a> Served<'a> {
             if !self.stand_ins.contains_key(&writer) {
                 // The graph may say later who it is.
                 let Some((_, endpoint)) = self.world.get(&writer) else { continue };
-                match self.common.outside.create_stand_in(endpoint.clone()) {
+                match self.common.outside.create_outsider(endpoint.clone()) {
                     Ok(stand_in) => drop(self.stand_ins.insert(writer, stand_in)),
                     Err(error) => {
                         tracing::error!(%writer, %error, "a publisher cannot be received from");

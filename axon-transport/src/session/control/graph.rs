@@ -11,7 +11,7 @@ use crate::{
     graph::{Endpoint, EndpointKind, GraphEntry, GraphView, Pairing, pairing},
     ids::Gid,
     session::{
-        events::Source,
+        events::{Changes, Source},
         message::{Graph, Pair},
         publisher::PublisherInner,
         state::SessionEvent,
@@ -70,30 +70,41 @@ impl Control {
     }
 
     /// A publisher's, server's or client's readers changed.
-    pub(super) fn writer_changed(&mut self, publisher: &PublisherInner) {
-        let writer = publisher.endpoint.gid;
+    pub(super) fn writer_changed(&mut self, publisher: &Arc<PublisherInner>) {
         let changes = publisher.rematch();
-        for reader in changes.added {
-            self.stands(&Pair { reader, writer });
-        }
-        self.tell_matched(&publisher.endpoint);
+        self.rematched(changes, &Source::Publisher(publisher.clone()));
     }
 
     /// A subscription's, server's or client's writers changed.
-    pub(super) fn reader_changed(&mut self, subscription: &SubscriptionInner) {
-        let reader = subscription.endpoint.gid;
+    pub(super) fn reader_changed(&mut self, subscription: &Arc<SubscriptionInner>) {
         let changes = subscription.rematch();
-        for writer in changes.added {
-            self.stands(&Pair { reader, writer });
-        }
-        self.timed = None;
-        self.tell_matched(&subscription.endpoint);
+        self.rematched(changes, &Source::Subscription(subscription.clone()));
     }
 
-    fn tell_matched(&mut self, own: &Endpoint) {
+    fn rematched(&mut self, changes: Changes, source: &Source) {
+        let own = source.endpoint();
+        for other in changes.added {
+            self.stands(&match source {
+                Source::Publisher(_) => Pair { reader: other, writer: own.gid },
+                Source::Subscription(_) => Pair { reader: own.gid, writer: other },
+            });
+        }
+        self.timed = None;
         // Whether a service is available is no more than that.
         self.graph_changed |= matches!(own.kind, EndpointKind::Server | EndpointKind::Client);
         self.shared.notify(Some(&SessionEvent::Matched(own.gid)));
+    }
+
+    /// Tells what other threads of the session changed.
+    pub(super) fn tell_rematched(&mut self) {
+        let (rematched, regraphed) = {
+            let mut state = self.shared.state();
+            (std::mem::take(&mut state.rematched), std::mem::take(&mut state.regraphed))
+        };
+        self.graph_changed |= regraphed;
+        for (changes, source) in rematched {
+            self.rematched(changes, &source);
+        }
     }
 
     /// An endpoint of the session is gone: nobody waits for its pairs.
@@ -122,6 +133,10 @@ impl Control {
     fn appear(&mut self, entry: GraphEntry) {
         let endpoint = &entry.endpoint;
         let own = endpoint.gid.0[..12] == self.shared.id.0[..12];
+        // One of its own that has ended since it was announced: the daemon will say so.
+        if own && self.shared.state().tombstones.contains(&endpoint.gid) {
+            return;
+        }
         self.relate(endpoint);
         let shown = self.building.is_some()
             && self.shared.state().graph.endpoints.contains_key(&endpoint.gid);

@@ -17,7 +17,7 @@ use crate::{
         state::StatusAnswer,
         subscription::{Accept, SubscriptionInner},
     },
-    shm::{Grant, Location, Peer, Reader, ReaderInfo, ReaderOptions, ShmError},
+    shm::{Grant, Location, Peer, ReaderInfo, ShmError},
 };
 
 impl Control {
@@ -79,7 +79,9 @@ impl Control {
         for publisher in publishers {
             let (writer, attached) = (publisher.endpoint.gid, publisher.attached().clone());
             for reader in attached {
-                if !repeated.contains(&Pair { reader, writer }) && publisher.detach(reader) {
+                let pair = Pair { reader, writer };
+                if !repeated.contains(&pair) && !self.is_at_home(&pair) && publisher.detach(reader)
+                {
                     self.writer_changed(&publisher);
                 }
             }
@@ -90,13 +92,20 @@ impl Control {
             let gone = slots
                 .writers()
                 .into_iter()
-                .filter(|&writer| !repeated.contains(&Pair { reader, writer }));
+                .map(|writer| Pair { reader, writer })
+                .filter(|pair| !repeated.contains(pair) && !self.is_at_home(pair))
+                .map(|pair| pair.writer);
             let news = gone.collect::<Vec<_>>().iter().filter(|writer| slots.end(writer)).count();
             drop(slots);
             if news > 0 {
                 self.reader_changed(&subscription);
             }
         }
+    }
+
+    /// Whether both are the session's own, which part as soon as one of them ends.
+    fn is_at_home(&self, pair: &Pair) -> bool {
+        pair.reader.is_of(&self.shared.id) && pair.writer.is_of(&self.shared.id)
     }
 
     /// Lets go of memory of others that nobody here reads any more, of which the daemon did not say
@@ -178,18 +187,22 @@ impl Control {
         }
         // Counted whether or not it comes to anything, as the daemon does.
         let peer = self.hold(attach.session, pair, descriptors, &attach.segments);
-        if attach.session == self.shared.id && !self.has_lane(&pair, attach.lane) {
-            tracing::error!(reader = %pair.reader, "a lane of the session that it has not");
-            return;
-        }
+        let shared = self.shared.clone();
+        let own = attach.session == shared.id;
+        // Neither of two at home shall end between the look at it and the grant.
+        let home = own.then(|| shared.home());
         let Some(publisher) = self.shared.state().publishers.get(&attach.writer).cloned() else {
             return;
         };
+        if own && !self.has_lane(&pair, attach.lane) {
+            return;
+        }
         let grant = peer.map_err(|e| e.to_string()).and_then(|peer| {
             let Attach { reader: gid, lane, qos, stands_for, .. } = attach;
             let reader = ReaderInfo { gid, lane, qos, peer, stands_for };
             publisher.attach(reader).map_err(|e| e.to_string())
         });
+        drop(home);
         match grant {
             Ok((Grant { generation, first }, ring)) => {
                 let Pair { reader, writer } = pair;
@@ -225,13 +238,15 @@ impl Control {
         if all {
             self.peers.drop_unnamed(&session, writer);
         }
-        if session == self.shared.id && !self.has_ring(&writer, ring) {
-            tracing::error!(%writer, "a ring of the session that it has not");
-            return;
-        }
+        let shared = self.shared.clone();
+        let own = session == shared.id;
+        let home = own.then(|| shared.home());
         let Some(subscription) = self.shared.state().subscriptions.get(&reader).cloned() else {
             return;
         };
+        if own && !self.has_ring(&writer, ring) {
+            return;
+        }
         let grant = Grant { generation, first };
         let mut slots = subscription.lock();
         let lane = match slots.accept(writer, grant) {
@@ -248,17 +263,8 @@ impl Control {
         };
         drop(slots);
         let mapped = peer.map_err(|e| e.to_string()).and_then(|peer| {
-            let options = ReaderOptions {
-                reader,
-                writer,
-                peer,
-                ring,
-                lane,
-                grant,
-                qos: subscription.qos,
-                max_message: self.shared.config.max_message,
-            };
-            Reader::map(options).map_err(|e| e.to_string())
+            let most = shared.config.max_message;
+            subscription.map(writer, peer, ring, lane, grant, most).map_err(|e| e.to_string())
         });
         match mapped {
             Ok(mapped) => {
@@ -266,11 +272,13 @@ impl Control {
                 let linked = matches!(self.link, Link::Socket(_)) && !writer.is_of(&session);
                 let stands_in = linked && subscription.endpoint.kind == EndpointKind::Subscription;
                 subscription.lock().add(mapped, stands_in);
+                drop(home);
                 self.reader_changed(&subscription);
                 // It may have history to take.
                 self.shared.segment.notify();
             }
             Err(error) => {
+                drop(home);
                 let topic = &subscription.endpoint.topic;
                 tracing::error!(topic, %writer, error, "a publisher cannot be received from");
                 self.tell_failure(&pair, error);
@@ -302,13 +310,24 @@ impl Control {
     /// sample.
     fn has_lane(&self, pair: &Pair, lane: Location) -> bool {
         let subscription = self.shared.state().subscriptions.get(&pair.reader).cloned();
-        subscription.is_some_and(|s| s.lock().lanes().contains(&(pair.writer, lane)))
+        // It may have ended, with its lanes, since it asked.
+        let Some(subscription) = subscription else { return false };
+        let has = subscription.lock().lanes().contains(&(pair.writer, lane));
+        if !has {
+            tracing::error!(reader = %pair.reader, "a lane of the session that it has not");
+        }
+        has
     }
 
     /// Whether a publisher of ours has that ring.
     fn has_ring(&self, writer: &Gid, ring: Location) -> bool {
-        let state = self.shared.state();
-        state.publishers.get(writer).is_some_and(|p| p.rings.has(ring))
+        let publisher = self.shared.state().publishers.get(writer).cloned();
+        let Some(publisher) = publisher else { return false };
+        let has = publisher.rings.has(ring);
+        if !has {
+            tracing::error!(%writer, "a ring of the session that it has not");
+        }
+        has
     }
 
     fn segment(&mut self, opened: &SegmentOpened, descriptors: &[PassedFd]) {

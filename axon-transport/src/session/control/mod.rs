@@ -131,6 +131,7 @@ impl Control {
         while !self.shared.stopping.load(Ordering::Acquire) {
             self.try_reconnected();
             self.try_again();
+            self.tell_rematched();
             self.collect();
             self.send();
             self.prepare();

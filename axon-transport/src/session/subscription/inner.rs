@@ -1,9 +1,6 @@
 //! What the session's control thread shares with a subscription's handle.
 
-use std::{
-    collections::BTreeMap,
-    sync::{Mutex, MutexGuard, PoisonError},
-};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use super::slots::Slots;
 use crate::{
@@ -18,7 +15,7 @@ use crate::{
         message::EndpointRole,
         state::Shared,
     },
-    shm::ShmError,
+    shm::{Grant, Lane, Location, Peer, Reader, ReaderOptions, ShmError},
     wait::Look,
 };
 
@@ -109,14 +106,33 @@ impl SubscriptionInner {
         }
     }
 
+    /// What reads the ring that a writer granted.
+    pub(in crate::session) fn map(
+        &self,
+        writer: Gid,
+        peer: Peer,
+        ring: Location,
+        lane: Lane,
+        grant: Grant,
+        max_message: u64,
+    ) -> Result<Reader, ShmError> {
+        let (reader, qos) = (self.endpoint.gid, self.qos);
+        let options = ReaderOptions { reader, writer, peer, ring, lane, grant, qos, max_message };
+        let mut mapped = Reader::map(options)?;
+        if self.role == EndpointRole::Relay {
+            mapped.tell_progress();
+        }
+        Ok(mapped)
+    }
+
     /// What became of its matches since it was asked last.
     pub(in crate::session) fn rematch(&self) -> Changes {
-        let leases: BTreeMap<Gid, Option<u64>> = {
+        let leases = || {
             let slots = self.lock();
             let active = slots.slots.iter().filter(|slot| !slot.over);
             active.map(|slot| (slot.reader.writer(), slot.reader.times().lease)).collect()
         };
-        self.events.writers(&leases, clock::monotonic())
+        self.events.writers(leases, clock::monotonic())
     }
 
     /// Counts the deadlines that passed and looks who is alive. When to look again, and whether

@@ -149,6 +149,18 @@ impl Subscription {
         !self.session.is_forked() && self.inner.lock().has_from(writer)
     }
 
+    /// The publishers that have a lease, and when each was last alive, by the monotonic clock.
+    pub(crate) fn assertions(&self) -> Vec<(Gid, u64)> {
+        if self.session.is_forked() {
+            return Vec::new();
+        }
+        let slots = self.inner.lock();
+        let there = slots.slots.iter().filter(|slot| !slot.over);
+        let times = there.map(|slot| (slot.reader.writer(), slot.reader.times()));
+        let leased = times.filter(|(_, times)| times.lease.is_some());
+        leased.filter_map(|(gid, times)| Some((gid, times.asserted?))).collect()
+    }
+
     /// For a relay: the remote subscriptions that it stands for from now on.
     pub fn set_stands_for(&self, gids: Vec<Gid>) {
         if self.session.is_forked() {

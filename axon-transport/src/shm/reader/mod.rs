@@ -118,7 +118,7 @@ struct Reads {
     /// The longest sample that may be pinned, in bytes.
     in_place: u64,
     /// Whether a publisher may wait for it.
-    holds: bool,
+    tells: bool,
 }
 
 impl Reader {
@@ -147,7 +147,7 @@ impl Reader {
             return refuse("its ring is too far");
         }
         lane.open(grant, reader);
-        let holds = holds(&qos) && peer.remote().is_some();
+        let tells = holds(&qos) && peer.remote().is_some();
         let (depth, in_place) = (depth(&qos), Allowance::of(grant.generation).longest());
         let attachment = Attachment::new(map, words, lane);
         if let Some(session) = peer.remote() {
@@ -166,7 +166,7 @@ impl Reader {
             skipped: 0,
             corrupt: None,
             given_up: false,
-            reads: Reads { writer, peer, grant, depth, max_message, in_place, holds },
+            reads: Reads { writer, peer, grant, depth, max_message, in_place, tells },
         })
     }
 
@@ -411,9 +411,14 @@ impl Reader {
         self.make_room_known();
     }
 
+    /// Has its publisher woken by whatever is taken, if it waits for that: of what stands for others.
+    pub(crate) fn tell_progress(&mut self) {
+        self.reads.tells = true;
+    }
+
     /// Wakes a publisher that waits for this reader.
     fn make_room_known(&self) {
-        if self.reads.holds {
+        if self.reads.tells {
             settle::<AtomicU64>();
             self.reads.peer.ring_if(Purpose::Room);
         }

@@ -1,6 +1,7 @@
 //! The publishing end of a ring.
 
 mod commit;
+mod handover;
 
 use std::{sync::Arc, time::Duration};
 
@@ -257,17 +258,6 @@ impl Writer {
     /// Whether any reader is attached.
     pub fn has_readers(&self) -> bool {
         !self.is_forked() && !self.lock().audience.is_empty()
-    }
-
-    /// The next position, and the one below which all has been handed to those who carry it
-    /// elsewhere.
-    pub(crate) fn handed_over(&self) -> (u64, u64) {
-        if self.is_forked() {
-            return (0, 0);
-        }
-        let state = self.lock();
-        let head = state.history.head();
-        (head, state.audience.handed_over(head))
     }
 
     /// If a sample would be read by nobody, now or later, uses up the next sequence number as if one

@@ -1,0 +1,210 @@
+//! How endpoints come to be known, and go.
+
+use std::{sync::Arc, time::Duration};
+
+use super::{
+    Client, EndpointSpec, Publisher, Server, Session, SessionError, Subscription,
+    message::EndpointRole,
+    publisher::PublisherInner,
+    rings::{Lanes, Rings},
+    state::Outgoing,
+    subscription::SubscriptionInner,
+};
+use crate::{
+    graph::{Endpoint, EndpointKind, Pairing, pairing},
+    ids::Gid,
+    qos::Qos,
+    shm::{RingOptions, ShmError, Writer},
+};
+
+/// How long a new endpoint waits for those that it is matched with.
+const PAIRS: Duration = Duration::from_millis(50);
+
+impl Session {
+    pub(super) fn endpoint(
+        &self,
+        spec: EndpointSpec,
+        kind: EndpointKind,
+    ) -> Result<Endpoint, SessionError> {
+        let endpoint = self.describe(spec, kind)?;
+        if endpoint.is_sane() {
+            Ok(endpoint)
+        } else {
+            Err(SessionError::Endpoint { topic: endpoint.topic })
+        }
+    }
+
+    /// An endpoint with a GID of its own.
+    pub(super) fn describe(
+        &self,
+        spec: EndpointSpec,
+        kind: EndpointKind,
+    ) -> Result<Endpoint, SessionError> {
+        if self.is_forked() {
+            return Err(ShmError::Forked.into());
+        }
+        let number = {
+            let mut state = self.shared().state();
+            state.next_entity += 1;
+            state.next_entity
+        };
+        let EndpointSpec { topic, type_name, type_hash, qos, node, namespace, .. } = spec;
+        Ok(Endpoint {
+            gid: Gid::new(self.shared().id, number),
+            kind,
+            topic,
+            type_name,
+            type_hash,
+            qos,
+            node,
+            namespace,
+            enclave: String::new(),
+        })
+    }
+
+    pub(super) fn add_publisher(
+        &self,
+        endpoint: Endpoint,
+        role: EndpointRole,
+    ) -> Result<Publisher, SessionError> {
+        self.add_writer(endpoint, |endpoint, rings| PublisherInner::new(endpoint, role, rings))
+    }
+
+    pub(super) fn add_stand_in(&self, remote: Endpoint) -> Result<Publisher, SessionError> {
+        let role = EndpointRole::StandIn;
+        self.add_writer(remote, |e, rings| PublisherInner::new(e, role, rings).asserted())
+    }
+
+    fn add_writer(
+        &self,
+        endpoint: Endpoint,
+        inner: impl FnOnce(Endpoint, Rings) -> PublisherInner,
+    ) -> Result<Publisher, SessionError> {
+        let options = self.ring(&endpoint, endpoint.qos);
+        let writer = Arc::new(Writer::create(self.shared().segment.clone(), options)?);
+        let inner = Arc::new(inner(endpoint, Rings::Shared(writer.clone())));
+        self.announce(Some(&inner), None);
+        Ok(Publisher { inner, writer, session: self.clone() })
+    }
+
+    pub(super) fn add_subscription(
+        &self,
+        endpoint: Endpoint,
+        role: EndpointRole,
+        stands_for: Vec<Gid>,
+    ) -> Subscription {
+        self.add_reader(SubscriptionInner::new(endpoint, role, stands_for))
+    }
+
+    pub(super) fn add_reader(&self, inner: SubscriptionInner) -> Subscription {
+        let inner = Arc::new(inner);
+        self.announce(None, Some(&inner));
+        Subscription { inner, session: self.clone() }
+    }
+
+    pub(super) fn add_client(
+        &self,
+        endpoint: Endpoint,
+        role: EndpointRole,
+    ) -> Result<Client, SessionError> {
+        let options = self.ring(&endpoint, Qos::keep_all());
+        let writer = Arc::new(Writer::create(self.shared().segment.clone(), options)?);
+        let (requests, responses) = self.add_both(endpoint, role, Rings::Shared(writer.clone()));
+        Ok(Client::new(requests, responses, writer, self.clone()))
+    }
+
+    pub(super) fn add_server(&self, endpoint: Endpoint, role: EndpointRole) -> Server {
+        let options = self.ring(&endpoint, Qos::keep_all());
+        let lanes = Arc::new(Lanes::new(self.shared().segment.clone(), options));
+        let (responses, requests) = self.add_both(endpoint, role, Rings::Each(lanes.clone()));
+        Server::new(responses, requests, lanes, self.clone())
+    }
+
+    /// The two sides of an endpoint that writes and reads.
+    fn add_both(
+        &self,
+        endpoint: Endpoint,
+        role: EndpointRole,
+        rings: Rings,
+    ) -> (Arc<PublisherInner>, Arc<SubscriptionInner>) {
+        let writes = Arc::new(PublisherInner::new(endpoint.clone(), role, rings));
+        let reads = Arc::new(SubscriptionInner::new(endpoint, role, Vec::new()));
+        self.announce(Some(&writes), Some(&reads));
+        (writes, reads)
+    }
+
+    fn ring(&self, endpoint: &Endpoint, qos: Qos) -> RingOptions {
+        let config = &self.shared().config;
+        let (budget, max_message) = (config.ring_bytes, config.max_message);
+        RingOptions { gid: endpoint.gid, qos, budget, max_message, expected: 0 }
+    }
+
+    /// Keeps an endpoint's sides for the control thread, and has it told of.
+    fn announce(
+        &self,
+        writes: Option<&Arc<PublisherInner>>,
+        reads: Option<&Arc<SubscriptionInner>>,
+    ) {
+        let shared = self.shared();
+        let mut state = shared.state();
+        let (mut endpoint, mut role) = (None, EndpointRole::Application);
+        if let Some(inner) = writes {
+            state.publishers.insert(inner.endpoint.gid, inner.clone());
+            (endpoint, role) = (Some(&inner.endpoint), inner.role);
+        }
+        if let Some(inner) = reads {
+            state.subscriptions.insert(inner.endpoint.gid, inner.clone());
+            (endpoint, role) = (Some(&inner.endpoint), inner.role);
+        }
+        let Some(endpoint) = endpoint else { return };
+        if role == EndpointRole::Application {
+            state.index(endpoint);
+        }
+        state.outgoing.push_back(Outgoing::Announce(endpoint.gid));
+        drop(state);
+        shared.wake();
+    }
+
+    /// An endpoint's or a node's handle is dropped.
+    pub(super) fn forget_endpoint(&self, gid: &Gid) {
+        // In a forked child it is the parent's still, and its locks may be held.
+        if self.is_forked() {
+            return;
+        }
+        self.shared().part(gid);
+        self.shared().wake();
+    }
+
+    /// A relay stands for others than before: its writers and the daemon hear of it.
+    pub(super) fn renew(&self, gid: Gid) {
+        if self.is_forked() {
+            return;
+        }
+        self.shared().tell(Outgoing::Announce(gid));
+    }
+
+    /// Waits until a new endpoint is matched with all that the graph shows and that go with it: whoever
+    /// counts them reaches them. Not for long, and not where nobody could do it.
+    pub(super) fn await_pairs(&self, own: &Endpoint, matched: impl Fn(&Gid) -> bool) {
+        let shared = self.shared();
+        if shared.control.get() == Some(&std::thread::current().id()) {
+            return;
+        }
+        let goes = |other: &Endpoint| {
+            pairing(own, other) == Pairing::Match || pairing(other, own) == Pairing::Match
+        };
+        let graph = {
+            let state = shared.state();
+            if state.daemon.is_none() {
+                return;
+            }
+            state.graph.clone()
+        };
+        let foreign = graph.endpoints.values().map(|other| &other.endpoint);
+        let foreign = foreign.filter(|other| other.gid.0[..12] != own.gid.0[..12] && goes(other));
+        let others: Vec<Gid> = foreign.map(|other| other.gid).collect();
+        drop(graph);
+        let there = |other: &Gid| shared.state().graph.endpoints.contains_key(other);
+        shared.wait_changed(PAIRS, || others.iter().all(|other| matched(other) || !there(other)));
+    }
+}

@@ -1,0 +1,136 @@
+//! Pairs within one session: the thread that creates the second end attaches them, and the one that
+//! drops the first parts them, each before it returns.
+//!
+//! The daemon tells of such a pair as of any other, and it stands already: asked by the same lane
+//! again, a writer repeats its grant. What it cannot do at once, such as for want of memory, is left
+//! to that.
+
+use std::sync::{Arc, MutexGuard, PoisonError};
+
+use super::{
+    events::Source, message::EndpointRole, publisher::PublisherInner, state::Shared,
+    subscription::Accept, subscription::SubscriptionInner,
+};
+use crate::{
+    graph::{Pairing, pairing},
+    ids::Gid,
+    shm::{Peer, ReaderInfo, ShmError},
+};
+
+impl Shared {
+    /// Under this lock, the pairs of a session's own endpoints come and go with them.
+    pub(super) fn home(&self) -> MutexGuard<'_, ()> {
+        self.home.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Attaches a new endpoint to those of its session that go with it.
+    pub(super) fn meet(&self, own: &Gid) {
+        let home = self.home();
+        let pairs = self.pairs_of(own);
+        let mut changed = Vec::new();
+        for (writer, reader) in pairs {
+            match self.join(&writer, &reader) {
+                Ok(()) => changed.extend([Source::Publisher(writer), Source::Subscription(reader)]),
+                Err(error) => {
+                    let topic = &writer.endpoint.topic;
+                    tracing::debug!(topic, %error, "two endpoints of a session do not meet at once");
+                }
+            }
+        }
+        drop(home);
+        self.rematch(changed);
+    }
+
+    fn pairs_of(&self, own: &Gid) -> Vec<(Arc<PublisherInner>, Arc<SubscriptionInner>)> {
+        let state = self.state();
+        let (writer, reader) = (state.publishers.get(own), state.subscriptions.get(own));
+        let topic = writer.map(|w| &w.endpoint).or(reader.map(|r| &r.endpoint)).map(|e| &e.topic);
+        let others = topic.and_then(|topic| state.topics.get(topic));
+        let mut pairs = Vec::new();
+        for other in others.into_iter().flatten().filter(|other| *other != own) {
+            let out = (writer, state.subscriptions.get(other));
+            let back = (state.publishers.get(other), reader);
+            for (writer, reader) in [out, back] {
+                if let (Some(writer), Some(reader)) = (writer, reader)
+                    && pairing(&writer.endpoint, &reader.endpoint) == Pairing::Match
+                    && !reader.ignores_local
+                {
+                    pairs.push((Arc::clone(writer), Arc::clone(reader)));
+                }
+            }
+        }
+        pairs
+    }
+
+    fn join(&self, writer: &PublisherInner, reader: &SubscriptionInner) -> Result<(), ShmError> {
+        let (from, gid, peer) =
+            (writer.endpoint.gid, reader.endpoint.gid, Peer::Local(self.segment.clone()));
+        // All of it under one lock: between two parts, the control thread would ask by another lane.
+        let mut slots = reader.lock();
+        let lane = slots.lane_for(from, || self.segment.allocate_lane())?;
+        let (grant, ring) = writer.attach(ReaderInfo {
+            gid,
+            lane,
+            qos: reader.qos,
+            peer: peer.clone(),
+            stands_for: Vec::new(),
+        })?;
+        if let Accept::Map(lane) = slots.accept(from, grant) {
+            let max_message = self.config.max_message;
+            slots.add(reader.map(from, peer, ring, lane, grant, max_message)?, false);
+        }
+        Ok(())
+    }
+
+    /// Takes an endpoint or a node out of what the session has, and parts it from the others there.
+    pub(super) fn part(&self, gid: &Gid) {
+        let home = self.home();
+        let mut state = self.state();
+        let node = state.nodes.remove(gid);
+        let publisher = state.publishers.remove(gid);
+        let subscription = state.subscriptions.remove(gid);
+        let writes = publisher.as_ref().map(|p| (&p.endpoint, p.role));
+        let reads = subscription.as_ref().map(|s| (&s.endpoint, s.role));
+        let mut others = Vec::new();
+        match writes.or(reads) {
+            // Their GIDs are not in the graph, or stand for what is.
+            Some((_, EndpointRole::StandIn | EndpointRole::Relay)) => state.tell_gone(gid),
+            Some((endpoint, EndpointRole::Application)) => {
+                state.unindex(endpoint);
+                state.bury(gid);
+                for other in state.topics.get(&endpoint.topic).into_iter().flatten() {
+                    others.extend(state.publishers.get(other).cloned().map(Source::Publisher));
+                    let reads = state.subscriptions.get(other).cloned();
+                    others.extend(reads.map(Source::Subscription));
+                }
+            }
+            None => state.bury(gid),
+        }
+        drop(state);
+        others.retain(|other| {
+            other.events().forget(gid);
+            match other {
+                Source::Publisher(writer) => writer.detach(*gid),
+                Source::Subscription(reader) => reader.lock().end(gid),
+            }
+        });
+        drop(home);
+        drop((node, publisher, subscription));
+        self.rematch(others);
+    }
+
+    /// Counts what became of the pairs of these. The control thread tells the rest.
+    fn rematch(&self, endpoints: Vec<Source>) {
+        let news = endpoints.into_iter().map(|endpoint| (endpoint.rematch(), endpoint));
+        let news: Vec<_> = news.filter(|(changes, _)| !changes.is_empty()).collect();
+        if news.is_empty() {
+            return;
+        }
+        let mut state = self.state();
+        state.rematched.extend(news);
+        drop(state);
+        self.notify(None);
+        self.segment.notify();
+        self.wake();
+    }
+}

@@ -1,0 +1,168 @@
+//! How a session begins and ends: with a daemon, with none, or relayed by one.
+
+use std::{os::fd::OwnedFd, sync::Arc};
+
+use super::{
+    Handle, Session, SessionError, SessionOptions,
+    connect::Caller,
+    control::{Control, Start},
+    local::House,
+    message::SessionRole,
+    signals,
+    state::Shared,
+};
+use crate::{
+    config::{Config, DaemonPolicy},
+    ids::SessionId,
+    relay::near::Near,
+    shm::SessionSegment,
+};
+
+impl Session {
+    /// Opens a session with the daemon of this user and domain, which is started when there is
+    /// none and `AXON_DAEMON` is `spawn`. Under `off`, endpoints of the session reach each other
+    /// and nobody else.
+    ///
+    /// # Errors
+    /// When the daemon cannot be reached or started, or has other security settings: the error
+    /// names the variable.
+    pub fn open(config: &Config, options: SessionOptions) -> Result<Self, SessionError> {
+        let id = SessionId::random();
+        if config.daemon == DaemonPolicy::Off {
+            let house = Start::House(Arc::default());
+            let segment = SessionSegment::create(id)?;
+            return Ok(Self::of(Self::start(config, options, segment, house)?));
+        }
+        let reason = if config.shm {
+            let segment = SessionSegment::create(id)?;
+            let caller = Caller {
+                config,
+                options: &options,
+                id,
+                segment: Some(&segment),
+                relay: None,
+                cancel: None,
+            };
+            match caller.connect() {
+                Ok(daemon) => {
+                    let start = Start::Daemon(daemon);
+                    return Ok(Self::of(Self::start(config, options, segment, start)?));
+                }
+                Err(SessionError::NotShared(reason)) => reason,
+                Err(error) => return Err(error),
+            }
+        } else {
+            "AXON_SHM is off".to_owned()
+        };
+        Self::relayed(config, options, id, reason)
+    }
+
+    /// A session whose samples pass through the daemon. It has the world outside in its own process:
+    /// a session that stands for it, and a registry that brings the two together.
+    fn relayed(
+        config: &Config,
+        options: SessionOptions,
+        id: SessionId,
+        reason: String,
+    ) -> Result<Self, SessionError> {
+        tracing::info!(reason, "samples pass through the daemon");
+        let caller = Caller {
+            config,
+            options: &options,
+            id,
+            segment: None,
+            relay: Some(&reason),
+            cancel: None,
+        };
+        let connected = caller.connect()?;
+        let house = Arc::<House>::default();
+        let segment = SessionSegment::create(id)?;
+        let start = Start::House(Arc::clone(&house));
+        let mut handle = Self::start(config, options, segment, start)?;
+        let outside = SessionOptions::new("relay").role(SessionRole::Gateway);
+        let segment = SessionSegment::create(SessionId::random())?;
+        let start = Start::House(Arc::clone(&house));
+        let outside = Self::of(Self::start(config, outside, segment, start)?);
+        handle.relay =
+            Some(Near::start(Arc::clone(&handle.shared), house, outside, connected, reason)?);
+        Ok(Self::of(handle))
+    }
+
+    /// A session over a socket that is connected to a daemon. It ends with that connection.
+    ///
+    /// # Errors
+    /// When the daemon refuses it.
+    pub fn over(
+        socket: OwnedFd,
+        config: &Config,
+        options: SessionOptions,
+    ) -> Result<Self, SessionError> {
+        Self::over_as(SessionId::random(), socket, config, options)
+    }
+
+    /// As [`over`](Self::over), under a given id: for the daemon, in whose memory the endpoints of a
+    /// relayed session are.
+    pub(crate) fn over_as(
+        id: SessionId,
+        socket: OwnedFd,
+        config: &Config,
+        options: SessionOptions,
+    ) -> Result<Self, SessionError> {
+        let segment = SessionSegment::create(id)?;
+        let caller = Caller {
+            config,
+            options: &options,
+            id,
+            segment: Some(&segment),
+            relay: None,
+            cancel: None,
+        };
+        let connected = caller.greet_over(socket)?;
+        Ok(Self::of(Self::start(config, options, segment, Start::Socket(connected))?))
+    }
+
+    fn start(
+        config: &Config,
+        options: SessionOptions,
+        segment: Arc<SessionSegment>,
+        start: Start,
+    ) -> Result<Handle, SessionError> {
+        let flags = rustix::event::EventfdFlags::CLOEXEC | rustix::event::EventfdFlags::NONBLOCK;
+        let system = |what| move |source: std::io::Error| SessionError::System { what, source };
+        let wake = rustix::event::eventfd(0, flags)
+            .map_err(|e| system("creating an eventfd")(e.into()))?;
+        let shared = Arc::new(Shared::new(config.clone(), options, segment, wake));
+        let control = Control::new(shared.clone(), start)?;
+        let blocked = signals::Blocked::all();
+        let thread = std::thread::Builder::new()
+            .name("axon-ctl".into())
+            .spawn(move || control.run())
+            .map_err(system("starting the control thread"))?;
+        drop(blocked);
+        Ok(Handle { shared, thread: Some(thread), relay: None })
+    }
+
+    fn of(handle: Handle) -> Self {
+        Self { handle: Arc::new(handle) }
+    }
+}
+
+impl Drop for Handle {
+    fn drop(&mut self) {
+        // The thread, and what it has to say, stay with the parent of a forked child.
+        if self.shared.segment.is_forked() {
+            std::mem::forget(self.thread.take());
+            std::mem::forget(self.relay.take());
+            return;
+        }
+        // First: it carries on what the session's publishers left.
+        drop(self.relay.take());
+        self.shared.stop();
+        if let Some(thread) = self.thread.take() {
+            // A listener may hold the last handle.
+            if thread.thread().id() != std::thread::current().id() {
+                let _ = thread.join();
+            }
+        }
+    }
+}

@@ -1,0 +1,234 @@
+//! What only a played daemon can bring about: an order in which things happen.
+
+use super::*;
+use crate::{
+    graph::{Endpoint, EndpointKind},
+    session::{arrivals, message::GraphItem},
+    shm::{PublishError, Reader, ReaderOptions},
+};
+
+/// What is read, and the session that it is of as the reader has it.
+struct Taking {
+    reader: Reader,
+    view: Arc<PeerSession>,
+}
+
+impl Taking {
+    /// The number of the next sample, whose memory the session may have told of meanwhile.
+    fn take(&mut self, daemon: &Daemon) -> u64 {
+        let mut taken = None;
+        until("a sample", || {
+            while let Ok(Received { message, descriptors }) =
+                socket::receive(&daemon.socket, &mut Vec::new())
+            {
+                if let (Message::Segment(opened), [descriptor]) = (message, &descriptors[..]) {
+                    self.view.add_segment(opened.segment.into(), descriptor).unwrap();
+                }
+            }
+            taken = self.reader.take(&mut Vec::new()).unwrap();
+            taken.is_some()
+        });
+        taken.unwrap().meta.sequence
+    }
+}
+
+/// A reader of another session, which takes when the test says so.
+struct Taker {
+    session: Arc<SessionSegment>,
+    gid: Gid,
+}
+
+impl Taker {
+    fn new() -> Self {
+        let session = SessionSegment::create(SessionId::random()).unwrap();
+        let gid = Gid::new(session.id(), 1);
+        Self { session, gid }
+    }
+
+    /// Has it attached to a publisher as one that stands for others, or not.
+    fn attach(&self, to: &Publisher, stands_for: Vec<Gid>, daemon: &Daemon) -> Taking {
+        let (writer, qos) = (to.gid(), to.endpoint().qos);
+        let lane = self.session.allocate_lane().unwrap();
+        let attach = Attach {
+            reader: self.gid,
+            writer,
+            lane: lane.location(),
+            qos,
+            session: self.session.id(),
+            stands_for,
+            segments: Vec::new(),
+        };
+        let PeerDescriptors { segment, doorbell, pidfd } = self.session.descriptors().unwrap();
+        let descriptors = [segment.as_fd(), doorbell.as_fd(), pidfd.as_fd()];
+        daemon.say(Message::Attach(attach), &descriptors);
+        let granted = daemon.hear(|message| match message {
+            Message::Grant(granted) => Some(granted),
+            _ => None,
+        });
+        let Granted { generation, first, ring, .. } = granted;
+        let view = PeerSession::map(daemon.id, daemon.handed.try_clone().unwrap()).unwrap();
+        let mut reader = Reader::map(ReaderOptions {
+            reader: self.gid,
+            writer,
+            peer: Peer::Remote(view.clone()),
+            ring,
+            lane,
+            grant: Grant { generation, first },
+            qos,
+            max_message: 1 << 20,
+        })
+        .unwrap();
+        reader.tell_progress();
+        Taking { reader, view }
+    }
+
+    /// Itself as the graph has it.
+    fn endpoint(&self, to: &Publisher) -> Endpoint {
+        let kind = EndpointKind::Subscription;
+        Endpoint { gid: self.gid, kind, ..to.endpoint().clone() }
+    }
+}
+
+fn appears(daemon: &Daemon, endpoint: Endpoint) {
+    let added = vec![GraphItem { endpoint, daemon: None }];
+    let graph =
+        Graph { version: 2, whole: false, added, removed: Vec::new(), more: false, ended: None };
+    daemon.say(Message::Graph(graph), &[]);
+}
+
+/// Waits until the session has heard all that was said so far: it asks about a pair when it has.
+fn has_heard(daemon: &Daemon, asking: &Subscription) {
+    let writer = Gid::new(SessionId::random(), 1);
+    daemon.say(Message::Match(Pair { reader: asking.gid(), writer }), &[]);
+    daemon.hear(|message| {
+        matches!(message, Message::Attach(attach) if attach.writer == writer).then_some(())
+    });
+}
+
+fn shows(session: &Session, gid: Gid) -> bool {
+    session.graph().endpoints.contains_key(&gid)
+}
+
+fn publisher(session: &Session, qos: Qos) -> Publisher {
+    session.create_publisher(EndpointSpec::new("/p", "test/Bytes", qos)).unwrap()
+}
+
+/// Tries until the session had to hold something back for less than its patience, however slow the
+/// machine.
+fn in_time(mut attempt: impl FnMut() -> bool) {
+    for _ in 0..100 {
+        let begun = Instant::now();
+        let held = attempt();
+        if begun.elapsed() < arrivals::PATIENCE {
+            assert!(held, "it was counted before it was reached");
+            return;
+        }
+    }
+    panic!("this machine is too slow for it");
+}
+
+#[test]
+fn a_subscription_is_counted_once_it_is_reached() {
+    let (session, daemon) = session();
+    let publisher = publisher(&session, Qos::default());
+    let asking = subscription(&session);
+    in_time(|| {
+        let taker = Taker::new();
+        appears(&daemon, taker.endpoint(&publisher));
+        has_heard(&daemon, &asking);
+        let held = !shows(&session, taker.gid);
+        let mut taking = taker.attach(&publisher, Vec::new(), &daemon);
+        assert!(session.wait_graph(EVER, |graph| graph.endpoints.contains_key(&taker.gid)));
+        let number = publisher.publish(b"x").unwrap();
+        assert_eq!(taking.take(&daemon), number);
+        held
+    });
+    // One that has nothing to do with anybody here need not be waited for.
+    let other = Taker::new();
+    let stranger = Endpoint { topic: "/other".into(), ..other.endpoint(&publisher) };
+    appears(&daemon, stranger);
+    has_heard(&daemon, &asking);
+    assert!(shows(&session, other.gid));
+}
+
+#[test]
+fn a_publisher_is_counted_once_it_is_received_from() {
+    let (session, daemon) = session();
+    let asking = subscription(&session);
+    in_time(|| {
+        let far = Far::new(&daemon);
+        let subscription = subscription(&session);
+        let gid = far.writer.gid();
+        let kind = EndpointKind::Publisher;
+        appears(&daemon, Endpoint { gid, kind, ..subscription.endpoint().clone() });
+        has_heard(&daemon, &asking);
+        let mut held = !shows(&session, gid);
+        for reader in [&asking, &subscription] {
+            daemon.say(Message::Match(far.pair(reader)), &[]);
+            let attach = daemon.hear(|message| match message {
+                Message::Attach(attach) if attach.writer == gid => Some(attach),
+                _ => None,
+            });
+            held &= !shows(&session, gid);
+            let introduction = far.introduction();
+            let introduction: Vec<_> = introduction.iter().map(AsFd::as_fd).collect();
+            let introduction = if reader.gid() == asking.gid() { &introduction[..] } else { &[] };
+            daemon.say(Message::Grant(far.grant(&attach)), introduction);
+        }
+        assert!(session.wait_graph(EVER, |graph| graph.endpoints.contains_key(&gid)));
+        far.publish(1, b"x");
+        assert!(subscription.recv(&mut Vec::new(), Some(EVER)).is_some());
+        assert!(asking.recv(&mut Vec::new(), Some(EVER)).is_some());
+        held
+    });
+}
+
+#[test]
+fn a_sample_is_acknowledged_when_whoever_carries_it_away_has_it() {
+    let (session, daemon) = session();
+    let publisher = publisher(&session, Qos::default());
+    let elsewhere = vec![Gid([5; 16])];
+    let mut taking = Taker::new().attach(&publisher, elsewhere, &daemon);
+    until("it is matched", || publisher.matched() == [Gid([5; 16])]);
+    assert!(publisher.wait_acknowledged(Duration::ZERO), "nothing was published");
+    let room = || session.segment().armed_word(Purpose::Room);
+    for round in 0..3u8 {
+        publisher.publish(&[round]).unwrap();
+        assert!(!publisher.wait_acknowledged(Duration::ZERO));
+        thread::scope(|scope| {
+            let waiting = scope.spawn(|| publisher.wait_acknowledged(EVER));
+            until("it sleeps", || room().load(std::sync::atomic::Ordering::Relaxed) != 0);
+            assert!(!waiting.is_finished());
+            taking.take(&daemon);
+            assert!(waiting.join().unwrap(), "nobody told it");
+        });
+    }
+    // What has left carries nothing.
+    publisher.publish(b"last").unwrap();
+    thread::scope(|scope| {
+        let waiting = scope.spawn(|| publisher.wait_acknowledged(EVER));
+        until("it sleeps", || room().load(std::sync::atomic::Ordering::Relaxed) != 0);
+        drop(taking);
+        assert!(waiting.join().unwrap(), "nobody told it");
+    });
+}
+
+#[test]
+fn a_reliable_publisher_is_held_up_by_who_takes_nothing_and_goes_on_when_it_does() {
+    let (session, daemon) = session();
+    let publisher = publisher(&session, Qos::keep_all());
+    let mut taking = Taker::new().attach(&publisher, vec![Gid([5; 16])], &daemon);
+    let sample = vec![7; 1 << 19];
+    let mut published = 0;
+    while publisher.publish(&sample).is_ok() {
+        published += 1;
+        assert!(published < 1000, "its budget is much less");
+    }
+    assert!(matches!(publisher.publish(&sample), Err(PublishError::Blocked { .. })));
+    // Nothing of it is given up, and what is taken makes room.
+    for sequence in 1..=published {
+        assert_eq!(taking.take(&daemon), sequence);
+    }
+    publisher.publish(&sample).unwrap();
+    assert_eq!((taking.take(&daemon), taking.reader.lost()), (published + 1, 0));
+}
