@@ -261,7 +261,9 @@ fn section(out: &mut String, title: &str, none: &str, table: Table) {
 
 #[cfg(test)]
 mod tests {
-    use axon_transport::daemon::status::{ReaderStatus, RefusalStatus, WriterStatus};
+    use axon_transport::daemon::status::{
+        ReaderStatus, RefusalStatus, TrafficStatus, WriterStatus,
+    };
     use serde_json::json;
 
     use super::*;
@@ -284,6 +286,7 @@ mod tests {
             runtime_dir: None,
             port: Some(61_348),
             gateway: "running".to_owned(),
+            traffic: TrafficStatus::default(),
             sessions: Vec::new(),
             topics: vec![TopicStatus {
                 topic: "/scan".to_owned(),

@@ -19,6 +19,7 @@ use std::{
 
 use axon_transport::{
     config::{Config, OsFiles},
+    daemon::status::TrafficStatus,
     graph::{GraphEntry, GraphView},
     ids::Gid,
     qos::Qos,
@@ -210,6 +211,26 @@ fn processor(pid: u32) -> f64 {
     (ticks(11) + ticks(12)) / 100.0
 }
 
+/// Memory of a process that it shares with no other, in KiB.
+fn private(pid: u32) -> u64 {
+    let rollup = fs::read_to_string(format!("/proc/{pid}/smaps_rollup")).unwrap();
+    let of = |name: &str| {
+        let line = rollup.lines().find_map(|line| line.strip_prefix(name)).unwrap();
+        line.trim().trim_end_matches(" kB").parse::<u64>().unwrap()
+    };
+    of("Private_Clean:") + of("Private_Dirty:")
+}
+
+/// Prints what sessions and daemon said to each other.
+fn print_traffic(when: &str, host: &Host) {
+    let TrafficStatus { packets_in, packets_out, bytes_out } = host.status().unwrap().traffic;
+    println!("  packets to the daemon, {when:<8} {packets_in:>8}");
+    println!(
+        "  from it                         {packets_out:>8}, {:.1} MB",
+        bytes_out as f64 / 1e6
+    );
+}
+
 #[test]
 fn every_session_of_many_knows_all_endpoints() {
     if std::env::var("PLAY").is_ok() {
@@ -225,12 +246,18 @@ fn every_session_of_many_knows_all_endpoints() {
         players.iter_mut().for_each(|player| assert_eq!(player.hear(), what));
         Instant::now()
     };
+    println!("{processes} processes, {SESSIONS} sessions each, {total} endpoints in all:");
+    let begun = Instant::now();
     let created = all(&mut players, "created");
     let whole = all(&mut players, "whole");
     let busy = |players: &[support::Player]| -> f64 {
         players.iter().map(|player| processor(player.pid())).sum()
     };
     let start_up = (processor(daemon.0.id()), busy(&players));
+    print_traffic("start", &host);
+    let memory = players.iter().map(|player| private(player.pid())).max().unwrap();
+    println!("  memory of its own, most      {memory:>8} KiB");
+    println!("  of the daemon                {:>8} KiB", private(daemon.0.id()));
     std::thread::sleep(REST);
     let before = (processor(daemon.0.id()), busy(&players));
     std::thread::sleep(REST);
@@ -242,7 +269,8 @@ fn every_session_of_many_knows_all_endpoints() {
     all(&mut players, "found");
     let found = Instant::now();
     let whole_again = all(&mut players, "whole again");
-    println!("{processes} processes, {SESSIONS} sessions each, {total} endpoints in all:");
+    print_traffic("again", &host);
+    println!("  created                         {:>8.2} s", (created - begun).as_secs_f64());
     println!("  whole after the last creation   {:>8.2} s", (whole - created).as_secs_f64());
     println!("  processor, daemon and others    {:>8.2} s {:>8.2} s", start_up.0, start_up.1);
     let share = 100.0 / REST.as_secs_f64();

@@ -14,7 +14,7 @@ use super::{
     admission::Admission,
     bridge::ToControl,
     registry::Registry,
-    status::{LinkStatus, RefusalStatus, unix_ms},
+    status::{LinkStatus, RefusalStatus, TrafficStatus, unix_ms},
 };
 use crate::{
     config::Config,
@@ -44,6 +44,8 @@ pub(super) struct Control {
     pub(super) pool: Arc<Pool>,
     /// Memory that sessions try whether they can map it.
     pub(super) probe: Option<OwnedFd>,
+    /// Packets that were exchanged with sessions.
+    pub(super) traffic: TrafficStatus,
     wakers: HashMap<SessionId, Rc<Notify>>,
     /// Wakes the task that flushes the graph.
     pub(super) changed: Rc<Notify>,
@@ -67,6 +69,7 @@ impl Control {
             gateway: "off".into(),
             pool: Pool::new(config.reliable_queue),
             probe: probe().inspect_err(|error| tracing::error!(%error, "no memory to try")).ok(),
+            traffic: TrafficStatus::default(),
             wakers: HashMap::new(),
             config,
             changed: Rc::default(),

@@ -345,7 +345,10 @@ fn send_all(
         let descriptors: Vec<BorrowedFd<'_>> =
             output.descriptors.iter().map(|d| d.as_fd()).collect();
         match socket::send(socket.get_ref(), &output.packet, &descriptors) {
-            Ok(()) => {}
+            Ok(()) => {
+                control.traffic.packets_out += 1;
+                control.traffic.bytes_out += output.packet.len() as u64;
+            }
             Err(SocketError::NotReady) => {
                 drop(descriptors);
                 registry.return_output(id, output);
@@ -403,6 +406,7 @@ fn receive_some(
                 );
             }
             Ok(Received { message, descriptors }) => {
+                control.traffic.packets_in += 1;
                 let descriptors = descriptors.into_iter().map(Arc::new).collect();
                 if let Err(violation) = control.registry.message(id, message, descriptors) {
                     tracing::warn!(session = %id, %violation, "a session was disconnected");

@@ -51,6 +51,7 @@ pub(super) fn status(control: &Control) -> Status {
         runtime_dir: config.runtime_dir.as_ref().map(|dir| dir.display().to_string()),
         port: control.port,
         gateway: control.gateway.clone(),
+        traffic: control.traffic,
         sessions: sessions.collect(),
         topics: topics(&control.registry),
         links: control.links.values().cloned().collect(),

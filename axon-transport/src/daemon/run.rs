@@ -22,6 +22,7 @@ use super::{
 use crate::{
     config::{Config, ConfigError, security_settings},
     discovery::Event,
+    passed,
     session::address::{Address, AddressError, private_directory},
 };
 
@@ -201,6 +202,15 @@ fn harden() {
     let files = getrlimit(Resource::Nofile);
     if let Err(error) = setrlimit(Resource::Nofile, Rlimit { current: files.maximum, ..files }) {
         refused("RLIMIT_NOFILE", error);
+    }
+    if let Some(limit) = getrlimit(Resource::Nofile).current
+        && passed::is_scarce(limit)
+    {
+        tracing::warn!(
+            limit,
+            "few descriptors (RLIMIT_NOFILE): few sessions are served, and one of this user that \
+             sends others which are slow to close may hold all of them up"
+        );
     }
 }
 

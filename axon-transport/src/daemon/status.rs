@@ -40,6 +40,9 @@ pub struct Status {
     pub port: Option<u16>,
     /// `running`, `starting`, or why it is not.
     pub gateway: String,
+    /// Packets exchanged with sessions since the daemon's start.
+    #[serde(default)]
+    pub traffic: TrafficStatus,
     /// Sessions on this host.
     pub sessions: Vec<SessionStatus>,
     /// Topics with an endpoint somewhere.
@@ -50,6 +53,17 @@ pub struct Status {
     pub keys: serde_json::Value,
     /// The last refusals, oldest first.
     pub refusals: Vec<RefusalStatus>,
+}
+
+/// Control packets, which carry no samples.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TrafficStatus {
+    /// From sessions.
+    pub packets_in: u64,
+    /// To sessions.
+    pub packets_out: u64,
+    /// Bytes of those.
+    pub bytes_out: u64,
 }
 
 /// A session.

@@ -30,7 +30,8 @@ const SMALL: i64 = (1 << 20) / 512;
 /// The most descriptors that the system lets a packet carry.
 const SCM_MAX_FD: usize = 253;
 /// Descriptors that stay free for what else a process opens, when what it [holds](PassedFd) of others
-/// [is too much](is_short).
+/// [is too much](is_short): more than a packet can carry. Of a limit so low that this is more than half
+/// of it, half.
 const RESERVE: u64 = 400;
 
 /// Those that are open, also those that wait to be closed.
@@ -180,7 +181,17 @@ fn closed() {
 pub(crate) fn is_short() -> bool {
     let open = OPEN.load(Ordering::Relaxed);
     let limit = getrlimit(Resource::Nofile).current;
-    limit.is_some_and(|limit| open + RESERVE > limit) || Lane::Session.is_full()
+    limit.is_some_and(|limit| open + reserve(limit) > limit) || Lane::Session.is_full()
+}
+
+fn reserve(limit: u64) -> u64 {
+    RESERVE.min(limit / 2)
+}
+
+/// Whether what this process may have open at most, `limit`, leaves no room for all that a packet can
+/// carry: who sends descriptors that are slow to close can then hold it up.
+pub(crate) fn is_scarce(limit: u64) -> bool {
+    reserve(limit) < RESERVE
 }
 
 /// Whether so many connections of strangers wait to be closed that nobody's should be accepted.
@@ -191,7 +202,7 @@ pub(crate) fn has_too_many_strangers() -> bool {
 /// The most descriptors that one of several processes should make this one hold.
 pub(crate) fn share() -> usize {
     let limit = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
-    usize::try_from(limit.saturating_sub(RESERVE) / 2).unwrap_or(usize::MAX)
+    usize::try_from((limit - reserve(limit)) / 2).unwrap_or(usize::MAX)
 }
 
 /// A packet of a socket.

@@ -10,7 +10,7 @@ use std::{
 };
 
 use rustix::{
-    fs::{FlockOperation, flock},
+    fs::{FlockOperation, OFlags, flock},
     io::Errno,
     net::{
         AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, connect, listen, socket_with,
@@ -53,6 +53,12 @@ impl Bound {
     pub fn into_parts(self) -> (OwnedFd, Lock) {
         (self.listener, self.lock)
     }
+}
+
+/// The turn to start a daemon, until it is dropped or its process ends.
+#[derive(Debug)]
+pub(crate) struct Turn {
+    _kept: Option<OwnedFd>,
 }
 
 /// Why an address could not be used.
@@ -150,6 +156,35 @@ impl Address {
         }
         listen(&listener, 512)?;
         Ok(Bound { listener, lock: Lock { _file: lock } })
+    }
+
+    /// The turn to start a daemon here; `None` where another thread or process has it. What keeps it
+    /// is a bound name or a locked file: where neither can be had, nobody is kept from trying.
+    pub(crate) fn turn(&self) -> Option<Turn> {
+        match self.try_turn() {
+            Ok(kept) => Some(Turn { _kept: Some(kept) }),
+            Err(Errno::ADDRINUSE | Errno::WOULDBLOCK) => None,
+            Err(_) => Some(Turn { _kept: None }),
+        }
+    }
+
+    fn try_turn(&self) -> Result<OwnedFd, Errno> {
+        match self {
+            Self::Abstract(name) => {
+                let socket = seqpacket(SocketFlags::CLOEXEC)?;
+                let name = format!("{name}/start");
+                bind(&socket, &SocketAddrUnix::new_abstract_name(name.as_bytes())?)?;
+                Ok(socket)
+            }
+            Self::Path { socket, .. } => {
+                // What is wrong with it, the daemon says.
+                let _ = socket.parent().map(private_directory);
+                let flags = OFlags::CREATE | OFlags::WRONLY | OFlags::CLOEXEC;
+                let file = rustix::fs::open(socket.with_extension("start"), flags, 0o600.into())?;
+                flock(&file, FlockOperation::NonBlockingLockExclusive)?;
+                Ok(file)
+            }
+        }
     }
 
     fn name(&self) -> Result<SocketAddrUnix, AddressError> {

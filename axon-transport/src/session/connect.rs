@@ -25,6 +25,10 @@ use crate::{
 
 /// How long a daemon may take to come up and answer.
 const PATIENCE: Duration = Duration::from_secs(20);
+/// How soon a daemon is to answer that has the address.
+const AFTER: Duration = Duration::from_millis(500);
+/// How long another may take to start a daemon before this one does, too.
+const TURN: Duration = Duration::from_secs(5);
 /// What a daemon names that cannot share memory with a session.
 pub(crate) const SHM: &str = "AXON_SHM";
 
@@ -60,6 +64,7 @@ impl Caller<'_> {
         // A daemon that is on its way out, or another's that comes up, is worth some patience
         // before one is started: only one of many that start at once gets the address.
         let mut spawn_after = Instant::now();
+        let (mut turn, mut gives_way_until) = (None, None);
         loop {
             match self.try_connect(&address, deadline) {
                 Err(Attempt::Final(error)) => return Err(error),
@@ -68,10 +73,22 @@ impl Caller<'_> {
                     return Err(SessionError::NoDaemon { address: address.to_string() });
                 }
                 Err(Attempt::Absent) if Instant::now() >= spawn_after => {
-                    let command = self.options.daemon_command.as_ref();
-                    match spawn(self.config, command, &|| self.cancelled())? {
-                        Outcome::Ready => continue,
-                        Outcome::Taken => spawn_after = Instant::now() + Duration::from_millis(500),
+                    // All that a daemon leaves behind look for the next at the same moment.
+                    if turn.is_none() {
+                        turn = address.turn();
+                        if turn.is_some() {
+                            // Whoever had it before has started one, perhaps.
+                            continue;
+                        }
+                    }
+                    let until = *gives_way_until.get_or_insert_with(|| Instant::now() + TURN);
+                    if turn.is_some() || Instant::now() >= until {
+                        let command = self.options.daemon_command.as_ref();
+                        match spawn(self.config, command, &|| self.cancelled())? {
+                            Outcome::Ready => continue,
+                            Outcome::Taken => spawn_after = Instant::now() + AFTER,
+                        }
+                        turn = None;
                     }
                 }
                 Err(Attempt::Absent | Attempt::Again) => {}

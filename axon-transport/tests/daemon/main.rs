@@ -1,6 +1,7 @@
 //! Sessions and their daemon as real processes.
 
 mod hostile;
+mod life;
 #[path = "../support/mod.rs"]
 mod support;
 
@@ -60,6 +61,11 @@ fn receive(subscription: &Subscription) -> u64 {
 #[test]
 fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
+    match part.as_str() {
+        "streamless" => life::streamless(),
+        "few descriptors" => return life::few_descriptors(),
+        _ => {}
+    }
     let config = Config::from_env().unwrap();
     let session = match Session::open(&config, SessionOptions::new(&*part)) {
         Ok(session) => session,

@@ -1,0 +1,251 @@
+//! Under what circumstances a daemon is started, and what it lives through.
+
+use std::{
+    fs,
+    os::unix::{fs::PermissionsExt as _, process::CommandExt as _},
+    process::{Command, Stdio},
+};
+
+use axon_transport::{
+    ids::DaemonId,
+    session::{address::Address, message::Welcome},
+};
+use rustix::process::{Pid, Signal, kill_process_group};
+
+use super::*;
+use crate::support::Kept;
+
+/// A child that plays `part`, of which nothing is heard but what it does.
+fn command(host: &Host, part: &str) -> Command {
+    let mut command = host.command(std::env::current_exe().unwrap());
+    command.args(["child", "--exact", "--nocapture", "--test-threads=1"]).env("PLAY", part);
+    command.stdin(Stdio::piped()).stdout(Stdio::null());
+    command
+}
+
+/// The sessions of applications, once there are so many.
+fn sessions(host: &Host, count: usize) -> Status {
+    let mut status = None;
+    until("the sessions are there", || {
+        status = host.status().ok();
+        status.as_ref().is_some_and(|s| s.sessions.len() - gateways(s) == count)
+    });
+    status.unwrap()
+}
+
+#[test]
+fn the_terminals_interrupt_ends_an_application_and_not_the_daemon_it_started() {
+    let host = Host::new();
+    let first = Kept(command(&host, "idle").process_group(0).spawn().unwrap());
+    let second = Kept(command(&host, "idle").process_group(0).spawn().unwrap());
+    let before = sessions(&host, 2);
+    for mut player in [first, second] {
+        let group = Pid::from_child(&player.0);
+        kill_process_group(group, Signal::INT).unwrap();
+        assert!(!player.0.wait().unwrap().success());
+    }
+    let after = sessions(&host, 0);
+    assert_eq!((after.daemon, after.pid), (before.daemon, before.pid));
+}
+
+#[test]
+fn a_daemon_is_started_by_who_has_no_standard_streams() {
+    let host = Host::new();
+    let _player = Kept(command(&host, "streamless").spawn().unwrap());
+    let status = sessions(&host, 1);
+    // Nor has it any that were not meant for it.
+    let streams = (0..3).map(|fd| fs::read_link(format!("/proc/{}/fd/{fd}", status.pid)));
+    let streams: Vec<_> = streams.map(|link| link.unwrap().display().to_string()).collect();
+    assert_eq!(streams[..2], ["/dev/null", "/dev/null"]);
+    assert!(streams[2].ends_with("run/axon-0.log"), "{streams:?}");
+}
+
+/// What the child does: it loses its streams, whose numbers are free for what a session opens.
+pub(crate) fn streamless() {
+    for stream in 0..3 {
+        // SAFETY: nobody in this process uses them from here on; what takes their numbers is not
+        // written to by the harness, which this does not return to.
+        unsafe { libc::close(stream) };
+    }
+    let session = support::of_child("streamless");
+    let (subscription, publisher) = (
+        session.create_subscription(spec("/t")).unwrap(),
+        session.create_publisher(spec("/t")).unwrap(),
+    );
+    publish(&publisher, 1);
+    assert_eq!(receive(&subscription), 1);
+    // Until the test ends it.
+    loop {
+        std::thread::park();
+    }
+}
+
+#[test]
+fn all_works_where_every_file_system_is_read_only() {
+    let host = Host::new()
+        .without("AXON_RUNTIME_DIR")
+        .with("XDG_RUNTIME_DIR", "/tmp/xdg")
+        .with("ROS_DOMAIN_ID", "171");
+    let script = "mount --make-rprivate / && mount --bind / / && \
+        awk '{ print $2 }' /proc/mounts | tac | while read at; do \
+        mount -o remount,ro,bind \"$at\" 2>/dev/null; done; \
+        if touch /tmp/.axon-test 2>/dev/null; then rm /tmp/.axon-test; exit 77; fi; exec \"$@\"";
+    let own = std::env::current_exe().unwrap();
+    let mut unshare = host.command("unshare");
+    unshare.args(["-m", "sh", "-c", script, "sh"]).arg(own);
+    unshare.args(["child", "--exact", "--nocapture", "--test-threads=1"]).env("PLAY", "idle");
+    unshare.stdin(Stdio::piped()).stdout(Stdio::null());
+    let mut player = match unshare.spawn() {
+        Ok(child) => Kept(child),
+        Err(error) => return skip(&format!("no unshare: {error}")),
+    };
+    let mut status = None;
+    until("it is served", || {
+        status = host.status().ok().filter(|s| s.sessions.len() > gateways(s));
+        status.is_some() || player.0.try_wait().unwrap().is_some()
+    });
+    match player.0.try_wait().unwrap() {
+        Some(ended) if status.is_none() => skip(&format!("no mount namespace here: {ended}")),
+        _ => {
+            let status = status.expect("a session");
+            assert_eq!(status.runtime_dir, None);
+            assert!(status.socket.starts_with('@'), "{}", status.socket);
+        }
+    }
+}
+
+#[allow(clippy::print_stdout, reason = "why something of it cannot be tried here")]
+fn skip(why: &str) {
+    println!("skipped: {why}");
+}
+
+#[test]
+fn all_works_without_a_runtime_directory() {
+    let host = Host::new().without("AXON_RUNTIME_DIR").with("ROS_DOMAIN_ID", "172");
+    let mut player = host.play("idle");
+    let daemon = player.hear();
+    let status = host.status().unwrap();
+    assert_eq!((status.daemon, status.runtime_dir), (daemon, None));
+    player.finish();
+}
+
+#[test]
+fn all_works_with_256_descriptors() {
+    let host = Host::new();
+    let mut players: Vec<_> = (0..8).map(|_| host.play("few descriptors")).collect();
+    for player in &mut players {
+        assert_eq!(player.hear(), "limited");
+    }
+    for player in &mut players {
+        assert_eq!(player.hear(), "matched");
+    }
+    players.iter_mut().for_each(support::Player::go);
+    for player in &mut players {
+        assert_eq!(player.hear(), "taken");
+    }
+    // The daemon is of one of them, and may have no more than they.
+    let limits = fs::read_to_string(format!("/proc/{}/limits", host.status().unwrap().pid));
+    let limits = limits.unwrap();
+    let files = limits.lines().find(|line| line.starts_with("Max open files")).unwrap();
+    assert_eq!(files.split_whitespace().nth(4), Some("256"));
+    players.into_iter().for_each(support::Player::finish);
+}
+
+/// What each of these children does.
+pub(crate) fn few_descriptors() {
+    let few = rustix::process::Rlimit { current: Some(256), maximum: Some(256) };
+    rustix::process::setrlimit(rustix::process::Resource::Nofile, few).unwrap();
+    say("limited");
+    let session = support::of_child("few");
+    let topics = || (0..10).map(|topic| spec(&format!("/t{topic}")));
+    let subscriptions: Vec<_> =
+        topics().map(|spec| session.create_subscription(spec).unwrap()).collect();
+    let publishers: Vec<_> = topics().map(|spec| session.create_publisher(spec).unwrap()).collect();
+    assert!(subscriptions.iter().all(|s| s.wait_matched(8, PATIENCE)));
+    assert!(publishers.iter().all(|p| p.wait_matched(8, PATIENCE)));
+    say("matched");
+    let mut line = String::new();
+    std::io::stdin().read_line(&mut line).unwrap();
+    publishers.iter().for_each(|publisher| publish(publisher, 1));
+    for subscription in &subscriptions {
+        (0..8).for_each(|_| assert_eq!(receive(subscription), 1));
+        assert_eq!(subscription.lost(), 0);
+    }
+    say("taken");
+    wait_for_the_end();
+}
+
+#[test]
+fn many_that_lose_their_daemon_do_not_each_start_one() {
+    let host = Host::new();
+    // Counts those that are started.
+    let script = host.dir.path().join("daemon.sh");
+    let count = host.dir.path().join("started");
+    let text = format!(
+        "#!/bin/sh\necho one >> {}\nexec {} \"$@\"\n",
+        count.display(),
+        env!("CARGO_BIN_EXE_axon_daemon")
+    );
+    fs::write(&script, text).unwrap();
+    fs::set_permissions(&script, fs::Permissions::from_mode(0o755)).unwrap();
+    let host = host.with("AXON_DAEMON_PATH", script.to_str().unwrap());
+    let players: Vec<_> = (0..20).map(|_| host.play("idle")).collect();
+    let first = sessions(&host, 20);
+    signal(first.pid, Signal::KILL);
+    until("there is another", || host.status().is_ok_and(|next| next.daemon != first.daemon));
+    sessions(&host, 20);
+    let started = fs::read_to_string(&count).unwrap().lines().count();
+    // Two, unless the machine is so slow that some of them lost patience.
+    assert!(started < 8, "{started} daemons were started");
+    players.into_iter().for_each(support::Player::finish);
+}
+
+#[test]
+fn another_version_is_refused_by_both_sides() {
+    let host = Host::new();
+    let daemon = host.daemon();
+    let hello = |protocol| {
+        Message::Hello(Hello {
+            protocol,
+            session: SessionId([9; 16]),
+            role: SessionRole::Tool,
+            name: "later".into(),
+            domain: 0,
+            settings: Vec::new(),
+            relay: None,
+        })
+    };
+    let stranger = Address::of(&host.config()).connect().unwrap();
+    socket::send(&stranger, &hello(PROTOCOL + 1).encode().unwrap(), &[]).unwrap();
+    let mut answer = None;
+    until("it answers", || {
+        answer = socket::receive(&stranger, &mut Vec::new()).ok();
+        answer.is_some()
+    });
+    match answer.unwrap().message {
+        Message::Refused(refused) => {
+            assert!(refused.text.contains("protocol"), "{}", refused.text);
+        }
+        other => panic!("instead of a refusal: {other:?}"),
+    }
+    drop(daemon);
+
+    // A daemon of another version, where this one's would be.
+    let (listener, _lock) = Address::of(&host.config()).bind().unwrap().into_parts();
+    let later = std::thread::spawn(move || {
+        let mut accepted = None;
+        until("somebody calls", || {
+            accepted = rustix::net::accept(&listener).ok();
+            accepted.is_some()
+        });
+        let accepted = accepted.unwrap();
+        until("HELLO", || socket::receive(&accepted, &mut Vec::new()).is_ok());
+        let daemon = DaemonId([7; 16]);
+        let welcome =
+            Message::Welcome(Welcome { protocol: PROTOCOL + 1, daemon, pid: std::process::id() });
+        socket::send(&accepted, &welcome.encode().unwrap(), &[]).unwrap();
+    });
+    let refused = host.session("now").unwrap_err();
+    assert!(refused.to_string().contains(&format!("protocol {}", PROTOCOL + 1)), "{refused}");
+    later.join().unwrap();
+}
