@@ -113,6 +113,26 @@
 #define AXON_KIND_CLIENT 8
 
 /**
+ * What helps to find a fault.
+ */
+#define AXON_LOG_DEBUG 10
+
+/**
+ * What is as it should be.
+ */
+#define AXON_LOG_INFO 20
+
+/**
+ * What is not, and is coped with.
+ */
+#define AXON_LOG_WARN 30
+
+/**
+ * What does not work for it.
+ */
+#define AXON_LOG_ERROR 40
+
+/**
  * The time at which the call is made, as a sample's source timestamp.
  */
 #define AXON_TIME_NOW INT64_MIN
@@ -591,6 +611,13 @@ typedef struct axon_loan_t {
 } axon_loan_t;
 
 /**
+ * Told of a line: how severe it is (AXON_LOG_*), which part of the library says it, and what. Both
+ * strings stand during the call. It is called by whatever thread has something to say, must not
+ * block, and what it makes the library say is not told.
+ */
+typedef void (*axon_log_t)(const void *user, uint32_t severity, const char *part, const char *text);
+
+/**
  * A guard condition: stands from when it is triggered until a wait has seen it.
  */
 typedef struct axon_guard_t {
@@ -1006,6 +1033,26 @@ axon_ret_t axon_session_loan_publish(struct axon_loan_t loan,
 axon_ret_t axon_session_loan_abandon(struct axon_loan_t loan);
 
 /**
+ * Has `callback` told of what the library says in this process, in place of the one before, which has
+ * returned and is not called any more when this returns. Null: nobody is told, as at first. A daemon
+ * has a log of its own.
+ *
+ * AXON_RET_ERROR: it is called from within a callback, or a part of the program in Rust has what the
+ * library says already (a global `tracing` subscriber).
+ *
+ * # Safety
+ * `callback` may be called with `user` from any thread until it is replaced.
+ */
+axon_ret_t axon_session_log_set_callback(axon_log_t callback,
+                                         const void *user);
+
+/**
+ * How severe a line must be at least to be told: AXON_LOG_WARN at first. A severity between those that
+ * have a name is as good as any.
+ */
+axon_ret_t axon_session_log_set_severity(uint32_t severity);
+
+/**
  * A node, which is in the graph until it is destroyed; its endpoints do not end with it. Two nodes
  * may have the same name. It keeps its session open.
  *
@@ -1116,7 +1163,8 @@ axon_ret_t axon_session_publisher_wait_matched(struct axon_publisher_t publisher
 /**
  * Blocks until every sample published so far is acknowledged, for at most `timeout` nanoseconds
  * (negative: for ever): AXON_RET_TIMEOUT where one is not. A sample that is to be read on this host is
- * so at once, and one for another host when the daemon has taken it over.
+ * so at once, and one for another host when this host's daemon has taken it over: the other host has
+ * not said that it came.
  */
 axon_ret_t axon_session_publisher_wait_acknowledged(struct axon_publisher_t publisher,
                                                     int64_t timeout);

@@ -10,7 +10,7 @@ pub type axon_callback_t = Option<unsafe extern "C" fn(user: *const c_void, coun
 
 /// What a function is to be called with. The program says that any thread may.
 #[derive(Clone, Copy)]
-struct User(*const c_void);
+pub(super) struct User(pub(super) *const c_void);
 
 // SAFETY: it is never dereferenced here, and whoever sets a callback says that it may be called with
 // it from any thread.

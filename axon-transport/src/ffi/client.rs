@@ -3,13 +3,13 @@
 use std::ffi::c_void;
 
 use super::{
-    callback::{axon_callback_t, told},
-    endpoint::{axon_endpoint_options_t, axon_gid_t, spec},
+    callback::axon_callback_t,
+    endpoint::{axon_endpoint_options_t, axon_gid_t, describe, end, matched, set_callback, spec},
     error::{Failure, axon_ret_t},
     guarded,
-    handle::{axon_client_t, axon_node_t, axon_sample_t, give, named, revoke},
-    memory::{elements, present, present_if_wanted, store, store_if_wanted},
-    qos::{axon_qos_t, store_qos},
+    handle::{axon_client_t, axon_node_t, axon_sample_t, give, named},
+    memory::{elements, present, present_if_wanted, store_if_wanted},
+    qos::axon_qos_t,
     subscription::{Place, SamplePlace, axon_message_info_t, axon_room_t},
     wait::duration,
 };
@@ -42,12 +42,7 @@ pub unsafe extern "C" fn axon_session_client_create(
 /// Ends a client. Its callback has returned, and is not called any more, when this returns.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_client_destroy(client: axon_client_t) -> axon_ret_t {
-    guarded(|| {
-        let client = revoke(client)?;
-        // Another call may keep it for a while. Only listening may fail, not ceasing to.
-        let _ = client.set_on_new_response(None);
-        Ok(())
-    })
+    guarded(|| end(client))
 }
 
 /// What the client is: its GID, and the profile that it has for requests and for responses. Null
@@ -61,15 +56,8 @@ pub unsafe extern "C" fn axon_session_client_describe(
     gid: *mut axon_gid_t,
     qos: *mut axon_qos_t,
 ) -> axon_ret_t {
-    guarded(|| {
-        present_if_wanted(gid)?;
-        present_if_wanted(qos)?;
-        let client = named(client)?;
-        // SAFETY: the caller's word.
-        unsafe { store_if_wanted(gid, client.gid().into()) }?;
-        // SAFETY: the caller's word.
-        unsafe { store_qos(qos, &client.endpoint().qos) }
-    })
+    // SAFETY: the caller's word.
+    guarded(|| unsafe { describe(client, gid, qos) })
 }
 
 /// How many servers a request that is sent now reaches, and whose responses reach the client: the
@@ -82,11 +70,8 @@ pub unsafe extern "C" fn axon_session_client_matched(
     client: axon_client_t,
     count: *mut usize,
 ) -> axon_ret_t {
-    guarded(|| {
-        let matched = named(client)?.servers().len();
-        // SAFETY: the caller's word.
-        unsafe { store(count, matched, "the place of the number") }
-    })
+    // SAFETY: the caller's word.
+    guarded(|| unsafe { matched(client, count) })
 }
 
 /// Blocks until the service is available, for at most `timeout` nanoseconds (negative: for ever):
@@ -185,11 +170,5 @@ pub unsafe extern "C" fn axon_session_client_set_callback(
     callback: axon_callback_t,
     user: *const c_void,
 ) -> axon_ret_t {
-    guarded(|| {
-        let object = named(client)?;
-        let set = |callback| object.set_on_new_response(callback).map_err(Failure::from);
-        set(told(callback, user)).map_err(|e| e.of_endpoint(object.endpoint()))?;
-        // Whoever destroyed it meanwhile may have been too early to unset this one.
-        named(client).map(drop).or_else(|gone| set(None).and(Err(gone)))
-    })
+    guarded(|| set_callback(client, callback, user))
 }

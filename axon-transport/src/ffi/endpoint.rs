@@ -1,13 +1,20 @@
 //! What all endpoints are made of.
 
-use std::os::raw::c_char;
+use std::{ffi::c_void, os::raw::c_char};
 
 use super::{
+    callback::{axon_callback_t, told},
     error::Failure,
-    memory::{elements, text, value},
-    qos::axon_qos_t,
+    handle::{Handle, named, revoke},
+    memory::{elements, present_if_wanted, store, store_if_wanted, text, value},
+    qos::{axon_qos_t, store_qos},
 };
-use crate::{ids::Gid, qos::QosRequest, session::EndpointSpec};
+use crate::{
+    graph::Endpoint,
+    ids::Gid,
+    qos::QosRequest,
+    session::{Client, EndpointSpec, OnNew, Publisher, Server, SessionError, Subscription},
+};
 
 /// The most bytes that the hash of a type may have.
 pub const AXON_TYPE_HASH_SIZE: usize = 64;
@@ -69,4 +76,97 @@ pub(super) unsafe fn spec(
         ..EndpointSpec::new(topic, type_name, request.for_service())
     };
     Ok((spec, request))
+}
+
+/// What a handle of any endpoint names.
+pub(super) trait Object {
+    fn endpoint(&self) -> &Endpoint;
+
+    /// How many others it is matched with.
+    fn count(&self) -> usize;
+}
+
+/// An endpoint of which something is taken.
+pub(super) trait Taking: Object {
+    fn set_on_new(&self, callback: Option<OnNew>) -> Result<(), SessionError>;
+}
+
+macro_rules! objects {
+    ($($object:ident: $matched:ident $(, $set:ident)?;)+) => {$(
+        impl Object for $object {
+            fn endpoint(&self) -> &Endpoint {
+                self.endpoint()
+            }
+
+            fn count(&self) -> usize {
+                self.$matched().len()
+            }
+        }
+
+        $(impl Taking for $object {
+            fn set_on_new(&self, callback: Option<OnNew>) -> Result<(), SessionError> {
+                self.$set(callback)
+            }
+        })?
+    )+};
+}
+
+objects! {
+    Publisher: matched;
+    Subscription: matched, set_on_new_sample;
+    Server: clients, set_on_new_request;
+    Client: servers, set_on_new_response;
+}
+
+/// Stores what an endpoint is.
+///
+/// # Safety
+/// `gid` and `qos` are null or point to room for one.
+pub(super) unsafe fn describe<H: Handle<Object: Object>>(
+    handle: H,
+    gid: *mut axon_gid_t,
+    qos: *mut axon_qos_t,
+) -> Result<(), Failure> {
+    present_if_wanted(gid)?;
+    present_if_wanted(qos)?;
+    let object = named(handle)?;
+    let endpoint = object.endpoint();
+    // SAFETY: the caller's word.
+    unsafe { store_if_wanted(gid, endpoint.gid.into()) }?;
+    // SAFETY: the caller's word.
+    unsafe { store_qos(qos, &endpoint.qos) }
+}
+
+/// Stores how many others an endpoint is matched with.
+///
+/// # Safety
+/// `count` points to room for a number.
+pub(super) unsafe fn matched<H: Handle<Object: Object>>(
+    handle: H,
+    count: *mut usize,
+) -> Result<(), Failure> {
+    let matched = named(handle)?.count();
+    // SAFETY: the caller's word.
+    unsafe { store(count, matched, "the place of the number") }
+}
+
+/// Has `callback` told of what comes to an endpoint.
+pub(super) fn set_callback<H: Handle<Object: Taking>>(
+    handle: H,
+    callback: axon_callback_t,
+    user: *const c_void,
+) -> Result<(), Failure> {
+    let object = named(handle)?;
+    let set = |callback| object.set_on_new(callback).map_err(Failure::from);
+    set(told(callback, user)).map_err(|failure| failure.of_endpoint(object.endpoint()))?;
+    // Whoever destroyed it meanwhile may have been too early to unset this one.
+    named(handle).map(drop).or_else(|gone| set(None).and(Err(gone)))
+}
+
+/// Ends an endpoint that has a callback.
+pub(super) fn end<H: Handle<Object: Taking>>(handle: H) -> Result<(), Failure> {
+    let object = revoke(handle)?;
+    // Another call may keep it for a while. Only listening may fail, not ceasing to.
+    let _ = object.set_on_new(None);
+    Ok(())
 }

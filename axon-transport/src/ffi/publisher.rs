@@ -1,12 +1,12 @@
 //! Publishers.
 
 use super::{
-    endpoint::{axon_endpoint_options_t, axon_gid_t, spec},
+    endpoint::{axon_endpoint_options_t, axon_gid_t, describe, matched, spec},
     error::{Failure, axon_ret_t},
     guarded,
     handle::{axon_node_t, axon_publisher_t, give, named, revoke},
     memory::{elements, present, present_if_wanted, store, store_if_wanted},
-    qos::{axon_qos_t, store_qos},
+    qos::axon_qos_t,
     wait::{duration, time},
 };
 use crate::{graph::EndpointKind, qos::Qos};
@@ -60,15 +60,8 @@ pub unsafe extern "C" fn axon_session_publisher_describe(
     gid: *mut axon_gid_t,
     qos: *mut axon_qos_t,
 ) -> axon_ret_t {
-    guarded(|| {
-        present_if_wanted(gid)?;
-        present_if_wanted(qos)?;
-        let publisher = named(publisher)?;
-        // SAFETY: the caller's word.
-        unsafe { store_if_wanted(gid, publisher.gid().into()) }?;
-        // SAFETY: the caller's word.
-        unsafe { store_qos(qos, &publisher.endpoint().qos) }
-    })
+    // SAFETY: the caller's word.
+    guarded(|| unsafe { describe(publisher, gid, qos) })
 }
 
 /// Publishes a sample of `len` bytes at `data`, which are copied. `source_timestamp` is in
@@ -136,11 +129,8 @@ pub unsafe extern "C" fn axon_session_publisher_matched(
     publisher: axon_publisher_t,
     count: *mut usize,
 ) -> axon_ret_t {
-    guarded(|| {
-        let matched = named(publisher)?.matched().len();
-        // SAFETY: the caller's word.
-        unsafe { store(count, matched, "the place of the number") }
-    })
+    // SAFETY: the caller's word.
+    guarded(|| unsafe { matched(publisher, count) })
 }
 
 /// Blocks until at least `count` subscriptions receive from the publisher, for at most `timeout`
@@ -163,7 +153,8 @@ pub extern "C" fn axon_session_publisher_wait_matched(
 
 /// Blocks until every sample published so far is acknowledged, for at most `timeout` nanoseconds
 /// (negative: for ever): AXON_RET_TIMEOUT where one is not. A sample that is to be read on this host is
-/// so at once, and one for another host when the daemon has taken it over.
+/// so at once, and one for another host when this host's daemon has taken it over: the other host has
+/// not said that it came.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_publisher_wait_acknowledged(
     publisher: axon_publisher_t,

@@ -3,13 +3,13 @@
 use std::ffi::c_void;
 
 use super::{
-    callback::{axon_callback_t, told},
-    endpoint::{axon_endpoint_options_t, axon_gid_t, spec},
+    callback::axon_callback_t,
+    endpoint::{axon_endpoint_options_t, axon_gid_t, describe, end, matched, set_callback, spec},
     error::{Failure, axon_ret_t},
     guarded,
-    handle::{axon_node_t, axon_sample_t, axon_server_t, give, named, revoke},
-    memory::{elements, present, present_if_wanted, store, store_if_wanted, value},
-    qos::{axon_qos_t, store_qos},
+    handle::{axon_node_t, axon_sample_t, axon_server_t, give, named},
+    memory::{elements, present, value},
+    qos::axon_qos_t,
     subscription::{Place, SamplePlace, axon_message_info_t, axon_room_t},
 };
 use crate::ids::Gid;
@@ -43,12 +43,7 @@ pub unsafe extern "C" fn axon_session_server_create(
 /// Ends a server. Its callback has returned, and is not called any more, when this returns.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_server_destroy(server: axon_server_t) -> axon_ret_t {
-    guarded(|| {
-        let server = revoke(server)?;
-        // Another call may keep it for a while. Only listening may fail, not ceasing to.
-        let _ = server.set_on_new_request(None);
-        Ok(())
-    })
+    guarded(|| end(server))
 }
 
 /// What the server is: its GID, and the profile that it has for requests and for responses. Null
@@ -62,15 +57,8 @@ pub unsafe extern "C" fn axon_session_server_describe(
     gid: *mut axon_gid_t,
     qos: *mut axon_qos_t,
 ) -> axon_ret_t {
-    guarded(|| {
-        present_if_wanted(gid)?;
-        present_if_wanted(qos)?;
-        let server = named(server)?;
-        // SAFETY: the caller's word.
-        unsafe { store_if_wanted(gid, server.gid().into()) }?;
-        // SAFETY: the caller's word.
-        unsafe { store_qos(qos, &server.endpoint().qos) }
-    })
+    // SAFETY: the caller's word.
+    guarded(|| unsafe { describe(server, gid, qos) })
 }
 
 /// How many clients reach the server, and are reached by it.
@@ -82,11 +70,8 @@ pub unsafe extern "C" fn axon_session_server_matched(
     server: axon_server_t,
     count: *mut usize,
 ) -> axon_ret_t {
-    guarded(|| {
-        let matched = named(server)?.clients().len();
-        // SAFETY: the caller's word.
-        unsafe { store(count, matched, "the place of the number") }
-    })
+    // SAFETY: the caller's word.
+    guarded(|| unsafe { matched(server, count) })
 }
 
 /// Copies the next request to where `room` says, as `axon_session_subscription_take`. The sender and
@@ -167,11 +152,5 @@ pub unsafe extern "C" fn axon_session_server_set_callback(
     callback: axon_callback_t,
     user: *const c_void,
 ) -> axon_ret_t {
-    guarded(|| {
-        let object = named(server)?;
-        let set = |callback| object.set_on_new_request(callback).map_err(Failure::from);
-        set(told(callback, user)).map_err(|e| e.of_endpoint(object.endpoint()))?;
-        // Whoever destroyed it meanwhile may have been too early to unset this one.
-        named(server).map(drop).or_else(|gone| set(None).and(Err(gone)))
-    })
+    guarded(|| set_callback(server, callback, user))
 }

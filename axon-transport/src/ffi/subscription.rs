@@ -3,13 +3,13 @@
 use std::{ffi::c_void, slice};
 
 use super::{
-    callback::{axon_callback_t, told},
-    endpoint::{axon_endpoint_options_t, axon_gid_t, spec},
+    callback::axon_callback_t,
+    endpoint::{axon_endpoint_options_t, axon_gid_t, describe, end, matched, set_callback, spec},
     error::{AXON_RET_BAD_ALLOC, Failure, axon_ret_t},
     guarded,
     handle::{axon_node_t, axon_sample_t, axon_subscription_t, give, named, revoke},
     memory::{present, present_if_wanted, store, store_if_wanted},
-    qos::{axon_qos_t, store_qos},
+    qos::axon_qos_t,
     wait::duration,
 };
 use crate::{
@@ -78,12 +78,7 @@ pub unsafe extern "C" fn axon_session_subscription_create(
 pub extern "C" fn axon_session_subscription_destroy(
     subscription: axon_subscription_t,
 ) -> axon_ret_t {
-    guarded(|| {
-        let subscription = revoke(subscription)?;
-        // Another call may keep it for a while. Only listening may fail, not ceasing to.
-        let _ = subscription.set_on_new_sample(None);
-        Ok(())
-    })
+    guarded(|| end(subscription))
 }
 
 /// What the subscription is: its GID, and the profile that it has. Null where one is not wanted.
@@ -96,15 +91,8 @@ pub unsafe extern "C" fn axon_session_subscription_describe(
     gid: *mut axon_gid_t,
     qos: *mut axon_qos_t,
 ) -> axon_ret_t {
-    guarded(|| {
-        present_if_wanted(gid)?;
-        present_if_wanted(qos)?;
-        let subscription = named(subscription)?;
-        // SAFETY: the caller's word.
-        unsafe { store_if_wanted(gid, subscription.gid().into()) }?;
-        // SAFETY: the caller's word.
-        unsafe { store_qos(qos, &subscription.endpoint().qos) }
-    })
+    // SAFETY: the caller's word.
+    guarded(|| unsafe { describe(subscription, gid, qos) })
 }
 
 /// How many publishers the subscription receives from, on this host and on others.
@@ -116,11 +104,8 @@ pub unsafe extern "C" fn axon_session_subscription_matched(
     subscription: axon_subscription_t,
     count: *mut usize,
 ) -> axon_ret_t {
-    guarded(|| {
-        let matched = named(subscription)?.matched().len();
-        // SAFETY: the caller's word.
-        unsafe { store(count, matched, "the place of the number") }
-    })
+    // SAFETY: the caller's word.
+    guarded(|| unsafe { matched(subscription, count) })
 }
 
 /// Blocks until the subscription receives from at least `count` publishers, for at most `timeout`
@@ -234,13 +219,7 @@ pub unsafe extern "C" fn axon_session_subscription_set_callback(
     callback: axon_callback_t,
     user: *const c_void,
 ) -> axon_ret_t {
-    guarded(|| {
-        let object = named(subscription)?;
-        let set = |callback| object.set_on_new_sample(callback).map_err(Failure::from);
-        set(told(callback, user)).map_err(|e| e.of_endpoint(object.endpoint()))?;
-        // Whoever destroyed it meanwhile may have been too early to unset this one.
-        named(subscription).map(drop).or_else(|gone| set(None).and(Err(gone)))
-    })
+    guarded(|| set_callback(subscription, callback, user))
 }
 
 impl axon_message_info_t {

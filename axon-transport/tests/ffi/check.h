@@ -66,5 +66,6 @@ void case_threads(void);
 void case_fork(void);
 void case_services(void);
 void case_graph(void);
+void case_log(void);
 
 #endif
