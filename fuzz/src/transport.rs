@@ -194,6 +194,7 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
         Message::Graph(graph(1)),
         Message::Graph(graph(64)),
         Message::GraphResync(link::GraphResync { version: 2 }),
+        Message::Asserted(link::Asserted { publishers: vec![gid] }),
         Message::Subscribe(link::Subscribe {
             route: 1,
             topic: "/scan".into(),

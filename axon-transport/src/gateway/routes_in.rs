@@ -64,6 +64,11 @@ impl RoutesIn {
         self.find(number, |route| route.writers.get(&gid).cloned()).await
     }
 
+    /// What stands for `gid` here, as far as a route is fed from it.
+    pub(super) fn stand_in(&self, gid: &Gid) -> Option<Arc<StandIn>> {
+        read(&self.routes).values().find_map(|route| route.writers.get(gid).cloned())
+    }
+
     /// Looks, for a while, as long as there is such a route.
     async fn find<T>(&self, number: u32, look: impl Fn(&RouteIn) -> Option<T>) -> Option<T> {
         let found = async {

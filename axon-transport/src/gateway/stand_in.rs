@@ -161,6 +161,14 @@ impl StandIn {
         Ok(if there { Written::Yes } else { Written::Nobody })
     }
 
+    /// Its host says that it is alive.
+    pub(super) fn assert_alive(&self) {
+        if let Face::Publisher(publisher) = self.face() {
+            // Only a forked child is refused.
+            let _ = publisher.assert_liveliness();
+        }
+    }
+
     /// What goes to its host: the next request to a server, or response to a client.
     pub(super) fn take(&self) -> Option<Sample> {
         let mut payload = Vec::new();

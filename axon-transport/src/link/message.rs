@@ -167,6 +167,16 @@ pub struct RouteReady {
     pub publishers: Vec<Gid>,
 }
 
+/// Publishers of the sender's host that were alive since it was said last, whether or not they
+/// published: of those that have a lease and feed a route.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Asserted {
+    /// Their GIDs.
+    #[n(0)]
+    pub publishers: Vec<Gid>,
+}
+
 /// KEEPALIVE carries nothing.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
@@ -195,6 +205,8 @@ pub enum Message {
     RouteReady(RouteReady),
     /// Still here.
     Keepalive,
+    /// These publishers, too.
+    Asserted(Asserted),
     /// About keys.
     Keys(KeyMessage),
 }
@@ -211,6 +223,7 @@ impl Message {
             Self::Unsubscribe(m) => (6, to_map(m)),
             Self::RouteReady(m) => (7, to_map(m)),
             Self::Keepalive => (8, to_map(&Nothing {})),
+            Self::Asserted(m) => (9, to_map(m)),
             Self::Keys(m) => {
                 let mut map = Vec::new();
                 m.encode(&mut map);
@@ -230,6 +243,7 @@ impl Message {
             6 => Self::Unsubscribe(from_map(kind, map)?),
             7 => Self::RouteReady(from_map(kind, map)?),
             8 => from_map::<Nothing>(kind, map).map(|_| Self::Keepalive)?,
+            9 => Self::Asserted(from_map(kind, map)?),
             16..=19 => Self::Keys(
                 KeyMessage::decode(kind, map)
                     .map_err(|e| FrameError::Malformed { kind, reason: e.to_string() })?,
@@ -256,6 +270,9 @@ impl Message {
                     && m.added.iter().all(Endpoint::is_sane),
                 "an endpoint is out of bounds",
             ),
+            Self::Asserted(m) => {
+                ok(m.publishers.len() <= LIMITS.endpoints, "more publishers than there can be")
+            }
             Self::Subscribe(m) => ok(
                 m.topic.len() <= LIMITS.name
                     && m.type_name.len() <= LIMITS.name

@@ -122,6 +122,7 @@ impl Message {
             Self::Unsubscribe(_) => "UNSUBSCRIBE",
             Self::RouteReady(_) => "ROUTE_READY",
             Self::Keepalive => "KEEPALIVE",
+            Self::Asserted(_) => "ASSERTED",
             Self::Keys(m) => m.name(),
         }
     }

@@ -4,7 +4,8 @@
 //! `publish TOPIC SIZES READERS COUNT`: waits for as many readers, then publishes; with a count of
 //! `stream` until the first line on standard input. `subscribe TOPIC SIZES`: takes, and compares.
 //! `serve SERVICE COUNT`: answers as many requests with their bytes reversed, and takes one more.
-//! `ask SERVICE COUNT`: sends as many requests, and takes no response.
+//! `ask SERVICE COUNT`: sends as many requests, and takes no response. `alive TOPIC`: a publisher that
+//! has a lease of half a second, and publishes nothing.
 
 use std::{
     error::Error,
@@ -39,8 +40,10 @@ fn main() -> Result<(), Box<dyn Error>> {
         ["subscribe", topic, sizes] => subscribe(&session, &stdin, topic, sizes.parse()?),
         ["serve", service, count] => serve(&session, &stdin, service, count.parse()?),
         ["ask", service, count] => ask(&session, &stdin, service, count.parse()?),
+        ["alive", topic] => alive(&session, &stdin, topic),
         _ => Err(
-            "publish TOPIC SIZES READERS COUNT, subscribe TOPIC SIZES, serve or ask SERVICE COUNT"
+            "publish TOPIC SIZES READERS COUNT, subscribe TOPIC SIZES, serve or ask SERVICE COUNT, \
+             alive TOPIC"
                 .into(),
         ),
     }
@@ -48,6 +51,14 @@ fn main() -> Result<(), Box<dyn Error>> {
 
 fn spec(topic: &str) -> EndpointSpec {
     EndpointSpec::new(topic, "test/Bytes", Qos::keep_all())
+}
+
+fn alive(session: &Session, stdin: &Receiver<u8>, topic: &str) -> Result<(), Box<dyn Error>> {
+    let qos = Qos { lease: Some(500_000_000), ..Qos::default() };
+    let _publisher = session.create_publisher(EndpointSpec::new(topic, "test/Bytes", qos))?;
+    Word::Ready.say()?;
+    while stdin.recv().is_ok() {}
+    Ok(())
 }
 
 fn publish(

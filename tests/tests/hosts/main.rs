@@ -3,6 +3,7 @@
 
 mod delivery;
 mod election;
+mod events;
 mod hostile;
 mod identity;
 mod mismatch;

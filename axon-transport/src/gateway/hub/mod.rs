@@ -13,7 +13,10 @@ use std::{
 };
 
 use axon_tls::Negotiated;
-use tokio::sync::{Notify, mpsc};
+use tokio::{
+    sync::{Notify, mpsc},
+    time::sleep_until,
+};
 
 use super::{
     accept::Incomer,
@@ -33,7 +36,7 @@ use super::{
 };
 use crate::{
     daemon::bridge::{ToControl, ToGateway},
-    graph::Endpoint,
+    graph::{Endpoint, EndpointKind},
     ids::{DaemonId, Gid},
     link::{Candidate, CloseCode, Elected, GraphResync, Hello, Message},
     session::Session,
@@ -41,6 +44,9 @@ use crate::{
 
 /// Seconds between two looks whether the certificate of a linked peer has run out.
 const CERTIFICATES_EVERY: u32 = 60;
+
+/// The shortest time between two looks at who is alive.
+const SHORTEST: Duration = Duration::from_millis(5);
 
 /// What the hub and the peers' tasks share.
 pub(super) struct Shared {
@@ -163,8 +169,10 @@ impl Hub {
         let mut second = tokio::time::interval(Duration::from_secs(1));
         second.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         let mut seconds = 0_u32;
+        let mut alive_at = Instant::now();
         let mut kept = true;
         loop {
+            let alive_every = self.alive_every();
             tokio::select! {
                 event = inbox.recv() => match event {
                     None | Some(Event::Order(ToGateway::Shutdown)) => break,
@@ -174,6 +182,10 @@ impl Hub {
                 () = session.lost.notified() => {
                     kept = false;
                     break;
+                }
+                () = sleep_until((alive_at + alive_every.unwrap_or_default()).into()), if alive_every.is_some() => {
+                    alive_at = Instant::now();
+                    self.peers.values_mut().for_each(Peer::tell_alive);
                 }
                 // Without a link, and keys, there is nothing that time would change.
                 _ = second.tick(), if !self.links.is_empty() || self.context.keyring.is_some() => {
@@ -191,6 +203,16 @@ impl Hub {
             let _ = tokio::time::timeout(Duration::from_millis(500), endpoint.wait_idle()).await;
         }
         kept
+    }
+
+    /// How often peers are told who is alive here: in time for the shortest lease.
+    fn alive_every(&self) -> Option<Duration> {
+        if self.peers.is_empty() {
+            return None;
+        }
+        let leases = self.local.values().filter(|e| e.kind == EndpointKind::Publisher);
+        let shortest = leases.filter_map(|endpoint| endpoint.qos.lease).min()?;
+        Some((Duration::from_nanos(shortest) / 4).max(SHORTEST))
     }
 
     async fn on_event(&mut self, event: Event) {
@@ -295,6 +317,10 @@ impl Hub {
             Message::Unsubscribe(unsubscribe) => {
                 peer.unserve(unsubscribe.route);
                 peer.update_services(&self.local, &self.shared);
+                Ok(())
+            }
+            Message::Asserted(asserted) => {
+                peer.hear_alive(&asserted);
                 Ok(())
             }
             Message::RouteReady(ready) => {

@@ -1,5 +1,6 @@
 //! One linked peer: its graph, the routes in both directions, and the tasks that carry samples.
 
+mod alive;
 mod asking;
 mod serving;
 
@@ -50,6 +51,8 @@ pub(super) struct Peer {
     routes_in: Arc<RoutesIn>,
     /// Routes that the peer asked for.
     served: HashMap<u32, Served>,
+    /// When each publisher here that has a lease was alive, as the peer was told.
+    told_alive: BTreeMap<Gid, u64>,
     /// Servers there whose host takes requests for them.
     answering: BTreeSet<Gid>,
     orders: mpsc::UnboundedSender<outbound::Order>,
@@ -86,6 +89,7 @@ impl Peer {
             asked: BTreeMap::new(),
             routes_in: Arc::default(),
             served: HashMap::new(),
+            told_alive: BTreeMap::new(),
             answering: BTreeSet::new(),
             orders,
         }

@@ -27,7 +27,7 @@ pub(super) struct Served {
     route: Route,
     /// Its readers there.
     pub(super) subscribers: Vec<Gid>,
-    sources: Vec<Source>,
+    pub(super) sources: Vec<Source>,
     /// Whether it was asked for on the link in use.
     pub(super) repeated: bool,
     /// Sends ROUTE_READY once a publisher is attached.
