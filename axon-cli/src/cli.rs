@@ -64,6 +64,10 @@ pub(crate) enum Command {
     #[command(hide = true)]
     BenchRead,
     #[command(hide = true)]
+    BenchSessionAnswer,
+    #[command(hide = true)]
+    BenchSessionRead,
+    #[command(hide = true)]
     DemoPlayer(DemoPlayer),
     #[command(hide = true)]
     DemoSubscriber(DemoSubscriber),
@@ -235,6 +239,35 @@ pub(crate) enum Bench {
     /// Shared memory between two processes, beside what the machine gives without any middleware
     #[command(after_help = BENCH_SHM_HELP)]
     Shm(BenchShm),
+    /// Sessions between two processes, beside bare shared memory
+    #[command(after_help = BENCH_SESSION_HELP)]
+    Session(BenchSession),
+}
+
+const BENCH_SESSION_HELP: &str = "\
+Latency of a publisher and a subscription, and of a service, in the sessions of two processes with a
+daemon of their own, beside bare shared memory in the same run: with a receiver that polls and one
+that waits on a wait set. Then what a publish costs by the number of subscriptions. The rest of the
+machine should be idle. About two minutes; --quick takes seconds and is only to see it run. Writes
+session.json, with all percentiles.
+
+Examples:
+  axon bench session
+  axon bench session --sizes 64,1048576 --out results
+  axon bench session --quick --out results && jq .latency[].session_to_bare results/session.json";
+
+/// `axon bench session`.
+#[derive(Args, Debug)]
+pub(crate) struct BenchSession {
+    /// Sizes of messages in bytes, from 8 to 64 MiB [default: seven from 64 B to 4 MiB]
+    #[arg(long, value_name = "BYTES", value_delimiter = ',', value_parser = message_size)]
+    pub(crate) sizes: Vec<usize>,
+    /// Where to write session.json
+    #[arg(long, value_name = "DIR", default_value = ".")]
+    pub(crate) out: PathBuf,
+    /// A few messages only: the figures are good for nothing
+    #[arg(long)]
+    pub(crate) quick: bool,
 }
 
 const BENCH_SHM_HELP: &str = "\

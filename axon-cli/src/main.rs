@@ -32,8 +32,11 @@ fn main() -> ExitCode {
         Command::Trust(args) => trust::run(args).map(done),
         Command::Daemon(args) => daemon::run(args),
         Command::Bench(Bench::Shm(args)) => bench::shm(args).map(done),
+        Command::Bench(Bench::Session(args)) => bench::session::run(args).map(done),
         Command::BenchAnswer => bench::answer().map(done),
         Command::BenchRead => bench::read().map(done),
+        Command::BenchSessionAnswer => bench::session::answer().map(done),
+        Command::BenchSessionRead => bench::session::read().map(done),
         Command::DemoPlayer(args) => demo::run_player(args).map(done),
         Command::DemoSubscriber(args) => demo::run_subscriber(args).map(done),
     };

@@ -191,3 +191,43 @@ fn a_size_that_cannot_be_measured_is_refused() {
         assert!(String::from_utf8_lossy(&output.stderr).contains("number of bytes"), "{wrong}");
     }
 }
+
+#[test]
+fn a_quick_run_of_sessions_compares_them_with_bare_shared_memory() {
+    if !has_two_cpus() {
+        return;
+    }
+    let dir = tempfile::tempdir().expect("temporary directory");
+    let output = axon([])
+        .args(["bench", "session", "--quick", "--sizes", "64,8192", "--out"])
+        .arg(dir.path())
+        .output()
+        .expect("it runs");
+    let text = String::from_utf8(output.stdout).expect("text");
+    assert!(output.status.success(), "{text}\n{}", String::from_utf8_lossy(&output.stderr));
+    assert!(text.contains("session") && text.contains("16 to 1"), "{text}");
+    let document = fs::read(dir.path().join("session.json")).expect("a file");
+    let document: Value = serde_json::from_slice(&document).expect("JSON");
+    let latency = rows(&document, "latency");
+    assert_eq!(latency.len(), 4 * 2);
+    for row in &latency {
+        for medium in ["bare", "session", "service_one_way"] {
+            check_times(&row[medium]);
+        }
+        for (judged, at_most) in [("session_to_bare", 1.3), ("service_round_trip_to_session", 2.5)]
+        {
+            let judged = &row[judged];
+            let ratio = judged["ratio"].as_f64().expect("a ratio");
+            assert_eq!(
+                (&judged["at_most"], &judged["met"]),
+                (&at_most.into(), &(ratio <= at_most).into())
+            );
+        }
+    }
+    let publish = rows(&document, "publish");
+    let counts = |row: &Value| {
+        let of = rows(row, "subscriptions");
+        of.iter().map(|s| s["count"].as_u64().expect("a number")).collect::<Vec<_>>()
+    };
+    assert!(publish.len() == 2 && publish.iter().all(|row| counts(row) == [1, 4, 16]));
+}

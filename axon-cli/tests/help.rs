@@ -29,7 +29,7 @@ fn the_first_page_names_every_command_and_the_exit_statuses() {
     ] {
         assert!(text.contains(part), "{part:?} is missing in:\n{text}");
     }
-    for hidden in ["demo-player", "bench-answer", "bench-read"] {
+    for hidden in ["demo-player", "bench-answer", "bench-read", "bench-session-read"] {
         assert!(!text.contains(hidden), "what the tool starts is not for people:\n{text}");
     }
 }
@@ -61,7 +61,7 @@ fn trust_says_how_two_hosts_come_to_know_each_other() {
 
 #[test]
 fn no_line_is_wider_than_a_page() {
-    let others: [&[&str]; 9] = [
+    let others: [&[&str]; 10] = [
         &[],
         &["demo"],
         &["play"],
@@ -71,6 +71,7 @@ fn no_line_is_wider_than_a_page() {
         &["daemon"],
         &["bench"],
         &["bench", "shm"],
+        &["bench", "session"],
     ];
     for command in others.into_iter().chain(TRUST.iter().map(|command| &command[..])) {
         for line in help(command).lines() {

@@ -1,10 +1,12 @@
-//! `axon bench`: what AXON costs beside what the machine gives without it.
+//! `axon bench`: what AXON costs beside what the machine gives without it, and its sessions beside its
+//! own shared memory.
 
 mod budgets;
 mod chart;
 pub(crate) mod harness;
 mod readers;
 mod report;
+pub(crate) mod session;
 
 use std::{
     fs,

@@ -1,0 +1,215 @@
+//! Sessions, as their documentation says to use them.
+
+use std::{
+    sync::{
+        OnceLock,
+        atomic::{AtomicU32, Ordering},
+    },
+    time::Duration,
+};
+
+use axon_transport::{
+    ids::Gid,
+    qos::Qos,
+    session::{Client, EndpointSpec, Publisher, Server, Session, Subscription, Waitable},
+};
+
+use super::place::{PATIENCE, session};
+use crate::bench::harness::{
+    Channel, End, Error, Load, Medium, Motion, Result, Side, agree, qos, stamp,
+};
+
+/// A wait ends with what it is for.
+const LONGEST_SLEEP: Option<Duration> = Some(Duration::from_secs(1));
+/// Up to here a sample is copied in any case.
+const COPIED: usize = 4096;
+/// Up to here so is what is loaned.
+const LOANS_COPIED: usize = 512;
+
+/// Where the daemon is, in the process that measures.
+pub(super) static DIRECTORY: OnceLock<String> = OnceLock::new();
+
+/// The number of an end, for topics that no other has.
+static NUMBER: AtomicU32 = AtomicU32::new(0);
+
+/// A publisher and a subscription in each of two sessions.
+pub(super) struct Sessions;
+
+/// A service: a request there, and its response back.
+pub(super) struct Service;
+
+/// The session of this end, and the name of what it shares with the other.
+fn meet(side: Side, channel: &Channel) -> Result<(Session, String)> {
+    let (directory, name) = match side {
+        Side::Near => {
+            let directory = DIRECTORY.get().ok_or("no daemon was started")?.clone();
+            let name = format!("/bench/{}", NUMBER.fetch_add(1, Ordering::Relaxed));
+            channel.tell(&(&directory, &name))?;
+            (directory, name)
+        }
+        Side::Far => channel.hear::<(String, String)>()?,
+    };
+    Ok((session(&directory)?, name))
+}
+
+fn spec(name: &str, qos: Qos) -> EndpointSpec {
+    EndpointSpec::new(name, "bench/Bytes", qos)
+}
+
+impl Medium for Sessions {
+    fn name(&self) -> &'static str {
+        "session"
+    }
+
+    fn open(&self, load: &Load, side: Side, channel: &Channel) -> Result<Box<dyn End>> {
+        let (session, name) = meet(side, channel)?;
+        let (out, back) = match side {
+            Side::Near => ("there", "back"),
+            Side::Far => ("back", "there"),
+        };
+        let spec = |way| Ok::<_, Error>(spec(&format!("{name}/{way}"), qos(load.window)?));
+        let subscription = session.create_subscription(spec(back)?)?;
+        let publisher = session.create_publisher(spec(out)?)?;
+        if !publisher.wait_matched(1, PATIENCE) || !subscription.wait_matched(1, PATIENCE) {
+            return Err("the two sessions do not meet".into());
+        }
+        let loans = load.motion == Motion::Touch && load.size > LOANS_COPIED;
+        Ok(Box::new(SessionEnd {
+            publisher,
+            subscription,
+            session,
+            size: load.size,
+            sleeps: load.wake.sleeps(),
+            loans,
+            copies: !(loans || load.size > COPIED) || load.motion == Motion::Copy,
+            out: vec![0x5a; load.size],
+            into: Vec::with_capacity(load.size),
+        }))
+    }
+}
+
+struct SessionEnd {
+    publisher: Publisher,
+    subscription: Subscription,
+    session: Session,
+    size: usize,
+    sleeps: bool,
+    loans: bool,
+    copies: bool,
+    out: Vec<u8>,
+    into: Vec<u8>,
+}
+
+impl End for SessionEnd {
+    fn send(&mut self, number: u64) -> Result<()> {
+        if self.loans {
+            let mut loan = self.publisher.loan(self.size)?;
+            stamp(&mut loan, number);
+            loan.publish()?;
+        } else {
+            stamp(&mut self.out, number);
+            self.publisher.publish(&self.out)?;
+        }
+        Ok(())
+    }
+
+    fn receive(&mut self) -> Result<u64> {
+        loop {
+            if self.sleeps {
+                let subscription = Waitable::Subscription(&self.subscription);
+                self.session.wait_for(&[subscription], LONGEST_SLEEP)?;
+            }
+            if self.copies {
+                if self.subscription.take(&mut self.into).is_some() {
+                    return numbered(&self.into);
+                }
+            } else if let Some((_, sample)) = self.subscription.take_sample() {
+                let [mut first, mut last] = [[0; 8]; 2];
+                sample.read_at(0, &mut first);
+                sample.read_at(self.size - 8, &mut last);
+                return agree(first, last);
+            }
+        }
+    }
+}
+
+impl Medium for Service {
+    fn name(&self) -> &'static str {
+        "service"
+    }
+
+    fn open(&self, load: &Load, side: Side, channel: &Channel) -> Result<Box<dyn End>> {
+        let (session, name) = meet(side, channel)?;
+        let (sleeps, bytes) = (load.wake.sleeps(), vec![0x5a; load.size]);
+        if side == Side::Near {
+            let client = session.create_client(spec(&name, Qos::default()))?;
+            if !client.wait_available(PATIENCE) {
+                return Err("there is no server".into());
+            }
+            return Ok(Box::new(Asking { client, session, sleeps, bytes }));
+        }
+        let server = session.create_server(spec(&name, Qos::default()))?;
+        let asked = None;
+        Ok(Box::new(Answering { server, session, sleeps, bytes, asked }))
+    }
+}
+
+struct Asking {
+    client: Client,
+    session: Session,
+    sleeps: bool,
+    bytes: Vec<u8>,
+}
+
+impl End for Asking {
+    fn send(&mut self, number: u64) -> Result<()> {
+        stamp(&mut self.bytes, number);
+        self.client.send_request(&self.bytes)?;
+        Ok(())
+    }
+
+    fn receive(&mut self) -> Result<u64> {
+        loop {
+            if self.sleeps {
+                self.session.wait_for(&[Waitable::Client(&self.client)], LONGEST_SLEEP)?;
+            }
+            if self.client.take_response(&mut self.bytes).is_some() {
+                return numbered(&self.bytes);
+            }
+        }
+    }
+}
+
+struct Answering {
+    server: Server,
+    session: Session,
+    sleeps: bool,
+    bytes: Vec<u8>,
+    /// Who asked last, and what number the request has.
+    asked: Option<(Gid, u64)>,
+}
+
+impl End for Answering {
+    fn send(&mut self, number: u64) -> Result<()> {
+        let (client, sequence) = self.asked.take().ok_or("an answer that nobody asked for")?;
+        stamp(&mut self.bytes, number);
+        self.server.send_response(client, sequence, &self.bytes)?;
+        Ok(())
+    }
+
+    fn receive(&mut self) -> Result<u64> {
+        loop {
+            if self.sleeps {
+                self.session.wait_for(&[Waitable::Server(&self.server)], LONGEST_SLEEP)?;
+            }
+            if let Some(info) = self.server.take_request(&mut self.bytes) {
+                self.asked = Some((info.publisher, info.sequence));
+                return numbered(&self.bytes);
+            }
+        }
+    }
+}
+
+fn numbered(bytes: &[u8]) -> Result<u64> {
+    agree(*bytes.first_chunk().ok_or("too short")?, *bytes.last_chunk().ok_or("too short")?)
+}

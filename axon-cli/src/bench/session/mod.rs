@@ -1,0 +1,112 @@
+//! `axon bench session`: what a session adds to the shared memory under it.
+
+mod medium;
+mod place;
+mod readers;
+mod report;
+
+use std::{
+    fs,
+    io::{self, Write},
+};
+
+use self::{
+    medium::{DIRECTORY, Service, Sessions},
+    place::Place,
+    readers::{Cost, Crowd},
+};
+use super::harness::{
+    self, Axon, Effort, Load, Machine, Medium, Motion, Pair, Progress, Rounds, Wake, words,
+};
+use crate::{cli, failure::Failure};
+
+const SIZES: [usize; 7] = [64, 1 << 10, 4 << 10, 64 << 10, 256 << 10, 1 << 20, 4 << 20];
+const QUICK_SIZES: [usize; 2] = [64, 64 << 10];
+const KINDS: [(Wake, Motion); 4] = [
+    (Wake::Poll, Motion::Copy),
+    (Wake::Poll, Motion::Touch),
+    (Wake::Event, Motion::Copy),
+    (Wake::Event, Motion::Touch),
+];
+/// What a session may take at most, by what bare shared memory takes.
+const BUDGET: f64 = 1.3;
+/// What a request and its response may take at most, by what one message takes one way.
+const SERVICE_BUDGET: f64 = 2.5;
+
+/// Bare shared memory first.
+const MEDIA: [&dyn Medium; 3] = [&Axon, &Sessions, &Service];
+
+const ANSWERING: &str = "bench-session-answer";
+const READING: &str = "bench-session-read";
+
+/// A load, and what each of the three made of it: times are one way, half a round trip.
+struct Compared {
+    load: Load,
+    bare: Rounds,
+    session: Rounds,
+    service: Rounds,
+}
+
+struct Results {
+    machine: Machine,
+    quick: bool,
+    effort: Effort,
+    latency: Vec<Compared>,
+    publish: Vec<Cost>,
+}
+
+/// Runs `axon bench session`.
+pub(crate) fn run(args: &cli::BenchSession) -> Result<(), Failure> {
+    let sizes = match (&args.sizes[..], args.quick) {
+        ([], false) => &SIZES[..],
+        ([], true) => &QUICK_SIZES[..],
+        (sizes, _) => sizes,
+    };
+    let results = measure(sizes, args.quick).map_err(Failure::failed)?;
+    fs::create_dir_all(&args.out)?;
+    fs::write(args.out.join("session.json"), report::json(&results))?;
+    let mut out = io::stdout().lock();
+    out.write_all(report::text(&results).as_bytes())?;
+    writeln!(out, "\nsession.json is in {}", args.out.display())?;
+    Ok(())
+}
+
+/// Is the process that answers.
+pub(crate) fn answer() -> Result<(), Failure> {
+    harness::serve(&MEDIA).map_err(Failure::failed)
+}
+
+/// Is one of the readers.
+pub(crate) fn read() -> Result<(), Failure> {
+    readers::attend().map_err(Failure::failed)
+}
+
+fn measure(sizes: &[usize], quick: bool) -> harness::Result<Results> {
+    let effort = if quick { Effort::QUICK } else { Effort::FULL };
+    let machine = Machine::look()?;
+    let place = Place::start()?;
+    let directory = DIRECTORY.get_or_init(|| place.directory());
+    let progress = Progress::new(sizes.len() * (KINDS.len() + 1));
+    let pair = Pair::start(&MEDIA, effort, &machine, &[ANSWERING])?;
+    let mut latency = Vec::new();
+    for (wake, motion) in KINDS {
+        progress.step(&format!("latency, {}", words::kind(wake, motion)));
+        for size in sizes {
+            let load = Load::ping_pong(*size, wake, motion);
+            let rounds = pair.latency(&load)?;
+            let [bare, session, service] =
+                rounds.try_into().map_err(|_| "a medium without figures")?;
+            latency.push(Compared { load, bare, session, service });
+            progress.advance();
+        }
+    }
+    drop(pair);
+    progress.step("a publish by its subscriptions");
+    let crowd = Crowd::start(&[READING])?;
+    let mut publish = Vec::new();
+    for size in sizes {
+        publish.push(crowd.measure(directory, *size, effort)?);
+        progress.advance();
+    }
+    Ok(Results { machine, quick, effort, latency, publish })
+}
