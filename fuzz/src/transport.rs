@@ -186,6 +186,7 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
         before: 1,
         added: vec![endpoint(); endpoints],
         removed: vec![gid],
+        more: endpoints > 1,
     };
     let mask = |bits| IndexMask::from_bits(bits).unwrap();
     let messages = [

@@ -228,7 +228,7 @@ impl Link {
             namespace: String::new(),
             enclave: String::new(),
         };
-        let graph = Graph { version: 1, before: 0, added: vec![endpoint], removed: vec![] };
+        let graph = Graph { version: 1, before: 0, added: vec![endpoint], ..Graph::default() };
         self.established
             .outbox
             .send(Message::Elected(Elected { link: rand::random(), election: 1 }));

@@ -87,6 +87,9 @@ pub struct Graph {
     /// Endpoints that went.
     #[n(3)]
     pub removed: Vec<Gid>,
+    /// Whether the next GRAPH goes on with it: a whole graph counts once all of it is there.
+    #[n(4)]
+    pub more: bool,
 }
 
 /// The receiver of GRAPH missed a version and asks for the whole.

@@ -54,7 +54,13 @@ fn messages() -> Vec<Message> {
             ..hello()
         }),
         elected(),
-        Message::Graph(Graph { version: 2, before: 1, added: vec![], removed: vec![Gid([5; 16])] }),
+        Message::Graph(Graph {
+            version: 2,
+            before: 1,
+            added: vec![],
+            removed: vec![Gid([5; 16])],
+            more: true,
+        }),
         Message::GraphResync(GraphResync { version: 2 }),
         Message::Subscribe(Subscribe {
             route: 1,

@@ -5,6 +5,7 @@ use std::net::SocketAddr;
 
 use axon_tls::identity::{Auth, SigningKey};
 use axon_transport::{
+    graph::{Endpoint, EndpointKind},
     ids::{DaemonId, Gid},
     link::{Elected, Graph, GraphResync, Message, Subscribe, Subscriber},
     qos::Qos,
@@ -51,6 +52,28 @@ impl Elector {
     fn linked(&self, met: &mut Met) {
         let whole = |m: &Message| matches!(m, Message::Graph(Graph { before: 0, .. }));
         self.stranger.hear(met, whole).expect("the host's graph");
+    }
+
+    /// Says a whole graph of 600 publishers in two parts; the last is of the topic.
+    fn say_graph(&self, met: &mut Met, version: u64) {
+        let publisher = |number: u16| Endpoint {
+            gid: Gid(std::array::from_fn(|at| [9, (number >> 8) as u8, number as u8][at.min(2)])),
+            kind: EndpointKind::Publisher,
+            topic: if number == 599 { TOPIC.into() } else { format!("/other_{number}") },
+            type_name: TYPE.into(),
+            type_hash: Vec::new(),
+            qos: Qos::default(),
+            node: "many".into(),
+            namespace: "/".into(),
+            enclave: String::new(),
+        };
+        for (part, more) in [(0..300, true), (300..600, false)] {
+            let version = version + u64::from(!more);
+            let before = if more { 0 } else { version - 1 };
+            let (added, removed) = (part.map(publisher).collect(), Vec::new());
+            let graph = Graph { version, before, added, removed, more };
+            self.stranger.say(met, &Message::Graph(graph));
+        }
     }
 
     /// Asks for the topic under this route number.
@@ -140,4 +163,30 @@ fn one_peer_has_so_many_connections_and_leaves_room_for_others() {
     let other = Elector { auth: Auth::None(SigningKey::generate().unwrap()), ..elector };
     let claim = Claim { host: "other", daemon: DaemonId([0xff; 16]), auth: 0 };
     other.stranger.dial(&other.host, &other.auth, &claim).expect("another one's link");
+}
+
+#[test]
+fn a_whole_graph_in_parts_ends_no_route_in_between() {
+    let elector = Elector::new();
+    let session = elector.host.session("listener");
+    let spec = EndpointSpec::new(TOPIC, TYPE, Qos::default());
+    let subscription = session.create_subscription(spec).unwrap();
+    let mut link = elector.meet();
+    elector.elect(&mut link, 1);
+    elector.linked(&mut link);
+    elector.say_graph(&mut link, 1);
+    let asked =
+        |m: &Message| matches!(m, Message::Subscribe(subscribe) if subscribe.topic == TOPIC);
+    elector.stranger.hear(&mut link, asked).expect("the host asks for the topic");
+    until("it is matched", || !subscription.matched().is_empty());
+
+    elector.say_graph(&mut link, 3);
+    elector.stranger.say(&mut link, &Message::GraphResync(GraphResync { version: 0 }));
+    let ended = std::cell::Cell::new(false);
+    let next = |m: &Message| {
+        ended.set(ended.get() || matches!(m, Message::Unsubscribe(_)));
+        matches!(m, Message::Graph(Graph { before: 0, .. }))
+    };
+    elector.stranger.hear(&mut link, next).expect("the host's graph");
+    assert!(!ended.get() && !subscription.matched().is_empty());
 }

@@ -26,7 +26,7 @@ use super::{
     endpoint::Endpoints,
     establish::{Established, Sealing, close, peer_text},
     outbound::Carrier,
-    peer::Peer,
+    peer::{GraphTaken, Peer},
     pulse::Pulse,
     refusal::{Refusal, RefusedBy},
     routes::Offered,
@@ -294,11 +294,12 @@ impl Hub {
         let Some(peer) = self.peers.get_mut(&daemon).filter(|p| p.link == number) else { return };
         let result = match message {
             Message::Graph(graph) => match peer.take_graph(graph) {
-                Ok(Some(change)) => {
+                Ok(GraphTaken::Changed(change)) => {
                     self.remote_graph(daemon, change).await;
                     Ok(())
                 }
-                Ok(None) => {
+                Ok(GraphTaken::Part) => Ok(()),
+                Ok(GraphTaken::Gap) => {
                     let version = peer.remote_version();
                     peer.say(Message::GraphResync(GraphResync { version }));
                     Ok(())

@@ -43,6 +43,8 @@ pub(super) struct Peer {
     pub(super) counters: Arc<Counters>,
     remote: BTreeMap<Gid, Endpoint>,
     remote_version: u64,
+    /// What came of a whole graph so far.
+    gathered: Option<Vec<Endpoint>>,
     sent: BTreeMap<Gid, Endpoint>,
     sent_version: u64,
     next_route: u32,
@@ -68,6 +70,16 @@ pub(super) struct GraphChange {
     pub(super) removed: Vec<Gid>,
 }
 
+/// What became of a GRAPH message.
+pub(super) enum GraphTaken {
+    /// It counts.
+    Changed(GraphChange),
+    /// More of it is to come.
+    Part,
+    /// A version is missing: the whole graph must be asked for.
+    Gap,
+}
+
 impl Peer {
     /// A peer whose first link was elected.
     pub(super) fn new(link: u64, outbox: Outbox, carrier: Carrier, shared: &Arc<Shared>) -> Self {
@@ -83,6 +95,7 @@ impl Peer {
             counters,
             remote: BTreeMap::new(),
             remote_version: 0,
+            gathered: None,
             sent: BTreeMap::new(),
             sent_version: 0,
             next_route: 1,
@@ -157,40 +170,56 @@ impl Peer {
         if parts.is_empty() {
             parts.push(Vec::new());
         }
-        for part in parts {
+        let last = parts.len() - 1;
+        for (index, added) in parts.into_iter().enumerate() {
             self.sent_version += 1;
             let removed = removed.take().unwrap_or_default();
-            let graph = Graph { version: self.sent_version, before, added: part, removed };
+            let (version, more) = (self.sent_version, index < last);
+            let graph = Graph { version, before, added, removed, more };
             self.say(Message::Graph(graph));
             before = self.sent_version;
         }
         self.sent.clone_from(local);
     }
 
-    /// Takes a GRAPH in; `None` when a version is missing and the whole graph must be asked for.
+    /// Takes a GRAPH in.
     ///
     /// # Errors
     /// The peer announces more endpoints than allowed.
-    pub(super) fn take_graph(&mut self, graph: Graph) -> Result<Option<GraphChange>, &'static str> {
-        let whole = graph.before == 0;
-        if !whole && graph.before != self.remote_version {
-            return Ok(None);
+    pub(super) fn take_graph(&mut self, graph: Graph) -> Result<GraphTaken, &'static str> {
+        const TOO_MANY: &str = "more endpoints than a peer may have";
+        let Graph { version, before, added, removed, more } = graph;
+        if before == 0 {
+            self.gathered = Some(Vec::new());
+        } else if before != self.remote_version {
+            return Ok(GraphTaken::Gap);
         }
-        if whole {
-            self.remote.clear();
+        self.remote_version = version;
+        if let Some(gathered) = &mut self.gathered {
+            gathered.extend(added);
+            if gathered.len() > LIMITS.endpoints {
+                return Err(TOO_MANY);
+            }
+            if more {
+                return Ok(GraphTaken::Part);
+            }
+            let added = std::mem::take(gathered);
+            self.gathered = None;
+            self.remote = added.iter().map(|endpoint| (endpoint.gid, endpoint.clone())).collect();
             self.unserve_unrepeated();
+            let removed = Vec::new();
+            return Ok(GraphTaken::Changed(GraphChange { reset: true, added, removed }));
         }
-        for gid in &graph.removed {
+        for gid in &removed {
             self.remote.remove(gid);
         }
-        for endpoint in &graph.added {
+        for endpoint in &added {
             self.remote.insert(endpoint.gid, endpoint.clone());
         }
         if self.remote.len() > LIMITS.endpoints {
-            return Err("more endpoints than a peer may have");
+            return Err(TOO_MANY);
         }
-        self.remote_version = graph.version;
-        Ok(Some(GraphChange { reset: whole, added: graph.added, removed: graph.removed }))
+        Ok(GraphTaken::Changed(GraphChange { reset: false, added, removed }))
     }
 
     /// The version of the peer's graph that this side holds.
