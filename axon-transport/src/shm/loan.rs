@@ -74,7 +74,7 @@ impl Deref for Lender<'_> {
 }
 
 enum Memory {
-    /// Of words that are [aligned](ALIGNED).
+    /// Of words that are aligned to 16.
     Own(Vec<u128>),
     Shared(Place),
     Published,

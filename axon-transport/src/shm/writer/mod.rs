@@ -326,7 +326,7 @@ impl Writer {
         self.loan_behind(0, len)
     }
 
-    /// As [`loan`](Self::loan); aligned to [`ALIGNED`] is what is behind the first `header` bytes.
+    /// As [`loan`](Self::loan); aligned to 16 is what is behind the first `header` bytes.
     ///
     /// # Errors
     /// As [`publish`](Self::publish).
