@@ -60,6 +60,8 @@ def use(host, prefix):
     """Has a host's processes use this installation."""
     for name, path in (('AMENT_PREFIX_PATH', prefix), ('LD_LIBRARY_PATH', prefix / 'lib')):
         host.env[name] = f'{path}:{host.env[name]}'
+    # The profile beside the daemon is its configuration.
+    del host.env['AXON_CONFIG']
     # The tool is installed elsewhere, and finds the profile by its daemon.
     host.tool_env = {'AXON_DAEMON_PATH': str(prefix / 'lib/rmw_axon/axon_daemon')}
 
