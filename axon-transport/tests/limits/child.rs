@@ -130,7 +130,7 @@ pub(crate) fn play(part: &str) {
                     say("disconnected");
                 }
             });
-            let all: Vec<_> = (0..100)
+            let all: Vec<_> = (0..150)
                 .map(|number| {
                     let publisher = session.create_publisher(latched(&format!("/t{number}")));
                     let publisher = publisher.unwrap();
