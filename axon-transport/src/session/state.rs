@@ -38,7 +38,7 @@ pub enum SessionEvent {
     Matched(Gid),
     /// The daemon is gone. Rings that are attached flow on.
     DaemonLost,
-    /// A daemon, perhaps another one than before, knows this session's endpoints.
+    /// A daemon, perhaps another one than before, knows the session's endpoints.
     DaemonFound(DaemonId),
 }
 
@@ -238,7 +238,7 @@ impl Shared {
         self.notify(Some(&daemon.map_or(SessionEvent::DaemonLost, SessionEvent::DaemonFound)));
     }
 
-    /// For a relay: so many samples of `writer` were lost on their way to this session's
+    /// For a relay: so many samples of `writer` were lost on their way to the session's
     /// subscriptions.
     pub(crate) fn lost(&self, writer: &Gid, samples: u64) {
         let subscriptions: Vec<_> = self.state().subscriptions.values().cloned().collect();

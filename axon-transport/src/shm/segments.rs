@@ -1,4 +1,4 @@
-//! This session's own segments, by their numbers.
+//! A session's own segments, by their numbers.
 
 use std::{
     collections::BTreeMap,

@@ -99,15 +99,15 @@ impl SessionSegment {
         })
     }
 
-    /// An epoll instance that is readable when this session was rung.
+    /// An epoll instance that is readable when the session was rung.
     pub fn doorbell(&self) -> BorrowedFd<'_> {
         self.doorbell.as_fd()
     }
 
-    /// Has `listener` hear of all further segments of this session: other sessions must be told of
+    /// Has `listener` hear of all further segments of the session: other sessions must be told of
     /// them, and given their descriptors. False when there is a listener already.
     ///
-    /// It is called while locks are held: it must neither block nor call into this session.
+    /// It is called while locks are held: it must neither block nor call into the session.
     pub fn on_segment(&self, listener: impl Fn(SegmentEvent<'_>) + Send + Sync + 'static) -> bool {
         self.segments.listen(Box::new(listener))
     }
@@ -181,7 +181,7 @@ impl SessionSegment {
     }
 
     /// Has `elsewhere`, another session of this process where a thread waits, look again when `look` may
-    /// be ready, until what this returns is dropped. Somebody must listen for this session meanwhile.
+    /// be ready, until what this returns is dropped. Somebody must listen for the session meanwhile.
     pub(crate) fn pass_on(
         &self,
         look: Arc<dyn Look>,
@@ -190,7 +190,7 @@ impl SessionSegment {
         self.doorbell.pass_on(self.armed_words(), look, elsewhere.clone())
     }
 
-    /// Makes every waiter of this session look again.
+    /// Makes every waiter of the session look again.
     pub fn notify(&self) {
         if !self.is_forked() {
             self.doorbell.notify();
@@ -204,7 +204,7 @@ impl SessionSegment {
         }
     }
 
-    /// Lets an event loop lead this session's waits.
+    /// Lets an event loop lead the session's waits.
     ///
     /// # Errors
     /// There is one already, or this process is a fork of the session's.
@@ -261,7 +261,7 @@ impl SessionSegment {
         self.lanes.lock().unwrap_or_else(PoisonError::into_inner).free.push(lane);
     }
 
-    /// [Allocates](Heap::allocate) an object of this session.
+    /// [Allocates](Heap::allocate) an object of the session.
     pub(super) fn allocate(
         &self,
         len: u64,
@@ -271,7 +271,7 @@ impl SessionSegment {
         self.heap.allocate(&self.segments, len, need, mapped)
     }
 
-    /// Has [room](Heap::foresee) for an object of this session.
+    /// Has [room](Heap::foresee) for an object of the session.
     pub(super) fn foresee(&self, len: u64) {
         self.heap.foresee(&self.segments, len);
     }
@@ -290,7 +290,7 @@ impl SessionSegment {
         self.segments.open(SegmentKind::Samples(gid), bytes)
     }
 
-    /// A segment of this session.
+    /// A segment of the session.
     pub(super) fn own(&self, number: u32) -> Option<Arc<OwnSegment>> {
         self.segments.get(number)
     }
@@ -300,7 +300,7 @@ impl SessionSegment {
         self.segments.close(number);
     }
 
-    /// Tells this session's owner.
+    /// Tells the session's owner.
     pub(super) fn tell(&self, event: SegmentEvent<'_>) {
         self.segments.tell(event);
     }

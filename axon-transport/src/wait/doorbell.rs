@@ -85,7 +85,7 @@ enum Leader {
 struct Follower {
     turn: Condvar,
     look: Option<Arc<dyn Look>>,
-    /// It sleeps at this session's doorbell.
+    /// It sleeps at the session's doorbell.
     elsewhere: Option<Arc<SessionSegment>>,
 }
 
@@ -234,7 +234,7 @@ impl Doorbell {
     /// Wakes those of the crowd that what was heard may concern.
     fn spread(&self, mut crowd: MutexGuard<'_, Crowd>, words: Words<'_>, heard: Heard) {
         if heard.closed && !crowd.closed {
-            crowd.give_up(&self.ear, "closed this session's doorbell");
+            crowd.give_up(&self.ear, "closed the session's doorbell");
         }
         crowd.queued = (crowd.queued || heard.queued) && !crowd.closed;
         let rung = heard.rung || (heard.tick && crowd.closed);
@@ -388,9 +388,7 @@ impl Crowd {
                 // A ring whose event was still to come may have been taken with the others, and
                 // somebody sleeps who relies on it.
                 Drained::Some => ear.knock(),
-                Drained::Rights => {
-                    self.give_up(ear, "put descriptors into this session's doorbell")
-                }
+                Drained::Rights => self.give_up(ear, "put descriptors into the session's doorbell"),
             }
         }
         self.ticket += 1;
