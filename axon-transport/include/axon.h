@@ -612,8 +612,10 @@ typedef struct axon_loan_t {
 
 /**
  * Told of a line: how severe it is (AXON_LOG_*), which part of the library says it, and what. Both
- * strings stand during the call. It is called by whatever thread has something to say, must not
- * block, and what it makes the library say is not told.
+ * strings stand during the call. It is called on a thread of the library's own, which begins with the
+ * first line, for one line after another. That thread has nothing else to do and holds nothing that the
+ * program may wait for, so the callback may block and may call this interface. Meanwhile 256 lines wait;
+ * of more only the number is told. What the callback makes the library say on its thread is not told.
  */
 typedef void (*axon_log_t)(const void *user, uint32_t severity, const char *part, const char *text);
 
@@ -1035,7 +1037,7 @@ axon_ret_t axon_session_loan_abandon(struct axon_loan_t loan);
 /**
  * Has `callback` told of what the library says in this process, in place of the one before, which has
  * returned and is not called any more when this returns. Null: nobody is told, as at first. A daemon
- * has a log of its own.
+ * has a log of its own. A forked child says it again for what it says itself.
  *
  * AXON_RET_ERROR: it is called from within a callback, or a part of the program in Rust has what the
  * library says already (a global `tracing` subscriber).

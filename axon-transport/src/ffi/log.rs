@@ -1,7 +1,8 @@
 //! What the library logs, for the program to hear.
 
+mod queue;
+
 use std::{
-    cell::Cell,
     ffi::{CString, c_void},
     fmt::{Debug, Write as _},
     os::raw::c_char,
@@ -34,8 +35,10 @@ pub const AXON_LOG_WARN: u32 = 30;
 pub const AXON_LOG_ERROR: u32 = 40;
 
 /// Told of a line: how severe it is (AXON_LOG_*), which part of the library says it, and what. Both
-/// strings stand during the call. It is called by whatever thread has something to say, must not
-/// block, and what it makes the library say is not told.
+/// strings stand during the call. It is called on a thread of the library's own, which begins with the
+/// first line, for one line after another. That thread has nothing else to do and holds nothing that the
+/// program may wait for, so the callback may block and may call this interface. Meanwhile 256 lines wait;
+/// of more only the number is told. What the callback makes the library say on its thread is not told.
 pub type axon_log_t = Option<
     unsafe extern "C" fn(
         user: *const c_void,
@@ -52,14 +55,9 @@ static TOLD: RwLock<Option<Told>> = RwLock::new(None);
 /// Guards nothing but itself: its loads and stores are relaxed.
 static LEAST: AtomicU32 = AtomicU32::new(AXON_LOG_WARN);
 
-thread_local! {
-    /// Whether the function is being called on this thread.
-    static TELLING: Cell<bool> = const { Cell::new(false) };
-}
-
 /// Has `callback` told of what the library says in this process, in place of the one before, which has
 /// returned and is not called any more when this returns. Null: nobody is told, as at first. A daemon
-/// has a log of its own.
+/// has a log of its own. A forked child says it again for what it says itself.
 ///
 /// AXON_RET_ERROR: it is called from within a callback, or a part of the program in Rust has what the
 /// library says already (a global `tracing` subscriber).
@@ -72,7 +70,7 @@ pub unsafe extern "C" fn axon_session_log_set_callback(
     user: *const c_void,
 ) -> axon_ret_t {
     guarded(|| {
-        if TELLING.get() {
+        if queue::is_teller() {
             return Err(Failure::new(AXON_RET_ERROR, "called from within a log callback"));
         }
         let mut told = TOLD.write().unwrap_or_else(PoisonError::into_inner);
@@ -104,6 +102,33 @@ fn severity(level: &Level) -> u32 {
     }
 }
 
+fn is_wanted(severity: u32) -> bool {
+    severity >= LEAST.load(Ordering::Relaxed)
+}
+
+/// Something that was said.
+struct Line {
+    severity: u32,
+    part: &'static str,
+    text: String,
+}
+
+impl Line {
+    /// Calls the program, if it still wants to hear of this.
+    fn tell(self) {
+        let told = TOLD.read().unwrap_or_else(PoisonError::into_inner);
+        let Some((function, User(user))) = *told else { return };
+        if !is_wanted(self.severity) {
+            return;
+        }
+        let text = |text: &str| CString::new(text.replace('\0', " ")).unwrap_or_default();
+        let (part, text) = (text(self.part), text(&self.text));
+        // SAFETY: whoever set it says that it may be called so until it is replaced, for which the
+        // lock would be needed.
+        unsafe { function(user, self.severity, part.as_ptr(), text.as_ptr()) };
+    }
+}
+
 /// Hears all of the process.
 struct Listener;
 
@@ -122,26 +147,18 @@ impl Subscriber for Listener {
     }
 
     fn enabled(&self, metadata: &Metadata<'_>) -> bool {
-        severity(metadata.level()) >= LEAST.load(Ordering::Relaxed) && metadata.is_event()
+        is_wanted(severity(metadata.level())) && metadata.is_event() && !queue::is_teller()
     }
 
     fn event(&self, event: &Event<'_>) {
-        if TELLING.replace(true) {
-            return;
-        }
-        let told = TOLD.read().unwrap_or_else(PoisonError::into_inner);
-        if let Some((function, User(user))) = *told {
-            let metadata = event.metadata();
-            let mut line = Line::default();
-            event.record(&mut line);
-            let text = |text: String| CString::new(text.replace('\0', " ")).unwrap_or_default();
-            let (part, text) = (text(metadata.target().to_owned()), text(line.text()));
-            // SAFETY: whoever set it says that it may be called so until it is replaced, for which
-            // the lock would be needed.
-            unsafe { function(user, severity(metadata.level()), part.as_ptr(), text.as_ptr()) };
-        }
-        drop(told);
-        TELLING.set(false);
+        let metadata = event.metadata();
+        let mut text = Text::default();
+        event.record(&mut text);
+        queue::say(Line {
+            severity: severity(metadata.level()),
+            part: metadata.target(),
+            text: text.message + &text.values,
+        });
     }
 
     // Spans are not shown: there is one of them, and it is not entered.
@@ -160,23 +177,75 @@ impl Subscriber for Listener {
 
 /// An event as text: what it says, and then its values.
 #[derive(Default)]
-struct Line {
+struct Text {
     message: String,
     values: String,
 }
 
-impl Line {
-    fn text(self) -> String {
-        self.message + &self.values
-    }
-}
-
-impl Visit for Line {
+impl Visit for Text {
     fn record_debug(&mut self, field: &Field, value: &dyn Debug) {
         // To write to a string does not fail.
         let _ = match field.name() {
             "message" => write!(self.message, "{value:?}"),
             name => write!(self.values, " {name}={value:?}"),
         };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{
+        ffi::CStr,
+        sync::{Mutex, mpsc},
+    };
+
+    use super::*;
+    use crate::ffi::error::AXON_RET_OK;
+
+    /// What a program's logger holds while it publishes what it logs.
+    static LOGGER: Mutex<()> = Mutex::new(());
+
+    unsafe extern "C" fn hear(user: *const c_void, _: u32, _: *const c_char, text: *const c_char) {
+        // SAFETY: what the test set, which outlives its callback.
+        let heard = unsafe { &*user.cast::<Mutex<mpsc::Sender<String>>>() };
+        let _held = LOGGER.lock().unwrap();
+        // SAFETY: a string that stands during the call.
+        let text = unsafe { CStr::from_ptr(text) }.to_string_lossy().into_owned();
+        tracing::error!("said by a callback");
+        let _ = heard.lock().unwrap().send(text);
+    }
+
+    #[test]
+    fn whoever_says_something_waits_for_no_callback_and_what_is_too_much_is_counted() {
+        let (sender, heard) = mpsc::channel::<String>();
+        let sender = Mutex::new(sender);
+        let set = |callback: axon_log_t| {
+            // SAFETY: `sender` stands until the callback is taken back, below.
+            unsafe { axon_session_log_set_callback(callback, (&raw const sender).cast()) }
+        };
+        assert_eq!(set(Some(hear)), AXON_RET_OK);
+        let held = LOGGER.lock().unwrap();
+        for number in 0..300 {
+            tracing::error!(number, "said in a test");
+        }
+        drop(held);
+        let mut said = 0;
+        // What other tests say meanwhile is heard as well.
+        loop {
+            let text = heard.recv().unwrap();
+            assert!(!text.contains("said by a callback"), "{text}");
+            said += u64::from(text.starts_with("said in a test"));
+            if let Some(lost) = text.strip_suffix(" more lines than could wait were said") {
+                let lost: u64 = lost.parse().unwrap();
+                assert!(lost + said >= 300 && said <= 257, "{said} told, {lost} lost");
+                break;
+            }
+        }
+        tracing::error!("the last");
+        while !heard.recv().unwrap().starts_with("the last") {}
+        assert_eq!(set(None), AXON_RET_OK);
+        tracing::error!("to nobody");
+        drop(sender);
+        assert!(heard.iter().all(|text| !text.starts_with("to nobody")));
     }
 }
