@@ -13,6 +13,7 @@
 #include "context.hpp"
 #include "error.hpp"
 #include "features.hpp"
+#include "logging.hpp"
 #include "rcutils/strdup.h"
 #include "rmw/init.h"
 #include "rmw/init_options.h"
@@ -214,6 +215,7 @@ rmw_ret_t rmw_init(const rmw_init_options_t * options, rmw_context_t * context)
         throw Failure(RMW_RET_INVALID_ARGUMENT, "context is initialised already");
       }
       auto impl = std::make_unique<rmw_context_impl_t>();
+      rmw_axon::start_logging();
       impl->session = open_session(*options);
       uint32_t domain = 0;
       rmw_init_options_t kept = rmw_get_zero_initialized_init_options();

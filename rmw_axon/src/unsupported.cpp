@@ -8,7 +8,6 @@
 #include "endpoint.hpp"
 #include "error.hpp"
 #include "features.hpp"
-#include "rcutils/logging.h"
 #include "rmw/get_network_flow_endpoints.h"
 #include "rmw/rmw.h"
 
@@ -112,26 +111,5 @@ rmw_ret_t rmw_serialization_support_init(
   return guarded([] {unsupported("dynamic messages");});
 }
 #endif
-
-rmw_ret_t rmw_set_log_severity(rmw_log_severity_t severity)
-{
-  return guarded(
-    [&] {
-      switch (severity) {
-        case RMW_LOG_SEVERITY_DEBUG:
-        case RMW_LOG_SEVERITY_INFO:
-        case RMW_LOG_SEVERITY_WARN:
-        case RMW_LOG_SEVERITY_ERROR:
-        case RMW_LOG_SEVERITY_FATAL:
-          break;
-        default:
-          throw Failure(RMW_RET_INVALID_ARGUMENT, "severity is none");
-      }
-      const int level = static_cast<int>(severity);
-      if (rcutils_logging_set_logger_level(rmw_axon::identifier, level) != RCUTILS_RET_OK) {
-        throw Failure(RMW_RET_ERROR, "the logger's severity could not be set");
-      }
-    });
-}
 
 }
