@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT OR Apache-2.0
-"""What the programs here have in common: `python3 FILE.py FUNCTION [ARGUMENT...]`.
+"""What the programs here have in common: `python3 FILE.py FUNCTION [ARGUMENT...] [--ros-args ...]`.
 
 Each says what it does in lines of its own, and ends when it is interrupted.
 """
@@ -8,6 +8,7 @@ import sys
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.utilities import remove_ros_args
 
 
 def say(text):
@@ -25,7 +26,8 @@ def main(functions):
     """Run the one of `functions` that the command line names."""
     rclpy.init()
     try:
-        functions[sys.argv[1]](*sys.argv[2:])
+        function, *arguments = remove_ros_args(sys.argv)[1:]
+        functions[function](*arguments)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
