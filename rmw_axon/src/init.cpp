@@ -4,6 +4,7 @@
 
 #include <dlfcn.h>
 
+#include <exception>
 #include <memory>
 #include <string>
 #include <tuple>
@@ -216,7 +217,12 @@ rmw_ret_t rmw_init(const rmw_init_options_t * options, rmw_context_t * context)
       }
       auto impl = std::make_unique<rmw_context_impl_t>();
       rmw_axon::start_logging();
-      impl->session = open_session(*options);
+      try {
+        impl->session = open_session(*options);
+      } catch (const std::exception &) {
+        rmw_axon::tell_logger();
+        throw;
+      }
       uint32_t domain = 0;
       rmw_init_options_t kept = rmw_get_zero_initialized_init_options();
       rmw_ret_t copied = RMW_RET_ERROR;
@@ -243,6 +249,8 @@ rmw_ret_t rmw_shutdown(rmw_context_t * context)
       require_initialized(context->implementation_identifier, "context");
       require(context->impl, "context's implementation");
       context->impl->is_shutdown = true;
+      // Where there was no node.
+      rmw_axon::tell_logger();
     });
 }
 

@@ -4,6 +4,10 @@
 
 #include "logging.hpp"
 
+#include <atomic>
+#include <condition_variable>
+#include <mutex>
+
 #include "axon.h"
 #include "error.hpp"
 #include "rcutils/logging.h"
@@ -15,8 +19,48 @@ namespace rmw_axon
 namespace
 {
 
+// Where the core's thread waits with the first line until the logger may be told.
+class Gate
+{
+public:
+  void pass()
+  {
+    // With release in open(): what the opener set before, the logger's levels above all.
+    if (is_open_.load(std::memory_order_acquire)) {
+      return;
+    }
+    std::unique_lock<std::mutex> lock(mutex_);
+    opened_.wait(lock, [this] {return is_open_.load(std::memory_order_relaxed);});
+  }
+
+  void open()
+  {
+    if (is_open_.load(std::memory_order_acquire)) {
+      return;
+    }
+    {
+      const std::lock_guard<std::mutex> lock(mutex_);
+      is_open_.store(true, std::memory_order_release);
+    }
+    opened_.notify_all();
+  }
+
+private:
+  std::atomic<bool> is_open_{false};
+  std::mutex mutex_;
+  std::condition_variable opened_;
+};
+
+// Never destroyed: the thread may wait at it while the process ends.
+Gate & gate()
+{
+  static Gate * const made = new Gate;
+  return *made;
+}
+
 void tell(const void *, uint32_t severity, const char * part, const char * text)
 {
+  gate().pass();
   // AXON_LOG_* are the numbers that ROS has for the same severities.
   const int level = static_cast<int>(severity);
   if (rcutils_logging_logger_is_enabled_for(identifier, level)) {
@@ -29,10 +73,16 @@ void tell(const void *, uint32_t severity, const char * part, const char * text)
 
 void start_logging()
 {
+  gate();
   // The logger's level, which may change at any time, says what is told.
   check(axon_session_log_set_severity(AXON_LOG_DEBUG));
   // Refused where the program has its own ear for what Rust code says: then it hears it there.
   axon_session_log_set_callback(tell, nullptr);
+}
+
+void tell_logger()
+{
+  gate().open();
 }
 
 }  // namespace rmw_axon

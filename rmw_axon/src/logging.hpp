@@ -6,8 +6,11 @@
 namespace rmw_axon
 {
 
-// From now on what the core says in this process goes to ROS's logger. As often as one likes.
+// From now on what the core says in this process is for ROS's logger. As often as one likes.
 void start_logging();
+
+// Tells the logger from now on, and first what has been said so far: a program sets its levels after rmw_init.
+void tell_logger();
 
 }  // namespace rmw_axon
 

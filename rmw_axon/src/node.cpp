@@ -4,6 +4,7 @@
 
 #include "context.hpp"
 #include "error.hpp"
+#include "logging.hpp"
 #include "rmw/rmw.h"
 #include "rmw/validate_namespace.h"
 #include "rmw/validate_node_name.h"
@@ -68,6 +69,7 @@ rmw_node_t * rmw_create_node(rmw_context_t * context, const char * name, const c
   return rmw_axon::guarded_pointer(
     [&] {
       rmw_context_impl_t & impl = rmw_axon::usable(context);
+      rmw_axon::tell_logger();
       require(name, "name");
       require(namespace_, "namespace_");
       rmw_axon::validate(name, namespace_);

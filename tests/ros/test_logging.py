@@ -29,7 +29,11 @@ def test_a_daemon_that_is_killed_is_told_of_by_the_logger_unless_it_is_to_be_sil
     assert 'rmw_axon' not in silent.output
 
 
-def test_what_is_only_worth_knowing_is_told_by_default_too(host):
+def test_what_is_said_before_the_levels_are_set_obeys_them_too(host):
     host.env['AXON_SHM'] = 'off'
-    relayed = host.node('qos', 'subscription', 0)
-    relayed.said(r'\[INFO\] \[\d+\.\d+\] \[rmw_axon\]: samples pass through the daemon')
+    told = host.node('qos', 'subscription', 0)
+    silent = host.node('qos', 'subscription', 0, *level('warn'))
+    told.said(r'\[INFO\] \[\d+\.\d+\] \[rmw_axon\]: samples pass through the daemon')
+    host.node('qos', 'publisher', 100000, 0.1)
+    silent.said('heard', count=3)
+    assert 'samples pass through the daemon' not in silent.output
