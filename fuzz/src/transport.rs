@@ -11,7 +11,7 @@ use axon_transport::{
     keys::KeyMessage,
     link::{self, FrameError},
     qos::Qos,
-    relay::flow::{Incoming, Pool, WINDOW},
+    relay::flow::{Channel, Incoming, Pool, WINDOW},
     session::message::{self as session, CodecError, MAX_PACKET},
     shm::Location,
 };
@@ -76,13 +76,19 @@ pub fn session_message(data: &[u8]) -> bool {
     true
 }
 
+/// A publisher's, and those of a server's responses to two clients.
+fn relay_channels() -> [Channel; 3] {
+    let [writer, one, other] = [1, 2, 3].map(|number| Gid([number; 16]));
+    [Channel::of(writer), Channel::between(writer, one), Channel::between(writer, other)]
+}
+
 /// Packets of a relayed session, each behind its length: whatever their pieces say, no more is kept
 /// than the session was given credit for, and all of it is given back.
 pub fn relay_pieces(data: &[u8]) -> bool {
     const MAX: u64 = 100_000;
     let pool = Pool::new(MAX);
     let mut incoming = Incoming::new(MAX, pool.clone());
-    let channels = [Gid([1; 16]), Gid([2; 16])];
+    let channels = relay_channels();
     for channel in channels {
         assert!(incoming.open(channel).is_some_and(|credit| credit.bytes == WINDOW));
     }
@@ -215,26 +221,28 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
     messages.iter().map(|message| message.to_frame().unwrap().split_off(4)).collect()
 }
 
-/// One sample in one piece, two at a time in several, and one longer than a channel's window.
+/// One sample in one piece, one on each of three channels at a time in several, and one longer than a
+/// channel's window.
 pub fn relay_pieces_seeds() -> Vec<Vec<u8>> {
     use session::{Head, Message, Piece};
-    let piece = |channel, length: Option<u32>, bytes: usize| {
+    let piece = |channel: usize, length: Option<u32>, bytes: usize| {
         let head = length.map(|length| Head { length, sequence: 1, source_timestamp: 2, lost: 3 });
-        let publisher = Gid([channel; 16]);
-        let packet =
-            Message::Piece(Piece { publisher, head, bytes: vec![0; bytes] }).encode().unwrap();
+        let Channel { writer: publisher, client } = relay_channels()[channel];
+        let piece = Piece { publisher, head, bytes: vec![0; bytes], client };
+        let packet = Message::Piece(piece).encode().unwrap();
         let length = u16::try_from(packet.len()).unwrap().to_be_bytes();
         [&length[..], &packet].concat()
     };
-    let both = [piece(1, Some(9), 4), piece(2, Some(8), 0), piece(1, None, 5), piece(2, None, 8)];
-    let long = [piece(1, Some(40_000), 30_000), piece(1, None, 10_000)];
-    vec![piece(1, Some(3), 3), both.concat(), long.concat()]
+    let begun = [(0, 9, 4), (1, 8, 0), (2, 7, 7)].map(|(of, all, now)| piece(of, Some(all), now));
+    let ended = [(1, 8), (0, 5)].map(|(of, rest)| piece(of, None, rest));
+    let long = [piece(2, Some(40_000), 30_000), piece(2, None, 10_000)];
+    vec![piece(0, Some(3), 3), [begun.concat(), ended.concat()].concat(), long.concat()]
 }
 
 /// Every message of the session socket.
 pub fn session_message_seeds() -> Vec<Vec<u8>> {
     use session::{
-        Announce, Attach, Credit, EndpointRole, Gone, Granted, Graph, GraphItem, Head, Hello, Matched,
+        Announce, Asserted, Attach, Credit, EndpointRole, Gone, Granted, Graph, GraphItem, Head, Hello, Matched,
         Message, PROTOCOL, Pair, Piece, Refused, Segment, SegmentName, SegmentOpened, SessionRole, StatusPart, Unmatch,
         Welcome,
     };
@@ -307,8 +315,10 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             publisher: writer,
             head: Some(Head { length: 3, sequence: 7, source_timestamp: -1, lost: 2 }),
             bytes: vec![1, 2],
+            client: None,
         }),
-        Message::Credit(Credit { publisher: writer, bytes: 128, opens: true }),
+        Message::Credit(Credit { publisher: writer, bytes: 128, opens: true, client: Some(reader) }),
+        Message::Asserted(Asserted { publishers: vec![writer] }),
         Message::Unknown(200),
     ];
     messages.iter().map(|message| message.encode().unwrap()).collect()

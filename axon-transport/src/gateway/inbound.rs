@@ -12,11 +12,12 @@ use super::{
     pulse::Pulse,
     routes_in::RoutesIn,
     seal::{MAX_OVERHEAD, Protection, RefusedMessage, writer},
-    stand_in::{StandIn, Written},
+    stand_in::StandIn,
 };
 use crate::{
     ids::Gid,
     link::CloseCode,
+    session::Written,
     shm::{Meta, PublishError},
 };
 

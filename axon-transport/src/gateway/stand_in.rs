@@ -19,9 +19,9 @@ use std::{
 
 use super::{keyring::lock, queue::Sample, seal::sample};
 use crate::{
-    graph::{Endpoint, EndpointKind},
+    graph::Endpoint,
     ids::Gid,
-    session::{Client, Publisher, Server, Session, SessionError},
+    session::{Face, Session, SessionError, Written},
     shm::{Meta, PublishError},
 };
 
@@ -42,21 +42,6 @@ pub(super) struct StandIn {
     last: AtomicU64,
     gid: Gid,
     known: Known,
-}
-
-enum Face {
-    Publisher(Publisher),
-    Client(Client),
-    Server(Server),
-}
-
-/// What became of a message that was to be written.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Written {
-    /// Its readers have it.
-    Yes,
-    /// The client that it answers is gone.
-    Nobody,
 }
 
 impl StandIns {
@@ -88,7 +73,7 @@ impl StandIns {
                 }
                 None => {
                     let stand_in = Arc::new(StandIn {
-                        face: Some(Face::new(session, remote.clone())?),
+                        face: Some(Face::stand_in(session, remote.clone())?),
                         feeding: Arc::default(),
                         last: AtomicU64::new(0),
                         gid: remote.gid,
@@ -102,16 +87,6 @@ impl StandIns {
     }
 }
 
-impl Face {
-    fn new(session: &Session, remote: Endpoint) -> Result<Self, SessionError> {
-        Ok(match remote.kind {
-            EndpointKind::Client => Self::Client(session.create_stand_in_client(remote)?),
-            EndpointKind::Server => Self::Server(session.create_stand_in_server(remote)),
-            _ => Self::Publisher(session.create_stand_in(remote)?),
-        })
-    }
-}
-
 impl StandIn {
     /// Whom it stands for.
     pub(super) fn gid(&self) -> Gid {
@@ -119,20 +94,12 @@ impl StandIn {
     }
 
     fn endpoint(&self) -> &Endpoint {
-        match self.face() {
-            Face::Publisher(publisher) => publisher.endpoint(),
-            Face::Client(client) => client.endpoint(),
-            Face::Server(server) => server.endpoint(),
-        }
+        self.face().endpoint()
     }
 
     /// Those here whom it reaches and who, where it is of a service, reach it.
     pub(super) fn partners(&self) -> Vec<Gid> {
-        match self.face() {
-            Face::Publisher(publisher) => publisher.matched(),
-            Face::Client(client) => client.servers(),
-            Face::Server(server) => server.clients(),
-        }
+        self.face().partners()
     }
 
     /// Writes a sample, a request, or a response to `client`, without waiting for room.
@@ -145,28 +112,15 @@ impl StandIn {
         meta: Meta,
         payload: &[u8],
     ) -> Result<Written, PublishError> {
-        let there = match self.face() {
-            Face::Publisher(publisher) => {
-                publisher.try_publish_with(meta, payload)?;
-                true
-            }
-            Face::Client(client) => {
-                client.try_forward(meta, payload)?;
-                true
-            }
-            Face::Server(server) => server.try_respond(client, meta, payload)?,
-        };
+        let written = self.face().try_write(client, meta, payload)?;
         // Relaxed: only where a resumed route begins; sessions drop what they have seen.
         self.last.store(meta.sequence, Ordering::Relaxed);
-        Ok(if there { Written::Yes } else { Written::Nobody })
+        Ok(written)
     }
 
     /// Its host says that it is alive.
     pub(super) fn assert_alive(&self) {
-        if let Face::Publisher(publisher) = self.face() {
-            // Only a forked child is refused.
-            let _ = publisher.assert_liveliness();
-        }
+        self.face().assert_alive();
     }
 
     /// What goes to its host: the next request to a server, or response to a client.

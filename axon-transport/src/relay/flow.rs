@@ -1,10 +1,11 @@
 //! Samples in pieces, and who may send how many of them: plain data in, data out.
 //!
-//! There is a channel for each publisher whose samples cross. Its receiver lets the sender have so
-//! many bytes under way, and gives them back when samples have gone to where they belong: whoever is
-//! not read leaves its samples in the ring they come from, where their publisher's QoS says what
-//! becomes of them, and holds up no other channel. Pieces of all channels take turns, so that an image
-//! does not keep a small sample waiting.
+//! There is a [`Channel`] for each publisher whose samples cross, each client's requests, and the
+//! responses of each server to each client. Its receiver lets the sender have so many bytes under way,
+//! and gives them back when samples have gone to where they belong: whoever is not read leaves its
+//! samples in the ring they come from, where their publisher's QoS says what becomes of them, and holds
+//! up no other channel. Pieces of all channels take turns, so that an image does not keep a small
+//! sample waiting.
 
 use std::{
     collections::{BTreeMap, HashMap, VecDeque},
@@ -29,6 +30,31 @@ pub const PIECE: usize = 31 << 10;
 /// Bytes beyond the windows of its channels that one session's arriving samples may take; one sample
 /// may always.
 const SESSION: u64 = 64 << 20;
+
+/// Samples that follow each other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Channel {
+    /// Who wrote them.
+    pub writer: Gid,
+    /// The one whose responses they are, where a server did.
+    pub client: Option<Gid>,
+}
+
+impl Channel {
+    /// That of a publisher's samples, or a client's requests.
+    pub fn of(writer: Gid) -> Self {
+        Self { writer, client: None }
+    }
+
+    /// That of a server's responses to a client.
+    pub fn between(server: Gid, client: Gid) -> Self {
+        Self { writer: server, client: Some(client) }
+    }
+
+    fn credit(self, bytes: u64, opens: bool) -> Credit {
+        Credit { publisher: self.writer, bytes, opens, client: self.client }
+    }
+}
 
 /// A sample's bytes.
 pub trait Content {
@@ -78,9 +104,9 @@ pub struct Departing<S> {
 /// The sending end.
 #[derive(Debug)]
 pub struct Outgoing<S> {
-    channels: BTreeMap<Gid, Sending<S>>,
+    channels: BTreeMap<Channel, Sending<S>>,
     /// Channels that may send a piece, in their order.
-    turns: VecDeque<Gid>,
+    turns: VecDeque<Channel>,
 }
 
 #[derive(Debug)]
@@ -102,21 +128,30 @@ impl<S> Default for Outgoing<S> {
 
 impl<S: Content> Outgoing<S> {
     /// Opens a channel, which waits for its receiver.
-    pub fn open(&mut self, publisher: Gid) {
+    pub fn open(&mut self, channel: Channel) {
         let closed = Sending { credit: None, window: 0, current: None, in_turn: false };
-        self.channels.entry(publisher).or_insert(closed);
+        self.channels.entry(channel).or_insert(closed);
     }
 
-    /// Closes a channel; the rest of a sample that is under way is not sent.
-    pub fn close(&mut self, publisher: &Gid) {
-        self.channels.remove(publisher);
-        self.turns.retain(|gid| gid != publisher);
+    /// Closes those channels that `keep` does not want; the rest of a sample that is under way is not
+    /// sent.
+    pub fn retain(&mut self, keep: impl Fn(&Channel) -> bool) {
+        self.channels.retain(|channel, _| keep(channel));
+        let channels = &self.channels;
+        self.turns.retain(|channel| channels.contains_key(channel));
+    }
+
+    /// Closes a channel.
+    pub fn close(&mut self, channel: &Channel) {
+        self.channels.remove(channel);
+        self.turns.retain(|other| other != channel);
     }
 
     /// What the receiver of a channel says.
     pub fn credit(&mut self, credit: &Credit) {
-        let Credit { publisher, bytes, opens } = *credit;
-        let Some(channel) = self.channels.get_mut(&publisher) else { return };
+        let Credit { publisher, bytes, opens, client } = *credit;
+        let name = Channel { writer: publisher, client };
+        let Some(channel) = self.channels.get_mut(&name) else { return };
         match (&mut channel.credit, opens) {
             (none @ None, true) => {
                 *none = Some(bytes);
@@ -126,12 +161,12 @@ impl<S: Content> Outgoing<S> {
             // Of a channel that this one came after.
             (None, false) | (Some(_), true) => {}
         }
-        self.enqueue(publisher);
+        self.enqueue(name);
     }
 
     /// Whether all that was sent on a channel has gone to where it belongs.
-    pub fn is_idle(&self, publisher: &Gid) -> bool {
-        self.channels.get(publisher).is_none_or(|channel| {
+    pub fn is_idle(&self, channel: &Channel) -> bool {
+        self.channels.get(channel).is_none_or(|channel| {
             channel.current.is_none()
                 && channel.credit.is_none_or(|credit| credit == channel.window)
         })
@@ -139,23 +174,23 @@ impl<S: Content> Outgoing<S> {
 
     /// Asks for the next sample of each channel that has none under way and may send one. Whether
     /// there was any.
-    pub fn fill(&mut self, mut take: impl FnMut(&Gid) -> Option<Departing<S>>) -> bool {
+    pub fn fill(&mut self, mut take: impl FnMut(&Channel) -> Option<Departing<S>>) -> bool {
         let mut found = Vec::new();
-        for (gid, channel) in &mut self.channels {
+        for (name, channel) in &mut self.channels {
             if channel.current.is_none() && channel.credit >= Some(OVERHEAD) {
-                channel.current = take(gid).map(|sample| (sample, None));
-                found.extend(channel.current.is_some().then_some(*gid));
+                channel.current = take(name).map(|sample| (sample, None));
+                found.extend(channel.current.is_some().then_some(*name));
             }
         }
-        found.iter().for_each(|gid| self.enqueue(*gid));
+        found.iter().for_each(|name| self.enqueue(*name));
         !found.is_empty()
     }
 
     /// The next piece, of the channel whose turn it is.
     pub fn next_piece(&mut self) -> Option<Piece> {
         loop {
-            let publisher = self.turns.pop_front()?;
-            let Some(channel) = self.channels.get_mut(&publisher) else { continue };
+            let name = self.turns.pop_front()?;
+            let Some(channel) = self.channels.get_mut(&name) else { continue };
             channel.in_turn = false;
             let (Some((sample, at)), Some(credit)) = (&mut channel.current, &mut channel.credit)
             else {
@@ -189,18 +224,19 @@ impl<S: Content> Outgoing<S> {
             if bytes.len() == left {
                 channel.current = None;
             } else {
-                self.enqueue(publisher);
+                self.enqueue(name);
             }
-            return Some(Piece { publisher, head, bytes });
+            let Channel { writer: publisher, client } = name;
+            return Some(Piece { publisher, head, bytes, client });
         }
     }
 
-    fn enqueue(&mut self, publisher: Gid) {
-        if let Some(channel) = self.channels.get_mut(&publisher)
+    fn enqueue(&mut self, name: Channel) {
+        if let Some(channel) = self.channels.get_mut(&name)
             && channel.current.is_some()
             && !std::mem::replace(&mut channel.in_turn, true)
         {
-            self.turns.push_back(publisher);
+            self.turns.push_back(name);
         }
     }
 }
@@ -208,8 +244,8 @@ impl<S: Content> Outgoing<S> {
 /// A sample that has come whole.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Arrived {
-    /// Its publisher.
-    pub publisher: Gid,
+    /// On which channel.
+    pub channel: Channel,
     /// Its number and time.
     pub meta: Meta,
     /// Samples of its publisher that were lost since the one before.
@@ -274,10 +310,10 @@ impl Pool {
 /// The receiving end.
 #[derive(Debug)]
 pub struct Incoming {
-    channels: HashMap<Gid, Receiving>,
+    channels: HashMap<Channel, Receiving>,
     max_message: u64,
     /// Channels whose sample is longer than their window, until there is room.
-    waiting: VecDeque<Gid>,
+    waiting: VecDeque<Channel>,
     /// Bytes that were granted beyond the windows.
     reserved: u64,
     pool: Arc<Pool>,
@@ -306,20 +342,25 @@ impl Incoming {
     }
 
     /// Opens a channel, unless it is open: what its sender is to be told.
-    pub fn open(&mut self, publisher: Gid) -> Option<Credit> {
-        if self.channels.contains_key(&publisher) {
+    pub fn open(&mut self, channel: Channel) -> Option<Credit> {
+        if self.channels.contains_key(&channel) {
             return None;
         }
-        self.channels.insert(publisher, Receiving::default());
-        Some(Credit { publisher, bytes: WINDOW, opens: true })
+        self.channels.insert(channel, Receiving::default());
+        Some(channel.credit(WINDOW, true))
     }
 
-    /// Closes a channel and forgets what came on it.
-    pub fn close(&mut self, publisher: &Gid) {
-        if let Some(channel) = self.channels.remove(publisher) {
-            self.release(channel.granted);
-        }
-        self.waiting.retain(|gid| gid != publisher);
+    /// Closes those channels that `keep` does not want, and forgets what came on them.
+    pub fn retain(&mut self, keep: impl Fn(&Channel) -> bool) {
+        let mut granted = 0;
+        self.channels.retain(|name, channel| {
+            let keep = keep(name);
+            granted += if keep { 0 } else { channel.granted };
+            keep
+        });
+        self.release(granted);
+        let channels = &self.channels;
+        self.waiting.retain(|channel| channels.contains_key(channel));
     }
 
     /// Takes a piece; the sample, if it was the last.
@@ -327,9 +368,10 @@ impl Incoming {
     /// # Errors
     /// [`Violation`].
     pub fn piece(&mut self, piece: Piece) -> Result<Option<Arrived>, Violation> {
-        let Piece { publisher, head, bytes } = piece;
+        let Piece { publisher, head, bytes, client } = piece;
+        let name = Channel { writer: publisher, client };
         // Of a channel that was closed meanwhile.
-        let Some(channel) = self.channels.get_mut(&publisher) else { return Ok(None) };
+        let Some(channel) = self.channels.get_mut(&name) else { return Ok(None) };
         let opens = head.is_some();
         let partial = match (head, channel.partial.take()) {
             (Some(head), None) if u64::from(head.length) > self.max_message => {
@@ -353,20 +395,20 @@ impl Incoming {
         if payload.len() < length {
             channel.partial = Some(Partial { head, payload });
             if opens && extra(length) > 0 {
-                self.waiting.push_back(publisher);
+                self.waiting.push_back(name);
             }
             return Ok(None);
         }
         let Head { sequence, source_timestamp, lost, .. } = head;
         let meta = Meta { sequence, source_timestamp };
-        Ok(Some(Arrived { publisher, meta, lost, payload }))
+        Ok(Some(Arrived { channel: name, meta, lost, payload }))
     }
 
     /// For whom there is room now.
     pub fn grants(&mut self) -> Vec<Credit> {
         let mut granted = Vec::new();
-        while let Some(publisher) = self.waiting.front().copied() {
-            let channel = self.channels.get_mut(&publisher);
+        while let Some(name) = self.waiting.front().copied() {
+            let channel = self.channels.get_mut(&name);
             let Some((channel, length)) = channel.and_then(|c| {
                 let length = c.partial.as_ref()?.head.length as usize;
                 Some((c, length))
@@ -381,7 +423,7 @@ impl Incoming {
             channel.granted += more;
             self.reserved += more;
             self.waiting.pop_front();
-            granted.push(Credit { publisher, bytes: more, opens: false });
+            granted.push(name.credit(more, false));
         }
         granted
     }
@@ -393,15 +435,15 @@ impl Incoming {
 
     /// A sample has gone to where it belongs, or nowhere: what its sender is given back.
     pub fn done(&mut self, sample: &Arrived) -> Option<Credit> {
-        let publisher = sample.publisher;
-        let channel = self.channels.get_mut(&publisher)?;
+        let name = sample.channel;
+        let channel = self.channels.get_mut(&name)?;
         let (cost, more) = (sample.cost(), extra(sample.payload.len()));
         channel.held = channel.held.saturating_sub(cost);
         // One that was not asked for can have come within the window, by the grant for another.
         let more = more.min(channel.granted);
         channel.granted -= more;
         self.release(more);
-        Some(Credit { publisher, bytes: cost - more, opens: false })
+        Some(name.credit(cost - more, false))
     }
 
     fn release(&mut self, bytes: u64) {

@@ -4,11 +4,14 @@
 //! gateway session of their own stand for the world outside (`near`): relays read what the
 //! application publishes, stand-ins write what it subscribes to, and all else works as with shared
 //! memory. In the daemon a session of the same id has the application's endpoints, in memory that
-//! everybody maps (`far`): to others, on this host and elsewhere, it is a session like any.
+//! everybody maps (`far`): to others, on this host and elsewhere, it is a session like any. Clients and
+//! servers stand for others and cross as topics do (`calls`), and so does who is alive (`alive`).
 //!
 //! [`flow`] is plain data: samples in pieces, and who may send how many of them. `pipe` moves them
 //! over the socket (`docs/formats.md`, section 10).
 
+mod alive;
+mod calls;
 pub(crate) mod far;
 pub mod flow;
 pub(crate) mod near;
@@ -21,8 +24,10 @@ pub(crate) use status::Tally;
 
 /// Relayed sessions of one daemon: each costs it two threads and memory of its own.
 pub(crate) const MAX_SESSIONS: usize = 32;
-/// Publishers, and subscriptions, of a relayed session.
+/// Publishers, subscriptions, clients, and servers, of a relayed session.
 const MAX_ENDPOINTS: usize = 1024;
+/// Clients elsewhere that a relayed session's servers answer, each counted once for each of them.
+const MAX_CALLERS: usize = 1024;
 /// Others that one endpoint is said to be matched with; one packet holds no more.
 const MAX_MATCHED: usize = 1024;
 /// Bytes of the reason for which a session is relayed.

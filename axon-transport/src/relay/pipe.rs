@@ -4,20 +4,21 @@ use std::{
     collections::{BTreeMap, VecDeque},
     os::fd::BorrowedFd,
     sync::Arc,
+    time::Duration,
 };
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::{
     Tally,
-    flow::{Arrived, Departing, Incoming, Outgoing, Violation},
+    flow::{Arrived, Channel, Departing, Incoming, Outgoing, Violation},
     news::News,
 };
 use crate::{
     ids::Gid,
     passed::PassedFd,
     session::{
-        Publisher,
+        Face, Written,
         message::Message,
         socket::{self, Received, SocketError},
     },
@@ -29,6 +30,9 @@ use crate::{
 const MAX_WAITING: usize = 32 << 20;
 /// Packets sent, and received, before the other direction has its turn.
 const BATCH: usize = 64;
+
+/// Between looks for what nobody tells of.
+const NAP: Duration = Duration::from_millis(5);
 
 /// Why a relay ends.
 #[derive(Debug, thiserror::Error)]
@@ -54,7 +58,7 @@ pub(super) struct Pipe {
     pub(super) outgoing: Outgoing<Sample>,
     pub(super) incoming: Incoming,
     /// Samples that came and are not published yet.
-    arrived: BTreeMap<Gid, VecDeque<Arrived>>,
+    arrived: BTreeMap<Channel, VecDeque<Arrived>>,
     /// Whether one of them waits for a reader.
     pub(super) blocked: bool,
     tally: Arc<Tally>,
@@ -89,20 +93,20 @@ impl Pipe {
     }
 
     /// Opens a channel for samples that come.
-    pub(super) fn open(&mut self, publisher: Gid) -> Result<(), End> {
-        match self.incoming.open(publisher) {
+    pub(super) fn open(&mut self, channel: Channel) -> Result<(), End> {
+        match self.incoming.open(channel) {
             Some(credit) => self.say(&Message::Credit(credit)),
             None => Ok(()),
         }
     }
 
-    /// Closes it again.
-    pub(super) fn close(&mut self, publisher: &Gid) {
-        self.incoming.close(publisher);
-        self.arrived.remove(publisher);
+    /// Closes those that `keep` does not want.
+    pub(super) fn retain(&mut self, keep: impl Fn(&Channel) -> bool) {
+        self.incoming.retain(&keep);
+        self.arrived.retain(|channel, _| keep(channel));
     }
 
-    /// Takes packets; the control messages among them, and whether there may be more.
+    /// Takes packets; the messages among them that are not of samples, and whether there may be more.
     pub(super) fn receive(&mut self) -> Result<(Vec<Message>, bool), End> {
         let mut messages = Vec::new();
         for _ in 0..BATCH {
@@ -115,33 +119,34 @@ impl Pipe {
             match message {
                 Message::Piece(piece) => {
                     if let Some(sample) = self.incoming.piece(piece)? {
-                        self.arrived.entry(sample.publisher).or_default().push_back(sample);
+                        self.arrived.entry(sample.channel).or_default().push_back(sample);
                     }
                 }
-                Message::Credit(credit) => self.outgoing.credit(&credit),
                 other => messages.push(other),
             }
         }
         Ok((messages, true))
     }
 
-    /// Publishes what came, as far as readers make room; `lost` hears of samples that did not come.
-    pub(super) fn publish<'a>(
+    /// Writes what came, as far as readers make room; `lost` hears of samples that did not come.
+    pub(super) fn write<'a>(
         &mut self,
-        find: impl Fn(&Gid) -> Option<&'a Publisher>,
+        find: impl Fn(&Gid) -> Option<&'a Face>,
         mut lost: impl FnMut(&Gid, u64),
     ) -> Result<(), End> {
         self.blocked = false;
         let mut credits = Vec::new();
-        for (gid, samples) in &mut self.arrived {
+        for (Channel { writer: gid, client }, samples) in &mut self.arrived {
             while let Some(sample) = samples.front_mut() {
-                let Some(publisher) = find(gid) else { break };
+                let Some(face) = find(gid) else { break };
                 match std::mem::take(&mut sample.lost) {
                     0 => {}
                     count => lost(gid, count),
                 }
-                match publisher.try_publish_with(sample.meta, &sample.payload) {
-                    Ok(()) => self.tally.arrived(sample.payload.len()),
+                let client = client.as_ref().unwrap_or(gid);
+                match face.try_write(client, sample.meta, &sample.payload) {
+                    Ok(Written::Yes) => self.tally.arrived(sample.payload.len()),
+                    Ok(Written::Nobody) => {}
                     Err(PublishError::Blocked { .. }) => {
                         self.blocked = true;
                         break;
@@ -164,13 +169,15 @@ impl Pipe {
     /// send. Whether anything was sent.
     pub(super) fn send(
         &mut self,
-        mut take: impl FnMut(&Gid) -> Option<Departing<Sample>>,
+        mut take: impl FnMut(&Channel) -> Option<Departing<Sample>>,
     ) -> Result<bool, End> {
         for credit in self.incoming.grants() {
             self.say(&Message::Credit(credit))?;
         }
         let tally = Arc::clone(&self.tally);
-        let mut take = |gid: &Gid| take(gid).inspect(|sample| tally.departed(sample.content.len()));
+        let mut take = |channel: &Channel| {
+            take(channel).inspect(|sample| tally.departed(sample.content.len()))
+        };
         self.outgoing.fill(&mut take);
         let mut sent = false;
         for _ in 0..BATCH {
@@ -198,12 +205,13 @@ impl Pipe {
 }
 
 impl Pipe {
-    /// Sleeps until there is something to do; whether `end` became readable.
+    /// Sleeps until there is something to do, for at most `left`; whether `end` became readable.
     pub(super) fn sleep(
         &self,
         leader: &ExternalLeader,
         news: &News,
         end: Option<BorrowedFd<'_>>,
+        left: Option<Duration>,
     ) -> bool {
         let out = if self.is_full() { PollFlags::OUT } else { PollFlags::empty() };
         let mut fds = vec![
@@ -213,8 +221,9 @@ impl Pipe {
         ];
         fds.extend(end.map(|end| PollFd::from_borrowed_fd(end, PollFlags::IN)));
         // Nobody says when others have left room in the pool.
-        let nap = Timespec { tv_sec: 0, tv_nsec: 5_000_000 };
-        let _ = poll(&mut fds, self.incoming.is_short().then_some(&nap));
+        let nap = self.incoming.is_short().then_some(NAP);
+        let left = left.into_iter().chain(nap).min().and_then(|left| Timespec::try_from(left).ok());
+        let _ = poll(&mut fds, left.as_ref());
         fds.get(3).is_some_and(|end| !end.revents().is_empty())
     }
 }

@@ -70,9 +70,13 @@ impl Session {
         self.add_writer(endpoint, |endpoint, rings| PublisherInner::new(endpoint, role, rings))
     }
 
-    pub(super) fn add_stand_in(&self, remote: Endpoint) -> Result<Publisher, SessionError> {
-        let role = EndpointRole::StandIn;
-        self.add_writer(remote, |e, rings| PublisherInner::new(e, role, rings).asserted())
+    /// A publisher that is alive when it is said to be.
+    pub(super) fn add_asserted(
+        &self,
+        endpoint: Endpoint,
+        role: EndpointRole,
+    ) -> Result<Publisher, SessionError> {
+        self.add_writer(endpoint, |e, rings| PublisherInner::new(e, role, rings).asserted())
     }
 
     fn add_writer(

@@ -98,43 +98,12 @@ impl Session {
         GuardCondition::new(self.shared())
     }
 
-    /// A local ring for a publisher on another host, under that publisher's own GID. Where it has a
-    /// lease it is alive when a sample of it comes or [`Publisher::assert_liveliness`] says so. For the
-    /// gateway alone; a daemon refuses it from anybody else.
-    ///
-    /// # Errors
-    /// When there is no memory.
-    pub fn create_stand_in(&self, remote: Endpoint) -> Result<Publisher, SessionError> {
-        self.add_stand_in(remote)
-    }
-
-    /// The same in a relayed process, for any publisher outside: AUTOMATIC ones are alive as long as
-    /// their daemon speaks of them.
-    pub(crate) fn create_outsider(&self, outside: Endpoint) -> Result<Publisher, SessionError> {
-        self.add_publisher(outside, EndpointRole::StandIn)
-    }
-
-    /// A client of another host as the servers here see it, under its own GID. For the gateway alone.
-    pub(crate) fn create_stand_in_client(&self, remote: Endpoint) -> Result<Client, SessionError> {
-        self.add_client(remote, EndpointRole::StandIn)
-    }
-
-    /// A server of another host as the clients here see it, under its own GID. For the gateway alone.
-    pub(crate) fn create_stand_in_server(&self, remote: Endpoint) -> Server {
-        self.add_server(remote, EndpointRole::StandIn)
-    }
-
-    /// A publisher as another process of the session describes it, under its GID there.
-    pub(crate) fn adopt_publisher(&self, endpoint: Endpoint) -> Result<Publisher, SessionError> {
-        self.add_publisher(endpoint, EndpointRole::Application)
-    }
-
-    /// As [`adopt_publisher`](Self::adopt_publisher), a subscription.
+    /// A subscription as another process of the session describes it, under its GID there.
     pub(crate) fn adopt_subscription(&self, endpoint: Endpoint) -> Subscription {
         self.add_subscription(endpoint, EndpointRole::Application, Vec::new())
     }
 
-    /// As [`adopt_publisher`](Self::adopt_publisher), a node.
+    /// As [`adopt_subscription`](Self::adopt_subscription), a node.
     pub(crate) fn adopt_node(&self, endpoint: Endpoint) -> Node {
         let gid = endpoint.gid;
         let changed = self.create_guard_condition();

@@ -15,6 +15,7 @@ mod control;
 mod create;
 mod error;
 mod events;
+mod face;
 mod guard;
 mod home;
 pub(crate) mod local;
@@ -44,6 +45,7 @@ use std::{
 pub use callback::OnNew;
 pub use error::SessionError;
 pub use events::Event;
+pub(crate) use face::{Face, Written};
 pub use guard::GuardCondition;
 pub use message::SessionRole;
 pub use node::Node;

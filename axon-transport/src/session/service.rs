@@ -129,7 +129,7 @@ impl Server {
         ring.publish(meta, payload).map(drop)
     }
 
-    /// For the gateway: gives `client` a response without waiting for room. `false` when there is no
+    /// For who speaks for it: gives `client` a response without waiting for room. `false` when there is no
     /// such client any more.
     pub(crate) fn try_respond(
         &self,
@@ -139,6 +139,16 @@ impl Server {
     ) -> Result<bool, PublishError> {
         let Some(ring) = self.lanes.ring(client) else { return Ok(false) };
         ring.try_publish(meta, payload).map(|_| true)
+    }
+
+    /// For a relay: the next request of one client.
+    pub(crate) fn take_request_from(&self, client: &Gid) -> Option<Sample> {
+        take_from_one(&self.requests, &self.session, client)
+    }
+
+    /// Whether there is a request of this client to be taken.
+    pub(crate) fn has_request_from(&self, client: &Gid) -> bool {
+        !self.session.is_forked() && self.requests.lock().has_from(client)
     }
 
     pub(super) fn await_clients(&self) {
@@ -194,9 +204,19 @@ impl Client {
         self.ring.publish_next(clock::wall(), payload)
     }
 
-    /// For the gateway: a request under the number that it has on its host, without waiting for room.
+    /// For who speaks for it: a request under the number that it has there, without waiting for room.
     pub(crate) fn try_forward(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
         self.ring.try_publish(meta, payload).map(drop)
+    }
+
+    /// For a relay: the next response of one server.
+    pub(crate) fn take_response_from(&self, server: &Gid) -> Option<Sample> {
+        take_from_one(&self.responses, &self.session, server)
+    }
+
+    /// Whether there is a response of this server to be taken.
+    pub(crate) fn has_response_from(&self, server: &Gid) -> bool {
+        !self.session.is_forked() && self.responses.lock().has_from(server)
     }
 
     pub(super) fn await_servers(&self) {
@@ -253,6 +273,13 @@ impl Client {
     pub fn set_on_new_response(&self, callback: Option<OnNew>) -> Result<(), SessionError> {
         set_callback(&self.responses, callback, &self.session)
     }
+}
+
+fn take_from_one(inner: &SubscriptionInner, session: &Session, writer: &Gid) -> Option<Sample> {
+    if session.is_forked() {
+        return None;
+    }
+    inner.lock().take_from(writer, inner).map(|(sample, _)| sample)
 }
 
 fn await_both(writes: &PublisherInner, reads: &SubscriptionInner, session: &Session) {

@@ -20,12 +20,12 @@ fn hello(host: &Host) -> Hello {
 pub(crate) fn say_to(socket: &OwnedFd, message: &Message) {
     let packet = message.encode().unwrap();
     while let Err(SocketError::NotReady) = socket::send(socket, &packet, &[]) {
-        std::thread::sleep(Duration::from_millis(1));
+        thread::sleep(Duration::from_millis(1));
     }
 }
 
 /// The next message that `want` wants; `None` at the end of the connection.
-fn hear(socket: &OwnedFd, want: impl Fn(&Message) -> bool) -> Option<Message> {
+pub(crate) fn hear(socket: &OwnedFd, want: impl Fn(&Message) -> bool) -> Option<Message> {
     let deadline = Instant::now() + PATIENCE;
     loop {
         match socket::receive(socket, &mut Vec::new()) {
@@ -33,7 +33,7 @@ fn hear(socket: &OwnedFd, want: impl Fn(&Message) -> bool) -> Option<Message> {
             Ok(_) => {}
             Err(SocketError::NotReady) => {
                 assert!(Instant::now() < deadline, "nothing is said, and nobody hangs up");
-                std::thread::sleep(Duration::from_millis(1));
+                thread::sleep(Duration::from_millis(1));
             }
             Err(_) => return None,
         }
@@ -74,7 +74,7 @@ fn announce(gid: Gid, kind: EndpointKind, role: EndpointRole) -> Message {
 
 fn piece(publisher: Gid, length: Option<u32>, bytes: usize) -> Message {
     let head = length.map(|length| Head { length, sequence: 1, source_timestamp: 0, lost: 0 });
-    Message::Piece(Piece { publisher, head, bytes: vec![0; bytes] })
+    Message::Piece(Piece { publisher, head, bytes: vec![0; bytes], client: None })
 }
 
 #[test]
@@ -176,4 +176,72 @@ fn hostile_frames_end_their_own_relay_and_nothing_else() {
     until("all of it is read", || {
         relays(&host.status().unwrap()).iter().any(|relay| relay.samples_in == 600)
     });
+}
+
+/// A server of its own that answers these clients, as far as it says.
+fn server_for(host: &Host, own: Gid, others: Vec<Gid>) -> OwnedFd {
+    let socket = by_hand(host, hello(host));
+    say_to(&socket, &announce(own, EndpointKind::Server, EndpointRole::Application));
+    say_to(&socket, &Message::Matched(Matched { gid: own, others }));
+    socket
+}
+
+#[test]
+fn whoever_answers_what_nobody_asked_it_reaches_nobody() {
+    let host = host();
+    let _daemon = host.daemon();
+    let (here, there) = (session(&host, "server", true), session(&host, "client", false));
+    let spec = || EndpointSpec::new("/t", "test/Bytes", Qos::keep_all());
+    let server = here.create_server(spec()).unwrap();
+    let client = there.create_client(spec()).unwrap();
+    assert!(client.wait_available(PATIENCE));
+    let own = Gid::new(SessionId([9; 16]), 1);
+    let answer = |of: Gid, client: Gid, length: u32, bytes: usize| {
+        let head = Some(Head { length, sequence: 1, source_timestamp: 0, lost: 0 });
+        let bytes = vec![7; bytes];
+        Message::Piece(Piece { publisher: of, head, bytes, client: Some(client) })
+    };
+
+    // Not its own, or no server.
+    for gid in [server.gid(), client.gid(), Gid([7; 16])] {
+        let socket = by_hand(&host, hello(&host));
+        say_to(&socket, &Message::Matched(Matched { gid, others: vec![client.gid()] }));
+        assert!(hear(&socket, |_| false).is_none(), "{gid}");
+    }
+    let socket = by_hand(&host, hello(&host));
+    say_to(&socket, &announce(own, EndpointKind::Client, EndpointRole::Application));
+    say_to(&socket, &Message::Matched(Matched { gid: own, others: vec![server.gid()] }));
+    assert!(hear(&socket, |_| false).is_none(), "a client answers nobody");
+    // More than it may.
+    let many = (0..1025).map(|number| Gid::new(SessionId([8; 16]), number)).collect();
+    assert!(hear(&server_for(&host, own, many), |_| false).is_none());
+    // More than there is credit for.
+    let socket = server_for(&host, own, vec![client.gid()]);
+    let credit = |m: &Message| matches!(m, Message::Credit(c) if c.publisher == own && c.client == Some(client.gid()));
+    assert!(hear(&socket, credit).is_some());
+    say_to(&socket, &answer(own, client.gid(), 10, 11));
+    assert!(hear(&socket, |_| false).is_none());
+
+    // For others, and before it says whom it answers, it goes nowhere. To whom it is not matched with,
+    // too, and that is done with at once.
+    let stranger = Gid([5; 16]);
+    let socket = server_for(&host, own, vec![stranger]);
+    say_to(&socket, &answer(server.gid(), client.gid(), 4, 4));
+    say_to(&socket, &answer(own, client.gid(), 4, 4));
+    let opened = |m: &Message| matches!(m, Message::Credit(c) if c.client == Some(stranger));
+    assert!(hear(&socket, opened).is_some());
+    for _ in 0..600 {
+        say_to(&socket, &answer(own, stranger, 0, 0));
+        assert!(hear(&socket, opened).is_some());
+    }
+    // Whoever is not its own does not live by its word.
+    let publishers = vec![server.gid(), own, stranger];
+    say_to(&socket, &Message::Asserted(Asserted { publishers }));
+    assert!(client.recv_response(&mut Vec::new(), Some(Duration::from_millis(20))).is_none());
+    let number = client.send_request(b"x").unwrap();
+    services::answer(&server);
+    let info = client.recv_response(&mut Vec::new(), Some(PATIENCE)).unwrap();
+    assert_eq!((info.publisher, info.sequence), (server.gid(), number));
+    say_to(&socket, &Message::Resync);
+    assert!(hear(&socket, |_| false).is_none(), "it was there until now");
 }

@@ -1,14 +1,18 @@
 //! Sessions that share no memory, beside those that do.
 
 mod hostile;
+mod played;
+mod services;
 #[allow(dead_code, reason = "for the tests of daemons too")]
 #[path = "../support/mod.rs"]
 mod support;
 mod time;
 
 use std::{
+    collections::HashMap,
     os::fd::{AsFd, OwnedFd},
-    sync::atomic::{AtomicBool, Ordering},
+    sync::atomic::{AtomicBool, AtomicU32, Ordering},
+    thread,
     time::{Duration, Instant},
 };
 
@@ -22,7 +26,8 @@ use axon_transport::{
         EndpointSpec, Publisher, Session, SessionOptions, Subscription,
         address::Address,
         message::{
-            Announce, EndpointRole, Head, Hello, Message, PROTOCOL, Piece, Refused, SessionRole,
+            Announce, Asserted, Credit, EndpointRole, Head, Hello, Matched, Message, PROTOCOL,
+            Piece, Refused, SessionRole,
         },
         socket::{self, SocketError},
     },
@@ -134,6 +139,44 @@ fn child() {
             say("matched");
             wait_for_the_end();
         }
+        // Does nothing but live.
+        "alive" => {
+            let publisher = session.create_publisher(spec("/t", time::automatic_lease())).unwrap();
+            say("there");
+            wait_for_the_end();
+            drop(publisher);
+        }
+        "caller" => {
+            let client = session.create_client(services::service()).unwrap();
+            assert!(client.wait_available(PATIENCE));
+            for number in 0..services::CALLS {
+                services::call(
+                    &client,
+                    &pattern(number, if number % 7 == 0 { 40_000 } else { 20 }),
+                );
+            }
+            say("complete");
+            wait_for_the_end();
+        }
+        // Asks and never takes.
+        "asker" => {
+            let client = session.create_client(services::service()).unwrap();
+            assert!(client.wait_available(PATIENCE));
+            for _ in 0..services::CALLS {
+                client.send_request(b"x").unwrap();
+            }
+            say("asked");
+            wait_for_the_end();
+        }
+        // Answers one request and is in the middle of the next.
+        "server" => {
+            let server = session.create_server(services::service()).unwrap();
+            say("serves");
+            services::answer(&server);
+            server.recv_request(&mut Vec::new(), Some(PATIENCE)).unwrap();
+            say("took");
+            wait_for_the_end();
+        }
         _ => unreachable!("no such part: {part}"),
     }
 }
@@ -178,7 +221,7 @@ fn keep_all_holds_its_publisher_back_and_loses_nothing() {
             assert!(last < 20_000, "nothing holds it back");
         }
         let more = last + 200;
-        std::thread::scope(|scope| {
+        thread::scope(|scope| {
             scope.spawn(|| {
                 for sequence in last + 1..=more {
                     assert_eq!(publish(&publisher, &pattern(sequence, len)), sequence);
@@ -432,7 +475,7 @@ fn keep_descriptors_back(listener: &OwnedFd, daemon: &Address, end: &AtomicBool)
             pairs.push([caller, daemon.connect().unwrap()]);
         }
         pairs.retain(|[a, b]| pass_on(a, b) && pass_on(b, a));
-        std::thread::sleep(Duration::from_millis(1));
+        thread::sleep(Duration::from_millis(1));
     }
 }
 
@@ -457,7 +500,7 @@ fn where_descriptors_do_not_arrive_a_session_is_relayed_by_itself() {
     let behind = behind.with("AXON_RUNTIME_DIR", run.to_str().unwrap());
     let (listener, _lock) = Address::of(&behind.config()).bind().unwrap().into_parts();
     let (daemon, end) = (Address::of(&host.config()), AtomicBool::new(false));
-    std::thread::scope(|scope| {
+    thread::scope(|scope| {
         scope.spawn(|| keep_descriptors_back(&listener, &daemon, &end));
         let outcome = std::panic::catch_unwind(|| {
             let far = session(&behind, "behind", true);
@@ -473,17 +516,25 @@ fn where_descriptors_do_not_arrive_a_session_is_relayed_by_itself() {
     });
 }
 
-#[test]
-fn another_host_reaches_a_relayed_session_and_is_reached() {
+/// Two hosts that find each other.
+fn two_hosts() -> [Host; 2] {
+    // Of tests that run at the same time none may find those of another.
+    static PAIRS: AtomicU32 = AtomicU32::new(1);
+    let pair = 2 * PAIRS.fetch_add(1, Ordering::Relaxed);
     let pid = std::process::id();
     let net = 1 + pid % 250;
-    let hosts = [1, 2].map(|number| {
+    [pair, pair + 1].map(|number| {
         host()
             .with("AXON_BIND_ADDRS", &format!("127.98.{net}.{number}"))
-            .with("AXON_DAEMON_PEERS", &format!("127.98.{net}.{}", 3 - number))
+            .with("AXON_DAEMON_PEERS", &format!("127.98.{net}.{}", number ^ 1))
             .with("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
             .with("ROS_DOMAIN_ID", &(1 + pid % 98).to_string())
-    });
+    })
+}
+
+#[test]
+fn another_host_reaches_a_relayed_session_and_is_reached() {
+    let hosts = two_hosts();
     let _daemons = [hosts[0].daemon(), hosts[1].daemon()];
     let (here, there) = (session(&hosts[0], "here", false), session(&hosts[1], "there", false));
     for (from, to) in [(&here, &there), (&there, &here)] {

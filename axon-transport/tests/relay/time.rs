@@ -74,6 +74,53 @@ fn a_lease_runs_out_beyond_a_relay_and_a_sample_renews_it() {
 }
 
 #[test]
+fn who_says_without_a_sample_that_it_is_alive_is_so_beyond_a_relay() {
+    let host = host();
+    let _daemon = host.daemon();
+    for (shares, other_shares) in ENDS {
+        let (from, to) = (session(&host, "from", shares), session(&host, "to", other_shares));
+        let liveliness = Liveliness::ManualByTopic;
+        let manual = Qos { liveliness, lease: Some(200 * MILLI), ..Qos::default() };
+        let (publisher, subscription) = connect(&from, &to, "/t", manual);
+        let changed = subscription.event(EventKind::LivelinessChanged).unwrap();
+        until("it counts as not alive", || alive(&changed) == (0, 1));
+        until("it is alive again", || {
+            publisher.assert_liveliness().unwrap();
+            alive(&changed) == (1, 0)
+        });
+        until("it runs out again", || alive(&changed) == (0, 1));
+        assert_eq!(subscription.received(), 0);
+    }
+}
+
+#[test]
+fn a_process_that_is_stopped_is_not_alive_beyond_a_relay() {
+    let host = host();
+    let _daemon = host.daemon();
+    let relaying = services::relaying(&host);
+    for (shares, other_shares) in ENDS {
+        let mut automatic = if shares { &host } else { &relaying }.play("alive");
+        assert_eq!(automatic.hear(), "there");
+        let to = session(&host, "to", other_shares);
+        let subscription = to.create_subscription(spec("/t", automatic_lease())).unwrap();
+        let changed = subscription.event(EventKind::LivelinessChanged).unwrap();
+        assert!(subscription.wait_matched(1, PATIENCE));
+        until("it is alive", || alive(&changed) == (1, 0));
+        signal(automatic.pid(), Signal::STOP);
+        until("it is not alive", || alive(&changed) == (0, 1));
+        signal(automatic.pid(), Signal::CONT);
+        until("it is alive again", || alive(&changed) == (1, 0));
+        automatic.finish();
+        until("it is forgotten", || alive(&changed) == (0, 0));
+    }
+}
+
+/// The lease of a process that lives as long as it runs.
+pub(crate) fn automatic_lease() -> Qos {
+    Qos { lease: Some(400 * MILLI), ..Qos::default() }
+}
+
+#[test]
 fn a_sample_that_outlived_its_lifespan_is_not_delivered_beyond_a_relay() {
     let host = host();
     let _daemon = host.daemon();

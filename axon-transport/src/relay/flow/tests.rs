@@ -8,8 +8,14 @@ use super::*;
 
 const MAX: u64 = 1 << 20;
 
-fn gid(number: u8) -> Gid {
-    Gid([number; 16])
+/// Those of requests and of responses beside those of publishers.
+fn channel(number: u8) -> Channel {
+    let writer = Gid([number / 2; 16]);
+    if number.is_multiple_of(2) {
+        Channel::of(writer)
+    } else {
+        Channel::between(writer, Gid([9; 16]))
+    }
 }
 
 fn incoming() -> Incoming {
@@ -26,15 +32,16 @@ fn head(length: u32) -> Option<Head> {
     Some(Head { length, sequence: 1, source_timestamp: 0, lost: 0 })
 }
 
-fn piece(channel: u8, head: Option<Head>, len: usize) -> Piece {
-    Piece { publisher: gid(channel), head, bytes: vec![0; len] }
+fn piece(number: u8, head: Option<Head>, len: usize) -> Piece {
+    let name = channel(number);
+    Piece { publisher: name.writer, head, bytes: vec![0; len], client: name.client }
 }
 
 #[test]
 fn what_no_sender_does_is_refused() {
     let open = || {
         let mut incoming = incoming();
-        incoming.open(gid(1));
+        incoming.open(channel(1));
         incoming
     };
     let refused = |pieces: &[Piece]| {
@@ -66,12 +73,12 @@ fn a_long_sample_waits_for_room_and_gives_it_back() {
     let pool = Pool::new(100_000);
     let mut ends = [(); 2].map(|()| Incoming::new(MAX, Arc::clone(&pool)));
     for incoming in &mut ends {
-        incoming.open(gid(1));
+        incoming.open(channel(1));
         assert_eq!(incoming.piece(piece(1, head(100_000), 0)), Ok(None));
     }
     let [first, second] = &mut ends;
     let more = OVERHEAD + 100_000 - WINDOW;
-    let credit = Credit { publisher: gid(1), bytes: more, opens: false };
+    let credit = channel(1).credit(more, false);
     assert_eq!(first.grants(), [credit]);
     assert_eq!(second.grants(), [], "the pool is one for all");
     assert!(second.is_short() && !first.is_short());
@@ -81,9 +88,9 @@ fn a_long_sample_waits_for_room_and_gives_it_back() {
     assert_eq!(first.done(&arrived), Some(credit), "what was granted is not given back");
     assert_eq!(pool.held(), 0);
     assert_eq!(second.grants().len(), 1);
-    second.close(&gid(1));
+    second.retain(|_| false);
     assert_eq!(pool.held(), 0);
-    second.open(gid(1));
+    second.open(channel(1));
     assert_eq!(second.piece(piece(1, head(100_000), 0)), Ok(None));
     assert_eq!(second.grants().len(), 1);
     drop(ends);
@@ -93,43 +100,47 @@ fn a_long_sample_waits_for_room_and_gives_it_back() {
 #[test]
 fn one_sample_may_be_longer_than_the_pool() {
     let mut incoming = Incoming::new(MAX, Pool::new(1));
-    incoming.open(gid(1));
+    incoming.open(channel(1));
     assert_eq!(incoming.piece(piece(1, head(MAX as u32), 0)), Ok(None));
     assert_eq!(incoming.grants().len(), 1);
 }
 
 #[test]
 fn an_image_does_not_hold_a_small_sample_up() {
+    let next = |outgoing: &mut Outgoing<Vec<u8>>| {
+        let piece = outgoing.next_piece().unwrap();
+        Channel { writer: piece.publisher, client: piece.client }
+    };
     let mut outgoing = Outgoing::default();
-    for channel in [1, 2] {
-        outgoing.open(gid(channel));
-        outgoing.credit(&Credit { publisher: gid(channel), bytes: MAX, opens: true });
+    for number in [1, 2] {
+        outgoing.open(channel(number));
+        outgoing.credit(&channel(number).credit(MAX, true));
     }
-    assert!(outgoing.fill(|of| (*of == gid(1)).then(|| departing(1, 500_000))));
-    assert_eq!(outgoing.next_piece().unwrap().publisher, gid(1));
-    assert!(outgoing.fill(|of| (*of == gid(2)).then(|| departing(1, 52))));
-    let next = [(); 2].map(|()| outgoing.next_piece().unwrap().publisher);
-    assert!(next.contains(&gid(2)));
-    assert_eq!(outgoing.next_piece().unwrap().publisher, gid(1));
+    assert!(outgoing.fill(|of| (*of == channel(1)).then(|| departing(1, 500_000))));
+    assert_eq!(next(&mut outgoing), channel(1));
+    assert!(outgoing.fill(|of| (*of == channel(2)).then(|| departing(1, 52))));
+    let both = [(); 2].map(|()| next(&mut outgoing));
+    assert!(both.contains(&channel(2)));
+    assert_eq!(next(&mut outgoing), channel(1));
 }
 
 #[test]
 fn a_channel_without_its_receiver_sends_nothing() {
     let mut outgoing = Outgoing::default();
-    outgoing.open(gid(1));
-    outgoing.credit(&Credit { publisher: gid(1), bytes: 1000, opens: false });
+    outgoing.open(channel(1));
+    outgoing.credit(&channel(1).credit(1000, false));
     assert!(!outgoing.fill(|_| Some(departing(1, 1))), "of a channel before it");
-    outgoing.credit(&Credit { publisher: gid(1), bytes: 1000, opens: true });
+    outgoing.credit(&channel(1).credit(1000, true));
     assert!(outgoing.fill(|_| Some(departing(1, 1))));
-    assert!(!outgoing.is_idle(&gid(1)));
+    assert!(!outgoing.is_idle(&channel(1)));
     let sent = outgoing.next_piece().unwrap();
     assert_eq!(outgoing.next_piece(), None);
-    assert!(!outgoing.is_idle(&gid(1)), "nobody has said that it is where it belongs");
+    assert!(!outgoing.is_idle(&channel(1)), "nobody has said that it is where it belongs");
     let mut incoming = incoming();
-    incoming.open(gid(1));
+    incoming.open(channel(1));
     let arrived = incoming.piece(sent).unwrap().unwrap();
     outgoing.credit(&incoming.done(&arrived).unwrap());
-    assert!(outgoing.is_idle(&gid(1)));
+    assert!(outgoing.is_idle(&channel(1)));
 }
 
 proptest! {
@@ -146,22 +157,22 @@ proptest! {
         let pool = Pool::new(300_000);
         let mut incoming = Incoming::new(MAX, Arc::clone(&pool));
         let mut outgoing = Outgoing::default();
-        let mut queues: HashMap<Gid, VecDeque<Departing<Vec<u8>>>> = HashMap::new();
-        let mut expected: HashMap<Gid, VecDeque<Vec<u8>>> = HashMap::new();
-        for channel in 0..4 {
-            outgoing.open(gid(channel));
-            outgoing.credit(&incoming.open(gid(channel)).unwrap());
+        let mut queues: HashMap<Channel, VecDeque<Departing<Vec<u8>>>> = HashMap::new();
+        let mut expected: HashMap<Channel, VecDeque<Vec<u8>>> = HashMap::new();
+        for number in 0..4 {
+            outgoing.open(channel(number));
+            outgoing.credit(&incoming.open(channel(number)).unwrap());
         }
-        for (number, (channel, len)) in sizes.iter().enumerate() {
+        for (number, (of, len)) in sizes.iter().enumerate() {
             let sample = departing(number as u64, *len);
-            expected.entry(gid(*channel)).or_default().push_back(sample.content.clone());
-            queues.entry(gid(*channel)).or_default().push_back(sample);
+            expected.entry(channel(*of)).or_default().push_back(sample.content.clone());
+            queues.entry(channel(*of)).or_default().push_back(sample);
         }
         let mut held: Vec<Arrived> = Vec::new();
         let mut random = order;
         for round in 0.. {
             let all_there = queues.values().all(VecDeque::is_empty)
-                && (0..4).all(|channel| outgoing.is_idle(&gid(channel)));
+                && (0..4).all(|number| outgoing.is_idle(&channel(number)));
             if all_there {
                 break;
             }
@@ -184,12 +195,12 @@ proptest! {
             // What is stuck goes on only when nothing else does.
             let keep = held
                 .iter()
-                .any(|sample| sample.publisher != gid(stuck)) || sent;
+                .any(|sample| sample.channel != channel(stuck)) || sent;
             let (go, stay): (Vec<_>, Vec<_>) =
-                held.into_iter().partition(|sample| sample.publisher != gid(stuck) || !keep);
+                held.into_iter().partition(|sample| sample.channel != channel(stuck) || !keep);
             held = stay;
             for sample in go {
-                let next = expected.get_mut(&sample.publisher).unwrap().pop_front();
+                let next = expected.get_mut(&sample.channel).unwrap().pop_front();
                 prop_assert_eq!(Some(&sample.payload), next.as_ref());
                 prop_assert_eq!(sample.lost, sample.meta.sequence);
                 outgoing.credit(&incoming.done(&sample).unwrap());
@@ -206,11 +217,11 @@ proptest! {
     ) {
         let pool = Pool::new(50_000);
         let mut incoming = Incoming::new(90_000, Arc::clone(&pool));
-        incoming.open(gid(0));
-        incoming.open(gid(1));
+        incoming.open(channel(0));
+        incoming.open(channel(1));
         let mut kept = 0;
-        for (channel, length, len, gone) in pieces {
-            let arrived = incoming.piece(piece(channel, length.and_then(head), len));
+        for (of, length, len, gone) in pieces {
+            let arrived = incoming.piece(piece(of, length.and_then(head), len));
             incoming.grants();
             match arrived {
                 Ok(Some(sample)) if gone => drop(incoming.done(&sample)),

@@ -1,6 +1,7 @@
 //! The end in a relayed session's own process.
 
 mod relays;
+mod stand_ins;
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap},
@@ -12,19 +13,24 @@ use std::{
     time::{Duration, Instant},
 };
 
-use self::relays::{Group, Relay, take};
+use self::{
+    relays::{Group, Relay, take},
+    stand_ins::StandIn,
+};
 use super::{
     Pool, Tally,
-    flow::Incoming,
+    alive::Alive,
+    calls::{self, Calls},
+    flow::{Channel, Incoming},
     news::News,
     pipe::{End, Pipe},
 };
 use crate::{
-    graph::{Endpoint, EndpointKind, Pairing, pairing},
+    graph::{Endpoint, EndpointKind, writes},
     ids::{DaemonId, Gid},
     passed::PassedFd,
     session::{
-        Publisher, Session, SessionError, Shared,
+        Session, SessionError, Shared,
         connect::{Caller, Connected},
         local::House,
         message::{Announce, EndpointRole, Gone, Graph, Message},
@@ -163,16 +169,25 @@ struct Served<'a> {
     pipe: Pipe,
     /// The session's endpoints that the daemon was told of.
     own: BTreeMap<Gid, Arc<Endpoint>>,
-    /// Publishers among them that are gone, and may have left something.
+    /// Those among them that write and are gone, and may have left something.
     ending: BTreeSet<Gid>,
     /// Whether one of them waits for something else before it is told of.
     held_back: bool,
     /// With whom the daemon says they are matched.
-    matched: HashMap<Gid, Vec<Gid>>,
+    matched: HashMap<Gid, BTreeSet<Gid>>,
     relays: BTreeMap<Group, Relay>,
     /// Samples of the session's publishers that were lost here, as far as the daemon knows.
     lost: HashMap<Gid, u64>,
-    stand_ins: BTreeMap<Gid, Publisher>,
+    stand_ins: BTreeMap<Gid, StandIn>,
+    /// What the session's clients ask.
+    calls: Calls,
+    /// Since when the daemon knows of each of its clients.
+    asking: HashMap<Gid, Instant>,
+    /// Those whose requests wait until they have been matched outside with all that they count.
+    settling: HashMap<Gid, Instant>,
+    /// The clients outside whom the daemon may let each of its servers answer.
+    callers: BTreeMap<Gid, BTreeSet<Gid>>,
+    alive: Alive,
     /// The endpoints outside.
     world: HashMap<Gid, (DaemonId, Endpoint)>,
 }
@@ -194,6 +209,11 @@ impl<'a> Served<'a> {
             relays: BTreeMap::new(),
             lost: HashMap::new(),
             stand_ins: BTreeMap::new(),
+            calls: Calls::default(),
+            asking: HashMap::new(),
+            settling: HashMap::new(),
+            callers: BTreeMap::new(),
+            alive: Alive::default(),
             world: HashMap::new(),
         }
     }
@@ -208,18 +228,31 @@ impl<'a> Served<'a> {
             common.leader.arm(blocked);
             let news = common.news.take() | !std::mem::replace(&mut begun, true);
             let (messages, more) = self.pipe.receive()?;
-            let changed = !messages.is_empty();
+            let changed = messages.iter().any(|m| !matches!(m, Message::Credit(_)));
             messages.into_iter().for_each(|message| self.handle(message));
-            if news || changed || self.held_back || !self.ending.is_empty() {
+            let waits = self.held_back || !self.ending.is_empty() || !self.settling.is_empty();
+            if news || changed || waits {
                 self.update()?;
             }
+            let leased = self.relays.values().flat_map(Relay::assertions);
+            let news = self.alive.news(leased);
+            news.iter().try_for_each(|message| self.pipe.say(message))?;
             let stand_ins = &self.stand_ins;
-            self.pipe.publish(
-                |gid| stand_ins.get(gid),
-                |gid, samples| common.shared.lost(gid, samples),
-            )?;
+            let find = |gid: &Gid| stand_ins.get(gid).map(StandIn::face);
+            self.pipe.write(find, |gid, samples| common.shared.lost(gid, samples))?;
             let (own, relays, lost) = (&self.own, &self.relays, &mut self.lost);
-            let sent = self.pipe.send(|gid| take(own, relays, lost, gid))?;
+            let (calls, settling) = (&mut self.calls, &self.settling);
+            let sent = self.pipe.send(|channel| {
+                let Channel { writer, client } = channel;
+                match own.get(writer)? {
+                    _ if client.is_some() => calls::response(channel, find),
+                    _ if settling.contains_key(writer) => None,
+                    endpoint if endpoint.kind == EndpointKind::Client => {
+                        calls.request(writer, find)
+                    }
+                    endpoint => take(endpoint, relays, lost),
+                }
+            })?;
             let passed = self.pass_over();
             if common.finishes() {
                 let by = *finish_by.get_or_insert_with(|| Instant::now() + LINGER);
@@ -231,15 +264,19 @@ impl<'a> Served<'a> {
                 common.leader.disarm();
                 continue;
             }
-            self.pipe.sleep(&common.leader, &common.news, None);
+            let left = self.alive.left().into_iter().chain(self.settled_in()).min();
+            self.pipe.sleep(&common.leader, &common.news, None, left);
         }
     }
 
     fn handle(&mut self, message: Message) {
         match message {
             Message::Graph(graph) => self.graph(graph),
-            Message::Matched(matched) => {
-                self.matched.insert(matched.gid, matched.others);
+            Message::Matched(matched) => self.rematch(matched),
+            Message::Credit(credit) => self.pipe.outgoing.credit(&credit),
+            Message::Asserted(asserted) => {
+                let named = asserted.publishers.iter().filter_map(|gid| self.stand_ins.get(gid));
+                named.for_each(|stand_in| stand_in.face().assert_alive());
             }
             Message::Refused(refused) => {
                 tracing::error!(reason = refused.text, "the daemon refuses an endpoint");
@@ -278,8 +315,13 @@ impl<'a> Served<'a> {
     fn update(&mut self) -> Result<(), End> {
         self.tell_endpoints()?;
         self.update_relays();
-        self.end_publishers()?;
-        self.update_stand_ins()
+        self.end_writers()?;
+        self.update_stand_ins()?;
+        self.update_calls()?;
+        let matched = |e: &Endpoint| self.matched.get(&e.gid).is_some_and(|all| !all.is_empty());
+        let read = self.own.values().filter(|e| e.kind == EndpointKind::Publisher && matched(e));
+        self.alive.watch(read.filter_map(|e| e.qos.lease));
+        Ok(())
     }
 
     fn tell_endpoints(&mut self) -> Result<(), End> {
@@ -292,7 +334,7 @@ impl<'a> Served<'a> {
             .map(|e| (e.gid, e.kind))
             .collect();
         for (gid, kind) in gone {
-            if kind == EndpointKind::Publisher {
+            if writes(kind) {
                 self.ending.insert(gid);
             } else {
                 self.tell_gone(gid)?;
@@ -304,7 +346,7 @@ impl<'a> Served<'a> {
             if !gid.is_of(session) || self.own.contains_key(gid) {
                 continue;
             }
-            if endpoint.kind == EndpointKind::Subscription && !self.is_served(endpoint) {
+            if !self.is_served(endpoint) {
                 self.held_back = true;
                 continue;
             }
@@ -315,73 +357,47 @@ impl<'a> Served<'a> {
                 ring: None,
             }))?;
             self.own.insert(*gid, Arc::clone(endpoint));
-            if endpoint.kind == EndpointKind::Publisher {
-                self.pipe.outgoing.open(*gid);
+            // A server's responses are a channel for each of its clients.
+            if matches!(endpoint.kind, EndpointKind::Publisher | EndpointKind::Client) {
+                self.pipe.outgoing.open(Channel::of(*gid));
+            }
+            if endpoint.kind == EndpointKind::Client {
+                self.asking.insert(*gid, Instant::now());
             }
         }
         Ok(())
-    }
-
-    /// Whether a subscription receives from all stand-ins that there are for it: who outside counts it
-    /// may rely on it.
-    fn is_served(&self, subscription: &Endpoint) -> bool {
-        self.stand_ins.values().all(|stand_in| {
-            pairing(stand_in.endpoint(), subscription) != Pairing::Match
-                || stand_in.matched().contains(&subscription.gid)
-        })
     }
 
     fn tell_gone(&mut self, gid: Gid) -> Result<(), End> {
         self.own.remove(&gid);
         self.matched.remove(&gid);
         self.lost.remove(&gid);
+        self.callers.remove(&gid);
+        self.asking.remove(&gid);
+        self.pipe.outgoing.retain(|channel| channel.writer != gid);
         self.pipe.say(&Message::EndpointGone(Gone { gid }))
     }
 
     fn is_drained(&self) -> bool {
-        self.own.values().all(|e| e.kind != EndpointKind::Publisher || self.has_left(e))
+        self.own.values().all(|e| self.has_left(e))
     }
 
-    fn end_publishers(&mut self) -> Result<(), End> {
+    /// Whether all that an endpoint has written is with the daemon.
+    fn has_left(&self, endpoint: &Endpoint) -> bool {
+        match endpoint.kind {
+            EndpointKind::Publisher => self.is_published(endpoint),
+            EndpointKind::Client => self.is_asked(&endpoint.gid),
+            EndpointKind::Server => self.is_answered(&endpoint.gid),
+            EndpointKind::Subscription | EndpointKind::Node => true,
+        }
+    }
+
+    fn end_writers(&mut self) -> Result<(), End> {
         let left =
             self.ending.iter().filter(|gid| self.own.get(gid).is_none_or(|e| self.has_left(e)));
         for gid in left.copied().collect::<Vec<_>>() {
             self.ending.remove(&gid);
-            self.pipe.outgoing.close(&gid);
             self.tell_gone(gid)?;
-        }
-        Ok(())
-    }
-
-    fn update_stand_ins(&mut self) -> Result<(), End> {
-        let mut wanted: BTreeMap<Gid, Vec<Gid>> = BTreeMap::new();
-        for endpoint in self.own.values().filter(|e| e.kind == EndpointKind::Subscription) {
-            for writer in self.matched.get(&endpoint.gid).into_iter().flatten() {
-                wanted.entry(*writer).or_default().push(endpoint.gid);
-            }
-        }
-        let gone: Vec<Gid> =
-            self.stand_ins.keys().filter(|gid| !wanted.contains_key(gid)).copied().collect();
-        for gid in gone {
-            self.pipe.close(&gid);
-            self.stand_ins.remove(&gid);
-        }
-        for (writer, readers) in wanted {
-            if !self.stand_ins.contains_key(&writer) {
-                // The graph may say later who it is.
-                let Some((_, endpoint)) = self.world.get(&writer) else { continue };
-                match self.common.outside.create_outsider(endpoint.clone()) {
-                    Ok(stand_in) => drop(self.stand_ins.insert(writer, stand_in)),
-                    Err(error) => {
-                        tracing::error!(%writer, %error, "a publisher cannot be received from");
-                        continue;
-                    }
-                }
-            }
-            let matched = self.stand_ins[&writer].matched();
-            if readers.iter().all(|reader| matched.contains(reader)) {
-                self.pipe.open(writer)?;
-            }
         }
         Ok(())
     }

@@ -1,17 +1,17 @@
 //! What the application publishes, as the daemon is to get it: relays that take it, as many as there are
 //! kinds of QoS on a topic.
 
-use std::{
-    collections::{BTreeMap, BTreeSet, HashMap},
-    sync::Arc,
-};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use super::Served;
 use crate::{
     graph::{Endpoint, EndpointKind},
     ids::Gid,
     qos::{Durability, History, Liveliness, Qos, Reliability},
-    relay::{MAX_MATCHED, flow::Departing},
+    relay::{
+        MAX_MATCHED,
+        flow::{Channel, Departing},
+    },
     session::{EndpointSpec, Subscription},
     shm::Sample,
 };
@@ -74,20 +74,27 @@ pub(super) struct Relay {
     stands_for: BTreeSet<Gid>,
 }
 
+impl Relay {
+    /// When each of its publishers that has a lease was last alive.
+    pub(super) fn assertions(&self) -> Vec<(Gid, u64)> {
+        self.subscription.assertions()
+    }
+}
+
 impl Served<'_> {
     pub(super) fn update_relays(&mut self) {
         let mut wanted: BTreeMap<Group, Wanted> = BTreeMap::new();
         for endpoint in self.own.values().filter(|e| e.kind == EndpointKind::Publisher) {
             let group = Group::of(endpoint);
-            let readers = self.matched.get(&endpoint.gid).map_or(&[][..], Vec::as_slice);
+            let readers = self.matched.get(&endpoint.gid);
             // History goes ahead of those who will ask for it; what is left is carried to its end.
             let rest = self.ending.contains(&endpoint.gid) && self.relays.contains_key(&group);
-            if readers.is_empty() && group.volatile && !rest {
+            if readers.is_none_or(BTreeSet::is_empty) && group.volatile && !rest {
                 continue;
             }
             let wanted = wanted.entry(group).or_default();
             wanted.depth = wanted.depth.max(endpoint.qos.depth);
-            wanted.stands_for.extend(readers);
+            wanted.stands_for.extend(readers.into_iter().flatten());
         }
         self.relays.retain(|group, _| wanted.contains_key(group));
         for (group, Wanted { depth, stands_for }) in wanted {
@@ -110,10 +117,10 @@ impl Served<'_> {
     }
 
     /// Whether all that a publisher has published is with the daemon.
-    pub(super) fn has_left(&self, publisher: &Endpoint) -> bool {
+    pub(super) fn is_published(&self, publisher: &Endpoint) -> bool {
         let relay = self.relays.get(&Group::of(publisher));
         relay.is_none_or(|relay| !relay.subscription.has_from(&publisher.gid))
-            && self.pipe.outgoing.is_idle(&publisher.gid)
+            && self.pipe.outgoing.is_idle(&Channel::of(publisher.gid))
     }
 
     /// Takes what goes by way of another relay; whether there was any.
@@ -139,14 +146,13 @@ impl Served<'_> {
 }
 
 pub(super) fn take(
-    own: &BTreeMap<Gid, Arc<Endpoint>>,
+    publisher: &Endpoint,
     relays: &BTreeMap<Group, Relay>,
     lost: &mut HashMap<Gid, u64>,
-    publisher: &Gid,
 ) -> Option<Departing<Sample>> {
-    let relay = relays.get(&Group::of(own.get(publisher)?))?;
-    let (content, now) = relay.subscription.take_from(publisher)?;
-    let before = lost.insert(*publisher, now).unwrap_or(0);
+    let relay = relays.get(&Group::of(publisher))?;
+    let (content, now) = relay.subscription.take_from(&publisher.gid)?;
+    let before = lost.insert(publisher.gid, now).unwrap_or(0);
     // A relay that attached anew counts from 0.
     let lost = now.checked_sub(before).unwrap_or(now);
     Some(Departing { meta: content.meta(), lost, content })

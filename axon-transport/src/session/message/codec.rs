@@ -59,6 +59,7 @@ impl Message {
             Self::Matched(m) => (24, minicbor::to_vec(m)),
             Self::Piece(m) => (25, minicbor::to_vec(m)),
             Self::Credit(m) => (26, minicbor::to_vec(m)),
+            Self::Asserted(m) => (27, minicbor::to_vec(m)),
             Self::Unknown(kind) => (*kind, minicbor::to_vec(Empty {})),
         };
         // Encoding into a Vec has no way to fail.
@@ -107,6 +108,7 @@ impl Message {
             24 => Self::Matched(map(kind, body)?),
             25 => Self::Piece(map(kind, body)?),
             26 => Self::Credit(map(kind, body)?),
+            27 => Self::Asserted(map(kind, body)?),
             _ => Self::Unknown(kind),
         })
     }

@@ -329,7 +329,8 @@ pub struct StatusPart {
     pub text: Vec<u8>,
 }
 
-/// With whom an endpoint of a relayed session is matched outside of its process.
+/// With whom an endpoint of a relayed session is matched outside of its process; from the session, the
+/// clients of a server for which there is what stands for them in its process.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct Matched {
@@ -345,7 +346,7 @@ pub struct Matched {
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct Piece {
-    /// Its publisher, which is the channel.
+    /// Its publisher, client or server.
     #[n(0)]
     pub publisher: Gid,
     /// In the first part.
@@ -354,6 +355,9 @@ pub struct Piece {
     /// The bytes that follow those of the part before.
     #[cbor(n(2), with = "minicbor::bytes")]
     pub bytes: Vec<u8>,
+    /// Whose response it is, of a server.
+    #[n(3)]
+    pub client: Option<Gid>,
 }
 
 /// What goes with a sample that crosses a relay.
@@ -377,7 +381,7 @@ pub struct Head {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct Credit {
-    /// The channel.
+    /// The channel's publisher, client or server.
     #[n(0)]
     pub publisher: Gid,
     /// For so many bytes more.
@@ -386,6 +390,18 @@ pub struct Credit {
     /// It is the first that it says of this channel.
     #[n(2)]
     pub opens: bool,
+    /// Of a server, the client whose responses are the channel.
+    #[n(3)]
+    pub client: Option<Gid>,
+}
+
+/// Publishers that were alive since their end of a relay said so last.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Asserted {
+    /// Which.
+    #[n(0)]
+    pub publishers: Vec<Gid>,
 }
 
 /// A message of the session socket.
@@ -412,6 +428,7 @@ pub enum Message {
     Matched(Matched),
     Piece(Piece),
     Credit(Credit),
+    Asserted(Asserted),
     /// A type that this version does not know; to be skipped.
     Unknown(u8),
 }

@@ -89,9 +89,16 @@ fn messages() -> Vec<Message> {
             publisher: writer,
             head: Some(Head { length: 3, sequence: 7, source_timestamp: -1, lost: 2 }),
             bytes: vec![1, 2],
+            client: None,
         }),
-        Message::Piece(Piece { publisher: writer, head: None, bytes: vec![3] }),
-        Message::Credit(Credit { publisher: writer, bytes: 128, opens: true }),
+        Message::Piece(Piece {
+            publisher: writer,
+            head: None,
+            bytes: vec![3],
+            client: Some(reader),
+        }),
+        Message::Credit(Credit { publisher: writer, bytes: 128, opens: true, client: None }),
+        Message::Asserted(Asserted { publishers: vec![writer] }),
     ]
 }
 

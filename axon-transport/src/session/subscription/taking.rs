@@ -96,7 +96,7 @@ impl Slots {
         None
     }
 
-    pub(super) fn take_from(
+    pub(in crate::session) fn take_from(
         &mut self,
         writer: &Gid,
         of: &SubscriptionInner,
@@ -129,7 +129,7 @@ impl Slots {
         }
     }
 
-    pub(super) fn has_from(&self, writer: &Gid) -> bool {
+    pub(in crate::session) fn has_from(&self, writer: &Gid) -> bool {
         self.slots.iter().any(|slot| slot.reader.writer() == *writer && slot.reader.has_data())
     }
 

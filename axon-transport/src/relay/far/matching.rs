@@ -1,0 +1,203 @@
+//! Whom a relayed session's endpoints are matched with, and what of theirs it gets.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    sync::Arc,
+};
+
+use super::Served;
+use crate::{
+    daemon::registry::parts,
+    graph::Endpoint,
+    ids::Gid,
+    qos::{Durability, History, Qos, Reliability},
+    relay::{
+        MAX_MATCHED,
+        flow::{Channel, Departing},
+        pipe::End,
+    },
+    session::{
+        Face, Subscription,
+        message::{GraphItem, Matched, Message},
+    },
+    shm::Sample,
+};
+
+/// Samples of one pair that are passed over before others have their turn.
+const BATCH: usize = 64;
+
+/// By what a publisher's samples are taken: they cross once, whatever the number of subscriptions.
+pub(super) struct Source {
+    subscription: Gid,
+    /// The samples that this one lost, as far as the session knows.
+    lost: u64,
+}
+
+impl Served {
+    /// Tells what changed in the graph.
+    pub(super) fn tell_graph(&mut self) -> Result<(), End> {
+        let now = self.session.graph();
+        let before = std::mem::replace(&mut self.graph, Arc::clone(&now));
+        let same = |gid: &Gid| match (now.endpoints.get(gid), before.endpoints.get(gid)) {
+            (Some(a), Some(b)) => a.daemon == b.daemon && a.endpoint == b.endpoint,
+            _ => false,
+        };
+        let removed: Vec<Gid> = before.endpoints.keys().filter(|gid| !same(gid)).copied().collect();
+        let added = now.endpoints.values().filter(|entry| !same(&entry.endpoint.gid));
+        let added = added
+            .map(|e| GraphItem { endpoint: Endpoint::clone(&e.endpoint), daemon: e.daemon })
+            .collect::<Vec<_>>();
+        if removed.is_empty() && added.is_empty() {
+            return Ok(());
+        }
+        let all = parts(now.version, false, added.into_iter(), &removed, &BTreeSet::new(), false);
+        all.into_iter().try_for_each(|part| self.pipe.say(&Message::Graph(part)))
+    }
+
+    /// Tells with whom the session's endpoints are matched, and decides by which of them what others
+    /// write goes to it.
+    pub(super) fn match_up(&mut self) -> Result<(), End> {
+        let mut changes = Vec::new();
+        self.draining = false;
+        for (gid, face) in &self.writers {
+            let mut others = face.partners().into_iter().collect();
+            let left = |other: &Gid| {
+                face.has_from(other) || !self.pipe.outgoing.is_idle(&channel(face, *other))
+            };
+            self.draining |= keep_what_is_left(&mut others, self.told.get(gid), left);
+            changes.push((*gid, others));
+        }
+        for (gid, subscription) in &self.subscriptions {
+            let mut writers = subscription.matched().into_iter().collect();
+            let left = |writer: &Gid| {
+                subscription.has_from(writer)
+                    || self.sources.get(writer).is_some_and(|s| s.subscription == *gid)
+                        && !self.pipe.outgoing.is_idle(&Channel::of(*writer))
+            };
+            self.draining |= keep_what_is_left(&mut writers, self.told.get(gid), left);
+            changes.push((*gid, writers));
+        }
+        for (gid, others) in changes {
+            if self.told.get(&gid) != Some(&others) {
+                let shown = others.iter().take(MAX_MATCHED).copied().collect();
+                self.pipe.say(&Message::Matched(Matched { gid, others: shown }))?;
+                self.told.insert(gid, others);
+            }
+        }
+        self.choose();
+        let servers = self
+            .told
+            .iter()
+            .filter(|(gid, _)| matches!(self.writers.get(gid), Some(Face::Server(_))));
+        self.calls.set(servers.flat_map(|(gid, all)| all.iter().map(|client| (*client, *gid))));
+        self.close_unwanted();
+        self.wanted().into_iter().for_each(|channel| self.pipe.outgoing.open(channel));
+        let graph = &self.graph.endpoints;
+        let sources = self.sources.keys().filter_map(|writer| graph.get(writer));
+        self.alive.watch(sources.filter_map(|entry| entry.endpoint.qos.lease));
+        Ok(())
+    }
+
+    /// The channels to the session, as it has been told with whom its endpoints are matched.
+    fn wanted(&self) -> BTreeSet<Channel> {
+        let mut wanted = BTreeSet::new();
+        for (gid, others) in &self.told {
+            match self.writers.get(gid) {
+                Some(Face::Publisher(_)) => {}
+                Some(face) => wanted.extend(others.iter().map(|other| channel(face, *other))),
+                None => wanted.extend(others.iter().map(|writer| Channel::of(*writer))),
+            }
+        }
+        wanted
+    }
+
+    pub(super) fn close_unwanted(&mut self) {
+        let wanted = self.wanted();
+        self.sources.retain(|writer, _| wanted.contains(&Channel::of(*writer)));
+        self.pipe.outgoing.retain(|channel| wanted.contains(channel));
+    }
+
+    fn choose(&mut self) {
+        let mut best: BTreeMap<Gid, Gid> = BTreeMap::new();
+        self.others.clear();
+        for (gid, writers) in &self.told {
+            let Some(qos) = self.subscriptions.get(gid).map(|s| s.endpoint().qos) else { continue };
+            for writer in writers {
+                match best.insert(*writer, *gid) {
+                    Some(other)
+                        if rank(&self.subscriptions[&other].endpoint().qos) >= rank(&qos) =>
+                    {
+                        best.insert(*writer, other);
+                        self.others.push((*gid, *writer));
+                    }
+                    Some(other) => self.others.push((other, *writer)),
+                    None => {}
+                }
+            }
+        }
+        self.sources.retain(|writer, _| best.contains_key(writer));
+        for (writer, subscription) in best {
+            let source = self.sources.entry(writer).or_insert(Source { subscription, lost: 0 });
+            if source.subscription != subscription {
+                *source = Source { subscription, lost: 0 };
+            }
+        }
+    }
+
+    /// Takes what comes by way of another subscription; whether there was any.
+    pub(super) fn pass_over(&self) -> bool {
+        let mut any = false;
+        for (reader, writer) in &self.others {
+            let Some(subscription) = self.subscriptions.get(reader) else { continue };
+            for _ in 0..BATCH {
+                if subscription.take_from(writer).is_none() {
+                    break;
+                }
+                any = true;
+            }
+        }
+        any
+    }
+}
+
+/// Which of two subscriptions to one publisher is the one that misses least.
+fn rank(qos: &Qos) -> (bool, bool, bool, u32) {
+    (
+        qos.reliability == Reliability::Reliable,
+        qos.durability == Durability::TransientLocal,
+        qos.history == History::KeepAll,
+        qos.depth,
+    )
+}
+
+pub(super) fn take(
+    source: &mut Source,
+    subscriptions: &BTreeMap<Gid, Subscription>,
+    writer: &Gid,
+) -> Option<Departing<Sample>> {
+    let (content, lost) = subscriptions.get(&source.subscription)?.take_from(writer)?;
+    let before = std::mem::replace(&mut source.lost, lost);
+    // A publisher that attached anew counts from 0.
+    let lost = lost.checked_sub(before).unwrap_or(lost);
+    Some(Departing { meta: content.meta(), lost, content })
+}
+
+/// On which channel the session gets what `other` writes for one of its clients or servers.
+fn channel(of: &Face, other: Gid) -> Channel {
+    match of {
+        Face::Client(client) => Channel::between(other, client.gid()),
+        Face::Server(_) | Face::Publisher(_) => Channel::of(other),
+    }
+}
+
+/// Adds those that were there before and have left something: that comes first. Whether there are any.
+fn keep_what_is_left(
+    others: &mut BTreeSet<Gid>,
+    before: Option<&BTreeSet<Gid>>,
+    left: impl Fn(&Gid) -> bool,
+) -> bool {
+    let rest = before.into_iter().flatten().filter(|other| !others.contains(other) && left(other));
+    let rest: Vec<Gid> = rest.copied().collect();
+    others.extend(&rest);
+    !rest.is_empty()
+}

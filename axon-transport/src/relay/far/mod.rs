@@ -1,0 +1,319 @@
+//! The daemon's end: the endpoints of a relayed session, in memory that every session maps.
+
+mod matching;
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    os::fd::{AsFd, OwnedFd},
+    sync::Arc,
+};
+
+use rustix::process::{Pid, PidfdFlags, pidfd_open};
+
+use self::matching::{Source, take};
+use super::{
+    MAX_CALLERS, MAX_ENDPOINTS, Pool, Tally,
+    alive::Alive,
+    calls::{self, Calls},
+    flow::{Channel, Incoming},
+    news::News,
+    pipe::{End, Pipe},
+};
+use crate::{
+    config::Config,
+    graph::{Endpoint, EndpointKind, GraphView},
+    ids::{Gid, SessionId},
+    passed::PassedFd,
+    session::{
+        Face, Node, Session, SessionError, SessionOptions, Subscription,
+        message::{Announce, EndpointRole, Matched, Message, PROTOCOL, Refused, Welcome},
+        socket,
+    },
+    wait::ExternalLeader,
+};
+
+/// What a relay is started with.
+pub(crate) struct Far {
+    /// The session's connection.
+    pub(crate) socket: PassedFd,
+    /// One end of a socket pair, at whose other end the control plane serves.
+    pub(crate) inside: OwnedFd,
+    pub(crate) config: Arc<Config>,
+    /// The session's name and id.
+    pub(crate) name: String,
+    pub(crate) id: SessionId,
+    /// Its process; 0 where that cannot be seen.
+    pub(crate) pid: u32,
+    pub(crate) tally: Arc<Tally>,
+    pub(crate) pool: Arc<Pool>,
+}
+
+impl Far {
+    /// Serves the session on a thread of its own, until it or the control plane ends it.
+    pub(crate) fn start(self) -> std::io::Result<()> {
+        std::thread::Builder::new().name("axon-relay".into()).spawn(move || self.run()).map(drop)
+    }
+
+    fn run(self) {
+        let id = self.id;
+        match self.open().and_then(Served::serve) {
+            Ok(()) => {}
+            Err(End::Socket(socket::SocketError::Closed)) => {
+                tracing::debug!(session = %id, "a relayed session ended");
+            }
+            Err(why) => tracing::warn!(session = %id, %why, "a relayed session was disconnected"),
+        }
+    }
+
+    fn open(self) -> Result<Served, End> {
+        let Self { socket, inside, config, name, id, pid, tally, pool } = self;
+        let say = |message: Message| {
+            let packet = message.encode().map_err(|e| End::Other(e.to_string()))?;
+            // The connection is new: its buffer has room.
+            Ok::<(), End>(socket::send(&socket, &packet, &[])?)
+        };
+        let process = i32::try_from(pid).ok().and_then(Pid::from_raw);
+        let process = process.and_then(|pid| pidfd_open(pid, PidfdFlags::empty()).ok());
+        let session = match Session::over_as(id, inside, &config, SessionOptions::new(name)) {
+            Ok(session) => session,
+            Err(error) => {
+                let text = error.to_string();
+                let [variable, ours, theirs] = [const { String::new() }; 3];
+                say(Message::Refused(Refused { variable, ours, theirs, text }))?;
+                return Err(failed(&error));
+            }
+        };
+        let news = News::new().map_err(|e| End::Other(e.to_string()))?;
+        news.of(&session);
+        let leader = session.segment().external_leader().map_err(|e| End::Other(e.to_string()))?;
+        let daemon = session.daemon().unwrap_or_default();
+        let welcome = Welcome { protocol: PROTOCOL, daemon, pid: std::process::id() };
+        say(Message::Welcome(welcome))?;
+        let incoming = Incoming::new(config.max_message, pool);
+        Ok(Served {
+            id,
+            pipe: Pipe::new(socket, incoming, Arc::clone(&tally)),
+            tally,
+            writers: BTreeMap::new(),
+            subscriptions: BTreeMap::new(),
+            nodes: BTreeMap::new(),
+            told: BTreeMap::new(),
+            sources: BTreeMap::new(),
+            others: Vec::new(),
+            calls: Calls::default(),
+            callers: BTreeMap::new(),
+            alive: Alive::default(),
+            graph: Arc::default(),
+            draining: false,
+            leader,
+            news,
+            process,
+            session,
+        })
+    }
+}
+
+fn failed(error: &SessionError) -> End {
+    End::Other(error.to_string())
+}
+
+/// A session that is served.
+struct Served {
+    id: SessionId,
+    pipe: Pipe,
+    tally: Arc<Tally>,
+    /// Its publishers, clients and servers.
+    writers: BTreeMap<Gid, Face>,
+    subscriptions: BTreeMap<Gid, Subscription>,
+    nodes: BTreeMap<Gid, Node>,
+    /// The others that each endpoint was said to be matched with.
+    told: BTreeMap<Gid, BTreeSet<Gid>>,
+    /// The publishers whose samples the session gets.
+    sources: BTreeMap<Gid, Source>,
+    /// The pairs, reader first, whose samples it gets by way of another of its subscriptions.
+    others: Vec<(Gid, Gid)>,
+    /// What is asked of its servers.
+    calls: Calls,
+    /// The clients that its process has for each of its servers: whose responses may come.
+    callers: BTreeMap<Gid, BTreeSet<Gid>>,
+    alive: Alive,
+    /// The graph as it was told.
+    graph: Arc<GraphView>,
+    /// Whether a publisher that is gone has samples left.
+    draining: bool,
+    leader: ExternalLeader,
+    news: Arc<News>,
+    process: Option<OwnedFd>,
+    /// Last: what is above is of it.
+    session: Session,
+}
+
+impl Served {
+    fn serve(mut self) -> Result<(), End> {
+        let mut begun = false;
+        loop {
+            self.leader.clear();
+            let blocked = self.pipe.blocked;
+            self.leader.arm(blocked);
+            let news = self.news.take() | !std::mem::replace(&mut begun, true);
+            if self.news.is_lost() {
+                return Err(End::Other("the control plane dropped it".into()));
+            }
+            let (messages, more) = self.pipe.receive()?;
+            let changed = messages.iter().any(|m| !matches!(m, Message::Credit(_)));
+            messages.into_iter().try_for_each(|message| self.handle(message))?;
+            if news {
+                self.tell_graph()?;
+            }
+            if news || changed || self.draining {
+                self.match_up()?;
+            }
+            let leased = self.subscriptions.values().flat_map(Subscription::assertions);
+            let news = self.alive.news(leased);
+            news.iter().try_for_each(|message| self.pipe.say(message))?;
+            let (writers, tally) = (&self.writers, &self.tally);
+            let find = |gid: &Gid| writers.get(gid);
+            self.pipe.write(find, |_, samples| tally.lost(samples))?;
+            let (sources, subscriptions) = (&mut self.sources, &self.subscriptions);
+            let calls = &mut self.calls;
+            let sent = self.pipe.send(|channel| {
+                if channel.client.is_some() {
+                    calls::response(channel, find)
+                } else if let Some(source) = sources.get_mut(&channel.writer) {
+                    take(source, subscriptions, &channel.writer)
+                } else {
+                    calls.request(&channel.writer, find)
+                }
+            })?;
+            let passed = self.pass_over();
+            if more || sent || passed || self.pipe.blocked && !blocked {
+                self.leader.disarm();
+                continue;
+            }
+            let process = self.process.as_ref().map(AsFd::as_fd);
+            if self.pipe.sleep(&self.leader, &self.news, process, self.alive.left()) {
+                return Err(End::Other("its process ended".into()));
+            }
+        }
+    }
+
+    fn handle(&mut self, message: Message) -> Result<(), End> {
+        match message {
+            Message::Endpoint(announce) => self.announce(announce),
+            Message::EndpointGone(gone) => {
+                self.forget(&gone.gid);
+                Ok(())
+            }
+            Message::Matched(matched) => self.callers(matched),
+            Message::Asserted(asserted) => {
+                let own = asserted.publishers.iter().filter_map(|gid| self.writers.get(gid));
+                own.for_each(Face::assert_alive);
+                Ok(())
+            }
+            Message::Credit(credit) => {
+                self.pipe.outgoing.credit(&credit);
+                Ok(())
+            }
+            Message::Unknown(_) => Ok(()),
+            _ => Err(End::Other("it sent a message that no relayed session sends".into())),
+        }
+    }
+
+    fn announce(&mut self, announce: Announce) -> Result<(), End> {
+        let Announce { endpoint, role, .. } = announce;
+        let gid = endpoint.gid;
+        if role != EndpointRole::Application || !gid.is_of(&self.id) {
+            return Err(End::Other(format!("endpoint {gid} is not its own")));
+        }
+        let known = self.writers.contains_key(&gid)
+            || self.subscriptions.contains_key(&gid)
+            || self.nodes.contains_key(&gid);
+        let refusal = match endpoint.kind {
+            _ if known => return Ok(()),
+            _ if !endpoint.is_sane() => Some("a name, type hash or depth out of bounds"),
+            kind if self.count(kind) >= MAX_ENDPOINTS => {
+                Some("a relayed session may have no more of its kind")
+            }
+            _ => None,
+        };
+        match refusal {
+            Some(text) => self.refuse(&endpoint, text),
+            None => self.adopt(endpoint),
+        }
+    }
+
+    fn count(&self, kind: EndpointKind) -> usize {
+        match kind {
+            EndpointKind::Subscription => self.subscriptions.len(),
+            EndpointKind::Node => self.nodes.len(),
+            _ => self.writers.values().filter(|face| face.endpoint().kind == kind).count(),
+        }
+    }
+
+    fn adopt(&mut self, endpoint: Endpoint) -> Result<(), End> {
+        let gid = endpoint.gid;
+        match endpoint.kind {
+            EndpointKind::Subscription => {
+                self.subscriptions.insert(gid, self.session.adopt_subscription(endpoint));
+            }
+            EndpointKind::Node => {
+                self.nodes.insert(gid, self.session.adopt_node(endpoint));
+            }
+            kind => match Face::adopt(&self.session, endpoint.clone()) {
+                Ok(face) => {
+                    self.writers.insert(gid, face);
+                    // A server's responses are a channel for each of its clients.
+                    if kind != EndpointKind::Server {
+                        self.pipe.open(Channel::of(gid))?;
+                    }
+                }
+                Err(error) => self.refuse(&endpoint, &error.to_string())?,
+            },
+        }
+        Ok(())
+    }
+
+    /// An endpoint is gone. What it was sent is not wanted any more from here on, in the order in which
+    /// both ends say so: its channels must not be taken for those of another that come after them.
+    fn forget(&mut self, gid: &Gid) {
+        if self.writers.remove(gid).is_some() {
+            self.pipe.retain(|channel| channel.writer != *gid);
+        }
+        self.subscriptions.remove(gid);
+        self.nodes.remove(gid);
+        self.callers.remove(gid);
+        if self.told.remove(gid).is_some() {
+            self.close_unwanted();
+        }
+    }
+
+    /// The process has what stands for these clients of a server, whose responses they get by way of it.
+    fn callers(&mut self, matched: Matched) -> Result<(), End> {
+        let Matched { gid, others } = matched;
+        let others: BTreeSet<Gid> = others.into_iter().collect();
+        match self.writers.get(&gid) {
+            Some(Face::Server(_)) => {}
+            // It was refused.
+            None if gid.is_of(&self.id) => return Ok(()),
+            _ => return Err(End::Other(format!("{gid} is no server of its own"))),
+        }
+        self.callers.remove(&gid);
+        let elsewhere: usize = self.callers.values().map(BTreeSet::len).sum();
+        if elsewhere + others.len() > MAX_CALLERS {
+            return Err(End::Other(format!("its servers answer more than {MAX_CALLERS} clients")));
+        }
+        let wanted = |client: Option<Gid>| client.is_some_and(|client| others.contains(&client));
+        self.pipe.retain(|channel| channel.writer != gid || wanted(channel.client));
+        for client in &others {
+            self.pipe.open(Channel::between(gid, *client))?;
+        }
+        self.callers.insert(gid, others);
+        Ok(())
+    }
+
+    fn refuse(&mut self, endpoint: &Endpoint, why: &str) -> Result<(), End> {
+        let [variable, ours, theirs] = [const { String::new() }; 3];
+        let text = format!("endpoint {} of topic {:?}: {why}", endpoint.gid, endpoint.topic);
+        self.pipe.say(&Message::Refused(Refused { variable, ours, theirs, text }))
+    }
+}

@@ -1,0 +1,206 @@
+//! What stands in the session's process for those outside with whom the daemon says its endpoints are
+//! matched.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    time::{Duration, Instant},
+};
+
+use super::Served;
+use crate::{
+    graph::{Endpoint, EndpointKind, Pairing, pairing, reads},
+    ids::Gid,
+    relay::{MAX_CALLERS, flow::Channel, pipe::End},
+    session::{
+        Face,
+        message::{Matched, Message},
+    },
+};
+
+/// How long a client's requests wait for servers that it counts and that the daemon does not say yet
+/// that it is matched with.
+const SETTLING: Duration = Duration::from_secs(1);
+
+/// What stands for one of them.
+pub(super) struct StandIn {
+    face: Face,
+    since: Instant,
+}
+
+impl StandIn {
+    pub(super) fn face(&self) -> &Face {
+        &self.face
+    }
+}
+
+impl Served<'_> {
+    /// The daemon says with whom an endpoint of the session is matched. What it was matched with before
+    /// is let go of at once: another message may have it come back, and its channels begin anew then.
+    pub(super) fn rematch(&mut self, matched: Matched) {
+        let Matched { gid, others } = matched;
+        // It may have ended meanwhile.
+        if !self.own.contains_key(&gid) {
+            return;
+        }
+        let others: BTreeSet<Gid> = others.into_iter().collect();
+        let before = self.matched.insert(gid, others.clone());
+        if before.is_some_and(|before| !before.is_subset(&others)) {
+            self.forget_unwanted();
+        }
+    }
+
+    /// Those who write for an endpoint of the session, and for which of them.
+    fn wanted(&self) -> BTreeMap<Gid, Vec<Gid>> {
+        let mut wanted: BTreeMap<Gid, Vec<Gid>> = BTreeMap::new();
+        for endpoint in self.own.values().filter(|e| reads(e.kind)) {
+            for writer in self.matched.get(&endpoint.gid).into_iter().flatten() {
+                wanted.entry(*writer).or_default().push(endpoint.gid);
+            }
+        }
+        wanted
+    }
+
+    fn forget_unwanted(&mut self) -> BTreeMap<Gid, Vec<Gid>> {
+        let wanted = self.wanted();
+        self.stand_ins.retain(|gid, _| wanted.contains_key(gid));
+        self.pipe.retain(|Channel { writer, client }| {
+            wanted.get(writer).is_some_and(|readers| client.is_none_or(|c| readers.contains(&c)))
+        });
+        wanted
+    }
+
+    pub(super) fn update_stand_ins(&mut self) -> Result<(), End> {
+        for (writer, readers) in self.forget_unwanted() {
+            if !self.stand_ins.contains_key(&writer) {
+                // The graph may say later who it is.
+                let Some((_, endpoint)) = self.world.get(&writer) else { continue };
+                match Face::stand_in(&self.common.outside, endpoint.clone()) {
+                    Ok(face) => {
+                        self.stand_ins.insert(writer, StandIn { face, since: Instant::now() });
+                    }
+                    Err(error) => {
+                        let topic = &endpoint.topic;
+                        tracing::error!(topic, %writer, %error, "nothing is received from it");
+                        continue;
+                    }
+                }
+            }
+            let face = self.stand_ins[&writer].face();
+            let partners = face.partners();
+            if let Face::Server(_) = face {
+                for client in readers.iter().filter(|client| partners.contains(client)) {
+                    self.pipe.open(Channel::between(writer, *client))?;
+                }
+                continue;
+            }
+            // Whoever there is to read it, whether or not the daemon has said so of all of them: what
+            // comes first is theirs, too. Who is gone and has left something reads no more.
+            let own = self.own.values().filter(|e| !self.ending.contains(&e.gid));
+            let mut readers = own.filter(|e| pairing(face.endpoint(), e) == Pairing::Match);
+            if readers.all(|reader| partners.contains(&reader.gid)) {
+                self.pipe.open(Channel::of(writer))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether a subscription or server receives from all stand-ins that there are for it: who outside
+    /// counts it may rely on it.
+    pub(super) fn is_served(&self, reader: &Endpoint) -> bool {
+        // A client may be told of: its requests wait until it is served (`settling`).
+        !matches!(reader.kind, EndpointKind::Subscription | EndpointKind::Server)
+            || self.stand_ins.values().map(StandIn::face).all(|face| {
+                pairing(face.endpoint(), reader) != Pairing::Match
+                    || face.partners().contains(&reader.gid)
+            })
+    }
+
+    /// By way of whom requests leave, and which wait; to whom responses may.
+    pub(super) fn update_calls(&mut self) -> Result<(), End> {
+        self.settling.clear();
+        let mut pairs = Vec::new();
+        for client in self.own.values().filter(|e| e.kind == EndpointKind::Client) {
+            let matched = self.matched.get(&client.gid);
+            for (server, stand_in) in &self.stand_ins {
+                let face = stand_in.face();
+                if pairing(client, face.endpoint()) != Pairing::Match {
+                    continue;
+                }
+                pairs.push((client.gid, *server));
+                if !matched.is_some_and(|all| all.contains(server))
+                    && face.partners().contains(&client.gid)
+                {
+                    // It stands for the sake of another client, and this one counts it already.
+                    let told = self.asking.get(&client.gid).copied().unwrap_or(stand_in.since);
+                    let until = told.max(stand_in.since) + SETTLING;
+                    let latest = self.settling.entry(client.gid).or_insert(until);
+                    *latest = until.max(*latest);
+                }
+            }
+        }
+        self.calls.set(pairs.into_iter());
+        let now = Instant::now();
+        self.settling.retain(|_, until| *until > now);
+        self.tell_callers()
+    }
+
+    /// Tells the daemon of the clients for whom there is a stand-in, whose servers' responses may then
+    /// come.
+    fn tell_callers(&mut self) -> Result<(), End> {
+        let mut room = MAX_CALLERS;
+        let mut changes = Vec::new();
+        for server in self.own.values().filter(|e| e.kind == EndpointKind::Server) {
+            let all = self.matched.get(&server.gid).into_iter().flatten();
+            let there: Vec<Gid> =
+                all.filter(|client| self.stand_ins.contains_key(client)).copied().collect();
+            let now: BTreeSet<Gid> = there.iter().take(room).copied().collect();
+            room -= now.len();
+            let before = self.callers.get(&server.gid);
+            if before == Some(&now) {
+                continue;
+            }
+            if now.len() < there.len() {
+                let topic = &server.topic;
+                tracing::error!(topic, "it has more clients than a relayed session may answer");
+            }
+            let more = now.len().cast_signed() - before.map_or(0, BTreeSet::len).cast_signed();
+            changes.push((more, server.gid, now));
+        }
+        // Those that have fewer first: in between there are not too many, either.
+        changes.sort_by_key(|(more, ..)| *more);
+        for (_, server, now) in changes {
+            self.pipe.outgoing.retain(|Channel { writer, client }| {
+                *writer != server || client.is_some_and(|client| now.contains(&client))
+            });
+            for client in &now {
+                self.pipe.outgoing.open(Channel::between(server, *client));
+            }
+            let others = now.iter().copied().collect();
+            self.callers.insert(server, now);
+            self.pipe.say(&Message::Matched(Matched { gid: server, others }))?;
+        }
+        Ok(())
+    }
+
+    /// How long until requests go whether or not all is settled.
+    pub(super) fn settled_in(&self) -> Option<Duration> {
+        let until = self.settling.values().min()?;
+        Some(until.saturating_duration_since(Instant::now()))
+    }
+
+    /// Whether all requests of a client of the session are with the daemon.
+    pub(super) fn is_asked(&self, client: &Gid) -> bool {
+        self.pipe.outgoing.is_idle(&Channel::of(*client))
+            && self.stand_ins.values().all(|stand_in| !stand_in.face().has_from(client))
+    }
+
+    /// Whether all responses of a server of the session are.
+    pub(super) fn is_answered(&self, server: &Gid) -> bool {
+        let clients = self.callers.get(server).into_iter().flatten();
+        let mut there = clients.filter_map(|client| Some((client, self.stand_ins.get(client)?)));
+        there.all(|(client, stand_in)| {
+            !stand_in.face().has_from(server)
+                && self.pipe.outgoing.is_idle(&Channel::between(*server, *client))
+        })
+    }
+}

@@ -1,0 +1,120 @@
+//! Whoever writes elsewhere, as those see it that read here: a publisher, client or server that another
+//! process, of this host or of another, speaks for.
+
+use super::{Client, Publisher, Server, Session, SessionError, message::EndpointRole};
+use crate::{
+    graph::{Endpoint, EndpointKind},
+    ids::Gid,
+    shm::{Meta, PublishError, Sample},
+};
+
+/// What stands for it here. Of a service it reads, too: a client's is given the responses that go to
+/// where the client is, and a server's the requests.
+pub(crate) enum Face {
+    Publisher(Publisher),
+    Client(Client),
+    Server(Server),
+}
+
+/// What became of a message that was to be written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Written {
+    /// Its readers have it.
+    Yes,
+    /// The client that it answers is gone.
+    Nobody,
+}
+
+impl Face {
+    /// A stand-in for `remote`, under its GID. For gateways alone; a daemon refuses it from anybody
+    /// else.
+    ///
+    /// # Errors
+    /// When there is no memory.
+    pub(crate) fn stand_in(session: &Session, remote: Endpoint) -> Result<Self, SessionError> {
+        Self::new(session, remote, EndpointRole::StandIn)
+    }
+
+    /// An endpoint of `session` as another process of the session describes it, under its GID there.
+    ///
+    /// # Errors
+    /// When there is no memory.
+    pub(crate) fn adopt(session: &Session, own: Endpoint) -> Result<Self, SessionError> {
+        Self::new(session, own, EndpointRole::Application)
+    }
+
+    fn new(session: &Session, of: Endpoint, role: EndpointRole) -> Result<Self, SessionError> {
+        Ok(match of.kind {
+            EndpointKind::Client => Self::Client(session.add_client(of, role)?),
+            EndpointKind::Server => Self::Server(session.add_server(of, role)),
+            _ => Self::Publisher(session.add_asserted(of, role)?),
+        })
+    }
+
+    pub(crate) fn endpoint(&self) -> &Endpoint {
+        match self {
+            Self::Publisher(publisher) => publisher.endpoint(),
+            Self::Client(client) => client.endpoint(),
+            Self::Server(server) => server.endpoint(),
+        }
+    }
+
+    /// Those here whom it reaches and who, where it is of a service, reach it.
+    pub(crate) fn partners(&self) -> Vec<Gid> {
+        match self {
+            Self::Publisher(publisher) => publisher.matched(),
+            Self::Client(client) => client.servers(),
+            Self::Server(server) => server.clients(),
+        }
+    }
+
+    /// Writes a sample, a request, or a response to `client`, without waiting for room.
+    ///
+    /// # Errors
+    /// [`PublishError::Blocked`] when there is none; the others say what does not fit.
+    pub(crate) fn try_write(
+        &self,
+        client: &Gid,
+        meta: Meta,
+        payload: &[u8],
+    ) -> Result<Written, PublishError> {
+        let there = match self {
+            Self::Publisher(publisher) => {
+                publisher.try_publish_with(meta, payload)?;
+                true
+            }
+            Self::Client(client) => {
+                client.try_forward(meta, payload)?;
+                true
+            }
+            Self::Server(server) => server.try_respond(client, meta, payload)?,
+        };
+        Ok(if there { Written::Yes } else { Written::Nobody })
+    }
+
+    /// The next request or response of `writer`, in place.
+    pub(crate) fn take_from(&self, writer: &Gid) -> Option<Sample> {
+        match self {
+            Self::Publisher(_) => None,
+            Self::Client(client) => client.take_response_from(writer),
+            Self::Server(server) => server.take_request_from(writer),
+        }
+    }
+
+    /// Whether there is a request or response of `writer` to be taken.
+    pub(crate) fn has_from(&self, writer: &Gid) -> bool {
+        match self {
+            Self::Publisher(_) => false,
+            Self::Client(client) => client.has_response_from(writer),
+            Self::Server(server) => server.has_request_from(writer),
+        }
+    }
+
+    /// Whoever speaks for it says that it is alive.
+    pub(crate) fn assert_alive(&self) {
+        if let Self::Publisher(publisher) = self {
+            // Only a forked child is refused.
+            let _ = publisher.assert_liveliness();
+        }
+    }
+}

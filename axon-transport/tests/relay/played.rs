@@ -1,0 +1,133 @@
+//! A daemon that says what the tests have it say.
+
+use axon_transport::{
+    ids::DaemonId,
+    session::message::{Graph, GraphItem, Welcome},
+};
+
+use super::{hostile::hear, *};
+
+/// A relayed session, and the connection to its daemon, which is played.
+fn played(host: &Host) -> (Session, OwnedFd) {
+    let (listener, lock) = Address::of(&host.config()).bind().unwrap().into_parts();
+    let session = thread::scope(|scope| {
+        let session = scope.spawn(|| session(host, "session", false));
+        let flags = rustix::net::SocketFlags::CLOEXEC | rustix::net::SocketFlags::NONBLOCK;
+        let mut socket = None;
+        until("it calls", || {
+            socket = rustix::net::accept_with(&listener, flags).ok();
+            socket.is_some()
+        });
+        let socket = socket.unwrap();
+        assert!(matches!(hear(&socket, |_| true), Some(Message::Hello(_))));
+        let (daemon, pid) = (DaemonId([1; 16]), std::process::id());
+        say_to(&socket, &Message::Welcome(Welcome { protocol: PROTOCOL, daemon, pid }));
+        (session.join().unwrap(), socket)
+    });
+    drop((listener, lock));
+    session
+}
+
+/// There is an endpoint outside, of this kind and the same topic as `own`.
+fn show(socket: &OwnedFd, own: &Endpoint, kind: EndpointKind) -> Gid {
+    let number = if kind == EndpointKind::Server { 2 } else { 1 };
+    let gid = Gid::new(SessionId([9; 16]), number);
+    let endpoint = Endpoint { gid, kind, ..own.clone() };
+    let added = vec![GraphItem { endpoint, daemon: None }];
+    let (removed, ended) = (Vec::new(), None);
+    let graph = Graph { version: 1, whole: false, added, removed, more: false, ended };
+    say_to(socket, &Message::Graph(graph));
+    gid
+}
+
+fn announced(socket: &OwnedFd, gid: Gid) {
+    let heard = hear(socket, |m| matches!(m, Message::Endpoint(a) if a.endpoint.gid == gid));
+    assert!(heard.is_some());
+}
+
+fn opened(socket: &OwnedFd, writer: Gid, reader: Option<Gid>) {
+    let heard = hear(
+        socket,
+        |m| matches!(m, Message::Credit(c) if c.publisher == writer && c.client == reader && c.opens),
+    );
+    assert!(heard.is_some());
+}
+
+fn matched(socket: &OwnedFd, gid: Gid, others: &[Gid]) {
+    say_to(socket, &Message::Matched(Matched { gid, others: others.to_vec() }));
+}
+
+#[test]
+fn who_is_gone_and_back_at_once_is_received_from_anew() {
+    let host = host();
+    let (session, socket) = played(&host);
+    let subscription = session.create_subscription(spec("/t", Qos::default())).unwrap();
+    announced(&socket, subscription.gid());
+    let outside = show(&socket, subscription.endpoint(), EndpointKind::Publisher);
+    matched(&socket, subscription.gid(), &[outside]);
+    opened(&socket, outside, None);
+    // What the daemon had sent on of that publisher it has forgotten, and so must the session.
+    for _ in 0..3 {
+        matched(&socket, subscription.gid(), &[]);
+        matched(&socket, subscription.gid(), &[outside]);
+        opened(&socket, outside, None);
+    }
+}
+
+#[test]
+fn the_ends_of_a_service_that_are_gone_and_back_at_once_begin_anew() {
+    let host = host();
+    let (session, socket) = played(&host);
+    let own = session.create_server(services::service()).unwrap();
+    announced(&socket, own.gid());
+    let outside = show(&socket, own.endpoint(), EndpointKind::Client);
+    for _ in 0..3 {
+        matched(&socket, own.gid(), &[outside]);
+        opened(&socket, outside, None);
+        matched(&socket, own.gid(), &[]);
+    }
+    drop(own);
+
+    let own = session.create_client(services::service()).unwrap();
+    announced(&socket, own.gid());
+    let outside = show(&socket, own.endpoint(), EndpointKind::Server);
+    for _ in 0..3 {
+        matched(&socket, own.gid(), &[outside]);
+        opened(&socket, outside, Some(own.gid()));
+        matched(&socket, own.gid(), &[]);
+    }
+    until("it counts nobody", || !own.is_available());
+}
+
+#[test]
+fn a_request_is_sent_once_however_many_servers_it_is_for() {
+    let host = host();
+    let (session, socket) = played(&host);
+    let own = session.create_client(services::service()).unwrap();
+    announced(&socket, own.gid());
+    let one = show(&socket, own.endpoint(), EndpointKind::Server);
+    matched(&socket, own.gid(), &[one]);
+    opened(&socket, one, Some(own.gid()));
+    assert!(own.is_available());
+    let credit = Credit { publisher: own.gid(), bytes: 1000, opens: true, client: None };
+    say_to(&socket, &Message::Credit(credit));
+    for number in 1..=3 {
+        assert_eq!(own.send_request(b"x").unwrap(), number);
+        let piece = hear(&socket, |m| matches!(m, Message::Piece(_)));
+        let Some(Message::Piece(piece)) = piece else { panic!("no request") };
+        assert_eq!((piece.publisher, piece.client), (own.gid(), None));
+        assert_eq!(piece.head.unwrap().sequence, number);
+    }
+    // To whom it answers, and which it answers, is the server's to say; whose it is, is not.
+    let other = Gid::new(SessionId([9; 16]), 7);
+    let answer = |server, client, sequence| {
+        let head = Some(Head { length: 1, sequence, source_timestamp: 0, lost: 0 });
+        Message::Piece(Piece { publisher: server, head, bytes: vec![0], client })
+    };
+    say_to(&socket, &answer(other, Some(own.gid()), 1));
+    say_to(&socket, &answer(one, Some(other), 1));
+    say_to(&socket, &answer(one, Some(own.gid()), 2));
+    let info = own.recv_response(&mut Vec::new(), Some(PATIENCE)).unwrap();
+    assert_eq!((info.publisher, info.sequence), (one, 2));
+    assert!(!own.has_response());
+}

@@ -1,0 +1,395 @@
+//! Services where requests and responses pass through the daemon: who is there for whom, and whose each
+//! response is.
+
+use std::collections::HashSet;
+
+use axon_transport::session::{Client, Server, Waitable};
+
+use super::*;
+
+/// Who shares memory of server and client.
+const ENDS: [(bool, bool); 3] = [(false, true), (true, false), (false, false)];
+const CLIENTS: usize = 20;
+pub(crate) const CALLS: u64 = 50;
+
+pub(crate) fn service() -> EndpointSpec {
+    EndpointSpec::new("/add", "Add", Qos::default())
+}
+
+/// Answers one request with its bytes reversed.
+pub(crate) fn answer(server: &Server) -> Gid {
+    let mut bytes = Vec::new();
+    let request = server.recv_request(&mut bytes, Some(PATIENCE)).expect("a request");
+    bytes.reverse();
+    respond(server, request.publisher, request.sequence, &bytes);
+    request.publisher
+}
+
+fn respond(server: &Server, client: Gid, sequence: u64, bytes: &[u8]) {
+    let deadline = Instant::now() + PATIENCE;
+    while let Err(error) = server.send_response(client, sequence, bytes) {
+        assert!(matches!(error, PublishError::Blocked { .. }), "{error}");
+        assert!(Instant::now() < deadline, "for ever");
+    }
+}
+
+pub(crate) fn call(client: &Client, bytes: &[u8]) {
+    let number = client.send_request(bytes).unwrap();
+    let mut response = Vec::new();
+    let info = client.recv_response(&mut response, Some(PATIENCE)).expect("a response");
+    assert_eq!(info.sequence, number, "the response to another request");
+    assert!(response.iter().rev().eq(bytes), "the response to something else");
+}
+
+fn call_in_thread(client: &Client, server: &Server, bytes: &[u8]) {
+    thread::scope(|scope| {
+        scope.spawn(|| answer(server));
+        call(client, bytes);
+    });
+}
+
+fn serve(session: &Session) -> Server {
+    session.create_server(service()).unwrap()
+}
+
+/// A client once it counts `server`.
+fn ask(session: &Session, server: &Server) -> Client {
+    let client = session.create_client(service()).unwrap();
+    until("the client counts the server", || client.servers().contains(&server.gid()));
+    client
+}
+
+/// Its processes are relayed. It must outlive what they need of `host`.
+pub(crate) fn relaying(host: &Host) -> Host {
+    let relaying = Host { env: host.env.clone(), dir: tempfile::tempdir().unwrap() };
+    relaying.with("AXON_SHM", "off").with("AXON_DAEMON", "require")
+}
+
+fn nothing_more(client: &Client) {
+    let mut bytes = Vec::new();
+    assert!(client.recv_response(&mut bytes, Some(Duration::from_millis(20))).is_none());
+}
+
+#[test]
+fn calls_of_all_sizes_cross_whoever_shares_memory() {
+    let host = host();
+    let _daemon = host.daemon();
+    for (serves, asks) in ENDS {
+        let (here, there) = (session(&host, "server", serves), session(&host, "client", asks));
+        let server = serve(&here);
+        let client = ask(&there, &server);
+        for (number, len) in (0..).zip([0, 1, 4097, 31 << 10, 64 << 10, 3_000_000, 1]) {
+            call_in_thread(&client, &server, &pattern(number, len));
+        }
+        assert_eq!((server.clients(), client.servers()), (vec![client.gid()], vec![server.gid()]));
+    }
+}
+
+#[test]
+fn a_service_is_available_while_it_is_there_and_to_those_it_goes_with() {
+    let host = host();
+    let _daemon = host.daemon();
+    for (serves, asks) in ENDS {
+        let (here, there) = (session(&host, "server", serves), session(&host, "client", asks));
+        let node = there.create_node("n", "/", "/").unwrap();
+        let changed = [Waitable::GuardCondition(node.graph_changed())];
+        let client = there.create_client(service()).unwrap();
+        assert!(!client.is_available());
+        let other = EndpointSpec::new("/add", "Subtract", Qos::default());
+        let _other = here.create_server(other).unwrap();
+        let server = serve(&here);
+        assert!(client.wait_available(PATIENCE));
+        assert_eq!(client.servers(), [server.gid()]);
+        until("the server counts it", || server.clients() == [client.gid()]);
+        drop(server);
+        while client.is_available() {
+            assert_eq!(there.wait_for(&changed, Some(PATIENCE)).unwrap(), [0]);
+        }
+        let server = serve(&here);
+        assert!(client.wait_available(PATIENCE));
+        call_in_thread(&client, &server, b"abc");
+        drop(client);
+        until("the server counts it no more", || server.clients().is_empty());
+    }
+}
+
+#[test]
+fn a_request_goes_to_every_server_and_a_response_to_nobody_but_who_asked() {
+    let host = host();
+    let _daemon = host.daemon();
+    let sessions = [true, false, false].map(|shm| session(&host, "any", shm));
+    // Two of each in every process, so that some calls stay there and others cross once or twice.
+    let twice = || sessions.iter().chain(&sessions);
+    let servers: Vec<Server> = twice().map(serve).collect();
+    let clients: Vec<Client> =
+        twice().map(|session| session.create_client(service()).unwrap()).collect();
+    for client in &clients {
+        until("it counts all", || client.servers().len() == servers.len());
+    }
+    let rounds = 20;
+    for round in 1..=rounds {
+        for client in &clients {
+            assert_eq!(client.send_request(&client.gid().0).unwrap(), round);
+        }
+    }
+    let mut bytes = Vec::new();
+    for server in &servers {
+        let mut asked = Vec::new();
+        for _ in 0..rounds * clients.len() as u64 {
+            let request = server.recv_request(&mut bytes, Some(PATIENCE)).expect("a request");
+            assert_eq!(bytes, request.publisher.0, "of somebody else");
+            asked.push((request.publisher, request.sequence));
+        }
+        assert!(!server.has_request(), "one came twice");
+        assert_eq!(asked.iter().collect::<HashSet<_>>().len(), asked.len());
+        for (client, sequence) in asked.into_iter().rev() {
+            respond(server, client, sequence, &client.0);
+        }
+    }
+    for client in &clients {
+        let mut came: HashMap<Gid, Vec<u64>> = HashMap::new();
+        for _ in 0..rounds * servers.len() as u64 {
+            let info = client.recv_response(&mut bytes, Some(PATIENCE)).expect("a response");
+            assert_eq!(bytes, client.gid().0, "the response to another client");
+            came.entry(info.publisher).or_default().push(info.sequence);
+        }
+        assert!(!client.has_response(), "one came twice");
+        assert_eq!(came.len(), servers.len());
+        assert!(came.values().all(|numbers| numbers.iter().copied().eq((1..=rounds).rev())));
+    }
+}
+
+#[test]
+fn twenty_clients_in_twenty_relayed_processes_get_each_their_own() {
+    let host = host();
+    let _daemon = host.daemon();
+    let relaying = relaying(&host);
+    for shm in [true, false] {
+        let session = session(&host, "server", shm);
+        let server = serve(&session);
+        let mut players: Vec<_> = (0..CLIENTS).map(|_| relaying.play("caller")).collect();
+        for _ in 0..CLIENTS as u64 * CALLS {
+            answer(&server);
+        }
+        players.iter_mut().for_each(|player| assert_eq!(player.hear(), "complete"));
+        assert_eq!(server.clients().len(), CLIENTS);
+        players.into_iter().for_each(support::Player::finish);
+        until("all of them are gone", || server.clients().is_empty());
+    }
+}
+
+#[test]
+fn a_relayed_client_that_dies_with_responses_pending_harms_nobody() {
+    let host = host();
+    let _daemon = host.daemon();
+    let relaying = relaying(&host);
+    for shm in [true, false] {
+        let session = session(&host, "server", shm);
+        let server = serve(&session);
+        let mut asker = relaying.play("asker");
+        assert_eq!(asker.hear(), "asked");
+        let mut bytes = Vec::new();
+        let mut requests = Vec::new();
+        for number in 0..CALLS {
+            let request = server.recv_request(&mut bytes, Some(PATIENCE)).unwrap();
+            if number == CALLS / 2 {
+                signal(asker.pid(), Signal::KILL);
+            }
+            respond(&server, request.publisher, request.sequence, &[0; 60_000]);
+            requests.push(request);
+        }
+        until("the server heard of it", || server.clients().is_empty());
+        for request in &requests {
+            server.send_response(request.publisher, request.sequence, b"late").unwrap();
+        }
+        let mut caller = relaying.play("caller");
+        for _ in 0..CALLS {
+            answer(&server);
+        }
+        assert_eq!(caller.hear(), "complete");
+        caller.finish();
+    }
+}
+
+#[test]
+fn a_relayed_server_that_dies_in_a_call_is_not_available_and_another_one_is() {
+    let host = host();
+    let _daemon = host.daemon();
+    let relaying = relaying(&host);
+    for shm in [true, false] {
+        let session = session(&host, "client", shm);
+        let node = session.create_node("n", "/", "/").unwrap();
+        let changed = [Waitable::GuardCondition(node.graph_changed())];
+        let client = session.create_client(service()).unwrap();
+        let mut server = relaying.play("server");
+        assert_eq!(server.hear(), "serves");
+        assert!(client.wait_available(PATIENCE));
+        call(&client, b"abc");
+        client.send_request(b"never answered").unwrap();
+        assert_eq!(server.hear(), "took");
+        signal(server.pid(), Signal::KILL);
+        while client.is_available() {
+            assert_eq!(session.wait_for(&changed, Some(PATIENCE)).unwrap(), [0]);
+        }
+        nothing_more(&client);
+        let mut next = relaying.play("server");
+        assert_eq!(next.hear(), "serves");
+        assert!(client.wait_available(PATIENCE));
+        call(&client, b"xyz");
+    }
+}
+
+#[test]
+fn who_takes_no_responses_holds_its_own_back_and_nobody_elses() {
+    let host = host();
+    let _daemon = host.daemon();
+    for (serves, asks) in ENDS {
+        let (here, there) = (session(&host, "server", serves), session(&host, "client", asks));
+        let server = serve(&here);
+        let (stuck, other) = (ask(&there, &server), ask(&there, &server));
+        until("both ends know it", || server.clients().len() == 2);
+        let mut sent = 0;
+        let refused = loop {
+            match server.send_response(stuck.gid(), sent + 1, &pattern(sent, 50_000)) {
+                Ok(()) => sent += 1,
+                Err(error) => break error,
+            }
+            assert!(sent < 20_000, "nothing holds it back");
+        };
+        assert!(matches!(refused, PublishError::Blocked { .. }), "{refused}");
+        (0..20).for_each(|number| call_in_thread(&other, &server, &pattern(number, 5_000)));
+        let mut bytes = Vec::new();
+        for number in 0..sent {
+            let info = stuck.recv_response(&mut bytes, Some(PATIENCE)).expect("none is lost");
+            assert_eq!(info.sequence, number + 1);
+            assert_eq!(bytes, pattern(number, 50_000));
+        }
+    }
+}
+
+#[test]
+fn a_server_that_takes_no_requests_holds_its_clients_back_and_loses_nothing() {
+    let host = host();
+    let _daemon = host.daemon();
+    for (serves, asks) in ENDS {
+        let (here, there) = (session(&host, "server", serves), session(&host, "client", asks));
+        let server = serve(&here);
+        let client = ask(&there, &server);
+        let mut sent = 0;
+        let refused = loop {
+            match client.send_request(&pattern(sent + 1, 50_000)) {
+                Ok(number) => sent = number,
+                Err(error) => break error,
+            }
+            assert!(sent < 20_000, "nothing holds it back");
+        };
+        assert!(matches!(refused, PublishError::Blocked { .. }), "{refused}");
+        let mut bytes = Vec::new();
+        for number in 1..=sent {
+            let info = server.recv_request(&mut bytes, Some(PATIENCE)).expect("none is lost");
+            assert_eq!((info.sequence, &bytes), (number, &pattern(number, 50_000)));
+        }
+        until("the server counts it", || server.clients() == [client.gid()]);
+        respond(&server, client.gid(), sent, b"at last");
+        assert_eq!(client.recv_response(&mut bytes, Some(PATIENCE)).unwrap().sequence, sent);
+    }
+}
+
+#[test]
+fn what_was_asked_or_answered_last_arrives_though_who_did_is_gone() {
+    let host = host();
+    let _daemon = host.daemon();
+    for (serves, asks) in ENDS {
+        let (here, there) = (session(&host, "server", serves), session(&host, "client", asks));
+        let (server, witness) = (serve(&here), serve(&here));
+        let client = ask(&there, &server);
+        until("it counts both", || client.servers().len() == 2);
+        until("they count it", || server.clients().len() == 1 && witness.clients().len() == 1);
+        let (many, len) = (30, 100_000);
+        let mut bytes = Vec::new();
+        thread::scope(|scope| {
+            scope.spawn(|| {
+                for number in 1..=many {
+                    while client.send_request(&pattern(number, len)).is_err() {}
+                }
+            });
+            for number in 1..=many {
+                let info = server.recv_request(&mut bytes, Some(PATIENCE)).expect("a request");
+                assert_eq!(info.sequence, number);
+                respond(&server, info.publisher, number, &bytes);
+                if number < many {
+                    continue;
+                }
+                // The other one has taken nothing yet.
+                for number in 1..=many {
+                    let info = witness.recv_request(&mut bytes, Some(PATIENCE));
+                    assert_eq!(info.expect("a request").sequence, number);
+                }
+            }
+        });
+        drop(server);
+        for number in 1..=many {
+            let info = client.recv_response(&mut bytes, Some(PATIENCE)).expect("a response");
+            assert_eq!((info.sequence, &bytes), (number, &pattern(number, len)));
+        }
+        until("only one is left", || client.servers() == [witness.gid()]);
+        client.send_request(b"the last word").unwrap();
+        drop(client);
+        assert!(witness.recv_request(&mut bytes, Some(PATIENCE)).is_some());
+        assert_eq!(bytes, b"the last word");
+        until("it is forgotten", || witness.clients().is_empty());
+    }
+}
+
+#[test]
+fn calls_go_on_with_the_next_daemon() {
+    let host = host();
+    let mut daemon = host.daemon();
+    let (a, b, c) =
+        (session(&host, "a", false), session(&host, "b", false), session(&host, "c", true));
+    let servers = [serve(&a), serve(&c)];
+    let client = b.create_client(service()).unwrap();
+    for round in 0..3 {
+        until("it counts both", || client.servers().len() == 2);
+        let number = client.send_request(b"to both").unwrap();
+        let from: HashSet<Gid> = servers.iter().map(answer).collect();
+        assert_eq!(from, HashSet::from([client.gid()]), "round {round}");
+        for _ in &servers {
+            let info = client.recv_response(&mut Vec::new(), Some(PATIENCE)).unwrap();
+            assert_eq!(info.sequence, number);
+        }
+        client.send_request(b"never answered").unwrap();
+        for server in &servers {
+            server.recv_request(&mut Vec::new(), Some(PATIENCE)).expect("a request");
+        }
+        daemon.0.kill().unwrap();
+        daemon.0.wait().unwrap();
+        until("nobody is there", || !client.is_available());
+        daemon = host.daemon();
+    }
+    until("it counts both", || client.servers().len() == 2);
+    nothing_more(&client);
+    drop(daemon);
+}
+
+#[test]
+fn calls_cross_to_another_host_and_from_there() {
+    let hosts = two_hosts();
+    let _daemons = [hosts[0].daemon(), hosts[1].daemon()];
+    for (serves, asks) in ENDS {
+        let here = session(&hosts[0], "server", serves);
+        let there = session(&hosts[1], "client", asks);
+        let server = serve(&here);
+        let clients = [ask(&there, &server), ask(&there, &server)];
+        for (number, len) in (0..).zip([0, 4097, 300_000]) {
+            clients.iter().for_each(|one| call_in_thread(one, &server, &pattern(number, len)));
+        }
+        let [left, gone] = clients;
+        drop(gone);
+        until("the server counts one", || server.clients() == [left.gid()]);
+        left.send_request(b"never answered").unwrap();
+        drop(server);
+        until("it is not available", || !left.is_available());
+        nothing_more(&left);
+    }
+}
