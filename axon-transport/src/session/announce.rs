@@ -119,7 +119,9 @@ impl Session {
 
     pub(super) fn add_server(&self, endpoint: Endpoint, role: EndpointRole) -> Server {
         let options = self.ring(&endpoint, Qos::keep_all());
-        let lanes = Arc::new(Lanes::new(self.shared().segment.clone(), options));
+        let shared = self.shared();
+        let lanes = Lanes::new(shared.segment.clone(), options, shared.room.clone());
+        let lanes = Arc::new(lanes);
         let (responses, requests) = self.add_both(endpoint, role, Rings::Each(lanes.clone()));
         Server::new(responses, requests, lanes, self.clone())
     }

@@ -11,6 +11,7 @@ pub struct SessionOptions {
     pub(super) name: String,
     pub(super) role: SessionRole,
     pub(super) daemon_command: Option<DaemonCommand>,
+    pub(super) callers: usize,
 }
 
 impl SessionOptions {
@@ -20,13 +21,20 @@ impl SessionOptions {
         while name.len() > 256 {
             name.pop();
         }
-        Self { name, role: SessionRole::Application, daemon_command: None }
+        Self { name, role: SessionRole::Application, daemon_command: None, callers: usize::MAX }
     }
 
     /// Another kind of session.
     #[must_use]
     pub fn role(mut self, role: SessionRole) -> Self {
         self.role = role;
+        self
+    }
+
+    /// How many clients its servers may have, each counted once for each of them.
+    #[must_use]
+    pub(crate) fn callers(mut self, most: usize) -> Self {
+        self.callers = most;
         self
     }
 

@@ -2,7 +2,10 @@
 
 use std::{
     collections::BTreeMap,
-    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    sync::{
+        Arc, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicUsize, Ordering},
+    },
     time::Instant,
 };
 
@@ -22,7 +25,39 @@ pub(super) enum Rings {
 pub(super) struct Lanes {
     session: Arc<SessionSegment>,
     options: RingOptions,
-    rings: Mutex<BTreeMap<Gid, Arc<Writer>>>,
+    room: Arc<Room>,
+    rings: Mutex<BTreeMap<Gid, (Arc<Writer>, Place)>>,
+}
+
+/// How many clients the servers of a session have, and may have: each counted once for each of them.
+#[derive(Debug)]
+pub(super) struct Room {
+    most: usize,
+    taken: AtomicUsize,
+}
+
+/// Of one client of one server.
+struct Place(Arc<Room>);
+
+impl Room {
+    pub(super) fn new(most: usize) -> Self {
+        Self { most, taken: AtomicUsize::new(0) }
+    }
+
+    // Relaxed, here and below: the count guards nothing but itself.
+    fn take(self: &Arc<Self>) -> Result<Place, ShmError> {
+        let more = |taken| (taken < self.most).then_some(taken + 1);
+        match self.taken.fetch_update(Ordering::Relaxed, Ordering::Relaxed, more) {
+            Ok(_) => Ok(Place(Arc::clone(self))),
+            Err(_) => Err(ShmError::NoRoom(self.most)),
+        }
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        self.0.taken.fetch_sub(1, Ordering::Relaxed);
+    }
 }
 
 impl Rings {
@@ -46,7 +81,7 @@ impl Rings {
     pub(super) fn has(&self, at: Location) -> bool {
         match self {
             Self::Shared(writer) => writer.location() == at,
-            Self::Each(lanes) => lanes.lock().values().any(|ring| ring.location() == at),
+            Self::Each(lanes) => lanes.lock().values().any(|(ring, _)| ring.location() == at),
         }
     }
 
@@ -64,7 +99,7 @@ impl Rings {
             Self::Shared(writer) => writer.drop_dead(),
             Self::Each(lanes) => {
                 let mut gone = Vec::new();
-                lanes.lock().retain(|reader, ring| {
+                lanes.lock().retain(|reader, (ring, _)| {
                     let dead = !ring.drop_dead().is_empty();
                     gone.extend(dead.then_some(*reader));
                     !dead
@@ -87,7 +122,7 @@ impl Rings {
         match self {
             Self::Shared(writer) => writer.tend(now),
             Self::Each(lanes) => {
-                let rings: Vec<_> = lanes.lock().values().cloned().collect();
+                let rings: Vec<_> = lanes.lock().values().map(|(ring, _)| ring.clone()).collect();
                 rings.iter().filter(|ring| ring.tend(now)).count() > 0
             }
         }
@@ -102,25 +137,26 @@ impl Rings {
 }
 
 impl Lanes {
-    pub(super) fn new(session: Arc<SessionSegment>, options: RingOptions) -> Self {
-        Self { session, options, rings: Mutex::default() }
+    pub(super) fn new(session: Arc<SessionSegment>, options: RingOptions, room: Arc<Room>) -> Self {
+        Self { session, options, room, rings: Mutex::default() }
     }
 
     /// The ring of a client; `None` when it is not, or no more, served.
     pub(super) fn ring(&self, client: &Gid) -> Option<Arc<Writer>> {
-        self.lock().get(client).cloned()
+        self.lock().get(client).map(|(ring, _)| ring.clone())
     }
 
     fn ring_for(&self, client: Gid) -> Result<Arc<Writer>, ShmError> {
         if let Some(ring) = self.ring(&client) {
             return Ok(ring);
         }
+        let place = self.room.take()?;
         let ring = Arc::new(Writer::create(self.session.clone(), self.options)?);
-        self.lock().insert(client, ring.clone());
+        self.lock().insert(client, (ring.clone(), place));
         Ok(ring)
     }
 
-    fn lock(&self) -> MutexGuard<'_, BTreeMap<Gid, Arc<Writer>>> {
+    fn lock(&self) -> MutexGuard<'_, BTreeMap<Gid, (Arc<Writer>, Place)>> {
         self.rings.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -18,6 +18,7 @@ use super::{
     guard::GuardCondition,
     message::{Gone, Message, StatusPart},
     publisher::PublisherInner,
+    rings::Room,
     subscription::SubscriptionInner,
 };
 use crate::{
@@ -62,6 +63,8 @@ pub(crate) struct Shared {
     pub(super) asking: Mutex<()>,
     /// Held while pairs of the session's own endpoints come or go.
     pub(super) home: Mutex<()>,
+    /// For the clients of its servers.
+    pub(super) room: Arc<Room>,
     state: Mutex<State>,
     changed: Condvar,
 }
@@ -211,6 +214,7 @@ impl Shared {
         wake: OwnedFd,
     ) -> Self {
         let wake = Arc::new(wake);
+        let room = Arc::new(Room::new(options.callers));
         let memory = Arc::new(MemoryNews { wake: wake.clone(), changes: Mutex::default() });
         let listener = memory.clone();
         segment.on_segment(move |event| listener.note(event));
@@ -227,6 +231,7 @@ impl Shared {
             listener: Mutex::new(None),
             asking: Mutex::new(()),
             home: Mutex::default(),
+            room,
             state: Mutex::default(),
             changed: Condvar::new(),
         }

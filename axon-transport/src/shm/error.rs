@@ -67,6 +67,11 @@ pub enum ShmError {
         /// How many lanes it has.
         lanes: u32,
     },
+    /// The servers of the session have as many clients as they may.
+    #[error(
+        "the servers of a relayed session may have {0} clients: share memory, or use more processes"
+    )]
+    NoRoom(usize),
     /// The session has given out all numbers for segments of its memory.
     #[error("session {0} has opened as many segments as a session may: open another session")]
     NoNumber(SessionId),

@@ -108,7 +108,7 @@ fn a_request_is_sent_once_however_many_servers_it_is_for() {
     let one = show(&socket, own.endpoint(), EndpointKind::Server);
     matched(&socket, own.gid(), &[one]);
     opened(&socket, one, Some(own.gid()));
-    assert!(own.is_available());
+    assert!(own.wait_available(PATIENCE));
     let credit = Credit { publisher: own.gid(), bytes: 1000, opens: true, client: None };
     say_to(&socket, &Message::Credit(credit));
     for number in 1..=3 {

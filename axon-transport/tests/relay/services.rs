@@ -342,6 +342,35 @@ fn what_was_asked_or_answered_last_arrives_though_who_did_is_gone() {
 }
 
 #[test]
+fn whom_a_relayed_session_may_not_answer_does_not_count_it() {
+    let host = host();
+    let _daemon = host.daemon();
+    let (here, there) = (session(&host, "servers", false), session(&host, "clients", true));
+    let servers: Vec<Server> = (0..33).map(|_| serve(&here)).collect();
+    let clients: Vec<Client> = (0..32).map(|_| there.create_client(service()).unwrap()).collect();
+    // Of the pairs that they would make.
+    until("as many as may", || clients.iter().map(|c| c.servers().len()).sum::<usize>() == 1024);
+    clients.iter().for_each(|client| assert_eq!(client.send_request(b"x").unwrap(), 1));
+    let mut missing: usize = 1024;
+    let mut bytes = Vec::new();
+    until("all are answered", || {
+        for server in &servers {
+            while let Some(request) = server.take_request(&mut bytes) {
+                respond(server, request.publisher, request.sequence, b"y");
+            }
+        }
+        for client in &clients {
+            missing -= std::iter::from_fn(|| client.take_response(&mut bytes)).count();
+        }
+        missing == 0
+    });
+    // Those who are left have room, once others have gone.
+    drop(clients);
+    let client = ask(&there, &servers[0]);
+    until("it counts all", || client.servers().len() == servers.len());
+}
+
+#[test]
 fn calls_go_on_with_the_next_daemon() {
     let host = host();
     let mut daemon = host.daemon();

@@ -74,7 +74,8 @@ impl Far {
         };
         let process = i32::try_from(pid).ok().and_then(Pid::from_raw);
         let process = process.and_then(|pid| pidfd_open(pid, PidfdFlags::empty()).ok());
-        let session = match Session::over_as(id, inside, &config, SessionOptions::new(name)) {
+        let options = SessionOptions::new(name).callers(MAX_CALLERS);
+        let session = match Session::over_as(id, inside, &config, options) {
             Ok(session) => session,
             Err(error) => {
                 let text = error.to_string();
