@@ -106,7 +106,7 @@ fn a_service_is_available_from_when_both_directions_stand_until_it_is_gone() {
     assert!(client.is_available(), "created means matched");
     assert_eq!((client.servers(), server.clients()), (vec![server.gid()], vec![client.gid()]));
     assert_eq!(call_in_thread(&client, &server), b"cba");
-    assert_eq!(session.graph().count(EndpointKind::Server, "/add"), 2);
+    assert!(session.wait_graph(PATIENCE, |graph| graph.count(EndpointKind::Server, "/add") == 2));
     let changed = [Waitable::GuardCondition(node.graph_changed())];
     drop(server);
     while client.is_available() {
