@@ -242,9 +242,9 @@ pub fn relay_pieces_seeds() -> Vec<Vec<u8>> {
 /// Every message of the session socket.
 pub fn session_message_seeds() -> Vec<Vec<u8>> {
     use session::{
-        Announce, Asserted, Attach, Credit, EndpointRole, Gone, Granted, Graph, GraphItem, Head, Hello, Matched,
-        Message, PROTOCOL, Pair, Piece, Refused, Segment, SegmentName, SegmentOpened, SessionRole, StatusPart, Unmatch,
-        Welcome,
+        Announce, Asserted, Attach, Credit, EndpointRole, Gone, Granted, Graph, GraphItem, Head,
+        Hello, Matched, Message, PROTOCOL, Pair, Piece, Refused, Segment, SegmentName,
+        SegmentOpened, SessionRole, StatusPart, Unmatch, Welcome,
     };
     let (reader, writer) = (Gid([1; 16]), Gid([2; 16]));
     let place = Location { segment: 3, offset: 4096 };
@@ -317,7 +317,12 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             bytes: vec![1, 2],
             client: None,
         }),
-        Message::Credit(Credit { publisher: writer, bytes: 128, opens: true, client: Some(reader) }),
+        Message::Credit(Credit {
+            publisher: writer,
+            bytes: 128,
+            opens: true,
+            client: Some(reader),
+        }),
         Message::Asserted(Asserted { publishers: vec![writer] }),
         Message::Unknown(200),
     ];
