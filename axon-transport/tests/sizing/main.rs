@@ -1,0 +1,33 @@
+//! What many processes of many endpoints take: what each holds of the others, where each reads from
+//! each ([`held`]), and how soon all know all when they start at once ([`startup`]).
+//!
+//! In the full size: `SIZING=50 cargo test --release -p axon-transport --test sizing -- --nocapture`
+#![expect(clippy::print_stdout, reason = "what it prints is its result")]
+
+mod held;
+mod startup;
+#[path = "../support/mod.rs"]
+#[allow(dead_code, reason = "what other tests need of it")]
+mod support;
+
+/// Topics: a publisher and a subscription of each process or session for each.
+const TOPICS: usize = 10;
+
+/// How many processes: `few` in an ordinary run.
+fn size(few: usize) -> usize {
+    std::env::var("SIZING").ok().map_or(few, |n| n.parse().unwrap())
+}
+
+/// Not a test of its own: what each of the processes does.
+#[test]
+fn child() {
+    let Ok(part) = std::env::var("PLAY") else { return };
+    let (part, number) = part.split_once(' ').unwrap();
+    let number = number.parse().unwrap();
+    match part {
+        "held" => held::play(number),
+        "sessions" => startup::play_sessions(number),
+        "node" => startup::play_node(number),
+        _ => panic!("{part}"),
+    }
+}
