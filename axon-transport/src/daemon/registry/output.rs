@@ -8,7 +8,7 @@ use std::{
 use super::{MAX_QUEUE, MAX_QUEUE_BYTES, Registry, STATUS_SLICE, SessionEntry};
 use crate::{
     ids::SessionId,
-    session::message::{Graph, Message, Pair, SessionRole, StatusPart},
+    session::message::{Graph, Message, SessionRole, StatusPart},
 };
 
 /// A packet for a session.
@@ -148,13 +148,7 @@ impl<F: Clone> Registry<F> {
         for part in parts {
             self.push(id, &Message::Graph(part), Vec::new());
         }
-        let own: Vec<Pair> = self
-            .pairs
-            .keys()
-            .filter(|p| [p.reader, p.writer].iter().any(|g| self.owner(g) == Some(*id)))
-            .copied()
-            .collect();
-        for pair in own {
+        for pair in self.pairs_of(id) {
             // A reader that is not served yet asks again; one that is learns how.
             if self.owner(&pair.reader) == Some(*id) && !self.forward_grant(&pair) {
                 self.push(id, &Message::Match(pair), Vec::new());
