@@ -81,6 +81,34 @@ fn switches() -> u64 {
 }
 
 #[test]
+fn what_a_session_makes_is_in_its_own_graph_at_once_whatever_becomes_of_the_daemon() {
+    use EndpointKind::{Client, Publisher, Server, Subscription};
+    let host = Host::new();
+    let mut daemon = host.daemon();
+    let session = host.session("own").unwrap();
+    let node = session.create_node("n", "/", "/").unwrap();
+    for round in 0..ROUNDS {
+        if round % 5 == 4 {
+            daemon.0.kill().unwrap();
+            daemon.0.wait().unwrap();
+            daemon = host.daemon();
+        }
+        let spec = || spec(&format!("/own{round}"));
+        let counted = |kind| session.graph().count(kind, &spec().topic);
+        let publisher = node.create_publisher(spec()).unwrap();
+        assert_eq!(counted(Publisher), 1);
+        let subscription = node.create_subscription(spec()).unwrap();
+        assert_eq!(counted(Subscription), 1);
+        let server = node.create_server(spec()).unwrap();
+        assert_eq!(counted(Server), 1);
+        let client = node.create_client(spec()).unwrap();
+        assert_eq!([Publisher, Subscription, Server, Client].map(counted), [1; 4]);
+        drop((publisher, subscription, server, client));
+        assert_eq!([Publisher, Subscription, Server, Client].map(counted), [0; 4]);
+    }
+}
+
+#[test]
 fn a_subscription_that_is_counted_gets_what_is_published_next() {
     let host = Host::new();
     let _daemon = host.daemon();

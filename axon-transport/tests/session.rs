@@ -3,7 +3,12 @@
 #[path = "support/alone.rs"]
 mod alone;
 
-use std::{path::Path, sync::Arc, thread, time::Duration};
+use std::{
+    path::Path,
+    sync::{Arc, mpsc},
+    thread,
+    time::Duration,
+};
 
 use alone::alone;
 use axon_transport::{
@@ -86,6 +91,18 @@ fn a_node_is_in_the_graph_from_its_creation_to_its_end() {
     expect(&[("twin", &[])]);
     drop(second);
     expect(&[]);
+}
+
+#[test]
+fn an_endpoint_is_in_the_graph_from_its_creation_to_its_end() {
+    let session = alone();
+    let node = session.create_node("n", "/", "/").unwrap();
+    for _ in 0..20 {
+        let publisher = node.create_publisher(spec(Qos::default())).unwrap();
+        assert_eq!(nodes(&session), [("n".into(), vec!["/t".into()])], "at once");
+        drop(publisher);
+        assert_eq!(nodes(&session), [("n".into(), Vec::new())], "at once");
+    }
 }
 
 #[test]
@@ -207,8 +224,10 @@ fn no_signal_is_delivered_to_the_control_thread() {
     let session = alone();
     assert_eq!(blocked(here), before, "the mask of the thread that opened it");
     // Once it has told of something, its control thread has long had its name.
+    let (tells, told) = mpsc::channel();
+    session.set_listener(move |event| tells.send(event.clone()).unwrap_or_default());
     let _publisher = session.create_publisher(spec(Qos::default())).unwrap();
-    assert!(session.wait_graph(PATIENCE, |graph| graph.endpoints.len() == 1));
+    assert!(told.recv_timeout(PATIENCE).is_ok());
     let tasks = std::fs::read_dir("/proc/self/task").unwrap().map(|task| task.unwrap().path());
     let named = |task: &Path| {
         std::fs::read_to_string(task.join("comm")).is_ok_and(|name| name.trim() == "axon-ctl")

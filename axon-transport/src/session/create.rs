@@ -1,13 +1,11 @@
 //! What a session makes: endpoints, nodes and conditions.
 
-use std::sync::Arc;
-
 use super::{
     Client, EndpointSpec, GuardCondition, Node, Publisher, Server, Session, SessionError,
     Subscription, message::EndpointRole, state::Outgoing, subscription::SubscriptionInner,
 };
 use crate::{
-    graph::{Endpoint, EndpointKind, GraphEntry},
+    graph::{Endpoint, EndpointKind},
     ids::Gid,
     qos::Qos,
 };
@@ -22,7 +20,7 @@ impl Session {
         let endpoint = self.endpoint(spec, EndpointKind::Publisher)?;
         let publisher = self.add_publisher(endpoint, EndpointRole::Application)?;
         let inner = &publisher.inner;
-        self.shared().meet(&inner.endpoint.gid);
+        self.shared().meet(&inner.endpoint);
         self.await_pairs(&inner.endpoint, |other| inner.events.is_matched(other));
         Ok(publisher)
     }
@@ -39,7 +37,7 @@ impl Session {
         inner.ignores_local = ignores_local;
         let subscription = self.add_reader(inner);
         let inner = &subscription.inner;
-        self.shared().meet(&inner.endpoint.gid);
+        self.shared().meet(&inner.endpoint);
         self.await_pairs(&inner.endpoint, |other| inner.events.is_matched(other));
         Ok(subscription)
     }
@@ -51,7 +49,7 @@ impl Session {
     pub fn create_server(&self, spec: EndpointSpec) -> Result<Server, SessionError> {
         let endpoint = self.endpoint(spec, EndpointKind::Server)?;
         let server = self.add_server(endpoint, EndpointRole::Application);
-        self.shared().meet(&server.gid());
+        self.shared().meet(server.endpoint());
         server.await_clients();
         Ok(server)
     }
@@ -64,7 +62,7 @@ impl Session {
     pub fn create_client(&self, spec: EndpointSpec) -> Result<Client, SessionError> {
         let endpoint = self.endpoint(spec, EndpointKind::Client)?;
         let client = self.add_client(endpoint, EndpointRole::Application)?;
-        self.shared().meet(&client.gid());
+        self.shared().meet(client.endpoint());
         client.await_servers();
         Ok(client)
     }
@@ -110,9 +108,7 @@ impl Session {
         {
             let mut state = self.shared().state();
             state.nodes.insert(gid, (endpoint.clone(), changed.clone()));
-            // Who makes a node finds it in the graph, whatever the daemon does meanwhile.
-            let entry = GraphEntry { endpoint: Arc::new(endpoint.clone()), daemon: None };
-            Arc::make_mut(&mut state.graph).endpoints.insert(gid, entry);
+            state.show(&endpoint);
         }
         self.shared().tell(Outgoing::Announce(gid));
         Node::new(endpoint, changed, self.clone())

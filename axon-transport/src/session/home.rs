@@ -12,7 +12,7 @@ use super::{
     subscription::Accept, subscription::SubscriptionInner,
 };
 use crate::{
-    graph::{Pairing, pairing},
+    graph::{Endpoint, Pairing, pairing},
     ids::Gid,
     shm::{Peer, ReaderInfo, ShmError},
 };
@@ -23,10 +23,11 @@ impl Shared {
         self.home.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Attaches a new endpoint to those of its session that go with it.
-    pub(super) fn meet(&self, own: &Gid) {
+    /// Attaches a new endpoint to those of its session that go with it, and shows it in the session's
+    /// graph.
+    pub(super) fn meet(&self, own: &Endpoint) {
         let home = self.home();
-        let pairs = self.pairs_of(own);
+        let pairs = self.pairs_of(&own.gid);
         let mut changed = Vec::new();
         for (writer, reader) in pairs {
             match self.join(&writer, &reader) {
@@ -39,6 +40,8 @@ impl Shared {
         }
         drop(home);
         self.rematch(changed);
+        self.state().show(own);
+        self.wake();
     }
 
     fn pairs_of(&self, own: &Gid) -> Vec<(Arc<PublisherInner>, Arc<SubscriptionInner>)> {

@@ -16,14 +16,14 @@ use super::{
     SessionOptions,
     events::{Changes, Source},
     guard::GuardCondition,
-    message::{Gone, Message, StatusPart},
+    message::{EndpointRole, Gone, Message, StatusPart},
     publisher::PublisherInner,
     rings::Room,
     subscription::SubscriptionInner,
 };
 use crate::{
     config::Config,
-    graph::{Endpoint, GraphView},
+    graph::{Endpoint, GraphEntry, GraphView},
     ids::{DaemonId, Gid, SessionId},
     shm::{SegmentEvent, SessionSegment, ShmError},
     wait::ExternalLeader,
@@ -95,6 +95,25 @@ pub(super) struct State {
 }
 
 impl State {
+    /// The nodes and endpoints of the session's application.
+    pub(super) fn own(&self) -> impl Iterator<Item = &Endpoint> {
+        let application = |role| role == EndpointRole::Application;
+        let nodes = self.nodes.values().map(|(node, _)| node);
+        let publishers = self.publishers.values().filter(move |p| application(p.role));
+        let subscriptions = self.subscriptions.values().filter(move |s| application(s.role));
+        nodes
+            .chain(publishers.map(|publisher| &publisher.endpoint))
+            .chain(subscriptions.map(|subscription| &subscription.endpoint))
+    }
+
+    /// Shows what the session has made, whatever the daemon does meanwhile: whoever made it finds it
+    /// in the graph.
+    pub(super) fn show(&mut self, own: &Endpoint) {
+        let entry = || GraphEntry { endpoint: Arc::new(own.clone()), daemon: None };
+        Arc::make_mut(&mut self.graph).endpoints.entry(own.gid).or_insert_with(entry);
+        self.regraphed = true;
+    }
+
     pub(super) fn index(&mut self, endpoint: &Endpoint) {
         self.topics.entry(endpoint.topic.clone()).or_default().insert(endpoint.gid);
     }

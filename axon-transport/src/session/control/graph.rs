@@ -50,9 +50,9 @@ impl Control {
         {
             let mut state = self.shared.state();
             // The daemon may have told of the whole before it heard of the newest of them.
-            for (gid, (node, _)) in &state.nodes {
-                let entry = || GraphEntry { endpoint: Arc::new(node.clone()), daemon: None };
-                view.endpoints.entry(*gid).or_insert_with(entry);
+            for own in state.own() {
+                let entry = || GraphEntry { endpoint: Arc::new(own.clone()), daemon: None };
+                view.endpoints.entry(own.gid).or_insert_with(entry);
             }
             state.graph = Arc::new(view);
         }
