@@ -1,6 +1,7 @@
 //! What an endpoint reports of itself: statuses, and who is told of them.
 
 use std::{
+    cmp::Ordering,
     collections::{BTreeMap, BTreeSet},
     fmt,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
@@ -170,6 +171,35 @@ impl Changes {
     }
 }
 
+/// The same, with the leases of those that are new.
+#[derive(Default)]
+struct Moved {
+    added: Vec<(Gid, Option<u64>)>,
+    removed: Vec<Gid>,
+}
+
+impl Moved {
+    /// What makes `after` of `before`, both in order.
+    fn between(before: &[Gid], after: &[(Gid, Option<u64>)]) -> Self {
+        let mut moved = Self::default();
+        let (mut before, mut after) = (before.iter().peekable(), after.iter().peekable());
+        loop {
+            let order = match (before.peek(), after.peek()) {
+                (Some(old), Some((new, _))) => (*old).cmp(new),
+                (Some(_), None) => Ordering::Less,
+                (None, Some(_)) => Ordering::Greater,
+                (None, None) => return moved,
+            };
+            if order.is_le() {
+                moved.removed.extend(before.next().filter(|_| order.is_lt()));
+            }
+            if order.is_ge() {
+                moved.added.extend(after.next().filter(|_| order.is_gt()));
+            }
+        }
+    }
+}
+
 /// The events of one endpoint.
 pub(super) struct EndpointEvents {
     inner: Mutex<Inner>,
@@ -178,7 +208,8 @@ pub(super) struct EndpointEvents {
 struct Inner {
     statuses: Statuses,
     callbacks: BTreeMap<EventKind, Arc<Callback>>,
-    matched: BTreeSet<Gid>,
+    /// In order.
+    matched: Vec<Gid>,
     /// Those of the topic that do not go with this one, and have been counted.
     incompatible: BTreeSet<Gid>,
     /// A subscription's publishers.
@@ -206,7 +237,7 @@ impl EndpointEvents {
         let inner = Inner {
             statuses,
             callbacks: BTreeMap::new(),
-            matched: BTreeSet::new(),
+            matched: Vec::new(),
             incompatible: BTreeSet::new(),
             liveness: Liveness::default(),
             lease,
@@ -234,27 +265,27 @@ impl EndpointEvents {
     }
 
     pub(super) fn is_matched(&self, gid: &Gid) -> bool {
-        self.lock().matched.contains(gid)
+        self.lock().matched.binary_search(gid).is_ok()
     }
 
     pub(super) fn matched_now(&self) -> Vec<Gid> {
-        self.lock().matched.iter().copied().collect()
+        self.lock().matched.clone()
     }
 
     /// Those that a publisher sends to are these now. They are looked up under the lock: of two
     /// threads that do so, the later one knows the later state.
     pub(super) fn readers(&self, now: impl FnOnce() -> Vec<Gid>) -> Changes {
-        self.rematch(|| now().into_iter().map(|gid| (gid, None)).collect(), |_, _, _| {})
+        self.rematch(|| now().into_iter().map(|gid| (gid, None)).collect(), |_, _| {})
     }
 
     /// As [`readers`](Self::readers), those that a subscription receives from, with the leases that
     /// they offer.
     pub(super) fn writers(
         &self,
-        now: impl FnOnce() -> BTreeMap<Gid, Option<u64>>,
+        now: impl FnOnce() -> Vec<(Gid, Option<u64>)>,
         time: u64,
     ) -> Changes {
-        self.rematch(now, |inner, changes, leases| {
+        self.rematch(now, |inner, changes| {
             let (mut alive, mut not_alive) = (0, 0);
             let mut add = |change: (i64, i64)| {
                 alive += change.0;
@@ -263,8 +294,8 @@ impl EndpointEvents {
             for gid in &changes.removed {
                 add(inner.liveness.unmatched(gid));
             }
-            for gid in &changes.added {
-                add(inner.liveness.matched(*gid, leases[gid], time));
+            for (gid, lease) in &changes.added {
+                add(inner.liveness.matched(*gid, *lease, time));
             }
             inner.statuses.liveliness_changed(alive, not_alive);
         })
@@ -272,26 +303,28 @@ impl EndpointEvents {
 
     fn rematch(
         &self,
-        now: impl FnOnce() -> BTreeMap<Gid, Option<u64>>,
-        liveness: impl FnOnce(&mut Inner, &Changes, &BTreeMap<Gid, Option<u64>>),
+        now: impl FnOnce() -> Vec<(Gid, Option<u64>)>,
+        liveness: impl FnOnce(&mut Inner, &Moved),
     ) -> Changes {
         let mut changes = Changes::default();
         self.change(|inner| {
-            let leases = now();
-            let now: BTreeSet<Gid> = leases.keys().copied().collect();
-            changes.removed = inner.matched.difference(&now).copied().collect();
-            changes.added = now.difference(&inner.matched).copied().collect();
-            if changes.is_empty() {
+            let mut now = now();
+            now.sort_unstable_by_key(|(gid, _)| *gid);
+            now.dedup_by_key(|(gid, _)| *gid);
+            let moved = Moved::between(&inner.matched, &now);
+            if moved.added.is_empty() && moved.removed.is_empty() {
                 return;
             }
-            inner.matched = now;
-            changes.removed.iter().for_each(|_| {
+            inner.matched = now.into_iter().map(|(gid, _)| gid).collect();
+            moved.removed.iter().for_each(|_| {
                 inner.statuses.unmatched();
             });
-            changes.added.iter().for_each(|_| {
+            moved.added.iter().for_each(|_| {
                 inner.statuses.matched();
             });
-            liveness(inner, &changes, &leases);
+            liveness(inner, &moved);
+            changes.added = moved.added.into_iter().map(|(gid, _)| gid).collect();
+            changes.removed = moved.removed;
         });
         changes
     }

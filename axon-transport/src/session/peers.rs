@@ -5,8 +5,15 @@
 //! does, so that both agree on what the session holds.
 
 use std::{
-    collections::{BTreeSet, HashMap, HashSet, hash_map::Entry as Slot},
+    collections::{BTreeSet, HashMap, HashSet},
+    mem::MaybeUninit,
+    os::fd::{AsFd, BorrowedFd, OwnedFd},
     sync::Arc,
+};
+
+use rustix::{
+    event::{Timespec, epoll},
+    io::Errno,
 };
 
 use super::{
@@ -23,10 +30,18 @@ pub(super) struct Peers {
     own: Arc<SessionSegment>,
     news: Arc<MemoryNews>,
     peers: HashMap<SessionId, Entry>,
+    /// An epoll instance of their pidfds: with hundreds of them, looking at each whenever anything
+    /// happens would be most of what there is to do.
+    deaths: Arc<OwnedFd>,
 }
+
+/// Ends of processes that are looked at together; those behind them are not forgotten.
+const DEATHS: usize = 64;
 
 struct Entry {
     session: Arc<PeerSession>,
+    /// Where its process's death is seen.
+    deaths: Arc<OwnedFd>,
     pairs: HashSet<Pair>,
     /// The segments that came or were named since the daemon began to tell everything: of others it
     /// does not know that they are here, so it will not say when they are gone.
@@ -34,6 +49,14 @@ struct Entry {
 }
 
 impl Entry {
+    fn new(session: Arc<PeerSession>, deaths: &Arc<OwnedFd>) -> Result<Self, ShmError> {
+        let key = epoll::EventData::new_u64(key(&session.id()));
+        epoll::add(deaths, session.pidfd(), key, epoll::EventFlags::IN)
+            .map_err(ShmError::system("watching a process"))?;
+        let (pairs, named) = (HashSet::new(), BTreeSet::new());
+        Ok(Self { session, deaths: deaths.clone(), pairs, named })
+    }
+
     fn add(&mut self, segment: Segment, descriptor: &PassedFd) {
         self.named.insert(segment.number);
         if let Err(error) = self.session.add_segment(segment.into(), descriptor) {
@@ -41,6 +64,18 @@ impl Entry {
             tracing::error!(%session, number, %error, "memory of another process is not usable");
         }
     }
+}
+
+impl Drop for Entry {
+    fn drop(&mut self) {
+        // The pidfd may be in use for longer, here and in other processes, which share it.
+        let _ = epoll::delete(&self.deaths, self.session.pidfd());
+    }
+}
+
+/// What tells sessions apart, nearly always.
+fn key(id: &SessionId) -> u64 {
+    id.0.iter().take(8).fold(0, |key, byte| key << 8 | u64::from(*byte))
 }
 
 /// Why a peer session cannot be used.
@@ -53,8 +88,9 @@ pub(super) enum PeerError {
 }
 
 impl Peers {
-    pub(super) fn new(own: Arc<SessionSegment>, news: Arc<MemoryNews>) -> Self {
-        Self { own, news, peers: HashMap::new() }
+    pub(super) fn new(own: Arc<SessionSegment>, news: Arc<MemoryNews>) -> Result<Self, Errno> {
+        let deaths = Arc::new(epoll::create(epoll::CreateFlags::CLOEXEC)?);
+        Ok(Self { own, news, peers: HashMap::new(), deaths })
     }
 
     /// The session `id`, for `pair`, with the descriptors that came along, if any: those of its
@@ -71,28 +107,26 @@ impl Peers {
         }
         let introduced = descriptors.len().saturating_sub(segments.len());
         let maps = descriptors.split_off(introduced);
-        let others: Vec<_> = match self.peers.contains_key(&id) {
-            true => Vec::new(),
-            false => self.sessions().cloned().collect(),
-        };
-        let entry = match self.peers.entry(id) {
-            Slot::Occupied(held) => held.into_mut(),
-            Slot::Vacant(slot) => {
-                let [segment, doorbell, pidfd] =
-                    <[PassedFd; 3]>::try_from(descriptors).map_err(|_| PeerError::Missing)?;
-                let descriptors = PeerDescriptors { segment, doorbell, pidfd };
-                let session = PeerSession::map_among(id, descriptors, &others)?;
-                let news = self.news.clone();
-                session.on_wanted(move || news.wake());
-                let (pairs, named) = (HashSet::new(), BTreeSet::new());
-                slot.insert(Entry { session, pairs, named })
-            }
-        };
+        if !self.peers.contains_key(&id) {
+            let [segment, doorbell, pidfd] =
+                <[PassedFd; 3]>::try_from(descriptors).map_err(|_| PeerError::Missing)?;
+            let descriptors = PeerDescriptors { segment, doorbell, pidfd };
+            let session = PeerSession::map_among(id, descriptors, self.sessions())?;
+            let news = self.news.clone();
+            session.on_wanted(move || news.want(id));
+            self.peers.insert(id, Entry::new(session, &self.deaths)?);
+        }
+        let entry = self.peers.get_mut(&id).ok_or(PeerError::Missing)?;
         entry.pairs.insert(pair);
         for (segment, descriptor) in segments.iter().zip(&maps) {
             entry.add(*segment, descriptor);
         }
         Ok(Peer::Remote(entry.session.clone()))
+    }
+
+    /// The segments of a session that readers miss.
+    pub(super) fn take_wanted(&self, id: &SessionId) -> BTreeSet<u32> {
+        self.peers.get(id).map(|entry| entry.session.take_wanted()).unwrap_or_default()
     }
 
     /// A session that is held has one segment more.
@@ -155,16 +189,27 @@ impl Peers {
         }
     }
 
-    /// Forgets and returns the sessions whose process is dead.
-    pub(super) fn take_dead(&mut self) -> Vec<Arc<PeerSession>> {
-        let dead = |entry: &mut Entry| entry.session.is_dead();
-        let dead: Vec<SessionId> =
-            self.peers.iter_mut().filter_map(|(id, e)| dead(e).then_some(*id)).collect();
-        dead.iter().filter_map(|id| self.peers.remove(id)).map(|e| e.session).collect()
+    /// Forgets the sessions whose process has ended; whether there were any.
+    pub(super) fn drop_dead(&mut self) -> bool {
+        let mut events = [MaybeUninit::<epoll::Event>::uninit(); DEATHS];
+        let now = Timespec::default();
+        let Ok((events, _)) = epoll::wait(&self.deaths, &mut events, Some(&now)) else {
+            return false;
+        };
+        let ended: HashSet<u64> = events.iter().map(|event| event.data.u64()).collect();
+        let before = self.peers.len();
+        if !ended.is_empty() {
+            self.peers.retain(|id, e| !(ended.contains(&key(id)) && e.session.is_dead()));
+        }
+        self.peers.len() != before
     }
 
-    /// All of them, to be watched for their death.
-    pub(super) fn sessions(&self) -> impl Iterator<Item = &Arc<PeerSession>> {
+    /// Readable once the process of one of them has ended.
+    pub(super) fn deaths(&self) -> BorrowedFd<'_> {
+        self.deaths.as_fd()
+    }
+
+    fn sessions(&self) -> impl Iterator<Item = &Arc<PeerSession>> {
         self.peers.values().map(|e| &e.session)
     }
 }

@@ -150,13 +150,15 @@ pub(super) struct MemoryNews {
     changes: Mutex<Vec<SegmentChange>>,
 }
 
-/// What became of the session's own memory.
+/// What became of the session's own memory, or is to be asked of another's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum SegmentChange {
     Opened(u32),
     Gone(u32),
     /// This publisher has no memory ready for its next large sample.
     Low(Gid),
+    /// Readers miss memory of this other session.
+    Wanted(SessionId),
 }
 
 impl MemoryNews {
@@ -166,6 +168,15 @@ impl MemoryNews {
             SegmentEvent::Gone(info) => SegmentChange::Gone(info.number),
             SegmentEvent::Low(publisher) => SegmentChange::Low(publisher),
         };
+        self.push(change);
+    }
+
+    /// Readers miss memory of another session.
+    pub(super) fn want(&self, session: SessionId) {
+        self.push(SegmentChange::Wanted(session));
+    }
+
+    fn push(&self, change: SegmentChange) {
         self.changes.lock().unwrap_or_else(PoisonError::into_inner).push(change);
         self.wake();
     }

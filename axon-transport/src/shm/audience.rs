@@ -1,6 +1,6 @@
 //! Who reads a ring, and what of it must stand for them.
 
-use std::sync::Arc;
+use std::{collections::HashSet, sync::Arc};
 
 use super::{
     Grant, Peer, PeerSession, ReaderInfo, ShmError,
@@ -141,10 +141,10 @@ impl Audience {
             head
         };
         let tenancy = self.seats.admit(info.gid, &info.peer, info.lane, &lane)?;
-        self.readers.retain(|known| known.info.gid != info.gid);
         let grant = Grant { generation: tenancy.generation(), first };
+        self.detach(info.gid);
+        self.joined(&info);
         self.readers.push(Attached { info, lane, tenancy, grant, dead: false });
-        self.changed();
         Ok(grant)
     }
 
@@ -170,8 +170,12 @@ impl Audience {
     pub(super) fn detach(&mut self, reader: Gid) -> bool {
         let before = self.readers.len();
         self.readers.retain(|known| known.info.gid != reader);
-        self.changed();
-        self.readers.len() != before
+        let gone = self.readers.len() != before;
+        // A session asks all of its publishers whenever an endpoint ends anywhere.
+        if gone {
+            self.changed();
+        }
+        gone
     }
 
     /// Adds to `found` the positions that any reader pins, after
@@ -285,34 +289,42 @@ impl Audience {
         worst.map(|(_, gid)| (gid, peers))
     }
 
+    /// There is one reader more. A publisher of hundreds gets them one by one, so that what stands is
+    /// added to, and not found anew.
+    fn joined(&mut self, info: &ReaderInfo) {
+        self.window = self.window.max(wanted(&info.qos)).min(self.capacity);
+        let id = info.peer.id();
+        if self.peers.iter().all(|peer| peer.id() != id) {
+            self.peers = self.peers.iter().chain([&info.peer]).cloned().collect();
+        }
+    }
+
+    /// There are others than before.
     fn changed(&mut self) {
-        let readers = self.readers.iter().map(|reader| &reader.info.qos);
         let all_kept = self.offered.history == History::KeepAll
             && self.offered.durability == Durability::TransientLocal;
         self.window = if all_kept {
             self.capacity
         } else {
-            readers
-                .chain([&self.offered])
-                .filter(|qos| qos.history == History::KeepLast)
-                .map(depth)
-                .chain([BURST])
-                .max()
-                .unwrap_or(BURST)
-                .min(self.capacity)
+            let readers = self.readers.iter().map(|reader| &reader.info.qos);
+            let most = readers.chain([&self.offered]).map(wanted).max().unwrap_or(BURST);
+            most.min(self.capacity)
         };
-        let mut peers: Vec<Peer> = Vec::new();
-        for reader in &self.readers {
-            if peers.iter().all(|peer| peer.id() != reader.info.peer.id()) {
-                peers.push(reader.info.peer.clone());
-            }
-        }
-        self.peers = peers.into();
+        let mut met = HashSet::new();
+        let peers = self.readers.iter().map(|reader| &reader.info.peer);
+        self.peers = peers.filter(|peer| met.insert(peer.id())).cloned().collect();
         // Nobody watches the processes of those that are not attached any more.
-        let readers = &self.readers;
-        self.seats.sweep(|seat| {
-            readers.iter().all(|reader| reader.grant.generation != seat.tenancy.generation())
-        });
+        let attached: HashSet<u64> =
+            self.readers.iter().map(|reader| reader.grant.generation).collect();
+        self.seats.sweep(|seat| !attached.contains(&seat.tenancy.generation()));
+    }
+}
+
+/// How many samples are kept for a profile at least.
+fn wanted(qos: &Qos) -> u64 {
+    match qos.history {
+        History::KeepLast => depth(qos).max(BURST),
+        History::KeepAll => BURST,
     }
 }
 

@@ -84,7 +84,7 @@ pub enum ShmError {
 }
 
 impl ShmError {
-    pub(super) fn system(what: &'static str) -> impl FnOnce(rustix::io::Errno) -> Self {
+    pub(crate) fn system(what: &'static str) -> impl FnOnce(rustix::io::Errno) -> Self {
         move |errno| Self::System { what, source: errno.into() }
     }
 }

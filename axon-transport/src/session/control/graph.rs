@@ -6,7 +6,7 @@ use std::{
     time::Instant,
 };
 
-use super::Control;
+use super::{Control, Rematching};
 use crate::{
     graph::{Endpoint, EndpointKind, GraphEntry, GraphView, Pairing, pairing},
     ids::Gid,
@@ -71,14 +71,22 @@ impl Control {
 
     /// A publisher's, server's or client's readers changed.
     pub(super) fn writer_changed(&mut self, publisher: &Arc<PublisherInner>) {
-        let changes = publisher.rematch();
-        self.rematched(changes, &Source::Publisher(publisher.clone()));
+        self.rematching.writers.insert(publisher.endpoint.gid, publisher.clone());
     }
 
     /// A subscription's, server's or client's writers changed.
     pub(super) fn reader_changed(&mut self, subscription: &Arc<SubscriptionInner>) {
-        let changes = subscription.rematch();
-        self.rematched(changes, &Source::Subscription(subscription.clone()));
+        self.rematching.readers.insert(subscription.endpoint.gid, subscription.clone());
+    }
+
+    /// Counts what became of pairs, once for each endpoint: where many come at a time, what is counted
+    /// is all of them each time.
+    pub(super) fn tell_matched(&mut self) {
+        let Rematching { writers, readers } = std::mem::take(&mut self.rematching);
+        let writers = writers.into_values().map(Source::Publisher);
+        for source in writers.chain(readers.into_values().map(Source::Subscription)) {
+            self.rematched(source.rematch(), &source);
+        }
     }
 
     fn rematched(&mut self, changes: Changes, source: &Source) {
@@ -221,7 +229,8 @@ impl Control {
             Source::Publisher(writer) => pairing(&writer.endpoint, other),
             Source::Subscription(reader) => pairing(other, &reader.endpoint),
         };
-        if own.events().incompatible(other.gid, verdict) {
+        let differs = !matches!(verdict, Pairing::Match | Pairing::Unrelated);
+        if differs && own.events().incompatible(other.gid, verdict) {
             self.shared.segment.notify();
         }
     }

@@ -20,12 +20,6 @@ impl Control {
         for change in self.shared.memory.take() {
             self.tell_segment(change);
         }
-        for session in self.peers.sessions() {
-            for number in session.take_wanted() {
-                let need = SegmentName { session: session.id(), number };
-                self.outbox.push_back((Message::Need(need), Vec::new()));
-            }
-        }
     }
 
     pub(super) fn tell_segment(&mut self, change: SegmentChange) {
@@ -58,6 +52,12 @@ impl Control {
             }
             SegmentChange::Low(gid) => {
                 self.low.insert(gid);
+            }
+            SegmentChange::Wanted(session) => {
+                for number in self.peers.take_wanted(&session) {
+                    let need = SegmentName { session, number };
+                    self.outbox.push_back((Message::Need(need), Vec::new()));
+                }
             }
         }
     }

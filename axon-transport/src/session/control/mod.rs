@@ -8,7 +8,7 @@ mod memory;
 mod time;
 
 use std::{
-    collections::{BTreeSet, HashSet, VecDeque},
+    collections::{BTreeMap, BTreeSet, HashSet, VecDeque},
     os::fd::{AsFd, BorrowedFd},
     sync::{Arc, atomic::Ordering, mpsc::Receiver},
     time::{Duration, Instant},
@@ -24,10 +24,12 @@ use super::{
     local::{House, Local},
     message::{Announce, EndpointRole, Gone, Message, Pair},
     peers::Peers,
+    publisher::PublisherInner,
     socket::{self, SocketError},
     state::{Outgoing, Shared},
+    subscription::SubscriptionInner,
 };
-use crate::{graph::GraphView, ids::Gid, passed::PassedFd, wait::ExternalLeader};
+use crate::{graph::GraphView, ids::Gid, passed::PassedFd, shm::ShmError, wait::ExternalLeader};
 
 /// Packets handled before queued ones are sent: neither direction starves the other.
 const BATCH: usize = 64;
@@ -64,12 +66,21 @@ pub(super) struct Control {
     /// This process had no descriptors left: when it asks to be told everything anew.
     retry: Option<Instant>,
     arrivals: Arrivals,
+    /// Endpoints of whose pairs some came or went since [`tell_matched`](Self::tell_matched).
+    rematching: Rematching,
     /// The graph is another one than was last told.
     graph_changed: bool,
     /// Endpoints of whom somebody watches the time, unless they are to be looked for anew.
     timed: Option<Vec<Source>>,
     /// When to look at them, by the monotonic clock.
     alarm: Option<u64>,
+}
+
+/// By GID.
+#[derive(Default)]
+struct Rematching {
+    writers: BTreeMap<Gid, Arc<PublisherInner>>,
+    readers: BTreeMap<Gid, Arc<SubscriptionInner>>,
 }
 
 /// With whom a session speaks first.
@@ -93,7 +104,8 @@ impl Control {
     pub(super) fn new(shared: Arc<Shared>, start: Start) -> Result<Self, SessionError> {
         let reconnects = matches!(start, Start::Daemon(_));
         shared.segment.doorbell_hub().is_watched();
-        let peers = Peers::new(shared.segment.clone(), shared.memory.clone());
+        let peers = Peers::new(shared.segment.clone(), shared.memory.clone())
+            .map_err(ShmError::system("watching processes"))?;
         let mut control = Self {
             shared,
             link: Link::Ended,
@@ -112,6 +124,7 @@ impl Control {
             pause: Duration::ZERO,
             retry: None,
             arrivals: Arrivals::default(),
+            rematching: Rematching::default(),
             graph_changed: false,
             timed: None,
             alarm: None,
@@ -132,6 +145,8 @@ impl Control {
             self.try_reconnected();
             self.try_again();
             self.tell_rematched();
+            // Before the others hear of it: whoever is granted something is counted here.
+            self.tell_matched();
             self.collect();
             self.send();
             self.prepare();
@@ -233,6 +248,7 @@ impl Control {
                     for (message, descriptors) in local.exchange(Some((message, descriptors))) {
                         self.handle(message, descriptors);
                     }
+                    self.tell_matched();
                 }
                 Link::Socket(socket) => {
                     let packet = match message.encode() {
@@ -252,6 +268,7 @@ impl Control {
                         Err(error) => {
                             // What the daemon said last, such as REFUSED, is worth hearing.
                             self.receive();
+                            self.tell_matched();
                             if matches!(self.link, Link::Socket(_)) {
                                 self.lost(&error);
                             }
@@ -265,13 +282,12 @@ impl Control {
     }
 
     fn sleep(&mut self) {
-        let sessions: Vec<_> = self.peers.sessions().cloned().collect();
-        let mut fds = vec![PollFd::new(&self.shared.wake, PollFlags::IN)];
+        let deaths = PollFd::from_borrowed_fd(self.peers.deaths(), PollFlags::IN);
+        let mut fds = vec![PollFd::new(&self.shared.wake, PollFlags::IN), deaths];
         if let Link::Socket(socket) = &self.link {
             let waits = if self.outbox.is_empty() { PollFlags::empty() } else { PollFlags::OUT };
             fds.push(PollFd::new(socket, PollFlags::IN | waits));
         }
-        fds.extend(sessions.iter().map(|s| PollFd::from_borrowed_fd(s.pidfd(), PollFlags::IN)));
         let listening = self.shared.listening();
         if let Some(listening) = &listening {
             fds.push(PollFd::new(listening, PollFlags::IN));
@@ -324,7 +340,7 @@ impl Control {
 
     /// Looks for peers that died.
     fn bury(&mut self) {
-        if self.peers.take_dead().is_empty() {
+        if !self.peers.drop_dead() {
             return;
         }
         let (publishers, subscriptions) = self.endpoints();
@@ -341,7 +357,7 @@ impl Control {
     }
 }
 
-fn stands_for(subscription: &super::subscription::SubscriptionInner) -> Vec<Gid> {
+fn stands_for(subscription: &SubscriptionInner) -> Vec<Gid> {
     let mut gids = subscription.stands_for();
     gids.truncate(MAX_STANDS_FOR);
     gids

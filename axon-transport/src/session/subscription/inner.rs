@@ -130,7 +130,7 @@ impl SubscriptionInner {
         let leases = || {
             let slots = self.lock();
             let active = slots.slots.iter().filter(|slot| !slot.over);
-            active.map(|slot| (slot.reader.writer(), slot.reader.times().lease)).collect()
+            active.map(|slot| (slot.reader.writer(), slot.lease)).collect()
         };
         self.events.writers(leases, clock::monotonic())
     }

@@ -55,6 +55,8 @@ pub(super) struct Slot {
     pub(super) since: u64,
     /// The age at which its samples are not delivered any more.
     pub(super) lifespan: Option<i64>,
+    /// Within what the writer says that it is alive.
+    pub(super) lease: Option<u64>,
     /// The writer is gone: take what it left, then unmap.
     pub(super) over: bool,
     /// Found nothing in the take that is under way, since the writer was faster.
@@ -118,7 +120,7 @@ impl Slots {
 
     /// Whether the lease of one of the writers may run out.
     pub(in crate::session) fn offers_lease(&self) -> bool {
-        self.slots.iter().any(|slot| !slot.over && slot.reader.times().lease.is_some())
+        self.slots.iter().any(|slot| !slot.over && slot.lease.is_some())
     }
 
     pub(super) fn losses(&self) -> u64 {
@@ -194,9 +196,12 @@ impl Slots {
     pub(in crate::session) fn add(&mut self, reader: Reader, stands_in: bool) {
         let writer = reader.writer();
         let since = clock::monotonic();
-        let lifespan = reader.times().lifespan.map(|age| i64::try_from(age).unwrap_or(i64::MAX));
+        let times = reader.times();
+        let lifespan = times.lifespan.map(|age| i64::try_from(age).unwrap_or(i64::MAX));
+        let lease = times.lease;
         let gaps = stands_in.then(Gaps::default);
-        self.slots.push(Slot { reader, since, lifespan, over: false, overtaken: false, gaps });
+        let (over, overtaken) = (false, false);
+        self.slots.push(Slot { reader, since, lifespan, lease, over, overtaken, gaps });
         self.forget_older(writer);
     }
 
