@@ -56,9 +56,7 @@ impl Control {
             }
             state.graph = Arc::new(view);
         }
-        for gid in over {
-            self.endpoint_over(gid);
-        }
+        self.endpoints_over(&over);
         if !graph.more {
             let repeated = self.repeated.take();
             if let Some(repeated) = &repeated {

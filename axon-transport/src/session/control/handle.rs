@@ -57,16 +57,22 @@ impl Control {
         }
     }
 
-    /// An endpoint ended, perhaps while there was no daemon to say who was attached to it.
-    pub(super) fn endpoint_over(&mut self, gid: Gid) {
+    /// Endpoints ended, perhaps while there was no daemon to say who was attached to them.
+    pub(super) fn endpoints_over(&mut self, gids: &[Gid]) {
+        if gids.is_empty() {
+            return;
+        }
         let (publishers, subscriptions) = self.endpoints();
         for publisher in publishers {
-            if publisher.detach(gid) {
+            if gids.iter().filter(|gid| publisher.detach(**gid)).count() > 0 {
                 self.writer_changed(&publisher);
             }
         }
         for subscription in subscriptions {
-            if subscription.lock().end(&gid) {
+            let mut slots = subscription.lock();
+            let news = gids.iter().filter(|gid| slots.end(gid)).count();
+            drop(slots);
+            if news > 0 {
                 self.reader_changed(&subscription);
             }
         }
