@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
-use crate::trust::cli::Trust;
+use crate::{demo::mode::Mode, trust::cli::Trust};
 
 const ABOUT: &str = "Robot data between processes over shared memory and between hosts over QUIC, \
                      under post-quantum or quantum-distributed keys";
@@ -67,6 +67,10 @@ pub(crate) enum Command {
     BenchSessionAnswer,
     #[command(hide = true)]
     BenchSessionRead,
+    #[command(hide = true)]
+    BenchNetAnswer,
+    #[command(hide = true)]
+    BenchNetRead,
     #[command(hide = true)]
     DemoPlayer(DemoPlayer),
     #[command(hide = true)]
@@ -242,6 +246,38 @@ pub(crate) enum Bench {
     /// Sessions between two processes, beside bare shared memory
     #[command(after_help = BENCH_SESSION_HELP)]
     Session(BenchSession),
+    /// Messages between two hosts, beside a stream of bare quinn
+    #[command(after_help = BENCH_NET_HELP)]
+    Net(BenchNet),
+}
+
+const BENCH_NET_HELP: &str = "\
+Two hosts with a daemon each, on this machine's loopback: latency, and streams of a publisher that
+waits for a slow reader (KEEP_ALL) and of one that overtakes it (KEEP_LAST), each beside a stream of
+bare quinn in the same run, with the processor time that a message costs. With X25519MLKEM768
+(classic) and with keys of two KMEs that are simulated. The rest of the machine should be idle.
+About three minutes; --quick takes seconds and is only to see it run. Writes net.json.
+
+Examples:
+  axon bench net
+  axon bench net --modes classic --sizes 1024,1048576 --out results
+  axon bench net --quick --out results && jq .modes[].streams results/net.json";
+
+/// `axon bench net`.
+#[derive(Args, Debug)]
+pub(crate) struct BenchNet {
+    /// Security modes [default: all]
+    #[arg(long, value_name = "MODE", value_delimiter = ',', value_enum)]
+    pub(crate) modes: Vec<Mode>,
+    /// Sizes of messages in bytes, from 8 to 64 MiB [default: six from 64 B to 4 MiB]
+    #[arg(long, value_name = "BYTES", value_delimiter = ',', value_parser = message_size)]
+    pub(crate) sizes: Vec<usize>,
+    /// Where to write net.json
+    #[arg(long, value_name = "DIR", default_value = ".")]
+    pub(crate) out: PathBuf,
+    /// A few messages only: the figures are good for nothing
+    #[arg(long)]
+    pub(crate) quick: bool,
 }
 
 const BENCH_SESSION_HELP: &str = "\

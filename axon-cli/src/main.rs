@@ -33,10 +33,13 @@ fn main() -> ExitCode {
         Command::Daemon(args) => daemon::run(args),
         Command::Bench(Bench::Shm(args)) => bench::shm(args).map(done),
         Command::Bench(Bench::Session(args)) => bench::session::run(args).map(done),
+        Command::Bench(Bench::Net(args)) => bench::net::run(args).map(done),
         Command::BenchAnswer => bench::answer().map(done),
         Command::BenchRead => bench::read().map(done),
         Command::BenchSessionAnswer => bench::session::answer().map(done),
         Command::BenchSessionRead => bench::session::read().map(done),
+        Command::BenchNetAnswer => bench::net::answer().map(done),
+        Command::BenchNetRead => bench::net::read().map(done),
         Command::DemoPlayer(args) => demo::run_player(args).map(done),
         Command::DemoSubscriber(args) => demo::run_subscriber(args).map(done),
     };

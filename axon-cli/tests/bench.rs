@@ -231,3 +231,44 @@ fn a_quick_run_of_sessions_compares_them_with_bare_shared_memory() {
     };
     assert!(publish.len() == 2 && publish.iter().all(|row| counts(row) == [1, 4, 16]));
 }
+
+#[test]
+fn a_quick_run_between_two_hosts_has_every_mode_and_size() {
+    if !has_two_cpus() {
+        return;
+    }
+    let dir = tempfile::tempdir().expect("temporary directory");
+    let output = axon([])
+        .args(["bench", "net", "--quick", "--modes", "classic,messages10"])
+        .args(["--sizes", "64,65536", "--out"])
+        .arg(dir.path())
+        .output()
+        .expect("it runs");
+    let text = String::from_utf8(output.stdout).expect("text");
+    assert!(output.status.success(), "{text}\n{}", String::from_utf8_lossy(&output.stderr));
+    assert!(text.contains("QUIC qkd/messages10") && text.contains("KEEP_LAST"), "{text}");
+    let document = fs::read(dir.path().join("net.json")).expect("a file");
+    let document: Value = serde_json::from_slice(&document).expect("JSON");
+    let modes = rows(&document, "modes");
+    let names: Vec<_> = modes.iter().map(|mode| &mode["mode"]).collect();
+    assert_eq!(names, ["classic", "messages10"]);
+    for mode in &modes {
+        let sizes = |part: &str| rows(mode, part).iter().map(|row| row["bytes"].clone()).collect();
+        let (latency, streams): (Vec<_>, Vec<_>) = (sizes("latency"), sizes("streams"));
+        assert_eq!(
+            (latency, streams),
+            (vec![64.into(), 65_536.into()], vec![64.into(), 65_536.into()])
+        );
+        for row in rows(mode, "latency") {
+            check_times(&row["bare"]);
+            check_times(&row["axon"]);
+        }
+        for row in rows(mode, "streams") {
+            let of = |what: &str, count: &str| row[what][count].as_u64().expect("a number");
+            for waits in ["bare", "keep_all"] {
+                assert_eq!(of(waits, "sent"), of(waits, "taken"), "{waits} loses nothing: {row}");
+            }
+            assert!((1..=of("keep_last", "sent")).contains(&of("keep_last", "taken")), "{row}");
+        }
+    }
+}

@@ -29,7 +29,9 @@ fn the_first_page_names_every_command_and_the_exit_statuses() {
     ] {
         assert!(text.contains(part), "{part:?} is missing in:\n{text}");
     }
-    for hidden in ["demo-player", "bench-answer", "bench-read", "bench-session-read"] {
+    for hidden in
+        ["demo-player", "bench-answer", "bench-read", "bench-session-read", "bench-net-read"]
+    {
         assert!(!text.contains(hidden), "what the tool starts is not for people:\n{text}");
     }
 }

@@ -4,6 +4,7 @@
 mod budgets;
 mod chart;
 pub(crate) mod harness;
+pub(crate) mod net;
 mod readers;
 mod report;
 pub(crate) mod session;

@@ -4,9 +4,9 @@
 mod classical;
 mod env_file;
 mod events;
-mod hosts;
-mod kmes;
-mod mode;
+pub(crate) mod hosts;
+pub(crate) mod kmes;
+pub(crate) mod mode;
 mod player;
 mod process;
 mod progress;

@@ -1,7 +1,9 @@
-//! The security modes that the demo shows.
+//! The security modes that the demo shows, and that are measured.
+
+use clap::ValueEnum;
 
 /// A way to establish keys between two hosts.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Mode {
     /// X25519MLKEM768.
     Classic,

@@ -56,6 +56,12 @@ impl Machine {
         })
     }
 
+    /// Lets this thread run wherever the process may, after a [`Pair`](super::Pair) has kept it on one
+    /// CPU.
+    pub(crate) fn release(&self) -> Result<()> {
+        unpin(&self.allowed)
+    }
+
     /// One line for people.
     pub(crate) fn line(&self) -> String {
         format!(

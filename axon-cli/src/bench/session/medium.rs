@@ -1,10 +1,7 @@
 //! Sessions, as their documentation says to use them.
 
 use std::{
-    sync::{
-        OnceLock,
-        atomic::{AtomicU32, Ordering},
-    },
+    sync::atomic::{AtomicU32, Ordering},
     time::Duration,
 };
 
@@ -14,7 +11,7 @@ use axon_transport::{
     session::{Client, EndpointSpec, Publisher, Server, Session, Subscription, Waitable},
 };
 
-use super::place::{PATIENCE, session};
+use super::place::{PATIENCE, Settings, session};
 use crate::bench::harness::{
     Channel, End, Error, Load, Medium, Motion, Result, Side, agree, qos, stamp,
 };
@@ -26,30 +23,31 @@ const COPIED: usize = 4096;
 /// Up to here so is what is loaned.
 const LOANS_COPIED: usize = 512;
 
-/// Where the daemon is, in the process that measures.
-pub(super) static DIRECTORY: OnceLock<String> = OnceLock::new();
-
 /// The number of an end, for topics that no other has.
 static NUMBER: AtomicU32 = AtomicU32::new(0);
 
+/// The hosts of the process that measures and of the other one, which may be the same; the other
+/// process is told.
+pub(in crate::bench) type Hosts = Option<[Settings; 2]>;
+
 /// A publisher and a subscription in each of two sessions.
-pub(super) struct Sessions;
+pub(in crate::bench) struct Sessions(pub(in crate::bench) Hosts);
 
 /// A service: a request there, and its response back.
-pub(super) struct Service;
+pub(super) struct Service(pub(super) Hosts);
 
 /// The session of this end, and the name of what it shares with the other.
-fn meet(side: Side, channel: &Channel) -> Result<(Session, String)> {
-    let (directory, name) = match side {
+fn meet(hosts: &Hosts, side: Side, channel: &Channel) -> Result<(Session, String)> {
+    let (settings, name) = match side {
         Side::Near => {
-            let directory = DIRECTORY.get().ok_or("no daemon was started")?.clone();
+            let [near, far] = hosts.as_ref().ok_or("no daemon was started")?;
             let name = format!("/bench/{}", NUMBER.fetch_add(1, Ordering::Relaxed));
-            channel.tell(&(&directory, &name))?;
-            (directory, name)
+            channel.tell(&(far, &name))?;
+            (near.clone(), name)
         }
-        Side::Far => channel.hear::<(String, String)>()?,
+        Side::Far => channel.hear::<(Settings, String)>()?,
     };
-    Ok((session(&directory)?, name))
+    Ok((session(&settings)?, name))
 }
 
 fn spec(name: &str, qos: Qos) -> EndpointSpec {
@@ -62,7 +60,7 @@ impl Medium for Sessions {
     }
 
     fn open(&self, load: &Load, side: Side, channel: &Channel) -> Result<Box<dyn End>> {
-        let (session, name) = meet(side, channel)?;
+        let (session, name) = meet(&self.0, side, channel)?;
         let (out, back) = match side {
             Side::Near => ("there", "back"),
             Side::Far => ("back", "there"),
@@ -139,7 +137,7 @@ impl Medium for Service {
     }
 
     fn open(&self, load: &Load, side: Side, channel: &Channel) -> Result<Box<dyn End>> {
-        let (session, name) = meet(side, channel)?;
+        let (session, name) = meet(&self.0, side, channel)?;
         let (sleeps, bytes) = (load.wake.sleeps(), vec![0x5a; load.size]);
         if side == Side::Near {
             let client = session.create_client(spec(&name, Qos::default()))?;

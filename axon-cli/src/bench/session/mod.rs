@@ -1,7 +1,7 @@
 //! `axon bench session`: what a session adds to the shared memory under it.
 
-mod medium;
-mod place;
+pub(super) mod medium;
+pub(super) mod place;
 mod readers;
 mod report;
 
@@ -11,7 +11,7 @@ use std::{
 };
 
 use self::{
-    medium::{DIRECTORY, Service, Sessions},
+    medium::{Service, Sessions},
     place::Place,
     readers::{Cost, Crowd},
 };
@@ -32,9 +32,6 @@ const KINDS: [(Wake, Motion); 4] = [
 const BUDGET: f64 = 1.3;
 /// What a request and its response may take at most, by what one message takes one way.
 const SERVICE_BUDGET: f64 = 2.5;
-
-/// Bare shared memory first.
-const MEDIA: [&dyn Medium; 3] = [&Axon, &Sessions, &Service];
 
 const ANSWERING: &str = "bench-session-answer";
 const READING: &str = "bench-session-read";
@@ -73,7 +70,7 @@ pub(crate) fn run(args: &cli::BenchSession) -> Result<(), Failure> {
 
 /// Is the process that answers.
 pub(crate) fn answer() -> Result<(), Failure> {
-    harness::serve(&MEDIA).map_err(Failure::failed)
+    harness::serve(&media(&Sessions(None), &Service(None))).map_err(Failure::failed)
 }
 
 /// Is one of the readers.
@@ -81,13 +78,20 @@ pub(crate) fn read() -> Result<(), Failure> {
     readers::attend().map_err(Failure::failed)
 }
 
+/// Bare shared memory first.
+fn media<'a>(sessions: &'a Sessions, service: &'a Service) -> [&'a dyn Medium; 3] {
+    [&Axon, sessions, service]
+}
+
 fn measure(sizes: &[usize], quick: bool) -> harness::Result<Results> {
     let effort = if quick { Effort::QUICK } else { Effort::FULL };
     let machine = Machine::look()?;
     let place = Place::start()?;
-    let directory = DIRECTORY.get_or_init(|| place.directory());
+    let hosts = Some([place.settings(), place.settings()]);
+    let (sessions, service) = (Sessions(hosts.clone()), Service(hosts));
+    let media = media(&sessions, &service);
     let progress = Progress::new(sizes.len() * (KINDS.len() + 1));
-    let pair = Pair::start(&MEDIA, effort, &machine, &[ANSWERING])?;
+    let pair = Pair::start(&media, effort, &machine, &[ANSWERING])?;
     let mut latency = Vec::new();
     for (wake, motion) in KINDS {
         progress.step(&format!("latency, {}", words::kind(wake, motion)));
@@ -105,7 +109,7 @@ fn measure(sizes: &[usize], quick: bool) -> harness::Result<Results> {
     let crowd = Crowd::start(&[READING])?;
     let mut publish = Vec::new();
     for size in sizes {
-        publish.push(crowd.measure(directory, *size, effort)?);
+        publish.push(crowd.measure(&place.settings(), *size, effort)?);
         progress.advance();
     }
     Ok(Results { machine, quick, effort, latency, publish })

@@ -15,11 +15,15 @@ use axon_transport::{
 use crate::bench::harness::Result;
 
 /// Longer than any machine needs to start a daemon or to match two endpoints.
-pub(super) const PATIENCE: Duration = Duration::from_secs(60);
+pub(in crate::bench) const PATIENCE: Duration = Duration::from_secs(60);
+
+/// What a host's processes have in their environment.
+pub(in crate::bench) type Settings = Vec<(String, String)>;
 
 /// A host of the measurement's own: nobody else's daemon takes part.
 pub(super) struct Place {
-    dir: tempfile::TempDir,
+    _dir: tempfile::TempDir,
+    settings: Settings,
     daemon: Child,
 }
 
@@ -31,11 +35,18 @@ impl Place {
         for (name, _) in env::vars().filter(|(name, _)| ours(name)) {
             command.env_remove(name);
         }
-        let directory = dir.path().display().to_string();
-        command.args(["daemon", "--while-stdin"]).envs(settings(&directory));
+        let settings: Settings = [
+            ("AXON_RUNTIME_DIR", &*dir.path().display().to_string()),
+            ("AXON_BIND_ADDRS", "127.0.0.1"),
+            ("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF"),
+            ("AXON_LOG", "error"),
+        ]
+        .map(|(name, value)| (name.to_owned(), value.to_owned()))
+        .into();
+        command.args(["daemon", "--while-stdin"]).envs(settings.iter().cloned());
         let daemon = command.stdin(Stdio::piped()).stdout(Stdio::null()).spawn()?;
-        let place = Self { dir, daemon };
-        let config = config(&place.directory())?;
+        let config = config(&settings)?;
+        let place = Self { _dir: dir, settings, daemon };
         let deadline = Instant::now() + PATIENCE;
         while daemon_status(&config).is_err() {
             if Instant::now() > deadline {
@@ -47,8 +58,8 @@ impl Place {
     }
 
     /// What another process needs to know to come here, too.
-    pub(super) fn directory(&self) -> String {
-        self.dir.path().display().to_string()
+    pub(super) fn settings(&self) -> Settings {
+        self.settings.clone()
     }
 }
 
@@ -59,22 +70,14 @@ impl Drop for Place {
     }
 }
 
-/// A session with the daemon there.
-pub(super) fn session(directory: &str) -> Result<Session> {
-    Ok(Session::open(&config(directory)?, SessionOptions::new("bench"))?)
+/// A session with the daemon that has these settings.
+pub(in crate::bench) fn session(settings: &Settings) -> Result<Session> {
+    Ok(Session::open(&config(settings)?, SessionOptions::new("bench"))?)
 }
 
-fn settings(directory: &str) -> [(&'static str, String); 4] {
-    [
-        ("AXON_RUNTIME_DIR", directory.to_owned()),
-        ("AXON_BIND_ADDRS", "127.0.0.1".to_owned()),
-        ("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF".to_owned()),
-        ("AXON_LOG", "error".to_owned()),
-    ]
-}
-
-fn config(directory: &str) -> Result<Config> {
-    let env = settings(directory).map(|(n, v)| (OsString::from(n), OsString::from(v)));
+/// With them a session finds its daemon.
+pub(in crate::bench) fn config(settings: &Settings) -> Result<Config> {
+    let env = settings.iter().map(|(name, value)| (OsString::from(name), OsString::from(value)));
     let config = Config::resolve(env, None, &OsFiles)?;
     Ok(Config { daemon: DaemonPolicy::Require, ..config })
 }

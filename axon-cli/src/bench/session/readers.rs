@@ -5,7 +5,7 @@ use std::time::Instant;
 use rustix::process::{Signal, set_parent_process_death_signal};
 use serde::{Deserialize, Serialize};
 
-use super::place::{PATIENCE, session};
+use super::place::{PATIENCE, Settings, session};
 use crate::bench::harness::{Channel, Effort, Error, Other, Result, Rounds, qos, spawn};
 use axon_transport::session::EndpointSpec;
 
@@ -21,7 +21,7 @@ pub(super) struct Cost {
 enum Order {
     /// Subscribe there to this.
     Subscribe {
-        directory: String,
+        settings: Settings,
         topic: String,
     },
     Drop,
@@ -35,16 +35,16 @@ impl Crowd {
     }
 
     /// Nanoseconds of a publish of `size` bytes, with subscriptions that neither take nor sleep.
-    pub(super) fn measure(&self, directory: &str, size: usize, effort: Effort) -> Result<Cost> {
-        let session = session(directory)?;
+    pub(super) fn measure(&self, settings: &Settings, size: usize, effort: Effort) -> Result<Cost> {
+        let session = session(settings)?;
         let mut publishers = Vec::new();
         for readers in READERS {
             let topic = format!("/bench/{size}/{readers}");
             let spec = EndpointSpec::new(&*topic, "bench/Bytes", qos(1)?);
             let publisher = session.create_publisher(spec)?;
             for reader in &self.0[..readers] {
-                let (directory, topic) = (directory.to_owned(), topic.clone());
-                reader.channel().tell(&Order::Subscribe { directory, topic })?;
+                let (settings, topic) = (settings.clone(), topic.clone());
+                reader.channel().tell(&Order::Subscribe { settings, topic })?;
                 reader.channel().hear::<()>()?;
             }
             if !publisher.wait_matched(readers, PATIENCE) {
@@ -95,10 +95,10 @@ pub(super) fn attend() -> Result<()> {
     let mut open = None;
     while let Ok(order) = channel.hear::<Order>() {
         match order {
-            Order::Subscribe { directory, topic } => {
+            Order::Subscribe { settings, topic } => {
                 let session = match open.take() {
                     Some(session) => session,
-                    None => session(&directory)?,
+                    None => session(&settings)?,
                 };
                 let spec = EndpointSpec::new(topic, "bench/Bytes", qos(1)?);
                 subscriptions.push(session.create_subscription(spec)?);

@@ -1,0 +1,151 @@
+//! `axon bench net`: what crosses between two hosts, beside a stream of bare quinn.
+
+mod bare;
+mod hosts;
+mod report;
+mod stream;
+
+use std::{
+    fs,
+    io::{self, Write},
+    time::Duration,
+};
+
+use self::{
+    bare::BareQuic,
+    hosts::Hosts,
+    stream::{Flow, Reader, Streamed},
+};
+use super::{
+    harness::{self, Effort, Load, Machine, Medium, Motion, Pair, Progress, Rounds, Wake},
+    session::medium::Sessions,
+};
+use crate::{
+    cli,
+    demo::{kmes::Kmes, mode::Mode},
+    failure::Failure,
+};
+
+const SIZES: [usize; 6] = [64, 1 << 10, 4 << 10, 64 << 10, 1 << 20, 4 << 20];
+const QUICK_SIZES: [usize; 2] = [64, 64 << 10];
+
+const ANSWERING: &str = "bench-net-answer";
+const READING: &str = "bench-net-read";
+
+/// A message there and one back, by turns; times are one way, half a round trip.
+struct Latency {
+    size: usize,
+    bare: Rounds,
+    axon: Rounds,
+}
+
+/// Streams of one size, by turns; of each the best turn.
+struct Streams {
+    size: usize,
+    bare: Streamed,
+    waits: Streamed,
+    overtakes: Streamed,
+}
+
+struct Measured {
+    mode: Mode,
+    latency: Vec<Latency>,
+    streams: Vec<Streams>,
+}
+
+struct Results {
+    machine: Machine,
+    quick: bool,
+    effort: Effort,
+    modes: Vec<Measured>,
+}
+
+/// Runs `axon bench net`.
+pub(crate) fn run(args: &cli::BenchNet) -> Result<(), Failure> {
+    let sizes = match (&args.sizes[..], args.quick) {
+        ([], false) => &SIZES[..],
+        ([], true) => &QUICK_SIZES[..],
+        (sizes, _) => sizes,
+    };
+    let modes = match &args.modes[..] {
+        [] => &Mode::ALL[..],
+        modes => modes,
+    };
+    let results = measure(sizes, modes, args.quick).map_err(Failure::failed)?;
+    fs::create_dir_all(&args.out)?;
+    fs::write(args.out.join("net.json"), report::json(&results))?;
+    let mut out = io::stdout().lock();
+    out.write_all(report::text(&results).as_bytes())?;
+    writeln!(out, "\nnet.json is in {}", args.out.display())?;
+    Ok(())
+}
+
+/// Is the process that answers.
+pub(crate) fn answer() -> Result<(), Failure> {
+    harness::serve(&media(&Sessions(None))).map_err(Failure::failed)
+}
+
+/// Is the process that reads streams.
+pub(crate) fn read() -> Result<(), Failure> {
+    stream::attend().map_err(Failure::failed)
+}
+
+/// The raw limit first.
+fn media(sessions: &Sessions) -> [&dyn Medium; 2] {
+    [&BareQuic, sessions]
+}
+
+fn measure(sizes: &[usize], modes: &[Mode], quick: bool) -> harness::Result<Results> {
+    let effort = if quick { Effort::QUICK } else { Effort::FULL };
+    let (turns, length) = if quick { (1, 20) } else { (3, 1000) };
+    let length = Duration::from_millis(length);
+    let machine = Machine::look()?;
+    let directory = tempfile::Builder::new().prefix("axon-bench-").tempdir()?;
+    let runtime =
+        tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
+    let kmes = runtime.block_on(Kmes::start(directory.path()))?;
+    let progress = Progress::new(modes.len() * sizes.len() * 2);
+    let mut measured = Vec::new();
+    for mode in modes {
+        let hosts = Hosts::start(&runtime, *mode, &kmes, directory.path())?;
+        let sessions = Sessions(Some(hosts.settings.clone()));
+        let media = media(&sessions);
+
+        progress.step(&format!("latency, {}", mode.route()));
+        let pair = Pair::start(&media, effort, &machine, &[ANSWERING])?;
+        let mut latency = Vec::new();
+        for size in sizes {
+            let load = Load::ping_pong(*size, Wake::Event, Motion::Copy);
+            let [bare, axon] =
+                pair.latency(&load)?.try_into().map_err(|_| "a medium without figures")?;
+            latency.push(Latency { size: *size, bare, axon });
+            progress.advance();
+        }
+        drop(pair);
+
+        progress.step(&format!("streams, {}", mode.route()));
+        machine.release()?;
+        let reader = Reader::start(&[READING])?;
+        let mut streams = Vec::new();
+        for size in sizes {
+            let by_turns = (0..turns).map(|_| {
+                Ok([
+                    reader.bare(*size, length)?,
+                    reader.axon(&hosts, *size, Flow::Waits, length)?,
+                    reader.axon(&hosts, *size, Flow::Overtakes, length)?,
+                ])
+            });
+            let by_turns = by_turns.collect::<harness::Result<Vec<_>>>()?;
+            let best = |which: usize| {
+                let one = |turn: &[Streamed; 3]| turn[which];
+                let more = |a: &Streamed, b: &Streamed| a.per_second().total_cmp(&b.per_second());
+                by_turns.iter().map(one).max_by(more).ok_or("no turn")
+            };
+            let (bare, waits, overtakes) = (best(0)?, best(1)?, best(2)?);
+            streams.push(Streams { size: *size, bare, waits, overtakes });
+            progress.advance();
+        }
+        measured.push(Measured { mode: *mode, latency, streams });
+    }
+    Ok(Results { machine, quick, effort, modes: measured })
+}

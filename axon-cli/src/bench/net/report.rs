@@ -1,0 +1,126 @@
+//! The results as text, and as JSON.
+
+use std::fmt::Write as _;
+
+use serde_json::{Value, json};
+
+use super::{Measured, Results, stream::Streamed};
+use crate::{
+    bench::harness::words,
+    text::{self, Table},
+};
+
+/// How figures are taken; in every output.
+const REPORTED: &str = "AXON between two hosts on one machine's loopback, and one stream of bare \
+                        quinn, take turns. Latency is one way (half a round trip), of the round \
+                        with the least median; of streams the best of the turns counts.";
+
+pub(super) fn text(results: &Results) -> String {
+    let mut out = format!("{}\n{REPORTED}\n", results.machine.line());
+    if results.quick {
+        out += "A quick run: its figures are good for nothing.\n";
+    }
+    for measured in &results.modes {
+        let _ = writeln!(out, "\nLatency, {}.\n", measured.mode.route());
+        out += &latency(measured);
+        let _ = writeln!(out, "\nStreams, {}, in messages a second.\n", measured.mode.route());
+        out += &streams(measured);
+    }
+    out
+}
+
+fn latency(measured: &Measured) -> String {
+    let header = [">size", ">bare p50", ">p99", ">AXON p50", ">p99", ">ratio of p50"];
+    let mut table = Table::new(&header);
+    for row in &measured.latency {
+        let times = [&row.bare, &row.axon].map(|rounds| {
+            let all = rounds.all();
+            [rounds.best().p50(), all.tail(99.0).unwrap_or(all.at[9])].map(words::nanoseconds)
+        });
+        let mut cells = vec![words::size(row.size)];
+        cells.extend(times.into_iter().flatten());
+        cells.push(format!("{:.2}", row.axon.to(&row.bare).best));
+        table.row(cells);
+    }
+    table.render(0)
+}
+
+fn streams(measured: &Measured) -> String {
+    let header = [
+        ">size",
+        ">bare",
+        ">KEEP_ALL",
+        ">ratio",
+        "",
+        ">KEEP_LAST sent",
+        ">taken",
+        ">CPU: bare",
+        ">KEEP_ALL",
+        ">KEEP_LAST",
+    ];
+    let mut table = Table::new(&header);
+    for row in &measured.streams {
+        let rate = |streamed: &Streamed| text::grouped(streamed.per_second() as u64);
+        let sent = row.overtakes.sent as f64 / row.overtakes.seconds.max(1e-9);
+        let mut cells = vec![
+            words::size(row.size),
+            rate(&row.bare),
+            rate(&row.waits),
+            format!("{:.2}", row.waits.per_second() / row.bare.per_second()),
+            format!("{}/s", text::bytes((row.waits.per_second() * row.size as f64) as u64)),
+            text::grouped(sent as u64),
+            rate(&row.overtakes),
+        ];
+        let cpu = [&row.bare, &row.waits, &row.overtakes];
+        cells.extend(cpu.map(|streamed| words::nanoseconds(streamed.cpu_us_a_message() * 1e3)));
+        table.row(cells);
+    }
+    table.render(0)
+}
+
+pub(super) fn json(results: &Results) -> String {
+    let streamed = |of: &Streamed| -> Value {
+        json!({
+            "sent": of.sent,
+            "taken": of.taken,
+            "seconds": of.seconds,
+            "per_second": of.per_second(),
+            "cpu_us_a_message": of.cpu_us_a_message(),
+        })
+    };
+    let modes = results.modes.iter().map(|measured| {
+        let latency = measured.latency.iter().map(|row| {
+            json!({
+                "bytes": row.size,
+                "bare": row.bare.json(),
+                "axon": row.axon.json(),
+                "ratio": row.axon.to(&row.bare).best,
+            })
+        });
+        let streams = measured.streams.iter().map(|row| {
+            json!({
+                "bytes": row.size,
+                "bare": streamed(&row.bare),
+                "keep_all": streamed(&row.waits),
+                "keep_last": streamed(&row.overtakes),
+                "ratio_of_keep_all": row.waits.per_second() / row.bare.per_second(),
+            })
+        });
+        json!({
+            "mode": measured.mode.stem(),
+            "latency": latency.collect::<Vec<_>>(),
+            "streams": streams.collect::<Vec<_>>(),
+        })
+    });
+    let document = json!({
+        "benchmark": "axon bench net",
+        "version": env!("CARGO_PKG_VERSION"),
+        "optimized": !cfg!(debug_assertions),
+        "quick": results.quick,
+        "reported": REPORTED,
+        "machine": results.machine,
+        "rounds": results.effort.rounds,
+        "modes": modes.collect::<Vec<_>>(),
+    });
+    format!("{document:#}\n")
+}

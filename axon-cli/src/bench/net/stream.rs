@@ -1,0 +1,206 @@
+//! Streams: as fast as the publisher can, to a reader in another process.
+
+use std::{
+    fs,
+    time::{Duration, Instant},
+};
+
+use axon_transport::{qos::Qos, session::EndpointSpec, shm::PublishError};
+use rustix::process::{Signal, set_parent_process_death_signal};
+use serde::{Deserialize, Serialize};
+
+use super::{bare::BareQuic, hosts::Hosts};
+use crate::bench::{
+    harness::{Channel, Load, Medium, Motion, Other, Result, Side, agree, spawn, stamp},
+    session::place::{PATIENCE, Settings, session},
+};
+
+/// The number of a stream's last message.
+const LAST: u64 = u64::MAX;
+
+/// What the publisher does when it is too fast.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Flow {
+    /// It waits: RELIABLE and KEEP_ALL.
+    Waits,
+    /// It does not, and the oldest are lost: RELIABLE and KEEP_LAST(10), ROS 2's default.
+    Overtakes,
+}
+
+/// What became of a stream.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+pub(super) struct Streamed {
+    pub(super) sent: u64,
+    pub(super) taken: u64,
+    /// From the first message taken to the last.
+    pub(super) seconds: f64,
+    /// Processor time of all processes that took part.
+    pub(super) cpu_seconds: f64,
+}
+
+impl Streamed {
+    pub(super) fn per_second(&self) -> f64 {
+        self.taken as f64 / self.seconds.max(1e-9)
+    }
+
+    pub(super) fn cpu_us_a_message(&self) -> f64 {
+        self.cpu_seconds * 1e6 / self.taken.max(1) as f64
+    }
+}
+
+#[derive(Serialize, Deserialize)]
+enum Order {
+    Bare { size: usize },
+    Read { settings: Settings, topic: String, flow: Flow },
+}
+
+/// What the reader found: messages, seconds, processor time.
+type Found = (u64, f64, f64);
+
+/// The process that reads.
+pub(super) struct Reader(Other);
+
+impl Reader {
+    pub(super) fn start(arguments: &[&str]) -> Result<Self> {
+        Ok(Self(spawn(arguments)?))
+    }
+
+    /// Over bare quinn.
+    pub(super) fn bare(&self, size: usize, length: Duration) -> Result<Streamed> {
+        let channel = self.0.channel();
+        channel.tell(&Order::Bare { size })?;
+        let mut end = BareQuic.open(&load(size), Side::Near, channel)?;
+        channel.hear::<()>()?;
+        let cpu = cpu_seconds("self");
+        let sent = until_over(length, |number| end.send(number))?;
+        self.found(sent, || cpu_seconds("self") - cpu)
+    }
+
+    /// From a publisher on the first host to a subscription on the other.
+    pub(super) fn axon(
+        &self,
+        hosts: &Hosts<'_>,
+        size: usize,
+        flow: Flow,
+        length: Duration,
+    ) -> Result<Streamed> {
+        let [near, far] = &hosts.settings;
+        let channel = self.0.channel();
+        let topic = format!("/stream/{size}/{flow:?}");
+        channel.tell(&Order::Read { settings: far.clone(), topic: topic.clone(), flow })?;
+        let session = session(near)?;
+        let publisher = session.create_publisher(spec(&topic, flow))?;
+        if !publisher.wait_matched(1, PATIENCE) {
+            return Err("the two hosts do not meet".into());
+        }
+        channel.hear::<()>()?;
+        let pids = hosts.pids()?;
+        let cpu = || {
+            let daemons = pids.iter().map(|pid| cpu_seconds(&pid.to_string()));
+            daemons.sum::<f64>() + cpu_seconds("self")
+        };
+        let before = cpu();
+        let mut bytes = vec![0x5a; size];
+        let sent = until_over(length, |number| {
+            stamp(&mut bytes, number);
+            loop {
+                match publisher.publish(&bytes) {
+                    Ok(_) => return Ok(()),
+                    // The reader is slow: this is what KEEP_ALL means.
+                    Err(PublishError::Blocked { .. }) => {}
+                    Err(error) => return Err(error.into()),
+                }
+            }
+        })?;
+        self.found(sent, || cpu() - before)
+    }
+
+    fn found(&self, sent: u64, cpu: impl Fn() -> f64) -> Result<Streamed> {
+        let (taken, seconds, theirs) = self.0.channel().hear::<Found>()?;
+        Ok(Streamed { sent, taken, seconds, cpu_seconds: theirs + cpu() })
+    }
+}
+
+/// Is the process that reads, until the one that measures ends.
+pub(super) fn attend() -> Result<()> {
+    set_parent_process_death_signal(Some(Signal::KILL))?;
+    let channel = Channel::inherited()?;
+    while let Ok(order) = channel.hear::<Order>() {
+        let found = match order {
+            Order::Bare { size } => {
+                let mut end = BareQuic.open(&load(size), Side::Far, &channel)?;
+                channel.tell(&())?;
+                count(|| end.receive())?
+            }
+            Order::Read { settings, topic, flow } => read(&channel, &settings, &topic, flow)?,
+        };
+        channel.tell(&found)?;
+    }
+    Ok(())
+}
+
+fn read(channel: &Channel, settings: &Settings, topic: &str, flow: Flow) -> Result<Found> {
+    let session = session(settings)?;
+    let subscription = session.create_subscription(spec(topic, flow))?;
+    if !subscription.wait_matched(1, PATIENCE) {
+        return Err("the two hosts do not meet".into());
+    }
+    channel.tell(&())?;
+    let mut bytes = Vec::new();
+    count(|| {
+        subscription.recv(&mut bytes, Some(PATIENCE)).ok_or("the stream does not end")?;
+        let [first, last] = [bytes.first_chunk(), bytes.last_chunk()];
+        agree(*first.ok_or("too short")?, *last.ok_or("too short")?)
+    })
+}
+
+/// Receives until the last message, in order.
+fn count(mut receive: impl FnMut() -> Result<u64>) -> Result<Found> {
+    let mut before = receive()?;
+    let (start, cpu) = (Instant::now(), cpu_seconds("self"));
+    let mut taken = 1;
+    while before != LAST {
+        let number = receive()?;
+        if number <= before {
+            return Err(format!("message {number} came after message {before}").into());
+        }
+        before = number;
+        taken += 1;
+    }
+    Ok((taken, start.elapsed().as_secs_f64(), cpu_seconds("self") - cpu))
+}
+
+/// Sends for this long, then the last message; how many in all.
+fn until_over(length: Duration, mut send: impl FnMut(u64) -> Result<()>) -> Result<u64> {
+    let start = Instant::now();
+    let mut sent = 0;
+    while start.elapsed() < length {
+        sent += 1;
+        send(sent)?;
+    }
+    send(LAST)?;
+    Ok(sent + 1)
+}
+
+fn load(size: usize) -> Load {
+    Load::stream(size, Motion::Copy)
+}
+
+fn spec(topic: &str, flow: Flow) -> EndpointSpec {
+    let qos = match flow {
+        Flow::Waits => Qos::keep_all(),
+        Flow::Overtakes => Qos::default(),
+    };
+    EndpointSpec::new(topic, "bench/Bytes", qos)
+}
+
+/// Processor time of a process so far, of the threads that it has now.
+fn cpu_seconds(pid: &str) -> f64 {
+    let tasks = fs::read_dir(format!("/proc/{pid}/task"));
+    let nanoseconds = tasks.into_iter().flatten().filter_map(|task| {
+        let text = fs::read_to_string(task.ok()?.path().join("schedstat")).ok()?;
+        text.split(' ').next()?.parse::<u64>().ok()
+    });
+    nanoseconds.sum::<u64>() as f64 / 1e9
+}
