@@ -16,6 +16,7 @@ use super::{
     dial::{Target, dial, handshake},
     endpoint::Endpoints,
     establish::{Established, establish},
+    frames::Frames,
     inbound::stream_header,
     keyring::Keyring,
     queue::Sample,
@@ -277,8 +278,8 @@ impl Link {
         let route = Route { kind: Kind::Topic, topic: hash };
         let sample = greeting(publisher);
         protection.demand(1);
-        let mut frame = Vec::new();
-        while protection.write(&sample, route, Delivery::Reliable, &mut frame).is_err() {
+        let mut frames = Frames::default();
+        while protection.write(&sample, route, Delivery::Reliable, &mut frames).is_err() {
             match tokio::time::timeout(ROUTE_TIMEOUT, self.established.reader.next()).await {
                 Ok(Ok(Message::Keys(message))) => self.key_message(&message),
                 Ok(Ok(_)) => {}
@@ -286,7 +287,7 @@ impl Link {
                 Err(_) => return Err(Refusal::network("no key became READY")),
             }
         }
-        Ok(frame)
+        Ok(frames.take().concat())
     }
 
     async fn closed(&self) -> Refusal {

@@ -9,6 +9,7 @@ use tokio::sync::mpsc;
 use super::{
     counters::Counters,
     establish::close,
+    pieces::Pieces,
     pulse::Pulse,
     routes_in::RoutesIn,
     seal::{MAX_OVERHEAD, Protection, RefusedMessage, writer},
@@ -73,9 +74,10 @@ impl Inbound {
         }
     }
 
-    async fn stream(&self, mut stream: RecvStream) -> End {
+    async fn stream(&self, stream: RecvStream) -> End {
+        let mut stream = Pieces::new(stream);
         let mut header = [0; STREAM_HEADER];
-        if stream.read_exact(&mut header).await.is_err() {
+        if !stream.exact(&mut header).await {
             return End::Finished;
         }
         let (kind, number, gid) = match parse_header(&header) {
@@ -86,7 +88,7 @@ impl Inbound {
             // Unsubscribed, or the publisher is gone from the graph: its samples may still be
             // under way.
             self.counters.dropped("no_route", 1);
-            let _ = stream.stop(NO_ROUTE);
+            stream.stop(NO_ROUTE);
             return End::Finished;
         };
         let _feeding = feeding.lock().await;
@@ -104,12 +106,12 @@ impl Inbound {
     /// Reads and publishes one message; false when the stream ended before it.
     async fn message(
         &self,
-        stream: &mut RecvStream,
+        stream: &mut Pieces,
         body: &mut Vec<u8>,
         from: From,
     ) -> Result<bool, (CloseCode, String)> {
         let mut prefix = [0; 4];
-        if stream.read_exact(&mut prefix).await.is_err() {
+        if !stream.exact(&mut prefix).await {
             return Ok(false);
         }
         let length = u64::from(u32::from_be_bytes(prefix));
@@ -122,13 +124,9 @@ impl Inbound {
         body.clear();
         let mut left = length as usize;
         while left > 0 {
-            match stream.read_chunk(left, true).await {
-                Ok(Some(chunk)) => {
-                    body.extend_from_slice(&chunk.bytes);
-                    left -= chunk.bytes.len();
-                }
-                Ok(None) | Err(_) => return Ok(false),
-            }
+            let Some(piece) = stream.next(left).await else { return Ok(false) };
+            body.extend_from_slice(&piece);
+            left -= piece.len();
         }
         let opened = self.protection.open(body, from.route, self.max_message).map_err(|e| {
             let code = match e {
@@ -154,14 +152,15 @@ impl Inbound {
     /// which in turn holds the peer's stream back.
     async fn publish(&self, stand_in: &StandIn, client: &Gid, meta: Meta, payload: &[u8]) {
         let mut waiting = None;
-        let mut beat = self.pulse.subscribe();
         loop {
-            beat.mark_unchanged();
             match stand_in.try_write(client, meta, payload) {
                 Ok(Written::Yes) => return self.counters.arrived(payload.len()),
                 Ok(Written::Nobody) => return self.counters.dropped("no_client", 1),
                 Err(PublishError::Blocked { .. }) if self.connection.close_reason().is_none() => {
-                    waiting.get_or_insert_with(|| self.pulse.wait_for_room());
+                    // Tried once more with the first beat: there may have been room since.
+                    let (beat, _) = waiting.get_or_insert_with(|| {
+                        (self.pulse.subscribe(), self.pulse.wait_for_room())
+                    });
                     // The timeout only covers a link that ends meanwhile.
                     let _ = tokio::time::timeout(Duration::from_millis(100), beat.changed()).await;
                 }

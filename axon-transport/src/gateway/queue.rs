@@ -6,6 +6,8 @@
 
 use std::collections::VecDeque;
 
+use bytes::Bytes;
+
 use crate::{
     ids::Gid,
     qos::{History, Qos, Reliability},
@@ -20,7 +22,7 @@ pub(super) struct Sample {
     /// Whose call it is, where it is a request or a response.
     pub(super) client: Option<Gid>,
     /// The payload.
-    pub(super) payload: Vec<u8>,
+    pub(super) payload: Bytes,
     /// When it was copied out of the ring, on the monotonic clock.
     pub(super) since: std::time::Instant,
 }
@@ -56,6 +58,13 @@ enum Policy {
     Depth(usize),
 }
 
+impl Sample {
+    /// What it takes of a queue's room: an empty one, too, is somewhere.
+    fn size(&self) -> usize {
+        self.payload.len() + size_of::<Self>()
+    }
+}
+
 impl Queue {
     /// The queue for a relay with `qos`, of at most `max_bytes` (one sample may always wait).
     pub(super) fn new(qos: &Qos, max_bytes: usize) -> Self {
@@ -69,7 +78,7 @@ impl Queue {
 
     /// Puts `sample` at the end, as the policy says.
     pub(super) fn offer(&mut self, sample: Sample) -> Offered {
-        let size = sample.payload.len();
+        let size = sample.size();
         let over = |q: &Self| !q.samples.is_empty() && q.bytes + size > q.max_bytes;
         if self.policy == Policy::Wait && over(self) {
             return Offered::Full(sample);
@@ -91,8 +100,19 @@ impl Queue {
     /// The oldest sample.
     pub(super) fn pop(&mut self) -> Option<Sample> {
         let sample = self.samples.pop_front()?;
-        self.bytes -= sample.payload.len();
+        self.bytes -= sample.size();
         Some(sample)
+    }
+
+    /// The oldest samples, until they have `bytes` together or none is left.
+    pub(super) fn pop_together(&mut self, bytes: usize, into: &mut VecDeque<Sample>) {
+        let mut together = 0;
+        while together < bytes
+            && let Some(sample) = self.pop()
+        {
+            together += sample.size();
+            into.push_back(sample);
+        }
     }
 }
 
@@ -108,7 +128,17 @@ mod tests {
             received_timestamp: 0,
             reception: sequence,
         };
-        Sample { info, client: None, payload: vec![0; size], since: std::time::Instant::now() }
+        Sample {
+            info,
+            client: None,
+            payload: vec![0; size].into(),
+            since: std::time::Instant::now(),
+        }
+    }
+
+    /// A queue with room for so many samples of so many bytes.
+    fn queue(qos: &Qos, samples: usize, size: usize) -> Queue {
+        Queue::new(qos, samples * sample(0, size).size())
     }
 
     fn offer(queue: &mut Queue, sequence: u64, size: usize) -> Result<u64, u64> {
@@ -120,7 +150,7 @@ mod tests {
 
     #[test]
     fn keep_all_hands_the_sample_back_and_loses_nothing() {
-        let mut queue = Queue::new(&Qos::keep_all(), 100);
+        let mut queue = queue(&Qos::keep_all(), 1, 60);
         assert_eq!(offer(&mut queue, 1, 60), Ok(0));
         assert_eq!(offer(&mut queue, 2, 60), Err(2));
         assert_eq!(queue.pop().unwrap().info.sequence, 1);
@@ -131,23 +161,48 @@ mod tests {
 
     #[test]
     fn one_sample_over_the_bound_still_passes() {
-        let mut queue = Queue::new(&Qos::keep_all(), 100);
+        let mut queue = queue(&Qos::keep_all(), 1, 60);
         assert_eq!(offer(&mut queue, 1, 1000), Ok(0));
     }
 
     #[test]
     fn keep_last_drops_the_oldest_and_says_how_many() {
-        let mut queue = Queue::new(&Qos::default(), 100);
+        let mut queue = queue(&Qos::default(), 5, 20);
         for sequence in 1..=5 {
             assert_eq!(offer(&mut queue, sequence, 20), Ok(0));
         }
-        assert_eq!(offer(&mut queue, 6, 50), Ok(3));
+        let of_three = 2 * sample(0, 20).size() + 20;
+        assert_eq!(offer(&mut queue, 6, of_three), Ok(3));
         assert_eq!(queue.pop().unwrap().info.sequence, 4);
     }
 
     #[test]
+    fn samples_without_bytes_take_room_too() {
+        let mut queue = queue(&Qos::default(), 3, 0);
+        let dropped: Vec<_> = (1..=5).map(|sequence| offer(&mut queue, sequence, 0)).collect();
+        assert_eq!(dropped, [Ok(0), Ok(0), Ok(0), Ok(1), Ok(1)]);
+    }
+
+    #[test]
+    fn together_go_as_many_as_have_the_bytes_and_at_least_one() {
+        let mut queue = queue(&Qos::keep_all(), 9, 1000);
+        for sequence in 1..=4 {
+            assert_eq!(offer(&mut queue, sequence, 1000), Ok(0));
+        }
+        let mut together = |bytes| {
+            let mut into = VecDeque::new();
+            queue.pop_together(bytes, &mut into);
+            into.iter().map(|sample| sample.info.sequence).collect::<Vec<_>>()
+        };
+        assert_eq!(together(1), [1]);
+        assert_eq!(together(1500), [2, 3]);
+        assert_eq!(together(1 << 20), [4]);
+        assert!(together(1).is_empty());
+    }
+
+    #[test]
     fn best_effort_keeps_no_more_than_its_depth() {
-        let mut queue = Queue::new(&Qos { depth: 2, ..Qos::sensor_data() }, 1000);
+        let mut queue = queue(&Qos { depth: 2, ..Qos::sensor_data() }, 10, 1);
         assert_eq!(offer(&mut queue, 1, 1), Ok(0));
         assert_eq!(offer(&mut queue, 2, 1), Ok(0));
         assert_eq!(offer(&mut queue, 3, 1), Ok(1));

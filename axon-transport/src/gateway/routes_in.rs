@@ -71,6 +71,12 @@ impl RoutesIn {
 
     /// Looks, for a while, as long as there is such a route.
     async fn find<T>(&self, number: u32, look: impl Fn(&RouteIn) -> Option<T>) -> Option<T> {
+        // Almost always it is there, and then nothing else is needed.
+        match read(&self.routes).get(&number).map(&look) {
+            Some(None) => {}
+            Some(found) => return found,
+            None => return None,
+        }
         let found = async {
             loop {
                 let changed = self.changed.notified();

@@ -6,6 +6,7 @@ use std::{sync::Arc, time::Instant};
 use axon_envelope::{Delivery, Kind, OpenError, Route, TAG_LEN, inner};
 
 use super::{
+    frames::Frames,
     keyring::{Keyring, PeerKeys},
     queue::Sample,
 };
@@ -78,25 +79,25 @@ fn number(sequence: u64) -> i64 {
 }
 
 impl Protection {
-    /// Writes `length || body` of `sample` into `frame`, which is cleared first.
+    /// Adds `length || body` of `sample` to `frames`.
     ///
     /// # Errors
-    /// [`NoKey`] in `messages10` when no READY key is left for this kind of delivery.
+    /// [`NoKey`] in `messages10` when no READY key is left for this kind of delivery: then nothing was
+    /// added.
     pub(super) fn write(
         &self,
         sample: &Sample,
         route: Route,
         delivery: Delivery,
-        frame: &mut Vec<u8>,
+        frames: &mut Frames,
     ) -> Result<(), NoKey> {
-        frame.clear();
         let header = header(sample).encode();
+        let plain = header.len() + sample.payload.len();
         match self {
             Self::Link => {
-                let length = header.len() + sample.payload.len();
-                frame.extend_from_slice(&(length as u32).to_be_bytes());
-                frame.extend_from_slice(&header);
-                frame.extend_from_slice(&sample.payload);
+                frames.copy(&(plain as u32).to_be_bytes());
+                frames.copy(&header);
+                frames.share(&sample.payload);
                 Ok(())
             }
             Self::Envelope { keyring, keys, connection } => {
@@ -105,22 +106,22 @@ impl Protection {
                     if sender.attached() != Some(*connection) {
                         return Err(NoKey::Detached);
                     }
-                    let plain = header.len() + sample.payload.len();
-                    frame.resize(LENGTH + sender.overhead() + plain, 0);
+                    let most = LENGTH + sender.overhead() + plain;
                     let slot = sender.slot(now, delivery)?;
                     let parts: [&[u8]; 2] = [&header, &sample.payload];
-                    let sealed = slot.seal_into(route, &parts, &mut frame[LENGTH..]);
-                    // The buffer has room for the longest header, and the payload is bounded.
-                    let length = sealed.map_err(|_| NoKey::None)?;
-                    frame.truncate(LENGTH + length);
-                    frame[..LENGTH].copy_from_slice(&(length as u32).to_be_bytes());
-                    Ok(())
+                    frames.fill(most, |frame| {
+                        let sealed = slot.seal_into(route, &parts, &mut frame[LENGTH..]);
+                        // There is room for the longest header, and the payload is bounded.
+                        let length = sealed.map_err(|_| NoKey::None)?;
+                        frame[..LENGTH].copy_from_slice(&(length as u32).to_be_bytes());
+                        Ok(LENGTH + length)
+                    })
                 })
             }
         }
     }
 
-    /// One more message waits to be sealed: what the key supply plans by.
+    /// So many more messages wait to be sealed: what the key supply plans by.
     pub(super) fn demand(&self, messages: u32) {
         if let Self::Envelope { keyring, keys, .. } = self {
             keys.with_sender(keyring, |now, sender| sender.demand(now, messages));
@@ -185,7 +186,7 @@ fn cause(error: &OpenError) -> String {
 
 /// A sample as it was taken from a relay.
 pub(super) fn sample(info: crate::session::MessageInfo, payload: Vec<u8>) -> Sample {
-    Sample { info, client: None, payload, since: Instant::now() }
+    Sample { info, client: None, payload: payload.into(), since: Instant::now() }
 }
 
 /// Who wrote a message that came in the stream of `of`: the publisher that the stream is of, the

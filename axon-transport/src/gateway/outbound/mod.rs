@@ -7,7 +7,11 @@
 
 mod stream;
 
-use std::{collections::HashMap, sync::Arc};
+use std::{
+    collections::HashMap,
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use axon_envelope::{Kind, Route};
 use quinn::Connection;
@@ -23,10 +27,18 @@ use super::{
     seal::{Protection, sample},
     stand_in::StandIn,
 };
-use crate::{ids::Gid, qos::Qos, session::Subscription};
+use crate::{
+    ids::Gid,
+    qos::{Qos, Reliability},
+    session::Subscription,
+};
 
-/// Samples taken from one relay before the next one has its turn.
-const BATCH: usize = 64;
+/// Samples taken from one relay before the next one has its turn, and bytes.
+const BATCH: (usize, usize) = (64, 256 << 10);
+/// After a turn in which most samples took the room of others a relay is left alone for so long: what
+/// its publisher writes over meanwhile nobody has copied in vain. That is longer where they are long,
+/// by so many nanoseconds a byte.
+const REST: (Duration, u64) = (Duration::from_millis(1), 2);
 
 /// A route that the peer asked for.
 pub(super) struct RouteOut {
@@ -116,6 +128,18 @@ struct Shared {
 struct Tap {
     source: Source,
     pending: Option<Sample>,
+    /// Until when it is left alone.
+    rests: Option<Instant>,
+}
+
+/// What came of looking for samples.
+#[derive(Default)]
+struct Moved {
+    /// Some were taken: there may be more.
+    any: bool,
+    queued: u32,
+    /// When a source that rests is to be looked at again.
+    again: Option<Instant>,
 }
 
 struct Active {
@@ -144,11 +168,14 @@ pub(super) async fn run(
         tokio::pin!(room);
         // Registered before the queues are looked at, so that no pop in between is missed.
         room.as_mut().enable();
-        let mut moved = false;
+        let mut moved = Moved::default();
         for (number, active) in &mut routes {
-            moved |= active.move_samples(*number, &shared, &offered);
+            active.move_samples(*number, &shared, &offered, &mut moved);
         }
-        if moved {
+        if moved.queued > 0 {
+            shared.carrier.borrow().protection.demand(moved.queued);
+        }
+        if moved.any {
             // More may wait; let the streams and orders run in between.
             tokio::task::yield_now().await;
             while let Ok(order) = orders.try_recv() {
@@ -163,7 +190,16 @@ pub(super) async fn run(
             },
             changed = beat.changed() => if changed.is_err() { return },
             () = room => {}
+            () = rested(moved.again) => {}
         }
+    }
+}
+
+/// Waits until then; without a time for ever.
+async fn rested(again: Option<Instant>) {
+    match again {
+        Some(again) => tokio::time::sleep_until(again.into()).await,
+        None => std::future::pending().await,
     }
 }
 
@@ -184,7 +220,7 @@ fn apply(order: Order, routes: &mut HashMap<u32, Active>, carrier: &watch::Sende
                     let tap = o.taps.iter_mut().find(|tap| tap.source.is(&source));
                     tap.and_then(|tap| tap.pending.take())
                 });
-                taps.push(Tap { source, pending });
+                taps.push(Tap { source, pending, rests: None });
             }
             let mut seen = route.seen;
             let mut streams = HashMap::new();
@@ -200,29 +236,55 @@ fn apply(order: Order, routes: &mut HashMap<u32, Active>, carrier: &watch::Sende
 }
 
 impl Active {
-    /// Moves what the rings hold into the queues; true when anything moved.
+    /// Moves what the rings hold into the queues.
     fn move_samples(
         &mut self,
         number: u32,
         shared: &Arc<Shared>,
         offered: &impl Fn(Gid) -> Option<Offer>,
-    ) -> bool {
-        let mut moved = false;
+        moved: &mut Moved,
+    ) {
         for index in 0..self.taps.len() {
-            for _ in 0..BATCH {
+            let tap = &mut self.taps[index];
+            if let Some(until) = tap.rests {
+                if until > Instant::now() {
+                    moved.again = moved.again.into_iter().chain([until]).min();
+                    continue;
+                }
+                tap.rests = None;
+            }
+            let (mut samples, mut bytes, mut dropped) = (0, 0, 0);
+            while samples < BATCH.0 && bytes < BATCH.1 {
                 let tap = &mut self.taps[index];
                 let next = tap.pending.take().or_else(|| tap.source.take());
                 let Some(sample) = next else { break };
-                if self.wanted(index, &sample, offered)
-                    && let Some(back) = self.offer(number, index, sample, shared)
-                {
-                    self.taps[index].pending = Some(back);
-                    break;
+                samples += 1;
+                bytes += sample.payload.len();
+                if !self.wanted(index, &sample, offered) {
+                    moved.any = true;
+                    continue;
                 }
-                moved = true;
+                match self.offer(number, index, sample, shared) {
+                    Offered::Queued { dropped: older } => {
+                        dropped += older;
+                        moved.queued += 1;
+                        moved.any = true;
+                    }
+                    Offered::Full(sample) => {
+                        self.taps[index].pending = Some(sample);
+                        break;
+                    }
+                }
+            }
+            // Of BEST_EFFORT little waits, which is gone before such a rest is over, unless the
+            // publisher is far ahead.
+            let whole = samples >= BATCH.0 || bytes >= BATCH.1;
+            let reliable = self.taps[index].source.qos().reliability == Reliability::Reliable;
+            if 2 * dropped >= samples as u64 && dropped > 0 && (whole || reliable) {
+                let rest = REST.0.max(Duration::from_nanos(bytes as u64 * REST.1));
+                self.taps[index].rests = Some(Instant::now() + rest);
             }
         }
-        moved
     }
 
     /// Whether this source is the one that sends the sample, and the peer lacks it.
@@ -255,7 +317,7 @@ impl Active {
         index: usize,
         sample: Sample,
         shared: &Arc<Shared>,
-    ) -> Option<Sample> {
+    ) -> Offered {
         let (publisher, sequence) = (sample.info.publisher, sample.info.sequence);
         let of = sample.client.unwrap_or(publisher);
         let (route, qos) = (self.route, self.taps[index].source.qos());
@@ -268,17 +330,13 @@ impl Active {
             .entry(of)
             .or_insert_with(|| Stream::start(number, route, of, &qos, Arc::clone(shared)));
         let offered = lock(&stream.queue).offer(sample);
-        match offered {
-            Offered::Full(sample) => Some(sample),
-            Offered::Queued { dropped } => {
-                if route.kind == Kind::Request {
-                    self.seen.insert(publisher, sequence);
-                }
-                shared.counters.dropped("queue", dropped);
-                shared.carrier.borrow().protection.demand(1);
-                stream.filled.notify_one();
-                None
+        if let Offered::Queued { dropped } = offered {
+            if route.kind == Kind::Request {
+                self.seen.insert(publisher, sequence);
             }
+            shared.counters.dropped("queue", dropped);
+            stream.filled.notify_one();
         }
+        offered
     }
 }
