@@ -2,7 +2,8 @@
 //! input.
 //!
 //! `publish TOPIC SIZES READERS COUNT`: waits for as many readers, then publishes; with a count of
-//! `stream` until the first line on standard input. `subscribe TOPIC SIZES`: takes, and compares.
+//! `stream` until the first line on standard input, one a millisecond, and with one of `flood` as fast
+//! as it may. `subscribe TOPIC SIZES`: takes, and compares.
 //! `serve SERVICE COUNT`: answers as many requests with their bytes reversed, and takes one more.
 //! `ask SERVICE COUNT`: sends as many requests, and takes no response. `alive TOPIC`: a publisher that
 //! has a lease of half a second, and publishes nothing.
@@ -35,7 +36,9 @@ fn main() -> Result<(), Box<dyn Error>> {
     let stdin = bytes_of_stdin();
     match arguments[..] {
         ["publish", topic, sizes, readers, count] => {
-            publish(&session, &stdin, topic, sizes.parse()?, readers.parse()?, count.parse().ok())
+            let pace = if count == "stream" { PACE } else { Duration::ZERO };
+            let count = count.parse().ok();
+            publish(&session, &stdin, topic, sizes.parse()?, readers.parse()?, count, pace)
         }
         ["subscribe", topic, sizes] => subscribe(&session, &stdin, topic, sizes.parse()?),
         ["serve", service, count] => serve(&session, &stdin, service, count.parse()?),
@@ -68,6 +71,7 @@ fn publish(
     sizes: Sizes,
     readers: usize,
     count: Option<u64>,
+    pace: Duration,
 ) -> Result<(), Box<dyn Error>> {
     let publisher = session.create_publisher(spec(topic))?;
     if !publisher.wait_matched(readers, PATIENCE) {
@@ -87,8 +91,8 @@ fn publish(
             }
         }
         sent += 1;
-        if count.is_none() {
-            thread::sleep(PACE);
+        if !pace.is_zero() {
+            thread::sleep(pace);
         }
         if reported.elapsed() >= REPORT {
             reported = Instant::now();

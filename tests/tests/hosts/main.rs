@@ -6,6 +6,7 @@ mod election;
 mod events;
 mod hostile;
 mod identity;
+mod load;
 mod mismatch;
 mod mode;
 mod pair;

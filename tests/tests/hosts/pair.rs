@@ -195,6 +195,11 @@ impl Host {
         self.node(&["publish", TOPIC, sizes.name(), &readers, &count])
     }
 
+    /// A publisher that waits for as many readers and then streams as fast as they let it.
+    pub(crate) fn flood(&self, sizes: Sizes, readers: usize) -> Node {
+        self.node(&["publish", TOPIC, sizes.name(), &readers.to_string(), "flood"])
+    }
+
     /// A subscriber, once it is there.
     pub(crate) fn subscribe(&self, sizes: Sizes) -> Node {
         let mut node = self.node(&["subscribe", TOPIC, sizes.name()]);

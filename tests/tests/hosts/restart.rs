@@ -8,7 +8,7 @@ use axon_transport::daemon::status::Status;
 use super::{
     mode::{Kmes, Settings, classic},
     pair::{self, Host, Plan},
-    process::until,
+    process::{Node, until},
 };
 
 /// Enough to be in the middle of the stream.
@@ -33,10 +33,19 @@ impl Host {
 
 /// Kills the daemon of host `victim` while samples flow from A to A and B.
 fn kill(settings: [Settings; 2], victim: usize, kmes: Option<&Kmes>) {
+    kill_while(|host| host.publish(Sizes::Small, 2, None), settings, victim, kmes);
+}
+
+fn kill_while(
+    publish: impl Fn(&Host) -> Node,
+    settings: [Settings; 2],
+    victim: usize,
+    kmes: Option<&Kmes>,
+) {
     let mut hosts = Plan { grace_s: 5, ..Plan::new(settings) }.start();
     let mut there = hosts[1].subscribe(Sizes::Small);
     let mut here = hosts[0].subscribe(Sizes::Small);
-    let mut publisher = hosts[0].publish(Sizes::Small, 2, None);
+    let mut publisher = publish(&hosts[0]);
     there.wait_taken(SOME);
     let old = [0, 1].map(|host| hosts[host].link());
     let keys = kmes.map(Kmes::keys);
@@ -97,6 +106,13 @@ fn of_the_publisher_in_classic() {
 #[test]
 fn of_the_subscriber_in_classic() {
     kill([classic(&[]), classic(&[])], 1, None);
+}
+
+/// The link is cut in the middle of what is written together.
+#[test]
+fn in_the_middle_of_a_flood() {
+    let flood = |host: &Host| host.flood(Sizes::Small, 2);
+    kill_while(flood, [classic(&[]), classic(&[])], 1, None);
 }
 
 fn kill_qkd(victim: usize, key_mode: &str) {

@@ -1,0 +1,92 @@
+//! More than gets through: what waits for whom, and that the newest arrives.
+
+use std::thread;
+
+use axon_transport::{
+    qos::Qos,
+    session::{EndpointSpec, Publisher, Subscription},
+    shm::PublishError,
+};
+
+use super::{
+    mode::classic,
+    pair::{Host, Plan},
+    process::PATIENCE,
+};
+
+fn hosts() -> [Host; 2] {
+    Plan::new([classic(&[]), classic(&[])]).start()
+}
+
+/// A publisher on the first host and a subscription on the second that have met.
+fn across(hosts: &[Host; 2], topic: &str, qos: Qos) -> (Publisher, Subscription) {
+    let (here, there) = (hosts[0].session("publisher"), hosts[1].session("subscription"));
+    let spec = || EndpointSpec::new(topic, "test/Bytes", qos);
+    let subscription = there.create_subscription(spec()).unwrap();
+    let publisher = here.create_publisher(spec()).unwrap();
+    assert!(publisher.wait_matched(1, PATIENCE) && subscription.wait_matched(1, PATIENCE));
+    (publisher, subscription)
+}
+
+fn take(subscription: &Subscription, bytes: &mut Vec<u8>) -> u64 {
+    subscription.recv(bytes, Some(PATIENCE)).expect("a sample").sequence
+}
+
+#[test]
+fn a_flood_that_overtakes_its_reader_arrives_in_order_with_its_end() {
+    const SAMPLES: u64 = 100_000;
+    let hosts = hosts();
+    let (publisher, subscription) = across(&hosts, "/flood", Qos::default());
+    let reader = thread::spawn(move || {
+        let (mut bytes, mut taken, mut last) = (Vec::new(), 0, 0);
+        while last < SAMPLES {
+            let sequence = take(&subscription, &mut bytes);
+            assert!(sequence > last, "{sequence} after {last}");
+            assert_eq!((bytes.len(), &bytes[..8]), (1024, &sequence.to_ne_bytes()[..]));
+            (taken, last) = (taken + 1, sequence);
+        }
+        (taken, subscription.lost())
+    });
+    let mut bytes = [0x5a; 1024];
+    for number in 1..=SAMPLES {
+        bytes[..8].copy_from_slice(&number.to_ne_bytes());
+        assert_eq!(publisher.publish(&bytes).unwrap(), number);
+    }
+    let (taken, lost) = reader.join().unwrap();
+    // What it passes over for the depth, or before the first that it takes, is none of its losses.
+    assert!(taken + lost <= SAMPLES, "{taken} taken, {lost} lost");
+}
+
+#[test]
+fn a_topic_that_nobody_reads_holds_up_its_own_publisher_alone() {
+    const TINY: u64 = 2_000;
+    let hosts = hosts();
+    let (huge, unread) = across(&hosts, "/huge", Qos::keep_all());
+    let (tiny, read) = across(&hosts, "/tiny", Qos::keep_all());
+    let large = vec![0x5a; 1 << 20];
+    let mut sent = 0;
+    loop {
+        match huge.publish(&large) {
+            Ok(sequence) => sent = sequence,
+            Err(PublishError::Blocked { .. }) => break,
+            Err(error) => panic!("{error}"),
+        }
+    }
+    let mut bytes = Vec::new();
+    let reader = thread::spawn(move || {
+        for number in 1..=TINY {
+            assert_eq!((take(&read, &mut bytes), &bytes[..]), (number, &number.to_ne_bytes()[..]));
+        }
+    });
+    for number in 1..=TINY {
+        while let Err(error) = tiny.publish(&number.to_ne_bytes()) {
+            assert!(matches!(error, PublishError::Blocked { .. }), "{error}");
+        }
+    }
+    reader.join().unwrap();
+    // What was held up is all there.
+    let mut bytes = Vec::new();
+    for number in 1..=sent {
+        assert_eq!((take(&unread, &mut bytes), bytes.len()), (number, large.len()));
+    }
+}
