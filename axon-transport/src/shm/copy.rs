@@ -58,13 +58,10 @@ fn copy(words: &[AtomicU64], at: usize, out: &mut [MaybeUninit<u8>]) {
     if out.len() >= BULK {
         let from = words.as_ptr().cast::<u8>().wrapping_add(at);
         let (lines, rest) = out.split_at_mut(if out.len() > CACHED { out.len() & !63 } else { 0 });
-        // SAFETY: the words hold as many bytes from `at` on, as was just checked, and the rest begins
-        // where the lines end.
-        unsafe {
-            copy_lines(from, lines);
-            copy_bulk(from.wrapping_add(lines.len()), rest);
-        }
-        return;
+        // SAFETY: the words hold as many bytes from `at` on, as was just checked.
+        unsafe { copy_lines(from, lines) };
+        // SAFETY: as above; the rest begins where the lines end.
+        return unsafe { copy_bulk(from.wrapping_add(lines.len()), rest) };
     }
     copy_words(words, at, out);
 }
