@@ -278,6 +278,36 @@ fn new_samples_are_told_of_each_once_and_those_that_wait_at_once() {
 }
 
 #[test]
+fn a_callback_that_replaces_another_is_not_told_what_that_one_was() {
+    let session = alone();
+    let (publisher, subscription) = pair(&session, "/t");
+    let (sender, told) = std::sync::mpsc::channel();
+    let set = |name: &'static str| {
+        let sender = sender.clone();
+        let tell = move |new| sender.send((name, new)).unwrap();
+        subscription.set_on_new_sample(Some(Arc::new(tell))).unwrap();
+    };
+    let publish = || drop(publisher.publish(b"x").unwrap());
+    set("first");
+    publish();
+    assert_eq!(told.recv_timeout(PATIENCE), Ok(("first", 1)));
+    set("second");
+    publish();
+    assert_eq!(told.recv_timeout(PATIENCE), Ok(("second", 1)));
+    subscription.set_on_new_sample(None).unwrap();
+    (0..3).for_each(|_| publish());
+    set("third");
+    assert_eq!(told.recv_timeout(PATIENCE), Ok(("third", 3)));
+    // None that is taken already, though nobody was told of it.
+    subscription.set_on_new_sample(None).unwrap();
+    publish();
+    while subscription.take(&mut Vec::new()).is_some() {}
+    set("fourth");
+    publish();
+    assert_eq!(told.recv_timeout(PATIENCE), Ok(("fourth", 1)));
+}
+
+#[test]
 fn an_event_loop_and_callbacks_do_not_listen_at_once() {
     let session = alone();
     let (_publisher, subscription) = pair(&session, "/t");

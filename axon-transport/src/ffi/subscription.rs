@@ -205,8 +205,8 @@ pub unsafe extern "C" fn axon_session_subscription_lost(
 
 /// Has `callback` told of new samples from now on, in place of the one before, which has returned and
 /// is not called any more when this returns, unless this is called from within it. Null: nobody is
-/// told. What is there to be taken it is told at once, in this call; the rest on the session's
-/// thread.
+/// told. What is there to be taken, and nobody was told of, it is told at once, in this call; the rest on
+/// the session's thread.
 ///
 /// AXON_RET_ERROR: an event loop of the program's listens already.
 ///

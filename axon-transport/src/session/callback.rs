@@ -55,11 +55,11 @@ impl Callback {
     /// Has `function` told from now on, and at once of what nobody was told. The one before is not
     /// called any more once this returns, but by the calling thread that is in it.
     pub(super) fn set(&self, function: Option<OnNew>) {
-        self.replace(function, None);
+        self.replace(function, |untold| untold);
     }
 
-    /// As [`set`](Self::set), where it is now known how often it happened that nobody was told.
-    pub(super) fn replace(&self, function: Option<OnNew>, untold: Option<u64>) {
+    /// As [`set`](Self::set), where `recount` says of how often it happened untold what that is now.
+    pub(super) fn replace(&self, function: Option<OnNew>, recount: impl FnOnce(u64) -> u64) {
         let me = thread::current().id();
         let mut state = self.lock();
         let before = std::mem::replace(&mut state.function, function);
@@ -68,7 +68,7 @@ impl Callback {
         while state.running.iter().any(|(thread, of)| *thread != me && *of < version) {
             state = self.idle.wait(state).unwrap_or_else(PoisonError::into_inner);
         }
-        state.untold = untold.unwrap_or(state.untold);
+        state.untold = recount(state.untold);
         drop(state);
         drop(before);
         self.tell();

@@ -89,12 +89,12 @@ impl SubscriptionInner {
         };
         *listens = there;
         drop(listens);
-        let untold = {
+        let (new, unread) = {
             let mut slots = self.lock();
-            slots.new_arrivals();
-            slots.unread(&self.qos)
+            (slots.new_arrivals(), slots.unread(&self.qos))
         };
-        self.arrived.replace(callback, Some(untold));
+        // Of those that nobody was told of some may have been taken, or lost.
+        self.arrived.replace(callback, |untold| (untold + new).min(unread));
         Ok(())
     }
 

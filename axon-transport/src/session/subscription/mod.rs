@@ -111,9 +111,9 @@ impl Subscription {
     }
 
     /// Has `callback` told of new samples from now on, in place of the one before, which is not
-    /// called any more once this returns. Those that are there to be taken it is told at once, on
-    /// this thread; others as they come, on the control thread. It must neither block nor panic, nor
-    /// hold the session.
+    /// called any more once this returns. Those that are there to be taken, and that nobody was told of, it is
+    /// told at once, on this thread; others as they come, on the control thread. It must neither block nor
+    /// panic, nor hold the session.
     ///
     /// # Errors
     /// In a forked child, or when an event loop of the program's listens already
