@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
 #include <algorithm>
+#include <thread>
 #include <vector>
 
 #include "axon.h"
@@ -156,6 +157,11 @@ rmw_ret_t rmw_wait(
       const axon_ret_t waited =
       axon_session_wait(set.context->impl->session, &wait, rmw_axon::timeout(wait_timeout));
       if (waited == AXON_RET_TIMEOUT) {
+        // rclcpp's multi-threaded executor looks again and again, with no timeout, while a timer is due whose
+        // group is busy: the thread that is to make it free may have lost its processor to this one.
+        if (wait_timeout != nullptr && wait_timeout->sec == 0 && wait_timeout->nsec == 0) {
+          std::this_thread::yield();
+        }
         rmw_axon::clear(of_subscriptions.at, of_subscriptions.count);
         rmw_axon::clear(of_guards.at, of_guards.count);
         rmw_axon::clear(of_services.at, of_services.count);
