@@ -144,7 +144,11 @@ rmw_ret_t infos(
       if (Of::check_zero(out) != RMW_RET_OK) {
         throw Failure(RMW_RET_INVALID_ARGUMENT, "the array of infos is not zero-initialised");
       }
-      const auto found = endpoints(of, kind, no_mangle ? name : topic_name(name, false));
+      // Nothing has a name that is none, for which rmw.h knows no error.
+      std::vector<EndpointInfo> found;
+      if (no_mangle || is_ros_name(name)) {
+        found = endpoints(of, kind, name);
+      }
       if (found.empty()) {
         return;
       }
