@@ -287,7 +287,9 @@ fn a_callback_that_replaces_another_is_not_told_what_that_one_was() {
         let tell = move |new| sender.send((name, new)).unwrap();
         subscription.set_on_new_sample(Some(Arc::new(tell))).unwrap();
     };
-    let publish = || drop(publisher.publish(b"x").unwrap());
+    let publish = || {
+        publisher.publish(b"x").unwrap();
+    };
     set("first");
     publish();
     assert_eq!(told.recv_timeout(PATIENCE), Ok(("first", 1)));
