@@ -65,8 +65,7 @@ impl Medium for Axon {
             sleeps: load.wake.sleeps(),
             loans,
             copies: !in_place || load.motion == Motion::Copy,
-            out: vec![0x5a; load.size],
-            into: Vec::with_capacity(load.size),
+            bytes: vec![0x5a; load.size],
         }))
     }
 }
@@ -85,8 +84,8 @@ struct AxonEnd {
     sleeps: bool,
     loans: bool,
     copies: bool,
-    out: Vec<u8>,
-    into: Vec<u8>,
+    /// What is sent, and what is received: one buffer, as the raw limit and other media have.
+    bytes: Vec<u8>,
 }
 
 impl End for AxonEnd {
@@ -96,8 +95,8 @@ impl End for AxonEnd {
             stamp(&mut loan, number);
             loan.publish_now()?;
         } else {
-            stamp(&mut self.out, number);
-            self.publisher.publish(&self.out)?;
+            stamp(&mut self.bytes, number);
+            self.publisher.publish(&self.bytes)?;
         }
         Ok(())
     }
@@ -108,8 +107,8 @@ impl End for AxonEnd {
                 self.context.wait(|| self.subscriber.has_data(), LONGEST_SLEEP);
             }
             if self.copies {
-                if self.subscriber.take_into(&mut self.into)?.is_some() {
-                    let [first, last] = [self.into.first_chunk(), self.into.last_chunk()];
+                if self.subscriber.take_into(&mut self.bytes)?.is_some() {
+                    let [first, last] = [self.bytes.first_chunk(), self.bytes.last_chunk()];
                     return agree(*first.ok_or("too short")?, *last.ok_or("too short")?);
                 }
             } else if let Some(sample) = self.subscriber.take()? {

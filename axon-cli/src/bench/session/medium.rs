@@ -80,8 +80,7 @@ impl Medium for Sessions {
             sleeps: load.wake.sleeps(),
             loans,
             copies: !(loans || load.size > COPIED) || load.motion == Motion::Copy,
-            out: vec![0x5a; load.size],
-            into: Vec::with_capacity(load.size),
+            bytes: vec![0x5a; load.size],
         }))
     }
 }
@@ -94,8 +93,7 @@ struct SessionEnd {
     sleeps: bool,
     loans: bool,
     copies: bool,
-    out: Vec<u8>,
-    into: Vec<u8>,
+    bytes: Vec<u8>,
 }
 
 impl End for SessionEnd {
@@ -105,8 +103,8 @@ impl End for SessionEnd {
             stamp(&mut loan, number);
             loan.publish()?;
         } else {
-            stamp(&mut self.out, number);
-            self.publisher.publish(&self.out)?;
+            stamp(&mut self.bytes, number);
+            self.publisher.publish(&self.bytes)?;
         }
         Ok(())
     }
@@ -118,8 +116,8 @@ impl End for SessionEnd {
                 self.session.wait_for(&[subscription], LONGEST_SLEEP)?;
             }
             if self.copies {
-                if self.subscription.take(&mut self.into).is_some() {
-                    return numbered(&self.into);
+                if self.subscription.take(&mut self.bytes).is_some() {
+                    return numbered(&self.bytes);
                 }
             } else if let Some((_, sample)) = self.subscription.take_sample() {
                 let [mut first, mut last] = [[0; 8]; 2];
