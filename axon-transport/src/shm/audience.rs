@@ -63,9 +63,9 @@ impl Attached {
         }
     }
 
-    /// The same within what it may say.
+    /// The same within what it may say, and up to `head`: which may be one of before it was attached.
     fn cursor(&self, head: u64) -> Option<u64> {
-        self.position().map(|cursor| cursor.clamp(self.grant.first, head))
+        self.position().map(|cursor| cursor.max(self.grant.first).min(head))
     }
 }
 

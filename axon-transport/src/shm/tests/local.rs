@@ -435,3 +435,26 @@ fn a_ring_reaches_the_one_of_several_waiting_threads_that_it_is_for() {
         }
     });
 }
+
+#[test]
+fn one_who_carries_samples_on_from_later_has_none_of_those_before_to_hand_over() {
+    let a = session();
+    let writer = writer(&a, keep_last(10), 1 << 20);
+    let _reader = attach(&writer, &a, &a, keep_last(10));
+    for sequence in 1..=3 {
+        writer.publish(meta(sequence), b"before").unwrap();
+    }
+    let lane = a.allocate_lane().unwrap();
+    let gid = Gid::new(a.id(), 99);
+    let info = ReaderInfo {
+        gid,
+        lane: lane.location(),
+        qos: keep_last(10),
+        peer: Peer::Local(a.clone()),
+        stands_for: vec![gid],
+    };
+    assert_eq!(writer.attach(info).unwrap().first, 3);
+    // Somebody has waited since the first of the three.
+    let handed_over = |published| writer.lock().audience.handed_over(published);
+    assert_eq!([1, 3, 4].map(handed_over), [1, 3, 3]);
+}
