@@ -24,7 +24,7 @@ use crate::{
     session::{Session, SessionEvent, SessionOptions, SessionRole},
 };
 
-/// Worker threads: one that carries samples may be deep in an AEAD while another answers.
+/// Worker threads at most: one that carries samples may be deep in an AEAD while another answers.
 const WORKERS: usize = 2;
 /// Between two looks at the files of the identity: a change is in force within a second.
 const LOOK: Duration = Duration::from_millis(250);
@@ -36,11 +36,17 @@ const LOOK: Duration = Duration::from_millis(250);
 /// dropped.
 pub fn run(parts: GatewayParts) -> Result<(), GatewayError> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(WORKERS)
+        .worker_threads(workers())
         .thread_name("axon-gw")
         .enable_all()
         .build()?;
     runtime.block_on(serve(parts))
+}
+
+/// Of two processors a second worker would take the one that the applications have.
+fn workers() -> usize {
+    let processors = std::thread::available_parallelism().map_or(1, usize::from);
+    (processors / 2).clamp(1, WORKERS)
 }
 
 async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
