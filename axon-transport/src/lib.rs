@@ -12,6 +12,7 @@ pub mod ids;
 pub mod keys;
 pub mod link;
 pub mod passed;
+mod process;
 pub mod qos;
 pub mod relay;
 pub mod session;

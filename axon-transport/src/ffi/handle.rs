@@ -1,12 +1,6 @@
 //! The kinds of handles, and what each of them names.
 
-use std::{
-    ptr,
-    sync::{
-        Arc,
-        atomic::{AtomicPtr, Ordering},
-    },
-};
+use std::sync::Arc;
 
 use super::{
     error::{AXON_RET_BAD_ALLOC, AXON_RET_FORKED, AXON_RET_INVALID_HANDLE, Failure, axon_ret_t},
@@ -16,6 +10,7 @@ use super::{
     table::{Process, Table, Unknown},
 };
 use crate::{
+    process::{Made, PerProcess},
     session::{Client, GuardCondition, Node, Publisher, Server, Session, Subscription},
     shm::{ForkToken, Sample},
 };
@@ -114,17 +109,14 @@ macro_rules! handles {
     ($($number:literal $table:ident: $handle:ident => $object:ty, $what:literal;)+) => {
         /// What the handles of a process name.
         pub(super) struct Tables {
-            token: ForkToken,
-            /// Those of the process that it was forked from. Their locks may be held for ever.
-            before: Option<&'static Tables>,
             process: Process,
             $($table: Table<$object>,)+
         }
 
         impl Tables {
-            fn new(token: ForkToken, before: Option<&'static Tables>) -> Self {
+            fn new(token: ForkToken) -> Self {
                 let process = Process::new(token.value());
-                Self { token, before, process, $($table: Table::new($number, process),)+ }
+                Self { process, $($table: Table::new($number, process),)+ }
             }
         }
 
@@ -168,52 +160,18 @@ handles! {
     10 loans: axon_loan_t => NamedLoan, "loan";
 }
 
-const _: () = {
-    const fn shared_by_threads<T: Send + Sync>() {}
-    shared_by_threads::<Tables>();
-};
+static TABLES: PerProcess<Tables> = PerProcess::new();
 
-/// This process's, or those of one that it is a fork of.
-static CURRENT: AtomicPtr<Tables> = AtomicPtr::new(ptr::null_mut());
-
-impl Tables {
-    /// This process's. A forked child begins with new ones.
-    fn current() -> Result<&'static Self, Failure> {
-        loop {
-            let before = Self::latest();
-            if let Some(tables) = before.filter(|tables| !tables.token.is_forked()) {
-                return Ok(tables);
-            }
-            let token =
-                ForkToken::current().map_err(|error| Failure::new(AXON_RET_BAD_ALLOC, error))?;
-            let tables = Box::into_raw(Box::new(Self::new(token, before)));
-            let seen = before.map_or(ptr::null_mut(), |tables| ptr::from_ref(tables).cast_mut());
-            // Release pairs with the acquire of `latest`: whoever sees them sees them whole.
-            let (made, other) = (Ordering::AcqRel, Ordering::Acquire);
-            if CURRENT.compare_exchange(seen, tables, made, other).is_err() {
-                // SAFETY: made by `into_raw` above, and nobody else has seen it.
-                drop(unsafe { Box::from_raw(tables) });
-            }
-        }
-    }
-
-    /// Whether this process is a fork of that one, as far as handles can tell.
-    fn descends_from(&self, process: Process) -> bool {
-        let ancestors = std::iter::successors(self.before, |tables| tables.before);
-        ancestors.into_iter().any(|tables| tables.process == process)
-    }
-
-    /// The last that were made, in this process or in one that it is a fork of.
-    fn latest() -> Option<&'static Self> {
-        // SAFETY: null, or made by `Box::into_raw` and never freed once it is in `CURRENT`.
-        unsafe { CURRENT.load(Ordering::Acquire).as_ref() }
-    }
+/// This process's tables. A forked child begins with new ones.
+fn current() -> Result<&'static Made<Tables>, Failure> {
+    let none = |_: &'static Tables, _: &'static Tables| {};
+    TABLES.get(Tables::new, none).map_err(|error| Failure::new(AXON_RET_BAD_ALLOC, error))
 }
 
 /// What a handle names.
 pub(super) fn named<H: Handle>(handle: H) -> Result<Arc<H::Object>, Failure> {
-    let tables = Tables::current()?;
-    H::table(tables).get(handle.id()).map_err(|why| tables.unknown(handle, why))
+    let tables = current()?;
+    H::table(tables.value()).get(handle.id()).map_err(|why| unknown(tables, handle, why))
 }
 
 /// A handle for something new, stored at `out`.
@@ -221,7 +179,7 @@ pub(super) fn named<H: Handle>(handle: H) -> Result<Arc<H::Object>, Failure> {
 /// # Safety
 /// As [`store`].
 pub(super) unsafe fn give<H: Handle>(object: H::Object, out: *mut H) -> Result<(), Failure> {
-    let id = H::table(Tables::current()?).insert(object).ok_or_else(|| {
+    let id = H::table(current()?.value()).insert(object).ok_or_else(|| {
         let what = H::WHAT;
         Failure::new(AXON_RET_BAD_ALLOC, format_args!("no {what} more: there are a million"))
     })?;
@@ -231,8 +189,8 @@ pub(super) unsafe fn give<H: Handle>(object: H::Object, out: *mut H) -> Result<(
 
 /// Gives a handle up: what it named ends when no call uses it any more.
 pub(super) fn revoke<H: Handle>(handle: H) -> Result<Arc<H::Object>, Failure> {
-    let tables = Tables::current()?;
-    H::table(tables).remove(handle.id()).map_err(|why| tables.unknown(handle, why))
+    let tables = current()?;
+    H::table(tables.value()).remove(handle.id()).map_err(|why| unknown(tables, handle, why))
 }
 
 /// Does something with what a handle names, as a signal handler may: see [`Table::visit`].
@@ -240,38 +198,38 @@ pub(super) fn visit<H: Handle>(
     handle: H,
     visit: impl FnOnce(&H::Object),
 ) -> Result<(), axon_ret_t> {
-    let Some(tables) = Tables::latest() else { return Err(AXON_RET_INVALID_HANDLE) };
-    if tables.token.is_forked() {
+    let Some(tables) = TABLES.latest() else { return Err(AXON_RET_INVALID_HANDLE) };
+    if tables.is_forked() {
         return Err(AXON_RET_FORKED);
     }
-    H::table(tables).visit(handle.id(), visit).map_err(|why| tables.code(why))
+    H::table(tables.value()).visit(handle.id(), visit).map_err(|why| code(tables, why))
 }
 
-impl Tables {
-    fn code(&self, why: Unknown) -> axon_ret_t {
-        match why {
-            Unknown::Foreign(process) if self.descends_from(process) => AXON_RET_FORKED,
-            _ => AXON_RET_INVALID_HANDLE,
+fn code(tables: &Made<Tables>, why: Unknown) -> axon_ret_t {
+    match why {
+        Unknown::Foreign(process) if tables.ancestors().any(|a| a.process == process) => {
+            AXON_RET_FORKED
         }
+        _ => AXON_RET_INVALID_HANDLE,
     }
+}
 
-    fn unknown<H: Handle>(&self, handle: H, why: Unknown) -> Failure {
-        let (id, what) = (handle.id(), H::WHAT);
-        let code = self.code(why);
-        let text = match why {
-            Unknown::Null => format!("the handle of the {what} is 0"),
-            Unknown::OtherKind(kind) => {
-                let other = self::what(kind);
-                format!("the handle {id:#x} names a {other} where a {what} is expected")
-            }
-            Unknown::Foreign(_) if code == AXON_RET_FORKED => format!(
-                "the {what} belongs to the process of which this one is a fork: \
-                 open a session here"
-            ),
-            Unknown::Foreign(_) | Unknown::Gone => {
-                format!("the handle {id:#x} names no {what}: it was destroyed")
-            }
-        };
-        Failure::new(code, text)
-    }
+fn unknown<H: Handle>(tables: &Made<Tables>, handle: H, why: Unknown) -> Failure {
+    let (id, what) = (handle.id(), H::WHAT);
+    let code = code(tables, why);
+    let text = match why {
+        Unknown::Null => format!("the handle of the {what} is 0"),
+        Unknown::OtherKind(kind) => {
+            let other = self::what(kind);
+            format!("the handle {id:#x} names a {other} where a {what} is expected")
+        }
+        Unknown::Foreign(_) if code == AXON_RET_FORKED => format!(
+            "the {what} belongs to the process of which this one is a fork: \
+             open a session here"
+        ),
+        Unknown::Foreign(_) | Unknown::Gone => {
+            format!("the handle {id:#x} names no {what}: it was destroyed")
+        }
+    };
+    Failure::new(code, text)
 }

@@ -7,7 +7,7 @@ use std::{
     fmt::{Debug, Write as _},
     os::raw::c_char,
     sync::{
-        PoisonError, RwLock,
+        Condvar, Mutex, MutexGuard, PoisonError,
         atomic::{AtomicU32, Ordering},
     },
 };
@@ -19,10 +19,15 @@ use tracing::{
     subscriber::{Interest, set_global_default},
 };
 
+use self::queue::Waiting;
 use super::{
     callback::User,
-    error::{AXON_RET_ERROR, Failure, axon_ret_t},
+    error::{AXON_RET_BAD_ALLOC, AXON_RET_ERROR, Failure, axon_ret_t},
     guarded,
+};
+use crate::{
+    process::{Made, PerProcess},
+    shm::ShmError,
 };
 
 /// What helps to find a fault.
@@ -48,16 +53,40 @@ pub type axon_log_t = Option<
     ),
 >;
 
-/// Who is told, and with what.
-type Told = (unsafe extern "C" fn(*const c_void, u32, *const c_char, *const c_char), User);
+/// The log of a process. A forked child has one of its own: nobody is told there at first, and what was
+/// said before it was forked its parent tells.
+#[derive(Default)]
+struct Log {
+    waiting: Waiting,
+    ear: Mutex<Ear>,
+    /// A call has returned.
+    returned: Condvar,
+}
 
-static TOLD: RwLock<Option<Told>> = RwLock::new(None);
+/// Who is told.
+#[derive(Default)]
+struct Ear {
+    told: Option<Told>,
+    /// Rises with each that is set.
+    version: u64,
+    /// The version that is being called.
+    called: Option<u64>,
+}
+
+#[derive(Clone, Copy)]
+struct Told {
+    function: unsafe extern "C" fn(*const c_void, u32, *const c_char, *const c_char),
+    user: User,
+}
+
+static LOG: PerProcess<Log> = PerProcess::new();
 /// Guards nothing but itself: its loads and stores are relaxed.
 static LEAST: AtomicU32 = AtomicU32::new(AXON_LOG_WARN);
 
 /// Has `callback` told of what the library says in this process, in place of the one before, which has
-/// returned and is not called any more when this returns. Null: nobody is told, as at first. A daemon
-/// has a log of its own. A forked child says it again for what it says itself.
+/// returned and is not called any more when this returns; it blocks until then. To set the one that is
+/// set already with the same `user` changes nothing, and does not block. Null: nobody is told, as at
+/// first. A daemon has a log of its own. A forked child says it again for what it says itself.
 ///
 /// AXON_RET_ERROR: it is called from within a callback, or a part of the program in Rust has what the
 /// library says already (a global `tracing` subscriber).
@@ -73,12 +102,12 @@ pub unsafe extern "C" fn axon_session_log_set_callback(
         if queue::is_teller() {
             return Err(Failure::new(AXON_RET_ERROR, "called from within a log callback"));
         }
-        let mut told = TOLD.write().unwrap_or_else(PoisonError::into_inner);
+        let log = Log::current().map_err(|error| Failure::new(AXON_RET_BAD_ALLOC, error))?;
         if callback.is_some() && !Listener::stands() {
             let text = "another part of the program has a global subscriber of tracing";
             return Err(Failure::new(AXON_RET_ERROR, text));
         }
-        *told = callback.map(|function| (function, User(user)));
+        log.set(callback.map(|function| Told { function, user: User(user) }));
         Ok(())
     })
 }
@@ -113,19 +142,51 @@ struct Line {
     text: String,
 }
 
-impl Line {
-    /// Calls the program, if it still wants to hear of this.
-    fn tell(self) {
-        let told = TOLD.read().unwrap_or_else(PoisonError::into_inner);
-        let Some((function, User(user))) = *told else { return };
-        if !is_wanted(self.severity) {
+impl Told {
+    fn is(&self, other: &Self) -> bool {
+        std::ptr::fn_addr_eq(self.function, other.function) && self.user.0 == other.user.0
+    }
+}
+
+impl Log {
+    fn current() -> Result<&'static Self, ShmError> {
+        LOG.get(|_| Self::default(), |_, _| {}).map(Made::value)
+    }
+
+    fn set(&self, told: Option<Told>) {
+        let mut ear = self.ear();
+        let same = match (&ear.told, &told) {
+            (Some(one), Some(other)) => one.is(other),
+            _ => false,
+        };
+        if same {
             return;
         }
+        ear.told = told;
+        ear.version += 1;
+        let version = ear.version;
+        while ear.called.is_some_and(|called| called < version) {
+            ear = self.returned.wait(ear).unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+
+    /// Calls the program, if it still wants to hear of this. No lock is held meanwhile.
+    fn tell(&self, line: &Line) {
+        let mut ear = self.ear();
+        let Some(told) = ear.told.filter(|_| is_wanted(line.severity)) else { return };
+        ear.called = Some(ear.version);
+        drop(ear);
         let text = |text: &str| CString::new(text.replace('\0', " ")).unwrap_or_default();
-        let (part, text) = (text(self.part), text(&self.text));
-        // SAFETY: whoever set it says that it may be called so until it is replaced, for which the
-        // lock would be needed.
-        unsafe { function(user, self.severity, part.as_ptr(), text.as_ptr()) };
+        let (part, text) = (text(line.part), text(&line.text));
+        // SAFETY: whoever set it says that it may be called so until it is replaced, and `set` does not
+        // return before this call has.
+        unsafe { (told.function)(told.user.0, line.severity, part.as_ptr(), text.as_ptr()) };
+        self.ear().called = None;
+        self.returned.notify_all();
+    }
+
+    fn ear(&self) -> MutexGuard<'_, Ear> {
+        self.ear.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -154,11 +215,14 @@ impl Subscriber for Listener {
         let metadata = event.metadata();
         let mut text = Text::default();
         event.record(&mut text);
-        queue::say(Line {
+        let line = Line {
             severity: severity(metadata.level()),
             part: metadata.target(),
             text: text.message + &text.values,
-        });
+        };
+        // Without memory to find it by there is no log.
+        let Ok(log) = Log::current() else { return };
+        log.waiting.say(line, |line| log.tell(&line));
     }
 
     // Spans are not shown: there is one of them, and it is not entered.

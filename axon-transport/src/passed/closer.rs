@@ -1,19 +1,17 @@
 //! Threads on which descriptors of others are closed.
 
-#![allow(unsafe_code)]
-
 use std::{
     os::fd::{AsFd, OwnedFd},
-    sync::{
-        Condvar, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicPtr, Ordering},
-    },
+    sync::{Condvar, Mutex, MutexGuard, PoisonError},
     thread,
 };
 
 use rustix::net::{AddressFamily, sockopt};
 
-use crate::session::signals;
+use crate::{
+    process::{Made, PerProcess},
+    session::signals,
+};
 
 /// Whose threads close a descriptor. None waits for what another's wait for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -33,12 +31,17 @@ const MANY: [usize; 3] = [usize::MAX, 1024, 256];
 
 impl Lane {
     pub(super) fn close(self, fd: OwnedFd) {
-        current().crews[self as usize].close(fd);
+        match current() {
+            Some(closer) => closer.crews[self as usize].close(fd),
+            // That it may block here is better than to keep it for ever.
+            None => drop(fd),
+        }
     }
 
     /// Whether so many wait that no more should be taken in.
     pub(super) fn is_full(self) -> bool {
-        current().crews[self as usize].lock().waiting.len() >= MANY[self as usize]
+        let waiting = |closer: &Closer| closer.crews[self as usize].lock().waiting.len();
+        current().is_some_and(|closer| waiting(closer) >= MANY[self as usize])
     }
 
     #[cfg(test)]
@@ -47,9 +50,8 @@ impl Lane {
     }
 }
 
+/// The threads of a process: a forked child has none of its parent's.
 struct Closer {
-    /// The process that the threads are in: a forked child has none of its parent's.
-    process: u32,
     crews: [Crew; 3],
 }
 
@@ -68,37 +70,14 @@ struct State {
     waiting: Vec<OwnedFd>,
 }
 
-/// That of this process, or of the one that it is a forked child of.
-static CLOSER: AtomicPtr<Closer> = AtomicPtr::new(std::ptr::null_mut());
+static CLOSER: PerProcess<Closer> = PerProcess::new();
 
-fn current() -> &'static Closer {
-    let process = std::process::id();
-    // Pairs with the release exchange below: it is whole.
-    let found = CLOSER.load(Ordering::Acquire);
-    // SAFETY: it is null or one that was leaked below, so it lives for ever; it is only shared.
-    let before = unsafe { found.as_ref() };
-    if let Some(closer) = before.filter(|closer| closer.process == process) {
-        return closer;
-    }
-    let crews = THREADS.map(|most| Crew { most, state: Mutex::default(), work: Condvar::new() });
-    let fresh = Box::into_raw(Box::new(Closer { process, crews }));
-    // Release: pairs with the acquire load above.
-    match CLOSER.compare_exchange(found, fresh, Ordering::AcqRel, Ordering::Acquire) {
-        Ok(_) => {
-            // SAFETY: it was made above and is never freed; it is only shared from now on.
-            let closer: &'static Closer = unsafe { &*fresh };
-            if let Some(before) = before {
-                closer.inherit(before);
-            }
-            closer
-        }
-        Err(other) => {
-            // SAFETY: it was made above, and nobody else has seen it.
-            drop(unsafe { Box::from_raw(fresh) });
-            // SAFETY: another thread of this process, the only one that could, leaked it.
-            unsafe { &*other }
-        }
-    }
+/// That of this process; `None` where there is no memory to tell it from its parent's by.
+fn current() -> Option<&'static Closer> {
+    let new = |_| Closer {
+        crews: THREADS.map(|most| Crew { most, state: Mutex::default(), work: Condvar::new() }),
+    };
+    CLOSER.get(new, Closer::inherit).ok().map(Made::value)
 }
 
 impl Closer {

@@ -92,7 +92,8 @@ impl PassedFd {
         Ok(Self::new(self.as_fd().try_clone_to_owned()?, origin))
     }
 
-    /// Whether it is memory that can be sealed. Asks no file system.
+    /// Whether it is memory that can be sealed, or a file of a tmpfs, which is as good. Asks no file
+    /// system.
     pub(crate) fn is_memfd(&self) -> bool {
         fcntl_get_seals(self).is_ok()
     }

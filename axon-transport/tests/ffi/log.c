@@ -2,6 +2,8 @@
 #include "check.h"
 
 #include <pthread.h>
+#include <stdatomic.h>
+#include <sys/wait.h>
 #include <unistd.h>
 
 struct heard {
@@ -44,6 +46,41 @@ static void say_something(struct place place) {
     OK(axon_session_subscription_destroy(listener));
 }
 
+/* What a program that is not ready to hear holds. */
+static pthread_mutex_t gate = PTHREAD_MUTEX_INITIALIZER;
+static atomic_int waits_at_gate;
+
+static void wait_at_gate(const void *user, uint32_t severity, const char *part, const char *text) {
+    (void)user, (void)severity, (void)part, (void)text;
+    atomic_store(&waits_at_gate, 1);
+    pthread_mutex_lock(&gate);
+    pthread_mutex_unlock(&gate);
+}
+
+/* While a callback is under way. */
+static void set_again_and_in_a_fork(struct place place) {
+    pthread_mutex_lock(&gate);
+    OK(axon_session_log_set_callback(wait_at_gate, NULL));
+    for (int round = 0; !atomic_load(&waits_at_gate); round++) {
+        CHECK(round < 1000);
+        say_something(place);
+    }
+    /* That it waits for what this thread holds is in nobody's way. */
+    OK(axon_session_log_set_callback(wait_at_gate, NULL));
+    pid_t child = fork();
+    if (child == 0) {
+        /* It would wait for ever for a call that only its parent makes. */
+        alarm(60);
+        OK(axon_session_log_set_callback(hear, &heard));
+        OK(axon_session_log_set_callback(NULL, NULL));
+        _exit(0);
+    }
+    int status = -1;
+    CHECK(child > 0 && waitpid(child, &status, 0) == child && status == 0);
+    pthread_mutex_unlock(&gate);
+    OK(axon_session_log_set_callback(NULL, NULL));
+}
+
 void case_log(void) {
     OK(axon_session_log_set_severity(AXON_LOG_DEBUG));
     OK(axon_session_log_set_callback(hear, &heard));
@@ -64,6 +101,7 @@ void case_log(void) {
     before = lines();
     say_something(place);
     CHECK(lines() == before);
+    set_again_and_in_a_fork(place);
     close_place(place);
     OK(axon_session_log_set_severity(AXON_LOG_WARN));
 }
