@@ -1036,8 +1036,9 @@ axon_ret_t axon_session_loan_abandon(struct axon_loan_t loan);
 
 /**
  * Has `callback` told of what the library says in this process, in place of the one before, which has
- * returned and is not called any more when this returns. Null: nobody is told, as at first. A daemon
- * has a log of its own. A forked child says it again for what it says itself.
+ * returned and is not called any more when this returns; it blocks until then. To set the one that is
+ * set already with the same `user` changes nothing, and does not block. Null: nobody is told, as at
+ * first. A daemon has a log of its own. A forked child says it again for what it says itself.
  *
  * AXON_RET_ERROR: it is called from within a callback, or a part of the program in Rust has what the
  * library says already (a global `tracing` subscriber).
@@ -1414,8 +1415,9 @@ axon_ret_t axon_session_subscription_take(struct axon_subscription_t subscriptio
 
 /**
  * Takes the oldest sample, by source timestamp among all publishers, in place: `len` bytes at `data`,
- * which stand until `axon_session_sample_release`. A copy is aligned to 8; what was lent is aligned as
- * it was, and what a publisher wrote that does not keep to the protocol anyhow. One of more than 4 KiB is in the
+ * which stand until `axon_session_sample_release`. What was lent is aligned as it was, a copy as
+ * the allocator does it (to 8 at least, but for one of 0 bytes, of which `data` is any address), and what a
+ * publisher wrote that does not keep to the protocol anyhow. One of more than 4 KiB is in the
  * publisher's memory, of which a subscription can keep five for each publisher; a sixth is copied.
  * Where there is none the handle is 0, and nothing else is stored.
  *

@@ -12,7 +12,8 @@
 //! Handles are numbers, never pointers: one that is 0, stale, destroyed twice, of another kind or made
 //! up gives [`AXON_RET_INVALID_HANDLE`], one that a forked child inherited [`AXON_RET_FORKED`]. An
 //! object may be destroyed by one thread while others use it: calls that are under way end as they
-//! would have. No panic crosses the border: each is caught in one place (`guarded`).
+//! would have. No panic crosses the border: what could panic is called in one place
+//! (`guarded`), which catches it.
 #![allow(unsafe_code, non_camel_case_types)]
 
 mod callback;

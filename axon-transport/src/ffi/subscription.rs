@@ -1,6 +1,6 @@
 //! Subscriptions, and the samples that they take.
 
-use std::{ffi::c_void, slice};
+use std::{ffi::c_void, mem::MaybeUninit, slice};
 
 use super::{
     callback::axon_callback_t,
@@ -152,8 +152,9 @@ pub unsafe extern "C" fn axon_session_subscription_take(
 }
 
 /// Takes the oldest sample, by source timestamp among all publishers, in place: `len` bytes at `data`,
-/// which stand until `axon_session_sample_release`. A copy is aligned to 8; what was lent is aligned as
-/// it was, and what a publisher wrote that does not keep to the protocol anyhow. One of more than 4 KiB is in the
+/// which stand until `axon_session_sample_release`. What was lent is aligned as it was, a copy as
+/// the allocator does it (to 8 at least, but for one of 0 bytes, of which `data` is any address), and what a
+/// publisher wrote that does not keep to the protocol anyhow. One of more than 4 KiB is in the
 /// publisher's memory, of which a subscription can keep five for each publisher; a sixth is copied.
 /// Where there is none the handle is 0, and nothing else is stored.
 ///
@@ -276,8 +277,10 @@ impl Place {
                 return Err(Failure::new(AXON_RET_BAD_ALLOC, text).of_endpoint(endpoint));
             }
             if len > 0 {
-                // SAFETY: not null, and room for as many bytes, by the word of the caller of `new`.
-                sample.read_at(0, unsafe { slice::from_raw_parts_mut(at, len) });
+                let at = at.cast::<MaybeUninit<u8>>();
+                // SAFETY: not null, and room for as many bytes, by the word of the caller of `new`. What
+                // is in it does not matter.
+                sample.write_to(unsafe { slice::from_raw_parts_mut(at, len) });
             }
             // SAFETY: as it was checked in `new`, and by its caller's word.
             unsafe { store_if_wanted(self.info, axon_message_info_t::new(&info, endpoint)) }?;

@@ -50,9 +50,12 @@ pub(super) fn copy_out(
     Ok(())
 }
 
-/// Writes to all of `out`.
+/// Writes the bytes from `at` on to all of `out`.
+///
+/// # Panics
+/// The words have fewer.
 #[inline]
-fn copy(words: &[AtomicU64], at: usize, out: &mut [MaybeUninit<u8>]) {
+pub(super) fn copy(words: &[AtomicU64], at: usize, out: &mut [MaybeUninit<u8>]) {
     assert!(at.checked_add(out.len()).is_some_and(|end| end <= words.len() * 8));
     #[cfg(all(target_arch = "x86_64", not(miri)))]
     if out.len() >= BULK {

@@ -139,10 +139,11 @@ pub(super) struct Map {
 /// What `fstatfs` says of an ordinary memfd (linux/magic.h).
 const TMPFS_MAGIC: i64 = 0x0102_1994;
 
-// SAFETY: what `base` points to is plain memory reached only through atomics, and unmapping it works
-// from any thread. The other fields may go anywhere by themselves.
+// SAFETY: what `base` points to is plain memory, and unmapping it works from any thread. The other fields
+// may go anywhere by themselves.
 unsafe impl Send for Map {}
-// SAFETY: as above: all access is atomic.
+// SAFETY: as above: all access is atomic, but for bytes whose address a `Segment` gives away, and who asks
+// for that answers for it (what is lent is one loan's alone).
 unsafe impl Sync for Map {}
 
 impl Map {
@@ -150,7 +151,7 @@ impl Map {
     /// never shrink under the map, which would turn a read into a SIGBUS. For as long as it is
     /// mapped it counts towards `quota`.
     pub(super) fn open(fd: BorrowedFd<'_>, quota: &Arc<Quota>) -> Result<Self, ShmError> {
-        // The call fails on anything but a memfd.
+        // The call fails on anything but a memfd or a file of a tmpfs; what may not shrink is sealed so.
         let found =
             fcntl_get_seals(fd).map_err(|_| ShmError::Refused { what: "it is not a memfd" })?;
         if !found.contains(seals()) {

@@ -4,6 +4,7 @@ use std::{
     collections::TryReserveError,
     fmt,
     io::{self, Read, Seek, SeekFrom},
+    mem::MaybeUninit,
     ops::Range,
     slice,
     sync::{Arc, atomic::AtomicU64},
@@ -113,6 +114,25 @@ impl Sample {
             Data::Pinned { there, .. } => copy::read_at(there.words(), there.skip + at, out),
         }
         count
+    }
+
+    /// Writes its first bytes to all of `out`, of which it has as many; false, with nothing written, in
+    /// a forked child.
+    ///
+    /// # Panics
+    /// It has fewer.
+    pub(crate) fn write_to(&self, out: &mut [MaybeUninit<u8>]) -> bool {
+        assert!(out.len() <= self.len);
+        match &self.data {
+            Data::Copied(bytes) => {
+                for (to, byte) in out.iter_mut().zip(bytes) {
+                    to.write(*byte);
+                }
+            }
+            Data::Pinned { pin, .. } if pin.attachment().lane.is_forked() => return false,
+            Data::Pinned { there, .. } => copy::copy(there.words(), there.skip, out),
+        }
+        true
     }
 
     /// Replaces what `out` holds by the sample's bytes. In a forked child, by none.
