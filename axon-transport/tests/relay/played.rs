@@ -75,6 +75,22 @@ fn who_is_gone_and_back_at_once_is_received_from_anew() {
 }
 
 #[test]
+fn a_session_ends_though_nobody_takes_what_it_left() {
+    let host = host();
+    let (session, socket) = played(&host);
+    let publisher = session.create_publisher(spec("/t", Qos::keep_all())).unwrap();
+    announced(&socket, publisher.gid());
+    let outside = show(&socket, publisher.endpoint(), EndpointKind::Subscription);
+    matched(&socket, publisher.gid(), &[outside]);
+    until("it counts the one outside", || publisher.matched() == [outside]);
+    publish(&publisher, b"for which there is no credit");
+    drop(publisher);
+    let end = thread::spawn(move || drop(session));
+    until("it ends", || end.is_finished());
+    end.join().unwrap();
+}
+
+#[test]
 fn the_ends_of_a_service_that_are_gone_and_back_at_once_begin_anew() {
     let host = host();
     let (session, socket) = played(&host);

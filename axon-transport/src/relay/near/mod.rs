@@ -220,7 +220,7 @@ impl<'a> Served<'a> {
 
     fn serve(&mut self) -> Result<(), End> {
         let mut begun = false;
-        let mut finish_by = None;
+        let mut finish_by: Option<Instant> = None;
         loop {
             let common = self.common;
             common.leader.clear();
@@ -264,7 +264,8 @@ impl<'a> Served<'a> {
                 common.leader.disarm();
                 continue;
             }
-            let left = self.alive.left().into_iter().chain(self.settled_in()).min();
+            let end = finish_by.map(|by| by.saturating_duration_since(Instant::now()));
+            let left = self.alive.left().into_iter().chain(self.settled_in()).chain(end).min();
             self.pipe.sleep(&common.leader, &common.news, None, left);
         }
     }
