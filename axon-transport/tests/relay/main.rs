@@ -338,6 +338,29 @@ fn what_is_within_a_process_stays_there_and_crosses_once_for_all() {
 }
 
 #[test]
+fn a_relay_passes_over_no_more_than_each_publisher_does() {
+    let host = host();
+    let _daemon = host.daemon();
+    let (from, to) = (session(&host, "from", false), session(&host, "to", true));
+    let keeps = Qos { history: History::KeepAll, ..best_effort(1) };
+    let subscription = to.create_subscription(spec("/t", keeps)).unwrap();
+    let little = from.create_publisher(spec("/t", best_effort(1))).unwrap();
+    await_pair(&little, &subscription);
+    let much = from.create_publisher(spec("/t", best_effort(500))).unwrap();
+    await_pair(&much, &subscription);
+    let lost_on_the_way = || relays(&host.status().unwrap()).iter().map(|r| r.lost).sum::<u64>();
+    for sequence in 1..=500 {
+        assert_eq!(much.publish(&[0; 1000]).unwrap(), sequence);
+    }
+    let mut bytes = Vec::new();
+    let mut taken = 0;
+    while subscription.recv(&mut bytes, Some(PATIENCE)).expect("a sample in time").sequence < 500 {
+        taken += 1;
+    }
+    assert_eq!((taken, subscription.lost(), lost_on_the_way()), (499, 0, 0));
+}
+
+#[test]
 fn the_graph_is_the_same_for_all() {
     let host = host();
     let _daemon = host.daemon();

@@ -26,21 +26,26 @@ pub(super) struct Group {
     type_name: String,
     best_effort: bool,
     volatile: bool,
+    /// How many samples each keeps for whoever has not taken them; `None` where a reader may have all.
+    depth: Option<u32>,
 }
 
 impl Group {
     pub(super) fn of(endpoint: &Endpoint) -> Self {
+        let Qos { reliability, durability, history, depth, .. } = endpoint.qos;
+        let best_effort = reliability == Reliability::BestEffort;
         Self {
             topic: endpoint.topic.clone(),
             type_name: endpoint.type_name.clone(),
-            best_effort: endpoint.qos.reliability == Reliability::BestEffort,
-            volatile: endpoint.qos.durability == Durability::Volatile,
+            best_effort,
+            volatile: durability == Durability::Volatile,
+            depth: (best_effort && history == History::KeepLast).then_some(depth),
         }
     }
 
     /// What a relay requests to get all that its publishers offer: whether one is held back is up to
     /// the publisher's QoS, as ever.
-    fn qos(&self, depth: u32) -> Qos {
+    fn qos(&self) -> Qos {
         Qos {
             reliability: if self.best_effort {
                 Reliability::BestEffort
@@ -52,21 +57,14 @@ impl Group {
             } else {
                 Durability::TransientLocal
             },
-            history: if self.best_effort { History::KeepLast } else { History::KeepAll },
-            depth,
+            history: if self.depth.is_some() { History::KeepLast } else { History::KeepAll },
+            depth: self.depth.unwrap_or(1),
             deadline: None,
             lifespan: None,
             liveliness: Liveliness::Automatic,
             lease: None,
         }
     }
-}
-
-/// What is wanted of a relay.
-#[derive(Default)]
-struct Wanted {
-    depth: u32,
-    stands_for: BTreeSet<Gid>,
 }
 
 pub(super) struct Relay {
@@ -83,7 +81,7 @@ impl Relay {
 
 impl Served<'_> {
     pub(super) fn update_relays(&mut self) {
-        let mut wanted: BTreeMap<Group, Wanted> = BTreeMap::new();
+        let mut wanted: BTreeMap<Group, BTreeSet<Gid>> = BTreeMap::new();
         for endpoint in self.own.values().filter(|e| e.kind == EndpointKind::Publisher) {
             let group = Group::of(endpoint);
             let readers = self.matched.get(&endpoint.gid);
@@ -92,12 +90,10 @@ impl Served<'_> {
             if readers.is_none_or(BTreeSet::is_empty) && group.volatile && !rest {
                 continue;
             }
-            let wanted = wanted.entry(group).or_default();
-            wanted.depth = wanted.depth.max(endpoint.qos.depth);
-            wanted.stands_for.extend(readers.into_iter().flatten());
+            wanted.entry(group).or_default().extend(readers.into_iter().flatten());
         }
         self.relays.retain(|group, _| wanted.contains_key(group));
-        for (group, Wanted { depth, stands_for }) in wanted {
+        for (group, stands_for) in wanted {
             let gids: Vec<Gid> = stands_for.iter().take(MAX_MATCHED).copied().collect();
             if let Some(relay) = self.relays.get_mut(&group) {
                 if relay.stands_for != stands_for {
@@ -106,7 +102,7 @@ impl Served<'_> {
                 }
                 continue;
             }
-            let spec = EndpointSpec::new(&*group.topic, &*group.type_name, group.qos(depth));
+            let spec = EndpointSpec::new(&*group.topic, &*group.type_name, group.qos());
             match self.common.outside.create_relay(spec, gids) {
                 Ok(subscription) => {
                     self.relays.insert(group, Relay { subscription, stands_for });
