@@ -4,7 +4,7 @@
 //! responses of each server to each client. Its receiver lets the sender have so many bytes under way,
 //! and gives them back when samples have gone to where they belong: whoever is not read leaves its
 //! samples in the ring they come from, where their publisher's QoS says what becomes of them, and holds
-//! up no other channel. Pieces of all channels take turns, so that an image does not keep a small
+//! up no other channel but with long samples ([`Incoming::grants`]). Pieces of all channels take turns, so that an image does not keep a small
 //! sample waiting.
 
 use std::{
@@ -27,9 +27,12 @@ pub const WINDOW: u64 = 32 << 10;
 pub const OVERHEAD: u64 = 128;
 /// Most bytes of a sample in one packet.
 pub const PIECE: usize = 31 << 10;
-/// Bytes beyond the windows of its channels that one session's arriving samples may take; one sample
-/// may always.
+/// Bytes beyond the windows of its channels that one session's arriving samples may take, but for one
+/// that is long.
 const SESSION: u64 = 64 << 20;
+/// Bytes beyond its window above which a sample is long: there is one at a time, so that those which
+/// are not read leave room for others.
+const LONG: u64 = SESSION / 8;
 
 /// Samples that follow each other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -314,9 +317,12 @@ pub struct Incoming {
     max_message: u64,
     /// Channels whose sample is longer than their window, until there is room.
     waiting: VecDeque<Channel>,
-    /// Bytes that were granted beyond the windows.
+    /// Bytes that were granted beyond the windows to samples that are not long.
     reserved: u64,
+    /// The channel of the one that is, and what it was granted.
+    long: Option<(Channel, u64)>,
     pool: Arc<Pool>,
+    is_short: bool,
 }
 
 #[derive(Debug, Default)]
@@ -338,7 +344,8 @@ impl Incoming {
     /// An end that takes samples of at most `max_message` bytes, and memory beyond its windows out of
     /// `pool`.
     pub fn new(max_message: u64, pool: Arc<Pool>) -> Self {
-        Self { channels: HashMap::new(), max_message, waiting: VecDeque::new(), reserved: 0, pool }
+        let (channels, waiting) = (HashMap::new(), VecDeque::new());
+        Self { channels, max_message, waiting, reserved: 0, long: None, pool, is_short: false }
     }
 
     /// Opens a channel, unless it is open: what its sender is to be told.
@@ -352,13 +359,10 @@ impl Incoming {
 
     /// Closes those channels that `keep` does not want, and forgets what came on them.
     pub fn retain(&mut self, keep: impl Fn(&Channel) -> bool) {
-        let mut granted = 0;
-        self.channels.retain(|name, channel| {
-            let keep = keep(name);
-            granted += if keep { 0 } else { channel.granted };
-            keep
-        });
-        self.release(granted);
+        let closed = self.channels.extract_if(|name, _| !keep(name));
+        for (name, channel) in closed.collect::<Vec<_>>() {
+            self.release(name, channel.granted);
+        }
         let channels = &self.channels;
         self.waiting.retain(|channel| channels.contains_key(channel));
     }
@@ -404,33 +408,46 @@ impl Incoming {
         Ok(Some(Arrived { channel: name, meta, lost, payload }))
     }
 
-    /// For whom there is room now.
+    /// For whom there is room now. One for whom there is none keeps none of the others waiting.
     pub fn grants(&mut self) -> Vec<Credit> {
         let mut granted = Vec::new();
-        while let Some(name) = self.waiting.front().copied() {
-            let channel = self.channels.get_mut(&name);
-            let Some((channel, length)) = channel.and_then(|c| {
-                let length = c.partial.as_ref()?.head.length as usize;
-                Some((c, length))
-            }) else {
-                self.waiting.pop_front();
+        self.is_short = false;
+        for name in std::mem::take(&mut self.waiting) {
+            let partial = self.channels.get(&name).and_then(|channel| channel.partial.as_ref());
+            let Some(more) = partial.map(|partial| extra(partial.head.length as usize)) else {
                 continue;
             };
-            let more = extra(length);
-            if self.reserved > 0 && self.reserved + more > SESSION || !self.pool.take(more) {
-                break;
+            if self.reserve(name, more) {
+                self.channels.entry(name).or_default().granted += more;
+                granted.push(name.credit(more, false));
+            } else {
+                self.waiting.push_back(name);
             }
-            channel.granted += more;
-            self.reserved += more;
-            self.waiting.pop_front();
-            granted.push(name.credit(more, false));
         }
         granted
     }
 
-    /// Whether somebody waits for room.
+    fn reserve(&mut self, name: Channel, bytes: u64) -> bool {
+        let is_long = bytes > LONG;
+        let fits = if is_long { self.long.is_none() } else { self.reserved + bytes <= SESSION };
+        if !fits {
+            return false;
+        }
+        if !self.pool.take(bytes) {
+            self.is_short = true;
+            return false;
+        }
+        if is_long {
+            self.long = Some((name, bytes));
+        } else {
+            self.reserved += bytes;
+        }
+        true
+    }
+
+    /// Whether somebody waits for room that other sessions have.
     pub fn is_short(&self) -> bool {
-        !self.waiting.is_empty()
+        self.is_short
     }
 
     /// A sample has gone to where it belongs, or nowhere: what its sender is given back.
@@ -442,19 +459,29 @@ impl Incoming {
         // One that was not asked for can have come within the window, by the grant for another.
         let more = more.min(channel.granted);
         channel.granted -= more;
-        self.release(more);
+        self.release(name, more);
         Some(name.credit(cost - more, false))
     }
 
-    fn release(&mut self, bytes: u64) {
-        self.reserved -= bytes;
+    fn release(&mut self, of: Channel, bytes: u64) {
+        let mut rest = bytes;
+        if let Some((name, long)) = &mut self.long
+            && *name == of
+        {
+            let most = rest.min(*long);
+            (*long, rest) = (*long - most, rest - most);
+            if *long == 0 {
+                self.long = None;
+            }
+        }
+        self.reserved -= rest;
         self.pool.give(bytes);
     }
 }
 
 impl Drop for Incoming {
     fn drop(&mut self) {
-        self.pool.give(self.reserved);
+        self.pool.give(self.reserved + self.long.map_or(0, |(_, bytes)| bytes));
     }
 }
 

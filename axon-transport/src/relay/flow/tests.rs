@@ -98,6 +98,34 @@ fn a_long_sample_waits_for_room_and_gives_it_back() {
 }
 
 #[test]
+fn a_long_sample_that_is_not_read_holds_up_none_but_long_ones() {
+    let mut incoming = Incoming::new(1 << 30, Pool::new(u64::MAX));
+    let lengths = [63 << 20, 200 << 20, LONG as u32, LONG as u32, 40 << 20, 100_000];
+    for (number, length) in (0..).zip(lengths) {
+        incoming.open(channel(number));
+        assert_eq!(incoming.piece(piece(number, head(length), 0)), Ok(None));
+    }
+    let granted = |incoming: &mut Incoming| {
+        let names = incoming.grants().into_iter();
+        let names = names.map(|credit| Channel { writer: credit.publisher, client: credit.client });
+        names.collect::<Vec<_>>()
+    };
+    assert_eq!(granted(&mut incoming), [0, 2, 3, 5].map(channel));
+    assert!(!incoming.is_short(), "no other session can make room");
+    incoming.retain(|name| *name != channel(0));
+    assert_eq!(granted(&mut incoming), [channel(1)], "the next of those that are long");
+    incoming.retain(|name| *name != channel(1));
+    assert_eq!(granted(&mut incoming), [channel(4)]);
+    // Those that are not long are not without a bound, either.
+    for number in 6..20 {
+        incoming.open(channel(number));
+        assert_eq!(incoming.piece(piece(number, head(LONG as u32), 0)), Ok(None));
+    }
+    let more = granted(&mut incoming).len();
+    assert!((2..=6).contains(&more), "{more} of at most eight in all");
+}
+
+#[test]
 fn one_sample_may_be_longer_than_the_pool() {
     let mut incoming = Incoming::new(MAX, Pool::new(1));
     incoming.open(channel(1));
