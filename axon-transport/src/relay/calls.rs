@@ -1,28 +1,32 @@
 //! Services: what of them goes to the other end of a relay. In the daemon clients and servers are the
 //! session's own, in the session's process they stand for the world's; otherwise both ends do the same.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::BTreeMap;
 
-use super::flow::{Channel, Departing};
+use super::{
+    flow::{Channel, Departing},
+    merge::Merge,
+};
 use crate::{ids::Gid, session::Face, shm::Sample};
 
 /// The channels to the other end that a relay's clients and servers call for, and how far they have got.
 #[derive(Default)]
 pub(super) struct Calls {
-    /// The servers here of each client that is on this side.
-    servers: BTreeMap<Gid, BTreeSet<Gid>>,
-    /// The number of each client's newest request that has been sent.
-    sent: HashMap<Gid, u64>,
+    /// The requests of each client that is on this side, by way of the servers here.
+    requests: BTreeMap<Gid, Merge<Sample>>,
 }
 
 impl Calls {
     /// From now on these are the pairs of client and server by way of whose servers requests are taken.
     pub(super) fn set(&mut self, pairs: impl Iterator<Item = (Gid, Gid)>) {
-        self.servers.clear();
+        let mut servers: BTreeMap<Gid, Vec<Gid>> = BTreeMap::new();
         for (client, server) in pairs {
-            self.servers.entry(client).or_default().insert(server);
+            servers.entry(client).or_default().push(server);
         }
-        self.sent.retain(|client, _| self.servers.contains_key(client));
+        self.requests.retain(|client, _| servers.contains_key(client));
+        for (client, servers) in servers {
+            self.requests.entry(client).or_default().set(servers);
+        }
     }
 
     /// The next request of `client` that has not been sent. It came to each of the servers.
@@ -31,16 +35,21 @@ impl Calls {
         client: &Gid,
         find: impl Fn(&Gid) -> Option<&'a Face>,
     ) -> Option<Departing<Sample>> {
-        for server in self.servers.get(client)?.iter().filter_map(find) {
-            while let Some(request) = server.take_from(client) {
-                let sequence = request.meta().sequence;
-                if self.sent.get(client).is_none_or(|sent| sequence > *sent) {
-                    self.sent.insert(*client, sequence);
-                    return Some(departing(request));
-                }
-            }
+        self.requests.get_mut(client)?.next(|server| find(server)?.take_from(client).map(departing))
+    }
+
+    /// Takes the requests that were sent by way of another server; whether there are more.
+    pub(super) fn pass_over<'a>(&mut self, find: impl Fn(&Gid) -> Option<&'a Face>) -> bool {
+        let mut more = false;
+        for (client, requests) in &mut self.requests {
+            more |= requests.pass_over(|server| find(server)?.take_from(client).map(departing));
         }
-        None
+        more
+    }
+
+    /// Whether a request of `client` came by way of `server` and is still to be sent.
+    pub(super) fn holds(&self, client: &Gid, server: &Gid) -> bool {
+        self.requests.get(client).is_some_and(|requests| requests.holds(server))
     }
 }
 

@@ -14,6 +14,7 @@ mod alive;
 mod calls;
 pub(crate) mod far;
 pub mod flow;
+mod merge;
 pub(crate) mod near;
 mod news;
 mod pipe;

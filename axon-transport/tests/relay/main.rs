@@ -338,6 +338,25 @@ fn what_is_within_a_process_stays_there_and_crosses_once_for_all() {
 }
 
 #[test]
+fn what_came_by_way_of_one_subscription_that_ends_is_not_lost_for_another() {
+    let host = host();
+    let _daemon = host.daemon();
+    let (from, to) = (session(&host, "from", true), session(&host, "to", false));
+    let (publisher, one) = connect(&from, &to, "/t", Qos::keep_all());
+    let other = to.create_subscription(spec("/t", Qos::keep_all())).unwrap();
+    await_pair(&publisher, &other);
+    let mut last = 0;
+    while let Ok(sequence) = publisher.publish(&pattern(last + 1, 50_000)) {
+        last = sequence;
+    }
+    // Whichever of them it is that the daemon takes from.
+    let (ends, stays) = if one.gid() < other.gid() { (one, other) } else { (other, one) };
+    drop(ends);
+    assert!(take_until(&stays, last).into_iter().eq(1..=last));
+    assert_eq!(stays.lost(), 0);
+}
+
+#[test]
 fn a_relay_passes_over_no_more_than_each_publisher_does() {
     let host = host();
     let _daemon = host.daemon();

@@ -31,7 +31,10 @@ fn played(host: &Host) -> (Session, OwnedFd) {
 /// There is an endpoint outside, of this kind and the same topic as `own`.
 fn show(socket: &OwnedFd, own: &Endpoint, kind: EndpointKind) -> Gid {
     let number = if kind == EndpointKind::Server { 2 } else { 1 };
-    let gid = Gid::new(SessionId([9; 16]), number);
+    show_as(socket, Gid::new(SessionId([9; 16]), number), own, kind)
+}
+
+fn show_as(socket: &OwnedFd, gid: Gid, own: &Endpoint, kind: EndpointKind) -> Gid {
     let endpoint = Endpoint { gid, kind, ..own.clone() };
     let added = vec![GraphItem { endpoint, daemon: None }];
     let (removed, ended) = (Vec::new(), None);
@@ -146,4 +149,28 @@ fn a_request_is_sent_once_however_many_servers_it_is_for() {
     let info = own.recv_response(&mut Vec::new(), Some(PATIENCE)).unwrap();
     assert_eq!((info.publisher, info.sequence), (one, 2));
     assert!(!own.has_response());
+}
+
+#[test]
+fn what_waits_for_one_server_goes_before_what_another_has_too() {
+    let host = host();
+    let (session, socket) = played(&host);
+    let own = session.create_client(services::service()).unwrap();
+    announced(&socket, own.gid());
+    let [early, late] = [7, 3].map(|number| Gid::new(SessionId([9; 16]), number));
+    show_as(&socket, early, own.endpoint(), EndpointKind::Server);
+    matched(&socket, own.gid(), &[early]);
+    until("it counts the one", || own.servers() == [early]);
+    (1..=4).for_each(|number| assert_eq!(own.send_request(b"x").unwrap(), number));
+    show_as(&socket, late, own.endpoint(), EndpointKind::Server);
+    matched(&socket, own.gid(), &[late, early]);
+    until("it counts both", || own.servers().len() == 2);
+    assert_eq!(own.send_request(b"x").unwrap(), 5);
+    let credit = Credit { publisher: own.gid(), bytes: 1000, opens: true, client: None };
+    say_to(&socket, &Message::Credit(credit));
+    for number in 1..=5 {
+        let piece = hear(&socket, |m| matches!(m, Message::Piece(_)));
+        let Some(Message::Piece(piece)) = piece else { panic!("no request") };
+        assert_eq!(piece.head.unwrap().sequence, number);
+    }
 }

@@ -10,10 +10,11 @@ use crate::{
     daemon::registry::parts,
     graph::Endpoint,
     ids::Gid,
-    qos::{Durability, History, Qos, Reliability},
+    qos::{Durability, History, Qos},
     relay::{
         MAX_MATCHED,
         flow::{Channel, Departing},
+        merge::Merge,
         pipe::End,
     },
     session::{
@@ -23,14 +24,12 @@ use crate::{
     shm::Sample,
 };
 
-/// Samples of one pair that are passed over before others have their turn.
-const BATCH: usize = 64;
-
-/// By what a publisher's samples are taken: they cross once, whatever the number of subscriptions.
+/// A publisher's samples: they cross once, whatever the number of subscriptions.
+#[derive(Default)]
 pub(super) struct Source {
-    subscription: Gid,
-    /// The samples that this one lost, as far as the session knows.
-    lost: u64,
+    samples: Merge<Sample>,
+    /// How much of its history has been asked for.
+    history: Option<u32>,
 }
 
 impl Served {
@@ -62,7 +61,9 @@ impl Served {
         for (gid, face) in &self.writers {
             let mut others = face.partners().into_iter().collect();
             let left = |other: &Gid| {
-                face.has_from(other) || !self.pipe.outgoing.is_idle(&channel(face, *other))
+                face.has_from(other)
+                    || self.calls.holds(other, gid)
+                    || !self.pipe.outgoing.is_idle(&channel(face, *other))
             };
             self.draining |= keep_what_is_left(&mut others, self.told.get(gid), left);
             changes.push((*gid, others));
@@ -71,8 +72,8 @@ impl Served {
             let mut writers = subscription.matched().into_iter().collect();
             let left = |writer: &Gid| {
                 subscription.has_from(writer)
-                    || self.sources.get(writer).is_some_and(|s| s.subscription == *gid)
-                        && !self.pipe.outgoing.is_idle(&Channel::of(*writer))
+                    || self.sources.get(writer).is_some_and(|s| s.samples.holds(gid))
+                    || !self.pipe.outgoing.is_idle(&Channel::of(*writer))
             };
             self.draining |= keep_what_is_left(&mut writers, self.told.get(gid), left);
             changes.push((*gid, writers));
@@ -84,7 +85,7 @@ impl Served {
                 self.told.insert(gid, others);
             }
         }
-        self.choose();
+        self.ask();
         let servers = self
             .told
             .iter()
@@ -117,57 +118,43 @@ impl Served {
         self.pipe.outgoing.retain(|channel| wanted.contains(channel));
     }
 
-    fn choose(&mut self) {
-        let mut best: BTreeMap<Gid, Gid> = BTreeMap::new();
-        self.others.clear();
+    /// By way of which subscriptions each publisher's samples are taken: of all that there are.
+    fn ask(&mut self) {
+        let mut asked: BTreeMap<Gid, (Vec<Gid>, Option<u32>)> = BTreeMap::new();
         for (gid, writers) in &self.told {
-            let Some(qos) = self.subscriptions.get(gid).map(|s| s.endpoint().qos) else { continue };
+            let Some(subscription) = self.subscriptions.get(gid) else { continue };
             for writer in writers {
-                match best.insert(*writer, *gid) {
-                    Some(other)
-                        if rank(&self.subscriptions[&other].endpoint().qos) >= rank(&qos) =>
-                    {
-                        best.insert(*writer, other);
-                        self.others.push((*gid, *writer));
-                    }
-                    Some(other) => self.others.push((other, *writer)),
-                    None => {}
-                }
+                let (readers, history) = asked.entry(*writer).or_default();
+                readers.push(*gid);
+                *history = history_of(&subscription.endpoint().qos).max(*history);
             }
         }
-        self.sources.retain(|writer, _| best.contains_key(writer));
-        for (writer, subscription) in best {
-            let source = self.sources.entry(writer).or_insert(Source { subscription, lost: 0 });
-            if source.subscription != subscription {
-                *source = Source { subscription, lost: 0 };
+        self.sources.retain(|writer, _| asked.contains_key(writer));
+        for (writer, (readers, history)) in asked {
+            let source = self.sources.entry(writer).or_default();
+            source.samples.set(readers);
+            if history > source.history {
+                source.history = history;
+                source.samples.begin_anew();
             }
         }
     }
 
-    /// Takes what comes by way of another subscription; whether there was any.
-    pub(super) fn pass_over(&self) -> bool {
-        let mut any = false;
-        for (reader, writer) in &self.others {
-            let Some(subscription) = self.subscriptions.get(reader) else { continue };
-            for _ in 0..BATCH {
-                if subscription.take_from(writer).is_none() {
-                    break;
-                }
-                any = true;
-            }
+    /// Takes what has gone by way of another subscription or server; whether there is more.
+    pub(super) fn pass_over(&mut self) -> bool {
+        let mut more = self.calls.pass_over(|gid| self.writers.get(gid));
+        for (writer, source) in &mut self.sources {
+            more |=
+                source.samples.pass_over(|reader| departing(&self.subscriptions, reader, writer));
         }
-        any
+        more
     }
 }
 
-/// Which of two subscriptions to one publisher is the one that misses least.
-fn rank(qos: &Qos) -> (bool, bool, bool, u32) {
-    (
-        qos.reliability == Reliability::Reliable,
-        qos.durability == Durability::TransientLocal,
-        qos.history == History::KeepAll,
-        qos.depth,
-    )
+/// How much a subscription asks for of what was published before it was there.
+fn history_of(qos: &Qos) -> Option<u32> {
+    let depth = if qos.history == History::KeepAll { u32::MAX } else { qos.depth };
+    (qos.durability == Durability::TransientLocal).then_some(depth)
 }
 
 pub(super) fn take(
@@ -175,10 +162,15 @@ pub(super) fn take(
     subscriptions: &BTreeMap<Gid, Subscription>,
     writer: &Gid,
 ) -> Option<Departing<Sample>> {
-    let (content, lost) = subscriptions.get(&source.subscription)?.take_from(writer)?;
-    let before = std::mem::replace(&mut source.lost, lost);
-    // A publisher that attached anew counts from 0.
-    let lost = lost.checked_sub(before).unwrap_or(lost);
+    source.samples.next(|reader| departing(subscriptions, reader, writer))
+}
+
+fn departing(
+    subscriptions: &BTreeMap<Gid, Subscription>,
+    reader: &Gid,
+    writer: &Gid,
+) -> Option<Departing<Sample>> {
+    let (content, lost) = subscriptions.get(reader)?.take_from(writer)?;
     Some(Departing { meta: content.meta(), lost, content })
 }
 

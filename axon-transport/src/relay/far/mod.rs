@@ -100,7 +100,6 @@ impl Far {
             nodes: BTreeMap::new(),
             told: BTreeMap::new(),
             sources: BTreeMap::new(),
-            others: Vec::new(),
             calls: Calls::default(),
             callers: BTreeMap::new(),
             alive: Alive::default(),
@@ -131,8 +130,6 @@ struct Served {
     told: BTreeMap<Gid, BTreeSet<Gid>>,
     /// The publishers whose samples the session gets.
     sources: BTreeMap<Gid, Source>,
-    /// The pairs, reader first, whose samples it gets by way of another of its subscriptions.
-    others: Vec<(Gid, Gid)>,
     /// What is asked of its servers.
     calls: Calls,
     /// The clients that its process has for each of its servers: whose responses may come.

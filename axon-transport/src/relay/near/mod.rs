@@ -253,7 +253,7 @@ impl<'a> Served<'a> {
                     endpoint => take(endpoint, relays, lost),
                 }
             })?;
-            let passed = self.pass_over();
+            let passed = self.pass_over() | self.calls.pass_over(find);
             if common.finishes() {
                 let by = *finish_by.get_or_insert_with(|| Instant::now() + LINGER);
                 if self.is_drained() || Instant::now() >= by {

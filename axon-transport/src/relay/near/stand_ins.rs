@@ -191,7 +191,9 @@ impl Served<'_> {
     /// Whether all requests of a client of the session are with the daemon.
     pub(super) fn is_asked(&self, client: &Gid) -> bool {
         self.pipe.outgoing.is_idle(&Channel::of(*client))
-            && self.stand_ins.values().all(|stand_in| !stand_in.face().has_from(client))
+            && self.stand_ins.iter().all(|(server, stand_in)| {
+                !stand_in.face().has_from(client) && !self.calls.holds(client, server)
+            })
     }
 
     /// Whether all responses of a server of the session are.

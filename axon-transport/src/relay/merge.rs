@@ -1,0 +1,251 @@
+//! What one writer writes and several readers have: each sample once, in the writer's order.
+
+use std::collections::BTreeMap;
+
+use super::flow::Departing;
+use crate::ids::Gid;
+
+/// Samples of one reader that are passed over before others have their turn.
+const BATCH: usize = 64;
+
+/// A writer's samples, by way of all readers of it that there are. What one of them has, and has not
+/// been given on, is not lost when another has gone further or comes to an end.
+#[derive(Debug)]
+pub(super) struct Merge<S> {
+    /// The number of the newest one that was given on.
+    given: Option<u64>,
+    ways: BTreeMap<Gid, Way<S>>,
+    /// Whether a reader had more to be dropped than was looked at.
+    behind: bool,
+}
+
+#[derive(Debug)]
+struct Way<S> {
+    /// Taken, and newer than what was given on.
+    next: Option<Departing<S>>,
+    /// Samples that its reader has lost, as far as is known.
+    lost: u64,
+    /// Those among them that come after what was given on.
+    missed: u64,
+}
+
+impl<S> Default for Merge<S> {
+    fn default() -> Self {
+        Self { given: None, ways: BTreeMap::new(), behind: false }
+    }
+}
+
+impl<S> Default for Way<S> {
+    fn default() -> Self {
+        Self { next: None, lost: 0, missed: 0 }
+    }
+}
+
+impl<S> Merge<S> {
+    /// These are the readers from now on.
+    pub(super) fn set(&mut self, readers: impl IntoIterator<Item = Gid>) {
+        let mut before = std::mem::take(&mut self.ways);
+        let ways = readers.into_iter().map(|gid| (gid, before.remove(&gid).unwrap_or_default()));
+        self.ways = ways.collect();
+    }
+
+    /// Whatever the readers have is given on once more: one of them has what came before.
+    pub(super) fn begin_anew(&mut self) {
+        self.given = None;
+    }
+
+    /// Whether there is a sample that a reader has given up to it.
+    pub(super) fn holds(&self, reader: &Gid) -> bool {
+        self.ways.get(reader).is_some_and(|way| way.next.is_some())
+    }
+
+    /// The next sample. `take` has that of one reader, with the number of all that it has lost.
+    pub(super) fn next(
+        &mut self,
+        take: impl Fn(&Gid) -> Option<Departing<S>>,
+    ) -> Option<Departing<S>> {
+        self.look(&take);
+        if self.ways.values().any(|way| way.next.is_some()) {
+            // Where there was nothing there may be by now what was written before that one.
+            self.look(&take);
+        }
+        if self.behind {
+            return None;
+        }
+        let there = self.ways.values_mut().filter(|way| way.next.is_some());
+        let way = there.min_by_key(|way| way.next.as_ref().map(|next| next.meta.sequence))?;
+        let mut next = way.next.take()?;
+        let sequence = next.meta.sequence;
+        // What one has lost another may have had.
+        let missing = self.given.map_or(u64::MAX, |given| sequence.saturating_sub(given + 1));
+        next.lost = std::mem::take(&mut way.missed).min(missing);
+        self.given = Some(sequence);
+        Some(next)
+    }
+
+    /// Drops what one reader has and another had. Whether there is more of it: nothing is next until
+    /// there is not.
+    pub(super) fn pass_over(&mut self, take: impl Fn(&Gid) -> Option<Departing<S>>) -> bool {
+        if self.ways.len() > 1 || self.behind {
+            self.look(&take);
+        }
+        self.behind
+    }
+
+    /// Has the next sample of each reader at hand, if it has one that was not given on.
+    fn look(&mut self, take: &impl Fn(&Gid) -> Option<Departing<S>>) {
+        let given = self.given;
+        let is_new = |next: &Departing<S>| Some(next.meta.sequence) > given;
+        self.behind = false;
+        for (reader, way) in &mut self.ways {
+            let mut left = BATCH;
+            if way.next.as_ref().is_some_and(|next| !is_new(next)) {
+                (way.next, way.missed) = (None, 0);
+            }
+            while way.next.is_none() {
+                if left == 0 {
+                    self.behind = true;
+                    break;
+                }
+                left -= 1;
+                let Some(next) = take(reader) else { break };
+                // A writer that was attached anew counts from 0.
+                let lost = next.lost.checked_sub(way.lost).unwrap_or(next.lost);
+                way.lost = next.lost;
+                if is_new(&next) {
+                    way.missed = lost;
+                    way.next = Some(next);
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{
+        cell::RefCell,
+        collections::{HashMap, VecDeque},
+    };
+
+    use super::*;
+    use crate::shm::Meta;
+
+    const ONE: Gid = Gid([1; 16]);
+    const OTHER: Gid = Gid([2; 16]);
+
+    /// What readers have: numbers, each with that of the samples lost by then.
+    #[derive(Default)]
+    struct Readers(RefCell<HashMap<Gid, VecDeque<(u64, u64)>>>);
+
+    impl Readers {
+        fn have(&self, reader: Gid, samples: impl IntoIterator<Item = (u64, u64)>) {
+            self.0.borrow_mut().entry(reader).or_default().extend(samples);
+        }
+
+        fn take(&self, reader: &Gid) -> Option<Departing<()>> {
+            let (sequence, lost) = self.0.borrow_mut().get_mut(reader)?.pop_front()?;
+            let meta = Meta { sequence, source_timestamp: 0 };
+            Some(Departing { meta, lost, content: () })
+        }
+    }
+
+    fn merge() -> Merge<()> {
+        let mut merge = Merge::default();
+        merge.set([ONE, OTHER]);
+        merge
+    }
+
+    /// Whatever there is: the number of each, and that of those lost before it.
+    fn all(merge: &mut Merge<()>, readers: &Readers) -> Vec<(u64, u64)> {
+        let mut all = Vec::new();
+        loop {
+            let next = merge.next(|reader| readers.take(reader));
+            all.extend(next.as_ref().map(|next| (next.meta.sequence, next.lost)));
+            if next.is_none() && !merge.pass_over(|reader| readers.take(reader)) {
+                return all;
+            }
+        }
+    }
+
+    fn whole(numbers: std::ops::RangeInclusive<u64>) -> impl Iterator<Item = (u64, u64)> {
+        numbers.map(|number| (number, 0))
+    }
+
+    #[test]
+    fn each_is_given_on_once_and_in_order() {
+        let (mut merge, readers) = (merge(), Readers::default());
+        readers.have(ONE, whole(5..=5));
+        readers.have(OTHER, whole(1..=5));
+        assert!(all(&mut merge, &readers).into_iter().eq(whole(1..=5)));
+        readers.have(ONE, whole(6..=200));
+        readers.have(OTHER, whole(7..=201));
+        assert!(all(&mut merge, &readers).into_iter().eq(whole(6..=201)));
+    }
+
+    #[test]
+    fn what_a_reader_that_ends_has_left_another_has_too() {
+        let (mut merge, readers) = (merge(), Readers::default());
+        readers.have(ONE, whole(1..=300));
+        readers.have(OTHER, whole(1..=300));
+        let next = merge.next(|reader| readers.take(reader)).unwrap();
+        assert_eq!(next.meta.sequence, 1);
+        while merge.pass_over(|reader| readers.take(reader)) {}
+        assert!(merge.holds(&ONE) && merge.holds(&OTHER));
+        merge.set([OTHER]);
+        assert!(!merge.holds(&ONE));
+        assert!(all(&mut merge, &readers).into_iter().eq(whole(2..=300)));
+    }
+
+    #[test]
+    fn what_comes_while_readers_are_asked_does_not_go_before_what_came_first() {
+        let (mut merge, readers) = (merge(), Readers::default());
+        let asked = RefCell::new(0);
+        // It is written after the first reader was asked, which has all of it.
+        let take = |reader: &Gid| {
+            if asked.replace_with(|asked| *asked + 1) == 1 {
+                readers.have(ONE, whole(1..=5));
+                readers.have(OTHER, whole(5..=5));
+            }
+            readers.take(reader)
+        };
+        assert_eq!(merge.next(take).unwrap().meta.sequence, 1);
+        assert!(all(&mut merge, &readers).into_iter().eq(whole(2..=5)));
+    }
+
+    #[test]
+    fn lost_is_what_none_of_them_has() {
+        let (mut merge, readers) = (merge(), Readers::default());
+        readers.have(ONE, [(3, 2)]);
+        assert_eq!(all(&mut merge, &readers), [(3, 2)], "before the first");
+        readers.have(ONE, [(4, 2), (5, 2), (9, 5)]);
+        readers.have(OTHER, [(5, 4), (6, 4), (9, 6), (10, 6), (20, 11)]);
+        // 7 and 8 are of the one's three and the other's two.
+        let found = all(&mut merge, &readers);
+        assert_eq!(found, [(4, 0), (5, 0), (6, 0), (9, 2), (10, 0), (20, 5)]);
+        // Numbers that nobody lost were of nobody's samples. Who attached anew counts anew.
+        readers.have(OTHER, [(30, 0), (40, 3)]);
+        assert_eq!(all(&mut merge, &readers), [(30, 0), (40, 3)]);
+    }
+
+    #[test]
+    fn a_backlog_that_was_given_on_long_ago_hides_nothing_new() {
+        let (mut merge, readers) = (merge(), Readers::default());
+        readers.have(ONE, whole(1..=1000));
+        assert_eq!(all(&mut merge, &readers).len(), 1000);
+        readers.have(ONE, whole(1003..=1003));
+        readers.have(OTHER, whole(1..=1003));
+        assert!(all(&mut merge, &readers).into_iter().eq(whole(1001..=1003)));
+    }
+
+    #[test]
+    fn history_is_given_on_when_it_is_wanted() {
+        let (mut merge, readers) = (merge(), Readers::default());
+        readers.have(ONE, whole(8..=9));
+        assert!(all(&mut merge, &readers).into_iter().eq(whole(8..=9)));
+        readers.have(OTHER, whole(1..=9));
+        merge.begin_anew();
+        readers.have(ONE, whole(10..=10));
+        assert!(all(&mut merge, &readers).into_iter().eq(whole(1..=10)));
+    }
+}
