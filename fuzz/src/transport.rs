@@ -90,7 +90,7 @@ pub fn relay_pieces(data: &[u8]) -> bool {
     let mut incoming = Incoming::new(MAX, pool.clone());
     let channels = relay_channels();
     for channel in channels {
-        assert!(incoming.open(channel).is_some_and(|credit| credit.bytes == WINDOW));
+        assert!(incoming.open(channel, 0).is_some_and(|credit| credit.bytes == WINDOW));
     }
     let mut kept = Vec::new();
     let mut packets = data;
@@ -320,7 +320,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
         Message::Credit(Credit {
             publisher: writer,
             bytes: 128,
-            opens: true,
+            opens: Some(3),
             client: Some(reader),
         }),
         Message::Asserted(Asserted { publishers: vec![writer] }),

@@ -54,7 +54,7 @@ impl Channel {
         Self { writer: server, client: Some(client) }
     }
 
-    fn credit(self, bytes: u64, opens: bool) -> Credit {
+    fn credit(self, bytes: u64, opens: Option<u64>) -> Credit {
         Credit { publisher: self.writer, bytes, opens, client: self.client }
     }
 }
@@ -114,6 +114,8 @@ pub struct Outgoing<S> {
 
 #[derive(Debug)]
 struct Sending<S> {
+    /// MATCHED that this end had said when it opened its end.
+    since: u64,
     /// Bytes that may still be sent; `None` until the receiver opened its end.
     credit: Option<u64>,
     /// What it was when the receiver opened its end: all of it is back when nothing is under way.
@@ -130,9 +132,10 @@ impl<S> Default for Outgoing<S> {
 }
 
 impl<S: Content> Outgoing<S> {
-    /// Opens a channel, which waits for its receiver.
-    pub fn open(&mut self, channel: Channel) {
-        let closed = Sending { credit: None, window: 0, current: None, in_turn: false };
+    /// Opens a channel, which waits for a receiver that has heard as many MATCHED as were said when it
+    /// was to be opened: one that has not means a channel of the same name that was closed since.
+    pub fn open(&mut self, channel: Channel, since: u64) {
+        let closed = Sending { since, credit: None, window: 0, current: None, in_turn: false };
         self.channels.entry(channel).or_insert(closed);
     }
 
@@ -156,13 +159,13 @@ impl<S: Content> Outgoing<S> {
         let name = Channel { writer: publisher, client };
         let Some(channel) = self.channels.get_mut(&name) else { return };
         match (&mut channel.credit, opens) {
-            (none @ None, true) => {
+            (none @ None, Some(heard)) if heard >= channel.since => {
                 *none = Some(bytes);
                 channel.window = bytes;
             }
-            (Some(credit), false) => *credit = credit.saturating_add(bytes),
+            (Some(credit), None) => *credit = credit.saturating_add(bytes),
             // Of a channel that this one came after.
-            (None, false) | (Some(_), true) => {}
+            (None, _) | (Some(_), Some(_)) => {}
         }
         self.enqueue(name);
     }
@@ -348,13 +351,14 @@ impl Incoming {
         Self { channels, max_message, waiting, reserved: 0, long: None, pool, is_short: false }
     }
 
-    /// Opens a channel, unless it is open: what its sender is to be told.
-    pub fn open(&mut self, channel: Channel) -> Option<Credit> {
+    /// Opens a channel, unless it is open: what its sender, of which so many MATCHED were heard, is to
+    /// be told.
+    pub fn open(&mut self, channel: Channel, heard: u64) -> Option<Credit> {
         if self.channels.contains_key(&channel) {
             return None;
         }
         self.channels.insert(channel, Receiving::default());
-        Some(channel.credit(WINDOW, true))
+        Some(channel.credit(WINDOW, Some(heard)))
     }
 
     /// Closes those channels that `keep` does not want, and forgets what came on them.
@@ -419,7 +423,7 @@ impl Incoming {
             };
             if self.reserve(name, more) {
                 self.channels.entry(name).or_default().granted += more;
-                granted.push(name.credit(more, false));
+                granted.push(name.credit(more, None));
             } else {
                 self.waiting.push_back(name);
             }
@@ -460,7 +464,7 @@ impl Incoming {
         let more = more.min(channel.granted);
         channel.granted -= more;
         self.release(name, more);
-        Some(name.credit(cost - more, false))
+        Some(name.credit(cost - more, None))
     }
 
     fn release(&mut self, of: Channel, bytes: u64) {

@@ -61,6 +61,10 @@ pub(super) struct Pipe {
     arrived: BTreeMap<Channel, VecDeque<Arrived>>,
     /// Whether one of them waits for a reader.
     pub(super) blocked: bool,
+    /// MATCHED that this end has said, and those that it has heard: by these both ends tell a channel
+    /// from an earlier one of the same name.
+    said: u64,
+    heard: u64,
     tally: Arc<Tally>,
 }
 
@@ -75,6 +79,8 @@ impl Pipe {
             incoming,
             arrived: BTreeMap::new(),
             blocked: false,
+            said: 0,
+            heard: 0,
             tally,
         }
     }
@@ -84,6 +90,7 @@ impl Pipe {
         let packet = message.encode().map_err(|e| End::Other(e.to_string()))?;
         self.waiting_bytes += packet.len();
         self.waiting.push_back(packet);
+        self.said += u64::from(matches!(message, Message::Matched(_)));
         if self.waiting_bytes > MAX_WAITING { Err(End::Deaf) } else { Ok(()) }
     }
 
@@ -92,9 +99,14 @@ impl Pipe {
         !self.waiting.is_empty()
     }
 
+    /// Opens a channel for samples that go, once the MATCHED is said by which the other end knows.
+    pub(super) fn open_out(&mut self, channel: Channel) {
+        self.outgoing.open(channel, self.said);
+    }
+
     /// Opens a channel for samples that come.
-    pub(super) fn open(&mut self, channel: Channel) -> Result<(), End> {
-        match self.incoming.open(channel) {
+    pub(super) fn open_in(&mut self, channel: Channel) -> Result<(), End> {
+        match self.incoming.open(channel, self.heard) {
             Some(credit) => self.say(&Message::Credit(credit)),
             None => Ok(()),
         }
@@ -122,7 +134,10 @@ impl Pipe {
                         self.arrived.entry(sample.channel).or_default().push_back(sample);
                     }
                 }
-                other => messages.push(other),
+                other => {
+                    self.heard += u64::from(matches!(other, Message::Matched(_)));
+                    messages.push(other);
+                }
             }
         }
         Ok((messages, true))

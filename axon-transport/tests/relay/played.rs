@@ -2,7 +2,7 @@
 
 use axon_transport::{
     ids::DaemonId,
-    session::message::{Graph, GraphItem, Welcome},
+    session::message::{Gone, Graph, GraphItem, Welcome},
 };
 
 use super::{hostile::hear, *};
@@ -51,7 +51,7 @@ fn announced(socket: &OwnedFd, gid: Gid) {
 fn opened(socket: &OwnedFd, writer: Gid, reader: Option<Gid>) {
     let heard = hear(
         socket,
-        |m| matches!(m, Message::Credit(c) if c.publisher == writer && c.client == reader && c.opens),
+        |m| matches!(m, Message::Credit(c) if c.publisher == writer && c.client == reader && c.opens.is_some()),
     );
     assert!(heard.is_some());
 }
@@ -128,7 +128,7 @@ fn a_request_is_sent_once_however_many_servers_it_is_for() {
     matched(&socket, own.gid(), &[one]);
     opened(&socket, one, Some(own.gid()));
     assert!(own.wait_available(PATIENCE));
-    let credit = Credit { publisher: own.gid(), bytes: 1000, opens: true, client: None };
+    let credit = Credit { publisher: own.gid(), bytes: 1000, opens: Some(1), client: None };
     say_to(&socket, &Message::Credit(credit));
     for number in 1..=3 {
         assert_eq!(own.send_request(b"x").unwrap(), number);
@@ -166,11 +166,45 @@ fn what_waits_for_one_server_goes_before_what_another_has_too() {
     matched(&socket, own.gid(), &[late, early]);
     until("it counts both", || own.servers().len() == 2);
     assert_eq!(own.send_request(b"x").unwrap(), 5);
-    let credit = Credit { publisher: own.gid(), bytes: 1000, opens: true, client: None };
+    let credit = Credit { publisher: own.gid(), bytes: 1000, opens: Some(1), client: None };
     say_to(&socket, &Message::Credit(credit));
     for number in 1..=5 {
         let piece = hear(&socket, |m| matches!(m, Message::Piece(_)));
         let Some(Message::Piece(piece)) = piece else { panic!("no request") };
         assert_eq!(piece.head.unwrap().sequence, number);
     }
+}
+
+#[test]
+fn a_channel_goes_on_when_one_of_its_readers_ends_and_another_is_matched() {
+    let host = host();
+    let (session, socket) = played(&host);
+    let [one, other] = [(); 2].map(|()| {
+        let own = session.create_subscription(spec("/t", Qos::keep_all())).unwrap();
+        announced(&socket, own.gid());
+        own
+    });
+    let outside = show(&socket, one.endpoint(), EndpointKind::Publisher);
+    matched(&socket, one.gid(), &[outside]);
+    opened(&socket, outside, None);
+    until("both receive from it", || other.matched() == [outside]);
+    let (gone, bytes) = (one.gid(), pattern(1, 1000));
+    let (front, rest) = bytes.split_at(500);
+    let head = Some(Head { length: 1000, sequence: 1, source_timestamp: 0, lost: 0 });
+    let piece = |head, bytes: &[u8]| {
+        let bytes = bytes.to_vec();
+        say_to(&socket, &Message::Piece(Piece { publisher: outside, head, bytes, client: None }));
+    };
+    piece(head, front);
+    drop(one);
+    let ended = |m: &Message| *m == Message::EndpointGone(Gone { gid: gone });
+    assert!(hear(&socket, ended).is_some());
+    // Said before the daemon has heard that: for the daemon the channel has had a reader all along.
+    matched(&socket, other.gid(), &[outside]);
+    until("it is received from", || other.matched() == [outside]);
+    piece(None, rest);
+    assert_eq!(take_until(&other, 1), [1]);
+    let back = |m: &Message| matches!(m, Message::Credit(c) if c.publisher == outside);
+    let Some(Message::Credit(credit)) = hear(&socket, back) else { panic!("it hangs up") };
+    assert_eq!((credit.bytes, credit.opens), (1128, None), "it does not begin anew");
 }

@@ -56,7 +56,7 @@ impl Served {
     /// Tells with whom the session's endpoints are matched, and decides by which of them what others
     /// write goes to it.
     pub(super) fn match_up(&mut self) -> Result<(), End> {
-        let mut changes = Vec::new();
+        let mut changes: Vec<(Gid, BTreeSet<Gid>)> = Vec::new();
         self.draining = false;
         for (gid, face) in &self.writers {
             let mut others = face.partners().into_iter().collect();
@@ -79,10 +79,9 @@ impl Served {
             changes.push((*gid, writers));
         }
         for (gid, others) in changes {
+            let others: BTreeSet<Gid> = others.into_iter().take(MAX_MATCHED).collect();
             if self.told.get(&gid) != Some(&others) {
-                let shown = others.iter().take(MAX_MATCHED).copied().collect();
-                self.pipe.say(&Message::Matched(Matched { gid, others: shown }))?;
-                self.told.insert(gid, others);
+                self.tell(gid, others)?;
             }
         }
         self.ask();
@@ -91,25 +90,39 @@ impl Served {
             .iter()
             .filter(|(gid, _)| matches!(self.writers.get(gid), Some(Face::Server(_))));
         self.calls.set(servers.flat_map(|(gid, all)| all.iter().map(|client| (*client, *gid))));
-        self.close_unwanted();
-        self.wanted().into_iter().for_each(|channel| self.pipe.outgoing.open(channel));
         let graph = &self.graph.endpoints;
         let sources = self.sources.keys().filter_map(|writer| graph.get(writer));
         self.alive.watch(sources.filter_map(|entry| entry.endpoint.qos.lease));
         Ok(())
     }
 
+    /// Tells with whom an endpoint is matched. What that opens and closes is so from here on, in the
+    /// order in which the session hears it.
+    fn tell(&mut self, gid: Gid, others: BTreeSet<Gid>) -> Result<(), End> {
+        let shown = others.iter().copied().collect();
+        self.pipe.say(&Message::Matched(Matched { gid, others: shown }))?;
+        let before = self.told.insert(gid, others);
+        if before.is_some_and(|before| !before.is_subset(&self.told[&gid])) {
+            self.close_unwanted();
+        }
+        for channel in self.channels(&gid, &self.told[&gid]) {
+            self.pipe.open_out(channel);
+        }
+        Ok(())
+    }
+
+    /// On which channels the session gets what `others` write for an endpoint of its.
+    fn channels(&self, gid: &Gid, others: &BTreeSet<Gid>) -> Vec<Channel> {
+        match self.writers.get(gid) {
+            Some(Face::Publisher(_)) => Vec::new(),
+            Some(face) => others.iter().map(|other| channel(face, *other)).collect(),
+            None => others.iter().map(|writer| Channel::of(*writer)).collect(),
+        }
+    }
+
     /// The channels to the session, as it has been told with whom its endpoints are matched.
     fn wanted(&self) -> BTreeSet<Channel> {
-        let mut wanted = BTreeSet::new();
-        for (gid, others) in &self.told {
-            match self.writers.get(gid) {
-                Some(Face::Publisher(_)) => {}
-                Some(face) => wanted.extend(others.iter().map(|other| channel(face, *other))),
-                None => wanted.extend(others.iter().map(|writer| Channel::of(*writer))),
-            }
-        }
-        wanted
+        self.told.iter().flat_map(|(gid, others)| self.channels(gid, others)).collect()
     }
 
     pub(super) fn close_unwanted(&mut self) {

@@ -200,7 +200,7 @@ impl Served {
             Message::Endpoint(announce) => self.announce(announce),
             Message::EndpointGone(gone) => {
                 self.forget(&gone.gid);
-                Ok(())
+                self.pipe.say(&Message::EndpointGone(gone))
             }
             Message::Matched(matched) => self.callers(matched),
             Message::Asserted(asserted) => {
@@ -262,7 +262,7 @@ impl Served {
                     self.writers.insert(gid, face);
                     // A server's responses are a channel for each of its clients.
                     if kind != EndpointKind::Server {
-                        self.pipe.open(Channel::of(gid))?;
+                        self.pipe.open_in(Channel::of(gid))?;
                     }
                 }
                 Err(error) => self.refuse(&endpoint, &error.to_string())?,
@@ -271,8 +271,8 @@ impl Served {
         Ok(())
     }
 
-    /// An endpoint is gone. What it was sent is not wanted any more from here on, in the order in which
-    /// both ends say so: its channels must not be taken for those of another that come after them.
+    /// An endpoint is gone. What it was sent is not wanted any more from here on, as both ends know by
+    /// the answer: its channels must not be taken for those of another that come after them.
     fn forget(&mut self, gid: &Gid) {
         if self.writers.remove(gid).is_some() {
             self.pipe.retain(|channel| channel.writer != *gid);
@@ -303,7 +303,7 @@ impl Served {
         let wanted = |client: Option<Gid>| client.is_some_and(|client| others.contains(&client));
         self.pipe.retain(|channel| channel.writer != gid || wanted(channel.client));
         for client in &others {
-            self.pipe.open(Channel::between(gid, *client))?;
+            self.pipe.open_in(Channel::between(gid, *client))?;
         }
         self.callers.insert(gid, others);
         Ok(())

@@ -41,7 +41,7 @@ fn piece(number: u8, head: Option<Head>, len: usize) -> Piece {
 fn what_no_sender_does_is_refused() {
     let open = || {
         let mut incoming = incoming();
-        incoming.open(channel(1));
+        incoming.open(channel(1), 0);
         incoming
     };
     let refused = |pieces: &[Piece]| {
@@ -73,12 +73,12 @@ fn a_long_sample_waits_for_room_and_gives_it_back() {
     let pool = Pool::new(100_000);
     let mut ends = [(); 2].map(|()| Incoming::new(MAX, Arc::clone(&pool)));
     for incoming in &mut ends {
-        incoming.open(channel(1));
+        incoming.open(channel(1), 0);
         assert_eq!(incoming.piece(piece(1, head(100_000), 0)), Ok(None));
     }
     let [first, second] = &mut ends;
     let more = OVERHEAD + 100_000 - WINDOW;
-    let credit = channel(1).credit(more, false);
+    let credit = channel(1).credit(more, None);
     assert_eq!(first.grants(), [credit]);
     assert_eq!(second.grants(), [], "the pool is one for all");
     assert!(second.is_short() && !first.is_short());
@@ -90,7 +90,7 @@ fn a_long_sample_waits_for_room_and_gives_it_back() {
     assert_eq!(second.grants().len(), 1);
     second.retain(|_| false);
     assert_eq!(pool.held(), 0);
-    second.open(channel(1));
+    second.open(channel(1), 0);
     assert_eq!(second.piece(piece(1, head(100_000), 0)), Ok(None));
     assert_eq!(second.grants().len(), 1);
     drop(ends);
@@ -102,7 +102,7 @@ fn a_long_sample_that_is_not_read_holds_up_none_but_long_ones() {
     let mut incoming = Incoming::new(1 << 30, Pool::new(u64::MAX));
     let lengths = [63 << 20, 200 << 20, LONG as u32, LONG as u32, 40 << 20, 100_000];
     for (number, length) in (0..).zip(lengths) {
-        incoming.open(channel(number));
+        incoming.open(channel(number), 0);
         assert_eq!(incoming.piece(piece(number, head(length), 0)), Ok(None));
     }
     let granted = |incoming: &mut Incoming| {
@@ -118,7 +118,7 @@ fn a_long_sample_that_is_not_read_holds_up_none_but_long_ones() {
     assert_eq!(granted(&mut incoming), [channel(4)]);
     // Those that are not long are not without a bound, either.
     for number in 6..20 {
-        incoming.open(channel(number));
+        incoming.open(channel(number), 0);
         assert_eq!(incoming.piece(piece(number, head(LONG as u32), 0)), Ok(None));
     }
     let more = granted(&mut incoming).len();
@@ -128,7 +128,7 @@ fn a_long_sample_that_is_not_read_holds_up_none_but_long_ones() {
 #[test]
 fn one_sample_may_be_longer_than_the_pool() {
     let mut incoming = Incoming::new(MAX, Pool::new(1));
-    incoming.open(channel(1));
+    incoming.open(channel(1), 0);
     assert_eq!(incoming.piece(piece(1, head(MAX as u32), 0)), Ok(None));
     assert_eq!(incoming.grants().len(), 1);
 }
@@ -141,8 +141,8 @@ fn an_image_does_not_hold_a_small_sample_up() {
     };
     let mut outgoing = Outgoing::default();
     for number in [1, 2] {
-        outgoing.open(channel(number));
-        outgoing.credit(&channel(number).credit(MAX, true));
+        outgoing.open(channel(number), 0);
+        outgoing.credit(&channel(number).credit(MAX, Some(0)));
     }
     assert!(outgoing.fill(|of| (*of == channel(1)).then(|| departing(1, 500_000))));
     assert_eq!(next(&mut outgoing), channel(1));
@@ -155,20 +155,32 @@ fn an_image_does_not_hold_a_small_sample_up() {
 #[test]
 fn a_channel_without_its_receiver_sends_nothing() {
     let mut outgoing = Outgoing::default();
-    outgoing.open(channel(1));
-    outgoing.credit(&channel(1).credit(1000, false));
+    outgoing.open(channel(1), 0);
+    outgoing.credit(&channel(1).credit(1000, None));
     assert!(!outgoing.fill(|_| Some(departing(1, 1))), "of a channel before it");
-    outgoing.credit(&channel(1).credit(1000, true));
+    outgoing.credit(&channel(1).credit(1000, Some(0)));
     assert!(outgoing.fill(|_| Some(departing(1, 1))));
     assert!(!outgoing.is_idle(&channel(1)));
     let sent = outgoing.next_piece().unwrap();
     assert_eq!(outgoing.next_piece(), None);
     assert!(!outgoing.is_idle(&channel(1)), "nobody has said that it is where it belongs");
     let mut incoming = incoming();
-    incoming.open(channel(1));
+    incoming.open(channel(1), 0);
     let arrived = incoming.piece(sent).unwrap().unwrap();
     outgoing.credit(&incoming.done(&arrived).unwrap());
     assert!(outgoing.is_idle(&channel(1)));
+}
+
+#[test]
+fn who_means_a_channel_that_was_closed_does_not_open_the_one_that_came_after() {
+    let mut outgoing = Outgoing::default();
+    outgoing.open(channel(1), 1);
+    outgoing.close(&channel(1));
+    outgoing.open(channel(1), 3);
+    outgoing.credit(&channel(1).credit(1000, Some(2)));
+    assert!(!outgoing.fill(|_| Some(departing(1, 1))), "it has not heard that it was closed");
+    outgoing.credit(&channel(1).credit(1000, Some(3)));
+    assert!(outgoing.fill(|_| Some(departing(1, 1))));
 }
 
 proptest! {
@@ -188,8 +200,8 @@ proptest! {
         let mut queues: HashMap<Channel, VecDeque<Departing<Vec<u8>>>> = HashMap::new();
         let mut expected: HashMap<Channel, VecDeque<Vec<u8>>> = HashMap::new();
         for number in 0..4 {
-            outgoing.open(channel(number));
-            outgoing.credit(&incoming.open(channel(number)).unwrap());
+            outgoing.open(channel(number), 0);
+            outgoing.credit(&incoming.open(channel(number), 0).unwrap());
         }
         for (number, (of, len)) in sizes.iter().enumerate() {
             let sample = departing(number as u64, *len);
@@ -245,8 +257,8 @@ proptest! {
     ) {
         let pool = Pool::new(50_000);
         let mut incoming = Incoming::new(90_000, Arc::clone(&pool));
-        incoming.open(channel(0));
-        incoming.open(channel(1));
+        incoming.open(channel(0), 0);
+        incoming.open(channel(1), 0);
         let mut kept = 0;
         for (of, length, len, gone) in pieces {
             let arrived = incoming.piece(piece(of, length.and_then(head), len));

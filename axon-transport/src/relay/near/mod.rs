@@ -26,7 +26,7 @@ use super::{
     pipe::{End, Pipe},
 };
 use crate::{
-    graph::{Endpoint, EndpointKind, writes},
+    graph::{Endpoint, EndpointKind, reads, writes},
     ids::{DaemonId, Gid},
     passed::PassedFd,
     session::{
@@ -173,6 +173,8 @@ struct Served<'a> {
     ending: BTreeSet<Gid>,
     /// Whether one of them waits for something else before it is told of.
     held_back: bool,
+    /// Those that read and are gone, until the daemon has answered that.
+    parting: BTreeSet<Gid>,
     /// With whom the daemon says they are matched.
     matched: HashMap<Gid, BTreeSet<Gid>>,
     relays: BTreeMap<Group, Relay>,
@@ -205,6 +207,7 @@ impl<'a> Served<'a> {
             own: BTreeMap::new(),
             ending: BTreeSet::new(),
             held_back: false,
+            parting: BTreeSet::new(),
             matched: HashMap::new(),
             relays: BTreeMap::new(),
             lost: HashMap::new(),
@@ -274,6 +277,7 @@ impl<'a> Served<'a> {
         match message {
             Message::Graph(graph) => self.graph(graph),
             Message::Matched(matched) => self.rematch(matched),
+            Message::EndpointGone(gone) => self.part(&gone.gid),
             Message::Credit(credit) => self.pipe.outgoing.credit(&credit),
             Message::Asserted(asserted) => {
                 let named = asserted.publishers.iter().filter_map(|gid| self.stand_ins.get(gid));
@@ -360,7 +364,7 @@ impl<'a> Served<'a> {
             self.own.insert(*gid, Arc::clone(endpoint));
             // A server's responses are a channel for each of its clients.
             if matches!(endpoint.kind, EndpointKind::Publisher | EndpointKind::Client) {
-                self.pipe.outgoing.open(Channel::of(*gid));
+                self.pipe.open_out(Channel::of(*gid));
             }
             if endpoint.kind == EndpointKind::Client {
                 self.asking.insert(*gid, Instant::now());
@@ -370,8 +374,12 @@ impl<'a> Served<'a> {
     }
 
     fn tell_gone(&mut self, gid: Gid) -> Result<(), End> {
-        self.own.remove(&gid);
-        self.matched.remove(&gid);
+        let Some(endpoint) = self.own.remove(&gid) else { return Ok(()) };
+        if reads(endpoint.kind) {
+            self.parting.insert(gid);
+        } else {
+            self.matched.remove(&gid);
+        }
         self.lost.remove(&gid);
         self.callers.remove(&gid);
         self.asking.remove(&gid);

@@ -38,8 +38,8 @@ impl Served<'_> {
     /// is let go of at once: another message may have it come back, and its channels begin anew then.
     pub(super) fn rematch(&mut self, matched: Matched) {
         let Matched { gid, others } = matched;
-        // It may have ended meanwhile.
-        if !self.own.contains_key(&gid) {
+        // A writer may have ended meanwhile.
+        if !self.own.contains_key(&gid) && !self.parting.contains(&gid) {
             return;
         }
         let others: BTreeSet<Gid> = others.into_iter().collect();
@@ -49,12 +49,22 @@ impl Served<'_> {
         }
     }
 
-    /// Those who write for an endpoint of the session, and for which of them.
+    /// The daemon has heard that an endpoint is gone, and says nothing of it any more. Until then it was
+    /// a reader for the daemon, and what is channelled to it may have gone on for the sake of another.
+    pub(super) fn part(&mut self, gid: &Gid) {
+        if self.parting.remove(gid) && self.matched.remove(gid).is_some() {
+            self.forget_unwanted();
+        }
+    }
+
+    /// Those who write for an endpoint of the session, and for which of them, as the daemon knows of
+    /// them.
     fn wanted(&self) -> BTreeMap<Gid, Vec<Gid>> {
         let mut wanted: BTreeMap<Gid, Vec<Gid>> = BTreeMap::new();
-        for endpoint in self.own.values().filter(|e| reads(e.kind)) {
-            for writer in self.matched.get(&endpoint.gid).into_iter().flatten() {
-                wanted.entry(*writer).or_default().push(endpoint.gid);
+        let own = self.own.values().filter(|e| reads(e.kind)).map(|e| &e.gid);
+        for reader in own.chain(&self.parting) {
+            for writer in self.matched.get(reader).into_iter().flatten() {
+                wanted.entry(*writer).or_default().push(*reader);
             }
         }
         wanted
@@ -71,6 +81,9 @@ impl Served<'_> {
 
     pub(super) fn update_stand_ins(&mut self) -> Result<(), End> {
         for (writer, readers) in self.forget_unwanted() {
+            if readers.iter().all(|reader| self.parting.contains(reader)) {
+                continue;
+            }
             if !self.stand_ins.contains_key(&writer) {
                 // The graph may say later who it is.
                 let Some((_, endpoint)) = self.world.get(&writer) else { continue };
@@ -89,7 +102,7 @@ impl Served<'_> {
             let partners = face.partners();
             if let Face::Server(_) = face {
                 for client in readers.iter().filter(|client| partners.contains(client)) {
-                    self.pipe.open(Channel::between(writer, *client))?;
+                    self.pipe.open_in(Channel::between(writer, *client))?;
                 }
                 continue;
             }
@@ -98,7 +111,7 @@ impl Served<'_> {
             let own = self.own.values().filter(|e| !self.ending.contains(&e.gid));
             let mut readers = own.filter(|e| pairing(face.endpoint(), e) == Pairing::Match);
             if readers.all(|reader| partners.contains(&reader.gid)) {
-                self.pipe.open(Channel::of(writer))?;
+                self.pipe.open_in(Channel::of(writer))?;
             }
         }
         Ok(())
@@ -169,15 +182,15 @@ impl Served<'_> {
         // Those that have fewer first: in between there are not too many, either.
         changes.sort_by_key(|(more, ..)| *more);
         for (_, server, now) in changes {
+            let others = now.iter().copied().collect();
+            self.pipe.say(&Message::Matched(Matched { gid: server, others }))?;
             self.pipe.outgoing.retain(|Channel { writer, client }| {
                 *writer != server || client.is_some_and(|client| now.contains(&client))
             });
             for client in &now {
-                self.pipe.outgoing.open(Channel::between(server, *client));
+                self.pipe.open_out(Channel::between(server, *client));
             }
-            let others = now.iter().copied().collect();
             self.callers.insert(server, now);
-            self.pipe.say(&Message::Matched(Matched { gid: server, others }))?;
         }
         Ok(())
     }

@@ -387,9 +387,9 @@ pub struct Credit {
     /// For so many bytes more.
     #[n(1)]
     pub bytes: u64,
-    /// It is the first that it says of this channel.
+    /// In the first that it says of this channel: how many MATCHED it has heard by then.
     #[n(2)]
-    pub opens: bool,
+    pub opens: Option<u64>,
     /// Of a server, the client whose responses are the channel.
     #[n(3)]
     pub client: Option<Gid>,

@@ -97,7 +97,7 @@ fn messages() -> Vec<Message> {
             bytes: vec![3],
             client: Some(reader),
         }),
-        Message::Credit(Credit { publisher: writer, bytes: 128, opens: true, client: None }),
+        Message::Credit(Credit { publisher: writer, bytes: 128, opens: Some(3), client: None }),
         Message::Asserted(Asserted { publishers: vec![writer] }),
     ]
 }
