@@ -98,7 +98,7 @@ pub struct RelayStatus {
     /// Their bytes.
     pub bytes_out: u64,
     /// Samples of its publishers that were overwritten before they had crossed, or for which there
-    /// was no memory.
+    /// was no memory, and those that others had left when they ended and that it did not take.
     pub lost: u64,
 }
 

@@ -34,7 +34,7 @@ impl Tally {
         self.bytes_out.fetch_add(bytes as u64, Ordering::Relaxed);
     }
 
-    /// Samples of the session's publishers that did not get here.
+    /// Samples of the session's publishers that did not get here, or of others' that it did not take.
     pub(super) fn lost(&self, samples: u64) {
         self.lost.fetch_add(samples, Ordering::Relaxed);
     }

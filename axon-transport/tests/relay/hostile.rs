@@ -245,3 +245,35 @@ fn whoever_answers_what_nobody_asked_it_reaches_nobody() {
     say_to(&socket, &Message::Resync);
     assert!(hear(&socket, |_| false).is_none(), "it was there until now");
 }
+
+#[test]
+fn whoever_gives_no_credit_back_does_not_have_the_daemon_keep_all_that_ever_wrote() {
+    let host = host();
+    let _daemon = host.daemon();
+    let here = session(&host, "here", true);
+    let own = Gid::new(SessionId([9; 16]), 1);
+    let socket = by_hand(&host, hello(&host));
+    say_to(&socket, &announce(own, EndpointKind::Subscription, EndpointRole::Application));
+    let mut others = Vec::new();
+    let mut told = |socket: &OwnedFd, wanted: &dyn Fn(&[Gid]) -> bool| {
+        while !wanted(&others) {
+            let heard = hear(socket, |m| matches!(m, Message::Matched(m) if m.gid == own));
+            let Some(Message::Matched(matched)) = heard else { panic!("it hangs up") };
+            others = matched.others;
+        }
+    };
+    let mut first = None;
+    for _ in 0..300 {
+        let publisher = here.create_publisher(spec("/t", Qos::keep_all())).unwrap();
+        let gid = publisher.gid();
+        first.get_or_insert(gid);
+        told(&socket, &|others| others.contains(&gid));
+        let credit = Credit { publisher: gid, bytes: 1000, opens: Some(u64::MAX), client: None };
+        say_to(&socket, &Message::Credit(credit));
+        publish(&publisher, b"x");
+        let piece = |m: &Message| matches!(m, Message::Piece(p) if p.publisher == gid);
+        assert!(hear(&socket, piece).is_some());
+    }
+    let first = first.unwrap();
+    told(&socket, &|others| !others.contains(&first));
+}

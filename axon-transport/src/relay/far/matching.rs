@@ -24,6 +24,10 @@ use crate::{
     shm::Sample,
 };
 
+/// Partners of a session's endpoints that are gone and whose last samples are kept until it takes them.
+/// Those samples are in memory of a process that may have ended.
+const MAX_LEFT: usize = 256;
+
 /// A publisher's samples: they cross once, whatever the number of subscriptions.
 #[derive(Default)]
 pub(super) struct Source {
@@ -56,29 +60,13 @@ impl Served {
     /// Tells with whom the session's endpoints are matched, and decides by which of them what others
     /// write goes to it.
     pub(super) fn match_up(&mut self) -> Result<(), End> {
-        let mut changes: Vec<(Gid, BTreeSet<Gid>)> = Vec::new();
-        self.draining = false;
-        for (gid, face) in &self.writers {
-            let mut others = face.partners().into_iter().collect();
-            let left = |other: &Gid| {
-                face.has_from(other)
-                    || self.calls.holds(other, gid)
-                    || !self.pipe.outgoing.is_idle(&channel(face, *other))
-            };
-            self.draining |= keep_what_is_left(&mut others, self.told.get(gid), left);
-            changes.push((*gid, others));
-        }
-        for (gid, subscription) in &self.subscriptions {
-            let mut writers = subscription.matched().into_iter().collect();
-            let left = |writer: &Gid| {
-                subscription.has_from(writer)
-                    || self.sources.get(writer).is_some_and(|s| s.samples.holds(gid))
-                    || !self.pipe.outgoing.is_idle(&Channel::of(*writer))
-            };
-            self.draining |= keep_what_is_left(&mut writers, self.told.get(gid), left);
-            changes.push((*gid, writers));
-        }
-        for (gid, others) in changes {
+        let mut matched: BTreeMap<Gid, BTreeSet<Gid>> = BTreeMap::new();
+        let faces = self.writers.iter().map(|(gid, face)| (gid, face.partners()));
+        matched.extend(faces.map(|(gid, others)| (*gid, others.into_iter().collect())));
+        let readers = self.subscriptions.iter().map(|(gid, s)| (gid, s.matched()));
+        matched.extend(readers.map(|(gid, others)| (*gid, others.into_iter().collect())));
+        self.keep_what_is_left(&mut matched);
+        for (gid, others) in matched {
             let others: BTreeSet<Gid> = others.into_iter().take(MAX_MATCHED).collect();
             if self.told.get(&gid) != Some(&others) {
                 self.tell(gid, others)?;
@@ -94,6 +82,50 @@ impl Served {
         let sources = self.sources.keys().filter_map(|writer| graph.get(writer));
         self.alive.watch(sources.filter_map(|entry| entry.endpoint.qos.lease));
         Ok(())
+    }
+
+    /// Adds those that were there before and have left something: that comes first.
+    fn keep_what_is_left(&mut self, matched: &mut BTreeMap<Gid, BTreeSet<Gid>>) {
+        let mut rest = BTreeSet::new();
+        for (gid, others) in matched.iter() {
+            let before = self.told.get(gid).into_iter().flatten();
+            let gone = before.filter(|other| !others.contains(other));
+            rest.extend(gone.filter(|other| self.has_left(gid, other)).map(|other| (*gid, *other)));
+        }
+        self.left.retain(|pair| rest.remove(pair));
+        self.left.extend(rest);
+        while self.left.len() > MAX_LEFT
+            && let Some((gid, other)) = self.left.pop_front()
+        {
+            self.discard(&gid, &other);
+        }
+        for (gid, other) in &self.left {
+            matched.entry(*gid).or_default().insert(*other);
+        }
+    }
+
+    /// Whether what `other` wrote for an endpoint of the session has not all been taken by it.
+    fn has_left(&self, gid: &Gid, other: &Gid) -> bool {
+        if let Some(face) = self.writers.get(gid) {
+            return face.has_from(other)
+                || self.calls.holds(other, gid)
+                || !self.pipe.outgoing.is_idle(&channel(face, *other));
+        }
+        self.subscriptions.get(gid).is_some_and(|subscription| subscription.has_from(other))
+            || self.sources.get(other).is_some_and(|source| source.samples.holds(gid))
+            || !self.pipe.outgoing.is_idle(&Channel::of(*other))
+    }
+
+    /// Gives up what `other`, which is gone, has left for an endpoint of a session that does not take it.
+    fn discard(&self, gid: &Gid, other: &Gid) {
+        let take = || match self.writers.get(gid) {
+            Some(face) => face.take_from(other),
+            None => self.subscriptions.get(gid)?.take_from(other).map(|(sample, _)| sample),
+        };
+        let samples = std::iter::from_fn(take).count() as u64;
+        self.tally.lost(samples);
+        let (session, limit) = (&self.id, MAX_LEFT);
+        tracing::warn!(%session, %other, samples, limit, "what it left is not taken, and is lost");
     }
 
     /// Tells with whom an endpoint is matched. What that opens and closes is so from here on, in the
@@ -193,16 +225,4 @@ fn channel(of: &Face, other: Gid) -> Channel {
         Face::Client(client) => Channel::between(other, client.gid()),
         Face::Server(_) | Face::Publisher(_) => Channel::of(other),
     }
-}
-
-/// Adds those that were there before and have left something: that comes first. Whether there are any.
-fn keep_what_is_left(
-    others: &mut BTreeSet<Gid>,
-    before: Option<&BTreeSet<Gid>>,
-    left: impl Fn(&Gid) -> bool,
-) -> bool {
-    let rest = before.into_iter().flatten().filter(|other| !others.contains(other) && left(other));
-    let rest: Vec<Gid> = rest.copied().collect();
-    others.extend(&rest);
-    !rest.is_empty()
 }

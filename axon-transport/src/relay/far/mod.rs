@@ -3,7 +3,7 @@
 mod matching;
 
 use std::{
-    collections::{BTreeMap, BTreeSet},
+    collections::{BTreeMap, BTreeSet, VecDeque},
     os::fd::{AsFd, OwnedFd},
     sync::Arc,
 };
@@ -104,7 +104,7 @@ impl Far {
             callers: BTreeMap::new(),
             alive: Alive::default(),
             graph: Arc::default(),
-            draining: false,
+            left: VecDeque::new(),
             leader,
             news,
             process,
@@ -137,8 +137,9 @@ struct Served {
     alive: Alive,
     /// The graph as it was told.
     graph: Arc<GraphView>,
-    /// Whether a publisher that is gone has samples left.
-    draining: bool,
+    /// The pairs, an endpoint of the session first, of which the other is gone and has left something,
+    /// in the order in which they went.
+    left: VecDeque<(Gid, Gid)>,
     leader: ExternalLeader,
     news: Arc<News>,
     process: Option<OwnedFd>,
@@ -163,7 +164,7 @@ impl Served {
             if news {
                 self.tell_graph()?;
             }
-            if news || changed || self.draining {
+            if news || changed || !self.left.is_empty() {
                 self.match_up()?;
             }
             let leased = self.subscriptions.values().flat_map(Subscription::assertions);
