@@ -207,7 +207,6 @@ fn relay(
         config: Arc::clone(&state.config),
         name: hello.name,
         id: hello.session,
-        pid: peer.pid,
         tally,
         pool: Arc::clone(&state.pool),
     };

@@ -45,6 +45,8 @@ pub(super) enum End {
     Descriptors,
     #[error("the other end does not read")]
     Deaf,
+    #[error("its process ended")]
+    Gone,
     #[error("{0}")]
     Other(String),
 }

@@ -1,18 +1,27 @@
 //! Who says what no session says.
 
-use rustix::process::{Pid, WaitId, WaitIdOptions, waitid};
+use std::process::{Command, Stdio};
+
+use rustix::{
+    event::{PollFd, PollFlags, poll},
+    process::{Pid, PidfdFlags, WaitId, WaitIdOptions, pidfd_open, waitid},
+};
 
 use super::*;
 
 /// What a session under the id of nines says first.
 fn hello(host: &Host) -> Hello {
+    hello_of(&host.config())
+}
+
+fn hello_of(config: &Config) -> Hello {
     Hello {
         protocol: PROTOCOL,
         session: SessionId([9; 16]),
         role: SessionRole::Application,
         name: "by hand".into(),
         domain: 0,
-        settings: security_settings(&host.config()).unwrap(),
+        settings: security_settings(config).unwrap(),
         relay: Some("written by hand".into()),
     }
 }
@@ -108,6 +117,42 @@ fn who_is_not_to_be_relayed_is_refused() {
     until("they are gone", || relays(&host.status().unwrap()).len() == 1);
 }
 
+fn stop(daemon: &Kept) {
+    let pid = daemon.0.id();
+    signal(pid, Signal::STOP);
+    let id = WaitId::Pid(Pid::from_raw(pid.cast_signed()).unwrap());
+    waitid(id, WaitIdOptions::STOPPED).unwrap();
+}
+
+/// In a child: calls, and leaves the connection to a process that reads until the other end hangs up.
+pub(crate) fn call_and_leave() -> u32 {
+    let config = Config::from_env().unwrap();
+    let socket = Address::of(&config).connect().unwrap();
+    say_to(&socket, &Message::Hello(hello_of(&config)));
+    rustix::io::ioctl_fionbio(&socket, false).unwrap();
+    let holder = Command::new("cat").stdin(socket).stdout(Stdio::null()).spawn();
+    holder.expect("cat is there").id()
+}
+
+#[test]
+fn whoever_ended_before_it_is_served_is_not_served() {
+    let host = host();
+    let daemon = host.daemon();
+    let mut caller = host.play("leaver");
+    assert_eq!(caller.hear(), "there");
+    stop(&daemon);
+    caller.go();
+    let pid: i32 = caller.hear().parse().unwrap();
+    let holder = pidfd_open(Pid::from_raw(pid).unwrap(), PidfdFlags::empty()).unwrap();
+    // It is gone and forgotten: its number may be another's.
+    caller.finish();
+    signal(daemon.0.id(), Signal::CONT);
+    let patience = PATIENCE.try_into().unwrap();
+    let ended = poll(&mut [PollFd::new(&holder, PollFlags::IN)], Some(&patience)).unwrap();
+    let _ = rustix::process::pidfd_send_signal(&holder, Signal::KILL);
+    assert_eq!(ended, 1, "the daemon does not hang up");
+}
+
 #[test]
 fn hostile_frames_end_their_own_relay_and_nothing_else() {
     let host = host();
@@ -143,13 +188,10 @@ fn hostile_frames_end_their_own_relay_and_nothing_else() {
     ] {
         let socket = credited();
         // It hears them together: after the first of a long sample alone it would make room for it.
-        let pid = daemon.0.id();
-        signal(pid, Signal::STOP);
-        let id = WaitId::Pid(Pid::from_raw(pid.cast_signed()).unwrap());
-        waitid(id, WaitIdOptions::STOPPED).unwrap();
+        stop(&daemon);
         let packets = pieces.iter().map(|piece| piece.encode().unwrap());
         packets.for_each(|packet| socket::send(&socket, &packet, &[]).unwrap());
-        signal(pid, Signal::CONT);
+        signal(daemon.0.id(), Signal::CONT);
         assert!(hear(&socket, |_| false).is_none(), "{pieces:?}");
     }
     for packet in [&[][..], &[25], &[25, 0xff, 0xff], &[0xff; 32 * 1024]] {

@@ -35,7 +35,7 @@ use axon_transport::{
 };
 use hostile::say_to;
 use rustix::process::Signal;
-use support::{Host, PATIENCE, of_child, say, signal, until, wait_for_the_end};
+use support::{Host, Kept, PATIENCE, of_child, say, signal, until, wait_for_the_end};
 
 /// Around each border of how samples are kept and carried, and an image.
 const SIZES: [usize; 10] = [0, 1, 96, 97, 4096, 4097, 31 << 10, 32 << 10, 64 << 10, 25_000_000];
@@ -145,6 +145,11 @@ fn child() {
             say("there");
             wait_for_the_end();
             drop(publisher);
+        }
+        "leaver" => {
+            say("there");
+            std::io::stdin().read_line(&mut String::new()).unwrap();
+            say(hostile::call_and_leave());
         }
         "caller" => {
             let client = session.create_client(services::service()).unwrap();

@@ -8,7 +8,7 @@ use std::{
     sync::Arc,
 };
 
-use rustix::process::{Pid, PidfdFlags, pidfd_open};
+use rustix::io::Errno;
 
 use self::matching::{Source, take};
 use super::{
@@ -42,8 +42,6 @@ pub(crate) struct Far {
     /// The session's name and id.
     pub(crate) name: String,
     pub(crate) id: SessionId,
-    /// Its process; 0 where that cannot be seen.
-    pub(crate) pid: u32,
     pub(crate) tally: Arc<Tally>,
     pub(crate) pool: Arc<Pool>,
 }
@@ -66,14 +64,21 @@ impl Far {
     }
 
     fn open(self) -> Result<Served, End> {
-        let Self { socket, inside, config, name, id, pid, tally, pool } = self;
+        let Self { socket, inside, config, name, id, tally, pool } = self;
         let say = |message: Message| {
             let packet = message.encode().map_err(|e| End::Other(e.to_string()))?;
             // The connection is new: its buffer has room.
             Ok::<(), End>(socket::send(&socket, &packet, &[])?)
         };
-        let process = i32::try_from(pid).ok().and_then(Pid::from_raw);
-        let process = process.and_then(|pid| pidfd_open(pid, PidfdFlags::empty()).ok());
+        let process = match socket::process(&socket) {
+            Ok(process) => Some(process),
+            Err(socket::SocketError::System(Errno::SRCH)) => return Err(End::Gone),
+            // It is served as long as somebody holds the connection.
+            Err(error) => {
+                tracing::debug!(session = %id, %error, "the end of its process will not be seen");
+                None
+            }
+        };
         let options = SessionOptions::new(name).callers(MAX_CALLERS);
         let session = match Session::over_as(id, inside, &config, options) {
             Ok(session) => session,
@@ -191,7 +196,7 @@ impl Served {
             }
             let process = self.process.as_ref().map(AsFd::as_fd);
             if self.pipe.sleep(&self.leader, &self.news, process, self.alive.left()) {
-                return Err(End::Other("its process ended".into()));
+                return Err(End::Gone);
             }
         }
     }
