@@ -15,6 +15,7 @@ pub mod passed;
 mod process;
 pub mod qos;
 pub mod relay;
+mod seldom;
 pub mod session;
 pub mod shm;
 pub mod wait;

@@ -4,7 +4,7 @@ use std::{
     collections::{BTreeMap, VecDeque},
     os::fd::BorrowedFd,
     sync::Arc,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -17,6 +17,7 @@ use super::{
 use crate::{
     ids::Gid,
     passed::PassedFd,
+    seldom::Seldom,
     session::{
         Face, Written,
         message::Message,
@@ -68,6 +69,7 @@ pub(super) struct Pipe {
     said: u64,
     heard: u64,
     tally: Arc<Tally>,
+    losses: Seldom,
 }
 
 impl Pipe {
@@ -84,6 +86,7 @@ impl Pipe {
             said: 0,
             heard: 0,
             tally,
+            losses: Seldom::default(),
         }
     }
 
@@ -169,8 +172,10 @@ impl Pipe {
                         break;
                     }
                     Err(error) => {
-                        tracing::error!(%gid, %error, "a relayed sample is lost");
                         lost(gid, 1);
+                        if let Some(samples) = self.losses.count(Instant::now()) {
+                            tracing::error!(%gid, %error, samples, "relayed samples are lost");
+                        }
                     }
                 }
                 if let Some(sample) = samples.pop_front() {

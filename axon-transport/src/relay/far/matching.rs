@@ -3,6 +3,7 @@
 use std::{
     collections::{BTreeMap, BTreeSet},
     sync::Arc,
+    time::Instant,
 };
 
 use super::Served;
@@ -124,8 +125,10 @@ impl Served {
         };
         let samples = std::iter::from_fn(take).count() as u64;
         self.tally.lost(samples);
-        let (session, limit) = (&self.id, MAX_LEFT);
-        tracing::warn!(%session, %other, samples, limit, "what it left is not taken, and is lost");
+        if let Some(writers) = self.given_up.count(Instant::now()) {
+            let (session, limit) = (&self.id, MAX_LEFT);
+            tracing::warn!(%session, %other, writers, limit, "what was left is not taken: lost");
+        }
     }
 
     /// Tells with whom an endpoint is matched. What that opens and closes is so from here on, in the

@@ -24,6 +24,7 @@ use crate::{
     graph::{Endpoint, EndpointKind, GraphView},
     ids::{Gid, SessionId},
     passed::PassedFd,
+    seldom::Seldom,
     session::{
         Face, Node, Session, SessionError, SessionOptions, Subscription,
         message::{Announce, EndpointRole, Matched, Message, PROTOCOL, Refused, Welcome},
@@ -110,6 +111,7 @@ impl Far {
             alive: Alive::default(),
             graph: Arc::default(),
             left: VecDeque::new(),
+            given_up: Seldom::default(),
             leader,
             news,
             process,
@@ -145,6 +147,8 @@ struct Served {
     /// The pairs, an endpoint of the session first, of which the other is gone and has left something,
     /// in the order in which they went.
     left: VecDeque<(Gid, Gid)>,
+    /// Those of them that were given up.
+    given_up: Seldom,
     leader: ExternalLeader,
     news: Arc<News>,
     process: Option<OwnedFd>,

@@ -1,0 +1,45 @@
+//! What is logged of many samples: once a second at most, and then how many there were.
+
+use std::{
+    sync::{Mutex, PoisonError},
+    time::{Duration, Instant},
+};
+
+const BETWEEN: Duration = Duration::from_secs(1);
+
+/// Counts what would be said of each.
+#[derive(Debug, Default)]
+pub(crate) struct Seldom(Mutex<Said>);
+
+#[derive(Debug, Default)]
+struct Said {
+    last: Option<Instant>,
+    since: u64,
+}
+
+impl Seldom {
+    /// One more at `now`. How many there were since it was said last, this one among them, if it is to
+    /// be said.
+    pub(crate) fn count(&self, now: Instant) -> Option<u64> {
+        let mut said = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        said.since += 1;
+        let due = said.last.is_none_or(|last| now.saturating_duration_since(last) >= BETWEEN);
+        due.then(|| {
+            said.last = Some(now);
+            std::mem::take(&mut said.since)
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn it_is_said_at_once_and_then_once_a_second_with_how_many_there_were() {
+        let (seldom, start) = (Seldom::default(), Instant::now());
+        let at = |milliseconds| seldom.count(start + Duration::from_millis(milliseconds));
+        assert_eq!([0, 1, 500, 999].map(at), [Some(1), None, None, None]);
+        assert_eq!([1000, 1001, 2500].map(at), [Some(4), None, Some(2)]);
+    }
+}
