@@ -106,6 +106,10 @@ impl Publisher {
     /// another host is when this host's daemon has taken it over: it is sealed and sent from then on
     /// whatever becomes of the publisher, but the other host has not said that it came. Where a link
     /// breaks, what was on its way is lost, and the subscriptions there count it.
+    ///
+    /// Where the session shares no memory (`AXON_SHM`), one for another process is when the session's
+    /// relay has taken it. From there it crosses even if the publisher is dropped, but not if the
+    /// process is killed; and one that ends waits for it no longer than a second.
     pub fn wait_acknowledged(&self, timeout: Duration) -> bool {
         self.session.is_forked() || self.writer.wait_handed_over(timeout)
     }
