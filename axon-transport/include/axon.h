@@ -792,8 +792,9 @@ extern "C" {
 uint32_t axon_session_abi(void);
 
 /**
- * A client of a node: `topic` in the options is the service's name. When it returns, the client is
- * matched with those servers that the graph shows, unless they take longer than 50 ms.
+ * A client of a node: `topic` in the options is the service's name. Of responses that were not taken
+ * it keeps of each server what a server keeps of each client's requests. When it returns, the client
+ * is matched with those servers that the graph shows, unless they take longer than 50 ms.
  *
  * Returns as `axon_session_publisher_create`.
  *
@@ -1200,9 +1201,10 @@ axon_ret_t axon_session_qos_check(const struct axon_qos_t *offered,
 const char *axon_session_policy_name(uint32_t policy);
 
 /**
- * A server of a node: `topic` in the options is the service's name. Requests and responses are
- * never dropped to make room, whatever the history. When it returns, the server is matched with
- * those clients that the graph shows, unless they take longer than 50 ms.
+ * A server of a node: `topic` in the options is the service's name. Of requests that were not taken
+ * a KEEP_LAST server keeps the newest of each client, as many as its depth, and a KEEP_ALL one all.
+ * What is kept is never dropped to make room. When it returns, the server is matched with those
+ * clients that the graph shows, unless they take longer than 50 ms.
  *
  * Returns as `axon_session_publisher_create`.
  *

@@ -14,7 +14,8 @@ use std::{
 use alone::alone;
 use axon_transport::{
     graph::EndpointKind,
-    qos::Qos,
+    ids::Gid,
+    qos::{History, Qos},
     session::{Client, EndpointSpec, OnNew, Server, Waitable},
     shm::PublishError,
 };
@@ -26,6 +27,25 @@ const CALLS: u64 = 50;
 
 fn spec() -> EndpointSpec {
     EndpointSpec::new("/add", "Add", Qos::default())
+}
+
+/// Of what nobody took an endpoint of this keeps so much; without a depth all of it.
+fn keeping(depth: Option<u32>) -> EndpointSpec {
+    let qos = match depth {
+        Some(depth) => Qos { history: History::KeepLast, depth, ..Qos::default() },
+        None => Qos::keep_all(),
+    };
+    EndpointSpec { qos, ..spec() }
+}
+
+/// Who asked, and under what number, of all that waits.
+fn requests(server: &Server) -> Vec<(Gid, u64)> {
+    let take = || server.take_request(&mut Vec::new());
+    std::iter::from_fn(take).map(|info| (info.publisher, info.sequence)).collect()
+}
+
+fn responses(client: &Client) -> Vec<u64> {
+    std::iter::from_fn(|| client.take_response(&mut Vec::new())).map(|info| info.sequence).collect()
 }
 
 /// Answers one request with its bytes reversed.
@@ -168,7 +188,7 @@ fn a_response_to_nobody_is_no_error() {
     until("the server heard of it", || server.clients().is_empty());
     server.send_response(request.publisher, request.sequence, b"late").unwrap();
     server.send_response(gid, 77, b"to a number that was never given").unwrap();
-    server.send_response(axon_transport::ids::Gid([3; 16]), 1, b"to a stranger").unwrap();
+    server.send_response(Gid([3; 16]), 1, b"to a stranger").unwrap();
 }
 
 #[test]
@@ -227,7 +247,7 @@ fn a_client_that_dies_with_responses_pending_harms_nobody() {
     let host = Host::new();
     let _daemon = host.daemon();
     let session = host.session("server").unwrap();
-    let server = session.create_server(spec()).unwrap();
+    let server = session.create_server(keeping(None)).unwrap();
     let mut asker = host.play("asker");
     assert_eq!(asker.hear(), "asked");
     let mut bytes = Vec::new();
@@ -256,7 +276,7 @@ fn a_client_that_takes_nothing_is_waited_for_briefly_and_loses_nothing() {
     let _daemon = host.daemon();
     let (here, there) = (host.session("server").unwrap(), host.session("client").unwrap());
     let server = here.create_server(spec()).unwrap();
-    let client = there.create_client(spec()).unwrap();
+    let client = there.create_client(keeping(None)).unwrap();
     assert!(client.wait_available(PATIENCE));
     until("both ends know it", || !server.clients().is_empty());
     let mut sent = 0;
@@ -272,6 +292,111 @@ fn a_client_that_takes_nothing_is_waited_for_briefly_and_loses_nothing() {
         let info = client.take_response(&mut bytes).expect("none of them is lost");
         assert_eq!((info.sequence, &bytes[..]), (number + 1, &number.to_le_bytes()[..]));
     }
+}
+
+#[test]
+fn a_server_keeps_of_each_client_the_newest_requests_up_to_its_depth() {
+    let session = alone();
+    let servers = [Some(1), Some(3), None].map(|d| session.create_server(keeping(d)).unwrap());
+    let clients = [spec(), spec()].map(|spec| session.create_client(spec).unwrap());
+    assert!(clients.iter().all(|client| client.servers().len() == 3));
+    for number in 1..=40 {
+        clients.iter().for_each(|client| assert_eq!(client.send_request(b"x").unwrap(), number));
+    }
+    for (server, depth) in servers.iter().zip([1, 3, 40]) {
+        let newest = 41 - depth..=40;
+        let expected = newest.flat_map(|number| clients.each_ref().map(|c| (c.gid(), number)));
+        assert_eq!(requests(server), expected.collect::<Vec<_>>());
+    }
+}
+
+#[test]
+fn a_client_keeps_of_each_server_the_newest_responses_up_to_its_depth() {
+    let session = alone();
+    let servers = [spec(), spec()].map(|spec| session.create_server(spec).unwrap());
+    let clients = [Some(1), Some(3), None].map(|d| session.create_client(keeping(d)).unwrap());
+    for client in &clients {
+        assert_eq!(client.servers().len(), 2);
+        for server in &servers {
+            for number in 1..=40 {
+                server.send_response(client.gid(), number, b"y").unwrap();
+            }
+        }
+    }
+    for (client, depth) in clients.iter().zip([1, 3, 40]) {
+        let newest = 41 - depth..=40;
+        assert_eq!(responses(client), newest.clone().chain(newest).collect::<Vec<_>>());
+    }
+}
+
+#[test]
+fn twenty_clients_that_ask_at_once_are_all_answered_by_a_server_that_keeps_one() {
+    let session = alone();
+    let server = session.create_server(keeping(Some(1))).unwrap();
+    let clients: Vec<_> = (0..CLIENTS).map(|_| session.create_client(spec()).unwrap()).collect();
+    clients.iter().for_each(|client| assert_eq!(client.send_request(b"x").unwrap(), 1));
+    (0..CLIENTS).for_each(|_| answer(&server));
+    clients.iter().for_each(|client| assert_eq!(responses(client), [1]));
+}
+
+#[test]
+fn a_callback_that_is_set_late_is_told_of_what_can_be_taken() {
+    let session = alone();
+    let server = session.create_server(keeping(Some(2))).unwrap();
+    let clients = [spec(), spec()].map(|spec| session.create_client(spec).unwrap());
+    for client in clients.iter().flat_map(|client| [client; 5]) {
+        client.send_request(b"x").unwrap();
+    }
+    let (sender, told) = std::sync::mpsc::channel();
+    let tell: OnNew = Arc::new(move |new| {
+        let _ = sender.send(new);
+    });
+    server.set_on_new_request(Some(tell)).unwrap();
+    assert_eq!(told.recv_timeout(PATIENCE), Ok(4));
+}
+
+/// More than any ring has room for, to one that takes nothing meanwhile.
+#[test]
+fn who_keeps_the_newest_only_is_never_waited_for() {
+    const MANY: u64 = 20_000;
+    let host = Host::new();
+    let _daemon = host.daemon();
+    let (here, there) = (host.session("server").unwrap(), host.session("client").unwrap());
+    let server = here.create_server(keeping(Some(3))).unwrap();
+    let client = there.create_client(keeping(Some(2))).unwrap();
+    assert!(client.wait_available(PATIENCE));
+    until("both ends know it", || server.clients() == [client.gid()]);
+    for number in 1..=MANY {
+        assert_eq!(client.send_request(b"x").unwrap(), number);
+    }
+    assert_eq!(requests(&server), [MANY - 2, MANY - 1, MANY].map(|n| (client.gid(), n)));
+    for number in 1..=MANY {
+        server.send_response(client.gid(), number, b"y").unwrap();
+    }
+    assert_eq!(responses(&client), [MANY - 1, MANY]);
+}
+
+/// What is within the depth is not given up for want of room either.
+#[test]
+fn a_depth_that_there_is_no_room_for_is_waited_for() {
+    static LARGE: [u8; 300_000] = [7; 300_000];
+    let host = Host::new().with("AXON_RING_BUFFER_SIZE_MB", "1");
+    let _daemon = host.daemon();
+    let (here, there) = (host.session("server").unwrap(), host.session("client").unwrap());
+    let server = here.create_server(keeping(Some(100))).unwrap();
+    let client = there.create_client(spec()).unwrap();
+    assert!(client.wait_available(PATIENCE));
+    let mut sent = 0;
+    let refused = loop {
+        match client.send_request(&LARGE) {
+            Ok(number) => sent = number,
+            Err(error) => break error,
+        }
+        assert!(sent < 100, "nothing holds it back");
+    };
+    assert!(matches!(refused, PublishError::Blocked { .. }), "{refused}");
+    assert!(requests(&server).into_iter().map(|(_, number)| number).eq(1..=sent));
+    client.send_request(&LARGE).unwrap();
 }
 
 #[test]

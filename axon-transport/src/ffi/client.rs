@@ -14,8 +14,9 @@ use super::{
     wait::duration,
 };
 
-/// A client of a node: `topic` in the options is the service's name. When it returns, the client is
-/// matched with those servers that the graph shows, unless they take longer than 50 ms.
+/// A client of a node: `topic` in the options is the service's name. Of responses that were not taken
+/// it keeps of each server what a server keeps of each client's requests. When it returns, the client
+/// is matched with those servers that the graph shows, unless they take longer than 50 ms.
 ///
 /// Returns as `axon_session_publisher_create`.
 ///

@@ -14,9 +14,10 @@ use super::{
 };
 use crate::ids::Gid;
 
-/// A server of a node: `topic` in the options is the service's name. Requests and responses are
-/// never dropped to make room, whatever the history. When it returns, the server is matched with
-/// those clients that the graph shows, unless they take longer than 50 ms.
+/// A server of a node: `topic` in the options is the service's name. Of requests that were not taken
+/// a KEEP_LAST server keeps the newest of each client, as many as its depth, and a KEEP_ALL one all.
+/// What is kept is never dropped to make room. When it returns, the server is matched with those
+/// clients that the graph shows, unless they take longer than 50 ms.
 ///
 /// Returns as `axon_session_publisher_create`.
 ///

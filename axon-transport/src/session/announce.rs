@@ -106,23 +106,29 @@ impl Session {
         Subscription { inner, session: self.clone() }
     }
 
+    /// A client, of whose responses those stand that `reads` asks for.
     pub(super) fn add_client(
         &self,
         endpoint: Endpoint,
         role: EndpointRole,
+        reads: Qos,
     ) -> Result<Client, SessionError> {
         let options = self.ring(&endpoint, Qos::keep_all());
-        let writer = Arc::new(Writer::create(self.shared().segment.clone(), options)?);
-        let (requests, responses) = self.add_both(endpoint, role, Rings::Shared(writer.clone()));
+        let segment = self.shared().segment.clone();
+        let writer = Arc::new(Writer::create_for_calls(segment, options)?);
+        let rings = Rings::Shared(writer.clone());
+        let (requests, responses) = self.add_both(endpoint, role, reads, rings);
         Ok(Client::new(requests, responses, writer, self.clone()))
     }
 
-    pub(super) fn add_server(&self, endpoint: Endpoint, role: EndpointRole) -> Server {
+    /// A server, of whose requests those stand that `reads` asks for.
+    pub(super) fn add_server(&self, endpoint: Endpoint, role: EndpointRole, reads: Qos) -> Server {
         let options = self.ring(&endpoint, Qos::keep_all());
         let shared = self.shared();
         let lanes = Lanes::new(shared.segment.clone(), options, shared.room.clone());
         let lanes = Arc::new(lanes);
-        let (responses, requests) = self.add_both(endpoint, role, Rings::Each(lanes.clone()));
+        let rings = Rings::Each(lanes.clone());
+        let (responses, requests) = self.add_both(endpoint, role, reads, rings);
         Server::new(responses, requests, lanes, self.clone())
     }
 
@@ -131,10 +137,11 @@ impl Session {
         &self,
         endpoint: Endpoint,
         role: EndpointRole,
+        reads: Qos,
         rings: Rings,
     ) -> (Arc<PublisherInner>, Arc<SubscriptionInner>) {
         let writes = Arc::new(PublisherInner::new(endpoint.clone(), role, rings));
-        let reads = Arc::new(SubscriptionInner::new(endpoint, role, Vec::new()));
+        let reads = Arc::new(SubscriptionInner::of_service(endpoint, role, reads));
         self.announce(Some(&writes), Some(&reads));
         (writes, reads)
     }

@@ -42,26 +42,30 @@ impl Session {
         Ok(subscription)
     }
 
-    /// A server of a service. Its clients are matched as a publisher's readers are.
+    /// A server of a service. Its clients are matched as a publisher's readers are. Of requests that
+    /// nobody took a KEEP_LAST server keeps the newest of each client, as many as its depth.
     ///
     /// # Errors
     /// When the specification is out of bounds.
     pub fn create_server(&self, spec: EndpointSpec) -> Result<Server, SessionError> {
         let endpoint = self.endpoint(spec, EndpointKind::Server)?;
-        let server = self.add_server(endpoint, EndpointRole::Application);
+        let reads = unread(&endpoint.qos);
+        let server = self.add_server(endpoint, EndpointRole::Application, reads);
         self.shared().meet(server.endpoint());
         server.await_clients();
         Ok(server)
     }
 
     /// A client of a service. Its servers are matched as a publisher's readers are; see
-    /// [`Client::wait_available`].
+    /// [`Client::wait_available`]. Of responses that nobody took a KEEP_LAST client keeps the newest of
+    /// each server, as many as its depth.
     ///
     /// # Errors
     /// When the specification is out of bounds or there is no memory.
     pub fn create_client(&self, spec: EndpointSpec) -> Result<Client, SessionError> {
         let endpoint = self.endpoint(spec, EndpointKind::Client)?;
-        let client = self.add_client(endpoint, EndpointRole::Application)?;
+        let reads = unread(&endpoint.qos);
+        let client = self.add_client(endpoint, EndpointRole::Application, reads)?;
         self.shared().meet(client.endpoint());
         client.await_servers();
         Ok(client)
@@ -127,4 +131,9 @@ impl Session {
         let endpoint = self.endpoint(spec, EndpointKind::Subscription)?;
         Ok(self.add_subscription(endpoint, EndpointRole::Relay, stands_for))
     }
+}
+
+/// What a client or server of this profile asks of those that it reads: nothing is lost but for its depth.
+fn unread(qos: &Qos) -> Qos {
+    Qos { history: qos.history, depth: qos.depth, ..Qos::keep_all() }
 }

@@ -5,6 +5,7 @@ use super::{Client, Publisher, Server, Session, SessionError, message::EndpointR
 use crate::{
     graph::{Endpoint, EndpointKind},
     ids::Gid,
+    qos::Qos,
     shm::{Meta, PublishError, Sample},
 };
 
@@ -44,9 +45,11 @@ impl Face {
     }
 
     fn new(session: &Session, of: Endpoint, role: EndpointRole) -> Result<Self, SessionError> {
+        // What it takes is another's, whose depth counts there.
+        let all = Qos::keep_all();
         Ok(match of.kind {
-            EndpointKind::Client => Self::Client(session.add_client(of, role)?),
-            EndpointKind::Server => Self::Server(session.add_server(of, role)),
+            EndpointKind::Client => Self::Client(session.add_client(of, role, all)?),
+            EndpointKind::Server => Self::Server(session.add_server(of, role, all)),
             _ => Self::Publisher(session.add_asserted(of, role)?),
         })
     }

@@ -151,7 +151,7 @@ impl Lanes {
             return Ok(ring);
         }
         let place = self.room.take()?;
-        let ring = Arc::new(Writer::create(self.session.clone(), self.options)?);
+        let ring = Arc::new(Writer::create_for_calls(self.session.clone(), self.options)?);
         self.lock().insert(client, (ring.clone(), place));
         Ok(ring)
     }

@@ -20,6 +20,8 @@ const BURST: u64 = 16;
 /// The readers of one ring.
 pub(super) struct Audience {
     offered: Qos,
+    /// Whether it waits for KEEP_LAST readers, too: for what is within their depth.
+    heeds_depths: bool,
     /// The most samples that can ever stand.
     capacity: u64,
     readers: Vec<Attached>,
@@ -43,15 +45,12 @@ struct Attached {
 pub(super) struct Floors {
     /// Given up last: the windows of all readers, and what KEEP_ALL readers have not taken.
     pub(super) retained: u64,
-    /// Never given up: a RELIABLE, KEEP_ALL publisher's for its like in other sessions.
+    /// Never given up: a RELIABLE, KEEP_ALL publisher's for its like in other sessions, and what is
+    /// within the depth of those that read requests or responses there.
     pub(super) held: u64,
 }
 
 impl Attached {
-    fn keeps_all(&self) -> bool {
-        self.info.qos.history == History::KeepAll && !self.dead
-    }
-
     /// The next position that the reader takes, as it says; `None` when it has left.
     fn position(&self) -> Option<u64> {
         let lane = self.lane.words();
@@ -67,12 +66,19 @@ impl Attached {
     fn cursor(&self, head: u64) -> Option<u64> {
         self.position().map(|cursor| cursor.max(self.grant.first).min(head))
     }
+
+    /// The oldest position that it wants: KEEP_LAST passes over what is beyond its depth.
+    fn floor(&self, head: u64) -> Option<u64> {
+        let within = head.saturating_sub(depth(&self.info.qos));
+        self.cursor(head).map(|cursor| cursor.max(within))
+    }
 }
 
 impl Audience {
     pub(super) fn new(offered: Qos, capacity: u64, pool: Pool) -> Self {
         let mut audience = Self {
             offered,
+            heeds_depths: false,
             capacity,
             readers: Vec::new(),
             seats: Seats::new(pool),
@@ -81,6 +87,22 @@ impl Audience {
         };
         audience.changed();
         audience
+    }
+
+    /// Holds what is within its readers' depths, too.
+    pub(super) fn heed_depths(&mut self) {
+        self.heeds_depths = true;
+    }
+
+    /// The readers for whom more than the window is kept, each with whether the publisher waits for it.
+    fn heeded(&self) -> impl Iterator<Item = (&Attached, bool)> {
+        let all = self.heeds_depths;
+        let heeded = move |reader: &&Attached| {
+            !reader.dead && (all || reader.info.qos.history == History::KeepAll)
+        };
+        self.readers.iter().filter(heeded).map(move |reader| {
+            (reader, reader.info.peer.remote().is_some() && (all || holds(&reader.info.qos)))
+        })
     }
 
     pub(super) fn is_empty(&self) -> bool {
@@ -240,11 +262,11 @@ impl Audience {
     pub(super) fn floors(&self, head: u64) -> Floors {
         let holds = holds(&self.offered);
         let mut floors = Floors { retained: head.saturating_sub(self.window), held: u64::MAX };
-        for reader in self.readers.iter().filter(|reader| reader.keeps_all()) {
-            if let Some(cursor) = reader.cursor(head) {
-                floors.retained = floors.retained.min(cursor);
-                if holds && reader.info.peer.remote().is_some() && self::holds(&reader.info.qos) {
-                    floors.held = floors.held.min(cursor);
+        for (reader, waits) in self.heeded() {
+            if let Some(floor) = reader.floor(head) {
+                floors.retained = floors.retained.min(floor);
+                if holds && waits {
+                    floors.held = floors.held.min(floor);
                 }
             }
         }
@@ -277,13 +299,13 @@ impl Audience {
     pub(super) fn laggards(&self, tail: u64, head: u64) -> Option<(Gid, Vec<Arc<PeerSession>>)> {
         let mut worst = None;
         let mut peers = Vec::new();
-        for reader in self.readers.iter().filter(|reader| reader.keeps_all()) {
-            let Some(cursor) = reader.cursor(head).filter(|cursor| *cursor <= tail) else {
+        for (reader, _) in self.heeded().filter(|(_, waits)| *waits) {
+            let Some(floor) = reader.floor(head).filter(|floor| *floor <= tail) else {
                 continue;
             };
-            if let Some(peer) = reader.info.peer.remote().filter(|_| holds(&reader.info.qos)) {
+            if let Some(peer) = reader.info.peer.remote() {
                 peers.push(Arc::clone(peer));
-                worst = worst.into_iter().chain([(cursor, reader.info.gid)]).min();
+                worst = worst.into_iter().chain([(floor, reader.info.gid)]).min();
             }
         }
         worst.map(|(_, gid)| (gid, peers))

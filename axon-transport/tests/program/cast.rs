@@ -26,8 +26,11 @@ fn spec(topic: u64, hash: u64, qos: Qos) -> EndpointSpec {
     EndpointSpec { type_hash, ..EndpointSpec::new(format!("/t{topic}"), "test/Bytes", qos) }
 }
 
-fn service(number: u64) -> EndpointSpec {
-    EndpointSpec::new(format!("/s{number}"), "test/Echo", Qos::default())
+/// With any history: all of them go together.
+fn service(number: u64, profile: Qos) -> EndpointSpec {
+    let Qos { history, depth, .. } = profile;
+    let qos = Qos { history, depth, ..Qos::default() };
+    EndpointSpec::new(format!("/s{number}"), "test/Echo", qos)
 }
 
 /// The endpoints of a process, by the numbers that its test gives them.
@@ -144,13 +147,13 @@ pub(super) fn play() {
                 say(made.gid());
                 cast.subscriptions.insert(id, made);
             }
-            ("server", &[id, number, ..]) => {
-                let made = session.create_server(service(number)).unwrap();
+            ("server", &[id, number, _, qos]) => {
+                let made = session.create_server(service(number, profile(qos))).unwrap();
                 say(made.gid());
                 cast.servers.insert(id, made);
             }
-            ("client", &[id, number, ..]) => {
-                let made = session.create_client(service(number)).unwrap();
+            ("client", &[id, number, _, qos]) => {
+                let made = session.create_client(service(number, profile(qos))).unwrap();
                 say(made.gid());
                 cast.clients.insert(id, made);
             }

@@ -107,6 +107,16 @@ impl Modelled {
         }
     }
 
+    /// Of the requests of a client, or the responses of a server, it keeps the newest.
+    pub(super) fn keep_call(&mut self, other: &str, stamp: u64) {
+        let of_other = (other.to_owned(), 0)..=(other.to_owned(), u64::MAX);
+        self.calls.insert((other.to_owned(), stamp));
+        while self.calls.range(of_other.clone()).count() > self.depth() {
+            let oldest = self.calls.range(of_other.clone()).next().cloned();
+            oldest.map(|oldest| self.calls.remove(&oldest));
+        }
+    }
+
     pub(super) fn keep(&mut self, stamp: u64, len: u64) {
         self.samples.insert(stamp, len);
         while self.samples.len() > self.depth() {

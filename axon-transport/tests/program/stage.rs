@@ -141,13 +141,14 @@ impl Stage {
     /// A client asks all servers that there are.
     fn request(&mut self) {
         let Some(id) = self.pick(|m| m.kind == Kind::Client) else { return };
-        self.stamp += 1;
-        let (stamp, len) = (self.stamp, [0, 60, 5000, 70_000][self.dice.roll(4) as usize]);
-        let process = self.model[&id].process;
-        self.ask(process, &format!("ask {id} {stamp} {len}"));
         let client = self.model.remove(&id).unwrap();
-        for server in self.model.values_mut().filter(|other| client.goes_with(other)) {
-            server.calls.insert((client.gid.clone(), stamp));
+        for _ in 0..=self.dice.roll(4) {
+            self.stamp += 1;
+            let (stamp, len) = (self.stamp, [0, 60, 5000, 70_000][self.dice.roll(4) as usize]);
+            self.ask(client.process, &format!("ask {id} {stamp} {len}"));
+            for server in self.model.values_mut().filter(|other| client.goes_with(other)) {
+                server.keep_call(&client.gid, stamp);
+            }
         }
         self.model.insert(id, client);
     }
@@ -163,7 +164,7 @@ impl Stage {
         // A client that is gone gets nothing.
         for (client, stamp) in requests {
             if let Some(client) = self.model.values_mut().find(|other| other.gid == client) {
-                client.calls.insert((gid.clone(), stamp));
+                client.keep_call(&gid, stamp);
             }
         }
     }

@@ -12,8 +12,9 @@ const ENDS: [(bool, bool); 3] = [(false, true), (true, false), (false, false)];
 const CLIENTS: usize = 20;
 pub(crate) const CALLS: u64 = 50;
 
+/// Nothing that nobody took yet is passed over.
 pub(crate) fn service() -> EndpointSpec {
-    EndpointSpec::new("/add", "Add", Qos::default())
+    EndpointSpec::new("/add", "Add", Qos::keep_all())
 }
 
 /// Answers one request with its bytes reversed.
@@ -263,6 +264,46 @@ fn who_takes_no_responses_holds_its_own_back_and_nobody_elses() {
             let info = stuck.recv_response(&mut bytes, Some(PATIENCE)).expect("none is lost");
             assert_eq!(info.sequence, number + 1);
             assert_eq!(bytes, pattern(number, 50_000));
+        }
+    }
+}
+
+#[test]
+fn who_keeps_the_newest_only_gets_them_and_holds_nobody_back() {
+    const MANY: u64 = 500;
+    let host = host();
+    let _daemon = host.daemon();
+    let newest = Qos { depth: 3, ..Qos::default() };
+    for (serves, asks) in ENDS {
+        let (here, there) = (session(&host, "server", serves), session(&host, "client", asks));
+        let server = here.create_server(EndpointSpec { qos: newest, ..service() }).unwrap();
+        let client = there.create_client(EndpointSpec { qos: newest, ..service() }).unwrap();
+        assert!(client.wait_available(PATIENCE));
+        until("the server counts it", || server.clients() == [client.gid()]);
+        // Unless all that comes is taken or passed over the ring on one way would be full.
+        for number in 1..=MANY {
+            let sent = Instant::now() + PATIENCE;
+            while let Err(error) = client.send_request(&pattern(number, 50_000)) {
+                assert!(matches!(error, PublishError::Blocked { .. }), "{error}");
+                assert!(Instant::now() < sent, "held back for good");
+            }
+        }
+        let mut bytes = Vec::new();
+        let (mut last, mut taken) = (0, 0);
+        while last < MANY {
+            let info = server.recv_request(&mut bytes, Some(PATIENCE)).expect("the newest");
+            assert!(info.sequence > last && bytes == pattern(info.sequence, 50_000));
+            (last, taken) = (info.sequence, taken + 1);
+        }
+        assert!(taken < MANY, "nothing was passed over");
+        for number in 1..=MANY {
+            respond(&server, client.gid(), number, &pattern(number, 50_000));
+        }
+        let mut last = 0;
+        while last < MANY {
+            let info = client.recv_response(&mut bytes, Some(PATIENCE)).expect("the newest");
+            assert!(info.sequence > last && bytes == pattern(info.sequence, 50_000));
+            last = info.sequence;
         }
     }
 }

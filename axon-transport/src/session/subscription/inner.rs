@@ -6,7 +6,7 @@ use super::slots::Slots;
 use crate::{
     graph::{Endpoint, EndpointKind},
     ids::Gid,
-    qos::Qos,
+    qos::{History, Qos},
     session::{
         OnNew,
         callback::Callback,
@@ -23,9 +23,11 @@ use crate::{
 /// with the handle.
 pub(in crate::session) struct SubscriptionInner {
     pub(in crate::session) endpoint: Endpoint,
-    /// What its readers request: what the endpoint does, but for a client's or a server's, which
-    /// lose nothing.
+    /// What its readers request.
     pub(in crate::session) qos: Qos,
+    /// How many samples stand of all its writers together. Of each alone it is what `qos` says: a
+    /// client's requests do not take the room of another's.
+    pub(super) shared_depth: Option<u32>,
     /// Whether it is never matched with publishers of its own session.
     pub(in crate::session) ignores_local: bool,
     /// Whether a writer's numbers rise: the responses of a server come in whatever order it likes.
@@ -45,23 +47,31 @@ impl SubscriptionInner {
         role: EndpointRole,
         stands_for: Vec<Gid>,
     ) -> Self {
-        let (stands_for, slots) = (Mutex::new(stands_for), Mutex::default());
-        let events = EndpointEvents::of_subscription(&endpoint.qos);
-        let (arrived, listens) = (Callback::default(), Mutex::new(false));
-        let service = matches!(endpoint.kind, EndpointKind::Server | EndpointKind::Client);
-        let qos = if service { Qos::keep_all() } else { endpoint.qos };
+        let qos = endpoint.qos;
+        let shared_depth = (qos.history == History::KeepLast).then_some(qos.depth);
+        Self { shared_depth, stands_for: stands_for.into(), ..Self::reading(endpoint, role, qos) }
+    }
+
+    /// The reading side of a client or server.
+    pub(in crate::session) fn of_service(endpoint: Endpoint, role: EndpointRole, qos: Qos) -> Self {
         let rising = endpoint.kind != EndpointKind::Client;
+        Self { rising, ..Self::reading(endpoint, role, qos) }
+    }
+
+    fn reading(endpoint: Endpoint, role: EndpointRole, qos: Qos) -> Self {
+        let events = EndpointEvents::of_subscription(&endpoint.qos);
         Self {
             endpoint,
             qos,
+            shared_depth: None,
             ignores_local: false,
-            rising,
+            rising: true,
             role,
             events,
-            stands_for,
-            slots,
-            arrived,
-            listens,
+            stands_for: Mutex::default(),
+            slots: Mutex::default(),
+            arrived: Callback::default(),
+            listens: Mutex::new(false),
         }
     }
 
@@ -91,7 +101,7 @@ impl SubscriptionInner {
         drop(listens);
         let (new, unread) = {
             let mut slots = self.lock();
-            (slots.new_arrivals(), slots.unread(&self.qos))
+            (slots.new_arrivals(), slots.unread(self.shared_depth))
         };
         // Of those that nobody was told of some may have been taken, or lost.
         self.arrived.replace(callback, |untold| (untold + new).min(unread));
@@ -121,6 +131,9 @@ impl SubscriptionInner {
         let mut mapped = Reader::map(options)?;
         if self.role == EndpointRole::Relay {
             mapped.tell_progress();
+        }
+        if matches!(self.endpoint.kind, EndpointKind::Server | EndpointKind::Client) {
+            mapped.tell_room();
         }
         Ok(mapped)
     }

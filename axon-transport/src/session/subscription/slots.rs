@@ -7,7 +7,6 @@ use std::{
 
 use crate::{
     ids::Gid,
-    qos::{History, Qos},
     session::clock,
     shm::{Grant, Lane, Location, Reader},
 };
@@ -135,13 +134,10 @@ impl Slots {
         arrived.saturating_sub(std::mem::replace(&mut self.arrived_before, arrived))
     }
 
-    /// Samples to be taken.
-    pub(super) fn unread(&self, qos: &Qos) -> u64 {
+    /// Samples to be taken: of all writers together at most `depth`, if they share one.
+    pub(super) fn unread(&self, depth: Option<u32>) -> u64 {
         let unread = self.slots.iter().map(|slot| slot.reader.unread()).sum::<u64>();
-        match qos.history {
-            History::KeepLast => unread.min(qos.depth.into()),
-            History::KeepAll => unread,
-        }
+        depth.map_or(unread, |depth| unread.min(depth.into()))
     }
 
     /// Losses since this was last asked.

@@ -6,7 +6,6 @@ use super::{MessageInfo, inner::SubscriptionInner, slots::Slots};
 use crate::{
     graph::Endpoint,
     ids::Gid,
-    qos::History,
     session::{clock, message::EndpointRole},
     shm::{Meta, Reader, Sample, TakeError},
 };
@@ -25,8 +24,8 @@ impl Slots {
         // A writer that repeats itself without end must not keep the lock: callers come back as
         // long as there is something to take.
         for _ in 0..REPEATS {
-            if of.qos.history == History::KeepLast && self.slots.len() > 1 {
-                self.skip_to_depth(u64::from(of.qos.depth));
+            if let Some(depth) = of.shared_depth.filter(|_| self.slots.len() > 1) {
+                self.skip_to_depth(depth.into());
             }
             let Some(index) = self.oldest() else {
                 // What was skipped may have been the last of a writer that is gone.
@@ -171,7 +170,7 @@ impl Slots {
         oldest.map(|(_, index)| index)
     }
 
-    /// KEEP_LAST(depth) counts over all publishers together.
+    /// A subscription's KEEP_LAST(depth) counts over all publishers together.
     fn skip_to_depth(&mut self, depth: u64) {
         let mut unread: u64 = self.slots.iter().map(|s| s.reader.unread()).sum();
         while unread > depth {

@@ -416,6 +416,11 @@ impl Reader {
         self.reads.tells = true;
     }
 
+    /// Has its publisher, in another session, woken when it may go on: one that waits for KEEP_LAST, too.
+    pub(crate) fn tell_room(&mut self) {
+        self.reads.tells |= self.reads.peer.remote().is_some();
+    }
+
     /// Wakes a publisher that waits for this reader.
     fn make_room_known(&self) {
         if self.reads.tells {

@@ -198,6 +198,17 @@ impl Writer {
         Ok(writer)
     }
 
+    /// As [`create`](Self::create), for requests or responses: of a KEEP_LAST reader in another session,
+    /// too, it gives up nothing that is within the depth.
+    pub(crate) fn create_for_calls(
+        session: Arc<SessionSegment>,
+        options: RingOptions,
+    ) -> Result<Self, ShmError> {
+        let writer = Self::create(session, options)?;
+        writer.lock().audience.heed_depths();
+        Ok(writer)
+    }
+
     /// The publisher's GID.
     pub fn gid(&self) -> Gid {
         self.options.gid
