@@ -26,6 +26,7 @@ mod pieces;
 mod pulse;
 mod queue;
 mod refusal;
+mod room;
 mod routes;
 mod routes_in;
 mod run;

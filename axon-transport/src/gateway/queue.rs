@@ -4,10 +4,11 @@
 //! counts it. Only KEEP_ALL makes the relay wait, which leaves its samples in the ring and so in
 //! time holds its publisher back.
 
-use std::collections::VecDeque;
+use std::{collections::VecDeque, sync::Arc};
 
 use bytes::Bytes;
 
+use super::room::Room;
 use crate::{
     ids::Gid,
     qos::{History, Qos, Reliability},
@@ -44,7 +45,7 @@ pub(super) enum Offered {
 pub(super) struct Queue {
     samples: VecDeque<Sample>,
     bytes: usize,
-    max_bytes: usize,
+    room: Arc<Room>,
     policy: Policy,
 }
 
@@ -54,7 +55,7 @@ enum Policy {
     Wait,
     /// RELIABLE and KEEP_LAST: drops the oldest beyond the bytes.
     Bytes,
-    /// BEST_EFFORT: drops the oldest beyond the history's depth too.
+    /// BEST_EFFORT: drops the oldest beyond the history's depth too. It takes no other's room.
     Depth(usize),
 }
 
@@ -66,41 +67,59 @@ impl Sample {
 }
 
 impl Queue {
-    /// The queue for a relay with `qos`, of at most `max_bytes` (one sample may always wait).
-    pub(super) fn new(qos: &Qos, max_bytes: usize) -> Self {
+    /// The queue for a relay with `qos`, in the room of a peer. One sample may always wait.
+    pub(super) fn new(qos: &Qos, room: Arc<Room>) -> Self {
         let policy = match (qos.reliability, qos.history) {
             (Reliability::Reliable, History::KeepAll) => Policy::Wait,
             (Reliability::Reliable, History::KeepLast) => Policy::Bytes,
             (Reliability::BestEffort, _) => Policy::Depth(qos.depth as usize),
         };
-        Self { samples: VecDeque::new(), bytes: 0, max_bytes, policy }
+        Self { samples: VecDeque::new(), bytes: 0, room, policy }
     }
 
     /// Puts `sample` at the end, as the policy says.
     pub(super) fn offer(&mut self, sample: Sample) -> Offered {
-        let size = sample.size();
-        let over = |q: &Self| !q.samples.is_empty() && q.bytes + size > q.max_bytes;
-        if self.policy == Policy::Wait && over(self) {
-            return Offered::Full(sample);
-        }
         let mut dropped = 0;
-        while over(self)
-            || matches!(self.policy, Policy::Depth(d) if self.samples.len() >= d.max(1))
-        {
-            if self.pop().is_none() {
-                break;
+        while !self.takes(sample.size()) {
+            if self.policy == Policy::Wait {
+                return Offered::Full(sample);
             }
-            dropped += 1;
+            dropped += u64::from(self.pop().is_some());
         }
-        self.bytes += size;
+        self.bytes += sample.size();
         self.samples.push_back(sample);
         Offered::Queued { dropped }
+    }
+
+    /// Whether there is room for a sample of this size, which is taken then.
+    fn takes(&self, size: usize) -> bool {
+        let fits = self.bytes + size <= self.room.of_queue();
+        match self.policy {
+            Policy::Depth(depth) => {
+                self.samples.is_empty() || fits && self.samples.len() < depth.max(1)
+            }
+            Policy::Wait | Policy::Bytes if fits && self.room.take(size) => true,
+            Policy::Wait | Policy::Bytes => {
+                let first = self.samples.is_empty();
+                if first {
+                    self.room.overtake(size);
+                }
+                first
+            }
+        }
+    }
+
+    fn give_back(&self, size: usize) {
+        if !matches!(self.policy, Policy::Depth(_)) {
+            self.room.give_back(size);
+        }
     }
 
     /// The oldest sample.
     pub(super) fn pop(&mut self) -> Option<Sample> {
         let sample = self.samples.pop_front()?;
         self.bytes -= sample.size();
+        self.give_back(sample.size());
         Some(sample)
     }
 
@@ -113,6 +132,12 @@ impl Queue {
             together += sample.size();
             into.push_back(sample);
         }
+    }
+}
+
+impl Drop for Queue {
+    fn drop(&mut self) {
+        self.give_back(self.bytes);
     }
 }
 
@@ -136,9 +161,14 @@ mod tests {
         }
     }
 
+    /// Room in which each queue has some for so many samples of so many bytes.
+    fn room(samples: usize, size: usize) -> Arc<Room> {
+        Room::new(32 * (samples * sample(0, size).size()) as u64)
+    }
+
     /// A queue with room for so many samples of so many bytes.
     fn queue(qos: &Qos, samples: usize, size: usize) -> Queue {
-        Queue::new(qos, samples * sample(0, size).size())
+        Queue::new(qos, room(samples, size).of_peer())
     }
 
     fn offer(queue: &mut Queue, sequence: u64, size: usize) -> Result<u64, u64> {
@@ -198,6 +228,33 @@ mod tests {
         assert_eq!(together(1500), [2, 3]);
         assert_eq!(together(1 << 20), [4]);
         assert!(together(1).is_empty());
+    }
+
+    #[test]
+    fn queues_towards_a_peer_share_its_room_and_give_it_back() {
+        let peer = room(4, 20).of_peer();
+        let [keeping, dropping] = [Qos::keep_all(), Qos::default()];
+        // A quarter of 32 times as much as one has: that of eight.
+        let mut full: Vec<_> = (0..8).map(|_| Queue::new(&keeping, peer.clone())).collect();
+        for queue in &mut full {
+            (1..=4).for_each(|sequence| assert_eq!(offer(queue, sequence, 20), Ok(0)));
+        }
+        let mut waits = Queue::new(&keeping, peer.clone());
+        assert_eq!(offer(&mut waits, 1, 20), Ok(0), "one may always wait");
+        assert_eq!(offer(&mut waits, 2, 20), Err(2));
+        let mut drops = Queue::new(&dropping, peer.clone());
+        assert_eq!(offer(&mut drops, 1, 20), Ok(0));
+        assert_eq!(offer(&mut drops, 2, 20), Ok(1));
+        // Best effort takes none of it.
+        let mut lossy = Queue::new(&Qos::sensor_data(), peer.clone());
+        (1..=4).for_each(|sequence| assert_eq!(offer(&mut lossy, sequence, 20), Ok(0)));
+        full[0].pop().unwrap();
+        drop(full.pop());
+        for sequence in 2..=4 {
+            assert_eq!(offer(&mut waits, sequence, 20), Ok(0));
+        }
+        assert_eq!(offer(&mut waits, 5, 20), Err(5), "it has as much as a queue may");
+        assert_eq!(offer(&mut drops, 3, 20), Ok(1), "no room is left");
     }
 
     #[test]

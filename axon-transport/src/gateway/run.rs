@@ -17,6 +17,7 @@ use super::{
     hub::{Event, Hub, Noticed, Shared},
     keyring::Keyring,
     pulse::Pulse,
+    room::Room,
     stand_in::StandIns,
 };
 use crate::{
@@ -74,6 +75,7 @@ async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
         offered: Arc::new(RwLock::new(HashMap::new())),
         domain: config.domain,
         max_message: config.max_message,
+        queues: Room::new(config.reliable_queue),
     });
     if let (Some(keyring), Some(key_events)) = (keyring, key_events) {
         tokio::spawn(keyring.run(key_events));

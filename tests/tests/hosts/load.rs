@@ -8,9 +8,11 @@ use axon_transport::{
     shm::PublishError,
 };
 
+use rustix::process::Signal;
+
 use super::{
     mode::classic,
-    pair::{Host, Plan},
+    pair::{Host, Plan, signal},
     process::PATIENCE,
 };
 
@@ -89,4 +91,33 @@ fn a_topic_that_nobody_reads_holds_up_its_own_publisher_alone() {
     for number in 1..=sent {
         assert_eq!((take(&unread, &mut bytes), bytes.len()), (number, large.len()));
     }
+}
+
+/// So many of a flood towards a daemon that stands still get there when it goes on.
+fn survivors(queue_mb: &str) -> usize {
+    const SAMPLES: u64 = 300;
+    let settings = classic(&[("AXON_RELIABLE_QUEUE_MB", queue_mb)]);
+    let hosts = Plan::new([settings, classic(&[])]).start();
+    let newest = Qos { depth: 1000, ..Qos::default() };
+    let (publisher, subscription) = across(&hosts, "/newest", newest);
+    let daemon = hosts[1].status().pid;
+    signal(daemon, Signal::STOP);
+    let mut bytes = vec![0x5a; 300_000];
+    for number in 1..=SAMPLES {
+        assert_eq!(publisher.publish(&bytes).unwrap(), number);
+        assert!(publisher.wait_acknowledged(PATIENCE));
+    }
+    signal(daemon, Signal::CONT);
+    let mut taken = 0;
+    while take(&subscription, &mut bytes) < SAMPLES {
+        taken += 1;
+    }
+    taken
+}
+
+/// A queue may take a thirty-second of all: 2 MiB, and 32.
+#[test]
+fn what_waits_for_a_slow_peer_is_bounded_as_configured() {
+    let [few, many] = ["64", "1024"].map(survivors);
+    assert!(few + 80 < many, "{few} and {many} of 300 samples of 300 kB");
 }

@@ -29,6 +29,7 @@ use super::{
     peer::{GraphTaken, Peer},
     pulse::Pulse,
     refusal::{Refusal, RefusedBy},
+    room::Room,
     routes::Offered,
     seal::Protection,
     stand_in::StandIns,
@@ -62,6 +63,8 @@ pub(super) struct Shared {
     pub(super) domain: u32,
     /// Largest payload.
     pub(super) max_message: u64,
+    /// What may wait to be sent reliably.
+    pub(super) queues: Arc<Room>,
 }
 
 /// Reads a lock; a panic elsewhere leaves nothing half-done.

@@ -23,6 +23,7 @@ use super::{
     keyring::lock,
     pulse::Pulse,
     queue::{Offered, Sample},
+    room::Room,
     routes::{Offered as Offer, RelaySpec, serves},
     seal::{Protection, sample},
     stand_in::StandIn,
@@ -120,8 +121,10 @@ pub(super) struct Carrier {
 struct Shared {
     carrier: watch::Receiver<Carrier>,
     counters: Arc<Counters>,
+    /// What may wait in the queues.
+    queues: Arc<Room>,
     /// A queue has room again.
-    room: Notify,
+    popped: Notify,
 }
 
 /// A source, and a sample of it for which there was no room.
@@ -155,19 +158,21 @@ pub(super) async fn run(
     first: Carrier,
     mut orders: mpsc::UnboundedReceiver<Order>,
     counters: Arc<Counters>,
+    queues: Arc<Room>,
     pulse: Pulse,
     offered: impl Fn(Gid) -> Option<Offer> + Send,
 ) {
     let (carrier, current) = watch::channel(first);
-    let shared = Arc::new(Shared { carrier: current, counters, room: Notify::new() });
+    let shared = Arc::new(Shared { carrier: current, counters, queues, popped: Notify::new() });
     let mut routes: HashMap<u32, Active> = HashMap::new();
     let mut beat = pulse.subscribe();
     loop {
         beat.mark_unchanged();
-        let room = shared.room.notified();
-        tokio::pin!(room);
-        // Registered before the queues are looked at, so that no pop in between is missed.
-        room.as_mut().enable();
+        let (popped, freed) = (shared.popped.notified(), shared.queues.freed());
+        tokio::pin!(popped, freed);
+        // Registered before the queues are looked at, so that nothing in between is missed.
+        popped.as_mut().enable();
+        freed.as_mut().enable();
         let mut moved = Moved::default();
         for (number, active) in &mut routes {
             active.move_samples(*number, &shared, &offered, &mut moved);
@@ -189,7 +194,8 @@ pub(super) async fn run(
                 None => return,
             },
             changed = beat.changed() => if changed.is_err() { return },
-            () = room => {}
+            () = popped => {}
+            () = freed => {}
             () = rested(moved.again) => {}
         }
     }

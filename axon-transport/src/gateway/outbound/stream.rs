@@ -30,8 +30,6 @@ use crate::{
 const TOGETHER: usize = 64 << 10;
 /// So many bytes a single sample always has.
 const ONE: usize = 1;
-/// Most that waits for one publisher.
-const PUBLISHER_BYTES: usize = 8 << 20;
 /// The priority of requests and responses above samples.
 const SERVICES: i32 = 1;
 /// A reliable stream with nothing to send is finished after this.
@@ -60,7 +58,7 @@ impl Stream {
         qos: &Qos,
         shared: Arc<Shared>,
     ) -> Self {
-        let queue = Arc::new(Mutex::new(Queue::new(qos, PUBLISHER_BYTES)));
+        let queue = Arc::new(Mutex::new(Queue::new(qos, Arc::clone(&shared.queues))));
         let filled = Arc::new(Notify::new());
         let reliable = qos.reliability == Reliability::Reliable;
         let writer = Writer {
@@ -101,7 +99,7 @@ impl Writer {
         if self.batch.is_empty() {
             lock(&self.queue).pop_together(bytes, &mut self.batch);
             if !self.batch.is_empty() {
-                self.shared.room.notify_one();
+                self.shared.popped.notify_one();
             }
         }
         !self.batch.is_empty()

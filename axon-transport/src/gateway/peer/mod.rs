@@ -87,8 +87,9 @@ impl Peer {
         let (orders, receiver) = mpsc::unbounded_channel();
         let graph = Arc::clone(&shared.offered);
         let offered = move |gid| super::hub::read(&graph).get(&gid).cloned();
-        let pulse = shared.pulse.clone();
-        tokio::spawn(outbound::run(carrier, receiver, Arc::clone(&counters), pulse, offered));
+        let (queues, pulse) = (shared.queues.of_peer(), shared.pulse.clone());
+        let sent = Arc::clone(&counters);
+        tokio::spawn(outbound::run(carrier, receiver, sent, queues, pulse, offered));
         Self {
             link,
             outbox,
