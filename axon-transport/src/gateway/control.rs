@@ -77,19 +77,19 @@ const MAX_QUEUED: usize = 200_000;
 /// Where control messages wait to be written. Cheap to clone.
 #[derive(Clone, Debug)]
 pub(super) struct Outbox {
-    messages: mpsc::UnboundedSender<Message>,
+    messages: mpsc::UnboundedSender<Option<Message>>,
     queued: Arc<AtomicUsize>,
     connection: Connection,
 }
 
 impl Outbox {
-    /// Writes what is sent until the connection or the last outbox ends.
+    /// Writes what is sent until the connection ends, or the last outbox, or one is told to.
     pub(super) fn spawn(connection: Connection, mut writer: ControlWriter) -> Self {
-        let (messages, mut receiver) = mpsc::unbounded_channel::<Message>();
+        let (messages, mut receiver) = mpsc::unbounded_channel::<Option<Message>>();
         let queued = Arc::new(AtomicUsize::new(0));
         let outbox = Self { messages, queued: Arc::clone(&queued), connection: connection.clone() };
         tokio::spawn(async move {
-            while let Some(message) = receiver.recv().await {
+            while let Some(Some(message)) = receiver.recv().await {
                 let result = writer.send(&message).await;
                 // Relaxed here and in `send`: a bound, not a hand-over.
                 queued.fetch_sub(weight(&message), Ordering::Relaxed);
@@ -112,7 +112,12 @@ impl Outbox {
         if self.queued.fetch_add(weight, Ordering::Relaxed) > MAX_QUEUED {
             return close(&self.connection, CloseCode::TooLarge, "control messages are not read");
         }
-        let _ = self.messages.send(message);
+        let _ = self.messages.send(Some(message));
+    }
+
+    /// Ends the control stream behind what was queued. What others queue now is lost.
+    pub(super) fn end(&self) {
+        let _ = self.messages.send(None);
     }
 }
 

@@ -4,7 +4,7 @@ use std::{sync::Arc, time::Duration};
 
 use axon_envelope::Route;
 use quinn::{Connection, RecvStream, VarInt};
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 
 use super::{
     counters::Counters,
@@ -43,6 +43,8 @@ pub(super) struct Inbound {
     pub(super) pulse: Pulse,
     /// Largest payload accepted.
     pub(super) max_message: u64,
+    /// Held by each stream that is read; its other end goes when what is left of them is not wanted.
+    pub(super) wanted: watch::Receiver<()>,
     /// What was refused, for the log and status.
     pub(super) refused: mpsc::Sender<(CloseCode, String)>,
 }
@@ -148,15 +150,16 @@ impl Inbound {
         Ok(true)
     }
 
-    /// Writes into the stand-in's ring; waits for a reader that keeps all as long as the link stands,
-    /// which in turn holds the peer's stream back.
+    /// Writes into the stand-in's ring; waits for a reader that keeps all, which in turn holds the peer's
+    /// stream back: as long as the link stands, and beyond that for what had come when a successor took
+    /// over.
     async fn publish(&self, stand_in: &StandIn, client: &Gid, meta: Meta, payload: &[u8]) {
         let mut waiting = None;
         loop {
             match stand_in.try_write(client, meta, payload) {
                 Ok(Written::Yes) => return self.counters.arrived(payload.len()),
                 Ok(Written::Nobody) => return self.counters.dropped("no_client", 1),
-                Err(PublishError::Blocked { .. }) if self.connection.close_reason().is_none() => {
+                Err(PublishError::Blocked { .. }) if self.wanted.has_changed().is_ok() => {
                     // Tried once more with the first beat: there may have been room since.
                     let (beat, _) = waiting.get_or_insert_with(|| {
                         (self.pulse.subscribe(), self.pulse.wait_for_room())

@@ -121,6 +121,22 @@ fn the_last_elected_stands_when_it_is_heard_of_last() {
 }
 
 #[test]
+fn both_sides_say_that_they_are_done_before_a_superseded_link_is_closed() {
+    let elector = Elector::new();
+    let (mut first, mut last) = (elector.meet(), elector.meet());
+    elector.elect(&mut first, 1);
+    elector.linked(&mut first);
+    elector.elect(&mut last, 2);
+    elector.linked(&mut last);
+    elector.stranger.hear_out(&mut first);
+    assert_eq!(first.connection.close_reason(), None);
+    elector.stranger.end(&mut first);
+    let why = elector.stranger.closed(&first);
+    assert!(why.contains("a successor took over"), "{why}");
+    assert_eq!((last.connection.close_reason(), elector.links()), (None, 1));
+}
+
+#[test]
 fn a_route_whose_end_was_lost_with_a_link_ends_or_gives_way_to_its_successor() {
     let elector = Elector::new();
     let session = elector.host.session("talker");

@@ -1,12 +1,22 @@
 //! Links that are made anew under a new key while samples flow.
 
+use std::{thread, time::Duration};
+
 use axon_tests::{Sizes, Tally};
+use axon_transport::{
+    qos::Qos,
+    session::{EndpointSpec, Publisher},
+    shm::PublishError,
+};
 
 use super::{
     mode::Kmes,
     pair::{Host, Plan},
-    process::{Node, until},
+    process::{Node, PATIENCE, until},
 };
+
+/// Longer than a superseded link is kept for nothing.
+const LONG: Duration = Duration::from_secs(6);
 
 fn renew(key_mode: &str, publish: impl Fn(&Host) -> Node) -> (u64, Tally) {
     let kmes = Kmes::start();
@@ -46,7 +56,7 @@ fn nothing_lost(sent: u64, tally: &Tally) {
     assert_eq!(*tally, Tally { taken: sent, first: 1, last: sent, ..Tally::default() });
 }
 
-/// What a link still has to carry when it is superseded has only so long, which a flood may exceed.
+/// What a link still has to carry when it is superseded has no longer than its key, which a flood may exceed.
 #[track_caller]
 fn in_order_and_counted(sent: u64, tally: &Tally) {
     assert_eq!((tally.repeated, tally.corrupt, tally.first), (0, 0, 1), "{tally:?}");
@@ -84,4 +94,59 @@ fn in_messages10_nothing_is_lost() {
 fn in_messages10_a_flood_stays_in_order() {
     let (sent, tally) = renew("messages10", flood);
     in_order_and_counted(sent, &tally);
+}
+
+/// Publishes until nothing more fits anywhere on the way; how many samples.
+fn fill(publisher: &Publisher) -> u64 {
+    let (mut sent, mut refused) = (0, 0);
+    while refused < 5 {
+        match publisher.publish(&[0x5a; 50_000]) {
+            Ok(sequence) => (sent, refused) = (sequence, 0),
+            Err(PublishError::Blocked { .. }) => refused += 1,
+            Err(error) => panic!("{error}"),
+        }
+    }
+    sent
+}
+
+/// A reader that takes nothing while the link is renewed, and for a while after that.
+fn what_waits_is_not_lost(key_mode: &str) {
+    let kmes = Kmes::start();
+    let more = [
+        ("AXON_QKD_KEY_MODE", key_mode),
+        ("AXON_QKD_SESSION_MAX_AGE", "20"),
+        ("AXON_RING_BUFFER_SIZE_MB", "1"),
+        ("AXON_MAX_MESSAGE_MB", "1"),
+    ];
+    let [a, b] = Plan::new([0, 1].map(|host| kmes.settings(host, &more))).start();
+    let (here, there) = (a.session("publisher"), b.session("subscription"));
+    let spec = || EndpointSpec::new("/kept", "test/Bytes", Qos::keep_all());
+    let subscription = there.create_subscription(spec()).unwrap();
+    let publisher = here.create_publisher(spec()).unwrap();
+    assert!(publisher.wait_matched(1, PATIENCE) && subscription.wait_matched(1, PATIENCE));
+    let since = b.link().since_unix_ms;
+    let sent = fill(&publisher);
+    until("the link is renewed", || {
+        b.status().links.first().is_some_and(|link| link.since_unix_ms != since)
+    });
+    thread::sleep(LONG);
+    let mut bytes = Vec::new();
+    for number in 1..=sent {
+        let info = subscription.recv(&mut bytes, Some(PATIENCE)).expect("what was sent");
+        assert_eq!((info.sequence, bytes.len()), (number, 50_000), "of {sent}");
+    }
+    // And the successor carries what comes.
+    let next = publisher.publish(b"next").unwrap();
+    assert_eq!(subscription.recv(&mut bytes, Some(PATIENCE)).unwrap().sequence, next);
+    assert_eq!(subscription.lost(), 0);
+}
+
+#[test]
+fn in_session_what_waits_for_its_reader_is_not_lost() {
+    what_waits_is_not_lost("session");
+}
+
+#[test]
+fn in_messages10_what_waits_for_its_reader_is_not_lost() {
+    what_waits_is_not_lost("messages10");
 }

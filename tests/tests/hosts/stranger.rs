@@ -121,6 +121,16 @@ impl Stranger {
         })
     }
 
+    /// Waits until the other side has nothing more to say, which it may have without closing.
+    pub(crate) fn hear_out(&self, met: &mut Met) {
+        self.limited(async { while next(&mut met.receive).await.is_some() {} });
+    }
+
+    /// Says that nothing more will be said.
+    pub(crate) fn end(&self, met: &mut Met) {
+        let _ = met.send.finish();
+    }
+
     /// Opens a stream for samples, once the other side lets it.
     pub(crate) fn open(&self, met: &Met) -> Result<SendStream, String> {
         self.limited(met.connection.open_uni()).map_err(|error| error.to_string())

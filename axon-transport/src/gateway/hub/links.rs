@@ -8,9 +8,9 @@ use std::{
     time::{Duration, Instant},
 };
 
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 
-use super::{Event, Hub, Link, Summary};
+use super::{Event, Hub, Link, Summary, leaving::Leaving};
 use crate::{
     daemon::bridge::ToControl,
     gateway::{
@@ -31,8 +31,6 @@ use crate::{
 
 /// A link that the lower id has not elected by then is closed.
 const ELECTION_TIMEOUT: Duration = Duration::from_secs(10);
-/// A superseded connection may still carry the end of its streams for this long.
-const HAND_OVER: Duration = Duration::from_secs(5);
 /// Peers, and connections that await their election.
 const MAX_LINKS: usize = 128 + 32;
 /// Connections of one peer: its link, one from each side in its place, and what these supersede.
@@ -73,9 +71,8 @@ impl Hub {
         if current.is_some_and(|c| !c.established.who.is(&who)) {
             return self.turn_away(established, TAKEN.into()).await;
         }
-        self.handed_over.retain(|(_, since)| since.elapsed() < HAND_OVER);
         let theirs = self.links.values().map(|link| &link.established.who);
-        let theirs = theirs.chain(self.handed_over.iter().map(|(who, _)| who));
+        let theirs = theirs.chain(self.leaving.values().filter_map(Leaving::who));
         let too_many = if theirs.filter(|other| other.is(&who)).count() >= MAX_LINKS_OF_PEER {
             Some("this peer has as many connections as it may")
         } else if current.is_none() && self.links.len() >= MAX_LINKS {
@@ -144,8 +141,12 @@ impl Hub {
             _ => Protection::Link,
         };
         let connection = established.connection;
+        let carrying = watch::Sender::new(());
+        let in_use = carrying.subscribe();
         let link = Link {
-            carrier: Carrier { connection: connection.clone(), protection },
+            carrier: Carrier { connection: connection.clone(), protection, in_use },
+            carrying,
+            reading: watch::Sender::new(()),
             connection,
             established: Summary {
                 hello: established.hello,
@@ -157,6 +158,7 @@ impl Hub {
             outbox: established.outbox,
             sealing: established.sealing,
             elected: None,
+            until: None,
             since_unix_ms: crate::daemon::status::unix_ms(),
         };
         self.links.insert(established.number, link);
@@ -193,6 +195,8 @@ impl Hub {
         }
         let Some(link) = self.links.get_mut(&number) else { return };
         link.elected = Some(elected);
+        let age = self.context.keyring.as_ref().map(|keyring| keyring.config.session_max_age);
+        link.until = age.map(|age| Instant::now() + age);
         let (connection, outbox) = (link.connection.clone(), link.outbox.clone());
         let (carrier, side) = (link.carrier.clone(), link.candidate.side);
         if let (Some(keyring), Some(sealing)) = (&self.context.keyring, link.sealing.take()) {
@@ -227,10 +231,12 @@ impl Hub {
     }
 
     pub(super) fn spawn_inbound(&self, number: u64, daemon: DaemonId, carrier: Carrier) {
-        let Some(peer) = self.peers.get(&daemon) else { return };
-        let who = self.links.get(&number).map(|l| self.peer_of(l)).unwrap_or_default();
+        let (Some(peer), Some(link)) = (self.peers.get(&daemon), self.links.get(&number)) else {
+            return;
+        };
+        let (who, wanted) = (self.peer_of(link), link.reading.subscribe());
         let (refused, mut violations) = mpsc::channel(1);
-        let inbound: Inbound = peer.inbound(carrier, &self.shared, refused);
+        let inbound: Inbound = peer.inbound(carrier, &self.shared, wanted, refused);
         tokio::spawn(inbound.run());
         let events = self.events.clone();
         tokio::spawn(async move {
@@ -238,24 +244,6 @@ impl Hub {
                 let _ = events.send(Event::Violation(number, who, code, reason)).await;
             }
         });
-    }
-
-    /// The old connection of a peer ends once its streams have been read.
-    pub(super) fn hand_over(&mut self, old: u64) {
-        if let Some(link) = self.links.remove(&old) {
-            self.handed_over.push((link.established.who.clone(), Instant::now()));
-            let keyring = self.context.keyring.clone();
-            tokio::spawn(async move {
-                // All of it: dropping the outbox would end the control stream, and with it the
-                // link at the peer, before the successor's ELECTED is read there.
-                let link = link;
-                tokio::time::sleep(HAND_OVER).await;
-                close(&link.connection, CloseCode::Replaced, "a successor took over");
-                if let Some(keyring) = keyring {
-                    keyring.forget_connection(old);
-                }
-            });
-        }
     }
 
     /// In qkd a link lives no longer than AXON_QKD_SESSION_MAX_AGE: its dialler makes a successor
@@ -305,10 +293,11 @@ impl Hub {
         for (number, why) in untrusted {
             self.violation(number, CloseCode::NotAllowed, why).await;
         }
+        self.close_untrusted_leaving(certificates);
     }
 
     pub(super) async fn link_ended(&mut self, number: u64, reason: &str) {
-        let Some(link) = self.links.remove(&number) else { return };
+        let Some(link) = self.links.remove(&number) else { return self.leaving_ended(number) };
         let refusal = link.connection.close_reason().map(|e| Refusal::of(&e));
         let reason = refusal.as_ref().map_or_else(|| reason.to_owned(), ToString::to_string);
         if let Some(keyring) = &self.context.keyring {
@@ -321,6 +310,7 @@ impl Hub {
             return;
         }
         self.peers.remove(&daemon);
+        self.abandon_leaving(daemon);
         tracing::info!(peer = %daemon, reason, "link down");
         if let Some(refusal) = refusal.filter(|r| r.by == RefusedBy::Peer) {
             let ordinary = ["GOODBYE", "DUPLICATE", "REPLACED"];

@@ -4,6 +4,7 @@
 //! reach it by events.
 
 mod graph;
+mod leaving;
 mod links;
 
 use std::{
@@ -14,10 +15,11 @@ use std::{
 
 use axon_tls::Negotiated;
 use tokio::{
-    sync::{Notify, mpsc},
+    sync::{Notify, mpsc, watch},
     time::sleep_until,
 };
 
+use self::leaving::Leaving;
 use super::{
     accept::Incomer,
     context::Context,
@@ -111,10 +113,16 @@ struct Link {
     candidate: Candidate,
     outbox: Outbox,
     carrier: Carrier,
+    /// Closed once nothing that was given to it waits for its acknowledgement; beside `carrier`.
+    carrying: watch::Sender<()>,
+    /// Held by what reads its streams, which gives up when it is dropped.
+    reading: watch::Sender<()>,
     /// Until the election: what then lets it announce keys.
     sealing: Option<Sealing>,
     /// What the lower id said of it, once elected.
     elected: Option<Elected>,
+    /// When its key is as old as a key may get, once elected.
+    until: Option<Instant>,
     since_unix_ms: u64,
 }
 
@@ -137,8 +145,8 @@ pub(super) struct Hub {
     control: mpsc::Sender<ToControl>,
     events: mpsc::Sender<Event>,
     links: HashMap<u64, Link>,
-    /// Whose superseded connections still carry the end of their streams, and since when.
-    handed_over: Vec<(Who, Instant)>,
+    /// Superseded links that still carry something.
+    leaving: HashMap<u64, Leaving>,
     peers: HashMap<DaemonId, Peer>,
     local: BTreeMap<Gid, Endpoint>,
 }
@@ -159,7 +167,7 @@ impl Hub {
             control,
             events,
             links: HashMap::new(),
-            handed_over: Vec::new(),
+            leaving: HashMap::new(),
             peers: HashMap::new(),
             local: BTreeMap::new(),
         }
@@ -294,7 +302,13 @@ impl Hub {
             return;
         }
         // What a superseded link still says was said again on its successor.
-        let Some(peer) = self.peers.get_mut(&daemon).filter(|p| p.link == number) else { return };
+        if self.peers.get(&daemon).is_none_or(|peer| peer.link != number) {
+            return;
+        }
+        if matches!(message, Message::Graph(_)) {
+            self.succeeded(daemon);
+        }
+        let Some(peer) = self.peers.get_mut(&daemon) else { return };
         let result = match message {
             Message::Graph(graph) => match peer.take_graph(graph) {
                 Ok(GraphTaken::Changed(change)) => {

@@ -115,6 +115,9 @@ pub(super) struct Carrier {
     pub(super) connection: Connection,
     /// How its messages are protected.
     pub(super) protection: Protection,
+    /// Held for as long as something that it carried, or may carry still, is not acknowledged.
+    #[expect(dead_code, reason = "what counts is that it is there")]
+    pub(super) in_use: watch::Receiver<()>,
 }
 
 /// What the streams of a peer share.

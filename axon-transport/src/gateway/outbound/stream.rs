@@ -251,7 +251,7 @@ impl Writer {
             if matches!(tokio::time::timeout(BEST_EFFORT_LIFE, write).await, Ok(Ok(()))) {
                 let _ = stream.finish();
                 self.batch.iter().for_each(|s| self.shared.counters.sent(s.payload.len()));
-                tokio::spawn(give_up_in_time(stream));
+                tokio::spawn(give_up_in_time(stream, carrier));
             } else {
                 // Dropping it would finish it, as if the message were whole.
                 let _ = stream.reset(VarInt::from_u32(CloseCode::Goodbye.code()));
@@ -261,8 +261,8 @@ impl Writer {
     }
 }
 
-/// Resets a finished stream that the peer has not acknowledged in time.
-async fn give_up_in_time(mut stream: SendStream) {
+/// Resets a finished stream that the peer has not acknowledged in time. Until then its carrier is in use.
+async fn give_up_in_time(mut stream: SendStream, _carrier: Carrier) {
     let acknowledged = tokio::time::timeout(BEST_EFFORT_LIFE, stream.stopped()).await;
     if acknowledged.is_err() {
         let _ = stream.reset(VarInt::from_u32(CloseCode::Goodbye.code()));

@@ -10,7 +10,7 @@ use std::{
     time::Duration,
 };
 
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 
 use self::{asking::Asked, serving::Served};
 use super::{
@@ -128,6 +128,7 @@ impl Peer {
         &self,
         carrier: Carrier,
         shared: &Shared,
+        wanted: watch::Receiver<()>,
         refused: mpsc::Sender<(crate::link::CloseCode, String)>,
     ) -> Inbound {
         Inbound {
@@ -137,6 +138,7 @@ impl Peer {
             counters: Arc::clone(&self.counters),
             pulse: shared.pulse.clone(),
             max_message: shared.max_message,
+            wanted,
             refused,
         }
     }
