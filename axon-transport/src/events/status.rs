@@ -274,15 +274,17 @@ impl Statuses {
 
     fn note(&mut self, kind: EventKind, count: u64) -> EventKind {
         debug_assert_eq!(kind.is_publishers(), self.publisher);
-        self.unread[kind as usize] += count;
+        let unread = &mut self.unread[kind as usize];
+        *unread = unread.saturating_add(count);
         kind
     }
 }
 
 impl Counted {
     fn add(&mut self, count: u64) {
-        self.total += count;
-        self.change += count;
+        // Losses are counted by numbers that another host says.
+        self.total = self.total.saturating_add(count);
+        self.change = self.change.saturating_add(count);
     }
 
     fn take(&mut self) -> Self {

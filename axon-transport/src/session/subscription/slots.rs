@@ -79,7 +79,9 @@ impl Gaps {
         let newest = self.before.map_or(sequence, |(newest, next)| {
             // What was overwritten on this side is counted there, by its positions.
             let missing = sequence.saturating_sub(newest).saturating_sub(1);
-            self.lost += missing.saturating_sub(position.saturating_sub(next));
+            let lost = missing.saturating_sub(position.saturating_sub(next));
+            // Numbers are whatever the other host says.
+            self.lost = self.lost.saturating_add(lost);
             newest.max(sequence)
         });
         self.before = Some((newest, position.saturating_add(1)));
@@ -99,7 +101,8 @@ impl Slot {
 
     /// Its samples that were lost, here and before they came here.
     pub(super) fn lost(&self) -> u64 {
-        self.reader.lost() + self.gaps.as_ref().map_or(0, |gaps| gaps.lost)
+        let before = self.gaps.as_ref().map_or(0, |gaps| gaps.lost);
+        self.reader.lost().saturating_add(before)
     }
 }
 
@@ -123,7 +126,7 @@ impl Slots {
     }
 
     pub(super) fn losses(&self) -> u64 {
-        self.lost + self.slots.iter().map(Slot::lost).sum::<u64>()
+        self.slots.iter().map(Slot::lost).fold(self.lost, u64::saturating_add)
     }
 
     /// Samples that came since this was last asked.
@@ -143,7 +146,7 @@ impl Slots {
     /// Losses since this was last asked.
     pub(super) fn new_losses(&mut self) -> u64 {
         let losses = self.losses();
-        losses - std::mem::replace(&mut self.lost_before, losses)
+        losses.saturating_sub(std::mem::replace(&mut self.lost_before, losses))
     }
 
     /// The lane that is, or from now on will be, the one for `writer`.
@@ -236,7 +239,8 @@ impl Slots {
         {
             let later = self.slots[newer].reader.grant().first;
             let slot = self.slots.remove(older);
-            self.lost += slot.lost() + slot.reader.unread_below(later);
+            self.lost = self.lost.saturating_add(slot.lost());
+            self.lost = self.lost.saturating_add(slot.reader.unread_below(later));
             self.arrived += slot.reader.arrived();
         }
     }
@@ -258,7 +262,7 @@ impl Slots {
         self.slots.retain(|s| {
             let keep = !s.over || !s.reader.is_drained();
             if !keep {
-                *lost += s.lost();
+                *lost = lost.saturating_add(s.lost());
                 *arrived += s.reader.arrived();
             }
             keep

@@ -113,7 +113,7 @@ impl Slots {
                 // What a relay passes over, nobody asked it to.
                 let relay = of.role == EndpointRole::Relay;
                 let skipped = if relay { slot.reader.skipped() } else { 0 };
-                let taken = sample.map(|sample| (sample, slot.lost() + skipped));
+                let taken = sample.map(|sample| (sample, slot.lost().saturating_add(skipped)));
                 self.sweep();
                 taken
             }
@@ -135,7 +135,7 @@ impl Slots {
     /// Samples of `writer` that were lost before they came to its ring here.
     pub(in crate::session) fn lost_elsewhere(&mut self, writer: &Gid, samples: u64) {
         if self.slots.iter().any(|slot| slot.reader.writer() == *writer) {
-            self.lost += samples;
+            self.lost = self.lost.saturating_add(samples);
         }
     }
 
@@ -185,7 +185,7 @@ impl Slots {
     fn discard(&mut self, index: usize, error: &TakeError, endpoint: &Endpoint) {
         tracing::error!(topic = endpoint.topic, %error, "a publisher's memory is not usable");
         let slot = self.slots.remove(index);
-        self.lost += slot.lost();
+        self.lost = self.lost.saturating_add(slot.lost());
         self.arrived += slot.reader.arrived();
         if !slot.over {
             self.discarded.push(slot.reader.writer());
@@ -195,6 +195,8 @@ impl Slots {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use super::*;
     use crate::{
         graph::EndpointKind,
@@ -203,10 +205,8 @@ mod tests {
         shm::{Peer, ReaderInfo, ReaderOptions, RingOptions, SessionSegment, Writer},
     };
 
-    #[test]
-    fn nobody_is_woken_at_once_for_a_sample_that_there_is_no_memory_for() {
-        let session = SessionSegment::create(SessionId::random()).unwrap();
-        let [writer, reader] = [1, 2].map(|number| Gid::new(session.id(), number));
+    /// A subscription's reader of a publisher of the same session, which is made for it.
+    fn reading(session: &Arc<SessionSegment>, writer: Gid, reader: Gid) -> (Writer, Reader) {
         let (qos, peer) = (Qos::default(), Peer::Local(session.clone()));
         let options = RingOptions { gid: writer, qos, budget: 0, max_message: 10, expected: 0 };
         let publisher = Writer::create(session.clone(), options).unwrap();
@@ -215,24 +215,36 @@ mod tests {
         let info =
             ReaderInfo { gid: reader, lane: at, qos, peer: peer.clone(), stands_for: Vec::new() };
         let (grant, ring) = (publisher.attach(info).unwrap(), publisher.location());
-        let mut slots = Slots::default();
         let options =
             ReaderOptions { reader, writer, peer, ring, lane, grant, qos, max_message: 10 };
-        slots.add(Reader::map(options).unwrap(), false);
-        publisher.publish_next(0, b"sample").unwrap();
-        assert!(slots.has_data());
+        (publisher, Reader::map(options).unwrap())
+    }
+
+    fn subscription(gid: Gid) -> SubscriptionInner {
         let endpoint = Endpoint {
-            gid: reader,
+            gid,
             kind: EndpointKind::Subscription,
             topic: "/t".into(),
             type_name: "T".into(),
             type_hash: Vec::new(),
-            qos,
+            qos: Qos::default(),
             node: String::new(),
             namespace: String::new(),
             enclave: String::new(),
         };
-        let inner = SubscriptionInner::new(endpoint, EndpointRole::Application, Vec::new());
+        SubscriptionInner::new(endpoint, EndpointRole::Application, Vec::new())
+    }
+
+    #[test]
+    fn nobody_is_woken_at_once_for_a_sample_that_there_is_no_memory_for() {
+        let session = SessionSegment::create(SessionId::random()).unwrap();
+        let [writer, gid] = [1, 2].map(|number| Gid::new(session.id(), number));
+        let (publisher, reader) = reading(&session, writer, gid);
+        let mut slots = Slots::default();
+        slots.add(reader, false);
+        publisher.publish_next(0, b"sample").unwrap();
+        assert!(slots.has_data());
+        let inner = subscription(gid);
         let none = |_: &mut Reader| Err::<Option<(Meta, ())>, _>(TakeError::NoMemory { len: 6 });
         assert!(slots.take(none, &inner).is_none() && !slots.has_data());
         // Whoever asks nevertheless gets it, if it can be had.
@@ -240,5 +252,34 @@ mod tests {
         let take = |reader: &mut Reader| Ok(reader.take(&mut out)?.map(|taken| (taken.meta, ())));
         assert!(slots.take(take, &inner).is_some());
         assert_eq!(out, b"sample");
+    }
+
+    #[test]
+    fn whatever_numbers_other_hosts_say_losses_can_be_counted() {
+        let session = SessionSegment::create(SessionId::random()).unwrap();
+        let [gid, writers @ ..] = [1, 2, 3].map(|number| Gid::new(session.id(), number));
+        let (mut slots, inner, mut out) = (Slots::default(), subscription(gid), Vec::new());
+        let mut publishers = Vec::new();
+        for writer in writers {
+            let (publisher, reader) = reading(&session, writer, gid);
+            slots.add(reader, true);
+            for sequence in [1, u64::MAX] {
+                publisher.publish(Meta { sequence, source_timestamp: 0 }, b"sample").unwrap();
+            }
+            publishers.push(publisher);
+        }
+        let mut numbers = Vec::new();
+        let mut take = |slots: &mut Slots| {
+            let take = |reader: &mut Reader| Ok(reader.take(&mut out)?.map(|t| (t.meta, ())));
+            slots.take(take, &inner)
+        };
+        while let Some((info, ())) = take(&mut slots) {
+            numbers.push(info.sequence);
+        }
+        numbers.sort_unstable();
+        assert_eq!(numbers, [1, 1, u64::MAX, u64::MAX]);
+        assert_eq!((slots.new_losses(), slots.losses()), (u64::MAX, u64::MAX));
+        assert!(writers.iter().all(|writer| slots.end(writer)));
+        assert_eq!((slots.new_losses(), slots.losses()), (0, u64::MAX));
     }
 }
