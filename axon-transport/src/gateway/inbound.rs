@@ -94,6 +94,7 @@ impl Inbound {
             return End::Finished;
         };
         let _feeding = feeding.lock().await;
+        stream.take_many();
         let from = From { number, route, gid };
         let mut body = Vec::new();
         loop {

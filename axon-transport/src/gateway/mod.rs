@@ -23,6 +23,8 @@ mod keyring;
 mod outbound;
 mod peer;
 mod pieces;
+#[cfg(test)]
+mod played;
 mod pulse;
 mod queue;
 mod refusal;
