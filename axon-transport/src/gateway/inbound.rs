@@ -1,6 +1,9 @@
 //! Samples from a peer: data streams in, stand-ins out (`docs/formats.md`, section 7).
 
-use std::{sync::Arc, time::Duration};
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use axon_envelope::Route;
 use quinn::{Connection, RecvStream, VarInt};
@@ -18,6 +21,7 @@ use super::{
 use crate::{
     ids::Gid,
     link::CloseCode,
+    seldom::Seldom,
     session::Written,
     shm::{Meta, PublishError},
 };
@@ -45,6 +49,8 @@ pub(super) struct Inbound {
     pub(super) max_message: u64,
     /// Held by each stream that is read; its other end goes when what is left of them is not wanted.
     pub(super) wanted: watch::Receiver<()>,
+    /// Samples that could not be published here, for the log.
+    pub(super) losses: Arc<Seldom>,
     /// What was refused, for the log and status.
     pub(super) refused: mpsc::Sender<(CloseCode, String)>,
 }
@@ -170,8 +176,11 @@ impl Inbound {
                 }
                 Err(error) => {
                     self.counters.dropped("ring", 1);
-                    let gid = stand_in.gid();
-                    return tracing::warn!(%gid, %error, "a sample from a peer is lost");
+                    if let Some(samples) = self.losses.count(Instant::now()) {
+                        let gid = stand_in.gid();
+                        tracing::warn!(%gid, %error, samples, "samples from a peer are lost");
+                    }
+                    return;
                 }
             }
         }

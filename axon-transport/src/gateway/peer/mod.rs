@@ -139,6 +139,7 @@ impl Peer {
             pulse: shared.pulse.clone(),
             max_message: shared.max_message,
             wanted,
+            losses: Arc::default(),
             refused,
         }
     }
