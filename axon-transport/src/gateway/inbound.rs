@@ -12,6 +12,7 @@ use tokio::sync::{mpsc, watch};
 use super::{
     counters::Counters,
     establish::close,
+    intake::Intake,
     pieces::Pieces,
     pulse::Pulse,
     routes_in::RoutesIn,
@@ -49,6 +50,8 @@ pub(super) struct Inbound {
     pub(super) max_message: u64,
     /// Held by each stream that is read; its other end goes when what is left of them is not wanted.
     pub(super) wanted: watch::Receiver<()>,
+    /// Memory for what comes.
+    pub(super) intake: Arc<Intake>,
     /// Samples that could not be published here, for the log.
     pub(super) losses: Arc<Seldom>,
     /// What was refused, for the log and status.
@@ -129,31 +132,40 @@ impl Inbound {
             let text = format!("a message of {length} bytes, at most {limit} are allowed");
             return Err((CloseCode::TooLarge, text));
         }
-        // Grows with what really arrives, not with what the length claims.
+        let mut room = self.intake.room(length as usize).await;
+        // There is room for as much as the length claims, of which what really arrives is used.
         body.clear();
+        body.reserve_exact(length as usize);
         let mut left = length as usize;
         while left > 0 {
             let Some(piece) = stream.next(left).await else { return Ok(false) };
             body.extend_from_slice(&piece);
             left -= piece.len();
         }
-        let opened = self.protection.open(body, from.route, self.max_message).map_err(|e| {
+        let refused = |e: RefusedMessage| {
             let code = match e {
                 RefusedMessage::Envelope { .. } => CloseCode::Envelope,
                 RefusedMessage::Malformed(_) => CloseCode::Malformed,
             };
             (code, e.to_string())
-        })?;
+        };
+        let opened = self.protection.open(body, from.route).map_err(refused)?;
         let gid = writer(from.route.kind, from.gid, &opened.header)
             .map_err(|text| (CloseCode::Malformed, text.to_owned()))?;
+        if opened.header.compressed {
+            self.intake.expand(&mut room).await;
+        }
+        let payload = opened.payload(self.max_message).map_err(refused)?;
         let meta = Meta {
             sequence: opened.header.sequence,
             source_timestamp: opened.header.source_timestamp,
         };
         match self.routes.writer(from.number, gid).await {
-            Some(stand_in) => self.publish(&stand_in, &from.gid, meta, &opened.payload).await,
+            Some(stand_in) => self.publish(&stand_in, &from.gid, meta, &payload).await,
             None => self.counters.dropped("no_route", 1),
         }
+        drop(payload);
+        Intake::shrink(body);
         Ok(true)
     }
 

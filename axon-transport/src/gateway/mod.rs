@@ -19,6 +19,7 @@ mod frames;
 mod hub;
 mod identity;
 mod inbound;
+mod intake;
 mod keyring;
 mod outbound;
 mod peer;

@@ -1,7 +1,7 @@
 //! The body of a data message: the inner header and the payload, in `messages10` within an
 //! AXQKD001 envelope (`docs/formats.md`, sections 3 and 7).
 
-use std::{sync::Arc, time::Instant};
+use std::{borrow::Cow, sync::Arc, time::Instant};
 
 use axon_envelope::{Delivery, Kind, OpenError, Route, TAG_LEN, inner};
 
@@ -36,8 +36,30 @@ pub(super) enum Protection {
 pub(super) struct Opened<'a> {
     /// Publisher, sequence number, timestamp.
     pub(super) header: inner::Header,
-    /// The payload, decompressed where it was compressed.
-    pub(super) payload: std::borrow::Cow<'a, [u8]>,
+    /// The payload as it came.
+    sent: &'a [u8],
+}
+
+impl<'a> Opened<'a> {
+    /// The payload, decompressed where it was compressed, to at most `most` bytes.
+    ///
+    /// # Errors
+    /// [`RefusedMessage::Malformed`].
+    pub(super) fn payload(&self, most: u64) -> Result<Cow<'a, [u8]>, RefusedMessage> {
+        if !self.header.compressed {
+            return Ok(self.sent.into());
+        }
+        let length = u64::from(self.header.uncompressed_len);
+        if length > most {
+            let text = format!("{length} bytes when decompressed, at most {most} allowed");
+            return Err(RefusedMessage::Malformed(text));
+        }
+        let payload = zstd::bulk::decompress(self.sent, length as usize)
+            .ok()
+            .filter(|p| p.len() as u64 == length)
+            .ok_or_else(|| RefusedMessage::Malformed("not one zstd frame as declared".into()))?;
+        Ok(payload.into())
+    }
 }
 
 /// Why a message is refused.
@@ -128,7 +150,7 @@ impl Protection {
         }
     }
 
-    /// Opens `body` in place. `max_payload` bounds what decompression may yield.
+    /// Opens `body` in place.
     ///
     /// # Errors
     /// [`RefusedMessage`]; nothing of the payload is handed on before its tag was verified.
@@ -136,7 +158,6 @@ impl Protection {
         &self,
         body: &'a mut [u8],
         route: Route,
-        max_payload: u64,
     ) -> Result<Opened<'a>, RefusedMessage> {
         let plain: &[u8] = match self {
             Self::Link => body,
@@ -160,19 +181,7 @@ impl Protection {
         };
         let (header, payload) =
             inner::Header::decode(plain).map_err(|e| RefusedMessage::Malformed(e.to_string()))?;
-        if !header.compressed {
-            return Ok(Opened { header, payload: payload.into() });
-        }
-        let length = u64::from(header.uncompressed_len);
-        if length > max_payload {
-            let text = format!("{length} bytes when decompressed, at most {max_payload} allowed");
-            return Err(RefusedMessage::Malformed(text));
-        }
-        let payload = zstd::bulk::decompress(payload, length as usize)
-            .ok()
-            .filter(|p| p.len() as u64 == length)
-            .ok_or_else(|| RefusedMessage::Malformed("not one zstd frame as declared".into()))?;
-        Ok(Opened { header, payload: payload.into() })
+        Ok(Opened { header, sent: payload })
     }
 }
 

@@ -18,6 +18,7 @@ use super::{
     counters::Counters,
     hub::{Event, Shared},
     inbound::Inbound,
+    intake::Intake,
     outbound::{self, Carrier},
     routes::RouteKey,
     routes_in::RoutesIn,
@@ -51,6 +52,8 @@ pub(super) struct Peer {
     /// Routes that this side asked for.
     asked: BTreeMap<RouteKey, Asked>,
     routes_in: Arc<RoutesIn>,
+    /// Memory for what comes from it, over whichever link.
+    intake: Arc<Intake>,
     /// Routes that the peer asked for.
     served: HashMap<u32, Served>,
     /// When each publisher here that has a lease was alive, as the peer was told.
@@ -102,6 +105,7 @@ impl Peer {
             next_route: 1,
             asked: BTreeMap::new(),
             routes_in: Arc::default(),
+            intake: Arc::new(Intake::new(shared.max_message)),
             served: HashMap::new(),
             told_alive: BTreeMap::new(),
             answering: BTreeSet::new(),
@@ -139,6 +143,7 @@ impl Peer {
             pulse: shared.pulse.clone(),
             max_message: shared.max_message,
             wanted,
+            intake: Arc::clone(&self.intake),
             losses: Arc::default(),
             refused,
         }
