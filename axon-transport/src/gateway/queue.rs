@@ -6,6 +6,7 @@
 
 use std::{collections::VecDeque, sync::Arc};
 
+use axon_envelope::Delivery;
 use bytes::Bytes;
 
 use super::room::Room;
@@ -14,6 +15,9 @@ use crate::{
     qos::{History, Qos, Reliability},
     session::MessageInfo,
 };
+
+/// So many bytes a single sample always has.
+const ONE: usize = 1;
 
 /// One sample on its way to a peer.
 #[derive(Debug)]
@@ -47,6 +51,8 @@ pub(super) struct Queue {
     bytes: usize,
     room: Arc<Room>,
     policy: Policy,
+    /// Nobody takes from it any more.
+    over: bool,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -59,6 +65,16 @@ enum Policy {
     Depth(usize),
 }
 
+impl Policy {
+    fn of(qos: &Qos) -> Self {
+        match (qos.reliability, qos.history) {
+            (Reliability::Reliable, History::KeepAll) => Self::Wait,
+            (Reliability::Reliable, History::KeepLast) => Self::Bytes,
+            (Reliability::BestEffort, _) => Self::Depth(qos.depth as usize),
+        }
+    }
+}
+
 impl Sample {
     /// What it takes of a queue's room: an empty one, too, is somewhere.
     fn size(&self) -> usize {
@@ -69,12 +85,38 @@ impl Sample {
 impl Queue {
     /// The queue for a relay with `qos`, in the room of a peer. One sample may always wait.
     pub(super) fn new(qos: &Qos, room: Arc<Room>) -> Self {
-        let policy = match (qos.reliability, qos.history) {
-            (Reliability::Reliable, History::KeepAll) => Policy::Wait,
-            (Reliability::Reliable, History::KeepLast) => Policy::Bytes,
-            (Reliability::BestEffort, _) => Policy::Depth(qos.depth as usize),
-        };
-        Self { samples: VecDeque::new(), bytes: 0, room, policy }
+        Self { samples: VecDeque::new(), bytes: 0, room, policy: Policy::of(qos), over: false }
+    }
+
+    /// From now on it is for a relay with `qos`: one that asks for more, or less, has taken over. What
+    /// waits already may be more than there is room for.
+    pub(super) fn serve(&mut self, qos: &Qos) {
+        let before = self.delivery();
+        self.policy = Policy::of(qos);
+        match (before, self.delivery()) {
+            (Delivery::BestEffort, Delivery::Reliable) => self.room.overtake(self.bytes),
+            (Delivery::Reliable, Delivery::BestEffort) => self.room.give_back(self.bytes),
+            _ => {}
+        }
+    }
+
+    /// How what is in it is to be delivered.
+    pub(super) fn delivery(&self) -> Delivery {
+        match self.policy {
+            Policy::Wait | Policy::Bytes => Delivery::Reliable,
+            Policy::Depth(_) => Delivery::BestEffort,
+        }
+    }
+
+    /// Whoever takes from it wants to end: it may, unless there is something in it.
+    pub(super) fn end(&mut self) -> bool {
+        self.over = self.samples.is_empty();
+        self.over
+    }
+
+    /// Whether nobody takes from it any more.
+    pub(super) fn is_over(&self) -> bool {
+        self.over
     }
 
     /// Puts `sample` at the end, as the policy says.
@@ -123,8 +165,9 @@ impl Queue {
         Some(sample)
     }
 
-    /// The oldest samples, until they have `bytes` together or none is left.
+    /// The oldest samples, until they have `bytes` together or none is left; of BEST_EFFORT one.
     pub(super) fn pop_together(&mut self, bytes: usize, into: &mut VecDeque<Sample>) {
+        let bytes = if self.delivery() == Delivery::Reliable { bytes } else { ONE };
         let mut together = 0;
         while together < bytes
             && let Some(sample) = self.pop()
@@ -255,6 +298,58 @@ mod tests {
         }
         assert_eq!(offer(&mut waits, 5, 20), Err(5), "it has as much as a queue may");
         assert_eq!(offer(&mut drops, 3, 20), Ok(1), "no room is left");
+    }
+
+    #[test]
+    fn who_takes_over_is_served_as_it_asks_from_the_next_sample_on() {
+        let mut queue = queue(&Qos { depth: 1, ..Qos::sensor_data() }, 2, 10);
+        assert_eq!((offer(&mut queue, 1, 10), offer(&mut queue, 2, 10)), (Ok(0), Ok(1)));
+        queue.serve(&Qos::keep_all());
+        assert_eq!(queue.delivery(), Delivery::Reliable);
+        assert_eq!((offer(&mut queue, 3, 10), offer(&mut queue, 4, 10)), (Ok(0), Err(4)));
+        queue.serve(&Qos::default());
+        assert_eq!(offer(&mut queue, 4, 10), Ok(1));
+        queue.serve(&Qos { depth: 1, ..Qos::sensor_data() });
+        assert_eq!((offer(&mut queue, 5, 10), queue.delivery()), (Ok(2), Delivery::BestEffort));
+    }
+
+    #[test]
+    fn who_takes_over_takes_the_room_and_gives_it_back() {
+        let daemon = room(2, 10);
+        let peer = daemon.of_peer();
+        let all = peer.of_queue() * 8;
+        for (qos, next) in
+            [(Qos::sensor_data(), Qos::keep_all()), (Qos::keep_all(), Qos::sensor_data())]
+        {
+            let mut queue = Queue::new(&qos, peer.clone());
+            (1..=2).for_each(|sequence| assert_eq!(offer(&mut queue, sequence, 10), Ok(0)));
+            queue.serve(&next);
+            assert_eq!(peer.take(all), next.reliability == Reliability::BestEffort);
+            if next.reliability == Reliability::BestEffort {
+                peer.give_back(all);
+            }
+            drop(queue);
+            assert!(peer.take(all), "nothing is left of it");
+            peer.give_back(all);
+        }
+    }
+
+    #[test]
+    fn it_does_not_end_with_something_in_it() {
+        let mut queue = queue(&Qos::keep_all(), 2, 10);
+        assert_eq!(offer(&mut queue, 1, 10), Ok(0));
+        assert!(!queue.end() && !queue.is_over());
+        queue.pop().unwrap();
+        assert!(queue.end() && queue.is_over());
+    }
+
+    #[test]
+    fn best_effort_goes_one_by_one() {
+        let mut queue = queue(&Qos::sensor_data(), 9, 1);
+        (1..=2).for_each(|sequence| assert_eq!(offer(&mut queue, sequence, 1), Ok(0)));
+        let mut into = VecDeque::new();
+        queue.pop_together(1 << 20, &mut into);
+        assert_eq!(into.len(), 1);
     }
 
     #[test]

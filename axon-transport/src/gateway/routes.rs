@@ -1,7 +1,10 @@
 //! Which topics a peer must send here, and under which QoS the gateway asks for them on the
 //! other side: plain data in, data out.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::{
+    cmp::Reverse,
+    collections::{BTreeMap, BTreeSet},
+};
 
 use axon_envelope::Kind;
 
@@ -9,7 +12,7 @@ use crate::{
     graph::{Endpoint, EndpointKind, Pairing, pairing, reads, writes},
     ids::Gid,
     link::Subscriber,
-    qos::{Durability, History, Qos, Reliability, compatible},
+    qos::{Durability, History, Qos, Reliability},
 };
 
 /// What a route carries: samples, requests or responses, of one name and type.
@@ -91,67 +94,67 @@ pub(super) fn wanted<'a>(
 pub(super) struct RelaySpec {
     /// What it requests locally.
     pub(super) qos: Qos,
+    /// How many samples the deepest of those it stands for wants to wait at most.
+    pub(super) depth: u32,
     /// The hash of its type, where the peer's subscriptions know it.
     pub(super) type_hash: Vec<u8>,
     /// The peer's subscriptions that it stands for.
     pub(super) stands_for: Vec<Gid>,
 }
 
-/// The relays of a topic's route. `hash` gives the hash of a subscription's type.
+impl RelaySpec {
+    /// Whether it is the relay that `other` is, for the same subscriptions or for others.
+    pub(super) fn is(&self, other: &Self) -> bool {
+        self.qos == other.qos && self.type_hash == other.type_hash
+    }
+
+    /// How what it sends is queued.
+    pub(super) fn queued(&self) -> Qos {
+        Qos { depth: self.depth, ..self.qos }
+    }
+}
+
+/// The relays of a topic's route, those that ask for more first. `hash` gives the hash of a
+/// subscription's type.
 ///
 /// Subscriptions are grouped by reliability, durability and type hash, because a relay must match
 /// exactly the publishers that its subscriptions match, and because only a reliable one may hold a
-/// publisher back. A publisher that two relays match is sent once, by the first that asks for more;
-/// see [`serves`].
+/// publisher back; and by how much they keep, because which relay stands for a subscription must not
+/// change when others come or go: it would miss what is published meanwhile. So a publisher may be read
+/// by several; [`crate::session::merge`] sends each sample once.
 pub(super) fn relays(subscribers: &[Subscriber], hash: impl Fn(&Gid) -> Vec<u8>) -> Vec<RelaySpec> {
-    let mut groups: BTreeMap<(bool, bool, Vec<u8>), RelaySpec> = BTreeMap::new();
+    let mut groups: BTreeMap<_, RelaySpec> = BTreeMap::new();
     for subscriber in subscribers {
-        let (qos, type_hash) = (subscriber.qos, hash(&subscriber.gid));
-        let best_effort = qos.reliability == Reliability::BestEffort;
-        let key = (best_effort, qos.durability == Durability::Volatile, type_hash.clone());
-        let group = groups.entry(key).or_insert_with(|| RelaySpec {
-            // Deadline, lifespan and liveliness are judged where the subscription lives.
-            qos: Qos {
-                deadline: None,
-                lifespan: None,
-                lease: None,
-                liveliness: crate::qos::Liveliness::Automatic,
-                ..qos
-            },
-            type_hash,
-            stands_for: Vec::new(),
-        });
-        group.qos.depth = group.qos.depth.max(qos.depth);
-        if qos.history == History::KeepAll {
-            group.qos.history = History::KeepAll;
-        }
+        let (offered, type_hash) = (subscriber.qos, hash(&subscriber.gid));
+        let keeps_all = offered.history == History::KeepAll;
+        // Deadline, lifespan and liveliness are judged where the subscription lives.
+        let qos = Qos {
+            reliability: offered.reliability,
+            durability: offered.durability,
+            history: offered.history,
+            depth: if keeps_all { Qos::keep_all().depth } else { class(offered.depth) },
+            ..Qos::default()
+        };
+        let key = (
+            qos.reliability == Reliability::BestEffort,
+            !keeps_all,
+            Reverse(qos.depth),
+            qos.durability == Durability::Volatile,
+            type_hash.clone(),
+        );
+        let new = RelaySpec { qos, depth: 0, type_hash, stands_for: Vec::new() };
+        let group = groups.entry(key).or_insert(new);
+        group.depth = group.depth.max(offered.depth);
         group.stands_for.push(subscriber.gid);
     }
     groups.into_values().collect()
 }
 
-/// Which of a route's relays sends the samples of a publisher that offers `offered`: the first
-/// that it is compatible with, in the order of [`relays`] (reliable before best effort,
-/// transient local before volatile).
-pub(super) fn serves<'a>(
-    relays: impl IntoIterator<Item = &'a RelaySpec>,
-    offered: &Offered,
-) -> Option<usize> {
-    let hashes = |other: &[u8]| {
-        let own = &*offered.type_hash;
-        own.is_empty() || other.is_empty() || own == other
-    };
-    let goes = |r: &RelaySpec| compatible(&offered.qos, &r.qos).is_ok() && hashes(&r.type_hash);
-    relays.into_iter().position(goes)
-}
-
-/// What a local publisher offers.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Offered {
-    /// Its QoS.
-    pub(super) qos: Qos,
-    /// The hash of its type.
-    pub(super) type_hash: Vec<u8>,
+/// The depth of the relay that stands for a subscription of this depth: one of few, so that not each
+/// takes a relay of its own.
+fn class(depth: u32) -> u32 {
+    let classes = (0..u32::BITS).step_by(4).map(|bits| 1 << bits);
+    classes.skip(1).find(|class| *class >= depth).unwrap_or(u32::MAX)
 }
 
 #[cfg(test)]
@@ -219,31 +222,42 @@ mod tests {
         assert_eq!(key.other_way().kind, Kind::Request);
     }
 
-    #[test]
-    fn a_mixed_route_has_a_relay_per_group_and_sends_each_publisher_once() {
-        let reliable = Subscriber { gid: Gid([1; 16]), qos: Qos::keep_all() };
-        let best_effort = Subscriber { gid: Gid([2; 16]), qos: Qos::sensor_data() };
-        let latched = Subscriber {
-            gid: Gid([3; 16]),
-            qos: Qos { durability: Durability::TransientLocal, ..Qos::default() },
-        };
-        let specs = relays(&[best_effort, reliable.clone(), latched], |_| Vec::new());
-        assert_eq!(specs.len(), 3);
-        assert_eq!(specs[1].stands_for, vec![reliable.gid]);
-        assert_eq!(specs[1].qos.history, History::KeepAll);
-        let serves = |qos| serves(&specs, &Offered { qos, type_hash: vec![] });
-        let offer = Qos { durability: Durability::TransientLocal, ..Qos::default() };
-        assert_eq!(serves(offer), Some(0));
-        assert_eq!(serves(Qos::default()), Some(1));
-        assert_eq!(serves(Qos::sensor_data()), Some(2));
+    fn subscriber(number: u8, qos: Qos) -> Subscriber {
+        Subscriber { gid: Gid([number; 16]), qos }
     }
 
     #[test]
-    fn a_publisher_of_another_type_hash_is_nobodys() {
-        let subscriber = |number| Subscriber { gid: Gid([number; 16]), qos: Qos::default() };
-        let specs = relays(&[subscriber(1), subscriber(2)], |gid| vec![gid.0[0]]);
-        assert_eq!(specs.len(), 2);
-        let serves = |type_hash| serves(&specs, &Offered { qos: Qos::default(), type_hash });
-        assert_eq!((serves(vec![2]), serves(vec![3]), serves(vec![])), (Some(1), None, Some(0)));
+    fn a_mixed_route_has_a_relay_per_group_that_asks_for_most_first() {
+        let latched = Qos { durability: Durability::TransientLocal, ..Qos::default() };
+        let deep = Qos { depth: 17, ..Qos::default() };
+        let qos = [Qos::sensor_data(), Qos::default(), latched, deep, Qos::keep_all()];
+        let subscribers: Vec<_> = (0..).zip(qos).map(|(n, qos)| subscriber(n, qos)).collect();
+        let specs = relays(&subscribers, |_| Vec::new());
+        let order: Vec<u8> = specs.iter().map(|spec| spec.stands_for[0].0[0]).collect();
+        assert_eq!(order, [4, 3, 2, 1, 0]);
+        assert_eq!(specs[0].qos.history, History::KeepAll);
+    }
+
+    #[test]
+    fn who_stands_for_a_subscription_is_the_same_whoever_else_there_is() {
+        let of = |depths: &[u32]| {
+            let qos = |depth| Qos { depth, ..Qos::default() };
+            let all = (0..).zip(depths).map(|(n, depth)| subscriber(n, qos(*depth)));
+            relays(&all.collect::<Vec<_>>(), |_| Vec::new())
+        };
+        let stands_for = |specs: &[RelaySpec]| {
+            let its = specs.iter().find(|spec| spec.stands_for.contains(&Gid([0; 16])));
+            its.cloned().unwrap()
+        };
+        let alone = stands_for(&of(&[10]));
+        assert_eq!((alone.qos.depth, alone.queued().depth), (16, 10));
+        for others in [&[10, 1][..], &[10, 16], &[10, 17], &[10, u32::MAX, 300]] {
+            assert!(stands_for(&of(others)).is(&alone), "{others:?}");
+        }
+        let together = of(&[10, 16, 1]);
+        assert_eq!((together.len(), together[0].queued().depth), (1, 16));
+        let depths = [0, 16, 17, 257, 1 << 28, (1 << 28) + 1, u32::MAX];
+        let classes = [16, 16, 256, 4096, 1 << 28, u32::MAX, u32::MAX];
+        assert_eq!(depths.map(class), classes);
     }
 }

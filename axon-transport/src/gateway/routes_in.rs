@@ -2,14 +2,14 @@
 
 use std::{
     collections::HashMap,
-    sync::{Arc, PoisonError, RwLock, RwLockWriteGuard},
+    sync::{Arc, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard},
     time::Duration,
 };
 
 use axon_envelope::{Kind, Route};
 use tokio::sync::{Mutex, Notify};
 
-use super::{hub::read, stand_in::StandIn};
+use super::stand_in::StandIn;
 use crate::ids::Gid;
 
 /// How long a stream waits for its publisher: samples may be here before the graph that tells of it,
@@ -66,13 +66,13 @@ impl RoutesIn {
 
     /// What stands for `gid` here, as far as a route is fed from it.
     pub(super) fn stand_in(&self, gid: &Gid) -> Option<Arc<StandIn>> {
-        read(&self.routes).values().find_map(|route| route.writers.get(gid).cloned())
+        self.read().values().find_map(|route| route.writers.get(gid).cloned())
     }
 
     /// Looks, for a while, as long as there is such a route.
     async fn find<T>(&self, number: u32, look: impl Fn(&RouteIn) -> Option<T>) -> Option<T> {
         // Almost always it is there, and then nothing else is needed.
-        match read(&self.routes).get(&number).map(&look) {
+        match self.read().get(&number).map(&look) {
             Some(None) => {}
             Some(found) => return found,
             None => return None,
@@ -83,7 +83,7 @@ impl RoutesIn {
                 tokio::pin!(changed);
                 // Registered before the look, so that no change in between is missed.
                 changed.as_mut().enable();
-                match read(&self.routes).get(&number).map(&look) {
+                match self.read().get(&number).map(&look) {
                     Some(None) => {}
                     Some(found) => return found,
                     None => return None,
@@ -92,6 +92,10 @@ impl RoutesIn {
             }
         };
         tokio::time::timeout(ARRIVAL, found).await.ok().flatten()
+    }
+
+    fn read(&self) -> RwLockReadGuard<'_, HashMap<u32, RouteIn>> {
+        self.routes.read().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn write(&self) -> RwLockWriteGuard<'_, HashMap<u32, RouteIn>> {

@@ -1,9 +1,8 @@
 //! Starting the gateway on the calling thread.
 
 use std::{
-    collections::HashMap,
     net::{Ipv4Addr, SocketAddr},
-    sync::{Arc, RwLock},
+    sync::Arc,
     time::Duration,
 };
 
@@ -72,7 +71,6 @@ async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
         stand_ins: StandIns::default(),
         pulse: Pulse::start(&session)?,
         session,
-        offered: Arc::new(RwLock::new(HashMap::new())),
         domain: config.domain,
         max_message: config.max_message,
         queues: Room::new(config.reliable_queue),

@@ -123,20 +123,45 @@ impl StandIn {
         self.face().assert_alive();
     }
 
-    /// What goes to its host: the next request to a server, or response to a client.
-    pub(super) fn take(&self) -> Option<Sample> {
-        let mut payload = Vec::new();
+    /// The clients of whose calls there is something to be taken here: requests to a server, or a client's
+    /// responses.
+    pub(super) fn with_calls(&self) -> Vec<Gid> {
         match self.face() {
-            Face::Publisher(_) => None,
-            Face::Client(client) => {
-                let info = client.take_response(&mut payload)?;
-                Some(Sample { client: Some(self.gid), ..sample(info, payload) })
-            }
-            Face::Server(server) => {
-                let info = server.take_request(&mut payload)?;
-                Some(Sample { client: Some(info.publisher), ..sample(info, payload) })
-            }
+            Face::Publisher(_) => Vec::new(),
+            Face::Client(client) => client.has_response().then_some(self.gid).into_iter().collect(),
+            Face::Server(server) => server.with_requests(),
         }
+    }
+
+    /// Whether calls of this client are taken here.
+    pub(super) fn reads(&self, client: &Gid) -> bool {
+        match self.face() {
+            Face::Publisher(_) => false,
+            Face::Client(_) => *client == self.gid,
+            Face::Server(server) => server.reads(client),
+        }
+    }
+
+    /// The number of the next request of this client.
+    pub(super) fn next_of(&self, client: &Gid) -> Option<u64> {
+        match self.face() {
+            Face::Publisher(_) | Face::Client(_) => None,
+            Face::Server(server) => server.next_request_of(client),
+        }
+    }
+
+    /// What goes to its host: the next request of this client, or response to it.
+    pub(super) fn take_of(&self, client: &Gid) -> Option<Sample> {
+        let (info, payload) = match self.face() {
+            Face::Publisher(_) => return None,
+            Face::Client(own) => {
+                let mut payload = Vec::new();
+                let info = (*client == self.gid).then(|| own.take_response(&mut payload))??;
+                (info, payload)
+            }
+            Face::Server(server) => server.take_request_of(client)?,
+        };
+        Some(Sample { client: Some(*client), ..sample(info, payload) })
     }
 
     /// Sequence number of the newest sample of a publisher that was written.

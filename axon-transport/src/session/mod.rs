@@ -19,6 +19,7 @@ mod face;
 mod guard;
 mod home;
 pub(crate) mod local;
+pub(crate) mod merge;
 pub mod message;
 mod node;
 mod open;

@@ -8,6 +8,7 @@ mod hostile;
 mod identity;
 mod load;
 mod mismatch;
+mod mixed;
 mod mode;
 mod pair;
 mod process;

@@ -3,8 +3,8 @@
 use super::Hub;
 use crate::{
     daemon::bridge::ToControl,
-    gateway::{establish::close, peer::GraphChange, routes::Offered},
-    graph::{Endpoint, EndpointKind},
+    gateway::{establish::close, peer::GraphChange},
+    graph::Endpoint,
     ids::DaemonId,
     link::CloseCode,
 };
@@ -19,10 +19,6 @@ impl Hub {
             .filter(|e| e.daemon.is_none())
             .map(|e| (e.endpoint.gid, (*e.endpoint).clone()))
             .collect();
-        let publishers = self.local.values().filter(|e| e.kind == EndpointKind::Publisher);
-        let offers = |e: &Endpoint| Offered { qos: e.qos, type_hash: e.type_hash.clone() };
-        let offered = publishers.map(|e| (e.gid, offers(e))).collect();
-        *self.shared.offered.write().unwrap_or_else(std::sync::PoisonError::into_inner) = offered;
         for peer in self.peers.values_mut() {
             peer.send_graph(&self.local, false);
             peer.update(&self.local, &self.shared);

@@ -9,7 +9,7 @@ mod links;
 
 use std::{
     collections::{BTreeMap, HashMap},
-    sync::{Arc, RwLock, RwLockReadGuard},
+    sync::Arc,
     time::{Duration, Instant},
 };
 
@@ -32,7 +32,6 @@ use super::{
     pulse::Pulse,
     refusal::{Refusal, RefusedBy},
     room::Room,
-    routes::Offered,
     seal::Protection,
     stand_in::StandIns,
     status::{self, Who},
@@ -59,19 +58,12 @@ pub(super) struct Shared {
     pub(super) stand_ins: StandIns,
     /// Wakes tasks when rings change.
     pub(super) pulse: Pulse,
-    /// What local publishers offer.
-    pub(super) offered: Arc<RwLock<HashMap<Gid, Offered>>>,
     /// ROS domain.
     pub(super) domain: u32,
     /// Largest payload.
     pub(super) max_message: u64,
     /// What may wait to be sent reliably.
     pub(super) queues: Arc<Room>,
-}
-
-/// Reads a lock; a panic elsewhere leaves nothing half-done.
-pub(super) fn read<T>(lock: &RwLock<T>) -> RwLockReadGuard<'_, T> {
-    lock.read().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
 
 /// What the gateway's session notices.

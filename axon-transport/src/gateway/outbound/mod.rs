@@ -5,41 +5,35 @@
 //! queues and then leaves its samples in the ring, where they hold back a KEEP_ALL publisher and
 //! nobody else.
 
+mod feed;
 mod stream;
+#[cfg(test)]
+mod tests;
 
 use std::{
-    collections::HashMap,
-    sync::Arc,
-    time::{Duration, Instant},
+    collections::{BTreeSet, HashMap},
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::Instant,
 };
 
-use axon_envelope::{Kind, Route};
+use axon_envelope::Route;
 use quinn::Connection;
 use tokio::sync::{Notify, mpsc, watch};
 
-use self::stream::Stream;
+use self::feed::Feed;
 use super::{
     counters::Counters,
-    keyring::lock,
     pulse::Pulse,
-    queue::{Offered, Sample},
+    queue::Sample,
     room::Room,
-    routes::{Offered as Offer, RelaySpec, serves},
+    routes::RelaySpec,
     seal::{Protection, sample},
     stand_in::StandIn,
 };
-use crate::{
-    ids::Gid,
-    qos::{Qos, Reliability},
-    session::Subscription,
-};
-
-/// Samples taken from one relay before the next one has its turn, and bytes.
-const BATCH: (usize, usize) = (64, 256 << 10);
-/// After a turn in which most samples took the room of others a relay is left alone for so long: what
-/// its publisher writes over meanwhile nobody has copied in vain. That is longer where they are long,
-/// by so many nanoseconds a byte.
-const REST: (Duration, u64) = (Duration::from_millis(1), 2);
+use crate::{ids::Gid, qos::Qos, session::Subscription};
 
 /// A route that the peer asked for.
 pub(super) struct RouteOut {
@@ -61,21 +55,44 @@ pub(super) enum Source {
 }
 
 impl Source {
-    fn take(&self) -> Option<Sample> {
+    /// The publishers, or clients, of which there is something to be taken there.
+    fn with_data(&self) -> Vec<Gid> {
+        match self {
+            Self::Relay(_, subscription) => subscription.with_data(),
+            Self::StandIn(stand_in) => stand_in.with_calls(),
+        }
+    }
+
+    /// Whether what is of this publisher or client is taken there.
+    fn reads(&self, of: &Gid) -> bool {
+        match self {
+            Self::Relay(_, subscription) => subscription.reads(of),
+            Self::StandIn(stand_in) => stand_in.reads(of),
+        }
+    }
+
+    /// The number of its next sample or request.
+    fn next_of(&self, of: &Gid) -> Option<u64> {
+        match self {
+            Self::Relay(_, subscription) => subscription.next_of(of),
+            Self::StandIn(stand_in) => stand_in.next_of(of),
+        }
+    }
+
+    fn take_of(&self, of: &Gid) -> Option<Sample> {
         match self {
             Self::Relay(_, subscription) => {
-                let mut payload = Vec::new();
-                let info = subscription.take(&mut payload)?;
+                let (info, payload) = subscription.take_of(of)?;
                 Some(sample(info, payload))
             }
-            Self::StandIn(stand_in) => stand_in.take(),
+            Self::StandIn(stand_in) => stand_in.take_of(of),
         }
     }
 
     /// How what is taken there is queued: of a service nothing is dropped.
     fn qos(&self) -> Qos {
         match self {
-            Self::Relay(spec, _) => spec.qos,
+            Self::Relay(spec, _) => spec.queued(),
             Self::StandIn(_) => Qos::keep_all(),
         }
     }
@@ -126,16 +143,10 @@ struct Shared {
     counters: Arc<Counters>,
     /// What may wait in the queues.
     queues: Arc<Room>,
-    /// A queue has room again.
+    /// A queue has room again, or is over.
     popped: Notify,
-}
-
-/// A source, and a sample of it for which there was no room.
-struct Tap {
-    source: Source,
-    pending: Option<Sample>,
-    /// Until when it is left alone.
-    rests: Option<Instant>,
+    /// A queue is over.
+    ended: AtomicBool,
 }
 
 /// What came of looking for samples.
@@ -144,29 +155,31 @@ struct Moved {
     /// Some were taken: there may be more.
     any: bool,
     queued: u32,
-    /// When a source that rests is to be looked at again.
+    /// When a feed that rests is to be looked at again.
     again: Option<Instant>,
 }
 
 struct Active {
+    number: u32,
     route: Route,
-    taps: Vec<Tap>,
-    /// The newest sequence number by publisher, or client that asks, that need not be sent.
+    sources: Vec<Source>,
+    /// The newest sequence number by publisher that the peer had when it asked.
     seen: HashMap<Gid, u64>,
-    streams: HashMap<Gid, Stream>,
+    /// What goes out, by publisher or client.
+    feeds: HashMap<Gid, Feed>,
 }
 
-/// Serves one peer until the order channel closes. `offered` says what a local publisher offers.
+/// Serves one peer until the order channel closes.
 pub(super) async fn run(
     first: Carrier,
     mut orders: mpsc::UnboundedReceiver<Order>,
     counters: Arc<Counters>,
     queues: Arc<Room>,
     pulse: Pulse,
-    offered: impl Fn(Gid) -> Option<Offer> + Send,
 ) {
     let (carrier, current) = watch::channel(first);
-    let shared = Arc::new(Shared { carrier: current, counters, queues, popped: Notify::new() });
+    let (popped, ended) = (Notify::new(), AtomicBool::new(false));
+    let shared = Arc::new(Shared { carrier: current, counters, queues, popped, ended });
     let mut routes: HashMap<u32, Active> = HashMap::new();
     let mut beat = pulse.subscribe();
     loop {
@@ -176,9 +189,13 @@ pub(super) async fn run(
         // Registered before the queues are looked at, so that nothing in between is missed.
         popped.as_mut().enable();
         freed.as_mut().enable();
+        // Relaxed: `popped`, which whoever stores it notifies afterwards, orders them.
+        if shared.ended.swap(false, Ordering::Relaxed) {
+            routes.values_mut().for_each(Active::prune);
+        }
         let mut moved = Moved::default();
-        for (number, active) in &mut routes {
-            active.move_samples(*number, &shared, &offered, &mut moved);
+        for active in routes.values_mut() {
+            active.move_samples(&shared, &mut moved);
         }
         if moved.queued > 0 {
             shared.carrier.borrow().protection.demand(moved.queued);
@@ -220,132 +237,36 @@ fn apply(order: Order, routes: &mut HashMap<u32, Active>, carrier: &watch::Sende
         Order::End(number) => {
             routes.remove(&number);
         }
-        Order::Route(number, route) => {
-            let mut old = routes.remove(&number);
-            let mut taps = Vec::new();
-            for source in route.sources {
-                // One that goes on keeps the sample it holds.
-                let pending = old.as_mut().and_then(|o| {
-                    let tap = o.taps.iter_mut().find(|tap| tap.source.is(&source));
-                    tap.and_then(|tap| tap.pending.take())
-                });
-                taps.push(Tap { source, pending, rests: None });
+        Order::Route(number, RouteOut { route, sources, seen }) => {
+            let feeds = HashMap::new();
+            let new = Active { number, route, sources: Vec::new(), seen: HashMap::new(), feeds };
+            let active = routes.entry(number).or_insert(new);
+            active.sources = sources;
+            for (of, feed) in &mut active.feeds {
+                feed.has(seen.get(of).copied());
             }
-            let mut seen = route.seen;
-            let mut streams = HashMap::new();
-            if let Some(old) = old {
-                if route.route.kind != Kind::Topic {
-                    seen.extend(old.seen);
-                }
-                streams = old.streams;
-            }
-            routes.insert(number, Active { route: route.route, taps, seen, streams });
+            active.seen = seen;
         }
     }
 }
 
 impl Active {
     /// Moves what the rings hold into the queues.
-    fn move_samples(
-        &mut self,
-        number: u32,
-        shared: &Arc<Shared>,
-        offered: &impl Fn(Gid) -> Option<Offer>,
-        moved: &mut Moved,
-    ) {
-        for index in 0..self.taps.len() {
-            let tap = &mut self.taps[index];
-            if let Some(until) = tap.rests {
-                if until > Instant::now() {
-                    moved.again = moved.again.into_iter().chain([until]).min();
-                    continue;
-                }
-                tap.rests = None;
-            }
-            let (mut samples, mut bytes, mut dropped) = (0, 0, 0);
-            while samples < BATCH.0 && bytes < BATCH.1 {
-                let tap = &mut self.taps[index];
-                let next = tap.pending.take().or_else(|| tap.source.take());
-                let Some(sample) = next else { break };
-                samples += 1;
-                bytes += sample.payload.len();
-                if !self.wanted(index, &sample, offered) {
-                    moved.any = true;
-                    continue;
-                }
-                match self.offer(number, index, sample, shared) {
-                    Offered::Queued { dropped: older } => {
-                        dropped += older;
-                        moved.queued += 1;
-                        moved.any = true;
-                    }
-                    Offered::Full(sample) => {
-                        self.taps[index].pending = Some(sample);
-                        break;
-                    }
-                }
-            }
-            // Of BEST_EFFORT little waits, which is gone before such a rest is over, unless the
-            // publisher is far ahead.
-            let whole = samples >= BATCH.0 || bytes >= BATCH.1;
-            let reliable = self.taps[index].source.qos().reliability == Reliability::Reliable;
-            if 2 * dropped >= samples as u64 && dropped > 0 && (whole || reliable) {
-                let rest = REST.0.max(Duration::from_nanos(bytes as u64 * REST.1));
-                self.taps[index].rests = Some(Instant::now() + rest);
-            }
+    fn move_samples(&mut self, shared: &Arc<Shared>, moved: &mut Moved) {
+        let held = self.feeds.iter().filter(|(_, feed)| feed.holds()).map(|(of, _)| *of);
+        let there = self.sources.iter().flat_map(Source::with_data);
+        let waiting: BTreeSet<Gid> = held.chain(there).collect();
+        for of in waiting {
+            let seen = self.seen.get(&of).copied();
+            let feed = self.feeds.entry(of).or_insert_with(|| Feed::new(of, seen));
+            feed.turn((self.number, self.route), &self.sources, shared, moved);
         }
     }
 
-    /// Whether this source is the one that sends the sample, and the peer lacks it.
-    fn wanted(
-        &self,
-        index: usize,
-        sample: &Sample,
-        offered: &impl Fn(Gid) -> Option<Offer>,
-    ) -> bool {
-        let publisher = sample.info.publisher;
-        let new = || self.seen.get(&publisher).is_none_or(|last| sample.info.sequence > *last);
-        let specs = self.taps.iter().filter_map(|tap| match &tap.source {
-            Source::Relay(spec, _) => Some(spec),
-            Source::StandIn(_) => None,
-        });
-        match self.route.kind {
-            // A publisher that is gone from the graph still drains through the relay that has it.
-            Kind::Topic => {
-                new() && offered(publisher).is_none_or(|o| serves(specs, &o) == Some(index))
-            }
-            // It comes by way of each server there is on the other side.
-            Kind::Request => new(),
-            Kind::Response => true,
-        }
-    }
-
-    fn offer(
-        &mut self,
-        number: u32,
-        index: usize,
-        sample: Sample,
-        shared: &Arc<Shared>,
-    ) -> Offered {
-        let (publisher, sequence) = (sample.info.publisher, sample.info.sequence);
-        let of = sample.client.unwrap_or(publisher);
-        let (route, qos) = (self.route, self.taps[index].source.qos());
-        let ended = self.streams.get(&of).is_some_and(|s| s.task.is_finished());
-        if ended {
-            self.streams.remove(&of);
-        }
-        let stream = self
-            .streams
-            .entry(of)
-            .or_insert_with(|| Stream::start(number, route, of, &qos, Arc::clone(shared)));
-        let offered = lock(&stream.queue).offer(sample);
-        if let Offered::Queued { dropped } = offered {
-            if route.kind == Kind::Request {
-                self.seen.insert(publisher, sequence);
-            }
-            shared.counters.dropped("queue", dropped);
-            stream.filled.notify_one();
-        }
-        offered
+    /// Forgets those that nothing will come of.
+    fn prune(&mut self) {
+        let sources = &self.sources;
+        let read = |of: &Gid| sources.iter().any(|source| source.reads(of));
+        self.feeds.retain(|of, feed| feed.is_in_use() || read(of));
     }
 }

@@ -2,7 +2,7 @@
 
 use std::{
     collections::VecDeque,
-    sync::{Arc, Mutex},
+    sync::{Arc, Mutex, atomic::Ordering},
     time::Duration,
 };
 
@@ -17,31 +17,29 @@ use crate::{
         frames::Frames,
         inbound::stream_header,
         keyring::lock,
-        queue::{Queue, Sample},
+        queue::{Offered, Queue, Sample},
         seal::Protection,
     },
     ids::Gid,
     keys::NoKey,
     link::CloseCode,
-    qos::{Qos, Reliability},
+    qos::Qos,
 };
 
 /// Bytes of samples that are written at once, where so many wait. A lone one waits for no other.
 const TOGETHER: usize = 64 << 10;
-/// So many bytes a single sample always has.
-const ONE: usize = 1;
 /// The priority of requests and responses above samples.
 const SERVICES: i32 = 1;
-/// A reliable stream with nothing to send is finished after this.
-const STREAM_IDLE: Duration = Duration::from_secs(30);
+/// With nothing to send a stream is over after this.
+const STREAM_IDLE: Duration = Duration::from_millis(if cfg!(test) { 50 } else { 30_000 });
 /// A best-effort sample that is not acknowledged by then is given up.
 const BEST_EFFORT_LIFE: Duration = Duration::from_millis(200);
 
 /// What waits for one publisher, or client of a service, and the task that sends it.
 pub(super) struct Stream {
-    pub(super) queue: Arc<Mutex<Queue>>,
-    pub(super) filled: Arc<Notify>,
-    pub(super) task: tokio::task::JoinHandle<()>,
+    queue: Arc<Mutex<Queue>>,
+    filled: Arc<Notify>,
+    task: tokio::task::JoinHandle<()>,
 }
 
 impl Drop for Stream {
@@ -51,41 +49,54 @@ impl Drop for Stream {
 }
 
 impl Stream {
-    pub(super) fn start(
-        number: u32,
-        route: Route,
-        of: Gid,
-        qos: &Qos,
-        shared: Arc<Shared>,
-    ) -> Self {
+    pub(super) fn new(number: u32, route: Route, of: Gid, qos: &Qos, shared: Arc<Shared>) -> Self {
         let queue = Arc::new(Mutex::new(Queue::new(qos, Arc::clone(&shared.queues))));
         let filled = Arc::new(Notify::new());
-        let reliable = qos.reliability == Reliability::Reliable;
         let writer = Writer {
-            header: stream_header(reliable, number, of),
+            number,
+            of,
             route,
             queue: Arc::clone(&queue),
             filled: Arc::clone(&filled),
             shared,
             batch: VecDeque::new(),
+            delivery: Delivery::Reliable,
             frames: Frames::default(),
         };
-        let task = tokio::spawn(async move {
-            if reliable { writer.reliable().await } else { writer.best_effort().await }
-        });
+        let task = tokio::spawn(writer.run());
         Self { queue, filled, task }
+    }
+
+    /// Queues a sample as `qos` says. It must not be over.
+    pub(super) fn offer(&self, sample: Sample, qos: &Qos) -> Offered {
+        let mut queue = lock(&self.queue);
+        queue.serve(qos);
+        let offered = queue.offer(sample);
+        drop(queue);
+        if matches!(offered, Offered::Queued { .. }) {
+            self.filled.notify_one();
+        }
+        offered
+    }
+
+    /// Whether it has ended, with nothing left to send.
+    pub(super) fn is_over(&self) -> bool {
+        lock(&self.queue).is_over()
     }
 }
 
 /// Seals and writes the samples of one queue.
 struct Writer {
-    header: [u8; 24],
+    number: u32,
+    of: Gid,
     route: Route,
     queue: Arc<Mutex<Queue>>,
     filled: Arc<Notify>,
     shared: Arc<Shared>,
     /// What was taken from the queue and is not known to be written.
     batch: VecDeque<Sample>,
+    /// How it is to be delivered.
+    delivery: Delivery,
     /// What of it is sealed.
     frames: Frames,
 }
@@ -94,10 +105,13 @@ struct Writer {
 struct Gone;
 
 impl Writer {
-    /// Fills the batch with what waits, up to `bytes`; whether there is anything in it.
-    fn gather(&mut self, bytes: usize) -> bool {
+    /// Fills the batch with what waits; whether there is anything in it.
+    fn gather(&mut self) -> bool {
         if self.batch.is_empty() {
-            lock(&self.queue).pop_together(bytes, &mut self.batch);
+            let mut queue = lock(&self.queue);
+            self.delivery = queue.delivery();
+            queue.pop_together(TOGETHER, &mut self.batch);
+            drop(queue);
             if !self.batch.is_empty() {
                 self.shared.popped.notify_one();
             }
@@ -106,23 +120,24 @@ impl Writer {
     }
 
     /// As [`gather`](Self::gather), once something waits.
-    async fn next(&mut self, bytes: usize) {
-        while !self.gather(bytes) {
+    async fn next(&mut self) {
+        while !self.gather() {
             self.filled.notified().await;
         }
     }
 
     /// Seals the batch, or as much of it as there are keys for; of RELIABLE one sample at least, for
     /// whose key it waits. How many samples.
-    async fn seal(&mut self, carrier: &Carrier, delivery: Delivery) -> Result<usize, Gone> {
+    async fn seal(&mut self, carrier: &Carrier) -> Result<usize, Gone> {
+        let delivery = self.delivery;
         loop {
             let Protection::Envelope { keys, .. } = &carrier.protection else {
-                return self.seal_now(carrier, delivery).map_err(|_| Gone);
+                return self.seal_now(carrier).map_err(|_| Gone);
             };
             let changed = keys.changed.notified();
             tokio::pin!(changed);
             changed.as_mut().enable();
-            match self.seal_now(carrier, delivery) {
+            match self.seal_now(carrier) {
                 Ok(sealed) => return Ok(sealed),
                 Err(_) if delivery == Delivery::BestEffort => return Ok(0),
                 Err(NoKey::Detached) => return Err(Gone),
@@ -136,10 +151,10 @@ impl Writer {
     }
 
     /// As [`seal`](Self::seal), without waiting.
-    fn seal_now(&mut self, carrier: &Carrier, delivery: Delivery) -> Result<usize, NoKey> {
+    fn seal_now(&mut self, carrier: &Carrier) -> Result<usize, NoKey> {
         let mut sealed = 0;
         for sample in &self.batch {
-            match carrier.protection.write(sample, self.route, delivery, &mut self.frames) {
+            match carrier.protection.write(sample, self.route, self.delivery, &mut self.frames) {
                 Ok(()) => sealed += 1,
                 Err(why) if sealed == 0 => return Err(why),
                 Err(_) => break,
@@ -148,9 +163,16 @@ impl Writer {
         Ok(sealed)
     }
 
-    /// One long stream, in order. Ends when the connection is lost; a new carrier goes on after
-    /// the old stream was acknowledged to its end, so that nothing is overtaken.
-    async fn reliable(mut self) {
+    /// The header of its streams, for what is in the batch.
+    fn header(&self) -> Bytes {
+        let reliable = self.delivery == Delivery::Reliable;
+        Bytes::copy_from_slice(&stream_header(reliable, self.number, self.of))
+    }
+
+    /// Sends what comes until nothing has come for a while. What is reliable goes over one long stream,
+    /// in order. When the connection is lost, a new carrier goes on after the old stream was
+    /// acknowledged to its end, so that nothing is overtaken.
+    async fn run(mut self) {
         let mut carriers = self.shared.carrier.clone();
         loop {
             let carrier = carriers.borrow_and_update().clone();
@@ -161,20 +183,29 @@ impl Writer {
                     Ok(true) => break,
                     Err(_) => return,
                 }
-                if !self.gather(TOGETHER) {
+                if !self.gather() {
                     tokio::select! {
-                        () = self.next(TOGETHER) => {}
+                        () = self.next() => {}
                         changed = carriers.changed() => {
                             if changed.is_err() { return }
                             carriers.mark_changed();
                         }
-                        () = tokio::time::sleep(STREAM_IDLE), if stream.is_some() => {
-                            if let Some(mut idle) = stream.take() { let _ = idle.finish(); }
+                        () = tokio::time::sleep(STREAM_IDLE) => {
+                            if lock(&self.queue).end() {
+                                finish(&mut stream, &carrier);
+                                // Relaxed as where it is read.
+                                self.shared.ended.store(true, Ordering::Relaxed);
+                                return self.shared.popped.notify_one();
+                            }
                         }
                     }
                     continue;
                 }
-                if let Err(Gone) = self.send(&mut stream, &carrier).await {
+                if self.delivery == Delivery::BestEffort {
+                    // The peer reads one stream of a publisher after the other.
+                    finish(&mut stream, &carrier);
+                    self.best_effort(&carrier).await;
+                } else if let Err(Gone) = self.reliable(&mut stream, &carrier).await {
                     if carriers.changed().await.is_err() {
                         return;
                     }
@@ -190,17 +221,17 @@ impl Writer {
     }
 
     /// Writes what of the batch can be sealed.
-    async fn send(
+    async fn reliable(
         &mut self,
         stream: &mut Option<SendStream>,
         carrier: &Carrier,
     ) -> Result<(), Gone> {
-        let sealed = self.seal(carrier, Delivery::Reliable).await?;
+        let sealed = self.seal(carrier).await?;
         let mut pieces = self.frames.take();
         if stream.is_none() {
             let opened = carrier.connection.open_uni().await.map_err(|_| Gone)?;
             let _ = opened.set_priority(if self.route.kind == Kind::Topic { 0 } else { SERVICES });
-            pieces.insert(0, Bytes::copy_from_slice(&self.header));
+            pieces.insert(0, self.header());
             *stream = Some(opened);
         }
         let Some(open) = stream.as_mut() else { return Err(Gone) };
@@ -222,42 +253,51 @@ impl Writer {
         }
     }
 
-    /// A stream a message, reset when it is not acknowledged in time.
-    async fn best_effort(mut self) {
-        loop {
-            self.batch.clear();
-            self.next(ONE).await;
-            let carrier = self.shared.carrier.borrow().clone();
-            if carrier.connection.close_reason().is_some() {
-                self.shared.counters.dropped("no_link", 1);
-                continue;
-            }
-            match self.seal(&carrier, Delivery::BestEffort).await {
-                Ok(1) => {}
-                Ok(_) => {
-                    self.shared.counters.dropped("no_key", 1);
-                    continue;
-                }
-                Err(Gone) => continue,
-            }
-            let mut pieces = self.frames.take();
-            pieces.insert(0, Bytes::copy_from_slice(&self.header));
-            let opened = tokio::time::timeout(BEST_EFFORT_LIFE, carrier.connection.open_uni());
-            let Ok(Ok(mut stream)) = opened.await else {
-                self.shared.counters.dropped("late", 1);
-                continue;
-            };
-            let write = stream.write_all_chunks(&mut pieces);
-            if matches!(tokio::time::timeout(BEST_EFFORT_LIFE, write).await, Ok(Ok(()))) {
-                let _ = stream.finish();
-                self.batch.iter().for_each(|s| self.shared.counters.sent(s.payload.len()));
-                tokio::spawn(give_up_in_time(stream, carrier));
-            } else {
-                // Dropping it would finish it, as if the message were whole.
-                let _ = stream.reset(VarInt::from_u32(CloseCode::Goodbye.code()));
-                self.shared.counters.dropped("late", 1);
-            }
+    /// A stream of its own for the sample, reset when it is not acknowledged in time.
+    async fn best_effort(&mut self, carrier: &Carrier) {
+        if let Err(cause) = self.try_best_effort(carrier).await {
+            self.shared.counters.dropped(cause, self.batch.len() as u64);
         }
+        self.batch.clear();
+    }
+
+    /// As [`best_effort`](Self::best_effort); why the sample was dropped.
+    async fn try_best_effort(&mut self, carrier: &Carrier) -> Result<(), &'static str> {
+        if carrier.connection.close_reason().is_some() {
+            return Err("no_link");
+        }
+        match self.seal(carrier).await {
+            Ok(1) => {}
+            Ok(_) => return Err("no_key"),
+            Err(Gone) => return Err("no_link"),
+        }
+        let mut pieces = self.frames.take();
+        pieces.insert(0, self.header());
+        let opened = tokio::time::timeout(BEST_EFFORT_LIFE, carrier.connection.open_uni());
+        let Ok(Ok(mut stream)) = opened.await else { return Err("late") };
+        let write = stream.write_all_chunks(&mut pieces);
+        if !matches!(tokio::time::timeout(BEST_EFFORT_LIFE, write).await, Ok(Ok(()))) {
+            // Dropping it would finish it, as if the message were whole.
+            let _ = stream.reset(VarInt::from_u32(CloseCode::Goodbye.code()));
+            return Err("late");
+        }
+        let _ = stream.finish();
+        self.batch.iter().for_each(|s| self.shared.counters.sent(s.payload.len()));
+        tokio::spawn(give_up_in_time(stream, carrier.clone()));
+        Ok(())
+    }
+}
+
+/// Finishes a stream: nothing more goes over it. Until it is acknowledged to its end its carrier is in use.
+fn finish(stream: &mut Option<SendStream>, carrier: &Carrier) {
+    if let Some(mut stream) = stream.take()
+        && stream.finish().is_ok()
+    {
+        let carrier = carrier.clone();
+        tokio::spawn(async move {
+            let _ = stream.stopped().await;
+            drop(carrier);
+        });
     }
 }
 

@@ -88,11 +88,9 @@ impl Peer {
     pub(super) fn new(link: u64, outbox: Outbox, carrier: Carrier, shared: &Arc<Shared>) -> Self {
         let counters = Arc::new(Counters::default());
         let (orders, receiver) = mpsc::unbounded_channel();
-        let graph = Arc::clone(&shared.offered);
-        let offered = move |gid| super::hub::read(&graph).get(&gid).cloned();
         let (queues, pulse) = (shared.queues.of_peer(), shared.pulse.clone());
         let sent = Arc::clone(&counters);
-        tokio::spawn(outbound::run(carrier, receiver, sent, queues, pulse, offered));
+        tokio::spawn(outbound::run(carrier, receiver, sent, queues, pulse));
         Self {
             link,
             outbox,

@@ -18,7 +18,7 @@ use crate::{
 
 /// How long ROUTE_READY waits for the first local publisher to attach.
 const READY_TIMEOUT: Duration = Duration::from_secs(2);
-/// Routes that a peer may ask for. Each costs a lane.
+/// Routes that a peer may ask for.
 const MAX_ROUTES: usize = 1024;
 
 /// A route that the peer asked for.
@@ -73,7 +73,7 @@ impl Peer {
             None => Vec::new(),
         };
         let sources = match kind {
-            Kind::Topic => self.open_relays(&key, &subscribers, old, shared),
+            Kind::Topic => self.open_relays(&key, &subscribers, &old, shared),
             Kind::Request | Kind::Response => self.of_service(&key),
         };
         let _announcing = self.announce_ready(number, &sources);
@@ -105,19 +105,22 @@ impl Peer {
         &self,
         key: &RouteKey,
         subscribers: &[Subscriber],
-        mut old: Vec<Source>,
+        old: &[Source],
         shared: &Arc<Shared>,
     ) -> Vec<Source> {
         let hash = |gid: &Gid| self.remote.get(gid).map_or_else(Vec::new, |e| e.type_hash.clone());
+        let specs = relays(subscribers, hash);
+        let there = |spec: &RelaySpec| {
+            old.iter().position(|source| matches!(source, Source::Relay(o, _) if o.is(spec)))
+        };
         let mut sources = Vec::new();
-        for spec in relays(subscribers, hash) {
-            let RelaySpec { qos, ref type_hash, ref stands_for } = spec;
-            let same = |source: &Source| matches!(source, Source::Relay(o, _) if o.qos == qos && o.type_hash == *type_hash);
-            if let Some(at) = old.iter().position(same)
-                && let Source::Relay(_, subscription) = old.swap_remove(at)
+        for spec in specs {
+            let RelaySpec { qos, ref type_hash, ref stands_for, .. } = spec;
+            if let Some(at) = there(&spec)
+                && let Source::Relay(_, subscription) = &old[at]
             {
                 subscription.set_stands_for(stands_for.clone());
-                sources.push(Source::Relay(spec, subscription));
+                sources.push(Source::Relay(spec, Arc::clone(subscription)));
                 continue;
             }
             let endpoint = EndpointSpec {

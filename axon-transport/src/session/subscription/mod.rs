@@ -10,8 +10,8 @@ use std::{
     time::{Duration, Instant},
 };
 
-use self::inner::lock;
 pub(super) use self::{inner::SubscriptionInner, slots::Accept};
+use self::{inner::lock, slots::Slots};
 use super::{
     OnNew, Session, SessionError,
     events::{Event, Source},
@@ -144,6 +144,26 @@ impl Subscription {
         self.inner.lock().take_from(writer, &self.inner)
     }
 
+    /// For a relay: the next sample of one publisher, as bytes.
+    pub(crate) fn take_of(&self, writer: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
+        take_of(&self.inner, &self.session, writer)
+    }
+
+    /// The number of that sample.
+    pub(crate) fn next_of(&self, writer: &Gid) -> Option<u64> {
+        if self.session.is_forked() { None } else { self.inner.lock().next_of(writer) }
+    }
+
+    /// The publishers of which there is something to take.
+    pub(crate) fn with_data(&self) -> Vec<Gid> {
+        if self.session.is_forked() { Vec::new() } else { self.inner.lock().with_data().collect() }
+    }
+
+    /// Whether it reads what this publisher writes or wrote, or may do so soon.
+    pub(crate) fn reads(&self, writer: &Gid) -> bool {
+        !self.session.is_forked() && self.inner.lock().reads(writer)
+    }
+
     /// Whether there is something to take of this publisher.
     pub(crate) fn has_from(&self, writer: &Gid) -> bool {
         !self.session.is_forked() && self.inner.lock().has_from(writer)
@@ -205,13 +225,33 @@ pub(super) fn take_from<T>(
     session: &Session,
     take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
 ) -> Option<(MessageInfo, T)> {
+    take_with(inner, session, |slots| slots.take(take, inner))
+}
+
+/// The next of one writer, as bytes.
+pub(super) fn take_of(
+    inner: &SubscriptionInner,
+    session: &Session,
+    writer: &Gid,
+) -> Option<(MessageInfo, Vec<u8>)> {
+    let mut out = Vec::new();
+    let take = |reader: &mut Reader| Ok(reader.take(&mut out)?.map(|taken| (taken.meta, ())));
+    let (info, ()) = take_with(inner, session, |slots| slots.take_of(writer, take, inner))?;
+    Some((info, out))
+}
+
+fn take_with<T>(
+    inner: &SubscriptionInner,
+    session: &Session,
+    take: impl FnOnce(&mut Slots) -> Option<(MessageInfo, T)>,
+) -> Option<(MessageInfo, T)> {
     // A thread of the parent may have held the lock when this process was forked.
     if session.is_forked() {
         tracing::error!("an endpoint of the parent process is used after fork");
         return None;
     }
     let mut slots = inner.lock();
-    let taken = slots.take(take, inner);
+    let taken = take(&mut slots);
     let gone = std::mem::take(&mut slots.discarded);
     let lost = slots.new_losses();
     let again = if taken.is_none() { slots.short_until() } else { None };

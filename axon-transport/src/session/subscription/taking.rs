@@ -19,7 +19,6 @@ impl Slots {
         mut take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
         of: &SubscriptionInner,
     ) -> Option<(MessageInfo, T)> {
-        let endpoint = &of.endpoint;
         self.slots.iter_mut().for_each(|slot| slot.overtaken = false);
         // A writer that repeats itself without end must not keep the lock: callers come back as
         // long as there is something to take.
@@ -34,65 +33,117 @@ impl Slots {
                 }
                 return None;
             };
-            let slot = &mut self.slots[index];
-            let writer = slot.reader.writer();
-            let (meta, taken) = match take(&mut slot.reader) {
-                Ok(Some(taken)) => taken,
-                // Overwritten again and again while we read: the others have their turn first.
-                Ok(None) => {
-                    slot.overtaken = true;
-                    continue;
-                }
-                Err(error @ TakeError::TooLarge { .. }) => {
-                    tracing::error!(topic = endpoint.topic, %error, "a sample is lost");
-                    continue;
-                }
-                // It stands, and may be taken when there is memory again.
-                Err(error @ TakeError::NoMemory { .. }) => {
-                    slot.overtaken = true;
-                    if !self.is_short() {
-                        tracing::error!(topic = endpoint.topic, %error, "a sample is not taken yet");
-                    }
-                    self.short = Some(Instant::now());
-                    continue;
-                }
-                Err(error) => {
-                    self.discard(index, &error, endpoint);
-                    continue;
-                }
-            };
-            let over = slot.over;
-            let received_timestamp = clock::wall();
-            let expired = slot.lifespan.is_some_and(|lifespan| {
-                meta.source_timestamp.saturating_add(lifespan) < received_timestamp
-            });
-            slot.passed(meta.sequence, self.last.get(&writer).copied());
-            let last = self.last.entry(writer).or_default();
-            let repeated = of.rising && meta.sequence <= *last;
-            if !repeated {
-                *last = meta.sequence;
-                if expired {
-                    self.expired += 1;
-                } else {
-                    self.received += 1;
-                }
+            if let Some(taken) = self.take_at(index, &mut take, of) {
+                return Some(taken);
             }
-            if over {
-                self.sweep();
-            }
-            if repeated || expired {
-                continue;
-            }
-            let info = MessageInfo {
-                publisher: writer,
-                sequence: meta.sequence,
-                source_timestamp: meta.source_timestamp,
-                received_timestamp,
-                reception: self.received,
-            };
-            return Some((info, taken));
         }
         None
+    }
+
+    /// As [`take`](Self::take), of one writer.
+    pub(super) fn take_of<T>(
+        &mut self,
+        writer: &Gid,
+        mut take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
+        of: &SubscriptionInner,
+    ) -> Option<(MessageInfo, T)> {
+        self.slots.iter_mut().for_each(|slot| slot.overtaken = false);
+        for _ in 0..REPEATS {
+            let next = self.slots.iter().position(|slot| {
+                !slot.overtaken && slot.reader.writer() == *writer && slot.reader.has_data()
+            });
+            let Some(index) = next else {
+                self.sweep();
+                return None;
+            };
+            if let Some(taken) = self.take_at(index, &mut take, of) {
+                return Some(taken);
+            }
+        }
+        None
+    }
+
+    /// The number of the next sample of `writer`.
+    pub(in crate::session) fn next_of(&mut self, writer: &Gid) -> Option<u64> {
+        let mut its = self.slots.iter_mut().filter(|slot| slot.reader.writer() == *writer);
+        its.find_map(|slot| match slot.reader.peek() {
+            Ok(next) => Some(next?.sequence),
+            // It is chosen, so that taking finds out what is wrong.
+            Err(_) => Some(0),
+        })
+    }
+
+    /// The writers of which there is something to take.
+    pub(in crate::session) fn with_data(&self) -> impl Iterator<Item = Gid> {
+        let some = self.slots.iter().filter(|slot| slot.reader.has_data());
+        some.map(|slot| slot.reader.writer())
+    }
+
+    /// Takes from a slot, unless nothing is to be had there, or nothing that counts.
+    fn take_at<T>(
+        &mut self,
+        index: usize,
+        take: &mut impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
+        of: &SubscriptionInner,
+    ) -> Option<(MessageInfo, T)> {
+        let endpoint = &of.endpoint;
+        let slot = &mut self.slots[index];
+        let writer = slot.reader.writer();
+        let (meta, taken) = match take(&mut slot.reader) {
+            Ok(Some(taken)) => taken,
+            // Overwritten again and again while we read: the others have their turn first.
+            Ok(None) => {
+                slot.overtaken = true;
+                return None;
+            }
+            Err(error @ TakeError::TooLarge { .. }) => {
+                tracing::error!(topic = endpoint.topic, %error, "a sample is lost");
+                return None;
+            }
+            // It stands, and may be taken when there is memory again.
+            Err(error @ TakeError::NoMemory { .. }) => {
+                slot.overtaken = true;
+                if !self.is_short() {
+                    tracing::error!(topic = endpoint.topic, %error, "a sample is not taken yet");
+                }
+                self.short = Some(Instant::now());
+                return None;
+            }
+            Err(error) => {
+                self.discard(index, &error, endpoint);
+                return None;
+            }
+        };
+        let over = slot.over;
+        let received_timestamp = clock::wall();
+        let expired = slot.lifespan.is_some_and(|lifespan| {
+            meta.source_timestamp.saturating_add(lifespan) < received_timestamp
+        });
+        slot.passed(meta.sequence, self.last.get(&writer).copied());
+        let last = self.last.entry(writer).or_default();
+        let repeated = of.rising && meta.sequence <= *last;
+        if !repeated {
+            *last = meta.sequence;
+            if expired {
+                self.expired += 1;
+            } else {
+                self.received += 1;
+            }
+        }
+        if over {
+            self.sweep();
+        }
+        if repeated || expired {
+            return None;
+        }
+        let info = MessageInfo {
+            publisher: writer,
+            sequence: meta.sequence,
+            source_timestamp: meta.source_timestamp,
+            received_timestamp,
+            reception: self.received,
+        };
+        Some((info, taken))
     }
 
     pub(in crate::session) fn take_from(

@@ -1,0 +1,146 @@
+//! What goes out of one publisher, or client of a service, whichever sources have it.
+
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use axon_envelope::{Kind, Route};
+
+use super::{Moved, Shared, Source, stream::Stream};
+use crate::{
+    gateway::queue::{Offered, Sample},
+    ids::Gid,
+    qos::{Qos, Reliability},
+    session::merge::{self, Next},
+};
+
+/// Samples moved before the next feed has its turn, and bytes.
+const BATCH: (usize, usize) = (64, 256 << 10);
+/// After a turn in which most samples took the room of others a feed is left alone for so long: what
+/// its publisher writes over meanwhile nobody has copied in vain. That is longer where they are long,
+/// by so many nanoseconds a byte.
+const REST: (Duration, u64) = (Duration::from_millis(1), 2);
+
+pub(super) struct Feed {
+    of: Gid,
+    /// The newest sequence number that was queued, or need not be.
+    sent: u64,
+    /// A sample for which there was no room.
+    held: Option<Sample>,
+    /// Until when it is left alone.
+    rests: Option<Instant>,
+    /// As long as there is something to be sent, and a while longer.
+    stream: Option<Stream>,
+}
+
+impl Feed {
+    /// The feed of a publisher or client, of which the peer has those up to `seen`.
+    pub(super) fn new(of: Gid, seen: Option<u64>) -> Self {
+        Self { of, sent: seen.unwrap_or(0), held: None, rests: None, stream: None }
+    }
+
+    /// The peer has those up to `seen`.
+    pub(super) fn has(&mut self, seen: Option<u64>) {
+        self.sent = self.sent.max(seen.unwrap_or(0));
+    }
+
+    /// Whether it has a sample that was taken and could not be queued.
+    pub(super) fn holds(&self) -> bool {
+        self.held.is_some()
+    }
+
+    /// Whether something may still wait to be sent.
+    pub(super) fn is_in_use(&mut self) -> bool {
+        self.stream.take_if(|stream| stream.is_over());
+        self.holds() || self.stream.is_some()
+    }
+
+    /// Moves what its sources have to the queue.
+    pub(super) fn turn(
+        &mut self,
+        route: (u32, Route),
+        sources: &[Source],
+        shared: &Arc<Shared>,
+        moved: &mut Moved,
+    ) {
+        if let Some(until) = self.rests {
+            if until > Instant::now() {
+                moved.again = moved.again.into_iter().chain([until]).min();
+                return;
+            }
+            self.rests = None;
+        }
+        // As the first asks that reads it: those that ask for more come first.
+        let first = sources.iter().find(|source| source.reads(&self.of));
+        let qos = first.map_or_else(Qos::keep_all, Source::qos);
+        let (mut samples, mut bytes, mut dropped) = (0, 0, 0);
+        while samples < BATCH.0 && bytes < BATCH.1 {
+            let sample = match self.next(route.1.kind, sources) {
+                Next::Taken(sample) => sample,
+                Next::Repeated => {
+                    samples += 1;
+                    moved.any = true;
+                    continue;
+                }
+                Next::Nothing => break,
+            };
+            samples += 1;
+            bytes += sample.payload.len();
+            match self.queue(sample, &qos, route, shared) {
+                Offered::Queued { dropped: older } => {
+                    dropped += older;
+                    moved.queued += 1;
+                    moved.any = true;
+                }
+                Offered::Full(sample) => {
+                    self.held = Some(sample);
+                    break;
+                }
+            }
+        }
+        // Of BEST_EFFORT little waits, which is gone before such a rest is over, unless the
+        // publisher is far ahead.
+        let whole = samples >= BATCH.0 || bytes >= BATCH.1;
+        let reliable = qos.reliability == Reliability::Reliable;
+        if 2 * dropped >= samples as u64 && dropped > 0 && (whole || reliable) {
+            let rest = REST.0.max(Duration::from_nanos(bytes as u64 * REST.1));
+            self.rests = Some(Instant::now() + rest);
+        }
+    }
+
+    fn next(&mut self, kind: Kind, sources: &[Source]) -> Next<Sample> {
+        let of = self.of;
+        if let Some(held) = self.held.take() {
+            return Next::Taken(held);
+        }
+        if kind == Kind::Response {
+            // They come in whatever order the servers like, all by way of what stands in for the client.
+            let mut taken = sources.iter().filter_map(|source| source.take_of(&of));
+            return taken.next().map_or(Next::Nothing, Next::Taken);
+        }
+        let take = |source: &Source| {
+            let sample = source.take_of(&of)?;
+            Some((sample.info.sequence, sample))
+        };
+        merge::next(sources, &mut self.sent, |source| source.next_of(&of), take)
+    }
+
+    pub(super) fn queue(
+        &mut self,
+        sample: Sample,
+        qos: &Qos,
+        (number, route): (u32, Route),
+        shared: &Arc<Shared>,
+    ) -> Offered {
+        self.stream.take_if(|stream| stream.is_over());
+        let (of, start) = (self.of, || Arc::clone(shared));
+        let stream =
+            self.stream.get_or_insert_with(|| Stream::new(number, route, of, qos, start()));
+        let offered = stream.offer(sample, qos);
+        if let Offered::Queued { dropped } = offered {
+            shared.counters.dropped("queue", dropped);
+        }
+        offered
+    }
+}
