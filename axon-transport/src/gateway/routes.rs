@@ -89,6 +89,12 @@ pub(super) fn wanted<'a>(
     routes
 }
 
+/// Relays that a peer may have: a thirty-second of the endpoints that the gateway's session may have for
+/// all peers. Each takes a lane for each publisher here that it reads.
+const MAX_RELAYS: usize = 2048;
+/// Those for one route.
+const MAX_RELAYS_OF_ROUTE: usize = 16;
+
 /// One relay subscription that the sending side opens for a topic's route.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct RelaySpec {
@@ -148,6 +154,25 @@ pub(super) fn relays(subscribers: &[Subscriber], hash: impl Fn(&Gid) -> Vec<u8>)
         group.stands_for.push(subscriber.gid);
     }
     groups.into_values().collect()
+}
+
+/// Leaves of `specs` those that there are already, and as many of the others as a peer may have that has
+/// so many relays for other routes. How many it leaves out.
+pub(super) fn admit(
+    specs: &mut Vec<RelaySpec>,
+    is_there: impl Fn(&RelaySpec) -> bool,
+    elsewhere: usize,
+) -> usize {
+    let (asked, there) = (specs.len(), specs.iter().filter(|spec| is_there(spec)).count());
+    let most = MAX_RELAYS_OF_ROUTE.min(MAX_RELAYS.saturating_sub(elsewhere));
+    let mut more = most.saturating_sub(there);
+    specs.retain(|spec| {
+        let new = !is_there(spec);
+        let admitted = !new || more > 0;
+        more -= usize::from(new && admitted);
+        admitted
+    });
+    asked - specs.len()
 }
 
 /// The depth of the relay that stands for a subscription of this depth: one of few, so that not each
@@ -259,5 +284,22 @@ mod tests {
         let depths = [0, 16, 17, 257, 1 << 28, (1 << 28) + 1, u32::MAX];
         let classes = [16, 16, 256, 4096, 1 << 28, u32::MAX, u32::MAX];
         assert_eq!(depths.map(class), classes);
+    }
+    #[test]
+    fn a_peer_has_so_many_relays_and_keeps_those_that_it_has() {
+        let of = |hashes: std::ops::Range<u8>| {
+            let all: Vec<_> = hashes.map(|n| subscriber(n, Qos::default())).collect();
+            relays(&all, |gid| vec![gid.0[0]])
+        };
+        let mut specs = of(0..20);
+        assert_eq!((admit(&mut specs, |_| false, 0), specs.len()), (4, 16));
+        let mut specs = of(0..20);
+        let later = |spec: &RelaySpec| spec.type_hash[0] >= 10;
+        assert_eq!((admit(&mut specs, later, 0), specs.len()), (4, 16));
+        assert_eq!(specs.iter().filter(|spec| later(spec)).count(), 10);
+        let mut specs = of(0..5);
+        assert_eq!((admit(&mut specs, |_| false, MAX_RELAYS - 3), specs.len()), (2, 3));
+        let mut specs = of(0..5);
+        assert_eq!((admit(&mut specs, |_| true, MAX_RELAYS), specs.len()), (0, 5));
     }
 }

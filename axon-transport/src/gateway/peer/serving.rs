@@ -9,7 +9,7 @@ use crate::{
     gateway::{
         hub::Shared,
         outbound::{Order, RouteOut, Source},
-        routes::{RelaySpec, RouteKey, relays},
+        routes::{RelaySpec, RouteKey, admit, relays},
     },
     ids::Gid,
     link::{Message, RouteReady, Subscribe, Subscriber},
@@ -109,10 +109,21 @@ impl Peer {
         shared: &Arc<Shared>,
     ) -> Vec<Source> {
         let hash = |gid: &Gid| self.remote.get(gid).map_or_else(Vec::new, |e| e.type_hash.clone());
-        let specs = relays(subscribers, hash);
+        let mut specs = relays(subscribers, hash);
         let there = |spec: &RelaySpec| {
             old.iter().position(|source| matches!(source, Source::Relay(o, _) if o.is(spec)))
         };
+        let topics = self.served.values().filter(|served| served.key.kind == Kind::Topic);
+        let elsewhere: usize = topics.map(|served| served.sources.len()).sum();
+        let refused = admit(&mut specs, |spec| there(spec).is_some(), elsewhere);
+        if refused > 0 {
+            let topic = &key.topic;
+            tracing::warn!(
+                topic,
+                refused,
+                "a peer asks in more ways than it may: some get nothing"
+            );
+        }
         let mut sources = Vec::new();
         for spec in specs {
             let RelaySpec { qos, ref type_hash, ref stands_for, .. } = spec;
