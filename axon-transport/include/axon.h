@@ -376,7 +376,14 @@ typedef struct axon_endpoint_options_t {
     /**
      * 0.
      */
-    uint8_t reserved[7];
+    uint8_t reserved[3];
+    /**
+     * A publisher: the length of most samples in bytes; 0 where it is not known. Where it is more than
+     * 512, the publisher has memory of its own for samples from the start, which each reader maps, and
+     * loans of more than 512 bytes are in place there, like all samples of more than 4 KiB. Otherwise
+     * only the latter are, in memory that comes with the first of them.
+     */
+    uint32_t expected_len;
 } axon_endpoint_options_t;
 
 /**
@@ -1001,7 +1008,8 @@ axon_ret_t axon_session_graph_count(struct axon_session_t session,
 
 /**
  * Lends `len` bytes to be written and then published: in shared memory where they are more than
- * 4 KiB, so that nothing is copied. They are at `data` and hold zeros or bytes of earlier samples.
+ * 4 KiB, or more than 512 bytes if the publisher was created to expect so many, so that nothing is
+ * copied. They are at `data` and hold zeros or bytes of earlier samples.
  * Aligned to 16 is what is behind the first `header` of them, here and where they are taken in place:
  * 0 for all of them, 4 for a structure that follows a header of four bytes. Fewer than `len` may be published, so that what is serialized can be given its
  * upper bound. Blocks and fails as `axon_session_publisher_publish`.
@@ -1419,8 +1427,9 @@ axon_ret_t axon_session_subscription_take(struct axon_subscription_t subscriptio
  * Takes the oldest sample, by source timestamp among all publishers, in place: `len` bytes at `data`,
  * which stand until `axon_session_sample_release`. What was lent is aligned as it was, a copy as
  * the allocator does it (to 8 at least, but for one of 0 bytes, of which `data` is any address), and what a
- * publisher wrote that does not keep to the protocol anyhow. One of more than 4 KiB is in the
- * publisher's memory, of which a subscription can keep five for each publisher; a sixth is copied.
+ * publisher wrote that does not keep to the protocol anyhow. One of more than 4 KiB, and a loan of more
+ * than 512 bytes whose publisher expects so many, is in the publisher's memory, of which a subscription
+ * can keep five for each publisher; a sixth is copied.
  * Where there is none the handle is 0, and nothing else is stored.
  *
  * Nobody may write to the bytes, and a forked child may not read them. Such a publisher, in another

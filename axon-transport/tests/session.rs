@@ -175,6 +175,27 @@ fn a_waiting_reader_is_woken_by_a_sample() {
 }
 
 #[test]
+fn loans_that_are_expected_are_in_place_from_513_bytes_on() {
+    let session = alone();
+    for (expected_len, shortest) in [(0, 4097), (512, 4097), (513, 513), (1 << 20, 513)] {
+        let spec = EndpointSpec { expected_len, ..spec(Qos::default()) };
+        let publisher = session.create_publisher(spec.clone()).unwrap();
+        let subscription = session.create_subscription(spec).unwrap();
+        assert!(subscription.wait_matched(1, PATIENCE));
+        for len in [512, 513, 1000, 4096, 4097] {
+            let mut loan = publisher.loan(len).unwrap();
+            loan.fill(1);
+            loan.publish().unwrap();
+            let (_, sample) = subscription.take_sample().unwrap();
+            assert_eq!(sample.is_borrowed(), len >= shortest, "{len} where {expected_len}");
+            publisher.publish(&vec![2; len]).unwrap();
+            let (_, sample) = subscription.take_sample().unwrap();
+            assert_eq!(sample.is_borrowed(), len > 4096, "copied in, {len} where {expected_len}");
+        }
+    }
+}
+
+#[test]
 fn a_sample_is_kept_beyond_all_that_it_came_from() {
     let session = alone();
     let publisher = session.create_publisher(spec(Qos::default())).unwrap();

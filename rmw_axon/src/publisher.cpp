@@ -1,5 +1,7 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
+#include <algorithm>
+#include <cstdint>
 #include <memory>
 #include <string>
 
@@ -85,7 +87,12 @@ rmw_publisher_t * rmw_create_publisher(
       auto publisher = std::make_unique<Publisher>();
       publisher->plan = rmw_axon::cdr::plan(type_support);
       names.type = publisher->plan.type;
-      const auto options = rmw_axon::endpoint_options(names, *qos_profile, type_support);
+      auto options = rmw_axon::endpoint_options(names, *qos_profile, type_support);
+      if (publisher->plan.plain) {
+        // What is lent is in place from smaller sizes on where it is expected.
+        const size_t size = rmw_axon::cdr::HEADER + publisher->plan.size_of;
+        options.expected_len = static_cast<uint32_t>(std::min<size_t>(size, UINT32_MAX));
+      }
       check(axon_session_publisher_create(of.handle, &options, &publisher->handle));
       axon_qos_t qos{};
       check(axon_session_publisher_describe(publisher->handle, &publisher->gid, &qos));

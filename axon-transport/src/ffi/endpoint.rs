@@ -51,7 +51,12 @@ pub struct axon_endpoint_options_t {
     /// A subscription: not 0 to receive nothing from publishers of its own session.
     pub ignore_local: u8,
     /// 0.
-    pub reserved: [u8; 7],
+    pub reserved: [u8; 3],
+    /// A publisher: the length of most samples in bytes; 0 where it is not known. Where it is more than
+    /// 512, the publisher has memory of its own for samples from the start, which each reader maps, and
+    /// loans of more than 512 bytes are in place there, like all samples of more than 4 KiB. Otherwise
+    /// only the latter are, in memory that comes with the first of them.
+    pub expected_len: u32,
 }
 
 /// What is asked for, with the profile as it is asked for.
@@ -73,6 +78,7 @@ pub(super) unsafe fn spec(
     let spec = EndpointSpec {
         type_hash: hash.to_vec(),
         ignore_local: options.ignore_local != 0,
+        expected_len: options.expected_len.into(),
         ..EndpointSpec::new(topic, type_name, request.for_service())
     };
     Ok((spec, request))

@@ -20,7 +20,8 @@ pub(super) struct NamedLoan {
 }
 
 /// Lends `len` bytes to be written and then published: in shared memory where they are more than
-/// 4 KiB, so that nothing is copied. They are at `data` and hold zeros or bytes of earlier samples.
+/// 4 KiB, or more than 512 bytes if the publisher was created to expect so many, so that nothing is
+/// copied. They are at `data` and hold zeros or bytes of earlier samples.
 /// Aligned to 16 is what is behind the first `header` of them, here and where they are taken in place:
 /// 0 for all of them, 4 for a structure that follows a header of four bytes. Fewer than `len` may be published, so that what is serialized can be given its
 /// upper bound. Blocks and fails as `axon_session_publisher_publish`.

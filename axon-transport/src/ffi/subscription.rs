@@ -154,8 +154,9 @@ pub unsafe extern "C" fn axon_session_subscription_take(
 /// Takes the oldest sample, by source timestamp among all publishers, in place: `len` bytes at `data`,
 /// which stand until `axon_session_sample_release`. What was lent is aligned as it was, a copy as
 /// the allocator does it (to 8 at least, but for one of 0 bytes, of which `data` is any address), and what a
-/// publisher wrote that does not keep to the protocol anyhow. One of more than 4 KiB is in the
-/// publisher's memory, of which a subscription can keep five for each publisher; a sixth is copied.
+/// publisher wrote that does not keep to the protocol anyhow. One of more than 4 KiB, and a loan of more
+/// than 512 bytes whose publisher expects so many, is in the publisher's memory, of which a subscription
+/// can keep five for each publisher; a sixth is copied.
 /// Where there is none the handle is 0, and nothing else is stored.
 ///
 /// Nobody may write to the bytes, and a forked child may not read them. Such a publisher, in another

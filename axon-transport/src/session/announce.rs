@@ -65,9 +65,10 @@ impl Session {
     pub(super) fn add_publisher(
         &self,
         endpoint: Endpoint,
-        role: EndpointRole,
+        expected_len: u64,
     ) -> Result<Publisher, SessionError> {
-        self.add_writer(endpoint, |endpoint, rings| PublisherInner::new(endpoint, role, rings))
+        let role = EndpointRole::Application;
+        self.add_writer(endpoint, expected_len, |e, rings| PublisherInner::new(e, role, rings))
     }
 
     /// A publisher that is alive when it is said to be.
@@ -76,15 +77,16 @@ impl Session {
         endpoint: Endpoint,
         role: EndpointRole,
     ) -> Result<Publisher, SessionError> {
-        self.add_writer(endpoint, |e, rings| PublisherInner::new(e, role, rings).asserted())
+        self.add_writer(endpoint, 0, |e, rings| PublisherInner::new(e, role, rings).asserted())
     }
 
     fn add_writer(
         &self,
         endpoint: Endpoint,
+        expected: u64,
         inner: impl FnOnce(Endpoint, Rings) -> PublisherInner,
     ) -> Result<Publisher, SessionError> {
-        let options = self.ring(&endpoint, endpoint.qos);
+        let options = RingOptions { expected, ..self.ring(&endpoint, endpoint.qos) };
         let writer = Arc::new(Writer::create(self.shared().segment.clone(), options)?);
         let inner = Arc::new(inner(endpoint, Rings::Shared(writer.clone())));
         self.announce(Some(&inner), None);

@@ -17,8 +17,9 @@ impl Session {
     /// # Errors
     /// When the specification is out of bounds or there is no memory.
     pub fn create_publisher(&self, spec: EndpointSpec) -> Result<Publisher, SessionError> {
+        let expected_len = spec.expected_len;
         let endpoint = self.endpoint(spec, EndpointKind::Publisher)?;
-        let publisher = self.add_publisher(endpoint, EndpointRole::Application)?;
+        let publisher = self.add_publisher(endpoint, expected_len)?;
         let inner = &publisher.inner;
         self.shared().meet(&inner.endpoint);
         self.await_pairs(&inner.endpoint, |other| inner.events.is_matched(other));

@@ -88,6 +88,9 @@ pub struct EndpointSpec {
     pub namespace: String,
     /// A subscription: whether it receives nothing from publishers of its own session.
     pub ignore_local: bool,
+    /// A publisher: the length of most samples in bytes, as in
+    /// [`PublisherOptions::expected_len`](crate::shm::PublisherOptions::expected_len); 0 when unknown.
+    pub expected_len: u64,
 }
 
 impl EndpointSpec {
@@ -101,6 +104,7 @@ impl EndpointSpec {
             node: String::new(),
             namespace: String::new(),
             ignore_local: false,
+            expected_len: 0,
         }
     }
 }

@@ -120,7 +120,8 @@ impl Publisher {
     }
 
     /// Room for a sample of exactly `len` bytes, to serialize into: in shared memory where it is
-    /// more than 4 KiB.
+    /// more than 4 KiB, or more than 512 bytes if so many are
+    /// [expected](super::EndpointSpec::expected_len).
     ///
     /// # Errors
     /// As for [`publish`](Self::publish).

@@ -121,7 +121,9 @@ void case_topics(void) {
     close_place(place);
 }
 
-static void publish_loan(axon_publisher_t talker, size_t header, size_t most, size_t len) {
+/* Where it was lent. */
+static const uint8_t *publish_loan(axon_publisher_t talker, size_t header, size_t most,
+                                   size_t len) {
     axon_loan_t loan;
     uint8_t *data = NULL;
     OK(axon_session_publisher_loan(talker, header, most, &loan, &data));
@@ -135,6 +137,7 @@ static void publish_loan(axon_publisher_t talker, size_t header, size_t most, si
     CHECK(sequence > 0);
     NO_HANDLE(axon_session_loan_publish(loan, len, 5, NULL));
     NO_HANDLE(axon_session_loan_abandon(loan));
+    return data;
 }
 
 static void take_in_place(struct place place, axon_subscription_t listener, size_t header,
@@ -154,6 +157,37 @@ static void take_in_place(struct place place, axon_subscription_t listener, size
     }
     OK(axon_session_sample_release(sample));
     NO_HANDLE(axon_session_sample_release(sample));
+}
+
+/* Those that are expected are in place from 513 bytes on. A publisher of this session shows by the
+   address: two at a time, so that none is where another one was. */
+static void take_expected(struct place place) {
+    axon_endpoint_options_t options = endpoint("/expected");
+    options.expected_len = 513;
+    axon_publisher_t talker;
+    OK(axon_session_publisher_create(place.node, &options, &talker));
+    axon_subscription_t listener = subscription(place, "/expected");
+    OK(axon_session_publisher_wait_matched(talker, 1, PATIENCE));
+    static const size_t sizes[] = {513, 1000, 4096, 4097};
+    for (size_t i = 0; i < sizeof sizes / sizeof sizes[0]; i++) {
+        const uint8_t *lent[2], *found[2];
+        axon_sample_t samples[2];
+        for (size_t one = 0; one < 2; one++) {
+            lent[one] = publish_loan(talker, 4, sizes[i], sizes[i]);
+        }
+        for (size_t one = 0; one < 2; one++) {
+            size_t len = 0;
+            OK(axon_session_subscription_take_sample(listener, &samples[one], &found[one], &len,
+                                                     NULL));
+            CHECK(len == sizes[i] && found[one] == lent[one]);
+        }
+        for (size_t one = 0; one < 2; one++) {
+            CHECK(found[one][512] == (uint8_t)(512 * 7));
+            OK(axon_session_sample_release(samples[one]));
+        }
+    }
+    OK(axon_session_subscription_destroy(listener));
+    OK(axon_session_publisher_destroy(talker));
 }
 
 void case_loans(void) {
@@ -177,6 +211,8 @@ void case_loans(void) {
     size_t len = 0;
     OK(axon_session_subscription_take_sample(listener, &sample, &data, &len, NULL));
     CHECK(sample.id == 0 && data == NULL);
+
+    take_expected(place);
 
     axon_loan_t loan;
     uint8_t *room_for = NULL;

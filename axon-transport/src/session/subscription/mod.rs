@@ -67,8 +67,9 @@ impl Subscription {
         take_from(&self.inner, &self.session, take).map(|(info, ())| info)
     }
 
-    /// As [`take`](Self::take), but a sample of more than 4 KiB stays in the publisher's memory for
-    /// as long as it is kept, unless `AXON_SHM_COPY` asks for copies.
+    /// As [`take`](Self::take), but a sample of more than 4 KiB, or a loan of more than 512 bytes whose
+    /// publisher [expects](super::EndpointSpec::expected_len) so many, stays in the publisher's memory
+    /// for as long as it is kept, unless `AXON_SHM_COPY` asks for copies.
     pub fn take_sample(&self) -> Option<(MessageInfo, Sample)> {
         take_sample_from(&self.inner, &self.session)
     }
