@@ -46,7 +46,7 @@ pub(super) fn svg(results: &Results) -> String {
         across: |readers| format!("{readers}"),
         upwards: time,
     });
-    let machine = &results.machine;
+    let machine = &results.run.machine;
     let subtitle = format!("{}, {}, {} CPUs", machine.cpu, machine.kernel, machine.cpus);
     page("AXON's shared memory beside the raw limit", &subtitle, &charts)
 }

@@ -7,6 +7,7 @@ pub(crate) mod harness;
 pub(crate) mod net;
 mod readers;
 mod report;
+mod run;
 pub(crate) mod session;
 
 use std::{
@@ -15,11 +16,9 @@ use std::{
 };
 
 use self::{
-    harness::{
-        Axon, Effort, Load, Machine, Medium, Motion, Pair, Progress, Raw, Rounds, SIZES, Wake,
-        words,
-    },
+    harness::{Axon, Load, Medium, Motion, Pair, Progress, Raw, Rounds, SIZES, Wake, words},
     readers::{Cost, Crowd},
+    run::Run,
 };
 use crate::{cli, failure::Failure};
 
@@ -53,9 +52,7 @@ struct Compared {
 
 /// All that was measured.
 struct Results {
-    machine: Machine,
-    quick: bool,
-    effort: Effort,
+    run: Run,
     /// By kind, then by size.
     latency: Vec<Compared>,
     streams: Vec<Compared>,
@@ -91,12 +88,11 @@ pub(crate) fn read() -> Result<(), Failure> {
 }
 
 fn measure(sizes: &[usize], quick: bool) -> harness::Result<Results> {
-    let effort = if quick { Effort::QUICK } else { Effort::FULL };
-    let machine = Machine::look()?;
+    let run = Run::start(quick)?;
     let progress = Progress::new(sizes.len() * (KINDS.len() + STREAMS.len() + 1));
     let (mut latency, mut streams, mut publish) = (Vec::new(), Vec::new(), Vec::new());
 
-    let pair = Pair::start(&MEDIA, effort, &machine, &[ANSWERING])?;
+    let pair = Pair::start(&MEDIA, run.effort, &run.machine, &[ANSWERING])?;
     for (wake, motion) in KINDS {
         progress.step(&format!("latency, {}", words::kind(wake, motion)));
         for size in sizes {
@@ -118,10 +114,10 @@ fn measure(sizes: &[usize], quick: bool) -> harness::Result<Results> {
     progress.step("a publish by its readers");
     let crowd = Crowd::start(&[READING])?;
     for size in sizes {
-        publish.push(crowd.measure(*size, effort)?);
+        publish.push(crowd.measure(*size, run.effort)?);
         progress.advance();
     }
-    Ok(Results { machine, quick, effort, latency, streams, publish })
+    Ok(Results { run, latency, streams, publish })
 }
 
 fn compared(load: Load, rounds: Vec<Rounds>) -> harness::Result<Compared> {

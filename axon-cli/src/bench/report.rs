@@ -18,10 +18,7 @@ const REPORTED: &str = "Raw and AXON take turns. Times are one way (half a round
                         the first.";
 
 pub(super) fn text(results: &Results) -> String {
-    let mut out = format!("{}\n{REPORTED}\n", results.machine.line());
-    if results.quick {
-        out += "A quick run: its figures are good for nothing.\n";
-    }
+    let mut out = results.run.heading(REPORTED);
     for (wake, motion) in KINDS {
         let _ = writeln!(
             out,
@@ -178,19 +175,12 @@ pub(super) fn json(results: &Results) -> String {
             "budget": budget_json(ratio, Some(budgets::SIXTEEN_READERS)),
         })
     };
-    let document = json!({
-        "benchmark": "axon bench shm",
-        "version": env!("CARGO_PKG_VERSION"),
-        "optimized": !cfg!(debug_assertions),
-        "quick": results.quick,
-        "reported": REPORTED,
-        "machine": results.machine,
-        "rounds": results.effort.rounds,
-        "latency": results.latency.iter().map(latency).collect::<Vec<_>>(),
-        "throughput": results.streams.iter().map(compared).collect::<Vec<_>>(),
-        "publish": results.publish.iter().map(publish).collect::<Vec<_>>(),
-    });
-    format!("{document:#}\n")
+    let figures = [
+        ("latency", results.latency.iter().map(latency).collect()),
+        ("throughput", results.streams.iter().map(compared).collect()),
+        ("publish", results.publish.iter().map(publish).collect()),
+    ];
+    results.run.document("shm", REPORTED, figures)
 }
 
 fn ratio_json(ratio: Ratio) -> Value {

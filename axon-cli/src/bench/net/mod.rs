@@ -17,7 +17,8 @@ use self::{
     stream::{Flow, Reader, Streamed},
 };
 use super::{
-    harness::{self, Effort, Load, Machine, Medium, Motion, Pair, Progress, Rounds, Wake},
+    harness::{self, Load, Medium, Motion, Pair, Progress, Rounds, Wake},
+    run::Run,
     session::medium::Sessions,
 };
 use crate::{
@@ -54,9 +55,7 @@ struct Measured {
 }
 
 struct Results {
-    machine: Machine,
-    quick: bool,
-    effort: Effort,
+    run: Run,
     modes: Vec<Measured>,
 }
 
@@ -96,10 +95,9 @@ fn media(sessions: &Sessions) -> [&dyn Medium; 2] {
 }
 
 fn measure(sizes: &[usize], modes: &[Mode], quick: bool) -> harness::Result<Results> {
-    let effort = if quick { Effort::QUICK } else { Effort::FULL };
+    let run = Run::start(quick)?;
     let (turns, length) = if quick { (1, 20) } else { (3, 1000) };
     let length = Duration::from_millis(length);
-    let machine = Machine::look()?;
     let directory = tempfile::Builder::new().prefix("axon-bench-").tempdir()?;
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
@@ -112,7 +110,7 @@ fn measure(sizes: &[usize], modes: &[Mode], quick: bool) -> harness::Result<Resu
         let media = media(&sessions);
 
         progress.step(&format!("latency, {}", mode.route()));
-        let pair = Pair::start(&media, effort, &machine, &[ANSWERING])?;
+        let pair = Pair::start(&media, run.effort, &run.machine, &[ANSWERING])?;
         let mut latency = Vec::new();
         for size in sizes {
             let load = Load::ping_pong(*size, Wake::Event, Motion::Copy);
@@ -124,7 +122,7 @@ fn measure(sizes: &[usize], modes: &[Mode], quick: bool) -> harness::Result<Resu
         drop(pair);
 
         progress.step(&format!("streams, {}", mode.route()));
-        machine.release()?;
+        run.machine.release()?;
         let reader = Reader::start(&[READING])?;
         let mut streams = Vec::new();
         for size in sizes {
@@ -147,5 +145,5 @@ fn measure(sizes: &[usize], modes: &[Mode], quick: bool) -> harness::Result<Resu
         }
         measured.push(Measured { mode: *mode, latency, streams });
     }
-    Ok(Results { machine, quick, effort, modes: measured })
+    Ok(Results { run, modes: measured })
 }

@@ -16,10 +16,7 @@ const REPORTED: &str = "AXON between two hosts on one machine's loopback, and on
                         with the least median; of streams the best of the turns counts.";
 
 pub(super) fn text(results: &Results) -> String {
-    let mut out = format!("{}\n{REPORTED}\n", results.machine.line());
-    if results.quick {
-        out += "A quick run: its figures are good for nothing.\n";
-    }
+    let mut out = results.run.heading(REPORTED);
     for measured in &results.modes {
         let _ = writeln!(out, "\nLatency, {}.\n", measured.mode.route());
         out += &latency(measured);
@@ -112,15 +109,5 @@ pub(super) fn json(results: &Results) -> String {
             "streams": streams.collect::<Vec<_>>(),
         })
     });
-    let document = json!({
-        "benchmark": "axon bench net",
-        "version": env!("CARGO_PKG_VERSION"),
-        "optimized": !cfg!(debug_assertions),
-        "quick": results.quick,
-        "reported": REPORTED,
-        "machine": results.machine,
-        "rounds": results.effort.rounds,
-        "modes": modes.collect::<Vec<_>>(),
-    });
-    format!("{document:#}\n")
+    results.run.document("net", REPORTED, [("modes", modes.collect())])
 }

@@ -15,8 +15,9 @@ use self::{
     place::Place,
     readers::{Cost, Crowd},
 };
-use super::harness::{
-    self, Axon, Effort, Load, Machine, Medium, Motion, Pair, Progress, Rounds, Wake, words,
+use super::{
+    harness::{self, Axon, Load, Medium, Motion, Pair, Progress, Rounds, Wake, words},
+    run::Run,
 };
 use crate::{cli, failure::Failure};
 
@@ -45,9 +46,7 @@ struct Compared {
 }
 
 struct Results {
-    machine: Machine,
-    quick: bool,
-    effort: Effort,
+    run: Run,
     latency: Vec<Compared>,
     publish: Vec<Cost>,
 }
@@ -84,14 +83,13 @@ fn media<'a>(sessions: &'a Sessions, service: &'a Service) -> [&'a dyn Medium; 3
 }
 
 fn measure(sizes: &[usize], quick: bool) -> harness::Result<Results> {
-    let effort = if quick { Effort::QUICK } else { Effort::FULL };
-    let machine = Machine::look()?;
+    let run = Run::start(quick)?;
     let place = Place::start()?;
     let hosts = Some([place.settings(), place.settings()]);
     let (sessions, service) = (Sessions(hosts.clone()), Service(hosts));
     let media = media(&sessions, &service);
     let progress = Progress::new(sizes.len() * (KINDS.len() + 1));
-    let pair = Pair::start(&media, effort, &machine, &[ANSWERING])?;
+    let pair = Pair::start(&media, run.effort, &run.machine, &[ANSWERING])?;
     let mut latency = Vec::new();
     for (wake, motion) in KINDS {
         progress.step(&format!("latency, {}", words::kind(wake, motion)));
@@ -109,8 +107,8 @@ fn measure(sizes: &[usize], quick: bool) -> harness::Result<Results> {
     let crowd = Crowd::start(&[READING])?;
     let mut publish = Vec::new();
     for size in sizes {
-        publish.push(crowd.measure(&place.settings(), *size, effort)?);
+        publish.push(crowd.measure(&place.settings(), *size, run.effort)?);
         progress.advance();
     }
-    Ok(Results { machine, quick, effort, latency, publish })
+    Ok(Results { run, latency, publish })
 }

@@ -22,10 +22,7 @@ fn ratios(row: &Compared) -> [(f64, f64); 2] {
 }
 
 pub(super) fn text(results: &Results) -> String {
-    let mut out = format!("{}\n{REPORTED}\n", results.machine.line());
-    if results.quick {
-        out += "A quick run: its figures are good for nothing.\n";
-    }
+    let mut out = results.run.heading(REPORTED);
     for (wake, motion) in KINDS {
         let _ = writeln!(out, "\nLatency, {}.\n", words::kind(wake, motion));
         let mut table = Table::new(&[
@@ -98,16 +95,6 @@ pub(super) fn json(results: &Results) -> String {
                 .collect::<Vec<_>>(),
         })
     });
-    let document = json!({
-        "benchmark": "axon bench session",
-        "version": env!("CARGO_PKG_VERSION"),
-        "optimized": !cfg!(debug_assertions),
-        "quick": results.quick,
-        "reported": REPORTED,
-        "machine": results.machine,
-        "rounds": results.effort.rounds,
-        "latency": latency.collect::<Vec<_>>(),
-        "publish": publish.collect::<Vec<_>>(),
-    });
-    format!("{document:#}\n")
+    let figures = [("latency", latency.collect()), ("publish", publish.collect())];
+    results.run.document("session", REPORTED, figures)
 }
