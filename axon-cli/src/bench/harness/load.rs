@@ -73,6 +73,11 @@ pub(crate) trait Medium {
     /// Its name in tables, charts and files.
     fn name(&self) -> &'static str;
 
+    /// Whether it has a part under `load`: one without is passed over.
+    fn carries(&self, _load: &Load) -> bool {
+        true
+    }
+
     /// This side's end for `load`. The other side opens its own at the same time, and both may
     /// talk over `channel` until both are done.
     fn open(&self, load: &Load, side: Side, channel: &Channel) -> Result<Box<dyn End>>;

@@ -120,7 +120,7 @@ impl<'a> Pair<'a> {
         Ok(Self { media, effort, clock: machine.clock_ns, cpu: near, cpus, credit, other })
     }
 
-    /// Nanoseconds of half a round trip, for each medium.
+    /// Nanoseconds of half a round trip, for each medium that carries this.
     pub(crate) fn latency(&self, load: &Load) -> Result<Vec<Rounds>> {
         self.by_turns(load, |end, medium, sent, count| {
             let cold = count / 16 + 1;
@@ -161,17 +161,18 @@ impl<'a> Pair<'a> {
         })
     }
 
-    /// All media under one load, a turn each per round, beginning with another one each time.
+    /// All media that carry a load, a turn each per round, beginning with another one each time.
     fn by_turns(
         &self,
         load: &Load,
         turn: impl Fn(&mut dyn End, usize, &mut u64, u64) -> Result<Vec<f64>>,
     ) -> Result<Vec<Rounds>> {
         let channel = self.other.channel();
+        let media = carrying(self.media, load);
         machine::unpin(&self.cpus)?;
         channel.tell(&Order::Open(*load))?;
         let mut ends = Vec::new();
-        for medium in self.media {
+        for medium in &media {
             let end = medium.open(load, Side::Near, channel);
             ends.push((end.map_err(|error| named(*medium, error))?, 0));
             channel.hear::<()>()?;
@@ -185,13 +186,13 @@ impl<'a> Pair<'a> {
             let (end, sent) = &mut ends[medium];
             let start = Instant::now();
             let times = turn(&mut **end, medium, sent, count);
-            let times = times.map_err(|error| named(self.media[medium], error))?;
+            let times = times.map_err(|error| named(media[medium], error))?;
             channel.hear::<()>()?;
             Ok::<_, Error>((times, start.elapsed()))
         };
         // The second time all is warm, and the least of the three was disturbed least.
         let mut counts = Vec::new();
-        for medium in 0..self.media.len() {
+        for medium in 0..media.len() {
             let mut count = 4;
             counts.push(loop {
                 let mut least = turn(medium, count)?.1;
@@ -204,10 +205,10 @@ impl<'a> Pair<'a> {
                 count *= 4;
             });
         }
-        let mut rounds: Vec<Rounds> = self.media.iter().map(|_| Rounds::default()).collect();
+        let mut rounds: Vec<Rounds> = media.iter().map(|_| Rounds::default()).collect();
         for round in 0..self.effort.rounds {
-            for next in 0..self.media.len() {
-                let medium = (round + next) % self.media.len();
+            for next in 0..media.len() {
+                let medium = (round + next) % media.len();
                 let (times, _) = turn(medium, counts[medium])?;
                 rounds[medium].add(times);
             }
@@ -220,7 +221,7 @@ impl<'a> Pair<'a> {
 }
 
 /// Is the other process, until the one that measures ends.
-pub(crate) fn serve(media: &[&dyn Medium]) -> Result<()> {
+pub(crate) fn serve(all: &[&dyn Medium]) -> Result<()> {
     // In the middle of a loop nobody else would end this process.
     set_parent_process_death_signal(Some(Signal::KILL))?;
     let channel = Channel::inherited()?;
@@ -229,13 +230,15 @@ pub(crate) fn serve(media: &[&dyn Medium]) -> Result<()> {
     let credit = Shared::map(&fd, CREDIT)?;
     // Each with the number of the last message.
     let mut ends: Vec<(Box<dyn End>, u64)> = Vec::new();
+    let mut media = Vec::new();
     let mut window = 1;
     while let Ok(order) = channel.hear() {
         match order {
             Order::Open(load) => {
                 window = load.window as u64;
                 machine::unpin(&cpus)?;
-                for medium in media {
+                media = carrying(all, &load);
+                for medium in &media {
                     let end = medium.open(&load, Side::Far, &channel);
                     ends.push((end.map_err(|error| named(*medium, error))?, 0));
                     channel.tell(&())?;
@@ -275,6 +278,11 @@ pub(crate) fn serve(media: &[&dyn Medium]) -> Result<()> {
         }
     }
     Ok(())
+}
+
+/// Those that have a part under `load`, the same on both sides.
+fn carrying<'a>(media: &[&'a dyn Medium], load: &Load) -> Vec<&'a dyn Medium> {
+    media.iter().copied().filter(|medium| medium.carries(load)).collect()
 }
 
 /// Receives the message after `last`.

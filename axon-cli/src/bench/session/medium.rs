@@ -33,7 +33,7 @@ pub(in crate::bench) type Hosts = Option<[Settings; 2]>;
 /// A publisher and a subscription in each of two sessions.
 pub(in crate::bench) struct Sessions(pub(in crate::bench) Hosts);
 
-/// A service: a request there, and its response back.
+/// A service: a request there, and its response back, both copied in and out.
 pub(super) struct Service(pub(super) Hosts);
 
 /// The session of this end, and the name of what it shares with the other.
@@ -65,7 +65,11 @@ impl Medium for Sessions {
             Side::Near => ("there", "back"),
             Side::Far => ("back", "there"),
         };
-        let spec = |way| Ok::<_, Error>(spec(&format!("{name}/{way}"), qos(load.window)?));
+        let expected_len = load.size as u64;
+        let spec = |way| {
+            let spec = spec(&format!("{name}/{way}"), qos(load.window)?);
+            Ok::<_, Error>(EndpointSpec { expected_len, ..spec })
+        };
         let subscription = session.create_subscription(spec(back)?)?;
         let publisher = session.create_publisher(spec(out)?)?;
         if !publisher.wait_matched(1, PATIENCE) || !subscription.wait_matched(1, PATIENCE) {
@@ -132,6 +136,10 @@ impl End for SessionEnd {
 impl Medium for Service {
     fn name(&self) -> &'static str {
         "service"
+    }
+
+    fn carries(&self, load: &Load) -> bool {
+        load.motion == Motion::Copy
     }
 
     fn open(&self, load: &Load, side: Side, channel: &Channel) -> Result<Box<dyn End>> {

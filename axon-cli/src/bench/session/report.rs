@@ -6,55 +6,39 @@ use serde_json::{Value, json};
 
 use super::{BUDGET, Compared, KINDS, Results, SERVICE_BUDGET, readers::READERS};
 use crate::{
-    bench::{budgets::verdict, harness::words},
+    bench::{
+        budgets::verdict,
+        harness::{Rounds, words},
+    },
     text::Table,
 };
 
 /// How figures are taken from rounds; in every output.
 const REPORTED: &str = "Bare shared memory, sessions and a service take turns. Times are p50 of the \
                         round in which it was least: one way (half a round trip), and for the \
-                        service both ways. Ratios are of these.";
+                        service both ways. Ratios are of these. A service copies requests and \
+                        responses, so that it is beside messages that are copied, too.";
 
-/// A session by bare shared memory, and a service's round trip by a session's message.
-fn ratios(row: &Compared) -> [(f64, f64); 2] {
-    let Compared { bare, session, service, .. } = row;
-    [(session.to(bare).best, BUDGET), (2.0 * service.to(session).best, SERVICE_BUDGET)]
+/// A ratio, and what it may be.
+type Judged = (f64, f64);
+
+/// A session by bare shared memory.
+fn session_to_bare(row: &Compared) -> Judged {
+    (row.session.to(&row.bare).best, BUDGET)
+}
+
+/// A service's round trip by a session's message.
+fn service_to_session(row: &Compared, service: &Rounds) -> Judged {
+    (2.0 * service.to(&row.session).best, SERVICE_BUDGET)
 }
 
 pub(super) fn text(results: &Results) -> String {
     let mut out = results.run.heading(REPORTED);
     for (wake, motion) in KINDS {
         let _ = writeln!(out, "\nLatency, {}.\n", words::kind(wake, motion));
-        let mut table = Table::new(&[
-            ">size",
-            ">bare",
-            ">session",
-            ">ratio",
-            ">budget",
-            "",
-            ">service",
-            ">by session",
-            ">budget",
-            "",
-        ]);
         let rows = results.latency.iter();
-        for row in rows.filter(|c| (c.load.wake, c.load.motion) == (wake, motion)) {
-            let [session, service] = ratios(row);
-            let time = |ns: f64| words::nanoseconds(ns);
-            let judged = |(ratio, budget): (f64, f64)| {
-                [format!("{ratio:.2}"), format!("{budget:.2}"), verdict(ratio, budget).to_owned()]
-            };
-            let mut cells = vec![
-                words::size(row.load.size),
-                time(row.bare.best().p50()),
-                time(row.session.best().p50()),
-            ];
-            cells.extend(judged(session));
-            cells.push(time(2.0 * row.service.best().p50()));
-            cells.extend(judged(service));
-            table.row(cells);
-        }
-        out += &table.render(0);
+        let rows = rows.filter(|c| (c.load.wake, c.load.motion) == (wake, motion));
+        out += &latency_table(rows.collect());
     }
     out += "\nA publish to 1, 4 and 16 subscriptions, each in a process of its own, which is idle.\n\n";
     let mut table = Table::new(&[">size", ">1", ">4", ">16", ">16 to 1"]);
@@ -68,22 +52,44 @@ pub(super) fn text(results: &Results) -> String {
     out + &table.render(0)
 }
 
+fn latency_table(rows: Vec<&Compared>) -> String {
+    let mut header = vec![">size", ">bare", ">session", ">ratio", ">budget", ""];
+    if rows.iter().any(|row| row.service.is_some()) {
+        header.extend([">service", ">by session", ">budget", ""]);
+    }
+    let mut table = Table::new(&header);
+    let judged = |(ratio, budget): Judged| {
+        [format!("{ratio:.2}"), format!("{budget:.2}"), verdict(ratio, budget).to_owned()]
+    };
+    for row in rows {
+        let mut cells = vec![words::size(row.load.size)];
+        cells.extend([&row.bare, &row.session].map(|r| words::nanoseconds(r.best().p50())));
+        cells.extend(judged(session_to_bare(row)));
+        if let Some(service) = &row.service {
+            cells.push(words::nanoseconds(2.0 * service.best().p50()));
+            cells.extend(judged(service_to_session(row, service)));
+        }
+        table.row(cells);
+    }
+    table.render(0)
+}
+
 pub(super) fn json(results: &Results) -> String {
-    let judged = |(ratio, budget): (f64, f64)| -> Value {
+    let judged = |(ratio, budget): Judged| -> Value {
         let ratio = (ratio * 1e3).round() / 1e3;
         json!({ "ratio": ratio, "at_most": budget, "met": ratio <= budget })
     };
     let latency = results.latency.iter().map(|row| {
-        let [session, service] = ratios(row);
+        let service = row.service.as_ref();
         json!({
             "bytes": row.load.size,
             "wake": row.load.wake,
             "motion": row.load.motion,
             "bare": row.bare.json(),
             "session": row.session.json(),
-            "service_one_way": row.service.json(),
-            "session_to_bare": judged(session),
-            "service_round_trip_to_session": judged(service),
+            "service_one_way": service.map(Rounds::json),
+            "session_to_bare": judged(session_to_bare(row)),
+            "service_round_trip_to_session": service.map(|s| judged(service_to_session(row, s))),
         })
     });
     let publish = results.publish.iter().map(|cost| {
