@@ -139,17 +139,17 @@ fn differs(
 ) -> Box<Refused> {
     let (variable, ours, theirs) = (variable.to_owned(), session.to_string(), daemon.to_string());
     let text = format!("{variable} is {ours} in the session and {theirs} in the daemon");
-    Box::new(Refused { variable, ours, theirs, text })
+    Box::new(Refused { variable, ours, theirs, text, endpoint: None })
 }
 
 /// No memory can be shared with it: it may come back to be relayed.
 pub(super) fn unshared(text: String) -> Box<Refused> {
     let [ours, theirs] = ["on", "off"].map(str::to_owned);
-    Box::new(Refused { variable: SHM.into(), ours, theirs, text })
+    Box::new(Refused { variable: SHM.into(), ours, theirs, text, endpoint: None })
 }
 
 fn plain(text: String) -> Box<Refused> {
-    Box::new(Refused { variable: String::new(), ours: String::new(), theirs: String::new(), text })
+    Box::new(Refused::because(text))
 }
 
 #[cfg(test)]

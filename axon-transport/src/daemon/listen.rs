@@ -161,11 +161,6 @@ fn refuse(
     say(socket, Message::Refused(refused), &[]);
 }
 
-fn because(text: String) -> Refused {
-    let [variable, ours, theirs] = [const { String::new() }; 3];
-    Refused { variable, ours, theirs, text }
-}
-
 /// What is shown of a session in log and status.
 fn shown(name: &str) -> String {
     name.chars().filter(|c| !c.is_control()).take(64).collect()
@@ -187,11 +182,15 @@ fn relay(
     };
     let checked = match state.admission.check(&hello, descriptors, peer, false) {
         Err(refused) => Err(*refused),
-        Ok(_) if state.registry.relayed() >= crate::relay::MAX_SESSIONS => Err(because(format!(
-            "{} sessions are relayed already; one that shares memory is served",
-            crate::relay::MAX_SESSIONS
-        ))),
-        Ok(_) => pair().map_err(|error| because(format!("no socket to relay it by: {error}"))),
+        Ok(_) if state.registry.relayed() >= crate::relay::MAX_SESSIONS => {
+            Err(Refused::because(format!(
+                "{} sessions are relayed already; one that shares memory is served",
+                crate::relay::MAX_SESSIONS
+            )))
+        }
+        Ok(_) => {
+            pair().map_err(|error| Refused::because(format!("no socket to relay it by: {error}")))
+        }
     };
     let (ours, theirs) = match checked {
         Ok(pair) => pair,
@@ -238,13 +237,13 @@ fn admit(
     // Endpoints are named after their session's id: who has another's could end them.
     if let Some(pid) = taken_by(control, &hello.session, pid) {
         let text = format!("process {pid} has a session with this one's id or one like it");
-        refuse(control, socket, &hello.name, peer, because(text));
+        refuse(control, socket, &hello.name, peer, Refused::because(text));
         return None;
     }
     let same = |(_, entry): &(&SessionId, &SessionEntry<_>)| entry.pid == pid;
     if !gateway && control.registry.sessions().filter(same).count() >= MAX_OF_PROCESS {
         let text = format!("its process has {MAX_OF_PROCESS} sessions already");
-        refuse(control, socket, &hello.name, peer, because(text));
+        refuse(control, socket, &hello.name, peer, Refused::because(text));
         return None;
     }
     let death = match &handed {
@@ -255,7 +254,7 @@ fn admit(
     tracing::debug!(%session, name, pid, "a session");
     let handed = handed.map(|fds| fds.map(Arc::new));
     if let Err(violation) = control.registry.connect(session, role, name.clone(), pid, handed) {
-        refuse(control, socket, &name, peer, because(violation.to_string()));
+        refuse(control, socket, &name, peer, Refused::because(violation.to_string()));
         return None;
     }
     if let Inside::Relay { tally, .. } = inside {

@@ -41,6 +41,9 @@ pub enum SessionEvent {
     DaemonLost,
     /// A daemon, perhaps another one than before, knows the session's endpoints.
     DaemonFound(DaemonId),
+    /// The daemon does not take this endpoint: no other session hears of it, and the graph does not
+    /// show it.
+    Refused(Gid),
 }
 
 type Listener = Arc<dyn Fn(&SessionEvent) + Send + Sync>;
@@ -82,6 +85,8 @@ pub(super) struct State {
     /// Endpoints that are gone, until a daemon has said so to everybody.
     pub(super) tombstones: BTreeSet<Gid>,
     pub(super) graph: Arc<GraphView>,
+    /// Endpoints of its own that the daemon does not take: nobody else ever hears of them.
+    pub(super) refused: BTreeSet<Gid>,
     pub(super) daemon: Option<DaemonId>,
     pub(super) status: StatusAnswer,
     /// When those who wait shall look again, whether or not anything comes.
@@ -106,12 +111,43 @@ impl State {
             .chain(subscriptions.map(|subscription| &subscription.endpoint))
     }
 
+    /// Those of them that the graph shows.
+    pub(super) fn shown(&self) -> impl Iterator<Item = &Endpoint> {
+        self.own().filter(|own| !self.refused.contains(&own.gid))
+    }
+
     /// Shows what the session has made, whatever the daemon does meanwhile: whoever made it finds it
-    /// in the graph.
+    /// in the graph, unless the daemon has refused it.
     pub(super) fn show(&mut self, own: &Endpoint) {
+        if self.refused.contains(&own.gid) {
+            return;
+        }
         let entry = || GraphEntry { endpoint: Arc::new(own.clone()), daemon: None };
         Arc::make_mut(&mut self.graph).endpoints.entry(own.gid).or_insert_with(entry);
         self.regraphed = true;
+    }
+
+    /// The daemon does not take one of its own: it is in nobody's graph, and so not in this one.
+    pub(super) fn refuse(&mut self, gid: Gid) {
+        // It may have ended meanwhile.
+        if self.own().any(|own| own.gid == gid) {
+            self.refused.insert(gid);
+            self.hide(&gid);
+        }
+    }
+
+    /// Another daemon may take those that the last one refused.
+    pub(super) fn forget_refusals(&mut self) {
+        let refused = std::mem::take(&mut self.refused);
+        let own: Vec<_> = self.own().filter(|e| refused.contains(&e.gid)).cloned().collect();
+        own.iter().for_each(|own| self.show(own));
+    }
+
+    fn hide(&mut self, gid: &Gid) {
+        if self.graph.endpoints.contains_key(gid) {
+            Arc::make_mut(&mut self.graph).endpoints.remove(gid);
+            self.regraphed = true;
+        }
     }
 
     pub(super) fn index(&mut self, endpoint: &Endpoint) {
@@ -121,10 +157,8 @@ impl State {
     /// One of its own is gone: nobody here counts it any more, whatever the daemon has heard.
     pub(super) fn bury(&mut self, gid: &Gid) {
         self.tombstones.insert(*gid);
-        if self.graph.endpoints.contains_key(gid) {
-            Arc::make_mut(&mut self.graph).endpoints.remove(gid);
-            self.regraphed = true;
-        }
+        self.refused.remove(gid);
+        self.hide(gid);
         self.tell_gone(gid);
     }
 
@@ -269,8 +303,21 @@ impl Shared {
 
     /// For a relay: there is a daemon now, or none any more.
     pub(crate) fn set_daemon(&self, daemon: Option<DaemonId>) {
-        self.state().daemon = daemon;
+        {
+            let mut state = self.state();
+            state.daemon = daemon;
+            if daemon.is_some() {
+                state.forget_refusals();
+            }
+        }
         self.notify(Some(&daemon.map_or(SessionEvent::DaemonLost, SessionEvent::DaemonFound)));
+    }
+
+    /// The daemon does not take an endpoint of the session's own.
+    pub(crate) fn refuse(&self, gid: Gid) {
+        self.state().refuse(gid);
+        self.notify(Some(&SessionEvent::Refused(gid)));
+        self.wake();
     }
 
     /// For a relay: so many samples of `writer` were lost on their way to the session's

@@ -22,7 +22,8 @@ use rustix::{
 
 use super::{
     message::{
-        Attach, Granted, Graph, Message, PROTOCOL, Pair, Segment, SegmentOpened, Unmatch, Welcome,
+        Attach, Granted, Graph, Message, PROTOCOL, Pair, Refused, Segment, SegmentOpened, Unmatch,
+        Welcome,
     },
     socket::{Received, SocketError},
     *,

@@ -2,6 +2,7 @@
 
 mod hostile;
 mod played;
+mod refused;
 mod services;
 #[allow(dead_code, reason = "for the tests of daemons too")]
 #[path = "../support/mod.rs"]

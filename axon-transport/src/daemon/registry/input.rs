@@ -128,15 +128,9 @@ impl<F: Clone> Registry<F> {
         } else {
             self.too_many_pairs(entry, &endpoint)
         };
-        if let Some(text) = refusal {
-            let text = format!("endpoint {gid} of topic {:?}: {text}", endpoint.topic);
-            self.note_refused(id, &text);
-            let refused = Refused {
-                variable: String::new(),
-                ours: String::new(),
-                theirs: String::new(),
-                text,
-            };
+        if let Some(why) = refusal {
+            let refused = Refused::of(&endpoint, why);
+            self.note_refused(id, &refused.text);
             self.push(id, &Message::Refused(refused), Vec::new());
             return Ok(());
         }

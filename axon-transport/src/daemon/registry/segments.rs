@@ -56,9 +56,7 @@ impl<F: Clone> Registry<F> {
              fewer publishers of samples over 4 KiB in one process"
         );
         self.note_refused(id, &text);
-        let none = String::new;
-        let refused = Refused { variable: none(), ours: none(), theirs: none(), text };
-        self.push(id, &Message::Refused(refused), Vec::new());
+        self.push(id, &Message::Refused(Refused::because(text)), Vec::new());
     }
 
     /// A session has given a segment up.

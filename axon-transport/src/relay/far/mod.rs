@@ -84,9 +84,7 @@ impl Far {
         let session = match Session::over_as(id, inside, &config, options) {
             Ok(session) => session,
             Err(error) => {
-                let text = error.to_string();
-                let [variable, ours, theirs] = [const { String::new() }; 3];
-                say(Message::Refused(Refused { variable, ours, theirs, text }))?;
+                say(Message::Refused(Refused::because(error.to_string())))?;
                 return Err(failed(&error));
             }
         };
@@ -320,8 +318,6 @@ impl Served {
     }
 
     fn refuse(&mut self, endpoint: &Endpoint, why: &str) -> Result<(), End> {
-        let [variable, ours, theirs] = [const { String::new() }; 3];
-        let text = format!("endpoint {} of topic {:?}: {why}", endpoint.gid, endpoint.topic);
-        self.pipe.say(&Message::Refused(Refused { variable, ours, theirs, text }))
+        self.pipe.say(&Message::Refused(Refused::of(endpoint, why)))
     }
 }

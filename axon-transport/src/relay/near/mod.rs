@@ -33,7 +33,7 @@ use crate::{
         Session, SessionError, Shared,
         connect::{Caller, Connected},
         local::House,
-        message::{Announce, EndpointRole, Gone, Graph, Message},
+        message::{Announce, EndpointRole, Gone, Graph, Message, Refused},
     },
     wait::ExternalLeader,
 };
@@ -283,8 +283,11 @@ impl<'a> Served<'a> {
                 let named = asserted.publishers.iter().filter_map(|gid| self.stand_ins.get(gid));
                 named.for_each(|stand_in| stand_in.face().assert_alive());
             }
-            Message::Refused(refused) => {
-                tracing::error!(reason = refused.text, "the daemon refuses an endpoint");
+            Message::Refused(Refused { endpoint, text: reason, .. }) => {
+                tracing::error!(reason, "the daemon refuses an endpoint");
+                if let Some(gid) = endpoint {
+                    self.common.shared.refuse(gid);
+                }
             }
             // What a daemon never says is not worth more than not being heard.
             _ => {}

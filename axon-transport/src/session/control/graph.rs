@@ -50,7 +50,7 @@ impl Control {
         {
             let mut state = self.shared.state();
             // The daemon may have told of the whole before it heard of the newest of them.
-            for own in state.own() {
+            for own in state.shown() {
                 let entry = || GraphEntry { endpoint: Arc::new(own.clone()), daemon: None };
                 view.endpoints.entry(own.gid).or_insert_with(entry);
             }
@@ -139,9 +139,12 @@ impl Control {
     fn appear(&mut self, entry: GraphEntry) {
         let endpoint = &entry.endpoint;
         let own = endpoint.gid.0[..12] == self.shared.id.0[..12];
-        // One of its own that has ended since it was announced: the daemon will say so.
-        if own && self.shared.state().tombstones.contains(&endpoint.gid) {
-            return;
+        if own {
+            let state = self.shared.state();
+            // It may have ended since it was announced: the daemon will say so.
+            if state.tombstones.contains(&endpoint.gid) || state.refused.contains(&endpoint.gid) {
+                return;
+            }
         }
         self.relate(endpoint);
         let shown = self.building.is_some()

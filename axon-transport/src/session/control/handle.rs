@@ -9,8 +9,8 @@ use crate::{
     passed::PassedFd,
     session::{
         message::{
-            Attach, Granted, MAX_DESCRIPTORS, Message, Pair, Segment, SegmentName, SegmentOpened,
-            Unmatch,
+            Attach, Granted, MAX_DESCRIPTORS, Message, Pair, Refused, Segment, SegmentName,
+            SegmentOpened, Unmatch,
         },
         peers::PeerError,
         publisher::PublisherInner,
@@ -46,11 +46,11 @@ impl Control {
                     self.shared.notify(None);
                 }
             }
-            Message::Refused(refused) => {
-                tracing::error!(
-                    reason = refused.text,
-                    "the daemon refuses something of the session"
-                );
+            Message::Refused(Refused { endpoint, text: reason, .. }) => {
+                tracing::error!(reason, "the daemon refuses something of the session");
+                if let Some(gid) = endpoint {
+                    self.shared.refuse(gid);
+                }
             }
             // What a daemon never says is not worth more than not being heard.
             _ => {}

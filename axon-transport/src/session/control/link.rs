@@ -41,6 +41,7 @@ impl Control {
         {
             let mut state = self.shared.state();
             state.daemon = Some(daemon);
+            state.forget_refusals();
             state.outgoing.clear();
             let endpoints = state.publishers.keys().chain(state.subscriptions.keys());
             let gids: BTreeSet<Gid> = state.nodes.keys().chain(endpoints).copied().collect();

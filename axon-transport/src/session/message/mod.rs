@@ -115,6 +115,23 @@ pub struct Refused {
     /// What is wrong.
     #[n(3)]
     pub text: String,
+    /// The endpoint that is refused; `None` when it is not one.
+    #[n(4)]
+    pub endpoint: Option<Gid>,
+}
+
+impl Refused {
+    /// For a reason that no variable is to blame for.
+    pub fn because(text: String) -> Self {
+        let [variable, ours, theirs] = [const { String::new() }; 3];
+        Self { variable, ours, theirs, text, endpoint: None }
+    }
+
+    /// Of one endpoint.
+    pub(crate) fn of(endpoint: &Endpoint, why: &str) -> Self {
+        let text = format!("endpoint {} of topic {:?}: {why}", endpoint.gid, endpoint.topic);
+        Self { endpoint: Some(endpoint.gid), ..Self::because(text) }
+    }
 }
 
 /// An endpoint exists. Repeating it changes only for whom it stands.

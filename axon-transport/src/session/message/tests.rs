@@ -38,6 +38,7 @@ fn messages() -> Vec<Message> {
             ours: "a".into(),
             theirs: "b".into(),
             text: String::new(),
+            endpoint: Some(writer),
         }),
         Message::Endpoint(Announce {
             endpoint: endpoint(),

@@ -232,3 +232,59 @@ fn a_reliable_publisher_is_held_up_by_who_takes_nothing_and_goes_on_when_it_does
     publisher.publish(&sample).unwrap();
     assert_eq!((taking.take(&daemon), taking.reader.lost()), (published + 1, 0));
 }
+
+#[test]
+fn an_endpoint_that_is_refused_is_not_in_the_graph() {
+    let (session, daemon) = session();
+    let node = session.create_node("n", "/", "/").unwrap();
+    let asking = subscription(&session);
+    let refused = publisher(&session, Qos::default());
+    let reader =
+        session.create_subscription(EndpointSpec::new("/p", "test/Bytes", Qos::default())).unwrap();
+    assert!(shows(&session, refused.gid()), "until it is refused");
+    let refuse = |gid| {
+        let refusal = Refused { endpoint: Some(gid), ..Refused::because("too many".into()) };
+        daemon.say(Message::Refused(refusal), &[]);
+    };
+    refuse(refused.gid());
+    let changed = [Waitable::GuardCondition(node.graph_changed())];
+    while shows(&session, refused.gid()) {
+        assert_eq!(session.wait_for(&changed, Some(EVER)).unwrap(), [0], "the change is told");
+    }
+    assert!(shows(&session, reader.gid()) && shows(&session, asking.gid()));
+    // What it has of its own session it keeps.
+    refused.publish(b"x").unwrap();
+    assert!(reader.has_data());
+    // The whole graph, of which the daemon says nothing of it, and a refusal of one that is gone.
+    daemon.tell_all(Vec::new());
+    let gone = refused.gid();
+    drop(refused);
+    refuse(gone);
+    refuse(Gid::new(SessionId::random(), 1));
+    has_heard(&daemon, &asking);
+    assert!(!shows(&session, gone) && shows(&session, reader.gid()));
+    assert!(session.shared().state().refused.is_empty());
+}
+
+#[test]
+fn one_that_is_refused_while_it_is_made_is_never_shown_again() {
+    let (session, daemon) = session();
+    let asking = subscription(&session);
+    for _ in 0..50 {
+        let (created, gid) = thread::scope(|scope| {
+            let creating = scope.spawn(|| publisher(&session, Qos::default()));
+            let gid = daemon.hear(|message| match message {
+                Message::Endpoint(announce) if announce.endpoint.topic == "/p" => {
+                    Some(announce.endpoint.gid)
+                }
+                _ => None,
+            });
+            let refusal = Refused { endpoint: Some(gid), ..Refused::because("no".into()) };
+            daemon.say(Message::Refused(refusal), &[]);
+            (creating.join().unwrap(), gid)
+        });
+        has_heard(&daemon, &asking);
+        assert_eq!(created.gid(), gid);
+        assert!(!shows(&session, gid));
+    }
+}

@@ -1,0 +1,30 @@
+//! Endpoints that the daemon does not take.
+
+use std::collections::BTreeSet;
+
+use super::*;
+
+/// Nodes that a relayed session may have.
+const MOST: usize = 1024;
+
+#[test]
+fn what_the_daemon_refuses_is_in_no_graph_and_the_next_daemon_is_asked_again() {
+    let host = host();
+    let mut daemon = host.daemon();
+    let (witness, own) = (session(&host, "witness", true), session(&host, "own", false));
+    let shown = |by: &Session| by.graph().endpoints.keys().copied().collect::<BTreeSet<_>>();
+    let node = |number| own.create_node(&format!("n{number}"), "/", "/").unwrap();
+    let mut nodes: Vec<_> = (0..=MOST).map(node).collect();
+    until("one too many is not shown", || shown(&own).len() == MOST);
+    until("both see the same", || shown(&own) == shown(&witness));
+
+    let accepted = nodes.iter().position(|node| shown(&own).contains(&node.gid())).unwrap();
+    nodes.remove(accepted);
+    until("it is gone", || shown(&own).len() == MOST - 1 && shown(&own) == shown(&witness));
+    daemon.0.kill().unwrap();
+    daemon.0.wait().unwrap();
+    daemon = host.daemon();
+    let all: BTreeSet<Gid> = nodes.iter().map(|node| node.gid()).collect();
+    until("the next one takes all", || shown(&own) == all && shown(&witness) == all);
+    drop(daemon);
+}
