@@ -66,6 +66,31 @@ pub(crate) fn relaying(host: &Host) -> Host {
     relaying.with("AXON_SHM", "off").with("AXON_DAEMON", "require")
 }
 
+/// Has a test done with the sessions of a server and a client, whoever of them shares memory.
+fn with_both_ends(test: impl Fn(&Session, &Session)) {
+    let host = host();
+    let _daemon = host.daemon();
+    between([&host, &host], test);
+}
+
+/// The same of two hosts, the server's first.
+fn between([here, there]: [&Host; 2], test: impl Fn(&Session, &Session)) {
+    for (serves, asks) in ENDS {
+        test(&session(here, "server", serves), &session(there, "client", asks));
+    }
+}
+
+/// Has a test done with a session that shares memory and with one that does not, beside processes that
+/// are relayed.
+fn beside_relayed(name: &str, test: impl Fn(&Session, &Host)) {
+    let host = host();
+    let _daemon = host.daemon();
+    let relaying = relaying(&host);
+    for shm in [true, false] {
+        test(&session(&host, name, shm), &relaying);
+    }
+}
+
 fn nothing_more(client: &Client) {
     let mut bytes = Vec::new();
     assert!(client.recv_response(&mut bytes, Some(Duration::from_millis(20))).is_none());
@@ -73,32 +98,26 @@ fn nothing_more(client: &Client) {
 
 #[test]
 fn calls_of_all_sizes_cross_whoever_shares_memory() {
-    let host = host();
-    let _daemon = host.daemon();
-    for (serves, asks) in ENDS {
-        let (here, there) = (session(&host, "server", serves), session(&host, "client", asks));
-        let server = serve(&here);
-        let client = ask(&there, &server);
+    with_both_ends(|here, there| {
+        let server = serve(here);
+        let client = ask(there, &server);
         for (number, len) in (0..).zip([0, 1, 4097, 31 << 10, 64 << 10, 3_000_000, 1]) {
             call_in_thread(&client, &server, &pattern(number, len));
         }
         assert_eq!((server.clients(), client.servers()), (vec![client.gid()], vec![server.gid()]));
-    }
+    });
 }
 
 #[test]
 fn a_service_is_available_while_it_is_there_and_to_those_it_goes_with() {
-    let host = host();
-    let _daemon = host.daemon();
-    for (serves, asks) in ENDS {
-        let (here, there) = (session(&host, "server", serves), session(&host, "client", asks));
+    with_both_ends(|here, there| {
         let node = there.create_node("n", "/", "/").unwrap();
         let changed = [Waitable::GuardCondition(node.graph_changed())];
         let client = there.create_client(service()).unwrap();
         assert!(!client.is_available());
         let other = EndpointSpec::new("/add", "Subtract", Qos::default());
         let _other = here.create_server(other).unwrap();
-        let server = serve(&here);
+        let server = serve(here);
         assert!(client.wait_available(PATIENCE));
         assert_eq!(client.servers(), [server.gid()]);
         until("the server counts it", || server.clients() == [client.gid()]);
@@ -106,12 +125,12 @@ fn a_service_is_available_while_it_is_there_and_to_those_it_goes_with() {
         while client.is_available() {
             assert_eq!(there.wait_for(&changed, Some(PATIENCE)).unwrap(), [0]);
         }
-        let server = serve(&here);
+        let server = serve(here);
         assert!(client.wait_available(PATIENCE));
         call_in_thread(&client, &server, b"abc");
         drop(client);
         until("the server counts it no more", || server.clients().is_empty());
-    }
+    });
 }
 
 #[test]
@@ -162,12 +181,8 @@ fn a_request_goes_to_every_server_and_a_response_to_nobody_but_who_asked() {
 
 #[test]
 fn twenty_clients_in_twenty_relayed_processes_get_each_their_own() {
-    let host = host();
-    let _daemon = host.daemon();
-    let relaying = relaying(&host);
-    for shm in [true, false] {
-        let session = session(&host, "server", shm);
-        let server = serve(&session);
+    beside_relayed("server", |session, relaying| {
+        let server = serve(session);
         let mut players: Vec<_> = (0..CLIENTS).map(|_| relaying.play("caller")).collect();
         for _ in 0..CLIENTS as u64 * CALLS {
             answer(&server);
@@ -176,17 +191,13 @@ fn twenty_clients_in_twenty_relayed_processes_get_each_their_own() {
         assert_eq!(server.clients().len(), CLIENTS);
         players.into_iter().for_each(support::Player::finish);
         until("all of them are gone", || server.clients().is_empty());
-    }
+    });
 }
 
 #[test]
 fn a_relayed_client_that_dies_with_responses_pending_harms_nobody() {
-    let host = host();
-    let _daemon = host.daemon();
-    let relaying = relaying(&host);
-    for shm in [true, false] {
-        let session = session(&host, "server", shm);
-        let server = serve(&session);
+    beside_relayed("server", |session, relaying| {
+        let server = serve(session);
         let mut asker = relaying.play("asker");
         assert_eq!(asker.hear(), "asked");
         let mut bytes = Vec::new();
@@ -209,16 +220,12 @@ fn a_relayed_client_that_dies_with_responses_pending_harms_nobody() {
         }
         assert_eq!(caller.hear(), "complete");
         caller.finish();
-    }
+    });
 }
 
 #[test]
 fn a_relayed_server_that_dies_in_a_call_is_not_available_and_another_one_is() {
-    let host = host();
-    let _daemon = host.daemon();
-    let relaying = relaying(&host);
-    for shm in [true, false] {
-        let session = session(&host, "client", shm);
+    beside_relayed("client", |session, relaying| {
         let node = session.create_node("n", "/", "/").unwrap();
         let changed = [Waitable::GuardCondition(node.graph_changed())];
         let client = session.create_client(service()).unwrap();
@@ -237,17 +244,14 @@ fn a_relayed_server_that_dies_in_a_call_is_not_available_and_another_one_is() {
         assert_eq!(next.hear(), "serves");
         assert!(client.wait_available(PATIENCE));
         call(&client, b"xyz");
-    }
+    });
 }
 
 #[test]
 fn who_takes_no_responses_holds_its_own_back_and_nobody_elses() {
-    let host = host();
-    let _daemon = host.daemon();
-    for (serves, asks) in ENDS {
-        let (here, there) = (session(&host, "server", serves), session(&host, "client", asks));
-        let server = serve(&here);
-        let (stuck, other) = (ask(&there, &server), ask(&there, &server));
+    with_both_ends(|here, there| {
+        let server = serve(here);
+        let (stuck, other) = (ask(there, &server), ask(there, &server));
         until("both ends know it", || server.clients().len() == 2);
         let mut sent = 0;
         let refused = loop {
@@ -265,7 +269,7 @@ fn who_takes_no_responses_holds_its_own_back_and_nobody_elses() {
             assert_eq!(info.sequence, number + 1);
             assert_eq!(bytes, pattern(number, 50_000));
         }
-    }
+    });
 }
 
 #[test]
@@ -310,12 +314,9 @@ fn who_keeps_the_newest_only_gets_them_and_holds_nobody_back() {
 
 #[test]
 fn a_server_that_takes_no_requests_holds_its_clients_back_and_loses_nothing() {
-    let host = host();
-    let _daemon = host.daemon();
-    for (serves, asks) in ENDS {
-        let (here, there) = (session(&host, "server", serves), session(&host, "client", asks));
-        let server = serve(&here);
-        let client = ask(&there, &server);
+    with_both_ends(|here, there| {
+        let server = serve(here);
+        let client = ask(there, &server);
         let mut sent = 0;
         let refused = loop {
             match client.send_request(&pattern(sent + 1, 50_000)) {
@@ -333,17 +334,14 @@ fn a_server_that_takes_no_requests_holds_its_clients_back_and_loses_nothing() {
         until("the server counts it", || server.clients() == [client.gid()]);
         respond(&server, client.gid(), sent, b"at last");
         assert_eq!(client.recv_response(&mut bytes, Some(PATIENCE)).unwrap().sequence, sent);
-    }
+    });
 }
 
 #[test]
 fn what_was_asked_or_answered_last_arrives_though_who_did_is_gone() {
-    let host = host();
-    let _daemon = host.daemon();
-    for (serves, asks) in ENDS {
-        let (here, there) = (session(&host, "server", serves), session(&host, "client", asks));
-        let (server, witness) = (serve(&here), serve(&here));
-        let client = ask(&there, &server);
+    with_both_ends(|here, there| {
+        let (server, witness) = (serve(here), serve(here));
+        let client = ask(there, &server);
         until("it counts both", || client.servers().len() == 2);
         until("they count it", || server.clients().len() == 1 && witness.clients().len() == 1);
         let (many, len) = (30, 100_000);
@@ -379,7 +377,7 @@ fn what_was_asked_or_answered_last_arrives_though_who_did_is_gone() {
         assert!(witness.recv_request(&mut bytes, Some(PATIENCE)).is_some());
         assert_eq!(bytes, b"the last word");
         until("it is forgotten", || witness.clients().is_empty());
-    }
+    });
 }
 
 #[test]
@@ -446,11 +444,9 @@ fn calls_go_on_with_the_next_daemon() {
 fn calls_cross_to_another_host_and_from_there() {
     let hosts = two_hosts();
     let _daemons = [hosts[0].daemon(), hosts[1].daemon()];
-    for (serves, asks) in ENDS {
-        let here = session(&hosts[0], "server", serves);
-        let there = session(&hosts[1], "client", asks);
-        let server = serve(&here);
-        let clients = [ask(&there, &server), ask(&there, &server)];
+    between([&hosts[0], &hosts[1]], |here, there| {
+        let server = serve(here);
+        let clients = [ask(there, &server), ask(there, &server)];
         for (number, len) in (0..).zip([0, 4097, 300_000]) {
             clients.iter().for_each(|one| call_in_thread(one, &server, &pattern(number, len)));
         }
@@ -461,5 +457,5 @@ fn calls_cross_to_another_host_and_from_there() {
         drop(server);
         until("it is not available", || !left.is_available());
         nothing_more(&left);
-    }
+    });
 }
