@@ -30,6 +30,7 @@ pub(super) struct Peers {
     own: Arc<SessionSegment>,
     news: Arc<MemoryNews>,
     peers: HashMap<SessionId, Entry>,
+    held: Held,
     /// An epoll instance of their pidfds: with hundreds of them, looking at each whenever anything
     /// happens would be most of what there is to do.
     deaths: Arc<OwnedFd>,
@@ -42,7 +43,6 @@ struct Entry {
     session: Arc<PeerSession>,
     /// Where its process's death is seen.
     deaths: Arc<OwnedFd>,
-    pairs: HashSet<Pair>,
     /// The segments that came or were named since the daemon began to tell everything: of others it
     /// does not know that they are here, so it will not say when they are gone.
     named: BTreeSet<u32>,
@@ -53,8 +53,7 @@ impl Entry {
         let key = epoll::EventData::new_u64(key(&session.id()));
         epoll::add(deaths, session.pidfd(), key, epoll::EventFlags::IN)
             .map_err(ShmError::system("watching a process"))?;
-        let (pairs, named) = (HashSet::new(), BTreeSet::new());
-        Ok(Self { session, deaths: deaths.clone(), pairs, named })
+        Ok(Self { session, deaths: deaths.clone(), named: BTreeSet::new() })
     }
 
     fn add(&mut self, segment: Segment, descriptor: &PassedFd) {
@@ -70,6 +69,52 @@ impl Drop for Entry {
     fn drop(&mut self) {
         // The pidfd may be in use for longer, here and in other processes, which share it.
         let _ = epoll::delete(&self.deaths, self.session.pidfd());
+    }
+}
+
+/// For which pairs sessions are held: of thousands of pairs with hundreds of sessions one is over at a
+/// time.
+#[derive(Default)]
+struct Held {
+    pairs: BTreeSet<(Pair, SessionId)>,
+    /// How many of them each session has.
+    counts: HashMap<SessionId, usize>,
+}
+
+impl Held {
+    fn add(&mut self, pair: Pair, id: SessionId) {
+        if self.pairs.insert((pair, id)) {
+            *self.counts.entry(id).or_default() += 1;
+        }
+    }
+
+    /// A pair is over. The sessions that are held for no other.
+    fn release(&mut self, pair: &Pair) -> Vec<SessionId> {
+        let [first, last] = [0, u8::MAX].map(|byte| (*pair, SessionId([byte; 16])));
+        let over: Vec<_> = self.pairs.range(first..=last).copied().collect();
+        let mut free = Vec::new();
+        for held in over {
+            self.pairs.remove(&held);
+            let (_, id) = held;
+            if let Some(count) = self.counts.get_mut(&id) {
+                *count -= 1;
+                if *count == 0 {
+                    self.counts.remove(&id);
+                    free.push(id);
+                }
+            }
+        }
+        free
+    }
+
+    fn holds(&self, id: &SessionId) -> bool {
+        self.counts.contains_key(id)
+    }
+
+    /// Sessions are gone, whatever pairs there were.
+    fn keep(&mut self, which: impl Fn(&SessionId) -> bool) {
+        self.pairs.retain(|(_, id)| which(id));
+        self.counts.retain(|id, _| which(id));
     }
 }
 
@@ -90,7 +135,7 @@ pub(super) enum PeerError {
 impl Peers {
     pub(super) fn new(own: Arc<SessionSegment>, news: Arc<MemoryNews>) -> Result<Self, Errno> {
         let deaths = Arc::new(epoll::create(epoll::CreateFlags::CLOEXEC)?);
-        Ok(Self { own, news, peers: HashMap::new(), deaths })
+        Ok(Self { own, news, peers: HashMap::new(), held: Held::default(), deaths })
     }
 
     /// The session `id`, for `pair`, with the descriptors that came along, if any: those of its
@@ -117,7 +162,7 @@ impl Peers {
             self.peers.insert(id, Entry::new(session, &self.deaths)?);
         }
         let entry = self.peers.get_mut(&id).ok_or(PeerError::Missing)?;
-        entry.pairs.insert(pair);
+        self.held.add(pair, id);
         for (segment, descriptor) in segments.iter().zip(&maps) {
             entry.add(*segment, descriptor);
         }
@@ -161,7 +206,8 @@ impl Peers {
     /// returned.
     pub(super) fn drop_unread(&mut self, read: impl Fn(&Gid) -> bool) -> Vec<(SessionId, u32)> {
         // Readers and publishers hold the sessions that they have to do with.
-        self.peers.retain(|_, e| !e.pairs.is_empty() || Arc::strong_count(&e.session) > 1);
+        let held = &self.held;
+        self.peers.retain(|id, e| held.holds(id) || Arc::strong_count(&e.session) > 1);
         let mut unnamed = Vec::new();
         for (id, Entry { session, named, .. }) in &self.peers {
             for SegmentInfo { number, kind } in session.segments() {
@@ -178,15 +224,15 @@ impl Peers {
 
     /// The daemon said that `pair` is over.
     pub(super) fn release(&mut self, pair: &Pair) {
-        self.peers.retain(|_, entry| !entry.pairs.remove(pair) || !entry.pairs.is_empty());
+        for id in self.held.release(pair) {
+            self.peers.remove(&id);
+        }
     }
 
     /// The daemon starts to count anew. What is mapped stays, for the pairs that it will repeat.
     pub(super) fn recount(&mut self) {
-        for entry in self.peers.values_mut() {
-            entry.pairs.clear();
-            entry.named.clear();
-        }
+        self.held = Held::default();
+        self.peers.values_mut().for_each(|entry| entry.named.clear());
     }
 
     /// Forgets the sessions whose process has ended; whether there were any.
@@ -201,7 +247,11 @@ impl Peers {
         if !ended.is_empty() {
             self.peers.retain(|id, e| !(ended.contains(&key(id)) && e.session.is_dead()));
         }
-        self.peers.len() != before
+        let died = self.peers.len() != before;
+        if died {
+            self.held.keep(|id| self.peers.contains_key(id));
+        }
+        died
     }
 
     /// Readable once the process of one of them has ended.
@@ -211,5 +261,64 @@ impl Peers {
 
     fn sessions(&self) -> impl Iterator<Item = &Arc<PeerSession>> {
         self.peers.values().map(|e| &e.session)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    #[derive(Clone, Debug)]
+    enum Step {
+        Add(u8, u8),
+        Release(u8),
+        Die(u8),
+    }
+
+    fn step() -> impl Strategy<Value = Step> {
+        let (pair, id) = (0..6_u8, prop_oneof![0..4_u8, Just(u8::MAX)]);
+        prop_oneof![
+            4 => (pair.clone(), id.clone()).prop_map(|(pair, id)| Step::Add(pair, id)),
+            3 => pair.prop_map(Step::Release),
+            1 => id.prop_map(Step::Die),
+        ]
+    }
+
+    proptest! {
+        #[test]
+        fn a_session_is_held_for_as_long_as_one_of_its_pairs(
+            steps in prop::collection::vec(step(), 0..100),
+        ) {
+            let pair = |number: u8| Pair { reader: Gid([number; 16]), writer: Gid([9; 16]) };
+            let session = |number: u8| SessionId([number; 16]);
+            let (mut held, mut model) = (Held::default(), HashMap::<u8, HashSet<u8>>::new());
+            for step in steps {
+                match step {
+                    Step::Add(one, of) => {
+                        held.add(pair(one), session(of));
+                        model.entry(of).or_default().insert(one);
+                    }
+                    Step::Release(one) => {
+                        let mut free = Vec::new();
+                        model.retain(|of, pairs| {
+                            let over = pairs.remove(&one) && pairs.is_empty();
+                            free.extend(over.then_some(session(*of)));
+                            !over
+                        });
+                        free.sort();
+                        prop_assert_eq!(held.release(&pair(one)), free);
+                    }
+                    Step::Die(of) => {
+                        held.keep(|id| *id != session(of));
+                        model.remove(&of);
+                    }
+                }
+                for number in [0, 1, 2, 3, u8::MAX] {
+                    prop_assert_eq!(held.holds(&session(number)), model.contains_key(&number));
+                }
+            }
+        }
     }
 }
