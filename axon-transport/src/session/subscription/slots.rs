@@ -21,9 +21,9 @@ pub(in crate::session) struct Slots {
     pub(super) slots: Vec<Slot>,
     /// Lanes given to writers that have not granted yet.
     pub(super) pending: HashMap<Gid, Lane>,
-    /// The last sequence number taken of each publisher, also of those that are gone: one that
-    /// comes back, as a remote one does with its link, must not be heard twice.
-    pub(super) last: HashMap<Gid, u64>,
+    /// The last sequence number taken of each publisher that is gone: one that comes back, as a remote
+    /// one does with its link, must not be heard twice.
+    last: HashMap<Gid, u64>,
     pub(super) received: u64,
     pub(super) expired: u64,
     pub(super) lost: u64,
@@ -60,6 +60,8 @@ pub(super) struct Slot {
     pub(super) over: bool,
     /// Found nothing in the take that is under way, since the writer was faster.
     pub(super) overtaken: bool,
+    /// The last sequence number taken of its writer, by way of whatever slot.
+    pub(super) last: Option<u64>,
     /// What is missing of its numbers, where that tells of losses on the way to its ring.
     pub(super) gaps: Option<Gaps>,
 }
@@ -89,11 +91,11 @@ impl Gaps {
 }
 
 impl Slot {
-    /// A sample was taken; `last` is the number of the newest one that came by way of any slot.
-    pub(super) fn passed(&mut self, sequence: u64, last: Option<u64>) {
+    /// A sample was taken.
+    pub(super) fn passed(&mut self, sequence: u64) {
         let Some(gaps) = &mut self.gaps else { return };
         let position = self.reader.position().saturating_sub(1);
-        if let (None, Some(last)) = (gaps.before, last) {
+        if let (None, Some(last)) = (gaps.before, self.last) {
             gaps.before = Some((last, self.reader.grant().first));
         }
         gaps.pass(sequence, position);
@@ -200,7 +202,9 @@ impl Slots {
         let lease = times.lease;
         let gaps = stands_in.then(Gaps::default);
         let (over, overtaken) = (false, false);
-        self.slots.push(Slot { reader, since, lifespan, lease, over, overtaken, gaps });
+        let earlier = self.slots.iter().find(|s| s.reader.writer() == writer).map(|s| s.last);
+        let last = earlier.unwrap_or_else(|| self.last.remove(&writer));
+        self.slots.push(Slot { reader, since, lifespan, lease, over, overtaken, last, gaps });
         self.forget_older(writer);
     }
 
@@ -239,9 +243,25 @@ impl Slots {
         {
             let later = self.slots[newer].reader.grant().first;
             let slot = self.slots.remove(older);
-            self.lost = self.lost.saturating_add(slot.lost());
             self.lost = self.lost.saturating_add(slot.reader.unread_below(later));
-            self.arrived += slot.reader.arrived();
+            self.retire(&slot);
+        }
+    }
+
+    /// Keeps what a slot that is given up leaves to be known.
+    pub(super) fn retire(&mut self, slot: &Slot) {
+        self.lost = self.lost.saturating_add(slot.lost());
+        self.arrived += slot.reader.arrived();
+        if self.last.len() >= REMEMBERED {
+            self.last.clear();
+        }
+        self.last.extend(slot.last.map(|last| (slot.reader.writer(), last)));
+    }
+
+    /// This sample of `writer` was taken.
+    pub(super) fn note(&mut self, writer: Gid, sequence: u64) {
+        for slot in self.slots.iter_mut().filter(|s| s.reader.writer() == writer) {
+            slot.last = Some(sequence);
         }
     }
 
@@ -258,19 +278,9 @@ impl Slots {
 
     /// Unmaps writers that are gone and drained.
     pub(super) fn sweep(&mut self) {
-        let (lost, arrived) = (&mut self.lost, &mut self.arrived);
-        self.slots.retain(|s| {
-            let keep = !s.over || !s.reader.is_drained();
-            if !keep {
-                *lost = lost.saturating_add(s.lost());
-                *arrived += s.reader.arrived();
-            }
-            keep
-        });
-        if self.last.len() > REMEMBERED {
-            let slots = &self.slots;
-            self.last.retain(|gid, _| slots.iter().any(|s| s.reader.writer() == *gid));
-        }
+        let over = |slot: &mut Slot| slot.over && slot.reader.is_drained();
+        let gone: Vec<Slot> = self.slots.extract_if(.., over).collect();
+        gone.iter().for_each(|slot| self.retire(slot));
     }
 }
 

@@ -119,11 +119,10 @@ impl Slots {
         let expired = slot.lifespan.is_some_and(|lifespan| {
             meta.source_timestamp.saturating_add(lifespan) < received_timestamp
         });
-        slot.passed(meta.sequence, self.last.get(&writer).copied());
-        let last = self.last.entry(writer).or_default();
-        let repeated = of.rising && meta.sequence <= *last;
+        slot.passed(meta.sequence);
+        let repeated = of.rising && slot.last.is_some_and(|last| meta.sequence <= last);
         if !repeated {
-            *last = meta.sequence;
+            self.note(writer, meta.sequence);
             if expired {
                 self.expired += 1;
             } else {
@@ -159,7 +158,7 @@ impl Slots {
         match slot.reader.take_sample() {
             Ok(sample) => {
                 if let Some(sample) = &sample {
-                    slot.passed(sample.meta().sequence, None);
+                    slot.passed(sample.meta().sequence);
                 }
                 // What a relay passes over, nobody asked it to.
                 let relay = of.role == EndpointRole::Relay;
@@ -236,8 +235,7 @@ impl Slots {
     fn discard(&mut self, index: usize, error: &TakeError, endpoint: &Endpoint) {
         tracing::error!(topic = endpoint.topic, %error, "a publisher's memory is not usable");
         let slot = self.slots.remove(index);
-        self.lost = self.lost.saturating_add(slot.lost());
-        self.arrived += slot.reader.arrived();
+        self.retire(&slot);
         if !slot.over {
             self.discarded.push(slot.reader.writer());
         }
