@@ -264,7 +264,7 @@ fn bytes_of_mut(words: &mut [u128]) -> &mut [u8] {
 }
 
 /// Nanoseconds since the Unix epoch.
-pub(super) fn now() -> i64 {
+pub(crate) fn now() -> i64 {
     let now = clock_gettime(ClockId::Realtime);
     now.tv_sec.saturating_mul(1_000_000_000).saturating_add(now.tv_nsec).max(0)
 }

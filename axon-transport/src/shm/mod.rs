@@ -118,6 +118,7 @@ pub(crate) use fork::ForkToken;
 pub use lane::Lane;
 pub use layout::{Location, SegmentKind};
 pub use loan::Loan;
+pub(crate) use loan::now;
 pub use peer::{Peer, PeerDescriptors, PeerSession};
 pub use publisher::{Publisher, PublisherOptions};
 pub use reader::{Reader, ReaderOptions};
