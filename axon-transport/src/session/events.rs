@@ -147,8 +147,8 @@ impl Event {
     }
 
     /// What a wait set looks at.
-    pub(super) fn parts(&self) -> (Source, EventKind) {
-        (self.source.clone(), self.kind)
+    pub(super) fn parts(&self) -> (&Source, EventKind) {
+        (&self.source, self.kind)
     }
 }
 

@@ -1,9 +1,6 @@
 //! Waiting for any of several things.
 
-use std::{
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::{sync::Arc, time::Duration};
 
 use super::{
     Client, Event, GuardCondition, Server, Session, SessionError, Subscription, events::Source,
@@ -31,8 +28,16 @@ pub enum Waitable<'a> {
     Event(&'a Event),
 }
 
-/// The part of a [`Waitable`] that may be looked at by whoever listens for all.
-pub(super) enum Part {
+/// The part of a [`Waitable`] that is looked at.
+#[derive(Clone, Copy)]
+enum Part<'a> {
+    Data(&'a Arc<SubscriptionInner>),
+    Guard(&'a Arc<Guard>),
+    Event(&'a Source, EventKind),
+}
+
+/// The same, kept for others to look at.
+enum Kept {
     Data(Arc<SubscriptionInner>),
     Guard(Arc<Guard>),
     Event(Source, EventKind),
@@ -40,7 +45,7 @@ pub(super) enum Part {
 
 /// What is waited for, without keeping it from ending.
 pub(crate) struct Watch {
-    parts: Vec<Part>,
+    parts: Vec<Kept>,
     /// The sessions that it belongs to, but for the one that waits.
     others: Vec<Arc<Shared>>,
 }
@@ -103,16 +108,23 @@ impl Session {
         waitables: &[Waitable<'_>],
         timeout: Option<Duration>,
     ) -> Result<Vec<usize>, SessionError> {
-        self.wait_watch(&self.watch(waitables)?, timeout)
+        if waitables.iter().any(|one| !Arc::ptr_eq(one.segment(), self.segment())) {
+            return self.wait_watch(&self.watch(waitables)?, timeout);
+        }
+        let take = || indices(waitables.iter().map(|one| one.part().take()));
+        let watch = || {
+            let parts = waitables.iter().map(|one| one.part().kept()).collect();
+            Arc::new(Watch { parts, others: Vec::new() })
+        };
+        self.wait_until(take, watch, timeout)
     }
 
     /// What [`wait_watch`](Self::wait_watch) waits for.
     pub(crate) fn watch(&self, waitables: &[Waitable<'_>]) -> Result<Arc<Watch>, SessionError> {
         let (mut parts, mut others) = (Vec::with_capacity(waitables.len()), Vec::new());
         for waitable in waitables {
-            let (part, segment) = waitable.part();
-            parts.push(part);
-            if !Arc::ptr_eq(segment, self.segment()) {
+            parts.push(waitable.part().kept());
+            if !Arc::ptr_eq(waitable.segment(), self.segment()) {
                 let session = waitable.session().ok_or(SessionError::OtherSession)?;
                 if !others.iter().any(|known| Arc::ptr_eq(known, &session)) {
                     others.push(session);
@@ -131,42 +143,62 @@ impl Session {
         if self.is_forked() {
             return Err(ShmError::Forked.into());
         }
-        let deadline = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
         let visit = |other| Visit::new(other, watch, self.shared());
         let visits: Result<Vec<_>, _> = watch.others.iter().map(|one| visit(one)).collect();
         let _visits = visits.map_err(|_| SessionError::OtherSession)?;
-        loop {
-            let ready = watch.collect();
-            let left = deadline.map(|deadline| deadline.saturating_duration_since(Instant::now()));
-            if !ready.is_empty() || left.is_some_and(|left| left.is_zero()) {
-                return Ok(ready);
-            }
-            // That something may be ready is enough for it to return: the next look is exact.
-            self.segment().wait_for(watch.clone(), left);
+        let take = || indices(watch.parts.iter().map(|kept| kept.part().take()));
+        self.wait_until(take, || watch.clone(), timeout)
+    }
+
+    /// Waits until `take` finds something. `watch` is for other threads to look at, and made where one
+    /// has to.
+    fn wait_until(
+        &self,
+        mut take: impl FnMut() -> Vec<usize>,
+        watch: impl Fn() -> Arc<Watch>,
+        timeout: Option<Duration>,
+    ) -> Result<Vec<usize>, SessionError> {
+        if self.is_forked() {
+            return Err(ShmError::Forked.into());
         }
+        let mut ready = Vec::new();
+        let look = || {
+            ready = take();
+            !ready.is_empty()
+        };
+        self.segment().wait_for(look, &|| -> Arc<dyn Look> { watch() }, timeout);
+        Ok(ready)
     }
 }
 
+/// Where there is a `true`.
+fn indices(all: impl Iterator<Item = bool>) -> Vec<usize> {
+    all.enumerate().filter_map(|(index, there)| there.then_some(index)).collect()
+}
+
 impl Waitable<'_> {
-    /// What is looked at, and the segment of the session that it belongs to.
-    fn part(&self) -> (Part, &Arc<SessionSegment>) {
+    /// What is looked at.
+    fn part(&self) -> Part<'_> {
         match self {
-            Waitable::Subscription(subscription) => {
-                (Part::Data(subscription.inner.clone()), subscription.session.segment())
-            }
-            Waitable::Server(server) => {
-                (Part::Data(server.requests.clone()), server.session.segment())
-            }
-            Waitable::Client(client) => {
-                (Part::Data(client.responses.clone()), client.session.segment())
-            }
-            Waitable::GuardCondition(guard) => {
-                (Part::Guard(guard.guard().clone()), guard.guard().segment())
-            }
+            Waitable::Subscription(subscription) => Part::Data(&subscription.inner),
+            Waitable::Server(server) => Part::Data(&server.requests),
+            Waitable::Client(client) => Part::Data(&client.responses),
+            Waitable::GuardCondition(guard) => Part::Guard(guard.guard()),
             Waitable::Event(event) => {
                 let (source, kind) = event.parts();
-                (Part::Event(source, kind), event.session.segment())
+                Part::Event(source, kind)
             }
+        }
+    }
+
+    /// The segment of the session that it belongs to.
+    fn segment(&self) -> &Arc<SessionSegment> {
+        match self {
+            Waitable::Subscription(subscription) => subscription.session.segment(),
+            Waitable::Server(server) => server.session.segment(),
+            Waitable::Client(client) => client.session.segment(),
+            Waitable::GuardCondition(guard) => guard.guard().segment(),
+            Waitable::Event(event) => event.session.segment(),
         }
     }
 
@@ -183,29 +215,46 @@ impl Waitable<'_> {
     }
 }
 
-impl Watch {
-    /// What is ready. Guard conditions that are stand no more.
-    fn collect(&self) -> Vec<usize> {
-        let ready = |part: &Part| match part {
+impl Part<'_> {
+    /// Whether it is ready. A guard condition that is stands no more.
+    fn take(self) -> bool {
+        match self {
             Part::Data(inner) => inner.has_data(),
             Part::Guard(guard) => guard.take(),
-            Part::Event(source, kind) => source.has(*kind),
-        };
-        self.parts
-            .iter()
-            .enumerate()
-            .filter(|(_, part)| ready(part))
-            .map(|(index, _)| index)
-            .collect()
+            Part::Event(source, kind) => source.has(kind),
+        }
+    }
+
+    /// The same for others than who waits, which changes nothing: where somebody is taking, it may be.
+    fn may_be_ready(self) -> bool {
+        match self {
+            Part::Data(inner) => inner.ready(),
+            Part::Guard(guard) => guard.is_triggered(),
+            Part::Event(source, kind) => source.may_have(kind),
+        }
+    }
+
+    fn kept(self) -> Kept {
+        match self {
+            Part::Data(inner) => Kept::Data(Arc::clone(inner)),
+            Part::Guard(guard) => Kept::Guard(Arc::clone(guard)),
+            Part::Event(source, kind) => Kept::Event(source.clone(), kind),
+        }
+    }
+}
+
+impl Kept {
+    fn part(&self) -> Part<'_> {
+        match self {
+            Self::Data(inner) => Part::Data(inner),
+            Self::Guard(guard) => Part::Guard(guard),
+            Self::Event(source, kind) => Part::Event(source, *kind),
+        }
     }
 }
 
 impl Look for Watch {
     fn ready(&self) -> bool {
-        self.parts.iter().any(|part| match part {
-            Part::Data(inner) => inner.ready(),
-            Part::Guard(guard) => guard.is_triggered(),
-            Part::Event(source, kind) => source.may_have(*kind),
-        })
+        self.parts.iter().any(|kept| kept.part().may_be_ready())
     }
 }

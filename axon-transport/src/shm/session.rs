@@ -170,14 +170,19 @@ impl SessionSegment {
         self.doorbell.wait(self.armed_words(), Purpose::Samples, ready, None, &[], timeout)
     }
 
-    /// As [`wait`](Self::wait), for something that other threads can look for too: this one is
-    /// woken only when it is there.
-    pub(crate) fn wait_for(&self, look: Arc<dyn Look>, timeout: Option<Duration>) -> bool {
+    /// As [`wait`](Self::wait), for something that other threads can look for too, by what `look`
+    /// makes: this one is woken only when it is there.
+    pub(crate) fn wait_for(
+        &self,
+        ready: impl FnMut() -> bool,
+        look: &dyn Fn() -> Arc<dyn Look>,
+        timeout: Option<Duration>,
+    ) -> bool {
         if self.is_forked() {
             return false;
         }
-        let (words, ready) = (self.armed_words(), || look.ready());
-        self.doorbell.wait(words, Purpose::Samples, ready, Some(look.clone()), &[], timeout)
+        let words = self.armed_words();
+        self.doorbell.wait(words, Purpose::Samples, ready, Some(look), &[], timeout)
     }
 
     /// Has `elsewhere`, another session of this process where a thread waits, look again when `look` may

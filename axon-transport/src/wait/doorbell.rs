@@ -121,22 +121,27 @@ impl Doorbell {
     /// Waits until `ready`, asked again after each ring, each [`Doorbell::notify`] and each event
     /// on `others`, or until `timeout` has passed. Returns what `ready` said last.
     ///
-    /// A thread that follows does not see `others`. With `look`, which must say what `ready` says,
-    /// it is woken for nothing else but its turn to lead.
+    /// A thread that follows does not see `others`. With `look`, which is made when it begins to follow
+    /// and must say what `ready` says, it is woken for nothing else but its turn to lead.
     pub(crate) fn wait(
         &self,
         words: Words<'_>,
         purpose: Purpose,
         mut ready: impl FnMut() -> bool,
-        look: Option<Arc<dyn Look>>,
+        look: Option<&dyn Fn() -> Arc<dyn Look>>,
         others: &[BorrowedFd<'_>],
         timeout: Option<Duration>,
     ) -> bool {
+        // What does not sleep in the end costs no look at the clock that can be done without.
         if ready() {
             return true;
         }
-        let deadline = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
-        if self.spin.look(&mut ready, deadline) {
+        if timeout == Some(Duration::ZERO) {
+            return false;
+        }
+        let now = Instant::now();
+        let deadline = timeout.and_then(|timeout| now.checked_add(timeout));
+        if self.spin.look(&mut ready, now, deadline) {
             return true;
         }
         let start = Instant::now();
@@ -156,7 +161,7 @@ impl Doorbell {
             if left.is_some_and(|left| left.is_zero()) {
                 return false;
             }
-            self.sleep(words, armed_at, look.as_ref(), others, left);
+            self.sleep(words, armed_at, look, others, left);
             // Most sleeps end with what they were for, which is not kept waiting for another ticket.
             if ready() {
                 self.spin.slept(start.elapsed());
@@ -188,7 +193,7 @@ impl Doorbell {
         &self,
         words: Words<'_>,
         armed_at: u64,
-        look: Option<&Arc<dyn Look>>,
+        look: Option<&dyn Fn() -> Arc<dyn Look>>,
         others: &[BorrowedFd<'_>],
         left: Option<Duration>,
     ) {
@@ -197,7 +202,7 @@ impl Doorbell {
             return;
         }
         if crowd.leader != Leader::None || crowd.coming {
-            self.follow(crowd, look, left);
+            self.follow(crowd, look.map(|look| look()), left);
             return;
         }
         crowd.leader = Leader::Thread;
@@ -215,11 +220,10 @@ impl Doorbell {
     fn follow(
         &self,
         mut crowd: MutexGuard<'_, Crowd>,
-        look: Option<&Arc<dyn Look>>,
+        look: Option<Arc<dyn Look>>,
         left: Option<Duration>,
     ) {
-        let (turn, look) = (Condvar::new(), look.cloned());
-        let follower = Arc::new(Follower { turn, look, elsewhere: None });
+        let follower = Arc::new(Follower { turn: Condvar::new(), look, elsewhere: None });
         crowd.followers.push(Arc::clone(&follower));
         crowd = match crowd.not_too_long(left) {
             Some(left) => {

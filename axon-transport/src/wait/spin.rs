@@ -41,15 +41,20 @@ impl Spin {
         Self { now, pause, patience, most }
     }
 
-    /// Whether `ready` came true, looked at again and again until `deadline` at the latest.
-    pub(super) fn look(&self, mut ready: impl FnMut() -> bool, deadline: Option<Instant>) -> bool {
+    /// Whether `ready` came true, looked at again and again from `now` until `deadline` at the latest.
+    pub(super) fn look(
+        &self,
+        mut ready: impl FnMut() -> bool,
+        mut now: Instant,
+        deadline: Option<Instant>,
+    ) -> bool {
         let budget = self.now.load(Ordering::Relaxed);
         if budget == 0 {
             return false;
         }
-        let mut end = Instant::now() + Duration::from_nanos(u64::from(budget));
+        let mut end = now + Duration::from_nanos(u64::from(budget));
         end = deadline.map_or(end, |deadline| end.min(deadline));
-        while Instant::now() < end {
+        while now < end {
             for _ in 0..8 {
                 spin_loop();
             }
@@ -57,6 +62,7 @@ impl Spin {
                 self.patience.store(1, Ordering::Relaxed);
                 return true;
             }
+            now = Instant::now();
         }
         let patience = self.patience.load(Ordering::Relaxed);
         self.now.store(0, Ordering::Relaxed);
@@ -95,6 +101,7 @@ mod tests {
                     looked = true;
                     false
                 },
+                Instant::now(),
                 None,
             );
             vain += u32::from(looked);
@@ -105,7 +112,7 @@ mod tests {
         // do all that follow.
         let mut found = 0;
         for _ in 0..10_000 {
-            let one = spin.look(|| true, None);
+            let one = spin.look(|| true, Instant::now(), None);
             found += u32::from(one);
             if !one {
                 spin.slept(Duration::from_nanos(500));
@@ -124,6 +131,7 @@ mod tests {
                     looks += 1;
                     false
                 },
+                Instant::now(),
                 None,
             );
             looks
@@ -144,7 +152,8 @@ mod tests {
         alone.slept(Duration::from_nanos(1));
         assert_eq!(look(&alone), 0);
         spin.slept(Duration::from_secs(1));
-        assert!(spin.look(|| true, None));
-        assert!(!spin.look(|| true, Some(Instant::now())), "its time is over");
+        assert!(spin.look(|| true, Instant::now(), None));
+        let now = Instant::now();
+        assert!(!spin.look(|| true, now, Some(now)), "its time is over");
     }
 }

@@ -342,8 +342,9 @@ fn of_those_that_follow_the_right_one_is_woken() {
         let mut waiters: Vec<_> = flags
             .iter()
             .map(|flag| {
-                let (session, look) = (&session, Arc::clone(flag));
-                scope.spawn(move || session.wait_for(look, Some(EVER)))
+                let session = &session;
+                let look = move || -> Arc<dyn Look> { flag.clone() };
+                scope.spawn(move || session.wait_for(|| flag.ready(), &look, Some(EVER)))
             })
             .collect();
         let armed = session.armed_word(Purpose::Samples);

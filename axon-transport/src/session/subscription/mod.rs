@@ -23,6 +23,7 @@ use crate::{
     graph::Endpoint,
     ids::Gid,
     shm::{Meta, Reader, Sample, ShmError, TakeError},
+    wait::Look,
 };
 
 /// Receives the samples of a topic. Thread-safe.
@@ -275,7 +276,7 @@ pub(super) fn recv_from<T>(
     timeout: Option<Duration>,
     mut take: impl FnMut() -> Option<T>,
 ) -> Option<T> {
-    let deadline = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
+    let mut begun = None;
     loop {
         // Nothing comes to a forked child, however long it waits.
         if session.is_forked() {
@@ -284,9 +285,13 @@ pub(super) fn recv_from<T>(
         if let Some(taken) = take() {
             return Some(taken);
         }
-        let left = deadline.map(|deadline| deadline.saturating_duration_since(Instant::now()));
-        let look = Arc::clone(inner);
-        if left.is_some_and(|left| left.is_zero()) || !session.segment().wait_for(look, left) {
+        // What is there already is taken without a look at the clock.
+        let now = Instant::now();
+        let waited = now.duration_since(*begun.get_or_insert(now));
+        let left = timeout.map(|timeout| timeout.saturating_sub(waited));
+        let look = || -> Arc<dyn Look> { inner.clone() };
+        let over = left.is_some_and(|left| left.is_zero());
+        if over || !session.segment().wait_for(|| inner.has_data(), &look, left) {
             return None;
         }
     }
