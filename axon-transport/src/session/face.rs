@@ -1,7 +1,11 @@
 //! Whoever writes elsewhere, as those see it that read here: a publisher, client or server that another
 //! process, of this host or of another, speaks for.
 
-use super::{Client, Publisher, Server, Session, SessionError, message::EndpointRole};
+use super::{
+    Client, Publisher, Server, Session, SessionError,
+    message::{EndpointRole, Leaving, Message},
+    state::Outgoing,
+};
 use crate::{
     graph::{Endpoint, EndpointKind},
     ids::Gid,
@@ -62,13 +66,26 @@ impl Face {
         }
     }
 
-    /// Those here whom it reaches and who, where it is of a service, reach it.
+    /// Those here whom it reaches and who, where it is of a service, reach it; whether or not they
+    /// have ended but for what they left.
     pub(crate) fn partners(&self) -> Vec<Gid> {
         match self {
             Self::Publisher(publisher) => publisher.matched(),
-            Self::Client(client) => client.servers(),
-            Self::Server(server) => server.clients(),
+            Self::Client(client) => client.attached(),
+            Self::Server(server) => server.attached(),
         }
+    }
+
+    /// Says that it has ended but for what is to be written, or that it has not: nobody counts it
+    /// until then, and those who read it get the rest.
+    pub(crate) fn leave(&self, leaving: bool) {
+        let session = match self {
+            Self::Publisher(publisher) => &publisher.session,
+            Self::Client(client) => &client.session,
+            Self::Server(server) => &server.session,
+        };
+        let leaving = Leaving { gid: self.endpoint().gid, leaving };
+        session.shared().tell(Outgoing::Message(Box::new(Message::Leaving(leaving))));
     }
 
     /// Writes a sample, a request, or a response to `client`, without waiting for room.

@@ -186,6 +186,11 @@ impl Server {
         both(&self.responses, &self.requests, &self.session)
     }
 
+    /// For a relay: as [`clients`](Self::clients), with those of whom there is more to come.
+    pub(crate) fn attached(&self) -> Vec<Gid> {
+        attached(&self.responses, &self.requests, &self.session)
+    }
+
     /// Whether there is a request to be taken.
     pub fn has_request(&self) -> bool {
         !self.session.is_forked() && self.requests.has_data()
@@ -287,6 +292,11 @@ impl Client {
         both(&self.requests, &self.responses, &self.session)
     }
 
+    /// For a relay: as [`servers`](Self::servers), with those of whom there is more to come.
+    pub(crate) fn attached(&self) -> Vec<Gid> {
+        attached(&self.requests, &self.responses, &self.session)
+    }
+
     /// Whether there is a response to be taken.
     pub fn has_response(&self) -> bool {
         !self.session.is_forked() && self.responses.has_data()
@@ -321,6 +331,16 @@ fn both(writes: &PublisherInner, reads: &SubscriptionInner, session: &Session) -
     }
     let mut gids = reads.events.matched_now();
     gids.retain(|gid| writes.events.is_matched(gid));
+    gids
+}
+
+/// The same, with those who have ended and have left something that is still to come.
+fn attached(writes: &PublisherInner, reads: &SubscriptionInner, session: &Session) -> Vec<Gid> {
+    let mut gids = both(writes, reads, session);
+    if !session.is_forked() {
+        let leaving = reads.lock().leaving();
+        gids.extend(leaving.into_iter().filter(|gid| writes.events.is_matched(gid)));
+    }
     gids
 }
 

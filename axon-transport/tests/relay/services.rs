@@ -338,6 +338,76 @@ fn a_server_that_takes_no_requests_holds_its_clients_back_and_loses_nothing() {
 }
 
 #[test]
+fn who_has_ended_is_not_counted_though_more_of_it_is_to_come() {
+    with_both_ends(|here, there| {
+        let node = there.create_node("n", "/", "/").unwrap();
+        let changed = [Waitable::GuardCondition(node.graph_changed())];
+        let server = serve(here);
+        let client = ask(there, &server);
+        until("the server counts it", || server.clients() == [client.gid()]);
+        let len = 50_000;
+        let mut answered = 0;
+        while server.send_response(client.gid(), answered + 1, &pattern(answered, len)).is_ok() {
+            answered += 1;
+            assert!(answered < 20_000, "nothing holds it back");
+        }
+        let gone = server.gid();
+        drop(server);
+        while client.is_available() || there.graph().endpoints.contains_key(&gone) {
+            assert_eq!(there.wait_for(&changed, Some(PATIENCE)).unwrap(), [0]);
+        }
+        let mut bytes = Vec::new();
+        for number in 0..answered {
+            let info = client.recv_response(&mut bytes, Some(PATIENCE)).expect("none is lost");
+            assert_eq!((info.publisher, info.sequence), (gone, number + 1));
+            assert_eq!(bytes, pattern(number, len));
+        }
+        nothing_more(&client);
+
+        let server = serve(here);
+        assert!(client.wait_available(PATIENCE));
+        until("the server counts it", || server.clients() == [client.gid()]);
+        let mut asked = 0;
+        while client.send_request(&pattern(asked, len)).is_ok() {
+            asked += 1;
+            assert!(asked < 20_000, "nothing holds it back");
+        }
+        let gone = client.gid();
+        drop(client);
+        until("the server counts it no more", || {
+            server.clients().is_empty() && !here.graph().endpoints.contains_key(&gone)
+        });
+        for number in 0..asked {
+            let info = server.recv_request(&mut bytes, Some(PATIENCE)).expect("none is lost");
+            assert_eq!((info.publisher, &bytes), (gone, &pattern(number, len)));
+        }
+    });
+}
+
+#[test]
+fn a_publisher_that_has_ended_is_not_counted_though_more_of_it_is_to_come() {
+    let host = host();
+    let _daemon = host.daemon();
+    for (writes, reads) in ENDS {
+        let (here, there) = (session(&host, "writes", writes), session(&host, "reads", reads));
+        let (publisher, subscription) = connect(&here, &there, "/t", Qos::keep_all());
+        let len = 50_000;
+        let mut last = 0;
+        while let Ok(number) = publisher.publish(&pattern(last + 1, len)) {
+            last = number;
+            assert!(last < 20_000, "nothing holds it back");
+        }
+        let gone = publisher.gid();
+        drop(publisher);
+        until("it is counted no more", || {
+            subscription.matched().is_empty() && !there.graph().endpoints.contains_key(&gone)
+        });
+        assert_eq!(take_until(&subscription, last), (1..=last).collect::<Vec<_>>());
+        assert_eq!(subscription.lost(), 0);
+    }
+}
+
+#[test]
 fn what_was_asked_or_answered_last_arrives_though_who_did_is_gone() {
     with_both_ends(|here, there| {
         let (server, witness) = (serve(here), serve(here));

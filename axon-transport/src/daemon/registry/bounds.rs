@@ -5,8 +5,8 @@ use crate::{
     graph::EndpointKind,
     qos::Qos,
     session::message::{
-        Announce, Attach, EndpointRole, Granted, Message, Segment, SegmentName, SegmentOpened,
-        StatusPart, Unmatch,
+        Announce, Attach, EndpointRole, Gone, Granted, Leaving, Message, Segment, SegmentName,
+        SegmentOpened, StatusPart, Unmatch,
     },
 };
 
@@ -123,7 +123,7 @@ fn the_gateway_brings_the_publishers_of_other_hosts_to_every_reader() {
     assert_eq!(registry.take_refused().len(), 1);
     let last = stand_in(u32::try_from(MAX_ALL_PAIRS).unwrap() / readers);
     assert!(!registry.endpoints.contains_key(&last), "it was refused");
-    let gone = |gid| Message::EndpointGone(crate::session::message::Gone { gid });
+    let gone = |gid| Message::EndpointGone(Gone { gid });
     assert_eq!(registry.message(&id(1), gone(last), vec![]), Ok(()));
     let other = registry.message(&id(2), gone(last), vec![]);
     assert_eq!(other, Err(Violation::NotItsOwn(last)), "nobody else speaks for other hosts");
@@ -289,4 +289,76 @@ fn the_segments_of_a_session_are_bounded_and_it_is_told() {
     let gone = Message::SegmentGone(SegmentName { session, number: 1 });
     registry.message(&session, gone, vec![]).unwrap();
     assert_eq!(registry.session(&session).unwrap().segments.len(), MAX_SEGMENTS - 1);
+}
+
+#[test]
+fn who_leaves_is_shown_to_nobody_and_read_to_its_end() {
+    let mut registry = registry(&[SessionRole::Application; 3]);
+    announce(&mut registry, 1, 1, EndpointKind::Publisher);
+    announce(&mut registry, 2, 1, EndpointKind::Subscription);
+    let [writer, reader] = [1, 2].map(|session| Gid::new(id(session), 1));
+    let place = Location { segment: 0, offset: 4096 };
+    let attach = Attach {
+        reader,
+        writer,
+        lane: place,
+        qos: Qos::default(),
+        session: id(2),
+        stands_for: Vec::new(),
+        segments: Vec::new(),
+    };
+    registry.message(&id(2), Message::Attach(attach), vec![]).unwrap();
+    let grant = Granted {
+        reader,
+        writer,
+        generation: 1,
+        first: 0,
+        session: id(1),
+        ring: place,
+        segments: Vec::new(),
+    };
+    registry.message(&id(1), Message::Grant(grant), vec![]).unwrap();
+    registry.flush();
+    (1..=3).for_each(|session| drop(drain(&mut registry, session)));
+    let before = registry.digest();
+
+    let leave = |registry: &mut Registry<Label>, session, leaving| {
+        let leaving = Message::Leaving(Leaving { gid: writer, leaving });
+        registry.message(&id(session), leaving, vec![])
+    };
+    assert_eq!(leave(&mut registry, 2, true), Err(Violation::NotItsOwn(writer)));
+    for _ in 0..2 {
+        leave(&mut registry, 1, true).unwrap();
+    }
+    registry.flush();
+    let is_leaving =
+        |m: &&Message| matches!(m, Message::Leaving(l) if l.gid == writer && l.leaving);
+    let removed = |m: &Message| matches!(m, Message::Graph(graph) if graph.removed == [writer]);
+    let told = drain(&mut registry, 2);
+    assert_eq!(told.iter().filter(is_leaving).count(), 1);
+    assert!(!told.iter().any(|m| matches!(m, Message::Unmatch(_))));
+    assert!(told.iter().any(removed) && drain(&mut registry, 3).iter().any(removed));
+    assert_ne!(registry.digest(), before);
+
+    // Nobody new gets it, and who is told everything anew hears so again, after the grant.
+    announce(&mut registry, 3, 1, EndpointKind::Subscription);
+    assert!(!drain(&mut registry, 3).iter().any(|m| matches!(m, Message::Match(_))));
+    drain(&mut registry, 2);
+    registry.message(&id(2), Message::Resync, vec![]).unwrap();
+    let told = drain(&mut registry, 2);
+    let granted = told.iter().position(|m| matches!(m, Message::Grant(_))).unwrap();
+    assert!(told[granted..].iter().any(|m| is_leaving(&m)));
+    let shows = |m: &Message| matches!(m, Message::Graph(graph) if graph.added.iter().any(|i| i.endpoint.gid == writer));
+    assert!(!told.iter().any(shows));
+
+    // It has come back.
+    leave(&mut registry, 1, false).unwrap();
+    registry.flush();
+    let told = drain(&mut registry, 3);
+    assert!(told.iter().any(shows) && told.iter().any(|m| matches!(m, Message::Match(_))));
+    assert_eq!(registry.pairs.len(), 2);
+    leave(&mut registry, 1, true).unwrap();
+    registry.message(&id(1), Message::EndpointGone(Gone { gid: writer }), vec![]).unwrap();
+    assert!(registry.pairs.is_empty());
+    assert_eq!(registry.session(&id(1)).unwrap().pairs, 0);
 }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use super::Registry;
+use super::{LocalEndpoint, Registry};
 use crate::{
     graph::{Endpoint, LIMITS},
     ids::{DaemonId, Gid},
@@ -78,8 +78,7 @@ impl<F: Clone> Registry<F> {
     /// A number that stands for the endpoints of applications here: another one, most likely, when
     /// they change.
     pub fn digest(&self) -> u64 {
-        let own = self.endpoints.values().filter(|e| e.role == EndpointRole::Application);
-        own.fold(0, |digest, local| {
+        self.shown().fold(0, |digest, local| {
             // GIDs are mostly random; FNV-1a spreads the rest.
             let hash = local.endpoint.gid.0.iter().fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
                 (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)
@@ -95,17 +94,19 @@ impl<F: Clone> Registry<F> {
 
     /// The whole graph, open-ended: the last part says that more follows.
     pub(super) fn whole_graph(&self) -> Vec<Graph> {
-        let local = self
-            .endpoints
-            .values()
-            .filter(|e| e.role == EndpointRole::Application)
-            .map(|e| GraphItem { endpoint: e.endpoint.clone(), daemon: None });
+        let local = self.shown().map(|e| GraphItem { endpoint: e.endpoint.clone(), daemon: None });
         let remote = self
             .remote_endpoints()
             .map(|(d, e)| GraphItem { endpoint: e.clone(), daemon: Some(*d) });
         let tombstones: Vec<Gid> = self.tombstones.iter().copied().collect();
         let ended = self.tombstones.iter().copied().collect();
         parts(self.version, true, local.chain(remote), &tombstones, &ended, true)
+    }
+
+    /// The endpoints of this host's applications that are in the graph.
+    fn shown(&self) -> impl Iterator<Item = &LocalEndpoint> {
+        let all = self.endpoints.values();
+        all.filter(|local| local.role == EndpointRole::Application && !local.leaving)
     }
 
     pub(super) fn graph_add_local(&mut self, endpoint: &Endpoint) {
@@ -131,7 +132,7 @@ impl<F: Clone> Registry<F> {
         self.ended.insert(gid);
     }
 
-    fn graph_remove(&mut self, gid: Gid) {
+    pub(super) fn graph_remove(&mut self, gid: Gid) {
         self.added.remove(&gid);
         self.removed.insert(gid);
     }

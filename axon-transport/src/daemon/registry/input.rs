@@ -1,5 +1,7 @@
 //! What sessions say.
 
+use std::collections::BTreeSet;
+
 use super::{
     Asked, LocalEndpoint, MAX_ALL_PAIRS, MAX_PAIRS, MAX_SESSIONS, MAX_TOMBSTONES, Registry,
     SessionEntry, Violation, output::session_entry,
@@ -8,7 +10,8 @@ use crate::{
     graph::{Endpoint, EndpointKind, LIMITS, writes},
     ids::{Gid, SessionId},
     session::message::{
-        Announce, Attach, EndpointRole, Granted, Message, Pair, Refused, SessionRole, Unmatch,
+        Announce, Attach, EndpointRole, Granted, Leaving, Message, Pair, Refused, SessionRole,
+        Unmatch,
     },
 };
 
@@ -75,6 +78,7 @@ impl<F: Clone> Registry<F> {
                 Ok(())
             }
             Message::EndpointGone(gone) => self.gone(id, gone.gid),
+            Message::Leaving(leaving) => self.leave(id, leaving),
             Message::Attach(attach) => self.attach(id, attach),
             Message::Grant(grant) => self.grant(id, grant),
             Message::Detach(pair) => self.detach(id, pair),
@@ -140,7 +144,8 @@ impl<F: Clone> Registry<F> {
         if role == EndpointRole::Application {
             self.graph_add_local(&endpoint);
         }
-        let local = LocalEndpoint { session: *id, endpoint, role, stands_for, ring };
+        let local =
+            LocalEndpoint { session: *id, endpoint, role, stands_for, ring, leaving: false };
         self.index(&local);
         self.endpoints.insert(gid, local);
         self.match_endpoint(&gid);
@@ -203,6 +208,43 @@ impl<F: Clone> Registry<F> {
         }
     }
 
+    /// An endpoint has ended, or has not after all, and there is more to come of it: its pairs stand,
+    /// but nobody counts it, and nobody new is matched with it.
+    fn leave(&mut self, id: &SessionId, leave: Leaving) -> Result<(), Violation> {
+        let Leaving { gid, leaving } = leave;
+        // It may have been refused.
+        let Some(local) = self.endpoints.get_mut(&gid) else { return Ok(()) };
+        if local.session != *id || !writes(local.endpoint.kind) {
+            return Err(Violation::NotItsOwn(gid));
+        }
+        if std::mem::replace(&mut local.leaving, leaving) == leaving {
+            return Ok(());
+        }
+        if local.role == EndpointRole::Application {
+            let endpoint = local.endpoint.clone();
+            if leaving {
+                self.graph_remove(gid);
+            } else {
+                self.graph_add_local(&endpoint);
+            }
+        }
+        for reader in self.readers_of(&gid) {
+            self.push(&reader, &Message::Leaving(leave), Vec::new());
+        }
+        if !leaving {
+            self.match_endpoint(&gid);
+        }
+        Ok(())
+    }
+
+    /// The sessions that read what an endpoint writes.
+    fn readers_of(&self, writer: &Gid) -> BTreeSet<SessionId> {
+        let Some(local) = self.endpoints.get(writer) else { return BTreeSet::new() };
+        let pairs = self.prospective_pairs(&local.endpoint).into_iter();
+        let pairs = pairs.filter(|p| p.writer == *writer && self.pairs.contains_key(p));
+        pairs.filter_map(|pair| Some(self.endpoints.get(&pair.reader)?.session)).collect()
+    }
+
     fn attach(&mut self, id: &SessionId, attach: Attach) -> Result<(), Violation> {
         if self.endpoints.get(&attach.reader).is_some_and(|r| r.session != *id) {
             return Err(Violation::NotItsOwn(attach.reader));
@@ -260,6 +302,7 @@ impl<F: Clone> Registry<F> {
             return false;
         };
         let (to, of) = (reader.session, grant.session);
+        let leaving = self.endpoints.get(&pair.writer).is_some_and(|writer| writer.leaving);
         let mut descriptors = self.introduce(&to, &of, pair);
         // The ring's own first: those that do not fit follow.
         let numbers = self.segments_for(&of, &pair.writer);
@@ -267,6 +310,10 @@ impl<F: Clone> Registry<F> {
         grant.segments = self.hand_over(&to, &of, numbers, &mut descriptors);
         self.push(&to, &Message::Grant(grant), descriptors);
         self.hand_over_rest(&to, &of, &pair.writer);
+        if leaving {
+            let leaving = Message::Leaving(Leaving { gid: pair.writer, leaving });
+            self.push(&to, &leaving, Vec::new());
+        }
         true
     }
 

@@ -31,7 +31,11 @@ impl<F: Clone> Registry<F> {
             else {
                 continue;
             };
-            if !roles_match(w.role, r.role) {
+            if !roles_match(w.role, r.role) || w.leaving || r.leaving {
+                continue;
+            }
+            // One that has come back.
+            if self.pairs.contains_key(&pair) {
                 continue;
             }
             let (to_writer, to_reader) = (w.session, r.session);
@@ -93,18 +97,20 @@ impl<F: Clone> Registry<F> {
     /// that start at once, each is told of its own.
     pub(super) fn pairs_of(&self, id: &SessionId) -> BTreeSet<Pair> {
         let gids = self.sessions.get(id).into_iter().flat_map(|entry| &entry.endpoints);
-        let prospects = gids.filter_map(|gid| {
-            let endpoint = &self.endpoints.get(gid)?.endpoint;
-            Some(self.topics.get(&topic(endpoint))?.pairs_of(gid, endpoint.kind))
-        });
+        let prospects =
+            gids.filter_map(|gid| Some(self.prospective_pairs(&self.endpoints.get(gid)?.endpoint)));
         prospects.flatten().filter(|pair| self.pairs.contains_key(pair)).collect()
     }
 
     /// How many pairs an endpoint would make at most.
     pub(super) fn prospects(&self, endpoint: &Endpoint) -> usize {
-        self.topics
-            .get(&topic(endpoint))
-            .map_or(0, |members| members.pairs_of(&endpoint.gid, endpoint.kind).len())
+        self.prospective_pairs(endpoint).len()
+    }
+
+    /// The pairs that an endpoint would make at most.
+    pub(super) fn prospective_pairs(&self, endpoint: &Endpoint) -> Vec<Pair> {
+        let members = self.topics.get(&topic(endpoint));
+        members.map(|all| all.pairs_of(&endpoint.gid, endpoint.kind)).unwrap_or_default()
     }
 
     /// Whether there was such a pair.

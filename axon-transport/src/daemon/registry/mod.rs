@@ -137,6 +137,8 @@ pub struct LocalEndpoint {
     pub stands_for: Vec<Gid>,
     /// Where a writer's ring is.
     pub ring: Option<Location>,
+    /// It has ended, but what it has written is not all in its ring yet.
+    pub leaving: bool,
 }
 
 /// How far a pair has come.

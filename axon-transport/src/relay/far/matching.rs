@@ -64,7 +64,7 @@ impl Served {
         let mut matched: BTreeMap<Gid, BTreeSet<Gid>> = BTreeMap::new();
         let faces = self.writers.iter().map(|(gid, face)| (gid, face.partners()));
         matched.extend(faces.map(|(gid, others)| (*gid, others.into_iter().collect())));
-        let readers = self.subscriptions.iter().map(|(gid, s)| (gid, s.matched()));
+        let readers = self.subscriptions.iter().map(|(gid, s)| (gid, s.attached()));
         matched.extend(readers.map(|(gid, others)| (*gid, others.into_iter().collect())));
         self.keep_what_is_left(&mut matched);
         for (gid, others) in matched {

@@ -27,7 +27,7 @@ use crate::{
     seldom::Seldom,
     session::{
         Face, Node, Session, SessionError, SessionOptions, Subscription,
-        message::{Announce, EndpointRole, Matched, Message, PROTOCOL, Refused, Welcome},
+        message::{Announce, EndpointRole, Leaving, Matched, Message, PROTOCOL, Refused, Welcome},
         socket,
     },
     wait::ExternalLeader,
@@ -209,6 +209,13 @@ impl Served {
             Message::EndpointGone(gone) => {
                 self.forget(&gone.gid);
                 self.pipe.say(&Message::EndpointGone(gone))
+            }
+            Message::Leaving(Leaving { gid, leaving }) => {
+                // It may have been refused.
+                if let Some(face) = self.writers.get(&gid) {
+                    face.leave(leaving);
+                }
+                Ok(())
             }
             Message::Matched(matched) => self.callers(matched),
             Message::Asserted(asserted) => {

@@ -33,7 +33,7 @@ use crate::{
         Session, SessionError, Shared,
         connect::{Caller, Connected},
         local::House,
-        message::{Announce, EndpointRole, Gone, Graph, Message, Refused},
+        message::{Announce, EndpointRole, Gone, Graph, Leaving, Message, Refused},
     },
     wait::ExternalLeader,
 };
@@ -169,8 +169,9 @@ struct Served<'a> {
     pipe: Pipe,
     /// The session's endpoints that the daemon was told of.
     own: BTreeMap<Gid, Arc<Endpoint>>,
-    /// Those among them that write and are gone, and may have left something.
-    ending: BTreeSet<Gid>,
+    /// Those among them that write and are gone, and may have left something; whether the daemon was
+    /// told that they have.
+    ending: BTreeMap<Gid, bool>,
     /// Whether one of them waits for something else before it is told of.
     held_back: bool,
     /// Those that read and are gone, until the daemon has answered that.
@@ -205,7 +206,7 @@ impl<'a> Served<'a> {
             daemon: connected.welcome.daemon,
             pipe: Pipe::new(socket, incoming, Arc::new(Tally::default())),
             own: BTreeMap::new(),
-            ending: BTreeSet::new(),
+            ending: BTreeMap::new(),
             held_back: false,
             parting: BTreeSet::new(),
             matched: HashMap::new(),
@@ -325,6 +326,7 @@ impl<'a> Served<'a> {
         self.update_relays();
         self.end_writers()?;
         self.update_stand_ins()?;
+        self.note_leaving();
         self.update_calls()?;
         let matched = |e: &Endpoint| self.matched.get(&e.gid).is_some_and(|all| !all.is_empty());
         let read = self.own.values().filter(|e| e.kind == EndpointKind::Publisher && matched(e));
@@ -343,7 +345,7 @@ impl<'a> Served<'a> {
             .collect();
         for (gid, kind) in gone {
             if writes(kind) {
-                self.ending.insert(gid);
+                self.ending.entry(gid).or_default();
             } else {
                 self.tell_gone(gid)?;
             }
@@ -405,11 +407,13 @@ impl<'a> Served<'a> {
     }
 
     fn end_writers(&mut self) -> Result<(), End> {
-        let left =
-            self.ending.iter().filter(|gid| self.own.get(gid).is_none_or(|e| self.has_left(e)));
-        for gid in left.copied().collect::<Vec<_>>() {
-            self.ending.remove(&gid);
-            self.tell_gone(gid)?;
+        for gid in self.ending.keys().copied().collect::<Vec<_>>() {
+            if self.own.get(&gid).is_none_or(|endpoint| self.has_left(endpoint)) {
+                self.ending.remove(&gid);
+                self.tell_gone(gid)?;
+            } else if self.ending.insert(gid, true) == Some(false) {
+                self.pipe.say(&Message::Leaving(Leaving { gid, leaving: true }))?;
+            }
         }
         Ok(())
     }

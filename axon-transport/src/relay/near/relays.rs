@@ -86,7 +86,7 @@ impl Served<'_> {
             let group = Group::of(endpoint);
             let readers = self.matched.get(&endpoint.gid);
             // History goes ahead of those who will ask for it; what is left is carried to its end.
-            let rest = self.ending.contains(&endpoint.gid) && self.relays.contains_key(&group);
+            let rest = self.ending.contains_key(&endpoint.gid) && self.relays.contains_key(&group);
             if readers.is_none_or(BTreeSet::is_empty) && group.volatile && !rest {
                 continue;
             }

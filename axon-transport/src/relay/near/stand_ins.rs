@@ -25,6 +25,8 @@ const SETTLING: Duration = Duration::from_secs(1);
 pub(super) struct StandIn {
     face: Face,
     since: Instant,
+    /// Whom it stands for is gone, and has left something.
+    leaving: bool,
 }
 
 impl StandIn {
@@ -89,7 +91,10 @@ impl Served<'_> {
                 let Some((_, endpoint)) = self.world.get(&writer) else { continue };
                 match Face::stand_in(&self.common.outside, endpoint.clone()) {
                     Ok(face) => {
-                        self.stand_ins.insert(writer, StandIn { face, since: Instant::now() });
+                        self.stand_ins.insert(
+                            writer,
+                            StandIn { face, since: Instant::now(), leaving: false },
+                        );
                     }
                     Err(error) => {
                         let topic = &endpoint.topic;
@@ -108,13 +113,23 @@ impl Served<'_> {
             }
             // Whoever there is to read it, whether or not the daemon has said so of all of them: what
             // comes first is theirs, too. Who is gone and has left something reads no more.
-            let own = self.own.values().filter(|e| !self.ending.contains(&e.gid));
+            let own = self.own.values().filter(|e| !self.ending.contains_key(&e.gid));
             let mut readers = own.filter(|e| pairing(face.endpoint(), e) == Pairing::Match);
             if readers.all(|reader| partners.contains(&reader.gid)) {
                 self.pipe.open_in(Channel::of(writer))?;
             }
         }
         Ok(())
+    }
+
+    /// Has nobody count those who are gone from the graph, and stand for the sake of what they left.
+    pub(super) fn note_leaving(&mut self) {
+        for (gid, stand_in) in &mut self.stand_ins {
+            let leaving = !self.world.contains_key(gid);
+            if std::mem::replace(&mut stand_in.leaving, leaving) != leaving {
+                stand_in.face.leave(leaving);
+            }
+        }
     }
 
     /// Whether a subscription or server receives from all stand-ins that there are for it: who outside

@@ -9,8 +9,8 @@ use crate::{
     passed::PassedFd,
     session::{
         message::{
-            Attach, Granted, MAX_DESCRIPTORS, Message, Pair, Refused, Segment, SegmentName,
-            SegmentOpened, Unmatch,
+            Attach, Granted, Leaving, MAX_DESCRIPTORS, Message, Pair, Refused, Segment,
+            SegmentName, SegmentOpened, Unmatch,
         },
         peers::PeerError,
         publisher::PublisherInner,
@@ -32,6 +32,7 @@ impl Control {
                 self.detach_reader(&pair);
             }
             Message::Unmatch(unmatch) => self.unmatch(&unmatch),
+            Message::Leaving(leaving) => self.leave(leaving),
             Message::Segment(opened) => self.segment(&opened, &descriptors),
             Message::SegmentGone(gone) => {
                 self.peers.gone(&gone.session, gone.number);
@@ -73,6 +74,16 @@ impl Control {
             let news = gids.iter().filter(|gid| slots.end(gid)).count();
             drop(slots);
             if news > 0 {
+                self.reader_changed(&subscription);
+            }
+        }
+    }
+
+    /// A writer has ended, or has not after all, and more comes of it.
+    fn leave(&mut self, Leaving { gid, leaving }: Leaving) {
+        let (_, subscriptions) = self.endpoints();
+        for subscription in subscriptions {
+            if subscription.lock().leave(&gid, leaving) {
                 self.reader_changed(&subscription);
             }
         }

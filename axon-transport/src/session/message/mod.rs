@@ -421,6 +421,19 @@ pub struct Asserted {
     pub publishers: Vec<Gid>,
 }
 
+/// Something that writes has ended, or has come back, while what it has written is still on its way to
+/// a ring: it is in no graph and nobody counts it, and those who read it get the rest.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Leaving {
+    /// What.
+    #[n(0)]
+    pub gid: Gid,
+    /// Whether it has ended.
+    #[n(1)]
+    pub leaving: bool,
+}
+
 /// A message of the session socket.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[allow(missing_docs)]
@@ -442,6 +455,7 @@ pub enum Message {
     Segment(SegmentOpened),
     SegmentGone(SegmentName),
     Need(SegmentName),
+    Leaving(Leaving),
     Matched(Matched),
     Piece(Piece),
     Credit(Credit),

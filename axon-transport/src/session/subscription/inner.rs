@@ -142,7 +142,7 @@ impl SubscriptionInner {
     pub(in crate::session) fn rematch(&self) -> Changes {
         let leases = || {
             let slots = self.lock();
-            let active = slots.slots.iter().filter(|slot| !slot.over);
+            let active = slots.slots.iter().filter(|slot| slot.counts());
             active.map(|slot| (slot.reader.writer(), slot.lease)).collect()
         };
         self.events.writers(leases, clock::monotonic())
@@ -153,7 +153,7 @@ impl SubscriptionInner {
     pub(in crate::session) fn look_at_time(&self, now: u64) -> (Option<u64>, bool) {
         let times: Vec<_> = {
             let slots = self.lock();
-            let active = slots.slots.iter().filter(|slot| !slot.over);
+            let active = slots.slots.iter().filter(|slot| slot.counts());
             let times = active.map(|slot| {
                 let mut times = slot.reader.times();
                 times.sampled = times.sampled.filter(|sampled| *sampled >= slot.since);

@@ -91,7 +91,7 @@ impl Subscription {
             return Vec::new();
         }
         let slots = self.inner.lock();
-        slots.slots.iter().filter(|s| !s.over).map(|s| s.reader.writer()).collect()
+        slots.slots.iter().filter(|s| s.counts()).map(|s| s.reader.writer()).collect()
     }
 
     /// Waits until it receives from at least `count` publishers; whether it does.
@@ -135,6 +135,16 @@ impl Subscription {
     /// Samples taken.
     pub fn received(&self) -> u64 {
         if self.session.is_forked() { 0 } else { self.inner.lock().received }
+    }
+
+    /// For a relay: the publishers of whom something may come. Those who have ended, but for what is
+    /// on its way, do not count any more.
+    pub(crate) fn attached(&self) -> Vec<Gid> {
+        let mut gids = self.matched();
+        if !self.session.is_forked() {
+            gids.extend(self.inner.lock().leaving());
+        }
+        gids
     }
 
     /// For a relay: the next sample of one publisher, and how many of that publisher's this

@@ -58,6 +58,8 @@ pub(super) struct Slot {
     pub(super) lease: Option<u64>,
     /// The writer is gone: take what it left, then unmap.
     pub(super) over: bool,
+    /// It is gone, too, but what it left is still to come.
+    pub(super) leaving: bool,
     /// Found nothing in the take that is under way, since the writer was faster.
     pub(super) overtaken: bool,
     /// The last sequence number taken of its writer, by way of whatever slot.
@@ -91,6 +93,11 @@ impl Gaps {
 }
 
 impl Slot {
+    /// Whether the writer is one of those that the subscription is matched with.
+    pub(super) fn counts(&self) -> bool {
+        !self.over && !self.leaving
+    }
+
     /// A sample was taken.
     pub(super) fn passed(&mut self, sequence: u64) {
         let Some(gaps) = &mut self.gaps else { return };
@@ -124,7 +131,7 @@ impl Slots {
 
     /// Whether the lease of one of the writers may run out.
     pub(in crate::session) fn offers_lease(&self) -> bool {
-        self.slots.iter().any(|slot| !slot.over && slot.lease.is_some())
+        self.slots.iter().any(|slot| slot.counts() && slot.lease.is_some())
     }
 
     pub(super) fn losses(&self) -> u64 {
@@ -201,10 +208,20 @@ impl Slots {
         let lifespan = times.lifespan.map(|age| i64::try_from(age).unwrap_or(i64::MAX));
         let lease = times.lease;
         let gaps = stands_in.then(Gaps::default);
-        let (over, overtaken) = (false, false);
+        let (over, leaving, overtaken) = (false, false, false);
         let earlier = self.slots.iter().find(|s| s.reader.writer() == writer).map(|s| s.last);
         let last = earlier.unwrap_or_else(|| self.last.remove(&writer));
-        self.slots.push(Slot { reader, since, lifespan, lease, over, overtaken, last, gaps });
+        self.slots.push(Slot {
+            reader,
+            since,
+            lifespan,
+            lease,
+            over,
+            leaving,
+            overtaken,
+            last,
+            gaps,
+        });
         self.forget_older(writer);
     }
 
@@ -212,6 +229,22 @@ impl Slots {
     pub(in crate::session) fn end(&mut self, writer: &Gid) -> bool {
         self.pending.remove(writer);
         self.end_where(|reader| reader.writer() == *writer)
+    }
+
+    /// The writer is gone though more comes of it, or is not after all. Whether that is news.
+    pub(in crate::session) fn leave(&mut self, writer: &Gid, leaving: bool) -> bool {
+        let mut news = false;
+        for slot in self.slots.iter_mut().filter(|slot| slot.reader.writer() == *writer) {
+            news |= slot.leaving != leaving;
+            slot.leaving = leaving;
+        }
+        news
+    }
+
+    /// Those who are, though more comes of them.
+    pub(in crate::session) fn leaving(&self) -> Vec<Gid> {
+        let leaving = self.slots.iter().filter(|slot| slot.leaving && !slot.over);
+        leaving.map(|slot| slot.reader.writer()).collect()
     }
 
     /// Writers whose process is dead will not write any more. Whether there are any.
