@@ -29,10 +29,11 @@ FAST_DDS_SHARING = """<?xml version="1.0" encoding="UTF-8"?>
 class Rmw:
     """One implementation in one set-up."""
 
-    def __init__(self, name, library=None, setup=lambda directory: {}):
+    def __init__(self, name, library=None, setup=lambda directory: {}, network_only=False):
         self.name = name
         self.library = library or name
         self._setup = setup
+        self.network_only = network_only
 
     def environment(self, end, network=False):
         """Variables for one host's processes; what they need goes with `end`."""
@@ -63,6 +64,8 @@ def fast_dds_sharing(directory):
 
 ALL = [
     Rmw('rmw_axon'),
+    Rmw('rmw_axon, AES-256-GCM', 'rmw_axon', lambda _: {'AXON_QUIC_CIPHER': 'aes-256-gcm'},
+        network_only=True),
     Rmw('rmw_cyclonedds_cpp', setup=lambda _: {'CYCLONEDDS_URI': CYCLONE}),
     Rmw('rmw_fastrtps_cpp'),
     Rmw('rmw_fastrtps_cpp, data sharing', 'rmw_fastrtps_cpp', fast_dds_sharing),
