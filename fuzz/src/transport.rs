@@ -267,6 +267,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             ours: "chacha20-poly1305".into(),
             theirs: "aes-256-gcm".into(),
             text: "they differ".into(),
+            endpoint: Some(writer),
         }),
         Message::Endpoint(Announce {
             endpoint: endpoint(),
