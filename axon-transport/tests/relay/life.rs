@@ -1,0 +1,139 @@
+//! Processes and daemons that end, and sessions that find out that they have to be relayed.
+
+use super::*;
+
+#[test]
+fn a_process_that_is_killed_leaves_whole_samples_and_nothing_else() {
+    let host = host();
+    let _daemon = host.daemon();
+    let relaying = Host { env: host.env.clone(), dir: tempfile::tempdir().unwrap() };
+    let relaying = relaying.with("AXON_SHM", "off").with("AXON_DAEMON", "require");
+
+    let listener = session(&host, "listener", true);
+    let subscription = listener.create_subscription(spec("/t", Qos::keep_all())).unwrap();
+    let talker = relaying.play("talker");
+    assert_eq!(take_until(&subscription, 100).len(), 100);
+    signal(talker.pid(), Signal::KILL);
+    until("it is gone", || subscription.matched().is_empty());
+    let mut bytes = Vec::new();
+    let mut next = 101;
+    while let Some(info) = subscription.take(&mut bytes) {
+        assert_eq!((info.sequence, bytes.len()), (next, next as usize % 10_000));
+        next += 1;
+    }
+    drop(talker);
+
+    let publisher = listener.create_publisher(spec("/t", Qos::keep_all())).unwrap();
+    drop(subscription);
+    let mut deaf = relaying.play("deaf");
+    assert_eq!(deaf.hear(), "matched");
+    while publish_once(&publisher, 1_000_000) {}
+    signal(deaf.pid(), Signal::KILL);
+    until("nobody holds it back", || publish_once(&publisher, 1_000_000));
+    until("nobody is relayed any more", || relays(&host.status().unwrap()).is_empty());
+}
+
+#[test]
+fn what_was_published_last_arrives_though_the_process_ends() {
+    let host = host();
+    let _daemon = host.daemon();
+    let relaying = Host { env: host.env.clone(), dir: tempfile::tempdir().unwrap() };
+    let relaying = relaying.with("AXON_SHM", "off").with("AXON_DAEMON", "require");
+    let listener = session(&host, "listener", true);
+    let subscription = listener.create_subscription(spec("/t", Qos::keep_all())).unwrap();
+    let brief = relaying.play("brief");
+    brief.finish();
+    assert!(take_until(&subscription, 300).into_iter().eq(1..=300));
+    assert_eq!(subscription.lost(), 0);
+}
+
+#[test]
+fn another_daemon_takes_over() {
+    let host = host();
+    let daemon = host.daemon();
+    let (a, b, c) =
+        (session(&host, "a", false), session(&host, "b", false), session(&host, "c", true));
+    let publisher = a.create_publisher(spec("/t", latched(2))).unwrap();
+    let readers = [&b, &c].map(|s| s.create_subscription(spec("/t", latched(2))).unwrap());
+    readers.iter().for_each(|reader| await_pair(&publisher, reader));
+    for sequence in 1..=2 {
+        publish(&publisher, &pattern(sequence, 100));
+    }
+    readers.iter().for_each(|reader| assert_eq!(take_until(reader, 2), [1, 2]));
+    let before = a.daemon();
+    drop(daemon);
+    until("it is noticed", || a.daemon() != before);
+    until("the path is gone", || publisher.matched().is_empty());
+    publish(&publisher, &pattern(3, 100));
+
+    let _daemon = host.daemon();
+    readers.iter().for_each(|reader| await_pair(&publisher, reader));
+    publish(&publisher, &pattern(4, 100));
+    for reader in &readers {
+        assert_eq!(take_until(reader, 4), [3, 4], "nothing is repeated");
+        assert_eq!(reader.lost(), 0);
+    }
+}
+
+#[test]
+fn without_a_daemon_to_be_relayed_by_it_is_an_error() {
+    let host = host();
+    let config = Config { daemon: DaemonPolicy::Require, shm: false, ..host.config() };
+    assert!(Session::open(&config, SessionOptions::new("alone")).is_err());
+    let config = Config { daemon: DaemonPolicy::Off, ..config };
+    let alone = Session::open(&config, SessionOptions::new("alone")).unwrap();
+    let (publisher, subscription) = connect(&alone, &alone, "/t", Qos::default());
+    publish(&publisher, &pattern(1, 10));
+    assert_eq!(take_until(&subscription, 1), [1]);
+    assert!(alone.wait_graph(PATIENCE, |graph| graph.endpoints.len() == 2));
+}
+
+/// Stands between sessions and their daemon, and keeps descriptors back.
+fn keep_descriptors_back(listener: &OwnedFd, daemon: &Address, end: &AtomicBool) {
+    let mut pairs: Vec<[OwnedFd; 2]> = Vec::new();
+    while !end.load(Ordering::Relaxed) {
+        let flags = rustix::net::SocketFlags::CLOEXEC | rustix::net::SocketFlags::NONBLOCK;
+        if let Ok(caller) = rustix::net::accept_with(listener, flags) {
+            pairs.push([caller, daemon.connect().unwrap()]);
+        }
+        pairs.retain(|[a, b]| pass_on(a, b) && pass_on(b, a));
+        thread::sleep(Duration::from_millis(1));
+    }
+}
+
+/// Whether the connection goes on.
+fn pass_on(from: &OwnedFd, to: &OwnedFd) -> bool {
+    for _ in 0..16 {
+        match socket::receive(from, &mut Vec::new()) {
+            Ok(received) => say_to(to, &received.message),
+            Err(SocketError::NotReady) => return true,
+            Err(_) => return false,
+        }
+    }
+    true
+}
+
+#[test]
+fn where_descriptors_do_not_arrive_a_session_is_relayed_by_itself() {
+    let host = host();
+    let _daemon = host.daemon();
+    let behind = Host { env: host.env.clone(), dir: tempfile::tempdir().unwrap() };
+    let run = behind.dir.path().join("run");
+    let behind = behind.with("AXON_RUNTIME_DIR", run.to_str().unwrap());
+    let (listener, _lock) = Address::of(&behind.config()).bind().unwrap().into_parts();
+    let (daemon, end) = (Address::of(&host.config()), AtomicBool::new(false));
+    thread::scope(|scope| {
+        scope.spawn(|| keep_descriptors_back(&listener, &daemon, &end));
+        let outcome = std::panic::catch_unwind(|| {
+            let far = session(&behind, "behind", true);
+            let near = session(&host, "near", true);
+            let (publisher, subscription) = connect(&far, &near, "/t", Qos::keep_all());
+            publish(&publisher, &pattern(1, 100_000));
+            assert_eq!(take_until(&subscription, 1), [1]);
+            let relayed = relays(&host.status().unwrap());
+            assert!(relayed[0].reason.contains("descriptors"), "{relayed:?}");
+        });
+        end.store(true, Ordering::Relaxed);
+        outcome.unwrap();
+    });
+}
