@@ -8,7 +8,7 @@ pub(crate) enum Next<T> {
     Taken(T),
     /// One that came before by way of another reader, which has passed over it.
     Repeated,
-    /// Nothing, for now.
+    /// None of the readers has one.
     Nothing,
 }
 

@@ -159,8 +159,9 @@ static void take_in_place(struct place place, axon_subscription_t listener, size
     NO_HANDLE(axon_session_sample_release(sample));
 }
 
-/* Those that are expected are in place from 513 bytes on. A publisher of this session shows by the
-   address: two at a time, so that none is where another one was. */
+/* Those that are expected are in place from 513 bytes on. That a sample was not copied shows by
+   its address, where publisher and subscription share one map: two at a time, so that none is where
+   another one was. */
 static void take_expected(struct place place) {
     axon_endpoint_options_t options = endpoint("/expected");
     options.expected_len = 513;

@@ -2,14 +2,17 @@
 
 use super::*;
 
+/// Where processes of this host are relayed.
+fn relaying(host: &Host) -> Host {
+    let here = Host { env: host.env.clone(), dir: tempfile::tempdir().unwrap() };
+    here.with("AXON_SHM", "off").with("AXON_DAEMON", "require")
+}
+
 #[test]
 fn a_process_that_is_killed_leaves_whole_samples_and_nothing_else() {
     let host = host();
     let _daemon = host.daemon();
-    let relaying = Host { env: host.env.clone(), dir: tempfile::tempdir().unwrap() };
-    let relaying = relaying.with("AXON_SHM", "off").with("AXON_DAEMON", "require");
-
-    let listener = session(&host, "listener", true);
+    let (relaying, listener) = (relaying(&host), session(&host, "listener", true));
     let subscription = listener.create_subscription(spec("/t", Qos::keep_all())).unwrap();
     let talker = relaying.play("talker");
     assert_eq!(take_until(&subscription, 100).len(), 100);
@@ -37,9 +40,7 @@ fn a_process_that_is_killed_leaves_whole_samples_and_nothing_else() {
 fn what_was_published_last_arrives_though_the_process_ends() {
     let host = host();
     let _daemon = host.daemon();
-    let relaying = Host { env: host.env.clone(), dir: tempfile::tempdir().unwrap() };
-    let relaying = relaying.with("AXON_SHM", "off").with("AXON_DAEMON", "require");
-    let listener = session(&host, "listener", true);
+    let (relaying, listener) = (relaying(&host), session(&host, "listener", true));
     let subscription = listener.create_subscription(spec("/t", Qos::keep_all())).unwrap();
     let brief = relaying.play("brief");
     brief.finish();

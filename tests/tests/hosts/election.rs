@@ -54,6 +54,16 @@ impl Elector {
         self.stranger.hear(met, whole).expect("the host's graph");
     }
 
+    /// A link, and the one that takes over from it.
+    fn supersede(&self) -> (Met, Met) {
+        let (mut first, mut last) = (self.meet(), self.meet());
+        self.elect(&mut first, 1);
+        self.linked(&mut first);
+        self.elect(&mut last, 2);
+        self.linked(&mut last);
+        (first, last)
+    }
+
     /// Says a whole graph of 600 publishers in two parts; the last is of the topic.
     fn say_graph(&self, met: &mut Met, version: u64) {
         let publisher = |number: u16| Endpoint {
@@ -110,11 +120,7 @@ fn the_last_elected_stands_when_it_is_heard_of_first() {
 #[test]
 fn the_last_elected_stands_when_it_is_heard_of_last() {
     let elector = Elector::new();
-    let (mut first, mut last) = (elector.meet(), elector.meet());
-    elector.elect(&mut first, 1);
-    elector.linked(&mut first);
-    elector.elect(&mut last, 2);
-    elector.linked(&mut last);
+    let (first, last) = elector.supersede();
     let why = elector.stranger.closed(&first);
     assert!(why.contains("a successor took over"), "{why}");
     assert_eq!((last.connection.close_reason(), elector.links()), (None, 1));
@@ -123,11 +129,7 @@ fn the_last_elected_stands_when_it_is_heard_of_last() {
 #[test]
 fn both_sides_say_that_they_are_done_before_a_superseded_link_is_closed() {
     let elector = Elector::new();
-    let (mut first, mut last) = (elector.meet(), elector.meet());
-    elector.elect(&mut first, 1);
-    elector.linked(&mut first);
-    elector.elect(&mut last, 2);
-    elector.linked(&mut last);
+    let (mut first, last) = elector.supersede();
     elector.stranger.hear_out(&mut first);
     assert_eq!(first.connection.close_reason(), None);
     elector.stranger.end(&mut first);
