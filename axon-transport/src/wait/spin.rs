@@ -7,8 +7,12 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// A sleep and the ring that ends it cost both sides about as much together.
-const MOST: Duration = Duration::from_micros(20);
+/// About what a sleep and the ring that ends it cost both sides together on a virtual machine, where they
+/// cost most: with less, two who wait for each other never get to know that looking is worth it.
+const MOST: Duration = Duration::from_micros(50);
+
+/// Looks between two looks at the clock, which takes longer than one.
+const LOOKS: u32 = 8;
 
 /// Short sleeps, at most, that have to follow a look in vain before the next look.
 const PATIENCE: u32 = 1023;
@@ -55,12 +59,12 @@ impl Spin {
         let mut end = now + Duration::from_nanos(u64::from(budget));
         end = deadline.map_or(end, |deadline| end.min(deadline));
         while now < end {
-            for _ in 0..8 {
+            for _ in 0..LOOKS {
                 spin_loop();
-            }
-            if ready() {
-                self.patience.store(1, Ordering::Relaxed);
-                return true;
+                if ready() {
+                    self.patience.store(1, Ordering::Relaxed);
+                    return true;
+                }
             }
             now = Instant::now();
         }
