@@ -194,7 +194,8 @@ impl History {
         Some(at)
     }
 
-    fn has_room(&self, len: u64) -> bool {
+    /// Whether so much more is within the budget.
+    pub(super) fn has_room(&self, len: u64) -> bool {
         self.placed <= 1 || self.used + len <= self.budget
     }
 

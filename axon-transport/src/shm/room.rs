@@ -150,23 +150,34 @@ impl Writer {
     pub(super) fn copy_in(&self, state: &mut State, payload: &[u8]) -> Result<Block, Refusal> {
         debug_assert!(payload.len() as u64 <= COPIED);
         let bytes = Area::rounded(payload.len() as u64);
-        let floors = state.audience.floors(state.history.head());
-        let may_go = |position| position < floors.held;
-        state.history.make_room(bytes, may_go)?;
-        let block = loop {
-            if let Some(block) = state.history.blocks().take(bytes) {
-                break block;
-            }
-            match self.block(state, bytes) {
-                Ok(block) => break block,
-                Err(error) if !state.history.shrink(may_go)? => return Err(error.into()),
-                Err(_) => self.give_blocks_back(state),
-            }
+        // Nobody asks without need how far readers are: they say so in cache lines of their own.
+        let at_hand =
+            if state.history.has_room(bytes) { state.history.blocks().take(bytes) } else { None };
+        let block = match at_hand {
+            Some(block) => block,
+            None => self.block_with_room(state, bytes)?,
         };
         self.show_tail(state);
         ring::about_to_write::<AtomicU64>();
         ring::copy_in(state.maps.words(&block), payload);
         Ok(block)
+    }
+
+    /// A block for a sample, for which the oldest samples go if they have to.
+    fn block_with_room(&self, state: &mut State, bytes: u64) -> Result<Block, Refusal> {
+        let floors = state.audience.floors(state.history.head());
+        let may_go = |position| position < floors.held;
+        state.history.make_room(bytes, may_go)?;
+        loop {
+            if let Some(block) = state.history.blocks().take(bytes) {
+                return Ok(block);
+            }
+            match self.block(state, bytes) {
+                Ok(block) => return Ok(block),
+                Err(error) if !state.history.shrink(may_go)? => return Err(error.into()),
+                Err(_) => self.give_blocks_back(state),
+            }
+        }
     }
 
     /// A new block of the session's memory.
