@@ -88,6 +88,7 @@ mod orphans;
 mod peer;
 mod pi_mutex;
 mod pins;
+mod prefetch;
 pub(crate) mod probe;
 mod publisher;
 mod quota;

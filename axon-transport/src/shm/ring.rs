@@ -17,6 +17,7 @@ use super::{
         DESCRIPTOR_WORDS, Location, halves,
         ring::{ARRAY, HEAD, TAIL},
     },
+    prefetch::prefetch,
     sync::{Ordering, Site, Word, fence_at},
 };
 
@@ -223,6 +224,13 @@ impl<'a, W: Word> View<'a, W> {
             _ => return Look::Corrupt("a sample is in no known kind of place"),
         };
         Look::Sample(Record { sequence, timestamp, len, place })
+    }
+
+    /// Has the rest of a descriptor that is [here](State::Here) on its way from the publisher's core
+    /// while the caller gets ready to take it: what locks in between would have it wait.
+    #[inline]
+    pub(super) fn expect(&self, position: u64) {
+        prefetch(&descriptor(self.array, position)[DESCRIPTOR_WORDS / 2]);
     }
 
     /// The words of a sample that is in its descriptor.

@@ -199,9 +199,14 @@ impl Reader {
                 Err(_) => return true,
             },
         };
-        match descriptors.view(&self.attachment).state(self.cursor) {
+        let view = descriptors.view(&self.attachment);
+        match view.state(self.cursor) {
             State::Ahead => self.cursor < self.seen,
-            State::Here | State::Gone => true,
+            State::Here => {
+                view.expect(self.cursor);
+                true
+            }
+            State::Gone => true,
         }
     }
 
