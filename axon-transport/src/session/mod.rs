@@ -58,7 +58,7 @@ pub use state::SessionEvent;
 pub(crate) use state::Shared;
 pub use status::daemon_status;
 pub use subscription::{MessageInfo, Subscription};
-pub use waiting::Waitable;
+pub use waiting::{Ready, Waitable};
 
 use crate::{
     config::DaemonPolicy,

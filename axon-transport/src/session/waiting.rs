@@ -1,6 +1,8 @@
 //! Waiting for any of several things.
 
-use std::{sync::Arc, time::Duration};
+use std::{ops::Deref, sync::Arc, time::Duration};
+
+use smallvec::SmallVec;
 
 use super::{
     Client, Event, GuardCondition, Server, Session, SessionError, Subscription, events::Source,
@@ -27,6 +29,14 @@ pub enum Waitable<'a> {
     /// Ready while it occurred and its status was not taken since.
     Event(&'a Event),
 }
+
+/// What was found ready: its indices among all that was waited for, in order. A slice; no allocation
+/// where it is a few.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Ready(SmallVec<[usize; FEW]>);
+
+/// So many are mostly ready at the same time, at most.
+const FEW: usize = 8;
 
 /// The part of a [`Waitable`] that is looked at.
 #[derive(Clone, Copy)]
@@ -107,7 +117,7 @@ impl Session {
         &self,
         waitables: &[Waitable<'_>],
         timeout: Option<Duration>,
-    ) -> Result<Vec<usize>, SessionError> {
+    ) -> Result<Ready, SessionError> {
         if waitables.iter().any(|one| !Arc::ptr_eq(one.segment(), self.segment())) {
             return self.wait_watch(&self.watch(waitables)?, timeout);
         }
@@ -139,7 +149,7 @@ impl Session {
         &self,
         watch: &Arc<Watch>,
         timeout: Option<Duration>,
-    ) -> Result<Vec<usize>, SessionError> {
+    ) -> Result<Ready, SessionError> {
         if self.is_forked() {
             return Err(ShmError::Forked.into());
         }
@@ -154,14 +164,14 @@ impl Session {
     /// has to.
     fn wait_until(
         &self,
-        mut take: impl FnMut() -> Vec<usize>,
+        mut take: impl FnMut() -> Ready,
         watch: impl Fn() -> Arc<Watch>,
         timeout: Option<Duration>,
-    ) -> Result<Vec<usize>, SessionError> {
+    ) -> Result<Ready, SessionError> {
         if self.is_forked() {
             return Err(ShmError::Forked.into());
         }
-        let mut ready = Vec::new();
+        let mut ready = Ready::default();
         let look = || {
             ready = take();
             !ready.is_empty()
@@ -172,8 +182,22 @@ impl Session {
 }
 
 /// Where there is a `true`.
-fn indices(all: impl Iterator<Item = bool>) -> Vec<usize> {
-    all.enumerate().filter_map(|(index, there)| there.then_some(index)).collect()
+fn indices(all: impl Iterator<Item = bool>) -> Ready {
+    Ready(all.enumerate().filter_map(|(index, there)| there.then_some(index)).collect())
+}
+
+impl Deref for Ready {
+    type Target = [usize];
+
+    fn deref(&self) -> &[usize] {
+        &self.0
+    }
+}
+
+impl<const N: usize> PartialEq<[usize; N]> for Ready {
+    fn eq(&self, other: &[usize; N]) -> bool {
+        self[..] == other[..]
+    }
 }
 
 impl Waitable<'_> {

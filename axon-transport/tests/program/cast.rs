@@ -100,7 +100,7 @@ impl Cast {
         let (ids, all): (Vec<u64>, Vec<_>) = subscriptions.chain(servers).chain(clients).unzip();
         let timeout = if some { PATIENCE } else { Duration::ZERO };
         let ready = session.wait_for(&all, Some(timeout)).unwrap();
-        joined(&ready.into_iter().map(|index| ids[index].to_string()).collect())
+        joined(&ready.iter().map(|&index| ids[index].to_string()).collect())
     }
 
     fn state(&self, session: &Session) -> State {
