@@ -283,9 +283,9 @@ pub(crate) struct BenchNet {
 const BENCH_SESSION_HELP: &str = "\
 Latency of a publisher and a subscription, and of a service, in the sessions of two processes with a
 daemon of their own, beside bare shared memory in the same run: with a receiver that polls and one
-that waits on a wait set. Then what a publish costs by the number of subscriptions. The rest of the
-machine should be idle. About two minutes; --quick takes seconds and is only to see it run. Writes
-session.json, with all percentiles.
+that waits on a wait set. Then the throughput of the same, and what a publish costs by the number of
+subscriptions. The rest of the machine should be idle. Under a minute; --quick takes seconds and is
+only to see it run. Writes session.json, with all percentiles.
 
 Examples:
   axon bench session

@@ -104,7 +104,7 @@ fn measure(sizes: &[usize], quick: bool) -> harness::Result<Results> {
     for motion in STREAMS {
         progress.step(&format!("throughput, {}", words::motion(motion)));
         for size in sizes {
-            let load = Load::stream(*size, motion);
+            let load = Load::stream(*size, Wake::Poll, motion);
             streams.push(compared(load, pair.stream(&load)?)?);
             progress.advance();
         }

@@ -54,8 +54,13 @@ impl Load {
     }
 
     /// As many as 16 MiB hold, from 4 to 64.
-    pub(crate) fn stream(size: usize, motion: Motion) -> Self {
-        Self { size, wake: Wake::Poll, motion, window: ((16 << 20) / size).clamp(4, 64) }
+    pub(crate) fn stream(size: usize, wake: Wake, motion: Motion) -> Self {
+        Self { size, wake, motion, window: ((16 << 20) / size).clamp(4, 64) }
+    }
+
+    /// Whether more than one message may be under way.
+    pub(crate) fn is_stream(&self) -> bool {
+        self.window > 1
     }
 }
 

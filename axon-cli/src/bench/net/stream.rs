@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{bare::BareQuic, hosts::Hosts};
 use crate::bench::{
-    harness::{Channel, Load, Medium, Motion, Other, Result, Side, agree, spawn, stamp},
+    harness::{Channel, Load, Medium, Motion, Other, Result, Side, Wake, agree, spawn, stamp},
     session::place::{PATIENCE, Settings, session},
 };
 
@@ -184,7 +184,7 @@ fn until_over(length: Duration, mut send: impl FnMut(u64) -> Result<()>) -> Resu
 }
 
 fn load(size: usize) -> Load {
-    Load::stream(size, Motion::Copy)
+    Load::stream(size, Wake::Poll, Motion::Copy)
 }
 
 fn spec(topic: &str, flow: Flow) -> EndpointSpec {

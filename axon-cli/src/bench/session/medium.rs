@@ -139,7 +139,7 @@ impl Medium for Service {
     }
 
     fn carries(&self, load: &Load) -> bool {
-        load.motion == Motion::Copy
+        load.motion == Motion::Copy && !load.is_stream()
     }
 
     fn open(&self, load: &Load, side: Side, channel: &Channel) -> Result<Box<dyn End>> {

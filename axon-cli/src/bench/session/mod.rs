@@ -38,7 +38,8 @@ const SERVICE_BUDGET: f64 = 2.5;
 const ANSWERING: &str = "bench-session-answer";
 const READING: &str = "bench-session-read";
 
-/// A load, and what each of those made of it that carry it: times are one way, half a round trip.
+/// A load, and what each of those made of it that carry it: times are one way, half a round trip, or
+/// from message to message.
 struct Compared {
     load: Load,
     bare: Rounds,
@@ -49,6 +50,7 @@ struct Compared {
 struct Results {
     run: Run,
     latency: Vec<Compared>,
+    streams: Vec<Compared>,
     publish: Vec<Cost>,
 }
 
@@ -89,16 +91,22 @@ fn measure(sizes: &[usize], quick: bool) -> harness::Result<Results> {
     let hosts = Some([place.settings(), place.settings()]);
     let (sessions, service) = (Sessions(hosts.clone()), Service(hosts));
     let media = media(&sessions, &service);
-    let progress = Progress::new(sizes.len() * (KINDS.len() + 1));
+    let progress = Progress::new(sizes.len() * (2 * KINDS.len() + 1));
     let pair = Pair::start(&media, run.effort, &run.machine, &[ANSWERING])?;
-    let mut latency = Vec::new();
+    let (mut latency, mut streams) = (Vec::new(), Vec::new());
     for (wake, motion) in KINDS {
         progress.step(&format!("latency, {}", words::kind(wake, motion)));
         for size in sizes {
             let load = Load::ping_pong(*size, wake, motion);
-            let mut rounds = pair.latency(&load)?.into_iter();
-            let (bare, session) = rounds.next().zip(rounds.next()).ok_or("no figures")?;
-            latency.push(Compared { load, bare, session, service: rounds.next() });
+            latency.push(compared(load, pair.latency(&load)?)?);
+            progress.advance();
+        }
+    }
+    for (wake, motion) in KINDS {
+        progress.step(&format!("throughput, {}", words::kind(wake, motion)));
+        for size in sizes {
+            let load = Load::stream(*size, wake, motion);
+            streams.push(compared(load, pair.stream(&load)?)?);
             progress.advance();
         }
     }
@@ -110,5 +118,11 @@ fn measure(sizes: &[usize], quick: bool) -> harness::Result<Results> {
         publish.push(crowd.measure(&place.settings(), *size, run.effort)?);
         progress.advance();
     }
-    Ok(Results { run, latency, publish })
+    Ok(Results { run, latency, streams, publish })
+}
+
+fn compared(load: Load, rounds: Vec<Rounds>) -> harness::Result<Compared> {
+    let mut rounds = rounds.into_iter();
+    let (bare, session) = rounds.next().zip(rounds.next()).ok_or("no figures")?;
+    Ok(Compared { load, bare, session, service: rounds.next() })
 }

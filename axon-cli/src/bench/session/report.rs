@@ -10,17 +10,20 @@ use crate::{
         budgets::verdict,
         harness::{Rounds, words},
     },
-    text::Table,
+    text::{self, Table},
 };
 
 /// How figures are taken from rounds; in every output.
 const REPORTED: &str = "Bare shared memory, sessions and a service take turns. Times are p50 of the \
                         round in which it was least: one way (half a round trip), and for the \
                         service both ways. Ratios are of these. A service copies requests and \
-                        responses, so that it is beside messages that are copied, too.";
+                        responses, so that it is beside messages that are copied, too. Of a \
+                        stream as much is under way as 16 MiB hold, from 4 to 64 messages.";
 
 /// A ratio, and what it may be.
 type Judged = (f64, f64);
+/// Makes a table of those.
+type Tabulate = fn(Vec<&Compared>) -> String;
 
 /// A session by bare shared memory.
 fn session_to_bare(row: &Compared) -> Judged {
@@ -34,11 +37,17 @@ fn service_to_session(row: &Compared, service: &Rounds) -> Judged {
 
 pub(super) fn text(results: &Results) -> String {
     let mut out = results.run.heading(REPORTED);
-    for (wake, motion) in KINDS {
-        let _ = writeln!(out, "\nLatency, {}.\n", words::kind(wake, motion));
-        let rows = results.latency.iter();
-        let rows = rows.filter(|c| (c.load.wake, c.load.motion) == (wake, motion));
-        out += &latency_table(rows.collect());
+    let tables: [(&str, &[Compared], Tabulate); 2] = [
+        ("Latency", &results.latency, latency_table),
+        ("Throughput", &results.streams, stream_table),
+    ];
+    for (name, figures, table) in tables {
+        for (wake, motion) in KINDS {
+            let _ = writeln!(out, "\n{name}, {}.\n", words::kind(wake, motion));
+            let rows = figures.iter();
+            let rows = rows.filter(|c| (c.load.wake, c.load.motion) == (wake, motion));
+            out += &table(rows.collect());
+        }
     }
     out += "\nA publish to 1, 4 and 16 subscriptions, each in a process of its own, which is idle.\n\n";
     let mut table = Table::new(&[">size", ">1", ">4", ">16", ">16 to 1"]);
@@ -52,15 +61,29 @@ pub(super) fn text(results: &Results) -> String {
     out + &table.render(0)
 }
 
+fn judged((ratio, budget): Judged) -> [String; 3] {
+    [format!("{ratio:.2}"), format!("{budget:.2}"), verdict(ratio, budget).to_owned()]
+}
+
+fn stream_table(rows: Vec<&Compared>) -> String {
+    let mut table =
+        Table::new(&[">size", ">bare messages/s", ">session", ">ratio of times", ">budget", ""]);
+    for row in rows {
+        let mut cells = vec![words::size(row.load.size)];
+        let rate = |rounds: &Rounds| text::grouped((1e9 / rounds.best().p50()) as u64);
+        cells.extend([&row.bare, &row.session].map(rate));
+        cells.extend(judged(session_to_bare(row)));
+        table.row(cells);
+    }
+    table.render(0)
+}
+
 fn latency_table(rows: Vec<&Compared>) -> String {
     let mut header = vec![">size", ">bare", ">session", ">ratio", ">budget", ""];
     if rows.iter().any(|row| row.service.is_some()) {
         header.extend([">service", ">by session", ">budget", ""]);
     }
     let mut table = Table::new(&header);
-    let judged = |(ratio, budget): Judged| {
-        [format!("{ratio:.2}"), format!("{budget:.2}"), verdict(ratio, budget).to_owned()]
-    };
     for row in rows {
         let mut cells = vec![words::size(row.load.size)];
         cells.extend([&row.bare, &row.session].map(|r| words::nanoseconds(r.best().p50())));
@@ -79,6 +102,17 @@ pub(super) fn json(results: &Results) -> String {
         let ratio = (ratio * 1e3).round() / 1e3;
         json!({ "ratio": ratio, "at_most": budget, "met": ratio <= budget })
     };
+    let streams = results.streams.iter().map(|row| {
+        json!({
+            "bytes": row.load.size,
+            "wake": row.load.wake,
+            "motion": row.load.motion,
+            "under_way": row.load.window,
+            "bare": row.bare.json(),
+            "session": row.session.json(),
+            "session_to_bare": judged(session_to_bare(row)),
+        })
+    });
     let latency = results.latency.iter().map(|row| {
         let service = row.service.as_ref();
         json!({
@@ -101,6 +135,10 @@ pub(super) fn json(results: &Results) -> String {
                 .collect::<Vec<_>>(),
         })
     });
-    let figures = [("latency", latency.collect()), ("publish", publish.collect())];
+    let figures = [
+        ("latency", latency.collect()),
+        ("throughput", streams.collect()),
+        ("publish", publish.collect()),
+    ];
     results.run.document("session", REPORTED, figures)
 }
