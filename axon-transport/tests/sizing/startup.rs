@@ -146,14 +146,71 @@ fn private(pid: u32) -> u64 {
     of("Private_Clean:") + of("Private_Dirty:")
 }
 
-/// Prints what sessions and daemon said to each other.
-fn print_traffic(when: &str, host: &Host) {
-    let TrafficStatus { packets_in, packets_out, bytes_out } = host.status().unwrap().traffic;
-    println!("  packets to the daemon, {when:<8} {packets_in:>8}");
-    println!(
-        "  from it                         {packets_out:>8}, {:.1} MB",
-        bytes_out as f64 / 1e6
-    );
+/// Descriptors of a process.
+fn descriptors(pid: u32) -> usize {
+    fs::read_dir(format!("/proc/{pid}/fd")).unwrap().count()
+}
+
+/// What it took until all knew all, and what they hold then and do.
+struct Whole {
+    /// Until all knew all.
+    time: Duration,
+    /// Seconds of the processor until then: of the daemon, and of the others.
+    processor: [f64; 2],
+    traffic: TrafficStatus,
+    /// KiB that are nobody else's: of the daemon, and the most that another has.
+    memory: [u64; 2],
+    /// The same of descriptors.
+    descriptors: [usize; 2],
+    /// Of one processor, while nothing happens: the daemon, and all others together.
+    at_rest: [f64; 2],
+}
+
+impl Whole {
+    /// Of players that know all, `time` after what made them look, when the others had had `before`
+    /// seconds of the processor.
+    fn look(host: &Host, players: &[Player], time: Duration, before: f64) -> Self {
+        let daemon = host.status().unwrap();
+        let worked = || [processor(daemon.pid), processor_of_all(players)];
+        let [of_daemon, of_all] = worked();
+        let most = |of: fn(u32) -> u64| players.iter().map(|one| of(one.pid())).max().unwrap();
+        let descriptors = [descriptors(daemon.pid), most(|pid| descriptors(pid) as u64) as usize];
+        let memory = [private(daemon.pid), most(private)];
+        std::thread::sleep(REST);
+        let resting = worked();
+        std::thread::sleep(REST);
+        let rested = worked();
+        let share = |of: usize| 100.0 * (rested[of] - resting[of]) / REST.as_secs_f64();
+        Self {
+            time,
+            processor: [of_daemon, of_all - before],
+            traffic: daemon.traffic,
+            memory,
+            descriptors,
+            at_rest: [share(0), share(1)],
+        }
+    }
+}
+
+/// A table of both.
+fn print(start: &Whole, again: &Whole) {
+    let row = |name: &str, of: &dyn Fn(&Whole) -> String| {
+        println!("| {name:<38} | {:>9} | {:>9} |", of(start), of(again));
+    };
+    row("", &|whole| if std::ptr::eq(whole, start) { "start" } else { "kill" }.into());
+    println!("| {:-<38} | {:->9} | {:->9} |", "", ":", ":");
+    row("all know all after", &|whole| format!("{:.2} s", whole.time.as_secs_f64()));
+    row("processor of the daemon until then", &|whole| format!("{:.2} s", whole.processor[0]));
+    row("and of the others", &|whole| format!("{:.2} s", whole.processor[1]));
+    row("packets to the daemon", &|whole| whole.traffic.packets_in.to_string());
+    row("packets from it", &|whole| whole.traffic.packets_out.to_string());
+    row("bytes from it", &|whole| format!("{:.1} MB", whole.traffic.bytes_out as f64 / 1e6));
+    row("memory of a process, the most", &|whole| format!("{} KiB", whole.memory[1]));
+    row("memory of the daemon", &|whole| format!("{} KiB", whole.memory[0]));
+    row("descriptors of a process, the most", &|whole| whole.descriptors[1].to_string());
+    row("descriptors of the daemon", &|whole| whole.descriptors[0].to_string());
+    row("daemon at rest, of one processor", &|whole| format!("{:.2} %", whole.at_rest[0]));
+    row("all others at rest", &|whole| format!("{:.2} %", whole.at_rest[1]));
 }
 
 /// Starts `processes` that each play `part`, and kills the daemon once all know all.
@@ -167,46 +224,22 @@ fn measure(processes: usize, part: &str) {
     };
     let begun = Instant::now();
     let created = all(&mut players, "created");
-    let at_creation = (processor(daemon.0.id()), processor_of_all(&players));
     let whole = all(&mut players, "whole");
-    let start_up = (processor(daemon.0.id()), processor_of_all(&players));
-    println!("  created                         {:>8.2} s", (created - begun).as_secs_f64());
-    println!("  whole after the last creation   {:>8.2} s", (whole - created).as_secs_f64());
-    println!("  daemon and others until then    {:>8.2} s {:>8.2} s", at_creation.0, at_creation.1);
-    println!("  and until whole                 {:>8.2} s {:>8.2} s", start_up.0, start_up.1);
-    print_traffic("start", &host);
-    let memory = players.iter().map(|player| private(player.pid())).max().unwrap();
-    println!("  memory of its own, most      {memory:>8} KiB");
-    println!("  of the daemon                {:>8} KiB", private(daemon.0.id()));
-    std::thread::sleep(REST);
-    let before = (processor(daemon.0.id()), processor_of_all(&players));
-    std::thread::sleep(REST);
-    let rest = (processor(daemon.0.id()) - before.0, processor_of_all(&players) - before.1);
-    let share = 100.0 / REST.as_secs_f64();
-    println!(
-        "  at rest                         {:>8.2} % {:>8.2} %",
-        rest.0 * share,
-        rest.1 * share
-    );
+    let start = Whole::look(&host, &players, whole - created, 0.0);
     let before = processor_of_all(&players);
     daemon.0.kill().unwrap();
     daemon.0.wait().unwrap();
     // One of them starts the next.
-    let again = Instant::now();
-    all(&mut players, "found");
-    let found = Instant::now();
+    let killed = Instant::now();
+    let found = all(&mut players, "found");
     let whole_again = all(&mut players, "whole again");
-    let of_daemon = processor(host.status().unwrap().pid);
-    println!("  a new daemon found by all       {:>8.2} s", (found - again).as_secs_f64());
-    println!("  and the graph whole             {:>8.2} s", (whole_again - again).as_secs_f64());
+    let again = Whole::look(&host, &players, whole_again - killed, before);
     println!(
-        "  daemon and others for it        {of_daemon:>8.2} s {:>8.2} s",
-        processor_of_all(&players) - before
+        "all was created after {:.2} s; after the kill a new daemon was found by all after {:.2} s",
+        (created - begun).as_secs_f64(),
+        (found - killed).as_secs_f64(),
     );
-    print_traffic("again", &host);
-    let descriptors =
-        fs::read_dir(format!("/proc/{}/fd", host.status().unwrap().pid)).unwrap().count();
-    println!("  descriptors of the daemon       {descriptors:>8}");
+    print(&start, &again);
     players.into_iter().for_each(Player::finish);
 }
 
