@@ -159,19 +159,19 @@ fn rust_crypto_agrees_with_the_vectors() {
     check_vectors::<axon_envelope::aead::RustCrypto>();
 }
 
+/// Says why, past the harness, which would show it only beside a failure.
+fn skipped<T>(why: &str) -> Option<T> {
+    let _ = writeln!(std::io::stderr(), "skipped: {why}");
+    None
+}
+
 /// Runs the Python implementation; `None` if this machine cannot.
 fn python(command: &str, input: &[u8]) -> Option<Vec<u8>> {
     let probe = Command::new("python3").args(["-c", "import cryptography"]).output();
     match probe {
         Ok(output) if output.status.success() => {}
-        Ok(_) => {
-            eprintln!("skipped: python3 has no `cryptography` (pip install cryptography)");
-            return None;
-        }
-        Err(error) => {
-            eprintln!("skipped: python3 does not run: {error}");
-            return None;
-        }
+        Ok(_) => return skipped("python3 has no `cryptography` (pip install cryptography)"),
+        Err(error) => return skipped(&format!("python3 does not run: {error}")),
     }
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/python/axqkd001.py");
     let mut child = Command::new("python3")

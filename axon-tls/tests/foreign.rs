@@ -8,7 +8,7 @@ use std::net::SocketAddr;
 use axon_tls::{Cipher, PskKex, qkd};
 use peers::psk::{is_on, openssl_psk, our_client, our_server, psk, vector};
 use peers::{
-    LABEL, Peer, dial, exchange, file, gnutls, handshake, listen, openssls, patient, port,
+    LABEL, Peer, dial, exchange, file, gnutls, handshake, listen, openssls, patient, port, skipped,
 };
 
 /// Every cipher and mode that `program` can do.
@@ -19,7 +19,7 @@ fn with_openssl(test: impl Fn(&str, Cipher, PskKex)) {
             if has_group {
                 test(&program, cipher, PskKex::PskDheKe);
             } else {
-                eprintln!("skipped: psk_dhe_ke, {program} has no X25519MLKEM768");
+                skipped(format_args!("psk_dhe_ke, {program} has no X25519MLKEM768"));
             }
         }
     }

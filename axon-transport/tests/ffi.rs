@@ -1,6 +1,9 @@
 //! The C interface: that the header is the code's, and a C program that uses every function, wrongly
 //! too, built by plain `cc` and run as it is, under valgrind, and under AddressSanitizer.
 
+#[path = "support/skip.rs"]
+mod skip;
+
 use std::{
     ffi::OsStr,
     fs,
@@ -9,6 +12,8 @@ use std::{
     sync::Once,
     time::{Duration, SystemTime},
 };
+
+use skip::skip;
 
 const HERE: &str = env!("CARGO_MANIFEST_DIR");
 /// What a static library of Rust needs of the system.
@@ -75,7 +80,7 @@ fn run(command: &mut Command) -> String {
 fn has(program: &str) -> bool {
     let found = Command::new(program).arg("--version").output().is_ok_and(|o| o.status.success());
     if !found {
-        eprintln!("skipped: {program} is not installed");
+        skip(format_args!("{program} is not installed"));
     }
     found
 }
@@ -256,8 +261,7 @@ fn a_c_program_uses_every_function_under_address_sanitizer() {
     let mut cc = Command::new("cc");
     cc.arg("-fsanitize=address").arg(&probe).arg("-o").arg(directory.path().join("probe"));
     if !cc.output().is_ok_and(|output| output.status.success()) {
-        eprintln!("skipped: cc has no AddressSanitizer");
-        return;
+        return skip("cc has no AddressSanitizer");
     }
     let program = build(directory.path(), &["-fsanitize=address", "-fno-omit-frame-pointer"]);
     run(&mut alone(program));
@@ -269,19 +273,13 @@ fn a_c_program_uses_every_function_under_valgrind() {
         return;
     }
     let directory = tempfile::tempdir().unwrap();
-    let (source, probe) = (directory.path().join("probe.c"), directory.path().join("probe"));
-    let pidfd = "#include <unistd.h>\n#include <sys/syscall.h>\n\
-                 int main(void) { return syscall(SYS_pidfd_open, getpid(), 0) < 0; }\n";
-    fs::write(&source, pidfd).unwrap();
-    run(Command::new("cc").arg(&source).arg("-o").arg(&probe));
-    if !Command::new("valgrind").arg(&probe).output().unwrap().status.success() {
-        eprintln!(
-            "skipped: this valgrind does not know pidfd_open, without which there is no session"
-        );
-        return;
-    }
     let program = build(directory.path(), &[]);
     let mut valgrind = alone("valgrind");
-    valgrind.args(["--quiet", "--error-exitcode=99", "--leak-check=full"]);
-    run(valgrind.args(["--errors-for-leak-kinds=definite"]).arg(program));
+    // It keeps account of the address space, too: what nobody uses of it takes most of the time.
+    valgrind.envs([("AXON_RING_BUFFER_SIZE_MB", "1"), ("AXON_MAX_MESSAGE_MB", "1")]);
+    // Who waits for a thread that does not run gives way to it.
+    valgrind.args(["--quiet", "--fair-sched=try", "--error-exitcode=99", "--leak-check=full"]);
+    valgrind.args(["--errors-for-leak-kinds=definite", "--show-leak-kinds=definite"]);
+    let known = path("tests/ffi/valgrind.supp");
+    run(valgrind.arg(format!("--suppressions={}", known.display())).arg(program));
 }

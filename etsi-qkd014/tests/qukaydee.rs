@@ -5,6 +5,7 @@
 //! `account-ACCT-server-ca-qukaydee-com.crt` and, for N = 1 and 2, `sae-N.crt` and `sae-N.key`. The
 //! same steps are taken over the simulator in QuKayDee's place, so that they are known to work.
 
+use std::io::Write;
 use std::path::PathBuf;
 
 use etsi_qkd014::sim::{Layout, Network, Pki, Site};
@@ -34,11 +35,14 @@ impl Account {
         Ok(Self { id, certs, url })
     }
 
-    /// The account in the environment, or `None` with the reason on standard error.
-    #[allow(clippy::print_stderr, reason = "a skipped test says so")]
+    /// The account in the environment, or `None` with the reason on standard error: past the
+    /// harness, which would show it only beside a failure.
     fn here() -> Option<Self> {
         let read = Self::read(|name| std::env::var(name).ok());
-        read.inspect_err(|why| eprintln!("skipped, QuKayDee was not asked: {why}")).ok()
+        read.inspect_err(|why| {
+            let _ = writeln!(std::io::stderr(), "skipped: QuKayDee was not asked: {why}");
+        })
+        .ok()
     }
 
     /// A client that is SAE `n` at KME `n`.

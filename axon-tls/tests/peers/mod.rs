@@ -6,6 +6,7 @@
 
 pub(crate) mod psk;
 
+use std::fmt::Display;
 use std::io::{BufRead, BufReader, Error, Read, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
 use std::path::PathBuf;
@@ -186,7 +187,7 @@ pub(crate) fn openssls() -> Vec<(String, bool)> {
                 eprintln!("with {version}");
                 found.push((program, minor.is_some_and(|minor: u32| minor >= 5)));
             }
-            other => eprintln!("skipped: {program} is not OpenSSL 3 ({other:?})"),
+            other => skipped(format_args!("{program} is not OpenSSL 3 ({other:?})")),
         }
     }
     found
@@ -194,8 +195,16 @@ pub(crate) fn openssls() -> Vec<(String, bool)> {
 
 pub(crate) fn gnutls() -> bool {
     let found = version_of("gnutls-cli", "--version").zip(version_of("gnutls-serv", "--version"));
-    eprintln!("{}", found.as_ref().map_or("skipped: no GnuTLS", |(version, _)| version));
+    match &found {
+        Some((version, _)) => eprintln!("with {version}"),
+        None => skipped("no GnuTLS"),
+    }
     found.is_some()
+}
+
+/// Says what is left out, and why, past the harness: it would show that only beside a failure.
+pub(crate) fn skipped(what: impl Display) {
+    let _ = writeln!(std::io::stderr(), "skipped: {what}");
 }
 
 /// Runs `test` with every `openssl` that has X25519MLKEM768.
@@ -206,11 +215,11 @@ pub(crate) fn with_hybrid_openssl(test: impl Fn(&str)) {
             any = true;
             test(&program);
         } else {
-            eprintln!("skipped: {program} has no X25519MLKEM768");
+            skipped(format_args!("{program} has no X25519MLKEM768"));
         }
     }
     if !any {
-        eprintln!("skipped: no OpenSSL with X25519MLKEM768; TEST_OPENSSL may name one");
+        skipped("no OpenSSL with X25519MLKEM768; TEST_OPENSSL may name one");
     }
 }
 

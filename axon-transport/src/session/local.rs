@@ -71,17 +71,26 @@ impl Inside {
 }
 
 impl Local {
+    /// A house of its own, where nobody else is and nothing is handed to anybody.
+    pub(super) fn alone(session: &Shared) -> Self {
+        Self::enter(Arc::default(), session, None)
+    }
+
     /// Joins `house`.
-    pub(super) fn new(house: Arc<House>, session: &Shared) -> Result<Self, ShmError> {
-        let (id, role, name) = (session.id, session.options.role, session.options.name.clone());
+    pub(super) fn join(house: Arc<House>, session: &Shared) -> Result<Self, ShmError> {
         let handed = session.segment.descriptors()?;
         let handed = [handed.segment, handed.doorbell, handed.pidfd].map(Arc::new);
+        Ok(Self::enter(house, session, Some(handed)))
+    }
+
+    fn enter(house: Arc<House>, session: &Shared, handed: Option<[Arc<PassedFd>; 3]>) -> Self {
+        let (id, role, name) = (session.id, session.options.role, session.options.name.clone());
         let mut inside = house.lock();
         inside.wakers.insert(id, session.wake.clone());
         // There are at most two, which is never too many.
-        let _ = inside.registry.connect(id, role, name, std::process::id(), Some(handed));
+        let _ = inside.registry.connect(id, role, name, std::process::id(), handed);
         drop(inside);
-        Ok(Self { id, house })
+        Self { id, house }
     }
 
     /// What a daemon would answer to nothing, or to a message.

@@ -29,9 +29,8 @@ impl Session {
     pub fn open(config: &Config, options: SessionOptions) -> Result<Self, SessionError> {
         let id = SessionId::random();
         if config.daemon == DaemonPolicy::Off {
-            let house = Start::House(Arc::default());
             let segment = SessionSegment::create(id)?;
-            return Ok(Self::of(Self::start(config, options, segment, house)?));
+            return Ok(Self::of(Self::start(config, options, segment, Start::Alone)?));
         }
         let reason = if config.shm {
             let segment = SessionSegment::create(id)?;

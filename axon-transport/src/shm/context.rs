@@ -88,7 +88,7 @@ impl Context {
     /// A new context of this process.
     ///
     /// # Errors
-    /// Memory or descriptors are short, or the system has no memfds or pidfds (Linux 5.3).
+    /// Memory or descriptors are short, or the system has no sealed memfds.
     pub fn new() -> Result<Self, ShmError> {
         Ok(Self::of(SessionSegment::create(SessionId::random())?))
     }

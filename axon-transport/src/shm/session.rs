@@ -22,7 +22,6 @@ use super::{
 };
 use crate::{
     ids::{Gid, SessionId},
-    passed::PassedFd,
     wait::{Doorbell, ExternalLeader, Look, PassedOn, Purpose, due, waits},
 };
 
@@ -37,7 +36,6 @@ pub struct SessionSegment {
     heap: Heap,
     orphans: Orphans,
     doorbell: Doorbell,
-    pidfd: OwnedFd,
     lanes: Mutex<Lanes>,
     /// The last ticket of each of our own armed words that we rang for.
     rung: [AtomicU64; 2],
@@ -58,12 +56,10 @@ impl SessionSegment {
     /// Makes the memory of a new session.
     ///
     /// # Errors
-    /// The system has no memory or descriptors left, or lacks sealed memfds or pidfds (Linux 5.3).
+    /// The system has no memory or descriptors left, or lacks sealed memfds.
     pub fn create(id: SessionId) -> Result<Arc<Self>, ShmError> {
         let segments = Segments::new(id);
         let first = segments.open(SegmentKind::Session, layout::SESSION_BYTES)?;
-        let pidfd = pidfd_open(getpid(), PidfdFlags::empty())
-            .map_err(ShmError::system("opening a pidfd of this process"))?;
         Ok(Arc::new(Self {
             id,
             heap: Heap::new(Arc::clone(&first)),
@@ -71,7 +67,6 @@ impl SessionSegment {
             segments,
             orphans: Orphans::default(),
             doorbell: Doorbell::new().map_err(ShmError::system("creating a doorbell"))?,
-            pidfd,
             lanes: Mutex::default(),
             rung: Default::default(),
         }))
@@ -82,20 +77,25 @@ impl SessionSegment {
         self.id
     }
 
-    /// Duplicates of the descriptors that other sessions need.
+    /// Descriptors of their own for other sessions, which need them.
     ///
     /// # Errors
-    /// The process has no descriptors left.
+    /// The process has no descriptors left, is a fork of the session's, or the system lacks pidfds
+    /// (Linux 5.3).
     pub fn descriptors(&self) -> Result<PeerDescriptors, ShmError> {
-        let clone = |fd: BorrowedFd<'_>| {
-            fd.try_clone_to_owned()
-                .map(PassedFd::from)
-                .map_err(|source| ShmError::System { what: "duplicating a descriptor", source })
-        };
+        // Others would wait for the end of the wrong process.
+        if self.is_forked() {
+            return Err(ShmError::Forked);
+        }
+        let doorbell = self.doorbell.bell().as_fd().try_clone_to_owned();
+        let doorbell = doorbell
+            .map_err(|source| ShmError::System { what: "duplicating a descriptor", source })?;
+        let pidfd = pidfd_open(getpid(), PidfdFlags::empty())
+            .map_err(ShmError::system("opening a pidfd of this process"))?;
         Ok(PeerDescriptors {
             segment: self.first.descriptor()?.into(),
-            doorbell: clone(self.doorbell.bell().as_fd())?,
-            pidfd: clone(self.pidfd.as_fd())?,
+            doorbell: doorbell.into(),
+            pidfd: pidfd.into(),
         })
     }
 

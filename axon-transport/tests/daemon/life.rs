@@ -13,7 +13,7 @@ use axon_transport::{
 use rustix::process::{Pid, Signal, kill_process_group};
 
 use super::*;
-use crate::support::Kept;
+use crate::{skip::skip, support::Kept};
 
 /// A child that plays `part`, of which nothing is heard but what it does.
 fn command(host: &Host, part: &str) -> Command {
@@ -97,7 +97,7 @@ fn all_works_where_every_file_system_is_read_only() {
     unshare.stdin(Stdio::piped()).stdout(Stdio::null());
     let mut player = match unshare.spawn() {
         Ok(child) => Kept(child),
-        Err(error) => return skip(&format!("no unshare: {error}")),
+        Err(error) => return skip(format_args!("no unshare: {error}")),
     };
     let mut status = None;
     until("it is served", || {
@@ -105,18 +105,13 @@ fn all_works_where_every_file_system_is_read_only() {
         status.is_some() || player.0.try_wait().unwrap().is_some()
     });
     match player.0.try_wait().unwrap() {
-        Some(ended) if status.is_none() => skip(&format!("no mount namespace here: {ended}")),
+        Some(ended) if status.is_none() => skip(format_args!("no mount namespace here: {ended}")),
         _ => {
             let status = status.expect("a session");
             assert_eq!(status.runtime_dir, None);
             assert!(status.socket.starts_with('@'), "{}", status.socket);
         }
     }
-}
-
-#[allow(clippy::print_stdout, reason = "why something of it cannot be tried here")]
-fn skip(why: &str) {
-    println!("skipped: {why}");
 }
 
 #[test]

@@ -2,6 +2,8 @@
 
 mod hostile;
 mod life;
+#[path = "../support/skip.rs"]
+mod skip;
 #[path = "../support/mod.rs"]
 mod support;
 

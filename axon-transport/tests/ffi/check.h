@@ -6,6 +6,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/types.h>
 
 #define SECOND INT64_C(1000000000)
 /* Long enough for a loaded machine; what works does not wait for it. */
@@ -54,6 +55,12 @@ void await(struct place place, axon_subscription_t subscription);
 
 /* A handle that names nothing any more, of any kind. */
 #define STALE UINT64_C(0x123456789abcdef)
+
+/* How a forked child ends that did what it should. Not by _exit, at which valgrind looks for leaks: what
+ * other threads of its parent alone reach is lost to it. */
+void end_child(void);
+/* Waits for that. */
+void child_ends(pid_t child);
 
 /* The cases. */
 void case_settings(void);

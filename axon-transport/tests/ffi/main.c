@@ -1,6 +1,9 @@
 /* Uses every function of the C interface, wrongly too. The first argument names the case. */
 #include "check.h"
 
+#include <signal.h>
+#include <sys/wait.h>
+
 void fail(const char *file, int line, const char *what) {
     fprintf(stderr, "%s:%d: %s\n  last error: %s\n", file, line, what, axon_session_last_error());
     abort();
@@ -74,6 +77,16 @@ void await(struct place place, axon_subscription_t subscription) {
     set.subscriptions = &subscription;
     set.subscription_count = 1;
     OK(axon_session_wait(place.session, &set, PATIENCE));
+}
+
+void end_child(void) {
+    raise(SIGKILL);
+}
+
+void child_ends(pid_t child) {
+    int status = 0;
+    CHECK(child > 0 && waitpid(child, &status, 0) == child);
+    CHECK(WIFSIGNALED(status) && WTERMSIG(status) == SIGKILL);
 }
 
 int main(int argc, char **argv) {

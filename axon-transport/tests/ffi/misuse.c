@@ -380,11 +380,9 @@ void case_fork(void) {
         FORKED(axon_session_publisher_publish(talker, &byte, 1, AXON_TIME_NOW, NULL));
         OK(axon_session_publisher_destroy(said));
         close_place(own);
-        _exit(0);
+        end_child();
     }
-    int status = 0;
-    CHECK(waitpid(child, &status, 0) == child);
-    CHECK(WIFEXITED(status) && WEXITSTATUS(status) == 0);
+    child_ends(child);
     /* The parent goes on. */
     struct message message;
     OK(axon_session_publisher_publish(talker, (const uint8_t *)"on", 2, AXON_TIME_NOW, NULL));

@@ -5,6 +5,8 @@ mod child;
 #[path = "../support/group.rs"]
 mod group;
 mod interrupted;
+#[path = "../support/skip.rs"]
+mod skip;
 #[path = "../support/mod.rs"]
 mod support;
 
@@ -24,6 +26,7 @@ use axon_transport::{
 };
 use group::Group;
 use rustix::process::{Resource, Rlimit};
+use skip::skip;
 use support::{Host, PATIENCE, until};
 
 fn spec(topic: &str) -> EndpointSpec {
@@ -46,12 +49,6 @@ fn meet(name: &str, first: bool) -> UnixDatagram {
 
 fn at(host: &Host, name: &str) -> String {
     host.dir.path().join(name).to_str().unwrap().to_owned()
-}
-
-/// Says in the test's output why something of it cannot be tried here.
-#[allow(clippy::print_stdout)]
-fn skip(why: &str) {
-    println!("skipped: {why}");
 }
 
 /// What the children of the tests do. In a run of the tests themselves it does nothing.
@@ -81,7 +78,7 @@ fn a_reader_that_locks_its_memory_takes_none_of_its_publishers() {
     let mut reader = host.play("locked");
     let said = reader.hear();
     if said != "locked" {
-        return skip(&said);
+        return skip(said);
     }
     let mut owner = host.play("owner");
     for step in ["attached", "taken"] {
@@ -188,7 +185,7 @@ fn a_session_without_descriptors_left_says_so_and_goes_on() {
 fn a_publisher_at_the_limit_of_its_control_group_is_refused_and_not_killed() {
     let group = match Group::new(64 << 20) {
         Ok(group) => group,
-        Err(why) => return skip(&why),
+        Err(why) => return skip(why),
     };
     let host = Host::new().with("GROUP", group.path().to_str().unwrap());
     let mut publisher = host.play("confined");

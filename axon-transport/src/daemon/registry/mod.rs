@@ -81,7 +81,7 @@ pub struct SessionEntry<F> {
     pub pid: u32,
     /// Its endpoints.
     pub endpoints: BTreeSet<Gid>,
-    /// Segment, doorbell and pidfd; a tool has none.
+    /// Segment, doorbell and pidfd; a tool has none, nor has a session that nobody can meet.
     pub descriptors: Option<[F; 3]>,
     /// The segments of its memory besides the first, by number.
     pub segments: BTreeMap<u32, SessionSegment<F>>,

@@ -89,8 +89,10 @@ pub(super) enum Start {
     Daemon(Connected),
     /// Whoever is at the other end of a socket, and nobody after it.
     Socket(Connected),
-    /// The registry of its own process.
+    /// The registry of its own process, where it meets another session.
     House(Arc<House>),
+    /// Nobody.
+    Alone,
 }
 
 enum Link {
@@ -132,8 +134,9 @@ impl Control {
         match start {
             Start::Daemon(connected) | Start::Socket(connected) => control.connected(connected),
             Start::House(house) => {
-                control.link = Link::Local(Local::new(house, &control.shared)?);
+                control.link = Link::Local(Local::join(house, &control.shared)?);
             }
+            Start::Alone => control.link = Link::Local(Local::alone(&control.shared)),
         }
         Ok(control)
     }
