@@ -34,7 +34,7 @@ use rustix::{
     fs::{MemfdFlags, memfd_create},
     process::{Pid, Signal, WaitId, WaitIdOptions, waitid},
 };
-use support::{Host, PATIENCE, say, signal, until, wait_for_the_end};
+use support::{Host, PATIENCE, Player, say, signal, until, wait_for_the_end};
 
 fn spec(topic: &str) -> EndpointSpec {
     EndpointSpec::new(topic, "test/Bytes", Qos::keep_all())
@@ -128,8 +128,12 @@ fn child() {
 }
 
 fn run_pair(host: &Host, meanwhile: impl FnOnce(&str)) {
-    let mut listener = host.play("listener");
-    let mut talker = host.play("talker");
+    talk(host, [host.play("listener"), host.play("talker")], meanwhile);
+}
+
+/// Has a talker talk to a listener until `meanwhile`, which is told the daemon, is over.
+fn talk(host: &Host, players: [Player; 2], meanwhile: impl FnOnce(&str)) {
+    let [mut listener, mut talker] = players;
     assert_eq!(talker.hear(), "matched");
     let first: u64 = listener.hear().parse().unwrap();
     let daemon = host.status().unwrap().daemon;
@@ -223,7 +227,7 @@ fn of_twenty_that_start_at_once_one_starts_the_daemon() {
     let status = host.status().unwrap();
     assert_eq!(status.daemon, daemons[0]);
     assert_eq!(status.sessions.len() - gateways(&status), 20);
-    players.into_iter().for_each(support::Player::finish);
+    players.into_iter().for_each(Player::finish);
 }
 
 #[test]
@@ -317,12 +321,14 @@ fn without_a_usable_runtime_directory_nothing_is_kept_and_everything_works() {
         .without("AXON_RUNTIME_DIR")
         .with("XDG_RUNTIME_DIR", "/proc/no-such-directory")
         .with("ROS_DOMAIN_ID", "170");
-    let mut player = host.play("idle");
-    let daemon = player.hear();
+    run_pair(&host, |daemon| keeps_nothing(&host, daemon));
+}
+
+/// That this daemon, which a session started, has no directory, and an address that is no file.
+fn keeps_nothing(host: &Host, daemon: &str) {
     let status = host.status().unwrap();
-    assert_eq!((status.daemon, status.runtime_dir), (daemon, None));
+    assert_eq!((&*status.daemon, status.runtime_dir), (daemon, None));
     assert!(status.socket.starts_with('@'), "{}", status.socket);
-    player.finish();
 }
 
 #[test]

@@ -94,7 +94,11 @@ impl Host {
 
     /// A child that plays `part`.
     pub(crate) fn play(&self, part: &str) -> Player {
-        let mut command = self.command(std::env::current_exe().unwrap());
+        self.play_in(self.command(std::env::current_exe().unwrap()), part)
+    }
+
+    /// The same, where `command` is this program, or runs the one that its arguments end with.
+    pub(crate) fn play_in(&self, mut command: Command, part: &str) -> Player {
         command.args(["child", "--exact", "--nocapture", "--test-threads=1"]).env("PLAY", part);
         let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
         let lines = BufReader::new(child.stdout.take().unwrap()).lines();
