@@ -4,7 +4,13 @@
 #[allow(dead_code, reason = "what other tests need of it")]
 mod support;
 
-use std::{collections::BTreeMap, fs, sync::Arc, thread, time::Duration};
+use std::{
+    collections::BTreeMap,
+    fs,
+    sync::Arc,
+    thread,
+    time::{Duration, Instant},
+};
 
 use axon_transport::{
     config::Config,
@@ -19,6 +25,9 @@ const WATCH: Duration = Duration::from_secs(5);
 /// Between two looks whether a process has come to rest.
 const SETTLE: Duration = Duration::from_millis(500);
 
+/// The lease of who has one, in nanoseconds. It is renewed at each third of it.
+const LEASE: u64 = 3_000_000_000;
+
 fn spec(topic: &str) -> EndpointSpec {
     EndpointSpec::new(topic, "test/Bytes", Qos::default())
 }
@@ -27,12 +36,14 @@ fn spec(topic: &str) -> EndpointSpec {
 #[test]
 fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
+    let lease = (part == "leased").then_some(LEASE);
+    let leased = || EndpointSpec { qos: Qos { lease, ..Qos::default() }, ..spec("/a") };
     let session = Session::open(&Config::from_env().unwrap(), SessionOptions::new(&*part)).unwrap();
     let _node = session.create_node("idle", "/", "/").unwrap();
-    let talker = session.create_publisher(spec("/a")).unwrap();
-    let heard = session.create_subscription(spec("/a")).unwrap();
+    let talker = session.create_publisher(leased()).unwrap();
+    let heard = session.create_subscription(leased()).unwrap();
     let silent = session.create_subscription(spec("/b")).unwrap();
-    let called = session.create_subscription(spec("/a")).unwrap();
+    let called = session.create_subscription(leased()).unwrap();
     let server = session.create_server(spec("/s")).unwrap();
     let client = session.create_client(spec("/s")).unwrap();
     let lost = silent.event(EventKind::MessageLost).unwrap();
@@ -76,21 +87,35 @@ fn sleeps(pid: u32) -> BTreeMap<String, u64> {
     all
 }
 
-/// What a process at rest does within [`WATCH`], as counts of sleeps by thread.
-fn wakes(pid: u32) -> BTreeMap<String, u64> {
-    let mut before = sleeps(pid);
+/// Once the threads of a process have come to rest, but those whose names `busy` knows.
+fn settle(pid: u32, busy: impl Fn(&str) -> bool) {
+    let resting = || -> BTreeMap<_, _> {
+        sleeps(pid).into_iter().filter(|(thread, _)| !busy(thread)).collect()
+    };
+    let mut before = resting();
     until("it comes to rest", || {
         thread::sleep(SETTLE);
-        let now = sleeps(pid);
+        let now = resting();
         now == std::mem::replace(&mut before, now.clone())
     });
-    thread::sleep(WATCH);
+}
+
+/// What has happened in a process since `before`, as counts of sleeps by thread.
+fn since(before: &BTreeMap<String, u64>, pid: u32) -> BTreeMap<String, u64> {
     let mut after = sleeps(pid);
     for (thread, count) in before {
-        *after.entry(thread).or_default() -= count;
+        *after.entry(thread.clone()).or_default() -= count;
     }
     after.retain(|_, count| *count > 0);
     after
+}
+
+/// What a process at rest does within [`WATCH`].
+fn wakes(pid: u32) -> BTreeMap<String, u64> {
+    settle(pid, |_| false);
+    let before = sleeps(pid);
+    thread::sleep(WATCH);
+    since(&before, pid)
 }
 
 #[test]
@@ -101,6 +126,34 @@ fn a_process_at_rest_does_not_wake_up() {
     players.iter_mut().for_each(|player| assert_eq!(player.hear(), "rests"));
     for player in &players {
         assert_eq!(wakes(player.pid()), BTreeMap::new());
+    }
+}
+
+/// Each offers a lease, and watches its own and the other's.
+#[test]
+fn leases_wake_the_control_thread_up_three_times_each_and_nobody_else() {
+    let host = Host::new();
+    let _daemon = host.daemon();
+    let mut players = [0, 1].map(|_| host.play("leased"));
+    players.iter_mut().for_each(|player| assert_eq!(player.hear(), "rests"));
+    for player in &players {
+        let control = |thread: &str| thread.ends_with(" axon-ctl");
+        settle(player.pid(), control);
+        // However late this process is: what is counted was within the time that is.
+        let start = Instant::now();
+        let before = sleeps(player.pid());
+        let mut woken = BTreeMap::new();
+        until("it renewed its lease some times", || {
+            woken = since(&before, player.pid());
+            woken.values().sum::<u64>() >= 3
+        });
+        let thirds = start.elapsed().as_nanos() / u128::from(LEASE / 3);
+        let threads: Vec<_> = woken.keys().collect();
+        assert!(threads.len() == 1 && control(threads[0]), "{woken:?}");
+        assert!(
+            woken.values().all(|count| u128::from(*count) <= thirds + 1),
+            "{woken:?}, {thirds}"
+        );
     }
 }
 
