@@ -17,6 +17,9 @@
  * handle finds no room, and AXON_RET_PANIC. An object may be destroyed by one thread while others use it:
  * calls that are under way end as they would have. A handle that is never destroyed keeps what it names.
  *
+ * A process that executes another program without closing its sessions is gone for the others as if it had
+ * been killed, but for the samples that it holds: their memory is free once that program has ended.
+ *
  * Made by cbindgen from src/ffi: edit it there. */
 
 

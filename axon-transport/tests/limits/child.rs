@@ -1,6 +1,6 @@
 //! What the children of the tests do.
 
-use std::{fs, path::Path, time::Duration};
+use std::{fs, os::unix::process::CommandExt as _, path::Path, process::Command, time::Duration};
 
 use axon_transport::{
     qos::{Durability, Qos},
@@ -14,7 +14,7 @@ use axon_transport::{
 use rustix::process::{Resource, Rlimit, setrlimit};
 
 use crate::{
-    blocks, group, latched, meet, spec,
+    blocks, descriptors, group, image, latched, meet, spec,
     support::{PATIENCE, of_child, say, until, wait_for_the_end},
 };
 
@@ -197,6 +197,19 @@ pub(crate) fn play(part: &str) {
             });
             let end = socket::receive(&socket, &mut buffer);
             say(if matches!(end, Err(socket::SocketError::Closed)) { "put out" } else { "heard" });
+        }
+        "successor" => {
+            say(descriptors("self"));
+            let session = of_child("former");
+            let _publisher = session.create_publisher(spec("/t")).unwrap();
+            let subscription = session.create_subscription(image()).unwrap();
+            assert!(session.wait(|| subscription.has_data(), Some(PATIENCE)));
+            let (_, held) = subscription.take_sample().unwrap();
+            assert!(held.is_borrowed());
+            say("holds");
+            std::io::stdin().read_line(&mut String::new()).unwrap();
+            let error = Command::new("sleep").arg("1000").exec();
+            panic!("sleep: {error}");
         }
         "listener" => {
             let session = of_child("listener");

@@ -39,6 +39,27 @@ fn latched(topic: &str) -> EndpointSpec {
     EndpointSpec::new(topic, "test/Bytes", qos)
 }
 
+/// Of what is read in place the newest are kept, for whoever comes.
+fn image() -> EndpointSpec {
+    let qos = Qos { durability: Durability::TransientLocal, ..Qos::default() };
+    EndpointSpec::new("/image", "test/Bytes", qos)
+}
+
+/// What the descriptors of a process are of.
+fn descriptors(process: &str) -> String {
+    let entries = fs::read_dir(format!("/proc/{process}/fd")).unwrap();
+    let links = entries.filter_map(|entry| {
+        let number = entry.ok()?.path();
+        let to = fs::read_link(&number).ok()?;
+        // Not the one by which this is read.
+        let other = !to.starts_with("/proc");
+        other.then(|| format!("{} {}", number.file_name().unwrap().display(), to.display()))
+    });
+    let mut links: Vec<String> = links.collect();
+    links.sort();
+    links.join(", ")
+}
+
 /// One end of a socket between a test and its child; `first` is the test's.
 fn meet(name: &str, first: bool) -> UnixDatagram {
     let path = |end: bool| PathBuf::from(format!("{name}.{}", u8::from(end)));
@@ -196,6 +217,41 @@ fn a_publisher_at_the_limit_of_its_control_group_is_refused_and_not_killed() {
     until("the group is empty", || {
         fs::read_to_string(group.path().join("cgroup.procs")).is_ok_and(|text| text.is_empty())
     });
+}
+
+#[test]
+fn a_process_that_becomes_another_program_is_gone_but_for_the_samples_that_it_read() {
+    let host = Host::new();
+    let _daemon = host.daemon();
+    let session = host.session("camera").unwrap();
+    let publisher = session.create_publisher(image()).unwrap();
+    let publish = || {
+        let mut loan = publisher.loan(100_000).unwrap();
+        loan.fill(7);
+        let at = loan.as_ptr().addr();
+        loan.publish().unwrap();
+        at
+    };
+    let held = publish();
+    // So many that a place comes again unless it is held.
+    let comes_again = || (0..100).any(|_| publish() == held);
+    let mut former = host.play("successor");
+    let before = former.hear();
+    assert_eq!(former.hear(), "holds");
+    assert!(!comes_again(), "a sample was written over while it was read");
+    assert!(publisher.wait_matched(1, PATIENCE));
+    assert!(session.wait_graph(PATIENCE, |graph| graph.endpoints.len() == 3));
+    former.go();
+
+    let pid = former.pid().to_string();
+    let name = Path::new("/proc").join(&pid).join("comm");
+    until("it is another program", || fs::read(&name).is_ok_and(|name| name == b"sleep\n"));
+    until("it has what it had before its session", || descriptors(&pid) == before);
+    assert!(session.wait_graph(PATIENCE, |graph| graph.endpoints.len() == 1));
+    until("it is no reader", || publisher.matched().is_empty());
+    assert!(!comes_again(), "its memory was given back before its process ended");
+    drop(former);
+    until("the sample's place is free", comes_again);
 }
 
 #[test]
