@@ -57,6 +57,40 @@ fn an_endpoint_out_of_bounds_is_refused() {
     assert!(session.create_subscription(bottomless).is_err());
 }
 
+/// What two sessions would have in common, if anything.
+#[test]
+fn sessions_of_a_process_without_a_daemon_know_nothing_of_each_other() {
+    let sessions = [alone(), alone()];
+    let ends = sessions.each_ref().map(|session| {
+        let node = session.create_node("n", "/", "/").unwrap();
+        let subscription = node.create_subscription(spec(Qos::keep_all())).unwrap();
+        let publisher = node.create_publisher(spec(Qos::keep_all())).unwrap();
+        (node, subscription, publisher)
+    });
+    let service = || EndpointSpec::new("/s", "S", Qos::default());
+    let _server = sessions[0].create_server(service()).unwrap();
+    let client = sessions[1].create_client(service()).unwrap();
+    for (number, (_, subscription, publisher)) in ends.iter().enumerate() {
+        assert!(subscription.wait_matched(1, PATIENCE) && publisher.wait_matched(1, PATIENCE));
+        publisher.publish(&[u8::try_from(number).unwrap()]).unwrap();
+    }
+    let mut bytes = Vec::new();
+    for (number, (_, subscription, _)) in ends.iter().enumerate() {
+        assert!(subscription.recv(&mut bytes, Some(PATIENCE)).is_some());
+        assert_eq!(bytes.iter().map(|byte| usize::from(*byte)).collect::<Vec<_>>(), [number]);
+    }
+    // Were there more to come, it would have begun to long ago.
+    for (session, (_, subscription, publisher)) in sessions.iter().zip(&ends) {
+        let moment = Duration::from_millis(100);
+        assert!(!session.wait_graph(moment, |graph| graph.endpoints.len() > 4));
+        assert_eq!(nodes(session), [("n".into(), vec!["/t".into()])]);
+        assert!(subscription.take(&mut bytes).is_none());
+        let matched = (publisher.matched(), subscription.matched());
+        assert_eq!(matched, (vec![subscription.gid()], vec![publisher.gid()]));
+    }
+    assert!(!client.is_available());
+}
+
 #[test]
 fn a_node_is_in_the_graph_from_its_creation_to_its_end() {
     let session = alone();

@@ -274,6 +274,40 @@ fn require_without_a_daemon_fails_and_off_needs_none() {
 }
 
 #[test]
+fn domains_that_share_a_runtime_directory_have_a_daemon_each_and_nothing_else_in_common() {
+    let one = Host::new();
+    let run = one.dir.path().join("run").to_str().unwrap().to_owned();
+    let other = Host::new().with("AXON_RUNTIME_DIR", &run).with("ROS_DOMAIN_ID", "1");
+    let hosts = [one, other];
+    let _daemons = hosts.each_ref().map(Host::daemon);
+    let sessions = hosts.each_ref().map(|host| host.session("a").unwrap());
+    let ends = sessions.each_ref().map(|session| {
+        let subscription = session.create_subscription(spec("/t")).unwrap();
+        (subscription, session.create_publisher(spec("/t")).unwrap())
+    });
+    for (number, (subscription, publisher)) in (1..).zip(&ends) {
+        assert!(subscription.wait_matched(1, PATIENCE) && publisher.wait_matched(1, PATIENCE));
+        // One sample there and two here.
+        (1..=number).for_each(|sample| publish(publisher, sample));
+    }
+    for (number, (subscription, publisher)) in (1..).zip(&ends) {
+        assert!((1..=number).all(|sample| receive(subscription) == sample));
+        assert!(subscription.take(&mut Vec::new()).is_none());
+        let matched = (publisher.matched(), subscription.matched());
+        assert_eq!(matched, (vec![subscription.gid()], vec![publisher.gid()]));
+    }
+    let statuses = hosts.each_ref().map(|host| host.status().unwrap());
+    for (status, session) in statuses.iter().zip(&sessions) {
+        assert_eq!(session.daemon().map(|daemon| daemon.to_string()), Some(status.daemon.clone()));
+        assert_eq!(status.sessions.len() - gateways(status), 1);
+        assert_eq!(status.runtime_dir.as_deref(), Some(&*run));
+        assert!(!session.wait_graph(Duration::from_millis(100), |g| g.endpoints.len() > 2));
+    }
+    let [one, other] = &statuses;
+    assert!(one.daemon != other.daemon && one.pid != other.pid && one.socket != other.socket);
+}
+
+#[test]
 fn a_session_killed_takes_its_endpoints_with_it() {
     let host = Host::new();
     let _daemon = host.daemon();
