@@ -1,0 +1,128 @@
+//! What `cargo xtask install-c` installs: programs in C build and run with it as the README of
+//! axon-transport says, linked with either library, and the shared one exports what the header
+//! declares and nothing else.
+//!
+//! It builds axon-transport by itself, with other features than the workspace's, so that all that it
+//! depends on may be built once more: `cargo test -p xtask --test install_c -- --include-ignored`.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::io::{Write, stderr};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command};
+
+fn run(command: &mut Command) -> String {
+    let output = command.output().unwrap_or_else(|error| panic!("{command:?}: {error}"));
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    let (out, err) = (text(&output.stdout), text(&output.stderr));
+    assert!(output.status.success(), "{command:?}: {}\n{out}\n{err}", output.status);
+    out
+}
+
+/// Where everything was installed.
+struct Installed(tempfile::TempDir);
+
+impl Installed {
+    fn new() -> Self {
+        let prefix = tempfile::tempdir().unwrap();
+        let mut install = Command::new(env!("CARGO_BIN_EXE_xtask"));
+        // What the workspace has built is of use here.
+        let target = Path::new(env!("CARGO_TARGET_TMPDIR")).parent().unwrap();
+        install.env("CARGO_TARGET_DIR", target).args(["install-c"]).arg(prefix.path()).arg("dev");
+        run(&mut install);
+        Self(prefix)
+    }
+
+    fn path(&self, within: &str) -> PathBuf {
+        self.0.path().join(within)
+    }
+
+    /// The functions that the header declares.
+    fn declared(&self) -> BTreeSet<String> {
+        let header = fs::read_to_string(self.path("include/axon.h")).unwrap();
+        let declarations =
+            header.split('(').filter_map(|before| before.rsplit([' ', '*', '\n']).next());
+        // Types of functions have a parenthesis behind the name, too.
+        let functions =
+            declarations.filter(|name| name.starts_with("axon_") && !name.ends_with(')'));
+        functions.map(str::to_owned).collect()
+    }
+
+    /// What a program finds in the shared library.
+    fn exported(&self) -> BTreeSet<String> {
+        let library = self.path("lib/libaxon_transport.so");
+        let symbols = run(Command::new("nm").args(["-D", "--defined-only"]).arg(library));
+        symbols.lines().filter_map(|line| line.split(' ').nth(2)).map(str::to_owned).collect()
+    }
+
+    /// What pkg-config answers.
+    fn asked(&self, options: &[&str]) -> Vec<String> {
+        let mut ask = Command::new("pkg-config");
+        ask.env("PKG_CONFIG_PATH", self.path("lib/pkgconfig")).args(options).arg("axon-transport");
+        run(&mut ask).split_whitespace().map(str::to_owned).collect()
+    }
+
+    /// An example, built as the README says.
+    fn example(&self, name: &str, options: &[&str]) -> PathBuf {
+        let repository = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+        let source = repository.join("axon-transport/examples/c").join(name).with_extension("c");
+        let program = self.path(name);
+        run(Command::new("cc").arg(source).args(self.asked(options)).arg("-o").arg(&program));
+        program
+    }
+
+    /// A program among which there is a daemon of theirs, which does not stay long.
+    fn command(&self, program: &Path) -> Command {
+        let mut command = Command::new(program);
+        let ours = |name: &str| name.starts_with("AXON_") || name.starts_with("ROS_");
+        for (name, _) in std::env::vars().filter(|(name, _)| ours(name)) {
+            command.env_remove(name);
+        }
+        let config = self.path("axon.toml");
+        fs::write(&config, "[link]\ngrace_s = 1\n").unwrap();
+        command.env("LD_LIBRARY_PATH", self.path("lib"));
+        command.env("AXON_DAEMON_PATH", self.asked(&["--variable=daemon"]).concat());
+        command.env("AXON_RUNTIME_DIR", self.path("run")).env("AXON_CONFIG", config);
+        command.env("AXON_BIND_ADDRS", "127.0.0.1").env("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF");
+        command
+    }
+}
+
+/// Ends with the test.
+struct Kept(Child);
+
+impl Drop for Kept {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+#[test]
+#[ignore = "builds all that axon-transport depends on once more"]
+fn programs_in_c_build_and_run_with_what_is_installed() {
+    let installed = Installed::new();
+    let declared = installed.declared();
+    assert!(declared.len() > 30, "{declared:?}");
+    assert_eq!(installed.exported(), declared);
+
+    if !Command::new("pkg-config").arg("--version").output().is_ok_and(|o| o.status.success()) {
+        // Past the harness, which would show it only beside a failure.
+        let _ = writeln!(stderr(), "skipped: pkg-config is not installed");
+        return;
+    }
+    let talker = installed.example("talker", &["--cflags", "--libs"]);
+    let needed =
+        run(Command::new("ldd").env("LD_LIBRARY_PATH", installed.path("lib")).arg(&talker));
+    assert!(needed.contains("libaxon_transport.so => "), "{needed}");
+    // The linker takes the static library where the other is missing.
+    let shared = installed.path("lib/libaxon_transport.so");
+    let aside = installed.path("libaxon_transport.so");
+    fs::rename(&shared, &aside).unwrap();
+    let listener = installed.example("listener", &["--cflags", "--libs", "--static"]);
+    fs::rename(&aside, &shared).unwrap();
+
+    let _talker = Kept(installed.command(&talker).spawn().unwrap());
+    let heard = run(&mut installed.command(&listener));
+    assert_eq!(heard.lines().filter(|line| line.starts_with("heard hello ")).count(), 3, "{heard}");
+}
