@@ -1,109 +1,190 @@
-//! What endpoints are by the rules of ROS 2, and what processes must see of them.
+//! What endpoints are by the rules of ROS 2 and of AXON's design, and what processes must see of them.
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use axon_transport::qos::{Durability, History, Qos, Reliability};
+use super::{
+    orders::{Call, Described, Kind, Losses, Own, Reported, Sample, Taken},
+    rules::same_type,
+};
 
-/// A profile by its number: reliability, durability, and how much is kept.
-pub(super) fn profile(number: u64) -> Qos {
-    let depths = [1, 3, 10, 40];
-    let depth = depths.get(usize::try_from(number / 4).unwrap()).copied();
-    Qos {
-        reliability: [Reliability::Reliable, Reliability::BestEffort][(number % 2) as usize],
-        durability: [Durability::Volatile, Durability::TransientLocal][(number / 2 % 2) as usize],
-        history: if depth.is_some() { History::KeepLast } else { History::KeepAll },
-        depth: depth.unwrap_or(10),
-        ..Qos::default()
-    }
-}
+/// Of a publisher's history each process is allowed so many bytes.
+pub(super) const RING: u64 = 8 << 20;
+/// So much of it stands whatever the lengths of samples do to memory; the bound itself is the product's.
+const SURE: u64 = RING / 2;
 
-pub(super) const PROFILES: u64 = 20;
-
-pub(super) fn joined(set: &BTreeSet<String>) -> String {
-    set.iter().cloned().collect::<Vec<_>>().join(",")
-}
-
-/// What a process sees.
-#[derive(Debug, Default, PartialEq)]
-pub(super) struct State {
-    pub(super) graph: BTreeSet<String>,
-    /// By the numbers of its endpoints.
-    pub(super) matched: BTreeMap<u64, BTreeSet<String>>,
-}
-
-impl std::fmt::Display for State {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{}", joined(&self.graph))?;
-        self.matched.iter().try_for_each(|(id, gids)| write!(f, ";{id}={}", joined(gids)))
-    }
-}
-
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Kind {
-    Publisher,
-    Subscription,
-    Server,
-    Client,
-}
-
-impl Kind {
-    pub(super) fn name(self) -> &'static str {
-        match self {
-            Self::Publisher => "publisher",
-            Self::Subscription => "subscription",
-            Self::Server => "server",
-            Self::Client => "client",
-        }
-    }
-}
-
-/// An endpoint as the model has it.
+/// A node or an endpoint as the model has it.
 pub(super) struct Modelled {
     pub(super) gid: String,
     pub(super) process: usize,
-    pub(super) kind: Kind,
-    /// Or service.
-    pub(super) topic: u64,
-    pub(super) hash: u64,
-    pub(super) qos: Qos,
-    /// A publisher's samples, oldest first; what a subscription has to take, by the source's time.
-    pub(super) samples: BTreeMap<u64, u64>,
+    pub(super) what: Described,
+    /// A publisher: whether its clock is slow by [`SLOW`](super::stage::SLOW), and what it published.
+    pub(super) slow: bool,
+    pub(super) sequence: u64,
+    pub(super) bytes: u64,
+    /// What of it late joiners get, oldest first.
+    pub(super) history: BTreeMap<i64, Owed>,
+    /// What a subscription has to take, by the source's time.
+    pub(super) owed: BTreeMap<i64, Owed>,
+    taken: u64,
+    lost: u64,
+    expired: u64,
+    /// Losses that its event was last seen to count.
+    told: u64,
     /// The requests that a server has to answer, and the responses that a client has to take, with
     /// the other end of each.
-    pub(super) calls: BTreeSet<(String, u64)>,
+    pub(super) calls: BTreeSet<Call>,
+    /// What it met that it does not go with, and why the last of them did not.
+    met: Met,
+}
+
+/// Everything that an endpoint met since it was made.
+#[derive(Default)]
+struct Met {
+    matched: u64,
+    qos: u64,
+    policies: BTreeSet<String>,
+    types: u64,
+}
+
+/// A sample that somebody has to take.
+#[derive(Clone, Debug)]
+pub(super) struct Owed {
+    pub(super) sample: Sample,
+    /// Bytes that its publisher had published before it.
+    pub(super) behind: u64,
+    /// Whether it is too old to be delivered.
+    pub(super) expired: bool,
+    /// Whether its publisher waits rather than that this reader loses it.
+    pub(super) held: bool,
+}
+
+/// What two endpoints are to each other.
+#[derive(Debug, PartialEq)]
+pub(super) enum Relation {
+    None,
+    Match,
+    /// They would match but for these policies.
+    Qos(BTreeSet<String>),
+    Type,
 }
 
 impl Modelled {
-    /// ROS 2's rule, as its documentation has it.
-    pub(super) fn goes_with(&self, other: &Self) -> bool {
-        let (offers, requests) = match (self.kind, other.kind) {
-            (Kind::Publisher, Kind::Subscription) => (self, other),
-            (Kind::Subscription, Kind::Publisher) => (other, self),
-            (Kind::Server, Kind::Client) | (Kind::Client, Kind::Server) => {
-                return self.topic == other.topic;
-            }
-            _ => return false,
-        };
-        let reliable = offers.qos.reliability == Reliability::Reliable
-            || requests.qos.reliability == Reliability::BestEffort;
-        let durable = offers.qos.durability == Durability::TransientLocal
-            || requests.qos.durability == Durability::Volatile;
-        (self.topic, self.hash) == (other.topic, other.hash) && reliable && durable
-    }
-
-    /// Whether a wait finds it ready.
-    pub(super) fn is_ready(&self) -> bool {
-        match self.kind {
-            Kind::Publisher => false,
-            Kind::Subscription => !self.samples.is_empty(),
-            Kind::Server | Kind::Client => !self.calls.is_empty(),
+    pub(super) fn new(gid: String, process: usize, what: Described, slow: bool) -> Self {
+        let (history, owed) = (BTreeMap::new(), BTreeMap::new());
+        let (sequence, bytes, taken, lost, expired, told) = (0, 0, 0, 0, 0, 0);
+        let (calls, met) = (BTreeSet::new(), Met::default());
+        Self {
+            gid,
+            process,
+            what,
+            slow,
+            sequence,
+            bytes,
+            history,
+            owed,
+            taken,
+            lost,
+            expired,
+            told,
+            calls,
+            met,
         }
     }
 
-    pub(super) fn depth(&self) -> usize {
-        match self.qos.history {
-            History::KeepLast => self.qos.depth as usize,
-            History::KeepAll => usize::MAX,
+    pub(super) fn is(&self, kind: Kind) -> bool {
+        self.what.kind == kind
+    }
+
+    pub(super) fn relation(&self, other: &Self) -> Relation {
+        let (offers, wants) = match (self.what.kind, other.what.kind) {
+            (Kind::Publisher, Kind::Subscription) => (&self.what, &other.what),
+            (Kind::Subscription, Kind::Publisher) => (&other.what, &self.what),
+            // They differ in nothing but in how much they keep.
+            (Kind::Server, Kind::Client) | (Kind::Client, Kind::Server) => {
+                let same = self.what.topic == other.what.topic;
+                return if same { Relation::Match } else { Relation::None };
+            }
+            _ => return Relation::None,
+        };
+        if offers.topic != wants.topic {
+            return Relation::None;
+        }
+        if !same_type((&offers.type_name, &offers.hash), (&wants.type_name, &wants.hash)) {
+            return Relation::Type;
+        }
+        let policies = offers.profile.falls_short_of(&wants.profile);
+        if policies.is_empty() { Relation::Match } else { Relation::Qos(policies) }
+    }
+
+    pub(super) fn matches(&self, other: &Self) -> bool {
+        self.relation(other) == Relation::Match
+    }
+
+    /// The other was made, or it was, and the other is there. Of several that a new endpoint finds,
+    /// any may be the last.
+    pub(super) fn meet(&mut self, relation: &Relation, new: bool) {
+        match relation {
+            Relation::None => {}
+            Relation::Match => self.met.matched += 1,
+            Relation::Type => self.met.types += 1,
+            Relation::Qos(policies) => {
+                self.met.qos += 1;
+                if !new {
+                    self.met.policies.clear();
+                }
+                self.met.policies.extend(policies.iter().cloned());
+            }
+        }
+    }
+
+    /// What its process must see of it, where these are matched with it.
+    pub(super) fn sees(&self, matched: BTreeSet<String>) -> Own {
+        let current = matched.len() as u64;
+        let reports = matches!(self.what.kind, Kind::Publisher | Kind::Subscription);
+        let alive = if self.is(Kind::Subscription) { current } else { 0 };
+        let reported = reports.then(|| Reported {
+            ever: self.met.matched,
+            current,
+            qos: self.met.qos,
+            policy: None,
+            types: self.met.types,
+            // No lease and no deadline is as short as a program takes.
+            alive,
+            ..Reported::default()
+        });
+        Own { matched, reported }
+    }
+
+    /// Whether the policy that it names is one of those that it may.
+    pub(super) fn may_name(&self, policy: Option<&String>) -> bool {
+        match policy {
+            Some(policy) => self.met.policies.contains(policy),
+            None => self.met.policies.is_empty(),
+        }
+    }
+
+    /// Whether a wait finds it ready. How old a sample is, only taking it finds out.
+    pub(super) fn is_ready(&self) -> bool {
+        !self.owed.is_empty() || !self.calls.is_empty()
+    }
+
+    fn depth(&self) -> usize {
+        self.what.profile.depth.map_or(usize::MAX, |depth| depth as usize)
+    }
+
+    /// A publisher keeps this for late joiners.
+    pub(super) fn keep_history(&mut self, sample: &Owed) {
+        self.history.insert(sample.sample.stamp, sample.clone());
+        while self.history.len() > self.depth() {
+            self.history.pop_first();
+        }
+    }
+
+    /// A subscription has to take this, and may lose it unless it is `held` for it.
+    pub(super) fn owe(&mut self, sample: &Owed, held: bool) {
+        self.owed.insert(sample.sample.stamp, Owed { held, ..sample.clone() });
+        while self.owed.len() > self.depth() {
+            self.owed.pop_first();
         }
     }
 
@@ -117,10 +198,77 @@ impl Modelled {
         }
     }
 
-    pub(super) fn keep(&mut self, stamp: u64, len: u64) {
-        self.samples.insert(stamp, len);
-        while self.samples.len() > self.depth() {
-            self.samples.pop_first();
+    /// What it gets of a publisher that was there before it.
+    pub(super) fn join(&mut self, publisher: &Self) {
+        let both = [&publisher.what, &self.what].iter().all(|what| what.profile.transient_local);
+        if both {
+            let stands = self.depth().min(publisher.depth());
+            let late: Vec<_> = publisher.history.values().rev().take(stands).cloned().collect();
+            let held = publisher.waits_for(self);
+            late.iter().for_each(|sample| self.owe(sample, held));
         }
+    }
+
+    /// Whether this publisher loses nothing of what this reader has to take, but waits for it.
+    pub(super) fn waits_for(&self, reader: &Self) -> bool {
+        let both = [&self.what, &reader.what];
+        self.process != reader.process
+            && both.iter().all(|what| what.profile.reliable && what.profile.depth.is_none())
+    }
+
+    /// Bytes that it has to take of a publisher.
+    pub(super) fn backlog(&self, publisher: &str) -> u64 {
+        let of = self.owed.values().filter(|owed| owed.sample.publisher == publisher);
+        of.map(|owed| owed.sample.len).sum()
+    }
+
+    /// Whether this reader may hold the publisher back.
+    pub(super) fn may_hold(&self, publisher: &Self) -> bool {
+        publisher.matches(self) && publisher.waits_for(self) && self.backlog(&publisher.gid) >= SURE
+    }
+
+    /// Its event counts losses before anything is taken.
+    pub(super) fn hear_of(&mut self, losses: Losses) {
+        assert!(losses.total > self.told, "{losses:?}");
+        assert_eq!(losses.change, losses.total - self.told);
+        self.told = losses.total;
+    }
+
+    /// Holds what it took against what it had to. `published` says how many bytes each publisher has
+    /// published. How many were lost.
+    pub(super) fn take(&mut self, taken: &Taken, published: &BTreeMap<String, u64>) -> u64 {
+        let owed = std::mem::take(&mut self.owed);
+        let mut numbers = taken.samples.iter().map(|(_, number)| *number);
+        assert!(numbers.all(|number| {
+            self.taken += 1;
+            number == self.taken
+        }));
+        let samples: Vec<&Sample> = taken.samples.iter().map(|(sample, _)| sample).collect();
+        let stamps: BTreeSet<i64> = samples.iter().map(|sample| sample.stamp).collect();
+        let (expired, fresh): (Vec<_>, Vec<_>) = owed.values().partition(|owed| owed.expired);
+        let (come, missing): (Vec<_>, Vec<_>) =
+            fresh.into_iter().partition(|owed| stamps.contains(&owed.sample.stamp));
+        let come: Vec<&Sample> = come.iter().map(|owed| &owed.sample).collect();
+        assert_eq!(samples, come, "what was taken, and what there was to take");
+        for lost in &missing {
+            assert!(self.what.profile.depth.is_none(), "what is within a depth stands: {lost:?}");
+            assert!(!lost.held, "its publisher was to wait for it: {lost:?}");
+            let publisher = &lost.sample.publisher;
+            let since = published[publisher] - lost.behind;
+            assert!(since > SURE, "lost, though only {since} bytes came since: {lost:?}");
+            let before = |sample: &Sample| {
+                sample.publisher == *publisher && sample.sequence < lost.sample.sequence
+            };
+            assert!(!samples.iter().any(|sample| before(sample)), "older ones stood: {lost:?}");
+        }
+        self.expired += expired.len() as u64;
+        assert_eq!(taken.expired, self.expired, "too old");
+        let lost = missing.len() as u64;
+        self.lost += lost;
+        let Losses { total, change } = taken.losses;
+        assert_eq!((taken.lost, total), (self.lost, self.lost), "lost");
+        assert_eq!(change, total - self.told);
+        self.told = total;
+        lost
     }
 }

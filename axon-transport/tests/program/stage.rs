@@ -1,27 +1,28 @@
-//! The processes of a program, and the steps that it takes.
+//! The processes of a program, and what they must be like after each step.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
     io::Write as _,
-    time::{Duration, Instant},
+    time::{Instant, SystemTime},
 };
 
-use axon_transport::qos::Durability;
-use rustix::process::Signal;
+use serde::de::DeserializeOwned;
 
 use super::{
-    model::{Kind, Modelled, PROFILES, State, joined, profile},
-    support::{self, Host, PATIENCE, Player, signal},
+    model::{Modelled, RING},
+    orders::{Described, Kind, Order, Own, State},
+    support::{Host, PATIENCE, Player},
 };
 
-const PROCESSES: usize = 3;
-const TOPICS: u64 = 2;
+pub(super) const PROCESSES: usize = 3;
+/// By how much slow clocks are, in nanoseconds.
+pub(super) const SLOW: i64 = 2 * 3600 * 1_000_000_000;
 
 /// Its own: a test whose seed is all that need be known.
-struct Dice(u64);
+pub(super) struct Dice(u64);
 
 impl Dice {
-    fn roll(&mut self, sides: u64) -> u64 {
+    pub(super) fn roll(&mut self, sides: u64) -> u64 {
         // SplitMix64.
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;
@@ -29,259 +30,152 @@ impl Dice {
         z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
         (z ^ (z >> 31)) % sides
     }
-}
 
-/// As the processes say it.
-fn said_by(calls: &BTreeSet<(String, u64)>) -> String {
-    joined(&calls.iter().map(|(who, stamp)| format!("{who}/{stamp}")).collect())
+    pub(super) fn one_of<T: Clone>(&mut self, of: &[T]) -> T {
+        of[self.roll(of.len() as u64) as usize].clone()
+    }
+
+    pub(super) fn process(&mut self) -> usize {
+        self.roll(PROCESSES as u64) as usize
+    }
 }
 
 /// The processes, and what they must be like.
 pub(super) struct Stage {
-    host: Host,
-    players: Vec<Player>,
-    model: BTreeMap<u64, Modelled>,
+    pub(super) host: Host,
+    pub(super) players: Vec<Player>,
+    pub(super) model: BTreeMap<u64, Modelled>,
+    /// Bytes that publishers published, those that are gone, too.
+    pub(super) published: BTreeMap<String, u64>,
     next: u64,
-    stamp: u64,
-    dice: Dice,
+    /// The last source time, by a clock that is right.
+    pub(super) clock: i64,
+    pub(super) calls: u64,
+    pub(super) dice: Dice,
+    /// What happened, and how often.
+    pub(super) sights: BTreeMap<String, u64>,
+    orders: Vec<String>,
 }
 
 impl Stage {
     pub(super) fn new(seed: u64) -> Self {
-        let host = Host::new().with("AXON_LOG", "error");
+        let ring = (RING >> 20).to_string();
+        let host = Host::new().with("AXON_LOG", "error").with("AXON_RING_BUFFER_SIZE_MB", &ring);
         let players = (0..PROCESSES).map(|_| Self::player(&host)).collect();
-        let model = BTreeMap::new();
-        Self { host, players, model, next: 0, stamp: 0, dice: Dice(seed) }
+        let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap();
+        let clock = i64::try_from(now.as_nanos()).unwrap();
+        let (model, published, sights) = (BTreeMap::new(), BTreeMap::new(), BTreeMap::new());
+        let (next, calls, dice, orders) = (0, 0, Dice(seed), Vec::new());
+        Self { host, players, model, published, next, clock, calls, dice, sights, orders }
     }
 
-    fn player(host: &Host) -> Player {
+    pub(super) fn player(host: &Host) -> Player {
         let mut player = host.play("program");
         assert_eq!(player.hear(), "ready");
         player
     }
 
-    fn ask(&mut self, process: usize, line: &str) -> String {
+    pub(super) fn saw(&mut self, what: impl Into<String>) {
+        *self.sights.entry(what.into()).or_default() += 1;
+    }
+
+    /// Has a process do something, and hears what comes of it.
+    pub(super) fn ask<T: DeserializeOwned>(&mut self, process: usize, order: &Order) -> T {
+        let line = serde_json::to_string(order).unwrap();
+        if !matches!(order, Order::State) {
+            self.orders.push(format!("{process}: {line}"));
+        }
         let player = &mut self.players[process];
         let mut input = player.child.0.stdin.as_ref().unwrap();
         writeln!(input, "{line}").unwrap();
-        player.hear()
+        serde_json::from_str(&player.hear()).unwrap()
     }
 
-    fn create(&mut self) {
-        let (id, process) = (self.next, self.dice.roll(PROCESSES as u64) as usize);
+    pub(super) fn pick(&mut self, which: impl Fn(&Modelled) -> bool) -> Option<u64> {
+        let which = self.model.iter().filter(|(_, m)| which(m));
+        let ids: Vec<u64> = which.map(|(id, _)| *id).collect();
+        (!ids.is_empty()).then(|| self.dice.one_of(&ids))
+    }
+
+    /// One of those that suit best, if there are any.
+    pub(super) fn pick_best(
+        &mut self,
+        which: impl Fn(&Modelled) -> bool,
+        best: impl Fn(&Modelled) -> bool,
+    ) -> Option<u64> {
+        self.pick(|m| which(m) && best(m)).or_else(|| self.pick(which))
+    }
+
+    /// Makes something, and has it meet all that is there.
+    pub(super) fn make(
+        &mut self,
+        process: usize,
+        by: Option<u64>,
+        what: Described,
+        slow: bool,
+    ) -> u64 {
+        let id = self.next;
         self.next += 1;
-        let kind = match self.dice.roll(20) {
-            0..7 => Kind::Publisher,
-            7..14 => Kind::Subscription,
-            14..17 => Kind::Server,
-            _ => Kind::Client,
-        };
-        let topic = self.dice.roll(TOPICS);
-        let hash = if topic == 0 { 7 } else { 7 + self.dice.roll(2) };
-        let number = self.dice.roll(PROFILES);
-        let gid = self.ask(process, &format!("{} {id} {topic} {hash} {number}", kind.name()));
-        let (samples, calls) = (BTreeMap::new(), BTreeSet::new());
-        let qos = profile(number);
-        let mut new = Modelled { gid, process, kind, topic, hash, qos, samples, calls };
-        if kind == Kind::Subscription && qos.durability == Durability::TransientLocal {
-            let others = self.model.values().filter(|other| other.goes_with(&new));
-            let late = others.flat_map(|other| {
-                let stands = new.depth().min(other.depth());
-                other.samples.iter().rev().take(stands).map(|(stamp, len)| (*stamp, *len))
-            });
-            let late: Vec<_> = late.collect();
-            new.samples.extend(late);
-            while new.samples.len() > new.depth() {
-                new.samples.pop_first();
+        let order = Order::Create { id, by, what: Box::new(what.clone()) };
+        let gid: String = self.ask(process, &order);
+        self.published.insert(gid.clone(), 0);
+        let mut new = Modelled::new(gid, process, what, slow);
+        let mut sights = BTreeSet::new();
+        for other in self.model.values_mut() {
+            let relation = new.relation(other);
+            sights.extend(relation.sights());
+            new.meet(&relation, true);
+            other.meet(&relation, false);
+            if new.is(Kind::Subscription) && new.matches(other) {
+                new.join(other);
             }
         }
+        if !new.owed.is_empty() {
+            sights.insert("late joiner with history".to_owned());
+        }
+        sights.into_iter().for_each(|sight| self.saw(sight));
         self.model.insert(id, new);
-    }
-
-    fn pick(&mut self, which: impl Fn(&Modelled) -> bool) -> Option<u64> {
-        let ids: Vec<u64> =
-            self.model.iter().filter(|(_, m)| which(m)).map(|(id, _)| *id).collect();
-        let at = self.dice.roll(ids.len().max(1) as u64) as usize;
-        ids.get(at).copied()
-    }
-
-    fn publish(&mut self) {
-        let Some(id) = self.pick(|m| m.kind == Kind::Publisher) else { return };
-        for _ in 0..=self.dice.roll(20) {
-            self.stamp += 1;
-            let (stamp, len) = (self.stamp, [0, 8, 96, 5000, 70_000][self.dice.roll(5) as usize]);
-            let process = self.model[&id].process;
-            self.ask(process, &format!("publish {id} {stamp} {len}"));
-            let publisher = &self.model[&id];
-            let readers: Vec<u64> = self
-                .model
-                .iter()
-                .filter(|(_, other)| publisher.goes_with(other))
-                .map(|(id, _)| *id)
-                .collect();
-            for reader in readers {
-                self.model.get_mut(&reader).unwrap().keep(stamp, len);
-            }
-            self.model.get_mut(&id).unwrap().keep(stamp, len);
-        }
-    }
-
-    pub(super) fn take(&mut self) {
-        let Some(id) = self.pick(|m| m.kind == Kind::Subscription) else { return };
-        let all = self.model[&id].samples.len();
-        let process = self.model[&id].process;
-        let samples = std::mem::take(&mut self.model.get_mut(&id).unwrap().samples);
-        let expected: Vec<String> =
-            samples.iter().map(|(stamp, len)| format!("{stamp}/{len}")).collect();
-        let taken = self.ask(process, &format!("take {id} {all}"));
-        let expected = format!("{} lost: 0", expected.join(" "));
-        assert_eq!(taken.trim(), expected.trim(), "subscription {id}");
-    }
-
-    /// A client asks all servers that there are.
-    fn request(&mut self) {
-        let Some(id) = self.pick(|m| m.kind == Kind::Client) else { return };
-        let client = self.model.remove(&id).unwrap();
-        for _ in 0..=self.dice.roll(4) {
-            self.stamp += 1;
-            let (stamp, len) = (self.stamp, [0, 60, 5000, 70_000][self.dice.roll(4) as usize]);
-            self.ask(client.process, &format!("ask {id} {stamp} {len}"));
-            for server in self.model.values_mut().filter(|other| client.goes_with(other)) {
-                server.keep_call(&client.gid, stamp);
-            }
-        }
-        self.model.insert(id, client);
-    }
-
-    /// A server answers all that it was asked.
-    fn answer(&mut self) {
-        let Some(id) = self.pick(|m| m.kind == Kind::Server) else { return };
-        let server = self.model.get_mut(&id).unwrap();
-        let (process, gid) = (server.process, server.gid.clone());
-        let requests = std::mem::take(&mut server.calls);
-        let answered = self.ask(process, &format!("answer {id} {}", requests.len()));
-        assert_eq!(answered, said_by(&requests), "server {id}");
-        // A client that is gone gets nothing.
-        for (client, stamp) in requests {
-            if let Some(client) = self.model.values_mut().find(|other| other.gid == client) {
-                client.keep_call(&gid, stamp);
-            }
-        }
-    }
-
-    fn hear(&mut self) {
-        let Some(id) = self.pick(|m| m.kind == Kind::Client) else { return };
-        let client = self.model.get_mut(&id).unwrap();
-        let process = client.process;
-        let responses = std::mem::take(&mut client.calls);
-        let heard = self.ask(process, &format!("hear {id} {}", responses.len()));
-        assert_eq!(heard, said_by(&responses), "client {id}");
-    }
-
-    /// A process waits for all that it has.
-    pub(super) fn wait(&mut self) {
-        let process = self.dice.roll(PROCESSES as u64) as usize;
-        let ready = self.model.iter().filter(|(_, m)| m.process == process && m.is_ready());
-        let ready: BTreeSet<String> = ready.map(|(id, _)| id.to_string()).collect();
-        let found = self.ask(process, &format!("wait {}", ready.len()));
-        assert_eq!(found, joined(&ready), "process {process}");
-    }
-
-    fn end(&mut self) {
-        let Some(id) = self.pick(|_| true) else { return };
-        let process = self.model[&id].process;
-        self.ask(process, &format!("end {id}"));
-        self.model.remove(&id);
-    }
-
-    fn kill(&mut self) {
-        let process = self.dice.roll(PROCESSES as u64) as usize;
-        signal(self.players[process].pid(), Signal::KILL);
-        self.players[process] = Self::player(&self.host);
-        self.model.retain(|_, m| m.process != process);
-    }
-
-    fn kill_daemon(&mut self) {
-        let before = self.host.status().unwrap();
-        signal(before.pid, Signal::KILL);
-        support::until("there is another daemon", || {
-            self.host.status().is_ok_and(|now| now.daemon != before.daemon)
-        });
-    }
-
-    /// How many subscriptions there are.
-    pub(super) fn subscriptions(&self) -> usize {
-        self.model.values().filter(|m| m.kind == Kind::Subscription).count()
+        id
     }
 
     /// Waits until every process sees what the model says.
     pub(super) fn settle(&mut self) {
-        let graph: BTreeSet<String> = self.model.values().map(|m| m.gid.clone()).collect();
-        let expected: Vec<String> = (0..PROCESSES)
-            .map(|process| {
-                let own = self.model.iter().filter(|(_, m)| m.process == process);
-                let matched = own.map(|(id, m)| {
-                    let others = self.model.values().filter(|other| m.goes_with(other));
-                    (*id, others.map(|other| other.gid.clone()).collect())
-                });
-                State { graph: graph.clone(), matched: matched.collect() }.to_string()
-            })
-            .collect();
+        let graph = self.model.values().map(|m| (m.gid.clone(), m.what.clone()));
+        let graph: BTreeMap<String, Described> = graph.collect();
         let deadline = Instant::now() + PATIENCE;
-        for (process, expected) in expected.iter().enumerate() {
+        for process in 0..PROCESSES {
+            let ours = self.model.iter().filter(|(_, m)| m.process == process);
+            let own: BTreeMap<u64, Own> = ours
+                .filter(|(_, m)| !m.is(Kind::Node))
+                .map(|(id, m)| {
+                    let partners = self.model.values().filter(|other| m.matches(other));
+                    (*id, m.sees(partners.map(|other| other.gid.clone()).collect()))
+                })
+                .collect();
+            let expected = State { graph: graph.clone(), own };
             loop {
-                let seen = self.ask(process, "state");
-                if seen == *expected {
+                let mut seen: State = self.ask(process, &Order::State);
+                let named = seen.own.iter_mut().all(|(id, own)| {
+                    let policy = own.reported.as_mut().and_then(|all| all.policy.take());
+                    self.model.get(id).is_some_and(|m| m.may_name(policy.as_ref()))
+                });
+                if seen == expected && named {
                     break;
                 }
-                assert!(Instant::now() < deadline, "{process} sees\n{seen}, not\n{expected}");
-                std::thread::sleep(Duration::from_millis(2));
+                assert!(
+                    Instant::now() < deadline,
+                    "{process} sees\n{seen:#?}\n(policies: {named}), not\n{expected:#?}"
+                );
+                std::thread::sleep(std::time::Duration::from_millis(2));
             }
         }
     }
+}
 
-    pub(super) fn step(&mut self) -> &'static str {
-        match self.dice.roll(100) {
-            0..26 => {
-                self.create();
-                "create"
-            }
-            26..46 => {
-                self.publish();
-                "publish"
-            }
-            46..60 => {
-                self.take();
-                "take"
-            }
-            60..68 => {
-                self.request();
-                "request"
-            }
-            68..75 => {
-                self.answer();
-                "answer"
-            }
-            75..80 => {
-                self.hear();
-                "hear"
-            }
-            80..86 => {
-                self.wait();
-                "wait"
-            }
-            86..96 => {
-                self.end();
-                "end"
-            }
-            96..99 => {
-                self.kill();
-                "kill"
-            }
-            _ => {
-                self.kill_daemon();
-                "kill the daemon"
-            }
+impl Drop for Stage {
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            eprintln!("--- what the processes were told:\n{}", self.orders.join("\n"));
         }
     }
 }

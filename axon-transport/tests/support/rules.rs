@@ -1,0 +1,101 @@
+//! ROS 2's rules by which a publisher and a subscription go together, written down a second time for
+//! the models of tests. What decides here asks nothing of what is tested: it is the table of ROS 2's
+//! documentation ("About Quality of Service settings"), a line a policy.
+
+use std::collections::BTreeSet;
+
+use axon_transport::qos::{Durability, History, Liveliness, Qos, Reliability};
+use serde::{Deserialize, Serialize};
+
+const SECOND: u64 = 1_000_000_000;
+
+/// A quality of service. Times are in seconds, `None` is infinite.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Profile {
+    pub(crate) reliable: bool,
+    pub(crate) transient_local: bool,
+    /// KEEP_LAST's; `None` is KEEP_ALL.
+    pub(crate) depth: Option<u32>,
+    pub(crate) deadline: Option<u64>,
+    pub(crate) manual: bool,
+    pub(crate) lease: Option<u64>,
+    pub(crate) lifespan: Option<u64>,
+}
+
+impl Default for Profile {
+    /// ROS 2's default: RELIABLE, VOLATILE, KEEP_LAST(10).
+    fn default() -> Self {
+        let (deadline, lease, lifespan) = (None, None, None);
+        let (reliable, transient_local, depth, manual) = (true, false, Some(10), false);
+        Self { reliable, transient_local, depth, deadline, manual, lease, lifespan }
+    }
+}
+
+/// The policies that can keep two endpoints apart, as ROS 2 spells them.
+pub(crate) const POLICIES: [&str; 5] =
+    ["RELIABILITY", "DURABILITY", "DEADLINE", "LIVELINESS", "LIVELINESS_LEASE_DURATION"];
+
+impl Profile {
+    /// Why a publisher of this profile does not serve a subscription of that one.
+    pub(crate) fn falls_short_of(&self, wanted: &Self) -> BTreeSet<String> {
+        // A period that is offered must not be longer than the one that is wanted.
+        let longer = |offered: Option<u64>, wanted: Option<u64>| match (offered, wanted) {
+            (_, None) => false,
+            (None, Some(_)) => true,
+            (Some(offered), Some(wanted)) => offered > wanted,
+        };
+        let short = [
+            !self.reliable && wanted.reliable,
+            !self.transient_local && wanted.transient_local,
+            longer(self.deadline, wanted.deadline),
+            !self.manual && wanted.manual,
+            longer(self.lease, wanted.lease),
+        ];
+        let policies = POLICIES.iter().zip(short).filter(|(_, short)| *short);
+        policies.map(|(policy, _)| (*policy).to_owned()).collect()
+    }
+
+    /// As an endpoint is made with it.
+    pub(crate) fn qos(&self) -> Qos {
+        let period = |seconds: Option<u64>| seconds.map(|seconds| seconds * SECOND);
+        Qos {
+            reliability: if self.reliable {
+                Reliability::Reliable
+            } else {
+                Reliability::BestEffort
+            },
+            durability: if self.transient_local {
+                Durability::TransientLocal
+            } else {
+                Durability::Volatile
+            },
+            history: if self.depth.is_some() { History::KeepLast } else { History::KeepAll },
+            depth: self.depth.unwrap_or(1),
+            deadline: period(self.deadline),
+            lifespan: period(self.lifespan),
+            liveliness: if self.manual { Liveliness::ManualByTopic } else { Liveliness::Automatic },
+            lease: period(self.lease),
+        }
+    }
+
+    /// As an endpoint says it is. `None` where it is nothing that [`qos`](Self::qos) makes.
+    #[allow(dead_code, reason = "not every test looks at others' profiles")]
+    pub(crate) fn of(qos: &Qos) -> Option<Self> {
+        let seconds = |period: Option<u64>| period.map(|period| period / SECOND);
+        let profile = Self {
+            reliable: qos.reliability == Reliability::Reliable,
+            transient_local: qos.durability == Durability::TransientLocal,
+            depth: (qos.history == History::KeepLast).then_some(qos.depth),
+            deadline: seconds(qos.deadline),
+            manual: qos.liveliness == Liveliness::ManualByTopic,
+            lease: seconds(qos.lease),
+            lifespan: seconds(qos.lifespan),
+        };
+        (profile.qos() == *qos).then_some(profile)
+    }
+}
+
+/// Whether two endpoints of a topic mean the same type: by its name, and by its hash where both know it.
+pub(crate) fn same_type(one: (&str, &[u8]), other: (&str, &[u8])) -> bool {
+    one.0 == other.0 && (one.1 == other.1 || one.1.is_empty() || other.1.is_empty())
+}
