@@ -1,4 +1,4 @@
-//! What endpoints of two hosts report of each other: deadlines, lifespan, liveliness.
+//! What endpoints of two hosts report of each other: the eleven events, at both ends, and lifespan.
 
 use std::{
     sync::atomic::{AtomicBool, Ordering},
@@ -7,8 +7,8 @@ use std::{
 };
 
 use axon_transport::{
-    events::{EventKind, EventStatus, LivelinessChanged},
-    qos::{Liveliness, Qos},
+    events::{Counted, EventKind, EventStatus, LivelinessChanged, Matched},
+    qos::{Durability, Incompatible, Liveliness, Qos, Reliability},
     session::{EndpointSpec, Event, Publisher, Session, Subscription, Waitable},
 };
 use rustix::process::Signal;
@@ -38,6 +38,16 @@ fn occurs(session: &Session, event: &Event) {
     assert_eq!(session.wait_for(&[Waitable::Event(event)], Some(PATIENCE)).unwrap(), [0]);
 }
 
+fn counted(event: &Event) -> Counted {
+    let EventStatus::Counted(status) = event.take() else { unreachable!() };
+    status
+}
+
+fn matches(event: &Event) -> Matched {
+    let EventStatus::Matched(status) = event.take() else { unreachable!() };
+    status
+}
+
 fn changed(event: &Event) -> LivelinessChanged {
     let EventStatus::LivelinessChanged(status) = event.take() else { unreachable!() };
     status
@@ -54,6 +64,124 @@ fn becomes(session: &Session, event: &Event, alive: bool) {
             return;
         }
     }
+}
+
+#[test]
+fn matches_are_counted_on_both_hosts() {
+    let [a, b] = hosts();
+    let (here, there) = (a.session("publisher"), b.session("subscriptions"));
+    let spec = || EndpointSpec::new("/counted", "test/Bytes", Qos::default());
+    let publisher = here.create_publisher(spec()).unwrap();
+    let publication = publisher.event(EventKind::PublicationMatched).unwrap();
+    let first = there.create_subscription(spec()).unwrap();
+    let one = Matched { total: 1, total_change: 1, current: 1, current_change: 1 };
+    let subscribed = first.event(EventKind::SubscriptionMatched).unwrap();
+    for (session, event) in [(&here, &publication), (&there, &subscribed)] {
+        occurs(session, event);
+        assert_eq!(matches(event), one);
+    }
+    let second = there.create_subscription(spec()).unwrap();
+    occurs(&here, &publication);
+    let two = Matched { total: 2, current: 2, ..one };
+    assert_eq!(matches(&publication), two);
+    drop(first);
+    occurs(&here, &publication);
+    let left = Matched { total: 2, total_change: 0, current: 1, current_change: -1 };
+    assert_eq!(matches(&publication), left);
+    assert_eq!(publisher.matched(), [second.gid()]);
+    let subscribed = second.event(EventKind::SubscriptionMatched).unwrap();
+    occurs(&there, &subscribed);
+    assert_eq!(matches(&subscribed), one);
+    drop(publisher);
+    occurs(&there, &subscribed);
+    let none = Matched { total: 1, total_change: 0, current: 0, current_change: -1 };
+    assert_eq!(matches(&subscribed), none);
+}
+
+#[test]
+fn each_policy_that_falls_short_is_reported_on_both_hosts() {
+    let [a, b] = hosts();
+    let (here, there) = (a.session("publisher"), b.session("subscription"));
+    let least = Qos::sensor_data();
+    let manual = Liveliness::ManualByTopic;
+    for (policy, requested) in [
+        (Incompatible::Reliability, Qos { reliability: Reliability::Reliable, ..least }),
+        (Incompatible::Durability, Qos { durability: Durability::TransientLocal, ..least }),
+        (Incompatible::Deadline, Qos { deadline: Some(3600 * SECOND), ..least }),
+        (Incompatible::Liveliness, Qos { liveliness: manual, ..least }),
+        (Incompatible::LivelinessLease, Qos { lease: Some(3600 * SECOND), ..least }),
+    ] {
+        let spec = |qos| EndpointSpec::new(format!("/{policy}"), "test/Bytes", qos);
+        let publisher = here.create_publisher(spec(least)).unwrap();
+        let offers = publisher.event(EventKind::OfferedQosIncompatible).unwrap();
+        for total in 1..=2 {
+            let subscription = there.create_subscription(spec(requested)).unwrap();
+            let requests = subscription.event(EventKind::RequestedQosIncompatible).unwrap();
+            for (session, event, total) in [(&here, &offers, total), (&there, &requests, 1)] {
+                occurs(session, event);
+                let EventStatus::IncompatibleQos(status) = event.take() else { unreachable!() };
+                assert_eq!(status.count, Counted { total, change: 1 });
+                assert_eq!(status.last_policy, Some(policy));
+            }
+            assert!(publisher.matched().is_empty() && subscription.matched().is_empty());
+        }
+    }
+}
+
+#[test]
+fn another_type_is_reported_on_both_hosts() {
+    let [a, b] = hosts();
+    let (here, there) = (a.session("publisher"), b.session("subscription"));
+    let spec = |type_name: &str, hash: u8| EndpointSpec {
+        type_hash: vec![hash; 32],
+        ..EndpointSpec::new("/typed", type_name, Qos::default())
+    };
+    let publisher = here.create_publisher(spec("test/Bytes", 1)).unwrap();
+    let offers = publisher.event(EventKind::PublisherIncompatibleType).unwrap();
+    for (total, spec) in [(1, spec("test/Bytes", 2)), (2, spec("test/Other", 1))] {
+        let subscription = there.create_subscription(spec).unwrap();
+        let requests = subscription.event(EventKind::SubscriptionIncompatibleType).unwrap();
+        for (session, event, total) in [(&here, &offers, total), (&there, &requests, 1)] {
+            occurs(session, event);
+            assert_eq!(counted(event), Counted { total, change: 1 });
+        }
+        assert!(publisher.matched().is_empty() && subscription.matched().is_empty());
+    }
+}
+
+#[test]
+fn every_sample_is_taken_or_counted_as_lost_elsewhere() {
+    let ring = || classic(&[("AXON_RING_BUFFER_SIZE_MB", "1")]);
+    let [a, b] = Plan::new([ring(), ring()]).start();
+    let (here, there) = (a.session("publisher"), b.session("subscription"));
+    let qos = Qos { reliability: Reliability::BestEffort, ..Qos::keep_all() };
+    let (publisher, subscription) = matched(&here, &there, qos);
+    let lost = subscription.event(EventKind::MessageLost).unwrap();
+    // What is lost is missed from the first one on that came.
+    publisher.publish(b"first").unwrap();
+    let (mut bytes, mut taken) = (Vec::new(), 1);
+    assert!(subscription.recv(&mut bytes, Some(PATIENCE)).is_some());
+    assert!(!lost.is_ready());
+    let flood: u64 = 2000;
+    for _ in 0..flood {
+        publisher.publish(&[7; 5000]).unwrap();
+    }
+    loop {
+        let Some(info) = subscription.recv(&mut bytes, Some(Duration::from_millis(50))) else {
+            // What was dropped last is missed when the next one comes.
+            publisher.publish(&[7; 5000]).unwrap();
+            continue;
+        };
+        taken += 1;
+        assert_eq!(taken + subscription.lost(), info.sequence, "up to this one");
+        if info.sequence > flood + 1 {
+            break;
+        }
+    }
+    assert!(taken < flood, "this was more than there is room for");
+    occurs(&there, &lost);
+    let status = counted(&lost);
+    assert_eq!((status.total, status.change), (subscription.lost(), subscription.lost()));
 }
 
 #[test]
