@@ -6,7 +6,8 @@
 //! as it may. `subscribe TOPIC SIZES`: takes, and compares.
 //! `serve SERVICE COUNT`: answers as many requests with their bytes reversed, and takes one more.
 //! `ask SERVICE COUNT`: sends as many requests, and takes no response. `alive TOPIC`: a publisher that
-//! has a lease of half a second, and publishes nothing.
+//! has a lease of half a second, and publishes nothing. `everything NAME`: a node with one endpoint of
+//! each kind under that name.
 
 use std::{
     error::Error,
@@ -44,9 +45,10 @@ fn main() -> Result<(), Box<dyn Error>> {
         ["serve", service, count] => serve(&session, &stdin, service, count.parse()?),
         ["ask", service, count] => ask(&session, &stdin, service, count.parse()?),
         ["alive", topic] => alive(&session, &stdin, topic),
+        ["everything", name] => everything(&session, &stdin, name),
         _ => Err(
             "publish TOPIC SIZES READERS COUNT, subscribe TOPIC SIZES, serve or ask SERVICE COUNT, \
-             alive TOPIC"
+             alive TOPIC, everything NAME"
                 .into(),
         ),
     }
@@ -59,6 +61,19 @@ fn spec(topic: &str) -> EndpointSpec {
 fn alive(session: &Session, stdin: &Receiver<u8>, topic: &str) -> Result<(), Box<dyn Error>> {
     let qos = Qos { lease: Some(500_000_000), ..Qos::default() };
     let _publisher = session.create_publisher(EndpointSpec::new(topic, "test/Bytes", qos))?;
+    Word::Ready.say()?;
+    while stdin.recv().is_ok() {}
+    Ok(())
+}
+
+fn everything(session: &Session, stdin: &Receiver<u8>, name: &str) -> Result<(), Box<dyn Error>> {
+    let node = session.create_node("everything", "/of/a/process", "/")?;
+    let _ends = (
+        node.create_publisher(spec(name))?,
+        node.create_subscription(spec(name))?,
+        node.create_server(spec(name))?,
+        node.create_client(spec(name))?,
+    );
     Word::Ready.say()?;
     while stdin.recv().is_ok() {}
     Ok(())

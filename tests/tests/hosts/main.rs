@@ -4,6 +4,7 @@
 mod delivery;
 mod election;
 mod events;
+mod graph;
 mod hostile;
 mod identity;
 mod load;

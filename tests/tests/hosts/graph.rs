@@ -1,0 +1,180 @@
+//! The graph of one host as the other has it: every field of every node and endpoint, and nothing else;
+//! whoever waits for it to change needs to look at no other time.
+
+use axon_transport::{
+    graph::{Endpoint, EndpointKind, GraphView},
+    ids::Gid,
+    qos::{Durability, History, Liveliness, Qos, Reliability},
+    session::{EndpointSpec, Node, Session, Waitable},
+};
+use rustix::process::Signal;
+
+use super::{
+    mode::classic,
+    pair::{Host, Plan, signal},
+    process::PATIENCE,
+};
+
+fn hosts() -> [Host; 2] {
+    Plan::new([classic(&[]), classic(&[])]).start()
+}
+
+/// A session, and the node that is told of changes.
+struct Witness {
+    session: Session,
+    node: Node,
+}
+
+impl Witness {
+    fn on(host: &Host) -> Self {
+        let session = host.session("witness");
+        let node = session.create_node("witness", "/", "/").unwrap();
+        Self { session, node }
+    }
+
+    /// Waits until the graph is as it must be, woken by its changes and by nothing else.
+    #[track_caller]
+    fn sees(&self, reached: impl Fn(&GraphView) -> bool) {
+        while !reached(&self.session.graph()) {
+            let changed = [Waitable::GuardCondition(self.node.graph_changed())];
+            let woken = self.session.wait_for(&changed, Some(PATIENCE)).unwrap();
+            assert_eq!(woken, [0], "nothing changes in {:#?}", self.session.graph());
+        }
+    }
+
+    /// What the graph has besides the node itself.
+    fn others(graph: &GraphView) -> Vec<&Endpoint> {
+        let all = graph.endpoints.values().map(|entry| &*entry.endpoint);
+        all.filter(|endpoint| endpoint.node != "witness").collect()
+    }
+}
+
+/// Unlike any default in each of its policies.
+fn odd() -> Qos {
+    Qos {
+        reliability: Reliability::BestEffort,
+        durability: Durability::TransientLocal,
+        history: History::KeepLast,
+        depth: 7,
+        deadline: Some(3_600_000_000_001),
+        lifespan: Some(5_000_000_003),
+        liveliness: Liveliness::ManualByTopic,
+        lease: Some(7_200_000_000_005),
+    }
+}
+
+fn named(gid: Gid, node: &str, namespace: &str, enclave: &str) -> Endpoint {
+    Endpoint {
+        gid,
+        kind: EndpointKind::Node,
+        topic: String::new(),
+        type_name: String::new(),
+        type_hash: Vec::new(),
+        qos: Qos::default(),
+        node: node.into(),
+        namespace: namespace.into(),
+        enclave: enclave.into(),
+    }
+}
+
+#[test]
+fn every_field_of_what_is_on_one_host_is_in_the_others_graph_for_as_long_as_it_is_there() {
+    let [a, b] = hosts();
+    let witness = Witness::on(&b);
+    let session = a.session("everything");
+    let daemon = session.daemon();
+    let mut expected: Vec<Endpoint> = Vec::new();
+    // One after another, so that each has to be told of.
+    let appears = |expected: &mut Vec<Endpoint>, new: Endpoint| {
+        let gid = new.gid;
+        expected.push(new);
+        witness.sees(|graph| graph.endpoints.contains_key(&gid));
+        let graph = witness.session.graph();
+        assert_eq!(Witness::others(&graph).len(), expected.len());
+        for one in expected {
+            let entry = &graph.endpoints[&one.gid];
+            assert_eq!(*entry.endpoint, *one);
+            assert_eq!(entry.daemon, daemon, "whose host it is on");
+        }
+    };
+    let left = session.create_node("left", "/front", "/robot").unwrap();
+    appears(&mut expected, named(left.gid(), "left", "/front", "/robot"));
+    let right = session.create_node("right", "/front/low", "/").unwrap();
+    appears(&mut expected, named(right.gid(), "right", "/front/low", "/"));
+
+    let all = Qos { history: History::KeepAll, depth: 3, ..odd() };
+    let few = Qos { depth: 4, ..Qos::default() };
+    let spec = |topic: &str, hash: u8, qos| EndpointSpec {
+        type_hash: vec![hash; 32],
+        ..EndpointSpec::new(topic, format!("test/Of{hash}"), qos)
+    };
+    let of = |node: &Node, gid, kind, topic: &str, hash: u8, qos| Endpoint {
+        gid,
+        kind,
+        topic: topic.into(),
+        type_name: format!("test/Of{hash}"),
+        type_hash: vec![hash; 32],
+        qos,
+        enclave: String::new(),
+        ..named(gid, node.name(), node.namespace(), "")
+    };
+    let publisher = left.create_publisher(spec("/a", 1, odd())).unwrap();
+    let kind = EndpointKind::Publisher;
+    appears(&mut expected, of(&left, publisher.gid(), kind, "/a", 1, odd()));
+    let subscription = right.create_subscription(spec("/b", 2, all)).unwrap();
+    let kind = EndpointKind::Subscription;
+    appears(&mut expected, of(&right, subscription.gid(), kind, "/b", 2, all));
+    let server = left.create_server(spec("/c", 3, few)).unwrap();
+    appears(&mut expected, of(&left, server.gid(), EndpointKind::Server, "/c", 3, few));
+    let client = right.create_client(spec("/d", 4, odd())).unwrap();
+    appears(&mut expected, of(&right, client.gid(), EndpointKind::Client, "/d", 4, odd()));
+    // One of no node, of a type that nobody knows more of.
+    let bare = session.create_publisher(EndpointSpec::new("/e", "", Qos::default())).unwrap();
+    let unknown = Endpoint {
+        type_name: String::new(),
+        type_hash: Vec::new(),
+        node: String::new(),
+        namespace: String::new(),
+        ..of(&left, bare.gid(), EndpointKind::Publisher, "/e", 5, Qos::default())
+    };
+    appears(&mut expected, unknown);
+
+    let disappears = |gid: Gid| {
+        witness.sees(|graph| !graph.endpoints.contains_key(&gid));
+    };
+    let gone: [(Gid, Box<dyn FnOnce()>); 7] = [
+        (client.gid(), Box::new(move || drop(client))),
+        (left.gid(), Box::new(move || drop(left))),
+        (publisher.gid(), Box::new(move || drop(publisher))),
+        (server.gid(), Box::new(move || drop(server))),
+        (bare.gid(), Box::new(move || drop(bare))),
+        (subscription.gid(), Box::new(move || drop(subscription))),
+        (right.gid(), Box::new(move || drop(right))),
+    ];
+    for (gid, end) in gone {
+        end();
+        disappears(gid);
+        expected.retain(|one| one.gid != gid);
+        let graph = witness.session.graph();
+        assert_eq!(Witness::others(&graph).len(), expected.len(), "only what ended is gone");
+    }
+}
+
+#[test]
+fn what_a_process_had_that_is_killed_leaves_the_others_graph() {
+    use EndpointKind::{Client, Publisher, Server, Subscription};
+    let [a, b] = hosts();
+    let witness = Witness::on(&b);
+    for _ in 0..3 {
+        let mut node = a.node(&["everything", "/all"]);
+        node.wait_ready();
+        witness.sees(|graph| {
+            let kinds = [Publisher, Subscription, Server, Client];
+            kinds.iter().all(|kind| graph.count(*kind, "/all") == 1)
+                && graph.has_node("everything", "/of/a/process")
+        });
+        assert_eq!(Witness::others(&witness.session.graph()).len(), 5);
+        signal(node.pid(), Signal::KILL);
+        witness.sees(|graph| Witness::others(graph).is_empty());
+    }
+}
