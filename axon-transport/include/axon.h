@@ -9,6 +9,10 @@
  *   the places that it was given, and axon_session_last_error says in words what is wrong.
  * - It keeps no pointer that it was given. Strings are UTF-8 and end with a 0 byte.
  * - What it calls back must neither throw nor longjmp out of the call.
+ * - Where it replaces a callback, or destroys what has one, that has returned when it returns, unless it is
+ *   called from within it, and is called no more: whatever other threads do meanwhile, one that would set
+ *   another gets AXON_RET_INVALID_HANDLE. It blocks until then: hold nothing that
+ *   the callback waits for.
  *
  * Handles are numbers, never pointers, and may be copied freely: one that is 0, stale, destroyed twice, of
  * another kind or made up gives AXON_RET_INVALID_HANDLE, one that a forked child inherited
@@ -461,7 +465,8 @@ typedef struct axon_sample_t {
 
 /**
  * Told how often something happened since it was told last; at least once. It may be called on the
- * session's thread, must not block, and may call any function of this interface that does not block.
+ * session's thread, but never by two threads at once, must not block, and may call any function of this
+ * interface that does not block, also to replace itself or to destroy what it was set for.
  */
 typedef void (*axon_callback_t)(const void *user, size_t count);
 
@@ -928,8 +933,8 @@ axon_ret_t axon_session_subscription_event(struct axon_subscription_t subscripti
                                            struct axon_event_t *event);
 
 /**
- * Gives an event's handle up. The callback that was set by it has returned, and is not called any
- * more, when this returns.
+ * Gives an event's handle up. Its callback has returned, and is not called any more, when this returns;
+ * those of other handles of the same event are.
  */
 axon_ret_t axon_session_event_destroy(struct axon_event_t event);
 
@@ -943,10 +948,10 @@ axon_ret_t axon_session_event_destroy(struct axon_event_t event);
 axon_ret_t axon_session_event_take(struct axon_event_t event, struct axon_event_status_t *status);
 
 /**
- * Has `callback` told of the event from now on, in place of the one before, which has returned and is
- * not called any more when this returns, unless this is called from within it. Null: nobody is
- * told. What happened since the status was last taken, and nobody was told of, it is told at once,
- * in this call.
+ * Has `callback` told of the event from now on, in place of the one that this handle had before, which
+ * has returned and is not called any more when this returns, unless this is called from within it.
+ * Null: nobody is told. What happened since the status was last taken, and nobody was told of by this
+ * handle, it is told at once, in this call.
  *
  * # Safety
  * `callback` may be called with `user` from any thread until it is replaced or the event is

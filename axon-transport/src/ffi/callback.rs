@@ -5,7 +5,8 @@ use std::{ffi::c_void, sync::Arc};
 use crate::session::OnNew;
 
 /// Told how often something happened since it was told last; at least once. It may be called on the
-/// session's thread, must not block, and may call any function of this interface that does not block.
+/// session's thread, but never by two threads at once, must not block, and may call any function of this
+/// interface that does not block, also to replace itself or to destroy what it was set for.
 pub type axon_callback_t = Option<unsafe extern "C" fn(user: *const c_void, count: usize)>;
 
 /// What a function is to be called with. The program says that any thread may.
@@ -26,7 +27,8 @@ pub(super) fn told(callback: axon_callback_t, user: *const c_void) -> Option<OnN
         let User(pointer) = { user };
         let count = usize::try_from(count).unwrap_or(usize::MAX);
         // SAFETY: whoever set it says that it may be called with this until it is replaced or its
-        // object destroyed, and neither returns before this call does.
+        // object destroyed. Neither returns before this call does, and none begins after them
+        // (`Callback::vacate`, `Callback::end`), whichever threads set and destroy.
         unsafe { function(pointer, count) };
     }))
 }

@@ -95,6 +95,7 @@ pub(super) trait Object {
 /// An endpoint of which something is taken.
 pub(super) trait Taking: Object {
     fn set_on_new(&self, callback: Option<OnNew>) -> Result<(), SessionError>;
+    fn tell_no_more(&self);
 }
 
 macro_rules! objects {
@@ -112,6 +113,10 @@ macro_rules! objects {
         $(impl Taking for $object {
             fn set_on_new(&self, callback: Option<OnNew>) -> Result<(), SessionError> {
                 self.$set(callback)
+            }
+
+            fn tell_no_more(&self) {
+                self.tell_no_more();
             }
         })?
     )+};
@@ -163,16 +168,15 @@ pub(super) fn set_callback<H: Handle<Object: Taking>>(
     user: *const c_void,
 ) -> Result<(), Failure> {
     let object = named(handle)?;
-    let set = |callback| object.set_on_new(callback).map_err(Failure::from);
-    set(told(callback, user)).map_err(|failure| failure.of_endpoint(object.endpoint()))?;
-    // Whoever destroyed it meanwhile may have been too early to unset this one.
-    named(handle).map(drop).or_else(|gone| set(None).and(Err(gone)))
+    let set = object.set_on_new(told(callback, user));
+    set.map_err(|error| Failure::from(error).of_endpoint(object.endpoint()))?;
+    // One that was destroyed meanwhile has none.
+    named(handle).map(drop)
 }
 
 /// Ends an endpoint that has a callback.
 pub(super) fn end<H: Handle<Object: Taking>>(handle: H) -> Result<(), Failure> {
-    let object = revoke(handle)?;
-    // Another call may keep it for a while. Only listening may fail, not ceasing to.
-    let _ = object.set_on_new(None);
+    // Another call may keep it for a while.
+    revoke(handle)?.tell_no_more();
     Ok(())
 }

@@ -1,9 +1,6 @@
 //! Events of publishers and subscriptions.
 
-use std::{
-    ffi::c_void,
-    sync::atomic::{AtomicBool, Ordering},
-};
+use std::ffi::c_void;
 
 use super::{
     callback::{axon_callback_t, told},
@@ -17,13 +14,6 @@ use crate::{
     events::{EventKind, EventStatus},
     session::Event,
 };
-
-/// What an event's handle names.
-pub(super) struct NamedEvent {
-    pub(super) event: Event,
-    /// Whether a callback was set by this handle.
-    told: AtomicBool,
-}
 
 /// Of a subscription: a publisher became alive or ceased to be.
 pub const AXON_EVENT_LIVELINESS_CHANGED: u32 = 0;
@@ -109,12 +99,13 @@ pub unsafe extern "C" fn axon_session_subscription_event(
     })
 }
 
-/// Gives an event's handle up. The callback that was set by it has returned, and is not called any
-/// more, when this returns.
+/// Gives an event's handle up. Its callback has returned, and is not called any more, when this returns;
+/// those of other handles of the same event are.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_event_destroy(event: axon_event_t) -> axon_ret_t {
     guarded(|| {
-        revoke(event)?.untell();
+        // Another call may keep it for a while.
+        revoke(event)?.tell_no_more();
         Ok(())
     })
 }
@@ -131,17 +122,17 @@ pub unsafe extern "C" fn axon_session_event_take(
 ) -> axon_ret_t {
     guarded(|| {
         present(status, "the place of the status")?;
-        let named = named(event)?;
-        let found = flat(named.event.kind(), named.event.take());
+        let event = named(event)?;
+        let found = flat(event.kind(), event.take());
         // SAFETY: the caller's word.
         unsafe { store(status, found, "the place of the status") }
     })
 }
 
-/// Has `callback` told of the event from now on, in place of the one before, which has returned and is
-/// not called any more when this returns, unless this is called from within it. Null: nobody is
-/// told. What happened since the status was last taken, and nobody was told of, it is told at once,
-/// in this call.
+/// Has `callback` told of the event from now on, in place of the one that this handle had before, which
+/// has returned and is not called any more when this returns, unless this is called from within it.
+/// Null: nobody is told. What happened since the status was last taken, and nobody was told of by this
+/// handle, it is told at once, in this call.
 ///
 /// # Safety
 /// `callback` may be called with `user` from any thread until it is replaced or the event is
@@ -154,19 +145,10 @@ pub unsafe extern "C" fn axon_session_event_set_callback(
 ) -> axon_ret_t {
     guarded(|| {
         let object = named(event)?;
-        object.told.store(callback.is_some(), Ordering::SeqCst);
-        object.event.set_callback(told(callback, user));
-        // Whoever destroyed it meanwhile may have been too early to unset this one.
-        named(event).map(drop).inspect_err(|_| object.event.set_callback(None))
+        object.set_callback(told(callback, user));
+        // One that was destroyed meanwhile has none.
+        named(event).map(drop)
     })
-}
-
-impl NamedEvent {
-    fn untell(&self) {
-        if self.told.swap(false, Ordering::SeqCst) {
-            self.event.set_callback(None);
-        }
-    }
 }
 
 /// # Safety
@@ -180,7 +162,7 @@ unsafe fn give_event(
     let none = || Failure::argument(format_args!("a {of} has no event {kind}"));
     let event = event.ok_or_else(none)?;
     // SAFETY: the caller's word.
-    unsafe { give(NamedEvent { event, told: AtomicBool::new(false) }, out) }
+    unsafe { give(event, out) }
 }
 
 fn of_number(kind: u32) -> Option<EventKind> {

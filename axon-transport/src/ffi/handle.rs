@@ -4,14 +4,13 @@ use std::sync::Arc;
 
 use super::{
     error::{AXON_RET_BAD_ALLOC, AXON_RET_FORKED, AXON_RET_INVALID_HANDLE, Failure, axon_ret_t},
-    event::NamedEvent,
     loan::NamedLoan,
     memory::store,
     table::{Process, Table, Unknown},
 };
 use crate::{
     process::{Made, PerProcess},
-    session::{Client, GuardCondition, Node, Publisher, Server, Session, Subscription},
+    session::{Client, Event, GuardCondition, Node, Publisher, Server, Session, Subscription},
     shm::{ForkToken, Sample},
 };
 
@@ -155,7 +154,7 @@ handles! {
     5 servers: axon_server_t => Server, "server";
     6 clients: axon_client_t => Client, "client";
     7 guards: axon_guard_t => GuardCondition, "guard condition";
-    8 events: axon_event_t => NamedEvent, "event";
+    8 events: axon_event_t => Event, "event";
     9 samples: axon_sample_t => Sample, "sample";
     10 loans: axon_loan_t => NamedLoan, "loan";
 }
@@ -171,7 +170,10 @@ fn current() -> Result<&'static Made<Tables>, Failure> {
 /// What a handle names.
 pub(super) fn named<H: Handle>(handle: H) -> Result<Arc<H::Object>, Failure> {
     let tables = current()?;
-    H::table(tables.value()).get(handle.id()).map_err(|why| unknown(tables, handle, why))
+    let found = H::table(tables.value()).get(handle.id());
+    #[cfg(test)]
+    super::tests::found();
+    found.map_err(|why| unknown(tables, handle, why))
 }
 
 /// A handle for something new, stored at `out`.

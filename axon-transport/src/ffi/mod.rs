@@ -8,6 +8,10 @@
 //!   none of the places that it was given, and [`axon_session_last_error`] says in words what is wrong.
 //! - It keeps no pointer that it was given. Strings are UTF-8 and end with a 0 byte.
 //! - What it calls back must neither throw nor `longjmp` out of the call.
+//! - Where it replaces a callback, or destroys what has one, that has returned when it returns, unless it
+//!   is called from within it, and is called no more: whatever other threads do meanwhile, one that
+//!   would set another gets `AXON_RET_INVALID_HANDLE`. It blocks until then: hold nothing that
+//!   the callback waits for.
 //!
 //! Handles are numbers, never pointers: one that is 0, stale, destroyed twice, of another kind or made
 //! up gives [`AXON_RET_INVALID_HANDLE`], one that a forked child inherited [`AXON_RET_FORKED`]. An
@@ -33,6 +37,8 @@ mod server;
 mod session;
 mod subscription;
 mod table;
+#[cfg(test)]
+mod tests;
 mod wait;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};

@@ -115,7 +115,7 @@ pub unsafe extern "C" fn axon_session_wait(
                 .chain(guards.iter().map(|one| Waitable::GuardCondition(one)))
                 .chain(servers.iter().map(|one| Waitable::Server(one)))
                 .chain(clients.iter().map(|one| Waitable::Client(one)))
-                .chain(events.iter().map(|one| Waitable::Event(&one.event)))
+                .chain(events.iter().map(|one| Waitable::Event(one)))
                 .collect();
             // It does not keep what is waited for from ending.
             session.watch(&waitables)?

@@ -1,13 +1,14 @@
 //! A callback that is told how often something happened.
 
 use std::{
+    convert::Infallible,
     fmt,
     sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
     thread::{self, ThreadId},
 };
 
 /// Told how often something happened since it was told last; at least once. It may be called on the
-/// session's control thread, and must neither block nor panic.
+/// session's control thread, but never by two threads at once, and must neither block nor panic.
 pub type OnNew = Arc<dyn Fn(u64) + Send + Sync>;
 
 /// What is to be told, and to whom.
@@ -20,20 +21,15 @@ pub(super) struct Callback {
 #[derive(Default)]
 struct State {
     function: Option<OnNew>,
-    /// Rises with each function.
-    version: u64,
     untold: u64,
-    /// Who is in which function.
-    running: Vec<(ThreadId, u64)>,
+    /// Who is in a function. Whoever has something to tell meanwhile leaves it to that thread: two in
+    /// the same function that both wait for the other to return would wait for ever.
+    running: Option<ThreadId>,
+    /// There is to be no function any more.
+    ended: bool,
 }
 
 impl Callback {
-    /// One for something that has happened `untold` times already.
-    pub(super) fn new(untold: u64) -> Self {
-        let state = State { untold, ..State::default() };
-        Self { state: Mutex::new(state), idle: Condvar::new() }
-    }
-
     /// It happened `count` times more.
     pub(super) fn add(&self, count: u64) {
         if count > 0 {
@@ -42,9 +38,9 @@ impl Callback {
         }
     }
 
-    /// What happened so far has been seen.
-    pub(super) fn forget(&self) {
-        self.lock().untold = 0;
+    /// It happened `count` times that nobody was told of.
+    pub(super) fn recount(&self, count: u64) {
+        self.lock().untold = count;
     }
 
     /// Whether there is anybody to tell.
@@ -52,41 +48,70 @@ impl Callback {
         self.lock().function.is_some()
     }
 
-    /// Has `function` told from now on, and at once of what nobody was told. The one before is not
-    /// called any more once this returns, but by the calling thread that is in it.
+    /// Has `function` told from now on, and at once of what nobody was told, unless it [ended](Self::end).
+    /// The one before is not called any more once this returns, but by the calling thread that is in
+    /// it, which tells `function` when it has left it.
     pub(super) fn set(&self, function: Option<OnNew>) {
-        self.replace(function, |untold| untold);
+        let Ok(()) = self.replace(function, Ok::<_, Infallible>);
     }
 
-    /// As [`set`](Self::set), where `recount` says of how often it happened untold what that is now.
-    pub(super) fn replace(&self, function: Option<OnNew>, recount: impl FnOnce(u64) -> u64) {
+    /// As [`set`](Self::set), where `recount` says of how often it happened untold what that is now. It
+    /// runs under the lock, at the moment from which `function` is told of the rest. Nobody is told
+    /// any more where it fails.
+    pub(super) fn replace<E>(
+        &self,
+        function: Option<OnNew>,
+        recount: impl FnOnce(u64) -> Result<u64, E>,
+    ) -> Result<(), E> {
+        let mut state = self.vacate();
+        if state.ended {
+            return Ok(());
+        }
+        state.untold = recount(state.untold)?;
+        state.function = function;
+        drop(state);
+        self.tell();
+        Ok(())
+    }
+
+    /// Nobody is told any more, whatever is set from now on. What was set is not called any more once
+    /// this returns, but by the calling thread that is in it.
+    pub(super) fn end(&self) {
+        self.lock().ended = true;
+        drop(self.vacate());
+    }
+
+    /// Has nobody told, and waits for the call that is under way on another thread.
+    fn vacate(&self) -> MutexGuard<'_, State> {
         let me = thread::current().id();
         let mut state = self.lock();
-        let before = std::mem::replace(&mut state.function, function);
-        state.version += 1;
-        let version = state.version;
-        while state.running.iter().any(|(thread, of)| *thread != me && *of < version) {
-            state = self.idle.wait(state).unwrap_or_else(PoisonError::into_inner);
+        loop {
+            if let Some(before) = state.function.take() {
+                drop(state);
+                // What it captured may be anything.
+                drop(before);
+                state = self.lock();
+            } else if state.running.is_some_and(|running| running != me) {
+                state = self.idle.wait(state).unwrap_or_else(PoisonError::into_inner);
+            } else {
+                return state;
+            }
         }
-        state.untold = recount(state.untold);
-        drop(state);
-        drop(before);
-        self.tell();
     }
 
     fn tell(&self) {
         loop {
             let mut state = self.lock();
-            let Some(function) = state.function.clone().filter(|_| state.untold > 0) else {
+            if state.running.is_some() || state.untold == 0 {
                 return;
-            };
+            }
+            let Some(function) = state.function.clone() else { return };
             let count = std::mem::take(&mut state.untold);
-            let run = (thread::current().id(), state.version);
-            state.running.push(run);
+            state.running = Some(thread::current().id());
             drop(state);
-            let running = Running { callback: self, run };
+            let running = Running(self);
             function(count);
-            drop(running);
+            drop((function, running));
         }
     }
 
@@ -96,19 +121,12 @@ impl Callback {
 }
 
 /// A call that is under way, until it is dropped.
-struct Running<'a> {
-    callback: &'a Callback,
-    run: (ThreadId, u64),
-}
+struct Running<'a>(&'a Callback);
 
 impl Drop for Running<'_> {
     fn drop(&mut self) {
-        let mut state = self.callback.lock();
-        if let Some(index) = state.running.iter().position(|run| *run == self.run) {
-            state.running.swap_remove(index);
-        }
-        drop(state);
-        self.callback.idle.notify_all();
+        self.0.lock().running = None;
+        self.0.idle.notify_all();
     }
 }
 
@@ -121,8 +139,8 @@ impl fmt::Debug for Callback {
 #[cfg(test)]
 mod tests {
     use std::sync::{
-        Barrier,
         atomic::{AtomicBool, AtomicU64, Ordering},
+        mpsc,
     };
 
     use super::*;
@@ -139,7 +157,8 @@ mod tests {
 
     #[test]
     fn what_happened_before_is_told_at_once_and_once() {
-        let callback = Callback::new(2);
+        let callback = Callback::default();
+        callback.recount(2);
         callback.add(1);
         let (first, told_first) = counter();
         callback.set(Some(first));
@@ -152,7 +171,7 @@ mod tests {
         assert_eq!(told_second.load(Ordering::SeqCst), 0);
         callback.set(None);
         callback.add(5);
-        callback.forget();
+        callback.recount(0);
         callback.add(1);
         let (third, told_third) = counter();
         callback.set(Some(third));
@@ -169,22 +188,122 @@ mod tests {
     }
 
     #[test]
-    fn the_one_before_runs_no_more_once_it_is_replaced() {
+    fn a_callback_that_replaces_itself_tells_the_next_one_of_the_rest() {
+        let callback = Arc::new(Callback::default());
+        let (next, told) = counter();
+        let (own, count) = (Arc::downgrade(&callback), told.clone());
+        callback.set(Some(Arc::new(move |_| {
+            let own = own.upgrade().unwrap();
+            own.set(Some(next.clone()));
+            own.add(2);
+            assert_eq!(count.load(Ordering::SeqCst), 0, "this one has not returned");
+        })));
+        callback.add(1);
+        assert_eq!(told.load(Ordering::SeqCst), 2);
+    }
+
+    /// A function that says that it was entered, and returns when it is told to.
+    fn gate() -> (OnNew, mpsc::Receiver<u64>, mpsc::Sender<()>, Arc<AtomicBool>) {
+        let (entered, entries) = mpsc::channel();
+        let (go, goes) = mpsc::channel();
+        let (inside, goes) = (Arc::new(AtomicBool::new(false)), Mutex::new(goes));
+        let within = inside.clone();
+        let function = move |new| {
+            assert!(!inside.swap(true, Ordering::SeqCst), "in two threads at once");
+            entered.send(new).unwrap();
+            goes.lock().unwrap().recv().unwrap();
+            inside.store(false, Ordering::SeqCst);
+        };
+        (Arc::new(function), entries, go, within)
+    }
+
+    #[test]
+    fn what_happens_while_it_runs_it_is_told_afterwards_by_the_same_thread() {
         let callback = Callback::default();
-        let (entered, over) = (Barrier::new(2), AtomicBool::new(false));
+        let (function, entries, go, _) = gate();
+        callback.set(Some(function));
         thread::scope(|scope| {
-            let entered: &'static Barrier = Box::leak(Box::new(entered));
-            let over: &'static AtomicBool = Box::leak(Box::new(over));
-            callback.set(Some(Arc::new(move |_| {
-                entered.wait();
-                thread::sleep(std::time::Duration::from_millis(50));
-                over.store(true, Ordering::SeqCst);
-            })));
             scope.spawn(|| callback.add(1));
-            entered.wait();
-            callback.set(None);
-            assert!(over.load(Ordering::SeqCst), "it was waited for");
+            assert_eq!(entries.recv(), Ok(1));
+            callback.add(2);
+            callback.add(3);
+            go.send(()).unwrap();
+            assert_eq!(entries.recv(), Ok(5));
+            go.send(()).unwrap();
         });
+    }
+
+    #[test]
+    fn the_one_before_runs_no_more_once_it_is_replaced_and_the_next_is_told_what_is_counted_then() {
+        let callback = Callback::default();
+        let (function, entries, go, inside) = gate();
+        let (next, told) = counter();
+        callback.set(Some(function));
+        thread::scope(|scope| {
+            scope.spawn(|| callback.add(1));
+            assert_eq!(entries.recv(), Ok(1));
+            let (vacant, counted) = (&callback, &inside);
+            let replacing = scope.spawn(move || {
+                let Ok(()) = vacant.replace(Some(next), |untold| {
+                    assert!(!counted.load(Ordering::SeqCst), "it was waited for");
+                    Ok::<_, Infallible>(untold.min(2))
+                });
+            });
+            // Nobody is told from the moment at which it begins to wait.
+            while callback.is_set() {
+                thread::yield_now();
+            }
+            callback.add(3);
+            assert_eq!(told.load(Ordering::SeqCst), 0);
+            go.send(()).unwrap();
+            replacing.join().unwrap();
+        });
+        assert_eq!(told.load(Ordering::SeqCst), 2);
+    }
+
+    #[test]
+    fn once_it_has_ended_nobody_is_told_whatever_is_set() {
+        let callback = Callback::default();
+        let (function, entries, go, inside) = gate();
+        let (late, told) = counter();
+        callback.set(Some(function));
+        thread::scope(|scope| {
+            scope.spawn(|| callback.add(1));
+            assert_eq!(entries.recv(), Ok(1));
+            let ending = scope.spawn(|| {
+                callback.end();
+                assert!(!inside.load(Ordering::SeqCst), "it was waited for");
+            });
+            while callback.is_set() {
+                thread::yield_now();
+            }
+            callback.add(3);
+            // It waits, too.
+            let setting = scope.spawn(|| callback.set(Some(late.clone())));
+            go.send(()).unwrap();
+            ending.join().unwrap();
+            setting.join().unwrap();
+        });
+        callback.set(Some(late.clone()));
+        callback.add(1);
+        assert_eq!(told.load(Ordering::SeqCst), 0);
+        assert_eq!(Arc::strong_count(&late), 1, "it was not kept");
+    }
+
+    #[test]
+    fn it_may_end_within_itself_and_nobody_is_told_where_counting_fails() {
+        let callback = Arc::new(Callback::default());
+        let own = Arc::downgrade(&callback);
+        callback.set(Some(Arc::new(move |_| own.upgrade().unwrap().end())));
+        callback.add(1);
+        callback.add(1);
+        assert!(!callback.is_set());
+
+        let callback = Callback::default();
+        let (function, told) = counter();
+        assert_eq!(callback.replace(Some(function), |_| Err("no")), Err("no"));
+        callback.add(1);
+        assert_eq!(told.load(Ordering::SeqCst), 0);
     }
 
     #[test]

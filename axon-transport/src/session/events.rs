@@ -2,7 +2,7 @@
 
 use std::{
     cmp::Ordering,
-    collections::{BTreeMap, BTreeSet},
+    collections::BTreeSet,
     fmt,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
 };
@@ -45,9 +45,11 @@ use crate::{
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 pub struct Event {
-    pub(super) source: Source,
+    source: Source,
     kind: EventKind,
     pub(super) session: Session,
+    /// Its own, which the endpoint knows from when it is first set.
+    callback: Arc<Callback>,
 }
 
 /// Whose event it is.
@@ -109,7 +111,8 @@ impl Source {
 impl Event {
     pub(super) fn new(source: Source, kind: EventKind, session: Session) -> Option<Self> {
         let publishers = matches!(source, Source::Publisher(_));
-        (kind.is_publishers() == publishers).then_some(Self { source, kind, session })
+        let callback = Arc::default();
+        (kind.is_publishers() == publishers).then_some(Self { source, kind, session, callback })
     }
 
     /// Which it is.
@@ -135,14 +138,24 @@ impl Event {
         self.source.events().take(self.kind)
     }
 
-    /// Has `callback` told of it from now on, in place of the one before, which is not called any
-    /// more once this returns. What happened since the status was last taken, and nobody was told
-    /// of, it is told at once, on this thread; the rest on the control thread, or where another endpoint of the
-    /// session comes or goes. It must
-    /// neither block nor panic, nor hold the session.
+    /// Has `callback` told of it from now on, in place of the one that this handle had before, which is
+    /// not called any more once this returns. What happened since the status was last taken, and this
+    /// handle told nobody of, it is told at once, on this thread; the rest on the control thread, or
+    /// where another endpoint of the session comes or goes. It must neither block nor panic, nor hold
+    /// the session. It ends with this handle.
     pub fn set_callback(&self, callback: Option<OnNew>) {
         if !self.session.is_forked() {
-            self.source.events().callback(self.kind).set(callback);
+            self.source.events().tell(self.kind, &self.callback);
+            self.callback.set(callback);
+        }
+    }
+
+    /// The callback has returned and is not called any more once this returns, whatever is set from now
+    /// on: for a handle that other threads may still use though it has ended.
+    pub(crate) fn tell_no_more(&self) {
+        if !self.session.is_forked() {
+            self.callback.end();
+            self.source.events().tell_no_more(&self.callback);
         }
     }
 
@@ -155,6 +168,12 @@ impl Event {
 impl fmt::Debug for Event {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_tuple("Event").field(&self.kind).finish()
+    }
+}
+
+impl Drop for Event {
+    fn drop(&mut self) {
+        self.tell_no_more();
     }
 }
 
@@ -207,7 +226,8 @@ pub(super) struct EndpointEvents {
 
 struct Inner {
     statuses: Statuses,
-    callbacks: BTreeMap<EventKind, Arc<Callback>>,
+    /// Of all handles of events that have one.
+    callbacks: Vec<(EventKind, Arc<Callback>)>,
     /// In order.
     matched: Vec<Gid>,
     /// Those of the topic that do not go with this one, and have been counted.
@@ -236,7 +256,7 @@ impl EndpointEvents {
     fn new(statuses: Statuses, qos: &Qos, lease: Option<Lease>) -> Self {
         let inner = Inner {
             statuses,
-            callbacks: BTreeMap::new(),
+            callbacks: Vec::new(),
             matched: Vec::new(),
             incompatible: BTreeSet::new(),
             liveness: Liveness::default(),
@@ -252,16 +272,21 @@ impl EndpointEvents {
 
     fn take(&self, kind: EventKind) -> EventStatus {
         let mut inner = self.lock();
-        if let Some(callback) = inner.callbacks.get(&kind) {
-            callback.forget();
-        }
+        inner.callbacks_of(kind).for_each(|callback| callback.recount(0));
         inner.statuses.take(kind).expect("checked when the event was made")
     }
 
-    fn callback(&self, kind: EventKind) -> Arc<Callback> {
+    /// Has a callback told of an event from now on, and of what happened since its status was taken.
+    fn tell(&self, kind: EventKind, callback: &Arc<Callback>) {
         let mut inner = self.lock();
-        let untold = inner.statuses.unread(kind);
-        inner.callbacks.entry(kind).or_insert_with(|| Arc::new(Callback::new(untold))).clone()
+        if !inner.callbacks_of(kind).any(|known| Arc::ptr_eq(known, callback)) {
+            callback.recount(inner.statuses.unread(kind));
+            inner.callbacks.push((kind, Arc::clone(callback)));
+        }
+    }
+
+    fn tell_no_more(&self, callback: &Arc<Callback>) {
+        self.lock().callbacks.retain(|(_, known)| !Arc::ptr_eq(known, callback));
     }
 
     pub(super) fn is_matched(&self, gid: &Gid) -> bool {
@@ -436,7 +461,8 @@ impl EndpointEvents {
             for ((kind, before), after) in EventKind::ALL.iter().zip(before).zip(unread(&inner)) {
                 if after > before {
                     news = true;
-                    told.extend(inner.callbacks.get(kind).map(|c| (c.clone(), after - before)));
+                    let callbacks = inner.callbacks_of(*kind);
+                    told.extend(callbacks.map(|callback| (callback.clone(), after - before)));
                 }
             }
         }
@@ -450,6 +476,10 @@ impl EndpointEvents {
 }
 
 impl Inner {
+    fn callbacks_of(&self, kind: EventKind) -> impl Iterator<Item = &Arc<Callback>> {
+        self.callbacks.iter().filter(move |(of, _)| *of == kind).map(|(_, callback)| callback)
+    }
+
     /// Counts the deadlines that have passed, where the newest sample is of `sampled`. When to look
     /// again.
     fn deadlines(&mut self, qos: &Qos, sampled: Option<u64>, now: u64) -> Option<u64> {

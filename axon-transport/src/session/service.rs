@@ -203,6 +203,13 @@ impl Server {
     pub fn set_on_new_request(&self, callback: Option<OnNew>) -> Result<(), SessionError> {
         set_callback(&self.requests, callback, &self.session)
     }
+
+    /// As [`Subscription::tell_no_more`](super::Subscription::tell_no_more).
+    pub(crate) fn tell_no_more(&self) {
+        if !self.session.is_forked() {
+            self.requests.tell_no_more(self.session.shared());
+        }
+    }
 }
 
 impl Client {
@@ -309,6 +316,13 @@ impl Client {
     pub fn set_on_new_response(&self, callback: Option<OnNew>) -> Result<(), SessionError> {
         set_callback(&self.responses, callback, &self.session)
     }
+
+    /// As [`Subscription::tell_no_more`](super::Subscription::tell_no_more).
+    pub(crate) fn tell_no_more(&self) {
+        if !self.session.is_forked() {
+            self.responses.tell_no_more(self.session.shared());
+        }
+    }
 }
 
 fn take_from_one(inner: &SubscriptionInner, session: &Session, writer: &Gid) -> Option<Sample> {
@@ -369,14 +383,14 @@ impl fmt::Debug for Client {
 
 impl Drop for Server {
     fn drop(&mut self) {
-        let _ = set_callback(&self.requests, None, &self.session);
+        self.tell_no_more();
         self.session.forget_endpoint(&self.gid());
     }
 }
 
 impl Drop for Client {
     fn drop(&mut self) {
-        let _ = set_callback(&self.responses, None, &self.session);
+        self.tell_no_more();
         self.session.forget_endpoint(&self.gid());
     }
 }

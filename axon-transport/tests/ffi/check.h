@@ -74,5 +74,6 @@ void case_fork(void);
 void case_services(void);
 void case_graph(void);
 void case_log(void);
+void case_callbacks(void);
 
 #endif

@@ -84,27 +84,32 @@ impl SubscriptionInner {
         callback: Option<OnNew>,
         shared: &Shared,
     ) -> Result<(), ShmError> {
-        let mut listens = lock(&self.listens);
-        let there = match (*listens, callback.is_some()) {
-            (false, true) => {
-                shared.listen()?;
-                true
-            }
-            (listens, there) => {
-                if listens && !there {
-                    shared.listen_no_more();
-                }
-                there
-            }
-        };
-        *listens = there;
-        drop(listens);
-        let (new, unread) = {
+        let listens = callback.is_some();
+        self.arrived.replace(callback, |untold| {
+            self.listen(listens, shared)?;
             let mut slots = self.lock();
-            (slots.new_arrivals(), slots.unread(self.shared_depth))
-        };
-        // Of those that nobody was told of some may have been taken, or lost.
-        self.arrived.replace(callback, |untold| (untold + new).min(unread));
+            // Of those that nobody was told of some may have been taken, or lost.
+            let untold = untold + slots.new_arrivals();
+            Ok(untold.min(slots.unread(self.shared_depth)))
+        })
+    }
+
+    /// Nobody hears of samples any more, whatever is set from now on.
+    pub(in crate::session) fn tell_no_more(&self, shared: &Shared) {
+        self.arrived.end();
+        // Only listening may fail, not ceasing to.
+        let _ = self.listen(false, shared);
+    }
+
+    /// Has the control thread listen for it, or not any more.
+    fn listen(&self, whether: bool, shared: &Shared) -> Result<(), ShmError> {
+        let mut listens = lock(&self.listens);
+        match (*listens, whether) {
+            (false, true) => shared.listen()?,
+            (true, false) => shared.listen_no_more(),
+            _ => {}
+        }
+        *listens = whether;
         Ok(())
     }
 

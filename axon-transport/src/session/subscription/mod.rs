@@ -127,6 +127,14 @@ impl Subscription {
         Ok(self.inner.set_on_new_sample(callback, self.session.shared())?)
     }
 
+    /// The callback has returned and is not called any more once this returns, whatever is set from now
+    /// on: for one that other threads may still use though it has ended.
+    pub(crate) fn tell_no_more(&self) {
+        if !self.session.is_forked() {
+            self.inner.tell_no_more(self.session.shared());
+        }
+    }
+
     /// One of its events; `None` where `kind` is a publisher's.
     pub fn event(&self, kind: EventKind) -> Option<Event> {
         Event::new(Source::Subscription(self.inner.clone()), kind, self.session.clone())
@@ -211,10 +219,7 @@ impl fmt::Debug for Subscription {
 
 impl Drop for Subscription {
     fn drop(&mut self) {
-        if !self.session.is_forked() {
-            // Only listening may fail, not ceasing to.
-            let _ = self.inner.set_on_new_sample(None, self.session.shared());
-        }
+        self.tell_no_more();
         self.session.forget_endpoint(&self.gid());
     }
 }
