@@ -72,8 +72,15 @@ pub(super) unsafe fn spec(
     let topic = unsafe { text(options.topic, "the topic") }?;
     // SAFETY: the caller's word.
     let type_name = unsafe { text(options.type_name, "the type's name") }?;
+    let hash_size = options.type_hash_size;
+    if hash_size > AXON_TYPE_HASH_SIZE {
+        let text = format_args!(
+            "the type's hash has {hash_size} bytes, and may have {AXON_TYPE_HASH_SIZE}"
+        );
+        return Err(Failure::argument(text).of(topic));
+    }
     // SAFETY: the caller's word.
-    let hash = unsafe { elements(options.type_hash, options.type_hash_size, "the type's hash") }?;
+    let hash = unsafe { elements(options.type_hash, hash_size, "the type's hash") }?;
     let request = options.qos.request().map_err(|failure| failure.of(topic))?;
     let spec = EndpointSpec {
         type_hash: hash.to_vec(),

@@ -241,6 +241,9 @@ void case_misuse(void) {
     options.type_hash_size = sizeof hash;
     RETURNS(AXON_RET_INVALID_ARGUMENT, axon_session_publisher_create(place.node, &options, &made),
             "/misuse");
+    options.type_hash_size = SIZE_MAX / 2;
+    RETURNS(AXON_RET_INVALID_ARGUMENT, axon_session_publisher_create(place.node, &options, &made),
+            "/misuse");
     RETURNS(AXON_RET_INVALID_ARGUMENT, axon_session_node_create(place.session, "", "/", "/", &node), "");
     CHECK(made.id == 7 && heard.id == 7 && node.id == 7);
 
