@@ -99,10 +99,10 @@ pub unsafe extern "C" fn axon_session_log_set_callback(
     user: *const c_void,
 ) -> axon_ret_t {
     guarded(|| {
-        if queue::is_teller() {
+        let log = Log::current().map_err(|error| Failure::new(AXON_RET_BAD_ALLOC, error))?;
+        if log.waiting.is_teller() {
             return Err(Failure::new(AXON_RET_ERROR, "called from within a log callback"));
         }
-        let log = Log::current().map_err(|error| Failure::new(AXON_RET_BAD_ALLOC, error))?;
         if callback.is_some() && !Listener::stands() {
             let text = "another part of the program has a global subscriber of tracing";
             return Err(Failure::new(AXON_RET_ERROR, text));
@@ -208,7 +208,8 @@ impl Subscriber for Listener {
     }
 
     fn enabled(&self, metadata: &Metadata<'_>) -> bool {
-        is_wanted(severity(metadata.level())) && metadata.is_event() && !queue::is_teller()
+        let teller = || Log::current().is_ok_and(|log| log.waiting.is_teller());
+        is_wanted(severity(metadata.level())) && metadata.is_event() && !teller()
     }
 
     fn event(&self, event: &Event<'_>) {

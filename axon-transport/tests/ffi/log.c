@@ -80,6 +80,43 @@ static void set_again_and_in_a_fork(struct place place) {
     OK(axon_session_log_set_callback(NULL, NULL));
 }
 
+static atomic_int child_status;
+
+/* A child has a log of its own, though it is within its parent's callback. */
+static void fork_within(const void *user, uint32_t severity, const char *part, const char *text) {
+    (void)user, (void)severity, (void)part, (void)text;
+    static int forked;
+    if (forked++ > 0) {
+        return;
+    }
+    pid_t child = fork();
+    if (child == 0) {
+        pthread_mutex_init(&heard.lock, NULL);
+        heard.lines = 0;
+        OK(axon_session_log_set_callback(hear, &heard));
+        struct place place = open_place("child");
+        for (int round = 0; lines() == 0; round++) {
+            CHECK(round < 1000);
+            say_something(place);
+        }
+        _exit(0);
+    }
+    int status = -1;
+    CHECK(child > 0 && waitpid(child, &status, 0) == child);
+    atomic_store(&child_status, status);
+}
+
+static void fork_within_a_callback(struct place place) {
+    atomic_store(&child_status, -1);
+    OK(axon_session_log_set_callback(fork_within, NULL));
+    for (int round = 0; atomic_load(&child_status) == -1; round++) {
+        CHECK(round < 1000);
+        say_something(place);
+    }
+    CHECK(atomic_load(&child_status) == 0);
+    OK(axon_session_log_set_callback(NULL, NULL));
+}
+
 void case_log(void) {
     OK(axon_session_log_set_severity(AXON_LOG_DEBUG));
     OK(axon_session_log_set_callback(hear, &heard));
@@ -101,6 +138,7 @@ void case_log(void) {
     say_something(place);
     CHECK(lines() == before);
     set_again_and_in_a_fork(place);
+    fork_within_a_callback(place);
     close_place(place);
     OK(axon_session_log_set_severity(AXON_LOG_WARN));
 }

@@ -7,7 +7,7 @@
 use std::{
     cell::Cell,
     collections::VecDeque,
-    mem,
+    mem, ptr,
     sync::{Condvar, Mutex, MutexGuard, PoisonError},
     thread,
 };
@@ -35,15 +35,17 @@ struct State {
 }
 
 thread_local! {
-    static TELLS: Cell<bool> = const { Cell::new(false) };
-}
-
-/// Whether this is the thread that calls the program.
-pub(super) fn is_teller() -> bool {
-    TELLS.get()
+    /// Whose lines this thread tells.
+    static TELLS: Cell<*const Waiting> = const { Cell::new(ptr::null()) };
 }
 
 impl Waiting {
+    /// Whether this is the thread that calls the program. In a child that a callback forked it is not:
+    /// the lines there are others.
+    pub(super) fn is_teller(&self) -> bool {
+        ptr::eq(TELLS.get(), self)
+    }
+
     /// Has `tell` called with it soon.
     pub(super) fn say(&'static self, line: Line, tell: impl Fn(Line) + Send + 'static) {
         let mut state = self.lock();
@@ -65,7 +67,7 @@ impl Waiting {
     }
 
     fn tell_all(&self, tell: impl Fn(Line) + Send + 'static) {
-        TELLS.set(true);
+        TELLS.set(self);
         let mut state = self.lock();
         loop {
             let line = match (state.lines.pop_front(), state.lost) {
