@@ -1344,8 +1344,9 @@ axon_ret_t axon_session_open(const struct axon_session_options_t *options,
                              struct axon_session_t *session);
 
 /**
- * Gives a session's handle up. The session ends when the last of its nodes, endpoints, guard
- * conditions and events is destroyed, which then blocks for milliseconds while its thread ends.
+ * Gives a session's handle up. The session ends when the last of its nodes, endpoints and events is
+ * destroyed and the last call returns that uses one, which then blocks for milliseconds while its
+ * thread ends.
  */
 axon_ret_t axon_session_close(struct axon_session_t session);
 
@@ -1485,12 +1486,14 @@ axon_ret_t axon_session_subscription_set_callback(struct axon_subscription_t sub
                                                   const void *user);
 
 /**
- * A guard condition of a session, which keeps the session open.
+ * A guard condition of a session. It does not keep the session open: it may be triggered and destroyed
+ * when that has ended, but nobody can wait for it any more.
  *
  * # Safety
  * `guard` points to room for a handle.
  */
-axon_ret_t axon_session_guard_create(struct axon_session_t session, struct axon_guard_t *guard);
+axon_ret_t axon_session_guard_create(struct axon_session_t session,
+                                     struct axon_guard_t *guard);
 
 /**
  * Gives a guard condition's handle up. A wait that waits for it goes on without.

@@ -194,8 +194,9 @@ fn own_name() -> String {
     path.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned())
 }
 
-/// Gives a session's handle up. The session ends when the last of its nodes, endpoints, guard
-/// conditions and events is destroyed, which then blocks for milliseconds while its thread ends.
+/// Gives a session's handle up. The session ends when the last of its nodes, endpoints and events is
+/// destroyed and the last call returns that uses one, which then blocks for milliseconds while its
+/// thread ends.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_close(session: axon_session_t) -> axon_ret_t {
     guarded(|| revoke(session).map(drop))

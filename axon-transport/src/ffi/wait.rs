@@ -17,7 +17,8 @@ use crate::session::Waitable;
 /// As a timeout: for ever.
 pub const AXON_WAIT_FOREVER: i64 = -1;
 
-/// A guard condition of a session, which keeps the session open.
+/// A guard condition of a session. It does not keep the session open: it may be triggered and destroyed
+/// when that has ended, but nobody can wait for it any more.
 ///
 /// # Safety
 /// `guard` points to room for a handle.

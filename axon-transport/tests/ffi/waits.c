@@ -83,7 +83,16 @@ void case_waits(void) {
     NO_HANDLE(axon_session_wait(place.session, &set, AXON_WAIT_FOREVER));
     CHECK(guards[0].id == theirs.id && waited[0].id == listeners[0].id);
 
+    /* What is left of a session that has ended. */
+    OK(axon_session_guard_create(other.session, &theirs));
     close_place(other);
+    guards[0] = theirs, waited[0] = listeners[0];
+    RETURNS(AXON_RET_INVALID_ARGUMENT, axon_session_wait(place.session, &set, AXON_WAIT_FOREVER),
+            "session");
+    CHECK(guards[0].id == theirs.id && waited[0].id == listeners[0].id);
+    OK(axon_session_guard_trigger(theirs));
+    OK(axon_session_guard_destroy(theirs));
+
     OK(axon_session_publisher_destroy(newcomer));
     OK(axon_session_guard_destroy(graph));
     OK(axon_session_guard_destroy(stop));
