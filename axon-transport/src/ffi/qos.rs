@@ -1,6 +1,6 @@
 //! Quality of service, as C has it.
 
-use std::os::raw::c_char;
+use std::{mem::MaybeUninit, os::raw::c_char};
 
 use super::{
     error::{Failure, axon_ret_t},
@@ -216,7 +216,7 @@ pub unsafe extern "C" fn axon_session_qos_check(
         // SAFETY: the caller's word.
         let requested = unsafe { value(requested, "the profile that is requested") }?.request()?;
         // SAFETY: the caller's word.
-        let room = unsafe { elements_mut(reason.cast::<u8>(), reason_size, "the reason") }?;
+        let room = unsafe { elements_mut(reason.cast(), reason_size, "the reason") }?;
         let (found, policies) = match check(&offered, &requested) {
             Compatibility::Compatible => (AXON_QOS_COMPATIBLE, Vec::new()),
             Compatibility::Unknown(policies) => (AXON_QOS_UNKNOWN, policies),
@@ -259,12 +259,13 @@ pub(super) unsafe fn store_qos(out: *mut axon_qos_t, qos: &Qos) -> Result<(), Fa
 }
 
 /// As much of `text` as fits before the 0 at the end, without half characters.
-fn write_text(room: &mut [u8], text: &str) {
+fn write_text(room: &mut [MaybeUninit<u8>], text: &str) {
     let Some(most) = room.len().checked_sub(1) else { return };
     let mut len = text.len().min(most);
     while !text.is_char_boundary(len) {
         len -= 1;
     }
-    room[..len].copy_from_slice(&text.as_bytes()[..len]);
-    room[len] = 0;
+    for (to, from) in room.iter_mut().zip(text.as_bytes()[..len].iter().chain(&[0])) {
+        to.write(*from);
+    }
 }
