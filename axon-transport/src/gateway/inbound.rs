@@ -1,6 +1,7 @@
 //! Samples from a peer: data streams in, stand-ins out (`docs/formats.md`, section 7).
 
 use std::{
+    fmt::Display,
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -149,7 +150,11 @@ impl Inbound {
             };
             (code, e.to_string())
         };
-        let opened = self.protection.open(body, from.route).map_err(refused)?;
+        let Some(opened) = self.protection.open(body, from.route).map_err(refused)? else {
+            // Nothing is wrong with it. The rest is read to be counted.
+            self.lost("no_link", from.gid, &"the link ended before they were read");
+            return Ok(true);
+        };
         let gid = writer(from.route.kind, from.gid, &opened.header)
             .map_err(|text| (CloseCode::Malformed, text.to_owned()))?;
         if opened.header.compressed {
@@ -186,15 +191,16 @@ impl Inbound {
                     // The timeout only covers a link that ends meanwhile.
                     let _ = tokio::time::timeout(Duration::from_millis(100), beat.changed()).await;
                 }
-                Err(error) => {
-                    self.counters.dropped("ring", 1);
-                    if let Some(samples) = self.losses.count(Instant::now()) {
-                        let gid = stand_in.gid();
-                        tracing::warn!(%gid, %error, samples, "samples from a peer are lost");
-                    }
-                    return;
-                }
+                Err(error) => return self.lost("ring", stand_in.gid(), &error),
             }
+        }
+    }
+
+    /// A sample came here and is lost.
+    fn lost(&self, cause: &'static str, gid: Gid, error: &dyn Display) {
+        self.counters.dropped(cause, 1);
+        if let Some(samples) = self.losses.count(Instant::now()) {
+            tracing::warn!(%gid, %error, samples, "samples from a peer are lost");
         }
     }
 }

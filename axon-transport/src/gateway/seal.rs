@@ -150,7 +150,8 @@ impl Protection {
         }
     }
 
-    /// Opens `body` in place.
+    /// Opens `body` in place. `None`: the connection is over on this side and its keys are gone, which it
+    /// had before anything was sealed with them.
     ///
     /// # Errors
     /// [`RefusedMessage`]; nothing of the payload is handed on before its tag was verified.
@@ -158,30 +159,28 @@ impl Protection {
         &self,
         body: &'a mut [u8],
         route: Route,
-    ) -> Result<Opened<'a>, RefusedMessage> {
+    ) -> Result<Option<Opened<'a>>, RefusedMessage> {
         let plain: &[u8] = match self {
             Self::Link => body,
             Self::Envelope { keyring, keys, connection } => {
-                let range = keys.with_receiver(keyring, |now, receiver| {
-                    let refused = |text: String| RefusedMessage::Envelope { text };
-                    let opener = receiver
-                        .opener(*connection)
-                        .ok_or_else(|| refused("the connection has no keys".into()))?;
+                let opened = keys.with_receiver(keyring, |now, receiver| {
+                    let Some(opener) = receiver.opener(*connection) else { return Ok(None) };
                     let start = body.as_ptr().addr();
                     match opener.open_in_place(now, route, body) {
                         Ok(plain) => {
                             let at = plain.as_ptr().addr() - start;
-                            Ok(at..at + plain.len())
+                            Ok(Some(at..at + plain.len()))
                         }
-                        Err(error) => Err(refused(cause(&error))),
+                        Err(error) => Err(RefusedMessage::Envelope { text: cause(&error) }),
                     }
                 })?;
+                let Some(range) = opened else { return Ok(None) };
                 &body[range]
             }
         };
         let (header, payload) =
             inner::Header::decode(plain).map_err(|e| RefusedMessage::Malformed(e.to_string()))?;
-        Ok(Opened { header, sent: payload })
+        Ok(Some(Opened { header, sent: payload }))
     }
 }
 

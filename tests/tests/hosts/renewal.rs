@@ -146,6 +146,31 @@ fn what_waits_is_not_lost(key_mode: &str) {
     assert_eq!(subscription.lost(), 0);
 }
 
+/// What a link still carries when its key is at its end is counted, and nobody is blamed for it.
+#[test]
+fn in_messages10_what_waits_longer_than_its_key_may_live_is_nobodys_fault() {
+    let kmes = Kmes::start();
+    let more = [
+        ("AXON_QKD_KEY_MODE", "messages10"),
+        ("AXON_QKD_SESSION_MAX_AGE", "4"),
+        ("AXON_RING_BUFFER_SIZE_MB", "1"),
+        ("AXON_MAX_MESSAGE_MB", "1"),
+    ];
+    let [a, b] = Plan::new([0, 1].map(|host| kmes.settings(host, &more))).start();
+    let (here, there) = (a.session("publisher"), b.session("subscription"));
+    let spec = || EndpointSpec::new("/kept", "test/Bytes", Qos::keep_all());
+    let subscription = there.create_subscription(spec()).unwrap();
+    let publisher = here.create_publisher(spec()).unwrap();
+    assert!(publisher.wait_matched(1, PATIENCE) && subscription.wait_matched(1, PATIENCE));
+    fill(&publisher);
+    until("what is left of the old link is counted", || {
+        let links = b.status().links;
+        links.iter().any(|link| link.dropped.get("no_link").is_some_and(|lost| *lost > 0))
+    });
+    let refusals = b.status().refusals;
+    assert!(refusals.iter().all(|refusal| refusal.what != "ENVELOPE_REFUSED"), "{refusals:?}");
+}
+
 #[test]
 fn in_session_what_waits_for_its_reader_is_not_lost() {
     what_waits_is_not_lost("session");
