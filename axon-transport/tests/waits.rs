@@ -5,7 +5,7 @@ mod alone;
 
 use std::{
     sync::{
-        Arc, OnceLock,
+        Arc, Barrier, OnceLock,
         atomic::{AtomicBool, AtomicU64, Ordering},
     },
     thread,
@@ -16,7 +16,8 @@ use alone::alone;
 use axon_transport::{
     qos::Qos,
     session::{
-        EndpointSpec, GuardCondition, Publisher, Session, SessionError, Subscription, Waitable,
+        EndpointSpec, GuardCondition, OnNew, Publisher, Session, SessionError, Subscription,
+        Waitable,
     },
 };
 
@@ -307,6 +308,33 @@ fn a_callback_that_replaces_another_is_not_told_what_that_one_was() {
     set("fourth");
     publish();
     assert_eq!(told.recv_timeout(PATIENCE), Ok(("fourth", 1)));
+}
+
+/// Whichever thread comes last: a callback that stays set is told of what comes.
+#[test]
+fn a_callback_that_is_set_while_another_thread_unsets_it_is_told_or_gone() {
+    let session = alone();
+    let (publisher, subscription) = pair(&session, "/t");
+    let both = Barrier::new(2);
+    for round in 0..500 {
+        let (sender, told) = std::sync::mpsc::channel();
+        let callback: OnNew = Arc::new(move |new| sender.send(new).unwrap());
+        thread::scope(|scope| {
+            scope.spawn(|| {
+                both.wait();
+                subscription.set_on_new_sample(Some(callback.clone())).unwrap();
+            });
+            both.wait();
+            subscription.set_on_new_sample(None).unwrap();
+        });
+        publisher.publish(b"x").unwrap();
+        if Arc::strong_count(&callback) > 1 {
+            assert_eq!(told.recv_timeout(PATIENCE), Ok(1), "in round {round}");
+        }
+        subscription.set_on_new_sample(None).unwrap();
+        while subscription.take(&mut Vec::new()).is_some() {}
+        assert_eq!(Arc::strong_count(&callback), 1);
+    }
 }
 
 #[test]
