@@ -105,7 +105,8 @@ impl Publisher {
     /// One that is to be read on this host is so at once, whether or not it has been taken. One for
     /// another host is when this host's daemon has taken it over: it is sealed and sent from then on
     /// whatever becomes of the publisher, but the other host has not said that it came. Where a link
-    /// breaks, what was on its way is lost, and the subscriptions there count it.
+    /// breaks, what was on its way is lost, and the subscriptions there count it when a later sample of
+    /// this publisher comes: nothing else tells them of its last ones.
     ///
     /// Where the session shares no memory (`AXON_SHM`), one for another process is when the session's
     /// relay has taken it. From there it crosses even if the publisher is dropped, but not if the
