@@ -274,6 +274,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             role: EndpointRole::Relay,
             stands_for: vec![reader, writer],
             ring: Some(place),
+            only: Some(writer),
         }),
         Message::EndpointGone(Gone { gid: reader }),
         Message::Graph(Graph {
@@ -291,7 +292,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             lane: place,
             qos: Qos::default(),
             session,
-            stands_for: vec![reader],
+            stands_for: Some(vec![reader]),
             segments: vec![segment],
         }),
         Message::Grant(Granted {

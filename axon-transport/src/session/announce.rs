@@ -93,15 +93,6 @@ impl Session {
         Ok(Publisher { inner, writer, session: self.clone() })
     }
 
-    pub(super) fn add_subscription(
-        &self,
-        endpoint: Endpoint,
-        role: EndpointRole,
-        stands_for: Vec<Gid>,
-    ) -> Subscription {
-        self.add_reader(SubscriptionInner::new(endpoint, role, stands_for))
-    }
-
     pub(super) fn add_reader(&self, inner: SubscriptionInner) -> Subscription {
         let inner = Arc::new(inner);
         self.announce(None, Some(&inner));

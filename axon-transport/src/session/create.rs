@@ -103,7 +103,7 @@ impl Session {
 
     /// A subscription as another process of the session describes it, under its GID there.
     pub(crate) fn adopt_subscription(&self, endpoint: Endpoint) -> Subscription {
-        self.add_subscription(endpoint, EndpointRole::Application, Vec::new())
+        self.add_reader(SubscriptionInner::new(endpoint, EndpointRole::Application, Vec::new()))
     }
 
     /// As [`adopt_subscription`](Self::adopt_subscription), a node.
@@ -129,8 +129,29 @@ impl Session {
         spec: EndpointSpec,
         stands_for: Vec<Gid>,
     ) -> Result<Subscription, SessionError> {
+        self.add_relay(spec, None, stands_for)
+    }
+
+    /// As [`create_relay`](Self::create_relay), of one publisher alone.
+    pub(crate) fn create_relay_of(
+        &self,
+        publisher: Gid,
+        spec: EndpointSpec,
+        stands_for: Vec<Gid>,
+    ) -> Result<Subscription, SessionError> {
+        self.add_relay(spec, Some(publisher), stands_for)
+    }
+
+    fn add_relay(
+        &self,
+        spec: EndpointSpec,
+        only: Option<Gid>,
+        stands_for: Vec<Gid>,
+    ) -> Result<Subscription, SessionError> {
         let endpoint = self.endpoint(spec, EndpointKind::Subscription)?;
-        Ok(self.add_subscription(endpoint, EndpointRole::Relay, stands_for))
+        let mut inner = SubscriptionInner::new(endpoint, EndpointRole::Relay, stands_for);
+        inner.only = only;
+        Ok(self.add_reader(inner))
     }
 }
 

@@ -76,7 +76,7 @@ impl Shared {
             lane,
             qos: reader.qos,
             peer: peer.clone(),
-            stands_for: Vec::new(),
+            stands_for: None,
         })?;
         if let Accept::Map(lane) = slots.accept(from, grant) {
             let max_message = self.config.max_message;

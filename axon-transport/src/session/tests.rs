@@ -157,7 +157,7 @@ impl Far {
     /// Its answer to a reader that asked.
     fn grant(&self, attach: &Attach) -> Granted {
         let Attach { reader, writer, lane, qos, .. } = *attach;
-        let (peer, stands_for) = (self.view.clone(), Vec::new());
+        let (peer, stands_for) = (self.view.clone(), None);
         let info = ReaderInfo { gid: reader, lane, qos, peer, stands_for };
         let Grant { generation, first } = self.writer.attach(info).unwrap();
         let (session, ring) = (self.session.id(), self.writer.location());

@@ -122,10 +122,9 @@ impl Audience {
     pub(super) fn readers(&self) -> Vec<Gid> {
         let mut gids = Vec::new();
         for Attached { info, .. } in &self.readers {
-            if info.stands_for.is_empty() {
-                gids.push(info.gid);
-            } else {
-                gids.extend_from_slice(&info.stands_for);
+            match &info.stands_for {
+                Some(others) => gids.extend_from_slice(others),
+                None => gids.push(info.gid),
             }
         }
         gids

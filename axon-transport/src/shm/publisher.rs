@@ -126,8 +126,7 @@ impl Publisher {
         } else {
             self.context.peer(session, descriptors)?
         };
-        let stands_for = Vec::new();
-        let info = ReaderInfo { gid, lane, qos, peer: peer.clone(), stands_for };
+        let info = ReaderInfo { gid, lane, qos, peer: peer.clone(), stands_for: None };
         let Grant { generation, first } = self.writer.attach(info)?;
         let (session, writer) = (self.context.id(), self.gid());
         let ring = self.writer.location();

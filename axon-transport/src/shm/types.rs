@@ -31,14 +31,14 @@ pub struct ReaderInfo {
     pub qos: Qos,
     /// Its session.
     pub peer: Peer,
-    /// The remote subscriptions that it stands for when it is a relay.
-    pub stands_for: Vec<Gid>,
+    /// The subscriptions elsewhere that it stands for when it is a relay; `None` when it reads for itself.
+    pub stands_for: Option<Vec<Gid>>,
 }
 
 impl ReaderInfo {
     /// Whether it reads for subscriptions elsewhere.
     pub(super) fn is_relay(&self) -> bool {
-        !self.stands_for.is_empty()
+        self.stands_for.as_ref().is_some_and(|gids| !gids.is_empty())
     }
 }
 

@@ -333,7 +333,7 @@ fn attach(session: &Arc<SessionSegment>, writer: &Writer, qos: Qos) -> Reader {
         lane: lane.location(),
         qos,
         peer: peer.clone(),
-        stands_for: Vec::new(),
+        stands_for: None,
     };
     let grant = writer.attach(info).expect("an attachment");
     let (writer_gid, max_message) = (writer.gid(), LARGEST);

@@ -101,7 +101,7 @@ impl Wire {
     /// What the publisher attaches; with it the reader's segments, to be looked at from outside.
     pub(crate) fn take_request(&self, qos: Qos) -> (ReaderInfo, Vec<OwnedFd>) {
         let (peer, gid, lane, seen) = self.meet();
-        let (peer, stands_for) = (Peer::Remote(peer), Vec::new());
+        let (peer, stands_for) = (Peer::Remote(peer), None);
         (ReaderInfo { gid, lane, qos, peer, stands_for }, seen)
     }
 

@@ -78,7 +78,8 @@ fn announce(gid: Gid, kind: EndpointKind, role: EndpointRole) -> Message {
         namespace: String::new(),
         enclave: String::new(),
     };
-    Message::Endpoint(Announce { endpoint, role, stands_for: Vec::new(), ring: None })
+    let (stands_for, ring, only) = (Vec::new(), None, None);
+    Message::Endpoint(Announce { endpoint, role, stands_for, ring, only })
 }
 
 fn piece(publisher: Gid, length: Option<u32>, bytes: usize) -> Message {

@@ -77,6 +77,46 @@ fn who_is_gone_and_back_at_once_is_received_from_anew() {
     }
 }
 
+/// Waits until what the session's process has heard of its endpoints has come to all that it may come to
+/// there: a pair that is asked for later stands.
+fn settle(session: &Session, socket: &OwnedFd) {
+    let own = session.create_subscription(spec("/settled", Qos::default())).unwrap();
+    announced(socket, own.gid());
+    let gid = Gid::new(SessionId([9; 16]), 99);
+    show_as(socket, gid, own.endpoint(), EndpointKind::Publisher);
+    matched(socket, own.gid(), &[gid]);
+    until("it is received from", || own.matched() == [gid]);
+}
+
+#[test]
+fn whom_the_daemon_names_for_another_publisher_is_not_counted() {
+    let host = host();
+    let (session, socket) = played(&host);
+    let publisher = |qos| {
+        let own = session.create_publisher(spec("/t", qos)).unwrap();
+        announced(&socket, own.gid());
+        own
+    };
+    let first = publisher(best_effort(1));
+    let outside = show(&socket, first.endpoint(), EndpointKind::Subscription);
+    matched(&socket, first.gid(), &[outside]);
+    until("it counts the one outside", || first.matched() == [outside]);
+    let others = [best_effort(1), best_effort(500), Qos::default(), latched(5)].map(publisher);
+    settle(&session, &socket);
+    for other in others {
+        assert_eq!(other.matched(), [], "{:?}", other.endpoint().qos);
+        matched(&socket, other.gid(), &[outside]);
+        until("it counts the one outside", || other.matched() == [outside]);
+        let number = other.publish(b"x").unwrap();
+        let credit = Credit { publisher: other.gid(), bytes: 1000, opens: Some(9), client: None };
+        say_to(&socket, &Message::Credit(credit));
+        let piece = hear(&socket, |m| matches!(m, Message::Piece(_)));
+        let Some(Message::Piece(piece)) = piece else { panic!("it hangs up") };
+        let Head { sequence, lost, .. } = piece.head.unwrap();
+        assert_eq!((piece.publisher, sequence, lost), (other.gid(), number, 0));
+    }
+}
+
 #[test]
 fn a_session_ends_though_nobody_takes_what_it_left() {
     let host = host();

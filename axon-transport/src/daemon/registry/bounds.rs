@@ -59,7 +59,8 @@ fn announce_as(
 ) {
     let place = Location { segment: 0, offset: 4096 };
     let ring = (endpoint.kind == EndpointKind::Publisher).then_some(place);
-    let message = Message::Endpoint(Announce { endpoint, role, stands_for: vec![], ring });
+    let announce = Announce { endpoint, role, stands_for: vec![], ring, only: None };
+    let message = Message::Endpoint(announce);
     registry.message(&id(session), message, vec![]).unwrap();
 }
 
@@ -245,7 +246,7 @@ fn memory_that_is_given_up_does_not_wait_for_who_is_stopped() {
     announce(&mut registry, 2, 1, EndpointKind::Subscription);
     let (writer, reader) = (Gid::new(id(1), 1), Gid::new(id(2), 1));
     let (lane, qos) = (Location { segment: 0, offset: 4096 }, Qos::default());
-    let (stands_for, segments) = (vec![], vec![]);
+    let (stands_for, segments) = (None, vec![]);
     let attach = Attach { reader, writer, lane, qos, session: id(2), stands_for, segments };
     registry.message(&id(2), Message::Attach(attach), vec![]).unwrap();
     let (generation, first, segments) = (1, 0, vec![]);
@@ -304,7 +305,7 @@ fn who_leaves_is_shown_to_nobody_and_read_to_its_end() {
         lane: place,
         qos: Qos::default(),
         session: id(2),
-        stands_for: Vec::new(),
+        stands_for: None,
         segments: Vec::new(),
     };
     registry.message(&id(2), Message::Attach(attach), vec![]).unwrap();

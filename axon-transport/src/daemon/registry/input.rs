@@ -96,11 +96,14 @@ impl<F: Clone> Registry<F> {
     }
 
     fn announce(&mut self, id: &SessionId, announce: Announce) -> Result<(), Violation> {
-        let Announce { endpoint, role, stands_for, ring } = announce;
+        let Announce { endpoint, role, stands_for, ring, only } = announce;
         let gid = endpoint.gid;
         // A server has a ring for each of its clients, of which GRANT speaks.
         if ring.is_some() != matches!(endpoint.kind, EndpointKind::Publisher | EndpointKind::Client)
         {
+            return Err(Violation::Unexpected);
+        }
+        if only.is_some() && role != EndpointRole::Relay {
             return Err(Violation::Unexpected);
         }
         let Some(entry) = self.sessions.get(id) else { return Ok(()) };
@@ -145,7 +148,7 @@ impl<F: Clone> Registry<F> {
             self.graph_add_local(&endpoint);
         }
         let local =
-            LocalEndpoint { session: *id, endpoint, role, stands_for, ring, leaving: false };
+            LocalEndpoint { session: *id, endpoint, role, stands_for, only, ring, leaving: false };
         self.index(&local);
         self.endpoints.insert(gid, local);
         self.match_endpoint(&gid);

@@ -31,7 +31,8 @@ impl<F: Clone> Registry<F> {
             else {
                 continue;
             };
-            if !roles_match(w.role, r.role) || w.leaving || r.leaving {
+            let reads = r.only.is_none_or(|only| only == pair.writer);
+            if !reads || !roles_match(w.role, r.role) || w.leaving || r.leaving {
                 continue;
             }
             // One that has come back.

@@ -135,6 +135,8 @@ pub struct LocalEndpoint {
     pub role: EndpointRole,
     /// A relay's remote subscriptions.
     pub stands_for: Vec<Gid>,
+    /// The only writer that a relay reads, where it is not all.
+    pub only: Option<Gid>,
     /// Where a writer's ring is.
     pub ring: Option<Location>,
     /// It has ended, but what it has written is not all in its ring yet.

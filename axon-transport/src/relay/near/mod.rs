@@ -14,7 +14,7 @@ use std::{
 };
 
 use self::{
-    relays::{Group, Relay, take},
+    relays::Relay,
     stand_ins::StandIn,
 };
 use super::{
@@ -178,9 +178,8 @@ struct Served<'a> {
     parting: BTreeSet<Gid>,
     /// With whom the daemon says they are matched.
     matched: HashMap<Gid, BTreeSet<Gid>>,
-    relays: BTreeMap<Group, Relay>,
-    /// Samples of the session's publishers that were lost here, as far as the daemon knows.
-    lost: HashMap<Gid, u64>,
+    /// One for each of its publishers of which something crosses.
+    relays: BTreeMap<Gid, Relay>,
     stand_ins: BTreeMap<Gid, StandIn>,
     /// What the session's clients ask.
     calls: Calls,
@@ -211,7 +210,6 @@ impl<'a> Served<'a> {
             parting: BTreeSet::new(),
             matched: HashMap::new(),
             relays: BTreeMap::new(),
-            lost: HashMap::new(),
             stand_ins: BTreeMap::new(),
             calls: Calls::default(),
             asking: HashMap::new(),
@@ -244,7 +242,7 @@ impl<'a> Served<'a> {
             let stand_ins = &self.stand_ins;
             let find = |gid: &Gid| stand_ins.get(gid).map(StandIn::face);
             self.pipe.write(find, |gid, samples| common.shared.lost(gid, samples))?;
-            let (own, relays, lost) = (&self.own, &self.relays, &mut self.lost);
+            let (own, relays) = (&self.own, &mut self.relays);
             let (calls, settling) = (&mut self.calls, &self.settling);
             let sent = self.pipe.send(|channel| {
                 let Channel { writer, client } = channel;
@@ -254,10 +252,10 @@ impl<'a> Served<'a> {
                     endpoint if endpoint.kind == EndpointKind::Client => {
                         calls.request(writer, find)
                     }
-                    endpoint => take(endpoint, relays, lost),
+                    _ => relays.get_mut(writer)?.take(writer),
                 }
             })?;
-            let passed = self.pass_over() | self.calls.pass_over(find);
+            let passed = self.calls.pass_over(find);
             if common.finishes() {
                 let by = *finish_by.get_or_insert_with(|| Instant::now() + LINGER);
                 if self.is_drained() || Instant::now() >= by {
@@ -365,6 +363,7 @@ impl<'a> Served<'a> {
                 role: EndpointRole::Application,
                 stands_for: Vec::new(),
                 ring: None,
+                only: None,
             }))?;
             self.own.insert(*gid, Arc::clone(endpoint));
             // A server's responses are a channel for each of its clients.
@@ -385,7 +384,6 @@ impl<'a> Served<'a> {
         } else {
             self.matched.remove(&gid);
         }
-        self.lost.remove(&gid);
         self.callers.remove(&gid);
         self.asking.remove(&gid);
         self.pipe.outgoing.retain(|channel| channel.writer != gid);
@@ -399,7 +397,7 @@ impl<'a> Served<'a> {
     /// Whether all that an endpoint has written is with the daemon.
     fn has_left(&self, endpoint: &Endpoint) -> bool {
         match endpoint.kind {
-            EndpointKind::Publisher => self.is_published(endpoint),
+            EndpointKind::Publisher => self.is_published(&endpoint.gid),
             EndpointKind::Client => self.is_asked(&endpoint.gid),
             EndpointKind::Server => self.is_answered(&endpoint.gid),
             EndpointKind::Subscription | EndpointKind::Node => true,

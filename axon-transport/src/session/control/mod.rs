@@ -211,14 +211,16 @@ impl Control {
                             role: publisher.role,
                             stands_for: Vec::new(),
                             ring: publisher.rings.shared().map(|writer| writer.location()),
+                            only: None,
                         };
                         self.say(Message::Endpoint(announce));
                     } else if let Some(subscription) = state.subscriptions.get(&gid) {
                         let announce = Announce {
                             endpoint: subscription.endpoint.clone(),
                             role: subscription.role,
-                            stands_for: stands_for(subscription),
+                            stands_for: stands_for(subscription).unwrap_or_default(),
                             ring: None,
+                            only: subscription.only,
                         };
                         self.outbox.push_back((Message::Endpoint(announce), Vec::new()));
                         if subscription.role == EndpointRole::Relay {
@@ -234,6 +236,7 @@ impl Control {
                             role: EndpointRole::Application,
                             stands_for: Vec::new(),
                             ring: None,
+                            only: None,
                         };
                         self.outbox.push_back((Message::Endpoint(announce), Vec::new()));
                     }
@@ -360,8 +363,11 @@ impl Control {
     }
 }
 
-fn stands_for(subscription: &SubscriptionInner) -> Vec<Gid> {
-    let mut gids = subscription.stands_for();
-    gids.truncate(MAX_STANDS_FOR);
-    gids
+/// For whom a relay reads.
+fn stands_for(subscription: &SubscriptionInner) -> Option<Vec<Gid>> {
+    (subscription.role == EndpointRole::Relay).then(|| {
+        let mut gids = subscription.stands_for();
+        gids.truncate(MAX_STANDS_FOR);
+        gids
+    })
 }

@@ -150,6 +150,9 @@ pub struct Announce {
     /// Where a writer's ring is in its session's memory.
     #[n(3)]
     pub ring: Option<Location>,
+    /// The only writer that a relay reads; `None` when it reads all that go with it.
+    #[n(4)]
+    pub only: Option<Gid>,
 }
 
 /// An endpoint is gone.
@@ -229,9 +232,9 @@ pub struct Attach {
     /// The reader's session.
     #[n(4)]
     pub session: SessionId,
-    /// The remote subscriptions that the reader stands for.
+    /// The subscriptions elsewhere that a relay stands for; `None` of a reader that is none.
     #[n(5)]
-    pub stands_for: Vec<Gid>,
+    pub stands_for: Option<Vec<Gid>>,
     /// The segments of the reader's session that come along.
     #[n(6)]
     pub segments: Vec<Segment>,

@@ -45,6 +45,7 @@ fn messages() -> Vec<Message> {
             role: EndpointRole::Relay,
             stands_for: vec![reader, writer],
             ring: Some(Location { segment: 0, offset: 4096 }),
+            only: Some(writer),
         }),
         Message::EndpointGone(Gone { gid: reader }),
         Message::Graph(Graph {
@@ -62,7 +63,7 @@ fn messages() -> Vec<Message> {
             lane: Location { segment: 3, offset: 1 << 33 },
             qos: Qos::default(),
             session,
-            stands_for: vec![],
+            stands_for: Some(vec![]),
             segments: vec![Segment { number: 3, publisher: None }],
         }),
         Message::Grant(Granted {

@@ -30,6 +30,8 @@ pub(in crate::session) struct SubscriptionInner {
     pub(super) shared_depth: Option<u32>,
     /// Whether it is never matched with publishers of its own session.
     pub(in crate::session) ignores_local: bool,
+    /// The only publisher that a relay reads, where it is not all.
+    pub(in crate::session) only: Option<Gid>,
     /// Whether a writer's numbers rise: the responses of a server come in whatever order it likes.
     pub(super) rising: bool,
     pub(in crate::session) role: EndpointRole,
@@ -65,6 +67,7 @@ impl SubscriptionInner {
             qos,
             shared_depth: None,
             ignores_local: false,
+            only: None,
             rising: true,
             role,
             events,

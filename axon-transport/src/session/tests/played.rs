@@ -46,7 +46,7 @@ impl Taker {
     }
 
     /// Has it attached to a publisher as one that stands for others, or not.
-    fn attach(&self, to: &Publisher, stands_for: Vec<Gid>, daemon: &Daemon) -> Taking {
+    fn attach(&self, to: &Publisher, stands_for: Option<Vec<Gid>>, daemon: &Daemon) -> Taking {
         let (writer, qos) = (to.gid(), to.endpoint().qos);
         let lane = self.session.allocate_lane().unwrap();
         let attach = Attach {
@@ -137,7 +137,7 @@ fn a_subscription_is_counted_once_it_is_reached() {
         appears(&daemon, taker.endpoint(&publisher));
         has_heard(&daemon, &asking);
         let held = !shows(&session, taker.gid);
-        let mut taking = taker.attach(&publisher, Vec::new(), &daemon);
+        let mut taking = taker.attach(&publisher, None, &daemon);
         assert!(session.wait_graph(EVER, |graph| graph.endpoints.contains_key(&taker.gid)));
         let number = publisher.publish(b"x").unwrap();
         assert_eq!(taking.take(&daemon), number);
@@ -188,7 +188,7 @@ fn a_sample_is_acknowledged_when_whoever_carries_it_away_has_it() {
     let (session, daemon) = session();
     let publisher = publisher(&session, Qos::default());
     let elsewhere = vec![Gid([5; 16])];
-    let mut taking = Taker::new().attach(&publisher, elsewhere, &daemon);
+    let mut taking = Taker::new().attach(&publisher, Some(elsewhere), &daemon);
     until("it is matched", || publisher.matched() == [Gid([5; 16])]);
     assert!(publisher.wait_acknowledged(Duration::ZERO), "nothing was published");
     let room = || session.segment().armed_word(Purpose::Room);
@@ -217,7 +217,7 @@ fn a_sample_is_acknowledged_when_whoever_carries_it_away_has_it() {
 fn a_reliable_publisher_is_held_up_by_who_takes_nothing_and_goes_on_when_it_does() {
     let (session, daemon) = session();
     let publisher = publisher(&session, Qos::keep_all());
-    let mut taking = Taker::new().attach(&publisher, vec![Gid([5; 16])], &daemon);
+    let mut taking = Taker::new().attach(&publisher, Some(vec![Gid([5; 16])]), &daemon);
     let sample = vec![7; 1 << 19];
     let mut published = 0;
     while publisher.publish(&sample).is_ok() {

@@ -70,7 +70,7 @@ fn a_process_gets_no_more_lanes_of_a_ring_than_it_may() {
             lane: lane.location(),
             qos: keep_last(1),
             peer: from[which].clone(),
-            stands_for: Vec::new(),
+            stands_for: None,
         })
     };
     let mut lanes = Vec::new();

@@ -44,7 +44,7 @@ fn untold(
         let (asked, descriptors, line) = channel.await_asked().unwrap();
         let Asked { session: id, reader, lane, qos } = asked;
         let peer = Peer::Remote(PeerSession::map(id, descriptors).unwrap());
-        let info = ReaderInfo { gid: reader, lane, qos, peer, stands_for: Vec::new() };
+        let info = ReaderInfo { gid: reader, lane, qos, peer, stands_for: None };
         let Grant { generation, first } = writer.attach(info).unwrap();
         let (session_id, ring) = (session.id(), writer.location());
         let writer = writer.gid();

@@ -102,7 +102,7 @@ fn the_largest_fits_at_depth_one_whatever_the_budget() {
         lane: lane.location(),
         qos: keep_last(1),
         peer: peer(&a, &b),
-        stands_for: Vec::new(),
+        stands_for: None,
     };
     let grant = writer.attach(info).unwrap();
     let options = ReaderOptions {
@@ -278,13 +278,16 @@ fn attaching_again_changes_nothing_but_whom_a_relay_stands_for() {
         lane: lanes[0].location(),
         qos: keep_last(5),
         peer: peer(&a, &b),
-        stands_for: Vec::new(),
+        stands_for: None,
     };
     assert!(!writer.has_readers());
     let grant = writer.attach(info.clone()).unwrap();
     assert_eq!(writer.readers(), [info.gid]);
     writer.publish(meta(0), b"x").unwrap();
-    info.stands_for = relayed.clone();
+    info.stands_for = Some(Vec::new());
+    assert_eq!(writer.attach(info.clone()).unwrap(), grant);
+    assert_eq!(writer.readers(), [], "it stands for nobody");
+    info.stands_for = Some(relayed.clone());
     assert_eq!(writer.attach(info.clone()).unwrap(), grant);
     assert_eq!(writer.readers(), relayed);
     // Another lane is another attachment.
@@ -451,7 +454,7 @@ fn one_who_carries_samples_on_from_later_has_none_of_those_before_to_hand_over()
         lane: lane.location(),
         qos: keep_last(10),
         peer: Peer::Local(a.clone()),
-        stands_for: vec![gid],
+        stands_for: Some(vec![gid]),
     };
     assert_eq!(writer.attach(info).unwrap().first, 3);
     // Somebody has waited since the first of the three.

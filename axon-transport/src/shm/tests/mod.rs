@@ -126,7 +126,7 @@ fn attach_to(
             lane: lane.location(),
             qos,
             peer: peer(publisher, reader),
-            stands_for: Vec::new(),
+            stands_for: None,
         })
         .unwrap();
     let options = ReaderOptions {

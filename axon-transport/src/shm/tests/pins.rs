@@ -470,7 +470,7 @@ fn a_lane_that_passes_on_unseen_is_another_attachment() {
         lane: lane.location(),
         qos: Qos::keep_all(),
         peer: peer(&a, &b),
-        stands_for: Vec::new(),
+        stands_for: None,
     };
     let before = writer.attach(info.clone()).unwrap();
     publish(&writer, 0, 10);
@@ -497,7 +497,7 @@ fn asking_for_ever_takes_no_memory() {
             lane: lanes[round % 3].location(),
             qos: keep_last(1),
             peer: peer(&a, &b),
-            stands_for: Vec::new(),
+            stands_for: None,
         };
         grants.push(writer.attach(info).unwrap());
         assert!(writer.detach(Gid::new(b.id(), 1)));

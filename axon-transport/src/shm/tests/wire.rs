@@ -106,8 +106,7 @@ impl Wire {
     pub(super) fn serve(&self, session: &SessionSegment, writer: &Writer, qos: Qos) {
         self.send_session(session, writer.location(), writer.gid());
         let (peer, lane, gid) = self.receive_session();
-        let stands_for = Vec::new();
-        let info = ReaderInfo { gid, lane, qos, peer: Peer::Remote(peer), stands_for };
+        let info = ReaderInfo { gid, lane, qos, peer: Peer::Remote(peer), stands_for: None };
         let grant = writer.attach(info).unwrap();
         self.send_numbers(&[grant.generation, grant.first]);
     }

@@ -66,7 +66,7 @@ const DESCRIPTORS_KEEP_ALL: u64 = 1 << 13;
 ///     lane: lane.location(),
 ///     qos: Qos::default(),
 ///     peer: peer.clone(),
-///     stands_for: Vec::new(),
+///     stands_for: None,
 /// })?;
 /// let mut reader = Reader::map(ReaderOptions {
 ///     reader: reader_gid,

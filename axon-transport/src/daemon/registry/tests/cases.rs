@@ -26,7 +26,8 @@ fn what_no_session_does_is_a_violation() {
 
     let writer = endpoint(Gid::new(own, 1), EndpointKind::Publisher, 0, Qos::default());
     let role = EndpointRole::Application;
-    let placeless = Announce { endpoint: writer.clone(), role, stands_for: vec![], ring: None };
+    let endpoint = writer.clone();
+    let placeless = Announce { endpoint, role, stands_for: vec![], ring: None, only: None };
     let placeless = registry.message(&own, Message::Endpoint(placeless), vec![]);
     assert_eq!(placeless, Err(Violation::Unexpected));
     let segment = Segment { number: 3, publisher: None };

@@ -51,7 +51,7 @@ fn announce(endpoint: Endpoint) -> Message {
 fn announce_as(endpoint: Endpoint, role: EndpointRole) -> Message {
     let has = matches!(endpoint.kind, EndpointKind::Publisher | EndpointKind::Client);
     let ring = has.then_some(PLACE);
-    Message::Endpoint(Announce { endpoint, role, stands_for: vec![], ring })
+    Message::Endpoint(Announce { endpoint, role, stands_for: vec![], ring, only: None })
 }
 
 /// A session that does what the client does, without rings.
@@ -142,7 +142,7 @@ impl Client {
                         lane: PLACE,
                         qos: reader.qos,
                         session: self.id,
-                        stands_for: vec![],
+                        stands_for: None,
                         segments: vec![],
                     };
                     self.outgoing.push((Message::Attach(attach), vec![]));
