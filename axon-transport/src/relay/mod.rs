@@ -10,6 +10,8 @@
 //! [`flow`] is plain data: samples in pieces, and who may send how many of them. `pipe` moves them
 //! over the socket (`docs/formats.md`, section 10).
 
+use std::time::Duration;
+
 mod alive;
 mod calls;
 pub(crate) mod far;
@@ -31,5 +33,7 @@ const MAX_ENDPOINTS: usize = 1024;
 const MAX_CALLERS: usize = 1024;
 /// Others that one endpoint is said to be matched with; one packet holds no more.
 const MAX_MATCHED: usize = 1024;
+/// How long an end that ends waits for what was written before to have gone on.
+const LINGER: Duration = Duration::from_secs(1);
 /// Bytes of the reason for which a session is relayed.
 pub(crate) const MAX_REASON: usize = 200;

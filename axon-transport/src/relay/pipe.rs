@@ -7,7 +7,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::{
+    event::{PollFd, PollFlags, Timespec, poll},
+    net::{Shutdown, shutdown},
+};
 
 use super::{
     Tally,
@@ -68,6 +71,10 @@ pub(super) struct Pipe {
     /// from an earlier one of the same name.
     said: u64,
     heard: u64,
+    /// The other end is gone, and nothing is said to it any more.
+    gone: bool,
+    /// What it had said has been heard to its end.
+    over: bool,
     tally: Arc<Tally>,
     losses: Seldom,
 }
@@ -85,6 +92,8 @@ impl Pipe {
             blocked: false,
             said: 0,
             heard: 0,
+            gone: false,
+            over: false,
             tally,
             losses: Seldom::default(),
         }
@@ -92,6 +101,9 @@ impl Pipe {
 
     /// Queues a control message.
     pub(super) fn say(&mut self, message: &Message) -> Result<(), End> {
+        if self.gone {
+            return Ok(());
+        }
         let packet = message.encode().map_err(|e| End::Other(e.to_string()))?;
         self.waiting_bytes += packet.len();
         self.waiting.push_back(packet);
@@ -100,7 +112,7 @@ impl Pipe {
     }
 
     /// Whether there is something that the socket had no room for.
-    pub(super) fn is_full(&self) -> bool {
+    fn is_full(&self) -> bool {
         !self.waiting.is_empty()
     }
 
@@ -123,6 +135,26 @@ impl Pipe {
         self.arrived.retain(|channel, _| keep(channel));
     }
 
+    /// The other end is gone, or as good as that: what it has said is heard, and nothing is said to it
+    /// any more.
+    fn hang_up(&mut self) {
+        // Whoever has its end besides adds nothing, so that there is an end to what is to be heard.
+        let _ = shutdown(&self.socket, Shutdown::Both);
+        self.gone = true;
+        self.waiting.clear();
+        self.waiting_bytes = 0;
+    }
+
+    /// Whether the other end is gone and all that it had said is heard.
+    pub(super) fn is_over(&self) -> bool {
+        self.over
+    }
+
+    /// Samples that came and are not published.
+    pub(super) fn arrived(&self) -> usize {
+        self.arrived.values().map(VecDeque::len).sum()
+    }
+
     /// Takes packets; the messages among them that are not of samples, and whether there may be more.
     pub(super) fn receive(&mut self) -> Result<(Vec<Message>, bool), End> {
         let mut messages = Vec::new();
@@ -131,6 +163,11 @@ impl Pipe {
                 Ok(Received { message, descriptors }) if descriptors.is_empty() => message,
                 Ok(_) => return Err(End::Descriptors),
                 Err(SocketError::NotReady) => return Ok((messages, false)),
+                Err(SocketError::Closed) => {
+                    self.hang_up();
+                    self.over = true;
+                    return Ok((messages, false));
+                }
                 Err(error) => return Err(error.into()),
             };
             match message {
@@ -193,6 +230,9 @@ impl Pipe {
         &mut self,
         mut take: impl FnMut(&Channel) -> Option<Departing<Sample>>,
     ) -> Result<bool, End> {
+        if self.gone {
+            return Ok(false);
+        }
         for credit in self.incoming.grants() {
             self.say(&Message::Credit(credit))?;
         }
@@ -219,6 +259,10 @@ impl Pipe {
                     self.waiting.pop_front();
                 }
                 Err(SocketError::NotReady) => break,
+                Err(SocketError::Closed) => {
+                    self.hang_up();
+                    break;
+                }
                 Err(error) => return Err(error.into()),
             }
         }
@@ -227,25 +271,30 @@ impl Pipe {
 }
 
 impl Pipe {
-    /// Sleeps until there is something to do, for at most `left`; whether `end` became readable.
+    /// Sleeps until there is something to do, for at most `left`. The other end is gone once `end`, its
+    /// process, is readable.
     pub(super) fn sleep(
-        &self,
+        &mut self,
         leader: &ExternalLeader,
         news: &News,
         end: Option<BorrowedFd<'_>>,
         left: Option<Duration>,
-    ) -> bool {
+    ) {
         let out = if self.is_full() { PollFlags::OUT } else { PollFlags::empty() };
-        let mut fds = vec![
-            PollFd::new(&self.socket, PollFlags::IN | out),
-            PollFd::new(leader, PollFlags::IN),
-            PollFd::new(news, PollFlags::IN),
-        ];
+        let mut fds =
+            vec![PollFd::new(leader, PollFlags::IN), PollFd::new(news, PollFlags::IN)];
+        // What has come to its end is readable for ever.
+        if !self.over {
+            fds.push(PollFd::new(&self.socket, PollFlags::IN | out));
+        }
+        let end = end.filter(|_| !self.gone);
         fds.extend(end.map(|end| PollFd::from_borrowed_fd(end, PollFlags::IN)));
         // Nobody says when others have left room in the pool.
         let nap = self.incoming.is_short().then_some(NAP);
         let left = left.into_iter().chain(nap).min().and_then(|left| Timespec::try_from(left).ok());
         let _ = poll(&mut fds, left.as_ref());
-        fds.get(3).is_some_and(|end| !end.revents().is_empty())
+        if end.is_some() && fds.pop().is_some_and(|end| !end.revents().is_empty()) {
+            self.hang_up();
+        }
     }
 }

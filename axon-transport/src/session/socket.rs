@@ -169,7 +169,12 @@ pub fn send(
 /// for [`SocketError::NoDescriptors`]: the packet is gone, and the next ones may come whole.
 pub fn receive(socket: impl AsFd, buffer: &mut Vec<u8>) -> Result<Received, SocketError> {
     buffer.resize(MAX_PACKET + 1, 0);
-    let Packet { bytes, truncated, lost, descriptors } = passed::receive(socket, buffer)?;
+    let packet = match passed::receive(&socket, buffer) {
+        // Said once, before what the other end has sent: it closed without having read all of ours.
+        Err(Errno::CONNRESET) => passed::receive(&socket, buffer),
+        received => received,
+    };
+    let Packet { bytes, truncated, lost, descriptors } = packet?;
     if truncated || descriptors.len() > MAX_DESCRIPTORS {
         return Err(SocketError::Truncated);
     }
@@ -231,6 +236,18 @@ mod tests {
         assert_eq!(got.descriptors.len(), 2);
         assert_eq!(peer(&b).unwrap().pid, std::process::id());
         drop(a);
+        assert!(matches!(receive(&b, &mut Vec::new()), Err(SocketError::Closed)));
+    }
+
+    #[test]
+    fn what_was_said_is_heard_though_who_said_it_left_something_unread() {
+        let (a, b) = pair();
+        let message = Message::Resync.encode().unwrap();
+        [&b, &a, &a].iter().for_each(|from| send(from, &message, &[]).unwrap());
+        drop(a);
+        for _ in 0..2 {
+            assert_eq!(receive(&b, &mut Vec::new()).unwrap().message, Message::Resync);
+        }
         assert!(matches!(receive(&b, &mut Vec::new()), Err(SocketError::Closed)));
     }
 }

@@ -125,14 +125,114 @@ fn stop(daemon: &Kept) {
     waitid(id, WaitIdOptions::STOPPED).unwrap();
 }
 
-/// In a child: calls, and leaves the connection to a process that reads until the other end hangs up.
-pub(crate) fn call_and_leave() -> u32 {
+/// In a child: a relayed session that does as the test does.
+fn call() -> OwnedFd {
     let config = Config::from_env().unwrap();
     let socket = Address::of(&config).connect().unwrap();
     say_to(&socket, &Message::Hello(hello_of(&config)));
+    socket
+}
+
+/// In a child: calls, and leaves the connection to a process that reads until the other end hangs up.
+pub(crate) fn call_and_leave() -> u32 {
+    let socket = call();
     rustix::io::ioctl_fionbio(&socket, false).unwrap();
     let holder = Command::new("cat").stdin(socket).stdout(Stdio::null()).spawn();
     holder.expect("cat is there").id()
+}
+
+/// In a child: calls, and leaves the connection to a process that talks until the other end hangs up.
+pub(crate) fn call_and_have_it_talk() -> u32 {
+    let socket = call();
+    assert!(matches!(hear(&socket, |_| true), Some(Message::Welcome(_))));
+    rustix::io::ioctl_fionbio(&socket, false).unwrap();
+    let holder = Command::new("yes").stdin(Stdio::null()).stdout(socket).spawn();
+    holder.expect("yes is there").id()
+}
+
+/// The publisher of whoever speaks for itself.
+fn own() -> Gid {
+    Gid::new(SessionId([9; 16]), 1)
+}
+
+/// Has it publish as many as may be under way together.
+fn announce_and_await_credit(socket: &OwnedFd) {
+    say_to(socket, &announce(own(), EndpointKind::Publisher, EndpointRole::Application));
+    let credit = |m: &Message| matches!(m, Message::Credit(c) if c.publisher == own());
+    assert!(hear(socket, credit).is_some());
+}
+
+const SAID: u64 = 20;
+
+fn say_all(socket: &OwnedFd) {
+    for sequence in 1..=SAID {
+        let head = Some(Head { length: 10, sequence, source_timestamp: 0, lost: 0 });
+        let bytes = pattern(sequence, 10);
+        say_to(socket, &Message::Piece(Piece { publisher: own(), head, bytes, client: None }));
+    }
+}
+
+/// In a child: publishes when it is told to.
+pub(crate) fn publish_when_told() {
+    let socket = call();
+    assert!(matches!(hear(&socket, |_| true), Some(Message::Welcome(_))));
+    announce_and_await_credit(&socket);
+    say("credited");
+    std::io::stdin().read_line(&mut String::new()).unwrap();
+    say_all(&socket);
+    say("said");
+    wait_for_the_end();
+}
+
+#[test]
+fn what_was_said_before_the_connection_ended_is_heard() {
+    let host = host();
+    let daemon = host.daemon();
+    let listener = session(&host, "listener", true);
+    let subscription = listener.create_subscription(spec("/t", Qos::keep_all())).unwrap();
+    let socket = by_hand(&host, hello(&host));
+    announce_and_await_credit(&socket);
+    until("it is received from", || subscription.matched() == [own()]);
+    stop(&daemon);
+    say_all(&socket);
+    drop(socket);
+    signal(daemon.0.id(), Signal::CONT);
+    assert!(take_until(&subscription, SAID).into_iter().eq(1..=SAID));
+    until("it is gone", || subscription.matched().is_empty());
+}
+
+#[test]
+fn what_a_process_said_before_it_was_killed_is_heard() {
+    let host = host();
+    let daemon = host.daemon();
+    let listener = session(&host, "listener", true);
+    let subscription = listener.create_subscription(spec("/t", Qos::keep_all())).unwrap();
+    let mut publisher = host.play("publisher by hand");
+    assert_eq!(publisher.hear(), "credited");
+    until("it is received from", || subscription.matched() == [own()]);
+    stop(&daemon);
+    publisher.go();
+    assert_eq!(publisher.hear(), "said");
+    // Both its end and that of the connection are there to be seen before anything that it said is heard.
+    drop(publisher);
+    signal(daemon.0.id(), Signal::CONT);
+    assert!(take_until(&subscription, SAID).into_iter().eq(1..=SAID));
+    until("it is gone", || subscription.matched().is_empty());
+}
+
+#[test]
+fn who_talks_on_a_connection_after_its_process_ended_is_hung_up_on() {
+    let host = host();
+    let _daemon = host.daemon();
+    let mut caller = host.play("one that has another talk");
+    let pid: i32 = caller.hear().parse().unwrap();
+    let holder = pidfd_open(Pid::from_raw(pid).unwrap(), PidfdFlags::empty()).unwrap();
+    caller.finish();
+    let patience = PATIENCE.try_into().unwrap();
+    let ended = poll(&mut [PollFd::new(&holder, PollFlags::IN)], Some(&patience)).unwrap();
+    let _ = rustix::process::pidfd_send_signal(&holder, Signal::KILL);
+    assert_eq!(ended, 1, "the daemon does not hang up");
+    until("it is gone", || relays(&host.status().unwrap()).is_empty());
 }
 
 #[test]

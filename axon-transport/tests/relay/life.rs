@@ -37,6 +37,28 @@ fn a_process_that_is_killed_leaves_whole_samples_and_nothing_else() {
 }
 
 #[test]
+fn what_a_killed_process_left_for_who_takes_nothing_is_not_kept_for_ever() {
+    let host = host();
+    let _daemon = host.daemon();
+    let (relaying, listener) = (relaying(&host), session(&host, "listener", true));
+    let subscription = listener.create_subscription(spec("/t", Qos::keep_all())).unwrap();
+    let talker = relaying.play("talker");
+    let crossed = || relays(&host.status().unwrap()).iter().map(|r| r.samples_in).sum::<u64>();
+    let mut before = 0;
+    until("it is held back", || {
+        let now = crossed();
+        now > 0 && std::mem::replace(&mut before, now) == now
+    });
+    drop(talker);
+    until("nobody is relayed any more", || relays(&host.status().unwrap()).is_empty());
+    until("it is not counted", || subscription.matched().is_empty());
+    let mut bytes = Vec::new();
+    let numbers = std::iter::from_fn(|| Some(subscription.take(&mut bytes)?.sequence));
+    let numbers: Vec<u64> = numbers.collect();
+    assert!(numbers.len() as u64 >= before && numbers.iter().copied().eq(1..=numbers.len() as u64));
+}
+
+#[test]
 fn what_was_published_last_arrives_though_the_process_ends() {
     let host = host();
     let _daemon = host.daemon();

@@ -153,6 +153,8 @@ fn child() {
             std::io::stdin().read_line(&mut String::new()).unwrap();
             say(hostile::call_and_leave());
         }
+        "publisher by hand" => hostile::publish_when_told(),
+        "one that has another talk" => say(hostile::call_and_have_it_talk()),
         "caller" => {
             let client = session.create_client(services::service()).unwrap();
             assert!(client.wait_available(PATIENCE));

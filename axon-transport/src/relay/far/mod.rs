@@ -6,13 +6,14 @@ use std::{
     collections::{BTreeMap, BTreeSet, VecDeque},
     os::fd::{AsFd, OwnedFd},
     sync::Arc,
+    time::Instant,
 };
 
 use rustix::io::Errno;
 
 use self::matching::{Source, take};
 use super::{
-    MAX_CALLERS, MAX_ENDPOINTS, Pool, Tally,
+    LINGER, MAX_CALLERS, MAX_ENDPOINTS, Pool, Tally,
     alive::Alive,
     calls::{self, Calls},
     flow::{Channel, Incoming},
@@ -28,7 +29,7 @@ use crate::{
     session::{
         Face, Node, Session, SessionError, SessionOptions, Subscription,
         message::{Announce, EndpointRole, Leaving, Matched, Message, PROTOCOL, Refused, Welcome},
-        socket,
+        socket::{self, SocketError},
     },
     wait::ExternalLeader,
 };
@@ -57,7 +58,7 @@ impl Far {
         let id = self.id;
         match self.open().and_then(Served::serve) {
             Ok(()) => {}
-            Err(End::Socket(socket::SocketError::Closed)) => {
+            Err(End::Socket(SocketError::Closed)) => {
                 tracing::debug!(session = %id, "a relayed session ended");
             }
             Err(why) => tracing::warn!(session = %id, %why, "a relayed session was disconnected"),
@@ -73,7 +74,7 @@ impl Far {
         };
         let process = match socket::process(&socket) {
             Ok(process) => Some(process),
-            Err(socket::SocketError::System(Errno::SRCH)) => return Err(End::Gone),
+            Err(SocketError::System(Errno::SRCH)) => return Err(End::Gone),
             // It is served as long as somebody holds the connection.
             Err(error) => {
                 tracing::debug!(session = %id, %error, "the end of its process will not be seen");
@@ -180,6 +181,9 @@ impl Served {
             let (writers, tally) = (&self.writers, &self.tally);
             let find = |gid: &Gid| writers.get(gid);
             self.pipe.write(find, |_, samples| tally.lost(samples))?;
+            if self.pipe.is_over() {
+                return self.wind_up();
+            }
             let (sources, subscriptions) = (&mut self.sources, &self.subscriptions);
             let calls = &mut self.calls;
             let sent = self.pipe.send(|channel| {
@@ -197,10 +201,33 @@ impl Served {
                 continue;
             }
             let process = self.process.as_ref().map(AsFd::as_fd);
-            if self.pipe.sleep(&self.leader, &self.news, process, self.alive.left()) {
-                return Err(End::Gone);
+            self.pipe.sleep(&self.leader, &self.news, process, self.alive.left());
+        }
+    }
+
+    /// The process is gone, and was heard to the end: what it wrote goes to readers that make room for it
+    /// soon, while nobody counts it any more.
+    fn wind_up(mut self) -> Result<(), End> {
+        let end = Instant::now() + LINGER;
+        self.subscriptions.clear();
+        self.nodes.clear();
+        self.writers.values().for_each(|face| face.leave(true));
+        while self.pipe.blocked && !self.news.is_lost() && Instant::now() < end {
+            self.leader.clear();
+            self.leader.arm(true);
+            self.news.take();
+            let (writers, tally) = (&self.writers, &self.tally);
+            self.pipe.write(|gid| writers.get(gid), |_, samples| tally.lost(samples))?;
+            if self.pipe.blocked {
+                let left = end.saturating_duration_since(Instant::now());
+                self.pipe.sleep(&self.leader, &self.news, None, Some(left));
             }
         }
+        let samples = self.pipe.arrived();
+        if samples > 0 {
+            tracing::warn!(session = %self.id, samples, "what a process left is not taken: lost");
+        }
+        Err(SocketError::Closed.into())
     }
 
     fn handle(&mut self, message: Message) -> Result<(), End> {

@@ -18,7 +18,7 @@ use self::{
     stand_ins::StandIn,
 };
 use super::{
-    Pool, Tally,
+    LINGER, Pool, Tally,
     alive::Alive,
     calls::{self, Calls},
     flow::{Channel, Incoming},
@@ -34,12 +34,11 @@ use crate::{
         connect::{Caller, Connected},
         local::House,
         message::{Announce, EndpointRole, Gone, Graph, Leaving, Message, Refused},
+        socket::SocketError,
     },
     wait::ExternalLeader,
 };
 
-/// How long the end of a session waits for what its publishers left to be gone.
-const LINGER: Duration = Duration::from_secs(1);
 /// Between attempts to find a daemon.
 const MIN_PAUSE: Duration = Duration::from_millis(100);
 const MAX_PAUSE: Duration = Duration::from_secs(2);
@@ -242,6 +241,9 @@ impl<'a> Served<'a> {
             let stand_ins = &self.stand_ins;
             let find = |gid: &Gid| stand_ins.get(gid).map(StandIn::face);
             self.pipe.write(find, |gid, samples| common.shared.lost(gid, samples))?;
+            if self.pipe.is_over() {
+                return Err(SocketError::Closed.into());
+            }
             let (own, relays) = (&self.own, &mut self.relays);
             let (calls, settling) = (&mut self.calls, &self.settling);
             let sent = self.pipe.send(|channel| {
