@@ -4,10 +4,12 @@
 //! Plain data: time comes in as nanoseconds of one monotonic clock, and nothing is waited for.
 //! A session's control thread feeds these, and hands what is new to wait sets and callbacks.
 
+mod alive;
 mod deadline;
 mod liveliness;
 mod status;
 
+pub(crate) use alive::Alive;
 pub use deadline::Deadline;
 pub use liveliness::{Lease, Liveness};
 pub use status::{

@@ -142,14 +142,6 @@ impl StandIn {
         }
     }
 
-    /// The number of the next request of this client.
-    pub(super) fn next_of(&self, client: &Gid) -> Option<u64> {
-        match self.face() {
-            Face::Publisher(_) | Face::Client(_) => None,
-            Face::Server(server) => server.next_request_of(client),
-        }
-    }
-
     /// What goes to its host: the next request of this client, or response to it.
     pub(super) fn take_of(&self, client: &Gid) -> Option<Sample> {
         let (info, payload) = match self.face() {

@@ -3,11 +3,15 @@
 
 use std::collections::BTreeMap;
 
-use super::{
-    flow::{Channel, Departing},
-    merge::Merge,
+use super::flow::{Channel, Departing};
+use crate::{
+    ids::Gid,
+    session::{
+        Face,
+        merge::{Merge, Taken},
+    },
+    shm::Sample,
 };
-use crate::{ids::Gid, session::Face, shm::Sample};
 
 /// The channels to the other end that a relay's clients and servers call for, and how far they have got.
 #[derive(Default)]
@@ -35,14 +39,15 @@ impl Calls {
         client: &Gid,
         find: impl Fn(&Gid) -> Option<&'a Face>,
     ) -> Option<Departing<Sample>> {
-        self.requests.get_mut(client)?.next(|server| find(server)?.take_from(client).map(departing))
+        let requests = self.requests.get_mut(client)?;
+        requests.next(|server| find(server)?.take_from(client).map(taken)).map(Departing::from)
     }
 
     /// Takes the requests that were sent by way of another server; whether there are more.
     pub(super) fn pass_over<'a>(&mut self, find: impl Fn(&Gid) -> Option<&'a Face>) -> bool {
         let mut more = false;
         for (client, requests) in &mut self.requests {
-            more |= requests.pass_over(|server| find(server)?.take_from(client).map(departing));
+            more |= requests.pass_over(|server| find(server)?.take_from(client).map(taken));
         }
         more
     }
@@ -59,9 +64,9 @@ pub(super) fn response<'a>(
     find: impl Fn(&Gid) -> Option<&'a Face>,
 ) -> Option<Departing<Sample>> {
     let client = find(&channel.client?)?;
-    client.take_from(&channel.writer).map(departing)
+    client.take_from(&channel.writer).map(taken).map(Departing::from)
 }
 
-fn departing(content: Sample) -> Departing<Sample> {
-    Departing { meta: content.meta(), lost: 0, content }
+fn taken(content: Sample) -> Taken<Sample> {
+    Taken { number: content.meta().sequence, lost: 0, content }
 }

@@ -17,8 +17,11 @@ use std::{
 
 use crate::{
     ids::Gid,
-    session::message::{Credit, Head, Piece},
-    shm::Meta,
+    session::{
+        merge::Taken,
+        message::{Credit, Head, Piece},
+    },
+    shm::{Meta, Sample},
 };
 
 /// Bytes that a channel may have under way without asking.
@@ -71,7 +74,7 @@ pub trait Content {
     fn read_at(&self, at: usize, out: &mut [u8]) -> usize;
 }
 
-impl Content for crate::shm::Sample {
+impl Content for Sample {
     fn len(&self) -> usize {
         self.len()
     }
@@ -102,6 +105,12 @@ pub struct Departing<S> {
     pub lost: u64,
     /// Its bytes, which may stay where they are.
     pub content: S,
+}
+
+impl From<Taken<Sample>> for Departing<Sample> {
+    fn from(Taken { lost, content, .. }: Taken<Sample>) -> Self {
+        Self { meta: content.meta(), lost, content }
+    }
 }
 
 /// The sending end.

@@ -5,18 +5,16 @@
 //! application publishes, stand-ins write what it subscribes to, and all else works as with shared
 //! memory. In the daemon a session of the same id has the application's endpoints, in memory that
 //! everybody maps (`far`): to others, on this host and elsewhere, it is a session like any. Clients and
-//! servers stand for others and cross as topics do (`calls`), and so does who is alive (`alive`).
+//! servers stand for others and cross as topics do (`calls`), and who is alive is said apart.
 //!
 //! [`flow`] is plain data: samples in pieces, and who may send how many of them. `pipe` moves them
 //! over the socket (`docs/formats.md`, section 10).
 
 use std::time::Duration;
 
-mod alive;
 mod calls;
 pub(crate) mod far;
 pub mod flow;
-mod merge;
 pub(crate) mod near;
 mod news;
 mod pipe;

@@ -1,121 +1,284 @@
-//! One writer's messages by way of several readers of its ring, as where some ask for more of it than
-//! others, or came later: in the order of their numbers, and each once.
+//! What one writer writes and several readers of its ring have, as where some ask for more of it than
+//! others, or came later: each message once, in the order of their numbers.
+//!
+//! Whoever carries messages away from where they were written needs that: to another host, or to or from
+//! a process that shares no memory.
 
-/// What a look for a writer's next message finds.
-#[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Next<T> {
-    /// This one.
-    Taken(T),
-    /// One that came before by way of another reader, which has passed over it.
-    Repeated,
-    /// None of the readers has one.
-    Nothing,
+use std::collections::BTreeMap;
+
+use crate::ids::Gid;
+
+/// Messages of one reader that are passed over before others have their turn.
+const BATCH: usize = 64;
+
+/// A message that was taken.
+#[derive(Debug)]
+pub(crate) struct Taken<T> {
+    pub(crate) number: u64,
+    /// Of the writer's messages, those that the reader has lost by then. Of what is given on, those that
+    /// all have lost since the one before.
+    pub(crate) lost: u64,
+    pub(crate) content: T,
 }
 
-/// The next message of a writer: the first that any of the `readers` has, by way of the first of those
-/// that have it. `number` says which one a reader has next, `take` takes it. `sent` is the number of the
-/// newest that was handed out, 0 before the first.
-///
-/// A reader passes over what came by way of another when it is its turn, never before: those that go on
-/// alone, because the others end, have all that was not handed out.
-pub(crate) fn next<R, T>(
-    readers: &[R],
-    sent: &mut u64,
-    number: impl Fn(&R) -> Option<u64>,
-    take: impl FnOnce(&R) -> Option<(u64, T)>,
-) -> Next<T> {
-    let look = || {
-        let numbers = readers.iter().map(&number).enumerate();
-        numbers.filter_map(|(at, number)| Some((number?, at))).min()
-    };
-    let reader = match readers {
-        [only] => only,
-        // A reader that was looked at before the others may have got something earlier since. What
-        // was written before what the first look found is there by now: the second finds it.
-        _ => match look().and_then(|_| look()) {
-            Some((_, first)) => &readers[first],
-            None => return Next::Nothing,
-        },
-    };
-    match take(reader) {
-        Some((number, taken)) if number > *sent => {
-            *sent = number;
-            Next::Taken(taken)
+/// A writer's messages, by way of all readers of it that there are. What one of them has, and has not
+/// been given on, is not lost when another has gone further or comes to an end.
+#[derive(Debug)]
+pub(crate) struct Merge<T> {
+    /// The number of the newest one that was given on.
+    given: Option<u64>,
+    ways: BTreeMap<Gid, Way<T>>,
+    /// Whether a reader had more to be dropped than was looked at.
+    behind: bool,
+}
+
+#[derive(Debug)]
+struct Way<T> {
+    /// Taken, and newer than what was given on.
+    next: Option<Taken<T>>,
+    /// Messages that its reader has lost, as far as is known.
+    lost: u64,
+    /// Those among them that come after what was given on.
+    missed: u64,
+}
+
+impl<T> Default for Merge<T> {
+    fn default() -> Self {
+        Self { given: None, ways: BTreeMap::new(), behind: false }
+    }
+}
+
+impl<T> Default for Way<T> {
+    fn default() -> Self {
+        Self { next: None, lost: 0, missed: 0 }
+    }
+}
+
+impl<T> Merge<T> {
+    /// These are the readers from now on.
+    pub(crate) fn set(&mut self, readers: impl IntoIterator<Item = Gid>) {
+        let mut before = std::mem::take(&mut self.ways);
+        let ways = readers.into_iter().map(|gid| (gid, before.remove(&gid).unwrap_or_default()));
+        self.ways = ways.collect();
+    }
+
+    /// Whatever the readers have is given on once more: one of them has what came before.
+    pub(crate) fn begin_anew(&mut self) {
+        self.given = None;
+    }
+
+    /// Those up to this number need not be given on.
+    pub(crate) fn pass(&mut self, number: u64) {
+        self.given = self.given.max(Some(number));
+    }
+
+    /// Whether there is a message that a reader has given up to it.
+    pub(crate) fn holds(&self, reader: &Gid) -> bool {
+        self.ways.get(reader).is_some_and(|way| way.next.is_some())
+    }
+
+    /// Whether there is one of any reader.
+    pub(crate) fn holds_any(&self) -> bool {
+        self.ways.values().any(|way| way.next.is_some())
+    }
+
+    /// Whether readers have more that another had than could be dropped in one go: there is no next one
+    /// until that is gone.
+    pub(crate) fn is_behind(&self) -> bool {
+        self.behind
+    }
+
+    /// The next message. `take` has that of one reader.
+    pub(crate) fn next(&mut self, take: impl Fn(&Gid) -> Option<Taken<T>>) -> Option<Taken<T>> {
+        self.look(&take);
+        if self.ways.len() > 1 && self.holds_any() {
+            // Where there was nothing there may be by now what was written before that one.
+            self.look(&take);
         }
-        Some(_) => Next::Repeated,
-        None => Next::Nothing,
+        if self.behind {
+            return None;
+        }
+        let there = self.ways.values_mut().filter(|way| way.next.is_some());
+        let way = there.min_by_key(|way| way.next.as_ref().map(|next| next.number))?;
+        let mut next = way.next.take()?;
+        // What one has lost another may have had.
+        let missing = self.given.map_or(u64::MAX, |given| next.number.saturating_sub(given + 1));
+        next.lost = std::mem::take(&mut way.missed).min(missing);
+        self.given = Some(next.number);
+        Some(next)
+    }
+
+    /// Drops what one reader has and another had; whether it [is behind](Self::is_behind).
+    pub(crate) fn pass_over(&mut self, take: impl Fn(&Gid) -> Option<Taken<T>>) -> bool {
+        if self.ways.len() > 1 || self.behind {
+            self.look(&take);
+        }
+        self.behind
+    }
+
+    /// Has the next message of each reader at hand, if it has one that was not given on.
+    fn look(&mut self, take: &impl Fn(&Gid) -> Option<Taken<T>>) {
+        let given = self.given;
+        let is_new = |next: &Taken<T>| Some(next.number) > given;
+        self.behind = false;
+        for (reader, way) in &mut self.ways {
+            let mut left = BATCH;
+            if way.next.as_ref().is_some_and(|next| !is_new(next)) {
+                (way.next, way.missed) = (None, 0);
+            }
+            while way.next.is_none() {
+                if left == 0 {
+                    self.behind = true;
+                    break;
+                }
+                left -= 1;
+                let Some(next) = take(reader) else { break };
+                // A writer that was attached anew counts from 0.
+                let lost = next.lost.checked_sub(way.lost).unwrap_or(next.lost);
+                way.lost = next.lost;
+                if is_new(&next) {
+                    way.missed = lost;
+                    way.next = Some(next);
+                }
+            }
+        }
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use std::{cell::RefCell, collections::VecDeque};
+    use std::{
+        cell::RefCell,
+        collections::{HashMap, VecDeque},
+    };
 
     use super::*;
 
-    type Readers = [RefCell<VecDeque<u64>>];
+    const ONE: Gid = Gid([1; 16]);
+    const OTHER: Gid = Gid([2; 16]);
 
-    fn step(readers: &Readers, sent: &mut u64) -> Next<u64> {
-        let take = |reader: &RefCell<VecDeque<u64>>| {
-            let number = reader.borrow_mut().pop_front()?;
-            Some((number, number))
-        };
-        next(readers, sent, |reader| reader.borrow().front().copied(), take)
+    /// What readers have: numbers, each with that of the samples lost by then.
+    #[derive(Default)]
+    struct Readers(RefCell<HashMap<Gid, VecDeque<(u64, u64)>>>);
+
+    impl Readers {
+        fn have(&self, reader: Gid, samples: impl IntoIterator<Item = (u64, u64)>) {
+            self.0.borrow_mut().entry(reader).or_default().extend(samples);
+        }
+
+        fn take(&self, reader: &Gid) -> Option<Taken<()>> {
+            let (number, lost) = self.0.borrow_mut().get_mut(reader)?.pop_front()?;
+            Some(Taken { number, lost, content: () })
+        }
     }
 
-    fn all(readers: &Readers, sent: &mut u64) -> Vec<u64> {
-        let mut taken = Vec::new();
+    fn merge() -> Merge<()> {
+        let mut merge = Merge::default();
+        merge.set([ONE, OTHER]);
+        merge
+    }
+
+    /// Whatever there is: the number of each, and that of those lost before it.
+    fn all(merge: &mut Merge<()>, readers: &Readers) -> Vec<(u64, u64)> {
+        let mut all = Vec::new();
         loop {
-            match step(readers, sent) {
-                Next::Taken(number) => taken.push(number),
-                Next::Repeated => {}
-                Next::Nothing => return taken,
+            let next = merge.next(|reader| readers.take(reader));
+            all.extend(next.as_ref().map(|next| (next.number, next.lost)));
+            if next.is_none() && !merge.pass_over(|reader| readers.take(reader)) {
+                return all;
             }
         }
     }
 
-    fn readers<const N: usize>(numbers: [&[u64]; N]) -> [RefCell<VecDeque<u64>>; N] {
-        numbers.map(|numbers| RefCell::new(numbers.iter().copied().collect()))
+    fn whole(numbers: std::ops::RangeInclusive<u64>) -> impl Iterator<Item = (u64, u64)> {
+        numbers.map(|number| (number, 0))
     }
 
     #[test]
-    fn what_waits_with_an_older_reader_goes_before_what_a_newer_one_has() {
-        let mut sent = 0;
-        let both = readers([&[5, 6], &[1, 2, 3, 4, 5, 6]]);
-        assert_eq!(all(&both, &mut sent), [1, 2, 3, 4, 5, 6]);
-        assert!(both.iter().all(|reader| reader.borrow().is_empty()));
+    fn each_is_given_on_once_and_in_order() {
+        let (mut merge, readers) = (merge(), Readers::default());
+        readers.have(ONE, whole(5..=5));
+        readers.have(OTHER, whole(1..=5));
+        assert!(all(&mut merge, &readers).into_iter().eq(whole(1..=5)));
+        readers.have(ONE, whole(6..=200));
+        readers.have(OTHER, whole(7..=201));
+        assert!(all(&mut merge, &readers).into_iter().eq(whole(6..=201)));
     }
 
     #[test]
-    fn what_was_handed_out_is_not_again() {
-        let mut sent = 4;
-        let both = readers([&[3, 4, 5], &[4, 7]]);
-        assert_eq!(step(&both, &mut sent), Next::Repeated);
-        assert_eq!(all(&both, &mut sent), [5, 7]);
+    fn what_a_reader_that_ends_has_left_another_has_too() {
+        let (mut merge, readers) = (merge(), Readers::default());
+        readers.have(ONE, whole(1..=300));
+        readers.have(OTHER, whole(1..=300));
+        let next = merge.next(|reader| readers.take(reader)).unwrap();
+        assert_eq!(next.number, 1);
+        while merge.pass_over(|reader| readers.take(reader)) {}
+        assert!(merge.holds(&ONE) && merge.holds(&OTHER));
+        merge.set([OTHER]);
+        assert!(!merge.holds(&ONE));
+        assert!(all(&mut merge, &readers).into_iter().eq(whole(2..=300)));
     }
 
     #[test]
-    fn a_reader_that_is_left_alone_has_all_that_was_not_handed_out() {
-        let mut sent = 0;
-        let both = readers([&[1, 2, 3, 4], &[1, 2, 3, 4]]);
-        assert_eq!(step(&both, &mut sent), Next::Taken(1));
-        assert_eq!(all(&both[1..], &mut sent), [2, 3, 4]);
-    }
-
-    #[test]
-    fn what_comes_between_the_looks_does_not_overtake() {
-        let both = readers([&[], &[3]]);
-        // Both get 2 and 3, the first reader when it has been looked at already.
-        let looks = RefCell::new(0);
-        let number = |reader: &RefCell<VecDeque<u64>>| {
-            let number = reader.borrow().front().copied();
-            if looks.replace_with(|looks| *looks + 1) == 0 {
-                both[0].borrow_mut().extend([2, 3]);
+    fn what_comes_while_readers_are_asked_does_not_go_before_what_came_first() {
+        let (mut merge, readers) = (merge(), Readers::default());
+        let asked = RefCell::new(0);
+        // It is written after the first reader was asked, which has all of it.
+        let take = |reader: &Gid| {
+            if asked.replace_with(|asked| *asked + 1) == 1 {
+                readers.have(ONE, whole(1..=5));
+                readers.have(OTHER, whole(5..=5));
             }
-            number
+            readers.take(reader)
         };
-        let take =
-            |reader: &RefCell<VecDeque<u64>>| reader.borrow_mut().pop_front().map(|n| (n, n));
-        assert_eq!(next(&both, &mut 0, number, take), Next::Taken(2));
+        assert_eq!(merge.next(take).unwrap().number, 1);
+        assert!(all(&mut merge, &readers).into_iter().eq(whole(2..=5)));
+    }
+
+    #[test]
+    fn lost_is_what_none_of_them_has() {
+        let (mut merge, readers) = (merge(), Readers::default());
+        readers.have(ONE, [(3, 2)]);
+        assert_eq!(all(&mut merge, &readers), [(3, 2)], "before the first");
+        readers.have(ONE, [(4, 2), (5, 2), (9, 5)]);
+        readers.have(OTHER, [(5, 4), (6, 4), (9, 6), (10, 6), (20, 11)]);
+        // 7 and 8 are of the one's three and the other's two.
+        let found = all(&mut merge, &readers);
+        assert_eq!(found, [(4, 0), (5, 0), (6, 0), (9, 2), (10, 0), (20, 5)]);
+        // Numbers that nobody lost were of nobody's samples. Who attached anew counts anew.
+        readers.have(OTHER, [(30, 0), (40, 3)]);
+        assert_eq!(all(&mut merge, &readers), [(30, 0), (40, 3)]);
+    }
+
+    #[test]
+    fn a_backlog_that_was_given_on_long_ago_hides_nothing_new() {
+        let (mut merge, readers) = (merge(), Readers::default());
+        readers.have(ONE, whole(1..=1000));
+        assert_eq!(all(&mut merge, &readers).len(), 1000);
+        readers.have(ONE, whole(1003..=1003));
+        readers.have(OTHER, whole(1..=1003));
+        assert!(all(&mut merge, &readers).into_iter().eq(whole(1001..=1003)));
+    }
+
+    #[test]
+    fn what_was_passed_before_is_not_given_on() {
+        let (mut merge, readers) = (merge(), Readers::default());
+        merge.pass(4);
+        merge.pass(2);
+        readers.have(ONE, whole(3..=5));
+        readers.have(OTHER, whole(4..=4));
+        readers.have(OTHER, whole(7..=7));
+        assert_eq!(all(&mut merge, &readers), [(5, 0), (7, 0)]);
+    }
+
+    #[test]
+    fn history_is_given_on_when_it_is_wanted() {
+        let (mut merge, readers) = (merge(), Readers::default());
+        readers.have(ONE, whole(8..=9));
+        assert!(all(&mut merge, &readers).into_iter().eq(whole(8..=9)));
+        readers.have(OTHER, whole(1..=9));
+        merge.begin_anew();
+        readers.have(ONE, whole(10..=10));
+        assert!(all(&mut merge, &readers).into_iter().eq(whole(1..=10)));
     }
 }

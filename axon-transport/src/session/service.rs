@@ -153,11 +153,6 @@ impl Server {
         take_of(&self.requests, &self.session, client)
     }
 
-    /// The number of that request.
-    pub(crate) fn next_request_of(&self, client: &Gid) -> Option<u64> {
-        if self.session.is_forked() { None } else { self.requests.lock().next_of(client) }
-    }
-
     /// The clients of which there is a request to be taken.
     pub(crate) fn with_requests(&self) -> Vec<Gid> {
         if self.session.is_forked() {

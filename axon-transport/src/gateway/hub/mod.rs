@@ -16,7 +16,7 @@ use std::{
 use axon_tls::Negotiated;
 use tokio::{
     sync::{Notify, mpsc, watch},
-    time::sleep_until,
+    time::sleep,
 };
 
 use self::leaving::Leaving;
@@ -38,7 +38,7 @@ use super::{
 };
 use crate::{
     daemon::bridge::{ToControl, ToGateway},
-    graph::{Endpoint, EndpointKind},
+    graph::Endpoint,
     ids::{DaemonId, Gid},
     link::{Candidate, CloseCode, Elected, GraphResync, Hello, Message},
     session::Session,
@@ -46,9 +46,6 @@ use crate::{
 
 /// Seconds between two looks whether the certificate of a linked peer has run out.
 const CERTIFICATES_EVERY: u32 = 60;
-
-/// The shortest time between two looks at who is alive.
-const SHORTEST: Duration = Duration::from_millis(5);
 
 /// What the hub and the peers' tasks share.
 pub(super) struct Shared {
@@ -172,10 +169,10 @@ impl Hub {
         let mut second = tokio::time::interval(Duration::from_secs(1));
         second.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         let mut seconds = 0_u32;
-        let mut alive_at = Instant::now();
         let mut kept = true;
         loop {
-            let alive_every = self.alive_every();
+            let now = Instant::now();
+            let alive_in = self.peers.values().filter_map(|peer| peer.alive_in(now)).min();
             tokio::select! {
                 event = inbox.recv() => match event {
                     None | Some(Event::Order(ToGateway::Shutdown)) => break,
@@ -186,9 +183,9 @@ impl Hub {
                     kept = false;
                     break;
                 }
-                () = sleep_until((alive_at + alive_every.unwrap_or_default()).into()), if alive_every.is_some() => {
-                    alive_at = Instant::now();
-                    self.peers.values_mut().for_each(Peer::tell_alive);
+                () = sleep(alive_in.unwrap_or_default()), if alive_in.is_some() => {
+                    let now = Instant::now();
+                    self.peers.values_mut().for_each(|peer| peer.tell_alive(now));
                 }
                 // Without a link, and keys, there is nothing that time would change.
                 _ = second.tick(), if !self.links.is_empty() || self.context.keyring.is_some() => {
@@ -206,16 +203,6 @@ impl Hub {
             let _ = tokio::time::timeout(Duration::from_millis(500), endpoint.wait_idle()).await;
         }
         kept
-    }
-
-    /// How often peers are told who is alive here: in time for the shortest lease.
-    fn alive_every(&self) -> Option<Duration> {
-        if self.peers.is_empty() {
-            return None;
-        }
-        let leases = self.local.values().filter(|e| e.kind == EndpointKind::Publisher);
-        let shortest = leases.filter_map(|endpoint| endpoint.qos.lease).min()?;
-        Some((Duration::from_nanos(shortest) / 4).max(SHORTEST))
     }
 
     async fn on_event(&mut self, event: Event) {

@@ -12,7 +12,7 @@ use crate::{
     gateway::queue::{Offered, Sample},
     ids::Gid,
     qos::{Qos, Reliability},
-    session::merge::{self, Next},
+    session::merge::{Merge, Taken},
 };
 
 /// Samples moved before the next feed has its turn, and bytes.
@@ -24,8 +24,8 @@ const REST: (Duration, u64) = (Duration::from_millis(1), 2);
 
 pub(super) struct Feed {
     of: Gid,
-    /// The newest sequence number that was queued, or need not be.
-    sent: u64,
+    /// Of what its sources have, what was not queued and need be.
+    samples: Merge<Sample>,
     /// A sample for which there was no room.
     held: Option<Sample>,
     /// Until when it is left alone.
@@ -35,19 +35,20 @@ pub(super) struct Feed {
 }
 
 impl Feed {
-    /// The feed of a publisher or client, of which the peer has those up to `seen`.
-    pub(super) fn new(of: Gid, seen: Option<u64>) -> Self {
-        Self { of, sent: seen.unwrap_or(0), held: None, rests: None, stream: None }
+    /// The feed of a publisher or client.
+    pub(super) fn new(of: Gid) -> Self {
+        Self { of, samples: Merge::default(), held: None, rests: None, stream: None }
     }
 
-    /// The peer has those up to `seen`.
-    pub(super) fn has(&mut self, seen: Option<u64>) {
-        self.sent = self.sent.max(seen.unwrap_or(0));
+    /// From now on it has these sources, and the peer has what was published up to `seen`.
+    pub(super) fn set(&mut self, sources: &[Source], seen: Option<u64>) {
+        self.samples.set(sources.iter().map(Source::gid));
+        self.samples.pass(seen.unwrap_or(0));
     }
 
-    /// Whether it has a sample that was taken and could not be queued.
+    /// Whether it has a sample that was taken and is not queued.
     pub(super) fn holds(&self) -> bool {
-        self.held.is_some()
+        self.held.is_some() || self.samples.holds_any()
     }
 
     /// Whether something may still wait to be sent.
@@ -76,14 +77,9 @@ impl Feed {
         let qos = first.map_or_else(Qos::keep_all, Source::qos);
         let (mut samples, mut bytes, mut dropped) = (0, 0, 0);
         while samples < BATCH.0 && bytes < BATCH.1 {
-            let sample = match self.next(route.1.kind, sources) {
-                Next::Taken(sample) => sample,
-                Next::Repeated => {
-                    samples += 1;
-                    moved.any = true;
-                    continue;
-                }
-                Next::Nothing => break,
+            let Some(sample) = self.next(route.1.kind, sources) else {
+                moved.any |= self.samples.is_behind();
+                break;
             };
             samples += 1;
             bytes += sample.payload.len();
@@ -109,21 +105,21 @@ impl Feed {
         }
     }
 
-    fn next(&mut self, kind: Kind, sources: &[Source]) -> Next<Sample> {
+    fn next(&mut self, kind: Kind, sources: &[Source]) -> Option<Sample> {
         let of = self.of;
         if let Some(held) = self.held.take() {
-            return Next::Taken(held);
+            return Some(held);
         }
         if kind == Kind::Response {
             // They come in whatever order the servers like, all by way of what stands in for the client.
-            let mut taken = sources.iter().filter_map(|source| source.take_of(&of));
-            return taken.next().map_or(Next::Nothing, Next::Taken);
+            return sources.iter().find_map(|source| source.take_of(&of));
         }
-        let take = |source: &Source| {
-            let sample = source.take_of(&of)?;
-            Some((sample.info.sequence, sample))
-        };
-        merge::next(sources, &mut self.sent, |source| source.next_of(&of), take)
+        let next = self.samples.next(|reader| {
+            let content = sources.iter().find(|source| source.gid() == *reader)?.take_of(&of)?;
+            // Who is subscribed there counts what is lost by the numbers.
+            Some(Taken { number: content.info.sequence, lost: 0, content })
+        });
+        Some(next?.content)
     }
 
     pub(super) fn queue(

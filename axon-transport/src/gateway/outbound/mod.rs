@@ -71,11 +71,11 @@ impl Source {
         }
     }
 
-    /// The number of its next sample or request.
-    fn next_of(&self, of: &Gid) -> Option<u64> {
+    /// Who reads there.
+    fn gid(&self) -> Gid {
         match self {
-            Self::Relay(_, subscription) => subscription.next_of(of),
-            Self::StandIn(stand_in) => stand_in.next_of(of),
+            Self::Relay(_, subscription) => subscription.gid(),
+            Self::StandIn(stand_in) => stand_in.gid(),
         }
     }
 
@@ -243,7 +243,7 @@ fn apply(order: Order, routes: &mut HashMap<u32, Active>, carrier: &watch::Sende
             let active = routes.entry(number).or_insert(new);
             active.sources = sources;
             for (of, feed) in &mut active.feeds {
-                feed.has(seen.get(of).copied());
+                feed.set(&active.sources, seen.get(of).copied());
             }
             active.seen = seen;
         }
@@ -257,8 +257,11 @@ impl Active {
         let there = self.sources.iter().flat_map(Source::with_data);
         let waiting: BTreeSet<Gid> = held.chain(there).collect();
         for of in waiting {
-            let seen = self.seen.get(&of).copied();
-            let feed = self.feeds.entry(of).or_insert_with(|| Feed::new(of, seen));
+            let feed = self.feeds.entry(of).or_insert_with(|| {
+                let mut feed = Feed::new(of);
+                feed.set(&self.sources, self.seen.get(&of).copied());
+                feed
+            });
             feed.turn((self.number, self.route), &self.sources, shared, moved);
         }
     }

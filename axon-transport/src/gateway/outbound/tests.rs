@@ -83,7 +83,7 @@ fn one_that_sends_no_more_leaves_nothing_behind() {
         let pair = Pair::new().await;
         let (shared, _carrier) = shared(&pair.here);
         for qos in [Qos::keep_all(), Qos::sensor_data()] {
-            let mut feeds = HashMap::from([(OF, Feed::new(OF, None))]);
+            let mut feeds = HashMap::from([(OF, Feed::new(OF))]);
             let feed = feeds.get_mut(&OF).unwrap();
             queued(feed.queue(a_sample(1), &qos, (1, route()), &shared));
             assert!(feed.is_in_use());
@@ -105,7 +105,7 @@ fn what_comes_when_a_stream_is_over_has_another() {
     block_on(async {
         let pair = Pair::new().await;
         let (shared, _carrier) = shared(&pair.here);
-        let mut feed = Feed::new(OF, None);
+        let mut feed = Feed::new(OF);
         for sequence in 1..=2 {
             queued(feed.queue(a_sample(sequence), &Qos::keep_all(), (1, route()), &shared));
             assert!(arrived(&pair.there).await.0);

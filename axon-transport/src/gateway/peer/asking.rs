@@ -62,6 +62,8 @@ impl Peer {
         local: &BTreeMap<Gid, Endpoint>,
         shared: &Arc<Shared>,
     ) {
+        let publishers = local.values().filter(|e| e.kind == EndpointKind::Publisher);
+        self.alive.watch(publishers.filter_map(|e| e.qos.lease));
         // A server there is shown once its host asks for requests: then it has what answers them.
         self.answering = self.now_answering();
         let reachable = self

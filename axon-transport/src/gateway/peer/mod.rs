@@ -24,6 +24,7 @@ use super::{
     routes_in::RoutesIn,
 };
 use crate::{
+    events::Alive,
     graph::{Endpoint, LIMITS},
     ids::Gid,
     link::{Graph, Message},
@@ -56,8 +57,8 @@ pub(super) struct Peer {
     intake: Arc<Intake>,
     /// Routes that the peer asked for.
     served: HashMap<u32, Served>,
-    /// When each publisher here that has a lease was alive, as the peer was told.
-    told_alive: BTreeMap<Gid, u64>,
+    /// Which publishers here were alive, as the peer was told.
+    alive: Alive,
     /// Servers there whose host takes requests for them.
     answering: BTreeSet<Gid>,
     orders: mpsc::UnboundedSender<outbound::Order>,
@@ -105,7 +106,7 @@ impl Peer {
             routes_in: Arc::default(),
             intake: Arc::new(Intake::new(shared.max_message)),
             served: HashMap::new(),
-            told_alive: BTreeMap::new(),
+            alive: Alive::default(),
             answering: BTreeSet::new(),
             orders,
         }

@@ -15,11 +15,11 @@ use crate::{
     relay::{
         MAX_MATCHED,
         flow::{Channel, Departing},
-        merge::Merge,
         pipe::End,
     },
     session::{
         Face, Subscription,
+        merge::{Merge, Taken},
         message::{GraphItem, Matched, Message},
     },
     shm::Sample,
@@ -193,7 +193,7 @@ impl Served {
         let mut more = self.calls.pass_over(|gid| self.writers.get(gid));
         for (writer, source) in &mut self.sources {
             more |=
-                source.samples.pass_over(|reader| departing(&self.subscriptions, reader, writer));
+                source.samples.pass_over(|reader| taken(&self.subscriptions, reader, writer));
         }
         more
     }
@@ -210,16 +210,16 @@ pub(super) fn take(
     subscriptions: &BTreeMap<Gid, Subscription>,
     writer: &Gid,
 ) -> Option<Departing<Sample>> {
-    source.samples.next(|reader| departing(subscriptions, reader, writer))
+    source.samples.next(|reader| taken(subscriptions, reader, writer)).map(Departing::from)
 }
 
-fn departing(
+fn taken(
     subscriptions: &BTreeMap<Gid, Subscription>,
     reader: &Gid,
     writer: &Gid,
-) -> Option<Departing<Sample>> {
+) -> Option<Taken<Sample>> {
     let (content, lost) = subscriptions.get(reader)?.take_from(writer)?;
-    Some(Departing { meta: content.meta(), lost, content })
+    Some(Taken { number: content.meta().sequence, lost, content })
 }
 
 /// On which channel the session gets what `other` writes for one of its clients or servers.

@@ -14,7 +14,6 @@ use rustix::io::Errno;
 use self::matching::{Source, take};
 use super::{
     LINGER, MAX_CALLERS, MAX_ENDPOINTS, Pool, Tally,
-    alive::Alive,
     calls::{self, Calls},
     flow::{Channel, Incoming},
     news::News,
@@ -22,13 +21,14 @@ use super::{
 };
 use crate::{
     config::Config,
+    events::Alive,
     graph::{Endpoint, EndpointKind, GraphView},
     ids::{Gid, SessionId},
     passed::PassedFd,
     seldom::Seldom,
     session::{
         Face, Node, Session, SessionError, SessionOptions, Subscription,
-        message::{Announce, EndpointRole, Leaving, Matched, Message, PROTOCOL, Refused, Welcome},
+        message::{Announce, Asserted, EndpointRole, Leaving, Matched, Message, PROTOCOL, Refused, Welcome},
         socket::{self, SocketError},
     },
     wait::ExternalLeader,
@@ -176,8 +176,9 @@ impl Served {
                 self.match_up()?;
             }
             let leased = self.subscriptions.values().flat_map(Subscription::assertions);
-            let news = self.alive.news(leased);
-            news.iter().try_for_each(|message| self.pipe.say(message))?;
+            for publishers in self.alive.news(Instant::now(), leased) {
+                self.pipe.say(&Message::Asserted(Asserted { publishers }))?;
+            }
             let (writers, tally) = (&self.writers, &self.tally);
             let find = |gid: &Gid| writers.get(gid);
             self.pipe.write(find, |_, samples| tally.lost(samples))?;
@@ -201,7 +202,8 @@ impl Served {
                 continue;
             }
             let process = self.process.as_ref().map(AsFd::as_fd);
-            self.pipe.sleep(&self.leader, &self.news, process, self.alive.left());
+            let left = self.alive.left(Instant::now());
+            self.pipe.sleep(&self.leader, &self.news, process, left);
         }
     }
 

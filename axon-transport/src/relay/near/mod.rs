@@ -19,13 +19,13 @@ use self::{
 };
 use super::{
     LINGER, Pool, Tally,
-    alive::Alive,
     calls::{self, Calls},
     flow::{Channel, Incoming},
     news::News,
     pipe::{End, Pipe},
 };
 use crate::{
+    events::Alive,
     graph::{Endpoint, EndpointKind, reads, writes},
     ids::{DaemonId, Gid},
     passed::PassedFd,
@@ -33,7 +33,7 @@ use crate::{
         Session, SessionError, Shared,
         connect::{Caller, Connected},
         local::House,
-        message::{Announce, EndpointRole, Gone, Graph, Leaving, Message, Refused},
+        message::{Announce, Asserted, EndpointRole, Gone, Graph, Leaving, Message, Refused},
         socket::SocketError,
     },
     wait::ExternalLeader,
@@ -236,8 +236,9 @@ impl<'a> Served<'a> {
                 self.update()?;
             }
             let leased = self.relays.values().flat_map(Relay::assertions);
-            let news = self.alive.news(leased);
-            news.iter().try_for_each(|message| self.pipe.say(message))?;
+            for publishers in self.alive.news(Instant::now(), leased) {
+                self.pipe.say(&Message::Asserted(Asserted { publishers }))?;
+            }
             let stand_ins = &self.stand_ins;
             let find = |gid: &Gid| stand_ins.get(gid).map(StandIn::face);
             self.pipe.write(find, |gid, samples| common.shared.lost(gid, samples))?;
@@ -269,7 +270,7 @@ impl<'a> Served<'a> {
                 continue;
             }
             let end = finish_by.map(|by| by.saturating_duration_since(Instant::now()));
-            let left = self.alive.left().into_iter().chain(self.settled_in()).chain(end).min();
+            let left = self.alive.left(Instant::now()).into_iter().chain(self.settled_in()).chain(end).min();
             self.pipe.sleep(&common.leader, &common.news, None, left);
         }
     }

@@ -169,11 +169,6 @@ impl Subscription {
         take_of(&self.inner, &self.session, writer)
     }
 
-    /// The number of that sample.
-    pub(crate) fn next_of(&self, writer: &Gid) -> Option<u64> {
-        if self.session.is_forked() { None } else { self.inner.lock().next_of(writer) }
-    }
-
     /// The publishers of which there is something to take.
     pub(crate) fn with_data(&self) -> Vec<Gid> {
         if self.session.is_forked() { Vec::new() } else { self.inner.lock().with_data().collect() }

@@ -63,16 +63,6 @@ impl Slots {
         None
     }
 
-    /// The number of the next sample of `writer`.
-    pub(in crate::session) fn next_of(&mut self, writer: &Gid) -> Option<u64> {
-        let mut its = self.slots.iter_mut().filter(|slot| slot.reader.writer() == *writer);
-        its.find_map(|slot| match slot.reader.peek() {
-            Ok(next) => Some(next?.sequence),
-            // It is chosen, so that taking finds out what is wrong.
-            Err(_) => Some(0),
-        })
-    }
-
     /// The writers of which there is something to take.
     pub(in crate::session) fn with_data(&self) -> impl Iterator<Item = Gid> {
         let some = self.slots.iter().filter(|slot| slot.reader.has_data());

@@ -1,0 +1,105 @@
+//! Who is alive, as those are told who do not see it themselves, such as another host: in time for the
+//! shortest lease, the publishers that said so since.
+
+use std::{
+    collections::BTreeMap,
+    time::{Duration, Instant},
+};
+
+use crate::ids::Gid;
+
+/// The shortest time between two looks.
+const SHORTEST: Duration = Duration::from_millis(5);
+/// Publishers in one message.
+const PART: usize = 1024;
+
+/// What one end tells another of its publishers' leases.
+#[derive(Default)]
+pub(crate) struct Alive {
+    every: Option<Duration>,
+    looked: Option<Instant>,
+    told: BTreeMap<Gid, u64>,
+}
+
+impl Alive {
+    /// These are the leases of the publishers that count, in nanoseconds.
+    pub(crate) fn watch(&mut self, leases: impl Iterator<Item = u64>) {
+        self.every = leases.min().map(|least| (Duration::from_nanos(least) / 4).max(SHORTEST));
+    }
+
+    /// How long it is until the next look; `None` when nobody has a lease.
+    pub(crate) fn left(&self, now: Instant) -> Option<Duration> {
+        let every = self.every?;
+        let since = self.looked.map(|looked| now.saturating_duration_since(looked));
+        Some(since.map_or(Duration::ZERO, |since| every.saturating_sub(since)))
+    }
+
+    /// If it is time: those that have been alive since this was last asked, as many together as go into
+    /// a message. `asserted` has when each was; a publisher may be in it several times.
+    pub(crate) fn news(
+        &mut self,
+        now: Instant,
+        asserted: impl Iterator<Item = (Gid, u64)>,
+    ) -> Vec<Vec<Gid>> {
+        if self.left(now) != Some(Duration::ZERO) {
+            return Vec::new();
+        }
+        self.looked = Some(now);
+        let mut alive: BTreeMap<Gid, u64> = BTreeMap::new();
+        for (gid, at) in asserted {
+            let last = alive.entry(gid).or_default();
+            *last = at.max(*last);
+        }
+        let news = alive.iter().filter(|(gid, at)| self.told.get(gid) != Some(at));
+        let news: Vec<Gid> = news.map(|(gid, _)| *gid).collect();
+        self.told = alive;
+        news.chunks(PART).map(<[_]>::to_vec).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LEASE: u64 = 400_000_000;
+
+    fn gid(number: u8) -> Gid {
+        Gid([number; 16])
+    }
+
+    #[test]
+    fn who_was_alive_since_is_named_in_time_for_the_shortest_lease() {
+        let (mut alive, start) = (Alive::default(), Instant::now());
+        assert_eq!(alive.left(start), None);
+        assert!(alive.news(start, [(gid(1), 1)].into_iter()).is_empty(), "nobody has a lease");
+        alive.watch([2 * LEASE, LEASE].into_iter());
+        assert_eq!(alive.left(start), Some(Duration::ZERO));
+        let both = [(gid(1), 1), (gid(2), 1), (gid(1), 3)];
+        assert_eq!(alive.news(start, both.into_iter()), [[gid(1), gid(2)]]);
+        let quarter = Duration::from_nanos(LEASE) / 4;
+        assert_eq!(alive.left(start), Some(quarter));
+        let early = start + quarter / 2;
+        assert!(alive.news(early, [(gid(2), 2)].into_iter()).is_empty(), "not yet");
+        // What stands is no news, in whatever order it comes; who was not heard of meanwhile is.
+        let next = start + quarter;
+        let now = [(gid(1), 3), (gid(1), 1), (gid(2), 2), (gid(3), 1)];
+        assert_eq!(alive.news(next, now.into_iter()), [[gid(2), gid(3)]]);
+        alive.watch([1].into_iter());
+        assert_eq!(alive.left(next), Some(SHORTEST));
+        alive.watch(std::iter::empty());
+        assert_eq!(alive.left(next + quarter), None);
+    }
+
+    #[test]
+    fn however_many_are_alive_all_are_named() {
+        let mut alive = Alive::default();
+        alive.watch([LEASE].into_iter());
+        let many = (0..2500).map(|number: u64| {
+            let mut gid = [0; 16];
+            gid[..8].copy_from_slice(&number.to_be_bytes());
+            (Gid(gid), 1)
+        });
+        let parts = alive.news(Instant::now(), many);
+        assert!(parts.iter().map(Vec::len).eq([1024, 1024, 452]));
+    }
+}
