@@ -281,8 +281,7 @@ impl Pipe {
         left: Option<Duration>,
     ) {
         let out = if self.is_full() { PollFlags::OUT } else { PollFlags::empty() };
-        let mut fds =
-            vec![PollFd::new(leader, PollFlags::IN), PollFd::new(news, PollFlags::IN)];
+        let mut fds = vec![PollFd::new(leader, PollFlags::IN), PollFd::new(news, PollFlags::IN)];
         // What has come to its end is readable for ever.
         if !self.over {
             fds.push(PollFd::new(&self.socket, PollFlags::IN | out));

@@ -38,6 +38,7 @@ mod tests;
 mod waiting;
 
 use std::{
+    collections::BTreeMap,
     sync::{Arc, PoisonError},
     thread::JoinHandle,
     time::Duration,
@@ -63,7 +64,7 @@ pub use waiting::{Ready, Waitable};
 use crate::{
     config::DaemonPolicy,
     graph::GraphView,
-    ids::{DaemonId, SessionId},
+    ids::{DaemonId, Gid, SessionId},
     relay::near::Near,
     shm::SessionSegment,
 };
@@ -142,6 +143,11 @@ impl Session {
     /// The session's segment, for waiting in other ways.
     pub fn segment(&self) -> &Arc<SessionSegment> {
         &self.shared().segment
+    }
+
+    /// Its endpoints that the daemon does not take, and why.
+    pub(crate) fn refused(&self) -> BTreeMap<Gid, String> {
+        self.shared().state().refused.clone()
     }
 
     /// Has `listener` called on the control thread for every event. It must not block, and must

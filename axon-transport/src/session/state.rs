@@ -1,7 +1,7 @@
 //! What the handles of a session and its control thread share.
 
 use std::{
-    collections::{BTreeSet, HashMap, VecDeque},
+    collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
     fmt,
     os::fd::OwnedFd,
     sync::{
@@ -85,8 +85,8 @@ pub(super) struct State {
     /// Endpoints that are gone, until a daemon has said so to everybody.
     pub(super) tombstones: BTreeSet<Gid>,
     pub(super) graph: Arc<GraphView>,
-    /// Endpoints of its own that the daemon does not take: nobody else ever hears of them.
-    pub(super) refused: BTreeSet<Gid>,
+    /// Endpoints of its own that the daemon does not take, and why: nobody else ever hears of them.
+    pub(super) refused: BTreeMap<Gid, String>,
     pub(super) daemon: Option<DaemonId>,
     pub(super) status: StatusAnswer,
     /// When those who wait shall look again, whether or not anything comes.
@@ -113,13 +113,13 @@ impl State {
 
     /// Those of them that the graph shows.
     pub(super) fn shown(&self) -> impl Iterator<Item = &Endpoint> {
-        self.own().filter(|own| !self.refused.contains(&own.gid))
+        self.own().filter(|own| !self.refused.contains_key(&own.gid))
     }
 
     /// Shows what the session has made, whatever the daemon does meanwhile: whoever made it finds it
     /// in the graph, unless the daemon has refused it.
     pub(super) fn show(&mut self, own: &Endpoint) {
-        if self.refused.contains(&own.gid) {
+        if self.refused.contains_key(&own.gid) {
             return;
         }
         let entry = || GraphEntry { endpoint: Arc::new(own.clone()), daemon: None };
@@ -128,10 +128,10 @@ impl State {
     }
 
     /// The daemon does not take one of its own: it is in nobody's graph, and so not in this one.
-    pub(super) fn refuse(&mut self, gid: Gid) {
+    pub(super) fn refuse(&mut self, gid: Gid, why: String) {
         // It may have ended meanwhile.
         if self.own().any(|own| own.gid == gid) {
-            self.refused.insert(gid);
+            self.refused.insert(gid, why);
             self.hide(&gid);
         }
     }
@@ -139,7 +139,7 @@ impl State {
     /// Another daemon may take those that the last one refused.
     pub(super) fn forget_refusals(&mut self) {
         let refused = std::mem::take(&mut self.refused);
-        let own: Vec<_> = self.own().filter(|e| refused.contains(&e.gid)).cloned().collect();
+        let own: Vec<_> = self.own().filter(|e| refused.contains_key(&e.gid)).cloned().collect();
         own.iter().for_each(|own| self.show(own));
     }
 
@@ -314,8 +314,8 @@ impl Shared {
     }
 
     /// The daemon does not take an endpoint of the session's own.
-    pub(crate) fn refuse(&self, gid: Gid) {
-        self.state().refuse(gid);
+    pub(crate) fn refuse(&self, gid: Gid, why: String) {
+        self.state().refuse(gid, why);
         self.notify(Some(&SessionEvent::Refused(gid)));
         self.wake();
     }

@@ -192,8 +192,7 @@ impl Served {
     pub(super) fn pass_over(&mut self) -> bool {
         let mut more = self.calls.pass_over(|gid| self.writers.get(gid));
         for (writer, source) in &mut self.sources {
-            more |=
-                source.samples.pass_over(|reader| taken(&self.subscriptions, reader, writer));
+            more |= source.samples.pass_over(|reader| taken(&self.subscriptions, reader, writer));
         }
         more
     }

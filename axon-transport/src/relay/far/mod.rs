@@ -1,6 +1,8 @@
 //! The daemon's end: the endpoints of a relayed session, in memory that every session maps.
 
 mod matching;
+#[cfg(test)]
+mod tests;
 
 use std::{
     collections::{BTreeMap, BTreeSet, VecDeque},
@@ -28,7 +30,9 @@ use crate::{
     seldom::Seldom,
     session::{
         Face, Node, Session, SessionError, SessionOptions, Subscription,
-        message::{Announce, Asserted, EndpointRole, Leaving, Matched, Message, PROTOCOL, Refused, Welcome},
+        message::{
+            Announce, Asserted, EndpointRole, Leaving, Matched, Message, PROTOCOL, Refused, Welcome,
+        },
         socket::{self, SocketError},
     },
     wait::ExternalLeader,
@@ -170,6 +174,7 @@ impl Served {
             let changed = messages.iter().any(|m| !matches!(m, Message::Credit(_)));
             messages.into_iter().try_for_each(|message| self.handle(message))?;
             if news {
+                self.tell_refused()?;
                 self.tell_graph()?;
             }
             if news || changed || !self.left.is_empty() {
@@ -350,6 +355,16 @@ impl Served {
             self.pipe.open_in(Channel::between(gid, *client))?;
         }
         self.callers.insert(gid, others);
+        Ok(())
+    }
+
+    /// What the control plane does not take, its process is told of as of what is refused here.
+    fn tell_refused(&mut self) -> Result<(), End> {
+        for (gid, text) in self.session.refused() {
+            self.forget(&gid);
+            let refused = Refused { endpoint: Some(gid), ..Refused::because(text) };
+            self.pipe.say(&Message::Refused(refused))?;
+        }
         Ok(())
     }
 

@@ -13,10 +13,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use self::{
-    relays::Relay,
-    stand_ins::StandIn,
-};
+use self::{relays::Relay, stand_ins::StandIn};
 use super::{
     LINGER, Pool, Tally,
     calls::{self, Calls},
@@ -168,6 +165,8 @@ struct Served<'a> {
     pipe: Pipe,
     /// The session's endpoints that the daemon was told of.
     own: BTreeMap<Gid, Arc<Endpoint>>,
+    /// Those that it does not take.
+    refused: BTreeSet<Gid>,
     /// Those among them that write and are gone, and may have left something; whether the daemon was
     /// told that they have.
     ending: BTreeMap<Gid, bool>,
@@ -204,6 +203,7 @@ impl<'a> Served<'a> {
             daemon: connected.welcome.daemon,
             pipe: Pipe::new(socket, incoming, Arc::new(Tally::default())),
             own: BTreeMap::new(),
+            refused: BTreeSet::new(),
             ending: BTreeMap::new(),
             held_back: false,
             parting: BTreeSet::new(),
@@ -270,7 +270,13 @@ impl<'a> Served<'a> {
                 continue;
             }
             let end = finish_by.map(|by| by.saturating_duration_since(Instant::now()));
-            let left = self.alive.left(Instant::now()).into_iter().chain(self.settled_in()).chain(end).min();
+            let left = self
+                .alive
+                .left(Instant::now())
+                .into_iter()
+                .chain(self.settled_in())
+                .chain(end)
+                .min();
             self.pipe.sleep(&common.leader, &common.news, None, left);
         }
     }
@@ -288,7 +294,7 @@ impl<'a> Served<'a> {
             Message::Refused(Refused { endpoint, text: reason, .. }) => {
                 tracing::error!(reason, "the daemon refuses an endpoint");
                 if let Some(gid) = endpoint {
-                    self.common.shared.refuse(gid);
+                    self.refuse(gid, reason);
                 }
             }
             // What a daemon never says is not worth more than not being heard.
@@ -351,10 +357,12 @@ impl<'a> Served<'a> {
                 self.tell_gone(gid)?;
             }
         }
+        self.refused.retain(|gid| graph.endpoints.contains_key(gid));
         self.held_back = false;
         for (gid, entry) in &graph.endpoints {
             let endpoint = &entry.endpoint;
-            if !gid.is_of(session) || self.own.contains_key(gid) {
+            let known = self.own.contains_key(gid) || self.refused.contains(gid);
+            if !gid.is_of(session) || known {
                 continue;
             }
             if !self.is_served(endpoint) {
@@ -381,16 +389,31 @@ impl<'a> Served<'a> {
     }
 
     fn tell_gone(&mut self, gid: Gid) -> Result<(), End> {
-        let Some(endpoint) = self.own.remove(&gid) else { return Ok(()) };
+        let Some(endpoint) = self.let_go(&gid) else { return Ok(()) };
         if reads(endpoint.kind) {
             self.parting.insert(gid);
         } else {
             self.matched.remove(&gid);
         }
-        self.callers.remove(&gid);
-        self.asking.remove(&gid);
-        self.pipe.outgoing.retain(|channel| channel.writer != gid);
         self.pipe.say(&Message::EndpointGone(Gone { gid }))
+    }
+
+    /// The daemon does not take an endpoint: it knows nothing of it.
+    fn refuse(&mut self, gid: Gid, why: String) {
+        if self.let_go(&gid).is_some() {
+            self.ending.remove(&gid);
+            self.matched.remove(&gid);
+            self.refused.insert(gid);
+        }
+        self.common.shared.refuse(gid, why);
+    }
+
+    /// Nothing that an endpoint of the session writes crosses any more.
+    fn let_go(&mut self, gid: &Gid) -> Option<Arc<Endpoint>> {
+        self.callers.remove(gid);
+        self.asking.remove(gid);
+        self.pipe.outgoing.retain(|channel| channel.writer != *gid);
+        self.own.remove(gid)
     }
 
     fn is_drained(&self) -> bool {

@@ -142,7 +142,8 @@ impl Control {
         if own {
             let state = self.shared.state();
             // It may have ended since it was announced: the daemon will say so.
-            if state.tombstones.contains(&endpoint.gid) || state.refused.contains(&endpoint.gid) {
+            if state.tombstones.contains(&endpoint.gid) || state.refused.contains_key(&endpoint.gid)
+            {
                 return;
             }
         }

@@ -50,7 +50,7 @@ impl Control {
             Message::Refused(Refused { endpoint, text: reason, .. }) => {
                 tracing::error!(reason, "the daemon refuses something of the session");
                 if let Some(gid) = endpoint {
-                    self.shared.refuse(gid);
+                    self.shared.refuse(gid, reason);
                 }
             }
             // What a daemon never says is not worth more than not being heard.

@@ -251,8 +251,7 @@ mod tests {
         let publisher = Writer::create(session.clone(), options).unwrap();
         let lane = session.allocate_lane().unwrap();
         let at = lane.location();
-        let info =
-            ReaderInfo { gid: reader, lane: at, qos, peer: peer.clone(), stands_for: None };
+        let info = ReaderInfo { gid: reader, lane: at, qos, peer: peer.clone(), stands_for: None };
         let (grant, ring) = (publisher.attach(info).unwrap(), publisher.location());
         let options =
             ReaderOptions { reader, writer, peer, ring, lane, grant, qos, max_message: 10 };
