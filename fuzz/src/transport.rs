@@ -324,6 +324,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             bytes: 128,
             opens: Some(3),
             client: Some(reader),
+            done: Some(7),
         }),
         Message::Asserted(Asserted { publishers: vec![writer] }),
         Message::Unknown(200),

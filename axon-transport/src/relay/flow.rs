@@ -58,7 +58,7 @@ impl Channel {
     }
 
     fn credit(self, bytes: u64, opens: Option<u64>) -> Credit {
-        Credit { publisher: self.writer, bytes, opens, client: self.client }
+        Credit { publisher: self.writer, bytes, opens, client: self.client, done: None }
     }
 }
 
@@ -164,7 +164,7 @@ impl<S: Content> Outgoing<S> {
 
     /// What the receiver of a channel says.
     pub fn credit(&mut self, credit: &Credit) {
-        let Credit { publisher, bytes, opens, client } = *credit;
+        let Credit { publisher, bytes, opens, client, .. } = *credit;
         let name = Channel { writer: publisher, client };
         let Some(channel) = self.channels.get_mut(&name) else { return };
         match (&mut channel.credit, opens) {
@@ -473,7 +473,7 @@ impl Incoming {
         let more = more.min(channel.granted);
         channel.granted -= more;
         self.release(name, more);
-        Some(name.credit(cost - more, None))
+        Some(Credit { done: Some(sample.meta.sequence), ..name.credit(cost - more, None) })
     }
 
     fn release(&mut self, of: Channel, bytes: u64) {

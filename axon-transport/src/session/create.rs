@@ -132,7 +132,8 @@ impl Session {
         self.add_relay(spec, None, stands_for)
     }
 
-    /// As [`create_relay`](Self::create_relay), of one publisher alone.
+    /// As [`create_relay`](Self::create_relay), of one publisher alone. What it takes, it
+    /// [acknowledges](Subscription::acknowledge).
     pub(crate) fn create_relay_of(
         &self,
         publisher: Gid,

@@ -108,9 +108,8 @@ impl Publisher {
     /// breaks, what was on its way is lost, and the subscriptions there count it when a later sample of
     /// this publisher comes: nothing else tells them of its last ones.
     ///
-    /// Where the session shares no memory (`AXON_SHM`), one for another process is when the session's
-    /// relay has taken it. From there it crosses even if the publisher is dropped, but not if the
-    /// process is killed; and one that ends waits for it no longer than a second.
+    /// Where the session shares no memory (`AXON_SHM`), one for another process is when this host's daemon
+    /// has taken it over, too. One that ends waits for that no longer than a second.
     pub fn wait_acknowledged(&self, timeout: Duration) -> bool {
         self.session.is_forked() || self.writer.wait_handed_over(timeout)
     }

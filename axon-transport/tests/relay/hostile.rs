@@ -118,7 +118,7 @@ fn who_is_not_to_be_relayed_is_refused() {
     until("they are gone", || relays(&host.status().unwrap()).len() == 1);
 }
 
-fn stop(daemon: &Kept) {
+pub(crate) fn stop(daemon: &Kept) {
     let pid = daemon.0.id();
     signal(pid, Signal::STOP);
     let id = WaitId::Pid(Pid::from_raw(pid.cast_signed()).unwrap());
@@ -411,7 +411,7 @@ fn whoever_gives_no_credit_back_does_not_have_the_daemon_keep_all_that_ever_wrot
         let gid = publisher.gid();
         first.get_or_insert(gid);
         told(&socket, &|others| others.contains(&gid));
-        let credit = Credit { publisher: gid, bytes: 1000, opens: Some(u64::MAX), client: None };
+        let credit = open_for(gid, u64::MAX);
         say_to(&socket, &Message::Credit(credit));
         publish(&publisher, b"x");
         let piece = |m: &Message| matches!(m, Message::Piece(p) if p.publisher == gid);

@@ -35,7 +35,7 @@ use axon_transport::{
     },
     shm::PublishError,
 };
-use hostile::say_to;
+use hostile::{say_to, stop};
 use rustix::process::Signal;
 use support::{Host, Kept, PATIENCE, of_child, say, signal, until, wait_for_the_end};
 
@@ -95,6 +95,11 @@ fn await_pair(publisher: &Publisher, subscription: &Subscription) {
     until("the subscription counts the publisher", || {
         subscription.matched().contains(&publisher.gid())
     });
+}
+
+/// Opens a publisher's or client's channel to whoever has heard so many MATCHED.
+fn open_for(publisher: Gid, heard: u64) -> Credit {
+    Credit { publisher, bytes: 1000, opens: Some(heard), client: None, done: None }
 }
 
 /// The sequence numbers that are taken until `last`.
@@ -290,6 +295,24 @@ fn best_effort_waits_for_nobody_and_what_is_lost_is_counted() {
         drop((from, to, publisher, slow));
         until("both are gone", || host.status().unwrap().sessions.len() == 1);
     }
+}
+
+#[test]
+fn a_sample_that_the_daemon_has_not_taken_is_not_acknowledged() {
+    let host = host();
+    let daemon = host.daemon();
+    let (from, to) = (session(&host, "from", false), session(&host, "to", true));
+    let (publisher, subscription) = connect(&from, &to, "/t", Qos::default());
+    publish(&publisher, &pattern(1, 10));
+    assert!(publisher.wait_acknowledged(PATIENCE));
+    stop(&daemon);
+    publish(&publisher, &pattern(2, 10));
+    assert!(!publisher.wait_acknowledged(Duration::from_millis(50)));
+    signal(daemon.0.id(), Signal::CONT);
+    assert!(publisher.wait_acknowledged(PATIENCE));
+    // It is where a subscription finds it that looks now.
+    assert!(subscription.has_data());
+    assert_eq!(take_until(&subscription, 2), [1, 2]);
 }
 
 #[test]

@@ -108,12 +108,38 @@ fn whom_the_daemon_names_for_another_publisher_is_not_counted() {
         matched(&socket, other.gid(), &[outside]);
         until("it counts the one outside", || other.matched() == [outside]);
         let number = other.publish(b"x").unwrap();
-        let credit = Credit { publisher: other.gid(), bytes: 1000, opens: Some(9), client: None };
+        let credit = open_for(other.gid(), 9);
         say_to(&socket, &Message::Credit(credit));
         let piece = hear(&socket, |m| matches!(m, Message::Piece(_)));
         let Some(Message::Piece(piece)) = piece else { panic!("it hangs up") };
         let Head { sequence, lost, .. } = piece.head.unwrap();
         assert_eq!((piece.publisher, sequence, lost), (other.gid(), number, 0));
+    }
+}
+
+#[test]
+fn a_sample_is_acknowledged_once_the_daemon_has_it() {
+    let soon = Duration::from_millis(20);
+    let host = host();
+    let (session, socket) = played(&host);
+    for qos in [Qos::default(), Qos::keep_all(), best_effort(10), latched(10)] {
+        let publisher = session.create_publisher(spec("/t", qos)).unwrap();
+        announced(&socket, publisher.gid());
+        let outside = show(&socket, publisher.endpoint(), EndpointKind::Subscription);
+        matched(&socket, publisher.gid(), &[outside]);
+        until("it counts the one outside", || publisher.matched() == [outside]);
+        assert!(publisher.wait_acknowledged(soon), "nothing was published");
+        say_to(&socket, &Message::Credit(open_for(publisher.gid(), 99)));
+        for sequence in 1..=2 {
+            assert_eq!(publisher.publish(b"x").unwrap(), sequence);
+            assert!(hear(&socket, |m| matches!(m, Message::Piece(_))).is_some());
+        }
+        for sequence in 1..=2 {
+            assert!(!publisher.wait_acknowledged(soon), "{sequence} is on its way");
+            let back = Credit { bytes: 129, opens: None, ..open_for(publisher.gid(), 0) };
+            say_to(&socket, &Message::Credit(Credit { done: Some(sequence), ..back }));
+        }
+        assert!(publisher.wait_acknowledged(PATIENCE));
     }
 }
 
@@ -168,7 +194,7 @@ fn a_request_is_sent_once_however_many_servers_it_is_for() {
     matched(&socket, own.gid(), &[one]);
     opened(&socket, one, Some(own.gid()));
     assert!(own.wait_available(PATIENCE));
-    let credit = Credit { publisher: own.gid(), bytes: 1000, opens: Some(1), client: None };
+    let credit = open_for(own.gid(), 1);
     say_to(&socket, &Message::Credit(credit));
     for number in 1..=3 {
         assert_eq!(own.send_request(b"x").unwrap(), number);
@@ -206,7 +232,7 @@ fn what_waits_for_one_server_goes_before_what_another_has_too() {
     matched(&socket, own.gid(), &[late, early]);
     until("it counts both", || own.servers().len() == 2);
     assert_eq!(own.send_request(b"x").unwrap(), 5);
-    let credit = Credit { publisher: own.gid(), bytes: 1000, opens: Some(1), client: None };
+    let credit = open_for(own.gid(), 1);
     say_to(&socket, &Message::Credit(credit));
     for number in 1..=5 {
         let piece = hear(&socket, |m| matches!(m, Message::Piece(_)));

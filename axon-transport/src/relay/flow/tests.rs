@@ -84,7 +84,7 @@ fn a_long_sample_waits_for_room_and_gives_it_back() {
     assert!(second.is_short() && !first.is_short());
     let arrived = first.piece(piece(1, None, 100_000)).unwrap().unwrap();
     assert_eq!(pool.held(), more);
-    let credit = Credit { bytes: WINDOW, ..credit };
+    let credit = Credit { bytes: WINDOW, done: Some(arrived.meta.sequence), ..credit };
     assert_eq!(first.done(&arrived), Some(credit), "what was granted is not given back");
     assert_eq!(pool.held(), 0);
     assert_eq!(second.grants().len(), 1);

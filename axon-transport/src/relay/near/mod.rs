@@ -286,7 +286,14 @@ impl<'a> Served<'a> {
             Message::Graph(graph) => self.graph(graph),
             Message::Matched(matched) => self.rematch(matched),
             Message::EndpointGone(gone) => self.part(&gone.gid),
-            Message::Credit(credit) => self.pipe.outgoing.credit(&credit),
+            Message::Credit(credit) => {
+                self.pipe.outgoing.credit(&credit);
+                if let Some(relay) = self.relays.get(&credit.publisher)
+                    && let Some(sequence) = credit.done
+                {
+                    relay.acknowledge(sequence);
+                }
+            }
             Message::Asserted(asserted) => {
                 let named = asserted.publishers.iter().filter_map(|gid| self.stand_ins.get(gid));
                 named.for_each(|stand_in| stand_in.face().assert_alive());

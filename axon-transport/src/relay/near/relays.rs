@@ -29,6 +29,11 @@ impl Relay {
         self.subscription.assertions()
     }
 
+    /// The daemon has its publisher's samples up to this number.
+    pub(super) fn acknowledge(&self, sequence: u64) {
+        self.subscription.acknowledge(sequence);
+    }
+
     /// The next sample of its publisher.
     pub(super) fn take(&mut self, publisher: &Gid) -> Option<Departing<Sample>> {
         let (content, now) = self.subscription.take_from(publisher)?;

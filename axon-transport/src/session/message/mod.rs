@@ -413,6 +413,9 @@ pub struct Credit {
     /// Of a server, the client whose responses are the channel.
     #[n(3)]
     pub client: Option<Gid>,
+    /// The number of the sample that used the bytes, and is where it is to go.
+    #[n(4)]
+    pub done: Option<u64>,
 }
 
 /// Publishers that were alive since their end of a relay said so last.

@@ -100,7 +100,13 @@ fn messages() -> Vec<Message> {
             bytes: vec![3],
             client: Some(reader),
         }),
-        Message::Credit(Credit { publisher: writer, bytes: 128, opens: Some(3), client: None }),
+        Message::Credit(Credit {
+            publisher: writer,
+            bytes: 128,
+            opens: Some(3),
+            client: None,
+            done: Some(8),
+        }),
         Message::Asserted(Asserted { publishers: vec![writer] }),
     ]
 }

@@ -140,6 +140,9 @@ impl SubscriptionInner {
         if self.role == EndpointRole::Relay {
             mapped.tell_progress();
         }
+        if self.only.is_some() {
+            mapped.finish_later();
+        }
         if matches!(self.endpoint.kind, EndpointKind::Server | EndpointKind::Client) {
             mapped.tell_room();
         }

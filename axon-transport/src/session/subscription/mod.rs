@@ -164,6 +164,14 @@ impl Subscription {
         self.inner.lock().take_from(writer, &self.inner)
     }
 
+    /// For a relay of one publisher alone: samples up to this number are where they are to go. Until then
+    /// nobody takes them as acknowledged.
+    pub(crate) fn acknowledge(&self, sequence: u64) {
+        if !self.session.is_forked() {
+            self.inner.lock().finish(sequence);
+        }
+    }
+
     /// For a relay: the next sample of one publisher, as bytes.
     pub(crate) fn take_of(&self, writer: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
         take_of(&self.inner, &self.session, writer)

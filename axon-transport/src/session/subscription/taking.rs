@@ -168,6 +168,11 @@ impl Slots {
         }
     }
 
+    /// Samples up to this number are done with.
+    pub(in crate::session) fn finish(&mut self, sequence: u64) {
+        self.slots.iter_mut().for_each(|slot| slot.reader.finish(sequence));
+    }
+
     pub(in crate::session) fn has_from(&self, writer: &Gid) -> bool {
         self.slots.iter().any(|slot| slot.reader.writer() == *writer && slot.reader.has_data())
     }

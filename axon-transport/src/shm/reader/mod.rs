@@ -3,6 +3,7 @@
 mod find;
 
 use std::{
+    collections::VecDeque,
     ops::Range,
     sync::{Arc, Weak, atomic::AtomicU64},
     time::{Duration, Instant},
@@ -68,6 +69,8 @@ pub struct Reader {
     /// Whether the publisher is known to be gone.
     ended: bool,
     cursor: u64,
+    /// Where what is taken is done with once that is said: numbers and positions of what is not.
+    under_way: Option<VecDeque<(u64, u64)>>,
     /// The head as it was seen last.
     seen: u64,
     received: u64,
@@ -160,6 +163,7 @@ impl Reader {
             missing: None,
             ended: false,
             cursor: grant.first,
+            under_way: None,
             seen: 0,
             received: 0,
             lost: 0,
@@ -406,14 +410,41 @@ impl Reader {
         let taken = Taken { meta: meta(record), position: self.cursor };
         self.received += 1;
         self.attachment.lane.taken(record.timestamp);
+        if let Some(under_way) = &mut self.under_way {
+            under_way.push_back((record.sequence, self.cursor));
+        }
         self.advance(self.cursor + 1);
         taken
     }
 
     fn advance(&mut self, cursor: u64) {
         self.cursor = cursor;
-        self.attachment.lane.advance(cursor, self.received, self.lost, self.skipped);
+        self.tell_cursor();
+    }
+
+    fn tell_cursor(&self) {
+        let first = self.under_way.as_ref().and_then(VecDeque::front);
+        let done = first.map_or(self.cursor, |(_, position)| *position);
+        self.attachment.lane.advance(done, self.received, self.lost, self.skipped);
         self.make_room_known();
+    }
+
+    /// What is taken from now on is done with when [`finish`](Self::finish) says so: until then its
+    /// publisher takes it as not taken.
+    pub(crate) fn finish_later(&mut self) {
+        self.under_way.get_or_insert_default();
+    }
+
+    /// Samples up to this number are done with.
+    pub(crate) fn finish(&mut self, sequence: u64) {
+        let Some(under_way) = &mut self.under_way else { return };
+        if self.attachment.lane.is_forked() {
+            return;
+        }
+        while under_way.front().is_some_and(|(number, _)| *number <= sequence) {
+            under_way.pop_front();
+        }
+        self.tell_cursor();
     }
 
     /// Has its publisher woken by whatever is taken, if it waits for that: of what stands for others.
