@@ -2,12 +2,6 @@
 
 use super::*;
 
-/// Where processes of this host are relayed.
-fn relaying(host: &Host) -> Host {
-    let here = Host { env: host.env.clone(), dir: tempfile::tempdir().unwrap() };
-    here.with("AXON_SHM", "off").with("AXON_DAEMON", "require")
-}
-
 #[test]
 fn a_process_that_is_killed_leaves_whole_samples_and_nothing_else() {
     let host = host();
@@ -30,9 +24,9 @@ fn a_process_that_is_killed_leaves_whole_samples_and_nothing_else() {
     drop(subscription);
     let mut deaf = relaying.play("deaf");
     assert_eq!(deaf.hear(), "matched");
-    while publish_once(&publisher, 1_000_000) {}
+    fill(|_| publisher.publish(&vec![0; 1_000_000]));
     signal(deaf.pid(), Signal::KILL);
-    until("nobody holds it back", || publish_once(&publisher, 1_000_000));
+    patiently(|| publisher.publish(&vec![0; 1_000_000]));
     until("nobody is relayed any more", || relays(&host.status().unwrap()).is_empty());
 }
 

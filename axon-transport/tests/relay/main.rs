@@ -1,5 +1,6 @@
 //! Sessions that share no memory, beside those that do.
 
+mod backlog;
 mod hostile;
 mod life;
 mod played;
@@ -54,6 +55,9 @@ fn latched(depth: u32) -> Qos {
     Qos { durability: Durability::TransientLocal, depth, ..Qos::default() }
 }
 
+/// Who shares memory with its daemon, of the two ends of what is tested.
+const ENDS: [(bool, bool); 3] = [(false, true), (true, false), (false, false)];
+
 /// Its publishers keep little, so that what lies in between is soon full.
 fn host() -> Host {
     Host::new().with("AXON_RING_BUFFER_SIZE_MB", "4")
@@ -65,20 +69,56 @@ fn session(host: &Host, name: &str, shm: bool) -> Session {
     Session::open(&config, SessionOptions::new(name)).unwrap()
 }
 
+/// Where processes of this host are relayed. It must outlive what they need of `host`.
+fn relaying(host: &Host) -> Host {
+    let relaying = Host { env: host.env.clone(), dir: tempfile::tempdir().unwrap() };
+    relaying.with("AXON_SHM", "off").with("AXON_DAEMON", "require")
+}
+
+/// Has a test done with two sessions, whoever of them shares memory.
+fn with_both_ends(test: impl Fn(&Session, &Session)) {
+    let host = host();
+    let _daemon = host.daemon();
+    between([&host, &host], test);
+}
+
+/// The same of two hosts.
+fn between([here, there]: [&Host; 2], test: impl Fn(&Session, &Session)) {
+    for (one, other) in ENDS {
+        test(&session(here, "one", one), &session(there, "other", other));
+    }
+}
+
 fn pattern(sequence: u64, len: usize) -> Vec<u8> {
     (0..len as u64).map(|at| (at ^ sequence) as u8).collect()
 }
 
-fn publish(publisher: &Publisher, payload: &[u8]) -> u64 {
+/// Sends something, however long it is held back: the reader is slow, and this is what KEEP_ALL means.
+fn patiently<T>(mut send: impl FnMut() -> Result<T, PublishError>) -> T {
     let deadline = Instant::now() + PATIENCE;
     loop {
-        match publisher.publish(payload) {
-            Ok(sequence) => return sequence,
-            // The reader is slow: this is what KEEP_ALL means.
+        match send() {
+            Ok(sent) => return sent,
             Err(PublishError::Blocked { .. }) => assert!(Instant::now() < deadline, "for ever"),
             Err(error) => panic!("{error}"),
         }
     }
+}
+
+/// Sends one after the other, by its number, until it is held back; how many went.
+fn fill<T>(mut send: impl FnMut(u64) -> Result<T, PublishError>) -> u64 {
+    for number in 1..20_000 {
+        match send(number) {
+            Ok(_) => {}
+            Err(PublishError::Blocked { .. }) => return number - 1,
+            Err(error) => panic!("{error}"),
+        }
+    }
+    panic!("nothing holds it back");
+}
+
+fn publish(publisher: &Publisher, payload: &[u8]) -> u64 {
+    patiently(|| publisher.publish(payload))
 }
 
 fn connect(from: &Session, to: &Session, topic: &str, qos: Qos) -> (Publisher, Subscription) {
@@ -197,11 +237,8 @@ fn child() {
 
 #[test]
 fn samples_of_all_sizes_cross_whole_and_in_order_whoever_shares_memory() {
-    let host = host();
-    let _daemon = host.daemon();
-    for (from, to) in [(false, true), (true, false), (false, false)] {
-        let (from, to) = (session(&host, "from", from), session(&host, "to", to));
-        let (publisher, subscription) = connect(&from, &to, "/t", Qos::keep_all());
+    with_both_ends(|from, to| {
+        let (publisher, subscription) = connect(from, to, "/t", Qos::keep_all());
         let mut bytes = Vec::new();
         for (number, len) in (0..).zip(SIZES.iter().chain(SIZES.iter().rev())) {
             let payload = pattern(number, *len);
@@ -213,27 +250,16 @@ fn samples_of_all_sizes_cross_whole_and_in_order_whoever_shares_memory() {
             assert_eq!((info.publisher, info.sequence, info.source_timestamp), expected);
         }
         assert_eq!(subscription.lost(), 0);
-    }
+    });
 }
 
 #[test]
 fn keep_all_holds_its_publisher_back_and_loses_nothing() {
-    let host = host();
-    let _daemon = host.daemon();
-    for (from, to) in [(false, true), (true, false), (false, false)] {
-        let (from, to) = (session(&host, "from", from), session(&host, "to", to));
-        let (publisher, subscription) = connect(&from, &to, "/t", Qos::keep_all());
+    with_both_ends(|from, to| {
+        let (publisher, subscription) = connect(from, to, "/t", Qos::keep_all());
         let len = 50_000;
         // As much as all that lies in between may hold is there before the first is taken.
-        let mut last = 0;
-        loop {
-            match publisher.publish(&pattern(last + 1, len)) {
-                Ok(sequence) => last = sequence,
-                Err(PublishError::Blocked { .. }) => break,
-                Err(error) => panic!("{error}"),
-            }
-            assert!(last < 20_000, "nothing holds it back");
-        }
+        let last = fill(|number| publisher.publish(&pattern(number, len)));
         let more = last + 200;
         thread::scope(|scope| {
             scope.spawn(|| {
@@ -244,14 +270,14 @@ fn keep_all_holds_its_publisher_back_and_loses_nothing() {
             assert!(take_until(&subscription, more).into_iter().eq(1..=more));
         });
         assert_eq!(subscription.lost(), 0);
-    }
+    });
 }
 
 #[test]
 fn a_late_joiner_gets_the_history_once() {
     let host = host();
     let _daemon = host.daemon();
-    for (from_shares, to_shares) in [(false, true), (true, false), (false, false)] {
+    for (from_shares, to_shares) in ENDS {
         let from = session(&host, "from", from_shares);
         let [one, two] = ["one", "two"].map(|name| session(&host, name, to_shares));
         let publisher = from.create_publisher(spec("/t", latched(3))).unwrap();
@@ -276,7 +302,7 @@ fn a_late_joiner_gets_the_history_once() {
 fn best_effort_waits_for_nobody_and_what_is_lost_is_counted() {
     let host = host();
     let _daemon = host.daemon();
-    for (from, to) in [(false, true), (true, false), (false, false)] {
+    for (from, to) in ENDS {
         let (from, to) = (session(&host, "from", from), session(&host, "to", to));
         let keeps = Qos { history: History::KeepAll, ..best_effort(1) };
         let publisher = from.create_publisher(spec("/t", best_effort(4))).unwrap();
@@ -321,7 +347,7 @@ fn a_reader_that_takes_nothing_holds_nobody_else_up() {
     let _daemon = host.daemon();
     let (from, to) = (session(&host, "from", true), session(&host, "to", false));
     let (stuck, never) = connect(&from, &to, "/stuck", Qos::keep_all());
-    while publish_once(&stuck, 1_000_000) {}
+    fill(|_| stuck.publish(&vec![0; 1_000_000]));
     let (image, slow) = connect(&from, &to, "/image", best_effort(1));
     let (twist, quick) = connect(&from, &to, "/twist", Qos::keep_all());
     for sequence in 1..=100 {
@@ -332,14 +358,6 @@ fn a_reader_that_takes_nothing_holds_nobody_else_up() {
     assert_eq!(take_until(&slow, 100).last(), Some(&100));
     let mut bytes = Vec::new();
     assert!(never.recv(&mut bytes, Some(PATIENCE)).is_some(), "and it may still go on");
-}
-
-fn publish_once(publisher: &Publisher, len: usize) -> bool {
-    match publisher.publish(&vec![0; len]) {
-        Ok(_) => true,
-        Err(PublishError::Blocked { .. }) => false,
-        Err(error) => panic!("{error}"),
-    }
 }
 
 #[test]
@@ -380,10 +398,7 @@ fn what_came_by_way_of_one_subscription_that_ends_is_not_lost_for_another() {
     let (publisher, one) = connect(&from, &to, "/t", Qos::keep_all());
     let other = to.create_subscription(spec("/t", Qos::keep_all())).unwrap();
     await_pair(&publisher, &other);
-    let mut last = 0;
-    while let Ok(sequence) = publisher.publish(&pattern(last + 1, 50_000)) {
-        last = sequence;
-    }
+    let last = fill(|number| publisher.publish(&pattern(number, 50_000)));
     // Whichever of them it is that the daemon takes from.
     let (ends, stays) = if one.gid() < other.gid() { (one, other) } else { (other, one) };
     drop(ends);

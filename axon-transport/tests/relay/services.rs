@@ -7,8 +7,6 @@ use axon_transport::session::{Client, Server, Waitable};
 
 use super::*;
 
-/// Who shares memory of server and client.
-const ENDS: [(bool, bool); 3] = [(false, true), (true, false), (false, false)];
 const CLIENTS: usize = 20;
 pub(crate) const CALLS: u64 = 50;
 
@@ -26,12 +24,8 @@ pub(crate) fn answer(server: &Server) -> Gid {
     request.publisher
 }
 
-fn respond(server: &Server, client: Gid, sequence: u64, bytes: &[u8]) {
-    let deadline = Instant::now() + PATIENCE;
-    while let Err(error) = server.send_response(client, sequence, bytes) {
-        assert!(matches!(error, PublishError::Blocked { .. }), "{error}");
-        assert!(Instant::now() < deadline, "for ever");
-    }
+pub(crate) fn respond(server: &Server, client: Gid, sequence: u64, bytes: &[u8]) {
+    patiently(|| server.send_response(client, sequence, bytes));
 }
 
 pub(crate) fn call(client: &Client, bytes: &[u8]) {
@@ -42,42 +36,22 @@ pub(crate) fn call(client: &Client, bytes: &[u8]) {
     assert!(response.iter().rev().eq(bytes), "the response to something else");
 }
 
-fn call_in_thread(client: &Client, server: &Server, bytes: &[u8]) {
+pub(crate) fn call_in_thread(client: &Client, server: &Server, bytes: &[u8]) {
     thread::scope(|scope| {
         scope.spawn(|| answer(server));
         call(client, bytes);
     });
 }
 
-fn serve(session: &Session) -> Server {
+pub(crate) fn serve(session: &Session) -> Server {
     session.create_server(service()).unwrap()
 }
 
 /// A client once it counts `server`.
-fn ask(session: &Session, server: &Server) -> Client {
+pub(crate) fn ask(session: &Session, server: &Server) -> Client {
     let client = session.create_client(service()).unwrap();
     until("the client counts the server", || client.servers().contains(&server.gid()));
     client
-}
-
-/// Its processes are relayed. It must outlive what they need of `host`.
-pub(crate) fn relaying(host: &Host) -> Host {
-    let relaying = Host { env: host.env.clone(), dir: tempfile::tempdir().unwrap() };
-    relaying.with("AXON_SHM", "off").with("AXON_DAEMON", "require")
-}
-
-/// Has a test done with the sessions of a server and a client, whoever of them shares memory.
-fn with_both_ends(test: impl Fn(&Session, &Session)) {
-    let host = host();
-    let _daemon = host.daemon();
-    between([&host, &host], test);
-}
-
-/// The same of two hosts, the server's first.
-fn between([here, there]: [&Host; 2], test: impl Fn(&Session, &Session)) {
-    for (serves, asks) in ENDS {
-        test(&session(here, "server", serves), &session(there, "client", asks));
-    }
 }
 
 /// Has a test done with a session that shares memory and with one that does not, beside processes that
@@ -91,7 +65,7 @@ fn beside_relayed(name: &str, test: impl Fn(&Session, &Host)) {
     }
 }
 
-fn nothing_more(client: &Client) {
+pub(crate) fn nothing_more(client: &Client) {
     let mut bytes = Vec::new();
     assert!(client.recv_response(&mut bytes, Some(Duration::from_millis(20))).is_none());
 }
@@ -245,209 +219,6 @@ fn a_relayed_server_that_dies_in_a_call_is_not_available_and_another_one_is() {
         assert_eq!(next.hear(), "serves");
         assert!(client.wait_available(PATIENCE));
         call(&client, b"xyz");
-    });
-}
-
-#[test]
-fn who_takes_no_responses_holds_its_own_back_and_nobody_elses() {
-    with_both_ends(|here, there| {
-        let server = serve(here);
-        let (stuck, other) = (ask(there, &server), ask(there, &server));
-        until("both ends know it", || server.clients().len() == 2);
-        let mut sent = 0;
-        let refused = loop {
-            match server.send_response(stuck.gid(), sent + 1, &pattern(sent, 50_000)) {
-                Ok(()) => sent += 1,
-                Err(error) => break error,
-            }
-            assert!(sent < 20_000, "nothing holds it back");
-        };
-        assert!(matches!(refused, PublishError::Blocked { .. }), "{refused}");
-        (0..20).for_each(|number| call_in_thread(&other, &server, &pattern(number, 5_000)));
-        let mut bytes = Vec::new();
-        for number in 0..sent {
-            let info = stuck.recv_response(&mut bytes, Some(PATIENCE)).expect("none is lost");
-            assert_eq!(info.sequence, number + 1);
-            assert_eq!(bytes, pattern(number, 50_000));
-        }
-    });
-}
-
-#[test]
-fn who_keeps_the_newest_only_gets_them_and_holds_nobody_back() {
-    const MANY: u64 = 500;
-    let host = host();
-    let _daemon = host.daemon();
-    let newest = Qos { depth: 3, ..Qos::default() };
-    for (serves, asks) in ENDS {
-        let (here, there) = (session(&host, "server", serves), session(&host, "client", asks));
-        let server = here.create_server(EndpointSpec { qos: newest, ..service() }).unwrap();
-        let client = there.create_client(EndpointSpec { qos: newest, ..service() }).unwrap();
-        assert!(client.wait_available(PATIENCE));
-        until("the server counts it", || server.clients() == [client.gid()]);
-        // Unless all that comes is taken or passed over the ring on one way would be full.
-        for number in 1..=MANY {
-            let sent = Instant::now() + PATIENCE;
-            while let Err(error) = client.send_request(&pattern(number, 50_000)) {
-                assert!(matches!(error, PublishError::Blocked { .. }), "{error}");
-                assert!(Instant::now() < sent, "held back for good");
-            }
-        }
-        let mut bytes = Vec::new();
-        let (mut last, mut taken) = (0, 0);
-        while last < MANY {
-            let info = server.recv_request(&mut bytes, Some(PATIENCE)).expect("the newest");
-            assert!(info.sequence > last && bytes == pattern(info.sequence, 50_000));
-            (last, taken) = (info.sequence, taken + 1);
-        }
-        assert!(taken < MANY, "nothing was passed over");
-        for number in 1..=MANY {
-            respond(&server, client.gid(), number, &pattern(number, 50_000));
-        }
-        let mut last = 0;
-        while last < MANY {
-            let info = client.recv_response(&mut bytes, Some(PATIENCE)).expect("the newest");
-            assert!(info.sequence > last && bytes == pattern(info.sequence, 50_000));
-            last = info.sequence;
-        }
-    }
-}
-
-#[test]
-fn a_server_that_takes_no_requests_holds_its_clients_back_and_loses_nothing() {
-    with_both_ends(|here, there| {
-        let server = serve(here);
-        let client = ask(there, &server);
-        let mut sent = 0;
-        let refused = loop {
-            match client.send_request(&pattern(sent + 1, 50_000)) {
-                Ok(number) => sent = number,
-                Err(error) => break error,
-            }
-            assert!(sent < 20_000, "nothing holds it back");
-        };
-        assert!(matches!(refused, PublishError::Blocked { .. }), "{refused}");
-        let mut bytes = Vec::new();
-        for number in 1..=sent {
-            let info = server.recv_request(&mut bytes, Some(PATIENCE)).expect("none is lost");
-            assert_eq!((info.sequence, &bytes), (number, &pattern(number, 50_000)));
-        }
-        until("the server counts it", || server.clients() == [client.gid()]);
-        respond(&server, client.gid(), sent, b"at last");
-        assert_eq!(client.recv_response(&mut bytes, Some(PATIENCE)).unwrap().sequence, sent);
-    });
-}
-
-#[test]
-fn who_has_ended_is_not_counted_though_more_of_it_is_to_come() {
-    with_both_ends(|here, there| {
-        let node = there.create_node("n", "/", "/").unwrap();
-        let changed = [Waitable::GuardCondition(node.graph_changed())];
-        let server = serve(here);
-        let client = ask(there, &server);
-        until("the server counts it", || server.clients() == [client.gid()]);
-        let len = 50_000;
-        let mut answered = 0;
-        while server.send_response(client.gid(), answered + 1, &pattern(answered, len)).is_ok() {
-            answered += 1;
-            assert!(answered < 20_000, "nothing holds it back");
-        }
-        let gone = server.gid();
-        drop(server);
-        while client.is_available() || there.graph().endpoints.contains_key(&gone) {
-            assert_eq!(there.wait_for(&changed, Some(PATIENCE)).unwrap(), [0]);
-        }
-        let mut bytes = Vec::new();
-        for number in 0..answered {
-            let info = client.recv_response(&mut bytes, Some(PATIENCE)).expect("none is lost");
-            assert_eq!((info.publisher, info.sequence), (gone, number + 1));
-            assert_eq!(bytes, pattern(number, len));
-        }
-        nothing_more(&client);
-
-        let server = serve(here);
-        assert!(client.wait_available(PATIENCE));
-        until("the server counts it", || server.clients() == [client.gid()]);
-        let mut asked = 0;
-        while client.send_request(&pattern(asked, len)).is_ok() {
-            asked += 1;
-            assert!(asked < 20_000, "nothing holds it back");
-        }
-        let gone = client.gid();
-        drop(client);
-        until("the server counts it no more", || {
-            server.clients().is_empty() && !here.graph().endpoints.contains_key(&gone)
-        });
-        for number in 0..asked {
-            let info = server.recv_request(&mut bytes, Some(PATIENCE)).expect("none is lost");
-            assert_eq!((info.publisher, &bytes), (gone, &pattern(number, len)));
-        }
-    });
-}
-
-#[test]
-fn a_publisher_that_has_ended_is_not_counted_though_more_of_it_is_to_come() {
-    let host = host();
-    let _daemon = host.daemon();
-    for (writes, reads) in ENDS {
-        let (here, there) = (session(&host, "writes", writes), session(&host, "reads", reads));
-        let (publisher, subscription) = connect(&here, &there, "/t", Qos::keep_all());
-        let len = 50_000;
-        let mut last = 0;
-        while let Ok(number) = publisher.publish(&pattern(last + 1, len)) {
-            last = number;
-            assert!(last < 20_000, "nothing holds it back");
-        }
-        let gone = publisher.gid();
-        drop(publisher);
-        until("it is counted no more", || {
-            subscription.matched().is_empty() && !there.graph().endpoints.contains_key(&gone)
-        });
-        assert_eq!(take_until(&subscription, last), (1..=last).collect::<Vec<_>>());
-        assert_eq!(subscription.lost(), 0);
-    }
-}
-
-#[test]
-fn what_was_asked_or_answered_last_arrives_though_who_did_is_gone() {
-    with_both_ends(|here, there| {
-        let (server, witness) = (serve(here), serve(here));
-        let client = ask(there, &server);
-        until("it counts both", || client.servers().len() == 2);
-        until("they count it", || server.clients().len() == 1 && witness.clients().len() == 1);
-        let (many, len) = (30, 100_000);
-        let mut bytes = Vec::new();
-        thread::scope(|scope| {
-            scope.spawn(|| {
-                for number in 1..=many {
-                    while client.send_request(&pattern(number, len)).is_err() {}
-                }
-            });
-            for number in 1..=many {
-                let info = server.recv_request(&mut bytes, Some(PATIENCE)).expect("a request");
-                assert_eq!(info.sequence, number);
-                respond(&server, info.publisher, number, &bytes);
-                if number < many {
-                    continue;
-                }
-                // The other one has taken nothing yet.
-                for number in 1..=many {
-                    let info = witness.recv_request(&mut bytes, Some(PATIENCE));
-                    assert_eq!(info.expect("a request").sequence, number);
-                }
-            }
-        });
-        drop(server);
-        for number in 1..=many {
-            let info = client.recv_response(&mut bytes, Some(PATIENCE)).expect("a response");
-            assert_eq!((info.sequence, &bytes), (number, &pattern(number, len)));
-        }
-        until("only one is left", || client.servers() == [witness.gid()]);
-        client.send_request(b"the last word").unwrap();
-        drop(client);
-        assert!(witness.recv_request(&mut bytes, Some(PATIENCE)).is_some());
-        assert_eq!(bytes, b"the last word");
-        until("it is forgotten", || witness.clients().is_empty());
     });
 }
 

@@ -11,9 +11,6 @@ use super::*;
 
 const MILLI: u64 = 1_000_000;
 
-/// Both ways to be relayed, and both at once: who shares memory of publisher and subscription.
-const ENDS: [(bool, bool); 3] = [(false, true), (true, false), (false, false)];
-
 fn await_counted(session: &Session, event: &Event) -> Counted {
     let ready = session.wait_for(&[Waitable::Event(event)], Some(PATIENCE)).unwrap();
     assert_eq!(ready, [0], "{event:?}");
@@ -32,35 +29,29 @@ fn alive(event: &Event) -> (u64, u64) {
 
 #[test]
 fn deadlines_are_missed_at_both_ends_of_a_relay() {
-    let host = host();
-    let _daemon = host.daemon();
-    for (shares, other_shares) in ENDS {
-        let (from, to) = (session(&host, "from", shares), session(&host, "to", other_shares));
+    with_both_ends(|from, to| {
         let timed = Qos { deadline: Some(50 * MILLI), ..Qos::default() };
-        let (publisher, subscription) = connect(&from, &to, "/t", timed);
+        let (publisher, subscription) = connect(from, to, "/t", timed);
         let offered = publisher.event(EventKind::OfferedDeadlineMissed).unwrap();
         let requested = subscription.event(EventKind::RequestedDeadlineMissed).unwrap();
         publisher.publish(b"x").unwrap();
-        for (session, event) in [(&from, &offered), (&to, &requested)] {
+        for (session, event) in [(from, &offered), (to, &requested)] {
             let first = await_counted(session, event).total;
             assert!(await_counted(session, event).total > first, "one for every period");
         }
         assert!(subscription.recv(&mut Vec::new(), Some(PATIENCE)).is_some());
-    }
+    });
 }
 
 #[test]
 fn a_lease_runs_out_beyond_a_relay_and_a_sample_renews_it() {
-    let host = host();
-    let _daemon = host.daemon();
-    for (shares, other_shares) in ENDS {
-        let (from, to) = (session(&host, "from", shares), session(&host, "to", other_shares));
+    with_both_ends(|from, to| {
         let manual = Qos {
             liveliness: Liveliness::ManualByTopic,
             lease: Some(100 * MILLI),
             ..Qos::default()
         };
-        let (publisher, subscription) = connect(&from, &to, "/t", manual);
+        let (publisher, subscription) = connect(from, to, "/t", manual);
         let changed = subscription.event(EventKind::LivelinessChanged).unwrap();
         until("it counts as not alive", || alive(&changed) == (0, 1));
         until("it is alive again", || {
@@ -70,18 +61,15 @@ fn a_lease_runs_out_beyond_a_relay_and_a_sample_renews_it() {
         until("it runs out again", || alive(&changed) == (0, 1));
         drop(publisher);
         until("it is forgotten", || alive(&changed) == (0, 0));
-    }
+    });
 }
 
 #[test]
 fn who_says_without_a_sample_that_it_is_alive_is_so_beyond_a_relay() {
-    let host = host();
-    let _daemon = host.daemon();
-    for (shares, other_shares) in ENDS {
-        let (from, to) = (session(&host, "from", shares), session(&host, "to", other_shares));
+    with_both_ends(|from, to| {
         let liveliness = Liveliness::ManualByTopic;
         let manual = Qos { liveliness, lease: Some(200 * MILLI), ..Qos::default() };
-        let (publisher, subscription) = connect(&from, &to, "/t", manual);
+        let (publisher, subscription) = connect(from, to, "/t", manual);
         let changed = subscription.event(EventKind::LivelinessChanged).unwrap();
         until("it counts as not alive", || alive(&changed) == (0, 1));
         until("it is alive again", || {
@@ -90,14 +78,14 @@ fn who_says_without_a_sample_that_it_is_alive_is_so_beyond_a_relay() {
         });
         until("it runs out again", || alive(&changed) == (0, 1));
         assert_eq!(subscription.received(), 0);
-    }
+    });
 }
 
 #[test]
 fn a_process_that_is_stopped_is_not_alive_beyond_a_relay() {
     let host = host();
     let _daemon = host.daemon();
-    let relaying = services::relaying(&host);
+    let relaying = relaying(&host);
     for (shares, other_shares) in ENDS {
         let mut automatic = if shares { &host } else { &relaying }.play("alive");
         assert_eq!(automatic.hear(), "there");
@@ -122,12 +110,9 @@ pub(crate) fn automatic_lease() -> Qos {
 
 #[test]
 fn a_sample_that_outlived_its_lifespan_is_not_delivered_beyond_a_relay() {
-    let host = host();
-    let _daemon = host.daemon();
-    for (shares, other_shares) in ENDS {
-        let (from, to) = (session(&host, "from", shares), session(&host, "to", other_shares));
+    with_both_ends(|from, to| {
         let mortal = Qos { lifespan: Some(3_600_000 * MILLI), ..Qos::default() };
-        let (publisher, subscription) = connect(&from, &to, "/t", mortal);
+        let (publisher, subscription) = connect(from, to, "/t", mortal);
         // Published by a clock that is far too late.
         publisher.publish_at(1_000_000_000, b"old").unwrap();
         publisher.publish(b"new").unwrap();
@@ -136,5 +121,5 @@ fn a_sample_that_outlived_its_lifespan_is_not_delivered_beyond_a_relay() {
         assert_eq!((info.sequence, &bytes[..]), (2, &b"new"[..]));
         let counts = (subscription.expired(), subscription.received(), subscription.lost());
         assert_eq!(counts, (1, 1, 0));
-    }
+    });
 }
