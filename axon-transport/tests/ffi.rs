@@ -5,6 +5,7 @@
 mod skip;
 
 use std::{
+    collections::BTreeSet,
     ffi::OsStr,
     fs,
     path::{Path, PathBuf},
@@ -147,19 +148,32 @@ fn the_header_is_plain_c_and_plain_cpp() {
 
 /// Names of the functions that the library has for C.
 fn exported() -> Vec<String> {
-    let mut names = Vec::new();
+    functions().into_iter().map(|(name, _)| name).collect()
+}
+
+/// The same, each with its source.
+fn functions() -> Vec<(String, String)> {
+    let mut functions = Vec::new();
     for file in files("src/ffi", "rs") {
         let text = fs::read_to_string(file).unwrap();
-        let mut lines = text.lines();
-        while let Some(line) = lines.next() {
-            if line.trim() == "#[unsafe(no_mangle)]" {
-                let declaration = lines.next().unwrap();
-                let name = declaration.split("fn ").nth(1).unwrap();
-                names.push(name.split('(').next().unwrap().to_owned());
-            }
+        for after in text.split("#[unsafe(no_mangle)]\n").skip(1) {
+            let source = after.split("\n}\n").next().unwrap().to_owned();
+            let declared = source.split("fn ").nth(1).unwrap();
+            functions.push((declared.split('(').next().unwrap().to_owned(), source));
         }
     }
-    names
+    functions
+}
+
+/// What `guarded` does with a panic, its own tests show.
+#[test]
+fn no_function_lets_a_panic_through() {
+    // They only look something up; the first must do so in a signal handler.
+    let bare = ["guard_trigger", "policy_name", "abi", "last_error"]
+        .map(|name| format!("axon_session_{name}"));
+    let open = functions().into_iter().filter(|(_, source)| !source.contains("guarded(||"));
+    let open: BTreeSet<String> = open.map(|(name, _)| name).collect();
+    assert_eq!(open, BTreeSet::from(bare));
 }
 
 #[test]

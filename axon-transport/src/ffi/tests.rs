@@ -199,3 +199,14 @@ fn the_end_of_one_handle_of_an_event_leaves_the_callback_of_another() {
     ok(axon_session_event_destroy(other));
     place.end();
 }
+
+#[test]
+fn a_panic_becomes_a_code_and_a_text() {
+    let panicked = guarded(|| panic!("somewhere inside"));
+    assert_eq!(panicked, AXON_RET_PANIC);
+    // SAFETY: the text stands until the next call that fails in this thread.
+    let text = unsafe { std::ffi::CStr::from_ptr(axon_session_last_error()) };
+    assert!(text.to_str().unwrap().contains("defect of AXON"), "{text:?}");
+    // The next call is not affected.
+    assert_eq!(guarded(|| Ok(())), AXON_RET_OK);
+}

@@ -70,6 +70,7 @@ void case_waits(void);
 void case_events(void);
 void case_misuse(void);
 void case_threads(void);
+void case_texts(void);
 void case_fork(void);
 void case_services(void);
 void case_graph(void);

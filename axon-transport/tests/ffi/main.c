@@ -96,7 +96,7 @@ int main(int argc, char **argv) {
     } cases[] = {
         {"settings", case_settings}, {"topics", case_topics}, {"loans", case_loans},
         {"waits", case_waits},       {"events", case_events}, {"misuse", case_misuse},
-        {"threads", case_threads},   {"fork", case_fork},
+        {"threads", case_threads},   {"texts", case_texts},   {"fork", case_fork},
         {"services", case_services}, {"graph", case_graph}, {"log", case_log},
         {"callbacks", case_callbacks},
     };

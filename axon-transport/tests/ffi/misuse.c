@@ -82,12 +82,29 @@ void case_settings(void) {
             axon_session_qos_check(NULL, &requested, &verdict, NULL, 0), "null");
 }
 
+static void no_node(void *user, const char *name, const char *namespace_, const char *enclave) {
+    (void)user, (void)name, (void)namespace_, (void)enclave;
+    CHECK(!"of a session that is not there");
+}
+
+static void no_name(void *user, const char *name, const char *const *types, size_t type_count) {
+    (void)type_count, (void)types;
+    no_node(user, name, NULL, NULL);
+}
+
+static void no_endpoint(void *user, const axon_endpoint_t *endpoint) {
+    (void)endpoint;
+    no_node(user, NULL, NULL, NULL);
+}
+
 /* Every function that takes a handle, with this one. */
 static void use(uint64_t id) {
     axon_session_t session = {id};
     axon_node_t node = {id};
     axon_publisher_t publisher = {id};
     axon_subscription_t subscription = {id};
+    axon_server_t server = {id};
+    axon_client_t client = {id};
     axon_guard_t guard = {id};
     axon_event_t event = {id};
     axon_sample_t sample = {id};
@@ -102,6 +119,8 @@ static void use(uint64_t id) {
     uint64_t count;
     const uint8_t *bytes;
     axon_event_status_t status;
+    axon_gid_t gid;
+    memset(&gid, 0, sizeof gid);
     NO_HANDLE(axon_session_close(session));
     NO_HANDLE(axon_session_domain(session, &number));
     NO_HANDLE(axon_session_is_connected(session, &byte));
@@ -115,6 +134,7 @@ static void use(uint64_t id) {
     NO_HANDLE(axon_session_publisher_skip_unread(publisher, &count));
     NO_HANDLE(axon_session_publisher_matched(publisher, &size));
     NO_HANDLE(axon_session_publisher_wait_matched(publisher, 1, AXON_WAIT_FOREVER));
+    NO_HANDLE(axon_session_publisher_wait_acknowledged(publisher, AXON_WAIT_FOREVER));
     NO_HANDLE(axon_session_publisher_assert_liveliness(publisher));
     NO_HANDLE(axon_session_publisher_loan(publisher, 0, 1, &loan, &data));
     NO_HANDLE(axon_session_publisher_event(publisher, AXON_EVENT_LIVELINESS_LOST, &event));
@@ -130,6 +150,27 @@ static void use(uint64_t id) {
     NO_HANDLE(axon_session_subscription_lost(subscription, &count));
     NO_HANDLE(axon_session_subscription_set_callback(subscription, NULL, NULL));
     NO_HANDLE(axon_session_subscription_event(subscription, AXON_EVENT_MESSAGE_LOST, &event));
+    NO_HANDLE(axon_session_server_create(node, &options, &server));
+    NO_HANDLE(axon_session_server_destroy(server));
+    NO_HANDLE(axon_session_server_describe(server, NULL, NULL));
+    NO_HANDLE(axon_session_server_matched(server, &size));
+    NO_HANDLE(axon_session_server_take(server, room, &message, NULL, &byte));
+    NO_HANDLE(axon_session_server_take_sample(server, &sample, &bytes, &size, NULL));
+    NO_HANDLE(axon_session_server_respond(server, &gid, 1, NULL, 0));
+    NO_HANDLE(axon_session_server_set_callback(server, NULL, NULL));
+    NO_HANDLE(axon_session_client_create(node, &options, &client));
+    NO_HANDLE(axon_session_client_destroy(client));
+    NO_HANDLE(axon_session_client_describe(client, NULL, NULL));
+    NO_HANDLE(axon_session_client_matched(client, &size));
+    NO_HANDLE(axon_session_client_wait_available(client, AXON_WAIT_FOREVER));
+    NO_HANDLE(axon_session_client_request(client, NULL, 0, NULL));
+    NO_HANDLE(axon_session_client_take(client, room, &message, NULL, &byte));
+    NO_HANDLE(axon_session_client_take_sample(client, &sample, &bytes, &size, NULL));
+    NO_HANDLE(axon_session_client_set_callback(client, NULL, NULL));
+    NO_HANDLE(axon_session_graph_nodes(session, no_node, NULL));
+    NO_HANDLE(axon_session_graph_names(session, AXON_KIND_PUBLISHER, NULL, NULL, no_name, NULL));
+    NO_HANDLE(axon_session_graph_endpoints(session, AXON_KIND_PUBLISHER, "/t", no_endpoint, NULL));
+    NO_HANDLE(axon_session_graph_count(session, AXON_KIND_PUBLISHER, "/t", &size));
     NO_HANDLE(axon_session_sample_release(sample));
     NO_HANDLE(axon_session_event_take(event, &status));
     NO_HANDLE(axon_session_event_set_callback(event, NULL, NULL));
@@ -263,6 +304,9 @@ static struct {
     struct place place;
     axon_publisher_t talker;
     axon_subscription_t listener;
+    axon_server_t server;
+    axon_client_t client;
+    axon_event_t event;
     axon_guard_t guard;
     pthread_barrier_t start;
 } shared;
@@ -304,6 +348,16 @@ static void *use_shared(void *argument) {
         if (worked_or_gone(ret) && sample.id != 0) {
             OK(axon_session_sample_release(sample));
         }
+        worked_or_gone(axon_session_client_request(shared.client, &byte, 1, NULL));
+        axon_message_info_t *asked = &message.info;
+        ret = axon_session_server_take(shared.server, room, &message, asked, &taken);
+        if (worked_or_gone(ret) && taken) {
+            worked_or_gone(axon_session_server_respond(shared.server, &asked->sender,
+                                                       asked->publication_sequence, &byte, 1));
+        }
+        worked_or_gone(axon_session_client_take(shared.client, room, &message, NULL, &taken));
+        axon_event_status_t status;
+        worked_or_gone(axon_session_event_take(shared.event, &status));
         (void)axon_session_guard_trigger(shared.guard);
         worked_or_gone(axon_session_wait(shared.place.session, &set, 100000));
     }
@@ -330,6 +384,10 @@ void case_threads(void) {
         shared.place = open_place("threads");
         shared.talker = publisher(shared.place, "/threads");
         shared.listener = subscription(shared.place, "/threads");
+        axon_endpoint_options_t options = endpoint("/threads/calls");
+        OK(axon_session_server_create(shared.place.node, &options, &shared.server));
+        OK(axon_session_client_create(shared.place.node, &options, &shared.client));
+        OK(axon_session_publisher_event(shared.talker, AXON_EVENT_PUBLICATION_MATCHED, &shared.event));
         OK(axon_session_guard_create(shared.place.session, &shared.guard));
         CHECK(pthread_barrier_init(&shared.start, NULL, 4) == 0);
         pthread_t users[3];
@@ -340,7 +398,10 @@ void case_threads(void) {
         usleep((useconds_t)round * 100);
         (void)axon_session_guard_trigger(shared.guard);
         OK(axon_session_subscription_destroy(shared.listener));
+        OK(axon_session_server_destroy(shared.server));
+        OK(axon_session_event_destroy(shared.event));
         OK(axon_session_publisher_destroy(shared.talker));
+        OK(axon_session_client_destroy(shared.client));
         OK(axon_session_guard_destroy(shared.guard));
         close_place(shared.place);
         for (int i = 0; i < 3; i++) {
@@ -348,6 +409,33 @@ void case_threads(void) {
         }
         CHECK(pthread_barrier_destroy(&shared.start) == 0);
     }
+}
+
+/* Fails with this domain, and sees its own text once the other thread has failed, too. */
+static void *fail_with(void *domain) {
+    axon_session_options_t options;
+    OK(axon_session_options_init(&options, AXON_SESSION_ABI));
+    options.domain = *(const uint32_t *)domain;
+    char own[8];
+    snprintf(own, sizeof own, "%u", (unsigned)options.domain);
+    for (int round = 0; round < 100; round++) {
+        pthread_barrier_wait(&shared.start);
+        RETURNS(AXON_RET_CONFIG, axon_session_options_check(&options), own);
+        const char *text = axon_session_last_error();
+        pthread_barrier_wait(&shared.start);
+        CHECK(text == axon_session_last_error() && strstr(text, own));
+    }
+    return NULL;
+}
+
+void case_texts(void) {
+    uint32_t domains[2] = {901, 902};
+    CHECK(pthread_barrier_init(&shared.start, NULL, 2) == 0);
+    pthread_t other;
+    CHECK(pthread_create(&other, NULL, fail_with, &domains[0]) == 0);
+    fail_with(&domains[1]);
+    CHECK(pthread_join(other, NULL) == 0);
+    CHECK(pthread_barrier_destroy(&shared.start) == 0);
 }
 
 void case_fork(void) {
