@@ -27,6 +27,7 @@ mod neighbour;
 use std::{
     env,
     io::{BufRead as _, BufReader},
+    os::unix::net::UnixDatagram,
     path::Path,
     process::{Child, Command, ExitCode, Stdio},
     sync::{
@@ -37,7 +38,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_transport::shm::Context;
+use axon_transport::{
+    qos::Qos,
+    shm::{Context, Publisher, PublisherOptions, Subscriber, SubscriberOptions},
+};
 
 /// The environment variables that make a process one of them: what it plays, and where they meet.
 const ROLE: &str = "SCRIBBLE_ROLE";
@@ -56,8 +60,7 @@ fn main() -> ExitCode {
         match role.as_str() {
             "hostile" => hostile::run(Path::new(&place), seed),
             "honest" => neighbour::publish(Path::new(&place)),
-            // Whether one can be made here at all.
-            "probe" => drop(Context::new().expect("a context")),
+            "probe" => probe(),
             "overrun" => overrun(),
             _ => neighbour::run(Path::new(&place)),
         }
@@ -116,6 +119,20 @@ fn overrun() {
 fn is_checked(through: &[&str], place: &Path) -> bool {
     let mut overrun = play("overrun", place, 0, through);
     !overrun.0.wait().expect("a child").success()
+}
+
+/// Shares memory with another, of the same process: fails where what that takes cannot be had.
+fn probe() {
+    let (one, another) = UnixDatagram::pair().expect("sockets");
+    let [here, there] = [(), ()].map(|()| Context::new().expect("a context"));
+    thread::scope(|scope| {
+        scope.spawn(|| {
+            let options = SubscriberOptions::new(Qos::default());
+            drop(Subscriber::connect(&there, &another, options, Some(PATIENCE)).expect("served"));
+        });
+        let publisher = Publisher::new(&here, PublisherOptions::new(Qos::default()));
+        publisher.expect("a publisher").serve(&one, Some(PATIENCE)).expect("a subscriber");
+    });
 }
 
 /// Whether the neighbour can run under a checker; says why if it cannot.
