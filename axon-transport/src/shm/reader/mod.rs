@@ -69,8 +69,9 @@ pub struct Reader {
     /// Whether the publisher is known to be gone.
     ended: bool,
     cursor: u64,
-    /// Where what is taken is done with once that is said: numbers and positions of what is not.
-    under_way: Option<VecDeque<(u64, u64)>>,
+    /// Where what is taken is done with only once that is said. Apart: few readers have it, and what each
+    /// take looks at is together.
+    under_way: Option<Box<UnderWay>>,
     /// The head as it was seen last.
     seen: u64,
     received: u64,
@@ -80,6 +81,10 @@ pub struct Reader {
     /// The publisher is gone, and its descriptors are in memory that never came.
     given_up: bool,
 }
+
+/// Numbers and positions of samples that were taken and are not done with.
+#[derive(Default)]
+struct UnderWay(VecDeque<(u64, u64)>);
 
 /// Where a ring's descriptors were found.
 struct Descriptors {
@@ -411,7 +416,7 @@ impl Reader {
         self.received += 1;
         self.attachment.lane.taken(record.timestamp);
         if let Some(under_way) = &mut self.under_way {
-            under_way.push_back((record.sequence, self.cursor));
+            under_way.0.push_back((record.sequence, self.cursor));
         }
         self.advance(self.cursor + 1);
         taken
@@ -422,8 +427,9 @@ impl Reader {
         self.tell_cursor();
     }
 
+    #[inline]
     fn tell_cursor(&self) {
-        let first = self.under_way.as_ref().and_then(VecDeque::front);
+        let first = self.under_way.as_ref().and_then(|under_way| under_way.0.front());
         let done = first.map_or(self.cursor, |(_, position)| *position);
         self.attachment.lane.advance(done, self.received, self.lost, self.skipped);
         self.make_room_known();
@@ -441,8 +447,8 @@ impl Reader {
         if self.attachment.lane.is_forked() {
             return;
         }
-        while under_way.front().is_some_and(|(number, _)| *number <= sequence) {
-            under_way.pop_front();
+        while under_way.0.front().is_some_and(|(number, _)| *number <= sequence) {
+            under_way.0.pop_front();
         }
         self.tell_cursor();
     }
