@@ -53,6 +53,12 @@ int take(axon_subscription_t subscription, struct message *message);
 /* Waits until there is something to take. */
 void await(struct place place, axon_subscription_t subscription);
 
+/* Whether to try what a forked child does. Not with the address sanitizer: those of older compilers do not
+ * make their allocator ready for a fork, so that a child may wait for ever for a lock which it holds. */
+#ifndef FORKS
+#define FORKS 1
+#endif
+
 /* A handle that names nothing any more, of any kind. */
 #define STALE UINT64_C(0x123456789abcdef)
 

@@ -439,6 +439,9 @@ void case_texts(void) {
 }
 
 void case_fork(void) {
+    if (!FORKS) {
+        return;
+    }
     struct place place = open_place("parent");
     axon_publisher_t talker = publisher(place, "/fork");
     axon_subscription_t listener = subscription(place, "/fork");
