@@ -114,16 +114,22 @@ fn fill(publisher: &Publisher) -> u64 {
     sent
 }
 
-/// A reader that takes nothing while the link is renewed, and for a while after that.
-fn what_waits_is_not_lost(key_mode: &str) {
+/// Hosts that keep little, with keys of so many seconds.
+fn little_room(key_mode: &str, max_age: &str) -> (Kmes, [Host; 2]) {
     let kmes = Kmes::start();
     let more = [
         ("AXON_QKD_KEY_MODE", key_mode),
-        ("AXON_QKD_SESSION_MAX_AGE", "20"),
+        ("AXON_QKD_SESSION_MAX_AGE", max_age),
         ("AXON_RING_BUFFER_SIZE_MB", "1"),
         ("AXON_MAX_MESSAGE_MB", "1"),
     ];
-    let [a, b] = Plan::new([0, 1].map(|host| kmes.settings(host, &more))).start();
+    let hosts = Plan::new([0, 1].map(|host| kmes.settings(host, &more))).start();
+    (kmes, hosts)
+}
+
+/// A reader that takes nothing while the link is renewed, and for a while after that.
+fn what_waits_is_not_lost(key_mode: &str) {
+    let (_kmes, [a, b]) = little_room(key_mode, "20");
     let (here, there) = (a.session("publisher"), b.session("subscription"));
     let spec = || EndpointSpec::new("/kept", "test/Bytes", Qos::keep_all());
     let subscription = there.create_subscription(spec()).unwrap();
@@ -149,14 +155,7 @@ fn what_waits_is_not_lost(key_mode: &str) {
 /// What a link still carries when its key is at its end is counted, and nobody is blamed for it.
 #[test]
 fn in_messages10_what_waits_longer_than_its_key_may_live_is_nobodys_fault() {
-    let kmes = Kmes::start();
-    let more = [
-        ("AXON_QKD_KEY_MODE", "messages10"),
-        ("AXON_QKD_SESSION_MAX_AGE", "4"),
-        ("AXON_RING_BUFFER_SIZE_MB", "1"),
-        ("AXON_MAX_MESSAGE_MB", "1"),
-    ];
-    let [a, b] = Plan::new([0, 1].map(|host| kmes.settings(host, &more))).start();
+    let (_kmes, [a, b]) = little_room("messages10", "4");
     let (here, there) = (a.session("publisher"), b.session("subscription"));
     let spec = || EndpointSpec::new("/kept", "test/Bytes", Qos::keep_all());
     let subscription = there.create_subscription(spec()).unwrap();
