@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
 // What the ROS distributions differ in, read off their headers: Humble (rmw 6.1), Iron (7.1), Jazzy (7.3)
-// and Rolling (7.5). Nothing else in this package asks which one it is built for.
+// and Rolling (7.5). Only cdr/buffer.hpp asks, too, of rosidl.
 
 #ifndef FEATURES_HPP_
 #define FEATURES_HPP_

@@ -218,10 +218,44 @@ size_t least_of_item(const Field & field)
   }
 }
 
+// `size` items, each given to the introspection's functions.
+template<typename In>
+void get_each(const Field & field, uint8_t * sequence, size_t size, Reader & reader)
+{
+  In::resize(field, sequence, size);
+  if (field.size(sequence) != size) {
+    fail(field, "the sequence cannot be given the stream's length");
+  }
+  if (field.item == Item::Bool) {
+    const uint8_t * from = reader.bytes(size, 1, field);
+    for (size_t i = 0; i < size; ++i) {
+      const bool value = flag(from + i) != 0;
+      field.assign(sequence, i, &value);
+    }
+    return;
+  }
+  OneItem item;
+  for (size_t i = 0; i < size; ++i) {
+    if (field.width != 0) {
+      get_items<In>(field, item.bytes, 1, reader);
+      field.assign(sequence, i, item.bytes);
+    } else {
+      get_items<In>(field, static_cast<uint8_t *>(field.at_mutable(sequence, i)), 1, reader);
+    }
+  }
+}
+
 template<typename In>
 void get_sequence(const Field & field, uint8_t * sequence, Reader & reader)
 {
   const size_t size = reader.length(field.count, least_of_item(field), field);
+  if (field.container == Container::Buffer) {
+    return buffer::assign(sequence, reader.bytes(size, 1, field), size);
+  }
+  In::release_buffer(field, sequence);
+  if (field.container == Container::Opaque) {
+    return get_each<In>(field, sequence, size, reader);
+  }
   if (field.item == Item::Number && !reader.swapped()) {
     const uint8_t * from = size == 0 ? nullptr :
       reader.bytes(size * field.width, field.alignment, field);
@@ -229,13 +263,6 @@ void get_sequence(const Field & field, uint8_t * sequence, Reader & reader)
   }
   In::resize(field, sequence, size);
   if (size == 0) {
-    return;
-  }
-  if (field.item == Item::Bool) {
-    const uint8_t * from = reader.bytes(size, 1, field);
-    for (size_t i = 0; i < size; ++i) {
-      In::set_flag(field, sequence, i, flag(from + i) != 0);
-    }
     return;
   }
   get_items<In>(field, In::items(field, static_cast<void *>(sequence)), size, reader);

@@ -38,6 +38,7 @@ class Measure
 public:
   void align(size_t alignment) {position_ = aligned(position_, alignment);}
   void copy(const void *, size_t size) {position_ += size;}
+  void copy_buffer(const void *, size_t size) {position_ += size;}
   void zeros(size_t size) {position_ += size;}
   size_t position() const {return position_;}
 
@@ -60,6 +61,13 @@ public:
   void copy(const void * from, size_t size)
   {
     std::memcpy(room(size), from, size);
+  }
+
+  void copy_buffer(const void * from, size_t size)
+  {
+    if (!buffer::copy_to(from, room(size), size)) {
+      changed();
+    }
   }
 
   void zeros(size_t size)
@@ -186,22 +194,46 @@ void put_items(const Field & field, const uint8_t * from, size_t count, Sink & s
   }
 }
 
+// `size` items that the introspection's functions give one by one. A std::vector<bool> has no item to point to.
+template<typename In, typename Sink>
+void put_each(const Field & field, const uint8_t * sequence, size_t size, Sink & sink)
+{
+  if (field.item == Item::Bool) {
+    for (size_t i = 0; i < size; ++i) {
+      bool value = false;
+      field.fetch(sequence, i, &value);
+      put(sink, static_cast<uint8_t>(value));
+    }
+    return;
+  }
+  OneItem item;
+  for (size_t i = 0; i < size; ++i) {
+    if (field.width != 0) {
+      field.fetch(sequence, i, item.bytes);
+      put_items<In>(field, item.bytes, 1, sink);
+    } else {
+      put_items<In>(field, static_cast<const uint8_t *>(field.at(sequence, i)), 1, sink);
+    }
+  }
+}
+
 template<typename In, typename Sink>
 void put_sequence(const Field & field, const uint8_t * sequence, Sink & sink)
 {
-  const size_t size = In::size(field, sequence);
+  const void * buffer = In::buffer(field, sequence);
+  const size_t size = buffer != nullptr ? buffer::size(buffer) : In::size(field, sequence);
   check(size, field.count, "items", field);
   put_length(sink, size, field);
   if (size == 0) {
     return;
   }
-  if (field.item == Item::Bool) {
-    for (size_t i = 0; i < size; ++i) {
-      put(sink, static_cast<uint8_t>(In::flag(field, sequence, i)));
-    }
-    return;
+  if (buffer != nullptr) {
+    sink.copy_buffer(buffer, size);
+  } else if (field.container == Container::Contiguous) {
+    put_items<In>(field, In::items(field, static_cast<const void *>(sequence)), size, sink);
+  } else {
+    put_each<In>(field, sequence, size, sink);
   }
-  put_items<In>(field, In::items(field, static_cast<const void *>(sequence)), size, sink);
 }
 
 template<typename In, typename Sink>

@@ -13,7 +13,9 @@
 #include <string_view>
 #include <vector>
 
+#include "cdr/buffer.hpp"
 #include "cdr/plan.hpp"
+#include "rosidl_runtime_c/primitives_sequence_functions.h"
 #include "rosidl_runtime_c/string_functions.h"
 #include "rosidl_runtime_c/u16string_functions.h"
 #include "rosidl_typesupport_introspection_c/field_types.h"
@@ -21,9 +23,15 @@
 namespace rmw_axon::cdr
 {
 
+// Room for an item that a function copies.
+struct alignas(std::max_align_t) OneItem
+{
+  uint8_t bytes[sizeof(long double)];
+};
+
 struct InC
 {
-  // Every generated sequence in C has this shape.
+  // A Container::Contiguous in C.
   struct Sequence
   {
     uint8_t * data;
@@ -60,9 +68,12 @@ struct InC
     return reinterpret_cast<char16_t *>(string->data);
   }
 
-  static size_t size(const Field &, const void * field)
+  static size_t size(const Field & field, const void * sequence)
   {
-    return static_cast<const Sequence *>(field)->size;
+    if (field.container == Container::Opaque) {
+      return field.size(sequence);
+    }
+    return static_cast<const Sequence *>(sequence)->size;
   }
 
   static const uint8_t * items(const Field &, const void * field)
@@ -75,13 +86,32 @@ struct InC
     return static_cast<const Sequence *>(field)->data;
   }
 
-  static void resize(const Field & field, void * sequence, size_t size)
+  static void resize(const Field & field, void * sequence, size_t length)
   {
-    if (static_cast<const Sequence *>(sequence)->size == size) {
-      return;
-    }
-    if (!field.resize_c(sequence, size)) {
+    if (size(field, sequence) != length && !field.resize_c(sequence, length)) {
       throw std::bad_alloc();
+    }
+  }
+
+  // The Buffer that holds the sequence's items in place of the sequence, or null.
+  static const void * buffer(const Field & field, const void * sequence)
+  {
+    // Of primitive types alone, which have a width.
+    if (field.width == 0 || field.container != Container::Contiguous) {
+      return nullptr;
+    }
+    const void * held = buffer::held_in_c(sequence);
+    if (held != nullptr && field.width != 1) {
+      throw Error(std::string(field.name) + ": items of more than a byte in a buffer of bytes");
+    }
+    return held;
+  }
+
+  // Has the sequence hold its items itself. A Buffer that it held is ended as its flags say.
+  static void release_buffer(const Field & field, void * sequence)
+  {
+    if (buffer(field, sequence) != nullptr) {
+      rosidl_runtime_c__uint8__Sequence__fini(static_cast<rosidl_runtime_c__uint8__Sequence *>(sequence));
     }
   }
 
@@ -91,16 +121,6 @@ struct InC
     if (size != 0) {
       std::memcpy(items(field, sequence), from, size * field.width);
     }
-  }
-
-  static bool flag(const Field & field, const void * sequence, size_t index)
-  {
-    return items(field, sequence)[index] != 0;
-  }
-
-  static void set_flag(const Field & field, void * sequence, size_t index, bool value)
-  {
-    items(field, sequence)[index] = value;
   }
 };
 
@@ -148,6 +168,13 @@ struct InCpp
     field.resize_cpp(sequence, size);
   }
 
+  static const void * buffer(const Field & field, const void * sequence)
+  {
+    return field.container == Container::Buffer ? sequence : nullptr;
+  }
+
+  static void release_buffer(const Field &, void *) {}
+
   template<typename Number>
   static void set_vector(void * sequence, const uint8_t * from, size_t size)
   {
@@ -156,6 +183,7 @@ struct InCpp
   }
 
   // An image of megabytes is not zeroed first, where the sequence is a vector and the stream is aligned.
+  // Container::Contiguous alone.
   static void set_numbers(const Field & field, void * sequence, const uint8_t * from, size_t size)
   {
     if (!field.bounded && reinterpret_cast<uintptr_t>(from) % field.alignment == 0) {
@@ -190,19 +218,6 @@ struct InCpp
     if (size != 0) {
       std::memcpy(items(field, sequence), from, size * field.width);
     }
-  }
-
-  // A std::vector<bool> has no bytes to point to.
-  static bool flag(const Field & field, const void * sequence, size_t index)
-  {
-    bool value = false;
-    field.fetch(sequence, index, &value);
-    return value;
-  }
-
-  static void set_flag(const Field & field, void * sequence, size_t index, bool value)
-  {
-    field.assign(sequence, index, &value);
   }
 };
 

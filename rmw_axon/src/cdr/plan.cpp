@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <utility>
 
+#include "cdr/container.hpp"
 #include "rcutils/error_handling.h"
 #include "rosidl_runtime_c/string.h"
 #include "rosidl_runtime_c/u16string.h"
@@ -169,9 +170,21 @@ void set_functions(const Member & member, Field & field)
   }
 }
 
+// A distribution may store a type in another way than those that are known: seen where it takes less memory.
+template<typename Members, typename Member>
+void require_room(const Members & members, const Member & member, size_t size)
+{
+  const size_t room = room_of(members, member);
+  if (size > room) {
+    throw Error(
+            std::string(member.name_) + ": has " + std::to_string(room) + " bytes in a message, " +
+            std::to_string(size) + " are expected: rmw_axon does not know this distribution's layout");
+  }
+}
+
 // Appends what the member is in a message at `base`. A single nested message is its fields.
 template<typename Members, typename Member>
-void append(const Member & member, size_t base, std::vector<Field> & fields)
+void append(const Members & members, const Member & member, size_t base, std::vector<Field> & fields)
 {
   constexpr Language language =
     std::is_same_v<Member, CMember> ? Language::C : Language::Cpp;
@@ -187,8 +200,9 @@ void append(const Member & member, size_t base, std::vector<Field> & fields)
   if (member.type_id_ == rosidl_typesupport_introspection_c__ROS_TYPE_MESSAGE) {
     const auto * nested = static_cast<const Members *>(member.members_->data);
     if (!member.is_array_) {
+      require_room(members, member, nested->size_of_);
       for (uint32_t i = 0; i < nested->member_count_; ++i) {
-        append<Members>(nested->members_[i], field.offset, fields);
+        append(*nested, nested->members_[i], field.offset, fields);
       }
       return;
     }
@@ -207,6 +221,9 @@ void append(const Member & member, size_t base, std::vector<Field> & fields)
   }
   if (field.shape == Shape::Sequence) {
     set_functions(member, field);
+    field.container = container_of(members, member, field);
+  } else {
+    require_room(members, member, field.stride * field.count);
   }
   fields.push_back(std::move(field));
 }
@@ -226,7 +243,7 @@ Plan build(const Members & members)
   }
   plan.fini = members.fini_function;
   for (uint32_t i = 0; i < members.member_count_; ++i) {
-    append<Members>(members.members_[i], 0, plan.fields);
+    append(members, members.members_[i], 0, plan.fields);
   }
   find_runs(plan.fields);
   for (const Field & field : plan.fields) {

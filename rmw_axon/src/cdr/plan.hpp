@@ -36,6 +36,17 @@ enum class Item { Number, Bool, LongDouble, WChar, String, WString, Message };
 
 enum class Shape { One, Array, Sequence };
 
+// How a sequence stores its items.
+enum class Container
+{
+  // Unknown: each item is reached through the introspection's functions.
+  Opaque,
+  // One after another: a std::vector in C++; data, size and capacity in C.
+  Contiguous,
+  // C++: a rosidl::Buffer<uint8_t>.
+  Buffer,
+};
+
 struct Plan;
 
 struct Field
@@ -57,7 +68,9 @@ struct Field
   size_t characters = SIZE_MAX;
   // Item::Message
   std::unique_ptr<Plan> message;
-  // Shape::Sequence, as introspection gives them.
+  // Shape::Sequence
+  Container container = Container::Opaque;
+  // As introspection gives them.
   size_t (* size)(const void *) = nullptr;
   const void * (*at)(const void *, size_t) = nullptr;
   void * (*at_mutable)(void *, size_t) = nullptr;
