@@ -287,6 +287,26 @@
 #define AXON_DISCOVERY_SYSTEM_DEFAULT 4
 
 /**
+ * `AXON_SECURITY_MODE` is `classic` and `AXON_CLASSIC_AUTH` is `none`: any host that answers is a peer.
+ */
+#define AXON_AUTHENTICATION_NONE 0
+
+/**
+ * `classic` and `pinned`: a peer has a key of the trust file.
+ */
+#define AXON_AUTHENTICATION_PINNED 1
+
+/**
+ * `classic` and `ca`: a peer has a certificate of the CA.
+ */
+#define AXON_AUTHENTICATION_CA 2
+
+/**
+ * `qkd`: a peer has a key that the KMEs gave to both.
+ */
+#define AXON_AUTHENTICATION_QKD 3
+
+/**
  * As a timeout: for ever.
  */
 #define AXON_WAIT_FOREVER -1
@@ -1325,6 +1345,18 @@ axon_ret_t axon_session_options_init(struct axon_session_options_t *options, uin
  * As for `axon_session_open`.
  */
 axon_ret_t axon_session_options_check(const struct axon_session_options_t *options);
+
+/**
+ * How other hosts prove who they are to a session with these options: AXON_AUTHENTICATION_*, as the
+ * environment and `axon.toml` say it. Opens nothing.
+ *
+ * AXON_RET_CONFIG: a setting is wrong, as for `axon_session_options_check`.
+ *
+ * # Safety
+ * As for `axon_session_open`; `authentication` points to room for a number.
+ */
+axon_ret_t axon_session_options_authentication(const struct axon_session_options_t *options,
+                                               uint32_t *authentication);
 
 /**
  * Opens a session, and starts a daemon where none runs and `AXON_DAEMON` lets it. A process may have

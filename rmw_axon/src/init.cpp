@@ -18,6 +18,7 @@
 #include "rcutils/strdup.h"
 #include "rmw/init.h"
 #include "rmw/init_options.h"
+#include "security.hpp"
 
 namespace
 {
@@ -97,6 +98,7 @@ axon_session_t open_session(const rmw_init_options_t & options)
   set_discovery(options, session, peers);
   const std::string daemon = installed_daemon();
   session.daemon_path = daemon.empty() ? nullptr : daemon.c_str();
+  rmw_axon::check_security(options, session);
   axon_session_t opened{};
   check(axon_session_open(&session, &opened));
   return opened;

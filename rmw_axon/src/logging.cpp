@@ -7,10 +7,14 @@
 #include <atomic>
 #include <condition_variable>
 #include <mutex>
+#include <string>
+#include <utility>
+#include <vector>
 
 #include "axon.h"
 #include "error.hpp"
 #include "rcutils/logging.h"
+#include "rcutils/logging_macros.h"
 #include "rmw/rmw.h"
 
 namespace rmw_axon
@@ -18,6 +22,11 @@ namespace rmw_axon
 
 namespace
 {
+
+void log_warning(const std::string & text)
+{
+  RCUTILS_LOG_WARN_NAMED(identifier, "%s", text.c_str());
+}
 
 // Where the core's thread waits with the first line until the logger may be told.
 class Gate
@@ -38,15 +47,34 @@ public:
     if (is_open_.load(std::memory_order_acquire)) {
       return;
     }
+    std::vector<std::string> kept;
     {
       const std::lock_guard<std::mutex> lock(mutex_);
       is_open_.store(true, std::memory_order_release);
+      kept.swap(kept_);
     }
     opened_.notify_all();
+    for (const std::string & text : kept) {
+      log_warning(text);
+    }
+  }
+
+  void warn(std::string text)
+  {
+    {
+      const std::lock_guard<std::mutex> lock(mutex_);
+      if (!is_open_.load(std::memory_order_relaxed)) {
+        kept_.push_back(std::move(text));
+        return;
+      }
+    }
+    log_warning(text);
   }
 
 private:
   std::atomic<bool> is_open_{false};
+  // Warnings from before the gate was open.
+  std::vector<std::string> kept_;
   std::mutex mutex_;
   std::condition_variable opened_;
 };
@@ -83,6 +111,11 @@ void start_logging()
 void tell_logger()
 {
   gate().open();
+}
+
+void warn(std::string text)
+{
+  gate().warn(std::move(text));
 }
 
 }  // namespace rmw_axon

@@ -3,6 +3,8 @@
 #ifndef LOGGING_HPP_
 #define LOGGING_HPP_
 
+#include <string>
+
 namespace rmw_axon
 {
 
@@ -11,6 +13,9 @@ void start_logging();
 
 // Tells the logger from now on, and first what has been said so far: a program sets its levels after rmw_init.
 void tell_logger();
+
+// A warning of this adapter's own, told when the logger may be.
+void warn(std::string text);
 
 }  // namespace rmw_axon
 

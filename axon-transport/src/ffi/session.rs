@@ -10,7 +10,7 @@ use super::{
     memory::{elements, present, store, text, value},
 };
 use crate::{
-    config::{Config, DaemonPolicy},
+    config::{ClassicAuth, Config, DaemonPolicy, Security},
     session::{DaemonCommand, Session, SessionOptions},
 };
 
@@ -28,6 +28,15 @@ pub const AXON_DISCOVERY_LOCALHOST: u32 = 2;
 pub const AXON_DISCOVERY_SUBNET: u32 = 3;
 /// What multicast reaches; the list is passed over.
 pub const AXON_DISCOVERY_SYSTEM_DEFAULT: u32 = 4;
+
+/// `AXON_SECURITY_MODE` is `classic` and `AXON_CLASSIC_AUTH` is `none`: any host that answers is a peer.
+pub const AXON_AUTHENTICATION_NONE: u32 = 0;
+/// `classic` and `pinned`: a peer has a key of the trust file.
+pub const AXON_AUTHENTICATION_PINNED: u32 = 1;
+/// `classic` and `ca`: a peer has a certificate of the CA.
+pub const AXON_AUTHENTICATION_CA: u32 = 2;
+/// `qkd`: a peer has a key that the KMEs gave to both.
+pub const AXON_AUTHENTICATION_QKD: u32 = 3;
 
 /// How a session is opened. `axon_session_options_init` fills it in; what is to be otherwise is
 /// changed then. Everything that it does not say, the environment and `axon.toml` do.
@@ -104,6 +113,35 @@ pub unsafe extern "C" fn axon_session_options_check(
     guarded(|| {
         // SAFETY: the caller's word.
         unsafe { settings(options) }.map(drop)
+    })
+}
+
+/// How other hosts prove who they are to a session with these options: AXON_AUTHENTICATION_*, as the
+/// environment and `axon.toml` say it. Opens nothing.
+///
+/// AXON_RET_CONFIG: a setting is wrong, as for `axon_session_options_check`.
+///
+/// # Safety
+/// As for `axon_session_open`; `authentication` points to room for a number.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn axon_session_options_authentication(
+    options: *const axon_session_options_t,
+    authentication: *mut u32,
+) -> axon_ret_t {
+    guarded(|| {
+        present(authentication, "the place of the authentication")?;
+        // SAFETY: the caller's word.
+        let (config, _) = unsafe { settings(options) }?;
+        let of = match &config.security {
+            Security::Classic(classic) => match classic.auth {
+                ClassicAuth::None => AXON_AUTHENTICATION_NONE,
+                ClassicAuth::Pinned => AXON_AUTHENTICATION_PINNED,
+                ClassicAuth::Ca => AXON_AUTHENTICATION_CA,
+            },
+            Security::Qkd(_) => AXON_AUTHENTICATION_QKD,
+        };
+        // SAFETY: the caller's word.
+        unsafe { store(authentication, of, "the place of the authentication") }
     })
 }
 

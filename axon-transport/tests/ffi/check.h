@@ -69,6 +69,7 @@ void end_child(void);
 void child_ends(pid_t child);
 
 /* The cases. */
+void case_authentication(void);
 void case_settings(void);
 void case_topics(void);
 void case_loans(void);
