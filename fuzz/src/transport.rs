@@ -294,6 +294,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             session,
             stands_for: Some(vec![reader]),
             segments: vec![segment],
+            after: Some(2),
         }),
         Message::Grant(Granted {
             reader,
@@ -303,6 +304,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             session,
             ring: place,
             segments: vec![segment],
+            after: Some(2),
         }),
         Message::Detach(Pair { reader, writer }),
         Message::Unmatch(Unmatch { reader, writer, reason: "gone".into() }),

@@ -70,17 +70,13 @@ impl Shared {
             (writer.endpoint.gid, reader.endpoint.gid, Peer::Local(self.segment.clone()));
         // All of it under one lock: between two parts, the control thread would ask by another lane.
         let mut slots = reader.lock();
-        let lane = slots.lane_for(from, || self.segment.allocate_lane())?;
-        let (grant, ring) = writer.attach(ReaderInfo {
-            gid,
-            lane,
-            qos: reader.qos,
-            peer: peer.clone(),
-            stands_for: None,
-        })?;
+        let lane = slots.lane_for(from, || self.segment.allocate_lane())?.lane;
+        let reads = ReaderInfo { gid, lane, qos: reader.qos, peer: peer.clone(), stands_for: None };
+        let (grant, after, ring) = writer.attach(reads, None)?;
         if let Accept::Map(lane) = slots.accept(from, grant) {
             let max_message = self.config.max_message;
-            slots.add(reader.map(from, peer, ring, lane, grant, max_message)?, false);
+            let mapped = reader.map(from, peer, ring, lane, grant, max_message)?;
+            slots.add(mapped, Some(after), false, false);
         }
         Ok(())
     }

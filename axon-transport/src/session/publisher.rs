@@ -258,10 +258,15 @@ impl PublisherInner {
         self
     }
 
-    /// Serves a reader: what it is granted, and in which ring.
-    pub(super) fn attach(&self, reader: ReaderInfo) -> Result<(Grant, Location), ShmError> {
+    /// Serves a reader, from what comes `after` a number on if it has been here before: what it is
+    /// granted, the number in front of that, and in which ring.
+    pub(super) fn attach(
+        &self,
+        reader: ReaderInfo,
+        after: Option<u64>,
+    ) -> Result<(Grant, u64, Location), ShmError> {
         let gid = reader.gid;
-        let granted = self.rings.attach(reader)?;
+        let granted = self.rings.attach(reader, after)?;
         self.attached().insert(gid);
         Ok(granted)
     }

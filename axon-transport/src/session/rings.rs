@@ -68,13 +68,18 @@ impl Rings {
         }
     }
 
-    /// Serves a reader: what it is granted, and in which ring.
-    pub(super) fn attach(&self, reader: ReaderInfo) -> Result<(Grant, Location), ShmError> {
+    /// Serves a reader: what it is granted, the number in front of that, and in which ring.
+    pub(super) fn attach(
+        &self,
+        reader: ReaderInfo,
+        after: Option<u64>,
+    ) -> Result<(Grant, u64, Location), ShmError> {
         let writer = match self {
             Self::Shared(writer) => writer.clone(),
             Self::Each(lanes) => lanes.ring_for(reader.gid)?,
         };
-        Ok((writer.attach(reader)?, writer.location()))
+        let (grant, after) = writer.attach_after(reader, after)?;
+        Ok((grant, after, writer.location()))
     }
 
     /// Whether it is one of them that is there.

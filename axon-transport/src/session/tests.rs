@@ -1,6 +1,7 @@
 //! A session whose daemon is played by the test: what it makes of what it is told, and in which
 //! order it says what.
 
+mod followed;
 mod played;
 
 use std::{
@@ -156,12 +157,13 @@ impl Far {
 
     /// Its answer to a reader that asked.
     fn grant(&self, attach: &Attach) -> Granted {
-        let Attach { reader, writer, lane, qos, .. } = *attach;
+        let Attach { reader, writer, lane, qos, after, .. } = *attach;
         let (peer, stands_for) = (self.view.clone(), None);
         let info = ReaderInfo { gid: reader, lane, qos, peer, stands_for };
-        let Grant { generation, first } = self.writer.attach(info).unwrap();
+        let (Grant { generation, first }, _) = self.writer.attach_after(info, after).unwrap();
         let (session, ring) = (self.session.id(), self.writer.location());
-        Granted { reader, writer, generation, first, session, ring, segments: Vec::new() }
+        let segments = Vec::new();
+        Granted { reader, writer, generation, first, session, ring, segments, after: None }
     }
 
     fn introduction(&self) -> Vec<OwnedFd> {
@@ -424,8 +426,8 @@ fn a_daemon_cannot_have_a_session_read_its_own_samples_as_rings_and_lanes() {
     let asked = daemon.hear_attach();
     // As a publisher would to the first that asks.
     let (generation, segments) = (5 << 24 | 1, Vec::new());
-    let granted =
-        Granted { reader, writer, generation, first: 0, session: own, ring: sample, segments };
+    let (first, session, ring, after) = (0, own, sample, None);
+    let granted = Granted { reader, writer, generation, first, session, ring, segments, after };
     daemon.say(Message::Grant(granted), &[]);
     daemon.say(Message::Attach(Attach { lane: sample, ..asked.clone() }), &[]);
     daemon.say(Message::Attach(asked), &[]);

@@ -130,7 +130,7 @@ impl Audience {
         gids
     }
 
-    /// Adds a reader, whose lane is `lane`.
+    /// Adds a reader, whose lane is `lane`, and who goes on at `resumed` if it has been here before.
     ///
     /// # Errors
     /// Its process has too many. It, or the one that it takes the place of, stays as it was.
@@ -140,6 +140,7 @@ impl Audience {
         lane: LaneView,
         tail: u64,
         head: u64,
+        resumed: Option<u64>,
     ) -> Result<Grant, ShmError> {
         let known = self.readers.iter().position(|known| {
             let same = &known.info;
@@ -161,6 +162,7 @@ impl Audience {
         } else {
             head
         };
+        let first = resumed.map_or(first, |resumed| resumed.clamp(tail, head).min(first));
         let tenancy = self.seats.admit(info.gid, &info.peer, info.lane, &lane)?;
         let grant = Grant { generation: tenancy.generation(), first };
         self.detach(info.gid);
@@ -358,6 +360,6 @@ pub(super) fn depth(qos: &Qos) -> u64 {
 }
 
 /// Whether a profile loses nothing rather than go on.
-pub(super) fn holds(qos: &Qos) -> bool {
+pub(crate) fn holds(qos: &Qos) -> bool {
     qos.reliability == Reliability::Reliable && qos.history == History::KeepAll
 }

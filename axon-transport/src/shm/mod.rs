@@ -112,6 +112,7 @@ mod writer;
 #[cfg(test)]
 mod tests;
 
+pub(crate) use audience::holds;
 pub use connect::ConnectError;
 pub use context::Context;
 pub use error::{Keeper, PublishError, ShmError, TakeError};

@@ -119,6 +119,12 @@ pub(super) fn publish<W: Word>(
     ring[HEAD].store(position + 1, Site::HeadStore.order());
 }
 
+/// Publisher: the number of the sample at a position that stands.
+pub(super) fn number<W: Word>(array: &[W], position: u64) -> u64 {
+    // Relaxed: nobody else stores to it.
+    descriptor(array, position)[SEQUENCE].load(Ordering::Relaxed)
+}
+
 /// Publisher: fills a new array with what stands, from `tail` up to `head`, in the old one. After
 /// [`about_to_write`]; [`replace`] follows.
 pub(super) fn copy_descriptors<W: Word>(old: &[W], new: &[W], tail: u64, head: u64) {

@@ -1,4 +1,4 @@
-//! One of the eight: publishes and takes until it is told to come to an end, or is killed.
+//! One of the processes: publishes and takes until it is told to come to an end, or is killed.
 
 use std::{
     collections::HashMap,
@@ -8,7 +8,7 @@ use std::{
         atomic::{AtomicBool, AtomicU64, Ordering},
     },
     thread,
-    time::{Duration, Instant},
+    time::{Duration, Instant, SystemTime},
 };
 
 use axon_transport::{
@@ -19,9 +19,12 @@ use axon_transport::{
     shm::{PublishError, Sample},
 };
 
-use crate::sample::{LONGEST, Random, fill, is_whole};
+use crate::{
+    sample::{LONGEST, Random, fill, is_whole},
+    trail::Trail,
+};
 
-/// The environment variable that makes a process one of the eight; its value is the seed.
+/// The environment variable that makes a process one of them; its value is the seed.
 pub(crate) const ROLE: &str = "TORTURE_SEED";
 /// What it takes if it is not wedged.
 const PATIENCE: Duration = Duration::from_secs(120);
@@ -36,10 +39,21 @@ struct Child {
     /// The last sample of each publisher that was taken, of those of which none may be missed.
     last: Mutex<HashMap<Gid, u64>>,
     taken: AtomicU64,
-    /// Publishers of which a KEEP_ALL subscription missed some samples, and how many.
-    missed: Mutex<Vec<(Gid, u64)>>,
+    /// What the KEEP_ALL subscription missed.
+    missed: Mutex<Vec<Miss>>,
+    trail: Trail,
     /// How many samples were published by each publisher: whoever publishes holds it meanwhile.
     published: [Mutex<u64>; 2],
+}
+
+/// Samples of one publisher that never came, though later ones did.
+struct Miss {
+    publisher: Gid,
+    samples: u64,
+    /// When the later one came, in milliseconds since the epoch.
+    at: u128,
+    /// Whether the subscription says that they are lost.
+    counted: bool,
 }
 
 fn spec(topic: &str, qos: Qos) -> EndpointSpec {
@@ -53,6 +67,7 @@ pub(crate) fn run(seed: u64) {
         print(info);
         std::process::abort();
     }));
+    let trail = Trail::keep();
     let config = Config::from_env().expect("a configuration");
     let start = Instant::now();
     let session = loop {
@@ -75,14 +90,16 @@ pub(crate) fn run(seed: u64) {
         last: Mutex::default(),
         taken: AtomicU64::new(0),
         missed: Mutex::default(),
+        trail,
         published: Default::default(),
     };
+    say(&hex(subscriptions[0].gid()));
     thread::scope(|scope| {
         scope.spawn(|| child.publish_all(&mut Random(seed)));
         let [all, last] = &subscriptions;
         scope.spawn(|| child.take_all(all, true, &mut Random(seed ^ 1)));
         scope.spawn(|| child.take_all(last, false, &mut Random(seed ^ 2)));
-        child.obey(all.gid());
+        child.obey();
         child.over.store(true, Ordering::Relaxed);
         child.session.segment().notify();
     });
@@ -90,7 +107,7 @@ pub(crate) fn run(seed: u64) {
 
 impl Child {
     /// Does what the conductor says, a line at a time, until that one closes the pipe.
-    fn obey(&self, all: Gid) {
+    fn obey(&self) {
         for line in io::stdin().lock().lines() {
             let line = line.expect("text");
             let mut words = line.split(' ');
@@ -102,10 +119,16 @@ impl Child {
                 )),
                 Some("missed") => {
                     let missed = self.missed.lock().expect("no panic");
-                    let missed = missed.iter().map(|(gid, count)| format!("{} {count}", hex(*gid)));
+                    let missed = missed.iter().map(|Miss { publisher, samples, at, counted }| {
+                        format!("{} {samples} {at} {counted}", hex(*publisher))
+                    });
                     say(&missed.collect::<Vec<_>>().join(" "));
                 }
-                Some("who") => say(&hex(all)),
+                // Of the pairs with this reader or writer, for people.
+                Some("trail") => {
+                    self.trail.print(words.next().expect("a GID"));
+                    say("printed");
+                }
                 Some("quiet") => self.quiet.store(true, Ordering::Relaxed),
                 // Everybody hears this publisher, and then its last samples.
                 Some("final") => {
@@ -187,6 +210,19 @@ impl Child {
         }
     }
 
+    /// Keeps what is missing between `before` and the sample that came, and prints how that came about.
+    fn missed(&self, info: &MessageInfo, before: u64, counted: bool) {
+        let (publisher, samples) = (info.publisher, info.sequence - before - 1);
+        let at = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+        let at = at.expect("after the epoch").as_millis();
+        self.missed.lock().expect("no panic").push(Miss { publisher, samples, at, counted });
+        let said = if counted { "counted" } else { "NOT COUNTED" };
+        self.trail.add(&format!(
+            "{publisher}: {samples} samples missing between {before} and {}, {said}",
+            info.sequence
+        ));
+    }
+
     fn take_all(&self, subscription: &Subscription, gapless: bool, random: &mut Random) {
         let mut last: HashMap<Gid, u64> = HashMap::new();
         let mut kept: Vec<(MessageInfo, Sample)> = Vec::new();
@@ -219,10 +255,11 @@ impl Child {
                 let own = self.every.iter().any(|publisher| publisher.gid() == info.publisher);
                 if gapless && missed > 0 {
                     all_missed += missed;
-                    let lost = subscription.lost();
-                    assert!(all_missed <= lost, "{all_missed} are missing, {lost} said to be lost");
+                    let counted = all_missed <= subscription.lost();
+                    // Each miss that is not counted is told of once.
+                    all_missed = all_missed.min(subscription.lost());
                     if !own {
-                        self.missed.lock().expect("no panic").push((info.publisher, missed));
+                        self.missed(&info, before, counted);
                     }
                 }
             }

@@ -1,4 +1,4 @@
-//! Starts the eight, disturbs them, and asks in the end whether all is well.
+//! Starts the processes, disturbs them, and asks in the end whether all is well.
 
 use std::{
     collections::HashMap,
@@ -9,7 +9,7 @@ use std::{
     process::{Child, ChildStdin, Command, Stdio},
     sync::mpsc::{self, Receiver, RecvTimeoutError},
     thread,
-    time::{Duration, Instant},
+    time::{Duration, Instant, SystemTime},
 };
 
 use rustix::process::{Pid, Signal, kill_process};
@@ -19,7 +19,50 @@ use crate::{
     sample::{LONGEST, Random},
 };
 
-const PROCESSES: usize = 8;
+/// How the processes are disturbed.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Plan {
+    /// Eight of them are stopped for some tenths of a second at most, often.
+    Brief,
+    /// Twelve are stopped for some seconds, and the daemon is killed meanwhile.
+    Stops,
+}
+
+impl Plan {
+    fn processes(self) -> usize {
+        match self {
+            Self::Brief => 8,
+            Self::Stops => 12,
+        }
+    }
+
+    /// What happens next, mostly nothing.
+    fn next(self, random: &mut Random) -> Disturbance {
+        match (self, random.below(1000)) {
+            (Self::Brief, 0..120) => Disturbance::Kill,
+            (Self::Brief, 120..400) => Disturbance::Stop(Duration::from_millis(random.below(400))),
+            (Self::Brief, 400..440) => Disturbance::Daemon,
+            (Self::Stops, 0..60) => Disturbance::Kill,
+            (Self::Stops, 60..120) => Disturbance::Stop(Duration::from_millis(random.below(400))),
+            (Self::Stops, 120..160) => {
+                Disturbance::StopAround(Duration::from_millis(1000 + random.below(3000)))
+            }
+            (Self::Stops, 160..180) => Disturbance::Daemon,
+            _ => Disturbance::None,
+        }
+    }
+}
+
+/// What happens to one process or to the daemon.
+enum Disturbance {
+    None,
+    Kill,
+    Stop(Duration),
+    /// The daemon is killed while it is stopped, and some that come back to the next one.
+    StopAround(Duration),
+    Daemon,
+}
+
 /// One that is asked and says nothing for so long stands still.
 const PATIENCE: Duration = Duration::from_secs(180);
 /// `AXON_RING_BUFFER_SIZE_MB` of each.
@@ -28,15 +71,20 @@ const BUDGET_MB: u64 = 16;
 /// pinned, lent or being replaced may take beside it; and its session.
 const CEILING_MB: u64 = 2 * (2 * BUDGET_MB + 8 * (LONGEST as u64 >> 20)) + 2;
 
+/// For how long after the daemon's death those that come back to the next one are killed often.
+const COMING_BACK: Duration = Duration::from_millis(800);
 /// How often the memory that they hold is added up, which takes a while.
 const LOOK: Duration = Duration::from_millis(200);
 
-/// One of the eight.
+/// One of the processes.
 struct Player {
     process: Child,
     /// Until it is to end.
     orders: Option<ChildStdin>,
     answers: Receiver<String>,
+    /// Its KEEP_ALL subscription, once it has said so.
+    reader: Option<String>,
+    /// Until when it is stopped.
     stopped: Option<Instant>,
 }
 
@@ -73,7 +121,7 @@ impl Host {
         let lines = BufReader::new(process.stdout.take().expect("a pipe")).lines();
         let (sender, answers) = mpsc::channel();
         thread::spawn(move || lines.map_while(Result::ok).try_for_each(|line| sender.send(line)));
-        Player { process, orders, answers, stopped: None }
+        Player { process, orders, answers, reader: None, stopped: None }
     }
 
     /// The daemon's process, if there is one.
@@ -121,6 +169,32 @@ impl Player {
     }
 
     fn hear(&mut self) -> String {
+        self.reader();
+        self.line()
+    }
+
+    /// Its KEEP_ALL subscription.
+    fn reader(&mut self) -> String {
+        if self.reader.is_none() {
+            self.reader = Some(self.line());
+        }
+        self.reader.clone().expect("just said")
+    }
+
+    /// The same, if it has said so.
+    fn known(&mut self) -> Option<&str> {
+        if self.reader.is_none() {
+            self.reader = self.answers.try_recv().ok();
+        }
+        self.reader.as_deref()
+    }
+
+    fn ask(&mut self, order: &str) -> String {
+        self.tell(order);
+        self.hear()
+    }
+
+    fn line(&mut self) -> String {
         match self.answers.recv_timeout(PATIENCE) {
             Ok(answer) => answer,
             Err(RecvTimeoutError::Timeout) => {
@@ -167,8 +241,9 @@ fn held(pids: impl Iterator<Item = u32>) -> u64 {
     blocks.values().sum::<u64>() * 512
 }
 
-/// What was done to the eight, and what those that lived to the end did meanwhile.
+/// What was done to the processes, and what those that lived to the end did meanwhile.
 pub(crate) struct Round {
+    plan: Plan,
     seed: u64,
     time: Duration,
     kills: u32,
@@ -184,60 +259,88 @@ pub(crate) struct Round {
 
 impl Round {
     pub(crate) fn heading() -> String {
-        let most = format!("MiB of {}", PROCESSES as u64 * CEILING_MB);
         format!(
-            "{:>6} {:>8} {:>6} {:>6} {:>8} {:>10} {:>9} {:>14} {most:>12}",
-            "seed", "seconds", "kills", "stops", "daemons", "published", "taken", "gone with dead"
+            "{:>6} {:>6} {:>8} {:>6} {:>6} {:>8} {:>10} {:>9} {:>14} {:>6} {:>6}",
+            "plan",
+            "seed",
+            "seconds",
+            "kills",
+            "stops",
+            "daemons",
+            "published",
+            "taken",
+            "gone with dead",
+            "MiB",
+            "most"
         )
     }
 }
 
 impl fmt::Display for Round {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { seed, time, kills, stops, daemons, published, taken, gone, most } = self;
+        let Self { plan, seed, time, kills, stops, daemons, published, taken, gone, most } = self;
         let (seconds, most) = (time.as_secs_f64(), most >> 20);
+        let (plan, limit) = (format!("{plan:?}"), plan.processes() as u64 * CEILING_MB);
         write!(
             f,
-            "{seed:>6} {seconds:>8.1} {kills:>6} {stops:>6} {daemons:>8} {published:>10} \
-             {taken:>9} {gone:>14} {most:>12}"
+            "{plan:>6} {seed:>6} {seconds:>8.1} {kills:>6} {stops:>6} {daemons:>8} \
+             {published:>10} {taken:>9} {gone:>14} {most:>6} {limit:>6}"
         )
     }
 }
 
 /// Disturbs them for `time`, and then has them come to rest.
-pub(crate) fn run(time: Duration, seed: u64) -> Round {
+pub(crate) fn run(plan: Plan, time: Duration, seed: u64) -> Round {
     let host = Host { dir: tempfile::tempdir().expect("a directory") };
     let mut random = Random(seed);
-    let mut players: Vec<Player> = (0..PROCESSES).map(|_| host.start(random.next())).collect();
+    let count = plan.processes();
+    let mut players: Vec<Player> = (0..count).map(|_| host.start(random.next())).collect();
     let (start, mut most) = (Instant::now(), 0);
     let mut looked = start;
     let (mut kills, mut stops, mut daemons) = (0, 0, 0);
+    // When the processes of these readers were killed.
+    let mut deaths: HashMap<String, u128> = HashMap::new();
+    let mut kill_daemon_at: Option<Instant> = None;
+    let mut rough_until = start;
     while start.elapsed() < time {
         thread::sleep(Duration::from_millis(20 + random.below(60)));
-        let index = usize::try_from(random.below(PROCESSES as u64)).expect("one of eight");
-        match random.below(100) {
-            0..12 => {
-                players[index] = host.start(random.next());
+        let index = usize::try_from(random.below(count as u64)).expect("one of them");
+        let player = &mut players[index];
+        let now = Instant::now();
+        let mut stop = |player: &mut Player, pause| {
+            player.signal(Signal::STOP);
+            player.stopped = Some(now + pause);
+            stops += 1;
+        };
+        let rough = now < rough_until && player.stopped.is_none() && random.below(3) == 0;
+        match if rough { Disturbance::Kill } else { plan.next(&mut random) } {
+            Disturbance::Kill => {
+                if let Some(reader) = player.known() {
+                    deaths.insert(reader.to_owned(), epoch());
+                }
+                *player = host.start(random.next());
                 kills += 1;
             }
-            12..40 if players[index].stopped.is_none() => {
-                players[index].signal(Signal::STOP);
-                players[index].stopped = Some(Instant::now());
-                stops += 1;
+            Disturbance::Stop(pause) if player.stopped.is_none() => stop(player, pause),
+            Disturbance::StopAround(pause) if player.stopped.is_none() => {
+                stop(player, pause);
+                kill_daemon_at = Some(now + pause.mul_f64(random.below(1000) as f64 / 1000.0));
             }
-            40..44 => {
-                if let Some(daemon) = host.daemon() {
-                    daemons += u32::from(kill_process(daemon, Signal::KILL).is_ok());
-                }
+            Disturbance::Daemon => kill_daemon_at = Some(now),
+            Disturbance::Stop(_) | Disturbance::StopAround(_) | Disturbance::None => {}
+        }
+        if kill_daemon_at.take_if(|at| *at <= now).is_some()
+            && let Some(daemon) = host.daemon()
+        {
+            daemons += u32::from(kill_process(daemon, Signal::KILL).is_ok());
+            if matches!(plan, Plan::Stops) {
+                rough_until = now + COMING_BACK;
             }
-            _ => {}
         }
         for player in &mut players {
             player.must_live();
-            let pause = Duration::from_millis(random.below(400));
-            if player.stopped.is_some_and(|since| since.elapsed() > pause) {
+            if player.stopped.take_if(|until| *until <= Instant::now()).is_some() {
                 player.signal(Signal::CONT);
-                player.stopped = None;
             }
         }
         if looked.elapsed() < LOOK {
@@ -247,16 +350,15 @@ pub(crate) fn run(time: Duration, seed: u64) -> Round {
         let daemon = host.daemon().map(|pid| pid.as_raw_nonzero().get().unsigned_abs());
         let now = held(players.iter().map(|player| player.process.id()).chain(daemon));
         most = most.max(now);
-        let ceiling = (PROCESSES as u64 * CEILING_MB) << 20;
+        let ceiling = (count as u64 * CEILING_MB) << 20;
         assert!(now <= ceiling, "{now} bytes of shared memory, more than {ceiling}");
     }
     assert!(most > 0, "no shared memory was found");
     come_to_rest(&mut players);
-    let gone = missed(&mut players);
+    let gone = missed(&mut players, &deaths);
     let (mut published, mut taken) = (0, 0);
     for player in &mut players {
-        player.tell("count");
-        let counts = player.hear();
+        let counts = player.ask("count");
         let mut counts = counts.split(' ').map(|n| n.parse::<u64>().expect("a number"));
         published += counts.next().expect("published");
         taken += counts.next().expect("taken");
@@ -266,34 +368,55 @@ pub(crate) fn run(time: Duration, seed: u64) -> Round {
         player.orders = None;
         assert!(player.process.wait().expect("a child").success());
     }
-    Round { seed, time: start.elapsed(), kills, stops, daemons, published, taken, gone, most }
+    let time = start.elapsed();
+    Round { plan, seed, time, kills, stops, daemons, published, taken, gone, most }
 }
 
-/// How many samples KEEP_ALL subscriptions missed of publishers that are dead; of those that live
-/// they must not miss any.
-fn missed(players: &mut [Player]) -> u64 {
+/// Milliseconds since the epoch.
+fn epoch() -> u128 {
+    let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    now.expect("after the epoch").as_millis()
+}
+
+/// How many samples KEEP_ALL subscriptions missed of publishers that were dead by then; of those that
+/// lived they must not miss any, and must count the others.
+fn missed(players: &mut [Player], deaths: &HashMap<String, u128>) -> u64 {
     // A GID begins with that of its session.
     let session = |gid: &str| gid[..24].to_owned();
-    let mut ask = |order: &str| -> Vec<String> {
-        let answer = |player: &mut Player| {
-            player.tell(order);
-            player.hear()
-        };
-        players.iter_mut().map(answer).collect()
-    };
-    let alive: Vec<String> = ask("who").iter().map(|gid| session(gid)).collect();
-    let mut gone = 0;
-    for answer in ask("missed") {
+    let deaths: HashMap<String, u128> =
+        deaths.iter().map(|(reader, at)| (session(reader), *at)).collect();
+    let (mut gone, mut wrong) = (0, Vec::new());
+    for (index, player) in players.iter_mut().enumerate() {
+        let answer = player.ask("missed");
         let words: Vec<&str> = answer.split_ascii_whitespace().collect();
-        for [publisher, count] in words.as_chunks::<2>().0 {
-            let lives = alive.contains(&session(publisher));
-            assert!(
-                !lives,
-                "{count} samples of {publisher}, which lives, are lost to a KEEP_ALL subscription"
-            );
-            gone += count.parse::<u64>().expect("a number");
+        for [publisher, samples, at, counted] in words.as_chunks::<4>().0 {
+            let at: u128 = at.parse().expect("a time");
+            if deaths.get(&session(publisher)).is_some_and(|death| *death <= at)
+                && *counted == "true"
+            {
+                gone += samples.parse::<u64>().expect("a number");
+            } else {
+                let reader = player.reader();
+                wrong.push((index, reader, format!("{samples} of {publisher} ({counted})")));
+            }
         }
     }
+    for (index, reader, what) in &wrong {
+        let publisher = what.split(' ').nth(2).expect("its GID").to_owned();
+        players[*index].ask(&format!("trail {publisher}"));
+        for player in players.iter_mut() {
+            if session(&player.reader()) == session(&publisher) {
+                player.ask(&format!("trail {reader}"));
+            }
+        }
+    }
+    let wrong: Vec<String> =
+        wrong.into_iter().map(|(_, reader, what)| format!("{reader} missed {what}")).collect();
+    assert!(
+        wrong.is_empty(),
+        "samples of publishers that live, or that nobody counts, are missing:\n{}",
+        wrong.join("\n")
+    );
     gone
 }
 
@@ -307,21 +430,18 @@ fn come_to_rest(players: &mut [Player]) {
     }
     let mut subscriptions = String::new();
     for player in players.iter_mut() {
-        player.tell("who");
         subscriptions += " ";
-        subscriptions += &player.hear();
+        subscriptions += &player.reader();
     }
     let mut lasts = Vec::new();
     for (index, player) in players.iter_mut().enumerate() {
-        player.tell(&format!("final{subscriptions}"));
-        lasts.push((index, player.hear()));
+        lasts.push((index, player.ask(&format!("final{subscriptions}"))));
     }
     for (of, last) in &lasts {
         for (index, player) in players.iter_mut().enumerate() {
             // A publisher does not wait for subscriptions of its own session.
             if index != *of {
-                player.tell(&format!("expect {last}"));
-                assert_eq!(player.hear(), "there");
+                assert_eq!(player.ask(&format!("expect {last}")), "there");
             }
         }
     }

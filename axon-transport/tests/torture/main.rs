@@ -1,19 +1,26 @@
-//! Eight processes publish to each other while some of them are killed, stopped and continued at
-//! random, and the daemon is killed under them.
+//! Processes publish to each other while some of them are killed, stopped and continued at random,
+//! and the daemon is killed under them.
 //!
 //! Samples are of 0 bytes to 8 MiB and carry their number and a pattern of it. What must hold: every
 //! sample is whole; a KEEP_ALL subscription misses none of a publisher that lives, repeats none of any,
-//! and what it misses of one that was killed it counts; no process fails or stands still; the memory they hold together stays below a ceiling. At the end
-//! the disturbances cease, and every process must come to have the last sample of every other.
+//! and what it misses of one that was killed it counts; no process fails or stands still; the memory
+//! they hold together stays below a ceiling. At the end the disturbances cease, and every process must
+//! come to have the last sample of every other. When something is missing, both processes print the
+//! history of the pair.
 //!
-//! One round of some seconds by default. For longer, `cargo test --release -p axon-transport --test
-//! torture -- --minutes 60`: rounds of half a minute, each of another seed, and a line of a table for
-//! each. `--seed N` begins with that one: the same disturbances again, though not the same moments.
+//! There are two plans. `Brief`: eight processes, stopped for some tenths of a second, often. `Stops`:
+//! twelve, stopped for one to four seconds, while the daemon is killed.
+//!
+//! One round of some seconds of each by default. For longer, `cargo test --release -p axon-transport
+//! --test torture -- --minutes 60`: rounds of half a minute, each of another seed, and a line of a table
+//! for each; `--stops` has them all be of the second plan, which otherwise alternate. `--seed N` begins
+//! with that one: the same disturbances again, though not the same moments.
 #![expect(clippy::print_stdout, reason = "what it prints is its result")]
 
 mod child;
 mod conductor;
 mod sample;
+mod trail;
 
 use std::{
     env,
@@ -21,10 +28,11 @@ use std::{
     time::{Duration, Instant},
 };
 
-use conductor::Round;
+use conductor::{Plan, Round};
 
-/// How long the eight are disturbed in an ordinary run.
-const SHORT: Duration = Duration::from_secs(6);
+/// How long the processes are disturbed in an ordinary run, by each plan.
+const SHORT: [(Plan, Duration); 2] =
+    [(Plan::Brief, Duration::from_secs(6)), (Plan::Stops, Duration::from_secs(12))];
 /// The same of each round of a long run.
 const LONG: Duration = Duration::from_secs(25);
 
@@ -45,12 +53,16 @@ fn main() -> ExitCode {
     let seed = value("--seed").unwrap_or(1);
     println!("{}", Round::heading());
     let Some(minutes) = value("--minutes") else {
-        println!("{}", conductor::run(SHORT, seed));
+        for (plan, time) in SHORT {
+            println!("{}", conductor::run(plan, time, seed));
+        }
         return ExitCode::SUCCESS;
     };
+    let stops = arguments.iter().any(|a| a == "--stops");
     let (start, time) = (Instant::now(), Duration::from_secs(60 * minutes));
     for seed in seed.. {
-        println!("{}", conductor::run(LONG, seed));
+        let plan = if stops || seed.is_multiple_of(2) { Plan::Stops } else { Plan::Brief };
+        println!("{}", conductor::run(plan, LONG, seed));
         if start.elapsed() >= time {
             break;
         }

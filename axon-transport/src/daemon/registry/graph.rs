@@ -123,6 +123,8 @@ impl<F: Clone> Registry<F> {
     }
 
     fn graph_add(&mut self, item: GraphItem) {
+        // One that is back is attached to anew. That it had ended its partners have been told.
+        self.ended.remove(&item.endpoint.gid);
         self.added.insert(item.endpoint.gid, item);
     }
 

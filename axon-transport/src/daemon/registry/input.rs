@@ -259,7 +259,8 @@ impl<F: Clone> Registry<F> {
         // A repetition is not passed on: whoever should know has been told, is about to be, or is
         // behind. Sessions that are told everything anew would otherwise set each other back
         // without end.
-        if asked.attach != attach {
+        let of = |attach: &Option<Attach>| attach.clone().map(|a| Attach { after: None, ..a });
+        if of(&asked.attach) != of(&attach) {
             *asked = Asked { attach, grant: None, by: asked.by };
             self.forward_attach(&pair);
         }
@@ -287,7 +288,8 @@ impl<F: Clone> Registry<F> {
             return Ok(());
         };
         let grant = Some(Granted { session: *id, segments: Vec::new(), ..grant });
-        if asked.grant != grant {
+        let of = |grant: &Option<Granted>| grant.clone().map(|g| Granted { after: None, ..g });
+        if of(&asked.grant) != of(&grant) {
             asked.grant = grant;
             self.forward_grant(&pair);
         }

@@ -26,8 +26,8 @@ impl Control {
             self.building = Some(GraphView::default());
             self.arrivals.restart();
             self.peers.recount();
-            // A daemon that tells everything to a session it knew repeats every pair. A new daemon
-            // learns of the pairs from us, one by one.
+            // A daemon that tells everything to a session it knew repeats every pair that it told it
+            // of. A new daemon learns of the pairs from their two sides, one by one.
             self.repeated = self.told.then(HashSet::new);
             self.told = true;
         }
@@ -59,10 +59,11 @@ impl Control {
         self.endpoints_over(&over);
         if !graph.more {
             let repeated = self.repeated.take();
-            if let Some(repeated) = &repeated {
+            let told = repeated.is_some();
+            if let Some(repeated) = repeated {
                 self.drop_unrepeated(repeated);
             }
-            self.drop_unread(repeated.is_some());
+            self.drop_unread(told);
             self.graph_changed = true;
         }
     }

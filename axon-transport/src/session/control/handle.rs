@@ -2,7 +2,7 @@
 
 use std::{collections::HashSet, sync::Arc};
 
-use super::{Control, Link, stands_for};
+use super::{Control, Link, stands_for, trail};
 use crate::{
     graph::EndpointKind,
     ids::{Gid, SessionId},
@@ -15,7 +15,7 @@ use crate::{
         peers::PeerError,
         publisher::PublisherInner,
         state::StatusAnswer,
-        subscription::{Accept, SubscriptionInner},
+        subscription::{Accept, Asking, SubscriptionInner},
     },
     shm::{Grant, Location, Peer, ReaderInfo, ShmError},
 };
@@ -28,6 +28,7 @@ impl Control {
             Message::Attach(attach) => self.attach(attach, descriptors),
             Message::Grant(grant) => self.grant(grant, descriptors),
             Message::Detach(pair) => {
+                self.spoken.remove(&pair);
                 self.peers.release(&pair);
                 self.detach_reader(&pair);
             }
@@ -63,15 +64,26 @@ impl Control {
         if gids.is_empty() {
             return;
         }
+        self.spoken.retain(|pair| !gids.contains(&pair.reader) && !gids.contains(&pair.writer));
         let (publishers, subscriptions) = self.endpoints();
         for publisher in publishers {
-            if gids.iter().filter(|gid| publisher.detach(**gid)).count() > 0 {
+            let detached = gids.iter().filter(|gid| publisher.detach(**gid));
+            let writer = publisher.endpoint.gid;
+            let detached = detached.inspect(|gid| {
+                trail::over(&Pair { reader: **gid, writer }, "the reader ended");
+            });
+            if detached.count() > 0 {
                 self.writer_changed(&publisher);
             }
         }
         for subscription in subscriptions {
             let mut slots = subscription.lock();
-            let news = gids.iter().filter(|gid| slots.end(gid)).count();
+            let reader = subscription.endpoint.gid;
+            let ended = gids.iter().filter(|gid| slots.end(gid));
+            let ended = ended.inspect(|gid| {
+                trail::over(&Pair { reader, writer: **gid }, "the writer ended");
+            });
+            let news = ended.count();
             drop(slots);
             if news > 0 {
                 self.reader_changed(&subscription);
@@ -89,16 +101,18 @@ impl Control {
         }
     }
 
-    /// What the daemon did not say again is over: it was unmatched while the session was too slow
-    /// to be told.
-    pub(super) fn drop_unrepeated(&mut self, repeated: &HashSet<Pair>) {
+    /// What the daemon told of and did not say again is over: it was unmatched while the session was
+    /// too slow to be told.
+    pub(super) fn drop_unrepeated(&mut self, repeated: HashSet<Pair>) {
+        let spoken = std::mem::take(&mut self.spoken);
+        let is_over = |pair: &Pair| spoken.contains(pair) && !repeated.contains(pair);
         let (publishers, subscriptions) = self.endpoints();
         for publisher in publishers {
             let (writer, attached) = (publisher.endpoint.gid, publisher.attached().clone());
             for reader in attached {
                 let pair = Pair { reader, writer };
-                if !repeated.contains(&pair) && !self.is_at_home(&pair) && publisher.detach(reader)
-                {
+                if is_over(&pair) && !self.is_at_home(&pair) && publisher.detach(reader) {
+                    trail::over(&pair, "the daemon did not repeat it to the writer");
                     self.writer_changed(&publisher);
                 }
             }
@@ -110,13 +124,27 @@ impl Control {
                 .writers()
                 .into_iter()
                 .map(|writer| Pair { reader, writer })
-                .filter(|pair| !repeated.contains(pair) && !self.is_at_home(pair))
+                .filter(|pair| is_over(pair) && !self.is_at_home(pair))
                 .map(|pair| pair.writer);
-            let news = gone.collect::<Vec<_>>().iter().filter(|writer| slots.end(writer)).count();
+            let gone = gone.collect::<Vec<_>>().into_iter().filter(|writer| slots.end(writer));
+            let gone = gone.inspect(|writer| {
+                let pair = Pair { reader, writer: *writer };
+                trail::over(&pair, "the daemon did not repeat it to the reader");
+            });
+            let news = gone.count();
             drop(slots);
             if news > 0 {
                 self.reader_changed(&subscription);
             }
+        }
+        self.spoken = repeated;
+    }
+
+    /// The daemon says that a pair stands, or is to.
+    fn told_of(&mut self, pair: Pair) {
+        self.spoken.insert(pair);
+        if let Some(repeated) = &mut self.repeated {
+            repeated.insert(pair);
         }
     }
 
@@ -142,9 +170,7 @@ impl Control {
     }
 
     fn matched(&mut self, pair: Pair) {
-        if let Some(repeated) = &mut self.repeated {
-            repeated.insert(pair);
-        }
+        self.told_of(pair);
         self.ask(&pair);
     }
 
@@ -158,19 +184,19 @@ impl Control {
             return;
         }
         let segment = self.shared.segment.clone();
-        let lane = subscription.lock().lane_for(pair.writer, || segment.allocate_lane());
-        self.ask_with(&subscription, pair.writer, lane);
+        let asking = subscription.lock().lane_for(pair.writer, || segment.allocate_lane());
+        self.ask_with(&subscription, pair.writer, asking);
     }
 
     fn ask_with(
         &mut self,
         subscription: &SubscriptionInner,
         writer: Gid,
-        lane: Result<Location, ShmError>,
+        asking: Result<Asking, ShmError>,
     ) {
-        match lane {
-            Ok(lane) => {
-                let message = self.attach_message(subscription, writer, lane);
+        match asking {
+            Ok(asking) => {
+                let message = self.attach_message(subscription, writer, asking);
                 self.say(message);
             }
             Err(error) => {
@@ -184,7 +210,7 @@ impl Control {
         &self,
         subscription: &SubscriptionInner,
         writer: Gid,
-        lane: Location,
+        Asking { lane, after }: Asking,
     ) -> Message {
         Message::Attach(Attach {
             reader: subscription.endpoint.gid,
@@ -194,14 +220,14 @@ impl Control {
             session: self.shared.id,
             stands_for: stands_for(subscription),
             segments: Vec::new(),
+            // The numbers of the others say nothing of what came before.
+            after: after.filter(|_| subscription.rising),
         })
     }
 
     fn attach(&mut self, attach: Attach, descriptors: Vec<PassedFd>) {
         let pair = Pair { reader: attach.reader, writer: attach.writer };
-        if let Some(repeated) = &mut self.repeated {
-            repeated.insert(pair);
-        }
+        self.told_of(pair);
         // Counted whether or not it comes to anything, as the daemon does.
         let peer = self.hold(attach.session, pair, descriptors, &attach.segments);
         let shared = self.shared.clone();
@@ -215,17 +241,20 @@ impl Control {
             return;
         }
         let grant = peer.map_err(|e| e.to_string()).and_then(|peer| {
-            let Attach { reader: gid, lane, qos, stands_for, .. } = attach;
+            let Attach { reader: gid, lane, qos, stands_for, after, .. } = attach;
             let reader = ReaderInfo { gid, lane, qos, peer, stands_for };
-            publisher.attach(reader).map_err(|e| e.to_string())
+            publisher.attach(reader, after).map_err(|e| e.to_string())
         });
         drop(home);
         match grant {
-            Ok((Grant { generation, first }, ring)) => {
+            Ok((Grant { generation, first }, after, ring)) => {
                 let Pair { reader, writer } = pair;
+                trail::granted(&pair, generation, first);
                 let session = self.shared.id;
                 let segments = Vec::new();
-                let grant = Granted { reader, writer, generation, first, session, ring, segments };
+                let after = Some(after);
+                let grant =
+                    Granted { reader, writer, generation, first, session, ring, segments, after };
                 self.say(Message::Grant(grant));
                 self.writer_changed(&publisher);
             }
@@ -244,11 +273,9 @@ impl Control {
     }
 
     fn grant(&mut self, granted: Granted, descriptors: Vec<PassedFd>) {
-        let Granted { reader, writer, generation, first, session, ring, segments } = granted;
+        let Granted { reader, writer, generation, first, session, ring, segments, after } = granted;
         let pair = Pair { reader, writer };
-        if let Some(repeated) = &mut self.repeated {
-            repeated.insert(pair);
-        }
+        self.told_of(pair);
         // In a packet that is full not all of them were named.
         let all = descriptors.len() < MAX_DESCRIPTORS;
         let peer = self.hold(session, pair, descriptors, &segments);
@@ -269,12 +296,13 @@ impl Control {
         let lane = match slots.accept(writer, grant) {
             Accept::Stands => return,
             Accept::AskAgain => {
+                trail::forgotten(&pair);
                 // Under the same lock: the lane of before is in use still, so this is another one,
                 // and what we ask is no repetition, which the daemon would not pass on.
                 let segment = &self.shared.segment;
-                let lane = slots.lane_for(writer, || segment.allocate_lane());
+                let asking = slots.lane_for(writer, || segment.allocate_lane());
                 drop(slots);
-                return self.ask_with(&subscription, writer, lane);
+                return self.ask_with(&subscription, writer, asking);
             }
             Accept::Map(lane) => lane,
         };
@@ -285,10 +313,11 @@ impl Control {
         });
         match mapped {
             Ok(mapped) => {
+                trail::accepted(&pair, generation, first);
                 // Under `off` and in a relayed process what was lost on the way is said aloud.
                 let linked = matches!(self.link, Link::Socket(_)) && !writer.is_of(&session);
                 let stands_in = linked && subscription.endpoint.kind == EndpointKind::Subscription;
-                subscription.lock().add(mapped, stands_in);
+                subscription.lock().add(mapped, after, stands_in, subscription.keeps_all());
                 drop(home);
                 self.reader_changed(&subscription);
                 // It may have history to take.
@@ -358,11 +387,13 @@ impl Control {
     fn unmatch(&mut self, unmatch: &Unmatch) {
         let Unmatch { reader, writer, reason } = unmatch;
         let pair = Pair { reader: *reader, writer: *writer };
+        self.spoken.remove(&pair);
         self.peers.release(&pair);
         self.detach_reader(&pair);
         let subscription = self.shared.state().subscriptions.get(reader).cloned();
         if let Some(subscription) = subscription {
             if subscription.lock().end(writer) {
+                trail::over(&pair, reason);
                 self.reader_changed(&subscription);
             }
             let topic = &subscription.endpoint.topic;
@@ -373,6 +404,7 @@ impl Control {
     fn detach_reader(&mut self, pair: &Pair) {
         let publisher = self.shared.state().publishers.get(&pair.writer).cloned();
         if let Some(publisher) = publisher.filter(|p| p.detach(pair.reader)) {
+            trail::over(pair, "the daemon said so to the writer");
             self.writer_changed(&publisher);
         }
         if self.shared.segment.tidy() {

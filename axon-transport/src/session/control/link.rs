@@ -32,6 +32,7 @@ impl Control {
         self.outbox.clear();
         self.building = None;
         self.repeated = None;
+        self.spoken.clear();
         self.told = false;
         self.segments.clear();
         self.untold.clear();
@@ -54,6 +55,7 @@ impl Control {
         for info in self.shared.segment.segments() {
             self.tell_segment(SegmentChange::Opened(info.number));
         }
+        tracing::debug!(%daemon, "a daemon took the session");
         self.shared.notify(Some(&SessionEvent::DaemonFound(daemon)));
     }
 

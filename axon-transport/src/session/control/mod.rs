@@ -6,6 +6,7 @@ mod handle;
 mod link;
 mod memory;
 mod time;
+mod trail;
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashSet, VecDeque},
@@ -27,7 +28,7 @@ use super::{
     publisher::PublisherInner,
     socket::{self, SocketError},
     state::{Outgoing, Shared},
-    subscription::SubscriptionInner,
+    subscription::{Asking, SubscriptionInner},
 };
 use crate::{graph::GraphView, ids::Gid, passed::PassedFd, shm::ShmError, wait::ExternalLeader};
 
@@ -49,6 +50,9 @@ pub(super) struct Control {
     building: Option<GraphView>,
     /// Pairs that the daemon repeated since it began to tell everything anew.
     repeated: Option<HashSet<Pair>>,
+    /// Pairs that the daemon of this connection has told of. What it never told of stands by the word
+    /// of an earlier one, and this one may know nothing of it yet: a stopped process has not come back.
+    spoken: HashSet<Pair>,
     /// Whether this connection has brought a whole graph already.
     told: bool,
     /// When to look after the memory of large samples, while there is any.
@@ -117,6 +121,7 @@ impl Control {
             buffer: Vec::new(),
             building: None,
             repeated: None,
+            spoken: HashSet::new(),
             told: false,
             tend: None,
             segments: BTreeSet::new(),
@@ -226,7 +231,8 @@ impl Control {
                         if subscription.role == EndpointRole::Relay {
                             let lanes = subscription.lock().lanes();
                             for (writer, lane) in lanes {
-                                let attach = self.attach_message(subscription, writer, lane);
+                                let asking = Asking { lane, after: None };
+                                let attach = self.attach_message(subscription, writer, asking);
                                 self.say(attach);
                             }
                         }

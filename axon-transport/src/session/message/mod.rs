@@ -238,6 +238,9 @@ pub struct Attach {
     /// The segments of the reader's session that come along.
     #[n(6)]
     pub segments: Vec<Segment>,
+    /// The last number that a reader has of the writer that was attached before: it goes on behind it.
+    #[n(7)]
+    pub after: Option<u64>,
 }
 
 /// The writer serves the reader.
@@ -265,6 +268,9 @@ pub struct Granted {
     /// The segments of the writer's session that come along.
     #[n(6)]
     pub segments: Vec<Segment>,
+    /// The number of the writer's last sample in front of the first position.
+    #[n(7)]
+    pub after: Option<u64>,
 }
 
 /// A segment of a session's memory, besides the first.

@@ -65,6 +65,7 @@ fn messages() -> Vec<Message> {
             session,
             stands_for: Some(vec![]),
             segments: vec![Segment { number: 3, publisher: None }],
+            after: Some(8),
         }),
         Message::Grant(Granted {
             reader,
@@ -74,6 +75,7 @@ fn messages() -> Vec<Message> {
             session,
             ring: Location { segment: 0, offset: 4096 },
             segments: vec![Segment { number: 7, publisher: Some(writer) }],
+            after: Some(11),
         }),
         Message::Detach(Pair { reader, writer }),
         Message::Unmatch(Unmatch { reader, writer, reason: "gone".into() }),

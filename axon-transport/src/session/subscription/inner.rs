@@ -15,7 +15,7 @@ use crate::{
         message::EndpointRole,
         state::Shared,
     },
-    shm::{Grant, Lane, Location, Peer, Reader, ReaderOptions, ShmError},
+    shm::{Grant, Lane, Location, Peer, Reader, ReaderOptions, ShmError, holds},
     wait::Look,
 };
 
@@ -33,7 +33,7 @@ pub(in crate::session) struct SubscriptionInner {
     /// The only publisher that a relay reads, where it is not all.
     pub(in crate::session) only: Option<Gid>,
     /// Whether a writer's numbers rise: the responses of a server come in whatever order it likes.
-    pub(super) rising: bool,
+    pub(in crate::session) rising: bool,
     pub(in crate::session) role: EndpointRole,
     pub(in crate::session) events: EndpointEvents,
     pub(super) stands_for: Mutex<Vec<Gid>>,
@@ -76,6 +76,11 @@ impl SubscriptionInner {
             arrived: Callback::default(),
             listens: Mutex::new(false),
         }
+    }
+
+    /// Whether it wants every sample of its publishers.
+    pub(in crate::session) fn keeps_all(&self) -> bool {
+        self.endpoint.kind == EndpointKind::Subscription && holds(&self.qos)
     }
 
     pub(in crate::session) fn has_data(&self) -> bool {

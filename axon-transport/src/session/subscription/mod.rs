@@ -10,7 +10,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-pub(super) use self::{inner::SubscriptionInner, slots::Accept};
+pub(super) use self::{
+    inner::SubscriptionInner,
+    slots::{Accept, Asking},
+};
 use self::{inner::lock, slots::Slots};
 use super::{
     OnNew, Session, SessionError,

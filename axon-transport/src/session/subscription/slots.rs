@@ -19,8 +19,8 @@ const SHORT: Duration = Duration::from_secs(1);
 #[derive(Default)]
 pub(in crate::session) struct Slots {
     pub(super) slots: Vec<Slot>,
-    /// Lanes given to writers that have not granted yet.
-    pub(super) pending: HashMap<Gid, Lane>,
+    /// Lanes given to writers that have not granted yet, and the number behind which each is to go on.
+    pub(super) pending: HashMap<Gid, (Lane, Option<u64>)>,
     /// The last sequence number taken of each publisher that is gone: one that comes back, as a remote
     /// one does with its link, must not be heard twice.
     last: HashMap<Gid, u64>,
@@ -36,6 +36,13 @@ pub(in crate::session) struct Slots {
     pub(super) short: Option<Instant>,
     /// Writers whose memory was not usable, of which the others have to be told.
     pub(super) discarded: Vec<Gid>,
+}
+
+/// How a writer is asked to serve.
+pub(in crate::session) struct Asking {
+    pub(in crate::session) lane: Location,
+    /// The last number that the reader has of it, where it was attached before.
+    pub(in crate::session) after: Option<u64>,
 }
 
 /// What a grant calls for.
@@ -62,8 +69,11 @@ pub(super) struct Slot {
     pub(super) leaving: bool,
     /// Found nothing in the take that is under way, since the writer was faster.
     pub(super) overtaken: bool,
-    /// The last sequence number taken of its writer, by way of whatever slot.
+    /// The last sequence number taken of its writer, by way of whatever slot; of one that was attached
+    /// before and has taken nothing, the one in front of its first.
     pub(super) last: Option<u64>,
+    /// The number in front of the first that this slot was granted.
+    after: Option<u64>,
     /// What is missing of its numbers, where that tells of losses on the way to its ring.
     pub(super) gaps: Option<Gaps>,
 }
@@ -106,6 +116,11 @@ impl Slot {
             gaps.before = Some((last, self.reader.grant().first));
         }
         gaps.pass(sequence, position);
+    }
+
+    /// The number up to which nothing is to come any more.
+    fn reached(&self) -> Option<u64> {
+        self.last.or(self.after)
     }
 
     /// Its samples that were lost, here and before they came here.
@@ -163,17 +178,19 @@ impl Slots {
         &mut self,
         writer: Gid,
         allocate: impl FnOnce() -> Result<Lane, E>,
-    ) -> Result<Location, E> {
+    ) -> Result<Asking, E> {
         if let Some(slot) = self.slots.iter().find(|s| s.reader.writer() == writer && !s.over) {
-            return Ok(slot.reader.lane());
+            return Ok(Asking { lane: slot.reader.lane(), after: None });
         }
-        if let Some(lane) = self.pending.get(&writer) {
-            return Ok(lane.location());
+        if let Some((lane, after)) = self.pending.get(&writer) {
+            return Ok(Asking { lane: lane.location(), after: *after });
         }
+        let earlier = self.slots.iter().find(|slot| slot.reader.writer() == writer);
+        let after = earlier.map_or_else(|| self.last.get(&writer).copied(), Slot::reached);
         let lane = allocate()?;
         let location = lane.location();
-        self.pending.insert(writer, lane);
-        Ok(location)
+        self.pending.insert(writer, (lane, after));
+        Ok(Asking { lane: location, after })
     }
 
     /// The lanes of all that are attached, or asked to be: what is repeated when `stands_for`
@@ -181,7 +198,9 @@ impl Slots {
     pub(in crate::session) fn lanes(&self) -> Vec<(Gid, Location)> {
         let attached = self.slots.iter().filter(|s| !s.over);
         let attached = attached.map(|s| (s.reader.writer(), s.reader.lane()));
-        attached.chain(self.pending.iter().map(|(gid, lane)| (*gid, lane.location()))).collect()
+        attached
+            .chain(self.pending.iter().map(|(gid, (lane, _))| (*gid, lane.location())))
+            .collect()
     }
 
     /// What a grant of `writer` calls for.
@@ -197,20 +216,30 @@ impl Slots {
             self.forget_older(writer);
             return Accept::AskAgain;
         }
-        self.pending.remove(&writer).map_or(Accept::Stands, Accept::Map)
+        self.pending.remove(&writer).map_or(Accept::Stands, |(lane, _)| Accept::Map(lane))
     }
 
-    /// A writer granted. If it `stands_in` for one elsewhere, its numbers tell what was lost on the way.
-    pub(in crate::session) fn add(&mut self, reader: Reader, stands_in: bool) {
+    /// A writer granted what comes `after` a number. If it `stands_in` for one elsewhere, its numbers
+    /// tell what was lost on the way. If it was here before and the subscription `keeps_all`, they tell
+    /// what was lost meanwhile.
+    pub(in crate::session) fn add(
+        &mut self,
+        reader: Reader,
+        after: Option<u64>,
+        stands_in: bool,
+        keeps_all: bool,
+    ) {
         let writer = reader.writer();
+        // One that speaks for another has no number before it has a sample.
+        let after = after.filter(|number| *number > 0);
         let since = clock::monotonic();
         let times = reader.times();
         let lifespan = times.lifespan.map(|age| i64::try_from(age).unwrap_or(i64::MAX));
         let lease = times.lease;
-        let gaps = stands_in.then(Gaps::default);
         let (over, leaving, overtaken) = (false, false, false);
-        let earlier = self.slots.iter().find(|s| s.reader.writer() == writer).map(|s| s.last);
+        let earlier = self.slots.iter().find(|s| s.reader.writer() == writer).map(Slot::reached);
         let last = earlier.unwrap_or_else(|| self.last.remove(&writer));
+        let gaps = (stands_in || keeps_all && last.is_some()).then(Gaps::default);
         self.slots.push(Slot {
             reader,
             since,
@@ -220,6 +249,7 @@ impl Slots {
             leaving,
             overtaken,
             last,
+            after,
             gaps,
         });
         self.forget_older(writer);
@@ -288,7 +318,7 @@ impl Slots {
         if self.last.len() >= REMEMBERED {
             self.last.clear();
         }
-        self.last.extend(slot.last.map(|last| (slot.reader.writer(), last)));
+        self.last.extend(slot.reached().map(|last| (slot.reader.writer(), last)));
     }
 
     /// This sample of `writer` was taken.

@@ -285,7 +285,7 @@ mod tests {
         let [writer, gid] = [1, 2].map(|number| Gid::new(session.id(), number));
         let (publisher, reader) = reading(&session, writer, gid);
         let mut slots = Slots::default();
-        slots.add(reader, false);
+        slots.add(reader, None, false, false);
         publisher.publish_next(0, b"sample").unwrap();
         assert!(slots.has_data());
         let inner = subscription(gid);
@@ -306,7 +306,7 @@ mod tests {
         let mut publishers = Vec::new();
         for writer in writers {
             let (publisher, reader) = reading(&session, writer, gid);
-            slots.add(reader, true);
+            slots.add(reader, None, true, false);
             for sequence in [1, u64::MAX] {
                 publisher.publish(Meta { sequence, source_timestamp: 0 }, b"sample").unwrap();
             }

@@ -8,7 +8,7 @@ use crate::{
 };
 
 /// What is read, and the session that it is of as the reader has it.
-struct Taking {
+pub(super) struct Taking {
     reader: Reader,
     view: Arc<PeerSession>,
 }
@@ -33,20 +33,25 @@ impl Taking {
 }
 
 /// A reader of another session, which takes when the test says so.
-struct Taker {
+pub(super) struct Taker {
     session: Arc<SessionSegment>,
-    gid: Gid,
+    pub(super) gid: Gid,
 }
 
 impl Taker {
-    fn new() -> Self {
+    pub(super) fn new() -> Self {
         let session = SessionSegment::create(SessionId::random()).unwrap();
         let gid = Gid::new(session.id(), 1);
         Self { session, gid }
     }
 
     /// Has it attached to a publisher as one that stands for others, or not.
-    fn attach(&self, to: &Publisher, stands_for: Option<Vec<Gid>>, daemon: &Daemon) -> Taking {
+    pub(super) fn attach(
+        &self,
+        to: &Publisher,
+        stands_for: Option<Vec<Gid>>,
+        daemon: &Daemon,
+    ) -> Taking {
         let (writer, qos) = (to.gid(), to.endpoint().qos);
         let lane = self.session.allocate_lane().unwrap();
         let attach = Attach {
@@ -57,6 +62,7 @@ impl Taker {
             session: self.session.id(),
             stands_for,
             segments: Vec::new(),
+            after: None,
         };
         let PeerDescriptors { segment, doorbell, pidfd } = self.session.descriptors().unwrap();
         let descriptors = [segment.as_fd(), doorbell.as_fd(), pidfd.as_fd()];

@@ -115,6 +115,23 @@ pub(super) struct State {
 }
 
 impl State {
+    /// The first position that stands whose sample has a higher number.
+    fn position_after(&self, number: u64) -> u64 {
+        let standing = self.history.tail()..self.history.head();
+        let later = |position: &u64| ring::number(self.array.words(), *position) > number;
+        standing.rev().take_while(later).last().unwrap_or(self.history.head())
+    }
+
+    /// The number of the last sample in front of a position.
+    fn number_before(&self, position: u64) -> u64 {
+        let stands = position >= self.history.tail() && position < self.history.head();
+        if stands {
+            ring::number(self.array.words(), position).saturating_sub(1)
+        } else {
+            self.last
+        }
+    }
+
     fn new(audience: Audience, history: History, array: Object) -> Self {
         Self {
             history,
@@ -224,15 +241,30 @@ impl Writer {
     /// # Errors
     /// Its session has no such lane, or its process as many readers of this publisher as it may.
     pub fn attach(&self, reader: ReaderInfo) -> Result<Grant, ShmError> {
+        Ok(self.attach_after(reader, None)?.0)
+    }
+
+    /// As [`attach`](Self::attach), for a reader that was attached before and has all up to the number
+    /// `after`: it goes on with what stands of the samples behind that. Also returns the number of the
+    /// sample in front of the first that it is granted.
+    ///
+    /// # Errors
+    /// As [`attach`](Self::attach).
+    pub(crate) fn attach_after(
+        &self,
+        reader: ReaderInfo,
+        after: Option<u64>,
+    ) -> Result<(Grant, u64), ShmError> {
         if self.is_forked() {
             return Err(ShmError::Forked);
         }
         let lane = reader.peer.lane(reader.lane)?;
         let mut state = self.lock();
+        let resumed = after.map(|after| state.position_after(after));
         let State { audience, history, .. } = &mut *state;
-        let granted = audience.attach(reader, lane, history.tail(), history.head());
+        let granted = audience.attach(reader, lane, history.tail(), history.head(), resumed);
         self.show_window(&state);
-        granted
+        granted.map(|grant| (grant, state.number_before(grant.first)))
     }
 
     /// Forgets a reader; false when it was not attached. The samples that it keeps it may keep.

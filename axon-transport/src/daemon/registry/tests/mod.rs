@@ -144,6 +144,7 @@ impl Client {
                         session: self.id,
                         stands_for: None,
                         segments: vec![],
+                        after: None,
                     };
                     self.outgoing.push((Message::Attach(attach), vec![]));
                 }
@@ -166,6 +167,7 @@ impl Client {
                         session,
                         ring: PLACE,
                         segments: vec![],
+                        after: None,
                     };
                     self.outgoing.push((Message::Grant(grant), vec![]));
                 }

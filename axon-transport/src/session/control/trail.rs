@@ -1,0 +1,31 @@
+//! The life of each pair, in the log at `debug`: who granted what to whom, and why it ended. Rare, so
+//! that a test can keep all of it and print the history of a pair that lost something.
+
+use crate::session::message::Pair;
+
+/// What it is logged under.
+const TARGET: &str = "axon_transport::pairs";
+
+/// Writer: a reader is served from position `first` on.
+pub(super) fn granted(pair: &Pair, generation: u64, first: u64) {
+    let Pair { reader, writer } = pair;
+    tracing::debug!(target: TARGET, %reader, %writer, generation, first, "granted");
+}
+
+/// Reader: the writer's ring is mapped and read from position `first` on.
+pub(super) fn accepted(pair: &Pair, generation: u64, first: u64) {
+    let Pair { reader, writer } = pair;
+    tracing::debug!(target: TARGET, %reader, %writer, generation, first, "accepted");
+}
+
+/// Reader: the writer granted anew, so it had forgotten the reader.
+pub(super) fn forgotten(pair: &Pair) {
+    let Pair { reader, writer } = pair;
+    tracing::debug!(target: TARGET, %reader, %writer, "the writer had forgotten the reader");
+}
+
+/// Either end lets go of the other.
+pub(super) fn over(pair: &Pair, why: &str) {
+    let Pair { reader, writer } = pair;
+    tracing::debug!(target: TARGET, %reader, %writer, why, "over");
+}

@@ -1,0 +1,141 @@
+//! A daemon that follows another, and readers that are attached anew.
+
+use rustix::net::accept_with;
+
+use super::*;
+use crate::{
+    config::{Config, OsFiles},
+    session::{address::Address, tests::played::Taker},
+    shm::{PublishError, probe::probe},
+};
+
+/// Where the test plays one daemon after another.
+struct Stage {
+    listener: OwnedFd,
+    config: Config,
+    _dir: tempfile::TempDir,
+}
+
+impl Stage {
+    fn new() -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        let run = dir.path().join("run").into_os_string();
+        let env = [("AXON_RUNTIME_DIR".into(), run), ("AXON_DAEMON".into(), "require".into())];
+        let config = Config::resolve(env, None, &OsFiles).unwrap();
+        let (listener, _) = Address::of(&config).bind().unwrap().into_parts();
+        Self { listener, config, _dir: dir }
+    }
+
+    /// The next daemon, once a session has come to it.
+    fn daemon(&self, number: u8) -> Daemon {
+        let mut fds = [PollFd::new(&self.listener, PollFlags::IN)];
+        assert_eq!(poll(&mut fds, Some(&EVER.try_into().unwrap())), Ok(1), "nobody comes");
+        let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+        let socket = accept_with(&self.listener, flags).unwrap();
+        let Received { message: Message::Hello(hello), descriptors } = hear(&socket) else {
+            panic!("something else before HELLO")
+        };
+        let [segment, doorbell, pidfd] = <[_; 3]>::try_from(descriptors).expect("three");
+        let handed = PeerDescriptors { segment, doorbell, pidfd };
+        let daemon = Daemon { socket, id: hello.session, handed };
+        let welcome =
+            Welcome { protocol: PROTOCOL, daemon: DaemonId([number; 16]), pid: std::process::id() };
+        daemon.say(Message::Welcome(welcome), &[probe().unwrap().as_fd()]);
+        daemon.tell_all(Vec::new());
+        daemon
+    }
+
+    fn session(&self) -> (Session, Daemon) {
+        let config = self.config.clone();
+        let opening = thread::spawn(move || Session::open(&config, SessionOptions::new("t")));
+        let daemon = self.daemon(1);
+        (opening.join().unwrap().unwrap(), daemon)
+    }
+}
+
+/// Waits until the session has done what it was told: it asks for a pair that it is told of last.
+fn done(daemon: &Daemon, asking: &Subscription) {
+    let writer = Gid::new(SessionId::random(), 1);
+    daemon.say(Message::Match(Pair { reader: asking.gid(), writer }), &[]);
+    daemon.hear(|message| {
+        matches!(message, Message::Attach(attach) if attach.writer == writer).then_some(())
+    });
+}
+
+#[test]
+fn a_pair_stands_though_a_new_daemon_that_tells_all_again_does_not_know_of_it_yet() {
+    let stage = Stage::new();
+    let (session, daemon) = stage.session();
+    let far = Far::new(&daemon);
+    let (subscription, _) = far.matched(&session, &daemon);
+    let publisher =
+        session.create_publisher(EndpointSpec::new("/p", "test/Bytes", Qos::keep_all())).unwrap();
+    let taker = Taker::new();
+    let taking = taker.attach(&publisher, None, &daemon);
+    drop(daemon);
+    let daemon = stage.daemon(2);
+    // It has no more to say of the others than before: they are stopped, and have not come to it.
+    daemon.tell_all(Vec::new());
+    done(&daemon, &subscription);
+    assert_eq!(subscription.matched(), [far.writer.gid()]);
+    assert_eq!(publisher.matched(), [taker.gid]);
+    far.publish(1, b"x");
+    assert_eq!(take(&subscription), Some(1));
+    // The publisher waits for its reader still.
+    let held_back = (0..1 << 14).any(|_| match publisher.publish(&[0; 4096]) {
+        Ok(_) => false,
+        Err(PublishError::Blocked { .. }) => true,
+        Err(error) => panic!("{error}"),
+    });
+    assert!(held_back, "nobody is waited for");
+    drop(taking);
+
+    // What it told of itself, and does not repeat, is over.
+    let Pair { reader, writer } = far.pair(&subscription);
+    daemon.say(Message::Match(Pair { reader, writer }), &[]);
+    daemon.hear_attach();
+    daemon.tell_all(Vec::new());
+    done(&daemon, &subscription);
+    assert!(subscription.matched().is_empty());
+}
+
+#[test]
+fn a_reader_that_is_attached_anew_goes_on_where_it_was_and_counts_what_is_missing() {
+    let (session, daemon) = session();
+    let far = Far::new(&daemon);
+    let (subscription, _) = far.matched(&session, &daemon);
+    let pair = far.pair(&subscription);
+    let lose = || {
+        let Pair { reader, writer } = pair;
+        daemon.say(Message::Unmatch(Unmatch { reader, writer, reason: "lost".into() }), &[]);
+        until("it is over", || subscription.matched().is_empty());
+    };
+    let attach_after = |number| {
+        daemon.say(Message::Match(pair), &[]);
+        let attach = daemon.hear_attach();
+        assert_eq!(attach.after, Some(number));
+        let granted = far.grant(&attach);
+        let introduction = far.introduction();
+        let introduction: Vec<_> = introduction.iter().map(AsFd::as_fd).collect();
+        daemon.say(Message::Grant(granted), &introduction);
+        assert!(subscription.wait_matched(1, EVER));
+    };
+    far.publish(1, b"x");
+    assert_eq!(take(&subscription), Some(1));
+    lose();
+    far.publish(2, b"x");
+    far.publish(3, b"x");
+    attach_after(1);
+    assert_eq!((take(&subscription), take(&subscription)), (Some(2), Some(3)));
+    assert_eq!(subscription.lost(), 0, "all of it stood");
+
+    // Where nobody reads, nothing stands.
+    lose();
+    assert!(far.writer.detach(pair.reader));
+    far.publish(4, b"x");
+    far.publish(5, b"x");
+    attach_after(3);
+    far.publish(6, b"x");
+    assert_eq!(take(&subscription), Some(6));
+    assert_eq!(subscription.lost(), 2);
+}
