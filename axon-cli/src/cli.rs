@@ -126,6 +126,9 @@ Each topic is published under the name and type in the log, at the pace of the r
 --qos keep-all, the default, a full reader that keeps all as well slows the replay and nothing is
 lost; the other profiles never wait.
 
+A log whose end is missing, or that fails a checksum, is refused; the error says how much of it is
+whole, and --incomplete publishes that.
+
 Examples:
   axon play examples/data/mit-csail.mcap
   axon play log.mcap --rate 10 --wait 1
@@ -149,6 +152,9 @@ pub(crate) struct Play {
     /// Start again at the end, until interrupted
     #[arg(long = "loop")]
     pub(crate) repeat: bool,
+    /// Play a damaged log as far as it is whole
+    #[arg(long)]
+    pub(crate) incomplete: bool,
 }
 
 /// The profiles on offer.

@@ -49,6 +49,8 @@ pub(crate) struct Survey {
     pub(crate) largest: u64,
     /// Time from the earliest to the latest message, in nanoseconds.
     pub(crate) duration: u64,
+    /// What ends the log early, where only its whole part was asked for.
+    pub(crate) damage: Option<String>,
 }
 
 /// Why a log cannot be read.
@@ -56,15 +58,45 @@ pub(crate) struct Survey {
 pub(crate) enum LogError {
     #[error("cannot open the log {path}: {source}")]
     Open { path: PathBuf, source: std::io::Error },
-    #[error("{path} is not a whole MCAP log: {source}")]
+    #[error("{path} is not an MCAP log: {source}")]
     Read { path: PathBuf, source: mcap::McapError },
+    #[error(
+        "{path} is damaged: {source}; the {messages} messages ({seconds:.1} s) before that are whole, \
+         and `axon play --incomplete` publishes them"
+    )]
+    Damaged { path: PathBuf, messages: u64, seconds: f64, source: mcap::McapError },
+    #[error("{path} changed while it was read: fewer messages are whole than at the start")]
+    Changed { path: PathBuf },
     #[error("{path} holds no messages")]
     Empty { path: PathBuf },
 }
 
 impl Survey {
-    /// Reads the log once from end to end.
+    /// Reads the log once from end to end, checksums included.
+    ///
+    /// # Errors
+    /// [`LogError::Damaged`] where a part of the log is missing or fails its checksum.
     pub(crate) fn of(path: &Path) -> Result<Self, LogError> {
+        match Self::read(path)? {
+            (survey, None) => Ok(survey),
+            (survey, Some(source)) => Err(LogError::Damaged {
+                path: survey.path,
+                messages: survey.messages,
+                seconds: survey.duration as f64 / 1e9,
+                source,
+            }),
+        }
+    }
+
+    /// As [`Survey::of`], but of a damaged log its part before the damage.
+    pub(crate) fn of_whole_part(path: &Path) -> Result<Self, LogError> {
+        let (mut survey, damage) = Self::read(path)?;
+        survey.damage = damage.map(|error| error.to_string());
+        Ok(survey)
+    }
+
+    /// The messages before the first damage, and the damage.
+    fn read(path: &Path) -> Result<(Self, Option<mcap::McapError>), LogError> {
         let mut survey = Self {
             path: path.to_owned(),
             topics: Vec::new(),
@@ -72,11 +104,20 @@ impl Survey {
             bytes: 0,
             largest: 0,
             duration: 0,
+            damage: None,
         };
         let mut span: Option<(u64, u64)> = None;
-        let mut messages = Messages::open(path, Vec::new())?;
+        let mut damage = None;
+        let mut messages = Messages::open(path, Vec::new(), Checks::Whole)?;
         while let Some(message) = messages.advance() {
-            let message = message?;
+            let message = match message {
+                Ok(message) => message,
+                Err(LogError::Read { source, .. }) if survey.messages > 0 => {
+                    damage = Some(source);
+                    break;
+                }
+                Err(error) => return Err(error),
+            };
             survey.messages += 1;
             survey.bytes += message.data.len() as u64;
             survey.largest = survey.largest.max(message.data.len() as u64);
@@ -88,15 +129,23 @@ impl Survey {
         };
         survey.duration = last - first;
         survey.topics = messages.topics;
-        Ok(survey)
+        Ok((survey, damage))
     }
 
-    /// The messages in the order of the file, with indexes into this survey's topics.
+    /// The surveyed messages in the order of the file, with indexes into this survey's topics.
     pub(crate) fn messages(
         &self,
     ) -> Result<impl Iterator<Item = Result<Message, LogError>> + Send + use<>, LogError> {
-        let mut messages = Messages::open(&self.path, self.topics.clone())?;
-        Ok(std::iter::from_fn(move || messages.advance()))
+        let mut messages = Messages::open(&self.path, self.topics.clone(), Checks::Chunks)?;
+        let mut left = self.messages;
+        Ok(std::iter::from_fn(move || {
+            left = left.checked_sub(1)?;
+            let message = messages.advance();
+            if !matches!(message, Some(Ok(_))) {
+                left = 0;
+            }
+            message.or_else(|| Some(Err(LogError::Changed { path: messages.path.clone() })))
+        }))
     }
 }
 
@@ -122,6 +171,15 @@ impl Log {
     }
 }
 
+/// Which checksums are compared.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Checks {
+    /// Of each chunk, before its first message is handed out.
+    Chunks,
+    /// Those of the chunks, and that of the data section.
+    Whole,
+}
+
 struct Messages {
     path: PathBuf,
     reader: mcap::io::MessageReader<BufReader<File>>,
@@ -129,10 +187,13 @@ struct Messages {
 }
 
 impl Messages {
-    fn open(path: &Path, topics: Vec<Topic>) -> Result<Self, LogError> {
+    fn open(path: &Path, topics: Vec<Topic>, checks: Checks) -> Result<Self, LogError> {
         let file =
             File::open(path).map_err(|source| LogError::Open { path: path.to_owned(), source })?;
-        let options = LinearReaderOptions::default().with_record_length_limit(RECORD_LIMIT);
+        let options = LinearReaderOptions::default()
+            .with_record_length_limit(RECORD_LIMIT)
+            .with_prevalidate_chunk_crcs(true)
+            .with_validate_data_section_crc(checks == Checks::Whole);
         let reader = mcap::io::MessageReader::new_with_options(BufReader::new(file), options);
         Ok(Self { path: path.to_owned(), reader, topics })
     }
@@ -179,10 +240,100 @@ mod tests {
     }
 
     #[test]
-    fn a_log_cut_anywhere_is_an_error_and_no_panic() {
+    fn a_log_cut_anywhere_is_an_error_and_its_whole_part_is_readable() {
         let whole = std::fs::read(RECORDED).expect("the recorded log");
+        let log = Log::load(Path::new(RECORDED)).expect("the recorded log");
+        let mut found = 0;
         for cut in (0..whole.len()).step_by(whole.len() / 37) {
-            assert!(Survey::of(file(&whole[..cut]).path()).is_err(), "cut at {cut}");
+            let file = file(&whole[..cut]);
+            let error = Survey::of(file.path()).expect_err("a cut log");
+            let LogError::Damaged { messages, .. } = error else {
+                assert!(Survey::of_whole_part(file.path()).is_err(), "cut at {cut}: {error}");
+                continue;
+            };
+            assert!(error.to_string().contains("--incomplete"), "{error}");
+            let part = Survey::of_whole_part(file.path()).expect("the part before the cut");
+            assert!(messages >= found && part.messages == messages && part.damage.is_some());
+            let mut heads = vec![0; part.topics.len()];
+            for message in part.messages().expect("opens") {
+                let message = message.expect("a whole message");
+                let topic = &part.topics[message.topic];
+                let same = log.survey.topics.iter().position(|t| t == topic).expect("recorded");
+                assert_eq!(message.data, log.payloads[same][heads[message.topic]]);
+                heads[message.topic] += 1;
+            }
+            assert_eq!(heads.iter().sum::<usize>() as u64, messages);
+            found = messages;
+        }
+        assert!(found > 5_000, "the last cut leaves nearly all: {found}");
+    }
+
+    #[test]
+    fn no_message_of_a_chunk_with_a_wrong_checksum_is_handed_out() {
+        for compression in [None, Some(mcap::Compression::Zstd)] {
+            let bytes = chunks_of_ten(3, compression);
+            // The checksum follows two times and the uncompressed size in the chunk's header.
+            let header = chunk_header(&bytes, 1);
+            let mut wrong = bytes.clone();
+            wrong[header + 24] ^= 1;
+            let file = file(&wrong);
+            let error = Survey::of(file.path()).expect_err("a wrong checksum");
+            assert!(matches!(error, LogError::Damaged { messages: 10, .. }), "{error}");
+            let part = Survey::of_whole_part(file.path()).expect("the first chunk");
+            assert_eq!(part.messages().expect("opens").filter(Result::is_ok).count(), 10);
+            assert!(Survey::of(self::file(&bytes).path()).is_ok());
+        }
+    }
+
+    #[test]
+    fn a_log_that_shrinks_between_survey_and_replay_is_an_error() {
+        let bytes = chunks_of_ten(3, None);
+        let file = file(&bytes);
+        let survey = Survey::of(file.path()).expect("a whole log");
+        file.as_file().set_len(chunk_header(&bytes, 2) as u64).expect("truncate");
+        let read: Vec<_> = survey.messages().expect("opens").collect();
+        assert_eq!(read.iter().filter(|message| message.is_ok()).count(), 20);
+        assert!(read.last().expect("an error").is_err());
+    }
+
+    /// A log of `count` chunks with ten messages each.
+    fn chunks_of_ten(count: u64, compression: Option<mcap::Compression>) -> Vec<u8> {
+        let mut writer = mcap::WriteOptions::new()
+            .compression(compression)
+            .create(std::io::Cursor::new(Vec::new()))
+            .expect("writer");
+        let channel = writer.add_channel(0, "/t", "cdr", &BTreeMap::new()).expect("channel");
+        for number in 0..count * 10 {
+            let header = mcap::records::MessageHeader {
+                channel_id: channel,
+                sequence: number as u32,
+                log_time: number,
+                publish_time: number,
+            };
+            writer.write_to_known_channel(&header, &number.to_le_bytes()).expect("message");
+            if number % 10 == 9 {
+                writer.flush().expect("end of a chunk");
+            }
+        }
+        writer.finish().expect("finish");
+        writer.into_inner().into_inner()
+    }
+
+    /// Where the body of the chunk of this index begins.
+    fn chunk_header(bytes: &[u8], index: usize) -> usize {
+        const CHUNK: u8 = 6;
+        let mut at = mcap::MAGIC.len();
+        let mut chunks = 0;
+        loop {
+            let body = at + 9;
+            let length = bytes[at + 1..body].try_into().expect("eight bytes");
+            if bytes[at] == CHUNK {
+                if chunks == index {
+                    return body;
+                }
+                chunks += 1;
+            }
+            at = body + u64::from_le_bytes(length) as usize;
         }
     }
 

@@ -49,7 +49,16 @@ pub(crate) struct Sent {
 /// Runs `axon play`.
 pub(crate) fn run(args: &cli::Play) -> Result<(), Failure> {
     let config = logging::configure()?;
-    let survey = Survey::of(&args.file).map_err(Failure::failed)?;
+    let survey =
+        if args.incomplete { Survey::of_whole_part(&args.file) } else { Survey::of(&args.file) };
+    let survey = survey.map_err(Failure::failed)?;
+    if let Some(damage) = &survey.damage {
+        let (messages, time) = (text::grouped(survey.messages), text::duration(survey.duration));
+        let file = survey.path.display();
+        eprintln!(
+            "axon play: {file} is damaged ({damage}); playing the {messages} messages, {time}, before"
+        );
+    }
     let session = session::open(&config, "axon play")?;
     let publishers = publishers(&session, &survey, args.qos.qos())?;
     if args.wait > 0 {
