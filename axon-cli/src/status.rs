@@ -21,7 +21,8 @@ pub(crate) fn run(args: &cli::Status) -> Result<(), Failure> {
     let json = session::daemon_status(&config).map_err(crate::session::failure)?;
     let text = if args.json {
         let value: Value = serde_json::from_str(&json).map_err(Failure::failed)?;
-        serde_json::to_string_pretty(&value).map_err(Failure::failed)? + "\n"
+        let json = serde_json::to_string_pretty(&value).map_err(Failure::failed)?;
+        text::printable_json(&json) + "\n"
     } else {
         render(&serde_json::from_str(&json).map_err(Failure::failed)?)
     };

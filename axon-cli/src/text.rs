@@ -2,6 +2,8 @@
 
 use std::fmt::Write as _;
 
+use axon_transport::text::is_plain;
+
 /// A table of text: a header, rows, columns as wide as their widest cell.
 pub(crate) struct Table {
     header: Vec<&'static str>,
@@ -58,13 +60,27 @@ impl Table {
     }
 }
 
-/// `text` with every control character escaped.
+/// `text` with every character escaped that could steer a terminal.
 pub(crate) fn printable(text: &str) -> String {
     text.chars().fold(String::with_capacity(text.len()), |mut out, c| {
-        if c.is_control() || matches!(c, '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}') {
-            out.extend(c.escape_unicode());
-        } else {
+        if is_plain(c) {
             out.push(c);
+        } else {
+            out.extend(c.escape_unicode());
+        }
+        out
+    })
+}
+
+/// A JSON text in which every character that could steer a terminal is escaped; it means the same.
+pub(crate) fn printable_json(json: &str) -> String {
+    json.chars().fold(String::with_capacity(json.len()), |mut out, c| {
+        if c == '\n' || is_plain(c) {
+            out.push(c);
+        } else {
+            for unit in c.encode_utf16(&mut [0; 2]) {
+                let _ = write!(out, "\\u{unit:04x}");
+            }
         }
         out
     })
@@ -163,6 +179,16 @@ mod tests {
         let text = table.render(2);
         assert!(!text.contains('\x1b') && !text.contains('\r'), "{text:?}");
         assert_eq!(text.lines().count(), 3);
+    }
+
+    #[test]
+    fn bidirectional_marks_are_escaped_in_cells_and_in_json() {
+        let name = "/a\u{2066}b\u{2069}\u{61c}\u{e0041}";
+        assert_eq!(printable(name), "/a\\u{2066}b\\u{2069}\\u{61c}\\u{e0041}");
+        let value = serde_json::json!({ "topic": name, "quoted": "\"\\" });
+        let json = printable_json(&serde_json::to_string_pretty(&value).expect("serializable"));
+        assert!(json.chars().all(|c| c == '\n' || is_plain(c)), "{json:?}");
+        assert_eq!(serde_json::from_str::<serde_json::Value>(&json).expect("JSON"), value);
     }
 
     #[test]

@@ -18,4 +18,5 @@ pub mod relay;
 mod seldom;
 pub mod session;
 pub mod shm;
+pub mod text;
 pub mod wait;

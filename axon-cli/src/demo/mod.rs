@@ -91,7 +91,8 @@ pub(crate) fn run(args: &cli::Demo) -> Result<ExitCode, Failure> {
         other => Failure::failed(other),
     })?;
     let text = if args.json {
-        serde_json::to_string_pretty(&report).map_err(Failure::failed)? + "\n"
+        let json = serde_json::to_string_pretty(&report).map_err(Failure::failed)?;
+        crate::text::printable_json(&json) + "\n"
     } else {
         report.render()
     };

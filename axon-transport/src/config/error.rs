@@ -1,6 +1,8 @@
 //! Why a configuration was refused, in one line.
 
-use std::fmt;
+use std::fmt::{self, Write as _};
+
+use crate::text::is_plain;
 
 /// A setting that was refused: which one, what was read, what is accepted.
 ///
@@ -98,9 +100,10 @@ impl fmt::Display for OneLine<'_> {
         let mut chars = self.0.chars();
         for c in chars.by_ref().take(LONGEST) {
             // Quotes stay readable; control characters, line breaks and bidi marks do not get through.
-            match c {
-                '"' | '\'' | '\\' => write!(f, "{c}")?,
-                c => write!(f, "{}", c.escape_debug())?,
+            if is_plain(c) {
+                f.write_char(c)?;
+            } else {
+                write!(f, "{}", c.escape_debug())?;
             }
         }
         if chars.next().is_some() { f.write_str("…") } else { Ok(()) }

@@ -25,6 +25,7 @@ use crate::{
         message::{Hello, Message, PROTOCOL, Refused, Welcome},
         socket::{self, Peer, Received, SocketError},
     },
+    text,
 };
 
 /// How long a connection may take to say HELLO.
@@ -163,7 +164,7 @@ fn refuse(
 
 /// What is shown of a session in log and status.
 fn shown(name: &str) -> String {
-    name.chars().filter(|c| !c.is_control()).take(64).collect()
+    text::plain(name, 64)
 }
 
 /// Has a session relayed whose memory is not shared.

@@ -102,8 +102,7 @@ impl Refusal {
 
 /// A peer's words, bounded and printable.
 fn text(bytes: &[u8]) -> String {
-    let text: String = String::from_utf8_lossy(bytes).chars().take(300).collect();
-    text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect()
+    crate::text::plain(&String::from_utf8_lossy(bytes), 300)
 }
 
 fn transport_name(error: &ConnectionError) -> String {

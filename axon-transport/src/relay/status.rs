@@ -18,7 +18,7 @@ pub(crate) struct Tally {
 impl Tally {
     /// Of a session that is relayed for this reason.
     pub(crate) fn new(reason: &str) -> Self {
-        let reason = reason.chars().filter(|c| !c.is_control()).take(super::MAX_REASON).collect();
+        let reason = crate::text::plain(reason, super::MAX_REASON);
         Self { reason, ..Self::default() }
     }
 

@@ -43,13 +43,14 @@ fn printable(message: &str) -> String {
             out.push('…');
             break;
         }
-        out.push(if c.is_control() || is_layout(c) { ' ' } else { c });
+        out.push(if is_layout(c) { ' ' } else { c });
     }
     out
 }
 
 fn is_layout(c: char) -> bool {
-    matches!(c, '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
+    // The standard library keeps the table of what is printable, and escapes quotes besides.
+    !matches!(c, '"' | '\'' | '\\') && c.escape_debug().len() > 1
 }
 
 #[cfg(test)]
@@ -69,7 +70,7 @@ mod tests {
     fn messages_are_made_fit_for_a_terminal() {
         let answer = error_answer(br#"{"message":"no\u001b[2J key\n"}"#);
         assert_eq!(answer.message, "no [2J key ");
-        let turned = error_answer("{\"message\":\"a\u{202e}b\u{2028}c\u{2066}\"}".as_bytes());
+        let turned = error_answer("{\"message\":\"a\u{202e}b\u{2028}c\u{61c}\"}".as_bytes());
         assert_eq!(turned.message, "a b c ");
         let long = format!("{{\"message\":\"{}\"}}", "x".repeat(10_000));
         assert!(error_answer(long.as_bytes()).message.len() < 600);

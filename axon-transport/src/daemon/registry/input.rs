@@ -9,10 +9,12 @@ use super::{
 use crate::{
     graph::{Endpoint, EndpointKind, LIMITS, writes},
     ids::{Gid, SessionId},
+    relay,
     session::message::{
         Announce, Attach, EndpointRole, Granted, Leaving, Message, Pair, Refused, SessionRole,
         Unmatch,
     },
+    text,
 };
 
 impl<F: Clone> Registry<F> {
@@ -335,8 +337,7 @@ impl<F: Clone> Registry<F> {
             return Err(Violation::NotItsOwn(reader));
         }
         let topic = self.endpoints.get(&writer).map_or("", |writer| &writer.endpoint.topic);
-        let reason: String =
-            reason.chars().filter(|c| !c.is_control()).take(crate::relay::MAX_REASON).collect();
+        let reason = text::plain(&reason, relay::MAX_REASON);
         let text = format!(
             "topic {topic:?}: reader {reader} and publisher {writer} do not meet: {reason}. \
              AXON_SHM=off for the process of one of them has samples pass through the daemon"

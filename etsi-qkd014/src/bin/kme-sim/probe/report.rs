@@ -102,10 +102,11 @@ impl fmt::Display for Report {
     }
 }
 
-/// A KME's words for a terminal: no control characters, and not without end.
+/// A KME's words for a terminal: nothing that steers it, and not without end.
 fn shown(text: &str) -> String {
     const MOST: usize = 100;
-    let plain = |c: char| if c.is_control() { '\u{fffd}' } else { c };
+    let shaped = |c: char| matches!(c, '"' | '\'' | '\\') || c.escape_debug().len() == 1;
+    let plain = |c: char| if shaped(c) { c } else { '\u{fffd}' };
     let mut out: String = text.chars().take(MOST).map(plain).collect();
     if text.chars().nth(MOST).is_some() {
         out.push_str("...");
