@@ -139,6 +139,14 @@ pub enum PublishError {
         /// A reader that keeps some.
         keeper: Keeper,
     },
+    /// The number that a publisher elsewhere gave its sample cannot be.
+    #[error("sequence number {sequence} after {last}: so many samples cannot have been lost")]
+    Sequence {
+        /// The sample's number.
+        sequence: u64,
+        /// That of the last sample before it.
+        last: u64,
+    },
     /// A loan was published before all of it was written.
     #[error("loan of {len} bytes published with {written} written")]
     Incomplete {

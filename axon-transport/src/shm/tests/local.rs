@@ -461,3 +461,26 @@ fn one_who_carries_samples_on_from_later_has_none_of_those_before_to_hand_over()
     let handed_over = |published| writer.lock().audience.handed_over(published);
     assert_eq!([1, 3, 4].map(handed_over), [1, 3, 3]);
 }
+
+#[test]
+fn a_number_that_no_publisher_can_have_reached_is_refused() {
+    let a = session();
+    for (before, number) in
+        [(None, 1 << 49), (None, u64::MAX), (Some(7), u64::MAX), (Some(7), 1 << 33)]
+    {
+        let writer = writer(&a, keep_last(10), 1 << 20);
+        let mut reader = attach(&writer, &a, &a, keep_last(10));
+        if let Some(before) = before {
+            writer.publish(meta(before), b"before").unwrap();
+            assert_eq!(take(&mut reader), Some((before, b"before".to_vec())));
+        }
+        for payload in [&b"short"[..], &[0; 10_000]] {
+            let error = writer.publish(meta(number), payload).unwrap_err();
+            let last = before.unwrap_or(0);
+            assert_eq!(error, PublishError::Sequence { sequence: number, last });
+        }
+        writer.publish(meta(8), b"after").unwrap();
+        assert_eq!(take(&mut reader), Some((8, b"after".to_vec())), "the reader goes on");
+        assert_eq!(reader.lost(), 0);
+    }
+}

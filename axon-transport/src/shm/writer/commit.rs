@@ -27,6 +27,20 @@ pub(in crate::shm) struct Patience {
     end: Option<Instant>,
 }
 
+/// Samples that a publisher elsewhere may be ahead of the last one of its here: more than an hour of
+/// outage at a million samples a second.
+const MAX_GAP: u64 = 1 << 32;
+/// Samples that it may have published before the first one that comes here.
+const MAX_FIRST: u64 = 1 << 48;
+
+/// Refuses a number from outside that would make readers count losses that cannot be.
+fn judge(state: &State, numbering: Numbering) -> Result<(), PublishError> {
+    let Numbering::Given(Meta { sequence, .. }) = numbering else { return Ok(()) };
+    let last = state.last;
+    let most = if last == 0 { MAX_FIRST } else { last.saturating_add(MAX_GAP) };
+    if sequence > most { Err(PublishError::Sequence { sequence, last }) } else { Ok(()) }
+}
+
 impl Patience {
     pub(in crate::shm) fn new(whole: Duration) -> Self {
         Self { whole, end: None }
@@ -51,6 +65,7 @@ impl Writer {
             return self.commit(numbering, Payload::Bytes(payload), patience);
         }
         let lent: Result<LoanPlace, Meta> = self.patiently(&mut patience, |state| {
+            judge(state, numbering)?;
             if self.is_unread(state) {
                 return Ok(Err(self.pass(state, numbering)));
             }
@@ -79,6 +94,7 @@ impl Writer {
             return Err(PublishError::Forked);
         }
         let (meta, position, waiting) = self.patiently(&mut patience, |state| {
+            judge(state, numbering)?;
             if self.is_unread(state) {
                 return Ok((self.pass(state, numbering), None, None));
             }
