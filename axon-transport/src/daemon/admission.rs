@@ -92,10 +92,10 @@ impl Admission {
             return Err(unshared(format!("the session's memory cannot be mapped: {error}")));
         }
         let handed = PeerDescriptors { segment, doorbell, pidfd };
-        let process = handed
-            .process()
+        let own = handed
+            .is_of(peer.pid)
             .map_err(|error| plain(format!("the pidfd in HELLO cannot be looked up: {error}")))?;
-        if process != Some(peer.pid) {
+        if !own {
             return Err(plain("the pidfd in HELLO is not the sender's own".into()));
         }
         let PeerDescriptors { segment, doorbell, pidfd } = handed;

@@ -9,7 +9,12 @@ use std::{
 };
 
 use rustix::net::{AddressFamily, SocketFlags, SocketType, accept_with, socketpair};
-use tokio::{io::unix::AsyncFd, sync::Notify, task::spawn_local, time::timeout};
+use tokio::{
+    io::unix::AsyncFd,
+    sync::{Notify, Semaphore},
+    task::spawn_local,
+    time::timeout,
+};
 
 use super::{
     admission::unshared,
@@ -38,12 +43,23 @@ const PAUSE: Duration = Duration::from_millis(50);
 const BATCH: usize = 64;
 
 /// Accepts sessions for as long as it is polled.
-pub(super) async fn accept(control: Rc<RefCell<Control>>, listener: OwnedFd) {
+pub(super) async fn accept(control: Rc<RefCell<Control>>, listeners: Vec<OwnedFd>) {
+    let strangers = Arc::new(Semaphore::new(STRANGERS));
+    let mut listeners = listeners.into_iter();
+    // A path, a name, or both.
+    let [first, second] = [listeners.next(), listeners.next()].map(|listener| async {
+        if let Some(listener) = listener {
+            accept_at(control.clone(), listener, strangers.clone()).await;
+        }
+    });
+    tokio::join!(first, second);
+}
+
+async fn accept_at(control: Rc<RefCell<Control>>, listener: OwnedFd, strangers: Arc<Semaphore>) {
     let listener = match watch(listener) {
         Ok(listener) => listener,
         Err(error) => return tracing::error!(%error, "the session socket cannot be watched"),
     };
-    let strangers = Arc::new(tokio::sync::Semaphore::new(STRANGERS));
     let mut full = false;
     loop {
         let Ok(permit) = strangers.clone().acquire_owned().await else { return };

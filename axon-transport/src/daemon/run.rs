@@ -139,7 +139,7 @@ pub fn main(start: Start, log: impl FnOnce(&Config)) -> ExitCode {
 /// When it cannot start. What goes wrong later is logged and shown in its status.
 pub fn run(config: Config, mut options: DaemonOptions) -> Result<(), DaemonError> {
     let started = start(config, &options);
-    let (control, listener, _bound) = match started {
+    let (control, listeners, _bound) = match started {
         Ok(started) => started,
         Err(error) => {
             match &error {
@@ -156,23 +156,21 @@ pub fn run(config: Config, mut options: DaemonOptions) -> Result<(), DaemonError
         .map_err(system("the control runtime"))?;
     let control = Rc::new(RefCell::new(control));
     let local = LocalSet::new();
-    let outcome = local.block_on(&runtime, serve(control.clone(), listener, options));
+    let outcome = local.block_on(&runtime, serve(control.clone(), listeners, options));
     let address = control.borrow().address.clone();
-    if let Address::Path { socket, .. } = address {
-        let _ = std::fs::remove_file(socket);
-    }
+    address.remove();
     // A session that is being served, or a gateway that hangs, does not hold up the end.
     runtime.shutdown_background();
     outcome
 }
 
-type Started = (Control, OwnedFd, crate::session::address::Lock);
+type Started = (Control, Vec<OwnedFd>, crate::session::address::Lock);
 
 /// Everything before the runtime: the socket first, since it is the lock.
 fn start(config: Config, _options: &DaemonOptions) -> Result<Started, DaemonError> {
     let settings = security_settings(&config)?;
     let address = Address::of(&config);
-    let (listener, lock) = match address.bind() {
+    let (listeners, lock) = match address.bind() {
         Ok(bound) => bound.into_parts(),
         Err(AddressError::Taken) => return Err(DaemonError::Taken(address.to_string())),
         Err(error) => return Err(error.into()),
@@ -185,7 +183,7 @@ fn start(config: Config, _options: &DaemonOptions) -> Result<Started, DaemonErro
         tracing::warn!(%error, "nothing is kept across restarts");
         config.runtime_dir = None;
     }
-    Ok((Control::new(Arc::new(config), settings), listener, lock))
+    Ok((Control::new(Arc::new(config), settings), listeners, lock))
 }
 
 /// Keys live in this process: no core file, no debugger of the same user. And a robot has many
@@ -198,6 +196,10 @@ fn harden() {
     let none = Rlimit { current: Some(0), maximum: Some(0) };
     if let Err(error) = setrlimit(Resource::Core, none) {
         refused("RLIMIT_CORE", error);
+    }
+    let size = getrlimit(Resource::Fsize);
+    if let Err(error) = setrlimit(Resource::Fsize, Rlimit { current: size.maximum, ..size }) {
+        refused("RLIMIT_FSIZE", error);
     }
     let files = getrlimit(Resource::Nofile);
     if let Err(error) = setrlimit(Resource::Nofile, Rlimit { current: files.maximum, ..files }) {
@@ -234,7 +236,7 @@ async fn serve(
         let control = control.borrow();
         tracing::info!(daemon = %control.id, address = %control.address, "the daemon takes sessions");
     }
-    let accepting = spawn_local(accept(control.clone(), listener));
+    let accepting = spawn_local(accept(control.clone(), listeners));
     let flushing = spawn_local(flush(control.clone(), remote.digests()));
     options.report.ready();
     tokio::select! {
@@ -286,7 +288,7 @@ async fn unneeded(control: &Rc<RefCell<Control>>) {
 }
 
 /// The one line of a program that cannot go on.
-#[allow(clippy::print_stderr)]
 fn eprint_line(text: &str) {
-    eprintln!("axon: {}", text.replace('\n', " "));
+    // Where it cannot be written, the exit status remains.
+    let _ = writeln!(std::io::stderr(), "axon: {}", text.replace('\n', " "));
 }

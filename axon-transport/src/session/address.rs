@@ -1,4 +1,9 @@
-//! Where a daemon's socket is: an abstract name, or a path in the runtime directory.
+//! Where a daemon's socket is: a path in the runtime directory, or an abstract name.
+//!
+//! Any user of the host may bind an abstract name first, so a path is preferred where there is a
+//! directory of this user's own. Under `AXON_RUNTIME_DIR` the path is the whole address. Under
+//! `XDG_RUNTIME_DIR` the daemon listens at the name as well, for processes of the same user that
+//! are started without that variable, as services are; who has the variable uses the path first.
 
 use std::{
     fs::{DirBuilder, File, OpenOptions},
@@ -7,6 +12,7 @@ use std::{
         unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt},
     },
     path::{Path, PathBuf},
+    time::Duration,
 };
 
 use rustix::{
@@ -17,28 +23,29 @@ use rustix::{
     },
 };
 
-use super::message::PROTOCOL;
+use super::{message::PROTOCOL, socket};
 use crate::config::Config;
 
 /// Where the daemon of a user and domain listens.
 #[derive(Clone, Debug)]
-pub enum Address {
-    /// A name in the abstract namespace (written with an `@` in front): a kill frees it, and no
-    /// file system is needed.
-    Abstract(String),
-    /// A path under `AXON_RUNTIME_DIR`, with its lock file.
-    Path {
-        /// The socket.
-        socket: PathBuf,
-        /// Locked by the daemon as long as it lives.
-        lock: PathBuf,
-    },
+pub struct Address {
+    place: Option<Place>,
+    /// A name in the abstract namespace: a kill frees it, and no file system is needed.
+    name: Option<String>,
 }
 
-/// A socket that listens (close-on-exec and non-blocking), and what keeps it ours.
+/// A socket in the file system, with what belongs to it.
+#[derive(Clone, Debug)]
+struct Place {
+    socket: PathBuf,
+    /// Locked by the daemon as long as it lives.
+    lock: PathBuf,
+}
+
+/// Sockets that listen (close-on-exec and non-blocking), and what keeps them ours.
 #[derive(Debug)]
 pub struct Bound {
-    listener: OwnedFd,
+    listeners: Vec<OwnedFd>,
     lock: Lock,
 }
 
@@ -49,9 +56,9 @@ pub struct Lock {
 }
 
 impl Bound {
-    /// The listener, which may be closed before the lock is given up.
-    pub fn into_parts(self) -> (OwnedFd, Lock) {
-        (self.listener, self.lock)
+    /// The listeners, at least one, which may be closed before the lock is given up.
+    pub fn into_parts(self) -> (Vec<OwnedFd>, Lock) {
+        (self.listeners, self.lock)
     }
 }
 
@@ -75,7 +82,7 @@ pub enum AddressError {
     #[error("another daemon has the address")]
     Taken,
     /// A path or directory is not usable.
-    #[error("AXON_RUNTIME_DIR {}: {reason}", path.display())]
+    #[error("the runtime directory (AXON_RUNTIME_DIR, or XDG_RUNTIME_DIR) {}: {reason}", path.display())]
     Directory {
         /// Which.
         path: PathBuf,
@@ -87,18 +94,35 @@ pub enum AddressError {
     System(#[from] Errno),
 }
 
+/// Between attempts to reach the owner of a name.
+const PAUSE: Duration = Duration::from_millis(10);
+/// How often the owner of a name is called that may be about to listen.
+const CALLS: u32 = 20;
+
 impl Address {
     /// The address that `config` stands for.
     pub fn of(config: &Config) -> Self {
+        let domain = config.domain;
+        let name = || {
+            let uid = rustix::process::geteuid().as_raw();
+            format!("axon/{uid}/{domain}/{PROTOCOL}")
+        };
+        let place = |dir: &Path, stem: String| Place {
+            socket: dir.join(format!("{stem}.sock")),
+            lock: dir.join(format!("{stem}.lock")),
+        };
         match &config.runtime_dir {
-            Some(dir) if config.socket_in_runtime_dir => Self::Path {
-                socket: dir.join(format!("axon-{}.sock", config.domain)),
-                lock: dir.join(format!("axon-{}.lock", config.domain)),
-            },
-            _ => {
-                let uid = rustix::process::geteuid().as_raw();
-                Self::Abstract(format!("axon/{uid}/{}/{PROTOCOL}", config.domain))
+            Some(dir) if config.socket_in_runtime_dir => {
+                Self { place: Some(place(dir, format!("axon-{domain}"))), name: None }
             }
+            Some(dir) => {
+                // As with the name: a daemon serves one network namespace.
+                let namespace =
+                    std::fs::metadata("/proc/thread-self/ns/net").map_or(0, |m| m.ino());
+                let stem = format!("axon-{domain}-{namespace}");
+                Self { place: Some(place(dir, stem)), name: Some(name()) }
+            }
+            None => Self { place: None, name: Some(name()) },
         }
     }
 
@@ -107,12 +131,24 @@ impl Address {
     /// # Errors
     /// [`AddressError::Absent`] when there is none.
     pub fn connect(&self) -> Result<OwnedFd, AddressError> {
-        let socket = seqpacket(SocketFlags::CLOEXEC | SocketFlags::NONBLOCK)?;
-        match connect(&socket, &self.name()?) {
-            Ok(()) => Ok(socket),
-            Err(Errno::CONNREFUSED | Errno::NOENT) => Err(AddressError::Absent),
-            Err(Errno::AGAIN) => Err(AddressError::Busy),
-            Err(errno) => Err(errno.into()),
+        let at_place = |place: &Place| path_name(&place.socket).and_then(|path| call(&path));
+        let at_name = |name: &String| abstract_name(name).and_then(|name| call(&name));
+        match (&self.place, &self.name) {
+            (Some(place), None) => at_place(place),
+            (None, Some(name)) => at_name(name),
+            (Some(place), Some(name)) => {
+                // XDG_RUNTIME_DIR may be left from another user's login, and another user may have
+                // bound the name: neither keeps this one from a daemon of its own.
+                let own = |socket: &OwnedFd| is_own(socket);
+                match at_place(place) {
+                    Err(AddressError::Busy) => Err(AddressError::Busy),
+                    called => called.ok().filter(own).map_or_else(
+                        || at_name(name).ok().filter(own).ok_or(AddressError::Absent),
+                        Ok,
+                    ),
+                }
+            }
+            (None, None) => Err(AddressError::Absent),
         }
     }
 
@@ -121,41 +157,46 @@ impl Address {
     /// # Errors
     /// [`AddressError::Taken`] when another daemon has it.
     pub fn bind(&self) -> Result<Bound, AddressError> {
-        let lock = match self {
-            Self::Abstract(_) => None,
-            Self::Path { socket, lock } => {
-                if let Some(dir) = socket.parent() {
-                    private_directory(dir)?;
-                }
-                let file = OpenOptions::new()
-                    .create(true)
-                    .truncate(false)
-                    .write(true)
-                    .mode(0o600)
-                    .open(lock)
-                    .map_err(|e| directory(lock, &e))?;
-                match flock(&file, FlockOperation::NonBlockingLockExclusive) {
-                    Ok(()) => {}
-                    Err(Errno::WOULDBLOCK) => return Err(AddressError::Taken),
-                    Err(errno) => return Err(errno.into()),
-                }
-                // A kill leaves the file behind; whoever holds the lock may remove it.
-                if let Err(e) = std::fs::remove_file(socket)
-                    && e.kind() != std::io::ErrorKind::NotFound
-                {
-                    return Err(directory(socket, &e));
-                }
-                Some(file)
+        let mut listeners = Vec::new();
+        let mut lock = Lock { _file: None };
+        match self.place.as_ref().map(Place::bind) {
+            None => {}
+            Some(Ok((listener, file))) => {
+                listeners.push(listener);
+                lock = Lock { _file: Some(file) };
             }
-        };
-        let listener = seqpacket(SocketFlags::CLOEXEC | SocketFlags::NONBLOCK)?;
-        match bind(&listener, &self.name()?) {
-            Ok(()) => {}
-            Err(Errno::ADDRINUSE) => return Err(AddressError::Taken),
-            Err(errno) => return Err(errno.into()),
+            // XDG_RUNTIME_DIR may be what is left of a login: the name serves as well.
+            Some(Err(error @ AddressError::Directory { .. })) if self.name.is_some() => {
+                tracing::warn!(%error, "the session socket has an abstract name only");
+            }
+            Some(Err(error)) => return Err(error),
         }
-        listen(&listener, 512)?;
-        Ok(Bound { listener, lock: Lock { _file: lock } })
+        if let Some(name) = &self.name {
+            match bind_name(name) {
+                Ok(listener) => listeners.push(listener),
+                Err(AddressError::Taken) if !listeners.is_empty() && !is_served(name)? => {
+                    tracing::warn!(
+                        name,
+                        "another user has the daemon's abstract name: processes without \
+                         XDG_RUNTIME_DIR do not find this daemon; set AXON_RUNTIME_DIR for all"
+                    );
+                }
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(Bound { listeners, lock })
+    }
+
+    /// Whether another user can keep the daemon of this one from the address.
+    pub(crate) fn is_open_to_others(&self) -> bool {
+        self.place.is_none()
+    }
+
+    /// Removes the socket file of a daemon that ends.
+    pub(crate) fn remove(&self) {
+        if let Some(place) = &self.place {
+            let _ = std::fs::remove_file(&place.socket);
+        }
     }
 
     /// The turn to start a daemon here; `None` where another thread or process has it. What keeps it
@@ -169,40 +210,123 @@ impl Address {
     }
 
     fn try_turn(&self) -> Result<OwnedFd, Errno> {
-        match self {
-            Self::Abstract(name) => {
-                let socket = seqpacket(SocketFlags::CLOEXEC)?;
-                let name = format!("{name}/start");
-                bind(&socket, &SocketAddrUnix::new_abstract_name(name.as_bytes())?)?;
-                Ok(socket)
+        if let Some(place) = &self.place {
+            // What is wrong with the directory, the daemon says.
+            let ours = place.socket.parent().map(private_directory).is_none_or(|made| made.is_ok());
+            if !ours && self.name.is_some() {
+                return self.name_turn();
             }
-            Self::Path { socket, .. } => {
-                // What is wrong with it, the daemon says.
-                let _ = socket.parent().map(private_directory);
-                let flags = OFlags::CREATE | OFlags::WRONLY | OFlags::CLOEXEC;
-                let file = rustix::fs::open(socket.with_extension("start"), flags, 0o600.into())?;
-                flock(&file, FlockOperation::NonBlockingLockExclusive)?;
-                Ok(file)
+            let flags = OFlags::CREATE | OFlags::WRONLY | OFlags::CLOEXEC;
+            let file = place.socket.with_extension("start");
+            match rustix::fs::open(file, flags, 0o600.into()) {
+                Ok(file) => {
+                    flock(&file, FlockOperation::NonBlockingLockExclusive)?;
+                    return Ok(file);
+                }
+                Err(errno) if self.name.is_none() => return Err(errno),
+                Err(_) => {}
             }
         }
+        self.name_turn()
     }
 
-    fn name(&self) -> Result<SocketAddrUnix, AddressError> {
-        match self {
-            Self::Abstract(name) => Ok(SocketAddrUnix::new_abstract_name(name.as_bytes())?),
-            Self::Path { socket, .. } => SocketAddrUnix::new(socket.as_path()).map_err(|_| {
-                let reason = "a socket's path has at most 107 bytes; choose a shorter directory";
-                AddressError::Directory { path: socket.clone(), reason: reason.into() }
-            }),
+    fn name_turn(&self) -> Result<OwnedFd, Errno> {
+        let name = format!("{}/start", self.name.as_deref().unwrap_or_default());
+        let socket = seqpacket(SocketFlags::CLOEXEC)?;
+        bind(&socket, &SocketAddrUnix::new_abstract_name(name.as_bytes())?)?;
+        Ok(socket)
+    }
+}
+
+impl Place {
+    /// Listens there, once the lock is had.
+    fn bind(&self) -> Result<(OwnedFd, File), AddressError> {
+        let Self { socket, lock } = self;
+        if let Some(dir) = socket.parent() {
+            private_directory(dir)?;
+        }
+        let file = OpenOptions::new()
+            .create(true)
+            .truncate(false)
+            .write(true)
+            .mode(0o600)
+            .open(lock)
+            .map_err(|e| directory(lock, &e))?;
+        match flock(&file, FlockOperation::NonBlockingLockExclusive) {
+            Ok(()) => {}
+            Err(Errno::WOULDBLOCK) => return Err(AddressError::Taken),
+            Err(errno) => return Err(errno.into()),
+        }
+        // A kill leaves the file behind; only the holder of the lock may remove it.
+        if let Err(e) = std::fs::remove_file(socket)
+            && e.kind() != std::io::ErrorKind::NotFound
+        {
+            return Err(directory(socket, &e));
+        }
+        Ok((listen_at(&path_name(socket)?)?, file))
+    }
+}
+
+fn bind_name(name: &str) -> Result<OwnedFd, AddressError> {
+    listen_at(&abstract_name(name)?)
+}
+
+fn listen_at(name: &SocketAddrUnix) -> Result<OwnedFd, AddressError> {
+    let listener = seqpacket(SocketFlags::CLOEXEC | SocketFlags::NONBLOCK)?;
+    match bind(&listener, name) {
+        Ok(()) => {}
+        Err(Errno::ADDRINUSE) => return Err(AddressError::Taken),
+        Err(errno) => return Err(errno.into()),
+    }
+    listen(&listener, 512)?;
+    Ok(listener)
+}
+
+fn call(name: &SocketAddrUnix) -> Result<OwnedFd, AddressError> {
+    let socket = seqpacket(SocketFlags::CLOEXEC | SocketFlags::NONBLOCK)?;
+    match connect(&socket, name) {
+        Ok(()) => Ok(socket),
+        Err(Errno::CONNREFUSED | Errno::NOENT) => Err(AddressError::Absent),
+        Err(Errno::AGAIN) => Err(AddressError::Busy),
+        Err(errno) => Err(errno.into()),
+    }
+}
+
+/// Whether a process of this user listens at a name that is bound.
+fn is_served(name: &str) -> Result<bool, AddressError> {
+    let name = abstract_name(name)?;
+    for _ in 0..CALLS {
+        match call(&name) {
+            Ok(socket) => return Ok(is_own(&socket)),
+            // A daemon that is starting has bound it and does not listen yet.
+            Err(_) => std::thread::sleep(PAUSE),
         }
     }
+    Ok(false)
+}
+
+fn is_own(socket: &OwnedFd) -> bool {
+    let own = rustix::process::geteuid().as_raw();
+    socket::peer(socket).is_ok_and(|peer| peer.uid == own)
+}
+
+fn abstract_name(name: &str) -> Result<SocketAddrUnix, AddressError> {
+    Ok(SocketAddrUnix::new_abstract_name(name.as_bytes())?)
+}
+
+fn path_name(socket: &Path) -> Result<SocketAddrUnix, AddressError> {
+    SocketAddrUnix::new(socket).map_err(|_| {
+        let reason = "a socket's path has at most 107 bytes; choose a shorter directory";
+        AddressError::Directory { path: socket.into(), reason: reason.into() }
+    })
 }
 
 impl std::fmt::Display for Address {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::Abstract(name) => write!(f, "@{name}"),
-            Self::Path { socket, .. } => write!(f, "{}", socket.display()),
+        match (&self.place, &self.name) {
+            (Some(place), _) => write!(f, "{}", place.socket.display()),
+            (None, Some(name)) => write!(f, "@{name}"),
+            (None, None) => Ok(()),
         }
     }
 }

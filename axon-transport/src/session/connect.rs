@@ -27,6 +27,8 @@ use crate::{
 const PATIENCE: Duration = Duration::from_secs(20);
 /// How soon a daemon is to answer that has the address.
 const AFTER: Duration = Duration::from_millis(500);
+/// How often an address may be found bound with nobody listening there. A daemon listens at once.
+const UNSERVED: u32 = 4;
 /// How long another may take to start a daemon before this one does, too.
 const TURN: Duration = Duration::from_secs(5);
 /// What a daemon names that cannot share memory with a session.
@@ -65,6 +67,7 @@ impl Caller<'_> {
         // before one is started: only one of many that start at once gets the address.
         let mut spawn_after = Instant::now();
         let (mut turn, mut gives_way_until) = (None, None);
+        let mut taken = 0;
         loop {
             match self.try_connect(&address, deadline) {
                 Err(Attempt::Final(error)) => return Err(error),
@@ -86,12 +89,18 @@ impl Caller<'_> {
                         let command = self.options.daemon_command.as_ref();
                         match spawn(self.config, command, &|| self.cancelled())? {
                             Outcome::Ready => continue,
-                            Outcome::Taken => spawn_after = Instant::now() + AFTER,
+                            Outcome::Taken => {
+                                spawn_after = Instant::now() + AFTER;
+                                taken += 1;
+                            }
                         }
                         turn = None;
                     }
                 }
                 Err(Attempt::Absent | Attempt::Again) => {}
+            }
+            if taken > UNSERVED && address.is_open_to_others() {
+                return Err(SessionError::Squatted { address: address.to_string() });
             }
             if self.cancelled() || Instant::now() >= deadline {
                 return Err(SessionError::Silent { address: address.to_string() });

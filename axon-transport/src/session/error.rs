@@ -81,13 +81,23 @@ pub enum SessionError {
     },
     /// Whoever listens at the daemon's address belongs to another user.
     #[error(
-        "{address} belongs to uid {uid}, which is neither this process's nor in AXON_TRUSTED_UIDS"
+        "{address} belongs to uid {uid}, which is neither this process's nor in AXON_TRUSTED_UIDS; \
+         set XDG_RUNTIME_DIR or AXON_RUNTIME_DIR to a directory of this user's own"
     )]
     Untrusted {
         /// The address.
         address: String,
         /// The user who has it.
         uid: u32,
+    },
+    /// Another process has bound the daemon's abstract name and serves no session.
+    #[error(
+        "{address} is bound by a process that serves no session, another user's perhaps; \
+         set XDG_RUNTIME_DIR or AXON_RUNTIME_DIR to a directory of this user's own"
+    )]
+    Squatted {
+        /// The address.
+        address: String,
     },
     /// The daemon does not answer.
     #[error("the daemon at {address} does not answer")]

@@ -10,7 +10,10 @@ use std::{
     },
 };
 
-use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::{
+    event::{PollFd, PollFlags, Timespec, poll},
+    process::{Pid, PidfdFlags, pidfd_open},
+};
 
 use super::{
     Location, SegmentInfo, SessionSegment, ShmError,
@@ -58,6 +61,19 @@ impl PeerDescriptors {
     /// The process has no descriptors left to look it up with.
     pub fn process(&self) -> io::Result<Option<u32>> {
         process(&self.pidfd)
+    }
+
+    /// Whether the pidfd is of the process that has this number in our PID namespace.
+    ///
+    /// # Errors
+    /// Nobody has the number, or one of the two cannot be looked up.
+    pub(crate) fn is_of(&self, pid: u32) -> io::Result<bool> {
+        let number = i32::try_from(pid).ok().and_then(Pid::from_raw);
+        let Some(number) = number else { return Ok(false) };
+        let same = PassedFd::from(pidfd_open(number, PidfdFlags::empty())?);
+        // What /proc calls a process need not be its number here: it may be another namespace's.
+        let shown = process(&same)?;
+        Ok(shown.is_some() && shown == self.process()?)
     }
 }
 

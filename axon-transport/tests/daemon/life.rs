@@ -214,11 +214,11 @@ fn another_version_is_refused_by_both_sides() {
     drop(daemon);
 
     // A daemon of another version, where this one's would be.
-    let (listener, _lock) = Address::of(&host.config()).bind().unwrap().into_parts();
+    let (listeners, _lock) = Address::of(&host.config()).bind().unwrap().into_parts();
     let later = std::thread::spawn(move || {
         let mut accepted = None;
         until("somebody calls", || {
-            accepted = rustix::net::accept(&listener).ok();
+            accepted = rustix::net::accept(&listeners[0]).ok();
             accepted.is_some()
         });
         let accepted = accepted.unwrap();

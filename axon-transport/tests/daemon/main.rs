@@ -1,5 +1,6 @@
 //! Sessions and their daemon as real processes.
 
+mod address;
 mod hostile;
 mod life;
 #[path = "../support/skip.rs"]

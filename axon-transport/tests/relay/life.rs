@@ -137,10 +137,10 @@ fn where_descriptors_do_not_arrive_a_session_is_relayed_by_itself() {
     let behind = Host { env: host.env.clone(), dir: tempfile::tempdir().unwrap() };
     let run = behind.dir.path().join("run");
     let behind = behind.with("AXON_RUNTIME_DIR", run.to_str().unwrap());
-    let (listener, _lock) = Address::of(&behind.config()).bind().unwrap().into_parts();
+    let (listeners, _lock) = Address::of(&behind.config()).bind().unwrap().into_parts();
     let (daemon, end) = (Address::of(&host.config()), AtomicBool::new(false));
     thread::scope(|scope| {
-        scope.spawn(|| keep_descriptors_back(&listener, &daemon, &end));
+        scope.spawn(|| keep_descriptors_back(&listeners[0], &daemon, &end));
         let outcome = std::panic::catch_unwind(|| {
             let far = session(&behind, "behind", true);
             let near = session(&host, "near", true);

@@ -9,13 +9,13 @@ use super::{hostile::hear, *};
 
 /// A relayed session, and the connection to its daemon, which is played.
 fn played(host: &Host) -> (Session, OwnedFd) {
-    let (listener, lock) = Address::of(&host.config()).bind().unwrap().into_parts();
+    let (listeners, lock) = Address::of(&host.config()).bind().unwrap().into_parts();
     let session = thread::scope(|scope| {
         let session = scope.spawn(|| session(host, "session", false));
         let flags = rustix::net::SocketFlags::CLOEXEC | rustix::net::SocketFlags::NONBLOCK;
         let mut socket = None;
         until("it calls", || {
-            socket = rustix::net::accept_with(&listener, flags).ok();
+            socket = rustix::net::accept_with(&listeners[0], flags).ok();
             socket.is_some()
         });
         let socket = socket.unwrap();
@@ -24,7 +24,7 @@ fn played(host: &Host) -> (Session, OwnedFd) {
         say_to(&socket, &Message::Welcome(Welcome { protocol: PROTOCOL, daemon, pid }));
         (session.join().unwrap(), socket)
     });
-    drop((listener, lock));
+    drop((listeners, lock));
     session
 }
 
