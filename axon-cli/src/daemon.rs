@@ -18,7 +18,7 @@ pub(crate) fn run(args: &cli::Daemon) -> Result<ExitCode, Failure> {
     if args.while_stdin {
         thread::spawn(end_with_stdin);
     }
-    Ok(daemon::main(start, logging::start))
+    Ok(daemon::main(start))
 }
 
 /// Ends this process as SIGTERM would, when standard input ends.

@@ -1,8 +1,6 @@
 //! Where log lines go: standard error, filtered by `AXON_LOG`.
 
-use std::io::IsTerminal;
-
-use axon_transport::config::Config;
+use axon_transport::{config::Config, daemon::log};
 use tracing_subscriber::EnvFilter;
 
 use crate::failure::Failure;
@@ -13,7 +11,7 @@ use crate::failure::Failure;
 /// A setting that is unknown, obsolete or half-given.
 pub(crate) fn configure() -> Result<Config, Failure> {
     let config = check()?;
-    start(&config);
+    log::start(&config);
     Ok(config)
 }
 
@@ -28,13 +26,4 @@ pub(crate) fn check() -> Result<Config, Failure> {
         Failure::Setting(format!("AXON_LOG: read {:?} ({error}); accepted: {accepted}", config.log))
     })?;
     Ok(config)
-}
-
-/// Sets logging up as a checked configuration says.
-pub(crate) fn start(config: &Config) {
-    tracing_subscriber::fmt()
-        .with_env_filter(EnvFilter::new(&config.log))
-        .with_writer(std::io::stderr)
-        .with_ansi(std::io::stderr().is_terminal())
-        .init();
 }

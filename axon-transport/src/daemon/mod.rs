@@ -11,6 +11,7 @@ mod control;
 mod gateway;
 mod inherit;
 mod listen;
+pub mod log;
 pub mod registry;
 mod remote;
 mod report;

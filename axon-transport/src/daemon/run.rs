@@ -1,6 +1,9 @@
 //! A daemon's life: from its first system call to its exit status.
 
-use std::{cell::RefCell, os::fd::OwnedFd, process::ExitCode, rc::Rc, sync::Arc, time::Duration};
+use std::{
+    cell::RefCell, io::Write as _, os::fd::OwnedFd, process::ExitCode, rc::Rc, sync::Arc,
+    time::Duration,
+};
 
 use rustix::process::{
     DumpableBehavior, Resource, Rlimit, getrlimit, set_dumpable_behavior, setrlimit,
@@ -14,8 +17,9 @@ use tokio::{
 use super::{
     control::Control,
     gateway::GatewayEntry,
-    inherit::close_inherited,
+    inherit::{close_inherited, survive_file_size_limit},
     listen::accept,
+    log,
     remote::Remote,
     spawn::{Report, detach, start_detached},
 };
@@ -82,9 +86,10 @@ pub enum DaemonError {
 }
 
 /// The whole of a daemon program's `main`: reads the configuration from the environment, detaches
-/// if it is to, has `log` set logging up (to standard error, which is the log file by then), and
-/// runs. Call it before anything else opens a file or starts a thread.
-pub fn main(start: Start, log: impl FnOnce(&Config)) -> ExitCode {
+/// if it is to, sets logging up (to standard error, which is the log file by then), and runs. Call
+/// it before anything else opens a file or starts a thread.
+pub fn main(start: Start) -> ExitCode {
+    survive_file_size_limit();
     let fail = |report: &mut Report, text: &str, status: u8| {
         report.error(text);
         eprint_line(text);
@@ -116,7 +121,7 @@ pub fn main(start: Start, log: impl FnOnce(&Config)) -> ExitCode {
     if detached && let Err(error) = detach(Some(&config)) {
         return fail(&mut report, &error.to_string(), 1);
     }
-    log(&config);
+    log::start(&config);
     let options = DaemonOptions { report, ..DaemonOptions::default() };
     match run(config, options) {
         Ok(()) => ExitCode::SUCCESS,
@@ -218,7 +223,7 @@ fn harden() {
 
 async fn serve(
     control: Rc<RefCell<Control>>,
-    listener: OwnedFd,
+    listeners: Vec<OwnedFd>,
     mut options: DaemonOptions,
 ) -> Result<(), DaemonError> {
     let signals =

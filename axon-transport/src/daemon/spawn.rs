@@ -16,6 +16,7 @@ use std::{
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
+use super::log;
 use crate::{
     config::{Config, DiscoveryRange},
     session::{DaemonCommand, SessionError, address::private_directory},
@@ -229,14 +230,12 @@ pub fn start_detached() -> std::io::Result<()> {
 pub fn detach(config: Option<&Config>) -> std::io::Result<()> {
     rustix::process::setsid()?;
     rustix::process::chdir("/")?;
-    let log = config.and_then(|config| {
-        let dir = config.runtime_dir.as_ref()?;
-        private_directory(dir).ok()?;
-        let path = dir.join(format!("axon-{}.log", config.domain));
-        std::fs::OpenOptions::new().create(true).append(true).open(path).ok()
-    });
-    if let Some(log) = log {
-        rustix::stdio::dup2_stderr(log.as_fd())?;
+    if let Some(config) = config
+        && let Some(dir) = &config.runtime_dir
+        && private_directory(dir).is_ok()
+    {
+        // Without its log a daemon works as well.
+        let _ = log::keep_in(&dir.join(format!("axon-{}.log", config.domain)));
     }
     Ok(())
 }

@@ -3,6 +3,7 @@
 mod address;
 mod hostile;
 mod life;
+mod logging;
 #[path = "../support/skip.rs"]
 mod skip;
 #[path = "../support/mod.rs"]

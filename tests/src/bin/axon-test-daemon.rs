@@ -3,14 +3,10 @@
 
 use std::process::ExitCode;
 
-use axon_transport::{
-    config::Config,
-    daemon::{
-        self, Start,
-        spawn::{DETACHED, SPAWNED},
-    },
+use axon_transport::daemon::{
+    self, Start,
+    spawn::{DETACHED, SPAWNED},
 };
-use tracing_subscriber::EnvFilter;
 
 fn main() -> ExitCode {
     let start = match std::env::args().nth(1).as_deref() {
@@ -22,14 +18,5 @@ fn main() -> ExitCode {
         }
         _ => Start::Foreground,
     };
-    daemon::main(start, log)
-}
-
-fn log(config: &Config) {
-    let filter = EnvFilter::try_new(&config.log).unwrap_or_else(|_| EnvFilter::new("warn"));
-    let subscriber = tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_writer(std::io::stderr)
-        .with_ansi(false);
-    let _ = subscriber.try_init();
+    daemon::main(start)
 }
