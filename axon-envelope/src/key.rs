@@ -1,11 +1,14 @@
 //! Key bytes as they come from the KME, and what is derived from them.
 
 use alloc::boxed::Box;
+use core::hint::black_box;
+use core::panic::{RefUnwindSafe, UnwindSafe};
 
 use hkdf::Hkdf;
 use sha2::Sha256;
 use zeroize::{Zeroize, Zeroizing};
 
+use crate::aead::Aead;
 use crate::channel::{Channel, KeyId};
 
 /// A 256-bit key as a KME delivered it, erased on drop.
@@ -23,7 +26,19 @@ use crate::channel::{Channel, KeyId};
 /// println!("{key:?}");
 /// ```
 // Boxed, so that moving the key copies a pointer and leaves no key bytes behind.
-pub struct KmeKey(Box<Zeroizing<[u8; 32]>>);
+pub struct KmeKey(Box<Holder>);
+
+/// What holds the bytes, and erases them on drop.
+type Holder = dyn AsRef<[u8; 32]> + Send + Sync + UnwindSafe + RefUnwindSafe;
+
+/// A key on the heap.
+struct Own(Zeroizing<[u8; 32]>);
+
+impl AsRef<[u8; 32]> for Own {
+    fn as_ref(&self) -> &[u8; 32] {
+        &self.0
+    }
+}
 
 /// Key bytes of a length other than 32.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -38,8 +53,7 @@ pub struct RandomError(#[from] getrandom::Error);
 impl KmeKey {
     /// Takes the key over and erases the place it came from.
     pub fn take(bytes: &mut [u8; 32]) -> Self {
-        let mut key = Self::zeroed();
-        key.0.copy_from_slice(bytes);
+        let key = Self::copy(bytes);
         bytes.zeroize();
         key
     }
@@ -49,34 +63,65 @@ impl KmeKey {
     /// # Errors
     /// [`KeyLength`] unless there are exactly 32 bytes.
     pub fn from_slice(bytes: &[u8]) -> Result<Self, KeyLength> {
-        if bytes.len() != 32 {
-            return Err(KeyLength(bytes.len()));
-        }
-        let mut key = Self::zeroed();
-        key.0.copy_from_slice(bytes);
-        Ok(key)
+        bytes.try_into().map(Self::copy).map_err(|_| KeyLength(bytes.len()))
     }
 
-    /// The key's bytes, for a derivation of the caller's own.
+    /// A key that stays where its holder has it, as in memory that is never swapped out.
+    ///
+    /// The holder erases it on drop, and gives the same bytes each time it is asked.
+    pub fn from_holder<H>(holder: H) -> Self
+    where
+        H: AsRef<[u8; 32]> + Send + Sync + UnwindSafe + RefUnwindSafe + 'static,
+    {
+        Self(Box::new(holder))
+    }
+
+    /// The key's bytes, for a derivation of the caller's own. See [`derive`](Self::derive).
     pub fn expose(&self) -> &[u8; 32] {
-        &self.0
+        (*self.0).as_ref()
+    }
+
+    /// Runs `derivation` on the key so that nothing of it is left on the stack.
+    ///
+    /// Libraries for hashes, HKDF and ciphers erase their states, but not what they moved, spilled
+    /// or returned by value: their stack frames keep parts of the key and of all that is made of
+    /// it. So the derivation runs again, with 32 zeros for the key: the same code at the same depth
+    /// writes to the same places, whichever they are, takes no more stack, and leaves registers
+    /// without secrets as well.
+    ///
+    /// That holds if the derivation takes the same way whatever the key is, as code that runs in
+    /// constant time does, and has no side effects. What it returns is moved: a secret in it has to
+    /// be behind a pointer. A signal that interrupts the first run leaves registers on the stack.
+    pub fn derive<T>(&self, derivation: impl Fn(&[u8; 32]) -> T) -> T {
+        let derived = run(&derivation, self.expose());
+        // Opaque, so that this run is neither left out nor compiled in another way.
+        drop(black_box(run(&derivation, black_box(&[0; 32]))));
+        derived
     }
 
     pub(crate) fn random() -> Result<Self, RandomError> {
-        let mut key = Self::zeroed();
-        getrandom::fill(&mut key.0[..])?;
-        Ok(key)
+        let mut key = Zeroizing::new([0; 32]);
+        getrandom::fill(&mut key[..])?;
+        Ok(Self::copy(&key))
     }
 
-    fn zeroed() -> Self {
-        Self(Box::new(Zeroizing::new([0; 32])))
+    fn copy(bytes: &[u8; 32]) -> Self {
+        let mut own = Box::new(Own(Zeroizing::new([0; 32])));
+        own.0.copy_from_slice(bytes);
+        Self(own)
     }
 }
 
-/// The AEAD key for one KME key in one direction of one connection.
+/// Never inlined, so that each run is the same code at the same depth.
+#[inline(never)]
+fn run<T>(derivation: &impl Fn(&[u8; 32]) -> T, key: &[u8; 32]) -> T {
+    derivation(black_box(key))
+}
+
+/// The AEAD for one KME key in one direction of one connection.
 ///
 /// Every field is length-prefixed, so no two different tuples share an info string.
-pub(crate) fn aead_key(channel: &Channel, key_id: &KeyId, key: &KmeKey) -> Zeroizing<[u8; 32]> {
+pub(crate) fn aead<A: Aead>(channel: &Channel, key_id: &KeyId, key: &KmeKey) -> A {
     const LABEL: &[u8] = b"seal";
     let fields =
         [LABEL, key_id.as_bytes(), channel.sender(), channel.receiver(), channel.context()];
@@ -90,9 +135,11 @@ pub(crate) fn aead_key(channel: &Channel, key_id: &KeyId, key: &KmeKey) -> Zeroi
         pair[1] = field;
     }
 
-    let mut derived = Zeroizing::new([0; 32]);
-    Hkdf::<Sha256>::new(Some(b"AXQKD001"), key.expose())
-        .expand_multi_info(&info, &mut derived[..])
-        .expect("32 bytes are within HKDF-SHA256's 8,160");
-    derived
+    key.derive(|key| {
+        let mut derived = Zeroizing::new([0; 32]);
+        Hkdf::<Sha256>::new(Some(b"AXQKD001"), key)
+            .expand_multi_info(&info, &mut derived[..])
+            .expect("32 bytes are within HKDF-SHA256's 8,160");
+        A::new(&derived)
+    })
 }

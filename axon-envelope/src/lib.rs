@@ -45,7 +45,9 @@
 //! - **A refusal tells the sender nothing.** [`OpenError::Refused`] reads the same and does the
 //!   same work whether the key was unknown or retired, the index replayed or the tag wrong.
 //! - **Secrets are erased** on drop, are neither `Clone` nor `Debug`, and are not left behind by
-//!   moves, since they live behind a pointer. A [`Sealer`] or [`Opener`] prints names and counts.
+//!   moves, since they live behind a pointer, nor on the stack by their derivation
+//!   ([`KmeKey::derive`]). A [`Sealer`] or [`Opener`] prints names and counts. A key can stay in
+//!   locked memory of the caller's: [`KmeKey::from_holder`].
 //!
 //! # Features
 //!

@@ -8,7 +8,7 @@ use crate::TAG_LEN;
 use crate::aead::{Aead, AeadError, DefaultAead};
 use crate::channel::{Channel, KeyId};
 use crate::header::{NONCE_LEN, Template};
-use crate::key::{KmeKey, RandomError, aead_key};
+use crate::key::{self, KmeKey, RandomError};
 use crate::mask::{Delivery, IndexMask, MESSAGES_PER_KEY};
 use crate::route::Route;
 
@@ -159,7 +159,7 @@ impl<A: Aead> Sealer<A> {
         prefix: [u8; 8],
     ) -> Self {
         Self(Box::new(State {
-            aead: A::new(&aead_key(channel, &key_id, &key)),
+            aead: key::aead(channel, &key_id, &key),
             template: Template::new(channel.sender(), &key_id, prefix),
             key_id,
             key: Some(key),

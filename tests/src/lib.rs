@@ -1,9 +1,15 @@
 //! What the test processes and the tests that start them have in common.
 
+#[cfg(target_os = "linux")]
+pub mod memory;
 mod samples;
+#[cfg(target_os = "linux")]
+mod secrets;
 mod words;
 
 pub use samples::{Sizes, payload};
+#[cfg(target_os = "linux")]
+pub use secrets::unexpected;
 pub use words::{Tally, Word};
 
 use rustix::process::{Signal, getpid, kill_process};

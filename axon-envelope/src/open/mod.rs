@@ -14,7 +14,7 @@ use crate::aead::DefaultAead;
 use crate::aead::{Aead, AeadError};
 use crate::channel::{Channel, KeyId};
 use crate::header::{Header, HeaderError, NONCE_LEN};
-use crate::key::{KmeKey, RandomError, aead_key};
+use crate::key::{self, KmeKey, RandomError};
 use crate::mask::IndexMask;
 use crate::route::Route;
 use crate::seal::KEY_MAX_AGE;
@@ -150,7 +150,7 @@ impl<A: Aead> Opener<A> {
     pub fn with_limits(channel: Channel, limits: Limits) -> Result<Self, RandomError> {
         // Envelopes that are refused before the tag counts are run against a key that nobody
         // knows, so that they cost what a wrong tag costs.
-        let decoy = A::new(KmeKey::random()?.expose());
+        let decoy = KmeKey::random()?.derive(A::new);
         Ok(Self { channel, keys: Keyring::new(limits), decoy, latest: Duration::ZERO })
     }
 
@@ -159,7 +159,7 @@ impl<A: Aead> Opener<A> {
     /// # Errors
     /// [`AddKeyError`] if the limit is reached or the key_ID was here before; the key is erased.
     pub fn add_key(&mut self, key_id: KeyId, key: KmeKey) -> Result<(), AddKeyError> {
-        let aead = A::new(&aead_key(&self.channel, &key_id, &key));
+        let aead = key::aead(&self.channel, &key_id, &key);
         self.keys.add(key_id, key, aead)
     }
 

@@ -1,0 +1,72 @@
+//! What is derived of a KME key, and where it was found.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use base64::{Engine, engine::general_purpose::STANDARD};
+use hkdf::Hkdf;
+use sha2::Sha256;
+
+use crate::memory::{Find, Needles, Secret};
+
+impl Needles {
+    /// Adds a KME key, raw and as the KME writes it.
+    pub fn add_key(&mut self, number: usize, key: &[u8]) {
+        self.add("KME key", number, key);
+        let secret = Secret { kind: "KME key, base64", number };
+        self.add_text(secret, STANDARD.encode(key).as_bytes());
+    }
+
+    /// Adds `HKDF-SHA256` of a key: the extracted key, the two states of HMAC that stand for it, and
+    /// as `kind` what is expanded.
+    pub fn add_derived(
+        &mut self,
+        kind: &'static str,
+        number: usize,
+        salt: Option<&[u8]>,
+        key: &[u8],
+        info: &[&[u8]],
+    ) {
+        let (prk, expand) = Hkdf::<Sha256>::extract(salt, key);
+        self.add("PRK", number, &prk);
+        for mask in [0x36, 0x5c] {
+            let mut block = [mask; 64];
+            block.iter_mut().zip(&prk).for_each(|(block, prk)| *block ^= prk);
+            let mut state = INITIAL;
+            sha2::block_api::compress256(&mut state, &[block]);
+            let state: Vec<u8> = state.iter().flat_map(|word| word.to_ne_bytes()).collect();
+            self.add_text(Secret { kind: "PRK", number }, &state);
+        }
+        let mut derived = [0; 32];
+        expand.expand_multi_info(info, &mut derived).expect("32 bytes are few");
+        self.add(kind, number, &derived);
+    }
+}
+
+/// What SHA-256 begins with (FIPS 180-4, 5.3.3).
+const INITIAL: [u32; 8] = [
+    0x6a09_e667,
+    0xbb67_ae85,
+    0x3c6e_f372,
+    0xa54f_f53a,
+    0x510e_527f,
+    0x9b05_688c,
+    0x1f83_d9ab,
+    0x5be0_cd19,
+];
+
+/// Prints what was found that is not `allowed`; returns how many pieces that is.
+pub fn unexpected(name: &str, found: &[Find], allowed: impl Fn(&Find) -> bool) -> usize {
+    let wrong: Vec<&Find> = found.iter().filter(|find| !allowed(find)).collect();
+    let mut kinds: BTreeMap<&str, BTreeSet<usize>> = BTreeMap::new();
+    for Find { secret, .. } in &wrong {
+        kinds.entry(secret.kind).or_default().insert(secret.number);
+    }
+    for (kind, numbers) in kinds {
+        eprintln!("{name}: parts of {} of kind {kind}", numbers.len());
+    }
+    for find in wrong.iter().take(20) {
+        let Find { secret, address, length, mapping, .. } = find;
+        eprintln!("{name}: {secret:?}: {length} bytes at {address:#x} {mapping}");
+    }
+    wrong.len()
+}
