@@ -6,8 +6,9 @@ use std::sync::Arc;
 use rustls_axon::crypto::CryptoProvider;
 use rustls_axon::crypto::aws_lc_rs::{cipher_suite, default_provider, kx_group};
 use rustls_axon::external_psk::{
-    ExternalPsk, ExternalPskOffer, PskKeyExchangeMode, ResolvesExternalPsk,
+    ExternalPsk, ExternalPskOffer, ExternalPskSource, PskKeyExchangeMode, ResolvesExternalPsk,
 };
+use rustls_axon::pki_types::ServerName;
 use rustls_axon::{ClientConfig, CommonState, NamedGroup, ServerConfig, SupportedCipherSuite};
 
 use super::Psk;
@@ -41,7 +42,7 @@ pub(super) fn client_config_with(
     alpn: &[u8],
 ) -> Result<ClientConfig, Error> {
     let mut config = ClientConfig::builder_with_provider(Arc::new(provider))
-        .with_external_psks(vec![psk.external()], mode(kex))?;
+        .with_external_psk_source(Arc::new(OneKey(psk)), mode(kex))?;
     config.alpn_protocols = protocols(alpn)?;
     config.enable_sni = false;
     Ok(config)
@@ -119,13 +120,28 @@ fn mode(kex: PskKex) -> PskKeyExchangeMode {
     }
 }
 
+/// A client's one key. Once that is erased, connecting fails: there is nothing to offer.
+struct OneKey(Arc<Psk>);
+
+impl ExternalPskSource for OneKey {
+    fn external_psks(&self, _server_name: &ServerName<'_>) -> Vec<Arc<ExternalPsk>> {
+        self.0.external().into_iter().collect()
+    }
+}
+
+impl Debug for OneKey {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("OneKey").field(&self.0.identity().escape_ascii().to_string()).finish()
+    }
+}
+
 /// Looks up the first identity alone: our clients offer one, and a look-up may cause work.
 struct FirstKnown(Arc<dyn PskResolver>);
 
 impl ResolvesExternalPsk for FirstKnown {
     fn resolve(&self, offer: ExternalPskOffer<'_>) -> Option<Arc<ExternalPsk>> {
         let identity = offer.identities().next()?;
-        self.0.resolve(identity).filter(|psk| psk.identity() == identity).map(|psk| psk.external())
+        self.0.resolve(identity).filter(|psk| psk.identity() == identity)?.external()
     }
 }
 

@@ -1,6 +1,7 @@
 //! From a QKD key to a pre-shared key of TLS.
 
-use std::sync::Arc;
+use std::hint::black_box;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use aws_lc_rs::hkdf::{HKDF_SHA256, KeyType, Salt};
 use rustls_axon::crypto::hash::HashAlgorithm;
@@ -13,15 +14,25 @@ use crate::{Cipher, Error};
 /// A pre-shared key for one connection, and the identity it is named by.
 ///
 /// Zeroized on drop; neither `Clone` nor `Debug`. Share it with an [`Arc`].
+///
+/// A connection keeps its configuration until it ends, and that keeps the key: [`erase`](Self::erase)
+/// it when the handshake is complete.
 pub struct Psk {
-    psk: Arc<ExternalPsk>,
+    identity: Vec<u8>,
+    psk: Mutex<Option<Arc<ExternalPsk>>>,
     cipher: Cipher,
 }
 
 impl Psk {
     /// The identity, as the client sends it.
     pub fn identity(&self) -> &[u8] {
-        self.psk.identity()
+        &self.identity
+    }
+
+    /// Erases the secret: no handshake begins with it from here on. One under way, which has it
+    /// already, goes on and erases it at its end.
+    pub fn erase(&self) {
+        self.psk.lock().unwrap_or_else(PoisonError::into_inner).take();
     }
 
     /// The only cipher this key can be used with.
@@ -30,11 +41,12 @@ impl Psk {
     }
 
     pub(super) fn new(psk: Arc<ExternalPsk>, cipher: Cipher) -> Self {
-        Self { psk, cipher }
+        Self { identity: psk.identity().to_vec(), psk: Mutex::new(Some(psk)), cipher }
     }
 
-    pub(crate) fn external(&self) -> Arc<ExternalPsk> {
-        Arc::clone(&self.psk)
+    /// The key as rustls takes it; `None` once it is erased.
+    pub(crate) fn external(&self) -> Option<Arc<ExternalPsk>> {
+        self.psk.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 }
 
@@ -75,12 +87,21 @@ fn secret(key: &[u8; 32], names: [&str; 4], len: usize) -> Result<Zeroizing<Vec<
         length_prefixed(&mut info, name.as_bytes());
     }
     let mut secret = Zeroizing::new(vec![0; len]);
+    fill(black_box(key), &info, &mut secret)?;
+    // aws-lc-rs moves the extracted key about and leaves it on the stack. The same code with a
+    // public key overwrites the same places.
+    fill(black_box(&[0; 32]), &info, &mut Zeroizing::new(vec![0; len]))?;
+    Ok(secret)
+}
+
+/// Never inlined, so that each call is the same code at the same depth.
+#[inline(never)]
+fn fill(key: &[u8; 32], info: &[u8], secret: &mut [u8]) -> Result<(), Error> {
     Salt::new(HKDF_SHA256, SALT)
         .extract(key)
-        .expand(&[&info], Len(len))
-        .and_then(|okm| okm.fill(&mut secret))
-        .map_err(|_| Error::KeyGeneration)?;
-    Ok(secret)
+        .expand(&[info], Len(secret.len()))
+        .and_then(|okm| okm.fill(secret))
+        .map_err(|_| Error::KeyGeneration)
 }
 
 const SALT: &[u8] = b"AXON-QKD-TLS13-EXTERNAL-PSK-v1";
@@ -103,6 +124,9 @@ impl KeyType for Len {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::PskKex;
+    use crate::qkd::client_config;
+    use rustls_axon::ClientConnection;
 
     /// The vectors are from `tests/vectors/make.py`, which knows nothing of this file.
     #[test]
@@ -129,6 +153,17 @@ mod tests {
             let hex: String = secret.iter().map(|byte| format!("{byte:02x}")).collect();
             assert_eq!(hex, text("psk"));
         }
+    }
+
+    #[test]
+    fn erased_key_begins_no_handshake() {
+        let psk = Arc::new(derive_psk(&[1; 32], "k", "a", "b", Cipher::default()).unwrap());
+        let config = client_config(Arc::clone(&psk), PskKex::PskKe, b"").unwrap();
+        let config = Arc::new(config);
+        let connect = || ClientConnection::new(Arc::clone(&config), "peer".try_into().unwrap());
+        assert!(connect().is_ok());
+        psk.erase();
+        assert!(connect().is_err());
     }
 
     #[test]

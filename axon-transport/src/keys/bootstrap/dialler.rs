@@ -162,6 +162,8 @@ impl Dialler {
         let Some(peer) = self.peers.get_mut(sae) else { return Completion::Reused };
         match &peer.state {
             State::Held(held) if held.key_id == *key_id => {
+                // The connection keeps its configuration, and with it the PSK.
+                held.psk.erase();
                 *peer = Peer::new();
                 Completion::First
             }
