@@ -15,6 +15,7 @@ pub mod passed;
 mod process;
 pub mod qos;
 pub mod relay;
+mod secrets;
 mod seldom;
 pub mod session;
 pub mod shm;

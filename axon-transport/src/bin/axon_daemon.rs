@@ -7,9 +7,12 @@
 use std::process::ExitCode;
 
 use axon_transport::daemon::{
-    self, Start,
+    self, ErasingHeap, Start,
     spawn::{DETACHED, SPAWNED},
 };
+
+#[global_allocator]
+static HEAP: ErasingHeap = ErasingHeap;
 
 fn main() -> ExitCode {
     let arguments: Vec<_> = std::env::args_os().skip(1).collect();

@@ -21,5 +21,6 @@ pub mod status;
 mod topics;
 pub(crate) mod watch;
 
+pub use crate::secrets::ErasingHeap;
 pub use gateway::GatewayEntry;
 pub use run::{DaemonError, DaemonOptions, Start, main, run};

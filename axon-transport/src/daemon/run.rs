@@ -27,6 +27,7 @@ use crate::{
     config::{Config, ConfigError, security_settings},
     discovery::Event,
     passed,
+    secrets::erase_from_now_on,
     session::address::{Address, AddressError, private_directory},
 };
 
@@ -173,6 +174,8 @@ type Started = (Control, Vec<OwnedFd>, crate::session::address::Lock);
 
 /// Everything before the runtime: the socket first, since it is the lock.
 fn start(config: Config, _options: &DaemonOptions) -> Result<Started, DaemonError> {
+    erase_from_now_on();
+    harden();
     let settings = security_settings(&config)?;
     let address = Address::of(&config);
     let (listeners, lock) = match address.bind() {
@@ -180,7 +183,6 @@ fn start(config: Config, _options: &DaemonOptions) -> Result<Started, DaemonErro
         Err(AddressError::Taken) => return Err(DaemonError::Taken(address.to_string())),
         Err(error) => return Err(error.into()),
     };
-    harden();
     let mut config = config;
     if let Some(dir) = &config.runtime_dir
         && let Err(error) = private_directory(dir)

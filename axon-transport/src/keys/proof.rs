@@ -13,18 +13,18 @@ pub const LEN: usize = 32;
 /// `HMAC-SHA256(HKDF-SHA256(no salt, key, "axon ready"), key_ID || ready)`; `ready` is the
 /// connection's TLS exporter [`READY_EXPORTER`](super::READY_EXPORTER).
 pub fn compute(key: &KmeKey, key_id: &KeyId, ready: &[u8; 32]) -> [u8; LEN] {
-    mac(key, key_id, ready).finalize().into_bytes().into()
+    key.derive(|key| mac(key, key_id, ready).finalize().into_bytes().into())
 }
 
 /// Whether `proof` is that of [`compute`], in constant time.
 #[must_use]
 pub fn verify(key: &KmeKey, key_id: &KeyId, ready: &[u8; 32], proof: &[u8; LEN]) -> bool {
-    mac(key, key_id, ready).verify_slice(proof).is_ok()
+    key.derive(|key| mac(key, key_id, ready).verify_slice(proof).is_ok())
 }
 
-fn mac(key: &KmeKey, key_id: &KeyId, ready: &[u8; 32]) -> Hmac<Sha256> {
+fn mac(key: &[u8; LEN], key_id: &KeyId, ready: &[u8; 32]) -> Hmac<Sha256> {
     let mut k = Zeroizing::new([0; LEN]);
-    Hkdf::<Sha256>::new(None, key.expose())
+    Hkdf::<Sha256>::new(None, key)
         .expand(b"axon ready", &mut k[..])
         .expect("32 bytes are within HKDF-SHA256's limit of 8160");
     Hmac::<Sha256>::new_from_slice(&k[..])

@@ -13,7 +13,7 @@ use super::fault::Fault;
 use super::handshake::Acceptors;
 use super::pki::{Layout, Pair, Pki, Sae, Site, Validity};
 use super::plan::{FaultPlan, Faults};
-use super::store::{FillRate, Store};
+use super::store::{FillRate, Store, Witness};
 use super::{Error, server};
 use crate::{Client, ClientBuilder};
 
@@ -38,6 +38,7 @@ pub struct NetworkBuilder {
     rate: FillRate,
     initially: Option<u64>,
     tls12_only: bool,
+    witness: Witness,
 }
 
 impl NetworkBuilder {
@@ -94,13 +95,20 @@ impl NetworkBuilder {
         self
     }
 
+    /// Calls `tell` with key_ID and secret of each key that a master draws, for tests that search
+    /// memory for keys.
+    pub fn witness(mut self, tell: impl Fn(&str, &[u8]) + Send + Sync + 'static) -> Self {
+        self.witness = Witness::new(tell);
+        self
+    }
+
     /// Makes the certificates, binds and serves. Needs a tokio runtime, on which the KMEs run until
     /// the network is dropped.
     ///
     /// # Errors
     /// [`Error`] names the ID, setting or address that cannot be used.
     pub async fn start(self) -> Result<Network, Error> {
-        let Self { layout, pki, limits, rate, initially, tls12_only } = self;
+        let Self { layout, pki, limits, rate, initially, tls12_only, witness } = self;
         layout.check()?;
         let sizes = limits.min_key_size..=limits.max_key_size;
         if !sizes.contains(&limits.key_size) || !limits.key_size.is_multiple_of(8) {
@@ -131,7 +139,7 @@ impl NetworkBuilder {
         let pki = pki.map_or_else(|| Pki::create(&layout), Ok)?;
         let initially = initially.unwrap_or(limits.max_stored);
         let shared = Arc::new(Shared {
-            store: Mutex::new(Store::new(rate, limits.max_stored, initially)),
+            store: Mutex::new(Store::new(rate, limits.max_stored, initially).with_witness(witness)),
             layout: layout.clone(),
             limits,
         });
@@ -197,6 +205,7 @@ impl Network {
             rate: FillRate::Unlimited,
             initially: None,
             tls12_only: false,
+            witness: Witness::default(),
         }
     }
 

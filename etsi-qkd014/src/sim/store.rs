@@ -1,6 +1,8 @@
 //! Key material that the KMEs of a network share: what a QKD link would have put into both.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::fmt;
+use std::sync::Arc;
 use std::time::Instant;
 
 use zeroize::Zeroizing;
@@ -30,6 +32,23 @@ pub(super) struct Store {
     /// The IDs of `waiting`, in order of their drawing.
     order: BTreeMap<u64, String>,
     drawn: u64,
+    witness: Witness,
+}
+
+/// Is told of each key that is drawn: its key_ID and the key.
+#[derive(Clone, Default)]
+pub(super) struct Witness(Option<Arc<dyn Fn(&str, &[u8]) + Send + Sync>>);
+
+impl Witness {
+    pub(super) fn new(tell: impl Fn(&str, &[u8]) + Send + Sync + 'static) -> Self {
+        Self(Some(Arc::new(tell)))
+    }
+}
+
+impl fmt::Debug for Witness {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(if self.0.is_some() { "a witness" } else { "no witness" })
+    }
 }
 
 /// A key that slaves may still draw.
@@ -62,7 +81,12 @@ impl Store {
             waiting: HashMap::new(),
             order: BTreeMap::new(),
             drawn: 0,
+            witness: Witness::default(),
         }
+    }
+
+    pub(super) fn with_witness(self, witness: Witness) -> Self {
+        Self { witness, ..self }
     }
 
     /// Keys in stock between two KMEs now.
@@ -105,6 +129,9 @@ impl Store {
             let mut secret = Zeroizing::new(vec![0; bytes]);
             random(&mut secret);
             let id = uuid();
+            if let Some(tell) = &self.witness.0 {
+                tell(&id, &secret);
+            }
             let (master, slaves) = (master.to_owned(), slaves.clone());
             self.drawn += 1;
             let waiting = Waiting { place: self.drawn, secret: secret.clone(), master, slaves };

@@ -4,9 +4,12 @@
 use std::process::ExitCode;
 
 use axon_transport::daemon::{
-    self, Start,
+    self, ErasingHeap, Start,
     spawn::{DETACHED, SPAWNED},
 };
+
+#[global_allocator]
+static HEAP: ErasingHeap = ErasingHeap;
 
 fn main() -> ExitCode {
     let start = match std::env::args().nth(1).as_deref() {

@@ -16,5 +16,6 @@ mod process;
 mod renewal;
 mod restart;
 mod rules;
+mod secrets;
 mod services;
 mod stranger;

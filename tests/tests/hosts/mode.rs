@@ -1,6 +1,10 @@
 //! The ways in which two hosts may be set up.
 
-use std::{fs, path::Path};
+use std::{
+    fs,
+    path::Path,
+    sync::{Arc, Mutex},
+};
 
 use axon_tls::identity::SigningKey;
 use etsi_qkd014::sim;
@@ -17,6 +21,7 @@ pub(crate) struct Kmes {
     network: sim::Network,
     dir: tempfile::TempDir,
     _runtime: tokio::runtime::Runtime,
+    drawn: Arc<Mutex<Vec<(String, Vec<u8>)>>>,
 }
 
 impl Kmes {
@@ -27,10 +32,15 @@ impl Kmes {
         let network = sim::Network::builder()
             .kme("kme-a", ([127, 0, 0, 1], 0).into(), [SAE[0]])
             .kme("kme-b", ([127, 0, 0, 2], 0).into(), [SAE[1]]);
+        let drawn = Arc::new(Mutex::new(Vec::new()));
+        let witness = Arc::clone(&drawn);
+        let network = network.witness(move |key_id, key| {
+            witness.lock().unwrap().push((key_id.to_owned(), key.to_vec()));
+        });
         let network = runtime.block_on(network.start()).unwrap();
         let dir = tempfile::tempdir().unwrap();
         network.write_files(dir.path()).unwrap();
-        Self { network, dir, _runtime: runtime }
+        Self { network, dir, _runtime: runtime, drawn }
     }
 
     /// Settings of host 0 or 1 in qkd.
@@ -40,6 +50,11 @@ impl Kmes {
         settings.push(("AXON_QKD_PEERS", SAE[1 - host].into()));
         set(&mut settings, more);
         settings
+    }
+
+    /// Each key that was drawn so far, and its key_ID.
+    pub(crate) fn drawn(&self) -> Vec<(String, Vec<u8>)> {
+        self.drawn.lock().unwrap().clone()
     }
 
     /// Keys that SAEs got by asking for new ones, and by key_ID.

@@ -6,7 +6,10 @@ use axon_envelope::{KeyId, KmeKey};
 use etsi_qkd014::{Client, Error, KeyContainer};
 
 use super::{Recorder, STATUS_TIMEOUT};
-use crate::keys::request::{Failure, FailureKind, Fetched, Request, Stock};
+use crate::{
+    keys::request::{Failure, FailureKind, Fetched, Request, Stock},
+    secrets::LockedKey,
+};
 
 /// Bits of a key.
 const KEY_SIZE: u32 = 256;
@@ -53,14 +56,17 @@ async fn call(client: &Client, request: &Request) -> Result<Fetched, Failure> {
     }
 }
 
-/// Moves the keys over; the client erases its own copies.
+/// Moves the keys to locked memory; the client erases its own copies.
 fn keys(container: KeyContainer) -> Result<Fetched, Failure> {
     let ambiguous = |text: String| Failure::new(FailureKind::Ambiguous, text);
     let keys = container.keys.iter().map(|key| {
         let key_id = KeyId::new(key.key_id()).map_err(|e| ambiguous(format!("key_ID: {e}")))?;
-        let kme_key = KmeKey::from_slice(key.expose())
-            .map_err(|_| ambiguous(format!("key {key_id} has {} bytes, not 32", key.len())))?;
-        Ok((key_id, kme_key))
+        let bytes = key
+            .expose_array()
+            .ok_or_else(|| ambiguous(format!("key {key_id} has {} bytes, not 32", key.len())))?;
+        let locked = LockedKey::copy_of(bytes)
+            .map_err(|e| ambiguous(format!("no memory for key {key_id}: {e}")))?;
+        Ok((key_id, KmeKey::from_holder(locked)))
     });
     keys.collect::<Result<_, _>>().map(Fetched::Keys)
 }

@@ -20,7 +20,7 @@ use tokio::{
 };
 
 use super::request::{Answer, Failure, FailureKind, Fetched, Purpose, Request, Stock};
-use crate::config::QkdConfig;
+use crate::{config::QkdConfig, secrets};
 
 pub use statistics::{CallStatistics, Statistics};
 
@@ -125,6 +125,9 @@ impl Kme {
     /// Outside a tokio runtime.
     pub fn start(config: &QkdConfig) -> Result<(Self, Events), KmeError> {
         let client = client(config)?;
+        if let Err(error) = secrets::prepare() {
+            tracing::warn!(%error, "there is no memory for keys yet");
+        }
         let recorder = Arc::new(Recorder::default());
         let (events, receiver) = mpsc::channel(QUEUE);
         let serve = |limit: usize| {
