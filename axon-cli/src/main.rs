@@ -19,9 +19,14 @@ mod trust;
 
 use std::process::ExitCode;
 
+use axon_transport::daemon::ErasingHeap;
 use clap::Parser;
 
 use crate::cli::{Bench, Cli, Command};
+
+/// Erases in `axon daemon` alone.
+#[global_allocator]
+static HEAP: ErasingHeap = ErasingHeap;
 
 fn main() -> ExitCode {
     let outcome = match &Cli::parse().command {
