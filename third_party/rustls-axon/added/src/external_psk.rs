@@ -52,7 +52,6 @@ use zeroize::Zeroizing;
 use crate::crypto::CryptoProvider;
 use crate::crypto::hash::HashAlgorithm;
 use crate::error::Error;
-use crate::msgs::handshake::PresharedKeyIdentity;
 use crate::sync::Arc;
 use crate::tls13::Tls13CipherSuite;
 
@@ -198,9 +197,12 @@ pub trait ExternalPskSource: Debug + Send + Sync {
 pub trait ResolvesExternalPsk: Debug + Send + Sync {
     /// Picks one of the PSKs that a client offered.
     ///
-    /// The returned PSK must have one of the identities in `offer`, and a hash that goes with a
-    /// cipher suite both ends support.  `None` refuses the connection with an
-    /// `unknown_psk_identity` alert.
+    /// The returned PSK must have one of the identities in `offer`.  `None` refuses the connection
+    /// with an `unknown_psk_identity` alert.
+    ///
+    /// The hash of the PSK must go with a cipher suite both ends support:
+    /// [`ExternalPskOffer::accepts()`] tells.  If it does not, this is called again without that
+    /// identity, a few times at most, so that a client can offer one PSK for each hash.
     ///
     /// This is called before the binder is checked, and again after a HelloRetryRequest: see the
     /// [module documentation](self#security) for what that means for single-use keys.
@@ -210,16 +212,22 @@ pub trait ResolvesExternalPsk: Debug + Send + Sync {
 /// What a client offered, as seen by [`ResolvesExternalPsk`].
 #[derive(Clone, Copy, Debug)]
 pub struct ExternalPskOffer<'a> {
-    pub(crate) identities: &'a [PresharedKeyIdentity],
+    pub(crate) identities: &'a [&'a [u8]],
+    pub(crate) suites: &'a [&'static Tls13CipherSuite],
     pub(crate) server_name: Option<&'a DnsName<'a>>,
 }
 
 impl<'a> ExternalPskOffer<'a> {
     /// The identities, in the client's order of preference.
     pub fn identities(&self) -> impl Iterator<Item = &'a [u8]> + 'a {
-        self.identities
+        self.identities.iter().copied()
+    }
+
+    /// Whether a cipher suite that both ends support has the hash function of `psk`.
+    pub fn accepts(&self, psk: &ExternalPsk) -> bool {
+        self.suites
             .iter()
-            .map(|id| id.identity.0.as_slice())
+            .any(|suite| psk.usable_with(suite))
     }
 
     /// The server name that the client sent, if any.

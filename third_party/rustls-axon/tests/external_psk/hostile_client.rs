@@ -4,7 +4,7 @@ use std::io::{Read, Write};
 use std::sync::atomic::Ordering;
 use std::sync::Arc;
 
-use rustls_axon::crypto::aws_lc_rs::{cipher_suite, kx_group};
+use rustls_axon::crypto::aws_lc_rs::kx_group;
 use rustls_axon::external_psk::PskKeyExchangeMode;
 use rustls_axon::server::ServerSessionMemoryCache;
 use rustls_axon::{Error, PeerMisbehaved, ServerConnection};
@@ -265,90 +265,6 @@ fn server_skips_early_data_before_a_second_client_hello() {
     let mut flood = || feed(&mut server, &early.seal(APPLICATION_DATA, &[0; 4_096]));
     assert!((0..10).any(|_| flood().is_err()));
     assert_eq!(written(&mut server).last(), Some(&10));
-}
-
-/// What a second ClientHello may not do, and one that does all right.
-#[test]
-fn server_refuses_second_client_hellos_that_break_the_rules() {
-    let client_hello = |share: &[u8]| {
-        let hello = offer().in_psk_dhe_ke(29, share);
-        let groups = list16(&[0, 23, 0, 29]);
-        hello.with(10, &groups)
-    };
-    let first = || {
-        let share = [&[0, 23][..], &list16(&[4; 65])].concat();
-        client_hello(&[]).with(51, &list16(&share))
-    };
-    let exchange = || kx_group::X25519.start().unwrap();
-    let retried = |first: &ClientHello| {
-        let resolver = Known::new(vec![psk("a", 1, SHA256), psk("b", 2, SHA256)]);
-        let mode = PskKeyExchangeMode::PskDheKe;
-        let suites = [SHA256, cipher_suite::TLS13_AES_128_GCM_SHA256];
-        let config = server_config_over(&suites, &[kx_group::X25519], resolver, mode);
-        let mut server = server(config);
-        let first = first.encode();
-        feed(&mut server, &records(HANDSHAKE, &first)).unwrap();
-        let retry = plaintext(&written(&mut server));
-        assert_eq!(&retry[6..10], [0xcf, 0x21, 0xad, 0x74], "a HelloRetryRequest");
-        (server, [message(254, &digest(&first)), retry].concat())
-    };
-
-    type Second<'a> = &'a dyn Fn(ClientHello) -> ClientHello;
-    let wrong: &[(&str, Second<'_>, u8)] = &[
-        (
-            "binder over the second ClientHello alone",
-            &|hello| ClientHello { before: vec![], ..hello },
-            51,
-        ),
-        ("early data", &|hello| hello.with(42, &[]), 47),
-        (
-            "no PSK",
-            &|hello| ClientHello { offers: vec![], ..hello }.with(13, &list16(&[4, 3])),
-            109,
-        ),
-        (
-            "the group that was not asked for",
-            &|hello| hello.with(51, &list16(&[&[0, 23][..], &list16(&[4; 65])].concat())),
-            47,
-        ),
-        ("no share at all", &|hello| hello.with(51, &list16(&[])), 47),
-        ("another mode", &|hello| hello.with(45, &[1, 0]), 40),
-        (
-            "another PSK under the binder of the first",
-            &|hello| ClientHello { offers: vec![Offer::new("b", &SECRET)], ..hello },
-            51,
-        ),
-        ("another suite that would do", &|hello| ClientHello { suites: vec![0x1301], ..hello }, 47),
-    ];
-    for (what, change, alert) in wrong {
-        let (mut server, before) = retried(&first());
-        let second = ClientHello { before, ..client_hello(exchange().pub_key()) };
-        let error = feed(&mut server, &records(HANDSHAKE, &change(second).encode())).unwrap_err();
-        assert_eq!(written(&mut server).last(), Some(alert), "{what}: {error}");
-        assert!(server.external_psk().is_none());
-    }
-
-    // again the first one, which has no share of the group that was asked for
-    let (mut server, before) = retried(&first());
-    let again = ClientHello { before, ..first() };
-    let error = feed(&mut server, &records(HANDSHAKE, &again.encode())).unwrap_err();
-    assert_eq!(error, PeerMisbehaved::RefusedToFollowHelloRetryRequest.into());
-
-    let (mut server, before) = retried(&first());
-    let ours = exchange();
-    let second = ClientHello { before: before.clone(), ..client_hello(ours.pub_key()) }.encode();
-    feed(&mut server, &records(HANDSHAKE, &second)).unwrap();
-    let flight = written(&mut server);
-    let server_hello = plaintext(&flight);
-    let head = [0, 51, 0, 36, 0, 29, 0, 32];
-    let at = server_hello.windows(8).position(|window| window == head).unwrap() + 8;
-    let shared = ours.complete(&server_hello[at..at + 32]).unwrap();
-    let transcript = [before, second, server_hello].concat();
-    let mut client =
-        Peer::new(Role::Client, Some(&SECRET), Some(shared.secret_bytes()), transcript);
-    client.expect_finished(&flight);
-    feed(&mut server, &client.finish()).unwrap();
-    assert_eq!(server.external_psk().unwrap().identity(), b"a");
 }
 
 /// A look-up, a wrong Finished and a cut connection leave nothing that a caller would take for use.

@@ -10,4 +10,6 @@ mod hostile_server;
 mod peer;
 mod quic;
 mod resumption;
+mod second_client_hello;
+mod selection;
 mod server_hello;

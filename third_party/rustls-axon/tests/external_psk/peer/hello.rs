@@ -57,6 +57,7 @@ impl Offer {
 pub(crate) struct ClientHello {
     pub(crate) legacy_version: u16,
     pub(crate) random: [u8; 32],
+    pub(crate) session_id: Vec<u8>,
     pub(crate) suites: Vec<u16>,
     pub(crate) compression: Vec<u8>,
     /// All but `pre_shared_key`.
@@ -73,6 +74,7 @@ impl ClientHello {
         Self {
             legacy_version: 0x0303,
             random: [3; 32],
+            session_id: vec![5; 32],
             suites: vec![0x1303],
             compression: vec![0],
             extensions: vec![ext(43, &[2, 3, 4]), ext(45, &[1, 0])],
@@ -134,7 +136,7 @@ impl ClientHello {
 
     fn encode_with(&self, list: &[(u16, Vec<u8>)]) -> Vec<u8> {
         let suites: Vec<u8> = self.suites.iter().flat_map(|suite| suite.to_be_bytes()).collect();
-        let session_id = list8(&[5; 32]);
+        let session_id = list8(&self.session_id);
         message(
             1,
             &[

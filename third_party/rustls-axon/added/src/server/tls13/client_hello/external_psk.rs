@@ -3,8 +3,6 @@
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 
-use subtle::ConstantTimeEq;
-
 use super::{emit_fake_ccs, emit_finished_tls13, emit_hello_retry_request, max_early_data_size};
 use crate::NoKeyLog;
 use crate::common_state::{HandshakeFlightTls13, HandshakeKind, KxState};
@@ -12,9 +10,7 @@ use crate::conn::ConnectionRandoms;
 use crate::crypto::SupportedKxGroup;
 use crate::enums::{AlertDescription, CipherSuite, ProtocolVersion};
 use crate::error::{Error, PeerIncompatible, PeerMisbehaved};
-use crate::external_psk::{
-    ExternalPsk, ExternalPskOffer, NegotiatedExternalPsk, PskKeyExchangeMode, ServerExternalPsks,
-};
+use crate::external_psk::{NegotiatedExternalPsk, PskKeyExchangeMode, ServerExternalPsks};
 use crate::hash_hs::HandshakeHash;
 use crate::msgs::enums::Compression;
 use crate::msgs::handshake::{
@@ -31,6 +27,13 @@ use crate::suites::SupportedCipherSuite;
 use crate::sync::Arc;
 use crate::tls13::Tls13CipherSuite;
 use crate::tls13::key_schedule::{KeyScheduleEarly, KeyScheduleHandshake, KeySchedulePreHandshake};
+
+mod retry;
+mod select;
+
+pub(in crate::server) use retry::RepeatedParts;
+use retry::check_second_hello;
+use select::{Selected, binder_is_correct, select};
 
 /// Handles a ClientHello under a config that has external PSKs, up to our Finished.
 pub(in crate::server) fn handle_client_hello(
@@ -54,6 +57,9 @@ pub(in crate::server) fn handle_client_hello(
 
     check_offer_is_well_formed(cx, client_hello, previous_hello.as_ref())?;
     let offer = offer_in_mode(cx, client_hello, mode)?;
+    if let Some(before) = &previous_hello {
+        check_second_hello(cx.common, before, chm, client_hello, offer)?;
+    }
 
     // Before the resolver: what cannot be answered must not cost a look-up.
     let suites = common_suites(&config, cx, client_hello);
@@ -64,23 +70,8 @@ pub(in crate::server) fn handle_client_hello(
         ));
     }
 
-    let resolved = external_psks
-        .resolver
-        .resolve(ExternalPskOffer {
-            identities: &offer.identities,
-            server_name: cx.data.sni.as_ref(),
-        });
-    let (index, psk) = select(cx, offer, resolved)?;
-
-    let Some(suite) = suites
-        .into_iter()
-        .find(|suite| psk.usable_with(suite))
-    else {
-        return Err(cx.common.send_fatal_alert(
-            AlertDescription::HandshakeFailure,
-            PeerIncompatible::NoCipherSuitesInCommon,
-        ));
-    };
+    let selected = select(cx, offer, &*external_psks.resolver, &suites)?;
+    let suite = selected.suite;
     if previous_hello
         .as_ref()
         .is_some_and(|before| before.suite != suite.common.suite)
@@ -98,7 +89,8 @@ pub(in crate::server) fn handle_client_hello(
         HandshakeHashOrBuffer::Hash(hash) => hash,
     };
 
-    if !binder_is_correct(suite, &transcript, chm, &psk, offer.binders[index].as_ref()) {
+    let binder = offer.binders[selected.index].as_ref();
+    if !binder_is_correct(&selected, &transcript, chm, binder) {
         return Err(cx.common.send_fatal_alert(
             AlertDescription::DecryptError,
             PeerMisbehaved::IncorrectBinder,
@@ -140,6 +132,8 @@ pub(in crate::server) fn handle_client_hello(
                         previous_hello: Some(PreviousClientHello {
                             offered_psk: true,
                             suite: suite.common.suite,
+                            group: group.name(),
+                            repeated: Some(RepeatedParts::new(suite, chm, offer)),
                         }),
                         send_tickets: 0,
                     });
@@ -164,10 +158,8 @@ pub(in crate::server) fn handle_client_hello(
         cx,
         &mut transcript,
         &randoms,
-        suite,
         &client_hello.session_id,
-        index,
-        &psk,
+        &selected,
         share,
     )?;
     if previous_hello.is_none() {
@@ -177,7 +169,7 @@ pub(in crate::server) fn handle_client_hello(
         .handshake_kind
         .get_or_insert(HandshakeKind::Full);
     cx.common.external_psk = Some(NegotiatedExternalPsk {
-        identity: psk.identity().to_vec(),
+        identity: selected.psk.identity().to_vec(),
         mode,
     });
 
@@ -327,55 +319,6 @@ fn common_suites(
     }
 }
 
-/// Finds what the resolver returned in the offer.
-fn select(
-    cx: &mut ServerContext<'_>,
-    offer: &PresharedKeyOffer,
-    resolved: Option<Arc<ExternalPsk>>,
-) -> Result<(usize, Arc<ExternalPsk>), Error> {
-    let Some(psk) = resolved else {
-        return Err(cx.common.send_fatal_alert(
-            AlertDescription::UnknownPSKIdentity,
-            PeerIncompatible::UnknownExternalPskIdentity,
-        ));
-    };
-
-    let index = offer
-        .identities
-        .iter()
-        .position(|id| id.identity.0 == psk.identity());
-    match index {
-        Some(index) => Ok((index, psk)),
-        None => Err(cx.common.send_fatal_alert(
-            AlertDescription::InternalError,
-            Error::General("external PSK: resolver returned a PSK that was not offered".into()),
-        )),
-    }
-}
-
-fn binder_is_correct(
-    suite: &'static Tls13CipherSuite,
-    transcript: &HandshakeHash,
-    client_hello: &Message<'_>,
-    psk: &ExternalPsk,
-    binder: &[u8],
-) -> bool {
-    let MessagePayload::Handshake { parsed, encoded } = &client_hello.payload else {
-        return false;
-    };
-    let encoded = encoded.bytes();
-    let truncated_hello = &encoded[..encoded
-        .len()
-        .saturating_sub(parsed.total_binder_length())];
-
-    let expected = KeyScheduleEarly::new(suite, psk.secret())
-        .external_psk_binder_key_and_sign_verify_data(
-            psk.is_imported(),
-            &transcript.hash_given(truncated_hello),
-        );
-    ConstantTimeEq::ct_eq(expected.as_ref(), binder).into()
-}
-
 /// The group to use: one that needs no further round trip if there is one.
 fn choose_group(
     config: &ServerConfig,
@@ -427,10 +370,8 @@ fn emit_server_hello(
     cx: &mut ServerContext<'_>,
     transcript: &mut HandshakeHash,
     randoms: &ConnectionRandoms,
-    suite: &'static Tls13CipherSuite,
     session_id: &SessionId,
-    psk_index: usize,
-    psk: &ExternalPsk,
+    selected: &Selected,
     share: Option<(&'static dyn SupportedKxGroup, &KeyShareEntry)>,
 ) -> Result<KeyScheduleHandshake, Error> {
     let exchanged = match share {
@@ -462,13 +403,13 @@ fn emit_server_hello(
                 legacy_version: ProtocolVersion::TLSv1_2,
                 random: Random::from(randoms.server),
                 session_id: *session_id,
-                cipher_suite: suite.common.suite,
+                cipher_suite: selected.suite.common.suite,
                 compression_method: Compression::Null,
                 extensions: Box::new(ServerExtensions {
                     key_share,
                     selected_version: Some(ProtocolVersion::TLSv1_3),
                     // at most 2^16 / 7 identities fit into an offer
-                    preshared_key: Some(psk_index as u16),
+                    preshared_key: Some(selected.index as u16),
                     ..Default::default()
                 }),
             },
@@ -479,7 +420,10 @@ fn emit_server_hello(
     transcript.add_message(&sh);
     cx.common.send_msg(sh, false);
 
-    let key_schedule = KeySchedulePreHandshake::from(KeyScheduleEarly::new(suite, psk.secret()));
+    let key_schedule = KeySchedulePreHandshake::from(KeyScheduleEarly::new(
+        selected.suite,
+        selected.psk.secret(),
+    ));
     let key_schedule = match shared_secret {
         Some(shared_secret) => key_schedule.into_handshake(shared_secret),
         None => key_schedule.into_handshake_without_shared_secret(),
