@@ -1,7 +1,7 @@
 //! A QKD key imported as RFC 9258 says: against rustls-axon's own importer, and never in place of the
 //! other form.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
 use axon_tls::qkd::{
     self, ImportedIdentity, Psk, PskIdentity, PskResolver, derive_psk, import_psk,
@@ -11,7 +11,10 @@ use rustls_axon::crypto::CryptoProvider;
 use rustls_axon::crypto::aws_lc_rs::{cipher_suite, default_provider};
 use rustls_axon::crypto::hash::HashAlgorithm;
 use rustls_axon::external_psk::{ImportedIdentity as TlsIdentity, ImportedPsk, PskKeyExchangeMode};
-use rustls_axon::{ClientConfig, ClientConnection, Error, ServerConnection};
+use rustls_axon::{
+    ClientConfig, ClientConnection, Error, PeerIncompatible, PeerMisbehaved, ServerConfig,
+    ServerConnection,
+};
 use zeroize::Zeroizing;
 
 const KEY: [u8; 32] = [7; 32];
@@ -39,17 +42,33 @@ impl PskResolver for Base {
 }
 
 fn handshake(client: ClientConfig, cipher: Cipher, kex: PskKex) -> Result<KeyExchange, Error> {
+    let server = qkd::server_config(Arc::new(Base(cipher)), cipher, kex, b"").unwrap();
+    connect(client, server)
+}
+
+fn handshake_with(
+    resolver: Arc<EveryHash>,
+    client: ClientConfig,
+    cipher: Cipher,
+) -> Result<KeyExchange, Error> {
+    connect(client, qkd::server_config(resolver, cipher, PskKex::PskKe, b"").unwrap())
+}
+
+fn connect(client: ClientConfig, server: ServerConfig) -> Result<KeyExchange, Error> {
     let name = "base".try_into().unwrap();
     let mut client = ClientConnection::new(Arc::new(client), name).unwrap();
-    let server = qkd::server_config(Arc::new(Base(cipher)), cipher, kex, b"").unwrap();
     let mut server = ServerConnection::new(Arc::new(server)).unwrap();
     while client.is_handshaking() || server.is_handshaking() {
         let mut records = Vec::new();
         while client.wants_write() {
             client.write_tls(&mut records).unwrap();
         }
-        server.read_tls(&mut &records[..]).unwrap();
-        server.process_new_packets()?;
+        // a long offer takes more than one read
+        let mut unread = &records[..];
+        while !unread.is_empty() {
+            server.read_tls(&mut unread).unwrap();
+            server.process_new_packets()?;
+        }
         records.clear();
         while server.wants_write() {
             server.write_tls(&mut records).unwrap();
@@ -98,6 +117,94 @@ fn a_stranger_imports_the_same() {
         assert!(run(other).is_err(), "{}", other.escape_ascii());
     }
     assert_eq!(run(b"\x00\x05robot\x00\x04base"), Ok(KeyExchange::PskKe));
+}
+
+/// Knows one QKD key, imported for whatever hash is asked for, and counts its look-ups.
+#[derive(Debug, Default)]
+struct EveryHash {
+    looked_up: Mutex<Vec<Vec<u8>>>,
+    fetched: Mutex<Vec<Vec<u8>>>,
+}
+
+impl PskResolver for EveryHash {
+    fn resolve(&self, identity: &[u8]) -> Option<Arc<Psk>> {
+        self.fetched.lock().unwrap().push(identity.to_vec());
+        self.resolve_known(identity)
+    }
+
+    fn resolve_known(&self, identity: &[u8]) -> Option<Arc<Psk>> {
+        self.looked_up.lock().unwrap().push(identity.to_vec());
+        let named = ImportedIdentity::parse(identity).ok()?;
+        let known = named.key_id() == "key-1" && named.server_sae() == SERVER_SAE;
+        let psk = import_psk(&KEY, "key-1", named.client_sae(), SERVER_SAE, named.cipher());
+        known.then(|| Arc::new(psk.unwrap()))
+    }
+}
+
+/// A stranger that offers a QKD key under each hash, or keys that the server does not know.
+fn offering(offers: &[(&str, [u8; 32], HashAlgorithm)]) -> ClientConfig {
+    let import = |(key_id, key, hash): &(&str, [u8; 32], HashAlgorithm)| {
+        let context = b"\x00\x05robot\x00\x04base";
+        let identity = TlsIdentity::new(key_id.as_bytes(), context, *hash).unwrap();
+        let suite = cipher_suite::TLS13_AES_128_GCM_SHA256.tls13().unwrap();
+        ImportedPsk::new(identity, &Zeroizing::new(key.to_vec()), suite).unwrap().into()
+    };
+    let provider = CryptoProvider {
+        cipher_suites: vec![
+            cipher_suite::TLS13_AES_256_GCM_SHA384,
+            cipher_suite::TLS13_CHACHA20_POLY1305_SHA256,
+        ],
+        kx_groups: vec![],
+        ..default_provider()
+    };
+    ClientConfig::builder_with_provider(Arc::new(provider))
+        .with_external_psks(offers.iter().map(import).collect(), PskKeyExchangeMode::PskKe)
+        .unwrap()
+}
+
+/// RFC 8446 4.2.11 and RFC 9258 5.1: the server takes the key that goes with its cipher, wherever it
+/// stands in the offer.
+#[test]
+fn a_server_takes_a_later_identity_that_it_knows() {
+    use HashAlgorithm::{SHA256, SHA384};
+    let pairs = [[SHA256, SHA384], [SHA384, SHA256]];
+    for cipher in Cipher::ALL {
+        for pair in pairs {
+            let offers = pair.map(|hash| ("key-1", KEY, hash));
+            let resolver = Arc::new(EveryHash::default());
+            let agreed = handshake_with(resolver.clone(), offering(&offers), cipher);
+            assert_eq!(agreed, Ok(KeyExchange::PskKe), "{cipher}, {pair:?}");
+            assert!(resolver.fetched.lock().unwrap().is_empty(), "a known key costs no fetch");
+        }
+
+        let hash = if cipher == Cipher::Aes256Gcm { SHA384 } else { SHA256 };
+        let offers = [("key-0", KEY, hash), ("key-1", KEY, hash)];
+        let resolver = Arc::new(EveryHash::default());
+        let agreed = handshake_with(resolver.clone(), offering(&offers), cipher);
+        assert_eq!(agreed, Ok(KeyExchange::PskKe), "{cipher}, an unknown key first");
+
+        let offers = [("key-0", KEY, hash), ("key-1", [8; 32], hash)];
+        let refused = handshake_with(Arc::new(EveryHash::default()), offering(&offers), cipher);
+        assert_eq!(refused, Err(PeerMisbehaved::IncorrectBinder.into()), "{cipher}");
+
+        let offers = [("key-0", KEY, hash), ("key-2", KEY, hash)];
+        let resolver = Arc::new(EveryHash::default());
+        let refused = handshake_with(resolver.clone(), offering(&offers), cipher);
+        assert_eq!(refused, Err(PeerIncompatible::UnknownExternalPskIdentity.into()), "{cipher}");
+        assert_eq!(resolver.fetched.lock().unwrap().len(), 1, "the first one alone is fetched");
+    }
+}
+
+/// One ClientHello cannot have a server look a thousand identities up.
+#[test]
+fn a_server_looks_up_eight_identities_at_most() {
+    let names: Vec<String> = (0..500).map(|number| format!("unknown-{number}")).collect();
+    let offers: Vec<_> =
+        names.iter().map(|name| (name.as_str(), KEY, HashAlgorithm::SHA256)).collect();
+    let resolver = Arc::new(EveryHash::default());
+    assert!(handshake_with(resolver.clone(), offering(&offers), Cipher::default()).is_err());
+    assert_eq!(resolver.looked_up.lock().unwrap().len(), 8 + 1);
+    assert_eq!(resolver.fetched.lock().unwrap().len(), 1);
 }
 
 #[test]

@@ -26,6 +26,16 @@ pub trait PskResolver: Debug + Send + Sync {
     ///
     /// These are bytes from the network: see [`PskIdentity::parse()`](super::PskIdentity::parse).
     fn resolve(&self, identity: &[u8]) -> Option<Arc<Psk>>;
+
+    /// The same without any effect: a resolver that begins to fetch a key it has not must not do so
+    /// here.
+    ///
+    /// Where a client offers several identities, this is called for each of the first eight, in the
+    /// client's order, until one is known that was derived for the configured cipher. If none is,
+    /// [`resolve()`](Self::resolve) is called for the first one.
+    fn resolve_known(&self, identity: &[u8]) -> Option<Arc<Psk>> {
+        self.resolve(identity)
+    }
 }
 
 /// A client's configuration for one connection on `psk`, with one ALPN protocol, or none if `alpn`
@@ -57,17 +67,19 @@ pub fn server_config(
     kex: PskKex,
     alpn: &[u8],
 ) -> Result<ServerConfig, Error> {
-    server_config_with(provider(cipher, kex), resolver, kex, alpn)
+    server_config_with(provider(cipher, kex), resolver, cipher, kex, alpn)
 }
 
 pub(super) fn server_config_with(
     provider: CryptoProvider,
     resolver: Arc<dyn PskResolver>,
+    cipher: Cipher,
     kex: PskKex,
     alpn: &[u8],
 ) -> Result<ServerConfig, Error> {
+    let resolver = Arc::new(FirstKnown { resolver, cipher });
     let mut config = ServerConfig::builder_with_provider(Arc::new(provider))
-        .with_external_psk_resolver(Arc::new(FirstKnown(resolver)), mode(kex))?;
+        .with_external_psk_resolver(resolver, mode(kex))?;
     config.alpn_protocols = protocols(alpn)?;
     Ok(config)
 }
@@ -135,18 +147,36 @@ impl Debug for OneKey {
     }
 }
 
-/// Looks up the first identity alone: our clients offer one, and a look-up may cause work.
-struct FirstKnown(Arc<dyn PskResolver>);
+/// Takes the first offered identity that is known and goes with the configured cipher.
+struct FirstKnown {
+    resolver: Arc<dyn PskResolver>,
+    cipher: Cipher,
+}
 
 impl ResolvesExternalPsk for FirstKnown {
     fn resolve(&self, offer: ExternalPskOffer<'_>) -> Option<Arc<ExternalPsk>> {
-        let identity = offer.identities().next()?;
-        self.0.resolve(identity).filter(|psk| psk.identity() == identity)?.external()
+        let identities: Vec<&[u8]> = offer.identities().take(MAX_LOOKED_UP).collect();
+        let (first, others) = identities.split_first()?;
+        let at_hand = |identity: &&[u8]| {
+            let psk = self.resolver.resolve_known(identity)?;
+            (psk.identity() == *identity && psk.cipher() == self.cipher).then_some(psk)
+        };
+
+        // A key at hand under a later identity must not cost a fetch of the first one.
+        let known = if others.is_empty() { None } else { identities.iter().find_map(at_hand) };
+        known
+            .or_else(|| self.resolver.resolve(first).filter(|psk| psk.identity() == *first))
+            .and_then(|psk| psk.external())
     }
 }
 
 impl Debug for FirstKnown {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.fmt(f)
+        self.resolver.fmt(f)
     }
 }
+
+/// How many identities of one ClientHello are looked up.
+///
+/// A ClientHello has room for more than a thousand, and every client can send one.
+const MAX_LOOKED_UP: usize = 8;

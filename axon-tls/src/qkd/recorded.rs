@@ -69,7 +69,7 @@ fn client(cipher: Cipher) -> ClientConnection {
 
 fn server(cipher: Cipher) -> ServerConnection {
     let resolver = Arc::new(OneKey(cipher));
-    let config = server_config_with(fixed(cipher), resolver, PskKex::PskKe, b"").unwrap();
+    let config = server_config_with(fixed(cipher), resolver, cipher, PskKex::PskKe, b"").unwrap();
     ServerConnection::new(Arc::new(config)).unwrap()
 }
 

@@ -168,7 +168,7 @@ impl Acceptor {
     /// Looks up, and fetches within the same bounds, a key that a probe names ahead of its
     /// handshake.
     pub fn prefetch(&self, source: IpAddr, identity: &[u8]) -> Lookup {
-        self.look_up(source, identity).0
+        self.look_up(Some(source), identity).0
     }
 
     /// A handshake under `identity` is complete: the key is spent, and erased.
@@ -275,7 +275,8 @@ impl Acceptor {
         self.state().expire(now);
     }
 
-    fn look_up(&self, source: IpAddr, identity: &[u8]) -> (Lookup, Option<Arc<Psk>>) {
+    /// Without a `source` to count a fetch for, nothing is fetched.
+    fn look_up(&self, source: Option<IpAddr>, identity: &[u8]) -> (Lookup, Option<Arc<Psk>>) {
         let inner = &*self.0;
         let Ok(parsed) = PskIdentity::parse(identity) else { return (Lookup::Malformed, None) };
         let Ok(key_id) = KeyId::new(parsed.key_id()) else { return (Lookup::Malformed, None) };
@@ -302,6 +303,7 @@ impl Acceptor {
         if state.pending.iter().any(|p| p.identity == parsed) {
             return (Lookup::Fetching, None);
         }
+        let Some(source) = source else { return (Lookup::UnknownKeyId, None) };
         let seen = fingerprint(identity);
         let missed = state.missed.last_seen(&seen);
         let missed = missed.is_some_and(|at| now.saturating_sub(at) < MISSED_FOR);
@@ -422,9 +424,16 @@ impl Resolver {
 
 impl PskResolver for Resolver {
     fn resolve(&self, identity: &[u8]) -> Option<Arc<Psk>> {
-        let (lookup, psk) = self.acceptor.look_up(self.source, identity);
+        let (lookup, psk) = self.acceptor.look_up(Some(self.source), identity);
         *self.last() = Some((lookup, PskIdentity::parse(identity).ok()));
         psk
+    }
+
+    fn resolve_known(&self, identity: &[u8]) -> Option<Arc<Psk>> {
+        let (lookup, psk) = self.acceptor.look_up(None, identity);
+        let psk = psk?;
+        *self.last() = Some((lookup, PskIdentity::parse(identity).ok()));
+        Some(psk)
     }
 }
 

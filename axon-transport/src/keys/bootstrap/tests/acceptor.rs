@@ -51,6 +51,25 @@ fn a_miss_asks_once_and_the_next_look_up_finds_the_clients_psk() {
     assert_eq!(resolver.identity().unwrap().client_sae(), "sae-a");
 }
 
+/// A client may offer several identities: the daemon asks its KME for none of them if it has one.
+#[test]
+fn a_look_up_among_several_identities_fetches_nothing() {
+    let (acceptor, _) = new(listed(&["sae-a"]));
+    let (missing, cached) = (identity("sae-a", "k0"), identity("sae-a", "k1"));
+    look_up(&acceptor, "10.0.0.1", &cached);
+    acceptor.on_answer(key(acceptor.poll_request().unwrap(), "k1", 9));
+
+    let resolver = acceptor.resolver(ip("10.0.0.1"));
+    assert!(resolver.resolve_known(&missing).is_none());
+    assert_eq!(resolver.outcome(), None);
+    assert!(acceptor.poll_request().is_none(), "nothing is fetched");
+    assert!(resolver.resolve_known(&cached).is_some());
+    assert_eq!(resolver.outcome(), Some(Lookup::Found));
+    assert_eq!(resolver.identity().unwrap().key_id(), "k1");
+    assert_eq!(acceptor.spent(&cached), Completion::First);
+    assert!(resolver.resolve_known(&cached).is_none(), "a spent key is not at hand");
+}
+
 #[test]
 fn only_a_completed_handshake_spends_a_key_and_only_once() {
     let (acceptor, clock) = new(listed(&["sae-a"]));
