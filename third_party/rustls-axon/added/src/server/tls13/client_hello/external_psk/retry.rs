@@ -125,7 +125,13 @@ fn repeated_parts(encoded: &[u8]) -> Option<Vec<u8>> {
 /// `encrypted_client_hello`, which is sealed anew.
 ///
 /// `cookie` is missing: no HelloRetryRequest of this server has one to return.
-const MAY_CHANGE: [u16; 5] = [PADDING, PRE_SHARED_KEY, EARLY_DATA, KEY_SHARE, ENCRYPTED_CLIENT_HELLO];
+const MAY_CHANGE: [u16; 5] = [
+    PADDING,
+    PRE_SHARED_KEY,
+    EARLY_DATA,
+    KEY_SHARE,
+    ENCRYPTED_CLIENT_HELLO,
+];
 const PADDING: u16 = 21;
 const PRE_SHARED_KEY: u16 = 41;
 const EARLY_DATA: u16 = 42;
