@@ -18,19 +18,24 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
+mod erasing;
+
 use std::sync::Arc;
 
 use rustls::client::Resumption;
-use rustls::crypto::aws_lc_rs::{cipher_suite, default_provider, kx_group};
+use rustls::crypto::aws_lc_rs::{default_provider, kx_group};
 use rustls::crypto::{CryptoProvider, SupportedKxGroup};
 use rustls::server::NoServerSessionStorage;
 use rustls::version::TLS13;
-use rustls::{ClientConfig, CommonState, NamedGroup, ServerConfig, SupportedCipherSuite};
+use rustls::{ClientConfig, CommonState, NamedGroup, ServerConfig};
 
+use self::erasing::suite;
 use crate::identity::{Auth, SpkiDigest};
 use crate::{Cipher, Error, KeyExchange, Negotiated};
 
 /// aws-lc-rs with X25519MLKEM768 alone and the TLS 1.3 suites with 256-bit keys alone.
+///
+/// Their HKDF erases the secrets that it held.
 pub fn provider() -> CryptoProvider {
     CryptoProvider {
         cipher_suites: Cipher::ALL.into_iter().map(suite).collect(),
@@ -99,10 +104,3 @@ pub(crate) fn protocols(alpn: &[u8]) -> Result<Vec<Vec<u8>>, Error> {
 }
 
 const GROUP: &dyn SupportedKxGroup = kx_group::X25519MLKEM768;
-
-fn suite(cipher: Cipher) -> SupportedCipherSuite {
-    match cipher {
-        Cipher::ChaCha20Poly1305 => cipher_suite::TLS13_CHACHA20_POLY1305_SHA256,
-        Cipher::Aes256Gcm => cipher_suite::TLS13_AES_256_GCM_SHA384,
-    }
-}

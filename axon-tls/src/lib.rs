@@ -28,6 +28,7 @@
 //! ```
 #![forbid(unsafe_code)]
 
+mod erase;
 mod error;
 pub mod hybrid;
 pub mod identity;

@@ -9,6 +9,7 @@ use rustls_axon::external_psk::ExternalPsk;
 use zeroize::Zeroizing;
 
 use super::PskIdentity;
+use crate::erase::erasing_stack;
 use crate::{Cipher, Error};
 
 /// A pre-shared key for one connection, and the identity it is named by.
@@ -76,7 +77,8 @@ pub fn derive_psk(
         Cipher::ChaCha20Poly1305 => ("SHA256", HashAlgorithm::SHA256, 32),
         Cipher::Aes256Gcm => ("SHA384", HashAlgorithm::SHA384, 48),
     };
-    let secret = secret(key, [key_id, client_sae, server_sae, hash_name], len)?;
+    let names = [key_id, client_sae, server_sae, hash_name];
+    let secret = erasing_stack(|| secret(key, names, len))?;
     let psk = ExternalPsk::new(identity.to_bytes(), secret, hash)?;
     Ok(Psk::new(Arc::new(psk), cipher))
 }

@@ -6,6 +6,7 @@ use rustls_axon::external_psk::{ImportedIdentity as TlsIdentity, ImportedPsk};
 use zeroize::Zeroizing;
 
 use super::Psk;
+use crate::erase::erasing_stack;
 use crate::{Cipher, Error};
 
 /// Imports a QKD key for one connection, as RFC 9258 does.
@@ -33,7 +34,8 @@ pub fn import_psk(
     let identity = TlsIdentity::new(named.key_id.as_bytes(), &context, hash(cipher))?;
     let base_key = Zeroizing::new(key.to_vec());
     let suite = TLS13_CHACHA20_POLY1305_SHA256.tls13().ok_or(Error::KeyGeneration)?;
-    Ok(Psk::new(ImportedPsk::new(identity, &base_key, suite)?.into(), cipher))
+    let imported = erasing_stack(|| ImportedPsk::new(identity, &base_key, suite))?;
+    Ok(Psk::new(imported.into(), cipher))
 }
 
 /// What the identity of an imported QKD key says. It is sent in the clear.

@@ -18,6 +18,7 @@ use super::tls::quic::{
     PacketKey, Secrets, ServerConnection, Suite, Version,
 };
 use super::tls::{self, ClientConfig, ServerConfig};
+use crate::erase::{erasing_stack, erasing_stack_of_packet};
 use crate::quic::protection;
 
 /// Client side of quinn's configuration.
@@ -41,9 +42,12 @@ impl crypto::ClientConfig for Client {
         let version = supported(version)?;
         let invalid_name = || ConnectError::InvalidServerName(server_name.into());
         let name = ServerName::try_from(server_name).map_err(|_| invalid_name())?.to_owned();
-        let conn = ClientConnection::new(Arc::clone(&self.tls), version, name, encoded(params))
-            .map_err(|_| ConnectError::EndpointStopping)?;
-        Ok(Box::new(Session::new(Ok(conn.into()), Side::Client)))
+        // the ClientHello has a binder, which is made with the pre-shared key
+        erasing_stack(|| {
+            let conn = ClientConnection::new(Arc::clone(&self.tls), version, name, encoded(params))
+                .map_err(|_| ConnectError::EndpointStopping)?;
+            Ok(Box::new(Session::new(Ok(conn.into()), Side::Client)) as Box<dyn crypto::Session>)
+        })
     }
 }
 
@@ -90,7 +94,7 @@ struct Session {
     told_of_handshake_data: bool,
     /// A server's 1-RTT keys, which TLS has before the client is known to be the client.
     withheld: Option<Keys>,
-    next_secrets: Option<Secrets>,
+    next_secrets: Option<Box<Secrets>>,
 }
 
 impl Session {
@@ -128,7 +132,7 @@ impl crypto::Session for Session {
 
     fn read_handshake(&mut self, buf: &[u8]) -> Result<bool, TransportError> {
         let conn = self.conn.as_mut().map_err(|err| transport_error(None, err))?;
-        conn.read_hs(buf).map_err(|err| transport_error(conn.alert(), &err))?;
+        erasing_stack(|| conn.read_hs(buf)).map_err(|err| transport_error(conn.alert(), &err))?;
 
         let first_time = !self.told_of_handshake_data && !conn.is_handshaking();
         self.told_of_handshake_data |= first_time;
@@ -148,11 +152,10 @@ impl crypto::Session for Session {
     fn write_handshake(&mut self, buf: &mut Vec<u8>) -> Option<Keys> {
         let handshaking = self.is_handshaking();
         let conn = self.conn.as_mut().ok()?;
-        match conn.write_hs(buf) {
-            Some(KeyChange::Handshake { keys }) => Some(quinn_keys(keys)),
-            Some(KeyChange::OneRtt { keys, next }) => {
-                self.next_secrets = Some(next);
-                let keys = quinn_keys(keys);
+        match erasing_stack(|| change_of_keys(conn, buf)) {
+            Some((keys, None)) => Some(keys),
+            Some((keys, next)) => {
+                self.next_secrets = next;
                 if self.side.is_server() && handshaking {
                     self.withheld = Some(keys);
                     return None;
@@ -165,7 +168,8 @@ impl crypto::Session for Session {
     }
 
     fn next_1rtt_keys(&mut self) -> Option<KeyPair<Box<dyn crypto::PacketKey>>> {
-        let keys = self.next_secrets.as_mut()?.next_packet_keys();
+        let next = self.next_secrets.as_mut()?;
+        let keys = erasing_stack(|| next.next_packet_keys());
         Some(KeyPair {
             local: Box::new(PacketProtection(keys.local)),
             remote: Box::new(PacketProtection(keys.remote)),
@@ -183,9 +187,20 @@ impl crypto::Session for Session {
         context: &[u8],
     ) -> Result<(), ExportKeyingMaterialError> {
         let conn = self.conn.as_ref().map_err(|_| ExportKeyingMaterialError)?;
-        conn.export_keying_material(output, label, Some(context))
-            .map(|_| ())
+        erasing_stack(|| conn.export_keying_material(output, label, Some(context)).map(|_| ()))
             .map_err(|_| ExportKeyingMaterialError)
+    }
+}
+
+/// The next keys, if the handshake has come to them, and with those for data the secrets of the
+/// keys after them, in a box that moves do not copy.
+fn change_of_keys(
+    conn: &mut Connection,
+    buf: &mut Vec<u8>,
+) -> Option<(Keys, Option<Box<Secrets>>)> {
+    match conn.write_hs(buf)? {
+        KeyChange::Handshake { keys } => Some((quinn_keys(keys), None)),
+        KeyChange::OneRtt { keys, next } => Some((quinn_keys(keys), Some(Box::new(next)))),
     }
 }
 
@@ -196,9 +211,7 @@ impl crypto::PacketKey for PacketProtection {
     fn encrypt(&self, packet: u64, buf: &mut [u8], header_len: usize) {
         let (header, rest) = buf.split_at_mut(header_len);
         let (payload, tag_out) = rest.split_at_mut(rest.len() - self.0.tag_len());
-        let tag = self
-            .0
-            .encrypt_in_place(packet, header, payload)
+        let tag = erasing_stack_of_packet(|| self.0.encrypt_in_place(packet, header, payload))
             .expect("a QUIC packet is within the limits of the AEAD");
         tag_out.copy_from_slice(tag.as_ref());
     }
@@ -209,8 +222,8 @@ impl crypto::PacketKey for PacketProtection {
         header: &[u8],
         payload: &mut BytesMut,
     ) -> Result<(), CryptoError> {
-        let plain = self.0.decrypt_in_place(packet, header, payload).map_err(|_| CryptoError)?;
-        let len = plain.len();
+        let open = || self.0.decrypt_in_place(packet, header, payload).map(|plain| plain.len());
+        let len = erasing_stack_of_packet(open).map_err(|_| CryptoError)?;
         payload.truncate(len);
         Ok(())
     }
@@ -247,13 +260,15 @@ impl HeaderProtection {
 impl crypto::HeaderKey for HeaderProtection {
     fn decrypt(&self, pn_offset: usize, packet: &mut [u8]) {
         let (sample, first, packet_number) = self.parts(pn_offset, packet);
-        self.0.decrypt_in_place(sample, first, packet_number).expect("the sample has its length");
+        erasing_stack_of_packet(|| self.0.decrypt_in_place(sample, first, packet_number))
+            .expect("the sample has its length");
     }
 
     fn encrypt(&self, pn_offset: usize, packet: &mut [u8]) {
         let (sample, first, packet_number) = self.parts(pn_offset, packet);
         // of the room for it, no more is changed than the first byte says the packet number takes
-        self.0.encrypt_in_place(sample, first, packet_number).expect("the sample has its length");
+        erasing_stack_of_packet(|| self.0.encrypt_in_place(sample, first, packet_number))
+            .expect("the sample has its length");
     }
 
     fn sample_size(&self) -> usize {
