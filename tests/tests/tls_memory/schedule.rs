@@ -1,0 +1,191 @@
+//! The key schedule of RFC 8446 section 7 and RFC 9001 section 5, from a QKD key on.
+
+use axon_tls::{Cipher, PskKex};
+use hmac::{Hmac, KeyInit, Mac};
+use sha2::{Digest, Sha256, Sha384};
+
+use crate::child::{CLIENT_SAE, EXPORTER, KEY_ID, SERVER_SAE};
+
+pub(crate) struct Secret {
+    pub(crate) name: String,
+    pub(crate) bytes: Vec<u8>,
+}
+
+impl Secret {
+    pub(crate) fn new(name: impl Into<String>, bytes: &[u8]) -> Self {
+        Self { name: name.into(), bytes: bytes.to_vec() }
+    }
+}
+
+#[derive(Clone, Copy)]
+struct Hash(Cipher);
+
+impl Hash {
+    fn len(self) -> usize {
+        if self.0 == Cipher::Aes256Gcm { 48 } else { 32 }
+    }
+
+    fn digest(self, data: &[u8]) -> Vec<u8> {
+        match self.0 {
+            Cipher::Aes256Gcm => Sha384::digest(data).to_vec(),
+            Cipher::ChaCha20Poly1305 => Sha256::digest(data).to_vec(),
+        }
+    }
+
+    fn hmac(self, key: &[u8], data: &[u8]) -> Vec<u8> {
+        match self.0 {
+            Cipher::Aes256Gcm => {
+                let mac = Hmac::<Sha384>::new_from_slice(key).unwrap();
+                mac.chain_update(data).finalize().into_bytes().to_vec()
+            }
+            Cipher::ChaCha20Poly1305 => {
+                let mac = Hmac::<Sha256>::new_from_slice(key).unwrap();
+                mac.chain_update(data).finalize().into_bytes().to_vec()
+            }
+        }
+    }
+
+    /// HKDF-Expand-Label for at most one block.
+    fn expand(self, secret: &[u8], label: &str, context: &[u8], len: usize) -> Vec<u8> {
+        let mut info = vec![0, len as u8, label.len() as u8 + 6];
+        info.extend(b"tls13 ");
+        info.extend(label.as_bytes());
+        info.push(context.len() as u8);
+        info.extend(context);
+        info.push(1);
+        self.hmac(secret, &info)[..len].to_vec()
+    }
+
+    fn derive(self, secret: &[u8], label: &str, messages: &[u8]) -> Vec<u8> {
+        self.expand(secret, label, &self.digest(messages), self.len())
+    }
+}
+
+/// Every secret of one connection.
+pub(crate) struct Schedule {
+    hash: Hash,
+    /// Secrets that the connection has no use for once it is established.
+    handshake: Vec<(String, Vec<u8>)>,
+    /// Secrets that it uses to its end.
+    traffic: Vec<(String, Vec<u8>)>,
+}
+
+impl Schedule {
+    /// `transcript` is ClientHello to the client's Finished. With psk_dhe_ke the schedule ends where
+    /// the key exchange comes in.
+    pub(crate) fn new(cipher: Cipher, kex: PskKex, key: &[u8; 32], transcript: &[u8]) -> Self {
+        let mut schedule = Self { hash: Hash(cipher), handshake: vec![], traffic: vec![] };
+        let psk = schedule.pre_shared_key(key);
+        let (hash, len) = (schedule.hash, schedule.hash.len());
+        let zeros = vec![0; len];
+
+        let early = schedule.step("early secret", hash.hmac(&zeros, &psk));
+        let binder = schedule.step("binder key", hash.derive(&early, "ext binder", b""));
+        schedule.step("binder's finished key", hash.expand(&binder, "finished", b"", len));
+        let derived = schedule.step("derived secret", hash.derive(&early, "derived", b""));
+        if kex == PskKex::PskDheKe {
+            return schedule;
+        }
+
+        let [server_hello, server_finished, client_finished] = flights(transcript);
+        let handshake = schedule.step("handshake secret", hash.hmac(&derived, &zeros));
+        for (name, label) in [("client", "c hs traffic"), ("server", "s hs traffic")] {
+            let secret = hash.derive(&handshake, label, server_hello);
+            schedule.step(format!("{name} handshake traffic secret"), secret.clone());
+            let finished = hash.expand(&secret, "finished", b"", len);
+            schedule.step(format!("{name}'s finished key"), finished);
+            for label in ["quic key", "quic hp"] {
+                let key = hash.expand(&secret, label, b"", 32);
+                schedule.step(format!("{name}'s handshake {label}"), key);
+            }
+        }
+        let derived =
+            schedule.step("second derived secret", hash.derive(&handshake, "derived", b""));
+        let master = schedule.step("master secret", hash.hmac(&derived, &zeros));
+
+        for (name, label) in [("client", "c ap traffic"), ("server", "s ap traffic")] {
+            let mut secret = hash.derive(&master, label, server_finished);
+            let header = hash.expand(&secret, "quic hp", b"", 32);
+            schedule.later(format!("{name}'s quic hp"), header);
+            for update in 0..4 {
+                schedule.later(format!("{name} traffic secret {update}"), secret.clone());
+                let key = hash.expand(&secret, "quic key", b"", 32);
+                schedule.later(format!("{name}'s quic key {update}"), key);
+                secret = hash.expand(&secret, "quic ku", b"", len);
+            }
+        }
+        let exporter = hash.derive(&master, "exp master", server_finished);
+        let exported = hash.derive(&exporter, EXPORTER, b"");
+        schedule.later("exporter secret", exporter);
+        schedule.later("secret of one exporter label", exported);
+        let resumption = hash.derive(&master, "res master", client_finished);
+        schedule.later("resumption secret", resumption);
+        schedule
+    }
+
+    /// What `derive_psk()` makes of a QKD key, by the words of its documentation.
+    fn pre_shared_key(&mut self, key: &[u8; 32]) -> Vec<u8> {
+        let (sha256, len) = (Hash(Cipher::ChaCha20Poly1305), self.hash.len());
+        let prk = sha256.hmac(b"AXON-QKD-TLS13-EXTERNAL-PSK-v1", key);
+        let mut info = Vec::new();
+        let name = if len == 48 { "SHA384" } else { "SHA256" };
+        for part in [KEY_ID, CLIENT_SAE, SERVER_SAE, name] {
+            info.extend((part.len() as u16).to_be_bytes());
+            info.extend(part.as_bytes());
+        }
+        let first = sha256.hmac(&prk, &[&info[..], &[1]].concat());
+        let second = sha256.hmac(&prk, &[&first[..], &info, &[2]].concat());
+        let psk = [first, second].concat()[..len].to_vec();
+        self.later("QKD key", key.to_vec());
+        self.later("PRK of the QKD key", prk);
+        self.later("pre-shared key", psk.clone());
+        psk
+    }
+
+    fn step(&mut self, name: impl Into<String>, secret: Vec<u8>) -> Vec<u8> {
+        self.handshake.push((name.into(), secret.clone()));
+        secret
+    }
+
+    fn later(&mut self, name: impl Into<String>, secret: Vec<u8>) {
+        self.traffic.push((name.into(), secret));
+    }
+
+    pub(crate) fn of_the_handshake(&self) -> Vec<Secret> {
+        self.handshake.iter().map(|(name, bytes)| Secret::new(name, bytes)).collect()
+    }
+
+    pub(crate) fn all(&self) -> Vec<Secret> {
+        let all = self.handshake.iter().chain(&self.traffic);
+        all.map(|(name, bytes)| Secret::new(name, bytes)).collect()
+    }
+}
+
+/// The transcript up to ServerHello, up to the server's Finished, and up to the client's.
+fn flights(transcript: &[u8]) -> [&[u8]; 3] {
+    let mut ends = Vec::new();
+    let mut at = 0;
+    while let [kind, high, middle, low, ..] = transcript[at..] {
+        at += 4 + usize::from(high) * 65_536 + usize::from(middle) * 256 + usize::from(low);
+        ends.push((kind, at));
+    }
+    let kinds: Vec<u8> = ends.iter().map(|(kind, _)| *kind).collect();
+    assert_eq!(kinds, [1, 2, 8, 20, 20], "hellos, EncryptedExtensions, Finished twice");
+    [ends[1].1, ends[3].1, ends[4].1].map(|end| &transcript[..end])
+}
+
+/// RFC 8448, section 3: what makes this key schedule worth anything.
+#[test]
+fn the_key_schedule_is_that_of_rfc_8448() {
+    let hash = Hash(Cipher::ChaCha20Poly1305);
+    let early = hash.hmac(&[0; 32], &[0; 32]);
+    let derived = hash.derive(&early, "derived", b"");
+    assert_eq!(
+        early,
+        crate::unhex("33ad0a1c607ec03b09e6cd9893680ce210adf300aa1f2660e1b22e10f170f92a")
+    );
+    assert_eq!(
+        derived,
+        crate::unhex("6f2615a108c702c5678f54fc9dbab69716c076189c48250cebeac3576c3611ba")
+    );
+}
