@@ -191,6 +191,8 @@ fn selects(hello: &ClientHello, index: usize) -> bool {
     let flight = answer(PskKeyExchangeMode::PskKe, &hello_bytes).unwrap();
     let server_hello = plaintext(&flight);
     let selected = [&[0, 41, 0, 2][..], &(index as u16).to_be_bytes()].concat();
+    // `supported_versions` and the selection, and no share
+    assert_eq!(server_hello.len(), 4 + 2 + 32 + 33 + 2 + 1 + 2 + 6 + 6);
     let transcript = [&hello_bytes[..], &server_hello].concat();
     let secret = &hello.offers[index].secret;
     let mut client = Peer::new(Role::Client, Some(secret), None, transcript);

@@ -180,6 +180,12 @@ fn server_follows_key_updates_but_not_a_flood() {
     };
     let error = (0..100).find_map(|_| flood().err());
     assert_eq!(error, Some(PeerMisbehaved::TooManyKeyUpdateRequests.into()));
+
+    for (body, alert) in [(&[2][..], 47), (&[], 50), (&[0, 0], 50)] {
+        let (mut server, mut client) = connected();
+        let error = feed(&mut server, &client.say(24, body)).unwrap_err();
+        assert_eq!(client.alert_in(&written(&mut server)), Some(alert), "{body:?}: {error}");
+    }
 }
 
 /// RFC 8446 5.1: a record that holds the last message under old keys ends with it.

@@ -108,6 +108,32 @@ fn server_takes_the_second_identity_under_its_own_binder() {
     assert_eq!(answer(other, Some(vec![second, first])), Err(51));
 }
 
+/// A resolver that compares names carelessly: the server compares them by itself.
+struct Careless;
+
+impl fmt::Debug for Careless {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Careless")
+    }
+}
+
+impl ResolvesExternalPsk for Careless {
+    fn resolve(&self, _: ExternalPskOffer<'_>) -> Option<Arc<ExternalPsk>> {
+        Some(psk("a", 1, SHA256))
+    }
+}
+
+/// RFC 9257 6.1.1: identities are compared byte by byte.
+#[test]
+fn an_identity_that_differs_in_one_byte_is_another() {
+    for (offered, alert) in [("a", None), ("A", Some(80)), ("a\0", Some(80)), ("aa", Some(80))] {
+        let mut server = server(server_on(&[SHA256], Arc::new(Careless)));
+        let hello = ClientHello::new(vec![Offer::new(offered, &SECRET)]).encode();
+        let refused = feed(&mut server, &records(HANDSHAKE, &hello)).is_err();
+        assert_eq!(refused.then(|| *written(&mut server).last().unwrap()), alert, "{offered:?}");
+    }
+}
+
 /// Knows a PSK under every name, and none of them goes with a suite of the server.
 struct WrongHash(std::sync::atomic::AtomicUsize);
 
