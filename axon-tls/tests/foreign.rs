@@ -3,13 +3,23 @@
 
 mod peers;
 
+use std::fmt;
 use std::net::SocketAddr;
+use std::sync::Arc;
 
 use axon_tls::{Cipher, PskKex, qkd};
 use peers::psk::{is_on, openssl_psk, our_client, our_server, psk, vector};
 use peers::{
     LABEL, Peer, dial, exchange, file, gnutls, handshake, listen, openssls, patient, port, skipped,
 };
+use rustls_axon::crypto::CryptoProvider;
+use rustls_axon::crypto::aws_lc_rs::{cipher_suite, default_provider, kx_group};
+use rustls_axon::crypto::hash::HashAlgorithm;
+use rustls_axon::external_psk::{
+    ExternalPsk, ExternalPskOffer, PskKeyExchangeMode, ResolvesExternalPsk,
+};
+use rustls_axon::{HandshakeKind, ServerConfig, ServerConnection};
+use zeroize::Zeroizing;
 
 /// Every cipher and mode that `program` can do.
 fn with_openssl(test: impl Fn(&str, Cipher, PskKex)) {
@@ -134,5 +144,66 @@ fn gnutls_both_ways_and_its_classical_groups_refused() {
         } else {
             assert_eq!(qkd::negotiated(&conn), None);
         }
+    }
+}
+
+/// A server of rustls-axon whose only group is one that no client sends a share of at first.
+fn retrying_server() -> ServerConnection {
+    let cipher = Cipher::ChaCha20Poly1305;
+    let (identity, secret) = vector(cipher);
+    let byte = |at| u8::from_str_radix(&secret[at..at + 2], 16).unwrap();
+    let secret = Zeroizing::new((0..secret.len()).step_by(2).map(byte).collect::<Vec<u8>>());
+    let psk = ExternalPsk::new(identity, secret, HashAlgorithm::SHA256).unwrap();
+    let provider = CryptoProvider {
+        cipher_suites: vec![cipher_suite::TLS13_CHACHA20_POLY1305_SHA256],
+        kx_groups: vec![kx_group::SECP384R1],
+        ..default_provider()
+    };
+    let config = ServerConfig::builder_with_provider(Arc::new(provider))
+        .with_external_psk_resolver(Arc::new(OneKey(Arc::new(psk))), PskKeyExchangeMode::PskDheKe)
+        .unwrap();
+    ServerConnection::new(Arc::new(config)).unwrap()
+}
+
+struct OneKey(Arc<ExternalPsk>);
+
+impl fmt::Debug for OneKey {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("OneKey")
+    }
+}
+
+impl ResolvesExternalPsk for OneKey {
+    fn resolve(&self, offer: ExternalPskOffer<'_>) -> Option<Arc<ExternalPsk>> {
+        let known = offer.identities().any(|identity| identity == self.0.identity());
+        known.then(|| Arc::clone(&self.0))
+    }
+}
+
+/// What a server demands of a second ClientHello is what foreign clients do.
+#[test]
+fn foreign_clients_get_through_a_hello_retry_request() {
+    let (identity, secret) = vector(Cipher::ChaCha20Poly1305);
+    let retried = |start: &dyn Fn(SocketAddr) -> Peer| {
+        let (listener, addr) = listen();
+        let _client = start(addr);
+        let mut socket = patient(listener.accept().unwrap().0);
+        let mut conn = retrying_server();
+        handshake(&mut conn, &mut socket).unwrap();
+        assert_eq!(conn.handshake_kind(), Some(HandshakeKind::FullWithHelloRetryRequest));
+        assert_eq!(conn.external_psk().unwrap().identity(), identity.as_bytes());
+    };
+    for (program, _) in openssls() {
+        retried(&|addr| {
+            let addr = addr.to_string();
+            let mut args = vec!["s_client", "-connect", &addr, "-tls1_3", "-psk", &secret];
+            args.extend(["-psk_identity", &identity, "-groups", "X25519:P-384"]);
+            args.extend(["-ciphersuites", "TLS_CHACHA20_POLY1305_SHA256"]);
+            Peer::start(&program, &args)
+        });
+    }
+    if gnutls() {
+        let groups = "-GROUP-ALL:+GROUP-X25519:+GROUP-SECP256R1:+GROUP-SECP384R1";
+        retried(&|addr| gnutls_client(addr, &format!("{GNUTLS_ECDHE_PSK}:{groups}")));
     }
 }
