@@ -3,7 +3,7 @@
 use std::{collections::BTreeMap, fmt::Write as _, io::Write as _};
 
 use axon_transport::{
-    daemon::status::{LinkStatus, RelayStatus, Status, TopicStatus},
+    daemon::status::{LinkStatus, RelayStatus, SessionStatus, Status, TopicStatus},
     session,
 };
 use serde_json::Value;
@@ -45,6 +45,7 @@ fn render(status: &Status) -> String {
             ("mode", mode(status)),
             ("socket", status.socket.clone()),
             ("keeps files in", status.runtime_dir.clone().unwrap_or_else(|| "nothing".to_owned())),
+            ("discovery", discovery(status)),
             ("gateway", format!("{}, UDP port {port}", status.gateway)),
         ],
     );
@@ -52,6 +53,7 @@ fn render(status: &Status) -> String {
     section(&mut out, "Links", "no other host is linked", links(&status.links));
     keys(&mut out, &status.keys);
     section(&mut out, "Topics", "none", topics(status));
+    section(&mut out, "Out of range", "no pair", out_of_range(status));
     section(&mut out, "Sessions", "none", sessions(status));
     section(&mut out, "Refusals", "nobody was refused", refusals(status));
     out
@@ -62,6 +64,15 @@ fn mode(status: &Status) -> String {
     let sae = status.sae.as_ref().map(|sae| format!(", SAE {sae}")).unwrap_or_default();
     let details: Vec<&str> = details.into_iter().flatten().collect();
     format!("{} ({}){sae}", status.mode, details.join(", "))
+}
+
+/// How far the daemon looks for other hosts, and for which by name.
+fn discovery(status: &Status) -> String {
+    let looks = &status.discovery;
+    if looks.hosts.is_empty() {
+        return looks.range.clone();
+    }
+    format!("{}, looks for {}", looks.range, looks.hosts.join(", "))
 }
 
 fn settings(status: &Status) -> Table {
@@ -200,11 +211,47 @@ fn stalled(topic: &TopicStatus) -> String {
 }
 
 fn sessions(status: &Status) -> Table {
-    let mut table = Table::new(&[">process", "name", "role", ">endpoints", "memory"]);
+    let mut table = Table::new(&[">process", "name", "role", ">endpoints", "range", "memory"]);
     for session in &status.sessions {
         let (pid, endpoints) = (session.pid.to_string(), session.endpoints.to_string());
         let (name, role) = (session.name.clone(), session.role.clone());
-        table.row([pid, name, role, endpoints, memory(session.relay.as_ref())]);
+        let memory = memory(session.relay.as_ref());
+        table.row([pid, name, role, endpoints, range(session, &status.links), memory]);
+    }
+    table
+}
+
+/// A session's discovery range and static peers, and which of the linked hosts those are.
+fn range(session: &SessionStatus, links: &[LinkStatus]) -> String {
+    let Some(range) = &session.range else { return dash() };
+    let mut text = range.clone();
+    if !session.range_stated {
+        text += " (its library states none)";
+    }
+    if !session.static_peers.is_empty() {
+        let named = |id: &String| {
+            let link = links.iter().find(|link| link.peer == *id);
+            link.map_or_else(|| id.clone(), |link| link.host.clone())
+        };
+        let linked: Vec<String> = session.lists.iter().map(named).collect();
+        let linked = if linked.is_empty() { "none".to_owned() } else { linked.join(", ") };
+        let _ =
+            write!(text, ", lists {}; linked of these: {linked}", session.static_peers.join(", "));
+    }
+    text
+}
+
+fn out_of_range(status: &Status) -> Table {
+    let mut table = Table::new(&["topic", "publisher", "subscription", "why"]);
+    for topic in &status.topics {
+        for pair in &topic.out_of_range {
+            table.row([
+                topic.topic.clone(),
+                pair.writer.clone(),
+                pair.reader.clone(),
+                pair.reason.clone(),
+            ]);
+        }
     }
     table
 }
@@ -263,7 +310,7 @@ fn section(out: &mut String, title: &str, none: &str, table: Table) {
 #[cfg(test)]
 mod tests {
     use axon_transport::daemon::status::{
-        ReaderStatus, RefusalStatus, TrafficStatus, WriterStatus,
+        DiscoveryStatus, OutOfRangeStatus, ReaderStatus, RefusalStatus, TrafficStatus, WriterStatus,
     };
     use serde_json::json;
 
@@ -287,8 +334,23 @@ mod tests {
             runtime_dir: None,
             port: Some(61_348),
             gateway: "running".to_owned(),
+            discovery: DiscoveryStatus {
+                range: "SUBNET".to_owned(),
+                hosts: vec!["robot-2".to_owned()],
+            },
             traffic: TrafficStatus::default(),
-            sessions: Vec::new(),
+            sessions: vec![SessionStatus {
+                pid: 9,
+                name: "talker".to_owned(),
+                role: "application".to_owned(),
+                endpoints: 1,
+                queued: 0,
+                range: Some("LOCALHOST".to_owned()),
+                range_stated: true,
+                static_peers: vec!["robot-2".to_owned()],
+                lists: Vec::new(),
+                relay: None,
+            }],
             topics: vec![TopicStatus {
                 topic: "/scan".to_owned(),
                 bytes_committed: 3 << 20,
@@ -297,6 +359,11 @@ mod tests {
                     WriterStatus { depth: Some(10), ..WriterStatus::default() },
                     WriterStatus::default(),
                 ],
+                out_of_range: vec![OutOfRangeStatus {
+                    writer: "aa".to_owned(),
+                    reader: "bb".to_owned(),
+                    reason: "the range is LOCALHOST".to_owned(),
+                }],
                 readers: vec![reader(41, Some(12_000), true), reader(42, Some(999), true)],
                 ..TopicStatus::default()
             }],
@@ -339,7 +406,9 @@ mod tests {
             "5 overwritten",
             "pid 41 (stopped, 12.0 s)",
             "wrong PSK",
-            "Sessions\n  none\n",
+            "SUBNET, looks for robot-2",
+            "LOCALHOST, lists robot-2; linked of these: none",
+            "the range is LOCALHOST",
         ] {
             assert!(text.contains(part), "{part:?} is missing in:\n{text}");
         }

@@ -267,17 +267,17 @@
 #define AXON_DISCOVERY_ENVIRONMENT 0
 
 /**
- * Nowhere, not even to peers that are listed.
+ * Nowhere: the session reaches its own endpoints alone, static peers or not.
  */
 #define AXON_DISCOVERY_OFF 1
 
 /**
- * This host, and the peers that are listed.
+ * This host, and other hosts of which either side lists the other as a static peer.
  */
 #define AXON_DISCOVERY_LOCALHOST 2
 
 /**
- * What multicast reaches, and the peers that are listed.
+ * What multicast reaches, and static peers.
  */
 #define AXON_DISCOVERY_SUBNET 3
 
@@ -688,7 +688,7 @@ typedef struct axon_session_options_t {
      */
     uint32_t domain;
     /**
-     * AXON_DISCOVERY_*: how far a daemon looks that the session starts.
+     * AXON_DISCOVERY_*: how far the session is discovered, whoever started the daemon.
      */
     uint32_t discovery;
     /**

@@ -218,7 +218,7 @@ fn the_examples_are_built_by_plain_cc_and_meet() {
     let there = |program: &Path| {
         let mut command = alone(program);
         command.env("AXON_DAEMON", "require").env("AXON_BIND_ADDRS", "127.0.0.1");
-        command.env("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF");
+        command.env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST");
         command.env("AXON_RUNTIME_DIR", directory.path());
         command
     };

@@ -193,6 +193,8 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
         added: vec![endpoint(); endpoints],
         removed: vec![gid],
         more: endpoints > 1,
+        localhost: Some(vec![gid]),
+        listing: Some(vec![gid]),
     };
     let mask = |bits| IndexMask::from_bits(bits).unwrap();
     let messages = [
@@ -260,8 +262,10 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             domain: 7,
             settings: vec![("AXON_SECURITY_MODE".into(), "classic".into())],
             relay: Some("AXON_SHM is off".into()),
+            range: Some(0),
+            static_peers: None,
         }),
-        Message::Welcome(Welcome { protocol: PROTOCOL, daemon, pid: 12 }),
+        Message::Welcome(Welcome { protocol: PROTOCOL, daemon, pid: 12, ranges: Some(true) }),
         Message::Refused(Refused {
             variable: "AXON_QUIC_CIPHER".into(),
             ours: "chacha20-poly1305".into(),
@@ -280,7 +284,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
         Message::Graph(Graph {
             version: 3,
             whole: true,
-            added: vec![GraphItem { endpoint: endpoint(), daemon: Some(daemon) }],
+            added: vec![GraphItem { endpoint: endpoint(), daemon: Some(daemon), reach: None }],
             removed: vec![writer],
             more: false,
             ended: Some(vec![writer]),

@@ -54,6 +54,14 @@ void set_discovery(
   const rmw_init_options_t & options, axon_session_options_t & session,
   std::vector<const char *> & peers)
 {
+  // rcl has resolved ROS_*. Only who calls rmw without rcl leaves it to the library.
+#if AXON_RMW_LOCALHOST_ONLY
+  if (options.localhost_only == RMW_LOCALHOST_ONLY_ENABLED) {
+    // Wins over all that follows.
+    session.discovery = AXON_DISCOVERY_LOCALHOST;
+    return;
+  }
+#endif
 #if AXON_RMW_IRON
   const rmw_discovery_options_t & discovery = options.discovery_options;
   switch (discovery.automatic_discovery_range) {
@@ -79,8 +87,8 @@ void set_discovery(
     peers.push_back(discovery.static_peers[i].peer_address);
   }
 #else
-  session.discovery = options.localhost_only == RMW_LOCALHOST_ONLY_ENABLED ?
-    AXON_DISCOVERY_LOCALHOST : AXON_DISCOVERY_ENVIRONMENT;
+  session.discovery = options.localhost_only == RMW_LOCALHOST_ONLY_DISABLED ?
+    AXON_DISCOVERY_SUBNET : AXON_DISCOVERY_ENVIRONMENT;
 #endif
   session.static_peers = peers.data();
   session.static_peer_count = peers.size();

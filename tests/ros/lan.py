@@ -97,6 +97,11 @@ class LanHost(Host):
     def start(self, *command):
         return super().start(*self._namespace.enter, *command)
 
+    def start_with(self, variables, *command):
+        """Start a command with variables of its own beside the host's."""
+        settings = [f'{name}={value}' for name, value in variables.items()]
+        return self.start('env', *settings, *command)
+
     def status(self):
         """What this host's daemon says of itself; None where there is no daemon."""
         asked = subprocess.run(

@@ -220,3 +220,60 @@ def test_a_host_whose_kme_is_on_another_qkd_network_exchanges_nothing(lan, mode)
     (of_a, _), (_, of_b) = settings(lan, mode), settings(lan, mode)
     unknown = 'the PSK identity is not known'
     refused(lan.host('a', **of_a), lan.host('b', **of_b), [unknown, unknown])
+
+
+@pytest.mark.parametrize('first', ['kept_in', 'wide'])
+@pytest.mark.parametrize('variables', [
+    {'ROS_LOCALHOST_ONLY': '1'},
+    {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'},
+    {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'},
+], ids=['localhost_only', 'localhost', 'off'])
+def test_a_node_has_its_own_range_whoever_started_the_daemon(lan, variables, first):  # noqa: F811
+    a, b = lan.host('a'), lan.host('b')
+    heard_kept, heard_wide = listener(b, 'kept'), listener(b, 'wide', '-r', '__node:=of_wide')
+
+    def start(which):
+        if which == 'wide':
+            return talker(a, 'wide', '-r', '__node:=talker_wide')
+        return a.start_with(
+            variables, 'ros2', 'run', 'demo_nodes_cpp', 'talker', '--ros-args',
+            '-r', 'chatter:=kept', '-r', '__node:=talker_kept')
+
+    order = [first, 'wide' if first == 'kept_in' else 'kept_in']
+    speakers = {}
+    for which in order:
+        speakers[which] = start(which)
+        speakers[which].said('Publishing', count=2)
+    heard_wide.said(r'I heard', count=5)
+    so_far = len(speakers['kept_in'].lines)
+    speakers['kept_in'].said('Publishing', count=5, since=so_far)
+    assert 'I heard' not in heard_kept.output
+    nodes = b.run('ros2', 'node', 'list', '--no-daemon').split()
+    assert '/talker_wide' in nodes and '/talker_kept' not in nodes, nodes
+    # On its own host it is heard, unless it is OFF.
+    nodes = a.run('ros2', 'node', 'list', '--no-daemon').split()
+    off = 'OFF' in variables.values()
+    assert ('/talker_kept' in nodes) != off, nodes
+    if not off:
+        listener(a, 'kept', '-r', '__node:=at_home').said('I heard')
+    status = a.status()
+    if status is not None:
+        ranges = {session['range'] for session in status['sessions']} - {None}
+        expected = 'OFF' if off else 'LOCALHOST'
+        assert {'SUBNET', expected} <= ranges, ranges
+
+
+def test_a_static_peer_on_one_side_is_enough(lan):  # noqa: F811
+    a, b = lan.host('a'), lan.host('b')
+    localhost = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+    remap = ['--ros-args', '-r', '__node:=other', '-r', 'chatter:=not_listed']
+    heard = [
+        b.start_with(localhost, 'ros2', 'run', 'demo_nodes_cpp', 'listener'),
+        b.start_with(localhost, 'ros2', 'run', 'demo_nodes_cpp', 'listener', *remap)]
+    lists_b = {**localhost, 'ROS_STATIC_PEERS': '10.88.0.2'}
+    a.start_with(lists_b, 'ros2', 'run', 'demo_nodes_cpp', 'talker')
+    unlisted = a.start_with(localhost, 'ros2', 'run', 'demo_nodes_cpp', 'talker', *remap)
+    heard[0].said('I heard', count=3)
+    so_far = len(unlisted.lines)
+    unlisted.said('Publishing', count=3, since=so_far)
+    assert 'I heard' not in heard[1].output

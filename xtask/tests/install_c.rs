@@ -83,7 +83,9 @@ impl Installed {
         command.env("LD_LIBRARY_PATH", self.path("lib"));
         command.env("AXON_DAEMON_PATH", self.asked(&["--variable=daemon"]).concat());
         command.env("AXON_RUNTIME_DIR", self.path("run")).env("AXON_CONFIG", config);
-        command.env("AXON_BIND_ADDRS", "127.0.0.1").env("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF");
+        command
+            .env("AXON_BIND_ADDRS", "127.0.0.1")
+            .env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST");
         command
     }
 }

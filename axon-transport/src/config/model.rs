@@ -3,6 +3,7 @@
 use std::{net::IpAddr, path::PathBuf, time::Duration};
 
 use axon_tls::{Cipher, PskKex};
+use minicbor::{Decode, Encode};
 
 /// Everything that the environment and `axon.toml` decide.
 #[derive(Clone, Debug)]
@@ -13,7 +14,8 @@ pub struct Config {
     pub cipher: Cipher,
     /// `ROS_DOMAIN_ID`.
     pub domain: u32,
-    /// How far automatic discovery reaches (`ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_LOCALHOST_ONLY`).
+    /// How far a session is discovered (`ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_LOCALHOST_ONLY`). Of a
+    /// daemon it counts while the daemon has no session.
     pub range: DiscoveryRange,
     /// `ROS_STATIC_PEERS`: addresses or host names; empty where the range ignores them.
     pub static_peers: Vec<String>,
@@ -152,15 +154,39 @@ pub enum DaemonPolicy {
     Off,
 }
 
-/// How far automatic discovery reaches, as ROS 2 means it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// How far a session is discovered, as ROS 2 means it; the narrowest first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Encode, Decode)]
+#[cbor(index_only)]
 pub enum DiscoveryRange {
-    /// Nowhere: no peers at all.
+    /// Nowhere: the session matches nothing but itself.
+    #[n(2)]
     Off,
-    /// This host, and peers that either side lists.
+    /// This host, and hosts of which either side lists the other as a static peer.
+    #[n(1)]
     Localhost,
-    /// What multicast reaches, and listed peers.
+    /// What multicast reaches, and static peers.
+    #[n(0)]
     Subnet,
+}
+
+impl DiscoveryRange {
+    /// Its number on every wire.
+    pub const fn number(self) -> u8 {
+        match self {
+            Self::Subnet => 0,
+            Self::Localhost => 1,
+            Self::Off => 2,
+        }
+    }
+
+    /// The value of `ROS_AUTOMATIC_DISCOVERY_RANGE`.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Off => "OFF",
+            Self::Localhost => "LOCALHOST",
+            Self::Subnet => "SUBNET",
+        }
+    }
 }
 
 /// A static peer (`AXON_DAEMON_PEERS`).

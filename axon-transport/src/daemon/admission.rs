@@ -177,6 +177,8 @@ mod tests {
             domain: 3,
             settings: admission().settings,
             relay: None,
+            range: Some(0),
+            static_peers: None,
         }
     }
 

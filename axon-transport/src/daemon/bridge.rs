@@ -11,7 +11,7 @@ use tokio::sync::mpsc;
 use super::status::LinkStatus;
 use crate::{
     config::Config,
-    graph::Endpoint,
+    graph::RemoteEndpoint,
     ids::{DaemonId, Gid},
 };
 
@@ -48,7 +48,7 @@ pub enum ToControl {
         /// Forget what it had.
         reset: bool,
         /// Endpoints that are new.
-        added: Vec<Endpoint>,
+        added: Vec<RemoteEndpoint>,
         /// Endpoints that are gone.
         removed: Vec<Gid>,
     },

@@ -1,14 +1,15 @@
 //! The control plane's state in a running daemon. One thread; never borrowed across an await.
 
 use std::{
-    collections::{BTreeMap, HashMap, VecDeque},
+    collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
+    net::IpAddr,
     os::fd::OwnedFd,
     rc::Rc,
     sync::Arc,
     time::Instant,
 };
 
-use tokio::sync::Notify;
+use tokio::sync::{Notify, watch};
 
 use super::{
     admission::Admission,
@@ -18,6 +19,7 @@ use super::{
 };
 use crate::{
     config::Config,
+    discovery::Wanted,
     ids::{DaemonId, SessionId},
     passed::PassedFd,
     relay::Pool,
@@ -46,6 +48,12 @@ pub(super) struct Control {
     pub(super) probe: Option<OwnedFd>,
     /// Packets that were exchanged with sessions.
     pub(super) traffic: TrafficStatus,
+    /// How far discovery looks, and for whom: as far as the widest session needs.
+    pub(super) wanted: watch::Sender<Wanted>,
+    /// The addresses that names of static peers have.
+    names: BTreeMap<String, Vec<IpAddr>>,
+    /// Where linked peers are.
+    linked: BTreeMap<DaemonId, IpAddr>,
     wakers: HashMap<SessionId, Rc<Notify>>,
     /// Wakes the task that flushes the graph.
     pub(super) changed: Rc<Notify>,
@@ -70,6 +78,9 @@ impl Control {
             pool: Pool::new(config.reliable_queue),
             probe: probe().inspect_err(|error| tracing::error!(%error, "no memory to try")).ok(),
             traffic: TrafficStatus::default(),
+            wanted: watch::Sender::new(Wanted::of(&config, [])),
+            names: BTreeMap::new(),
+            linked: BTreeMap::new(),
             wakers: HashMap::new(),
             config,
             changed: Rc::default(),
@@ -116,6 +127,11 @@ impl Control {
                 bell.notify_one();
             }
         }
+        if self.registry.take_rescoped() {
+            let wanted = Wanted::of(&self.config, self.registry.scopes());
+            self.wanted
+                .send_if_modified(|known| std::mem::replace(known, wanted.clone()) != wanted);
+        }
         self.changed.notify_one();
         if std::mem::replace(&mut self.needed, self.registry.is_needed()) != self.needed {
             self.need.notify_one();
@@ -155,24 +171,62 @@ impl Control {
                 self.port = Some(port);
                 self.gateway = "running".into();
             }
+            ToControl::LinkUp { daemon, address } => self.linked_at(daemon, address.ip()),
             ToControl::RemoteGraph { daemon, reset, added, removed } => {
                 self.registry.remote_graph(daemon, reset, added, removed);
             }
             ToControl::Link(status) => {
+                // A peer may have moved.
+                let daemon = self.linked.keys().find(|d| d.to_string() == status.peer).copied();
+                let address = status.address.parse::<std::net::SocketAddr>();
+                if let (Some(daemon), Ok(address)) = (daemon, address) {
+                    self.linked_at(daemon, address.ip());
+                }
                 self.links.insert(status.peer.clone(), *status);
             }
             ToControl::LinkDown { daemon, reason } => {
                 tracing::info!(%daemon, reason, "link down");
                 self.links.remove(&daemon.to_string());
                 self.registry.remote_gone(&daemon);
+                self.linked.remove(&daemon);
+                self.relist();
             }
             ToControl::Refusal { peer, what, reason } => self.refused(peer, what, reason),
             ToControl::Keys(keys) => self.keys = keys,
-            ToControl::LinkUp { .. }
-            | ToControl::DialFailed { .. }
-            | ToControl::Datagram { .. } => {}
+            ToControl::DialFailed { .. } | ToControl::Datagram { .. } => {}
         }
         self.settle();
+    }
+
+    /// The addresses that names of static peers have now.
+    pub(super) fn named(&mut self, names: BTreeMap<String, Vec<IpAddr>>) {
+        self.names = names;
+        self.relist();
+        self.settle();
+    }
+
+    fn linked_at(&mut self, daemon: DaemonId, address: IpAddr) {
+        let address = address.to_canonical();
+        if self.linked.insert(daemon, address) != Some(address) {
+            self.relist();
+        }
+    }
+
+    /// Decides anew which linked peers each session lists: those whose link is at an address that one
+    /// of its static peers has. What beacons say of addresses does not count, as anybody can write it.
+    pub(super) fn relist(&mut self) {
+        let (names, linked) = (&self.names, &self.linked);
+        self.registry.relist(|peers| {
+            let addresses: BTreeSet<IpAddr> = peers
+                .iter()
+                .flat_map(|peer| match peer.parse::<IpAddr>() {
+                    Ok(address) => vec![address.to_canonical()],
+                    Err(_) => names.get(peer).cloned().unwrap_or_default(),
+                })
+                .collect();
+            let listed = linked.iter().filter(|(_, address)| addresses.contains(address));
+            listed.map(|(daemon, _)| *daemon).collect()
+        });
     }
 
     /// The gateway is no more, and with it everything that was known of other hosts.
@@ -180,7 +234,9 @@ impl Control {
         self.gateway = why.to_owned();
         self.port = None;
         self.links.clear();
-        let daemons: std::collections::BTreeSet<DaemonId> =
+        self.linked.clear();
+        self.relist();
+        let daemons: BTreeSet<DaemonId> =
             self.registry.remote_endpoints().map(|(daemon, _)| *daemon).collect();
         for daemon in daemons {
             self.registry.remote_gone(&daemon);

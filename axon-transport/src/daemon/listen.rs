@@ -23,6 +23,8 @@ use super::{
     watch::watch,
 };
 use crate::{
+    config::Config,
+    graph::Scope,
     ids::{Gid, SessionId},
     passed::{self, PassedFd},
     relay::{Tally, far::Far},
@@ -220,7 +222,7 @@ fn relay(
     let far = Far {
         socket: socket.into_inner(),
         inside: theirs,
-        config: Arc::clone(&state.config),
+        config: scoped(&state.config, scope_of(&hello)),
         name: hello.name,
         id: hello.session,
         tally,
@@ -229,6 +231,17 @@ fn relay(
     if let Err(error) = far.start() {
         tracing::error!(%error, "no thread to relay a session");
     }
+}
+
+/// How far a session is discovered, as it says.
+fn scope_of(hello: &Hello) -> Scope {
+    Scope::of(hello.range, hello.static_peers.clone().unwrap_or_default())
+}
+
+/// The daemon's settings with the range of a relayed session, under whose id they are used.
+fn scoped(config: &Config, scope: Scope) -> Arc<Config> {
+    let Scope { range, static_peers, .. } = scope;
+    Arc::new(Config { range, static_peers, ..config.clone() })
 }
 
 type Admitted = (SessionId, Rc<Notify>, Option<AsyncFd<PassedFd>>);
@@ -267,18 +280,22 @@ fn admit(
         Some([_, _, pidfd]) => Some(watch(pidfd.try_clone().ok()?).ok()?),
         None => None,
     };
+    let scope = (!gateway).then(|| scope_of(&hello));
     let Hello { session, role, name, .. } = hello;
     tracing::debug!(%session, name, pid, "a session");
     let handed = handed.map(|fds| fds.map(Arc::new));
-    if let Err(violation) = control.registry.connect(session, role, name.clone(), pid, handed) {
+    if let Err(violation) =
+        control.registry.connect(session, role, name.clone(), pid, handed, scope)
+    {
         refuse(control, socket, &name, peer, Refused::because(violation.to_string()));
         return None;
     }
+    control.relist();
     if let Inside::Relay { tally, .. } = inside {
         control.registry.set_relayed(&session, Arc::clone(tally));
     }
     let pid = std::process::id();
-    let welcome = Welcome { protocol: PROTOCOL, daemon: control.id, pid };
+    let welcome = Welcome { protocol: PROTOCOL, daemon: control.id, pid, ranges: Some(true) };
     let probe: Vec<BorrowedFd<'_>> = control.probe.iter().map(AsFd::as_fd).collect();
     if !say(socket, Message::Welcome(welcome), &probe) {
         control.registry.disconnect(&session);

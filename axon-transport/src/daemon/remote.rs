@@ -132,6 +132,7 @@ impl Remote {
                     format!("{what} is {} here and {} there", mismatch.ours, mismatch.theirs);
                 control.borrow_mut().refused(peer, what, reason);
             }
+            Action::Named(names) => control.borrow_mut().named(names),
             Action::Gone { daemon } => tracing::debug!(%daemon, "a peer is gone"),
         }
     }
@@ -197,7 +198,10 @@ impl Discovery {
         let (events, inbox) = mpsc::channel(CHANNEL);
         let (outbox, actions) = mpsc::channel(CHANNEL);
         let (config, daemon) = (Arc::clone(&control.config), control.id);
-        let task = spawn_local(async move { discovery::run(&config, daemon, inbox, outbox).await });
+        let wanted = control.wanted.subscribe();
+        let task = spawn_local(async move {
+            discovery::run(&config, daemon, wanted, inbox, outbox).await;
+        });
         Self { events, actions, task }
     }
 

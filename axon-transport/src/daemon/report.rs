@@ -4,11 +4,12 @@ use std::collections::BTreeMap;
 
 use super::{
     control::Control,
-    status::{SessionStatus, Status},
+    status::{DiscoveryStatus, SessionStatus, Status},
     topics::topics,
 };
 use crate::{
     config::{KeyMode, Security},
+    discovery::Wanted,
     session::message::{PROTOCOL, SessionRole},
 };
 
@@ -33,6 +34,10 @@ pub(super) fn status(control: &Control) -> Status {
         role: if s.role == SessionRole::Gateway { "gateway" } else { "application" }.into(),
         endpoints: s.endpoints.len(),
         queued: s.queued(),
+        range: s.scope.as_ref().map(|scope| scope.range.name().to_owned()),
+        range_stated: s.scope.as_ref().is_some_and(|scope| scope.stated),
+        static_peers: s.scope.as_ref().map_or_else(Vec::new, |scope| scope.static_peers.clone()),
+        lists: s.lists.iter().map(ToString::to_string).collect(),
         relay: s.relay.as_deref().map(crate::relay::Tally::show),
     });
     Status {
@@ -51,6 +56,7 @@ pub(super) fn status(control: &Control) -> Status {
         runtime_dir: config.runtime_dir.as_ref().map(|dir| dir.display().to_string()),
         port: control.port,
         gateway: control.gateway.clone(),
+        discovery: discovery(&control.wanted.borrow()),
         traffic: control.traffic,
         sessions: sessions.collect(),
         topics: topics(&control.registry),
@@ -58,5 +64,17 @@ pub(super) fn status(control: &Control) -> Status {
         keys: control.keys.clone(),
         refusals: control.refusals.iter().cloned().collect(),
         settings,
+    }
+}
+
+fn discovery(wanted: &Wanted) -> DiscoveryStatus {
+    let host = |(host, port): &(String, Option<u16>)| match port {
+        Some(port) if host.contains(':') => format!("[{host}]:{port}"),
+        Some(port) => format!("{host}:{port}"),
+        None => host.clone(),
+    };
+    DiscoveryStatus {
+        range: wanted.range.name().to_owned(),
+        hosts: wanted.hosts.iter().map(host).collect(),
     }
 }

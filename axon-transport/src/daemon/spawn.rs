@@ -126,21 +126,18 @@ fn inherited(name: &OsString) -> bool {
     ];
     const PREFIXES: &[&str] = &["AXON_", "ROS_", "LC_"];
     name.to_str().is_some_and(|name| {
-        NAMES.contains(&name) || PREFIXES.iter().any(|prefix| name.starts_with(prefix))
+        NAMES.contains(&name)
+            || PREFIXES.iter().any(|prefix| name.starts_with(prefix))
     })
 }
 
-/// What a session may have been opened with in place of the environment's.
+/// What a session may have been opened with in place of the environment's. A daemon that a session
+/// starts has no range of its own: each session, this one too, tells it theirs.
 fn chosen(config: &Config) -> [(&'static str, String); 3] {
-    let range = match config.range {
-        DiscoveryRange::Off => "OFF",
-        DiscoveryRange::Localhost => "LOCALHOST",
-        DiscoveryRange::Subnet => "SUBNET",
-    };
     [
         ("ROS_DOMAIN_ID", config.domain.to_string()),
-        ("ROS_AUTOMATIC_DISCOVERY_RANGE", range.to_owned()),
-        ("ROS_STATIC_PEERS", config.static_peers.join(";")),
+        ("ROS_AUTOMATIC_DISCOVERY_RANGE", DiscoveryRange::Off.name().to_owned()),
+        ("ROS_STATIC_PEERS", String::new()),
     ]
 }
 

@@ -40,6 +40,9 @@ pub struct Status {
     pub port: Option<u16>,
     /// `running`, `starting`, or why it is not.
     pub gateway: String,
+    /// What discovery does, as far as the sessions need.
+    #[serde(default)]
+    pub discovery: DiscoveryStatus,
     /// Packets exchanged with sessions since the daemon's start.
     #[serde(default)]
     pub traffic: TrafficStatus,
@@ -53,6 +56,15 @@ pub struct Status {
     pub keys: serde_json::Value,
     /// The last refusals, oldest first.
     pub refusals: Vec<RefusalStatus>,
+}
+
+/// What discovery does at present.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DiscoveryStatus {
+    /// The widest range of any session; `SUBNET` alone uses multicast.
+    pub range: String,
+    /// Hosts that are looked for by address or name.
+    pub hosts: Vec<String>,
 }
 
 /// Control packets, which carry no samples.
@@ -79,6 +91,18 @@ pub struct SessionStatus {
     pub endpoints: usize,
     /// Control packets that wait for it.
     pub queued: usize,
+    /// Its discovery range: `SUBNET`, `LOCALHOST` or `OFF`; absent of the gateway.
+    #[serde(default)]
+    pub range: Option<String>,
+    /// Whether it stated that range; one that did not is kept to `LOCALHOST`.
+    #[serde(default)]
+    pub range_stated: bool,
+    /// Its static peers.
+    #[serde(default)]
+    pub static_peers: Vec<String>,
+    /// The daemon ids of the linked peers that these name.
+    #[serde(default)]
+    pub lists: Vec<String>,
     /// Present where it shares no memory: its samples pass through the daemon.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub relay: Option<RelayStatus>,
@@ -137,6 +161,21 @@ pub struct TopicStatus {
     pub readers: Vec<ReaderStatus>,
     /// How many more there are.
     pub more_readers: usize,
+    /// Pairs that are not matched since one session is out of the other's discovery range. Of
+    /// endpoints on other hosts it has those that their daemons showed to this one.
+    #[serde(default)]
+    pub out_of_range: Vec<OutOfRangeStatus>,
+}
+
+/// A pair that the discovery ranges of its sessions keep apart.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct OutOfRangeStatus {
+    /// The GID of the publisher, or of the endpoint of a service.
+    pub writer: String,
+    /// The GID of the subscription, or of the endpoint of a service.
+    pub reader: String,
+    /// Why.
+    pub reason: String,
 }
 
 /// A publisher's ring.

@@ -13,7 +13,7 @@ use std::{
 
 use super::{
     registry::{LocalEndpoint, Registry, SessionEntry},
-    status::{ReaderStatus, TopicStatus, WriterStatus},
+    status::{OutOfRangeStatus, ReaderStatus, TopicStatus, WriterStatus},
 };
 use crate::{
     graph::{Endpoint, EndpointKind},
@@ -30,6 +30,8 @@ use crate::{
 const LISTED: usize = 64;
 /// Readers that are looked at for one status: so many that it still takes a fraction of a second.
 const LOOKED_AT: usize = 1 << 16;
+/// Pairs out of range that the status lists, of all topics.
+const KEPT_APART: usize = 64;
 
 type Sessions = Registry<Arc<PassedFd>>;
 type Session = SessionEntry<Arc<PassedFd>>;
@@ -78,6 +80,15 @@ pub(super) fn topics(registry: &Sessions) -> Vec<TopicStatus> {
         let mut reader = reader(session, local, attach, rings.get(&attach.writer));
         reader.stopped = stopped;
         entry(&mut topics, &local.endpoint).readers.push(reader);
+    }
+    for apart in registry.kept_apart(KEPT_APART, LOOKED_AT) {
+        if let Some(topic) = topics.get_mut(&(apart.topic, apart.type_name)) {
+            topic.out_of_range.push(OutOfRangeStatus {
+                writer: apart.pair.writer.to_string(),
+                reader: apart.pair.reader.to_string(),
+                reason: apart.why.to_string(),
+            });
+        }
     }
     topics.into_values().map(summed_up).collect()
 }

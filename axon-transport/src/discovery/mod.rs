@@ -7,7 +7,8 @@
 #![forbid(unsafe_code)]
 
 use std::{
-    net::{Ipv4Addr, SocketAddr, SocketAddrV4},
+    collections::BTreeMap,
+    net::{IpAddr, Ipv4Addr, SocketAddr, SocketAddrV4},
     ops::RangeInclusive,
 };
 
@@ -21,11 +22,13 @@ pub mod socket;
 mod terms;
 #[cfg(test)]
 mod tests;
+mod wanted;
 
 pub use interfaces::{Interface, interfaces};
 pub use peers::{Arrival, Local, Output, Peers};
 pub use run::{Event, run};
 pub use terms::{Difference, Terms};
+pub use wanted::Wanted;
 
 /// The protocol versions that this release speaks.
 pub const PROTOCOLS: RangeInclusive<u8> = 1..=1;
@@ -82,6 +85,8 @@ pub enum Action {
     },
     /// This peer is not dialled, and why. Said once a peer; after 32 of them one a second.
     Mismatch(Mismatch),
+    /// The addresses that the names of static peers have.
+    Named(BTreeMap<String, Vec<IpAddr>>),
     /// Nothing was heard of this peer for long, or it said goodbye.
     Gone {
         /// Which.

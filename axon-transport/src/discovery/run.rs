@@ -1,19 +1,20 @@
 //! The task that gives [`Peers`] its clock, its sockets and its events.
 
 use std::{
+    collections::{BTreeMap, BTreeSet},
     future::pending,
     net::{IpAddr, SocketAddr},
     time::Duration,
 };
 
 use tokio::{
-    sync::mpsc,
+    sync::{mpsc, watch},
     task::JoinSet,
     time::{Instant, MissedTickBehavior, interval, sleep_until, timeout},
 };
 use tracing::{debug, warn};
 
-use super::{Action, Arrival, Local, Output, Peers, interfaces, socket::SharedSocket};
+use super::{Action, Arrival, Local, Output, Peers, Wanted, interfaces, socket::SharedSocket};
 use crate::{
     config::{Config, DiscoveryRange},
     ids::DaemonId,
@@ -61,7 +62,8 @@ pub enum Event {
     GraphDigest(u64),
 }
 
-/// Discovers until `events` closes, then says goodbye and ends, which closes `actions`.
+/// Discovers as far as is `wanted`, until `events` closes; then says goodbye and ends, which closes
+/// `actions`.
 ///
 /// Never waits for `actions` to have room: a datagram that finds none is lost, a dial counts as
 /// failed. No failure of a socket, an interface or a name ends it; what cannot work is logged, and
@@ -69,6 +71,7 @@ pub enum Event {
 pub async fn run(
     config: &Config,
     daemon: DaemonId,
+    mut wanted: watch::Receiver<Wanted>,
     mut events: mpsc::Receiver<Event>,
     actions: mpsc::Sender<Action>,
 ) {
@@ -78,9 +81,12 @@ pub async fn run(
     let mut names = interval(NAMES_EVERY);
     names.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut lookups = JoinSet::new();
-    let listed = listed(config);
+    let mut hosts = BTreeSet::new();
+    let mut range = DiscoveryRange::Off;
+    wanted.mark_changed();
 
     loop {
+        let nameless = hosts.is_empty() && shell.names.is_empty();
         let wakeup = shell.peers.next_wakeup().map(|at| shell.start + at);
         tokio::select! {
             event = events.recv() => match event {
@@ -98,13 +104,23 @@ pub async fn run(
                 }
             },
             () = sleep_until_some(wakeup) => {}
-            _ = look.tick(), if config.range != DiscoveryRange::Off => shell.look_at_interfaces(),
-            _ = names.tick(), if lookups.is_empty() && !listed.is_empty() => {
-                lookups.spawn(look_up(listed.clone()));
+            Ok(()) = wanted.changed() => {
+                let now = wanted.borrow_and_update().clone();
+                range = now.range;
+                shell.set_range(range);
+                if hosts != now.hosts {
+                    hosts = now.hosts;
+                    // Once the one that is under way is over, with what is wanted by then.
+                    names.reset_immediately();
+                }
+                look.reset_immediately();
+            }
+            _ = look.tick(), if range != DiscoveryRange::Off => shell.look_at_interfaces(),
+            _ = names.tick(), if lookups.is_empty() && !nameless => {
+                lookups.spawn(look_up(hosts.clone()));
             }
             Some(found) = lookups.join_next() => if let Ok(found) = found {
-                let now = shell.start.elapsed();
-                shell.peers.set_listed(now, found);
+                shell.set_found(found);
             },
         }
         let now = shell.start.elapsed();
@@ -124,6 +140,8 @@ struct Shell {
     domain: u32,
     bind: Vec<IpAddr>,
     actions: mpsc::Sender<Action>,
+    /// The addresses of static peers. A name keeps those that it had while its look-up fails.
+    names: BTreeMap<String, Vec<IpAddr>>,
     /// The last failure to open the shared port, so that it is said once.
     complained: bool,
 }
@@ -134,12 +152,41 @@ impl Shell {
             start: Instant::now(),
             peers: Peers::new(Local::of(config, daemon), rand::random()),
             socket: None,
-            multicast: config.range == DiscoveryRange::Subnet,
+            multicast: false,
             domain: config.domain,
             bind: config.bind_addrs.clone(),
             actions,
+            names: BTreeMap::new(),
             complained: false,
         }
+    }
+
+    fn set_range(&mut self, range: DiscoveryRange) {
+        self.multicast = range == DiscoveryRange::Subnet;
+        if !self.multicast {
+            // Leaves the group.
+            self.socket = None;
+        }
+        let now = self.start.elapsed();
+        self.peers.set_range(now, range);
+    }
+
+    fn set_found(&mut self, found: Found) {
+        let now = self.start.elapsed();
+        let mut listed = Vec::new();
+        let mut names: BTreeMap<String, Vec<IpAddr>> = BTreeMap::new();
+        for ((host, port), mut addresses) in found {
+            if addresses.is_empty() {
+                addresses = self.names.get(&host).cloned().unwrap_or_default();
+            }
+            listed.extend(addresses.iter().map(|address| (*address, port)));
+            names.entry(host).or_default().extend(addresses);
+        }
+        listed.dedup();
+        self.peers.set_listed(now, listed);
+        self.names.clone_from(&names);
+        // One that is dropped is overtaken by the next.
+        let _ = self.actions.try_send(Action::Named(names));
     }
 
     fn event(&mut self, event: Event) {
@@ -215,29 +262,38 @@ async fn sleep_until_some(at: Option<Instant>) {
     }
 }
 
-/// The peers that the configuration lists.
-fn listed(config: &Config) -> Vec<(String, Option<u16>)> {
-    let ours = config.daemon_peers.iter().map(|peer| (peer.host.clone(), peer.port));
-    let of_ros = config.static_peers.iter().map(|host| (host.clone(), None));
-    ours.chain(of_ros).collect()
+/// Hosts, with a port where one was given, and their addresses.
+type Found = Vec<((String, Option<u16>), Vec<IpAddr>)>;
+
+async fn look_up(hosts: BTreeSet<(String, Option<u16>)>) -> Found {
+    // At once: a name server that does not answer for one host holds up no other.
+    let mut lookups = JoinSet::new();
+    for (host, port) in hosts {
+        lookups.spawn(async move {
+            let addresses = addresses_of(&host).await;
+            ((host, port), addresses)
+        });
+    }
+    let mut found = lookups.join_all().await;
+    found.sort_unstable();
+    found
 }
 
-async fn look_up(peers: Vec<(String, Option<u16>)>) -> Vec<(IpAddr, Option<u16>)> {
-    let mut found = Vec::new();
-    for (host, port) in peers {
-        if let Ok(address) = host.parse() {
-            found.push((address, port));
-            continue;
+async fn addresses_of(host: &str) -> Vec<IpAddr> {
+    if let Ok(address) = host.parse::<IpAddr>() {
+        return vec![address.to_canonical()];
+    }
+    match timeout(NAME_TIMEOUT, tokio::net::lookup_host((host, 0))).await {
+        Ok(Ok(addresses)) => {
+            addresses.take(MOST_OF_A_NAME).map(|address| address.ip().to_canonical()).collect()
         }
-        match timeout(NAME_TIMEOUT, tokio::net::lookup_host((&*host, 0))).await {
-            Ok(Ok(addresses)) => {
-                let addresses = addresses.take(MOST_OF_A_NAME);
-                found.extend(addresses.map(|address| (address.ip().to_canonical(), port)));
-            }
-            Ok(Err(error)) => debug!(host, %error, "listed peer has no address"),
-            Err(_) => debug!(host, "listed peer: no answer to the look-up of its name"),
+        Ok(Err(error)) => {
+            debug!(host, %error, "static peer has no address");
+            Vec::new()
+        }
+        Err(_) => {
+            debug!(host, "static peer: no answer to the look-up of its name");
+            Vec::new()
         }
     }
-    found.dedup();
-    found
 }

@@ -2,7 +2,11 @@
 
 use std::{net::SocketAddr, time::Duration};
 
-use tokio::{net::UdpSocket, sync::mpsc, time::timeout};
+use tokio::{
+    net::UdpSocket,
+    sync::{mpsc, watch},
+    time::timeout,
+};
 
 use super::{beacon::Datagram, socket::SharedSocket, *};
 use crate::config::{Config, OsFiles};
@@ -41,7 +45,11 @@ impl Daemon {
         let (of_actions, actions) = mpsc::channel(1024);
         let (others, of_others) = mpsc::channel(64);
         events.send(Event::QuicPort(address.port())).await.unwrap();
-        tokio::spawn(async move { run(&config, id, of_events, of_actions).await });
+        tokio::spawn(async move {
+            // Held: there is one for as long as there is a daemon.
+            let wanted = watch::Sender::new(Wanted::of(&config, []));
+            run(&config, id, wanted.subscribe(), of_events, of_actions).await;
+        });
         tokio::spawn(carry(quic, events.downgrade(), actions, others));
         Self { id, address, events, actions: of_others }
     }
@@ -65,6 +73,7 @@ async fn carry(
                 Some(Action::SendFromQuicPort { to, bytes }) => {
                     let _ = quic.send_to(&bytes, to).await;
                 }
+                Some(Action::Named(_)) => {}
                 Some(other) => drop(others.send(other).await),
                 None => return,
             },
@@ -117,7 +126,7 @@ async fn listed_daemons_find_each_other_without_multicast_and_say_why_they_do_no
         212,
         &[
             ("AXON_BIND_ADDRS", "127.0.0.2"),
-            ("AXON_DAEMON_PEERS", "127.0.0.3"),
+            ("ROS_STATIC_PEERS", "127.0.0.3"),
             ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
         ],
     );
@@ -155,7 +164,7 @@ async fn the_shared_port_reaches_all_and_comes_from_the_bound_address() {
         loop {
             let (from, bytes) = timeout(PATIENCE, receiver.receive()).await.unwrap().unwrap();
             if bytes == sent {
-                assert_eq!(from.ip(), "127.0.0.2".parse::<std::net::IpAddr>().unwrap());
+                assert_eq!(from.ip(), "127.0.0.2".parse::<IpAddr>().unwrap());
                 break;
             }
         }
@@ -169,7 +178,8 @@ async fn actions_nobody_takes_hold_nothing_up() {
     let config =
         config(214, &[("AXON_BIND_ADDRS", "127.0.0.2"), ("AXON_DAEMON_PEERS", "127.0.0.3")]);
     let task = tokio::spawn(async move {
-        run(&config, DaemonId::random(), of_events, of_actions).await;
+        let wanted = watch::Sender::new(Wanted::of(&config, []));
+        run(&config, DaemonId::random(), wanted.subscribe(), of_events, of_actions).await;
     });
     for n in 0..100_u8 {
         events.send(Event::QuicPort(64_000 + u16::from(n))).await.unwrap();

@@ -164,7 +164,7 @@ pub unsafe extern "C" fn axon_session_graph_endpoints(
             // SAFETY: the caller's word.
             graph.endpoints_of(known, unsafe { text(topic, "the topic") }?)
         };
-        for GraphEntry { endpoint, daemon } in endpoints {
+        for GraphEntry { endpoint, daemon, .. } in endpoints {
             let (name, type_name) = (string(&endpoint.topic)?, string(&endpoint.type_name)?);
             let (node, namespace) = (string(&endpoint.node)?, string(&endpoint.namespace)?);
             let shown = axon_endpoint_t {

@@ -20,11 +20,11 @@ pub const AXON_DOMAIN_ENVIRONMENT: u32 = 0xffff_ffff;
 /// Discovery reaches as far as `ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_STATIC_PEERS` and
 /// `ROS_LOCALHOST_ONLY` say.
 pub const AXON_DISCOVERY_ENVIRONMENT: u32 = 0;
-/// Nowhere, not even to peers that are listed.
+/// Nowhere: the session reaches its own endpoints alone, static peers or not.
 pub const AXON_DISCOVERY_OFF: u32 = 1;
-/// This host, and the peers that are listed.
+/// This host, and other hosts of which either side lists the other as a static peer.
 pub const AXON_DISCOVERY_LOCALHOST: u32 = 2;
-/// What multicast reaches, and the peers that are listed.
+/// What multicast reaches, and static peers.
 pub const AXON_DISCOVERY_SUBNET: u32 = 3;
 /// What multicast reaches; the list is passed over.
 pub const AXON_DISCOVERY_SYSTEM_DEFAULT: u32 = 4;
@@ -47,7 +47,7 @@ pub struct axon_session_options_t {
     pub abi: u32,
     /// 0 to 232, or AXON_DOMAIN_ENVIRONMENT.
     pub domain: u32,
-    /// AXON_DISCOVERY_*: how far a daemon looks that the session starts.
+    /// AXON_DISCOVERY_*: how far the session is discovered, whoever started the daemon.
     pub discovery: u32,
     /// 0.
     pub reserved: u32,

@@ -9,7 +9,10 @@ use std::{
 use axon_envelope::Kind;
 
 use crate::{
-    graph::{Endpoint, EndpointKind, Pairing, pairing, reads, writes},
+    graph::{
+        Endpoint, EndpointKind, Pairing, RemoteEndpoint, Toward, out_of_range, pairing, reads,
+        writes,
+    },
     ids::Gid,
     link::Subscriber,
     qos::{Durability, History, Qos, Reliability},
@@ -59,20 +62,25 @@ pub(super) struct Wanted {
     pub(super) writers: Vec<(Endpoint, usize)>,
 }
 
-/// Matches a peer's writers with this host's readers.
+/// Matches a peer's writers with this host's readers, as far as the ranges of their sessions permit.
 pub(super) fn wanted<'a>(
-    local: impl IntoIterator<Item = &'a Endpoint>,
-    remote: impl IntoIterator<Item = &'a Endpoint>,
+    local: impl IntoIterator<Item = (&'a Endpoint, Toward)>,
+    remote: impl IntoIterator<Item = &'a RemoteEndpoint>,
 ) -> BTreeMap<RouteKey, Wanted> {
-    let mut readers: BTreeMap<&str, Vec<&Endpoint>> = BTreeMap::new();
-    for endpoint in local.into_iter().filter(|e| reads(e.kind)) {
-        readers.entry(&endpoint.topic).or_default().push(endpoint);
+    let mut readers: BTreeMap<&str, Vec<(&Endpoint, Toward)>> = BTreeMap::new();
+    for (endpoint, toward) in local.into_iter().filter(|(e, _)| reads(e.kind)) {
+        readers.entry(&endpoint.topic).or_default().push((endpoint, toward));
     }
     let mut routes: BTreeMap<RouteKey, Wanted> = BTreeMap::new();
     let mut counted = BTreeSet::new();
-    for writer in remote.into_iter().filter(|e| writes(e.kind)) {
+    for remote in remote.into_iter().filter(|remote| writes(remote.endpoint.kind)) {
+        let writer = &remote.endpoint;
         let candidates = readers.get(&*writer.topic).into_iter().flatten();
-        let served: Vec<_> = candidates.filter(|r| pairing(writer, r) == Pairing::Match).collect();
+        let in_range = candidates.filter(|(_, own)| out_of_range(*own, remote.toward).is_none());
+        let served: Vec<&Endpoint> = in_range
+            .map(|(reader, _)| *reader)
+            .filter(|reader| pairing(writer, reader) == Pairing::Match)
+            .collect();
         let Some(key) = RouteKey::of(writer).filter(|_| !served.is_empty()) else { continue };
         let route = routes.entry(key).or_default();
         for reader in &served {
@@ -185,6 +193,7 @@ fn class(depth: u32) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::DiscoveryRange;
 
     fn endpoint(number: u8, kind: EndpointKind, topic: &str, qos: Qos) -> Endpoint {
         Endpoint {
@@ -198,6 +207,32 @@ mod tests {
             namespace: String::new(),
             enclave: String::new(),
         }
+    }
+
+    fn wanted(local: &[Endpoint], remote: &[Endpoint]) -> BTreeMap<RouteKey, Wanted> {
+        let remote: Vec<RemoteEndpoint> = remote.iter().cloned().map(Into::into).collect();
+        super::wanted(local.iter().map(|e| (e, SUBNET)), &remote)
+    }
+
+    const SUBNET: Toward = Toward { range: DiscoveryRange::Subnet, lists: false };
+
+    #[test]
+    fn a_reader_whose_range_a_writer_is_out_of_asks_for_nothing() {
+        use EndpointKind::{Publisher, Subscription};
+        let localhost = Toward { range: DiscoveryRange::Localhost, lists: false };
+        let readers = [1, 2].map(|n| endpoint(n, Subscription, "/t", Qos::default()));
+        let mut writer = RemoteEndpoint::from(endpoint(11, Publisher, "/t", Qos::default()));
+        let asked = |own: [Toward; 2], writer: &RemoteEndpoint| {
+            let routes = super::wanted(readers.iter().zip(own), [writer]);
+            routes.values().map(|wanted| wanted.subscribers.len()).sum::<usize>()
+        };
+        assert_eq!(asked([SUBNET, localhost], &writer), 1);
+        assert_eq!(asked([localhost; 2], &writer), 0);
+        assert_eq!(asked([Toward { lists: true, ..localhost }, localhost], &writer), 1);
+        writer.toward = localhost;
+        assert_eq!(asked([SUBNET; 2], &writer), 0);
+        writer.toward.lists = true;
+        assert_eq!(asked([SUBNET, localhost], &writer), 2);
     }
 
     #[test]

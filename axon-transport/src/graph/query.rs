@@ -121,7 +121,7 @@ mod tests {
             enclave: if kind == Node { "/".into() } else { String::new() },
         };
         assert!(endpoint.is_sane(), "{endpoint:?}");
-        let entry = GraphEntry { endpoint: Arc::new(endpoint), daemon: None };
+        let entry = GraphEntry { endpoint: Arc::new(endpoint), daemon: None, reach: None };
         view.endpoints.insert(entry.endpoint.gid, entry);
     }
 

@@ -2,7 +2,7 @@
 
 use std::{collections::HashMap, sync::Arc};
 
-use super::Endpoint;
+use super::{Endpoint, Reach};
 use crate::ids::{DaemonId, Gid};
 
 /// Every node and endpoint that a session's daemon knows, here and on other hosts.
@@ -21,4 +21,6 @@ pub struct GraphEntry {
     pub endpoint: Arc<Endpoint>,
     /// The daemon it belongs to when it is on another host.
     pub daemon: Option<DaemonId>,
+    /// How far its session is discovered: of endpoints of this host, in the gateway's view alone.
+    pub(crate) reach: Option<Reach>,
 }

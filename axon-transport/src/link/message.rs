@@ -90,6 +90,12 @@ pub struct Graph {
     /// Whether the next GRAPH goes on with it: a whole graph counts once all of it is there.
     #[n(4)]
     pub more: bool,
+    /// Those of `added` whose session's range is LOCALHOST; the others' is SUBNET.
+    #[n(5)]
+    pub localhost: Option<Vec<Gid>>,
+    /// Those of `added` whose session lists the receiver's host as a static peer.
+    #[n(6)]
+    pub listing: Option<Vec<Gid>>,
 }
 
 /// The receiver of GRAPH missed a version and asks for the whole.
@@ -270,6 +276,9 @@ impl Message {
             Self::Graph(m) => ok(
                 m.added.len() <= LIMITS.endpoints
                     && m.removed.len() <= LIMITS.endpoints
+                    && [&m.localhost, &m.listing]
+                        .iter()
+                        .all(|gids| gids.as_ref().is_none_or(|gids| gids.len() <= m.added.len()))
                     && m.added.iter().all(Endpoint::is_sane),
                 "an endpoint is out of bounds",
             ),

@@ -60,6 +60,8 @@ fn messages() -> Vec<Message> {
             added: vec![],
             removed: vec![Gid([5; 16])],
             more: true,
+            localhost: None,
+            listing: None,
         }),
         Message::GraphResync(GraphResync { version: 2 }),
         Message::Subscribe(Subscribe {

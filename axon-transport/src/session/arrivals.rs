@@ -116,7 +116,7 @@ mod tests {
             namespace: String::new(),
             enclave: String::new(),
         };
-        GraphEntry { endpoint: Arc::new(endpoint), daemon: None }
+        GraphEntry { endpoint: Arc::new(endpoint), daemon: None, reach: None }
     }
 
     fn pair(reader: u8, writer: u8) -> Pair {

@@ -16,7 +16,7 @@ use super::{
     socket::{self, SocketError},
 };
 use crate::{
-    config::{Config, DaemonPolicy, security_settings},
+    config::{Config, DaemonPolicy, DiscoveryRange, security_settings},
     daemon::spawn::{Outcome, spawn},
     ids::SessionId,
     passed::PassedFd,
@@ -166,6 +166,8 @@ impl Caller<'_> {
             domain: self.config.domain,
             settings,
             relay: self.relay.map(str::to_owned),
+            range: Some(self.config.range.number()),
+            static_peers: Some(self.config.static_peers.clone()),
         });
         let packet = hello.encode().map_err(SessionError::from)?;
         let descriptors = match self.segment {
@@ -206,6 +208,7 @@ impl Caller<'_> {
             };
             return match received.message {
                 Message::Welcome(welcome) if welcome.protocol == PROTOCOL => {
+                    self.check_range(&welcome, address, pid)?;
                     Ok(Connected { socket, welcome, descriptors: received.descriptors })
                 }
                 Message::Welcome(welcome) => Err(Attempt::Final(SessionError::Refused {
@@ -237,6 +240,22 @@ impl Caller<'_> {
 }
 
 impl Caller<'_> {
+    /// A daemon of an earlier version would have its own range in place of the session's.
+    fn check_range(&self, welcome: &Welcome, address: &str, pid: u32) -> Result<(), Attempt> {
+        let applies = welcome.ranges.unwrap_or(false);
+        let asks = self.options.role == SessionRole::Application
+            && self.config.range != DiscoveryRange::Subnet;
+        if applies || !asks {
+            return Ok(());
+        }
+        let text = format!(
+            "it is of a version that does not keep each session's discovery range, and this \
+             session's is {}: end that daemon (process {pid}), and a new one is started",
+            self.config.range.name()
+        );
+        Err(Attempt::Final(SessionError::Refused { address: address.to_owned(), text }))
+    }
+
     fn await_socket(
         &self,
         socket: &OwnedFd,

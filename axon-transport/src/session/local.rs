@@ -39,6 +39,7 @@ impl House {
     /// What the world outside has: endpoints of `daemon` that are new, and those that are gone.
     pub(crate) fn outside(&self, daemon: DaemonId, added: Vec<Endpoint>, removed: Vec<Gid>) {
         let mut inside = self.lock();
+        let added = added.into_iter().map(Into::into).collect();
         inside.registry.remote_graph(daemon, false, added, removed);
         inside.settle(None);
     }
@@ -88,7 +89,7 @@ impl Local {
         let mut inside = house.lock();
         inside.wakers.insert(id, session.wake.clone());
         // There are at most two, which is never too many.
-        let _ = inside.registry.connect(id, role, name, std::process::id(), handed);
+        let _ = inside.registry.connect(id, role, name, std::process::id(), handed, None);
         drop(inside);
         Self { id, house }
     }

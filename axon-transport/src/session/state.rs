@@ -122,7 +122,7 @@ impl State {
         if self.refused.contains_key(&own.gid) {
             return;
         }
-        let entry = || GraphEntry { endpoint: Arc::new(own.clone()), daemon: None };
+        let entry = || GraphEntry { endpoint: Arc::new(own.clone()), daemon: None, reach: None };
         Arc::make_mut(&mut self.graph).endpoints.entry(own.gid).or_insert_with(entry);
         self.regraphed = true;
     }

@@ -66,7 +66,8 @@ fn session() -> (Session, Daemon) {
     let handed = PeerDescriptors { segment, doorbell, pidfd };
     let daemon = Daemon { socket, id: hello.session, handed };
     let pid = std::process::id();
-    let welcome = Welcome { protocol: PROTOCOL, daemon: DaemonId([7; 16]), pid };
+    let welcome =
+        Welcome { protocol: PROTOCOL, daemon: DaemonId([7; 16]), pid, ranges: Some(true) };
     daemon.say(Message::Welcome(welcome), &[]);
     daemon.tell_all(Vec::new());
     (opening.join().unwrap().unwrap(), daemon)

@@ -18,6 +18,8 @@ fn garbage_on_the_socket_hurts_nobody() {
             domain: 0,
             settings,
             relay: None,
+            range: Some(0),
+            static_peers: None,
         })
         .encode()
         .unwrap()
@@ -54,6 +56,8 @@ fn garbage_on_the_socket_hurts_nobody() {
         domain: 0,
         settings: Vec::new(),
         relay: None,
+        range: Some(0),
+        static_peers: None,
     });
     socket::send(&tool, &packet.encode().unwrap(), &[]).unwrap();
     socket::send(&tool, &Message::Resync.encode().unwrap(), &[]).unwrap();
@@ -87,6 +91,8 @@ fn the_daemon_is_handed_nothing_that_a_read_could_wait_for() {
             domain: 0,
             settings: settings.clone(),
             relay: None,
+            range: Some(0),
+            static_peers: None,
         });
         let socket = Address::of(&host.config()).connect().unwrap();
         let handed = segment.descriptors().unwrap();
@@ -162,6 +168,8 @@ fn descriptors_that_are_slow_to_close_do_not_stop_the_daemon() {
         domain: 0,
         settings: Vec::new(),
         relay: None,
+        range: Some(0),
+        static_peers: None,
     });
     // The daemon receives nothing before all is sent: one that had closed a descriptor already would leave
     // its last close to this thread.

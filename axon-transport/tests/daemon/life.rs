@@ -196,6 +196,8 @@ fn another_version_is_refused_by_both_sides() {
             domain: 0,
             settings: Vec::new(),
             relay: None,
+            range: Some(0),
+            static_peers: None,
         })
     };
     let stranger = Address::of(&host.config()).connect().unwrap();
@@ -224,8 +226,12 @@ fn another_version_is_refused_by_both_sides() {
         let accepted = accepted.unwrap();
         until("HELLO", || socket::receive(&accepted, &mut Vec::new()).is_ok());
         let daemon = DaemonId([7; 16]);
-        let welcome =
-            Message::Welcome(Welcome { protocol: PROTOCOL + 1, daemon, pid: std::process::id() });
+        let welcome = Message::Welcome(Welcome {
+            protocol: PROTOCOL + 1,
+            daemon,
+            pid: std::process::id(),
+            ranges: Some(true),
+        });
         socket::send(&accepted, &welcome.encode().unwrap(), &[]).unwrap();
     });
     let refused = host.session("now").unwrap_err();

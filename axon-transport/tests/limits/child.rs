@@ -189,6 +189,8 @@ pub(crate) fn play(part: &str) {
                 domain: 171,
                 settings: Vec::new(),
                 relay: None,
+                range: Some(0),
+                static_peers: None,
             });
             let _ = socket::send(&socket, &hello.encode().unwrap(), &[]);
             let mut buffer = Vec::new();

@@ -23,6 +23,8 @@ fn hello_of(config: &Config) -> Hello {
         domain: 0,
         settings: security_settings(config).unwrap(),
         relay: Some("written by hand".into()),
+        range: Some(0),
+        static_peers: None,
     }
 }
 

@@ -478,7 +478,7 @@ fn two_hosts() -> [Host; 2] {
     [pair, pair + 1].map(|number| {
         host()
             .with("AXON_BIND_ADDRS", &format!("127.98.{net}.{number}"))
-            .with("AXON_DAEMON_PEERS", &format!("127.98.{net}.{}", number ^ 1))
+            .with("ROS_STATIC_PEERS", &format!("127.98.{net}.{}", number ^ 1))
             .with("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
             .with("ROS_DOMAIN_ID", &(1 + pid % 98).to_string())
     })

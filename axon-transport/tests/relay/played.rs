@@ -21,7 +21,10 @@ fn played(host: &Host) -> (Session, OwnedFd) {
         let socket = socket.unwrap();
         assert!(matches!(hear(&socket, |_| true), Some(Message::Hello(_))));
         let (daemon, pid) = (DaemonId([1; 16]), std::process::id());
-        say_to(&socket, &Message::Welcome(Welcome { protocol: PROTOCOL, daemon, pid }));
+        say_to(
+            &socket,
+            &Message::Welcome(Welcome { protocol: PROTOCOL, daemon, pid, ranges: Some(true) }),
+        );
         (session.join().unwrap(), socket)
     });
     drop((listeners, lock));
@@ -36,7 +39,7 @@ fn show(socket: &OwnedFd, own: &Endpoint, kind: EndpointKind) -> Gid {
 
 fn show_as(socket: &OwnedFd, gid: Gid, own: &Endpoint, kind: EndpointKind) -> Gid {
     let endpoint = Endpoint { gid, kind, ..own.clone() };
-    let added = vec![GraphItem { endpoint, daemon: None }];
+    let added = vec![GraphItem { endpoint, daemon: None, reach: None }];
     let (removed, ended) = (Vec::new(), None);
     let graph = Graph { version: 1, whole: false, added, removed, more: false, ended };
     say_to(socket, &Message::Graph(graph));

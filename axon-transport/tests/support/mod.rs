@@ -34,7 +34,7 @@ impl Host {
             ("AXON_DAEMON_PATH", env!("CARGO_BIN_EXE_axon_daemon")),
             ("AXON_BIND_ADDRS", "127.0.0.1"),
             // Hosts of other tests are on the same loopback.
-            ("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF"),
+            ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
             ("AXON_LOG", "debug"),
         ];
         Self { env: env.map(|(n, v)| (n.to_owned(), v.to_owned())).into(), dir }

@@ -110,7 +110,7 @@ impl Host {
             .env("AXON_RUNTIME_DIR", self.dir.path().join("run"))
             .env("AXON_DAEMON_PATH", env!("CARGO_BIN_EXE_axon_daemon"))
             .env("AXON_BIND_ADDRS", "127.0.0.1")
-            .env("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
+            .env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
             .env("AXON_RING_BUFFER_SIZE_MB", BUDGET_MB.to_string())
             .env("AXON_MAX_MESSAGE_MB", (LONGEST >> 20).to_string())
             .stdin(Stdio::piped())

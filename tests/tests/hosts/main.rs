@@ -13,6 +13,7 @@ mod mixed;
 mod mode;
 mod pair;
 mod process;
+mod range;
 mod renewal;
 mod restart;
 mod rules;

@@ -24,7 +24,7 @@ use super::{
 };
 
 /// The topic of all these tests.
-const TOPIC: &str = "/numbers";
+pub(crate) const TOPIC: &str = "/numbers";
 
 /// What two hosts are started with.
 #[derive(Clone, Debug)]
@@ -44,6 +44,13 @@ impl Plan {
 
     /// Starts both hosts.
     pub(crate) fn start(self) -> [Host; 2] {
+        let mut hosts = self.prepare();
+        hosts.iter_mut().for_each(Host::start);
+        hosts
+    }
+
+    /// Both hosts without a daemon: a process of theirs starts it.
+    pub(crate) fn prepare(self) -> [Host; 2] {
         static PAIRS: AtomicU32 = AtomicU32::new(0);
         let (pair, pid) = (PAIRS.fetch_add(1, Ordering::Relaxed), std::process::id());
         // Where hardly anybody is; another run of these tests at the same time has its own.
@@ -51,7 +58,7 @@ impl Plan {
         // Below 100: the tool's tests, whose daemons may still be in their grace time, are above.
         let domain = 1 + (pid.wrapping_mul(31) + 2 * pair) % 98;
         let addresses = [1, 2].map(|host| Ipv4Addr::new(127, net[0], net[1], host));
-        let mut hosts = [0, 1].map(|host| {
+        [0, 1].map(|host| {
             let more = [
                 ("AXON_BIND_ADDRS", addresses[host].to_string()),
                 ("AXON_DAEMON_PEERS", addresses[1 - host].to_string()),
@@ -59,9 +66,7 @@ impl Plan {
             ];
             let settings = self.settings[host].iter().cloned().chain(more);
             Host::new(["A", "B"][host], addresses[host], settings, self.grace_s)
-        });
-        hosts.iter_mut().for_each(Host::start);
-        hosts
+        })
     }
 }
 
@@ -213,8 +218,13 @@ impl Host {
     }
 
     pub(crate) fn node(&self, arguments: &[&str]) -> Node {
+        self.node_with(&[], arguments)
+    }
+
+    /// A process with settings of its own beside the host's.
+    pub(crate) fn node_with(&self, settings: &[(&str, &str)], arguments: &[&str]) -> Node {
         let mut command = self.command(env!("CARGO_BIN_EXE_axon-test-node"));
-        command.args(arguments);
+        command.args(arguments).envs(settings.iter().copied());
         Node::start(command)
     }
 

@@ -38,7 +38,7 @@ impl Place {
         let settings: Settings = [
             ("AXON_RUNTIME_DIR", &*dir.path().display().to_string()),
             ("AXON_BIND_ADDRS", "127.0.0.1"),
-            ("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF"),
+            ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
             ("AXON_LOG", "error"),
         ]
         .map(|(name, value)| (name.to_owned(), value.to_owned()))

@@ -20,7 +20,7 @@ fn registry(roles: &[SessionRole]) -> Registry<Label> {
     let mut registry = Registry::default();
     for (number, role) in (1..).zip(roles) {
         let handed = (*role != SessionRole::Tool).then_some(["segment", "doorbell", "pidfd"]);
-        registry.connect(id(number), *role, String::new(), 1, handed).unwrap();
+        registry.connect(id(number), *role, String::new(), 1, handed, None).unwrap();
         drain(&mut registry, number);
     }
     registry

@@ -4,9 +4,9 @@ use std::collections::BTreeSet;
 
 use super::{LocalEndpoint, Registry};
 use crate::{
-    graph::{Endpoint, LIMITS},
-    ids::{DaemonId, Gid},
-    session::message::{EndpointRole, Graph, GraphItem, Message, SessionRole},
+    graph::{Endpoint, LIMITS, RemoteEndpoint},
+    ids::{DaemonId, Gid, SessionId},
+    session::message::{EndpointRole, Graph, GraphItem, Message},
 };
 
 /// Bytes of endpoints in one packet; leaves room for the rest of the message and one endpoint more.
@@ -21,29 +21,42 @@ impl<F: Clone> Registry<F> {
         &mut self,
         daemon: DaemonId,
         reset: bool,
-        added: Vec<Endpoint>,
+        added: Vec<RemoteEndpoint>,
         removed: Vec<Gid>,
     ) {
         if reset {
             self.remote_gone(&daemon);
         }
+        // What stands for them is matched anew.
+        let mut changed = Vec::new();
         for gid in removed {
-            if self.remote.get_mut(&daemon).is_some_and(|all| all.remove(&gid).is_some()) {
+            if let Some(gone) = self.remote.get_mut(&daemon).and_then(|all| all.remove(&gid)) {
                 self.graph_remove(gid);
+                changed.push(gone);
             }
         }
-        for endpoint in added {
-            let gid = endpoint.gid;
+        for remote in added {
+            let gid = remote.endpoint.gid;
             let local = self.endpoints.get(&gid).is_some_and(|e| e.role != EndpointRole::StandIn);
             let elsewhere =
                 self.remote.iter().any(|(other, all)| *other != daemon && all.contains_key(&gid));
             let all = self.remote.entry(daemon).or_default();
-            if local || elsewhere || !endpoint.is_sane() || all.len() >= LIMITS.endpoints {
+            let full = all.len() >= LIMITS.endpoints;
+            if local || elsewhere || !remote.endpoint.is_sane() || full {
                 continue;
             }
-            all.insert(gid, endpoint.clone());
-            self.graph_add(GraphItem { endpoint, daemon: Some(daemon) });
+            let before = all.insert(gid, remote.clone());
+            if before.as_ref().is_some_and(|before| before.toward != remote.toward) {
+                // Sessions that saw it may not see it any more.
+                self.graph_remove(gid);
+            }
+            if before.is_none_or(|before| before.toward != remote.toward) {
+                changed.push(remote.clone());
+            }
+            let endpoint = remote.endpoint;
+            self.graph_add(GraphItem { endpoint, daemon: Some(daemon), reach: None });
         }
+        self.rematch_remote(&changed);
     }
 
     /// Another host's daemon is gone, and its endpoints with it.
@@ -56,22 +69,27 @@ impl<F: Clone> Registry<F> {
     /// Queues what changed in the graph since the last call. Called a few milliseconds after a
     /// change, so that a node that starts with twenty endpoints costs each session one packet.
     pub fn flush(&mut self) {
-        if self.added.is_empty() && self.removed.is_empty() {
+        if !self.needs_flush() {
             return;
         }
         self.version += 1;
         let removed: Vec<Gid> = std::mem::take(&mut self.removed).into_iter().collect();
-        let added = std::mem::take(&mut self.added).into_values();
+        let added = std::mem::take(&mut self.added);
         let ended = std::mem::take(&mut self.ended);
-        let parts = parts(self.version, false, added, &removed, &ended, false);
-        let sessions: Vec<_> = self
-            .sessions
-            .iter()
-            .filter(|(_, s)| s.role != SessionRole::Tool && !s.behind)
-            .map(|(id, _)| *id)
-            .collect();
-        for part in parts {
-            self.push_shared(&sessions, &Message::Graph(part));
+        let regraded = std::mem::take(&mut self.regraded);
+        let regraded = regraded.iter().filter(|gid| !added.contains_key(*gid));
+        let regraded = regraded.filter_map(|gid| self.endpoints.get(gid)).filter(|e| is_shown(e));
+        let regraded: Vec<GraphItem> = regraded.map(item).collect();
+        for (view, sessions) in self.views() {
+            let again = regraded.iter().filter(|_| view.is_gateway());
+            let shown: Vec<GraphItem> =
+                added.values().chain(again).filter_map(|item| self.shown_in(&view, item)).collect();
+            if shown.is_empty() && removed.is_empty() {
+                continue;
+            }
+            for part in parts(self.version, false, shown.into_iter(), &removed, &ended, false) {
+                self.push_shared(&sessions, &Message::Graph(part));
+            }
         }
     }
 
@@ -89,24 +107,27 @@ impl<F: Clone> Registry<F> {
 
     /// Whether [`flush`](Self::flush) has something to do.
     pub fn needs_flush(&self) -> bool {
-        !self.added.is_empty() || !self.removed.is_empty()
+        !self.added.is_empty() || !self.removed.is_empty() || !self.regraded.is_empty()
     }
 
-    /// The whole graph, open-ended: the last part says that more follows.
-    pub(super) fn whole_graph(&self) -> Vec<Graph> {
-        let local = self.shown().map(|e| GraphItem { endpoint: e.endpoint.clone(), daemon: None });
-        let remote = self
-            .remote_endpoints()
-            .map(|(d, e)| GraphItem { endpoint: e.clone(), daemon: Some(*d) });
+    /// The whole graph as a session is shown it, open-ended: the last part says that more follows.
+    pub(super) fn whole_graph(&self, id: &SessionId) -> Vec<Graph> {
+        let view = self.view(id);
+        let local = self.shown().map(item);
+        let remote = self.remote_endpoints().map(|(d, e)| GraphItem {
+            endpoint: e.clone(),
+            daemon: Some(*d),
+            reach: None,
+        });
+        let shown = local.chain(remote).filter_map(|item| self.shown_in(&view, &item));
         let tombstones: Vec<Gid> = self.tombstones.iter().copied().collect();
         let ended = self.tombstones.iter().copied().collect();
-        parts(self.version, true, local.chain(remote), &tombstones, &ended, true)
+        parts(self.version, true, shown, &tombstones, &ended, true)
     }
 
     /// The endpoints of this host's applications that are in the graph.
     fn shown(&self) -> impl Iterator<Item = &LocalEndpoint> {
-        let all = self.endpoints.values();
-        all.filter(|local| local.role == EndpointRole::Application && !local.leaving)
+        self.endpoints.values().filter(|local| is_shown(local))
     }
 
     pub(super) fn graph_add_local(&mut self, endpoint: &Endpoint) {
@@ -119,7 +140,7 @@ impl<F: Clone> Registry<F> {
         if !claimed.is_empty() {
             self.graph_remove(endpoint.gid);
         }
-        self.graph_add(GraphItem { endpoint: endpoint.clone(), daemon: None });
+        self.graph_add(GraphItem { endpoint: endpoint.clone(), daemon: None, reach: None });
     }
 
     fn graph_add(&mut self, item: GraphItem) {
@@ -138,6 +159,14 @@ impl<F: Clone> Registry<F> {
         self.added.remove(&gid);
         self.removed.insert(gid);
     }
+}
+
+fn is_shown(local: &LocalEndpoint) -> bool {
+    local.role == EndpointRole::Application && !local.leaving
+}
+
+fn item(local: &LocalEndpoint) -> GraphItem {
+    GraphItem { endpoint: local.endpoint.clone(), daemon: None, reach: None }
 }
 
 /// Splits a change into packets. `open` leaves `more` set in the last.
@@ -171,6 +200,7 @@ pub(crate) fn parts(
         let e = &item.endpoint;
         let names = [&e.topic, &e.type_name, &e.node, &e.namespace, &e.enclave];
         let bytes = names.iter().map(|n| n.len()).sum::<usize>() + e.type_hash.len() + 160;
+        let bytes = bytes + item.reach.as_ref().map_or(0, |reach| 8 + 17 * reach.lists.len());
         if size + bytes > PART {
             parts.push(std::mem::replace(&mut part, empty(false)));
             size = 0;

@@ -7,7 +7,7 @@ use super::{
     SessionEntry, Violation, output::session_entry,
 };
 use crate::{
-    graph::{Endpoint, EndpointKind, LIMITS, writes},
+    graph::{Endpoint, EndpointKind, LIMITS, Scope, writes},
     ids::{Gid, SessionId},
     relay,
     session::message::{
@@ -18,7 +18,8 @@ use crate::{
 };
 
 impl<F: Clone> Registry<F> {
-    /// A session whose HELLO was taken. It will be told the whole graph.
+    /// A session whose HELLO was taken. It will be told the whole graph, or as much of it as its
+    /// `scope` lets it see; without one ranges do not apply to it.
     ///
     /// # Errors
     /// When there are too many sessions.
@@ -29,12 +30,14 @@ impl<F: Clone> Registry<F> {
         name: String,
         pid: u32,
         descriptors: Option<[F; 3]>,
+        scope: Option<Scope>,
     ) -> Result<(), Violation> {
         self.disconnect(&id);
         if self.sessions.len() >= MAX_SESSIONS {
             return Err(Violation::Sessions);
         }
-        self.sessions.insert(id, session_entry(role, name, pid, descriptors));
+        self.sessions.insert(id, session_entry(role, name, pid, descriptors, scope));
+        self.rescoped |= role == SessionRole::Application;
         if role != SessionRole::Tool {
             self.mark_behind(&id);
         }
@@ -49,6 +52,7 @@ impl<F: Clone> Registry<F> {
         }
         self.sessions.remove(id);
         self.ready.remove(id);
+        self.rescoped = true;
     }
 
     /// A message of a session.
@@ -127,7 +131,10 @@ impl<F: Clone> Registry<F> {
             if known.session != *id || known.role != role {
                 return Err(Violation::NotItsOwn(gid));
             }
-            known.stands_for = stands_for;
+            if known.stands_for != stands_for {
+                known.stands_for = stands_for;
+                self.rematch(&gid);
+            }
             return Ok(());
         }
         let refusal = if !endpoint.is_sane() {
@@ -263,7 +270,7 @@ impl<F: Clone> Registry<F> {
         // without end.
         let of = |attach: &Option<Attach>| attach.clone().map(|a| Attach { after: None, ..a });
         if of(&asked.attach) != of(&attach) {
-            *asked = Asked { attach, grant: None, by: asked.by };
+            *asked = Asked { attach, stands_for: None, grant: None, by: asked.by };
             self.forward_attach(&pair);
         }
         Ok(())
@@ -274,6 +281,10 @@ impl<F: Clone> Registry<F> {
         let Some(attach) = self.pairs.get(pair).and_then(|p| p.attach.as_ref()) else { return };
         let Some(writer) = self.endpoints.get(&pair.writer) else { return };
         let (mut attach, to) = (attach.clone(), writer.session);
+        attach.stands_for = self.stands_for(pair);
+        if let Some(asked) = self.pairs.get_mut(pair) {
+            asked.stands_for.clone_from(&attach.stands_for);
+        }
         let (of, lane) = (attach.session, attach.lane.segment);
         let mut descriptors = self.introduce(&to, &of, pair);
         // The publisher looks at nothing but the lane.

@@ -39,6 +39,9 @@ impl<F: Clone> Registry<F> {
             if self.pairs.contains_key(&pair) {
                 continue;
             }
+            if self.apart(w, r).is_some() {
+                continue;
+            }
             let (to_writer, to_reader) = (w.session, r.session);
             let relayed = |id| self.sessions.get(id).is_some_and(|s| s.relay.is_some());
             if to_writer == to_reader && relayed(&to_writer) {
@@ -47,7 +50,8 @@ impl<F: Clone> Registry<F> {
             match pairing(&w.endpoint, &r.endpoint) {
                 Pairing::Match => {
                     let by = if pair.writer == *gid { to_writer } else { to_reader };
-                    self.pairs.insert(pair, Asked { by, attach: None, grant: None });
+                    self.pairs
+                        .insert(pair, Asked { by, attach: None, stands_for: None, grant: None });
                     if let Some(entry) = self.sessions.get_mut(&by) {
                         entry.pairs += 1;
                     }
@@ -123,7 +127,13 @@ impl<F: Clone> Registry<F> {
         true
     }
 
-    fn unmatch(&mut self, pair: &Pair, to_writer: SessionId, to_reader: SessionId, reason: &str) {
+    pub(super) fn unmatch(
+        &mut self,
+        pair: &Pair,
+        to_writer: SessionId,
+        to_reader: SessionId,
+        reason: &str,
+    ) {
         let Pair { reader, writer } = *pair;
         let message = Message::Unmatch(Unmatch { reader, writer, reason: reason.to_owned() });
         self.push(&to_reader, &message, Vec::new());
@@ -156,6 +166,6 @@ fn roles_match(writer: EndpointRole, reader: EndpointRole) -> bool {
         || (writer == EndpointRole::StandIn && reader == EndpointRole::Application)
 }
 
-fn topic(endpoint: &Endpoint) -> Topic {
+pub(super) fn topic(endpoint: &Endpoint) -> Topic {
     Topic(endpoint.topic.clone(), endpoint.type_name.clone())
 }

@@ -11,6 +11,7 @@ mod graph;
 mod input;
 mod matching;
 mod output;
+mod range;
 mod segments;
 #[cfg(test)]
 mod tests;
@@ -22,9 +23,10 @@ use std::{
 
 pub(crate) use graph::parts;
 pub use output::Output;
+pub use range::KeptApart;
 
 use crate::{
-    graph::Endpoint,
+    graph::{Endpoint, RemoteEndpoint, Scope},
     ids::{DaemonId, Gid, SessionId},
     relay::Tally,
     session::message::{Attach, EndpointRole, Granted, GraphItem, Pair, Segment, SessionRole},
@@ -58,13 +60,17 @@ pub struct Registry<F> {
     endpoints: HashMap<Gid, LocalEndpoint>,
     topics: HashMap<Topic, Members>,
     pairs: BTreeMap<Pair, Asked>,
-    remote: BTreeMap<DaemonId, BTreeMap<Gid, Endpoint>>,
+    remote: BTreeMap<DaemonId, BTreeMap<Gid, RemoteEndpoint>>,
     tombstones: VecDeque<Gid>,
     version: u64,
     added: BTreeMap<Gid, GraphItem>,
     removed: BTreeSet<Gid>,
     /// Those of them that were this host's own.
     ended: BTreeSet<Gid>,
+    /// Endpoints of this host whose session lists other peers than the gateway was told.
+    regraded: BTreeSet<Gid>,
+    /// Applications' sessions came or went.
+    rescoped: bool,
     ready: BTreeSet<SessionId>,
     /// The first endpoint of each session that was refused, and why.
     refused: Vec<(SessionId, String)>,
@@ -79,6 +85,10 @@ pub struct SessionEntry<F> {
     pub name: String,
     /// Its process.
     pub pid: u32,
+    /// How far it is discovered; `None` of the gateway, and of all in a registry within a process.
+    pub scope: Option<Scope>,
+    /// Daemons of the linked peers that it lists.
+    pub lists: BTreeSet<DaemonId>,
     /// Its endpoints.
     pub endpoints: BTreeSet<Gid>,
     /// Segment, doorbell and pidfd; a tool has none, nor has a session that nobody can meet.
@@ -150,6 +160,8 @@ struct Asked {
     by: SessionId,
     /// What its reader asked.
     attach: Option<Attach>,
+    /// For whom the reader stands, as the writer was told.
+    stands_for: Option<Vec<Gid>>,
     /// What its writer answered.
     grant: Option<Granted>,
 }
@@ -198,6 +210,8 @@ impl<F> Default for Registry<F> {
             added: BTreeMap::new(),
             removed: BTreeSet::new(),
             ended: BTreeSet::new(),
+            regraded: BTreeSet::new(),
+            rescoped: false,
             ready: BTreeSet::new(),
             refused: Vec::new(),
         }
@@ -239,7 +253,9 @@ impl<F: Clone> Registry<F> {
 
     /// The endpoints on other hosts.
     pub fn remote_endpoints(&self) -> impl Iterator<Item = (&DaemonId, &Endpoint)> {
-        self.remote.iter().flat_map(|(daemon, all)| all.values().map(move |e| (daemon, e)))
+        self.remote
+            .iter()
+            .flat_map(|(daemon, all)| all.values().map(move |e| (daemon, &e.endpoint)))
     }
 
     /// The pairs whose reader has asked its writer.

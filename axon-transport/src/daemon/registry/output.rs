@@ -7,6 +7,7 @@ use std::{
 
 use super::{MAX_QUEUE, MAX_QUEUE_BYTES, Registry, STATUS_SLICE, SessionEntry};
 use crate::{
+    graph::Scope,
     ids::SessionId,
     session::message::{Graph, Message, SessionRole, StatusPart},
 };
@@ -138,7 +139,7 @@ impl<F: Clone> Registry<F> {
     fn tell_everything(&mut self, id: &SessionId) {
         // Pending changes are part of the whole, and the others hear of them as usual.
         self.flush();
-        let parts = self.whole_graph();
+        let parts = self.whole_graph(id);
         let Some(entry) = self.sessions.get_mut(id) else { return };
         entry.behind = false;
         entry.resync = false;
@@ -192,11 +193,14 @@ pub(super) fn session_entry<F>(
     name: String,
     pid: u32,
     descriptors: Option<[F; 3]>,
+    scope: Option<Scope>,
 ) -> SessionEntry<F> {
     SessionEntry {
         role,
         name,
         pid,
+        scope,
+        lists: BTreeSet::new(),
         endpoints: BTreeSet::new(),
         descriptors,
         segments: BTreeMap::new(),

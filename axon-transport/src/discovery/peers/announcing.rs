@@ -31,7 +31,7 @@ const INTERVAL_PER_HOST: Duration = Duration::from_millis(250);
 impl Peers {
     /// This daemon ends: tells those who would otherwise dial it.
     pub fn say_goodbye(&mut self) {
-        if self.port.is_none() {
+        if self.port.is_none() || self.local.range == DiscoveryRange::Off {
             return;
         }
         let goodbye = Datagram::Goodbye { domain: self.local.domain, daemon: self.local.daemon };
@@ -50,6 +50,9 @@ impl Peers {
     }
 
     pub(super) fn start_burst(&mut self, now: Duration) {
+        if self.port.is_none() || self.local.range == DiscoveryRange::Off {
+            return;
+        }
         self.burst_left = BURST.len();
         self.next_beacon = Some(now);
     }
@@ -72,13 +75,14 @@ impl Peers {
         self.announce(&bytes);
     }
 
-    /// Sends to all who may listen: the group, the QUIC ports of this host and of listed peers.
+    /// Sends to all who may listen: the QUIC ports of listed peers, and in SUBNET the group and the
+    /// QUIC ports of this host, where the group may not be reached.
     fn announce(&mut self, bytes: &[u8]) {
+        let mut targets = Vec::new();
         if self.local.range == DiscoveryRange::Subnet {
             self.outputs.push_back(Output::Multicast(bytes.to_vec()));
+            targets.push((IpAddr::from(Ipv4Addr::LOCALHOST), None));
         }
-        let loopback = IpAddr::from(Ipv4Addr::LOCALHOST);
-        let mut targets = vec![(loopback, None)];
         targets.extend(&self.listed);
         for (address, port) in targets {
             if !self.here.can_reach(address) {

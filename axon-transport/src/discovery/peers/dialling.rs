@@ -27,7 +27,10 @@ impl Peers {
     }
 
     pub(super) fn schedule_dial(&mut self, now: Duration, daemon: DaemonId) {
-        let Some(record) = self.records.get_mut(&daemon).filter(|r| r.wants_dial()) else { return };
+        if !self.records.get(&daemon).is_some_and(|record| self.wants_dial(record)) {
+            return;
+        }
+        let Some(record) = self.records.get_mut(&daemon) else { return };
         let ours = (self.local.sae.as_ref().map(|(own, _)| own), self.local.daemon);
         let first = record.listed || ours < (record.sae.as_ref(), daemon);
         record.dial.schedule(if first { now } else { now + SECOND_DIAL });
@@ -40,7 +43,7 @@ impl Peers {
         let mut due: Vec<(Duration, DaemonId)> = self
             .records
             .iter()
-            .filter(|(_, record)| record.wants_dial())
+            .filter(|(_, record)| self.wants_dial(record))
             .filter_map(|(id, record)| Some((record.dial.due.filter(|at| *at <= now)?, *id)))
             .collect();
         due.sort_unstable();

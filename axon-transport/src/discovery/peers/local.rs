@@ -19,7 +19,7 @@ pub struct Local {
     pub terms: Terms,
     /// In qkd its SAE ID and those it accepts.
     pub sae: Option<(String, QkdPeers)>,
-    /// How far it looks.
+    /// How far it looks, at first.
     pub range: DiscoveryRange,
     /// `AXON_BIND_ADDRS`.
     pub bind: Vec<IpAddr>,
@@ -39,7 +39,8 @@ impl Local {
             domain: config.domain,
             terms: Terms::of(config),
             sae,
-            range: config.range,
+            // Sessions say more: `Peers::set_range`.
+            range: DiscoveryRange::Off,
             bind: config.bind_addrs.clone(),
             advertise: config.advertise_addrs.clone(),
         }

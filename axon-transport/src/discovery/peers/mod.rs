@@ -101,7 +101,7 @@ impl Peers {
         let may_dial = self.in_flight() < MOST_IN_FLIGHT;
         let lifetime = self.lifetime();
         let of_records = self.records.values().flat_map(|record| {
-            let due = record.dial.due.filter(|_| may_dial && record.wants_dial());
+            let due = record.dial.due.filter(|_| may_dial && self.wants_dial(record));
             let expiry = record.may_be_forgotten().then(|| record.last_seen + lifetime);
             [due, record.dial.in_flight, expiry].into_iter().flatten()
         });
@@ -122,9 +122,38 @@ impl Peers {
 
     /// The QUIC port is bound.
     pub fn set_port(&mut self, now: Duration, port: u16) {
-        if self.local.range != DiscoveryRange::Off && self.port.replace(port) != Some(port) {
+        if self.port.replace(port) != Some(port) {
             self.start_burst(now);
         }
+    }
+
+    /// How far this daemon looks from now on. Links that stand are left alone: what goes over them is
+    /// decided for each pair.
+    pub fn set_range(&mut self, now: Duration, range: DiscoveryRange) {
+        let before = std::mem::replace(&mut self.local.range, range);
+        if range > before {
+            self.start_burst(now);
+        }
+        if range == DiscoveryRange::Off {
+            self.next_beacon = None;
+        }
+        if range < before {
+            // Those who still want this daemon say so to its QUIC port.
+            let unlinked = self.records.iter_mut().filter(|(_, record)| !record.linked);
+            let far: Vec<DaemonId> = unlinked
+                .filter(|(_, record)| range == DiscoveryRange::Off || !record.listed)
+                .map(|(id, _)| *id)
+                .collect();
+            far.into_iter().for_each(|daemon| self.forget(daemon));
+            self.records.values_mut().for_each(|record| record.near = record.listed);
+        } else {
+            self.dial_all(now);
+        }
+    }
+
+    fn dial_all(&mut self, now: Duration) {
+        let ids: Vec<DaemonId> = self.records.keys().copied().collect();
+        ids.into_iter().for_each(|id| self.schedule_dial(now, id));
     }
 
     /// The interfaces of this host, whenever they were looked at.
@@ -133,13 +162,8 @@ impl Peers {
             return;
         }
         self.here.interfaces = interfaces;
-        let ids: Vec<DaemonId> = self.records.keys().copied().collect();
-        for id in ids {
-            if let Some(record) = self.records.get_mut(&id) {
-                record.dial.reset();
-            }
-            self.schedule_dial(now, id);
-        }
+        self.records.values_mut().for_each(|record| record.dial.reset());
+        self.dial_all(now);
         if self.port.is_some() {
             self.start_burst(now);
         }
@@ -150,6 +174,10 @@ impl Peers {
         listed.truncate(MOST_LISTED);
         let new = listed.iter().any(|peer| !self.listed.contains(peer));
         self.listed = listed;
+        let listed: Vec<IpAddr> = self.listed.iter().map(|(address, _)| *address).collect();
+        for record in self.records.values_mut() {
+            record.listed = record.sources.iter().any(|source| listed.contains(&source.ip()));
+        }
         if new && self.port.is_some() {
             self.start_burst(now);
         }
@@ -234,6 +262,16 @@ impl Peers {
         for id in silent {
             self.forget(id);
         }
+    }
+
+    /// Whether a dial would make sense, and the range lets this daemon look for the peer.
+    fn wants_dial(&self, record: &Record) -> bool {
+        let in_range = match self.local.range {
+            DiscoveryRange::Off => false,
+            DiscoveryRange::Localhost => record.near || record.listed,
+            DiscoveryRange::Subnet => true,
+        };
+        in_range && record.wants_dial()
     }
 
     fn lists(&self, address: IpAddr) -> bool {

@@ -53,6 +53,7 @@ impl Peers {
         if daemon == self.local.daemon || !self.in_range(from, arrival, beacon.localhost, listed) {
             return;
         }
+        let near = arrival == Arrival::Quic || self.here.is_local(from.ip());
         self.make_room(daemon);
         let difference = self.judge(&beacon);
         let observed = match arrival {
@@ -63,6 +64,7 @@ impl Peers {
         let record = self.records.entry(daemon).or_default();
         record.last_seen = now;
         record.listed |= listed;
+        record.near |= near;
         match difference {
             None => {
                 record.compatible = true;

@@ -25,6 +25,8 @@ pub(super) struct Record {
     pub(super) compatible: bool,
     /// We list it.
     pub(super) listed: bool,
+    /// It is on this host, or spoke to our QUIC port since this daemon looks no further than that.
+    pub(super) near: bool,
     pub(super) last_seen: Duration,
     pub(super) last_answered: Option<Duration>,
     /// Its mismatch was reported.

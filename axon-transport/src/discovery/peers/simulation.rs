@@ -161,6 +161,7 @@ impl Subnet {
                 Output::Action(Action::Mismatch(mismatch)) => {
                     self.hosts[host].mismatches.push((mismatch.peer, mismatch.setting));
                 }
+                Output::Action(Action::Named(names)) => panic!("it looks no names up: {names:?}"),
                 // So many beacons were lost in a row that it seemed gone; it is told of anew.
                 Output::Action(Action::Gone { daemon }) => {
                     let gone = self.hosts.iter().position(|h| h.peers.local.daemon == daemon);

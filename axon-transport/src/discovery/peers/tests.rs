@@ -350,9 +350,54 @@ fn ranges_are_kept() {
     let mut alone = Peers::new(Local { range: Localhost, bind: Vec::new(), ..local() }, 1);
     alone.set_port(Duration::ZERO, 61300);
     alone.advance(Duration::ZERO);
+    assert_eq!(alone.poll(), None, "it lists nobody");
+    alone.set_listed(secs(1.0), vec![("10.0.0.2".parse().unwrap(), None)]);
+    alone.advance(secs(1.0));
     let sent: Vec<_> = std::iter::from_fn(|| alone.poll()).collect();
-    assert_eq!(sent.len(), 15, "the other QUIC ports of this host");
+    assert_eq!(sent.len(), 16, "the QUIC ports of the host that it lists");
     assert!(!sent.iter().any(|output| matches!(output, Output::Multicast(_))));
+}
+
+#[test]
+fn a_range_that_changes_is_followed() {
+    use DiscoveryRange::{Localhost, Off, Subnet};
+    let multicasts = |peers: &mut Peers, now: f64| {
+        peers.advance(secs(now));
+        let sent: Vec<_> = std::iter::from_fn(|| peers.poll()).collect();
+        sent.iter().filter(|output| matches!(output, Output::Multicast(_))).count()
+    };
+    let mut peers = Peers::new(Local { range: Off, ..local() }, 1);
+    peers.set_port(Duration::ZERO, 61300);
+    assert_eq!(peers.next_wakeup(), None, "it is silent");
+    assert_eq!(multicasts(&mut peers, 0.0), 0);
+    peers.set_range(secs(1.0), Localhost);
+    assert_eq!(multicasts(&mut peers, 1.0), 0);
+    peers.set_range(secs(2.0), Subnet);
+    assert_eq!(multicasts(&mut peers, 2.0), 1);
+    hear(&mut peers, 3.0, beacon(HIGHER));
+    assert_eq!(dials(&mut peers), [HIGHER]);
+    peers.link_up(secs(3.0), HIGHER, from("10.0.0.2:61301"));
+
+    // A link stays; once it is down it is not made again for nobody.
+    peers.set_range(secs(4.0), Localhost);
+    assert_eq!(multicasts(&mut peers, 30.0), 0);
+    peers.link_down(secs(31.0), HIGHER);
+    peers.advance(secs(60.0));
+    assert_eq!(dials(&mut peers), []);
+    hear(&mut peers, 61.0, beacon(HIGHER));
+    assert_eq!(dials(&mut peers), [], "by multicast");
+    let bytes = Datagram::Beacon(beacon(HIGHER)).encode();
+    peers.datagram(secs(62.0), from("10.0.0.2:61301"), Arrival::Quic, &bytes);
+    assert_eq!(dials(&mut peers), [HIGHER], "it lists this host");
+
+    peers.set_range(secs(63.0), Off);
+    peers.dial_failed(secs(64.0), HIGHER);
+    actions(&mut peers);
+    peers.datagram(secs(65.0), from("10.0.0.2:61301"), Arrival::Quic, &bytes);
+    peers.advance(secs(90.0));
+    assert_eq!(peers.poll(), None);
+    peers.say_goodbye();
+    assert_eq!(peers.poll(), None);
 }
 
 #[test]

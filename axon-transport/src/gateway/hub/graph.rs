@@ -4,7 +4,7 @@ use super::Hub;
 use crate::{
     daemon::bridge::ToControl,
     gateway::{establish::close, peer::GraphChange},
-    graph::Endpoint,
+    graph::RemoteEndpoint,
     ids::DaemonId,
     link::CloseCode,
 };
@@ -17,7 +17,8 @@ impl Hub {
             .endpoints
             .values()
             .filter(|e| e.daemon.is_none())
-            .map(|e| (e.endpoint.gid, (*e.endpoint).clone()))
+            // One of which nothing is known goes nowhere.
+            .filter_map(|e| Some((e.endpoint.gid, ((*e.endpoint).clone(), e.reach.clone()?))))
             .collect();
         for peer in self.peers.values_mut() {
             peer.send_graph(&self.local, false);
@@ -31,13 +32,13 @@ impl Hub {
         let own = self.shared.session.id().0;
         let ours: Vec<_> = added
             .iter()
-            .map(|e| e.gid)
+            .map(|e| e.endpoint.gid)
             .filter(|gid| self.local.contains_key(gid) || gid.0[..12] == own[..12])
             .collect();
         if !ours.is_empty() {
             tracing::warn!(peer = %daemon, endpoints = ours.len(),
                 "a peer announces endpoints of this host; they are ignored");
-            added.retain(|e| !ours.contains(&e.gid));
+            added.retain(|e| !ours.contains(&e.endpoint.gid));
             if let Some(peer) = self.peers.get_mut(&daemon) {
                 peer.forget(&ours);
             }
@@ -45,6 +46,8 @@ impl Hub {
         let dead = self.taken_over(daemon, &added);
         // Before the dead links let go of their stand-ins: rings and readers stay as they are.
         if let Some(peer) = self.peers.get_mut(&daemon) {
+            // Sessions there may list this host now, or no more.
+            peer.send_graph(&self.local, false);
             peer.update(&self.local, &self.shared);
         }
         for link in dead {
@@ -60,14 +63,15 @@ impl Hub {
     /// A restarted daemon announces the endpoints of its predecessor, whose link may not have timed
     /// out yet: that link is dead, if both are the same host by what they proved. Somebody else's
     /// claim is ignored.
-    fn taken_over(&mut self, daemon: DaemonId, added: &[Endpoint]) -> Vec<u64> {
+    fn taken_over(&mut self, daemon: DaemonId, added: &[RemoteEndpoint]) -> Vec<u64> {
         let mut dead = Vec::new();
         let Some(owner) = self.identity_of(daemon) else { return dead };
         let others: Vec<_> = self.peers.keys().filter(|d| **d != daemon).copied().collect();
         for other in others {
             let same_host = self.identity_of(other).is_some_and(|i| i == owner);
             let Some(peer) = self.peers.get_mut(&other) else { continue };
-            let moved: Vec<_> = added.iter().map(|e| e.gid).filter(|gid| peer.has(*gid)).collect();
+            let moved: Vec<_> =
+                added.iter().map(|e| e.endpoint.gid).filter(|gid| peer.has(*gid)).collect();
             if moved.is_empty() {
                 continue;
             }

@@ -214,7 +214,7 @@ impl Hub {
                 false
             }
             None => {
-                let peer = Peer::new(number, outbox, carrier.clone(), &self.shared);
+                let peer = Peer::new(daemon, number, outbox, carrier.clone(), &self.shared);
                 self.peers.insert(daemon, peer);
                 true
             }

@@ -38,7 +38,7 @@ use super::{
 };
 use crate::{
     daemon::bridge::{ToControl, ToGateway},
-    graph::Endpoint,
+    graph::{Endpoint, Reach},
     ids::{DaemonId, Gid},
     link::{Candidate, CloseCode, Elected, GraphResync, Hello, Message},
     session::Session,
@@ -126,6 +126,9 @@ pub(super) struct Summary {
     pub(super) who: Who,
 }
 
+/// The endpoints of applications on this host, and how far their sessions are discovered.
+pub(super) type Local = BTreeMap<Gid, (Endpoint, Reach)>;
+
 /// The hub's state.
 pub(super) struct Hub {
     context: Arc<Context>,
@@ -137,7 +140,7 @@ pub(super) struct Hub {
     /// Superseded links that still carry something.
     leaving: HashMap<u64, Leaving>,
     peers: HashMap<DaemonId, Peer>,
-    local: BTreeMap<Gid, Endpoint>,
+    local: Local,
 }
 
 impl Hub {

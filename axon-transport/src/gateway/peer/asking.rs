@@ -12,7 +12,7 @@ use super::{OnDrop, POLL, Peer};
 use crate::{
     gateway::{
         control::Outbox,
-        hub::Shared,
+        hub::{Local, Shared},
         routes::{self, RouteKey, Wanted},
         routes_in::{RouteIn, RoutesIn},
         stand_in::StandIn,
@@ -57,30 +57,24 @@ impl Asked {
 
 impl Peer {
     /// Brings routes and stand-ins in line with what there is here and there.
-    pub(in crate::gateway) fn update(
-        &mut self,
-        local: &BTreeMap<Gid, Endpoint>,
-        shared: &Arc<Shared>,
-    ) {
-        let publishers = local.values().filter(|e| e.kind == EndpointKind::Publisher);
+    pub(in crate::gateway) fn update(&mut self, local: &Local, shared: &Arc<Shared>) {
+        let publishers =
+            local.values().map(|(e, _)| e).filter(|e| e.kind == EndpointKind::Publisher);
         self.alive.watch(publishers.filter_map(|e| e.qos.lease));
         // A server there is shown once its host asks for requests: then it has what answers them.
         self.answering = self.now_answering();
-        let reachable = self
-            .remote
-            .values()
-            .filter(|e| e.kind != EndpointKind::Server || self.answering.contains(&e.gid));
-        let wanted = routes::wanted(local.values(), reachable);
+        let reachable = self.remote.values().filter(|remote| {
+            let e = &remote.endpoint;
+            e.kind != EndpointKind::Server || self.answering.contains(&e.gid)
+        });
+        let own = local.values().map(|(endpoint, reach)| (endpoint, reach.toward(self.daemon)));
+        let wanted = routes::wanted(own, reachable);
         self.want(wanted, shared);
         self.feed_services();
     }
 
     /// As [`update`](Self::update), where servers there have become reachable or are so no more.
-    pub(in crate::gateway) fn update_services(
-        &mut self,
-        local: &BTreeMap<Gid, Endpoint>,
-        shared: &Arc<Shared>,
-    ) {
+    pub(in crate::gateway) fn update_services(&mut self, local: &Local, shared: &Arc<Shared>) {
         if self.answering != self.now_answering() {
             self.update(local, shared);
         }

@@ -16,7 +16,7 @@ use self::{asking::Asked, serving::Served};
 use super::{
     control::Outbox,
     counters::Counters,
-    hub::{Event, Shared},
+    hub::{Event, Local, Shared},
     inbound::Inbound,
     intake::Intake,
     outbound::{self, Carrier},
@@ -24,9 +24,10 @@ use super::{
     routes_in::RoutesIn,
 };
 use crate::{
+    config::DiscoveryRange,
     events::Alive,
-    graph::{Endpoint, LIMITS},
-    ids::Gid,
+    graph::{LIMITS, RemoteEndpoint, Toward},
+    ids::{DaemonId, Gid},
     link::{Graph, Message},
 };
 
@@ -37,17 +38,18 @@ const POLL: Duration = Duration::from_millis(5);
 
 /// A peer with an elected link.
 pub(super) struct Peer {
+    daemon: DaemonId,
     /// The number of the link in use.
     pub(super) link: u64,
     /// Control messages to it.
     pub(super) outbox: Outbox,
     /// What was carried and dropped.
     pub(super) counters: Arc<Counters>,
-    remote: BTreeMap<Gid, Endpoint>,
+    remote: BTreeMap<Gid, RemoteEndpoint>,
     remote_version: u64,
     /// What came of a whole graph so far.
-    gathered: Option<Vec<Endpoint>>,
-    sent: BTreeMap<Gid, Endpoint>,
+    gathered: Option<Vec<RemoteEndpoint>>,
+    sent: BTreeMap<Gid, RemoteEndpoint>,
     sent_version: u64,
     next_route: u32,
     /// Routes that this side asked for.
@@ -69,7 +71,7 @@ pub(super) struct GraphChange {
     /// Whether it replaces everything that was known of the peer.
     pub(super) reset: bool,
     /// Endpoints that came or changed.
-    pub(super) added: Vec<Endpoint>,
+    pub(super) added: Vec<RemoteEndpoint>,
     /// Endpoints that went.
     pub(super) removed: Vec<Gid>,
 }
@@ -86,13 +88,20 @@ pub(super) enum GraphTaken {
 
 impl Peer {
     /// A peer whose first link was elected.
-    pub(super) fn new(link: u64, outbox: Outbox, carrier: Carrier, shared: &Arc<Shared>) -> Self {
+    pub(super) fn new(
+        daemon: DaemonId,
+        link: u64,
+        outbox: Outbox,
+        carrier: Carrier,
+        shared: &Arc<Shared>,
+    ) -> Self {
         let counters = Arc::new(Counters::default());
         let (orders, receiver) = mpsc::unbounded_channel();
         let (queues, pulse) = (shared.queues.of_peer(), shared.pulse.clone());
         let sent = Arc::clone(&counters);
         tokio::spawn(outbound::run(carrier, receiver, sent, queues, pulse));
         Self {
+            daemon,
             link,
             outbox,
             counters,
@@ -160,34 +169,61 @@ impl Peer {
 
     // ---- graph ----
 
+    /// What the peer is shown of this host. A LOCALHOST session's endpoints are shown to a host that
+    /// the session lists, and to one of which a session lists this host; those of an OFF one to nobody.
+    fn shown(&self, local: &Local) -> BTreeMap<Gid, RemoteEndpoint> {
+        let listed = self.remote.values().any(|remote| remote.toward.lists);
+        let shown = local.iter().filter_map(|(gid, (endpoint, reach))| {
+            let toward = reach.toward(self.daemon);
+            let shown = match toward.range {
+                DiscoveryRange::Off => false,
+                DiscoveryRange::Localhost => toward.lists || listed,
+                DiscoveryRange::Subnet => true,
+            };
+            shown.then(|| (*gid, RemoteEndpoint { endpoint: endpoint.clone(), toward }))
+        });
+        shown.collect()
+    }
+
     /// Sends what changed since the last time, or all of it.
-    pub(super) fn send_graph(&mut self, local: &BTreeMap<Gid, Endpoint>, whole: bool) {
+    pub(super) fn send_graph(&mut self, local: &Local, whole: bool) {
         if whole {
             self.sent.clear();
         }
+        let now = self.shown(local);
         let added: Vec<_> =
-            local.values().filter(|e| self.sent.get(&e.gid) != Some(e)).cloned().collect();
+            now.iter().filter(|(gid, e)| self.sent.get(gid) != Some(e)).map(|(_, e)| e).collect();
         let removed: Vec<_> =
-            self.sent.keys().filter(|gid| !local.contains_key(gid)).copied().collect();
+            self.sent.keys().filter(|gid| !now.contains_key(gid)).copied().collect();
         if !whole && added.is_empty() && removed.is_empty() {
             return;
         }
         let mut before = if whole { 0 } else { self.sent_version };
         let mut removed = Some(removed);
-        let mut parts: Vec<_> = added.chunks(GRAPH_PART).map(<[_]>::to_vec).collect();
+        let mut parts: Vec<&[_]> = added.chunks(GRAPH_PART).collect();
         if parts.is_empty() {
-            parts.push(Vec::new());
+            parts.push(&[]);
         }
         let last = parts.len() - 1;
-        for (index, added) in parts.into_iter().enumerate() {
+        for (index, part) in parts.into_iter().enumerate() {
             self.sent_version += 1;
-            let removed = removed.take().unwrap_or_default();
-            let (version, more) = (self.sent_version, index < last);
-            let graph = Graph { version, before, added, removed, more };
+            let named = |is: fn(&Toward) -> bool| {
+                let gids = part.iter().filter(|e| is(&e.toward)).map(|e| e.endpoint.gid);
+                Some(gids.collect::<Vec<_>>()).filter(|gids| !gids.is_empty())
+            };
+            let graph = Graph {
+                version: self.sent_version,
+                before,
+                localhost: named(|toward| toward.range != DiscoveryRange::Subnet),
+                listing: named(|toward| toward.lists),
+                added: part.iter().map(|e| e.endpoint.clone()).collect(),
+                removed: removed.take().unwrap_or_default(),
+                more: index < last,
+            };
             self.say(Message::Graph(graph));
             before = self.sent_version;
         }
-        self.sent.clone_from(local);
+        self.sent = now;
     }
 
     /// Takes a GRAPH in.
@@ -196,7 +232,16 @@ impl Peer {
     /// The peer announces more endpoints than allowed.
     pub(super) fn take_graph(&mut self, graph: Graph) -> Result<GraphTaken, &'static str> {
         const TOO_MANY: &str = "more endpoints than a peer may have";
-        let Graph { version, before, added, removed, more } = graph;
+        let Graph { version, before, added, removed, more, localhost, listing } = graph;
+        let [localhost, listing] = [localhost, listing]
+            .map(|gids| gids.unwrap_or_default().into_iter().collect::<BTreeSet<Gid>>());
+        let added = added.into_iter().map(|endpoint| {
+            let near = localhost.contains(&endpoint.gid);
+            let range = if near { DiscoveryRange::Localhost } else { DiscoveryRange::Subnet };
+            let toward = Toward { range, lists: listing.contains(&endpoint.gid) };
+            RemoteEndpoint { endpoint, toward }
+        });
+        let added: Vec<RemoteEndpoint> = added.collect();
         if before == 0 {
             self.gathered = Some(Vec::new());
         } else if before != self.remote_version {
@@ -213,7 +258,7 @@ impl Peer {
             }
             let added = std::mem::take(gathered);
             self.gathered = None;
-            self.remote = added.iter().map(|endpoint| (endpoint.gid, endpoint.clone())).collect();
+            self.remote = added.iter().map(|e| (e.endpoint.gid, e.clone())).collect();
             self.unserve_unrepeated();
             let removed = Vec::new();
             return Ok(GraphTaken::Changed(GraphChange { reset: true, added, removed }));
@@ -221,8 +266,8 @@ impl Peer {
         for gid in &removed {
             self.remote.remove(gid);
         }
-        for endpoint in &added {
-            self.remote.insert(endpoint.gid, endpoint.clone());
+        for remote in &added {
+            self.remote.insert(remote.endpoint.gid, remote.clone());
         }
         if self.remote.len() > LIMITS.endpoints {
             return Err(TOO_MANY);

@@ -108,7 +108,9 @@ impl Peer {
         old: &[Source],
         shared: &Arc<Shared>,
     ) -> Vec<Source> {
-        let hash = |gid: &Gid| self.remote.get(gid).map_or_else(Vec::new, |e| e.type_hash.clone());
+        let hash = |gid: &Gid| {
+            self.remote.get(gid).map_or_else(Vec::new, |e| e.endpoint.type_hash.clone())
+        };
         let mut specs = relays(subscribers, hash);
         let there = |spec: &RelaySpec| {
             old.iter().position(|source| matches!(source, Source::Relay(o, _) if o.is(spec)))

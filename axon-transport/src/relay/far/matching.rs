@@ -49,7 +49,11 @@ impl Served {
         let removed: Vec<Gid> = before.endpoints.keys().filter(|gid| !same(gid)).copied().collect();
         let added = now.endpoints.values().filter(|entry| !same(&entry.endpoint.gid));
         let added = added
-            .map(|e| GraphItem { endpoint: Endpoint::clone(&e.endpoint), daemon: e.daemon })
+            .map(|e| GraphItem {
+                endpoint: Endpoint::clone(&e.endpoint),
+                daemon: e.daemon,
+                reach: None,
+            })
             .collect::<Vec<_>>();
         if removed.is_empty() && added.is_empty() {
             return Ok(());

@@ -97,7 +97,8 @@ impl Far {
         news.of(&session);
         let leader = session.segment().external_leader().map_err(|e| End::Other(e.to_string()))?;
         let daemon = session.daemon().unwrap_or_default();
-        let welcome = Welcome { protocol: PROTOCOL, daemon, pid: std::process::id() };
+        let pid = std::process::id();
+        let welcome = Welcome { protocol: PROTOCOL, daemon, pid, ranges: Some(true) };
         say(Message::Welcome(welcome))?;
         let incoming = Incoming::new(config.max_message, pool);
         Ok(Served {

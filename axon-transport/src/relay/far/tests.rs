@@ -57,7 +57,8 @@ fn what_the_control_plane_refuses_its_process_is_told_of() {
     relay.start().unwrap();
     hear(&control, |message| matches!(message, Message::Hello(_)).then_some(()));
     let pid = std::process::id();
-    let welcome = Welcome { protocol: PROTOCOL, daemon: DaemonId([7; 16]), pid };
+    let welcome =
+        Welcome { protocol: PROTOCOL, daemon: DaemonId([7; 16]), pid, ranges: Some(true) };
     say(&control, &Message::Welcome(welcome));
     hear(&process, |message| matches!(message, Message::Welcome(_)).then_some(()));
     let all = [

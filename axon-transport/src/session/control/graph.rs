@@ -42,7 +42,11 @@ impl Control {
             self.disappear(&gid);
         }
         for item in graph.added {
-            self.appear(GraphEntry { endpoint: Arc::new(item.endpoint), daemon: item.daemon });
+            self.appear(GraphEntry {
+                endpoint: Arc::new(item.endpoint),
+                daemon: item.daemon,
+                reach: item.reach,
+            });
         }
         self.view(|view| view.version = graph.version);
         if !graph.more
@@ -51,7 +55,8 @@ impl Control {
             let mut state = self.shared.state();
             // The daemon may have told of the whole before it heard of the newest of them.
             for own in state.shown() {
-                let entry = || GraphEntry { endpoint: Arc::new(own.clone()), daemon: None };
+                let entry =
+                    || GraphEntry { endpoint: Arc::new(own.clone()), daemon: None, reach: None };
                 view.endpoints.entry(own.gid).or_insert_with(entry);
             }
             state.graph = Arc::new(view);

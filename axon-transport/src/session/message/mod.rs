@@ -12,7 +12,7 @@ use minicbor::{Decode, Encode};
 use serde::Serialize;
 
 use crate::{
-    graph::Endpoint,
+    graph::{Endpoint, Reach},
     ids::{DaemonId, Gid, SessionId},
     qos::Qos,
     shm::{Location, SegmentInfo, SegmentKind},
@@ -82,6 +82,12 @@ pub struct Hello {
     /// Why it shares no memory, if so: then it is relayed, and has no descriptors.
     #[n(6)]
     pub relay: Option<String>,
+    /// Discovery range: 0 subnet, 1 localhost, 2 off. Absent where an older library opened it.
+    #[n(7)]
+    pub range: Option<u8>,
+    /// Static peers: addresses or host names; absent is none.
+    #[n(8)]
+    pub static_peers: Option<Vec<String>>,
 }
 
 /// The daemon takes the session.
@@ -97,6 +103,10 @@ pub struct Welcome {
     /// Its process.
     #[n(2)]
     pub pid: u32,
+    /// Whether it applies the range and the static peers of each session. An older daemon has one
+    /// range for all.
+    #[n(3)]
+    pub ranges: Option<bool>,
 }
 
 /// The daemon does not take the session, or one of its endpoints.
@@ -174,6 +184,9 @@ pub struct GraphItem {
     /// The daemon it belongs to when that is another host's.
     #[n(1)]
     pub daemon: Option<DaemonId>,
+    /// To the gateway, of an endpoint of this host: how far its session is discovered.
+    #[n(2)]
+    pub reach: Option<Reach>,
 }
 
 /// A change of the graph, or a part of the whole of it.

@@ -31,8 +31,15 @@ fn messages() -> Vec<Message> {
             domain: 7,
             settings: vec![("AXON_SECURITY_MODE".into(), "classic".into())],
             relay: Some("AXON_SHM is off".into()),
+            range: Some(0),
+            static_peers: None,
         }),
-        Message::Welcome(Welcome { protocol: 1, daemon: DaemonId([4; 16]), pid: 12 }),
+        Message::Welcome(Welcome {
+            protocol: 1,
+            daemon: DaemonId([4; 16]),
+            pid: 12,
+            ranges: Some(true),
+        }),
         Message::Refused(Refused {
             variable: "AXON_QUIC_CIPHER".into(),
             ours: "a".into(),
@@ -51,7 +58,11 @@ fn messages() -> Vec<Message> {
         Message::Graph(Graph {
             version: 3,
             whole: true,
-            added: vec![GraphItem { endpoint: endpoint(), daemon: Some(DaemonId([9; 16])) }],
+            added: vec![GraphItem {
+                endpoint: endpoint(),
+                daemon: Some(DaemonId([9; 16])),
+                reach: None,
+            }],
             removed: vec![writer],
             more: false,
             ended: Some(vec![Gid([8; 16])]),
@@ -147,7 +158,7 @@ fn unknown_types_and_keys_are_skipped() {
     e.map(1).unwrap().u8(2).unwrap().u8(3).unwrap();
     e.u8(1).unwrap().bytes(&[4; 16]).unwrap();
     e.u8(2).unwrap().u8(12).unwrap();
-    let welcome = Welcome { protocol: 1, daemon: DaemonId([4; 16]), pid: 12 };
+    let welcome = Welcome { protocol: 1, daemon: DaemonId([4; 16]), pid: 12, ranges: None };
     assert_eq!(Message::decode(&packet).unwrap(), Message::Welcome(welcome));
 }
 

@@ -96,7 +96,7 @@ impl Taker {
 }
 
 fn appears(daemon: &Daemon, endpoint: Endpoint) {
-    let added = vec![GraphItem { endpoint, daemon: None }];
+    let added = vec![GraphItem { endpoint, daemon: None, reach: None }];
     let graph =
         Graph { version: 2, whole: false, added, removed: Vec::new(), more: false, ended: None };
     daemon.say(Message::Graph(graph), &[]);

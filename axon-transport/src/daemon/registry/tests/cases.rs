@@ -72,7 +72,10 @@ fn a_sample_never_goes_back_to_where_it_came_from() {
     let mut world = connected(1);
     let gateway = session_id(200);
     let name = String::new();
-    world.registry.connect(gateway, SessionRole::Gateway, name, 1, Some(handed(gateway))).unwrap();
+    world
+        .registry
+        .connect(gateway, SessionRole::Gateway, name, 1, Some(handed(gateway)), None)
+        .unwrap();
     let own = first(&world);
     let remote = endpoint(Gid([9; 16]), EndpointKind::Publisher, 0, Qos::default());
     let relay = endpoint(Gid::new(gateway, 1), EndpointKind::Subscription, 0, Qos::default());
@@ -96,7 +99,7 @@ fn a_sample_never_goes_back_to_where_it_came_from() {
     world.registry.flush();
     let shown: BTreeSet<Gid> = world
         .registry
-        .whole_graph()
+        .whole_graph(&own)
         .iter()
         .flat_map(|g| g.added.iter().map(|i| i.endpoint.gid))
         .collect();
@@ -108,7 +111,10 @@ fn ends_of_a_service_elsewhere_meet_those_here_and_never_each_other() {
     let mut world = connected(1);
     let gateway = session_id(200);
     let name = String::new();
-    world.registry.connect(gateway, SessionRole::Gateway, name, 1, Some(handed(gateway))).unwrap();
+    world
+        .registry
+        .connect(gateway, SessionRole::Gateway, name, 1, Some(handed(gateway)), None)
+        .unwrap();
     let own = first(&world);
     let of = |gid, kind| endpoint(gid, kind, 0, Qos::default());
     let (client, server) =
@@ -141,9 +147,9 @@ fn a_gid_that_is_taken_is_nobody_elses() {
     let (a, b) = (DaemonId([1; 16]), DaemonId([2; 16]));
     let remote = endpoint(Gid([9; 16]), EndpointKind::Publisher, 0, Qos::default());
     // Another host claims the GID before its session announces it.
-    world.registry.remote_graph(a, true, vec![local.clone(), remote.clone()], vec![]);
+    world.registry.remote_graph(a, true, vec![local.clone().into(), remote.clone().into()], vec![]);
     world.registry.message(&own, announce(local.clone()), vec![]).unwrap();
-    world.registry.remote_graph(b, true, vec![local.clone(), remote.clone()], vec![]);
+    world.registry.remote_graph(b, true, vec![local.clone().into(), remote.clone().into()], vec![]);
     let of: Vec<_> = world.registry.remote_endpoints().map(|(d, e)| (*d, e.gid)).collect();
     assert_eq!(of, [(a, remote.gid)]);
     // Nor can the one take away what is the other's.
@@ -206,7 +212,7 @@ fn a_large_graph_is_told_in_packets_that_fit() {
             ..endpoint(gid, EndpointKind::Publisher, 0, Qos::default())
         }
     });
-    world.registry.remote_graph(DaemonId([1; 16]), true, added.collect(), vec![]);
+    world.registry.remote_graph(DaemonId([1; 16]), true, added.map(Into::into).collect(), vec![]);
     world.settle();
     assert_eq!(world.clients[&0].graph.len(), 3000);
 }
@@ -230,7 +236,7 @@ fn a_remote_endpoint_that_comes_and_goes_ends_nothing_here() {
     };
     // A successor link repeats the whole graph within one flush.
     for _ in 0..2 {
-        world.registry.remote_graph(DaemonId([1; 16]), true, vec![endpoint.clone()], vec![]);
+        world.registry.remote_graph(DaemonId([1; 16]), true, vec![endpoint.clone().into()], vec![]);
     }
     world.registry.flush();
     let mut seen = false;

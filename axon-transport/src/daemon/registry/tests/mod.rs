@@ -315,7 +315,7 @@ impl World {
                 self.generation = self.generation.wrapping_add(SESSIONS);
                 let id = session_id(self.generation.wrapping_add(session));
                 self.registry
-                    .connect(id, SessionRole::Application, String::new(), 1, Some(handed(id)))
+                    .connect(id, SessionRole::Application, String::new(), 1, Some(handed(id)), None)
                     .unwrap();
                 let client = Client { id, connected: true, ..Client::default() };
                 self.clients.insert(session, client);
@@ -359,7 +359,7 @@ impl World {
             Step::Remote { daemon, reset, add, remove } => {
                 let gid = |n: u8| Gid([100 + daemon.wrapping_mul(8) + n; 16]);
                 let kind = EndpointKind::Publisher;
-                let added = vec![endpoint(gid(add), kind, 0, Qos::default())];
+                let added = vec![endpoint(gid(add), kind, 0, Qos::default()).into()];
                 let id = DaemonId([daemon; 16]);
                 self.registry.remote_graph(id, reset, added, vec![gid(remove)]);
             }

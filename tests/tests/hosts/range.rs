@@ -1,0 +1,309 @@
+//! The discovery range is each session's own: which session started the daemon does not matter, and both
+//! hosts decide for each pair.
+
+use axon_tests::Sizes;
+use axon_transport::{
+    config::{Config, DaemonPolicy, DiscoveryRange},
+    daemon::status::SessionStatus,
+    ids::Gid,
+    qos::Qos,
+    session::{EndpointSpec, Publisher, Session, SessionOptions, Subscription},
+};
+
+use super::{
+    mode::classic,
+    pair::{Host, Plan, TOPIC},
+    process::{PATIENCE, until},
+};
+use DiscoveryRange::{Localhost, Off, Subnet};
+
+/// Samples of each publisher, none of which may cross that must not.
+const SAMPLES: u64 = 400;
+
+/// This process's environment is not the host's: a daemon that it started would be another one.
+const REQUIRE: DaemonPolicy = DaemonPolicy::Require;
+
+fn spec() -> EndpointSpec {
+    EndpointSpec::new(TOPIC, "test/Bytes", Qos::keep_all())
+}
+
+/// A session of this process on `host`, with a range and static peers of its own.
+fn open(host: &Host, range: DiscoveryRange, lists: &[&Host]) -> Session {
+    let static_peers = lists.iter().map(|peer| peer.address.to_string()).collect();
+    let config = Config { range, static_peers, daemon: REQUIRE, ..host.config() };
+    Session::open(&config, SessionOptions::new(range.name())).unwrap()
+}
+
+/// As [`open`], sharing no memory with its daemon.
+fn open_relayed(host: &Host, range: DiscoveryRange, lists: &[&Host]) -> Session {
+    let static_peers = lists.iter().map(|peer| peer.address.to_string()).collect();
+    let config = Config { range, static_peers, shm: false, daemon: REQUIRE, ..host.config() };
+    Session::open(&config, SessionOptions::new("relayed")).unwrap()
+}
+
+fn publisher(session: &Session) -> Publisher {
+    session.create_publisher(spec()).unwrap()
+}
+
+fn subscription(session: &Session) -> Subscription {
+    session.create_subscription(spec()).unwrap()
+}
+
+fn publish(publisher: &Publisher) {
+    for number in 1..=SAMPLES {
+        publisher.publish(&number.to_be_bytes()).unwrap();
+    }
+}
+
+/// Takes `SAMPLES` of `writer`, and nothing of anybody else.
+#[track_caller]
+fn take_all_of(subscription: &Subscription, writer: Gid) {
+    let mut bytes = Vec::new();
+    for number in 1..=SAMPLES {
+        let info = subscription.recv(&mut bytes, Some(PATIENCE)).expect("a sample");
+        assert_eq!((info.publisher, info.sequence), (writer, number));
+    }
+}
+
+/// Takes all, until `SAMPLES` of `writer` have come.
+#[track_caller]
+fn take_of(subscription: &Subscription, writer: Gid) {
+    let mut bytes = Vec::new();
+    loop {
+        let info = subscription.recv(&mut bytes, Some(PATIENCE)).expect("a sample");
+        if (info.publisher, info.sequence) == (writer, SAMPLES) {
+            return;
+        }
+    }
+}
+
+/// Whether nothing is there to be taken.
+fn is_empty(subscription: &Subscription) -> bool {
+    !subscription.has_data()
+}
+
+#[track_caller]
+fn meet(publisher: &Publisher, subscription: &Subscription) {
+    let what = "a publisher and a subscription that are in range meet";
+    until(what, || {
+        publisher.matched().contains(&subscription.gid())
+            && subscription.matched().contains(&publisher.gid())
+    });
+}
+
+#[track_caller]
+fn apart(session: &Session, publisher: &Publisher, other: &Session, subscription: &Subscription) {
+    assert!(!publisher.matched().contains(&subscription.gid()), "the publisher counts it");
+    assert!(!subscription.matched().contains(&publisher.gid()), "the subscription counts it");
+    assert!(!session.graph().endpoints.contains_key(&subscription.gid()), "it is in the graph");
+    assert!(!other.graph().endpoints.contains_key(&publisher.gid()), "it is in the other's graph");
+}
+
+fn session_of(host: &Host, name: &str) -> SessionStatus {
+    let sessions = host.status().sessions;
+    sessions.into_iter().find(|session| session.name == name).expect("the session is listed")
+}
+
+/// Hosts without daemons, and with daemons that have no range of their own where `daemons` says so.
+fn hosts(daemons: bool) -> [Host; 2] {
+    let silent = || classic(&[("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")]);
+    let plan = Plan::new(if daemons { [silent(), silent()] } else { [classic(&[]), classic(&[])] });
+    if daemons { plan.start() } else { plan.prepare() }
+}
+
+/// A LOCALHOST session beside a SUBNET one: what the first publishes stays here, and what the second
+/// publishes arrives, whichever of them started the daemon.
+fn localhost_beside_subnet(first: &[(&str, &str)]) {
+    let [a, b] = hosts(false);
+    // It starts the daemon of A, and one of B's own range starts that of B.
+    let _first = a.node_with(first, &["publish", "/first", Sizes::Small.name(), "0", "stream"]);
+    let _of_b = b.node(&["publish", "/of_b", Sizes::Small.name(), "0", "stream"]);
+    until("the daemons stand", || a.try_status().is_some() && b.try_status().is_some());
+
+    let near = open(&a, Localhost, &[]);
+    let wide = open(&a, Subnet, &[]);
+    let there = open(&b, Subnet, &[]);
+    let (here, away) = (subscription(&wide), subscription(&there));
+    let (kept, sent) = (publisher(&near), publisher(&wide));
+    meet(&kept, &here);
+    meet(&sent, &away);
+    publish(&kept);
+    take_all_of(&here, kept.gid());
+    apart(&near, &kept, &there, &away);
+    publish(&sent);
+    take_all_of(&away, sent.gid());
+    assert!(is_empty(&away), "not one of the LOCALHOST session's");
+
+    // The other way round: what is published there does not reach the LOCALHOST session.
+    let (far, from_there) = (subscription(&near), publisher(&there));
+    meet(&from_there, &here);
+    meet(&sent, &far);
+    publish(&from_there);
+    take_of(&here, from_there.gid());
+    apart(&there, &from_there, &near, &far);
+
+    let status = a.status();
+    let topic = status.topics.iter().find(|topic| topic.topic == TOPIC).unwrap();
+    let pair = topic.out_of_range.iter().find(|pair| pair.writer == kept.gid().to_string());
+    let pair = pair.expect("why the pair is refused");
+    assert_eq!(pair.reader, away.gid().to_string());
+    assert!(pair.reason.contains("LOCALHOST") && pair.reason.contains("ROS_STATIC_PEERS"));
+    assert_eq!(status.discovery.range, "SUBNET");
+    assert_eq!(session_of(&a, "LOCALHOST").range.as_deref(), Some("LOCALHOST"));
+    assert_eq!(session_of(&a, "SUBNET").range.as_deref(), Some("SUBNET"));
+}
+
+#[test]
+fn a_localhost_session_that_started_the_daemon_does_not_keep_a_subnet_one_in() {
+    localhost_beside_subnet(&[("ROS_LOCALHOST_ONLY", "1")]);
+}
+
+#[test]
+fn a_subnet_session_that_started_the_daemon_does_not_let_a_localhost_one_out() {
+    localhost_beside_subnet(&[("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")]);
+}
+
+#[test]
+fn an_off_session_reaches_itself_alone() {
+    let [a, b] = hosts(true);
+    let there = open(&b, Subnet, &[&a]);
+    let off = open(&a, Off, &[&b]);
+    let beside = open(&a, Subnet, &[]);
+    let (itself, own) = (publisher(&off), subscription(&off));
+    let (here, away) = (subscription(&beside), subscription(&there));
+    let (sent, from_there) = (publisher(&beside), publisher(&there));
+    meet(&itself, &own);
+    meet(&sent, &away);
+    meet(&from_there, &here);
+    publish(&itself);
+    take_all_of(&own, itself.gid());
+    for (session, subscription) in [(&beside, &here), (&there, &away)] {
+        apart(&off, &itself, session, subscription);
+    }
+    for (session, publisher) in [(&beside, &sent), (&there, &from_there)] {
+        apart(session, publisher, &off, &own);
+    }
+    assert!(is_empty(&here) && is_empty(&away));
+    let topics = a.status().topics;
+    let topic = topics.iter().find(|topic| topic.topic == TOPIC).unwrap();
+    assert!(topic.out_of_range.iter().any(|pair| pair.reason.contains("OFF")), "{topic:?}");
+}
+
+/// A static peer on one side is enough, for the session that lists it alone.
+#[test]
+fn a_localhost_session_meets_the_hosts_that_it_lists() {
+    let [a, b] = hosts(true);
+    let there = open(&b, Localhost, &[]);
+    let unlisting = open(&a, Localhost, &[]);
+    let (kept, away) = (publisher(&unlisting), subscription(&there));
+    let from_there = publisher(&there);
+    assert!(a.status().links.is_empty() && b.status().links.is_empty());
+
+    let listing = open(&a, Localhost, &[&b]);
+    let (sent, here) = (publisher(&listing), subscription(&listing));
+    meet(&sent, &away);
+    meet(&from_there, &here);
+    publish(&kept);
+    publish(&sent);
+    take_all_of(&away, sent.gid());
+    publish(&from_there);
+    take_of(&here, from_there.gid());
+    apart(&unlisting, &kept, &there, &away);
+    // Its own session's, and not one of the session that lists nobody.
+    take_all_of(&away, from_there.gid());
+    assert!(is_empty(&away));
+    let shown = session_of(&a, "LOCALHOST");
+    assert!(shown.range_stated);
+    let listed = a.status().sessions.into_iter().find(|session| !session.lists.is_empty()).unwrap();
+    assert_eq!(listed.static_peers, [b.address.to_string()]);
+    assert_eq!(listed.lists, [b.status().daemon]);
+}
+
+#[test]
+fn discovery_looks_as_far_as_the_sessions_that_there_are() {
+    let [a, b] = hosts(true);
+    let there = open(&b, Subnet, &[]);
+    let away = subscription(&there);
+    let near = open(&a, Localhost, &[]);
+    let kept = publisher(&near);
+    assert_eq!(a.status().discovery.range, "LOCALHOST");
+    assert!(a.status().discovery.hosts.is_empty(), "AXON_DAEMON_PEERS is for SUBNET sessions");
+    for _ in 0..3 {
+        let wide = open(&a, Subnet, &[]);
+        let sent = publisher(&wide);
+        meet(&sent, &away);
+        assert_eq!(a.status().discovery.range, "SUBNET");
+        let gid = sent.gid();
+        drop((sent, wide));
+        until("it is gone there", || !there.graph().endpoints.contains_key(&gid));
+        until("nobody looks that far", || a.status().discovery.range == "LOCALHOST");
+        apart(&near, &kept, &there, &away);
+    }
+    // A session there lists this host: then it is in range while that one is there.
+    let listing = open(&b, Subnet, &[&a]);
+    let listens = subscription(&listing);
+    meet(&kept, &listens);
+    apart(&near, &kept, &there, &away);
+    publish(&kept);
+    take_all_of(&listens, kept.gid());
+    drop((listens, listing));
+    until("nobody there is in range", || kept.matched().is_empty());
+    assert!(is_empty(&away));
+}
+
+#[test]
+fn ranges_hold_after_a_daemon_was_restarted() {
+    let [mut a, b] = hosts(true);
+    let there = open(&b, Subnet, &[]);
+    let near = open(&a, Localhost, &[]);
+    let wide = open(&a, Subnet, &[]);
+    let listing = open(&a, Localhost, &[&b]);
+    let away = subscription(&there);
+    let (kept, sent, listed) = (publisher(&near), publisher(&wide), publisher(&listing));
+    meet(&sent, &away);
+    meet(&listed, &away);
+    for _ in 0..2 {
+        let old = a.kill_daemon().daemon;
+        let _starts = a.node(&["publish", "/next", Sizes::Small.name(), "0", "stream"]);
+        until("another daemon takes over", || a.try_status().is_some_and(|s| s.daemon != old));
+        let new = a.status().daemon;
+        until("the new daemon is linked", || b.status().links.iter().any(|l| l.peer == new));
+        meet(&sent, &away);
+        meet(&listed, &away);
+        apart(&near, &kept, &there, &away);
+    }
+    publish(&kept);
+    publish(&sent);
+    take_all_of(&away, sent.gid());
+    assert!(is_empty(&away));
+}
+
+#[test]
+fn ranges_are_kept_for_a_relayed_session() {
+    let [a, b] = hosts(true);
+    let there = open(&b, Subnet, &[]);
+    let away = subscription(&there);
+    let near = open_relayed(&a, Localhost, &[]);
+    let wide = open(&a, Subnet, &[]);
+    let (here, kept, sent) = (subscription(&wide), publisher(&near), publisher(&wide));
+    meet(&kept, &here);
+    meet(&sent, &away);
+    publish(&kept);
+    take_all_of(&here, kept.gid());
+    apart(&near, &kept, &there, &away);
+    assert!(is_empty(&away));
+    assert_eq!(session_of(&a, "relayed").range.as_deref(), Some("LOCALHOST"));
+    drop((kept, near));
+
+    let listing = open_relayed(&a, Localhost, &[&b]);
+    let listed = publisher(&listing);
+    meet(&listed, &away);
+    publish(&listed);
+    take_all_of(&away, listed.gid());
+
+    let off = open_relayed(&a, Off, &[&b]);
+    let (own, silent) = (subscription(&off), publisher(&off));
+    meet(&silent, &own);
+    apart(&off, &silent, &wide, &here);
+    apart(&wide, &sent, &off, &own);
+}
