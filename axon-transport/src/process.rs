@@ -1,4 +1,4 @@
-//! What there is one of in each process: a forked child makes its own.
+//! What there is one of in each process: a forked child makes its own. And whose rights it has.
 
 #![allow(unsafe_code)]
 
@@ -8,6 +8,13 @@ use std::{
 };
 
 use crate::shm::{ForkToken, ShmError};
+
+/// Whether this process has more rights than its caller, as the kernel says (AT_SECURE): its program is
+/// set-uid or set-gid, or has file capabilities.
+pub(crate) fn is_elevated() -> bool {
+    // SAFETY: looks a number up in what the kernel gave the process at its start.
+    unsafe { libc::getauxval(libc::AT_SECURE) != 0 }
+}
 
 /// A place for one `T` a process, which stands until the process ends. Finding it takes no lock, so
 /// that none which a thread of the parent's held at the fork is in a child's way.

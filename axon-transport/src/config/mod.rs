@@ -12,6 +12,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
+pub(crate) mod elevated;
 mod error;
 mod files;
 mod model;
@@ -34,6 +35,9 @@ pub use summary::security_settings;
 impl Config {
     /// The configuration of this process: its environment, and the `axon.toml` that `AXON_CONFIG`
     /// names, else the one beside the daemon (`AXON_DAEMON_PATH`, or this very program), if any.
+    ///
+    /// A process that has more rights than its caller (set-uid, set-gid, file capabilities) takes no
+    /// programs, files or users to trust from its environment: they are errors.
     pub fn from_env() -> Result<Self, ConfigError> {
         Self::from_env_with([], None)
     }
@@ -50,6 +54,10 @@ impl Config {
         daemon: Option<&Path>,
     ) -> Result<Self, ConfigError> {
         let mut variables: BTreeMap<OsString, OsString> = std::env::vars_os().collect();
+        let is_elevated = crate::process::is_elevated();
+        if is_elevated {
+            elevated::restrict(&mut variables)?;
+        }
         for (name, value) in overrides {
             match value {
                 Some(value) => variables.insert(name.into(), value),
@@ -62,6 +70,9 @@ impl Config {
             None => std::env::current_exe().ok(),
         });
         let file = beside.map(|daemon| daemon.with_file_name("axon.toml"));
+        if let Some(file) = file.as_deref().filter(|_| is_elevated) {
+            elevated::check_default_file(file)?;
+        }
         Self::resolve(variables, file.as_deref(), &OsFiles)
     }
 

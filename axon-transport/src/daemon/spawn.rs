@@ -18,7 +18,8 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::log;
 use crate::{
-    config::{Config, DiscoveryRange},
+    config::{Config, DiscoveryRange, elevated::check_owner},
+    process::is_elevated,
     session::{DaemonCommand, SessionError, address::private_directory},
 };
 
@@ -49,12 +50,21 @@ pub(crate) fn spawn(
 ) -> Result<Outcome, SessionError> {
     let DaemonCommand { program, arguments } = find(config, command)?;
     let failed = |text: String| SessionError::DaemonFailed { program: program.clone(), text };
+    let is_elevated = is_elevated();
+    if is_elevated {
+        check_owner(&program).map_err(|why| {
+            failed(format!(
+                "not started: this program runs with more rights than its caller, who could have put \
+                 the daemon's program there: {why}"
+            ))
+        })?;
+    }
     let (reader, writer) = std::io::pipe().map_err(|e| failed(e.to_string()))?;
     let mut child = Command::new(&program)
         .args(arguments)
         .arg(SPAWNED)
         .env_clear()
-        .envs(std::env::vars_os().filter(|(name, _)| inherited(name)))
+        .envs(std::env::vars_os().filter(|(name, _)| inherited(name, is_elevated)))
         .env_remove("ROS_LOCALHOST_ONLY")
         .envs(chosen(config))
         .stdin(Stdio::null())
@@ -110,8 +120,9 @@ fn own_file() -> Option<PathBuf> {
     })
 }
 
-/// Whether a daemon gets this variable: what it reads, and what its system libraries need.
-fn inherited(name: &OsString) -> bool {
+/// Whether a daemon gets this variable: what it reads, and what its system libraries need. These take
+/// files from it, so one of a process with more rights than its caller gets what AXON reads alone.
+fn inherited(name: &OsString, is_elevated: bool) -> bool {
     const NAMES: &[&str] = &[
         "HOME",
         "LANG",
@@ -126,7 +137,7 @@ fn inherited(name: &OsString) -> bool {
     ];
     const PREFIXES: &[&str] = &["AXON_", "ROS_", "LC_"];
     name.to_str().is_some_and(|name| {
-        NAMES.contains(&name)
+        (NAMES.contains(&name) && !is_elevated)
             || PREFIXES.iter().any(|prefix| name.starts_with(prefix))
     })
 }

@@ -21,6 +21,7 @@ use crate::{
 pub(crate) fn play(part: &str) {
     let place = || std::env::var("PLACE").unwrap();
     match part {
+        "elevated" => crate::elevated::play(),
         "locked" => {
             // SAFETY: takes plain flags.
             if unsafe { libc::mlockall(libc::MCL_CURRENT | libc::MCL_FUTURE) } != 0 {

@@ -2,6 +2,7 @@
 //! short, or a delay, and never somebody's end.
 
 mod child;
+mod elevated;
 #[path = "../support/group.rs"]
 mod group;
 mod interrupted;

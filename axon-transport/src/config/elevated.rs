@@ -1,0 +1,151 @@
+//! What a program that runs with more rights than its caller takes from that caller: no programs, no
+//! files and no users to trust.
+//!
+//! The environment of a set-uid, set-gid or file-capability program is its caller's. A path in it would
+//! be executed or read with rights that the caller does not have.
+
+use std::{
+    collections::BTreeMap,
+    ffi::{OsStr, OsString},
+    os::unix::fs::MetadataExt,
+    path::Path,
+};
+
+use super::{ConfigError, names};
+
+/// Settings that name programs, files, directories, or users who are let in.
+const REFUSED: &[&str] = &[
+    names::CONFIG,
+    "AXON_DAEMON_PATH",
+    "AXON_RUNTIME_DIR",
+    "AXON_CLASSIC_KEY",
+    "AXON_CLASSIC_TRUST",
+    "AXON_CLASSIC_CA",
+    "AXON_CLASSIC_CERT",
+    "AXON_CLASSIC_CRL",
+    "AXON_KME_CA",
+    "AXON_SAE_CERT",
+    "AXON_SAE_KEY",
+    "AXON_TRUSTED_UIDS",
+];
+
+const ACCEPTED: &str = "nothing from the environment: this program runs with more rights than its caller \
+                        (set-uid, set-gid or file capabilities; AT_SECURE). Unset it, and write it into \
+                        an axon.toml beside the daemon's program";
+
+/// Takes what such a program must not take out of its environment.
+///
+/// # Errors
+/// A setting of the caller's that names a program or a file.
+pub(super) fn restrict(variables: &mut BTreeMap<OsString, OsString>) -> Result<(), ConfigError> {
+    for name in REFUSED {
+        if let Some(value) = variables.get(OsStr::new(name)) {
+            return Err(ConfigError::value(name, &value.to_string_lossy(), ACCEPTED));
+        }
+    }
+    // Every login sets it, so that it is no error: the directory is just not used.
+    variables.remove(OsStr::new("XDG_RUNTIME_DIR"));
+    Ok(())
+}
+
+/// The `axon.toml` that nobody named, unless the caller could have put it there: a hard link makes the
+/// program stand in a directory of its caller's.
+///
+/// # Errors
+/// Somebody else could have written it.
+pub(super) fn check_default_file(file: &Path) -> Result<(), ConfigError> {
+    match std::fs::symlink_metadata(file) {
+        // There is none, or it cannot be read either.
+        Err(_) => Ok(()),
+        Ok(_) => check_owner(file).map_err(|why| {
+            let accepted = format!("a file that the caller of this program cannot replace: {why}");
+            ConfigError::value(names::CONFIG, &file.to_string_lossy(), accepted)
+        }),
+    }
+}
+
+/// Checks that nobody but root, and the user whose rights this process has been given, can replace a
+/// file: by its owner and mode, and those of all directories above it.
+///
+/// # Errors
+/// What is wrong, and where.
+pub(crate) fn check_owner(path: &Path) -> Result<(), String> {
+    if !path.is_absolute() {
+        return Err(format!("{} is no absolute path", path.display()));
+    }
+    let path = std::fs::canonicalize(path).map_err(|e| format!("{}: {e}", path.display()))?;
+    let given = rustix::process::geteuid();
+    // In a set-gid program and in one with capabilities the effective user is the caller.
+    let given = Some(given).filter(|given| *given != rustix::process::getuid());
+    for part in path.ancestors() {
+        let shown = part.display();
+        let facts = std::fs::symlink_metadata(part).map_err(|e| format!("{shown}: {e}"))?;
+        if facts.uid() != 0 && given.is_none_or(|given| facts.uid() != given.as_raw()) {
+            return Err(format!("{shown} is user {}'s", facts.uid()));
+        }
+        // In a directory with the sticky bit only a file's owner replaces it.
+        let sticky = facts.is_dir() && facts.mode() & 0o1000 != 0;
+        if facts.mode() & 0o022 != 0 && !sticky {
+            return Err(format!("others may write {shown}"));
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+
+    fn environment(name: &str) -> BTreeMap<OsString, OsString> {
+        [
+            ("ROS_DOMAIN_ID", "3"),
+            ("AXON_LOG", "info"),
+            ("XDG_RUNTIME_DIR", "/run/user/1"),
+            (name, "/x"),
+        ]
+        .into_iter()
+        .map(|(name, value)| (name.into(), value.into()))
+        .collect()
+    }
+
+    #[test]
+    fn every_setting_that_names_a_path_is_refused() {
+        for name in REFUSED {
+            let error = restrict(&mut environment(name)).unwrap_err();
+            assert_eq!(error.variable(), *name);
+            assert!(error.to_string().contains("AT_SECURE"), "{error}");
+        }
+        let mut rest = environment("AXON_MAX_MESSAGE_MB");
+        restrict(&mut rest).unwrap();
+        assert!(!rest.contains_key(OsStr::new("XDG_RUNTIME_DIR")) && rest.len() == 3);
+    }
+
+    /// A setting that is added must be looked at: does its value name a path?
+    #[test]
+    fn no_setting_is_forgotten() {
+        let paths = ["_KEY", "_TRUST", "_CA", "_CERT", "_CRL", "_PATH", "_DIR", "_FILE", "_CONFIG"];
+        for name in names::SETTINGS {
+            let named = paths.iter().any(|end| name.ends_with(end));
+            assert!(!named || REFUSED.contains(name), "{name}");
+        }
+    }
+
+    #[test]
+    fn a_file_that_others_can_replace_is_not_taken() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("axon.toml");
+        check_default_file(&file).unwrap();
+        std::fs::write(&file, "").unwrap();
+        if rustix::process::geteuid().is_root() {
+            check_default_file(&file).unwrap();
+        } else {
+            assert!(check_default_file(&file).is_err(), "it is the caller's");
+        }
+        std::fs::set_permissions(dir.path(), std::fs::Permissions::from_mode(0o777)).unwrap();
+        let error = check_default_file(&file).unwrap_err();
+        assert_eq!(error.variable(), "AXON_CONFIG");
+        assert!(check_owner(Path::new("axon_daemon")).unwrap_err().contains("absolute"));
+    }
+}
