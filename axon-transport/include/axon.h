@@ -688,7 +688,7 @@ typedef struct axon_session_options_t {
      */
     uint32_t domain;
     /**
-     * AXON_DISCOVERY_*: how far the session is discovered, whoever started the daemon.
+     * AXON_DISCOVERY_*: how far the session is discovered, whichever process started the daemon.
      */
     uint32_t discovery;
     /**

@@ -228,7 +228,7 @@ def test_a_host_whose_kme_is_on_another_qkd_network_exchanges_nothing(lan, mode)
     {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'},
     {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'},
 ], ids=['localhost_only', 'localhost', 'off'])
-def test_a_node_has_its_own_range_whoever_started_the_daemon(lan, variables, first):  # noqa: F811
+def test_a_node_has_its_own_range_whichever_node_is_first(lan, variables, first):  # noqa: F811
     a, b = lan.host('a'), lan.host('b')
     heard_kept, heard_wide = listener(b, 'kept'), listener(b, 'wide', '-r', '__node:=of_wide')
 

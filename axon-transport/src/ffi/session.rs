@@ -47,7 +47,7 @@ pub struct axon_session_options_t {
     pub abi: u32,
     /// 0 to 232, or AXON_DOMAIN_ENVIRONMENT.
     pub domain: u32,
-    /// AXON_DISCOVERY_*: how far the session is discovered, whoever started the daemon.
+    /// AXON_DISCOVERY_*: how far the session is discovered, whichever process started the daemon.
     pub discovery: u32,
     /// 0.
     pub reserved: u32,
