@@ -57,7 +57,7 @@ const NOTHING_SERVED: Rows = &[
 ];
 
 /// A fault at the master's KME, or with `slave:` before it at the slave's.
-const FAULTS: [(&str, Rows); 40] = [
+const FAULTS: [(&str, Rows); 41] = [
     ("handshake-refused", &[CERTIFICATE]),
     ("handshake-dropped", &[CERTIFICATE]),
     ("certificate-expired", &[CERTIFICATE]),
@@ -117,6 +117,7 @@ const FAULTS: [(&str, Rows); 40] = [
     ("slave:garbage", &[SAME_BY_GET, SAME_BY_POST]),
     ("slave:empty", &[SAME_BY_GET, SAME_BY_POST, AGAIN]),
     ("slave:certificate-expired", &[SAME_BY_GET, SAME_BY_POST, AGAIN]),
+    ("slave:wrong-key", &[SAME_BY_GET, SAME_BY_POST]),
     ("slave:key-kept", &[AGAIN]),
 ];
 

@@ -176,3 +176,18 @@ async fn a_pool_hands_out_no_key_id_twice_however_often_the_kme_does() {
     assert!(unusable >= 3, "{unusable}");
     assert!(taken.len() >= 24);
 }
+
+#[tokio::test]
+async fn a_wrong_key_differs_from_the_other_saes_and_its_neighbours_do_not() {
+    let network = two().start().await.unwrap();
+    let (master, slave) = (client(&network, "sae-a"), client(&network, "sae-b"));
+    for wrong in ["kme-a", "kme-b"] {
+        network.kme(wrong).unwrap().inject(Fault::WrongKey, 1);
+        let theirs = master.enc_keys("sae-b").number(3).send().await.unwrap().keys;
+        let ids: Vec<_> = theirs.iter().map(|key| key.key_id().to_owned()).collect();
+        let ours = slave.dec_keys("sae-a").key_ids(ids).send().await.unwrap().keys;
+        let same: Vec<bool> = theirs.iter().zip(&ours).map(|(one, other)| one == other).collect();
+        assert_eq!(same, [false, true, true], "{wrong}");
+        assert!(theirs.iter().zip(&ours).all(|(one, other)| one.key_id() == other.key_id()));
+    }
+}

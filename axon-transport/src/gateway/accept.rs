@@ -16,6 +16,7 @@ use crate::{
     link::Side,
 };
 
+const DECRYPT_ERROR: u8 = 51;
 /// Handshakes under way at once; further dials are refused and come again.
 const MAX_HANDSHAKES: usize = 64;
 /// A dialler that has its Retry is given this long for the rest of the handshake.
@@ -101,7 +102,11 @@ async fn answer(context: &Arc<Context>, incoming: Incoming) -> Option<Incomer> {
                 tracing::debug!(%source, "a PSK is being fetched; the dialler will come again");
                 return None;
             }
-            if let Some(outcome) = outcome {
+            if let (Some(DECRYPT_ERROR), Some(Lookup::Found)) = (refusal.alert, &outcome) {
+                let what = "either the KMEs disagree about it and their operators must compare what \
+                            they hold for these two SAEs, or somebody copied its name";
+                refusal.reason = format!("{}: {what}", refusal.reason);
+            } else if let Some(outcome) = outcome {
                 refusal.reason = format!("{}; PSK look-up: {outcome}", refusal.reason);
             }
             return refused(refusal, resolver.as_deref());

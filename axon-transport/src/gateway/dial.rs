@@ -186,9 +186,15 @@ async fn qkd(
                 };
                 let refusal = error.refusal();
                 match refusal.alert {
-                    Some(UNKNOWN_PSK_IDENTITY | DECRYPT_ERROR) => {
+                    Some(UNKNOWN_PSK_IDENTITY) => {
                         keyring.with_dialler(|now, d| d.refused(now, sae, key_id));
                         tracing::debug!(peer = sae, %refusal, "the peer does not have the key yet");
+                    }
+                    Some(DECRYPT_ERROR) => {
+                        tracing::debug!(peer = sae, %refusal, "the peer has another key");
+                        if keyring.with_dialler(|now, d| d.mismatched(now, sae, key_id)) {
+                            keyring.warn_disagreement(sae, &format_args!("key_ID {key_id}"));
+                        }
                     }
                     _ => {
                         keyring.with_dialler(|now, d| d.silent(now, sae, key_id));

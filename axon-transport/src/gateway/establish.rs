@@ -15,12 +15,13 @@ use quinn::{Connection, VarInt};
 use super::{
     context::{Context, chain},
     control::{ControlError, ControlReader, ControlWriter, Outbox},
-    keyring::{Keyring, PeerKeys},
+    keyring::PeerKeys,
+    prove::Proof,
     refusal::Refusal,
 };
 use crate::{
     config::Security,
-    keys::{ClientProof, Completion, Exporters, Origin, ProofResponder, ProofState},
+    keys::{Completion, Exporters},
     link::{CloseCode, Hello, Message, Order, Side, check},
 };
 
@@ -107,11 +108,11 @@ pub(super) async fn establish(
 }
 
 /// What went wrong on the way.
-enum Failure {
+pub(super) enum Failure {
     /// This side refuses.
     Ours(CloseCode, String),
     /// This side refuses, and tells the peer less than its own people.
-    Quietly { told: &'static str, why: String },
+    Quietly { code: CloseCode, told: &'static str, why: String },
     /// The peer closed, or the connection broke.
     Connection,
     /// The control stream said so; the connection may know more.
@@ -126,10 +127,7 @@ impl Failure {
         };
         match self {
             Self::Ours(code, reason) => (Refusal::here(code, reason), Some(code)),
-            Self::Quietly { why, .. } => {
-                let code = CloseCode::NotAllowed;
-                (Refusal::here(code, why), Some(code))
-            }
+            Self::Quietly { code, why, .. } => (Refusal::here(code, why), Some(code)),
             Self::Connection => (lost("the connection broke".into()), None),
             Self::Control(error) => match error.code() {
                 Some(code) => (Refusal::here(code, &error), Some(code)),
@@ -156,7 +154,7 @@ async fn run(
     let negotiated = agreed(context, connection)?;
     if let Some(why) = context.closed() {
         let told = "this host cannot read whom it trusts, and takes nobody; its log says more";
-        return Err(Failure::Quietly { told, why });
+        return Err(Failure::Quietly { code: CloseCode::NotAllowed, told, why });
     }
     let psk_sae = psk_sae(context, side, &negotiated, dialled)?;
     let qkd = context.keyring.is_some();
@@ -293,184 +291,6 @@ async fn open_control(
     }
     .map_err(|_| Failure::Connection)?;
     Ok((ControlWriter::new(send), ControlReader::new(receive)))
-}
-
-/// The proof of the client's name, from either end.
-struct Proof<'a> {
-    keyring: &'a Arc<Keyring>,
-    connection: &'a Connection,
-    number: u64,
-    sae: &'a str,
-    outbox: &'a Outbox,
-}
-
-impl Proof<'_> {
-    fn exporters(&self) -> Result<Exporters, Failure> {
-        Exporters::derive(|out, label| self.connection.export_keying_material(out, label, b""))
-            .map_err(|_| Failure::Ours(CloseCode::Internal, "no TLS exporter".into()))
-    }
-
-    fn say(&self, message: crate::keys::KeyMessage) {
-        self.outbox.send(Message::Keys(message));
-    }
-
-    /// In messages10: the keys of this peer, ready to receive on this connection.
-    fn attach(&self, exporters: &Exporters) -> Result<Arc<PeerKeys>, Failure> {
-        let internal = |e: &dyn std::fmt::Display| {
-            Failure::Ours(CloseCode::Internal, format!("message keys: {e}"))
-        };
-        let keys = self.keyring.peer(self.sae).map_err(|e| internal(&e))?;
-        keys.attach_receiver(self.keyring, self.number, exporters, self.outbox.clone())
-            .map_err(|e| internal(&e))?;
-        Ok(keys)
-    }
-
-    /// The next key message, in its order.
-    async fn next(
-        &self,
-        reader: &mut ControlReader,
-        order: &mut Order,
-    ) -> Result<crate::keys::KeyMessage, Failure> {
-        loop {
-            let message = reader.next().await?;
-            order
-                .accept(&message)
-                .map_err(|e| Failure::Ours(CloseCode::OutOfOrder, e.to_string()))?;
-            if let Message::Keys(message) = message {
-                return Ok(message);
-            }
-        }
-    }
-
-    /// Server: announces a fresh key and takes nothing but the right READY.
-    async fn demand(
-        &self,
-        reader: &mut ControlReader,
-        order: &mut Order,
-    ) -> Result<Option<Sealing>, Failure> {
-        let exporters = self.exporters()?;
-        let clock = &self.keyring.clock;
-        let mut answers = self.keyring.proof_answers(self.number);
-        let mut proof = ClientProof::new(clock.now(), self.sae, &exporters);
-        // One read at a time, held across the loop: a cancelled read would lose its place.
-        let mut read = Box::pin(self.next(reader, order));
-        loop {
-            while let Some(request) = proof.poll_request(clock.now()) {
-                self.keyring.submit(Origin::Proof(self.number), request);
-            }
-            while let Some(message) = proof.poll_message() {
-                self.say(message);
-            }
-            match proof.state() {
-                ProofState::Pending => {}
-                ProofState::Proven => break,
-                ProofState::Failed(failure) => {
-                    let code = CloseCode::from_code(failure.code());
-                    let code = code.unwrap_or(CloseCode::Proof);
-                    return Err(Failure::Ours(code, failure.to_string()));
-                }
-            }
-            let until = proof.poll_timeout().map_or(Duration::from_secs(1), |at| {
-                at.saturating_sub(clock.now()).min(Duration::from_secs(1))
-            });
-            tokio::select! {
-                Some(answer) = answers.recv() => proof.on_answer(clock.now(), answer),
-                message = &mut read => {
-                    proof.on_message(clock.now(), &message?);
-                    // At most one message proves or fails; another read is started only if not.
-                    if matches!(proof.state(), ProofState::Pending) {
-                        let text = "the message is no answer to the announced key";
-                        return Err(Failure::Ours(CloseCode::OutOfOrder, text.into()));
-                    }
-                }
-                () = tokio::time::sleep(until) => proof.on_timeout(clock.now()),
-            }
-        }
-        drop(read);
-        self.keyring.authenticated(self.connection.remote_address().ip(), self.sae);
-        if !self.keyring.seals_messages() {
-            return Ok(None);
-        }
-        let keys = self.attach(&exporters)?;
-        Ok(Some(Sealing { keys, exporters, first: proof.into_key() }))
-    }
-
-    /// Client: answers the server's ANNOUNCE.
-    async fn give(
-        &self,
-        reader: &mut ControlReader,
-        order: &mut Order,
-    ) -> Result<Option<Sealing>, Failure> {
-        let exporters = self.exporters()?;
-        if self.keyring.seals_messages() {
-            let keys = self.give_as_receiver(&exporters, reader, order).await?;
-            return Ok(Some(Sealing { keys, exporters, first: None }));
-        }
-        let clock = &self.keyring.clock;
-        let mut answers = self.keyring.proof_answers(self.number);
-        let mut responder = ProofResponder::new(self.sae, &exporters);
-        let announce = self.next(reader, order).await?;
-        responder.on_message(clock.now(), &announce).map_err(|violation| {
-            let code = CloseCode::from_code(violation.code()).unwrap_or(CloseCode::Malformed);
-            Failure::Ours(code, violation.to_string())
-        })?;
-        loop {
-            while let Some(request) = responder.poll_request(clock.now()) {
-                self.keyring.submit(Origin::Responder(self.number), request);
-            }
-            while let Some(message) = responder.poll_message() {
-                self.say(message);
-            }
-            match responder.answered() {
-                Some(Ok(())) => return Ok(None),
-                Some(Err(reason)) => return Err(Failure::Ours(CloseCode::KeySupply, reason)),
-                None => {}
-            }
-            let until = responder.poll_timeout().map_or(Duration::from_secs(1), |at| {
-                at.saturating_sub(clock.now()).min(Duration::from_secs(1))
-            });
-            tokio::select! {
-                Some(answer) = answers.recv() => responder.on_answer(clock.now(), answer),
-                () = tokio::time::sleep(until) => {}
-            }
-        }
-    }
-
-    /// Client in messages10: the announced key is the server's first sending key, so the receiver
-    /// of message keys answers.
-    async fn give_as_receiver(
-        &self,
-        exporters: &Exporters,
-        reader: &mut ControlReader,
-        order: &mut Order,
-    ) -> Result<Arc<PeerKeys>, Failure> {
-        let keys = self.attach(exporters)?;
-        let announce = self.next(reader, order).await?;
-        keys.on_message(self.keyring, self.number, &announce)
-            .map_err(|e| Failure::Ours(CloseCode::Malformed, e.to_string()))?;
-        let crate::keys::KeyMessage::Announce(key_ids) = announce else {
-            return Err(Failure::Ours(CloseCode::OutOfOrder, "ANNOUNCE was due".into()));
-        };
-        // READY is in the outbox once the key is held; ELECTED must not overtake it.
-        let held = |keys: &PeerKeys| {
-            keys.with_receiver(self.keyring, |_, receiver| {
-                receiver.opener(self.number).is_some_and(|opener| {
-                    key_ids.iter().any(|key_id| opener.contains(key_id.as_bytes()))
-                })
-            })
-        };
-        loop {
-            let changed = keys.changed.notified();
-            if held(&keys) {
-                return Ok(keys.clone());
-            }
-            tokio::select! {
-                () = changed => {}
-                () = tokio::time::sleep(Duration::from_millis(20)) => {}
-                _ = self.connection.closed() => return Err(Failure::Connection),
-            }
-        }
-    }
 }
 
 /// Where a peer is, for log and status.

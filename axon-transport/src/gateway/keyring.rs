@@ -90,7 +90,7 @@ impl Keyring {
                     let peers: Vec<_> = lock(&self.peers).values().cloned().collect();
                     for peer in peers {
                         peer.with_receiver(&self, |now, receiver| receiver.expire(now));
-                        peer.warn(self.clock.now());
+                        peer.warn(&self);
                     }
                 }
             }
@@ -248,6 +248,17 @@ impl Keyring {
         }
     }
 
+    /// The peer's KME gave it another key than this host's KME gave here, under the same key_ID.
+    pub(super) fn warn_disagreement(&self, peer: &str, what: &impl std::fmt::Display) {
+        tracing::warn!(
+            "the KMEs disagree about {what}: SAE {} has one key from {}, SAE {peer} another one from \
+             its own KME. It is given up and protects nothing. If this comes again, have the \
+             operators of both KMEs compare what they hold for these two SAEs",
+            self.config.sae_id,
+            self.config.kme_url,
+        );
+    }
+
     fn by_number(&self, number: u64) -> Option<Arc<PeerKeys>> {
         lock(&self.peers).values().find(|p| p.number == number).cloned()
     }
@@ -328,6 +339,7 @@ impl PeerKeys {
                     self.with_sender(keyring, |now, s| s.on_message(now, connection, message));
                 // A key may have become READY.
                 self.changed.notify_waiters();
+                self.warn(keyring);
                 result
             }
         }
@@ -415,9 +427,18 @@ impl PeerKeys {
         }
     }
 
-    fn warn(&self, now: Duration) {
-        if let Some(warning) = lock(&self.sender).warning(now) {
+    /// Says what the owner of this host should know of the keys.
+    fn warn(&self, keyring: &Keyring) {
+        let now = keyring.clock.now();
+        let (supply, disagreement) = {
+            let mut sender = lock(&self.sender);
+            (sender.warning(now), sender.disagreement(now))
+        };
+        if let Some(warning) = supply {
             tracing::warn!(peer = %self.sae, "{warning}");
+        }
+        if let Some(disagreement) = disagreement {
+            keyring.warn_disagreement(&self.sae, &disagreement);
         }
     }
 }

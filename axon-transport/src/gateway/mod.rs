@@ -26,6 +26,7 @@ mod peer;
 mod pieces;
 #[cfg(test)]
 mod played;
+mod prove;
 mod pulse;
 mod queue;
 mod refusal;

@@ -15,12 +15,19 @@ const RETRY_AFTER_MAX: Duration = Duration::from_secs(10);
 /// Calls in flight at once.
 const IN_FLIGHT: usize = 4;
 
+/// Refused calls that a master may cause at once by names that the KME does not know, more than
+/// a restarted receiver of the most keys has, and how many a second after that.
+const REFUSALS: f64 = 300.0;
+const REFUSALS_PER_SECOND: f64 = 5.0;
+
 /// The keys of one master that are being fetched. Bounded by its caller.
 pub(super) struct Fetches {
     master: String,
     purpose: Purpose,
     waiting: VecDeque<Batch>,
     in_flight: Vec<Batch>,
+    /// Refused calls that may still come at once, as of a time.
+    refusals: (f64, Duration),
 }
 
 struct Batch {
@@ -36,7 +43,8 @@ pub(super) type Outcome = (KeyId, Result<KmeKey, Failure>);
 impl Fetches {
     pub(super) fn new(master: &str, purpose: Purpose) -> Self {
         let (waiting, in_flight) = Default::default();
-        Self { master: master.to_owned(), purpose, waiting, in_flight }
+        let refusals = (REFUSALS, Duration::ZERO);
+        Self { master: master.to_owned(), purpose, waiting, in_flight, refusals }
     }
 
     /// Starts fetching `key_ids`, which must not be empty or under way already.
@@ -45,7 +53,7 @@ impl Fetches {
     }
 
     pub(super) fn poll_request(&mut self, now: Duration) -> Option<Request> {
-        if self.in_flight.len() >= IN_FLIGHT {
+        if self.in_flight.len() >= IN_FLIGHT || now < self.refusals_allow() {
             return None;
         }
         let due = self.waiting.iter().position(|b| b.not_before <= now)?;
@@ -59,7 +67,7 @@ impl Fetches {
     }
 
     /// What became of the keys that `answer` settles; none where they are asked for again.
-    pub(super) fn on_answer(&mut self, answer: Answer) -> Vec<Outcome> {
+    pub(super) fn on_answer(&mut self, now: Duration, answer: Answer) -> Vec<Outcome> {
         let Request::Dec { key_ids, .. } = answer.request else { return Vec::new() };
         let Some(i) = self.in_flight.iter().position(|b| b.key_ids == key_ids) else {
             return Vec::new();
@@ -72,6 +80,11 @@ impl Fetches {
             }
             Err(failure) => failure,
         };
+        if failure.kind == FailureKind::Refused {
+            let (left, at) = self.refusals;
+            let gained = now.saturating_sub(at).as_secs_f64() * REFUSALS_PER_SECOND;
+            self.refusals = ((left + gained).min(REFUSALS) - 1.0, now);
+        }
         match failure.kind {
             FailureKind::Refused if batch.key_ids.len() > 1 => {
                 // One unknown key_ID spoils a batch: the others may still be had.
@@ -96,7 +109,14 @@ impl Fetches {
     /// When [`poll_request`](Self::poll_request) gives something without an answer before.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         let free = self.in_flight.len() < IN_FLIGHT;
-        free.then(|| self.waiting.iter().map(|b| b.not_before).min()).flatten()
+        let due = free.then(|| self.waiting.iter().map(|b| b.not_before).min()).flatten();
+        due.map(|due| due.max(self.refusals_allow()))
+    }
+
+    /// When another call may be refused.
+    fn refusals_allow(&self) -> Duration {
+        let (left, at) = self.refusals;
+        at + Duration::from_secs_f64((1.0 - left).max(0.0) / REFUSALS_PER_SECOND)
     }
 }
 

@@ -79,9 +79,6 @@ impl From<minicbor::decode::Error> for MessageError {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Violation {
-    /// READY with a proof that does not fit: the peer does not hold the key, or it is not the peer.
-    #[error("READY for key_ID {0} carries a wrong proof: the peer does not hold this key")]
-    WrongProof(KeyId),
     /// RETIRE with masks that contradict each other, or what has opened.
     #[error("RETIRE for key_ID {0}: {1}")]
     Masks(KeyId, String),
@@ -94,7 +91,6 @@ impl Violation {
     /// The application error code to close the connection with (docs/formats.md, section 6).
     pub fn code(&self) -> u64 {
         match self {
-            Self::WrongProof(_) => 0x20,
             Self::Masks(..) => 0x30,
             Self::Unexpected(_) => 0x32,
         }

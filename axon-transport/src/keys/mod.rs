@@ -29,5 +29,5 @@ pub use exporters::{ENVELOPE_EXPORTER, Exporters, READY_EXPORTER};
 pub use kme::{Event, Events, Kme, KmeError, Origin, Statistics};
 pub use message::{KeyMessage, MessageError, Violation};
 pub use request::{Answer, Failure, FailureKind, Fetched, Purpose, Request, Stock};
-pub use supply::{NoKey, Receiver, Sender, SupplyError};
+pub use supply::{Disagreement, NoKey, Receiver, Sender, SupplyError};
 pub use verifier::{ClientProof, ProofFailure, ProofResponder, ProofState};

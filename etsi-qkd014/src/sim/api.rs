@@ -384,6 +384,7 @@ fn container(mut keys: Vec<Drawn>, extensions: &Extensions, fault: Option<&Fault
                 keys.extend_from_within(..);
             }
         }
+        Some(Fault::WrongKey) => keys[0].1.iter_mut().for_each(|byte| *byte = !*byte),
         Some(Fault::KeyMissing) => drop(keys.remove(0)),
         Some(Fault::UpperCaseIds) => keys.iter_mut().for_each(|key| key.0.make_ascii_uppercase()),
         Some(Fault::OtherIds) => keys.iter_mut().for_each(|key| key.0 = uuid()),

@@ -57,6 +57,9 @@ pub enum Fault {
     ReuseKeyId,
     /// `key-kept`: `dec_keys` gives keys and keeps them, so that they are given again.
     KeyKept,
+    /// `wrong-key`: the first key of an answer is not the one that the other SAE gets under its
+    /// key_ID: the two KMEs disagree about it.
+    WrongKey,
     /// `key-missing`: the first key is missing.
     KeyMissing,
     /// `upper-case-ids`: key_IDs in upper case.
@@ -77,7 +80,7 @@ pub(super) enum Meets {
 }
 
 /// The faults whose name is all there is to them.
-const PLAIN: [(&str, Fault); 19] = [
+const PLAIN: [(&str, Fault); 20] = [
     ("handshake-refused", Fault::HandshakeRefused),
     ("handshake-dropped", Fault::HandshakeDropped),
     ("certificate-expired", Fault::CertificateExpired),
@@ -93,6 +96,7 @@ const PLAIN: [(&str, Fault); 19] = [
     ("repeat-key-id", Fault::RepeatKeyId),
     ("reuse-key-id", Fault::ReuseKeyId),
     ("key-kept", Fault::KeyKept),
+    ("wrong-key", Fault::WrongKey),
     ("key-missing", Fault::KeyMissing),
     ("upper-case-ids", Fault::UpperCaseIds),
     ("other-ids", Fault::OtherIds),

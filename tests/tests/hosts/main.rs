@@ -2,6 +2,7 @@
 //! in qkd a KME each, simulated in the test's process.
 
 mod delivery;
+mod disagree;
 mod election;
 mod events;
 mod graph;

@@ -57,6 +57,27 @@ impl Kmes {
         self.drawn.lock().unwrap().clone()
     }
 
+    /// Has the KME of host 0 or 1 do something wrong.
+    pub(crate) fn plan(&self, host: usize, plan: sim::FaultPlan) {
+        self.network.kmes()[host].plan(plan);
+    }
+
+    /// Has all KMEs do everything right again.
+    pub(crate) fn clear_faults(&self) {
+        self.network.kmes().iter().for_each(sim::Kme::clear_faults);
+    }
+
+    /// The URL of the KME of host 0 or 1.
+    pub(crate) fn url(&self, host: usize) -> String {
+        self.network.kmes()[host].url().to_owned()
+    }
+
+    /// Calls that the KMEs had.
+    pub(crate) fn calls(&self) -> u64 {
+        let calls = |c: sim::Counters| c.status_calls + c.enc_keys_calls + c.dec_keys_calls;
+        self.network.kmes().iter().map(|kme| calls(kme.counters())).sum()
+    }
+
     /// Keys that SAEs got by asking for new ones, and by key_ID.
     pub(crate) fn keys(&self) -> (u64, u64) {
         let counters = self.network.kmes().iter().map(|kme| kme.counters());

@@ -17,7 +17,7 @@ use tokio::sync::Notify;
 
 use super::{
     Completion,
-    limits::{Buckets, IN_FLIGHT, KEPT, PER_SOURCE, Source},
+    limits::{Buckets, IN_FLIGHT, KEPT, PER_SOURCE, Source, Unproven},
     memory::{Fingerprint, Memory, fingerprint},
 };
 use crate::{
@@ -84,7 +84,9 @@ impl fmt::Display for Lookup {
             Self::NotAPeer => f.write_str("this SAE is not in AXON_QKD_PEERS"),
             Self::OwnSaeId => f.write_str("the client claims this host's own SAE ID"),
             Self::Malformed => f.write_str("not an identity of the form axon-qkd-v1:SAE:key_ID"),
-            Self::Limited(which) => write!(f, "too many calls to the KME: {which}"),
+            Self::Limited(which) => {
+                write!(f, "it would cost too many keys or calls to the KME: {which}")
+            }
             Self::KmeFailed(why) => write!(f, "dec_keys: {why}"),
         }
     }
@@ -118,6 +120,7 @@ struct State {
     failed: VecDeque<(Fingerprint, String)>,
     spent: Memory<Fingerprint>,
     buckets: Buckets,
+    unproven: Unproven,
     known_sources: Memory<Source>,
     known_saes: Memory<String>,
 }
@@ -152,6 +155,7 @@ impl Acceptor {
                 failed: VecDeque::new(),
                 spent: Memory::new(SPENT),
                 buckets: Buckets::default(),
+                unproven: Unproven::default(),
                 known_sources: Memory::new(KNOWN),
                 known_saes: Memory::new(KNOWN),
             }),
@@ -191,6 +195,14 @@ impl Acceptor {
         let mut state = self.state();
         state.known_sources.insert(now, source.into());
         state.known_saes.insert(now, client_sae.to_owned());
+        state.unproven.proven(source.into(), client_sae);
+    }
+
+    /// Somebody who claims to be `client_sae` had a key announced and did not prove to hold it.
+    /// Each such try costs a key, so that more of them from this source have to wait.
+    pub fn unproven(&self, source: IpAddr, client_sae: &str) {
+        let now = self.0.clock.now();
+        self.state().unproven.failed(now, source.into(), client_sae);
     }
 
     /// The next call to the KME, if any.
@@ -296,6 +308,10 @@ impl Acceptor {
         if state.spent.contains(&fingerprint(key_id.as_bytes())) {
             return (Lookup::Spent, None);
         }
+        if state.unproven.waits(now, source.into(), parsed.client_sae()) {
+            let which = "it did not prove its name with the last keys, and has to wait";
+            return (Lookup::Limited(which), None);
+        }
         let cached = state.cached.get(parsed.client_sae());
         if let Some(c) = cached.and_then(|c| c.iter().find(|c| c.psk.identity() == identity)) {
             return (Lookup::Found, Some(Arc::clone(&c.psk)));
@@ -396,6 +412,7 @@ impl State {
         self.missed.forget_before(now.saturating_sub(UNKNOWN_FOR));
         self.unknown.forget_before(now.saturating_sub(UNKNOWN_FOR));
         self.buckets.expire(now);
+        self.unproven.expire(now);
     }
 }
 

@@ -27,6 +27,9 @@ const REDIAL: [Duration; 6] = [
 ];
 /// How long a key is tried against refusals.
 const REFUSED_FOR: Duration = Duration::from_secs(10);
+/// How often the peer may say that its key of this name is another one. More than once, since
+/// anyone on the path can say so.
+const MISMATCHES: u32 = 4;
 /// Longest wait before the KME is asked for another key, after a call or a key that failed.
 const BACK_OFF_MAX: Duration = Duration::from_secs(60);
 /// How long `enc_keys` may take.
@@ -114,6 +117,7 @@ struct Held {
     since: Duration,
     not_before: Duration,
     refusals: usize,
+    mismatches: u32,
     last_refusal: Option<Duration>,
     refused_for: Duration,
 }
@@ -171,7 +175,27 @@ impl Dialler {
         }
     }
 
-    /// The peer refused the key `key_id`: unknown to it (0x173), or another key to it (0x133).
+    /// The peer holds another key under the name `key_id` (0x133). True where that was said often
+    /// enough for the key to be given up.
+    pub fn mismatched(&mut self, now: Duration, sae: &str, key_id: &KeyId) -> bool {
+        let held = self.peers.get_mut(sae).and_then(|peer| match &mut peer.state {
+            State::Held(held) if held.key_id == *key_id => Some(held),
+            _ => None,
+        });
+        let Some(held) = held else { return false };
+        held.mismatches += 1;
+        let given_up = held.mismatches >= MISMATCHES;
+        self.refused(now, sae, key_id);
+        if given_up
+            && let Some(peer) = self.peers.get_mut(sae)
+            && matches!(peer.state, State::Held(_))
+        {
+            peer.failed(now, format!("peer holds another key under key_ID {key_id}"));
+        }
+        given_up
+    }
+
+    /// The peer refused the key `key_id`: it is unknown to it (0x173).
     pub fn refused(&mut self, now: Duration, sae: &str, key_id: &KeyId) {
         let Some(peer) = self.peers.get_mut(sae) else { return };
         let State::Held(held) = &mut peer.state else { return };
@@ -237,6 +261,7 @@ impl Dialler {
                     since: now,
                     not_before: now,
                     refusals: 0,
+                    mismatches: 0,
                     last_refusal: None,
                     refused_for: Duration::ZERO,
                 });

@@ -34,6 +34,62 @@ impl From<IpAddr> for Source {
     }
 }
 
+/// Proofs that a peer may fail from one source before it has to wait.
+const FAILED_PROOFS: u32 = 4;
+/// The first wait, which doubles, and the longest.
+const PROOF_PAUSE: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(60));
+/// Peers and sources that failed.
+const UNPROVEN: usize = 1024;
+
+/// Who failed to prove its name, from where: each try costs a key.
+#[derive(Default)]
+pub(super) struct Unproven(HashMap<(Source, String), Tries>);
+
+struct Tries {
+    failed: u32,
+    until: Duration,
+}
+
+impl Unproven {
+    /// One more proof failed.
+    pub(super) fn failed(&mut self, now: Duration, source: Source, sae: &str) {
+        let key = (source, sae.to_owned());
+        if self.0.len() >= UNPROVEN && !self.0.contains_key(&key) {
+            let first = self.0.iter().min_by_key(|(_, tries)| tries.until).map(|(k, _)| k.clone());
+            first.and_then(|first| self.0.remove(&first));
+        }
+        let tries = self.0.entry(key).or_insert(Tries { failed: 0, until: now });
+        tries.failed = tries.failed.saturating_add(1);
+        let over = tries.failed.saturating_sub(FAILED_PROOFS);
+        if over > 0 {
+            let pause = PROOF_PAUSE.0 * (1 << (over - 1).min(10));
+            tries.until = now.saturating_add(pause.min(PROOF_PAUSE.1));
+        }
+    }
+
+    /// A proof succeeded: it makes up for one that failed.
+    pub(super) fn proven(&mut self, source: Source, sae: &str) {
+        let key = (source, sae.to_owned());
+        if let Some(tries) = self.0.get_mut(&key) {
+            tries.failed -= 1;
+            if tries.failed == 0 {
+                self.0.remove(&key);
+            }
+        }
+    }
+
+    /// Whether this one has to wait.
+    pub(super) fn waits(&self, now: Duration, source: Source, sae: &str) -> bool {
+        let tries = self.0.get(&(source, sae.to_owned()));
+        tries.is_some_and(|tries| now < tries.until)
+    }
+
+    /// Forgets what happened long ago.
+    pub(super) fn expire(&mut self, now: Duration) {
+        self.0.retain(|_, tries| now < tries.until.saturating_add(2 * PROOF_PAUSE.1));
+    }
+}
+
 /// Token buckets by name. A bucket that is full again is no different from none.
 #[derive(Default)]
 pub(super) struct Buckets(HashMap<String, Bucket>);
@@ -93,6 +149,37 @@ mod tests {
         assert!(buckets.take(Duration::ZERO, "sae-b"), "another name has its own");
         buckets.expire(Duration::from_secs(200));
         assert!(buckets.0.is_empty());
+    }
+
+    #[test]
+    fn failed_proofs_are_spaced_out_for_their_source_alone_and_one_that_succeeds_makes_up_for_one()
+    {
+        let source = |a: &str| Source::from(a.parse::<IpAddr>().unwrap());
+        let (here, there) = (source("10.0.0.1"), source("10.0.0.2"));
+        let mut unproven = Unproven::default();
+        let mut now = Duration::ZERO;
+        let mut pauses = Vec::new();
+        for _ in 0..12 {
+            unproven.failed(now, here, "sae-a");
+            let start = now;
+            while unproven.waits(now, here, "sae-a") {
+                now += Duration::from_secs(1);
+            }
+            pauses.push((now - start).as_secs());
+        }
+        assert_eq!(pauses, [0, 0, 0, 0, 1, 2, 4, 8, 16, 32, 60, 60]);
+        unproven.failed(now, here, "sae-a");
+        assert!(!unproven.waits(now, there, "sae-a") && !unproven.waits(now, here, "sae-b"));
+        for _ in 0..13 {
+            unproven.proven(here, "sae-a");
+        }
+        assert!(!unproven.waits(now, here, "sae-a"));
+        for i in 0..3000 {
+            unproven.failed(now, here, &format!("sae-{i}"));
+            assert!(unproven.0.len() <= UNPROVEN);
+        }
+        unproven.expire(now + Duration::from_secs(300));
+        assert!(unproven.0.is_empty());
     }
 
     #[test]

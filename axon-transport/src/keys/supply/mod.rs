@@ -6,6 +6,7 @@
 //! draw from the KME, and how many, are the rules of [`etsi_qkd014::pool`].
 
 mod demand;
+mod disagreement;
 mod pool;
 mod receiver;
 mod sender;
@@ -16,6 +17,7 @@ mod tests;
 use axon_envelope::{ChannelError, RandomError};
 
 pub use demand::SupplyWarning;
+pub use disagreement::Disagreement;
 pub use receiver::{Receiver, ReceiverStatistics};
 pub use sender::{NoKey, Sender, SenderStatistics};
 

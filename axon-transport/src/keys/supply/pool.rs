@@ -32,6 +32,8 @@ pub(super) struct Fresh {
     pub(super) key: KmeKey,
     /// When it was asked for, where its lead time is to be measured.
     pub(super) asked: Option<Duration>,
+    /// When it was first announced, where no connection has answered for it yet.
+    pub(super) announced: Option<Duration>,
 }
 
 /// The keys of one sending direction before they are announced.
@@ -120,7 +122,9 @@ impl Pool {
         let mut usable = Vec::with_capacity(keys.len());
         for (key_id, key) in keys {
             match self.admit(&key_id) {
-                Ok(()) => usable.push(Fresh { key_id, key, asked: Some(asked) }),
+                Ok(()) => {
+                    usable.push(Fresh { key_id, key, asked: Some(asked), announced: None });
+                }
                 Err(why) => refused = Some(why),
             }
         }
@@ -148,13 +152,13 @@ impl Pool {
 
     /// Takes in a key that was drawn elsewhere, as the newest.
     pub(super) fn put(&mut self, now: Duration, key_id: KeyId, key: KmeKey) {
-        self.core.put(now, Fresh { key_id, key, asked: None });
+        self.core.put(now, Fresh { key_id, key, asked: None, announced: None });
     }
 
     /// Takes back a key that nothing was sealed under, to be announced before all others: the peer
-    /// may hold it already.
-    pub(super) fn put_back(&mut self, key_id: KeyId, key: KmeKey) {
-        self.core.put(Duration::ZERO, Fresh { key_id, key, asked: None });
+    /// may hold it already. `announced`: since when the peer owes an answer for it.
+    pub(super) fn put_back(&mut self, key_id: KeyId, key: KmeKey, announced: Option<Duration>) {
+        self.core.put(Duration::ZERO, Fresh { key_id, key, asked: None, announced });
     }
 
     /// The peer could not use a key, or did not answer for it.

@@ -177,7 +177,7 @@ impl Receiver {
 
     /// The KME's answer to one of our requests.
     pub fn on_answer(&mut self, now: Duration, answer: Answer) {
-        for (key_id, outcome) in self.fetches.on_answer(answer) {
+        for (key_id, outcome) in self.fetches.on_answer(now, answer) {
             // Retired meanwhile: nobody waits for it.
             let Some(conn) = self.wanted.remove(&key_id) else { continue };
             match outcome {

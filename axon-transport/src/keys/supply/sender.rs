@@ -13,8 +13,9 @@ use serde::Serialize;
 use zeroize::Zeroizing;
 
 use super::{
-    MAX_UNRETIRED, SupplyError, SupplyWarning,
+    Disagreement, MAX_UNRETIRED, SupplyError, SupplyWarning,
     demand::{self, Demand},
+    disagreement::Disagreements,
     pool::{Fresh, Pool},
 };
 use crate::keys::{
@@ -22,7 +23,8 @@ use crate::keys::{
     request::{Answer, Request},
 };
 
-/// How long an announced key waits for READY or FAILED: the receiver's tries, and more.
+/// How long an announced key waits for READY or FAILED, over all connections that it is announced
+/// on: the receiver's tries, and more.
 const ANSWER_WITHIN: Duration = Duration::from_secs(60);
 
 /// The keys of this host's messages to one peer.
@@ -39,6 +41,7 @@ pub struct Sender {
     begun: Option<Duration>,
     outbox: VecDeque<(u64, KeyMessage)>,
     demand: Demand,
+    disagreements: Disagreements,
     counts: Counts,
 }
 
@@ -51,6 +54,7 @@ struct Link {
 struct Announced {
     key: KmeKey,
     asked: Option<Duration>,
+    /// When it was announced first, on whatever connection.
     since: Duration,
 }
 
@@ -59,6 +63,7 @@ struct Counts {
     sealed: u64,
     retired: u64,
     failed: u64,
+    disagreed: u64,
     no_key: u64,
     last_failure: Option<String>,
 }
@@ -102,6 +107,8 @@ pub struct SenderStatistics {
     pub retired: u64,
     /// Keys that the peer could not fetch or did not answer, or that the KME gave before.
     pub failed: u64,
+    /// Keys whose proof did not fit: the peer's KME gave it another key under the same key_ID.
+    pub disagreed: u64,
     /// How often a message was refused for want of a key.
     pub no_key: u64,
     /// Why the last key or call failed.
@@ -134,6 +141,7 @@ impl Sender {
             begun: None,
             outbox: VecDeque::new(),
             demand: Demand::new(),
+            disagreements: Disagreements::default(),
             counts: Counts::default(),
         };
         sender.plan(Duration::ZERO);
@@ -243,7 +251,9 @@ impl Sender {
         all.saturating_sub(kept)
     }
 
-    /// READY or FAILED from the peer.
+    /// READY or FAILED from the peer. A proof that does not fit retires its key and nothing else:
+    /// the peer's KME may have given it another one, which [`disagreement`](Self::disagreement)
+    /// reports.
     ///
     /// # Errors
     /// The peer broke a rule, or the system gives no random bytes.
@@ -261,7 +271,11 @@ impl Sender {
             KeyMessage::Ready { key_id, proof } => {
                 let Some(waiting) = self.announced.get(key_id) else { return Ok(()) };
                 if !proof::verify(&waiting.key, key_id, &link.ready, proof) {
-                    return Err(Violation::WrongProof(key_id.clone()).into());
+                    self.give_up(now, key_id);
+                    self.counts.disagreed += 1;
+                    self.disagreements.add(key_id.clone());
+                    self.failed(format!("peer holds another key under key_ID {key_id}"));
+                    return Ok(());
                 }
                 let Some(Announced { key, asked, .. }) = self.announced.remove(key_id) else {
                     return Ok(());
@@ -330,6 +344,7 @@ impl Sender {
             sealed: self.counts.sealed,
             retired: self.counts.retired,
             failed: self.counts.failed + pool.unusable,
+            disagreed: self.counts.disagreed,
             no_key: self.counts.no_key,
             last_failure: self.counts.last_failure.clone(),
         }
@@ -339,6 +354,11 @@ impl Sender {
     pub fn warning(&mut self, now: Duration) -> Option<SupplyWarning> {
         let supply = self.pool.status(now).supply?;
         self.demand.warning(now, supply)
+    }
+
+    /// Reports keys that the peer holds differently; at most every ten seconds.
+    pub fn disagreement(&mut self, now: Duration) -> Option<Disagreement> {
+        self.disagreements.take(now)
     }
 
     /// Tells the pool how many keys to have ahead, and how many of them left it.
@@ -379,12 +399,17 @@ impl Sender {
         let late: Vec<KeyId> =
             self.announced.iter().filter(|(_, a)| late(a)).map(|(id, _)| id.clone()).collect();
         for key_id in late {
-            self.announced.remove(&key_id);
-            self.pool.key_refused(now);
+            self.give_up(now, &key_id);
             self.failed(format!("peer did not answer ANNOUNCE of key_ID {key_id}"));
-            let (used, reliable) = Default::default();
-            self.tell(KeyMessage::Retire { key_id, used, reliable });
         }
+    }
+
+    /// Erases an announced key that nothing will be sealed under, and has the peer erase its own.
+    fn give_up(&mut self, now: Duration, key_id: &KeyId) {
+        self.announced.remove(key_id);
+        self.pool.key_refused(now);
+        let (used, reliable) = Default::default();
+        self.tell(KeyMessage::Retire { key_id: key_id.clone(), used, reliable });
     }
 
     fn retire_first(&mut self) {
@@ -408,10 +433,16 @@ impl Sender {
         let room = MAX_UNRETIRED.saturating_sub(self.announced.len() + self.ready.len());
         let mut key_ids = Vec::new();
         while key_ids.len() < message::MAX_ANNOUNCED.min(room)
-            && let Some(Fresh { key_id, key, asked }) = self.pool.take(now)
+            && let Some(Fresh { key_id, key, asked, announced }) = self.pool.take(now)
         {
+            let since = announced.unwrap_or(now);
+            if now.saturating_sub(since) >= ANSWER_WITHIN {
+                self.pool.key_refused(now);
+                self.failed(format!("peer did not answer ANNOUNCE of key_ID {key_id}"));
+                continue;
+            }
             key_ids.push(key_id.clone());
-            self.announced.insert(key_id, Announced { key, asked, since: now });
+            self.announced.insert(key_id, Announced { key, asked, since });
         }
         (!key_ids.is_empty()).then_some((conn, KeyMessage::Announce(key_ids)))
     }
@@ -421,7 +452,7 @@ impl Sender {
         self.settle(now);
         while let Some(sealer) = self.ready.pop_front() {
             match sealer.into_unused() {
-                Ok((key_id, key)) => self.pool.put_back(key_id, key),
+                Ok((key_id, key)) => self.pool.put_back(key_id, key, None),
                 Err(begun) => {
                     self.ready.push_front(begun);
                     self.retire_first();
@@ -429,8 +460,8 @@ impl Sender {
             }
         }
         self.begun = None;
-        for (key_id, Announced { key, .. }) in self.announced.drain() {
-            self.pool.put_back(key_id, key);
+        for (key_id, Announced { key, since, .. }) in self.announced.drain() {
+            self.pool.put_back(key_id, key, Some(since));
         }
     }
 

@@ -53,8 +53,8 @@ impl ProofResponder {
     }
 
     /// The KME's answer to one of our requests. The key is used for the proof, and erased.
-    pub fn on_answer(&mut self, _now: Duration, answer: Answer) {
-        for (key_id, outcome) in self.fetches.on_answer(answer) {
+    pub fn on_answer(&mut self, now: Duration, answer: Answer) {
+        for (key_id, outcome) in self.fetches.on_answer(now, answer) {
             let (message, answered) = match outcome {
                 Ok(key) => {
                     let proof = proof::compute(&key, &key_id, &self.ready);

@@ -80,6 +80,38 @@ fn a_key_is_tried_again_with_growing_pauses_and_given_up_after_ten_seconds() {
 }
 
 #[test]
+fn a_key_that_the_peer_holds_differently_is_given_up_at_the_fourth_word_of_it() {
+    let mut dialler = holding(s(0), "k1");
+    let mut now = s(0);
+    for said in 1..=4 {
+        assert_eq!(attempt(&mut dialler, now), Some(id("k1")), "{said}");
+        assert!(!dialler.mismatched(now, "sae-b", &id("k0")), "not the key in question");
+        assert_eq!(dialler.mismatched(now, "sae-b", &id("k1")), said == 4);
+        now += s(2);
+    }
+    assert!(!dialler.mismatched(now, "sae-b", &id("k1")), "it is gone");
+    give(&mut dialler, now, "k2");
+    assert_eq!(attempt(&mut dialler, now), Some(id("k2")));
+}
+
+#[test]
+fn kmes_that_disagree_about_every_key_are_asked_ever_more_seldom() {
+    let (mut dialler, mut asked) = (new(), 0);
+    for tenth in 0..6_000 {
+        let now = ms(100 * tenth);
+        if let Some(key_id) = attempt(&mut dialler, now) {
+            dialler.mismatched(now, "sae-b", &key_id);
+        }
+        if let Some(request) = dialler.poll_request(now) {
+            asked += 1;
+            dialler.on_answer(now, key(request, &format!("k{asked}"), 1));
+        }
+    }
+    // 1, 2, 4 … 60 s apart.
+    assert!((10..=16).contains(&asked), "{asked} in ten minutes");
+}
+
+#[test]
 fn silence_does_not_count_against_a_key() {
     let mut dialler = holding(s(0), "k1");
     let mut now = s(0);

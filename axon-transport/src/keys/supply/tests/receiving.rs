@@ -144,3 +144,23 @@ fn messages_that_never_came_are_counted_once() {
     pair.receiver.expire(pair.now);
     assert_eq!((missing(&pair), pair.receiver.statistics().expired), (3, 2));
 }
+
+#[test]
+fn names_that_no_kme_knows_cost_a_bounded_number_of_calls() {
+    let mut pair = Pair::new();
+    let mut calls = 0;
+    for tick in 0..6_000 {
+        let made_up = (0..16).map(|i| id(&format!("made-up-{tick}-{i}"))).collect();
+        pair.receiver.on_message(pair.now, 1, &KeyMessage::Announce(made_up)).unwrap();
+        while let Some(request) = pair.receiver.poll_request(pair.now) {
+            calls += 1;
+            let answer = pair.kmes.answer(request);
+            pair.receiver.on_answer(pair.now, answer);
+        }
+        while pair.receiver.poll_message().is_some() {}
+        pair.now += ms(10);
+    }
+    assert!(calls <= 300 + 60 * 5 + 4, "{calls} in a minute");
+    let next = pair.receiver.poll_timeout(pair.now).expect("calls go on");
+    assert!(next > pair.now && next <= pair.now + ms(1000));
+}

@@ -3,7 +3,7 @@ use std::time::Duration;
 use axon_envelope::Delivery;
 
 use super::{Pair, ROUTE, id, ms, retire};
-use crate::keys::{KeyMessage, NoKey, Receiver, SupplyError, Violation};
+use crate::keys::{KeyMessage, NoKey, Receiver};
 
 #[test]
 fn nothing_is_sealed_before_ready() {
@@ -20,23 +20,85 @@ fn nothing_is_sealed_before_ready() {
 }
 
 #[test]
-fn a_wrong_proof_ends_the_link_and_readies_nothing() {
+fn a_wrong_proof_retires_its_key_and_nothing_else() {
     let mut pair = Pair::new();
     pair.draw();
     let (_, KeyMessage::Announce(key_ids)) = pair.sender.poll_message(pair.now).unwrap() else {
         panic!()
     };
-    for proof in [[0; 32], [0xff; 32]] {
-        let ready = KeyMessage::Ready { key_id: key_ids[0].clone(), proof };
-        let refused = pair.sender.on_message(pair.now, 1, &ready);
-        assert!(matches!(refused, Err(SupplyError::Violation(Violation::WrongProof(_)))));
+    for (wrong, proof) in [[0; 32], [0xff; 32]].into_iter().enumerate() {
+        let key_id = key_ids[wrong].clone();
+        let ready = KeyMessage::Ready { key_id: key_id.clone(), proof };
+        pair.sender.on_message(pair.now, 1, &ready).unwrap();
+        let expected = retire(std::str::from_utf8(key_id.as_bytes()).unwrap(), 0, 0);
+        assert_eq!(pair.sender.poll_message(pair.now), Some((1, expected)));
+        // Said again, it is about a key that nobody holds any more.
+        pair.sender.on_message(pair.now, 1, &ready).unwrap();
     }
+    let statistics = pair.sender.statistics(pair.now);
+    assert_eq!((statistics.disagreed, statistics.announced), (2, key_ids.len() - 2));
     let unknown = KeyMessage::Ready { key_id: id("nobody's"), proof: [0; 32] };
     pair.sender.on_message(pair.now, 1, &unknown).unwrap();
     assert_eq!(pair.seal(Delivery::Reliable), Err(NoKey::None));
     for unexpected in [KeyMessage::Announce(vec![id("k")]), retire("k", 0, 0)] {
         assert!(pair.sender.on_message(pair.now, 1, &unexpected).is_err());
     }
+    // The others are as good as before.
+    let announce = KeyMessage::Announce(key_ids[2..].to_vec());
+    pair.receiver.on_message(pair.now, 1, &announce).unwrap();
+    pair.run();
+    let envelope = pair.seal(Delivery::Reliable).unwrap();
+    pair.open(envelope).unwrap();
+}
+
+#[test]
+fn one_wrong_key_is_reported_and_gone_from_both_ends_for_good() {
+    let mut pair = Pair::new();
+    pair.draw();
+    let wrong = id("key-1");
+    pair.kmes.stored.insert(wrong.clone(), [9; 32]);
+    pair.run();
+    assert_eq!(pair.sender.statistics(pair.now).ready, 3);
+    assert!(!pair.receiver.opener(1).unwrap().contains(wrong.as_bytes()));
+    let report = pair.sender.disagreement(pair.now).unwrap();
+    assert_eq!((report.key_id, report.keys), (wrong.clone(), 1));
+    assert_eq!(pair.sender.disagreement(pair.now), None);
+    // Neither end brings it to the next connection.
+    pair.close(1);
+    let before = pair.log.len();
+    pair.connect();
+    pair.now += ms(1000);
+    pair.run();
+    let again = |m: &KeyMessage| matches!(m, KeyMessage::Announce(ids) if ids.contains(&wrong));
+    assert!(!pair.log[before..].iter().any(again));
+    assert_eq!(pair.sender.statistics(pair.now).ready, 4);
+    assert_eq!(pair.sender.statistics(pair.now).disagreed, 1);
+}
+
+#[test]
+fn a_peer_that_fails_every_proof_burns_few_keys() {
+    let mut pair = Pair::new();
+    for second in 0..60 {
+        for _ in 0..100 {
+            pair.draw();
+            while let Some((conn, message)) = pair.sender.poll_message(pair.now) {
+                let KeyMessage::Announce(key_ids) = message else { continue };
+                for key_id in key_ids {
+                    let ready = KeyMessage::Ready { key_id, proof: [1; 32] };
+                    pair.sender.on_message(pair.now, conn, &ready).unwrap();
+                }
+            }
+            pair.now += ms(10);
+        }
+        // A new connection is no new beginning.
+        if second % 2 == 0 {
+            pair.connect();
+        }
+    }
+    assert!(pair.kmes.issued <= 40, "{} keys in a minute", pair.kmes.issued);
+    pair.now += Duration::from_secs(30);
+    pair.run();
+    assert!(pair.seal(Delivery::Reliable).is_ok(), "well again");
 }
 
 #[test]
@@ -161,4 +223,30 @@ fn an_announcement_that_nobody_answers_is_dropped() {
     pair.now += ms(60_000);
     assert!(matches!(pair.sender.poll_message(pair.now), Some((1, KeyMessage::Retire { .. }))));
     assert_eq!(pair.sender.statistics(pair.now).announced, 0);
+}
+
+#[test]
+fn an_announcement_grows_old_over_all_its_connections() {
+    let mut pair = Pair::new();
+    pair.draw();
+    let announced = |pair: &mut Pair| match pair.sender.poll_message(pair.now) {
+        Some((_, KeyMessage::Announce(key_ids))) => key_ids,
+        _ => Vec::new(),
+    };
+    let first = announced(&mut pair);
+    assert_eq!(first.len(), 4);
+    for _ in 0..5 {
+        pair.now += ms(10_000);
+        pair.sender.detach(pair.now, pair.conn);
+        pair.connect();
+        assert_eq!(announced(&mut pair).len(), 4, "again, since nobody answered");
+    }
+    pair.now += ms(10_000);
+    pair.sender.detach(pair.now, pair.conn);
+    pair.connect();
+    assert_eq!(announced(&mut pair), [], "a minute is enough");
+    assert_eq!(pair.sender.statistics(pair.now).failed, 4);
+    pair.now += ms(1000);
+    pair.run();
+    assert!(pair.seal(Delivery::Reliable).is_ok());
 }
