@@ -6,10 +6,12 @@ use std::fmt;
 use std::time::Duration;
 
 use super::supply::Supply;
-use crate::Status;
 
+mod status;
 #[cfg(test)]
 mod tests;
+
+pub use status::{PoolStatus, Stock};
 
 /// Time between two looks at the KME's stock.
 const STATUS_EVERY: Duration = Duration::from_secs(5);
@@ -34,6 +36,8 @@ const RETRY_AFTER_MAX: Duration = Duration::from_secs(60);
 ///   `max_key_per_request`; 0 says nothing. Until a status was answered, for one.
 /// - A refill begins when a batch, or a quarter of the target, is missing, and goes on until
 ///   everything missing is asked for.
+/// - A call that takes longer than [`overdue`](Settings::overdue) is not waited for: its keys are
+///   asked for anew, and taken as well should they come.
 /// - An empty store halves the batch, since fewer keys may be had; a call that succeeds doubles it
 ///   again.
 /// - After failures it waits: 100 ms to 2 s where they cost nothing, 1 s to 30 s where each may have
@@ -59,8 +63,7 @@ pub struct Core<K> {
     jitter: Box<dyn FnMut() -> u8 + Send>,
     /// With the time at which each was asked for; the oldest first.
     held: VecDeque<(Duration, K)>,
-    /// Keys asked for by each call in flight, and when.
-    in_flight: Vec<(u32, Duration)>,
+    in_flight: Vec<Call>,
     /// Keys that the owner keeps ready.
     elsewhere: usize,
     /// Keys that the next call may ask for.
@@ -70,6 +73,8 @@ pub struct Core<K> {
     /// Failures since the last call that gave keys.
     failures: u32,
     not_before: Duration,
+    /// When the last call failed: those that were in flight then fail for the same cause.
+    failed_at: Option<Duration>,
     held_until: Duration,
     /// Since when keys were wanted without an answer, for the supply's rate.
     unanswered_since: Option<Duration>,
@@ -78,6 +83,14 @@ pub struct Core<K> {
     stock: Stocktaking,
     supply: Supply,
     counts: Counts,
+}
+
+/// A call for keys in flight.
+struct Call {
+    keys: u32,
+    since: Duration,
+    /// It takes so long that its keys are not counted on any more.
+    overdue: bool,
 }
 
 #[derive(Default)]
@@ -111,11 +124,15 @@ pub struct Settings {
     pub calls: usize,
     /// Age, counted from when it was asked for, at which a key is dropped. Default ten minutes.
     pub max_age: Duration,
+    /// Time after which the keys of a call in flight are not counted on any more, so that others
+    /// are asked for in their place, within [`calls`](Self::calls). Default one second.
+    pub overdue: Duration,
 }
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { target: 16, batch: 8, calls: 4, max_age: Duration::from_secs(600) }
+        let (max_age, overdue) = (Duration::from_secs(600), Duration::from_secs(1));
+        Self { target: 16, batch: 8, calls: 4, max_age, overdue }
     }
 }
 
@@ -141,64 +158,6 @@ pub enum FailureClass {
     KeysLost,
 }
 
-/// The part of the KME's status that a pool depends on.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Stock {
-    /// Keys that the KME stores; 0: unknown.
-    pub stored_key_count: u64,
-    /// Most keys that a call may ask for; 0: unknown.
-    pub max_key_per_request: u64,
-}
-
-impl From<&Status> for Stock {
-    fn from(status: &Status) -> Self {
-        Self {
-            stored_key_count: status.stored_key_count,
-            max_key_per_request: status.max_key_per_request,
-        }
-    }
-}
-
-/// How a pool stands.
-#[derive(Clone, Debug, PartialEq)]
-#[non_exhaustive]
-pub struct PoolStatus {
-    /// Keys that can be taken now.
-    pub held: usize,
-    /// Keys asked for and not there.
-    pub asked: usize,
-    /// Keys that the owner keeps ready, as it last said.
-    pub elsewhere: usize,
-    /// Keys that should be held or asked for: what was set, within the KME's stock.
-    pub target: usize,
-    /// Keys a second that the KME gives, where it was seen at its limit.
-    pub supply: Option<f64>,
-    /// How long keys have been wanted without any coming. See [`is_stalled`](Self::is_stalled).
-    pub waiting: Option<Duration>,
-    /// Failed calls for keys since the last one that gave some.
-    pub failures: u32,
-    /// Keys that came and could be taken.
-    pub obtained: u64,
-    /// Keys put in by the owner.
-    pub put: u64,
-    /// Keys taken.
-    pub taken: u64,
-    /// Keys dropped because nobody took them in time.
-    pub expired: u64,
-    /// Keys that came and were refused, as under a key_ID that was there before.
-    pub unusable: u64,
-    /// What the KME last said of its stock.
-    pub stock: Option<Stock>,
-}
-
-impl PoolStatus {
-    /// Whether keys have been wanted for a second or more and none came.
-    #[must_use]
-    pub fn is_stalled(&self) -> bool {
-        self.waiting.is_some_and(|time| time >= Duration::from_secs(1))
-    }
-}
-
 impl<K> Core<K> {
     /// An empty pool. `jitter` gives a random byte for each pause.
     pub fn new(settings: Settings, jitter: impl FnMut() -> u8 + Send + 'static) -> Self {
@@ -214,6 +173,7 @@ impl<K> Core<K> {
             elsewhere: 0,
             failures: 0,
             not_before: Duration::ZERO,
+            failed_at: None,
             held_until: Duration::ZERO,
             unanswered_since: None,
             dry_since: None,
@@ -227,6 +187,9 @@ impl<K> Core<K> {
     /// event and at [`poll_timeout`](Self::poll_timeout).
     pub fn poll(&mut self, now: Duration) -> Option<Ask> {
         self.expire(now);
+        for call in &mut self.in_flight {
+            call.overdue |= now.saturating_sub(call.since) >= self.settings.overdue;
+        }
         if !self.stock.asked && now >= self.stock.due {
             self.stock.asked = true;
             return Some(Ask::Status);
@@ -246,7 +209,7 @@ impl<K> Core<K> {
         }
         let missing = u32::try_from(self.missing()).unwrap_or(u32::MAX);
         let number = self.per_call().min(missing);
-        self.in_flight.push((number, now));
+        self.in_flight.push(Call { keys: number, since: now, overdue: false });
         Some(Ask::Keys(number))
     }
 
@@ -256,7 +219,11 @@ impl<K> Core<K> {
         let status = (!self.stock.asked).then_some(self.stock.due);
         let refill = (self.refill_is_due() && self.may_call()).then(|| self.begins());
         let expiry = self.held.front().and_then(|(at, _)| at.checked_add(self.settings.max_age));
-        [status, refill, expiry].into_iter().flatten().min()
+        let in_time = self.in_flight.iter().filter(|call| !call.overdue);
+        let overdue =
+            in_time.filter_map(|call| call.since.checked_add(self.settings.overdue)).min();
+        let overdue = overdue.filter(|_| self.may_call());
+        [status, refill, expiry, overdue].into_iter().flatten().min()
     }
 
     /// Whether [`poll`](Self::poll) would give a call for keys: for an owner whose calls are made
@@ -282,10 +249,11 @@ impl<K> Core<K> {
         self.refilling |= unusable > 0;
         self.answered(now, came);
         if came == 0 {
-            self.back_off(now, FailureClass::KeysLost);
+            self.back_off(now, since, FailureClass::KeysLost);
             return;
         }
         self.failures = 0;
+        self.failed_at = None;
         self.not_before = now;
         self.dry_since = None;
         self.size = self.size.saturating_mul(2).min(self.settings.batch);
@@ -296,10 +264,10 @@ impl<K> Core<K> {
         match ask {
             Ask::Status => self.status_ended(now),
             Ask::Keys(asked) => {
-                self.ended(asked);
+                let since = self.ended(asked).unwrap_or(now);
                 self.refilling = true;
                 self.answered(now, 0);
-                self.back_off(now, class);
+                self.back_off(now, since, class);
                 if class == FailureClass::Refused {
                     self.size = (self.size / 2).max(1);
                 }
@@ -388,7 +356,8 @@ impl<K> Core<K> {
         let fresh = |(at, _): &&(Duration, K)| now.saturating_sub(*at) < self.settings.max_age;
         PoolStatus {
             held: self.held.iter().filter(fresh).count(),
-            asked: self.asked(),
+            asked: self.asked() + self.overdue(),
+            overdue: self.overdue(),
             elsewhere: self.elsewhere,
             target: self.target(),
             supply: self.supply.rate(),
@@ -403,8 +372,15 @@ impl<K> Core<K> {
         }
     }
 
+    /// Keys asked for that are counted on.
     fn asked(&self) -> usize {
-        self.in_flight.iter().map(|&(number, _)| number as usize).sum()
+        let in_time = self.in_flight.iter().filter(|call| !call.overdue);
+        in_time.map(|call| call.keys as usize).sum()
+    }
+
+    fn overdue(&self) -> usize {
+        let overdue = self.in_flight.iter().filter(|call| call.overdue);
+        overdue.map(|call| call.keys as usize).sum()
     }
 
     fn missing(&self) -> usize {
@@ -442,8 +418,8 @@ impl<K> Core<K> {
 
     /// Ends a call for keys, and says when it began.
     fn ended(&mut self, asked: u32) -> Option<Duration> {
-        let call = self.in_flight.iter().position(|&(number, _)| number == asked)?;
-        Some(self.in_flight.remove(call).1)
+        let call = self.in_flight.iter().position(|call| call.keys == asked)?;
+        Some(self.in_flight.remove(call).since)
     }
 
     fn status_ended(&mut self, now: Duration) {
@@ -457,7 +433,13 @@ impl<K> Core<K> {
         self.supply.answered(waited, came);
     }
 
-    fn back_off(&mut self, now: Duration, class: FailureClass) {
+    /// A call that began at `since` failed. Calls that hang together fail together, and are one
+    /// cause to wait longer.
+    fn back_off(&mut self, now: Duration, since: Duration, class: FailureClass) {
+        if self.failed_at.is_some_and(|at| since < at) {
+            return;
+        }
+        self.failed_at = Some(now);
         let (first, longest) = if class == FailureClass::KeysLost { PAUSE_LOST } else { PAUSE };
         let full = (first * (1 << self.failures.min(10))).min(longest);
         let pause = full / 2 + full / 2 * u32::from((self.jitter)()) / 255;

@@ -147,7 +147,8 @@ proptest! {
                         prop_assert!(n >= 1 && n <= batch.max(1));
                         prop_assert!(flying.len() <= calls.max(1));
                         prop_assert!(now >= held_until);
-                        let ahead = status.held + status.asked + elsewhere;
+                        let counted = status.asked - status.overdue;
+                        let ahead = status.held + counted + elsewhere;
                         prop_assert!(ahead <= target);
                         match last_stock {
                             None => prop_assert_eq!(n, 1, "nothing is known"),
@@ -249,6 +250,42 @@ fn failures_that_may_cost_keys_wait_longer_and_jitter_stays_in_the_upper_half() 
             }
         }
     }
+}
+
+#[test]
+fn a_call_that_hangs_is_not_waited_for() {
+    let mut core = core(4, stock(0, 0));
+    assert_eq!(core.poll(ms(0)), Some(Ask::Keys(4)));
+    assert_eq!(core.poll(ms(999)), None);
+    assert_eq!(core.poll_timeout(), Some(ms(1_000)));
+    for calls in 1..4 {
+        assert_eq!(core.poll(ms(1_000 * calls)), Some(Ask::Keys(4)), "call {calls}");
+        assert_eq!(core.poll(ms(1_000 * calls)), None);
+    }
+    assert_eq!(core.poll(ms(4_000)), None, "as many calls as may be");
+    let status = core.status(ms(4_000));
+    assert_eq!((status.asked, status.overdue), (16, 16));
+    // Those that answer after all are welcome, the oldest first.
+    core.on_keys(ms(4_100), 4, 0..4);
+    assert_eq!(core.poll(ms(4_100)), None, "nothing is missing");
+    core.on_keys(ms(4_200), 4, 4..8);
+    assert_eq!(core.status(ms(4_200)).held, 8);
+    assert_eq!(core.take(ms(4_200)), Some(0));
+}
+
+#[test]
+fn calls_that_hang_together_are_one_cause_to_wait() {
+    let mut core = core(4, stock(0, 0));
+    for at in [0, 1_000, 2_000, 3_000] {
+        assert_eq!(core.poll(ms(at)), Some(Ask::Keys(4)));
+    }
+    core.on_failure(ms(3_000), Ask::Keys(4), FailureClass::KeysLost);
+    for _ in 0..2 {
+        core.on_failure(ms(3_500), Ask::Keys(4), FailureClass::KeysLost);
+    }
+    assert_eq!(core.status(ms(3_500)).failures, 1);
+    assert_eq!(core.poll(ms(3_999)), None);
+    assert_eq!(core.poll(ms(4_000)), Some(Ask::Keys(4)), "a second, not four");
 }
 
 #[test]
