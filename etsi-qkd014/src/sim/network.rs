@@ -167,7 +167,7 @@ impl NetworkBuilder {
                 saes.push(sae(id, kme, &pki, Pair { cert: cert.clone(), key: key.clone() }));
             }
         }
-        Ok(Network { kmes, saes, pki })
+        Ok(Network { kmes, saes, pki, shared })
     }
 }
 
@@ -186,6 +186,7 @@ pub struct Network {
     kmes: Vec<Kme>,
     saes: Vec<Sae>,
     pki: Pki,
+    shared: Arc<Shared>,
 }
 
 impl Network {
@@ -231,6 +232,18 @@ impl Network {
     #[must_use]
     pub fn sae(&self, id: &str) -> Option<&Sae> {
         self.saes.iter().find(|sae| sae.id == id)
+    }
+
+    /// Notes the state of the key stores, as a backup does. All keys drawn from here on are kept
+    /// for [`set_back`](Self::set_back).
+    pub fn note_state(&self) {
+        self.shared.store().note();
+    }
+
+    /// Sets the key stores back to the state that was noted: the KMEs give the keys that were drawn
+    /// since then once more, in the same order, and can give them to the slaves once more.
+    pub fn set_back(&self) {
+        self.shared.store().set_back();
     }
 
     /// Settings of a client that acts as the SAE `sae`.

@@ -1,6 +1,6 @@
 //! Key material that the KMEs of a network share: what a QKD link would have put into both.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::fmt;
 use std::sync::Arc;
 use std::time::Instant;
@@ -32,6 +32,10 @@ pub(super) struct Store {
     /// The IDs of `waiting`, in order of their drawing.
     order: BTreeMap<u64, String>,
     drawn: u64,
+    /// What was drawn since the state was noted, where it was.
+    noted: Option<Vec<Noted>>,
+    /// What is drawn again, the oldest first.
+    again: VecDeque<Noted>,
     witness: Witness,
 }
 
@@ -49,6 +53,13 @@ impl fmt::Debug for Witness {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(if self.0.is_some() { "a witness" } else { "no witness" })
     }
+}
+
+/// A key as it was drawn.
+struct Noted {
+    key: Drawn,
+    master: String,
+    slaves: BTreeSet<String>,
 }
 
 /// A key that slaves may still draw.
@@ -81,12 +92,46 @@ impl Store {
             waiting: HashMap::new(),
             order: BTreeMap::new(),
             drawn: 0,
+            noted: None,
+            again: VecDeque::new(),
             witness: Witness::default(),
         }
     }
 
     pub(super) fn with_witness(self, witness: Witness) -> Self {
         Self { witness, ..self }
+    }
+
+    /// Notes its state, to be set back to.
+    pub(super) fn note(&mut self) {
+        self.noted = Some(Vec::new());
+        self.again.clear();
+    }
+
+    /// Goes back to the state that was noted: what was drawn since is drawn again.
+    pub(super) fn set_back(&mut self) {
+        self.again.extend(self.noted.replace(Vec::new()).unwrap_or_default());
+    }
+
+    /// The key that comes next for `master` and `slaves`.
+    fn next_key(&mut self, bytes: usize, master: &str, slaves: &BTreeSet<String>) -> Drawn {
+        let fits = |noted: &Noted| {
+            noted.master == master && noted.slaves == *slaves && noted.key.1.len() == bytes
+        };
+        let before = self.again.iter().position(fits).and_then(|i| self.again.remove(i));
+        let key = before.map_or_else(
+            || {
+                let mut secret = Zeroizing::new(vec![0; bytes]);
+                random(&mut secret);
+                (uuid(), secret)
+            },
+            |noted| noted.key,
+        );
+        if let Some(noted) = &mut self.noted {
+            let (master, slaves) = (master.to_owned(), slaves.clone());
+            noted.push(Noted { key: key.clone(), master, slaves });
+        }
+        key
     }
 
     /// Keys in stock between two KMEs now.
@@ -126,9 +171,7 @@ impl Store {
         }
         let mut drawn = Vec::new();
         for _ in 0..number {
-            let mut secret = Zeroizing::new(vec![0; bytes]);
-            random(&mut secret);
-            let id = uuid();
+            let (id, secret) = self.next_key(bytes, master, slaves);
             if let Some(tell) = &self.witness.0 {
                 tell(&id, &secret);
             }
@@ -280,6 +323,23 @@ mod tests {
         assert_eq!(store.give(&ids, "m", "s", true).unwrap(), drawn);
         assert_eq!(store.give(&ids, "m", "s", false).unwrap(), drawn);
         assert!(store.give(&ids, "m", "s", false).is_err());
+    }
+
+    #[test]
+    fn a_store_that_is_set_back_gives_the_same_keys_again_to_the_same_saes() {
+        let mut store = Store::new(FillRate::Unlimited, 10, 10);
+        let draw = |store: &mut Store, slave: &str| {
+            store.draw(&link(0, 1), 2, 32, 2, "m", &slaves(&[slave])).unwrap()
+        };
+        let before = draw(&mut store, "s");
+        store.note();
+        let [first, other] = ["s", "t"].map(|slave| draw(&mut store, slave));
+        assert!(first != before);
+        store.set_back();
+        assert_eq!(draw(&mut store, "t"), other);
+        assert_eq!(draw(&mut store, "s"), first);
+        assert!(store.give(std::slice::from_ref(&first[0].0), "m", "s", false).is_ok());
+        assert!(draw(&mut store, "s") != first, "nothing more was drawn then");
     }
 
     #[test]

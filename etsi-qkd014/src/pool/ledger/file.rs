@@ -30,25 +30,29 @@ pub(super) struct FileLedger {
     /// another try proves nothing.
     broken: bool,
     seen: HashSet<Short>,
+    /// Records after which the file becomes the older one, and a new one begins.
+    capacity: usize,
+    /// What the older file has.
+    older: HashSet<Short>,
 }
 
 impl FileLedger {
-    pub(super) fn open(path: PathBuf) -> Result<Self, LedgerError> {
+    pub(super) fn open(path: PathBuf, capacity: usize) -> Result<Self, LedgerError> {
         match Self::open_at(&path) {
-            Ok(opened) => opened,
+            Ok(Ok(mut this)) => {
+                this.capacity = capacity.max(1);
+                if capacity != usize::MAX {
+                    this.older = older(&older_path(&path))?;
+                }
+                Ok(this)
+            }
+            Ok(refused) => refused,
             Err(source) => Err(LedgerError::Open { path, source }),
         }
     }
 
     fn open_at(path: &Path) -> io::Result<Result<Self, LedgerError>> {
-        let file = OpenOptions::new()
-            .read(true)
-            .write(true)
-            .create(true)
-            .truncate(false)
-            .mode(0o600)
-            .custom_flags((OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32)
-            .open(path)?;
+        let file = private().create(true).truncate(false).open(path)?;
         let meta = file.metadata()?;
         let path = path.to_owned();
         if !meta.is_file() {
@@ -70,7 +74,9 @@ impl FileLedger {
     }
 
     fn over(path: PathBuf, file: File) -> Self {
-        Self { path, file, good: 0, torn: false, broken: false, seen: HashSet::new() }
+        let (seen, older) = Default::default();
+        let capacity = usize::MAX;
+        Self { path, file, good: 0, torn: false, broken: false, seen, capacity, older }
     }
 
     /// Reads the file and cuts off what is torn; `false` where it is no ledger.
@@ -89,22 +95,8 @@ impl FileLedger {
             self.good = RECORD as u64;
             return Ok(true);
         }
-        let mut good = RECORD as u64;
-        let mut record = [0; RECORD];
-        loop {
-            let mut have = 0;
-            while have < RECORD {
-                match reader.read(&mut record[have..])? {
-                    0 => break,
-                    n => have += n,
-                }
-            }
-            if have < RECORD {
-                break;
-            }
-            self.seen.insert(short(&record));
-            good += RECORD as u64;
-        }
+        let records = records(&mut reader, &mut self.seen)?;
+        let good = (records + 1) * RECORD as u64;
         self.good = good;
         // What a crash left may be in the system's memory only, also whole records.
         self.file.set_len(good)?;
@@ -119,7 +111,29 @@ impl FileLedger {
     }
 
     pub(super) fn len(&self) -> usize {
-        self.seen.len()
+        self.seen.len() + self.older.len()
+    }
+
+    pub(super) fn contains(&self, short: &Short) -> bool {
+        self.seen.contains(short) || self.older.contains(short)
+    }
+
+    /// The file is full: it becomes the older one, and what was that is forgotten. Where this fails
+    /// halfway, records go on into the file under its new name, and it is tried again with the next.
+    fn turn(&mut self) -> io::Result<()> {
+        match std::fs::rename(&self.path, older_path(&self.path)) {
+            Ok(()) => {}
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            Err(error) => return Err(error),
+        }
+        let file = private().create_new(true).open(&self.path)?;
+        flock(&file, FlockOperation::NonBlockingLockExclusive)?;
+        file.write_all_at(HEADER, 0)?;
+        file.sync_all()?;
+        self.file = file;
+        (self.good, self.torn) = (RECORD as u64, false);
+        self.older = std::mem::take(&mut self.seen);
+        self.sync_directory()
     }
 
     pub(super) fn record(&mut self, shas: &[Sha]) -> Result<Vec<bool>, LedgerError> {
@@ -130,7 +144,7 @@ impl FileLedger {
         let mut bytes = Vec::new();
         let mut new = Vec::with_capacity(shas.len());
         for sha in shas {
-            let is_new = !self.seen.contains(&short(sha)) && batch.insert(short(sha));
+            let is_new = !self.contains(&short(sha)) && batch.insert(short(sha));
             if is_new {
                 bytes.extend_from_slice(sha);
             }
@@ -140,6 +154,10 @@ impl FileLedger {
             let written = self.append(&bytes);
             written.map_err(|source| LedgerError::Write { path: self.path.clone(), source })?;
             self.seen.extend(batch);
+            if self.seen.len() >= self.capacity {
+                // What was recorded is recorded; the file is only longer than it should be.
+                let _ = self.turn();
+            }
         }
         Ok(new)
     }
@@ -166,6 +184,58 @@ impl FileLedger {
         self.file.set_len(self.good)?;
         self.torn = false;
         Ok(())
+    }
+}
+
+/// How a file is opened that nobody else may read, and that is no link to another.
+fn private() -> OpenOptions {
+    let mut options = OpenOptions::new();
+    let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
+    options.read(true).write(true).mode(0o600).custom_flags(flags.bits() as i32);
+    options
+}
+
+/// Where the records are that were full before.
+fn older_path(path: &Path) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".old");
+    name.into()
+}
+
+/// What a full file has; nothing where there is none.
+fn older(path: &Path) -> Result<HashSet<Short>, LedgerError> {
+    let mut seen = HashSet::new();
+    let read = |seen: &mut HashSet<Short>| -> io::Result<bool> {
+        let mut reader = BufReader::with_capacity(1 << 16, private().open(path)?);
+        let mut begin = [0; RECORD];
+        reader.read_exact(&mut begin)?;
+        records(&mut reader, seen)?;
+        Ok(&begin == HEADER)
+    };
+    match read(&mut seen) {
+        Ok(true) => Ok(seen),
+        Ok(false) => {
+            Err(LedgerError::NotALedger { path: path.to_owned(), reason: "it begins otherwise" })
+        }
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(seen),
+        Err(source) => Err(LedgerError::Open { path: path.to_owned(), source }),
+    }
+}
+
+/// Reads whole records to the end; how many.
+fn records(reader: &mut impl Read, seen: &mut HashSet<Short>) -> io::Result<u64> {
+    let mut record = [0; RECORD];
+    let mut count = 0;
+    loop {
+        let mut have = 0;
+        while have < RECORD {
+            match reader.read(&mut record[have..])? {
+                0 => return Ok(count),
+                n => have += n,
+            }
+        }
+        seen.insert(short(&record));
+        count += 1;
     }
 }
 
@@ -196,7 +266,7 @@ mod tests {
     fn a_storage_that_lost_a_write_is_not_trusted_again() {
         // The state that a failed fdatasync leaves.
         let (_dir, path) = temp();
-        let mut ledger = FileLedger::open(path).unwrap();
+        let mut ledger = FileLedger::open(path, usize::MAX).unwrap();
         ledger.broken = true;
         assert!(matches!(ledger.record(&[sha("a")]), Err(LedgerError::Broken { .. })));
     }
@@ -218,6 +288,52 @@ mod tests {
             drop(ledger);
             assert_eq!(std::fs::read(&path).unwrap(), whole, "cut at {cut}");
         }
+    }
+
+    #[test]
+    fn a_bounded_ledger_remembers_the_last_of_its_capacity_over_any_restart() {
+        let (dir, path) = temp();
+        for first in 0..12 {
+            // Opened anew each time, for two records.
+            let ledger = Ledger::file_of(&path, 5).unwrap();
+            for id in [2 * first, 2 * first + 1] {
+                assert_eq!(ledger.record([id.to_string()]).unwrap(), [true]);
+            }
+            let last = 2 * first + 1;
+            for known in (last + 1_usize).saturating_sub(5)..=last {
+                assert!(ledger.contains(&known.to_string()), "{known} of {last}");
+                assert_eq!(ledger.record([known.to_string()]).unwrap(), [false]);
+            }
+            assert!(ledger.len() <= 10);
+        }
+        for file in std::fs::read_dir(dir.path()).unwrap() {
+            let meta = file.unwrap().metadata().unwrap();
+            assert_eq!(meta.mode() & 0o7777, 0o600);
+            assert!(meta.len() <= (RECORD * 6) as u64);
+        }
+        std::fs::write(older_path(&path), "junk that is longer than the header of a ledger")
+            .unwrap();
+        assert!(matches!(Ledger::file_of(&path, 5), Err(LedgerError::NotALedger { .. })));
+        std::fs::remove_file(older_path(&path)).unwrap();
+        assert!(Ledger::file_of(&path, 5).is_ok());
+    }
+
+    #[test]
+    fn a_ledger_that_cannot_turn_its_file_goes_on_in_it() {
+        let (_dir, path) = temp();
+        let ledger = Ledger::file_of(&path, 2).unwrap();
+        // A directory is in the way.
+        std::fs::create_dir(older_path(&path)).unwrap();
+        std::fs::write(older_path(&path).join("x"), "").unwrap();
+        for id in ["a", "b", "c", "d"] {
+            assert_eq!(ledger.record([id]).unwrap(), [true]);
+        }
+        assert_eq!(ledger.record(["a", "d"]).unwrap(), [false, false]);
+        std::fs::remove_dir_all(older_path(&path)).unwrap();
+        assert_eq!(ledger.record(["e"]).unwrap(), [true]);
+        drop(ledger);
+        let ledger = Ledger::file_of(&path, 2).unwrap();
+        assert_eq!(ledger.record(["a", "b", "c", "d", "e", "f"]).unwrap()[..5], [false; 5]);
     }
 
     #[test]

@@ -108,8 +108,29 @@ impl Ledger {
     /// [`LedgerError`]: it cannot be opened, is no ledger, is open to others, or is in use.
     #[cfg(unix)]
     pub fn file(path: impl Into<PathBuf>) -> Result<Self, LedgerError> {
-        let file = file::FileLedger::open(path.into())?;
+        Self::file_of(path, usize::MAX)
+    }
+
+    /// As [`file`](Self::file), and remembers the last `capacity` key_IDs at least and twice as many
+    /// at most: a full file takes the name `PATH.old`, and a new one begins.
+    ///
+    /// # Errors
+    /// [`LedgerError`], as of [`file`](Self::file), for either file.
+    #[cfg(unix)]
+    pub fn file_of(path: impl Into<PathBuf>, capacity: usize) -> Result<Self, LedgerError> {
+        let file = file::FileLedger::open(path.into(), capacity)?;
         Ok(Self { inner: Arc::new(Mutex::new(Inner::File(file))), in_file: true })
+    }
+
+    /// Whether it remembers this key_ID. Records nothing, and does not block on a disk.
+    #[must_use]
+    pub fn contains(&self, key_id: &str) -> bool {
+        let short = short(&sha(key_id));
+        match &*self.inner.lock().unwrap_or_else(PoisonError::into_inner) {
+            Inner::Memory(memory) => memory.seen.contains(&short),
+            #[cfg(unix)]
+            Inner::File(file) => file.contains(&short),
+        }
     }
 
     /// Records key_IDs and says of each whether it is new: only then may its key be used. All are
