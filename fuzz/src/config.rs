@@ -86,7 +86,8 @@ pub fn seeds() -> Vec<Vec<u8>> {
     let qkd = "AXON_SECURITY_MODE=qkd\nAXON_QKD_KEY_MODE=session\nAXON_QKD_KEX=psk_dhe_ke\n\
                AXON_QKD_PEERS=sae-b;sae-c\nAXON_QKD_SESSION_MAX_AGE=60\n\
                AXON_KME_URL=https://kme:8443/a\nAXON_KME_CA=ca.pem\nAXON_KME_ID=kme-a\n\
-               AXON_KME_QUIRKS=null-members\nAXON_SAE_ID=sae-a\nAXON_SAE_CERT=/a.crt\n\
+               AXON_KME_QUIRKS=null-members\nAXON_KME_CONNECT_TIMEOUT=1\n\
+               AXON_KME_ANSWER_TIMEOUT=2\nAXON_SAE_ID=sae-a\nAXON_SAE_CERT=/a.crt\n\
                AXON_SAE_KEY=/a.key\n";
     let classic = "AXON_CLASSIC_AUTH=pinned\nAXON_CLASSIC_KEY=/k\nAXON_CLASSIC_TRUST=/t\n\
                    AXON_QUIC_CIPHER=aes-256-gcm\n";

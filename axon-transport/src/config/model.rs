@@ -113,6 +113,10 @@ pub struct QkdConfig {
     pub sae_key: PathBuf,
     /// `AXON_KME_QUIRKS`.
     pub kme_quirks: Vec<String>,
+    /// `AXON_KME_CONNECT_TIMEOUT`: how long TCP and TLS to the KME may take.
+    pub kme_connect_timeout: Duration,
+    /// `AXON_KME_ANSWER_TIMEOUT`: how long a whole call may take.
+    pub kme_answer_timeout: Duration,
 }
 
 /// What KME keys protect (`AXON_QKD_KEY_MODE`).

@@ -201,6 +201,7 @@ fn qkd(values: &Values<'_, impl Files>) -> Result<QkdConfig, ConfigError> {
         return Err(values.refuse("AXON_QKD_PEERS", accepted));
     }
     let max_age = values.number("AXON_QKD_SESSION_MAX_AGE", 1..=86_400, "seconds")?;
+    let (kme_connect_timeout, kme_answer_timeout) = kme_timeouts(values)?;
     Ok(QkdConfig {
         key_mode: values.choice("AXON_QKD_KEY_MODE", &key_modes)?.unwrap_or(KeyMode::Messages10),
         kex: values.choice("AXON_QKD_KEX", &kexes)?.unwrap_or_default(),
@@ -217,7 +218,27 @@ fn qkd(values: &Values<'_, impl Files>) -> Result<QkdConfig, ConfigError> {
         sae_cert: file("AXON_SAE_CERT", Use::Public)?,
         sae_key: file("AXON_SAE_KEY", Use::Secret)?,
         kme_quirks: values.quirks("AXON_KME_QUIRKS")?,
+        kme_connect_timeout,
+        kme_answer_timeout,
     })
+}
+
+/// How long a connection to the KME, and a whole call with it, may take.
+fn kme_timeouts(values: &Values<'_, impl Files>) -> Result<(Duration, Duration), ConfigError> {
+    const CONNECT: &str = "AXON_KME_CONNECT_TIMEOUT";
+    const ANSWER: &str = "AXON_KME_ANSWER_TIMEOUT";
+    let connect = values.number(CONNECT, 1..=10, "seconds")?;
+    let answer = values.number(ANSWER, 1..=10, "seconds")?.unwrap_or(3);
+    // A given answer time of 1 s is enough to say that connecting takes no longer.
+    let connect = connect.unwrap_or(answer.min(2));
+    if connect > answer {
+        let accepted = format!(
+            "at most {answer} (seconds): a call may take that long with its connection, \
+             {ANSWER}"
+        );
+        return Err(values.refuse(CONNECT, accepted));
+    }
+    Ok((Duration::from_secs(connect), Duration::from_secs(answer)))
 }
 
 fn domain(sources: &Sources) -> Result<u32, ConfigError> {

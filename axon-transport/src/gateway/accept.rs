@@ -1,9 +1,9 @@
 //! Answering dials: Retry for every unvalidated address, then the handshake, then
 //! [`establish`](super::establish).
 
-use std::{sync::Arc, time::Duration};
+use std::{net::SocketAddr, sync::Arc, time::Duration};
 
-use quinn::{Endpoint, Incoming};
+use quinn::{ConnectionError, Endpoint, Incoming};
 use tokio::sync::mpsc;
 
 use super::{
@@ -84,9 +84,13 @@ async fn answer(context: &Arc<Context>, incoming: Incoming) -> Option<Incomer> {
             return refused(Refusal::here(crate::link::CloseCode::Internal, error), None);
         }
     };
+    // A hello that comes in one packet is answered, or refused, right here.
     let connecting = match incoming.accept_with(Arc::new(server)) {
         Ok(connecting) => connecting,
-        Err(error) => return refused(Refusal::of(&error), resolver.as_deref()),
+        Err(error) => {
+            let refusal = explained(&error, resolver.as_deref(), source)?;
+            return refused(refusal, resolver.as_deref());
+        }
     };
     let connection = match tokio::time::timeout(HANDSHAKE_TIMEOUT, connecting).await {
         Ok(Ok(connection)) => connection,
@@ -95,20 +99,7 @@ async fn answer(context: &Arc<Context>, incoming: Incoming) -> Option<Incomer> {
             return refused(late, resolver.as_deref());
         }
         Ok(Err(error)) => {
-            let mut refusal = Refusal::of(&error);
-            let outcome = resolver.as_ref().and_then(|r| r.outcome());
-            // How every bootstrap begins: the key is being fetched, and the dialler comes again.
-            if matches!(outcome, Some(Lookup::Fetching)) {
-                tracing::debug!(%source, "a PSK is being fetched; the dialler will come again");
-                return None;
-            }
-            if let (Some(DECRYPT_ERROR), Some(Lookup::Found)) = (refusal.alert, &outcome) {
-                let what = "either the KMEs disagree about it and their operators must compare what \
-                            they hold for these two SAEs, or somebody copied its name";
-                refusal.reason = format!("{}: {what}", refusal.reason);
-            } else if let Some(outcome) = outcome {
-                refusal.reason = format!("{}; PSK look-up: {outcome}", refusal.reason);
-            }
+            let refusal = explained(&error, resolver.as_deref(), source)?;
             return refused(refusal, resolver.as_deref());
         }
     };
@@ -116,4 +107,28 @@ async fn answer(context: &Arc<Context>, incoming: Incoming) -> Option<Incomer> {
         Ok(established) => Some(Incomer::Established(Box::new(established))),
         Err(refusal) => refused(refusal, resolver.as_deref()),
     }
+}
+
+/// Why a handshake failed, with what the look-up of its key says; `None` where that is how every
+/// bootstrap begins: the key is being fetched, and the dialler comes again.
+fn explained(
+    error: &ConnectionError,
+    resolver: Option<&Resolver>,
+    source: SocketAddr,
+) -> Option<Refusal> {
+    let mut refusal = Refusal::of(error);
+    let Some(outcome) = resolver.and_then(Resolver::outcome) else { return Some(refusal) };
+    match outcome {
+        Lookup::Fetching => {
+            tracing::debug!(%source, "a PSK is being fetched; the dialler will come again");
+            return None;
+        }
+        Lookup::Found if refusal.alert == Some(DECRYPT_ERROR) => {
+            let what = "either the KMEs disagree about it and their operators must compare what \
+                        they hold for these two SAEs, or somebody copied its name";
+            refusal.reason = format!("{}: {what}", refusal.reason);
+        }
+        outcome => refusal.reason = format!("{}; PSK look-up: {outcome}", refusal.reason),
+    }
+    Some(refusal)
 }

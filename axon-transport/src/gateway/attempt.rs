@@ -85,7 +85,7 @@ pub async fn link(
     bootstrap: Bootstrap,
 ) -> Result<Link, Refusal> {
     let here = |e: GatewayError| Refusal::here(CloseCode::Internal, e);
-    let keyring = Keyring::start(config).map_err(|e| here(e.into()))?;
+    let keyring = Keyring::start(config, keys::UsedKeys::in_memory).map_err(|e| here(e.into()))?;
     let keyring = keyring.map(|(keyring, events)| {
         tokio::spawn(Arc::clone(&keyring).run(events));
         keyring

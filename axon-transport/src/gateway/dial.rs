@@ -19,7 +19,8 @@ use crate::{
 
 /// One address is given this long to complete the handshake.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
-/// A dial, with all its redials, is given up after this; discovery backs off and dials again.
+/// A dial, with all its redials, is given up after this, in qkd with two KME calls; discovery backs
+/// off and dials again.
 const DIAL_TIMEOUT: Duration = Duration::from_secs(20);
 /// Alerts of a server that does not have the key (yet), or has another.
 const UNKNOWN_PSK_IDENTITY: u8 = 115;
@@ -73,8 +74,10 @@ pub(super) async fn dial(
         }
     };
     // Not around `establish`, which has limits of its own and cleans up after itself.
-    let late = |_| Refusal::network("no answer within 20 s");
-    let connection = tokio::time::timeout(DIAL_TIMEOUT, connect).await.map_err(late)??;
+    let calls = context.keyring.as_ref().map(|keyring| 2 * keyring.config.kme_answer_timeout);
+    let limit = DIAL_TIMEOUT + calls.unwrap_or_default();
+    let late = |_| Refusal::network(format!("no answer within {limit:?}"));
+    let connection = tokio::time::timeout(limit, connect).await.map_err(late)??;
     establish(context, connection, Side::Client, hello, target.sae.as_deref()).await
 }
 

@@ -25,9 +25,12 @@ use crate::{
     link::{CloseCode, Hello, Message, Order, Side, check},
 };
 
-/// HELLO, and the whole proof with its two KME calls, must be done in this time.
+/// HELLO must be done in this time.
 const HELLO_TIMEOUT: Duration = Duration::from_secs(5);
-const PROOF_TIMEOUT: Duration = Duration::from_secs(15);
+/// The proof must be done in this time and that of its KME calls: this side's, and three tries of
+/// the peer's.
+const PROOF_TIMEOUT: Duration = Duration::from_secs(3);
+const PROOF_CALLS: u32 = 4;
 
 /// A connection whose peer said who it is and, in qkd, proved it.
 pub(super) struct Established {
@@ -156,7 +159,7 @@ async fn run(
         let told = "this host cannot read whom it trusts, and takes nobody; its log says more";
         return Err(Failure::Quietly { code: CloseCode::NotAllowed, told, why });
     }
-    let psk_sae = psk_sae(context, side, &negotiated, dialled)?;
+    let psk_sae = psk_sae(context, side, &negotiated, dialled).await?;
     let qkd = context.keyring.is_some();
     let mut order = Order::new(side, qkd);
 
@@ -188,8 +191,10 @@ async fn run(
     let sealing = match (&context.keyring, &theirs.sae) {
         (Some(keyring), Some(sae)) => {
             let proof = Proof { keyring, connection, number, sae, outbox: &outbox };
-            let late = |_| Failure::Ours(CloseCode::KeySupply, "no proof within 15 s".into());
-            let sealing = tokio::time::timeout(PROOF_TIMEOUT, async {
+            let limit = PROOF_TIMEOUT + PROOF_CALLS * keyring.config.kme_answer_timeout;
+            let late =
+                |_| Failure::Ours(CloseCode::KeySupply, format!("no proof within {limit:?}"));
+            let sealing = tokio::time::timeout(limit, async {
                 match side {
                     Side::Server => proof.demand(&mut reader, &mut order).await,
                     Side::Client => proof.give(&mut reader, &mut order).await,
@@ -259,7 +264,7 @@ fn is_who_it_says(
 
 /// The peer's SAE by the PSK, in qkd. A server spends the PSK here: the client's Finished was
 /// verified.
-fn psk_sae(
+async fn psk_sae(
     context: &Context,
     side: Side,
     negotiated: &Negotiated,
@@ -272,7 +277,7 @@ fn psk_sae(
     let identity = negotiated.psk_identity.as_deref().unwrap_or_default();
     let parsed = PskIdentity::parse(identity)
         .map_err(|e| Failure::Ours(CloseCode::Internal, e.to_string()))?;
-    match keyring.acceptor.spent(identity) {
+    match keyring.spent(identity, parsed.key_id()).await {
         Completion::First => Ok(Some(parsed.client_sae().to_owned())),
         Completion::Reused => {
             let text = "this PSK has completed a handshake before; a KME key is used once";

@@ -18,8 +18,9 @@ use super::control::Outbox;
 use crate::{
     config::{Config, KeyMode, QkdConfig, Security},
     keys::{
-        Acceptor, Answer, Clock, Dialler, Event, Events, Exporters, Fetched, KeyMessage, Kme,
-        KmeError, Origin, Purpose, Receiver, Request, Sender, SupplyError,
+        Acceptor, Answer, Clock, Completion, Dialler, Event, Events, Exporters, Fetched,
+        KeyMessage, Kme, KmeError, Origin, Purpose, Receiver, Request, Sender, SupplyError,
+        UsedKeys,
     },
     link::Message,
 };
@@ -42,6 +43,7 @@ pub(super) struct Keyring {
     /// Wakes dials that wait for the KME.
     dialler_answered: Notify,
     kme: Kme,
+    used: UsedKeys,
     peers: Mutex<HashMap<String, Arc<PeerKeys>>>,
     /// Answers for proofs under way, by link number.
     proofs: Mutex<HashMap<u64, mpsc::UnboundedSender<Answer>>>,
@@ -56,15 +58,26 @@ impl std::fmt::Debug for Keyring {
 
 impl Keyring {
     /// The keyring of a daemon in `qkd`, `None` in `classic`. Must run within a tokio runtime.
-    pub(super) fn start(config: &Config) -> Result<Option<(Arc<Self>, Events)>, KmeError> {
+    /// `used` opens the record of the keys that this host had before.
+    pub(super) fn start(
+        config: &Config,
+        used: impl FnOnce() -> UsedKeys,
+    ) -> Result<Option<(Arc<Self>, Events)>, KmeError> {
         let Security::Qkd(qkd) = &config.security else { return Ok(None) };
         let clock = Clock::start();
-        let (kme, events) = Kme::start(qkd)?;
+        let used = used();
+        let (kme, events) = Kme::start(qkd, used.clone())?;
         let keyring = Arc::new(Self {
             acceptor: Acceptor::new(&qkd.sae_id, qkd.peers.clone(), config.cipher, clock.clone()),
-            dialler: Mutex::new(Dialler::new(&qkd.sae_id, qkd.peers.clone(), config.cipher)),
+            dialler: Mutex::new(Dialler::new(
+                &qkd.sae_id,
+                qkd.peers.clone(),
+                config.cipher,
+                qkd.kme_answer_timeout,
+            )),
             dialler_answered: Notify::new(),
             kme,
+            used,
             peers: Mutex::default(),
             proofs: Mutex::default(),
             next_peer: AtomicU64::new(1),
@@ -167,12 +180,8 @@ impl Keyring {
         link: u64,
     ) -> Result<(KeyId, KmeKey), String> {
         let mut answers = self.proof_answers(link);
-        let request = Request::Enc {
-            slave: slave.to_owned(),
-            number: 1,
-            purpose: Purpose::Bootstrap,
-            timeout: Duration::from_secs(5),
-        };
+        let request =
+            Request::Enc { slave: slave.to_owned(), number: 1, purpose: Purpose::Bootstrap };
         self.submit(Origin::Proof(link), request);
         let answer = answers.recv().await;
         self.proof_over(link);
@@ -187,6 +196,19 @@ impl Keyring {
     pub(super) fn submit(&self, origin: Origin, request: Request) {
         if let Err(event) = self.kme.submit(origin, request) {
             self.dispatch(*event);
+        }
+    }
+
+    /// A handshake under `identity`, with the key `key_id`, is complete: the key is spent.
+    pub(super) async fn spent(&self, identity: &[u8], key_id: &str) -> Completion {
+        if self.acceptor.spent(identity) == Completion::Reused {
+            return Completion::Reused;
+        }
+        let (used, key_id) = (self.used.clone(), [key_id.to_owned()]);
+        // A daemon before this one may have had it.
+        match tokio::task::spawn_blocking(move || used.record(&key_id)).await.as_deref() {
+            Ok([true]) => Completion::First,
+            _ => Completion::Reused,
         }
     }
 
@@ -219,7 +241,8 @@ impl Keyring {
                 (p.sae.clone(), status)
             })
             .collect();
-        serde_json::json!({ "kme": self.kme.statistics(), "peers": peers })
+        let used = self.used.statistics();
+        serde_json::json!({ "kme": self.kme.statistics(), "peers": peers, "used_keys": used })
     }
 
     fn dispatch(&self, event: Event) {

@@ -21,6 +21,7 @@ use super::{
 };
 use crate::{
     daemon::bridge::{CHANNEL, GatewayParts, ToControl},
+    keys::UsedKeys,
     session::{Session, SessionEvent, SessionOptions, SessionRole},
 };
 
@@ -51,7 +52,8 @@ fn workers() -> usize {
 
 async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
     let GatewayParts { config, daemon, socket, control, mut orders } = parts;
-    let keyring = Keyring::start(&config)?;
+    let used = || UsedKeys::open(config.runtime_dir.as_deref(), config.domain);
+    let keyring = Keyring::start(&config, used)?;
     let (keyring, key_events) = match keyring {
         Some((keyring, events)) => (Some(keyring), Some(events)),
         None => (None, None),

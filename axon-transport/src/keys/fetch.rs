@@ -8,7 +8,7 @@ use super::request::{Answer, Failure, FailureKind, Fetched, Purpose, Request};
 
 /// How often a batch is asked for.
 const TRIES: u8 = 3;
-/// How long a try takes: at most until its answer, and at least until the next one.
+/// Time between two tries, at least.
 const TRY: Duration = Duration::from_secs(2);
 /// Longest pause between two tries that a KME can ask for: whoever announced the keys waits too.
 const RETRY_AFTER_MAX: Duration = Duration::from_secs(10);
@@ -63,7 +63,7 @@ impl Fetches {
         let key_ids = batch.key_ids.clone();
         self.in_flight.push(batch);
         let (master, purpose) = (self.master.clone(), self.purpose);
-        Some(Request::Dec { master, key_ids, purpose, timeout: TRY })
+        Some(Request::Dec { master, key_ids, purpose })
     }
 
     /// What became of the keys that `answer` settles; none where they are asked for again.
@@ -97,7 +97,6 @@ impl Fetches {
                 Vec::new()
             }
             kind if kind.is_transient() && batch.tries_left > 0 => {
-                // A try is over no later than the next may begin.
                 batch.not_before += failure.retry_after.unwrap_or_default().min(RETRY_AFTER_MAX);
                 self.waiting.push_back(batch);
                 Vec::new()

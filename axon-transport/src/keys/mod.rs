@@ -21,6 +21,7 @@ pub mod message;
 pub mod proof;
 pub mod request;
 pub mod supply;
+mod used;
 pub mod verifier;
 
 pub use bootstrap::{Acceptor, Attempt, Completion, Dial, DialRefusal, Dialler, Lookup, Resolver};
@@ -30,4 +31,5 @@ pub use kme::{Event, Events, Kme, KmeError, Origin, Statistics};
 pub use message::{KeyMessage, MessageError, Violation};
 pub use request::{Answer, Failure, FailureKind, Fetched, Purpose, Request, Stock};
 pub use supply::{Disagreement, NoKey, Receiver, Sender, SupplyError};
+pub use used::{UsedKeys, UsedStatistics};
 pub use verifier::{ClientProof, ProofFailure, ProofResponder, ProofState};

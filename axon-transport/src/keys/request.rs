@@ -31,8 +31,6 @@ pub enum Request {
         number: u32,
         /// What for.
         purpose: Purpose,
-        /// How long the call may take.
-        timeout: Duration,
     },
     /// `dec_keys`: the keys that `master` named.
     Dec {
@@ -42,8 +40,6 @@ pub enum Request {
         key_ids: Vec<KeyId>,
         /// What for.
         purpose: Purpose,
-        /// How long the call may take.
-        timeout: Duration,
     },
     /// `status`: what is in stock with `slave`.
     Status {
@@ -65,7 +61,8 @@ pub struct Answer {
 
 /// What a successful [`Request`] gave.
 pub enum Fetched {
-    /// Keys, in the order asked for. All that were asked for, or it is a [`Failure`].
+    /// Keys, in the order asked for. All that were asked for, or it is a [`Failure`]; of
+    /// `enc_keys` for messages without those that were used before.
     Keys(Vec<(KeyId, KmeKey)>),
     /// The answer to [`Request::Status`].
     Stock(Stock),
@@ -96,6 +93,8 @@ pub enum FailureKind {
     Unauthorized,
     /// Cut off or answered badly after the request may have arrived: its keys may be consumed.
     Ambiguous,
+    /// The KME gave keys whose key_IDs it had given before. They are not used.
+    Repeated,
     /// Too many calls are waiting; nothing was asked.
     Busy,
     /// This host could not even put the request.
@@ -127,6 +126,7 @@ impl FailureKind {
             Self::Refused => "its KME refused the request",
             Self::Unauthorized => "its KME and it do not accept each other",
             Self::Ambiguous => "its KME's answer was lost or unusable",
+            Self::Repeated => "its KME gives keys a second time",
             Self::Busy => "too many calls wait for its KME",
             Self::Invalid => "the request could not be put",
         }

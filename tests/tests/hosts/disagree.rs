@@ -52,3 +52,24 @@ fn a_failed_proof_retires_that_key_on_both_hosts_and_nothing_else() {
         node.finish();
     }
 }
+
+/// Of every answer by name that host B gets, the first key is wrong.
+#[test]
+fn kmes_that_disagree_about_the_first_keys_cost_few_of_them() {
+    let kmes = Kmes::start();
+    kmes.plan(1, FaultPlan::new(Fault::WrongKey).on(Method::DecKeys));
+    let [a, b] = hosts(&kmes);
+    let named = |host: &Host, own: usize| {
+        host.log_lines(&["WARN", "KMEs disagree", SAE[own], &kmes.url(own)]) > 0
+    };
+    until("a host names the KMEs", || named(&a, 0) || named(&b, 1));
+    let before = kmes.calls();
+    let start = [&a, &b].map(|host| host.status().uptime_s);
+    until("ten seconds pass", || a.status().uptime_s >= start[0] + 10);
+    // Eight for each dial, which are ever further apart, and the status of two pools.
+    let calls = kmes.calls() - before;
+    assert!(calls <= 60, "{calls} calls in ten seconds");
+    kmes.clear_faults();
+    a.link();
+    b.link();
+}

@@ -67,6 +67,16 @@ impl Kmes {
         self.network.kmes().iter().for_each(sim::Kme::clear_faults);
     }
 
+    /// Notes what the KMEs hold, as a backup does.
+    pub(crate) fn note_state(&self) {
+        self.network.note_state();
+    }
+
+    /// Sets the KMEs back to what was noted: they give the keys since then again.
+    pub(crate) fn set_back(&self) {
+        self.network.set_back();
+    }
+
     /// The URL of the KME of host 0 or 1.
     pub(crate) fn url(&self, host: usize) -> String {
         self.network.kmes()[host].url().to_owned()

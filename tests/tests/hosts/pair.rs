@@ -188,6 +188,12 @@ impl Host {
         });
     }
 
+    /// Lines of its daemon's log that have all of this.
+    pub(crate) fn log_lines(&self, parts: &[&str]) -> usize {
+        let log = self.all_logs();
+        log.lines().filter(|line| parts.iter().all(|part| line.contains(part))).count()
+    }
+
     /// Whether its daemon is the process that it was started with.
     pub(crate) fn is_first_daemon(&self) -> bool {
         self.daemon.as_ref().is_some_and(|daemon| daemon.0.id() == self.status().pid)

@@ -136,6 +136,7 @@ fn nothing_given_is_the_table_of_defaults() {
     assert_eq!(qkd.session_max_age, Duration::from_secs(3600));
     assert_eq!(qkd.peers, QkdPeers::Listed(vec!["sae-b".into(), "sae-c".into()]));
     assert!(qkd.kme_id.is_none() && qkd.kme_quirks.is_empty());
+    assert_eq!((qkd.kme_connect_timeout.as_secs(), qkd.kme_answer_timeout.as_secs()), (2, 3));
 
     assert_eq!(classic(&resolve(PINNED, &[]).unwrap()).auth, ClassicAuth::Pinned);
     let ca = resolve(CA, &[("AXON_CLASSIC_CRL", "crl.pem")]).unwrap();
@@ -154,6 +155,8 @@ fn every_setting_takes_effect() {
             ("AXON_QUIC_CIPHER", "aes-256-gcm"),
             ("AXON_KME_ID", "KME A"),
             ("AXON_KME_QUIRKS", "null-members,any-key-id"),
+            ("AXON_KME_CONNECT_TIMEOUT", "4"),
+            ("AXON_KME_ANSWER_TIMEOUT", "7"),
             ("AXON_DAEMON", "require"),
             ("AXON_DAEMON_PATH", "daemon"),
             ("AXON_RUNTIME_DIR", "/f/created/later"),
@@ -178,6 +181,7 @@ fn every_setting_takes_effect() {
     assert_eq!((&of_qkd.peers, of_qkd.session_max_age.as_secs()), (&QkdPeers::Any, 86_400));
     assert_eq!(of_qkd.kme_id.as_deref(), Some("KME A"));
     assert_eq!(of_qkd.kme_quirks, ["any-key-id", "null-members"]);
+    assert_eq!((of_qkd.kme_connect_timeout.as_secs(), of_qkd.kme_answer_timeout.as_secs()), (4, 7));
     assert_eq!(config.cipher, Cipher::Aes256Gcm);
     assert_eq!(config.daemon, DaemonPolicy::Require);
     assert_eq!(config.daemon_path, Some("/f/daemon".into()));

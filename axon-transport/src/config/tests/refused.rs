@@ -105,6 +105,8 @@ fn bad_values_are_refused_by_name() {
             "AXON_QKD_SESSION_MAX_AGE",
             &["0", "-1", "+5", "1h", "86401", "1e3", "99999999999999999999"],
         ),
+        (QKD, "AXON_KME_CONNECT_TIMEOUT", &["0", "-1", "2s", "0.5", "4", "11"]),
+        (QKD, "AXON_KME_ANSWER_TIMEOUT", &["0", "-1", "3s", "2.5", "11", "never"]),
         (&[], "AXON_QUIC_CIPHER", &["aes-128-gcm", "aes", "none", "CHACHA20"]),
         (&[], "AXON_CLASSIC_AUTH", &["tofu", "pin", "psk"]),
         (PINNED, "AXON_CLASSIC_KEY", &["/f/none", "/f", "/f/open-key.pem"]),

@@ -45,8 +45,6 @@ const MISSED_FOR: Duration = Duration::from_secs(1);
 const SPENT: usize = 4096;
 /// Sources, and SAEs, remembered to have authenticated.
 const KNOWN: usize = 1024;
-/// How long `dec_keys` may take.
-const TIMEOUT: Duration = Duration::from_secs(5);
 /// After this a call counts as lost, answered or not.
 const LOST: Duration = Duration::from_secs(60);
 
@@ -214,7 +212,6 @@ impl Acceptor {
             master: pending.identity.client_sae().to_owned(),
             key_ids: vec![pending.key_id.clone()],
             purpose: Purpose::Accept,
-            timeout: TIMEOUT,
         })
     }
 

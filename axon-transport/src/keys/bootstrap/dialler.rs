@@ -25,15 +25,13 @@ const REDIAL: [Duration; 6] = [
     Duration::from_millis(800),
     Duration::from_millis(1600),
 ];
-/// How long a key is tried against refusals.
-const REFUSED_FOR: Duration = Duration::from_secs(10);
+/// How long a key is tried against refusals, beyond the time that the peer's KME may take.
+const REFUSED_FOR: Duration = Duration::from_secs(7);
 /// How often the peer may say that its key of this name is another one. More than once, since
 /// anyone on the path can say so.
 const MISMATCHES: u32 = 4;
 /// Longest wait before the KME is asked for another key, after a call or a key that failed.
 const BACK_OFF_MAX: Duration = Duration::from_secs(60);
-/// How long `enc_keys` may take.
-const TIMEOUT: Duration = Duration::from_secs(10);
 /// Most peers remembered: beacons, which anyone can send, name SAEs.
 const MAX_PEERS: usize = 256;
 /// Calls in flight at once.
@@ -89,6 +87,8 @@ pub struct Dialler {
     sae_id: String,
     allowed: QkdPeers,
     cipher: Cipher,
+    /// How long a KME may take.
+    answer: Duration,
     peers: HashMap<String, Peer>,
 }
 
@@ -123,9 +123,9 @@ struct Held {
 }
 
 impl Dialler {
-    /// For the host `sae_id`, which may dial `allowed`.
-    pub fn new(sae_id: &str, allowed: QkdPeers, cipher: Cipher) -> Self {
-        Self { sae_id: sae_id.to_owned(), allowed, cipher, peers: HashMap::new() }
+    /// For the host `sae_id`, which may dial `allowed`. A KME may take as long as `answer`.
+    pub fn new(sae_id: &str, allowed: QkdPeers, cipher: Cipher, answer: Duration) -> Self {
+        Self { sae_id: sae_id.to_owned(), allowed, cipher, answer, peers: HashMap::new() }
     }
 
     /// Whether and with which key to dial `sae` now. Asks the KME for one where there is none.
@@ -209,8 +209,12 @@ impl Dialler {
         let since =
             held.last_refusal.replace(now).map_or(Duration::ZERO, |last| now.saturating_sub(last));
         held.refused_for += since.min(2 * REDIAL[REDIAL.len() - 1]);
-        if held.refused_for >= REFUSED_FOR {
-            let why = format!("peer refused key_ID {key_id} for {REFUSED_FOR:?}");
+        let patience = REFUSED_FOR + self.answer;
+        if held.refused_for >= patience {
+            let why = format!(
+                "peer does not have key_ID {key_id} after {patience:?}: its KME does not give it, or \
+                 cannot be asked; its own log says which"
+            );
             peer.failed(now, why);
         }
     }
@@ -233,12 +237,7 @@ impl Dialler {
         }
         let (sae, peer) = self.peers.iter_mut().find(|(_, p)| matches!(p.state, State::Wanted))?;
         peer.state = State::Asked;
-        Some(Request::Enc {
-            slave: sae.clone(),
-            number: 1,
-            purpose: Purpose::Bootstrap,
-            timeout: TIMEOUT,
-        })
+        Some(Request::Enc { slave: sae.clone(), number: 1, purpose: Purpose::Bootstrap })
     }
 
     /// The KME's answer to one of our requests.

@@ -1,36 +1,106 @@
 //! One request as one call of the client.
 
-use std::time::{Duration, Instant};
+use std::{
+    sync::{Mutex, PoisonError},
+    time::Instant,
+};
 
 use axon_envelope::{KeyId, KmeKey};
 use etsi_qkd014::{Client, Error, KeyContainer};
 
-use super::{Recorder, STATUS_TIMEOUT};
+use super::{
+    outage::{Notice, Outages},
+    statistics::{Recorder, Statistics},
+};
 use crate::{
-    keys::request::{Failure, FailureKind, Fetched, Request, Stock},
+    config::QkdConfig,
+    keys::{
+        request::{Failure, FailureKind, Fetched, Purpose, Request, Stock},
+        used::UsedKeys,
+    },
     secrets::LockedKey,
 };
 
 /// Bits of a key.
 const KEY_SIZE: u32 = 256;
 
-/// Runs `request` and records how it went.
-pub(super) async fn run(
-    client: &Client,
-    recorder: &Recorder,
-    request: &Request,
-) -> Result<Fetched, Failure> {
-    let start = Instant::now();
-    let limit = match request {
-        Request::Enc { timeout, .. } | Request::Dec { timeout, .. } => *timeout,
-        Request::Status { .. } => STATUS_TIMEOUT,
-    };
-    let outcome = match tokio::time::timeout(limit, call(client, request)).await {
-        Ok(outcome) => outcome,
-        Err(_) => Err(timed_out(request, limit)),
-    };
-    recorder.record(request, start.elapsed(), &outcome);
-    outcome
+/// Makes calls, and keeps account of them.
+pub(super) struct Caller {
+    client: Client,
+    recorder: Recorder,
+    used: UsedKeys,
+    outages: Mutex<Outages>,
+}
+
+impl Caller {
+    pub(super) fn new(client: Client, config: &QkdConfig, used: UsedKeys) -> Self {
+        let outages = Mutex::new(Outages::new(&config.kme_url, &config.sae_id));
+        Self { client, recorder: Recorder::default(), used, outages }
+    }
+
+    /// Runs `request` and records how it went.
+    pub(super) async fn run(&self, request: &Request) -> Result<Fetched, Failure> {
+        let start = Instant::now();
+        // The client keeps to AXON_KME_ANSWER_TIMEOUT by itself.
+        let outcome = call(&self.client, request).await;
+        let (outcome, repeated) = match (request, outcome) {
+            (Request::Enc { purpose, .. }, Ok(Fetched::Keys(keys))) => {
+                self.unused(*purpose, keys).await
+            }
+            (_, outcome) => (outcome, None),
+        };
+        self.recorder.record(request, start.elapsed(), &outcome);
+        let notice = {
+            // Says too much or too little at worst, whatever thread panicked over it.
+            let mut outages = self.outages.lock().unwrap_or_else(PoisonError::into_inner);
+            let failure = repeated.as_ref().or(outcome.as_ref().err());
+            outages.record(Instant::now(), request, failure)
+        };
+        match notice {
+            Some(Notice::Fails(text)) => tracing::warn!("{text}"),
+            Some(Notice::Works(text)) => tracing::info!("{text}"),
+            None => {}
+        }
+        outcome
+    }
+
+    /// Those of fresh `keys` that this host never had, and what is wrong with the others. Only
+    /// messages make do with some of those asked for.
+    async fn unused(
+        &self,
+        purpose: Purpose,
+        keys: Vec<(KeyId, KmeKey)>,
+    ) -> (Result<Fetched, Failure>, Option<Failure>) {
+        let names: Vec<_> =
+            keys.iter().map(|(id, _)| String::from_utf8_lossy(id.as_bytes()).into()).collect();
+        let used = self.used.clone();
+        let recorded = tokio::task::spawn_blocking(move || used.record(&names)).await;
+        // The runtime ends: nobody is left to use a key.
+        let new = recorded.unwrap_or_else(|_| vec![false; keys.len()]);
+        let mut again = None;
+        let mut unused = Vec::with_capacity(keys.len());
+        for (key, new) in keys.into_iter().zip(new) {
+            if new {
+                unused.push(key);
+            } else {
+                again = Some(key.0);
+            }
+        }
+        let failure = again.map(|key_id| {
+            let text = format!("the KME gave key_ID {key_id} again, which this host had before");
+            Failure::new(FailureKind::Repeated, text)
+        });
+        match failure {
+            Some(failure) if unused.is_empty() || purpose != Purpose::Messages => {
+                (Err(failure.clone()), Some(failure))
+            }
+            failure => (Ok(Fetched::Keys(unused)), failure),
+        }
+    }
+
+    pub(super) fn statistics(&self) -> Statistics {
+        self.recorder.statistics()
+    }
 }
 
 async fn call(client: &Client, request: &Request) -> Result<Fetched, Failure> {
@@ -74,7 +144,9 @@ fn keys(container: KeyContainer) -> Result<Fetched, Failure> {
 fn failure(e: &Error) -> Failure {
     let kind = match e {
         Error::KeyPossiblyConsumed { .. } | Error::Interrupted { .. } => FailureKind::Ambiguous,
-        Error::Unreachable { .. } => FailureKind::Unreachable,
+        Error::Unreachable { .. } | Error::Timeout { phase: "connect", .. } => {
+            FailureKind::Unreachable
+        }
         Error::Timeout { .. } | Error::Unavailable { .. } => FailureKind::Unavailable,
         Error::Unauthorized { .. } | Error::Tls { .. } => FailureKind::Unauthorized,
         Error::BadRequest { .. } => FailureKind::Refused,
@@ -86,14 +158,4 @@ fn failure(e: &Error) -> Failure {
         _ => None,
     };
     Failure { kind, text: e.to_string(), retry_after }
-}
-
-/// The call was dropped in the middle: whether it reached the KME is not known.
-fn timed_out(request: &Request, limit: Duration) -> Failure {
-    let (kind, call) = match request {
-        Request::Enc { .. } => (FailureKind::Ambiguous, "enc_keys"),
-        Request::Dec { .. } => (FailureKind::Ambiguous, "dec_keys"),
-        Request::Status { .. } => (FailureKind::Unavailable, "status"),
-    };
-    Failure::new(kind, format!("{call}: no answer from the KME within {limit:?}"))
 }

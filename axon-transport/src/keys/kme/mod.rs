@@ -5,6 +5,7 @@
 //! their own limits, so that a hungry supply cannot keep a link from being made.
 
 mod calls;
+mod outage;
 mod statistics;
 
 use std::{
@@ -19,12 +20,15 @@ use tokio::{
     task::JoinSet,
 };
 
-use super::request::{Answer, Failure, FailureKind, Fetched, Purpose, Request, Stock};
+use super::{
+    request::{Answer, Failure, FailureKind, Fetched, Purpose, Request, Stock},
+    used::UsedKeys,
+};
 use crate::{config::QkdConfig, secrets};
 
 pub use statistics::{CallStatistics, Statistics};
 
-use statistics::Recorder;
+use calls::Caller;
 
 /// Requests that wait, for links and for messages each.
 const QUEUE: usize = 256;
@@ -32,10 +36,6 @@ const QUEUE: usize = 256;
 const LINK_CALLS: usize = 32;
 /// Calls in flight for messages.
 const MESSAGE_CALLS: usize = 16;
-/// How long a `status` may take.
-const STATUS_TIMEOUT: Duration = Duration::from_secs(5);
-/// TCP and TLS.
-const CONNECT_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Who asked, and so who gets the answer. The numbers are the caller's own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -92,10 +92,9 @@ pub enum KmeError {
 pub struct Kme(Arc<Shared>);
 
 struct Shared {
-    client: Client,
+    caller: Arc<Caller>,
     links: mpsc::Sender<Job>,
     messages: mpsc::Sender<Job>,
-    recorder: Arc<Recorder>,
 }
 
 /// Gives the answers.
@@ -116,28 +115,27 @@ impl Kme {
         client(config).map(drop)
     }
 
-    /// Starts taking requests, on the current tokio runtime.
+    /// Starts taking requests, on the current tokio runtime. Keys that are in `used` already are
+    /// not given out.
     ///
     /// # Errors
     /// As [`check`](Self::check).
     ///
     /// # Panics
     /// Outside a tokio runtime.
-    pub fn start(config: &QkdConfig) -> Result<(Self, Events), KmeError> {
-        let client = client(config)?;
+    pub fn start(config: &QkdConfig, used: UsedKeys) -> Result<(Self, Events), KmeError> {
         if let Err(error) = secrets::prepare() {
             tracing::warn!(%error, "there is no memory for keys yet");
         }
-        let recorder = Arc::new(Recorder::default());
+        let caller = Arc::new(Caller::new(client(config)?, config, used));
         let (events, receiver) = mpsc::channel(QUEUE);
         let serve = |limit: usize| {
             let (sender, jobs) = mpsc::channel(QUEUE);
-            let (client, recorder) = (client.clone(), Arc::clone(&recorder));
-            tokio::spawn(serve(client, recorder, limit, jobs, events.clone()));
+            tokio::spawn(serve(Arc::clone(&caller), limit, jobs, events.clone()));
             sender
         };
         let (links, messages) = (serve(LINK_CALLS), serve(MESSAGE_CALLS));
-        Ok((Self(Arc::new(Shared { client, links, messages, recorder })), Events(receiver)))
+        Ok((Self(Arc::new(Shared { caller, links, messages })), Events(receiver)))
     }
 
     /// Queues a request; its answer comes out of [`Events`]. Never blocks.
@@ -165,7 +163,7 @@ impl Kme {
     /// Why not.
     pub async fn probe(&self, slave: &str) -> Result<Stock, Failure> {
         let request = Request::Status { slave: slave.to_owned() };
-        match calls::run(&self.0.client, &self.0.recorder, &request).await? {
+        match self.0.caller.run(&request).await? {
             Fetched::Stock(stock) => Ok(stock),
             Fetched::Keys(_) => {
                 Err(Failure::new(FailureKind::Invalid, "status answered with keys"))
@@ -175,7 +173,7 @@ impl Kme {
 
     /// What was asked and given since the start.
     pub fn statistics(&self) -> Statistics {
-        self.0.recorder.statistics()
+        self.0.caller.statistics()
     }
 }
 
@@ -188,8 +186,7 @@ impl Events {
 
 /// Runs the jobs of one queue, `limit` at a time, and answers each.
 async fn serve(
-    client: Client,
-    recorder: Arc<Recorder>,
+    caller: Arc<Caller>,
     limit: usize,
     mut jobs: mpsc::Receiver<Job>,
     events: mpsc::Sender<Event>,
@@ -205,9 +202,11 @@ async fn serve(
         let (Ok(permit), Some(job)) = (permit, next(&mut jobs, &mut running, &events).await) else {
             break;
         };
-        let (client, recorder, events) = (client.clone(), Arc::clone(&recorder), events.clone());
+        let (caller, events) = (Arc::clone(&caller), events.clone());
         running.spawn(async move {
-            let outcome = calls::run(&client, &recorder, &job.request).await;
+            let outcome = caller.run(&job.request).await;
+            // Who hears of the last answer may start the next client, on the same files.
+            drop(caller);
             drop(permit);
             let took = job.since.elapsed();
             let answer = Answer { request: job.request, took, outcome };
@@ -215,6 +214,7 @@ async fn serve(
             let _ = events.send(Event { origin: job.origin, answer }).await;
         });
     }
+    drop(caller);
     while running.join_next().await.is_some() {}
 }
 
@@ -240,7 +240,8 @@ fn client(config: &QkdConfig) -> Result<Client, KmeError> {
         .ca(read("AXON_KME_CA", &config.kme_ca)?)
         .sae_cert(read("AXON_SAE_CERT", &config.sae_cert)?)
         .sae_key(zeroize::Zeroizing::new(read("AXON_SAE_KEY", &config.sae_key)?))
-        .connect_timeout(CONNECT_TIMEOUT)
+        .connect_timeout(config.kme_connect_timeout)
+        .timeout(config.kme_answer_timeout)
         // The machines repeat what may be repeated, and know when.
         .retry(RetryPolicy::none())
         .quirks(quirks.map_err(setting)?);

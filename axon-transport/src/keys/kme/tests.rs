@@ -9,7 +9,10 @@ use etsi_qkd014::sim::{Fault, Network};
 use super::{Kme, KmeError, Origin};
 use crate::{
     config::{KeyMode, QkdConfig, QkdPeers},
-    keys::request::{FailureKind, Fetched, Purpose, Request},
+    keys::{
+        UsedKeys,
+        request::{FailureKind, Fetched, Purpose, Request},
+    },
 };
 
 async fn network() -> Network {
@@ -35,11 +38,13 @@ fn config(network: &Network, sae: &str, dir: &Path) -> QkdConfig {
         sae_cert: env["AXON_SAE_CERT"].clone().into(),
         sae_key: env["AXON_SAE_KEY"].clone().into(),
         kme_quirks: Vec::new(),
+        kme_connect_timeout: Duration::from_secs(2),
+        kme_answer_timeout: LONG,
     }
 }
 
-fn enc(number: u32, timeout: Duration) -> Request {
-    Request::Enc { slave: "sae-b".to_owned(), number, purpose: Purpose::Messages, timeout }
+fn enc(number: u32) -> Request {
+    Request::Enc { slave: "sae-b".to_owned(), number, purpose: Purpose::Messages }
 }
 
 const LONG: Duration = Duration::from_secs(30);
@@ -76,11 +81,13 @@ async fn start_up_names_the_variable_that_is_wrong() {
 async fn keys_reach_both_sides_and_are_counted() {
     let network = network().await;
     let dir = tempfile::tempdir().unwrap();
-    let (a, mut a_events) = Kme::start(&config(&network, "sae-a", dir.path())).unwrap();
-    let (b, mut b_events) = Kme::start(&config(&network, "sae-b", dir.path())).unwrap();
+    let (a, mut a_events) =
+        Kme::start(&config(&network, "sae-a", dir.path()), UsedKeys::in_memory()).unwrap();
+    let (b, mut b_events) =
+        Kme::start(&config(&network, "sae-b", dir.path()), UsedKeys::in_memory()).unwrap();
     assert!(a.probe("sae-b").await.is_ok());
 
-    a.submit(Origin::Sender(7), enc(3, LONG)).unwrap();
+    a.submit(Origin::Sender(7), enc(3)).unwrap();
     let event = a_events.recv().await.unwrap();
     assert_eq!(event.origin, Origin::Sender(7));
     let Ok(Fetched::Keys(masters)) = event.answer.outcome else { panic!() };
@@ -88,7 +95,7 @@ async fn keys_reach_both_sides_and_are_counted() {
 
     let key_ids: Vec<KeyId> = masters.iter().map(|(id, _)| id.clone()).collect();
     let (master, purpose) = ("sae-a".to_owned(), Purpose::Accept);
-    let dec = Request::Dec { master, key_ids, purpose, timeout: LONG };
+    let dec = Request::Dec { master, key_ids, purpose };
     b.submit(Origin::Acceptor, dec.clone()).unwrap();
     let event = b_events.recv().await.unwrap();
     assert_eq!(event.origin, Origin::Acceptor);
@@ -99,8 +106,8 @@ async fn keys_reach_both_sides_and_are_counted() {
     }
 
     let unknown = KeyId::new("00000000-0000-4000-8000-000000000000").unwrap();
-    let Request::Dec { master, purpose, timeout, .. } = dec else { unreachable!() };
-    let dec = Request::Dec { master, key_ids: vec![unknown], purpose, timeout };
+    let Request::Dec { master, purpose, .. } = dec else { unreachable!() };
+    let dec = Request::Dec { master, key_ids: vec![unknown], purpose };
     b.submit(Origin::Acceptor, dec).unwrap();
     let failure = b_events.recv().await.unwrap().answer.outcome.expect_err("no such key");
     assert_eq!(failure.kind, FailureKind::Refused, "{failure}");
@@ -116,7 +123,7 @@ async fn failures_say_whether_keys_may_be_lost() {
     let network = network().await;
     let dir = tempfile::tempdir().unwrap();
     let settings = config(&network, "sae-a", dir.path());
-    let (kme, mut events) = Kme::start(&settings).unwrap();
+    let (kme, mut events) = Kme::start(&settings, UsedKeys::in_memory()).unwrap();
     let sim = network.kme("kme-a").unwrap();
     for (fault, kind) in [
         (Fault::Empty, FailureKind::Unavailable),
@@ -127,7 +134,7 @@ async fn failures_say_whether_keys_may_be_lost() {
     ] {
         let name = format!("{fault:?}");
         sim.inject(fault, 1);
-        kme.submit(Origin::Sender(0), enc(2, LONG)).unwrap();
+        kme.submit(Origin::Sender(0), enc(2)).unwrap();
         let failure = events.recv().await.unwrap().answer.outcome.expect_err("a fault");
         assert_eq!(failure.kind, kind, "{name}: {failure}");
         assert_eq!(kme.statistics().last_failure, Some(failure.text));
@@ -135,19 +142,22 @@ async fn failures_say_whether_keys_may_be_lost() {
     assert_eq!(kme.statistics().keys_possibly_lost, 8);
 
     sim.inject(Fault::Busy(7), 1);
-    kme.submit(Origin::Sender(0), enc(2, LONG)).unwrap();
+    kme.submit(Origin::Sender(0), enc(2)).unwrap();
     let failure = events.recv().await.unwrap().answer.outcome.expect_err("busy");
     assert_eq!(failure.kind, FailureKind::Unavailable, "{failure}");
     assert_eq!(failure.retry_after, Some(Duration::from_secs(7)));
 
     sim.inject(Fault::Silence, 1);
-    kme.submit(Origin::Sender(0), enc(2, Duration::from_millis(50))).unwrap();
+    let mut hurried = settings.clone();
+    hurried.kme_answer_timeout = Duration::from_secs(1);
+    let (kme, mut events) = Kme::start(&hurried, UsedKeys::in_memory()).unwrap();
+    kme.submit(Origin::Sender(0), enc(2)).unwrap();
     let failure = events.recv().await.unwrap().answer.outcome.expect_err("too slow");
     assert_eq!(failure.kind, FailureKind::Ambiguous, "{failure}");
 
     let mut gone = settings.clone();
     gone.kme_url = "https://127.0.0.1:1".to_owned();
-    let (gone, _events) = Kme::start(&gone).unwrap();
+    let (gone, _events) = Kme::start(&gone, UsedKeys::in_memory()).unwrap();
     let failure = gone.probe("sae-b").await.unwrap_err();
     assert_eq!(failure.kind, FailureKind::Unreachable, "{failure}");
 }
@@ -156,15 +166,16 @@ async fn failures_say_whether_keys_may_be_lost() {
 async fn a_stuck_kme_holds_no_more_than_its_bounds_and_links_go_first() {
     let network = network().await;
     let dir = tempfile::tempdir().unwrap();
-    let (kme, mut events) = Kme::start(&config(&network, "sae-a", dir.path())).unwrap();
+    let (kme, mut events) =
+        Kme::start(&config(&network, "sae-a", dir.path()), UsedKeys::in_memory()).unwrap();
     network.kme("kme-a").unwrap().inject(Fault::Silence, 16);
     let mut taken = 0;
-    while kme.submit(Origin::Sender(0), enc(1, LONG)).is_ok() {
+    while kme.submit(Origin::Sender(0), enc(1)).is_ok() {
         taken += 1;
         tokio::task::yield_now().await;
         assert!(taken <= 2000, "unbounded");
     }
-    let refused = kme.submit(Origin::Sender(4), enc(1, LONG)).unwrap_err();
+    let refused = kme.submit(Origin::Sender(4), enc(1)).unwrap_err();
     assert_eq!(refused.origin, Origin::Sender(4));
     assert_eq!(refused.answer.outcome.err().unwrap().kind, FailureKind::Busy);
 
@@ -173,7 +184,7 @@ async fn a_stuck_kme_holds_no_more_than_its_bounds_and_links_go_first() {
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
     let (slave, purpose) = ("sae-b".to_owned(), Purpose::Bootstrap);
-    let bootstrap = Request::Enc { slave, number: 1, purpose, timeout: LONG };
+    let bootstrap = Request::Enc { slave, number: 1, purpose };
     kme.submit(Origin::Dialler, bootstrap).unwrap();
     let event = events.recv().await.unwrap();
     assert_eq!(event.origin, Origin::Dialler);
@@ -184,9 +195,40 @@ async fn a_stuck_kme_holds_no_more_than_its_bounds_and_links_go_first() {
 async fn events_end_when_the_last_handle_is_dropped() {
     let network = network().await;
     let dir = tempfile::tempdir().unwrap();
-    let (kme, mut events) = Kme::start(&config(&network, "sae-a", dir.path())).unwrap();
-    kme.submit(Origin::Dialler, enc(1, LONG)).unwrap();
+    let (kme, mut events) =
+        Kme::start(&config(&network, "sae-a", dir.path()), UsedKeys::in_memory()).unwrap();
+    kme.submit(Origin::Dialler, enc(1)).unwrap();
     drop(kme);
     assert!(events.recv().await.is_some(), "what was asked is answered");
     assert!(events.recv().await.is_none());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn keys_that_come_again_after_a_restart_are_not_given_out() {
+    let network = network().await;
+    let dir = tempfile::tempdir().unwrap();
+    let settings = config(&network, "sae-a", dir.path());
+    let start = || Kme::start(&settings, UsedKeys::open(Some(dir.path()), 0)).unwrap();
+    network.note_state();
+    let draw = async |number| {
+        let (kme, mut events) = start();
+        kme.submit(Origin::Sender(0), enc(number)).unwrap();
+        let outcome = events.recv().await.unwrap().answer.outcome;
+        // The file is let go with the last of it.
+        drop(kme);
+        assert!(events.recv().await.is_none());
+        match outcome {
+            Ok(Fetched::Keys(keys)) => Ok(keys.into_iter().map(|(id, _)| id).collect::<Vec<_>>()),
+            Ok(other) => panic!("{other:?}"),
+            Err(failure) => Err(failure),
+        }
+    };
+    let first = draw(3).await.unwrap();
+    network.set_back();
+    let failure = draw(2).await.unwrap_err();
+    assert_eq!(failure.kind, FailureKind::Repeated);
+    assert!(failure.text.contains(&first[1].to_string()), "{failure}");
+    let rest = draw(4).await.unwrap();
+    assert_eq!(rest.len(), 3, "one is left of those before");
+    assert!(!rest.iter().any(|key_id| first.contains(key_id)));
 }

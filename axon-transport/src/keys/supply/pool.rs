@@ -15,16 +15,18 @@ use crate::keys::{
 const PER_CALL: u32 = 8;
 /// Calls for keys in flight.
 const IN_FLIGHT: usize = 4;
-/// How long a call may take.
-const TIMEOUT: Duration = Duration::from_secs(10);
-
-/// Pause after a key that the peer could not use, first and longest. Doubles with every
-/// [`REFUSALS`] of them that no READY makes up for: each costs a key that is gone for good.
+/// Pause after keys that the peer could not use, first and longest: each is gone for good. It
+/// doubles with each round that no READY makes up for. A round is all keys that were announced
+/// before the first of them was refused, since they fail for the same cause.
 const REFUSED: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(30));
-/// See [`REFUSED`].
-const REFUSALS: u32 = 4;
-/// Refusals that are remembered, so that a peer that is well again is served again soon.
-const REFUSALS_MAX: u32 = 40;
+/// READYs that make up for one round.
+const MAKE_UP: u32 = 4;
+/// Rounds that are remembered, so that a peer that is well again is served again soon.
+const ROUNDS_MAX: u32 = 10;
+/// Rounds in a row after which no more than [`FEW`] keys are had ahead, until one is READY.
+const ROUNDS_OF_MANY: u32 = 2;
+/// See [`ROUNDS_OF_MANY`].
+const FEW: usize = 4;
 
 /// A key that no connection knows of.
 pub(super) struct Fresh {
@@ -41,8 +43,12 @@ pub(super) struct Pool {
     core: Core<Fresh>,
     /// Key_IDs of this direction, so that a KME that repeats itself has no key used twice.
     seen: Ledger,
-    /// Keys that the peer refused, less those that it readied.
-    refusals: u32,
+    /// Rounds of refused keys that no READY made up for.
+    rounds: u32,
+    /// When the last round was refused.
+    refused: Option<Duration>,
+    /// READYs since a round was made up for.
+    readied: u32,
 }
 
 impl Pool {
@@ -53,12 +59,14 @@ impl Pool {
         settings.calls = IN_FLIGHT;
         // A key ages from its first use on, and that is the sender's to watch.
         settings.max_age = Duration::MAX;
-        Self { core: Core::new(settings, jitter), seen: Ledger::default(), refusals: 0 }
+        let (core, seen) = (Core::new(settings, jitter), Ledger::default());
+        Self { core, seen, rounds: 0, refused: None, readied: 0 }
     }
 
     /// `ahead` keys are to be on their way or ready, where `elsewhere` of them are the sender's.
     pub(super) fn plan(&mut self, ahead: usize, elsewhere: usize) {
-        self.core.set_target(ahead);
+        let few = self.rounds >= ROUNDS_OF_MANY;
+        self.core.set_target(if few { ahead.min(FEW) } else { ahead });
         self.core.set_elsewhere(elsewhere);
     }
 
@@ -73,9 +81,7 @@ impl Pool {
         let slave = peer.to_owned();
         Some(match ask {
             Ask::Status => Request::Status { slave },
-            Ask::Keys(number) => {
-                Request::Enc { slave, number, purpose: Purpose::Messages, timeout: TIMEOUT }
-            }
+            Ask::Keys(number) => Request::Enc { slave, number, purpose: Purpose::Messages },
         })
     }
 
@@ -161,16 +167,25 @@ impl Pool {
         self.core.put(Duration::ZERO, Fresh { key_id, key, asked: None, announced });
     }
 
-    /// The peer could not use a key, or did not answer for it.
-    pub(super) fn key_refused(&mut self, now: Duration) {
-        self.refusals = (self.refusals + 1).min(REFUSALS_MAX);
-        let pause = (REFUSED.0 * (1 << (self.refusals / REFUSALS))).min(REFUSED.1);
+    /// The peer could not use a key that was `announced` then, or did not answer for it.
+    pub(super) fn key_refused(&mut self, now: Duration, announced: Duration) {
+        if self.refused.is_some_and(|at| announced <= at) {
+            return;
+        }
+        self.refused = Some(now);
+        self.readied = 0;
+        self.rounds = (self.rounds + 1).min(ROUNDS_MAX);
+        let pause = (REFUSED.0 * (1 << (self.rounds - 1))).min(REFUSED.1);
         self.core.hold_until(now.saturating_add(pause));
     }
 
     /// The peer readied a key.
     pub(super) fn key_ready(&mut self) {
-        self.refusals = self.refusals.saturating_sub(1);
+        self.readied += 1;
+        if self.readied >= MAKE_UP {
+            self.readied = 0;
+            self.rounds = self.rounds.saturating_sub(1);
+        }
     }
 
     /// How it stands.
@@ -182,7 +197,7 @@ impl Pool {
 /// What a failed call cost.
 fn class(kind: FailureKind) -> FailureClass {
     match kind {
-        FailureKind::Ambiguous => FailureClass::KeysLost,
+        FailureKind::Ambiguous | FailureKind::Repeated => FailureClass::KeysLost,
         FailureKind::Unavailable | FailureKind::Refused => FailureClass::Refused,
         FailureKind::Unreachable
         | FailureKind::Unauthorized

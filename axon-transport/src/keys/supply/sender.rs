@@ -288,8 +288,8 @@ impl Sender {
                 Ok(())
             }
             KeyMessage::Failed { key_id, reason } => {
-                if self.announced.remove(key_id).is_some() {
-                    self.pool.key_refused(now);
+                if let Some(refused) = self.announced.remove(key_id) {
+                    self.pool.key_refused(now, refused.since);
                     self.failed(format!("peer could not fetch key_ID {key_id}: {reason}"));
                 }
                 Ok(())
@@ -406,8 +406,9 @@ impl Sender {
 
     /// Erases an announced key that nothing will be sealed under, and has the peer erase its own.
     fn give_up(&mut self, now: Duration, key_id: &KeyId) {
-        self.announced.remove(key_id);
-        self.pool.key_refused(now);
+        if let Some(refused) = self.announced.remove(key_id) {
+            self.pool.key_refused(now, refused.since);
+        }
         let (used, reliable) = Default::default();
         self.tell(KeyMessage::Retire { key_id: key_id.clone(), used, reliable });
     }
@@ -437,7 +438,7 @@ impl Sender {
         {
             let since = announced.unwrap_or(now);
             if now.saturating_sub(since) >= ANSWER_WITHIN {
-                self.pool.key_refused(now);
+                self.pool.key_refused(now, since);
                 self.failed(format!("peer did not answer ANNOUNCE of key_ID {key_id}"));
                 continue;
             }

@@ -10,10 +10,8 @@ use crate::keys::{
     request::{Answer, Failure, FailureKind, Fetched, Purpose, Request},
 };
 
-/// How long the whole proof may take: the client's `dec_keys` has three tries of 2 s.
-const DEADLINE: Duration = Duration::from_secs(20);
-/// How long `enc_keys` may take.
-const TIMEOUT: Duration = Duration::from_secs(5);
+/// How long the whole proof may take at most: four calls of the longest that may be set.
+const DEADLINE: Duration = Duration::from_secs(60);
 /// Calls to `enc_keys`, where it is certain that those before cost no key.
 const TRIES: u32 = 3;
 /// Wait before such a call is made again.
@@ -116,12 +114,7 @@ impl ClientProof {
         }
         self.step = Step::Asked;
         self.tries -= 1;
-        Some(Request::Enc {
-            slave: self.client_sae.clone(),
-            number: 1,
-            purpose: Purpose::Proof,
-            timeout: TIMEOUT,
-        })
+        Some(Request::Enc { slave: self.client_sae.clone(), number: 1, purpose: Purpose::Proof })
     }
 
     /// The KME's answer to our request.

@@ -1,7 +1,7 @@
 use super::*;
 
 fn new() -> Dialler {
-    Dialler::new("sae-a", listed(&["sae-b", "sae-c"]), Cipher::default())
+    Dialler::new("sae-a", listed(&["sae-b", "sae-c"]), Cipher::default(), s(3))
 }
 
 /// A dialler that holds key `name` for sae-b since `now`.
@@ -32,7 +32,7 @@ fn no_kme_call_for_who_is_no_peer() {
     }
     assert!(dialler.poll_request(s(1)).is_none());
     // Not even under `*`.
-    let mut dialler = Dialler::new("sae-a", QkdPeers::Any, Cipher::default());
+    let mut dialler = Dialler::new("sae-a", QkdPeers::Any, Cipher::default(), s(3));
     let dial = dialler.dial(s(1), "sae-a");
     assert!(matches!(dial, Dial::Refused(DialRefusal::OwnSaeId(_))));
     assert!(dialler.poll_request(s(1)).is_none());
@@ -155,7 +155,7 @@ fn failed_calls_are_spaced_out_up_to_a_minute() {
 
 #[test]
 fn made_up_names_under_a_star_are_bounded() {
-    let mut dialler = Dialler::new("sae-a", QkdPeers::Any, Cipher::default());
+    let mut dialler = Dialler::new("sae-a", QkdPeers::Any, Cipher::default(), s(3));
     let mut asked = 0;
     for i in 0..2000 {
         dialler.dial(s(0), &format!("made-up-{i}"));

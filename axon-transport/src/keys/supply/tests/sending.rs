@@ -196,6 +196,54 @@ fn a_peer_that_refuses_every_key_burns_few() {
     assert!(pair.seal(Delivery::Reliable).is_ok(), "well again");
 }
 
+/// What a KME does that hangs: the keys that it was being asked for are lost.
+#[test]
+fn many_keys_that_are_refused_together_are_one_cause_to_wait() {
+    let mut pair = Pair::new();
+    for _ in 0..100 {
+        pair.run();
+        pair.sender.demand(pair.now, 100);
+        for _ in 0..10 {
+            let _ = pair.seal(Delivery::Reliable);
+        }
+        pair.now += ms(10);
+    }
+    while pair.seal(Delivery::Reliable).is_ok() {}
+    let mut refused = 0;
+    pair.draw();
+    while let Some((conn, message)) = pair.sender.poll_message(pair.now) {
+        let KeyMessage::Announce(key_ids) = message else { continue };
+        for key_id in key_ids {
+            refused += 1;
+            let failed = KeyMessage::Failed { key_id, reason: String::new() };
+            pair.sender.on_message(pair.now, conn, &failed).unwrap();
+        }
+    }
+    assert!(refused > 8, "{refused}");
+    assert!(pair.seal(Delivery::Reliable).is_err());
+    pair.now += ms(100);
+    pair.run();
+    assert!(pair.seal(Delivery::Reliable).is_ok());
+}
+
+#[test]
+fn a_peer_that_is_owed_many_keys_and_refuses_them_soon_gets_few() {
+    let mut pair = Pair::new();
+    for _ in 0..6_000 {
+        pair.sender.demand(pair.now, 1000);
+        pair.draw();
+        while let Some((conn, message)) = pair.sender.poll_message(pair.now) {
+            let KeyMessage::Announce(key_ids) = message else { continue };
+            for key_id in key_ids {
+                let ready = KeyMessage::Ready { key_id, proof: [1; 32] };
+                pair.sender.on_message(pair.now, conn, &ready).unwrap();
+            }
+        }
+        pair.now += ms(10);
+    }
+    assert!(pair.kmes.issued <= 2 * 256 + 40, "{} keys in a minute", pair.kmes.issued);
+}
+
 #[test]
 fn a_key_in_use_ends_after_an_hour() {
     let mut pair = Pair::new();

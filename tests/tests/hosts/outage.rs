@@ -1,0 +1,77 @@
+//! KMEs that fail for a while, and what log and status say of it.
+
+use axon_tests::Sizes;
+use etsi_qkd014::sim::{Fault, FaultPlan, Method};
+
+use super::{
+    mode::{Kmes, SAE},
+    pair::{Host, Plan},
+    process::until,
+};
+
+const SOME: u64 = 300;
+
+fn hosts(kmes: &Kmes, key_mode: &str) -> [Host; 2] {
+    let more = [("AXON_QKD_KEY_MODE", key_mode)];
+    Plan::new([0, 1].map(|host| kmes.settings(host, &more))).start()
+}
+
+/// Both hosts link, and neither has anything to say of it.
+fn starts_without_a_refusal(key_mode: &str) {
+    let kmes = Kmes::start();
+    let hosts = hosts(&kmes, key_mode);
+    let mut there = hosts[1].subscribe(Sizes::Small);
+    let mut publisher = hosts[0].publish(Sizes::Small, 1, Some(SOME));
+    there.wait_taken(publisher.wait_sent());
+    for host in &hosts {
+        host.link();
+        let status = host.status();
+        assert!(status.refusals.is_empty(), "{:?}", status.refusals);
+        assert_eq!(host.log_lines(&["WARN", "refused"]), 0);
+    }
+}
+
+#[test]
+fn in_session_an_honest_start_records_no_refusal() {
+    starts_without_a_refusal("session");
+}
+
+#[test]
+fn in_messages10_an_honest_start_records_no_refusal() {
+    starts_without_a_refusal("messages10");
+}
+
+/// The KME of host `failing` fails in one call until it works again.
+fn is_named_once(failing: usize, call: Method, name: &str) {
+    let kmes = Kmes::start();
+    let hosts = hosts(&kmes, "messages10");
+    let mut there = hosts[1].subscribe(Sizes::Small);
+    let mut publisher = hosts[0].publish(Sizes::Small, 1, None);
+    there.wait_taken(SOME);
+    let (url, [own, peer]) = (kmes.url(failing), [SAE[failing], SAE[1 - failing]]);
+    let fails = ["WARN", url.as_str(), name, own, peer, "fails", "503"];
+
+    kmes.plan(failing, FaultPlan::new(Fault::Empty).on(call));
+    hosts[failing].wait_log(&fails);
+    let failures = |host: &Host| host.status().keys["kme"][name]["failures"].as_u64().unwrap();
+    until("it fails again and again", || failures(&hosts[failing]) >= 5);
+    kmes.clear_faults();
+    hosts[failing].wait_log(&["INFO", &url, name, own, peer, "works again"]);
+    assert_eq!(hosts[failing].log_lines(&fails), 1, "said once");
+    assert_eq!(hosts[1 - failing].log_lines(&["WARN", "fails"]), 0, "and not by the other host");
+    let now = publisher.published();
+    there.wait_taken(now + SOME);
+    let sent = publisher.stop();
+    there.wait_taken(sent);
+    assert_eq!(there.tally().lost, 0);
+}
+
+#[test]
+fn a_kme_that_gives_no_new_keys_is_named_once() {
+    is_named_once(0, Method::EncKeys, "enc_keys");
+}
+
+#[test]
+fn a_kme_that_gives_no_keys_by_name_is_named_once() {
+    is_named_once(1, Method::DecKeys, "dec_keys");
+}
