@@ -162,5 +162,5 @@ fn names_that_no_kme_knows_cost_a_bounded_number_of_calls() {
     }
     assert!(calls <= 300 + 60 * 5 + 4, "{calls} in a minute");
     let next = pair.receiver.poll_timeout(pair.now).expect("calls go on");
-    assert!(next > pair.now && next <= pair.now + ms(1000));
+    assert!(next <= pair.now + ms(1000));
 }
