@@ -124,7 +124,9 @@ pub(crate) struct Demo {
 const PLAY_HELP: &str = "\
 Each topic is published under the name and type in the log, at the pace of the recording. With
 --qos keep-all, the default, a full reader that keeps all as well slows the replay and nothing is
-lost; the other profiles never wait.
+lost; the other profiles never wait. At the end it waits for other hosts to acknowledge what they got,
+prints how many messages are acknowledged, and fails where some are not: after 15 s in which no more
+were, or when a link or a daemon was lost with them.
 
 A log whose end is missing, or that fails a checksum, is refused; the error says how much of it is
 whole, and --incomplete publishes that.

@@ -23,6 +23,10 @@ use crate::{
 
 /// Messages read ahead of their time.
 const READ_AHEAD: usize = 64;
+/// Messages that other hosts do not acknowledge are waited for so long.
+const UNACKNOWLEDGED: Duration = Duration::from_secs(15);
+/// Between two looks at them.
+const LOOK: Duration = Duration::from_millis(10);
 
 impl Profile {
     /// The policies of the profile.
@@ -44,6 +48,8 @@ pub(crate) struct Sent {
     pub(crate) bytes: u64,
     /// How often a full reader made the publisher wait.
     pub(crate) waits: u64,
+    /// Messages that were published while their topic had fewer subscriptions than were waited for.
+    pub(crate) missed: u64,
 }
 
 /// Runs `axon play`.
@@ -69,26 +75,71 @@ pub(crate) fn run(args: &cli::Play) -> Result<(), Failure> {
     let bar = progress_bar(&survey);
     let mut total = Sent::default();
     loop {
-        let sent = replay(&survey, &publishers, args.rate, |sent| {
+        let sent = replay(&survey, &publishers, (args.rate, args.wait), |sent| {
             bar.set_position(sent.messages);
             Ok(true)
         })?;
         total.messages += sent.messages;
         total.bytes += sent.bytes;
         total.waits += sent.waits;
+        total.missed += sent.missed;
         if !args.repeat {
             break;
         }
     }
     bar.finish_and_clear();
+    let left = wait_acknowledged(&publishers, UNACKNOWLEDGED);
+    let given_up = publishers.iter().map(Publisher::given_up).sum::<u64>();
+    let Sent { messages, bytes, waits, missed } = total;
+    let acknowledged = messages.saturating_sub(left).saturating_sub(given_up);
     eprintln!(
-        "axon play: {} messages, {} in {}; waited {} times for a reader",
-        text::grouped(total.messages),
-        text::bytes(total.bytes),
+        "axon play: {} messages, {} in {}; {} acknowledged; waited {} times for a reader",
+        text::grouped(messages),
+        text::bytes(bytes),
         text::duration(started.elapsed().as_nanos() as u64),
-        text::grouped(total.waits),
+        text::grouped(acknowledged),
+        text::grouped(waits),
     );
-    Ok(())
+    unheard(left, given_up, missed)
+}
+
+/// Waits until other hosts have acknowledged what was published, for as long as that gets on; how many
+/// messages they have not.
+fn wait_acknowledged(publishers: &[Publisher], patience: Duration) -> u64 {
+    let left = || publishers.iter().map(Publisher::unacknowledged).sum::<u64>();
+    let (mut least, mut since) = (left(), Instant::now());
+    while least > 0 && since.elapsed() < patience {
+        thread::sleep(LOOK);
+        let now = left();
+        if now < least {
+            (least, since) = (now, Instant::now());
+        }
+    }
+    least
+}
+
+/// Why a replay is not known to have reached everybody, if so.
+fn unheard(left: u64, given_up: u64, missed: u64) -> Result<(), Failure> {
+    let mut why = Vec::new();
+    if left > 0 {
+        let seconds = UNACKNOWLEDGED.as_secs();
+        let left = text::grouped(left);
+        why.push(format!("{left} messages were not acknowledged, none of them for {seconds} s"));
+    }
+    if given_up > 0 {
+        let given_up = text::grouped(given_up);
+        why.push(format!("{given_up} messages were lost with a link or a daemon"));
+    }
+    // Where nothing broke, a subscription that left did so because it wanted no more.
+    if missed > 0 && given_up > 0 {
+        let missed = text::grouped(missed);
+        why.push(format!("{missed} messages found fewer subscriptions than --wait asks for"));
+    }
+    if why.is_empty() {
+        return Ok(());
+    }
+    let why = why.join("; ");
+    Err(Failure::failed(format_args!("{why}. `axon status` on both hosts shows links and losses")))
 }
 
 /// A publisher for each topic of the log.
@@ -117,11 +168,12 @@ pub(crate) fn wait_matched(
 }
 
 /// Publishes the log at `rate` times its pace, in the order of the file: a message that was
-/// recorded before the one in front of it goes at once. `progress` says whether to go on.
+/// recorded before the one in front of it goes at once. Messages of topics with fewer subscriptions than
+/// `readers` are counted. `progress` says whether to go on.
 pub(crate) fn replay(
     survey: &Survey,
     publishers: &[Publisher],
-    rate: f64,
+    (rate, readers): (f64, usize),
     mut progress: impl FnMut(Sent) -> std::io::Result<bool>,
 ) -> Result<Sent, Failure> {
     let mut sent = Sent::default();
@@ -143,6 +195,7 @@ pub(crate) fn replay(
                 return Ok(sent);
             }
         }
+        sent.missed += u64::from(publishers[message.topic].matched().len() < readers);
         sent.messages += 1;
         sent.bytes += message.data.len() as u64;
         if !progress(sent)? {
@@ -210,6 +263,21 @@ fn progress_bar(survey: &Survey) -> ProgressBar {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_replay_that_is_not_known_to_have_arrived_fails_and_says_why() {
+        assert!(unheard(0, 0, 0).is_ok() && unheard(0, 0, 7).is_ok());
+        for (counts, part) in [
+            ((1, 0, 0), "1 messages were not acknowledged"),
+            ((0, 2000, 0), "2,000 messages were lost"),
+            ((0, 1, 3), "3 messages found fewer"),
+        ] {
+            match unheard(counts.0, counts.1, counts.2) {
+                Err(Failure::Failed(text)) => assert!(text.contains(part), "{text}"),
+                other => panic!("{other:?}"),
+            }
+        }
+    }
 
     #[test]
     fn pace_is_kept_and_never_overflows() {

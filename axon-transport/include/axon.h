@@ -1202,9 +1202,9 @@ axon_ret_t axon_session_publisher_wait_matched(struct axon_publisher_t publisher
 
 /**
  * Blocks until every sample published so far is acknowledged, for at most `timeout` nanoseconds
- * (negative: for ever): AXON_RET_TIMEOUT where one is not. A sample that is to be read on this host is
- * so at once, and one for another host when this host's daemon has taken it over: the other host has
- * not said that it came.
+ * (negative: for ever): AXON_RET_TIMEOUT where one is not. A sample for this host is acknowledged at
+ * once, and a RELIABLE sample for another host when that host has it. AXON_RET_TIMEOUT comes at once, and
+ * once, when samples were given up since the last call: with a link, or with this host's daemon.
  */
 axon_ret_t axon_session_publisher_wait_acknowledged(struct axon_publisher_t publisher,
                                                     int64_t timeout);

@@ -211,6 +211,15 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
             kind: 0,
             subscribers: vec![link::Subscriber { gid, qos: Qos::default() }],
             last: vec![link::LastSeen { publisher: gid, sequence: 42 }],
+            acknowledges: Some(true),
+        }),
+        Message::Received(link::Received {
+            flows: vec![link::ReceivedOf { route: 1, publisher: gid, sequence: 43, dropped: 1 }],
+        }),
+        Message::RouteRefused(link::RouteRefused {
+            route: 1,
+            reason: "why".into(),
+            retry_s: Some(10),
         }),
         Message::Unsubscribe(link::Unsubscribe { route: 1 }),
         Message::RouteReady(link::RouteReady { route: 1, publishers: vec![gid] }),

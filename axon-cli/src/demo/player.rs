@@ -38,7 +38,7 @@ pub(crate) fn run(args: &cli::DemoPlayer) -> Result<(), Failure> {
 
     let stopped = end_of_stdin();
     let mut reported = Instant::now();
-    let sent = play::replay(&survey, &publishers, args.rate, |progress| {
+    let sent = play::replay(&survey, &publishers, (args.rate, 0), |progress| {
         if reported.elapsed() >= REPORT {
             reported = Instant::now();
             Event::Progress { messages: progress.messages }.say()?;

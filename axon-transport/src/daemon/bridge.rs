@@ -89,6 +89,18 @@ pub enum ToControl {
         /// Why.
         reason: String,
     },
+    /// Samples of a topic did not get to another host.
+    Lost {
+        /// The topic.
+        topic: String,
+        /// Why, as the status names it.
+        cause: &'static str,
+        /// How many.
+        samples: u64,
+    },
+    /// Whether samples of publishers that ended are on their way to other hosts: the daemon does not
+    /// end meanwhile.
+    Draining(bool),
     /// What is to be shown of the key supply.
     Keys(serde_json::Value),
 }

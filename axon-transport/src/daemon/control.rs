@@ -29,6 +29,8 @@ use crate::{
 
 /// Refusals that are remembered.
 const REFUSALS: usize = 32;
+/// Topics whose losses on the way to other hosts are remembered.
+const TOPICS_WITH_LOSSES: usize = 1024;
 
 pub(super) struct Control {
     pub(super) config: Arc<Config>,
@@ -39,6 +41,10 @@ pub(super) struct Control {
     pub(super) registry: Registry<Arc<PassedFd>>,
     pub(super) links: BTreeMap<String, LinkStatus>,
     pub(super) refusals: VecDeque<RefusalStatus>,
+    /// Samples that did not get to other hosts, by topic and cause.
+    pub(super) lost: BTreeMap<String, BTreeMap<&'static str, u64>>,
+    /// Whether samples of publishers that ended are on their way to other hosts.
+    draining: bool,
     pub(super) keys: serde_json::Value,
     pub(super) port: Option<u16>,
     pub(super) gateway: String,
@@ -72,6 +78,8 @@ impl Control {
             registry: Registry::default(),
             links: BTreeMap::new(),
             refusals: VecDeque::new(),
+            lost: BTreeMap::new(),
+            draining: false,
             keys: serde_json::Value::Null,
             port: None,
             gateway: "off".into(),
@@ -133,8 +141,22 @@ impl Control {
                 .send_if_modified(|known| std::mem::replace(known, wanted.clone()) != wanted);
         }
         self.changed.notify_one();
-        if std::mem::replace(&mut self.needed, self.registry.is_needed()) != self.needed {
+        let needed = self.is_needed();
+        if std::mem::replace(&mut self.needed, needed) != needed {
             self.need.notify_one();
+        }
+    }
+
+    /// Whether there is an application, or something on its way to another host.
+    pub(super) fn is_needed(&self) -> bool {
+        self.draining || self.registry.is_needed()
+    }
+
+    /// Samples of a topic did not get to another host.
+    fn lost(&mut self, topic: String, cause: &'static str, samples: u64) {
+        if self.lost.len() < TOPICS_WITH_LOSSES || self.lost.contains_key(&topic) {
+            let count = self.lost.entry(topic).or_default().entry(cause).or_default();
+            *count = count.saturating_add(samples);
         }
     }
 
@@ -193,7 +215,11 @@ impl Control {
             }
             ToControl::Refusal { peer, what, reason } => self.refused(peer, what, reason),
             ToControl::Keys(keys) => self.keys = keys,
-            ToControl::DialFailed { .. } | ToControl::Datagram { .. } => {}
+            ToControl::Lost { topic, cause, samples } => self.lost(topic, cause, samples),
+            ToControl::Draining(draining) => self.draining = draining,
+            ToControl::LinkUp { .. }
+            | ToControl::DialFailed { .. }
+            | ToControl::Datagram { .. } => {}
         }
         self.settle();
     }
@@ -233,6 +259,7 @@ impl Control {
     pub(super) fn gateway_ended(&mut self, why: &str) {
         self.gateway = why.to_owned();
         self.port = None;
+        self.draining = false;
         self.links.clear();
         self.linked.clear();
         self.relist();

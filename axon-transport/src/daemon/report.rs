@@ -59,7 +59,7 @@ pub(super) fn status(control: &Control) -> Status {
         discovery: discovery(&control.wanted.borrow()),
         traffic: control.traffic,
         sessions: sessions.collect(),
-        topics: topics(&control.registry),
+        topics: topics(&control.registry, &control.lost),
         links: control.links.values().cloned().collect(),
         keys: control.keys.clone(),
         refusals: control.refusals.iter().cloned().collect(),

@@ -286,7 +286,7 @@ async fn unneeded(control: &Rc<RefCell<Control>>) {
     let grace = control.borrow().config.link.grace;
     let changed = control.borrow().need.clone();
     loop {
-        if control.borrow().registry.is_needed() {
+        if control.borrow().is_needed() {
             changed.notified().await;
         } else if tokio::time::timeout(grace, changed.notified()).await.is_err() {
             return;

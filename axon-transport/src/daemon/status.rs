@@ -149,7 +149,9 @@ pub struct TopicStatus {
     /// committed.
     pub bytes_committed: u64,
     /// Samples that were not delivered on this host, by why: `overwritten` before a reader took
-    /// them within its depth; `blocked`, `no_memory`, `pinned` as for [`WriterStatus`].
+    /// them within its depth; `blocked`, `no_memory`, `pinned` as for [`WriterStatus`]. And samples of
+    /// publishers here that another host did not acknowledge: `link_ended` when its link did,
+    /// `publisher_ended` ten seconds without progress after their publisher did.
     pub dropped: BTreeMap<String, u64>,
     /// The publishers on this host, stand-ins for remote ones among them: up to 64, those with the
     /// most memory first.

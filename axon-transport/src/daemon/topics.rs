@@ -37,7 +37,10 @@ type Sessions = Registry<Arc<PassedFd>>;
 type Session = SessionEntry<Arc<PassedFd>>;
 
 /// All topics with an endpoint somewhere.
-pub(super) fn topics(registry: &Sessions) -> Vec<TopicStatus> {
+pub(super) fn topics(
+    registry: &Sessions,
+    lost: &BTreeMap<String, BTreeMap<&'static str, u64>>,
+) -> Vec<TopicStatus> {
     let mut topics: BTreeMap<(String, String), TopicStatus> = BTreeMap::new();
     let mut rings = HashMap::new();
     for local in registry.endpoints().filter(|e| e.endpoint.kind != EndpointKind::Node) {
@@ -90,7 +93,18 @@ pub(super) fn topics(registry: &Sessions) -> Vec<TopicStatus> {
             });
         }
     }
-    topics.into_values().map(summed_up).collect()
+    let mut topics: Vec<_> = topics.into_values().map(summed_up).collect();
+    for (name, causes) in lost {
+        let known = topics.iter().position(|topic| topic.topic == *name);
+        let index = known.unwrap_or_else(|| {
+            topics.push(TopicStatus { topic: name.clone(), ..TopicStatus::default() });
+            topics.len() - 1
+        });
+        for (cause, samples) in causes {
+            add(topics[index].dropped.entry((*cause).to_owned()).or_default(), *samples);
+        }
+    }
+    topics
 }
 
 fn entry<'a>(

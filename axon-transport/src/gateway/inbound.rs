@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_envelope::Route;
+use axon_envelope::{Kind, Route};
 use quinn::{Connection, RecvStream, VarInt};
 use tokio::sync::{mpsc, watch};
 
@@ -16,6 +16,7 @@ use super::{
     intake::Intake,
     pieces::Pieces,
     pulse::Pulse,
+    receipts::Receipts,
     routes_in::RoutesIn,
     seal::{MAX_OVERHEAD, Protection, RefusedMessage, writer},
     stand_in::StandIn,
@@ -53,6 +54,8 @@ pub(super) struct Inbound {
     pub(super) wanted: watch::Receiver<()>,
     /// Memory for what comes.
     pub(super) intake: Arc<Intake>,
+    /// What the peer is told of it.
+    pub(super) receipts: Arc<Receipts>,
     /// Samples that could not be published here, for the log.
     pub(super) losses: Arc<Seldom>,
     /// What was refused, for the log and status.
@@ -105,7 +108,7 @@ impl Inbound {
         };
         let _feeding = feeding.lock().await;
         stream.take_many();
-        let from = From { number, route, gid };
+        let from = From { number, route, gid, reliable: kind == RELIABLE };
         let mut body = Vec::new();
         loop {
             match self.message(&mut stream, &mut body, from).await {
@@ -166,7 +169,7 @@ impl Inbound {
             source_timestamp: opened.header.source_timestamp,
         };
         match self.routes.writer(from.number, gid).await {
-            Some(stand_in) => self.publish(&stand_in, &from.gid, meta, &payload).await,
+            Some(stand_in) => self.take_in(&stand_in, from, meta, &payload).await,
             None => self.counters.dropped("no_route", 1),
         }
         drop(payload);
@@ -174,15 +177,37 @@ impl Inbound {
         Ok(true)
     }
 
+    /// Writes into the stand-in's ring, and has the peer told if it awaits that. What came over an
+    /// earlier link and was sent again is there already.
+    async fn take_in(&self, stand_in: &StandIn, from: From, meta: Meta, payload: &[u8]) {
+        let From { number, gid, reliable, route } = from;
+        let told = reliable && route.kind == Kind::Topic;
+        if told && stand_in.last_sequence() >= Some(meta.sequence) {
+            return self.receipts.came(number, gid, meta.sequence, payload.len());
+        }
+        let there = self.publish(stand_in, &gid, meta, payload).await;
+        match told {
+            true if there => self.receipts.came(number, gid, meta.sequence, payload.len()),
+            true => self.receipts.dropped(number, gid, meta.sequence),
+            false => {}
+        }
+    }
+
     /// Writes into the stand-in's ring; waits for a reader that keeps all, which in turn holds the peer's
     /// stream back: as long as the link stands, and beyond that for what had come when a successor took
-    /// over.
-    async fn publish(&self, stand_in: &StandIn, client: &Gid, meta: Meta, payload: &[u8]) {
+    /// over. Whether it is there.
+    async fn publish(&self, stand_in: &StandIn, client: &Gid, meta: Meta, payload: &[u8]) -> bool {
         let mut waiting = None;
         loop {
             match stand_in.try_write(client, meta, payload) {
-                Ok(Written::Yes) => return self.counters.arrived(payload.len()),
-                Ok(Written::Nobody) => return self.counters.dropped("no_client", 1),
+                Ok(Written::Yes) => {
+                    self.counters.arrived(payload.len());
+                    return true;
+                }
+                Ok(Written::Nobody) => {
+                    self.counters.dropped("no_client", 1);
+                    return false;
+                }
                 Err(PublishError::Blocked { .. }) if self.wanted.has_changed().is_ok() => {
                     // Tried once more with the first beat: there may have been room since.
                     let (beat, _) = waiting.get_or_insert_with(|| {
@@ -191,7 +216,10 @@ impl Inbound {
                     // The timeout only covers a link that ends meanwhile.
                     let _ = tokio::time::timeout(Duration::from_millis(100), beat.changed()).await;
                 }
-                Err(error) => return self.lost("ring", stand_in.gid(), &error),
+                Err(error) => {
+                    self.lost("ring", stand_in.gid(), &error);
+                    return false;
+                }
             }
         }
     }
@@ -212,6 +240,7 @@ struct From {
     route: Route,
     /// A publisher; of a service the client.
     gid: Gid,
+    reliable: bool,
 }
 
 fn parse_header(header: &[u8; STREAM_HEADER]) -> Result<(u8, u32, Gid), &'static str> {

@@ -29,6 +29,7 @@ mod played;
 mod prove;
 mod pulse;
 mod queue;
+mod receipts;
 mod refusal;
 mod room;
 mod routes;

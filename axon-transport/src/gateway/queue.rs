@@ -20,7 +20,7 @@ use crate::{
 const ONE: usize = 1;
 
 /// One sample on its way to a peer.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct Sample {
     /// Publisher, sequence number and timestamps.
     pub(super) info: MessageInfo,
@@ -51,8 +51,17 @@ pub(super) struct Queue {
     bytes: usize,
     room: Arc<Room>,
     policy: Policy,
+    /// RELIABLE samples that were taken and that the peer has not acknowledged, where it does so.
+    sent: Option<Sent>,
     /// Nobody takes from it any more.
     over: bool,
+}
+
+/// What was taken and is not acknowledged, in the order of its numbers.
+#[derive(Debug, Default)]
+struct Sent {
+    samples: VecDeque<Sample>,
+    bytes: usize,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -84,8 +93,10 @@ impl Sample {
 
 impl Queue {
     /// The queue for a relay with `qos`, in the room of a peer. One sample may always wait.
-    pub(super) fn new(qos: &Qos, room: Arc<Room>) -> Self {
-        Self { samples: VecDeque::new(), bytes: 0, room, policy: Policy::of(qos), over: false }
+    /// Where the peer `acknowledges`, a RELIABLE sample keeps its room until then.
+    pub(super) fn new(qos: &Qos, room: Arc<Room>, acknowledges: bool) -> Self {
+        let (samples, sent) = (VecDeque::new(), acknowledges.then(Sent::default));
+        Self { samples, bytes: 0, room, policy: Policy::of(qos), sent, over: false }
     }
 
     /// From now on it is for a relay with `qos`: one that asks for more, or less, has taken over. What
@@ -110,7 +121,7 @@ impl Queue {
 
     /// Whoever takes from it wants to end: it may, unless there is something in it.
     pub(super) fn end(&mut self) -> bool {
-        self.over = self.samples.is_empty();
+        self.over = self.samples.is_empty() && !self.has_sent();
         self.over
     }
 
@@ -165,16 +176,58 @@ impl Queue {
         Some(sample)
     }
 
-    /// The oldest samples, until they have `bytes` together or none is left; of BEST_EFFORT one.
+    /// The oldest samples, until they have `bytes` together or none is left; of BEST_EFFORT one. What
+    /// awaits its acknowledgement may take the room of one queue: then there are none.
     pub(super) fn pop_together(&mut self, bytes: usize, into: &mut VecDeque<Sample>) {
-        let bytes = if self.delivery() == Delivery::Reliable { bytes } else { ONE };
+        let reliable = self.delivery() == Delivery::Reliable;
+        let (bytes, most) = (if reliable { bytes } else { ONE }, self.room.of_queue());
         let mut together = 0;
-        while together < bytes
-            && let Some(sample) = self.pop()
-        {
-            together += sample.size();
-            into.push_back(sample);
+        while together < bytes {
+            if reliable && let Some(sent) = &mut self.sent {
+                let Some(size) = self.samples.front().map(Sample::size) else { return };
+                if !sent.samples.is_empty() && sent.bytes + size > most {
+                    return;
+                }
+                let Some(sample) = self.samples.pop_front() else { return };
+                into.push_back(sample.clone());
+                sent.samples.push_back(sample);
+                sent.bytes += size;
+                together += size;
+            } else {
+                let Some(sample) = self.pop() else { return };
+                together += sample.size();
+                into.push_back(sample);
+            }
         }
+    }
+
+    /// The peer has samples up to this number. How many of them were awaited, and the newest of these.
+    pub(super) fn acknowledge(&mut self, sequence: u64) -> (u64, Option<u64>) {
+        let (mut samples, mut newest) = (0, None);
+        while let Some(sent) = &mut self.sent
+            && sent.samples.front().is_some_and(|sample| sample.info.sequence <= sequence)
+            && let Some(sample) = sent.samples.pop_front()
+        {
+            let size = sample.size();
+            sent.bytes -= size;
+            self.bytes -= size;
+            self.give_back(size);
+            (samples, newest) = (samples + 1, Some(sample.info.sequence));
+        }
+        (samples, newest)
+    }
+
+    /// What is not acknowledged is to be sent again, first of all.
+    pub(super) fn rewind(&mut self) {
+        let Some(sent) = &mut self.sent else { return };
+        while let Some(sample) = sent.samples.pop_back() {
+            self.samples.push_front(sample);
+        }
+        sent.bytes = 0;
+    }
+
+    fn has_sent(&self) -> bool {
+        self.sent.as_ref().is_some_and(|sent| !sent.samples.is_empty())
     }
 }
 
@@ -211,7 +264,7 @@ mod tests {
 
     /// A queue with room for so many samples of so many bytes.
     fn queue(qos: &Qos, samples: usize, size: usize) -> Queue {
-        Queue::new(qos, room(samples, size).of_peer())
+        Queue::new(qos, room(samples, size).of_peer(), false)
     }
 
     fn offer(queue: &mut Queue, sequence: u64, size: usize) -> Result<u64, u64> {
@@ -278,18 +331,18 @@ mod tests {
         let peer = room(4, 20).of_peer();
         let [keeping, dropping] = [Qos::keep_all(), Qos::default()];
         // A quarter of 32 times as much as one has: that of eight.
-        let mut full: Vec<_> = (0..8).map(|_| Queue::new(&keeping, peer.clone())).collect();
+        let mut full: Vec<_> = (0..8).map(|_| Queue::new(&keeping, peer.clone(), false)).collect();
         for queue in &mut full {
             (1..=4).for_each(|sequence| assert_eq!(offer(queue, sequence, 20), Ok(0)));
         }
-        let mut waits = Queue::new(&keeping, peer.clone());
+        let mut waits = Queue::new(&keeping, peer.clone(), false);
         assert_eq!(offer(&mut waits, 1, 20), Ok(0), "one may always wait");
         assert_eq!(offer(&mut waits, 2, 20), Err(2));
-        let mut drops = Queue::new(&dropping, peer.clone());
+        let mut drops = Queue::new(&dropping, peer.clone(), false);
         assert_eq!(offer(&mut drops, 1, 20), Ok(0));
         assert_eq!(offer(&mut drops, 2, 20), Ok(1));
         // Best effort takes none of it.
-        let mut lossy = Queue::new(&Qos::sensor_data(), peer.clone());
+        let mut lossy = Queue::new(&Qos::sensor_data(), peer.clone(), false);
         (1..=4).for_each(|sequence| assert_eq!(offer(&mut lossy, sequence, 20), Ok(0)));
         full[0].pop().unwrap();
         drop(full.pop());
@@ -321,7 +374,7 @@ mod tests {
         for (qos, next) in
             [(Qos::sensor_data(), Qos::keep_all()), (Qos::keep_all(), Qos::sensor_data())]
         {
-            let mut queue = Queue::new(&qos, peer.clone());
+            let mut queue = Queue::new(&qos, peer.clone(), false);
             (1..=2).for_each(|sequence| assert_eq!(offer(&mut queue, sequence, 10), Ok(0)));
             queue.serve(&next);
             assert_eq!(peer.take(all), next.reliability == Reliability::BestEffort);
@@ -341,6 +394,43 @@ mod tests {
         assert!(!queue.end() && !queue.is_over());
         queue.pop().unwrap();
         assert!(queue.end() && queue.is_over());
+    }
+
+    fn taken(queue: &mut Queue) -> Vec<u64> {
+        let mut into = VecDeque::new();
+        queue.pop_together(1 << 20, &mut into);
+        into.iter().map(|sample| sample.info.sequence).collect()
+    }
+
+    #[test]
+    fn a_sample_keeps_its_room_until_it_is_acknowledged() {
+        let mut queue = Queue::new(&Qos::keep_all(), room(3, 10).of_peer(), true);
+        (1..=3).for_each(|sequence| assert_eq!(offer(&mut queue, sequence, 10), Ok(0)));
+        assert_eq!(taken(&mut queue), [1, 2, 3]);
+        // One may always wait, but is not taken.
+        assert_eq!((offer(&mut queue, 4, 10), offer(&mut queue, 5, 10)), (Ok(0), Err(5)));
+        assert!(taken(&mut queue).is_empty());
+        assert_eq!(queue.acknowledge(2), (2, Some(2)));
+        assert_eq!(queue.acknowledge(2), (0, None), "said again");
+        assert_eq!(taken(&mut queue), [4]);
+        assert!(!queue.end());
+        // A peer may claim what it likes.
+        assert_eq!(queue.acknowledge(u64::MAX), (2, Some(4)));
+        assert!(queue.end());
+        assert_eq!(queue.bytes, 0);
+    }
+
+    #[test]
+    fn what_is_not_acknowledged_is_sent_again_in_order() {
+        let peer = room(9, 10).of_peer();
+        let mut queue = Queue::new(&Qos::default(), peer.clone(), true);
+        (1..=3).for_each(|sequence| assert_eq!(offer(&mut queue, sequence, 10), Ok(0)));
+        assert_eq!(taken(&mut queue), [1, 2, 3]);
+        assert_eq!((queue.acknowledge(1), offer(&mut queue, 4, 10)), ((1, Some(1)), Ok(0)));
+        queue.rewind();
+        assert_eq!(taken(&mut queue), [2, 3, 4]);
+        drop(queue);
+        assert!(peer.take(8 * peer.of_queue()), "nothing is left of it");
     }
 
     #[test]

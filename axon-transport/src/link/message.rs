@@ -153,6 +153,9 @@ pub struct Subscribe {
     /// Where to resume.
     #[n(5)]
     pub last: Vec<LastSeen>,
+    /// Whether the asking side acknowledges the samples of a topic with RECEIVED.
+    #[n(6)]
+    pub acknowledges: Option<bool>,
 }
 
 /// Ends a route.
@@ -186,6 +189,49 @@ pub struct Asserted {
     pub publishers: Vec<Gid>,
 }
 
+/// How far the samples of publishers came: a message of one.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Received {
+    /// One element a publisher and route.
+    #[n(0)]
+    pub flows: Vec<ReceivedOf>,
+}
+
+/// How far the reliable samples of one publisher came over one route.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(array)]
+pub struct ReceivedOf {
+    /// The receiver's number for the route.
+    #[n(0)]
+    pub route: u32,
+    /// The publisher.
+    #[n(1)]
+    pub publisher: Gid,
+    /// Samples up to this number are in the ring from which subscriptions take.
+    #[n(2)]
+    pub sequence: u64,
+    /// But for so many, since it was said last, that the receiver had to drop.
+    #[n(3)]
+    pub dropped: u64,
+}
+
+/// A route is not served, though it was asked for.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct RouteRefused {
+    /// The asking side's number for the route.
+    #[n(0)]
+    pub route: u32,
+    /// Why, for people.
+    #[n(1)]
+    pub reason: String,
+    /// Seconds after which the route may be asked for again; absent: as long as nothing changes there
+    /// is no use.
+    #[n(2)]
+    pub retry_s: Option<u32>,
+}
+
 /// KEEPALIVE carries nothing.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
@@ -193,6 +239,7 @@ struct Nothing {}
 
 const MAX_HOST: usize = 255;
 const MAX_SAE: usize = 63;
+const MAX_REASON: usize = 1024;
 
 /// A control message.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -216,6 +263,10 @@ pub enum Message {
     Keepalive,
     /// These publishers, too.
     Asserted(Asserted),
+    /// So far samples came.
+    Received(Received),
+    /// This route is not served.
+    RouteRefused(RouteRefused),
     /// About keys.
     Keys(KeyMessage),
 }
@@ -233,6 +284,8 @@ impl Message {
             Self::RouteReady(m) => (7, to_map(m)),
             Self::Keepalive => (8, to_map(&Nothing {})),
             Self::Asserted(m) => (9, to_map(m)),
+            Self::Received(m) => (10, to_map(m)),
+            Self::RouteRefused(m) => (11, to_map(m)),
             Self::Keys(m) => {
                 let mut map = Vec::new();
                 m.encode(&mut map);
@@ -253,6 +306,8 @@ impl Message {
             7 => Self::RouteReady(from_map(kind, map)?),
             8 => from_map::<Nothing>(kind, map).map(|_| Self::Keepalive)?,
             9 => Self::Asserted(from_map(kind, map)?),
+            10 => Self::Received(from_map(kind, map)?),
+            11 => Self::RouteRefused(from_map(kind, map)?),
             16..=19 => Self::Keys(
                 KeyMessage::decode(kind, map)
                     .map_err(|e| FrameError::Malformed { kind, reason: e.to_string() })?,
@@ -285,6 +340,10 @@ impl Message {
             Self::Asserted(m) => {
                 ok(m.publishers.len() <= LIMITS.endpoints, "more publishers than there can be")
             }
+            Self::Received(m) => {
+                ok(m.flows.len() <= LIMITS.endpoints, "more publishers than there can be")
+            }
+            Self::RouteRefused(m) => ok(m.reason.len() <= MAX_REASON, "a reason is too long"),
             Self::Subscribe(m) => ok(
                 m.topic.len() <= LIMITS.name
                     && m.type_name.len() <= LIMITS.name

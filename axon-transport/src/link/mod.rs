@@ -15,8 +15,8 @@ pub use election::{Candidate, keep};
 pub use frame::{FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, read_length};
 pub use hello::{Mismatch, PROTOCOL, check};
 pub use message::{
-    Asserted, Elected, Graph, GraphResync, Hello, LastSeen, Message, RouteReady, Subscribe,
-    Subscriber, Unsubscribe,
+    Asserted, Elected, Graph, GraphResync, Hello, LastSeen, Message, Received, ReceivedOf,
+    RouteReady, RouteRefused, Subscribe, Subscriber, Unsubscribe,
 };
 pub use order::{Order, OutOfOrder, Side};
 

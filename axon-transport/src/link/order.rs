@@ -123,6 +123,8 @@ impl Message {
             Self::RouteReady(_) => "ROUTE_READY",
             Self::Keepalive => "KEEPALIVE",
             Self::Asserted(_) => "ASSERTED",
+            Self::Received(_) => "RECEIVED",
+            Self::RouteRefused(_) => "ROUTE_REFUSED",
             Self::Keys(m) => m.name(),
         }
     }

@@ -71,7 +71,12 @@ fn messages() -> Vec<Message> {
             kind: 0,
             subscribers: vec![Subscriber { gid: Gid([6; 16]), qos }],
             last: vec![LastSeen { publisher: Gid([7; 16]), sequence: 42 }],
+            acknowledges: Some(true),
         }),
+        Message::Received(Received {
+            flows: vec![ReceivedOf { route: 1, publisher: Gid([7; 16]), sequence: 43, dropped: 1 }],
+        }),
+        Message::RouteRefused(RouteRefused { route: 1, reason: "why".into(), retry_s: Some(10) }),
         Message::Unsubscribe(Unsubscribe { route: 1 }),
         Message::RouteReady(RouteReady { route: 1, publishers: vec![Gid([7; 16])] }),
         Message::Keepalive,
@@ -217,7 +222,7 @@ proptest! {
 
     #[test]
     fn no_damaged_frame_makes_the_decoder_panic(
-        which in 0usize..12, at in any::<prop::sample::Index>(), byte in any::<u8>()
+        which in 0usize..15, at in any::<prop::sample::Index>(), byte in any::<u8>()
     ) {
         let mut frame = messages()[which].to_frame().unwrap();
         let at = at.index(frame.len() - 4) + 4;

@@ -102,16 +102,30 @@ impl Publisher {
 
     /// Waits until every sample published so far is acknowledged; whether it is.
     ///
-    /// One that is to be read on this host is so at once, whether or not it has been taken. One for
-    /// another host is when this host's daemon has taken it over: it is sealed and sent from then on
-    /// whatever becomes of the publisher, but the other host has not said that it came. Where a link
-    /// breaks, what was on its way is lost, and the subscriptions there count it when a later sample of
-    /// this publisher comes: nothing else tells them of its last ones.
+    /// A sample for this host is acknowledged at once, whether or not it has been taken. A RELIABLE sample
+    /// for another host is acknowledged when that host has it in the ring from which its subscriptions
+    /// take, or has no subscription for it any more. A best-effort sample is acknowledged when it is sent
+    /// or dropped. A peer that runs a version of AXON which sends no acknowledgements counts as having a
+    /// sample when it was handed to the link.
+    ///
+    /// Returns false, once and at once, when samples were [given up](Self::given_up) since the last call:
+    /// their link broke, the peer stopped reading, or this host's daemon was killed.
     ///
     /// Where the session shares no memory (`AXON_SHM`), one for another process is when this host's daemon
     /// has taken it over, too. One that ends waits for that no longer than a second.
     pub fn wait_acknowledged(&self, timeout: Duration) -> bool {
         self.session.is_forked() || self.writer.wait_handed_over(timeout)
+    }
+
+    /// Samples for other hosts that are not acknowledged yet.
+    pub fn unacknowledged(&self) -> u64 {
+        self.writer.under_way()
+    }
+
+    /// Samples for other hosts that were never acknowledged, and will not be. Some of them may have
+    /// arrived.
+    pub fn given_up(&self) -> u64 {
+        self.writer.given_up()
     }
 
     /// One of its events; `None` where `kind` is a subscription's.

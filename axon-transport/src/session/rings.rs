@@ -98,6 +98,13 @@ impl Rings {
         }
     }
 
+    /// A relay gave up so many samples.
+    pub(super) fn give_up(&self, reader: Gid, samples: u64) {
+        if let Self::Shared(writer) = self {
+            writer.give_up(reader, samples);
+        }
+    }
+
     /// Forgets the readers whose process has ended, and names them.
     pub(super) fn drop_dead(&self) -> Vec<Gid> {
         match self {

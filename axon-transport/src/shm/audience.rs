@@ -30,6 +30,8 @@ pub(super) struct Audience {
     /// Their sessions, each once, shared with publishes that ring after they have unlocked.
     peers: Arc<[Peer]>,
     window: u64,
+    /// Samples that readers who stand for others gave up.
+    given_up: u64,
 }
 
 struct Attached {
@@ -38,6 +40,10 @@ struct Attached {
     tenancy: Tenancy,
     grant: Grant,
     dead: bool,
+    /// Of a relay: the furthest position that it was seen to be done with, and how many samples it said
+    /// that it gave up.
+    done: u64,
+    given_up: u64,
 }
 
 /// Positions from which on samples are wanted.
@@ -67,6 +73,16 @@ impl Attached {
         self.position().map(|cursor| cursor.max(self.grant.first).min(head))
     }
 
+    /// Of a relay: up to where it is done. One that has left is where it was seen last, until the daemon
+    /// says that it ended, or what it gave up.
+    fn done_with(&mut self, head: u64) -> u64 {
+        match self.position() {
+            Some(position) if position < u64::MAX => self.done = self.done.max(position),
+            _ => {}
+        }
+        self.done.min(head)
+    }
+
     /// The oldest position that it wants: KEEP_LAST passes over what is beyond its depth.
     fn floor(&self, head: u64) -> Option<u64> {
         let within = head.saturating_sub(depth(&self.info.qos));
@@ -84,6 +100,7 @@ impl Audience {
             seats: Seats::new(pool),
             peers: Arc::new([]),
             window: 0,
+            given_up: 0,
         };
         audience.changed();
         audience
@@ -165,9 +182,17 @@ impl Audience {
         let first = resumed.map_or(first, |resumed| resumed.clamp(tail, head).min(first));
         let tenancy = self.seats.admit(info.gid, &info.peer, info.lane, &lane)?;
         let grant = Grant { generation: tenancy.generation(), first };
-        self.detach(info.gid);
+        self.detach(info.gid, head);
         self.joined(&info);
-        self.readers.push(Attached { info, lane, tenancy, grant, dead: false });
+        self.readers.push(Attached {
+            info,
+            lane,
+            tenancy,
+            grant,
+            dead: false,
+            done: first,
+            given_up: 0,
+        });
         Ok(grant)
     }
 
@@ -190,8 +215,12 @@ impl Audience {
         self.seats
     }
 
-    pub(super) fn detach(&mut self, reader: Gid) -> bool {
+    pub(super) fn detach(&mut self, reader: Gid, head: u64) -> bool {
         let before = self.readers.len();
+        // A process that ended said nothing of what it leaves.
+        if self.readers.iter().any(|known| known.info.gid == reader && known.info.is_relay()) {
+            self.mark_dead(head);
+        }
         self.readers.retain(|known| known.info.gid != reader);
         let gone = self.readers.len() != before;
         // A session asks all of its publishers whenever an endpoint ends anywhere.
@@ -223,21 +252,41 @@ impl Audience {
         self.seats.sweep(|_| true);
     }
 
-    /// Stops counting on readers whose process has ended; [`Self::drop_dead`] names them.
-    pub(super) fn mark_dead(&mut self) {
-        for reader in &mut self.readers {
-            reader.dead |= reader.info.peer.is_dead();
+    /// Stops counting on readers whose process has ended; [`Self::drop_dead`] names them. What a relay
+    /// among them was not done with is given up.
+    pub(super) fn mark_dead(&mut self, head: u64) {
+        for reader in self.readers.iter_mut().filter(|reader| !reader.dead) {
+            reader.dead = reader.info.peer.is_dead();
+            if reader.dead && reader.info.is_relay() {
+                let left = head.saturating_sub(reader.done_with(head));
+                let left = left.saturating_sub(reader.given_up);
+                self.given_up = self.given_up.saturating_add(left);
+            }
         }
     }
 
-    pub(super) fn drop_dead(&mut self) -> Vec<Gid> {
-        self.mark_dead();
+    /// A reader that stands for others says that so many samples do not get there.
+    pub(super) fn give_up(&mut self, reader: Gid, samples: u64) {
+        let known = self.readers.iter_mut().find(|known| known.info.gid == reader);
+        if let Some(known) = known.filter(|known| !known.dead) {
+            known.given_up = known.given_up.saturating_add(samples);
+            self.given_up = self.given_up.saturating_add(samples);
+        }
+    }
+
+    /// Samples that readers who stand for others gave up.
+    pub(super) fn given_up(&self) -> u64 {
+        self.given_up
+    }
+
+    pub(super) fn drop_dead(&mut self, head: u64) -> Vec<Gid> {
+        self.mark_dead(head);
         self.drop_those(|reader| reader.dead)
     }
 
     /// Forgets those that have left, too, whether or not they keep samples.
-    pub(super) fn drop_gone(&mut self) -> Vec<Gid> {
-        self.mark_dead();
+    pub(super) fn drop_gone(&mut self, head: u64) -> Vec<Gid> {
+        self.mark_dead(head);
         // A reader's cursor is at the end of all positions once it takes no more.
         self.drop_those(|reader| reader.dead || matches!(reader.position(), None | Some(u64::MAX)))
     }
@@ -284,10 +333,11 @@ impl Audience {
         cursors.filter_map(|reader| reader.cursor(head)).min().unwrap_or(head)
     }
 
-    /// Below this every reader that stands for others, elsewhere, has taken what it wanted.
-    pub(super) fn handed_over(&self, head: u64) -> u64 {
-        let relays = self.readers.iter().filter(|reader| !reader.dead && reader.info.is_relay());
-        relays.filter_map(|reader| reader.cursor(head)).min().unwrap_or(head)
+    /// Below this every reader that stands for others, elsewhere, is done with what it wanted.
+    pub(super) fn handed_over(&mut self, head: u64) -> u64 {
+        let relays = self.readers.iter_mut();
+        let relays = relays.filter(|reader| !reader.dead && reader.info.is_relay());
+        relays.map(|reader| reader.done_with(head)).min().unwrap_or(head)
     }
 
     /// The sessions of those that do.

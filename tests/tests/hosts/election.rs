@@ -114,7 +114,15 @@ impl Elector {
     fn subscribe(&self, met: &mut Met, route: u32) {
         let subscribers = vec![Subscriber { gid: SUBSCRIPTION, qos: Qos::default() }];
         let (topic, type_name) = (TOPIC.into(), TYPE.into());
-        let subscribe = Subscribe { route, topic, type_name, kind: 0, subscribers, last: vec![] };
+        let subscribe = Subscribe {
+            route,
+            topic,
+            type_name,
+            kind: 0,
+            subscribers,
+            last: vec![],
+            acknowledges: None,
+        };
         self.stranger.say(met, &Message::Subscribe(subscribe));
     }
 

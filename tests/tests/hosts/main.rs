@@ -4,6 +4,7 @@
 mod delivery;
 mod disagree;
 mod election;
+mod ending;
 mod events;
 mod graph;
 mod hostile;

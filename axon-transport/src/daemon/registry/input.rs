@@ -11,8 +11,8 @@ use crate::{
     ids::{Gid, SessionId},
     relay,
     session::message::{
-        Announce, Attach, EndpointRole, Granted, Leaving, Message, Pair, Refused, SessionRole,
-        Unmatch,
+        Announce, Attach, EndpointRole, GivenUp, Granted, Leaving, Message, Pair, Refused,
+        SessionRole, Unmatch,
     },
     text,
 };
@@ -88,6 +88,7 @@ impl<F: Clone> Registry<F> {
             Message::Attach(attach) => self.attach(id, attach),
             Message::Grant(grant) => self.grant(id, grant),
             Message::Detach(pair) => self.detach(id, pair),
+            Message::GivenUp(given_up) => self.give_up(id, given_up),
             Message::Unmatch(unmatch) => self.fail(id, unmatch),
             Message::Resync => {
                 // Everything costs much more to tell than to ask for.
@@ -375,6 +376,22 @@ impl<F: Clone> Registry<F> {
         let Pair { reader, writer } = pair;
         let reason = "detached".to_owned();
         self.push(id, &Message::Unmatch(Unmatch { reader, writer, reason }), Vec::new());
+        Ok(())
+    }
+
+    /// A relay gave up samples of a publisher, whose session is told.
+    fn give_up(&mut self, id: &SessionId, given_up: GivenUp) -> Result<(), Violation> {
+        let GivenUp { reader, writer, .. } = given_up;
+        let relay = self.endpoints.get(&reader).filter(|e| e.role == EndpointRole::Relay);
+        if relay.is_some_and(|relay| relay.session != *id) {
+            return Err(Violation::NotItsOwn(reader));
+        }
+        let to = self.endpoints.get(&writer).map(|writer| writer.session);
+        if let (Some(to), true) =
+            (to, relay.is_some() && self.pairs.contains_key(&Pair { reader, writer }))
+        {
+            self.push(&to, &Message::GivenUp(given_up), Vec::new());
+        }
         Ok(())
     }
 

@@ -3,9 +3,12 @@
 use super::Hub;
 use crate::{
     daemon::bridge::ToControl,
-    gateway::{establish::close, peer::GraphChange},
+    gateway::{
+        establish::close,
+        peer::{GraphChange, Peer},
+    },
     graph::RemoteEndpoint,
-    ids::DaemonId,
+    ids::{DaemonId, Gid},
     link::CloseCode,
 };
 
@@ -21,8 +24,26 @@ impl Hub {
             .filter_map(|e| Some((e.endpoint.gid, ((*e.endpoint).clone(), e.reach.clone()?))))
             .collect();
         for peer in self.peers.values_mut() {
+            peer.keep_ending(&self.local);
             peer.send_graph(&self.local, false);
             peer.update(&self.local, &self.shared);
+        }
+        self.tell_draining().await;
+    }
+
+    /// Nothing is left of what a publisher here left for a peer.
+    pub(super) async fn drained(&mut self, daemon: DaemonId, publisher: Gid) {
+        if let Some(peer) = self.peers.get_mut(&daemon) {
+            peer.drained(&publisher, &self.local);
+        }
+        self.tell_draining().await;
+    }
+
+    /// The daemon does not end while something is on its way.
+    pub(super) async fn tell_draining(&mut self) {
+        let draining = self.peers.values().any(Peer::is_draining);
+        if std::mem::replace(&mut self.draining, draining) != draining {
+            self.tell(ToControl::Draining(draining)).await;
         }
     }
 

@@ -19,7 +19,7 @@ use crate::{
         endpoint::open_windows,
         establish::{Established, Sealing, close, peer_text},
         inbound::Inbound,
-        outbound::Carrier,
+        outbound::{Carrier, Owner},
         peer::{Peer, spawn_reader},
         refusal::{Refusal, RefusedBy},
         seal::Protection,
@@ -214,7 +214,8 @@ impl Hub {
                 false
             }
             None => {
-                let peer = Peer::new(daemon, number, outbox, carrier.clone(), &self.shared);
+                let owner = Owner { daemon, events: self.events.clone() };
+                let peer = Peer::new(daemon, number, outbox, carrier.clone(), &self.shared, owner);
                 self.peers.insert(daemon, peer);
                 true
             }
@@ -311,6 +312,7 @@ impl Hub {
         }
         self.peers.remove(&daemon);
         self.abandon_leaving(daemon);
+        self.tell_draining().await;
         tracing::info!(peer = %daemon, reason, "link down");
         if let Some(refusal) = refusal.filter(|r| r.by == RefusedBy::Peer) {
             let ordinary = ["GOODBYE", "DUPLICATE", "REPLACED"];

@@ -92,6 +92,17 @@ pub(super) enum Event {
     Expired(u64),
     /// Other keys or certificates may be trusted than before.
     Identity,
+    /// Nothing is left of what this publisher here left for this peer.
+    Drained(DaemonId, Gid),
+    /// Samples of a topic did not get to a peer.
+    Lost {
+        /// The topic.
+        topic: Arc<str>,
+        /// Why, as the status names it.
+        cause: &'static str,
+        /// How many.
+        samples: u64,
+    },
 }
 
 /// A connection between HELLO and its end.
@@ -141,6 +152,8 @@ pub(super) struct Hub {
     leaving: HashMap<u64, Leaving>,
     peers: HashMap<DaemonId, Peer>,
     local: Local,
+    /// Whether publishers ended of which something is on its way, as the control plane was told.
+    draining: bool,
 }
 
 impl Hub {
@@ -162,6 +175,7 @@ impl Hub {
             leaving: HashMap::new(),
             peers: HashMap::new(),
             local: BTreeMap::new(),
+            draining: false,
         }
     }
 
@@ -252,6 +266,10 @@ impl Hub {
             }
             Event::Renew(link) => self.renew(link),
             Event::Identity => self.close_untrusted(true).await,
+            Event::Drained(daemon, publisher) => self.drained(daemon, publisher).await,
+            Event::Lost { topic, cause, samples } => {
+                self.tell(ToControl::Lost { topic: topic.to_string(), cause, samples }).await;
+            }
             Event::Expired(link) => {
                 let text = "AXON_QKD_SESSION_MAX_AGE is reached and no successor came";
                 if let Some(l) = self.links.get(&link) {
@@ -323,6 +341,11 @@ impl Hub {
                 peer.hear_alive(&asserted);
                 Ok(())
             }
+            Message::Received(received) => {
+                peer.received(received);
+                Ok(())
+            }
+            Message::RouteRefused(_) => Ok(()),
             Message::RouteReady(ready) => {
                 tracing::debug!(peer = %daemon, route = ready.route,
                     publishers = ready.publishers.len(), "route ready");

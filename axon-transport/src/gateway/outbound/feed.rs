@@ -5,9 +5,9 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_envelope::{Kind, Route};
+use axon_envelope::Kind;
 
-use super::{Moved, Shared, Source, stream::Stream};
+use super::{Flow, Moved, Shared, Source, stream::Stream};
 use crate::{
     gateway::queue::{Offered, Sample},
     ids::Gid,
@@ -22,6 +22,9 @@ const BATCH: (usize, usize) = (64, 256 << 10);
 /// by so many nanoseconds a byte.
 const REST: (Duration, u64) = (Duration::from_millis(1), 2);
 
+/// So many bytes sent are progress.
+const PART: u64 = 256 << 10;
+
 pub(super) struct Feed {
     of: Gid,
     /// Of what its sources have, what was not queued and need be.
@@ -32,12 +35,21 @@ pub(super) struct Feed {
     rests: Option<Instant>,
     /// As long as there is something to be sent, and a while longer.
     stream: Option<Stream>,
+    /// Samples that the peer acknowledged.
+    acknowledged: u64,
 }
 
 impl Feed {
     /// The feed of a publisher or client.
     pub(super) fn new(of: Gid) -> Self {
-        Self { of, samples: Merge::default(), held: None, rests: None, stream: None }
+        Self {
+            of,
+            samples: Merge::default(),
+            held: None,
+            rests: None,
+            stream: None,
+            acknowledged: 0,
+        }
     }
 
     /// From now on it has these sources, and the peer has what was published up to `seen`.
@@ -57,10 +69,23 @@ impl Feed {
         self.holds() || self.stream.is_some()
     }
 
+    /// The peer has samples up to this number. The newest that was awaited.
+    pub(super) fn acknowledge(&mut self, sequence: u64) -> Option<u64> {
+        let (samples, newest) = self.stream.as_ref()?.acknowledge(sequence);
+        self.acknowledged += samples;
+        newest
+    }
+
+    /// What changes when it gets on: samples that were acknowledged, and large parts of one that were
+    /// sent.
+    pub(super) fn progress(&self) -> (u64, u64) {
+        (self.acknowledged, self.stream.as_ref().map_or(0, Stream::moved) / PART)
+    }
+
     /// Moves what its sources have to the queue.
     pub(super) fn turn(
         &mut self,
-        route: (u32, Route),
+        flow: Flow,
         sources: &[Source],
         shared: &Arc<Shared>,
         moved: &mut Moved,
@@ -77,13 +102,13 @@ impl Feed {
         let qos = first.map_or_else(Qos::keep_all, Source::qos);
         let (mut samples, mut bytes, mut dropped) = (0, 0, 0);
         while samples < BATCH.0 && bytes < BATCH.1 {
-            let Some(sample) = self.next(route.1.kind, sources) else {
+            let Some(sample) = self.next(flow.route.kind, sources) else {
                 moved.any |= self.samples.is_behind();
                 break;
             };
             samples += 1;
             bytes += sample.payload.len();
-            match self.queue(sample, &qos, route, shared) {
+            match self.queue(sample, &qos, flow, shared) {
                 Offered::Queued { dropped: older } => {
                     dropped += older;
                     moved.queued += 1;
@@ -126,13 +151,12 @@ impl Feed {
         &mut self,
         sample: Sample,
         qos: &Qos,
-        (number, route): (u32, Route),
+        flow: Flow,
         shared: &Arc<Shared>,
     ) -> Offered {
         self.stream.take_if(|stream| stream.is_over());
         let (of, start) = (self.of, || Arc::clone(shared));
-        let stream =
-            self.stream.get_or_insert_with(|| Stream::new(number, route, of, qos, start()));
+        let stream = self.stream.get_or_insert_with(|| Stream::new(flow, of, qos, start()));
         let offered = stream.offer(sample, qos);
         if let Offered::Queued { dropped } = offered {
             shared.counters.dropped("queue", dropped);

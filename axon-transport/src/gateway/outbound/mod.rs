@@ -5,6 +5,7 @@
 //! queues and then leaves its samples in the ring, where they hold back a KEEP_ALL publisher and
 //! nobody else.
 
+mod ending;
 mod feed;
 mod stream;
 #[cfg(test)]
@@ -13,7 +14,7 @@ mod tests;
 use std::{
     collections::{BTreeSet, HashMap},
     sync::{
-        Arc,
+        Arc, Mutex,
         atomic::{AtomicBool, Ordering},
     },
     time::Instant,
@@ -23,9 +24,11 @@ use axon_envelope::Route;
 use quinn::Connection;
 use tokio::sync::{Notify, mpsc, watch};
 
-use self::feed::Feed;
+use self::{ending::Endings, feed::Feed};
 use super::{
     counters::Counters,
+    hub::Event,
+    keyring::lock,
     pulse::Pulse,
     queue::Sample,
     room::Room,
@@ -33,12 +36,21 @@ use super::{
     seal::{Protection, sample},
     stand_in::StandIn,
 };
-use crate::{ids::Gid, qos::Qos, session::Subscription};
+use crate::{
+    ids::{DaemonId, Gid},
+    link::ReceivedOf,
+    qos::{Qos, Reliability},
+    session::Subscription,
+};
 
 /// A route that the peer asked for.
 pub(super) struct RouteOut {
+    /// The topic's name.
+    pub(super) topic: Arc<str>,
     /// Topic and kind, for the envelope.
     pub(super) route: Route,
+    /// Whether the peer acknowledges what comes over it.
+    pub(super) acknowledged: bool,
     /// Where its samples come from; relays in the order of [`super::routes::relays`].
     pub(super) sources: Vec<Source>,
     /// Samples that the peer has already: the newest sequence number by publisher.
@@ -97,6 +109,35 @@ impl Source {
         }
     }
 
+    /// Samples of this publisher up to this number have come where they were to go, or need not.
+    fn acknowledge_of(&self, of: &Gid, sequence: u64) {
+        if let Self::Relay(_, subscription) = self {
+            subscription.acknowledge_of(of, sequence);
+        }
+    }
+
+    /// Samples that were to be delivered reliably and are not acknowledged, by publisher.
+    fn unacknowledged(&self) -> HashMap<Gid, u64> {
+        match self {
+            Self::Relay(spec, subscription) if spec.qos.reliability == Reliability::Reliable => {
+                subscription.unacknowledged()
+            }
+            _ => HashMap::new(),
+        }
+    }
+
+    /// Whether there are such of this publisher.
+    pub(super) fn has_unacknowledged(&self, of: &Gid) -> bool {
+        self.reads(of) && self.unacknowledged().contains_key(of)
+    }
+
+    /// Tells a publisher that so many of its samples do not get there.
+    fn give_up(&self, of: Gid, samples: u64) {
+        if let Self::Relay(_, subscription) = self {
+            subscription.give_up(of, samples);
+        }
+    }
+
     /// Those whose samples are taken there.
     pub(super) fn writers(&self) -> Vec<Gid> {
         match self {
@@ -123,6 +164,34 @@ pub(super) enum Order {
     End(u32),
     /// Send over this connection from now on.
     Connection(Carrier),
+    /// The peer acknowledges samples.
+    Received(Vec<ReceivedOf>),
+    /// This publisher has ended: what it left is carried, and then the hub is told.
+    Ending(Gid),
+}
+
+/// Whose outbound task it is, and who is told what came of it.
+pub(super) struct Owner {
+    /// The peer.
+    pub(super) daemon: DaemonId,
+    /// To the hub.
+    pub(super) events: mpsc::Sender<Event>,
+}
+
+/// A route as its streams know it.
+#[derive(Clone, Copy)]
+struct Flow {
+    number: u32,
+    route: Route,
+    /// Whether the peer acknowledges what comes over it.
+    acknowledged: bool,
+}
+
+/// Up to which sample a publisher's are done with, and how many of them did not get there.
+#[derive(Clone, Copy)]
+struct Done {
+    sequence: u64,
+    given_up: u64,
 }
 
 /// A connection and how its messages are protected.
@@ -147,6 +216,21 @@ struct Shared {
     popped: Notify,
     /// A queue is over.
     ended: AtomicBool,
+    /// What was sent, or dropped, to a peer that acknowledges nothing, by route and publisher.
+    done: Mutex<HashMap<(u32, Gid), Done>>,
+}
+
+impl Shared {
+    fn done(&self, route: u32, of: Gid, done: Done) {
+        lock(&self.done)
+            .entry((route, of))
+            .and_modify(|known| {
+                known.sequence = known.sequence.max(done.sequence);
+                known.given_up += done.given_up;
+            })
+            .or_insert(done);
+        self.popped.notify_one();
+    }
 }
 
 /// What came of looking for samples.
@@ -160,8 +244,8 @@ struct Moved {
 }
 
 struct Active {
-    number: u32,
-    route: Route,
+    flow: Flow,
+    topic: Arc<str>,
     sources: Vec<Source>,
     /// The newest sequence number by publisher that the peer had when it asked.
     seen: HashMap<Gid, u64>,
@@ -176,10 +260,19 @@ pub(super) async fn run(
     counters: Arc<Counters>,
     queues: Arc<Room>,
     pulse: Pulse,
+    owner: Owner,
 ) {
     let (carrier, current) = watch::channel(first);
     let (popped, ended) = (Notify::new(), AtomicBool::new(false));
-    let shared = Arc::new(Shared { carrier: current, counters, queues, popped, ended });
+    let shared = Arc::new(Shared {
+        carrier: current,
+        counters,
+        queues,
+        popped,
+        ended,
+        done: Mutex::default(),
+    });
+    let mut endings = Endings::new(owner);
     let mut routes: HashMap<u32, Active> = HashMap::new();
     let mut beat = pulse.subscribe();
     loop {
@@ -193,7 +286,12 @@ pub(super) async fn run(
         if shared.ended.swap(false, Ordering::Relaxed) {
             routes.values_mut().for_each(Active::prune);
         }
-        let mut moved = Moved::default();
+        for ((route, of), done) in std::mem::take(&mut *lock(&shared.done)) {
+            if let Some(active) = routes.get(&route) {
+                active.done(of, done);
+            }
+        }
+        let mut moved = Moved { again: endings.look(&mut routes, &shared), ..Moved::default() };
         for active in routes.values_mut() {
             active.move_samples(&shared, &mut moved);
         }
@@ -204,16 +302,16 @@ pub(super) async fn run(
             // More may wait; let the streams and orders run in between.
             tokio::task::yield_now().await;
             while let Ok(order) = orders.try_recv() {
-                apply(order, &mut routes, &carrier);
+                apply(order, &mut routes, &carrier, &mut endings);
             }
             continue;
         }
         tokio::select! {
             order = orders.recv() => match order {
-                Some(order) => apply(order, &mut routes, &carrier),
-                None => return,
+                Some(order) => apply(order, &mut routes, &carrier, &mut endings),
+                None => return endings.link_over(&routes).await,
             },
-            changed = beat.changed() => if changed.is_err() { return },
+            changed = beat.changed() => if changed.is_err() { return endings.link_over(&routes).await },
             () = popped => {}
             () = freed => {}
             () = rested(moved.again) => {}
@@ -229,7 +327,12 @@ async fn rested(again: Option<Instant>) {
     }
 }
 
-fn apply(order: Order, routes: &mut HashMap<u32, Active>, carrier: &watch::Sender<Carrier>) {
+fn apply(
+    order: Order,
+    routes: &mut HashMap<u32, Active>,
+    carrier: &watch::Sender<Carrier>,
+    endings: &mut Endings,
+) {
     match order {
         Order::Connection(next) => {
             let _ = carrier.send(next);
@@ -237,10 +340,22 @@ fn apply(order: Order, routes: &mut HashMap<u32, Active>, carrier: &watch::Sende
         Order::End(number) => {
             routes.remove(&number);
         }
-        Order::Route(number, RouteOut { route, sources, seen }) => {
-            let feeds = HashMap::new();
-            let new = Active { number, route, sources: Vec::new(), seen: HashMap::new(), feeds };
-            let active = routes.entry(number).or_insert(new);
+        Order::Ending(of) => endings.add(of),
+        Order::Received(flows) => {
+            for ReceivedOf { route, publisher, sequence, dropped } in flows {
+                if let Some(active) = routes.get_mut(&route) {
+                    active.acknowledge(publisher, sequence, dropped);
+                }
+            }
+        }
+        Order::Route(number, RouteOut { topic, route, acknowledged, sources, seen }) => {
+            let active = routes.entry(number).or_insert_with(|| Active {
+                flow: Flow { number, route, acknowledged },
+                topic,
+                sources: Vec::new(),
+                seen: HashMap::new(),
+                feeds: HashMap::new(),
+            });
             active.sources = sources;
             for (of, feed) in &mut active.feeds {
                 feed.set(&active.sources, seen.get(of).copied());
@@ -262,8 +377,37 @@ impl Active {
                 feed.set(&self.sources, self.seen.get(&of).copied());
                 feed
             });
-            feed.turn((self.number, self.route), &self.sources, shared, moved);
+            feed.turn(self.flow, &self.sources, shared, moved);
         }
+    }
+
+    /// The peer has samples of a publisher up to this number, but for some that it dropped.
+    fn acknowledge(&mut self, of: Gid, sequence: u64, dropped: u64) {
+        let newest = self.feeds.get_mut(&of).and_then(|feed| feed.acknowledge(sequence));
+        // Of what was never sent nothing is acknowledged, whatever a peer says.
+        if let Some(sequence) = newest {
+            self.done(of, Done { sequence, given_up: dropped });
+        }
+    }
+
+    fn done(&self, of: Gid, Done { sequence, given_up }: Done) {
+        let sources = self.sources.iter().filter(|source| source.reads(&of));
+        for (number, source) in sources.enumerate() {
+            if number == 0 && given_up > 0 {
+                source.give_up(of, given_up);
+            }
+            source.acknowledge_of(&of, sequence);
+        }
+    }
+
+    /// Samples that are not acknowledged, by publisher.
+    fn unacknowledged(&self) -> HashMap<Gid, u64> {
+        let mut most = HashMap::new();
+        for (of, samples) in self.sources.iter().flat_map(Source::unacknowledged) {
+            let known: &mut u64 = most.entry(of).or_default();
+            *known = samples.max(*known);
+        }
+        most
     }
 
     /// Forgets those that nothing will come of.

@@ -2,16 +2,19 @@
 
 use std::{
     collections::VecDeque,
-    sync::{Arc, Mutex, atomic::Ordering},
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicU64, Ordering},
+    },
     time::Duration,
 };
 
-use axon_envelope::{Delivery, Kind, Route};
+use axon_envelope::{Delivery, Kind};
 use bytes::Bytes;
 use quinn::{SendStream, VarInt};
 use tokio::sync::Notify;
 
-use super::{Carrier, Shared};
+use super::{Carrier, Done, Flow, Shared};
 use crate::{
     gateway::{
         frames::Frames,
@@ -39,6 +42,8 @@ const BEST_EFFORT_LIFE: Duration = Duration::from_millis(200);
 pub(super) struct Stream {
     queue: Arc<Mutex<Queue>>,
     filled: Arc<Notify>,
+    /// Bytes that QUIC took over.
+    moved: Arc<AtomicU64>,
     task: tokio::task::JoinHandle<()>,
 }
 
@@ -49,22 +54,24 @@ impl Drop for Stream {
 }
 
 impl Stream {
-    pub(super) fn new(number: u32, route: Route, of: Gid, qos: &Qos, shared: Arc<Shared>) -> Self {
-        let queue = Arc::new(Mutex::new(Queue::new(qos, Arc::clone(&shared.queues))));
+    pub(super) fn new(flow: Flow, of: Gid, qos: &Qos, shared: Arc<Shared>) -> Self {
+        let queue = Queue::new(qos, Arc::clone(&shared.queues), flow.acknowledged);
+        let queue = Arc::new(Mutex::new(queue));
         let filled = Arc::new(Notify::new());
+        let moved = Arc::default();
         let writer = Writer {
-            number,
+            flow,
             of,
-            route,
             queue: Arc::clone(&queue),
             filled: Arc::clone(&filled),
+            moved: Arc::clone(&moved),
             shared,
             batch: VecDeque::new(),
             delivery: Delivery::Reliable,
             frames: Frames::default(),
         };
         let task = tokio::spawn(writer.run());
-        Self { queue, filled, task }
+        Self { queue, filled, moved, task }
     }
 
     /// Queues a sample as `qos` says. It must not be over.
@@ -79,6 +86,20 @@ impl Stream {
         offered
     }
 
+    /// The peer has samples up to this number. How many of them were awaited, and the newest of these.
+    pub(super) fn acknowledge(&self, sequence: u64) -> (u64, Option<u64>) {
+        let acknowledged = lock(&self.queue).acknowledge(sequence);
+        // There may be room for more to be under way.
+        self.filled.notify_one();
+        acknowledged
+    }
+
+    /// Bytes that QUIC took over.
+    pub(super) fn moved(&self) -> u64 {
+        // Relaxed: a count that is compared with itself.
+        self.moved.load(Ordering::Relaxed)
+    }
+
     /// Whether it has ended, with nothing left to send.
     pub(super) fn is_over(&self) -> bool {
         lock(&self.queue).is_over()
@@ -87,11 +108,11 @@ impl Stream {
 
 /// Seals and writes the samples of one queue.
 struct Writer {
-    number: u32,
+    flow: Flow,
     of: Gid,
-    route: Route,
     queue: Arc<Mutex<Queue>>,
     filled: Arc<Notify>,
+    moved: Arc<AtomicU64>,
     shared: Arc<Shared>,
     /// What was taken from the queue and is not known to be written.
     batch: VecDeque<Sample>,
@@ -154,7 +175,8 @@ impl Writer {
     fn seal_now(&mut self, carrier: &Carrier) -> Result<usize, NoKey> {
         let mut sealed = 0;
         for sample in &self.batch {
-            match carrier.protection.write(sample, self.route, self.delivery, &mut self.frames) {
+            match carrier.protection.write(sample, self.flow.route, self.delivery, &mut self.frames)
+            {
                 Ok(()) => sealed += 1,
                 Err(why) if sealed == 0 => return Err(why),
                 Err(_) => break,
@@ -166,17 +188,22 @@ impl Writer {
     /// The header of its streams, for what is in the batch.
     fn header(&self) -> Bytes {
         let reliable = self.delivery == Delivery::Reliable;
-        Bytes::copy_from_slice(&stream_header(reliable, self.number, self.of))
+        Bytes::copy_from_slice(&stream_header(reliable, self.flow.number, self.of))
     }
 
     /// Sends what comes until nothing has come for a while. What is reliable goes over one long stream,
     /// in order. When the connection is lost, a new carrier goes on after the old stream was
-    /// acknowledged to its end, so that nothing is overtaken.
+    /// acknowledged to its end, so that nothing is overtaken; it begins with what the peer has not
+    /// acknowledged, which drops what it has.
     async fn run(mut self) {
         let mut carriers = self.shared.carrier.clone();
         loop {
             let carrier = carriers.borrow_and_update().clone();
             let mut stream: Option<SendStream> = None;
+            if self.flow.acknowledged {
+                self.batch.clear();
+                lock(&self.queue).rewind();
+            }
             loop {
                 match carriers.has_changed() {
                     Ok(false) => {}
@@ -230,27 +257,43 @@ impl Writer {
         let mut pieces = self.frames.take();
         if stream.is_none() {
             let opened = carrier.connection.open_uni().await.map_err(|_| Gone)?;
-            let _ = opened.set_priority(if self.route.kind == Kind::Topic { 0 } else { SERVICES });
+            let _ =
+                opened.set_priority(if self.flow.route.kind == Kind::Topic { 0 } else { SERVICES });
             pieces.insert(0, self.header());
             *stream = Some(opened);
         }
         let Some(open) = stream.as_mut() else { return Err(Gone) };
-        match open.write_all_chunks(&mut pieces).await {
+        match write(open, &mut pieces, &self.moved).await {
             Ok(()) => {
+                let mut newest = None;
                 for sample in self.batch.drain(..sealed) {
                     self.shared.counters.sent(sample.payload.len());
+                    newest = Some(sample.info.sequence);
+                }
+                if let (Some(sequence), false) = (newest, self.flow.acknowledged) {
+                    self.done(Done { sequence, given_up: 0 });
                 }
                 Ok(())
             }
             // The peer no longer has the route; it says so on the control stream too.
             Err(quinn::WriteError::Stopped(_)) => {
                 *stream = None;
-                self.batch.drain(..sealed);
-                self.shared.counters.dropped("no_route", sealed as u64);
+                let newest = self.batch.drain(..sealed).map(|sample| sample.info.sequence).last();
+                let acknowledged = lock(&self.queue).acknowledge(newest.unwrap_or(0)).0;
+                let given_up = acknowledged.max(sealed as u64);
+                self.shared.counters.dropped("no_route", given_up);
+                if let Some(sequence) = newest {
+                    self.done(Done { sequence, given_up });
+                }
                 Ok(())
             }
             Err(_) => Err(Gone),
         }
+    }
+
+    /// Nothing more is done for these.
+    fn done(&self, done: Done) {
+        self.shared.done(self.flow.number, self.of, done);
     }
 
     /// A stream of its own for the sample, reset when it is not acknowledged in time.
@@ -258,7 +301,10 @@ impl Writer {
         if let Err(cause) = self.try_best_effort(carrier).await {
             self.shared.counters.dropped(cause, self.batch.len() as u64);
         }
-        self.batch.clear();
+        let newest = self.batch.drain(..).next_back().map(|sample| sample.info.sequence);
+        if let Some(sequence) = newest {
+            self.done(Done { sequence, given_up: 0 });
+        }
     }
 
     /// As [`best_effort`](Self::best_effort); why the sample was dropped.
@@ -286,6 +332,22 @@ impl Writer {
         tokio::spawn(give_up_in_time(stream, carrier.clone()));
         Ok(())
     }
+}
+
+/// Writes all `pieces`, and counts what QUIC took over.
+async fn write(
+    stream: &mut SendStream,
+    pieces: &mut [Bytes],
+    moved: &AtomicU64,
+) -> Result<(), quinn::WriteError> {
+    let mut left = pieces;
+    while !left.is_empty() {
+        let written = stream.write_chunks(left).await?;
+        // Relaxed as where it is read.
+        moved.fetch_add(written.bytes as u64, Ordering::Relaxed);
+        left = &mut left[written.chunks..];
+    }
+    Ok(())
 }
 
 /// Finishes a stream: nothing more goes over it. Until it is acknowledged to its end its carrier is in use.

@@ -12,8 +12,9 @@ use crate::{
 
 const OF: Gid = Gid([7; 16]);
 
-fn route() -> Route {
-    Route { kind: Kind::Topic, topic: TopicHash::new(0, "/t", "T").unwrap() }
+fn flow() -> Flow {
+    let route = Route { kind: Kind::Topic, topic: TopicHash::new(0, "/t", "T").unwrap() };
+    Flow { number: 1, route, acknowledged: false }
 }
 
 /// What the streams to a peer share that is at the other end of `connection`, and what must outlive it.
@@ -23,7 +24,8 @@ fn shared(connection: &Connection) -> (Arc<Shared>, watch::Sender<Carrier>) {
     let (sender, carrier) = watch::channel(Carrier { connection, protection, in_use });
     let (popped, ended) = (Notify::new(), AtomicBool::new(false));
     let (counters, queues) = (Arc::default(), Room::new(256 << 20).of_peer());
-    (Arc::new(Shared { carrier, counters, queues, popped, ended }), sender)
+    let done = Mutex::default();
+    (Arc::new(Shared { carrier, counters, queues, popped, ended, done }), sender)
 }
 
 fn a_sample(sequence: u64) -> Sample {
@@ -60,7 +62,7 @@ fn each_sample_goes_as_whoever_asks_for_most_wants_it() {
         let pair = Pair::new().await;
         let (shared, _carrier) = shared(&pair.here);
         let (lossy, whole) = (Qos::sensor_data(), Qos::keep_all());
-        let stream = Stream::new(1, route(), OF, &lossy, Arc::clone(&shared));
+        let stream = Stream::new(flow(), OF, &lossy, Arc::clone(&shared));
         queued(stream.offer(a_sample(1), &lossy));
         let (reliable, one) = arrived(&pair.there).await;
         assert!(!reliable);
@@ -85,11 +87,12 @@ fn one_that_sends_no_more_leaves_nothing_behind() {
         for qos in [Qos::keep_all(), Qos::sensor_data()] {
             let mut feeds = HashMap::from([(OF, Feed::new(OF))]);
             let feed = feeds.get_mut(&OF).unwrap();
-            queued(feed.queue(a_sample(1), &qos, (1, route()), &shared));
+            queued(feed.queue(a_sample(1), &qos, flow(), &shared));
             assert!(feed.is_in_use());
             let sources = Vec::new();
             let seen = HashMap::new();
-            let mut active = Active { number: 1, route: route(), sources, seen, feeds };
+            let (flow, topic) = (flow(), "/t".into());
+            let mut active = Active { flow, topic, sources, seen, feeds };
             active.prune();
             assert_eq!(active.feeds.len(), 1, "something is sent");
             arrived(&pair.there).await;
@@ -107,7 +110,7 @@ fn what_comes_when_a_stream_is_over_has_another() {
         let (shared, _carrier) = shared(&pair.here);
         let mut feed = Feed::new(OF);
         for sequence in 1..=2 {
-            queued(feed.queue(a_sample(sequence), &Qos::keep_all(), (1, route()), &shared));
+            queued(feed.queue(a_sample(sequence), &Qos::keep_all(), flow(), &shared));
             assert!(arrived(&pair.there).await.0);
             until_over(&shared).await;
             assert!(!feed.is_in_use());

@@ -51,6 +51,7 @@ impl Asked {
             kind: key.kind as u8,
             subscribers: self.subscribers.clone(),
             last,
+            acknowledges: Some(key.kind == Kind::Topic),
         })
     }
 }

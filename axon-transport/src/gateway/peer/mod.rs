@@ -19,16 +19,17 @@ use super::{
     hub::{Event, Local, Shared},
     inbound::Inbound,
     intake::Intake,
-    outbound::{self, Carrier},
+    outbound::{self, Carrier, Owner},
+    receipts::Receipts,
     routes::RouteKey,
     routes_in::RoutesIn,
 };
 use crate::{
     config::DiscoveryRange,
     events::Alive,
-    graph::{LIMITS, RemoteEndpoint, Toward},
+    graph::{EndpointKind, LIMITS, RemoteEndpoint, Toward},
     ids::{DaemonId, Gid},
-    link::{Graph, Message},
+    link::{Graph, Message, Received},
 };
 
 /// Endpoints in one GRAPH message; a larger graph takes several.
@@ -57,6 +58,11 @@ pub(super) struct Peer {
     routes_in: Arc<RoutesIn>,
     /// Memory for what comes from it, over whichever link.
     intake: Arc<Intake>,
+    /// What it is told of it, and the task that does so.
+    receipts: Arc<Receipts>,
+    _telling: OnDrop,
+    /// Publishers here that ended, which it sees until it has what they left.
+    ending: BTreeMap<Gid, RemoteEndpoint>,
     /// Routes that the peer asked for.
     served: HashMap<u32, Served>,
     /// Which publishers here were alive, as the peer was told.
@@ -94,12 +100,15 @@ impl Peer {
         outbox: Outbox,
         carrier: Carrier,
         shared: &Arc<Shared>,
+        owner: Owner,
     ) -> Self {
         let counters = Arc::new(Counters::default());
         let (orders, receiver) = mpsc::unbounded_channel();
         let (queues, pulse) = (shared.queues.of_peer(), shared.pulse.clone());
         let sent = Arc::clone(&counters);
-        tokio::spawn(outbound::run(carrier, receiver, sent, queues, pulse));
+        tokio::spawn(outbound::run(carrier, receiver, sent, queues, pulse, owner));
+        let receipts = Receipts::new(outbox.clone());
+        let telling = OnDrop(tokio::spawn(Arc::clone(&receipts).run()));
         Self {
             daemon,
             link,
@@ -114,6 +123,9 @@ impl Peer {
             asked: BTreeMap::new(),
             routes_in: Arc::default(),
             intake: Arc::new(Intake::new(shared.max_message)),
+            receipts,
+            _telling: telling,
+            ending: BTreeMap::new(),
             served: HashMap::new(),
             alive: Alive::default(),
             answering: BTreeSet::new(),
@@ -125,6 +137,7 @@ impl Peer {
     /// said last, since it may have been lost with the old one.
     pub(super) fn succeed(&mut self, link: u64, outbox: Outbox, carrier: Carrier) {
         self.link = link;
+        self.receipts.succeed(outbox.clone());
         self.outbox = outbox;
         let _ = self.orders.send(outbound::Order::Connection(carrier));
         for (key, asked) in &self.asked {
@@ -152,6 +165,7 @@ impl Peer {
             max_message: shared.max_message,
             wanted,
             intake: Arc::clone(&self.intake),
+            receipts: Arc::clone(&self.receipts),
             losses: Arc::default(),
             refused,
         }
@@ -185,12 +199,49 @@ impl Peer {
         shown.collect()
     }
 
+    /// Keeps publishers that ended in the peer's sight for as long as it has not got what they left.
+    pub(super) fn keep_ending(&mut self, local: &Local) {
+        let ended = self.sent.iter().filter(|(gid, shown)| {
+            shown.endpoint.kind == EndpointKind::Publisher
+                && !local.contains_key(gid)
+                && !self.ending.contains_key(gid)
+        });
+        let carried = |gid: &Gid| {
+            let sources = self.served.values().flat_map(|served| &served.sources);
+            sources.into_iter().any(|source| source.has_unacknowledged(gid))
+        };
+        let ended = ended.filter(|(gid, _)| carried(gid));
+        let ended: Vec<_> = ended.map(|(gid, shown)| (*gid, shown.clone())).collect();
+        for (gid, shown) in ended {
+            let _ = self.orders.send(outbound::Order::Ending(gid));
+            self.ending.insert(gid, shown);
+        }
+    }
+
+    /// Nothing is left of what a publisher left.
+    pub(super) fn drained(&mut self, gid: &Gid, local: &Local) {
+        if self.ending.remove(gid).is_some() {
+            self.send_graph(local, false);
+        }
+    }
+
+    /// Whether there are publishers that ended and whose samples are on their way.
+    pub(super) fn is_draining(&self) -> bool {
+        !self.ending.is_empty()
+    }
+
+    /// The peer acknowledges samples.
+    pub(super) fn received(&self, received: Received) {
+        let _ = self.orders.send(outbound::Order::Received(received.flows));
+    }
+
     /// Sends what changed since the last time, or all of it.
     pub(super) fn send_graph(&mut self, local: &Local, whole: bool) {
         if whole {
             self.sent.clear();
         }
-        let now = self.shown(local);
+        let mut now = self.ending.clone();
+        now.extend(self.shown(local));
         let added: Vec<_> =
             now.iter().filter(|(gid, e)| self.sent.get(gid) != Some(e)).map(|(_, e)| e).collect();
         let removed: Vec<_> =

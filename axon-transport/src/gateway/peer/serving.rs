@@ -45,7 +45,7 @@ impl Peer {
         subscribe: Subscribe,
         shared: &Arc<Shared>,
     ) -> Result<(), String> {
-        let Subscribe { route: number, topic, type_name, kind, subscribers, last } = subscribe;
+        let Subscribe { route: number, topic, type_name, kind, subscribers, last, .. } = subscribe;
         let hash = TopicHash::new(shared.domain, &topic, &type_name).map_err(|e| e.to_string())?;
         let kind = match kind {
             0 => Kind::Topic,
@@ -53,6 +53,7 @@ impl Peer {
             2 => Kind::Response,
             other => return Err(format!("a route of kind {other}")),
         };
+        let acknowledged = kind == Kind::Topic && subscribe.acknowledges == Some(true);
         let key = RouteKey { kind, topic, type_name };
         let mut others = self.served.iter().filter(|(route, _)| **route != number);
         match others.find(|(_, served)| served.key == key).map(|(other, s)| (*other, s.repeated)) {
@@ -79,7 +80,8 @@ impl Peer {
         let _announcing = self.announce_ready(number, &sources);
         let route = Route { kind, topic: hash };
         let seen = last.iter().map(|l| (l.publisher, l.sequence)).collect();
-        let out = RouteOut { route, sources: sources.clone(), seen };
+        let topic = key.topic.as_str().into();
+        let out = RouteOut { topic, route, acknowledged, sources: sources.clone(), seen };
         let _ = self.orders.send(Order::Route(number, out));
         let subscribers = subscribers.iter().map(|subscriber| subscriber.gid).collect();
         let repeated = true;
@@ -175,7 +177,9 @@ impl Peer {
         for (number, sources) in changes {
             let Some(served) = self.served.get_mut(&number) else { continue };
             served.sources.clone_from(&sources);
-            let out = RouteOut { route: served.route, sources, seen: HashMap::new() };
+            let topic = served.key.topic.as_str().into();
+            let (route, acknowledged, seen) = (served.route, false, HashMap::new());
+            let out = RouteOut { topic, route, acknowledged, sources, seen };
             let _ = self.orders.send(Order::Route(number, out));
         }
     }

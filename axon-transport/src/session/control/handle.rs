@@ -9,7 +9,7 @@ use crate::{
     passed::PassedFd,
     session::{
         message::{
-            Attach, Granted, Leaving, MAX_DESCRIPTORS, Message, Pair, Refused, Segment,
+            Attach, GivenUp, Granted, Leaving, MAX_DESCRIPTORS, Message, Pair, Refused, Segment,
             SegmentName, SegmentOpened, Unmatch,
         },
         peers::PeerError,
@@ -34,6 +34,7 @@ impl Control {
             }
             Message::Unmatch(unmatch) => self.unmatch(&unmatch),
             Message::Leaving(leaving) => self.leave(leaving),
+            Message::GivenUp(given_up) => self.give_up(given_up),
             Message::Segment(opened) => self.segment(&opened, &descriptors),
             Message::SegmentGone(gone) => {
                 self.peers.gone(&gone.session, gone.number);
@@ -98,6 +99,16 @@ impl Control {
             if subscription.lock().leave(&gid, leaving) {
                 self.reader_changed(&subscription);
             }
+        }
+    }
+
+    /// A relay of a publisher here gave samples up.
+    fn give_up(&self, GivenUp { reader, writer, samples }: GivenUp) {
+        let publisher = self.shared.state().publishers.get(&writer).cloned();
+        if let Some(publisher) = publisher {
+            publisher.rings.give_up(reader, samples);
+            // Those who wait for acknowledgements.
+            self.shared.segment.notify();
         }
     }
 

@@ -459,6 +459,21 @@ pub struct Leaving {
     pub leaving: bool,
 }
 
+/// A relay does not get samples where they are to go: their publisher learns of it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct GivenUp {
+    /// The relay.
+    #[n(0)]
+    pub reader: Gid,
+    /// The publisher.
+    #[n(1)]
+    pub writer: Gid,
+    /// How many.
+    #[n(2)]
+    pub samples: u64,
+}
+
 /// A message of the session socket.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[allow(missing_docs)]
@@ -481,6 +496,7 @@ pub enum Message {
     SegmentGone(SegmentName),
     Need(SegmentName),
     Leaving(Leaving),
+    GivenUp(GivenUp),
     Matched(Matched),
     Piece(Piece),
     Credit(Credit),

@@ -144,8 +144,6 @@ impl SubscriptionInner {
         let mut mapped = Reader::map(options)?;
         if self.role == EndpointRole::Relay {
             mapped.tell_progress();
-        }
-        if self.only.is_some() {
             mapped.finish_later();
         }
         if matches!(self.endpoint.kind, EndpointKind::Server | EndpointKind::Client) {

@@ -5,6 +5,7 @@ mod slots;
 mod taking;
 
 use std::{
+    collections::HashMap,
     fmt,
     sync::Arc,
     time::{Duration, Instant},
@@ -18,7 +19,7 @@ use self::{inner::lock, slots::Slots};
 use super::{
     OnNew, Session, SessionError,
     events::{Event, Source},
-    message::{Message, Pair},
+    message::{GivenUp, Message, Pair},
     state::Outgoing,
 };
 use crate::{
@@ -173,6 +174,26 @@ impl Subscription {
         if !self.session.is_forked() {
             self.inner.lock().finish(sequence);
         }
+    }
+
+    /// For a relay: samples of this publisher up to this number are where they are to go. Until then
+    /// nobody takes them as acknowledged.
+    pub(crate) fn acknowledge_of(&self, writer: &Gid, sequence: u64) {
+        if !self.session.is_forked() {
+            self.inner.lock().finish_of(writer, sequence);
+        }
+    }
+
+    /// For a relay: samples that are not acknowledged, those that were not taken among them, by
+    /// publisher.
+    pub(crate) fn unacknowledged(&self) -> HashMap<Gid, u64> {
+        if self.session.is_forked() { HashMap::new() } else { self.inner.lock().undone() }
+    }
+
+    /// For a relay: so many samples of this publisher do not get where they are to go. It is told.
+    pub(crate) fn give_up(&self, writer: Gid, samples: u64) {
+        let given_up = GivenUp { reader: self.gid(), writer, samples };
+        self.session.shared().tell(Outgoing::Message(Box::new(Message::GivenUp(given_up))));
     }
 
     /// For a relay: the next sample of one publisher, as bytes.

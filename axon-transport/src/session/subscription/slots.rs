@@ -339,9 +339,10 @@ impl Slots {
         self.pending.contains_key(writer) || self.slots.iter().any(|s| s.reader.writer() == *writer)
     }
 
-    /// Unmaps writers that are gone and drained.
+    /// Unmaps writers that are gone and drained, and of which nothing is under way.
     pub(super) fn sweep(&mut self) {
-        let over = |slot: &mut Slot| slot.over && slot.reader.is_drained();
+        let over =
+            |slot: &mut Slot| slot.over && slot.reader.is_drained() && !slot.reader.is_under_way();
         let gone: Vec<Slot> = self.slots.extract_if(.., over).collect();
         gone.iter().for_each(|slot| self.retire(slot));
     }

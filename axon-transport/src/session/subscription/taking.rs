@@ -1,6 +1,6 @@
 //! Which of a subscription's publishers is taken from next.
 
-use std::time::Instant;
+use std::{collections::HashMap, time::Instant};
 
 use super::{MessageInfo, inner::SubscriptionInner, slots::Slots};
 use crate::{
@@ -171,6 +171,32 @@ impl Slots {
     /// Samples up to this number are done with.
     pub(in crate::session) fn finish(&mut self, sequence: u64) {
         self.slots.iter_mut().for_each(|slot| slot.reader.finish(sequence));
+        self.sweep();
+    }
+
+    /// As [`finish`](Self::finish), those of one writer.
+    pub(in crate::session) fn finish_of(&mut self, writer: &Gid, sequence: u64) {
+        let of = self.slots.iter_mut().filter(|slot| slot.reader.writer() == *writer);
+        let mut over = false;
+        for slot in of {
+            slot.reader.finish(sequence);
+            over |= slot.over;
+        }
+        if over {
+            self.sweep();
+        }
+    }
+
+    /// Samples that are not done with, by writer.
+    pub(in crate::session) fn undone(&self) -> HashMap<Gid, u64> {
+        let mut undone = HashMap::new();
+        for slot in &self.slots {
+            let samples = slot.reader.undone();
+            if samples > 0 {
+                *undone.entry(slot.reader.writer()).or_default() += samples;
+            }
+        }
+        undone
     }
 
     pub(in crate::session) fn has_from(&self, writer: &Gid) -> bool {

@@ -3,7 +3,10 @@
 use super::*;
 use crate::{
     graph::{Endpoint, EndpointKind},
-    session::{arrivals, message::GraphItem},
+    session::{
+        arrivals,
+        message::{GivenUp, GraphItem},
+    },
     shm::{PublishError, Reader, ReaderOptions},
 };
 
@@ -194,7 +197,8 @@ fn a_sample_is_acknowledged_when_whoever_carries_it_away_has_it() {
     let (session, daemon) = session();
     let publisher = publisher(&session, Qos::default());
     let elsewhere = vec![Gid([5; 16])];
-    let mut taking = Taker::new().attach(&publisher, Some(elsewhere), &daemon);
+    let taker = Taker::new();
+    let mut taking = taker.attach(&publisher, Some(elsewhere), &daemon);
     until("it is matched", || publisher.matched() == [Gid([5; 16])]);
     assert!(publisher.wait_acknowledged(Duration::ZERO), "nothing was published");
     let room = || session.segment().armed_word(Purpose::Room);
@@ -214,9 +218,37 @@ fn a_sample_is_acknowledged_when_whoever_carries_it_away_has_it() {
     thread::scope(|scope| {
         let waiting = scope.spawn(|| publisher.wait_acknowledged(EVER));
         until("it sleeps", || room().load(std::sync::atomic::Ordering::Relaxed) != 0);
+        // The daemon says that it ended, and not that it gave anything up.
         drop(taking);
+        daemon.say(Message::Detach(Pair { reader: taker.gid, writer: publisher.gid() }), &[]);
         assert!(waiting.join().unwrap(), "nobody told it");
     });
+}
+
+#[test]
+fn a_sample_that_is_given_up_is_not_acknowledged() {
+    let (session, daemon) = session();
+    let publisher = publisher(&session, Qos::keep_all());
+    let taker = Taker::new();
+    let mut taking = taker.attach(&publisher, Some(vec![Gid([5; 16])]), &daemon);
+    taking.reader.finish_later();
+    until("it is matched", || publisher.matched() == [Gid([5; 16])]);
+    for number in 1..=3 {
+        publisher.publish(b"x").unwrap();
+        assert_eq!(taking.take(&daemon), number);
+    }
+    taking.reader.finish(1);
+    assert_eq!((publisher.unacknowledged(), publisher.given_up()), (2, 0));
+    let (reader, writer) = (taker.gid, publisher.gid());
+    thread::scope(|scope| {
+        let waiting = scope.spawn(|| publisher.wait_acknowledged(EVER));
+        daemon.say(Message::GivenUp(GivenUp { reader, writer, samples: 2 }), &[]);
+        daemon.say(Message::Detach(Pair { reader, writer }), &[]);
+        assert!(!waiting.join().unwrap());
+    });
+    until("it ended", || publisher.matched().is_empty());
+    assert_eq!((publisher.unacknowledged(), publisher.given_up()), (0, 2));
+    assert!(publisher.wait_acknowledged(Duration::ZERO), "it was said once");
 }
 
 #[test]

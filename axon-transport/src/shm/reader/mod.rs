@@ -441,6 +441,17 @@ impl Reader {
         self.under_way.get_or_insert_default();
     }
 
+    /// Whether samples that were taken are not done with.
+    pub(crate) fn is_under_way(&self) -> bool {
+        self.under_way.as_ref().is_some_and(|under_way| !under_way.0.is_empty())
+    }
+
+    /// Samples that are not done with, those that were not taken among them.
+    pub(crate) fn undone(&self) -> u64 {
+        let under_way = self.under_way.as_ref().map_or(0, |under_way| under_way.0.len() as u64);
+        under_way.saturating_add(self.unread())
+    }
+
     /// Samples up to this number are done with.
     pub(crate) fn finish(&mut self, sequence: u64) {
         let Some(under_way) = &mut self.under_way else { return };

@@ -237,6 +237,8 @@ impl Writer {
         };
         let pidfds: Vec<_> = laggards.iter().map(|peer| peer.pidfd()).collect();
         self.session.wait_for_room(ready, &pidfds, left);
-        self.lock().audience.mark_dead();
+        let mut state = self.lock();
+        let State { history, audience, .. } = &mut *state;
+        audience.mark_dead(history.head());
     }
 }

@@ -1,16 +1,16 @@
-//! What readers that stand for others, elsewhere, have taken over.
+//! What readers that stand for others, elsewhere, are done with.
 
 use std::{
     sync::Arc,
     time::{Duration, Instant},
 };
 
-use super::Writer;
-use crate::shm::PeerSession;
+use super::{State, Writer};
+use crate::{ids::Gid, shm::PeerSession};
 
 impl Writer {
-    /// Waits until all that was published so far has been handed to those who carry it elsewhere;
-    /// whether it has. One that has ended carries nothing, so nothing is waited for.
+    /// Waits until those who carry samples elsewhere are done with all that was published so far;
+    /// whether none of it was given up. What was given up makes it false once.
     pub(crate) fn wait_handed_over(&self, timeout: Duration) -> bool {
         if self.is_forked() {
             return true;
@@ -20,11 +20,16 @@ impl Writer {
         loop {
             let relays = {
                 let mut state = self.lock();
-                state.audience.mark_dead();
-                if state.audience.handed_over(published) >= published {
+                let State { history, audience, known_given_up, .. } = &mut *state;
+                audience.mark_dead(history.head());
+                let given_up = audience.given_up();
+                if std::mem::replace(known_given_up, given_up) != given_up {
+                    return false;
+                }
+                if audience.handed_over(published) >= published {
                     return true;
                 }
-                state.audience.relays()
+                audience.relays()
             };
             let left =
                 end.map_or(Duration::MAX, |end| end.saturating_duration_since(Instant::now()));
@@ -35,9 +40,35 @@ impl Writer {
         }
     }
 
+    /// Samples with which those who carry them elsewhere are not done.
+    pub(crate) fn under_way(&self) -> u64 {
+        if self.is_forked() {
+            return 0;
+        }
+        let mut state = self.lock();
+        let State { history, audience, .. } = &mut *state;
+        let head = history.head();
+        audience.mark_dead(head);
+        head.saturating_sub(audience.handed_over(head))
+    }
+
+    /// Samples that those who carry them elsewhere gave up.
+    pub(crate) fn given_up(&self) -> u64 {
+        if self.is_forked() { 0 } else { self.lock().audience.given_up() }
+    }
+
+    /// One of them says that it gave up so many.
+    pub(crate) fn give_up(&self, reader: Gid, samples: u64) {
+        if !self.is_forked() {
+            self.lock().audience.give_up(reader, samples);
+        }
+    }
+
     fn await_handover(&self, published: u64, relays: &[Arc<PeerSession>], left: Duration) {
         let ready = || {
-            self.lock().audience.handed_over(published) >= published
+            let mut state = self.lock();
+            state.audience.given_up() != state.known_given_up
+                || state.audience.handed_over(published) >= published
                 || relays.iter().any(|peer| peer.is_dead())
         };
         let pidfds: Vec<_> = relays.iter().map(|peer| peer.pidfd()).collect();

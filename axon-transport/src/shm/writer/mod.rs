@@ -110,6 +110,8 @@ pub(super) struct State {
     pub(super) pinned: Pinned,
     /// The last sample's sequence number.
     last: u64,
+    /// Of the samples that relays gave up: those of which a wait said so.
+    known_given_up: u64,
     /// Samples published, read or not.
     published: u64,
 }
@@ -142,6 +144,7 @@ impl State {
             shown_tail: 0,
             pinned: Pinned::default(),
             last: 0,
+            known_given_up: 0,
             published: 0,
         }
     }
@@ -269,7 +272,7 @@ impl Writer {
 
     /// Forgets a reader; false when it was not attached. The samples that it keeps it may keep.
     pub fn detach(&self, reader: Gid) -> bool {
-        !self.is_forked() && self.change(|audience| audience.detach(reader))
+        !self.is_forked() && self.change(|audience, head| audience.detach(reader, head))
     }
 
     /// Forgets the readers whose process has ended, and names them.
@@ -282,11 +285,12 @@ impl Writer {
         if self.is_forked() { Vec::new() } else { self.change(Audience::drop_gone) }
     }
 
-    fn change<T>(&self, by: impl FnOnce(&mut Audience) -> T) -> T {
+    fn change<T>(&self, by: impl FnOnce(&mut Audience, u64) -> T) -> T {
         let mut state = self.lock();
         // A session of which this was the last part is unmapped after the lock, and not under it.
         let peers = state.audience.peers();
-        let changed = by(&mut state.audience);
+        let State { audience, history, .. } = &mut *state;
+        let changed = by(audience, history.head());
         self.show_window(&state);
         drop(state);
         drop(peers);

@@ -1,0 +1,162 @@
+//! What is left when a publisher, a link or a daemon ends: it arrives, or is known not to.
+
+use std::{
+    thread,
+    time::{Duration, Instant},
+};
+
+use axon_transport::{
+    qos::Qos,
+    session::{EndpointSpec, Publisher, Subscription},
+    shm::PublishError,
+};
+use rustix::process::Signal;
+
+use super::{
+    mode::{Kmes, Settings, classic},
+    pair::{Host, Plan, kill, signal},
+    process::{PATIENCE, until},
+};
+
+const TOPIC: &str = "/ending";
+const SAMPLES: u64 = 5_000;
+
+fn spec() -> EndpointSpec {
+    EndpointSpec::new(TOPIC, "test/Bytes", Qos::keep_all())
+}
+
+/// A publisher on the first host and a subscription on the second that have met.
+fn across(hosts: &[Host; 2]) -> (Publisher, Subscription) {
+    let (here, there) = (hosts[0].session("publisher"), hosts[1].session("subscription"));
+    let subscription = there.create_subscription(spec()).unwrap();
+    let publisher = here.create_publisher(spec()).unwrap();
+    assert!(publisher.wait_matched(1, PATIENCE) && subscription.wait_matched(1, PATIENCE));
+    (publisher, subscription)
+}
+
+fn publish(publisher: &Publisher, samples: u64) {
+    let bytes = vec![0x5a; 4000];
+    for _ in 0..samples {
+        while let Err(error) = publisher.publish(&bytes) {
+            assert!(matches!(error, PublishError::Blocked { .. }), "{error}");
+        }
+    }
+}
+
+/// The numbers of what comes, to the last that must.
+fn take(subscription: &Subscription, last: u64) -> Vec<u64> {
+    let (mut bytes, mut numbers) = (Vec::new(), Vec::new());
+    while numbers.last() != Some(&last) {
+        let Some(info) = subscription.recv(&mut bytes, Some(PATIENCE)) else { break };
+        numbers.push(info.sequence);
+    }
+    numbers
+}
+
+/// Samples that the status counts as lost with this cause.
+fn lost(host: &Host, cause: &str) -> u64 {
+    let topics = host.status().topics;
+    let topics = topics.iter().filter(|topic| topic.topic == TOPIC);
+    topics.filter_map(|topic| topic.dropped.get(cause)).sum()
+}
+
+fn what_a_publisher_leaves_arrives(settings: [Settings; 2]) {
+    let hosts = Plan::new(settings).start();
+    let (publisher, subscription) = across(&hosts);
+    let reader = thread::spawn(move || take(&subscription, SAMPLES));
+    publish(&publisher, SAMPLES);
+    drop(publisher);
+    assert!(reader.join().unwrap().into_iter().eq(1..=SAMPLES));
+    assert_eq!(lost(&hosts[0], "publisher_ended"), 0);
+    // Nobody shows it any more.
+    until("its end is known there", || {
+        hosts[1].status().topics.iter().all(|topic| topic.remote_publishers == 0)
+    });
+}
+
+#[test]
+fn what_a_publisher_leaves_arrives_in_classic() {
+    what_a_publisher_leaves_arrives([classic(&[]), classic(&[])]);
+}
+
+/// It waits for keys.
+#[test]
+fn what_a_publisher_leaves_arrives_in_messages10() {
+    let kmes = Kmes::start();
+    let more = [("AXON_QKD_KEY_MODE", "messages10")];
+    what_a_publisher_leaves_arrives([0, 1].map(|host| kmes.settings(host, &more)));
+}
+
+#[test]
+fn what_a_publisher_leaves_keeps_the_daemon_until_it_arrived() {
+    let hosts = Plan { grace_s: 1, ..Plan::new([classic(&[]), classic(&[])]) }.start();
+    let (publisher, subscription) = across(&hosts);
+    let there = hosts[1].status().pid;
+    signal(there, Signal::STOP);
+    publish(&publisher, 100);
+    drop(publisher);
+    // Longer than the grace time, shorter than what is waited for progress.
+    thread::sleep(Duration::from_secs(4));
+    signal(there, Signal::CONT);
+    assert!(take(&subscription, 100).into_iter().eq(1..=100));
+    until("the daemon ends", || hosts[0].try_status().is_none());
+}
+
+#[test]
+fn what_a_publisher_leaves_and_nobody_takes_is_counted() {
+    let hosts = Plan::new([classic(&[]), classic(&[])]).start();
+    let (publisher, _subscription) = across(&hosts);
+    signal(hosts[1].status().pid, Signal::STOP);
+    publish(&publisher, 100);
+    drop(publisher);
+    until("it is given up", || lost(&hosts[0], "publisher_ended") == 100);
+    hosts[0].wait_log(&[TOPIC, "samples=100", "a publisher ended"]);
+    signal(hosts[1].daemon.as_ref().unwrap().0.id(), Signal::CONT);
+}
+
+#[test]
+fn acknowledged_is_what_the_other_host_has() {
+    let hosts = Plan::new([classic(&[]), classic(&[])]).start();
+    let (publisher, subscription) = across(&hosts);
+    publish(&publisher, 10);
+    assert!(publisher.wait_acknowledged(PATIENCE));
+    let there = hosts[1].status().pid;
+    signal(there, Signal::STOP);
+    publish(&publisher, 100);
+    assert!(!publisher.wait_acknowledged(Duration::from_millis(500)));
+    assert_eq!((publisher.unacknowledged(), publisher.given_up()), (100, 0));
+    signal(there, Signal::CONT);
+    assert!(publisher.wait_acknowledged(PATIENCE));
+    // It is all there: the daemon is not needed any more.
+    kill(there);
+    assert!(take(&subscription, 110).into_iter().eq(1..=110));
+}
+
+#[test]
+fn what_a_killed_daemon_had_is_not_acknowledged() {
+    let mut hosts = Plan::new([classic(&[]), classic(&[])]).start();
+    let (publisher, _subscription) = across(&hosts);
+    let there = hosts[1].status().pid;
+    signal(there, Signal::STOP);
+    publish(&publisher, 100);
+    hosts[0].kill_daemon();
+    assert!(!publisher.wait_acknowledged(PATIENCE));
+    assert_eq!(publisher.given_up(), 100);
+    signal(there, Signal::CONT);
+}
+
+#[test]
+fn what_a_link_had_when_it_broke_is_counted() {
+    let mut hosts = Plan::new([classic(&[]), classic(&[])]).start();
+    let (publisher, _subscription) = across(&hosts);
+    let there = hosts[1].status().pid;
+    signal(there, Signal::STOP);
+    publish(&publisher, 100);
+    // It is killed, and has a successor on the same port.
+    assert_eq!(hosts[1].daemon.take().unwrap().0.id(), there);
+    let begun = Instant::now();
+    assert!(!publisher.wait_acknowledged(PATIENCE), "{:?}", begun.elapsed());
+    assert_eq!(publisher.given_up(), 100);
+    until("it is counted", || lost(&hosts[0], "link_ended") == 100);
+    hosts[0].wait_log(&[TOPIC, "samples=100", "the link ended"]);
+}
