@@ -51,6 +51,9 @@ fn render(status: &Status) -> String {
     );
     section(&mut out, "Settings", "none", settings(status));
     section(&mut out, "Links", "no other host is linked", links(&status.links));
+    if status.links.iter().any(|link| !link.routes_refused.is_empty()) {
+        section(&mut out, "Routes refused", "none", routes_refused(&status.links));
+    }
     keys(&mut out, &status.keys);
     section(&mut out, "Topics", "none", topics(status));
     section(&mut out, "Out of range", "no pair", out_of_range(status));
@@ -112,6 +115,20 @@ fn links(links: &[LinkStatus]) -> Table {
             traffic(link.samples_out, link.bytes_out),
             causes(&link.dropped),
         ]);
+    }
+    table
+}
+
+fn routes_refused(links: &[LinkStatus]) -> Table {
+    let mut table = Table::new(&["host", "topic", "why"]);
+    for link in links {
+        for (topic, why) in &link.routes_refused {
+            table.row([link.host.clone(), topic.clone(), why.clone()]);
+        }
+        if link.more_routes_refused > 0 {
+            let more = format!("and {} more", grouped(link.more_routes_refused as u64));
+            table.row([link.host.clone(), more, dash()]);
+        }
     }
     table
 }

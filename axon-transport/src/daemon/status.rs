@@ -273,6 +273,12 @@ pub struct LinkStatus {
     pub bytes_out: u64,
     /// Samples dropped, by cause.
     pub dropped: BTreeMap<String, u64>,
+    /// Topics and services that do not cross though they match, and why: the first 64.
+    #[serde(default)]
+    pub routes_refused: BTreeMap<String, String>,
+    /// How many more there are.
+    #[serde(default)]
+    pub more_routes_refused: usize,
 }
 
 /// Somebody who was refused.

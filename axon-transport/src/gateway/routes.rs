@@ -4,6 +4,7 @@
 use std::{
     cmp::Reverse,
     collections::{BTreeMap, BTreeSet},
+    fmt,
 };
 
 use axon_envelope::Kind;
@@ -27,6 +28,17 @@ pub(super) struct RouteKey {
     pub(super) topic: String,
     /// Type name.
     pub(super) type_name: String,
+}
+
+impl fmt::Display for RouteKey {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let kind = match self.kind {
+            Kind::Topic => "",
+            Kind::Request => " (requests)",
+            Kind::Response => " (responses)",
+        };
+        write!(f, "{}{kind} [{}]", self.topic, self.type_name)
+    }
 }
 
 impl RouteKey {

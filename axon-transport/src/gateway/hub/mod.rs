@@ -209,6 +209,8 @@ impl Hub {
                     seconds = seconds.wrapping_add(1);
                     self.close_untrusted(seconds.is_multiple_of(CERTIFICATES_EVERY)).await;
                     self.report().await;
+                    let now = Instant::now();
+                    self.peers.values_mut().for_each(|peer| peer.ask_again(now));
                 }
             }
         }
@@ -345,8 +347,12 @@ impl Hub {
                 peer.received(received);
                 Ok(())
             }
-            Message::RouteRefused(_) => Ok(()),
+            Message::RouteRefused(refused) => {
+                peer.route_refused(refused);
+                Ok(())
+            }
             Message::RouteReady(ready) => {
+                peer.route_ready(ready.route);
                 tracing::debug!(peer = %daemon, route = ready.route,
                     publishers = ready.publishers.len(), "route ready");
                 Ok(())
@@ -394,6 +400,7 @@ impl Hub {
                 let mut status =
                     status::link(&link.established, &link.connection, link.since_unix_ms);
                 peer.counters.fill(&mut status);
+                peer.show_refused(&mut status);
                 self.tell(ToControl::Link(Box::new(status))).await;
             }
         }

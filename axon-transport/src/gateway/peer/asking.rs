@@ -8,7 +8,10 @@ use std::{
 
 use axon_envelope::{Kind, Route, TopicHash};
 
-use super::{OnDrop, POLL, Peer};
+use super::{
+    MAX_ROUTES, OnDrop, POLL, Peer,
+    refused::{TOO_MANY_ASKED, TOO_MANY_WRITERS},
+};
 use crate::{
     gateway::{
         control::Outbox,
@@ -29,7 +32,7 @@ const MAX_STAND_INS: usize = 1024;
 
 /// A route that this side asked for.
 pub(super) struct Asked {
-    number: u32,
+    pub(super) number: u32,
     subscribers: Vec<Subscriber>,
     pub(super) stand_ins: HashMap<Gid, Arc<StandIn>>,
     /// Sends SUBSCRIBE once the stand-ins have their readers.
@@ -88,14 +91,25 @@ impl Peer {
 
     fn want(&mut self, wanted: BTreeMap<RouteKey, Wanted>, shared: &Arc<Shared>) {
         let gone: Vec<_> = self.asked.keys().filter(|k| !wanted.contains_key(k)).cloned().collect();
+        self.refused.unasked.retain(|key, _| wanted.contains_key(key));
+        let room_there = gone.len();
         for key in gone {
+            self.refused.settle(&key);
             if let Some(asked) = self.asked.remove(&key) {
                 self.routes_in.change(|routes| drop(routes.remove(&asked.number)));
                 self.say(Message::Unsubscribe(Unsubscribe { route: asked.number }));
             }
         }
         for (key, wanted) in wanted {
+            if self.asked.len() >= MAX_ROUTES && !self.asked.contains_key(&key) {
+                self.refused.unasked(&key, TOO_MANY_ASKED);
+                continue;
+            }
+            self.refused.unasked.remove(&key);
             self.want_one(key, wanted, shared);
+        }
+        if room_there > 0 {
+            self.ask_instead(room_there);
         }
     }
 
@@ -114,6 +128,10 @@ impl Peer {
         let writers: HashSet<_> = wanted.writers.iter().map(|(writer, _)| writer.gid).collect();
         asked.stand_ins.retain(|gid, _| writers.contains(gid));
         let fresh = self.show(&key, &mut asked, &wanted.writers, shared);
+        if asked.stand_ins.is_empty() && asked.subscribers.is_empty() {
+            // Nobody here would take what comes.
+            return;
+        }
         let changed = asked.subscribers != wanted.subscribers || fresh;
         asked.subscribers = wanted.subscribers;
         let route = Route { kind: key.kind, topic };
@@ -147,7 +165,7 @@ impl Peer {
 
     /// Makes the stand-ins that a route lacks. Whether there are new ones.
     fn show(
-        &self,
+        &mut self,
         key: &RouteKey,
         asked: &mut Asked,
         writers: &[(Endpoint, usize)],
@@ -161,7 +179,7 @@ impl Peer {
                 continue;
             }
             if asked.stand_ins.len() + elsewhere >= MAX_STAND_INS {
-                tracing::warn!(topic = key.topic, "a peer has more publishers than are shown");
+                self.refused.unasked(key, TOO_MANY_WRITERS);
                 break;
             }
             match shared.stand_ins.get(&shared.session, writer) {

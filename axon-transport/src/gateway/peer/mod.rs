@@ -2,6 +2,7 @@
 
 mod alive;
 mod asking;
+mod refused;
 mod serving;
 
 use std::{
@@ -12,7 +13,7 @@ use std::{
 
 use tokio::sync::{mpsc, watch};
 
-use self::{asking::Asked, serving::Served};
+use self::{asking::Asked, refused::RefusedRoutes, serving::Served};
 use super::{
     control::Outbox,
     counters::Counters,
@@ -32,6 +33,8 @@ use crate::{
     link::{Graph, Message, Received},
 };
 
+/// Routes that a peer may ask for, and that it is asked for.
+const MAX_ROUTES: usize = 1024;
 /// Endpoints in one GRAPH message; a larger graph takes several.
 const GRAPH_PART: usize = 512;
 /// How often readers are looked for meanwhile.
@@ -55,6 +58,8 @@ pub(super) struct Peer {
     next_route: u32,
     /// Routes that this side asked for.
     asked: BTreeMap<RouteKey, Asked>,
+    /// Routes that do not come about.
+    refused: RefusedRoutes,
     routes_in: Arc<RoutesIn>,
     /// Memory for what comes from it, over whichever link.
     intake: Arc<Intake>,
@@ -121,6 +126,7 @@ impl Peer {
             sent_version: 0,
             next_route: 1,
             asked: BTreeMap::new(),
+            refused: RefusedRoutes::default(),
             routes_in: Arc::default(),
             intake: Arc::new(Intake::new(shared.max_message)),
             receipts,

@@ -18,8 +18,6 @@ use crate::{
 
 /// How long ROUTE_READY waits for the first local publisher to attach.
 const READY_TIMEOUT: Duration = Duration::from_secs(2);
-/// Routes that a peer may ask for.
-const MAX_ROUTES: usize = 1024;
 
 /// A route that the peer asked for.
 pub(super) struct Served {
@@ -68,11 +66,15 @@ impl Peer {
         let old = match self.served.remove(&number) {
             Some(served) if served.key == key => served.sources,
             Some(_) => return Err("a route number for two topics".into()),
-            None if self.served.len() >= MAX_ROUTES => {
-                return Err(format!("more than {MAX_ROUTES} routes"));
+            None => {
+                if let Some(why) = self.has_too_many_routes() {
+                    self.refuse(number, &key, why, None);
+                    return Ok(());
+                }
+                Vec::new()
             }
-            None => Vec::new(),
         };
+        self.refused.forget(number);
         let sources = match kind {
             Kind::Topic => self.open_relays(&key, &subscribers, &old, shared),
             Kind::Request | Kind::Response => self.of_service(&key),
@@ -92,6 +94,7 @@ impl Peer {
 
     /// UNSUBSCRIBE.
     pub(in crate::gateway) fn unserve(&mut self, route: u32) {
+        self.refused.forget(route);
         self.served.remove(&route);
         let _ = self.orders.send(Order::End(route));
     }

@@ -1,0 +1,104 @@
+//! More topics between two hosts than may cross.
+
+use axon_tls::identity::{Auth, SigningKey};
+use axon_transport::{
+    ids::{DaemonId, Gid},
+    link::{Message, Subscribe, Subscriber, Unsubscribe},
+    qos::Qos,
+    session::{EndpointSpec, Publisher, Session, Subscription},
+};
+
+use super::{
+    mode::classic,
+    pair::{Host, Plan},
+    process::{PATIENCE, until},
+    stranger::{Claim, Stranger},
+};
+
+/// What may cross.
+const ROUTES: u32 = 1024;
+const MORE: u32 = 30;
+const TYPE: &str = "test/Bytes";
+
+fn spec(number: u32) -> EndpointSpec {
+    EndpointSpec::new(format!("/crowd_{number:04}"), TYPE, Qos::default())
+}
+
+fn subscribe(route: u32) -> Message {
+    Message::Subscribe(Subscribe {
+        route,
+        topic: format!("/crowd_{route:04}"),
+        type_name: TYPE.into(),
+        kind: 0,
+        subscribers: vec![Subscriber { gid: Gid([7; 16]), qos: Qos::default() }],
+        last: vec![],
+        acknowledges: None,
+    })
+}
+
+/// How many topics the host shows as refused.
+fn refused(host: &Host) -> usize {
+    let links = host.status().links;
+    links.iter().map(|link| link.routes_refused.len() + link.more_routes_refused).sum()
+}
+
+#[test]
+fn a_peer_that_asks_for_too_many_routes_is_refused_those_by_name_and_keeps_its_link() {
+    let [host, _other] = Plan::new([classic(&[]), classic(&[])]).start();
+    let (stranger, auth) = (Stranger::new(), Auth::None(SigningKey::generate().unwrap()));
+    let claim = Claim { host: "greedy", daemon: DaemonId([0xff; 16]), auth: 0 };
+    let mut met = stranger.dial(&host, &auth, &claim).expect("a link");
+    for route in 0..ROUTES + MORE {
+        stranger.say(&mut met, &subscribe(route));
+    }
+    for route in ROUTES..ROUTES + MORE {
+        let refused = |m: &Message| matches!(m, Message::RouteRefused(r) if r.route == route);
+        stranger.hear(&mut met, refused).expect("it is refused");
+    }
+    until("it is shown", || refused(&host) == MORE as usize);
+    let shown = host.status().links.into_iter().find(|link| link.host == "greedy").unwrap();
+    assert!(shown.routes_refused.keys().any(|topic| topic.contains("/crowd_1024")), "{shown:?}");
+    // Where there is room it gets it.
+    stranger.say(&mut met, &Message::Unsubscribe(Unsubscribe { route: 0 }));
+    stranger.say(&mut met, &subscribe(ROUTES));
+    let ready = |m: &Message| matches!(m, Message::RouteReady(ready) if ready.route == ROUTES);
+    stranger.hear(&mut met, ready).expect("it is served");
+    assert_eq!(met.connection.close_reason(), None);
+    until("it is shown no more", || refused(&host) == MORE as usize - 1);
+}
+
+/// One end of each of so many topics.
+fn ends<T>(session: &Session, create: impl Fn(&Session, EndpointSpec) -> T) -> Vec<T> {
+    (0..ROUTES + MORE).map(|number| create(session, spec(number))).collect()
+}
+
+#[test]
+fn what_is_more_than_may_cross_is_named_on_both_hosts_and_harms_nothing_else() {
+    let hosts = Plan::new([classic(&[]), classic(&[])]).start();
+    let since = hosts[0].link().since_unix_ms;
+    let (here, there) = (hosts[0].session("publishers"), hosts[1].session("subscriptions"));
+    let subscriptions: Vec<Subscription> =
+        ends(&there, |session, spec| session.create_subscription(spec).unwrap());
+    let publishers: Vec<Publisher> =
+        ends(&here, |session, spec| session.create_publisher(spec).unwrap());
+    let crossing = || publishers.iter().filter(|p| !p.matched().is_empty()).count();
+    until("as many cross as may", || crossing() == ROUTES as usize);
+    until("the others are named there", || refused(&hosts[1]) == MORE as usize);
+    for publisher in &publishers {
+        publisher.publish(b"one").unwrap();
+    }
+    let mut bytes = Vec::new();
+    for (subscription, publisher) in subscriptions.iter().zip(&publishers) {
+        if !publisher.matched().is_empty() {
+            assert!(subscription.recv(&mut bytes, Some(PATIENCE)).is_some());
+        }
+    }
+    assert_eq!((crossing(), hosts[0].link().since_unix_ms), (ROUTES as usize, since));
+    // One that ends makes room for another.
+    let first = publishers.iter().position(|publisher| !publisher.matched().is_empty()).unwrap();
+    let mut publishers = publishers;
+    drop(publishers.remove(first));
+    let crossing = || publishers.iter().filter(|p| !p.matched().is_empty()).count();
+    until("another crosses", || crossing() == ROUTES as usize);
+    assert_eq!(hosts[0].link().since_unix_ms, since);
+}
