@@ -207,12 +207,15 @@ pub struct PeerAddress {
 pub struct LinkConfig {
     /// How long a daemon outlives its last session.
     pub grace: Duration,
+    /// A peer that reads nothing of a KEEP_ALL topic for so long is disconnected from it.
+    pub stalled: Duration,
     /// Largest UDP payload that path discovery tries, in bytes.
     pub mtu: u16,
 }
 
 impl Default for LinkConfig {
     fn default() -> Self {
-        Self { grace: Duration::from_secs(10), mtu: 1452 }
+        let ten = Duration::from_secs(10);
+        Self { grace: ten, stalled: ten, mtu: 1452 }
     }
 }

@@ -311,8 +311,9 @@ fn link(sources: &Sources) -> Result<LinkConfig, ConfigError> {
         };
         match key.as_str() {
             "grace_s" => link.grace = Duration::from_secs(number(0, 86_400, "seconds")?),
+            "stalled_s" => link.stalled = Duration::from_secs(number(1, 86_400, "seconds")?),
             "mtu" => link.mtu = number(1_200, 65_527, "bytes")? as u16,
-            _ => return Err(ConfigError::name(&name, "grace_s, mtu").at(place)),
+            _ => return Err(ConfigError::name(&name, "grace_s, stalled_s, mtu").at(place)),
         }
     }
     Ok(link)

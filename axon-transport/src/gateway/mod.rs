@@ -37,6 +37,7 @@ mod routes_in;
 mod run;
 mod seal;
 mod socket;
+mod stalls;
 mod stand_in;
 mod status;
 

@@ -2,7 +2,7 @@
 
 use std::{
     net::{Ipv4Addr, SocketAddr},
-    sync::Arc,
+    sync::{Arc, Mutex},
     time::Duration,
 };
 
@@ -76,6 +76,8 @@ async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
         domain: config.domain,
         max_message: config.max_message,
         queues: Room::new(config.reliable_queue),
+        stalled_after: config.link.stalled,
+        stalls: Mutex::default(),
     });
     if let (Some(keyring), Some(key_events)) = (keyring, key_events) {
         tokio::spawn(keyring.run(key_events));

@@ -25,3 +25,4 @@ mod rules;
 mod secrets;
 mod services;
 mod stranger;
+mod unread;

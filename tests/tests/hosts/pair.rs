@@ -33,13 +33,15 @@ pub(crate) struct Plan {
     pub(crate) settings: [Settings; 2],
     /// Seconds that a daemon outlives its last session.
     pub(crate) grace_s: u32,
+    /// Seconds after which a peer that reads nothing is disconnected from a topic.
+    pub(crate) stalled_s: u32,
     /// Whether host B is in another domain.
     pub(crate) other_domain: bool,
 }
 
 impl Plan {
     pub(crate) fn new(settings: [Settings; 2]) -> Self {
-        Self { settings, grace_s: 300, other_domain: false }
+        Self { settings, grace_s: 300, stalled_s: 300, other_domain: false }
     }
 
     /// Starts both hosts.
@@ -65,7 +67,7 @@ impl Plan {
                 ("ROS_DOMAIN_ID", (domain + u32::from(self.other_domain && host == 1)).to_string()),
             ];
             let settings = self.settings[host].iter().cloned().chain(more);
-            Host::new(["A", "B"][host], addresses[host], settings, self.grace_s)
+            Host::new(["A", "B"][host], addresses[host], settings, [self.grace_s, self.stalled_s])
         })
     }
 }
@@ -85,11 +87,12 @@ impl Host {
         name: &'static str,
         address: Ipv4Addr,
         settings: impl IntoIterator<Item = (&'static str, String)>,
-        grace_s: u32,
+        [grace_s, stalled_s]: [u32; 2],
     ) -> Self {
         let dir = tempfile::tempdir().unwrap();
         let path = |name: &str| dir.path().join(name).to_str().unwrap().to_owned();
-        fs::write(path("axon.toml"), format!("[link]\ngrace_s = {grace_s}\n")).unwrap();
+        let toml = format!("[link]\ngrace_s = {grace_s}\nstalled_s = {stalled_s}\n");
+        fs::write(path("axon.toml"), toml).unwrap();
         let mut env = vec![
             ("AXON_RUNTIME_DIR".to_owned(), path("run")),
             ("AXON_CONFIG".to_owned(), path("axon.toml")),

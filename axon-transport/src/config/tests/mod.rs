@@ -127,7 +127,10 @@ fn nothing_given_is_the_table_of_defaults() {
     assert_eq!((config.max_message, config.reliable_queue), (256 << 20, 256 << 20));
     assert!(!config.shm_copy && config.trusted_uids.is_empty());
     assert_eq!(config.log, "warn");
-    assert_eq!(config.link, LinkConfig { grace: Duration::from_secs(10), mtu: 1452 });
+    assert_eq!(
+        config.link,
+        LinkConfig { grace: Duration::from_secs(10), stalled: Duration::from_secs(10), mtu: 1452 }
+    );
     assert!(config.warnings().iter().any(|w| w.contains("not authenticated")));
 
     let config = resolve(QKD, &[]).unwrap();
@@ -245,6 +248,7 @@ fn the_environment_wins_over_the_file() {
         trusted_uids = [7]
         [link]
         grace_s = 3
+        stalled_s = 4
         mtu = 9000
     ";
     let config = with_file(&[], file).unwrap();
@@ -253,7 +257,10 @@ fn the_environment_wins_over_the_file() {
     assert!(config.shm_copy);
     assert_eq!((config.ring_bytes, config.trusted_uids.len()), (8 << 20, 1));
     assert_eq!(config.daemon_peers.len(), 2);
-    assert_eq!(config.link, LinkConfig { grace: Duration::from_secs(3), mtu: 9000 });
+    assert_eq!(
+        config.link,
+        LinkConfig { grace: Duration::from_secs(3), stalled: Duration::from_secs(4), mtu: 9000 }
+    );
 
     let config =
         with_file(&[("AXON_RING_BUFFER_SIZE_MB", "9"), ("AXON_DAEMON_PEERS", "")], file).unwrap();

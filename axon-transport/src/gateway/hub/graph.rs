@@ -1,6 +1,8 @@
 //! The graph across links: what peers are told, and the routes that follow from what they tell.
 
-use super::Hub;
+use std::sync::Arc;
+
+use super::{Event, Hub};
 use crate::{
     daemon::bridge::ToControl,
     gateway::{
@@ -37,6 +39,28 @@ impl Hub {
             peer.drained(&publisher, &self.local);
         }
         self.tell_draining().await;
+    }
+
+    /// A peer does not read what it asked for: it is served no more, for a while.
+    pub(super) async fn stalled(&mut self, daemon: DaemonId, route: u32) {
+        let Some(peer) = self.peers.get_mut(&daemon) else { return };
+        let Some(stalled) = peer.stalled(route, &self.shared) else { return };
+        peer.update_services(&self.local, &self.shared);
+        let (number, counters) = (peer.link, Arc::clone(&peer.counters));
+        let Some(link) = self.links.get(&number) else { return };
+        let (who, events) = (self.peer_of(link), self.events.clone());
+        let (topic, reason) = (stalled.topic, stalled.reason);
+        let what = format!("topic {topic}");
+        self.tell(ToControl::Refusal { peer: who, what, reason }).await;
+        tokio::spawn(async move {
+            // Whoever ends it counts what was under way.
+            let samples = stalled.samples.await.unwrap_or(0);
+            counters.dropped("stalled", samples);
+            tracing::warn!(topic, samples, "samples are lost: a peer does not read the topic");
+            // An error: the hub is gone.
+            let _ =
+                events.send(Event::Lost { topic: topic.into(), cause: "stalled", samples }).await;
+        });
     }
 
     /// The daemon does not end while something is on its way.

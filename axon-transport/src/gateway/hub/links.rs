@@ -214,7 +214,8 @@ impl Hub {
                 false
             }
             None => {
-                let owner = Owner { daemon, events: self.events.clone() };
+                let identity = link.established.who.host_identity(connection.remote_address());
+                let owner = Owner { daemon, identity, events: self.events.clone() };
                 let peer = Peer::new(daemon, number, outbox, carrier.clone(), &self.shared, owner);
                 self.peers.insert(daemon, peer);
                 true

@@ -9,7 +9,7 @@ mod links;
 
 use std::{
     collections::{BTreeMap, HashMap},
-    sync::Arc,
+    sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
 
@@ -33,6 +33,7 @@ use super::{
     refusal::{Refusal, RefusedBy},
     room::Room,
     seal::Protection,
+    stalls::Stalls,
     stand_in::StandIns,
     status::{self, Who},
 };
@@ -61,6 +62,10 @@ pub(super) struct Shared {
     pub(super) max_message: u64,
     /// What may wait to be sent reliably.
     pub(super) queues: Arc<Room>,
+    /// A peer that reads nothing for so long is disconnected from the topic.
+    pub(super) stalled_after: Duration,
+    /// Those that were.
+    pub(super) stalls: Mutex<Stalls>,
 }
 
 /// What the gateway's session notices.
@@ -94,6 +99,13 @@ pub(super) enum Event {
     Identity,
     /// Nothing is left of what this publisher here left for this peer.
     Drained(DaemonId, Gid),
+    /// A peer does not read what it asked for.
+    Stalled {
+        /// The peer.
+        daemon: DaemonId,
+        /// Its number for the route.
+        route: u32,
+    },
     /// Samples of a topic did not get to a peer.
     Lost {
         /// The topic.
@@ -269,6 +281,7 @@ impl Hub {
             Event::Renew(link) => self.renew(link),
             Event::Identity => self.close_untrusted(true).await,
             Event::Drained(daemon, publisher) => self.drained(daemon, publisher).await,
+            Event::Stalled { daemon, route } => self.stalled(daemon, route).await,
             Event::Lost { topic, cause, samples } => {
                 self.tell(ToControl::Lost { topic: topic.to_string(), cause, samples }).await;
             }

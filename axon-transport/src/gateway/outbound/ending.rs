@@ -30,6 +30,11 @@ impl Endings {
         Self { owner, endings: HashMap::new() }
     }
 
+    /// Whose they are.
+    pub(super) fn owner(&self) -> &Owner {
+        &self.owner
+    }
+
     /// This publisher ended.
     pub(super) fn add(&mut self, of: Gid) {
         let ending = Ending { progress: (0, 0), since: Instant::now() };

@@ -7,6 +7,7 @@
 
 mod ending;
 mod feed;
+mod stalling;
 mod stream;
 #[cfg(test)]
 mod tests;
@@ -17,14 +18,14 @@ use std::{
         Arc, Mutex,
         atomic::{AtomicBool, Ordering},
     },
-    time::Instant,
+    time::{Duration, Instant},
 };
 
 use axon_envelope::Route;
 use quinn::Connection;
-use tokio::sync::{Notify, mpsc, watch};
+use tokio::sync::{Notify, mpsc, oneshot, watch};
 
-use self::{ending::Endings, feed::Feed};
+use self::{ending::Endings, feed::Feed, stalling::Stalling};
 use super::{
     counters::Counters,
     hub::Event,
@@ -162,6 +163,9 @@ pub(super) enum Order {
     Route(u32, RouteOut),
     /// The peer no longer wants it.
     End(u32),
+    /// The peer does not read it: as [`End`](Self::End), but what is not acknowledged is given up. How
+    /// many samples that were is told.
+    GiveUp(u32, oneshot::Sender<u64>),
     /// Send over this connection from now on.
     Connection(Carrier),
     /// The peer acknowledges samples.
@@ -174,6 +178,8 @@ pub(super) enum Order {
 pub(super) struct Owner {
     /// The peer.
     pub(super) daemon: DaemonId,
+    /// Who it proved to be.
+    pub(super) identity: String,
     /// To the hub.
     pub(super) events: mpsc::Sender<Event>,
 }
@@ -246,6 +252,8 @@ struct Moved {
 struct Active {
     flow: Flow,
     topic: Arc<str>,
+    /// Its peer reads nothing, as the hub knows.
+    stalled: bool,
     sources: Vec<Source>,
     /// The newest sequence number by publisher that the peer had when it asked.
     seen: HashMap<Gid, u64>,
@@ -261,6 +269,7 @@ pub(super) async fn run(
     queues: Arc<Room>,
     pulse: Pulse,
     owner: Owner,
+    stalled_after: Duration,
 ) {
     let (carrier, current) = watch::channel(first);
     let (popped, ended) = (Notify::new(), AtomicBool::new(false));
@@ -272,7 +281,7 @@ pub(super) async fn run(
         ended,
         done: Mutex::default(),
     });
-    let mut endings = Endings::new(owner);
+    let (mut endings, mut stalling) = (Endings::new(owner), Stalling::new(stalled_after));
     let mut routes: HashMap<u32, Active> = HashMap::new();
     let mut beat = pulse.subscribe();
     loop {
@@ -291,7 +300,10 @@ pub(super) async fn run(
                 active.done(of, done);
             }
         }
-        let mut moved = Moved { again: endings.look(&mut routes, &shared), ..Moved::default() };
+        let ending = endings.look(&mut routes, &shared);
+        let stalling = stalling.look(&mut routes, &shared, endings.owner());
+        let again = ending.into_iter().chain(stalling).min();
+        let mut moved = Moved { again, ..Moved::default() };
         for active in routes.values_mut() {
             active.move_samples(&shared, &mut moved);
         }
@@ -340,6 +352,11 @@ fn apply(
         Order::End(number) => {
             routes.remove(&number);
         }
+        Order::GiveUp(number, told) => {
+            let given_up = routes.remove(&number).map_or(0, |active| active.give_up());
+            // An error: the hub is gone.
+            let _ = told.send(given_up);
+        }
         Order::Ending(of) => endings.add(of),
         Order::Received(flows) => {
             for ReceivedOf { route, publisher, sequence, dropped } in flows {
@@ -352,6 +369,7 @@ fn apply(
             let active = routes.entry(number).or_insert_with(|| Active {
                 flow: Flow { number, route, acknowledged },
                 topic,
+                stalled: false,
                 sources: Vec::new(),
                 seen: HashMap::new(),
                 feeds: HashMap::new(),

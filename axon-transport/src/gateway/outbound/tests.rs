@@ -92,7 +92,7 @@ fn one_that_sends_no_more_leaves_nothing_behind() {
             let sources = Vec::new();
             let seen = HashMap::new();
             let (flow, topic) = (flow(), "/t".into());
-            let mut active = Active { flow, topic, sources, seen, feeds };
+            let mut active = Active { flow, topic, stalled: false, sources, seen, feeds };
             active.prune();
             assert_eq!(active.feeds.len(), 1, "something is sent");
             arrived(&pair.there).await;

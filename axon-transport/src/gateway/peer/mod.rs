@@ -58,6 +58,8 @@ pub(super) struct Peer {
     next_route: u32,
     /// Routes that this side asked for.
     asked: BTreeMap<RouteKey, Asked>,
+    /// Who it proved to be.
+    identity: String,
     /// Routes that do not come about.
     refused: RefusedRoutes,
     routes_in: Arc<RoutesIn>,
@@ -110,8 +112,9 @@ impl Peer {
         let counters = Arc::new(Counters::default());
         let (orders, receiver) = mpsc::unbounded_channel();
         let (queues, pulse) = (shared.queues.of_peer(), shared.pulse.clone());
+        let (owner_identity, stalled_after) = (owner.identity.clone(), shared.stalled_after);
         let sent = Arc::clone(&counters);
-        tokio::spawn(outbound::run(carrier, receiver, sent, queues, pulse, owner));
+        tokio::spawn(outbound::run(carrier, receiver, sent, queues, pulse, owner, stalled_after));
         let receipts = Receipts::new(outbox.clone());
         let telling = OnDrop(tokio::spawn(Arc::clone(&receipts).run()));
         Self {
@@ -126,6 +129,7 @@ impl Peer {
             sent_version: 0,
             next_route: 1,
             asked: BTreeMap::new(),
+            identity: owner_identity,
             refused: RefusedRoutes::default(),
             routes_in: Arc::default(),
             intake: Arc::new(Intake::new(shared.max_message)),

@@ -1,13 +1,19 @@
 //! Routes that the peer asks for, and what they are fed from.
 
-use std::{collections::HashMap, sync::Arc, time::Duration};
+use std::{
+    collections::HashMap,
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use axon_envelope::{Kind, Route, TopicHash};
+use tokio::sync::oneshot;
 
 use super::{OnDrop, POLL, Peer};
 use crate::{
     gateway::{
         hub::Shared,
+        keyring::lock,
         outbound::{Order, RouteOut, Source},
         routes::{RelaySpec, RouteKey, admit, relays},
     },
@@ -30,6 +36,16 @@ pub(super) struct Served {
     pub(super) repeated: bool,
     /// Sends ROUTE_READY once a publisher is attached.
     _announcing: OnDrop,
+}
+
+/// A route that its peer does not read.
+pub(in crate::gateway) struct Stalled {
+    /// Its topic.
+    pub(in crate::gateway) topic: String,
+    /// What was done.
+    pub(in crate::gateway) reason: String,
+    /// How many samples were given up, once that is known.
+    pub(in crate::gateway) samples: oneshot::Receiver<u64>,
 }
 
 impl Peer {
@@ -74,6 +90,11 @@ impl Peer {
                 Vec::new()
             }
         };
+        let left = lock(&shared.stalls).left(&self.identity, &key, Instant::now());
+        if let Some(left) = left {
+            self.refuse(number, &key, "it was not read".into(), Some(left));
+            return Ok(());
+        }
         self.refused.forget(number);
         let sources = match kind {
             Kind::Topic => self.open_relays(&key, &subscribers, &old, shared),
@@ -90,6 +111,23 @@ impl Peer {
         let served = Served { key, route, subscribers, sources, repeated, _announcing };
         self.served.insert(number, served);
         Ok(())
+    }
+
+    /// The peer does not read a route: it ends. What is to be said of it.
+    pub(in crate::gateway) fn stalled(&mut self, route: u32, shared: &Shared) -> Option<Stalled> {
+        let served = self.served.remove(&route)?;
+        let (told, samples) = oneshot::channel();
+        let _ = self.orders.send(Order::GiveUp(route, told));
+        let (limit, now) = (shared.stalled_after, Instant::now());
+        let wait = lock(&shared.stalls).add(&self.identity, &served.key, limit, now);
+        let reason = format!(
+            "nothing of {} was read for {} s; it is not sent for {} s ([link] stalled_s)",
+            served.key.topic,
+            limit.as_secs(),
+            wait.as_secs()
+        );
+        self.refuse(route, &served.key, reason.clone(), Some(wait));
+        Some(Stalled { topic: served.key.topic.clone(), reason, samples })
     }
 
     /// UNSUBSCRIBE.

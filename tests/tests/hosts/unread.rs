@@ -1,0 +1,120 @@
+//! A peer that asked for a topic and does not read it.
+
+use std::{thread, time::Duration};
+
+use axon_tests::Sizes;
+use axon_tls::identity::{Auth, SigningKey};
+use axon_transport::{
+    ids::{DaemonId, Gid},
+    link::{Message, Subscribe, Subscriber},
+    qos::Qos,
+    session::EndpointSpec,
+    shm::PublishError,
+};
+use rustix::process::Signal;
+
+use super::{
+    mode::classic,
+    pair::{Plan, signal},
+    process::{PATIENCE, until},
+    stranger::{Claim, Met, Stranger},
+};
+
+const TOPIC: &str = "/unread";
+const TYPE: &str = "test/Bytes";
+
+fn subscribe(stranger: &Stranger, met: &mut Met) {
+    let subscribe = Subscribe {
+        route: 1,
+        topic: TOPIC.into(),
+        type_name: TYPE.into(),
+        kind: 0,
+        subscribers: vec![Subscriber { gid: Gid([7; 16]), qos: Qos::keep_all() }],
+        last: vec![],
+        acknowledges: Some(true),
+    };
+    stranger.say(met, &Message::Subscribe(subscribe));
+}
+
+fn refused(message: &Message) -> bool {
+    matches!(message, Message::RouteRefused(refused) if refused.route == 1)
+}
+
+fn retry(message: Message) -> u32 {
+    let Message::RouteRefused(refused) = message else { panic!("{message:?}") };
+    refused.retry_s.expect("it may ask again")
+}
+
+#[test]
+fn a_peer_that_reads_nothing_is_disconnected_from_the_topic_and_the_publisher_goes_on() {
+    let [host, _other] = Plan { stalled_s: 3, ..Plan::new([classic(&[]), classic(&[])]) }.start();
+    let session = host.session("publisher");
+    let spec = || EndpointSpec::new(TOPIC, TYPE, Qos::keep_all());
+    let publisher = session.create_publisher(spec()).unwrap();
+    let local = host.session("reader").create_subscription(spec()).unwrap();
+    assert!(publisher.wait_matched(1, PATIENCE));
+
+    let (stranger, auth) = (Stranger::new(), Auth::None(SigningKey::generate().unwrap()));
+    let claim = Claim { host: "idle", daemon: DaemonId([0xff; 16]), auth: 0 };
+    let mut met = stranger.dial(&host, &auth, &claim).expect("a link");
+    subscribe(&stranger, &mut met);
+    until("it is served", || publisher.matched().len() == 2);
+    let reader = thread::spawn(move || {
+        let mut bytes = Vec::new();
+        while let Some(info) = local.recv(&mut bytes, Some(PATIENCE)) {
+            if bytes.is_empty() {
+                return info.sequence;
+            }
+        }
+        panic!("no last sample")
+    });
+    let sample = vec![0x5a; 1 << 20];
+    let mut published = 0;
+    loop {
+        match publisher.publish(&sample) {
+            Ok(sequence) => published = sequence,
+            Err(PublishError::Blocked { .. }) => break,
+            Err(error) => panic!("{error}"),
+        }
+    }
+    let told = stranger.hear(&mut met, refused).expect("it is told");
+    assert!(retry(told) > 0);
+    until("the publisher goes on", || publisher.publish(&[]).is_ok());
+    assert_eq!(reader.join().unwrap(), published + 1, "the reader here has it all");
+    assert!(!publisher.wait_acknowledged(Duration::ZERO) && publisher.given_up() > 0);
+    host.wait_refusal("it is shown", |text| text.contains(TOPIC) && text.contains("stalled_s"));
+    let topics = host.status().topics;
+    let stalled = topics.iter().filter_map(|topic| topic.dropped.get("stalled")).sum::<u64>();
+    assert_eq!(stalled, publisher.given_up());
+    assert!(publisher.matched().len() <= 1);
+}
+
+#[test]
+fn a_stopped_reader_behind_an_honest_daemon_is_served_again_once_it_reads() {
+    let hosts = Plan { stalled_s: 3, ..Plan::new([classic(&[]), classic(&[])]) }.start();
+    let mut there = hosts[1].subscribe(Sizes::Small);
+    let mut here = hosts[0].subscribe(Sizes::Small);
+    let mut publisher = hosts[0].flood(Sizes::Small, 2);
+    there.wait_taken(100);
+    signal(there.pid(), Signal::STOP);
+    hosts[0].wait_refusal("it is disconnected", |text| text.contains("stalled_s"));
+    until("it is shown there", || {
+        hosts[1].status().links.iter().any(|link| !link.routes_refused.is_empty())
+    });
+    let now = publisher.published();
+    here.wait_taken(now + 100);
+    signal(there.pid(), Signal::CONT);
+    // Other samples than those that were on their way when it was disconnected.
+    until("it is served again", || {
+        hosts[1].status().links.iter().all(|link| link.routes_refused.is_empty())
+    });
+    let now = publisher.published();
+    there.wait_taken(now + 100);
+    let sent = publisher.stop();
+    there.wait_taken(sent);
+    let tally = there.tally();
+    assert_eq!((tally.repeated, tally.corrupt), (0, 0), "{tally:?}");
+    for node in [publisher, here, there] {
+        node.finish();
+    }
+}
