@@ -18,12 +18,17 @@ pub(super) struct Pair {
 
 impl Pair {
     pub(super) async fn new() -> Self {
+        Self::by_way_of(|to| to).await
+    }
+
+    /// One whose dialling end finds the other at the address that this says.
+    pub(super) async fn by_way_of(way: impl FnOnce(SocketAddr) -> SocketAddr) -> Self {
         let auth = || Auth::None(SigningKey::generate().unwrap());
         let any = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
         let server = hybrid_server(&auth(), Cipher::default(), ALPN).unwrap();
         let client = hybrid_client(&auth(), Cipher::default(), ALPN).unwrap();
         let (one, other) = (Endpoint::client(any).unwrap(), Endpoint::server(server, any).unwrap());
-        let dialled = one.connect_with(client, other.local_addr().unwrap(), "axon").unwrap();
+        let dialled = one.connect_with(client, way(other.local_addr().unwrap()), "axon").unwrap();
         let accepted = async { other.accept().await.unwrap().await };
         let (here, there) = tokio::join!(dialled, accepted);
         Self { here: here.unwrap(), there: there.unwrap(), _ends: [one, other] }

@@ -4,7 +4,7 @@
 //! counts it. Only KEEP_ALL makes the relay wait, which leaves its samples in the ring and so in
 //! time holds its publisher back.
 
-use std::{collections::VecDeque, sync::Arc};
+use std::{collections::VecDeque, sync::Arc, time::Duration};
 
 use axon_envelope::Delivery;
 use bytes::Bytes;
@@ -199,6 +199,17 @@ impl Queue {
                 into.push_back(sample);
             }
         }
+    }
+
+    /// Drops those of BEST_EFFORT that have waited for longer than `life` while a newer one waits. How many.
+    pub(super) fn drop_late(&mut self, life: Duration) -> u64 {
+        let mut dropped = 0;
+        while self.samples.len() > 1
+            && self.samples.front().is_some_and(|sample| sample.since.elapsed() > life)
+        {
+            dropped += u64::from(self.pop().is_some());
+        }
+        dropped
     }
 
     /// The peer has samples up to this number. How many of them were awaited, and the newest of these.
@@ -431,6 +442,17 @@ mod tests {
         assert_eq!(taken(&mut queue), [2, 3, 4]);
         drop(queue);
         assert!(peer.take(8 * peer.of_queue()), "nothing is left of it");
+    }
+
+    #[test]
+    fn best_effort_that_waited_too_long_gives_way_to_newer_samples() {
+        let mut queue = queue(&Qos { depth: 5, ..Qos::sensor_data() }, 9, 1);
+        (1..=3).for_each(|sequence| assert_eq!(offer(&mut queue, sequence, 1), Ok(0)));
+        assert_eq!(queue.drop_late(Duration::from_secs(1000)), 0);
+        std::thread::sleep(Duration::from_millis(2));
+        // The newest stays, however old.
+        assert_eq!(queue.drop_late(Duration::from_millis(1)), 2);
+        assert_eq!(taken(&mut queue), [3]);
     }
 
     #[test]

@@ -7,6 +7,7 @@
 
 mod ending;
 mod feed;
+mod flight;
 mod stalling;
 mod stream;
 #[cfg(test)]

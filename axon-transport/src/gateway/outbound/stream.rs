@@ -14,7 +14,7 @@ use bytes::Bytes;
 use quinn::{SendStream, VarInt};
 use tokio::sync::Notify;
 
-use super::{Carrier, Done, Flow, Shared};
+use super::{Carrier, Done, Flow, Shared, flight::Flight};
 use crate::{
     gateway::{
         frames::Frames,
@@ -35,8 +35,12 @@ const TOGETHER: usize = 64 << 10;
 const SERVICES: i32 = 1;
 /// With nothing to send a stream is over after this.
 const STREAM_IDLE: Duration = Duration::from_millis(if cfg!(test) { 50 } else { 30_000 });
-/// A best-effort sample that is not acknowledged by then is given up.
+/// A best-effort sample that cannot have arrived by then gives way to a newer one, and one for which no
+/// stream can be had by then is dropped.
 const BEST_EFFORT_LIFE: Duration = Duration::from_millis(200);
+
+/// QUIC takes a whole best-effort sample within this, or none of it: others fill the link.
+const BEST_EFFORT_WRITE: Duration = Duration::from_secs(2);
 
 /// What waits for one publisher, or client of a service, and the task that sends it.
 pub(super) struct Stream {
@@ -68,6 +72,7 @@ impl Stream {
             shared,
             batch: VecDeque::new(),
             delivery: Delivery::Reliable,
+            flight: Flight::default(),
             frames: Frames::default(),
         };
         let task = tokio::spawn(writer.run());
@@ -118,6 +123,8 @@ struct Writer {
     batch: VecDeque<Sample>,
     /// How it is to be delivered.
     delivery: Delivery,
+    /// Best effort that is not acknowledged.
+    flight: Flight,
     /// What of it is sealed.
     frames: Frames,
 }
@@ -131,6 +138,16 @@ impl Writer {
         if self.batch.is_empty() {
             let mut queue = lock(&self.queue);
             self.delivery = queue.delivery();
+            if self.delivery == Delivery::BestEffort {
+                let window = || self.shared.carrier.borrow().connection.stats().path.cwnd;
+                if !self.flight.has_room(window) {
+                    return false;
+                }
+                // What would arrive too late gives way to what is newer.
+                let wait = BEST_EFFORT_LIFE.saturating_sub(self.flight.took());
+                let late = queue.drop_late(wait);
+                self.shared.counters.dropped("late", late);
+            }
             queue.pop_together(TOGETHER, &mut self.batch);
             drop(queue);
             if !self.batch.is_empty() {
@@ -143,7 +160,10 @@ impl Writer {
     /// As [`gather`](Self::gather), once something waits.
     async fn next(&mut self) {
         while !self.gather() {
-            self.filled.notified().await;
+            tokio::select! {
+                () = self.filled.notified() => {}
+                () = self.flight.landed() => {}
+            }
         }
     }
 
@@ -321,15 +341,17 @@ impl Writer {
         pieces.insert(0, self.header());
         let opened = tokio::time::timeout(BEST_EFFORT_LIFE, carrier.connection.open_uni());
         let Ok(Ok(mut stream)) = opened.await else { return Err("late") };
+        let _ = stream.set_priority(self.flight.priority());
+        let bytes = pieces.iter().map(|piece| piece.len() as u64).sum();
         let write = stream.write_all_chunks(&mut pieces);
-        if !matches!(tokio::time::timeout(BEST_EFFORT_LIFE, write).await, Ok(Ok(()))) {
+        if !matches!(tokio::time::timeout(BEST_EFFORT_WRITE, write).await, Ok(Ok(()))) {
             // Dropping it would finish it, as if the message were whole.
             let _ = stream.reset(VarInt::from_u32(CloseCode::Goodbye.code()));
             return Err("late");
         }
         let _ = stream.finish();
         self.batch.iter().for_each(|s| self.shared.counters.sent(s.payload.len()));
-        tokio::spawn(give_up_in_time(stream, carrier.clone()));
+        self.flight.add(stream, bytes, carrier.clone());
         Ok(())
     }
 }
@@ -360,13 +382,5 @@ fn finish(stream: &mut Option<SendStream>, carrier: &Carrier) {
             let _ = stream.stopped().await;
             drop(carrier);
         });
-    }
-}
-
-/// Resets a finished stream that the peer has not acknowledged in time. Until then its carrier is in use.
-async fn give_up_in_time(mut stream: SendStream, _carrier: Carrier) {
-    let acknowledged = tokio::time::timeout(BEST_EFFORT_LIFE, stream.stopped()).await;
-    if acknowledged.is_err() {
-        let _ = stream.reset(VarInt::from_u32(CloseCode::Goodbye.code()));
     }
 }

@@ -117,3 +117,120 @@ fn what_comes_when_a_stream_is_over_has_another() {
         }
     });
 }
+
+/// Passes packets of two ends on, at no more than so many bytes a second from the one that dials.
+fn shaped(to: std::net::SocketAddr, rate: u64, delay: Duration) -> std::net::SocketAddr {
+    use std::{collections::VecDeque, net::UdpSocket};
+
+    let front = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let back = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let address = front.local_addr().unwrap();
+    back.connect(to).unwrap();
+    front.set_nonblocking(true).unwrap();
+    back.set_nonblocking(true).unwrap();
+    std::thread::spawn(move || {
+        // A router's buffer: 50 ms.
+        let most = Duration::from_millis(50);
+        let (mut there, mut here) = (VecDeque::new(), VecDeque::new());
+        let (mut free, mut from, mut bytes) = (Instant::now(), None, [0; 65_536]);
+        let mut silent = Instant::now();
+        while silent.elapsed() < Duration::from_secs(20) {
+            let now = Instant::now();
+            while let Ok((length, source)) = front.recv_from(&mut bytes) {
+                (from, silent) = (Some(source), now);
+                free = free.max(now);
+                if free.duration_since(now) < most {
+                    free += Duration::from_nanos(length as u64 * 1_000_000_000 / rate);
+                    there.push_back((free + delay, bytes[..length].to_vec()));
+                }
+            }
+            while let Ok(length) = back.recv(&mut bytes) {
+                here.push_back((now + delay, bytes[..length].to_vec()));
+            }
+            while there.front().is_some_and(|(due, _)| *due <= Instant::now()) {
+                let _ = back.send(&there.pop_front().unwrap().1);
+            }
+            while here.front().is_some_and(|(due, _)| *due <= Instant::now()) {
+                let packet: (_, Vec<u8>) = here.pop_front().unwrap();
+                from.map(|from| front.send_to(&packet.1, from));
+            }
+            std::thread::sleep(Duration::from_micros(200));
+        }
+    });
+    address
+}
+
+/// Offers best-effort samples of this length, so many for each that the path can carry; the share of
+/// them that arrives, and the median of their ages when they do.
+fn overload(rate: u64, length: usize, samples: u32, load: f64, depth: u32) -> (f64, Duration) {
+    let mut builder = tokio::runtime::Builder::new_multi_thread();
+    let runtime = builder.worker_threads(2).enable_all().build().unwrap();
+    runtime.block_on(async {
+        let pair = Pair::by_way_of(|to| shaped(to, rate, Duration::from_millis(1))).await;
+        pair.there.set_max_concurrent_uni_streams(4096_u32.into());
+        pair.there.set_receive_window((256_u32 << 20).into());
+        let (shared, _carrier) = shared(&pair.here);
+        let qos = Qos { depth, ..Qos::sensor_data() };
+        let mut feed = Feed::new(OF);
+        let there = pair.there.clone();
+        let ages = Arc::new(Mutex::new(Vec::new()));
+        let noted = Arc::clone(&ages);
+        let begun = Instant::now();
+        tokio::spawn(async move {
+            while let Ok(mut stream) = there.accept_uni().await {
+                let noted = Arc::clone(&noted);
+                tokio::spawn(async move {
+                    if let Ok(bytes) = stream.read_to_end(1 << 24).await {
+                        let sent = &bytes[bytes.len() - 8..];
+                        let sent = u64::from_be_bytes(sent.try_into().unwrap());
+                        lock(&noted).push(begun.elapsed() - Duration::from_micros(sent));
+                    }
+                });
+            }
+        });
+        let every = Duration::from_secs_f64(length as f64 / rate as f64 / load);
+        for number in 1..=samples {
+            tokio::time::sleep_until((begun + every * number).into()).await;
+            let mut payload = vec![0; length];
+            let now = begun.elapsed().as_micros() as u64;
+            payload[length - 8..].copy_from_slice(&now.to_be_bytes());
+            let mut sample = a_sample(number.into());
+            sample.payload = payload.into();
+            feed.queue(sample, &qos, flow(), &shared);
+        }
+        tokio::time::sleep(Duration::from_secs(2)).await;
+        let mut ages = lock(&ages).clone();
+        ages.sort_unstable();
+        let median = ages.get(ages.len() / 2).copied().unwrap_or_default();
+        (ages.len() as f64 / f64::from(samples), median)
+    })
+}
+
+#[test]
+fn of_best_effort_beyond_what_a_link_carries_most_of_what_it_carries_arrives() {
+    // A link can carry half of it.
+    let (share, _) = overload(1_000_000, 64 << 10, 60, 2.0, 5);
+    assert!(share > 0.2, "{share}");
+}
+
+#[test]
+fn best_effort_that_crosses_an_idle_link_slowly_arrives() {
+    // Each takes half a second, and the link is idle for as long.
+    let (share, _) = overload(250_000, 125_000, 4, 0.5, 1);
+    assert!(share > 0.9, "{share}");
+}
+
+/// `cargo test -p axon-transport --lib best_effort_figures -- --ignored --nocapture`
+#[test]
+#[ignore = "figures: 512 KiB at 54 Mbit/s"]
+fn best_effort_figures() {
+    for depth in [1, 5] {
+        for load in [0.5, 1.01, 1.26, 2.3] {
+            let (share, age) = overload(54_000_000 / 8, 512 << 10, 150, load, depth);
+            let whole = share * load;
+            eprintln!(
+                "depth {depth}: {load:.2} offered, {share:.3} arrived, {whole:.2} of the link, {age:?}"
+            );
+        }
+    }
+}
