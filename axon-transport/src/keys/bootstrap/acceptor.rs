@@ -48,6 +48,15 @@ const KNOWN: usize = 1024;
 /// After this a call counts as lost, answered or not.
 const LOST: Duration = Duration::from_secs(60);
 
+/// What a look-up does about a key that is not at hand.
+#[derive(Clone, Copy)]
+enum Miss {
+    /// Has the KME asked for it, within the limits of its source.
+    Fetch,
+    /// Nothing.
+    Leave,
+}
+
 /// What a look-up found, and why nothing more.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
@@ -170,7 +179,7 @@ impl Acceptor {
     /// Looks up, and fetches within the same bounds, a key that a probe names ahead of its
     /// handshake.
     pub fn prefetch(&self, source: IpAddr, identity: &[u8]) -> Lookup {
-        self.look_up(Some(source), identity).0
+        self.look_up(source, identity, Miss::Fetch).0
     }
 
     /// A handshake under `identity` is complete: the key is spent, and erased.
@@ -284,8 +293,7 @@ impl Acceptor {
         self.state().expire(now);
     }
 
-    /// Without a `source` to count a fetch for, nothing is fetched.
-    fn look_up(&self, source: Option<IpAddr>, identity: &[u8]) -> (Lookup, Option<Arc<Psk>>) {
+    fn look_up(&self, source: IpAddr, identity: &[u8], miss: Miss) -> (Lookup, Option<Arc<Psk>>) {
         let inner = &*self.0;
         let Ok(parsed) = PskIdentity::parse(identity) else { return (Lookup::Malformed, None) };
         let Ok(key_id) = KeyId::new(parsed.key_id()) else { return (Lookup::Malformed, None) };
@@ -316,7 +324,9 @@ impl Acceptor {
         if state.pending.iter().any(|p| p.identity == parsed) {
             return (Lookup::Fetching, None);
         }
-        let Some(source) = source else { return (Lookup::UnknownKeyId, None) };
+        if matches!(miss, Miss::Leave) {
+            return (Lookup::UnknownKeyId, None);
+        }
         let seen = fingerprint(identity);
         let missed = state.missed.last_seen(&seen);
         let missed = missed.is_some_and(|at| now.saturating_sub(at) < MISSED_FOR);
@@ -438,13 +448,13 @@ impl Resolver {
 
 impl PskResolver for Resolver {
     fn resolve(&self, identity: &[u8]) -> Option<Arc<Psk>> {
-        let (lookup, psk) = self.acceptor.look_up(Some(self.source), identity);
+        let (lookup, psk) = self.acceptor.look_up(self.source, identity, Miss::Fetch);
         *self.last() = Some((lookup, PskIdentity::parse(identity).ok()));
         psk
     }
 
     fn resolve_known(&self, identity: &[u8]) -> Option<Arc<Psk>> {
-        let (lookup, psk) = self.acceptor.look_up(None, identity);
+        let (lookup, psk) = self.acceptor.look_up(self.source, identity, Miss::Leave);
         let psk = psk?;
         *self.last() = Some((lookup, PskIdentity::parse(identity).ok()));
         Some(psk)
