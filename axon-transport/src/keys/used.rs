@@ -18,8 +18,8 @@ const UNWRITTEN: usize = 65_536;
 /// Time between two tries to open the file of a daemon that has not ended yet.
 const AGAIN: Duration = Duration::from_secs(1);
 
-/// A record of the key_IDs of all keys that the KME gave this host. No key is in it. Where its
-/// file cannot be kept the record lasts as long as the daemon does, which the log says once.
+/// A record of the key_IDs of all keys that the KME gave this host. It holds no key. If its file
+/// cannot be kept, the record lasts as long as the daemon, and the log says so once.
 #[derive(Clone)]
 pub struct UsedKeys(Arc<Mutex<Used>>);
 

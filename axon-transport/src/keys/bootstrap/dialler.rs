@@ -27,8 +27,8 @@ const REDIAL: [Duration; 6] = [
 ];
 /// How long a key is tried against refusals, beyond the time that the peer's KME may take.
 const REFUSED_FOR: Duration = Duration::from_secs(7);
-/// How often the peer may say that its key of this name is another one. More than once, since
-/// anyone on the path can say so.
+/// Alerts `decrypt_error` after which a key is given up. More than one, since anybody on the path
+/// can forge the alert.
 const MISMATCHES: u32 = 4;
 /// Longest wait before the KME is asked for another key, after a call or a key that failed.
 const BACK_OFF_MAX: Duration = Duration::from_secs(60);
@@ -175,8 +175,7 @@ impl Dialler {
         }
     }
 
-    /// The peer holds another key under the name `key_id` (0x133). True where that was said often
-    /// enough for the key to be given up.
+    /// The peer holds another key under `key_id` (0x133). Returns whether the key is given up.
     pub fn mismatched(&mut self, now: Duration, sae: &str, key_id: &KeyId) -> bool {
         let held = self.peers.get_mut(sae).and_then(|peer| match &mut peer.state {
             State::Held(held) if held.key_id == *key_id => Some(held),

@@ -41,7 +41,7 @@ const PROOF_PAUSE: (Duration, Duration) = (Duration::from_secs(1), Duration::fro
 /// Peers and sources that failed.
 const UNPROVEN: usize = 1024;
 
-/// Who failed to prove its name, from where: each try costs a key.
+/// Failed proofs by source and SAE: each one costs a key.
 #[derive(Default)]
 pub(super) struct Unproven(HashMap<(Source, String), Tries>);
 

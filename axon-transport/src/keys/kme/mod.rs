@@ -205,7 +205,7 @@ async fn serve(
         let (caller, events) = (Arc::clone(&caller), events.clone());
         running.spawn(async move {
             let outcome = caller.run(&job.request).await;
-            // Who hears of the last answer may start the next client, on the same files.
+            // The receiver of the last answer may start the next client at once, on the same file.
             drop(caller);
             drop(permit);
             let took = job.since.elapsed();

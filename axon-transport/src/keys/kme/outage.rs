@@ -1,11 +1,14 @@
 //! What of the KME fails at present, so that the log says it once, by name, and says its end.
 
-use std::{collections::HashMap, time::Instant};
+use std::{
+    collections::HashMap,
+    time::{Duration, Instant},
+};
 
 use crate::keys::request::{Failure, FailureKind, Purpose, Request};
 
 /// Time between two lines about one call and SAE: a KME that comes and goes is not worth more.
-const EVERY: std::time::Duration = std::time::Duration::from_secs(10);
+const EVERY: Duration = Duration::from_secs(10);
 /// `dec_keys` calls in a row that are refused before that is worth a line: a peer names keys again
 /// that its KME gave away, and KMEs relay keys late.
 const REFUSED: u64 = 20;
@@ -139,8 +142,6 @@ fn advice(kind: FailureKind) -> &'static str {
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
     use super::*;
 
     fn enc(slave: &str) -> Request {
