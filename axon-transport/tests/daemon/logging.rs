@@ -119,6 +119,8 @@ fn a_flood_of_one_kind_leaves_few_lines_and_a_count() {
         domain: 0,
         settings: Vec::new(),
         relay: None,
+        range: None,
+        static_peers: None,
     });
     for _ in 0..FLOOD {
         let stranger = address.connect().unwrap();

@@ -22,7 +22,8 @@ impl Stage {
         let run = dir.path().join("run").into_os_string();
         let env = [("AXON_RUNTIME_DIR".into(), run), ("AXON_DAEMON".into(), "require".into())];
         let config = Config::resolve(env, None, &OsFiles).unwrap();
-        let (listener, _) = Address::of(&config).bind().unwrap().into_parts();
+        let (mut listeners, _) = Address::of(&config).bind().unwrap().into_parts();
+        let listener = listeners.pop().expect("a path");
         Self { listener, config, _dir: dir }
     }
 
@@ -38,8 +39,12 @@ impl Stage {
         let [segment, doorbell, pidfd] = <[_; 3]>::try_from(descriptors).expect("three");
         let handed = PeerDescriptors { segment, doorbell, pidfd };
         let daemon = Daemon { socket, id: hello.session, handed };
-        let welcome =
-            Welcome { protocol: PROTOCOL, daemon: DaemonId([number; 16]), pid: std::process::id() };
+        let welcome = Welcome {
+            protocol: PROTOCOL,
+            daemon: DaemonId([number; 16]),
+            pid: std::process::id(),
+            ranges: Some(true),
+        };
         daemon.say(Message::Welcome(welcome), &[probe().unwrap().as_fd()]);
         daemon.tell_all(Vec::new());
         daemon

@@ -280,6 +280,7 @@ fn a_publisher_counts_those_of_a_relay_that_it_meets() {
         session: id(GATEWAY),
         stands_for: Some(vec![met, not_met]),
         segments: vec![],
+        after: None,
     };
     world.registry.message(&id(GATEWAY), Message::Attach(attach), vec![]).unwrap();
     let stands_for = |told: &[Message]| {
@@ -297,6 +298,7 @@ fn a_publisher_counts_those_of_a_relay_that_it_meets() {
         session: id(1),
         ring: place,
         segments: vec![],
+        after: None,
     };
     world.registry.message(&id(1), Message::Grant(granted), vec![]).unwrap();
     // The other host's session lists this host from now on.
