@@ -87,6 +87,12 @@ pub async fn run(
 
     loop {
         let nameless = hosts.is_empty() && shell.names.is_empty();
+        // Where nobody is looked for, interfaces that change are no reason to wake up.
+        let looks = match range {
+            DiscoveryRange::Off => false,
+            DiscoveryRange::Localhost => !hosts.is_empty(),
+            DiscoveryRange::Subnet => true,
+        };
         let wakeup = shell.peers.next_wakeup().map(|at| shell.start + at);
         tokio::select! {
             event = events.recv() => match event {
@@ -113,9 +119,12 @@ pub async fn run(
                     // Once the one that is under way is over, with what is wanted by then.
                     names.reset_immediately();
                 }
-                look.reset_immediately();
+                if range != DiscoveryRange::Off {
+                    shell.look_at_interfaces();
+                }
+                look.reset();
             }
-            _ = look.tick(), if range != DiscoveryRange::Off => shell.look_at_interfaces(),
+            _ = look.tick(), if looks => shell.look_at_interfaces(),
             _ = names.tick(), if lookups.is_empty() && !nameless => {
                 lookups.spawn(look_up(hosts.clone()));
             }

@@ -41,7 +41,9 @@ pub(super) struct Store {
 
 /// Is told of each key that is drawn: its key_ID and the key.
 #[derive(Clone, Default)]
-pub(super) struct Witness(Option<Arc<dyn Fn(&str, &[u8]) + Send + Sync>>);
+pub(super) struct Witness(Option<Arc<Tell>>);
+
+type Tell = dyn Fn(&str, &[u8]) + Send + Sync;
 
 impl Witness {
     pub(super) fn new(tell: impl Fn(&str, &[u8]) + Send + Sync + 'static) -> Self {

@@ -14,6 +14,9 @@ use super::pair::write_key;
 /// Variables and their values.
 pub(crate) type Settings = Vec<(&'static str, String)>;
 
+/// Keys by their key_ID, as they were drawn.
+type Drawn = Vec<(String, Vec<u8>)>;
+
 pub(crate) const SAE: [&str; 2] = ["sae-a", "sae-b"];
 
 /// KMEs of the two hosts, and what they gave the SAEs.
@@ -21,7 +24,7 @@ pub(crate) struct Kmes {
     network: sim::Network,
     dir: tempfile::TempDir,
     _runtime: tokio::runtime::Runtime,
-    drawn: Arc<Mutex<Vec<(String, Vec<u8>)>>>,
+    drawn: Arc<Mutex<Drawn>>,
 }
 
 impl Kmes {
@@ -32,7 +35,7 @@ impl Kmes {
         let network = sim::Network::builder()
             .kme("kme-a", ([127, 0, 0, 1], 0).into(), [SAE[0]])
             .kme("kme-b", ([127, 0, 0, 2], 0).into(), [SAE[1]]);
-        let drawn = Arc::new(Mutex::new(Vec::new()));
+        let drawn = Arc::new(Mutex::new(Drawn::new()));
         let witness = Arc::clone(&drawn);
         let network = network.witness(move |key_id, key| {
             witness.lock().unwrap().push((key_id.to_owned(), key.to_vec()));
@@ -53,7 +56,7 @@ impl Kmes {
     }
 
     /// Each key that was drawn so far, and its key_ID.
-    pub(crate) fn drawn(&self) -> Vec<(String, Vec<u8>)> {
+    pub(crate) fn drawn(&self) -> Drawn {
         self.drawn.lock().unwrap().clone()
     }
 

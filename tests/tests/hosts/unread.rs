@@ -5,8 +5,9 @@ use std::{thread, time::Duration};
 use axon_tests::Sizes;
 use axon_tls::identity::{Auth, SigningKey};
 use axon_transport::{
+    graph::{Endpoint, EndpointKind},
     ids::{DaemonId, Gid},
-    link::{Message, Subscribe, Subscriber},
+    link::{Graph, Message, Subscribe, Subscriber},
     qos::Qos,
     session::EndpointSpec,
     shm::PublishError,
@@ -22,14 +23,29 @@ use super::{
 
 const TOPIC: &str = "/unread";
 const TYPE: &str = "test/Bytes";
+/// The peer's subscription of the topic.
+const SUBSCRIPTION: Gid = Gid([7; 16]);
 
 fn subscribe(stranger: &Stranger, met: &mut Met) {
+    let subscription = Endpoint {
+        gid: SUBSCRIPTION,
+        kind: EndpointKind::Subscription,
+        topic: TOPIC.into(),
+        type_name: TYPE.into(),
+        type_hash: Vec::new(),
+        qos: Qos::keep_all(),
+        node: "idle".into(),
+        namespace: "/".into(),
+        enclave: String::new(),
+    };
+    let graph = Graph { version: 1, added: vec![subscription], ..Graph::default() };
+    stranger.say(met, &Message::Graph(graph));
     let subscribe = Subscribe {
         route: 1,
         topic: TOPIC.into(),
         type_name: TYPE.into(),
         kind: 0,
-        subscribers: vec![Subscriber { gid: Gid([7; 16]), qos: Qos::keep_all() }],
+        subscribers: vec![Subscriber { gid: SUBSCRIPTION, qos: Qos::keep_all() }],
         last: vec![],
         acknowledges: Some(true),
     };

@@ -225,7 +225,9 @@ fn a_pair_that_cannot_share_memory_is_shown_with_the_reason() {
     let shown = registry.take_refused();
     assert_eq!(shown[0].0, id(1));
     let text = &shown[0].1;
-    assert!(text.contains("\"/t\"") && text.contains("AXON_SHM") && text.contains("not [1mmapped"));
+    assert!(
+        text.contains("\"/t\"") && text.contains("AXON_SHM") && text.contains("not  [1mmapped")
+    );
     assert!(text.len() < 600 && !text.contains('\u{1b}'), "{text}");
     // The reader's side ends it.
     drain(&mut registry, 1);

@@ -273,7 +273,7 @@ mod tests {
         graph::EndpointKind,
         ids::SessionId,
         qos::Qos,
-        shm::{Peer, ReaderInfo, ReaderOptions, RingOptions, SessionSegment, Writer},
+        shm::{Peer, PublishError, ReaderInfo, ReaderOptions, RingOptions, SessionSegment, Writer},
     };
 
     /// A subscription's reader of a publisher of the same session, which is made for it.
@@ -325,7 +325,8 @@ mod tests {
     }
 
     #[test]
-    fn whatever_numbers_other_hosts_say_losses_can_be_counted() {
+    fn numbers_from_other_hosts_leave_losses_that_can_be_counted() {
+        const FURTHEST: u64 = 1 + (1 << 32);
         let session = SessionSegment::create(SessionId::random()).unwrap();
         let [gid, writers @ ..] = [1, 2, 3].map(|number| Gid::new(session.id(), number));
         let (mut slots, inner, mut out) = (Slots::default(), subscription(gid), Vec::new());
@@ -333,9 +334,13 @@ mod tests {
         for writer in writers {
             let (publisher, reader) = reading(&session, writer, gid);
             slots.add(reader, None, true, false);
-            for sequence in [1, u64::MAX] {
-                publisher.publish(Meta { sequence, source_timestamp: 0 }, b"sample").unwrap();
-            }
+            let say =
+                |sequence| publisher.publish(Meta { sequence, source_timestamp: 0 }, b"sample");
+            say(1).unwrap();
+            // So many cannot have been lost.
+            let refused = PublishError::Sequence { sequence: u64::MAX, last: 1 };
+            assert_eq!(say(u64::MAX).unwrap_err(), refused);
+            say(FURTHEST).unwrap();
             publishers.push(publisher);
         }
         let mut numbers = Vec::new();
@@ -347,9 +352,10 @@ mod tests {
             numbers.push(info.sequence);
         }
         numbers.sort_unstable();
-        assert_eq!(numbers, [1, 1, u64::MAX, u64::MAX]);
-        assert_eq!((slots.new_losses(), slots.losses()), (u64::MAX, u64::MAX));
+        let lost = 2 * (FURTHEST - 2);
+        assert_eq!(numbers, [1, 1, FURTHEST, FURTHEST]);
+        assert_eq!((slots.new_losses(), slots.losses()), (lost, lost));
         assert!(writers.iter().all(|writer| slots.end(writer)));
-        assert_eq!((slots.new_losses(), slots.losses()), (0, u64::MAX));
+        assert_eq!((slots.new_losses(), slots.losses()), (0, lost));
     }
 }
