@@ -8,6 +8,7 @@ pub mod events;
 pub mod ffi;
 pub mod gateway;
 pub mod graph;
+mod heap;
 pub mod ids;
 pub mod keys;
 pub mod link;

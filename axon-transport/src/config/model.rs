@@ -211,11 +211,13 @@ pub struct LinkConfig {
     pub stalled: Duration,
     /// Largest UDP payload that path discovery tries, in bytes.
     pub mtu: u16,
+    /// What the graph of one peer may take here, and its routes as much again, in bytes.
+    pub graph: usize,
 }
 
 impl Default for LinkConfig {
     fn default() -> Self {
         let ten = Duration::from_secs(10);
-        Self { grace: ten, stalled: ten, mtu: 1452 }
+        Self { grace: ten, stalled: ten, mtu: 1452, graph: 16 << 20 }
     }
 }

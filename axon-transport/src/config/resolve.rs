@@ -313,7 +313,10 @@ fn link(sources: &Sources) -> Result<LinkConfig, ConfigError> {
             "grace_s" => link.grace = Duration::from_secs(number(0, 86_400, "seconds")?),
             "stalled_s" => link.stalled = Duration::from_secs(number(1, 86_400, "seconds")?),
             "mtu" => link.mtu = number(1_200, 65_527, "bytes")? as u16,
-            _ => return Err(ConfigError::name(&name, "grace_s, stalled_s, mtu").at(place)),
+            "graph_mb" => link.graph = (number(1, 1_024, "MiB")? as usize) << 20,
+            _ => {
+                return Err(ConfigError::name(&name, "grace_s, stalled_s, mtu, graph_mb").at(place));
+            }
         }
     }
     Ok(link)

@@ -279,6 +279,15 @@ pub struct LinkStatus {
     /// How many more there are.
     #[serde(default)]
     pub more_routes_refused: usize,
+    /// Endpoints and nodes of the peer that are known here.
+    #[serde(default)]
+    pub endpoints: u64,
+    /// Those that it announces and that are left out here; a refusal names the first.
+    #[serde(default)]
+    pub endpoints_left_out: u64,
+    /// Bytes that count for the graph of the peer's identity, over all of its daemon ids.
+    #[serde(default)]
+    pub graph_bytes: u64,
 }
 
 /// Somebody who was refused.

@@ -8,9 +8,16 @@ use std::sync::{
 use quinn::{Connection, RecvStream, SendStream};
 use tokio::sync::mpsc;
 
-use super::establish::close;
-use crate::link::{
-    CloseCode, FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, Message, read_length,
+use super::{
+    account::{Account, Unpacked},
+    establish::close,
+};
+use crate::{
+    graph::Endpoint,
+    link::{
+        CloseCode, FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, Message,
+        read_length, unpacked_length,
+    },
 };
 
 /// Why no further message came.
@@ -57,22 +64,54 @@ impl ControlReader {
 
     /// The next message of a known type. Not cancel safe: a cancelled read loses its place.
     pub(super) async fn next(&mut self) -> Result<Message, ControlError> {
-        let ended = |e: &dyn std::fmt::Display| ControlError::Ended(e.to_string());
         loop {
-            let mut prefix = [0; 4];
-            self.stream.read_exact(&mut prefix).await.map_err(|e| ended(&e))?;
-            let length = read_length(prefix, self.limit)?;
-            let mut frame = vec![0; length];
-            self.stream.read_exact(&mut frame).await.map_err(|e| ended(&e))?;
+            let length = self.length().await?;
+            let frame = self.frame(length).await?;
             if let Some(message) = Message::from_frame(&frame, self.inflated)? {
                 return Ok(message);
             }
         }
     }
+
+    /// As [`next`](Self::next), once the peer's account has room for the frame, and then for what
+    /// becomes of it: until the message is handled, and what comes with it here is dropped.
+    pub(super) async fn next_within(
+        &mut self,
+        account: &Account,
+    ) -> Result<(Message, Unpacked), ControlError> {
+        loop {
+            let length = self.length().await?;
+            let reading = account.reading(length).await;
+            let frame = self.frame(length).await?;
+            // What is too long for anybody is refused before it waits.
+            let unpacked = account.unpacked(unpacked_length(&frame).min(self.inflated)).await;
+            let message = Message::from_frame(&frame, self.inflated)?;
+            drop((frame, reading));
+            if let Some(message) = message {
+                return Ok((message, unpacked));
+            }
+        }
+    }
+
+    async fn length(&mut self) -> Result<usize, ControlError> {
+        let mut prefix = [0; 4];
+        self.stream.read_exact(&mut prefix).await.map_err(ended)?;
+        Ok(read_length(prefix, self.limit)?)
+    }
+
+    async fn frame(&mut self, length: usize) -> Result<Vec<u8>, ControlError> {
+        let mut frame = vec![0; length];
+        self.stream.read_exact(&mut frame).await.map_err(ended)?;
+        Ok(frame)
+    }
 }
 
-/// What may wait for a peer that does not read: about three graphs of the largest size.
-const MAX_QUEUED: usize = 200_000;
+fn ended(error: quinn::ReadExactError) -> ControlError {
+    ControlError::Ended(error.to_string())
+}
+
+/// Bytes that may wait for a peer that does not read, by [`weight`].
+const MAX_QUEUED: usize = 64 << 20;
 
 /// Where control messages wait to be written. Cheap to clone.
 #[derive(Clone, Debug)]
@@ -121,14 +160,23 @@ impl Outbox {
     }
 }
 
-/// What a message counts for in the queue: its elements.
+/// Bytes that a message counts for in the queue.
 fn weight(message: &Message) -> usize {
-    1 + match message {
-        Message::Graph(graph) => graph.added.len() + graph.removed.len(),
-        Message::Subscribe(subscribe) => subscribe.subscribers.len() + subscribe.last.len(),
-        Message::RouteReady(ready) => ready.publishers.len(),
-        _ => 0,
-    }
+    size_of::<Message>()
+        + match message {
+            Message::Graph(graph) => {
+                let added: usize = graph.added.iter().map(Endpoint::bytes).sum();
+                let ranges = [&graph.localhost, &graph.listing].into_iter().flatten();
+                let ranges: usize = ranges.map(|gids| size_of_val(&**gids)).sum();
+                added + ranges + size_of_val(&*graph.removed)
+            }
+            Message::Subscribe(subscribe) => subscribe.bytes(),
+            Message::RouteReady(ready) => size_of_val(&*ready.publishers),
+            Message::Asserted(asserted) => size_of_val(&*asserted.publishers),
+            Message::Received(received) => size_of_val(&*received.flows),
+            Message::RouteRefused(refused) => refused.reason.len(),
+            _ => 0,
+        }
 }
 
 /// Writes messages.

@@ -8,6 +8,7 @@
 pub mod attempt;
 
 mod accept;
+mod account;
 mod context;
 mod control;
 mod counters;
@@ -22,6 +23,7 @@ mod inbound;
 mod intake;
 mod keyring;
 mod outbound;
+mod pace;
 mod peer;
 mod pieces;
 #[cfg(test)]

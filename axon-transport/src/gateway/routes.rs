@@ -86,7 +86,7 @@ pub(super) fn wanted<'a>(
     let mut routes: BTreeMap<RouteKey, Wanted> = BTreeMap::new();
     let mut counted = BTreeSet::new();
     for remote in remote.into_iter().filter(|remote| writes(remote.endpoint.kind)) {
-        let writer = &remote.endpoint;
+        let writer: &Endpoint = &remote.endpoint;
         let candidates = readers.get(&*writer.topic).into_iter().flatten();
         let in_range = candidates.filter(|(_, own)| out_of_range(*own, remote.toward).is_none());
         let served: Vec<&Endpoint> = in_range

@@ -10,6 +10,7 @@ use tokio::sync::mpsc;
 
 use super::{
     accept::accept,
+    account::Accounts,
     context::Context,
     endpoint::{Endpoints, reset_key},
     error::GatewayError,
@@ -75,6 +76,7 @@ async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
         session,
         domain: config.domain,
         max_message: config.max_message,
+        accounts: Accounts::new(config.link.graph),
         queues: Room::new(config.reliable_queue),
         stalled_after: config.link.stalled,
         stalls: Mutex::default(),

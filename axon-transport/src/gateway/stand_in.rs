@@ -17,7 +17,12 @@ use std::{
     time::Duration,
 };
 
-use super::{keyring::lock, queue::Sample, seal::sample};
+use super::{
+    account::{Account, Charge},
+    keyring::lock,
+    queue::Sample,
+    seal::sample,
+};
 use crate::{
     graph::Endpoint,
     ids::Gid,
@@ -42,10 +47,12 @@ pub(super) struct StandIn {
     last: AtomicU64,
     gid: Gid,
     known: Known,
+    _place: Charge,
 }
 
 impl StandIns {
-    /// The stand-in for `remote`: the one that there is, or a new one.
+    /// The stand-in for `remote`: the one that there is, or a new one; `None` when `account` has as
+    /// many as it may.
     ///
     /// # Errors
     /// It cannot be made, or another one under this GID still has readers to be drained.
@@ -53,7 +60,8 @@ impl StandIns {
         &self,
         session: &Session,
         remote: &Endpoint,
-    ) -> Result<Arc<StandIn>, SessionError> {
+        account: &Account,
+    ) -> Result<Option<Arc<StandIn>>, SessionError> {
         loop {
             let mut known = lock(&self.0);
             match known.get(&remote.gid).map(Weak::upgrade) {
@@ -62,7 +70,7 @@ impl StandIns {
                     // Released first: dropping the last of them takes the lock.
                     drop(known);
                     if same {
-                        return Ok(stand_in);
+                        return Ok(Some(stand_in));
                     }
                     return Err(SessionError::InUse(remote.gid));
                 }
@@ -72,15 +80,17 @@ impl StandIns {
                     std::thread::sleep(Duration::from_micros(100));
                 }
                 None => {
+                    let Some(place) = account.stand_ins.charge(1) else { return Ok(None) };
                     let stand_in = Arc::new(StandIn {
                         face: Some(Face::stand_in(session, remote.clone())?),
                         feeding: Arc::default(),
                         last: AtomicU64::new(0),
                         gid: remote.gid,
                         known: Arc::clone(&self.0),
+                        _place: place,
                     });
                     known.insert(remote.gid, Arc::downgrade(&stand_in));
-                    return Ok(stand_in);
+                    return Ok(Some(stand_in));
                 }
             }
         }

@@ -74,7 +74,16 @@ pub struct Limits {
 /// The bounds in force.
 pub const LIMITS: Limits = Limits { name: 512, type_hash: 64, endpoints: 65_536 };
 
+/// Bytes that an endpoint takes in the tables that know it, its names aside.
+const ENTRY: usize = size_of::<Endpoint>() + 128;
+
 impl Endpoint {
+    /// Bytes that count for it where memory is bounded: its names and what keeps it.
+    pub fn bytes(&self) -> usize {
+        let names = [&self.topic, &self.type_name, &self.node, &self.namespace, &self.enclave];
+        ENTRY + self.type_hash.len() + names.iter().map(|name| name.len()).sum::<usize>()
+    }
+
     /// Whether every field is within [`LIMITS`], what must be named is, and the depth is usable.
     pub fn is_sane(&self) -> bool {
         let names = [&self.topic, &self.type_name, &self.node, &self.namespace, &self.enclave];

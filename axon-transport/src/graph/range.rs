@@ -1,6 +1,8 @@
 //! Which endpoints may be matched by the discovery ranges of their sessions: one rule for the daemons
 //! of both hosts, either of which can refuse a pair.
 
+use std::sync::Arc;
+
 use minicbor::{Decode, Encode};
 
 use super::Endpoint;
@@ -75,7 +77,7 @@ pub struct Toward {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RemoteEndpoint {
     /// The endpoint.
-    pub endpoint: Endpoint,
+    pub endpoint: Arc<Endpoint>,
     /// The range of its session towards this host.
     pub toward: Toward,
 }
@@ -83,7 +85,8 @@ pub struct RemoteEndpoint {
 impl From<Endpoint> for RemoteEndpoint {
     /// An endpoint whose daemon says nothing of ranges: its session is SUBNET and lists nobody.
     fn from(endpoint: Endpoint) -> Self {
-        Self { endpoint, toward: Toward { range: DiscoveryRange::Subnet, lists: false } }
+        let toward = Toward { range: DiscoveryRange::Subnet, lists: false };
+        Self { endpoint: Arc::new(endpoint), toward }
     }
 }
 

@@ -56,6 +56,16 @@ pub fn read_length(prefix: [u8; 4], limit: usize) -> Result<usize, FrameError> {
     }
 }
 
+/// Bytes of the map in `frame` (without its length) once it is decompressed, as the frame says.
+pub fn unpacked_length(frame: &[u8]) -> usize {
+    match frame.split_first() {
+        Some((kind, body)) if kind & COMPRESSED != 0 => {
+            body.first_chunk::<4>().map_or(0, |length| u32::from_be_bytes(*length) as usize)
+        }
+        _ => frame.len(),
+    }
+}
+
 impl Message {
     /// The frame of this message with its length in front.
     ///

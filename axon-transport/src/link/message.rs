@@ -158,6 +158,14 @@ pub struct Subscribe {
     pub acknowledges: Option<bool>,
 }
 
+impl Subscribe {
+    /// Bytes that count for it where memory is bounded.
+    pub fn bytes(&self) -> usize {
+        let Self { topic, type_name, subscribers, last, .. } = self;
+        topic.len() + type_name.len() + size_of_val(&**subscribers) + size_of_val(&**last)
+    }
+}
+
 /// Ends a route.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]

@@ -12,7 +12,9 @@ mod order;
 
 pub use close::CloseCode;
 pub use election::{Candidate, keep};
-pub use frame::{FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, read_length};
+pub use frame::{
+    FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, read_length, unpacked_length,
+};
 pub use hello::{Mismatch, PROTOCOL, check};
 pub use message::{
     Asserted, Elected, Graph, GraphResync, Hello, LastSeen, Message, Received, ReceivedOf,

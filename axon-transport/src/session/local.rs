@@ -39,7 +39,6 @@ impl House {
     /// What the world outside has: endpoints of `daemon` that are new, and those that are gone.
     pub(crate) fn outside(&self, daemon: DaemonId, added: Vec<Endpoint>, removed: Vec<Gid>) {
         let mut inside = self.lock();
-        let added = added.into_iter().map(Into::into).collect();
         inside.registry.remote_graph(daemon, false, added, removed);
         inside.settle(None);
     }

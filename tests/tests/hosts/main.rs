@@ -8,6 +8,7 @@ mod election;
 mod ending;
 mod events;
 mod graph;
+mod greedy;
 mod hostile;
 mod identity;
 mod load;

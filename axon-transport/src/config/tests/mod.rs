@@ -129,7 +129,12 @@ fn nothing_given_is_the_table_of_defaults() {
     assert_eq!(config.log, "warn");
     assert_eq!(
         config.link,
-        LinkConfig { grace: Duration::from_secs(10), stalled: Duration::from_secs(10), mtu: 1452 }
+        LinkConfig {
+            grace: Duration::from_secs(10),
+            stalled: Duration::from_secs(10),
+            mtu: 1452,
+            graph: 16 << 20,
+        }
     );
     assert!(config.warnings().iter().any(|w| w.contains("not authenticated")));
 
@@ -250,6 +255,7 @@ fn the_environment_wins_over_the_file() {
         grace_s = 3
         stalled_s = 4
         mtu = 9000
+        graph_mb = 4
     ";
     let config = with_file(&[], file).unwrap();
     assert_eq!(qkd(&config).peers.to_string(), "sae-b;sae-c");
@@ -259,7 +265,12 @@ fn the_environment_wins_over_the_file() {
     assert_eq!(config.daemon_peers.len(), 2);
     assert_eq!(
         config.link,
-        LinkConfig { grace: Duration::from_secs(3), stalled: Duration::from_secs(4), mtu: 9000 }
+        LinkConfig {
+            grace: Duration::from_secs(3),
+            stalled: Duration::from_secs(4),
+            mtu: 9000,
+            graph: 4 << 20,
+        }
     );
 
     let config =

@@ -64,6 +64,10 @@ fn announce_as(
     registry.message(&id(session), message, vec![]).unwrap();
 }
 
+fn graphs(messages: &[Message]) -> usize {
+    messages.iter().filter(|m| matches!(m, Message::Graph(_))).count()
+}
+
 fn whole_graphs(messages: &[Message]) -> usize {
     messages.iter().filter(|m| matches!(m, Message::Graph(graph) if graph.whole)).count()
 }
@@ -128,6 +132,52 @@ fn the_gateway_brings_the_publishers_of_other_hosts_to_every_reader() {
     assert_eq!(registry.message(&id(1), gone(last), vec![]), Ok(()));
     let other = registry.message(&id(2), gone(last), vec![]);
     assert_eq!(other, Err(Violation::NotItsOwn(last)), "nobody else speaks for other hosts");
+}
+
+#[test]
+fn the_gateway_is_told_of_this_host_alone() {
+    let mut registry = registry(&[SessionRole::Gateway, SessionRole::Application]);
+    let elsewhere = endpoint(Gid([9; 16]), EndpointKind::Publisher);
+    registry.remote_graph(DaemonId([1; 16]), true, [elsewhere.clone()], vec![]);
+    registry.flush();
+    assert!(drain(&mut registry, 1).is_empty());
+    assert_eq!(graphs(&drain(&mut registry, 2)), 1);
+    announce(&mut registry, 2, 1, EndpointKind::Publisher);
+    registry.flush();
+    assert_eq!(graphs(&drain(&mut registry, 1)), 1);
+    registry.message(&id(1), Message::Resync, vec![]).unwrap();
+    let told = drain(&mut registry, 1);
+    let items = told.iter().filter_map(|m| if let Message::Graph(g) = m { Some(g) } else { None });
+    let gids: Vec<_> = items.flat_map(|g| &g.added).map(|item| item.endpoint.gid).collect();
+    assert_eq!(gids, [Gid::new(id(2), 1)]);
+    registry.remote_gone(&DaemonId([1; 16]));
+    registry.flush();
+    assert!(drain(&mut registry, 1).is_empty());
+    assert!(graphs(&drain(&mut registry, 2)) > 0);
+}
+
+#[test]
+fn sessions_that_are_told_everything_share_its_packets() {
+    let mut registry = registry(&[SessionRole::Application; 2]);
+    let many = (0..100).map(|n| endpoint(Gid::new(id(9), n), EndpointKind::Publisher));
+    registry.remote_graph(DaemonId([1; 16]), true, many, vec![]);
+    registry.flush();
+    let mut first = [1, 2].map(|number| {
+        registry.message(&id(number), Message::Resync, vec![]).unwrap();
+        while registry.session(&id(number)).is_some_and(|s| s.queued() > 0) {
+            registry.next_output(&id(number));
+        }
+        registry.next_output(&id(number)).unwrap().packet
+    });
+    assert!(Arc::ptr_eq(&first[0], &first[1]));
+    // Of another version are others.
+    announce(&mut registry, 1, 1, EndpointKind::Subscription);
+    registry.message(&id(2), Message::Resync, vec![]).unwrap();
+    while registry.session(&id(2)).is_some_and(|s| s.queued() > 0) {
+        registry.next_output(&id(2));
+    }
+    first[1] = registry.next_output(&id(2)).unwrap().packet;
+    assert!(!Arc::ptr_eq(&first[0], &first[1]));
 }
 
 #[test]

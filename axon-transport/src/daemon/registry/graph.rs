@@ -1,8 +1,11 @@
 //! The graph that sessions are shown, and its changes.
 
-use std::collections::BTreeSet;
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    sync::{Arc, Weak},
+};
 
-use super::{LocalEndpoint, Registry};
+use super::{LocalEndpoint, Registry, output::encode};
 use crate::{
     graph::{Endpoint, LIMITS, RemoteEndpoint},
     ids::{DaemonId, Gid, SessionId},
@@ -21,7 +24,7 @@ impl<F: Clone> Registry<F> {
         &mut self,
         daemon: DaemonId,
         reset: bool,
-        added: Vec<RemoteEndpoint>,
+        added: impl IntoIterator<Item = impl Into<RemoteEndpoint>>,
         removed: Vec<Gid>,
     ) {
         if reset {
@@ -31,11 +34,12 @@ impl<F: Clone> Registry<F> {
         let mut changed = Vec::new();
         for gid in removed {
             if let Some(gone) = self.remote.get_mut(&daemon).and_then(|all| all.remove(&gid)) {
-                self.graph_remove(gid);
+                self.graph_remove(gid, false);
                 changed.push(gone);
             }
         }
         for remote in added {
+            let remote: RemoteEndpoint = remote.into();
             let gid = remote.endpoint.gid;
             let local = self.endpoints.get(&gid).is_some_and(|e| e.role != EndpointRole::StandIn);
             let elsewhere =
@@ -48,13 +52,12 @@ impl<F: Clone> Registry<F> {
             let before = all.insert(gid, remote.clone());
             if before.as_ref().is_some_and(|before| before.toward != remote.toward) {
                 // Sessions that saw it may not see it any more.
-                self.graph_remove(gid);
+                self.graph_remove(gid, false);
             }
             if before.is_none_or(|before| before.toward != remote.toward) {
                 changed.push(remote.clone());
             }
-            let endpoint = remote.endpoint;
-            self.graph_add(GraphItem { endpoint, daemon: Some(daemon), reach: None });
+            self.graph_add(remote.endpoint, Some(daemon));
         }
         self.rematch_remote(&changed);
     }
@@ -62,7 +65,7 @@ impl<F: Clone> Registry<F> {
     /// Another host's daemon is gone, and its endpoints with it.
     pub fn remote_gone(&mut self, daemon: &DaemonId) {
         for (gid, _) in self.remote.remove(daemon).unwrap_or_default() {
-            self.graph_remove(gid);
+            self.graph_remove(gid, false);
         }
     }
 
@@ -73,22 +76,27 @@ impl<F: Clone> Registry<F> {
             return;
         }
         self.version += 1;
-        let removed: Vec<Gid> = std::mem::take(&mut self.removed).into_iter().collect();
+        let removed = std::mem::take(&mut self.removed);
         let added = std::mem::take(&mut self.added);
         let ended = std::mem::take(&mut self.ended);
         let regraded = std::mem::take(&mut self.regraded);
-        let regraded = regraded.iter().filter(|gid| !added.contains_key(*gid));
-        let regraded = regraded.filter_map(|gid| self.endpoints.get(gid)).filter(|e| is_shown(e));
-        let regraded: Vec<GraphItem> = regraded.map(item).collect();
+        let all: Vec<Gid> = removed.keys().copied().collect();
+        let own: Vec<Gid> = removed.iter().filter(|(_, own)| **own).map(|(gid, _)| *gid).collect();
         for (view, sessions) in self.views() {
-            let again = regraded.iter().filter(|_| view.is_gateway());
-            let shown: Vec<GraphItem> =
-                added.values().chain(again).filter_map(|item| self.shown_in(&view, item)).collect();
-            if shown.is_empty() && removed.is_empty() {
+            // What there is of other hosts the gateway said itself.
+            let removed = if view.is_gateway() { &own } else { &all };
+            let regraded = regraded.iter().filter(|_| view.is_gateway());
+            let regraded = regraded.filter(|gid| !added.contains_key(*gid));
+            let again = regraded.filter_map(|gid| self.endpoints.get(gid)).filter(|e| is_shown(e));
+            let again = again.map(|local| (&local.endpoint, None));
+            let added = added.values().map(|(endpoint, daemon)| (&**endpoint, *daemon));
+            let shown = added.chain(again).filter_map(|(e, d)| self.shown_in(&view, e, d));
+            let mut shown = shown.peekable();
+            if shown.peek().is_none() && removed.is_empty() {
                 continue;
             }
-            for part in parts(self.version, false, shown.into_iter(), &removed, &ended, false) {
-                self.push_shared(&sessions, &Message::Graph(part));
+            for packet in packets(self.version, false, shown, removed, &ended, false) {
+                self.push_encoded(&sessions, &packet);
             }
         }
     }
@@ -111,18 +119,29 @@ impl<F: Clone> Registry<F> {
     }
 
     /// The whole graph as a session is shown it, open-ended: the last part says that more follows.
-    pub(super) fn whole_graph(&self, id: &SessionId) -> Vec<Graph> {
+    /// Sessions of one view share its packets while they are of the same version.
+    pub(super) fn whole_graph(&mut self, id: &SessionId) -> Vec<Arc<[u8]>> {
         let view = self.view(id);
-        let local = self.shown().map(item);
-        let remote = self.remote_endpoints().map(|(d, e)| GraphItem {
-            endpoint: e.clone(),
-            daemon: Some(*d),
-            reach: None,
+        if self.whole.0 != self.version {
+            self.whole = (self.version, BTreeMap::new());
+        }
+        let made = self.whole.1.get(&view).and_then(|made| {
+            let made = made.iter().map(Weak::upgrade).collect::<Option<Vec<_>>>();
+            made.filter(|made| !made.is_empty())
         });
-        let shown = local.chain(remote).filter_map(|item| self.shown_in(&view, &item));
+        if let Some(made) = made {
+            return made;
+        }
+        let local = self.shown().map(|local| (&local.endpoint, None));
+        let remote = self.remote_endpoints().map(|(daemon, e)| (e, Some(*daemon)));
+        let shown = local.chain(remote).filter_map(|(e, d)| self.shown_in(&view, e, d));
         let tombstones: Vec<Gid> = self.tombstones.iter().copied().collect();
         let ended = self.tombstones.iter().copied().collect();
-        parts(self.version, true, shown, &tombstones, &ended, true)
+        let made = packets(self.version, true, shown, &tombstones, &ended, true);
+        if !view.is_gateway() {
+            self.whole.1.insert(view, made.iter().map(Arc::downgrade).collect());
+        }
+        made
     }
 
     /// The endpoints of this host's applications that are in the graph.
@@ -138,26 +157,27 @@ impl<F: Clone> Registry<F> {
             .filter_map(|(d, all)| all.remove(&endpoint.gid).map(|_| *d))
             .collect();
         if !claimed.is_empty() {
-            self.graph_remove(endpoint.gid);
+            self.graph_remove(endpoint.gid, false);
         }
-        self.graph_add(GraphItem { endpoint: endpoint.clone(), daemon: None, reach: None });
+        self.graph_add(Arc::new(endpoint.clone()), None);
     }
 
-    fn graph_add(&mut self, item: GraphItem) {
+    fn graph_add(&mut self, endpoint: Arc<Endpoint>, daemon: Option<DaemonId>) {
         // One that is back is attached to anew. That it had ended its partners have been told.
-        self.ended.remove(&item.endpoint.gid);
-        self.added.insert(item.endpoint.gid, item);
+        self.ended.remove(&endpoint.gid);
+        self.added.insert(endpoint.gid, (endpoint, daemon));
     }
 
     /// An endpoint of this host ended.
     pub(super) fn graph_end(&mut self, gid: Gid) {
-        self.graph_remove(gid);
+        self.graph_remove(gid, true);
         self.ended.insert(gid);
     }
 
-    pub(super) fn graph_remove(&mut self, gid: Gid) {
+    /// An endpoint is gone, of this host if it is its `own`.
+    pub(super) fn graph_remove(&mut self, gid: Gid, own: bool) {
         self.added.remove(&gid);
-        self.removed.insert(gid);
+        *self.removed.entry(gid).or_default() |= own;
     }
 }
 
@@ -165,8 +185,20 @@ fn is_shown(local: &LocalEndpoint) -> bool {
     local.role == EndpointRole::Application && !local.leaving
 }
 
-fn item(local: &LocalEndpoint) -> GraphItem {
-    GraphItem { endpoint: local.endpoint.clone(), daemon: None, reach: None }
+/// The packets of a change: each is made before the next one is put together.
+fn packets(
+    version: u64,
+    whole: bool,
+    added: impl Iterator<Item = GraphItem>,
+    removed: &[Gid],
+    ended: &BTreeSet<Gid>,
+    open: bool,
+) -> Vec<Arc<[u8]>> {
+    let mut packets = Vec::new();
+    each_part(version, whole, added, removed, ended, open, |part| {
+        packets.extend(encode(&Message::Graph(part)));
+    });
+    packets
 }
 
 /// Splits a change into packets. `open` leaves `more` set in the last.
@@ -178,15 +210,28 @@ pub(crate) fn parts(
     ended: &BTreeSet<Gid>,
     open: bool,
 ) -> Vec<Graph> {
+    let mut parts = Vec::new();
+    each_part(version, whole, added, removed, ended, open, |part| parts.push(part));
+    parts
+}
+
+fn each_part(
+    version: u64,
+    whole: bool,
+    added: impl Iterator<Item = GraphItem>,
+    removed: &[Gid],
+    ended: &BTreeSet<Gid>,
+    open: bool,
+    mut each: impl FnMut(Graph),
+) {
     let empty =
         |whole| Graph { version, whole, added: vec![], removed: vec![], more: true, ended: None };
-    let mut parts = Vec::new();
     let mut part = empty(whole);
     let mut size = 0;
     // Removals go first: a GID that was removed and is back must end up present.
     for gid in removed {
         if size + 34 > PART {
-            parts.push(std::mem::replace(&mut part, empty(false)));
+            each(std::mem::replace(&mut part, empty(false)));
             size = 0;
         }
         size += 17;
@@ -202,13 +247,12 @@ pub(crate) fn parts(
         let bytes = names.iter().map(|n| n.len()).sum::<usize>() + e.type_hash.len() + 160;
         let bytes = bytes + item.reach.as_ref().map_or(0, |reach| 8 + 17 * reach.lists.len());
         if size + bytes > PART {
-            parts.push(std::mem::replace(&mut part, empty(false)));
+            each(std::mem::replace(&mut part, empty(false)));
             size = 0;
         }
         size += bytes;
         part.added.push(item);
     }
     part.more = open;
-    parts.push(part);
-    parts
+    each(part);
 }

@@ -236,7 +236,7 @@ impl<F: Clone> Registry<F> {
         if local.role == EndpointRole::Application {
             let endpoint = local.endpoint.clone();
             if leaving {
-                self.graph_remove(gid);
+                self.graph_remove(gid, true);
             } else {
                 self.graph_add_local(&endpoint);
             }

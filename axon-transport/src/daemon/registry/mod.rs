@@ -18,7 +18,7 @@ mod tests;
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque},
-    sync::Arc,
+    sync::{Arc, Weak},
 };
 
 pub(crate) use graph::parts;
@@ -29,7 +29,7 @@ use crate::{
     graph::{Endpoint, RemoteEndpoint, Scope},
     ids::{DaemonId, Gid, SessionId},
     relay::Tally,
-    session::message::{Attach, EndpointRole, Granted, GraphItem, Pair, Segment, SessionRole},
+    session::message::{Attach, EndpointRole, Granted, Pair, Segment, SessionRole},
     shm::Location,
 };
 
@@ -63,14 +63,17 @@ pub struct Registry<F> {
     remote: BTreeMap<DaemonId, BTreeMap<Gid, RemoteEndpoint>>,
     tombstones: VecDeque<Gid>,
     version: u64,
-    added: BTreeMap<Gid, GraphItem>,
-    removed: BTreeSet<Gid>,
+    added: BTreeMap<Gid, Item>,
+    /// Whether each was this host's own.
+    removed: BTreeMap<Gid, bool>,
     /// Those of them that were this host's own.
     ended: BTreeSet<Gid>,
     /// Endpoints of this host whose session lists other peers than the gateway was told.
     regraded: BTreeSet<Gid>,
     /// Applications' sessions came or went.
     rescoped: bool,
+    /// The packets of the whole graph as each view was told it last, and the version of it.
+    whole: (u64, BTreeMap<range::View, Vec<Weak<[u8]>>>),
     ready: BTreeSet<SessionId>,
     /// The first endpoint of each session that was refused, and why.
     refused: Vec<(SessionId, String)>,
@@ -166,6 +169,9 @@ struct Asked {
     grant: Option<Granted>,
 }
 
+/// An endpoint that is new in the graph, and its daemon where that is another host's.
+type Item = (Arc<Endpoint>, Option<DaemonId>);
+
 /// A topic's or service's name and type.
 #[derive(Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 struct Topic(String, String);
@@ -208,10 +214,11 @@ impl<F> Default for Registry<F> {
             tombstones: VecDeque::new(),
             version: 0,
             added: BTreeMap::new(),
-            removed: BTreeSet::new(),
+            removed: BTreeMap::new(),
             ended: BTreeSet::new(),
             regraded: BTreeSet::new(),
             rescoped: false,
+            whole: (0, BTreeMap::new()),
             ready: BTreeSet::new(),
             refused: Vec::new(),
         }
@@ -255,7 +262,7 @@ impl<F: Clone> Registry<F> {
     pub fn remote_endpoints(&self) -> impl Iterator<Item = (&DaemonId, &Endpoint)> {
         self.remote
             .iter()
-            .flat_map(|(daemon, all)| all.values().map(move |e| (daemon, &e.endpoint)))
+            .flat_map(|(daemon, all)| all.values().map(move |e| (daemon, &*e.endpoint)))
     }
 
     /// The pairs whose reader has asked its writer.

@@ -93,9 +93,14 @@ impl<F: Clone> Registry<F> {
     }
 
     pub(super) fn push_shared(&mut self, to: &[SessionId], message: &Message) {
-        let Some(packet) = encode(message) else { return };
+        if let Some(packet) = encode(message) {
+            self.push_encoded(to, &packet);
+        }
+    }
+
+    pub(super) fn push_encoded(&mut self, to: &[SessionId], packet: &Arc<[u8]>) {
         for id in to {
-            let packet = packet.clone();
+            let packet = Arc::clone(packet);
             self.push_packet(id, Output { packet, descriptors: Vec::new(), segment: None });
         }
     }
@@ -139,15 +144,15 @@ impl<F: Clone> Registry<F> {
     fn tell_everything(&mut self, id: &SessionId) {
         // Pending changes are part of the whole, and the others hear of them as usual.
         self.flush();
-        let parts = self.whole_graph(id);
+        let packets = self.whole_graph(id);
         let Some(entry) = self.sessions.get_mut(id) else { return };
         entry.behind = false;
         entry.resync = false;
         entry.known.clear();
         entry.queue_limit = usize::MAX;
         entry.bytes_limit = usize::MAX;
-        for part in parts {
-            self.push(id, &Message::Graph(part), Vec::new());
+        for packet in packets {
+            self.push_encoded(&[*id], &packet);
         }
         for pair in self.pairs_of(id) {
             // A reader that is not served yet asks again; one that is learns how.
@@ -219,7 +224,7 @@ pub(super) fn session_entry<F>(
     }
 }
 
-fn encode(message: &Message) -> Option<Arc<[u8]>> {
+pub(super) fn encode(message: &Message) -> Option<Arc<[u8]>> {
     match message.encode() {
         Ok(packet) => Some(packet.into()),
         Err(error) => {

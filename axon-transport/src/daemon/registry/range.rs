@@ -11,13 +11,15 @@ use std::collections::{BTreeMap, BTreeSet, HashSet};
 use super::{LocalEndpoint, Registry, SessionEntry, matching::topic};
 use crate::{
     config::DiscoveryRange,
-    graph::{OutOfRange, Pairing, Reach, RemoteEndpoint, Scope, Toward, out_of_range, pairing},
+    graph::{
+        Endpoint, OutOfRange, Pairing, Reach, RemoteEndpoint, Scope, Toward, out_of_range, pairing,
+    },
     ids::{DaemonId, Gid, SessionId},
     session::message::{EndpointRole, GraphItem, Pair, SessionRole},
 };
 
 /// Which parts of the graph a session is shown. Sessions of one view are told the same.
-#[derive(Clone, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct View {
     /// Present where ranges apply: those of this host's registry, not those within a process.
     scope: Option<(DiscoveryRange, Vec<DaemonId>)>,
@@ -203,10 +205,16 @@ impl<F: Clone> Registry<F> {
         }
     }
 
-    /// An item of the graph as a view shows it, if it does.
-    pub(super) fn shown_in(&self, view: &View, item: &GraphItem) -> Option<GraphItem> {
-        let gid = &item.endpoint.gid;
-        let Some(daemon) = &item.daemon else {
+    /// An endpoint, of another host's `daemon` if there is one, as a view shows it, if it does. The
+    /// gateway is shown this host's alone: what there is elsewhere it said itself.
+    pub(super) fn shown_in(
+        &self,
+        view: &View,
+        endpoint: &Endpoint,
+        daemon: Option<DaemonId>,
+    ) -> Option<GraphItem> {
+        let gid = &endpoint.gid;
+        let Some(daemon) = daemon else {
             let owner = self.endpoints.get(gid)?.session;
             let entry = self.sessions.get(&owner)?;
             let hidden = view.alone.is_some() || entry.is_off();
@@ -214,16 +222,19 @@ impl<F: Clone> Registry<F> {
                 return None;
             }
             let reach = if view.gateway { entry.reach() } else { None };
-            return Some(GraphItem { reach, ..item.clone() });
+            return Some(GraphItem { endpoint: endpoint.clone(), daemon: None, reach });
         };
+        if view.gateway {
+            return None;
+        }
         if let Some((range, lists)) = &view.scope {
-            let own = Toward { range: *range, lists: lists.contains(daemon) };
-            let remote = self.remote.get(daemon)?.get(gid)?;
+            let own = Toward { range: *range, lists: lists.contains(&daemon) };
+            let remote = self.remote.get(&daemon)?.get(gid)?;
             if out_of_range(own, remote.toward).is_some() {
                 return None;
             }
         }
-        Some(item.clone())
+        Some(GraphItem { endpoint: endpoint.clone(), daemon: Some(daemon), reach: None })
     }
 
     /// The sessions that are told of the graph, by what they are shown of it.
@@ -259,10 +270,11 @@ impl<F: Clone> Registry<F> {
                 let toward = session.and_then(|session| session.toward(daemon));
                 let why = toward.and_then(|own| out_of_range(own, remote.toward));
                 // Of a service one direction says it all.
-                if pairing(&local.endpoint, &remote.endpoint) == Pairing::Match {
-                    (&local.endpoint, &remote.endpoint, why)
+                let remote: &Endpoint = &remote.endpoint;
+                if pairing(&local.endpoint, remote) == Pairing::Match {
+                    (&local.endpoint, remote, why)
                 } else {
-                    (&remote.endpoint, &local.endpoint, why)
+                    (remote, &local.endpoint, why)
                 }
             })
         });

@@ -1,17 +1,21 @@
 //! The graph across links: what peers are told, and the routes that follow from what they tell.
 
-use std::sync::Arc;
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use super::{Event, Hub};
 use crate::{
     daemon::bridge::ToControl,
     gateway::{
         establish::close,
+        keyring::lock,
         peer::{GraphChange, Peer},
     },
     graph::RemoteEndpoint,
     ids::{DaemonId, Gid},
-    link::CloseCode,
+    link::{CloseCode, GraphResync, Message},
 };
 
 impl Hub {
@@ -23,7 +27,7 @@ impl Hub {
             .values()
             .filter(|e| e.daemon.is_none())
             // One of which nothing is known goes nowhere.
-            .filter_map(|e| Some((e.endpoint.gid, ((*e.endpoint).clone(), e.reach.clone()?))))
+            .filter_map(|e| Some((e.endpoint.gid, (Arc::clone(&e.endpoint), e.reach.clone()?))))
             .collect();
         for peer in self.peers.values_mut() {
             peer.keep_ending(&self.local);
@@ -71,8 +75,42 @@ impl Hub {
         }
     }
 
-    pub(super) async fn remote_graph(&mut self, daemon: DaemonId, change: GraphChange) {
-        let GraphChange { reset, mut added, removed } = change;
+    /// How long it is until what changed in a peer's graph is to be followed up.
+    pub(super) fn turn_in(&self, now: Instant) -> Option<Duration> {
+        let stirred = self.peers.values().filter(|peer| peer.stirred);
+        stirred.map(|peer| lock(&peer.remote.account().turns).wait(now)).min()
+    }
+
+    /// Follows up what changed in the graphs of peers whose turn it is.
+    pub(super) async fn take_turns(&mut self) {
+        let stirred = self.peers.iter().filter(|(_, peer)| peer.stirred);
+        let stirred: Vec<_> = stirred.map(|(daemon, _)| *daemon).collect();
+        for daemon in stirred {
+            self.take_turn(daemon).await;
+        }
+    }
+
+    /// Follows up what changed in a peer's graph, if it is its turn.
+    pub(super) async fn take_turn(&mut self, daemon: DaemonId) {
+        let Some(peer) = self.peers.get_mut(&daemon) else { return };
+        let (account, began) = (Arc::clone(peer.remote.account()), Instant::now());
+        if !lock(&account.turns).take(began) {
+            return;
+        }
+        peer.stirred = false;
+        self.remote_graph(daemon).await;
+        lock(&account.turns).over(began, Instant::now());
+    }
+
+    /// The graph of a peer changed: routes follow, and the control plane is told.
+    async fn remote_graph(&mut self, daemon: DaemonId) {
+        let Some(peer) = self.peers.get_mut(&daemon) else { return };
+        let number = peer.link;
+        if let Some(refused) = peer.newly_refused() {
+            self.refused_in_part(number, "graph", refused).await;
+        }
+        let Some(peer) = self.peers.get_mut(&daemon) else { return };
+        let GraphChange { reset, mut added, removed } = peer.remote.changes();
         // An endpoint is its host's: nobody elsewhere speaks for one of ours, or for the gateway.
         let own = self.shared.session.id().0;
         let ours: Vec<_> = added
@@ -85,7 +123,7 @@ impl Hub {
                 "a peer announces endpoints of this host; they are ignored");
             added.retain(|e| !ours.contains(&e.endpoint.gid));
             if let Some(peer) = self.peers.get_mut(&daemon) {
-                peer.forget(&ours);
+                peer.remote.forget(&ours);
             }
         }
         let dead = self.taken_over(daemon, &added);
@@ -115,8 +153,8 @@ impl Hub {
         for other in others {
             let same_host = self.identity_of(other).is_some_and(|i| i == owner);
             let Some(peer) = self.peers.get_mut(&other) else { continue };
-            let moved: Vec<_> =
-                added.iter().map(|e| e.endpoint.gid).filter(|gid| peer.has(*gid)).collect();
+            let has = |gid: &Gid| peer.remote.has(gid);
+            let moved: Vec<_> = added.iter().map(|e| e.endpoint.gid).filter(has).collect();
             if moved.is_empty() {
                 continue;
             }
@@ -124,13 +162,32 @@ impl Hub {
                 tracing::warn!(peer = %daemon, endpoints = moved.len(),
                     "a peer announces endpoints of another peer; they stay where they were");
                 if let Some(claimer) = self.peers.get_mut(&daemon) {
-                    claimer.forget(&moved);
+                    claimer.remote.forget(&moved);
                 }
                 continue;
             }
             dead.push(peer.link);
         }
         dead
+    }
+
+    /// Asks peers for their graph of which something was left out for want of room that there is now, and
+    /// sends them this host's that they asked for.
+    pub(super) fn resync(&mut self) {
+        for peer in self.peers.values_mut() {
+            peer.resync_if_due(&self.local);
+            if peer.remote.has_room_again() {
+                let version = peer.remote.version();
+                peer.say(Message::GraphResync(GraphResync { version }));
+            }
+        }
+    }
+
+    /// Something of a peer's is refused, and its link stands.
+    pub(super) async fn refused_in_part(&self, number: u64, what: &str, reason: String) {
+        let Some(link) = self.links.get(&number) else { return };
+        let peer = format!("{} at {}", link.established.who, link.connection.remote_address());
+        self.tell(ToControl::Refusal { peer, what: what.to_owned(), reason }).await;
     }
 
     /// What a peer proved to be, beyond its daemon id.

@@ -14,6 +14,7 @@ use super::{Event, Hub, Link, Summary, leaving::Leaving};
 use crate::{
     daemon::bridge::ToControl,
     gateway::{
+        account::Account,
         control::ControlReader,
         dial::{Target, dial},
         endpoint::open_windows,
@@ -37,6 +38,8 @@ const MAX_LINKS: usize = 128 + 32;
 const MAX_LINKS_OF_PEER: usize = 16;
 /// Elections of this process. A daemon outlives its gateway, and its peers know its elections by its id.
 static ELECTIONS: AtomicU64 = AtomicU64::new(1);
+/// From so many endpoints of a peer on memory is given back when it leaves.
+const MANY: usize = 1000;
 /// Why somebody who claims a linked daemon's id gets no link.
 const TAKEN: &str = "this daemon id is linked already, under another identity";
 
@@ -98,8 +101,9 @@ impl Hub {
             }
             return;
         }
-        let reader = self.insert(established, candidate, who);
-        spawn_reader(number, reader, self.events.clone());
+        let connection = established.connection.clone();
+        let (reader, account) = self.insert(established, candidate, who);
+        spawn_reader(number, reader, account, connection, self.events.clone());
         if we_elect {
             self.elect(number).await;
         } else {
@@ -131,7 +135,7 @@ impl Hub {
         established: Established,
         candidate: Candidate,
         who: Who,
-    ) -> ControlReader {
+    ) -> (ControlReader, Arc<Account>) {
         let protection = match (&self.context.keyring, &established.sealing) {
             (Some(keyring), Some(sealing)) => Protection::Envelope {
                 keyring: Arc::clone(keyring),
@@ -141,6 +145,8 @@ impl Hub {
             _ => Protection::Link,
         };
         let connection = established.connection;
+        let identity = who.host_identity(connection.remote_address());
+        let account = self.shared.accounts.of(&identity);
         let carrying = watch::Sender::new(());
         let in_use = carrying.subscribe();
         let link = Link {
@@ -160,9 +166,10 @@ impl Hub {
             elected: None,
             until: None,
             since_unix_ms: crate::daemon::status::unix_ms(),
+            account: Arc::clone(&account),
         };
         self.links.insert(established.number, link);
-        established.reader
+        (established.reader, account)
     }
 
     /// This side has the lower id: the connection stays.
@@ -198,6 +205,7 @@ impl Hub {
         let age = self.context.keyring.as_ref().map(|keyring| keyring.config.session_max_age);
         link.until = age.map(|age| Instant::now() + age);
         let (connection, outbox) = (link.connection.clone(), link.outbox.clone());
+        let account = Arc::clone(&link.account);
         let (carrier, side) = (link.carrier.clone(), link.candidate.side);
         if let (Some(keyring), Some(sealing)) = (&self.context.keyring, link.sealing.take()) {
             let Sealing { keys, exporters, first } = sealing;
@@ -216,7 +224,8 @@ impl Hub {
             None => {
                 let identity = link.established.who.host_identity(connection.remote_address());
                 let owner = Owner { daemon, identity, events: self.events.clone() };
-                let peer = Peer::new(daemon, number, outbox, carrier.clone(), &self.shared, owner);
+                let (carrier, shared) = (carrier.clone(), &self.shared);
+                let peer = Peer::new(daemon, number, outbox, carrier, account, shared, owner);
                 self.peers.insert(daemon, peer);
                 true
             }
@@ -311,7 +320,9 @@ impl Hub {
         if self.peers.get(&daemon).is_none_or(|p| p.link != number) {
             return;
         }
-        self.peers.remove(&daemon);
+        if self.peers.remove(&daemon).is_some_and(|peer| peer.remote.len() >= MANY) {
+            give_memory_back();
+        }
         self.abandon_leaving(daemon);
         self.tell_draining().await;
         tracing::info!(peer = %daemon, reason, "link down");
@@ -324,6 +335,15 @@ impl Hub {
         }
         self.tell(ToControl::LinkDown { daemon, reason }).await;
     }
+}
+
+/// The allocator keeps what it freed: of a peer that had much it is given back, once the control plane
+/// has let go of it, too.
+fn give_memory_back() {
+    tokio::spawn(async {
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        let _ = tokio::task::spawn_blocking(crate::heap::give_back).await;
+    });
 }
 
 /// When the successor of a link is dialled: a tenth of its age before the end, but at least ten

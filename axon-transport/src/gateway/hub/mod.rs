@@ -22,6 +22,7 @@ use tokio::{
 use self::leaving::Leaving;
 use super::{
     accept::Incomer,
+    account::{Account, Accounts, Unpacked},
     context::Context,
     control::{ControlError, Outbox},
     dial::Target,
@@ -60,6 +61,8 @@ pub(super) struct Shared {
     pub(super) domain: u32,
     /// Largest payload.
     pub(super) max_message: u64,
+    /// What peers may have this daemon hold.
+    pub(super) accounts: Accounts,
     /// What may wait to be sent reliably.
     pub(super) queues: Arc<Room>,
     /// A peer that reads nothing for so long is disconnected from the topic.
@@ -86,7 +89,7 @@ pub(super) enum Event {
     /// A dial of a peer came to an end.
     Incomer(Incomer),
     /// A control message, or the end of the control stream.
-    Control(u64, Result<Message, ControlError>),
+    Control(u64, Result<(Message, Unpacked), ControlError>),
     /// A data stream of this link, with this peer, broke the protocol; the connection is closed.
     Violation(u64, String, CloseCode, String),
     /// A link was not elected in time.
@@ -136,6 +139,7 @@ struct Link {
     /// When its key is as old as a key may get, once elected.
     until: Option<Instant>,
     since_unix_ms: u64,
+    account: Arc<Account>,
 }
 
 /// What is kept of a link's beginning.
@@ -150,7 +154,7 @@ pub(super) struct Summary {
 }
 
 /// The endpoints of applications on this host, and how far their sessions are discovered.
-pub(super) type Local = BTreeMap<Gid, (Endpoint, Reach)>;
+pub(super) type Local = BTreeMap<Gid, (Arc<Endpoint>, Reach)>;
 
 /// The hub's state.
 pub(super) struct Hub {
@@ -202,6 +206,7 @@ impl Hub {
         loop {
             let now = Instant::now();
             let alive_in = self.peers.values().filter_map(|peer| peer.alive_in(now)).min();
+            let turn_in = self.turn_in(now);
             tokio::select! {
                 event = inbox.recv() => match event {
                     None | Some(Event::Order(ToGateway::Shutdown)) => break,
@@ -216,10 +221,14 @@ impl Hub {
                     let now = Instant::now();
                     self.peers.values_mut().for_each(|peer| peer.tell_alive(now));
                 }
+                () = sleep(turn_in.unwrap_or_default()), if turn_in.is_some() => {
+                    self.take_turns().await;
+                }
                 // Without a link, and keys, there is nothing that time would change.
                 _ = second.tick(), if !self.links.is_empty() || self.context.keyring.is_some() => {
                     seconds = seconds.wrapping_add(1);
                     self.close_untrusted(seconds.is_multiple_of(CERTIFICATES_EVERY)).await;
+                    self.resync();
                     self.report().await;
                     let now = Instant::now();
                     self.peers.values_mut().for_each(|peer| peer.ask_again(now));
@@ -260,7 +269,9 @@ impl Hub {
             Event::Incomer(Incomer::Refused { peer, refusal }) => {
                 self.refused(peer, refusal).await;
             }
-            Event::Control(link, Ok(message)) => self.on_message(link, message).await,
+            Event::Control(link, Ok((message, _until_handled))) => {
+                self.on_message(link, message).await;
+            }
             Event::Control(link, Err(error)) => {
                 if let (Some(code), Some(l)) = (error.code(), self.links.get(&link)) {
                     close(&l.connection, code, &error.to_string());
@@ -325,27 +336,28 @@ impl Hub {
         }
         let Some(peer) = self.peers.get_mut(&daemon) else { return };
         let result = match message {
-            Message::Graph(graph) => match peer.take_graph(graph) {
-                Ok(GraphTaken::Changed(change)) => {
-                    self.remote_graph(daemon, change).await;
-                    Ok(())
+            Message::Graph(graph) => {
+                match peer.take_graph(graph) {
+                    GraphTaken::Changed { .. } => {
+                        peer.stirred = true;
+                        self.take_turn(daemon).await;
+                    }
+                    GraphTaken::Part => {}
+                    GraphTaken::Gap => {
+                        let version = peer.remote.version();
+                        peer.say(Message::GraphResync(GraphResync { version }));
+                    }
                 }
-                Ok(GraphTaken::Part) => Ok(()),
-                Ok(GraphTaken::Gap) => {
-                    let version = peer.remote_version();
-                    peer.say(Message::GraphResync(GraphResync { version }));
-                    Ok(())
-                }
-                Err(reason) => Err((CloseCode::TooLarge, reason.to_owned())),
-            },
+                Ok(())
+            }
             Message::GraphResync(_) => {
-                peer.send_graph(&self.local, true);
+                peer.resync(&self.local, Instant::now());
                 Ok(())
             }
             Message::Subscribe(subscribe) => {
                 let served = peer.serve(subscribe, &self.shared);
                 peer.update_services(&self.local, &self.shared);
-                served.map_err(|e| (CloseCode::Malformed, e))
+                served.map_err(|reason| (CloseCode::Malformed, reason))
             }
             Message::Unsubscribe(unsubscribe) => {
                 peer.unserve(unsubscribe.route);
@@ -414,6 +426,7 @@ impl Hub {
                     status::link(&link.established, &link.connection, link.since_unix_ms);
                 peer.counters.fill(&mut status);
                 peer.show_refused(&mut status);
+                peer.fill(&mut status);
                 self.tell(ToControl::Link(Box::new(status))).await;
             }
         }

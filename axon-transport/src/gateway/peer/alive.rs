@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use super::Peer;
 use crate::{
-    gateway::outbound::Source,
+    gateway::{account::MAX_STAND_INS, outbound::Source},
     link::{Asserted, Message},
 };
 
@@ -29,7 +29,8 @@ impl Peer {
 
     /// The peer's publishers that were. Of others it has nothing to say: they are on no route of its.
     pub(in crate::gateway) fn hear_alive(&self, asserted: &Asserted) {
-        let stand_ins = asserted.publishers.iter().filter_map(|gid| self.routes_in.stand_in(gid));
+        let known = asserted.publishers.iter().filter(|gid| self.remote.get(gid).is_some());
+        let stand_ins = known.take(MAX_STAND_INS).filter_map(|gid| self.routes_in.stand_in(gid));
         stand_ins.for_each(|stand_in| stand_in.assert_alive());
     }
 }

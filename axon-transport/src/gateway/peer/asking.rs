@@ -27,8 +27,6 @@ use crate::{
 
 /// A route is asked for when its stand-ins have their local readers, or after this at the latest.
 const ATTACH_TIMEOUT: Duration = Duration::from_secs(1);
-/// Writers of a peer that are shown here. Each costs a ring.
-const MAX_STAND_INS: usize = 1024;
 
 /// A route that this side asked for.
 pub(super) struct Asked {
@@ -62,16 +60,20 @@ impl Asked {
 impl Peer {
     /// Brings routes and stand-ins in line with what there is here and there.
     pub(in crate::gateway) fn update(&mut self, local: &Local, shared: &Arc<Shared>) {
+        // What it announced since was not compared with what others announce: that comes with its turn.
+        if self.stirred {
+            return;
+        }
         let publishers =
             local.values().map(|(e, _)| e).filter(|e| e.kind == EndpointKind::Publisher);
         self.alive.watch(publishers.filter_map(|e| e.qos.lease));
         // A server there is shown once its host asks for requests: then it has what answers them.
         self.answering = self.now_answering();
-        let reachable = self.remote.values().filter(|remote| {
+        let reachable = self.remote.endpoints().filter(|remote| {
             let e = &remote.endpoint;
             e.kind != EndpointKind::Server || self.answering.contains(&e.gid)
         });
-        let own = local.values().map(|(endpoint, reach)| (endpoint, reach.toward(self.daemon)));
+        let own = local.values().map(|(endpoint, reach)| (&**endpoint, reach.toward(self.daemon)));
         let wanted = routes::wanted(own, reachable);
         self.want(wanted, shared);
         self.feed_services();
@@ -171,21 +173,20 @@ impl Peer {
         writers: &[(Endpoint, usize)],
         shared: &Arc<Shared>,
     ) -> bool {
-        let elsewhere: usize = self.asked.values().map(|a| a.stand_ins.len()).sum();
         let mut fresh = false;
         for (writer, _) in writers {
             let gid = writer.gid;
             if asked.stand_ins.contains_key(&gid) {
                 continue;
             }
-            if asked.stand_ins.len() + elsewhere >= MAX_STAND_INS {
-                self.refused.unasked(key, TOO_MANY_WRITERS);
-                break;
-            }
-            match shared.stand_ins.get(&shared.session, writer) {
-                Ok(stand_in) => {
+            match shared.stand_ins.get(&shared.session, writer, self.remote.account()) {
+                Ok(Some(stand_in)) => {
                     asked.stand_ins.insert(gid, stand_in);
                     fresh = true;
+                }
+                Ok(None) => {
+                    self.refused.unasked(key, TOO_MANY_WRITERS);
+                    break;
                 }
                 Err(error) => {
                     tracing::error!(topic = key.topic, %error, "a remote publisher is not shown");

@@ -2,19 +2,22 @@
 
 mod alive;
 mod asking;
+mod graph;
 mod refused;
 mod serving;
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap},
     sync::Arc,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use tokio::sync::{mpsc, watch};
 
-use self::{asking::Asked, refused::RefusedRoutes, serving::Served};
+pub(super) use self::graph::{GraphChange, GraphTaken};
+use self::{asking::Asked, graph::Remote, refused::RefusedRoutes, serving::Served};
 use super::{
+    account::Account,
     control::Outbox,
     counters::Counters,
     hub::{Event, Local, Shared},
@@ -27,8 +30,9 @@ use super::{
 };
 use crate::{
     config::DiscoveryRange,
+    daemon::status::LinkStatus,
     events::Alive,
-    graph::{EndpointKind, LIMITS, RemoteEndpoint, Toward},
+    graph::{Endpoint, EndpointKind, RemoteEndpoint, Toward},
     ids::{DaemonId, Gid},
     link::{Graph, Message, Received},
 };
@@ -37,6 +41,8 @@ use crate::{
 const MAX_ROUTES: usize = 1024;
 /// Endpoints in one GRAPH message; a larger graph takes several.
 const GRAPH_PART: usize = 512;
+/// How often a peer may ask for the whole graph.
+const RESYNC: Duration = Duration::from_secs(1);
 /// How often readers are looked for meanwhile.
 const POLL: Duration = Duration::from_millis(5);
 
@@ -49,12 +55,16 @@ pub(super) struct Peer {
     pub(super) outbox: Outbox,
     /// What was carried and dropped.
     pub(super) counters: Arc<Counters>,
-    remote: BTreeMap<Gid, RemoteEndpoint>,
-    remote_version: u64,
-    /// What came of a whole graph so far.
-    gathered: Option<Vec<RemoteEndpoint>>,
+    pub(super) remote: Remote,
     sent: BTreeMap<Gid, RemoteEndpoint>,
     sent_version: u64,
+    /// When the peer was sent the whole graph last that it asked for, and whether it asked again.
+    resynced: Option<Instant>,
+    resync_due: bool,
+    /// Its graph changed, and what follows from that was not worked out yet.
+    pub(super) stirred: bool,
+    /// Whether it was said that something is left out of its graph.
+    refusal_said: bool,
     next_route: u32,
     /// Routes that this side asked for.
     asked: BTreeMap<RouteKey, Asked>,
@@ -79,26 +89,6 @@ pub(super) struct Peer {
     orders: mpsc::UnboundedSender<outbound::Order>,
 }
 
-/// What a GRAPH message changed.
-pub(super) struct GraphChange {
-    /// Whether it replaces everything that was known of the peer.
-    pub(super) reset: bool,
-    /// Endpoints that came or changed.
-    pub(super) added: Vec<RemoteEndpoint>,
-    /// Endpoints that went.
-    pub(super) removed: Vec<Gid>,
-}
-
-/// What became of a GRAPH message.
-pub(super) enum GraphTaken {
-    /// It counts.
-    Changed(GraphChange),
-    /// More of it is to come.
-    Part,
-    /// A version is missing: the whole graph must be asked for.
-    Gap,
-}
-
 impl Peer {
     /// A peer whose first link was elected.
     pub(super) fn new(
@@ -106,6 +96,7 @@ impl Peer {
         link: u64,
         outbox: Outbox,
         carrier: Carrier,
+        account: Arc<Account>,
         shared: &Arc<Shared>,
         owner: Owner,
     ) -> Self {
@@ -122,11 +113,13 @@ impl Peer {
             link,
             outbox,
             counters,
-            remote: BTreeMap::new(),
-            remote_version: 0,
-            gathered: None,
+            remote: Remote::new(account),
             sent: BTreeMap::new(),
             sent_version: 0,
+            resynced: None,
+            resync_due: false,
+            stirred: false,
+            refusal_said: false,
             next_route: 1,
             asked: BTreeMap::new(),
             identity: owner_identity,
@@ -186,17 +179,12 @@ impl Peer {
         self.outbox.send(message);
     }
 
-    /// Whether the peer announced this endpoint.
-    pub(super) fn has(&self, gid: Gid) -> bool {
-        self.remote.contains_key(&gid)
-    }
-
     // ---- graph ----
 
     /// What the peer is shown of this host. A LOCALHOST session's endpoints are shown to a host that
     /// the session lists, and to one of which a session lists this host; those of an OFF one to nobody.
     fn shown(&self, local: &Local) -> BTreeMap<Gid, RemoteEndpoint> {
-        let listed = self.remote.values().any(|remote| remote.toward.lists);
+        let listed = self.remote.endpoints().any(|remote| remote.toward.lists);
         let shown = local.iter().filter_map(|(gid, (endpoint, reach))| {
             let toward = reach.toward(self.daemon);
             let shown = match toward.range {
@@ -204,7 +192,7 @@ impl Peer {
                 DiscoveryRange::Localhost => toward.lists || listed,
                 DiscoveryRange::Subnet => true,
             };
-            shown.then(|| (*gid, RemoteEndpoint { endpoint: endpoint.clone(), toward }))
+            shown.then(|| (*gid, RemoteEndpoint { endpoint: Arc::clone(endpoint), toward }))
         });
         shown.collect()
     }
@@ -277,7 +265,7 @@ impl Peer {
                 before,
                 localhost: named(|toward| toward.range != DiscoveryRange::Subnet),
                 listing: named(|toward| toward.lists),
-                added: part.iter().map(|e| e.endpoint.clone()).collect(),
+                added: part.iter().map(|e| Endpoint::clone(&e.endpoint)).collect(),
                 removed: removed.take().unwrap_or_default(),
                 more: index < last,
             };
@@ -287,65 +275,44 @@ impl Peer {
         self.sent = now;
     }
 
+    /// The peer asks for the whole graph: once a second it gets it.
+    pub(super) fn resync(&mut self, local: &Local, now: Instant) {
+        let recent = |sent| now.saturating_duration_since(sent) < RESYNC;
+        self.resync_due = self.resynced.is_some_and(recent);
+        if !self.resync_due {
+            self.resynced = Some(now);
+            self.send_graph(local, true);
+        }
+    }
+
+    /// Sends the whole graph where that was put off.
+    pub(super) fn resync_if_due(&mut self, local: &Local) {
+        if self.resync_due {
+            self.resync(local, Instant::now());
+        }
+    }
+
     /// Takes a GRAPH in.
-    ///
-    /// # Errors
-    /// The peer announces more endpoints than allowed.
-    pub(super) fn take_graph(&mut self, graph: Graph) -> Result<GraphTaken, &'static str> {
-        const TOO_MANY: &str = "more endpoints than a peer may have";
-        let Graph { version, before, added, removed, more, localhost, listing } = graph;
-        let [localhost, listing] = [localhost, listing]
-            .map(|gids| gids.unwrap_or_default().into_iter().collect::<BTreeSet<Gid>>());
-        let added = added.into_iter().map(|endpoint| {
-            let near = localhost.contains(&endpoint.gid);
-            let range = if near { DiscoveryRange::Localhost } else { DiscoveryRange::Subnet };
-            let toward = Toward { range, lists: listing.contains(&endpoint.gid) };
-            RemoteEndpoint { endpoint, toward }
-        });
-        let added: Vec<RemoteEndpoint> = added.collect();
-        if before == 0 {
-            self.gathered = Some(Vec::new());
-        } else if before != self.remote_version {
-            return Ok(GraphTaken::Gap);
-        }
-        self.remote_version = version;
-        if let Some(gathered) = &mut self.gathered {
-            gathered.extend(added);
-            if gathered.len() > LIMITS.endpoints {
-                return Err(TOO_MANY);
-            }
-            if more {
-                return Ok(GraphTaken::Part);
-            }
-            let added = std::mem::take(gathered);
-            self.gathered = None;
-            self.remote = added.iter().map(|e| (e.endpoint.gid, e.clone())).collect();
+    pub(super) fn take_graph(&mut self, graph: Graph) -> GraphTaken {
+        let taken = self.remote.take(graph);
+        if taken == (GraphTaken::Changed { whole: true }) {
             self.unserve_unrepeated();
-            let removed = Vec::new();
-            return Ok(GraphTaken::Changed(GraphChange { reset: true, added, removed }));
         }
-        for gid in &removed {
-            self.remote.remove(gid);
-        }
-        for remote in &added {
-            self.remote.insert(remote.endpoint.gid, remote.clone());
-        }
-        if self.remote.len() > LIMITS.endpoints {
-            return Err(TOO_MANY);
-        }
-        Ok(GraphTaken::Changed(GraphChange { reset: false, added, removed }))
+        taken
     }
 
-    /// The version of the peer's graph that this side holds.
-    pub(super) fn remote_version(&self) -> u64 {
-        self.remote_version
+    /// What is to be said of endpoints that are left out, once until the graph was complete again.
+    pub(super) fn newly_refused(&mut self) -> Option<String> {
+        let refused = self.remote.refused().map(str::to_owned);
+        let said = std::mem::replace(&mut self.refusal_said, refused.is_some());
+        refused.filter(|_| !said)
     }
 
-    /// These endpoints are another daemon's.
-    pub(super) fn forget(&mut self, gids: &[Gid]) {
-        for gid in gids {
-            self.remote.remove(gid);
-        }
+    /// Puts what the peer's graph takes into `status`.
+    pub(super) fn fill(&self, status: &mut LinkStatus) {
+        status.endpoints = self.remote.len() as u64;
+        status.endpoints_left_out = self.remote.left_out();
+        status.graph_bytes = self.remote.account().graph.held() as u64;
     }
 }
 
@@ -362,11 +329,20 @@ impl Drop for OnDrop {
 pub(super) fn spawn_reader(
     link: u64,
     mut reader: super::control::ControlReader,
+    account: Arc<Account>,
+    connection: quinn::Connection,
     events: mpsc::Sender<Event>,
 ) {
     tokio::spawn(async move {
         loop {
-            let next = reader.next().await;
+            let next = reader.next_within(&account).await;
+            if let Ok((message, _)) = &next {
+                tokio::select! {
+                    () = account.pace(message) => {}
+                    // Its end is heard of at once.
+                    _ = connection.closed() => {}
+                }
+            }
             let ended = next.is_err();
             if events.send(Event::Control(link, next)).await.is_err() || ended {
                 return;

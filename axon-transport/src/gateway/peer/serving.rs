@@ -12,6 +12,7 @@ use tokio::sync::oneshot;
 use super::{OnDrop, POLL, Peer};
 use crate::{
     gateway::{
+        account::Charge,
         hub::Shared,
         keyring::lock,
         outbound::{Order, RouteOut, Source},
@@ -32,6 +33,8 @@ pub(super) struct Served {
     /// Its readers there.
     pub(super) subscribers: Vec<Gid>,
     pub(super) sources: Vec<Source>,
+    /// What it takes of the peer's account.
+    _charge: Charge,
     /// Whether it was asked for on the link in use.
     pub(super) repeated: bool,
     /// Sends ROUTE_READY once a publisher is attached.
@@ -48,6 +51,11 @@ pub(in crate::gateway) struct Stalled {
     pub(in crate::gateway) samples: oneshot::Receiver<u64>,
 }
 
+/// Bytes that a route takes besides what its SUBSCRIBE says.
+const ROUTE: usize = 2048;
+/// How often what a SUBSCRIBE says is kept: by the route, its relays, and what feeds them.
+const COPIES: usize = 3;
+
 impl Peer {
     /// SUBSCRIBE: opens a route, or changes it. One for requests may have made servers reachable:
     /// [`update`](Self::update) sees to it.
@@ -59,6 +67,7 @@ impl Peer {
         subscribe: Subscribe,
         shared: &Arc<Shared>,
     ) -> Result<(), String> {
+        let bytes = ROUTE + COPIES * subscribe.bytes();
         let Subscribe { route: number, topic, type_name, kind, subscribers, last, .. } = subscribe;
         let hash = TopicHash::new(shared.domain, &topic, &type_name).map_err(|e| e.to_string())?;
         let kind = match kind {
@@ -95,6 +104,15 @@ impl Peer {
             self.refuse(number, &key, "it was not read".into(), Some(left));
             return Ok(());
         }
+        let room = &self.remote.account().routes;
+        let (charge, most) = (room.charge(bytes), room.most() >> 20);
+        let Some(charge) = charge else {
+            // It may have been served until now.
+            let _ = self.orders.send(Order::End(number));
+            let why = format!("what a peer asks for takes more than {most} MiB ([link] graph_mb)");
+            self.refuse(number, &key, why, None);
+            return Ok(());
+        };
         self.refused.forget(number);
         let sources = match kind {
             Kind::Topic => self.open_relays(&key, &subscribers, &old, shared),
@@ -108,7 +126,8 @@ impl Peer {
         let _ = self.orders.send(Order::Route(number, out));
         let subscribers = subscribers.iter().map(|subscriber| subscriber.gid).collect();
         let repeated = true;
-        let served = Served { key, route, subscribers, sources, repeated, _announcing };
+        let served =
+            Served { key, route, subscribers, sources, _charge: charge, repeated, _announcing };
         self.served.insert(number, served);
         Ok(())
     }
@@ -151,9 +170,7 @@ impl Peer {
         old: &[Source],
         shared: &Arc<Shared>,
     ) -> Vec<Source> {
-        let hash = |gid: &Gid| {
-            self.remote.get(gid).map_or_else(Vec::new, |e| e.endpoint.type_hash.clone())
-        };
+        let hash = |gid: &Gid| self.remote.get(gid).map_or_else(Vec::new, |e| e.type_hash.clone());
         let mut specs = relays(subscribers, hash);
         let there = |spec: &RelaySpec| {
             old.iter().position(|source| matches!(source, Source::Relay(o, _) if o.is(spec)))

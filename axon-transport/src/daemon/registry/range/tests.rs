@@ -79,7 +79,7 @@ impl World {
     }
 
     fn remote(&mut self, daemon: DaemonId, gid: Gid, kind: EndpointKind, toward: Toward) {
-        let remote = RemoteEndpoint { endpoint: endpoint(gid, kind), toward };
+        let remote = RemoteEndpoint { endpoint: endpoint(gid, kind).into(), toward };
         self.registry.remote_graph(daemon, false, vec![remote], vec![]);
     }
 

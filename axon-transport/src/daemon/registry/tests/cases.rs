@@ -101,7 +101,11 @@ fn a_sample_never_goes_back_to_where_it_came_from() {
         .registry
         .whole_graph(&own)
         .iter()
-        .flat_map(|g| g.added.iter().map(|i| i.endpoint.gid))
+        .flat_map(|packet| match Message::decode(packet).unwrap() {
+            Message::Graph(graph) => graph.added,
+            other => panic!("{other:?}"),
+        })
+        .map(|item| item.endpoint.gid)
         .collect();
     assert_eq!(shown, [local.gid, talker.gid].into());
 }
@@ -147,13 +151,13 @@ fn a_gid_that_is_taken_is_nobody_elses() {
     let (a, b) = (DaemonId([1; 16]), DaemonId([2; 16]));
     let remote = endpoint(Gid([9; 16]), EndpointKind::Publisher, 0, Qos::default());
     // Another host claims the GID before its session announces it.
-    world.registry.remote_graph(a, true, vec![local.clone().into(), remote.clone().into()], vec![]);
+    world.registry.remote_graph(a, true, vec![local.clone(), remote.clone()], vec![]);
     world.registry.message(&own, announce(local.clone()), vec![]).unwrap();
-    world.registry.remote_graph(b, true, vec![local.clone().into(), remote.clone().into()], vec![]);
+    world.registry.remote_graph(b, true, vec![local.clone(), remote.clone()], vec![]);
     let of: Vec<_> = world.registry.remote_endpoints().map(|(d, e)| (*d, e.gid)).collect();
     assert_eq!(of, [(a, remote.gid)]);
     // Nor can the one take away what is the other's.
-    world.registry.remote_graph(b, false, vec![], vec![remote.gid]);
+    world.registry.remote_graph(b, false, Vec::<Endpoint>::new(), vec![remote.gid]);
     assert_eq!(world.registry.remote_endpoints().count(), 1);
 }
 
@@ -212,7 +216,7 @@ fn a_large_graph_is_told_in_packets_that_fit() {
             ..endpoint(gid, EndpointKind::Publisher, 0, Qos::default())
         }
     });
-    world.registry.remote_graph(DaemonId([1; 16]), true, added.map(Into::into).collect(), vec![]);
+    world.registry.remote_graph(DaemonId([1; 16]), true, added, vec![]);
     world.settle();
     assert_eq!(world.clients[&0].graph.len(), 3000);
 }
@@ -236,7 +240,7 @@ fn a_remote_endpoint_that_comes_and_goes_ends_nothing_here() {
     };
     // A successor link repeats the whole graph within one flush.
     for _ in 0..2 {
-        world.registry.remote_graph(DaemonId([1; 16]), true, vec![endpoint.clone().into()], vec![]);
+        world.registry.remote_graph(DaemonId([1; 16]), true, vec![endpoint.clone()], vec![]);
     }
     world.registry.flush();
     let mut seen = false;

@@ -359,7 +359,7 @@ impl World {
             Step::Remote { daemon, reset, add, remove } => {
                 let gid = |n: u8| Gid([100 + daemon.wrapping_mul(8) + n; 16]);
                 let kind = EndpointKind::Publisher;
-                let added = vec![endpoint(gid(add), kind, 0, Qos::default()).into()];
+                let added = vec![endpoint(gid(add), kind, 0, Qos::default())];
                 let id = DaemonId([daemon; 16]);
                 self.registry.remote_graph(id, reset, added, vec![gid(remove)]);
             }

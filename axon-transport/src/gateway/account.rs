@@ -1,0 +1,218 @@
+//! What one peer may have this daemon hold, over all of its daemon ids and links.
+//!
+//! A peer is an identity here: the SAE, pinned name or certificate's host that it proved, its address
+//! where nothing is proved. What counts for a [`Meter`] is held by a [`Charge`] and given back when
+//! that is dropped.
+
+use std::{
+    collections::HashMap,
+    sync::{
+        Arc, Mutex, Weak,
+        atomic::{AtomicUsize, Ordering},
+    },
+    time::Instant,
+};
+
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+
+use super::{
+    keyring::lock,
+    pace::{Bucket, Turns},
+};
+use crate::link::{MAX_FRAME, MAX_INFLATED, Message};
+
+/// Stand-ins of one identity. Each costs a ring.
+pub(super) const MAX_STAND_INS: usize = 1024;
+/// Bytes that a unit of a semaphore stands for.
+const UNIT: usize = 1024;
+/// Control frames of one identity that are being read, in bytes.
+const READING: usize = 2 * MAX_FRAME;
+/// Control messages of one identity between decompression and the end of their handling, in bytes
+/// before they are decoded.
+const UNPACKED: usize = MAX_INFLATED;
+/// What each of them counts for at least: so many may wait before another peer's.
+const MESSAGE: usize = 64 << 10;
+/// What one identity may say a second, and at once, by [`cost`].
+const SAID: (u32, u32) = (4096, 16_384);
+
+/// Something that may be held up to a bound.
+#[derive(Debug)]
+pub(super) struct Meter {
+    most: usize,
+    held: AtomicUsize,
+}
+
+/// A part of what a meter allows, until it is dropped.
+#[derive(Debug)]
+pub(super) struct Charge {
+    meter: Arc<Meter>,
+    amount: usize,
+}
+
+impl Meter {
+    pub(super) fn new(most: usize) -> Arc<Self> {
+        Arc::new(Self { most, held: AtomicUsize::new(0) })
+    }
+
+    /// Holds `amount` more, if that is within the bound.
+    pub(super) fn charge(self: &Arc<Self>, amount: usize) -> Option<Charge> {
+        let more = |held: usize| held.checked_add(amount).filter(|sum| *sum <= self.most);
+        // Relaxed: a bound, not a hand-over.
+        self.held.fetch_update(Ordering::Relaxed, Ordering::Relaxed, more).ok()?;
+        Some(Charge { meter: Arc::clone(self), amount })
+    }
+
+    /// How much is held.
+    pub(super) fn held(&self) -> usize {
+        self.held.load(Ordering::Relaxed)
+    }
+
+    /// The bound.
+    pub(super) fn most(&self) -> usize {
+        self.most
+    }
+}
+
+impl Drop for Charge {
+    fn drop(&mut self) {
+        self.meter.held.fetch_sub(self.amount, Ordering::Relaxed);
+    }
+}
+
+/// The account of one identity.
+#[derive(Debug)]
+pub(super) struct Account {
+    /// Bytes of its graph.
+    pub(super) graph: Arc<Meter>,
+    /// Bytes of the routes that it asks for: as many again, so that one whose graph is full is served.
+    pub(super) routes: Arc<Meter>,
+    /// Its publishers, servers and clients that are shown here.
+    pub(super) stand_ins: Arc<Meter>,
+    /// When its changes are followed up.
+    pub(super) turns: Mutex<Turns>,
+    reading: Arc<Semaphore>,
+    unpacked: Arc<Semaphore>,
+    said: Mutex<Bucket>,
+}
+
+/// Room for a control message, until it is dropped.
+#[derive(Debug)]
+pub(super) struct Unpacked {
+    _room: Option<OwnedSemaphorePermit>,
+}
+
+impl Account {
+    fn new(graph: usize) -> Self {
+        Self {
+            graph: Meter::new(graph),
+            routes: Meter::new(graph),
+            stand_ins: Meter::new(MAX_STAND_INS),
+            reading: Arc::new(Semaphore::new(READING / UNIT)),
+            unpacked: Arc::new(Semaphore::new(UNPACKED / UNIT)),
+            turns: Mutex::default(),
+            said: Mutex::new(Bucket::new(SAID.0, SAID.1)),
+        }
+    }
+
+    /// Room to read a frame of `length` bytes.
+    pub(super) async fn reading(&self, length: usize) -> Unpacked {
+        room(&self.reading, length, READING).await
+    }
+
+    /// Room for a message of `length` bytes once it is decompressed.
+    pub(super) async fn unpacked(&self, length: usize) -> Unpacked {
+        room(&self.unpacked, length.max(MESSAGE), UNPACKED).await
+    }
+
+    /// Waits for as long as the identity said more than it may.
+    pub(super) async fn pace(&self, message: &Message) {
+        let wait = lock(&self.said).owe(cost(message), Instant::now());
+        if !wait.is_zero() {
+            tokio::time::sleep(wait).await;
+        }
+    }
+}
+
+/// What a message costs: about as many changes as it says.
+fn cost(message: &Message) -> u32 {
+    let elements = match message {
+        Message::Graph(graph) => graph.added.len() + graph.removed.len(),
+        Message::Subscribe(subscribe) => 7 + subscribe.subscribers.len() + subscribe.last.len(),
+        Message::Unsubscribe(_) | Message::RouteRefused(_) => 7,
+        Message::Asserted(asserted) => asserted.publishers.len() / 8,
+        // Keys are bounded where they are kept.
+        _ => 0,
+    };
+    u32::try_from(1 + elements).unwrap_or(u32::MAX)
+}
+
+/// Waits for its turn and for room. What is longer than all the room takes all of it.
+async fn room(semaphore: &Arc<Semaphore>, length: usize, all: usize) -> Unpacked {
+    let units = u32::try_from(length.clamp(1, all).div_ceil(UNIT)).unwrap_or(u32::MAX);
+    // It is never closed.
+    Unpacked { _room: Arc::clone(semaphore).acquire_many_owned(units).await.ok() }
+}
+
+/// The accounts of all peers, each for as long as it is used.
+#[derive(Debug)]
+pub(super) struct Accounts {
+    graph: usize,
+    open: Mutex<HashMap<String, Weak<Account>>>,
+}
+
+impl Accounts {
+    /// `graph` bytes are what the graph of one identity may take.
+    pub(super) fn new(graph: usize) -> Self {
+        Self { graph, open: Mutex::default() }
+    }
+
+    /// The account of an identity.
+    pub(super) fn of(&self, identity: &str) -> Arc<Account> {
+        let mut open = lock(&self.open);
+        if let Some(account) = open.get(identity).and_then(Weak::upgrade) {
+            return account;
+        }
+        open.retain(|_, account| account.strong_count() > 0);
+        let account = Arc::new(Account::new(self.graph));
+        open.insert(identity.to_owned(), Arc::downgrade(&account));
+        account
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gateway::played::block_on;
+
+    #[test]
+    fn an_identity_has_one_account_and_what_is_dropped_is_given_back() {
+        let accounts = Accounts::new(100);
+        let (one, again, other) = (accounts.of("a"), accounts.of("a"), accounts.of("b"));
+        let charge = one.graph.charge(60).unwrap();
+        assert!(again.graph.charge(41).is_none(), "of the same identity");
+        assert!(other.graph.charge(100).is_some());
+        assert!(again.graph.charge(usize::MAX).is_none());
+        assert_eq!(again.graph.held(), 60);
+        drop(charge);
+        assert!(again.graph.charge(100).is_some());
+        drop((one, again));
+        assert_eq!(accounts.of("a").graph.held(), 0);
+        assert_eq!(lock(&accounts.open).len(), 2);
+    }
+
+    #[test]
+    fn a_message_waits_until_those_before_it_are_handled() {
+        block_on(async {
+            let account = Accounts::new(0).of("a");
+            let first = account.unpacked(MAX_INFLATED).await;
+            let mut second = std::pin::pin!(account.unpacked(1));
+            let waits = std::future::poll_fn(|context| {
+                std::task::Poll::Ready(second.as_mut().poll(context).is_pending())
+            });
+            assert!(waits.await);
+            drop(first);
+            second.await;
+            account.unpacked(10 * MAX_INFLATED).await;
+        });
+    }
+}

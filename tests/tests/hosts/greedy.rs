@@ -1,0 +1,251 @@
+//! A pinned peer that announces more than fits anywhere.
+
+use std::{
+    fs,
+    time::{Duration, Instant},
+};
+
+use axon_tls::identity::{Auth, KeyAlgorithm, SigningKey, Trust, TrustFile};
+use axon_transport::{
+    graph::{Endpoint, EndpointKind},
+    ids::{DaemonId, Gid, SessionId},
+    link::{Graph, Message, Subscribe, Subscriber},
+    qos::Qos,
+    session::EndpointSpec,
+};
+
+use super::{
+    mode::pinned,
+    pair::{Host, Plan},
+    process::{PATIENCE, until},
+    stranger::{Claim, Met, Stranger},
+};
+
+/// Endpoints that one daemon id announces, each with four names of 500 bytes: 24 MB.
+const MANY: u32 = 12_000;
+/// In one message: it is 4 MiB at most before it is compressed.
+const PART: u32 = 1_800;
+/// What counts for each of them at least.
+const NAMES: usize = 2_000;
+/// What the graph of one peer may take.
+const BOUND: usize = 16 << 20;
+
+/// Two hosts that know each other, and a peer that A's trust file knows as "camera".
+pub(crate) struct Camera {
+    pub(crate) stranger: Stranger,
+    auth: Auth,
+    pub(crate) a: Host,
+    pub(crate) b: Host,
+    _dir: tempfile::TempDir,
+}
+
+impl Camera {
+    pub(crate) fn new() -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        let settings = pinned(dir.path(), [[false, true], [true, false]]);
+        let pem = SigningKey::generate_pem_with(KeyAlgorithm::Ed25519).unwrap();
+        let key = SigningKey::from_pem(&pem).unwrap();
+        let trust = dir.path().join("host-0.trust");
+        let lines = fs::read_to_string(&trust).unwrap();
+        fs::write(&trust, lines + &format!("camera {}\n", key.spki_digest())).unwrap();
+        let own = fs::read_to_string(dir.path().join("host-0.key")).unwrap();
+        let own = SigningKey::from_pem(&own).unwrap().spki_digest();
+        let pins = TrustFile::parse(&format!("a {own}")).unwrap();
+        let auth = Auth::Pinned { key, trust: Trust::new(pins) };
+        let [a, b] = Plan::new(settings).start();
+        b.link();
+        Self { stranger: Stranger::new(), auth, a, b, _dir: dir }
+    }
+
+    pub(crate) fn link(&self, id: u8) -> Met {
+        let claim = Claim { daemon: DaemonId([id; 16]), ..Claim::pinned("camera") };
+        self.stranger.dial(&self.a, &self.auth, &claim).expect("a link")
+    }
+
+    /// Announces so many endpoints as a whole graph.
+    fn announce(&self, met: &mut Met, session: SessionId, count: u32) {
+        for from in (0..count).step_by(PART as usize) {
+            let to = count.min(from + PART);
+            let added = (from..to).map(|number| long(session, number)).collect();
+            let (version, before) = (u64::from(to), u64::from(from));
+            let more = to < count;
+            let graph = Graph { version, before, added, more, ..Graph::default() };
+            self.stranger.say(met, &Message::Graph(graph));
+        }
+    }
+
+    /// Waits until all that was said on the link was heard.
+    fn heard(&self, met: &mut Met, route: u32) {
+        let subscribers = vec![Subscriber { gid: Gid([7; 16]), qos: Qos::default() }];
+        let topic = format!("/asked_{route}");
+        self.stranger.say(met, &subscribe(route, topic, subscribers));
+        let ready = |m: &Message| matches!(m, Message::RouteReady(ready) if ready.route == route);
+        self.stranger.hear(met, ready).expect("an answer");
+    }
+
+    /// Processor time of host A's daemon.
+    fn cpu(&self) -> Duration {
+        let pid = self.a.daemon.as_ref().unwrap().0.id();
+        let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap();
+        let (_, stat) = stat.rsplit_once(") ").unwrap();
+        let ticks = stat.split(' ').skip(11).take(2).map(|ticks| ticks.parse::<u64>().unwrap());
+        Duration::from_millis(ticks.sum::<u64>() * 10)
+    }
+
+    /// Bytes that host A's daemon has in memory, by this line of its status: now, and at most.
+    fn memory(&self, line: &str) -> usize {
+        let pid = self.a.daemon.as_ref().unwrap().0.id();
+        let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
+        let line = status.lines().find_map(|l| l.strip_prefix(line)).unwrap();
+        let kib: usize = line.split_whitespace().nth(1).unwrap().parse().unwrap();
+        kib << 10
+    }
+}
+
+fn long(session: SessionId, number: u32) -> Endpoint {
+    let name = |kind: &str| format!("/{kind}_{number}_{}", "n".repeat(500 - 20));
+    Endpoint {
+        gid: Gid::new(session, number),
+        kind: EndpointKind::Publisher,
+        topic: format!("{:0<500}", name("topic")),
+        type_name: format!("{:0<500}", name("type")),
+        type_hash: Vec::new(),
+        qos: Qos::default(),
+        node: format!("{:0<500}", name("node")),
+        namespace: format!("{:0<500}", name("space")),
+        enclave: String::new(),
+    }
+}
+
+fn subscribe(route: u32, topic: String, subscribers: Vec<Subscriber>) -> Message {
+    Message::Subscribe(Subscribe {
+        route,
+        topic,
+        type_name: "t".into(),
+        kind: 0,
+        subscribers,
+        last: Vec::new(),
+        acknowledges: None,
+    })
+}
+
+fn short(session: SessionId, number: u32, topic: &str) -> Endpoint {
+    let (topic, name) = (topic.to_owned(), String::new);
+    Endpoint {
+        topic,
+        type_name: "t".into(),
+        node: name(),
+        namespace: name(),
+        ..long(session, number)
+    }
+}
+
+#[test]
+fn a_graph_has_a_bound_for_all_daemon_ids_of_a_peer_and_the_rest_of_the_link_goes_on() {
+    let camera = Camera::new();
+    let witness = camera.a.session("witness");
+    let seen = || witness.graph().endpoints.values().filter(|e| e.daemon.is_some()).count();
+    let before = camera.memory("VmRSS");
+    let sessions = [SessionId::random(), SessionId::random()];
+    let mut links = [camera.link(0xff), camera.link(0xfe)];
+    for (link, session) in links.iter_mut().zip(sessions) {
+        camera.announce(link, session, MANY);
+        camera.heard(link, 1);
+    }
+    until("what there is room for is shown", || (seen() + 1000) * NAMES > BOUND / 2);
+    camera.a.wait_refusal("what is left out, by name and why", |text| {
+        ["camera", "graph", "/topic_", "more than 16 MiB"].iter().all(|part| text.contains(part))
+    });
+    until("all of it is known", || {
+        let links = camera.a.status().links;
+        let mut camera = links.iter().filter(|l| l.host == "camera");
+        camera.clone().count() == 2 && camera.all(|l| l.endpoints + l.endpoints_left_out == 12_000)
+    });
+    assert!(seen() * NAMES <= BOUND, "{} endpoints", seen());
+    let most = camera.memory("VmHWM") - before;
+    assert!(most < 12 * BOUND, "{} MiB", most >> 20);
+
+    // One goes, another one fits.
+    let [first, second] = &mut links;
+    let change = |before: u64, added, removed| {
+        let version = before + 1;
+        Message::Graph(Graph { version, before, added, removed, ..Graph::default() })
+    };
+    let version = u64::from(MANY);
+    let gone = vec![Gid::new(sessions[0], 0)];
+    camera.stranger.say(first, &change(version, Vec::new(), gone));
+    camera.heard(first, 2);
+    let small = short(sessions[1], MANY, "/small");
+    let gid = small.gid;
+    camera.stranger.say(second, &change(version, vec![small], Vec::new()));
+    until("the small one is shown", || witness.graph().endpoints.contains_key(&gid));
+    assert!(links.iter().all(|link| link.connection.close_reason().is_none()));
+
+    for link in &links {
+        camera.stranger.leave(link);
+    }
+    until("they are gone", || seen() == 0);
+    until("memory is given back", || camera.memory("VmRSS") < before + 2 * BOUND);
+    println!("{} MiB more at most, {} MiB before", most >> 20, before >> 20);
+}
+
+#[test]
+fn a_flood_of_changes_holds_up_nobody_and_ends_in_the_newest_state() {
+    const CHANGES: u64 = 40_000;
+    let camera = Camera::new();
+    let reader = camera.a.session("reader");
+    let mut link = camera.link(0xff);
+    let session = SessionId::random();
+    let topic = |version: u64| format!("/changed_{version}");
+    let (start, from) = (Instant::now(), camera.cpu());
+    for version in 1..=CHANGES {
+        let before = version - 1;
+        let added = vec![short(session, 1, &topic(version))];
+        let graph = Graph { version, before, added, ..Graph::default() };
+        camera.stranger.say(&mut link, &Message::Graph(graph));
+    }
+    let said = start.elapsed();
+    // While it is being taken.
+    let spec = || EndpointSpec::new("/new", "test/Text", Qos::default());
+    let subscription = reader.create_subscription(spec()).unwrap();
+    let writer = camera.b.session("writer");
+    let publisher = writer.create_publisher(spec()).unwrap();
+    assert!(publisher.wait_matched(1, PATIENCE) && subscription.wait_matched(1, PATIENCE));
+    let matched = start.elapsed() - said;
+    let gid = Gid::new(session, 1);
+    until("the newest state is shown", || {
+        let graph = reader.graph();
+        graph.endpoints.get(&gid).is_some_and(|entry| entry.endpoint.topic == topic(CHANGES))
+    });
+    let (all, version) = (start.elapsed(), reader.graph().version);
+    println!(
+        "{CHANGES} changes said in {said:?}, taken in {all:?} with {:?} of the daemon's time and \
+         {version} changes told; a topic of others matched after {matched:?}",
+        camera.cpu() - from
+    );
+    assert_eq!(link.connection.close_reason(), None);
+}
+
+#[test]
+fn routes_that_take_more_than_a_peer_may_are_refused_by_name_and_the_others_served() {
+    let camera = Camera::new();
+    let mut link = camera.link(0xff);
+    let qos = Qos::default();
+    // Each says 4 MB at most; it is kept three times.
+    let readers: Vec<_> = (0..40_000)
+        .map(|number| Subscriber { gid: Gid::new(SessionId([9; 16]), number), qos })
+        .collect();
+    for route in 100..104 {
+        let (topic, subscribers) = (format!("/read_{route}"), readers.clone());
+        camera.stranger.say(&mut link, &subscribe(route, topic, subscribers));
+    }
+    let refused = |m: &Message| matches!(m, Message::RouteRefused(r) if r.route == 103);
+    camera.stranger.hear(&mut link, refused).expect("a refusal");
+    camera.heard(&mut link, 1);
+    until("the route, by name and why", || {
+        let links = camera.a.status().links;
+        let mut refused = links.iter().flat_map(|link| &link.routes_refused);
+        refused.any(|(topic, why)| topic.contains("/read_103") && why.contains("more than 16 MiB"))
+    });
+    assert_eq!(link.connection.close_reason(), None);
+}
