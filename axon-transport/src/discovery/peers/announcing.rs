@@ -49,8 +49,18 @@ impl Peers {
         self.interval().mul_f64(6.25)
     }
 
+    /// Whether there is anybody to tell of this daemon.
+    pub(super) fn announces(&self) -> bool {
+        self.port.is_some()
+            && match self.local.range {
+                DiscoveryRange::Off => false,
+                DiscoveryRange::Localhost => !self.listed.is_empty(),
+                DiscoveryRange::Subnet => true,
+            }
+    }
+
     pub(super) fn start_burst(&mut self, now: Duration) {
-        if self.port.is_none() || self.local.range == DiscoveryRange::Off {
+        if !self.announces() {
             return;
         }
         self.burst_left = BURST.len();

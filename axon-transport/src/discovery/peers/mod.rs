@@ -115,8 +115,12 @@ impl Peers {
         self.dial_due(now);
         if self.next_beacon.is_some_and(|at| at <= now) {
             let first = self.burst_left > 0;
-            self.send_beacon(first);
-            self.schedule_beacon(now);
+            if self.announces() {
+                self.send_beacon(first);
+                self.schedule_beacon(now);
+            } else {
+                self.next_beacon = None;
+            }
         }
     }
 
