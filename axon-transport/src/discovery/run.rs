@@ -87,12 +87,7 @@ pub async fn run(
 
     loop {
         let nameless = hosts.is_empty() && shell.names.is_empty();
-        // Where nobody is looked for, interfaces that change are no reason to wake up.
-        let looks = match range {
-            DiscoveryRange::Off => false,
-            DiscoveryRange::Localhost => !hosts.is_empty(),
-            DiscoveryRange::Subnet => true,
-        };
+        let looks = looks_for_somebody(range, &hosts);
         let wakeup = shell.peers.next_wakeup().map(|at| shell.start + at);
         tokio::select! {
             event = events.recv() => match event {
@@ -122,7 +117,10 @@ pub async fn run(
                 if range != DiscoveryRange::Off {
                     shell.look_at_interfaces();
                 }
-                look.reset();
+                // A timer that is set fires, whether or not it is waited for.
+                if looks_for_somebody(range, &hosts) {
+                    look.reset();
+                }
             }
             _ = look.tick(), if looks => shell.look_at_interfaces(),
             _ = names.tick(), if lookups.is_empty() && !nameless => {
@@ -261,6 +259,15 @@ async fn receive(socket: Option<&SharedSocket>) -> std::io::Result<(SocketAddr, 
     match socket {
         Some(socket) => socket.receive().await,
         None => pending().await,
+    }
+}
+
+/// Where nobody is looked for, interfaces that change are no reason to wake up.
+fn looks_for_somebody(range: DiscoveryRange, hosts: &BTreeSet<(String, Option<u16>)>) -> bool {
+    match range {
+        DiscoveryRange::Off => false,
+        DiscoveryRange::Localhost => !hosts.is_empty(),
+        DiscoveryRange::Subnet => true,
     }
 }
 
