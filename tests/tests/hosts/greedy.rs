@@ -186,7 +186,7 @@ fn a_graph_has_a_bound_for_all_daemon_ids_of_a_peer_and_the_rest_of_the_link_goe
     }
     until("they are gone", || seen() == 0);
     until("memory is given back", || camera.memory("VmRSS") < before + 2 * BOUND);
-    println!("{} MiB more at most, {} MiB before", most >> 20, before >> 20);
+    eprintln!("{} MiB more at most, {} MiB before", most >> 20, before >> 20);
 }
 
 #[test]
@@ -218,7 +218,7 @@ fn a_flood_of_changes_holds_up_nobody_and_ends_in_the_newest_state() {
         graph.endpoints.get(&gid).is_some_and(|entry| entry.endpoint.topic == topic(CHANGES))
     });
     let (all, version) = (start.elapsed(), reader.graph().version);
-    println!(
+    eprintln!(
         "{CHANGES} changes said in {said:?}, taken in {all:?} with {:?} of the daemon's time and \
          {version} changes told; a topic of others matched after {matched:?}",
         camera.cpu() - from

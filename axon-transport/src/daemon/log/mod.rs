@@ -1,8 +1,8 @@
 //! The log of a daemon: lines on standard error, or in a file that is rotated.
 //!
 //! Logging never ends a daemon: a line that cannot be written is dropped. A peer or another user
-//! cannot fill a file system with it either: each kind of line has a rate ([`throttle`]), and the
-//! file a size ([`output`]).
+//! cannot fill a file system with it either: each kind of line has a rate (`throttle`), and the
+//! file a size (`output`).
 
 mod output;
 mod throttle;

@@ -53,6 +53,9 @@ pub const MAX_OF_PROCESS: usize = 256;
 /// Remembered GIDs of endpoints that ended while there was no daemon to tell.
 const MAX_TOMBSTONES: usize = 4096;
 
+/// Packets that live as long as a session has yet to be sent them.
+type SharedPackets = Vec<Weak<[u8]>>;
+
 /// The state of the control plane.
 #[derive(Debug)]
 pub struct Registry<F> {
@@ -73,7 +76,7 @@ pub struct Registry<F> {
     /// Applications' sessions came or went.
     rescoped: bool,
     /// The packets of the whole graph as each view was told it last, and the version of it.
-    whole: (u64, BTreeMap<range::View, Vec<Weak<[u8]>>>),
+    whole: (u64, BTreeMap<range::View, SharedPackets>),
     ready: BTreeSet<SessionId>,
     /// The first endpoint of each session that was refused, and why.
     refused: Vec<(SessionId, String)>,
