@@ -54,7 +54,7 @@ pub(super) struct Control {
     pub(super) probe: Option<OwnedFd>,
     /// Packets that were exchanged with sessions.
     pub(super) traffic: TrafficStatus,
-    /// How far discovery looks, and for whom: as far as the widest session needs.
+    /// The range and the hosts of discovery: what the widest session needs.
     pub(super) wanted: watch::Sender<Wanted>,
     /// The addresses that names of static peers have.
     names: BTreeMap<String, Vec<IpAddr>>,

@@ -83,7 +83,7 @@ impl<F: Clone> Registry<F> {
         let all: Vec<Gid> = removed.keys().copied().collect();
         let own: Vec<Gid> = removed.iter().filter(|(_, own)| **own).map(|(gid, _)| *gid).collect();
         for (view, sessions) in self.views() {
-            // What there is of other hosts the gateway said itself.
+            // The gateway itself reported the endpoints of other hosts.
             let removed = if view.is_gateway() { &own } else { &all };
             let regraded = regraded.iter().filter(|_| view.is_gateway());
             let regraded = regraded.filter(|gid| !added.contains_key(*gid));

@@ -166,7 +166,7 @@ struct Asked {
     by: SessionId,
     /// What its reader asked.
     attach: Option<Attach>,
-    /// For whom the reader stands, as the writer was told.
+    /// The subscriptions that the reader stands for, as last sent to the writer.
     stands_for: Option<Vec<Gid>>,
     /// What its writer answered.
     grant: Option<Granted>,

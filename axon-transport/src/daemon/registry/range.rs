@@ -145,7 +145,7 @@ impl<F: Clone> Registry<F> {
         self.match_endpoint(gid);
     }
 
-    /// Tells a writer for whom its relay stands now, if that is not what it was told.
+    /// Tells a writer which subscriptions its relay stands for, if they changed.
     fn retell_stands_for(&mut self, pair: &Pair) {
         let Some(asked) = self.pairs.get(pair) else { return };
         let told = asked.stands_for.clone();
@@ -154,7 +154,7 @@ impl<F: Clone> Registry<F> {
         }
     }
 
-    /// For whom the reader of a pair stands, as far as its writer's session may know.
+    /// The subscriptions that a pair's reader stands for and that the writer's session may see.
     pub(super) fn stands_for(&self, pair: &Pair) -> Option<Vec<Gid>> {
         let all = self.pairs.get(pair)?.attach.as_ref()?.stands_for.clone()?;
         let Some(writer) = self.endpoints.get(&pair.writer) else { return Some(Vec::new()) };

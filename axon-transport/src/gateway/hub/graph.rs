@@ -57,7 +57,7 @@ impl Hub {
         let what = format!("topic {topic}");
         self.tell(ToControl::Refusal { peer: who, what, reason }).await;
         tokio::spawn(async move {
-            // Whoever ends it counts what was under way.
+            // The code that ends it counts the samples in flight.
             let samples = stalled.samples.await.unwrap_or(0);
             counters.dropped("stalled", samples);
             tracing::warn!(topic, samples, "samples are lost: a peer does not read the topic");

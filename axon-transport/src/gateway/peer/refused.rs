@@ -20,7 +20,7 @@ const REMEMBERED: usize = 8192;
 /// Characters of a peer's reason that are shown.
 const REASON: usize = 200;
 
-/// What is refused, and by whom.
+/// The refusing side and the reason.
 #[derive(Default)]
 pub(super) struct RefusedRoutes {
     /// What this side does not ask for.
