@@ -52,7 +52,8 @@ fn settled(local: Local) -> Peers {
     peers.set_interfaces(Duration::ZERO, vec![interface]);
     peers.set_port(Duration::ZERO, 61300);
     for _ in 0..5 {
-        let at = peers.next_wakeup().unwrap();
+        // A daemon that looks for nobody sends no beacons and rests at once.
+        let Some(at) = peers.next_wakeup() else { break };
         assert!(at <= secs(2.0));
         peers.advance(at);
     }
