@@ -12,7 +12,7 @@ use axon_transport::{
 };
 use serde_json::json;
 
-use crate::{cli, failure::Failure, logging, session, text};
+use crate::{cli, failure::Failure, logging, say::say, session, text};
 
 /// Bytes of the payload that a line shows.
 const HEAD: usize = 16;
@@ -54,7 +54,7 @@ pub(crate) fn run(args: &cli::Echo) -> Result<(), Failure> {
     }
     let lost = subscription.lost();
     if lost > 0 {
-        eprintln!("axon echo: missed {} messages", text::grouped(lost));
+        say(format_args!("axon echo: missed {} messages", text::grouped(lost)));
     }
     Ok(())
 }
@@ -71,7 +71,7 @@ fn find_type(session: &Session, topic: &str) -> String {
         found.is_some()
     };
     if !session.wait_graph(AT_ONCE, &mut look) {
-        eprintln!("axon echo: waiting for {} to appear", text::printable(topic));
+        say(format_args!("axon echo: waiting for {} to appear", text::printable(topic)));
         while !session.wait_graph(Duration::from_secs(3_600), &mut look) {}
     }
     found.unwrap_or_default()

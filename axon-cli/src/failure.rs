@@ -4,6 +4,8 @@ use std::{fmt::Display, process::ExitCode};
 
 use axon_transport::config::ConfigError;
 
+use crate::say::say;
+
 /// Why a command ends without having done its work.
 #[derive(Debug)]
 pub(crate) enum Failure {
@@ -24,11 +26,11 @@ impl Failure {
         match self {
             // One line, whatever the setting held.
             Self::Setting(line) => {
-                eprintln!("axon: {}", crate::text::printable(line));
+                say(format_args!("axon: {}", crate::text::printable(line)));
                 ExitCode::from(2)
             }
             Self::Failed(reason) => {
-                eprintln!("axon: {reason}");
+                say(format_args!("axon: {reason}"));
                 ExitCode::FAILURE
             }
         }

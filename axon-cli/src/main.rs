@@ -2,6 +2,8 @@
 
 // But for the memory that `bench` shares between two processes by itself.
 #![deny(unsafe_code)]
+// `say` writes there, and does not panic where that fails.
+#![warn(clippy::print_stderr)]
 
 mod bench;
 mod cli;
@@ -12,6 +14,7 @@ mod failure;
 mod log;
 mod logging;
 mod play;
+mod say;
 mod session;
 mod status;
 mod text;

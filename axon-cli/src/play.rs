@@ -18,7 +18,9 @@ use crate::{
     cli::{self, Profile},
     failure::Failure,
     log::{LogError, Message, Survey},
-    logging, session, text,
+    logging,
+    say::say,
+    session, text,
 };
 
 /// Messages read ahead of their time.
@@ -61,14 +63,14 @@ pub(crate) fn run(args: &cli::Play) -> Result<(), Failure> {
     if let Some(damage) = &survey.damage {
         let (messages, time) = (text::grouped(survey.messages), text::duration(survey.duration));
         let file = survey.path.display();
-        eprintln!(
+        say(format_args!(
             "axon play: {file} is damaged ({damage}); playing the {messages} messages, {time}, before"
-        );
+        ));
     }
     let session = session::open(&config, "axon play")?;
     let publishers = publishers(&session, &survey, args.qos.qos())?;
     if args.wait > 0 {
-        eprintln!("axon play: waiting for {} subscriptions a topic", args.wait);
+        say(format_args!("axon play: waiting for {} subscriptions a topic", args.wait));
         wait_matched(&publishers, args.wait, Duration::MAX);
     }
     let started = Instant::now();
@@ -92,14 +94,14 @@ pub(crate) fn run(args: &cli::Play) -> Result<(), Failure> {
     let given_up = publishers.iter().map(Publisher::given_up).sum::<u64>();
     let Sent { messages, bytes, waits, missed } = total;
     let acknowledged = messages.saturating_sub(left).saturating_sub(given_up);
-    eprintln!(
+    say(format_args!(
         "axon play: {} messages, {} in {}; {} acknowledged; waited {} times for a reader",
         text::grouped(messages),
         text::bytes(bytes),
         text::duration(started.elapsed().as_nanos() as u64),
         text::grouped(acknowledged),
         text::grouped(waits),
-    );
+    ));
     unheard(left, given_up, missed)
 }
 

@@ -85,3 +85,13 @@ fn a_wrong_argument_has_status_2_too() {
         assert_eq!(axon([]).args(args).output().expect("runs").status.code(), Some(2), "{args:?}");
     }
 }
+
+#[test]
+fn a_standard_error_that_takes_nothing_changes_no_status() {
+    let full = || std::fs::OpenOptions::new().write(true).open("/dev/full").expect("Linux has it");
+    let mut setting = axon([("AXON_TYPO", "x")]);
+    assert_eq!(setting.arg("status").stderr(full()).status().expect("runs").code(), Some(2));
+    let mut missing = axon([]);
+    let file = ["play", "/nowhere/log.mcap"];
+    assert_eq!(missing.args(file).stderr(full()).status().expect("runs").code(), Some(1));
+}

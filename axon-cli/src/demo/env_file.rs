@@ -4,11 +4,13 @@
 use std::path::Path;
 
 /// The variables that may stand in the file.
-const KNOWN: [&str; 7] = [
+const KNOWN: [&str; 9] = [
     "AXON_KME_URL",
     "AXON_KME_CA",
     "AXON_KME_ID",
     "AXON_KME_QUIRKS",
+    "AXON_KME_CONNECT_TIMEOUT",
+    "AXON_KME_ANSWER_TIMEOUT",
     "AXON_SAE_ID",
     "AXON_SAE_CERT",
     "AXON_SAE_KEY",

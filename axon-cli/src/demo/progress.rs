@@ -4,6 +4,8 @@ use std::{io::IsTerminal, time::Duration};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
+use crate::say::say;
+
 /// The demo's progress.
 pub(crate) struct Progress {
     bar: ProgressBar,
@@ -35,7 +37,7 @@ impl Progress {
     /// What happens now.
     pub(crate) fn step(&self, what: &str, doing: &str) {
         if self.lines {
-            eprintln!("axon demo: {what}: {doing}");
+            say(format_args!("axon demo: {what}: {doing}"));
         }
         self.bar.set_message(format!("{what}: {doing}"));
     }

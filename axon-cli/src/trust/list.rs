@@ -9,6 +9,7 @@ use super::{cli, files};
 use crate::{
     failure::Failure,
     logging,
+    say::say,
     text::{Table, printable},
 };
 
@@ -30,7 +31,7 @@ fn paths(args: &cli::List) -> Result<(PathBuf, Option<PathBuf>), Failure> {
             Ok(config) => classic(config).and_then(|classic| classic.key),
             Err(error) => {
                 let error = printable(&error.to_string());
-                eprintln!("axon: this host's key is not marked: {error}");
+                say(format_args!("axon: this host's key is not marked: {error}"));
                 None
             }
         });

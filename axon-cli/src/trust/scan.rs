@@ -24,7 +24,7 @@ use super::{
     line::line,
     look::{self, look},
 };
-use crate::{failure::Failure, text::printable};
+use crate::{failure::Failure, say::say, text::printable};
 
 /// When one port has answered, the others have this long.
 const OTHERS: Duration = Duration::from_secs(1);
@@ -53,7 +53,9 @@ pub(super) fn run(args: &cli::Scan) -> Result<(), Failure> {
     })?;
 
     let found = Found::of(&seen);
-    eprint!("{}", found.notes);
+    if !found.notes.is_empty() {
+        say(found.notes.trim_end());
+    }
     if found.keys.is_empty() {
         let answered = !found.notes.is_empty();
         return Err(Failure::failed(nobody(args, &asked, domain, answered)));
@@ -70,7 +72,7 @@ pub(super) fn run(args: &cli::Scan) -> Result<(), Failure> {
             ),
         };
     }
-    eprintln!("{NOTHING_VERIFIED}");
+    say(NOTHING_VERIFIED);
     std::io::stdout().lock().write_all(out.as_bytes())?;
     Ok(())
 }

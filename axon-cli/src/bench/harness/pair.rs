@@ -20,6 +20,8 @@ use super::{
     raw::Shared,
 };
 
+use crate::say::say;
+
 /// Turns of the wait for credit before the CPU is offered to others: a medium's own threads may
 /// need it.
 const SPINS: u32 = 200_000;
@@ -69,7 +71,7 @@ pub(crate) fn spawn(arguments: &[&str]) -> Result<Other> {
     let watch = thread::spawn(move || {
         let status = child.wait();
         if !seen.load(Ordering::Relaxed) {
-            eprintln!("the other process of the measurement ended early: {status:?}");
+            say(format_args!("the other process of the measurement ended early: {status:?}"));
             exit(1);
         }
     });

@@ -4,6 +4,8 @@ use std::io::IsTerminal;
 
 use indicatif::{ProgressBar, ProgressStyle};
 
+use crate::say::say;
+
 /// A run's progress. Nothing moves while something is measured.
 pub(crate) struct Progress {
     bar: ProgressBar,
@@ -25,7 +27,7 @@ impl Progress {
     /// What is measured from now on.
     pub(crate) fn step(&self, what: &str) {
         if self.lines {
-            eprintln!("{what}");
+            say(what);
         }
         self.bar.set_message(what.to_owned());
     }
