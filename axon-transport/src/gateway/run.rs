@@ -18,6 +18,7 @@ use super::{
     keyring::Keyring,
     pulse::Pulse,
     room::Room,
+    silence::Echoes,
     stand_in::StandIns,
 };
 use crate::{
@@ -102,8 +103,13 @@ async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
         });
     }
     let forward = control.clone();
+    let echoes = Arc::<Echoes>::default();
+    let answered = Arc::clone(&echoes);
     tokio::spawn(async move {
         while let Some(datagram) = received.recv().await {
+            if answered.take(&datagram) {
+                continue;
+            }
             let notice = ToControl::Datagram { from: datagram.from, bytes: datagram.bytes };
             // A datagram that finds the control plane busy is lost, as datagrams may be.
             let _ = forward.try_send(notice);
@@ -118,7 +124,7 @@ async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
         }
         let _ = ordered.send(Event::Order(crate::daemon::bridge::ToGateway::Shutdown)).await;
     });
-    let hub = Hub::new(context, endpoints, shared, control, events);
+    let hub = Hub::new(context, endpoints, echoes, shared, control, events);
     if hub.run(inbox, &noticed).await { Ok(()) } else { Err(GatewayError::SessionLost) }
 }
 

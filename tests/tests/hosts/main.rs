@@ -2,6 +2,7 @@
 //! in qkd a KME each, simulated in the test's process.
 
 mod crowd;
+mod cut;
 mod delivery;
 mod disagree;
 mod election;
@@ -27,3 +28,4 @@ mod secrets;
 mod services;
 mod stranger;
 mod unread;
+mod wire;

@@ -21,6 +21,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use super::{
     mode::Settings,
     process::{Kept, Node, until},
+    wire::Wire,
 };
 
 /// The topic of all these tests.
@@ -37,11 +38,13 @@ pub(crate) struct Plan {
     pub(crate) stalled_s: u32,
     /// Whether host B is in another domain.
     pub(crate) other_domain: bool,
+    /// Whether only what lies between them leads from one to the other: [`Host::wire`].
+    pub(crate) wired: bool,
 }
 
 impl Plan {
     pub(crate) fn new(settings: [Settings; 2]) -> Self {
-        Self { settings, grace_s: 300, stalled_s: 300, other_domain: false }
+        Self { settings, grace_s: 300, stalled_s: 300, other_domain: false, wired: false }
     }
 
     /// Starts both hosts.
@@ -59,13 +62,22 @@ impl Plan {
         let net = [(16 + pair % 200) as u8, (1 + pid % 250) as u8];
         // Below 100: the tool's tests, whose daemons may still be in their grace time, are above.
         let domain = 1 + (pid.wrapping_mul(31) + 2 * pair) % 98;
-        let addresses = [1, 2].map(|host| Ipv4Addr::new(127, net[0], net[1], host));
+        let [addresses, ends] =
+            [[1, 2], [4, 3]].map(|of| of.map(|host| Ipv4Addr::new(127, net[0], net[1], host)));
         [0, 1].map(|host| {
-            let more = [
+            let peers = if self.wired { String::new() } else { addresses[1 - host].to_string() };
+            let mut more = vec![
                 ("AXON_BIND_ADDRS", addresses[host].to_string()),
-                ("AXON_DAEMON_PEERS", addresses[1 - host].to_string()),
+                ("AXON_DAEMON_PEERS", peers),
                 ("ROS_DOMAIN_ID", (domain + u32::from(self.other_domain && host == 1)).to_string()),
             ];
+            if self.wired {
+                more.push(("AXON_ADVERTISE_ADDRS", ends[host].to_string()));
+                more.push(("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST".to_owned()));
+                if host == 0 {
+                    more.push(("ROS_STATIC_PEERS", ends[1].to_string()));
+                }
+            }
             let settings = self.settings[host].iter().cloned().chain(more);
             Host::new(["A", "B"][host], addresses[host], settings, [self.grace_s, self.stalled_s])
         })
@@ -114,6 +126,16 @@ impl Host {
             assert!(ended.is_none(), "the daemon of {} ended: {ended:?}", self.name);
             self.try_status().is_some_and(|status| status.port.is_some())
         });
+    }
+
+    /// The wire to this host, which runs already, of a plan that is `wired`.
+    pub(crate) fn wire(&self) -> Wire {
+        let at = |host| {
+            let [a, b, c, _] = self.address.octets();
+            Ipv4Addr::new(a, b, c, host)
+        };
+        let port = self.status().port.unwrap();
+        Wire::between((at(3), port).into(), (at(4), 0).into(), (self.address, port).into())
     }
 
     fn command(&self, program: &str) -> Command {

@@ -124,15 +124,21 @@ async fn leave(
     mut news: watch::Receiver<News>,
     keyring: Option<Arc<Keyring>>,
 ) {
-    let Link { connection, outbox, carrier, carrying, reading, until, .. } = link;
+    let Link { connection, outbox, carrier, carrying, reading, until, silent, .. } = link;
     drop(carrier);
     let least = Instant::now() + HAND_OVER;
     let until = until.map(|until| until.max(least));
     let mut last = news.clone();
     let arrived = async {
-        carrying.closed().await;
+        // What a silent one has under way is sent again over its successor.
+        if !silent {
+            carrying.closed().await;
+        }
         // Who has not heard of the successor would take the end of the control stream for the link's.
         let _ = news.wait_for(|news| news.succeeded).await;
+        if silent {
+            return;
+        }
         outbox.end();
         while tokio::time::timeout(HAND_OVER, news.wait_for(|n| n.ended)).await.is_err() {
             // What accepts streams holds one, each that is read another.

@@ -24,6 +24,7 @@ use crate::{
         peer::{Peer, spawn_reader},
         refusal::{Refusal, RefusedBy},
         seal::Protection,
+        silence::{Traffic, Watch},
         status::Who,
     },
     ids::DaemonId,
@@ -42,6 +43,19 @@ static ELECTIONS: AtomicU64 = AtomicU64::new(1);
 const MANY: usize = 1000;
 /// Why somebody who claims a linked daemon's id gets no link.
 const TAKEN: &str = "this daemon id is linked already, under another identity";
+
+impl Link {
+    /// What makes its successor.
+    fn successor(&self) -> Target {
+        Target {
+            daemon: Some(self.established.hello.daemon),
+            sae: self.established.hello.sae.clone(),
+            addresses: vec![self.connection.remote_address()],
+            listed: false,
+            replaces: self.elected.map(|e| e.link),
+        }
+    }
+}
 
 impl Hub {
     pub(super) fn dial(&self, target: Target) {
@@ -167,6 +181,9 @@ impl Hub {
             until: None,
             since_unix_ms: crate::daemon::status::unix_ms(),
             account: Arc::clone(&account),
+            traffic: Traffic::default(),
+            watch: None,
+            silent: false,
         };
         self.links.insert(established.number, link);
         (established.reader, account)
@@ -276,13 +293,7 @@ impl Hub {
 
     pub(super) fn renew(&self, number: u64) {
         let Some(link) = self.links.get(&number) else { return };
-        self.dial(Target {
-            daemon: Some(link.established.hello.daemon),
-            sae: link.established.hello.sae.clone(),
-            addresses: vec![link.connection.remote_address()],
-            listed: false,
-            replaces: link.elected.map(|e| e.link),
-        });
+        self.dial(link.successor());
         // Should the dial fail, the next try is due before the key's age is reached.
         let after = self.context.keyring.as_ref().map(|k| k.config.session_max_age.mul_f64(0.04));
         let events = self.events.clone();
@@ -290,6 +301,41 @@ impl Hub {
             tokio::time::sleep(after.unwrap_or_default().max(Duration::from_secs(1))).await;
             let _ = events.send(Event::Renew(number)).await;
         });
+    }
+
+    /// Has links watched over which something went out and nothing came in the last second.
+    pub(super) fn watch_silent(&mut self) {
+        let (daemon, endpoints) = (self.context.hello.daemon, &self.endpoints);
+        for (number, link) in self.links.iter_mut().filter(|(_, link)| link.elected.is_some()) {
+            let before = std::mem::replace(&mut link.traffic, Traffic::of(&link.connection));
+            let watched = link.watch.as_ref().is_some_and(|watch| !watch.is_finished());
+            // It is not any more: what it has under way arrives.
+            link.silent &= !link.traffic.came_since(before);
+            if watched || !link.traffic.is_silent_since(before) {
+                continue;
+            }
+            let watch = Watch {
+                number: *number,
+                connection: link.connection.clone(),
+                side: link.candidate.side,
+                daemon,
+                endpoints: Arc::clone(endpoints),
+                echoes: Arc::clone(&self.echoes),
+                events: self.events.clone(),
+            };
+            link.watch = Some(tokio::spawn(watch.run()));
+        }
+    }
+
+    /// The path of a silent link works: a successor is dialled over it.
+    pub(super) fn replace_silent(&mut self, number: u64) {
+        let Some(link) = self.links.get_mut(&number) else { return };
+        link.silent = true;
+        let (daemon, address) = (link.established.hello.daemon, link.connection.remote_address());
+        tracing::info!(peer = %daemon, %address,
+            "the link is silent though its path works: dialling a successor");
+        let target = link.successor();
+        self.dial(target);
     }
 
     /// A pin that was removed, or ran out, closes its live links within a second; so does a

@@ -16,6 +16,7 @@ use std::{
 use axon_tls::Negotiated;
 use tokio::{
     sync::{Notify, mpsc, watch},
+    task::JoinHandle,
     time::sleep,
 };
 
@@ -34,6 +35,7 @@ use super::{
     refusal::{Refusal, RefusedBy},
     room::Room,
     seal::Protection,
+    silence::{Echoes, Traffic},
     stalls::Stalls,
     stand_in::StandIns,
     status::{self, Who},
@@ -98,6 +100,8 @@ pub(super) enum Event {
     Renew(u64),
     /// The link is as old as a link may get.
     Expired(u64),
+    /// Nothing comes over the link, though its path works.
+    Silent(u64),
     /// Other keys or certificates may be trusted than before.
     Identity,
     /// Nothing is left of what this publisher here left for this peer.
@@ -140,6 +144,12 @@ struct Link {
     until: Option<Instant>,
     since_unix_ms: u64,
     account: Arc<Account>,
+    /// What had gone over it a second ago.
+    traffic: Traffic,
+    /// Probes it while it is silent.
+    watch: Option<JoinHandle<()>>,
+    /// A successor was dialled since it is silent: what it has under way goes over that.
+    silent: bool,
 }
 
 /// What is kept of a link's beginning.
@@ -160,6 +170,7 @@ pub(super) type Local = BTreeMap<Gid, (Arc<Endpoint>, Reach)>;
 pub(super) struct Hub {
     context: Arc<Context>,
     endpoints: Arc<Endpoints>,
+    echoes: Arc<Echoes>,
     shared: Arc<Shared>,
     control: mpsc::Sender<ToControl>,
     events: mpsc::Sender<Event>,
@@ -177,6 +188,7 @@ impl Hub {
     pub(super) fn new(
         context: Arc<Context>,
         endpoints: Arc<Endpoints>,
+        echoes: Arc<Echoes>,
         shared: Arc<Shared>,
         control: mpsc::Sender<ToControl>,
         events: mpsc::Sender<Event>,
@@ -184,6 +196,7 @@ impl Hub {
         Self {
             context,
             endpoints,
+            echoes,
             shared,
             control,
             events,
@@ -229,6 +242,7 @@ impl Hub {
                     seconds = seconds.wrapping_add(1);
                     self.close_untrusted(seconds.is_multiple_of(CERTIFICATES_EVERY)).await;
                     self.resync();
+                    self.watch_silent();
                     self.report().await;
                     let now = Instant::now();
                     self.peers.values_mut().for_each(|peer| peer.ask_again(now));
@@ -290,6 +304,7 @@ impl Hub {
                 }
             }
             Event::Renew(link) => self.renew(link),
+            Event::Silent(link) => self.replace_silent(link),
             Event::Identity => self.close_untrusted(true).await,
             Event::Drained(daemon, publisher) => self.drained(daemon, publisher).await,
             Event::Stalled { daemon, route } => self.stalled(daemon, route).await,

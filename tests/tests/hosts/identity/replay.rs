@@ -3,12 +3,6 @@
 use std::{
     fs,
     net::{Ipv4Addr, SocketAddr, UdpSocket},
-    sync::{
-        Arc, Mutex,
-        atomic::{AtomicBool, Ordering},
-    },
-    thread,
-    time::Duration,
 };
 
 use axon_tls::identity::{Auth, KeyAlgorithm, SigningKey, Trust, TrustFile};
@@ -18,61 +12,8 @@ use super::super::{
     pair::Plan,
     process::until,
     stranger::{Claim, Stranger},
+    wire::Wire,
 };
-
-/// Passes datagrams on between one client and one server, and keeps what the client says.
-struct Wire {
-    address: SocketAddr,
-    /// What speaks to the server.
-    towards: Arc<UdpSocket>,
-    said: Arc<Mutex<Vec<Vec<u8>>>>,
-    over: Arc<AtomicBool>,
-}
-
-impl Wire {
-    fn to(server: SocketAddr) -> Self {
-        let [near, towards] = [0, 1].map(|_| {
-            let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
-            socket.set_read_timeout(Some(Duration::from_millis(10))).unwrap();
-            Arc::new(socket)
-        });
-        let wire = Self {
-            address: near.local_addr().unwrap(),
-            towards: Arc::clone(&towards),
-            said: Arc::default(),
-            over: Arc::default(),
-        };
-        let client = Arc::new(Mutex::new(None));
-        let (from, over, said) = (client.clone(), wire.over.clone(), wire.said.clone());
-        let (back, out) = (Arc::clone(&near), Arc::clone(&towards));
-        thread::spawn(move || {
-            let mut bytes = [0; 65_536];
-            while !over.load(Ordering::Relaxed) {
-                let Ok((length, address)) = near.recv_from(&mut bytes) else { continue };
-                *from.lock().unwrap() = Some(address);
-                said.lock().unwrap().push(bytes[..length].to_vec());
-                let _ = out.send_to(&bytes[..length], server);
-            }
-        });
-        let over = wire.over.clone();
-        thread::spawn(move || {
-            let mut bytes = [0; 65_536];
-            while !over.load(Ordering::Relaxed) {
-                let Ok((length, _)) = towards.recv_from(&mut bytes) else { continue };
-                if let Some(address) = *client.lock().unwrap() {
-                    let _ = back.send_to(&bytes[..length], address);
-                }
-            }
-        });
-        wire
-    }
-}
-
-impl Drop for Wire {
-    fn drop(&mut self) {
-        self.over.store(true, Ordering::Relaxed);
-    }
-}
 
 #[test]
 fn what_made_a_link_once_makes_no_second() {
@@ -90,7 +31,8 @@ fn what_made_a_link_once_makes_no_second() {
     let [a, b] = Plan::new(settings).start();
     b.link();
     let server = SocketAddr::from((a.address, a.status().port.unwrap()));
-    let wire = Wire::to(server);
+    let anywhere = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
+    let wire = Wire::between(anywhere, anywhere, server);
     let stranger = Stranger::new();
     let claim = Claim::pinned("camera");
     let link = stranger.dial_at(wire.address, a.domain(), &camera, &claim).expect("a link");
