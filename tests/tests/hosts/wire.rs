@@ -4,7 +4,7 @@ use std::{
     net::{SocketAddr, UdpSocket},
     sync::{
         Arc, Mutex,
-        atomic::{AtomicBool, Ordering},
+        atomic::{AtomicBool, AtomicU8, Ordering},
     },
     thread,
     time::Duration,
@@ -12,6 +12,25 @@ use std::{
 
 /// Datagrams that are remembered.
 const MOST: usize = 1000;
+
+const ALL: u8 = 0;
+const NOTHING: u8 = 1;
+const NEWCOMERS: u8 = 2;
+
+/// Whether a datagram with this first byte gets through.
+fn pass(passes: &AtomicU8, first: u8) -> bool {
+    match passes.load(Ordering::Relaxed) {
+        ALL => true,
+        NOTHING => false,
+        // A long header: a handshake.
+        _ if first & 0x80 != 0 => {
+            passes.store(ALL, Ordering::Relaxed);
+            true
+        }
+        // Discovery, and no short header.
+        _ => first & 0xc0 == 0,
+    }
+}
 
 /// Passes datagrams on between one client and one server.
 pub(crate) struct Wire {
@@ -21,7 +40,7 @@ pub(crate) struct Wire {
     pub(crate) towards: Arc<UdpSocket>,
     /// What the client said.
     pub(crate) said: Arc<Mutex<Vec<Vec<u8>>>>,
-    cut: Arc<AtomicBool>,
+    passes: Arc<AtomicU8>,
     over: Arc<AtomicBool>,
 }
 
@@ -37,18 +56,19 @@ impl Wire {
             address: near.local_addr().unwrap(),
             towards: Arc::clone(&towards),
             said: Arc::default(),
-            cut: Arc::default(),
+            passes: Arc::default(),
             over: Arc::default(),
         };
         let client = Arc::new(Mutex::new(None));
         let (from, over, said) = (client.clone(), wire.over.clone(), wire.said.clone());
-        let (back, out, cut) = (Arc::clone(&near), Arc::clone(&towards), Arc::clone(&wire.cut));
+        let (back, out, passes) =
+            (Arc::clone(&near), Arc::clone(&towards), Arc::clone(&wire.passes));
         thread::spawn(move || {
             let mut bytes = [0; 65_536];
             while !over.load(Ordering::Relaxed) {
                 let Ok((length, address)) = near.recv_from(&mut bytes) else { continue };
                 *from.lock().unwrap() = Some(address);
-                if cut.load(Ordering::Relaxed) {
+                if !pass(&passes, bytes[0]) {
                     continue;
                 }
                 let mut said = said.lock().unwrap();
@@ -59,13 +79,12 @@ impl Wire {
                 let _ = out.send_to(&bytes[..length], server);
             }
         });
-        let (over, cut) = (Arc::clone(&wire.over), Arc::clone(&wire.cut));
+        let (over, passes) = (Arc::clone(&wire.over), Arc::clone(&wire.passes));
         thread::spawn(move || {
             let mut bytes = [0; 65_536];
             while !over.load(Ordering::Relaxed) {
                 let Ok((length, _)) = towards.recv_from(&mut bytes) else { continue };
-                if let (Some(address), false) =
-                    (*client.lock().unwrap(), cut.load(Ordering::Relaxed))
+                if let (Some(address), false) = (*client.lock().unwrap(), !pass(&passes, bytes[0]))
                 {
                     let _ = back.send_to(&bytes[..length], address);
                 }
@@ -74,9 +93,20 @@ impl Wire {
         wire
     }
 
-    /// From now on nothing gets through, or all does again.
-    pub(crate) fn cut(&self, cut: bool) {
-        self.cut.store(cut, Ordering::Relaxed);
+    /// From now on nothing gets through.
+    pub(crate) fn cut(&self) {
+        self.passes.store(NOTHING, Ordering::Relaxed);
+    }
+
+    /// All gets through again.
+    pub(crate) fn mend(&self) {
+        self.passes.store(ALL, Ordering::Relaxed);
+    }
+
+    /// Discovery gets through again, and new connections; what was connected when the wire was cut is
+    /// silent until there is one, as QUIC is in its longest pause.
+    pub(crate) fn mend_for_newcomers(&self) {
+        self.passes.store(NEWCOMERS, Ordering::Relaxed);
     }
 }
 
