@@ -16,6 +16,7 @@ use std::{
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::{
+    intake::Intake,
     keyring::lock,
     pace::{Bucket, Turns},
 };
@@ -23,6 +24,11 @@ use crate::link::{MAX_FRAME, MAX_INFLATED, Message};
 
 /// Stand-ins of one identity. Each costs a ring.
 pub(super) const MAX_STAND_INS: usize = 1024;
+/// Stream data of one identity that was not read, in bytes: beside it each of its links has
+/// [`LINK_WINDOW`](super::endpoint::LINK_WINDOW).
+const UNREAD: usize = 64 << 20;
+/// Messages of one identity that are on their way in, in bytes; of one that is longer it is that one.
+const INTAKE: usize = 64 << 20;
 /// Bytes that a unit of a semaphore stands for.
 const UNIT: usize = 1024;
 /// Control frames of one identity that are being read, in bytes.
@@ -54,12 +60,32 @@ impl Meter {
         Arc::new(Self { most, held: AtomicUsize::new(0) })
     }
 
+    /// Holds nothing yet.
+    pub(super) fn nothing(self: &Arc<Self>) -> Charge {
+        Charge { meter: Arc::clone(self), amount: 0 }
+    }
+
     /// Holds `amount` more, if that is within the bound.
     pub(super) fn charge(self: &Arc<Self>, amount: usize) -> Option<Charge> {
         let more = |held: usize| held.checked_add(amount).filter(|sum| *sum <= self.most);
         // Relaxed: a bound, not a hand-over.
         self.held.fetch_update(Ordering::Relaxed, Ordering::Relaxed, more).ok()?;
         Some(Charge { meter: Arc::clone(self), amount })
+    }
+
+    /// Has `charge` hold half of what it holds and nobody else does, if that is more than it holds: so
+    /// something is left for those that come later. Whether it is more.
+    pub(super) fn share(self: &Arc<Self>, charge: &mut Charge) -> bool {
+        let others = self.held().saturating_sub(charge.amount);
+        let share = self.most.saturating_sub(others) / 2;
+        let more = share.checked_sub(charge.amount).filter(|more| *more > 0);
+        match more.and_then(|more| self.charge(more)) {
+            Some(mut more) => {
+                charge.amount += std::mem::take(&mut more.amount);
+                true
+            }
+            None => false,
+        }
     }
 
     /// How much is held.
@@ -70,6 +96,13 @@ impl Meter {
     /// The bound.
     pub(super) fn most(&self) -> usize {
         self.most
+    }
+}
+
+impl Charge {
+    /// How much it holds.
+    pub(super) fn amount(&self) -> usize {
+        self.amount
     }
 }
 
@@ -88,6 +121,10 @@ pub(super) struct Account {
     pub(super) routes: Arc<Meter>,
     /// Its publishers, servers and clients that are shown here.
     pub(super) stand_ins: Arc<Meter>,
+    /// Stream data that it may send and that was not read.
+    pub(super) unread: Arc<Meter>,
+    /// Memory for its messages.
+    pub(super) intake: Arc<Intake>,
     /// When its changes are followed up.
     pub(super) turns: Mutex<Turns>,
     reading: Arc<Semaphore>,
@@ -107,6 +144,8 @@ impl Account {
             graph: Meter::new(graph),
             routes: Meter::new(graph),
             stand_ins: Meter::new(MAX_STAND_INS),
+            unread: Meter::new(UNREAD),
+            intake: Arc::new(Intake::new(INTAKE)),
             reading: Arc::new(Semaphore::new(READING / UNIT)),
             unpacked: Arc::new(Semaphore::new(UNPACKED / UNIT)),
             turns: Mutex::default(),
@@ -198,6 +237,20 @@ mod tests {
         drop((one, again));
         assert_eq!(accounts.of("a").graph.held(), 0);
         assert_eq!(lock(&accounts.open).len(), 2);
+    }
+
+    #[test]
+    fn each_that_shares_leaves_as_much_and_takes_up_what_others_leave() {
+        let meter = Meter::new(64);
+        let [mut one, mut two, mut three] = [0; 3].map(|_| meter.nothing());
+        assert!(meter.share(&mut one) && meter.share(&mut two) && meter.share(&mut three));
+        assert_eq!([one.amount(), two.amount(), three.amount()], [32, 16, 8]);
+        assert!(!meter.share(&mut one) && !meter.share(&mut three), "it has its share");
+        drop(one);
+        assert!(meter.share(&mut two));
+        assert_eq!((two.amount(), meter.held()), (28, 36));
+        drop((two, three));
+        assert_eq!(meter.held(), 0);
     }
 
     #[test]

@@ -26,10 +26,10 @@ const STREAMS_BEFORE_HELLO: u32 = 128;
 const STREAMS_OPEN: u32 = 4096;
 const SOCKET_BUFFER: usize = 8 << 20;
 const SEND_WINDOW: u64 = 16 << 20;
-const STREAM_WINDOW: (u64, u64) = (1 << 20, 32 << 20);
-/// What a peer may have under way before its link is elected, and then.
-const WINDOW_BEFORE_ELECTION: u32 = 1 << 20;
-const WINDOW_OPEN: u32 = 256 << 20;
+const STREAM_WINDOW: (u64, u64) = (1 << 20, 4 << 20);
+/// What a link may have under way before it is elected, and each link has then beside its share of what
+/// its peer may have.
+pub(super) const LINK_WINDOW: u32 = 1 << 20;
 
 /// The endpoints of a daemon: one per bound address, all on the same port.
 #[derive(Debug)]
@@ -174,17 +174,22 @@ pub(super) fn transport(config: &Config) -> Arc<TransportConfig> {
         .max_idle_timeout(Some(IdleTimeout::from(VarInt::from_u32(IDLE_TIMEOUT_MS))))
         .keep_alive_interval(Some(Duration::from_secs(4)))
         .stream_receive_window(VarInt::from_u64(window).unwrap_or(VarInt::MAX))
-        .receive_window(VarInt::from_u32(WINDOW_BEFORE_ELECTION))
+        .receive_window(VarInt::from_u32(LINK_WINDOW))
         .send_window(SEND_WINDOW)
         .initial_mtu(1200)
         .mtu_discovery_config(Some(mtu));
     Arc::new(transport)
 }
 
-/// The link was elected: its peer may send as much as a peer may.
-pub(super) fn open_windows(connection: &quinn::Connection) {
+/// The link was elected: its peer may open as many streams as a link may have.
+pub(super) fn open_streams(connection: &quinn::Connection) {
     connection.set_max_concurrent_uni_streams(VarInt::from_u32(STREAMS_OPEN));
-    connection.set_receive_window(VarInt::from_u32(WINDOW_OPEN));
+}
+
+/// Lets the peer of a link have `share` bytes under way over it beside what each link has.
+pub(super) fn open_window(connection: &quinn::Connection, share: usize) {
+    let share = u32::try_from(share).unwrap_or(u32::MAX);
+    connection.set_receive_window(VarInt::from_u32(LINK_WINDOW.saturating_add(share)));
 }
 
 /// The key of stateless resets: kept in the runtime directory, so that the daemon that takes over

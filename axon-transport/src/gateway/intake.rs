@@ -7,12 +7,11 @@ use tokio::sync::{Mutex, OwnedMutexGuard, OwnedSemaphorePermit, Semaphore};
 
 /// Up to here a message takes what each stream has.
 const SMALL: usize = 32 << 10;
-/// Messages of the largest size for which there is room.
-const LARGEST: u64 = 4;
 /// What is counted.
 const UNIT: usize = 1024;
 
 /// What the messages of one peer share.
+#[derive(Debug)]
 pub(super) struct Intake {
     room: Arc<Semaphore>,
     units: u32,
@@ -28,10 +27,9 @@ pub(super) struct Room {
 }
 
 impl Intake {
-    /// For messages of at most so many bytes.
-    pub(super) fn new(max_message: u64) -> Self {
-        let units = (max_message * LARGEST).div_ceil(UNIT as u64);
-        let units = u32::try_from(units).unwrap_or(u32::MAX);
+    /// For messages of so many bytes together, or one that is longer.
+    pub(super) fn new(bytes: usize) -> Self {
+        let units = u32::try_from(bytes.div_ceil(UNIT)).unwrap_or(u32::MAX);
         let room = Arc::new(Semaphore::new(units as usize));
         Self { room, units, expanding: Arc::default() }
     }

@@ -93,7 +93,7 @@ impl Camera {
     }
 
     /// Bytes that host A's daemon has in memory, by this line of its status: now, and at most.
-    fn memory(&self, line: &str) -> usize {
+    pub(crate) fn memory(&self, line: &str) -> usize {
         let pid = self.a.daemon.as_ref().unwrap().0.id();
         let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
         let line = status.lines().find_map(|l| l.strip_prefix(line)).unwrap();

@@ -10,6 +10,7 @@ mod ending;
 mod events;
 mod graph;
 mod greedy;
+mod hoard;
 mod hostile;
 mod identity;
 mod load;

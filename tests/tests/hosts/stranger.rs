@@ -136,6 +136,13 @@ impl Stranger {
         self.limited(met.connection.open_uni()).map_err(|error| error.to_string())
     }
 
+    /// Writes for so long, as much of it as the other side lets it.
+    pub(crate) fn write_for(&self, stream: &mut SendStream, bytes: &[u8], time: Duration) {
+        let write = async { tokio::time::timeout(time, stream.write_all(bytes)).await };
+        // An error: the other side takes no more in that time, or stopped the stream.
+        let _ = self.runtime.block_on(write);
+    }
+
     /// Why the other side closed the connection.
     pub(crate) fn closed(&self, met: &Met) -> String {
         self.limited(met.connection.closed()).to_string()

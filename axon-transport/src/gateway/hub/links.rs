@@ -17,7 +17,7 @@ use crate::{
         account::Account,
         control::ControlReader,
         dial::{Target, dial},
-        endpoint::open_windows,
+        endpoint::{open_streams, open_window},
         establish::{Established, Sealing, close, peer_text},
         inbound::Inbound,
         outbound::{Carrier, Owner},
@@ -39,12 +39,17 @@ const MAX_LINKS: usize = 128 + 32;
 const MAX_LINKS_OF_PEER: usize = 16;
 /// Elections of this process. A daemon outlives its gateway, and its peers know its elections by its id.
 static ELECTIONS: AtomicU64 = AtomicU64::new(1);
-/// From so many endpoints of a peer on memory is given back when it leaves.
-const MANY: usize = 1000;
 /// Why somebody who claims a linked daemon's id gets no link.
 const TAKEN: &str = "this daemon id is linked already, under another identity";
 
 impl Link {
+    /// Lets its peer have as much under way over it as there is for it by now.
+    pub(super) fn widen(&mut self) {
+        if self.account.unread.share(&mut self.unread) {
+            open_window(&self.connection, self.unread.amount());
+        }
+    }
+
     /// What makes its successor.
     fn successor(&self) -> Target {
         Target {
@@ -180,6 +185,7 @@ impl Hub {
             elected: None,
             until: None,
             since_unix_ms: crate::daemon::status::unix_ms(),
+            unread: account.unread.nothing(),
             account: Arc::clone(&account),
             traffic: Traffic::default(),
             watch: None,
@@ -213,8 +219,11 @@ impl Hub {
         if current.and_then(|c| c.elected).is_some_and(|c| c.election > elected.election) {
             tracing::debug!(peer = %daemon, "superseded before its election was heard of");
             // The peer may have sent samples over it before it elected the next.
-            open_windows(&link.connection);
-            self.spawn_inbound(number, daemon, link.carrier.clone());
+            let Some(link) = self.links.get_mut(&number) else { return };
+            open_streams(&link.connection);
+            link.widen();
+            let carrier = link.carrier.clone();
+            self.spawn_inbound(number, daemon, carrier);
             return self.hand_over(number);
         }
         let Some(link) = self.links.get_mut(&number) else { return };
@@ -230,7 +239,8 @@ impl Hub {
                 tracing::error!(peer = %daemon, %error, "no message keys for this link");
             }
         }
-        open_windows(&connection);
+        open_streams(&connection);
+        link.widen();
         let new = match self.peers.get_mut(&daemon) {
             Some(peer) => {
                 let old = peer.link;
@@ -366,7 +376,8 @@ impl Hub {
         if self.peers.get(&daemon).is_none_or(|p| p.link != number) {
             return;
         }
-        if self.peers.remove(&daemon).is_some_and(|peer| peer.remote.len() >= MANY) {
+        // Its graph, and what of its streams was not read.
+        if self.peers.remove(&daemon).is_some() {
             give_memory_back();
         }
         self.abandon_leaving(daemon);
@@ -383,7 +394,7 @@ impl Hub {
     }
 }
 
-/// The allocator keeps what it freed: of a peer that had much it is given back, once the control plane
+/// The allocator keeps what it freed: what a peer had is given back, once the control plane
 /// has let go of it, too.
 fn give_memory_back() {
     tokio::spawn(async {

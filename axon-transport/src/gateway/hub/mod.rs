@@ -23,7 +23,7 @@ use tokio::{
 use self::leaving::Leaving;
 use super::{
     accept::Incomer,
-    account::{Account, Accounts, Unpacked},
+    account::{Account, Accounts, Charge, Unpacked},
     context::Context,
     control::{ControlError, Outbox},
     dial::Target,
@@ -144,6 +144,8 @@ struct Link {
     until: Option<Instant>,
     since_unix_ms: u64,
     account: Arc<Account>,
+    /// Its share of the stream data that its peer may have sent and that was not read.
+    unread: Charge,
     /// What had gone over it a second ago.
     traffic: Traffic,
     /// Probes it while it is silent.
@@ -243,6 +245,7 @@ impl Hub {
                     self.close_untrusted(seconds.is_multiple_of(CERTIFICATES_EVERY)).await;
                     self.resync();
                     self.watch_silent();
+                    self.links.values_mut().filter(|l| l.elected.is_some()).for_each(Link::widen);
                     self.report().await;
                     let now = Instant::now();
                     self.peers.values_mut().for_each(|peer| peer.ask_again(now));

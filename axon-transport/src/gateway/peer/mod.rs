@@ -101,6 +101,7 @@ impl Peer {
         owner: Owner,
     ) -> Self {
         let counters = Arc::new(Counters::default());
+        let intake = Arc::clone(&account.intake);
         let (orders, receiver) = mpsc::unbounded_channel();
         let (queues, pulse) = (shared.queues.of_peer(), shared.pulse.clone());
         let (owner_identity, stalled_after) = (owner.identity.clone(), shared.stalled_after);
@@ -125,7 +126,7 @@ impl Peer {
             identity: owner_identity,
             refused: RefusedRoutes::default(),
             routes_in: Arc::default(),
-            intake: Arc::new(Intake::new(shared.max_message)),
+            intake,
             receipts,
             _telling: telling,
             ending: BTreeMap::new(),
