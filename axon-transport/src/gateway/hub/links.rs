@@ -281,6 +281,7 @@ impl Hub {
             sae: link.established.hello.sae.clone(),
             addresses: vec![link.connection.remote_address()],
             listed: false,
+            standing: None,
             replaces: link.elected.map(|e| e.link),
         });
         // Should the dial fail, the next try is due before the key's age is reached.
