@@ -11,6 +11,7 @@ use tokio::sync::mpsc;
 use super::status::LinkStatus;
 use crate::{
     config::Config,
+    discovery::Standing,
     graph::RemoteEndpoint,
     ids::{DaemonId, Gid},
 };
@@ -72,6 +73,8 @@ pub enum ToControl {
     DialFailed {
         /// The peer.
         daemon: DaemonId,
+        /// Why it may be there, as the order said it.
+        standing: Standing,
     },
     /// A discovery datagram that arrived at the QUIC port.
     Datagram {
@@ -118,6 +121,8 @@ pub enum ToGateway {
         addresses: Vec<SocketAddr>,
         /// Whether this host lists it as a static peer.
         listed: bool,
+        /// Why it may be there; the answer says it again.
+        standing: Standing,
     },
     /// Send a discovery datagram from the QUIC port.
     SendDatagram {

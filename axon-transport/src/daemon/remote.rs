@@ -105,7 +105,9 @@ impl Remote {
                 self.linked.remove(daemon);
                 self.tell(Event::LinkDown { daemon: *daemon });
             }
-            ToControl::DialFailed { daemon } => self.tell(Event::DialFailed { daemon: *daemon }),
+            ToControl::DialFailed { daemon, standing } => {
+                self.tell(Event::DialFailed { daemon: *daemon, standing: *standing });
+            }
             _ => {}
         }
         match event {
@@ -116,10 +118,10 @@ impl Remote {
 
     fn action(&mut self, control: &Rc<RefCell<Control>>, action: Action) {
         match action {
-            Action::Dial { daemon, sae, addrs: addresses, listed } => {
-                let dial = ToGateway::Dial { daemon, sae, addresses, listed };
+            Action::Dial { daemon, sae, addrs: addresses, listed, standing } => {
+                let dial = ToGateway::Dial { daemon, sae, addresses, listed, standing };
                 if !self.order(dial) {
-                    self.tell(Event::DialFailed { daemon });
+                    self.tell(Event::DialFailed { daemon, standing });
                 }
             }
             Action::SendFromQuicPort { to, bytes } => {

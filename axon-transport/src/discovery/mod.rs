@@ -19,6 +19,7 @@ mod interfaces;
 mod peers;
 mod run;
 pub mod socket;
+mod standing;
 mod terms;
 #[cfg(test)]
 mod tests;
@@ -27,6 +28,7 @@ mod wanted;
 pub use interfaces::{Interface, interfaces};
 pub use peers::{Arrival, Local, Output, Peers};
 pub use run::{Event, run};
+pub use standing::Standing;
 pub use terms::{Difference, Terms};
 pub use wanted::Wanted;
 
@@ -75,6 +77,8 @@ pub enum Action {
         addrs: Vec<SocketAddr>,
         /// Whether we list it, for our HELLO.
         listed: bool,
+        /// Why it may be there; the answer says it again.
+        standing: Standing,
     },
     /// Send this from the QUIC port, best effort.
     SendFromQuicPort {

@@ -14,7 +14,9 @@ use tokio::{
 };
 use tracing::{debug, warn};
 
-use super::{Action, Arrival, Local, Output, Peers, Wanted, interfaces, socket::SharedSocket};
+use super::{
+    Action, Arrival, Local, Output, Peers, Standing, Wanted, interfaces, socket::SharedSocket,
+};
 use crate::{
     config::{Config, DiscoveryRange},
     ids::DaemonId,
@@ -57,6 +59,8 @@ pub enum Event {
     DialFailed {
         /// To whom.
         daemon: DaemonId,
+        /// As the action said it.
+        standing: Standing,
     },
     /// The graph has a new digest.
     GraphDigest(u64),
@@ -205,7 +209,9 @@ impl Shell {
             Event::QuicPort(port) => self.peers.set_port(now, port),
             Event::LinkUp { daemon, address } => self.peers.link_up(now, daemon, address),
             Event::LinkDown { daemon } => self.peers.link_down(now, daemon),
-            Event::DialFailed { daemon } => self.peers.dial_failed(now, daemon),
+            Event::DialFailed { daemon, standing } => {
+                self.peers.dial_failed(now, daemon, standing);
+            }
             Event::GraphDigest(digest) => self.peers.set_graph(digest),
         }
     }
@@ -242,12 +248,14 @@ impl Shell {
                 }
                 Output::Action(action) => {
                     let dial = match &action {
-                        Action::Dial { daemon, .. } => Some(*daemon),
+                        Action::Dial { daemon, standing, .. } => Some((*daemon, *standing)),
                         _ => None,
                     };
-                    if let (Err(_), Some(daemon)) = (self.actions.try_send(action), dial) {
+                    if let (Err(_), Some((daemon, standing))) =
+                        (self.actions.try_send(action), dial)
+                    {
                         let now = self.start.elapsed();
-                        self.peers.dial_failed(now, daemon);
+                        self.peers.dial_failed(now, daemon, standing);
                     }
                 }
             }

@@ -95,7 +95,7 @@ async fn two_daemons_find_each_other_by_multicast_and_part_with_a_goodbye() {
     let (of_a, of_b) = (a.next().await.unwrap(), b.next().await.unwrap());
     for (action, peer) in [(of_a, &b), (of_b, &a)] {
         match action {
-            Action::Dial { daemon, sae, addrs, listed } => {
+            Action::Dial { daemon, sae, addrs, listed, .. } => {
                 assert_eq!((daemon, sae, listed), (peer.id, None, false));
                 assert_eq!(addrs, [peer.address]);
             }
@@ -111,9 +111,9 @@ async fn two_daemons_find_each_other_by_multicast_and_part_with_a_goodbye() {
 
     a.events.send(Event::LinkDown { daemon: b.id }).await.unwrap();
     let mut action = a.next().await;
-    if let Some(Action::Dial { daemon, .. }) = action {
+    if let Some(Action::Dial { daemon, standing, .. }) = action {
         // The event overtook the datagram.
-        a.events.send(Event::DialFailed { daemon }).await.unwrap();
+        a.events.send(Event::DialFailed { daemon, standing }).await.unwrap();
         action = a.next().await;
     }
     assert_eq!(action, Some(Action::Gone { daemon: b.id }));

@@ -103,6 +103,7 @@ pub async fn link(
         sae: sae.map(Into::into),
         addresses: vec![target],
         listed: false,
+        standing: None,
         replaces: None,
     };
     let established = match bootstrap {

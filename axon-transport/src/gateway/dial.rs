@@ -12,6 +12,7 @@ use super::{
     refusal::Refusal,
 };
 use crate::{
+    discovery::Standing,
     ids::DaemonId,
     keys::{Completion, Dial},
     link::{CloseCode, Hello, Side},
@@ -37,6 +38,8 @@ pub(super) struct Target {
     pub(super) addresses: Vec<SocketAddr>,
     /// Whether this host lists it as a static peer.
     pub(super) listed: bool,
+    /// Why it may be there, where discovery says so.
+    pub(super) standing: Option<Standing>,
     /// The link that the new connection succeeds.
     pub(super) replaces: Option<[u8; 16]>,
 }

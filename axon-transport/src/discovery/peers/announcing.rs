@@ -7,11 +7,11 @@ use std::{
 
 use rand::RngExt;
 
-use super::{Output, Peers};
+use super::{Output, Peers, record::Record};
 use crate::{
     config::DiscoveryRange,
     discovery::{
-        PROTOCOLS,
+        PROTOCOLS, Standing,
         beacon::{Beacon, Datagram},
         quic_ports,
     },
@@ -27,6 +27,8 @@ const BURST: [Duration; 5] = [
 ];
 const INTERVAL_LEAST: Duration = Duration::from_secs(10);
 const INTERVAL_PER_HOST: Duration = Duration::from_millis(250);
+/// Most hosts that count without anything being known of them but a beacon.
+const MOST_HEARD_COUNT: usize = 32;
 
 impl Peers {
     /// This daemon ends: tells those who would otherwise dial it.
@@ -39,8 +41,16 @@ impl Peers {
         self.announce(&bytes);
     }
 
-    fn interval(&self) -> Duration {
-        let hosts = u32::try_from(self.records.len() + 1).unwrap_or(u32::MAX);
+    pub(super) fn interval(&self) -> Duration {
+        // Anybody can make up as many as there are records: few of them count.
+        let is_there = |record: &&Record| {
+            let unanswered = matches!(record.standing(), Standing::Heard | Standing::Known);
+            record.linked || !unanswered
+        };
+        let there = self.records.values().filter(is_there).count();
+        let heard = self.records.len() - there;
+        let hosts = there + heard.min(MOST_HEARD_COUNT) + 1;
+        let hosts = u32::try_from(hosts).unwrap_or(u32::MAX);
         INTERVAL_LEAST.max(INTERVAL_PER_HOST.saturating_mul(hosts))
     }
 

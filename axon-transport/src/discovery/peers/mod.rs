@@ -8,9 +8,13 @@ mod announcing;
 mod bucket;
 mod candidates;
 mod dialling;
+#[cfg(test)]
+mod flood;
 mod local;
+mod probing;
 mod receiving;
 mod record;
+mod room;
 #[cfg(test)]
 mod simulation;
 #[cfg(test)]
@@ -24,9 +28,16 @@ use std::{
 
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
+#[cfg(test)]
+use self::dialling::MOST_IN_FLIGHT;
 pub use self::local::Local;
-use self::{bucket::Bucket, candidates::Here, dialling::MOST_IN_FLIGHT, record::Record};
-use super::{Action, Interface};
+use self::{
+    bucket::Bucket,
+    candidates::Here,
+    probing::Probes,
+    record::{Record, Source},
+};
+use super::{Action, Interface, Standing};
 use crate::{config::DiscoveryRange, ids::DaemonId};
 
 /// Most records of peers that are not linked.
@@ -66,6 +77,14 @@ pub struct Peers {
     next_beacon: Option<Duration>,
     burst_left: usize,
     answers: Bucket,
+    /// For those at addresses that this host knows.
+    known_answers: Bucket,
+    echoes: Bucket,
+    probes: Bucket,
+    known_probes: Bucket,
+    asked: Probes,
+    /// Where links stood, the latest last.
+    met: VecDeque<IpAddr>,
     reports: Bucket,
     random: StdRng,
     outputs: VecDeque<Output>,
@@ -85,6 +104,12 @@ impl Peers {
             next_beacon: None,
             burst_left: 0,
             answers: Bucket::new(64, 64),
+            known_answers: Bucket::new(64, 64),
+            echoes: Bucket::new(1024, 1024),
+            probes: Bucket::new(1024, 1024),
+            known_probes: Bucket::new(1024, 1024),
+            asked: Probes::new(),
+            met: VecDeque::new(),
             reports: Bucket::new(32, 1),
             random: StdRng::seed_from_u64(seed),
             outputs: VecDeque::new(),
@@ -98,12 +123,18 @@ impl Peers {
 
     /// When [`advance`](Self::advance) is to be called at the latest.
     pub fn next_wakeup(&self) -> Option<Duration> {
-        let may_dial = self.in_flight() < MOST_IN_FLIGHT;
+        let in_flight = self.dials_in_flight();
         let lifetime = self.lifetime();
         let of_records = self.records.values().flat_map(|record| {
-            let due = record.dial.due.filter(|_| may_dial && self.wants_dial(record));
+            let dials = Standing::ALL.into_iter().flat_map(|standing| {
+                let dial = &record.dials[standing as usize];
+                let host = record.of(standing).next().map(|source| source.address.ip());
+                let may_dial =
+                    self.wants_dial(record, standing) && in_flight.has_room(standing, host);
+                [dial.due.filter(|_| may_dial), dial.in_flight]
+            });
             let expiry = record.may_be_forgotten().then(|| record.last_seen + lifetime);
-            [due, record.dial.in_flight, expiry].into_iter().flatten()
+            dials.chain([expiry]).flatten().min()
         });
         of_records.chain(self.next_beacon).min()
     }
@@ -112,6 +143,7 @@ impl Peers {
     pub fn advance(&mut self, now: Duration) {
         self.give_up_lost_dials(now);
         self.forget_silent(now);
+        self.forget_unanswered(now);
         self.dial_due(now);
         if self.next_beacon.is_some_and(|at| at <= now) {
             let first = self.burst_left > 0;
@@ -166,7 +198,8 @@ impl Peers {
             return;
         }
         self.here.interfaces = interfaces;
-        self.records.values_mut().for_each(|record| record.dial.reset());
+        let dials = self.records.values_mut().flat_map(|record| &mut record.dials);
+        dials.for_each(record::Dial::reset);
         self.dial_all(now);
         if self.port.is_some() {
             self.start_burst(now);
@@ -180,7 +213,13 @@ impl Peers {
         self.listed = listed;
         let listed: Vec<IpAddr> = self.listed.iter().map(|(address, _)| *address).collect();
         for record in self.records.values_mut() {
-            record.listed = record.sources.iter().any(|source| listed.contains(&source.ip()));
+            let lists = |source: &Source| listed.contains(&source.address.ip());
+            record.listed = record.sources.iter().any(lists);
+            for source in &mut record.sources {
+                let address = source.address.ip();
+                source.known = listed.contains(&address) || self.met.contains(&address);
+            }
+            record.order();
         }
         if new && self.port.is_some() {
             self.start_burst(now);
@@ -195,12 +234,16 @@ impl Peers {
     /// A link with `daemon` stands, whoever dialled it.
     pub fn link_up(&mut self, now: Duration, daemon: DaemonId, address: SocketAddr) {
         let listed = self.lists(address.ip().to_canonical());
+        let address = SocketAddr::new(address.ip().to_canonical(), address.port());
+        self.meet(address.ip());
         let record = self.records.entry(daemon).or_default();
         record.listed |= listed;
         record.linked = true;
         record.leaving = None;
         record.last_seen = record.last_seen.max(now);
-        record.dial.done();
+        record.from = Some(address.ip());
+        record.done();
+        record.proved(address);
         self.dial_due(now);
     }
 
@@ -208,7 +251,7 @@ impl Peers {
     pub fn link_down(&mut self, now: Duration, daemon: DaemonId) {
         let Some(record) = self.records.get_mut(&daemon) else { return };
         record.linked = false;
-        record.dial.done();
+        record.done();
         let left = record.left(now);
         // One that dialled us and whose beacons never came cannot be dialled.
         if left || !record.compatible {
@@ -219,63 +262,30 @@ impl Peers {
         }
     }
 
-    /// A dial did not become a link.
-    pub fn dial_failed(&mut self, now: Duration, daemon: DaemonId) {
+    /// A dial to addresses of this standing did not become a link.
+    pub fn dial_failed(&mut self, now: Duration, daemon: DaemonId, standing: Standing) {
         let jitter = self.random.random_range(0.5..1.5);
         let record = self.records.get_mut(&daemon);
-        if let Some(record) = record.filter(|record| record.dial.in_flight.is_some()) {
-            record.dial.failed(now, jitter);
-            if record.left(now) {
+        let under_way = |record: &&mut Record| record.dials[standing as usize].in_flight.is_some();
+        if let Some(record) = record.filter(under_way) {
+            record.failed(standing, now, jitter);
+            if record.may_be_forgotten() && record.left(now) {
                 self.forget(daemon);
+            } else {
+                self.schedule_dial(now, daemon);
             }
         }
         self.dial_due(now);
     }
 
-    /// Makes room for a record of `daemon`, if it has none.
-    fn make_room(&mut self, daemon: DaemonId) {
-        let unauthenticated = self.records.values().filter(|record| !record.linked).count();
-        if self.records.contains_key(&daemon) || unauthenticated < MOST_UNAUTHENTICATED {
-            return;
-        }
-        let oldest = self
-            .records
-            .iter()
-            .filter(|(_, record)| record.may_be_forgotten())
-            .min_by_key(|(_, record)| (record.listed, record.last_seen))
-            .map(|(id, _)| *id);
-        if let Some(oldest) = oldest {
-            self.forget(oldest);
-        }
-    }
-
-    fn forget(&mut self, daemon: DaemonId) {
-        if self.records.remove(&daemon).is_some() {
-            self.act(Action::Gone { daemon });
-        }
-    }
-
-    fn forget_silent(&mut self, now: Duration) {
-        let lifetime = self.lifetime();
-        let silent: Vec<DaemonId> = self
-            .records
-            .iter()
-            .filter(|(_, record)| record.may_be_forgotten() && record.last_seen + lifetime <= now)
-            .map(|(id, _)| *id)
-            .collect();
-        for id in silent {
-            self.forget(id);
-        }
-    }
-
     /// Whether a dial would make sense, and the range lets this daemon look for the peer.
-    fn wants_dial(&self, record: &Record) -> bool {
+    fn wants_dial(&self, record: &Record, standing: Standing) -> bool {
         let in_range = match self.local.range {
             DiscoveryRange::Off => false,
             DiscoveryRange::Localhost => record.near || record.listed,
             DiscoveryRange::Subnet => true,
         };
-        in_range && record.wants_dial()
+        in_range && record.wants_dial(standing)
     }
 
     fn lists(&self, address: IpAddr) -> bool {

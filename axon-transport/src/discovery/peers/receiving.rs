@@ -5,7 +5,7 @@ use std::{net::SocketAddr, time::Duration};
 use rand::RngExt;
 use tracing::{debug, info};
 
-use super::{Arrival, Peers};
+use super::{Arrival, Peers, record::Source};
 use crate::{
     config::DiscoveryRange,
     discovery::{
@@ -37,13 +37,16 @@ impl Peers {
             }
             Ok(Datagram::Probe { daemon, nonce }) => {
                 let ours = daemon == self.local.daemon;
-                if arrival == Arrival::Quic && !ours && self.answers.take(now) {
+                if arrival == Arrival::Quic && !ours && self.echoes.take(now) {
                     let echo = Datagram::Echo { daemon: self.local.daemon, nonce };
                     self.send(from, echo.encode());
                 }
             }
-            // We send no probes, so no echo is ours.
-            Ok(Datagram::Echo { .. }) => {}
+            Ok(Datagram::Echo { daemon, nonce }) => {
+                if arrival == Arrival::Quic {
+                    self.answered(now, from, daemon, nonce);
+                }
+            }
         }
     }
 
@@ -54,35 +57,43 @@ impl Peers {
             return;
         }
         let near = arrival == Arrival::Quic || self.here.is_local(from.ip());
-        self.make_room(daemon);
+        self.make_room(daemon, from.ip());
         let difference = self.judge(&beacon);
         let observed = match arrival {
             Arrival::Shared => SocketAddr::new(from.ip(), beacon.port),
             // A NAT's port, where one is between.
             Arrival::Quic => from,
         };
+        let known = self.knows(from.ip());
         let record = self.records.entry(daemon).or_default();
         record.last_seen = now;
         record.listed |= listed;
         record.near |= near;
+        if !record.linked {
+            record.from = Some(from.ip());
+        }
         match difference {
             None => {
                 record.compatible = true;
                 record.leaving = None;
-                // Who is linked has proven its name; a beacon proves nothing.
-                if !record.linked || record.sae.is_none() {
-                    record.sae = beacon.sae;
-                }
-                record.saw(observed);
                 let port = beacon.port;
-                record.advertised =
-                    beacon.addresses.iter().map(|a| SocketAddr::new(*a, port)).collect();
+                let advertised = beacon.addresses.iter().map(|a| SocketAddr::new(*a, port));
+                record.saw(Source {
+                    address: observed,
+                    sae: beacon.sae,
+                    advertised: advertised.collect(),
+                    proven: false,
+                    known,
+                    answered: false,
+                    asked: false,
+                });
                 self.schedule_dial(now, daemon);
+                self.ask_if_contested(now, daemon, observed);
             }
             Some(difference) => self.differs(now, daemon, from, difference),
         }
         if beacon.answer_wanted {
-            self.answer(now, daemon, observed);
+            self.answer(now, daemon, observed, known);
         }
     }
 
@@ -92,14 +103,18 @@ impl Peers {
         if ours || !self.in_range(from, arrival, false, listed) {
             return;
         }
-        self.make_room(daemon);
+        self.make_room(daemon, from.ip());
         let range = |low: u8, high: u8| format!("{low} to {high}");
         let difference = Difference {
             setting: "protocol version",
             ours: range(*PROTOCOLS.start(), *PROTOCOLS.end()),
             theirs: range(foreign.protocols.0, foreign.protocols.1),
         };
-        self.records.entry(daemon).or_default().last_seen = now;
+        let record = self.records.entry(daemon).or_default();
+        record.last_seen = now;
+        if !record.linked {
+            record.from = Some(from.ip());
+        }
         self.differs(now, daemon, from, difference);
     }
 
@@ -152,22 +167,45 @@ impl Peers {
 
     fn goodbye_from(&mut self, now: Duration, from: SocketAddr, daemon: DaemonId) {
         let Some(record) = self.records.get_mut(&daemon) else { return };
-        if !record.sources.iter().any(|source| source.ip() == from.ip()) {
+        let from = from.ip();
+        if !record.sources.iter().any(|source| source.address.ip() == from) {
             return;
         }
+        // Where several addresses claim the id, one that leaves takes itself away and no other.
+        let others = record.sources.iter().any(|source| source.address.ip() != from);
+        let best = record.sources.first().is_some_and(|source| source.address.ip() == from);
         if record.may_be_forgotten() {
-            self.forget(daemon);
-        } else {
+            if others {
+                record.sources.retain(|source| source.address.ip() != from || source.proven);
+            } else {
+                self.forget(daemon);
+            }
+        } else if best || !others {
             record.leaving = Some(now);
         }
     }
 
-    fn answer(&mut self, now: Duration, daemon: DaemonId, to: SocketAddr) {
+    /// Asks whether the daemon is there, if beacons under its id came from elsewhere, too.
+    fn ask_if_contested(&mut self, now: Duration, daemon: DaemonId, address: SocketAddr) {
+        let Some(record) = self.records.get(&daemon).filter(|record| !record.linked) else {
+            return;
+        };
+        if record.sources.len() < 2 {
+            return;
+        }
+        let source = record.sources.iter().find(|source| source.address == address);
+        if let Some(standing) = source.map(Source::standing) {
+            self.ask_whether_there(now, daemon, standing);
+        }
+    }
+
+    fn answer(&mut self, now: Duration, daemon: DaemonId, to: SocketAddr, known: bool) {
         let (Some(port), Some(record)) = (self.port, self.records.get_mut(&daemon)) else { return };
         if record.last_answered.is_some_and(|at| at + ANSWER_SPACING > now) {
             return;
         }
-        if !self.answers.take(now) {
+        let answers = if known { &mut self.known_answers } else { &mut self.answers };
+        if !answers.take(now) {
             // Many ask at once: one beacon to all of them instead.
             let soon = now + Duration::from_secs(1).mul_f64(self.random.random_range(0.5..1.0));
             self.next_beacon = self.next_beacon.map(|at| at.min(soon));

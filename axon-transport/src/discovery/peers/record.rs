@@ -1,32 +1,65 @@
 //! What is known of one peer.
 
-use std::{net::SocketAddr, time::Duration};
+use std::{
+    net::{IpAddr, SocketAddr},
+    time::Duration,
+};
 
-/// Most observed sources kept of a peer: one that others forge cannot push out the true one at once.
+use crate::discovery::Standing;
+
+/// Most addresses of one standing that are kept of a peer.
 const MOST_SOURCES: usize = 4;
 /// A dial that nobody answered for is taken as failed after this.
 const DIAL_FORGOTTEN: Duration = Duration::from_secs(30);
-/// Dials to one peer are at least this far apart.
+/// Dials to one address are at least this far apart.
 const DIAL_SPACING: Duration = Duration::from_secs(1);
 /// A goodbye this shortly before a link goes down or a dial fails was meant.
 const GOODBYE_COUNTS: Duration = Duration::from_secs(10);
 const BACKOFF_FIRST: Duration = Duration::from_millis(250);
 const BACKOFF_MOST: Duration = Duration::from_secs(8);
 
+/// An address at which a peer may be, and what was said of it from there.
+#[derive(Clone, Debug)]
+pub(super) struct Source {
+    /// With the port to dial.
+    pub(super) address: SocketAddr,
+    pub(super) sae: Option<String>,
+    pub(super) advertised: Vec<SocketAddr>,
+    /// A link with this peer stood there.
+    pub(super) proven: bool,
+    /// It is at an address that we list, or where another link stood.
+    pub(super) known: bool,
+    /// The peer answered a probe there.
+    pub(super) answered: bool,
+    /// It was probed since its latest beacon.
+    pub(super) asked: bool,
+}
+
+impl Source {
+    pub(super) fn standing(&self) -> Standing {
+        match (self.proven, self.known, self.answered) {
+            (true, _, _) => Standing::Proven,
+            (_, true, true) => Standing::KnownAnswered,
+            (_, true, false) => Standing::Known,
+            (_, false, true) => Standing::Answered,
+            (_, false, false) => Standing::Heard,
+        }
+    }
+}
+
 /// One daemon, by its id.
 #[derive(Debug, Default)]
 pub(super) struct Record {
-    /// Where beacons came from, the latest first, with the port to dial.
-    pub(super) sources: Vec<SocketAddr>,
-    /// What its latest beacon advertises.
-    pub(super) advertised: Vec<SocketAddr>,
-    pub(super) sae: Option<String>,
+    /// Where beacons came from: by standing, and the latest first.
+    pub(super) sources: Vec<Source>,
     /// A beacon of it was acceptable; later ones that are not may be forged.
     pub(super) compatible: bool,
     /// We list it.
     pub(super) listed: bool,
     /// It is on this host, or spoke to our QUIC port since this daemon looks no further than that.
     pub(super) near: bool,
+    /// Where the latest beacon under its id came from.
+    pub(super) from: Option<IpAddr>,
     pub(super) last_seen: Duration,
     pub(super) last_answered: Option<Duration>,
     /// Its mismatch was reported.
@@ -36,7 +69,8 @@ pub(super) struct Record {
     /// When it said goodbye while linked or dialled.
     pub(super) leaving: Option<Duration>,
     pub(super) linked: bool,
-    pub(super) dial: Dial,
+    /// One for each standing: a dial to an address where nobody is holds up no better one.
+    pub(super) dials: [Dial; Standing::COUNT],
 }
 
 /// When to dial.
@@ -45,20 +79,114 @@ pub(super) struct Dial {
     pub(super) due: Option<Duration>,
     /// Until when an outcome is awaited.
     pub(super) in_flight: Option<Duration>,
+    /// The address that was, or is, dialled first.
+    pub(super) first: Option<SocketAddr>,
     last: Option<Duration>,
     failures: u32,
 }
 
 impl Record {
-    pub(super) fn saw(&mut self, source: SocketAddr) {
-        self.sources.retain(|known| *known != source);
+    /// A beacon came from there; or the peer answered there.
+    pub(super) fn saw(&mut self, mut source: Source) {
+        if let Some(at) = self.sources.iter().position(|s| s.address == source.address) {
+            let known = self.sources.remove(at);
+            source.answered |= known.answered;
+            source.known |= known.known;
+            if known.proven {
+                // Who was linked has proven its name; a beacon proves nothing.
+                source = Source { proven: true, sae: known.sae, ..source };
+            }
+        }
         self.sources.insert(0, source);
-        self.sources.truncate(MOST_SOURCES);
+        self.order();
     }
 
-    /// Whether a dial would make sense.
-    pub(super) fn wants_dial(&self) -> bool {
-        self.compatible && !self.linked && self.dial.in_flight.is_none()
+    /// A link stands there. It is dialled there first, should the link end.
+    pub(super) fn proved(&mut self, address: SocketAddr) {
+        for source in &mut self.sources {
+            source.proven = source.address == address;
+        }
+        // One that cannot be dialled has no beacon, and none of its sources a name.
+        if let (true, Some(first)) = (self.compatible, self.sources.first())
+            && !self.sources.iter().any(|source| source.proven)
+        {
+            let source = Source { address, proven: true, known: true, ..first.clone() };
+            self.sources.insert(0, source);
+        }
+        for source in self.sources.iter_mut().filter(|source| source.address.ip() == address.ip()) {
+            source.known = true;
+        }
+        self.order();
+    }
+
+    /// Puts the sources in order again. Those of one standing push out no others.
+    pub(super) fn order(&mut self) {
+        self.sources.sort_by_key(Source::standing);
+        let mut kept = [0; Standing::COUNT];
+        self.sources.retain(|source| {
+            let kept = &mut kept[source.standing() as usize];
+            *kept += 1;
+            *kept <= MOST_SOURCES
+        });
+    }
+
+    /// The addresses of this standing, the latest first.
+    pub(super) fn of(&self, standing: Standing) -> impl Iterator<Item = &Source> {
+        self.sources.iter().filter(move |source| source.standing() == standing)
+    }
+
+    /// The best standing of any of its addresses.
+    pub(super) fn standing(&self) -> Standing {
+        self.sources.first().map_or(Standing::Heard, Source::standing)
+    }
+
+    /// Whether a dial to addresses of this standing would make sense.
+    pub(super) fn wants_dial(&self, standing: Standing) -> bool {
+        let Some(source) = self.of(standing).next() else { return false };
+        let elsewhere =
+            |dial: &Dial| dial.in_flight.is_none() || dial.first != Some(source.address);
+        self.compatible
+            && !self.linked
+            && self.dials[standing as usize].in_flight.is_none()
+            && self.dials.iter().all(elsewhere)
+    }
+
+    pub(super) fn in_flight(&self) -> impl Iterator<Item = (Standing, &Dial)> {
+        let dials = Standing::ALL.into_iter().zip(&self.dials);
+        dials.filter(|(_, dial)| dial.in_flight.is_some())
+    }
+
+    /// Schedules a dial to addresses of this standing unless one is scheduled.
+    pub(super) fn schedule(&mut self, standing: Standing, at: Duration) {
+        if self.dials[standing as usize].due.is_none() {
+            self.dials[standing as usize].due = Some(self.spaced(standing, at));
+        }
+    }
+
+    /// The dial failed; `jitter` is between 0.5 and 1.5.
+    pub(super) fn failed(&mut self, standing: Standing, now: Duration, jitter: f64) {
+        let dial = &mut self.dials[standing as usize];
+        dial.in_flight = None;
+        let doubled = BACKOFF_FIRST.saturating_mul(1 << dial.failures.min(16));
+        dial.failures = dial.failures.saturating_add(1);
+        let at = now + doubled.min(BACKOFF_MOST).mul_f64(jitter);
+        self.dials[standing as usize].due = Some(self.spaced(standing, at));
+    }
+
+    fn spaced(&self, standing: Standing, at: Duration) -> Duration {
+        let own = self.dials[standing as usize].last;
+        let address = self.of(standing).next().map(|source| source.address);
+        let same = self.dials.iter().filter(|dial| dial.first.is_some() && dial.first == address);
+        let last = same.filter_map(|dial| dial.last).chain(own).max();
+        last.map_or(at, |last| at.max(last + DIAL_SPACING))
+    }
+
+    /// The peer is linked, or was: nothing is under way.
+    pub(super) fn done(&mut self) {
+        for dial in &mut self.dials {
+            dial.reset();
+            dial.in_flight = None;
+        }
     }
 
     /// Whether it said goodbye just now; forgets that it did.
@@ -68,45 +196,21 @@ impl Record {
 
     /// Nothing would be lost that the next beacon does not bring back.
     pub(super) fn may_be_forgotten(&self) -> bool {
-        !self.linked && self.dial.in_flight.is_none()
+        !self.linked && self.in_flight().next().is_none()
     }
 }
 
 impl Dial {
-    /// Schedules a dial unless one is scheduled.
-    pub(super) fn schedule(&mut self, at: Duration) {
-        if self.due.is_none() {
-            self.due = Some(self.spaced(at));
-        }
-    }
-
-    pub(super) fn start(&mut self, now: Duration) {
+    pub(super) fn start(&mut self, now: Duration, first: Option<SocketAddr>) {
         self.due = None;
         self.last = Some(now);
+        self.first = first;
         self.in_flight = Some(now + DIAL_FORGOTTEN);
-    }
-
-    /// The dial failed; `jitter` is between 0.5 and 1.5.
-    pub(super) fn failed(&mut self, now: Duration, jitter: f64) {
-        self.in_flight = None;
-        let doubled = BACKOFF_FIRST.saturating_mul(1 << self.failures.min(16));
-        self.failures = self.failures.saturating_add(1);
-        self.due = Some(self.spaced(now + doubled.min(BACKOFF_MOST).mul_f64(jitter)));
     }
 
     /// Forgets failures, for a reason to hope; what is in flight stays.
     pub(super) fn reset(&mut self) {
         self.failures = 0;
         self.due = None;
-    }
-
-    /// The peer is linked: nothing to dial.
-    pub(super) fn done(&mut self) {
-        self.reset();
-        self.in_flight = None;
-    }
-
-    fn spaced(&self, at: Duration) -> Duration {
-        self.last.map_or(at, |last| at.max(last + DIAL_SPACING))
     }
 }

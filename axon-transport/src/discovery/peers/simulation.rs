@@ -32,7 +32,7 @@ struct Host {
 
 enum What {
     Datagram { to: usize, from: SocketAddr, arrival: Arrival, bytes: Vec<u8> },
-    DialEnds { from: usize, to: usize },
+    DialEnds { from: usize, to: usize, standing: Standing },
 }
 
 struct Subnet {
@@ -143,7 +143,7 @@ impl Subnet {
                     let to = self.hosts.iter().position(|h| h.address == to);
                     self.transmit(host, to.expect("a host's address"), Arrival::Quic, &bytes);
                 }
-                Output::Action(Action::Dial { daemon, addrs, sae, listed }) => {
+                Output::Action(Action::Dial { daemon, addrs, sae, listed, standing }) => {
                     let to = self.hosts.iter().position(|h| h.address == addrs[0]).unwrap();
                     assert_eq!((id(to), listed), (daemon, false));
                     assert_eq!(self.hosts[host].terms, self.hosts[to].terms, "dialled a mismatch");
@@ -156,7 +156,7 @@ impl Subnet {
                     let Host { in_flight, links, .. } = &self.hosts[host];
                     assert!(in_flight.difference(links).count() <= MOST_IN_FLIGHT);
                     let wait = Duration::from_millis(self.random.random_range(5..200));
-                    self.later(wait, What::DialEnds { from: host, to });
+                    self.later(wait, What::DialEnds { from: host, to, standing });
                 }
                 Output::Action(Action::Mismatch(mismatch)) => {
                     self.hosts[host].mismatches.push((mismatch.peer, mismatch.setting));
@@ -188,7 +188,7 @@ impl Subnet {
                         self.hosts[to].peers.datagram(self.now, from, arrival, &bytes);
                         self.settle(to);
                     }
-                    What::DialEnds { from, to } => self.dial_ends(from, to),
+                    What::DialEnds { from, to, standing } => self.dial_ends(from, to, standing),
                 }
             }
             for host in 0..self.hosts.len() {
@@ -199,11 +199,11 @@ impl Subnet {
         }
     }
 
-    fn dial_ends(&mut self, from: usize, to: usize) {
+    fn dial_ends(&mut self, from: usize, to: usize, standing: Standing) {
         let now = self.now;
         self.hosts[from].in_flight.remove(&to);
         if self.random.random_bool(self.loss) {
-            self.hosts[from].peers.dial_failed(now, id(to));
+            self.hosts[from].peers.dial_failed(now, id(to), standing);
             return self.settle(from);
         }
         for (a, b) in [(from, to), (to, from)] {

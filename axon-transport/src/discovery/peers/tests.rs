@@ -13,15 +13,15 @@ use crate::{
 
 const CLASSIC: Terms = Terms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(1) };
 const QKD: Terms = Terms { mode: 1, key_mode: 2, kex: 1, cipher: 0, auth: None };
-const OWN: DaemonId = DaemonId([0x80; 16]);
-const LOWER: DaemonId = DaemonId([0x01; 16]);
-const HIGHER: DaemonId = DaemonId([0xf0; 16]);
+pub(super) const OWN: DaemonId = DaemonId([0x80; 16]);
+pub(super) const LOWER: DaemonId = DaemonId([0x01; 16]);
+pub(super) const HIGHER: DaemonId = DaemonId([0xf0; 16]);
 
-fn secs(seconds: f64) -> Duration {
+pub(super) fn secs(seconds: f64) -> Duration {
     Duration::from_secs_f64(seconds)
 }
 
-fn local() -> Local {
+pub(super) fn local() -> Local {
     Local {
         daemon: OWN,
         domain: 0,
@@ -39,7 +39,7 @@ fn in_qkd() -> Local {
 }
 
 /// Past its first beacons, so that what it says next is about its peers.
-fn settled(local: Local) -> Peers {
+pub(super) fn settled(local: Local) -> Peers {
     let mut peers = Peers::new(local, 1);
     let interface = Interface {
         name: "eth0".to_owned(),
@@ -78,7 +78,7 @@ fn dials(peers: &mut Peers) -> Vec<DaemonId> {
     dialled.collect()
 }
 
-fn beacon(daemon: DaemonId) -> Beacon {
+pub(super) fn beacon(daemon: DaemonId) -> Beacon {
     Beacon {
         protocols: (1, 1),
         domain: 0,
@@ -93,13 +93,18 @@ fn beacon(daemon: DaemonId) -> Beacon {
     }
 }
 
-fn from(text: &str) -> SocketAddr {
+pub(super) fn from(text: &str) -> SocketAddr {
     text.parse().unwrap()
 }
 
 fn hear(peers: &mut Peers, now: f64, beacon: Beacon) {
     let bytes = Datagram::Beacon(beacon).encode();
     peers.datagram(secs(now), from("10.0.0.2:4000"), Arrival::Shared, &bytes);
+}
+
+/// Whatever dial to the peer is under way fails.
+fn fail(peers: &mut Peers, now: Duration, daemon: DaemonId) {
+    Standing::ALL.into_iter().for_each(|standing| peers.dial_failed(now, daemon, standing));
 }
 
 fn mismatches(peers: &mut Peers) -> Vec<Mismatch> {
@@ -192,7 +197,7 @@ fn forged_beacons_change_nothing_for_a_peer_that_was_acceptable() {
     hear(&mut peers, 3.0, beacon(HIGHER));
     assert_eq!(dials(&mut peers), [HIGHER]);
     hear(&mut peers, 3.1, forged());
-    peers.dial_failed(secs(3.2), HIGHER);
+    fail(&mut peers, secs(3.2), HIGHER);
     peers.advance(secs(4.5));
     assert_eq!(dials(&mut peers), [HIGHER], "still dialled");
 
@@ -261,7 +266,7 @@ fn failed_dials_back_off_up_to_eight_seconds() {
     let mut now = secs(3.0);
     let mut waits = Vec::new();
     while waits.len() < 30 {
-        peers.dial_failed(now, HIGHER);
+        fail(&mut peers, now, HIGHER);
         let failed = now;
         loop {
             now = peers.next_wakeup().unwrap();
@@ -277,7 +282,7 @@ fn failed_dials_back_off_up_to_eight_seconds() {
     assert!(waits.iter().all(|wait| (secs(1.0)..=secs(12.0)).contains(wait)), "{waits:?}");
     assert!(waits[10..].iter().all(|wait| *wait >= secs(4.0)), "{waits:?}");
 
-    peers.dial_failed(now, HIGHER);
+    fail(&mut peers, now, HIGHER);
     peers.set_interfaces(now + secs(1.0), Vec::new());
     assert_eq!(dials(&mut peers), [HIGHER], "another interface is another chance");
     // An outcome that nobody reports is a failure in the end.
@@ -316,9 +321,12 @@ fn answers_are_rationed() {
         id[..4].copy_from_slice(&n.to_be_bytes());
         hear(&mut peers, 3.0, Beacon { answer_wanted: true, ..beacon(DaemonId(id)) });
     }
-    let sent = actions(&mut peers)
-        .into_iter()
-        .filter(|action| matches!(action, Action::SendFromQuicPort { .. }));
+    let sent = actions(&mut peers).into_iter().filter(|action| match action {
+        Action::SendFromQuicPort { bytes, .. } => {
+            matches!(Datagram::decode(bytes), Ok(Datagram::Beacon(_)))
+        }
+        _ => false,
+    });
     assert_eq!(sent.count(), 64);
     assert!(peers.next_wakeup().unwrap() <= secs(4.0), "the rest by one beacon to all");
 }
@@ -392,7 +400,7 @@ fn a_range_that_changes_is_followed() {
     assert_eq!(dials(&mut peers), [HIGHER], "it lists this host");
 
     peers.set_range(secs(63.0), Off);
-    peers.dial_failed(secs(64.0), HIGHER);
+    fail(&mut peers, secs(64.0), HIGHER);
     actions(&mut peers);
     peers.datagram(secs(65.0), from("10.0.0.2:61301"), Arrival::Quic, &bytes);
     peers.advance(secs(90.0));
@@ -448,7 +456,7 @@ proptest! {
             match step {
                 0 => peers.link_up(now, daemon, at),
                 1 => peers.link_down(now, daemon),
-                2 => peers.dial_failed(now, daemon),
+                2 => fail(&mut peers, now, daemon),
                 3 => peers.datagram(now, at, quic, &bytes),
                 4 => {
                     let goodbye = Datagram::Goodbye { domain: 0, daemon }.encode();

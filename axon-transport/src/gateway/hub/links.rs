@@ -57,6 +57,7 @@ impl Link {
             sae: self.established.hello.sae.clone(),
             addresses: vec![self.connection.remote_address()],
             listed: false,
+            standing: None,
             replaces: self.elected.map(|e| e.link),
         }
     }

@@ -264,9 +264,9 @@ impl Hub {
 
     async fn on_event(&mut self, event: Event) {
         match event {
-            Event::Order(ToGateway::Dial { daemon, sae, addresses, listed }) => {
-                let daemon = Some(daemon);
-                self.dial(Target { daemon, sae, addresses, listed, replaces: None });
+            Event::Order(ToGateway::Dial { daemon, sae, addresses, listed, standing }) => {
+                let (daemon, standing) = (Some(daemon), Some(standing));
+                self.dial(Target { daemon, sae, addresses, listed, standing, replaces: None });
             }
             Event::Order(ToGateway::SendDatagram { to, bytes }) => self.endpoints.send(to, &bytes),
             Event::Order(ToGateway::Shutdown) => {}
@@ -274,8 +274,8 @@ impl Hub {
                 Ok(established) => self.established(established, target.replaces).await,
                 Err(refusal) => {
                     self.refused(target.text(), refusal).await;
-                    if let (Some(daemon), None) = (target.daemon, target.replaces) {
-                        self.tell(ToControl::DialFailed { daemon }).await;
+                    if let (Some(daemon), Some(standing)) = (target.daemon, target.standing) {
+                        self.tell(ToControl::DialFailed { daemon, standing }).await;
                     }
                 }
             },

@@ -1,0 +1,286 @@
+//! Forged beacons: an honest host is found and dialled while they last, and nothing of them stays.
+
+use super::{
+    tests::{HIGHER, LOWER, OWN, beacon, from, local, secs, settled},
+    *,
+};
+use crate::discovery::beacon::{Beacon, Datagram};
+
+/// When the honest host starts; the forger began before it.
+const STARTS: u64 = 1_000;
+/// The first beacons of a daemon, in milliseconds from its start.
+const BURST: [u64; 5] = [0, 180, 450, 900, 1_700];
+/// How long the two may take.
+const LIMIT: u64 = 3_000;
+
+/// What the forger sends in a millisecond: from where, and what.
+type Forger = fn(u64) -> Vec<(SocketAddr, Arrival, Datagram)>;
+
+/// An honest host at its address, and a forger.
+struct Scene {
+    peers: Peers,
+    honest: DaemonId,
+    address: SocketAddr,
+    arrival: Arrival,
+    forger: Forger,
+    /// When the honest host starts, in milliseconds.
+    starts: u64,
+    now: u64,
+}
+
+impl Scene {
+    fn new(honest: DaemonId, forger: Forger) -> Self {
+        let (peers, address) = (settled(local()), from("10.0.0.2:61300"));
+        Self {
+            peers,
+            honest,
+            address,
+            arrival: Arrival::Shared,
+            forger,
+            starts: STARTS,
+            now: 10_000,
+        }
+    }
+
+    /// This host lists the other one, which lists it too.
+    fn listed(honest: DaemonId, forger: Forger) -> Self {
+        let mut scene = Self::new(honest, forger);
+        scene.peers.set_listed(secs(3.0), vec![(scene.address.ip(), None)]);
+        scene.arrival = Arrival::Quic;
+        scene
+    }
+
+    /// The two had a link, which is lost when the forger begins.
+    fn met(honest: DaemonId, forger: Forger) -> Self {
+        let mut scene = Self::new(honest, forger);
+        scene.honest_speaks();
+        let (at, address) = (scene.time(), scene.address);
+        scene.peers.link_up(at, honest, address);
+        scene
+    }
+
+    fn time(&self) -> Duration {
+        Duration::from_millis(self.now)
+    }
+
+    fn honest_speaks(&mut self) {
+        let port = self.address.port();
+        let bytes = Datagram::Beacon(Beacon { port, ..beacon(self.honest) }).encode();
+        let source = match self.arrival {
+            Arrival::Quic => self.address,
+            Arrival::Shared => SocketAddr::new(self.address.ip(), 40_000),
+        };
+        self.peers.datagram(self.time(), source, self.arrival, &bytes);
+    }
+
+    /// Milliseconds from the honest host's start until this host dials it where it is.
+    fn play(&mut self) -> Option<u64> {
+        let begin = self.now;
+        for passed in 0..self.starts + 2 * LIMIT {
+            self.now = begin + passed;
+            for (source, arrival, datagram) in (self.forger)(passed) {
+                self.peers.datagram(self.time(), source, arrival, &datagram.encode());
+            }
+            let speaks =
+                passed.checked_sub(self.starts).is_some_and(|since| BURST.contains(&since));
+            if speaks {
+                self.honest_speaks();
+            }
+            self.peers.advance(self.time());
+            if self.is_dialled() && passed >= self.starts {
+                return Some(passed - self.starts);
+            }
+        }
+        None
+    }
+
+    /// Does what the state machine wants; only the honest host answers. Whether that was dialled.
+    fn is_dialled(&mut self) -> bool {
+        let mut dialled = false;
+        while let Some(output) = self.peers.poll() {
+            match output {
+                Output::Action(Action::Dial { daemon, addrs, .. }) => {
+                    // An address that does not answer takes 5 s; the first is what counts.
+                    dialled |= daemon == self.honest && addrs[0] == self.address;
+                }
+                Output::Action(Action::SendFromQuicPort { to, bytes }) if to == self.address => {
+                    if let Ok(Datagram::Probe { nonce, .. }) = Datagram::decode(&bytes) {
+                        let echo = Datagram::Echo { daemon: self.honest, nonce }.encode();
+                        let now = self.time();
+                        self.peers.datagram(now, self.address, Arrival::Quic, &echo);
+                    }
+                }
+                Output::Action(_) | Output::Multicast(_) => {}
+            }
+        }
+        dialled
+    }
+
+    #[track_caller]
+    fn links(&mut self, what: &str) {
+        let after = self.play().unwrap_or_else(|| panic!("{what}: never dialled"));
+        eprintln!("{what}: dialled after {after} ms");
+        assert!(after <= LIMIT, "{what}: dialled after {after} ms");
+        self.bounded();
+        self.ends();
+    }
+
+    fn bounded(&self) {
+        assert!(self.peers.records.len() <= MOST_UNAUTHENTICATED);
+        assert!(self.peers.in_flight() <= MOST_IN_FLIGHT);
+    }
+
+    /// The flood is over: nothing of it stays.
+    fn ends(&mut self) {
+        for second in 1..=300 {
+            self.now += 1_000;
+            // The honest host goes on.
+            if second % 10 == 0 {
+                self.honest_speaks();
+            }
+            self.peers.advance(self.time());
+            self.is_dialled();
+        }
+        assert_eq!(self.peers.records.len(), 1, "the honest host alone is known");
+    }
+}
+
+fn made_up(number: u64) -> DaemonId {
+    // Above and below this host's own.
+    let mut id = [if number.is_multiple_of(2) { 0x11 } else { 0xee }; 16];
+    id[1..9].copy_from_slice(&number.to_be_bytes());
+    DaemonId(id)
+}
+
+/// An address of this subnet's where nobody is.
+fn forged(number: u64) -> SocketAddr {
+    SocketAddr::from(([10, 0, 0, 10 + (number % 240) as u8], 10_000 + (number / 7 % 50_000) as u16))
+}
+
+fn said(source: SocketAddr, daemon: DaemonId) -> (SocketAddr, Arrival, Datagram) {
+    let beacon = Beacon { port: source.port(), answer_wanted: true, ..beacon(daemon) };
+    (source, Arrival::Quic, Datagram::Beacon(beacon))
+}
+
+/// 300 a second, each of another daemon at another address.
+fn from_everywhere(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
+    let numbers = (ms * 3 / 10)..((ms + 1) * 3 / 10);
+    numbers.map(|number| said(forged(number), made_up(number))).collect()
+}
+
+/// The same from one address.
+fn from_one_address(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
+    let numbers = (ms * 3 / 10)..((ms + 1) * 3 / 10);
+    let at = |number| SocketAddr::from(([10, 0, 0, 66], 10_000 + (number % 50_000) as u16));
+    numbers.map(|number| said(at(number), made_up(number))).collect()
+}
+
+/// The same, as if from the honest host's address.
+fn from_the_honest_address(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
+    let numbers = (ms * 3 / 10)..((ms + 1) * 3 / 10);
+    let at = |number| SocketAddr::from(([10, 0, 0, 2], 10_000 + (number % 50_000) as u16));
+    numbers.map(|number| said(at(number), made_up(number))).collect()
+}
+
+/// 20 a second under the ids of the hosts that these tests know.
+fn under_the_id(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
+    let number = ms / 50;
+    let ids = if ms.is_multiple_of(50) { &[LOWER, HIGHER][..] } else { &[] };
+    ids.iter().map(|id| said(forged(number), *id)).collect()
+}
+
+/// The same at the honest host's address, with ports that are wrong.
+fn under_the_id_with_wrong_ports(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
+    let mut all = under_the_id(ms);
+    for (source, ..) in &mut all {
+        *source = SocketAddr::from(([10, 0, 0, 2], 20_000 + (ms / 50) as u16));
+    }
+    all
+}
+
+/// All of it, and goodbyes under the same ids from the addresses that were forged.
+fn everything(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
+    let mut all = from_everywhere(ms);
+    all.extend(from_one_address(ms));
+    all.extend(under_the_id(ms));
+    if ms % 50 == 25 {
+        for daemon in [LOWER, HIGHER] {
+            let goodbye = Datagram::Goodbye { domain: 0, daemon };
+            all.push((forged(ms / 50), Arrival::Quic, goodbye));
+        }
+    }
+    all
+}
+
+#[test]
+fn a_listed_host_is_dialled_through_any_flood() {
+    for honest in [LOWER, HIGHER] {
+        Scene::listed(honest, from_everywhere).links("listed, 300/s from everywhere");
+        Scene::listed(honest, from_one_address).links("listed, 300/s from one address");
+        Scene::listed(honest, from_the_honest_address).links("listed, 300/s from its address");
+        Scene::listed(honest, under_the_id).links("listed, 20/s under its id");
+        Scene::listed(honest, under_the_id_with_wrong_ports).links("listed, wrong ports");
+        Scene::listed(honest, everything).links("listed, everything");
+    }
+}
+
+#[test]
+fn a_host_that_was_linked_is_dialled_again_through_any_flood() {
+    for honest in [LOWER, HIGHER] {
+        for (forger, what) in [
+            (from_everywhere as Forger, "met, 300/s from everywhere"),
+            (from_one_address, "met, 300/s from one address"),
+            (under_the_id, "met, 20/s under its id"),
+            (under_the_id_with_wrong_ports, "met, wrong ports"),
+            (everything, "met, everything"),
+        ] {
+            let mut scene = Scene::met(honest, forger);
+            // While it was linked beacons said other things of it.
+            for ms in 0..1_000 {
+                scene.now += 1;
+                for (source, arrival, datagram) in forger(ms) {
+                    scene.peers.datagram(scene.time(), source, arrival, &datagram.encode());
+                }
+            }
+            scene.peers.link_down(scene.time(), honest);
+            scene.starts = 0;
+            scene.links(what);
+        }
+    }
+}
+
+#[test]
+fn a_host_that_nobody_knows_is_dialled_once_it_answers() {
+    for honest in [LOWER, HIGHER] {
+        Scene::new(honest, from_everywhere).links("unknown, 300/s from everywhere");
+        Scene::new(honest, from_one_address).links("unknown, 300/s from one address");
+        Scene::new(honest, under_the_id).links("unknown, 20/s under its id");
+        Scene::new(honest, everything).links("unknown, everything");
+    }
+}
+
+#[test]
+fn an_answer_is_asked_of_no_flood() {
+    // A listed host that asks who is there is answered while others ask without end.
+    let mut scene = Scene::listed(HIGHER, from_everywhere);
+    for ms in 0..5_000 {
+        scene.now += 1;
+        for (source, arrival, datagram) in from_everywhere(ms) {
+            scene.peers.datagram(scene.time(), source, arrival, &datagram.encode());
+        }
+        scene.is_dialled();
+    }
+    let ask = Beacon { port: 61300, answer_wanted: true, ..beacon(HIGHER) };
+    let bytes = Datagram::Beacon(ask).encode();
+    scene.peers.datagram(scene.time(), scene.address, Arrival::Quic, &bytes);
+    let answered = std::iter::from_fn(|| scene.peers.poll()).any(|output| match output {
+        Output::Action(Action::SendFromQuicPort { to, bytes }) => {
+            let said = Datagram::decode(&bytes);
+            to == scene.address && matches!(said, Ok(Datagram::Beacon(b)) if b.daemon == OWN)
+        }
+        _ => false,
+    });
+    assert!(answered);
+    // Its own beacons go as often as without the flood.
+    assert!(scene.peers.interval() <= secs(20.0), "{:?}", scene.peers.interval());
+}

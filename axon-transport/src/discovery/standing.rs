@@ -1,0 +1,24 @@
+//! Why a daemon may be at an address.
+
+/// What speaks for a daemon being where a beacon puts it, the best first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Standing {
+    /// A link with this very daemon stood there.
+    Proven,
+    /// This host lists the address, or had a link with somebody there; and the daemon answered there.
+    KnownAnswered,
+    /// This host lists the address, or had a link with somebody there.
+    Known,
+    /// The daemon answered a probe there.
+    Answered,
+    /// A beacon says so, whose source address may be forged.
+    Heard,
+}
+
+impl Standing {
+    /// How many there are.
+    pub(super) const COUNT: usize = 5;
+    /// All of them, the best first.
+    pub(super) const ALL: [Self; Self::COUNT] =
+        [Self::Proven, Self::KnownAnswered, Self::Known, Self::Answered, Self::Heard];
+}
