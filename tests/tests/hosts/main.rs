@@ -25,5 +25,6 @@ mod restart;
 mod rules;
 mod secrets;
 mod services;
+mod squatter;
 mod stranger;
 mod unread;
