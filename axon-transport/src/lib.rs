@@ -12,6 +12,7 @@ mod heap;
 pub mod ids;
 pub mod keys;
 pub mod link;
+pub mod owner;
 pub mod passed;
 mod process;
 pub mod qos;

@@ -204,6 +204,9 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
         Message::Graph(graph(64)),
         Message::GraphResync(link::GraphResync { version: 2 }),
         Message::Asserted(link::Asserted { publishers: vec![gid] }),
+        Message::Owners(link::Owners {
+            proofs: vec![axon_transport::owner::Proof { key: [1; 32], signature: [2; 64] }],
+        }),
         Message::Subscribe(link::Subscribe {
             route: 1,
             topic: "/scan".into(),

@@ -1,8 +1,8 @@
 //! What the control plane and the gateway say to each other.
 //!
-//! They run on threads and runtimes of their own and share nothing but these two bounded channels
-//! and one session socket. Neither waits for the other: the control plane drops an order that does
-//! not fit, and a gateway that fails is started again.
+//! They run on threads and runtimes of their own and share nothing but these two bounded channels,
+//! one session socket, and the table of the sessions' keys. Neither waits for the other: the control
+//! plane drops an order that does not fit, and a gateway that fails is started again.
 
 use std::{net::SocketAddr, os::fd::OwnedFd, sync::Arc};
 
@@ -14,6 +14,7 @@ use crate::{
     discovery::Standing,
     graph::RemoteEndpoint,
     ids::{DaemonId, Gid},
+    owner::SessionKeys,
 };
 
 /// What either channel holds.
@@ -26,6 +27,8 @@ pub struct GatewayParts {
     pub config: Arc<Config>,
     /// The daemon.
     pub daemon: DaemonId,
+    /// The keys of the sessions, with which the gateway proves to peers that they are this daemon's.
+    pub keys: Arc<SessionKeys>,
     /// One end of a socket pair, for [`Session::over`](crate::session::Session::over).
     pub socket: OwnedFd,
     /// To the control plane.

@@ -21,6 +21,7 @@ use crate::{
     config::Config,
     discovery::Wanted,
     ids::{DaemonId, SessionId},
+    owner::SessionKeys,
     passed::PassedFd,
     relay::Pool,
     session::address::Address,
@@ -48,6 +49,8 @@ pub(super) struct Control {
     pub(super) keys: serde_json::Value,
     pub(super) port: Option<u16>,
     pub(super) gateway: String,
+    /// The sessions' own keys, with which the gateway proves that they are this daemon's.
+    pub(super) keys_of_sessions: Arc<SessionKeys>,
     /// For the samples that arrive over relays.
     pub(super) pool: Arc<Pool>,
     /// Memory that sessions try whether they can map it.
@@ -83,6 +86,7 @@ impl Control {
             keys: serde_json::Value::Null,
             port: None,
             gateway: "off".into(),
+            keys_of_sessions: Arc::default(),
             pool: Pool::new(config.reliable_queue),
             probe: probe().inspect_err(|error| tracing::error!(%error, "no memory to try")).ok(),
             traffic: TrafficStatus::default(),
@@ -112,6 +116,7 @@ impl Control {
         if self.wakers.get(id).is_some_and(|current| Rc::ptr_eq(current, bell)) {
             self.wakers.remove(id);
             self.registry.disconnect(id);
+            self.keys_of_sessions.remove(id);
             self.settle();
         }
     }

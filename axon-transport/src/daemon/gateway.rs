@@ -58,6 +58,7 @@ impl Running {
             GatewayParts {
                 config: Arc::clone(&control.config),
                 daemon: control.id,
+                keys: Arc::clone(&control.keys_of_sessions),
                 socket: theirs,
                 control: to_control,
                 orders: from_control,

@@ -17,8 +17,8 @@ use tokio::{
 };
 
 use super::{
-    admission::unshared,
     control::Control,
+    first::{First, first},
     registry::{MAX_OF_PROCESS, SessionEntry},
     watch::watch,
 };
@@ -26,6 +26,7 @@ use crate::{
     config::Config,
     graph::Scope,
     ids::{Gid, SessionId},
+    owner::SessionKey,
     passed::{self, PassedFd},
     relay::{Tally, far::Far},
     session::{
@@ -102,7 +103,7 @@ pub(super) enum Inside {
     /// The gateway's.
     Gateway,
     /// That of a relayed session of process `pid`.
-    Relay { pid: u32, tally: Arc<Tally> },
+    Relay { pid: u32, tally: Arc<Tally>, key: Option<Arc<SessionKey>> },
 }
 
 /// Serves one connection to its end. `known` is called when it is a stranger no more.
@@ -118,49 +119,23 @@ pub(super) async fn serve(
         return;
     }
     let Ok(socket) = watch(socket.trusted()) else { return };
-    let Ok(Some(hello)) = timeout(HELLO, first(&socket)).await else { return };
+    let Ok(Some(first)) = timeout(HELLO, first(&socket)).await else { return };
     known();
-    if hello.0.relay.is_some() {
-        return relay(&control, socket, hello, peer);
+    if first.hello.relay.is_some() {
+        return relay(&control, socket, first, peer);
     }
-    let Some((id, bell, death)) = admit(&control, &socket, hello, peer, &inside) else { return };
+    let Some((id, bell, death)) = admit(&control, &socket, first, peer, &inside) else { return };
     let why = converse(&control, &socket, id, &bell, death.as_ref()).await;
     tracing::debug!(session = %id, why, "a session ended");
     control.borrow_mut().remove(&id, &bell);
 }
 
-/// Messages of unknown types that may come before HELLO.
-const UNKNOWN: u32 = 8;
-
-async fn first(socket: &AsyncFd<PassedFd>) -> Option<(Hello, Vec<PassedFd>)> {
-    let mut buffer = Vec::new();
-    let mut unknown = 0;
-    loop {
-        let mut ready = socket.readable().await.ok()?;
-        match receive(socket.get_ref(), &mut buffer) {
-            Ok(Received { message: Message::Hello(hello), descriptors }) => {
-                return Some((hello, descriptors));
-            }
-            // A later version may say something first; a flood would keep everybody else waiting.
-            Ok(Received { message: Message::Unknown(_), descriptors })
-                if unknown < UNKNOWN && descriptors.is_empty() =>
-            {
-                unknown += 1;
-            }
-            Err(SocketError::NotReady) => ready.clear_ready(),
-            // Not for want of room here: somebody keeps them back.
-            Err(SocketError::NoDescriptors) if !passed::is_short() => {
-                let text = "its descriptors do not arrive".to_owned();
-                say(socket, Message::Refused(*unshared(text)), &[]);
-                return None;
-            }
-            Ok(_) | Err(_) => return None,
-        }
-    }
-}
-
 /// Says something to somebody new, whose socket has room; whether it was said.
-fn say(socket: &AsyncFd<PassedFd>, message: Message, descriptors: &[BorrowedFd<'_>]) -> bool {
+pub(super) fn say(
+    socket: &AsyncFd<PassedFd>,
+    message: Message,
+    descriptors: &[BorrowedFd<'_>],
+) -> bool {
     let packet = message.encode();
     let sent = packet.map(|packet| socket::send(socket.get_ref(), &packet, descriptors));
     matches!(sent, Ok(Ok(())))
@@ -186,12 +161,9 @@ fn shown(name: &str) -> String {
 }
 
 /// Has a session relayed whose memory is not shared.
-fn relay(
-    control: &Rc<RefCell<Control>>,
-    socket: AsyncFd<PassedFd>,
-    (mut hello, descriptors): (Hello, Vec<PassedFd>),
-    peer: Peer,
-) {
+fn relay(control: &Rc<RefCell<Control>>, socket: AsyncFd<PassedFd>, first: First, peer: Peer) {
+    let its_own = first.is_its_own();
+    let First { mut hello, descriptors, key } = first;
     hello.name = shown(&hello.name);
     let mut state = control.borrow_mut();
     let reason = hello.relay.clone().unwrap_or_default();
@@ -199,7 +171,8 @@ fn relay(
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
         socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None)
     };
-    let checked = match state.admission.check(&hello, descriptors, peer, false) {
+    let checked = its_own.and_then(|()| state.admission.check(&hello, descriptors, peer, false));
+    let checked = match checked {
         Err(refused) => Err(*refused),
         Ok(_) if state.registry.relayed() >= crate::relay::MAX_SESSIONS => {
             Err(Refused::because(format!(
@@ -217,7 +190,7 @@ fn relay(
     };
     let tally = Arc::new(Tally::new(&reason));
     tracing::info!(name = hello.name, pid = peer.pid, reason, "a session is relayed");
-    let inside = Inside::Relay { pid: peer.pid, tally: Arc::clone(&tally) };
+    let inside = Inside::Relay { pid: peer.pid, tally: Arc::clone(&tally), key };
     spawn_local(serve(control.clone(), ours.into(), inside, || ()));
     let far = Far {
         socket: socket.into_inner(),
@@ -249,14 +222,18 @@ type Admitted = (SessionId, Rc<Notify>, Option<AsyncFd<PassedFd>>);
 fn admit(
     control: &Rc<RefCell<Control>>,
     socket: &AsyncFd<PassedFd>,
-    (mut hello, descriptors): (Hello, Vec<PassedFd>),
+    first: First,
     peer: Peer,
     inside: &Inside,
 ) -> Option<Admitted> {
+    let its_own = first.is_its_own();
+    let First { mut hello, descriptors, mut key } = first;
     hello.name = shown(&hello.name);
     let control = &mut *control.borrow_mut();
     let gateway = matches!(inside, Inside::Gateway);
-    let handed = match control.admission.check(&hello, descriptors, peer, gateway) {
+    let admission = &mut control.admission;
+    let checked = its_own.and_then(|()| admission.check(&hello, descriptors, peer, gateway));
+    let handed = match checked {
         Ok(handed) => handed,
         Err(refused) => {
             refuse(control, socket, &hello.name, peer, *refused);
@@ -291,14 +268,19 @@ fn admit(
         return None;
     }
     control.relist();
-    if let Inside::Relay { tally, .. } = inside {
+    if let Inside::Relay { tally, key: of_process, .. } = inside {
         control.registry.set_relayed(&session, Arc::clone(tally));
+        key = of_process.clone();
+    }
+    if let Some(key) = key {
+        control.keys_of_sessions.insert(key);
     }
     let pid = std::process::id();
     let welcome = Welcome { protocol: PROTOCOL, daemon: control.id, pid, ranges: Some(true) };
     let probe: Vec<BorrowedFd<'_>> = control.probe.iter().map(AsFd::as_fd).collect();
     if !say(socket, Message::Welcome(welcome), &probe) {
         control.registry.disconnect(&session);
+        control.keys_of_sessions.remove(&session);
         control.settle();
         return None;
     }
@@ -393,7 +375,7 @@ fn send_all(
 }
 
 /// Receives one packet, unless it has descriptors for which there may be no room.
-fn receive(socket: &PassedFd, buffer: &mut Vec<u8>) -> Result<Received, SocketError> {
+pub(super) fn receive(socket: &PassedFd, buffer: &mut Vec<u8>) -> Result<Received, SocketError> {
     if passed::is_short() && passed::carries_descriptors(socket) {
         return Err(SocketError::NoDescriptors);
     }

@@ -179,6 +179,7 @@ fn cost(message: &Message) -> u32 {
         Message::Subscribe(subscribe) => 7 + subscribe.subscribers.len() + subscribe.last.len(),
         Message::Unsubscribe(_) | Message::RouteRefused(_) => 7,
         Message::Asserted(asserted) => asserted.publishers.len() / 8,
+        Message::Owners(owners) => 7 * owners.proofs.len(),
         // Keys are bounded where they are kept.
         _ => 0,
     };

@@ -81,6 +81,11 @@ impl Context {
         self.identity.as_ref().map(Identity::auth)
     }
 
+    /// Whether peers prove who they are.
+    pub(super) fn authenticates(&self) -> bool {
+        !matches!(self.auth(), Some(Auth::None(_)))
+    }
+
     /// Why nobody new is let in, if so: this host does not know at present whom to trust.
     pub(super) fn closed(&self) -> Option<String> {
         self.identity.as_ref().and_then(Identity::closed)

@@ -53,7 +53,7 @@ fn workers() -> usize {
 }
 
 async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
-    let GatewayParts { config, daemon, socket, control, mut orders } = parts;
+    let GatewayParts { config, daemon, keys, socket, control, mut orders } = parts;
     let used = || UsedKeys::open(config.runtime_dir.as_deref(), config.domain);
     let keyring = Keyring::start(&config, used)?;
     let (keyring, key_events) = match keyring {
@@ -77,6 +77,7 @@ async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
         session,
         domain: config.domain,
         max_message: config.max_message,
+        keys,
         accounts: Accounts::new(config.link.graph),
         queues: Room::new(config.reliable_queue),
         stalled_after: config.link.stalled,

@@ -7,6 +7,7 @@ use crate::{
     graph::{Endpoint, LIMITS},
     ids::{DaemonId, Gid},
     keys::KeyMessage,
+    owner::Proof,
     qos::Qos,
 };
 
@@ -240,6 +241,18 @@ pub struct RouteRefused {
     pub retry_s: Option<u32>,
 }
 
+/// That sessions are the sender's. Said before GRAPH, once on each connection.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Owners {
+    /// One for each session.
+    #[n(0)]
+    pub proofs: Vec<Proof>,
+}
+
+/// Proofs in one message.
+pub const MAX_PROOFS: usize = 128;
+
 /// KEEPALIVE carries nothing.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
@@ -275,6 +288,8 @@ pub enum Message {
     Received(Received),
     /// This route is not served.
     RouteRefused(RouteRefused),
+    /// These sessions are mine.
+    Owners(Owners),
     /// About keys.
     Keys(KeyMessage),
 }
@@ -294,6 +309,7 @@ impl Message {
             Self::Asserted(m) => (9, to_map(m)),
             Self::Received(m) => (10, to_map(m)),
             Self::RouteRefused(m) => (11, to_map(m)),
+            Self::Owners(m) => (12, to_map(m)),
             Self::Keys(m) => {
                 let mut map = Vec::new();
                 m.encode(&mut map);
@@ -316,6 +332,7 @@ impl Message {
             9 => Self::Asserted(from_map(kind, map)?),
             10 => Self::Received(from_map(kind, map)?),
             11 => Self::RouteRefused(from_map(kind, map)?),
+            12 => Self::Owners(from_map(kind, map)?),
             16..=19 => Self::Keys(
                 KeyMessage::decode(kind, map)
                     .map_err(|e| FrameError::Malformed { kind, reason: e.to_string() })?,
@@ -352,6 +369,7 @@ impl Message {
                 ok(m.flows.len() <= LIMITS.endpoints, "more publishers than there can be")
             }
             Self::RouteRefused(m) => ok(m.reason.len() <= MAX_REASON, "a reason is too long"),
+            Self::Owners(m) => ok(m.proofs.len() <= MAX_PROOFS, "too many proofs"),
             Self::Subscribe(m) => ok(
                 m.topic.len() <= LIMITS.name
                     && m.type_name.len() <= LIMITS.name

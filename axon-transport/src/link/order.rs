@@ -125,6 +125,7 @@ impl Message {
             Self::Asserted(_) => "ASSERTED",
             Self::Received(_) => "RECEIVED",
             Self::RouteRefused(_) => "ROUTE_REFUSED",
+            Self::Owners(_) => "OWNERS",
             Self::Keys(m) => m.name(),
         }
     }

@@ -178,16 +178,22 @@ impl Caller<'_> {
             None => Vec::new(),
         };
         let descriptors: Vec<BorrowedFd<'_>> = descriptors.iter().map(AsFd::as_fd).collect();
-        loop {
-            match socket::send(&socket, &packet, &descriptors) {
-                Ok(()) => break,
-                Err(SocketError::NotReady) => {
-                    self.await_socket(&socket, PollFlags::OUT, deadline, address)?
+        let say = |packet: &[u8], descriptors: &[BorrowedFd<'_>]| -> Result<(), Attempt> {
+            loop {
+                match socket::send(&socket, packet, descriptors) {
+                    Ok(()) => return Ok(()),
+                    Err(SocketError::NotReady) => {
+                        self.await_socket(&socket, PollFlags::OUT, deadline, address)?;
+                    }
+                    // It ended between our connecting and our speaking.
+                    Err(_) => return Err(Attempt::Again),
                 }
-                // It ended between our connecting and our speaking.
-                Err(_) => return Err(Attempt::Again),
             }
+        };
+        if let Some(key) = &self.options.key {
+            say(&key.packet(), &[])?;
         }
+        say(&packet, &descriptors)?;
         let mut buffer = Vec::new();
         loop {
             let received = match socket::receive(&socket, &mut buffer) {

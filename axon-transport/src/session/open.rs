@@ -14,6 +14,7 @@ use super::{
 use crate::{
     config::{Config, DaemonPolicy},
     ids::SessionId,
+    owner::SessionKey,
     relay::near::Near,
     shm::SessionSegment,
 };
@@ -26,8 +27,9 @@ impl Session {
     /// # Errors
     /// When the daemon cannot be reached or started, or has other security settings: the error
     /// names the variable.
-    pub fn open(config: &Config, options: SessionOptions) -> Result<Self, SessionError> {
-        let id = SessionId::random();
+    pub fn open(config: &Config, mut options: SessionOptions) -> Result<Self, SessionError> {
+        options.key = SessionKey::generate().map(Arc::new);
+        let id = options.key.as_ref().map_or_else(SessionId::random, |key| key.id());
         if config.daemon == DaemonPolicy::Off {
             let segment = SessionSegment::create(id)?;
             return Ok(Self::of(Self::start(config, options, segment, Start::Alone)?));

@@ -1,9 +1,9 @@
 //! What a session and its endpoints are opened with.
 
-use std::{ffi::OsString, io, path::PathBuf};
+use std::{ffi::OsString, io, path::PathBuf, sync::Arc};
 
 use super::message::SessionRole;
-use crate::qos::Qos;
+use crate::{owner::SessionKey, qos::Qos};
 
 /// How a session is opened.
 #[derive(Clone, Debug)]
@@ -12,6 +12,8 @@ pub struct SessionOptions {
     pub(super) role: SessionRole,
     pub(super) daemon_command: Option<DaemonCommand>,
     pub(super) callers: usize,
+    /// What its id is made of.
+    pub(super) key: Option<Arc<SessionKey>>,
 }
 
 impl SessionOptions {
@@ -21,7 +23,8 @@ impl SessionOptions {
         while name.len() > 256 {
             name.pop();
         }
-        Self { name, role: SessionRole::Application, daemon_command: None, callers: usize::MAX }
+        let role = SessionRole::Application;
+        Self { name, role, daemon_command: None, callers: usize::MAX, key: None }
     }
 
     /// Another kind of session.

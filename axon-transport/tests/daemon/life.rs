@@ -224,7 +224,10 @@ fn another_version_is_refused_by_both_sides() {
             accepted.is_some()
         });
         let accepted = accepted.unwrap();
-        until("HELLO", || socket::receive(&accepted, &mut Vec::new()).is_ok());
+        until("HELLO", || {
+            let received = socket::receive(&accepted, &mut Vec::new());
+            received.is_ok_and(|received| matches!(received.message, Message::Hello(_)))
+        });
         let daemon = DaemonId([7; 16]);
         let welcome = Message::Welcome(Welcome {
             protocol: PROTOCOL + 1,

@@ -10,6 +10,7 @@ use axon_transport::{
     graph::{Endpoint, EndpointKind},
     ids::{DaemonId, Gid, SessionId},
     link::{Graph, Message, Subscribe, Subscriber},
+    owner::SessionKey,
     qos::Qos,
     session::EndpointSpec,
 };
@@ -76,9 +77,8 @@ impl Camera {
 
     /// Waits until all that was said on the link was heard.
     fn heard(&self, met: &mut Met, route: u32) {
-        let subscribers = vec![Subscriber { gid: Gid([7; 16]), qos: Qos::default() }];
         let topic = format!("/asked_{route}");
-        self.stranger.say(met, &subscribe(route, topic, subscribers));
+        self.stranger.say(met, &subscribe(route, topic, Vec::new()));
         let ready = |m: &Message| matches!(m, Message::RouteReady(ready) if ready.route == route);
         self.stranger.hear(met, ready).expect("an answer");
     }
@@ -146,9 +146,11 @@ fn a_graph_has_a_bound_for_all_daemon_ids_of_a_peer_and_the_rest_of_the_link_goe
     let witness = camera.a.session("witness");
     let seen = || witness.graph().endpoints.values().filter(|e| e.daemon.is_some()).count();
     let before = camera.memory("VmRSS");
-    let sessions = [SessionId::random(), SessionId::random()];
-    let mut links = [camera.link(0xff), camera.link(0xfe)];
-    for (link, session) in links.iter_mut().zip(sessions) {
+    let (ids, mut links) = ([0xff, 0xfe], [camera.link(0xff), camera.link(0xfe)]);
+    let keys = [SessionKey::generate().unwrap(), SessionKey::generate().unwrap()];
+    let sessions = [keys[0].id(), keys[1].id()];
+    for (at, (link, session)) in links.iter_mut().zip(sessions).enumerate() {
+        camera.stranger.prove(link, DaemonId([ids[at]; 16]), &[&keys[at]]);
         camera.announce(link, session, MANY);
         camera.heard(link, 1);
     }
@@ -195,7 +197,9 @@ fn a_flood_of_changes_holds_up_nobody_and_ends_in_the_newest_state() {
     let camera = Camera::new();
     let reader = camera.a.session("reader");
     let mut link = camera.link(0xff);
-    let session = SessionId::random();
+    let key = SessionKey::generate().unwrap();
+    let session = key.id();
+    camera.stranger.prove(&mut link, DaemonId([0xff; 16]), &[&key]);
     let topic = |version: u64| format!("/changed_{version}");
     let (start, from) = (Instant::now(), camera.cpu());
     for version in 1..=CHANGES {
@@ -232,9 +236,10 @@ fn routes_that_take_more_than_a_peer_may_are_refused_by_name_and_the_others_serv
     let mut link = camera.link(0xff);
     let qos = Qos::default();
     // Each says 4 MB at most; it is kept three times.
-    let readers: Vec<_> = (0..40_000)
-        .map(|number| Subscriber { gid: Gid::new(SessionId([9; 16]), number), qos })
-        .collect();
+    let key = SessionKey::generate().unwrap();
+    camera.stranger.prove(&mut link, DaemonId([0xff; 16]), &[&key]);
+    let readers: Vec<_> =
+        (0..40_000).map(|number| Subscriber { gid: Gid::new(key.id(), number), qos }).collect();
     for route in 100..104 {
         let (topic, subscribers) = (format!("/read_{route}"), readers.clone());
         camera.stranger.say(&mut link, &subscribe(route, topic, subscribers));

@@ -4,8 +4,9 @@ use std::time::Duration;
 
 use axon_transport::{
     graph::{Endpoint, EndpointKind},
-    ids::{Gid, SessionId},
+    ids::{DaemonId, Gid},
     link::{Graph, Message},
+    owner::SessionKey,
     qos::Qos,
     session::EndpointSpec,
 };
@@ -55,9 +56,11 @@ fn what_a_peer_has_under_way_is_bounded_over_all_of_its_ids_and_given_back() {
     let mut met = Vec::new();
     let mut streams = Vec::new();
     // The host's own id is lower, as a rule: it elects.
-    for id in (0..IDS).map(|id| 0xff - id) {
+    let keys: Vec<_> = (0..IDS).map(|_| SessionKey::generate().unwrap()).collect();
+    for (id, key) in (0..IDS).map(|id| 0xff - id).zip(&keys) {
         let mut link = camera.link(id);
-        let publisher = Gid::new(SessionId([id; 16]), 1);
+        camera.stranger.prove(&mut link, DaemonId([id; 16]), &[key]);
+        let publisher = Gid::new(key.id(), 1);
         let route = published(&camera, &mut link, publisher);
         let mut header = vec![1, 0, 0, 0];
         header.extend_from_slice(&route.to_be_bytes());

@@ -27,6 +27,7 @@ mod restart;
 mod rules;
 mod secrets;
 mod services;
+mod squatter;
 mod stranger;
 mod unread;
 mod wire;

@@ -12,7 +12,8 @@ use axon_tls::{
 };
 use axon_transport::{
     ids::DaemonId,
-    link::{Hello, MAX_FRAME, Message, read_length},
+    link::{Hello, MAX_FRAME, Message, Owners, read_length},
+    owner::{EXPORTER, SessionKey},
 };
 use quinn::{Connection, Endpoint, RecvStream, SendStream};
 
@@ -96,6 +97,14 @@ impl Stranger {
         self.say(&mut met, &Message::Hello(hello(domain, claim)));
         self.hear(&mut met, |message| matches!(message, Message::Hello(_)))?;
         Ok(met)
+    }
+
+    /// Proves that these sessions are its own, as the daemon that it claims to be.
+    pub(crate) fn prove(&self, met: &mut Met, daemon: DaemonId, sessions: &[&SessionKey]) {
+        let mut binding = [0; 32];
+        met.connection.export_keying_material(&mut binding, EXPORTER, b"").unwrap();
+        let proofs = sessions.iter().map(|key| key.prove(&binding, daemon).unwrap()).collect();
+        self.say(met, &Message::Owners(Owners { proofs }));
     }
 
     /// Says something; whether it arrives is for what comes next to tell.

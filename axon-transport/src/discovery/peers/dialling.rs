@@ -47,6 +47,7 @@ impl Peers {
         }
     }
 
+    #[cfg(test)]
     pub(super) fn in_flight(&self) -> usize {
         self.records.values().map(|record| record.in_flight().count()).sum()
     }

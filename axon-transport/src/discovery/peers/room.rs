@@ -26,15 +26,11 @@ impl Peers {
         let of_heard = |record: &Record| record.standing() == Standing::Heard;
         let (all, heard) = (unlinked().count(), unlinked().filter(|r| of_heard(r)).count());
         let full = all >= MOST_UNAUTHENTICATED;
-        let heard_goes = if full && heard > LEAST_HEARD {
-            true
-        } else if heard >= MOST_HEARD && !self.knows(from) {
-            true
-        } else if full {
-            false
-        } else {
+        let crowded = heard >= MOST_HEARD && !self.knows(from);
+        if !full && !crowded {
             return;
-        };
+        }
+        let heard_goes = crowded || heard > LEAST_HEARD;
         let mut of_host: BTreeMap<Option<IpAddr>, usize> = BTreeMap::new();
         for record in self.records.values() {
             *of_host.entry(record.from).or_default() += 1;

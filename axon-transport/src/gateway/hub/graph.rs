@@ -126,6 +126,7 @@ impl Hub {
                 peer.remote.forget(&ours);
             }
         }
+        self.freed |= !removed.is_empty();
         let dead = self.taken_over(daemon, &added);
         // Before the dead links let go of their stand-ins: rings and readers stay as they are.
         if let Some(peer) = self.peers.get_mut(&daemon) {
@@ -163,6 +164,7 @@ impl Hub {
                     "a peer announces endpoints of another peer; they stay where they were");
                 if let Some(claimer) = self.peers.get_mut(&daemon) {
                     claimer.remote.forget(&moved);
+                    claimer.displaced = true;
                 }
                 continue;
             }
@@ -171,12 +173,14 @@ impl Hub {
         dead
     }
 
-    /// Asks peers for their graph of which something was left out for want of room that there is now, and
-    /// sends them this host's that they asked for.
+    /// Asks peers for their graph of which something was left out and need not be any more, and sends them
+    /// this host's that they asked for.
     pub(super) fn resync(&mut self) {
+        let freed = std::mem::take(&mut self.freed);
         for peer in self.peers.values_mut() {
             peer.resync_if_due(&self.local);
-            if peer.remote.has_room_again() {
+            let displaced = freed && std::mem::take(&mut peer.displaced);
+            if displaced || peer.remote.has_room_again() {
                 let version = peer.remote.version();
                 peer.say(Message::GraphResync(GraphResync { version }));
             }

@@ -21,7 +21,7 @@ use crate::{
         establish::{Established, Sealing, close, peer_text},
         inbound::Inbound,
         outbound::{Carrier, Owner},
-        peer::{Peer, spawn_reader},
+        peer::{Peer, Prover, spawn_reader},
         refusal::{Refusal, RefusedBy},
         seal::Protection,
         silence::{Traffic, Watch},
@@ -245,15 +245,17 @@ impl Hub {
         let new = match self.peers.get_mut(&daemon) {
             Some(peer) => {
                 let old = peer.link;
-                peer.succeed(number, outbox, carrier.clone());
+                peer.succeed(number, outbox, carrier.clone(), &self.local);
                 self.hand_over(old);
                 false
             }
             None => {
                 let identity = link.established.who.host_identity(connection.remote_address());
                 let owner = Owner { daemon, identity, events: self.events.clone() };
+                let (ours, proofs) = (self.context.hello.daemon, self.context.authenticates());
+                let prover = Prover::new(&self.shared.keys, ours, proofs, &connection);
                 let (carrier, shared) = (carrier.clone(), &self.shared);
-                let peer = Peer::new(daemon, number, outbox, carrier, account, shared, owner);
+                let peer = Peer::new(number, outbox, carrier, account, prover, shared, owner);
                 self.peers.insert(daemon, peer);
                 true
             }
@@ -381,6 +383,7 @@ impl Hub {
         if self.peers.remove(&daemon).is_some() {
             give_memory_back();
         }
+        self.freed = true;
         self.abandon_leaving(daemon);
         self.tell_draining().await;
         tracing::info!(peer = %daemon, reason, "link down");

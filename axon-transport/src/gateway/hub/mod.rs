@@ -30,7 +30,7 @@ use super::{
     endpoint::Endpoints,
     establish::{Established, Sealing, close, peer_text},
     outbound::Carrier,
-    peer::{GraphTaken, Peer},
+    peer::{GraphTaken, Peer, binding},
     pulse::Pulse,
     refusal::{Refusal, RefusedBy},
     room::Room,
@@ -45,6 +45,7 @@ use crate::{
     graph::{Endpoint, Reach},
     ids::{DaemonId, Gid},
     link::{Candidate, CloseCode, Elected, GraphResync, Hello, Message},
+    owner::SessionKeys,
     session::Session,
 };
 
@@ -63,6 +64,8 @@ pub(super) struct Shared {
     pub(super) domain: u32,
     /// Largest payload.
     pub(super) max_message: u64,
+    /// The keys of the sessions here, which prove that they are this daemon's.
+    pub(super) keys: Arc<SessionKeys>,
     /// What peers may have this daemon hold.
     pub(super) accounts: Accounts,
     /// What may wait to be sent reliably.
@@ -183,6 +186,8 @@ pub(super) struct Hub {
     local: Local,
     /// Whether publishers ended of which something is on its way, as the control plane was told.
     draining: bool,
+    /// A peer went, or an endpoint of one, since peers that lost endpoints to another were asked again.
+    freed: bool,
 }
 
 impl Hub {
@@ -207,6 +212,7 @@ impl Hub {
             peers: HashMap::new(),
             local: BTreeMap::new(),
             draining: false,
+            freed: false,
         }
     }
 
@@ -380,6 +386,13 @@ impl Hub {
             Message::Unsubscribe(unsubscribe) => {
                 peer.unserve(unsubscribe.route);
                 peer.update_services(&self.local, &self.shared);
+                Ok(())
+            }
+            Message::Owners(owners) => {
+                let link = self.links.get(&number);
+                if let Some(binding) = link.and_then(|link| binding(&link.connection)) {
+                    peer.remote.prove(&owners.proofs, &binding, daemon);
+                }
                 Ok(())
             }
             Message::Asserted(asserted) => {

@@ -5,12 +5,14 @@ use std::{
     sync::Arc,
 };
 
+use super::owners::Proven;
 use crate::{
     config::DiscoveryRange,
     gateway::account::{Account, Charge},
     graph::{Endpoint, EndpointKind, LIMITS, RemoteEndpoint, Toward},
-    ids::Gid,
+    ids::{DaemonId, Gid},
     link::Graph,
+    owner::{Binding, Prefix, Proof, prefix_of},
 };
 
 /// What changed in a peer's graph.
@@ -55,6 +57,7 @@ struct Refused {
 #[derive(Debug)]
 pub(in crate::gateway) struct Remote {
     account: Arc<Account>,
+    proven: Proven,
     all: BTreeMap<Gid, Held>,
     version: u64,
     /// What came of a whole graph so far.
@@ -69,9 +72,11 @@ pub(in crate::gateway) struct Remote {
 }
 
 impl Remote {
-    pub(in crate::gateway) fn new(account: Arc<Account>) -> Self {
+    /// That of a peer which must prove its sessions, if `proofs`.
+    pub(in crate::gateway) fn new(account: Arc<Account>, proofs: bool) -> Self {
         Self {
             account,
+            proven: Proven::new(proofs),
             all: BTreeMap::new(),
             version: 0,
             gathered: None,
@@ -118,6 +123,7 @@ impl Remote {
             let came = self.all.iter().filter(|(gid, held)| !same(held, old.get(gid)));
             self.changed.extend(came.map(|(gid, _)| *gid));
             self.changed.extend(old.keys().filter(|gid| !self.all.contains_key(gid)));
+            self.proven.settle();
             return GraphTaken::Changed { whole: true };
         }
         for gid in removed {
@@ -127,6 +133,10 @@ impl Remote {
         }
         for endpoint in added {
             let gid = endpoint.gid;
+            if !self.proven.owns(&gid) {
+                self.disown(&gid, || named(&endpoint));
+                continue;
+            }
             // What it replaces makes room for it.
             let before = self.all.remove(&gid);
             let known = before.is_some();
@@ -137,6 +147,7 @@ impl Remote {
             }
             self.all.extend(held.map(|held| (gid, held)));
         }
+        self.proven.settle();
         GraphTaken::Changed { whole: false }
     }
 
@@ -148,9 +159,51 @@ impl Remote {
                 let remote = RemoteEndpoint { toward, ..known.remote.clone() };
                 Some(Held { remote, ..known.clone() })
             }
-            _ => self.hold(endpoint, toward, gathered.len()),
+            _ if self.proven.owns(&gid) => self.hold(endpoint, toward, gathered.len()),
+            _ => {
+                self.disown(&gid, || named(&endpoint));
+                None
+            }
         };
         gathered.extend(held.map(|held| (gid, held)));
+    }
+
+    /// Takes what the peer's daemon proves on the connection that `binding` is of.
+    pub(in crate::gateway) fn prove(
+        &mut self,
+        proofs: &[Proof],
+        binding: &Binding,
+        from: DaemonId,
+    ) {
+        let all = &self.all;
+        let used = |session: &Prefix| {
+            let mut first = [0; 16];
+            first[..session.len()].copy_from_slice(session);
+            let next = all.range(Gid(first)..).next();
+            next.is_some_and(|(gid, _)| prefix_of(gid) == *session)
+        };
+        self.proven.take(proofs, binding, from, used);
+    }
+
+    /// Whether the peer may speak for an endpoint of this GID.
+    pub(in crate::gateway) fn owns(&self, gid: &Gid) -> bool {
+        self.proven.owns(gid)
+    }
+
+    /// A reader that the peer names in SUBSCRIBE is left out.
+    pub(in crate::gateway) fn disown_reader(&mut self, gid: &Gid, topic: &str) {
+        self.disown(gid, || format!("the reader of {}", short(topic)));
+    }
+
+    fn disown(&mut self, gid: &Gid, named: impl FnOnce() -> String) {
+        self.left_out += 1;
+        self.refused.get_or_insert_with(|| {
+            let text = format!(
+                "{} is left out: the peer did not prove that its GID {gid} is of a session of its own",
+                named()
+            );
+            Refused { text, bytes: None }
+        });
     }
 
     fn hold(&mut self, endpoint: Endpoint, toward: Toward, beside: usize) -> Option<Held> {
@@ -243,9 +296,12 @@ impl Remote {
     }
 }
 
+fn short(name: &str) -> String {
+    format!("{:?}", name.chars().take(100).collect::<String>())
+}
+
 /// An endpoint for log and status, with whatever names a peer gave it.
 fn named(endpoint: &Endpoint) -> String {
-    let short = |name: &str| format!("{:?}", name.chars().take(100).collect::<String>());
     let what = match endpoint.kind {
         EndpointKind::Publisher => "the publisher of",
         EndpointKind::Subscription => "the subscription to",
@@ -259,7 +315,7 @@ fn named(endpoint: &Endpoint) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{gateway::account::Accounts, qos::Qos};
+    use crate::{gateway::account::Accounts, owner::SessionKey, qos::Qos};
 
     fn endpoint(number: u8, name: &str) -> Endpoint {
         Endpoint {
@@ -298,7 +354,7 @@ mod tests {
     fn what_there_is_no_room_for_is_left_out_by_name_and_the_rest_counts() {
         let account = Accounts::new(2 * one()).of("a");
         let (mut remote, mut other) =
-            (Remote::new(Arc::clone(&account)), Remote::new(Arc::clone(&account)));
+            (Remote::new(Arc::clone(&account), false), Remote::new(Arc::clone(&account), false));
         assert_eq!(
             remote.take(graph(0, vec![endpoint(1, "/t")], vec![], false)),
             GraphTaken::Changed { whole: true }
@@ -321,7 +377,7 @@ mod tests {
     #[test]
     fn a_whole_graph_that_is_said_again_takes_no_more_and_changes_nothing() {
         let account = Accounts::new(3 * one()).of("a");
-        let mut remote = Remote::new(Arc::clone(&account));
+        let mut remote = Remote::new(Arc::clone(&account), false);
         let all = || (1..=3).map(|n| endpoint(n, "/t")).collect::<Vec<_>>();
         remote.take(graph(0, all(), vec![], false));
         assert_eq!(changes(&mut remote), (vec![1, 2, 3], vec![]));
@@ -339,7 +395,7 @@ mod tests {
 
     #[test]
     fn the_newest_state_of_an_endpoint_counts_once() {
-        let mut remote = Remote::new(Accounts::new(1 << 20).of("a"));
+        let mut remote = Remote::new(Accounts::new(1 << 20).of("a"), false);
         remote.take(graph(0, vec![endpoint(1, "/t")], vec![], false));
         changes(&mut remote);
         for before in (1..100).step_by(2) {
@@ -354,5 +410,25 @@ mod tests {
         assert_eq!(remote.get(&Gid([1; 16])).unwrap().topic, "/u");
         assert_eq!(changes(&mut remote), (vec![1, 2], vec![]));
         assert_eq!(remote.take(graph(7, vec![], vec![], false)), GraphTaken::Gap);
+    }
+
+    #[test]
+    fn an_endpoint_of_a_session_that_is_not_proven_is_left_out_and_one_that_is_counts() {
+        let (own, others) = (SessionKey::generate().unwrap(), SessionKey::generate().unwrap());
+        let (binding, here) = ([7; 32], DaemonId([1; 16]));
+        let mut remote = Remote::new(Accounts::new(1 << 20).of("a"), true);
+        remote.prove(&[own.prove(&binding, here).unwrap()], &binding, here);
+        // The proof of another host, for another connection.
+        remote.prove(&[others.prove(&[8; 32], here).unwrap()], &binding, here);
+        let of =
+            |key: &SessionKey, topic| Endpoint { gid: Gid::new(key.id(), 1), ..endpoint(0, topic) };
+        for before in [0, 1] {
+            let added = vec![of(&others, "/squatted"), of(&own, "/t")];
+            remote.take(graph(before, added, vec![], false));
+            assert_eq!((remote.len(), remote.left_out()), (1, before + 1));
+            assert!(remote.owns(&Gid::new(own.id(), 9)) && !remote.owns(&Gid::new(others.id(), 1)));
+        }
+        assert!(remote.refused().unwrap().contains("\"/squatted\""));
+        assert!(!remote.has_room_again());
     }
 }

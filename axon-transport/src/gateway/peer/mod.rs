@@ -3,6 +3,7 @@
 mod alive;
 mod asking;
 mod graph;
+mod owners;
 mod refused;
 mod serving;
 
@@ -14,8 +15,11 @@ use std::{
 
 use tokio::sync::{mpsc, watch};
 
-pub(super) use self::graph::{GraphChange, GraphTaken};
 use self::{asking::Asked, graph::Remote, refused::RefusedRoutes, serving::Served};
+pub(super) use self::{
+    graph::{GraphChange, GraphTaken},
+    owners::{Prover, binding},
+};
 use super::{
     account::Account,
     control::Outbox,
@@ -56,6 +60,10 @@ pub(super) struct Peer {
     /// What was carried and dropped.
     pub(super) counters: Arc<Counters>,
     pub(super) remote: Remote,
+    /// Proves to it which sessions are this daemon's.
+    prover: Prover,
+    /// Endpoints of its were left out because another peer announced them first, where nothing is proved.
+    pub(super) displaced: bool,
     sent: BTreeMap<Gid, RemoteEndpoint>,
     sent_version: u64,
     /// When the peer was sent the whole graph last that it asked for, and whether it asked again.
@@ -92,11 +100,11 @@ pub(super) struct Peer {
 impl Peer {
     /// A peer whose first link was elected.
     pub(super) fn new(
-        daemon: DaemonId,
         link: u64,
         outbox: Outbox,
         carrier: Carrier,
         account: Arc<Account>,
+        prover: Prover,
         shared: &Arc<Shared>,
         owner: Owner,
     ) -> Self {
@@ -104,7 +112,8 @@ impl Peer {
         let intake = Arc::clone(&account.intake);
         let (orders, receiver) = mpsc::unbounded_channel();
         let (queues, pulse) = (shared.queues.of_peer(), shared.pulse.clone());
-        let (owner_identity, stalled_after) = (owner.identity.clone(), shared.stalled_after);
+        let (daemon, stalled_after) = (owner.daemon, shared.stalled_after);
+        let owner_identity = owner.identity.clone();
         let sent = Arc::clone(&counters);
         tokio::spawn(outbound::run(carrier, receiver, sent, queues, pulse, owner, stalled_after));
         let receipts = Receipts::new(outbox.clone());
@@ -114,7 +123,9 @@ impl Peer {
             link,
             outbox,
             counters,
-            remote: Remote::new(account),
+            remote: Remote::new(account, prover.is_needed()),
+            prover,
+            displaced: false,
             sent: BTreeMap::new(),
             sent_version: 0,
             resynced: None,
@@ -139,10 +150,14 @@ impl Peer {
 
     /// A successor link takes over: samples go over it from now on, and both sides repeat what they
     /// said last, since it may have been lost with the old one.
-    pub(super) fn succeed(&mut self, link: u64, outbox: Outbox, carrier: Carrier) {
+    pub(super) fn succeed(&mut self, link: u64, outbox: Outbox, carrier: Carrier, local: &Local) {
         self.link = link;
         self.receipts.succeed(outbox.clone());
         self.outbox = outbox;
+        self.prover.succeed(&carrier.connection);
+        // SUBSCRIBE names sessions as GRAPH does.
+        let visible = self.visible(local);
+        self.prove(&visible);
         let _ = self.orders.send(outbound::Order::Connection(carrier));
         for (key, asked) in &self.asked {
             self.say(asked.message(key));
@@ -234,13 +249,27 @@ impl Peer {
         let _ = self.orders.send(outbound::Order::Received(received.flows));
     }
 
+    /// What the peer sees: what it is shown, and publishers that ended and are kept in its sight.
+    fn visible(&self, local: &Local) -> BTreeMap<Gid, RemoteEndpoint> {
+        let mut visible = self.ending.clone();
+        visible.extend(self.shown(local));
+        visible
+    }
+
+    /// Proves to the peer that the sessions of these endpoints are this daemon's, where it was not told.
+    fn prove(&mut self, visible: &BTreeMap<Gid, RemoteEndpoint>) {
+        for proofs in self.prover.owed(visible.keys()) {
+            self.say(proofs);
+        }
+    }
+
     /// Sends what changed since the last time, or all of it.
     pub(super) fn send_graph(&mut self, local: &Local, whole: bool) {
         if whole {
             self.sent.clear();
         }
-        let mut now = self.ending.clone();
-        now.extend(self.shown(local));
+        let now = self.visible(local);
+        self.prove(&now);
         let added: Vec<_> =
             now.iter().filter(|(gid, e)| self.sent.get(gid) != Some(e)).map(|(_, e)| e).collect();
         let removed: Vec<_> =
@@ -282,6 +311,7 @@ impl Peer {
         self.resync_due = self.resynced.is_some_and(recent);
         if !self.resync_due {
             self.resynced = Some(now);
+            self.prover.forget();
             self.send_graph(local, true);
         }
     }

@@ -68,7 +68,8 @@ impl Peer {
         shared: &Arc<Shared>,
     ) -> Result<(), String> {
         let bytes = ROUTE + COPIES * subscribe.bytes();
-        let Subscribe { route: number, topic, type_name, kind, subscribers, last, .. } = subscribe;
+        let Subscribe { route: number, topic, type_name, kind, last, .. } = subscribe;
+        let subscribers = self.proven_only(subscribe.subscribers, &topic);
         let hash = TopicHash::new(shared.domain, &topic, &type_name).map_err(|e| e.to_string())?;
         let kind = match kind {
             0 => Kind::Topic,
@@ -130,6 +131,18 @@ impl Peer {
             Served { key, route, subscribers, sources, _charge: charge, repeated, _announcing };
         self.served.insert(number, served);
         Ok(())
+    }
+
+    /// Those whose sessions the peer proved to have; the others are left out by name.
+    fn proven_only(&mut self, mut subscribers: Vec<Subscriber>, topic: &str) -> Vec<Subscriber> {
+        let others = subscribers.extract_if(.., |reader| !self.remote.owns(&reader.gid));
+        let others: Vec<_> = others.map(|reader| reader.gid).collect();
+        for gid in others {
+            self.remote.disown_reader(&gid, topic);
+            // It is said with the next change of the graph.
+            self.stirred = true;
+        }
+        subscribers
     }
 
     /// The peer does not read a route: it ends. What is to be said of it.

@@ -5,6 +5,7 @@ use rustix::net::accept_with;
 use super::*;
 use crate::{
     config::{Config, OsFiles},
+    owner::OWNER,
     session::{address::Address, tests::played::Taker},
     shm::{PublishError, probe::probe},
 };
@@ -33,8 +34,14 @@ impl Stage {
         assert_eq!(poll(&mut fds, Some(&EVER.try_into().unwrap())), Ok(1), "nobody comes");
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
         let socket = accept_with(&self.listener, flags).unwrap();
-        let Received { message: Message::Hello(hello), descriptors } = hear(&socket) else {
-            panic!("something else before HELLO")
+        let (hello, descriptors) = loop {
+            match hear(&socket) {
+                Received { message: Message::Hello(hello), descriptors } => {
+                    break (hello, descriptors);
+                }
+                Received { message: Message::Unknown(OWNER), .. } => {}
+                other => panic!("before HELLO: {:?}", other.message),
+            }
         };
         let [segment, doorbell, pidfd] = <[_; 3]>::try_from(descriptors).expect("three");
         let handed = PeerDescriptors { segment, doorbell, pidfd };

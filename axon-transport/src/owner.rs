@@ -1,0 +1,211 @@
+//! To which daemon a session belongs. Each session makes a key pair. Its id, with which its GIDs begin,
+//! is a hash of the public key. The session hands the secret key to its daemon, and the daemon proves to
+//! each peer, for the one connection between them, that it has the key. A host that saw a GID of another
+//! host cannot announce that GID as its own.
+
+use std::{
+    collections::HashMap,
+    fmt,
+    sync::{Arc, Mutex, PoisonError},
+};
+
+use aws_lc_rs::{
+    digest::{SHA256, digest},
+    signature::{ED25519, Ed25519KeyPair, KeyPair, UnparsedPublicKey},
+};
+use minicbor::{Decode, Encode};
+use rand::{TryRng, rngs::SysRng};
+use zeroize::Zeroizing;
+
+use crate::{
+    ids::{DaemonId, Gid, SessionId},
+    secrets::LockedKey,
+};
+
+/// The type of the packet in which a session hands its key to its daemon, before HELLO.
+pub const OWNER: u8 = 32;
+/// What stands in front of the key there: the type, and a map of one entry, a string of 32 bytes.
+const PACKET: [u8; 5] = [OWNER, 0xa1, 0x00, 0x58, 0x20];
+const SIGNED: &[u8] = b"axon session owner 1";
+/// The label of the TLS exporter of [`Binding`].
+pub const EXPORTER: &[u8] = b"EXPORTER-axon-session-owner";
+
+/// 32 bytes that both ends of one connection know and no other connection has.
+pub type Binding = [u8; 32];
+/// What the GIDs of one session begin with.
+pub type Prefix = [u8; 12];
+
+/// The key of a session, in locked memory. It is erased when it is dropped.
+pub struct SessionKey {
+    seed: LockedKey,
+    public: [u8; 32],
+}
+
+impl fmt::Debug for SessionKey {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("SessionKey").field(&self.id()).finish()
+    }
+}
+
+impl SessionKey {
+    /// A fresh one; `None` where the system gives no random bytes or no memory.
+    pub fn generate() -> Option<Self> {
+        let mut seed = Zeroizing::new([0; 32]);
+        SysRng.try_fill_bytes(&mut seed[..]).ok()?;
+        Self::new(&seed)
+    }
+
+    fn new(seed: &[u8; 32]) -> Option<Self> {
+        let mut key = Self { seed: LockedKey::copy_of(seed).ok()?, public: [0; 32] };
+        key.public = key.pair()?.public_key().as_ref().try_into().ok()?;
+        Some(key)
+    }
+
+    /// The library erases its copy when it frees it, so that it is made for each use.
+    fn pair(&self) -> Option<Ed25519KeyPair> {
+        Ed25519KeyPair::from_seed_unchecked(self.seed.as_ref()).ok()
+    }
+
+    /// The id of its session.
+    pub fn id(&self) -> SessionId {
+        id_of(&self.public)
+    }
+
+    /// The packet that hands it to the daemon.
+    pub(crate) fn packet(&self) -> Zeroizing<Vec<u8>> {
+        let seed = self.seed.as_ref();
+        let mut packet = Zeroizing::new(Vec::with_capacity(PACKET.len() + seed.len()));
+        packet.extend_from_slice(&PACKET);
+        packet.extend_from_slice(seed);
+        packet
+    }
+
+    /// The key that a packet hands over; bytes after it do not count, as the buffer is larger.
+    pub(crate) fn from_packet(packet: &[u8]) -> Option<Self> {
+        Self::new(packet.strip_prefix(&PACKET)?.first_chunk::<32>()?)
+    }
+
+    /// Proves, on the connection that `binding` is of, that the daemon `from` has this session.
+    /// `None` where there is no memory for it, or in a forked process, which has no keys.
+    pub fn prove(&self, binding: &Binding, from: DaemonId) -> Option<Proof> {
+        let pair = self.pair()?;
+        if pair.public_key().as_ref() != self.public {
+            return None;
+        }
+        let signature = pair.sign(&signed(binding, from, &self.id()));
+        Some(Proof { key: self.public, signature: signature.as_ref().try_into().ok()? })
+    }
+}
+
+fn id_of(public: &[u8]) -> SessionId {
+    let hash = digest(&SHA256, &[&b"axon session id 1"[..], public].concat());
+    let mut id = [0; 16];
+    id.copy_from_slice(&hash.as_ref()[..16]);
+    SessionId(id)
+}
+
+fn signed(binding: &Binding, from: DaemonId, id: &SessionId) -> Vec<u8> {
+    [SIGNED, binding, &from.0, &id.0].concat()
+}
+
+/// The GIDs of a session begin with this.
+pub fn prefix(id: &SessionId) -> Prefix {
+    prefix_of(&Gid(id.0))
+}
+
+/// What a GID begins with.
+pub fn prefix_of(gid: &Gid) -> Prefix {
+    let mut prefix = [0; 12];
+    prefix.copy_from_slice(&gid.0[..12]);
+    prefix
+}
+
+/// A daemon's proof, for one connection, that a session is its own.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Proof {
+    /// The session's public key (Ed25519).
+    #[cbor(n(0), with = "minicbor::bytes")]
+    pub key: [u8; 32],
+    /// What is signed: `axon session owner 1`, the binding, the daemon's id, the session's id.
+    #[cbor(n(1), with = "minicbor::bytes")]
+    pub signature: [u8; 64],
+}
+
+impl Proof {
+    /// The session that it is for. Nothing is checked.
+    pub fn claims(&self) -> SessionId {
+        id_of(&self.key)
+    }
+
+    /// The session that the daemon `from` proves to have on the connection that `binding` is of; `None`
+    /// when the signature is not right.
+    pub fn session(&self, binding: &Binding, from: DaemonId) -> Option<SessionId> {
+        let id = self.claims();
+        let key = UnparsedPublicKey::new(&ED25519, &self.key);
+        key.verify(&signed(binding, from, &id), &self.signature).ok().map(|()| id)
+    }
+}
+
+/// The keys of the sessions of a daemon: the control plane puts them there, the gateway proves with
+/// them.
+#[derive(Debug, Default)]
+pub struct SessionKeys(Mutex<HashMap<Prefix, Arc<SessionKey>>>);
+
+impl SessionKeys {
+    pub(crate) fn insert(&self, key: Arc<SessionKey>) {
+        self.lock().insert(prefix(&key.id()), key);
+    }
+
+    pub(crate) fn remove(&self, id: &SessionId) {
+        self.lock().remove(&prefix(id));
+    }
+
+    pub(crate) fn get(&self, prefix: &Prefix) -> Option<Arc<SessionKey>> {
+        self.lock().get(prefix).cloned()
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, HashMap<Prefix, Arc<SessionKey>>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_proof_is_of_one_session_one_daemon_and_one_connection() {
+        let (key, other) = (SessionKey::generate().unwrap(), SessionKey::generate().unwrap());
+        let [one, two] = [1, 2].map(|byte| DaemonId([byte; 16]));
+        let proof = key.prove(&[7; 32], one).unwrap();
+        assert_eq!(proof.session(&[7; 32], one), Some(key.id()));
+        assert_eq!(proof.session(&[8; 32], one), None, "said on another connection");
+        assert_eq!(proof.session(&[7; 32], two), None, "said by another daemon");
+        let stolen = Proof { key: other.public, ..proof.clone() };
+        assert_eq!(stolen.session(&[7; 32], one), None, "for another session");
+        let mut torn = proof;
+        torn.signature[3] ^= 1;
+        assert_eq!(torn.session(&[7; 32], one), None);
+        assert_ne!(prefix(&key.id()), prefix(&other.id()));
+    }
+
+    #[test]
+    fn a_key_is_handed_over_whole_or_not_at_all() {
+        let key = SessionKey::generate().unwrap();
+        let packet = key.packet();
+        assert_eq!(SessionKey::from_packet(&packet).unwrap().id(), key.id());
+        for length in 0..packet.len() {
+            assert!(SessionKey::from_packet(&packet[..length]).is_none());
+        }
+        let in_buffer = [&packet[..], &[0; 9]].concat();
+        assert_eq!(SessionKey::from_packet(&in_buffer).unwrap().id(), key.id());
+        assert!(!format!("{key:?}").contains(&format!("{:?}", &key.seed.as_ref()[..4])));
+        let keys = SessionKeys::default();
+        keys.insert(Arc::new(key));
+        let id = SessionKey::from_packet(&packet).unwrap().id();
+        assert!(keys.get(&prefix(&id)).is_some());
+        keys.remove(&id);
+        assert!(keys.get(&prefix(&id)).is_none());
+    }
+}
