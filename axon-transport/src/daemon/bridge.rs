@@ -4,7 +4,12 @@
 //! one session socket, and the table of the sessions' keys. Neither waits for the other: the control
 //! plane drops an order that does not fit, and a gateway that fails is started again.
 
-use std::{net::SocketAddr, os::fd::OwnedFd, sync::Arc};
+use std::{
+    collections::BTreeSet,
+    net::{IpAddr, SocketAddr},
+    os::fd::OwnedFd,
+    sync::Arc,
+};
 
 use tokio::sync::mpsc;
 
@@ -134,6 +139,8 @@ pub enum ToGateway {
         /// What.
         bytes: Vec<u8>,
     },
+    /// These addresses are those of listed peers from now on.
+    Listed(BTreeSet<IpAddr>),
     /// Say goodbye to every peer and return.
     Shutdown,
 }

@@ -1,7 +1,7 @@
 //! The control plane's dealings with other hosts: discovery says whom to dial, the gateway dials,
 //! and the registry learns what they have.
 
-use std::{cell::RefCell, collections::BTreeSet, rc::Rc, sync::Arc};
+use std::{cell::RefCell, collections::BTreeSet, net::IpAddr, rc::Rc, sync::Arc};
 
 use tokio::{
     sync::mpsc,
@@ -29,6 +29,8 @@ pub(super) struct Remote {
     pause: Pause,
     discovery: Option<Discovery>,
     linked: BTreeSet<DaemonId>,
+    /// Addresses of listed peers, as the gateway was told.
+    listed: BTreeSet<IpAddr>,
 }
 
 struct Discovery {
@@ -46,8 +48,14 @@ impl Remote {
         control: &Rc<RefCell<Control>>,
         entry: Option<GatewayEntry>,
     ) -> Result<Self, String> {
-        let (pause, linked) = (Pause::new(), BTreeSet::new());
-        let mut remote = Self { entry, running: None, pause, discovery: None, linked };
+        let mut remote = Self {
+            entry,
+            running: None,
+            pause: Pause::new(),
+            discovery: None,
+            linked: BTreeSet::new(),
+            listed: BTreeSet::new(),
+        };
         let Some(entry) = entry else { return Ok(remote) };
         let mut running = Running::start(control, entry).map_err(|e| e.to_string())?;
         running.stands(control).await?;
@@ -96,7 +104,10 @@ impl Remote {
 
     fn event(&mut self, control: &Rc<RefCell<Control>>, event: ToControl) {
         match &event {
-            ToControl::Started { port } => self.tell(Event::QuicPort(*port)),
+            ToControl::Started { port } => {
+                self.order(ToGateway::Listed(self.listed.clone()));
+                self.tell(Event::QuicPort(*port));
+            }
             ToControl::LinkUp { daemon, address } => {
                 self.linked.insert(*daemon);
                 self.tell(Event::LinkUp { daemon: *daemon, address: *address });
@@ -134,7 +145,11 @@ impl Remote {
                     format!("{what} is {} here and {} there", mismatch.ours, mismatch.theirs);
                 control.borrow_mut().refused(peer, what, reason);
             }
-            Action::Named(names) => control.borrow_mut().named(names),
+            Action::Named(names) => {
+                self.listed = names.values().flatten().copied().collect();
+                self.order(ToGateway::Listed(self.listed.clone()));
+                control.borrow_mut().named(names);
+            }
             Action::Gone { daemon } => tracing::debug!(%daemon, "a peer is gone"),
         }
     }
@@ -208,6 +223,11 @@ impl Discovery {
     }
 
     fn tell(&self, event: Event) {
+        // Anybody can send datagrams: they leave room for what the gateway says of links.
+        let crowded = self.events.capacity() < CHANNEL / 4;
+        if matches!(event, Event::Datagram { .. }) && crowded {
+            return;
+        }
         if self.events.try_send(event).is_err() {
             tracing::debug!("discovery is busy; an event was dropped");
         }

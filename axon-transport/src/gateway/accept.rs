@@ -1,7 +1,11 @@
 //! Answering dials: Retry for every unvalidated address, then the handshake, then
 //! [`establish`](super::establish).
 
-use std::{net::SocketAddr, sync::Arc, time::Duration};
+use std::{
+    net::SocketAddr,
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use quinn::{ConnectionError, Endpoint, Incoming};
 use tokio::sync::mpsc;
@@ -10,15 +14,16 @@ use super::{
     context::Context,
     establish::{Established, establish},
     refusal::Refusal,
+    shares::{Handshakes, Said},
 };
 use crate::{
     keys::{Lookup, Resolver},
-    link::Side,
+    link::{CloseCode, Side},
 };
 
 const DECRYPT_ERROR: u8 = 51;
-/// Handshakes under way at once; further dials are refused and come again.
-const MAX_HANDSHAKES: usize = 64;
+/// Handshakes under way at once, but for those of listed peers; further dials are refused and come again.
+pub(super) const MAX_HANDSHAKES: usize = 64;
 /// A dialler that has its Retry is given this long for the rest of the handshake.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
 
@@ -40,9 +45,10 @@ pub(super) enum Incomer {
 pub(super) async fn accept(
     context: Arc<Context>,
     endpoint: Endpoint,
+    handshakes: Arc<Handshakes>,
     incomers: mpsc::Sender<Incomer>,
 ) {
-    let limit = Arc::new(tokio::sync::Semaphore::new(MAX_HANDSHAKES));
+    let mut crowded = Said::default();
     while let Some(incoming) = endpoint.accept().await {
         if !incoming.remote_address_validated() {
             // Before any key work. A fresh Incoming may always be answered with a Retry.
@@ -53,14 +59,22 @@ pub(super) async fn accept(
             }
             continue;
         }
-        let Ok(permit) = Arc::clone(&limit).try_acquire_owned() else {
+        let source = incoming.remote_address();
+        let Some(place) = handshakes.enter(source.ip(), context.is_listed(source.ip())) else {
             incoming.refuse();
+            if crowded.is_news(source.ip(), Instant::now()) {
+                let text = "hosts at this address have as many handshakes under way as they may";
+                let refusal = Refusal::here(CloseCode::NotAllowed, text);
+                let peer = super::establish::peer_text(None, source);
+                // Where that finds no room, it is not said.
+                let _ = incomers.try_send(Incomer::Refused { peer, refusal });
+            }
             continue;
         };
         let (context, incomers) = (Arc::clone(&context), incomers.clone());
         tokio::spawn(async move {
             let incomer = answer(&context, incoming).await;
-            drop(permit);
+            drop(place);
             if let Some(incomer) = incomer {
                 let _ = incomers.send(incomer).await;
             }
@@ -81,7 +95,7 @@ async fn answer(context: &Arc<Context>, incoming: Incoming) -> Option<Incomer> {
         Ok(server) => server,
         Err(error) => {
             incoming.refuse();
-            return refused(Refusal::here(crate::link::CloseCode::Internal, error), None);
+            return refused(Refusal::here(CloseCode::Internal, error), None);
         }
     };
     // A hello that comes in one packet is answered, or refused, right here.

@@ -19,15 +19,17 @@ use super::{
     frames::Frames,
     inbound::stream_header,
     keyring::Keyring,
+    peer::binding,
     queue::Sample,
     seal::{Protection, sample},
 };
 use crate::{
     config::{Config, Security},
     graph::{Endpoint, EndpointKind},
-    ids::{DaemonId, Gid, SessionId},
+    ids::{DaemonId, Gid},
     keys,
-    link::{CloseCode, Elected, Graph, Message, Side, Subscribe},
+    link::{CloseCode, Elected, Graph, Message, Owners, Side, Subscribe},
+    owner::SessionKey,
     qos::Qos,
     session::MessageInfo,
 };
@@ -187,8 +189,10 @@ impl Link {
         tamper: Tamper,
     ) -> Result<(), Refusal> {
         let internal = |e: &dyn std::fmt::Display| Refusal::here(CloseCode::Internal, e);
-        let publisher = Gid::new(SessionId::random(), 1);
-        self.announce(publisher, topic, type_name);
+        let session =
+            SessionKey::generate().ok_or_else(|| internal(&"no key for a session can be made"))?;
+        let publisher = Gid::new(session.id(), 1);
+        self.announce(&session, publisher, topic, type_name)?;
         let (subscribe, frame) = tokio::time::timeout(ROUTE_TIMEOUT, async {
             let subscribe = self.subscription(topic).await?;
             let frame = self.seal(publisher, topic, type_name).await?;
@@ -218,7 +222,15 @@ impl Link {
         }
     }
 
-    fn announce(&self, publisher: Gid, topic: &str, type_name: &str) {
+    /// Announces a publisher of a session that this side proves to be its own.
+    fn announce(
+        &self,
+        session: &SessionKey,
+        publisher: Gid,
+        topic: &str,
+        type_name: &str,
+    ) -> Result<(), Refusal> {
+        let internal = |e: &dyn std::fmt::Display| Refusal::here(CloseCode::Internal, e);
         let endpoint = Endpoint {
             gid: publisher,
             kind: EndpointKind::Publisher,
@@ -231,10 +243,16 @@ impl Link {
             enclave: String::new(),
         };
         let graph = Graph { version: 1, before: 0, added: vec![endpoint], ..Graph::default() };
+        let binding = binding(&self.established.connection)
+            .ok_or_else(|| internal(&"the connection has no exporter"))?;
+        let proof = session.prove(&binding, self.context.hello.daemon);
+        let proof = proof.ok_or_else(|| internal(&"the session cannot be proved"))?;
         self.established
             .outbox
             .send(Message::Elected(Elected { link: rand::random(), election: 1 }));
+        self.established.outbox.send(Message::Owners(Owners { proofs: vec![proof] }));
         self.established.outbox.send(Message::Graph(graph));
+        Ok(())
     }
 
     async fn subscription(&mut self, topic: &str) -> Result<Subscribe, Refusal> {

@@ -1,10 +1,11 @@
 //! What every task of the gateway shares.
 
 use std::{
+    collections::BTreeSet,
     fmt,
-    net::SocketAddr,
+    net::{IpAddr, SocketAddr},
     sync::{
-        Arc,
+        Arc, PoisonError, RwLock,
         atomic::{AtomicU64, Ordering},
     },
     time::Instant,
@@ -32,6 +33,8 @@ pub(super) struct Context {
     pub(super) config: Arc<Config>,
     /// What this side says in HELLO.
     pub(super) hello: Hello,
+    /// Addresses of listed peers.
+    listed: RwLock<BTreeSet<IpAddr>>,
     /// KME keys, in qkd.
     pub(super) keyring: Option<Arc<Keyring>>,
     /// The classic identity; `None` in qkd.
@@ -65,10 +68,22 @@ impl Context {
             hello,
             transport: transport(&config),
             next_link: AtomicU64::new(1),
+            listed: RwLock::default(),
             config,
             keyring,
             identity,
         })
+    }
+
+    /// From now on the listed peers have these addresses.
+    pub(super) fn set_listed(&self, addresses: BTreeSet<IpAddr>) {
+        *self.listed.write().unwrap_or_else(PoisonError::into_inner) = addresses;
+    }
+
+    /// Whether a listed peer has this address.
+    pub(super) fn is_listed(&self, address: IpAddr) -> bool {
+        let listed = self.listed.read().unwrap_or_else(PoisonError::into_inner);
+        listed.contains(&address.to_canonical())
     }
 
     /// A number for a new connection, unique in this daemon's life.

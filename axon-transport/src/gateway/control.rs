@@ -175,6 +175,7 @@ fn weight(message: &Message) -> usize {
             Message::Asserted(asserted) => size_of_val(&*asserted.publishers),
             Message::Received(received) => size_of_val(&*received.flows),
             Message::RouteRefused(refused) => refused.reason.len(),
+            Message::Owners(owners) => size_of_val(&*owners.proofs),
             _ => 0,
         }
 }

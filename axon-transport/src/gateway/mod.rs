@@ -38,6 +38,7 @@ mod routes;
 mod routes_in;
 mod run;
 mod seal;
+mod shares;
 mod silence;
 mod socket;
 mod stalls;

@@ -9,7 +9,7 @@ use std::{
 use tokio::sync::mpsc;
 
 use super::{
-    accept::accept,
+    accept::{MAX_HANDSHAKES, accept},
     account::Accounts,
     context::Context,
     endpoint::{Endpoints, reset_key},
@@ -18,6 +18,7 @@ use super::{
     keyring::Keyring,
     pulse::Pulse,
     room::Room,
+    shares::Handshakes,
     silence::Echoes,
     stand_in::StandIns,
 };
@@ -91,9 +92,15 @@ async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
     if context.has_files() {
         tokio::spawn(watch_files(Arc::clone(&context), events.clone()));
     }
+    let handshakes = Handshakes::new(MAX_HANDSHAKES);
     for endpoint in &endpoints.all {
         let (incomers, mut answered) = mpsc::channel(64);
-        tokio::spawn(accept(Arc::clone(&context), endpoint.clone(), incomers));
+        tokio::spawn(accept(
+            Arc::clone(&context),
+            endpoint.clone(),
+            Arc::clone(&handshakes),
+            incomers,
+        ));
         let events = events.clone();
         tokio::spawn(async move {
             while let Some(incomer) = answered.recv().await {

@@ -2,6 +2,7 @@
 
 use axon_tls::identity::{Auth, SigningKey};
 use axon_transport::{
+    daemon::status::LinkStatus,
     ids::{DaemonId, Gid},
     link::{Message, Subscribe, Subscriber, Unsubscribe},
     qos::Qos,
@@ -101,4 +102,33 @@ fn what_is_more_than_may_cross_is_named_on_both_hosts_and_harms_nothing_else() {
     let crossing = || publishers.iter().filter(|p| !p.matched().is_empty()).count();
     until("another crosses", || crossing() == ROUTES as usize);
     assert_eq!(hosts[0].link().since_unix_ms, since);
+}
+
+/// Links that a daemon has at most.
+const LINKS: u8 = 160;
+
+#[test]
+fn links_of_made_up_keys_from_one_address_keep_no_other_host_out() {
+    let [mut host, mut other] = Plan::new([classic(&[]), classic(&[])]).prepare();
+    host.start();
+    let stranger = Stranger::new();
+    let crowd: Vec<_> = (0..LINKS)
+        .map(|number| {
+            let mut daemon = [0xff; 16];
+            daemon[15] = number;
+            let claim = Claim { host: "crowd", daemon: DaemonId(daemon), auth: 0 };
+            stranger.dial(&host, &Auth::None(SigningKey::generate().unwrap()), &claim)
+        })
+        .collect::<Result<_, _>>()
+        .expect("there is a link for each");
+    let claim = Claim { host: "crowd", daemon: DaemonId([0xfe; 16]), auth: 0 };
+    let auth = Auth::None(SigningKey::generate().unwrap());
+    let refused = stranger.dial(&host, &auth, &claim).expect_err("there is none for one more");
+    assert!(refused.contains("as many links"), "{refused}");
+    other.start();
+    let is_other = |link: &LinkStatus| link.address.starts_with(&other.address.to_string());
+    until("the other host is linked", || host.status().links.iter().any(is_other));
+    host.wait_log(&["takes its place"]);
+    host.wait_refusal("it is said once of the address", |text| text.contains("as many links"));
+    drop(crowd);
 }

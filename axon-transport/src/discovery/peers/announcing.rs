@@ -1,6 +1,7 @@
 //! When this daemon says that it is here, to whom, and in what words.
 
 use std::{
+    collections::BTreeSet,
     net::{IpAddr, Ipv4Addr, SocketAddr},
     time::Duration,
 };
@@ -11,7 +12,7 @@ use super::{Output, Peers, record::Record};
 use crate::{
     config::DiscoveryRange,
     discovery::{
-        PROTOCOLS, Standing,
+        PROTOCOLS,
         beacon::{Beacon, Datagram},
         quic_ports,
     },
@@ -43,13 +44,13 @@ impl Peers {
 
     pub(super) fn interval(&self) -> Duration {
         // Anybody can make up as many as there are records: few of them count.
-        let is_there = |record: &&Record| {
-            let unanswered = matches!(record.standing(), Standing::Heard | Standing::Known);
-            record.linked || !unanswered
-        };
-        let there = self.records.values().filter(is_there).count();
-        let heard = self.records.len() - there;
-        let hosts = there + heard.min(MOST_HEARD_COUNT) + 1;
+        let linked = self.records.values().filter(|record| record.linked).count();
+        let others = || self.records.values().filter(|record| !record.linked);
+        // An address that answers under many ids is one host.
+        let answered = others().filter(|record| record.has_answered());
+        let answered = answered.filter_map(Record::host).collect::<BTreeSet<_>>().len();
+        let heard = others().filter(|record| !record.has_answered()).count();
+        let hosts = linked + answered + heard.min(MOST_HEARD_COUNT) + 1;
         let hosts = u32::try_from(hosts).unwrap_or(u32::MAX);
         INTERVAL_LEAST.max(INTERVAL_PER_HOST.saturating_mul(hosts))
     }

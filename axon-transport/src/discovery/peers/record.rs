@@ -135,6 +135,16 @@ impl Record {
         self.sources.iter().filter(move |source| source.standing() == standing)
     }
 
+    /// Where it is, as far as is known: the best of its addresses.
+    pub(super) fn host(&self) -> Option<IpAddr> {
+        self.sources.first().map(|source| source.address.ip()).or(self.from)
+    }
+
+    /// Whether somebody answered there: what a forged source does not do.
+    pub(super) fn has_answered(&self) -> bool {
+        self.sources.iter().any(|source| source.proven || source.answered)
+    }
+
     /// The best standing of any of its addresses.
     pub(super) fn standing(&self) -> Standing {
         self.sources.first().map_or(Standing::Heard, Source::standing)

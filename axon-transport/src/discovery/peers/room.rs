@@ -33,13 +33,14 @@ impl Peers {
         let heard_goes = crowded || heard > LEAST_HEARD;
         let mut of_host: BTreeMap<Option<IpAddr>, usize> = BTreeMap::new();
         for record in self.records.values() {
-            *of_host.entry(record.from).or_default() += 1;
+            *of_host.entry(record.host()).or_default() += 1;
         }
         let candidates = self.records.iter().filter(|(_, record)| record.may_be_forgotten());
         let candidates = candidates.filter(|(_, record)| of_heard(record) == heard_goes);
         let victim = candidates.min_by_key(|(_, record)| {
-            let crowd = of_host.get(&record.from).copied().unwrap_or_default();
-            (std::cmp::Reverse(crowd), record.last_seen)
+            let crowd = of_host.get(&record.host()).copied().unwrap_or_default();
+            // One whose peer was heard from goes last, whatever was forged under its address.
+            (record.has_answered(), std::cmp::Reverse(crowd), record.last_seen)
         });
         if let Some(victim) = victim.map(|(id, _)| *id) {
             self.forget(victim);

@@ -14,7 +14,7 @@ use tokio::sync::watch;
 
 use super::{Hub, Link, Summary};
 use crate::{
-    gateway::{establish::close, keyring::Keyring, status::Who},
+    gateway::{establish::close, keyring::Keyring, silence::Traffic, status::Who},
     ids::DaemonId,
     link::{CloseCode, Side},
 };
@@ -63,7 +63,9 @@ impl Leaving {
 impl Hub {
     /// The connection has a successor: it ends once all that is under way on it has arrived.
     pub(super) fn hand_over(&mut self, old: u64) {
-        let Some(link) = self.links.remove(&old) else { return };
+        let Some(mut link) = self.links.remove(&old) else { return };
+        // Something may have come since it was looked at.
+        link.silent &= !Traffic::of(&link.connection).came_since(link.traffic);
         self.leaving.retain(|_, leaving| !leaving.is_gone());
         let who = &link.established.who;
         let others = self.leaving.iter().filter(|(_, leaving)| leaving.established.who.is(who));

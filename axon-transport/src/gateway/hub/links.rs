@@ -1,6 +1,7 @@
 //! Links: from a connection that proved its peer to the one that is in use, its successor, its end.
 
 use std::{
+    net::IpAddr,
     sync::{
         Arc,
         atomic::{AtomicU64, Ordering},
@@ -24,6 +25,7 @@ use crate::{
         peer::{Peer, Prover, spawn_reader},
         refusal::{Refusal, RefusedBy},
         seal::Protection,
+        shares::gives_way,
         silence::{Traffic, Watch},
         status::Who,
     },
@@ -96,17 +98,23 @@ impl Hub {
         }
         let theirs = self.links.values().map(|link| &link.established.who);
         let theirs = theirs.chain(self.leaving.values().filter_map(Leaving::who));
+        let newcomer = established.connection.remote_address().ip();
+        let full = current.is_none() && self.links.len() >= MAX_LINKS;
         let too_many = if theirs.filter(|other| other.is(&who)).count() >= MAX_LINKS_OF_PEER {
             Some("this peer has as many connections as it may")
-        } else if current.is_none() && self.links.len() >= MAX_LINKS {
-            Some("this daemon has as many links as it may")
+        } else if full && !self.make_place(newcomer).await {
+            Some("this daemon has as many links as it may, and no address has more than this one")
         } else {
             None
         };
         if let Some(text) = too_many {
+            if self.crowded.is_news(newcomer, Instant::now()) {
+                return self.turn_away(established, text.into()).await;
+            }
             close(&established.connection, CloseCode::NotAllowed, text);
             return self.forget(&established);
         }
+        let current = self.peers.get(&daemon).and_then(|p| self.links.get(&p.link));
         let successor =
             replaces.is_some() && current.is_some_and(|c| c.elected.map(|e| e.link) == replaces);
         let candidate = Candidate { side: established.side, successor };
@@ -133,6 +141,27 @@ impl Hub {
                 let _ = events.send(Event::Unelected(number)).await;
             });
         }
+    }
+
+    /// Has a link of the address that has the most give way to one from `newcomer`; whether one did.
+    async fn make_place(&mut self, newcomer: IpAddr) -> bool {
+        let links = self.links.iter();
+        let links: Vec<_> =
+            links.map(|(number, link)| (link.connection.remote_address().ip(), *number)).collect();
+        let listed = |address| self.context.is_listed(address);
+        let Some(number) = gives_way(newcomer, &links, listed) else { return false };
+        let text = "a host at an address that has fewer links takes its place";
+        tracing::info!(%newcomer, "{text}");
+        if let Some(link) = self.links.get(&number) {
+            close(&link.connection, CloseCode::NotAllowed, text);
+            let address = link.connection.remote_address();
+            if self.crowded.is_news(address.ip(), Instant::now()) {
+                let refusal = Refusal::here(CloseCode::NotAllowed, text);
+                self.refused(self.peer_of(link), refusal).await;
+            }
+        }
+        self.link_ended(number, text).await;
+        true
     }
 
     async fn turn_away(&self, established: Established, why: String) {

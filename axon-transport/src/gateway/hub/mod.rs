@@ -35,6 +35,7 @@ use super::{
     refusal::{Refusal, RefusedBy},
     room::Room,
     seal::Protection,
+    shares::Said,
     silence::{Echoes, Traffic},
     stalls::Stalls,
     stand_in::StandIns,
@@ -184,6 +185,8 @@ pub(super) struct Hub {
     leaving: HashMap<u64, Leaving>,
     peers: HashMap<DaemonId, Peer>,
     local: Local,
+    /// Hosts that were told just now that there is no place for them.
+    crowded: Said,
     /// Whether publishers ended of which something is on its way, as the control plane was told.
     draining: bool,
     /// A peer went, or an endpoint of one, since peers that lost endpoints to another were asked again.
@@ -211,6 +214,7 @@ impl Hub {
             leaving: HashMap::new(),
             peers: HashMap::new(),
             local: BTreeMap::new(),
+            crowded: Said::default(),
             draining: false,
             freed: false,
         }
@@ -275,6 +279,7 @@ impl Hub {
                 self.dial(Target { daemon, sae, addresses, listed, standing, replaces: None });
             }
             Event::Order(ToGateway::SendDatagram { to, bytes }) => self.endpoints.send(to, &bytes),
+            Event::Order(ToGateway::Listed(addresses)) => self.context.set_listed(addresses),
             Event::Order(ToGateway::Shutdown) => {}
             Event::Dialled(target, result) => match *result {
                 Ok(established) => self.established(established, target.replaces).await,

@@ -1,0 +1,178 @@
+//! What the hosts at one address may take of what this daemon has for all of them.
+//!
+//! Keys can be made up, a source address that QUIC validated cannot: it is what is shared by.
+//! Hosts behind one translated address share it, so sharing begins only where there is scarcity.
+
+use std::{
+    collections::{HashMap, VecDeque},
+    net::{IpAddr, Ipv6Addr},
+    sync::{Arc, Mutex},
+    time::{Duration, Instant},
+};
+
+use super::keyring::lock;
+
+/// What may be under way beyond that to listed peers.
+const FOR_LISTED: usize = 16;
+/// A refusal at one address is said again after this.
+const SAID_AGAIN: Duration = Duration::from_secs(10);
+/// Most addresses of which it is remembered that a refusal was said.
+const MOST_SAID: usize = 64;
+
+/// What counts as one address: of IPv6 the network, as a host may take any address in it.
+pub(super) fn place(address: IpAddr) -> IpAddr {
+    match address.to_canonical() {
+        IpAddr::V6(v6) => {
+            let [a, b, c, d, ..] = v6.segments();
+            Ipv6Addr::new(a, b, c, d, 0, 0, 0, 0).into()
+        }
+        v4 => v4,
+    }
+}
+
+/// Handshakes under way, by address.
+#[derive(Debug)]
+pub(super) struct Handshakes {
+    most: usize,
+    under_way: Mutex<HashMap<IpAddr, usize>>,
+}
+
+/// A handshake that counts until this is dropped.
+#[derive(Debug)]
+pub(super) struct Place {
+    of: Arc<Handshakes>,
+    at: IpAddr,
+}
+
+impl Handshakes {
+    pub(super) fn new(most: usize) -> Arc<Self> {
+        Arc::new(Self { most, under_way: Mutex::default() })
+    }
+
+    /// A place for one more from this address: it may have as many as are free, so that another
+    /// address always finds one. A listed peer has some that nobody else gets.
+    pub(super) fn enter(self: &Arc<Self>, address: IpAddr, listed: bool) -> Option<Place> {
+        let at = place(address);
+        let mut under_way = lock(&self.under_way);
+        let all: usize = under_way.values().sum();
+        let own = under_way.get(&at).copied().unwrap_or_default();
+        let free = self.most.saturating_sub(all);
+        let reserved = listed && own < FOR_LISTED && all < self.most + FOR_LISTED;
+        if own >= free && !reserved {
+            return None;
+        }
+        *under_way.entry(at).or_default() += 1;
+        Some(Place { of: Arc::clone(self), at })
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        let mut under_way = lock(&self.of.under_way);
+        if let Some(count) = under_way.get_mut(&self.at) {
+            *count -= 1;
+            if *count == 0 {
+                under_way.remove(&self.at);
+            }
+        }
+    }
+}
+
+/// Who has to go so that a link from `newcomer` has a place, by the address and number of each link.
+/// `None`: the newcomer is refused, as no other address has more than it would have.
+///
+/// The address that has the most gives its newest link. A listed peer has a place even where others
+/// have few, and does not give its own to an unlisted one.
+pub(super) fn gives_way(
+    newcomer: IpAddr,
+    links: &[(IpAddr, u64)],
+    is_listed: impl Fn(IpAddr) -> bool,
+) -> Option<u64> {
+    let newcomer_place = place(newcomer);
+    let mut held: HashMap<IpAddr, usize> = HashMap::new();
+    for (address, _) in links {
+        *held.entry(place(*address)).or_default() += 1;
+    }
+    let own = held.get(&newcomer_place).copied().unwrap_or_default();
+    let privileged = |address: IpAddr| is_listed(address) && held[&place(address)] <= FOR_LISTED;
+    let others = links
+        .iter()
+        .filter(|(address, _)| place(*address) != newcomer_place && !privileged(*address));
+    let (address, newest) =
+        others.max_by_key(|(address, number)| (held[&place(*address)], *number))?;
+    let reserved = is_listed(newcomer) && own < FOR_LISTED;
+    (reserved || held[&place(*address)] > own + 1).then_some(*newest)
+}
+
+/// Of which addresses a refusal was said just now.
+#[derive(Debug, Default)]
+pub(super) struct Said(VecDeque<(IpAddr, Instant)>);
+
+impl Said {
+    /// Whether it is to be said, which it then was.
+    pub(super) fn is_news(&mut self, address: IpAddr, now: Instant) -> bool {
+        self.0.retain(|(_, at)| now.saturating_duration_since(*at) < SAID_AGAIN);
+        let at = place(address);
+        if self.0.iter().any(|(said, _)| *said == at) || self.0.len() >= MOST_SAID {
+            return false;
+        }
+        self.0.push_back((at, now));
+        true
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(last: u8) -> IpAddr {
+        [10, 0, 0, last].into()
+    }
+
+    #[test]
+    fn one_address_takes_at_most_what_it_leaves_and_listed_peers_have_places_of_their_own() {
+        let handshakes = Handshakes::new(64);
+        let take = |host, listed| {
+            std::iter::from_fn(|| handshakes.enter(at(host), listed)).collect::<Vec<_>>()
+        };
+        let greedy = take(1, false);
+        assert_eq!(greedy.len(), 32);
+        let second = take(2, false);
+        assert_eq!(second.len(), 16);
+        let many: Vec<_> = (3..200).flat_map(|host| take(host, false)).collect();
+        assert_eq!(greedy.len() + second.len() + many.len(), 64, "all places are of use");
+        assert!(handshakes.enter(at(250), false).is_none());
+        assert_eq!(take(251, true).len(), 16);
+        drop((greedy, second, many));
+        assert!(lock(&handshakes.under_way).is_empty());
+        // A host may take any IPv6 address of its network.
+        let in_net = |n: u16| IpAddr::from([0x2001, 0xdb8, 0, 1, 0, 0, 0, n]);
+        let places: Vec<_> = (0..100).filter_map(|n| handshakes.enter(in_net(n), false)).collect();
+        assert_eq!(places.len(), 32);
+    }
+
+    #[test]
+    fn the_newest_link_of_the_address_that_has_the_most_gives_way() {
+        let mut links: Vec<_> = (0..150).map(|number| (at(1), number)).collect();
+        links.extend((150..160).map(|number| (at(2), number)));
+        let none = |_: IpAddr| false;
+        assert_eq!(gives_way(at(3), &links, none), Some(149));
+        assert_eq!(gives_way(at(2), &links, none), Some(149), "it has fewer");
+        assert_eq!(gives_way(at(1), &links, none), None);
+        let spread: Vec<_> = (0..160).map(|number| (at(number as u8), number)).collect();
+        assert_eq!(gives_way(at(200), &spread, none), None, "each has its own");
+        assert_eq!(gives_way(at(200), &spread, |a| a == at(200)), Some(159), "a listed peer");
+        assert_eq!(gives_way(at(200), &spread, |_| true), None, "all are listed");
+        let two = [(at(1), 1), (at(1), 2), (at(2), 3)];
+        assert_eq!(gives_way(at(3), &two, |a| a == at(1)), None, "an unlisted one waits");
+    }
+
+    #[test]
+    fn a_refusal_is_said_once_for_each_address() {
+        let (mut said, now) = (Said::default(), Instant::now());
+        assert!(said.is_news(at(1), now) && said.is_news(at(2), now));
+        assert!(!said.is_news(at(1), now));
+        assert!(said.is_news(at(1), now + SAID_AGAIN));
+        assert!((0..=255).filter(|host| said.is_news(at(*host), now)).count() <= MOST_SAID);
+    }
+}
