@@ -1,4 +1,4 @@
-//! What there is one of in each process: a forked child makes its own. And whose rights it has.
+//! State of which each process has one, and a forked child makes its own; the rights of the process.
 
 #![allow(unsafe_code)]
 

@@ -154,7 +154,7 @@ fn a_graph_has_a_bound_for_all_daemon_ids_of_a_peer_and_the_rest_of_the_link_goe
         camera.announce(link, session, MANY);
         camera.heard(link, 1);
     }
-    until("what there is room for is shown", || (seen() + 1000) * NAMES > BOUND / 2);
+    until("endpoints are shown up to the bound", || (seen() + 1000) * NAMES > BOUND / 2);
     camera.a.wait_refusal("what is left out, by name and why", |text| {
         ["camera", "graph", "/topic_", "more than 16 MiB"].iter().all(|part| text.contains(part))
     });

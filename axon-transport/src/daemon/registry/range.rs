@@ -206,7 +206,7 @@ impl<F: Clone> Registry<F> {
     }
 
     /// An endpoint, of another host's `daemon` if there is one, as a view shows it, if it does. The
-    /// gateway is shown this host's alone: what there is elsewhere it said itself.
+    /// gateway is shown those of this host alone: it told of the others itself.
     pub(super) fn shown_in(
         &self,
         view: &View,
