@@ -325,6 +325,7 @@ fn greeting(publisher: Gid) -> Sample {
         source_timestamp: 0,
         received_timestamp: 0,
         reception: 1,
+        lifetime: None,
     };
     sample(info, b"an attempt".to_vec())
 }

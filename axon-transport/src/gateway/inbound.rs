@@ -26,7 +26,7 @@ use crate::{
     link::CloseCode,
     seldom::Seldom,
     session::Written,
-    shm::{Meta, PublishError},
+    shm::{Meta, PublishError, monotonic},
 };
 
 const STREAM_HEADER: usize = 24;
@@ -167,6 +167,7 @@ impl Inbound {
         let meta = Meta {
             sequence: opened.header.sequence,
             source_timestamp: opened.header.source_timestamp,
+            published: published(opened.header.age_ms),
         };
         match self.routes.writer(from.number, gid).await {
             Some(stand_in) => self.take_in(&stand_in, from, meta, &payload).await,
@@ -231,6 +232,12 @@ impl Inbound {
             tracing::warn!(%gid, %error, samples, "samples from a peer are lost");
         }
     }
+}
+
+/// When a sample of this age was published, on this host's monotonic clock.
+fn published(age_ms: u32) -> u64 {
+    // 0 would be now.
+    monotonic().saturating_sub(u64::from(age_ms) * 1_000_000).max(1)
 }
 
 /// Where a stream says that it comes from.

@@ -85,6 +85,17 @@ impl Policy {
 }
 
 impl Sample {
+    /// Its age: as far as is known, since it was published.
+    pub(super) fn age(&self) -> Duration {
+        let then = self.info.lifetime.map_or(Duration::ZERO, |lifetime| lifetime.age);
+        then.saturating_add(self.since.elapsed())
+    }
+
+    /// How much of its lifespan is left, where that is finite.
+    pub(super) fn left(&self) -> Option<Duration> {
+        Some(self.info.lifetime?.lifespan.saturating_sub(self.age()))
+    }
+
     /// What it takes of a queue's room: an empty one, too, is somewhere.
     fn size(&self) -> usize {
         self.payload.len() + size_of::<Self>()
@@ -201,12 +212,18 @@ impl Queue {
         }
     }
 
-    /// Drops those of BEST_EFFORT that have waited for longer than `life` while a newer one waits. How many.
-    pub(super) fn drop_late(&mut self, life: Duration) -> u64 {
+    /// Drops those of BEST_EFFORT that cannot arrive in time while a newer one waits: within `life`, or
+    /// within their lifespan, if the way takes as long as `transit`. Drops any whose lifespan is over.
+    /// Returns how many.
+    pub(super) fn drop_late(&mut self, life: Duration, transit: Duration) -> u64 {
         let mut dropped = 0;
-        while self.samples.len() > 1
-            && self.samples.front().is_some_and(|sample| sample.since.elapsed() > life)
-        {
+        while let Some(oldest) = self.samples.front() {
+            // The newest is always tried: what the last one took may not hold any more.
+            let transit = if self.samples.len() > 1 { transit } else { Duration::ZERO };
+            let late = self.samples.len() > 1 && oldest.since.elapsed() + transit > life;
+            if !late && oldest.left().is_none_or(|left| left > transit) {
+                break;
+            }
             dropped += u64::from(self.pop().is_some());
         }
         dropped
@@ -251,6 +268,7 @@ impl Drop for Queue {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::session::Lifetime;
 
     fn sample(sequence: u64, size: usize) -> Sample {
         let info = MessageInfo {
@@ -259,6 +277,7 @@ mod tests {
             source_timestamp: 0,
             received_timestamp: 0,
             reception: sequence,
+            lifetime: None,
         };
         Sample {
             info,
@@ -448,11 +467,37 @@ mod tests {
     fn best_effort_that_waited_too_long_gives_way_to_newer_samples() {
         let mut queue = queue(&Qos { depth: 5, ..Qos::sensor_data() }, 9, 1);
         (1..=3).for_each(|sequence| assert_eq!(offer(&mut queue, sequence, 1), Ok(0)));
-        assert_eq!(queue.drop_late(Duration::from_secs(1000)), 0);
+        assert_eq!(queue.drop_late(Duration::from_secs(1000), Duration::ZERO), 0);
         std::thread::sleep(Duration::from_millis(2));
-        // The newest stays, however old.
-        assert_eq!(queue.drop_late(Duration::from_millis(1)), 2);
+        // The newest stays, however old, and however long the way seems.
+        assert_eq!(queue.drop_late(Duration::from_millis(1), Duration::from_secs(9)), 2);
         assert_eq!(taken(&mut queue), [3]);
+    }
+
+    #[test]
+    fn best_effort_ages_by_its_publishers_lifespan_from_publication_on() {
+        let [life, age] = [1000, 900].map(Duration::from_secs);
+        let transit = Duration::from_secs(200);
+        let mortal = |sequence, age| {
+            let lifetime = Some(Lifetime { age, lifespan: Duration::from_secs(1000) });
+            let sample = sample(sequence, 1);
+            Sample { info: MessageInfo { lifetime, ..sample.info }, ..sample }
+        };
+        assert!(mortal(1, age).age() >= age, "it was as old when it was copied out");
+        assert!(mortal(1, age).left().unwrap() <= Duration::from_secs(100));
+        let mut queue = queue(&Qos { depth: 5, ..Qos::sensor_data() }, 9, 1);
+        for (sequence, age) in [(1, age), (2, Duration::ZERO), (3, age)] {
+            assert!(matches!(queue.offer(mortal(sequence, age)), Offered::Queued { dropped: 0 }));
+        }
+        assert_eq!(queue.drop_late(life, Duration::ZERO), 0);
+        // The first would arrive too late. The last might, too, but nothing newer is there.
+        assert_eq!(queue.drop_late(life, transit), 1);
+        assert_eq!(queue.pop().unwrap().info.sequence, 2);
+        assert_eq!(queue.drop_late(life, transit), 0);
+        assert_eq!(taken(&mut queue), [3]);
+        // One whose lifespan is over goes, with nothing newer.
+        assert!(matches!(queue.offer(mortal(4, life)), Offered::Queued { dropped: 0 }));
+        assert_eq!(queue.drop_late(life, Duration::ZERO), 1);
     }
 
     #[test]

@@ -78,7 +78,7 @@ pub(super) enum RefusedMessage {
 }
 
 fn header(sample: &Sample) -> inner::Header {
-    let age = sample.since.elapsed().as_millis();
+    let age = sample.age().as_millis();
     let request_id = sample.client.map_or_else(inner::RequestId::default, |client| {
         inner::RequestId { client: client.0, sequence: number(sample.info.sequence) }
     });
@@ -227,6 +227,7 @@ mod tests {
             source_timestamp: 0,
             received_timestamp: 0,
             reception: 1,
+            lifetime: None,
         };
         let topic = header(&sample(info(client), Vec::new()));
         let call = |of| header(&Sample { client: Some(client), ..sample(info(of), Vec::new()) });

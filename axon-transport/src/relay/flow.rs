@@ -218,10 +218,11 @@ impl<S: Content> Outgoing<S> {
                 None if *credit < OVERHEAD => continue,
                 None => {
                     cost = OVERHEAD;
-                    let Meta { sequence, source_timestamp } = sample.meta;
+                    let Meta { sequence, source_timestamp, published } = sample.meta;
                     // No sample is longer than AXON_MAX_MESSAGE_MB allows, which is below 4 GiB.
                     let length = u32::try_from(sample.content.len()).unwrap_or(u32::MAX);
-                    head = Some(Head { length, sequence, source_timestamp, lost: sample.lost });
+                    let lost = sample.lost;
+                    head = Some(Head { length, sequence, source_timestamp, lost, published });
                     0
                 }
             };
@@ -416,8 +417,8 @@ impl Incoming {
             }
             return Ok(None);
         }
-        let Head { sequence, source_timestamp, lost, .. } = head;
-        let meta = Meta { sequence, source_timestamp };
+        let Head { sequence, source_timestamp, lost, published, .. } = head;
+        let meta = Meta { sequence, source_timestamp, published };
         Ok(Some(Arrived { channel: name, meta, lost, payload }))
     }
 

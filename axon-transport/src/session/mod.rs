@@ -58,6 +58,8 @@ pub use service::{Client, Server};
 pub use state::SessionEvent;
 pub(crate) use state::Shared;
 pub use status::daemon_status;
+#[cfg(test)]
+pub(crate) use subscription::Lifetime;
 pub use subscription::{MessageInfo, Subscription};
 pub use waiting::{Ready, Waitable};
 

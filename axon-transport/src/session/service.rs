@@ -127,7 +127,7 @@ impl Server {
             self.session.wait_changed(PATIENCE, settled);
         }
         let Some(ring) = ring() else { return Ok(()) };
-        let meta = Meta { sequence, source_timestamp: clock::wall() };
+        let meta = Meta { sequence, source_timestamp: clock::wall(), published: 0 };
         ring.publish(meta, payload).map(drop)
     }
 

@@ -152,7 +152,7 @@ impl Far {
     }
 
     fn publish(&self, sequence: u64, payload: &[u8]) {
-        let meta = Meta { sequence, source_timestamp: 0 };
+        let meta = Meta { sequence, source_timestamp: 0, published: 0 };
         self.writer.publish(meta, payload).unwrap();
     }
 

@@ -22,7 +22,7 @@ pub(super) const COPIED: u64 = 4096;
 /// as much to pin a sample of so many bytes as to copy it.
 pub(super) const COPIED_ALWAYS: u64 = 512;
 /// Bytes of a sample that fit in its descriptor.
-pub(super) const INLINE: usize = 96;
+pub(super) const INLINE: usize = 88;
 /// Lanes of a session: how many rings it can read at a time.
 pub(super) const LANES: u32 = 4096;
 
@@ -54,7 +54,7 @@ pub(super) const RING: u64 = 384;
 #[cfg(test)]
 pub(super) const RING_WORDS: usize = RING as usize / 8;
 
-const VERSION: u32 = 2;
+const VERSION: u32 = 3;
 /// Reads otherwise on a machine of another byte order.
 const ORDER: u32 = 0x0a0b_0c0d;
 const SEGMENT_MAGIC: u64 = u64::from_ne_bytes(*b"AXONSEG2");

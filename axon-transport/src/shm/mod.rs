@@ -128,6 +128,6 @@ pub use sample::{Sample, SampleReader};
 pub use segments::{SegmentEvent, SegmentInfo};
 pub use session::SessionSegment;
 pub use subscriber::{Subscriber, SubscriberOptions};
-pub(crate) use times::Times;
+pub(crate) use times::{Times, monotonic};
 pub use types::{Grant, Meta, Published, ReaderInfo, RingOptions, Taken};
 pub use writer::Writer;

@@ -15,7 +15,7 @@ use std::ops::Range;
 use super::{
     layout::{
         DESCRIPTOR_WORDS, Location, halves,
-        ring::{ARRAY, HEAD, TAIL},
+        ring::{ARRAY, HEAD, LIFESPAN, TAIL},
     },
     prefetch::prefetch,
     sync::{Ordering, Site, Word, fence_at},
@@ -27,7 +27,9 @@ const TIMESTAMP: usize = 2;
 /// Length in bytes, and in what kind of place of which segment.
 const PLACE: usize = 3;
 const DATA: usize = 4;
-const INLINE_WORDS: usize = DESCRIPTOR_WORDS - DATA;
+/// When the sample was published, on the monotonic clock, where the lifespan is finite.
+const PUBLISHED: usize = DESCRIPTOR_WORDS - 1;
+const INLINE_WORDS: usize = PUBLISHED - DATA;
 
 /// No ring gets this far; a head beyond it was scribbled.
 pub(super) const MAX_POSITION: u64 = 1 << 62;
@@ -58,6 +60,8 @@ impl Place {
 pub(super) struct Record {
     pub(super) sequence: u64,
     pub(super) timestamp: i64,
+    /// 0 where the ring's lifespan is infinite.
+    pub(super) published: u64,
     pub(super) len: u32,
     pub(super) place: Place,
 }
@@ -109,8 +113,11 @@ pub(super) fn publish<W: Word>(
     slot[TIMESTAMP].store(record.timestamp.cast_unsigned(), Ordering::Relaxed);
     let (place, offset) = record.place.word();
     slot[PLACE].store(u64::from(record.len) | u64::from(place) << 32, Ordering::Relaxed);
+    if record.published != 0 {
+        slot[PUBLISHED].store(record.published, Ordering::Relaxed);
+    }
     match record.place {
-        Place::Inline => copy_in(&slot[DATA..], inline),
+        Place::Inline => copy_in(&slot[DATA..PUBLISHED], inline),
         Place::Block(_) | Place::Slot(_) => slot[DATA].store(offset, Ordering::Relaxed),
     }
     // Pairs with `state`: whoever sees the stamp sees the sample.
@@ -216,6 +223,9 @@ impl<'a, W: Word> View<'a, W> {
         let timestamp = slot[TIMESTAMP].load(Ordering::Relaxed).cast_signed();
         let (len, place) = halves(slot[PLACE].load(Ordering::Relaxed));
         let offset = slot[DATA].load(Ordering::Relaxed);
+        // Of a short sample the word is in a cache line that need not come otherwise.
+        let finite = self.ring[LIFESPAN].load(Ordering::Relaxed) != 0;
+        let published = if finite { slot[PUBLISHED].load(Ordering::Relaxed) } else { 0 };
         if !self.stands(position) {
             return Look::Lapped;
         }
@@ -229,7 +239,7 @@ impl<'a, W: Word> View<'a, W> {
             2 => Place::Slot(at),
             _ => return Look::Corrupt("a sample is in no known kind of place"),
         };
-        Look::Sample(Record { sequence, timestamp, len, place })
+        Look::Sample(Record { sequence, timestamp, published, len, place })
     }
 
     /// Has the rest of a descriptor that is [here](State::Here) on its way from the publisher's core
@@ -241,7 +251,7 @@ impl<'a, W: Word> View<'a, W> {
 
     /// The words of a sample that is in its descriptor.
     pub(super) fn inline(&self, position: u64) -> &'a [W] {
-        &descriptor(self.array, position)[DATA..]
+        &descriptor(self.array, position)[DATA..PUBLISHED]
     }
 
     /// Whether all that was loaded of `position` so far is what was published.

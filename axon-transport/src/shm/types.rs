@@ -58,6 +58,10 @@ pub struct Meta {
     pub sequence: u64,
     /// When it was published, in nanoseconds since the Unix epoch.
     pub source_timestamp: i64,
+    /// When it was published, in nanoseconds of this host's CLOCK_MONOTONIC: that of a sample from
+    /// another host is its arrival less its age. The publisher's lifespan counts from then. 0 is now
+    /// for a sample that is published, and stands in one that was taken where the lifespan is infinite.
+    pub published: u64,
 }
 
 /// A sample that was published.

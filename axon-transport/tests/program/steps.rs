@@ -210,7 +210,8 @@ impl Stage {
         let next = publisher.sequence + 1;
         assert_eq!(published.first, (published.count > 0).then_some(next), "numbers go up by one");
         let lifespan = publisher.what.profile.lifespan;
-        let expired = publisher.slow && lifespan.is_some_and(|age| age < 2 * HOUR);
+        // By age, whatever its clock says.
+        let expired = lifespan == Some(0);
         for done in 0..published.count {
             let sample = Sample {
                 publisher: publisher.gid.clone(),
@@ -242,7 +243,7 @@ impl Stage {
         // What late joiners get, and what is too old, is not told apart from what is lost.
         let which = |m: &Modelled| {
             let Profile { transient_local, lifespan, .. } = m.what.profile;
-            m.is(Kind::Publisher) && !transient_local && (lifespan.is_none() || !m.slow)
+            m.is(Kind::Publisher) && !transient_local && lifespan != Some(0)
         };
         let held = self.held();
         let best = |m: &Modelled| held.contains(&m.gid);
@@ -412,6 +413,6 @@ fn profile(dice: &mut super::stage::Dice) -> Profile {
         deadline: period(dice.roll(9)),
         manual: dice.roll(3) == 0,
         lease: period(dice.roll(9)),
-        lifespan: dice.one_of(&[None, None, Some(HOUR), Some(3 * HOUR)]),
+        lifespan: dice.one_of(&[None, None, Some(0), Some(HOUR)]),
     }
 }

@@ -85,7 +85,13 @@ fn announce(gid: Gid, kind: EndpointKind, role: EndpointRole) -> Message {
 }
 
 fn piece(publisher: Gid, length: Option<u32>, bytes: usize) -> Message {
-    let head = length.map(|length| Head { length, sequence: 1, source_timestamp: 0, lost: 0 });
+    let head = length.map(|length| Head {
+        length,
+        sequence: 1,
+        source_timestamp: 0,
+        lost: 0,
+        published: 0,
+    });
     Message::Piece(Piece { publisher, head, bytes: vec![0; bytes], client: None })
 }
 
@@ -168,7 +174,7 @@ const SAID: u64 = 20;
 
 fn say_all(socket: &OwnedFd) {
     for sequence in 1..=SAID {
-        let head = Some(Head { length: 10, sequence, source_timestamp: 0, lost: 0 });
+        let head = Some(Head { length: 10, sequence, source_timestamp: 0, lost: 0, published: 0 });
         let bytes = pattern(sequence, 10);
         say_to(socket, &Message::Piece(Piece { publisher: own(), head, bytes, client: None }));
     }
@@ -342,7 +348,7 @@ fn whoever_answers_what_nobody_asked_it_reaches_nobody() {
     assert!(client.wait_available(PATIENCE));
     let own = Gid::new(SessionId([9; 16]), 1);
     let answer = |of: Gid, client: Gid, length: u32, bytes: usize| {
-        let head = Some(Head { length, sequence: 1, source_timestamp: 0, lost: 0 });
+        let head = Some(Head { length, sequence: 1, source_timestamp: 0, lost: 0, published: 0 });
         let bytes = vec![7; bytes];
         Message::Piece(Piece { publisher: of, head, bytes, client: Some(client) })
     };

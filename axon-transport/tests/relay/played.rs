@@ -209,7 +209,7 @@ fn a_request_is_sent_once_however_many_servers_it_is_for() {
     // To whom it answers, and which it answers, is the server's to say; whose it is, is not.
     let other = Gid::new(SessionId([9; 16]), 7);
     let answer = |server, client, sequence| {
-        let head = Some(Head { length: 1, sequence, source_timestamp: 0, lost: 0 });
+        let head = Some(Head { length: 1, sequence, source_timestamp: 0, lost: 0, published: 0 });
         Message::Piece(Piece { publisher: server, head, bytes: vec![0], client })
     };
     say_to(&socket, &answer(other, Some(own.gid()), 1));
@@ -259,7 +259,7 @@ fn a_channel_goes_on_when_one_of_its_readers_ends_and_another_is_matched() {
     until("both receive from it", || other.matched() == [outside]);
     let (gone, bytes) = (one.gid(), pattern(1, 1000));
     let (front, rest) = bytes.split_at(500);
-    let head = Some(Head { length: 1000, sequence: 1, source_timestamp: 0, lost: 0 });
+    let head = Some(Head { length: 1000, sequence: 1, source_timestamp: 0, lost: 0, published: 0 });
     let piece = |head, bytes: &[u8]| {
         let bytes = bytes.to_vec();
         say_to(&socket, &Message::Piece(Piece { publisher: outside, head, bytes, client: None }));

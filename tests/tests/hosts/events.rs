@@ -3,7 +3,7 @@
 use std::{
     sync::atomic::{AtomicBool, Ordering},
     thread,
-    time::{Duration, SystemTime},
+    time::{Duration, Instant},
 };
 
 use axon_transport::{
@@ -200,15 +200,32 @@ fn a_deadline_is_missed_on_both_hosts() {
 fn what_is_older_than_its_lifespan_is_not_taken_elsewhere() {
     let [a, b] = hosts();
     let (here, there) = (a.session("publisher"), b.session("subscription"));
-    let qos = Qos { lifespan: Some(3600 * SECOND), ..Qos::default() };
-    let (publisher, subscription) = matched(&here, &there, qos);
-    let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap();
-    let now = i64::try_from(now.as_nanos()).unwrap();
-    publisher.publish_at(now - 2 * 3600 * i64::try_from(SECOND).unwrap(), b"old").unwrap();
-    publisher.publish_at(now, b"new").unwrap();
+    let lasts = |seconds| Qos {
+        lifespan: Some(seconds * SECOND),
+        durability: Durability::TransientLocal,
+        ..Qos::default()
+    };
+    // By the clock of its host it is of 1970: the clock does not matter.
+    let (publisher, subscription) = matched(&here, &there, lasts(3600));
+    publisher.publish_at(1_000_000_000, b"new").unwrap();
     let mut bytes = Vec::new();
-    let info = subscription.recv(&mut bytes, Some(PATIENCE)).expect("the new one");
-    assert_eq!((&bytes[..], info.sequence, subscription.lost()), (&b"new"[..], 2, 0));
+    let info = subscription.recv(&mut bytes, Some(PATIENCE)).expect("it is not old");
+    assert_eq!((&bytes[..], info.sequence, subscription.lost()), (&b"new"[..], 1, 0));
+    // By its clock this one is of 2262. It is four seconds old when it leaves, and these count.
+    let spec = || EndpointSpec::new("/late", "test/Bytes", lasts(6));
+    let late = here.create_publisher(spec()).unwrap();
+    let over = Instant::now() + Duration::from_secs(6);
+    late.publish_at(i64::MAX, b"old").unwrap();
+    thread::sleep(Duration::from_secs(4));
+    let subscription = there.create_subscription(spec()).unwrap();
+    while !subscription.has_data() && Instant::now() < over {
+        thread::sleep(Duration::from_millis(10));
+    }
+    let arrived = subscription.has_data();
+    // The time on the way does not count, which is far below two seconds.
+    thread::sleep(over.saturating_duration_since(Instant::now()) + Duration::from_secs(2));
+    assert!(subscription.take(&mut bytes).is_none());
+    assert_eq!((subscription.expired(), subscription.lost()), (u64::from(arrived), 0));
 }
 
 #[test]

@@ -65,8 +65,9 @@ impl Flight {
         if lock(&self.0.samples).under_way.is_empty() { 0 } else { BEHIND }
     }
 
-    /// A finished stream of so many bytes is under way. Its carrier is in use until it is acknowledged.
-    pub(super) fn add(&self, mut stream: SendStream, bytes: u64, carrier: Carrier) {
+    /// A finished stream of so many bytes is under way. It is reset after `life`, when the peer would
+    /// drop the sample. Its carrier is in use until it is acknowledged.
+    pub(super) fn add(&self, mut stream: SendStream, bytes: u64, life: Duration, carrier: Carrier) {
         let (flight, begun) = (self.clone(), Instant::now());
         let (number, first) = {
             let mut samples = lock(&self.0.samples);
@@ -87,7 +88,7 @@ impl Flight {
                 let _ = stream.set_priority(0);
                 let _ = acknowledged.await;
             };
-            if tokio::time::timeout(LONGEST, over).await.is_err() {
+            if tokio::time::timeout(LONGEST.min(life), over).await.is_err() {
                 let _ = stream.reset(VarInt::from_u32(CloseCode::Goodbye.code()));
             }
             flight.land(number, begun.elapsed());

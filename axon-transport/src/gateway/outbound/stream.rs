@@ -144,8 +144,7 @@ impl Writer {
                     return false;
                 }
                 // What would arrive too late gives way to what is newer.
-                let wait = BEST_EFFORT_LIFE.saturating_sub(self.flight.took());
-                let late = queue.drop_late(wait);
+                let late = queue.drop_late(BEST_EFFORT_LIFE, self.flight.took());
                 self.shared.counters.dropped("late", late);
             }
             queue.pop_together(TOGETHER, &mut self.batch);
@@ -339,19 +338,21 @@ impl Writer {
         }
         let mut pieces = self.frames.take();
         pieces.insert(0, self.header());
-        let opened = tokio::time::timeout(BEST_EFFORT_LIFE, carrier.connection.open_uni());
+        let left = self.batch.front().and_then(Sample::left).unwrap_or(Duration::MAX);
+        let patience = BEST_EFFORT_LIFE.min(left);
+        let opened = tokio::time::timeout(patience, carrier.connection.open_uni());
         let Ok(Ok(mut stream)) = opened.await else { return Err("late") };
         let _ = stream.set_priority(self.flight.priority());
         let bytes = pieces.iter().map(|piece| piece.len() as u64).sum();
         let write = stream.write_all_chunks(&mut pieces);
-        if !matches!(tokio::time::timeout(BEST_EFFORT_WRITE, write).await, Ok(Ok(()))) {
+        if !matches!(tokio::time::timeout(BEST_EFFORT_WRITE.min(left), write).await, Ok(Ok(()))) {
             // Dropping it would finish it, as if the message were whole.
             let _ = stream.reset(VarInt::from_u32(CloseCode::Goodbye.code()));
             return Err("late");
         }
         let _ = stream.finish();
         self.batch.iter().for_each(|s| self.shared.counters.sent(s.payload.len()));
-        self.flight.add(stream, bytes, carrier.clone());
+        self.flight.add(stream, bytes, left, carrier.clone());
         Ok(())
     }
 }

@@ -35,6 +35,7 @@ fn a_sample(sequence: u64) -> Sample {
         source_timestamp: 0,
         received_timestamp: 0,
         reception: sequence,
+        lifetime: None,
     };
     sample(info, b"sample".to_vec())
 }

@@ -23,13 +23,13 @@ fn incoming() -> Incoming {
 }
 
 fn departing(sequence: u64, len: usize) -> Departing<Vec<u8>> {
-    let meta = Meta { sequence, source_timestamp: -(sequence as i64) };
+    let meta = Meta { sequence, source_timestamp: -(sequence as i64), published: sequence * 5 };
     let content = (0..len).map(|at| (at as u64 * 31 + sequence) as u8).collect();
     Departing { meta, lost: sequence, content }
 }
 
 fn head(length: u32) -> Option<Head> {
-    Some(Head { length, sequence: 1, source_timestamp: 0, lost: 0 })
+    Some(Head { length, sequence: 1, source_timestamp: 0, lost: 0, published: 0 })
 }
 
 fn piece(number: u8, head: Option<Head>, len: usize) -> Piece {

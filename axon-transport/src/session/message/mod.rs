@@ -414,6 +414,11 @@ pub struct Head {
     /// Samples of its publisher that were lost since the one before.
     #[n(3)]
     pub lost: u64,
+    /// When it was published, in nanoseconds of CLOCK_MONOTONIC; 0, or absent, where its publisher's
+    /// lifespan is infinite.
+    #[n(4)]
+    #[cbor(default)]
+    pub published: u64,
 }
 
 /// The receiver of a channel has room.

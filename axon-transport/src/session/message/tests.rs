@@ -103,7 +103,13 @@ fn messages() -> Vec<Message> {
         Message::Matched(Matched { gid: reader, others: vec![writer] }),
         Message::Piece(Piece {
             publisher: writer,
-            head: Some(Head { length: 3, sequence: 7, source_timestamp: -1, lost: 2 }),
+            head: Some(Head {
+                length: 3,
+                sequence: 7,
+                source_timestamp: -1,
+                lost: 2,
+                published: 9,
+            }),
             bytes: vec![1, 2],
             client: None,
         }),

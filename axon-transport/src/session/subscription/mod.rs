@@ -17,7 +17,7 @@ pub(super) use self::{
 };
 use self::{inner::lock, slots::Slots};
 use super::{
-    OnNew, Session, SessionError,
+    OnNew, Session, SessionError, clock,
     events::{Event, Source},
     message::{GivenUp, Message, Pair},
     state::Outgoing,
@@ -49,6 +49,28 @@ pub struct MessageInfo {
     pub received_timestamp: i64,
     /// Its number among those that the endpoint has taken, from 1.
     pub reception: u64,
+    /// Its age and lifespan, where the lifespan is finite.
+    pub(crate) lifetime: Option<Lifetime>,
+}
+
+/// The age of a sample when it was taken, and its publisher's lifespan. The monotonic clock tells both,
+/// so that neither a step of the wall clock nor that of another host counts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Lifetime {
+    pub(crate) age: Duration,
+    pub(crate) lifespan: Duration,
+}
+
+impl Lifetime {
+    fn of(meta: &Meta, lifespan: Duration) -> Self {
+        let age = clock::monotonic().saturating_sub(meta.published);
+        Self { age: Duration::from_nanos(age), lifespan }
+    }
+
+    /// Whether the sample is not to be delivered any more.
+    fn is_over(self) -> bool {
+        self.age > self.lifespan
+    }
 }
 
 impl Subscription {

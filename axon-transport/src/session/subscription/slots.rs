@@ -60,7 +60,7 @@ pub(super) struct Slot {
     /// When it was mapped: what was published before is no news. By the monotonic clock.
     pub(super) since: u64,
     /// The age at which its samples are not delivered any more.
-    pub(super) lifespan: Option<i64>,
+    pub(super) lifespan: Option<Duration>,
     /// Within what the writer says that it is alive.
     pub(super) lease: Option<u64>,
     /// The writer is gone: take what it left, then unmap.
@@ -234,7 +234,7 @@ impl Slots {
         let after = after.filter(|number| *number > 0);
         let since = clock::monotonic();
         let times = reader.times();
-        let lifespan = times.lifespan.map(|age| i64::try_from(age).unwrap_or(i64::MAX));
+        let lifespan = times.lifespan.map(Duration::from_nanos);
         let lease = times.lease;
         let (over, leaving, overtaken) = (false, false, false);
         let earlier = self.slots.iter().find(|s| s.reader.writer() == writer).map(Slot::reached);

@@ -2,7 +2,7 @@
 
 use std::{collections::HashMap, time::Instant};
 
-use super::{MessageInfo, inner::SubscriptionInner, slots::Slots};
+use super::{Lifetime, MessageInfo, inner::SubscriptionInner, slots::Slots};
 use crate::{
     graph::Endpoint,
     ids::Gid,
@@ -106,9 +106,8 @@ impl Slots {
         };
         let over = slot.over;
         let received_timestamp = clock::wall();
-        let expired = slot.lifespan.is_some_and(|lifespan| {
-            meta.source_timestamp.saturating_add(lifespan) < received_timestamp
-        });
+        let lifetime = slot.lifespan.map(|lifespan| Lifetime::of(&meta, lifespan));
+        let expired = lifetime.is_some_and(Lifetime::is_over);
         slot.passed(meta.sequence);
         let repeated = of.rising && slot.last.is_some_and(|last| meta.sequence <= last);
         if !repeated {
@@ -131,6 +130,7 @@ impl Slots {
             source_timestamp: meta.source_timestamp,
             received_timestamp,
             reception: self.received,
+            lifetime,
         };
         Some((info, taken))
     }
@@ -334,8 +334,9 @@ mod tests {
         for writer in writers {
             let (publisher, reader) = reading(&session, writer, gid);
             slots.add(reader, None, true, false);
-            let say =
-                |sequence| publisher.publish(Meta { sequence, source_timestamp: 0 }, b"sample");
+            let say = |sequence| {
+                publisher.publish(Meta { sequence, source_timestamp: 0, published: 0 }, b"sample")
+            };
             say(1).unwrap();
             // So many cannot have been lost.
             let refused = PublishError::Sequence { sequence: u64::MAX, last: 1 };

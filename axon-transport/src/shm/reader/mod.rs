@@ -494,5 +494,6 @@ impl Drop for Reader {
 }
 
 fn meta(record: &Record) -> Meta {
-    Meta { sequence: record.sequence, source_timestamp: record.timestamp }
+    let Record { sequence, timestamp: source_timestamp, published, .. } = *record;
+    Meta { sequence, source_timestamp, published }
 }

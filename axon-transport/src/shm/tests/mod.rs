@@ -143,7 +143,7 @@ fn attach_to(
 }
 
 fn meta(sequence: u64) -> Meta {
-    Meta { sequence, source_timestamp: sequence.cast_signed() * 7 - 3 }
+    Meta { sequence, source_timestamp: sequence.cast_signed() * 7 - 3, published: 0 }
 }
 
 /// Bytes that differ by sequence number and place.

@@ -17,6 +17,7 @@ use crate::{
         ring::{self, Place, Record},
         room::Refusal,
         sync::{Ordering, Word},
+        times,
     },
     wait::{Purpose, settle},
 };
@@ -141,7 +142,7 @@ impl Writer {
         let meta = match numbering {
             Numbering::Given(meta) => meta,
             Numbering::Next(source_timestamp) => {
-                Meta { sequence: state.last.saturating_add(1), source_timestamp }
+                Meta { sequence: state.last.saturating_add(1), source_timestamp, published: 0 }
             }
         };
         state.last = meta.sequence;
@@ -171,12 +172,22 @@ impl Writer {
         let record = Record {
             sequence: meta.sequence,
             timestamp: meta.source_timestamp,
+            published: self.published_at(meta),
             len: u32::try_from(len).expect("no longer than the largest message"),
             place,
         };
         ring::about_to_write::<AtomicU64>();
         ring::publish(self.ring.words(), state.array.words(), position, &record, inline);
         position
+    }
+
+    /// The time from which the sample's lifespan counts; 0 where that is infinite.
+    fn published_at(&self, meta: Meta) -> u64 {
+        match (self.options.qos.lifespan, meta.published) {
+            (None, _) => 0,
+            (Some(_), 0) => times::monotonic(),
+            (Some(_), earlier) => earlier,
+        }
     }
 
     /// Tries until it works or `patience` is at its end. The lock is not held in between.

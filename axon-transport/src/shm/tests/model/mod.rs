@@ -88,7 +88,7 @@ impl Ring {
 }
 
 fn record(position: u64, place: Place) -> Record {
-    Record { sequence: 10 + position, timestamp: 0, len: 0, place }
+    Record { sequence: 10 + position, timestamp: 0, published: 0, len: 0, place }
 }
 
 /// A lane that a reader has opened to take `first` next.
