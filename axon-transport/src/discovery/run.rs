@@ -27,6 +27,8 @@ const INTERFACES_EVERY: Duration = Duration::from_secs(3);
 /// How often names of listed peers are looked up.
 const NAMES_EVERY: Duration = Duration::from_secs(30);
 const NAME_TIMEOUT: Duration = Duration::from_secs(5);
+/// Most datagrams that are looked at before what came of them is done.
+const TOGETHER: usize = 64;
 /// Most addresses of one name.
 const MOST_OF_A_NAME: usize = 4;
 
@@ -95,14 +97,16 @@ pub async fn run(
         let wakeup = shell.peers.next_wakeup().map(|at| shell.start + at);
         tokio::select! {
             event = events.recv() => match event {
-                Some(event) => shell.event(event),
+                Some(event) => {
+                    shell.event(event);
+                    // What more there is now is looked at together.
+                    let more = std::iter::from_fn(|| events.try_recv().ok());
+                    more.take(TOGETHER).for_each(|event| shell.event(event));
+                }
                 None => break,
             },
             datagram = receive(shell.socket.as_ref()) => match datagram {
-                Ok((from, bytes)) => {
-                    let now = shell.start.elapsed();
-                    shell.peers.datagram(now, from, Arrival::Shared, &bytes);
-                }
+                Ok((from, bytes)) => shell.heard(from, &bytes),
                 Err(error) => {
                     debug!(%error, "the shared discovery port fails, opening it anew");
                     shell.socket = None;
@@ -198,6 +202,17 @@ impl Shell {
         self.names.clone_from(&names);
         // One that is dropped is overtaken by the next.
         let _ = self.actions.try_send(Action::Named(names));
+    }
+
+    /// A datagram came to the shared port: it is looked at, with those that wait there.
+    fn heard(&mut self, from: SocketAddr, bytes: &[u8]) {
+        let now = self.start.elapsed();
+        self.peers.datagram(now, from, Arrival::Shared, bytes);
+        for _ in 1..TOGETHER {
+            let next = self.socket.as_ref().and_then(SharedSocket::try_receive);
+            let Some((from, bytes)) = next else { return };
+            self.peers.datagram(now, from, Arrival::Shared, &bytes);
+        }
     }
 
     fn event(&mut self, event: Event) {

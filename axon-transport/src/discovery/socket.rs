@@ -97,6 +97,14 @@ impl SharedSocket {
         Ok((from, buffer[..length].to_vec()))
     }
 
+    /// As [`receive`](Self::receive), if a datagram waits.
+    pub fn try_receive(&self) -> Option<(SocketAddr, Vec<u8>)> {
+        let mut buffer = [0; LONGEST + 1];
+        // An error is said by the next call that waits.
+        let (length, from) = self.receiver.try_recv_from(&mut buffer).ok()?;
+        Some((from, buffer[..length].to_vec()))
+    }
+
     /// Sends to the group on every interface that is followed, by broadcast where multicast fails.
     /// Never waits: what the kernel does not take at once is lost, as a datagram may be.
     pub fn send(&mut self, bytes: &[u8]) {

@@ -198,6 +198,22 @@ fn under_the_id_with_wrong_ports(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)
     all
 }
 
+/// 20 goodbyes a second in the names of the hosts that these tests know, from the honest host's
+/// address.
+fn goodbyes(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
+    let ids = if ms.is_multiple_of(50) { &[LOWER, HIGHER][..] } else { &[] };
+    let goodbye = |daemon: &DaemonId| Datagram::Goodbye { domain: 0, daemon: *daemon };
+    let at = SocketAddr::from(([10, 0, 0, 2], 40_000));
+    ids.iter().map(|id| (at, Arrival::Shared, goodbye(id))).collect()
+}
+
+/// Goodbyes, and beacons under the same ids from elsewhere.
+fn goodbyes_and_beacons(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
+    let mut all = goodbyes(ms);
+    all.extend(under_the_id(ms + 17));
+    all
+}
+
 /// All of it, and goodbyes under the same ids from the addresses that were forged.
 fn everything(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
     let mut all = from_everywhere(ms);
@@ -220,6 +236,8 @@ fn a_listed_host_is_dialled_through_any_flood() {
         Scene::listed(honest, from_the_honest_address).links("listed, 300/s from its address");
         Scene::listed(honest, under_the_id).links("listed, 20/s under its id");
         Scene::listed(honest, under_the_id_with_wrong_ports).links("listed, wrong ports");
+        Scene::listed(honest, goodbyes).links("listed, goodbyes from its address");
+        Scene::listed(honest, goodbyes_and_beacons).links("listed, goodbyes and beacons");
         Scene::listed(honest, everything).links("listed, everything");
     }
 }
@@ -232,6 +250,8 @@ fn a_host_that_was_linked_is_dialled_again_through_any_flood() {
             (from_one_address, "met, 300/s from one address"),
             (under_the_id, "met, 20/s under its id"),
             (under_the_id_with_wrong_ports, "met, wrong ports"),
+            (goodbyes, "met, goodbyes from its address"),
+            (goodbyes_and_beacons, "met, goodbyes and beacons"),
             (everything, "met, everything"),
         ] {
             let mut scene = Scene::met(honest, forger);
@@ -255,6 +275,7 @@ fn a_host_that_nobody_knows_is_dialled_once_it_answers() {
         Scene::new(honest, from_everywhere).links("unknown, 300/s from everywhere");
         Scene::new(honest, from_one_address).links("unknown, 300/s from one address");
         Scene::new(honest, under_the_id).links("unknown, 20/s under its id");
+        Scene::new(honest, goodbyes).links("unknown, goodbyes from its address");
         Scene::new(honest, everything).links("unknown, everything");
     }
 }
@@ -283,4 +304,99 @@ fn an_answer_is_asked_of_no_flood() {
     assert!(answered);
     // Its own beacons go as often as without the flood.
     assert!(scene.peers.interval() <= secs(20.0), "{:?}", scene.peers.interval());
+}
+
+/// Probes that were sent since the last look, by host.
+fn probed(peers: &mut Peers) -> BTreeMap<IpAddr, usize> {
+    let mut hosts = BTreeMap::new();
+    while let Some(output) = peers.poll() {
+        if let Output::Action(Action::SendFromQuicPort { to, bytes }) = output
+            && matches!(Datagram::decode(&bytes), Ok(Datagram::Probe { .. }))
+        {
+            *hosts.entry(to.ip()).or_default() += 1;
+        }
+    }
+    hosts
+}
+
+#[test]
+fn a_stranger_in_whose_name_beacons_are_forged_hears_few_probes() {
+    let mut scene = Scene::new(HIGHER, from_one_address);
+    for second in 0..10 {
+        for ms in 0..1_000 {
+            scene.now += 1;
+            for (source, arrival, datagram) in from_one_address(second * 1_000 + ms) {
+                scene.peers.datagram(scene.time(), source, arrival, &datagram.encode());
+            }
+            scene.peers.advance(scene.time());
+        }
+    }
+    let most = probed(&mut scene.peers).into_values().max().unwrap_or(0);
+    // 32 within each of the four times that answers are awaited.
+    assert!((1..=128).contains(&most), "{most}");
+}
+
+#[test]
+fn probes_of_strangers_keep_no_answer_from_a_host_that_is_known() {
+    let mut scene = Scene::listed(HIGHER, from_everywhere);
+    let (now, address) = (scene.time(), scene.address);
+    let probe = |nonce: u64| Datagram::Probe { daemon: HIGHER, nonce: nonce.to_be_bytes() };
+    for number in 0..5_000 {
+        scene.peers.datagram(now, forged(number), Arrival::Quic, &probe(number).encode());
+    }
+    let echoes = std::iter::from_fn(|| scene.peers.poll()).count();
+    assert!(echoes <= 1_024, "{echoes}");
+    scene.peers.datagram(now, address, Arrival::Quic, &probe(7).encode());
+    assert!(scene.peers.poll().is_some());
+}
+
+#[test]
+fn no_more_beacons_of_strangers_are_looked_at_than_a_second_has_time_for() {
+    let mut scene = Scene::listed(HIGHER, from_everywhere);
+    let now = scene.time();
+    let all = |number| said(forged(number), made_up(number));
+    for (source, arrival, datagram) in (0..20_000).map(all) {
+        scene.peers.datagram(now, source, arrival, &datagram.encode());
+    }
+    let outputs = std::iter::from_fn(|| scene.peers.poll());
+    let gone = outputs.filter(|o| matches!(o, Output::Action(Action::Gone { .. }))).count();
+    let heard = gone + scene.peers.records.len();
+    assert!((500..=1_024).contains(&heard), "{heard}");
+    scene.honest_speaks();
+    assert!(scene.peers.records.contains_key(&HIGHER), "one that is listed is always heard");
+}
+
+#[test]
+fn a_flood_pushes_out_no_host_that_answered() {
+    let mut scene = Scene::new(HIGHER, from_the_honest_address);
+    // Its dials fail, so that nothing but its answer speaks for it.
+    scene.honest_speaks();
+    let source = scene.address;
+    let record = scene.peers.records.get_mut(&HIGHER).unwrap();
+    record.sources.iter_mut().for_each(|source| source.answered = true);
+    record.done();
+    for ms in 0..10_000 {
+        scene.now += 1;
+        for (source, arrival, datagram) in from_the_honest_address(ms) {
+            scene.peers.datagram(scene.time(), source, arrival, &datagram.encode());
+        }
+        while scene.peers.poll().is_some() {}
+    }
+    let record = &scene.peers.records[&HIGHER];
+    assert!(record.sources.iter().any(|s| s.answered && s.address == source));
+}
+
+#[test]
+fn an_address_that_answers_under_many_names_counts_once() {
+    let mut scene = Scene::new(HIGHER, from_one_address);
+    for number in 0..100 {
+        let (_, arrival, datagram) = said(forged(number), made_up(number));
+        let one = SocketAddr::from(([10, 0, 0, 66], 61_300));
+        scene.peers.datagram(scene.time(), one, arrival, &datagram.encode());
+    }
+    for record in scene.peers.records.values_mut() {
+        record.sources.iter_mut().for_each(|source| source.answered = true);
+    }
+    assert!(scene.peers.records.len() >= 100);
+    assert_eq!(scene.peers.interval(), secs(10.0));
 }

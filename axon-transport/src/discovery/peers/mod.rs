@@ -80,6 +80,10 @@ pub struct Peers {
     /// For those at addresses that this host knows.
     known_answers: Bucket,
     echoes: Bucket,
+    known_echoes: Bucket,
+    /// Beacons and goodbyes that are looked at, of strangers and of hosts that this one knows.
+    heard: Bucket,
+    known_heard: Bucket,
     probes: Bucket,
     known_probes: Bucket,
     asked: Probes,
@@ -106,6 +110,9 @@ impl Peers {
             answers: Bucket::new(64, 64),
             known_answers: Bucket::new(64, 64),
             echoes: Bucket::new(1024, 1024),
+            known_echoes: Bucket::new(1024, 1024),
+            heard: Bucket::new(1024, 1024),
+            known_heard: Bucket::new(1024, 1024),
             probes: Bucket::new(1024, 1024),
             known_probes: Bucket::new(1024, 1024),
             asked: Probes::new(),
@@ -133,7 +140,7 @@ impl Peers {
                     self.wants_dial(record, standing) && in_flight.has_room(standing, host);
                 [dial.due.filter(|_| may_dial), dial.in_flight]
             });
-            let expiry = record.may_be_forgotten().then(|| record.last_seen + lifetime);
+            let expiry = record.may_be_forgotten().then(|| record.gone_at(lifetime));
             dials.chain([expiry]).flatten().min()
         });
         of_records.chain(self.next_beacon).min()
@@ -254,8 +261,10 @@ impl Peers {
         record.done();
         let left = record.left(now);
         // One that dialled us and whose beacons never came cannot be dialled.
-        if left || !record.compatible {
+        if !record.compatible {
             self.forget(daemon);
+        } else if left {
+            self.leaves(now, daemon);
         } else {
             record.last_seen = record.last_seen.max(now);
             self.schedule_dial(now, daemon);
@@ -270,7 +279,7 @@ impl Peers {
         if let Some(record) = record.filter(under_way) {
             record.failed(standing, now, jitter);
             if record.may_be_forgotten() && record.left(now) {
-                self.forget(daemon);
+                self.leaves(now, daemon);
             } else {
                 self.schedule_dial(now, daemon);
             }

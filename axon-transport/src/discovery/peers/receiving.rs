@@ -26,7 +26,17 @@ impl Peers {
             return;
         }
         let from = SocketAddr::new(from.ip().to_canonical(), from.port());
-        match Datagram::decode(bytes) {
+        let known = self.knows(from.ip());
+        let datagram = Datagram::decode(bytes);
+        let told = matches!(
+            datagram,
+            Ok(Datagram::Beacon(_) | Datagram::Foreign(_) | Datagram::Goodbye { .. })
+        );
+        let heard = if known { &mut self.known_heard } else { &mut self.heard };
+        if told && !heard.take(now) {
+            return;
+        }
+        match datagram {
             Err(error) => debug!(%from, %error, "discovery datagram dropped"),
             Ok(Datagram::Beacon(beacon)) => self.beacon(now, from, arrival, beacon),
             Ok(Datagram::Foreign(foreign)) => self.foreign(now, from, arrival, foreign),
@@ -37,7 +47,8 @@ impl Peers {
             }
             Ok(Datagram::Probe { daemon, nonce }) => {
                 let ours = daemon == self.local.daemon;
-                if arrival == Arrival::Quic && !ours && self.echoes.take(now) {
+                let echoes = if known { &mut self.known_echoes } else { &mut self.echoes };
+                if arrival == Arrival::Quic && !ours && echoes.take(now) {
                     let echo = Datagram::Echo { daemon: self.local.daemon, nonce };
                     self.send(from, echo.encode());
                 }
@@ -168,7 +179,7 @@ impl Peers {
     fn goodbye_from(&mut self, now: Duration, from: SocketAddr, daemon: DaemonId) {
         let Some(record) = self.records.get_mut(&daemon) else { return };
         let from = from.ip();
-        if !record.sources.iter().any(|source| source.address.ip() == from) {
+        if record.stays(now) || !record.sources.iter().any(|source| source.address.ip() == from) {
             return;
         }
         // Where several addresses claim the id, one that leaves takes itself away and no other.
@@ -176,9 +187,10 @@ impl Peers {
         let best = record.sources.first().is_some_and(|source| source.address.ip() == from);
         if record.may_be_forgotten() {
             if others {
-                record.sources.retain(|source| source.address.ip() != from || source.proven);
+                let trusted = |source: &Source| source.proven || source.answered || source.known;
+                record.sources.retain(|source| source.address.ip() != from || trusted(source));
             } else {
-                self.forget(daemon);
+                self.leaves(now, daemon);
             }
         } else if best || !others {
             record.leaving = Some(now);

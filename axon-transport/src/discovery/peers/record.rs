@@ -5,6 +5,7 @@ use std::{
     time::Duration,
 };
 
+use super::probing::ANSWER_WITHIN;
 use crate::discovery::Standing;
 
 /// Most addresses of one standing that are kept of a peer.
@@ -66,8 +67,10 @@ pub(super) struct Record {
     pub(super) reported: bool,
     /// A beacon that contradicts what stands was logged.
     pub(super) contradicted: bool,
-    /// When it said goodbye while linked or dialled.
+    /// When it said goodbye while linked or dialled, or was asked whether it is still there.
     pub(super) leaving: Option<Duration>,
+    /// When it was still there after a goodbye in its name.
+    pub(super) stayed: Option<Duration>,
     pub(super) linked: bool,
     /// One for each standing: a dial to an address where nobody is holds up no better one.
     pub(super) dials: [Dial; Standing::COUNT],
@@ -157,6 +160,7 @@ impl Record {
             |dial: &Dial| dial.in_flight.is_none() || dial.first != Some(source.address);
         self.compatible
             && !self.linked
+            && self.leaving.is_none()
             && self.dials[standing as usize].in_flight.is_none()
             && self.dials.iter().all(elsewhere)
     }
@@ -202,6 +206,17 @@ impl Record {
     /// Whether it said goodbye just now; forgets that it did.
     pub(super) fn left(&mut self, now: Duration) -> bool {
         self.leaving.take().is_some_and(|at| at + GOODBYE_COUNTS >= now)
+    }
+
+    /// Whether it was there just now after a goodbye in its name: further ones say nothing.
+    pub(super) fn stays(&self, now: Duration) -> bool {
+        self.stayed.is_some_and(|at| at + GOODBYE_COUNTS > now)
+    }
+
+    /// When it is gone, if it is not heard before.
+    pub(super) fn gone_at(&self, lifetime: Duration) -> Duration {
+        let silent = self.last_seen + lifetime;
+        self.leaving.map_or(silent, |at| silent.min(at + ANSWER_WITHIN))
     }
 
     /// Nothing would be lost that the next beacon does not bring back.

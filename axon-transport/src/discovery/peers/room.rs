@@ -72,7 +72,7 @@ impl Peers {
         let silent: Vec<DaemonId> = self
             .records
             .iter()
-            .filter(|(_, record)| record.may_be_forgotten() && record.last_seen + lifetime <= now)
+            .filter(|(_, record)| record.may_be_forgotten() && record.gone_at(lifetime) <= now)
             .map(|(id, _)| *id)
             .collect();
         for id in silent {
