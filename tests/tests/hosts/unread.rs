@@ -7,7 +7,7 @@ use axon_tls::identity::{Auth, SigningKey};
 use axon_transport::{
     graph::{Endpoint, EndpointKind},
     ids::{DaemonId, Gid},
-    link::{Graph, Message, Subscribe, Subscriber},
+    link::{Graph, Message, Received, ReceivedOf, Subscribe, Subscriber},
     qos::Qos,
     session::EndpointSpec,
     shm::PublishError,
@@ -103,6 +103,39 @@ fn a_peer_that_reads_nothing_is_disconnected_from_the_topic_and_the_publisher_go
     let stalled = topics.iter().filter_map(|topic| topic.dropped.get("stalled")).sum::<u64>();
     assert_eq!(stalled, publisher.given_up());
     assert!(publisher.matched().len() <= 1);
+}
+
+#[test]
+fn a_peer_that_claims_to_have_dropped_more_than_it_got_makes_up_no_losses() {
+    let [host, _other] = Plan::new([classic(&[]), classic(&[])]).start();
+    let session = host.session("publisher");
+    let publisher =
+        session.create_publisher(EndpointSpec::new(TOPIC, TYPE, Qos::keep_all())).unwrap();
+    let (stranger, auth) = (Stranger::new(), Auth::None(SigningKey::generate().unwrap()));
+    let claim = Claim { host: "liar", daemon: DaemonId([0xff; 16]), auth: 0 };
+    let mut met = stranger.dial(&host, &auth, &claim).expect("a link");
+    subscribe(&stranger, &mut met);
+    until("it is served", || publisher.matched().len() == 1);
+    let mut say = |sequence, dropped| {
+        let flow = ReceivedOf { route: 1, publisher: publisher.gid(), sequence, dropped };
+        stranger.say(&mut met, &Message::Received(Received { flows: vec![flow] }));
+    };
+    for given_up in 1..=2 {
+        let sequence = publisher.publish(b"sample").unwrap();
+        // What it acknowledges before it was sent counts for nothing: it says so again and again.
+        until("it is done with", || {
+            say(sequence, u64::MAX);
+            publisher.given_up() >= given_up
+        });
+        assert_eq!(publisher.given_up(), given_up);
+        assert!(!publisher.wait_acknowledged(Duration::ZERO), "each loss is told");
+    }
+    let sequence = publisher.publish(b"the last").unwrap();
+    until("it is acknowledged", || {
+        say(sequence, 0);
+        publisher.wait_acknowledged(Duration::from_millis(50))
+    });
+    assert_eq!(publisher.given_up(), 2);
 }
 
 #[test]

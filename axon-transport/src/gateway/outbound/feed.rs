@@ -7,7 +7,7 @@ use std::{
 
 use axon_envelope::Kind;
 
-use super::{Flow, Moved, Shared, Source, stream::Stream};
+use super::{Done, Flow, Moved, Shared, Source, stream::Stream};
 use crate::{
     gateway::queue::{Offered, Sample},
     ids::Gid,
@@ -69,11 +69,12 @@ impl Feed {
         self.holds() || self.stream.is_some()
     }
 
-    /// The peer has samples up to this number. The newest that was awaited.
-    pub(super) fn acknowledge(&mut self, sequence: u64) -> Option<u64> {
+    /// The peer says that it has samples up to this number, but for so many that it dropped: of those
+    /// that were sent to it, and not more of them.
+    pub(super) fn acknowledge(&mut self, sequence: u64, dropped: u64) -> Option<Done> {
         let (samples, newest) = self.stream.as_ref()?.acknowledge(sequence);
         self.acknowledged += samples;
-        newest
+        Some(Done { sequence: newest?, given_up: dropped.min(samples) })
     }
 
     /// What changes when it gets on: samples that were acknowledged, and large parts of one that were

@@ -402,10 +402,10 @@ impl Active {
 
     /// The peer has samples of a publisher up to this number, but for some that it dropped.
     fn acknowledge(&mut self, of: Gid, sequence: u64, dropped: u64) {
-        let newest = self.feeds.get_mut(&of).and_then(|feed| feed.acknowledge(sequence));
+        let done = self.feeds.get_mut(&of).and_then(|feed| feed.acknowledge(sequence, dropped));
         // Of what was never sent nothing is acknowledged, whatever a peer says.
-        if let Some(sequence) = newest {
-            self.done(of, Done { sequence, given_up: dropped });
+        if let Some(done) = done {
+            self.done(of, done);
         }
     }
 
