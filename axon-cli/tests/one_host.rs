@@ -28,6 +28,17 @@ fn play_of_what_is_no_log_fails_and_names_it() {
     assert!(host.status().is_none(), "no daemon is started for a log that cannot be read");
 }
 
+#[test]
+fn nothing_that_a_command_says_steers_a_terminal() {
+    let host = Host::new();
+    // Of a file's name, and of a setting.
+    let output = host.run(&["play", "/no\u{1b}[2Jne\u{2066}\u{61c}.mcap"]);
+    assert_eq!(output.status.code(), Some(1));
+    let stderr = String::from_utf8(output.stderr).expect("UTF-8");
+    assert!(stderr.contains("\\u{1b}[2Jne\\u{2066}\\u{61c}.mcap"), "{stderr}");
+    assert!(stderr.chars().all(|c| c == '\n' || !c.is_control()), "{stderr:?}");
+}
+
 /// An `echo` for each topic of the log, its messages awaited.
 struct Echoes([(Running, u64); 3]);
 

@@ -13,6 +13,7 @@ use tokio::sync::{mpsc, watch};
 use super::{
     counters::Counters,
     establish::close,
+    hub::Event,
     intake::Intake,
     pieces::Pieces,
     pulse::Pulse,
@@ -58,6 +59,8 @@ pub(super) struct Inbound {
     pub(super) receipts: Arc<Receipts>,
     /// Samples that could not be published here, for the log.
     pub(super) losses: Arc<Seldom>,
+    /// To the hub.
+    pub(super) events: mpsc::Sender<Event>,
     /// What was refused, for the log and status.
     pub(super) refused: mpsc::Sender<(CloseCode, String)>,
 }
@@ -155,7 +158,8 @@ impl Inbound {
         };
         let Some(opened) = self.protection.open(body, from.route).map_err(refused)? else {
             // Nothing is wrong with it. The rest is read to be counted.
-            self.lost("no_link", from.gid, &"the link ended before they were read");
+            let why = "the link ended before they were read";
+            self.lost("no_link", from.number, from.gid, &why).await;
             return Ok(true);
         };
         let gid = writer(from.route.kind, from.gid, &opened.header)
@@ -186,7 +190,7 @@ impl Inbound {
         if told && stand_in.last_sequence() >= Some(meta.sequence) {
             return self.receipts.came(number, gid, meta.sequence, payload.len());
         }
-        let there = self.publish(stand_in, &gid, meta, payload).await;
+        let there = self.publish(stand_in, from, meta, payload).await;
         match told {
             true if there => self.receipts.came(number, gid, meta.sequence, payload.len()),
             true => self.receipts.dropped(number, gid, meta.sequence),
@@ -197,10 +201,10 @@ impl Inbound {
     /// Writes into the stand-in's ring; waits for a reader that keeps all, which in turn holds the peer's
     /// stream back: as long as the link stands, and beyond that for what had come when a successor took
     /// over. Whether it is there.
-    async fn publish(&self, stand_in: &StandIn, client: &Gid, meta: Meta, payload: &[u8]) -> bool {
+    async fn publish(&self, stand_in: &StandIn, from: From, meta: Meta, payload: &[u8]) -> bool {
         let mut waiting = None;
         loop {
-            match stand_in.try_write(client, meta, payload) {
+            match stand_in.try_write(&from.gid, meta, payload) {
                 Ok(Written::Yes) => {
                     self.counters.arrived(payload.len());
                     return true;
@@ -218,19 +222,22 @@ impl Inbound {
                     let _ = tokio::time::timeout(Duration::from_millis(100), beat.changed()).await;
                 }
                 Err(error) => {
-                    self.lost("ring", stand_in.gid(), &error);
+                    self.lost("ring", from.number, stand_in.gid(), &error).await;
                     return false;
                 }
             }
         }
     }
 
-    /// A sample came here and is lost.
-    fn lost(&self, cause: &'static str, gid: Gid, error: &dyn Display) {
+    /// A sample of this route came here and is lost.
+    async fn lost(&self, cause: &'static str, number: u32, gid: Gid, error: &(dyn Display + Sync)) {
         self.counters.dropped(cause, 1);
+        let topic = self.routes.topic(number).unwrap_or_else(|| "(a route that ended)".into());
         if let Some(samples) = self.losses.count(Instant::now()) {
-            tracing::warn!(%gid, %error, samples, "samples from a peer are lost");
+            tracing::warn!(%topic, %gid, %error, samples, "samples from a peer are lost");
         }
+        // An error: the hub is gone, and the status with it.
+        let _ = self.events.send(Event::Lost { topic, cause, samples: 1 }).await;
     }
 }
 

@@ -18,6 +18,8 @@ const ARRIVAL: Duration = Duration::from_secs(2);
 
 /// A route.
 pub(super) struct RouteIn {
+    /// The topic's name.
+    pub(super) topic: Arc<str>,
     /// Topic and kind, for the envelope.
     pub(super) route: Route,
     /// What writes on the other side, once its readers here are attached.
@@ -34,8 +36,8 @@ pub(super) struct RoutesIn {
 }
 
 impl RouteIn {
-    pub(super) fn new(route: Route) -> Self {
-        Self { route, writers: HashMap::new(), clients: HashMap::new() }
+    pub(super) fn new(topic: Arc<str>, route: Route) -> Self {
+        Self { topic, route, writers: HashMap::new(), clients: HashMap::new() }
     }
 }
 
@@ -57,6 +59,11 @@ impl RoutesIn {
             Some((route.route, Arc::clone(feeding?)))
         })
         .await
+    }
+
+    /// The topic of a route that there is.
+    pub(super) fn topic(&self, number: u32) -> Option<Arc<str>> {
+        self.read().get(&number).map(|route| Arc::clone(&route.topic))
     }
 
     /// Who writes for `gid` here.

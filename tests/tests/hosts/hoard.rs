@@ -13,8 +13,8 @@ use axon_transport::{
 
 use super::{greedy::Camera, process::until, stranger::Met};
 
-const TOPIC: &str = "/hoarded";
-const TYPE: &str = "test/Bytes";
+pub(crate) const TOPIC: &str = "/hoarded";
+pub(crate) const TYPE: &str = "test/Bytes";
 /// Daemon ids of the peer, and data streams of each.
 const IDS: u8 = 4;
 const STREAMS: usize = 48;
@@ -25,7 +25,7 @@ const BYTES: usize = 8 << 20;
 const BOUND: usize = 160 << 20;
 
 /// Announces a publisher of the topic, and waits until it is subscribed to: the route.
-fn published(camera: &Camera, met: &mut Met, of: Gid) -> u32 {
+pub(crate) fn published(camera: &Camera, met: &mut Met, of: Gid) -> u32 {
     let publisher = Endpoint {
         gid: of,
         kind: EndpointKind::Publisher,

@@ -13,6 +13,7 @@ mod greedy;
 mod hoard;
 mod hostile;
 mod identity;
+mod liar;
 mod load;
 mod mismatch;
 mod mixed;

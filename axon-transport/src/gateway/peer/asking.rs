@@ -138,7 +138,8 @@ impl Peer {
         asked.subscribers = wanted.subscribers;
         let route = Route { kind: key.kind, topic };
         self.routes_in.change(|routes| {
-            let route = routes.entry(asked.number).or_insert_with(|| RouteIn::new(route));
+            let new = || RouteIn::new(key.topic.as_str().into(), route);
+            let route = routes.entry(asked.number).or_insert_with(new);
             route.writers.retain(|gid, _| asked.stand_ins.contains_key(gid));
             if key.kind == Kind::Response {
                 let clients: HashSet<_> =

@@ -173,6 +173,7 @@ impl Peer {
         carrier: Carrier,
         shared: &Shared,
         wanted: watch::Receiver<()>,
+        events: mpsc::Sender<Event>,
         refused: mpsc::Sender<(crate::link::CloseCode, String)>,
     ) -> Inbound {
         Inbound {
@@ -186,6 +187,7 @@ impl Peer {
             intake: Arc::clone(&self.intake),
             receipts: Arc::clone(&self.receipts),
             losses: Arc::default(),
+            events,
             refused,
         }
     }
