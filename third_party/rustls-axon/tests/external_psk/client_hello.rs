@@ -115,6 +115,12 @@ fn server_refuses_malformed_offers() {
         ("a share of the wrong length", psk_dhe_ke, offer().in_psk_dhe_ke(29, &[9; 31]), 47),
         ("a share that gives zeros", psk_dhe_ke, offer().in_psk_dhe_ke(29, &[0; 32]), 47),
         (
+            "a share of a group that is not listed",
+            psk_dhe_ke,
+            offer_with_share().with(10, &list16(&[0, 23])),
+            40,
+        ),
+        (
             "two shares of one group",
             psk_dhe_ke,
             {

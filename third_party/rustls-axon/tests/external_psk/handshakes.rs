@@ -85,6 +85,41 @@ fn hello_retry_request_works() {
     }
 }
 
+/// What cannot be negotiated any more is not offered again (RFC 8446, 4.1.4).
+#[test]
+fn second_client_hello_offers_no_psk_of_another_hash() {
+    let mode = PskKeyExchangeMode::PskDheKe;
+    let psks = vec![psk("the first", 1, SHA256), psk("the second", 2, SHA384)];
+    let client_config = ClientConfig::builder_with_provider(provider(
+        &[SHA256, SHA384],
+        &[kx_group::X25519, kx_group::SECP256R1],
+    ))
+    .with_external_psks(psks, mode)
+    .unwrap();
+    let offered = |bytes: &[u8]| {
+        let is_in = |identity: &[u8]| bytes.windows(identity.len()).any(|part| part == identity);
+        [is_in(b"the first"), is_in(b"the second")]
+    };
+    for (known, secret, suite, again) in
+        [("the first", 1, SHA256, [true, false]), ("the second", 2, SHA384, [false, true])]
+    {
+        let resolver = Known::new(vec![psk(known, secret, suite)]);
+        let server_config =
+            ServerConfig::builder_with_provider(provider(&[suite], &[kx_group::SECP256R1]))
+                .with_external_psk_resolver(resolver, mode)
+                .unwrap();
+        let (mut client, mut server) = (client(client_config.clone()), server(server_config));
+        let first = written(&mut client);
+        assert_eq!(offered(&first), [true, true]);
+        feed(&mut server, &first).unwrap();
+        feed(&mut client, &written(&mut server)).unwrap();
+        let second = written(&mut client);
+        assert_eq!(offered(&second), again, "with {known}");
+        feed(&mut server, &second).unwrap();
+        handshake(&mut client, &mut server).unwrap();
+    }
+}
+
 /// A server that looks at the ClientHello before it has a config.
 #[test]
 fn an_acceptor_works() {
