@@ -6,7 +6,7 @@ use axon_tests::Sizes;
 
 use super::{
     mode::{Kmes, Settings, classic},
-    pair::{Host, Plan},
+    pair::{Host, Plan, TOPIC},
     process::until,
     wire::Wire,
 };
@@ -80,4 +80,32 @@ fn a_cut_that_nobody_notices_makes_no_second_link() {
     sleep(Duration::from_secs(2));
     assert_eq!(hosts.each_ref().map(|host| host.log_lines(&DIALLED)), [0, 0]);
     assert_eq!(hosts[0].link().since_unix_ms, link.since_unix_ms);
+}
+
+#[test]
+fn what_an_outage_takes_that_outlasts_the_link_is_counted_at_both_ends() {
+    let (hosts, wire) = wired([classic(&[]), classic(&[])]);
+    let mut there = hosts[1].subscribe(Sizes::Small);
+    let mut publisher = hosts[0].flood(Sizes::Small, 1);
+    there.wait_taken(publisher.published() + SOME);
+    wire.cut();
+    let ended = |host: &Host| host.status().links.is_empty();
+    until("both have given the link up", || hosts.iter().all(ended));
+    wire.mend();
+    until("they are linked anew", || hosts.iter().all(|host| !ended(host)));
+    until("it is matched again", || there.tally().taken > 0 && publisher.published() > 0);
+    let now = publisher.published();
+    there.wait_taken(now + SOME);
+    let sent = publisher.stop();
+    there.wait_taken(sent);
+    let dropped = || {
+        let topics = hosts[0].status().topics;
+        topics.iter().filter_map(|topic| topic.dropped.get("link_ended")).sum::<u64>()
+    };
+    let tally = there.tally();
+    eprintln!("{sent} sent, {} lost, {} of them given up", tally.lost, dropped());
+    // What is published while there is no link has no reader: the reader alone counts it.
+    assert_eq!(tally.taken + tally.lost, sent, "{tally:?}");
+    assert!(dropped() > 0 && dropped() <= tally.lost, "{} of {}", dropped(), tally.lost);
+    hosts[0].wait_log(&["WARN", TOPIC, "the link ended before"]);
 }

@@ -75,3 +75,40 @@ fn a_kme_that_gives_no_new_keys_is_named_once() {
 fn a_kme_that_gives_no_keys_by_name_is_named_once() {
     is_named_once(1, Method::DecKeys, "dec_keys");
 }
+
+/// One call of host `failing` to its KME gets no answer. Keys come by the calls after it meanwhile.
+fn holds_up_no_other(failing: usize, call: Method, name: &str) {
+    let kmes = Kmes::start();
+    let more = [("AXON_QKD_KEY_MODE", "messages10"), ("AXON_KME_ANSWER_TIMEOUT", "10")];
+    let hosts = Plan::new([0, 1].map(|host| kmes.settings(host, &more))).start();
+    let mut there = hosts[1].subscribe(Sizes::Small);
+    let mut publisher = hosts[0].publish(Sizes::Small, 1, None);
+    there.wait_taken(SOME);
+    let keys = || [kmes.keys().0, kmes.keys().1][failing];
+    kmes.plan(failing, FaultPlan::new(Fault::Silence).on(call).times(1));
+    let (calls, before, taken) = (kmes.calls(), keys(), there.tally().taken);
+    let begin = std::time::Instant::now();
+    until("other calls are answered", || kmes.calls() >= calls + 10 && keys() >= before + 50);
+    there.wait_taken(taken + 1);
+    let url = kmes.url(failing);
+    let said = ["WARN", url.as_str(), name, "AXON_KME_ANSWER_TIMEOUT"];
+    assert_eq!(hosts[failing].log_lines(&said), 0, "before the one that hangs is given up");
+    eprintln!("{name}: {} keys within {:?}", keys() - before, begin.elapsed());
+    hosts[failing].wait_log(&said);
+    let now = publisher.published();
+    there.wait_taken(now + SOME);
+    let sent = publisher.stop();
+    there.wait_taken(sent);
+    assert_eq!(there.tally().lost, 0);
+    assert_eq!(hosts[failing].log_lines(&said), 1, "said once");
+}
+
+#[test]
+fn a_call_for_new_keys_that_hangs_holds_up_no_other() {
+    holds_up_no_other(0, Method::EncKeys, "enc_keys");
+}
+
+#[test]
+fn a_call_for_keys_by_name_that_hangs_holds_up_no_other() {
+    holds_up_no_other(1, Method::DecKeys, "dec_keys");
+}
