@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{Host, LOG, Running, eventually};
+use common::{Echoes, Host, LOG, Running, eventually};
 use rustix::process::Signal;
 
 #[test]
@@ -39,33 +39,6 @@ fn nothing_that_a_command_says_steers_a_terminal() {
     assert!(stderr.chars().all(|c| c == '\n' || !c.is_control()), "{stderr:?}");
 }
 
-/// An `echo` for each topic of the log, its messages awaited.
-struct Echoes([(Running, u64); 3]);
-
-impl Echoes {
-    fn start(host: &Host) -> Self {
-        Self([("/scan", 1_988), ("/odom", 1_988), ("/tf", 1_988)].map(|(topic, count)| {
-            let text = count.to_string();
-            let args = ["echo", topic, "--qos", "keep-all", "--json", "--count", &text];
-            (Running::start(host.axon(&args)), count)
-        }))
-    }
-
-    /// Every message came, once and in order.
-    fn assert_whole(self) {
-        for (mut echo, count) in self.0 {
-            let sequences: Vec<u64> = echo.lines().map(|line| sequence(&line)).collect();
-            assert_eq!(sequences, (1..=count).collect::<Vec<_>>());
-            assert!(echo.finish().status.success());
-        }
-    }
-}
-
-fn sequence(line: &str) -> u64 {
-    let message: serde_json::Value = serde_json::from_str(line).expect("JSON");
-    message["sequence"].as_u64().expect("a sequence number")
-}
-
 #[test]
 fn echo_prints_every_message_that_play_publishes() {
     let host = Host::new();
@@ -93,11 +66,11 @@ fn a_daemon_killed_in_the_middle_of_a_replay_loses_nothing_and_has_a_successor()
     let host = Host::new();
     let echoes = Echoes::start(&host);
     let play = Running::start(host.axon(&["play", LOG, "--rate", "60", "--wait", "1"]));
-    eventually("the middle of the replay", || published(&host) > 500);
+    eventually("the middle of the replay", || host.published() > 500);
     let before = host.daemon().expect("a daemon");
     assert!(host.kill_daemon(Signal::KILL));
     eventually("the next daemon", || host.daemon().is_some_and(|pid| pid != before));
-    assert!(published(&host) < 5_000, "it was killed after the replay, which shows nothing");
+    assert!(host.published() < 5_000, "it was killed after the replay, which shows nothing");
     echoes.assert_whole();
     assert!(play.finish().status.success());
 }
@@ -118,11 +91,4 @@ fn the_daemon_in_the_foreground_is_the_one_that_status_shows_and_ends_on_sigterm
     let output = daemon.finish();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     assert!(host.status().is_none());
-}
-
-/// Samples that the log's topics have seen on this host.
-fn published(host: &Host) -> u64 {
-    let Some(status) = host.status() else { return 0 };
-    let topics = status["topics"].as_array().expect("topics");
-    topics.iter().map(|topic| topic["published"].as_u64().expect("a count")).sum()
 }

@@ -30,23 +30,43 @@ pub(crate) fn axon<'a>(settings: impl IntoIterator<Item = (&'a str, &'a str)>) -
 pub(crate) struct Host {
     dir: tempfile::TempDir,
     domain: String,
+    address: String,
+    /// The other host of a pair.
+    peer: Option<String>,
 }
 
 impl Host {
     pub(crate) fn new() -> Self {
-        static NEXT: AtomicU32 = AtomicU32::new(0);
+        Self::at("127.0.0.1".to_owned(), None, Self::domain())
+    }
+
+    /// Two hosts that list each other.
+    pub(crate) fn pair() -> [Self; 2] {
+        let (net, domain) = (1 + std::process::id() % 250, Self::domain());
+        let [a, b] = [1, 2].map(|host| format!("127.9.{net}.{host}"));
+        [(a.clone(), b.clone()), (b, a)]
+            .map(|(address, peer)| Self::at(address, Some(peer), domain.clone()))
+    }
+
+    fn at(address: String, peer: Option<String>, domain: String) -> Self {
         let dir = tempfile::tempdir().expect("temporary directory");
-        // Tests run at the same time, and daemons outlive them by their grace time: each package's
-        // tests have a range of domains to themselves, as has the demo.
+        Self { dir, domain, address, peer }
+    }
+
+    /// Tests run at the same time, and daemons outlive them by their grace time: each package's tests
+    /// have a range of domains to themselves, as has the demo.
+    fn domain() -> String {
+        static NEXT: AtomicU32 = AtomicU32::new(0);
         let number = std::process::id().wrapping_mul(7) + NEXT.fetch_add(1, Ordering::Relaxed);
-        Self { dir, domain: (100 + number % 60).to_string() }
+        (100 + number % 60).to_string()
     }
 
     pub(crate) fn axon(&self, args: &[&str]) -> Command {
         let dir = self.dir.path().to_str().expect("a path in UTF-8");
         let mut command = axon([
             ("AXON_RUNTIME_DIR", dir),
-            ("AXON_BIND_ADDRS", "127.0.0.1"),
+            ("AXON_BIND_ADDRS", self.address.as_str()),
+            ("AXON_DAEMON_PEERS", self.peer.as_deref().unwrap_or_default()),
             ("ROS_DOMAIN_ID", self.domain.as_str()),
         ]);
         command.args(args);
@@ -60,6 +80,13 @@ impl Host {
     pub(crate) fn status(&self) -> Option<serde_json::Value> {
         let output = self.run(&["status", "--json"]);
         output.status.success().then(|| serde_json::from_slice(&output.stdout).expect("JSON"))
+    }
+
+    /// Messages that are published here.
+    pub(crate) fn published(&self) -> u64 {
+        let Some(status) = self.status() else { return 0 };
+        let topics = status["topics"].as_array().expect("topics");
+        topics.iter().map(|topic| topic["published"].as_u64().expect("a count")).sum()
     }
 
     /// The process id of the daemon.
@@ -114,6 +141,33 @@ impl Drop for Running {
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
+}
+
+/// An `echo` for each topic of the log, its messages awaited.
+pub(crate) struct Echoes([(Running, u64); 3]);
+
+impl Echoes {
+    pub(crate) fn start(host: &Host) -> Self {
+        Self([("/scan", 1_988), ("/odom", 1_988), ("/tf", 1_988)].map(|(topic, count)| {
+            let text = count.to_string();
+            let args = ["echo", topic, "--qos", "keep-all", "--json", "--count", &text];
+            (Running::start(host.axon(&args)), count)
+        }))
+    }
+
+    /// Every message came, once and in order.
+    pub(crate) fn assert_whole(self) {
+        for (mut echo, count) in self.0 {
+            let sequences: Vec<u64> = echo.lines().map(|line| sequence(&line)).collect();
+            assert_eq!(sequences, (1..=count).collect::<Vec<_>>());
+            assert!(echo.finish().status.success());
+        }
+    }
+}
+
+pub(crate) fn sequence(line: &str) -> u64 {
+    let message: serde_json::Value = serde_json::from_str(line).expect("JSON");
+    message["sequence"].as_u64().expect("a sequence number")
 }
 
 /// Waits until `reached`; a test that waits in vain fails.

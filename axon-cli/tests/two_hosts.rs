@@ -1,0 +1,70 @@
+//! `play` on one host, `echo` on another.
+
+#![forbid(unsafe_code)]
+
+mod common;
+
+use common::{Echoes, Host, LOG, Running, eventually};
+use rustix::process::Signal;
+
+/// Messages of the log.
+const MESSAGES: u64 = 3 * 1_988;
+
+fn play(host: &Host, rate: &str) -> Running {
+    Running::start(host.axon(&["play", LOG, "--rate", rate, "--wait", "1", "--qos", "keep-all"]))
+}
+
+/// The exit status, and what it said.
+fn outcome(play: Running) -> (Option<i32>, String) {
+    let output = play.finish();
+    (output.status.code(), String::from_utf8(output.stderr).expect("UTF-8"))
+}
+
+#[test]
+fn play_waits_until_the_other_host_has_every_message() {
+    let [a, b] = Host::pair();
+    let echoes = Echoes::start(&b);
+    let (code, said) = outcome(play(&a, "0"));
+    assert_eq!(code, Some(0), "{said}");
+    assert!(said.contains("5,964 acknowledged"), "{said}");
+    echoes.assert_whole();
+}
+
+#[test]
+fn play_fails_where_the_other_host_takes_nothing_more() {
+    let [a, b] = Host::pair();
+    let _echoes = Echoes::start(&b);
+    let play = play(&a, "60");
+    eventually("the middle of the replay", || a.published() > 500);
+    let there = b.daemon().expect("a daemon");
+    assert!(b.kill_daemon(Signal::STOP));
+    assert!(a.published() < MESSAGES, "it was stopped after the replay, which shows nothing");
+    let (code, said) = outcome(play);
+    signal(there, Signal::CONT);
+    assert_eq!(code, Some(1), "{said}");
+    // The link is given up after 20 s without a sign of life, which may be first.
+    let unheard = ["messages were not acknowledged, none of them for 15 s", "lost with a link"];
+    assert!(unheard.iter().any(|why| said.contains(why)), "{said}");
+}
+
+#[test]
+fn play_fails_where_messages_are_lost_with_its_daemon() {
+    let [a, b] = Host::pair();
+    let _echoes = Echoes::start(&b);
+    let play = play(&a, "60");
+    eventually("the middle of the replay", || a.published() > 500);
+    let there = b.daemon().expect("a daemon");
+    assert!(b.kill_daemon(Signal::STOP));
+    let stopped = a.published();
+    eventually("more is under way", || a.published() > stopped + 100);
+    assert!(a.kill_daemon(Signal::KILL));
+    signal(there, Signal::CONT);
+    let (code, said) = outcome(play);
+    assert_eq!(code, Some(1), "{said}");
+    assert!(said.contains("messages were lost with a link or a daemon"), "{said}");
+}
+
+fn signal(pid: i32, signal: Signal) {
+    let pid = rustix::process::Pid::from_raw(pid).expect("a process id");
+    rustix::process::kill_process(pid, signal).expect("it is there");
+}
