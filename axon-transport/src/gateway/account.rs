@@ -19,6 +19,7 @@ use super::{
     intake::Intake,
     keyring::lock,
     pace::{Bucket, Turns},
+    routes::MAX_RELAYS,
 };
 use crate::link::{MAX_FRAME, MAX_INFLATED, Message};
 
@@ -29,6 +30,8 @@ pub(super) const MAX_STAND_INS: usize = 1024;
 const UNREAD: usize = 64 << 20;
 /// Messages of one identity that are on their way in, in bytes; of one that is longer it is that one.
 const INTAKE: usize = 64 << 20;
+/// Control messages that wait for one identity to read them, in bytes.
+const UNSENT: usize = 128 << 20;
 /// Bytes that a unit of a semaphore stands for.
 const UNIT: usize = 1024;
 /// Control frames of one identity that are being read, in bytes.
@@ -119,6 +122,10 @@ pub(super) struct Account {
     pub(super) graph: Arc<Meter>,
     /// Bytes of the routes that it asks for: as many again, so that one whose graph is full is served.
     pub(super) routes: Arc<Meter>,
+    /// Relays for the routes that it asks for.
+    pub(super) relays: Arc<Meter>,
+    /// Control messages that it has not read.
+    pub(super) unsent: Arc<Meter>,
     /// Its publishers, servers and clients that are shown here.
     pub(super) stand_ins: Arc<Meter>,
     /// Stream data that it may send and that was not read.
@@ -143,6 +150,8 @@ impl Account {
         Self {
             graph: Meter::new(graph),
             routes: Meter::new(graph),
+            relays: Meter::new(MAX_RELAYS),
+            unsent: Meter::new(UNSENT),
             stand_ins: Meter::new(MAX_STAND_INS),
             unread: Meter::new(UNREAD),
             intake: Arc::new(Intake::new(INTAKE)),

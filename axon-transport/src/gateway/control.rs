@@ -1,7 +1,7 @@
 //! The control stream: whole, bounded messages over quinn's byte streams.
 
 use std::sync::{
-    Arc,
+    Arc, OnceLock,
     atomic::{AtomicUsize, Ordering},
 };
 
@@ -9,7 +9,7 @@ use quinn::{Connection, RecvStream, SendStream};
 use tokio::sync::mpsc;
 
 use super::{
-    account::{Account, Unpacked},
+    account::{Account, Charge, Meter, Unpacked},
     establish::close,
 };
 use crate::{
@@ -116,19 +116,27 @@ const MAX_QUEUED: usize = 64 << 20;
 /// Where control messages wait to be written. Cheap to clone.
 #[derive(Clone, Debug)]
 pub(super) struct Outbox {
-    messages: mpsc::UnboundedSender<Option<Message>>,
+    messages: mpsc::UnboundedSender<Option<(Message, Option<Charge>)>>,
     queued: Arc<AtomicUsize>,
+    /// What the peer's identity may leave unread, over all of its links, once that is known.
+    identity: Arc<OnceLock<Arc<Meter>>>,
     connection: Connection,
 }
 
 impl Outbox {
     /// Writes what is sent until the connection ends, or the last outbox, or one is told to.
     pub(super) fn spawn(connection: Connection, mut writer: ControlWriter) -> Self {
-        let (messages, mut receiver) = mpsc::unbounded_channel::<Option<Message>>();
-        let queued = Arc::new(AtomicUsize::new(0));
-        let outbox = Self { messages, queued: Arc::clone(&queued), connection: connection.clone() };
+        let (messages, mut receiver) = mpsc::unbounded_channel();
+        let (queued, identity) = (Arc::new(AtomicUsize::new(0)), Arc::default());
+        let outbox = Self {
+            messages,
+            queued: Arc::clone(&queued),
+            identity,
+            connection: connection.clone(),
+        };
         tokio::spawn(async move {
-            while let Some(Some(message)) = receiver.recv().await {
+            // The charge is held until its message is written.
+            while let Some(Some((message, _charge))) = receiver.recv().await {
                 let result = writer.send(&message).await;
                 // Relaxed here and in `send`: a bound, not a hand-over.
                 queued.fetch_sub(weight(&message), Ordering::Relaxed);
@@ -144,14 +152,22 @@ impl Outbox {
         outbox
     }
 
+    /// From now on what waits counts for this identity's links together, too.
+    pub(super) fn charge_to(&self, identity: Arc<Meter>) {
+        // An error: it is known already, and an outbox has one peer.
+        let _ = self.identity.set(identity);
+    }
+
     /// Queues a message; one that comes too late is lost with the link. Closes the link when the
     /// peer does not read what it is sent.
     pub(super) fn send(&self, message: Message) {
         let weight = weight(&message);
-        if self.queued.fetch_add(weight, Ordering::Relaxed) > MAX_QUEUED {
+        let charge = self.identity.get().map(|identity| identity.charge(weight));
+        let is_full = matches!(charge, Some(None));
+        if self.queued.fetch_add(weight, Ordering::Relaxed) > MAX_QUEUED || is_full {
             return close(&self.connection, CloseCode::TooLarge, "control messages are not read");
         }
-        let _ = self.messages.send(Some(message));
+        let _ = self.messages.send(Some((message, charge.flatten())));
     }
 
     /// Ends the control stream behind what was queued. What others queue now is lost.
@@ -196,5 +212,54 @@ impl ControlWriter {
     pub(super) async fn send(&mut self, message: &Message) -> Result<(), ControlError> {
         let frame = message.to_frame()?;
         self.stream.write_all(&frame).await.map_err(|e| ControlError::Ended(e.to_string()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{
+        gateway::played::{Pair, block_on},
+        link::RouteRefused,
+    };
+
+    const LENGTH: usize = 64 << 10;
+
+    fn long() -> Message {
+        let reason = "r".repeat(LENGTH);
+        Message::RouteRefused(RouteRefused { route: 1, reason, retry_s: None })
+    }
+
+    async fn outbox(pair: &Pair, identity: &Arc<Meter>) -> Outbox {
+        let (stream, _) = pair.here.open_bi().await.unwrap();
+        let outbox = Outbox::spawn(pair.here.clone(), ControlWriter::new(stream));
+        outbox.charge_to(Arc::clone(identity));
+        outbox
+    }
+
+    #[test]
+    fn what_an_identity_leaves_unread_is_bounded_over_its_links_and_given_back() {
+        block_on(async {
+            // None of them reads.
+            let pairs = [Pair::new().await, Pair::new().await];
+            let identity = Meter::new(4 << 20);
+            let [one, other] =
+                [outbox(&pairs[0], &identity).await, outbox(&pairs[1], &identity).await];
+            for _ in 0..(4 << 20) / LENGTH / 2 {
+                one.send(long());
+            }
+            assert!(pairs[0].here.close_reason().is_none(), "it is within the bound");
+            for _ in 0..(4 << 20) / LENGTH {
+                other.send(long());
+            }
+            assert!(pairs[1].here.close_reason().is_some());
+            assert!(pairs[0].here.close_reason().is_none(), "the other link stands");
+            assert!(identity.held() <= identity.most());
+            drop((one, other));
+            pairs[0].here.close(0_u32.into(), b"");
+            while identity.held() > 0 {
+                tokio::task::yield_now().await;
+            }
+        });
     }
 }

@@ -111,7 +111,7 @@ pub(super) fn wanted<'a>(
 
 /// Relays that a peer may have: a thirty-second of the endpoints that the gateway's session may have for
 /// all peers. Each takes a lane for each publisher here that it reads.
-const MAX_RELAYS: usize = 2048;
+pub(super) const MAX_RELAYS: usize = 2048;
 /// Those for one route.
 const MAX_RELAYS_OF_ROUTE: usize = 16;
 

@@ -196,6 +196,7 @@ impl Hub {
         let connection = established.connection;
         let identity = who.host_identity(connection.remote_address());
         let account = self.shared.accounts.of(&identity);
+        established.outbox.charge_to(Arc::clone(&account.unsent));
         let carrying = watch::Sender::new(());
         let in_use = carrying.subscribe();
         let link = Link {

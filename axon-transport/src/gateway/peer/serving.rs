@@ -33,8 +33,8 @@ pub(super) struct Served {
     /// Its readers there.
     pub(super) subscribers: Vec<Gid>,
     pub(super) sources: Vec<Source>,
-    /// What it takes of the peer's account.
-    _charge: Charge,
+    /// What it takes of the peer's account: bytes, and relays.
+    _charges: [Charge; 2],
     /// Whether it was asked for on the link in use.
     pub(super) repeated: bool,
     /// Sends ROUTE_READY once a publisher is attached.
@@ -119,6 +119,10 @@ impl Peer {
             Kind::Topic => self.open_relays(&key, &subscribers, &old, shared),
             Kind::Request | Kind::Response => self.of_service(&key),
         };
+        let relays = sources.iter().filter(|source| matches!(source, Source::Relay(..))).count();
+        let room = &self.remote.account().relays;
+        // There is room for all of them: all peers are served by one task.
+        let relays = room.charge(relays).unwrap_or_else(|| room.nothing());
         let _announcing = self.announce_ready(number, &sources);
         let route = Route { kind, topic: hash };
         let seen = last.iter().map(|l| (l.publisher, l.sequence)).collect();
@@ -127,8 +131,15 @@ impl Peer {
         let _ = self.orders.send(Order::Route(number, out));
         let subscribers = subscribers.iter().map(|subscriber| subscriber.gid).collect();
         let repeated = true;
-        let served =
-            Served { key, route, subscribers, sources, _charge: charge, repeated, _announcing };
+        let served = Served {
+            key,
+            route,
+            subscribers,
+            sources,
+            _charges: [charge, relays],
+            repeated,
+            _announcing,
+        };
         self.served.insert(number, served);
         Ok(())
     }
@@ -188,8 +199,8 @@ impl Peer {
         let there = |spec: &RelaySpec| {
             old.iter().position(|source| matches!(source, Source::Relay(o, _) if o.is(spec)))
         };
-        let topics = self.served.values().filter(|served| served.key.kind == Kind::Topic);
-        let elsewhere: usize = topics.map(|served| served.sources.len()).sum();
+        // Those of this route are not among them: what it took was given back.
+        let elsewhere = self.remote.account().relays.held();
         let refused = admit(&mut specs, |spec| there(spec).is_some(), elsewhere);
         if refused > 0 {
             let topic = &key.topic;
