@@ -16,6 +16,7 @@ use super::{
     bridge::ToControl,
     registry::Registry,
     status::{LinkStatus, RefusalStatus, TrafficStatus, unix_ms},
+    turns::Turns,
 };
 use crate::{
     config::Config,
@@ -64,6 +65,7 @@ pub(super) struct Control {
     /// Where linked peers are.
     linked: BTreeMap<DaemonId, IpAddr>,
     wakers: HashMap<SessionId, Rc<Notify>>,
+    pub(super) turns: Turns,
     /// Wakes the task that flushes the graph.
     pub(super) changed: Rc<Notify>,
     /// Whether there is an application, and what wakes the task that waits for that to change.
@@ -94,6 +96,7 @@ impl Control {
             names: BTreeMap::new(),
             linked: BTreeMap::new(),
             wakers: HashMap::new(),
+            turns: Turns::default(),
             config,
             changed: Rc::default(),
             needed: false,
@@ -111,14 +114,19 @@ impl Control {
         bell
     }
 
-    /// A session's task ends. `bell` is its own: a session that came back has another.
-    pub(super) fn remove(&mut self, id: &SessionId, bell: &Rc<Notify>) {
-        if self.wakers.get(id).is_some_and(|current| Rc::ptr_eq(current, bell)) {
-            self.wakers.remove(id);
-            self.registry.disconnect(id);
-            self.keys_of_sessions.remove(id);
-            self.settle();
+    /// A session's task ends: removes a part of what is left of the session; whether there is more.
+    /// `bell` is its own: a session that came back has another.
+    pub(super) fn remove_some(&mut self, id: &SessionId, bell: &Rc<Notify>) -> bool {
+        if !self.is_current(id, bell) {
+            return false;
         }
+        let more = self.registry.disconnect_some(id);
+        if !more {
+            self.wakers.remove(id);
+            self.keys_of_sessions.remove(id);
+        }
+        self.settle();
+        more
     }
 
     /// Whether `bell` is still that of the session's task.

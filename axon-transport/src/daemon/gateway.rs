@@ -72,7 +72,7 @@ impl Running {
                 Err(_) => "panicked; the log says where".to_owned(),
             });
         })?;
-        spawn_local(serve(control.clone(), ours.into(), Inside::Gateway, || ()));
+        spawn_local(serve(control.clone(), ours.into(), Inside::Gateway, None));
         Ok(Self { orders, events, end })
     }
 

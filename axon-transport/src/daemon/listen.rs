@@ -5,21 +5,18 @@ use std::{
     os::fd::{AsFd, BorrowedFd, OwnedFd},
     rc::Rc,
     sync::Arc,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use rustix::net::{AddressFamily, SocketFlags, SocketType, accept_with, socketpair};
-use tokio::{
-    io::unix::AsyncFd,
-    sync::{Notify, Semaphore},
-    task::spawn_local,
-    time::timeout,
-};
+use tokio::{io::unix::AsyncFd, sync::Notify, task::spawn_local, time::timeout};
 
 use super::{
     control::Control,
     first::{First, first},
-    registry::{MAX_OF_PROCESS, SessionEntry},
+    registry::{MAX_OF_PROCESS, MAX_QUEUE, SessionEntry},
+    strangers::{Stranger, Strangers},
+    turns::{PART, Turn},
     watch::watch,
 };
 use crate::{
@@ -38,16 +35,15 @@ use crate::{
 
 /// How long a connection may take to say HELLO.
 const HELLO: Duration = Duration::from_secs(5);
-/// Connections that may be without a HELLO at a time.
-const STRANGERS: usize = 256;
 /// Between attempts when no connection can be accepted.
 const PAUSE: Duration = Duration::from_millis(50);
-/// Packets taken from one session before the others have their turn.
-const BATCH: usize = 64;
+/// Packets that may wait for a session whose own are taken: its endpoints may make more of them than
+/// it reads.
+const UNREAD: usize = MAX_QUEUE / 4;
 
 /// Accepts sessions for as long as it is polled.
 pub(super) async fn accept(control: Rc<RefCell<Control>>, listeners: Vec<OwnedFd>) {
-    let strangers = Arc::new(Semaphore::new(STRANGERS));
+    let strangers = Strangers::default();
     let mut listeners = listeners.into_iter();
     // A path, a name, or both.
     let [first, second] = [listeners.next(), listeners.next()].map(|listener| async {
@@ -58,14 +54,13 @@ pub(super) async fn accept(control: Rc<RefCell<Control>>, listeners: Vec<OwnedFd
     tokio::join!(first, second);
 }
 
-async fn accept_at(control: Rc<RefCell<Control>>, listener: OwnedFd, strangers: Arc<Semaphore>) {
+async fn accept_at(control: Rc<RefCell<Control>>, listener: OwnedFd, strangers: Strangers) {
     let listener = match watch(listener) {
         Ok(listener) => listener,
         Err(error) => return tracing::error!(%error, "the session socket cannot be watched"),
     };
     let mut full = false;
     loop {
-        let Ok(permit) = strangers.clone().acquire_owned().await else { return };
         let Ok(mut ready) = listener.readable().await else { return };
         if passed::is_short() || passed::has_too_many_strangers() {
             // Those that have a session keep it.
@@ -80,11 +75,12 @@ async fn accept_at(control: Rc<RefCell<Control>>, listener: OwnedFd, strangers: 
         let accepted = ready.try_io(|l| Ok(accept_with(l.get_ref(), flags)?));
         match accepted {
             Ok(Ok(socket)) => {
-                let control = control.clone();
                 let socket = PassedFd::connection(socket);
-                spawn_local(async move {
-                    serve(control, socket, Inside::No, move || drop(permit)).await;
-                });
+                let pid = socket::peer(&socket).map_or(0, |peer| peer.pid);
+                let stranger = strangers.add(pid);
+                spawn_local(serve(control.clone(), socket, Inside::No, Some(stranger)));
+                // Those that were served meanwhile go on.
+                tokio::task::yield_now().await;
             }
             Ok(Err(error)) => {
                 // Out of descriptors, or the caller has gone: neither ends the daemon.
@@ -106,12 +102,12 @@ pub(super) enum Inside {
     Relay { pid: u32, tally: Arc<Tally>, key: Option<Arc<SessionKey>> },
 }
 
-/// Serves one connection to its end. `known` is called when it is a stranger no more.
+/// Serves one connection to its end. It is a `stranger` until it said HELLO.
 pub(super) async fn serve(
     control: Rc<RefCell<Control>>,
     socket: PassedFd,
     inside: Inside,
-    known: impl FnOnce(),
+    stranger: Option<Stranger>,
 ) {
     let Ok(peer) = socket::peer(&socket) else { return };
     if !control.borrow().admission.trusts(peer.uid) {
@@ -119,15 +115,43 @@ pub(super) async fn serve(
         return;
     }
     let Ok(socket) = watch(socket.trusted()) else { return };
-    let Ok(Some(first)) = timeout(HELLO, first(&socket)).await else { return };
-    known();
+    let replaced = async {
+        match &stranger {
+            Some(stranger) => stranger.replaced().await,
+            None => std::future::pending().await,
+        }
+    };
+    let first = tokio::select! {
+        first = timeout(HELLO, first(&socket)) => first,
+        () = replaced => {
+            return tracing::warn!(
+                pid = peer.pid,
+                "too many connections say nothing: one of them was closed for another"
+            );
+        }
+    };
+    drop(stranger);
+    let Ok(Some(first)) = first else { return };
     if first.hello.relay.is_some() {
         return relay(&control, socket, first, peer);
     }
-    let Some((id, bell, death)) = admit(&control, &socket, first, peer, &inside) else { return };
-    let why = converse(&control, &socket, id, &bell, death.as_ref()).await;
+    let Some(Admitted { id, bell, turn, death }) = admit(&control, &socket, first, peer, &inside)
+    else {
+        return;
+    };
+    let why = converse(&control, &socket, id, &bell, &turn, death.as_ref()).await;
     tracing::debug!(session = %id, why, "a session ended");
-    control.borrow_mut().remove(&id, &bell);
+    // Its descriptors are closed at once, its endpoints removed in its process's turns.
+    drop((socket, death));
+    loop {
+        {
+            let _turn = turn.lock().await;
+            if !control.borrow_mut().remove_some(&id, &bell) {
+                return;
+            }
+        }
+        tokio::task::yield_now().await;
+    }
 }
 
 /// Says something to somebody new, whose socket has room; whether it was said.
@@ -191,7 +215,7 @@ fn relay(control: &Rc<RefCell<Control>>, socket: AsyncFd<PassedFd>, first: First
     let tally = Arc::new(Tally::new(&reason));
     tracing::info!(name = hello.name, pid = peer.pid, reason, "a session is relayed");
     let inside = Inside::Relay { pid: peer.pid, tally: Arc::clone(&tally), key };
-    spawn_local(serve(control.clone(), ours.into(), inside, || ()));
+    spawn_local(serve(control.clone(), ours.into(), inside, None));
     let far = Far {
         socket: socket.into_inner(),
         inside: theirs,
@@ -217,7 +241,15 @@ fn scoped(config: &Config, scope: Scope) -> Arc<Config> {
     Arc::new(Config { range, static_peers, ..config.clone() })
 }
 
-type Admitted = (SessionId, Rc<Notify>, Option<AsyncFd<PassedFd>>);
+/// A session that is served.
+struct Admitted {
+    id: SessionId,
+    bell: Rc<Notify>,
+    /// Its process's.
+    turn: Turn,
+    /// Tells that its process ended.
+    death: Option<AsyncFd<PassedFd>>,
+}
 
 fn admit(
     control: &Rc<RefCell<Control>>,
@@ -275,6 +307,7 @@ fn admit(
     if let Some(key) = key {
         control.keys_of_sessions.insert(key);
     }
+    let turn = control.turns.of(pid);
     let pid = std::process::id();
     let welcome = Welcome { protocol: PROTOCOL, daemon: control.id, pid, ranges: Some(true) };
     let probe: Vec<BorrowedFd<'_>> = control.probe.iter().map(AsFd::as_fd).collect();
@@ -286,7 +319,7 @@ fn admit(
     }
     let bell = control.add_waker(session);
     control.settle();
-    Some((session, bell, death))
+    Some(Admitted { id: session, bell, turn, death })
 }
 
 /// The process of a session whose endpoints have the same GIDs as those of `session`, of process
@@ -305,14 +338,25 @@ async fn converse(
     socket: &AsyncFd<PassedFd>,
     id: SessionId,
     bell: &Rc<Notify>,
+    turn: &Turn,
     death: Option<&AsyncFd<PassedFd>>,
 ) -> String {
     let mut buffer = Vec::new();
     loop {
-        let full = match send_all(control, socket, &id, bell) {
-            Ok(full) => full,
+        let sent = {
+            let _turn = turn.lock().await;
+            send_some(control, socket, &id, bell)
+        };
+        let full = match sent {
+            Ok(Sent::All) => false,
+            Ok(Sent::Full) => true,
+            Ok(Sent::Some) => {
+                tokio::task::yield_now().await;
+                continue;
+            }
             Err(error) => return error.to_string(),
         };
+        let queued = control.borrow().registry.session(&id).map_or(0, SessionEntry::queued);
         tokio::select! {
             () = bell.notified() => {
                 if !control.borrow().is_current(&id, bell) {
@@ -321,17 +365,21 @@ async fn converse(
             }
             ready = socket.writable(), if full => {
                 let Ok(mut ready) = ready else { return "its socket cannot be watched".into() };
-                match send_all(control, socket, &id, bell) {
-                    Ok(true) => ready.clear_ready(),
-                    Ok(false) => {}
+                let _turn = turn.lock().await;
+                match send_some(control, socket, &id, bell) {
+                    Ok(Sent::Full) => ready.clear_ready(),
+                    Ok(Sent::All | Sent::Some) => {}
                     Err(error) => return error.to_string(),
                 }
             }
             // Too many descriptors in flight: nothing says when that is over.
             () = tokio::time::sleep(Duration::from_millis(20)), if full => {}
-            ready = socket.readable() => {
+            ready = socket.readable(), if queued < UNREAD => {
                 let Ok(mut ready) = ready else { return "its socket cannot be watched".into() };
-                match receive_some(control, socket, &id, bell, &mut buffer) {
+                let turn = turn.lock().await;
+                let received = receive_some(control, socket, &id, bell, &mut buffer);
+                drop(turn);
+                match received {
                     Ok(true) => ready.clear_ready(),
                     Ok(false) => tokio::task::yield_now().await,
                     Err(why) => return why,
@@ -342,19 +390,29 @@ async fn converse(
     }
 }
 
-/// Sends what waits for a session; whether some is left because the socket is full.
-fn send_all(
+/// What came of sending.
+enum Sent {
+    /// Nothing waits any more.
+    All,
+    /// Some waits, and the others have their turn first.
+    Some,
+    /// The socket is full.
+    Full,
+}
+
+/// Sends what waits for a session, for as long as a turn is.
+fn send_some(
     control: &Rc<RefCell<Control>>,
     socket: &AsyncFd<PassedFd>,
     id: &SessionId,
     bell: &Rc<Notify>,
-) -> Result<bool, SocketError> {
+) -> Result<Sent, SocketError> {
     let control = &mut *control.borrow_mut();
     // What waits is for the connection on which the session came back.
     if !control.is_current(id, bell) {
-        return Ok(false);
+        return Ok(Sent::All);
     }
-    let registry = &mut control.registry;
+    let (registry, begin) = (&mut control.registry, Instant::now());
     while let Some(output) = registry.next_output(id) {
         let descriptors: Vec<BorrowedFd<'_>> =
             output.descriptors.iter().map(|d| d.as_fd()).collect();
@@ -366,12 +424,15 @@ fn send_all(
             Err(SocketError::NotReady) => {
                 drop(descriptors);
                 registry.return_output(id, output);
-                return Ok(true);
+                return Ok(Sent::Full);
             }
             Err(error) => return Err(error),
         }
+        if begin.elapsed() >= PART {
+            return Ok(Sent::Some);
+        }
     }
-    Ok(false)
+    Ok(Sent::All)
 }
 
 /// Receives one packet, unless it has descriptors for which there may be no room.
@@ -382,7 +443,8 @@ pub(super) fn receive(socket: &PassedFd, buffer: &mut Vec<u8>) -> Result<Receive
     socket::receive(socket, buffer)
 }
 
-/// Takes a batch of packets; whether the socket is empty now.
+/// Takes packets for as long as a turn is, or as long as the session reads what they bring it; whether
+/// the socket is empty now.
 fn receive_some(
     control: &Rc<RefCell<Control>>,
     socket: &AsyncFd<PassedFd>,
@@ -394,8 +456,9 @@ fn receive_some(
     if !control.is_current(id, bell) {
         return Err("it came back on another connection".into());
     }
-    let mut outcome = Ok(false);
-    for _ in 0..BATCH {
+    let (mut outcome, begin) = (Ok(false), Instant::now());
+    let queued = |c: &Control| c.registry.session(id).map_or(0, SessionEntry::queued);
+    while begin.elapsed() < PART && queued(control) < UNREAD {
         match receive(socket.get_ref(), buffer) {
             Ok(Received { message: Message::StatusRequest, .. }) => control.send_status(id),
             // The one thing that is handed over after HELLO, and the only one that the daemon reads:

@@ -19,7 +19,9 @@ mod report;
 mod run;
 pub mod spawn;
 pub mod status;
+mod strangers;
 mod topics;
+mod turns;
 pub(crate) mod watch;
 
 pub use crate::secrets::ErasingHeap;

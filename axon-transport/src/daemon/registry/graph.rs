@@ -95,10 +95,23 @@ impl<F: Clone> Registry<F> {
             if shown.peek().is_none() && removed.is_empty() {
                 continue;
             }
-            for packet in packets(self.version, false, shown, removed, &ended, false) {
-                self.push_encoded(&sessions, &packet);
+            let (shown, telling): (Vec<_>, Vec<_>) = (shown.collect(), self.telling(&sessions));
+            let rest: Vec<_> =
+                sessions.iter().filter(|id| !telling.contains(id)).copied().collect();
+            // One that is being told everything takes a change as a part of the whole.
+            for (sessions, open) in [(rest, false), (telling, true)] {
+                let shown = shown.iter().cloned().take_while(|_| !sessions.is_empty());
+                for packet in packets(self.version, false, shown, removed, &ended, open) {
+                    self.push_encoded(&sessions, &packet);
+                }
             }
         }
+    }
+
+    /// Those of them that are being told everything.
+    fn telling(&self, sessions: &[SessionId]) -> Vec<SessionId> {
+        let told = |id: &&SessionId| self.sessions.get(*id).is_some_and(|s| s.telling.is_some());
+        sessions.iter().filter(told).copied().collect()
     }
 
     /// A number that stands for the endpoints of applications here: another one, most likely, when

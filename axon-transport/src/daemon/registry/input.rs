@@ -4,7 +4,8 @@ use std::collections::BTreeSet;
 
 use super::{
     Asked, LocalEndpoint, MAX_ALL_PAIRS, MAX_PAIRS, MAX_SESSIONS, MAX_TOMBSTONES, Registry,
-    SessionEntry, Violation, output::session_entry,
+    SessionEntry, Violation,
+    output::{PAIRS_TOGETHER, session_entry},
 };
 use crate::{
     graph::{Endpoint, EndpointKind, LIMITS, Scope, writes},
@@ -46,13 +47,29 @@ impl<F: Clone> Registry<F> {
 
     /// A session that is gone, and its endpoints with it.
     pub fn disconnect(&mut self, id: &SessionId) {
-        let Some(entry) = self.sessions.get_mut(id) else { return };
-        for gid in std::mem::take(&mut entry.endpoints) {
+        while self.disconnect_some(id) {}
+    }
+
+    /// As [`disconnect`](Self::disconnect), a part of it; whether there is more to do. What is left of
+    /// the session is told nothing any more.
+    pub fn disconnect_some(&mut self, id: &SessionId) -> bool {
+        self.mark_behind(id);
+        let mut pairs = 0;
+        while let Some(entry) = self.sessions.get_mut(id) {
+            let before = self.pairs.len();
+            let Some(gid) = entry.endpoints.pop_first() else {
+                self.sessions.remove(id);
+                self.ready.remove(id);
+                self.rescoped = true;
+                return false;
+            };
             self.remove_endpoint(&gid, "its session ended");
+            pairs += 1 + before - self.pairs.len();
+            if pairs >= PAIRS_TOGETHER {
+                return true;
+            }
         }
-        self.sessions.remove(id);
-        self.ready.remove(id);
-        self.rescoped = true;
+        false
     }
 
     /// A message of a session.

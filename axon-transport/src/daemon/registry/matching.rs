@@ -1,7 +1,5 @@
 //! Who goes with whom.
 
-use std::collections::BTreeSet;
-
 use super::{Asked, LocalEndpoint, Members, Registry, Topic};
 use crate::{
     graph::{Endpoint, EndpointKind, Pairing, pairing, reads, writes},
@@ -96,15 +94,6 @@ impl<F: Clone> Registry<F> {
         if local.role == EndpointRole::Application {
             self.graph_end(*gid);
         }
-    }
-
-    /// The pairs of a session's endpoints. All pairs are not looked through: of hundreds of sessions
-    /// that start at once, each is told of its own.
-    pub(super) fn pairs_of(&self, id: &SessionId) -> BTreeSet<Pair> {
-        let gids = self.sessions.get(id).into_iter().flat_map(|entry| &entry.endpoints);
-        let prospects =
-            gids.filter_map(|gid| Some(self.prospective_pairs(&self.endpoints.get(gid)?.endpoint)));
-        prospects.flatten().filter(|pair| self.pairs.contains_key(pair)).collect()
     }
 
     /// How many pairs an endpoint would make at most.

@@ -110,6 +110,8 @@ pub struct SessionEntry<F> {
     behind: bool,
     /// It asked to be told everything anew, and is once it has taken what waits for it.
     resync: bool,
+    /// Its endpoints whose pairs it is still to be told of, while it is told everything.
+    telling: Option<Vec<Gid>>,
     /// The pairs that its announcements made.
     pairs: usize,
     /// What it asked about, and the next part of it.

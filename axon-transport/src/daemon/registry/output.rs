@@ -12,6 +12,9 @@ use crate::{
     session::message::{Graph, Message, SessionRole, StatusPart},
 };
 
+/// Pairs of which a session is told at a time, and the rest of those of one endpoint.
+pub(super) const PAIRS_TOGETHER: usize = 256;
+
 /// A packet for a session.
 #[derive(Clone, Debug)]
 pub struct Output<F> {
@@ -28,16 +31,21 @@ impl<F: Clone> Registry<F> {
     ///
     /// A session that is behind is told everything anew: the graph, its matches or what was granted
     /// to its readers, and what readers asked of its writers, closed by a GRAPH without `more`. What
-    /// it does not hear again is over.
+    /// it does not hear again is over. It is told a part at a time, when it has taken what waits for it:
+    /// so the parts and what changes in between come in the order in which they were so.
     pub fn next_output(&mut self, id: &SessionId) -> Option<Output<F>> {
         let entry = self.sessions.get_mut(id)?;
-        if entry.queue.is_empty() && (entry.behind || entry.resync) {
-            self.tell_everything(id);
+        if entry.queue.is_empty() {
+            if entry.telling.is_some() {
+                self.tell_pairs(id);
+            } else if entry.behind || entry.resync {
+                self.tell_everything(id);
+            }
         }
         let entry = self.sessions.get_mut(id)?;
         let output = entry.queue.pop_front();
         entry.queued_bytes -= output.as_ref().map_or(0, |output| output.packet.len());
-        if entry.queue.is_empty() {
+        if entry.queue.is_empty() && entry.telling.is_none() {
             entry.queue_limit = MAX_QUEUE;
             entry.bytes_limit = MAX_QUEUE_BYTES;
         }
@@ -84,6 +92,10 @@ impl<F: Clone> Registry<F> {
 
     /// Queues a message for one session.
     pub fn push(&mut self, to: &SessionId, message: &Message, descriptors: Vec<F>) {
+        // It is told everything anew.
+        if self.sessions.get(to).is_none_or(|entry| entry.behind) {
+            return;
+        }
         let Some(packet) = encode(message) else { return };
         let segment = match message {
             Message::Segment(opened) => Some((opened.session, opened.segment.number)),
@@ -135,6 +147,7 @@ impl<F: Clone> Registry<F> {
         if let Some(entry) = self.sessions.get_mut(id) {
             // There is no graph that a tool could be behind with.
             entry.behind = entry.role != SessionRole::Tool;
+            entry.telling = None;
             entry.queue.clear();
             entry.queued_bytes = 0;
             self.ready.insert(*id);
@@ -149,32 +162,58 @@ impl<F: Clone> Registry<F> {
         entry.behind = false;
         entry.resync = false;
         entry.known.clear();
+        entry.telling = Some(entry.endpoints.iter().copied().collect());
         entry.queue_limit = usize::MAX;
         entry.bytes_limit = usize::MAX;
         for packet in packets {
             self.push_encoded(&[*id], &packet);
         }
-        for pair in self.pairs_of(id) {
-            // A reader that is not served yet asks again; one that is learns how.
-            if self.owner(&pair.reader) == Some(*id) && !self.forward_grant(&pair) {
-                self.push(id, &Message::Match(pair), Vec::new());
-            }
-            if self.owner(&pair.writer) == Some(*id) {
-                self.forward_attach(&pair);
+        self.limit_queue(id);
+    }
+
+    /// Tells a session of pairs of its endpoints, some at a time, and at last that this is the whole.
+    fn tell_pairs(&mut self, id: &SessionId) {
+        let Some(entry) = self.sessions.get_mut(id) else { return };
+        entry.queue_limit = usize::MAX;
+        entry.bytes_limit = usize::MAX;
+        let mut told = 0;
+        while told < PAIRS_TOGETHER {
+            let Some(entry) = self.sessions.get_mut(id) else { return };
+            let Some(gid) = entry.telling.as_mut().and_then(Vec::pop) else {
+                entry.telling = None;
+                return self.tell_end(id);
+            };
+            let Some(local) = self.endpoints.get(&gid) else { continue };
+            let mut pairs = self.prospective_pairs(&local.endpoint);
+            pairs.retain(|pair| self.pairs.contains_key(pair));
+            told += pairs.len();
+            for pair in pairs {
+                // A reader that is not served yet asks again; one that is learns how.
+                if pair.reader == gid && !self.forward_grant(&pair) {
+                    self.push(id, &Message::Match(pair), Vec::new());
+                }
+                if pair.writer == gid {
+                    self.forward_attach(&pair);
+                }
             }
         }
+        self.limit_queue(id);
+    }
+
+    fn tell_end(&mut self, id: &SessionId) {
         let (added, removed) = (Vec::new(), Vec::new());
         let end =
             Graph { version: self.version, whole: false, added, removed, more: false, ended: None };
         self.push(id, &Message::Graph(end), Vec::new());
+        self.limit_queue(id);
+    }
+
+    /// As much as usual may wait besides what waits now.
+    fn limit_queue(&mut self, id: &SessionId) {
         if let Some(entry) = self.sessions.get_mut(id) {
             entry.queue_limit = entry.queue.len() + MAX_QUEUE;
             entry.bytes_limit = entry.queued_bytes + MAX_QUEUE_BYTES;
         }
-    }
-
-    fn owner(&self, gid: &crate::ids::Gid) -> Option<SessionId> {
-        self.endpoints.get(gid).map(|e| e.session)
     }
 }
 
@@ -216,6 +255,7 @@ pub(super) fn session_entry<F>(
         bytes_limit: MAX_QUEUE_BYTES,
         behind: false,
         resync: false,
+        telling: None,
         pairs: 0,
         status: None,
         refused: false,

@@ -1,0 +1,103 @@
+//! Connections that have not said HELLO yet.
+
+use std::{
+    cell::RefCell,
+    collections::{BTreeMap, HashMap},
+    rc::Rc,
+};
+
+use tokio::sync::Notify;
+
+/// Connections that may be without a HELLO at a time.
+const MOST: usize = 256;
+
+/// Those of all processes. Of too many the process goes short that has the most of them, by the one
+/// that has said nothing for longest: a process that speaks as it connects is not held up by others.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Strangers(Rc<RefCell<Waiting>>);
+
+#[derive(Debug, Default)]
+struct Waiting {
+    next: u64,
+    /// By the order in which they came: the process, and what tells that another one takes its place.
+    connections: BTreeMap<u64, (u32, Rc<Notify>)>,
+}
+
+/// One of them, until it is dropped.
+#[derive(Debug)]
+pub(super) struct Stranger {
+    strangers: Strangers,
+    number: u64,
+    replaced: Rc<Notify>,
+}
+
+impl Strangers {
+    /// A connection of process `pid` came. Another one may have to go for it.
+    pub(super) fn add(&self, pid: u32) -> Stranger {
+        let mut waiting = self.0.borrow_mut();
+        let (number, replaced) = (waiting.next, Rc::new(Notify::new()));
+        waiting.next += 1;
+        waiting.connections.insert(number, (pid, Rc::clone(&replaced)));
+        if waiting.connections.len() > MOST
+            && let Some((_, victim)) =
+                waiting.victim().and_then(|number| waiting.connections.remove(&number))
+        {
+            victim.notify_one();
+        }
+        drop(waiting);
+        Stranger { strangers: self.clone(), number, replaced }
+    }
+}
+
+impl Waiting {
+    fn victim(&self) -> Option<u64> {
+        let mut of: HashMap<u32, usize> = HashMap::new();
+        for (pid, _) in self.connections.values() {
+            *of.entry(*pid).or_default() += 1;
+        }
+        let most = of.values().max()?;
+        self.connections.iter().find(|(_, (pid, _))| of[pid] == *most).map(|(number, _)| *number)
+    }
+}
+
+impl Stranger {
+    /// Waits until another connection takes its place.
+    pub(super) async fn replaced(&self) {
+        self.replaced.notified().await;
+    }
+}
+
+impl Drop for Stranger {
+    fn drop(&mut self) {
+        self.strangers.0.borrow_mut().connections.remove(&self.number);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_oldest_of_the_process_with_the_most_connections_makes_room() {
+        let strangers = Strangers::default();
+        let there =
+            |stranger: &Stranger| strangers.0.borrow().connections.contains_key(&stranger.number);
+        let honest = strangers.add(7);
+        let crowd: Vec<_> = (0..3 * MOST).map(|_| strangers.add(9)).collect();
+        let late = strangers.add(8);
+        assert!(there(&honest) && there(&late));
+        assert_eq!(crowd.iter().filter(|stranger| there(stranger)).count(), MOST - 2);
+        assert!(!there(&crowd[0]) && there(crowd.last().unwrap()), "the oldest go");
+        drop((honest, late, crowd));
+        assert!(strangers.0.borrow().connections.is_empty());
+    }
+
+    #[test]
+    fn of_many_processes_with_one_each_the_oldest_makes_room() {
+        let strangers = Strangers::default();
+        let crowd: Vec<_> = (0..2 * MOST).map(|pid| strangers.add(pid as u32)).collect();
+        let there: Vec<_> = strangers.0.borrow().connections.keys().copied().collect();
+        assert_eq!(there, (MOST as u64..2 * MOST as u64).collect::<Vec<_>>());
+        drop(crowd);
+    }
+}

@@ -1,0 +1,52 @@
+//! Whose turn it is: the control plane is one thread, and a process may have many sessions.
+//!
+//! What a session asks for is done in parts of about [`PART`], and of one process one part at a time.
+//! After each the others are served, so that a process that asks for much waits for itself.
+
+use std::{
+    collections::HashMap,
+    rc::{Rc, Weak},
+    time::Duration,
+};
+
+use tokio::sync::Mutex;
+
+/// The time after which the others have their turn.
+pub(super) const PART: Duration = Duration::from_millis(1);
+
+/// What a session's task holds while it does a part of its process's work. First come, first served.
+pub(super) type Turn = Rc<Mutex<()>>;
+
+/// The turns of all processes that have sessions.
+#[derive(Debug, Default)]
+pub(super) struct Turns(HashMap<u32, Weak<Mutex<()>>>);
+
+impl Turns {
+    /// That of the sessions of process `pid`.
+    pub(super) fn of(&mut self, pid: u32) -> Turn {
+        if let Some(turn) = self.0.get(&pid).and_then(Weak::upgrade) {
+            return turn;
+        }
+        self.0.retain(|_, turn| turn.strong_count() > 0);
+        let turn = Turn::default();
+        self.0.insert(pid, Rc::downgrade(&turn));
+        turn
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sessions_of_a_process_share_a_turn_and_nothing_is_left_of_it() {
+        let mut turns = Turns::default();
+        let (one, again, other) = (turns.of(1), turns.of(1), turns.of(2));
+        let held = one.try_lock().unwrap();
+        assert!(again.try_lock().is_err() && other.try_lock().is_ok());
+        drop(held);
+        drop((one, again));
+        let _third = turns.of(3);
+        assert_eq!(turns.0.len(), 2);
+    }
+}
