@@ -173,9 +173,9 @@ fn a_process_that_ends_hands_over_to_the_next_daemon() {
     stop(&daemon);
     leaver.go();
     assert_eq!(leaver.hear(), "published");
-    leaver.go();
     drop(daemon);
     let _daemon = host.daemon();
+    leaver.go();
     leaver.finish();
     // It waits for a second at most: a slow machine may take longer to start the daemon.
     let mut bytes = Vec::new();
@@ -275,8 +275,7 @@ fn what_a_killed_daemon_loses_of_keep_last_and_best_effort_is_counted() {
             let mut daemon = Some(host.daemon());
             let from = session(&host, "from", from_shares);
             let to = session(&host, "to", to_shares);
-            let publisher =
-                from.create_publisher(spec("/t", depth_four(reliability))).unwrap();
+            let publisher = from.create_publisher(spec("/t", depth_four(reliability))).unwrap();
             let keeps = Qos { reliability, ..Qos::keep_all() };
             let subscription = to.create_subscription(spec("/t", keeps)).unwrap();
             await_pair(&publisher, &subscription);

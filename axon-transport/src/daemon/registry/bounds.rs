@@ -305,8 +305,17 @@ fn memory_that_is_given_up_does_not_wait_for_who_is_stopped() {
     registry.message(&id(2), Message::Attach(attach), vec![]).unwrap();
     let relayed = None;
     let (generation, first, segments, session) = (1, 0, vec![], id(1));
-    let granted =
-        Granted { reader, writer, generation, first, session, ring: lane, segments, after, relayed };
+    let granted = Granted {
+        reader,
+        writer,
+        generation,
+        first,
+        session,
+        ring: lane,
+        segments,
+        after,
+        relayed,
+    };
     registry.message(&id(1), Message::Grant(granted), vec![]).unwrap();
     drain(&mut registry, 2);
     let mut turn = |number| {

@@ -1,9 +1,11 @@
 //! The end in a relayed session's own process.
 
+mod next;
 mod relays;
 mod stand_ins;
 
 use std::{
+    cell::OnceCell,
     collections::{BTreeMap, BTreeSet, HashMap},
     sync::{
         Arc,
@@ -15,7 +17,7 @@ use std::{
 
 use self::{relays::Relay, stand_ins::StandIn};
 use super::{
-    LINGER, Pool, Tally,
+    Pool, Tally,
     calls::{self, Calls},
     flow::{Channel, Incoming},
     news::News,
@@ -28,17 +30,13 @@ use crate::{
     passed::PassedFd,
     session::{
         Session, SessionError, Shared,
-        connect::{Caller, Connected},
+        connect::Connected,
         local::House,
         message::{Announce, Asserted, EndpointRole, Gone, Graph, Leaving, Message, Refused},
         socket::SocketError,
     },
     wait::ExternalLeader,
 };
-
-/// Between attempts to find a daemon.
-const MIN_PAUSE: Duration = Duration::from_millis(100);
-const MAX_PAUSE: Duration = Duration::from_secs(2);
 
 /// Carries a session's samples to its daemon and back, until it is dropped.
 #[derive(Debug)]
@@ -58,6 +56,7 @@ struct Common {
     leader: ExternalLeader,
     news: Arc<News>,
     finish: Arc<AtomicBool>,
+    finish_by: OnceCell<Instant>,
     reason: String,
 }
 
@@ -81,6 +80,7 @@ impl Near {
             leader,
             news: Arc::clone(&news),
             finish: Arc::clone(&finish),
+            finish_by: OnceCell::new(),
             reason,
         };
         let blocked = crate::session::signals::Blocked::all();
@@ -117,8 +117,8 @@ impl Common {
             served.forget_world();
             kept = served.keep_relays();
             drop(served);
-            if self.finishes() {
-                return;
+            if self.finishes() && (why.is_ok() || kept.is_empty()) {
+                break;
             }
             if let Err(why) = why {
                 tracing::warn!(%why, "the connection to the daemon is lost");
@@ -126,38 +126,7 @@ impl Common {
             self.shared.set_daemon(None);
             next = self.reconnect(since.elapsed() < Duration::from_secs(1), &mut kept);
         }
-    }
-
-    fn finishes(&self) -> bool {
-        self.finish.load(Ordering::Acquire)
-    }
-
-    /// Another daemon; `None` when the session ends. `brief` says that the last one was as good as
-    /// none.
-    fn reconnect(&self, brief: bool, kept: &mut BTreeMap<Gid, Relay>) -> Option<Connected> {
-        let mut pause = MIN_PAUSE;
-        let mut wait = brief;
-        while !self.finishes() {
-            relays::drop_overdue(kept);
-            if std::mem::replace(&mut wait, true) {
-                std::thread::sleep(pause);
-                pause = (pause * 2).min(MAX_PAUSE);
-            }
-            let caller = Caller {
-                config: &self.shared.config,
-                options: &self.shared.options,
-                id: self.shared.id,
-                segment: None,
-                relay: Some(&self.reason),
-                cancel: Some(&self.finish),
-            };
-            match caller.connect() {
-                Ok(connected) => return Some(connected),
-                Err(SessionError::NoDaemon { .. }) => {}
-                Err(error) => tracing::error!(%error, "no daemon took the session"),
-            }
-        }
-        None
+        kept.values().for_each(Relay::give_up);
     }
 }
 
@@ -224,7 +193,6 @@ impl<'a> Served<'a> {
 
     fn serve(&mut self) -> Result<(), End> {
         let mut begun = false;
-        let mut finish_by: Option<Instant> = None;
         loop {
             let common = self.common;
             common.leader.clear();
@@ -265,11 +233,9 @@ impl<'a> Served<'a> {
                 }
             })?;
             let passed = self.calls.pass_over(find);
-            if common.finishes() {
-                let by = *finish_by.get_or_insert_with(|| Instant::now() + LINGER);
-                if self.is_drained() || Instant::now() >= by {
-                    return Ok(());
-                }
+            let finish_by = common.finish_by();
+            if finish_by.is_some_and(|by| self.is_drained() || Instant::now() >= by) {
+                return Ok(());
             }
             if more || sent || passed || self.pipe.waits_for_readers() && !waiting {
                 common.leader.disarm();

@@ -128,8 +128,13 @@ impl Relay {
 
 /// Lets go of the relays that waited for too long while there is no daemon.
 pub(super) fn drop_overdue(kept: &mut BTreeMap<Gid, Relay>) {
-    let overdue = kept.extract_if(.., |_, relay| !relay.waits());
-    overdue.for_each(|(_, relay)| relay.give_up());
+    kept.retain(|_, relay| {
+        let waits = relay.waits();
+        if !waits {
+            relay.give_up();
+        }
+        waits
+    });
 }
 
 impl Served<'_> {
@@ -153,8 +158,13 @@ impl Served<'_> {
                 wanted.insert(gid, readers);
             }
         }
-        let unwanted = self.relays.extract_if(.., |publisher, _| !wanted.contains_key(publisher));
-        unwanted.filter(|(_, relay)| relay.is_kept()).for_each(|(_, r)| r.give_up());
+        self.relays.retain(|publisher, relay| {
+            let is_wanted = wanted.contains_key(publisher);
+            if !is_wanted && relay.is_kept() {
+                relay.give_up();
+            }
+            is_wanted
+        });
         for (publisher, stands_for) in wanted {
             let gids: Vec<Gid> = stands_for.iter().take(MAX_MATCHED).copied().collect();
             if let Some(relay) = self.relays.get_mut(&publisher) {

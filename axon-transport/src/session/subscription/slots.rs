@@ -356,9 +356,11 @@ impl Slots {
             return;
         }
         // One after the other: what is missing among them was counted, or is by their numbers.
-        while let Ok(Some(next)) = slot.reader.peek()
-            && slot.reader.skip()
-        {
+        for _ in 0..slot.reader.unread() {
+            let Ok(Some(next)) = slot.reader.peek() else { break };
+            if !slot.reader.skip() {
+                break;
+            }
             slot.passed(next.sequence);
             slot.last = slot.last.max(Some(next.sequence));
             self.lost = self.lost.saturating_add(1);

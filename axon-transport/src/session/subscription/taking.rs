@@ -213,7 +213,7 @@ impl Slots {
     /// `first` in that ring is seen by its number, where the subscription knows an earlier one.
     pub(in crate::session) fn lost_elsewhere(&mut self, writer: &Gid, samples: u64, first: bool) {
         let mut of = self.slots.iter().filter(|slot| slot.reader.writer() == *writer);
-        if of.any(|slot| !slot.over && !(first && slot.resumed)) {
+        if of.any(|slot| !(slot.over || first && slot.resumed)) {
             self.lost = self.lost.saturating_add(samples);
         }
     }
