@@ -334,13 +334,15 @@ impl Slots {
     /// Gives up all but the last of what a writer left, or the last few where nothing is to be lost: one
     /// that begins anew and anew would otherwise take all lanes.
     fn forget_older(&mut self, writer: Gid) {
-        let kept = if self.keeps_all { LEFT } else { 1 };
         loop {
             let of = self.slots_of(writer);
-            if of.iter().filter(|index| self.slots[**index].over).count() <= kept {
+            let over = of.iter().filter(|index| self.slots[**index].over).count();
+            let [older, newer, ..] = of[..] else { return };
+            let same = self.slots[newer].reader.is_of_ring(&self.slots[older].reader);
+            if over <= if self.keeps_all && !same { LEFT } else { 1 } {
                 return;
             }
-            let mut slot = self.slots.remove(of[0]);
+            let mut slot = self.slots.remove(older);
             self.count_left(&mut slot);
             self.retire(&slot);
         }
