@@ -156,7 +156,7 @@ impl Pipe {
 
     /// The other end is gone, or as good as that: what it has said is heard, and nothing is said to it
     /// any more.
-    fn hang_up(&mut self) {
+    pub(super) fn hang_up(&mut self) {
         // Whoever has its end besides adds nothing, so that there is an end to what is to be heard.
         let _ = shutdown(&self.socket, Shutdown::Both);
         self.gone = true;

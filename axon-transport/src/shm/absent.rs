@@ -78,3 +78,26 @@ impl Absences {
         self.there().map(|absent| (absent.position, absent.gid)).min()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn samples_are_kept_from_the_oldest_position_until_the_reader_is_back() {
+        let mut absences = Absences::default();
+        assert!(absences.is_empty() && absences.oldest().is_none() && absences.left().is_none());
+        let [one, other] = [1, 2].map(|byte| Gid([byte; 16]));
+        absences.add(one, 7);
+        absences.add(other, 5);
+        // It died once more before it had got on.
+        absences.add(one, 6);
+        assert_eq!((absences.position_of(&one), absences.oldest()), (Some(6), Some((5, other))));
+        assert_eq!(absences.expire(9), 0, "they were not absent for long");
+        absences.end(&other);
+        assert_eq!((absences.position_of(&other), absences.oldest()), (None, Some((6, one))));
+        absences.0[0].until = Instant::now();
+        assert!(absences.is_empty() && absences.position_of(&one).is_none());
+        assert_eq!((absences.expire(9), absences.left()), (3, None));
+    }
+}

@@ -17,8 +17,26 @@ fn depth_four(reliability: Reliability) -> Qos {
     Qos { reliability, depth: 4, ..Qos::default() }
 }
 
+/// Has the daemon end in good order, and starts the next.
+fn relieve(host: &Host, daemon: &mut Option<Kept>) {
+    if let Some(Kept(child)) = daemon {
+        signal(child.id(), Signal::TERM);
+        child.wait().unwrap();
+    }
+    replace(host, daemon);
+}
+
 #[test]
 fn keep_all_samples_survive_killed_daemons() {
+    keep_all_survives(replace);
+}
+
+#[test]
+fn keep_all_samples_survive_daemons_that_end_in_good_order() {
+    keep_all_survives(relieve);
+}
+
+fn keep_all_survives(end: fn(&Host, &mut Option<Kept>)) {
     const SAMPLES: u64 = 3600;
     for (from_shares, to_shares) in ENDS {
         let host = host();
@@ -52,7 +70,7 @@ fn keep_all_samples_survive_killed_daemons() {
                 until("some are taken", || {
                     taken.load(Ordering::Relaxed) >= kill_at || taking.is_finished()
                 });
-                replace(&host, &mut daemon);
+                end(&host, &mut daemon);
             }
             taking.join().unwrap();
             publishing.join().unwrap();
@@ -162,6 +180,20 @@ fn samples_of_a_dropped_publisher_go_through_the_next_daemon() {
     }
 }
 
+/// In a child: publishes a little when it is told to, and ends when it is told so.
+pub(super) fn publish_and_end(session: &Session) {
+    let publisher = session.create_publisher(spec("/t", Qos::keep_all())).unwrap();
+    assert!(publisher.wait_matched(1, PATIENCE));
+    say("matched");
+    let mut line = String::new();
+    std::io::stdin().read_line(&mut line).unwrap();
+    for sequence in 1..=20 {
+        publish(&publisher, &pattern(sequence, 500));
+    }
+    say("published");
+    std::io::stdin().read_line(&mut line).unwrap();
+}
+
 #[test]
 fn a_process_that_ends_hands_over_to_the_next_daemon() {
     let host = host();
@@ -177,7 +209,7 @@ fn a_process_that_ends_hands_over_to_the_next_daemon() {
     let _daemon = host.daemon();
     leaver.go();
     leaver.finish();
-    // It waits for a second at most: a slow machine may take longer to start the daemon.
+    // It waits for a second at most, which may be too short for a slow machine.
     let mut bytes = Vec::new();
     let mut next = 1;
     while let Some(info) = subscription.take(&mut bytes) {

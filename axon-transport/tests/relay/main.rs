@@ -199,19 +199,7 @@ fn child() {
             std::io::stdin().read_line(&mut String::new()).unwrap();
             say(hostile::call_and_leave());
         }
-        // Publishes a little when it is told to, and ends.
-        "publisher that ends" => {
-            let publisher = session.create_publisher(spec("/t", Qos::keep_all())).unwrap();
-            assert!(publisher.wait_matched(1, PATIENCE));
-            say("matched");
-            let mut line = String::new();
-            std::io::stdin().read_line(&mut line).unwrap();
-            for sequence in 1..=20 {
-                publish(&publisher, &pattern(sequence, 500));
-            }
-            say("published");
-            std::io::stdin().read_line(&mut line).unwrap();
-        }
+        "publisher that ends" => killed::publish_and_end(&session),
         "publisher by hand" => hostile::publish_when_told(),
         "one that has another talk" => say(hostile::call_and_have_it_talk()),
         "caller" => {

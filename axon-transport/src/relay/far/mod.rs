@@ -169,6 +169,10 @@ impl Served {
             self.leader.arm(waits);
             let news = self.news.take() | !std::mem::replace(&mut begun, true);
             if self.news.is_lost() {
+                // Most often the daemon ends, and its process with it. Its readers shall not say before
+                // that they have left: what they had not delivered is kept for the next daemon.
+                self.pipe.hang_up();
+                std::thread::sleep(LINGER);
                 return Err(End::Other("the control plane dropped it".into()));
             }
             let (messages, more) = self.pipe.receive()?;
