@@ -311,6 +311,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             stands_for: Some(vec![reader]),
             segments: vec![segment],
             after: Some(2),
+            carries: Some(true),
         }),
         Message::Grant(Granted {
             reader,
@@ -321,6 +322,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             ring: place,
             segments: vec![segment],
             after: Some(2),
+            relayed: Some(true),
         }),
         Message::Detach(Pair { reader, writer }),
         Message::Unmatch(Unmatch { reader, writer, reason: "gone".into() }),

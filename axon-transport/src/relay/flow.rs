@@ -57,6 +57,11 @@ impl Channel {
         Self { writer: server, client: Some(client) }
     }
 
+    /// Samples up to this number are where they are to go.
+    pub(super) fn done(self, sequence: u64) -> Credit {
+        Credit { done: Some(sequence), ..self.credit(0, None) }
+    }
+
     fn credit(self, bytes: u64, opens: Option<u64>) -> Credit {
         Credit { publisher: self.writer, bytes, opens, client: self.client, done: None }
     }

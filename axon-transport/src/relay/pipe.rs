@@ -1,7 +1,7 @@
 //! The socket of a relay, as either end uses it: control messages first, then pieces of samples.
 
 use std::{
-    collections::{BTreeMap, VecDeque},
+    collections::{BTreeMap, BTreeSet, VecDeque},
     os::fd::BorrowedFd,
     sync::Arc,
     time::{Duration, Instant},
@@ -65,8 +65,13 @@ pub(super) struct Pipe {
     pub(super) incoming: Incoming,
     /// Samples that came and are not published yet.
     arrived: BTreeMap<Channel, VecDeque<Arrived>>,
+    /// Channels of which a sample was written, or is to be.
+    begun: BTreeSet<Channel>,
     /// Whether one of them waits for a reader.
-    pub(super) blocked: bool,
+    blocked: bool,
+    /// Channels whose samples are written and not all handed over: up to which number the other end was
+    /// told that they are, and the last number.
+    written: BTreeMap<Channel, (u64, u64)>,
     /// MATCHED that this end has said, and those that it has heard: by these both ends tell a channel
     /// from an earlier one of the same name.
     said: u64,
@@ -89,7 +94,9 @@ impl Pipe {
             outgoing: Outgoing::default(),
             incoming,
             arrived: BTreeMap::new(),
+            begun: BTreeSet::new(),
             blocked: false,
+            written: BTreeMap::new(),
             said: 0,
             heard: 0,
             gone: false,
@@ -133,11 +140,23 @@ impl Pipe {
     pub(super) fn retain(&mut self, keep: impl Fn(&Channel) -> bool) {
         self.incoming.retain(&keep);
         self.arrived.retain(|channel, _| keep(channel));
+        self.written.retain(|channel, _| keep(channel));
+        self.begun.retain(&keep);
+    }
+
+    /// Whether a sample waits for a reader.
+    pub(super) fn is_blocked(&self) -> bool {
+        self.blocked
+    }
+
+    /// Whether readers that go on are worth being woken for.
+    pub(super) fn waits_for_readers(&self) -> bool {
+        self.blocked || !self.written.is_empty()
     }
 
     /// The other end is gone, or as good as that: what it has said is heard, and nothing is said to it
     /// any more.
-    fn hang_up(&mut self) {
+    pub(super) fn hang_up(&mut self) {
         // Whoever has its end besides adds nothing, so that there is an end to what is to be heard.
         let _ = shutdown(&self.socket, Shutdown::Both);
         self.gone = true;
@@ -185,22 +204,26 @@ impl Pipe {
         Ok((messages, true))
     }
 
-    /// Writes what came, as far as readers make room; `lost` hears of samples that did not come.
+    /// Writes what came, as far as readers make room; `lost` hears of samples that did not come, and
+    /// whether it was before the first of its channel.
     pub(super) fn write<'a>(
         &mut self,
         find: impl Fn(&Gid) -> Option<&'a Face>,
-        mut lost: impl FnMut(&Gid, u64),
+        mut lost: impl FnMut(&Gid, u64, bool),
     ) -> Result<(), End> {
         self.blocked = false;
         let mut credits = Vec::new();
-        for (Channel { writer: gid, client }, samples) in &mut self.arrived {
+        for (channel, samples) in &mut self.arrived {
+            let Channel { writer: gid, client } = channel;
             while let Some(sample) = samples.front_mut() {
                 let Some(face) = find(gid) else { break };
                 match std::mem::take(&mut sample.lost) {
                     0 => {}
-                    count => lost(gid, count),
+                    count => lost(gid, count, !self.begun.contains(channel)),
                 }
+                self.begun.insert(*channel);
                 let client = client.as_ref().unwrap_or(gid);
+                let number = sample.meta.sequence;
                 match face.try_write(client, sample.meta, &sample.payload) {
                     Ok(Written::Yes) => self.tally.arrived(sample.payload.len()),
                     Ok(Written::Nobody) => {}
@@ -209,18 +232,33 @@ impl Pipe {
                         break;
                     }
                     Err(error) => {
-                        lost(gid, 1);
+                        lost(gid, 1, false);
                         if let Some(samples) = self.losses.count(Instant::now()) {
                             tracing::error!(%gid, %error, samples, "relayed samples are lost");
                         }
                     }
                 }
-                if let Some(sample) = samples.pop_front() {
-                    credits.extend(self.incoming.done(&sample));
+                if let Some(sample) = samples.pop_front()
+                    && let Some(mut credit) = self.incoming.done(&sample)
+                {
+                    // What is written is in this process's memory only, where others carry it on.
+                    if let Some(over) = face.handed_over().filter(|over| *over < number) {
+                        credit.done = Some(over);
+                        self.written.insert(*channel, (over, number));
+                    }
+                    credits.push(credit);
                 }
             }
         }
         self.arrived.retain(|_, samples| !samples.is_empty());
+        self.written.retain(|channel, (said, last)| {
+            let over = find(&channel.writer).and_then(Face::handed_over).unwrap_or(*last);
+            if over > *said {
+                *said = over;
+                credits.push(channel.done(over));
+            }
+            over < *last
+        });
         credits.into_iter().try_for_each(|credit| self.say(&Message::Credit(credit)))
     }
 

@@ -2,7 +2,6 @@
 
 use std::{
     os::fd::{AsFd, BorrowedFd, OwnedFd},
-    sync::atomic::{AtomicBool, Ordering},
     time::{Duration, Instant},
 };
 
@@ -53,8 +52,8 @@ pub(crate) struct Caller<'a> {
     pub(crate) segment: Option<&'a SessionSegment>,
     /// Why it is relayed, if so.
     pub(crate) relay: Option<&'a str>,
-    /// Set when the answer is no longer wanted.
-    pub(crate) cancel: Option<&'a AtomicBool>,
+    /// Whether the answer is no longer wanted.
+    pub(crate) cancel: Option<&'a dyn Fn() -> bool>,
 }
 
 impl Caller<'_> {
@@ -111,8 +110,7 @@ impl Caller<'_> {
     }
 
     fn cancelled(&self) -> bool {
-        // Pairs with the release store in `Shared::stop`.
-        self.cancel.is_some_and(|cancel| cancel.load(Ordering::Acquire))
+        self.cancel.is_some_and(|cancel| cancel())
     }
 
     fn try_connect(&self, address: &Address, deadline: Instant) -> Result<Connected, Attempt> {

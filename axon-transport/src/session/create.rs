@@ -101,9 +101,12 @@ impl Session {
         GuardCondition::new(self.shared())
     }
 
-    /// A subscription as another process of the session describes it, under its GID there.
+    /// A subscription as another process of the session describes it, under its GID there. Where it
+    /// keeps all, what it takes is acknowledged when it [says so](Subscription::acknowledge_of).
     pub(crate) fn adopt_subscription(&self, endpoint: Endpoint) -> Subscription {
-        self.add_reader(SubscriptionInner::new(endpoint, EndpointRole::Application, Vec::new()))
+        let mut inner = SubscriptionInner::new(endpoint, EndpointRole::Application, Vec::new());
+        inner.carries = inner.keeps_all();
+        self.add_reader(inner)
     }
 
     /// As [`adopt_subscription`](Self::adopt_subscription), a node.
@@ -129,18 +132,20 @@ impl Session {
         spec: EndpointSpec,
         stands_for: Vec<Gid>,
     ) -> Result<Subscription, SessionError> {
-        self.add_relay(spec, None, stands_for)
+        self.add_relay(spec, None, stands_for, false)
     }
 
-    /// As [`create_relay`](Self::create_relay), of one publisher alone. What it takes, it
-    /// [acknowledges](Subscription::acknowledge).
+    /// As [`create_relay`](Self::create_relay), of one publisher alone. Where the publisher `waits` for
+    /// it, what it takes is acknowledged when it [says so](Subscription::acknowledge_of), whether or not
+    /// there is somebody for whom it stands.
     pub(crate) fn create_relay_of(
         &self,
         publisher: Gid,
         spec: EndpointSpec,
         stands_for: Vec<Gid>,
+        waits: bool,
     ) -> Result<Subscription, SessionError> {
-        self.add_relay(spec, Some(publisher), stands_for)
+        self.add_relay(spec, Some(publisher), stands_for, waits)
     }
 
     fn add_relay(
@@ -148,10 +153,12 @@ impl Session {
         spec: EndpointSpec,
         only: Option<Gid>,
         stands_for: Vec<Gid>,
+        carries: bool,
     ) -> Result<Subscription, SessionError> {
         let endpoint = self.endpoint(spec, EndpointKind::Subscription)?;
         let mut inner = SubscriptionInner::new(endpoint, EndpointRole::Relay, stands_for);
         inner.only = only;
+        inner.carries = carries;
         Ok(self.add_reader(inner))
     }
 }

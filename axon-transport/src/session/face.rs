@@ -112,6 +112,15 @@ impl Face {
         Ok(if there { Written::Yes } else { Written::Nobody })
     }
 
+    /// The number up to which what it has written is where it is to go, as far as that takes longer than
+    /// writing it.
+    pub(crate) fn handed_over(&self) -> Option<u64> {
+        match self {
+            Self::Publisher(publisher) => Some(publisher.handed_over()),
+            Self::Client(_) | Self::Server(_) => None,
+        }
+    }
+
     /// The next request or response of `writer`, in place.
     pub(crate) fn take_from(&self, writer: &Gid) -> Option<Sample> {
         match self {

@@ -8,13 +8,16 @@
 use std::sync::{Arc, MutexGuard, PoisonError};
 
 use super::{
-    events::Source, message::EndpointRole, publisher::PublisherInner, state::Shared,
-    subscription::Accept, subscription::SubscriptionInner,
+    events::Source,
+    message::EndpointRole,
+    publisher::PublisherInner,
+    state::Shared,
+    subscription::{Accept, Numbers, SubscriptionInner},
 };
 use crate::{
     graph::{Endpoint, Pairing, pairing},
     ids::Gid,
-    shm::{Peer, ReaderInfo, ShmError},
+    shm::{Peer, ReaderInfo, ShmError, Terms},
 };
 
 impl Shared {
@@ -72,11 +75,11 @@ impl Shared {
         let mut slots = reader.lock();
         let lane = slots.lane_for(from, || self.segment.allocate_lane())?.lane;
         let reads = ReaderInfo { gid, lane, qos: reader.qos, peer: peer.clone(), stands_for: None };
-        let (grant, after, ring) = writer.attach(reads, None)?;
+        let (grant, after, ring) = writer.attach(reads, Terms::default())?;
         if let Accept::Map(lane) = slots.accept(from, grant) {
             let max_message = self.config.max_message;
             let mapped = reader.map(from, peer, ring, lane, grant, max_message)?;
-            slots.add(mapped, Some(after), false, false);
+            slots.add(mapped, Some(after), Numbers::None);
         }
         Ok(())
     }

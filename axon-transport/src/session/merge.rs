@@ -62,6 +62,11 @@ impl<T> Merge<T> {
         self.ways = ways.collect();
     }
 
+    /// The readers.
+    pub(crate) fn readers(&self) -> impl Iterator<Item = &Gid> {
+        self.ways.keys()
+    }
+
     /// Whatever the readers have is given on once more: one of them has what came before.
     pub(crate) fn begin_anew(&mut self) {
         self.given = None;

@@ -19,7 +19,7 @@ use crate::{
     graph::Endpoint,
     ids::Gid,
     qos::{Liveliness, Qos},
-    shm::{Grant, Location, Meta, PublishError, ReaderInfo, ShmError, Writer},
+    shm::{Grant, Location, Meta, PublishError, ReaderInfo, ShmError, Terms, Writer},
 };
 
 /// Sends the samples of a topic. Thread-safe. When it is dropped, readers still take what it left.
@@ -111,8 +111,10 @@ impl Publisher {
     /// Returns false, once and at once, when samples were [given up](Self::given_up) since the last call:
     /// their link broke, the peer stopped reading, or this host's daemon was killed.
     ///
-    /// Where the session shares no memory (`AXON_SHM`), one for another process is when this host's daemon
-    /// has taken it over, too. One that ends waits for that no longer than a second.
+    /// Where one of two processes of this host shares no memory (`AXON_SHM`), a sample of a RELIABLE and
+    /// KEEP_ALL publisher for a subscription like it is acknowledged when the other process has it. Until
+    /// then it is kept, and goes to the next daemon if this one ends. For other subscriptions it is when
+    /// this host's daemon has taken it over. One that ends waits for that no longer than a second.
     pub fn wait_acknowledged(&self, timeout: Duration) -> bool {
         self.session.is_forked() || self.writer.wait_handed_over(timeout)
     }
@@ -155,6 +157,11 @@ impl Publisher {
 }
 
 impl Publisher {
+    /// The number up to which its samples are with those who carry them to other processes and hosts.
+    pub(crate) fn handed_over(&self) -> u64 {
+        self.writer.handed_over()
+    }
+
     /// As [`loan`](Self::loan), of `len` bytes at most, for who cannot borrow the publisher. What is
     /// behind the first `header` bytes is aligned to 16.
     pub(crate) fn loan_owned(&self, header: usize, len: usize) -> Result<OwnedLoan, PublishError> {
@@ -254,6 +261,8 @@ pub(super) struct PublisherInner {
     pub(super) events: EndpointEvents,
     /// A publication says that the publisher is alive, and nothing else but the program does.
     asserts: bool,
+    /// Its samples come from a process of this host that shares no memory.
+    pub(super) relayed: bool,
     /// Readers that were granted; a relay as itself.
     attached: Mutex<BTreeSet<Gid>>,
 }
@@ -263,24 +272,25 @@ impl PublisherInner {
         let Qos { liveliness, lease, .. } = endpoint.qos;
         let asserts = liveliness == Liveliness::ManualByTopic && lease.is_some();
         let events = EndpointEvents::of_publisher(&endpoint.qos, clock::monotonic());
-        Self { endpoint, role, rings, events, asserts, attached: Mutex::default() }
+        let (relayed, attached) = (false, Mutex::default());
+        Self { endpoint, role, rings, events, asserts, relayed, attached }
     }
 
     /// Has it be alive when it is said to be, whatever its liveliness: its process is elsewhere.
     pub(super) fn asserted(mut self) -> Self {
         self.asserts = self.endpoint.qos.lease.is_some();
+        self.relayed = self.role == EndpointRole::Application;
         self
     }
 
-    /// Serves a reader, from what comes `after` a number on if it has been here before: what it is
-    /// granted, the number in front of that, and in which ring.
+    /// Serves a reader on its terms: what it is granted, the number in front of that, and in which ring.
     pub(super) fn attach(
         &self,
         reader: ReaderInfo,
-        after: Option<u64>,
+        terms: Terms,
     ) -> Result<(Grant, u64, Location), ShmError> {
         let gid = reader.gid;
-        let granted = self.rings.attach(reader, after)?;
+        let granted = self.rings.attach(reader, terms)?;
         self.attached().insert(gid);
         Ok(granted)
     }

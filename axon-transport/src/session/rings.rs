@@ -11,7 +11,7 @@ use std::{
 
 use crate::{
     ids::Gid,
-    shm::{Grant, Location, ReaderInfo, RingOptions, SessionSegment, ShmError, Writer},
+    shm::{Grant, Location, ReaderInfo, RingOptions, SessionSegment, ShmError, Terms, Writer},
 };
 
 pub(super) enum Rings {
@@ -72,13 +72,13 @@ impl Rings {
     pub(super) fn attach(
         &self,
         reader: ReaderInfo,
-        after: Option<u64>,
+        terms: Terms,
     ) -> Result<(Grant, u64, Location), ShmError> {
         let writer = match self {
             Self::Shared(writer) => writer.clone(),
             Self::Each(lanes) => lanes.ring_for(reader.gid)?,
         };
-        let (grant, after) = writer.attach_after(reader, after)?;
+        let (grant, after) = writer.attach_on(reader, terms)?;
         Ok((grant, after, writer.location()))
     }
 

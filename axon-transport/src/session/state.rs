@@ -321,10 +321,10 @@ impl Shared {
     }
 
     /// For a relay: so many samples of `writer` were lost on their way to the session's
-    /// subscriptions.
-    pub(crate) fn lost(&self, writer: &Gid, samples: u64) {
+    /// subscriptions, before the `first` that comes through this daemon or later.
+    pub(crate) fn lost(&self, writer: &Gid, samples: u64, first: bool) {
         let subscriptions: Vec<_> = self.state().subscriptions.values().cloned().collect();
-        subscriptions.iter().for_each(|s| s.lock().lost_elsewhere(writer, samples));
+        subscriptions.iter().for_each(|s| s.lock().lost_elsewhere(writer, samples, first));
     }
 
     pub(super) fn state(&self) -> MutexGuard<'_, State> {

@@ -36,7 +36,7 @@ use crate::{
     qos::{Durability, Qos},
     shm::{
         Grant, Location, Meta, Peer, PeerDescriptors, PeerSession, ReaderInfo, RingOptions,
-        SegmentInfo, SegmentKind, Writer,
+        SegmentInfo, SegmentKind, Terms, Writer,
     },
     wait::Purpose,
 };
@@ -161,10 +161,12 @@ impl Far {
         let Attach { reader, writer, lane, qos, after, .. } = *attach;
         let (peer, stands_for) = (self.view.clone(), None);
         let info = ReaderInfo { gid: reader, lane, qos, peer, stands_for };
-        let (Grant { generation, first }, _) = self.writer.attach_after(info, after).unwrap();
+        let terms = Terms { after, carries: false };
+        let (Grant { generation, first }, _) = self.writer.attach_on(info, terms).unwrap();
         let (session, ring) = (self.session.id(), self.writer.location());
         let segments = Vec::new();
-        Granted { reader, writer, generation, first, session, ring, segments, after: None }
+        let (after, relayed) = (None, None);
+        Granted { reader, writer, generation, first, session, ring, segments, after, relayed }
     }
 
     fn introduction(&self) -> Vec<OwnedFd> {
@@ -428,7 +430,9 @@ fn a_daemon_cannot_have_a_session_read_its_own_samples_as_rings_and_lanes() {
     // As a publisher would to the first that asks.
     let (generation, segments) = (5 << 24 | 1, Vec::new());
     let (first, session, ring, after) = (0, own, sample, None);
-    let granted = Granted { reader, writer, generation, first, session, ring, segments, after };
+    let relayed = None;
+    let granted =
+        Granted { reader, writer, generation, first, session, ring, segments, after, relayed };
     daemon.say(Message::Grant(granted), &[]);
     daemon.say(Message::Attach(Attach { lane: sample, ..asked.clone() }), &[]);
     daemon.say(Message::Attach(asked), &[]);

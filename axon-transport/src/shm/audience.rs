@@ -1,9 +1,10 @@
 //! Who reads a ring, and what of it must stand for them.
 
-use std::{collections::HashSet, sync::Arc};
+use std::{collections::HashSet, sync::Arc, time::Duration};
 
 use super::{
     Grant, Peer, PeerSession, ReaderInfo, ShmError,
+    absent::Absences,
     allowance::Pool,
     lane::{self, LaneView, Standing, Tenancy},
     seats::{Holder, Pinned, Seats},
@@ -25,6 +26,8 @@ pub(super) struct Audience {
     /// The most samples that can ever stand.
     capacity: u64,
     readers: Vec<Attached>,
+    /// Those that carried samples to others and whose process ended.
+    absent: Absences,
     /// Their lanes, and those of readers that were here and may hold samples still.
     seats: Seats,
     /// Their sessions, each once, shared with publishes that ring after they have unlocked.
@@ -39,6 +42,8 @@ struct Attached {
     lane: LaneView,
     tenancy: Tenancy,
     grant: Grant,
+    /// Carries samples to another process.
+    carries: bool,
     dead: bool,
     /// Of a relay: the furthest position that it was seen to be done with, and how many samples it said
     /// that it gave up.
@@ -73,6 +78,20 @@ impl Attached {
         self.position().map(|cursor| cursor.max(self.grant.first).min(head))
     }
 
+    /// Whether it takes samples elsewhere: to another host, or to or from a process that shares no memory.
+    fn is_carrier(&self) -> bool {
+        self.carries || self.info.is_relay()
+    }
+
+    /// Of a carrier: below this it is done. One that read for itself and has left wants nothing; what a
+    /// relay leaves is given up by the daemon's word only.
+    fn delivered(&mut self, head: u64) -> Option<u64> {
+        match &self.info.stands_for {
+            Some(_) => Some(self.done_with(head)),
+            None => self.cursor(head),
+        }
+    }
+
     /// Of a relay: up to where it is done. One that has left is where it was seen last, until the daemon
     /// says that it ended, or what it gave up.
     fn done_with(&mut self, head: u64) -> u64 {
@@ -97,6 +116,7 @@ impl Audience {
             heeds_depths: false,
             capacity,
             readers: Vec::new(),
+            absent: Absences::default(),
             seats: Seats::new(pool),
             peers: Arc::new([]),
             window: 0,
@@ -123,7 +143,7 @@ impl Audience {
     }
 
     pub(super) fn is_empty(&self) -> bool {
-        self.readers.is_empty()
+        self.readers.is_empty() && self.absent.is_empty()
     }
 
     pub(super) fn peers(&self) -> Arc<[Peer]> {
@@ -147,7 +167,7 @@ impl Audience {
         gids
     }
 
-    /// Adds a reader, whose lane is `lane`, and who goes on at `resumed` if it has been here before.
+    /// Adds a reader, whose lane is `lane`, and which goes on at `resumed` if it has been here before.
     ///
     /// # Errors
     /// Its process has too many. It, or the one that it takes the place of, stays as it was.
@@ -158,10 +178,16 @@ impl Audience {
         tail: u64,
         head: u64,
         resumed: Option<u64>,
+        carries: bool,
     ) -> Result<Grant, ShmError> {
+        // One whose process ended has nothing to do with this one, though they share GID and lane.
+        if self.readers.iter().any(|known| known.info.gid == info.gid) {
+            self.mark_dead(head);
+        }
         let known = self.readers.iter().position(|known| {
             let same = &known.info;
-            same.gid == info.gid
+            !known.dead
+                && same.gid == info.gid
                 && same.lane == info.lane
                 && same.peer.id() == info.peer.id()
                 // One that has left since is given a new start.
@@ -170,6 +196,7 @@ impl Audience {
         if let Some(index) = known {
             let known = &mut self.readers[index];
             known.info.stands_for = info.stands_for;
+            known.carries = carries;
             return Ok(known.grant);
         }
         let transient =
@@ -179,16 +206,20 @@ impl Audience {
         } else {
             head
         };
+        let absent = self.absent.position_of(&info.gid);
+        let resumed = absent.into_iter().chain(resumed).min();
         let first = resumed.map_or(first, |resumed| resumed.clamp(tail, head).min(first));
         let tenancy = self.seats.admit(info.gid, &info.peer, info.lane, &lane)?;
         let grant = Grant { generation: tenancy.generation(), first };
         self.detach(info.gid, head);
         self.joined(&info);
+        self.absent.end(&info.gid);
         self.readers.push(Attached {
             info,
             lane,
             tenancy,
             grant,
+            carries,
             dead: false,
             done: first,
             given_up: 0,
@@ -218,7 +249,7 @@ impl Audience {
     pub(super) fn detach(&mut self, reader: Gid, head: u64) -> bool {
         let before = self.readers.len();
         // A process that ended said nothing of what it leaves.
-        if self.readers.iter().any(|known| known.info.gid == reader && known.info.is_relay()) {
+        if self.readers.iter().any(|known| known.info.gid == reader && known.is_carrier()) {
             self.mark_dead(head);
         }
         self.readers.retain(|known| known.info.gid != reader);
@@ -253,13 +284,21 @@ impl Audience {
     }
 
     /// Stops counting on readers whose process has ended; [`Self::drop_dead`] names them. What a relay
-    /// among them was not done with is given up.
+    /// among them was not done with is given up; what one had that carried it to a process which may
+    /// live on is kept for a while.
     pub(super) fn mark_dead(&mut self, head: u64) {
+        let late = self.absent.expire(head);
+        self.given_up = self.given_up.saturating_add(late);
         for reader in self.readers.iter_mut().filter(|reader| !reader.dead) {
             reader.dead = reader.info.peer.is_dead();
-            if reader.dead && reader.info.is_relay() {
-                let left = head.saturating_sub(reader.done_with(head));
-                let left = left.saturating_sub(reader.given_up);
+            if !reader.dead || !reader.is_carrier() {
+                continue;
+            }
+            let Some(position) = reader.delivered(head) else { continue };
+            if reader.carries && holds(&self.offered) && holds(&reader.info.qos) {
+                self.absent.add(reader.info.gid, position);
+            } else {
+                let left = head.saturating_sub(position).saturating_sub(reader.given_up);
                 self.given_up = self.given_up.saturating_add(left);
             }
         }
@@ -320,6 +359,10 @@ impl Audience {
                 }
             }
         }
+        if let Some((position, _)) = self.absent.oldest() {
+            floors.retained = floors.retained.min(position);
+            floors.held = floors.held.min(position);
+        }
         floors
     }
 
@@ -330,20 +373,31 @@ impl Audience {
             return 0;
         }
         let cursors = self.readers.iter().filter(|reader| !reader.dead);
-        cursors.filter_map(|reader| reader.cursor(head)).min().unwrap_or(head)
+        let cursors = cursors.filter_map(|reader| reader.cursor(head));
+        let absent = self.absent.oldest().map(|(position, _)| position);
+        cursors.chain(absent).min().unwrap_or(head)
     }
 
-    /// Below this every reader that stands for others, elsewhere, is done with what it wanted.
+    /// Below this every reader that carries samples elsewhere is done with what it wanted.
     pub(super) fn handed_over(&mut self, head: u64) -> u64 {
-        let relays = self.readers.iter_mut();
-        let relays = relays.filter(|reader| !reader.dead && reader.info.is_relay());
-        relays.map(|reader| reader.done_with(head)).min().unwrap_or(head)
+        let carriers = self.readers.iter_mut().filter(|r| !r.dead && r.is_carrier());
+        let done = carriers.filter_map(|reader| reader.delivered(head));
+        let absent = self.absent.oldest().map(|(position, _)| position.min(head));
+        done.chain(absent).min().unwrap_or(head)
+    }
+
+    fn carriers(&self) -> impl Iterator<Item = &Attached> {
+        self.readers.iter().filter(|reader| !reader.dead && reader.is_carrier())
+    }
+
+    /// How long it takes until one of the absent readers is given up.
+    pub(super) fn absent_for(&self) -> Option<Duration> {
+        self.absent.left()
     }
 
     /// The sessions of those that do.
     pub(super) fn relays(&self) -> Vec<Arc<PeerSession>> {
-        let relays = self.readers.iter().filter(|reader| !reader.dead && reader.info.is_relay());
-        relays.filter_map(|reader| reader.info.peer.remote().cloned()).collect()
+        self.carriers().filter_map(|reader| reader.info.peer.remote().cloned()).collect()
     }
 
     /// The reader that has most to take of those that hold `tail`, and the sessions of all these.
@@ -359,7 +413,8 @@ impl Audience {
                 worst = worst.into_iter().chain([(floor, reader.info.gid)]).min();
             }
         }
-        worst.map(|(_, gid)| (gid, peers))
+        let absent = self.absent.oldest().filter(|(position, _)| *position <= tail);
+        worst.into_iter().chain(absent).min().map(|(_, gid)| (gid, peers))
     }
 
     /// There is one reader more. A publisher of hundreds gets them one by one, so that what stands is

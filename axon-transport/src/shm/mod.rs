@@ -62,6 +62,7 @@
 #[cfg(not(all(target_pointer_width = "64", target_endian = "little")))]
 compile_error!("rings are laid out for 64-bit little-endian machines");
 
+mod absent;
 mod allowance;
 mod area;
 mod atfork;
@@ -129,5 +130,6 @@ pub use segments::{SegmentEvent, SegmentInfo};
 pub use session::SessionSegment;
 pub use subscriber::{Subscriber, SubscriberOptions};
 pub(crate) use times::{Times, monotonic};
+pub(crate) use types::Terms;
 pub use types::{Grant, Meta, Published, ReaderInfo, RingOptions, Taken};
 pub use writer::Writer;

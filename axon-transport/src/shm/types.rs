@@ -42,6 +42,16 @@ impl ReaderInfo {
     }
 }
 
+/// What a reader says besides who it is.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Terms {
+    /// The last number that it has, where it was attached before.
+    pub(crate) after: Option<u64>,
+    /// It carries samples to another process: they are taken when that process has them, and kept for it
+    /// for a while when the reader's own ends.
+    pub(crate) carries: bool,
+}
+
 /// What a reader is given when it attaches.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Grant {

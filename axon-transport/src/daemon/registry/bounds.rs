@@ -298,12 +298,24 @@ fn memory_that_is_given_up_does_not_wait_for_who_is_stopped() {
     announce(&mut registry, 2, 1, EndpointKind::Subscription);
     let (writer, reader) = (Gid::new(id(1), 1), Gid::new(id(2), 1));
     let (lane, qos) = (Location { segment: 0, offset: 4096 }, Qos::default());
-    let (session, stands_for, segments, after) = (id(2), None, vec![], None);
-    let attach = Attach { reader, writer, lane, qos, session, stands_for, segments, after };
+    let (session, stands_for, segments) = (id(2), None, vec![]);
+    let (after, carries) = (None, None);
+    let attach =
+        Attach { reader, writer, lane, qos, session, stands_for, segments, after, carries };
     registry.message(&id(2), Message::Attach(attach), vec![]).unwrap();
+    let relayed = None;
     let (generation, first, segments, session) = (1, 0, vec![], id(1));
-    let granted =
-        Granted { reader, writer, generation, first, session, ring: lane, segments, after };
+    let granted = Granted {
+        reader,
+        writer,
+        generation,
+        first,
+        session,
+        ring: lane,
+        segments,
+        after,
+        relayed,
+    };
     registry.message(&id(1), Message::Grant(granted), vec![]).unwrap();
     drain(&mut registry, 2);
     let mut turn = |number| {
@@ -360,6 +372,7 @@ fn who_leaves_is_shown_to_nobody_and_read_to_its_end() {
         stands_for: None,
         segments: Vec::new(),
         after: None,
+        carries: None,
     };
     registry.message(&id(2), Message::Attach(attach), vec![]).unwrap();
     let grant = Granted {
@@ -371,6 +384,7 @@ fn who_leaves_is_shown_to_nobody_and_read_to_its_end() {
         ring: place,
         segments: Vec::new(),
         after: None,
+        relayed: None,
     };
     registry.message(&id(1), Message::Grant(grant), vec![]).unwrap();
     registry.flush();

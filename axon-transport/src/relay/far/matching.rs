@@ -35,6 +35,17 @@ pub(super) struct Source {
     samples: Merge<Sample>,
     /// How much of its history has been asked for.
     history: Option<u32>,
+    /// The number up to which the session has them.
+    pub(super) done: Option<u64>,
+}
+
+impl Source {
+    /// Has its publisher know what the session has, by way of all subscriptions.
+    pub(super) fn acknowledge(&self, to: &BTreeMap<Gid, Subscription>, writer: &Gid) {
+        let Some(done) = self.done else { return };
+        let readers = self.samples.readers().filter_map(|reader| to.get(reader));
+        readers.for_each(|reader| reader.acknowledge_of(writer, done));
+    }
 }
 
 impl Served {
@@ -197,6 +208,10 @@ impl Served {
         let mut more = self.calls.pass_over(|gid| self.writers.get(gid));
         for (writer, source) in &mut self.sources {
             more |= source.samples.pass_over(|reader| taken(&self.subscriptions, reader, writer));
+            // What was passed over just now the session has by way of another.
+            if source.samples.readers().nth(1).is_some() {
+                source.acknowledge(&self.subscriptions, writer);
+            }
         }
         more
     }

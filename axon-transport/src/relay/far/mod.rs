@@ -165,10 +165,14 @@ impl Served {
         let mut begun = false;
         loop {
             self.leader.clear();
-            let blocked = self.pipe.blocked;
-            self.leader.arm(blocked);
+            let waits = self.pipe.waits_for_readers();
+            self.leader.arm(waits);
             let news = self.news.take() | !std::mem::replace(&mut begun, true);
             if self.news.is_lost() {
+                // Most often the daemon ends, and its process with it. Its readers shall not say before
+                // that they have left: what they had not delivered is kept for the next daemon.
+                self.pipe.hang_up();
+                std::thread::sleep(LINGER);
                 return Err(End::Other("the control plane dropped it".into()));
             }
             let (messages, more) = self.pipe.receive()?;
@@ -187,7 +191,7 @@ impl Served {
             }
             let (writers, tally) = (&self.writers, &self.tally);
             let find = |gid: &Gid| writers.get(gid);
-            self.pipe.write(find, |_, samples| tally.lost(samples))?;
+            self.pipe.write(find, |_, samples, _| tally.lost(samples))?;
             if self.pipe.is_over() {
                 return self.wind_up();
             }
@@ -203,7 +207,7 @@ impl Served {
                 }
             })?;
             let passed = self.pass_over();
-            if more || sent || passed || self.pipe.blocked && !blocked {
+            if more || sent || passed || self.pipe.waits_for_readers() && !waits {
                 self.leader.disarm();
                 continue;
             }
@@ -220,13 +224,13 @@ impl Served {
         self.subscriptions.clear();
         self.nodes.clear();
         self.writers.values().for_each(|face| face.leave(true));
-        while self.pipe.blocked && !self.news.is_lost() && Instant::now() < end {
+        while self.pipe.is_blocked() && !self.news.is_lost() && Instant::now() < end {
             self.leader.clear();
             self.leader.arm(true);
             self.news.take();
             let (writers, tally) = (&self.writers, &self.tally);
-            self.pipe.write(|gid| writers.get(gid), |_, samples| tally.lost(samples))?;
-            if self.pipe.blocked {
+            self.pipe.write(|gid| writers.get(gid), |_, samples, _| tally.lost(samples))?;
+            if self.pipe.is_blocked() {
                 let left = end.saturating_duration_since(Instant::now());
                 self.pipe.sleep(&self.leader, &self.news, None, Some(left));
             }
@@ -260,6 +264,10 @@ impl Served {
             }
             Message::Credit(credit) => {
                 self.pipe.outgoing.credit(&credit);
+                if let Some(source) = self.sources.get_mut(&credit.publisher) {
+                    source.done = source.done.max(credit.done);
+                    source.acknowledge(&self.subscriptions, &credit.publisher);
+                }
                 Ok(())
             }
             Message::Unknown(_) => Ok(()),

@@ -1,9 +1,11 @@
 //! The end in a relayed session's own process.
 
+mod next;
 mod relays;
 mod stand_ins;
 
 use std::{
+    cell::OnceCell,
     collections::{BTreeMap, BTreeSet, HashMap},
     sync::{
         Arc,
@@ -15,7 +17,7 @@ use std::{
 
 use self::{relays::Relay, stand_ins::StandIn};
 use super::{
-    LINGER, Pool, Tally,
+    Pool, Tally,
     calls::{self, Calls},
     flow::{Channel, Incoming},
     news::News,
@@ -28,17 +30,13 @@ use crate::{
     passed::PassedFd,
     session::{
         Session, SessionError, Shared,
-        connect::{Caller, Connected},
+        connect::Connected,
         local::House,
         message::{Announce, Asserted, EndpointRole, Gone, Graph, Leaving, Message, Refused},
         socket::SocketError,
     },
     wait::ExternalLeader,
 };
-
-/// Between attempts to find a daemon.
-const MIN_PAUSE: Duration = Duration::from_millis(100);
-const MAX_PAUSE: Duration = Duration::from_secs(2);
 
 /// Carries a session's samples to its daemon and back, until it is dropped.
 #[derive(Debug)]
@@ -58,6 +56,7 @@ struct Common {
     leader: ExternalLeader,
     news: Arc<News>,
     finish: Arc<AtomicBool>,
+    finish_by: OnceCell<Instant>,
     reason: String,
 }
 
@@ -81,6 +80,7 @@ impl Near {
             leader,
             news: Arc::clone(&news),
             finish: Arc::clone(&finish),
+            finish_by: OnceCell::new(),
             reason,
         };
         let blocked = crate::session::signals::Blocked::all();
@@ -107,54 +107,26 @@ impl Drop for Near {
 impl Common {
     fn run(self, connected: Connected) {
         let mut next = Some(connected);
+        let mut kept = BTreeMap::new();
         while let Some(connected) = next {
             let since = Instant::now();
             let daemon = connected.welcome.daemon;
-            let mut served = Served::new(&self, connected);
+            let mut served = Served::new(&self, connected, std::mem::take(&mut kept));
             self.shared.set_daemon(Some(daemon));
             let why = served.serve();
             served.forget_world();
+            kept = served.keep_relays();
             drop(served);
-            if self.finishes() {
-                return;
+            if self.finishes() && (why.is_ok() || kept.is_empty()) {
+                break;
             }
             if let Err(why) = why {
                 tracing::warn!(%why, "the connection to the daemon is lost");
             }
             self.shared.set_daemon(None);
-            next = self.reconnect(since.elapsed() < Duration::from_secs(1));
+            next = self.reconnect(since.elapsed() < Duration::from_secs(1), &mut kept);
         }
-    }
-
-    fn finishes(&self) -> bool {
-        self.finish.load(Ordering::Acquire)
-    }
-
-    /// Another daemon; `None` when the session ends. `brief` says that the last one was as good as
-    /// none.
-    fn reconnect(&self, brief: bool) -> Option<Connected> {
-        let mut pause = MIN_PAUSE;
-        let mut wait = brief;
-        while !self.finishes() {
-            if std::mem::replace(&mut wait, true) {
-                std::thread::sleep(pause);
-                pause = (pause * 2).min(MAX_PAUSE);
-            }
-            let caller = Caller {
-                config: &self.shared.config,
-                options: &self.shared.options,
-                id: self.shared.id,
-                segment: None,
-                relay: Some(&self.reason),
-                cancel: Some(&self.finish),
-            };
-            match caller.connect() {
-                Ok(connected) => return Some(connected),
-                Err(SessionError::NoDaemon { .. }) => {}
-                Err(error) => tracing::error!(%error, "no daemon took the session"),
-            }
-        }
-        None
+        kept.values().for_each(Relay::give_up);
     }
 }
 
@@ -193,7 +165,7 @@ struct Served<'a> {
 }
 
 impl<'a> Served<'a> {
-    fn new(common: &'a Common, connected: Connected) -> Self {
+    fn new(common: &'a Common, connected: Connected, relays: BTreeMap<Gid, Relay>) -> Self {
         // This end trusts its daemon with memory: there is one, and it takes what it is given credit
         // for.
         let incoming = Incoming::new(common.shared.config.max_message, Pool::new(u64::MAX));
@@ -208,7 +180,7 @@ impl<'a> Served<'a> {
             held_back: false,
             parting: BTreeSet::new(),
             matched: HashMap::new(),
-            relays: BTreeMap::new(),
+            relays,
             stand_ins: BTreeMap::new(),
             calls: Calls::default(),
             asking: HashMap::new(),
@@ -221,17 +193,19 @@ impl<'a> Served<'a> {
 
     fn serve(&mut self) -> Result<(), End> {
         let mut begun = false;
-        let mut finish_by: Option<Instant> = None;
         loop {
             let common = self.common;
             common.leader.clear();
-            let blocked = self.pipe.blocked;
-            common.leader.arm(blocked);
+            let waiting = self.pipe.waits_for_readers();
+            common.leader.arm(waiting);
             let news = common.news.take() | !std::mem::replace(&mut begun, true);
             let (messages, more) = self.pipe.receive()?;
             let changed = messages.iter().any(|m| !matches!(m, Message::Credit(_)));
             messages.into_iter().for_each(|message| self.handle(message));
-            let waits = self.held_back || !self.ending.is_empty() || !self.settling.is_empty();
+            let waits = self.held_back
+                || !self.ending.is_empty()
+                || !self.settling.is_empty()
+                || self.relays.values().any(Relay::is_kept);
             if news || changed || waits {
                 self.update()?;
             }
@@ -241,7 +215,7 @@ impl<'a> Served<'a> {
             }
             let stand_ins = &self.stand_ins;
             let find = |gid: &Gid| stand_ins.get(gid).map(StandIn::face);
-            self.pipe.write(find, |gid, samples| common.shared.lost(gid, samples))?;
+            self.pipe.write(find, |gid, samples, first| common.shared.lost(gid, samples, first))?;
             if self.pipe.is_over() {
                 return Err(SocketError::Closed.into());
             }
@@ -255,17 +229,15 @@ impl<'a> Served<'a> {
                     endpoint if endpoint.kind == EndpointKind::Client => {
                         calls.request(writer, find)
                     }
-                    _ => relays.get_mut(writer)?.take(writer),
+                    _ => relays.get_mut(writer)?.take(),
                 }
             })?;
             let passed = self.calls.pass_over(find);
-            if common.finishes() {
-                let by = *finish_by.get_or_insert_with(|| Instant::now() + LINGER);
-                if self.is_drained() || Instant::now() >= by {
-                    return Ok(());
-                }
+            let finish_by = common.finish_by();
+            if finish_by.is_some_and(|by| self.is_drained() || Instant::now() >= by) {
+                return Ok(());
             }
-            if more || sent || passed || self.pipe.blocked && !blocked {
+            if more || sent || passed || self.pipe.waits_for_readers() && !waiting {
                 common.leader.disarm();
                 continue;
             }
@@ -275,6 +247,7 @@ impl<'a> Served<'a> {
                 .left(Instant::now())
                 .into_iter()
                 .chain(self.settled_in())
+                .chain(self.relays.values().filter_map(Relay::waits_for))
                 .chain(end)
                 .min();
             self.pipe.sleep(&common.leader, &common.news, None, left);
@@ -337,6 +310,7 @@ impl<'a> Served<'a> {
     /// Brings what the daemon knows of the session, and the session of the world, up to date.
     fn update(&mut self) -> Result<(), End> {
         self.tell_endpoints()?;
+        self.announce_ended()?;
         self.update_relays();
         self.end_writers()?;
         self.update_stand_ins()?;
@@ -349,8 +323,9 @@ impl<'a> Served<'a> {
     }
 
     fn tell_endpoints(&mut self) -> Result<(), End> {
-        let graph = self.common.outside.graph();
-        let session = &self.common.shared.id;
+        let common = self.common;
+        let graph = common.outside.graph();
+        let session = &common.shared.id;
         let gone: Vec<(Gid, EndpointKind)> = self
             .own
             .values()
@@ -376,21 +351,39 @@ impl<'a> Served<'a> {
                 self.held_back = true;
                 continue;
             }
-            self.pipe.say(&Message::Endpoint(Announce {
-                endpoint: Endpoint::clone(endpoint),
-                role: EndpointRole::Application,
-                stands_for: Vec::new(),
-                ring: None,
-                only: None,
-            }))?;
-            self.own.insert(*gid, Arc::clone(endpoint));
-            // A server's responses are a channel for each of its clients.
-            if matches!(endpoint.kind, EndpointKind::Publisher | EndpointKind::Client) {
-                self.pipe.open_out(Channel::of(*gid));
-            }
+            self.announce(endpoint)?;
             if endpoint.kind == EndpointKind::Client {
                 self.asking.insert(*gid, Instant::now());
             }
+        }
+        Ok(())
+    }
+
+    fn announce(&mut self, endpoint: &Arc<Endpoint>) -> Result<(), End> {
+        self.pipe.say(&Message::Endpoint(Announce {
+            endpoint: Endpoint::clone(endpoint),
+            role: EndpointRole::Application,
+            stands_for: Vec::new(),
+            ring: None,
+            only: None,
+        }))?;
+        self.own.insert(endpoint.gid, Arc::clone(endpoint));
+        // A server's responses are a channel for each of its clients.
+        if matches!(endpoint.kind, EndpointKind::Publisher | EndpointKind::Client) {
+            self.pipe.open_out(Channel::of(endpoint.gid));
+        }
+        Ok(())
+    }
+
+    /// Publishers that ended before the next daemon had all of what they left are announced to it once
+    /// more.
+    fn announce_ended(&mut self) -> Result<(), End> {
+        let kept = self.relays.values_mut().filter(|relay| relay.is_kept());
+        let untold = kept.filter(|relay| !self.own.contains_key(&relay.publisher().gid));
+        let untold: Vec<_> = untold.map(Relay::revive).collect();
+        for endpoint in untold {
+            self.announce(&endpoint)?;
+            self.ending.insert(endpoint.gid, false);
         }
         Ok(())
     }
@@ -411,6 +404,9 @@ impl<'a> Served<'a> {
             self.ending.remove(&gid);
             self.matched.remove(&gid);
             self.refused.insert(gid);
+            if let Some(relay) = self.relays.remove(&gid) {
+                relay.give_up();
+            }
         }
         self.common.shared.refuse(gid, why);
     }
@@ -442,6 +438,8 @@ impl<'a> Served<'a> {
             if self.own.get(&gid).is_none_or(|endpoint| self.has_left(endpoint)) {
                 self.ending.remove(&gid);
                 self.tell_gone(gid)?;
+            } else if self.is_revived(&gid) {
+                // The readers of one that leaves are told of it only where they knew it before.
             } else if self.ending.insert(gid, true) == Some(false) {
                 self.pipe.say(&Message::Leaving(Leaving { gid, leaving: true }))?;
             }

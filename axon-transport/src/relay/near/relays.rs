@@ -1,7 +1,11 @@
 //! What the application publishes, as the daemon is to get it: a relay for each publisher. It stands for
 //! those with whom the daemon says that this publisher is matched: whom the publisher counts, it reaches.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use super::Served;
 use crate::{
@@ -13,15 +17,30 @@ use crate::{
         flow::{Channel, Departing},
     },
     session::{EndpointSpec, Subscription},
-    shm::Sample,
+    shm::{Sample, holds},
 };
 
 pub(super) struct Relay {
     subscription: Subscription,
+    /// Its publisher, which may have ended.
+    publisher: Arc<Endpoint>,
     stands_for: BTreeSet<Gid>,
     /// Samples that it has lost, as far as the daemon knows.
     lost: u64,
+    /// It comes from an earlier connection, and sends nothing before this.
+    awaits: Option<Awaits>,
+    /// Its publisher had ended when this daemon was told of it.
+    revived: bool,
 }
+
+/// The readers for which a relay waits, and how long: they lose what is sent before they are matched.
+struct Awaits {
+    readers: BTreeSet<Gid>,
+    until: Instant,
+}
+
+/// How long samples that a daemon did not confirm are kept for their readers, once that daemon is gone.
+const ABSENCE: Duration = Duration::from_secs(10);
 
 impl Relay {
     /// When its publisher was last alive, if that has a lease.
@@ -29,22 +48,103 @@ impl Relay {
         self.subscription.assertions()
     }
 
-    /// The daemon has its publisher's samples up to this number.
+    /// Its publisher.
+    pub(super) fn publisher(&self) -> &Endpoint {
+        &self.publisher
+    }
+
+    /// Its publisher, which has ended, is announced for the sake of what it left.
+    pub(super) fn revive(&mut self) -> Arc<Endpoint> {
+        self.revived = true;
+        Arc::clone(&self.publisher)
+    }
+
+    /// The publisher's samples up to this number are where they are to go.
     pub(super) fn acknowledge(&self, sequence: u64) {
-        self.subscription.acknowledge(sequence);
+        self.subscription.acknowledge_of(&self.publisher.gid, sequence);
+    }
+
+    /// How long it still waits at most for the readers that it had before the last daemon was gone.
+    pub(super) fn waits_for(&self) -> Option<Duration> {
+        let until = self.awaits.as_ref()?.until;
+        Some(until.saturating_duration_since(Instant::now())).filter(|left| !left.is_zero())
+    }
+
+    /// Whether it does.
+    fn waits(&self) -> bool {
+        self.waits_for().is_some()
+    }
+
+    /// Whether it comes from an earlier connection, and it is not decided yet how it goes on.
+    pub(super) fn is_kept(&self) -> bool {
+        self.awaits.is_some()
+    }
+
+    /// Samples that are not where they are to go.
+    pub(super) fn unconfirmed(&self) -> u64 {
+        self.subscription.unacknowledged().remove(&self.publisher.gid).unwrap_or(0)
+    }
+
+    /// Its readers did not come back, and nobody else reads: its publisher and the log are told what is
+    /// lost.
+    pub(super) fn give_up(&self) {
+        let samples = self.unconfirmed();
+        if samples > 0 {
+            let Endpoint { gid, topic, .. } = &*self.publisher;
+            self.subscription.give_up(*gid, samples);
+            tracing::warn!(topic, publisher = %gid, samples, "no daemon confirmed them: lost");
+        }
     }
 
     /// The next sample of its publisher.
-    pub(super) fn take(&mut self, publisher: &Gid) -> Option<Departing<Sample>> {
-        let (content, now) = self.subscription.take_from(publisher)?;
+    pub(super) fn take(&mut self) -> Option<Departing<Sample>> {
+        if self.is_kept() {
+            return None;
+        }
+        let (content, now) = self.subscription.take_from(&self.publisher.gid)?;
         let before = std::mem::replace(&mut self.lost, now);
         // Where the publisher has granted anew, it counts from 0.
         let lost = now.checked_sub(before).unwrap_or(now);
         Some(Departing { meta: content.meta(), lost, content })
     }
+
+    /// Takes back what was not confirmed, to be sent through the next daemon; whether it is kept for
+    /// that. Its publisher waits for it as before, and counts none of its readers meanwhile.
+    fn outlive_connection(&mut self) -> bool {
+        let readers = match self.awaits.take() {
+            Some(awaits) if awaits.until > Instant::now() => awaits.readers,
+            _ => std::mem::take(&mut self.stands_for),
+        };
+        if !holds(&self.publisher.qos) || readers.is_empty() {
+            return false;
+        }
+        self.subscription.take_back();
+        self.subscription.set_stands_for(Vec::new());
+        self.stands_for = BTreeSet::new();
+        self.awaits = Some(Awaits { readers, until: Instant::now() + ABSENCE });
+        true
+    }
+}
+
+/// Lets go of the relays that waited for too long while there is no daemon.
+pub(super) fn drop_overdue(kept: &mut BTreeMap<Gid, Relay>) {
+    kept.retain(|_, relay| {
+        let waits = relay.waits();
+        if !waits {
+            relay.give_up();
+        }
+        waits
+    });
 }
 
 impl Served<'_> {
+    /// The relays that outlive the connection.
+    pub(super) fn keep_relays(&mut self) -> BTreeMap<Gid, Relay> {
+        let mut relays = std::mem::take(&mut self.relays);
+        relays.retain(|_, relay| relay.outlive_connection());
+        relays
+    }
+
     pub(super) fn update_relays(&mut self) {
         let mut wanted: BTreeMap<Gid, BTreeSet<Gid>> = BTreeMap::new();
         for publisher in self.own.values().filter(|e| e.kind == EndpointKind::Publisher) {
@@ -52,12 +152,19 @@ impl Served<'_> {
             let readers = self.matched.get(&gid).cloned().unwrap_or_default();
             // History goes ahead of those who will ask for it; what is left is carried to its end.
             let history = publisher.qos.durability == Durability::TransientLocal;
-            let rest = self.ending.contains_key(&gid) && self.relays.contains_key(&gid);
-            if history || rest || !readers.is_empty() {
+            let known = self.relays.get(&gid);
+            let rest = self.ending.contains_key(&gid) && known.is_some_and(|r| !r.is_kept());
+            if history || rest || known.is_some_and(Relay::waits) || !readers.is_empty() {
                 wanted.insert(gid, readers);
             }
         }
-        self.relays.retain(|publisher, _| wanted.contains_key(publisher));
+        self.relays.retain(|publisher, relay| {
+            let is_wanted = wanted.contains_key(publisher);
+            if !is_wanted && relay.is_kept() {
+                relay.give_up();
+            }
+            is_wanted
+        });
         for (publisher, stands_for) in wanted {
             let gids: Vec<Gid> = stands_for.iter().take(MAX_MATCHED).copied().collect();
             if let Some(relay) = self.relays.get_mut(&publisher) {
@@ -65,24 +172,43 @@ impl Served<'_> {
                     relay.subscription.set_stands_for(gids);
                     relay.stands_for = stands_for;
                 }
+                let there = &relay.stands_for;
+                relay.awaits.take_if(|awaits| {
+                    awaits.readers.is_subset(there) || awaits.until <= Instant::now()
+                });
                 continue;
             }
-            let Endpoint { topic, type_name, qos, .. } = &*self.own[&publisher];
+            let endpoint = Arc::clone(&self.own[&publisher]);
+            let Endpoint { topic, type_name, qos, .. } = &*endpoint;
             let spec = EndpointSpec::new(&**topic, &**type_name, requested(qos));
-            match self.common.outside.create_relay_of(publisher, spec, gids) {
+            let outside = &self.common.outside;
+            match outside.create_relay_of(publisher, spec, gids, holds(qos)) {
                 Ok(subscription) => {
-                    self.relays.insert(publisher, Relay { subscription, stands_for, lost: 0 });
+                    let relay = Relay {
+                        subscription,
+                        publisher: endpoint,
+                        stands_for,
+                        lost: 0,
+                        awaits: None,
+                        revived: false,
+                    };
+                    self.relays.insert(publisher, relay);
                 }
                 Err(error) => tracing::error!(topic, %error, "nothing is relayed"),
             }
         }
     }
 
-    /// Whether all that a publisher has published is with the daemon.
+    /// Whether all that a publisher has published is where it is to go.
     pub(super) fn is_published(&self, publisher: &Gid) -> bool {
         let relay = self.relays.get(publisher);
-        relay.is_none_or(|relay| !relay.subscription.has_from(publisher))
+        relay.is_none_or(|relay| relay.unconfirmed() == 0)
             && self.pipe.outgoing.is_idle(&Channel::of(*publisher))
+    }
+
+    /// Whether the daemon was told of a publisher after it had ended.
+    pub(super) fn is_revived(&self, publisher: &Gid) -> bool {
+        self.relays.get(publisher).is_some_and(|relay| relay.revived)
     }
 }
 

@@ -15,9 +15,9 @@ use crate::{
         peers::PeerError,
         publisher::PublisherInner,
         state::StatusAnswer,
-        subscription::{Accept, Asking, SubscriptionInner},
+        subscription::{Accept, Asking, Numbers, SubscriptionInner},
     },
-    shm::{Grant, Location, Peer, ReaderInfo, ShmError},
+    shm::{Grant, Location, Peer, ReaderInfo, ShmError, Terms},
 };
 
 impl Control {
@@ -233,6 +233,7 @@ impl Control {
             segments: Vec::new(),
             // The numbers of the others say nothing of what came before.
             after: after.filter(|_| subscription.rising),
+            carries: subscription.carries.then_some(true),
         })
     }
 
@@ -252,9 +253,10 @@ impl Control {
             return;
         }
         let grant = peer.map_err(|e| e.to_string()).and_then(|peer| {
-            let Attach { reader: gid, lane, qos, stands_for, after, .. } = attach;
+            let Attach { reader: gid, lane, qos, stands_for, after, carries, .. } = attach;
             let reader = ReaderInfo { gid, lane, qos, peer, stands_for };
-            publisher.attach(reader, after).map_err(|e| e.to_string())
+            let terms = Terms { after, carries: carries == Some(true) };
+            publisher.attach(reader, terms).map_err(|e| e.to_string())
         });
         drop(home);
         match grant {
@@ -264,8 +266,18 @@ impl Control {
                 let session = self.shared.id;
                 let segments = Vec::new();
                 let after = Some(after);
-                let grant =
-                    Granted { reader, writer, generation, first, session, ring, segments, after };
+                let relayed = publisher.relayed.then_some(true);
+                let grant = Granted {
+                    reader,
+                    writer,
+                    generation,
+                    first,
+                    session,
+                    ring,
+                    segments,
+                    after,
+                    relayed,
+                };
                 self.say(Message::Grant(grant));
                 self.writer_changed(&publisher);
             }
@@ -284,7 +296,8 @@ impl Control {
     }
 
     fn grant(&mut self, granted: Granted, descriptors: Vec<PassedFd>) {
-        let Granted { reader, writer, generation, first, session, ring, segments, after } = granted;
+        let Granted { reader, writer, generation, first, session, ring, segments, .. } = granted;
+        let Granted { after, relayed, .. } = granted;
         let pair = Pair { reader, writer };
         self.told_of(pair);
         // In a packet that is full not all of them were named.
@@ -325,10 +338,16 @@ impl Control {
         match mapped {
             Ok(mapped) => {
                 trail::accepted(&pair, generation, first);
-                // Under `off` and in a relayed process what was lost on the way is said aloud.
-                let linked = matches!(self.link, Link::Socket(_)) && !writer.is_of(&session);
-                let stands_in = linked && subscription.endpoint.kind == EndpointKind::Subscription;
-                subscription.lock().add(mapped, after, stands_in, subscription.keeps_all());
+                let stands_in = !writer.is_of(&session) || relayed == Some(true);
+                let linked = matches!(self.link, Link::Socket(_));
+                let numbers = match subscription.endpoint.kind {
+                    EndpointKind::Subscription if stands_in && linked => Numbers::All,
+                    // In a relayed process what was lost on the way is said aloud.
+                    EndpointKind::Subscription if stands_in => Numbers::Between,
+                    _ if subscription.keeps_all() => Numbers::Since,
+                    _ => Numbers::None,
+                };
+                subscription.lock().add(mapped, after, numbers);
                 drop(home);
                 self.reader_changed(&subscription);
                 // It may have history to take.

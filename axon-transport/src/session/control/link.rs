@@ -94,7 +94,8 @@ impl Control {
                     id: shared.id,
                     segment: Some(&shared.segment),
                     relay: None,
-                    cancel: Some(&shared.stopping),
+                    // Pairs with the release store in `Shared::stop`.
+                    cancel: Some(&|| shared.stopping.load(Ordering::Acquire)),
                 };
                 match caller.connect() {
                     Ok(connected) => {

@@ -254,6 +254,10 @@ pub struct Attach {
     /// The last number that a reader has of the writer that was attached before: it goes on behind it.
     #[n(7)]
     pub after: Option<u64>,
+    /// Set where it carries samples to another process: they are taken when that process has them, and
+    /// kept for it for a while when the reader's own ends.
+    #[n(8)]
+    pub carries: Option<bool>,
 }
 
 /// The writer serves the reader.
@@ -284,6 +288,10 @@ pub struct Granted {
     /// The number of the writer's last sample in front of the first position.
     #[n(7)]
     pub after: Option<u64>,
+    /// Set where its samples come from a process that shares no memory: numbers that are missing were
+    /// lost on the way.
+    #[n(8)]
+    pub relayed: Option<bool>,
 }
 
 /// A segment of a session's memory, besides the first.

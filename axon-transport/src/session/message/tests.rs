@@ -77,6 +77,7 @@ fn messages() -> Vec<Message> {
             stands_for: Some(vec![]),
             segments: vec![Segment { number: 3, publisher: None }],
             after: Some(8),
+            carries: Some(true),
         }),
         Message::Grant(Granted {
             reader,
@@ -87,6 +88,7 @@ fn messages() -> Vec<Message> {
             ring: Location { segment: 0, offset: 4096 },
             segments: vec![Segment { number: 7, publisher: Some(writer) }],
             after: Some(11),
+            relayed: Some(true),
         }),
         Message::Detach(Pair { reader, writer }),
         Message::Unmatch(Unmatch { reader, writer, reason: "gone".into() }),

@@ -32,6 +32,8 @@ pub(in crate::session) struct SubscriptionInner {
     pub(in crate::session) ignores_local: bool,
     /// The only publisher that a relay reads, where it is not all.
     pub(in crate::session) only: Option<Gid>,
+    /// Whether it carries samples to another process, which says what it has.
+    pub(in crate::session) carries: bool,
     /// Whether a writer's numbers rise: the responses of a server come in whatever order it likes.
     pub(in crate::session) rising: bool,
     pub(in crate::session) role: EndpointRole,
@@ -62,17 +64,20 @@ impl SubscriptionInner {
 
     fn reading(endpoint: Endpoint, role: EndpointRole, qos: Qos) -> Self {
         let events = EndpointEvents::of_subscription(&endpoint.qos);
+        let keeps_all = endpoint.kind == EndpointKind::Subscription && holds(&qos);
+        let slots = Slots::new(keeps_all);
         Self {
             endpoint,
             qos,
             shared_depth: None,
             ignores_local: false,
             only: None,
+            carries: false,
             rising: true,
             role,
             events,
             stands_for: Mutex::default(),
-            slots: Mutex::default(),
+            slots: slots.into(),
             arrived: Callback::default(),
             listens: Mutex::new(false),
         }
@@ -144,6 +149,8 @@ impl SubscriptionInner {
         let mut mapped = Reader::map(options)?;
         if self.role == EndpointRole::Relay {
             mapped.tell_progress();
+        }
+        if self.role == EndpointRole::Relay || self.carries {
             mapped.finish_later();
         }
         if matches!(self.endpoint.kind, EndpointKind::Server | EndpointKind::Client) {

@@ -13,7 +13,7 @@ use std::{
 
 pub(super) use self::{
     inner::SubscriptionInner,
-    slots::{Accept, Asking},
+    slots::{Accept, Asking, Numbers},
 };
 use self::{inner::lock, slots::Slots};
 use super::{
@@ -26,6 +26,7 @@ use crate::{
     events::EventKind,
     graph::Endpoint,
     ids::Gid,
+    qos::Durability,
     shm::{Meta, Reader, Sample, ShmError, TakeError},
     wait::Look,
 };
@@ -190,11 +191,12 @@ impl Subscription {
         self.inner.lock().take_from(writer, &self.inner)
     }
 
-    /// For a relay of one publisher alone: samples up to this number are where they are to go. Until then
-    /// nobody takes them as acknowledged.
-    pub(crate) fn acknowledge(&self, sequence: u64) {
+    /// For a relay: what was taken and not acknowledged is to be taken once more; where its publisher
+    /// keeps a history, all of that.
+    pub(crate) fn take_back(&self) {
         if !self.session.is_forked() {
-            self.inner.lock().finish(sequence);
+            let history = self.inner.qos.durability == Durability::TransientLocal;
+            self.inner.lock().take_back(history);
         }
     }
 

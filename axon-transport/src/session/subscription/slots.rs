@@ -13,6 +13,8 @@ use crate::{
 
 /// Publishers whose last sequence number is remembered after they are gone.
 const REMEMBERED: usize = 4096;
+/// Rings that a KEEP_ALL subscription reads of what a writer left, each by way of another daemon.
+const LEFT: usize = 8;
 /// How long nobody is woken for a sample that there was no memory to take.
 const SHORT: Duration = Duration::from_secs(1);
 
@@ -34,8 +36,23 @@ pub(in crate::session) struct Slots {
     pub(super) arrived_before: u64,
     /// When there was no memory to take a sample last.
     pub(super) short: Option<Instant>,
+    /// Whether the subscription wants every sample.
+    pub(super) keeps_all: bool,
     /// Writers whose memory was not usable, of which the others have to be told.
     pub(super) discarded: Vec<Gid>,
+}
+
+/// What a writer's numbers tell of losses that the ring's positions do not.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(in crate::session) enum Numbers {
+    None,
+    /// It stands in for one elsewhere: what was lost on the way to its ring.
+    All,
+    /// What was lost since it was here before.
+    Since,
+    /// What was lost between the last sample that it brought before and its first. Later losses are said
+    /// aloud.
+    Between,
 }
 
 /// How a writer is asked to serve.
@@ -74,8 +91,13 @@ pub(super) struct Slot {
     pub(super) last: Option<u64>,
     /// The number in front of the first that this slot was granted.
     after: Option<u64>,
-    /// What is missing of its numbers, where that tells of losses on the way to its ring.
+    /// What is missing of its numbers, where that tells of losses.
     pub(super) gaps: Option<Gaps>,
+    numbers: Numbers,
+    /// A number of its writer was known when it was granted.
+    pub(super) resumed: bool,
+    /// What was missing while they were looked at.
+    missed: u64,
 }
 
 /// Samples of a publisher on another host that never came to the ring that stands in for it here:
@@ -116,6 +138,10 @@ impl Slot {
             gaps.before = Some((last, self.reader.grant().first));
         }
         gaps.pass(sequence, position);
+        if self.numbers == Numbers::Between {
+            self.missed = gaps.lost;
+            self.gaps = None;
+        }
     }
 
     /// The number up to which nothing is to come any more.
@@ -126,11 +152,16 @@ impl Slot {
     /// Its samples that were lost, here and before they came here.
     pub(super) fn lost(&self) -> u64 {
         let before = self.gaps.as_ref().map_or(0, |gaps| gaps.lost);
-        self.reader.lost().saturating_add(before)
+        self.reader.lost().saturating_add(before).saturating_add(self.missed)
     }
 }
 
 impl Slots {
+    /// Those of a subscription that wants every sample, or does not.
+    pub(super) fn new(keeps_all: bool) -> Self {
+        Self { keeps_all, ..Self::default() }
+    }
+
     pub(super) fn has_data(&self) -> bool {
         !self.is_short() && self.slots.iter().any(|slot| slot.reader.has_data())
     }
@@ -219,16 +250,8 @@ impl Slots {
         self.pending.remove(&writer).map_or(Accept::Stands, |(lane, _)| Accept::Map(lane))
     }
 
-    /// A writer granted what comes `after` a number. If it `stands_in` for one elsewhere, its numbers
-    /// tell what was lost on the way. If it was here before and the subscription `keeps_all`, they tell
-    /// what was lost meanwhile.
-    pub(in crate::session) fn add(
-        &mut self,
-        reader: Reader,
-        after: Option<u64>,
-        stands_in: bool,
-        keeps_all: bool,
-    ) {
+    /// A writer granted what comes `after` a number.
+    pub(in crate::session) fn add(&mut self, reader: Reader, after: Option<u64>, numbers: Numbers) {
         let writer = reader.writer();
         // One that speaks for another has no number before it has a sample.
         let after = after.filter(|number| *number > 0);
@@ -239,7 +262,14 @@ impl Slots {
         let (over, leaving, overtaken) = (false, false, false);
         let earlier = self.slots.iter().find(|s| s.reader.writer() == writer).map(Slot::reached);
         let last = earlier.unwrap_or_else(|| self.last.remove(&writer));
-        let gaps = (stands_in || keeps_all && last.is_some()).then(Gaps::default);
+        let resumed = earlier.is_some() || last.is_some();
+        let told = match numbers {
+            Numbers::None => false,
+            Numbers::All => true,
+            Numbers::Since | Numbers::Between => resumed,
+        };
+        let gaps = told.then(Gaps::default);
+        let missed = 0;
         self.slots.push(Slot {
             reader,
             since,
@@ -251,6 +281,9 @@ impl Slots {
             last,
             after,
             gaps,
+            numbers,
+            resumed,
+            missed,
         });
         self.forget_older(writer);
     }
@@ -298,16 +331,44 @@ impl Slots {
         news
     }
 
-    /// Gives up all but the last of what a writer left: one that begins anew and anew would otherwise
-    /// take all lanes. What comes after is read by the later grant, too.
+    /// Gives up all but the last of what a writer left, or the last few where nothing is to be lost: one
+    /// that begins anew and anew would otherwise take all lanes.
     fn forget_older(&mut self, writer: Gid) {
-        while let [older, newer, ..] = self.slots_of(writer)[..]
-            && self.slots[newer].over
-        {
-            let later = self.slots[newer].reader.grant().first;
-            let slot = self.slots.remove(older);
-            self.lost = self.lost.saturating_add(slot.reader.unread_below(later));
+        loop {
+            let of = self.slots_of(writer);
+            let over = of.iter().filter(|index| self.slots[**index].over).count();
+            let [older, newer, ..] = of[..] else { return };
+            let same = self.slots[newer].reader.is_of_ring(&self.slots[older].reader);
+            if over <= if self.keeps_all && !same { LEFT } else { 1 } {
+                return;
+            }
+            let mut slot = self.slots.remove(older);
+            self.count_left(&mut slot);
             self.retire(&slot);
+        }
+    }
+
+    /// Counts what a slot that is given up has not taken and no later one of its writer will.
+    fn count_left(&mut self, slot: &mut Slot) {
+        let writer = slot.reader.writer();
+        let Some(newer) = self.slots.iter().find(|s| s.reader.writer() == writer) else { return };
+        if newer.reader.is_of_ring(&slot.reader) {
+            let later = newer.reader.grant().first;
+            self.lost = self.lost.saturating_add(slot.reader.unread_below(later));
+            return;
+        }
+        // One after the other: what is missing among them was counted, or is by their numbers.
+        for _ in 0..slot.reader.unread() {
+            let Ok(Some(next)) = slot.reader.peek() else { break };
+            if !slot.reader.skip() {
+                break;
+            }
+            slot.passed(next.sequence);
+            slot.last = slot.last.max(Some(next.sequence));
+            self.lost = self.lost.saturating_add(1);
+        }
+        if let Some(last) = slot.last {
+            self.note(writer, last);
         }
     }
 

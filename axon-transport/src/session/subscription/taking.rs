@@ -2,7 +2,11 @@
 
 use std::{collections::HashMap, time::Instant};
 
-use super::{Lifetime, MessageInfo, inner::SubscriptionInner, slots::Slots};
+use super::{
+    Lifetime, MessageInfo,
+    inner::SubscriptionInner,
+    slots::{Slot, Slots},
+};
 use crate::{
     graph::Endpoint,
     ids::Gid,
@@ -168,13 +172,7 @@ impl Slots {
         }
     }
 
-    /// Samples up to this number are done with.
-    pub(in crate::session) fn finish(&mut self, sequence: u64) {
-        self.slots.iter_mut().for_each(|slot| slot.reader.finish(sequence));
-        self.sweep();
-    }
-
-    /// As [`finish`](Self::finish), those of one writer.
+    /// Samples of `writer` up to this number are done with.
     pub(in crate::session) fn finish_of(&mut self, writer: &Gid, sequence: u64) {
         let of = self.slots.iter_mut().filter(|slot| slot.reader.writer() == *writer);
         let mut over = false;
@@ -184,6 +182,14 @@ impl Slots {
         }
         if over {
             self.sweep();
+        }
+    }
+
+    /// What was taken and is not done with is to be taken once more; and all of the `history` that
+    /// stands, if so.
+    pub(in crate::session) fn take_back(&mut self, history: bool) {
+        for Slot { reader, .. } in &mut self.slots {
+            if history { reader.begin_anew() } else { reader.take_back() }
         }
     }
 
@@ -203,9 +209,11 @@ impl Slots {
         self.slots.iter().any(|slot| slot.reader.writer() == *writer && slot.reader.has_data())
     }
 
-    /// Samples of `writer` that were lost before they came to its ring here.
-    pub(in crate::session) fn lost_elsewhere(&mut self, writer: &Gid, samples: u64) {
-        if self.slots.iter().any(|slot| slot.reader.writer() == *writer) {
+    /// Samples of `writer` that were lost before they came to its ring here. What is missing before the
+    /// `first` in that ring is seen by its number, where the subscription knows an earlier one.
+    pub(in crate::session) fn lost_elsewhere(&mut self, writer: &Gid, samples: u64, first: bool) {
+        let mut of = self.slots.iter().filter(|slot| slot.reader.writer() == *writer);
+        if of.any(|slot| !(slot.over || first && slot.resumed)) {
             self.lost = self.lost.saturating_add(samples);
         }
     }
@@ -273,6 +281,7 @@ mod tests {
         graph::EndpointKind,
         ids::SessionId,
         qos::Qos,
+        session::subscription::Numbers,
         shm::{Peer, PublishError, ReaderInfo, ReaderOptions, RingOptions, SessionSegment, Writer},
     };
 
@@ -311,7 +320,7 @@ mod tests {
         let [writer, gid] = [1, 2].map(|number| Gid::new(session.id(), number));
         let (publisher, reader) = reading(&session, writer, gid);
         let mut slots = Slots::default();
-        slots.add(reader, None, false, false);
+        slots.add(reader, None, Numbers::None);
         publisher.publish_next(0, b"sample").unwrap();
         assert!(slots.has_data());
         let inner = subscription(gid);
@@ -333,7 +342,7 @@ mod tests {
         let mut publishers = Vec::new();
         for writer in writers {
             let (publisher, reader) = reading(&session, writer, gid);
-            slots.add(reader, None, true, false);
+            slots.add(reader, None, Numbers::All);
             let say = |sequence| {
                 publisher.publish(Meta { sequence, source_timestamp: 0, published: 0 }, b"sample")
             };

@@ -66,6 +66,7 @@ impl Taker {
             stands_for,
             segments: Vec::new(),
             after: None,
+            carries: None,
         };
         let PeerDescriptors { segment, doorbell, pidfd } = self.session.descriptors().unwrap();
         let descriptors = [segment.as_fd(), doorbell.as_fd(), pidfd.as_fd()];

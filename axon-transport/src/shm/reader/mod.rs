@@ -1,15 +1,15 @@
 //! The taking end of a ring.
 
 mod find;
+mod under_way;
 
 use std::{
-    collections::VecDeque,
     ops::Range,
     sync::{Arc, Weak, atomic::AtomicU64},
     time::{Duration, Instant},
 };
 
-use self::find::Bytes;
+use self::{find::Bytes, under_way::UnderWay};
 use super::{
     Grant, Lane, Location, Meta, Peer, Sample, ShmError, TakeError, Taken,
     allowance::Allowance,
@@ -81,10 +81,6 @@ pub struct Reader {
     /// The publisher is gone, and its descriptors are in memory that never came.
     given_up: bool,
 }
-
-/// Numbers and positions of samples that were taken and are not done with.
-#[derive(Default)]
-struct UnderWay(VecDeque<(u64, u64)>);
 
 /// Where a ring's descriptors were found.
 struct Descriptors {
@@ -361,6 +357,11 @@ impl Reader {
         self.attachment.lane.location()
     }
 
+    /// Whether it reads the ring that another does.
+    pub(crate) fn is_of_ring(&self, other: &Self) -> bool {
+        std::ptr::eq(self.attachment.ring(), other.attachment.ring())
+    }
+
     /// The number of the segment of the publisher's session that is needed to go on and has not
     /// come.
     pub fn missing(&self) -> Option<u32> {
@@ -416,7 +417,7 @@ impl Reader {
         self.received += 1;
         self.attachment.lane.taken(record.timestamp);
         if let Some(under_way) = &mut self.under_way {
-            under_way.0.push_back((record.sequence, self.cursor));
+            under_way.add(record.sequence, self.cursor);
         }
         self.advance(self.cursor + 1);
         taken
@@ -429,39 +430,10 @@ impl Reader {
 
     #[inline]
     fn tell_cursor(&self) {
-        let first = self.under_way.as_ref().and_then(|under_way| under_way.0.front());
-        let done = first.map_or(self.cursor, |(_, position)| *position);
+        let first = self.under_way.as_ref().and_then(|under_way| under_way.first());
+        let done = first.unwrap_or(self.cursor);
         self.attachment.lane.advance(done, self.received, self.lost, self.skipped);
         self.make_room_known();
-    }
-
-    /// What is taken from now on is done with when [`finish`](Self::finish) says so: until then its
-    /// publisher takes it as not taken.
-    pub(crate) fn finish_later(&mut self) {
-        self.under_way.get_or_insert_default();
-    }
-
-    /// Whether samples that were taken are not done with.
-    pub(crate) fn is_under_way(&self) -> bool {
-        self.under_way.as_ref().is_some_and(|under_way| !under_way.0.is_empty())
-    }
-
-    /// Samples that are not done with, those that were not taken among them.
-    pub(crate) fn undone(&self) -> u64 {
-        let under_way = self.under_way.as_ref().map_or(0, |under_way| under_way.0.len() as u64);
-        under_way.saturating_add(self.unread())
-    }
-
-    /// Samples up to this number are done with.
-    pub(crate) fn finish(&mut self, sequence: u64) {
-        let Some(under_way) = &mut self.under_way else { return };
-        if self.attachment.lane.is_forked() {
-            return;
-        }
-        while under_way.0.front().is_some_and(|(number, _)| *number <= sequence) {
-            under_way.0.pop_front();
-        }
-        self.tell_cursor();
     }
 
     /// Has its publisher woken by whatever is taken, if it waits for that: of what stands for others.

@@ -9,6 +9,14 @@ use super::{State, Writer};
 use crate::{ids::Gid, shm::PeerSession};
 
 impl Writer {
+    /// The number up to which all that was published has been handed to those who carry it elsewhere.
+    pub(crate) fn handed_over(&self) -> u64 {
+        let mut state = self.lock();
+        let State { history, audience, .. } = &mut *state;
+        let position = audience.handed_over(history.head());
+        state.number_before(position)
+    }
+
     /// Waits until those who carry samples elsewhere are done with all that was published so far;
     /// whether none of it was given up. What was given up makes it false once.
     pub(crate) fn wait_handed_over(&self, timeout: Duration) -> bool {
@@ -18,7 +26,7 @@ impl Writer {
         let end = Instant::now().checked_add(timeout);
         let published = self.lock().history.head();
         loop {
-            let relays = {
+            let (relays, absent) = {
                 let mut state = self.lock();
                 let State { history, audience, known_given_up, .. } = &mut *state;
                 audience.mark_dead(history.head());
@@ -29,13 +37,14 @@ impl Writer {
                 if audience.handed_over(published) >= published {
                     return true;
                 }
-                audience.relays()
+                (audience.relays(), audience.absent_for())
             };
             let left =
                 end.map_or(Duration::MAX, |end| end.saturating_duration_since(Instant::now()));
             if left.is_zero() {
                 return false;
             }
+            let left = left.min(absent.unwrap_or(Duration::MAX));
             self.await_handover(published, &relays, left);
         }
     }

@@ -9,7 +9,7 @@ pub(super) use self::commit::Patience;
 
 use super::{
     Grant, Loan, Location, Meta, PublishError, Published, ReaderInfo, RingOptions, SessionSegment,
-    ShmError,
+    ShmError, Terms,
     allowance::Pool,
     area::Area,
     audience::Audience,
@@ -125,7 +125,7 @@ impl State {
     }
 
     /// The number of the last sample in front of a position.
-    fn number_before(&self, position: u64) -> u64 {
+    pub(super) fn number_before(&self, position: u64) -> u64 {
         let stands = position >= self.history.tail() && position < self.history.head();
         if stands {
             ring::number(self.array.words(), position).saturating_sub(1)
@@ -244,28 +244,29 @@ impl Writer {
     /// # Errors
     /// Its session has no such lane, or its process as many readers of this publisher as it may.
     pub fn attach(&self, reader: ReaderInfo) -> Result<Grant, ShmError> {
-        Ok(self.attach_after(reader, None)?.0)
+        Ok(self.attach_on(reader, Terms::default())?.0)
     }
 
-    /// As [`attach`](Self::attach), for a reader that was attached before and has all up to the number
-    /// `after`: it goes on with what stands of the samples behind that. Also returns the number of the
-    /// sample in front of the first that it is granted.
+    /// As [`attach`](Self::attach), on a reader's terms: one that was attached before goes on with what
+    /// stands of the samples behind those that it has. Also returns the number of the sample in front of
+    /// the first that it is granted.
     ///
     /// # Errors
     /// As [`attach`](Self::attach).
-    pub(crate) fn attach_after(
+    pub(crate) fn attach_on(
         &self,
         reader: ReaderInfo,
-        after: Option<u64>,
+        terms: Terms,
     ) -> Result<(Grant, u64), ShmError> {
         if self.is_forked() {
             return Err(ShmError::Forked);
         }
         let lane = reader.peer.lane(reader.lane)?;
         let mut state = self.lock();
-        let resumed = after.map(|after| state.position_after(after));
+        let resumed = terms.after.map(|after| state.position_after(after));
         let State { audience, history, .. } = &mut *state;
-        let granted = audience.attach(reader, lane, history.tail(), history.head(), resumed);
+        let (tail, head) = (history.tail(), history.head());
+        let granted = audience.attach(reader, lane, tail, head, resumed, terms.carries);
         self.show_window(&state);
         granted.map(|grant| (grant, state.number_before(grant.first)))
     }

@@ -281,6 +281,7 @@ fn a_publisher_counts_those_of_a_relay_that_it_meets() {
         stands_for: Some(vec![met, not_met]),
         segments: vec![],
         after: None,
+        carries: None,
     };
     world.registry.message(&id(GATEWAY), Message::Attach(attach), vec![]).unwrap();
     let stands_for = |told: &[Message]| {
@@ -299,6 +300,7 @@ fn a_publisher_counts_those_of_a_relay_that_it_meets() {
         ring: place,
         segments: vec![],
         after: None,
+        relayed: None,
     };
     world.registry.message(&id(1), Message::Grant(granted), vec![]).unwrap();
     // The other host's session lists this host from now on.

@@ -145,6 +145,7 @@ impl Client {
                         stands_for: None,
                         segments: vec![],
                         after: None,
+                        carries: None,
                     };
                     self.outgoing.push((Message::Attach(attach), vec![]));
                 }
@@ -168,6 +169,7 @@ impl Client {
                         ring: PLACE,
                         segments: vec![],
                         after: None,
+                        relayed: None,
                     };
                     self.outgoing.push((Message::Grant(grant), vec![]));
                 }

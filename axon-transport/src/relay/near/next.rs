@@ -1,0 +1,79 @@
+//! The daemon after the one that is gone, and how long a session that ends waits for it.
+
+use std::{
+    collections::BTreeMap,
+    sync::atomic::Ordering,
+    time::{Duration, Instant},
+};
+
+use super::{
+    Common,
+    relays::{Relay, drop_overdue},
+};
+use crate::{
+    config::{Config, DaemonPolicy},
+    ids::Gid,
+    relay::LINGER,
+    session::{
+        SessionError,
+        connect::{Caller, Connected},
+    },
+};
+
+/// Between attempts to find a daemon.
+const MIN_PAUSE: Duration = Duration::from_millis(100);
+const MAX_PAUSE: Duration = Duration::from_secs(2);
+
+impl Common {
+    pub(super) fn finishes(&self) -> bool {
+        // Pairs with the release store as the session ends.
+        self.finish.load(Ordering::Acquire)
+    }
+
+    /// Until when a session that ends waits for what it has left to be where it is to go.
+    pub(super) fn finish_by(&self) -> Option<Instant> {
+        self.finishes().then(|| *self.finish_by.get_or_init(|| Instant::now() + LINGER))
+    }
+
+    /// Whether it waits no longer.
+    pub(super) fn is_over(&self) -> bool {
+        self.finish_by().is_some_and(|by| Instant::now() >= by)
+    }
+
+    /// Another daemon; `None` when the session ends. `brief` says that the last one was as good as
+    /// none.
+    pub(super) fn reconnect(
+        &self,
+        brief: bool,
+        kept: &mut BTreeMap<Gid, Relay>,
+    ) -> Option<Connected> {
+        let mut pause = MIN_PAUSE;
+        let mut wait = brief;
+        while !self.is_over() {
+            drop_overdue(kept);
+            if std::mem::replace(&mut wait, true) {
+                std::thread::sleep(pause);
+                pause = (pause * 2).min(if self.finishes() { MIN_PAUSE } else { MAX_PAUSE });
+            }
+            // A session that ends starts no daemon.
+            let config = &self.shared.config;
+            let last = self
+                .finishes()
+                .then(|| Config { daemon: DaemonPolicy::Require, ..Config::clone(config) });
+            let caller = Caller {
+                config: last.as_ref().unwrap_or(config),
+                options: &self.shared.options,
+                id: self.shared.id,
+                segment: None,
+                relay: Some(&self.reason),
+                cancel: Some(&|| if last.is_some() { self.is_over() } else { self.finishes() }),
+            };
+            match caller.connect() {
+                Ok(connected) => return Some(connected),
+                Err(SessionError::NoDaemon { .. }) => {}
+                Err(error) => tracing::error!(%error, "no daemon took the session"),
+            }
+        }
+        None
+    }
+}

@@ -1,0 +1,357 @@
+//! Daemons that are killed while samples are on their way through them.
+
+use super::*;
+
+/// One of these is on its way, at least, whenever the daemon is killed.
+fn len_of(sequence: u64) -> usize {
+    if sequence.is_multiple_of(50) { 40_000 } else { 90 }
+}
+
+/// Kills the daemon, and starts the next.
+fn replace(host: &Host, daemon: &mut Option<Kept>) {
+    drop(daemon.take());
+    *daemon = Some(host.daemon());
+}
+
+fn depth_four(reliability: Reliability) -> Qos {
+    Qos { reliability, depth: 4, ..Qos::default() }
+}
+
+/// Has the daemon end in good order, and starts the next.
+fn relieve(host: &Host, daemon: &mut Option<Kept>) {
+    if let Some(Kept(child)) = daemon {
+        signal(child.id(), Signal::TERM);
+        child.wait().unwrap();
+    }
+    replace(host, daemon);
+}
+
+#[test]
+fn keep_all_samples_survive_killed_daemons() {
+    keep_all_survives(replace);
+}
+
+#[test]
+fn keep_all_samples_survive_daemons_that_end_in_good_order() {
+    keep_all_survives(relieve);
+}
+
+fn keep_all_survives(end: fn(&Host, &mut Option<Kept>)) {
+    const SAMPLES: u64 = 3600;
+    for (from_shares, to_shares) in ENDS {
+        let host = host();
+        let mut daemon = Some(host.daemon());
+        let from = session(&host, "from", from_shares);
+        let to = session(&host, "to", to_shares);
+        let (publisher, subscription) = connect(&from, &to, "/t", Qos::keep_all());
+        let taken = AtomicU32::new(0);
+        thread::scope(|scope| {
+            let publishing = scope.spawn(|| {
+                for sequence in 1..=SAMPLES {
+                    let sample = pattern(sequence, len_of(sequence));
+                    assert_eq!(publish(&publisher, &sample), sequence);
+                    // It goes on while there is no daemon, too.
+                    if sequence.is_multiple_of(4) {
+                        thread::sleep(Duration::from_millis(1));
+                    }
+                }
+            });
+            let taking = scope.spawn(|| {
+                let mut bytes = Vec::new();
+                for sequence in 1..=SAMPLES {
+                    let info = subscription.recv(&mut bytes, Some(PATIENCE)).expect("in time");
+                    let of = (from_shares, to_shares);
+                    assert_eq!((info.sequence, subscription.lost()), (sequence, 0), "{of:?}");
+                    assert_eq!(bytes, pattern(sequence, len_of(sequence)));
+                    taken.store(sequence as u32, Ordering::Relaxed);
+                }
+            });
+            for kill_at in [600, 1800, 3000] {
+                until("some are taken", || {
+                    taken.load(Ordering::Relaxed) >= kill_at || taking.is_finished()
+                });
+                end(&host, &mut daemon);
+            }
+            taking.join().unwrap();
+            publishing.join().unwrap();
+        });
+        assert!(publisher.wait_acknowledged(PATIENCE));
+        assert_eq!(publisher.given_up(), 0);
+        assert!(subscription.take(&mut Vec::new()).is_none(), "nothing is repeated");
+    }
+}
+
+#[test]
+fn a_full_path_survives_killed_daemons() {
+    for (from_shares, to_shares) in ENDS {
+        let host = host();
+        let mut daemon = Some(host.daemon());
+        let from = session(&host, "from", from_shares);
+        let to = session(&host, "to", to_shares);
+        let (publisher, subscription) = connect(&from, &to, "/t", Qos::keep_all());
+        let mut last = fill(|number| publisher.publish(&pattern(number, 50_000)));
+        for _ in 0..2 {
+            replace(&host, &mut daemon);
+            await_pair(&publisher, &subscription);
+        }
+        let ends = (from_shares, to_shares);
+        // What its reader did not take is still in its ring, or comes with the next.
+        for sequence in last + 1..=last + 20 {
+            if publisher.publish(&pattern(sequence, 50_000)).is_err() {
+                break;
+            }
+            last = sequence;
+        }
+        assert!(take_until(&subscription, last).into_iter().eq(1..=last), "{ends:?}");
+        assert!(publisher.wait_acknowledged(PATIENCE), "{ends:?}");
+        assert_eq!((subscription.lost(), publisher.given_up()), (0, 0), "{ends:?}");
+    }
+}
+
+#[test]
+fn unread_samples_of_a_relayed_reader_are_not_acknowledged() {
+    let host = host();
+    let _daemon = host.daemon();
+    for (from_shares, to_shares) in [(true, false), (false, false)] {
+        let from = session(&host, "from", from_shares);
+        let to = session(&host, "to", to_shares);
+        let topic = format!("/of/{from_shares}");
+        let (publisher, subscription) = connect(&from, &to, &topic, Qos::keep_all());
+        // More than all that lies in between may hold.
+        let last = fill(|number| publisher.publish(&pattern(number, 50_000)));
+        assert!(!publisher.wait_acknowledged(Duration::from_millis(50)));
+        assert_eq!(take_until(&subscription, last).len() as u64, last);
+        assert!(publisher.wait_acknowledged(PATIENCE));
+    }
+}
+
+#[test]
+fn without_a_daemon_nothing_new_is_acknowledged() {
+    for (from_shares, to_shares) in [(false, true), (true, false), (false, false)] {
+        let host = host();
+        let daemon = host.daemon();
+        let from = session(&host, "from", from_shares);
+        let to = session(&host, "to", to_shares);
+        let (publisher, subscription) = connect(&from, &to, "/t", Qos::keep_all());
+        publish(&publisher, &pattern(1, 10));
+        assert_eq!(take_until(&subscription, 1), [1]);
+        assert!(publisher.wait_acknowledged(PATIENCE));
+        drop(daemon);
+        publish(&publisher, &pattern(2, 10));
+        publish(&publisher, &pattern(3, 5_000));
+        let ends = (from_shares, to_shares);
+        assert!(!publisher.wait_acknowledged(Duration::from_millis(50)), "{ends:?}");
+        let _daemon = host.daemon();
+        assert!(publisher.wait_acknowledged(PATIENCE), "{ends:?}");
+        assert_eq!(take_until(&subscription, 3), [2, 3]);
+        assert_eq!((subscription.lost(), publisher.given_up()), (0, 0), "{ends:?}");
+    }
+}
+
+#[test]
+fn samples_of_a_dropped_publisher_go_through_the_next_daemon() {
+    for to_shares in [true, false] {
+        for dropped_first in [true, false] {
+            let host = host();
+            let daemon = host.daemon();
+            let from = session(&host, "from", false);
+            let to = session(&host, "to", to_shares);
+            let (publisher, subscription) = connect(&from, &to, "/t", Qos::keep_all());
+            stop(&daemon);
+            for sequence in 1..=20 {
+                publish(&publisher, &pattern(sequence, 500));
+            }
+            let gid = publisher.gid();
+            if dropped_first {
+                drop(publisher);
+                drop(daemon);
+            } else {
+                drop(daemon);
+                drop(publisher);
+            }
+            let _daemon = host.daemon();
+            let case = (to_shares, dropped_first);
+            assert!(take_until(&subscription, 20).into_iter().eq(1..=20), "{case:?}");
+            assert_eq!(subscription.lost(), 0, "{case:?}");
+            until("the publisher is gone from the graph", || {
+                !to.graph().endpoints.contains_key(&gid)
+            });
+        }
+    }
+}
+
+/// In a child: publishes a little when it is told to, and ends when it is told so.
+pub(super) fn publish_and_end(session: &Session) {
+    let publisher = session.create_publisher(spec("/t", Qos::keep_all())).unwrap();
+    assert!(publisher.wait_matched(1, PATIENCE));
+    say("matched");
+    let mut line = String::new();
+    std::io::stdin().read_line(&mut line).unwrap();
+    for sequence in 1..=20 {
+        publish(&publisher, &pattern(sequence, 500));
+    }
+    say("published");
+    std::io::stdin().read_line(&mut line).unwrap();
+}
+
+#[test]
+fn a_process_that_ends_hands_over_to_the_next_daemon() {
+    let host = host();
+    let daemon = host.daemon();
+    let (relaying, listener) = (relaying(&host), session(&host, "listener", true));
+    let subscription = listener.create_subscription(spec("/t", Qos::keep_all())).unwrap();
+    let mut leaver = relaying.play("publisher that ends");
+    assert_eq!(leaver.hear(), "matched");
+    stop(&daemon);
+    leaver.go();
+    assert_eq!(leaver.hear(), "published");
+    drop(daemon);
+    let _daemon = host.daemon();
+    leaver.go();
+    leaver.finish();
+    // It waits for a second at most, which may be too short for a slow machine.
+    let mut bytes = Vec::new();
+    let mut next = 1;
+    while let Some(info) = subscription.take(&mut bytes) {
+        assert_eq!(info.sequence, next);
+        next += 1;
+    }
+    assert_eq!(subscription.lost(), 0);
+}
+
+#[test]
+fn the_publisher_and_its_daemon_may_be_killed_together() {
+    for to_shares in [true, false] {
+        let host = host();
+        let daemon = host.daemon();
+        let (relaying, listener) = (relaying(&host), session(&host, "listener", to_shares));
+        let subscription = listener.create_subscription(spec("/t", Qos::keep_all())).unwrap();
+        let talker = relaying.play("talker");
+        assert_eq!(take_until(&subscription, 100).len(), 100);
+        drop(daemon);
+        drop(talker);
+        let _daemon = host.daemon();
+        until("it is gone", || subscription.matched().is_empty());
+        let mut bytes = Vec::new();
+        let mut next = 101;
+        while let Some(info) = subscription.take(&mut bytes) {
+            assert_eq!((info.sequence, bytes.len()), (next, next as usize % 10_000));
+            next += 1;
+        }
+        let publisher = listener.create_publisher(spec("/t", Qos::keep_all())).unwrap();
+        await_pair(&publisher, &subscription);
+        assert_eq!(publish(&publisher, &pattern(1, 10)), 1);
+        assert_eq!(take_until(&subscription, 1), [1]);
+    }
+}
+
+#[test]
+fn a_reader_that_stays_away_holds_its_publisher_for_a_while_only() {
+    let host = host();
+    let daemon = host.daemon();
+    let relaying = relaying(&host);
+    let sharing = session(&host, "sharing", true);
+    let relayed = session(&host, "relayed", false);
+    let publishers = [&sharing, &relayed]
+        .map(|session| session.create_publisher(spec("/t", Qos::keep_all())).unwrap());
+    let mut deaf = relaying.play("deaf");
+    assert_eq!(deaf.hear(), "matched");
+    publishers.iter().for_each(|publisher| assert!(publisher.wait_matched(1, PATIENCE)));
+    for publisher in &publishers {
+        fill(|_| publisher.publish(&vec![0; 100_000]));
+    }
+    // The daemon does not live to see it end.
+    stop(&daemon);
+    signal(deaf.pid(), Signal::KILL);
+    drop(daemon);
+    let _daemon = host.daemon();
+    // It may have been killed with the daemon, or be stopped: they wait for a while.
+    for (publisher, of) in publishers.iter().zip(["sharing", "relayed"]) {
+        publish(publisher, &vec![0; 100_000]);
+        assert!(!publisher.wait_acknowledged(PATIENCE), "{of}");
+        assert!(publisher.given_up() > 0, "{of}");
+    }
+}
+
+#[test]
+fn another_reader_goes_on_when_one_ends_without_a_daemon() {
+    for (from_shares, to_shares) in ENDS {
+        let host = host();
+        let mut daemon = Some(host.daemon());
+        let from = session(&host, "from", from_shares);
+        let [one, other] = ["one", "other"].map(|name| session(&host, name, to_shares));
+        let (publisher, stays) = connect(&from, &one, "/t", Qos::keep_all());
+        let ends = other.create_subscription(spec("/t", Qos::keep_all())).unwrap();
+        await_pair(&publisher, &ends);
+        for sequence in 1..=50 {
+            publish(&publisher, &pattern(sequence, len_of(sequence)));
+        }
+        drop(daemon.take());
+        drop((ends, other));
+        for sequence in 51..=60 {
+            publish(&publisher, &pattern(sequence, len_of(sequence)));
+        }
+        daemon = Some(host.daemon());
+        assert!(take_until(&stays, 60).into_iter().eq(1..=60), "{:?}", (from_shares, to_shares));
+        assert_eq!(stays.lost(), 0);
+        assert!(publisher.wait_acknowledged(PATIENCE) || publisher.given_up() > 0);
+        drop(daemon);
+    }
+}
+
+#[test]
+fn what_a_killed_daemon_loses_of_keep_last_and_best_effort_is_counted() {
+    for reliability in [Reliability::Reliable, Reliability::BestEffort] {
+        for (from_shares, to_shares) in ENDS {
+            let host = host();
+            let mut daemon = Some(host.daemon());
+            let from = session(&host, "from", from_shares);
+            let to = session(&host, "to", to_shares);
+            let publisher = from.create_publisher(spec("/t", depth_four(reliability))).unwrap();
+            let keeps = Qos { reliability, ..Qos::keep_all() };
+            let subscription = to.create_subscription(spec("/t", keeps)).unwrap();
+            await_pair(&publisher, &subscription);
+            // Before its first sample a subscription does not know what there was.
+            let mut published = publish(&publisher, &pattern(1, 10));
+            assert_eq!(take_until(&subscription, 1), [1]);
+            for _ in 0..2 {
+                for _ in 0..300 {
+                    published = publish(&publisher, &pattern(published + 1, 3_000));
+                }
+                replace(&host, &mut daemon);
+                await_pair(&publisher, &subscription);
+            }
+            published = publish(&publisher, &pattern(published + 1, 3_000));
+            let taken = take_until(&subscription, published);
+            assert!(taken.is_sorted_by(|a, b| a < b), "nothing is repeated");
+            let case = (reliability, from_shares, to_shares);
+            assert_eq!(1 + taken.len() as u64 + subscription.lost(), published, "{case:?}");
+        }
+    }
+}
+
+#[test]
+fn a_late_joiner_gets_the_history_from_the_next_daemon() {
+    let all = Qos { durability: Durability::TransientLocal, ..Qos::keep_all() };
+    for (from_shares, to_shares) in ENDS {
+        let host = host();
+        let mut daemon = Some(host.daemon());
+        let from = session(&host, "from", from_shares);
+        let to = session(&host, "to", to_shares);
+        let (publisher, first) = connect(&from, &to, "/t", all);
+        for sequence in 1..=30 {
+            publish(&publisher, &pattern(sequence, len_of(sequence)));
+        }
+        replace(&host, &mut daemon);
+        let ends = (from_shares, to_shares);
+        let joiner = to.create_subscription(spec("/t", all)).unwrap();
+        assert!(take_until(&joiner, 30).into_iter().eq(1..=30), "{ends:?}");
+        assert!(take_until(&first, 30).into_iter().eq(1..=30), "{ends:?}");
+        publish(&publisher, &pattern(31, 10));
+        assert_eq!((take_until(&first, 31), take_until(&joiner, 31)), (vec![31], vec![31]));
+        assert_eq!((first.lost(), joiner.lost()), (0, 0), "{ends:?}");
+        // Who comes later gets it, too.
+        let late = to.create_subscription(spec("/t", all)).unwrap();
+        assert!(take_until(&late, 31).into_iter().eq(1..=31), "{ends:?}");
+    }
+}
