@@ -240,7 +240,13 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
 pub fn relay_pieces_seeds() -> Vec<Vec<u8>> {
     use session::{Head, Message, Piece};
     let piece = |channel: usize, length: Option<u32>, bytes: usize| {
-        let head = length.map(|length| Head { length, sequence: 1, source_timestamp: 2, lost: 3 });
+        let head = length.map(|length| Head {
+            length,
+            sequence: 1,
+            source_timestamp: 2,
+            lost: 3,
+            published: 4,
+        });
         let Channel { writer: publisher, client } = relay_channels()[channel];
         let piece = Piece { publisher, head, bytes: vec![0; bytes], client };
         let packet = Message::Piece(piece).encode().unwrap();
@@ -335,7 +341,13 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
         Message::Matched(Matched { gid: reader, others: vec![writer] }),
         Message::Piece(Piece {
             publisher: writer,
-            head: Some(Head { length: 3, sequence: 7, source_timestamp: -1, lost: 2 }),
+            head: Some(Head {
+                length: 3,
+                sequence: 7,
+                source_timestamp: -1,
+                lost: 2,
+                published: 9,
+            }),
             bytes: vec![1, 2],
             client: None,
         }),
