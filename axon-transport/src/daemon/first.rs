@@ -56,8 +56,10 @@ pub(super) async fn first(socket: &AsyncFd<PassedFd>) -> Option<First> {
             Ok(Received { message: Message::Unknown(OWNER), descriptors })
                 if key.is_none() && descriptors.is_empty() =>
             {
-                key = SessionKey::from_packet(&buffer).map(Arc::new);
+                // One that is no key ends the connection: it comes once at most.
+                let its_key = SessionKey::from_packet(&buffer);
                 buffer.zeroize();
+                key = Some(Arc::new(its_key?));
             }
             // A later version may say something first; a flood would keep everybody else waiting.
             Ok(Received { message: Message::Unknown(_), descriptors })
@@ -74,5 +76,7 @@ pub(super) async fn first(socket: &AsyncFd<PassedFd>) -> Option<First> {
             }
             Ok(_) | Err(_) => return None,
         }
+        // A socket that stays readable must not keep the others, or the time limit, from their turn.
+        tokio::task::yield_now().await;
     }
 }

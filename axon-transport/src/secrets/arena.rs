@@ -10,6 +10,8 @@ use std::{
     sync::{Mutex, MutexGuard, Once, PoisonError},
 };
 
+use crate::process::{Made, PerProcess};
+
 use rustix::mm::{Advice, MapFlags, ProtFlags, madvise, mlock, mmap_anonymous};
 use zeroize::Zeroize;
 
@@ -29,15 +31,26 @@ struct Arena {
 // thread's.
 unsafe impl Send for Arena {}
 
-static ARENA: Mutex<Arena> = Mutex::new(Arena { free: Vec::new(), slots: 0 });
+/// Locks are not inherited by a fork: a child's keys are in memory of its own, which it locked.
+static ARENA: PerProcess<Mutex<Arena>> = PerProcess::new();
 
-fn arena() -> MutexGuard<'static, Arena> {
+type Own = &'static Made<Mutex<Arena>>;
+
+fn arena() -> io::Result<Own> {
+    let empty = |_| Mutex::new(Arena { free: Vec::new(), slots: 0 });
+    ARENA.get(empty, |_, _| ()).map_err(io::Error::other)
+}
+
+fn lock(arena: Own) -> MutexGuard<'static, Arena> {
     // Each operation leaves the list whole, so what a panicking thread held is sound.
-    ARENA.lock().unwrap_or_else(PoisonError::into_inner)
+    arena.value().lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// A key in locked memory, erased on drop. Neither `Clone` nor `Debug`.
-pub(crate) struct LockedKey(NonNull<Slot>);
+pub(crate) struct LockedKey {
+    slot: NonNull<Slot>,
+    arena: Own,
+}
 
 impl UnwindSafe for LockedKey {}
 impl RefUnwindSafe for LockedKey {}
@@ -52,8 +65,12 @@ unsafe impl Sync for LockedKey {}
 /// # Errors
 /// The system gives no memory.
 pub(crate) fn prepare() -> io::Result<()> {
-    let mut arena = arena();
-    if arena.slots == 0 { arena.grow() } else { Ok(()) }
+    let arena = arena()?;
+    let mut held = lock(arena);
+    let grown = if held.slots == 0 { Some(held.grow()?) } else { None };
+    drop(held);
+    grown.into_iter().for_each(Grown::warn);
+    Ok(())
 }
 
 impl LockedKey {
@@ -62,17 +79,21 @@ impl LockedKey {
     /// # Errors
     /// The system gives no memory.
     pub(crate) fn copy_of(key: &[u8; 32]) -> io::Result<Self> {
-        let mut arena = arena();
+        let (arena, mut grown) = (arena()?, None);
+        let mut held = lock(arena);
         let slot = loop {
-            match arena.free.pop() {
+            match held.free.pop() {
                 Some(slot) => break slot,
-                None => arena.grow()?,
+                None => grown = Some(held.grow()?),
             }
         };
+        drop(held);
+        // Without the lock: a log that nobody reads must not hold up other keys.
+        grown.into_iter().for_each(Grown::warn);
         // Straight from there to here: a value in between would be left on the stack.
         // SAFETY: a slot out of the list is mapped, writable, and nobody else's.
         unsafe { slot.copy_from_nonoverlapping(NonNull::from(key), 1) };
-        Ok(Self(slot))
+        Ok(Self { slot, arena })
     }
 }
 
@@ -80,21 +101,24 @@ impl AsRef<[u8; 32]> for LockedKey {
     fn as_ref(&self) -> &[u8; 32] {
         // SAFETY: the slot is mapped as long as the process lives, was written by `copy_of`, and
         // changes only in `drop`.
-        unsafe { self.0.as_ref() }
+        unsafe { self.slot.as_ref() }
     }
 }
 
 impl Drop for LockedKey {
     fn drop(&mut self) {
         // SAFETY: as in `as_ref`; that nobody else refers to the slot is what `&mut self` says.
-        unsafe { self.0.as_mut() }.zeroize();
-        // There is room for every slot, so that this allocates nothing.
-        arena().free.push(self.0);
+        unsafe { self.slot.as_mut() }.zeroize();
+        // A forked child has locked none of its parent's slots, and uses none.
+        if !self.arena.is_forked() {
+            // There is room for every slot, so that this allocates nothing.
+            lock(self.arena).free.push(self.slot);
+        }
     }
 }
 
 impl Arena {
-    fn grow(&mut self) -> io::Result<()> {
+    fn grow(&mut self) -> io::Result<Grown> {
         let (access, private) = (ProtFlags::READ | ProtFlags::WRITE, MapFlags::PRIVATE);
         // SAFETY: a new mapping, wherever the system puts it, that replaces none.
         let chunk = unsafe { mmap_anonymous(ptr::null_mut(), CHUNK, access, private) }?;
@@ -104,7 +128,6 @@ impl Arena {
         let kept_out = unsafe { madvise(chunk, CHUNK, Advice::LinuxDontDump) };
         // SAFETY: as above. A forked child finds zeros where this process has keys, and uses none.
         let wiped = unsafe { madvise(chunk, CHUNK, Advice::LinuxWipeOnFork) };
-        warn(locked, kept_out.and(wiped));
         let first = NonNull::new(chunk.cast::<Slot>()).ok_or(io::ErrorKind::OutOfMemory)?;
         let fresh = CHUNK / size_of::<Slot>();
         self.slots += fresh;
@@ -113,16 +136,24 @@ impl Arena {
             // SAFETY: within the mapping, whose start is aligned to a page.
             self.free.push(unsafe { first.add(at) });
         }
-        Ok(())
+        Ok(Grown { locked, advised: kept_out.and(wiped) })
     }
 }
 
-/// Says once what the system does not do for keys, and what to do about it.
-fn warn(locked: rustix::io::Result<()>, advised: rustix::io::Result<()>) {
-    static LOCKED: Once = Once::new();
-    static ADVISED: Once = Once::new();
-    if let Err(error) = locked {
-        LOCKED.call_once(|| {
+/// What the system did for a new chunk.
+struct Grown {
+    locked: rustix::io::Result<()>,
+    advised: rustix::io::Result<()>,
+}
+
+impl Grown {
+    /// Says once what it does not do for keys, and what to do about it.
+    fn warn(self) {
+        static LOCKED: Once = Once::new();
+        static ADVISED: Once = Once::new();
+        let Self { locked, advised } = self;
+        if let Err(error) = locked {
+            LOCKED.call_once(|| {
             tracing::warn!(
                 %error,
                 "could not lock the memory of keys (mlock): they may be written to swap space; raise \
@@ -130,15 +161,16 @@ fn warn(locked: rustix::io::Result<()>, advised: rustix::io::Result<()>) {
                  memlock in limits.conf), or turn swap off"
             );
         });
-    }
-    if let Err(error) = advised {
-        ADVISED.call_once(|| {
+        }
+        if let Err(error) = advised {
+            ADVISED.call_once(|| {
             tracing::warn!(
                 %error,
                 "could not keep the memory of keys out of core files and forked processes (madvise): \
                  a kernel from 4.14 on does"
             );
         });
+        }
     }
 }
 
@@ -170,15 +202,15 @@ mod tests {
             assert_eq!(*key.as_ref(), [at as u8 | 1; 32]);
         }
         for key in keys.iter().step_by(500) {
-            let flags = flags(key.0.as_ptr().addr());
+            let flags = flags(key.slot.as_ptr().addr());
             for flag in ["lo", "dd", "wf"] {
                 assert!(flags.iter().any(|f| f == flag), "{flag} is not among {flags:?}");
             }
         }
-        let slots: Vec<_> = keys.iter().map(|key| key.0).collect();
+        let slots: Vec<_> = keys.iter().map(|key| key.slot).collect();
         drop(keys);
         // Under the lock, so that no other test's key takes one of them.
-        let arena = arena();
+        let arena = lock(arena().unwrap());
         for slot in slots.iter().filter(|slot| arena.free.contains(slot)) {
             // SAFETY: mapped for good, and nobody's as long as the lock is held.
             assert_eq!(unsafe { slot.read() }, [0; 32]);
@@ -188,7 +220,7 @@ mod tests {
     #[test]
     fn a_forked_child_finds_no_key() {
         let key = LockedKey::copy_of(&[0x5a; 32]).unwrap();
-        let slot = key.0;
+        let slot = key.slot;
         // SAFETY: the child reads mapped memory and ends, without a lock or an allocation.
         let child = unsafe { libc::fork() };
         if child == 0 {
@@ -201,6 +233,35 @@ mod tests {
         // SAFETY: waits for the child just made, and writes its status.
         assert_eq!(unsafe { libc::waitpid(child, &raw mut status, 0) }, child);
         assert_eq!(status, 0, "the child found the key");
+        assert_eq!(*key.as_ref(), [0x5a; 32]);
+    }
+
+    #[test]
+    fn a_forked_childs_own_keys_are_locked_though_the_parents_list_was() {
+        let key = LockedKey::copy_of(&[0x5a; 32]).unwrap();
+        // Held at the fork, as another thread could hold it.
+        let held = lock(arena().unwrap());
+        // SAFETY: the child, one of many threads, allocates: its allocator is ready for that after a
+        // fork (glibc). It ends without running anything of its parent's.
+        let child = unsafe { libc::fork() };
+        if child == 0 {
+            let own = LockedKey::copy_of(&[0x5b; 32]);
+            let is_locked = |own: LockedKey| {
+                let flags = flags(own.slot.as_ptr().addr());
+                own.slot != key.slot
+                    && ["lo", "dd", "wf"].iter().all(|f| flags.iter().any(|g| g == f))
+            };
+            // Given up in the child, its slot stays out of the child's list.
+            drop(key);
+            let found = own.is_ok_and(is_locked);
+            // SAFETY: it ends the process at once.
+            unsafe { libc::_exit(i32::from(!found)) };
+        }
+        drop(held);
+        let mut status = -1;
+        // SAFETY: waits for the child just made, and writes its status.
+        assert_eq!(unsafe { libc::waitpid(child, &raw mut status, 0) }, child);
+        assert_eq!(status, 0, "the child's key is not locked, or it has none");
         assert_eq!(*key.as_ref(), [0x5a; 32]);
     }
 }

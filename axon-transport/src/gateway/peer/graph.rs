@@ -155,17 +155,23 @@ impl Remote {
     fn gather(&mut self, gathered: &mut BTreeMap<Gid, Held>, endpoint: Endpoint, toward: Toward) {
         let gid = endpoint.gid;
         let held = match self.all.get(&gid) {
+            _ if !self.proven.owns(&gid) => {
+                self.disown(&gid, || named(&endpoint));
+                None
+            }
             Some(known) if *known.remote.endpoint == endpoint => {
                 let remote = RemoteEndpoint { toward, ..known.remote.clone() };
                 Some(Held { remote, ..known.clone() })
             }
-            _ if self.proven.owns(&gid) => self.hold(endpoint, toward, gathered.len()),
-            _ => {
-                self.disown(&gid, || named(&endpoint));
-                None
-            }
+            _ => self.hold(endpoint, toward, gathered.len()),
         };
         gathered.extend(held.map(|held| (gid, held)));
+    }
+
+    /// Another connection takes over: on it the peer proves its sessions anew, before it says anything of
+    /// them.
+    pub(in crate::gateway) fn succeed(&mut self) {
+        self.proven.succeed();
     }
 
     /// Takes what the peer's daemon proves on the connection that `binding` is of.
@@ -348,6 +354,28 @@ mod tests {
             added.iter().map(|e| first(&e.endpoint.gid)).collect(),
             removed.iter().map(first).collect(),
         )
+    }
+
+    #[test]
+    fn what_was_proved_on_one_connection_counts_for_nothing_on_the_next() {
+        let account = Accounts::new(10 * one()).of("a");
+        let mut remote = Remote::new(account, true);
+        let key = SessionKey::generate().unwrap();
+        let (own, from) = (Gid::new(key.id(), 1), DaemonId([7; 16]));
+        let [first, second] = [[1; 32], [2; 32]];
+        let all = || graph(0, vec![Endpoint { gid: own, ..endpoint(1, "/t") }], vec![], false);
+        remote.prove(&[key.prove(&first, from).unwrap()], &first, from);
+        remote.take(all());
+        assert_eq!((remote.left_out(), changes(&mut remote).0.len()), (0, 1));
+        remote.succeed();
+        assert!(!remote.owns(&own));
+        // The old proof is of the other connection.
+        remote.prove(&[key.prove(&first, from).unwrap()], &second, from);
+        remote.take(all());
+        assert_eq!((remote.left_out(), changes(&mut remote).1.len()), (1, 1));
+        remote.prove(&[key.prove(&second, from).unwrap()], &second, from);
+        remote.take(all());
+        assert_eq!((remote.left_out(), changes(&mut remote).0.len()), (0, 1));
     }
 
     #[test]

@@ -155,6 +155,7 @@ impl Peer {
         self.receipts.succeed(outbox.clone());
         self.outbox = outbox;
         self.prover.succeed(&carrier.connection);
+        self.remote.succeed();
         // SUBSCRIBE names sessions as GRAPH does.
         let visible = self.visible(local);
         self.prove(&visible);

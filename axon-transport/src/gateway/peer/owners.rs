@@ -32,8 +32,10 @@ pub(in crate::gateway) struct Prover {
     /// Whether proofs are asked for: where peers prove who they are.
     needed: bool,
     binding: Option<Binding>,
-    /// The sessions that were proved on the connection in use.
+    /// The sessions whose proofs the peer has, of those that were made on the connection in use.
     proved: HashSet<Prefix>,
+    /// The proofs: as long as the connection is the same, they are.
+    made: HashMap<Prefix, Proof>,
     /// The keys of sessions that the peer sees. A publisher that ended is seen longer than its session
     /// is connected.
     held: HashMap<Prefix, Arc<SessionKey>>,
@@ -53,6 +55,7 @@ impl Prover {
             needed,
             binding: None,
             proved: HashSet::new(),
+            made: HashMap::new(),
             held: HashMap::new(),
         };
         prover.succeed(connection);
@@ -67,10 +70,11 @@ impl Prover {
     /// Another connection takes over: everything is proved anew there.
     pub(super) fn succeed(&mut self, connection: &Connection) {
         self.binding = if self.needed { binding(connection) } else { None };
+        self.made.clear();
         self.forget();
     }
 
-    /// The peer asks for everything: everything is proved anew.
+    /// The peer asks for everything: every proof is said again.
     pub(super) fn forget(&mut self) {
         self.proved.clear();
     }
@@ -80,6 +84,7 @@ impl Prover {
         let Some(binding) = self.binding else { return Vec::new() };
         let sessions: BTreeSet<Prefix> = gids.map(prefix_of).collect();
         self.proved.retain(|session| sessions.contains(session));
+        self.made.retain(|session, _| sessions.contains(session));
         self.held.retain(|session, _| sessions.contains(session));
         let mut proofs = Vec::new();
         for session in sessions {
@@ -89,10 +94,16 @@ impl Prover {
             if let Some(key) = self.keys.get(&session) {
                 self.held.insert(session, key);
             }
-            let key = self.held.get(&session);
-            if let Some(proof) = key.and_then(|key| key.prove(&binding, self.daemon)) {
+            // A signature costs time: one for each session and connection.
+            if !self.made.contains_key(&session)
+                && let Some(key) = self.held.get(&session)
+                && let Some(proof) = key.prove(&binding, self.daemon)
+            {
+                self.made.insert(session, proof);
+            }
+            if let Some(proof) = self.made.get(&session) {
                 self.proved.insert(session);
-                proofs.push(proof);
+                proofs.push(proof.clone());
             }
         }
         let parts = proofs.chunks(MAX_PROOFS);
@@ -142,6 +153,12 @@ impl Proven {
                 self.fresh.insert(session);
             }
         }
+    }
+
+    /// Another connection takes over: what was proved on the one before counts no more.
+    pub(super) fn succeed(&mut self) {
+        self.sessions.clear();
+        self.fresh.clear();
     }
 
     /// A GRAPH came: a session that it says nothing of has no endpoint yet.
@@ -246,6 +263,7 @@ mod tests {
             needed: true,
             binding: Some(BINDING),
             proved: HashSet::new(),
+            made: HashMap::new(),
             held: HashMap::new(),
         }
     }
