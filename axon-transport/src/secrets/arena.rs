@@ -245,10 +245,10 @@ mod tests {
         // fork (glibc). It ends without running anything of its parent's.
         let child = unsafe { libc::fork() };
         if child == 0 {
-            let own = LockedKey::copy_of(&[0x5b; 32]);
+            let (own, parents) = (LockedKey::copy_of(&[0x5b; 32]), key.slot);
             let is_locked = |own: LockedKey| {
                 let flags = flags(own.slot.as_ptr().addr());
-                own.slot != key.slot
+                own.slot != parents
                     && ["lo", "dd", "wf"].iter().all(|f| flags.iter().any(|g| g == f))
             };
             // Given up in the child, its slot stays out of the child's list.

@@ -1,5 +1,7 @@
 //! Who says what no session says, or hands over what nobody should read.
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use super::*;
 
 #[test]
@@ -210,4 +212,33 @@ fn descriptors_that_are_slow_to_close_do_not_stop_the_daemon() {
     let publisher = session.create_publisher(spec("/t")).unwrap();
     let subscription = host.session("b").unwrap().create_subscription(spec("/t")).unwrap();
     assert!(subscription.wait_matched(1, PATIENCE) && publisher.wait_matched(1, PATIENCE));
+}
+
+#[test]
+fn keys_that_are_none_end_their_connection_and_hold_up_nobody() {
+    let host = Host::new();
+    let _daemon = host.daemon();
+    let address = Address::of(&host.config());
+    // The packet of a session's key, without the key, again and again from several threads.
+    let over = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        for _ in 0..3 {
+            scope.spawn(|| {
+                // Relaxed: nothing else is told by it.
+                while !over.load(Ordering::Relaxed) {
+                    let socket = address.connect().unwrap();
+                    while socket::send(&socket, &[32], &[]).is_ok() {}
+                }
+            });
+        }
+        for _ in 0..100 {
+            host.status().expect("the status");
+        }
+        over.store(true, Ordering::Relaxed);
+    });
+    let socket = address.connect().unwrap();
+    socket::send(&socket, &[32], &[]).unwrap();
+    until("it is over", || {
+        matches!(socket::receive(&socket, &mut Vec::new()), Err(socket::SocketError::Closed))
+    });
 }

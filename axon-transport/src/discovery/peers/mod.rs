@@ -10,6 +10,8 @@ mod candidates;
 mod dialling;
 #[cfg(test)]
 mod flood;
+#[cfg(test)]
+mod goodbye;
 mod local;
 mod probing;
 mod receiving;

@@ -61,7 +61,7 @@ pub(super) fn settled(local: Local) -> Peers {
     peers
 }
 
-fn actions(peers: &mut Peers) -> Vec<Action> {
+pub(super) fn actions(peers: &mut Peers) -> Vec<Action> {
     std::iter::from_fn(|| peers.poll())
         .filter_map(|output| match output {
             Output::Action(action) => Some(action),
@@ -70,7 +70,7 @@ fn actions(peers: &mut Peers) -> Vec<Action> {
         .collect()
 }
 
-fn dials(peers: &mut Peers) -> Vec<DaemonId> {
+pub(super) fn dials(peers: &mut Peers) -> Vec<DaemonId> {
     let dialled = actions(peers).into_iter().filter_map(|action| match action {
         Action::Dial { daemon, .. } => Some(daemon),
         _ => None,
@@ -97,13 +97,13 @@ pub(super) fn from(text: &str) -> SocketAddr {
     text.parse().unwrap()
 }
 
-fn hear(peers: &mut Peers, now: f64, beacon: Beacon) {
+pub(super) fn hear(peers: &mut Peers, now: f64, beacon: Beacon) {
     let bytes = Datagram::Beacon(beacon).encode();
     peers.datagram(secs(now), from("10.0.0.2:4000"), Arrival::Shared, &bytes);
 }
 
 /// Whatever dial to the peer is under way fails.
-fn fail(peers: &mut Peers, now: Duration, daemon: DaemonId) {
+pub(super) fn fail(peers: &mut Peers, now: Duration, daemon: DaemonId) {
     Standing::ALL.into_iter().for_each(|standing| peers.dial_failed(now, daemon, standing));
 }
 
@@ -210,71 +210,6 @@ fn forged_beacons_change_nothing_for_a_peer_that_was_acceptable() {
     assert!(actions(&mut peers).iter().all(quiet), "a link is neither closed nor forgotten");
     peers.link_down(secs(501.0), HIGHER);
     assert_eq!(dials(&mut peers), [HIGHER]);
-}
-
-#[test]
-fn a_goodbye_counts_once_the_link_is_down_and_only_from_where_the_peer_is() {
-    let goodbye = Datagram::Goodbye { domain: 0, daemon: HIGHER }.encode();
-    let mut peers = settled(local());
-    hear(&mut peers, 3.0, beacon(HIGHER));
-    peers.link_up(secs(3.1), HIGHER, from("10.0.0.2:61301"));
-    actions(&mut peers);
-    peers.datagram(secs(4.0), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
-    peers.link_down(secs(4.1), HIGHER);
-    // Anybody could have said it: it is asked, and not dialled meanwhile.
-    assert_eq!(probes(&mut peers).len(), 1);
-    peers.advance(secs(7.0));
-    assert_eq!(actions(&mut peers), []);
-    peers.advance(secs(7.2));
-    assert_eq!(actions(&mut peers), [Action::Gone { daemon: HIGHER }]);
-
-    let at = |host: &str| format!("10.0.0.{host}:4000").parse().unwrap();
-    let heard = Beacon { port: 61301, ..beacon(LOWER) };
-    peers.datagram(secs(8.0), at("3"), Arrival::Shared, &Datagram::Beacon(heard).encode());
-    let goodbye = Datagram::Goodbye { domain: 0, daemon: LOWER }.encode();
-    peers.datagram(secs(8.1), at("66"), Arrival::Shared, &goodbye);
-    assert_eq!(actions(&mut peers), [], "said by another");
-    peers.datagram(secs(8.2), at("3"), Arrival::Shared, &goodbye);
-    assert_eq!(probes(&mut peers).len(), 1);
-    peers.advance(secs(11.3));
-    assert_eq!(actions(&mut peers), [Action::Gone { daemon: LOWER }]);
-}
-
-#[test]
-fn a_peer_that_answers_after_a_goodbye_in_its_name_stays() {
-    let goodbye = Datagram::Goodbye { domain: 0, daemon: HIGHER }.encode();
-    let mut peers = settled(local());
-    hear(&mut peers, 3.0, beacon(HIGHER));
-    let address = from("10.0.0.2:61301");
-    peers.link_up(secs(3.1), HIGHER, address);
-    actions(&mut peers);
-    peers.datagram(secs(4.0), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
-    peers.link_down(secs(4.1), HIGHER);
-    let probes = probes(&mut peers);
-    let [(to, nonce)] = probes[..] else { panic!("{probes:?}") };
-    assert_eq!(to, address);
-    let echo = Datagram::Echo { daemon: HIGHER, nonce }.encode();
-    peers.datagram(secs(4.2), address, Arrival::Quic, &echo);
-    assert_eq!(dials(&mut peers), [HIGHER]);
-    fail(&mut peers, secs(4.3), HIGHER);
-    // More of them say nothing for a while, so that they cost nothing either.
-    for _ in 0..100 {
-        peers.datagram(secs(4.4), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
-    }
-    peers.advance(secs(6.0));
-    assert_eq!(dials(&mut peers), [HIGHER], "and it alone");
-}
-
-/// The probes that are to be sent, with their nonces; nothing else is.
-fn probes(peers: &mut Peers) -> Vec<(SocketAddr, [u8; 8])> {
-    let sent = actions(peers).into_iter().map(|action| match action {
-        Action::SendFromQuicPort { to, bytes } => match Datagram::decode(&bytes) {
-            Ok(Datagram::Probe { nonce, .. }) => (to, nonce),
-            other => panic!("{other:?}"),
-        },
-        other => panic!("{other:?}"),
-    });
-    sent.collect()
 }
 
 #[test]

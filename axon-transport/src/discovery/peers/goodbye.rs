@@ -1,0 +1,72 @@
+//! Goodbyes: of those who leave, and of others in their names.
+
+use super::{
+    tests::{HIGHER, LOWER, actions, beacon, dials, fail, from, hear, local, secs, settled},
+    *,
+};
+use crate::discovery::beacon::{Beacon, Datagram};
+
+#[test]
+fn a_goodbye_counts_once_the_link_is_down_and_only_from_where_the_peer_is() {
+    let goodbye = Datagram::Goodbye { domain: 0, daemon: HIGHER }.encode();
+    let mut peers = settled(local());
+    hear(&mut peers, 3.0, beacon(HIGHER));
+    peers.link_up(secs(3.1), HIGHER, from("10.0.0.2:61301"));
+    actions(&mut peers);
+    peers.datagram(secs(4.0), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
+    peers.link_down(secs(4.1), HIGHER);
+    // Anybody could have said it: it is asked, and not dialled meanwhile.
+    assert_eq!(probes(&mut peers).len(), 1);
+    peers.advance(secs(7.0));
+    assert_eq!(actions(&mut peers), []);
+    peers.advance(secs(7.2));
+    assert_eq!(actions(&mut peers), [Action::Gone { daemon: HIGHER }]);
+
+    let at = |host: &str| format!("10.0.0.{host}:4000").parse().unwrap();
+    let heard = Beacon { port: 61301, ..beacon(LOWER) };
+    peers.datagram(secs(8.0), at("3"), Arrival::Shared, &Datagram::Beacon(heard).encode());
+    let goodbye = Datagram::Goodbye { domain: 0, daemon: LOWER }.encode();
+    peers.datagram(secs(8.1), at("66"), Arrival::Shared, &goodbye);
+    assert_eq!(actions(&mut peers), [], "said by another");
+    peers.datagram(secs(8.2), at("3"), Arrival::Shared, &goodbye);
+    assert_eq!(probes(&mut peers).len(), 1);
+    peers.advance(secs(11.3));
+    assert_eq!(actions(&mut peers), [Action::Gone { daemon: LOWER }]);
+}
+
+#[test]
+fn a_peer_that_answers_after_a_goodbye_in_its_name_stays() {
+    let goodbye = Datagram::Goodbye { domain: 0, daemon: HIGHER }.encode();
+    let mut peers = settled(local());
+    hear(&mut peers, 3.0, beacon(HIGHER));
+    let address = from("10.0.0.2:61301");
+    peers.link_up(secs(3.1), HIGHER, address);
+    actions(&mut peers);
+    peers.datagram(secs(4.0), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
+    peers.link_down(secs(4.1), HIGHER);
+    let probes = probes(&mut peers);
+    let [(to, nonce)] = probes[..] else { panic!("{probes:?}") };
+    assert_eq!(to, address);
+    let echo = Datagram::Echo { daemon: HIGHER, nonce }.encode();
+    peers.datagram(secs(4.2), address, Arrival::Quic, &echo);
+    assert_eq!(dials(&mut peers), [HIGHER]);
+    fail(&mut peers, secs(4.3), HIGHER);
+    // More of them say nothing for a while, so that they cost nothing either.
+    for _ in 0..100 {
+        peers.datagram(secs(4.4), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
+    }
+    peers.advance(secs(6.0));
+    assert_eq!(dials(&mut peers), [HIGHER], "and it alone");
+}
+
+/// The probes that are to be sent, with their nonces; nothing else is.
+fn probes(peers: &mut Peers) -> Vec<(SocketAddr, [u8; 8])> {
+    let sent = actions(peers).into_iter().map(|action| match action {
+        Action::SendFromQuicPort { to, bytes } => match Datagram::decode(&bytes) {
+            Ok(Datagram::Probe { nonce, .. }) => (to, nonce),
+            other => panic!("{other:?}"),
+        },
+        other => panic!("{other:?}"),
+    });
+    sent.collect()
+}
