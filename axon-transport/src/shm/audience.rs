@@ -304,10 +304,13 @@ impl Audience {
         }
     }
 
-    /// A reader that stands for others says that so many samples do not get there.
-    pub(super) fn give_up(&mut self, reader: Gid, samples: u64) {
+    /// A reader that stands for others says that so many samples do not get there: of those that were
+    /// published since it came, and each of them once.
+    pub(super) fn give_up(&mut self, reader: Gid, samples: u64, head: u64) {
         let known = self.readers.iter_mut().find(|known| known.info.gid == reader);
         if let Some(known) = known.filter(|known| !known.dead) {
+            let since = head.saturating_sub(known.grant.first);
+            let samples = samples.min(since.saturating_sub(known.given_up));
             known.given_up = known.given_up.saturating_add(samples);
             self.given_up = self.given_up.saturating_add(samples);
         }

@@ -253,6 +253,26 @@ fn a_sample_that_is_given_up_is_not_acknowledged() {
 }
 
 #[test]
+fn no_more_is_given_up_than_was_published() {
+    let (session, daemon) = session();
+    let publisher = publisher(&session, Qos::keep_all());
+    let taker = Taker::new();
+    let taking = taker.attach(&publisher, Some(vec![Gid([5; 16])]), &daemon);
+    until("it is matched", || publisher.matched() == [Gid([5; 16])]);
+    let (reader, writer) = (taker.gid, publisher.gid());
+    let given_up = |samples, all| {
+        daemon.say(Message::GivenUp(GivenUp { reader, writer, samples }), &[]);
+        until("it is counted", || publisher.given_up() == all);
+        assert!(!publisher.wait_acknowledged(Duration::ZERO), "each is told");
+    };
+    publisher.publish(b"x").unwrap();
+    given_up(u64::MAX, 1);
+    publisher.publish(b"x").unwrap();
+    given_up(u64::MAX - 1, 2);
+    drop(taking);
+}
+
+#[test]
 fn a_reliable_publisher_is_held_up_by_who_takes_nothing_and_goes_on_when_it_does() {
     let (session, daemon) = session();
     let publisher = publisher(&session, Qos::keep_all());

@@ -69,7 +69,9 @@ impl Writer {
     /// One of them says that it gave up so many.
     pub(crate) fn give_up(&self, reader: Gid, samples: u64) {
         if !self.is_forked() {
-            self.lock().audience.give_up(reader, samples);
+            let mut state = self.lock();
+            let State { history, audience, .. } = &mut *state;
+            audience.give_up(reader, samples, history.head());
         }
     }
 
