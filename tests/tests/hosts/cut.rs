@@ -12,6 +12,7 @@ use super::{
 };
 
 const SOME: u64 = 300;
+const PROBED: [&str; 1] = ["the link does not answer: probing its path"];
 const DIALLED: [&str; 1] = ["the link is silent though its path works: dialling a successor"];
 
 fn wired(settings: [Settings; 2]) -> ([Host; 2], Wire) {
@@ -65,21 +66,32 @@ fn in_messages10_a_link_flows_again_soon_after_its_path_is_back() {
     flows_again([0, 1].map(|host| kmes.settings(host, &[("AXON_QKD_KEY_MODE", "messages10")])));
 }
 
+/// A daemon may have something to say during a cut, for example that a window has grown: it notices the
+/// cut, and the successor that it dials is none too many. Such a cut says nothing of the rule, and is made
+/// again.
 #[test]
 fn a_cut_that_nobody_notices_makes_no_second_link() {
     let (hosts, wire) = wired([classic(&[]), classic(&[])]);
     let mut there = hosts[1].subscribe(Sizes::Small);
     let mut publisher = hosts[0].publish(Sizes::Small, 1, Some(SOME));
     there.wait_taken(publisher.wait_sent());
-    let link = hosts[0].link();
-    // What is acknowledged late is not to be taken for silence.
-    sleep(Duration::from_millis(500));
-    wire.cut();
-    sleep(Duration::from_secs(3));
-    wire.mend();
-    sleep(Duration::from_secs(2));
-    assert_eq!(hosts.each_ref().map(|host| host.log_lines(&DIALLED)), [0, 0]);
-    assert_eq!(hosts[0].link().since_unix_ms, link.since_unix_ms);
+    let lines = |parts| hosts.each_ref().map(|host| host.log_lines(parts));
+    for _ in 0..5 {
+        let (probed, dialled) = (lines(&PROBED), lines(&DIALLED));
+        let link = hosts[0].link();
+        // An acknowledgement that is late is no silence.
+        sleep(Duration::from_millis(500));
+        wire.cut();
+        sleep(Duration::from_secs(3));
+        wire.mend();
+        sleep(Duration::from_secs(2));
+        if lines(&PROBED) == probed {
+            assert_eq!(lines(&DIALLED), dialled);
+            assert_eq!(hosts[0].link().since_unix_ms, link.since_unix_ms);
+            return;
+        }
+    }
+    panic!("each of five cuts was noticed, though no samples were published");
 }
 
 #[test]

@@ -358,6 +358,8 @@ impl Hub {
             if watched || !link.traffic.is_silent_since(before) {
                 continue;
             }
+            tracing::debug!(peer = %link.established.hello.daemon,
+                "the link does not answer: probing its path");
             let watch = Watch {
                 number: *number,
                 connection: link.connection.clone(),
