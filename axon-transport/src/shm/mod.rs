@@ -132,4 +132,5 @@ pub use subscriber::{Subscriber, SubscriberOptions};
 pub(crate) use times::{Times, monotonic};
 pub(crate) use types::Terms;
 pub use types::{Grant, Meta, Published, ReaderInfo, RingOptions, Taken};
+pub(crate) use writer::MAX_GAP;
 pub use writer::Writer;

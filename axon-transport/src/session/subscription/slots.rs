@@ -8,7 +8,7 @@ use std::{
 use crate::{
     ids::Gid,
     session::clock,
-    shm::{Grant, Lane, Location, Reader},
+    shm::{Grant, Lane, Location, MAX_GAP, Reader},
 };
 
 /// Publishers whose last sequence number is remembered after they are gone.
@@ -116,8 +116,10 @@ impl Gaps {
             // What was overwritten on this side is counted there, by its positions.
             let missing = sequence.saturating_sub(newest).saturating_sub(1);
             let lost = missing.saturating_sub(position.saturating_sub(next));
-            // Numbers are whatever the other host says.
-            self.lost = self.lost.saturating_add(lost);
+            // The writer's process may say any number. A loss that cannot be is not counted.
+            if missing <= MAX_GAP {
+                self.lost = self.lost.saturating_add(lost);
+            }
             newest.max(sequence)
         });
         self.before = Some((newest, position.saturating_add(1)));
@@ -430,5 +432,17 @@ mod tests {
         gaps.pass(30, 22);
         gaps.pass(32, 23);
         assert_eq!(gaps.lost, 6);
+    }
+
+    #[test]
+    fn a_number_that_no_publisher_can_have_reached_is_no_loss() {
+        let mut gaps = Gaps::default();
+        gaps.pass(1, 0);
+        gaps.pass(2 + MAX_GAP, 1);
+        assert_eq!(gaps.lost, MAX_GAP);
+        gaps.pass(u64::MAX, 2);
+        assert_eq!(gaps.lost, MAX_GAP, "nobody lost 2^64 samples");
+        gaps.pass(u64::MAX, 3);
+        assert_eq!(gaps.lost, MAX_GAP);
     }
 }

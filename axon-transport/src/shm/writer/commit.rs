@@ -30,7 +30,7 @@ pub(in crate::shm) struct Patience {
 
 /// Samples that a publisher elsewhere may be ahead of the last one of its here: more than an hour of
 /// outage at a million samples a second.
-const MAX_GAP: u64 = 1 << 32;
+pub(crate) const MAX_GAP: u64 = 1 << 32;
 /// Samples that it may have published before the first one that comes here.
 const MAX_FIRST: u64 = 1 << 48;
 

@@ -5,6 +5,7 @@ mod handover;
 
 use std::{sync::Arc, time::Duration};
 
+pub(crate) use self::commit::MAX_GAP;
 pub(super) use self::commit::Patience;
 
 use super::{
