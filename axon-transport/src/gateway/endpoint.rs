@@ -8,11 +8,15 @@ use std::{
     time::Duration,
 };
 
+use aws_lc_rs::hmac;
 use quinn::{
     Endpoint, EndpointConfig, IdleTimeout, MtuDiscoveryConfig, TokioRuntime, TransportConfig,
     VarInt,
 };
-use quinn_proto::HashedConnectionIdGenerator;
+use quinn_proto::{
+    HashedConnectionIdGenerator,
+    crypto::{CryptoError, HmacKey},
+};
 use tokio::sync::mpsc;
 
 use super::socket::{Datagram, DemuxSocket};
@@ -145,13 +149,30 @@ fn bind_one(address: SocketAddr) -> io::Result<(SocketAddr, UdpSocket)> {
     Ok((address, socket))
 }
 
+/// The key of stateless resets. quinn-proto takes aws-lc's own type only while no crate in the program
+/// enables its feature `ring`.
+struct ResetKey(hmac::Key);
+
+impl HmacKey for ResetKey {
+    fn sign(&self, data: &[u8], signature_out: &mut [u8]) {
+        signature_out.copy_from_slice(hmac::sign(&self.0, data).as_ref());
+    }
+
+    fn signature_len(&self) -> usize {
+        hmac::HMAC_SHA256.digest_algorithm().output_len()
+    }
+
+    fn verify(&self, data: &[u8], signature: &[u8]) -> Result<(), CryptoError> {
+        hmac::verify(&self.0, data, signature).map_err(|_| CryptoError)
+    }
+}
+
 fn endpoint_config(reset_key: &[u8; 32]) -> EndpointConfig {
-    let key = aws_lc_rs::hmac::Key::new(aws_lc_rs::hmac::HMAC_SHA256, reset_key);
-    let derive = aws_lc_rs::hmac::Key::new(aws_lc_rs::hmac::HMAC_SHA256, reset_key);
-    let mut config = EndpointConfig::new(Arc::new(key));
+    let key = hmac::Key::new(hmac::HMAC_SHA256, reset_key);
     // Connection ids are checked before a stateless reset is sent, so those of the predecessor must
     // pass: their key is derived from the one that is kept.
-    let tag = aws_lc_rs::hmac::sign(&derive, b"connection ids");
+    let tag = hmac::sign(&key, b"connection ids");
+    let mut config = EndpointConfig::new(Arc::new(ResetKey(key)));
     let mut seed = [0; 8];
     seed.copy_from_slice(&tag.as_ref()[..8]);
     let seed = u64::from_be_bytes(seed);
