@@ -8,7 +8,10 @@
 use std::{
     ffi::OsString,
     io::{Read, Write},
-    os::fd::{AsFd, OwnedFd},
+    os::{
+        fd::{AsFd, OwnedFd},
+        unix::fs::PermissionsExt,
+    },
     path::{Path, PathBuf},
     process::{Command, Stdio},
     time::{Duration, Instant},
@@ -86,24 +89,54 @@ pub(crate) fn spawn(
     }
 }
 
-/// The command for a daemon: `AXON_DAEMON_PATH`, the application's own, or `axon_daemon` beside
-/// the program or the library.
+/// The command for a daemon: `AXON_DAEMON_PATH`, the application's own, or a program in one of the
+/// [folders](folders).
 fn find(config: &Config, command: Option<&DaemonCommand>) -> Result<DaemonCommand, SessionError> {
-    let alone = |program: PathBuf| DaemonCommand { program, arguments: Vec::new() };
     if let Some(path) = &config.daemon_path {
-        return Ok(alone(path.clone()));
+        return Ok(DaemonCommand { program: path.clone(), arguments: Vec::new() });
     }
     if let Some(command) = command {
         return Ok(command.clone());
     }
-    let beside = |file: PathBuf| file.with_file_name("axon_daemon");
-    let mut tried: Vec<PathBuf> =
-        [std::env::current_exe().ok(), own_file()].into_iter().flatten().map(beside).collect();
-    tried.dedup();
-    match tried.iter().find(|path| path.is_file()) {
-        Some(path) => Ok(alone(path.clone())),
+    let tried = folders(|name| std::env::var_os(name).filter(|_| !is_elevated()));
+    match tried.iter().find_map(|folder| program_in(folder)) {
+        Some(command) => Ok(command),
         None => Err(SessionError::NoProgram { tried }),
     }
+}
+
+/// The daemon in a folder: `axon_daemon`, or the tool, which can be it.
+fn program_in(folder: &Path) -> Option<DaemonCommand> {
+    let programs: [(&str, &[&str]); 2] = [("axon_daemon", &[]), ("axon", &["daemon"])];
+    programs.into_iter().find_map(|(name, arguments)| {
+        let program = folder.join(name);
+        let arguments = arguments.iter().map(OsString::from).collect();
+        is_program(&program).then_some(DaemonCommand { program, arguments })
+    })
+}
+
+fn is_program(path: &Path) -> bool {
+    let mode = path.metadata().map(|file| file.is_file().then(|| file.permissions().mode()));
+    matches!(mode, Ok(Some(mode)) if mode & 0o111 != 0)
+}
+
+/// Where a daemon's program is looked for, in this order: beside this program, beside the library that
+/// this code is in, in `PATH`, and where cargo installs programs. `variable` reads the environment.
+fn folders(variable: impl Fn(&str) -> Option<OsString>) -> Vec<PathBuf> {
+    let beside = [std::env::current_exe().ok(), own_file()].into_iter().flatten();
+    let beside = beside.filter_map(|file| Some(file.parent()?.to_path_buf()));
+    let path = variable("PATH").unwrap_or_default();
+    let cargo = variable("CARGO_HOME")
+        .map(PathBuf::from)
+        .or_else(|| variable("HOME").map(|home| Path::new(&home).join(".cargo")));
+    let mut folders = Vec::new();
+    for folder in beside.chain(std::env::split_paths(&path)).chain(cargo.map(|c| c.join("bin"))) {
+        // A relative one would be another one for each process.
+        if folder.is_absolute() && !folders.contains(&folder) {
+            folders.push(folder);
+        }
+    }
+    folders
 }
 
 /// The file that this code was loaded from: the library's where it is in one.
@@ -246,4 +279,47 @@ pub fn detach(config: Option<&Config>) -> std::io::Result<()> {
         let _ = log::keep_in(&dir.join(format!("axon-{}.log", config.domain)));
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    #[test]
+    fn folders_of_path_and_cargo_come_after_those_beside_the_program() {
+        let variable = |name: &str| match name {
+            "PATH" => Some("/usr/bin:relative::/opt/axon:/usr/bin".into()),
+            "HOME" => Some("/home/user".into()),
+            _ => None,
+        };
+        let beside = std::env::current_exe().unwrap().parent().unwrap().to_path_buf();
+        let rest = ["/usr/bin", "/opt/axon", "/home/user/.cargo/bin"].map(PathBuf::from);
+        let found = folders(variable);
+        assert_eq!(found[0], beside);
+        assert!(found.ends_with(&rest), "{found:?}");
+        let cargo = |name: &str| (name == "CARGO_HOME").then(|| "/opt/cargo".into());
+        assert_eq!(folders(cargo).last(), Some(&"/opt/cargo/bin".into()));
+        assert_eq!(folders(|_| None), [beside]);
+    }
+
+    #[test]
+    fn a_daemon_is_preferred_to_the_tool_and_what_is_no_program_is_passed_over() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = |name: &str, mode| {
+            let path = dir.path().join(name);
+            fs::write(&path, "").unwrap();
+            fs::set_permissions(&path, fs::Permissions::from_mode(mode)).unwrap();
+            path
+        };
+        assert!(program_in(dir.path()).is_none());
+        let tool = file("axon", 0o755);
+        let daemon = file("axon_daemon", 0o644);
+        let found = program_in(dir.path()).unwrap();
+        assert_eq!((found.program, found.arguments), (tool, vec![OsString::from("daemon")]));
+        fs::set_permissions(&daemon, fs::Permissions::from_mode(0o755)).unwrap();
+        let found = program_in(dir.path()).unwrap();
+        assert_eq!((found.program, found.arguments), (daemon, vec![]));
+    }
 }

@@ -1,12 +1,14 @@
 //! Why a session could not do what it was asked.
 
-use std::path::PathBuf;
+use std::{fmt, path::PathBuf};
 
 use super::{address::AddressError, message::CodecError};
 use crate::{config::ConfigError, shm::ShmError};
 
 /// Why a session could not be opened or used.
-#[derive(Debug, thiserror::Error)]
+///
+/// `Debug` says the same as `Display`: it is what a `main` prints that returns the error.
+#[derive(thiserror::Error)]
 #[non_exhaustive]
 pub enum SessionError {
     /// A publisher of another description still has this GID.
@@ -36,11 +38,12 @@ pub enum SessionError {
     Off,
     /// The program to start was not found.
     #[error(
-        "no daemon runs, and none can be started: {} is not there; set AXON_DAEMON_PATH",
-        tried.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", nor ")
+        "no daemon runs, and none can be started: there is neither axon_daemon nor axon in {}; install \
+         it with `cargo install axon-cli`, or set AXON_DAEMON_PATH to the daemon's program",
+        tried.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", ")
     )]
     NoProgram {
-        /// Where it was looked for.
+        /// The folders in which it was looked for.
         tried: Vec<PathBuf>,
     },
     /// The daemon that was started gave up.
@@ -134,6 +137,12 @@ pub enum SessionError {
         /// What the system said.
         source: std::io::Error,
     },
+}
+
+impl fmt::Debug for SessionError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Display::fmt(self, f)
+    }
 }
 
 impl From<CodecError> for SessionError {
