@@ -219,8 +219,8 @@ pub(crate) struct Status {
 
 const DAEMON_HELP: &str = "\
 The same as axon_daemon. The first session on a host starts it, so this is for service managers,
-for logs (AXON_LOG=info) and for a host that only relays. Ends on SIGINT or SIGTERM, or after its
-grace time without sessions.
+for logs (AXON_LOG=info) and for a host that only relays. Ends on SIGINT or SIGTERM. One that a
+session started ends after its grace time without sessions; this one stays.
 
 Examples:
   AXON_LOG=info axon daemon

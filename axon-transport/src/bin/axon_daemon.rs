@@ -1,8 +1,8 @@
 //! The AXON daemon as a program of its own.
 //!
-//! Started by the first session of a user and domain, or by hand, and then it stays in the
-//! foreground. It takes its settings from the environment and ends when no session has needed it
-//! for its grace time.
+//! Started by the first session of a user and domain, it ends when no session has needed it for its
+//! grace time. Started by hand or by a service manager, it stays in the foreground until SIGTERM or
+//! SIGINT. It takes its settings from the environment.
 
 use std::process::ExitCode;
 

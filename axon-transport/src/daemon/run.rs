@@ -37,7 +37,7 @@ const COALESCE: Duration = Duration::from_millis(5);
 /// How a daemon process came to be.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Start {
-    /// By hand: it stays in the foreground.
+    /// By hand or by a service manager: it stays in the foreground until a signal ends it.
     Foreground,
     /// By a session (`--spawned`): starts the real daemon and ends.
     Spawned,
@@ -52,11 +52,13 @@ pub struct DaemonOptions {
     pub report: Report,
     /// The gateway to other hosts. Without one, the daemon serves this host alone.
     pub gateway: Option<GatewayEntry>,
+    /// Whether it stays when no session needs it. Otherwise it ends after its grace time.
+    pub stays: bool,
 }
 
 impl Default for DaemonOptions {
     fn default() -> Self {
-        Self { report: Report::none(), gateway: super::remote::GATEWAY }
+        Self { report: Report::none(), gateway: super::remote::GATEWAY, stays: false }
     }
 }
 
@@ -123,7 +125,7 @@ pub fn main(start: Start) -> ExitCode {
         return fail(&mut report, &error.to_string(), 1);
     }
     log::start(&config);
-    let options = DaemonOptions { report, ..DaemonOptions::default() };
+    let options = DaemonOptions { report, stays: !detached, ..DaemonOptions::default() };
     match run(config, options) {
         Ok(()) => ExitCode::SUCCESS,
         // Losing the race to start is how all but one end.
@@ -139,7 +141,8 @@ pub fn main(start: Start) -> ExitCode {
     }
 }
 
-/// Runs a daemon on this thread until nobody needs it, or SIGTERM or SIGINT.
+/// Runs a daemon on this thread until SIGTERM or SIGINT, or, unless it [stays](DaemonOptions::stays),
+/// until no session has needed it for its grace time.
 ///
 /// # Errors
 /// When it cannot start. What goes wrong later is logged and shown in its status.
@@ -249,7 +252,7 @@ async fn serve(
     tokio::select! {
         _ = terminate.recv() => tracing::info!("SIGTERM"),
         _ = interrupt.recv() => tracing::info!("SIGINT"),
-        () = unneeded(&control) => tracing::info!("no session needs the daemon any more"),
+        () = unneeded(&control), if !options.stays => tracing::info!("no session needs the daemon any more"),
         () = remote.run(&control) => {}
     }
     // The address is free from here on: who connects now starts a new daemon.

@@ -446,17 +446,36 @@ fn a_gateway_that_cannot_start_is_an_error_of_the_daemon() {
 }
 
 #[test]
-fn a_daemon_ends_on_sigterm_and_when_nobody_needs_it() {
-    let host = Host::new();
+fn a_daemon_in_the_foreground_stays_until_sigterm() {
+    let host = with_grace(Host::new(), 0);
     let mut daemon = host.daemon();
+    for _ in 0..2 {
+        drop(host.session("visitor").unwrap());
+        until("the session is gone", || {
+            let status = host.status().unwrap();
+            status.sessions.iter().all(|session| session.name != "visitor")
+        });
+    }
+    // A daemon that does not stay ends at once, without a grace time.
+    std::thread::sleep(Duration::from_millis(500));
+    assert_eq!(host.status().unwrap().pid, daemon.0.id());
     signal(daemon.0.id(), Signal::TERM);
     assert!(daemon.0.wait().unwrap().success());
     assert!(!host.dir.path().join("run/axon-0.sock").exists());
+}
 
+#[test]
+fn a_daemon_that_a_session_started_ends_when_no_session_needs_it() {
+    let host = with_grace(Host::new(), 1);
+    let player = host.play("idle");
+    until("it has started one", || host.status().is_ok());
+    player.finish();
+    until("the daemon ends", || matches!(host.status(), Err(SessionError::NoDaemon { .. })));
+}
+
+/// A host whose daemons outlive their last session by some seconds.
+fn with_grace(host: Host, seconds: u32) -> Host {
     let toml = host.dir.path().join("axon.toml");
-    std::fs::write(&toml, "[link]\ngrace_s = 1\n").unwrap();
-    let host = Host::new().with("AXON_CONFIG", toml.to_str().unwrap());
-    let mut command = host.command(env!("CARGO_BIN_EXE_axon_daemon"));
-    let mut child = support::Kept(command.spawn().unwrap());
-    assert!(child.0.wait().unwrap().success());
+    std::fs::write(&toml, format!("[link]\ngrace_s = {seconds}\n")).unwrap();
+    host.with("AXON_CONFIG", toml.to_str().unwrap())
 }
