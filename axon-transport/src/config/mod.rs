@@ -114,6 +114,7 @@ impl Config {
             ),
             Security::Classic(_) | Security::Qkd(_) => {}
         }
+        warnings.extend(self.unknown_variables());
         if self.runtime_dir.is_none() {
             warnings.push(
                 "neither AXON_RUNTIME_DIR nor XDG_RUNTIME_DIR is set: the daemon keeps nothing \
@@ -122,5 +123,15 @@ impl Config {
             );
         }
         warnings
+    }
+
+    /// What to say about variables that begin with `AXON_` and are no settings: one line, or nothing.
+    pub(crate) fn unknown_variables(&self) -> Option<String> {
+        (!self.unknown_variables.is_empty()).then(|| {
+            format!(
+                "{} is no setting of AXON and ignored; AXON_STRICT_ENV=1 makes it an error",
+                self.unknown_variables.join(", ")
+            )
+        })
     }
 }

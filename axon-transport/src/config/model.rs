@@ -49,6 +49,8 @@ pub struct Config {
     pub log: String,
     /// `[link]` of `axon.toml`.
     pub link: LinkConfig,
+    /// Variables of the environment that begin with `AXON_` and are no settings. They count for nothing.
+    pub unknown_variables: Vec<String>,
 }
 
 /// How peers prove themselves and agree on keys (`AXON_SECURITY_MODE`).

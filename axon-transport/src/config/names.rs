@@ -89,6 +89,19 @@ const OBSOLETE: &[(&str, &str)] = &[
     ),
 ];
 
+/// In the environment only: `1` refuses every variable that begins with `AXON_` and is no setting.
+pub(super) const STRICT: &str = "AXON_STRICT_ENV";
+
+/// Whether `name` of the environment, which is no setting, was meant to be one: it was one once, it is
+/// close to one, or its first word is one of theirs.
+pub(super) fn resembles(name: &str) -> bool {
+    let first_word = |name: &str| name.split('_').nth(1).unwrap_or_default().to_ascii_uppercase();
+    let settings = || SETTINGS.iter().copied().chain([CONFIG, STRICT]);
+    is_obsolete(name)
+        || nearest(name, settings()).is_some()
+        || settings().any(|setting| first_word(setting) == first_word(name))
+}
+
 /// The setting called `name`, or why there is none.
 pub(super) fn setting(name: &str) -> Result<&'static str, ConfigError> {
     if let Some(known) = SETTINGS.iter().chain([&CONFIG]).find(|known| **known == name) {
@@ -98,7 +111,7 @@ pub(super) fn setting(name: &str) -> Result<&'static str, ConfigError> {
         // Its value may be a key.
         return Err(ConfigError::withheld(name, *instead));
     }
-    let close = nearest(name, SETTINGS.iter().copied().chain([CONFIG]));
+    let close = nearest(name, SETTINGS.iter().copied().chain([CONFIG, STRICT]));
     let accepted = match close {
         Some(close) => format!("the settings of docs/configuration.md; did you mean {close}?"),
         None => "the settings of docs/configuration.md; remove this one".to_owned(),

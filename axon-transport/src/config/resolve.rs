@@ -101,6 +101,7 @@ pub(super) fn resolve(
         trusted_uids: values.uids("AXON_TRUSTED_UIDS")?,
         log: values.log_filter("AXON_LOG")?.unwrap_or_else(|| "warn".to_owned()),
         link: link(&sources)?,
+        unknown_variables: sources.strangers.clone(),
     })
 }
 

@@ -32,6 +32,8 @@ pub(super) struct Sources {
     pub(super) settings: BTreeMap<&'static str, Setting>,
     /// `ROS_*` and `XDG_RUNTIME_DIR`, from the environment alone.
     pub(super) foreign: BTreeMap<&'static str, String>,
+    /// Variables that begin with `AXON_` and are somebody else's.
+    pub(super) strangers: Vec<String>,
     /// `[qkd]` of the file, where there is one: settings that count once the mode is `qkd`.
     of_qkd: Option<BTreeMap<&'static str, Setting>>,
     /// `[link]` of the file.
@@ -86,7 +88,7 @@ impl Sources {
         env: impl IntoIterator<Item = (OsString, OsString)>,
     ) -> Result<(), ConfigError> {
         // In order of name, so that of two defects it is always the same one that is named.
-        let ours: BTreeMap<OsString, OsString> = env
+        let mut ours: BTreeMap<OsString, OsString> = env
             .into_iter()
             .filter(|(name, _)| is_ours(name) || FOREIGN.iter().any(|f| name == f))
             .collect();
@@ -94,13 +96,23 @@ impl Sources {
         if let Some(name) = ours.keys().find(|name| obsolete(name)) {
             names::setting(&name.to_string_lossy())?;
         }
+        let strict = match ours.remove(OsStr::new(names::STRICT)) {
+            Some(value) => strict(&utf8(names::STRICT, &value)?)?,
+            None => false,
+        };
         for (name, value) in ours {
             let shown = name.to_string_lossy();
             if let Some(foreign) = FOREIGN.iter().find(|f| name == **f) {
                 self.foreign.insert(foreign, utf8(&shown, &value)?);
                 continue;
             }
-            let setting = names::setting(&shown)?;
+            let setting = match names::setting(&shown) {
+                Err(_) if !strict && name.to_str().is_some_and(|name| !names::resembles(name)) => {
+                    self.strangers.push(shown.into_owned());
+                    continue;
+                }
+                setting => setting?,
+            };
             let text = utf8(setting, &value)?;
             self.settings.insert(setting, Setting { text, origin: Origin::Environment });
         }
@@ -186,6 +198,15 @@ impl Sources {
     }
 }
 
+/// Whether variables that are no settings are refused, whatever they resemble.
+fn strict(text: &str) -> Result<bool, ConfigError> {
+    match text {
+        "0" => Ok(false),
+        "1" => Ok(true),
+        other => Err(ConfigError::value(names::STRICT, other, "0, 1")),
+    }
+}
+
 /// A key of the file, and its value as the environment would spell it.
 fn setting_of_file(
     key: &str,
@@ -253,7 +274,7 @@ fn unreadable(path: &Path, error: &std::io::Error) -> ConfigError {
 
 fn setting_of_key(key: &str) -> Result<&'static str, ConfigError> {
     let upper = format!("AXON_{}", key.to_ascii_uppercase());
-    if key == "config" {
+    if [names::CONFIG, names::STRICT].contains(&upper.as_str()) {
         return Err(ConfigError::name(&upper, "in the environment only"));
     }
     // One spelling: `QKD_Peers` beside `qkd_peers` would be two keys of one setting.

@@ -125,6 +125,9 @@ pub fn main(start: Start) -> ExitCode {
         return fail(&mut report, &error.to_string(), 1);
     }
     log::start(&config);
+    if let Some(line) = config.unknown_variables() {
+        tracing::warn!("{line}");
+    }
     let options = DaemonOptions { report, stays: !detached, ..DaemonOptions::default() };
     match run(config, options) {
         Ok(()) => ExitCode::SUCCESS,

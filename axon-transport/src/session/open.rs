@@ -1,6 +1,9 @@
 //! How a session begins and ends: with a daemon, with none, or relayed by one.
 
-use std::{os::fd::OwnedFd, sync::Arc};
+use std::{
+    os::fd::OwnedFd,
+    sync::{Arc, Once},
+};
 
 use super::{
     Handle, Session, SessionError, SessionOptions,
@@ -28,6 +31,7 @@ impl Session {
     /// When the daemon cannot be reached or started, or has other security settings: the error
     /// names the variable.
     pub fn open(config: &Config, mut options: SessionOptions) -> Result<Self, SessionError> {
+        warn_of_unknown_variables(config);
         options.key = SessionKey::generate().map(Arc::new);
         let id = options.key.as_ref().map_or_else(SessionId::random, |key| key.id());
         if config.daemon == DaemonPolicy::Off {
@@ -165,5 +169,13 @@ impl Drop for Handle {
                 let _ = thread.join();
             }
         }
+    }
+}
+
+/// Says once in a process which variables begin as settings do and are none.
+fn warn_of_unknown_variables(config: &Config) {
+    static SAID: Once = Once::new();
+    if let Some(line) = config.unknown_variables() {
+        SAID.call_once(|| tracing::warn!("{line}"));
     }
 }

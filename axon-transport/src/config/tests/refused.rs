@@ -27,8 +27,9 @@ fn unknown_names_are_refused_with_the_nearest_known_one() {
         ("AXON_SECURITY_MOED", Some("AXON_SECURITY_MODE")),
         ("AXON_QKD_PEER", Some("AXON_QKD_PEERS")),
         ("AXON_KME_PASSWORD", None),
-        ("AXON_", None),
+        ("AXON_CLASSIC_EVERYBODY", None),
         ("AXON_security_mode", None),
+        ("AXON_STRICT_EMV", Some("AXON_STRICT_ENV")),
     ] {
         let error = resolve(&[], &[(name, "hunter2")]).unwrap_err();
         assert_eq!(error.variable(), name);
@@ -40,6 +41,25 @@ fn unknown_names_are_refused_with_the_nearest_known_one() {
         }
     }
     assert!(resolve(&[], &[("AXONX", "x"), ("axon_security_mode", "x")]).is_ok(), "not ours");
+}
+
+#[test]
+fn foreign_names_are_ignored_with_a_warning_unless_the_environment_is_strict() {
+    let foreign = [("AXON_CI_JOB", "hunter2"), ("AXON_", "hunter2"), ("AXON_BENCH_SIZES", "")];
+    let config = resolve(&[], &foreign).unwrap();
+    assert_eq!(config.unknown_variables, ["AXON_", "AXON_BENCH_SIZES", "AXON_CI_JOB"]);
+    let warnings = config.warnings().join("\n");
+    assert!(warnings.contains("AXON_CI_JOB") && !warnings.contains("hunter2"), "{warnings}");
+    assert!(resolve(&[], &[("AXON_STRICT_ENV", "0"), foreign[0]]).is_ok());
+    for (name, value) in foreign {
+        let error = resolve(&[], &[("AXON_STRICT_ENV", "1"), (name, value)]).unwrap_err();
+        assert_eq!(error.variable(), name);
+    }
+    let error = resolve(&[], &[("AXON_STRICT_ENV", "yes")]).unwrap_err();
+    assert_eq!((error.variable(), error.accepted()), ("AXON_STRICT_ENV", "0, 1"));
+    let error = with_file(&[], "strict_env = 1").unwrap_err();
+    assert_eq!(error.variable(), "AXON_STRICT_ENV");
+    assert!(resolve(&[], &[]).unwrap().unknown_variables.is_empty());
 }
 
 #[test]
