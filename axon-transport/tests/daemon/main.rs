@@ -77,7 +77,13 @@ fn child() {
     };
     match part.as_str() {
         "idle" => {
-            say(session.daemon().unwrap());
+            // The test may kill the daemon as soon as it has seen this session.
+            let mut daemon = None;
+            until("it has a daemon", || {
+                daemon = session.daemon();
+                daemon.is_some()
+            });
+            say(daemon.unwrap());
             wait_for_the_end();
         }
         // Publishes numbers until the test has enough, then says how many there were.
