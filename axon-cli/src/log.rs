@@ -220,7 +220,7 @@ mod tests {
 
     use super::*;
 
-    const RECORDED: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/data/mit-csail.mcap");
+    const RECORDED: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/data/mit-csail.mcap");
 
     fn file(bytes: &[u8]) -> tempfile::NamedTempFile {
         let mut file = tempfile::NamedTempFile::new().expect("temporary file");

@@ -43,7 +43,7 @@ use crate::{
 pub(crate) use self::{player::run as run_player, subscriber::run as run_subscriber};
 
 /// The log that is replayed when none is given, so that the binary alone suffices.
-const RECORDED: &[u8] = include_bytes!("../../../examples/data/mit-csail.mcap");
+const RECORDED: &[u8] = include_bytes!("../../data/mit-csail.mcap");
 const RECORDED_NAME: &str = "mit-csail.mcap";
 
 /// Why the demo cannot go on. A lost message or a wrong peer let in is no such error: the report
