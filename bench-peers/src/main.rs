@@ -6,6 +6,8 @@
 mod harness;
 mod iceoryx;
 mod report;
+#[path = "../../axon-cli/src/say.rs"]
+mod say;
 #[path = "../../axon-cli/src/text.rs"]
 #[allow(dead_code, reason = "the tool `axon` uses the rest")]
 mod text;
@@ -107,7 +109,7 @@ fn measure(media: &[&dyn Medium], sizes: &[usize], quick: bool) -> Result<Result
     for motion in STREAMS {
         progress.step(&format!("throughput, {}", words::motion(motion)));
         for size in sizes {
-            let load = Load::stream(*size, motion);
+            let load = Load::stream(*size, Wake::Poll, motion);
             streams.push(Compared { load, rounds: pair.stream(&load)? });
             progress.advance();
         }
