@@ -1,5 +1,5 @@
-//! The simulator's answers byte by byte: the words of the specification, and no leniency that a
-//! client could come to rely on.
+//! The simulator's answers byte by byte: the words of the specification, no leniency that a client could
+//! come to rely on where it is strict, and what clients in the field send where it is not.
 
 mod raw;
 
@@ -77,8 +77,8 @@ async fn refusals_have_the_words_of_the_specification() {
 }
 
 #[tokio::test]
-async fn bodies_that_are_not_as_specified_are_refused() {
-    let network = three().start().await.unwrap();
+async fn a_strict_kme_refuses_bodies_that_are_not_as_specified() {
+    let network = three().strict().start().await.unwrap();
     for body in [
         "",
         "null",
@@ -124,6 +124,50 @@ async fn bodies_that_are_not_as_specified_are_refused() {
         r#"{{"key_IDs":[{{"key_ID":"{id}","key_ID_extension":{{}}}}],"key_IDs_extension":{{}}}}"#
     );
     assert_eq!(post(&network, "sae-b", "sae-a/dec_keys", &body).await.status, 200);
+}
+
+#[tokio::test]
+async fn a_kme_passes_over_nulls_and_members_that_the_specification_does_not_list() {
+    let network = three().start().await.unwrap();
+    for body in [
+        r#"{"number":null}"#,
+        r#"{"number":1,"size":null,"extension_mandatory":null,"extension_optional":null}"#,
+        r#"{"additional_slave_SAE_IDs":null}"#,
+        r#"{"number":1,"Number":7,"client":{"name":"field","version":[1,2]}}"#,
+    ] {
+        let got = enc_keys(&network, body).await;
+        assert_eq!(got.status, 200, "{body}: {}", got.body);
+        assert_eq!(got.body["keys"].as_array().unwrap().len(), 1, "{body}");
+    }
+    let key = enc_keys(&network, "{}").await.body["keys"][0]["key_ID"].clone();
+    let id = key.as_str().unwrap();
+    for body in [
+        "[]".to_owned(),
+        r#"{"number":"1"}"#.to_owned(),
+        r#"{"number":1,"number":1}"#.to_owned(),
+        r#"{"extension_optional":[1]}"#.to_owned(),
+    ] {
+        assert_eq!(enc_keys(&network, &body).await.status, 400, "{body}");
+    }
+    for body in [
+        "{}".to_owned(),
+        r#"{"key_IDs":null}"#.to_owned(),
+        r#"{"key_IDs":[]}"#.to_owned(),
+        r#"{"key_IDs":[{"key_ID":null}]}"#.to_owned(),
+        format!(r#"{{"key_IDs":["{id}"]}}"#),
+    ] {
+        assert_eq!(post(&network, "sae-b", "sae-a/dec_keys", &body).await.status, 400, "{body}");
+    }
+    let body = format!(
+        r#"{{"key_IDs":[{{"key_ID":"{id}","key_ID_extension":null,"hint":1}}],"key_IDs_extension":null,"more":[]}}"#
+    );
+    let got = post(&network, "sae-b", "sae-a/dec_keys", &body).await;
+    assert_eq!(got.status, 200, "{}", got.body);
+
+    let get = "GET /api/v1/keys/sae-b/enc_keys?number=1&trace=on HTTP/1.1\r\nHost: x\r\n\r\n";
+    assert_eq!(exchange(&network, "sae-a", get).await.status, 200);
+    let strict = three().strict().start().await.unwrap();
+    assert_eq!(exchange(&strict, "sae-a", get).await.status, 400);
 }
 
 #[tokio::test]

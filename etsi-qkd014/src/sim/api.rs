@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde::de::value::MapAccessDeserializer;
-use serde::de::{Deserialize, DeserializeOwned, Deserializer, MapAccess, Visitor};
+use serde::de::{Deserialize, DeserializeOwned, Deserializer, Error as _, MapAccess, Visitor};
 use serde_json::{Value, json};
 use zeroize::Zeroizing;
 
@@ -59,6 +59,85 @@ struct KeyIdItem {
     _extension: serde_json::Map<String, Value>,
 }
 
+/// The body of a POST.
+trait Body: DeserializeOwned {
+    /// The members that the specification lists.
+    const MEMBERS: &'static [&'static str];
+    /// The member that is an array of objects, and the members that these have.
+    const ITEMS: Option<(&'static str, &'static [&'static str])>;
+}
+
+impl Body for KeyRequest {
+    const MEMBERS: &'static [&'static str] = &[
+        "number",
+        "size",
+        "additional_slave_SAE_IDs",
+        "extension_mandatory",
+        "extension_optional",
+    ];
+    const ITEMS: Option<(&'static str, &'static [&'static str])> = None;
+}
+
+impl Body for KeyIds {
+    const MEMBERS: &'static [&'static str] = &["key_IDs", "key_IDs_extension"];
+    const ITEMS: Option<(&'static str, &'static [&'static str])> =
+        Some(("key_IDs", &["key_ID", "key_ID_extension"]));
+}
+
+/// Leaves what is there of `members`. The specification forbids neither others, nor a `null` where an
+/// optional member is absent; a mandatory one that is `null` is missing.
+fn prune(object: &mut serde_json::Map<String, Value>, members: &[&str]) {
+    object.retain(|name, value| members.contains(&name.as_str()) && !value.is_null());
+}
+
+/// The JSON object that a POST carries.
+fn posted<B: Body>(request: &Request, strict: bool) -> Result<B, Answer> {
+    let unreadable = |error| bad(format!("the body cannot be read: {error}"));
+    let whole = || serde_json::from_slice::<Object<B>>(&request.body).map(|Object(body)| body);
+    if strict {
+        return whole().map_err(unreadable);
+    }
+    let Object(Unique(mut object)) = serde_json::from_slice(&request.body).map_err(unreadable)?;
+    prune(&mut object, B::MEMBERS);
+    if let Some((name, members)) = B::ITEMS
+        && let Some(items) = object.get_mut(name).and_then(Value::as_array_mut)
+    {
+        items.iter_mut().filter_map(Value::as_object_mut).for_each(|item| prune(item, members));
+    }
+    serde_json::from_value::<Object<B>>(Value::Object(object))
+        .map(|Object(body)| body)
+        .map_err(unreadable)
+}
+
+/// The members of an object, none of them twice.
+struct Unique(serde_json::Map<String, Value>);
+
+impl<'de> Deserialize<'de> for Unique {
+    fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
+        struct Members;
+
+        impl<'de> Visitor<'de> for Members {
+            type Value = Unique;
+
+            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str("an object")
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Unique, A::Error> {
+                let mut object = serde_json::Map::new();
+                while let Some((name, value)) = map.next_entry::<String, Value>()? {
+                    if object.contains_key(&name) {
+                        return Err(A::Error::custom(format!("duplicate member {name:?}")));
+                    }
+                    object.insert(name, value);
+                }
+                Ok(Unique(object))
+            }
+        }
+        from.deserialize_map(Members)
+    }
+}
+
 /// A JSON object and nothing else: a derived `Deserialize` takes an array of the members too.
 struct Object<T>(T);
 
@@ -84,12 +163,6 @@ impl<'de, T: DeserializeOwned> Deserialize<'de> for Object<T> {
 /// A member that may be left out, but is not `null`.
 fn present<'de, D: Deserializer<'de>>(from: D) -> Result<Option<u64>, D::Error> {
     u64::deserialize(from).map(Some)
-}
-
-/// The JSON object that a POST carries.
-fn posted<T: DeserializeOwned>(request: &Request) -> Result<T, Answer> {
-    let object = serde_json::from_slice::<Object<T>>(&request.body);
-    object.map(|Object(body)| body).map_err(|e| bad(format!("the body cannot be read: {e}")))
 }
 
 /// Answers one request of the SAE named by the client's certificate.
@@ -179,14 +252,18 @@ fn route(
     match method {
         "status" => status(shared, kme, caller, &sae),
         "enc_keys" => {
-            let asked = if get { enc_query(&request.query)? } else { posted(request)? };
+            let asked = if get {
+                enc_query(&request.query, shared.strict)?
+            } else {
+                posted(request, shared.strict)?
+            };
             enc_keys(shared, kme, caller, &sae, &asked, fault)
         }
         _ => {
             let ids = if get {
-                dec_query(&request.query)?
+                dec_query(&request.query, shared.strict)?
             } else {
-                let ids: KeyIds = posted(request)?;
+                let ids: KeyIds = posted(request, shared.strict)?;
                 ids.ids.into_iter().map(|Object(item)| item.id).collect()
             };
             dec_keys(shared, kme, caller, &sae, &ids, fault)
@@ -210,21 +287,25 @@ fn pairs(query: &str) -> Result<Vec<(String, String)>, Answer> {
     Ok(pairs)
 }
 
-fn enc_query(query: &str) -> Result<KeyRequest, Answer> {
+fn enc_query(query: &str, strict: bool) -> Result<KeyRequest, Answer> {
     let mut asked = KeyRequest::default();
     for (name, value) in pairs(query)? {
-        let number = value.parse().map_err(|_| bad(format!("{name} is not a number")))?;
-        match name.as_str() {
-            "number" => asked.number = Some(number),
-            "size" => asked.size = Some(number),
-            _ => return Err(bad(format!("{name:?} is not a parameter of enc_keys"))),
-        }
+        let number = match name.as_str() {
+            "number" => &mut asked.number,
+            "size" => &mut asked.size,
+            _ if strict => return Err(bad(format!("{name:?} is not a parameter of enc_keys"))),
+            _ => continue,
+        };
+        *number = Some(value.parse().map_err(|_| bad(format!("{name} is not a number")))?);
     }
     Ok(asked)
 }
 
-fn dec_query(query: &str) -> Result<Vec<String>, Answer> {
-    let pairs = pairs(query)?;
+fn dec_query(query: &str, strict: bool) -> Result<Vec<String>, Answer> {
+    let mut pairs = pairs(query)?;
+    if !strict {
+        pairs.retain(|(name, _)| name == "key_ID");
+    }
     match pairs.as_slice() {
         [(name, id)] if name == "key_ID" => Ok(vec![id.clone()]),
         _ => Err(bad("GET takes one parameter, key_ID")),

@@ -38,6 +38,7 @@ pub struct NetworkBuilder {
     rate: FillRate,
     initially: Option<u64>,
     tls12_only: bool,
+    strict: bool,
     witness: Witness,
 }
 
@@ -95,6 +96,14 @@ impl NetworkBuilder {
         self
     }
 
+    /// Refuses what the specification does not list: other members of a request, `null` for an absent
+    /// one, other parameters of a query. Clients in the field send these, and ETSI GS QKD 014 does not
+    /// forbid them, so by default they are passed over.
+    pub fn strict(mut self) -> Self {
+        self.strict = true;
+        self
+    }
+
     /// Calls `tell` with key_ID and secret of each key that a master draws, for tests that search
     /// memory for keys.
     pub fn witness(mut self, tell: impl Fn(&str, &[u8]) + Send + Sync + 'static) -> Self {
@@ -108,7 +117,7 @@ impl NetworkBuilder {
     /// # Errors
     /// [`Error`] names the ID, setting or address that cannot be used.
     pub async fn start(self) -> Result<Network, Error> {
-        let Self { layout, pki, limits, rate, initially, tls12_only, witness } = self;
+        let Self { layout, pki, limits, rate, initially, tls12_only, strict, witness } = self;
         layout.check()?;
         let sizes = limits.min_key_size..=limits.max_key_size;
         if !sizes.contains(&limits.key_size) || !limits.key_size.is_multiple_of(8) {
@@ -142,6 +151,7 @@ impl NetworkBuilder {
             store: Mutex::new(Store::new(rate, limits.max_stored, initially).with_witness(witness)),
             layout: layout.clone(),
             limits,
+            strict,
         });
         let mut kmes = Vec::new();
         for (index, site) in layout.sites.iter().enumerate() {
@@ -206,6 +216,7 @@ impl Network {
             rate: FillRate::Unlimited,
             initially: None,
             tls12_only: false,
+            strict: false,
             witness: Witness::default(),
         }
     }
@@ -382,6 +393,7 @@ pub(super) struct Shared {
     store: Mutex<Store>,
     layout: Layout,
     pub(super) limits: Limits,
+    pub(super) strict: bool,
 }
 
 impl Shared {

@@ -31,6 +31,10 @@ pub(crate) struct Arguments {
     /// Most keys in one request.
     #[arg(long, value_name = "KEYS")]
     max_per_request: Option<u64>,
+    /// Refuses members, parameters and nulls that the specification does not list. By default they are
+    /// passed over, since it does not forbid them.
+    #[arg(long)]
+    strict: bool,
     /// Delays every answer of every KME.
     #[arg(long, value_name = "MILLISECONDS")]
     latency: Option<u64>,
@@ -78,6 +82,9 @@ async fn serve(arguments: Arguments, layout: Layout) -> Outcome {
     }
     if let Some(keys) = arguments.max_per_request {
         builder = builder.max_keys_per_request(keys);
+    }
+    if arguments.strict {
+        builder = builder.strict();
     }
     let network = Arc::new(builder.start().await.map_err(other)?);
     for kme in network.kmes() {
