@@ -10,6 +10,7 @@ use zeroize::{Zeroize, Zeroizing};
 
 use crate::aead::Aead;
 use crate::channel::{Channel, KeyId};
+use crate::erase::erasing_stack;
 
 /// A 256-bit key as a KME delivered it, erased on drop.
 ///
@@ -87,16 +88,18 @@ impl KmeKey {
     /// or returned by value: their stack frames keep parts of the key and of all that is made of
     /// it. So the derivation runs again, with 32 zeros for the key: the same code at the same depth
     /// writes to the same places, whichever they are, takes no more stack, and leaves registers
-    /// without secrets as well.
+    /// without secrets as well. The upper part of that stack is overwritten besides.
     ///
     /// That holds if the derivation takes the same way whatever the key is, as code that runs in
     /// constant time does, and has no side effects. What it returns is moved: a secret in it has to
     /// be behind a pointer. A signal that interrupts the first run leaves registers on the stack.
     pub fn derive<T>(&self, derivation: impl Fn(&[u8; 32]) -> T) -> T {
-        let derived = run(&derivation, self.expose());
-        // Opaque, so that this run is neither left out nor compiled in another way.
-        drop(black_box(run(&derivation, black_box(&[0; 32]))));
-        derived
+        erasing_stack(|| {
+            let derived = run(&derivation, self.expose());
+            // Opaque, so that this run is neither left out nor compiled in another way.
+            drop(black_box(run(&derivation, black_box(&[0; 32]))));
+            derived
+        })
     }
 
     pub(crate) fn random() -> Result<Self, RandomError> {

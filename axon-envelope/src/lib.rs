@@ -69,6 +69,7 @@ compile_error!("axon-envelope needs an AEAD: enable the feature `aws-lc-rs` or `
 
 pub mod aead;
 mod channel;
+mod erase;
 mod header;
 pub mod inner;
 mod key;

@@ -16,7 +16,9 @@ pub(crate) fn erasing_stack_of_packet<T>(work: impl FnOnce() -> T) -> T {
     erasing::<PACKET_DEPTH, T>(work)
 }
 
-fn erasing<const DEPTH: usize, T>(work: impl FnOnce() -> T) -> T {
+/// Calls `work`, and then overwrites `DEPTH` bytes of the stack that it used. The result must not
+/// hold a secret by value.
+pub fn erasing<const DEPTH: usize, T>(work: impl FnOnce() -> T) -> T {
     let result = on_the_stack(work);
     overwrite::<DEPTH>();
     result

@@ -37,6 +37,9 @@ pub mod qkd;
 #[cfg(feature = "quic")]
 pub mod quic;
 
+// For AXON's own crates; not part of the interface.
+#[doc(hidden)]
+pub use erase::erasing;
 pub use error::{CaPart, Error};
 pub use negotiated::{Cipher, KeyExchange, Negotiated, PskKex, UnknownName};
 

@@ -6,6 +6,7 @@ pub mod daemon;
 pub mod discovery;
 pub mod events;
 pub mod ffi;
+mod files;
 pub mod gateway;
 pub mod graph;
 mod heap;

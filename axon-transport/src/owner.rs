@@ -13,6 +13,7 @@ use aws_lc_rs::{
     digest::{SHA256, digest},
     signature::{ED25519, Ed25519KeyPair, KeyPair, UnparsedPublicKey},
 };
+use axon_tls::erasing;
 use minicbor::{Decode, Encode};
 use rand::{TryRng, rngs::SysRng};
 use zeroize::Zeroizing;
@@ -29,6 +30,9 @@ const PACKET: [u8; 5] = [OWNER, 0xa1, 0x00, 0x58, 0x20];
 const SIGNED: &[u8] = b"axon session owner 1";
 /// The label of the TLS exporter of [`Binding`].
 pub const EXPORTER: &[u8] = b"EXPORTER-axon-session-owner";
+
+/// Bytes of stack, more than Ed25519 takes: its scalar and nonce are left there.
+const STACK: usize = 16 << 10;
 
 /// 32 bytes that both ends of one connection know and no other connection has.
 pub type Binding = [u8; 32];
@@ -56,14 +60,9 @@ impl SessionKey {
     }
 
     fn new(seed: &[u8; 32]) -> Option<Self> {
-        let mut key = Self { seed: LockedKey::copy_of(seed).ok()?, public: [0; 32] };
-        key.public = key.pair()?.public_key().as_ref().try_into().ok()?;
-        Some(key)
-    }
-
-    /// The library erases its copy when it frees it, so that it is made for each use.
-    fn pair(&self) -> Option<Ed25519KeyPair> {
-        Ed25519KeyPair::from_seed_unchecked(self.seed.as_ref()).ok()
+        let seed = LockedKey::copy_of(seed).ok()?;
+        let public = erasing::<STACK, _>(|| pair(&seed)?.public_key().as_ref().try_into().ok())?;
+        Some(Self { seed, public })
     }
 
     /// The id of its session.
@@ -88,13 +87,20 @@ impl SessionKey {
     /// Proves, on the connection that `binding` is of, that the daemon `from` has this session.
     /// `None` where there is no memory for it, or in a forked process, which has no keys.
     pub fn prove(&self, binding: &Binding, from: DaemonId) -> Option<Proof> {
-        let pair = self.pair()?;
-        if pair.public_key().as_ref() != self.public {
+        if self.seed.is_forked() {
             return None;
         }
-        let signature = pair.sign(&signed(binding, from, &self.id()));
-        Some(Proof { key: self.public, signature: signature.as_ref().try_into().ok()? })
+        let message = signed(binding, from, &self.id());
+        let signature =
+            erasing::<STACK, _>(|| pair(&self.seed)?.sign(&message).as_ref().try_into().ok())?;
+        Some(Proof { key: self.public, signature })
     }
+}
+
+/// Made for each use, since the library has its copy in memory that is not locked. It erases that
+/// copy when it frees it.
+fn pair(seed: &LockedKey) -> Option<Ed25519KeyPair> {
+    Ed25519KeyPair::from_seed_unchecked(seed.as_ref()).ok()
 }
 
 fn id_of(public: &[u8]) -> SessionId {
@@ -172,7 +178,65 @@ impl SessionKeys {
 
 #[cfg(test)]
 mod tests {
+    use std::hint::black_box;
+
+    use sha2::Sha512;
+
     use super::*;
+    use crate::secrets::left_on_the_stack;
+
+    /// The order of the group (RFC 8032, 5.1), least significant word first.
+    const ORDER: [u64; 4] =
+        [0x5812_631a_5cf5_d3ed, 0x14de_f9de_a2f7_9cd6, 0, 0x1000_0000_0000_0000];
+
+    /// A number modulo the group's order, least significant byte first.
+    fn reduced(number: &[u8]) -> Vec<u8> {
+        let mut rest = [0_u64; 4];
+        for bit in (0..number.len() * 8).rev() {
+            let mut carry = u64::from(number[bit / 8] >> (bit % 8) & 1);
+            for word in &mut rest {
+                (*word, carry) = (*word << 1 | carry, *word >> 63);
+            }
+            if rest.iter().rev().ge(ORDER.iter().rev()) {
+                let mut borrow = false;
+                for (word, order) in rest.iter_mut().zip(ORDER) {
+                    let (less, under) = word.overflowing_sub(order);
+                    let (less, again) = less.overflowing_sub(u64::from(borrow));
+                    (*word, borrow) = (less, under || again);
+                }
+            }
+        }
+        rest.iter().flat_map(|word| word.to_le_bytes()).collect()
+    }
+
+    /// The secrets of a signature (RFC 8032, 5.1.6): the seed, its hash, the scalar, and the nonce
+    /// for `message`.
+    fn secrets(seed: &[u8; 32], message: &[u8]) -> Vec<Vec<u8>> {
+        use sha2::Digest;
+        let hash = Sha512::digest(seed);
+        let mut scalar = hash[..32].to_vec();
+        scalar[0] &= 248;
+        scalar[31] = scalar[31] & 63 | 64;
+        let nonce = Sha512::new().chain_update(&hash[32..]).chain_update(message).finalize();
+        let reduced = [reduced(&scalar), reduced(&nonce)];
+        [seed.to_vec(), hash.to_vec(), scalar, nonce.to_vec()].into_iter().chain(reduced).collect()
+    }
+
+    #[test]
+    fn neither_a_new_key_nor_a_signature_leaves_a_secret_on_the_stack() {
+        let binding = [7; 32];
+        let from = DaemonId([1; 16]);
+        let secrets_of =
+            |key: &SessionKey| secrets(key.seed.as_ref(), &signed(&binding, from, &key.id()));
+        let generate = || SessionKey::generate().unwrap();
+        assert_eq!(left_on_the_stack(generate, secrets_of), [0_usize; 0], "a new key");
+        let key = SessionKey::generate().unwrap();
+        let packet = key.packet();
+        let take_over = || SessionKey::from_packet(black_box(&packet)).unwrap();
+        assert_eq!(left_on_the_stack(take_over, secrets_of), [0_usize; 0], "a key taken over");
+        let prove = || key.prove(&binding, from).unwrap();
+        assert_eq!(left_on_the_stack(prove, |_| secrets_of(&key)), [0_usize; 0], "a proof");
+    }
 
     #[test]
     fn a_proof_is_of_one_session_one_daemon_and_one_connection() {

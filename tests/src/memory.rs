@@ -16,6 +16,9 @@ const PIECE: usize = 8;
 /// Bits by which most bytes are told apart from the start of a piece.
 const FILTER: u32 = 20;
 const PAGE: usize = 4096;
+/// Bytes of the stack of a thread that Rust's library or tokio makes. Other memory may follow in the
+/// same mapping.
+const STACK: usize = 2 << 20;
 
 /// Secrets to search for, each in all forms in which a derivation handles it.
 pub struct Needles {
@@ -45,6 +48,8 @@ pub struct Find {
     pub mapping: String,
     /// Whether the mapping is locked, left out of core files, and wiped in a forked child.
     pub guarded: bool,
+    /// Whether they are on the stack of a thread that lives.
+    pub on_stack: bool,
 }
 
 impl Default for Needles {
@@ -95,6 +100,8 @@ struct Mapping {
     end: usize,
     name: String,
     guarded: bool,
+    /// Where the part of it that is a stack ends; its start if no part is.
+    stack_end: usize,
 }
 
 /// A process that is stopped until this is dropped.
@@ -156,8 +163,14 @@ fn wait_stopped(pid: u32) -> io::Result<()> {
 fn search_stopped(pid: u32, needles: &Needles) -> io::Result<Vec<Find>> {
     let memory = File::open(format!("/proc/{pid}/mem"))?;
     let pagemap = File::open(format!("/proc/{pid}/pagemap"))?;
+    let stack_pointers = stack_pointers(pid)?;
     let mut found = Vec::new();
-    for mapping in mappings(pid)? {
+    for mut mapping in mappings(pid)? {
+        if mapping.name == "[stack]" {
+            mapping.stack_end = mapping.end;
+        } else if stack_pointers.iter().any(|at| (mapping.start..mapping.end).contains(at)) {
+            mapping.stack_end = mapping.end.min(mapping.start + STACK);
+        }
         // Pieces may cross the border of two pages, so that present ones are searched in runs.
         let mut run = Vec::new();
         let mut start = mapping.start;
@@ -198,12 +211,27 @@ fn search_run(
             }
             _ => {
                 let (name, guarded) = (mapping.name.clone(), mapping.guarded);
-                let fresh = Find { secret, address, length: PIECE, mapping: name, guarded };
+                let on_stack = address < mapping.stack_end;
+                let fresh =
+                    Find { secret, address, length: PIECE, mapping: name, guarded, on_stack };
                 found.extend(last.replace(fresh));
             }
         }
     }
     found.extend(last);
+}
+
+/// Where the stacks of a stopped process's threads are.
+fn stack_pointers(pid: u32) -> io::Result<Vec<usize>> {
+    let mut pointers = Vec::new();
+    for thread in fs::read_dir(format!("/proc/{pid}/task"))? {
+        // A thread that ended meanwhile has no stack.
+        let Ok(text) = fs::read_to_string(thread?.path().join("syscall")) else { continue };
+        // The last two fields are the stack pointer and the program counter.
+        let pointer = text.split_whitespace().rev().nth(1).and_then(|at| at.strip_prefix("0x"));
+        pointers.extend(pointer.and_then(|at| usize::from_str_radix(at, 16).ok()));
+    }
+    Ok(pointers)
 }
 
 fn mappings(pid: u32) -> io::Result<Vec<Mapping>> {
@@ -220,7 +248,7 @@ fn mappings(pid: u32) -> io::Result<Vec<Mapping>> {
             writable = rest.starts_with("rw");
             if writable {
                 let name = rest.split_whitespace().nth(4).unwrap_or_default().to_owned();
-                mappings.push(Mapping { start, end, name, guarded: false });
+                mappings.push(Mapping { start, end, name, guarded: false, stack_end: start });
             }
         }
     }

@@ -16,8 +16,8 @@ impl Needles {
         self.add_text(secret, STANDARD.encode(key).as_bytes());
     }
 
-    /// Adds `HKDF-SHA256` of a key: the extracted key, the two states of HMAC that stand for it, and
-    /// as `kind` what is expanded.
+    /// Adds `HKDF-SHA256` of a key: what [`add_extracted`](Self::add_extracted) adds, and as `kind`
+    /// what is expanded.
     pub fn add_derived(
         &mut self,
         kind: &'static str,
@@ -26,7 +26,16 @@ impl Needles {
         key: &[u8],
         info: &[&[u8]],
     ) {
-        let (prk, expand) = Hkdf::<Sha256>::extract(salt, key);
+        self.add_extracted(number, salt, key);
+        let mut derived = [0; 32];
+        let expand = Hkdf::<Sha256>::new(salt, key);
+        expand.expand_multi_info(info, &mut derived).expect("32 bytes are few");
+        self.add(kind, number, &derived);
+    }
+
+    /// Adds what `HKDF-SHA256` extracts from a key, and the two states of HMAC that stand for it.
+    pub fn add_extracted(&mut self, number: usize, salt: Option<&[u8]>, key: &[u8]) {
+        let (prk, _) = Hkdf::<Sha256>::extract(salt, key);
         self.add("PRK", number, &prk);
         for mask in [0x36, 0x5c] {
             let mut block = [mask; 64];
@@ -36,9 +45,6 @@ impl Needles {
             let state: Vec<u8> = state.iter().flat_map(|word| word.to_ne_bytes()).collect();
             self.add_text(Secret { kind: "PRK", number }, &state);
         }
-        let mut derived = [0; 32];
-        expand.expand_multi_info(info, &mut derived).expect("32 bytes are few");
-        self.add(kind, number, &derived);
     }
 }
 
@@ -65,8 +71,9 @@ pub fn unexpected(name: &str, found: &[Find], allowed: impl Fn(&Find) -> bool) -
         eprintln!("{name}: parts of {} of kind {kind}", numbers.len());
     }
     for find in wrong.iter().take(20) {
-        let Find { secret, address, length, mapping, .. } = find;
-        eprintln!("{name}: {secret:?}: {length} bytes at {address:#x} {mapping}");
+        let Find { secret, address, length, mapping, on_stack, .. } = find;
+        let place = if *on_stack { "a thread's stack" } else { mapping };
+        eprintln!("{name}: {secret:?}: {length} bytes at {address:#x} {place}");
     }
     wrong.len()
 }

@@ -4,6 +4,7 @@ use aws_lc_rs::aead::{AES_256_GCM, Aad, LessSafeKey, Nonce, UnboundKey};
 
 use super::{Aead, AeadError};
 use crate::TAG_LEN;
+use crate::erase::erasing_stack;
 use crate::header::NONCE_LEN;
 
 /// AES-256-GCM by aws-lc-rs, which keeps the key behind a pointer and erases it when freed.
@@ -39,9 +40,11 @@ impl Aead for AwsLc {
         aad: &[u8],
         in_out: &mut [u8],
     ) -> Result<[u8; TAG_LEN], AeadError> {
-        let nonce = Nonce::assume_unique_for_key(*nonce);
-        let tag = self.0.seal_in_place_separate_tag(nonce, Aad::from(aad), in_out);
-        tag.map_err(|_| AeadError)?.as_ref().try_into().map_err(|_| AeadError)
+        erasing_stack(|| {
+            let nonce = Nonce::assume_unique_for_key(*nonce);
+            let tag = self.0.seal_in_place_separate_tag(nonce, Aad::from(aad), in_out);
+            tag.map_err(|_| AeadError)?.as_ref().try_into().map_err(|_| AeadError)
+        })
     }
 
     fn seal_apart(
@@ -51,12 +54,13 @@ impl Aead for AwsLc {
         plaintext: &[u8],
         ciphertext: &mut [u8],
     ) -> Result<[u8; TAG_LEN], AeadError> {
-        let nonce = Nonce::assume_unique_for_key(*nonce);
         let mut tag = [0; TAG_LEN];
-        self.0
-            .seal_out_of_place_scatter(nonce, Aad::from(aad), plaintext, ciphertext, &[], &mut tag)
-            .map_err(|_| AeadError)?;
-        Ok(tag)
+        let sealed = erasing_stack(|| {
+            let nonce = Nonce::assume_unique_for_key(*nonce);
+            let aad = Aad::from(aad);
+            self.0.seal_out_of_place_scatter(nonce, aad, plaintext, ciphertext, &[], &mut tag)
+        });
+        sealed.map(|()| tag).map_err(|_| AeadError)
     }
 
     fn open_in_place(
@@ -66,9 +70,11 @@ impl Aead for AwsLc {
         in_out: &mut [u8],
         tag: &[u8; TAG_LEN],
     ) -> Result<(), AeadError> {
-        let nonce = Nonce::assume_unique_for_key(*nonce);
-        let opened = self.0.open_in_place_separate_tag(nonce, Aad::from(aad), tag, in_out);
-        opened.map(|_| ()).map_err(|_| AeadError)
+        erasing_stack(|| {
+            let nonce = Nonce::assume_unique_for_key(*nonce);
+            let opened = self.0.open_in_place_separate_tag(nonce, Aad::from(aad), tag, in_out);
+            opened.map(|_| ()).map_err(|_| AeadError)
+        })
     }
 
     fn open_apart(
@@ -79,9 +85,11 @@ impl Aead for AwsLc {
         tag: &[u8; TAG_LEN],
         plaintext: &mut [u8],
     ) -> Result<(), AeadError> {
-        let nonce = Nonce::assume_unique_for_key(*nonce);
-        self.0
-            .open_separate_gather(nonce, Aad::from(aad), ciphertext, tag, plaintext)
-            .map_err(|_| AeadError)
+        erasing_stack(|| {
+            let nonce = Nonce::assume_unique_for_key(*nonce);
+            let opened =
+                self.0.open_separate_gather(nonce, Aad::from(aad), ciphertext, tag, plaintext);
+            opened.map_err(|_| AeadError)
+        })
     }
 }

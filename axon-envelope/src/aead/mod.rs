@@ -34,9 +34,10 @@ pub struct AeadError;
 
 /// AES-256-GCM under one key, with a 12-byte nonce and a 16-byte tag.
 ///
-/// Implementations erase the key on drop, compare tags in constant time, allocate nothing per
-/// message, and on a wrong tag may leave anything but the plaintext in the output buffer. Another
-/// algorithm must not be put behind this trait: the envelope's magic stands for AES-256-GCM.
+/// Implementations erase the key on drop, leave nothing that is made of it on the stack, compare tags
+/// in constant time, allocate nothing per message, and on a wrong tag may leave anything but the
+/// plaintext in the output buffer. Another algorithm must not be put behind this trait: the
+/// envelope's magic stands for AES-256-GCM.
 pub trait Aead: Sized + Send + Sync {
     /// The library's name, for logs and benchmarks.
     const NAME: &'static str;

@@ -7,6 +7,7 @@ use aes_gcm::{AeadInOut, Aes256Gcm, KeyInit};
 
 use super::{Aead, AeadError};
 use crate::TAG_LEN;
+use crate::erase::erasing_stack;
 use crate::header::NONCE_LEN;
 
 /// AES-256-GCM by RustCrypto, erased on drop.
@@ -41,8 +42,10 @@ impl Aead for RustCrypto {
         aad: &[u8],
         in_out: &mut [u8],
     ) -> Result<[u8; TAG_LEN], AeadError> {
-        let tag = self.0.encrypt_inout_detached(nonce.into(), aad, in_out.into());
-        tag.map(Into::into).map_err(|_| AeadError)
+        erasing_stack(|| {
+            let tag = self.0.encrypt_inout_detached(nonce.into(), aad, in_out.into());
+            tag.map(Into::into).map_err(|_| AeadError)
+        })
     }
 
     fn seal_apart(
@@ -53,8 +56,10 @@ impl Aead for RustCrypto {
         ciphertext: &mut [u8],
     ) -> Result<[u8; TAG_LEN], AeadError> {
         let buffers = InOutBuf::new(plaintext, ciphertext).map_err(|_| AeadError)?;
-        let tag = self.0.encrypt_inout_detached(nonce.into(), aad, buffers);
-        tag.map(Into::into).map_err(|_| AeadError)
+        erasing_stack(|| {
+            let tag = self.0.encrypt_inout_detached(nonce.into(), aad, buffers);
+            tag.map(Into::into).map_err(|_| AeadError)
+        })
     }
 
     fn open_in_place(
@@ -64,9 +69,11 @@ impl Aead for RustCrypto {
         in_out: &mut [u8],
         tag: &[u8; TAG_LEN],
     ) -> Result<(), AeadError> {
-        self.0
-            .decrypt_inout_detached(nonce.into(), aad, in_out.into(), tag.into())
-            .map_err(|_| AeadError)
+        erasing_stack(|| {
+            self.0
+                .decrypt_inout_detached(nonce.into(), aad, in_out.into(), tag.into())
+                .map_err(|_| AeadError)
+        })
     }
 
     fn open_apart(
@@ -78,6 +85,10 @@ impl Aead for RustCrypto {
         plaintext: &mut [u8],
     ) -> Result<(), AeadError> {
         let buffers = InOutBuf::new(ciphertext, plaintext).map_err(|_| AeadError)?;
-        self.0.decrypt_inout_detached(nonce.into(), aad, buffers, tag.into()).map_err(|_| AeadError)
+        erasing_stack(|| {
+            self.0
+                .decrypt_inout_detached(nonce.into(), aad, buffers, tag.into())
+                .map_err(|_| AeadError)
+        })
     }
 }

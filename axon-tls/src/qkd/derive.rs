@@ -36,6 +36,11 @@ impl Psk {
         self.psk.lock().unwrap_or_else(PoisonError::into_inner).take();
     }
 
+    /// Whether the secret was erased.
+    pub fn is_erased(&self) -> bool {
+        self.psk.lock().unwrap_or_else(PoisonError::into_inner).is_none()
+    }
+
     /// The only cipher this key can be used with.
     pub fn cipher(&self) -> Cipher {
         self.cipher

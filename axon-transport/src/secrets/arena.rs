@@ -1,4 +1,5 @@
-//! Keys in memory that is not swapped out, not part of a core file, and empty in a forked child.
+//! Keys in memory that is not swapped out, not part of a core file, and empty in a forked child. A child
+//! that uses a key of its parent is aborted: zeros are a key that everybody knows.
 
 // Mapped memory has no safe interface.
 #![allow(unsafe_code)]
@@ -95,19 +96,39 @@ impl LockedKey {
         unsafe { slot.copy_from_nonoverlapping(NonNull::from(key), 1) };
         Ok(Self { slot, arena })
     }
+
+    /// Whether the calling process is a fork of the one that made it, and so has no key here.
+    pub(crate) fn is_forked(&self) -> bool {
+        self.arena.is_forked()
+    }
 }
 
 impl AsRef<[u8; 32]> for LockedKey {
+    /// The key. Aborts a process that [is a fork](Self::is_forked) of the one that made it.
     fn as_ref(&self) -> &[u8; 32] {
-        // SAFETY: the slot is mapped as long as the process lives, was written by `copy_of`, and
-        // changes only in `drop`.
+        if self.is_forked() {
+            abort_forked();
+        }
+        // SAFETY: the slot is mapped as long as the process lives, and `copy_of` wrote it in this
+        // process, as was just asked. It changes in `drop` alone.
         unsafe { self.slot.as_ref() }
     }
 }
 
+/// Neither locks nor allocates: other threads of the parent may have held any lock at the fork.
+#[cold]
+fn abort_forked() -> ! {
+    const TEXT: &[u8] = b"axon: a forked process used a key of its parent, which is not there; \
+        open a session of its own in each process\n";
+    // It ends whether or not somebody reads this.
+    let _ = rustix::io::write(rustix::stdio::stderr(), TEXT);
+    std::process::abort()
+}
+
 impl Drop for LockedKey {
     fn drop(&mut self) {
-        // SAFETY: as in `as_ref`; that nobody else refers to the slot is what `&mut self` says.
+        // SAFETY: the slot is mapped as long as the process lives, in a forked child as well; that
+        // nobody else refers to it is what `&mut self` says.
         unsafe { self.slot.as_mut() }.zeroize();
         // A forked child has locked none of its parent's slots, and uses none.
         if !self.arena.is_forked() {
@@ -176,6 +197,8 @@ impl Grown {
 
 #[cfg(test)]
 mod tests {
+    use std::{io::Read, os::fd::AsRawFd};
+
     use super::*;
 
     /// The flags of the mapping with this address, as the kernel tells them.
@@ -233,6 +256,35 @@ mod tests {
         // SAFETY: waits for the child just made, and writes its status.
         assert_eq!(unsafe { libc::waitpid(child, &raw mut status, 0) }, child);
         assert_eq!(status, 0, "the child found the key");
+        assert_eq!(*key.as_ref(), [0x5a; 32]);
+    }
+
+    #[test]
+    fn a_forked_child_that_uses_its_parents_key_is_aborted_with_a_message() {
+        let key = LockedKey::copy_of(&[0x5a; 32]).unwrap();
+        let (mut said, says) = io::pipe().unwrap();
+        // SAFETY: the child makes two system calls, and then what is tested: that neither locks nor
+        // allocates. It ends without running anything of its parent's.
+        let child = unsafe { libc::fork() };
+        if child == 0 {
+            let no_core = libc::rlimit { rlim_cur: 0, rlim_max: 0 };
+            // SAFETY: reads the limit that it is given.
+            unsafe { libc::setrlimit(libc::RLIMIT_CORE, &raw const no_core) };
+            // SAFETY: both descriptors are open; the child is the only one with this standard error.
+            unsafe { libc::dup2(says.as_raw_fd(), 2) };
+            let used = std::hint::black_box(key.as_ref())[0];
+            // SAFETY: it ends the process at once.
+            unsafe { libc::_exit(i32::from(used)) };
+        }
+        drop(says);
+        let mut text = String::new();
+        said.read_to_string(&mut text).unwrap();
+        let mut status = -1;
+        // SAFETY: waits for the child just made, and writes its status.
+        assert_eq!(unsafe { libc::waitpid(child, &raw mut status, 0) }, child);
+        assert!(libc::WIFSIGNALED(status), "the child went on with a key of zeros");
+        assert_eq!(libc::WTERMSIG(status), libc::SIGABRT);
+        assert!(text.contains("forked"), "{text:?}");
         assert_eq!(*key.as_ref(), [0x5a; 32]);
     }
 

@@ -2,7 +2,11 @@
 
 mod arena;
 mod heap;
+#[cfg(test)]
+mod residue;
 
 pub(crate) use arena::{LockedKey, prepare};
 pub use heap::ErasingHeap;
 pub(crate) use heap::erase_from_now_on;
+#[cfg(test)]
+pub(crate) use residue::left_on_the_stack;

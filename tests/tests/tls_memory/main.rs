@@ -102,7 +102,7 @@ fn nothing_is_left_of(cipher: Cipher, kex: PskKex) {
     let mut examined = Examined::start(cipher, kex, &key);
     let transcript = unhex(&examined.at(child::CONNECTED));
     let schedule = Schedule::new(cipher, kex, &key, &transcript);
-    let early = examined.left(&schedule.of_the_handshake());
+    let early = examined.left(&schedule.used_up());
     examined.go_on();
     examined.at(child::DROPPED);
     let late = examined.left(&schedule.all());

@@ -64,17 +64,17 @@ impl Hash {
 /// Every secret of one connection.
 pub(crate) struct Schedule {
     hash: Hash,
-    /// Secrets that the connection has no use for once it is established.
-    handshake: Vec<(String, Vec<u8>)>,
-    /// Secrets that it uses to its end.
-    traffic: Vec<(String, Vec<u8>)>,
+    /// Secrets that an established connection has no use for.
+    used_up: Vec<(String, Vec<u8>)>,
+    /// Secrets that an established connection still uses.
+    in_use: Vec<(String, Vec<u8>)>,
 }
 
 impl Schedule {
     /// `transcript` is ClientHello to the client's Finished. With psk_dhe_ke the schedule ends where
     /// the key exchange comes in.
     pub(crate) fn new(cipher: Cipher, kex: PskKex, key: &[u8; 32], transcript: &[u8]) -> Self {
-        let mut schedule = Self { hash: Hash(cipher), handshake: vec![], traffic: vec![] };
+        let mut schedule = Self { hash: Hash(cipher), used_up: vec![], in_use: vec![] };
         let psk = schedule.pre_shared_key(key);
         let (hash, len) = (schedule.hash, schedule.hash.len());
         let zeros = vec![0; len];
@@ -108,7 +108,14 @@ impl Schedule {
             let header = hash.expand(&secret, "quic hp", b"", 32);
             schedule.later(format!("{name}'s quic hp"), header);
             for update in 0..4 {
-                schedule.later(format!("{name} traffic secret {update}"), secret.clone());
+                let traffic = format!("{name} traffic secret {update}");
+                // The keys of 0 and 1 are derived when the handshake is complete. An end that has
+                // not seen the update of the keys yet needs 2, and one that has needs 3.
+                if update < 2 {
+                    schedule.step(traffic, secret.clone());
+                } else {
+                    schedule.later(traffic, secret.clone());
+                }
                 let key = hash.expand(&secret, "quic key", b"", 32);
                 schedule.later(format!("{name}'s quic key {update}"), key);
                 secret = hash.expand(&secret, "quic ku", b"", len);
@@ -117,9 +124,9 @@ impl Schedule {
         let exporter = hash.derive(&master, "exp master", server_finished);
         let exported = hash.derive(&exporter, EXPORTER, b"");
         schedule.later("exporter secret", exporter);
-        schedule.later("secret of one exporter label", exported);
+        schedule.step("secret of one exporter label", exported);
         let resumption = hash.derive(&master, "res master", client_finished);
-        schedule.later("resumption secret", resumption);
+        schedule.step("resumption secret", resumption);
         schedule
     }
 
@@ -136,27 +143,27 @@ impl Schedule {
         let first = sha256.hmac(&prk, &[&info[..], &[1]].concat());
         let second = sha256.hmac(&prk, &[&first[..], &info, &[2]].concat());
         let psk = [first, second].concat()[..len].to_vec();
-        self.later("QKD key", key.to_vec());
-        self.later("PRK of the QKD key", prk);
+        self.step("QKD key", key.to_vec());
+        self.step("PRK of the QKD key", prk);
         self.later("pre-shared key", psk.clone());
         psk
     }
 
     fn step(&mut self, name: impl Into<String>, secret: Vec<u8>) -> Vec<u8> {
-        self.handshake.push((name.into(), secret.clone()));
+        self.used_up.push((name.into(), secret.clone()));
         secret
     }
 
     fn later(&mut self, name: impl Into<String>, secret: Vec<u8>) {
-        self.traffic.push((name.into(), secret));
+        self.in_use.push((name.into(), secret));
     }
 
-    pub(crate) fn of_the_handshake(&self) -> Vec<Secret> {
-        self.handshake.iter().map(|(name, bytes)| Secret::new(name, bytes)).collect()
+    pub(crate) fn used_up(&self) -> Vec<Secret> {
+        self.used_up.iter().map(|(name, bytes)| Secret::new(name, bytes)).collect()
     }
 
     pub(crate) fn all(&self) -> Vec<Secret> {
-        let all = self.handshake.iter().chain(&self.traffic);
+        let all = self.used_up.iter().chain(&self.in_use);
         all.map(|(name, bytes)| Secret::new(name, bytes)).collect()
     }
 }

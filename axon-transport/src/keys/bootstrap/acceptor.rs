@@ -137,6 +137,13 @@ struct Cached {
     since: Duration,
 }
 
+impl Drop for Cached {
+    /// A handshake that looked it up keeps the PSK.
+    fn drop(&mut self) {
+        self.psk.erase();
+    }
+}
+
 struct Pending {
     identity: PskIdentity,
     key_id: KeyId,

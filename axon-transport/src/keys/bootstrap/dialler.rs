@@ -122,6 +122,13 @@ struct Held {
     refused_for: Duration,
 }
 
+impl Drop for Held {
+    /// Attempts and connections keep their configuration, and with it the PSK.
+    fn drop(&mut self) {
+        self.psk.erase();
+    }
+}
+
 impl Dialler {
     /// For the host `sae_id`, which may dial `allowed`. A KME may take as long as `answer`.
     pub fn new(sae_id: &str, allowed: QkdPeers, cipher: Cipher, answer: Duration) -> Self {
@@ -166,8 +173,6 @@ impl Dialler {
         let Some(peer) = self.peers.get_mut(sae) else { return Completion::Reused };
         match &peer.state {
             State::Held(held) if held.key_id == *key_id => {
-                // The connection keeps its configuration, and with it the PSK.
-                held.psk.erase();
                 *peer = Peer::new();
                 Completion::First
             }
@@ -305,7 +310,8 @@ impl Peer {
         Self { state: State::Empty { not_before: Duration::ZERO, why: String::new() }, failures: 0 }
     }
 
-    /// A call or a key failed: whatever is held is erased, and the KME is left alone for a while.
+    /// A call or a key failed: a held PSK is erased, also for attempts under way, and the KME is left
+    /// alone for a while.
     fn failed(&mut self, now: Duration, why: String) {
         let wait = Duration::from_secs(1 << self.failures.min(6)).min(BACK_OFF_MAX);
         self.failures += 1;

@@ -19,12 +19,13 @@ use tokio::{
     sync::{Semaphore, mpsc},
     task::JoinSet,
 };
+use zeroize::Zeroizing;
 
 use super::{
     request::{Answer, Failure, FailureKind, Fetched, Purpose, Request, Stock},
     used::UsedKeys,
 };
-use crate::{config::QkdConfig, secrets};
+use crate::{config::QkdConfig, files::Demands, secrets};
 
 pub use statistics::{CallStatistics, Statistics};
 
@@ -237,9 +238,9 @@ fn client(config: &QkdConfig) -> Result<Client, KmeError> {
     let quirks = config.kme_quirks.join(",").parse::<Quirks>();
     let mut builder = Client::builder()
         .kme_url(&config.kme_url)
-        .ca(read("AXON_KME_CA", &config.kme_ca)?)
-        .sae_cert(read("AXON_SAE_CERT", &config.sae_cert)?)
-        .sae_key(zeroize::Zeroizing::new(read("AXON_SAE_KEY", &config.sae_key)?))
+        .ca(read("AXON_KME_CA", &config.kme_ca, Demands::CERTIFICATES)?.as_slice())
+        .sae_cert(read("AXON_SAE_CERT", &config.sae_cert, Demands::CERTIFICATES)?.as_slice())
+        .sae_key(read("AXON_SAE_KEY", &config.sae_key, Demands::KEY)?)
         .connect_timeout(config.kme_connect_timeout)
         .timeout(config.kme_answer_timeout)
         // The machines repeat what may be repeated, and know when.
@@ -251,13 +252,13 @@ fn client(config: &QkdConfig) -> Result<Client, KmeError> {
     builder.build().map_err(setting)
 }
 
-fn read(variable: &'static str, path: &Path) -> Result<Vec<u8>, KmeError> {
-    let path_text = || path.display().to_string();
-    std::fs::read(path).map_err(|e| KmeError::File {
-        variable,
-        path: path_text(),
-        reason: e.to_string(),
-    })
+fn read(
+    variable: &'static str,
+    path: &Path,
+    demands: Demands,
+) -> Result<Zeroizing<Vec<u8>>, KmeError> {
+    let failure = |reason| KmeError::File { variable, path: path.display().to_string(), reason };
+    demands.read(path).map_err(failure)
 }
 
 /// Names the variable behind the client's setting.

@@ -232,3 +232,38 @@ async fn keys_that_come_again_after_a_restart_are_not_given_out() {
     assert_eq!(rest.len(), 3, "one is left of those before");
     assert!(!rest.iter().any(|key_id| first.contains(key_id)));
 }
+
+/// A daemon that waits for a pipe's writer never starts; a file without end takes all memory.
+#[tokio::test]
+async fn files_that_are_no_such_files_are_refused_at_once() {
+    use std::os::unix::fs::PermissionsExt;
+
+    let network = network().await;
+    let dir = tempfile::tempdir().unwrap();
+    let config = config(&network, "sae-a", dir.path());
+    Kme::check(&config).unwrap();
+    let place = |name: &str| dir.path().join(name);
+
+    let pipe = place("pipe");
+    let mode = rustix::fs::Mode::RUSR | rustix::fs::Mode::WUSR;
+    rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, mode, 0).unwrap();
+    let large = place("large");
+    std::fs::File::create(&large).unwrap().set_len(5 << 20).unwrap();
+    std::fs::set_permissions(&large, PermissionsExt::from_mode(0o600)).unwrap();
+    let open = place("open");
+    std::fs::copy(&config.sae_key, &open).unwrap();
+    std::fs::set_permissions(&open, PermissionsExt::from_mode(0o644)).unwrap();
+
+    for (path, expected) in
+        [(&pipe, "not a regular file"), (&large, "larger than 64 KiB"), (&open, "chmod 600")]
+    {
+        let config = QkdConfig { sae_key: path.clone(), ..config.clone() };
+        let (sender, answer) = std::sync::mpsc::channel();
+        std::thread::spawn(move || sender.send(Kme::check(&config)));
+        let refused = answer.recv_timeout(LONG).expect("is refused at once").unwrap_err();
+        let KmeError::File { variable: "AXON_SAE_KEY", reason, .. } = refused else {
+            panic!("{refused}")
+        };
+        assert!(reason.contains(expected), "{reason}");
+    }
+}

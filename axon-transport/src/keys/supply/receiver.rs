@@ -2,16 +2,17 @@
 
 use std::{
     collections::{HashMap, VecDeque},
+    sync::Arc,
     time::Duration,
 };
 
 use axon_envelope::{Channel, ChannelError, Expired, KeyId, KmeKey, Opener};
 use serde::Serialize;
-use zeroize::Zeroizing;
 
 use super::{MAX_UNRETIRED, SupplyError};
 use crate::keys::{
     Exporters, KeyMessage, Violation,
+    exporters::Exporter,
     fetch::Fetches,
     proof,
     request::{Answer, Purpose, Request},
@@ -38,7 +39,7 @@ pub struct Receiver {
 
 struct Link {
     opener: Opener,
-    ready: Zeroizing<[u8; 32]>,
+    ready: Exporter,
 }
 
 #[derive(Default)]
@@ -109,7 +110,7 @@ impl Receiver {
         self.detach(now, conn);
         let channel = Channel::new(&self.peer, &self.local, exporters.envelope())?;
         let opener = Opener::new(channel)?;
-        self.links.insert(conn, Link { opener, ready: Zeroizing::new(*exporters.ready()) });
+        self.links.insert(conn, Link { opener, ready: Arc::clone(exporters.ready()) });
         Ok(())
     }
 

@@ -2,6 +2,7 @@
 
 use std::{
     collections::{HashMap, VecDeque},
+    sync::Arc,
     time::Duration,
 };
 
@@ -10,7 +11,6 @@ use axon_envelope::{
     Sealer, Slot, TAG_LEN,
 };
 use serde::Serialize;
-use zeroize::Zeroizing;
 
 use super::{
     Disagreement, MAX_UNRETIRED, SupplyError, SupplyWarning,
@@ -19,7 +19,9 @@ use super::{
     pool::{Fresh, Pool},
 };
 use crate::keys::{
-    Exporters, KeyMessage, Violation, message, proof,
+    Exporters, KeyMessage, Violation,
+    exporters::Exporter,
+    message, proof,
     request::{Answer, Request},
 };
 
@@ -48,7 +50,7 @@ pub struct Sender {
 struct Link {
     conn: u64,
     channel: Channel,
-    ready: Zeroizing<[u8; 32]>,
+    ready: Exporter,
 }
 
 struct Announced {
@@ -164,7 +166,7 @@ impl Sender {
         self.unbind(now);
         let retire = |(_, m): &(u64, KeyMessage)| matches!(m, KeyMessage::Retire { .. });
         let owed = self.outbox.drain(..).filter(retire).collect();
-        self.link = Some(Link { conn, channel, ready: Zeroizing::new(*exporters.ready()) });
+        self.link = Some(Link { conn, channel, ready: Arc::clone(exporters.ready()) });
         Ok(owed)
     }
 

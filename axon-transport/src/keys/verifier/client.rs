@@ -1,12 +1,13 @@
 //! The server's side.
 
-use std::time::Duration;
+use std::{sync::Arc, time::Duration};
 
 use axon_envelope::{KeyId, KmeKey};
-use zeroize::Zeroizing;
 
 use crate::keys::{
-    Exporters, KeyMessage, message, proof,
+    Exporters, KeyMessage,
+    exporters::Exporter,
+    message, proof,
     request::{Answer, Failure, FailureKind, Fetched, Purpose, Request},
 };
 
@@ -20,7 +21,7 @@ const PAUSE: Duration = Duration::from_millis(500);
 /// Has the client of one connection prove its name.
 pub struct ClientProof {
     client_sae: String,
-    ready: Zeroizing<[u8; 32]>,
+    ready: Exporter,
     deadline: Duration,
     tries: u32,
     step: Step,
@@ -99,7 +100,7 @@ impl ClientProof {
     pub fn new(now: Duration, client_sae: &str, exporters: &Exporters) -> Self {
         Self {
             client_sae: client_sae.to_owned(),
-            ready: Zeroizing::new(*exporters.ready()),
+            ready: Arc::clone(exporters.ready()),
             deadline: now + DEADLINE,
             tries: TRIES,
             step: Step::Ask { not_before: now },

@@ -1,11 +1,10 @@
 //! The client's side in `session`; in `messages10` the [`Receiver`](crate::keys::Receiver) answers.
 
-use std::time::Duration;
-
-use zeroize::Zeroizing;
+use std::{sync::Arc, time::Duration};
 
 use crate::keys::{
     Exporters, KeyMessage, Violation,
+    exporters::Exporter,
     fetch::Fetches,
     proof,
     request::{Answer, Purpose, Request},
@@ -13,7 +12,7 @@ use crate::keys::{
 
 /// Fetches the one key that the server announces and answers READY with its proof.
 pub struct ProofResponder {
-    ready: Zeroizing<[u8; 32]>,
+    ready: Exporter,
     fetches: Fetches,
     announced: bool,
     outbox: Option<KeyMessage>,
@@ -24,7 +23,7 @@ impl ProofResponder {
     /// Answers `server_sae` on the connection with these `exporters`.
     pub fn new(server_sae: &str, exporters: &Exporters) -> Self {
         Self {
-            ready: Zeroizing::new(*exporters.ready()),
+            ready: Arc::clone(exporters.ready()),
             fetches: Fetches::new(server_sae, Purpose::Proof),
             announced: false,
             outbox: None,

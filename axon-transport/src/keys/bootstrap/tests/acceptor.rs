@@ -204,3 +204,36 @@ async fn a_waiting_caller_is_woken_by_a_look_up() {
         .unwrap();
     assert!(matches!(waiting.await.unwrap(), Request::Dec { .. }));
 }
+
+/// Handshakes under way keep the PSK that they looked up: letting go of it erases nothing.
+#[test]
+fn an_expired_displaced_or_spent_psk_is_erased_in_handshakes_under_way() {
+    type End = fn(&Acceptor, &Clock);
+    let ends: [(&str, End); 3] = [
+        ("expired", |acceptor, clock| {
+            clock.advance(s(60));
+            acceptor.expire();
+        }),
+        ("displaced", |acceptor, clock| {
+            for number in 0..8 {
+                clock.advance(s(1));
+                let name = format!("later-{number}");
+                look_up(acceptor, "10.0.0.1", &identity("sae-a", &name));
+                acceptor.on_answer(key(acceptor.poll_request().unwrap(), &name, 1));
+            }
+        }),
+        ("spent", |acceptor, _| {
+            assert_eq!(acceptor.spent(&identity("sae-a", "k1")), Completion::First);
+        }),
+    ];
+    for (name, end) in ends {
+        let (acceptor, clock) = new(listed(&["sae-a"]));
+        let bytes = identity("sae-a", "k1");
+        look_up(&acceptor, "10.0.0.1", &bytes);
+        acceptor.on_answer(key(acceptor.poll_request().unwrap(), "k1", 9));
+        let psk = acceptor.resolver(ip("10.0.0.1")).resolve(&bytes).unwrap();
+        assert!(!psk.is_erased(), "{name}");
+        end(&acceptor, &clock);
+        assert!(psk.is_erased(), "{name}");
+    }
+}

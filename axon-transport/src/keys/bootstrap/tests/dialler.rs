@@ -177,3 +177,37 @@ fn answers_nobody_waits_for_are_dropped() {
     dialler.on_answer(s(1), key(request, "k2", 2));
     assert_eq!(attempt(&mut dialler, s(1)), Some(id("k1")));
 }
+
+/// Attempts and the connections that they lead to keep the PSK: letting go of it erases nothing.
+#[test]
+fn an_expired_refused_mismatched_or_spent_psk_is_erased_in_attempts_under_way() {
+    let psk = |dialler: &mut Dialler| match dialler.dial(s(0), "sae-b") {
+        Dial::Attempt(attempt) => attempt.psk,
+        other => panic!("{other:?}"),
+    };
+    type End = fn(&mut Dialler);
+    let ends: [(&str, End); 5] = [
+        ("expired", |dialler| {
+            dialler.dial(s(600), "sae-c");
+        }),
+        ("refused", |dialler| {
+            (0..20).for_each(|at| dialler.refused(s(at), "sae-b", &id("k1")));
+        }),
+        ("mismatched", |dialler| {
+            for _ in 0..4 {
+                dialler.mismatched(s(0), "sae-b", &id("k1"));
+            }
+        }),
+        ("spent", |dialler| {
+            assert_eq!(dialler.succeeded(s(0), "sae-b", &id("k1")), Completion::First);
+        }),
+        ("dialler dropped", |dialler| *dialler = new()),
+    ];
+    for (name, end) in ends {
+        let mut dialler = holding(s(0), "k1");
+        let psk = psk(&mut dialler);
+        assert!(!psk.is_erased(), "{name}");
+        end(&mut dialler);
+        assert!(psk.is_erased(), "{name}");
+    }
+}
