@@ -1,18 +1,20 @@
 //! `axon echo`: a line for each message of a topic.
 
 use std::{
+    collections::HashMap,
     io::{self, Write},
     time::Duration,
 };
 
 use axon_transport::{
     graph::{EndpointKind, GraphView},
+    ids::Gid,
     qos::{Qos, Reliability},
-    session::{EndpointSpec, MessageInfo, Session},
+    session::{EndpointSpec, GuardCondition, MessageInfo, Session, Subscription},
 };
 use serde_json::json;
 
-use crate::{cli, failure::Failure, logging, say::say, session, text};
+use crate::{cli, failure::Failure, interrupt, logging, say::say, session, text};
 
 /// Bytes of the payload that a line shows.
 const HEAD: usize = 16;
@@ -34,14 +36,56 @@ pub(crate) fn run(args: &cli::Echo) -> Result<(), Failure> {
     let qos = args.qos.map_or_else(|| qos_of(&session, &args.topic), cli::Profile::qos);
     let spec = EndpointSpec::new(&args.topic, &type_name, qos);
     let subscription = session.create_subscription(spec).map_err(session::failure)?;
+    let interrupt = interrupt::of(&session)?;
+    let mut numbers = Numbers::default();
+    let outcome = print(args, &session, &subscription, &interrupt, &mut numbers);
+    let missed = numbers.missing.max(subscription.lost());
+    if missed > 0 {
+        say(format_args!("axon echo: missed {} messages", text::grouped(missed)));
+    }
+    outcome
+}
 
+/// What is missing among the messages that came: lost, or passed over since more came than may wait.
+#[derive(Default)]
+struct Numbers {
+    /// The last number of each publisher.
+    last: HashMap<Gid, u64>,
+    missing: u64,
+}
+
+impl Numbers {
+    fn came(&mut self, info: &MessageInfo) {
+        let last = self.last.insert(info.publisher, info.sequence);
+        let expected = last.map_or(info.sequence, |last| last.saturating_add(1));
+        self.missing = self.missing.saturating_add(info.sequence.saturating_sub(expected));
+    }
+}
+
+/// Prints messages until there were as many as asked for, nobody reads them, or a signal comes.
+fn print(
+    args: &cli::Echo,
+    session: &Session,
+    subscription: &Subscription,
+    interrupt: &GuardCondition,
+    numbers: &mut Numbers,
+) -> Result<(), Failure> {
     let mut payload = Vec::new();
     let mut left = args.count;
     let mut out = io::stdout().lock();
     while left != Some(0) {
-        session.wait(|| subscription.has_data(), None);
-        while left != Some(0) {
+        session.wait(|| subscription.has_data() || interrupt.is_triggered(), None);
+        if interrupt.is_triggered() {
+            return match left {
+                Some(left) => Err(Failure::failed(format_args!(
+                    "interrupted: {left} messages of those asked for did not come"
+                ))),
+                None => Ok(()),
+            };
+        }
+        while left != Some(0) && !interrupt.is_triggered() {
             let Some(info) = subscription.take(&mut payload) else { break };
+            numbers.came(&info);
             let line = if args.json { as_json(&info, &payload) } else { as_text(&info, &payload) };
             match writeln!(out, "{line}").and_then(|()| out.flush()) {
                 Ok(()) => {}
@@ -51,10 +95,6 @@ pub(crate) fn run(args: &cli::Echo) -> Result<(), Failure> {
             }
             left = left.map(|left| left - 1);
         }
-    }
-    let lost = subscription.lost();
-    if lost > 0 {
-        say(format_args!("axon echo: missed {} messages", text::grouped(lost)));
     }
     Ok(())
 }

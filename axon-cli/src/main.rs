@@ -11,6 +11,7 @@ mod daemon;
 mod demo;
 mod echo;
 mod failure;
+mod interrupt;
 mod log;
 mod logging;
 mod play;

@@ -5,7 +5,7 @@
 mod common;
 
 use common::{Echoes, Host, LOG, Running, eventually};
-use rustix::process::Signal;
+use rustix::process::{Pid, Signal, kill_process};
 
 #[test]
 fn status_without_a_daemon_says_so_and_starts_none() {
@@ -59,6 +59,36 @@ fn echo_finds_the_type_and_shows_the_message() {
     assert!(line.contains(" B  00 01 00 00"), "no CDR header in {line:?}");
     assert!(lines.next().is_none());
     assert!(echo.finish().status.success());
+}
+
+/// More messages come than may wait while nobody reads what `axon echo` prints.
+#[test]
+fn echo_says_what_it_missed_whether_interrupted_or_no_longer_read() {
+    for interrupted in [true, false] {
+        let host = Host::new();
+        let mut echo = Running::start(host.axon(&["echo", "/tf"]));
+        let pid = Pid::from_child(&echo.0);
+        let mut lines = echo.lines();
+        let _play = Running::start(host.axon(&["play", LOG, "--rate", "200", "--loop"]));
+        lines.next().expect("a line");
+        kill_process(pid, Signal::STOP).expect("it runs");
+        let before = host.published();
+        eventually("more than may wait", || host.published() > before + 6_000);
+        if interrupted {
+            kill_process(pid, Signal::CONT).expect("it runs");
+            // More than the pipe can hold of what was printed before the stop.
+            assert_eq!(lines.by_ref().take(2_000).count(), 2_000);
+            kill_process(pid, Signal::INT).expect("it runs");
+            lines.for_each(drop);
+        } else {
+            drop(lines);
+            kill_process(pid, Signal::CONT).expect("it runs");
+        }
+        let output = echo.finish();
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(said.contains("axon echo: missed "), "interrupted {interrupted}: {said}");
+        assert!(output.status.success(), "{said}");
+    }
 }
 
 #[test]
