@@ -2,12 +2,17 @@
 
 use std::{
     fs::{self, File, OpenOptions},
-    os::fd::OwnedFd,
+    os::{fd::OwnedFd, unix::fs::PermissionsExt as _},
     process::{Command, Stdio},
+    time::Instant,
 };
 
+use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with};
+
 use super::*;
-use crate::support::Kept;
+use crate::{skip::skip, support::Kept};
+
+const NOBODY: libc::uid_t = 65534;
 
 /// A daemon in the foreground, given this standard error, that logs all that it does.
 fn foreground(host: &Host, mut command: Command, stderr: impl Into<Stdio>) -> Kept {
@@ -92,7 +97,7 @@ fn a_daemon_in_the_background_begins_a_new_log_file_at_8_mib() {
     let run = host.dir.path().join("run");
     let [log, before] = ["axon-0.log", "axon-0.log.1"].map(|name| run.join(name));
     fs::create_dir(&run).unwrap();
-    fs::set_permissions(&run, std::os::unix::fs::PermissionsExt::from_mode(0o700)).unwrap();
+    fs::set_permissions(&run, fs::Permissions::from_mode(0o700)).unwrap();
     fs::write(&log, vec![b'\n'; 8 << 20]).unwrap();
     fs::write(&before, "two files before").unwrap();
     let mut player = host.play("idle");
@@ -132,5 +137,59 @@ fn a_flood_of_one_kind_leaves_few_lines_and_a_count() {
         text.lines().filter(|line| line.contains("PROTOCOL") || line.contains("protocol"));
     assert!((1..FLOOD / 4).contains(&refused.count()), "{text}");
     assert!(text.chars().all(|c| c == '\n' || axon_transport::text::is_plain(c)), "{text:?}");
+    assert_it_goes_on(&host, daemon);
+}
+
+#[test]
+fn another_user_who_connects_without_end_leaves_few_lines() {
+    const CONNECTIONS: u64 = 3_000;
+    const CAUSE: &str = "a stranger's connection was closed";
+    if !rustix::process::geteuid().is_root() {
+        return skip("only root can be two users");
+    }
+    let host = Host::new().with("AXON_LOG", "warn");
+    let log = host.dir.path().join("stderr");
+    let daemon = foreground(&host, program(&host), File::create(&log).unwrap());
+    // The daemon ends some time after its last session.
+    let session = host.session("stays").unwrap();
+    // Nobody keeps the other user out but the daemon.
+    let run = host.dir.path().join("run");
+    let socket = run.join("axon-0.sock");
+    for path in [host.dir.path(), &run, &socket] {
+        fs::set_permissions(path, fs::Permissions::from_mode(0o777)).unwrap();
+    }
+    let address = SocketAddrUnix::new(&socket).unwrap();
+    let begin = Instant::now();
+    let flood = std::thread::spawn(move || {
+        // SAFETY: has no effect on memory. The system call itself changes the thread that calls it, and not
+        // the process, as the function of the C library would; the thread ends as the other user.
+        let changed = unsafe { libc::syscall(libc::SYS_setresuid, NOBODY, NOBODY, NOBODY) };
+        assert_eq!(changed, 0);
+        for _ in 0..CONNECTIONS {
+            let (unix, packets) = (AddressFamily::UNIX, SocketType::SEQPACKET);
+            let stranger = socket_with(unix, packets, SocketFlags::CLOEXEC, None).unwrap();
+            connect(&stranger, &address).unwrap();
+            // Until it is put out.
+            while let Ok(_) | Err(socket::SocketError::NotReady) =
+                socket::receive(&stranger, &mut Vec::new())
+            {
+                std::thread::yield_now();
+            }
+        }
+    });
+    flood.join().unwrap();
+    drop(session);
+    let text = fs::read_to_string(&log).unwrap();
+    let took = begin.elapsed();
+    let lines = text.lines().filter(|line| line.contains(CAUSE)).count() as u64;
+    eprintln!(
+        "{CONNECTIONS} connections of another user in {took:?}: {lines} lines, {:.0} bytes a second",
+        text.len() as f64 / took.as_secs_f64()
+    );
+    // Ten at once, and then one a second.
+    assert!((1..=10 + took.as_secs() + 1).contains(&lines), "{lines} lines in {took:?}:\n{text}");
+    assert!(lines < CONNECTIONS / 10, "{lines}");
+    let others = text.lines().filter(|line| line.contains("WARN") && !line.contains(CAUSE)).count();
+    assert!(others <= 2, "and of hardly any other cause:\n{text}");
     assert_it_goes_on(&host, daemon);
 }

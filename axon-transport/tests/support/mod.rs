@@ -159,6 +159,15 @@ impl Player {
         self.finish();
     }
 
+    /// As [`finish`](Self::finish); all that it still writes.
+    #[allow(dead_code, reason = "not every test needs it")]
+    pub(crate) fn finish_and_tell(mut self) -> Vec<String> {
+        drop(self.child.0.stdin.take());
+        let said = self.lines.by_ref().map(Result::unwrap).collect();
+        self.finish();
+        said
+    }
+
     pub(crate) fn pid(&self) -> u32 {
         self.child.0.id()
     }

@@ -1,4 +1,4 @@
-//! Beacons that somebody else forges, while two real daemons look for each other.
+//! Beacons and goodbyes that somebody else forges, while two real daemons look for each other.
 
 use std::{
     net::{Ipv4Addr, SocketAddr, UdpSocket},
@@ -20,7 +20,7 @@ use axon_transport::{
 };
 
 use super::{
-    mode::{classic, pinned},
+    mode::{Settings, classic, pinned},
     pair::{Host, Plan},
     process::until,
 };
@@ -28,25 +28,67 @@ use super::{
 /// Forged addresses.
 const SOURCES: u8 = 200;
 
-/// Sends beacons to both hosts until it is dropped.
+/// Sends datagrams to both hosts until it is dropped.
 struct Forger {
     over: Arc<AtomicBool>,
     sent: Arc<AtomicU64>,
     thread: Option<thread::JoinHandle<()>>,
 }
 
-/// In whose names beacons are forged: of daemons that there are not, or of this one.
+/// The daemon in whose name something is forged, once it is known.
 type Name = Arc<Mutex<Option<DaemonId>>>;
 
+/// What is forged, with `AXON_CLASSIC_AUTH` as beacons have it.
+#[derive(Clone)]
+enum Forged {
+    /// Beacons of daemons that there are not.
+    MadeUp(u8),
+    /// Beacons of a real daemon, from addresses where it is not.
+    Beacons(u8, Name),
+    /// Goodbyes of a real daemon, from its address, that of host B.
+    Goodbyes(Name),
+}
+
+impl Forged {
+    /// The datagram of this number, as one that comes from `address` has it.
+    fn datagram(&self, domain: u32, number: u64, address: SocketAddr) -> Option<Datagram> {
+        let mut id = [if number.is_multiple_of(2) { 0x11 } else { 0xee }; 16];
+        id[1..9].copy_from_slice(&number.to_be_bytes());
+        let (auth, daemon) = match self {
+            Self::MadeUp(auth) => (*auth, DaemonId(id)),
+            Self::Beacons(auth, name) => (*auth, (*name.lock().unwrap())?),
+            Self::Goodbyes(name) => {
+                let daemon = (*name.lock().unwrap())?;
+                return Some(Datagram::Goodbye { domain, daemon });
+            }
+        };
+        Some(Datagram::Beacon(Beacon {
+            protocols: (1, 1),
+            domain,
+            daemon,
+            terms: Terms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(auth) },
+            sae: None,
+            port: address.port(),
+            addresses: vec![address.ip()],
+            graph: number,
+            answer_wanted: true,
+            localhost: false,
+        }))
+    }
+}
+
 impl Forger {
-    fn new(hosts: &[Host; 2], auth: u8, a_second: u32, name: Name) -> Self {
+    fn new(hosts: &[Host; 2], forged: Forged, a_second: u32) -> Self {
         let [a, b, c, _] = hosts[0].address.octets();
         let own = hosts.each_ref().map(|host| host.address);
-        let sources: Vec<_> = (0..SOURCES)
-            .map(|last| Ipv4Addr::new(a, b, c, last))
-            .filter(|address| !own.contains(address))
-            .map(|address| UdpSocket::bind((address, 0)).unwrap())
-            .collect();
+        let elsewhere = (0..SOURCES).map(|last| Ipv4Addr::new(a, b, c, last));
+        let elsewhere = elsewhere.filter(|address| !own.contains(address));
+        let addresses: Vec<_> = match forged {
+            Forged::Goodbyes(_) => vec![own[1]],
+            Forged::MadeUp(_) | Forged::Beacons(..) => elsewhere.collect(),
+        };
+        let bind = |address: &Ipv4Addr| UdpSocket::bind((*address, 0)).unwrap();
+        let sources: Vec<_> = addresses.iter().map(bind).collect();
         let domain = hosts[0].domain();
         let port = 61_300 + 16 * domain as u16;
         let targets = own.map(|address| SocketAddr::from((address, port)));
@@ -59,23 +101,11 @@ impl Forger {
                 let number = count.fetch_add(1, Ordering::Relaxed);
                 let source = &sources[number as usize % sources.len()];
                 let address = source.local_addr().unwrap();
-                let mut id = [if number.is_multiple_of(2) { 0x11 } else { 0xee }; 16];
-                id[1..9].copy_from_slice(&number.to_be_bytes());
-                let datagram = Datagram::Beacon(Beacon {
-                    protocols: (1, 1),
-                    domain,
-                    daemon: name.lock().unwrap().unwrap_or(DaemonId(id)),
-                    terms: Terms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(auth) },
-                    sae: None,
-                    port: address.port(),
-                    addresses: vec![address.ip()],
-                    graph: number,
-                    answer_wanted: true,
-                    localhost: false,
-                });
-                for target in targets {
-                    // An error: nobody is there yet.
-                    let _ = source.send_to(&datagram.encode(), target);
+                if let Some(datagram) = forged.datagram(domain, number, address) {
+                    for target in targets {
+                        // An error: nobody is there yet.
+                        let _ = source.send_to(&datagram.encode(), target);
+                    }
                 }
                 let due = Duration::from_secs(number + 1) / a_second;
                 thread::sleep(due.saturating_sub(begin.elapsed()));
@@ -84,8 +114,10 @@ impl Forger {
         Self { over, sent, thread: Some(thread) }
     }
 
-    fn wait_for(&self, beacons: u64) {
-        until("the forger works", || self.sent.load(Ordering::Relaxed) >= beacons);
+    fn wait_for(&self, datagrams: u64) {
+        let sent = self.sent.load(Ordering::Relaxed);
+        let so_many = || self.sent.load(Ordering::Relaxed) >= sent + datagrams;
+        until("the forger works", so_many);
     }
 }
 
@@ -110,8 +142,9 @@ fn id_of(host: &Host) -> DaemonId {
     DaemonId(std::array::from_fn(byte))
 }
 
-/// Starts both hosts, then the first one anew; each time they link, while the forger goes on.
-fn link(what: &str, hosts: &mut [Host; 2], name: &Name) {
+/// Starts both hosts, then the first one anew. Each time they link before the forger, which goes on from now on
+/// in the second one's name, has sent so many more datagrams.
+fn link(what: &str, hosts: &mut [Host; 2], name: &Name, most: u64, sent: impl Fn() -> u64) {
     for again in [false, true] {
         if again {
             hosts[0].daemon = None;
@@ -120,35 +153,56 @@ fn link(what: &str, hosts: &mut [Host; 2], name: &Name) {
         } else {
             hosts.iter_mut().for_each(Host::start);
         }
-        let begin = Instant::now();
-        if let Some(name) = &mut *name.lock().unwrap() {
-            *name = id_of(&hosts[1]);
-        }
+        let (begin, before) = (Instant::now(), sent());
+        *name.lock().unwrap() = Some(id_of(&hosts[1]));
         until("they are linked", || linked(hosts));
+        let (took, sent) = (begin.elapsed(), sent() - before);
         let how = if again { "once one started anew" } else { "from the start" };
-        eprintln!("{what}: linked {:?} after both stood, {how}", begin.elapsed());
+        eprintln!("{what}: linked {took:?} after both stood, {how}");
+        assert!(sent < most, "{what}: linked after {sent} more datagrams, {how}");
     }
+}
+
+/// Links hosts, with the settings that `plan` gives them, while each of all that may be forged is forged.
+fn link_through_forged(plan: impl Fn([Settings; 2]) -> Plan) {
+    let dir = tempfile::tempdir().unwrap();
+    let none = || [classic(&[]), classic(&[])];
+    let pins = || pinned(dir.path(), [[true; 2]; 2]);
+    let name = Name::default;
+    for (what, settings, a_second, forged) in [
+        ("300 a second of made-up daemons, none", none(), 300, Forged::MadeUp(0)),
+        ("300 a second of made-up daemons, pinned", pins(), 300, Forged::MadeUp(1)),
+        ("20 a second in a host's name, none", none(), 20, Forged::Beacons(0, name())),
+        ("20 a second in a host's name, pinned", pins(), 20, Forged::Beacons(1, name())),
+        ("20 goodbyes a second from its address, none", none(), 20, Forged::Goodbyes(name())),
+    ] {
+        let mut hosts = plan(settings).prepare();
+        let forger = Forger::new(&hosts, forged.clone(), a_second);
+        forger.wait_for(u64::from(a_second));
+        let name = match &forged {
+            Forged::MadeUp(_) => Name::default(),
+            Forged::Beacons(_, name) | Forged::Goodbyes(name) => Arc::clone(name),
+        };
+        // As many as come in three seconds.
+        let sent = || forger.sent.load(Ordering::Relaxed);
+        link(what, &mut hosts, &name, 3 * u64::from(a_second), sent);
+        // What is forged takes nothing from a link that stands.
+        forger.wait_for(u64::from(a_second));
+        let since = hosts[0].link().since_unix_ms;
+        forger.wait_for(u64::from(a_second));
+        assert_eq!(hosts[0].link().since_unix_ms, since, "{what}");
+        drop(forger);
+    }
+    let mut hosts = plan(none()).prepare();
+    link("nothing forged", &mut hosts, &Name::default(), 1, || 0);
 }
 
 #[test]
 fn hosts_that_list_each_other_link_through_forged_beacons() {
-    let of_all = || Name::default();
-    let of_one = || Name::new(Mutex::new(Some(DaemonId([0x5a; 16]))));
-    let dir = tempfile::tempdir().unwrap();
-    let none = || [classic(&[]), classic(&[])];
-    let pins = || pinned(dir.path(), [[true; 2]; 2]);
-    for (what, settings, auth, a_second, name) in [
-        ("300 a second of made-up daemons, none", none(), 0, 300, of_all()),
-        ("300 a second of made-up daemons, pinned", pins(), 1, 300, of_all()),
-        ("20 a second in a host's name, none", none(), 0, 20, of_one()),
-        ("20 a second in a host's name, pinned", pins(), 1, 20, of_one()),
-    ] {
-        let mut hosts = Plan::new(settings).prepare();
-        let forger = Forger::new(&hosts, auth, a_second, Arc::clone(&name));
-        forger.wait_for(u64::from(a_second));
-        link(what, &mut hosts, &name);
-        drop(forger);
-    }
-    let mut hosts = Plan::new(none()).prepare();
-    link("nothing forged", &mut hosts, &of_all());
+    link_through_forged(Plan::new);
+}
+
+#[test]
+fn hosts_that_nobody_lists_link_through_forged_beacons() {
+    link_through_forged(|settings| Plan { listed: false, ..Plan::new(settings) });
 }

@@ -2,9 +2,12 @@
 
 use std::{
     fs,
+    sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed},
+    thread,
     time::{Duration, Instant},
 };
 
+use axon_tests::Sizes;
 use axon_tls::identity::{Auth, KeyAlgorithm, SigningKey, Trust, TrustFile};
 use axon_transport::{
     graph::{Endpoint, EndpointKind},
@@ -18,7 +21,7 @@ use axon_transport::{
 use super::{
     mode::pinned,
     pair::{Host, Plan},
-    process::{PATIENCE, until},
+    process::{Node, PATIENCE, until},
     stranger::{Claim, Met, Stranger},
 };
 
@@ -140,10 +143,41 @@ fn short(session: SessionId, number: u32, topic: &str) -> Endpoint {
     }
 }
 
+/// While a graph is loaded host A's daemon tells its status, and a stream of host B goes on: for each part of
+/// the graph there is a sample at least.
+fn serves_others(camera: &Camera, there: &mut Node, load: impl FnOnce()) {
+    let over = AtomicBool::new(false);
+    let (mut answers, mut longest) = (0, Duration::ZERO);
+    let before = there.tally().taken;
+    thread::scope(|scope| {
+        let (camera, over, answers, longest) = (&camera, &over, &mut answers, &mut longest);
+        scope.spawn(move || {
+            // Relaxed: nothing else is told by it.
+            while !over.load(Relaxed) {
+                let begin = Instant::now();
+                let status = camera.a.try_status();
+                // One that comes after the end says nothing.
+                if status.is_some() && !over.load(Relaxed) {
+                    (*answers, *longest) = (*answers + 1, (*longest).max(begin.elapsed()));
+                }
+            }
+        });
+        load();
+        over.store(true, Relaxed);
+    });
+    let samples = there.tally().taken - before;
+    eprintln!("{samples} samples and {answers} answers while it was taken, within {longest:?}");
+    assert!(answers >= 1, "{answers} answers");
+    assert!(samples >= u64::from(MANY.div_ceil(PART)), "{samples} samples");
+}
+
 #[test]
 fn a_graph_has_a_bound_for_all_daemon_ids_of_a_peer_and_the_rest_of_the_link_goes_on() {
     let camera = Camera::new();
     let witness = camera.a.session("witness");
+    let mut there = camera.a.subscribe(Sizes::Small);
+    let publisher = camera.b.publish(Sizes::Small, 1, None);
+    there.wait_taken(1);
     let seen = || witness.graph().endpoints.values().filter(|e| e.daemon.is_some()).count();
     let before = camera.memory("VmRSS");
     let (ids, mut links) = ([0xff, 0xfe], [camera.link(0xff), camera.link(0xfe)]);
@@ -151,9 +185,12 @@ fn a_graph_has_a_bound_for_all_daemon_ids_of_a_peer_and_the_rest_of_the_link_goe
     let sessions = [keys[0].id(), keys[1].id()];
     for (at, (link, session)) in links.iter_mut().zip(sessions).enumerate() {
         camera.stranger.prove(link, DaemonId([ids[at]; 16]), &[&keys[at]]);
-        camera.announce(link, session, MANY);
-        camera.heard(link, 1);
+        serves_others(&camera, &mut there, || {
+            camera.announce(link, session, MANY);
+            camera.heard(link, 1);
+        });
     }
+    drop(publisher);
     until("endpoints are shown up to the bound", || (seen() + 1000) * NAMES > BOUND / 2);
     camera.a.wait_refusal("what is left out, by name and why", |text| {
         ["camera", "graph", "/topic_", "more than 16 MiB"].iter().all(|part| text.contains(part))
@@ -193,40 +230,80 @@ fn a_graph_has_a_bound_for_all_daemon_ids_of_a_peer_and_the_rest_of_the_link_goe
 
 #[test]
 fn a_flood_of_changes_holds_up_nobody_and_ends_in_the_newest_state() {
-    const CHANGES: u64 = 40_000;
+    /// The flood is under way once so many are said: more than is on its way at a time.
+    const BEFORE: u64 = 30_000;
+    /// Others match before the flooder has said so many more.
+    const MEANWHILE: u64 = 60_000;
     let camera = Camera::new();
     let reader = camera.a.session("reader");
     let mut link = camera.link(0xff);
     let key = SessionKey::generate().unwrap();
     let session = key.id();
     camera.stranger.prove(&mut link, DaemonId([0xff; 16]), &[&key]);
-    let topic = |version: u64| format!("/changed_{version}");
+    // Every second time it is what somebody reads, so that the daemon has much to do about it.
+    let topic = |version: u64| match version % 2 {
+        0 => "/read".to_owned(),
+        _ => format!("/changed_{version}"),
+    };
+    let spec = EndpointSpec::new("/read", "t", Qos::default());
+    let _reads = reader.create_subscription(spec).unwrap();
     let (start, from) = (Instant::now(), camera.cpu());
-    for version in 1..=CHANGES {
-        let before = version - 1;
-        let added = vec![short(session, 1, &topic(version))];
-        let graph = Graph { version, before, added, ..Graph::default() };
-        camera.stranger.say(&mut link, &Message::Graph(graph));
-    }
-    let said = start.elapsed();
-    // While it is being taken.
-    let spec = || EndpointSpec::new("/new", "test/Text", Qos::default());
-    let subscription = reader.create_subscription(spec()).unwrap();
-    let writer = camera.b.session("writer");
-    let publisher = writer.create_publisher(spec()).unwrap();
-    assert!(publisher.wait_matched(1, PATIENCE) && subscription.wait_matched(1, PATIENCE));
-    let matched = start.elapsed() - said;
+    // Relaxed: nothing else is told by them.
+    let (said, enough) = (AtomicU64::new(0), AtomicBool::new(false));
+    let all = thread::scope(|scope| {
+        let (camera, link, said, enough) = (&camera, &mut link, &said, &enough);
+        let flood = scope.spawn(move || {
+            let mut version = 0;
+            while version % 2 == 1 || !enough.load(Relaxed) && version < BEFORE + MEANWHILE {
+                version += 1;
+                let before = version - 1;
+                let added = vec![short(session, 1, &topic(version))];
+                let graph = Graph { version, before, added, ..Graph::default() };
+                camera.stranger.say(link, &Message::Graph(graph));
+                said.store(version, Relaxed);
+            }
+            // The newest is like no other.
+            version += 1;
+            let (before, added) = (version - 1, vec![short(session, 1, &topic(version))]);
+            let graph = Graph { version, before, added, ..Graph::default() };
+            camera.stranger.say(link, &Message::Graph(graph));
+            version
+        });
+        until("it is under way", || said.load(Relaxed) >= BEFORE || flood.is_finished());
+        let spec = || EndpointSpec::new("/new", "test/Text", Qos::default());
+        let begin = Instant::now();
+        let subscription = reader.create_subscription(spec()).unwrap();
+        let writer = camera.b.session("writer");
+        let publisher = writer.create_publisher(spec()).unwrap();
+        assert!(publisher.wait_matched(1, PATIENCE) && subscription.wait_matched(1, PATIENCE));
+        let (matched, meanwhile) = (begin.elapsed(), said.load(Relaxed) - BEFORE);
+        enough.store(true, Relaxed);
+        eprintln!("a topic of others matched after {matched:?} and {meanwhile} more changes");
+        let all = flood.join().unwrap();
+        assert!(all < BEFORE + MEANWHILE, "{all} changes were taken before others matched");
+        all
+    });
     let gid = Gid::new(session, 1);
     until("the newest state is shown", || {
         let graph = reader.graph();
-        graph.endpoints.get(&gid).is_some_and(|entry| entry.endpoint.topic == topic(CHANGES))
+        graph.endpoints.get(&gid).is_some_and(|entry| entry.endpoint.topic == topic(all))
     });
-    let (all, version) = (start.elapsed(), reader.graph().version);
+    let (taken, version) = (start.elapsed(), reader.graph().version);
     eprintln!(
-        "{CHANGES} changes said in {said:?}, taken in {all:?} with {:?} of the daemon's time and \
-         {version} changes told; a topic of others matched after {matched:?}",
+        "{all} changes taken in {taken:?} with {:?} of the daemon's time and {version} changes told",
         camera.cpu() - from
     );
+    // What changed meanwhile was taken together: the daemon asked for few of the times that it was there.
+    camera.stranger.say(&mut link, &subscribe(1, "/asked".into(), Vec::new()));
+    let asked = AtomicU64::new(0);
+    let last = camera.stranger.hear(&mut link, |message| {
+        asked.fetch_add(u64::from(matches!(message, Message::Subscribe(_))), Relaxed);
+        matches!(message, Message::RouteReady(_))
+    });
+    last.expect("an answer");
+    let asked = asked.into_inner();
+    eprintln!("asked for {asked} times");
+    assert!((1..all / 200).contains(&asked), "{asked} of {all}");
     assert_eq!(link.connection.close_reason(), None);
 }
 

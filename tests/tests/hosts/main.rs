@@ -8,6 +8,7 @@ mod disagree;
 mod election;
 mod ending;
 mod events;
+mod flooded;
 mod forged;
 mod graph;
 mod greedy;

@@ -91,6 +91,16 @@ impl Kmes {
         self.network.kmes().iter().map(|kme| calls(kme.counters())).sum()
     }
 
+    /// Calls of this method that the KME of host 0 or 1 had.
+    pub(crate) fn calls_of(&self, host: usize, method: sim::Method) -> u64 {
+        let counters = self.network.kmes()[host].counters();
+        match method {
+            sim::Method::Status => counters.status_calls,
+            sim::Method::EncKeys => counters.enc_keys_calls,
+            sim::Method::DecKeys => counters.dec_keys_calls,
+        }
+    }
+
     /// Keys that SAEs got by asking for new ones, and by key_ID.
     pub(crate) fn keys(&self) -> (u64, u64) {
         let counters = self.network.kmes().iter().map(|kme| kme.counters());

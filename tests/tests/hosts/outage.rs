@@ -1,5 +1,10 @@
 //! KMEs that fail for a while, and what log and status say of it.
 
+use std::{
+    thread::sleep,
+    time::{Duration, Instant},
+};
+
 use axon_tests::Sizes;
 use etsi_qkd014::sim::{Fault, FaultPlan, Method};
 
@@ -87,7 +92,7 @@ fn holds_up_no_other(failing: usize, call: Method, name: &str) {
     let keys = || [kmes.keys().0, kmes.keys().1][failing];
     kmes.plan(failing, FaultPlan::new(Fault::Silence).on(call).times(1));
     let (calls, before, taken) = (kmes.calls(), keys(), there.tally().taken);
-    let begin = std::time::Instant::now();
+    let begin = Instant::now();
     until("other calls are answered", || kmes.calls() >= calls + 10 && keys() >= before + 50);
     there.wait_taken(taken + 1);
     let url = kmes.url(failing);
@@ -111,4 +116,59 @@ fn a_call_for_new_keys_that_hangs_holds_up_no_other() {
 #[test]
 fn a_call_for_keys_by_name_that_hangs_holds_up_no_other() {
     holds_up_no_other(1, Method::DecKeys, "dec_keys");
+}
+
+/// No call to the KME of host `failing` is answered within five seconds. Messages go on afterwards.
+fn hangs_as_a_whole(failing: usize, call: Method, name: &str) {
+    const HANGS: Duration = Duration::from_secs(5);
+    let kmes = Kmes::start();
+    let hosts = hosts(&kmes, "messages10");
+    let mut there = hosts[1].subscribe(Sizes::Small);
+    let mut publisher = hosts[0].publish(Sizes::Small, 1, None);
+    there.wait_taken(SOME);
+    let url = kmes.url(failing);
+    let said = ["WARN", url.as_str(), name, "AXON_KME_ANSWER_TIMEOUT"];
+    let before = kmes.calls_of(failing, call);
+    let begin = Instant::now();
+    kmes.plan(failing, FaultPlan::new(Fault::Latency(HANGS)));
+    let mut given_up = 0;
+    until("a second call", || {
+        given_up = hosts[failing].log_lines(&said);
+        kmes.calls_of(failing, call) >= before + 2
+    });
+    assert_eq!(given_up, 0, "the second call does not wait for the first one's end");
+    let (mut latest, mut at, mut longest) = (there.tally().taken, begin, Duration::ZERO);
+    let mut watch = |taken: u64| {
+        if taken > latest {
+            latest = taken;
+            longest = longest.max(at.elapsed());
+            at = Instant::now();
+        }
+    };
+    while begin.elapsed() < HANGS {
+        watch(there.tally().taken);
+        sleep(Duration::from_millis(10));
+    }
+    kmes.clear_faults();
+    let after = publisher.published() + SOME;
+    until("messages go on", || {
+        let tally = there.tally();
+        watch(tally.taken);
+        tally.last >= after
+    });
+    eprintln!("{name} and all else hang for {HANGS:?}: longest pause of the messages {longest:?}");
+    let sent = publisher.stop();
+    there.wait_taken(sent);
+    let tally = there.tally();
+    assert_eq!((tally.taken, tally.lost), (sent, 0));
+}
+
+#[test]
+fn a_kme_that_hangs_for_five_seconds_loses_nothing_where_new_keys_come_from() {
+    hangs_as_a_whole(0, Method::EncKeys, "enc_keys");
+}
+
+#[test]
+fn a_kme_that_hangs_for_five_seconds_loses_nothing_where_keys_come_by_name() {
+    hangs_as_a_whole(1, Method::DecKeys, "dec_keys");
 }

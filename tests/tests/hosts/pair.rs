@@ -40,11 +40,20 @@ pub(crate) struct Plan {
     pub(crate) other_domain: bool,
     /// Whether only what lies between them leads from one to the other: [`Host::wire`].
     pub(crate) wired: bool,
+    /// Whether they list each other; if not, multicast on the loopback has to do.
+    pub(crate) listed: bool,
 }
 
 impl Plan {
     pub(crate) fn new(settings: [Settings; 2]) -> Self {
-        Self { settings, grace_s: 300, stalled_s: 300, other_domain: false, wired: false }
+        Self {
+            settings,
+            grace_s: 300,
+            stalled_s: 300,
+            other_domain: false,
+            wired: false,
+            listed: true,
+        }
     }
 
     /// Starts both hosts.
@@ -65,7 +74,8 @@ impl Plan {
         let [addresses, ends] =
             [[1, 2], [4, 3]].map(|of| of.map(|host| Ipv4Addr::new(127, net[0], net[1], host)));
         [0, 1].map(|host| {
-            let peers = if self.wired { String::new() } else { addresses[1 - host].to_string() };
+            let lists = self.listed && !self.wired;
+            let peers = if lists { addresses[1 - host].to_string() } else { String::new() };
             let mut more = vec![
                 ("AXON_BIND_ADDRS", addresses[host].to_string()),
                 ("AXON_DAEMON_PEERS", peers),
@@ -153,6 +163,12 @@ impl Host {
         self.dir.path().join("host.txt")
     }
 
+    /// Gives a variable another value for the processes that are started from now on.
+    pub(crate) fn set(&mut self, name: &str, value: &str) {
+        self.env.retain(|(n, _)| n != name);
+        self.env.push((name.to_owned(), value.to_owned()));
+    }
+
     pub(crate) fn domain(&self) -> u32 {
         self.variable("ROS_DOMAIN_ID").parse().unwrap()
     }
@@ -211,6 +227,11 @@ impl Host {
             let log = self.all_logs();
             log.lines().any(|line| parts.iter().all(|part| line.contains(part)))
         });
+    }
+
+    /// Bytes of its daemon's log.
+    pub(crate) fn log_bytes(&self) -> usize {
+        self.all_logs().len()
     }
 
     /// Lines of its daemon's log that have all of this.

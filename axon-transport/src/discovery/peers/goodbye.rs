@@ -59,6 +59,43 @@ fn a_peer_that_answers_after_a_goodbye_in_its_name_stays() {
     assert_eq!(dials(&mut peers), [HIGHER], "and it alone");
 }
 
+/// Two addresses claim a daemon's id, neither of which could be dialled; then the first says goodbye.
+fn contested(now: f64) -> Peers {
+    let mut peers = settled(local());
+    hear(&mut peers, now, beacon(HIGHER));
+    let elsewhere = Datagram::Beacon(beacon(HIGHER)).encode();
+    peers.datagram(secs(now), from("10.0.0.66:4000"), Arrival::Shared, &elsewhere);
+    fail(&mut peers, secs(now + 0.2), HIGHER);
+    actions(&mut peers);
+    let goodbye = Datagram::Goodbye { domain: 0, daemon: HIGHER }.encode();
+    peers.datagram(secs(now + 0.5), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
+    peers
+}
+
+#[test]
+fn an_address_of_several_is_asked_before_a_goodbye_from_there_counts() {
+    let address = from("10.0.0.2:61301");
+    let mut peers = contested(3.0);
+    let probes = probes(&mut peers);
+    let [(to, nonce)] = probes[..] else { panic!("{probes:?}") };
+    assert_eq!(to, address);
+    let echo = Datagram::Echo { daemon: HIGHER, nonce }.encode();
+    peers.datagram(secs(3.6), address, Arrival::Quic, &echo);
+    peers.advance(secs(8.0));
+    let record = &peers.records[&HIGHER];
+    assert_eq!((record.sources[0].address, record.standing()), (address, Standing::Answered));
+}
+
+#[test]
+fn an_address_of_several_that_does_not_answer_after_a_goodbye_is_forgotten_alone() {
+    let mut peers = contested(3.0);
+    peers.advance(secs(6.4));
+    assert_eq!(peers.records[&HIGHER].sources.len(), 2, "an answer may still come");
+    peers.advance(secs(6.6));
+    let left: Vec<_> = peers.records[&HIGHER].sources.iter().map(|s| s.address).collect();
+    assert_eq!(left, [from("10.0.0.66:61301")]);
+}
+
 /// The probes that are to be sent, with their nonces; nothing else is.
 fn probes(peers: &mut Peers) -> Vec<(SocketAddr, [u8; 8])> {
     let sent = actions(peers).into_iter().map(|action| match action {

@@ -3,21 +3,27 @@
 //! A beacon's source address can be forged, an answer from there cannot be had. A probe costs one
 //! short datagram, a dial to an address where nobody is costs one of eight places for seconds.
 
-use std::{collections::VecDeque, net::SocketAddr, time::Duration};
+use std::{
+    collections::VecDeque,
+    net::{IpAddr, SocketAddr},
+    time::Duration,
+};
 
 use rand::RngExt;
 
 use super::{Peers, record::Source};
 use crate::{
-    discovery::{Standing, beacon::Datagram},
+    discovery::{Standing, beacon::Datagram, quic_ports},
     ids::DaemonId,
 };
 
 /// Most probes whose answer is awaited.
 const MOST_ASKED: usize = 1024;
-/// Most of them to one host of which nothing is known but beacons, which may be forged: it hears so
-/// many within [`ANSWER_WITHIN`].
-const MOST_ASKED_OF_A_STRANGER: usize = 32;
+/// Most of them to one host: beacons may be forged, and it hears so many within [`ANSWER_WITHIN`].
+/// Those to the [expected ports](Peers::expects) of a known host come on top.
+const MOST_ASKED_OF_A_HOST: usize = 32;
+/// An address is probed at most this often, whatever daemons are said to be there.
+const ASKED_AGAIN: Duration = Duration::from_millis(250);
 /// So long is an answer awaited.
 pub(super) const ANSWER_WITHIN: Duration = Duration::from_secs(3);
 
@@ -28,6 +34,10 @@ pub(super) struct Asked {
     nonce: [u8; 8],
     daemon: DaemonId,
     source: Source,
+    /// It counts towards [`MOST_ASKED_OF_A_HOST`].
+    counts: bool,
+    /// Somebody answered: it is kept for [`ASKED_AGAIN`] alone.
+    answered: bool,
 }
 
 /// The probes whose answers are awaited, the oldest first.
@@ -60,11 +70,20 @@ impl Peers {
         }
     }
 
-    /// Probes an address, unless too many are under way.
+    /// Probes an address, unless too many probes are under way or somebody answered there just now.
+    /// Whether an answer is awaited from there.
     fn ask(&mut self, now: Duration, daemon: DaemonId, source: Source) -> bool {
         let to = source.address;
-        let of_host = || self.asked.iter().filter(|asked| asked.source.address.ip() == to.ip());
-        if !source.known && of_host().count() >= MOST_ASKED_OF_A_STRANGER {
+        // The answer says which daemon is there, whichever was asked for.
+        let recent = |asked: &Asked| asked.source.address == to && asked.at + ASKED_AGAIN > now;
+        if let Some(recent) = self.asked.iter().rfind(|asked| recent(asked)) {
+            return !recent.answered;
+        }
+        let counts = !(source.known && self.expects(to));
+        let of_host = |asked: &&Asked| {
+            asked.counts && !asked.answered && asked.source.address.ip() == to.ip()
+        };
+        if counts && self.asked.iter().filter(of_host).count() >= MOST_ASKED_OF_A_HOST {
             return false;
         }
         let bucket = if source.known { &mut self.known_probes } else { &mut self.probes };
@@ -75,14 +94,19 @@ impl Peers {
         if self.asked.len() >= MOST_ASKED {
             self.asked.pop_front();
         }
-        self.asked.push_back(Asked { at: now, nonce, daemon, source });
+        self.asked.push_back(Asked { at: now, nonce, daemon, source, counts, answered: false });
         self.send(to, Datagram::Probe { daemon: self.local.daemon, nonce }.encode());
         true
     }
 
+    /// Whether a daemon of this domain usually has this port, or one is listed there with it.
+    fn expects(&self, address: SocketAddr) -> bool {
+        let (ip, port) = (address.ip(), address.port());
+        quic_ports(self.local.domain).contains(&port) || self.listed.contains(&(ip, Some(port)))
+    }
+
     /// The daemon said goodbye, or somebody did in its name. It is asked, and forgotten if it does not
-    /// answer in time. Where too many are asked, one of which there was nothing but a beacon is
-    /// forgotten at once.
+    /// answer in time. Where too many are asked the goodbye says nothing.
     pub(super) fn leaves(&mut self, now: Duration, daemon: DaemonId) {
         let Some(record) = self.records.get(&daemon) else { return };
         let Some(best) = record.sources.first() else { return self.forget(daemon) };
@@ -90,12 +114,26 @@ impl Peers {
             return;
         }
         let best = best.clone();
-        let heard = best.standing() == Standing::Heard;
         if self.ask(now, daemon, best) {
             let record = self.records.get_mut(&daemon);
             record.into_iter().for_each(|record| record.leaving = Some(now));
-        } else if heard {
-            self.forget(daemon);
+        } else {
+            self.schedule_dial(now, daemon);
+        }
+    }
+
+    /// The same, where the daemon is said to be elsewhere, too: addresses of this host of which there is
+    /// nothing but a beacon are asked, and forgotten if nobody answers there in time.
+    pub(super) fn leaves_host(&mut self, now: Duration, daemon: DaemonId, host: IpAddr) {
+        let Some(record) = self.records.get(&daemon) else { return };
+        let heard = record.of(Standing::Heard).filter(|source| source.address.ip() == host);
+        for source in heard.cloned().collect::<Vec<_>>() {
+            let address = source.address;
+            if source.leaving.is_none() && self.ask(now, daemon, source) {
+                let sources = self.records.get_mut(&daemon).map(|record| &mut record.sources);
+                let asked = sources.into_iter().flatten().find(|s| s.address == address);
+                asked.into_iter().for_each(|source| source.leaving = Some(now));
+            }
         }
     }
 
@@ -108,15 +146,21 @@ impl Peers {
         daemon: DaemonId,
         nonce: [u8; 8],
     ) {
-        let awaited =
-            |a: &Asked| a.nonce == nonce && a.daemon == daemon && a.source.address == from;
-        let Some(at) = self.asked.iter().position(awaited) else { return };
-        let Some(Asked { mut source, .. }) = self.asked.remove(at) else { return };
-        source.answered = true;
+        let awaited = |asked: &&mut Asked| {
+            !asked.answered && asked.nonce == nonce && asked.source.address == from
+        };
+        let Some(asked) = self.asked.iter_mut().find(awaited) else { return };
+        asked.answered = true;
         let Some(record) = self.records.get_mut(&daemon).filter(|record| record.compatible) else {
             return;
         };
-        record.saw(source);
+        let source = match asked.daemon == daemon {
+            true => Some(asked.source.clone()),
+            // Another one was asked for there, and this one was heard of as well.
+            false => record.sources.iter().find(|source| source.address == from).cloned(),
+        };
+        let Some(source) = source else { return };
+        record.saw(Source { answered: true, leaving: None, ..source });
         if !record.linked && record.leaving.take().is_some() {
             record.stayed = Some(now);
         }
@@ -126,6 +170,9 @@ impl Peers {
     pub(super) fn forget_unanswered(&mut self, now: Duration) {
         while self.asked.front().is_some_and(|asked| asked.at + ANSWER_WITHIN <= now) {
             self.asked.pop_front();
+        }
+        for record in self.records.values_mut() {
+            record.forget_unanswered(now);
         }
         if self.asked.is_empty() {
             self.asked.shrink_to_fit();

@@ -97,6 +97,7 @@ impl Peers {
                     known,
                     answered: false,
                     asked: false,
+                    leaving: None,
                 });
                 self.schedule_dial(now, daemon);
                 self.ask_if_contested(now, daemon, observed);
@@ -185,15 +186,14 @@ impl Peers {
         // Where several addresses claim the id, one that leaves takes itself away and no other.
         let others = record.sources.iter().any(|source| source.address.ip() != from);
         let best = record.sources.first().is_some_and(|source| source.address.ip() == from);
-        if record.may_be_forgotten() {
-            if others {
-                let trusted = |source: &Source| source.proven || source.answered || source.known;
-                record.sources.retain(|source| source.address.ip() != from || trusted(source));
-            } else {
-                self.leaves(now, daemon);
+        if record.linked {
+            if best || !others {
+                record.leaving = Some(now);
             }
-        } else if best || !others {
-            record.leaving = Some(now);
+        } else if others {
+            self.leaves_host(now, daemon, from);
+        } else {
+            self.leaves(now, daemon);
         }
     }
 

@@ -34,6 +34,8 @@ pub(super) struct Source {
     pub(super) answered: bool,
     /// It was probed since its latest beacon.
     pub(super) asked: bool,
+    /// When it was asked, after a goodbye from there, whether the peer is still there.
+    pub(super) leaving: Option<Duration>,
 }
 
 impl Source {
@@ -131,6 +133,12 @@ impl Record {
             *kept += 1;
             *kept <= MOST_SOURCES
         });
+    }
+
+    /// Those that were left, as a goodbye said and nobody there denied in time.
+    pub(super) fn forget_unanswered(&mut self, now: Duration) {
+        let left = |source: &Source| source.leaving.is_some_and(|at| at + ANSWER_WITHIN <= now);
+        self.sources.retain(|source| !left(source) || source.standing() != Standing::Heard);
     }
 
     /// The addresses of this standing, the latest first.
