@@ -223,7 +223,7 @@ fn the_second_client_hello_is_the_first_but_for_what_was_asked() {
 }
 
 /// A ClientHello in front of its extensions, and those.
-fn parts(hello: &[u8]) -> (Vec<u8>, Vec<(u16, Vec<u8>)>) {
+pub(crate) fn parts(hello: &[u8]) -> (Vec<u8>, Vec<(u16, Vec<u8>)>) {
     let number = |at: usize| u16::from_be_bytes([hello[at], hello[at + 1]]);
     // handshake header 4, version 2, random 32
     let suites = 38 + 1 + usize::from(hello[38]);
