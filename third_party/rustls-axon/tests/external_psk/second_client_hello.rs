@@ -185,6 +185,7 @@ fn server_refuses_a_second_client_hello_that_changes_more() {
             &|hello| ClientHello { offers: vec![], ..hello }.with(13, &list16(&[4, 3])),
             109,
         ),
+        ("no PSK and nothing instead", &|hello| ClientHello { offers: vec![], ..hello }, 109),
         (
             "another PSK",
             &|hello| ClientHello { offers: vec![Offer::new("c", &[3; 32])], ..hello },
