@@ -32,11 +32,8 @@ fn offer_with_share() -> ClientHello {
 /// What a server that knows `a` makes of it in a mode: its flight, or its alert and error.
 fn answer(mode: PskKeyExchangeMode, hello: &[u8]) -> Result<Vec<u8>, (u8, Error)> {
     let resolver = Known::new(vec![psk("a", 1, SHA256)]);
-    let groups: &[&'static dyn SupportedKxGroup] = match mode {
-        PskKeyExchangeMode::PskKe => &[],
-        PskKeyExchangeMode::PskDheKe => &[kx_group::X25519],
-    };
-    let mut server = server(server_config_over(&[SHA256], groups, resolver, mode));
+    // in psk_ke, too: it could send a share, and must not
+    let mut server = server(server_config_over(&[SHA256], &[kx_group::X25519], resolver, mode));
     let result = feed(&mut server, &records(HANDSHAKE, hello));
     let flight = written(&mut server);
     assert!(server.is_handshaking() && server.external_psk().is_none());
@@ -117,6 +114,8 @@ fn server_refuses_malformed_offers() {
         ("no share and no groups", psk_dhe_ke, offer().with(45, &[1, 1]), 109),
         ("a share without groups", psk_dhe_ke, offer_with_share().without(10), 109),
         ("a share without groups", psk_ke, offer_with_share().with(45, &[1, 0]).without(10), 109),
+        // as GnuTLS with `-GROUP-ALL`
+        ("an empty list of shares without groups", psk_ke, offer().with(51, &[0, 0]), 109),
         ("groups without a share", psk_dhe_ke, offer_with_share().without(51), 109),
         ("groups without a share", psk_ke, offer_with_share().with(45, &[1, 0]).without(51), 109),
         ("no group in common", psk_dhe_ke, offer().in_psk_dhe_ke(30, &[9; 56]), 40),

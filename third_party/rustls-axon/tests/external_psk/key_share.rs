@@ -1,4 +1,4 @@
-//! Key shares: which a client sends.
+//! Key shares: which a client sends, which a server takes, and what it answers with.
 //!
 //! Every one of these has more than one group to go wrong with.
 
@@ -6,14 +6,27 @@ use std::sync::Arc;
 
 use rustls_axon::client::{ClientSessionMemoryCache, ClientSessionStore, Resumption};
 use rustls_axon::crypto::aws_lc_rs::kx_group;
+use rustls_axon::crypto::{ActiveKeyExchange, SupportedKxGroup};
 use rustls_axon::external_psk::PskKeyExchangeMode;
 use rustls_axon::NamedGroup;
 
 use crate::common::*;
-use crate::peer::plaintext;
+use crate::peer::{plaintext, records, ClientHello, Offer, Peer, Role, HANDSHAKE};
+use crate::second_client_hello::{groups, shares};
 use crate::server_hello::parts;
 
 const MODE: PskKeyExchangeMode = PskKeyExchangeMode::PskDheKe;
+const SECRET: [u8; 32] = [1; 32];
+const X25519: u16 = 29;
+const P256: u16 = 23;
+
+fn group(id: u16) -> &'static dyn SupportedKxGroup {
+    match id {
+        X25519 => kx_group::X25519,
+        P256 => kx_group::SECP256R1,
+        _ => panic!("no group {id}"),
+    }
+}
 
 /// The groups that a ClientHello lists, and those that it has shares of.
 fn listed_and_shared(hello: &[u8]) -> (Vec<u16>, Vec<u16>) {
@@ -80,4 +93,94 @@ fn every_group_that_is_offered_can_be_selected() {
             }
         }
     }
+}
+
+fn hello(listed: &[u16], shared: &[(u16, &[u8])]) -> ClientHello {
+    ClientHello::new(vec![Offer::new("a", &SECRET)])
+        .with(45, &[1, 1])
+        .with(10, &groups(listed))
+        .with(51, &shares(shared))
+}
+
+/// The group of the share in the answer is one that the client listed and has a share of, and the
+/// keys are those of both shares.
+#[test]
+fn server_answers_with_a_share_of_the_group_that_it_selected() {
+    type Groups = &'static [u16];
+    let cases: [(Groups, Groups, Groups, u16); 6] = [
+        // with shares of both the order of the server counts
+        (&[X25519, P256], &[P256, X25519], &[P256, X25519], X25519),
+        (&[P256, X25519], &[X25519, P256], &[X25519, P256], P256),
+        // a share that is there counts more
+        (&[P256, X25519], &[P256, X25519], &[X25519], X25519),
+        (&[X25519, P256], &[X25519, P256], &[P256], P256),
+        // and one of a group that is not listed does not count
+        (&[P256, X25519], &[X25519], &[P256, X25519], X25519),
+        (&[X25519, P256], &[P256], &[X25519, P256], P256),
+    ];
+    for (of_server, listed, shared, selected) in cases {
+        let what = format!("{of_server:?}, {listed:?}, {shared:?}");
+        let ours: Vec<(u16, Box<dyn ActiveKeyExchange>)> =
+            shared.iter().map(|id| (*id, group(*id).start().unwrap())).collect();
+        let entries: Vec<(u16, &[u8])> = ours.iter().map(|(id, kx)| (*id, kx.pub_key())).collect();
+        let hello = hello(listed, &entries).encode();
+
+        let of_server: Vec<_> = of_server.iter().map(|id| group(*id)).collect();
+        let resolver = Known::new(vec![psk("a", 1, SHA256)]);
+        let mut server = server(server_config_over(&[SHA256], &of_server, resolver, MODE));
+        feed(&mut server, &records(HANDSHAKE, &hello)).unwrap();
+        let flight = written(&mut server);
+        let server_hello = plaintext(&flight);
+        assert_ne!(&server_hello[6..10], [0xcf, 0x21, 0xad, 0x74], "a HelloRetryRequest: {what}");
+
+        let len: u8 = if selected == X25519 { 32 } else { 65 };
+        let head = [0, 51, 0, len + 4, 0, selected as u8, 0, len];
+        let at = server_hello.windows(8).position(|window| window == head).expect(&what) + 8;
+        let (_, ours) = ours.into_iter().find(|(id, _)| *id == selected).unwrap();
+        let exchanged = ours.complete(&server_hello[at..][..usize::from(len)]).unwrap();
+
+        let transcript = [hello, server_hello].concat();
+        let mut client =
+            Peer::new(Role::Client, Some(&SECRET), Some(exchanged.secret_bytes()), transcript);
+        client.expect_finished(&flight);
+        feed(&mut server, &client.finish()).unwrap();
+        let used = server.negotiated_key_exchange_group().unwrap().name();
+        assert_eq!(u16::from(used), selected, "{what}");
+    }
+}
+
+/// RFC 8446 4.2.8.2: a share of P-256 is a point of the curve, uncompressed; X25519 has 32 bytes.
+#[test]
+fn server_refuses_shares_that_are_none() {
+    let right = group(P256).start().unwrap().pub_key().to_vec();
+    let changed = |at: usize, to: u8| {
+        let mut share = right.clone();
+        share[at] = to;
+        share
+    };
+    let compressed = [&[2 + (right[64] & 1)][..], &right[1..33]].concat();
+    for (what, id, share) in [
+        ("not on the curve", P256, changed(64, right[64] ^ 1)),
+        ("compressed", P256, compressed),
+        ("hybrid in form", P256, changed(0, 6 + (right[64] & 1))),
+        ("the point at infinity", P256, vec![0]),
+        ("short", P256, right[..64].to_vec()),
+        ("long", P256, [&right[..], &[0]].concat()),
+        ("short", X25519, vec![9; 31]),
+        ("long", X25519, vec![9; 33]),
+        ("gives zeros", X25519, vec![0; 32]),
+    ] {
+        let resolver = Known::new(vec![psk("a", 1, SHA256)]);
+        let both = [group(X25519), group(P256)];
+        let mut server = server(server_config_over(&[SHA256], &both, resolver, MODE));
+        let hello = hello(&[id], &[(id, &share)]).encode();
+        let refused = feed(&mut server, &records(HANDSHAKE, &hello));
+        assert!(refused.is_err(), "{what}, {id}");
+        assert_eq!(written(&mut server), [21, 3, 3, 0, 2, 2, 47], "{what}, {id}: {refused:?}");
+    }
+    // it is the share that was wrong
+    let resolver = Known::new(vec![psk("a", 1, SHA256)]);
+    let mut server = server(server_config_over(&[SHA256], &[group(P256)], resolver, MODE));
+    let hello = hello(&[P256], &[(P256, &right)]).encode();
+    feed(&mut server, &records(HANDSHAKE, &hello)).unwrap();
 }
