@@ -208,6 +208,23 @@ fn a_server_looks_up_eight_identities_at_most() {
 }
 
 #[test]
+fn a_server_takes_the_eighth_identity_and_not_the_ninth() {
+    let names: Vec<String> = (0..8).map(|number| format!("unknown-{number}")).collect();
+    let refused: Error = PeerIncompatible::UnknownExternalPskIdentity.into();
+    for (unknown, agreed) in [(7, Ok(KeyExchange::PskKe)), (8, Err(refused))] {
+        let offers: Vec<_> = names[..unknown]
+            .iter()
+            .map(String::as_str)
+            .chain(["key-1"])
+            .map(|name| (name, KEY, HashAlgorithm::SHA256))
+            .collect();
+        let resolver = Arc::new(EveryHash::default());
+        let cipher = Cipher::ChaCha20Poly1305;
+        assert_eq!(handshake_with(resolver, offering(&offers), cipher), agreed, "{unknown}");
+    }
+}
+
+#[test]
 fn another_key_or_name_is_refused() {
     let (cipher, kex) = (Cipher::default(), PskKex::PskKe);
     for (key, key_id, server) in

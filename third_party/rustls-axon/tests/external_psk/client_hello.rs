@@ -1,16 +1,21 @@
 //! What a server makes of a ClientHello.
 
+use std::sync::Arc;
+
 use rustls_axon::crypto::aws_lc_rs::kx_group;
 use rustls_axon::crypto::SupportedKxGroup;
 use rustls_axon::external_psk::PskKeyExchangeMode;
+use rustls_axon::server::Acceptor;
 use rustls_axon::{
     AlertDescription, ClientConfig, Error, InvalidMessage, PeerIncompatible, PeerMisbehaved,
+    ServerConnection,
 };
 
 use crate::common::*;
 use crate::peer::{
     digest, list16, list8, message, plaintext, records, ClientHello, Offer, Peer, Role, HANDSHAKE,
 };
+use crate::resumption::stock_server;
 
 const SECRET: [u8; 32] = [1; 32];
 
@@ -27,11 +32,8 @@ fn offer_with_share() -> ClientHello {
 /// What a server that knows `a` makes of it in a mode: its flight, or its alert and error.
 fn answer(mode: PskKeyExchangeMode, hello: &[u8]) -> Result<Vec<u8>, (u8, Error)> {
     let resolver = Known::new(vec![psk("a", 1, SHA256)]);
-    let groups: &[&'static dyn SupportedKxGroup] = match mode {
-        PskKeyExchangeMode::PskKe => &[],
-        PskKeyExchangeMode::PskDheKe => &[kx_group::X25519],
-    };
-    let mut server = server(server_config_over(&[SHA256], groups, resolver, mode));
+    // in psk_ke, too: it could send a share, and must not
+    let mut server = server(server_config_over(&[SHA256], &[kx_group::X25519], resolver, mode));
     let result = feed(&mut server, &records(HANDSHAKE, hello));
     let flight = written(&mut server);
     assert!(server.is_handshaking() && server.external_psk().is_none());
@@ -76,6 +78,9 @@ fn server_refuses_malformed_offers() {
             ClientHello { offers: vec![], ..offer() }.with(13, &list16(&[4, 3])),
             109,
         ),
+        // RFC 8446 9.2: nothing to authenticate with at all
+        ("no offer", psk_ke, ClientHello { offers: vec![], ..offer() }, 109),
+        ("no offer", psk_dhe_ke, ClientHello { offers: vec![], ..offer_with_share() }, 109),
         ("no modes", psk_ke, offer().without(45), 109),
         ("no modes", psk_dhe_ke, offer_with_share().without(45), 109),
         ("an empty list of modes", psk_ke, offer().with(45, &[0]), 50),
@@ -109,6 +114,8 @@ fn server_refuses_malformed_offers() {
         ("no share and no groups", psk_dhe_ke, offer().with(45, &[1, 1]), 109),
         ("a share without groups", psk_dhe_ke, offer_with_share().without(10), 109),
         ("a share without groups", psk_ke, offer_with_share().with(45, &[1, 0]).without(10), 109),
+        // as GnuTLS with `-GROUP-ALL`
+        ("an empty list of shares without groups", psk_ke, offer().with(51, &[0, 0]), 109),
         ("groups without a share", psk_dhe_ke, offer_with_share().without(51), 109),
         ("groups without a share", psk_ke, offer_with_share().with(45, &[1, 0]).without(51), 109),
         ("no group in common", psk_dhe_ke, offer().in_psk_dhe_ke(30, &[9; 56]), 40),
@@ -303,9 +310,9 @@ fn server_refuses_every_shortened_client_hello() {
     for len in 0..whole.len() - 4 {
         let shortened = message(1, &whole[4..][..len]);
         let (alert, error) = answer(MODES[0], &shortened).unwrap_err();
-        // without extensions it is a ClientHello of TLS 1.2, and one that lacks much
-        let expected: &[u8] = if len == 2 + 32 + 33 + 4 + 2 { &[40, 70, 109] } else { &[50] };
-        assert!(expected.contains(&alert), "{len} of {}: {alert} {error}", whole.len() - 4);
+        // without extensions it is a ClientHello of TLS 1.2
+        let expected = if len == 2 + 32 + 33 + 4 + 2 { 70 } else { 50 };
+        assert_eq!(alert, expected, "{len} of {}: {error}", whole.len() - 4);
     }
 }
 
@@ -396,5 +403,35 @@ fn server_refuses_with_the_right_alert() {
         let mut server = server(server_config(&[SHA256], resolver, mode));
         assert_eq!(pass(&mut client, &mut server), Err(error));
         assert_eq!(pass(&mut server, &mut client), Err(Error::AlertReceived(alert)));
+    }
+}
+
+/// RFC 8446 9.2: a ClientHello with neither `pre_shared_key` nor `signature_algorithms`. What is
+/// missing depends on the config, which an acceptor has not yet.
+#[test]
+fn server_refuses_who_offers_nothing_to_authenticate_with() {
+    let hello = ClientHello { offers: vec![], ..offer_with_share() }.encode();
+    let external = server_config(&[SHA256], Known::new(vec![psk("a", 1, SHA256)]), MODES[0]);
+    for (config, error, alert) in [
+        (Arc::new(external), PeerIncompatible::ExternalPskRequired, 109),
+        // rustls's own answer
+        (stock_server(), PeerIncompatible::SignatureAlgorithmsExtensionRequired, 40),
+    ] {
+        let error = Error::from(error);
+        let sent = [21, 3, 3, 0, 2, 2, alert];
+        let mut server = ServerConnection::new(config.clone()).unwrap();
+        assert_eq!(feed(&mut server, &records(HANDSHAKE, &hello)), Err(error.clone()));
+        assert_eq!(written(&mut server), sent);
+
+        let mut acceptor = Acceptor::default();
+        acceptor.read_tls(&mut &records(HANDSHAKE, &hello)[..]).unwrap();
+        let accepted = acceptor.accept().unwrap().unwrap();
+        let Err((refused, mut said)) = accepted.into_connection(config) else {
+            panic!("accepted");
+        };
+        assert_eq!(refused, error);
+        let mut flight = Vec::new();
+        said.write_all(&mut flight).unwrap();
+        assert_eq!(flight, sent);
     }
 }

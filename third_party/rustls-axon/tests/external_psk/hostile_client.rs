@@ -188,6 +188,16 @@ fn server_follows_key_updates_but_not_a_flood() {
     }
 }
 
+/// Not even the right Finished.
+#[test]
+fn server_refuses_what_should_be_encrypted_and_is_not() {
+    for kind in [HANDSHAKE, APPLICATION_DATA] {
+        let (server, client) = after_server_finished();
+        let flight = records(kind, &message(20, &client.verify_data()));
+        refused(server, client, &flight, 20, "in the clear");
+    }
+}
+
 /// RFC 8446 5.1: a record that holds the last message under old keys ends with it.
 #[test]
 fn server_refuses_messages_across_a_change_of_keys() {

@@ -7,6 +7,7 @@ mod configs;
 mod handshakes;
 mod hostile_client;
 mod hostile_server;
+mod key_share;
 mod peer;
 mod quic;
 mod resumption;

@@ -23,6 +23,7 @@ use crate::common::*;
 use crate::peer::{
     list16, plaintext, records, resumption_psk, ClientHello, Offer, Peer, Role, HANDSHAKE,
 };
+use crate::server_hello::parts;
 
 /// A certificate that nobody here looks at, with a key that signs.
 #[derive(Debug)]
@@ -216,29 +217,44 @@ fn a_server_with_external_psks_looks_up_no_tickets() {
 /// One store for a config that resumes and for one with external PSKs.
 #[test]
 fn a_client_with_external_psks_takes_no_tickets() {
-    let stock = stock_server();
+    let mut stock = ServerConfig::clone(&stock_server());
+    // one, so that it is missed if it is taken
+    stock.send_tls13_tickets = 1;
+    stock.max_early_data_size = 1_000;
+    let stock = Arc::new(stock);
     let store = Resumption::in_memory_sessions(8);
+    let verifier = Unchecked::new();
     let mut resuming = stock_client();
+    resuming.dangerous().set_certificate_verifier(verifier.clone());
     resuming.resumption = store.clone();
+    resuming.enable_early_data = true;
     let resuming = Arc::new(resuming);
     let connect_stock = || {
         let name = "example.com".try_into().unwrap();
         let mut client = ClientConnection::new(resuming.clone(), name).unwrap();
+        let early = client.early_data().is_some();
         let mut server = ServerConnection::new(stock.clone()).unwrap();
         handshake(&mut client, &mut server).unwrap();
-        client.handshake_kind()
+        (client.handshake_kind(), early)
     };
-    assert_eq!(connect_stock(), Some(HandshakeKind::Full));
-    assert_eq!(connect_stock(), Some(HandshakeKind::Resumed));
+    assert_eq!(connect_stock(), (Some(HandshakeKind::Full), false));
+    assert_eq!(connect_stock(), (Some(HandshakeKind::Resumed), true));
 
     let mode = PskKeyExchangeMode::PskDheKe;
     let psks = vec![psk("a", 1, SHA256)];
     let groups = [kx_group::SECP256R1, kx_group::X25519];
     let mut config = client_config_over(&[SHA256], &groups, psks, mode);
     config.resumption = store;
+    config.enable_early_data = true;
+    // rustls resumes under the same verifier and certificates alone
+    config.dangerous().set_certificate_verifier(verifier);
+    config.client_auth_cert_resolver = resuming.client_auth_cert_resolver.clone();
     let mut client = client(config);
+    assert!(client.early_data().is_none());
     let mut server = ServerConnection::new(stock.clone()).unwrap();
     let hello = written(&mut client);
+    let (_, extensions) = parts(&plaintext(&hello));
+    assert!(extensions.iter().all(|(kind, _)| *kind != 42), "early_data");
     // one identity, `a`, of age 0, and one binder at the end
     let tail = [&[0, 41, 0, 44, 0, 7, 0, 1, b'a', 0, 0, 0, 0, 0, 33, 32][..]].concat();
     let end = hello.len() - 32;
@@ -251,5 +267,6 @@ fn a_client_with_external_psks_takes_no_tickets() {
     assert_eq!(error, PeerIncompatible::SignatureAlgorithmsExtensionRequired.into());
     assert_eq!(written(&mut server).last(), Some(&40));
 
-    assert_eq!(connect_stock(), Some(HandshakeKind::Resumed), "nothing was taken or removed");
+    let again = (Some(HandshakeKind::Resumed), true);
+    assert_eq!(connect_stock(), again, "nothing was taken or removed");
 }

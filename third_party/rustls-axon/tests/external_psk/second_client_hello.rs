@@ -23,13 +23,13 @@ const P384: u16 = 24;
 
 const GROUPS: [&dyn SupportedKxGroup; 2] = [kx_group::X25519, kx_group::SECP256R1];
 
-fn shares(list: &[(u16, &[u8])]) -> Vec<u8> {
+pub(crate) fn shares(list: &[(u16, &[u8])]) -> Vec<u8> {
     let encode =
         |(group, share): &(u16, &[u8])| [&group.to_be_bytes(), &list16(share)[..]].concat();
     list16(&list.iter().flat_map(encode).collect::<Vec<_>>())
 }
 
-fn groups(list: &[u16]) -> Vec<u8> {
+pub(crate) fn groups(list: &[u16]) -> Vec<u8> {
     list16(&list.iter().flat_map(|group| group.to_be_bytes()).collect::<Vec<_>>())
 }
 
@@ -185,6 +185,7 @@ fn server_refuses_a_second_client_hello_that_changes_more() {
             &|hello| ClientHello { offers: vec![], ..hello }.with(13, &list16(&[4, 3])),
             109,
         ),
+        ("no PSK and nothing instead", &|hello| ClientHello { offers: vec![], ..hello }, 109),
         (
             "another PSK",
             &|hello| ClientHello { offers: vec![Offer::new("c", &[3; 32])], ..hello },

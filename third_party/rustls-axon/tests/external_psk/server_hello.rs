@@ -165,15 +165,20 @@ impl Retried {
 fn client_refuses_what_follows_a_retry() {
     let retry = [TLS13, (51, &[0, 23])];
     let share = |group: u16, len| [&group.to_be_bytes()[..], &list16(&vec![4; len])].concat();
-    let (right, first_group) = (share(23, 65), share(29, 32));
+    let (none, first_group) = (share(23, 65), share(29, 32));
+    // good ones, of which a client that does not look at the name would make the same keys
+    let point = kx_group::SECP256R1.start().unwrap().pub_key().to_vec();
+    let named = |group: u16| [&group.to_be_bytes()[..], &list16(&point)].concat();
+    let (right, misnamed) = (named(23), named(29));
 
     for (what, suite, random, extensions, alert) in [
         ("the group of before", 0x1303, [7; 32], &[TLS13, FIRST_PSK, (51, &first_group)][..], 47),
+        ("under the name of before", 0x1303, [7; 32], &[TLS13, FIRST_PSK, (51, &misnamed)], 47),
         ("another suite", 0x1302, [7; 32], &[TLS13, FIRST_PSK, (51, &right)], 47),
         ("a PSK that was dropped", 0x1303, [7; 32], &[TLS13, (41, &[0, 1]), (51, &right)], 47),
         ("no PSK", 0x1303, [7; 32], &[TLS13, (51, &right)], 40),
         ("no share", 0x1303, [7; 32], &[TLS13, FIRST_PSK], 47),
-        ("a share that is none", 0x1303, [7; 32], &[TLS13, FIRST_PSK, (51, &right)], 47),
+        ("not on the curve", 0x1303, [7; 32], &[TLS13, FIRST_PSK, (51, &none)], 47),
         ("to retry again", 0x1303, HELLO_RETRY_REQUEST, &[TLS13, (51, &[0, 29])], 10),
     ] {
         let Retried { mut client, second, .. } = Retried::new(&retry);
@@ -223,7 +228,7 @@ fn the_second_client_hello_is_the_first_but_for_what_was_asked() {
 }
 
 /// A ClientHello in front of its extensions, and those.
-fn parts(hello: &[u8]) -> (Vec<u8>, Vec<(u16, Vec<u8>)>) {
+pub(crate) fn parts(hello: &[u8]) -> (Vec<u8>, Vec<(u16, Vec<u8>)>) {
     let number = |at: usize| u16::from_be_bytes([hello[at], hello[at + 1]]);
     // handshake header 4, version 2, random 32
     let suites = 38 + 1 + usize::from(hello[38]);

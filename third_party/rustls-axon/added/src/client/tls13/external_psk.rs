@@ -121,6 +121,12 @@ impl OfferedExternalPsks {
             exts.key_shares = None;
         }
 
+        // rustls lets a hybrid share be followed by its component as a share of its own.  RFC 8446
+        // 4.2.8 wants shares made independently, and `complete_key_exchange()` knows one.
+        if let Some(shares) = &mut exts.key_shares {
+            shares.truncate(1);
+        }
+
         // All of these ask for a certificate, a ticket, or TLS 1.2.
         exts.signature_schemes = None;
         exts.certificate_status_request = None;
