@@ -2,8 +2,11 @@
 //!
 //! QUIC doubles its pause after each packet that nobody acknowledges: after an outage of eight seconds a
 //! link may stay silent for eight more. A link over which something went out and nothing comes is therefore
-//! probed beside QUIC, four times a second. When a probe is answered and the link stays silent, a successor
-//! is dialled (`docs/architecture.md`, links).
+//! probed beside QUIC, four times a second. When a probe is answered and the peer still acknowledges
+//! nothing, a successor is dialled (`docs/architecture.md`, links).
+//!
+//! What counts is acknowledgements. A packet that the peer sends of itself does not end our QUIC's pause:
+//! what waits here would still wait for it.
 
 use std::{
     collections::HashMap,
@@ -63,6 +66,8 @@ impl Echoes {
 pub(super) struct Traffic {
     /// Datagrams that came.
     came: u64,
+    /// Acknowledgements among what came.
+    acknowledged: u64,
     /// Frames that were sent and ask for an answer. What QUIC sends by itself to keep the connection, or
     /// to find out how long a packet may be, is not among them.
     asked: u64,
@@ -78,17 +83,17 @@ impl Traffic {
             + sent.stop_sending
             + sent.max_data
             + sent.max_stream_data;
-        Self { came: stats.udp_rx.datagrams, asked }
+        Self { came: stats.udp_rx.datagrams, acknowledged: stats.frame_rx.acks, asked }
     }
 
-    /// Whether something came since `before`.
-    pub(super) fn came_since(self, before: Self) -> bool {
-        self.came != before.came
+    /// Whether the peer acknowledged something since `before`: QUIC repeats at once what it has not got.
+    pub(super) fn answered_since(self, before: Self) -> bool {
+        self.acknowledged != before.acknowledged
     }
 
     /// Whether something was asked since `before` and nothing came.
     pub(super) fn is_silent_since(self, before: Self) -> bool {
-        !self.came_since(before) && self.asked > before.asked
+        self.came == before.came && self.asked > before.asked
     }
 }
 
@@ -98,6 +103,8 @@ pub(super) struct Watch {
     pub(super) number: u64,
     /// The connection.
     pub(super) connection: Connection,
+    /// What had gone over it when it was found silent. An answer may have come since.
+    pub(super) traffic: Traffic,
     /// Which end this side is.
     pub(super) side: Side,
     /// This daemon.
@@ -111,8 +118,8 @@ pub(super) struct Watch {
 }
 
 impl Watch {
-    /// Probes until something comes over the link, or it ends; tells the hub when the path works and the
-    /// link stays silent.
+    /// Probes until the peer acknowledges something, or the link ends; tells the hub when the path works
+    /// and the link stays silent.
     pub(super) async fn run(self) {
         let nonce = rand::random();
         self.probe(nonce).await;
@@ -120,10 +127,10 @@ impl Watch {
     }
 
     async fn probe(&self, nonce: [u8; 8]) {
-        let (began, before) = (Instant::now(), Traffic::of(&self.connection).came);
+        let began = Instant::now();
         let silent = || {
             let over = self.connection.close_reason().is_some();
-            !over && Traffic::of(&self.connection).came == before
+            !over && !Traffic::of(&self.connection).answered_since(self.traffic)
         };
         let bytes = Datagram::Probe { daemon: self.daemon, nonce }.encode();
         let mut echo = self.echoes.await_one(nonce);

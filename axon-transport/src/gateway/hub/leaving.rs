@@ -64,8 +64,9 @@ impl Hub {
     /// The connection has a successor: it ends once all that is under way on it has arrived.
     pub(super) fn hand_over(&mut self, old: u64) {
         let Some(mut link) = self.links.remove(&old) else { return };
-        // Something may have come since it was looked at.
-        link.silent &= !Traffic::of(&link.connection).came_since(link.traffic);
+        // An acknowledgement may have come since it was looked at.
+        link.silent &= !Traffic::of(&link.connection).answered_since(link.traffic);
+        tracing::debug!(link = old, silent = link.silent, "the link is superseded");
         self.leaving.retain(|_, leaving| !leaving.is_gone());
         let who = &link.established.who;
         let others = self.leaving.iter().filter(|(_, leaving)| leaving.established.who.is(who));
@@ -163,6 +164,7 @@ async fn leave(
         _ = last.wait_for(|news| news.enough) => {}
         () = at(until) => {}
     }
+    tracing::debug!(link = number, "the superseded link ends");
     // Closing what is closed already changes nothing.
     close(&connection, CloseCode::Replaced, SUPERSEDED);
     if let Some(keyring) = keyring {

@@ -354,7 +354,7 @@ impl Hub {
             let before = std::mem::replace(&mut link.traffic, Traffic::of(&link.connection));
             let watched = link.watch.as_ref().is_some_and(|watch| !watch.is_finished());
             // It is not any more: what it has under way arrives.
-            link.silent &= !link.traffic.came_since(before);
+            link.silent &= !link.traffic.answered_since(before);
             if watched || !link.traffic.is_silent_since(before) {
                 continue;
             }
@@ -363,6 +363,7 @@ impl Hub {
             let watch = Watch {
                 number: *number,
                 connection: link.connection.clone(),
+                traffic: link.traffic,
                 side: link.candidate.side,
                 daemon,
                 endpoints: Arc::clone(endpoints),
