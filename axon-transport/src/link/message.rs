@@ -72,6 +72,15 @@ pub struct Elected {
     pub election: u64,
 }
 
+/// The sender has closed a superseded link that was silent, and sends nothing over it any more.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct LinkClosed {
+    /// Its name in ELECTED.
+    #[cbor(n(0), with = "minicbor::bytes")]
+    pub link: [u8; 16],
+}
+
 /// What changed in the sender's graph.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
@@ -290,6 +299,8 @@ pub enum Message {
     RouteRefused(RouteRefused),
     /// These sessions are mine.
     Owners(Owners),
+    /// A silent link that this one succeeds is closed.
+    LinkClosed(LinkClosed),
     /// About keys.
     Keys(KeyMessage),
 }
@@ -310,6 +321,7 @@ impl Message {
             Self::Received(m) => (10, to_map(m)),
             Self::RouteRefused(m) => (11, to_map(m)),
             Self::Owners(m) => (12, to_map(m)),
+            Self::LinkClosed(m) => (13, to_map(m)),
             Self::Keys(m) => {
                 let mut map = Vec::new();
                 m.encode(&mut map);
@@ -333,6 +345,7 @@ impl Message {
             10 => Self::Received(from_map(kind, map)?),
             11 => Self::RouteRefused(from_map(kind, map)?),
             12 => Self::Owners(from_map(kind, map)?),
+            13 => Self::LinkClosed(from_map(kind, map)?),
             16..=19 => Self::Keys(
                 KeyMessage::decode(kind, map)
                     .map_err(|e| FrameError::Malformed { kind, reason: e.to_string() })?,

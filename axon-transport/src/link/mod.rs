@@ -17,8 +17,8 @@ pub use frame::{
 };
 pub use hello::{Mismatch, PROTOCOL, check};
 pub use message::{
-    Asserted, Elected, Graph, GraphResync, Hello, LastSeen, MAX_PROOFS, Message, Owners, Received,
-    ReceivedOf, RouteReady, RouteRefused, Subscribe, Subscriber, Unsubscribe,
+    Asserted, Elected, Graph, GraphResync, Hello, LastSeen, LinkClosed, MAX_PROOFS, Message,
+    Owners, Received, ReceivedOf, RouteReady, RouteRefused, Subscribe, Subscriber, Unsubscribe,
 };
 pub use order::{Order, OutOfOrder, Side};
 

@@ -126,6 +126,7 @@ impl Message {
             Self::Received(_) => "RECEIVED",
             Self::RouteRefused(_) => "ROUTE_REFUSED",
             Self::Owners(_) => "OWNERS",
+            Self::LinkClosed(_) => "LINK_CLOSED",
             Self::Keys(m) => m.name(),
         }
     }

@@ -16,7 +16,7 @@ use super::{Hub, Link, Summary};
 use crate::{
     gateway::{establish::close, keyring::Keyring, silence::Traffic, status::Who},
     ids::DaemonId,
-    link::{CloseCode, Side},
+    link::{CloseCode, Elected, LinkClosed, Side},
 };
 
 /// A superseded link always has so long; and so long is a peer waited for that has nothing under way and
@@ -31,6 +31,8 @@ pub(super) struct Leaving {
     connection: quinn::Connection,
     established: Summary,
     side: Side,
+    /// Its name.
+    elected: Option<Elected>,
     news: watch::Sender<News>,
 }
 
@@ -41,6 +43,8 @@ struct News {
     succeeded: bool,
     /// The peer has nothing under way any more.
     ended: bool,
+    /// The peer has closed the connection, though its QUIC may not say so.
+    closed: bool,
     /// It must go now.
     enough: bool,
 }
@@ -61,9 +65,10 @@ impl Leaving {
 }
 
 impl Hub {
-    /// The connection has a successor: it ends once all that is under way on it has arrived.
-    pub(super) fn hand_over(&mut self, old: u64) {
-        let Some(mut link) = self.links.remove(&old) else { return };
+    /// The connection has a successor: it ends once all that is under way on it has arrived, or at once
+    /// where it is silent. Then the result is what to say of it to the peer.
+    pub(super) fn hand_over(&mut self, old: u64) -> Option<LinkClosed> {
+        let mut link = self.links.remove(&old)?;
         // An acknowledgement may have come since it was looked at.
         link.silent &= !Traffic::of(&link.connection).answered_since(link.traffic);
         tracing::debug!(link = old, silent = link.silent, "the link is superseded");
@@ -81,10 +86,23 @@ impl Hub {
             connection: link.connection.clone(),
             established: link.established.clone(),
             side: link.candidate.side,
+            elected: link.elected,
             news,
         };
         self.leaving.insert(old, leaving);
+        // QUIC may not say it: quinn holds a CONNECTION_CLOSE back, as all else, where its congestion
+        // window is full of what nobody acknowledged.
+        let closed = link.elected.filter(|_| link.silent).map(|e| LinkClosed { link: e.link });
         tokio::spawn(leave(old, link, heard, self.context.keyring.clone()));
+        closed
+    }
+
+    /// The peer has closed a link that was silent.
+    pub(super) fn closed_by_peer(&self, daemon: DaemonId, closed: LinkClosed) {
+        let names = |leaving: &Leaving| leaving.elected.is_some_and(|e| e.link == closed.link);
+        let of_peer = |leaving: &&Leaving| leaving.established.hello.daemon == daemon;
+        let its = self.leaving.values().filter(of_peer).filter(|leaving| names(leaving));
+        its.for_each(|leaving| leaving.tell(|news| news.closed = true));
     }
 
     /// The peer spoke as it does on a link that it turned to.
@@ -131,7 +149,7 @@ async fn leave(
     drop(carrier);
     let least = Instant::now() + HAND_OVER;
     let until = until.map(|until| until.max(least));
-    let mut last = news.clone();
+    let (mut last, mut told) = (news.clone(), news.clone());
     let arrived = async {
         // What a silent one has under way is sent again over its successor.
         if !silent {
@@ -154,6 +172,7 @@ async fn leave(
         tokio::select! {
             () = arrived => {}
             _ = connection.closed() => {}
+            Ok(_) = told.wait_for(|news| news.closed) => {}
         }
         close(&connection, CloseCode::Replaced, SUPERSEDED);
         reading.closed().await;

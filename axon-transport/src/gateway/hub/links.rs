@@ -255,7 +255,8 @@ impl Hub {
             link.widen();
             let carrier = link.carrier.clone();
             self.spawn_inbound(number, daemon, carrier);
-            return self.hand_over(number);
+            self.hand_over(number);
+            return;
         }
         let Some(link) = self.links.get_mut(&number) else { return };
         link.elected = Some(elected);
@@ -272,11 +273,12 @@ impl Hub {
         }
         open_streams(&connection);
         link.widen();
+        let mut closed = None;
         let new = match self.peers.get_mut(&daemon) {
             Some(peer) => {
                 let old = peer.link;
                 peer.succeed(number, outbox, carrier.clone(), &self.local);
-                self.hand_over(old);
+                closed = self.hand_over(old);
                 false
             }
             None => {
@@ -293,6 +295,7 @@ impl Hub {
         self.spawn_inbound(number, daemon, carrier);
         self.plan_end(number, side);
         if let Some(peer) = self.peers.get_mut(&daemon) {
+            closed.into_iter().for_each(|closed| peer.say(Message::LinkClosed(closed)));
             peer.send_graph(&self.local, true);
         }
         let address = connection.remote_address();

@@ -360,8 +360,10 @@ impl Hub {
         if self.peers.get(&daemon).is_none_or(|peer| peer.link != number) {
             return;
         }
-        if matches!(message, Message::Graph(_)) {
-            self.succeeded(daemon);
+        match &message {
+            Message::Graph(_) => self.succeeded(daemon),
+            Message::LinkClosed(closed) => self.closed_by_peer(daemon, *closed),
+            _ => {}
         }
         let Some(peer) = self.peers.get_mut(&daemon) else { return };
         let result = match message {
@@ -418,9 +420,11 @@ impl Hub {
                     publishers = ready.publishers.len(), "route ready");
                 Ok(())
             }
-            Message::Hello(_) | Message::Elected(_) | Message::Keys(_) | Message::Keepalive => {
-                Ok(())
-            }
+            Message::Hello(_)
+            | Message::Elected(_)
+            | Message::Keys(_)
+            | Message::LinkClosed(_)
+            | Message::Keepalive => Ok(()),
         };
         if let Err((code, reason)) = result {
             self.violation(number, code, reason).await;
