@@ -16,7 +16,7 @@ fn a_key_is_made_and_looked_at_whatever_the_settings_are() {
     let key = dir.path().join("host.key");
     let key = key.to_str().expect("UTF-8");
     for settings in
-        [("AXON_TYPO", "x"), ("AXON_SECURITY_MODE", "qkd"), ("AXON_CLASSIC_KEY", "/nowhere/key")]
+        [("AXON_QKD_TYPO", "x"), ("AXON_SECURITY_MODE", "qkd"), ("AXON_CLASSIC_KEY", "/nowhere/key")]
     {
         let made = axon([settings]).args(["trust", "keygen", key]).output().expect("runs");
         assert!(made.status.success(), "{settings:?}: {}", String::from_utf8_lossy(&made.stderr));
@@ -89,7 +89,7 @@ fn a_wrong_argument_has_status_2_too() {
 #[test]
 fn a_standard_error_that_takes_nothing_changes_no_status() {
     let full = || std::fs::OpenOptions::new().write(true).open("/dev/full").expect("Linux has it");
-    let mut setting = axon([("AXON_TYPO", "x")]);
+    let mut setting = axon([("AXON_QKD_TYPO", "x")]);
     assert_eq!(setting.arg("status").stderr(full()).status().expect("runs").code(), Some(2));
     let mut missing = axon([]);
     let file = ["play", "/nowhere/log.mcap"];
