@@ -15,9 +15,11 @@ fn a_key_is_made_and_looked_at_whatever_the_settings_are() {
     let dir = tempfile::tempdir().expect("temporary directory");
     let key = dir.path().join("host.key");
     let key = key.to_str().expect("UTF-8");
-    for settings in
-        [("AXON_QKD_TYPO", "x"), ("AXON_SECURITY_MODE", "qkd"), ("AXON_CLASSIC_KEY", "/nowhere/key")]
-    {
+    for settings in [
+        ("AXON_QKD_TYPO", "x"),
+        ("AXON_SECURITY_MODE", "qkd"),
+        ("AXON_CLASSIC_KEY", "/nowhere/key"),
+    ] {
         let made = axon([settings]).args(["trust", "keygen", key]).output().expect("runs");
         assert!(made.status.success(), "{settings:?}: {}", String::from_utf8_lossy(&made.stderr));
         std::fs::remove_file(key).expect("made");
@@ -44,9 +46,12 @@ fn assert_refused(args: &[&str], settings: &[(&str, &str)], variable: &str) {
 #[test]
 fn obsolete_and_unknown_variables_are_refused_by_every_command() {
     for args in COMMANDS {
-        for name in
-            ["AXON_SECURITY_PROFILE", "AXON_ENCRYPTION_MODE", "AXON_ENCRYPTION_KEY", "AXON_TYPO"]
-        {
+        for name in [
+            "AXON_SECURITY_PROFILE",
+            "AXON_ENCRYPTION_MODE",
+            "AXON_ENCRYPTION_KEY",
+            "AXON_QKD_TYPO",
+        ] {
             assert_refused(args, &[(name, "x")], name);
         }
     }

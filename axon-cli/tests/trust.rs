@@ -225,7 +225,7 @@ fn without_a_file_the_settings_say_which() {
 
     refused(&["list"], &[], 2, "AXON_CLASSIC_TRUST");
     refused(&["list"], &settings[..1], 2, "AXON_CLASSIC_TRUST");
-    refused(&["list"], &[("AXON_TYPO", "x")], 2, "AXON_TYPO");
+    refused(&["list"], &[("AXON_QKD_TYPO", "x")], 2, "AXON_QKD_TYPO");
     // A file can be looked at before the settings are complete; why nothing is marked is said.
     let output = trust(&["list", utf8(&file)], &settings[..1]);
     assert!(output.status.success());
