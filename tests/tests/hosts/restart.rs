@@ -4,6 +4,7 @@ use std::fs;
 
 use axon_tests::{Sizes, Tally};
 use axon_transport::daemon::status::Status;
+use rustix::process::Signal;
 
 use super::{
     mode::{Kmes, Settings, classic},
@@ -79,7 +80,9 @@ fn kill_while(
         node.finish();
     }
 
-    // Nobody needs them any more: they end by themselves and leave nothing behind to trip over.
+    // Nobody needs them any more. The one that a session started ends by itself, the other is told to, and
+    // neither leaves anything behind to trip over.
+    pair::signal(hosts[1 - victim].status().pid, Signal::TERM);
     for host in &hosts {
         until("the daemon ends", || host.has_no_daemon());
         let run = host.dir.path().join("run");
