@@ -127,10 +127,11 @@ impl Config {
 
     /// What to say about variables that begin with `AXON_` and are no settings: one line, or nothing.
     pub(crate) fn unknown_variables(&self) -> Option<String> {
-        (!self.unknown_variables.is_empty()).then(|| {
+        let names = self.unknown_variables.iter().map(|name| name.escape_debug().to_string());
+        let names = names.collect::<Vec<_>>().join(", ");
+        (!names.is_empty()).then(|| {
             format!(
-                "{} is no setting of AXON and ignored; AXON_STRICT_ENV=1 makes it an error",
-                self.unknown_variables.join(", ")
+                "ignored, since it is no setting of AXON: {names}; AXON_STRICT_ENV=1 makes it an error"
             )
         })
     }

@@ -50,6 +50,8 @@ fn foreign_names_are_ignored_with_a_warning_unless_the_environment_is_strict() {
     assert_eq!(config.unknown_variables, ["AXON_", "AXON_BENCH_SIZES", "AXON_CI_JOB"]);
     let warnings = config.warnings().join("\n");
     assert!(warnings.contains("AXON_CI_JOB") && !warnings.contains("hunter2"), "{warnings}");
+    let steering = resolve(&[], &[("AXON_X\n\u{1b}[2J", "x")]).unwrap().warnings().join(" ");
+    assert!(steering.contains(r"AXON_X\n\u{1b}[2J"), "{steering}");
     assert!(resolve(&[], &[("AXON_STRICT_ENV", "0"), foreign[0]]).is_ok());
     for (name, value) in foreign {
         let error = resolve(&[], &[("AXON_STRICT_ENV", "1"), (name, value)]).unwrap_err();
