@@ -10,6 +10,7 @@ async fn network() -> Network {
     Network::builder()
         .kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a", "sae-c"])
         .kme("kme-b", "127.0.0.2:0".parse().unwrap(), ["sae-b"])
+        .strict()
         .start()
         .await
         .unwrap()
