@@ -56,9 +56,13 @@ struct Numbers {
 
 impl Numbers {
     fn came(&mut self, info: &MessageInfo) {
-        let last = self.last.insert(info.publisher, info.sequence);
-        let expected = last.map_or(info.sequence, |last| last.saturating_add(1));
-        self.missing = self.missing.saturating_add(info.sequence.saturating_sub(expected));
+        let last = self.last.entry(info.publisher).or_insert(info.sequence);
+        let missing = info.sequence.saturating_sub(last.saturating_add(1));
+        *last = info.sequence.max(*last);
+        // A publisher may say any number: so many it cannot have published.
+        if missing < 1 << 32 {
+            self.missing += missing;
+        }
     }
 }
 

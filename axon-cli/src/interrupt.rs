@@ -1,7 +1,7 @@
 //! SIGINT and SIGTERM as a condition at which a session waits, so that a command can say how it was
 //! before it ends.
 
-use std::{io, thread};
+use std::{io, process, thread};
 
 use axon_transport::session::{GuardCondition, Session};
 use tokio::{
@@ -9,7 +9,7 @@ use tokio::{
     signal::unix::{SignalKind, signal},
 };
 
-/// A condition that is triggered by the first of the two signals.
+/// A condition that is triggered by the first signal. The second ends the process.
 ///
 /// # Errors
 /// When the system does not let signals be followed.
@@ -22,13 +22,19 @@ pub(crate) fn of(session: &Session) -> io::Result<GuardCondition> {
         (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?)
     };
     thread::Builder::new().name("signals".into()).spawn(move || {
-        runtime.block_on(async {
-            tokio::select! {
-                _ = interrupt.recv() => {}
-                _ = terminate.recv() => {}
-            }
-        });
+        let mut signal = || {
+            runtime.block_on(async {
+                tokio::select! {
+                    _ = interrupt.recv() => {}
+                    _ = terminate.recv() => {}
+                }
+            });
+        };
+        signal();
         guard.trigger();
+        // The command may hang in a write that nobody reads.
+        signal();
+        process::exit(130);
     })?;
     Ok(condition)
 }
