@@ -142,7 +142,8 @@ impl Watch {
             let grace = if began.elapsed() < LONG { GRACE } else { GRACE_AFTER_LONG };
             let more = if self.side == Side::Client { Duration::ZERO } else { DIALLED };
             tokio::time::sleep(grace + more).await;
-            if !silent() || self.events.send(Event::Silent(self.number)).await.is_err() {
+            let silence = Event::Silent(self.number, self.traffic);
+            if !silent() || self.events.send(silence).await.is_err() {
                 return;
             }
             tokio::time::sleep(AGAIN).await;

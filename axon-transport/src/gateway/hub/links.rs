@@ -378,8 +378,12 @@ impl Hub {
     }
 
     /// The path of a silent link works: a successor is dialled over it.
-    pub(super) fn replace_silent(&mut self, number: u64) {
+    pub(super) fn replace_silent(&mut self, number: u64, since: Traffic) {
         let Some(link) = self.links.get_mut(&number) else { return };
+        // An acknowledgement may have come before the hub heard of the silence.
+        if Traffic::of(&link.connection).answered_since(since) {
+            return;
+        }
         link.silent = true;
         let (daemon, address) = (link.established.hello.daemon, link.connection.remote_address());
         tracing::info!(peer = %daemon, %address,

@@ -105,7 +105,7 @@ pub(super) enum Event {
     /// The link is as old as a link may get.
     Expired(u64),
     /// Nothing comes over the link, though its path works.
-    Silent(u64),
+    Silent(u64, Traffic),
     /// Other keys or certificates may be trusted than before.
     Identity,
     /// Nothing is left of what this publisher here left for this peer.
@@ -318,7 +318,7 @@ impl Hub {
                 }
             }
             Event::Renew(link) => self.renew(link),
-            Event::Silent(link) => self.replace_silent(link),
+            Event::Silent(link, since) => self.replace_silent(link, since),
             Event::Identity => self.close_untrusted(true).await,
             Event::Drained(daemon, publisher) => self.drained(daemon, publisher).await,
             Event::Stalled { daemon, route } => self.stalled(daemon, route).await,
