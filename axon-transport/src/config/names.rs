@@ -92,14 +92,48 @@ const OBSOLETE: &[(&str, &str)] = &[
 /// In the environment only: `1` refuses every variable that begins with `AXON_` and is no setting.
 pub(super) const STRICT: &str = "AXON_STRICT_ENV";
 
-/// Whether `name` of the environment, which is no setting, was meant to be one: it was one once, it is
-/// close to one, or its first word is one of theirs.
+/// Words of settings that decide about security: a name with one of them is never somebody else's.
+const SECURITY_WORDS: &[&str] = &[
+    "AUTH",
+    "AUTHENTICATION",
+    "CA",
+    "CERT",
+    "CIPHER",
+    "CLASSIC",
+    "CRL",
+    "ENCRYPTION",
+    "KEX",
+    "KEY",
+    "KEYS",
+    "KME",
+    "MODE",
+    "PEER",
+    "PEERS",
+    "PSK",
+    "QKD",
+    "SAE",
+    "SECURITY",
+    "TLS",
+    "TRUST",
+];
+
+/// Whether `name` of the environment, which is no setting, was meant to be one: it is close to one that is
+/// or was, its first word is one of theirs, or any of its words speaks of security.
 pub(super) fn resembles(name: &str) -> bool {
-    let first_word = |name: &str| name.split('_').nth(1).unwrap_or_default().to_ascii_uppercase();
-    let settings = || SETTINGS.iter().copied().chain([CONFIG, STRICT]);
-    is_obsolete(name)
-        || nearest(name, settings()).is_some()
-        || settings().any(|setting| first_word(setting) == first_word(name))
+    let upper = name.to_ascii_uppercase();
+    let words = || upper.split('_').skip(1);
+    let names = || {
+        let obsolete = OBSOLETE.iter().map(|(name, _)| *name);
+        SETTINGS.iter().copied().chain([CONFIG, STRICT]).chain(obsolete)
+    };
+    let is_word = |word: &str| {
+        SECURITY_WORDS
+            .iter()
+            .any(|known| *known == word || (known.len() > 4 && distance(word, known) == 1))
+    };
+    nearest(name, names()).is_some()
+        || names().any(|known| known.split('_').nth(1) == words().next())
+        || words().any(is_word)
 }
 
 /// The setting called `name`, or why there is none.

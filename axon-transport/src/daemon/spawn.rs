@@ -10,7 +10,7 @@ use std::{
     io::{Read, Write},
     os::{
         fd::{AsFd, OwnedFd},
-        unix::fs::PermissionsExt,
+        unix::fs::{MetadataExt, PermissionsExt},
     },
     path::{Path, PathBuf},
     process::{Command, Stdio},
@@ -76,7 +76,11 @@ pub(crate) fn spawn(
         .spawn()
         .map_err(|e| failed(e.to_string()))?;
     let report = read_report(reader.into(), cancelled);
-    // The first process ends as soon as it has started the second, or did not.
+    // The first process ends as soon as it has started the second, or did not. A program that is no
+    // daemon may stay.
+    if !matches!(report.trim_end(), "ready" | "taken") {
+        let _ = child.kill();
+    }
     let status = child.wait();
     match report.trim_end() {
         "ready" => Ok(Outcome::Ready),
@@ -99,25 +103,30 @@ fn find(config: &Config, command: Option<&DaemonCommand>) -> Result<DaemonComman
         return Ok(command.clone());
     }
     let tried = folders(|name| std::env::var_os(name).filter(|_| !is_elevated()));
-    match tried.iter().find_map(|folder| program_in(folder)) {
-        Some(command) => Ok(command),
-        None => Err(SessionError::NoProgram { tried }),
-    }
+    program_in(&tried).ok_or(SessionError::NoProgram { tried })
 }
 
-/// The daemon in a folder: `axon_daemon`, or the tool, which can be it.
-fn program_in(folder: &Path) -> Option<DaemonCommand> {
+/// The daemon in the first folder that has one, else the tool in the first that has it, which can be it.
+fn program_in(folders: &[PathBuf]) -> Option<DaemonCommand> {
     let programs: [(&str, &[&str]); 2] = [("axon_daemon", &[]), ("axon", &["daemon"])];
     programs.into_iter().find_map(|(name, arguments)| {
-        let program = folder.join(name);
+        let program = folders.iter().map(|folder| folder.join(name)).find(|p| is_program(p))?;
         let arguments = arguments.iter().map(OsString::from).collect();
-        is_program(&program).then_some(DaemonCommand { program, arguments })
+        Some(DaemonCommand { program, arguments })
     })
 }
 
+/// Whether this can be executed, belongs to this user or to root, and can be replaced by no other. This
+/// very program is passed over: an application that is called `axon` would start itself without end.
 fn is_program(path: &Path) -> bool {
-    let mode = path.metadata().map(|file| file.is_file().then(|| file.permissions().mode()));
-    matches!(mode, Ok(Some(mode)) if mode & 0o111 != 0)
+    let Ok(file) = path.metadata() else { return false };
+    let ours = [0, rustix::process::geteuid().as_raw()].contains(&file.uid());
+    let itself = || match (path.canonicalize(), std::env::current_exe()) {
+        (Ok(path), Ok(itself)) => path == itself,
+        _ => false,
+    };
+    let mode = file.permissions().mode();
+    file.is_file() && mode & 0o111 != 0 && mode & 0o002 == 0 && ours && !itself()
 }
 
 /// Where a daemon's program is looked for, in this order: beside this program, beside the library that
@@ -313,13 +322,20 @@ mod tests {
             fs::set_permissions(&path, fs::Permissions::from_mode(mode)).unwrap();
             path
         };
-        assert!(program_in(dir.path()).is_none());
+        let other = tempfile::tempdir().unwrap();
+        let folders = [other.path().to_path_buf(), dir.path().to_path_buf()];
+        assert!(program_in(&folders).is_none());
         let tool = file("axon", 0o755);
         let daemon = file("axon_daemon", 0o644);
-        let found = program_in(dir.path()).unwrap();
+        let found = program_in(&folders).unwrap();
         assert_eq!((found.program, found.arguments), (tool, vec![OsString::from("daemon")]));
+        // Another's tool in an earlier folder.
+        fs::write(other.path().join("axon"), "").unwrap();
+        fs::set_permissions(other.path().join("axon"), fs::Permissions::from_mode(0o755)).unwrap();
+        fs::set_permissions(&daemon, fs::Permissions::from_mode(0o757)).unwrap();
+        assert_ne!(program_in(&folders).unwrap().program, daemon, "everybody may replace it");
         fs::set_permissions(&daemon, fs::Permissions::from_mode(0o755)).unwrap();
-        let found = program_in(dir.path()).unwrap();
+        let found = program_in(&folders).unwrap();
         assert_eq!((found.program, found.arguments), (daemon, vec![]));
     }
 }

@@ -30,6 +30,14 @@ fn unknown_names_are_refused_with_the_nearest_known_one() {
         ("AXON_CLASSIC_EVERYBODY", None),
         ("AXON_security_mode", None),
         ("AXON_STRICT_EMV", Some("AXON_STRICT_ENV")),
+        ("AXON_MODE", None),
+        ("AXON_TRUST", None),
+        ("AXON_AUTH_MODE", None),
+        ("AXON_CRL", None),
+        ("AXON_KEY", None),
+        ("AXON_CLASIC_TRUST_FILE", None),
+        ("AXON_ENCRYPTION_KEYS", None),
+        ("AXON_RMW_SECURTY_LEVEL", None),
     ] {
         let error = resolve(&[], &[(name, "hunter2")]).unwrap_err();
         assert_eq!(error.variable(), name);
