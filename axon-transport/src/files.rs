@@ -38,7 +38,7 @@ impl Demands {
     /// Of a file with certificates.
     pub(crate) const CERTIFICATES: Self = Self::public(LARGEST_PEM);
 
-    /// Of a file that says whom to trust: not everybody may write it.
+    /// Rules for a file of trusted keys or certificates: it must not be world-writable.
     pub(crate) const fn public(largest: u64) -> Self {
         Self { largest, secret: false }
     }
