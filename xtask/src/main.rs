@@ -7,6 +7,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 mod install_c;
+mod repeat;
 mod rustls_axon;
 
 const USAGE: &str = "\
@@ -15,6 +16,9 @@ usage: cargo xtask COMMAND
   install-c PREFIX [PROFILE]
                        build axon-transport's C libraries and daemon, in release unless told
                        otherwise, and install them with header and pkg-config file
+  repeat TIMES [--busy N] [NAME ...]
+                       run the test suite, or the test programs with such a name, TIMES times,
+                       beside N busy threads, and list the tests that failed in any run
   patched-tree         make third_party/rustls-axon/patched/, which `cargo package` ships
   rustls-digests       after a change to patches/ or added/: write patched.sha256 anew
   rustls-checkout DIR [VERSION]
@@ -34,6 +38,10 @@ fn main() -> ExitCode {
     let result = match args[..] {
         ["install-c", prefix] => install_c::install(prefix.as_ref(), "release"),
         ["install-c", prefix, profile] => install_c::install(prefix.as_ref(), profile),
+        ["repeat", times, ref options @ ..] => match repeat_options(times, options) {
+            Some(options) => repeat::repeat(&options),
+            None => return usage(),
+        },
         ["patched-tree"] => rustls_axon::patched_tree(),
         ["rustls-digests"] => rustls_axon::digests(),
         ["rustls-checkout", dir] => rustls_axon::checkout(dir.as_ref(), None),
@@ -60,6 +68,15 @@ fn main() -> ExitCode {
 fn usage() -> ExitCode {
     eprintln!("{USAGE}");
     ExitCode::from(2)
+}
+
+fn repeat_options<'a>(times: &str, args: &[&'a str]) -> Option<repeat::Repeat<'a>> {
+    let times = times.parse().ok().filter(|&times| times > 0)?;
+    let (busy, only) = match args {
+        ["--busy", busy, only @ ..] => (busy.parse().ok()?, only),
+        only => (0, only),
+    };
+    Some(repeat::Repeat { times, busy, only: only.to_vec() })
 }
 
 fn rebase_options<'a>(version: &'a str, mut args: &[&'a str]) -> Option<rustls_axon::Rebase<'a>> {
