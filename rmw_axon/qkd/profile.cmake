@@ -28,12 +28,16 @@ message(WARNING
   "whoever reads ${AXON_QKD_MATERIAL} can get all of them. For tests and demonstrations only.")
 
 set(profile ${AXON_QKD_MATERIAL}/host-${AXON_QKD_ROLE})
-set(simulator ${core_build}/release/kme-sim)
+set(simulator ${core_artefacts}/kme-sim)
 if(AXON_QKD_ROLE EQUAL 1)
+  if(CMAKE_CROSSCOMPILING)
+    message(FATAL_ERROR
+      "AXON_QKD_ROLE=1 runs the simulator to draw its keys, and this build is for another machine: "
+      "build role 1 on its host. Role 2 can be cross-compiled.")
+  endif()
   # A call of its own: in one with the core's, the simulator's features would become the daemon's.
   set(build_simulator
-    COMMAND ${CMAKE_COMMAND} -E env --unset=CFLAGS --unset=CXXFLAGS CARGO_TARGET_DIR=${core_build}
-      ${CARGO} build --release --locked --package etsi-qkd014 --features sim --bin kme-sim)
+    COMMAND ${cargo_build} --package etsi-qkd014 --features sim --bin kme-sim)
 endif()
 add_custom_target(axon_qkd_profile ALL
   ${build_simulator}

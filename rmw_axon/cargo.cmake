@@ -1,0 +1,185 @@
+# Finds cargo, refuses a Rust that is too old before anything is built, and has cargo build for what CMake builds for.
+#
+#   CARGO              the cargo to use; by default CARGO_HOME's, ~/.cargo's, that in PATH
+#   AXON_CARGO_ARGS    more arguments of each `cargo build`: --offline
+#   AXON_CARGO_TARGET  the Rust target; by default the machine's own, or the one of CMake's toolchain file
+
+set(AXON_CARGO_ARGS "" CACHE STRING "More arguments of each `cargo build`, separated by semicolons: --offline")
+set(AXON_CARGO_TARGET "" CACHE STRING
+  "The Rust target of the core, as `rustc --print target-list` spells it; empty for that of CMake's compiler")
+
+set(axon_another_cargo "Another cargo is named by -DCARGO=/path/to/cargo.")
+
+# The workspace's rust-version, the only place that says it.
+function(axon_rust_needed source result)
+  set(manifest ${source}/Cargo.toml)
+  if(NOT EXISTS ${manifest})
+    message(FATAL_ERROR
+      "rmw_axon builds AXON's core from the repository that it is part of, and there is no ${manifest}. "
+      "Clone the whole repository into the workspace.")
+  endif()
+  file(STRINGS ${manifest} lines REGEX "^rust-version *= *\"[0-9.]+\"")
+  if(NOT lines MATCHES "\"([0-9.]+)\"")
+    message(FATAL_ERROR "${manifest} has no rust-version")
+  endif()
+  set(${result} ${CMAKE_MATCH_1} PARENT_SCOPE)
+endfunction()
+
+# Fails where `program --version` is not that of Rust `needed` or newer. Run in `source`, where a rust-toolchain
+# file or `rustup override` may choose the toolchain.
+function(axon_require_rust program needed source)
+  get_filename_component(name ${program} NAME)
+  execute_process(
+    COMMAND ${program} --version WORKING_DIRECTORY ${source}
+    RESULT_VARIABLE status OUTPUT_VARIABLE said ERROR_VARIABLE errors)
+  if(NOT status EQUAL 0 OR NOT said MATCHES "([0-9]+\\.[0-9]+\\.[0-9]+)")
+    message(FATAL_ERROR
+      "rmw_axon needs Rust ${needed} or newer, and `${program} --version` fails (${status}): ${said}${errors}\n"
+      "Run `rustup default stable`, or install Rust from https://rustup.rs. ${axon_another_cargo}")
+  endif()
+  if(CMAKE_MATCH_1 VERSION_LESS needed)
+    message(FATAL_ERROR
+      "rmw_axon needs Rust ${needed} or newer, and found ${name} ${CMAKE_MATCH_1} (${program}). "
+      "Run `rustup update stable`, or install Rust from https://rustup.rs: it is preferred to an older cargo of "
+      "the distribution. ${axon_another_cargo}")
+  endif()
+endfunction()
+
+# Finds cargo and the rustc that it runs; sets CARGO and AXON_RUSTC.
+macro(axon_find_rust source)
+  axon_rust_needed(${source} axon_needed)
+  find_program(CARGO cargo HINTS $ENV{CARGO_HOME}/bin $ENV{HOME}/.cargo/bin NO_CMAKE_FIND_ROOT_PATH)
+  set(axon_cargo_found ${CARGO})
+  # Not kept in the cache until it fits: the next run is to find what was installed meanwhile.
+  unset(CARGO CACHE)
+  if(NOT axon_cargo_found)
+    message(FATAL_ERROR
+      "rmw_axon needs Rust ${axon_needed} or newer, and there is no cargo in CARGO_HOME, in ~/.cargo and in PATH. "
+      "Install Rust from https://rustup.rs. ${axon_another_cargo}")
+  endif()
+  axon_require_rust(${axon_cargo_found} ${axon_needed} ${source})
+  get_filename_component(axon_cargo_bin ${axon_cargo_found} DIRECTORY)
+  set(axon_rustc_found $ENV{RUSTC})
+  if(NOT axon_rustc_found)
+    unset(axon_rustc_found)
+    find_program(axon_rustc_found rustc HINTS ${axon_cargo_bin} NO_CMAKE_FIND_ROOT_PATH)
+    set(AXON_RUSTC ${axon_rustc_found})
+    unset(axon_rustc_found CACHE)
+  else()
+    set(AXON_RUSTC ${axon_rustc_found})
+  endif()
+  if(NOT AXON_RUSTC)
+    message(FATAL_ERROR
+      "rmw_axon needs Rust ${axon_needed} or newer, and found ${axon_cargo_found} but no rustc. "
+      "Install Rust from https://rustup.rs. ${axon_another_cargo}")
+  endif()
+  axon_require_rust(${AXON_RUSTC} ${axon_needed} ${source})
+  set(CARGO ${axon_cargo_found} CACHE FILEPATH "The cargo that builds AXON's core")
+endmacro()
+
+# The Rust target for a compiler's triple, as `gcc -dumpmachine` says it, and CMAKE_SYSTEM_PROCESSOR.
+function(axon_rust_target triple processor result)
+  string(REGEX MATCH "^[^-]+" machine "${triple}")
+  if(NOT machine)
+    set(machine "${processor}")
+  endif()
+  string(TOLOWER "${machine}" machine)
+  string(REGEX MATCH "(gnu|musl)[a-z0-9]*$" abi "${triple}")
+  if(NOT abi)
+    set(abi gnu)
+  endif()
+  if(machine MATCHES "^(aarch64|arm64)$")
+    set(machine aarch64)
+  elseif(machine MATCHES "^(x86_64|amd64)$")
+    set(machine x86_64)
+  elseif(machine MATCHES "^arm")
+    # A compiler's name says "arm" of all 32-bit ones.
+    if("${machine} ${processor}" MATCHES "armv6")
+      set(machine arm)
+    else()
+      set(machine armv7)
+    endif()
+    if(NOT abi MATCHES "eabi")
+      string(APPEND abi eabihf)
+    endif()
+  elseif(machine MATCHES "^i[3-6]86$")
+    set(machine i686)
+  elseif(machine STREQUAL "riscv64")
+    set(machine riscv64gc)
+  elseif(machine MATCHES "^(powerpc64le|ppc64le)$")
+    set(machine powerpc64le)
+  elseif(NOT machine MATCHES "^(s390x|loongarch64)$")
+    message(FATAL_ERROR
+      "there is no Rust target known for compiler \"${triple}\", CMAKE_SYSTEM_PROCESSOR \"${processor}\". "
+      "Set AXON_CARGO_TARGET to one of `rustc --print target-list`.")
+  endif()
+  set(${result} ${machine}-unknown-linux-${abi} PARENT_SCOPE)
+endfunction()
+
+# Fails where `rustc` cannot compile for `target`.
+function(axon_require_target rustc target source)
+  execute_process(
+    COMMAND ${rustc} --print target-libdir --target ${target} WORKING_DIRECTORY ${source}
+    RESULT_VARIABLE status OUTPUT_VARIABLE libraries ERROR_VARIABLE errors OUTPUT_STRIP_TRAILING_WHITESPACE)
+  if(NOT status EQUAL 0)
+    message(FATAL_ERROR
+      "${rustc} has no target ${target}: ${errors}\n"
+      "Set AXON_CARGO_TARGET to one of `rustc --print target-list`.")
+  endif()
+  file(GLOB std ${libraries}/libstd-*)
+  if(NOT std)
+    message(FATAL_ERROR
+      "Rust's standard library for ${target} is not installed (${libraries}). Run `rustup target add ${target}`, "
+      "or set AXON_CARGO_TARGET to the target that is meant.")
+  endif()
+endfunction()
+
+# Sets `command` to the start of a cargo build's command line, and `artefacts` to the folder of what it makes.
+function(axon_cargo_build rustc source build command artefacts)
+  # What is set for C++ packages is not for aws-lc and zstd.
+  set(env --unset=CFLAGS --unset=CXXFLAGS CARGO_TARGET_DIR=${build})
+  set(arguments build --release --locked ${AXON_CARGO_ARGS})
+  set(out ${build}/release)
+  set(target "${AXON_CARGO_TARGET}")
+  set(machine "${CMAKE_CXX_COMPILER_TARGET}")
+  if(NOT target AND (CMAKE_CROSSCOMPILING OR machine))
+    if(NOT CMAKE_SYSTEM_NAME STREQUAL "Linux")
+      message(FATAL_ERROR "rmw_axon is for Linux, and CMAKE_SYSTEM_NAME is \"${CMAKE_SYSTEM_NAME}\"")
+    endif()
+    if(NOT machine)
+      execute_process(COMMAND ${CMAKE_CXX_COMPILER} -dumpmachine
+        OUTPUT_VARIABLE machine ERROR_QUIET OUTPUT_STRIP_TRAILING_WHITESPACE)
+    endif()
+    axon_rust_target("${machine}" "${CMAKE_SYSTEM_PROCESSOR}" target)
+  endif()
+  if(target)
+    axon_require_target(${rustc} ${target} ${source})
+    message(STATUS "AXON's core is built for ${target}")
+    list(APPEND arguments --target ${target})
+    set(out ${build}/${target}/release)
+    string(REPLACE "-" "_" lower ${target})
+    string(TOUPPER ${lower} upper)
+    set(flags "")
+    set(rustflags "$ENV{CARGO_TARGET_${upper}_RUSTFLAGS}")
+    foreach(flag IN ITEMS "--target=${CMAKE_C_COMPILER_TARGET}" "--sysroot=${CMAKE_SYSROOT}")
+      if(NOT flag MATCHES "=$")
+        string(APPEND flags " ${flag}")
+        string(APPEND rustflags " -Clink-arg=${flag}")
+      endif()
+    endforeach()
+    # Those without a target are for the programs that run while the core is built.
+    list(APPEND env --unset=CC --unset=CXX --unset=AR --unset=LDFLAGS
+      CC_${lower}=${CMAKE_C_COMPILER}
+      CXX_${lower}=${CMAKE_CXX_COMPILER}
+      AR_${lower}=${CMAKE_AR}
+      CARGO_TARGET_${upper}_LINKER=${CMAKE_C_COMPILER})
+    if(flags)
+      list(APPEND env
+        "CFLAGS_${lower}=$ENV{CFLAGS_${lower}}${flags}"
+        "CXXFLAGS_${lower}=$ENV{CXXFLAGS_${lower}}${flags}"
+        "CARGO_TARGET_${upper}_RUSTFLAGS=${rustflags}")
+    endif()
+  endif()
+  set(${command} ${CMAKE_COMMAND} -E env ${env} ${CARGO} ${arguments} PARENT_SCOPE)
+  set(${artefacts} ${out} PARENT_SCOPE)
+endfunction()
