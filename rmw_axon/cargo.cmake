@@ -137,7 +137,8 @@ endfunction()
 # Sets `command` to the start of a cargo build's command line, and `artefacts` to the folder of what it makes.
 function(axon_cargo_build rustc source build command artefacts)
   # What is set for C++ packages is not for aws-lc and zstd.
-  set(env --unset=CFLAGS --unset=CXXFLAGS CARGO_TARGET_DIR=${build})
+  # colcon takes what cargo says of its progress, on stderr, for something to be shown.
+  set(env --unset=CFLAGS --unset=CXXFLAGS CARGO_TERM_QUIET=true CARGO_TARGET_DIR=${build})
   set(arguments build --release --locked ${AXON_CARGO_ARGS})
   set(out ${build}/release)
   set(target "${AXON_CARGO_TARGET}")
