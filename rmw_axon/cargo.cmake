@@ -45,10 +45,23 @@ function(axon_require_rust program needed source)
   endif()
 endfunction()
 
+# Where rustup installs cargo. Without CARGO_HOME its /bin would be the distribution's.
+function(axon_cargo_places result)
+  set(places "")
+  if(NOT "$ENV{CARGO_HOME}" STREQUAL "")
+    list(APPEND places $ENV{CARGO_HOME}/bin)
+  endif()
+  if(NOT "$ENV{HOME}" STREQUAL "")
+    list(APPEND places $ENV{HOME}/.cargo/bin)
+  endif()
+  set(${result} "${places}" PARENT_SCOPE)
+endfunction()
+
 # Finds cargo and the rustc that it runs; sets CARGO and AXON_RUSTC.
 macro(axon_find_rust source)
   axon_rust_needed(${source} axon_needed)
-  find_program(CARGO cargo HINTS $ENV{CARGO_HOME}/bin $ENV{HOME}/.cargo/bin NO_CMAKE_FIND_ROOT_PATH)
+  axon_cargo_places(axon_places)
+  find_program(CARGO cargo HINTS ${axon_places} NO_CMAKE_FIND_ROOT_PATH)
   set(axon_cargo_found ${CARGO})
   # Not kept in the cache until it fits: the next run is to find what was installed meanwhile.
   unset(CARGO CACHE)

@@ -9,6 +9,9 @@ if(DEFINED CALL)
   if(CALL STREQUAL "find")
     axon_find_rust(${SOURCE})
     message(STATUS "cargo ${CARGO}, rustc ${AXON_RUSTC}")
+  elseif(CALL STREQUAL "places")
+    axon_cargo_places(places)
+    message(STATUS "places ${places}.")
   elseif(CALL STREQUAL "map")
     axon_rust_target("${TRIPLE}" "${PROCESSOR}" target)
     message(STATUS "target ${target}.")
@@ -27,7 +30,7 @@ function(expect failure expected call)
   execute_process(
     COMMAND ${CMAKE_COMMAND} -E env --unset=RUSTC --unset=CFLAGS_aarch64_unknown_linux_gnu
       --unset=CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUSTFLAGS
-      HOME=${FOLDER}/home CARGO_HOME=${FOLDER}/home "PATH=${path}"
+      HOME=${FOLDER}/home CARGO_HOME=${cargo_home} "PATH=${path}"
       ${CMAKE_COMMAND} -DCALL=${call} ${ARGN} -P ${CMAKE_CURRENT_LIST_FILE}
     RESULT_VARIABLE status OUTPUT_VARIABLE said ERROR_VARIABLE errors)
   string(REGEX REPLACE "[ \n]+" " " said "${said}${errors}")
@@ -71,6 +74,11 @@ if(at EQUAL -1)
 endif()
 
 set(path ${FOLDER}/none)
+# /bin is not among them, which has the distribution's cargo.
+set(cargo_home "")
+expect(FALSE "places ${FOLDER}/home/.cargo/bin." places)
+set(cargo_home ${FOLDER}/home)
+expect(FALSE "places ${FOLDER}/home/bin;${FOLDER}/home/.cargo/bin." places)
 expect(TRUE "needs Rust 1.70 or newer, and there is no cargo" find ${source})
 expect(TRUE "there is no ${FOLDER}/none/Cargo.toml. Clone the whole repository" find -DSOURCE=${FOLDER}/none)
 
