@@ -209,18 +209,34 @@ fn given_up(log: &[String]) -> u64 {
     .sum()
 }
 
+/// A relayed process that has published and not ended yet, and a subscription that shares memory; the
+/// daemon between them is gone. What is named last is dropped first.
+struct Leaving {
+    host: Host,
+    _relaying: Host,
+    _listener: Session,
+    subscription: Subscription,
+    leaver: Player,
+}
+
+impl Leaving {
+    fn new() -> Self {
+        let host = host();
+        let daemon = host.daemon();
+        let (relaying, listener) = (relaying(&host), session(&host, "listener", true));
+        let subscription = listener.create_subscription(spec("/t", Qos::keep_all())).unwrap();
+        let mut leaver = relaying.play("publisher that ends");
+        assert_eq!(leaver.hear(), "matched");
+        stop(&daemon);
+        leaver.go();
+        assert_eq!(leaver.hear(), "published");
+        Self { host, _relaying: relaying, _listener: listener, subscription, leaver }
+    }
+}
+
 #[test]
 fn a_process_that_ends_hands_over_to_the_next_daemon() {
-    let host = host();
-    let daemon = host.daemon();
-    let (relaying, listener) = (relaying(&host), session(&host, "listener", true));
-    let subscription = listener.create_subscription(spec("/t", Qos::keep_all())).unwrap();
-    let mut leaver = relaying.play("publisher that ends");
-    assert_eq!(leaver.hear(), "matched");
-    stop(&daemon);
-    leaver.go();
-    assert_eq!(leaver.hear(), "published");
-    drop(daemon);
+    let Leaving { host, _relaying, _listener, subscription, mut leaver } = Leaving::new();
     let _daemon = host.daemon();
     leaver.go();
     // It waits for a second at most, which may be too short for a slow machine: what it could not hand over
@@ -240,16 +256,8 @@ fn a_process_that_ends_hands_over_to_the_next_daemon() {
 
 #[test]
 fn a_process_that_ends_without_a_daemon_counts_what_it_could_not_hand_over() {
-    let host = host();
-    let daemon = host.daemon();
-    let (relaying, listener) = (relaying(&host), session(&host, "listener", true));
-    let _subscription = listener.create_subscription(spec("/t", Qos::keep_all())).unwrap();
-    let mut leaver = relaying.play("publisher that ends");
-    assert_eq!(leaver.hear(), "matched");
-    stop(&daemon);
-    leaver.go();
-    assert_eq!(leaver.hear(), "published");
-    drop(daemon);
+    let Leaving { host: _host, _relaying, _listener, subscription: _subscription, mut leaver } =
+        Leaving::new();
     leaver.go();
     assert_eq!(given_up(&leaver.finish_and_tell()), LEFT);
 }
