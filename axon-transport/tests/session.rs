@@ -12,7 +12,7 @@ use std::{
 
 use alone::alone;
 use axon_transport::{
-    config::{Config, DaemonPolicy, OsFiles},
+    config::{Config, DaemonPolicy},
     events::{EventKind, EventStatus},
     graph::EndpointKind,
     qos::Qos,
@@ -254,8 +254,7 @@ fn a_sample_is_kept_beyond_all_that_it_came_from() {
 
 #[test]
 fn samples_are_copied_where_the_settings_say_so() {
-    let config = Config::resolve([], None, &OsFiles).unwrap();
-    let config = Config { daemon: DaemonPolicy::Off, shm_copy: true, ..config };
+    let config = Config::builder().daemon(DaemonPolicy::Off).shm_copy(true).build().unwrap();
     let session = Session::open(&config, SessionOptions::new("test")).unwrap();
     let publisher = session.create_publisher(spec(Qos::default())).unwrap();
     let subscription = session.create_subscription(spec(Qos::default())).unwrap();

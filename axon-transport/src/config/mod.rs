@@ -1,8 +1,9 @@
-//! Configuration: environment and `axon.toml` in, one validated [`Config`] out.
+//! Configuration: environment and `axon.toml`, or a [`ConfigBuilder`], in, one validated [`Config`] out.
 //!
-//! The only place that reads the environment. A setting that is unknown, obsolete or half-given is
-//! an error that names the variable, what was read and what is accepted. Validation creates
-//! nothing, reads no private key, and runs in the process that starts, before any daemon does.
+//! The only place that reads the environment, and [`Config::builder`] and [`Config::default`] do not. A
+//! setting that is unknown, obsolete or half-given is an error that names the variable, what was read and
+//! what is accepted. Validation creates nothing, reads no private key, and runs in the process that starts,
+//! before any daemon does.
 
 #![forbid(unsafe_code)]
 
@@ -12,11 +13,13 @@ use std::{
     path::{Path, PathBuf},
 };
 
+mod builder;
 pub(crate) mod elevated;
 mod error;
 mod files;
 mod model;
 mod names;
+mod passed_on;
 mod resolve;
 mod sources;
 mod summary;
@@ -24,11 +27,15 @@ mod summary;
 mod tests;
 mod values;
 
+use passed_on::PassedOn;
+use sources::Given;
+
+pub use builder::ConfigBuilder;
 pub use error::ConfigError;
 pub use files::{FileFacts, FileKind, Files, OsFiles};
 pub use model::{
     ClassicAuth, ClassicConfig, Config, DaemonPolicy, DiscoveryRange, KeyMode, LinkConfig,
-    PeerAddress, QkdConfig, QkdPeers, Security,
+    PeerAddress, QkdConfig, QkdPeers, Security, SecurityMode,
 };
 pub use summary::security_settings;
 
@@ -53,30 +60,35 @@ impl Config {
         overrides: impl IntoIterator<Item = (&'static str, Option<OsString>)>,
         daemon: Option<&Path>,
     ) -> Result<Self, ConfigError> {
-        let mut variables: BTreeMap<OsString, OsString> = std::env::vars_os().collect();
-        let is_elevated = crate::process::is_elevated();
-        if is_elevated {
-            elevated::restrict(&mut variables)?;
-        }
-        for (name, value) in overrides {
+        let mut variables = environment()?;
+        let overrides: BTreeMap<_, _> = overrides.into_iter().collect();
+        for (name, value) in &overrides {
             match value {
-                Some(value) => variables.insert(name.into(), value),
+                Some(value) => variables.insert(name.into(), value.clone()),
                 None => variables.remove(OsStr::new(name)),
             };
         }
-        let named = variables.get(OsStr::new("AXON_DAEMON_PATH")).map(PathBuf::from);
-        let beside = named.or_else(|| match daemon {
-            Some(daemon) => Some(daemon.to_path_buf()),
-            None => std::env::current_exe().ok(),
-        });
-        let file = beside.map(|daemon| daemon.with_file_name("axon.toml"));
-        if let Some(file) = file.as_deref().filter(|_| is_elevated) {
-            elevated::check_default_file(file)?;
-        }
-        Self::resolve(variables, file.as_deref(), &OsFiles)
+        let file = file_beside(variables.get(OsStr::new(DAEMON_PATH)).map(Path::new), daemon)?;
+        let passed_on = PassedOn::inherited(overrides, &OsFiles);
+        resolve::resolve(variables, &Given::new(), file.as_deref(), &OsFiles, passed_on)
     }
 
-    /// The configuration that an environment makes, with `default_file` where it names no file.
+    /// The configuration of this process, where a builder was given some of it.
+    fn from_environment(given: Given) -> Result<Self, ConfigError> {
+        let variables = environment()?;
+        let daemon = match given.get(DAEMON_PATH) {
+            Some(Some(path)) => Some(Path::new(path)),
+            _ => variables.get(OsStr::new(DAEMON_PATH)).map(Path::new),
+        };
+        let file = file_beside(daemon, None)?;
+        let set = given.iter().map(|(name, text)| (*name, text.as_ref().map(OsString::from)));
+        let passed_on = PassedOn::inherited(set, &OsFiles);
+        resolve::resolve(variables, &given, file.as_deref(), &OsFiles, passed_on)
+    }
+
+    /// The configuration that an environment makes, with `default_file` where it names no file. The
+    /// environment of this process is not read, and a daemon that a session starts with the configuration
+    /// does not get it either. [`builder`](Self::builder) does the same with a method for each setting.
     ///
     /// ```
     /// use axon_transport::config::{Config, OsFiles, Security};
@@ -95,7 +107,10 @@ impl Config {
         default_file: Option<&Path>,
         files: &impl Files,
     ) -> Result<Self, ConfigError> {
-        resolve::resolve(env, default_file, files)
+        let env: Vec<_> = env.into_iter().collect();
+        let file = default_file.filter(|path| files.facts(path).is_ok());
+        let passed_on = PassedOn::whole(env.iter().cloned(), file, files);
+        resolve::resolve(env, &Given::new(), default_file, files, passed_on)
     }
 
     /// What whoever starts with this configuration should be told, once.
@@ -135,4 +150,26 @@ impl Config {
             )
         })
     }
+}
+
+const DAEMON_PATH: &str = "AXON_DAEMON_PATH";
+
+/// The environment, without what a program with more rights than its caller must not take from it.
+fn environment() -> Result<BTreeMap<OsString, OsString>, ConfigError> {
+    let mut variables: BTreeMap<OsString, OsString> = std::env::vars_os().collect();
+    if crate::process::is_elevated() {
+        elevated::restrict(&mut variables)?;
+    }
+    Ok(variables)
+}
+
+/// The `axon.toml` beside the daemon's program: the one that a setting names, else the one that a library
+/// knows of, else this very program.
+fn file_beside(named: Option<&Path>, known: Option<&Path>) -> Result<Option<PathBuf>, ConfigError> {
+    let daemon = named.or(known).map(Path::to_path_buf).or_else(|| std::env::current_exe().ok());
+    let file = daemon.map(|daemon| daemon.with_file_name("axon.toml"));
+    if let Some(file) = file.as_deref().filter(|_| crate::process::is_elevated()) {
+        elevated::check_default_file(file)?;
+    }
+    Ok(file)
 }

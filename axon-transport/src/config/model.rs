@@ -5,7 +5,12 @@ use std::{net::IpAddr, path::PathBuf, time::Duration};
 use axon_tls::{Cipher, PskKex};
 use minicbor::{Decode, Encode};
 
-/// Everything that the environment and `axon.toml` decide.
+use super::passed_on::PassedOn;
+
+/// Everything that the environment and `axon.toml`, or a [`ConfigBuilder`](super::ConfigBuilder), decide.
+///
+/// To change one, change the builder: neither validation nor the daemon that a session starts knows of a
+/// field that was assigned to.
 #[derive(Clone, Debug)]
 pub struct Config {
     /// How peers prove themselves and agree on keys.
@@ -51,6 +56,27 @@ pub struct Config {
     pub link: LinkConfig,
     /// Variables of the environment that begin with `AXON_` and are no settings. They count for nothing.
     pub unknown_variables: Vec<String>,
+    /// How a daemon that a session starts comes to these settings.
+    pub(crate) passed_on: PassedOn,
+}
+
+/// The choice that [`Security`] holds the settings of (`AXON_SECURITY_MODE`).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SecurityMode {
+    /// X25519MLKEM768 and nothing else.
+    Classic,
+    /// A KME key as external PSK.
+    Qkd,
+}
+
+impl SecurityMode {
+    /// As `AXON_SECURITY_MODE` spells it.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Classic => "classic",
+            Self::Qkd => "qkd",
+        }
+    }
 }
 
 /// How peers prove themselves and agree on keys (`AXON_SECURITY_MODE`).
@@ -173,6 +199,17 @@ pub enum DiscoveryRange {
     /// What multicast reaches, and static peers.
     #[n(0)]
     Subnet,
+}
+
+impl DaemonPolicy {
+    /// As `AXON_DAEMON` spells it.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Spawn => "spawn",
+            Self::Require => "require",
+            Self::Off => "off",
+        }
+    }
 }
 
 impl DiscoveryRange {

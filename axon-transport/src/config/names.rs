@@ -40,6 +40,24 @@ pub(super) const SETTINGS: &[&str] = &[
     "AXON_LOG",
 ];
 
+/// What `[link]` of `axon.toml` holds, as variables: there `AXON_LINK_MTU` is `mtu`.
+pub(super) const LINK: &[&str] =
+    &["AXON_LINK_GRACE_S", "AXON_LINK_STALLED_S", "AXON_LINK_MTU", "AXON_LINK_GRAPH_MB"];
+
+/// Settings that name files. A relative one is another file for a process in another directory.
+pub(super) const PATHS: &[&str] = &[
+    CONFIG,
+    "AXON_DAEMON_PATH",
+    "AXON_CLASSIC_KEY",
+    "AXON_CLASSIC_TRUST",
+    "AXON_CLASSIC_CA",
+    "AXON_CLASSIC_CERT",
+    "AXON_CLASSIC_CRL",
+    "AXON_KME_CA",
+    "AXON_SAE_CERT",
+    "AXON_SAE_KEY",
+];
+
 /// Where `axon.toml` is; the one setting that the file cannot hold.
 pub(super) const CONFIG: &str = "AXON_CONFIG";
 
@@ -124,7 +142,7 @@ pub(super) fn resembles(name: &str) -> bool {
     let words = || upper.split('_').skip(1);
     let names = || {
         let obsolete = OBSOLETE.iter().map(|(name, _)| *name);
-        SETTINGS.iter().copied().chain([CONFIG, STRICT]).chain(obsolete)
+        SETTINGS.iter().chain(LINK).copied().chain([CONFIG, STRICT]).chain(obsolete)
     };
     let is_word = |word: &str| {
         SECURITY_WORDS
@@ -138,14 +156,15 @@ pub(super) fn resembles(name: &str) -> bool {
 
 /// The setting called `name`, or why there is none.
 pub(super) fn setting(name: &str) -> Result<&'static str, ConfigError> {
-    if let Some(known) = SETTINGS.iter().chain([&CONFIG]).find(|known| **known == name) {
+    if let Some(known) = SETTINGS.iter().chain(LINK).chain([&CONFIG]).find(|known| **known == name)
+    {
         return Ok(known);
     }
     if let Some((_, instead)) = obsolete(name) {
         // Its value may be a key.
         return Err(ConfigError::withheld(name, *instead));
     }
-    let close = nearest(name, SETTINGS.iter().copied().chain([CONFIG, STRICT]));
+    let close = nearest(name, SETTINGS.iter().chain(LINK).copied().chain([CONFIG, STRICT]));
     let accepted = match close {
         Some(close) => format!("the settings of docs/configuration.md; did you mean {close}?"),
         None => "the settings of docs/configuration.md; remove this one".to_owned(),

@@ -10,10 +10,11 @@ use axon_tls::{Cipher, PskKex};
 
 use super::{
     ClassicAuth, ClassicConfig, Config, ConfigError, DaemonPolicy, DiscoveryRange, KeyMode,
-    LinkConfig, QkdConfig, QkdPeers, Security,
+    LinkConfig, QkdConfig, QkdPeers, Security, SecurityMode,
     files::Files,
     names,
-    sources::Sources,
+    passed_on::PassedOn,
+    sources::{Given, Sources},
     values::{self, Use, Values},
 };
 
@@ -23,19 +24,15 @@ const LONGEST_SOCKET_PATH: usize = 107;
 /// As many static peers as rcl takes.
 const MOST_ROS_PEERS: usize = 32;
 
-#[derive(Clone, Copy)]
-enum Mode {
-    Classic,
-    Qkd,
-}
-
 pub(super) fn resolve(
     env: impl IntoIterator<Item = (OsString, OsString)>,
+    given: &Given,
     default_file: Option<&Path>,
     files: &impl Files,
+    passed_on: PassedOn,
 ) -> Result<Config, ConfigError> {
-    let mut sources = Sources::collect(env, default_file, files)?;
-    let modes = [("classic", Mode::Classic), ("qkd", Mode::Qkd)];
+    let mut sources = Sources::collect(env, given, default_file, files)?;
+    let modes = [SecurityMode::Classic, SecurityMode::Qkd].map(|mode| (mode.name(), mode));
     let mode = Values { sources: &sources, files }.choice("AXON_SECURITY_MODE", &modes)?;
     let mode = match mode {
         Some(mode) => mode,
@@ -44,29 +41,26 @@ pub(super) fn resolve(
             let accepted = "classic or qkd: a file with a section [qkd] needs security_mode";
             return Err(ConfigError::missing("AXON_SECURITY_MODE", accepted));
         }
-        None => Mode::Classic,
+        None => SecurityMode::Classic,
     };
-    if matches!(mode, Mode::Qkd) {
+    if mode == SecurityMode::Qkd {
         sources.enter_qkd();
     }
     let values = Values { sources: &sources, files };
 
     let security = match mode {
-        Mode::Classic => {
+        SecurityMode::Classic => {
             refuse_all(&values, names::QKD_ONLY, "qkd")?;
             Security::Classic(classic(&values)?)
         }
-        Mode::Qkd => {
+        SecurityMode::Qkd => {
             refuse_all(&values, names::CLASSIC_ONLY, "classic")?;
             Security::Qkd(qkd(&values)?)
         }
     };
     let ciphers = [Cipher::ChaCha20Poly1305, Cipher::Aes256Gcm].map(|c| (c.name(), c));
-    let policies = [
-        ("spawn", DaemonPolicy::Spawn),
-        ("require", DaemonPolicy::Require),
-        ("off", DaemonPolicy::Off),
-    ];
+    let policies = [DaemonPolicy::Spawn, DaemonPolicy::Require, DaemonPolicy::Off];
+    let policies = policies.map(|policy| (policy.name(), policy));
     let domain = domain(&sources)?;
     let (range, static_peers) = range(&sources)?;
     let (runtime_dir, socket_in_runtime_dir) = runtime_dir(&values)?;
@@ -100,7 +94,8 @@ pub(super) fn resolve(
         shm_copy: values.choice("AXON_SHM_COPY", &[("0", false), ("1", true)])?.unwrap_or(false),
         trusted_uids: values.uids("AXON_TRUSTED_UIDS")?,
         log: values.log_filter("AXON_LOG")?.unwrap_or_else(|| "warn".to_owned()),
-        link: link(&sources)?,
+        link: link(&values)?,
+        passed_on,
         unknown_variables: sources.strangers.clone(),
     })
 }
@@ -242,7 +237,7 @@ fn kme_timeouts(values: &Values<'_, impl Files>) -> Result<(Duration, Duration),
     Ok((Duration::from_secs(connect), Duration::from_secs(answer)))
 }
 
-fn domain(sources: &Sources) -> Result<u32, ConfigError> {
+pub(super) fn domain(sources: &Sources) -> Result<u32, ConfigError> {
     const NAME: &str = "ROS_DOMAIN_ID";
     match sources.foreign.get(NAME).map(String::as_str) {
         None | Some("") => Ok(0),
@@ -279,7 +274,9 @@ fn range(sources: &Sources) -> Result<(DiscoveryRange, Vec<String>), ConfigError
     }
 }
 
-fn runtime_dir(values: &Values<'_, impl Files>) -> Result<(Option<PathBuf>, bool), ConfigError> {
+pub(super) fn runtime_dir(
+    values: &Values<'_, impl Files>,
+) -> Result<(Option<PathBuf>, bool), ConfigError> {
     const NAME: &str = "AXON_RUNTIME_DIR";
     if let Some(path) = values.directory(NAME)? {
         let socket = path.as_os_str().len() + "/axon-232.sock".len();
@@ -295,7 +292,8 @@ fn runtime_dir(values: &Values<'_, impl Files>) -> Result<(Option<PathBuf>, bool
     Ok((xdg.filter(|path| path.is_absolute()).map(|path| path.join("axon")), false))
 }
 
-fn link(sources: &Sources) -> Result<LinkConfig, ConfigError> {
+fn link(values: &Values<'_, impl Files>) -> Result<LinkConfig, ConfigError> {
+    let sources = values.sources;
     let mut link = LinkConfig::default();
     for (key, value) in &sources.link {
         let name = format!("link.{key}");
@@ -319,6 +317,19 @@ fn link(sources: &Sources) -> Result<LinkConfig, ConfigError> {
                 return Err(ConfigError::name(&name, "grace_s, stalled_s, mtu, graph_mb").at(place));
             }
         }
+    }
+    // The variables win over the file.
+    if let Some(grace) = values.number("AXON_LINK_GRACE_S", 0..=86_400, "seconds")? {
+        link.grace = Duration::from_secs(grace);
+    }
+    if let Some(stalled) = values.number("AXON_LINK_STALLED_S", 1..=86_400, "seconds")? {
+        link.stalled = Duration::from_secs(stalled);
+    }
+    if let Some(mtu) = values.number("AXON_LINK_MTU", 1_200..=65_527, "bytes")? {
+        link.mtu = mtu as u16;
+    }
+    if let Some(graph) = values.number("AXON_LINK_GRAPH_MB", 1..=1_024, "MiB")? {
+        link.graph = (graph as usize) << 20;
     }
     Ok(link)
 }

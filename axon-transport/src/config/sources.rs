@@ -23,6 +23,8 @@ pub(super) struct Setting {
 #[derive(Clone, Debug)]
 pub(super) enum Origin {
     Environment,
+    /// A method of [`ConfigBuilder`](super::ConfigBuilder).
+    Builder,
     File(Rc<PathBuf>),
 }
 
@@ -41,8 +43,12 @@ pub(super) struct Sources {
     pub(super) file: Option<Rc<PathBuf>>,
 }
 
+/// What a builder was given, as the environment would spell it; `None` where a variable of the
+/// environment is not to count.
+pub(super) type Given = BTreeMap<&'static str, Option<String>>;
+
 /// Variables that are not ours but decide something.
-const FOREIGN: &[&str] = &[
+pub(super) const FOREIGN: &[&str] = &[
     "ROS_DOMAIN_ID",
     "ROS_AUTOMATIC_DISCOVERY_RANGE",
     "ROS_STATIC_PEERS",
@@ -52,14 +58,18 @@ const FOREIGN: &[&str] = &[
 
 impl Sources {
     /// Reads the environment, then the file it names (or `default_file`), and lets the environment
-    /// win. `default_file` may be absent; one that `AXON_CONFIG` names may not.
+    /// win. What a builder was `given` counts in place of the environment's. `default_file` may be
+    /// absent; one that `AXON_CONFIG` names may not.
     pub(super) fn collect(
         env: impl IntoIterator<Item = (OsString, OsString)>,
+        given: &Given,
         default_file: Option<&Path>,
         files: &impl Files,
     ) -> Result<Self, ConfigError> {
         let mut sources = Self::default();
-        sources.take_environment(env)?;
+        let replaced = |name: &OsString| name.to_str().is_some_and(|n| given.contains_key(n));
+        sources.take_environment(env.into_iter().filter(|(name, _)| !replaced(name)))?;
+        sources.take_given(given);
 
         let file = match sources.settings.remove(names::CONFIG) {
             Some(setting) => Some(named_file(&setting.text, files)?),
@@ -117,6 +127,17 @@ impl Sources {
             self.settings.insert(setting, Setting { text, origin: Origin::Environment });
         }
         Ok(())
+    }
+
+    fn take_given(&mut self, given: &Given) {
+        for (name, text) in given.iter().filter_map(|(name, text)| Some((*name, text.as_ref()?))) {
+            if FOREIGN.contains(&name) {
+                self.foreign.insert(name, text.clone());
+            } else {
+                let setting = Setting { text: text.clone(), origin: Origin::Builder };
+                self.settings.insert(name, setting);
+            }
+        }
     }
 
     fn take_file(&mut self, path: PathBuf, files: &impl Files) -> Result<(), ConfigError> {
@@ -276,6 +297,10 @@ fn setting_of_key(key: &str) -> Result<&'static str, ConfigError> {
     let upper = format!("AXON_{}", key.to_ascii_uppercase());
     if [names::CONFIG, names::STRICT].contains(&upper.as_str()) {
         return Err(ConfigError::name(&upper, "in the environment only"));
+    }
+    if names::LINK.contains(&upper.as_str()) {
+        let key = key.strip_prefix("link_").unwrap_or(key);
+        return Err(ConfigError::name(&upper, format!("{key} in the section [link]")));
     }
     // One spelling: `QKD_Peers` beside `qkd_peers` would be two keys of one setting.
     if key.bytes().any(|byte| byte.is_ascii_uppercase()) {

@@ -261,7 +261,7 @@ impl<F: Files> Values<'_, F> {
 
     fn path(&self, name: &str, setting: &Setting) -> Result<PathBuf, ConfigError> {
         let file = match &setting.origin {
-            Origin::Environment => None,
+            Origin::Environment | Origin::Builder => None,
             Origin::File(path) => Some(path.as_path()),
         };
         sources::absolute(name, &setting.text, file, self.files)
@@ -275,8 +275,16 @@ fn refuse(name: &str, setting: &Setting, accepted: impl Into<String>) -> ConfigE
 fn at(error: ConfigError, name: &str, setting: &Setting) -> ConfigError {
     match &setting.origin {
         Origin::Environment => error,
+        Origin::Builder => error.at(method(name)),
         Origin::File(path) => error.at(in_file(name, path)),
     }
+}
+
+/// The method of the builder that gives a setting: what the file calls it.
+pub(super) fn method(name: &str) -> String {
+    let name = name.strip_prefix("AXON_").or(name.strip_prefix("ROS_")).unwrap_or(name);
+    let name = name.to_ascii_lowercase();
+    format!("ConfigBuilder::{}", name.strip_suffix("_s").unwrap_or(&name))
 }
 
 fn in_file(name: &str, path: &Path) -> String {

@@ -6,7 +6,8 @@
 //! that another one was faster, or what is wrong.
 
 use std::{
-    ffi::OsString,
+    collections::BTreeMap,
+    ffi::{OsStr, OsString},
     io::{Read, Write},
     os::{
         fd::{AsFd, OwnedFd},
@@ -67,9 +68,7 @@ pub(crate) fn spawn(
         .args(arguments)
         .arg(SPAWNED)
         .env_clear()
-        .envs(std::env::vars_os().filter(|(name, _)| inherited(name, is_elevated)))
-        .env_remove("ROS_LOCALHOST_ONLY")
-        .envs(chosen(config))
+        .envs(environment(config, std::env::vars_os(), is_elevated))
         .stdin(Stdio::null())
         .stdout(writer)
         .stderr(Stdio::null())
@@ -162,10 +161,33 @@ fn own_file() -> Option<PathBuf> {
     })
 }
 
-/// Whether a daemon gets this variable: what it reads, and what its system libraries need. These take
-/// files from it, so one of a process with more rights than its caller gets what AXON reads alone.
-fn inherited(name: &OsString, is_elevated: bool) -> bool {
-    const NAMES: &[&str] = &[
+/// The environment of a daemon: what its system libraries need of this process's, the settings that
+/// [`passed_on`](Config) says, and what each session has of its own.
+fn environment(
+    config: &Config,
+    own: impl IntoIterator<Item = (OsString, OsString)>,
+    is_elevated: bool,
+) -> BTreeMap<OsString, OsString> {
+    let passed_on = &config.passed_on;
+    let inherited = |name: &OsString| inherited(name, is_elevated, passed_on.inherits);
+    let mut environment: BTreeMap<_, _> =
+        own.into_iter().filter(|(name, _)| inherited(name)).collect();
+    for (name, value) in &passed_on.variables {
+        match value {
+            Some(value) => environment.insert(name.clone(), value.clone()),
+            None => environment.remove(name),
+        };
+    }
+    environment.remove(OsStr::new("ROS_LOCALHOST_ONLY"));
+    environment.extend(chosen(config).map(|(name, value)| (name.into(), value.into())));
+    environment
+}
+
+/// Whether a daemon gets this variable: what it reads, where its settings are the environment's, and what
+/// its system libraries need. These take files from it, so one of a process with more rights than its
+/// caller gets what AXON reads alone.
+fn inherited(name: &OsStr, is_elevated: bool, settings: bool) -> bool {
+    const SYSTEM: &[&str] = &[
         "HOME",
         "LANG",
         "LD_LIBRARY_PATH",
@@ -175,12 +197,13 @@ fn inherited(name: &OsString, is_elevated: bool) -> bool {
         "TMPDIR",
         "TZ",
         "USER",
-        "XDG_RUNTIME_DIR",
     ];
-    const PREFIXES: &[&str] = &["AXON_", "ROS_", "LC_"];
+    const SETTINGS: &[&str] = &["AXON_", "ROS_"];
     name.to_str().is_some_and(|name| {
-        (NAMES.contains(&name) && !is_elevated)
-            || PREFIXES.iter().any(|prefix| name.starts_with(prefix))
+        (SYSTEM.contains(&name) && !is_elevated)
+            || name.starts_with("LC_")
+            || (settings && name == "XDG_RUNTIME_DIR" && !is_elevated)
+            || (settings && SETTINGS.iter().any(|prefix| name.starts_with(prefix)))
     })
 }
 
@@ -311,6 +334,39 @@ mod tests {
         let cargo = |name: &str| (name == "CARGO_HOME").then(|| "/opt/cargo".into());
         assert_eq!(folders(cargo).last(), Some(&"/opt/cargo/bin".into()));
         assert_eq!(folders(|_| None), [beside]);
+    }
+
+    #[test]
+    fn a_daemon_gets_the_settings_of_its_session_and_of_nobody_else() {
+        let own = || {
+            [
+                ("PATH", "/bin"),
+                ("LC_ALL", "C"),
+                ("AXON_LOG", "trace"),
+                ("AXON_STRICT_ENV", "1"),
+                ("ROS_LOCALHOST_ONLY", "1"),
+                ("XDG_RUNTIME_DIR", "/run/user/1"),
+                ("EDITOR", "vi"),
+            ]
+            .map(|(name, value)| (name.into(), value.into()))
+        };
+        let names = |config: &Config, is_elevated| {
+            let names = environment(config, own(), is_elevated).into_keys();
+            names.map(|name| name.into_string().unwrap()).collect::<Vec<_>>()
+        };
+        let ros = ["ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_DOMAIN_ID", "ROS_STATIC_PEERS"];
+        let built = Config::default();
+        assert_eq!(names(&built, false), [&["AXON_CONFIG", "LC_ALL", "PATH"], &ros[..]].concat());
+        assert_eq!(names(&built, true), [&["AXON_CONFIG", "LC_ALL"], &ros[..]].concat());
+        let mut read = Config::default();
+        read.passed_on.inherits = true;
+        read.passed_on.variables.clear();
+        let of_axon = ["AXON_LOG", "AXON_STRICT_ENV", "LC_ALL"];
+        assert_eq!(
+            names(&read, false),
+            [&of_axon[..], &["PATH"], &ros, &["XDG_RUNTIME_DIR"]].concat()
+        );
+        assert_eq!(names(&read, true), [&of_axon[..], &ros].concat());
     }
 
     #[test]

@@ -28,13 +28,13 @@ use crate::{
 /// use std::time::Duration;
 ///
 /// use axon_transport::{
-///     config::{Config, DaemonPolicy, OsFiles},
+///     config::{Config, DaemonPolicy},
 ///     events::{EventKind, EventStatus},
 ///     qos::Qos,
 ///     session::{EndpointSpec, Session, SessionOptions},
 /// };
 ///
-/// let config = Config { daemon: DaemonPolicy::Off, ..Config::resolve([], None, &OsFiles)? };
+/// let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
 /// let session = Session::open(&config, SessionOptions::new("robot"))?;
 /// let publisher = session.create_publisher(EndpointSpec::new("/t", "T", Qos::default()))?;
 /// let matched = publisher.event(EventKind::PublicationMatched).expect("publishers have it");

@@ -14,12 +14,12 @@ use crate::{graph::Endpoint, ids::Gid};
 ///
 /// ```
 /// use axon_transport::{
-///     config::{Config, DaemonPolicy, OsFiles},
+///     config::{Config, DaemonPolicy},
 ///     qos::Qos,
 ///     session::{EndpointSpec, Session, SessionOptions},
 /// };
 ///
-/// let config = Config { daemon: DaemonPolicy::Off, ..Config::resolve([], None, &OsFiles)? };
+/// let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
 /// let session = Session::open(&config, SessionOptions::new("robot"))?;
 /// let lidar = session.create_node("lidar", "/front", "/")?;
 /// let scan = EndpointSpec::new("/scan", "sensor_msgs/msg/LaserScan", Qos::sensor_data());

@@ -37,12 +37,12 @@ pub struct Server {
 /// use std::time::Duration;
 ///
 /// use axon_transport::{
-///     config::{Config, DaemonPolicy, OsFiles},
+///     config::{Config, DaemonPolicy},
 ///     qos::Qos,
 ///     session::{EndpointSpec, Session, SessionOptions},
 /// };
 ///
-/// let config = Config { daemon: DaemonPolicy::Off, ..Config::resolve([], None, &OsFiles)? };
+/// let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
 /// let session = Session::open(&config, SessionOptions::new("robot"))?;
 /// let spec = || EndpointSpec::new("/add", "AddTwoInts", Qos::default());
 /// let server = session.create_server(spec())?;

@@ -92,12 +92,12 @@ impl Session {
     /// use std::time::Duration;
     ///
     /// use axon_transport::{
-    ///     config::{Config, DaemonPolicy, OsFiles},
+    ///     config::{Config, DaemonPolicy},
     ///     qos::Qos,
     ///     session::{EndpointSpec, Session, SessionOptions, Waitable},
     /// };
     ///
-    /// let config = Config { daemon: DaemonPolicy::Off, ..Config::resolve([], None, &OsFiles)? };
+    /// let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
     /// let session = Session::open(&config, SessionOptions::new("robot"))?;
     /// let spec = || EndpointSpec::new("/t", "T", Qos::default());
     /// let subscription = session.create_subscription(spec())?;

@@ -242,11 +242,9 @@ fn of_twenty_that_start_at_once_one_starts_the_daemon() {
 fn other_security_settings_are_refused_by_name() {
     let host = Host::new().with("AXON_QUIC_CIPHER", "aes-256-gcm");
     let _daemon = host.daemon();
-    let config = Config {
-        cipher: axon_tls::Cipher::ChaCha20Poly1305,
-        daemon: DaemonPolicy::Require,
-        ..host.config()
-    };
+    let mut config = host.config();
+    config.cipher = axon_tls::Cipher::ChaCha20Poly1305;
+    config.daemon = DaemonPolicy::Require;
     let refused = Session::open(&config, SessionOptions::new("other")).unwrap_err();
     let SessionError::Mismatch { variable, ours, theirs, .. } = &refused else {
         panic!("{refused}")
@@ -269,7 +267,8 @@ fn require_without_a_daemon_fails_and_off_needs_none() {
     assert!(matches!(refused, SessionError::NoDaemon { .. }), "{refused}");
     assert!(matches!(host.status(), Err(SessionError::NoDaemon { .. })));
 
-    let config = Config { daemon: DaemonPolicy::Off, ..host.config() };
+    let mut config = host.config();
+    config.daemon = DaemonPolicy::Off;
     let session = Session::open(&config, SessionOptions::new("off")).unwrap();
     let subscription = session.create_subscription(spec("/t")).unwrap();
     let publisher = session.create_publisher(spec("/t")).unwrap();

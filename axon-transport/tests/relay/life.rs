@@ -97,9 +97,10 @@ fn another_daemon_takes_over() {
 #[test]
 fn without_a_daemon_to_be_relayed_by_it_is_an_error() {
     let host = host();
-    let config = Config { daemon: DaemonPolicy::Require, shm: false, ..host.config() };
+    let mut config = host.config();
+    (config.daemon, config.shm) = (DaemonPolicy::Require, false);
     assert!(Session::open(&config, SessionOptions::new("alone")).is_err());
-    let config = Config { daemon: DaemonPolicy::Off, ..config };
+    config.daemon = DaemonPolicy::Off;
     let alone = Session::open(&config, SessionOptions::new("alone")).unwrap();
     let (publisher, subscription) = connect(&alone, &alone, "/t", Qos::default());
     publish(&publisher, &pattern(1, 10));

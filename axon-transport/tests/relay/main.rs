@@ -66,7 +66,8 @@ fn host() -> Host {
 
 /// A session that shares memory with the daemon of `host`, or does not.
 fn session(host: &Host, name: &str, shm: bool) -> Session {
-    let config = Config { daemon: DaemonPolicy::Require, shm, ..host.config() };
+    let mut config = host.config();
+    (config.daemon, config.shm) = (DaemonPolicy::Require, shm);
     Session::open(&config, SessionOptions::new(name)).unwrap()
 }
 

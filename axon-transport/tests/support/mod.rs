@@ -63,10 +63,10 @@ impl Host {
         Config::resolve(env, None, &OsFiles)
     }
 
-    /// A session in this process with the daemon that runs. It starts none: a daemon would get the
-    /// environment of the tests.
+    /// A session in this process with the daemon that runs. It starts none, which would outlive the test.
     pub(crate) fn session(&self, name: &str) -> Result<Session, SessionError> {
-        let config = Config { daemon: DaemonPolicy::Require, ..self.config() };
+        let mut config = self.config();
+        config.daemon = DaemonPolicy::Require;
         Session::open(&config, SessionOptions::new(name))
     }
 

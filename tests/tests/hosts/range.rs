@@ -30,14 +30,17 @@ fn spec() -> EndpointSpec {
 /// A session of this process on `host`, with a range and static peers of its own.
 fn open(host: &Host, range: DiscoveryRange, lists: &[&Host]) -> Session {
     let static_peers = lists.iter().map(|peer| peer.address.to_string()).collect();
-    let config = Config { range, static_peers, daemon: REQUIRE, ..host.config() };
+    let mut config = host.config();
+    (config.range, config.static_peers, config.daemon) = (range, static_peers, REQUIRE);
     Session::open(&config, SessionOptions::new(range.name())).unwrap()
 }
 
 /// As [`open`], sharing no memory with its daemon.
 fn open_relayed(host: &Host, range: DiscoveryRange, lists: &[&Host]) -> Session {
     let static_peers = lists.iter().map(|peer| peer.address.to_string()).collect();
-    let config = Config { range, static_peers, shm: false, daemon: REQUIRE, ..host.config() };
+    let mut config = host.config();
+    (config.range, config.static_peers, config.daemon) = (range, static_peers, REQUIRE);
+    config.shm = false;
     Session::open(&config, SessionOptions::new("relayed")).unwrap()
 }
 

@@ -248,7 +248,8 @@ fn with_kme_keys_each_daemon_proves_its_sessions() {
 fn a_relayed_session_is_proved_by_the_daemon_that_relays_it() {
     let camera = Camera::new();
     let [reader, owner] = [&camera.a, &camera.b].map(|host| {
-        let config = Config { shm: false, ..host.config() };
+        let mut config = host.config();
+        config.shm = false;
         Session::open(&config, SessionOptions::new("relayed")).unwrap()
     });
     let subscription = reader.create_subscription(spec(TOPIC)).unwrap();

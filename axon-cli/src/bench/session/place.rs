@@ -78,6 +78,7 @@ pub(in crate::bench) fn session(settings: &Settings) -> Result<Session> {
 /// With them a session finds its daemon.
 pub(in crate::bench) fn config(settings: &Settings) -> Result<Config> {
     let env = settings.iter().map(|(name, value)| (OsString::from(name), OsString::from(value)));
-    let config = Config::resolve(env, None, &OsFiles)?;
-    Ok(Config { daemon: DaemonPolicy::Require, ..config })
+    let mut config = Config::resolve(env, None, &OsFiles)?;
+    config.daemon = DaemonPolicy::Require;
+    Ok(config)
 }

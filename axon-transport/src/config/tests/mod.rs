@@ -14,6 +14,7 @@ use proptest::prelude::*;
 
 use super::*;
 
+mod builder;
 mod refused;
 
 /// A file system in memory, so that any bytes may name files in it.
@@ -391,7 +392,8 @@ fn summaries_differ_exactly_where_settings_do() {
 }
 
 fn names_and_noise() -> impl Strategy<Value = Vec<u8>> {
-    let known = names::SETTINGS.iter().map(|name| name.as_bytes().to_vec()).collect::<Vec<_>>();
+    let names = names::SETTINGS.iter().chain(names::LINK);
+    let known = names.map(|name| name.as_bytes().to_vec()).collect::<Vec<_>>();
     prop_oneof![
         6 => proptest::sample::select(known),
         1 => proptest::sample::select(vec![&b"AXON_CONFIG"[..], b"ROS_DOMAIN_ID", b"ROS_STATIC_PEERS"])

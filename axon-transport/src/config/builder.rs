@@ -1,0 +1,366 @@
+//! A configuration that a program writes, in place of the environment or on top of it.
+
+use std::{fmt::Display, net::IpAddr, path::Path, time::Duration};
+
+use axon_tls::{Cipher, PskKex};
+
+use super::{
+    ClassicAuth, Config, ConfigError, DaemonPolicy, DiscoveryRange, KeyMode, OsFiles, QkdPeers,
+    SecurityMode, names, passed_on::PassedOn, resolve::resolve, sources::Given, values::method,
+};
+
+/// Makes a [`Config`] in code. Each method gives the setting of `docs/configuration.md` that has its name:
+/// [`kme_url`](Self::kme_url) is `AXON_KME_URL`, and `kme_url` of `axon.toml`.
+///
+/// [`Config::builder`] starts from the defaults and reads no environment and no file;
+/// [`ConfigBuilder::from_env`] starts from what [`Config::from_env`] would read. [`build`](Self::build)
+/// validates all settings together, by the same rules as those of the environment: what is refused there
+/// is refused here. A daemon that a session starts with the configuration gets the same settings.
+///
+/// ```
+/// use axon_transport::{
+///     config::{Config, DaemonPolicy},
+///     qos::Qos,
+///     session::{EndpointSpec, Session, SessionOptions},
+/// };
+///
+/// let config = Config::builder()
+///     .domain(7)
+///     .ring_buffer_size_mb(16)
+///     .daemon_peers(["robot-2", "10.0.0.7:61300"])
+///     // Without a daemon: nobody but this process is reached.
+///     .daemon(DaemonPolicy::Off)
+///     .build()?;
+/// let session = Session::open(&config, SessionOptions::new("example"))?;
+/// let publisher = session.create_publisher(EndpointSpec::new("/t", "T", Qos::default()))?;
+/// publisher.publish(b"hello")?;
+///
+/// // Half of what a mode needs is an error that names the setting that is missing.
+/// let error = Config::builder().classic_key("/dev/null").build().unwrap_err();
+/// assert_eq!(error.variable(), "AXON_CLASSIC_TRUST");
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Clone, Debug, Default)]
+#[must_use]
+pub struct ConfigBuilder {
+    reads_environment: bool,
+    given: Given,
+    /// The first value that cannot be written as a setting.
+    refused: Option<ConfigError>,
+}
+
+impl Config {
+    /// A builder that starts from the defaults. It reads no environment, and no file but those given to it.
+    pub fn builder() -> ConfigBuilder {
+        ConfigBuilder::default()
+    }
+}
+
+/// The defaults of `docs/configuration.md`. No environment and no file is read.
+impl Default for Config {
+    fn default() -> Self {
+        match Self::builder().build() {
+            Ok(config) => config,
+            Err(error) => unreachable!("the defaults are valid: {error}"),
+        }
+    }
+}
+
+impl ConfigBuilder {
+    /// A builder that starts from the environment and the `axon.toml` that [`Config::from_env`] would read,
+    /// at the time of [`build`](Self::build). What is given to it wins.
+    pub fn from_env() -> Self {
+        Self { reads_environment: true, ..Self::default() }
+    }
+
+    /// The configuration.
+    ///
+    /// # Errors
+    /// A setting that is wrong, half-given or without effect, by the name of its variable. Files that are
+    /// named must exist and have the right mode.
+    pub fn build(self) -> Result<Config, ConfigError> {
+        let Self { reads_environment, given, refused } = self;
+        if let Some(error) = refused {
+            return Err(error);
+        }
+        if reads_environment {
+            return Config::from_environment(given);
+        }
+        let set =
+            given.iter().filter_map(|(name, text)| Some((name.into(), text.as_ref()?.into())));
+        let passed_on = PassedOn::whole(set, None, &OsFiles);
+        resolve([], &given, None, &OsFiles, passed_on)
+    }
+
+    /// The settings that were given.
+    #[cfg(test)]
+    pub(super) fn names(&self) -> Vec<&'static str> {
+        self.given.keys().copied().collect()
+    }
+
+    fn set(mut self, name: &'static str, text: impl Display) -> Self {
+        self.given.insert(name, Some(text.to_string()));
+        self
+    }
+
+    fn refuse(mut self, name: &'static str, read: &str, accepted: &str) -> Self {
+        let error = ConfigError::value(name, read, accepted).at(method(name));
+        self.refused.get_or_insert(error);
+        self
+    }
+
+    fn path(self, name: &'static str, path: impl AsRef<Path>) -> Self {
+        match path.as_ref().to_str() {
+            Some(path) => self.set(name, path),
+            None => self.refuse(name, &path.as_ref().to_string_lossy(), "a path in UTF-8"),
+        }
+    }
+
+    /// Entries, none of which may be read as two or as something else.
+    fn list<T: Display>(self, name: &'static str, entries: impl IntoIterator<Item = T>) -> Self {
+        let entries: Vec<String> = entries.into_iter().map(|entry| entry.to_string()).collect();
+        let one = |entry: &&String| {
+            entry.is_empty()
+                || *entry == "*"
+                || entry.trim() != **entry
+                || entry.contains([';', ','])
+        };
+        if let Some(entry) = entries.iter().find(one) {
+            let accepted = "entries that are not empty and not *, without ; and , and outer spaces";
+            return self.refuse(name, entry, accepted);
+        }
+        self.set(name, entries.join(";"))
+    }
+
+    fn seconds(self, name: &'static str, time: Duration) -> Self {
+        if time.subsec_nanos() != 0 {
+            return self.refuse(name, &format!("{time:?}"), "whole seconds");
+        }
+        self.set(name, time.as_secs())
+    }
+
+    /// How peers prove themselves and agree on keys. Default [`Classic`](SecurityMode::Classic).
+    pub fn security_mode(self, mode: SecurityMode) -> Self {
+        self.set("AXON_SECURITY_MODE", mode.name())
+    }
+
+    /// The one cipher offered. Default ChaCha20-Poly1305.
+    pub fn quic_cipher(self, cipher: Cipher) -> Self {
+        self.set("AXON_QUIC_CIPHER", cipher.name())
+    }
+
+    /// How a peer is known in `classic`. Default [`Pinned`](ClassicAuth::Pinned) where
+    /// [`classic_key`](Self::classic_key) or [`classic_trust`](Self::classic_trust) is given, else
+    /// [`None`](ClassicAuth::None).
+    pub fn classic_auth(self, auth: ClassicAuth) -> Self {
+        self.set("AXON_CLASSIC_AUTH", auth.name())
+    }
+
+    /// This host's private key, PKCS#8, mode 0600 or 0400.
+    pub fn classic_key(self, file: impl AsRef<Path>) -> Self {
+        self.path("AXON_CLASSIC_KEY", file)
+    }
+
+    /// The file of pins.
+    pub fn classic_trust(self, file: impl AsRef<Path>) -> Self {
+        self.path("AXON_CLASSIC_TRUST", file)
+    }
+
+    /// The file of roots, for [`Ca`](ClassicAuth::Ca).
+    pub fn classic_ca(self, file: impl AsRef<Path>) -> Self {
+        self.path("AXON_CLASSIC_CA", file)
+    }
+
+    /// This host's certificate chain, for [`Ca`](ClassicAuth::Ca).
+    pub fn classic_cert(self, file: impl AsRef<Path>) -> Self {
+        self.path("AXON_CLASSIC_CERT", file)
+    }
+
+    /// Certificate revocation lists, for [`Ca`](ClassicAuth::Ca).
+    pub fn classic_crl(self, file: impl AsRef<Path>) -> Self {
+        self.path("AXON_CLASSIC_CRL", file)
+    }
+
+    /// What KME keys protect. Default [`Messages10`](KeyMode::Messages10).
+    pub fn qkd_key_mode(self, mode: KeyMode) -> Self {
+        self.set("AXON_QKD_KEY_MODE", mode.name())
+    }
+
+    /// The key exchange beside the KME key. Default `psk_ke`, none.
+    pub fn qkd_kex(self, kex: PskKex) -> Self {
+        self.set("AXON_QKD_KEX", kex.name())
+    }
+
+    /// Which SAEs may be peers. Required in `qkd`.
+    pub fn qkd_peers(self, peers: QkdPeers) -> Self {
+        const NAME: &str = "AXON_QKD_PEERS";
+        match peers {
+            QkdPeers::Any => self.set(NAME, "*"),
+            QkdPeers::Listed(saes) => self.list(NAME, saes),
+        }
+    }
+
+    /// The age at which a connection is made anew under a new key, in whole seconds up to a day. Default
+    /// one hour.
+    pub fn qkd_session_max_age(self, age: Duration) -> Self {
+        self.seconds("AXON_QKD_SESSION_MAX_AGE", age)
+    }
+
+    /// `https://host[:port][/path]` of this host's KME. Required in `qkd`.
+    pub fn kme_url(self, url: impl Into<String>) -> Self {
+        self.set("AXON_KME_URL", url.into())
+    }
+
+    /// The file of roots for the KME's certificate. Required in `qkd`.
+    pub fn kme_ca(self, file: impl AsRef<Path>) -> Self {
+        self.path("AXON_KME_CA", file)
+    }
+
+    /// The common name that the KME's certificate must have too. Default not checked.
+    pub fn kme_id(self, id: impl Into<String>) -> Self {
+        self.set("AXON_KME_ID", id.into())
+    }
+
+    /// Deviations of the KME to tolerate, by the names of
+    /// [`Quirks::NAMES`](etsi_qkd014::Quirks::NAMES). Default none.
+    pub fn kme_quirks(self, names: impl IntoIterator<Item = impl Into<String>>) -> Self {
+        self.list("AXON_KME_QUIRKS", names.into_iter().map(Into::into))
+    }
+
+    /// The time that TCP and TLS to the KME may take, 1 to 10 whole seconds. Default 2 s.
+    pub fn kme_connect_timeout(self, time: Duration) -> Self {
+        self.seconds("AXON_KME_CONNECT_TIMEOUT", time)
+    }
+
+    /// The time that a whole call to the KME may take, 1 to 10 whole seconds. Default 3 s.
+    pub fn kme_answer_timeout(self, time: Duration) -> Self {
+        self.seconds("AXON_KME_ANSWER_TIMEOUT", time)
+    }
+
+    /// This host's SAE ID. Required in `qkd`.
+    pub fn sae_id(self, id: impl Into<String>) -> Self {
+        self.set("AXON_SAE_ID", id.into())
+    }
+
+    /// The client certificate for the KME. Required in `qkd`.
+    pub fn sae_cert(self, file: impl AsRef<Path>) -> Self {
+        self.path("AXON_SAE_CERT", file)
+    }
+
+    /// Its private key, mode 0600 or 0400. Required in `qkd`.
+    pub fn sae_key(self, file: impl AsRef<Path>) -> Self {
+        self.path("AXON_SAE_KEY", file)
+    }
+
+    /// What a session does about its daemon. Default [`Spawn`](DaemonPolicy::Spawn).
+    pub fn daemon(self, policy: DaemonPolicy) -> Self {
+        self.set("AXON_DAEMON", policy.name())
+    }
+
+    /// The daemon's program. Default: it is looked for, as `docs/configuration.md` says.
+    pub fn daemon_path(self, program: impl AsRef<Path>) -> Self {
+        self.path("AXON_DAEMON_PATH", program)
+    }
+
+    /// The absolute path of the directory for what a daemon keeps, and for the session socket. Default
+    /// none: the daemon has an abstract name alone, and keeps nothing.
+    pub fn runtime_dir(self, directory: impl AsRef<Path>) -> Self {
+        self.path("AXON_RUNTIME_DIR", directory)
+    }
+
+    /// The history of a publisher, 1 to 65536 MiB. Default 64.
+    pub fn ring_buffer_size_mb(self, mib: u64) -> Self {
+        self.set("AXON_RING_BUFFER_SIZE_MB", mib)
+    }
+
+    /// The largest message, 1 to 4095 MiB. Default 256.
+    pub fn max_message_mb(self, mib: u64) -> Self {
+        self.set("AXON_MAX_MESSAGE_MB", mib)
+    }
+
+    /// The daemon's queue of reliable samples for other hosts, 1 to 65536 MiB. Default 256.
+    pub fn reliable_queue_mb(self, mib: u64) -> Self {
+        self.set("AXON_RELIABLE_QUEUE_MB", mib)
+    }
+
+    /// Whether the process shares memory with others. Default true.
+    pub fn shm(self, shared: bool) -> Self {
+        self.set("AXON_SHM", if shared { "on" } else { "off" })
+    }
+
+    /// Whether samples of more than 4 KiB are copied when they are taken. Default false.
+    pub fn shm_copy(self, copy: bool) -> Self {
+        self.set("AXON_SHM_COPY", u8::from(copy))
+    }
+
+    /// Users beside this one whose daemon and sessions are trusted. Default none.
+    pub fn trusted_uids(self, uids: impl IntoIterator<Item = u32>) -> Self {
+        self.list("AXON_TRUSTED_UIDS", uids)
+    }
+
+    /// What the daemon logs: levels or `target=level`, separated by commas. Default `warn`.
+    pub fn log(self, filter: impl Into<String>) -> Self {
+        self.set("AXON_LOG", filter.into())
+    }
+
+    /// An `axon.toml` to read; what is given to the builder wins over it. Default none from
+    /// [`Config::builder`].
+    pub fn config(self, file: impl AsRef<Path>) -> Self {
+        self.path(names::CONFIG, file)
+    }
+
+    /// Local addresses of discovery and links, 1 to 16. Default all.
+    pub fn bind_addrs(self, addresses: impl IntoIterator<Item = IpAddr>) -> Self {
+        self.list("AXON_BIND_ADDRS", addresses)
+    }
+
+    /// Peers to try beside those that discovery finds: `host`, `host:port` or `[IPv6]:port`, up to 64.
+    pub fn daemon_peers(self, peers: impl IntoIterator<Item = impl Into<String>>) -> Self {
+        self.list("AXON_DAEMON_PEERS", peers.into_iter().map(Into::into))
+    }
+
+    /// Addresses to state in beacons, up to 4. Default those of the interfaces.
+    pub fn advertise_addrs(self, addresses: impl IntoIterator<Item = IpAddr>) -> Self {
+        self.list("AXON_ADVERTISE_ADDRS", addresses)
+    }
+
+    /// `ROS_DOMAIN_ID`, 0 to 232. Default 0.
+    pub fn domain(self, domain: u32) -> Self {
+        self.set("ROS_DOMAIN_ID", domain)
+    }
+
+    /// How far a session is discovered (`ROS_AUTOMATIC_DISCOVERY_RANGE`). Default
+    /// [`Subnet`](DiscoveryRange::Subnet).
+    pub fn discovery_range(mut self, range: DiscoveryRange) -> Self {
+        // It would win.
+        self.given.insert("ROS_LOCALHOST_ONLY", None);
+        self.set("ROS_AUTOMATIC_DISCOVERY_RANGE", range.name())
+    }
+
+    /// Addresses or host names of static peers (`ROS_STATIC_PEERS`), up to 32.
+    pub fn static_peers(self, peers: impl IntoIterator<Item = impl Into<String>>) -> Self {
+        self.list("ROS_STATIC_PEERS", peers.into_iter().map(Into::into))
+    }
+
+    /// How long a daemon that a session started outlives its last session, in whole seconds up to a day.
+    /// Default 10 s.
+    pub fn link_grace(self, time: Duration) -> Self {
+        self.seconds("AXON_LINK_GRACE_S", time)
+    }
+
+    /// The time after which a peer that takes nothing of a KEEP_ALL topic is disconnected from it, in whole
+    /// seconds from 1 s to a day. Default 10 s.
+    pub fn link_stalled(self, time: Duration) -> Self {
+        self.seconds("AXON_LINK_STALLED_S", time)
+    }
+
+    /// The largest UDP payload that path discovery tries, 1200 to 65527 bytes. Default 1452.
+    pub fn link_mtu(self, bytes: u16) -> Self {
+        self.set("AXON_LINK_MTU", bytes)
+    }
+
+    /// What the graph of one peer may take, and its routes as much again, 1 to 1024 MiB. Default 16.
+    pub fn link_graph_mb(self, mib: u64) -> Self {
+        self.set("AXON_LINK_GRAPH_MB", mib)
+    }
+}

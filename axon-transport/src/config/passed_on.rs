@@ -1,0 +1,61 @@
+//! How the settings of a session reach the daemon that it starts: by the environment, and by nothing else.
+
+use std::{
+    collections::BTreeMap,
+    ffi::{OsStr, OsString},
+    path::Path,
+};
+
+use super::{files::Files, names, sources::FOREIGN};
+
+/// The variables of a daemon that a session starts.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct PassedOn {
+    /// Whether it gets the settings in the session's environment too, as they are when it is started.
+    pub(crate) inherits: bool,
+    /// Variables that have this value, or none, whatever the session's environment says.
+    pub(crate) variables: BTreeMap<OsString, Option<OsString>>,
+}
+
+impl PassedOn {
+    /// The settings of a session that did not read the environment: these alone, and no `axon.toml` but
+    /// `file`.
+    pub(super) fn whole(
+        settings: impl IntoIterator<Item = (OsString, OsString)>,
+        file: Option<&Path>,
+        files: &impl Files,
+    ) -> Self {
+        let file = file.unwrap_or(Path::new("/dev/null"));
+        let mut variables = BTreeMap::from([(names::CONFIG.into(), Some(file.into()))]);
+        let is_setting = |name: &OsString| {
+            let known = |name: &str| FOREIGN.contains(&name) || names::setting(name).is_ok();
+            name.to_str().is_some_and(known)
+        };
+        variables.extend(
+            settings.into_iter().filter(|(name, _)| is_setting(name)).map(|(n, v)| (n, Some(v))),
+        );
+        Self { inherits: false, variables }.absolute(files)
+    }
+
+    /// The session's environment, with these variables in place of its own.
+    pub(super) fn inherited(
+        variables: impl IntoIterator<Item = (&'static str, Option<OsString>)>,
+        files: &impl Files,
+    ) -> Self {
+        let variables = variables.into_iter().map(|(name, value)| (name.into(), value)).collect();
+        Self { inherits: true, variables }.absolute(files)
+    }
+
+    /// The session's process may be in another directory by the time it starts a daemon.
+    fn absolute(mut self, files: &impl Files) -> Self {
+        let Ok(directory) = files.current_dir() else { return self };
+        for name in names::PATHS {
+            if let Some(Some(value)) = self.variables.get_mut(OsStr::new(name))
+                && !value.is_empty()
+            {
+                *value = directory.join(&*value).into();
+            }
+        }
+        self
+    }
+}
