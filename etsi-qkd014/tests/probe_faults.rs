@@ -46,7 +46,7 @@ const SAME_BY_POST: &str = "dec_keys by POST: the same 3 keys";
 const AGAIN: &str = "dec_keys of the same key again";
 
 /// What stands on the answer to a request that no key is given to.
-const NOTHING_SERVED: Rows = &[
+const NOTHING_ANSWERED: Rows = &[
     ANSWERED,
     ACCEPTED,
     STATUS_OF_NOBODY,
@@ -56,8 +56,12 @@ const NOTHING_SERVED: Rows = &[
     OTHER_TYPE,
 ];
 
+/// The same where each answer is a refusal, of which some may have any code.
+const NOTHING_SERVED: Rows =
+    &[ANSWERED, ACCEPTED, UNKNOWN_BY_POST, UNKNOWN_BY_GET, BROKEN_JSON, OTHER_TYPE];
+
 /// A fault at the master's KME, or with `slave:` before it at the slave's.
-const FAULTS: [(&str, Rows); 41] = [
+const FAULTS: [(&str, Rows); 43] = [
     ("handshake-refused", &[CERTIFICATE]),
     ("handshake-dropped", &[CERTIFICATE]),
     ("certificate-expired", &[CERTIFICATE]),
@@ -70,9 +74,9 @@ const FAULTS: [(&str, Rows); 41] = [
     ("empty", NOTHING_SERVED),
     ("busy=1", NOTHING_SERVED),
     ("status=500", NOTHING_SERVED),
-    ("reset", NOTHING_SERVED),
-    ("cut", NOTHING_SERVED),
-    ("endless", NOTHING_SERVED),
+    ("reset", NOTHING_ANSWERED),
+    ("cut", NOTHING_ANSWERED),
+    ("endless", NOTHING_ANSWERED),
     ("lying-length,on=status", &[ANSWERED, ACCEPTED, STATUS_OF_NOBODY]),
     ("status=400,on=status", &[ANSWERED, ACCEPTED, ERROR]),
     ("garbage,on=status", &["a JSON object", ACCEPTED, ERROR]),
@@ -96,6 +100,12 @@ const FAULTS: [(&str, Rows); 41] = [
             BY_GET,
             BY_POST,
         ],
+    ),
+    // Refused by a code that the specification names nowhere.
+    ("status=404,on=status", &[ANSWERED, ACCEPTED]),
+    (
+        "status=404,on=enc_keys",
+        &[ODD_SIZE, MANDATORY, NO_NUMBER, NO_NUMBER_IN_URL, BY_GET, BY_POST],
     ),
     // Refused, and not in the words of the specification.
     ("status=400,on=dec_keys", &[UNKNOWN_WORDS, NOT_NAMED]),
@@ -264,6 +274,22 @@ async fn each_check_sees_its_fault_and_no_other_does() {
         "{left:?}"
     );
     assert_eq!(left.len(), NOT_SHOWN.len(), "{left:?}");
+}
+
+/// A KME that knows its peers and its limits may say so by any code.
+#[tokio::test(flavor = "multi_thread")]
+async fn refusals_without_a_code_in_the_specification_are_noted_whatever_their_code() {
+    for code in [403, 404, 422, 503] {
+        let status = simulated(&format!("status={code},on=status")).await;
+        assert!(status.with("note").iter().any(|row| row.starts_with(STATUS_OF_NOBODY)));
+    }
+    // Its status is intact, so that its limits are known and tried.
+    let probed = simulated("status=404,on=enc_keys").await;
+    let noted = probed.with("note");
+    for row in [NUMBER, SIZE, SLAVES, KEYS_FOR_NOBODY] {
+        assert!(noted.iter().any(|noted| noted.starts_with(row)), "{row}: {}", probed.text);
+    }
+    assert!(probed.text.contains(" noted"), "{}", probed.text);
 }
 
 #[test]

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use super::party::Party;
 use super::quirks::{self, Tolerated};
-use super::refusals::{message, nobody, refused};
+use super::refusals::{message, nobody, not_served, refused};
 use super::report::{Report, Verdict};
 use super::wire::{Raw, Wire};
 use crate::{Outcome, other};
@@ -26,28 +26,28 @@ pub(super) async fn refusals(
     let url = master.method(slave, "enc_keys")?;
     let post = async |body: Value| wire.post(url.clone(), body.to_string()).await;
     let most = status.max_key_per_request;
-    let expected = "number over max_key_per_request: 400";
+    let expected = "number over max_key_per_request: refused, as by 400";
     match most.checked_add(1).filter(|_| most > 0) {
         Some(number) => {
             let raw = post(json!({ "number": number })).await;
-            refused(report, "6.2", expected, &raw, &[400]);
+            not_served(report, "6.2", expected, &raw, &[400]);
         }
         None => report.skip("6.2", expected, "the status does not say how many"),
     }
     let (min, max) = (status.min_key_size, status.max_key_size);
-    let expected = "size over max_key_size: 400";
+    let expected = "size over max_key_size: refused, as by 400";
     if max == 0 {
         report.skip("6.2", expected, "the status does not say how large");
     } else {
         let raw = post(json!({ "size": u64::from(max) + 8 })).await;
-        refused(report, "6.2", expected, &raw, &[400]);
+        not_served(report, "6.2", expected, &raw, &[400]);
     }
-    let expected = "size under min_key_size: 400";
+    let expected = "size under min_key_size: refused, as by 400";
     if min <= 8 {
         report.skip("6.2", expected, "no smaller size to ask for");
     } else {
         let raw = post(json!({ "size": min - 8 })).await;
-        refused(report, "6.2", expected, &raw, &[400]);
+        not_served(report, "6.2", expected, &raw, &[400]);
     }
     match status.key_size.checked_sub(1) {
         Some(size) => odd_size(&post(json!({ "size": size })).await, report),
@@ -57,12 +57,12 @@ pub(super) async fn refusals(
     let raw = post(json!({ "extension_mandatory": [{ "kmesim_unsupported": true }] })).await;
     refused(report, "6.2", "unsupported extension_mandatory: 400", &raw, &[400]);
     message(report, "6.2", &raw, "not all extension_mandatory parameters are supported");
-    let expected = "more than max_SAE_ID_count additional slaves: 400";
+    let expected = "more than max_SAE_ID_count additional slaves: refused, as by 400";
     match status.max_sae_id_count {
         count @ 0..1000 => {
             let ids: Vec<_> = (0..=count).map(|_| nobody()).collect();
             let raw = post(json!({ "additional_slave_SAE_IDs": ids })).await;
-            refused(report, "6.2", expected, &raw, &[400]);
+            not_served(report, "6.2", expected, &raw, &[400]);
         }
         count => report.skip("6.2", expected, &format!("{count} are too many to try")),
     }
@@ -72,7 +72,8 @@ pub(super) async fn refusals(
     get.query_pairs_mut().append_pair("number", "one");
     refused(report, "6.2", "number in the URL that is none: 400", &wire.get(get).await, &[400]);
     let raw = wire.get(master.method(&nobody(), "enc_keys")?).await;
-    refused(report, "5.3", "enc_keys for an unknown SAE: 400 or 401", &raw, &[400, 401]);
+    let expected = "enc_keys for an unknown SAE: refused, as by 400 or 401";
+    not_served(report, "5.3", expected, &raw, &[400, 401]);
     Ok(())
 }
 

@@ -25,8 +25,10 @@ use crate::{Failure, Outcome, other, say};
 /// what came, verdict.
 ///
 /// Without --consume-keys nothing is asked that a KME would serve with keys. What is not given is
-/// read from the environment that `kme-sim init` prints. Exit status: 0 if all checks passed (or
-/// were skipped), 1 if one failed or was only tolerated, 2 on wrong arguments.
+/// read from the environment that `kme-sim init` prints. A refusal by a code that the specification
+/// does not name for it (a limit exceeded, an unknown SAE) is noted, and no failure. Exit status: 0 if
+/// all checks passed (or were skipped or noted), 1 if one failed or was only tolerated, 2 on wrong
+/// arguments.
 #[derive(Args)]
 pub(crate) struct Arguments {
     /// `https://host[:port][/prefix]` of the KME.

@@ -3,7 +3,7 @@
 use serde_json::Value;
 
 use super::party::Party;
-use super::report::Report;
+use super::report::{Report, Verdict};
 use super::wire::{Raw, Wire};
 use crate::Outcome;
 
@@ -29,7 +29,13 @@ pub(super) async fn refusals(
     report: &mut Report,
 ) -> Outcome {
     let raw = wire.get(party.method(&nobody(), "status")?).await;
-    refused(report, "5.2", "status of an unknown SAE: 400 or 401", &raw, &[400, 401]);
+    not_served(
+        report,
+        "5.2",
+        "status of an unknown SAE: refused, as by 400 or 401",
+        &raw,
+        &[400, 401],
+    );
     error_format(report, &raw);
 
     let id = unknown_key_id();
@@ -49,6 +55,7 @@ pub(super) async fn refusals(
     Ok(())
 }
 
+/// A refusal by a code that the specification names for it.
 pub(super) fn refused(
     report: &mut Report,
     clause: &'static str,
@@ -59,6 +66,23 @@ pub(super) fn refused(
     match raw {
         Ok(raw) => report.check(clause, expected, raw.summary(), codes.contains(&raw.status)),
         Err(why) => report.check(clause, expected, why, false),
+    }
+}
+
+/// A refusal for which the specification names no code: another than the usual ones is worth a note, and no
+/// fault. Serving the request is one.
+pub(super) fn not_served(
+    report: &mut Report,
+    clause: &'static str,
+    expected: &str,
+    raw: &Result<Raw, String>,
+    usual: &[u16],
+) {
+    match raw {
+        Ok(raw) if matches!(raw.status, 400..=599) && !usual.contains(&raw.status) => {
+            report.row(clause, expected, raw.summary(), Verdict::Note);
+        }
+        _ => refused(report, clause, expected, raw, usual),
     }
 }
 

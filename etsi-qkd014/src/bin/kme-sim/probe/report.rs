@@ -10,7 +10,7 @@ pub(super) enum Verdict {
     /// Against the specification, and a client with these quirks works all the same.
     Tolerated(Vec<&'static str>),
     Skipped(String),
-    /// Nothing that the specification asks for.
+    /// Nothing that the specification asks for, or leaves no doubt about.
     Note,
 }
 
@@ -93,11 +93,12 @@ impl fmt::Display for Report {
         }
         writeln!(
             f,
-            "{} passed, {} failed, {} tolerated, {} skipped",
+            "{} passed, {} failed, {} tolerated, {} skipped, {} noted",
             self.count(|v| *v == Verdict::Pass),
             self.count(|v| *v == Verdict::Fail),
             self.count(|v| matches!(v, Verdict::Tolerated(_))),
             self.count(|v| matches!(v, Verdict::Skipped(_))),
+            self.count(|v| *v == Verdict::Note),
         )
     }
 }
