@@ -708,8 +708,9 @@ typedef struct axon_session_options_t {
      */
     const char *name;
     /**
-     * The daemon's program, where `AXON_DAEMON_PATH` names none; null: `axon_daemon` beside this
-     * program or the library. An `axon.toml` beside it is read.
+     * The daemon's program, where `AXON_DAEMON_PATH` names none. An `axon.toml` beside it is read. Null:
+     * `axon_daemon`, else `axon`, in the first of these folders that has it: this program's own, the
+     * library's, those in `PATH`, and the one where cargo installs programs.
      */
     const char *daemon_path;
 } axon_session_options_t;

@@ -57,8 +57,9 @@ pub struct axon_session_options_t {
     pub static_peer_count: usize,
     /// Shown to people; null or empty: the program's name.
     pub name: *const c_char,
-    /// The daemon's program, where `AXON_DAEMON_PATH` names none; null: `axon_daemon` beside this
-    /// program or the library. An `axon.toml` beside it is read.
+    /// The daemon's program, where `AXON_DAEMON_PATH` names none. An `axon.toml` beside it is read. Null:
+    /// `axon_daemon`, else `axon`, in the first of these folders that has it: this program's own, the
+    /// library's, those in `PATH`, and the one where cargo installs programs.
     pub daemon_path: *const c_char,
 }
 
