@@ -147,6 +147,18 @@ pub struct QkdConfig {
     pub kme_answer_timeout: Duration,
 }
 
+impl QkdConfig {
+    /// The quirk of a KME whose certificate does not name the host in its URL, as one without a
+    /// subjectAltName: the host's name is not checked, and [`kme_id`](Self::kme_id) alone tells the KME
+    /// from other holders of a certificate from [`kme_ca`](Self::kme_ca). Not valid without that ID.
+    pub const NO_NAME_CHECK: &'static str = "no-name-check";
+
+    /// Whether the KME's certificate must name the host in the KME's URL.
+    pub fn checks_name(&self) -> bool {
+        !self.kme_quirks.iter().any(|quirk| quirk == Self::NO_NAME_CHECK)
+    }
+}
+
 /// What KME keys protect (`AXON_QKD_KEY_MODE`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum KeyMode {

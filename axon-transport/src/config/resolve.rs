@@ -198,6 +198,13 @@ fn qkd(values: &Values<'_, impl Files>) -> Result<QkdConfig, ConfigError> {
     }
     let max_age = values.number("AXON_QKD_SESSION_MAX_AGE", 1..=86_400, "seconds")?;
     let (kme_connect_timeout, kme_answer_timeout) = kme_timeouts(values)?;
+    let kme_id = values.kme_id("AXON_KME_ID")?;
+    let kme_quirks = values.quirks("AXON_KME_QUIRKS")?;
+    if kme_id.is_none() && kme_quirks.iter().any(|quirk| quirk == QkdConfig::NO_NAME_CHECK) {
+        let accepted = "no-name-check with AXON_KME_ID only: without it any certificate of AXON_KME_CA \
+                        would do; set that, or remove this";
+        return Err(values.refuse("AXON_KME_QUIRKS", accepted));
+    }
     Ok(QkdConfig {
         key_mode: values.choice("AXON_QKD_KEY_MODE", &key_modes)?.unwrap_or(KeyMode::Messages10),
         kex: values.choice("AXON_QKD_KEX", &kexes)?.unwrap_or_default(),
@@ -209,11 +216,11 @@ fn qkd(values: &Values<'_, impl Files>) -> Result<QkdConfig, ConfigError> {
             "https://host:port of this host's KME",
         )?,
         kme_ca: file("AXON_KME_CA", Use::Public)?,
-        kme_id: values.kme_id("AXON_KME_ID")?,
+        kme_id,
         sae_id,
         sae_cert: file("AXON_SAE_CERT", Use::Public)?,
         sae_key: file("AXON_SAE_KEY", Use::Secret)?,
-        kme_quirks: values.quirks("AXON_KME_QUIRKS")?,
+        kme_quirks,
         kme_connect_timeout,
         kme_answer_timeout,
     })

@@ -8,7 +8,7 @@ use std::{
 };
 
 use super::{
-    ConfigError, PeerAddress, QkdPeers,
+    ConfigError, PeerAddress, QkdConfig, QkdPeers,
     files::{FileKind, Files},
     names,
     sources::{self, Origin, Setting, Sources},
@@ -143,7 +143,9 @@ impl<F: Files> Values<'_, F> {
     }
 
     pub(super) fn quirks(&self, name: &str) -> Result<Vec<String>, ConfigError> {
-        let known: Vec<&str> = etsi_qkd014::Quirks::NAMES.iter().map(|(name, _)| *name).collect();
+        let mut known: Vec<&str> =
+            etsi_qkd014::Quirks::NAMES.iter().map(|(name, _)| *name).collect();
+        known.push(QkdConfig::NO_NAME_CHECK);
         let mut quirks = self.list(name, &known.join(", "), LONGEST_LIST, |entry| {
             known.contains(&entry).then(|| entry.to_owned())
         })?;

@@ -163,7 +163,11 @@ fn bad_values_are_refused_by_name() {
         ),
         (QKD, "AXON_KME_CA", &["/f/none", "/f"]),
         (QKD, "AXON_KME_ID", &["a\nb", "é"]),
-        (QKD, "AXON_KME_QUIRKS", &["lenient", "any-key-id,", "any-key-id;lenient"]),
+        (
+            QKD,
+            "AXON_KME_QUIRKS",
+            &["lenient", "any-key-id,", "any-key-id;lenient", "no-name-check"],
+        ),
         (QKD, "AXON_SAE_ID", &["sae-b", "sae a", "*", "a;b", "a,b", "a\n", "é"]),
         (QKD, "AXON_SAE_CERT", &["/f/none", "/f", "/f/anyone-writes"]),
         (QKD, "AXON_SAE_KEY", &["/f/none", "/f", "/f/open-key.pem"]),

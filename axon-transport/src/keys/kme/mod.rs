@@ -235,7 +235,8 @@ async fn next(
 }
 
 fn client(config: &QkdConfig) -> Result<Client, KmeError> {
-    let quirks = config.kme_quirks.join(",").parse::<Quirks>();
+    let of_client = config.kme_quirks.iter().filter(|quirk| *quirk != QkdConfig::NO_NAME_CHECK);
+    let quirks = of_client.cloned().collect::<Vec<_>>().join(",").parse::<Quirks>();
     let mut builder = Client::builder()
         .kme_url(&config.kme_url)
         .ca(read("AXON_KME_CA", &config.kme_ca, Demands::CERTIFICATES)?.as_slice())
@@ -245,11 +246,14 @@ fn client(config: &QkdConfig) -> Result<Client, KmeError> {
         .timeout(config.kme_answer_timeout)
         // The machines repeat what may be repeated, and know when.
         .retry(RetryPolicy::none())
-        .quirks(quirks.map_err(setting)?);
+        .quirks(quirks.map_err(|error| setting(config, error))?);
     if let Some(id) = &config.kme_id {
         builder = builder.kme_id(id);
     }
-    builder.build().map_err(setting)
+    if !config.checks_name() {
+        builder = builder.kme_id_replaces_name_check();
+    }
+    builder.build().map_err(|error| setting(config, error))
 }
 
 fn read(
@@ -262,17 +266,23 @@ fn read(
 }
 
 /// Names the variable behind the client's setting.
-fn setting(e: etsi_qkd014::Error) -> KmeError {
+fn setting(config: &QkdConfig, e: etsi_qkd014::Error) -> KmeError {
     let (setting, reason) = match e {
         etsi_qkd014::Error::Config { setting, reason } => (setting, reason),
         other => ("", other.to_string()),
     };
     let variable = match setting {
         "kme_url" => "AXON_KME_URL",
-        "ca" | "ca_file" => "AXON_KME_CA",
-        "sae_cert" | "sae_cert_file" => "AXON_SAE_CERT",
-        "sae_key" | "sae_key_file" => "AXON_SAE_KEY",
+        "ca" | "sae_cert" | "sae_key" => {
+            let (variable, path) = match setting {
+                "ca" => ("AXON_KME_CA", &config.kme_ca),
+                "sae_cert" => ("AXON_SAE_CERT", &config.sae_cert),
+                _ => ("AXON_SAE_KEY", &config.sae_key),
+            };
+            return KmeError::File { variable, path: path.display().to_string(), reason };
+        }
         "kme_id" => "AXON_KME_ID",
+        "kme_id_replaces_name_check" => "AXON_KME_QUIRKS",
         "quirks" => "AXON_KME_QUIRKS",
         _ => "KME client",
     };

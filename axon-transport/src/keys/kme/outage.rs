@@ -126,7 +126,8 @@ fn advice(kind: FailureKind) -> &'static str {
         }
         FailureKind::Unauthorized => {
             "Check AXON_SAE_CERT, AXON_SAE_KEY and AXON_KME_CA, the clocks, and that the KME knows \
-             this SAE"
+             this SAE. A KME whose certificate names no host needs AXON_KME_ID and \
+             AXON_KME_QUIRKS=no-name-check"
         }
         FailureKind::Ambiguous => {
             "Look at the KME, or set AXON_KME_ANSWER_TIMEOUT higher if it is slow; keys of such a \
