@@ -37,7 +37,7 @@ fn main() -> ExitCode {
         Command::Demo(args) => demo::run(args),
         Command::Play(args) => play::run(args).map(done),
         Command::Echo(args) => echo::run(args).map(done),
-        Command::Status(args) => status::run(args).map(done),
+        Command::Status(args) => status::run(args),
         Command::Trust(args) => trust::run(args).map(done),
         Command::Daemon(args) => daemon::run(args),
         Command::Bench(Bench::Shm(args)) => bench::shm(args).map(done),

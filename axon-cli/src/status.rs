@@ -1,10 +1,11 @@
 //! `axon status`: what the daemon says of itself, as tables.
 
-use std::{collections::BTreeMap, fmt::Write as _, io::Write as _};
+use std::{collections::BTreeMap, fmt::Write as _, io::Write as _, process::ExitCode};
 
 use axon_transport::{
+    config::DaemonPlace,
     daemon::status::{LinkStatus, RelayStatus, SessionStatus, Status, TopicStatus},
-    session,
+    gateway, session,
 };
 use serde_json::Value;
 
@@ -16,9 +17,26 @@ use crate::{
 };
 
 /// Runs `axon status`.
-pub(crate) fn run(args: &cli::Status) -> Result<(), Failure> {
-    let config = logging::configure()?;
-    let json = session::daemon_status(&config).map_err(crate::session::failure)?;
+///
+/// # Errors
+/// A setting by which the daemon is found; or what it answers cannot be shown.
+pub(crate) fn run(args: &cli::Status) -> Result<ExitCode, Failure> {
+    // Whatever is wrong with this host's settings and files: a daemon that runs can be looked at.
+    let wrong = match logging::configure() {
+        Ok(config) => gateway::check(&config).map_err(Failure::failed).err(),
+        Err(failure) => Some(failure),
+    };
+    let status = wrong.as_ref().map(Failure::report);
+    let json = match DaemonPlace::from_env().map(|place| session::daemon_status_at(&place)) {
+        Ok(Ok(json)) => json,
+        Ok(Err(error)) => {
+            let failure = crate::session::failure(error);
+            let said = failure.report();
+            return Ok(status.unwrap_or(said));
+        }
+        // It was said: no other setting is worth a second line.
+        Err(error) => return status.ok_or(error.into()),
+    };
     let text = if args.json {
         let value: Value = serde_json::from_str(&json).map_err(Failure::failed)?;
         let json = serde_json::to_string_pretty(&value).map_err(Failure::failed)?;
@@ -27,7 +45,7 @@ pub(crate) fn run(args: &cli::Status) -> Result<(), Failure> {
         render(&serde_json::from_str(&json).map_err(Failure::failed)?)
     };
     std::io::stdout().lock().write_all(text.as_bytes())?;
-    Ok(())
+    Ok(ExitCode::SUCCESS)
 }
 
 /// The status for people.

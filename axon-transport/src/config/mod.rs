@@ -20,6 +20,7 @@ mod files;
 mod model;
 mod names;
 mod passed_on;
+mod place;
 mod resolve;
 mod sources;
 mod summary;
@@ -37,6 +38,7 @@ pub use model::{
     ClassicAuth, ClassicConfig, Config, DaemonPolicy, DiscoveryRange, KeyMode, LinkConfig,
     PeerAddress, QkdConfig, QkdPeers, Security, SecurityMode,
 };
+pub use place::DaemonPlace;
 pub use summary::security_settings;
 
 impl Config {

@@ -38,6 +38,8 @@ pub(super) struct Sources {
     pub(super) strangers: Vec<String>,
     /// `[qkd]` of the file, where there is one: settings that count once the mode is `qkd`.
     of_qkd: Option<BTreeMap<&'static str, Setting>>,
+    /// Settings that alone are looked at; all if there are none.
+    only: Option<&'static [&'static str]>,
     /// `[link]` of the file.
     pub(super) link: toml::Table,
     pub(super) file: Option<Rc<PathBuf>>,
@@ -129,6 +131,29 @@ impl Sources {
         Ok(())
     }
 
+    /// The settings in `only`, whatever is wrong with others. A file that cannot be used counts as none.
+    pub(super) fn collect_only(
+        only: &'static [&'static str],
+        env: impl IntoIterator<Item = (OsString, OsString)>,
+        default_file: Option<&Path>,
+        files: &impl Files,
+    ) -> Result<Self, ConfigError> {
+        let counts = |name: &OsString| {
+            only.iter().chain(FOREIGN).chain([&names::CONFIG]).any(|known| name == known)
+        };
+        let env: Vec<_> = env.into_iter().filter(|(name, _)| counts(name)).collect();
+        let mut sources = Self { only: Some(only), ..Self::default() };
+        sources.take_environment(env)?;
+        let file = match sources.settings.remove(names::CONFIG) {
+            Some(setting) => named_file(&setting.text, files).ok(),
+            None => default_file.map(Path::to_path_buf),
+        };
+        if let Some(file) = file {
+            let _ = sources.take_file(file, files);
+        }
+        Ok(sources)
+    }
+
     fn take_given(&mut self, given: &Given) {
         for (name, text) in given.iter().filter_map(|(name, text)| Some((*name, text.as_ref()?))) {
             if FOREIGN.contains(&name) {
@@ -167,6 +192,10 @@ impl Sources {
         let path = Rc::new(path);
         let mut from_file = BTreeMap::new();
         for (key, value) in table {
+            let name = format!("AXON_{}", key.to_ascii_uppercase());
+            if self.only.is_some_and(|only| !only.contains(&name.as_str())) {
+                continue;
+            }
             if key == "link" {
                 let toml::Value::Table(link) = value else {
                     return Err(ConfigError::name("link", "a section, [link]").at(shown));

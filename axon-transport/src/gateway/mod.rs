@@ -9,6 +9,7 @@ pub mod attempt;
 
 mod accept;
 mod account;
+mod check;
 mod context;
 mod control;
 mod counters;
@@ -45,6 +46,7 @@ mod stalls;
 mod stand_in;
 mod status;
 
+pub use check::check;
 pub use endpoint::EndpointError;
 pub use error::GatewayError;
 pub use refusal::{Refusal, RefusedBy};

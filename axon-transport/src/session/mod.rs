@@ -57,7 +57,7 @@ pub use publisher::{Loan, Publisher};
 pub use service::{Client, Server};
 pub use state::SessionEvent;
 pub(crate) use state::Shared;
-pub use status::daemon_status;
+pub use status::{daemon_status, daemon_status_at};
 #[cfg(test)]
 pub(crate) use subscription::Lifetime;
 pub use subscription::{MessageInfo, Subscription};

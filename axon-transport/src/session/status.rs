@@ -18,7 +18,7 @@ use super::{
     state::{Outgoing, StatusAnswer, StatusText},
 };
 use crate::{
-    config::{Config, DaemonPolicy},
+    config::{Config, DaemonPlace, DaemonPolicy},
     ids::SessionId,
     shm::ShmError,
 };
@@ -69,7 +69,15 @@ impl Session {
 /// # Errors
 /// [`SessionError::NoDaemon`] when there is none.
 pub fn daemon_status(config: &Config) -> Result<String, SessionError> {
-    let config = Config { daemon: DaemonPolicy::Require, ..config.clone() };
+    daemon_status_at(&DaemonPlace::from(config))
+}
+
+/// The same where no more is known than where that daemon is: other settings may be wrong.
+///
+/// # Errors
+/// As [`daemon_status`].
+pub fn daemon_status_at(place: &DaemonPlace) -> Result<String, SessionError> {
+    let config = Config { daemon: DaemonPolicy::Require, ..place.config() };
     let options = SessionOptions::new("status").role(SessionRole::Tool);
     let caller = Caller {
         config: &config,

@@ -24,6 +24,14 @@ use self::{
 use super::{GatewayError, keyring::lock};
 use crate::config::ClassicConfig;
 
+/// Whether the files that `classic` names can be used.
+///
+/// # Errors
+/// A file that cannot, by the name of its variable.
+pub(super) fn check(classic: &ClassicConfig) -> Result<(), GatewayError> {
+    Sources::of(classic)?.load(None).map(drop)
+}
+
 /// What this host is, and whom it trusts, as its files say.
 pub(super) struct Identity {
     sources: Sources,

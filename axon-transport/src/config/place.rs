@@ -1,0 +1,76 @@
+//! What it takes to find a daemon: the few settings that say where it listens.
+
+use std::{
+    ffi::OsString,
+    path::{Path, PathBuf},
+};
+
+use super::{
+    Config, ConfigError, Files, OsFiles, environment, file_beside, resolve, sources::Sources,
+    values::Values,
+};
+
+const RUNTIME_DIR: &str = "AXON_RUNTIME_DIR";
+const TRUSTED_UIDS: &str = "AXON_TRUSTED_UIDS";
+
+/// Where the daemon of this user and domain listens, and whose it may be. It is known although other
+/// settings, or the files that they name, are wrong: for tools that look at a daemon, and open no session.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DaemonPlace {
+    pub(super) domain: u32,
+    pub(super) runtime_dir: Option<PathBuf>,
+    pub(super) socket_in_runtime_dir: bool,
+    pub(super) trusted_uids: Vec<u32>,
+}
+
+impl DaemonPlace {
+    /// The place by the environment of this process and the `axon.toml` that [`Config::from_env`] would
+    /// read. A file that cannot be read, or that is no TOML, counts as none.
+    ///
+    /// # Errors
+    /// `ROS_DOMAIN_ID`, `AXON_RUNTIME_DIR` or `AXON_TRUSTED_UIDS` is wrong.
+    pub fn from_env() -> Result<Self, ConfigError> {
+        let variables = environment()?;
+        let named = variables.get::<std::ffi::OsStr>("AXON_DAEMON_PATH".as_ref()).map(Path::new);
+        let file = file_beside(named, None)?;
+        Self::resolve(variables, file.as_deref(), &OsFiles)
+    }
+
+    /// The same by another environment, with `default_file` where it names no file.
+    ///
+    /// # Errors
+    /// As [`from_env`](Self::from_env).
+    pub fn resolve(
+        env: impl IntoIterator<Item = (OsString, OsString)>,
+        default_file: Option<&Path>,
+        files: &impl Files,
+    ) -> Result<Self, ConfigError> {
+        let only = &[RUNTIME_DIR, TRUSTED_UIDS];
+        let sources = Sources::collect_only(only, env, default_file, files)?;
+        let values = Values { sources: &sources, files };
+        let (runtime_dir, socket_in_runtime_dir) = resolve::runtime_dir(&values)?;
+        Ok(Self {
+            domain: resolve::domain(&sources)?,
+            runtime_dir,
+            socket_in_runtime_dir,
+            trusted_uids: values.uids(TRUSTED_UIDS)?,
+        })
+    }
+
+    /// A configuration that finds this daemon, and is for nothing else: the rest of it are defaults.
+    pub(crate) fn config(&self) -> Config {
+        let Self { domain, runtime_dir, socket_in_runtime_dir, trusted_uids } = self.clone();
+        Config { domain, runtime_dir, socket_in_runtime_dir, trusted_uids, ..Config::default() }
+    }
+}
+
+impl From<&Config> for DaemonPlace {
+    fn from(config: &Config) -> Self {
+        Self {
+            domain: config.domain,
+            runtime_dir: config.runtime_dir.clone(),
+            socket_in_runtime_dir: config.socket_in_runtime_dir,
+            trusted_uids: config.trusted_uids.clone(),
+        }
+    }
+}

@@ -1,0 +1,24 @@
+//! Whether a daemon could start its gateway, found out without one.
+
+use super::{GatewayError, identity};
+use crate::{
+    config::{Config, Security},
+    keys::Kme,
+    secrets::erase_from_now_on,
+};
+
+/// Reads the files that a daemon with this configuration would read, its private key included, and says
+/// what the daemon would say of them. Opens no connection and keeps nothing.
+///
+/// From here on this process erases what it frees, where [`ErasingHeap`](crate::daemon::ErasingHeap) is
+/// its allocator.
+///
+/// # Errors
+/// A file that cannot be read or used, by the name of its variable.
+pub fn check(config: &Config) -> Result<(), GatewayError> {
+    erase_from_now_on();
+    match &config.security {
+        Security::Classic(classic) => identity::check(classic),
+        Security::Qkd(qkd) => Ok(Kme::check(qkd)?),
+    }
+}
