@@ -13,8 +13,8 @@ use rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName, UnixTime};
 use rustls::server::ParsedCertificate;
 use rustls::sign::{CertifiedKey, SingleCertAndKey};
 use rustls::{
-    AlertDescription, CertificateError, ClientConfig, DigitallySignedStruct, RootCertStore,
-    SignatureScheme,
+    AlertDescription, CertificateError, ClientConfig, DigitallySignedStruct, OtherError,
+    RootCertStore, SignatureScheme,
 };
 
 use crate::pem::PrivateKey;
@@ -87,8 +87,31 @@ pub(crate) fn certificates(
     Ok(all)
 }
 
+/// A certificate without extensions, in which nothing says for whom or what it is.
+#[derive(Debug)]
+struct OldVersion;
+
+impl std::fmt::Display for OldVersion {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(
+            "it is X.509 version 1 (or 2), which has no extensions; have it issued again as version 3",
+        )
+    }
+}
+
+impl std::error::Error for OldVersion {}
+
+/// Whether this is an X.509 certificate of version 1 or 2.
+fn is_of_old_version(certificate: &CertificateDer<'_>) -> bool {
+    let parsed = webpki::EndEntityCert::try_from(certificate);
+    matches!(parsed, Err(webpki::Error::UnsupportedCertVersion))
+}
+
 fn certified_key(cert: &[u8], key: &[u8]) -> Result<CertifiedKey, Error> {
     let chain = certificates(cert, "sae_cert")?;
+    if chain.iter().any(is_of_old_version) {
+        return Err(config("sae_cert", format!("no usable certificate: {OldVersion}")));
+    }
     // The reasons of these parsers are not passed on: they have seen the key.
     let unusable = || {
         let accepted = "accepted: PKCS#8, SEC1 or PKCS#1, as PEM or DER, unencrypted";
@@ -130,6 +153,9 @@ impl ServerCertVerifier for KmeVerifier {
         _ocsp_response: &[u8],
         now: UnixTime,
     ) -> Result<ServerCertVerified, rustls::Error> {
+        if std::iter::once(end_entity).chain(intermediates).any(is_of_old_version) {
+            return Err(CertificateError::Other(OtherError(Arc::new(OldVersion))).into());
+        }
         let cert = ParsedCertificate::try_from(end_entity)?;
         verify_server_cert_signed_by_trust_anchor(
             &cert,
@@ -242,6 +268,15 @@ fn certificate_reason(reason: &CertificateError) -> String {
         }
         CertificateError::UnknownIssuer | CertificateError::BadSignature => {
             "the KME's certificate was not issued by the CA given (ca)".to_owned()
+        }
+        CertificateError::Other(OtherError(other)) if other.is::<OldVersion>() => {
+            format!("the KME's certificate cannot be used: {other}")
+        }
+        CertificateError::NotValidForName | CertificateError::NotValidForNameContext { .. } => {
+            format!(
+                "the KME's certificate: {reason}; give the host that it names in kme_url, or where it \
+                 names none, know the KME by its ID alone (kme_id_replaces_name_check)"
+            )
         }
         other => format!("the KME's certificate: {other}"),
     }

@@ -6,9 +6,12 @@ use rustls::crypto::aws_lc_rs::default_provider;
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, CertificateRevocationListDer, PrivateKeyDer, UnixTime};
 use rustls::sign::{CertifiedKey, SigningKey, SingleCertAndKey};
-use rustls::{ClientConfig, ConfigBuilder, RootCertStore, ServerConfig, WantsVerifier};
+use rustls::{
+    ClientConfig, ConfigBuilder, InconsistentKeys, RootCertStore, ServerConfig, WantsVerifier,
+};
 use webpki::{CertRevocationList, OwnedCertRevocationList};
 
+use super::refused::{Refused, is_of_old_version};
 use super::roots::{self, FromRoots};
 use super::verifier::{Peers, Role, Verifier};
 use super::{pem, signing_key};
@@ -47,9 +50,22 @@ impl CaMaterial {
         }
         let chain = certificates(CaPart::Chain, chain)?;
         let key = private_key(key).map_err(|err| unusable(CaPart::Key, err))?;
+        // Roots are keys with a name, of which no extension is asked.
+        if chain.iter().any(is_of_old_version) {
+            return Err(unusable(CaPart::Chain, Refused::OldVersion));
+        }
         let ours = CertifiedKey::new(chain, key);
-        ours.keys_match()
-            .map_err(|_| unusable(CaPart::Key, "it is not the key of our certificate"))?;
+        ours.keys_match().map_err(|error| match error {
+            rustls::Error::InconsistentKeys(InconsistentKeys::KeyMismatch) => {
+                unusable(CaPart::Key, "it is not the key of our certificate")
+            }
+            rustls::Error::InconsistentKeys(_) => {
+                let why = "a key of this kind cannot be compared with our certificate; use Ed25519, \
+                           ECDSA, RSA or ML-DSA-65";
+                unusable(CaPart::Key, why)
+            }
+            other => unusable(CaPart::Chain, format!("it cannot be read: {other}")),
+        })?;
         let crls = crls.map_or(Ok(Vec::new()), |text| revocation_lists(text, &store))?;
         Ok(Self {
             roots: Arc::new(store),

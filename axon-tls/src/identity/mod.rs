@@ -8,6 +8,7 @@ mod ca;
 mod key;
 mod pem;
 mod raw_key;
+mod refused;
 mod roots;
 mod scan;
 mod spki;

@@ -18,7 +18,7 @@ pub(super) fn private_key(text: &str) -> Result<Zeroizing<Vec<u8>>, Error> {
         let (body, _) = from.split_once(END)?;
         Some(body)
     };
-    let body = section().ok_or(Error::PrivateKey("no PEM section `PRIVATE KEY` (PKCS#8)"))?;
+    let body = section().ok_or_else(|| Error::PrivateKey(missing(text)))?;
 
     let mut encoded = Zeroizing::new(Vec::with_capacity(body.len()));
     encoded.extend(body.bytes().filter(|byte| !byte.is_ascii_whitespace()));
@@ -28,6 +28,35 @@ pub(super) fn private_key(text: &str) -> Result<Zeroizing<Vec<u8>>, Error> {
         .map_err(|_| Error::PrivateKey("the PEM section `PRIVATE KEY` is not base64"))?;
     der.truncate(len);
     Ok(der)
+}
+
+/// What stands there in place of a PKCS#8 key.
+fn missing(text: &str) -> &'static str {
+    const OTHERS: [(&str, &str); 5] = [
+        (
+            "ENCRYPTED PRIVATE KEY",
+            "the key is encrypted, and nobody is asked for a passphrase; write it without one: openssl \
+             pkcs8 -topk8 -nocrypt",
+        ),
+        (
+            "EC PRIVATE KEY",
+            "a PEM section `EC PRIVATE KEY` (SEC1), and PKCS#8 is needed; convert it: openssl pkcs8 -topk8 \
+             -nocrypt",
+        ),
+        (
+            "RSA PRIVATE KEY",
+            "a PEM section `RSA PRIVATE KEY` (PKCS#1), and PKCS#8 is needed; convert it: openssl pkcs8 \
+             -topk8 -nocrypt",
+        ),
+        (
+            "OPENSSH PRIVATE KEY",
+            "a key of OpenSSH, and PKCS#8 is needed; make one: axon trust keygen, or openssl genpkey",
+        ),
+        ("CERTIFICATE", "a certificate and no private key"),
+    ];
+    let has = |label: &str| text.contains(&format!("-----BEGIN {label}-----"));
+    let other = OTHERS.iter().find(|(label, _)| has(label));
+    other.map_or("no PEM section `PRIVATE KEY` (PKCS#8)", |(_, why)| why)
 }
 
 #[cfg(test)]
@@ -43,6 +72,22 @@ mod tests {
         let not_base64 = format!("{BEGIN}\nAA\u{e4}A\0\n{END}");
         for text in ["", BEGIN, END, &endless, encrypted, &backwards, &not_base64] {
             assert!(private_key(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn other_sections_are_named() {
+        for (label, said) in [
+            ("EC PRIVATE KEY", "SEC1"),
+            ("RSA PRIVATE KEY", "PKCS#1"),
+            ("ENCRYPTED PRIVATE KEY", "encrypted"),
+            ("OPENSSH PRIVATE KEY", "OpenSSH"),
+            ("CERTIFICATE", "certificate"),
+            ("PUBLIC KEY", "no PEM section"),
+        ] {
+            let text = format!("-----BEGIN {label}-----\nAAAA\n-----END {label}-----\n");
+            let error = private_key(&text).unwrap_err().to_string();
+            assert!(error.contains(said), "{label}: {error}");
         }
     }
 

@@ -1,11 +1,14 @@
 //! Checking the raw public key of a peer (RFC 7250).
 
+use std::time::SystemTime;
+
 use rustls::client::danger::HandshakeSignatureValid;
 use rustls::crypto::aws_lc_rs::default_provider;
 use rustls::crypto::{WebPkiSupportedAlgorithms, verify_tls13_signature_with_raw_key};
 use rustls::pki_types::{CertificateDer, SubjectPublicKeyInfoDer, UnixTime};
 use rustls::{CertificateError, DigitallySignedStruct, Error, SignatureScheme};
 
+use super::refused::Refused;
 use super::verifier::{Peers, Role};
 use super::{SpkiDigest, Trust};
 
@@ -36,11 +39,13 @@ impl Peers for RawKeys {
         if !others.is_empty() {
             return Err(CertificateError::BadEncoding.into());
         }
-        match &self.trust {
-            Some(trust) if trust.name_of(&SpkiDigest::of(shown)).is_none() => {
-                Err(CertificateError::UnknownIssuer.into())
+        let Some(trust) = &self.trust else { return Ok(()) };
+        match trust.pin_of(&SpkiDigest::of(shown)) {
+            Some(pin) if pin.holds(SystemTime::now()) => Ok(()),
+            Some(pin) => {
+                Err(Refused::PinEnded(pin.last_day().unwrap_or_default().to_owned()).into())
             }
-            _ => Ok(()),
+            None => Err(CertificateError::UnknownIssuer.into()),
         }
     }
 
@@ -56,5 +61,25 @@ impl Peers for RawKeys {
 
     fn schemes(&self) -> Vec<SignatureScheme> {
         self.algorithms.supported_schemes()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::identity::TrustFile;
+
+    #[test]
+    fn an_ended_pin_says_its_last_day_and_an_unknown_key_says_none() {
+        let [ended, known, unknown] = [1, 2, 3].map(|byte| CertificateDer::from(vec![byte]));
+        let digest = |shown: &CertificateDer<'_>| SpkiDigest::of(shown);
+        let text = format!("arm {} 2024-02-29\nbase {}", digest(&ended), digest(&known));
+        let keys = RawKeys::new(Some(Trust::new(TrustFile::parse(&text).unwrap())));
+        let accept = |shown| keys.accept(shown, &[], Role::Client, UnixTime::now());
+        assert!(accept(&known).is_ok());
+        let said = accept(&ended).unwrap_err().to_string();
+        assert!(said.contains("last day") && said.contains("2024-02-29 (UTC)"), "{said}");
+        assert!(!said.contains("arm"), "the peer is told the reason, not our name for it: {said}");
+        assert_eq!(accept(&unknown), Err(CertificateError::UnknownIssuer.into()));
     }
 }

@@ -14,6 +14,7 @@ use webpki::{
     CertRevocationList, EndEntityCert, ExpirationPolicy, KeyUsage, RevocationOptionsBuilder,
 };
 
+use super::refused::Refused;
 use super::verifier::{Peers, Role};
 
 /// Accepts certificates from given roots.
@@ -121,6 +122,7 @@ fn refusal(error: webpki::Error) -> Error {
         webpki::Error::InvalidCrlSignatureForPublicKey => {
             return CertRevocationListError::BadSignature.into();
         }
+        webpki::Error::UnsupportedCertVersion => return Refused::OldVersion.into(),
         webpki::Error::BadDer => CertificateError::BadEncoding,
         webpki::Error::CertExpired { .. } => CertificateError::Expired,
         webpki::Error::CertNotValidYet { .. } => CertificateError::NotValidYet,

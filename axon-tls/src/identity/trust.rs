@@ -111,6 +111,11 @@ impl TrustFile {
         pin.holds(now).then_some(pin.name.as_str())
     }
 
+    /// The pin of the key, whether it still [holds](Pin::holds) or not.
+    pub fn pin_of(&self, key: &SpkiDigest) -> Option<&Pin> {
+        self.pins.get(key)
+    }
+
     /// Every key with its name, those of one name together, the one that ends first in front.
     pub fn pins(&self) -> impl Iterator<Item = &Pin> {
         let mut pins: Vec<_> = self.pins.values().collect();
@@ -208,6 +213,12 @@ impl Trust {
     pub fn name_of(&self, key: &SpkiDigest) -> Option<String> {
         let file = self.file.read().unwrap_or_else(PoisonError::into_inner);
         file.name_of(key, SystemTime::now()).map(str::to_owned)
+    }
+
+    /// The pin of the key, whether it still [holds](Pin::holds) or not.
+    pub fn pin_of(&self, key: &SpkiDigest) -> Option<Pin> {
+        let file = self.file.read().unwrap_or_else(PoisonError::into_inner);
+        file.pin_of(key).cloned()
     }
 }
 

@@ -8,7 +8,7 @@ use std::{
         Arc, PoisonError, RwLock,
         atomic::{AtomicU64, Ordering},
     },
-    time::Instant,
+    time::{Instant, SystemTime},
 };
 
 use axon_tls::{
@@ -130,8 +130,16 @@ impl Context {
     ) -> Option<String> {
         match self.auth()? {
             Auth::Pinned { trust, .. } => {
-                let pinned = negotiated.peer.is_some_and(|key| trust.name_of(&key).is_some());
-                (!pinned).then(|| "its key is no longer pinned in AXON_CLASSIC_TRUST".into())
+                let pin = negotiated.peer.and_then(|key| trust.pin_of(&key));
+                match pin {
+                    Some(pin) if pin.holds(SystemTime::now()) => None,
+                    Some(pin) => Some(format!(
+                        "its pin in AXON_CLASSIC_TRUST, of {}, ended: its last day is {} (UTC)",
+                        pin.name(),
+                        pin.last_day().unwrap_or("unknown")
+                    )),
+                    None => Some("its key is no longer pinned in AXON_CLASSIC_TRUST".into()),
+                }
             }
             Auth::Ca(material) if certificates => {
                 let chain = chain(connection);

@@ -128,6 +128,23 @@ fn a_pin_that_is_removed_ends_the_link_and_the_next_dial() {
 }
 
 #[test]
+fn a_pin_that_ends_says_its_last_day_to_the_link_and_to_the_next_dial() {
+    let dir = tempfile::tempdir().unwrap();
+    let hosts = Plan::new(pinned(dir.path(), EACH_OTHER)).start();
+    let trust = trust_of(dir.path(), 0);
+    let before = fs::read_to_string(&trust).unwrap();
+    hosts.iter().for_each(|host| drop(host.link()));
+
+    let dated = |line: &str| format!("{} 2024-02-29\n", line.trim_end());
+    fs::write(&trust, before.lines().map(dated).collect::<String>()).unwrap();
+    let [a, _b] = &hosts;
+    a.wait_refusal("why the link ended", |text| text.contains("its last day is 2024-02-29 (UTC)"));
+    a.wait_refusal("the next dial", |text| text.contains("in the trust file is 2024-02-29 (UTC)"));
+    fs::write(&trust, before).unwrap();
+    hosts.iter().for_each(|host| drop(host.link()));
+}
+
+#[test]
 fn a_file_that_is_gone_keeps_who_is_there_and_lets_nobody_in() {
     let dir = tempfile::tempdir().unwrap();
     let [a, mut b] = Plan::new(pinned(dir.path(), EACH_OTHER)).start();
