@@ -39,8 +39,10 @@ pub enum SessionError {
     /// The program to start was not found.
     #[error(
         "no daemon runs, and none can be started: there is neither axon_daemon nor axon in {}; install \
-         it with `cargo install axon-cli`, or set AXON_DAEMON_PATH to the daemon's program",
-        tried.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", ")
+         it with `cargo install --git {} axon-cli`, or set AXON_DAEMON_PATH to the daemon's program",
+        tried.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", "),
+        // Not from crates.io, where another project owns the name.
+        env!("CARGO_PKG_REPOSITORY")
     )]
     NoProgram {
         /// The folders in which it was looked for.
