@@ -40,6 +40,8 @@ const PAUSE: Duration = Duration::from_millis(50);
 /// Packets that may wait for a session whose own are taken: its endpoints may make more of them than
 /// it reads.
 const UNREAD: usize = MAX_QUEUE / 4;
+/// Parts of work, each of [`PART`], that what a session left behind in its socket may take.
+const REST: usize = 1000;
 
 /// Accepts sessions for as long as it is polled.
 pub(super) async fn accept(control: Rc<RefCell<Control>>, listeners: Vec<OwnedFd>) {
@@ -354,7 +356,10 @@ async fn converse(
                 tokio::task::yield_now().await;
                 continue;
             }
-            Err(error) => return error.to_string(),
+            Err(error) => {
+                take_rest(control, socket, &id, bell, turn).await;
+                return error.to_string();
+            }
         };
         let queued = control.borrow().registry.session(&id).map_or(0, SessionEntry::queued);
         tokio::select! {
@@ -365,11 +370,17 @@ async fn converse(
             }
             ready = socket.writable(), if full => {
                 let Ok(mut ready) = ready else { return "its socket cannot be watched".into() };
-                let _turn = turn.lock().await;
-                match send_some(control, socket, &id, bell) {
+                let sent = {
+                    let _turn = turn.lock().await;
+                    send_some(control, socket, &id, bell)
+                };
+                match sent {
                     Ok(Sent::Full) => ready.clear_ready(),
                     Ok(Sent::All | Sent::Some) => {}
-                    Err(error) => return error.to_string(),
+                    Err(error) => {
+                        take_rest(control, socket, &id, bell, turn).await;
+                        return error.to_string();
+                    }
                 }
             }
             // Too many descriptors in flight: nothing says when that is over.
@@ -377,7 +388,7 @@ async fn converse(
             ready = socket.readable(), if queued < UNREAD => {
                 let Ok(mut ready) = ready else { return "its socket cannot be watched".into() };
                 let turn = turn.lock().await;
-                let received = receive_some(control, socket, &id, bell, &mut buffer);
+                let received = receive_some(control, socket, &id, bell, &mut buffer, UNREAD);
                 drop(turn);
                 match received {
                     Ok(true) => ready.clear_ready(),
@@ -385,7 +396,30 @@ async fn converse(
                     Err(why) => return why,
                 }
             }
-            () = ended(death) => return "its process ended".into(),
+            () = ended(death) => {
+                take_rest(control, socket, &id, bell, turn).await;
+                return "its process ended".into();
+            }
+        }
+    }
+}
+
+/// Takes what a session sent before its process or its connection ended: memory in which its readers find
+/// the last samples.
+async fn take_rest(
+    control: &Rc<RefCell<Control>>,
+    socket: &AsyncFd<PassedFd>,
+    id: &SessionId,
+    bell: &Rc<Notify>,
+    turn: &Turn,
+) {
+    let mut buffer = Vec::new();
+    // Bounded: a child that inherited the socket may send without end.
+    for _ in 0..REST {
+        let _turn = turn.lock().await;
+        match receive_some(control, socket, id, bell, &mut buffer, usize::MAX) {
+            Ok(false) => {}
+            Ok(true) | Err(_) => return,
         }
     }
 }
@@ -443,14 +477,15 @@ pub(super) fn receive(socket: &PassedFd, buffer: &mut Vec<u8>) -> Result<Receive
     socket::receive(socket, buffer)
 }
 
-/// Takes packets for as long as a turn is, or as long as the session reads what they bring it; whether
-/// the socket is empty now.
+/// Takes packets for as long as a turn is, or until as many as `unread` wait for the session to read them;
+/// whether the socket is empty now.
 fn receive_some(
     control: &Rc<RefCell<Control>>,
     socket: &AsyncFd<PassedFd>,
     id: &SessionId,
     bell: &Rc<Notify>,
     buffer: &mut Vec<u8>,
+    unread: usize,
 ) -> Result<bool, String> {
     let control = &mut *control.borrow_mut();
     if !control.is_current(id, bell) {
@@ -458,7 +493,7 @@ fn receive_some(
     }
     let (mut outcome, begin) = (Ok(false), Instant::now());
     let queued = |c: &Control| c.registry.session(id).map_or(0, SessionEntry::queued);
-    while begin.elapsed() < PART && queued(control) < UNREAD {
+    while begin.elapsed() < PART && queued(control) < unread {
         match receive(socket.get_ref(), buffer) {
             Ok(Received { message: Message::StatusRequest, .. }) => control.send_status(id),
             // The one thing that is handed over after HELLO, and the only one that the daemon reads:

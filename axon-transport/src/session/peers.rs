@@ -43,6 +43,8 @@ struct Entry {
     session: Arc<PeerSession>,
     /// Where its process's death is seen.
     deaths: Arc<OwnedFd>,
+    /// Its process has ended. What the daemon took from it before may still come.
+    dead: bool,
     /// The segments that came or were named since the daemon began to tell everything: of others it
     /// does not know that they are here, so it will not say when they are gone.
     named: BTreeSet<u32>,
@@ -53,7 +55,20 @@ impl Entry {
         let key = epoll::EventData::new_u64(key(&session.id()));
         epoll::add(deaths, session.pidfd(), key, epoll::EventFlags::IN)
             .map_err(ShmError::system("watching a process"))?;
-        Ok(Self { session, deaths: deaths.clone(), named: BTreeSet::new() })
+        Ok(Self { session, deaths: deaths.clone(), dead: false, named: BTreeSet::new() })
+    }
+
+    /// Notes the death of its process, of which the epoll instance would tell again and again.
+    fn note_death(&mut self) {
+        self.unwatch();
+        self.dead = true;
+    }
+
+    fn unwatch(&self) {
+        // The pidfd may be in use for longer, here and in other processes, which share it.
+        if !self.dead {
+            let _ = epoll::delete(&self.deaths, self.session.pidfd());
+        }
     }
 
     fn add(&mut self, segment: Segment, descriptor: &PassedFd) {
@@ -67,8 +82,7 @@ impl Entry {
 
 impl Drop for Entry {
     fn drop(&mut self) {
-        // The pidfd may be in use for longer, here and in other processes, which share it.
-        let _ = epoll::delete(&self.deaths, self.session.pidfd());
+        self.unwatch();
     }
 }
 
@@ -109,12 +123,6 @@ impl Held {
 
     fn holds(&self, id: &SessionId) -> bool {
         self.counts.contains_key(id)
-    }
-
-    /// Sessions are gone, whatever pairs there were.
-    fn keep(&mut self, which: impl Fn(&SessionId) -> bool) {
-        self.pairs.retain(|(_, id)| which(id));
-        self.counts.retain(|id, _| which(id));
     }
 }
 
@@ -235,21 +243,24 @@ impl Peers {
         self.peers.values_mut().for_each(|entry| entry.named.clear());
     }
 
-    /// Forgets the sessions whose process has ended; whether there were any.
-    pub(super) fn drop_dead(&mut self) -> bool {
+    /// Notes which sessions' process has ended; whether there are any more. They stay until the daemon
+    /// has said that their pairs are over: memory that it took from them before may come until then.
+    pub(super) fn note_deaths(&mut self) -> bool {
         let mut events = [MaybeUninit::<epoll::Event>::uninit(); DEATHS];
         let now = Timespec::default();
         let Ok((events, _)) = epoll::wait(&self.deaths, &mut events, Some(&now)) else {
             return false;
         };
         let ended: HashSet<u64> = events.iter().map(|event| event.data.u64()).collect();
-        let before = self.peers.len();
-        if !ended.is_empty() {
-            self.peers.retain(|id, e| !(ended.contains(&key(id)) && e.session.is_dead()));
+        if ended.is_empty() {
+            return false;
         }
-        let died = self.peers.len() != before;
-        if died {
-            self.held.keep(|id| self.peers.contains_key(id));
+        let mut died = false;
+        for (id, entry) in &mut self.peers {
+            if !entry.dead && ended.contains(&key(id)) && entry.session.is_dead() {
+                entry.note_death();
+                died = true;
+            }
         }
         died
     }
@@ -274,7 +285,6 @@ mod tests {
     enum Step {
         Add(u8, u8),
         Release(u8),
-        Die(u8),
     }
 
     fn step() -> impl Strategy<Value = Step> {
@@ -282,7 +292,6 @@ mod tests {
         prop_oneof![
             4 => (pair.clone(), id.clone()).prop_map(|(pair, id)| Step::Add(pair, id)),
             3 => pair.prop_map(Step::Release),
-            1 => id.prop_map(Step::Die),
         ]
     }
 
@@ -309,10 +318,6 @@ mod tests {
                         });
                         free.sort();
                         prop_assert_eq!(held.release(&pair(one)), free);
-                    }
-                    Step::Die(of) => {
-                        held.keep(|id| *id != session(of));
-                        model.remove(&of);
                     }
                 }
                 for number in [0, 1, 2, 3, u8::MAX] {

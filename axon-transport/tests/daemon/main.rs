@@ -38,6 +38,9 @@ use rustix::{
 };
 use support::{Host, PATIENCE, Player, say, signal, until, wait_for_the_end};
 
+/// Samples whose descriptors do not fit in the first segment of a session's memory.
+const LEFT: u64 = 5_000;
+
 fn spec(topic: &str) -> EndpointSpec {
     EndpointSpec::new(topic, "test/Bytes", Qos::keep_all())
 }
@@ -105,6 +108,14 @@ fn child() {
             publish(&publisher, last);
             say(last);
             until("everything was taken", || publisher.matched().is_empty());
+        }
+        // Publishes more than fits in the first segment of its memory, and ends at once.
+        "leaver" => {
+            let publisher = session.create_publisher(spec("/numbers")).unwrap();
+            assert!(publisher.wait_matched(1, PATIENCE));
+            say("matched");
+            wait_for_the_end();
+            (1..=LEFT).for_each(|number| publish(&publisher, number));
         }
         // Takes numbers, which must come without a gap, until the process is told the last.
         "listener" => {
@@ -335,6 +346,36 @@ fn a_session_killed_takes_its_endpoints_with_it() {
     }
     assert_eq!(subscription.lost(), 0);
     until("the daemon forgot it", || host.status().unwrap().topics[0].publishers == 0);
+}
+
+/// Their daemon hangs meanwhile: it finds in one moment that the process ended, and what that sent before.
+#[test]
+fn all_samples_of_a_publisher_that_ends_are_taken_though_the_daemon_is_slow() {
+    for _ in 0..6 {
+        let host = Host::new();
+        let daemon = host.daemon();
+        let session = host.session("reader").unwrap();
+        let subscription = session.create_subscription(spec("/numbers")).unwrap();
+        let mut leaver = host.play("leaver");
+        assert_eq!(leaver.hear(), "matched");
+        assert!(subscription.wait_matched(1, PATIENCE));
+        signal(daemon.0.id(), Signal::STOP);
+        leaver.finish();
+        until("the reader heard of it", || subscription.matched().is_empty());
+        // It finds that memory is missing, and sleeps.
+        let (tell, told) = std::sync::mpsc::channel();
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                for number in 1..=LEFT {
+                    assert_eq!(receive(&subscription), number);
+                }
+                tell.send(()).unwrap();
+            });
+            assert!(told.recv_timeout(Duration::from_millis(500)).is_err(), "nothing was missing");
+            signal(daemon.0.id(), Signal::CONT);
+        });
+        assert_eq!(subscription.lost(), 0);
+    }
 }
 
 #[test]

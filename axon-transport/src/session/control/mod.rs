@@ -36,6 +36,8 @@ use crate::{graph::GraphView, ids::Gid, passed::PassedFd, shm::ShmError, wait::E
 const BATCH: usize = 64;
 /// Until a process that had no descriptors left tries again.
 const RETRY: Duration = Duration::from_secs(2);
+/// How long a session that ends waits for a daemon whose socket is full.
+const FAREWELL: Duration = Duration::from_secs(1);
 /// A relay stands for at most this many remote subscriptions by name; one packet holds no more.
 const MAX_STANDS_FOR: usize = 1024;
 
@@ -168,7 +170,24 @@ impl Control {
         // What was queued last, such as ENDPOINT_GONE, is said by the end of the connection. Only
         // of memory, in which readers may find the last samples, nobody else could tell.
         self.tell_segments();
-        self.send();
+        self.send_rest();
+    }
+
+    /// Sends what is queued, and waits for a daemon whose socket is full.
+    fn send_rest(&mut self) {
+        let deadline = Instant::now() + FAREWELL;
+        loop {
+            self.send();
+            let left = deadline.saturating_duration_since(Instant::now());
+            let Link::Socket(socket) = &self.link else { return };
+            if self.outbox.is_empty() || left.is_zero() {
+                return;
+            }
+            // A socket that is short of descriptors in flight does not say when that passes.
+            let nap = left.min(Duration::from_millis(20));
+            let nap = Timespec::try_from(nap).ok();
+            let _ = poll(&mut [PollFd::new(socket, PollFlags::OUT)], nap.as_ref());
+        }
     }
 
     /// Queues a message for the daemon, behind what it must know of memory that the message may
@@ -352,7 +371,7 @@ impl Control {
 
     /// Looks for peers that died.
     fn bury(&mut self) {
-        if !self.peers.drop_dead() {
+        if !self.peers.note_deaths() {
             return;
         }
         let (publishers, subscriptions) = self.endpoints();

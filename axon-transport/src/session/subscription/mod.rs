@@ -322,7 +322,7 @@ fn take_with<T>(
     let taken = take(&mut slots);
     let gone = std::mem::take(&mut slots.discarded);
     let lost = slots.new_losses();
-    let again = if taken.is_none() { slots.short_until() } else { None };
+    let again = if taken.is_none() { slots.look_again() } else { None };
     drop(slots);
     if let Some(again) = again {
         session.shared().look_again(again);

@@ -177,6 +177,12 @@ impl Slots {
         self.short.map(|since| since + SHORT).filter(|until| *until > Instant::now())
     }
 
+    /// When to look again though nobody rings: for memory to take a sample, or for memory of a writer.
+    pub(super) fn look_again(&self) -> Option<Instant> {
+        let missing = self.slots.iter().filter_map(|slot| slot.reader.look_again());
+        missing.chain(self.short_until()).min()
+    }
+
     /// Whether the lease of one of the writers may run out.
     pub(in crate::session) fn offers_lease(&self) -> bool {
         self.slots.iter().any(|slot| slot.counts() && slot.lease.is_some())
@@ -290,9 +296,13 @@ impl Slots {
         self.forget_older(writer);
     }
 
-    /// The writer will not write any more. Whether that is news.
+    /// The daemon said that the writer will not write any more: it has handed over all that there is.
+    /// Whether that is news.
     pub(in crate::session) fn end(&mut self, writer: &Gid) -> bool {
         self.pending.remove(writer);
+        for slot in self.slots.iter_mut().filter(|slot| slot.reader.writer() == *writer) {
+            slot.reader.end();
+        }
         self.end_where(|reader| reader.writer() == *writer)
     }
 
@@ -312,7 +322,8 @@ impl Slots {
         leaving.map(|slot| slot.reader.writer()).collect()
     }
 
-    /// Writers whose process is dead will not write any more. Whether there are any.
+    /// Writers whose process is dead will not write any more. Memory of theirs may still be on its way.
+    /// Whether there are any.
     pub(in crate::session) fn end_dead(&mut self) -> bool {
         self.end_where(Reader::writer_dead)
     }
@@ -326,7 +337,6 @@ impl Slots {
         let mut news = false;
         for slot in self.slots.iter_mut().filter(|s| !s.over && which(&s.reader)) {
             slot.over = true;
-            slot.reader.end();
             news = true;
         }
         self.sweep();

@@ -5,7 +5,7 @@ use std::{
     time::Instant,
 };
 
-use super::{ATTEMPTS, Descriptors, KNOWN, MISSING, Missing, Obstacle, Reader};
+use super::{ATTEMPTS, Descriptors, KNOWN, MISSING, MISSING_DEAD, Missing, Obstacle, Reader};
 use crate::shm::{
     TakeError, copy,
     layout::{self, Array, COPIED, COPIED_ALWAYS},
@@ -247,7 +247,8 @@ impl Reader {
 
     /// Whether a segment that has not come will not come any more.
     pub(super) fn is_over(&self, missing: &Missing) -> bool {
-        missing.since.elapsed() >= MISSING && (self.ended || self.writer_dead())
+        let waited = missing.since.elapsed();
+        self.ended && waited >= MISSING || waited >= MISSING_DEAD && self.writer_dead()
     }
 
     /// All that is published is lost, and nothing else will be.

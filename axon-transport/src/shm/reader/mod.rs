@@ -28,9 +28,12 @@ use crate::{
 
 /// How often a take follows a publisher that keeps overtaking it before it lets go.
 const ATTEMPTS: u32 = 16;
-/// How often a reader asks for memory that has not come, and how long it hopes for that of a
-/// publisher whose process has ended.
+/// How often a reader asks for memory that has not come, and how long it waits for it once it was told
+/// that the publisher is gone.
 const MISSING: Duration = Duration::from_secs(1);
+/// How long a reader waits for memory of a process that has ended where nobody has said so: the
+/// daemon hands over what the process left, and may be slow.
+const MISSING_DEAD: Duration = Duration::from_secs(10);
 /// Segments of samples that a reader finds without a lock.
 const KNOWN: usize = 4;
 
@@ -189,7 +192,8 @@ impl Reader {
             return !matches!(self.reads.peer.find(missing.segment), Found::Absent)
                 // It may not be needed any more.
                 || ring::bounds(self.attachment.ring()).is_ok_and(more)
-                || self.is_over(missing);
+                // It is to be asked for again, or given up.
+                || missing.asked.elapsed() >= MISSING;
         }
         let word = ring::array(self.attachment.ring());
         let found;
@@ -362,6 +366,11 @@ impl Reader {
         std::ptr::eq(self.attachment.ring(), other.attachment.ring())
     }
 
+    /// When to look again for memory that is needed to go on and has not come.
+    pub(crate) fn look_again(&self) -> Option<Instant> {
+        self.missing.map(|missing| missing.asked + MISSING)
+    }
+
     /// The number of the segment of the publisher's session that is needed to go on and has not
     /// come.
     pub fn missing(&self) -> Option<u32> {
@@ -374,8 +383,8 @@ impl Reader {
         self.missing.is_none() && !self.has_data()
     }
 
-    /// Notes that the publisher is gone, though its process may not be: memory of it that does not
-    /// come soon never will.
+    /// Notes that the publisher is gone and that all of its memory was handed over, whether or not its
+    /// process has ended: memory that does not come soon never will.
     pub fn end(&mut self) {
         self.ended = true;
     }
