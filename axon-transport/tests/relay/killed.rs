@@ -1,6 +1,7 @@
 //! Daemons that are killed while samples are on their way through them.
 
 use super::*;
+use crate::support::Player;
 
 /// One of these is on its way, at least, whenever the daemon is killed.
 fn len_of(sequence: u64) -> usize {

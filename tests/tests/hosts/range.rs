@@ -3,7 +3,7 @@
 
 use axon_tests::Sizes;
 use axon_transport::{
-    config::{Config, DaemonPolicy, DiscoveryRange},
+    config::{DaemonPolicy, DiscoveryRange},
     daemon::status::SessionStatus,
     ids::Gid,
     qos::Qos,

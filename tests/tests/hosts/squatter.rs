@@ -2,7 +2,6 @@
 
 use axon_tls::identity::{Auth, SigningKey};
 use axon_transport::{
-    config::Config,
     graph::{Endpoint, EndpointKind},
     ids::{DaemonId, Gid},
     link::{Graph, Message, Owners},
