@@ -138,7 +138,7 @@ async fn a_kme_that_gives_keys_wrongly_fails_where_it_is_at_fault() {
         ("repeat-key-id,on=enc_keys", "6.3", "enc_keys by POST: 3 keys of 256 bits"),
         ("key-missing,on=enc_keys", "6.3", "enc_keys by GET: 1 key of 256 bits"),
         ("garbage,on=enc_keys", "6.3", "enc_keys by GET: 1 key of 256 bits"),
-        ("status=500,on=enc_keys", "6.2", "number over max_key_per_request: 400"),
+        ("status=500,on=enc_keys", "6.2", "number of another type: 400"),
         ("reset,on=enc_keys", "6.2", "unsupported extension_mandatory: 400"),
         ("other-ids,on=enc_keys", "5.4", "dec_keys by GET: the same key"),
     ] {
