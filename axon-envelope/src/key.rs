@@ -5,6 +5,7 @@ use core::hint::black_box;
 use core::panic::{RefUnwindSafe, UnwindSafe};
 
 use hkdf::Hkdf;
+use secrecy::{ExposeSecret, ExposeSecretMut, SecretBox};
 use sha2::Sha256;
 use zeroize::{Zeroize, Zeroizing};
 
@@ -13,6 +14,15 @@ use crate::channel::{Channel, KeyId};
 use crate::erase::erasing_stack;
 
 /// A 256-bit key as a KME delivered it, erased on drop.
+///
+/// Its bytes come out only through [`ExposeSecret`] and [`derive`](Self::derive):
+///
+/// ```
+/// use axon_envelope::{KmeKey, secrecy::ExposeSecret};
+///
+/// let key = KmeKey::take(&mut [1; 32]);
+/// assert_eq!(key.expose_secret(), &[1; 32]);
+/// ```
 ///
 /// It can be neither cloned nor printed:
 ///
@@ -30,16 +40,7 @@ use crate::erase::erasing_stack;
 pub struct KmeKey(Box<Holder>);
 
 /// What holds the bytes, and erases them on drop.
-type Holder = dyn AsRef<[u8; 32]> + Send + Sync + UnwindSafe + RefUnwindSafe;
-
-/// A key on the heap.
-struct Own(Zeroizing<[u8; 32]>);
-
-impl AsRef<[u8; 32]> for Own {
-    fn as_ref(&self) -> &[u8; 32] {
-        &self.0
-    }
-}
+type Holder = dyn ExposeSecret<[u8; 32]> + Send + Sync + UnwindSafe + RefUnwindSafe;
 
 /// Key bytes of a length other than 32.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -67,19 +68,15 @@ impl KmeKey {
         bytes.try_into().map(Self::copy).map_err(|_| KeyLength(bytes.len()))
     }
 
-    /// A key that stays where its holder has it, as in memory that is never swapped out.
+    /// A key that stays where its holder has it, as in memory that is never swapped out. A
+    /// `SecretBox<[u8; 32]>` of the crate `secrecy` is a holder.
     ///
     /// The holder erases it on drop, and gives the same bytes each time it is asked.
     pub fn from_holder<H>(holder: H) -> Self
     where
-        H: AsRef<[u8; 32]> + Send + Sync + UnwindSafe + RefUnwindSafe + 'static,
+        H: ExposeSecret<[u8; 32]> + Send + Sync + UnwindSafe + RefUnwindSafe + 'static,
     {
         Self(Box::new(holder))
-    }
-
-    /// The key's bytes, for a derivation of the caller's own. See [`derive`](Self::derive).
-    pub fn expose(&self) -> &[u8; 32] {
-        (*self.0).as_ref()
     }
 
     /// Runs `derivation` on the key so that nothing of it is left on the stack.
@@ -95,7 +92,7 @@ impl KmeKey {
     /// be behind a pointer. A signal that interrupts the first run leaves registers on the stack.
     pub fn derive<T>(&self, derivation: impl Fn(&[u8; 32]) -> T) -> T {
         erasing_stack(|| {
-            let derived = run(&derivation, self.expose());
+            let derived = run(&derivation, self.expose_secret());
             // Opaque, so that this run is neither left out nor compiled in another way.
             drop(black_box(run(&derivation, black_box(&[0; 32]))));
             derived
@@ -109,9 +106,17 @@ impl KmeKey {
     }
 
     fn copy(bytes: &[u8; 32]) -> Self {
-        let mut own = Box::new(Own(Zeroizing::new([0; 32])));
-        own.0.copy_from_slice(bytes);
-        Self(own)
+        let mut own = SecretBox::new(Box::new([0; 32]));
+        own.expose_secret_mut().copy_from_slice(bytes);
+        Self::from_holder(own)
+    }
+}
+
+/// The key's bytes, for a derivation of the caller's own. [`KmeKey::derive`] leaves nothing of them
+/// on the stack.
+impl ExposeSecret<[u8; 32]> for KmeKey {
+    fn expose_secret(&self) -> &[u8; 32] {
+        self.0.expose_secret()
     }
 }
 

@@ -47,7 +47,8 @@
 //! - **Secrets are erased** on drop, are neither `Clone` nor `Debug`, and are not left behind by
 //!   moves, since they live behind a pointer, nor on the stack by their derivation
 //!   ([`KmeKey::derive`]). A [`Sealer`] or [`Opener`] prints names and counts. A key can stay in
-//!   locked memory of the caller's: [`KmeKey::from_holder`].
+//!   locked memory of the caller's: [`KmeKey::from_holder`]. Bytes of a key come out only through the
+//!   trait [`ExposeSecret`](secrecy::ExposeSecret) of the crate [`secrecy`].
 //!
 //! # Features
 //!
@@ -91,6 +92,7 @@ pub use open::{
 pub use rotate::{KeySource, RotateError, RotatingSealer};
 pub use route::{Kind, NameTooLong, Route, TopicHash};
 pub use seal::{KEY_MAX_AGE, MAX_PLAINTEXT_LEN, Retirement, SealError, Sealer, Slot, Spent};
+pub use secrecy;
 
 /// Bytes of the authentication tag at the end of every envelope.
 pub const TAG_LEN: usize = 16;

@@ -16,6 +16,7 @@ use aws_lc_rs::{
 use axon_tls::erasing;
 use minicbor::{Decode, Encode};
 use rand::{TryRng, rngs::SysRng};
+use secrecy::ExposeSecret;
 use zeroize::Zeroizing;
 
 use crate::{
@@ -72,7 +73,7 @@ impl SessionKey {
 
     /// The packet that hands it to the daemon.
     pub(crate) fn packet(&self) -> Zeroizing<Vec<u8>> {
-        let seed = self.seed.as_ref();
+        let seed = self.seed.expose_secret();
         let mut packet = Zeroizing::new(Vec::with_capacity(PACKET.len() + seed.len()));
         packet.extend_from_slice(&PACKET);
         packet.extend_from_slice(seed);
@@ -100,7 +101,7 @@ impl SessionKey {
 /// Made for each use, since the library has its copy in memory that is not locked. It erases that
 /// copy when it frees it.
 fn pair(seed: &LockedKey) -> Option<Ed25519KeyPair> {
-    Ed25519KeyPair::from_seed_unchecked(seed.as_ref()).ok()
+    Ed25519KeyPair::from_seed_unchecked(seed.expose_secret()).ok()
 }
 
 fn id_of(public: &[u8]) -> SessionId {
@@ -226,8 +227,9 @@ mod tests {
     fn neither_a_new_key_nor_a_signature_leaves_a_secret_on_the_stack() {
         let binding = [7; 32];
         let from = DaemonId([1; 16]);
-        let secrets_of =
-            |key: &SessionKey| secrets(key.seed.as_ref(), &signed(&binding, from, &key.id()));
+        let secrets_of = |key: &SessionKey| {
+            secrets(key.seed.expose_secret(), &signed(&binding, from, &key.id()))
+        };
         let generate = || SessionKey::generate().unwrap();
         assert_eq!(left_on_the_stack(generate, secrets_of), [0_usize; 0], "a new key");
         let key = SessionKey::generate().unwrap();
@@ -264,7 +266,7 @@ mod tests {
         }
         let in_buffer = [&packet[..], &[0; 9]].concat();
         assert_eq!(SessionKey::from_packet(&in_buffer).unwrap().id(), key.id());
-        assert!(!format!("{key:?}").contains(&format!("{:?}", &key.seed.as_ref()[..4])));
+        assert!(!format!("{key:?}").contains(&format!("{:?}", &key.seed.expose_secret()[..4])));
         let keys = SessionKeys::default();
         keys.insert(Arc::new(key));
         let id = SessionKey::from_packet(&packet).unwrap().id();

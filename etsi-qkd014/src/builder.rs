@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use reqwest::Url;
-use zeroize::Zeroizing;
+use secrecy::{ExposeSecret, SecretSlice};
 
 use crate::secret::SecretBuf;
 use crate::tls::{self, Identity};
@@ -44,7 +44,7 @@ pub(crate) struct Limits {
 }
 
 enum Source {
-    Bytes(Zeroizing<Vec<u8>>),
+    Bytes(SecretSlice<u8>),
     File(PathBuf),
 }
 
@@ -79,7 +79,7 @@ impl ClientBuilder {
     /// The CA that must have issued the KME's certificate, PEM (one or several) or DER. No other
     /// is trusted.
     pub fn ca(mut self, pem_or_der: impl Into<Vec<u8>>) -> Self {
-        self.ca = Some(Source::Bytes(Zeroizing::new(pem_or_der.into())));
+        self.ca = Some(Source::Bytes(SecretSlice::from(pem_or_der.into())));
         self
     }
 
@@ -91,7 +91,7 @@ impl ClientBuilder {
 
     /// The SAE's certificate, PEM (with its intermediates, if any) or DER.
     pub fn sae_cert(mut self, pem_or_der: impl Into<Vec<u8>>) -> Self {
-        self.sae_cert = Some(Source::Bytes(Zeroizing::new(pem_or_der.into())));
+        self.sae_cert = Some(Source::Bytes(SecretSlice::from(pem_or_der.into())));
         self
     }
 
@@ -103,7 +103,10 @@ impl ClientBuilder {
 
     /// The SAE's private key, PEM or DER: PKCS#8, SEC1 or PKCS#1. Zeroized after
     /// [`build`](Self::build).
-    pub fn sae_key(mut self, pem_or_der: impl Into<Zeroizing<Vec<u8>>>) -> Self {
+    ///
+    /// A `Vec<u8>` is taken as it is where its capacity is its length. Otherwise the allocator shrinks
+    /// it, and may leave a copy behind: give a `Box<[u8]>` or a `SecretSlice` then.
+    pub fn sae_key(mut self, pem_or_der: impl Into<SecretSlice<u8>>) -> Self {
         self.sae_key = Some(Source::Bytes(pem_or_der.into()));
         self
     }
@@ -198,7 +201,12 @@ impl ClientBuilder {
         let ca = read(self.ca, "ca")?;
         let cert = read(self.sae_cert, "sae_cert")?;
         let key = read(self.sae_key, "sae_key")?;
-        let tls = tls::client_config(&ca, &cert, &key, self.identity)?;
+        let tls = tls::client_config(
+            ca.expose_secret(),
+            cert.expose_secret(),
+            key.expose_secret(),
+            self.identity,
+        )?;
         let http = reqwest::Client::builder()
             .tls_backend_preconfigured(tls)
             .https_only(true)
@@ -261,7 +269,7 @@ fn base_url(text: Option<String>) -> Result<(Url, String), Error> {
     Ok((url, kme))
 }
 
-fn read(source: Option<Source>, setting: &'static str) -> Result<Zeroizing<Vec<u8>>, Error> {
+fn read(source: Option<Source>, setting: &'static str) -> Result<SecretSlice<u8>, Error> {
     let path = match source {
         None => return Err(config(setting, "is missing")),
         Some(Source::Bytes(bytes)) => return Ok(bytes),
@@ -271,7 +279,7 @@ fn read(source: Option<Source>, setting: &'static str) -> Result<Zeroizing<Vec<u
     // What is no regular file, as a pipe from a password manager, says no length beforehand.
     let file = File::open(&path).map_err(|e| fail(e.to_string()))?;
     match SecretBuf::read_from(file, MAX_FILE).map_err(|e| fail(e.to_string()))? {
-        Some(content) => Ok(content.into_bytes()),
+        Some(content) => Ok(content.into_secret()),
         None => Err(fail(format!("is larger than {MAX_FILE} bytes"))),
     }
 }

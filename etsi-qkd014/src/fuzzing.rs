@@ -5,6 +5,8 @@
 
 use std::collections::HashSet;
 
+use secrecy::ExposeSecret;
+
 use crate::parse::{self, Asked};
 use crate::{KeyContainer, Quirks};
 
@@ -53,7 +55,7 @@ pub fn key_container(data: &[u8]) -> bool {
 fn check(container: &KeyContainer, number: usize) {
     let keys = &container.keys;
     assert_eq!(keys.len(), number);
-    assert!(keys.iter().all(|key| key.len() == keys[0].len() && !key.expose().is_empty()));
+    assert!(keys.iter().all(|key| key.len() == keys[0].len() && !key.expose_secret().is_empty()));
     let ids: HashSet<_> = keys.iter().map(|key| key.key_id().to_ascii_lowercase()).collect();
     assert_eq!(ids.len(), number);
     assert!(ids.iter().all(|id| parse::is_key_id(id)));

@@ -1,14 +1,14 @@
 //! Keys: zeroized, not clonable, not printable.
 
+use secrecy::{ExposeSecret, SecretSlice};
 use serde_json::Value;
 use subtle::{Choice, ConstantTimeEq};
-use zeroize::Zeroizing;
 
 /// A key from a KME and its key_ID.
 ///
 /// The secret is zeroized on drop. It is neither `Clone` nor `Debug` nor `Display`, and comes out
-/// only through [`expose`](Key::expose). Equality compares the secrets, and only them, in constant
-/// time.
+/// only through [`ExposeSecret`], [`expose_array`](Key::expose_array) and
+/// [`into_secret`](Key::into_secret). Equality compares the secrets, and only them, in constant time.
 ///
 /// ```compile_fail
 /// fn clone_it<T: Clone>() {}
@@ -20,7 +20,7 @@ use zeroize::Zeroizing;
 /// ```
 pub struct Key {
     key_id: String,
-    secret: Zeroizing<Box<[u8]>>,
+    secret: SecretSlice<u8>,
     key_id_extension: Option<Value>,
     extension: Option<Value>,
 }
@@ -28,7 +28,7 @@ pub struct Key {
 impl Key {
     pub(crate) fn new(
         key_id: String,
-        secret: Zeroizing<Box<[u8]>>,
+        secret: SecretSlice<u8>,
         key_id_extension: Option<Value>,
         extension: Option<Value>,
     ) -> Self {
@@ -46,23 +46,23 @@ impl Key {
         &self.key_id
     }
 
-    /// The secret itself.
-    #[must_use]
-    pub fn expose(&self) -> &[u8] {
-        &self.secret
-    }
-
     /// The secret itself, where it is exactly `N` bytes long.
     #[must_use]
     pub fn expose_array<const N: usize>(&self) -> Option<&[u8; N]> {
-        self.expose().try_into().ok()
+        self.expose_secret().try_into().ok()
+    }
+
+    /// The secret without its key_ID, for code that takes keys in this form. Nothing is copied.
+    #[must_use]
+    pub fn into_secret(self) -> SecretSlice<u8> {
+        self.secret
     }
 
     /// Length of the secret in bytes; never 0.
     #[must_use]
     #[allow(clippy::len_without_is_empty, reason = "a key is never empty")]
     pub fn len(&self) -> usize {
-        self.secret.len()
+        self.expose_secret().len()
     }
 
     /// The KME's `key_ID_extension` (clause 6.3).
@@ -78,9 +78,16 @@ impl Key {
     }
 }
 
+/// The secret itself.
+impl ExposeSecret<[u8]> for Key {
+    fn expose_secret(&self) -> &[u8] {
+        self.secret.expose_secret()
+    }
+}
+
 impl ConstantTimeEq for Key {
     fn ct_eq(&self, other: &Self) -> Choice {
-        self.expose().ct_eq(other.expose())
+        self.expose_secret().ct_eq(other.expose_secret())
     }
 }
 

@@ -8,7 +8,7 @@
 //!
 //! ```no_run
 //! # async fn example() -> Result<(), etsi_qkd014::Error> {
-//! use etsi_qkd014::Client;
+//! use etsi_qkd014::{Client, secrecy::ExposeSecret};
 //!
 //! let client = Client::builder()
 //!     .kme_url("https://kme-a.example:8443")
@@ -18,7 +18,7 @@
 //!     .build()?;
 //! let key = client.enc_keys("sae-b").size(256).send().await?.into_single();
 //! println!("tell sae-b: {}", key.key_id());
-//! let secret: &[u8] = key.expose();
+//! let secret: &[u8] = key.expose_secret();
 //! # let _ = secret; Ok(())
 //! # }
 //! ```
@@ -29,7 +29,7 @@
 //!   and proxies from the environment are never followed. TLS 1.3 and 1.2; X25519MLKEM768 is
 //!   preferred where the KME has it.
 //! - **Secrets are zeroized.** A [`Key`] cannot be cloned or printed, compares in constant time and
-//!   shows its bytes only through [`Key::expose`]. See [Secrets](#secrets) for what the crate can
+//!   shows its bytes only through the trait [`ExposeSecret`](secrecy::ExposeSecret) of [`secrecy`]. See [Secrets](#secrets) for what the crate can
 //!   and cannot reach.
 //! - **What a KME says is checked**, each check named by the clause it comes from
 //!   ([`Error::Check`]). Deviations that real KMEs show are tolerated only by name: [`Quirks`].
@@ -105,6 +105,7 @@ pub use pool::KeyPool;
 pub use quirks::Quirks;
 pub use request::{DecKeys, EncKeys};
 pub use retry::RetryPolicy;
+pub use secrecy;
 pub use status::Status;
 
 /// The README's example, compiled as a doc test.

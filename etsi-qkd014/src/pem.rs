@@ -2,6 +2,7 @@
 //! rustls-pki-types, which is right for certificates, frees the base64 text as it is.
 
 use rustls::pki_types::{PrivateKeyDer, PrivatePkcs1KeyDer, PrivatePkcs8KeyDer, PrivateSec1KeyDer};
+use secrecy::{ExposeSecret, SecretSlice};
 use zeroize::Zeroizing;
 
 use crate::parse::base64_text;
@@ -17,7 +18,7 @@ enum Form {
 /// The DER of a private key, zeroized on drop.
 pub(crate) struct PrivateKey {
     form: Form,
-    der: Zeroizing<Box<[u8]>>,
+    der: SecretSlice<u8>,
 }
 
 impl PrivateKey {
@@ -48,7 +49,7 @@ impl PrivateKey {
     }
 
     pub(crate) fn der(&self) -> PrivateKeyDer<'_> {
-        let der = &**self.der;
+        let der = self.der.expose_secret();
         match self.form {
             Form::Pkcs8 => PrivatePkcs8KeyDer::from(der).into(),
             Form::Sec1 => PrivateSec1KeyDer::from(der).into(),
@@ -69,7 +70,8 @@ mod tests {
     use proptest::prelude::*;
 
     fn read(text: &str) -> Option<(Form, Vec<u8>)> {
-        PrivateKey::from_pem(text.as_bytes()).map(|key| (key.form, key.der.to_vec()))
+        PrivateKey::from_pem(text.as_bytes())
+            .map(|key| (key.form, key.der.expose_secret().to_vec()))
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 use std::io::{self, Read};
 
+use secrecy::SecretSlice;
 use zeroize::Zeroizing;
 
 pub(crate) struct SecretBuf {
@@ -35,8 +36,10 @@ impl SecretBuf {
         }
     }
 
-    pub(crate) fn into_bytes(mut self) -> Zeroizing<Vec<u8>> {
-        Zeroizing::new(std::mem::take(&mut self.bytes))
+    /// The bytes in a block of their own size: `SecretSlice::from(Vec)` would have the allocator
+    /// shrink the block, which may leave a copy behind.
+    pub(crate) fn into_secret(self) -> SecretSlice<u8> {
+        Box::<[u8]>::from(&self.bytes[..]).into()
     }
 
     pub(crate) fn extend(&mut self, more: &[u8]) -> Result<(), LimitExceeded> {

@@ -1,7 +1,7 @@
 //! The README's example, run against a simulated KME.
 
-use etsi_qkd014::Client;
 use etsi_qkd014::sim::Network;
+use etsi_qkd014::{Client, secrecy::ExposeSecret};
 
 /// The text between the marks is the README's.
 #[allow(clippy::print_stdout, reason = "the README prints")]
@@ -16,7 +16,7 @@ async fn example() -> Result<(), etsi_qkd014::Error> {
         .build()?;
     let key = client.enc_keys("sae-b").size(256).send().await?.into_single();
     println!("tell sae-b: {}", key.key_id());
-    let _secret: &[u8] = key.expose();
+    let _secret: &[u8] = key.expose_secret();
     // to here.
     Ok(())
 }
@@ -30,7 +30,7 @@ fn the_readme_has_the_text_that_is_run() {
     let (_, run) = include_str!("readme.rs").split_once("// From here\n").unwrap();
     let (run, _) = run.split_once("// to here.\n").unwrap();
     let (_, told) = include_str!("../README.md").split_once("etsi_qkd014::Error> {\n").unwrap();
-    let (told, _) = told.split_once("# Ok(()) }\n").unwrap();
+    let (told, _) = told.split_once("    Ok(())\n}\n").unwrap();
     assert_eq!(lines(run), lines(told));
     assert_eq!(lines(told).len(), 10);
 }

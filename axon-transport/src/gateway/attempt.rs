@@ -9,6 +9,7 @@ use std::{net::SocketAddr, sync::Arc, time::Duration};
 use axon_envelope::{Delivery, Kind, KmeKey, Route, TopicHash};
 use axon_tls::{Negotiated, qkd::derive_psk};
 use quinn::SendStream;
+use secrecy::ExposeSecret;
 
 use super::{
     GatewayError, Refusal,
@@ -132,7 +133,7 @@ async fn forged(
         Bootstrap::WrongKey => {
             let fetched = keyring.fetch_one(peer, context.next_link()).await;
             let (key_id, key) = fetched.map_err(|e| internal(&e))?;
-            let mut wrong = *key.expose();
+            let mut wrong = *key.expose_secret();
             wrong[0] ^= 1;
             (key_id, KmeKey::take(&mut wrong))
         }
@@ -143,7 +144,7 @@ async fn forged(
         }
     };
     let id = String::from_utf8_lossy(key_id.as_bytes()).into_owned();
-    let psk = derive_psk(key.expose(), &id, &qkd.sae_id, peer, context.config.cipher);
+    let psk = derive_psk(key.expose_secret(), &id, &qkd.sae_id, peer, context.config.cipher);
     let attempt = keys::Attempt { key_id, psk: Arc::new(psk.map_err(|e| internal(&e))?) };
     let client = context.qkd_client(&attempt).map_err(|e| internal(&e))?;
     let mut tries = 0;

@@ -14,6 +14,7 @@ use std::{
 use crate::process::{Made, PerProcess};
 
 use rustix::mm::{Advice, MapFlags, ProtFlags, madvise, mlock, mmap_anonymous};
+use secrecy::ExposeSecret;
 use zeroize::Zeroize;
 
 /// Bytes that are mapped at a time: 512 keys.
@@ -103,9 +104,9 @@ impl LockedKey {
     }
 }
 
-impl AsRef<[u8; 32]> for LockedKey {
+impl ExposeSecret<[u8; 32]> for LockedKey {
     /// The key. Aborts a process that [is a fork](Self::is_forked) of the one that made it.
-    fn as_ref(&self) -> &[u8; 32] {
+    fn expose_secret(&self) -> &[u8; 32] {
         if self.is_forked() {
             abort_forked();
         }
@@ -222,7 +223,7 @@ mod tests {
         let keys: Vec<_> =
             (0..2000_u32).map(|at| LockedKey::copy_of(&[at as u8 | 1; 32]).unwrap()).collect();
         for (at, key) in (0_u32..).zip(&keys) {
-            assert_eq!(*key.as_ref(), [at as u8 | 1; 32]);
+            assert_eq!(*key.expose_secret(), [at as u8 | 1; 32]);
         }
         for key in keys.iter().step_by(500) {
             let flags = flags(key.slot.as_ptr().addr());
@@ -256,7 +257,7 @@ mod tests {
         // SAFETY: waits for the child just made, and writes its status.
         assert_eq!(unsafe { libc::waitpid(child, &raw mut status, 0) }, child);
         assert_eq!(status, 0, "the child found the key");
-        assert_eq!(*key.as_ref(), [0x5a; 32]);
+        assert_eq!(*key.expose_secret(), [0x5a; 32]);
     }
 
     #[test]
@@ -272,7 +273,7 @@ mod tests {
             unsafe { libc::setrlimit(libc::RLIMIT_CORE, &raw const no_core) };
             // SAFETY: both descriptors are open; the child is the only one with this standard error.
             unsafe { libc::dup2(says.as_raw_fd(), 2) };
-            let used = std::hint::black_box(key.as_ref())[0];
+            let used = std::hint::black_box(key.expose_secret())[0];
             // SAFETY: it ends the process at once.
             unsafe { libc::_exit(i32::from(used)) };
         }
@@ -285,7 +286,7 @@ mod tests {
         assert!(libc::WIFSIGNALED(status), "the child went on with a key of zeros");
         assert_eq!(libc::WTERMSIG(status), libc::SIGABRT);
         assert!(text.contains("forked"), "{text:?}");
-        assert_eq!(*key.as_ref(), [0x5a; 32]);
+        assert_eq!(*key.expose_secret(), [0x5a; 32]);
     }
 
     #[test]
@@ -314,6 +315,6 @@ mod tests {
         // SAFETY: waits for the child just made, and writes its status.
         assert_eq!(unsafe { libc::waitpid(child, &raw mut status, 0) }, child);
         assert_eq!(status, 0, "the child's key is not locked, or it has none");
-        assert_eq!(*key.as_ref(), [0x5a; 32]);
+        assert_eq!(*key.expose_secret(), [0x5a; 32]);
     }
 }

@@ -1,11 +1,12 @@
 //! The value of `key`: a JSON string of base64, decoded without an unzeroized copy.
 
+use secrecy::{ExposeSecretMut, SecretSlice};
 use zeroize::Zeroizing;
 
 /// Decodes the raw text of a JSON string, quotes included. Strict RFC 4648 base64 with padding;
 /// white space between the characters is allowed, and JSON escapes of base64 characters are
 /// undone, as serializers that escape `/` or `+` write them.
-pub(super) fn decode(raw: &str) -> Result<Zeroizing<Box<[u8]>>, &'static str> {
+pub(super) fn decode(raw: &str) -> Result<SecretSlice<u8>, &'static str> {
     let inner = raw
         .strip_prefix('"')
         .and_then(|rest| rest.strip_suffix('"'))
@@ -22,17 +23,18 @@ pub(super) fn decode(raw: &str) -> Result<Zeroizing<Box<[u8]>>, &'static str> {
 }
 
 /// Straight into the only block that will hold the key.
-pub(crate) fn decode_text(text: &[u8]) -> Result<Zeroizing<Box<[u8]>>, &'static str> {
+pub(crate) fn decode_text(text: &[u8]) -> Result<SecretSlice<u8>, &'static str> {
     const REFUSED: &str = "is not base64 with padding (RFC 4648 section 4)";
     let padding = text.iter().rev().take(2).take_while(|byte| **byte == b'=').count();
     if !text.len().is_multiple_of(4) {
         return Err(REFUSED);
     }
     let digits = &text[..text.len() - padding];
-    let mut secret = Zeroizing::new(vec![0; text.len() / 4 * 3 - padding].into_boxed_slice());
+    let mut secret = SecretSlice::from(vec![0; text.len() / 4 * 3 - padding].into_boxed_slice());
+    let bytes = secret.expose_secret_mut();
     let mut values = Zeroizing::new([0; PART]);
     let mut sound = true;
-    for (digits, bytes) in digits.chunks(PART).zip(secret.chunks_mut(PART / 4 * 3)) {
+    for (digits, bytes) in digits.chunks(PART).zip(bytes.chunks_mut(PART / 4 * 3)) {
         for (value, digit) in values.iter_mut().zip(digits) {
             *value = value_of(*digit);
             sound &= *value != NONE;
@@ -127,6 +129,7 @@ mod tests {
     use base64::Engine;
     use base64::engine::general_purpose::STANDARD;
     use proptest::prelude::*;
+    use secrecy::ExposeSecret;
 
     #[test]
     fn it_refuses_what_is_not_strict() {
@@ -158,7 +161,7 @@ mod tests {
         let plain = decode("\"+/+/AA==\"").unwrap();
         for same in ["\"+/+/\\r\\nAA==\"", "\"\\u002b\\/\\u002B\\/AA\\u003d=\"", "\" +/+/ AA== \""]
         {
-            assert_eq!(*decode(same).unwrap(), *plain, "{same}");
+            assert_eq!(decode(same).unwrap().expose_secret(), plain.expose_secret(), "{same}");
         }
     }
 
@@ -182,14 +185,15 @@ mod tests {
         fn it_accepts_what_the_reference_accepts(text in "[A-Za-z0-9+/]{0,9}[A-Za-z0-9+/=_ -]{0,4}") {
             for text in [text.clone(), text.repeat(16)] {
                 let (ours, theirs) = (decode_text(text.as_bytes()), STANDARD.decode(&text));
-                prop_assert_eq!(ours.ok().map(|secret| secret.to_vec()), theirs.ok());
+                prop_assert_eq!(ours.ok().map(|secret| secret.expose_secret().to_vec()), theirs.ok());
             }
         }
 
         #[test]
         fn what_was_encoded_comes_back(bytes: Vec<u8>) {
             let text = format!("\"{}\"", STANDARD.encode(&bytes));
-            prop_assert_eq!(&**decode(&text).unwrap(), &bytes[..]);
+            let decoded = decode(&text).unwrap();
+            prop_assert_eq!(decoded.expose_secret(), &bytes[..]);
         }
     }
 }

@@ -2,6 +2,8 @@
 
 use std::cmp::Ordering;
 
+use secrecy::ExposeSecret;
+
 use super::json::{Object, Place, text};
 use super::{base64, malformed};
 use crate::{Error, Key, KeyContainer, Quirks};
@@ -69,7 +71,7 @@ fn key(place: Place, object: &mut Object<'_>, quirks: Quirks) -> Result<Key, Err
     check_key_id(&key_id, place, quirks)?;
     let secret =
         base64::decode(object.need("key")?).map_err(|why| malformed(object.path("key"), why))?;
-    if secret.is_empty() {
+    if secret.expose_secret().is_empty() {
         return Err(malformed(object.path("key"), "is empty"));
     }
     let key_id_extension = object.take_extension("key_ID_extension")?;

@@ -7,7 +7,6 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
-use zeroize::Zeroizing;
 
 use super::fault::Fault;
 use super::handshake::Acceptors;
@@ -294,7 +293,7 @@ pub(super) fn client_builder(sae: &Sae) -> ClientBuilder {
         .kme_id(sae.kme_id())
         .ca(sae.ca_pem())
         .sae_cert(sae.cert_pem())
-        .sae_key(Zeroizing::new(sae.key_pem().as_bytes().to_vec()))
+        .sae_key(sae.key_pem().as_bytes().to_vec())
 }
 
 impl Sae {

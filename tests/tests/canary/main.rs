@@ -18,6 +18,7 @@ mod trace;
 use std::cell::RefCell;
 use std::time::Duration;
 
+use etsi_qkd014::secrecy::ExposeSecret;
 use etsi_qkd014::{Client, ClientBuilder, Error, Key, KeyContainer};
 use kme::{Kmes, key, key_id};
 use search::{Needles, Sites};
@@ -101,7 +102,7 @@ fn script_keys<T>(_: &T) -> Vec<Vec<u8>> {
 }
 
 fn exposed(keys: &[Key]) -> Vec<Vec<u8>> {
-    keys.iter().map(|key| key.expose().to_vec()).collect()
+    keys.iter().map(|key| key.expose_secret().to_vec()).collect()
 }
 
 type Answer = Result<KeyContainer, Error>;

@@ -13,6 +13,7 @@ use axon_tls::{
     Cipher,
     qkd::{self, Psk, PskIdentity, PskResolver},
 };
+use secrecy::ExposeSecret;
 use tokio::sync::Notify;
 
 use super::{
@@ -260,7 +261,7 @@ impl Acceptor {
                 [(key_id, key)] if *key_id == pending.key_id => {
                     let name = pending.identity.key_id();
                     match qkd::derive_psk(
-                        key.expose(),
+                        key.expose_secret(),
                         name,
                         &master,
                         &self.0.sae_id,

@@ -7,6 +7,7 @@ use axon_tls::{
     Cipher,
     qkd::{self, Psk},
 };
+use secrecy::ExposeSecret;
 
 use super::Completion;
 use crate::{
@@ -327,5 +328,5 @@ fn derive(
 ) -> Result<Psk, String> {
     let text = std::str::from_utf8(key_id.as_bytes())
         .map_err(|_| format!("the KME named a key {key_id}, which is no text"))?;
-    qkd::derive_psk(key.expose(), text, client, server, cipher).map_err(|e| e.to_string())
+    qkd::derive_psk(key.expose_secret(), text, client, server, cipher).map_err(|e| e.to_string())
 }

@@ -237,11 +237,14 @@ async fn next(
 fn client(config: &QkdConfig) -> Result<Client, KmeError> {
     let of_client = config.kme_quirks.iter().filter(|quirk| *quirk != QkdConfig::NO_NAME_CHECK);
     let quirks = of_client.cloned().collect::<Vec<_>>().join(",").parse::<Quirks>();
+    // In a block of its own size, which nobody has to shrink; what was read is erased.
+    let sae_key =
+        Box::<[u8]>::from(read("AXON_SAE_KEY", &config.sae_key, Demands::KEY)?.as_slice());
     let mut builder = Client::builder()
         .kme_url(&config.kme_url)
         .ca(read("AXON_KME_CA", &config.kme_ca, Demands::CERTIFICATES)?.as_slice())
         .sae_cert(read("AXON_SAE_CERT", &config.sae_cert, Demands::CERTIFICATES)?.as_slice())
-        .sae_key(read("AXON_SAE_KEY", &config.sae_key, Demands::KEY)?)
+        .sae_key(sae_key)
         .connect_timeout(config.kme_connect_timeout)
         .timeout(config.kme_answer_timeout)
         // The machines repeat what may be repeated, and know when.

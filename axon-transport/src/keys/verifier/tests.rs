@@ -1,6 +1,7 @@
 use std::time::Duration;
 
 use axon_envelope::{KeyId, KmeKey};
+use secrecy::ExposeSecret;
 
 use super::{ClientProof, ProofFailure, ProofResponder, ProofState};
 use crate::keys::{
@@ -72,7 +73,7 @@ fn nothing_but_the_right_proof_will_do() {
     proof.on_message(NOW, &ready("k1", right));
     assert_eq!(proof.state(), ProofState::Proven);
     let (key_id, proven) = proof.into_key().unwrap();
-    assert_eq!((key_id, *proven.expose()), (id("k1"), [1; 32]));
+    assert_eq!((key_id, *proven.expose_secret()), (id("k1"), [1; 32]));
 }
 
 #[test]

@@ -141,8 +141,8 @@ fn dec_keys_returns_what_was_asked_in_its_order_and_spelling() {
     let container = parse(&two(), &Asked::Ids(&asked), Some(256)).unwrap();
     assert_eq!(container.keys[0].key_id(), asked[0]);
     assert_eq!(container.keys[1].key_id(), asked[1]);
-    assert_eq!(container.keys[0].expose()[0], 0x39);
-    assert_eq!(container.keys[1].expose()[0], 0xc0);
+    assert_eq!(container.keys[0].expose_secret()[0], 0x39);
+    assert_eq!(container.keys[1].expose_secret()[0], 0xc0);
 }
 
 #[test]
@@ -238,7 +238,7 @@ proptest! {
         let container = parse(&json!({ "keys": came }), &Asked::Ids(&ids), Some(32)).unwrap();
         for ((key, id), number) in container.keys.iter().zip(&ids).zip(&sorted) {
             prop_assert_eq!(key.key_id(), id);
-            prop_assert_eq!(key.expose(), &[*number; 4]);
+            prop_assert_eq!(key.expose_secret(), &[*number; 4]);
         }
         // One of them in another's place.
         let mut other = came;

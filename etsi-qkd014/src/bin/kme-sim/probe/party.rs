@@ -78,7 +78,7 @@ impl Party {
             .kme_url(&self.url)
             .ca(self.ca.clone())
             .sae_cert(self.cert.clone())
-            .sae_key(self.key.clone())
+            .sae_key(Box::<[u8]>::from(self.key.as_slice()))
             .timeout(self.timeout)
             .connect_timeout(self.timeout)
             .deadline(self.timeout)
