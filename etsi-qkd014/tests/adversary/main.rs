@@ -3,6 +3,5 @@
 
 mod cancellation;
 mod http;
-mod json;
 mod misuse;
 mod server;
