@@ -26,6 +26,7 @@ fn kmes() {
     let runtime = tokio::runtime::Runtime::new().expect("a runtime");
     runtime.block_on(async {
         let network = Network::builder()
+            .strict()
             .kme("kme-1", ([127, 0, 0, 1], 0).into(), ["sae-1"])
             .kme("kme-2", ([127, 0, 0, 2], 0).into(), ["sae-2"])
             .start()

@@ -37,6 +37,7 @@ struct Bed {
 impl Bed {
     async fn start() -> Self {
         let network = Network::builder()
+            .strict()
             .kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a"])
             .kme("kme-b", "127.0.0.2:0".parse().unwrap(), ["sae-b"])
             .start()

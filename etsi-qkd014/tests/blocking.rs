@@ -5,6 +5,7 @@ use etsi_qkd014::{Error, blocking};
 
 fn network(runtime: &tokio::runtime::Runtime) -> Network {
     let start = Network::builder()
+        .strict()
         .kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a"])
         .kme("kme-b", "127.0.0.2:0".parse().unwrap(), ["sae-b"])
         .start();

@@ -10,11 +10,10 @@ use serde_json::json;
 const UNKNOWN: &str = "11111111-2222-4333-8444-555555555555";
 
 fn two() -> NetworkBuilder {
-    Network::builder().kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a", "sae-c"]).kme(
-        "kme-b",
-        "127.0.0.2:0".parse().unwrap(),
-        ["sae-b"],
-    )
+    Network::builder()
+        .strict()
+        .kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a", "sae-c"])
+        .kme("kme-b", "127.0.0.2:0".parse().unwrap(), ["sae-b"])
 }
 
 struct Pair {
@@ -92,6 +91,7 @@ async fn a_kme_with_another_id_or_name_is_refused() {
 /// KMEs whose certificates name 0.0.0.0 and no address that a client could use.
 async fn two_on_all_addresses(_not: u16) -> Network {
     Network::builder()
+        .strict()
         .kme("kme-a", "0.0.0.0:0".parse().unwrap(), ["sae-a"])
         .kme("kme-b", "0.0.0.0:0".parse().unwrap(), ["sae-b"])
         .start()

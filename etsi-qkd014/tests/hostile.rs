@@ -7,6 +7,7 @@ use etsi_qkd014::{Client, ClientBuilder, Error, KeyContainer, Quirks, RefusedBy,
 
 async fn network() -> Network {
     Network::builder()
+        .strict()
         .kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a"])
         .kme("kme-b", "127.0.0.2:0".parse().unwrap(), ["sae-b"])
         .start()

@@ -94,6 +94,7 @@ async fn child_pool_with_a_full_disk() {
 
 async fn network() -> Network {
     Network::builder()
+        .strict()
         .kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a"])
         .kme("kme-b", "127.0.0.2:0".parse().unwrap(), ["sae-b"])
         .start()

@@ -154,7 +154,9 @@ async fn stand_in() -> (Network, tempfile::TempDir, Account) {
         let ca = dir.path().join("account-1234-server-ca-qukaydee-com.crt");
         std::fs::rename(dir.path().join("ca.pem"), ca).unwrap();
         // Another process may have taken the port in between.
-        let Ok(network) = Network::builder().layout(layout, pki).start().await else { continue };
+        let Ok(network) = Network::builder().strict().layout(layout, pki).start().await else {
+            continue;
+        };
         let account = Account::read(|name| {
             Some(match name {
                 "QUKAYDEE_ACCT" => "1234".to_owned(),

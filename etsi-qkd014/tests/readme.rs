@@ -38,6 +38,7 @@ fn the_readme_has_the_text_that_is_run() {
 #[tokio::test]
 async fn the_readme_example_draws_a_key_that_the_other_side_gets() {
     let network = Network::builder()
+        .strict()
         .kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a"])
         .kme("kme-b", "127.0.0.1:0".parse().unwrap(), ["sae-b"])
         .start()

@@ -11,7 +11,8 @@ use tokio::net::TcpStream;
 
 async fn network() -> (Arc<Network>, SocketAddr) {
     let any = "127.0.0.1:0".parse().unwrap();
-    let builder = Network::builder().kme("kme-a", any, ["sae-a"]).kme("kme-b", any, ["sae-b"]);
+    let builder =
+        Network::builder().strict().kme("kme-a", any, ["sae-a"]).kme("kme-b", any, ["sae-b"]);
     let network = Arc::new(builder.start().await.unwrap());
     let control = Control::bind(any).await.unwrap();
     let addr = control.addr();

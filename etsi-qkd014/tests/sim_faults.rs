@@ -10,7 +10,7 @@ use etsi_qkd014::{Client, Error, KeyPool, RefusedBy, RetryPolicy};
 use tokio::time::Instant;
 
 fn two() -> NetworkBuilder {
-    Network::builder().kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a"]).kme(
+    Network::builder().strict().kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a"]).kme(
         "kme-b",
         "127.0.0.2:0".parse().unwrap(),
         ["sae-b"],
@@ -85,7 +85,8 @@ async fn files_hold_the_certificates_out_of_their_time() {
         }
         // A KME that lives from the files alone has them too.
         let pki = Pki::load(dir.path(), &layout).unwrap();
-        let network = Network::builder().layout(layout.clone(), pki).start().await.unwrap();
+        let network =
+            Network::builder().strict().layout(layout.clone(), pki).start().await.unwrap();
         network.kme("kme-a").unwrap().inject(fault, 1);
         let client = client(&network, "sae-a");
         let error = client.status("sae-b").await.unwrap_err();

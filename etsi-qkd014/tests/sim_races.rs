@@ -11,11 +11,10 @@ use etsi_qkd014::{Client, Error, Key, RetryPolicy};
 use tokio::task::JoinSet;
 
 fn two() -> NetworkBuilder {
-    Network::builder().kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a", "sae-c"]).kme(
-        "kme-b",
-        "127.0.0.2:0".parse().unwrap(),
-        ["sae-b"],
-    )
+    Network::builder()
+        .strict()
+        .kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a", "sae-c"])
+        .kme("kme-b", "127.0.0.2:0".parse().unwrap(), ["sae-b"])
 }
 
 fn client(network: &Network, sae: &str) -> Client {

@@ -302,6 +302,7 @@ async fn keys_under_table_11s_name_need_the_quirk() {
 #[tokio::test]
 async fn a_short_retry_after_is_waited_for() {
     let network = Network::builder()
+        .strict()
         .kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a"])
         .kme("kme-b", "127.0.0.1:0".parse().unwrap(), ["sae-b"])
         .start()

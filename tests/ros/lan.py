@@ -70,7 +70,7 @@ class Lan:
 
     def serve_keys(self, program, directory, count):
         """Starts the `count` KMEs of a directory that `kme-sim init` made."""
-        command = [*self._switch.enter, program, 'run', directory]
+        command = [*self._switch.enter, program, 'run', '--strict', directory]
         process = Process([str(part) for part in command], dict(os.environ))
         self._kmes.append(process)
         process.said('https://', count=count)

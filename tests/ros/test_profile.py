@@ -112,7 +112,7 @@ def test_two_hosts_with_roles_have_keys_and_can_do_without(lan, tmp_path):  # no
     for host, prefix in zip((a, b), prefixes):
         use(host, prefix)
     kmes = a.start(
-        'ros2', 'run', 'rmw_axon', 'kme-sim', 'run',
+        'ros2', 'run', 'rmw_axon', 'kme-sim', 'run', '--strict',
         prefixes[0] / 'lib/rmw_axon/simulated-qkd/kmes')
     kmes.said('https://', count=2)
     heard_both_ways(a, b)

@@ -65,6 +65,7 @@ impl Kmes {
         let failed = |error: sim::Error| DemoError::Kme(error.to_string());
         let [a, b, visitor] = SAES;
         let network = sim::Network::builder()
+            .strict()
             .kme(KMES[0], ([127, 0, 0, 1], 0).into(), [a, visitor])
             .kme(KMES[1], ([127, 0, 0, 2], 0).into(), [b])
             .start()

@@ -24,6 +24,7 @@ async fn polled<T>(call: impl Future<Output = T>, most: usize) -> Option<T> {
 
 async fn each_wait(faults: &[Fault]) {
     let network = Network::builder()
+        .strict()
         .kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a"])
         .kme("kme-b", "127.0.0.1:0".parse().unwrap(), ["sae-b"])
         .start()

@@ -8,6 +8,7 @@ use etsi_qkd014::{Client, ClientBuilder, Error, Quirks, RetryPolicy};
 
 async fn network() -> Network {
     Network::builder()
+        .strict()
         .kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a"])
         .kme("kme-b", "127.0.0.1:0".parse().unwrap(), ["sae-b"])
         .start()

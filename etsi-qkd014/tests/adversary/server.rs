@@ -56,6 +56,7 @@ pub(crate) struct Server {
 impl Server {
     pub(crate) async fn start(answer: Vec<u8>, then: Then) -> Self {
         let network = Network::builder()
+            .strict()
             .kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a"])
             .kme("kme-b", "127.0.0.1:0".parse().unwrap(), ["sae-b"])
             .start()

@@ -13,7 +13,7 @@ use scripted::{Script, uuid};
 use tokio::time::{Instant, sleep};
 
 fn two() -> NetworkBuilder {
-    Network::builder().kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a"]).kme(
+    Network::builder().strict().kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a"]).kme(
         "kme-b",
         "127.0.0.2:0".parse().unwrap(),
         ["sae-b"],
@@ -145,7 +145,7 @@ async fn a_kme_that_is_down_and_comes_back_serves_again() {
     Pki::create(&layout).unwrap().write(dir.path()).unwrap();
     let start = async || {
         let pki = Pki::load(dir.path(), &layout).unwrap();
-        Network::builder().layout(layout.clone(), pki).start().await
+        Network::builder().strict().layout(layout.clone(), pki).start().await
     };
     let network = start().await.unwrap();
     let pool = pool(&network).target(8).build().unwrap();

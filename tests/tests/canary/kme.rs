@@ -104,6 +104,7 @@ pub(crate) fn serve_if_asked() {
     let Some(dir) = std::env::var_os(VARIABLE).map(PathBuf::from) else { return };
     let runtime = tokio::runtime::Runtime::new().unwrap();
     let network = Network::builder()
+        .strict()
         .kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a"])
         .kme("kme-b", "127.0.0.1:0".parse().unwrap(), ["sae-b"])
         .max_keys_per_request(1_000)

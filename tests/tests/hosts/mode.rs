@@ -33,6 +33,7 @@ impl Kmes {
             tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
         let runtime = runtime.unwrap();
         let network = sim::Network::builder()
+            .strict()
             .kme("kme-a", ([127, 0, 0, 1], 0).into(), [SAE[0]])
             .kme("kme-b", ([127, 0, 0, 2], 0).into(), [SAE[1]]);
         let drawn = Arc::new(Mutex::new(Drawn::new()));

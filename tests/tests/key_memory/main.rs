@@ -33,6 +33,7 @@ fn kmes() {
     let Some(dir) = std::env::var_os(VARIABLE).map(PathBuf::from) else { return };
     let runtime = Runtime::new().unwrap();
     let network = Network::builder()
+        .strict()
         .kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a"])
         .kme("kme-b", "127.0.0.1:0".parse().unwrap(), ["sae-b"])
         .max_keys_per_request(BATCH.into())

@@ -18,7 +18,8 @@ use crate::{
 
 async fn network() -> Network {
     let any = "127.0.0.1:0".parse().unwrap();
-    let builder = Network::builder().kme("kme-a", any, ["sae-a"]).kme("kme-b", any, ["sae-b"]);
+    let builder =
+        Network::builder().strict().kme("kme-a", any, ["sae-a"]).kme("kme-b", any, ["sae-b"]);
     builder.start().await.unwrap()
 }
 
