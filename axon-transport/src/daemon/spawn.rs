@@ -96,7 +96,7 @@ pub(crate) fn spawn(
 /// [folders](folders).
 fn find(config: &Config, command: Option<&DaemonCommand>) -> Result<DaemonCommand, SessionError> {
     if let Some(path) = &config.daemon_path {
-        return Ok(DaemonCommand { program: path.clone(), arguments: Vec::new() });
+        return Ok(named(path));
     }
     if let Some(command) = command {
         return Ok(command.clone());
@@ -105,14 +105,23 @@ fn find(config: &Config, command: Option<&DaemonCommand>) -> Result<DaemonComman
     program_in(&tried).ok_or(SessionError::NoProgram { tried })
 }
 
-/// The daemon in the first folder that has one, else the tool in the first that has it, which can be it.
+/// The daemon, and the tool, which can be it.
+const PROGRAMS: [&str; 2] = ["axon_daemon", TOOL];
+const TOOL: &str = "axon";
+
+/// The daemon in the first folder that has one, else the tool in the first that has it.
 fn program_in(folders: &[PathBuf]) -> Option<DaemonCommand> {
-    let programs: [(&str, &[&str]); 2] = [("axon_daemon", &[]), ("axon", &["daemon"])];
-    programs.into_iter().find_map(|(name, arguments)| {
+    PROGRAMS.into_iter().find_map(|name| {
         let program = folders.iter().map(|folder| folder.join(name)).find(|p| is_program(p))?;
-        let arguments = arguments.iter().map(OsString::from).collect();
-        Some(DaemonCommand { program, arguments })
+        Some(named(&program))
     })
+}
+
+/// How this program is started as a daemon: the tool has a command for it.
+fn named(program: &Path) -> DaemonCommand {
+    let is_tool = program.file_name().is_some_and(|name| name == TOOL);
+    let arguments = if is_tool { vec!["daemon".into()] } else { Vec::new() };
+    DaemonCommand { program: program.to_owned(), arguments }
 }
 
 /// Whether this can be executed, belongs to this user or to root, and can be replaced by no other. This
@@ -367,6 +376,17 @@ mod tests {
             [&of_axon[..], &["PATH"], &ros, &["XDG_RUNTIME_DIR"]].concat()
         );
         assert_eq!(names(&read, true), [&of_axon[..], &ros].concat());
+    }
+
+    #[test]
+    fn a_setting_may_name_the_tool_or_a_daemon_of_any_other_name() {
+        for (path, arguments) in
+            [("/opt/axon", &["daemon"][..]), ("/opt/axon_daemon", &[]), ("/opt/axon/mine", &[])]
+        {
+            let command = named(Path::new(path));
+            assert_eq!((command.program, command.arguments.len()), (path.into(), arguments.len()));
+            assert!(command.arguments.iter().eq(arguments), "{path}: {:?}", command.arguments);
+        }
     }
 
     #[test]
