@@ -1,0 +1,25 @@
+//! The published crates as somebody outside of this repository has them: from their packages, in
+//! projects of their own.
+//!
+//! Doc tests compile the README's blocks with the features, dependencies and hidden lines of this
+//! workspace. Here each block stands alone, in a project to which was added what the README says, and
+//! nothing else.
+//!
+//! Most of it builds all that the crates depend on, in part with other features than the workspace's:
+//! `cargo test -p xtask --test outside -- --include-ignored`.
+
+mod beside;
+mod examples;
+mod project;
+mod readme;
+mod run;
+
+/// The crates that are published, and where they are in this repository.
+const PUBLISHED: [(&str, &str); 6] = [
+    ("etsi-qkd014", "etsi-qkd014"),
+    ("axon-envelope", "axon-envelope"),
+    ("rustls-axon", "third_party/rustls-axon"),
+    ("axon-tls", "axon-tls"),
+    ("axon-transport", "axon-transport"),
+    ("axon-cli", "axon-cli"),
+];

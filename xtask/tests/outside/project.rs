@@ -1,0 +1,158 @@
+//! The packages of the published crates, and projects outside of the workspace that depend on them.
+
+use std::fs;
+use std::io::{Write, stderr};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::sync::LazyLock;
+
+use crate::PUBLISHED;
+
+/// What cargo says when it is the registry that is missing.
+const UNREACHABLE: [&str; 6] = [
+    "failed to download",
+    "download of config.json failed",
+    "Could not resolve host",
+    "Couldn't resolve host",
+    "spurious network error",
+    "network failure seems to have happened",
+];
+
+pub(crate) fn workspace() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("xtask is in the repository")
+}
+
+/// The workspace's target directory: it has aws-lc, built.
+pub(crate) fn target() -> &'static Path {
+    Path::new(env!("CARGO_TARGET_TMPDIR")).parent().expect("it is in the target directory")
+}
+
+fn scratch() -> PathBuf {
+    Path::new(env!("CARGO_TARGET_TMPDIR")).join("outside")
+}
+
+#[track_caller]
+pub(crate) fn run(command: &mut Command) -> Output {
+    let output = command.output().unwrap_or_else(|error| panic!("{command:?}: {error}"));
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    let (out, err) = (text(&output.stdout), text(&output.stderr));
+    assert!(output.status.success(), "{command:?}: {}\n{out}\n{err}", output.status);
+    output
+}
+
+/// Cargo in a directory, with the target directory of the workspace. What else it would inherit is of
+/// this workspace.
+pub(crate) fn cargo(dir: &Path, args: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO"));
+    command.args(args).current_dir(dir).env("CARGO_TARGET_DIR", target());
+    command
+}
+
+/// The directory of each unpacked package, in the order of [`PUBLISHED`]. Made once, as a release
+/// makes them.
+static PACKAGES: LazyLock<Vec<PathBuf>> = LazyLock::new(|| {
+    run(Command::new(env!("CARGO_BIN_EXE_xtask")).arg("patched-tree"));
+    let _ = fs::remove_dir_all(scratch());
+    let out = scratch().join("out");
+    fs::create_dir_all(&out).expect("a directory");
+    let mut package = cargo(workspace(), &["package", "--no-verify", "--allow-dirty", "--offline"]);
+    package.args(PUBLISHED.iter().flat_map(|(name, _)| ["--package", name]));
+    run(package.arg("--target-dir").arg(&out));
+
+    let packed = |name: &str| {
+        let is_it = |file: &PathBuf| {
+            let stem = file.file_stem().and_then(|stem| stem.to_str()).unwrap_or_default();
+            let version = stem.strip_prefix(name).and_then(|rest| rest.strip_prefix('-'));
+            file.extension().is_some_and(|end| end == "crate")
+                && version.is_some_and(|version| version.starts_with(|c: char| c.is_ascii_digit()))
+        };
+        let mut files = fs::read_dir(out.join("package")).expect("it was just made").flatten();
+        files.find_map(|entry| Some(entry.path()).filter(is_it)).expect(name)
+    };
+    let unpacked = PUBLISHED.iter().map(|(name, _)| {
+        let file = packed(name);
+        // -m: cargo goes by the time of a file, and all packed ones have the same
+        run(Command::new("tar").arg("-xmzf").arg(&file).arg("-C").arg(scratch()));
+        let dir = scratch().join(file.file_stem().expect("name and version"));
+        // Otherwise cargo looks for a workspace in the directories above, and finds this one.
+        let manifest = dir.join("Cargo.toml");
+        let text = fs::read_to_string(&manifest).expect("a manifest") + "\n[workspace]\n";
+        fs::write(&manifest, text).expect("a manifest");
+        dir
+    });
+    unpacked.collect()
+});
+
+/// The directory of a package.
+pub(crate) fn package(name: &str) -> &'static Path {
+    let at = PUBLISHED.iter().position(|(one, _)| *one == name);
+    &PACKAGES[at.unwrap_or_else(|| panic!("{name} is not published"))]
+}
+
+/// Has the packages find each other where a registry would have them.
+pub(crate) fn patch() -> String {
+    let lines = PUBLISHED.iter().map(|(name, _)| format!("{name}.path = {:?}\n", package(name)));
+    format!("[patch.crates-io]\n{}", lines.collect::<String>())
+}
+
+/// A project outside of the workspace.
+pub(crate) struct Project {
+    pub(crate) dir: PathBuf,
+}
+
+impl Project {
+    /// An empty project. It has the workspace's `Cargo.lock` and profiles, so that what was built for
+    /// the workspace is not built again.
+    pub(crate) fn new(name: &str) -> Self {
+        // Unpacked first, which empties the directory that this one is in.
+        let patch = patch();
+        let dir = scratch().join("projects").join(name);
+        let _ = fs::remove_dir_all(&dir);
+        fs::create_dir_all(dir.join("src/bin")).expect("a directory");
+        let manifest = fs::read_to_string(workspace().join("Cargo.toml")).expect("the manifest");
+        let profiles = &manifest[manifest.find("\n[profile.dev]").expect("a profile")..];
+        let own = format!("[package]\nname = {name:?}\nversion = \"0.0.0\"\nedition = \"2024\"\n");
+        let text = format!("{own}[workspace]\n{patch}{profiles}");
+        fs::write(dir.join("Cargo.toml"), text).expect("a manifest");
+        fs::copy(workspace().join("Cargo.lock"), dir.join("Cargo.lock")).expect("a lock file");
+        let project = Self { dir };
+        project.write("src/lib.rs", "");
+        project
+    }
+
+    pub(crate) fn write(&self, file: &str, text: &str) {
+        fs::write(self.dir.join(file), text).expect(file);
+    }
+
+    pub(crate) fn cargo(&self, args: &[&str]) -> Command {
+        cargo(&self.dir, args)
+    }
+
+    /// Runs `cargo add` with these arguments. A crate of ours is taken from its package: until it is
+    /// published, a registry does not have it.
+    ///
+    /// `None` without a registry, and says so.
+    pub(crate) fn add(&self, args: &[&str]) -> Option<()> {
+        let mut add = self.cargo(&["add"]);
+        for arg in args {
+            match PUBLISHED.iter().find(|(name, _)| name == arg) {
+                Some((name, _)) => add.arg("--path").arg(package(name)),
+                None => add.arg(arg),
+            };
+        }
+        reached(&mut add)
+    }
+}
+
+/// Runs a command that needs the registry. `None` where that is out of reach, and says so.
+pub(crate) fn reached(command: &mut Command) -> Option<()> {
+    let output = command.output().expect("cargo runs");
+    let why = String::from_utf8_lossy(&output.stderr);
+    if !output.status.success() && UNREACHABLE.iter().any(|part| why.contains(part)) {
+        // Past the harness, which would show it only beside a failure.
+        let _ = writeln!(stderr(), "skipped: the registry is out of reach:\n{why}");
+        return None;
+    }
+    assert!(output.status.success(), "{command:?}: {why}");
+    Some(())
+}

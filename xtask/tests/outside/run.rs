@@ -1,0 +1,187 @@
+//! Does what each README says, in a project outside of the workspace, and runs its programs.
+
+use std::fs;
+use std::io::{BufRead, BufReader};
+use std::net::TcpListener;
+use std::os::unix::fs::symlink;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+
+use crate::project::{Project, cargo, package, run, target, workspace};
+use crate::readme::Readme;
+
+/// A project with a program for each `rust` block of the README, built. `None` without a registry.
+fn built(name: &str) -> Option<Vec<PathBuf>> {
+    let readme = Readme::of(name);
+    let project = Project::new(&format!("readme-of-{name}"));
+    for arguments in readme.adds() {
+        project.add(&arguments)?;
+    }
+    let mut runnable = Vec::new();
+    for program in &readme.programs {
+        // The name says where it is from, and is in no other project: all share a target directory.
+        let bin = program.place.replace(", ", "-readme-").replace(' ', "-");
+        project.write(&format!("src/bin/{bin}.rs"), &program.text);
+        if program.has_main {
+            runnable.push(target().join("debug").join(&bin));
+        }
+    }
+    run(&mut project.cargo(&["build", "--bins"]));
+    Some(runnable)
+}
+
+/// Builds a program of a package, as `cargo install` does but for the profile and the versions.
+fn installed(name: &str, bin: &str, features: &[&str]) -> PathBuf {
+    let dir = package(name);
+    fs::copy(workspace().join("Cargo.lock"), dir.join("Cargo.lock")).expect("a lock file");
+    let manifest = dir.join("Cargo.toml");
+    let text = fs::read_to_string(&manifest).expect("a manifest");
+    if !text.contains("[patch.crates-io]") {
+        fs::write(&manifest, text + &crate::project::patch()).expect("a manifest");
+    }
+    run(cargo(dir, &["build", "--bin", bin]).args(features));
+    target().join("debug").join(bin)
+}
+
+/// A program with nothing of AXON or ROS 2 in its environment, in an empty directory.
+struct Place(tempfile::TempDir);
+
+impl Place {
+    fn new() -> Self {
+        Self(tempfile::tempdir().expect("a directory"))
+    }
+
+    fn command(&self, program: &Path) -> Command {
+        let mut command = Command::new(program);
+        let ours = |name: &str| name.starts_with("AXON_") || name.starts_with("ROS_");
+        for (name, _) in std::env::vars().filter(|(name, _)| ours(name)) {
+            command.env_remove(name);
+        }
+        command.current_dir(self.0.path());
+        command
+    }
+
+    /// The same, with a daemon that does not stay long and talks to no other host.
+    fn with_daemon(&self, program: &Path) -> Command {
+        let config = self.0.path().join("axon.toml");
+        fs::write(&config, "[link]\ngrace_s = 1\n").expect("a file");
+        let mut command = self.command(program);
+        command.env("AXON_CONFIG", config).env("AXON_RUNTIME_DIR", self.0.path().join("run"));
+        command.env("AXON_BIND_ADDRS", "127.0.0.1");
+        command.env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST");
+        command
+    }
+}
+
+/// Ends with the test.
+struct Kept(Child);
+
+impl Drop for Kept {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// What `kme-sim init` prints for an SAE.
+fn environment(printed: &str, sae: &str) -> Vec<(String, String)> {
+    let (_, rest) = printed.split_once(&format!("# {sae}\n")).expect("the SAE");
+    let lines = rest.lines().map_while(|line| line.strip_prefix("export ")?.split_once('='));
+    lines.map(|(name, value)| (name.to_owned(), value.trim_matches('\'').to_owned())).collect()
+}
+
+#[test]
+#[ignore = "builds all that etsi-qkd014 depends on"]
+fn the_readme_of_etsi_qkd014_does_what_it_says() {
+    let Some(programs) = built("etsi-qkd014") else { return };
+    assert_ne!(programs.len(), 0);
+    let commands = Readme::of("etsi-qkd014").commands;
+    let told = |line: &str| assert!(commands.iter().any(|one| one == line), "{line}: {commands:?}");
+    told("cargo install etsi-qkd014 --features sim");
+    told("kme-sim init certs");
+    told("kme-sim run certs");
+
+    let kme_sim = installed("etsi-qkd014", "kme-sim", &["--features", "sim"]);
+    let place = Place::new();
+    // As the README has it, but at a port that is free.
+    let port = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr());
+    let port = port.expect("a port").port();
+    let mut init = place.command(&kme_sim);
+    init.args(["init", "certs"]).args(["--kme", &format!("kme-a=127.0.0.1:{port}=sae-a")]);
+    let printed = run(init.args(["--kme", &format!("kme-b=127.0.0.2:{port}=sae-b")])).stdout;
+    let env = environment(&String::from_utf8(printed).expect("text"), "sae-a");
+    let mut serving = place.command(&kme_sim);
+    serving.args(["run", "--strict", "certs"]).stdout(Stdio::piped());
+    let mut serving = Kept(serving.spawn().expect("kme-sim"));
+    let said = BufReader::new(serving.0.stdout.take().expect("a pipe"));
+    assert_eq!(said.lines().take(2).count(), 2, "both KMEs listen");
+
+    for program in programs {
+        let output = run(place.command(&program).envs(env.iter().cloned()));
+        let text = String::from_utf8_lossy(&output.stdout).into_owned();
+        assert!(text.starts_with("tell sae-b: "), "{text}");
+    }
+}
+
+/// The README's programs need nothing but what it has the reader add.
+fn programs_run(name: &str) {
+    assert_ne!(Readme::of(name).programs.len(), 0);
+    let Some(programs) = built(name) else { return };
+    for program in programs {
+        run(&mut Place::new().command(&program));
+    }
+}
+
+#[test]
+#[ignore = "builds all that axon-envelope depends on"]
+fn the_readme_of_axon_envelope_does_what_it_says() {
+    programs_run("axon-envelope");
+}
+
+#[test]
+#[ignore = "builds all that rustls-axon depends on"]
+fn the_readme_of_rustls_axon_does_what_it_says() {
+    programs_run("rustls-axon");
+}
+
+#[test]
+#[ignore = "builds all that axon-tls depends on"]
+fn the_readme_of_axon_tls_does_what_it_says() {
+    programs_run("axon-tls");
+}
+
+#[test]
+#[ignore = "builds all that axon-transport and axon-cli depend on"]
+fn the_readmes_of_axon_transport_and_axon_cli_do_what_they_say() {
+    let Some(programs) = built("axon-transport") else { return };
+    assert_ne!(programs.len(), 0);
+    let commands = Readme::of("axon-transport").commands;
+    assert!(commands.iter().any(|line| line == "cargo install axon-cli"), "{commands:?}");
+    let axon = installed("axon-cli", "axon", &[]);
+    for program in programs {
+        let place = Place::new();
+        // Where `cargo install` puts it, and far from what the workspace built.
+        let cargo_home = place.0.path().join("cargo");
+        fs::create_dir_all(cargo_home.join("bin")).expect("a directory");
+        symlink(&axon, cargo_home.join("bin/axon")).expect("a link");
+        let moved = place.0.path().join("program");
+        fs::copy(&program, &moved).expect("a program");
+        run(place.with_daemon(&moved).env("CARGO_HOME", cargo_home).env("PATH", "/usr/bin:/bin"));
+        run(place.with_daemon(&moved).env("AXON_DAEMON_PATH", &axon));
+    }
+
+    let readme = Readme::of("axon-cli");
+    let place = Place::new();
+    let mut ran = 0;
+    for line in &readme.commands {
+        let mut words = line.split_whitespace();
+        if words.next() == Some("axon") {
+            run(place.with_daemon(&axon).args(words));
+            ran += 1;
+        }
+    }
+    assert_ne!(ran, 0, "{:?}", readme.commands);
+    for command in readme.table() {
+        run(place.command(&axon).args(command).arg("--help"));
+    }
+}
