@@ -146,6 +146,11 @@ impl Audience {
         self.readers.is_empty() && self.absent.is_empty()
     }
 
+    /// Whether all of the history is for those that come later, as far as its memory goes.
+    pub(super) fn keeps_all(&self) -> bool {
+        keeps_all(&self.offered)
+    }
+
     pub(super) fn peers(&self) -> Arc<[Peer]> {
         Arc::clone(&self.peers)
     }
@@ -432,9 +437,7 @@ impl Audience {
 
     /// There are others than before.
     fn changed(&mut self) {
-        let all_kept = self.offered.history == History::KeepAll
-            && self.offered.durability == Durability::TransientLocal;
-        self.window = if all_kept {
+        self.window = if self.keeps_all() {
             self.capacity
         } else {
             let readers = self.readers.iter().map(|reader| &reader.info.qos);
@@ -465,6 +468,11 @@ pub(super) fn depth(qos: &Qos) -> u64 {
         History::KeepLast => u64::from(qos.depth.max(1)),
         History::KeepAll => u64::MAX,
     }
+}
+
+/// Whether a publisher keeps all that its memory holds for readers that come later.
+pub(super) fn keeps_all(qos: &Qos) -> bool {
+    qos.history == History::KeepAll && qos.durability == Durability::TransientLocal
 }
 
 /// Whether a profile loses nothing rather than go on.

@@ -281,9 +281,8 @@ mod tests {
         let (segments, heap) = heap();
         let error = heap.allocate(&segments, HEAP_BYTES_MAX, Need::Now, |_| true).err();
         assert!(matches!(error, Some(ShmError::NoMemory { .. })), "{error:?}");
-        let most = HEAP_BYTES_MAX - HEAP_AT;
-        let object = heap.allocate(&segments, most, Need::Now, |_| true);
-        assert!(matches!(object, Ok(Some(_)) | Err(ShmError::NoMemory { .. })));
+        assert!(segments.further().is_empty());
+        heap.foresee(&segments, HEAP_BYTES_MAX - HEAP_AT);
         assert_eq!(segments.further()[0].memory.bytes(), HEAP_BYTES_MAX);
     }
 }

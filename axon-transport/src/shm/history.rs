@@ -1,6 +1,12 @@
 //! Which samples of a ring stand, and how room is made for the next: plain data, no shared memory.
 
-use super::{blocks::Blocks, classes, heap::Block, layout::Location, limbo::Limbo};
+use super::{
+    blocks::Blocks,
+    classes,
+    heap::Block,
+    layout::{self, Location},
+    limbo::Limbo,
+};
 
 /// The samples that stand, oldest to newest, and what they take of memory.
 ///
@@ -19,6 +25,8 @@ pub(super) struct History {
     /// Samples in blocks and slots.
     placed: u64,
     budget: u64,
+    /// Bytes of the budget that each sample takes beside its block or slot.
+    overhead: u64,
 }
 
 /// What memory a sample takes.
@@ -53,7 +61,13 @@ impl History {
             used: 0,
             placed: 0,
             budget,
+            overhead: 0,
         }
+    }
+
+    /// Descriptors take of the budget, too: it is all that bounds this history.
+    pub(super) fn count_descriptors(&mut self) {
+        self.overhead = layout::DESCRIPTOR;
     }
 
     /// The next position.
@@ -160,7 +174,7 @@ impl History {
             }
             Extent::Inline | Extent::Block(_) => false,
         };
-        self.placed > 1 && self.used + len > self.budget && !alike && !self.would_hold(len, false)
+        !self.has_room(len) && !alike && !self.would_hold(len, false)
     }
 
     /// Whether there would be a slot of `len` bytes if all samples were given up but one, and nothing
@@ -196,7 +210,14 @@ impl History {
 
     /// Whether so much more is within the budget.
     pub(super) fn has_room(&self, len: u64) -> bool {
-        self.placed <= 1 || self.used + len <= self.budget
+        let standing = self.head - self.tail;
+        let counted = if self.overhead == 0 { self.placed } else { standing };
+        counted <= 1 || self.used + self.overhead * (standing + 1) + len <= self.budget
+    }
+
+    /// Whether the next sample's descriptor is within the budget.
+    pub(super) fn has_room_for_descriptor(&self) -> bool {
+        self.overhead == 0 || self.has_room(0)
     }
 
     /// Gives back a loan.
@@ -302,6 +323,31 @@ mod tests {
         assert_eq!(history.pinned().loans(), 1);
         history.pinned().reclaim(|_, _| false);
         assert_eq!(history.lend(size), Some(first));
+    }
+
+    #[test]
+    fn descriptors_that_count_share_the_budget_with_blocks() {
+        const BUDGET: u64 = 100 * 128;
+        let mut history = History::new(256, BUDGET);
+        history.count_descriptors();
+        let mut inline = 0..1000;
+        while inline.next().is_some() {
+            history.make_place(|_| true).unwrap();
+            if !history.has_room_for_descriptor() {
+                history.make_room(0, |_| true).unwrap();
+            }
+            history.push(Extent::Inline);
+        }
+        assert_eq!(history.head() - history.tail(), 100);
+        for position in history.head()..history.head() + 1000 {
+            history.make_room(128, |_| true).unwrap();
+            let at = Location { segment: 0, offset: position * 128 };
+            history.push(Extent::Block(Block { at, len: 128 }));
+        }
+        assert_eq!(history.head() - history.tail(), 50);
+        // One stays, whatever it takes.
+        history.make_room(BUDGET, |_| true).unwrap();
+        assert_eq!(history.head() - history.tail(), 1);
     }
 
     #[test]

@@ -32,7 +32,7 @@ pub(super) const SESSION_BYTES: u64 = 1 << 20;
 pub(super) const LANES_AT: u64 = SESSION_BYTES - LANES as u64 * LANE;
 /// Bytes of a further one, which holds no object of more than [`HEAP_BYTES_MAX`] less a header.
 pub(super) const HEAP_BYTES: u64 = 8 << 20;
-pub(super) const HEAP_BYTES_MAX: u64 = 64 << 20;
+pub(super) const HEAP_BYTES_MAX: u64 = MAX_DESCRIPTORS * DESCRIPTOR + HEAP_BYTES;
 /// Where the objects of either begin, and where the slots of a publisher's segment do.
 pub(super) const HEAP_AT: u64 = 4096;
 pub(super) const SLOTS_AT: u64 = ALIGN;
@@ -41,7 +41,8 @@ pub(super) const SLOTS_AT: u64 = ALIGN;
 pub(super) const MAX_NUMBER: u32 = (1 << 24) - 1;
 /// A ring starts with this many descriptors and doubles.
 pub(super) const FIRST_DESCRIPTORS: u64 = 16;
-pub(super) const MAX_DESCRIPTORS: u64 = 1 << 18;
+/// A publish that doubles the array copies what stands: half a GiB is as much as it may take time for.
+pub(super) const MAX_DESCRIPTORS: u64 = 1 << 22;
 
 pub(super) const DESCRIPTOR: u64 = 128;
 /// Words of a descriptor.

@@ -105,7 +105,9 @@ impl Writer {
             let wanted = window.saturating_add((window / 4).max(4));
             if surplus == 0 || state.history.capacity() < wanted {
                 // A publish that waits for readers leaves them the time to map what they lack.
-                let need = if floors.held < u64::MAX { Need::Now } else { Need::Mapped };
+                // Nor does one give up what it keeps for others because of a reader that lacks it.
+                let now = floors.held < u64::MAX || state.audience.keeps_all();
+                let need = if now { Need::Now } else { Need::Mapped };
                 self.grow(state, need);
             }
             let history = &mut state.history;
@@ -113,6 +115,10 @@ impl Writer {
                 history.release_below(history.tail() + surplus.div_ceil(2));
             }
             history.make_place(|position| position < floors.held)?;
+        }
+        if !state.history.has_room_for_descriptor() {
+            let floors = state.audience.floors(state.history.head());
+            state.history.make_room(0, |position| position < floors.held)?;
         }
         self.show_tail(state);
         Ok(())

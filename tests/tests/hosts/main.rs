@@ -12,6 +12,7 @@ mod flooded;
 mod forged;
 mod graph;
 mod greedy;
+mod history;
 mod hoard;
 mod hostile;
 mod identity;

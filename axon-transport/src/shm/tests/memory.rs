@@ -73,6 +73,57 @@ fn keep_all_grows_to_its_limit_and_then_holds() {
     assert_eq!((take(&mut reader), reader.lost()), (None, 0));
 }
 
+/// KEEP_ALL, and all of it for those that come later.
+fn keep_all_for_later() -> Qos {
+    Qos { durability: Durability::TransientLocal, ..Qos::keep_all() }
+}
+
+/// Publishes `total` samples of `len` bytes, and returns what a reader gets that comes then.
+fn late_reader_gets(budget: u64, total: u64, len: usize) -> u64 {
+    let (a, b) = (session(), session());
+    let writer = writer(&a, keep_all_for_later(), budget);
+    (0..total).for_each(|sequence| publish(&writer, sequence, len));
+    let mut late = attach(&writer, &a, &b, keep_all_for_later());
+    let mut taken = 0;
+    while let Some(sequence) = take(&mut late) {
+        taken += 1;
+        // The newest are all there.
+        assert_eq!(sequence + late.unread(), total - 1);
+    }
+    assert_eq!(late.lost(), 0);
+    taken
+}
+
+#[test]
+fn history_for_late_readers_is_bounded_by_bytes() {
+    assert_eq!(late_reader_gets(64 << 20, 20_000, 64), 20_000);
+    // A descriptor of 128 bytes each.
+    assert_eq!(late_reader_gets(4 << 20, 200_000, 64), (4 << 20) / 128);
+    assert_eq!(late_reader_gets(3 << 20, 200_000, 64), (3 << 20) / 128);
+    // And a block of 256.
+    assert_eq!(late_reader_gets(3 << 20, 50_000, 200), (3 << 20) / 384);
+    assert_eq!(late_reader_gets(64 << 20, 600_000, 88), (64 << 20) / 128);
+}
+
+#[test]
+fn history_for_late_readers_is_kept_though_a_reader_lacks_the_memory_that_it_moves_to() {
+    let (a, b) = (silent_session(), session());
+    let writer = writer(&a, keep_all_for_later(), 64 << 20);
+    let (mut reader, from) = attach_untold(&writer, &a, &b, keep_last(1));
+    (0..20_000).for_each(|sequence| publish(&writer, sequence, 64));
+    let mut late = attach(&writer, &a, &a, keep_all_for_later());
+    for sequence in 0..20_000 {
+        assert_eq!(take(&mut late), Some(sequence));
+    }
+    assert_eq!(take(&mut reader), None, "it does not see where they are");
+    for segment in a.segments() {
+        if segment.number > 0 {
+            hand(&a, segment.number, &from);
+        }
+    }
+    assert_eq!(take(&mut reader), Some(19_999));
+}
+
 #[test]
 fn a_reader_keeps_its_place_while_the_ring_grows() {
     let (a, b) = (session(), session());

@@ -13,7 +13,7 @@ use super::{
     ShmError, Terms,
     allowance::Pool,
     area::Area,
-    audience::Audience,
+    audience::{Audience, keeps_all},
     heap::{Need, Object},
     history::History,
     layout::{self, Array, COPIED, COPIED_ALWAYS},
@@ -34,7 +34,10 @@ pub(super) const PATIENCE: Duration = Duration::from_millis(100);
 pub(super) const LOOKS: u32 = 1000;
 /// Descriptors up to which a ring grows for its readers' depths.
 const DESCRIPTORS: u64 = 1 << 14;
-/// Descriptors up to which one grows that keeps all that fits in its budget.
+/// Descriptors up to which one grows for its own depth, whatever that is: they do not count for its budget.
+const DESCRIPTORS_KEEP_LAST: u64 = 1 << 18;
+/// Descriptors up to which one grows that keeps all until its readers have it, and no longer: beyond that
+/// it holds its publisher back.
 const DESCRIPTORS_KEEP_ALL: u64 = 1 << 13;
 
 /// A publisher's ring. All methods may be called from any thread.
@@ -117,6 +120,11 @@ pub(super) struct State {
     published: u64,
 }
 
+/// The descriptors that a ring needs which keeps what fits in `budget`: a sample takes one at least.
+fn most_descriptors(budget: u64) -> u64 {
+    (budget / layout::DESCRIPTOR).max(layout::FIRST_DESCRIPTORS).next_power_of_two()
+}
+
 impl State {
     /// The first position that stands whose sample has a higher number.
     fn position_after(&self, number: u64) -> u64 {
@@ -185,7 +193,10 @@ impl Writer {
         }
         session.tidy();
         let limit = match qos.history {
-            Keep::KeepLast => (u64::from(qos.depth) + 1).next_power_of_two().max(DESCRIPTORS),
+            Keep::KeepLast => (u64::from(qos.depth) + 1)
+                .next_power_of_two()
+                .clamp(DESCRIPTORS, DESCRIPTORS_KEEP_LAST),
+            Keep::KeepAll if keeps_all(&qos) => most_descriptors(budget),
             Keep::KeepAll => DESCRIPTORS_KEEP_ALL,
         }
         .min(layout::MAX_DESCRIPTORS);
@@ -207,7 +218,10 @@ impl Writer {
         let at = Array { at: array.block.at, descriptors };
         layout::write_ring(ring.words(), options.gid, &at);
         times::offer(ring.words(), &options.qos);
-        let history = History::new(descriptors, budget);
+        let mut history = History::new(descriptors, budget);
+        if keeps_all(&qos) {
+            history.count_descriptors();
+        }
         let audience = Audience::new(qos, limit - 1, Pool::new(budget, max_message));
         let state = State::new(audience, history, array);
         let writer = Self { options, session, ring, limit, state: PiMutex::new(state)? };
