@@ -49,6 +49,8 @@ struct Attached {
     /// that it gave up.
     done: u64,
     given_up: u64,
+    /// How many its session said so far that it gave up.
+    told: u64,
 }
 
 /// Positions from which on samples are wanted.
@@ -100,6 +102,16 @@ impl Attached {
             _ => {}
         }
         self.done.min(head)
+    }
+
+    /// How many samples it gave up that were not counted, by its lane and by what its session said: both
+    /// say the same, one of them later. Never more than were published since it came.
+    fn newly_given_up(&mut self, head: u64) -> u64 {
+        let said = self.tenancy.given_up(self.lane.words()).max(self.told);
+        let since = head.saturating_sub(self.grant.first);
+        let new = said.min(since).saturating_sub(self.given_up);
+        self.given_up += new;
+        new
     }
 
     /// The oldest position that it wants: KEEP_LAST passes over what is beyond its depth.
@@ -228,6 +240,7 @@ impl Audience {
             dead: false,
             done: first,
             given_up: 0,
+            told: 0,
         });
         Ok(grant)
     }
@@ -257,6 +270,8 @@ impl Audience {
         if self.readers.iter().any(|known| known.info.gid == reader && known.is_carrier()) {
             self.mark_dead(head);
         }
+        // What it gave up last is counted.
+        self.given_up(head);
         self.readers.retain(|known| known.info.gid != reader);
         let gone = self.readers.len() != before;
         // A session asks all of its publishers whenever an endpoint ends anywhere.
@@ -300,6 +315,7 @@ impl Audience {
                 continue;
             }
             let Some(position) = reader.delivered(head) else { continue };
+            self.given_up = self.given_up.saturating_add(reader.newly_given_up(head));
             if reader.carries && holds(&self.offered) && holds(&reader.info.qos) {
                 self.absent.add(reader.info.gid, position);
             } else {
@@ -315,14 +331,17 @@ impl Audience {
         let known = self.readers.iter_mut().find(|known| known.info.gid == reader);
         if let Some(known) = known.filter(|known| !known.dead) {
             let since = head.saturating_sub(known.grant.first);
-            let samples = samples.min(since.saturating_sub(known.given_up));
-            known.given_up = known.given_up.saturating_add(samples);
-            self.given_up = self.given_up.saturating_add(samples);
+            known.told = known.told.saturating_add(samples).min(since);
+            self.given_up = self.given_up.saturating_add(known.newly_given_up(head));
         }
     }
 
-    /// Samples that readers who stand for others gave up.
-    pub(super) fn given_up(&self) -> u64 {
+    /// Samples that readers who stand for others gave up: those of them that were
+    /// [handed over](Self::handed_over) are counted if that was asked before.
+    pub(super) fn given_up(&mut self, head: u64) -> u64 {
+        for reader in self.readers.iter_mut().filter(|r| !r.dead && r.info.stands_for.is_some()) {
+            self.given_up = self.given_up.saturating_add(reader.newly_given_up(head));
+        }
         self.given_up
     }
 

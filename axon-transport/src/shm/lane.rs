@@ -13,7 +13,7 @@ use super::{
     heap::Object,
     layout::{
         self, LANE_WORDS, Location,
-        lane::{CURSOR, GENERATION, LOST, MAPPED, READER, RECEIVED, SKIPPED, TAKEN},
+        lane::{CURSOR, GENERATION, GIVEN_UP, LOST, MAPPED, READER, RECEIVED, SKIPPED, TAKEN},
     },
     memory::Map,
     pins,
@@ -27,6 +27,11 @@ const ASKED: u64 = 1 << 63;
 /// The part of a generation that says which time of the lane's use it is for: a grant of another
 /// time would bring back, for the publisher that gave it then, a reader that has left.
 const TIME: u64 = (1 << 24) - 1;
+
+/// Of the word that says how many samples were given up, what is the number; the rest is [`TIME`]'s part
+/// of the generation.
+const GIVEN_UP_BITS: u32 = 40;
+const GIVEN_UP_MAX: u64 = (1 << GIVEN_UP_BITS) - 1;
 
 /// Whether a grant of this generation is for the `number`th time that the session uses a lane.
 fn is_for(generation: u64, number: u64) -> bool {
@@ -73,6 +78,14 @@ impl Tenancy {
 
     pub(super) fn generation(&self) -> u64 {
         self.generation
+    }
+
+    /// Publisher: how many samples the reader gave up by now. Those below its [cursor](Self::cursor) are
+    /// counted if that was looked at before.
+    pub(super) fn given_up<W: Word>(&self, lane: &[W]) -> u64 {
+        // Ordered by the cursor. The mark says whose count it is, also when the lane has passed on.
+        let word = lane[GIVEN_UP].load(Ordering::Relaxed);
+        if word >> GIVEN_UP_BITS == self.generation & TIME { word & GIVEN_UP_MAX } else { 0 }
     }
 
     /// Publisher: what the lane says of the reader now.
@@ -122,7 +135,7 @@ pub(super) fn ask<W: Word>(lane: &[W], number: u64) {
 pub(super) fn open<W: Word>(lane: &[W], grant: Grant) {
     // The records are clear since the last pin was given up. To clear them once more could hide
     // from the last reader's publisher that this one's reads come after that one's.
-    for word in [RECEIVED, LOST, SKIPPED, TAKEN] {
+    for word in [RECEIVED, LOST, SKIPPED, TAKEN, GIVEN_UP] {
         lane[word].store(0, Ordering::Relaxed);
     }
     lane[CURSOR].store(grant.first, Ordering::Relaxed);
@@ -135,6 +148,13 @@ pub(super) fn open<W: Word>(lane: &[W], grant: Grant) {
 pub(super) fn advance<W: Word>(lane: &[W], cursor: u64) {
     // Pairs with `cursor`.
     lane[CURSOR].store(cursor, Site::CursorStore.order());
+}
+
+/// Reader: gave up so many samples since it came. Before it is done with them.
+pub(super) fn give_up<W: Word>(lane: &[W], number: u64, samples: u64) {
+    let word = (number & TIME) << GIVEN_UP_BITS | samples.min(GIVEN_UP_MAX);
+    // `advance` shows it.
+    lane[GIVEN_UP].store(word, Ordering::Relaxed);
 }
 
 /// Reader: has left, and pins nothing.
@@ -217,6 +237,11 @@ impl Lane {
         words[LOST].store(lost, Ordering::Relaxed);
         words[SKIPPED].store(skipped, Ordering::Relaxed);
         advance(words, cursor);
+    }
+
+    /// So many samples were given up since the lane was opened.
+    pub(super) fn give_up(&self, samples: u64) {
+        give_up(self.words(), self.number, samples);
     }
 
     /// The highest number of the publisher's segments that came is `number`.

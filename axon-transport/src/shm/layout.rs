@@ -84,6 +84,8 @@ pub(super) mod lane {
     pub(in crate::shm) const READER: usize = 12;
     /// The source timestamp of the sample that was taken last.
     pub(in crate::shm) const TAKEN: usize = 14;
+    /// Of the samples below the cursor, how many the reader gave up; whose they are in its upper bits.
+    pub(in crate::shm) const GIVEN_UP: usize = 15;
 }
 
 /// Words of a ring's header.

@@ -216,6 +216,12 @@ impl Subscription {
 
     /// For a relay: so many samples of this publisher do not get where they are to go. It is told.
     pub(crate) fn give_up(&self, writer: Gid, samples: u64) {
+        if self.session.is_forked() {
+            return;
+        }
+        // The publisher sees it before it sees that they are acknowledged. Its process is told besides: it
+        // may be of an older version, and the publisher may wait for acknowledgements.
+        self.inner.lock().give_up_of(&writer, samples);
         let given_up = GivenUp { reader: self.gid(), writer, samples };
         self.session.shared().tell(Outgoing::Message(Box::new(Message::GivenUp(given_up))));
     }

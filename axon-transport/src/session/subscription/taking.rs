@@ -185,6 +185,14 @@ impl Slots {
         }
     }
 
+    /// So many samples of `writer` do not get where they are to go.
+    pub(in crate::session) fn give_up_of(&mut self, writer: &Gid, samples: u64) {
+        let slot = self.slots.iter_mut().find(|slot| slot.reader.writer() == *writer);
+        if let Some(slot) = slot {
+            slot.reader.give_up(samples);
+        }
+    }
+
     /// What was taken and is not done with is to be taken once more; and all of the `history` that
     /// stands, if so.
     pub(in crate::session) fn take_back(&mut self, history: bool) {

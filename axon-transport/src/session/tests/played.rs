@@ -253,6 +253,61 @@ fn a_sample_that_is_given_up_is_not_acknowledged() {
 }
 
 #[test]
+fn a_publisher_that_goes_on_since_its_relay_left_has_no_acknowledgement() {
+    let (session, daemon) = session();
+    let publisher = publisher(&session, Qos::keep_all());
+    let taker = Taker::new();
+    let mut taking = taker.attach(&publisher, Some(vec![Gid([5; 16])]), &daemon);
+    taking.reader.finish_later();
+    until("it is matched", || publisher.matched() == [Gid([5; 16])]);
+    let sample = vec![7; 1 << 19];
+    let mut published = 0;
+    while publisher.publish(&sample).is_ok() {
+        published += 1;
+    }
+    assert_eq!(taking.take(&daemon), 1);
+    drop(taking);
+    assert_eq!(publisher.publish(&sample), Ok(published + 1), "nobody holds it back");
+    for _ in 0..3 {
+        assert!(
+            !publisher.wait_acknowledged(Duration::ZERO),
+            "the daemon has not said what became of it"
+        );
+    }
+    let (reader, writer) = (taker.gid, publisher.gid());
+    daemon.say(Message::GivenUp(GivenUp { reader, writer, samples: published }), &[]);
+    daemon.say(Message::Detach(Pair { reader, writer }), &[]);
+    until("it ended", || publisher.matched().is_empty());
+    assert!(!publisher.wait_acknowledged(Duration::ZERO));
+    assert_eq!(publisher.given_up(), published);
+}
+
+#[test]
+fn a_sample_that_its_relay_gave_up_is_never_acknowledged_before_the_daemon_says_so() {
+    let (session, daemon) = session();
+    let publisher = publisher(&session, Qos::keep_all());
+    let taker = Taker::new();
+    let mut taking = taker.attach(&publisher, Some(vec![Gid([5; 16])]), &daemon);
+    taking.reader.finish_later();
+    until("it is matched", || publisher.matched() == [Gid([5; 16])]);
+    for number in 1..=3 {
+        publisher.publish(b"x").unwrap();
+        assert_eq!(taking.take(&daemon), number);
+    }
+    taking.reader.give_up(2);
+    taking.reader.finish(3);
+    assert!(!publisher.wait_acknowledged(Duration::ZERO), "two are lost");
+    assert_eq!((publisher.unacknowledged(), publisher.given_up()), (0, 2));
+    // The message about them comes later, and makes them no more.
+    let (reader, writer) = (taker.gid, publisher.gid());
+    daemon.say(Message::GivenUp(GivenUp { reader, writer, samples: 2 }), &[]);
+    daemon.say(Message::Detach(Pair { reader, writer }), &[]);
+    until("it ended", || publisher.matched().is_empty());
+    assert_eq!(publisher.given_up(), 2);
+    assert!(publisher.wait_acknowledged(Duration::ZERO), "it was said once");
+}
+
+#[test]
 fn no_more_is_given_up_than_was_published() {
     let (session, daemon) = session();
     let publisher = publisher(&session, Qos::keep_all());

@@ -5,9 +5,10 @@ use std::collections::VecDeque;
 use super::Reader;
 use crate::shm::ring;
 
-/// Numbers and positions of samples that were taken and are not done with.
+/// Numbers and positions of samples that were taken and are not done with, and how many samples were given
+/// up so far.
 #[derive(Default)]
-pub(super) struct UnderWay(VecDeque<(u64, u64)>);
+pub(super) struct UnderWay(VecDeque<(u64, u64)>, u64);
 
 impl UnderWay {
     pub(super) fn add(&mut self, sequence: u64, position: u64) {
@@ -49,6 +50,16 @@ impl Reader {
             under_way.0.pop_front();
         }
         self.tell_cursor();
+    }
+
+    /// So many samples do not get where they are to go: their publisher sees that no later than that they
+    /// are [done with](Self::finish).
+    pub(crate) fn give_up(&mut self, samples: u64) {
+        let Some(under_way) = &mut self.under_way else { return };
+        if !self.attachment.lane.is_forked() {
+            under_way.1 = under_way.1.saturating_add(samples);
+            self.attachment.lane.give_up(under_way.1);
+        }
     }
 
     /// What was taken and is not done with is to be taken once more.

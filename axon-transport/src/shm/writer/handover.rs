@@ -30,11 +30,13 @@ impl Writer {
                 let mut state = self.lock();
                 let State { history, audience, known_given_up, .. } = &mut *state;
                 audience.mark_dead(history.head());
-                let given_up = audience.given_up();
+                // In this order: what is handed over since it was given up is counted by then.
+                let handed_over = audience.handed_over(published) >= published;
+                let given_up = audience.given_up(history.head());
                 if std::mem::replace(known_given_up, given_up) != given_up {
                     return false;
                 }
-                if audience.handed_over(published) >= published {
+                if handed_over {
                     return true;
                 }
                 (audience.relays(), audience.absent_for())
@@ -63,7 +65,12 @@ impl Writer {
 
     /// Samples that those who carry them elsewhere gave up.
     pub(crate) fn given_up(&self) -> u64 {
-        if self.is_forked() { 0 } else { self.lock().audience.given_up() }
+        if self.is_forked() {
+            return 0;
+        }
+        let mut state = self.lock();
+        let State { history, audience, .. } = &mut *state;
+        audience.given_up(history.head())
     }
 
     /// One of them says that it gave up so many.
@@ -78,8 +85,9 @@ impl Writer {
     fn await_handover(&self, published: u64, relays: &[Arc<PeerSession>], left: Duration) {
         let ready = || {
             let mut state = self.lock();
-            state.audience.given_up() != state.known_given_up
-                || state.audience.handed_over(published) >= published
+            let State { history, audience, known_given_up, .. } = &mut *state;
+            audience.handed_over(published) >= published
+                || audience.given_up(history.head()) != *known_given_up
                 || relays.iter().any(|peer| peer.is_dead())
         };
         let pidfds: Vec<_> = relays.iter().map(|peer| peer.pidfd()).collect();
