@@ -49,8 +49,9 @@ struct Attached {
     /// that it gave up.
     done: u64,
     given_up: u64,
-    /// How many its session said so far that it gave up.
+    /// How many its session said so far that it gave up, and how many its lane says.
     told: u64,
+    shown: u64,
 }
 
 /// Positions from which on samples are wanted.
@@ -97,17 +98,26 @@ impl Attached {
     /// Of a relay: up to where it is done. One that has left is where it was seen last, until the daemon
     /// says that it ended, or what it gave up.
     fn done_with(&mut self, head: u64) -> u64 {
-        match self.position() {
-            Some(position) if position < u64::MAX => self.done = self.done.max(position),
-            _ => {}
+        let position = self.position().filter(|position| *position < u64::MAX);
+        // In this order. What was seen of the cursor counts with what was given up below it.
+        if let (Some(position), true) = (position, self.look_for_given_up()) {
+            self.done = self.done.max(position);
         }
         self.done.min(head)
+    }
+
+    /// Notes what its lane says that it gave up; whether the lane still says that of this reader.
+    fn look_for_given_up(&mut self) -> bool {
+        let shown = self.tenancy.given_up(self.lane.words());
+        self.shown = self.shown.max(shown.unwrap_or_default());
+        shown.is_some()
     }
 
     /// How many samples it gave up that were not counted, by its lane and by what its session said: both
     /// say the same, one of them later. Never more than were published since it came.
     fn newly_given_up(&mut self, head: u64) -> u64 {
-        let said = self.tenancy.given_up(self.lane.words()).max(self.told);
+        self.look_for_given_up();
+        let said = self.shown.max(self.told);
         let since = head.saturating_sub(self.grant.first);
         let new = said.min(since).saturating_sub(self.given_up);
         self.given_up += new;
@@ -241,6 +251,7 @@ impl Audience {
             done: first,
             given_up: 0,
             told: 0,
+            shown: 0,
         });
         Ok(grant)
     }

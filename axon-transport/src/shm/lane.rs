@@ -80,12 +80,17 @@ impl Tenancy {
         self.generation
     }
 
-    /// Publisher: how many samples the reader gave up by now. Those below its [cursor](Self::cursor) are
-    /// counted if that was looked at before.
-    pub(super) fn given_up<W: Word>(&self, lane: &[W]) -> u64 {
-        // Ordered by the cursor. The mark says whose count it is, also when the lane has passed on.
-        let word = lane[GIVEN_UP].load(Ordering::Relaxed);
-        if word >> GIVEN_UP_BITS == self.generation & TIME { word & GIVEN_UP_MAX } else { 0 }
+    /// Publisher: how many samples the reader gave up by now; those below its [cursor](Self::cursor) are
+    /// counted if that was looked at before. `None` once the lane has passed on to another reader.
+    pub(super) fn given_up<W: Word>(&self, lane: &[W]) -> Option<u64> {
+        // Ordered by the cursor.
+        match lane[GIVEN_UP].load(Ordering::Relaxed) {
+            // As readers of an older version leave it.
+            0 => Some(0),
+            word => {
+                (word >> GIVEN_UP_BITS == self.generation & TIME).then_some(word & GIVEN_UP_MAX)
+            }
+        }
     }
 
     /// Publisher: what the lane says of the reader now.
@@ -135,9 +140,10 @@ pub(super) fn ask<W: Word>(lane: &[W], number: u64) {
 pub(super) fn open<W: Word>(lane: &[W], grant: Grant) {
     // The records are clear since the last pin was given up. To clear them once more could hide
     // from the last reader's publisher that this one's reads come after that one's.
-    for word in [RECEIVED, LOST, SKIPPED, TAKEN, GIVEN_UP] {
+    for word in [RECEIVED, LOST, SKIPPED, TAKEN] {
         lane[word].store(0, Ordering::Relaxed);
     }
+    give_up(lane, grant.generation, 0);
     lane[CURSOR].store(grant.first, Ordering::Relaxed);
     // Pairs with `standing`.
     lane[GENERATION].store(grant.generation, Site::OpenStore.order());

@@ -39,6 +39,35 @@ fn a_lane_that_is_open_shows_the_cursor_of_its_reader() {
     });
 }
 
+/// `CursorStore`, `CursorLoad`: what was given up is counted once the cursor has passed it, and only for
+/// the publisher of whose samples it was.
+#[test]
+fn what_is_given_up_shows_before_the_cursor_that_passes_it() {
+    check(3, || {
+        let (lane, tenancy) = granted(0);
+        let reader = {
+            let lane = lane.clone();
+            thread::spawn(move || {
+                lane::give_up(&lane[..], tenancy.generation(), 2);
+                lane::advance(&lane[..], 5);
+                lane::close(&lane[..]);
+                lane::ask(&lane[..], 2);
+                let next = Tenancy::grant(&lane[..], Allowance::ALL).generation();
+                lane::open(&lane[..], Grant { generation: next, first: 0 });
+                lane::give_up(&lane[..], next, 7);
+            })
+        };
+        let cursor = tenancy.cursor(&lane[..]);
+        let given_up = tenancy.given_up(&lane[..]);
+        match cursor {
+            // The lane may have passed on since.
+            Some(5) => assert!([Some(2), None].contains(&given_up), "{given_up:?}"),
+            _ => assert!([Some(0), Some(2), None].contains(&given_up), "{given_up:?}"),
+        }
+        reader.join().unwrap();
+    });
+}
+
 /// `CloseStore`, `AskStore`, `GenerationLoad`: a lane that is closed is not looked at for pins any
 /// more.
 #[test]
