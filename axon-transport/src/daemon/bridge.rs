@@ -25,6 +25,9 @@ use crate::{
 /// What either channel holds.
 pub const CHANNEL: usize = 1024;
 
+/// Stands in the status for topics whose losses are not kept apart: too many, or too long a name.
+pub(crate) const OTHER_TOPICS: &str = "(other topics)";
+
 /// What a gateway is started with.
 #[derive(Debug)]
 pub struct GatewayParts {

@@ -13,7 +13,7 @@ use tokio::sync::{Notify, watch};
 
 use super::{
     admission::Admission,
-    bridge::ToControl,
+    bridge::{OTHER_TOPICS, ToControl},
     registry::Registry,
     status::{LinkStatus, RefusalStatus, TrafficStatus, unix_ms},
     turns::Turns,
@@ -167,10 +167,10 @@ impl Control {
 
     /// Samples of a topic did not get to another host.
     fn lost(&mut self, topic: String, cause: &'static str, samples: u64) {
-        if self.lost.len() < TOPICS_WITH_LOSSES || self.lost.contains_key(&topic) {
-            let count = self.lost.entry(topic).or_default().entry(cause).or_default();
-            *count = count.saturating_add(samples);
-        }
+        let there = self.lost.contains_key(&topic) || self.lost.len() < TOPICS_WITH_LOSSES;
+        let topic = if there { topic } else { OTHER_TOPICS.to_owned() };
+        let count = self.lost.entry(topic).or_default().entry(cause).or_default();
+        *count = count.saturating_add(samples);
     }
 
     /// Answers a session that asks for the status. One that asks again before it has taken the

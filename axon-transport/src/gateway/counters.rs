@@ -3,12 +3,28 @@
 use std::{
     collections::BTreeMap,
     sync::{
-        Mutex,
+        Arc, Mutex,
         atomic::{AtomicU64, Ordering},
     },
 };
 
 use super::keyring::lock;
+use crate::{daemon::bridge::OTHER_TOPICS, text::plain};
+
+/// Topics of which losses are noted between two looks: as many as routes may cross each way.
+const TOPICS: usize = 2048;
+/// The longest name, in bytes, under which losses are noted.
+const NAME: usize = 1024;
+/// How much of a name is logged, in characters.
+const LOGGED: usize = 256;
+
+/// Samples of one topic that were dropped for one cause.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Loss {
+    pub(super) topic: Arc<str>,
+    pub(super) cause: &'static str,
+    pub(super) samples: u64,
+}
 
 /// The counters of one peer. Relaxed throughout: they are shown, never acted upon.
 #[derive(Debug, Default)]
@@ -18,6 +34,8 @@ pub(super) struct Counters {
     samples_out: AtomicU64,
     bytes_out: AtomicU64,
     dropped: Mutex<BTreeMap<&'static str, u64>>,
+    /// What was dropped since it was looked at last.
+    lost: Mutex<BTreeMap<Arc<str>, BTreeMap<&'static str, u64>>>,
 }
 
 impl Counters {
@@ -40,6 +58,31 @@ impl Counters {
         }
     }
 
+    /// As [`dropped`](Self::dropped), of a topic, for [`take_lost`](Self::take_lost).
+    pub(super) fn lost(&self, topic: &Arc<str>, cause: &'static str, count: u64) {
+        if count == 0 {
+            return;
+        }
+        self.dropped(cause, count);
+        let mut lost = lock(&self.lost);
+        let there = lost.contains_key(topic) || lost.len() < TOPICS && topic.len() <= NAME;
+        let topic = if there { Arc::clone(topic) } else { OTHER_TOPICS.into() };
+        let samples = lost.entry(topic).or_default().entry(cause).or_default();
+        *samples = samples.saturating_add(count);
+    }
+
+    /// What was lost since the last call, by topic and cause: each sample once.
+    pub(super) fn take_lost(&self) -> Vec<Loss> {
+        let lost = std::mem::take(&mut *lock(&self.lost));
+        let each = lost.into_iter().flat_map(|(topic, causes)| {
+            causes.into_iter().map(move |(cause, samples)| {
+                let topic = Arc::clone(&topic);
+                Loss { topic, cause, samples }
+            })
+        });
+        each.collect()
+    }
+
     /// Puts the counters into `status`.
     pub(super) fn fill(&self, status: &mut crate::daemon::status::LinkStatus) {
         status.samples_in = self.samples_in.load(Ordering::Relaxed);
@@ -48,5 +91,69 @@ impl Counters {
         status.bytes_out = self.bytes_out.load(Ordering::Relaxed);
         status.dropped =
             lock(&self.dropped).iter().map(|(cause, n)| ((*cause).to_owned(), *n)).collect();
+    }
+}
+
+/// Logs what was lost on the way to or from a peer, in one line: the topic that lost most by name.
+pub(super) fn log(losses: &[Loss], peer: &str) {
+    let Some((topic, causes, samples, others)) = worst(losses) else { return };
+    let topic = plain(topic, LOGGED);
+    if others == 0 {
+        tracing::warn!(topic, samples, causes, peer, "samples are dropped");
+    } else {
+        tracing::warn!(topic, samples, causes, others, peer, "samples are dropped");
+    }
+}
+
+/// The topic that lost most, why, how many samples, and how many were lost of others.
+fn worst(losses: &[Loss]) -> Option<(&str, String, u64, u64)> {
+    let sum = |losses: &[Loss]| losses.iter().fold(0_u64, |all, l| all.saturating_add(l.samples));
+    // Those of a topic are together.
+    let topics = losses.chunk_by(|one, other| one.topic == other.topic);
+    let worst = topics.max_by_key(|losses| sum(losses))?;
+    let causes = worst.iter().map(|loss| format!("{} {}", loss.cause, loss.samples));
+    let (samples, causes) = (sum(worst), causes.collect::<Vec<_>>().join(", "));
+    Some((&worst.first()?.topic, causes, samples, sum(losses) - samples))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::daemon::status::LinkStatus;
+
+    #[test]
+    fn losses_are_counted_by_topic_and_handed_over_once() {
+        let counters = Counters::default();
+        let [scan, image] = ["/scan", "/image"].map(Arc::<str>::from);
+        counters.lost(&scan, "queue", 3);
+        counters.lost(&image, "late", 0);
+        counters.lost(&image, "late", 1);
+        counters.lost(&scan, "queue", 2);
+        counters.lost(&scan, "no_key", 1);
+        let loss = |topic: &Arc<str>, cause, samples| Loss { topic: topic.clone(), cause, samples };
+        let all = [loss(&image, "late", 1), loss(&scan, "no_key", 1), loss(&scan, "queue", 5)];
+        let lost = counters.take_lost();
+        assert_eq!(lost, all);
+        assert_eq!(worst(&lost), Some(("/scan", "no_key 1, queue 5".to_owned(), 6, 1)));
+        assert_eq!(worst(&[]), None);
+        assert!(counters.take_lost().is_empty());
+        let mut status = LinkStatus::default();
+        counters.fill(&mut status);
+        let of_link = [("late", 1), ("no_key", 1), ("queue", 5)];
+        assert_eq!(status.dropped, of_link.map(|(cause, n)| (cause.to_owned(), n)).into());
+    }
+
+    #[test]
+    fn topics_of_a_peer_that_makes_up_names_take_bounded_memory() {
+        let counters = Counters::default();
+        counters.lost(&"n".repeat(NAME + 1).into(), "queue", 1);
+        for number in 0..2 * TOPICS {
+            counters.lost(&number.to_string().into(), "queue", 1);
+        }
+        let losses = counters.take_lost();
+        assert_eq!(losses.len(), TOPICS);
+        assert!(losses.iter().all(|loss| loss.topic.len() <= NAME));
+        let others = losses.iter().find(|loss| &*loss.topic == OTHER_TOPICS).unwrap();
+        assert_eq!(others.samples, TOPICS as u64 + 2);
     }
 }

@@ -105,7 +105,7 @@ impl Inbound {
         let Some((route, feeding)) = self.routes.stream(number, gid).await else {
             // Unsubscribed, or the publisher is gone from the graph: its samples may still be
             // under way.
-            self.counters.dropped("no_route", 1);
+            self.counters.lost(&self.topic(number), "no_route", 1);
             stream.stop(NO_ROUTE);
             return End::Finished;
         };
@@ -175,7 +175,7 @@ impl Inbound {
         };
         match self.routes.writer(from.number, gid).await {
             Some(stand_in) => self.take_in(&stand_in, from, meta, &payload).await,
-            None => self.counters.dropped("no_route", 1),
+            None => self.counters.lost(&self.topic(from.number), "no_route", 1),
         }
         drop(payload);
         Intake::shrink(body);
@@ -210,7 +210,7 @@ impl Inbound {
                     return true;
                 }
                 Ok(Written::Nobody) => {
-                    self.counters.dropped("no_client", 1);
+                    self.counters.lost(&self.topic(from.number), "no_client", 1);
                     return false;
                 }
                 Err(PublishError::Blocked { .. }) if self.wanted.has_changed().is_ok() => {
@@ -229,10 +229,15 @@ impl Inbound {
         }
     }
 
+    /// The name of a route's topic.
+    fn topic(&self, number: u32) -> Arc<str> {
+        self.routes.topic(number).unwrap_or_else(|| "(a route that ended)".into())
+    }
+
     /// A sample of this route came here and is lost.
     async fn lost(&self, cause: &'static str, number: u32, gid: Gid, error: &(dyn Display + Sync)) {
         self.counters.dropped(cause, 1);
-        let topic = self.routes.topic(number).unwrap_or_else(|| "(a route that ended)".into());
+        let topic = self.topic(number);
         if let Some(samples) = self.losses.count(Instant::now()) {
             tracing::warn!(%topic, %gid, %error, samples, "samples from a peer are lost");
         }

@@ -5,6 +5,7 @@ mod crowd;
 mod cut;
 mod delivery;
 mod disagree;
+mod dropped;
 mod election;
 mod ending;
 mod events;

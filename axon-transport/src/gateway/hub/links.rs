@@ -421,7 +421,8 @@ impl Hub {
             return;
         }
         // Its graph, and what of its streams was not read.
-        if self.peers.remove(&daemon).is_some() {
+        if let Some(peer) = self.peers.remove(&daemon) {
+            self.tell_lost(&peer).await;
             give_memory_back();
         }
         self.freed = true;

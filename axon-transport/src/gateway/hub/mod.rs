@@ -26,6 +26,7 @@ use super::{
     account::{Account, Accounts, Charge, Unpacked},
     context::Context,
     control::{ControlError, Outbox},
+    counters::{self, Loss},
     dial::Target,
     endpoint::Endpoints,
     establish::{Established, Sealing, close, peer_text},
@@ -459,8 +460,19 @@ impl Hub {
         self.tell(ToControl::Refusal { peer, what: refusal.name, reason }).await;
     }
 
+    /// What was dropped since it was told last, on the way to or from a peer.
+    async fn tell_lost(&self, peer: &Peer) {
+        let losses = peer.counters.take_lost();
+        let link = self.links.get(&peer.link).map(|link| self.peer_of(link));
+        counters::log(&losses, link.as_deref().unwrap_or("a peer whose link ended"));
+        for Loss { topic, cause, samples } in losses {
+            self.tell(ToControl::Lost { topic: topic.to_string(), cause, samples }).await;
+        }
+    }
+
     async fn report(&self) {
         for peer in self.peers.values() {
+            self.tell_lost(peer).await;
             if let Some(link) = self.links.get(&peer.link) {
                 let mut status =
                     status::link(&link.established, &link.connection, link.since_unix_ms);

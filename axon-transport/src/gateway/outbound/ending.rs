@@ -68,13 +68,13 @@ impl Endings {
             if now.duration_since(ending.since) >= PATIENCE {
                 shared.counters.dropped("publisher_ended", left);
                 tracing::warn!(
-                    topic = &*active.topic,
+                    topic = &*active.flow.topic,
                     publisher = %of,
                     samples = left,
                     "a publisher ended, and the peer did not take what it left: samples are lost"
                 );
                 active.forget(of);
-                over.push((*of, Some((Arc::clone(&active.topic), left))));
+                over.push((*of, Some((Arc::clone(&active.flow.topic), left))));
             }
         }
         for (of, lost) in over {
@@ -98,11 +98,11 @@ impl Endings {
         for active in routes.values() {
             let samples = active.give_up();
             if samples > 0 {
-                let topic = &*active.topic;
+                let topic = &*active.flow.topic;
                 let peer = &self.owner.daemon;
                 tracing::warn!(topic, %peer, samples,
                     "the link ended before the peer acknowledged them: samples may be lost");
-                let topic = Arc::clone(&active.topic);
+                let topic = Arc::clone(&active.flow.topic);
                 let lost = Event::Lost { topic, cause: "link_ended", samples };
                 let _ = self.owner.events.send(lost).await;
             }

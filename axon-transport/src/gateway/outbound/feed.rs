@@ -86,7 +86,7 @@ impl Feed {
     /// Moves what its sources have to the queue.
     pub(super) fn turn(
         &mut self,
-        flow: Flow,
+        flow: &Flow,
         sources: &[Source],
         shared: &Arc<Shared>,
         moved: &mut Moved,
@@ -152,15 +152,15 @@ impl Feed {
         &mut self,
         sample: Sample,
         qos: &Qos,
-        flow: Flow,
+        flow: &Flow,
         shared: &Arc<Shared>,
     ) -> Offered {
         self.stream.take_if(|stream| stream.is_over());
         let (of, start) = (self.of, || Arc::clone(shared));
-        let stream = self.stream.get_or_insert_with(|| Stream::new(flow, of, qos, start()));
+        let stream = self.stream.get_or_insert_with(|| Stream::new(flow.clone(), of, qos, start()));
         let offered = stream.offer(sample, qos);
         if let Offered::Queued { dropped } = offered {
-            shared.counters.dropped("queue", dropped);
+            shared.counters.lost(&flow.topic, "queue", dropped);
         }
         offered
     }

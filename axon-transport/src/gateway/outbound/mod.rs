@@ -186,9 +186,11 @@ pub(super) struct Owner {
 }
 
 /// A route as its streams know it.
-#[derive(Clone, Copy)]
+#[derive(Clone)]
 struct Flow {
     number: u32,
+    /// The topic's name.
+    topic: Arc<str>,
     route: Route,
     /// Whether the peer acknowledges what comes over it.
     acknowledged: bool,
@@ -252,7 +254,6 @@ struct Moved {
 
 struct Active {
     flow: Flow,
-    topic: Arc<str>,
     /// Its peer reads nothing, as the hub knows.
     stalled: bool,
     sources: Vec<Source>,
@@ -368,8 +369,7 @@ fn apply(
         }
         Order::Route(number, RouteOut { topic, route, acknowledged, sources, seen }) => {
             let active = routes.entry(number).or_insert_with(|| Active {
-                flow: Flow { number, route, acknowledged },
-                topic,
+                flow: Flow { number, topic, route, acknowledged },
                 stalled: false,
                 sources: Vec::new(),
                 seen: HashMap::new(),
@@ -396,7 +396,7 @@ impl Active {
                 feed.set(&self.sources, self.seen.get(&of).copied());
                 feed
             });
-            feed.turn(self.flow, &self.sources, shared, moved);
+            feed.turn(&self.flow, &self.sources, shared, moved);
         }
     }
 

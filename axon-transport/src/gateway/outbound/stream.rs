@@ -145,7 +145,7 @@ impl Writer {
                 }
                 // What would arrive too late gives way to what is newer.
                 let late = queue.drop_late(BEST_EFFORT_LIFE, self.flight.took());
-                self.shared.counters.dropped("late", late);
+                self.shared.counters.lost(&self.flow.topic, "late", late);
             }
             queue.pop_together(TOGETHER, &mut self.batch);
             drop(queue);
@@ -300,7 +300,7 @@ impl Writer {
                 let newest = self.batch.drain(..sealed).map(|sample| sample.info.sequence).last();
                 let acknowledged = lock(&self.queue).acknowledge(newest.unwrap_or(0)).0;
                 let given_up = acknowledged.max(sealed as u64);
-                self.shared.counters.dropped("no_route", given_up);
+                self.shared.counters.lost(&self.flow.topic, "no_route", given_up);
                 if let Some(sequence) = newest {
                     self.done(Done { sequence, given_up });
                 }
@@ -318,7 +318,7 @@ impl Writer {
     /// A stream of its own for the sample, reset when it is not acknowledged in time.
     async fn best_effort(&mut self, carrier: &Carrier) {
         if let Err(cause) = self.try_best_effort(carrier).await {
-            self.shared.counters.dropped(cause, self.batch.len() as u64);
+            self.shared.counters.lost(&self.flow.topic, cause, self.batch.len() as u64);
         }
         let newest = self.batch.drain(..).next_back().map(|sample| sample.info.sequence);
         if let Some(sequence) = newest {

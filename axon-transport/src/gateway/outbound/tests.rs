@@ -1,5 +1,5 @@
 use axon_envelope::{Kind, TopicHash};
-use quinn::Connection;
+use quinn::{Connection, VarInt};
 
 use super::{stream::Stream, *};
 use crate::{
@@ -7,6 +7,7 @@ use crate::{
         played::{Pair, block_on},
         queue::Offered,
     },
+    link::CloseCode,
     session::MessageInfo,
 };
 
@@ -14,7 +15,7 @@ const OF: Gid = Gid([7; 16]);
 
 fn flow() -> Flow {
     let route = Route { kind: Kind::Topic, topic: TopicHash::new(0, "/t", "T").unwrap() };
-    Flow { number: 1, route, acknowledged: false }
+    Flow { number: 1, topic: "/t".into(), route, acknowledged: false }
 }
 
 /// What the streams to a peer share that is at the other end of `connection`, and what must outlive it.
@@ -88,12 +89,11 @@ fn one_that_sends_no_more_leaves_nothing_behind() {
         for qos in [Qos::keep_all(), Qos::sensor_data()] {
             let mut feeds = HashMap::from([(OF, Feed::new(OF))]);
             let feed = feeds.get_mut(&OF).unwrap();
-            queued(feed.queue(a_sample(1), &qos, flow(), &shared));
+            queued(feed.queue(a_sample(1), &qos, &flow(), &shared));
             assert!(feed.is_in_use());
             let sources = Vec::new();
             let seen = HashMap::new();
-            let (flow, topic) = (flow(), "/t".into());
-            let mut active = Active { flow, topic, stalled: false, sources, seen, feeds };
+            let mut active = Active { flow: flow(), stalled: false, sources, seen, feeds };
             active.prune();
             assert_eq!(active.feeds.len(), 1, "something is sent");
             arrived(&pair.there).await;
@@ -111,10 +111,63 @@ fn what_comes_when_a_stream_is_over_has_another() {
         let (shared, _carrier) = shared(&pair.here);
         let mut feed = Feed::new(OF);
         for sequence in 1..=2 {
-            queued(feed.queue(a_sample(sequence), &Qos::keep_all(), flow(), &shared));
+            queued(feed.queue(a_sample(sequence), &Qos::keep_all(), &flow(), &shared));
             assert!(arrived(&pair.there).await.0);
             until_over(&shared).await;
             assert!(!feed.is_in_use());
+        }
+    });
+}
+
+#[test]
+fn samples_that_are_dropped_are_counted_by_topic_and_cause() {
+    block_on(async {
+        let pair = Pair::new().await;
+        let (shared, _carrier) = shared(&pair.here);
+        let lost = |shared: &Shared| {
+            let losses = shared.counters.take_lost();
+            assert!(losses.iter().all(|loss| &*loss.topic == "/t"), "{losses:?}");
+            losses.iter().map(|loss| (loss.cause, loss.samples)).collect::<Vec<_>>()
+        };
+        let mut feed = Feed::new(OF);
+        let newest = Qos { depth: 1, ..Qos::sensor_data() };
+        let mut dropped = 0;
+        // Nothing is sent in between.
+        for sequence in 1..=5 {
+            match feed.queue(a_sample(sequence), &newest, &flow(), &shared) {
+                Offered::Queued { dropped: older } => dropped += older,
+                full @ Offered::Full(_) => panic!("{full:?}"),
+            }
+        }
+        assert!(dropped > 0);
+        assert_eq!(lost(&shared), [("queue", dropped)]);
+        arrived(&pair.there).await;
+
+        let several = Qos { depth: 5, ..newest };
+        for (sequence, age) in [(6, 10), (7, 10), (8, 0)] {
+            let mut sample = a_sample(sequence);
+            sample.since -= Duration::from_secs(age);
+            queued(feed.queue(sample, &several, &flow(), &shared));
+        }
+        arrived(&pair.there).await;
+        assert_eq!(lost(&shared), [("late", 2)]);
+
+        let reliable = Qos::keep_all();
+        queued(feed.queue(a_sample(9), &reliable, &flow(), &shared));
+        let mut refused = pair.there.accept_uni().await.unwrap();
+        refused.stop(VarInt::from_u32(CloseCode::OutOfOrder as u32)).unwrap();
+        let mut sequence = 10;
+        while lost(&shared).iter().all(|(cause, _)| *cause != "no_route") {
+            queued(feed.queue(a_sample(sequence), &reliable, &flow(), &shared));
+            sequence += 1;
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+
+        pair.there.close(VarInt::from_u32(0), b"");
+        pair.here.closed().await;
+        queued(feed.queue(a_sample(sequence), &newest, &flow(), &shared));
+        while lost(&shared).iter().all(|(cause, _)| *cause != "no_link") {
+            tokio::time::sleep(Duration::from_millis(5)).await;
         }
     });
 }
@@ -197,7 +250,7 @@ fn overload(rate: u64, length: usize, samples: u32, load: f64, depth: u32) -> (f
             payload[length - 8..].copy_from_slice(&now.to_be_bytes());
             let mut sample = a_sample(number.into());
             sample.payload = payload.into();
-            feed.queue(sample, &qos, flow(), &shared);
+            feed.queue(sample, &qos, &flow(), &shared);
         }
         tokio::time::sleep(Duration::from_secs(2)).await;
         let mut ages = lock(&ages).clone();
