@@ -97,8 +97,8 @@ fn a_daemon_killed_in_the_middle_of_a_replay_loses_nothing_and_has_a_successor()
     let echoes = Echoes::start(&host);
     let play = Running::start(host.axon(&["play", LOG, "--rate", "60", "--wait", "1"]));
     eventually("the middle of the replay", || host.published() > 500);
-    let before = host.daemon().expect("a daemon");
-    assert!(host.kill_daemon(Signal::KILL));
+    let before = host.wait_daemon();
+    kill_process(Pid::from_raw(before).expect("a process id"), Signal::KILL).expect("it runs");
     eventually("the next daemon", || host.daemon().is_some_and(|pid| pid != before));
     assert!(host.published() < 5_000, "it was killed after the replay, which shows nothing");
     echoes.assert_whole();

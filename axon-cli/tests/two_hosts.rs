@@ -36,8 +36,8 @@ fn play_fails_where_the_other_host_takes_nothing_more() {
     let _echoes = Echoes::start(&b);
     let play = play(&a, "60");
     eventually("the middle of the replay", || a.published() > 500);
-    let there = b.daemon().expect("a daemon");
-    assert!(b.kill_daemon(Signal::STOP));
+    let there = b.wait_daemon();
+    signal(there, Signal::STOP);
     assert!(a.published() < MESSAGES, "it was stopped after the replay, which shows nothing");
     let (code, said) = outcome(play);
     signal(there, Signal::CONT);
@@ -53,11 +53,11 @@ fn play_fails_where_messages_are_lost_with_its_daemon() {
     let _echoes = Echoes::start(&b);
     let play = play(&a, "60");
     eventually("the middle of the replay", || a.published() > 500);
-    let there = b.daemon().expect("a daemon");
-    assert!(b.kill_daemon(Signal::STOP));
+    let there = b.wait_daemon();
+    signal(there, Signal::STOP);
     let stopped = a.published();
     eventually("more is under way", || a.published() > stopped + 100);
-    assert!(a.kill_daemon(Signal::KILL));
+    signal(a.wait_daemon(), Signal::KILL);
     signal(there, Signal::CONT);
     let (code, said) = outcome(play);
     assert_eq!(code, Some(1), "{said}");

@@ -95,6 +95,16 @@ impl Host {
         Some(i32::try_from(pid).expect("a process id"))
     }
 
+    /// The same, once it answers.
+    pub(crate) fn wait_daemon(&self) -> i32 {
+        let mut daemon = None;
+        eventually("a daemon answers", || {
+            daemon = self.daemon();
+            daemon.is_some()
+        });
+        daemon.expect("it answered")
+    }
+
     pub(crate) fn kill_daemon(&self, signal: rustix::process::Signal) -> bool {
         let pid = self.daemon().and_then(rustix::process::Pid::from_raw);
         pid.is_some_and(|pid| rustix::process::kill_process(pid, signal).is_ok())

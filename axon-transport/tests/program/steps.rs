@@ -394,7 +394,12 @@ impl Stage {
     }
 
     fn kill_daemon(&mut self) -> bool {
-        let before = self.host.status().unwrap();
+        let mut before = None;
+        until("a daemon answers", || {
+            before = self.host.status().ok();
+            before.is_some()
+        });
+        let before = before.unwrap();
         signal(before.pid, Signal::KILL);
         until("there is another daemon", || {
             self.host.status().is_ok_and(|now| now.daemon != before.daemon)
