@@ -11,7 +11,7 @@ use serde::de::DeserializeOwned;
 use super::{
     model::{Modelled, RING},
     orders::{Described, Kind, Order, Own, State},
-    support::{Host, PATIENCE, Player},
+    support::{Host, PATIENCE, Player, excerpt::excerpt},
 };
 
 pub(super) const PROCESSES: usize = 3;
@@ -175,7 +175,8 @@ impl Stage {
 impl Drop for Stage {
     fn drop(&mut self) {
         if std::thread::panicking() {
-            eprintln!("--- what the processes were told:\n{}", self.orders.join("\n"));
+            let told = excerpt("what the processes were told", &self.orders.join("\n"));
+            eprintln!("{told}");
         }
     }
 }

@@ -1,8 +1,11 @@
 //! A host of its own for each test: a runtime directory, a daemon binary, and child processes that
 //! play applications. A child is this very test program, told by `PLAY` what to do.
 
+pub(crate) mod excerpt;
+
 use std::{
     ffi::OsString,
+    fs,
     io::{BufRead, BufReader, Lines, Write as _},
     path::Path,
     process::{Child, ChildStdout, Command, Stdio},
@@ -86,10 +89,16 @@ impl Host {
 
     /// A daemon in the foreground, once it answers.
     pub(crate) fn daemon(&self) -> Kept {
-        let child = self.command(env!("CARGO_BIN_EXE_axon_daemon")).spawn().unwrap();
-        let kept = Kept(child);
+        let mut command = self.command(env!("CARGO_BIN_EXE_axon_daemon"));
+        let log = fs::OpenOptions::new().create(true).append(true).open(self.log()).unwrap();
+        let kept = Kept(command.stderr(log).spawn().unwrap());
         until("the daemon answers", || self.status().is_ok());
         kept
+    }
+
+    /// What daemons in the foreground log.
+    fn log(&self) -> std::path::PathBuf {
+        self.dir.path().join("daemon.txt")
     }
 
     /// A child that plays `part`.
@@ -111,12 +120,17 @@ impl Drop for Host {
         if let Ok(status) = self.status()
             && status.pid != std::process::id()
         {
-            signal(status.pid, rustix::process::Signal::KILL);
+            // It may have ended by itself meanwhile.
+            let _ = try_signal(status.pid, rustix::process::Signal::KILL);
         }
-        if std::thread::panicking()
-            && let Ok(log) = std::fs::read_to_string(self.dir.path().join("run/axon-0.log"))
-        {
-            eprintln!("--- the daemon's log:\n{log}");
+        if std::thread::panicking() {
+            let spawned = self.dir.path().join("run/axon-0.log");
+            for (name, log) in [("the log of a daemon", self.log()), ("the daemon's log", spawned)]
+            {
+                if let Ok(text) = fs::read(log) {
+                    eprintln!("{}", excerpt::excerpt(name, &String::from_utf8_lossy(&text)));
+                }
+            }
         }
     }
 }
@@ -216,6 +230,11 @@ pub(crate) fn until(what: &str, mut reached: impl FnMut() -> bool) {
 }
 
 pub(crate) fn signal(pid: u32, signal: rustix::process::Signal) {
+    try_signal(pid, signal).unwrap();
+}
+
+/// To a process that may end at any time.
+fn try_signal(pid: u32, signal: rustix::process::Signal) -> rustix::io::Result<()> {
     let pid = rustix::process::Pid::from_raw(i32::try_from(pid).unwrap()).unwrap();
-    rustix::process::kill_process(pid, signal).unwrap();
+    rustix::process::kill_process(pid, signal)
 }

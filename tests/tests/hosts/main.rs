@@ -9,6 +9,8 @@ mod dropped;
 mod election;
 mod ending;
 mod events;
+#[path = "../../../axon-transport/tests/support/excerpt.rs"]
+mod excerpt;
 mod flooded;
 mod forged;
 mod graph;

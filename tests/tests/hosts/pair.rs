@@ -19,6 +19,7 @@ use axon_transport::{
 use rustix::process::{Pid, Signal, kill_process};
 
 use super::{
+    excerpt::excerpt,
     mode::Settings,
     process::{Kept, Node, until},
     wire::Wire,
@@ -282,13 +283,8 @@ impl Host {
 
     fn all_logs(&self) -> String {
         let spawned = self.dir.path().join(format!("run/axon-{}.log", self.domain()));
-        [self.log(), spawned].map(|log| fs::read_to_string(log).unwrap_or_default()).concat()
-    }
-
-    fn logs(&self) -> String {
-        let logs = self.all_logs();
-        let lines: Vec<&str> = logs.lines().collect();
-        lines[lines.len().saturating_sub(150)..].join("\n")
+        let text = |log| String::from_utf8_lossy(&fs::read(log).unwrap_or_default()).into_owned();
+        [self.log(), spawned].map(text).concat()
     }
 }
 
@@ -297,13 +293,14 @@ impl Drop for Host {
         if let Some(status) = self.try_status() {
             if std::thread::panicking() {
                 let (links, refusals, keys) = (status.links, status.refusals, status.keys);
-                eprintln!("--- host {}: {links:#?}\n{refusals:#?}\n{keys}", self.name);
+                let text = format!("{links:#?}\n{refusals:#?}\n{keys}");
+                eprintln!("{}", excerpt(&format!("the status of host {}", self.name), &text));
             }
             // One that a session started is nobody's child.
             kill(status.pid);
         }
         if std::thread::panicking() {
-            eprintln!("--- the log of host {}:\n{}", self.name, self.logs());
+            eprintln!("{}", excerpt(&format!("the log of host {}", self.name), &self.all_logs()));
         }
     }
 }
