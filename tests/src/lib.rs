@@ -22,3 +22,8 @@ pub fn end_with_stdin() {
     // To itself: that cannot fail while there is somebody to see it fail.
     let _ = kill_process(getpid(), Signal::TERM);
 }
+
+// Its own documentation tests are off: most are rustls's, which call the crate `rustls`.
+#[cfg(doctest)]
+#[doc = include_str!("../../third_party/rustls-axon/README.md")]
+struct RustlsAxonReadme;

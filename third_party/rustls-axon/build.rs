@@ -1,7 +1,8 @@
-//! Finds or makes the source tree of the crate, and tells `src/lib.rs` where it is.
+//! Makes the source tree of the crate, and tells `src/lib.rs` where it is.
 //!
-//! In a checkout: rustls's own source, as cargo has it, with `patches/` applied and `added/` added,
-//! in `OUT_DIR`. In a package: `patched/`, which was made in the same way before packaging.
+//! That is rustls's own source, as cargo has it, with `patches/` applied and `added/` added, in `OUT_DIR`.
+//! A package has neither this script nor patches to apply: `cargo xtask package` makes its source in the
+//! same way.
 
 use std::env;
 use std::path::{Path, PathBuf};
@@ -31,22 +32,15 @@ fn source_tree() -> Result<PathBuf, String> {
     let var = |name: &str| env::var(name).map_err(|_| format!("{name} is not set by cargo"));
     let crate_dir = PathBuf::from(var("CARGO_MANIFEST_DIR")?);
 
-    for watched in ["patches", "added", "build", "patched", "upstream.sha256", "patched.sha256"] {
-        if crate_dir.join(watched).exists() {
-            println!("cargo::rerun-if-changed={}", crate_dir.join(watched).display());
-        }
-    }
-
     if !crate_dir.join("patches").is_dir() {
-        let packaged = crate_dir.join("patched/src");
-        if !packaged.is_dir() {
-            return Err(format!(
-                "{} has neither patches/ nor patched/: the package is incomplete",
-                crate_dir.display()
-            ));
-        }
-        tree::check(&tree::read_dir(&packaged)?, &crate_dir.join("patched.sha256"))?;
-        return Ok(packaged);
+        return Err(format!(
+            "{} has no patches/, so it is no checkout of the repository.\n\
+             A package of rustls-axon is made with: cargo xtask package rustls-axon",
+            crate_dir.display()
+        ));
+    }
+    for watched in ["patches", "added", "build", "upstream.sha256", "patched.sha256"] {
+        println!("cargo::rerun-if-changed={}", crate_dir.join(watched).display());
     }
 
     let out = PathBuf::from(var("OUT_DIR")?);

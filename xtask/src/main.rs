@@ -7,6 +7,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 mod install_c;
+mod package;
 mod repeat;
 mod rustls_axon;
 
@@ -16,10 +17,12 @@ usage: cargo xtask COMMAND
   install-c PREFIX [PROFILE]
                        build axon-transport's C libraries and daemon, in release unless told
                        otherwise, and install them with header and pkg-config file
+  package [CRATE]... [--allow-dirty] [--no-verify] [--offline] [--target-dir DIR]
+                       make the packages of these crates, or of all that are published, from a copy
+                       of the workspace in which rustls-axon has its patched source
   repeat TIMES [--busy N] [NAME ...]
                        run the test suite, or the test programs with such a name, TIMES times,
                        beside N busy threads, and list the tests that failed in any run
-  patched-tree         make third_party/rustls-axon/patched/, which `cargo package` ships
   rustls-digests       after a change to patches/ or added/: write patched.sha256 anew
   rustls-checkout DIR [VERSION]
                        make DIR a git repository with rustls's source and a commit a patch, and
@@ -38,11 +41,14 @@ fn main() -> ExitCode {
     let result = match args[..] {
         ["install-c", prefix] => install_c::install(prefix.as_ref(), "release"),
         ["install-c", prefix, profile] => install_c::install(prefix.as_ref(), profile),
+        ["package", ref options @ ..] => match package::Options::parse(options) {
+            Some(options) => package::package(&options),
+            None => return usage(),
+        },
         ["repeat", times, ref options @ ..] => match repeat_options(times, options) {
             Some(options) => repeat::repeat(&options),
             None => return usage(),
         },
-        ["patched-tree"] => rustls_axon::patched_tree(),
         ["rustls-digests"] => rustls_axon::digests(),
         ["rustls-checkout", dir] => rustls_axon::checkout(dir.as_ref(), None),
         ["rustls-checkout", dir, version] => rustls_axon::checkout(dir.as_ref(), Some(version)),

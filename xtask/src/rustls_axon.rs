@@ -1,4 +1,4 @@
-//! Chores of `third_party/rustls-axon`: its patches, digests and packaged tree.
+//! Chores of `third_party/rustls-axon`: its patches, digests and packaged form.
 //!
 //! What a patched tree is made of is decided in that crate's `build/`, which is used here as it is.
 
@@ -15,29 +15,15 @@ mod tree;
 #[path = "../../third_party/rustls-axon/build/upstream.rs"]
 mod upstream;
 
+mod packaged;
 mod rebase;
 
+pub(crate) use packaged::write_packaged_form;
+pub(crate) use rebase::walk;
 pub(crate) use rebase::{Options as Rebase, rebase};
 
 /// The author of the commits that stand for patches.
 const AUTHOR: [&str; 4] = ["-c", "user.name=AXON", "-c", "user.email=axon@localhost"];
-
-/// Makes `patched/`, checked against the committed digests.
-pub(crate) fn patched_tree() -> Result<String, String> {
-    let upstream = upstream_src(&crate_dir())?;
-    let made = tree::assemble(&upstream, &crate_dir())?;
-    tree::check(&made, &crate_dir().join("patched.sha256"))?;
-    let out = crate_dir().join("patched");
-    tree::write(&made, &out.join("src"))?;
-
-    // what is shipped is a derived work, so rustls's licences and copyright notices go with it
-    for licence in ["LICENSE-APACHE", "LICENSE-ISC", "LICENSE-MIT"] {
-        let from = upstream.with_file_name(licence);
-        fs::copy(&from, out.join(licence))
-            .map_err(|err| format!("cannot copy {}: {err}", from.display()))?;
-    }
-    Ok(format!("{}: {} files", out.display(), made.len()))
-}
 
 /// Writes `patched.sha256`, for the release that `upstream.sha256` has.
 pub(crate) fn digests() -> Result<String, String> {
@@ -138,7 +124,7 @@ fn commit(dir: &Path, message: &str) -> Result<(), String> {
     git(dir, &[&AUTHOR[..], &["commit", "--quiet", "--message", message]].concat()).map(drop)
 }
 
-fn git(dir: &Path, args: &[&str]) -> Result<String, String> {
+pub(crate) fn git(dir: &Path, args: &[&str]) -> Result<String, String> {
     let output = Command::new("git")
         .args(args)
         .current_dir(dir)
@@ -151,7 +137,7 @@ fn git(dir: &Path, args: &[&str]) -> Result<String, String> {
     Ok(String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
-fn workspace() -> &'static Path {
+pub(crate) fn workspace() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("xtask is in the root")
 }
 
@@ -162,7 +148,7 @@ fn crate_dir() -> PathBuf {
 /// Where the crate is in the workspace.
 const CRATE: &str = "third_party/rustls-axon";
 
-fn cargo() -> PathBuf {
+pub(crate) fn cargo() -> PathBuf {
     env::var_os("CARGO").map_or_else(|| PathBuf::from("cargo"), PathBuf::from)
 }
 

@@ -9,9 +9,10 @@
 //!
 //! use rustls_axon::crypto::{CryptoProvider, aws_lc_rs, hash::HashAlgorithm};
 //! use rustls_axon::external_psk::{ExternalPsk, PskKeyExchangeMode};
+//! use rustls_axon::zeroize::Zeroizing;
 //! use rustls_axon::{ClientConfig, ClientConnection};
 //!
-//! # fn example(secret: zeroize::Zeroizing<Vec<u8>>) -> Result<(), Box<dyn std::error::Error>> {
+//! # fn example(secret: Zeroizing<Vec<u8>>) -> Result<(), Box<dyn std::error::Error>> {
 //! let psk = ExternalPsk::new("the key of today", secret, HashAlgorithm::SHA256)?;
 //!
 //! let provider = CryptoProvider { kx_groups: vec![], ..aws_lc_rs::default_provider() };
@@ -39,5 +40,9 @@
 #![forbid(unsafe_code)]
 // The code is rustls's: its lints are checked there, with its own settings and all of its features.
 #![allow(warnings, clippy::all, rustdoc::all)]
+
+/// The crate that secrets are handed over with.
+#[doc(no_inline)]
+pub use zeroize;
 
 include!(concat!(env!("RUSTLS_AXON_SRC"), "/lib_body.rs"));

@@ -13,6 +13,7 @@ mod fit;
 mod pin;
 mod review;
 mod suite;
+pub(crate) use suite::walk;
 #[cfg(test)]
 mod tests;
 

@@ -53,14 +53,12 @@ fn run(command: &mut Command) -> Output {
 
 /// The unpacked package, made once, as a release makes it.
 static PACKAGE: LazyLock<PathBuf> = LazyLock::new(|| {
-    let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
-    run(Command::new(env!("CARGO_BIN_EXE_xtask")).arg("patched-tree"));
-
     let _ = fs::remove_dir_all(scratch());
     let out = scratch().join("out");
     fs::create_dir_all(&out).unwrap();
-    let package = ["package", "--package", "rustls-axon", "--no-verify", "--allow-dirty"];
-    run(cargo(workspace, &package).args(["--offline", "--target-dir"]).arg(&out));
+    let package = ["package", "rustls-axon", "--no-verify", "--allow-dirty", "--offline"];
+    let xtask = env!("CARGO_BIN_EXE_xtask");
+    run(Command::new(xtask).args(package).arg("--target-dir").arg(&out));
 
     let mut packed = fs::read_dir(out.join("package")).unwrap().map(|entry| entry.unwrap().path());
     let packed = packed.find(|path| path.extension().is_some_and(|end| end == "crate")).unwrap();
@@ -135,6 +133,34 @@ fn the_package_runs_beside_the_newest_rustls() {
     let target = Path::new(env!("CARGO_TARGET_TMPDIR")).parent().unwrap();
     let run_it = ["run", "--offline", "--locked"];
     both_shook_hands(&run(cargo(&project, &run_it).env("CARGO_TARGET_DIR", target)));
+}
+
+/// Who adds the package compiles rustls's source once: as this crate, and not to build it.
+#[test]
+fn the_package_has_no_build_script_and_no_build_dependencies() {
+    let manifest = fs::read_to_string(PACKAGE.join("Cargo.toml")).unwrap();
+    assert!(manifest.contains("\nbuild = false\n"), "{manifest}");
+    for part in ["build-dependencies", "[dependencies.rustls]", "publish"] {
+        let text = manifest.split("[dev-dependencies").next().unwrap();
+        assert!(!text.contains(part), "{part}: {text}");
+    }
+    assert!(!PACKAGE.join("build.rs").exists());
+    for file in ["src/external_psk.rs", "src/lib.rs", "patches", "LICENSE-ISC", "README.md"] {
+        assert!(PACKAGE.join(file).exists(), "{file}");
+    }
+    assert!(!PACKAGE.join("src/lib_body.rs").exists());
+}
+
+/// Cargo's own command would pack what cannot be built.
+#[test]
+fn a_checkout_cannot_be_packaged_without_its_source() {
+    let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+    let out = scratch().join("refused");
+    let package = ["package", "--package", "rustls-axon", "--no-verify", "--allow-dirty"];
+    let mut command = cargo(workspace, &package);
+    let output = command.args(["--offline", "--target-dir"]).arg(&out).output().unwrap();
+    let why = String::from_utf8_lossy(&output.stderr);
+    assert!(!output.status.success() && why.contains("made-by-cargo-xtask-package"), "{why}");
 }
 
 /// In a checkout, another rustls than the pinned one is an error; in the package it is none.

@@ -9,8 +9,11 @@ use super::super::{patched_digests, upstream_digests};
 use super::{CRATE, Tree, cargo};
 
 /// The lock files that have rustls, and the manifests they belong to.
-const LOCKS: [(&str, &str); 2] =
-    [("Cargo.lock", "Cargo.toml"), ("fuzz/Cargo.lock", "fuzz/Cargo.toml")];
+const LOCKS: [(&str, &str); 3] = [
+    ("Cargo.lock", "Cargo.toml"),
+    ("bench-peers/Cargo.lock", "bench-peers/Cargo.toml"),
+    ("fuzz/Cargo.lock", "fuzz/Cargo.toml"),
+];
 
 /// What is going to be in which file; `None` for a file that goes away.
 pub(super) struct Edits {
@@ -127,16 +130,12 @@ pub(super) fn plan(
     }
 
     for (name, place) in [
-        (path("Cargo.toml"), "\nversion = \"VERSION\"\n"),
+        (path("Cargo.toml"), "+rustls.VERSION\"\n"),
         (path("Cargo.toml"), "\nrustls = { version = \">=VERSION, <0.24\""),
         (path("src/lib.rs"), "This is rustls VERSION with"),
         (path("src/lib.rs"), "https://docs.rs/rustls/VERSION\n"),
         (path("README.md"), "[rustls](https://docs.rs/rustls) VERSION with"),
         ("docs/rustls-axon.md".into(), "`third_party/rustls-axon` is rustls VERSION with"),
-        (
-            "Cargo.toml".into(),
-            "\nrustls-axon = { path = \"third_party/rustls-axon\", version = \"VERSION\"",
-        ),
     ] {
         let with = |version: &str| place.replace("VERSION", version);
         edits.replace(&name, &with(pinned), &with(version))?;

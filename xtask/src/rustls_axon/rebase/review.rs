@@ -41,7 +41,7 @@ to look at:
   the diff of patches/, and rustls-axon's CHANGELOG
   rustls's own tests, without and with the patches (--suite)
   cargo test -p rustls-axon -p axon-tls --all-features, with OpenSSL and GnuTLS installed
-  cargo xtask patched-tree && cargo package -p rustls-axon";
+  cargo xtask package rustls-axon";
 
 /// Upstream's changes, those in files that patches touch first.
 pub(super) fn list(

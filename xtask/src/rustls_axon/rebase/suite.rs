@@ -101,7 +101,8 @@ fn copy_tracked(repository: &Path, to: &Path) -> Result<(), String> {
     Ok(())
 }
 
-fn walk(root: &Path, below: &str, files: &mut Vec<String>) -> Result<(), String> {
+/// The files below `root`, without build directories and git's own.
+pub(crate) fn walk(root: &Path, below: &str, files: &mut Vec<String>) -> Result<(), String> {
     let failed = |err| format!("cannot read {}: {err}", root.join(below).display());
     for entry in fs::read_dir(root.join(below)).map_err(failed)? {
         let entry = entry.map_err(failed)?;

@@ -169,7 +169,7 @@ fn small_workspace() -> Option<tempfile::TempDir> {
     let krate = workspace().join(CRATE);
     for (path, contents) in files(&krate) {
         let name = path.strip_prefix(&krate).unwrap();
-        if name.starts_with("patched") || name.starts_with("target") {
+        if name.starts_with("target") {
             continue;
         }
         let to = root.join(CRATE).join(name);
