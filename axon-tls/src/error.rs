@@ -25,9 +25,21 @@ pub enum Error {
     #[error("ALPN protocol must have 1 to 255 bytes")]
     Alpn,
     /// rustls refused the configuration of a hybrid connection.
+    #[cfg(feature = "hybrid")]
     #[error("rustls: {0}")]
     Rustls(#[from] rustls::Error),
-    /// rustls-axon refused the configuration of a QKD connection.
+    /// A configuration of the caller's that is not hybrid and nothing else. What it has instead.
+    #[error(
+        "the configuration has {0}, and must be hybrid alone: make it with axon_tls::hybrid::provider()"
+    )]
+    NotHybrid(String),
+    /// A configuration of the caller's with early data (0-RTT), which is replayable.
+    #[error("the configuration has early data (0-RTT), which is not supported: leave it off")]
+    EarlyData,
+    /// Pre-shared keys that cannot be configured together.
+    #[error("pre-shared keys: {0}")]
+    Psk(&'static str),
+    /// rustls-axon refused a pre-shared key or the configuration of a connection on one.
     #[error("rustls-axon: {0}")]
     RustlsAxon(#[from] rustls_axon::Error),
     /// The system's random number generator or key generation failed.

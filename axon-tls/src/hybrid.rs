@@ -13,7 +13,7 @@
 //!
 //! let auth = Auth::None(SigningKey::generate()?);
 //! let config = hybrid::client_config(&auth, Cipher::default(), b"my-protocol/1")?;
-//! let conn = rustls::ClientConnection::new(Arc::new(config), "peer".try_into()?)?;
+//! let conn = axon_tls::rustls::ClientConnection::new(Arc::new(config), "peer".try_into()?)?;
 //! assert!(hybrid::negotiated(&conn).is_none(), "the handshake has not begun");
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
@@ -23,14 +23,16 @@ mod erasing;
 use std::sync::Arc;
 
 use rustls::client::Resumption;
+use rustls::crypto::aws_lc_rs::cipher_suite::TLS13_AES_128_GCM_SHA256;
 use rustls::crypto::aws_lc_rs::{default_provider, kx_group};
 use rustls::crypto::{CryptoProvider, SupportedKxGroup};
 use rustls::server::NoServerSessionStorage;
 use rustls::version::TLS13;
-use rustls::{ClientConfig, CommonState, NamedGroup, ServerConfig};
+use rustls::{ClientConfig, CommonState, ConfigBuilder, NamedGroup, ServerConfig, WantsVerifier};
 
 use self::erasing::suite;
 use crate::identity::{Auth, SpkiDigest};
+use crate::negotiated::protocols;
 use crate::{Cipher, Error, KeyExchange, Negotiated};
 
 /// aws-lc-rs with X25519MLKEM768 alone and the TLS 1.3 suites with 256-bit keys alone.
@@ -47,6 +49,43 @@ pub fn provider() -> CryptoProvider {
 /// The same with one cipher suite.
 pub fn provider_with(cipher: Cipher) -> CryptoProvider {
     CryptoProvider { cipher_suites: vec![suite(cipher)], ..provider() }
+}
+
+/// A builder of your own client configuration, which goes on where it is chosen how the server's
+/// certificate is verified.
+///
+/// ```
+/// use axon_tls::{hybrid, rustls};
+///
+/// let mut config = hybrid::client_builder()
+///     .with_root_certificates(rustls::RootCertStore::empty())
+///     .with_no_client_auth();
+/// config.alpn_protocols = vec![b"h3".to_vec()];
+/// ```
+pub fn client_builder() -> ConfigBuilder<ClientConfig, WantsVerifier> {
+    ClientConfig::builder_with_provider(Arc::new(provider()))
+        .with_protocol_versions(&[&TLS13])
+        .expect("the provider has suites and a group of TLS 1.3")
+}
+
+/// A builder of your own server configuration, which goes on where it is chosen whether clients show
+/// certificates.
+pub fn server_builder() -> ConfigBuilder<ServerConfig, WantsVerifier> {
+    ServerConfig::builder_with_provider(Arc::new(provider()))
+        .with_protocol_versions(&[&TLS13])
+        .expect("the provider has suites and a group of TLS 1.3")
+}
+
+/// The suite that protects Initial packets of QUIC (RFC 9001 section 5.2), for
+/// `quinn::crypto::rustls::QuicServerConfig::with_initial()` and `QuicClientConfig::with_initial()`.
+///
+/// TLS offers it nowhere: it is not in [`provider()`]. The keys of Initial packets are made from what is
+/// on the wire, and protect nothing from anybody. The module `quic` uses it by itself.
+pub fn quic_initial_suite() -> rustls::quic::Suite {
+    TLS13_AES_128_GCM_SHA256
+        .tls13()
+        .and_then(|suite| suite.quic_suite())
+        .expect("aws-lc-rs has AES-128-GCM for QUIC")
 }
 
 /// A client's configuration, with one ALPN protocol, or none if `alpn` is empty.
@@ -95,12 +134,25 @@ pub fn negotiated(conn: &CommonState) -> Option<Negotiated> {
     })
 }
 
-pub(crate) fn protocols(alpn: &[u8]) -> Result<Vec<Vec<u8>>, Error> {
-    match alpn.len() {
-        0 => Ok(Vec::new()),
-        1..=255 => Ok(vec![alpn.to_vec()]),
-        _ => Err(Error::Alpn),
+/// Refuses a configuration that offers or takes anything but the hybrid group and 256-bit suites of
+/// TLS 1.3, or that has early data.
+#[cfg(feature = "quic")]
+pub(crate) fn check(provider: &CryptoProvider, early_data: bool) -> Result<(), Error> {
+    let not_hybrid = |what: String| Err(Error::NotHybrid(what));
+    if provider.kx_groups.is_empty() {
+        return not_hybrid("no key exchange group".into());
     }
+    for group in &provider.kx_groups {
+        if group.name() != NamedGroup::X25519MLKEM768 {
+            return not_hybrid(format!("the group {:?}", group.name()));
+        }
+    }
+    for offered in &provider.cipher_suites {
+        if !Cipher::ALL.into_iter().any(|cipher| suite(cipher).suite() == offered.suite()) {
+            return not_hybrid(format!("the cipher suite {:?}", offered.suite()));
+        }
+    }
+    if early_data { Err(Error::EarlyData) } else { Ok(()) }
 }
 
 const GROUP: &dyn SupportedKxGroup = kx_group::X25519MLKEM768;

@@ -2,40 +2,55 @@
 //!
 //! Two ways to agree on keys, and no third:
 //!
-//! - [`hybrid`]: the group X25519MLKEM768 alone, on [rustls](https://docs.rs/rustls) as released.
-//!   Who the peer is, is chosen with [`identity::Auth`].
-//! - [`qkd`]: an external pre-shared key made from a key that a quantum key distribution system
-//!   gave to both ends, on `rustls-axon`. The key authenticates both ends; there are no
-//!   certificates.
+//! - `hybrid`: the group X25519MLKEM768 alone, on [rustls](https://docs.rs/rustls) as released.
+//!   Who the peer is, is chosen with `identity::Auth`, or in a rustls configuration of your own.
+//! - [`psk`]: an external pre-shared key, on [`rustls_axon`]. The key authenticates both ends; there
+//!   are no certificates. [`qkd`] makes the key from one that a quantum key distribution system gave to
+//!   both ends.
 //!
-//! Both offer exactly one 256-bit [`Cipher`] and TLS 1.3 alone, have no tickets, no early data and
-//! no key log, and refuse whatever else the peer proposes. With the feature `quic` the same
-//! configurations are there for [quinn](https://docs.rs/quinn), in the module `quic`.
+//! Both offer 256-bit [`Cipher`]s and TLS 1.3 alone, and refuse whatever else the peer proposes. The
+//! configurations that this crate makes have one cipher, no tickets, no early data and no key log.
 //!
 //! After the handshake [`Negotiated`] says what was agreed, read from the connection and not from
 //! the configuration.
 //!
+//! # Features
+//!
+//! - `hybrid` (default): the modules `hybrid` and `identity`, on stock rustls, re-exported as `rustls`.
+//! - `quic`: both modes for [quinn](https://docs.rs/quinn), in the module `quic`, with `quinn` re-exported.
+//!
 //! # Example
 //!
-//! A provider for your own rustls configuration:
+//! A configuration of rustls for a client that knows servers by their certificates:
 //!
 //! ```
-//! let provider = std::sync::Arc::new(axon_tls::hybrid::provider());
-//! let builder = rustls::ClientConfig::builder_with_provider(provider)
-//!     .with_protocol_versions(&[&rustls::version::TLS13])?;
-//! # let _ = builder;
-//! # Ok::<(), rustls::Error>(())
+//! # #[cfg(feature = "hybrid")] {
+//! use axon_tls::{hybrid, rustls};
+//!
+//! let config = hybrid::client_builder()
+//!     .with_root_certificates(rustls::RootCertStore::empty()) // yours
+//!     .with_no_client_auth();
+//! # let _ = config; }
 //! ```
 #![forbid(unsafe_code)]
 
 mod erase;
 mod error;
+#[cfg(feature = "hybrid")]
 pub mod hybrid;
+#[cfg(feature = "hybrid")]
 pub mod identity;
 mod negotiated;
+pub mod psk;
 pub mod qkd;
 #[cfg(feature = "quic")]
 pub mod quic;
+
+#[cfg(feature = "quic")]
+pub use quinn;
+#[cfg(feature = "hybrid")]
+pub use rustls;
+pub use {rustls_axon, zeroize};
 
 // For AXON's own crates; not part of the interface.
 #[doc(hidden)]
@@ -43,6 +58,6 @@ pub use erase::erasing;
 pub use error::{CaPart, Error};
 pub use negotiated::{Cipher, KeyExchange, Negotiated, PskKex, UnknownName};
 
-#[cfg(doctest)]
+#[cfg(all(doctest, feature = "hybrid"))]
 #[doc = include_str!("../README.md")]
 struct Readme;

@@ -3,6 +3,10 @@
 use std::fmt;
 use std::str::FromStr;
 
+use rustls_axon::crypto::hash::HashAlgorithm;
+
+use crate::Error;
+#[cfg(feature = "hybrid")]
 use crate::identity::SpkiDigest;
 
 /// The cipher suite of a connection: TLS 1.3 with a 256-bit key.
@@ -27,6 +31,14 @@ impl Cipher {
         match self {
             Self::ChaCha20Poly1305 => "chacha20-poly1305",
             Self::Aes256Gcm => "aes-256-gcm",
+        }
+    }
+
+    /// The hash of the cipher suite.
+    pub(crate) const fn hash(self) -> HashAlgorithm {
+        match self {
+            Self::ChaCha20Poly1305 => HashAlgorithm::SHA256,
+            Self::Aes256Gcm => HashAlgorithm::SHA384,
         }
     }
 }
@@ -86,13 +98,24 @@ pub struct Negotiated {
     pub cipher: Cipher,
     /// The identity of the pre-shared key, if the connection runs on one.
     pub psk_identity: Option<Vec<u8>>,
-    /// The digest of the peer's public key, if the connection does not run on a pre-shared key.
+    /// The digest of the peer's public key. `None` on a pre-shared key, and for a client that was not
+    /// asked for a certificate.
     ///
     /// The peer has proven that it has the private key. Whether that says who it is, depends on
     /// the [`Auth`](crate::identity::Auth) of the configuration.
+    #[cfg(feature = "hybrid")]
     pub peer: Option<SpkiDigest>,
     /// The application protocol; empty if none was configured.
     pub alpn: Vec<u8>,
+}
+
+/// The protocols of a configuration with one, or with none if `alpn` is empty.
+pub(crate) fn protocols(alpn: &[u8]) -> Result<Vec<Vec<u8>>, Error> {
+    match alpn.len() {
+        0 => Ok(Vec::new()),
+        1..=255 => Ok(vec![alpn.to_vec()]),
+        _ => Err(Error::Alpn),
+    }
 }
 
 /// A name that is not one of those accepted.

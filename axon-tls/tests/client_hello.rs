@@ -1,5 +1,5 @@
 //! What is on the wire: the ClientHello of every mode, taken from records and packets and parsed here.
-#![cfg(feature = "quic")]
+#![cfg(all(feature = "hybrid", feature = "quic"))]
 
 mod common;
 

@@ -1,5 +1,6 @@
 //! Connections on a pre-shared key with OpenSSL and GnuTLS: every mode that they have in common with
 //! us, in both directions, and their refusals.
+#![cfg(feature = "hybrid")]
 
 mod peers;
 

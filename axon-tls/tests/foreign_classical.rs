@@ -1,4 +1,5 @@
 //! OpenSSL and GnuTLS with one classical way alone are refused, as clients and as servers.
+#![cfg(feature = "hybrid")]
 
 mod peers;
 

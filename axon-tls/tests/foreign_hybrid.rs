@@ -1,5 +1,6 @@
 //! The hybrid mode with OpenSSL 3.5 or later, in both directions: keys of its own making as raw
 //! public keys (RFC 7250) and in certificates, and what is refused of it.
+#![cfg(feature = "hybrid")]
 
 mod peers;
 

@@ -1,4 +1,5 @@
 //! Certificates: who is accepted, in either direction, and for which host.
+#![cfg(feature = "hybrid")]
 
 use std::sync::Arc;
 

@@ -1,5 +1,6 @@
 //! Peers that show what is not theirs, or is nothing: every one is refused, in either role, and
 //! whoever looks at it lives.
+#![cfg(feature = "hybrid")]
 
 use std::sync::Arc;
 

@@ -1,5 +1,6 @@
 //! A QKD key imported as RFC 9258 says: against rustls-axon's own importer, and never in place of the
 //! other form.
+#![cfg(feature = "hybrid")]
 
 use std::sync::{Arc, Mutex};
 

@@ -1,5 +1,5 @@
 //! Whole QUIC connections in one process: what is refused, and what works.
-#![cfg(feature = "quic")]
+#![cfg(all(feature = "hybrid", feature = "quic"))]
 
 mod common;
 

@@ -1,6 +1,6 @@
 //! Nothing is sent before the peer is known: neither a client's early data nor a server's data before
 //! the client's Finished, whatever the application or the peer would like.
-#![cfg(feature = "quic")]
+#![cfg(all(feature = "hybrid", feature = "quic"))]
 
 mod common;
 

@@ -1,5 +1,5 @@
 //! Keys of QUIC in memory: updates, Retry packets, and handshakes that somebody meddles with.
-#![cfg(feature = "quic")]
+#![cfg(all(feature = "hybrid", feature = "quic"))]
 
 mod common;
 

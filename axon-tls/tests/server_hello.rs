@@ -1,5 +1,5 @@
 //! What is on the wire: the ServerHello of every mode, over TCP and QUIC.
-#![cfg(feature = "quic")]
+#![cfg(all(feature = "hybrid", feature = "quic"))]
 
 mod common;
 

@@ -1,5 +1,6 @@
 //! Peers that show the right key and sign with another one, in another scheme or over something else;
 //! peers that take other signatures alone; peers with nothing after TLS 1.2.
+#![cfg(feature = "hybrid")]
 
 use std::sync::Arc;
 

@@ -16,7 +16,8 @@ use rustls::{CertificateError, ClientConfig, DigitallySignedStruct, Error, Signa
 use super::SpkiDigest;
 use super::roots::host_names;
 use super::verifier::{Peers, Role, Verifier};
-use crate::hybrid::{protocols, provider};
+use crate::hybrid::provider;
+use crate::negotiated::protocols;
 
 /// A client that looks at a server's key and then breaks off.
 ///

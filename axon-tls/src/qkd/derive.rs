@@ -1,60 +1,14 @@
 //! From a QKD key to a pre-shared key of TLS.
 
 use std::hint::black_box;
-use std::sync::{Arc, Mutex, PoisonError};
 
 use aws_lc_rs::hkdf::{HKDF_SHA256, KeyType, Salt};
-use rustls_axon::crypto::hash::HashAlgorithm;
-use rustls_axon::external_psk::ExternalPsk;
 use zeroize::Zeroizing;
 
 use super::PskIdentity;
 use crate::erase::erasing_stack;
+use crate::psk::Psk;
 use crate::{Cipher, Error};
-
-/// A pre-shared key for one connection, and the identity it is named by.
-///
-/// Zeroized on drop; neither `Clone` nor `Debug`. Share it with an [`Arc`].
-///
-/// A connection keeps its configuration until it ends, and that keeps the key: [`erase`](Self::erase)
-/// it when the handshake is complete.
-pub struct Psk {
-    identity: Vec<u8>,
-    psk: Mutex<Option<Arc<ExternalPsk>>>,
-    cipher: Cipher,
-}
-
-impl Psk {
-    /// The identity, as the client sends it.
-    pub fn identity(&self) -> &[u8] {
-        &self.identity
-    }
-
-    /// Erases the secret: no handshake begins with it from here on. One under way, which has it
-    /// already, goes on and erases it at its end.
-    pub fn erase(&self) {
-        self.psk.lock().unwrap_or_else(PoisonError::into_inner).take();
-    }
-
-    /// Whether the secret was erased.
-    pub fn is_erased(&self) -> bool {
-        self.psk.lock().unwrap_or_else(PoisonError::into_inner).is_none()
-    }
-
-    /// The only cipher this key can be used with.
-    pub fn cipher(&self) -> Cipher {
-        self.cipher
-    }
-
-    pub(super) fn new(psk: Arc<ExternalPsk>, cipher: Cipher) -> Self {
-        Self { identity: psk.identity().to_vec(), psk: Mutex::new(Some(psk)), cipher }
-    }
-
-    /// The key as rustls takes it; `None` once it is erased.
-    pub(crate) fn external(&self) -> Option<Arc<ExternalPsk>> {
-        self.psk.lock().unwrap_or_else(PoisonError::into_inner).clone()
-    }
-}
 
 /// Derives the pre-shared key of one connection from a QKD key.
 ///
@@ -78,14 +32,13 @@ pub fn derive_psk(
         return Err(Error::EqualSaeIds);
     }
 
-    let (hash_name, hash, len) = match cipher {
-        Cipher::ChaCha20Poly1305 => ("SHA256", HashAlgorithm::SHA256, 32),
-        Cipher::Aes256Gcm => ("SHA384", HashAlgorithm::SHA384, 48),
+    let (hash_name, len) = match cipher {
+        Cipher::ChaCha20Poly1305 => ("SHA256", 32),
+        Cipher::Aes256Gcm => ("SHA384", 48),
     };
     let names = [key_id, client_sae, server_sae, hash_name];
     let secret = erasing_stack(|| secret(key, names, len))?;
-    let psk = ExternalPsk::new(identity.to_bytes(), secret, hash)?;
-    Ok(Psk::new(Arc::new(psk), cipher))
+    Psk::new(identity.to_bytes(), secret, cipher)
 }
 
 fn secret(key: &[u8; 32], names: [&str; 4], len: usize) -> Result<Zeroizing<Vec<u8>>, Error> {
@@ -130,6 +83,8 @@ impl KeyType for Len {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use super::*;
     use crate::PskKex;
     use crate::qkd::client_config;

@@ -2,11 +2,11 @@
 
 use rustls_axon::crypto::aws_lc_rs::cipher_suite::TLS13_CHACHA20_POLY1305_SHA256;
 use rustls_axon::crypto::hash::HashAlgorithm;
-use rustls_axon::external_psk::{ImportedIdentity as TlsIdentity, ImportedPsk};
+use rustls_axon::external_psk::{ExternalPsk, ImportedIdentity as TlsIdentity, ImportedPsk};
 use zeroize::Zeroizing;
 
-use super::Psk;
 use crate::erase::erasing_stack;
+use crate::psk::Psk;
 use crate::{Cipher, Error};
 
 /// Imports a QKD key for one connection, as RFC 9258 does.
@@ -31,11 +31,11 @@ pub fn import_psk(
 ) -> Result<Psk, Error> {
     let named = ImportedIdentity::new(key_id, client_sae, server_sae, cipher)?;
     let context = named.context();
-    let identity = TlsIdentity::new(named.key_id.as_bytes(), &context, hash(cipher))?;
+    let identity = TlsIdentity::new(named.key_id.as_bytes(), &context, cipher.hash())?;
     let base_key = Zeroizing::new(key.to_vec());
     let suite = TLS13_CHACHA20_POLY1305_SHA256.tls13().ok_or(Error::KeyGeneration)?;
     let imported = erasing_stack(|| ImportedPsk::new(identity, &base_key, suite))?;
-    Ok(Psk::new(imported.into(), cipher))
+    Ok(ExternalPsk::from(imported).into())
 }
 
 /// What the identity of an imported QKD key says. It is sent in the clear.
@@ -117,13 +117,6 @@ impl ImportedIdentity {
 }
 
 const MAX_NAME: usize = 255;
-
-fn hash(cipher: Cipher) -> HashAlgorithm {
-    match cipher {
-        Cipher::ChaCha20Poly1305 => HashAlgorithm::SHA256,
-        Cipher::Aes256Gcm => HashAlgorithm::SHA384,
-    }
-}
 
 /// The two names of a context that is exactly that.
 fn split(context: &[u8]) -> Option<(&[u8], &[u8])> {

@@ -26,7 +26,7 @@
 //! assert_eq!(psk.identity(), b"axon-qkd-v1:sae-robot:5fa1");
 //!
 //! let config = qkd::client_config(Arc::new(psk), PskKex::PskKe, b"my-protocol/1")?;
-//! let conn = rustls_axon::ClientConnection::new(Arc::new(config), "base".try_into()?)?;
+//! let conn = axon_tls::rustls_axon::ClientConnection::new(Arc::new(config), "base".try_into()?)?;
 //!
 //! // what the server makes of it
 //! let identity = PskIdentity::parse(b"axon-qkd-v1:sae-robot:5fa1")?;
@@ -35,14 +35,26 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
-mod config;
 mod derive;
 mod identity;
 mod imported;
 #[cfg(test)]
 mod recorded;
 
-pub use config::{PskResolver, client_config, negotiated, server_config};
-pub use derive::{Psk, derive_psk};
-pub use identity::PskIdentity;
-pub use imported::{ImportedIdentity, import_psk};
+use std::sync::Arc;
+
+use rustls_axon::ClientConfig;
+
+pub use self::derive::derive_psk;
+pub use self::identity::PskIdentity;
+pub use self::imported::{ImportedIdentity, import_psk};
+pub use crate::psk::{Psk, PskResolver, negotiated, server_config};
+use crate::{Error, PskKex};
+
+/// A client's configuration for one connection on `psk`, with one ALPN protocol, or none if `alpn`
+/// is empty. The cipher is the one that the key was derived for.
+///
+/// [`psk::client_config()`](crate::psk::client_config) is the same for several keys.
+pub fn client_config(psk: Arc<Psk>, kex: PskKex, alpn: &[u8]) -> Result<ClientConfig, Error> {
+    crate::psk::client_config(vec![psk], kex, alpn)
+}

@@ -12,8 +12,8 @@ use rustls_axon::crypto::{CryptoProvider, GetRandomFailed, SecureRandom};
 use rustls_axon::{ClientConnection, ConnectionCommon, ServerConnection, SideData};
 use serde_json::Value;
 
-use super::config::{client_config_with, provider, server_config_with};
 use super::{Psk, PskResolver, derive_psk, negotiated};
+use crate::psk::config::{client_config_with, provider, server_config_with};
 use crate::{Cipher, KeyExchange, PskKex};
 
 mod record;
@@ -63,7 +63,7 @@ fn fixed(cipher: Cipher) -> CryptoProvider {
 }
 
 fn client(cipher: Cipher) -> ClientConnection {
-    let config = client_config_with(fixed(cipher), psk(cipher), PskKex::PskKe, b"").unwrap();
+    let config = client_config_with(fixed(cipher), vec![psk(cipher)], PskKex::PskKe, b"").unwrap();
     ClientConnection::new(Arc::new(config), "peer".try_into().unwrap()).unwrap()
 }
 

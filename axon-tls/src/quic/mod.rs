@@ -15,59 +15,126 @@
 //! | 115   | 0x173 | the server does not know the identity of the pre-shared key |
 //! | 120   | 0x178 | no common application protocol |
 
+#[cfg(feature = "hybrid")]
 mod hybrid;
 mod protection;
-mod qkd;
+mod psk;
 
 use std::any::Any;
 use std::sync::Arc;
 
+#[cfg(feature = "hybrid")]
 use crate::identity::Auth;
-use crate::qkd::{Psk, PskResolver};
+use crate::psk::{Psk, PskResolver};
 use crate::{Cipher, Error, Negotiated, PskKex};
 
 /// The application protocol of AXON.
 pub const ALPN: &[u8] = b"axon/1";
 
 /// A client in hybrid mode.
+#[cfg(feature = "hybrid")]
 pub fn hybrid_client(
     auth: &Auth,
     cipher: Cipher,
     alpn: &[u8],
 ) -> Result<quinn::ClientConfig, Error> {
-    check_alpn(alpn)?;
-    let tls = crate::hybrid::client_config(auth, cipher, alpn)?;
-    Ok(quinn::ClientConfig::new(Arc::new(hybrid::Client::new(tls))))
+    hybrid_client_with(crate::hybrid::client_config(auth, cipher, alpn)?)
 }
 
 /// A server in hybrid mode.
+#[cfg(feature = "hybrid")]
 pub fn hybrid_server(
     auth: &Auth,
     cipher: Cipher,
     alpn: &[u8],
 ) -> Result<quinn::ServerConfig, Error> {
-    check_alpn(alpn)?;
-    let tls = crate::hybrid::server_config(auth, cipher, alpn)?;
+    hybrid_server_with(crate::hybrid::server_config(auth, cipher, alpn)?)
+}
+
+/// A client in hybrid mode on a configuration of your own: one that checks a web server's certificate and
+/// shows none itself, say. Make it with [`hybrid::client_builder()`](crate::hybrid::client_builder).
+///
+/// Instead of quinn's `HandshakeData` the connection has [`negotiated()`].
+///
+/// # Errors
+/// [`Error::NotHybrid`] if the configuration has a group other than X25519MLKEM768 or a suite other than
+/// the two [`Cipher`]s, [`Error::EarlyData`] if it has early data, [`Error::Alpn`] if it has no ALPN
+/// protocol, which QUIC makes mandatory (RFC 9001 section 8.1).
+#[cfg(feature = "hybrid")]
+pub fn hybrid_client_with(tls: rustls::ClientConfig) -> Result<quinn::ClientConfig, Error> {
+    crate::hybrid::check(tls.crypto_provider(), tls.enable_early_data)?;
+    check_alpn(&tls.alpn_protocols)?;
+    Ok(quinn::ClientConfig::new(Arc::new(hybrid::Client::new(tls))))
+}
+
+/// A server in hybrid mode on a configuration of your own: one with a web certificate that asks clients
+/// for none, say. Make it with [`hybrid::server_builder()`](crate::hybrid::server_builder).
+///
+/// ```
+/// use axon_tls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
+/// use axon_tls::{hybrid, quic, quinn};
+///
+/// fn http3(
+///     chain: Vec<CertificateDer<'static>>,
+///     key: PrivateKeyDer<'static>,
+/// ) -> Result<quinn::ServerConfig, Box<dyn std::error::Error>> {
+///     let mut tls = hybrid::server_builder().with_no_client_auth().with_single_cert(chain, key)?;
+///     tls.alpn_protocols = vec![b"h3".to_vec()];
+///     Ok(quic::hybrid_server_with(tls)?)
+/// }
+/// ```
+///
+/// # Errors
+/// As [`hybrid_client_with()`].
+#[cfg(feature = "hybrid")]
+pub fn hybrid_server_with(tls: rustls::ServerConfig) -> Result<quinn::ServerConfig, Error> {
+    crate::hybrid::check(tls.crypto_provider(), tls.max_early_data_size != 0)?;
+    check_alpn(&tls.alpn_protocols)?;
     Ok(quinn::ServerConfig::with_crypto(Arc::new(hybrid::Server::new(tls))))
+}
+
+/// A client that offers `psks`, most preferred first. The cipher is the one that the keys are for.
+///
+/// # Errors
+/// As [`psk::client_config()`](crate::psk::client_config), and [`Error::Alpn`] if `alpn` is empty.
+pub fn psk_client(
+    psks: Vec<Arc<Psk>>,
+    kex: PskKex,
+    alpn: &[u8],
+) -> Result<quinn::ClientConfig, Error> {
+    let tls = crate::psk::client_config(psks, kex, alpn)?;
+    check_alpn(&tls.alpn_protocols)?;
+    Ok(quinn::ClientConfig::new(Arc::new(psk::Client::new(tls))))
+}
+
+/// A server on the pre-shared keys that `resolver` knows.
+///
+/// # Errors
+/// [`Error::Alpn`] if `alpn` is empty or too long.
+pub fn psk_server(
+    resolver: Arc<dyn PskResolver>,
+    cipher: Cipher,
+    kex: PskKex,
+    alpn: &[u8],
+) -> Result<quinn::ServerConfig, Error> {
+    let tls = crate::psk::server_config(resolver, cipher, kex, alpn)?;
+    check_alpn(&tls.alpn_protocols)?;
+    Ok(quinn::ServerConfig::with_crypto(Arc::new(psk::Server::new(tls))))
 }
 
 /// A client for one connection on `psk`. The cipher is the one that the key was derived for.
 pub fn qkd_client(psk: Arc<Psk>, kex: PskKex, alpn: &[u8]) -> Result<quinn::ClientConfig, Error> {
-    check_alpn(alpn)?;
-    let tls = crate::qkd::client_config(psk, kex, alpn)?;
-    Ok(quinn::ClientConfig::new(Arc::new(qkd::Client::new(tls))))
+    psk_client(vec![psk], kex, alpn)
 }
 
-/// A server on the pre-shared keys that `resolver` knows.
+/// A server on the pre-shared keys that `resolver` knows: the same as [`psk_server()`].
 pub fn qkd_server(
     resolver: Arc<dyn PskResolver>,
     cipher: Cipher,
     kex: PskKex,
     alpn: &[u8],
 ) -> Result<quinn::ServerConfig, Error> {
-    check_alpn(alpn)?;
-    let tls = crate::qkd::server_config(resolver, cipher, kex, alpn)?;
-    Ok(quinn::ServerConfig::with_crypto(Arc::new(qkd::Server::new(tls))))
+    psk_server(resolver, cipher, kex, alpn)
 }
 
 /// What the finished handshake of a connection from this module agreed on.
@@ -93,6 +160,10 @@ pub fn tls_alert(error: &quinn::ConnectionError) -> Option<u8> {
 }
 
 /// QUIC makes ALPN mandatory (RFC 9001 section 8.1).
-fn check_alpn(alpn: &[u8]) -> Result<(), Error> {
-    if alpn.is_empty() { Err(Error::Alpn) } else { Ok(()) }
+fn check_alpn(protocols: &[Vec<u8>]) -> Result<(), Error> {
+    let usable = |protocol: &Vec<u8>| (1..=255).contains(&protocol.len());
+    if protocols.is_empty() || !protocols.iter().all(usable) {
+        return Err(Error::Alpn);
+    }
+    Ok(())
 }

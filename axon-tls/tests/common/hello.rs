@@ -54,7 +54,7 @@ fn suite(cipher: Cipher) -> [u8; 2] {
 }
 
 pub(crate) struct ClientHello {
-    suites: Vec<u8>,
+    pub(crate) suites: Vec<u8>,
     order: Vec<u16>,
     pub(crate) extensions: BTreeMap<u16, Vec<u8>>,
 }

@@ -10,5 +10,5 @@ mod session;
 pub(super) use session::{Client, Server};
 
 fn negotiated(conn: &tls::CommonState) -> Option<crate::Negotiated> {
-    crate::qkd::negotiated(conn)
+    crate::psk::negotiated(conn)
 }

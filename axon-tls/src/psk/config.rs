@@ -1,5 +1,6 @@
 //! Configurations of rustls-axon for a pre-shared key, and what became of a connection.
 
+use std::collections::HashSet;
 use std::fmt::{self, Debug};
 use std::sync::Arc;
 
@@ -12,7 +13,7 @@ use rustls_axon::pki_types::ServerName;
 use rustls_axon::{ClientConfig, CommonState, NamedGroup, ServerConfig, SupportedCipherSuite};
 
 use super::Psk;
-use crate::hybrid::protocols;
+use crate::negotiated::protocols;
 use crate::{Cipher, Error, KeyExchange, Negotiated, PskKex};
 
 /// Where a server looks up pre-shared keys.
@@ -24,7 +25,8 @@ pub trait PskResolver: Debug + Send + Sync {
     /// The key with exactly this identity; `None` refuses the client with the alert
     /// `unknown_psk_identity`.
     ///
-    /// These are bytes from the network: see [`PskIdentity::parse()`](super::PskIdentity::parse).
+    /// These are bytes from the network. Those of a QKD key are for
+    /// [`PskIdentity::parse()`](crate::qkd::PskIdentity::parse).
     fn resolve(&self, identity: &[u8]) -> Option<Arc<Psk>>;
 
     /// The same without any effect: a resolver that begins to fetch a key it has not must not do so
@@ -38,24 +40,49 @@ pub trait PskResolver: Debug + Send + Sync {
     }
 }
 
-/// A client's configuration for one connection on `psk`, with one ALPN protocol, or none if `alpn`
-/// is empty. The cipher is the one that the key was derived for.
-pub fn client_config(psk: Arc<Psk>, kex: PskKex, alpn: &[u8]) -> Result<ClientConfig, Error> {
-    let provider = provider(psk.cipher(), kex);
-    client_config_with(provider, psk, kex, alpn)
+/// A client's configuration that offers `psks`, most preferred first, with one ALPN protocol, or none if
+/// `alpn` is empty. The cipher is the one that the keys are for.
+///
+/// No server name is sent. A server of this crate looks up the first eight identities.
+///
+/// # Errors
+/// [`Error::Psk`] if there is no key, if two have the same identity, if they are for different ciphers,
+/// or if their identities together do not fit into a ClientHello (about 60,000 bytes).
+pub fn client_config(psks: Vec<Arc<Psk>>, kex: PskKex, alpn: &[u8]) -> Result<ClientConfig, Error> {
+    let cipher = psks.first().ok_or(Error::Psk("there is none to offer"))?.cipher();
+    client_config_with(provider(cipher, kex), psks, kex, alpn)
 }
 
-pub(super) fn client_config_with(
+pub(crate) fn client_config_with(
     provider: CryptoProvider,
-    psk: Arc<Psk>,
+    psks: Vec<Arc<Psk>>,
     kex: PskKex,
     alpn: &[u8],
 ) -> Result<ClientConfig, Error> {
+    check_offer(&psks)?;
     let mut config = ClientConfig::builder_with_provider(Arc::new(provider))
-        .with_external_psk_source(Arc::new(OneKey(psk)), mode(kex))?;
+        .with_external_psk_source(Arc::new(Offer(psks)), mode(kex))?;
     config.alpn_protocols = protocols(alpn)?;
     config.enable_sni = false;
     Ok(config)
+}
+
+/// What would otherwise fail as late as a connection is made, and over quinn without a reason.
+fn check_offer(psks: &[Arc<Psk>]) -> Result<(), Error> {
+    let (mut identities, mut len) = (HashSet::new(), 0);
+    for psk in psks {
+        if psk.cipher() != psks[0].cipher() {
+            return Err(Error::Psk("the keys of one offer are for different ciphers"));
+        }
+        if !identities.insert(psk.identity()) {
+            return Err(Error::Psk("two keys have the same identity"));
+        }
+        len += psk.identity().len() + OFFER_OVERHEAD;
+    }
+    if len > MAX_OFFER {
+        return Err(Error::Psk("the identities are too long for a ClientHello"));
+    }
+    Ok(())
 }
 
 /// A server's configuration, with one ALPN protocol, or none if `alpn` is empty.
@@ -70,7 +97,7 @@ pub fn server_config(
     server_config_with(provider(cipher, kex), resolver, cipher, kex, alpn)
 }
 
-pub(super) fn server_config_with(
+pub(crate) fn server_config_with(
     provider: CryptoProvider,
     resolver: Arc<dyn PskResolver>,
     cipher: Cipher,
@@ -102,12 +129,13 @@ pub fn negotiated(conn: &CommonState) -> Option<Negotiated> {
         },
         cipher: Cipher::ALL.into_iter().find(|cipher| suite(*cipher).suite() == agreed)?,
         psk_identity: Some(psk.identity().to_vec()),
+        #[cfg(feature = "hybrid")]
         peer: None,
         alpn: conn.alpn_protocol().unwrap_or_default().to_vec(),
     })
 }
 
-pub(super) fn provider(cipher: Cipher, kex: PskKex) -> CryptoProvider {
+pub(crate) fn provider(cipher: Cipher, kex: PskKex) -> CryptoProvider {
     CryptoProvider {
         cipher_suites: vec![suite(cipher)],
         kx_groups: match kex {
@@ -132,18 +160,19 @@ fn mode(kex: PskKex) -> PskKeyExchangeMode {
     }
 }
 
-/// A client's one key. Once that is erased, connecting fails: there is nothing to offer.
-struct OneKey(Arc<Psk>);
+/// A client's keys. Once all are erased, connecting fails: there is nothing to offer.
+struct Offer(Vec<Arc<Psk>>);
 
-impl ExternalPskSource for OneKey {
+impl ExternalPskSource for Offer {
     fn external_psks(&self, _server_name: &ServerName<'_>) -> Vec<Arc<ExternalPsk>> {
-        self.0.external().into_iter().collect()
+        self.0.iter().filter_map(|psk| psk.external()).collect()
     }
 }
 
-impl Debug for OneKey {
+impl Debug for Offer {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_tuple("OneKey").field(&self.0.identity().escape_ascii().to_string()).finish()
+        let identities = self.0.iter().map(|psk| psk.identity().escape_ascii().to_string());
+        f.debug_list().entries(identities).finish()
     }
 }
 
@@ -180,3 +209,9 @@ impl Debug for FirstKnown {
 ///
 /// A ClientHello has room for more than a thousand, and every client can send one.
 const MAX_LOOKED_UP: usize = 8;
+
+/// What a ClientHello has room for beside its other extensions, of which the key share is the longest.
+const MAX_OFFER: usize = 60_000;
+
+/// A length and an obfuscated ticket age for each identity, and a binder with its length.
+const OFFER_OVERHEAD: usize = 2 + 4 + 1 + 48;
