@@ -16,6 +16,12 @@ pub(crate) fn erasing_stack_of_packet<T>(work: impl FnOnce() -> T) -> T {
     erasing::<PACKET_DEPTH, T>(work)
 }
 
+/// The same for a record of a byte stream, with what rustls does around the cipher.
+#[cfg(feature = "tokio")]
+pub(crate) fn erasing_stack_of_record<T>(work: impl FnOnce() -> T) -> T {
+    erasing::<RECORD_DEPTH, T>(work)
+}
+
 /// Calls `work`, and then overwrites `DEPTH` bytes of the stack that it used. The result must not
 /// hold a secret by value.
 pub fn erasing<const DEPTH: usize, T>(work: impl FnOnce() -> T) -> T {
@@ -40,3 +46,7 @@ const HANDSHAKE_DEPTH: usize = 96 * 1024;
 /// More than an AEAD takes.
 #[cfg(feature = "quic")]
 const PACKET_DEPTH: usize = 4 * 1024;
+
+/// More than rustls takes to protect a record, or to open one.
+#[cfg(feature = "tokio")]
+const RECORD_DEPTH: usize = 16 * 1024;

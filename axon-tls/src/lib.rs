@@ -18,6 +18,8 @@
 //!
 //! - `hybrid` (default): the modules `hybrid` and `identity`, on stock rustls, re-exported as `rustls`.
 //! - `quic`: both modes for [quinn](https://docs.rs/quinn), in the module `quic`, with `quinn` re-exported.
+//! - `tokio`: connections of rustls-axon over byte streams of tokio, in the module `stream`. Those of stock
+//!   rustls are what [tokio-rustls](https://docs.rs/tokio-rustls) is for.
 //!
 //! # Example
 //!
@@ -45,11 +47,15 @@ pub mod psk;
 pub mod qkd;
 #[cfg(feature = "quic")]
 pub mod quic;
+#[cfg(feature = "tokio")]
+pub mod stream;
 
 #[cfg(feature = "quic")]
 pub use quinn;
 #[cfg(feature = "hybrid")]
 pub use rustls;
+#[cfg(feature = "tokio")]
+pub use tokio;
 pub use {rustls_axon, zeroize};
 
 // For AXON's own crates; not part of the interface.

@@ -1,0 +1,30 @@
+//! What the features of axon-tls bring along.
+
+use std::path::Path;
+use std::process::Command;
+
+/// The packages that axon-tls is compiled with, each as `name vVERSION`.
+fn dependencies(features: &str) -> Vec<String> {
+    let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+    let mut tree = Command::new(env!("CARGO"));
+    tree.args(["tree", "--package", "axon-tls", "--edges", "normal", "--prefix", "none"]);
+    tree.args(["--offline", "--no-default-features", "--features", features]);
+    let output = tree.current_dir(workspace).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8_lossy(&output.stdout).lines().map(str::to_owned).collect()
+}
+
+#[test]
+fn each_feature_of_axon_tls_brings_what_it_needs_alone() {
+    let has = |features, name: &str| {
+        dependencies(features).iter().any(|line| line.starts_with(&format!("{name} v")))
+    };
+    for features in ["", "quic", "tokio", "quic,tokio"] {
+        assert!(has(features, "rustls-axon"), "{features}");
+        assert!(!has(features, "rustls"), "{features}: stock rustls is for `hybrid` alone");
+    }
+    assert!(has("hybrid", "rustls"));
+    for (name, feature) in [("quinn", "quic"), ("tokio", "tokio")] {
+        assert!(!has("hybrid", name) && has(feature, name), "{name}");
+    }
+}
