@@ -64,6 +64,6 @@ pub use erase::erasing;
 pub use error::{CaPart, Error};
 pub use negotiated::{Cipher, KeyExchange, Negotiated, PskKex, UnknownName};
 
-#[cfg(all(doctest, feature = "hybrid"))]
+#[cfg(all(doctest, feature = "hybrid", feature = "quic", feature = "tokio"))]
 #[doc = include_str!("../README.md")]
 struct Readme;
