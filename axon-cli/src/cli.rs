@@ -66,8 +66,6 @@ pub(crate) enum Command {
     #[command(hide = true)]
     BenchSessionAnswer,
     #[command(hide = true)]
-    BenchSessionRead,
-    #[command(hide = true)]
     BenchNetAnswer,
     #[command(hide = true)]
     BenchNetRead,
@@ -262,7 +260,8 @@ pub(crate) enum Bench {
 const BENCH_NET_HELP: &str = "\
 Two hosts with a daemon each, on this machine's loopback: latency, and streams of a publisher that
 waits for a slow reader (KEEP_ALL) and of one that overtakes it (KEEP_LAST), each beside a stream of
-bare quinn in the same run, with the processor time that a message costs. With X25519MLKEM768
+bare quinn in the same run (written and read 64 KiB at a time, where messages follow each other), with
+the processor time of a message in all processes. With X25519MLKEM768
 (classic) and with keys of two KMEs that are simulated. The rest of the machine should be idle.
 About three minutes; --quick takes seconds and is only to see it run. Writes net.json.
 
@@ -291,9 +290,9 @@ pub(crate) struct BenchNet {
 const BENCH_SESSION_HELP: &str = "\
 Latency of a publisher and a subscription, and of a service, in the sessions of two processes with a
 daemon of their own, beside bare shared memory in the same run: with a receiver that polls and one
-that waits on a wait set. Then the throughput of the same, and what a publish costs by the number of
-subscriptions. The rest of the machine should be idle. Under a minute; --quick takes seconds and is
-only to see it run. Writes session.json, with all percentiles.
+that waits on a wait set. Then the throughput of the same, and with each figure the processor time of a
+message. The rest of the machine should be idle. Under a minute; --quick takes seconds and is only to
+see it run. Writes session.json, with all percentiles.
 
 Examples:
   axon bench session
@@ -315,11 +314,12 @@ pub(crate) struct BenchSession {
 }
 
 const BENCH_SHM_HELP: &str = "\
-Latency (p50, p99, p99.9) with a receiver that polls and one that sleeps, throughput, and what a
-publish costs by the number of readers, each as a ratio to the raw limit in the same run: a spin on
-a shared atomic, epoll and eventfd, one memcpy, two. Two processes, each on a CPU of its own, take
-turns with both; so the rest of the machine should be idle. About two minutes; --quick takes
-seconds and is only to see it run. Writes shm.json, with all percentiles, and shm.svg.
+Latency (p50, p99, p99.9) with a receiver that polls, one that looks for 50 us before it sleeps, and
+one that sleeps between messages that come at 100 Hz and 1 kHz; throughput; and a publish to 1 to 16
+processes that sleep and read every byte. Each stands beside the raw limit of the same run (a spin on a
+shared atomic, epoll and eventfd, a futex, one memcpy, two), with the processor time of a message in all
+processes. The rest of the machine should be idle. About five minutes; --quick takes seconds and is only
+to see it run. Writes shm.json, with all percentiles, and shm.svg.
 
 Examples:
   axon bench shm

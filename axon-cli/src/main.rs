@@ -46,7 +46,6 @@ fn main() -> ExitCode {
         Command::BenchAnswer => bench::answer().map(done),
         Command::BenchRead => bench::read().map(done),
         Command::BenchSessionAnswer => bench::session::answer().map(done),
-        Command::BenchSessionRead => bench::session::read().map(done),
         Command::BenchNetAnswer => bench::net::answer().map(done),
         Command::BenchNetRead => bench::net::read().map(done),
         Command::DemoPlayer(args) => demo::run_player(args).map(done),

@@ -7,8 +7,13 @@ const INLINE: usize = 96;
 /// From here on a copy is judged by its bytes alone.
 const BYTES_ALONE: usize = 16 << 10;
 
-/// A publish to sixteen reader processes, by one to a single one.
+/// A publish to sixteen reader processes, wake-ups aside, by one to a single one.
 pub(super) const SIXTEEN_READERS: f64 = 1.3;
+
+/// Of the messages a second of bare quinn, at least.
+pub(super) const OF_QUINN: f64 = 0.85;
+/// The processor time of a message, by that of bare quinn.
+pub(super) const CPU_BY_QUINN: f64 = 1.25;
 
 /// How many times the latency of the raw limit is allowed.
 pub(super) fn latency(load: &Load) -> Option<f64> {
@@ -17,6 +22,7 @@ pub(super) fn latency(load: &Load) -> Option<f64> {
         (Wake::Poll, Motion::Copy) if load.size >= BYTES_ALONE => Some(1.05),
         (Wake::Poll, Motion::Touch) => Some(2.5),
         (Wake::Event | Wake::EventOneCpu, Motion::Touch) => Some(1.1),
+        _ if load.pace.is_some() => Some(1.1),
         _ => None,
     }
 }
@@ -44,6 +50,9 @@ mod tests {
             assert_eq!(of(size, Wake::EventOneCpu, Motion::Touch), Some(1.1));
             assert_eq!(of(size, Wake::Poll, Motion::Fill), None);
         }
+        let paced = Load::paced(64, Motion::Copy, std::time::Duration::from_millis(1));
+        assert_eq!(latency(&paced), Some(1.1));
+        assert_eq!(of(64, Wake::Event, Motion::Copy), None);
         assert_eq!((verdict(1.3, 1.3), verdict(1.31, 1.3)), ("met", "not met"));
     }
 }

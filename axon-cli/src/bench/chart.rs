@@ -3,7 +3,7 @@
 use super::{
     Compared, KINDS, Results, STREAMS,
     harness::{Chart, Line, Rounds, page, words},
-    readers::READERS,
+    readers::{Cost, Until},
 };
 use crate::text;
 
@@ -31,18 +31,28 @@ pub(super) fn svg(results: &Results) -> String {
             upwards: |rate| text::grouped(rate as u64),
         });
     }
-    let by_readers = |cost: &super::Cost| Line {
-        name: words::size(cost.size),
-        points: READERS
+    let sizes: Vec<usize> = results.publish.iter().map(|cost| cost.size).collect();
+    let by_readers = |size: usize, name: &str, of: fn(&Cost) -> &Rounds| Line {
+        name: format!("{}, {name}", words::size(size)),
+        points: results
+            .publish
             .iter()
-            .zip(&cost.by_readers)
-            .map(|(readers, rounds)| (*readers as f64, rounds.best().p50()))
+            .filter(|cost| cost.size == size && cost.until == Until::Woken)
+            .map(|cost| (cost.readers as f64, of(cost).all().p50()))
             .collect(),
     };
+    // The smallest and the largest: as many lines as there are colours.
+    let ends = sizes.first().into_iter().chain(sizes.last());
     charts.push(Chart {
-        title: "A publish, by reader processes".to_owned(),
-        // As many as there are colours.
-        lines: results.publish.iter().take(5).map(by_readers).collect(),
+        title: "A publish, by processes that sleep and read it".to_owned(),
+        lines: ends
+            .flat_map(|size| {
+                [
+                    by_readers(*size, "raw", |cost| &cost.raw.call),
+                    by_readers(*size, "AXON", |cost| &cost.axon.call),
+                ]
+            })
+            .collect(),
         across: |readers| format!("{readers}"),
         upwards: time,
     });

@@ -13,10 +13,13 @@ pub(crate) mod session;
 use std::{
     fs,
     io::{self, Write},
+    time::Duration,
 };
 
 use self::{
-    harness::{Axon, Load, Medium, Motion, Pair, Progress, Raw, Rounds, SIZES, Wake, words},
+    harness::{
+        Axon, Load, Medium, Motion, Pair, Progress, Raw, Rounds, SIZES, Sleeps, Wake, words,
+    },
     readers::{Cost, Crowd},
     run::Run,
 };
@@ -37,8 +40,15 @@ const KINDS: [(Wake, Motion); 6] = [
 /// The kinds of streams.
 const STREAMS: [Motion; 3] = [Motion::Copy, Motion::Fill, Motion::Touch];
 
-/// The raw limit first.
-const MEDIA: [&dyn Medium; 2] = [&Raw, &Axon];
+/// Sizes of messages that have a pace, and of those that many processes read, unless others are asked for.
+const FEW_SIZES: [usize; 2] = [64, 64 << 10];
+const READ_SIZES: [usize; 4] = [64, 4 << 10, 64 << 10, 1 << 20];
+/// From message to message: 100 Hz and 1 kHz.
+const PACES: [Duration; 2] = [Duration::from_millis(10), Duration::from_millis(1)];
+
+/// The raw limits first: of each load one, and of those that have a pace two.
+const MEDIA: [&dyn Medium; 4] =
+    [&Raw(Sleeps::Epoll), &Raw(Sleeps::SpinEpoll), &Raw(Sleeps::Futex), &Axon];
 
 const ANSWERING: &str = "bench-answer";
 const READING: &str = "bench-read";
@@ -50,11 +60,21 @@ struct Compared {
     axon: Rounds,
 }
 
+/// A load with a pace, and what two raw limits and AXON made of it.
+struct Paced {
+    load: Load,
+    epoll: Rounds,
+    futex: Rounds,
+    axon: Rounds,
+}
+
 /// All that was measured.
 struct Results {
     run: Run,
     /// By kind, then by size.
     latency: Vec<Compared>,
+    /// By pace, then by size.
+    paced: Vec<Paced>,
     streams: Vec<Compared>,
     publish: Vec<Cost>,
 }
@@ -66,7 +86,9 @@ pub(crate) fn shm(args: &cli::BenchShm) -> Result<(), Failure> {
         ([], true) => &QUICK_SIZES[..],
         (sizes, _) => sizes,
     };
-    let results = measure(sizes, args.quick).map_err(Failure::failed)?;
+    let few = |few: &'static [usize]| if args.sizes.is_empty() { few } else { sizes };
+    let results = measure(sizes, few(&FEW_SIZES), few(&READ_SIZES), args.quick);
+    let results = results.map_err(Failure::failed)?;
     fs::create_dir_all(&args.out)?;
     let file = |name: &str| args.out.join(name);
     fs::write(file("shm.json"), report::json(&results))?;
@@ -87,10 +109,17 @@ pub(crate) fn read() -> Result<(), Failure> {
     readers::attend().map_err(Failure::failed)
 }
 
-fn measure(sizes: &[usize], quick: bool) -> harness::Result<Results> {
+fn measure(
+    sizes: &[usize],
+    paced_sizes: &[usize],
+    read_sizes: &[usize],
+    quick: bool,
+) -> harness::Result<Results> {
     let run = Run::start(quick)?;
-    let progress = Progress::new(sizes.len() * (KINDS.len() + STREAMS.len() + 1));
-    let (mut latency, mut streams, mut publish) = (Vec::new(), Vec::new(), Vec::new());
+    let loads = sizes.len() * (KINDS.len() + STREAMS.len());
+    let progress = Progress::new(loads + paced_sizes.len() * PACES.len() + read_sizes.len());
+    let (mut latency, mut paced) = (Vec::new(), Vec::new());
+    let (mut streams, mut publish) = (Vec::new(), Vec::new());
 
     let pair = Pair::start(&MEDIA, run.effort, &run.machine, &[ANSWERING])?;
     for (wake, motion) in KINDS {
@@ -98,6 +127,16 @@ fn measure(sizes: &[usize], quick: bool) -> harness::Result<Results> {
         for size in sizes {
             let load = Load::ping_pong(*size, wake, motion);
             latency.push(compared(load, pair.latency(&load)?)?);
+            progress.advance();
+        }
+    }
+    for pace in PACES {
+        progress.step(&format!("latency at {}", words::pace(pace)));
+        for size in paced_sizes {
+            let load = Load::paced(*size, Motion::Copy, pace);
+            let rounds = pair.paced(&load)?.try_into();
+            let [epoll, futex, axon] = rounds.map_err(|_| "another number of media")?;
+            paced.push(Paced { load, epoll, futex, axon });
             progress.advance();
         }
     }
@@ -112,12 +151,13 @@ fn measure(sizes: &[usize], quick: bool) -> harness::Result<Results> {
     drop(pair);
 
     progress.step("a publish by its readers");
-    let crowd = Crowd::start(&[READING])?;
-    for size in sizes {
-        publish.push(crowd.measure(*size, run.effort)?);
+    let crowd = Crowd::start(&run.machine, &[READING])?;
+    for size in read_sizes {
+        publish.extend(crowd.measure(*size, run.effort)?);
         progress.advance();
     }
-    Ok(Results { run, latency, streams, publish })
+    drop(crowd);
+    Ok(Results { run, latency, paced, streams, publish })
 }
 
 fn compared(load: Load, rounds: Vec<Rounds>) -> harness::Result<Compared> {

@@ -7,6 +7,7 @@ use std::{
 };
 
 use rustix::{
+    event::{PollFd, PollFlags, Timespec, poll},
     io::Errno,
     net::{
         AddressFamily, RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, SendAncillaryBuffer,
@@ -56,6 +57,12 @@ impl Channel {
     /// Awaits a packet.
     pub(crate) fn hear<T: DeserializeOwned>(&self) -> Result<T> {
         self.take_over().map(|(packet, _)| packet)
+    }
+
+    /// Whether a packet is here, or the other process has ended.
+    pub(crate) fn is_readable(&self) -> Result<bool> {
+        let mut fds = [PollFd::new(&self.0, PollFlags::IN)];
+        Ok(poll(&mut fds, Some(&Timespec::default()))? > 0)
     }
 
     /// Awaits a packet and what descriptors it carries.

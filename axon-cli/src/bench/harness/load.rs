@@ -1,5 +1,7 @@
 //! What is sent, and by what.
 
+use std::time::Duration;
+
 use serde::{Deserialize, Serialize};
 
 use super::{Channel, Result};
@@ -45,17 +47,24 @@ pub(crate) struct Load {
     pub(crate) motion: Motion,
     /// How many messages may be under way.
     pub(crate) window: usize,
+    /// From message to message; none where the next one does not wait.
+    pub(crate) pace: Option<Duration>,
 }
 
 impl Load {
     /// One message at a time.
     pub(crate) fn ping_pong(size: usize, wake: Wake, motion: Motion) -> Self {
-        Self { size, wake, motion, window: 1 }
+        Self { size, wake, motion, window: 1, pace: None }
+    }
+
+    /// A message every `pace`, to a receiver that sleeps in between.
+    pub(crate) fn paced(size: usize, motion: Motion, pace: Duration) -> Self {
+        Self { pace: Some(pace), ..Self::ping_pong(size, Wake::Event, motion) }
     }
 
     /// As many as 16 MiB hold, from 4 to 64.
     pub(crate) fn stream(size: usize, wake: Wake, motion: Motion) -> Self {
-        Self { size, wake, motion, window: ((16 << 20) / size).clamp(4, 64) }
+        Self { size, wake, motion, window: ((16 << 20) / size).clamp(4, 64), pace: None }
     }
 
     /// Whether more than one message may be under way.
@@ -83,6 +92,14 @@ pub(crate) trait Medium {
         true
     }
 
+    /// Process ids of the daemons that carry its messages: their processor time counts.
+    ///
+    /// # Errors
+    /// A daemon does not say its own.
+    fn daemons(&self) -> Result<Vec<u32>> {
+        Ok(Vec::new())
+    }
+
     /// This side's end for `load`. The other side opens its own at the same time, and both may
     /// talk over `channel` until both are done.
     fn open(&self, load: &Load, side: Side, channel: &Channel) -> Result<Box<dyn End>>;
@@ -95,6 +112,11 @@ pub(crate) trait End {
 
     /// Awaits the next message and returns its stamp.
     fn receive(&mut self) -> Result<u64>;
+
+    /// Runs what has to run in this thread for what was sent to arrive, until `channel` can be read.
+    fn idle(&mut self, _channel: &Channel) -> Result<()> {
+        Ok(())
+    }
 }
 
 /// Writes `number` to the first and the last eight bytes.

@@ -62,6 +62,18 @@ impl Machine {
         unpin(&self.allowed)
     }
 
+    /// Keeps this thread on the CPU of the process that measures.
+    pub(crate) fn near(&self) -> Result<()> {
+        pin(self.pinned[0])
+    }
+
+    /// Keeps this thread, and the processes that it starts from now on, off that CPU.
+    pub(crate) fn beside(&self) -> Result<()> {
+        let near = self.pinned[0];
+        let others: Vec<usize> = self.allowed.iter().copied().filter(|cpu| *cpu != near).collect();
+        unpin(&others)
+    }
+
     /// One line for people.
     pub(crate) fn line(&self) -> String {
         format!(

@@ -18,15 +18,29 @@ pub(crate) struct Effort {
     pub(crate) turn: Duration,
     /// Messages of a turn at least, and at most.
     pub(crate) messages: [u64; 2],
+    /// Turns of each medium where messages have a pace.
+    pub(crate) paced_rounds: usize,
+    /// Messages of such a turn.
+    pub(crate) paced_messages: u64,
 }
 
 impl Effort {
     /// For figures.
-    pub(crate) const FULL: Self =
-        Self { rounds: 21, turn: Duration::from_millis(10), messages: [3, 50_000] };
+    pub(crate) const FULL: Self = Self {
+        rounds: 21,
+        turn: Duration::from_millis(10),
+        messages: [3, 50_000],
+        paced_rounds: 5,
+        paced_messages: 100,
+    };
     /// To see it run.
-    pub(crate) const QUICK: Self =
-        Self { rounds: 3, turn: Duration::from_millis(1), messages: [4, 1_000] };
+    pub(crate) const QUICK: Self = Self {
+        rounds: 3,
+        turn: Duration::from_millis(1),
+        messages: [4, 1_000],
+        paced_rounds: 3,
+        paced_messages: 4,
+    };
 
     /// How many messages fill a turn when `messages` took `elapsed`.
     pub(crate) fn count(&self, messages: u64, elapsed: Duration) -> u64 {
@@ -92,13 +106,22 @@ pub(crate) struct Rounds {
     turns: Vec<Summary>,
     /// The times of all turns.
     times: Vec<f64>,
+    /// Processor time of a message, by turns, in nanoseconds.
+    cpu: Vec<f64>,
 }
 
 impl Rounds {
-    /// Adds a turn's times.
-    pub(crate) fn add(&mut self, mut times: Vec<f64>) {
+    /// Adds a turn's times, and the nanoseconds of processor time that a message took in all
+    /// processes.
+    pub(crate) fn add(&mut self, mut times: Vec<f64>, cpu: f64) {
         self.turns.push(summarize(&mut times));
         self.times.append(&mut times);
+        self.cpu.push(cpu);
+    }
+
+    /// Nanoseconds of processor time of a message, in all processes: the median of the turns.
+    pub(crate) fn cpu(&self) -> f64 {
+        median(self.cpu.clone())
     }
 
     /// All times together, whatever disturbed the machine meanwhile among them.
@@ -123,6 +146,7 @@ impl Rounds {
             "best_round": self.best().json(),
             "all_rounds": self.all().json(),
             "median_of_p50_ns": tenths(self.typical()),
+            "cpu_ns_a_message": tenths(self.cpu()),
             "rounds": self.turns.len(),
         })
     }
@@ -182,7 +206,10 @@ mod tests {
     fn a_ratio_of_the_best_turns_and_the_median_of_the_rounds() {
         let rounds = |turns: [&[f64]; 3]| {
             let mut rounds = Rounds::default();
-            turns.iter().for_each(|times| rounds.add(times.to_vec()));
+            turns
+                .iter()
+                .zip([3.0, 1.0, 2.0])
+                .for_each(|(times, cpu)| rounds.add(times.to_vec(), cpu));
             rounds
         };
         let own = rounds([&[20.0], &[90.0], &[30.0]]);
@@ -190,12 +217,12 @@ mod tests {
         assert_eq!((own.all().count, own.all().mean), (3, 140.0 / 3.0));
         let ratio = own.to(&limit);
         assert_eq!((ratio.best, ratio.median), (4.0, 6.0));
-        assert_eq!((own.best().p50(), own.typical()), (20.0, 30.0));
+        assert_eq!((own.best().p50(), own.typical(), own.cpu()), (20.0, 30.0, 2.0));
     }
 
     #[test]
     fn a_turn_has_as_many_messages_as_fill_it_within_bounds() {
-        let effort = Effort { rounds: 1, turn: Duration::from_millis(10), messages: [8, 50_000] };
+        let effort = Effort { messages: [8, 50_000], ..Effort::FULL };
         assert_eq!(effort.count(10, Duration::from_micros(100)), 1_000);
         assert_eq!(effort.count(1, Duration::from_secs(1)), 8);
         assert_eq!(effort.count(1_000, Duration::ZERO), 50_000);

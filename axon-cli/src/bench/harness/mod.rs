@@ -2,18 +2,21 @@
 //! in turns with it, so that whatever disturbs the machine hits all of them.
 //!
 //! A [`Medium`] is such a way, an [`End`] what one of the two processes holds of it. [`Pair`] is
-//! the two processes. The comparison with other middlewares (`bench-peers/`) includes this folder
+//! the process that measures, [`serve`](serve()) the one that answers. The comparison with other middlewares (`bench-peers/`) includes this folder
 //! and adds its media.
 
 mod axon;
 mod channel;
 mod chart;
+pub(crate) mod cpu;
 mod load;
 mod machine;
 mod measure;
+mod other;
 mod pair;
 mod progress;
 mod raw;
+mod serve;
 pub(crate) mod words;
 
 pub(crate) use axon::{Axon, qos};
@@ -22,9 +25,11 @@ pub(crate) use chart::{Chart, Line, page};
 pub(crate) use load::{End, Load, Medium, Motion, Side, Wake, agree, stamp};
 pub(crate) use machine::Machine;
 pub(crate) use measure::{Effort, Ratio, Rounds, clock_cost};
-pub(crate) use pair::{Other, Pair, serve, spawn};
+pub(crate) use other::{Other, spawn};
+pub(crate) use pair::Pair;
 pub(crate) use progress::Progress;
-pub(crate) use raw::{Raw, Shared};
+pub(crate) use raw::{Raw, Shared, Sleeps};
+pub(crate) use serve::{now_ns, serve};
 
 /// Whatever stops a measurement.
 pub(crate) type Error = Box<dyn std::error::Error + Send + Sync>;

@@ -1,5 +1,7 @@
 //! What loads are called.
 
+use std::time::Duration;
+
 use super::{Load, Motion, Wake};
 use crate::text;
 
@@ -7,7 +9,7 @@ use crate::text;
 pub(crate) fn kind(wake: Wake, how: Motion) -> String {
     let wake = match wake {
         Wake::Poll => "polling",
-        Wake::Event => "event-driven",
+        Wake::Event => "event-driven, one message after the other",
         Wake::EventOneCpu => "event-driven on one CPU",
     };
     format!("{wake}, {}", motion(how))
@@ -26,7 +28,8 @@ pub(crate) fn motion(motion: Motion) -> &'static str {
 pub(crate) fn limit(wake: Wake, motion: Motion) -> String {
     let wake = match wake {
         Wake::Poll => "a spin on a shared atomic",
-        Wake::Event | Wake::EventOneCpu => "epoll and eventfd",
+        Wake::Event => "a spin of 50 us, then epoll and eventfd",
+        Wake::EventOneCpu => "epoll and eventfd",
     };
     match motion {
         Motion::Touch => wake.to_owned(),
@@ -52,6 +55,14 @@ pub(crate) fn throughput(load: &Load, rate: f64) -> String {
     }
 }
 
+/// How often messages come.
+pub(crate) fn pace(pace: Duration) -> String {
+    match 1e9 / pace.as_nanos() as f64 {
+        hz if hz >= 1000.0 => format!("{} kHz", hz / 1000.0),
+        hz => format!("{hz} Hz"),
+    }
+}
+
 /// A time.
 pub(crate) fn nanoseconds(ns: f64) -> String {
     text::duration(ns.max(0.0).round() as u64)
@@ -62,8 +73,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sizes_read_well() {
+    fn sizes_and_paces_read_well() {
         let sizes = [8, 1 << 10, 64 << 10, 1 << 20, 25_000_000, 100_000].map(size);
+        assert_eq!([10, 1].map(|ms| pace(Duration::from_millis(ms))), ["100 Hz", "1 kHz"]);
         assert_eq!(sizes, ["8 B", "1 KiB", "64 KiB", "1 MiB", "25 MB", "100 kB"]);
     }
 }

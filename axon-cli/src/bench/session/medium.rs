@@ -11,7 +11,7 @@ use axon_transport::{
     session::{Client, EndpointSpec, Publisher, Server, Session, Subscription, Waitable},
 };
 
-use super::place::{PATIENCE, Settings, session};
+use super::place::{PATIENCE, Settings, daemon_pid, session};
 use crate::bench::harness::{
     Channel, End, Error, Load, Medium, Motion, Result, Side, agree, qos, stamp,
 };
@@ -50,6 +50,18 @@ fn meet(hosts: &Hosts, side: Side, channel: &Channel) -> Result<(Session, String
     Ok((session(&settings)?, name))
 }
 
+/// The daemons of both hosts, or the one of both.
+fn daemons(hosts: &Hosts) -> Result<Vec<u32>> {
+    let mut pids = Vec::new();
+    for settings in hosts.iter().flatten() {
+        let pid = daemon_pid(settings)?;
+        if !pids.contains(&pid) {
+            pids.push(pid);
+        }
+    }
+    Ok(pids)
+}
+
 fn spec(name: &str, qos: Qos) -> EndpointSpec {
     EndpointSpec::new(name, "bench/Bytes", qos)
 }
@@ -57,6 +69,10 @@ fn spec(name: &str, qos: Qos) -> EndpointSpec {
 impl Medium for Sessions {
     fn name(&self) -> &'static str {
         "session"
+    }
+
+    fn daemons(&self) -> Result<Vec<u32>> {
+        daemons(&self.0)
     }
 
     fn open(&self, load: &Load, side: Side, channel: &Channel) -> Result<Box<dyn End>> {
@@ -140,6 +156,10 @@ impl Medium for Service {
 
     fn carries(&self, load: &Load) -> bool {
         load.motion == Motion::Copy && !load.is_stream()
+    }
+
+    fn daemons(&self) -> Result<Vec<u32>> {
+        daemons(&self.0)
     }
 
     fn open(&self, load: &Load, side: Side, channel: &Channel) -> Result<Box<dyn End>> {

@@ -2,7 +2,6 @@
 
 pub(super) mod medium;
 pub(super) mod place;
-mod readers;
 mod report;
 
 use std::{
@@ -13,7 +12,6 @@ use std::{
 use self::{
     medium::{Service, Sessions},
     place::Place,
-    readers::{Cost, Crowd},
 };
 use super::{
     harness::{self, Axon, Load, Medium, Motion, Pair, Progress, Rounds, Wake, words},
@@ -36,7 +34,6 @@ const BUDGET: f64 = 1.3;
 const SERVICE_BUDGET: f64 = 2.5;
 
 const ANSWERING: &str = "bench-session-answer";
-const READING: &str = "bench-session-read";
 
 /// A load, and what each of those made of it that carry it: times are one way, half a round trip, or
 /// from message to message.
@@ -51,7 +48,6 @@ struct Results {
     run: Run,
     latency: Vec<Compared>,
     streams: Vec<Compared>,
-    publish: Vec<Cost>,
 }
 
 /// Runs `axon bench session`.
@@ -75,11 +71,6 @@ pub(crate) fn answer() -> Result<(), Failure> {
     harness::serve(&media(&Sessions(None), &Service(None))).map_err(Failure::failed)
 }
 
-/// Is one of the readers.
-pub(crate) fn read() -> Result<(), Failure> {
-    readers::attend().map_err(Failure::failed)
-}
-
 /// Bare shared memory first.
 fn media<'a>(sessions: &'a Sessions, service: &'a Service) -> [&'a dyn Medium; 3] {
     [&Axon, sessions, service]
@@ -91,7 +82,7 @@ fn measure(sizes: &[usize], quick: bool) -> harness::Result<Results> {
     let hosts = Some([place.settings(), place.settings()]);
     let (sessions, service) = (Sessions(hosts.clone()), Service(hosts));
     let media = media(&sessions, &service);
-    let progress = Progress::new(sizes.len() * (2 * KINDS.len() + 1));
+    let progress = Progress::new(sizes.len() * 2 * KINDS.len());
     let pair = Pair::start(&media, run.effort, &run.machine, &[ANSWERING])?;
     let (mut latency, mut streams) = (Vec::new(), Vec::new());
     for (wake, motion) in KINDS {
@@ -110,15 +101,7 @@ fn measure(sizes: &[usize], quick: bool) -> harness::Result<Results> {
             progress.advance();
         }
     }
-    drop(pair);
-    progress.step("a publish by its subscriptions");
-    let crowd = Crowd::start(&[READING])?;
-    let mut publish = Vec::new();
-    for size in sizes {
-        publish.push(crowd.measure(&place.settings(), *size, run.effort)?);
-        progress.advance();
-    }
-    Ok(Results { run, latency, streams, publish })
+    Ok(Results { run, latency, streams })
 }
 
 fn compared(load: Load, rounds: Vec<Rounds>) -> harness::Result<Compared> {

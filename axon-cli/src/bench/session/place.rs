@@ -11,6 +11,7 @@ use axon_transport::{
     config::{Config, DaemonPolicy, OsFiles},
     session::{Session, SessionOptions, daemon_status},
 };
+use serde_json::Value;
 
 use crate::bench::harness::Result;
 
@@ -73,6 +74,12 @@ impl Drop for Place {
 /// A session with the daemon that has these settings.
 pub(in crate::bench) fn session(settings: &Settings) -> Result<Session> {
     Ok(Session::open(&config(settings)?, SessionOptions::new("bench"))?)
+}
+
+/// The process id of the daemon that has these settings.
+pub(in crate::bench) fn daemon_pid(settings: &Settings) -> Result<u32> {
+    let status: Value = serde_json::from_str(&daemon_status(&config(settings)?)?)?;
+    Ok(u32::try_from(status["pid"].as_u64().ok_or("a status without a pid")?)?)
 }
 
 /// With them a session finds its daemon.

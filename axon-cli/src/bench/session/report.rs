@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use serde_json::{Value, json};
 
-use super::{BUDGET, Compared, KINDS, Results, SERVICE_BUDGET, readers::READERS};
+use super::{BUDGET, Compared, KINDS, Results, SERVICE_BUDGET};
 use crate::{
     bench::{
         budgets::verdict,
@@ -18,7 +18,8 @@ const REPORTED: &str = "Bare shared memory, sessions and a service take turns. T
                         round in which it was least: one way (half a round trip), and for the \
                         service both ways. Ratios are of these. A service copies requests and \
                         responses, so that it is beside messages that are copied, too. Of a \
-                        stream as much is under way as 16 MiB hold, from 4 to 64 messages.";
+                        stream as much is under way as 16 MiB hold, from 4 to 64 messages. CPU is \
+                        the processor time of a message in both processes and their daemon.";
 
 /// A ratio, and what it may be.
 type Judged = (f64, f64);
@@ -49,16 +50,7 @@ pub(super) fn text(results: &Results) -> String {
             out += &table(rows.collect());
         }
     }
-    out += "\nA publish to 1, 4 and 16 subscriptions, each in a process of its own, which is idle.\n\n";
-    let mut table = Table::new(&[">size", ">1", ">4", ">16", ">16 to 1"]);
-    for cost in &results.publish {
-        let mut cells = vec![words::size(cost.size)];
-        cells.extend(cost.by_readers.iter().map(|rounds| words::nanoseconds(rounds.best().p50())));
-        let (one, most) = (&cost.by_readers[0], &cost.by_readers[READERS.len() - 1]);
-        cells.push(format!("{:.2}", most.to(one).best));
-        table.row(cells);
-    }
-    out + &table.render(0)
+    out
 }
 
 fn judged((ratio, budget): Judged) -> [String; 3] {
@@ -66,12 +58,21 @@ fn judged((ratio, budget): Judged) -> [String; 3] {
 }
 
 fn stream_table(rows: Vec<&Compared>) -> String {
-    let mut table =
-        Table::new(&[">size", ">bare messages/s", ">session", ">ratio of times", ">budget", ""]);
+    let mut table = Table::new(&[
+        ">size",
+        ">bare messages/s",
+        ">session",
+        ">CPU: bare",
+        ">session",
+        ">ratio of times",
+        ">budget",
+        "",
+    ]);
     for row in rows {
         let mut cells = vec![words::size(row.load.size)];
         let rate = |rounds: &Rounds| text::grouped((1e9 / rounds.best().p50()) as u64);
         cells.extend([&row.bare, &row.session].map(rate));
+        cells.extend([&row.bare, &row.session].map(|r| words::nanoseconds(r.cpu())));
         cells.extend(judged(session_to_bare(row)));
         table.row(cells);
     }
@@ -79,14 +80,17 @@ fn stream_table(rows: Vec<&Compared>) -> String {
 }
 
 fn latency_table(rows: Vec<&Compared>) -> String {
-    let mut header = vec![">size", ">bare", ">session", ">ratio", ">budget", ""];
+    let mut header =
+        vec![">size", ">bare", ">session", ">CPU: bare", ">session", ">ratio", ">budget", ""];
     if rows.iter().any(|row| row.service.is_some()) {
         header.extend([">service", ">by session", ">budget", ""]);
     }
     let mut table = Table::new(&header);
     for row in rows {
         let mut cells = vec![words::size(row.load.size)];
-        cells.extend([&row.bare, &row.session].map(|r| words::nanoseconds(r.best().p50())));
+        let both = [&row.bare, &row.session];
+        cells.extend(both.map(|r| words::nanoseconds(r.best().p50())));
+        cells.extend(both.map(|r| words::nanoseconds(r.cpu())));
         cells.extend(judged(session_to_bare(row)));
         if let Some(service) = &row.service {
             cells.push(words::nanoseconds(2.0 * service.best().p50()));
@@ -126,19 +130,6 @@ pub(super) fn json(results: &Results) -> String {
             "service_round_trip_to_session": service.map(|s| judged(service_to_session(row, s))),
         })
     });
-    let publish = results.publish.iter().map(|cost| {
-        let readers = READERS.iter().zip(&cost.by_readers);
-        json!({
-            "bytes": cost.size,
-            "subscriptions": readers
-                .map(|(count, rounds)| json!({ "count": count, "publish": rounds.json() }))
-                .collect::<Vec<_>>(),
-        })
-    });
-    let figures = [
-        ("latency", latency.collect()),
-        ("throughput", streams.collect()),
-        ("publish", publish.collect()),
-    ];
+    let figures = [("latency", latency.collect()), ("throughput", streams.collect())];
     results.run.document("session", REPORTED, figures)
 }

@@ -5,7 +5,7 @@ use std::{
     ffi::c_void,
     os::fd::{AsFd, OwnedFd},
     ptr::{self, NonNull},
-    sync::atomic::AtomicU64,
+    sync::atomic::{AtomicU32, AtomicU64},
 };
 
 use rustix::{
@@ -48,6 +48,16 @@ impl Shared {
         let word = unsafe { self.base.cast::<u8>().add(at) }.cast::<AtomicU64>();
         // SAFETY: it lives as long as the mapping, every bit pattern is a valid word, and that the
         // other process writes it too is what an atomic word is for.
+        unsafe { word.as_ref() }
+    }
+
+    /// The four bytes at byte `at`, a multiple of four: what a futex can be.
+    #[inline]
+    pub(crate) fn half(&self, at: usize) -> &AtomicU32 {
+        assert!(at.is_multiple_of(4) && at + 4 <= self.len);
+        // SAFETY: inside the mapping, which starts at a page, and aligned, as was just checked.
+        let word = unsafe { self.base.cast::<u8>().add(at) }.cast::<AtomicU32>();
+        // SAFETY: as in `word`.
         unsafe { word.as_ref() }
     }
 

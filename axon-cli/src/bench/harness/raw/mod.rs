@@ -1,21 +1,18 @@
 //! The limits: what the machine gives two processes without any middleware.
 
 mod memory;
+mod sleep;
 
 use std::{
     os::fd::{AsFd, OwnedFd},
     sync::atomic::Ordering,
 };
 
-use rustix::{
-    buffer::spare_capacity,
-    event::{EventfdFlags, epoll, eventfd},
-    io::{Errno, read, write},
-};
-
 pub(crate) use memory::Shared;
+pub(crate) use sleep::Sleeps;
+use sleep::{Asleep, Bell, sleep, wake};
 
-use super::{Channel, End, Load, Medium, Motion, Result, Side, agree, stamp};
+use super::{Channel, End, Load, Medium, Motion, Result, Side, Wake, agree, stamp};
 
 /// A message of up to this many bytes has room beside the word that announces it, so that its
 /// limit is the word alone.
@@ -24,13 +21,28 @@ const INLINE: usize = 96;
 const APART: usize = 256;
 const PAYLOADS: usize = 4096;
 
-/// A shared atomic that is spun on, or an eventfd and epoll; with as many plain copies as the load
-/// has. Messages of up to 96 bytes are not copied.
-pub(crate) struct Raw;
+/// From a direction's word to the word that says whether its receiver sleeps, on another line.
+const ASLEEP: usize = 128;
+
+/// A shared atomic that is spun on, or slept for in one of three ways; with as many plain copies as the
+/// load has. Messages of up to 96 bytes are not copied.
+///
+/// Where the receiver polls there is one for all, [`Sleeps::Epoll`]. Where messages follow each other at
+/// once AXON looks before it sleeps, so the limit that does so, too, is [`Sleeps::SpinEpoll`]; the other two
+/// are for messages that have a pace, and for two processes on one CPU, where looking is of no use.
+pub(crate) struct Raw(pub(crate) Sleeps);
 
 impl Medium for Raw {
     fn name(&self) -> &'static str {
-        "raw"
+        self.0.name()
+    }
+
+    fn carries(&self, load: &Load) -> bool {
+        match self.0 {
+            Sleeps::Epoll => load.wake != Wake::Event || load.pace.is_some(),
+            Sleeps::SpinEpoll => load.wake == Wake::Event && load.pace.is_none(),
+            Sleeps::Futex => load.pace.is_some(),
+        }
     }
 
     fn open(&self, load: &Load, side: Side, channel: &Channel) -> Result<Box<dyn End>> {
@@ -40,8 +52,7 @@ impl Medium for Raw {
         let (memory, bells) = match side {
             Side::Near => {
                 let (memory, fd) = Shared::create(len)?;
-                let bell = || eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK);
-                let bells = [bell()?, bell()?];
+                let bells = [Bell::cast()?, Bell::cast()?];
                 let fds = [fd.as_fd(), bells[1].as_fd(), bells[0].as_fd()];
                 channel.hand_over(&(), &fds)?;
                 (memory, bells)
@@ -71,8 +82,9 @@ impl Medium for Raw {
             slots: slots as u64,
             out: direction(out),
             into: direction(into),
+            how: load.wake.sleeps().then_some(self.0),
             bell: theirs,
-            sleep: Sleep::new(ours)?,
+            ours: Bell::listen(ours)?,
             bytes: vec![0x5a; load.size],
         }))
     }
@@ -87,9 +99,10 @@ struct RawEnd {
     slots: u64,
     out: Direction,
     into: Direction,
+    how: Option<Sleeps>,
     /// Wakes the other side.
     bell: OwnedFd,
-    sleep: Sleep,
+    ours: Bell,
     bytes: Vec<u8>,
 }
 
@@ -117,18 +130,20 @@ impl End for RawEnd {
         self.out.count += 1;
         // Pairs with the load in `receive`.
         self.memory.word(self.out.word).store(self.out.count, Ordering::Release);
-        if self.load.wake.sleeps() {
-            write(&self.bell, &1u64.to_ne_bytes())?;
+        if let Some(how) = self.how {
+            wake(how, &Asleep(self.memory.half(self.out.word + ASLEEP)), &self.bell)?;
         }
         Ok(())
     }
 
     fn receive(&mut self) -> Result<u64> {
         let next = self.into.count + 1;
-        if self.load.wake.sleeps() {
-            self.sleep.until_rung()?;
-        }
         let word = self.memory.word(self.into.word);
+        if let Some(how) = self.how {
+            let asleep = Asleep(self.memory.half(self.into.word + ASLEEP));
+            let ready = || word.load(Ordering::Acquire) >= next;
+            sleep(how, &asleep, &mut self.ours, ready)?;
+        }
         // Pairs with the store in `send`.
         while word.load(Ordering::Acquire) < next {}
         let at = self.at(&self.into);
@@ -148,40 +163,5 @@ impl End for RawEnd {
         };
         self.into.count = next;
         Ok(number)
-    }
-}
-
-/// An eventfd in an epoll set.
-struct Sleep {
-    bell: OwnedFd,
-    set: OwnedFd,
-    events: Vec<epoll::Event>,
-    /// Rings that came and have not been asked for.
-    rings: u64,
-}
-
-impl Sleep {
-    fn new(bell: OwnedFd) -> Result<Self> {
-        let set = epoll::create(epoll::CreateFlags::CLOEXEC)?;
-        epoll::add(&set, &bell, epoll::EventData::new_u64(0), epoll::EventFlags::IN)?;
-        Ok(Self { bell, set, events: Vec::with_capacity(1), rings: 0 })
-    }
-
-    fn until_rung(&mut self) -> Result<()> {
-        while self.rings == 0 {
-            self.events.clear();
-            match epoll::wait(&self.set, spare_capacity(&mut self.events), None) {
-                Ok(_) | Err(Errno::INTR) => {}
-                Err(errno) => return Err(errno.into()),
-            }
-            let mut counter = [0; 8];
-            match read(&self.bell, &mut counter) {
-                Ok(_) => self.rings = u64::from_ne_bytes(counter),
-                Err(Errno::AGAIN | Errno::INTR) => {}
-                Err(errno) => return Err(errno.into()),
-            }
-        }
-        self.rings -= 1;
-        Ok(())
     }
 }
