@@ -1,7 +1,8 @@
 //! The raw limit between two hosts: one stream of bare quinn, under AXON's key exchange and cipher and
-//! with its windows, and a length before each message.
+//! with its windows. Messages have a length before them; in a stream they are written 64 KiB at a time,
+//! and always read so.
 
-use std::{net::Ipv4Addr, sync::Arc};
+use std::{net::Ipv4Addr, sync::Arc, time::Duration};
 
 use axon_tls::{
     Cipher,
@@ -13,8 +14,11 @@ use tokio::runtime::Runtime;
 
 use crate::bench::harness::{Channel, End, Error, Load, Medium, Result, Side, agree, stamp};
 
-/// As many as a daemon has for its links.
-const WORKERS: usize = 2;
+/// Bytes of a write in a stream, and of a read.
+const BATCH: usize = 64 << 10;
+const HEADER: usize = 4;
+/// Between two looks at whether a turn is over.
+const LOOK: Duration = Duration::from_millis(1);
 const STREAM_WINDOW: u32 = 32 << 20;
 const SEND_WINDOW: u64 = 16 << 20;
 
@@ -27,10 +31,28 @@ impl Medium for BareQuic {
     }
 
     fn open(&self, load: &Load, side: Side, channel: &Channel) -> Result<Box<dyn End>> {
-        let runtime = tokio::runtime::Builder::new_multi_thread()
-            .worker_threads(WORKERS)
-            .enable_all()
-            .build()?;
+        Ok(Box::new(BareEnd::open(load, side, channel)?))
+    }
+}
+
+/// One end of the stream.
+pub(super) struct BareEnd {
+    out: SendStream,
+    into: RecvStream,
+    /// Queued and not handed to quinn yet.
+    unsent: Vec<u8>,
+    unread: Unread,
+    bytes: Vec<u8>,
+    _connection: Connection,
+    endpoint: Endpoint,
+    runtime: Runtime,
+}
+
+impl BareEnd {
+    /// Meets the other side.
+    pub(super) fn open(load: &Load, side: Side, channel: &Channel) -> Result<Self> {
+        // The thread that waits for a message runs quinn, too: nobody has to wake another thread.
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let (endpoint, connection, out, into) = match side {
             Side::Near => {
                 let key = Auth::None(SigningKey::generate()?);
@@ -64,8 +86,49 @@ impl Medium for BareQuic {
                 })?
             }
         };
-        let bytes = vec![0x5a; load.size];
-        Ok(Box::new(BareEnd { out, into, bytes, _connection: connection, endpoint, runtime }))
+        let mut end = Self {
+            out,
+            into,
+            unsent: Vec::with_capacity(BATCH + HEADER),
+            unread: Unread { buffer: vec![0; BATCH], taken: 0, filled: 0 },
+            bytes: vec![0x5a; load.size],
+            _connection: connection,
+            endpoint,
+            runtime,
+        };
+        // The far side's first byte goes once its thread runs quinn again.
+        match side {
+            Side::Near => channel.tell(&())?,
+            Side::Far => {
+                end.idle(channel)?;
+                channel.hear::<()>()?;
+            }
+        }
+        Ok(end)
+    }
+
+    /// Writes a message, which goes once 64 KiB are together.
+    pub(super) fn queue(&mut self, number: u64) -> Result<()> {
+        stamp(&mut self.bytes, number);
+        let length = u32::try_from(self.bytes.len())?.to_be_bytes();
+        self.unsent.extend_from_slice(&length);
+        if self.unsent.len() + self.bytes.len() <= BATCH {
+            self.unsent.extend_from_slice(&self.bytes);
+            return Ok(());
+        }
+        if self.bytes.len() < BATCH {
+            self.unsent.extend_from_slice(&self.bytes);
+            return self.flush();
+        }
+        // Nothing is gained by a copy of this one.
+        self.flush()?;
+        Ok(self.runtime.block_on(self.out.write_all(&self.bytes))?)
+    }
+
+    fn flush(&mut self) -> Result<()> {
+        self.runtime.block_on(self.out.write_all(&self.unsent))?;
+        self.unsent.clear();
+        Ok(())
     }
 }
 
@@ -84,36 +147,31 @@ fn transport() -> Arc<TransportConfig> {
     Arc::new(transport)
 }
 
-struct BareEnd {
-    out: SendStream,
-    into: RecvStream,
-    bytes: Vec<u8>,
-    _connection: Connection,
-    endpoint: Endpoint,
-    runtime: Runtime,
-}
-
 impl End for BareEnd {
     fn send(&mut self, number: u64) -> Result<()> {
-        stamp(&mut self.bytes, number);
-        let length = u32::try_from(self.bytes.len())?.to_be_bytes();
-        Ok(self.runtime.block_on(async {
-            self.out.write_all(&length).await?;
-            self.out.write_all(&self.bytes).await
-        })?)
+        self.queue(number)?;
+        self.flush()
     }
 
     fn receive(&mut self) -> Result<u64> {
-        let mut length = [0; 4];
-        self.runtime.block_on(async {
-            self.into.read_exact(&mut length).await?;
-            if u32::from_be_bytes(length) as usize != self.bytes.len() {
-                return Err("a message of another length".into());
-            }
-            Ok::<_, Error>(self.into.read_exact(&mut self.bytes).await?)
-        })?;
+        let mut length = [0; HEADER];
+        self.unread.take(&self.runtime, &mut self.into, &mut length)?;
+        if u32::from_be_bytes(length) as usize != self.bytes.len() {
+            return Err("a message of another length".into());
+        }
+        self.unread.take(&self.runtime, &mut self.into, &mut self.bytes)?;
         let [first, last] = [self.bytes.first_chunk(), self.bytes.last_chunk()];
         agree(*first.ok_or("too short")?, *last.ok_or("too short")?)
+    }
+
+    fn idle(&mut self, channel: &Channel) -> Result<()> {
+        // Not in the reactor: this is between turns, and the channel is one that blocks.
+        self.runtime.block_on(async {
+            while !channel.is_readable()? {
+                tokio::time::sleep(LOOK).await;
+            }
+            Ok(())
+        })
     }
 }
 
@@ -121,5 +179,34 @@ impl Drop for BareEnd {
     fn drop(&mut self) {
         self.endpoint.close(VarInt::from_u32(0), b"");
         self.runtime.block_on(self.endpoint.wait_idle());
+    }
+}
+
+/// What was read from the stream and not taken yet: the buffer's bytes from `taken` to `filled`.
+struct Unread {
+    buffer: Vec<u8>,
+    taken: usize,
+    filled: usize,
+}
+
+impl Unread {
+    /// Fills `into` with what comes next. Waits only where that is not here.
+    fn take(&mut self, runtime: &Runtime, stream: &mut RecvStream, into: &mut [u8]) -> Result<()> {
+        let mut done = 0;
+        loop {
+            let here = (self.filled - self.taken).min(into.len() - done);
+            let bytes = &self.buffer[self.taken..self.taken + here];
+            into[done..done + here].copy_from_slice(bytes);
+            self.taken += here;
+            done += here;
+            if done == into.len() {
+                return Ok(());
+            }
+            if into.len() - done >= BATCH {
+                return Ok(runtime.block_on(stream.read_exact(&mut into[done..]))?);
+            }
+            let read = runtime.block_on(stream.read(&mut self.buffer))?;
+            (self.taken, self.filled) = (0, read.ok_or("the stream has ended")?);
+        }
     }
 }

@@ -2,14 +2,12 @@
 
 use std::path::Path;
 
-use axon_transport::session::daemon_status;
-use serde_json::Value;
 use tokio::runtime::Runtime;
 
 use crate::{
     bench::{
         harness::Result,
-        session::place::{Settings, config},
+        session::place::{Settings, daemon_pid},
     },
     demo::{
         hosts::{Host, HostSpec},
@@ -58,12 +56,8 @@ impl<'a> Hosts<'a> {
 
     /// The process ids of the daemons.
     pub(super) fn pids(&self) -> Result<[u32; 2]> {
-        let mut pids = [0; 2];
-        for (pid, settings) in pids.iter_mut().zip(&self.settings) {
-            let status: Value = serde_json::from_str(&daemon_status(&config(settings)?)?)?;
-            *pid = u32::try_from(status["pid"].as_u64().ok_or("a status without a pid")?)?;
-        }
-        Ok(pids)
+        let [near, far] = &self.settings;
+        Ok([daemon_pid(near)?, daemon_pid(far)?])
     }
 }
 

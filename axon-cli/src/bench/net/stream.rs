@@ -1,17 +1,16 @@
 //! Streams: as fast as the publisher can, to a reader in another process.
 
-use std::{
-    fs,
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
 use axon_transport::{qos::Qos, session::EndpointSpec, shm::PublishError};
 use rustix::process::{Signal, set_parent_process_death_signal};
 use serde::{Deserialize, Serialize};
 
-use super::{bare::BareQuic, hosts::Hosts};
+use super::{bare::BareEnd, hosts::Hosts};
 use crate::bench::{
-    harness::{Channel, Load, Medium, Motion, Other, Result, Side, Wake, agree, spawn, stamp},
+    harness::{
+        Channel, End as _, Load, Motion, Other, Result, Side, Wake, agree, cpu, spawn, stamp,
+    },
     session::place::{PATIENCE, Settings, session},
 };
 
@@ -70,11 +69,15 @@ impl Reader {
     pub(super) fn bare(&self, size: usize, length: Duration) -> Result<Streamed> {
         let channel = self.0.channel();
         channel.tell(&Order::Bare { size })?;
-        let mut end = BareQuic.open(&load(size), Side::Near, channel)?;
+        let mut end = BareEnd::open(&load(size), Side::Near, channel)?;
         channel.hear::<()>()?;
-        let cpu = cpu_seconds("self");
-        let sent = until_over(length, |number| end.send(number))?;
-        self.found(sent, || cpu_seconds("self") - cpu)
+        let before = cpu::own();
+        let sent = until_over(length, |number| match number {
+            LAST => end.send(number),
+            _ => end.queue(number),
+        })?;
+        end.idle(channel)?;
+        self.found(sent, || cpu::own() - before)
     }
 
     /// From a publisher on the first host to a subscription on the other.
@@ -96,10 +99,7 @@ impl Reader {
         }
         channel.hear::<()>()?;
         let pids = hosts.pids()?;
-        let cpu = || {
-            let daemons = pids.iter().map(|pid| cpu_seconds(&pid.to_string()));
-            daemons.sum::<f64>() + cpu_seconds("self")
-        };
+        let cpu = || pids.iter().copied().map(cpu::of).sum::<f64>() + cpu::own();
         let before = cpu();
         let mut bytes = vec![0x5a; size];
         let sent = until_over(length, |number| {
@@ -129,7 +129,7 @@ pub(super) fn attend() -> Result<()> {
     while let Ok(order) = channel.hear::<Order>() {
         let found = match order {
             Order::Bare { size } => {
-                let mut end = BareQuic.open(&load(size), Side::Far, &channel)?;
+                let mut end = BareEnd::open(&load(size), Side::Far, &channel)?;
                 channel.tell(&())?;
                 count(|| end.receive())?
             }
@@ -158,7 +158,7 @@ fn read(channel: &Channel, settings: &Settings, topic: &str, flow: Flow) -> Resu
 /// Receives until the last message, in order.
 fn count(mut receive: impl FnMut() -> Result<u64>) -> Result<Found> {
     let mut before = receive()?;
-    let (start, cpu) = (Instant::now(), cpu_seconds("self"));
+    let (start, cpu) = (Instant::now(), cpu::own());
     let mut taken = 1;
     while before != LAST {
         let number = receive()?;
@@ -168,7 +168,7 @@ fn count(mut receive: impl FnMut() -> Result<u64>) -> Result<Found> {
         before = number;
         taken += 1;
     }
-    Ok((taken, start.elapsed().as_secs_f64(), cpu_seconds("self") - cpu))
+    Ok((taken, start.elapsed().as_secs_f64(), cpu::own() - cpu))
 }
 
 /// Sends for this long, then the last message; how many in all.
@@ -193,14 +193,4 @@ fn spec(topic: &str, flow: Flow) -> EndpointSpec {
         Flow::Overtakes => Qos::default(),
     };
     EndpointSpec::new(topic, "bench/Bytes", qos)
-}
-
-/// Processor time of a process so far, of the threads that it has now.
-fn cpu_seconds(pid: &str) -> f64 {
-    let tasks = fs::read_dir(format!("/proc/{pid}/task"));
-    let nanoseconds = tasks.into_iter().flatten().filter_map(|task| {
-        let text = fs::read_to_string(task.ok()?.path().join("schedstat")).ok()?;
-        text.split(' ').next()?.parse::<u64>().ok()
-    });
-    nanoseconds.sum::<u64>() as f64 / 1e9
 }
