@@ -17,24 +17,24 @@ use std::{
     fs,
     io::{self, Write},
     path::PathBuf,
+    time::Duration,
 };
 
 use clap::Parser;
 use harness::{
-    Axon, Effort, Load, Machine, Medium, Motion, Pair, Progress, Raw, Result, Rounds, SIZES, Wake,
-    words,
+    Axon, Effort, Load, Machine, Medium, Motion, Pair, Progress, Raw, Result, Rounds, SIZES,
+    Sleeps, Wake, words,
 };
 use iceoryx::Iceoryx2;
 use zenoh::Zenoh;
 
-/// The kinds of latency that are compared.
-const KINDS: [(Wake, Motion); 5] = [
-    (Wake::Poll, Motion::Touch),
-    (Wake::Poll, Motion::Copy),
-    (Wake::Event, Motion::Touch),
-    (Wake::EventOneCpu, Motion::Touch),
-    (Wake::Event, Motion::Copy),
-];
+/// The kinds of latency that are compared. Sleepers on two CPUs are compared at a pace: where messages
+/// follow each other at once, AXON looks for a while before it sleeps, and the others do not.
+const KINDS: [(Wake, Motion); 3] =
+    [(Wake::Poll, Motion::Touch), (Wake::Poll, Motion::Copy), (Wake::EventOneCpu, Motion::Touch)];
+/// What messages at a pace are.
+const PACED: [Motion; 2] = [Motion::Touch, Motion::Copy];
+const PACE: Duration = Duration::from_millis(1);
 /// The kinds of streams.
 const STREAMS: [Motion; 2] = [Motion::Touch, Motion::Copy];
 
@@ -56,6 +56,9 @@ struct Arguments {
     answer: bool,
 }
 
+/// The media in their order.
+const MEDIA: [&str; 4] = ["raw", "AXON", "iceoryx2", "zenoh"];
+
 /// A load, and what each medium made of it.
 struct Compared {
     load: Load,
@@ -66,15 +69,15 @@ struct Results {
     machine: Machine,
     quick: bool,
     effort: Effort,
-    media: Vec<&'static str>,
     latency: Vec<Compared>,
+    paced: Vec<Compared>,
     streams: Vec<Compared>,
 }
 
 fn main() -> Result<()> {
     let arguments = Arguments::parse();
     let (iceoryx, zenoh) = (Iceoryx2::default(), Zenoh::default());
-    let media: [&dyn Medium; 4] = [&Raw, &Axon, &iceoryx, &zenoh];
+    let media: [&dyn Medium; 4] = [&Raw(Sleeps::Epoll), &Axon, &iceoryx, &zenoh];
     if arguments.answer {
         return harness::serve(&media);
     }
@@ -95,14 +98,22 @@ fn main() -> Result<()> {
 fn measure(media: &[&dyn Medium], sizes: &[usize], quick: bool) -> Result<Results> {
     let effort = if quick { Effort::QUICK } else { Effort::FULL };
     let machine = Machine::look()?;
-    let progress = Progress::new(sizes.len() * (KINDS.len() + STREAMS.len()));
+    let progress = Progress::new(sizes.len() * (KINDS.len() + PACED.len() + STREAMS.len()));
     let pair = Pair::start(media, effort, &machine, &["--answer"])?;
-    let (mut latency, mut streams) = (Vec::new(), Vec::new());
+    let (mut latency, mut paced, mut streams) = (Vec::new(), Vec::new(), Vec::new());
     for (wake, motion) in KINDS {
         progress.step(&format!("latency, {}", words::kind(wake, motion)));
         for size in sizes {
             let load = Load::ping_pong(*size, wake, motion);
             latency.push(Compared { load, rounds: pair.latency(&load)? });
+            progress.advance();
+        }
+    }
+    for motion in PACED {
+        progress.step(&format!("latency at {}, {}", words::pace(PACE), words::motion(motion)));
+        for size in sizes {
+            let load = Load::paced(*size, motion, PACE);
+            paced.push(Compared { load, rounds: pair.paced(&load)? });
             progress.advance();
         }
     }
@@ -114,6 +125,5 @@ fn measure(media: &[&dyn Medium], sizes: &[usize], quick: bool) -> Result<Result
             progress.advance();
         }
     }
-    let media = media.iter().map(|medium| medium.name()).collect();
-    Ok(Results { machine, quick, effort, media, latency, streams })
+    Ok(Results { machine, quick, effort, latency, paced, streams })
 }
