@@ -70,9 +70,8 @@ class Stream:
             'sent': published['sent'], 'received': taken['received'],
             'per_second': taken['received'] / seconds,
             'gb_per_second': taken['received'] * self.size / seconds / 1e9,
-            'cpu_us_a_message': 1e6 * (
-                published['cpu_s'] / max(published['sent'], 1)
-                + taken['cpu_s'] / max(taken['received'], 1)),
+            'cpu_us_a_message':
+                1e6 * (published['cpu_s'] + taken['cpu_s']) / max(taken['received'], 1),
             'daemon_cores': of_daemon, **memory}
 
 

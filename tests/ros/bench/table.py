@@ -1,18 +1,26 @@
 # SPDX-License-Identifier: MIT OR Apache-2.0
 """The results as a table, in Markdown."""
 
+
+def with_daemons(r):
+    """CPU time of a message in microseconds, in the applications and in AXON's daemons."""
+    return r['cpu_us_a_message'] + 1e6 * r['daemon_cores'] / max(r['per_second'], 1e-9)
+
+
 # Of each part: (column, how it is computed from a result)
 FIGURES = {
     'latency': [
         ('p50 / p99 us', lambda r: f"{r['p50_us']:.0f} / {r['p99_us']:.0f}"),
         ('CPU us a message', lambda r: f"{r['cpu_us_a_message']:.0f}"),
+        ('with daemons', lambda r: f"{with_daemons(r):.0f}"),
         ('received', lambda r: f"{100 * r['received'] / max(r['sent'], 1):.1f} %"),
         ('MB a process', lambda r: f"{sum(r['pss_kib']) / 2048:.1f}")],
     'throughput': [
         ('messages/s received', lambda r: f"{r['per_second']:.0f}"),
         ('GB/s', lambda r: f"{r['gb_per_second']:.2f}"),
         ('received', lambda r: f"{100 * r['received'] / max(r['sent'], 1):.1f} %"),
-        ('CPU us a message', lambda r: f"{r['cpu_us_a_message']:.1f}")],
+        ('CPU us a message', lambda r: f"{r['cpu_us_a_message']:.1f}"),
+        ('with daemons', lambda r: f"{with_daemons(r):.1f}")],
     'first message': [('ms', lambda r: f"{r['first_ms']:.1f}")],
     'launch': [
         ('whole after s', lambda r: f"{r['since_last_created_s']:.1f}"),
