@@ -32,6 +32,11 @@ pub const TARGETS: &[Target] = &[
         seeds: transport::session_message_seeds,
     },
     Target {
+        name: "connect_packet",
+        check: transport::connect_packet,
+        seeds: transport::connect_packet_seeds,
+    },
+    Target {
         name: "relay_pieces",
         check: transport::relay_pieces,
         seeds: transport::relay_pieces_seeds,

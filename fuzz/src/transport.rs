@@ -13,7 +13,7 @@ use axon_transport::{
     qos::Qos,
     relay::flow::{Channel, Incoming, Pool, WINDOW},
     session::message::{self as session, CodecError, MAX_PACKET},
-    shm::Location,
+    shm::{Location, reencode_packet},
 };
 
 const TERMS: Terms = Terms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(1) };
@@ -73,6 +73,13 @@ pub fn session_message(data: &[u8]) -> bool {
         Err(CodecError::TooLarge(_)) => assert!(data.len() > MAX_PACKET - 16),
         Err(other) => panic!("does not encode: {other}"),
     }
+    true
+}
+
+/// What decodes encodes to a packet that decodes to the same.
+pub fn connect_packet(data: &[u8]) -> bool {
+    let Some(packet) = reencode_packet(data) else { return false };
+    assert_eq!(reencode_packet(&packet), Some(packet));
     true
 }
 
@@ -258,6 +265,25 @@ pub fn relay_pieces_seeds() -> Vec<Vec<u8>> {
     let ended = [(1, 8), (0, 5)].map(|(of, rest)| piece(of, None, rest));
     let long = [piece(2, Some(40_000), 30_000), piece(2, None, 10_000)];
     vec![piece(0, Some(3), 3), [begun.concat(), ended.concat()].concat(), long.concat()]
+}
+
+/// Every packet between a publisher and a subscriber.
+pub fn connect_packet_seeds() -> Vec<Vec<u8>> {
+    use session::{Segment, SegmentName, SegmentOpened};
+    /// Version, kind, and what a packet of that kind holds: `docs/formats.md`, section 9.
+    fn packet<T: minicbor::Encode<()>>(kind: u32, content: T) -> Vec<u8> {
+        minicbor::to_vec((2_u32, (kind, (content,)))).expect("it encodes")
+    }
+    let (reader, writer, session) = (Gid([1; 16]), Gid([2; 16]), SessionId([3; 16]));
+    let place = Location { segment: 3, offset: 4096 };
+    let segment = Segment { number: 3, publisher: Some(writer) };
+    vec![
+        packet(0, (session, reader, place, Qos::keep_all())),
+        packet(1, (reader, session, writer, 1_u64 << 40, 7_u64, place)),
+        packet(2, (reader, "incompatible")),
+        packet(3, SegmentOpened { session, segment }),
+        packet(4, SegmentName { session, number: 3 }),
+    ]
 }
 
 /// Every message of the session socket.

@@ -137,6 +137,29 @@ enum Packet {
     Gone(#[n(0)] SegmentName),
 }
 
+impl Packet {
+    fn encode(&self) -> Result<Vec<u8>, ConnectError> {
+        minicbor::to_vec((VERSION, self))
+            .map_err(|_| ConnectError::Protocol("nothing: the packet cannot be written"))
+    }
+
+    fn decode(bytes: &[u8]) -> Result<Self, ConnectError> {
+        match minicbor::decode(bytes) {
+            Ok((VERSION, packet)) => Ok(packet),
+            Ok(_) => Err(ConnectError::Protocol("a packet of another version")),
+            Err(_) => Err(ConnectError::Protocol("what is no packet")),
+        }
+    }
+}
+
+/// Decodes a packet and encodes it anew; `None` where it is refused. For the fuzz target
+/// `connect_packet`.
+#[doc(hidden)]
+#[must_use]
+pub fn reencode_packet(bytes: &[u8]) -> Option<Vec<u8>> {
+    Packet::decode(bytes).and_then(|packet| packet.encode()).ok()
+}
+
 /// The two ends over which a publisher hands segments to a subscriber: theirs alone, so that what
 /// else is said over the socket by which they met stays apart.
 pub(super) fn line() -> Result<(OwnedFd, OwnedFd), ConnectError> {
@@ -268,8 +291,7 @@ impl<'a> Channel<'a> {
     }
 
     fn send(&self, packet: &Packet, fds: &[BorrowedFd<'_>]) -> Result<(), ConnectError> {
-        let bytes = minicbor::to_vec((VERSION, packet))
-            .map_err(|_| ConnectError::Protocol("nothing: the packet cannot be written"))?;
+        let bytes = packet.encode()?;
         let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(MAX_DESCRIPTORS))];
         loop {
             let mut control = SendAncillaryBuffer::new(&mut space);
@@ -320,11 +342,7 @@ impl<'a> Channel<'a> {
             if got.lost {
                 return Err(no_descriptors());
             }
-            return match minicbor::decode(&bytes[..got.bytes]) {
-                Ok((VERSION, packet)) => Ok((packet, fds)),
-                Ok(_) => Err(ConnectError::Protocol("a packet of another version")),
-                Err(_) => Err(ConnectError::Protocol("what is no packet")),
-            };
+            return Ok((Packet::decode(&bytes[..got.bytes])?, fds));
         }
     }
 

@@ -115,6 +115,8 @@ mod tests;
 
 pub(crate) use audience::holds;
 pub use connect::ConnectError;
+#[doc(hidden)]
+pub use connect::reencode_packet;
 pub use context::Context;
 pub use error::{Keeper, PublishError, ShmError, TakeError};
 pub(crate) use fork::ForkToken;
