@@ -1,7 +1,7 @@
 //! Configuration: environment and `axon.toml`, or a [`ConfigBuilder`], in, one validated [`Config`] out.
 //!
-//! The only place that reads the environment, and [`Config::builder`] and [`Config::default`] do not. A
-//! setting that is unknown, obsolete or half-given is an error that names the variable, what was read and
+//! The only place that reads settings from the environment, and [`Config::builder`] and
+//! [`Config::default`] do not. A setting that is unknown, obsolete or half-given is an error that names the variable, what was read and
 //! what is accepted. Validation creates nothing, reads no private key, and runs in the process that starts,
 //! before any daemon does.
 
@@ -120,9 +120,9 @@ impl Config {
         let mut warnings = Vec::new();
         match &self.security {
             Security::Classic(classic) if classic.auth == ClassicAuth::None => warnings.push(
-                "AXON_CLASSIC_AUTH is none: peers are not authenticated. Traffic is safe from who \
-                 records it, not from who answers in a peer's place; give AXON_CLASSIC_KEY and \
-                 AXON_CLASSIC_TRUST to pin peers"
+                "AXON_CLASSIC_AUTH is none: peers are not authenticated. Traffic is protected \
+                 against recording, not against an active attacker who poses as a peer; give \
+                 AXON_CLASSIC_KEY and AXON_CLASSIC_TRUST to pin peers"
                     .to_owned(),
             ),
             Security::Qkd(qkd) if qkd.peers == QkdPeers::Any => warnings.push(

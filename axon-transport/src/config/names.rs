@@ -149,7 +149,7 @@ pub(super) fn resembles(name: &str) -> bool {
             .iter()
             .any(|known| *known == word || (known.len() > 4 && distance(word, known) == 1))
     };
-    nearest(name, names()).is_some()
+    nearest_name(name, names()).is_some()
         || names().any(|known| known.split('_').nth(1) == words().next())
         || words().any(is_word)
 }
@@ -164,7 +164,7 @@ pub(super) fn setting(name: &str) -> Result<&'static str, ConfigError> {
         // Its value may be a key.
         return Err(ConfigError::withheld(name, *instead));
     }
-    let close = nearest(name, SETTINGS.iter().chain(LINK).copied().chain([CONFIG, STRICT]));
+    let close = nearest_name(name, SETTINGS.iter().chain(LINK).copied().chain([CONFIG, STRICT]));
     let accepted = match close {
         Some(close) => format!("the settings of docs/configuration.md; did you mean {close}?"),
         None => "the settings of docs/configuration.md; remove this one".to_owned(),
@@ -179,6 +179,16 @@ pub(super) fn is_obsolete(name: &str) -> bool {
 
 fn obsolete(name: &str) -> Option<&'static (&'static str, &'static str)> {
     OBSOLETE.iter().find(|(old, _)| *old == name)
+}
+
+/// The name that `name` most likely meant, if any is close: by what follows `AXON_`, which all share, so
+/// that no short name is close to every other.
+fn nearest_name<'a>(name: &str, names: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
+    let own = |name: &'a str| name.strip_prefix("AXON_").unwrap_or(name);
+    let meant = name.strip_prefix("AXON_").unwrap_or(name);
+    let names: Vec<&str> = names.into_iter().collect();
+    let close = nearest(meant, names.iter().copied().map(own))?;
+    names.into_iter().find(|name| own(name) == close)
 }
 
 /// The candidate that `text` most likely meant, if any is close.

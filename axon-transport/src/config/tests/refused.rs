@@ -53,7 +53,12 @@ fn unknown_names_are_refused_with_the_nearest_known_one() {
 
 #[test]
 fn foreign_names_are_ignored_with_a_warning_unless_the_environment_is_strict() {
-    let foreign = [("AXON_CI_JOB", "hunter2"), ("AXON_", "hunter2"), ("AXON_BENCH_SIZES", "")];
+    let foreign = [
+        ("AXON_CI_JOB", "hunter2"),
+        ("AXON_", "hunter2"),
+        ("AXON_BENCH_SIZES", ""),
+        ("AXON_FOO", ""),
+    ];
     let config = resolve(&[], &foreign).unwrap();
     assert_eq!(config.unknown_variables, ["AXON_", "AXON_BENCH_SIZES", "AXON_CI_JOB"]);
     let warnings = config.warnings().join("\n");
