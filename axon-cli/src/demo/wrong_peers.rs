@@ -35,6 +35,9 @@ const VISITOR: &str = "127.0.0.1";
 /// Time that the daemon has to record a refusal.
 const RECORD: Duration = Duration::from_secs(5);
 
+/// Time for a daemon to refuse its settings.
+const REFUSAL: Duration = Duration::from_secs(10);
+
 /// What is tried, and the name of the one refusal that answers it: a TLS alert, or the close code
 /// of a link (`docs/formats.md`, section 6). Refused for another reason is not refused for this.
 #[derive(Clone, Copy, Debug)]
@@ -250,11 +253,13 @@ pub(crate) async fn obsolete_variable() -> Result<Attempt, DemoError> {
     let peer = "an obsolete variable";
     let settings = [("AXON_SECURITY_PROFILE".to_owned(), "classic".into())];
     let mut command = axon(&settings)?;
-    command.arg("status").kill_on_drop(true);
-    let output = command
-        .output()
+    command.arg("daemon").kill_on_drop(true);
+    let failed = |reason: String| DemoError::Attempt { attempt: peer, reason };
+    // A daemon that took the variable would stay.
+    let output = tokio::time::timeout(REFUSAL, command.output())
         .await
-        .map_err(|e| DemoError::Attempt { attempt: peer, reason: e.to_string() })?;
+        .map_err(|_| failed("a daemon was started with it".to_owned()))?
+        .map_err(|e| failed(e.to_string()))?;
     let line = String::from_utf8_lossy(&output.stderr).trim_end().to_owned();
     let refused = output.status.code() == Some(2)
         && line.lines().count() == 1
