@@ -57,9 +57,10 @@ impl Load {
         Self { size, wake, motion, window: 1, pace: None }
     }
 
-    /// A message every `pace`, to a receiver that sleeps in between.
+    /// A message every `pace`, to a receiver that sleeps in between. Four may be under way, should the
+    /// machine leave the receiver out for a while.
     pub(crate) fn paced(size: usize, motion: Motion, pace: Duration) -> Self {
-        Self { pace: Some(pace), ..Self::ping_pong(size, Wake::Event, motion) }
+        Self { pace: Some(pace), window: 4, ..Self::ping_pong(size, Wake::Event, motion) }
     }
 
     /// As many as 16 MiB hold, from 4 to 64.
@@ -67,9 +68,9 @@ impl Load {
         Self { size, wake, motion, window: ((16 << 20) / size).clamp(4, 64), pace: None }
     }
 
-    /// Whether more than one message may be under way.
+    /// Whether messages follow each other without an answer in between.
     pub(crate) fn is_stream(&self) -> bool {
-        self.window > 1
+        self.window > 1 && self.pace.is_none()
     }
 }
 

@@ -111,13 +111,17 @@ impl<'a> Pair<'a> {
                     let which = (round + next) % all.len();
                     let (sent_at, spent) = self.spent(&mut all[which], |of| {
                         let count = self.effort.paced_messages.min(MOST_PACED);
+                        let credit = self.board.word(0);
+                        let taken_before = credit.load(Ordering::Acquire);
                         channel.tell(&Order::Note { medium: of.index, count })?;
                         channel.hear::<()>()?;
                         let mut sent_at = Vec::new();
                         let mut due = Instant::now();
-                        for _ in 0..count {
+                        for index in 0..count {
                             due += pace;
                             thread::sleep(due.saturating_duration_since(Instant::now()));
+                            let window = load.window as u64;
+                            await_credit(credit, (taken_before + index + 1).saturating_sub(window));
                             sent_at.push(now_ns());
                             of.send()?;
                         }

@@ -112,11 +112,14 @@ pub(crate) fn serve(all: &[&dyn Medium]) -> Result<()> {
             }
             Order::Note { medium, count } => {
                 let (end, last) = &mut ends[medium];
+                let word = board.word(0);
+                let taken = word.load(Ordering::Relaxed);
                 channel.tell(&())?;
                 for index in 0..count {
                     next(&mut **end, last).map_err(|error| named(media[medium], error))?;
-                    // The packet that follows orders it before the load of the other process.
                     board.word(noted(index)).store(now_ns(), Ordering::Relaxed);
+                    // Pairs with the load of the one that waits for it.
+                    word.store(taken + index + 1, Ordering::Release);
                 }
                 channel.tell(&(cpu::own() - before))?;
             }
