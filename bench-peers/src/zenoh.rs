@@ -80,7 +80,7 @@ impl Medium for Zenoh {
             .declare_publisher(key(out))
             .congestion_control(CongestionControl::Block)
             // Nothing waits for more to go with it; a stream is better off in batches.
-            .express(load.window == 1)
+            .express(!load.is_stream())
             .wait()
             .map_err(Error::from)?;
         while !publisher.matching_status().wait().map_err(Error::from)?.matching() {

@@ -2,14 +2,23 @@
 //! with its windows. Messages have a length before them; in a stream they are written 64 KiB at a time,
 //! and always read so.
 
-use std::{net::Ipv4Addr, sync::Arc, time::Duration};
+use std::{
+    net::{Ipv4Addr, UdpSocket},
+    sync::Arc,
+    time::Duration,
+};
 
 use axon_tls::{
     Cipher,
     identity::{Auth, SigningKey},
     quic::{ALPN, hybrid_client, hybrid_server},
 };
-use quinn::{Connection, Endpoint, RecvStream, SendStream, TransportConfig, VarInt};
+use quinn::{
+    Connection, Endpoint, EndpointConfig, RecvStream, SendStream, ServerConfig, TokioRuntime,
+    TransportConfig, VarInt,
+};
+use rustix::net::sockopt;
+use serde::{Deserialize, Serialize};
 use tokio::runtime::Runtime;
 
 use crate::bench::harness::{Channel, End, Error, Load, Medium, Result, Side, agree, stamp};
@@ -19,6 +28,8 @@ const BATCH: usize = 64 << 10;
 const HEADER: usize = 4;
 /// Between two looks at whether a turn is over.
 const LOOK: Duration = Duration::from_millis(1);
+/// As a daemon's, like the two windows.
+const SOCKET_BUFFER: usize = 8 << 20;
 const STREAM_WINDOW: u32 = 32 << 20;
 const SEND_WINDOW: u64 = 16 << 20;
 
@@ -31,8 +42,17 @@ impl Medium for BareQuic {
     }
 
     fn open(&self, load: &Load, side: Side, channel: &Channel) -> Result<Box<dyn End>> {
-        Ok(Box::new(BareEnd::open(load, side, channel)?))
+        Ok(Box::new(BareEnd::open(load, side, channel, Threads::One)?))
     }
+}
+
+/// Which threads run quinn.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) enum Threads {
+    /// The one that waits for a message: no other has to be woken.
+    One,
+    /// One of its own: it encrypts while the application makes messages.
+    Two,
 }
 
 /// One end of the stream.
@@ -50,16 +70,24 @@ pub(super) struct BareEnd {
 
 impl BareEnd {
     /// Meets the other side.
-    pub(super) fn open(load: &Load, side: Side, channel: &Channel) -> Result<Self> {
-        // The thread that waits for a message runs quinn, too: nobody has to wake another thread.
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    pub(super) fn open(
+        load: &Load,
+        side: Side,
+        channel: &Channel,
+        threads: Threads,
+    ) -> Result<Self> {
+        let mut runtime = match threads {
+            Threads::One => tokio::runtime::Builder::new_current_thread(),
+            Threads::Two => tokio::runtime::Builder::new_multi_thread(),
+        };
+        let runtime = runtime.worker_threads(1).enable_all().build()?;
         let (endpoint, connection, out, into) = match side {
             Side::Near => {
                 let key = Auth::None(SigningKey::generate()?);
                 let mut config = hybrid_server(&key, Cipher::default(), ALPN)?;
                 config.transport_config(transport());
                 let _entered = runtime.enter();
-                let endpoint = Endpoint::server(config, (Ipv4Addr::LOCALHOST, 0).into())?;
+                let endpoint = endpoint(Some(config))?;
                 channel.tell(&endpoint.local_addr()?)?;
                 runtime.block_on(async {
                     let incoming = endpoint.accept().await.ok_or("nobody came")?;
@@ -76,7 +104,7 @@ impl BareEnd {
                 let mut config = hybrid_client(&key, Cipher::default(), ALPN)?;
                 config.transport_config(transport());
                 let _entered = runtime.enter();
-                let endpoint = Endpoint::client((Ipv4Addr::LOCALHOST, 0).into())?;
+                let endpoint = endpoint(None)?;
                 runtime.block_on(async {
                     let connection = endpoint.connect_with(config, address, "axon")?.await?;
                     let (out, mut into) = connection.accept_bi().await?;
@@ -136,6 +164,14 @@ impl BareEnd {
 async fn greet(mut out: SendStream) -> Result<SendStream> {
     out.write_all(&[0]).await?;
     Ok(out)
+}
+
+fn endpoint(config: Option<ServerConfig>) -> Result<Endpoint> {
+    let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0))?;
+    // As a daemon's. With the system's own a stream on loopback loses packets.
+    sockopt::set_socket_recv_buffer_size(&socket, SOCKET_BUFFER)?;
+    sockopt::set_socket_send_buffer_size(&socket, SOCKET_BUFFER)?;
+    Ok(Endpoint::new(EndpointConfig::default(), config, socket, Arc::new(TokioRuntime))?)
 }
 
 fn transport() -> Arc<TransportConfig> {

@@ -17,7 +17,8 @@ use crate::{
 const REPORTED: &str = "AXON between two hosts on one machine's loopback, and one stream of bare \
                         quinn, take turns. Latency is one way (half a round trip), of the round \
                         with the least median; of streams the best of the turns counts. In a stream \
-                        quinn is written and read 64 KiB at a time. CPU is the processor time of \
+                        quinn is written and read 64 KiB at a time, and runs in the application's \
+                        thread or in one of its own, whichever is faster. CPU is the processor time of \
                         a message in all processes: both applications, AXON's two daemons, and in \
                         qkd the KMEs.";
 

@@ -6,7 +6,10 @@ use axon_transport::{qos::Qos, session::EndpointSpec, shm::PublishError};
 use rustix::process::{Signal, set_parent_process_death_signal};
 use serde::{Deserialize, Serialize};
 
-use super::{bare::BareEnd, hosts::Hosts};
+use super::{
+    bare::{BareEnd, Threads},
+    hosts::Hosts,
+};
 use crate::bench::{
     harness::{
         Channel, End as _, Load, Motion, Other, Result, Side, Wake, agree, cpu, spawn, stamp,
@@ -50,7 +53,7 @@ impl Streamed {
 
 #[derive(Serialize, Deserialize)]
 enum Order {
-    Bare { size: usize },
+    Bare { size: usize, threads: Threads },
     Read { settings: Settings, topic: String, flow: Flow },
 }
 
@@ -66,10 +69,10 @@ impl Reader {
     }
 
     /// Over bare quinn.
-    pub(super) fn bare(&self, size: usize, length: Duration) -> Result<Streamed> {
+    pub(super) fn bare(&self, size: usize, threads: Threads, length: Duration) -> Result<Streamed> {
         let channel = self.0.channel();
-        channel.tell(&Order::Bare { size })?;
-        let mut end = BareEnd::open(&load(size), Side::Near, channel)?;
+        channel.tell(&Order::Bare { size, threads })?;
+        let mut end = BareEnd::open(&load(size), Side::Near, channel, threads)?;
         channel.hear::<()>()?;
         let before = cpu::own();
         let sent = until_over(length, |number| match number {
@@ -128,8 +131,8 @@ pub(super) fn attend() -> Result<()> {
     let channel = Channel::inherited()?;
     while let Ok(order) = channel.hear::<Order>() {
         let found = match order {
-            Order::Bare { size } => {
-                let mut end = BareEnd::open(&load(size), Side::Far, &channel)?;
+            Order::Bare { size, threads } => {
+                let mut end = BareEnd::open(&load(size), Side::Far, &channel, threads)?;
                 channel.tell(&())?;
                 count(|| end.receive())?
             }
