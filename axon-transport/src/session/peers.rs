@@ -58,6 +58,11 @@ impl Entry {
         Ok(Self { session, deaths: deaths.clone(), dead: false, named: BTreeSet::new() })
     }
 
+    /// Whether its process has ended, noted or not.
+    fn is_dead(&self) -> bool {
+        self.dead || self.session.is_dead()
+    }
+
     /// Notes the death of its process, of which the epoll instance would tell again and again.
     fn note_death(&mut self) {
         self.unwatch();
@@ -160,7 +165,9 @@ impl Peers {
         }
         let introduced = descriptors.len().saturating_sub(segments.len());
         let maps = descriptors.split_off(introduced);
-        if !self.peers.contains_key(&id) {
+        // What stands in for a relayed session has that session's id, in whatever daemon it is.
+        let returned = introduced > 0 && self.peers.get(&id).is_some_and(Entry::is_dead);
+        if returned || !self.peers.contains_key(&id) {
             let [segment, doorbell, pidfd] =
                 <[PassedFd; 3]>::try_from(descriptors).map_err(|_| PeerError::Missing)?;
             let descriptors = PeerDescriptors { segment, doorbell, pidfd };
