@@ -12,7 +12,7 @@ const LIBRARIES: [(&str, &str, &str); 5] = [
     ("etsi-qkd014", "blocking,pool,sim", ""),
     ("axon-envelope", "aws-lc-rs,rust-crypto", "rust-crypto"),
     ("rustls-axon", "aws_lc_rs,std,logging,tls12", ""),
-    ("axon-tls", "quic", ""),
+    ("axon-tls", "hybrid,quic,tokio", ""),
     ("axon-transport", "", ""),
 ];
 
