@@ -45,6 +45,9 @@ pub enum Start {
     Detached,
 }
 
+/// How long a daemon waits for its first session at least.
+const FIRST_SESSION: Duration = Duration::from_secs(10);
+
 /// What a daemon runs with besides its configuration.
 #[derive(Debug)]
 pub struct DaemonOptions {
@@ -291,6 +294,13 @@ async fn flush(control: Rc<RefCell<Control>>, digests: Option<mpsc::Sender<Event
 async fn unneeded(control: &Rc<RefCell<Control>>) {
     let grace = control.borrow().config.link.grace;
     let changed = control.borrow().need.clone();
+    // The session that started this daemon has yet to come, however short the grace time is.
+    if !control.borrow().is_needed() {
+        let first = grace.max(FIRST_SESSION);
+        if tokio::time::timeout(first, changed.notified()).await.is_err() {
+            return;
+        }
+    }
     loop {
         if control.borrow().is_needed() {
             changed.notified().await;
