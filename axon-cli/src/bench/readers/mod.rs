@@ -156,9 +156,11 @@ impl Turns<'_> {
         messages: u64,
     ) -> Result<Turn> {
         let readers = &self.crowd.readers[..readers];
-        for reader in readers {
+        for (index, reader) in readers.iter().enumerate() {
+            // A reader subscribes to those publishers only that have so many.
+            let absent = READERS.iter().filter(|count| **count <= index).count();
             reader.channel().tell(&Order::Attend {
-                source: source.map(|(index, _)| index),
+                source: source.map(|(at, _)| at - absent),
                 told: until == Until::Told,
                 messages,
                 after: self.published,
