@@ -43,7 +43,7 @@ struct Contestant<'a> {
 type Turn<T> = (T, u64);
 
 impl<'a> Pair<'a> {
-    /// Starts the other process, in which `arguments` must lead to [`serve`](super::serve) with the
+    /// Starts the other process, in which `arguments` must lead to [`serve`](super::serve()) with the
     /// same media.
     pub(crate) fn start(
         media: &'a [&'a dyn Medium],
