@@ -51,12 +51,11 @@ pub(crate) fn cargo(dir: &Path, args: &[&str]) -> Command {
 /// The directory of each unpacked package, in the order of [`PUBLISHED`]. Made once, as a release
 /// makes them.
 static PACKAGES: LazyLock<Vec<PathBuf>> = LazyLock::new(|| {
-    run(Command::new(env!("CARGO_BIN_EXE_xtask")).arg("patched-tree"));
     let _ = fs::remove_dir_all(scratch());
     let out = scratch().join("out");
     fs::create_dir_all(&out).expect("a directory");
-    let mut package = cargo(workspace(), &["package", "--no-verify", "--allow-dirty", "--offline"]);
-    package.args(PUBLISHED.iter().flat_map(|(name, _)| ["--package", name]));
+    let mut package = Command::new(env!("CARGO_BIN_EXE_xtask"));
+    package.args(["package", "--allow-dirty", "--no-verify", "--offline"]);
     run(package.arg("--target-dir").arg(&out));
 
     let packed = |name: &str| {
