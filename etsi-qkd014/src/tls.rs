@@ -87,7 +87,7 @@ pub(crate) fn certificates(
     Ok(all)
 }
 
-/// A certificate without extensions, in which nothing says for whom or what it is.
+/// A certificate of X.509 version 1: it has no extensions, and so names neither host nor purpose.
 #[derive(Debug)]
 struct OldVersion;
 

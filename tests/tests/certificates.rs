@@ -162,7 +162,7 @@ async fn asked(config: &QkdConfig) -> Result<(), String> {
     kme.probe("sae-b").await.map(drop).map_err(|failure| failure.to_string())
 }
 
-/// A server that shows `pair` to whoever connects, usable or not, and serves nothing.
+/// A TLS server that presents the certificate of `pair`, usable or not, and serves no request.
 fn show(pair: &Pair) -> SocketAddr {
     let chain = vec![CertificateDer::from_pem_slice(pair.cert.as_bytes()).unwrap()];
     let key = PrivateKeyDer::from_pem_slice(pair.key.as_bytes()).unwrap();

@@ -10,7 +10,7 @@ use webpki::EndEntityCert;
 /// Why a peer, or what this host is to show, is refused.
 #[derive(Clone, PartialEq, Eq)]
 pub(super) enum Refused {
-    /// A certificate without extensions: nothing in it says for whom it is.
+    /// A certificate of X.509 version 1: it has no extensions, and so names no host.
     OldVersion,
     /// A pin that held up to this day. The trust file's name for the peer stays here: who is refused
     /// is told the reason.
