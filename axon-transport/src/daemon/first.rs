@@ -5,10 +5,7 @@ use std::sync::Arc;
 use tokio::io::unix::AsyncFd;
 use zeroize::Zeroize;
 
-use super::{
-    admission::unshared,
-    listen::{receive, say},
-};
+use super::{admission::unshared, conversation::receive, listen::say};
 use crate::{
     owner::{OWNER, SessionKey},
     passed::{self, PassedFd},

@@ -8,6 +8,7 @@
 mod admission;
 pub mod bridge;
 mod control;
+mod conversation;
 mod first;
 mod gateway;
 mod inherit;
