@@ -348,36 +348,6 @@ fn a_session_killed_takes_its_endpoints_with_it() {
     until("the daemon forgot it", || host.status().unwrap().topics[0].publishers == 0);
 }
 
-/// Their daemon hangs meanwhile: it finds in one moment that the process ended, and what that sent before.
-#[test]
-fn all_samples_of_a_publisher_that_ends_are_taken_though_the_daemon_is_slow() {
-    for _ in 0..6 {
-        let host = Host::new();
-        let daemon = host.daemon();
-        let session = host.session("reader").unwrap();
-        let subscription = session.create_subscription(spec("/numbers")).unwrap();
-        let mut leaver = host.play("leaver");
-        assert_eq!(leaver.hear(), "matched");
-        assert!(subscription.wait_matched(1, PATIENCE));
-        signal(daemon.0.id(), Signal::STOP);
-        leaver.finish();
-        until("the reader heard of it", || subscription.matched().is_empty());
-        // It finds that memory is missing, and sleeps.
-        let (tell, told) = std::sync::mpsc::channel();
-        std::thread::scope(|scope| {
-            scope.spawn(|| {
-                for number in 1..=LEFT {
-                    assert_eq!(receive(&subscription), number);
-                }
-                tell.send(()).unwrap();
-            });
-            assert!(told.recv_timeout(Duration::from_millis(500)).is_err(), "nothing was missing");
-            signal(daemon.0.id(), Signal::CONT);
-        });
-        assert_eq!(subscription.lost(), 0);
-    }
-}
-
 #[test]
 fn a_reader_killed_does_not_hold_its_writer_up() {
     let host = Host::new();
