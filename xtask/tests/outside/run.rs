@@ -156,7 +156,8 @@ fn the_readmes_of_axon_transport_and_axon_cli_do_what_they_say() {
     let Some(programs) = built("axon-transport") else { return };
     assert_ne!(programs.len(), 0);
     let commands = Readme::of("axon-transport").commands;
-    assert!(commands.iter().any(|line| line == "cargo install axon-cli"), "{commands:?}");
+    let install = format!("cargo install --git {} axon-cli", env!("CARGO_PKG_REPOSITORY"));
+    assert!(commands.contains(&install), "{install}: {commands:?}");
     let axon = installed("axon-cli", "axon", &[]);
     for program in programs {
         let place = Place::new();
