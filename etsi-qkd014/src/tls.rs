@@ -107,6 +107,21 @@ fn is_of_old_version(certificate: &CertificateDer<'_>) -> bool {
     matches!(parsed, Err(webpki::Error::UnsupportedCertVersion))
 }
 
+/// The old version of a certificate that the chain needs, or the error as it is. A root that a KME sends along
+/// may have any version.
+fn version_or(
+    error: rustls::Error,
+    end_entity: &CertificateDer<'_>,
+    intermediates: &[CertificateDer<'_>],
+) -> rustls::Error {
+    use CertificateError::{Other, UnknownIssuer};
+    let no_path = matches!(error, rustls::Error::InvalidCertificate(UnknownIssuer | Other(_)));
+    if is_of_old_version(end_entity) || (no_path && intermediates.iter().any(is_of_old_version)) {
+        return Other(OtherError(Arc::new(OldVersion))).into();
+    }
+    error
+}
+
 fn certified_key(cert: &[u8], key: &[u8]) -> Result<CertifiedKey, Error> {
     let chain = certificates(cert, "sae_cert")?;
     if chain.iter().any(is_of_old_version) {
@@ -153,17 +168,19 @@ impl ServerCertVerifier for KmeVerifier {
         _ocsp_response: &[u8],
         now: UnixTime,
     ) -> Result<ServerCertVerified, rustls::Error> {
-        if std::iter::once(end_entity).chain(intermediates).any(is_of_old_version) {
-            return Err(CertificateError::Other(OtherError(Arc::new(OldVersion))).into());
-        }
-        let cert = ParsedCertificate::try_from(end_entity)?;
-        verify_server_cert_signed_by_trust_anchor(
-            &cert,
-            &self.roots,
-            intermediates,
-            now,
-            self.algorithms.all,
-        )?;
+        let cert = ParsedCertificate::try_from(end_entity)
+            .and_then(|cert| {
+                let (roots, algorithms) = (&self.roots, self.algorithms.all);
+                verify_server_cert_signed_by_trust_anchor(
+                    &cert,
+                    roots,
+                    intermediates,
+                    now,
+                    algorithms,
+                )?;
+                Ok(cert)
+            })
+            .map_err(|error| version_or(error, end_entity, intermediates))?;
         if self.identity.check_name {
             verify_server_name(&cert, server_name)?;
         }

@@ -55,13 +55,16 @@ impl Authority {
 
     /// A certificate with this common name, and these DNS names in its subjectAltName, if any.
     fn issue(&self, name: &str, dns: &[&str]) -> Pair {
-        let names: Vec<_> = dns.iter().map(|name| (*name).to_owned()).collect();
-        let mut params = CertificateParams::new(names).unwrap();
-        params.distinguished_name = rcgen::DistinguishedName::new();
-        params.distinguished_name.push(DnType::CommonName, name);
-        let key = KeyPair::generate().unwrap();
-        let cert = params.signed_by(&key, &self.issuer).unwrap().pem();
-        Pair { cert, key: key.serialize_pem() }
+        issued(named(name, dns), &self.issuer)
+    }
+
+    /// A CA below this one, whose own certificate is of version 1.
+    fn below_in_version_1(&self) -> Self {
+        let mut params = named("CA below", &[]);
+        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+        let pair = self.in_version_1(&issued(params.clone(), &self.issuer));
+        let key = || KeyPair::from_pem(&pair.key).unwrap();
+        Self { issuer: Issuer::new(params, key()), key: key(), pem: pair.cert }
     }
 
     /// The same certificate as version 1: without its number and its extensions, and signed again.
@@ -69,6 +72,21 @@ impl Authority {
         let cert = version_1(&pair.cert, &self.key);
         Pair { cert, key: pair.key.clone() }
     }
+}
+
+/// What a certificate with this common name, and these DNS names, is to say.
+fn named(name: &str, dns: &[&str]) -> CertificateParams {
+    let names: Vec<_> = dns.iter().map(|name| (*name).to_owned()).collect();
+    let mut params = CertificateParams::new(names).unwrap();
+    params.distinguished_name = rcgen::DistinguishedName::new();
+    params.distinguished_name.push(DnType::CommonName, name);
+    params
+}
+
+fn issued(params: CertificateParams, issuer: &Issuer<'static, KeyPair>) -> Pair {
+    let key = KeyPair::generate().unwrap();
+    let cert = params.signed_by(&key, issuer).unwrap().pem();
+    Pair { cert, key: key.serialize_pem() }
 }
 
 /// A certificate as version 1 (RFC 5280, 4.1), signed by `issuer`.
@@ -162,9 +180,9 @@ async fn asked(config: &QkdConfig) -> Result<(), String> {
     kme.probe("sae-b").await.map(drop).map_err(|failure| failure.to_string())
 }
 
-/// A TLS server that presents the certificate of `pair`, usable or not, and serves no request.
+/// A TLS server that presents the certificates of `pair`, usable or not, and serves no request.
 fn show(pair: &Pair) -> SocketAddr {
-    let chain = vec![CertificateDer::from_pem_slice(pair.cert.as_bytes()).unwrap()];
+    let chain = CertificateDer::pem_slice_iter(pair.cert.as_bytes()).map(Result::unwrap).collect();
     let key = PrivateKeyDer::from_pem_slice(pair.key.as_bytes()).unwrap();
     let certified = CertifiedKey::new(chain, any_supported_type(&key).unwrap());
     let config = ServerConfig::builder_with_provider(Arc::new(default_provider()))
@@ -193,7 +211,16 @@ async fn a_kme_of_version_1_is_refused_by_that_name() {
     let ca = Authority::new();
     let client = ca.issue("sae-a", &[]);
     let good = ca.issue("kme-a", &["localhost"]);
-    for (pair, said) in [(&ca.in_version_1(&good), true), (&good, false)] {
+    let sent_along =
+        |pair: &Pair, pem: &str| Pair { cert: format!("{}{pem}", pair.cert), ..pair.clone() };
+    // A root is a name and a key, whatever its version. A CA below it has to say that it is one, in an extension.
+    let old_root = sent_along(&good, &version_1(&ca.pem, &ca.key));
+    let below = ca.below_in_version_1();
+    let old_issuer = sent_along(&below.issue("kme-a", &["localhost"]), &below.pem);
+    let shown =
+        [(ca.in_version_1(&good), true), (good, false), (old_root, false), (old_issuer, true)];
+    for (pair, said) in &shown {
+        let said = *said;
         let url = format!("https://localhost:{}", show(pair).port());
         let text = asked(&qkd(sae(dir.path(), &ca.pem, &client, &url))).await.unwrap_err();
         assert_eq!(text.contains(VERSION_1), said, "{text}");
