@@ -107,12 +107,16 @@ async fn client_without_a_key_is_refused() {
 async fn first_known_identity_of_an_offer_is_taken() {
     let cipher = Cipher::default();
     let offer = || vec![key(b"new", 1, cipher), key(b"old", 2, cipher)];
+    let erased = key(b"new", 1, cipher);
+    erased.erase();
     for (known, expected) in [
         (table([key(b"new", 1, cipher), key(b"old", 2, cipher)]), b"new"),
         (table([key(b"old", 2, cipher)]), b"old"),
         (table([key(b"new", 1, cipher)]), b"new"),
         // a key of the other hash under the first identity is no key
         (table([key(b"new", 1, Cipher::Aes256Gcm), key(b"old", 2, cipher)]), b"old"),
+        // nor is an erased one
+        (table([erased, key(b"old", 2, cipher)]), b"old"),
     ] {
         assert_eq!(agreed(offer(), known, PskKex::PskKe).await.unwrap(), expected);
     }

@@ -33,8 +33,8 @@ pub trait PskResolver: Debug + Send + Sync {
     /// here.
     ///
     /// Where a client offers several identities, this is called for each of the first eight, in the
-    /// client's order, until one is known that was derived for the configured cipher. If none is,
-    /// [`resolve()`](Self::resolve) is called for the first one.
+    /// client's order, until one is known that was derived for the configured cipher and is not
+    /// erased. If none is, [`resolve()`](Self::resolve) is called for the first one.
     fn resolve_known(&self, identity: &[u8]) -> Option<Arc<Psk>> {
         self.resolve(identity)
     }
@@ -188,7 +188,8 @@ impl ResolvesExternalPsk for FirstKnown {
         let (first, others) = identities.split_first()?;
         let at_hand = |identity: &&[u8]| {
             let psk = self.resolver.resolve_known(identity)?;
-            (psk.identity() == *identity && psk.cipher() == self.cipher).then_some(psk)
+            let usable = psk.cipher() == self.cipher && !psk.is_erased();
+            (psk.identity() == *identity && usable).then_some(psk)
         };
 
         // A key at hand under a later identity must not cost a fetch of the first one.
