@@ -176,17 +176,23 @@ impl Control {
     /// Sends what is queued, and waits for a daemon whose socket is full.
     fn send_rest(&mut self) {
         let deadline = Instant::now() + FAREWELL;
+        let mut writable = false;
         loop {
+            let queued = self.outbox.len();
             self.send();
             let left = deadline.saturating_duration_since(Instant::now());
             let Link::Socket(socket) = &self.link else { return };
             if self.outbox.is_empty() || left.is_zero() {
                 return;
             }
-            // A socket that is short of descriptors in flight does not say when that passes.
             let nap = left.min(Duration::from_millis(20));
+            // A socket that is short of descriptors in flight is writable, and does not say when that passes.
+            if writable && self.outbox.len() == queued {
+                std::thread::sleep(nap);
+            }
             let nap = Timespec::try_from(nap).ok();
-            let _ = poll(&mut [PollFd::new(socket, PollFlags::OUT)], nap.as_ref());
+            writable =
+                poll(&mut [PollFd::new(socket, PollFlags::OUT)], nap.as_ref()).is_ok_and(|n| n > 0);
         }
     }
 
