@@ -102,7 +102,11 @@ fn find(config: &Config, command: Option<&DaemonCommand>) -> Result<DaemonComman
         return Ok(command.clone());
     }
     let tried = folders(|name| std::env::var_os(name).filter(|_| !is_elevated()));
-    program_in(&tried).ok_or(SessionError::NoProgram { tried })
+    program_in(&tried).ok_or_else(|| {
+        let programs = tried.iter().flat_map(|folder| PROGRAMS.map(|name| folder.join(name)));
+        let untrusted = programs.filter(|path| is_executable(path) && !is_trusted(path)).collect();
+        SessionError::NoProgram { tried, untrusted }
+    })
 }
 
 /// The daemon, and the tool, which can be it.
@@ -124,17 +128,27 @@ fn named(program: &Path) -> DaemonCommand {
     DaemonCommand { program: program.to_owned(), arguments }
 }
 
-/// Whether this can be executed, belongs to this user or to root, and can be replaced by no other. This
-/// very program is passed over: an application that is called `axon` would start itself without end.
+/// Whether this can be started as a daemon. This very program is passed over: an application that is called
+/// `axon` would start itself without end.
 fn is_program(path: &Path) -> bool {
-    let Ok(file) = path.metadata() else { return false };
-    let ours = [0, rustix::process::geteuid().as_raw()].contains(&file.uid());
     let itself = || match (path.canonicalize(), std::env::current_exe()) {
         (Ok(path), Ok(itself)) => path == itself,
         _ => false,
     };
-    let mode = file.permissions().mode();
-    file.is_file() && mode & 0o111 != 0 && mode & 0o002 == 0 && ours && !itself()
+    is_executable(path) && is_trusted(path) && !itself()
+}
+
+fn is_executable(path: &Path) -> bool {
+    path.metadata().is_ok_and(|file| file.is_file() && file.permissions().mode() & 0o111 != 0)
+}
+
+/// Whether this belongs to this user or to root, and not every user may write it. Its group may: where each
+/// user has a group of their own, that is how files are made.
+fn is_trusted(path: &Path) -> bool {
+    path.metadata().is_ok_and(|file| {
+        let ours = [0, rustix::process::geteuid().as_raw()].contains(&file.uid());
+        ours && file.permissions().mode() & 0o002 == 0
+    })
 }
 
 /// Where a daemon's program is looked for, in this order: beside this program, beside the library that
@@ -410,6 +424,7 @@ mod tests {
         fs::set_permissions(other.path().join("axon"), fs::Permissions::from_mode(0o755)).unwrap();
         fs::set_permissions(&daemon, fs::Permissions::from_mode(0o757)).unwrap();
         assert_ne!(program_in(&folders).unwrap().program, daemon, "everybody may replace it");
+        assert!(is_executable(&daemon) && !is_trusted(&daemon));
         fs::set_permissions(&daemon, fs::Permissions::from_mode(0o755)).unwrap();
         let found = program_in(&folders).unwrap();
         assert_eq!((found.program, found.arguments), (daemon, vec![]));

@@ -38,15 +38,19 @@ pub enum SessionError {
     Off,
     /// The program to start was not found.
     #[error(
-        "no daemon runs, and none can be started: there is neither axon_daemon nor axon in {}; install \
+        "no daemon runs, and none can be started: there is neither axon_daemon nor axon in {}{}; install \
          it with `cargo install --git {} axon-cli`, or set AXON_DAEMON_PATH to the daemon's program",
-        tried.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", "),
+        list(tried),
+        PassedOver(untrusted),
         // Not from crates.io, where another project owns the name.
         env!("CARGO_PKG_REPOSITORY")
     )]
     NoProgram {
         /// The folders in which it was looked for.
         tried: Vec<PathBuf>,
+        /// Programs of these names that were not started: they belong to another user, or every user may
+        /// replace them.
+        untrusted: Vec<PathBuf>,
     },
     /// The daemon that was started gave up.
     #[error("the daemon {} did not start: {text}", program.display())]
@@ -150,5 +154,25 @@ impl fmt::Debug for SessionError {
 impl From<CodecError> for SessionError {
     fn from(error: CodecError) -> Self {
         Self::Protocol(error.to_string())
+    }
+}
+
+fn list(paths: &[PathBuf]) -> String {
+    paths.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
+}
+
+/// Names the programs that were not started, if there are any.
+struct PassedOver<'a>(&'a [PathBuf]);
+
+impl fmt::Display for PassedOver<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.0.is_empty() {
+            return Ok(());
+        }
+        let programs = list(self.0);
+        write!(
+            f,
+            " (passed over, since another user owns it or every user may write it: {programs})"
+        )
     }
 }
