@@ -13,6 +13,7 @@ use crate::{
     cli,
     failure::Failure,
     logging,
+    say::say,
     text::{self, Table, grouped},
 };
 
@@ -23,7 +24,12 @@ use crate::{
 pub(crate) fn run(args: &cli::Status) -> Result<ExitCode, Failure> {
     // Whatever is wrong with this host's settings and files: a daemon that runs can be looked at.
     let wrong = match logging::configure() {
-        Ok(config) => gateway::check(&config).map_err(Failure::failed).err(),
+        Ok(config) => {
+            if let Some(line) = config.unknown_variables() {
+                say(format_args!("axon: {line}"));
+            }
+            gateway::check(&config).map_err(Failure::failed).err()
+        }
         Err(failure) => Some(failure),
     };
     let status = wrong.as_ref().map(Failure::report);

@@ -96,6 +96,22 @@ fn what_is_wrong_is_said_and_that_no_daemon_runs() {
 }
 
 #[test]
+fn a_variable_that_is_no_setting_is_named() {
+    let host = Host::new();
+    let _daemon = Running::start(host.axon(&["daemon"]));
+    eventually("the daemon answers", || host.daemon().is_some());
+    let output = status(&host, &[("AXON_EDITOR", "vi".to_owned())], &[]);
+    let stderr = said(&output, "AXON_EDITOR", &["ignored", "AXON_STRICT_ENV"]);
+    assert!(output.status.success(), "{stderr}");
+    // What speaks of security is no foreign variable.
+    for name in ["AXON_CERTIFICATE", "AXON_PINS", "AXON_ROBOT_IDENTITY"] {
+        let output = status(&host, &[(name, "x".to_owned())], &[]);
+        let stderr = said(&output, name, &["accepted"]);
+        assert!(!stderr.contains("ignored"), "{stderr}");
+    }
+}
+
+#[test]
 fn a_daemon_that_runs_is_shown_whatever_is_wrong_here() {
     let dir = tempfile::tempdir().expect("temporary directory");
     let host = Host::new();

@@ -143,7 +143,7 @@ impl Config {
     }
 
     /// What to say about variables that begin with `AXON_` and are no settings: one line, or nothing.
-    pub(crate) fn unknown_variables(&self) -> Option<String> {
+    pub fn unknown_variables(&self) -> Option<String> {
         let names = self.unknown_variables.iter().map(|name| name.escape_debug().to_string());
         let names = names.collect::<Vec<_>>().join(", ");
         (!names.is_empty()).then(|| {
