@@ -6,6 +6,7 @@ use std::env;
 use std::path::Path;
 use std::process::ExitCode;
 
+mod floors;
 mod install_c;
 mod package;
 mod repeat;
@@ -14,6 +15,8 @@ mod rustls_axon;
 const USAGE: &str = "\
 usage: cargo xtask COMMAND
 
+  floors               check that imports between rooms run down only, by the tables of
+                       docs/architecture.md
   install-c PREFIX [PROFILE]
                        build axon-transport's C libraries and daemon, in release unless told
                        otherwise, and install them with header and pkg-config file
@@ -39,6 +42,7 @@ fn main() -> ExitCode {
     let args: Vec<String> = env::args().skip(1).collect();
     let args: Vec<&str> = args.iter().map(String::as_str).collect();
     let result = match args[..] {
+        ["floors"] => floors::check(rustls_axon::workspace()),
         ["install-c", prefix] => install_c::install(prefix.as_ref(), "release"),
         ["install-c", prefix, profile] => install_c::install(prefix.as_ref(), profile),
         ["package", ref options @ ..] => match package::Options::parse(options) {

@@ -1,0 +1,373 @@
+//! Keeps the arrows between the rooms of a crate: imports run down only.
+//!
+//! A room is a module at a crate's root. `docs/architecture.md` has a table for each crate whose rooms stand on
+//! floors: one row a floor, the highest first. A room may import from the rooms below its own row, and from
+//! its own files; not from above, not from a room beside it, and not from the crate's root, which is the top.
+//! Tests may import what they like.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use proc_macro2::{TokenStream, TokenTree};
+use syn::visit::{self, Visit};
+use syn::{Attribute, Item, UseTree};
+
+/// Stands before the table of a crate, with the folder of its sources.
+const MARK: &str = "<!-- floors: ";
+
+/// Checks each crate that has a table; says how many imports were looked at.
+///
+/// # Errors
+/// Each import that runs up, each room that no table has, and each that is no room.
+pub(crate) fn check(root: &Path) -> Result<String, String> {
+    let page = root.join("docs/architecture.md");
+    let text = fs::read_to_string(&page).map_err(|e| format!("{}: {e}", page.display()))?;
+    let houses = houses(&text)?;
+    if houses.is_empty() {
+        return Err(format!("{} has no table of floors", page.display()));
+    }
+    let mut lines = Vec::new();
+    let mut wrong = Vec::new();
+    for (folder, floors) in houses {
+        let imports = imports(&root.join(&folder))?;
+        wrong.extend(judge(&folder, &floors, &imports));
+        lines.push(format!(
+            "{folder}: {} imports between {} rooms run down",
+            imports.len(),
+            floors.len()
+        ));
+    }
+    if wrong.is_empty() { Ok(lines.join("\n")) } else { Err(wrong.join("\n")) }
+}
+
+/// The floor of each room, 0 the highest.
+type Floors = BTreeMap<String, usize>;
+
+/// The folders of sources that the page names, and the rooms in the first column of the table below each.
+fn houses(page: &str) -> Result<Vec<(String, Floors)>, String> {
+    let mut found = Vec::new();
+    for part in page.split(MARK).skip(1) {
+        let (folder, rest) = part.split_once(" -->").ok_or("a mark of floors has no end")?;
+        let rows = rest
+            .lines()
+            .skip_while(|line| !line.starts_with('|'))
+            .take_while(|l| l.starts_with('|'));
+        let mut floors = Floors::new();
+        // Without the heading and the line below it.
+        for (floor, row) in rows.skip(2).enumerate() {
+            let cell = row.split('|').nth(1).unwrap_or_default();
+            for room in cell.split('`').skip(1).step_by(2) {
+                if floors.insert(room.to_owned(), floor).is_some() {
+                    return Err(format!("{folder}: `{room}` is on two floors"));
+                }
+            }
+        }
+        found.push((folder.to_owned(), floors));
+    }
+    Ok(found)
+}
+
+/// An import of another room, or of the crate's root: then `to` is empty.
+#[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Import {
+    from: String,
+    file: PathBuf,
+    to: String,
+    what: String,
+}
+
+/// What is wrong with a crate's imports and its table.
+fn judge(folder: &str, floors: &Floors, imports: &BTreeSet<Import>) -> Vec<String> {
+    let mut wrong = Vec::new();
+    let rooms: BTreeSet<&String> = imports.iter().map(|import| &import.from).collect();
+    for room in rooms.iter().filter(|room| !floors.contains_key(**room)) {
+        wrong.push(format!("{folder}: `{room}` is on no floor of docs/architecture.md"));
+    }
+    for import in imports {
+        let Import { from, file, to, what } = import;
+        let file = file.display();
+        if to.is_empty() {
+            wrong.push(format!("{file}: `{from}` imports {what} from the root, which is above it"));
+            continue;
+        }
+        let (Some(own), Some(other)) = (floors.get(from), floors.get(to)) else {
+            if !floors.contains_key(to) {
+                wrong
+                    .push(format!("{file}: {what}: `{to}` is on no floor of docs/architecture.md"));
+            }
+            continue;
+        };
+        if other < own {
+            wrong.push(format!("{file}: `{from}` imports {what} from above it"));
+        } else if other == own {
+            wrong.push(format!("{file}: `{from}` imports {what} from beside it"));
+        }
+    }
+    wrong
+}
+
+/// All imports between rooms, and from the root, of the crate whose sources are in `folder`.
+fn imports(folder: &Path) -> Result<BTreeSet<Import>, String> {
+    let read = |dir: &Path| {
+        let entries = fs::read_dir(dir).map_err(|e| format!("{}: {e}", dir.display()))?;
+        entries
+            .map(|entry| entry.map(|e| e.path()).map_err(|e| e.to_string()))
+            .collect::<Result<Vec<_>, _>>()
+    };
+    let modules: BTreeSet<String> = read(folder)?.iter().filter_map(|path| name(path)).collect();
+    let mut found = BTreeSet::new();
+    let mut left = read(folder)?;
+    while let Some(path) = left.pop() {
+        let inside = path.strip_prefix(folder).expect("below it");
+        if name(&path).is_some_and(|name| name == "tests") || inside == Path::new("bin") {
+            continue;
+        }
+        if path.is_dir() {
+            left.extend(read(&path)?);
+            continue;
+        }
+        let is_root = matches!(inside.to_str(), Some("lib.rs" | "main.rs"));
+        if path.extension().is_none_or(|extension| extension != "rs") || is_root {
+            continue;
+        }
+        let text = fs::read_to_string(&path).map_err(|e| format!("{}: {e}", path.display()))?;
+        let file = syn::parse_file(&text).map_err(|e| format!("{}: {e}", path.display()))?;
+        let module = module_of(inside);
+        let from = module[0].clone();
+        let mut paths = Paths { module, found: Vec::new() };
+        paths.visit_file(&file);
+        for what in paths.found {
+            let to =
+                what.first().filter(|first| modules.contains(*first)).cloned().unwrap_or_default();
+            if to != from {
+                let what = format!("crate::{}", what.join("::"));
+                found.insert(Import { from: from.clone(), file: path.clone(), to, what });
+            }
+        }
+    }
+    Ok(found)
+}
+
+/// The name of the module in this file or folder.
+fn name(path: &Path) -> Option<String> {
+    Some(path.file_stem()?.to_str()?.to_owned()).filter(|name| name != "lib" && name != "main")
+}
+
+/// The path of the module in this file, from the crate's root.
+fn module_of(inside: &Path) -> Vec<String> {
+    let mut module: Vec<String> =
+        inside.with_extension("").iter().map(|part| part.to_string_lossy().into_owned()).collect();
+    if module.last().is_some_and(|last| last == "mod") {
+        module.pop();
+    }
+    module
+}
+
+/// Collects the paths of a file that begin with `crate` or `super`, as paths from the root.
+struct Paths {
+    module: Vec<String>,
+    found: Vec<Vec<String>>,
+}
+
+impl Paths {
+    /// Notes a path by its parts, if it leaves this module.
+    fn note(&mut self, parts: &[String]) {
+        match parts.first().map(String::as_str) {
+            Some("crate") => self.found.push(parts[1..].to_vec()),
+            Some("super") => {
+                let ups = parts.iter().take_while(|part| *part == "super").count();
+                let above = &self.module[..self.module.len().saturating_sub(ups)];
+                self.found.push(above.iter().chain(&parts[ups..]).cloned().collect());
+            }
+            _ => {}
+        }
+    }
+
+    fn note_use(&mut self, before: &mut Vec<String>, tree: &UseTree) {
+        match tree {
+            UseTree::Path(path) => {
+                before.push(path.ident.to_string());
+                self.note_use(before, &path.tree);
+                before.pop();
+            }
+            UseTree::Group(group) => {
+                group.items.iter().for_each(|tree| self.note_use(before, tree))
+            }
+            UseTree::Name(name) => self.note(&[&before[..], &[name.ident.to_string()]].concat()),
+            UseTree::Rename(name) => self.note(&[&before[..], &[name.ident.to_string()]].concat()),
+            UseTree::Glob(_) => self.note(&[&before[..], &["*".to_owned()]].concat()),
+        }
+    }
+
+    /// A macro's tokens are no syntax tree: `crate::` is looked for among them.
+    fn note_tokens(&mut self, tokens: TokenStream) {
+        let mut parts: Vec<String> = Vec::new();
+        let mut colons = 0;
+        for token in tokens {
+            match token {
+                TokenTree::Ident(ident) => {
+                    if colons != 2 {
+                        self.note(&std::mem::take(&mut parts));
+                    }
+                    parts.push(ident.to_string());
+                    colons = 0;
+                }
+                TokenTree::Punct(punct) if punct.as_char() == ':' => colons += 1,
+                other => {
+                    self.note(&std::mem::take(&mut parts));
+                    colons = 0;
+                    if let TokenTree::Group(group) = other {
+                        self.note_tokens(group.stream());
+                    }
+                }
+            }
+        }
+        self.note(&parts);
+    }
+}
+
+/// Whether this item is compiled for tests only.
+fn is_test(attributes: &[Attribute]) -> bool {
+    attributes.iter().any(|attribute| {
+        attribute.path().is_ident("cfg")
+            && attribute.parse_args::<syn::Path>().is_ok_and(|path| path.is_ident("test"))
+    })
+}
+
+impl<'ast> Visit<'ast> for Paths {
+    fn visit_item(&mut self, item: &'ast Item) {
+        let attributes = match item {
+            Item::Mod(item) => &item.attrs,
+            Item::Use(item) => &item.attrs,
+            Item::Fn(item) => &item.attrs,
+            Item::Impl(item) => &item.attrs,
+            _ => return visit::visit_item(self, item),
+        };
+        if is_test(attributes) {
+            return;
+        }
+        match item {
+            Item::Use(item) => self.note_use(&mut Vec::new(), &item.tree),
+            Item::Mod(inner) => {
+                self.module.push(inner.ident.to_string());
+                visit::visit_item(self, item);
+                self.module.pop();
+            }
+            _ => visit::visit_item(self, item),
+        }
+    }
+
+    fn visit_path(&mut self, path: &'ast syn::Path) {
+        let parts: Vec<String> = path.segments.iter().map(|part| part.ident.to_string()).collect();
+        self.note(&parts);
+        visit::visit_path(self, path);
+    }
+
+    fn visit_vis_restricted(&mut self, _: &'ast syn::VisRestricted) {
+        // `pub(in crate::room)` imports nothing.
+    }
+
+    fn visit_macro(&mut self, found: &'ast syn::Macro) {
+        self.note_tokens(found.tokens.clone());
+        visit::visit_macro(self, found);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PAGE: &str = "\
+Text.
+
+<!-- floors: src -->
+
+| rooms | what |
+| --- | --- |
+| `roof` | highest |
+| `left`, `right` | beside each other |
+| `ground` | lowest |
+
+More text with `roof`.
+";
+
+    /// A crate with these files, and what is wrong with it.
+    fn wrong(files: &[(&str, &str)]) -> String {
+        let dir = tempfile::tempdir().expect("a directory");
+        let put = |name: &str, text: &str| {
+            let path = dir.path().join(name);
+            fs::create_dir_all(path.parent().expect("a folder")).expect("a folder");
+            fs::write(path, text).expect("a file");
+        };
+        put("docs/architecture.md", PAGE);
+        for room in ["roof", "left", "right", "ground"] {
+            put(&format!("src/{room}.rs"), "");
+        }
+        put("src/lib.rs", "mod roof; mod left; mod right; mod ground; pub use roof::Top;");
+        for (name, text) in files {
+            put(&format!("src/{name}"), text);
+        }
+        check(dir.path()).err().unwrap_or_default()
+    }
+
+    #[test]
+    fn imports_from_below_are_allowed() {
+        let text = "use crate::{ground::{Stone, Sand as S}, left::*}; fn f() { crate::right::f() }";
+        assert_eq!(wrong(&[("roof.rs", text)]), "");
+    }
+
+    #[test]
+    fn imports_from_above_beside_and_the_root_are_named() {
+        let cases = [
+            ("left.rs", "use crate::roof::Top;", "`left` imports crate::roof::Top from above it"),
+            (
+                "left.rs",
+                "use crate::right::Hand;",
+                "`left` imports crate::right::Hand from beside it",
+            ),
+            ("left.rs", "use crate::Top;", "`left` imports crate::Top from the root"),
+            ("left.rs", "use super::roof::Top;", "crate::roof::Top from above"),
+            ("left/inner.rs", "use super::super::roof::Top;", "crate::roof::Top from above"),
+            (
+                "left.rs",
+                "mod inner { use super::super::roof::Top; }",
+                "crate::roof::Top from above",
+            ),
+            ("left.rs", "fn f() -> crate::roof::Top { todo!() }", "crate::roof::Top from above"),
+            (
+                "ground.rs",
+                "fn f() { print!(\"{}\", crate::left::f(1)) }",
+                "crate::left::f from above",
+            ),
+            ("ground.rs", "impl crate::left::Hand for () {}", "crate::left::Hand from above"),
+        ];
+        for (file, text, said) in cases {
+            let found = wrong(&[(file, text)]);
+            assert!(found.contains(said) && found.contains(file), "{text}: {found}");
+        }
+    }
+
+    #[test]
+    fn own_files_and_tests_may_import_what_they_like() {
+        let text = "mod inner; use inner::A; use self::inner::B;
+            #[cfg(test)] mod checks { use crate::roof::Top; }
+            #[cfg(test)] use crate::roof::Top;
+            pub(in crate::left) fn f() {}";
+        let inner = "use super::C; use crate::left::D;";
+        let files = [
+            ("left.rs", text),
+            ("left/inner.rs", inner),
+            ("left/tests/all.rs", "use crate::roof::Top;"),
+        ];
+        assert_eq!(wrong(&files), "");
+    }
+
+    #[test]
+    fn a_room_without_a_floor_is_named() {
+        let found = wrong(&[("attic.rs", "use crate::roof::Top;")]);
+        assert!(found.contains("`attic` is on no floor"), "{found}");
+        let found = wrong(&[("attic.rs", ""), ("roof.rs", "use crate::attic::Box;")]);
+        assert!(found.contains("`attic` is on no floor"), "{found}");
+    }
+}
