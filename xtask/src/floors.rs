@@ -107,39 +107,31 @@ fn judge(folder: &str, floors: &Floors, imports: &BTreeSet<Import>) -> Vec<Strin
     wrong
 }
 
+/// A file of a crate, with the path of its module.
+struct Source {
+    path: PathBuf,
+    module: Vec<String>,
+    file: syn::File,
+}
+
 /// All imports between rooms, and from the root, of the crate whose sources are in `folder`.
 fn imports(folder: &Path) -> Result<BTreeSet<Import>, String> {
-    let read = |dir: &Path| {
-        let entries = fs::read_dir(dir).map_err(|e| format!("{}: {e}", dir.display()))?;
-        entries
-            .map(|entry| entry.map(|e| e.path()).map_err(|e| e.to_string()))
-            .collect::<Result<Vec<_>, _>>()
-    };
-    let modules: BTreeSet<String> = read(folder)?.iter().filter_map(|path| name(path)).collect();
+    let mut sources = Vec::new();
+    read(folder, folder, &mut sources)?;
+    let rooms: BTreeSet<String> =
+        sources.iter().filter_map(|s| s.module.first()).cloned().collect();
+    let tests: Vec<Vec<String>> = sources.iter().flat_map(Source::test_modules).collect();
     let mut found = BTreeSet::new();
-    let mut left = read(folder)?;
-    while let Some(path) = left.pop() {
-        let inside = path.strip_prefix(folder).expect("below it");
-        if name(&path).is_some_and(|name| name == "tests") || inside == Path::new("bin") {
+    for Source { path, module, file } in sources {
+        let Some(from) = module.first().cloned() else { continue };
+        if tests.iter().any(|test| module.starts_with(test)) {
             continue;
         }
-        if path.is_dir() {
-            left.extend(read(&path)?);
-            continue;
-        }
-        let is_root = matches!(inside.to_str(), Some("lib.rs" | "main.rs"));
-        if path.extension().is_none_or(|extension| extension != "rs") || is_root {
-            continue;
-        }
-        let text = fs::read_to_string(&path).map_err(|e| format!("{}: {e}", path.display()))?;
-        let file = syn::parse_file(&text).map_err(|e| format!("{}: {e}", path.display()))?;
-        let module = module_of(inside);
-        let from = module[0].clone();
         let mut paths = Paths { module, found: Vec::new() };
         paths.visit_file(&file);
         for what in paths.found {
             let to =
-                what.first().filter(|first| modules.contains(*first)).cloned().unwrap_or_default();
+                what.first().filter(|first| rooms.contains(*first)).cloned().unwrap_or_default();
             if to != from {
                 let what = format!("crate::{}", what.join("::"));
                 found.insert(Import { from: from.clone(), file: path.clone(), to, what });
@@ -149,16 +141,44 @@ fn imports(folder: &Path) -> Result<BTreeSet<Import>, String> {
     Ok(found)
 }
 
-/// The name of the module in this file or folder.
-fn name(path: &Path) -> Option<String> {
-    Some(path.file_stem()?.to_str()?.to_owned()).filter(|name| name != "lib" && name != "main")
+/// Reads the files below `dir`, but for programs in `bin`.
+fn read(folder: &Path, dir: &Path, sources: &mut Vec<Source>) -> Result<(), String> {
+    let entries = fs::read_dir(dir).map_err(|e| format!("{}: {e}", dir.display()))?;
+    for entry in entries {
+        let path = entry.map_err(|e| format!("{}: {e}", dir.display()))?.path();
+        let inside = path.strip_prefix(folder).expect("below it");
+        if path.is_dir() {
+            if inside != Path::new("bin") {
+                read(folder, &path, sources)?;
+            }
+        } else if path.extension().is_some_and(|extension| extension == "rs") {
+            let text = fs::read_to_string(&path).map_err(|e| format!("{}: {e}", path.display()))?;
+            let file = syn::parse_file(&text).map_err(|e| format!("{}: {e}", path.display()))?;
+            sources.push(Source { module: module_of(inside), file, path });
+        }
+    }
+    Ok(())
 }
 
-/// The path of the module in this file, from the crate's root.
+impl Source {
+    /// The modules in files of their own that this one has for tests only.
+    fn test_modules(&self) -> Vec<Vec<String>> {
+        let is_test_file = |item: &Item| match item {
+            Item::Mod(item) if item.content.is_none() && is_test(&item.attrs) => {
+                Some(item.ident.to_string())
+            }
+            _ => None,
+        };
+        let names = self.file.items.iter().filter_map(is_test_file);
+        names.map(|name| [&self.module[..], &[name]].concat()).collect()
+    }
+}
+
+/// The path of the module in this file, from the crate's root, whose own is empty.
 fn module_of(inside: &Path) -> Vec<String> {
     let mut module: Vec<String> =
         inside.with_extension("").iter().map(|part| part.to_string_lossy().into_owned()).collect();
-    if module.last().is_some_and(|last| last == "mod") {
+    if module.last().is_some_and(|last| last == "mod") || module == ["lib"] || module == ["main"] {
         module.pop();
     }
     module
@@ -351,6 +371,7 @@ More text with `roof`.
     #[test]
     fn own_files_and_tests_may_import_what_they_like() {
         let text = "mod inner; use inner::A; use self::inner::B;
+            #[cfg(test)] mod tests;
             #[cfg(test)] mod checks { use crate::roof::Top; }
             #[cfg(test)] use crate::roof::Top;
             pub(in crate::left) fn f() {}";
