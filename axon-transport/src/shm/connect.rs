@@ -19,12 +19,11 @@ use rustix::{
     },
 };
 
-use super::{Location, PeerDescriptors, SegmentInfo, ShmError};
+use super::{Location, PeerDescriptors, SegmentInfo, SegmentName, SegmentOpened, ShmError};
 use crate::{
     ids::{Gid, SessionId},
     passed::{self, PassedFd},
     qos::{Incompatible, Qos},
-    session::message::{SegmentName, SegmentOpened},
 };
 
 /// First of each packet.

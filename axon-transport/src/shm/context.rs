@@ -11,14 +11,14 @@ use std::{
 };
 
 use super::{
-    Location, Peer, PeerDescriptors, PeerSession, SessionSegment, ShmError,
+    Location, Peer, PeerDescriptors, PeerSession, SegmentName, SegmentOpened, SessionSegment,
+    ShmError,
     connect::{Granted, News},
     lines::Lines,
 };
 use crate::{
     ids::{Gid, SessionId},
     passed::PassedFd,
-    session::message::{SegmentName, SegmentOpened},
     wait::ExternalLeader,
 };
 

@@ -2,7 +2,7 @@
 
 use std::sync::atomic::AtomicU64;
 
-use super::{ShmError, classes, loan::ALIGNED, sync::Ordering};
+use super::{ShmError, classes, sync::Ordering};
 use crate::ids::{Gid, SessionId};
 
 /// Segments are multiples of this many bytes, and memory is committed in them.
@@ -23,6 +23,8 @@ pub(super) const COPIED: u64 = 4096;
 pub(super) const COPIED_ALWAYS: u64 = 512;
 /// Bytes of a sample that fit in its descriptor.
 pub(super) const INLINE: usize = 88;
+/// What is lent is aligned to so many bytes, or what is behind its header: as any type of C is at least.
+pub(super) const ALIGNED: usize = align_of::<u128>();
 /// Lanes of a session: how many rings it can read at a time.
 pub(super) const LANES: u32 = 4096;
 

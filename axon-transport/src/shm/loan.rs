@@ -8,10 +8,10 @@ use std::{
     sync::Arc,
 };
 
-use rustix::time::{ClockId, clock_gettime};
-
 use super::{
     Location, Meta, PublishError, Published, Writer,
+    clock::wall,
+    layout::ALIGNED,
     segments::OwnSegment,
     writer::{Numbering, PATIENCE, Patience, Payload},
 };
@@ -52,9 +52,6 @@ pub struct Loan<'a> {
     written: usize,
     memory: Memory,
 }
-
-/// What is lent is aligned to so many bytes, or what is behind its header: as any type of C is at least.
-pub(super) const ALIGNED: usize = align_of::<u128>();
 
 /// Whose memory it is.
 pub(super) enum Lender<'a> {
@@ -127,7 +124,7 @@ impl<'a> Loan<'a> {
     /// # Errors
     /// As for [`publish`](Self::publish).
     pub fn publish_now(self) -> Result<u64, PublishError> {
-        self.publish_next(now())
+        self.publish_next(wall())
     }
 
     /// As [`publish_next`](Self::publish_next), of its first `len` bytes.
@@ -261,10 +258,4 @@ fn bytes_of(words: &[u128]) -> &[u8] {
 fn bytes_of_mut(words: &mut [u128]) -> &mut [u8] {
     // SAFETY: the same memory, borrowed as long and mutably; any bytes are a word.
     unsafe { slice::from_raw_parts_mut(words.as_mut_ptr().cast(), size_of_val(words)) }
-}
-
-/// Nanoseconds since the Unix epoch.
-pub(crate) fn now() -> i64 {
-    let now = clock_gettime(ClockId::Realtime);
-    now.tv_sec.saturating_mul(1_000_000_000).saturating_add(now.tv_nsec).max(0)
 }

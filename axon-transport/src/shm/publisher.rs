@@ -9,8 +9,8 @@ use std::{
 use super::{
     ConnectError, Context, Grant, Loan, Meta, Peer, PeerDescriptors, PublishError, ReaderInfo,
     RingOptions, ShmError, Writer,
+    clock::wall,
     connect::{Asked, Channel, Granted},
-    loan,
 };
 use crate::{
     ids::Gid,
@@ -167,7 +167,7 @@ impl Publisher {
     /// # Errors
     /// The sample was not published; what to do is in the error.
     pub fn publish(&self, payload: &[u8]) -> Result<u64, PublishError> {
-        let published = self.writer.publish_next(loan::now(), payload);
+        let published = self.writer.publish_next(wall(), payload);
         self.keep_up();
         published
     }
@@ -177,7 +177,7 @@ impl Publisher {
     /// # Errors
     /// As for [`publish`](Self::publish).
     pub fn try_publish(&self, payload: &[u8]) -> Result<u64, PublishError> {
-        let published = self.writer.try_publish_next(loan::now(), payload);
+        let published = self.writer.try_publish_next(wall(), payload);
         self.keep_up();
         published
     }

@@ -1,20 +1,12 @@
 //! What a ring says of its publisher besides samples: how long these and its leases last, and when it
 //! was heard of last. Times are nanoseconds of the monotonic clock that all processes of a host share.
 
-use rustix::time::{ClockId, clock_gettime};
-
 use super::{
     Reader, Writer,
     layout::ring,
     sync::{Ordering, Word},
 };
 use crate::qos::Qos;
-
-/// Nanoseconds of the monotonic clock, which is the same in all processes of a host.
-pub(crate) fn monotonic() -> u64 {
-    let now = clock_gettime(ClockId::Monotonic);
-    now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
-}
 
 /// What a reader sees of its publisher's times.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

@@ -1,18 +1,20 @@
-//! Images at depth one beside other topics, at the sizes that the settings are by default.
+//! Images at depth one beside other topics, at the sizes that AXON's settings are by default.
 
 use std::{collections::VecDeque, thread};
 
 use super::*;
-use crate::{config::Config, qos::Reliability};
+use crate::qos::Reliability;
+
+/// `AXON_RING_BUFFER_SIZE_MB` and `AXON_MAX_MESSAGE_MB`, where nobody sets them.
+const BUDGET: u64 = 64 << 20;
+const MAX_MESSAGE: u64 = 256 << 20;
 
 /// Kept by a reader at most, while it takes the next.
 const KEPT: usize = 2;
 
 fn create(session: &Arc<SessionSegment>, number: u32, qos: Qos) -> Writer {
-    let Config { ring_bytes, max_message, .. } =
-        Config::resolve([], None, &crate::config::OsFiles).unwrap();
     let gid = Gid::new(session.id(), number);
-    let options = RingOptions { gid, qos, budget: ring_bytes, max_message, expected: 0 };
+    let options = RingOptions { gid, qos, budget: BUDGET, max_message: MAX_MESSAGE, expected: 0 };
     Writer::create(session.clone(), options).unwrap()
 }
 

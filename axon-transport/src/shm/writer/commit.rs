@@ -11,6 +11,7 @@ use crate::{
     shm::{
         Loan, Location, Meta, PeerSession, PublishError, Published, Writer,
         area::Area,
+        clock::monotonic,
         history::Extent,
         layout::{self, COPIED, INLINE},
         loan::{Lender, Place as LoanPlace},
@@ -185,7 +186,7 @@ impl Writer {
     fn published_at(&self, meta: Meta) -> u64 {
         match (self.options.qos.lifespan, meta.published) {
             (None, _) => 0,
-            (Some(_), 0) => times::monotonic(),
+            (Some(_), 0) => monotonic(),
             (Some(_), earlier) => earlier,
         }
     }
