@@ -7,7 +7,8 @@ mod codec;
 #[cfg(test)]
 mod tests;
 
-pub use crate::shm::{Segment, SegmentName, SegmentOpened};
+use axon_shm::internal::Location;
+pub use axon_shm::internal::{Segment, SegmentName, SegmentOpened};
 pub use codec::CodecError;
 use minicbor::{Decode, Encode};
 use serde::Serialize;
@@ -16,7 +17,6 @@ use crate::{
     graph::{Endpoint, Reach},
     ids::{DaemonId, Gid, SessionId},
     qos::Qos,
-    shm::Location,
 };
 
 /// The version of the session protocol that this crate speaks.
