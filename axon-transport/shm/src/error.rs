@@ -50,8 +50,8 @@ pub enum ShmError {
     #[error(
         "a ring for messages of {max_message} bytes and {budget} bytes of history is too large: \
          messages may take {} bytes and histories {} bytes",
-        super::layout::MAX_MESSAGE,
-        super::layout::MAX_BUDGET
+        super::limits::MAX_MESSAGE,
+        super::limits::MAX_BUDGET
     )]
     TooLarge {
         /// The largest message that was asked for, in bytes.

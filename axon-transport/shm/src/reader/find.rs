@@ -7,11 +7,14 @@ use std::{
 
 use super::{ATTEMPTS, Descriptors, KNOWN, MISSING, MISSING_DEAD, Missing, Obstacle, Reader};
 use crate::{
-    TakeError, copy,
-    layout::{self, Array, COPIED, COPIED_ALWAYS},
-    peer::Found,
-    ring::{self, Look, Place, Record, State},
-    sample::Extract,
+    error::TakeError,
+    memory::copy,
+    reader::sample::Extract,
+    ring::{
+        layout::{self, Array, COPIED, COPIED_ALWAYS},
+        protocol::{self, Look, Place, Record, State},
+    },
+    session::peer::Found,
 };
 
 impl Reader {
@@ -45,7 +48,7 @@ impl Reader {
 
     fn find_sane(&mut self) -> Result<Option<Record>, Obstacle> {
         for _ in 0..ATTEMPTS {
-            let word = ring::array(self.attachment.ring());
+            let word = protocol::array(self.attachment.ring());
             if self.descriptors.as_ref().is_none_or(|known| known.word != word) {
                 self.descriptors = None;
                 self.descriptors = Some(self.resolve(word)?);
@@ -88,7 +91,7 @@ impl Reader {
     /// Counts what is skipped and what is lost, by what the head, which is at least `least`, and
     /// the tail say.
     fn count(&mut self, least: u64) -> Result<(), Obstacle> {
-        let (tail, head) = ring::bounds(self.attachment.ring()).map_err(Obstacle::Corrupt)?;
+        let (tail, head) = protocol::bounds(self.attachment.ring()).map_err(Obstacle::Corrupt)?;
         let head = head.max(least);
         // A sample may be taken by its stamp before the head says so.
         if head + 1 < self.cursor {
@@ -253,7 +256,7 @@ impl Reader {
 
     /// All that is published is lost, and nothing else will be.
     fn give_all_up(&mut self) -> Result<(), &'static str> {
-        let (_, head) = ring::bounds(self.attachment.ring())?;
+        let (_, head) = protocol::bounds(self.attachment.ring())?;
         self.given_up = true;
         self.missing = None;
         self.lost += head.saturating_sub(self.cursor);

@@ -1,6 +1,7 @@
 //! The taking end of a ring.
 
 mod find;
+pub(crate) mod sample;
 mod under_way;
 
 use std::{
@@ -10,20 +11,26 @@ use std::{
 };
 
 use self::{find::Bytes, under_way::UnderWay};
-use super::{
-    Grant, Lane, Location, Meta, Peer, Sample, ShmError, TakeError, Taken,
-    allowance::Allowance,
-    attachment::{Attachment, Pinning},
-    audience::{depth, holds},
-    layout,
-    memory::Map,
-    peer::Found,
-    ring::{self, MAX_POSITION, Record, State, View},
-};
 use crate::{
+    alloc::allowance::Allowance,
+    error::{ShmError, TakeError},
     ids::Gid,
+    memory::segment::Map,
     qos::Qos,
-    wait::{Purpose, settle},
+    reader::sample::Sample,
+    ring::{
+        layout::{self, Location},
+        protocol::{self, MAX_POSITION, Record, State, View},
+        times::{Times, read},
+        types::{Grant, Meta, Taken},
+        window::{depth, holds},
+    },
+    session::{
+        attachment::{Attachment, Pinning},
+        lane::Lane,
+        peer::{Found, Peer},
+    },
+    wake::{Purpose, settle},
 };
 
 /// How often a take follows a publisher that keeps overtaking it before it lets go.
@@ -191,11 +198,11 @@ impl Reader {
             };
             return !matches!(self.reads.peer.find(missing.segment), Found::Absent)
                 // It may not be needed any more.
-                || ring::bounds(self.attachment.ring()).is_ok_and(more)
+                || protocol::bounds(self.attachment.ring()).is_ok_and(more)
                 // It is to be asked for again, or given up.
                 || missing.asked.elapsed() >= MISSING;
         }
-        let word = ring::array(self.attachment.ring());
+        let word = protocol::array(self.attachment.ring());
         let found;
         let descriptors = match &self.descriptors {
             Some(known) if known.word == word => known,
@@ -224,7 +231,7 @@ impl Reader {
         if self.given_up || self.attachment.lane.is_forked() {
             return 0;
         }
-        match (self.corrupt, ring::bounds(self.attachment.ring())) {
+        match (self.corrupt, protocol::bounds(self.attachment.ring())) {
             (None, Ok((tail, head))) => {
                 // The stamp of the last one may have come before the head.
                 let unread = head.saturating_sub(self.cursor.max(tail));
@@ -394,7 +401,7 @@ impl Reader {
         if self.corrupt.is_some() || self.attachment.lane.is_forked() {
             return 0;
         }
-        let head = ring::bounds(self.attachment.ring()).map_or(self.cursor, |(_, head)| head);
+        let head = protocol::bounds(self.attachment.ring()).map_or(self.cursor, |(_, head)| head);
         // A sample may be taken by its stamp before the head says so.
         head.max(self.cursor).saturating_sub(self.reads.grant.first)
     }
@@ -461,6 +468,11 @@ impl Reader {
             settle::<AtomicU64>();
             self.reads.peer.ring_if(Purpose::Room);
         }
+    }
+
+    /// What the publisher says of its times.
+    pub fn times(&self) -> Times {
+        self.ring_words().map_or_else(Times::default, read)
     }
 }
 

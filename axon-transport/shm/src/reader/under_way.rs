@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 
 use super::Reader;
-use crate::ring;
+use crate::ring::protocol;
 
 /// Numbers and positions of samples that were taken and are not done with, and how many samples were given
 /// up so far.
@@ -83,7 +83,7 @@ impl Reader {
         if self.under_way.is_none() || self.attachment.lane.is_forked() {
             return;
         }
-        if let Ok((tail, _)) = ring::bounds(self.attachment.ring()) {
+        if let Ok((tail, _)) = protocol::bounds(self.attachment.ring()) {
             let first = tail.max(self.reads.grant.first);
             if first < self.cursor {
                 self.cursor = first;

@@ -1,7 +1,7 @@
 //! What one process can take of another: only so much.
 
-use super::{super::memory::Segment, *};
-use crate::seats::OF_PROCESS;
+use super::*;
+use crate::{memory::segment::Segment, session::seats::OF_PROCESS};
 
 /// A segment as a session would announce it: of address space, and of next to no memory.
 fn sparse(of: &SessionSegment, number: u32, bytes: u64) -> Segment {
@@ -16,7 +16,7 @@ fn a_session_fills_no_address_space_but_its_share() {
     let peer = PeerSession::map(a.id(), a.descriptors().unwrap()).unwrap();
     let add = |number| {
         let info = SegmentInfo { number, kind: SegmentKind::Heap };
-        peer.add_segment(info, sparse(&a, number, layout::MAX_SEGMENT).fd())
+        peer.add_segment(info, sparse(&a, number, crate::limits::MAX_SEGMENT).fd())
     };
     // Four tebibytes of it, less what the first segment takes.
     (1..64).for_each(|number| add(number).unwrap());
@@ -41,7 +41,7 @@ fn sessions_of_one_process_share_its_address_space() {
     let other = PeerSession::map_among(b.id(), b.descriptors().unwrap(), [&one]).unwrap();
     let add = |to: &PeerSession, of: &SessionSegment, number| {
         let info = SegmentInfo { number, kind: SegmentKind::Heap };
-        to.add_segment(info, sparse(of, number, layout::MAX_SEGMENT).fd())
+        to.add_segment(info, sparse(of, number, crate::limits::MAX_SEGMENT).fd())
     };
     (1..40).for_each(|number| add(&one, &a, number).unwrap());
     let first = (1..64).find(|&number| add(&other, &b, number).is_err());

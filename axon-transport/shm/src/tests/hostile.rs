@@ -13,7 +13,8 @@ use rustix::{
     pipe::pipe,
 };
 
-use super::{super::memory::Segment, *};
+use super::*;
+use crate::memory::segment::Segment;
 
 const RING: u64 = layout::HEAP_AT;
 const ARRAY: u64 = RING + 512;

@@ -4,8 +4,8 @@ use std::os::fd::AsFd;
 
 use super::*;
 use crate::{
-    inspect::{self, LaneCounts, RingCounts},
     qos::Reliability,
+    ring::inspect::{self, LaneCounts, RingCounts},
 };
 
 fn counts(session: &SessionSegment, writer: &Writer) -> RingCounts {

@@ -12,14 +12,12 @@ use std::{
 
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
 
-use super::{
-    api::{SOON, pair, publisher, together},
-    *,
-};
+use super::*;
 use crate::{
-    connect::{Asked, Channel, Granted, News},
-    heap::Need,
-    passed::PassedFd,
+    alloc::heap::Need,
+    direct::connect::{Asked, Channel, Granted, News},
+    os::descriptors::PassedFd,
+    tests::api::{SOON, pair, publisher, together},
 };
 
 fn contexts() -> (Context, Context) {
@@ -206,8 +204,8 @@ fn memory_that_could_not_be_mapped_is_mapped_when_there_is_room() {
     let mut subscriber = together(&publisher, &there, keep_last(1)).1.unwrap();
     // All the address space that one context may take of another, but for a mebibyte.
     let open = |bytes| here.session().open_samples(publisher.gid(), bytes).unwrap().number();
-    let mut numbers: Vec<_> = (0..63).map(|_| open(layout::MAX_SEGMENT)).collect();
-    numbers.push(open(layout::MAX_SEGMENT - layout::SESSION_BYTES - (1 << 20)));
+    let mut numbers: Vec<_> = (0..63).map(|_| open(crate::limits::MAX_SEGMENT)).collect();
+    numbers.push(open(crate::limits::MAX_SEGMENT - layout::SESSION_BYTES - (1 << 20)));
     let seen = there.peer(here.id(), here.session().descriptors().unwrap()).unwrap();
     let seen = seen.remote().unwrap();
     let start = Instant::now();

@@ -20,10 +20,26 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::*;
 use crate::{
+    Context, Meta, Publisher, PublisherOptions, Sample, Subscriber, SubscriberOptions,
+    alloc::segments::{SegmentEvent, SegmentInfo},
+    direct::connect::{self, ConnectError},
+    error::{PublishError, ShmError, TakeError},
     ids::{Gid, SessionId},
+    memory::headroom,
     qos::{Durability, History, Qos},
+    reader::{Reader, ReaderOptions},
+    ring::{
+        layout::{self, Location, SegmentKind},
+        types::{Grant, RingOptions},
+    },
+    session::{
+        lane::Lane,
+        peer::{Peer, PeerDescriptors, PeerSession},
+        reader_info::ReaderInfo,
+        segment::SessionSegment,
+    },
+    writer::Writer,
 };
 
 const MAX: u64 = 1 << 20;

@@ -9,7 +9,7 @@ use std::{
     process::{Command, Stdio},
 };
 
-use super::super::sync::Site;
+use crate::sync::Site;
 
 /// The model that catches each.
 fn caught_by(site: Site) -> &'static str {
@@ -41,7 +41,7 @@ fn caught_by(site: Site) -> &'static str {
         LetGoSwap | TakeSwap => {
             "tests::model::lock::whoever_takes_a_lock_sees_what_its_last_holder_did"
         }
-        ArmFence | SettleFence => "wait::tests::the_last_look_or_the_ring_finds_what_came",
+        ArmFence | SettleFence => "wake::tests::the_last_look_or_the_ring_finds_what_came",
     }
 }
 

@@ -8,12 +8,10 @@ use std::{
     time::Duration,
 };
 
-use super::{
-    super::{
-        pins::RECORDS,
-        writer::{Numbering, Patience},
-    },
-    *,
+use super::*;
+use crate::{
+    ring::pins::RECORDS,
+    writer::{Numbering, Patience},
 };
 
 const LARGE: usize = 10_000;

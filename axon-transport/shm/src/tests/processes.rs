@@ -5,10 +5,8 @@
 
 use std::{env, io::Write as _, os::fd::AsFd, thread, time::Duration};
 
-use super::{
-    wire::{LARGE, Other, PART, Wire},
-    *,
-};
+use super::*;
+use crate::tests::wire::{LARGE, Other, PART, Wire};
 
 fn large_writer(session: &Arc<SessionSegment>, qos: Qos, budget: u64) -> Writer {
     let gid = Gid::new(session.id(), 1);

@@ -14,7 +14,7 @@ use rustix::net::{
 };
 
 use super::*;
-use crate::passed::PassedFd;
+use crate::os::descriptors::PassedFd;
 
 /// Tells this binary that it is the other process, and which part it plays.
 pub(super) const PART: &str = "SHM_TEST_PART";

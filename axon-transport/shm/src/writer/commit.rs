@@ -7,17 +7,24 @@ use std::{
 
 use super::{LOOKS, Numbering, Payload, State};
 use crate::{
-    Loan, Location, Meta, PeerSession, PublishError, Published, Writer,
-    area::Area,
-    clock::monotonic,
-    history::Extent,
-    layout::{self, COPIED, INLINE},
-    loan::{Lender, Place as LoanPlace},
+    alloc::area::Area,
+    error::PublishError,
+    os::clock::monotonic,
     qos::Durability,
-    ring::{self, Place, Record},
-    room::Refusal,
+    ring::{
+        layout::{self, COPIED, INLINE, Location},
+        protocol::{self, Place, Record},
+        types::{Meta, Published},
+    },
+    session::peer::PeerSession,
     sync::{Ordering, Word},
-    wait::{Purpose, settle},
+    wake::{Purpose, settle},
+    writer::{
+        Writer,
+        history::Extent,
+        loan::{Lender, Loan, Place as LoanPlace},
+        room::Refusal,
+    },
 };
 
 /// How long a publish waits altogether, from the first time on that it has to.
@@ -174,8 +181,8 @@ impl Writer {
             len: u32::try_from(len).expect("no longer than the largest message"),
             place,
         };
-        ring::about_to_write::<AtomicU64>();
-        ring::publish(self.ring.words(), state.array.words(), position, &record, inline);
+        protocol::about_to_write::<AtomicU64>();
+        protocol::publish(self.ring.words(), state.array.words(), position, &record, inline);
         position
     }
 

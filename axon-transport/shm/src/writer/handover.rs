@@ -6,7 +6,7 @@ use std::{
 };
 
 use super::{State, Writer};
-use crate::{PeerSession, ids::Gid};
+use crate::{ids::Gid, session::peer::PeerSession};
 
 impl Writer {
     /// The number up to which all that was published has been handed to those who carry it elsewhere.

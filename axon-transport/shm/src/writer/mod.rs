@@ -1,32 +1,52 @@
 //! The publishing end of a ring.
 
+pub(crate) mod absent;
+pub(crate) mod audience;
 mod commit;
 mod handover;
+pub(crate) mod history;
+pub(crate) mod loan;
+pub(crate) mod room;
+pub(crate) mod samples;
+mod tally;
+mod times;
 
 use std::{sync::Arc, time::Duration};
 
 pub use self::commit::MAX_GAP;
 pub(super) use self::commit::Patience;
 
-use super::{
-    Grant, Loan, Location, Meta, PublishError, Published, ReaderInfo, RingOptions, SessionSegment,
-    ShmError, Terms,
-    allowance::Pool,
-    area::Area,
-    audience::{Audience, keeps_all},
-    heap::{Need, Object},
-    history::History,
-    layout::{self, ALIGNED, Array, COPIED, COPIED_ALWAYS},
-    loan::Lender,
-    orphans::Orphan,
-    pi_mutex::{PiGuard, PiMutex},
-    ring,
-    room::Maps,
-    samples::Samples,
-    seats::Pinned,
-    times,
+use crate::{
+    alloc::{
+        allowance::Pool,
+        area::Area,
+        heap::{Need, Object},
+    },
+    error::{PublishError, ShmError},
+    ids::Gid,
+    os::pi_mutex::{PiGuard, PiMutex},
+    qos::History as Keep,
+    ring::{
+        layout::{self, ALIGNED, Array, COPIED, COPIED_ALWAYS, Location},
+        protocol,
+        times::offer,
+        types::{Grant, Meta, Published, RingOptions},
+        window::keeps_all,
+    },
+    session::{
+        orphans::Orphan,
+        reader_info::{ReaderInfo, Terms},
+        seats::Pinned,
+        segment::SessionSegment,
+    },
+    writer::{
+        audience::Audience,
+        history::History,
+        loan::{Lender, Loan},
+        room::Maps,
+        samples::Samples,
+    },
 };
-use crate::{ids::Gid, qos::History as Keep};
 
 /// How long a publish waits for a KEEP_ALL reader.
 pub(super) const PATIENCE: Duration = Duration::from_millis(100);
@@ -130,7 +150,7 @@ impl State {
     /// The first position that stands whose sample has a higher number.
     fn position_after(&self, number: u64) -> u64 {
         let standing = self.history.tail()..self.history.head();
-        let later = |position: &u64| ring::number(self.array.words(), *position) > number;
+        let later = |position: &u64| protocol::number(self.array.words(), *position) > number;
         standing.rev().take_while(later).last().unwrap_or(self.history.head())
     }
 
@@ -138,7 +158,7 @@ impl State {
     pub(super) fn number_before(&self, position: u64) -> u64 {
         let stands = position >= self.history.tail() && position < self.history.head();
         if stands {
-            ring::number(self.array.words(), position).saturating_sub(1)
+            protocol::number(self.array.words(), position).saturating_sub(1)
         } else {
             self.last
         }
@@ -215,10 +235,10 @@ impl Writer {
                 return Err(error);
             }
         };
-        ring::copy_descriptors(array.words(), array.words(), 0, 0);
+        protocol::copy_descriptors(array.words(), array.words(), 0, 0);
         let at = Array { at: array.block.at, descriptors };
         layout::write_ring(ring.words(), options.gid, &at);
-        times::offer(ring.words(), &options.qos);
+        offer(ring.words(), &options.qos);
         let mut history = History::new(descriptors, budget);
         if keeps_all(&qos) {
             history.count_descriptors();

@@ -5,17 +5,17 @@ use loom::{
     thread,
 };
 
-use super::{
-    super::super::{
-        lane,
+use crate::{
+    ring::{
         layout::{DESCRIPTOR_WORDS, LANE_WORDS, RING_WORDS},
-        ring::{
+        protocol::{
             Look, Place, State, View, about_to_write, array, copy_descriptors, publish, replace,
             retire,
         },
-        sync::{Ordering, Word},
     },
-    Cell, check, record, zeros,
+    session::lane,
+    sync::{Ordering, Word},
+    tests::model::{Cell, check, record, zeros},
 };
 
 /// A ring with two arrays to be in: two descriptors, then four.

@@ -2,18 +2,20 @@
 
 use loom::{sync::Arc, thread};
 
-use super::{
-    super::super::{
-        Grant,
-        allowance::Allowance,
-        lane::{self, Standing, Tenancy},
+use crate::{
+    alloc::allowance::Allowance,
+    ring::{
         layout::{LANE_WORDS, lane::CURSOR},
         pins::{about_to_scan, pin, unpin},
-        ring::retire,
-        seats::{Pinned, scan},
-        sync::{Ordering, Word},
+        protocol::retire,
+        types::Grant,
     },
-    Cell, Ring, check, granted, zeros,
+    session::{
+        lane::{self, Standing, Tenancy},
+        seats::{Pinned, scan},
+    },
+    sync::{Ordering, Word},
+    tests::model::{Cell, Ring, check, granted, zeros},
 };
 
 /// `OpenStore`, `GenerationLoad`: what the lane's last reader left is not taken for this one's.

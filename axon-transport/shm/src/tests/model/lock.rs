@@ -6,9 +6,9 @@ use loom::{
     thread,
 };
 
-use super::{
-    super::super::pi_mutex::{let_go, take},
-    Cell, check,
+use crate::{
+    os::pi_mutex::{let_go, take},
+    tests::model::{Cell, check},
 };
 
 /// `LetGoSwap`, `TakeSwap`.

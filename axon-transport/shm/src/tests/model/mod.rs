@@ -15,12 +15,14 @@ mod ring;
 
 use loom::sync::{Arc, atomic::AtomicU64};
 
-use super::super::{
-    Grant,
-    allowance::Allowance,
-    lane::{self, Tenancy},
-    layout::{DESCRIPTOR_WORDS, LANE_WORDS, RING_WORDS, ring::TAIL},
-    ring::{Place, Record, View, about_to_write, publish},
+use crate::{
+    alloc::allowance::Allowance,
+    ring::{
+        layout::{DESCRIPTOR_WORDS, LANE_WORDS, RING_WORDS, ring::TAIL},
+        protocol::{Place, Record, View, about_to_write, publish},
+        types::Grant,
+    },
+    session::lane::{self, Tenancy},
 };
 
 /// Payload that is read and written like any memory.

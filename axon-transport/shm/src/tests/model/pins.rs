@@ -5,14 +5,16 @@ use loom::{
     thread,
 };
 
-use super::{
-    super::super::{
-        lane::{self, Tenancy},
+use crate::{
+    ring::{
         pins::{about_to_scan, free, pin, unpin},
-        ring::{bounds, retire},
+        protocol::{bounds, retire},
+    },
+    session::{
+        lane::{self, Tenancy},
         seats::{Pinned, scan},
     },
-    Cell, Ring, check, granted,
+    tests::model::{Cell, Ring, check, granted},
 };
 
 /// Whether `position`, below the tail, may be written over.

@@ -5,14 +5,14 @@ use loom::{
     thread,
 };
 
-use super::{
-    super::super::{
-        lane,
+use crate::{
+    ring::{
         layout::Location,
-        ring::{Look, Place, State, about_to_write, bounds, copy_in, retire},
-        sync::{Ordering, Word},
+        protocol::{Look, Place, State, about_to_write, bounds, copy_in, retire},
     },
-    Cell, Ring, check, granted, record, zeros,
+    session::lane,
+    sync::{Ordering, Word},
+    tests::model::{Cell, Ring, check, granted, record, zeros},
 };
 
 const DESCRIPTORS: u64 = 2;
