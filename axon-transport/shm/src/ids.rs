@@ -71,6 +71,7 @@ id! {
 
 impl Gid {
     /// The GID of entity `number` of `session`.
+    #[inline]
     pub fn new(session: SessionId, number: u32) -> Self {
         let mut gid = session.0;
         gid[12..].copy_from_slice(&number.to_be_bytes());
@@ -78,11 +79,13 @@ impl Gid {
     }
 
     /// Whether it and `other` are of the same session.
+    #[inline]
     pub fn is_of_session_of(&self, other: &Self) -> bool {
         self.0[..12] == other.0[..12]
     }
 
     /// Whether it is one that `session` may give to an endpoint of its own.
+    #[inline]
     pub fn is_of(&self, session: &SessionId) -> bool {
         self.0[..12] == session.0[..12]
     }

@@ -159,6 +159,7 @@ impl Context {
     }
 
     /// Its id.
+    #[inline]
     pub fn id(&self) -> SessionId {
         self.session().id()
     }
@@ -184,6 +185,7 @@ impl Context {
         self.session().external_leader()
     }
 
+    #[inline]
     pub(crate) fn session(&self) -> &Arc<SessionSegment> {
         &self.inner.session
     }

@@ -87,6 +87,7 @@ impl Publisher {
     }
 
     /// Its GID.
+    #[inline]
     pub fn gid(&self) -> Gid {
         self.writer.gid()
     }
@@ -171,6 +172,7 @@ impl Publisher {
     ///
     /// # Errors
     /// The sample was not published; what to do is in the error.
+    #[inline]
     pub fn publish(&self, payload: &[u8]) -> Result<u64, PublishError> {
         let published = self.writer.publish_next(wall(), payload);
         self.keep_up();
@@ -181,6 +183,7 @@ impl Publisher {
     ///
     /// # Errors
     /// As for [`publish`](Self::publish).
+    #[inline]
     pub fn try_publish(&self, payload: &[u8]) -> Result<u64, PublishError> {
         let published = self.writer.try_publish_next(wall(), payload);
         self.keep_up();
@@ -191,6 +194,7 @@ impl Publisher {
     ///
     /// # Errors
     /// As for [`publish`](Self::publish).
+    #[inline]
     pub fn publish_with(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
         let published = self.writer.publish(meta, payload);
         self.keep_up();
@@ -213,6 +217,7 @@ impl Publisher {
     ///
     /// # Errors
     /// As for [`publish`](Self::publish).
+    #[inline]
     pub fn loan(&self, len: usize) -> Result<Loan<'_>, PublishError> {
         self.loan_behind(0, len)
     }
@@ -222,6 +227,7 @@ impl Publisher {
     ///
     /// # Errors
     /// As for [`publish`](Self::publish).
+    #[inline]
     pub fn loan_behind(&self, header: usize, len: usize) -> Result<Loan<'_>, PublishError> {
         let loan = self.writer.loan_behind(header, len);
         self.keep_up();

@@ -172,11 +172,13 @@ impl Subscriber {
     }
 
     /// Its GID.
+    #[inline]
     pub fn gid(&self) -> Gid {
         self.gid
     }
 
     /// The publisher's GID.
+    #[inline]
     pub fn publisher(&self) -> Gid {
         self.reader.writer()
     }
@@ -189,6 +191,7 @@ impl Subscriber {
     ///
     /// # Errors
     /// See [`TakeError`]. After [`TakeError::Corrupt`] there will be no more samples.
+    #[inline]
     pub fn take(&mut self) -> Result<Option<Sample>, TakeError> {
         self.take_with(Reader::take_sample)
     }
@@ -271,6 +274,7 @@ impl Subscriber {
 
     /// Whether there is something to take: two loads, and a system call only while memory of the
     /// publisher's is missing. For [`Context::wait`] and event loops.
+    #[inline]
     pub fn has_data(&self) -> bool {
         if self.reader.has_data() {
             return true;
@@ -283,16 +287,19 @@ impl Subscriber {
     }
 
     /// Samples taken.
+    #[inline]
     pub fn received(&self) -> u64 {
         self.reader.received()
     }
 
     /// Samples overwritten before they could be taken, within the requested depth.
+    #[inline]
     pub fn lost(&self) -> u64 {
         self.reader.lost()
     }
 
     /// Samples passed over because more recent ones fill the requested depth.
+    #[inline]
     pub fn skipped(&self) -> u64 {
         self.reader.skipped()
     }

@@ -95,6 +95,7 @@ impl Segment {
     }
 
     /// The address of `len` bytes at `at`, to be written otherwise than by words.
+    #[inline]
     pub(crate) fn address(&self, at: u64, len: usize) -> NonNull<u8> {
         let at = usize::try_from(at).expect("a segment is mapped whole");
         assert!(at.checked_add(len).is_some_and(|end| end <= self.map.bytes));
@@ -112,14 +113,17 @@ impl Segment {
         self.map.is_forked()
     }
 
+    #[inline]
     pub(crate) fn fd(&self) -> BorrowedFd<'_> {
         self.fd.as_fd()
     }
 
+    #[inline]
     pub(crate) fn map(&self) -> &Arc<Map> {
         &self.map
     }
 
+    #[inline]
     pub(crate) fn bytes(&self) -> u64 {
         self.map.bytes as u64
     }
@@ -225,6 +229,7 @@ impl Map {
 
     /// The segment's words. Those of another session's segment must only be loaded, relaxed or
     /// acquire: the map is read-only.
+    #[inline]
     pub(crate) fn words(&self) -> &[AtomicU64] {
         // SAFETY: page-aligned, `bytes` long and mapped readable for as long as `self` lives; the
         // seals keep the file at least that long. Every bit pattern is a valid word, and other
@@ -233,6 +238,7 @@ impl Map {
         unsafe { slice::from_raw_parts(self.base.as_ptr().cast::<AtomicU64>(), self.bytes / 8) }
     }
 
+    #[inline]
     pub(crate) fn is_forked(&self) -> bool {
         self.owner.is_forked()
     }

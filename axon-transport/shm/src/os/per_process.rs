@@ -68,6 +68,7 @@ impl<T: Send + Sync> PerProcess<T> {
     }
 
     /// The last that was made, in this process or in one that it is a fork of.
+    #[inline]
     pub fn latest(&self) -> Option<&'static Made<T>> {
         // SAFETY: null, or made by `Box::into_raw` and never freed once it is here.
         unsafe { self.0.load(Ordering::Acquire).as_ref() }
@@ -76,11 +77,13 @@ impl<T: Send + Sync> PerProcess<T> {
 
 impl<T> Made<T> {
     /// Whether it is of a process that the calling one is a fork of.
+    #[inline]
     pub fn is_forked(&self) -> bool {
         self.token.is_forked()
     }
 
     /// The `T` of this process.
+    #[inline]
     pub fn value(&self) -> &T {
         &self.value
     }

@@ -187,6 +187,7 @@ impl Reader {
 
     /// Whether there is something to take: a look at one line that the publisher writes with each
     /// sample, and one that it seldom writes.
+    #[inline]
     pub fn has_data(&self) -> bool {
         // A publisher of the same session is not there in a forked child.
         if self.corrupt.is_some() || self.given_up || self.attachment.lane.is_forked() {
@@ -227,6 +228,7 @@ impl Reader {
     }
 
     /// How many samples are to be taken; at most the subscription's depth.
+    #[inline]
     pub fn unread(&self) -> u64 {
         if self.given_up || self.attachment.lane.is_forked() {
             return 0;
@@ -244,6 +246,7 @@ impl Reader {
     }
 
     /// Those of them that are below a position.
+    #[inline]
     pub fn unread_below(&self, position: u64) -> u64 {
         self.unread().min(position.saturating_sub(self.cursor))
     }
@@ -252,6 +255,7 @@ impl Reader {
     ///
     /// # Errors
     /// The ring cannot be read.
+    #[inline]
     pub fn peek(&mut self) -> Result<Option<Meta>, TakeError> {
         Ok(self.find()?.map(|record| meta(&record)))
     }
@@ -266,6 +270,7 @@ impl Reader {
     /// The ring cannot be read, or the sample is longer than the subscription expects: that one is
     /// passed over and lost. Or memory for it is short: it can be taken later. `out` holds nothing
     /// useful.
+    #[inline]
     pub fn take(&mut self, out: &mut Vec<u8>) -> Result<Option<Taken>, TakeError> {
         for _ in 0..ATTEMPTS {
             let Some((record, bytes)) = self.find_whole()? else { break };
@@ -281,6 +286,7 @@ impl Reader {
     ///
     /// # Errors
     /// As for [`take`](Self::take).
+    #[inline]
     pub fn take_sample(&mut self) -> Result<Option<Sample>, TakeError> {
         for _ in 0..ATTEMPTS {
             let Some((record, bytes)) = self.find_whole()? else { break };
@@ -329,21 +335,25 @@ impl Reader {
     }
 
     /// Samples taken.
+    #[inline]
     pub fn received(&self) -> u64 {
         self.received
     }
 
     /// Samples overwritten before they could be taken, within the subscription's depth.
+    #[inline]
     pub fn lost(&self) -> u64 {
         self.lost
     }
 
     /// Samples passed over because more recent ones fill the subscription's depth.
+    #[inline]
     pub fn skipped(&self) -> u64 {
         self.skipped
     }
 
     /// The publisher.
+    #[inline]
     pub fn writer(&self) -> Gid {
         self.reads.writer
     }
@@ -354,26 +364,31 @@ impl Reader {
     }
 
     /// The grant by which it reads.
+    #[inline]
     pub fn grant(&self) -> Grant {
         self.reads.grant
     }
 
     /// The position that it takes next.
+    #[inline]
     pub fn position(&self) -> u64 {
         self.cursor
     }
 
     /// Where its lane is.
+    #[inline]
     pub fn lane(&self) -> Location {
         self.attachment.lane.location()
     }
 
     /// Whether it reads the ring that another does.
+    #[inline]
     pub fn is_of_ring(&self, other: &Self) -> bool {
         std::ptr::eq(self.attachment.ring(), other.attachment.ring())
     }
 
     /// When to look again for memory that is needed to go on and has not come.
+    #[inline]
     pub fn look_again(&self) -> Option<Instant> {
         self.missing.map(|missing| missing.asked + MISSING)
     }
@@ -397,6 +412,7 @@ impl Reader {
     }
 
     /// How many samples have come since the grant, whatever became of them.
+    #[inline]
     pub fn arrived(&self) -> u64 {
         if self.corrupt.is_some() || self.attachment.lane.is_forked() {
             return 0;
@@ -407,6 +423,7 @@ impl Reader {
     }
 
     /// The ring's header, which is not there in a forked child of the publisher's.
+    #[inline]
     pub(super) fn ring_words(&self) -> Option<&[AtomicU64]> {
         (!self.attachment.lane.is_forked()).then(|| self.attachment.ring())
     }
@@ -428,6 +445,7 @@ impl Reader {
     }
 
     /// The sample at the cursor is the caller's.
+    #[inline]
     fn taken(&mut self, record: &Record) -> Taken {
         let taken = Taken { meta: meta(record), position: self.cursor };
         self.received += 1;
@@ -439,6 +457,7 @@ impl Reader {
         taken
     }
 
+    #[inline]
     fn advance(&mut self, cursor: u64) {
         self.cursor = cursor;
         self.tell_cursor();
@@ -453,11 +472,13 @@ impl Reader {
     }
 
     /// Has its publisher woken by whatever is taken, if it waits for that: of what stands for others.
+    #[inline]
     pub fn tell_progress(&mut self) {
         self.reads.tells = true;
     }
 
     /// Has its publisher, in another session, woken when it may go on: one that waits for KEEP_LAST, too.
+    #[inline]
     pub fn tell_room(&mut self) {
         self.reads.tells |= self.reads.peer.remote().is_some();
     }

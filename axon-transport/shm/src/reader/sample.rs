@@ -64,6 +64,7 @@ pub(crate) struct Extract {
 }
 
 impl Extract {
+    #[inline]
     pub(crate) fn words(&self) -> &[AtomicU64] {
         &self.map.words()[self.words.clone()]
     }
@@ -82,32 +83,38 @@ impl Sample {
     }
 
     /// What goes with it.
+    #[inline]
     pub fn meta(&self) -> Meta {
         self.taken.meta
     }
 
     /// Its position in the publisher's ring.
+    #[inline]
     pub fn position(&self) -> u64 {
         self.taken.position
     }
 
     /// Its length in bytes.
+    #[inline]
     pub fn len(&self) -> usize {
         self.len
     }
 
     /// Whether it has no bytes.
+    #[inline]
     pub fn is_empty(&self) -> bool {
         self.len == 0
     }
 
     /// Whether it is in the publisher's memory.
+    #[inline]
     pub fn is_borrowed(&self) -> bool {
         matches!(self.data, Data::Pinned { .. })
     }
 
     /// Copies bytes from `at` on to the front of `out`, as many as there are and fit, and returns
     /// how many.
+    #[inline]
     pub fn read_at(&self, at: usize, out: &mut [u8]) -> usize {
         let count = out.len().min(self.len.saturating_sub(at));
         if count == 0 {
@@ -128,6 +135,7 @@ impl Sample {
     /// # Panics
     /// It has fewer.
     #[doc(hidden)]
+    #[inline]
     pub fn write_to(&self, out: &mut [MaybeUninit<u8>]) -> bool {
         assert!(out.len() <= self.len);
         match &self.data {
@@ -172,6 +180,7 @@ impl Sample {
     ///
     /// They are readable for as long as the sample lives. A publisher that does not keep to the
     /// protocol may change them at any time, so an access must be atomic or volatile.
+    #[inline]
     pub fn as_ptr(&self) -> *const u8 {
         match &self.data {
             Data::Copied(bytes) => bytes.as_ptr(),

@@ -25,22 +25,26 @@ impl UnderWay {
 impl Reader {
     /// What is taken from now on is done with when [`finish`](Self::finish) says so: until then its
     /// publisher takes it as not taken.
+    #[inline]
     pub fn finish_later(&mut self) {
         self.under_way.get_or_insert_default();
     }
 
     /// Whether samples that were taken are not done with.
+    #[inline]
     pub fn is_under_way(&self) -> bool {
         self.under_way.as_ref().is_some_and(|under_way| !under_way.0.is_empty())
     }
 
     /// Samples that are not done with, those that were not taken among them.
+    #[inline]
     pub fn undone(&self) -> u64 {
         let under_way = self.under_way.as_ref().map_or(0, |under_way| under_way.0.len() as u64);
         under_way.saturating_add(self.unread())
     }
 
     /// Samples up to this number are done with.
+    #[inline]
     pub fn finish(&mut self, sequence: u64) {
         let Some(under_way) = &mut self.under_way else { return };
         if self.attachment.lane.is_forked() {

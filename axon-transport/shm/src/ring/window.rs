@@ -6,6 +6,7 @@ use crate::qos::{Durability, History, Qos, Reliability};
 pub(crate) const BURST: u64 = 16;
 
 /// How many samples are kept for a profile at least.
+#[inline]
 pub(crate) fn wanted(qos: &Qos) -> u64 {
     match qos.history {
         History::KeepLast => depth(qos).max(BURST),
@@ -14,6 +15,7 @@ pub(crate) fn wanted(qos: &Qos) -> u64 {
 }
 
 /// How many samples a profile keeps.
+#[inline]
 pub(crate) fn depth(qos: &Qos) -> u64 {
     match qos.history {
         History::KeepLast => u64::from(qos.depth.max(1)),
@@ -22,11 +24,13 @@ pub(crate) fn depth(qos: &Qos) -> u64 {
 }
 
 /// Whether a publisher keeps all that its memory holds for readers that come later.
+#[inline]
 pub(crate) fn keeps_all(qos: &Qos) -> bool {
     qos.history == History::KeepAll && qos.durability == Durability::TransientLocal
 }
 
 /// Whether a profile loses nothing rather than go on.
+#[inline]
 pub fn holds(qos: &Qos) -> bool {
     qos.reliability == Reliability::Reliable && qos.history == History::KeepAll
 }

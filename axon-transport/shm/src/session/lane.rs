@@ -211,6 +211,7 @@ impl Lane {
     }
 
     /// Where it is, by which a publisher finds it.
+    #[inline]
     pub fn location(&self) -> Location {
         self.object.block.at
     }

@@ -284,6 +284,7 @@ impl PeerSession {
     }
 
     /// Its id.
+    #[inline]
     pub fn id(&self) -> SessionId {
         self.id
     }
@@ -363,6 +364,7 @@ pub enum Peer {
 
 impl Peer {
     /// The session's id.
+    #[inline]
     pub fn id(&self) -> SessionId {
         match self {
             Self::Local(session) => session.id(),
@@ -378,6 +380,7 @@ impl Peer {
         }
     }
 
+    #[inline]
     pub(crate) fn remote(&self) -> Option<&Arc<PeerSession>> {
         match self {
             Self::Local(_) => None,

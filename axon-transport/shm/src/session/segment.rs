@@ -78,6 +78,7 @@ impl SessionSegment {
     }
 
     /// Its id.
+    #[inline]
     pub fn id(&self) -> SessionId {
         self.id
     }
@@ -168,6 +169,7 @@ impl SessionSegment {
     /// or until `timeout` has passed. Returns what `ready` said last.
     ///
     /// Any number of threads may wait; none of our locks is held while `ready` runs.
+    #[inline]
     pub fn wait(&self, mut ready: impl FnMut() -> bool, timeout: Option<Duration>) -> bool {
         if self.is_forked() {
             return ready();
@@ -177,6 +179,7 @@ impl SessionSegment {
 
     /// As [`wait`](Self::wait), for something that other threads can look for too, by what `look`
     /// makes: this one is woken only when it is there.
+    #[inline]
     pub fn wait_for(
         &self,
         ready: impl FnMut() -> bool,
@@ -202,6 +205,7 @@ impl SessionSegment {
     }
 
     /// Makes every waiter of the session look again.
+    #[inline]
     pub fn notify(&self) {
         if !self.is_forked() {
             self.doorbell.notify();
@@ -209,6 +213,7 @@ impl SessionSegment {
     }
 
     /// Makes whoever listens look again, and have those look who follow. Async-signal-safe.
+    #[inline]
     pub fn knock(&self) {
         if !self.is_forked() {
             self.doorbell.ring_own();
@@ -237,11 +242,13 @@ impl SessionSegment {
         self.doorbell.wait(words, Purpose::Room, ready, None, others, Some(timeout))
     }
 
+    #[inline]
     pub(crate) fn doorbell_hub(&self) -> &Doorbell {
         &self.doorbell
     }
 
     /// The word in which a waiter for that stores its ticket.
+    #[inline]
     pub fn armed_word(&self, purpose: Purpose) -> &AtomicU64 {
         &self.first.memory.words()[match purpose {
             Purpose::Samples => layout::session::ARMED,
@@ -249,6 +256,7 @@ impl SessionSegment {
         }]
     }
 
+    #[inline]
     pub(crate) fn armed_words(&self) -> [&AtomicU64; 2] {
         [self.armed_word(Purpose::Samples), self.armed_word(Purpose::Room)]
     }
@@ -258,6 +266,7 @@ impl SessionSegment {
         waits(self.armed_word(purpose), &self.rung[purpose as usize])
     }
 
+    #[inline]
     pub(crate) fn ring_if(&self, purpose: Purpose) {
         if due(self.armed_word(purpose), &self.rung[purpose as usize]) {
             self.doorbell.ring_own();
@@ -265,6 +274,7 @@ impl SessionSegment {
     }
 
     /// Whether the calling process is a fork of the session's.
+    #[inline]
     pub fn is_forked(&self) -> bool {
         self.first.memory.is_forked()
     }
@@ -332,6 +342,7 @@ impl SessionSegment {
 }
 
 impl Knock for SessionSegment {
+    #[inline]
     fn knock(&self) {
         self.knock();
     }

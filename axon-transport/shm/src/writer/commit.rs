@@ -59,6 +59,7 @@ impl Patience {
 }
 
 impl Writer {
+    #[inline]
     pub(super) fn publish_within(
         &self,
         numbering: Numbering,
@@ -130,6 +131,7 @@ impl Writer {
     }
 
     /// Whether nobody will ever read what is published now.
+    #[inline]
     pub(super) fn is_unread(&self, state: &State) -> bool {
         state.audience.is_empty() && self.options.qos.durability == Durability::Volatile
     }
@@ -143,6 +145,7 @@ impl Writer {
         meta
     }
 
+    #[inline]
     fn number(&self, state: &mut State, numbering: Numbering) -> Meta {
         let meta = match numbering {
             Numbering::Given(meta) => meta,
@@ -154,6 +157,7 @@ impl Writer {
         meta
     }
 
+    #[inline]
     fn count(&self, state: &mut State) {
         state.published += 1;
         let published = &self.ring.words()[layout::ring::PUBLISHED];
@@ -187,6 +191,7 @@ impl Writer {
     }
 
     /// The time from which the sample's lifespan counts; 0 where that is infinite.
+    #[inline]
     fn published_at(&self, meta: Meta) -> u64 {
         match (self.options.qos.lifespan, meta.published) {
             (None, _) => 0,

@@ -67,6 +67,7 @@ pub(crate) enum Lender<'a> {
 impl Deref for Lender<'_> {
     type Target = Writer;
 
+    #[inline]
     fn deref(&self) -> &Writer {
         match self {
             Self::Borrowed(writer) => writer,
@@ -111,6 +112,7 @@ impl<'a> Loan<'a> {
     /// # Errors
     /// It was neither written to the end nor borrowed as a slice, or as [`Writer::publish`]. The
     /// loan is given back.
+    #[inline]
     pub fn publish(self, meta: Meta) -> Result<Published, PublishError> {
         self.publish_as(Numbering::Given(meta)).map(|(_, published)| published)
     }
@@ -120,6 +122,7 @@ impl<'a> Loan<'a> {
     ///
     /// # Errors
     /// As for [`publish`](Self::publish).
+    #[inline]
     pub fn publish_next(self, source_timestamp: i64) -> Result<u64, PublishError> {
         self.publish_as(Numbering::Next(source_timestamp)).map(|(sequence, _)| sequence)
     }
@@ -128,12 +131,14 @@ impl<'a> Loan<'a> {
     ///
     /// # Errors
     /// As for [`publish`](Self::publish).
+    #[inline]
     pub fn publish_now(self) -> Result<u64, PublishError> {
         self.publish_next(wall())
     }
 
     /// As [`publish_next`](Self::publish_next), of its first `len` bytes.
     #[doc(hidden)]
+    #[inline]
     pub fn publish_front(self, len: usize, source_timestamp: i64) -> Result<u64, PublishError> {
         let (most, written) = (self.len as u64, self.written as u64);
         if self.written < len {
@@ -143,6 +148,7 @@ impl<'a> Loan<'a> {
         self.commit(len, numbering, Patience::new(PATIENCE)).map(|(sequence, _)| sequence)
     }
 
+    #[inline]
     fn publish_as(self, numbering: Numbering) -> Result<(u64, Published), PublishError> {
         let len = self.len;
         if self.written < len {
@@ -180,6 +186,7 @@ impl<'a> Loan<'a> {
     }
 
     /// The address of the memory that is lent.
+    #[inline]
     fn lent(&self, place: &Place) -> NonNull<u8> {
         assert!(!self.writer.is_forked(), "a loan of shared memory, used after fork");
         place.segment.memory.address(place.at + self.lead as u64, self.len)
@@ -189,6 +196,7 @@ impl<'a> Loan<'a> {
 impl Deref for Loan<'_> {
     type Target = [u8];
 
+    #[inline]
     fn deref(&self) -> &[u8] {
         match &self.memory {
             Memory::Own(words) => &bytes_of(words)[self.lead..][..self.len],
@@ -207,6 +215,7 @@ impl Deref for Loan<'_> {
 
 impl DerefMut for Loan<'_> {
     /// Whoever borrows it is taken to write all of it.
+    #[inline]
     fn deref_mut(&mut self) -> &mut [u8] {
         self.written = self.len;
         if let Memory::Shared(place) = &self.memory {

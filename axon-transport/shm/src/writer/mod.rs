@@ -266,11 +266,13 @@ impl Writer {
     }
 
     /// The publisher's GID.
+    #[inline]
     pub fn gid(&self) -> Gid {
         self.options.gid
     }
 
     /// Where the ring is in its session's memory, for readers.
+    #[inline]
     pub fn location(&self) -> Location {
         self.ring.block.at
     }
@@ -336,6 +338,7 @@ impl Writer {
     }
 
     /// Whether any reader is attached.
+    #[inline]
     pub fn has_readers(&self) -> bool {
         !self.is_forked() && !self.lock().audience.is_empty()
     }
@@ -359,6 +362,7 @@ impl Writer {
     ///
     /// # Errors
     /// The sample was not published; what to do is in the error.
+    #[inline]
     pub fn publish(&self, meta: Meta, payload: &[u8]) -> Result<Published, PublishError> {
         self.publish_within(Numbering::Given(meta), payload, PATIENCE)
             .map(|(_, published)| published)
@@ -368,6 +372,7 @@ impl Writer {
     ///
     /// # Errors
     /// As [`publish`](Self::publish).
+    #[inline]
     pub fn try_publish(&self, meta: Meta, payload: &[u8]) -> Result<Published, PublishError> {
         let numbering = Numbering::Given(meta);
         self.publish_within(numbering, payload, Duration::ZERO).map(|(_, published)| published)
@@ -378,6 +383,7 @@ impl Writer {
     ///
     /// # Errors
     /// As [`publish`](Self::publish).
+    #[inline]
     pub fn publish_next(&self, source_timestamp: i64, payload: &[u8]) -> Result<u64, PublishError> {
         let numbering = Numbering::Next(source_timestamp);
         self.publish_within(numbering, payload, PATIENCE).map(|(sequence, _)| sequence)
@@ -387,6 +393,7 @@ impl Writer {
     ///
     /// # Errors
     /// As [`try_publish`](Self::try_publish).
+    #[inline]
     pub fn try_publish_next(
         &self,
         source_timestamp: i64,
@@ -402,6 +409,7 @@ impl Writer {
     ///
     /// # Errors
     /// As [`publish`](Self::publish).
+    #[inline]
     pub fn loan(&self, len: usize) -> Result<Loan<'_>, PublishError> {
         self.loan_behind(0, len)
     }
@@ -410,11 +418,13 @@ impl Writer {
     ///
     /// # Errors
     /// As [`publish`](Self::publish).
+    #[inline]
     pub fn loan_behind(&self, header: usize, len: usize) -> Result<Loan<'_>, PublishError> {
         self.lend_to(Lender::Borrowed(self), header, len)
     }
 
     /// As [`loan_behind`](Self::loan_behind), for who keeps the writer with it.
+    #[inline]
     pub fn loan_owned(
         self: &Arc<Self>,
         header: usize,
@@ -424,6 +434,7 @@ impl Writer {
     }
 
     /// The longest loan in bytes that is copied after all.
+    #[inline]
     pub(super) fn longest_copied(&self) -> u64 {
         if self.options.expected > COPIED_ALWAYS { COPIED_ALWAYS } else { COPIED }
     }
@@ -449,10 +460,12 @@ impl Writer {
         self.lock().history.give_back(at, Area::rounded(len as u64));
     }
 
+    #[inline]
     pub(super) fn is_forked(&self) -> bool {
         self.session.is_forked()
     }
 
+    #[inline]
     pub(super) fn options(&self) -> &RingOptions {
         &self.options
     }
@@ -465,6 +478,7 @@ impl Writer {
         if len > max { Err(PublishError::TooLarge { len, max }) } else { Ok(Area::rounded(len)) }
     }
 
+    #[inline]
     pub(super) fn lock(&self) -> PiGuard<'_, State> {
         self.state.lock()
     }
