@@ -10,17 +10,15 @@ mod files;
 pub mod gateway;
 pub mod graph;
 mod heap;
-pub mod ids;
 pub mod keys;
 pub mod link;
 pub mod owner;
-pub mod passed;
-mod process;
-pub mod qos;
 pub mod relay;
 mod secrets;
 mod seldom;
 pub mod session;
-pub mod shm;
 pub mod text;
-pub mod wait;
+
+pub use axon_shm as shm;
+#[doc(inline)]
+pub use axon_shm::{ids, qos};

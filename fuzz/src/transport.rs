@@ -13,7 +13,7 @@ use axon_transport::{
     qos::Qos,
     relay::flow::{Channel, Incoming, Pool, WINDOW},
     session::message::{self as session, CodecError, MAX_PACKET},
-    shm::{Location, reencode_packet},
+    shm::internal::{Location, reencode_packet},
 };
 
 const TERMS: Terms = Terms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(1) };

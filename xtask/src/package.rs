@@ -8,8 +8,15 @@ use std::process::Command;
 use super::rustls_axon::{self, cargo, git, workspace};
 
 /// What is published, each crate after those it depends on.
-pub(crate) const PUBLISHED: [&str; 6] =
-    ["etsi-qkd014", "axon-envelope", "rustls-axon", "axon-tls", "axon-transport", "axon-cli"];
+pub(crate) const PUBLISHED: [&str; 7] = [
+    "etsi-qkd014",
+    "axon-envelope",
+    "rustls-axon",
+    "axon-tls",
+    "axon-shm",
+    "axon-transport",
+    "axon-cli",
+];
 
 /// Which crates, and how.
 #[derive(Debug, Default, PartialEq, Eq)]

@@ -159,7 +159,7 @@ const DAEMON_PATH: &str = "AXON_DAEMON_PATH";
 /// The environment, without what a program with more rights than its caller must not take from it.
 fn environment() -> Result<BTreeMap<OsString, OsString>, ConfigError> {
     let mut variables: BTreeMap<OsString, OsString> = std::env::vars_os().collect();
-    if crate::process::is_elevated() {
+    if axon_shm::internal::is_elevated() {
         elevated::restrict(&mut variables)?;
     }
     Ok(variables)
@@ -170,7 +170,7 @@ fn environment() -> Result<BTreeMap<OsString, OsString>, ConfigError> {
 fn file_beside(named: Option<&Path>, known: Option<&Path>) -> Result<Option<PathBuf>, ConfigError> {
     let daemon = named.or(known).map(Path::to_path_buf).or_else(|| std::env::current_exe().ok());
     let file = daemon.map(|daemon| daemon.with_file_name("axon.toml"));
-    if let Some(file) = file.as_deref().filter(|_| crate::process::is_elevated()) {
+    if let Some(file) = file.as_deref().filter(|_| axon_shm::internal::is_elevated()) {
         elevated::check_default_file(file)?;
     }
     Ok(file)

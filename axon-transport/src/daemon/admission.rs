@@ -2,15 +2,15 @@
 
 use std::sync::Arc;
 
+use axon_shm::internal::{PeerDescriptors, out_of_reach, passed::PassedFd};
+
 use crate::{
     config::{Config, security_settings},
-    passed::PassedFd,
     session::{
         connect::SHM,
         message::{Hello, PROTOCOL, Refused, SessionRole},
         socket::Peer,
     },
-    shm::{PeerDescriptors, probe::out_of_reach},
 };
 
 /// What a daemon compares sessions with.

@@ -9,6 +9,7 @@ use std::{
     time::Instant,
 };
 
+use axon_shm::internal::{passed::PassedFd, probe};
 use tokio::sync::{Notify, watch};
 
 use super::{
@@ -23,10 +24,8 @@ use crate::{
     discovery::Wanted,
     ids::{DaemonId, SessionId},
     owner::SessionKeys,
-    passed::PassedFd,
     relay::Pool,
     session::address::Address,
-    shm::probe::probe,
 };
 
 /// Refusals that are remembered.

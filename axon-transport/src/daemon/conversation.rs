@@ -8,6 +8,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use axon_shm::internal::passed::{self, PassedFd};
 use tokio::{io::unix::AsyncFd, sync::Notify};
 
 use super::{
@@ -17,7 +18,6 @@ use super::{
 };
 use crate::{
     ids::SessionId,
-    passed::{self, PassedFd},
     session::{
         message::Message,
         socket::{self, Received, SocketError},

@@ -2,13 +2,13 @@
 
 use std::sync::Arc;
 
+use axon_shm::internal::passed::{self, PassedFd};
 use tokio::io::unix::AsyncFd;
 use zeroize::Zeroize;
 
 use super::{admission::unshared, conversation::receive, listen::say};
 use crate::{
     owner::{OWNER, SessionKey},
-    passed::{self, PassedFd},
     session::{
         message::{Hello, Message, Refused},
         socket::{Received, SocketError},

@@ -8,6 +8,7 @@ use std::{
     time::Duration,
 };
 
+use axon_shm::internal::passed::{self, PassedFd};
 use rustix::net::{AddressFamily, SocketFlags, SocketType, accept_with, socketpair};
 use tokio::{io::unix::AsyncFd, sync::Notify, task::spawn_local, time::timeout};
 
@@ -25,7 +26,6 @@ use crate::{
     graph::Scope,
     ids::{Gid, SessionId},
     owner::SessionKey,
-    passed::{self, PassedFd},
     relay::{Tally, far::Far},
     session::{
         message::{Hello, Message, PROTOCOL, Refused, Welcome},

@@ -11,7 +11,6 @@ mod control;
 mod conversation;
 mod first;
 mod gateway;
-mod inherit;
 mod listen;
 pub mod log;
 pub mod registry;

@@ -5,6 +5,7 @@ use std::{
     time::Duration,
 };
 
+use axon_shm::internal::{close_inherited, passed, survive_file_size_limit};
 use rustix::process::{
     DumpableBehavior, Resource, Rlimit, getrlimit, set_dumpable_behavior, setrlimit,
 };
@@ -17,7 +18,6 @@ use tokio::{
 use super::{
     control::Control,
     gateway::GatewayEntry,
-    inherit::{close_inherited, survive_file_size_limit},
     listen::accept,
     log,
     remote::Remote,
@@ -26,7 +26,6 @@ use super::{
 use crate::{
     config::{Config, ConfigError, security_settings},
     discovery::Event,
-    passed,
     secrets::erase_from_now_on,
     session::address::{Address, AddressError, private_directory},
 };

@@ -18,12 +18,12 @@ use std::{
     time::{Duration, Instant},
 };
 
+use axon_shm::internal::is_elevated;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::log;
 use crate::{
     config::{Config, DiscoveryRange, elevated::check_owner},
-    process::is_elevated,
     session::{DaemonCommand, SessionError, address::private_directory},
 };
 

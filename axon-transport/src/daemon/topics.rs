@@ -11,19 +11,20 @@ use std::{
     time::{Duration, SystemTime},
 };
 
+use axon_shm::internal::{
+    Location,
+    inspect::{self, LaneCounts, RingCounts},
+    passed::PassedFd,
+};
+
 use super::{
     registry::{LocalEndpoint, Registry, SessionEntry},
     status::{OutOfRangeStatus, ReaderStatus, TopicStatus, WriterStatus},
 };
 use crate::{
     graph::{Endpoint, EndpointKind},
-    passed::PassedFd,
     qos::{History, Qos},
     session::message::{Attach, EndpointRole},
-    shm::{
-        Location,
-        inspect::{self, LaneCounts, RingCounts},
-    },
 };
 
 /// Publishers, and readers, of a topic that the status lists.

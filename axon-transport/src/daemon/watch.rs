@@ -4,9 +4,8 @@
 
 use std::io;
 
+use axon_shm::internal::passed::PassedFd;
 use tokio::io::unix::AsyncFd;
-
-use crate::passed::PassedFd;
 
 /// Has the current runtime watch a descriptor.
 pub(crate) fn watch(fd: impl Into<PassedFd>) -> io::Result<AsyncFd<PassedFd>> {

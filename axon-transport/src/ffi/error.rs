@@ -8,10 +8,11 @@ use std::{
     ptr,
 };
 
+use axon_shm::{PublishError, ShmError};
+
 use crate::{
     graph::{Endpoint, EndpointKind},
     session::SessionError,
-    shm::{PublishError, ShmError},
 };
 
 /// What a call returns: `AXON_RET_OK`, or why it did not do what it was asked.

@@ -2,16 +2,19 @@
 
 use std::sync::Arc;
 
+use axon_shm::{
+    Sample,
+    internal::{ForkToken, Made, PerProcess},
+};
+
 use super::{
     error::{AXON_RET_BAD_ALLOC, AXON_RET_FORKED, AXON_RET_INVALID_HANDLE, Failure, axon_ret_t},
     loan::NamedLoan,
     memory::store,
     table::{Process, Table, Unknown},
 };
-use crate::{
-    process::{Made, PerProcess},
-    session::{Client, Event, GuardCondition, Node, Publisher, Server, Session, Subscription},
-    shm::{ForkToken, Sample},
+use crate::session::{
+    Client, Event, GuardCondition, Node, Publisher, Server, Session, Subscription,
 };
 
 /// A session: a process's membership of a domain. Destroyed by `axon_session_close`.

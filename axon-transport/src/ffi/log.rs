@@ -12,6 +12,10 @@ use std::{
     },
 };
 
+use axon_shm::{
+    ShmError,
+    internal::{Made, PerProcess},
+};
 use tracing::{
     Event, Level, Metadata, Subscriber,
     field::{Field, Visit},
@@ -24,10 +28,6 @@ use super::{
     callback::User,
     error::{AXON_RET_BAD_ALLOC, AXON_RET_ERROR, Failure, axon_ret_t},
     guarded,
-};
-use crate::{
-    process::{Made, PerProcess},
-    shm::ShmError,
 };
 
 /// What helps to find a fault.

@@ -2,6 +2,8 @@
 
 use std::{ffi::c_void, mem::MaybeUninit, slice};
 
+use axon_shm::Sample;
+
 use super::{
     callback::axon_callback_t,
     endpoint::{axon_endpoint_options_t, axon_gid_t, describe, end, matched, set_callback, spec},
@@ -16,7 +18,6 @@ use crate::{
     graph::{Endpoint, EndpointKind},
     qos::Qos,
     session::MessageInfo,
-    shm::Sample,
 };
 
 /// What is known of a message besides its bytes. Times are nanoseconds since the Unix epoch.

@@ -2,8 +2,10 @@
 
 use std::path::PathBuf;
 
+use axon_shm::ShmError;
+
 use super::EndpointError;
-use crate::{keys::KmeError, session::SessionError, shm::ShmError};
+use crate::{keys::KmeError, session::SessionError};
 
 /// Why a gateway could not start.
 #[derive(Debug, thiserror::Error)]

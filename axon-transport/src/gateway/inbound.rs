@@ -7,6 +7,7 @@ use std::{
 };
 
 use axon_envelope::{Kind, Route};
+use axon_shm::{Meta, PublishError, internal::monotonic};
 use quinn::{Connection, RecvStream, VarInt};
 use tokio::sync::{mpsc, watch};
 
@@ -22,13 +23,7 @@ use super::{
     seal::{MAX_OVERHEAD, Protection, RefusedMessage, writer},
     stand_in::StandIn,
 };
-use crate::{
-    ids::Gid,
-    link::CloseCode,
-    seldom::Seldom,
-    session::Written,
-    shm::{Meta, PublishError, monotonic},
-};
+use crate::{ids::Gid, link::CloseCode, seldom::Seldom, session::Written};
 
 const STREAM_HEADER: usize = 24;
 const RELIABLE: u8 = 1;

@@ -9,9 +9,10 @@ use std::{
     },
 };
 
+use axon_shm::ShmError;
 use tokio::sync::watch;
 
-use crate::{daemon::watch::watch as watch_descriptor, session::Session, shm::ShmError};
+use crate::{daemon::watch::watch as watch_descriptor, session::Session};
 
 /// Wakes whoever waits for samples in a ring, or for room in one.
 #[derive(Clone)]
@@ -61,7 +62,7 @@ impl Pulse {
 }
 
 async fn watch_doorbell(
-    leader: crate::wait::ExternalLeader,
+    leader: axon_shm::ExternalLeader,
     beat: &watch::Sender<u64>,
     blocked: &AtomicUsize,
 ) -> io::Result<()> {

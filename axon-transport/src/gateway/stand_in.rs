@@ -17,6 +17,8 @@ use std::{
     time::Duration,
 };
 
+use axon_shm::{Meta, PublishError};
+
 use super::{
     account::{Account, Charge},
     keyring::lock,
@@ -27,7 +29,6 @@ use crate::{
     graph::Endpoint,
     ids::Gid,
     session::{Face, Session, SessionError, Written},
-    shm::{Meta, PublishError},
 };
 
 type Known = Arc<Mutex<HashMap<Gid, Weak<StandIn>>>>;

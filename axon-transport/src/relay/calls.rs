@@ -3,6 +3,8 @@
 
 use std::collections::BTreeMap;
 
+use axon_shm::Sample;
+
 use super::flow::{Channel, Departing};
 use crate::{
     ids::Gid,
@@ -10,7 +12,6 @@ use crate::{
         Face,
         merge::{Merge, Taken},
     },
-    shm::Sample,
 };
 
 /// The channels to the other end that a relay's clients and servers call for, and how far they have got.

@@ -15,13 +15,14 @@ use std::{
     },
 };
 
+use axon_shm::{Meta, Sample};
+
 use crate::{
     ids::Gid,
     session::{
         merge::Taken,
         message::{Credit, Head, Piece},
     },
-    shm::{Meta, Sample},
 };
 
 /// Bytes that a channel may have under way without asking.

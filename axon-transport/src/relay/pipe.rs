@@ -7,6 +7,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use axon_shm::{ExternalLeader, PublishError, Sample, internal::passed::PassedFd};
 use rustix::{
     event::{PollFd, PollFlags, Timespec, poll},
     net::{Shutdown, shutdown},
@@ -19,15 +20,12 @@ use super::{
 };
 use crate::{
     ids::Gid,
-    passed::PassedFd,
     seldom::Seldom,
     session::{
         Face, Written,
         message::Message,
         socket::{self, Received, SocketError},
     },
-    shm::{PublishError, Sample},
-    wait::ExternalLeader,
 };
 
 /// Bytes of control messages that may wait for an end that does not read.

@@ -11,7 +11,7 @@ use std::{
     sync::{Mutex, MutexGuard, Once, PoisonError},
 };
 
-use crate::process::{Made, PerProcess};
+use axon_shm::internal::{Made, PerProcess};
 
 use rustix::mm::{Advice, MapFlags, ProtFlags, madvise, mlock, mmap_anonymous};
 use secrecy::ExposeSecret;

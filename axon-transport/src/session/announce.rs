@@ -2,6 +2,11 @@
 
 use std::{sync::Arc, time::Duration};
 
+use axon_shm::{
+    ShmError,
+    internal::{RingOptions, Writer},
+};
+
 use super::{
     Client, EndpointSpec, Publisher, Server, Session, SessionError, Subscription,
     message::EndpointRole,
@@ -14,7 +19,6 @@ use crate::{
     graph::{Endpoint, EndpointKind, Pairing, pairing},
     ids::Gid,
     qos::Qos,
-    shm::{RingOptions, ShmError, Writer},
 };
 
 /// How long a new endpoint waits for those that it is matched with.

@@ -1,3 +1,3 @@
 //! The two clocks: one for what people read, one for what is waited for.
 
-pub(super) use crate::shm::{monotonic, now as wall};
+pub(super) use axon_shm::internal::{monotonic, wall};

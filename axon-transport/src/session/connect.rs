@@ -5,6 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use axon_shm::internal::{SessionSegment, out_of_reach, passed::PassedFd};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::{
@@ -18,8 +19,6 @@ use crate::{
     config::{Config, DaemonPolicy, DiscoveryRange, security_settings},
     daemon::spawn::{Outcome, spawn},
     ids::SessionId,
-    passed::PassedFd,
-    shm::{SessionSegment, probe::out_of_reach},
 };
 
 /// How long a daemon may take to come up and answer.

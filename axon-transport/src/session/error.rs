@@ -2,8 +2,10 @@
 
 use std::{fmt, path::PathBuf};
 
+use axon_shm::ShmError;
+
 use super::{address::AddressError, message::CodecError};
-use crate::{config::ConfigError, shm::ShmError};
+use crate::config::ConfigError;
 
 /// Why a session could not be opened or used.
 ///

@@ -7,6 +7,8 @@ use std::{
     sync::{Arc, Mutex, MutexGuard, PoisonError},
 };
 
+use axon_shm::internal::Times;
+
 use super::{
     Session,
     callback::{Callback, OnNew},
@@ -18,7 +20,6 @@ use crate::{
     graph::{Endpoint, Pairing},
     ids::Gid,
     qos::{Liveliness, Qos},
-    shm::Times,
 };
 
 /// One event of a publisher or subscription. Thread-safe; it may outlive its endpoint, and then

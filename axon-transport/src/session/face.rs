@@ -1,6 +1,8 @@
 //! Whoever writes elsewhere, as those see it that read here: a publisher, client or server that another
 //! process, of this host or of another, speaks for.
 
+use axon_shm::{Meta, PublishError, Sample};
+
 use super::{
     Client, Publisher, Server, Session, SessionError,
     message::{EndpointRole, Leaving, Message},
@@ -10,7 +12,6 @@ use crate::{
     graph::{Endpoint, EndpointKind},
     ids::Gid,
     qos::Qos,
-    shm::{Meta, PublishError, Sample},
 };
 
 /// What stands for it here. Of a service it reads, too: a client's is given the responses that go to

@@ -8,8 +8,9 @@ use std::{
     },
 };
 
+use axon_shm::internal::SessionSegment;
+
 use super::state::Shared;
-use crate::shm::SessionSegment;
 
 /// A condition that stands from when it is triggered until a wait has seen it. Thread-safe; cheap to
 /// clone, and all clones are the same condition.

@@ -7,6 +7,11 @@
 
 use std::sync::{Arc, MutexGuard, PoisonError};
 
+use axon_shm::{
+    ShmError,
+    internal::{Peer, ReaderInfo, Terms},
+};
+
 use super::{
     events::Source,
     message::EndpointRole,
@@ -17,7 +22,6 @@ use super::{
 use crate::{
     graph::{Endpoint, Pairing, pairing},
     ids::Gid,
-    shm::{Peer, ReaderInfo, ShmError, Terms},
 };
 
 impl Shared {

@@ -8,13 +8,13 @@ use std::{
     sync::{Arc, Mutex, MutexGuard, PoisonError},
 };
 
+use axon_shm::{ShmError, internal::passed::PassedFd};
+
 use super::{message::Message, state::Shared};
 use crate::{
     daemon::registry::Registry,
     graph::Endpoint,
     ids::{DaemonId, Gid, SessionId},
-    passed::PassedFd,
-    shm::ShmError,
 };
 
 /// Brings the sessions of one process together.

@@ -28,7 +28,6 @@ mod peers;
 mod publisher;
 mod rings;
 mod service;
-pub(crate) mod signals;
 pub mod socket;
 mod state;
 mod status;
@@ -44,6 +43,7 @@ use std::{
     time::Duration,
 };
 
+use axon_shm::internal::SessionSegment;
 pub use callback::OnNew;
 pub use error::SessionError;
 pub use events::Event;
@@ -68,7 +68,6 @@ use crate::{
     graph::GraphView,
     ids::{DaemonId, Gid, SessionId},
     relay::near::Near,
-    shm::SessionSegment,
 };
 
 /// A process's session. Cheap to clone; thread-safe. It ends when the last clone and the last of

@@ -5,13 +5,14 @@ use std::{
     sync::{Arc, Once},
 };
 
+use axon_shm::internal::{BlockedSignals, SessionSegment};
+
 use super::{
     Handle, Session, SessionError, SessionOptions,
     connect::Caller,
     control::{Control, Start},
     local::House,
     message::SessionRole,
-    signals,
     state::Shared,
 };
 use crate::{
@@ -19,7 +20,6 @@ use crate::{
     ids::SessionId,
     owner::SessionKey,
     relay::near::Near,
-    shm::SessionSegment,
 };
 
 impl Session {
@@ -138,7 +138,7 @@ impl Session {
             .map_err(|e| system("creating an eventfd")(e.into()))?;
         let shared = Arc::new(Shared::new(config.clone(), options, segment, wake));
         let control = Control::new(shared.clone(), start)?;
-        let blocked = signals::Blocked::all();
+        let blocked = BlockedSignals::all();
         let thread = std::thread::Builder::new()
             .name("axon-ctl".into())
             .spawn(move || control.run())

@@ -92,7 +92,7 @@ pub struct EndpointSpec {
     /// A subscription: whether it receives nothing from publishers of its own session.
     pub ignore_local: bool,
     /// A publisher: the length of most samples in bytes, as in
-    /// [`PublisherOptions::expected_len`](crate::shm::PublisherOptions::expected_len); 0 when unknown.
+    /// [`PublisherOptions::expected_len`](axon_shm::PublisherOptions::expected_len); 0 when unknown.
     pub expected_len: u64,
 }
 

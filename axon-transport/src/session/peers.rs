@@ -11,6 +11,13 @@ use std::{
     sync::Arc,
 };
 
+use axon_shm::{
+    ShmError,
+    internal::{
+        Peer, PeerDescriptors, PeerSession, SegmentInfo, SegmentKind, SessionSegment,
+        passed::PassedFd,
+    },
+};
 use rustix::{
     event::{Timespec, epoll},
     io::Errno,
@@ -20,11 +27,7 @@ use super::{
     message::{Pair, Segment},
     state::MemoryNews,
 };
-use crate::{
-    ids::{Gid, SessionId},
-    passed::PassedFd,
-    shm::{Peer, PeerDescriptors, PeerSession, SegmentInfo, SegmentKind, SessionSegment, ShmError},
-};
+use crate::ids::{Gid, SessionId};
 
 pub(super) struct Peers {
     own: Arc<SessionSegment>,

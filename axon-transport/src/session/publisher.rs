@@ -8,6 +8,11 @@ use std::{
     time::Duration,
 };
 
+use axon_shm::{
+    Meta, PublishError, ShmError,
+    internal::{Grant, Location, ReaderInfo, Terms, Writer},
+};
+
 use super::{
     Session, clock,
     events::{Changes, EndpointEvents, Event, Source},
@@ -19,7 +24,6 @@ use crate::{
     graph::Endpoint,
     ids::Gid,
     qos::{Liveliness, Qos},
-    shm::{Grant, Location, Meta, PublishError, ReaderInfo, ShmError, Terms, Writer},
 };
 
 /// Sends the samples of a topic. Thread-safe. When it is dropped, readers still take what it left.
@@ -184,7 +188,7 @@ impl Drop for Publisher {
 /// A sample that is being written, from the front or as a slice. Dropped without
 /// [`publish`](Self::publish), it never was.
 pub struct Loan<'a> {
-    loan: crate::shm::Loan<'a>,
+    loan: axon_shm::Loan<'a>,
     publisher: &'a PublisherInner,
 }
 
@@ -230,7 +234,7 @@ impl io::Write for Loan<'_> {
 
 /// A sample that is being written, of which nothing but its start may be published.
 pub(crate) struct OwnedLoan {
-    loan: crate::shm::Loan<'static>,
+    loan: axon_shm::Loan<'static>,
     publisher: Arc<PublisherInner>,
 }
 

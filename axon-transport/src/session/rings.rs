@@ -9,10 +9,12 @@ use std::{
     time::Instant,
 };
 
-use crate::{
-    ids::Gid,
-    shm::{Grant, Location, ReaderInfo, RingOptions, SessionSegment, ShmError, Terms, Writer},
+use axon_shm::{
+    ShmError,
+    internal::{Grant, Location, ReaderInfo, RingOptions, SessionSegment, Terms, Writer},
 };
+
+use crate::ids::Gid;
 
 pub(super) enum Rings {
     /// A publisher's samples, or a client's requests.

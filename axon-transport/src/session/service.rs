@@ -8,17 +8,18 @@
 
 use std::{fmt, sync::Arc, time::Duration};
 
+use axon_shm::{
+    Meta, PublishError, Sample, ShmError,
+    internal::{Reader, Writer},
+};
+
 use super::{
     MessageInfo, OnNew, Session, SessionError, clock,
     publisher::PublisherInner,
     rings::Lanes,
     subscription::{SubscriptionInner, recv_from, take_from, take_of, take_sample_from},
 };
-use crate::{
-    graph::Endpoint,
-    ids::Gid,
-    shm::{Meta, PublishError, Reader, Sample, ShmError, Writer},
-};
+use crate::{graph::Endpoint, ids::Gid};
 
 /// How long a response waits for a client whose request came before it could be answered.
 const PATIENCE: Duration = Duration::from_millis(100);

@@ -8,6 +8,7 @@ use std::{
     os::fd::{AsFd, AsRawFd, BorrowedFd, FromRawFd, OwnedFd},
 };
 
+use axon_shm::internal::passed::{self, Packet, PassedFd};
 use rustix::{
     io::Errno,
     net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg},
@@ -15,7 +16,6 @@ use rustix::{
 };
 
 use super::message::{CodecError, MAX_DESCRIPTORS, MAX_PACKET, Message};
-use crate::passed::{self, Packet, PassedFd};
 
 /// A message that arrived, and what came with it.
 #[derive(Debug)]

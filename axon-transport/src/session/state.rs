@@ -12,6 +12,11 @@ use std::{
     time::{Duration, Instant},
 };
 
+use axon_shm::{
+    ExternalLeader, ShmError,
+    internal::{SegmentEvent, SessionSegment},
+};
+
 use super::{
     SessionOptions,
     events::{Changes, Source},
@@ -25,8 +30,6 @@ use crate::{
     config::Config,
     graph::{Endpoint, GraphEntry, GraphView},
     ids::{DaemonId, Gid, SessionId},
-    shm::{SegmentEvent, SessionSegment, ShmError},
-    wait::ExternalLeader,
 };
 
 /// Something that a session's owner may want to hear of.

@@ -6,6 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use axon_shm::ShmError;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::{
@@ -20,7 +21,6 @@ use super::{
 use crate::{
     config::{Config, DaemonPlace, DaemonPolicy},
     ids::SessionId,
-    shm::ShmError,
 };
 
 /// How long a daemon may take to answer.

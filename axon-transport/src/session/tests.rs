@@ -14,6 +14,13 @@ use std::{
     time::{Duration, Instant},
 };
 
+use axon_shm::{
+    Meta,
+    internal::{
+        Grant, Location, Peer, PeerDescriptors, PeerSession, Purpose, ReaderInfo, RingOptions,
+        SegmentInfo, SegmentKind, Terms, Writer,
+    },
+};
 use rustix::{
     event::{PollFd, PollFlags, poll},
     fs::fstat,
@@ -34,11 +41,6 @@ use crate::{
     graph::EndpointKind,
     ids::Gid,
     qos::{Durability, Qos},
-    shm::{
-        Grant, Location, Meta, Peer, PeerDescriptors, PeerSession, ReaderInfo, RingOptions,
-        SegmentInfo, SegmentKind, Terms, Writer,
-    },
-    wait::Purpose,
 };
 
 /// Only what was lost takes this long.

@@ -2,17 +2,17 @@
 
 use std::{ops::Deref, sync::Arc, time::Duration};
 
+use axon_shm::{
+    ShmError,
+    internal::{Look, PassedOn, SessionSegment},
+};
 use smallvec::SmallVec;
 
 use super::{
     Client, Event, GuardCondition, Server, Session, SessionError, Subscription, events::Source,
     guard::Guard, state::Shared, subscription::SubscriptionInner,
 };
-use crate::{
-    events::EventKind,
-    shm::{SessionSegment, ShmError},
-    wait::{Look, PassedOn},
-};
+use crate::events::EventKind;
 
 /// Something to wait for.
 #[derive(Clone, Copy, Debug)]

@@ -30,7 +30,7 @@ use axon_transport::{
         message::{Hello, Message, PROTOCOL, Segment, SegmentOpened, SessionRole},
         socket,
     },
-    shm::{PublishError, SessionSegment},
+    shm::{PublishError, internal::SessionSegment},
 };
 use rustix::{
     fs::{MemfdFlags, memfd_create},

@@ -6,10 +6,13 @@ use std::{
     time::{Duration, Instant},
 };
 
+use axon_shm::{
+    Meta,
+    internal::{Reader, RingOptions, SessionSegment, Writer},
+};
 use axon_transport::{
     ids::{Gid, SessionId},
     qos::Qos,
-    shm::{Meta, Reader, RingOptions, SessionSegment, Writer},
 };
 
 use crate::{around::Around, trace::mark, wire::Wire};

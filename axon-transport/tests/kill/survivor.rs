@@ -7,15 +7,14 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_transport::{
-    ids::Gid,
-    qos::Qos,
-    shm::{
-        Peer, PeerSession, Reader, ReaderInfo, ReaderOptions, Sample, SegmentInfo, SegmentKind,
+use axon_shm::{
+    ExternalLeader, Sample,
+    internal::{
+        Peer, PeerSession, Reader, ReaderInfo, ReaderOptions, SegmentInfo, SegmentKind,
         SessionSegment, Writer,
     },
-    wait::ExternalLeader,
 };
+use axon_transport::{ids::Gid, qos::Qos};
 use rustix::{
     event::{PollFd, PollFlags, Timespec, poll},
     fs::fstat,

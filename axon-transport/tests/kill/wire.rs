@@ -8,14 +8,13 @@ use std::{
     sync::{Arc, Mutex},
 };
 
+use axon_shm::internal::{
+    Grant, Lane, Location, Peer, PeerDescriptors, PeerSession, Reader, ReaderInfo, ReaderOptions,
+    SegmentEvent, SegmentInfo, SegmentKind, SessionSegment, Writer, passed::PassedFd,
+};
 use axon_transport::{
     ids::{Gid, SessionId},
-    passed::PassedFd,
     qos::Qos,
-    shm::{
-        Grant, Lane, Location, Peer, PeerDescriptors, PeerSession, Reader, ReaderInfo,
-        ReaderOptions, SegmentEvent, SegmentInfo, SegmentKind, SessionSegment, Writer,
-    },
 };
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::net::{

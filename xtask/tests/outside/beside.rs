@@ -8,11 +8,12 @@ const NEIGHBOURS: [&str; 4] = ["quinn", "rustls", "reqwest", "zenoh"];
 
 /// Each library of ours, all its features, and the least that it is of use with: axon-envelope needs an
 /// AEAD, and says so.
-const LIBRARIES: [(&str, &str, &str); 5] = [
+const LIBRARIES: [(&str, &str, &str); 6] = [
     ("etsi-qkd014", "blocking,pool,sim", ""),
     ("axon-envelope", "aws-lc-rs,rust-crypto", "rust-crypto"),
     ("rustls-axon", "aws_lc_rs,std,logging,tls12", ""),
     ("axon-tls", "hybrid,quic,tokio", ""),
+    ("axon-shm", "", ""),
     ("axon-transport", "", ""),
 ];
 

@@ -15,11 +15,12 @@ mod readme;
 mod run;
 
 /// The crates that are published, and where they are in this repository.
-const PUBLISHED: [(&str, &str); 6] = [
+const PUBLISHED: [(&str, &str); 7] = [
     ("etsi-qkd014", "etsi-qkd014"),
     ("axon-envelope", "axon-envelope"),
     ("rustls-axon", "third_party/rustls-axon"),
     ("axon-tls", "axon-tls"),
+    ("axon-shm", "axon-transport/shm"),
     ("axon-transport", "axon-transport"),
     ("axon-cli", "axon-cli"),
 ];

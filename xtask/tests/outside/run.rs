@@ -151,6 +151,12 @@ fn the_readme_of_axon_tls_does_what_it_says() {
 }
 
 #[test]
+#[ignore = "builds all that axon-shm depends on"]
+fn the_readme_of_axon_shm_does_what_it_says() {
+    programs_run("axon-shm");
+}
+
+#[test]
 #[ignore = "builds all that axon-transport and axon-cli depend on"]
 fn the_readmes_of_axon_transport_and_axon_cli_do_what_they_say() {
     let Some(programs) = built("axon-transport") else { return };

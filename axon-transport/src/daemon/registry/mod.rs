@@ -21,6 +21,7 @@ use std::{
     sync::{Arc, Weak},
 };
 
+use axon_shm::internal::Location;
 pub(crate) use graph::parts;
 pub use output::Output;
 pub use range::KeptApart;
@@ -30,7 +31,6 @@ use crate::{
     ids::{DaemonId, Gid, SessionId},
     relay::Tally,
     session::message::{Attach, EndpointRole, Granted, Pair, Segment, SessionRole},
-    shm::Location,
 };
 
 /// Packets that may wait for one session before it is told everything anew instead.

@@ -12,8 +12,9 @@ use std::{
     thread,
 };
 
+use axon_shm::internal::BlockedSignals;
+
 use super::{AXON_LOG_WARN, Line};
-use crate::session::signals;
 
 /// So many lines wait at most.
 const ROOM: usize = 256;
@@ -50,7 +51,7 @@ impl Waiting {
     pub(super) fn say(&'static self, line: Line, tell: impl Fn(Line) + Send + 'static) {
         let mut state = self.lock();
         if !state.runs {
-            let blocked = signals::Blocked::all();
+            let blocked = BlockedSignals::all();
             let run = move || self.tell_all(tell);
             let started = thread::Builder::new().name("axon-log".into()).spawn(run);
             drop(blocked);

@@ -6,6 +6,8 @@ use std::{
     time::Instant,
 };
 
+use axon_shm::Sample;
+
 use super::Served;
 use crate::{
     daemon::registry::parts,
@@ -22,7 +24,6 @@ use crate::{
         merge::{Merge, Taken},
         message::{GraphItem, Matched, Message},
     },
-    shm::Sample,
 };
 
 /// Partners of a session's endpoints that are gone and whose last samples are kept until it takes them.

@@ -11,6 +11,7 @@ use std::{
     time::Instant,
 };
 
+use axon_shm::{ExternalLeader, internal::passed::PassedFd};
 use rustix::io::Errno;
 
 use self::matching::{Source, take};
@@ -26,7 +27,6 @@ use crate::{
     events::Alive,
     graph::{Endpoint, EndpointKind, GraphView},
     ids::{Gid, SessionId},
-    passed::PassedFd,
     seldom::Seldom,
     session::{
         Face, Node, Session, SessionError, SessionOptions, Subscription,
@@ -35,7 +35,6 @@ use crate::{
         },
         socket::{self, SocketError},
     },
-    wait::ExternalLeader,
 };
 
 /// What a relay is started with.

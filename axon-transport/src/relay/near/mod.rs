@@ -15,6 +15,11 @@ use std::{
     time::{Duration, Instant},
 };
 
+use axon_shm::{
+    ExternalLeader,
+    internal::{BlockedSignals, passed::PassedFd},
+};
+
 use self::{relays::Relay, stand_ins::StandIn};
 use super::{
     Pool, Tally,
@@ -27,7 +32,6 @@ use crate::{
     events::Alive,
     graph::{Endpoint, EndpointKind, reads, writes},
     ids::{DaemonId, Gid},
-    passed::PassedFd,
     session::{
         Session, SessionError, Shared,
         connect::Connected,
@@ -35,7 +39,6 @@ use crate::{
         message::{Announce, Asserted, EndpointRole, Gone, Graph, Leaving, Message, Refused},
         socket::SocketError,
     },
-    wait::ExternalLeader,
 };
 
 /// Carries a session's samples to its daemon and back, until it is dropped.
@@ -83,7 +86,7 @@ impl Near {
             finish_by: OnceCell::new(),
             reason,
         };
-        let blocked = crate::session::signals::Blocked::all();
+        let blocked = BlockedSignals::all();
         let thread = std::thread::Builder::new()
             .name("axon-relay".into())
             .spawn(move || common.run(connected))

@@ -7,6 +7,8 @@ use std::{
     time::{Duration, Instant},
 };
 
+use axon_shm::{Sample, internal::holds};
+
 use super::Served;
 use crate::{
     graph::{Endpoint, EndpointKind},
@@ -17,7 +19,6 @@ use crate::{
         flow::{Channel, Departing},
     },
     session::{EndpointSpec, Subscription},
-    shm::{Sample, holds},
 };
 
 pub(super) struct Relay {

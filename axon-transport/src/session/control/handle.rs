@@ -2,11 +2,15 @@
 
 use std::{collections::HashSet, sync::Arc};
 
+use axon_shm::{
+    ShmError,
+    internal::{Grant, Location, Peer, ReaderInfo, Terms, passed::PassedFd},
+};
+
 use super::{Control, Link, stands_for, trail};
 use crate::{
     graph::EndpointKind,
     ids::{Gid, SessionId},
-    passed::PassedFd,
     session::{
         message::{
             Attach, GivenUp, Granted, Leaving, MAX_DESCRIPTORS, Message, Pair, Refused, Segment,
@@ -17,7 +21,6 @@ use crate::{
         state::StatusAnswer,
         subscription::{Accept, Asking, Numbers, SubscriptionInner},
     },
-    shm::{Grant, Location, Peer, ReaderInfo, ShmError, Terms},
 };
 
 impl Control {

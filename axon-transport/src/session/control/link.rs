@@ -9,10 +9,11 @@ use std::{
     time::{Duration, Instant},
 };
 
+use axon_shm::internal::passed::PassedFd;
+
 use super::{Control, Link};
 use crate::{
     ids::Gid,
-    passed::PassedFd,
     session::{
         connect::{Caller, Connected},
         error::SessionError,

@@ -15,6 +15,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use axon_shm::{ExternalLeader, ShmError, internal::passed::PassedFd};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::{
@@ -30,7 +31,7 @@ use super::{
     state::{Outgoing, Shared},
     subscription::{Asking, SubscriptionInner},
 };
-use crate::{graph::GraphView, ids::Gid, passed::PassedFd, shm::ShmError, wait::ExternalLeader};
+use crate::{graph::GraphView, ids::Gid};
 
 /// Packets handled before queued ones are sent: neither direction starves the other.
 const BATCH: usize = 64;
@@ -111,7 +112,7 @@ enum Link {
 impl Control {
     pub(super) fn new(shared: Arc<Shared>, start: Start) -> Result<Self, SessionError> {
         let reconnects = matches!(start, Start::Daemon(_));
-        shared.segment.doorbell_hub().is_watched();
+        shared.segment.is_watched();
         let peers = Peers::new(shared.segment.clone(), shared.memory.clone())
             .map_err(ShmError::system("watching processes"))?;
         let mut control = Self {

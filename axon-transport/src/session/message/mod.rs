@@ -7,6 +7,8 @@ mod codec;
 #[cfg(test)]
 mod tests;
 
+use axon_shm::internal::Location;
+pub use axon_shm::internal::{Segment, SegmentName, SegmentOpened};
 pub use codec::CodecError;
 use minicbor::{Decode, Encode};
 use serde::Serialize;
@@ -15,7 +17,6 @@ use crate::{
     graph::{Endpoint, Reach},
     ids::{DaemonId, Gid, SessionId},
     qos::Qos,
-    shm::{Location, SegmentInfo, SegmentKind},
 };
 
 /// The version of the session protocol that this crate speaks.
@@ -292,58 +293,6 @@ pub struct Granted {
     /// lost on the way.
     #[n(8)]
     pub relayed: Option<bool>,
-}
-
-/// A segment of a session's memory, besides the first.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
-pub struct Segment {
-    /// Its number.
-    #[n(0)]
-    pub number: u32,
-    /// The publisher whose samples are in it, where it is only one's.
-    #[n(1)]
-    pub publisher: Option<Gid>,
-}
-
-impl From<SegmentInfo> for Segment {
-    fn from(info: SegmentInfo) -> Self {
-        let publisher = match info.kind {
-            SegmentKind::Samples(gid) => Some(gid),
-            SegmentKind::Session | SegmentKind::Heap => None,
-        };
-        Self { number: info.number, publisher }
-    }
-}
-
-impl From<Segment> for SegmentInfo {
-    fn from(segment: Segment) -> Self {
-        let kind = segment.publisher.map_or(SegmentKind::Heap, SegmentKind::Samples);
-        Self { number: segment.number, kind }
-    }
-}
-
-/// A session has one segment more.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
-#[cbor(map)]
-pub struct SegmentOpened {
-    /// The session.
-    #[n(0)]
-    pub session: SessionId,
-    /// The segment.
-    #[n(1)]
-    pub segment: Segment,
-}
-
-/// One segment of a session: that is gone, or that another one needs.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
-#[cbor(map)]
-pub struct SegmentName {
-    /// The session.
-    #[n(0)]
-    pub session: SessionId,
-    /// The segment's number.
-    #[n(1)]
-    pub number: u32,
 }
 
 /// A reader and a writer have nothing to do with each other any more.

@@ -2,6 +2,11 @@
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use axon_shm::{
+    ShmError,
+    internal::{Grant, Lane, Location, Look, Peer, Reader, ReaderOptions, holds},
+};
+
 use super::slots::Slots;
 use crate::{
     graph::{Endpoint, EndpointKind},
@@ -15,8 +20,6 @@ use crate::{
         message::EndpointRole,
         state::Shared,
     },
-    shm::{Grant, Lane, Location, Peer, Reader, ReaderOptions, ShmError, holds},
-    wait::Look,
 };
 
 /// The reading side of a subscription, client or server, which the session's control thread shares

@@ -11,6 +11,11 @@ use std::{
     time::{Duration, Instant},
 };
 
+use axon_shm::{
+    Meta, Sample, ShmError, TakeError,
+    internal::{Look, Reader},
+};
+
 pub(super) use self::{
     inner::SubscriptionInner,
     slots::{Accept, Asking, Numbers},
@@ -22,14 +27,7 @@ use super::{
     message::{GivenUp, Message, Pair},
     state::Outgoing,
 };
-use crate::{
-    events::EventKind,
-    graph::Endpoint,
-    ids::Gid,
-    qos::Durability,
-    shm::{Meta, Reader, Sample, ShmError, TakeError},
-    wait::Look,
-};
+use crate::{events::EventKind, graph::Endpoint, ids::Gid, qos::Durability};
 
 /// Receives the samples of a topic. Thread-safe.
 pub struct Subscription {
@@ -146,7 +144,7 @@ impl Subscription {
     ///
     /// # Errors
     /// In a forked child, or when an event loop of the program's listens already
-    /// ([`SessionSegment::external_leader`](crate::shm::SessionSegment::external_leader)).
+    /// (an [`ExternalLeader`](axon_shm::ExternalLeader)).
     pub fn set_on_new_sample(&self, callback: Option<OnNew>) -> Result<(), SessionError> {
         if self.session.is_forked() {
             return Err(ShmError::Forked.into());

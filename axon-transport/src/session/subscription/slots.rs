@@ -5,11 +5,9 @@ use std::{
     time::{Duration, Instant},
 };
 
-use crate::{
-    ids::Gid,
-    session::clock,
-    shm::{Grant, Lane, Location, MAX_GAP, Reader},
-};
+use axon_shm::internal::{Grant, Lane, Location, MAX_GAP, Reader};
+
+use crate::{ids::Gid, session::clock};
 
 /// Publishers whose last sequence number is remembered after they are gone.
 const REMEMBERED: usize = 4096;

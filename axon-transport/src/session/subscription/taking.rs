@@ -2,6 +2,8 @@
 
 use std::{collections::HashMap, time::Instant};
 
+use axon_shm::{Meta, Sample, TakeError, internal::Reader};
+
 use super::{
     Lifetime, MessageInfo,
     inner::SubscriptionInner,
@@ -11,7 +13,6 @@ use crate::{
     graph::Endpoint,
     ids::Gid,
     session::{clock, message::EndpointRole},
-    shm::{Meta, Reader, Sample, TakeError},
 };
 
 /// Samples that one take passes over because they were taken before.
@@ -284,14 +285,13 @@ impl Slots {
 mod tests {
     use std::sync::Arc;
 
-    use super::*;
-    use crate::{
-        graph::EndpointKind,
-        ids::SessionId,
-        qos::Qos,
-        session::subscription::Numbers,
-        shm::{Peer, PublishError, ReaderInfo, ReaderOptions, RingOptions, SessionSegment, Writer},
+    use axon_shm::{
+        PublishError,
+        internal::{Peer, ReaderInfo, ReaderOptions, RingOptions, SessionSegment, Writer},
     };
+
+    use super::*;
+    use crate::{graph::EndpointKind, ids::SessionId, qos::Qos, session::subscription::Numbers};
 
     /// A subscription's reader of a publisher of the same session, which is made for it.
     fn reading(session: &Arc<SessionSegment>, writer: Gid, reader: Gid) -> (Writer, Reader) {

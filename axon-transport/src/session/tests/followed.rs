@@ -1,5 +1,6 @@
 //! A daemon that follows another, and readers that are attached anew.
 
+use axon_shm::{PublishError, internal::probe};
 use rustix::net::accept_with;
 
 use super::*;
@@ -7,7 +8,6 @@ use crate::{
     config::{Config, OsFiles},
     owner::OWNER,
     session::{address::Address, tests::played::Taker},
-    shm::{PublishError, probe::probe},
 };
 
 /// Where the test plays one daemon after another.

@@ -1,5 +1,10 @@
 //! What only a played daemon can bring about: an order in which things happen.
 
+use axon_shm::{
+    PublishError,
+    internal::{Reader, ReaderOptions},
+};
+
 use super::*;
 use crate::{
     graph::{Endpoint, EndpointKind},
@@ -7,7 +12,6 @@ use crate::{
         arrivals,
         message::{GivenUp, GraphItem},
     },
-    shm::{PublishError, Reader, ReaderOptions},
 };
 
 /// What is read, and the session that it is of as the reader has it.

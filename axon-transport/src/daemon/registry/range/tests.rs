@@ -1,11 +1,12 @@
 //! Pairs, and the graph, under sessions of different ranges.
 
+use axon_shm::internal::Location;
+
 use super::*;
 use crate::{
     graph::{Endpoint, EndpointKind},
     qos::Qos,
     session::message::{Announce, Attach, Granted, Message},
-    shm::Location,
 };
 
 use DiscoveryRange::{Localhost, Off, Subnet};

@@ -1,0 +1,47 @@
+//! A service and its client in one process, without a daemon.
+//!
+//! ```sh
+//! cargo run -p axon-transport --example service
+//! ```
+//!
+//! With the default, `DaemonPolicy::Spawn`, the two may be in different processes and on different hosts.
+#![expect(clippy::print_stdout, reason = "what it prints is its result")]
+
+use std::{error::Error, thread, time::Duration};
+
+use axon_transport::{
+    config::{Config, DaemonPolicy},
+    qos::Qos,
+    session::{EndpointSpec, Server, Session, SessionOptions},
+};
+
+const PATIENCE: Duration = Duration::from_secs(10);
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+    let session = Session::open(&config, SessionOptions::new("example"))?;
+    let spec = || EndpointSpec::new("/length", "example/Length", Qos::default());
+    let server = session.create_server(spec())?;
+    let client = session.create_client(spec())?;
+    let answering = thread::spawn(move || answer(&server));
+
+    // The two know each other.
+    if !client.wait_available(PATIENCE) {
+        return Err("no server answers".into());
+    }
+    let number = client.send_request(b"how long is this?")?;
+    let mut bytes = Vec::new();
+    let response = client.recv_response(&mut bytes, Some(PATIENCE)).ok_or("no response")?;
+    assert_eq!(response.sequence, number);
+    println!("{} bytes", String::from_utf8(bytes)?);
+    answering.join().expect("the server ends").map_err(Into::into)
+}
+
+/// Answers one request with its length.
+fn answer(server: &Server) -> Result<(), String> {
+    let mut bytes = Vec::new();
+    let request = server.recv_request(&mut bytes, Some(PATIENCE)).ok_or("no request")?;
+    let length = bytes.len().to_string();
+    let sent = server.send_response(request.publisher, request.sequence, length.as_bytes());
+    sent.map_err(|error| error.to_string())
+}

@@ -1,0 +1,158 @@
+//! How much of a publisher's memory its readers may keep: enough for two of them to keep samples of any
+//! length, and for many to keep shorter ones. What is beyond a reader's share it copies, so that the
+//! publisher finds room for the next sample whatever readers do. Plain data.
+
+use crate::{
+    alloc::classes,
+    limits::{ALIGN, MAX_SEGMENT},
+    ring::{
+        layout::{ALIGNED, COPIED_ALWAYS, SLOTS_AT},
+        pins::RECORDS,
+    },
+};
+
+/// Where it is in a grant's generation.
+const SHIFT: u32 = 24;
+const BITS: u64 = (1 << 6) - 1;
+/// Of what is left, one more reader gets this part.
+const PART: u64 = 16;
+
+/// The longest sample that a reader may pin: a power of two in bytes, or none at all.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Allowance {
+    /// Its binary logarithm; 0 for none.
+    power: u32,
+}
+
+impl Allowance {
+    pub(crate) const NONE: Self = Self { power: 0 };
+    /// For readers in the publisher's own session, to which it may do what it likes.
+    pub(crate) const ALL: Self = Self { power: BITS as u32 };
+
+    /// For samples of `len` bytes, and longer ones up to a power of two.
+    fn at_least(len: u64) -> Self {
+        Self { power: len.max(1).next_power_of_two().ilog2() }
+    }
+
+    /// For samples of up to `len` bytes, rounded down.
+    fn at_most(len: u64) -> Self {
+        // Shorter samples are never pinned.
+        if len > COPIED_ALWAYS { Self { power: len.ilog2() } } else { Self::NONE }
+    }
+
+    pub(crate) fn of(generation: u64) -> Self {
+        Self { power: (generation >> SHIFT & BITS) as u32 }
+    }
+
+    /// Its part of a generation.
+    pub(crate) fn bits(self) -> u64 {
+        u64::from(self.power) << SHIFT
+    }
+
+    /// The longest sample in bytes.
+    pub(crate) fn longest(self) -> u64 {
+        if self == Self::NONE { 0 } else { 1 << self.power }
+    }
+}
+
+/// What there is to be shared out.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Pool {
+    /// Bytes that all readers of other sessions may keep together. What this leaves of the publisher's
+    /// segments is more than half of them.
+    bytes: u64,
+    /// The largest slot.
+    largest: u64,
+}
+
+impl Pool {
+    /// Of a publisher with this budget.
+    pub(crate) fn new(budget: u64, max_message: u64) -> Self {
+        let segment = samples_bytes(budget, max_message, RECORDS as u64) - SLOTS_AT;
+        Self { bytes: segment / 2 * 3, largest: classes::rounded(max_message) }
+    }
+
+    /// What a reader may get where `taken` bytes have been given out, `process` of them to its own
+    /// process, which gets no more than three quarters of all.
+    pub(crate) fn share(&self, taken: u64, process: u64) -> Allowance {
+        let whole = Allowance::at_least(self.largest);
+        if taken + self.cost(whole) <= self.bytes / 2 {
+            return whole;
+        }
+        let left = self.bytes.saturating_sub(taken);
+        let left = left.min((self.bytes / 4 * 3).saturating_sub(process));
+        Allowance::at_most(left / PART / RECORDS as u64)
+    }
+
+    /// Bytes that a reader may keep in all.
+    pub(crate) fn cost(&self, allowance: Allowance) -> u64 {
+        RECORDS as u64 * allowance.longest().min(self.largest)
+    }
+}
+
+/// Bytes of a publisher's segment for a history of `budget` bytes of samples of at most
+/// `max_message` bytes. All of it is address space, not memory.
+pub(crate) fn samples_bytes(budget: u64, max_message: u64, pins: u64) -> u64 {
+    // Room for four of the largest, so that one of them always fits beside one that stands; and
+    // for as many as two readers can pin. Twice the budget, so that pieces between samples seldom
+    // shorten the history.
+    // One that is lent behind a header may begin so much later.
+    let largest = classes::rounded(max_message + ALIGNED as u64);
+    let bytes = (4 * largest).max(2 * budget) + 2 * pins * largest;
+    (SLOTS_AT + bytes).next_multiple_of(ALIGN).min(MAX_SEGMENT)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MIB: u64 = 1 << 20;
+
+    #[test]
+    fn a_generation_tells_what_it_allows() {
+        for allowance in [Allowance::NONE, Allowance::ALL, Allowance::at_most(25 * MIB)] {
+            let generation = 77 << 30 | allowance.bits() | 0xff_ffff;
+            assert_eq!(Allowance::of(generation), allowance);
+        }
+        assert_eq!(Allowance::at_most(25 * MIB).longest(), 16 * MIB);
+        assert_eq!(Allowance::at_least(25 * MIB).longest(), 32 * MIB);
+        assert_eq!(
+            (Allowance::NONE.longest(), Allowance::at_most(COPIED_ALWAYS)),
+            (0, Allowance::NONE)
+        );
+    }
+
+    /// What `readers` get one after the other, each of a process of its own or all of one.
+    fn shares(pool: Pool, readers: usize, one_process: bool) -> Vec<u64> {
+        let mut taken = 0;
+        let mut shares = Vec::new();
+        for _ in 0..readers {
+            let share = pool.share(taken, if one_process { taken } else { 0 });
+            taken += pool.cost(share);
+            shares.push(share.longest());
+        }
+        assert!(taken <= if one_process { pool.bytes / 4 * 3 } else { pool.bytes });
+        shares
+    }
+
+    #[test]
+    fn two_readers_keep_any_sample_and_many_keep_shorter_ones() {
+        // As publishers usually are.
+        let shares = shares(Pool::new(64 * MIB, 256 * MIB), 1000, false);
+        assert_eq!(shares[..2], [256 * MIB; 2]);
+        assert!(shares[2..16].iter().all(|longest| *longest >= 8 * MIB), "{shares:?}");
+        assert!(shares[16..64].iter().all(|longest| *longest >= MIB / 2), "{shares:?}");
+        assert_eq!(shares[999], 0);
+    }
+
+    #[test]
+    fn one_process_leaves_something_to_the_next() {
+        for (budget, max_message) in [(64 * MIB, 256 * MIB), (0, 25 * MIB), (1 << 32, 1 << 31)] {
+            let pool = Pool::new(budget, max_message);
+            let of_one = shares(pool, 5000, true);
+            assert!(of_one[1] >= max_message && of_one[4999] == 0);
+            let taken = of_one.iter().map(|longest| 6 * longest.min(&pool.largest)).sum();
+            assert!(pool.share(taken, 0).longest() > COPIED_ALWAYS, "the next process has its own");
+        }
+    }
+}

@@ -1,0 +1,292 @@
+//! A session's memory for objects: lanes, rings, their descriptors, and samples of up to 4 KiB. In
+//! the session's first segment for as long as that has room, then in further ones.
+//!
+//! Used when something attaches or grows, not by a steady publish.
+
+use std::{
+    sync::{Arc, Mutex, MutexGuard, PoisonError, atomic::AtomicU64},
+    time::{Duration, Instant},
+};
+
+use crate::{
+    alloc::{
+        area::Area,
+        segments::{OwnSegment, Segments},
+    },
+    error::ShmError,
+    memory::segment::Map,
+    ring::{
+        layout::{self, HEAP_AT, HEAP_BYTES, HEAP_BYTES_MAX, LANES_AT, Location, SegmentKind},
+        protocol::about_to_write,
+    },
+};
+
+/// Readers may take this long to map a segment before objects that they read move there without
+/// them: one that is stopped must not keep a ring small.
+const PATIENCE: Duration = Duration::from_secs(1);
+
+/// Memory of one object.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Block {
+    pub(crate) at: Location,
+    pub(crate) len: u64,
+}
+
+/// A block, and the map that it is in. Not given back when dropped.
+#[derive(Clone)]
+pub(crate) struct Object {
+    pub(crate) block: Block,
+    pub(crate) map: Arc<Map>,
+}
+
+impl Object {
+    #[inline]
+    pub(crate) fn words(&self) -> &[AtomicU64] {
+        let start = self.block.at.offset as usize / 8;
+        &self.map.words()[start..start + self.block.len as usize / 8]
+    }
+}
+
+/// Whether an object may be where its readers do not look yet.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Need {
+    /// If there is no other place.
+    Now,
+    /// It may not: rather none.
+    Mapped,
+}
+
+/// The segments that hold objects, and what of them is free.
+pub(crate) struct Heap(Mutex<Vec<Part>>);
+
+struct Part {
+    segment: Arc<OwnSegment>,
+    area: Area,
+    /// Where objects end that are no lanes.
+    limit: u64,
+    /// Bytes from the segment's start that are backed by memory.
+    committed: u64,
+    since: Instant,
+}
+
+impl Part {
+    fn new(segment: Arc<OwnSegment>) -> Self {
+        let bytes = segment.memory.bytes();
+        let limit = if segment.number() == 0 { LANES_AT } else { bytes };
+        let area = Area::new(HEAP_AT..bytes, 16);
+        Self { segment, area, limit, committed: layout::ALIGN, since: Instant::now() }
+    }
+
+    fn fits(&self, len: u64) -> bool {
+        self.area.fits_below(self.limit, len)
+    }
+
+    /// As [`allocate`](Self::allocate); what is in its way is noted, if it is the first.
+    fn give(&mut self, len: u64, short: &mut Option<ShmError>) -> Option<Object> {
+        self.allocate(len).unwrap_or_else(|error| {
+            short.get_or_insert(error);
+            None
+        })
+    }
+
+    fn allocate(&mut self, len: u64) -> Result<Option<Object>, ShmError> {
+        self.allocate_below(self.limit, len)
+    }
+
+    fn allocate_below(&mut self, limit: u64, len: u64) -> Result<Option<Object>, ShmError> {
+        let Some(offset) = self.area.allocate_below(limit, len) else { return Ok(None) };
+        let end = offset + len;
+        if end > self.committed {
+            let upto = end.next_multiple_of(layout::ALIGN);
+            if let Err(error) = self.segment.memory.commit(self.committed, upto) {
+                self.area.release(offset, len);
+                return Err(error);
+            }
+            self.committed = upto;
+        }
+        let at = Location { segment: self.segment.number(), offset };
+        Ok(Some(Object { block: Block { at, len }, map: Arc::clone(self.segment.map()) }))
+    }
+}
+
+impl Heap {
+    /// A heap in a session's first segment.
+    pub(crate) fn new(first: Arc<OwnSegment>) -> Self {
+        Self(Mutex::new(vec![Part::new(first)]))
+    }
+
+    /// `len` bytes, best in a segment that is `mapped` by those that will read there. `None` when
+    /// there is room only where it is not, and that will not do: ask again later.
+    ///
+    /// What is there may be what another object left, which somebody may still be reading, only to
+    /// find out that it is not good any more: it is to be written by words.
+    pub(crate) fn allocate(
+        &self,
+        segments: &Segments,
+        len: u64,
+        need: Need,
+        mapped: impl Fn(u32) -> bool,
+    ) -> Result<Option<Object>, ShmError> {
+        let len = Area::rounded(len);
+        let mut parts = self.parts();
+        let usable = |part: &Part| {
+            let number = part.segment.number();
+            number == 0 || mapped(number) || part.since.elapsed() >= PATIENCE
+        };
+        let mut found = None;
+        let mut elsewhere = false;
+        // Where one lacks memory, another may have some.
+        let mut short = None;
+        for part in &mut *parts {
+            if usable(part) {
+                found = part.give(len, &mut short);
+            } else {
+                elsewhere |= part.fits(len);
+            }
+            if found.is_some() {
+                break;
+            }
+        }
+        if found.is_none() && !elsewhere && short.is_none() {
+            let mut part = Self::another(segments, len)?;
+            if usable(&part) {
+                found = part.give(len, &mut short);
+            }
+            parts.push(part);
+        }
+        if found.is_none() && need == Need::Now {
+            found = parts.iter_mut().find_map(|part| part.give(len, &mut short));
+        }
+        drop(parts);
+        // Whoever gave this memory back did so after it raised a tail or replaced an array, and
+        // under the lock: readers that see what is written there now see that too.
+        about_to_write::<AtomicU64>();
+        match (found, short) {
+            (None, Some(error)) => Err(error),
+            (found, _) => Ok(found),
+        }
+    }
+
+    /// Has a segment with room for `len` bytes, so that others have it, too, by the time that they
+    /// are needed.
+    pub(crate) fn foresee(&self, segments: &Segments, len: u64) {
+        let len = Area::rounded(len);
+        let mut parts = self.parts();
+        if !parts.iter().any(|part| part.fits(len))
+            // What lacks now, whoever needs it then is told.
+            && let Ok(part) = Self::another(segments, len)
+        {
+            parts.push(part);
+        }
+    }
+
+    fn another(segments: &Segments, len: u64) -> Result<Part, ShmError> {
+        if len > HEAP_BYTES_MAX - HEAP_AT {
+            return Err(ShmError::NoMemory { needed: len, available: HEAP_BYTES_MAX });
+        }
+        let bytes = (HEAP_AT + len).next_multiple_of(HEAP_BYTES);
+        Ok(Part::new(segments.open(SegmentKind::Heap, bytes)?))
+    }
+
+    /// Memory for a lane, which is always in the first segment: who is asked by a reader there has
+    /// no other yet.
+    pub(crate) fn allocate_lane(&self) -> Result<Object, ShmError> {
+        let object = self.parts()[0].allocate_below(layout::SESSION_BYTES, layout::LANE)?;
+        // As for `allocate`: another object may have been there.
+        about_to_write::<AtomicU64>();
+        Ok(object.expect("there is room for all lanes"))
+    }
+
+    /// Takes a block back. Those who read there must have been told already.
+    pub(crate) fn release(&self, block: Block) {
+        let mut parts = self.parts();
+        if let Some(part) = parts.iter_mut().find(|p| p.segment.number() == block.at.segment) {
+            part.area.release(block.at.offset, block.len);
+        }
+    }
+
+    fn parts(&self) -> MutexGuard<'_, Vec<Part>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ids::SessionId;
+
+    fn heap() -> (Segments, Heap) {
+        let segments = Segments::new(SessionId::random());
+        let first = segments.open(SegmentKind::Session, layout::SESSION_BYTES).unwrap();
+        (segments, Heap::new(first))
+    }
+
+    #[test]
+    fn another_segment_is_used_once_it_is_mapped_or_nothing_else_will_do() {
+        let (segments, heap) = heap();
+        let nobody = |_| false;
+        let first = heap.allocate(&segments, 400 << 10, Need::Mapped, nobody).unwrap().unwrap();
+        assert_eq!(first.block.at.segment, 0);
+        for _ in 0..2 {
+            let none = heap.allocate(&segments, 400 << 10, Need::Mapped, nobody).unwrap();
+            assert!(none.is_none());
+        }
+        let now = heap.allocate(&segments, 400 << 10, Need::Now, nobody).unwrap().unwrap();
+        assert_eq!(now.block.at.segment, 1);
+        let small = heap.allocate(&segments, 1, Need::Now, nobody).unwrap().unwrap();
+        assert_eq!((small.block.at.segment, small.block.len), (0, 128));
+        let mapped = heap.allocate(&segments, 400 << 10, Need::Mapped, |_| true).unwrap().unwrap();
+        assert_eq!(mapped.block.at.segment, 1);
+        assert_eq!(segments.further().len(), 1);
+        heap.release(first.block);
+        let again = heap.allocate(&segments, 400 << 10, Need::Mapped, nobody).unwrap().unwrap();
+        assert_eq!(again.block, first.block);
+    }
+
+    #[test]
+    fn a_segment_that_lacks_memory_is_passed_over() {
+        let (segments, heap) = heap();
+        let most = HEAP_BYTES - HEAP_AT;
+        let second = heap.allocate(&segments, most, Need::Now, |_| true).unwrap().unwrap();
+        heap.release(second.block);
+        // Of what it says is free, no byte can be backed.
+        let end = layout::SESSION_BYTES;
+        heap.parts()[0].area = Area::new(end..2 * end, 16);
+        heap.parts()[0].committed = end;
+        heap.parts()[0].limit = 2 * end;
+        for mapped in [true, false] {
+            let object = heap.allocate(&segments, 128, Need::Now, |_| mapped).unwrap().unwrap();
+            assert_eq!(object.block.at.segment, 1);
+        }
+        heap.parts()[1].area = Area::new(HEAP_BYTES..2 * HEAP_BYTES, 16);
+        heap.parts()[1].committed = HEAP_BYTES;
+        heap.parts()[1].limit = 2 * HEAP_BYTES;
+        let error = heap.allocate(&segments, 128, Need::Now, |_| true).err();
+        assert!(matches!(error, Some(ShmError::System { .. })), "{error:?}");
+        assert_eq!(segments.further().len(), 1, "a third would lack it, too");
+    }
+
+    #[test]
+    fn lanes_have_room_in_the_first_segment_whatever_else_there_is() {
+        let (segments, heap) = heap();
+        let allocate = || heap.allocate(&segments, 1, Need::Now, |_| true).unwrap().unwrap().block;
+        let mut last = allocate();
+        while last.at.segment == 0 {
+            last = allocate();
+        }
+        for _ in 0..layout::LANES {
+            let lane = heap.allocate_lane().unwrap().block;
+            assert_eq!((lane.at.segment, lane.len), (0, layout::LANE));
+        }
+    }
+
+    #[test]
+    fn what_fits_nowhere_is_refused() {
+        let (segments, heap) = heap();
+        let error = heap.allocate(&segments, HEAP_BYTES_MAX, Need::Now, |_| true).err();
+        assert!(matches!(error, Some(ShmError::NoMemory { .. })), "{error:?}");
+        assert!(segments.further().is_empty());
+        heap.foresee(&segments, HEAP_BYTES_MAX - HEAP_AT);
+        assert_eq!(segments.further()[0].memory.bytes(), HEAP_BYTES_MAX);
+    }
+}

@@ -1,0 +1,231 @@
+//! The memory of a publisher's samples that readers read in place: samples that were given up stay
+//! in limbo until no reader pins them. Plain data, no shared memory.
+
+use std::ops::Range;
+
+use crate::{alloc::slots::Slots, ring::layout::Location};
+
+/// Who has which bytes of which segments. One at a time takes samples in; those that have been
+/// left are [vacated](Self::vacated) once the last of theirs has gone.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Limbo {
+    /// The one that takes samples in is the last of them.
+    stores: Vec<Store>,
+    retired: Vec<Retired>,
+    /// Places that were handed out and not published yet.
+    loans: u32,
+}
+
+/// One segment.
+#[derive(Clone, Debug)]
+struct Store {
+    number: u32,
+    slots: Slots,
+    left: bool,
+}
+
+#[derive(Clone, Debug)]
+struct Retired {
+    position: u64,
+    at: Location,
+    len: u64,
+    sample: u64,
+}
+
+impl Limbo {
+    /// The segment of this number, of which `range` is for samples, takes them in from now on.
+    pub(crate) fn open(&mut self, number: u32, range: Range<u64>) {
+        self.leave();
+        self.stores.push(Store { number, slots: Slots::new(range, 16), left: false });
+    }
+
+    /// No segment takes samples in, until another is opened.
+    pub(crate) fn leave(&mut self) {
+        self.stores.iter_mut().for_each(|store| store.left = true);
+    }
+
+    /// The slots of the segment where something was lent.
+    pub(crate) fn slots(&mut self, at: Location) -> &mut Slots {
+        slots(&mut self.stores, at)
+    }
+
+    /// Bytes in use of the segment that takes samples in, and bytes that are backed by memory.
+    pub(crate) fn extent(&self) -> Option<(u64, u64)> {
+        let store = self.stores.last().filter(|store| !store.left)?;
+        Some((store.slots.used(), store.slots.backed()))
+    }
+
+    /// The numbers of all segments.
+    pub(crate) fn segments(&self) -> impl ExactSizeIterator<Item = u32> + '_ {
+        self.stores.iter().map(|store| store.number)
+    }
+
+    /// A place that nobody reads, where samples are taken in.
+    pub(crate) fn take(&mut self, len: u64) -> Option<Location> {
+        self.take_by(|slots| slots.take(len))
+    }
+
+    fn take_by(&mut self, take: impl FnOnce(&mut Slots) -> Option<u64>) -> Option<Location> {
+        let store = self.stores.last_mut().filter(|store| !store.left)?;
+        let offset = take(&mut store.slots)?;
+        Some(Location { segment: store.number, offset })
+    }
+
+    /// What was taken is free again: no reader has heard of it.
+    pub(crate) fn put_back(&mut self, at: Location, len: u64) {
+        slots(&mut self.stores, at).release(at.offset, len);
+    }
+
+    /// There is no memory for what was taken.
+    pub(crate) fn forgo(&mut self, at: Location, len: u64) {
+        slots(&mut self.stores, at).forgo(at.offset, len);
+    }
+
+    /// A place that nobody reads, for a loan: in a segment that was left only if nowhere else.
+    pub(crate) fn lend(&mut self, len: u64) -> Option<Location> {
+        let at = self.take(len).or_else(|| {
+            let mut left = self.stores.iter_mut().filter(|store| store.left);
+            left.find_map(|store| {
+                let offset = store.slots.take(len)?;
+                Some(Location { segment: store.number, offset })
+            })
+        })?;
+        self.loans += 1;
+        Some(at)
+    }
+
+    /// As [`lend`](Self::lend), while slots [take turns](Slots::take_turn).
+    pub(crate) fn lend_turn(&mut self, len: u64) -> Option<Location> {
+        let at = self.take_by(|slots| slots.take_turn(len))?;
+        self.loans += 1;
+        Some(at)
+    }
+
+    /// Whether there would be room for `len` bytes if these samples were given up, and nothing that
+    /// readers keep: with no more memory than there is, unless it can `grow`.
+    pub(crate) fn would_hold(
+        &self,
+        len: u64,
+        samples: impl Iterator<Item = (Location, u64)>,
+        grow: bool,
+    ) -> bool {
+        let mut stores = self.stores.clone();
+        for (at, len) in samples {
+            slots(&mut stores, at).release(at.offset, len);
+        }
+        stores.iter_mut().any(|Store { slots, .. }| {
+            slots.take(len).is_some_and(|at| grow || slots.end(at, len) <= slots.backed())
+        })
+    }
+
+    /// The loan was not published.
+    pub(crate) fn give_back(&mut self, at: Location, len: u64) {
+        self.put_back(at, len);
+        self.loans -= 1;
+    }
+
+    /// There is no memory for the loan.
+    pub(crate) fn withdraw(&mut self, at: Location, len: u64) {
+        self.forgo(at, len);
+        self.loans -= 1;
+    }
+
+    /// The loan was published.
+    pub(crate) fn published(&mut self) {
+        self.loans -= 1;
+    }
+
+    /// The sample at `position`, of `sample` bytes in a slot of `len`, has been given up; readers may
+    /// still be at it.
+    pub(crate) fn retire(&mut self, position: u64, at: Location, len: u64, sample: u64) {
+        self.retired.push(Retired { position, at, len, sample });
+    }
+
+    /// Frees what no reader pins, by position and length of the sample: that is what a reader goes by, so
+    /// one that was lent more keeps all of it. The tail must have been raised above all that is here before
+    /// the pins were looked at.
+    pub(crate) fn reclaim(&mut self, pinned: impl Fn(u64, u64) -> bool) {
+        let keeps = |retired: &Retired| pinned(retired.position, retired.sample);
+        // The last ones first, so that the ones that were read longest ago are taken first.
+        for Retired { at, len, .. } in self.retired.iter().rev().filter(|retired| !keeps(retired)) {
+            slots(&mut self.stores, *at).release(at.offset, *len);
+        }
+        self.retired.retain(keeps);
+    }
+
+    /// The positions of samples that were given up and not reclaimed.
+    pub(crate) fn retired(&self) -> impl ExactSizeIterator<Item = u64> + '_ {
+        self.retired.iter().map(|retired| retired.position)
+    }
+
+    pub(crate) fn loans(&self) -> u32 {
+        self.loans
+    }
+
+    /// Forgets the segments that were left and hold nothing any more, and names them.
+    pub(crate) fn vacated(&mut self) -> Vec<u32> {
+        let vacant = |store: &Store| store.left && store.slots.used() == 0;
+        let numbers = self.stores.iter().filter(|store| vacant(store)).map(|store| store.number);
+        let numbers = numbers.collect();
+        self.stores.retain(|store| !vacant(store));
+        numbers
+    }
+}
+
+fn slots(stores: &mut [Store], at: Location) -> &mut Slots {
+    let store = stores.iter_mut().find(|store| store.number == at.segment);
+    // A segment is only forgotten once it holds nothing.
+    &mut store.expect("the segment of what is in use").slots
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LEN: u64 = 8192;
+
+    #[test]
+    fn a_segment_that_was_left_goes_with_the_last_that_it_holds() {
+        let mut limbo = Limbo::default();
+        limbo.open(1, 0..4 * LEN);
+        let [sample, loan] = [(); 2].map(|()| limbo.lend(LEN).unwrap());
+        limbo.published();
+        limbo.open(2, 0..4 * LEN);
+        assert_eq!(limbo.lend(LEN).unwrap().segment, 2, "the new one takes over");
+        assert!(limbo.vacated().is_empty());
+
+        limbo.retire(7, sample, LEN, LEN);
+        limbo.reclaim(|position, _| position == 7);
+        limbo.give_back(loan, LEN);
+        assert!(limbo.vacated().is_empty(), "a reader is still at it");
+        limbo.reclaim(|_, _| false);
+        assert_eq!(limbo.vacated(), [1]);
+        assert_eq!(limbo.segments().collect::<Vec<_>>(), [2]);
+    }
+
+    #[test]
+    fn a_segment_that_takes_samples_in_stays_though_it_is_empty() {
+        let mut limbo = Limbo::default();
+        assert_eq!(limbo.lend(LEN), None);
+        limbo.open(1, 0..4 * LEN);
+        assert!(limbo.vacated().is_empty());
+        limbo.leave();
+        assert!(limbo.extent().is_none());
+        assert_eq!((limbo.take(LEN), limbo.vacated()), (None, vec![1]));
+        assert_eq!(limbo.lend(LEN), None);
+    }
+
+    #[test]
+    fn a_segment_that_was_left_helps_out_while_it_is_there() {
+        let mut limbo = Limbo::default();
+        limbo.open(1, 0..2 * LEN);
+        let kept = limbo.lend(LEN).unwrap();
+        limbo.open(2, 0..LEN);
+        let places = [(); 3].map(|()| limbo.lend(LEN).map(|at| at.segment));
+        assert_eq!(places, [Some(2), Some(1), None]);
+        assert!(limbo.would_hold(LEN, [(kept, LEN)].into_iter(), true));
+        assert!(!limbo.would_hold(LEN, [(kept, LEN)].into_iter(), false), "it is not backed");
+        assert!(!limbo.would_hold(LEN, std::iter::empty(), true));
+        assert_eq!(limbo.loans(), 3, "to ask takes nothing");
+    }
+}

@@ -1,0 +1,12 @@
+//! A session's memory as its own process gives it out: segments, objects, slots for large samples, and who
+//! may keep how much.
+
+pub(crate) mod allowance;
+pub(crate) mod area;
+pub(crate) mod blocks;
+pub(crate) mod classes;
+pub(crate) mod heap;
+pub(crate) mod limbo;
+pub(crate) mod segments;
+pub(crate) mod slots;
+pub(crate) mod tenure;

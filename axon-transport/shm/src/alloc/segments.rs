@@ -1,0 +1,140 @@
+//! A session's own segments, by their numbers.
+
+use std::{
+    collections::BTreeMap,
+    fmt,
+    os::fd::{BorrowedFd, OwnedFd},
+    sync::{Arc, OnceLock, PoisonError, RwLock},
+};
+
+use crate::{
+    error::ShmError,
+    ids::{Gid, SessionId},
+    memory::segment::{Map, Segment},
+    ring::layout::{self, SegmentKind},
+};
+
+/// A segment as other sessions are told of it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SegmentInfo {
+    /// Its number in its session: from 0, never used again.
+    pub number: u32,
+    /// What it is for.
+    pub kind: SegmentKind,
+}
+
+/// What a session's owner passes on to the others, in this order.
+#[derive(Clone, Copy, Debug)]
+pub enum SegmentEvent<'a> {
+    /// A segment came into being, in which there will be what others read.
+    Opened(SegmentInfo, BorrowedFd<'a>),
+    /// A segment is given up: nobody reads it any more.
+    Gone(SegmentInfo),
+    /// This publisher would be glad if somebody [prepared](crate::writer::Writer::prepare) it for its next
+    /// sample. Nobody else needs to know.
+    Low(Gid),
+}
+
+type Listener = Box<dyn Fn(SegmentEvent<'_>) + Send + Sync>;
+
+/// One of them.
+pub(crate) struct OwnSegment {
+    pub(crate) info: SegmentInfo,
+    pub(crate) memory: Segment,
+}
+
+impl OwnSegment {
+    pub(crate) fn number(&self) -> u32 {
+        self.info.number
+    }
+
+    pub(crate) fn map(&self) -> &Arc<Map> {
+        self.memory.map()
+    }
+
+    pub(crate) fn descriptor(&self) -> Result<OwnedFd, ShmError> {
+        self.memory
+            .fd()
+            .try_clone_to_owned()
+            .map_err(|source| ShmError::System { what: "duplicating a descriptor", source })
+    }
+}
+
+/// All of them.
+pub(crate) struct Segments {
+    session: SessionId,
+    table: RwLock<Table>,
+    listener: OnceLock<Listener>,
+}
+
+#[derive(Default)]
+struct Table {
+    live: BTreeMap<u32, Arc<OwnSegment>>,
+    next: u32,
+}
+
+impl Segments {
+    pub(crate) fn new(session: SessionId) -> Self {
+        Self { session, table: RwLock::default(), listener: OnceLock::new() }
+    }
+
+    /// Has `listener` hear of each segment from now on, in the order of their numbers. It is called
+    /// while locks are held: it must not block, nor call into the session.
+    pub(crate) fn listen(&self, listener: Listener) -> bool {
+        self.listener.set(listener).is_ok()
+    }
+
+    /// Tells the listener.
+    pub(crate) fn tell(&self, event: SegmentEvent<'_>) {
+        if let Some(listener) = self.listener.get() {
+            listener(event);
+        }
+    }
+
+    /// A new segment of `bytes` bytes, of which the first [`layout::ALIGN`] are backed by memory.
+    pub(crate) fn open(&self, kind: SegmentKind, bytes: u64) -> Result<Arc<OwnSegment>, ShmError> {
+        let name = match kind {
+            SegmentKind::Session => "axon-session",
+            SegmentKind::Heap => "axon-heap",
+            SegmentKind::Samples(_) => "axon-samples",
+        };
+        let memory = Segment::create(name, bytes)?;
+        memory.commit(0, layout::ALIGN)?;
+        let mut table = self.table.write().unwrap_or_else(PoisonError::into_inner);
+        let number = table.next;
+        if number > layout::MAX_NUMBER {
+            return Err(ShmError::NoNumber(self.session));
+        }
+        table.next += 1;
+        layout::write_segment(memory.words(), self.session, number, kind);
+        let segment = Arc::new(OwnSegment { info: SegmentInfo { number, kind }, memory });
+        table.live.insert(number, Arc::clone(&segment));
+        self.tell(SegmentEvent::Opened(segment.info, segment.memory.fd()));
+        Ok(segment)
+    }
+
+    /// Nothing in the segment is of use to anybody any more.
+    pub(crate) fn close(&self, number: u32) {
+        let mut table = self.table.write().unwrap_or_else(PoisonError::into_inner);
+        if let Some(segment) = table.live.remove(&number) {
+            self.tell(SegmentEvent::Gone(segment.info));
+        }
+    }
+
+    pub(crate) fn get(&self, number: u32) -> Option<Arc<OwnSegment>> {
+        self.table.read().unwrap_or_else(PoisonError::into_inner).live.get(&number).cloned()
+    }
+
+    /// What there is besides the first, by number.
+    pub(crate) fn further(&self) -> Vec<Arc<OwnSegment>> {
+        let table = self.table.read().unwrap_or_else(PoisonError::into_inner);
+        table.live.values().filter(|s| s.info.kind != SegmentKind::Session).cloned().collect()
+    }
+}
+
+impl fmt::Debug for Segments {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let table = self.table.read().unwrap_or_else(PoisonError::into_inner);
+        f.debug_tuple("Segments").field(&table.live.keys().collect::<Vec<_>>()).finish()
+    }
+}

@@ -1,0 +1,121 @@
+//! How long a publisher keeps the memory of its large samples: as long as it publishes such, and
+//! about as much as they need. Plain data; whoever looks after the publisher says what time it is.
+
+use std::time::{Duration, Instant};
+
+/// Memory that holds nothing and was not used for this long is given up.
+pub(crate) const IDLE: Duration = Duration::from_secs(10);
+/// Memory is given up when this many times less was enough for as long.
+const SURPLUS: u64 = 4;
+/// So much is never too much, in bytes.
+const MODEST: u64 = 1 << 20;
+
+/// What was used of a segment.
+#[derive(Debug)]
+pub(crate) struct Tenure {
+    /// Whether there was a large sample since the last look.
+    used: bool,
+    /// When there was one last, as far as the looks tell.
+    last: Instant,
+    /// The most bytes in use since `since`.
+    peak: u64,
+    since: Instant,
+}
+
+impl Tenure {
+    pub(crate) fn begin(now: Instant) -> Self {
+        Self { used: true, last: now, peak: 0, since: now }
+    }
+
+    /// There is a large sample, and with it `bytes` are in use.
+    #[inline]
+    pub(crate) fn used(&mut self, bytes: u64) {
+        self.used = true;
+        self.peak = self.peak.max(bytes);
+    }
+
+    /// Looks at a segment with `backed` bytes of memory, of which `bytes` are in use. Whether it
+    /// should be left.
+    pub(crate) fn is_over(&mut self, now: Instant, bytes: u64, backed: u64) -> bool {
+        if std::mem::take(&mut self.used) {
+            self.last = now;
+        }
+        if bytes == 0 && now.saturating_duration_since(self.last) >= IDLE {
+            return true;
+        }
+        if now.saturating_duration_since(self.since) < IDLE {
+            return false;
+        }
+        let peak = std::mem::replace(&mut self.peak, bytes).max(bytes);
+        self.since = now;
+        backed > MODEST && backed / SURPLUS > peak
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MIB: u64 = 1 << 20;
+
+    fn seconds(start: Instant, count: u64) -> Instant {
+        start + Duration::from_secs(count)
+    }
+
+    #[test]
+    fn memory_that_nobody_uses_is_left() {
+        let start = Instant::now();
+        let mut tenure = Tenure::begin(start);
+        tenure.used(MIB);
+        for second in 1..=10 {
+            assert!(!tenure.is_over(seconds(start, second), 0, MIB), "used {second} s ago");
+        }
+        assert!(tenure.is_over(seconds(start, 11), 0, MIB), "10 s after the look that saw it");
+    }
+
+    #[test]
+    fn a_sample_that_stands_keeps_its_memory() {
+        let start = Instant::now();
+        let mut tenure = Tenure::begin(start);
+        tenure.used(20 * MIB);
+        for second in 1..1000 {
+            assert!(!tenure.is_over(seconds(start, second), 20 * MIB, 40 * MIB));
+        }
+    }
+
+    #[test]
+    fn memory_in_use_stays_for_ever() {
+        let start = Instant::now();
+        let mut tenure = Tenure::begin(start);
+        for second in 1..1000 {
+            tenure.used(20 * MIB);
+            assert!(!tenure.is_over(seconds(start, second), 20 * MIB, 64 * MIB));
+        }
+    }
+
+    #[test]
+    fn far_too_much_memory_is_left_after_a_while() {
+        let start = Instant::now();
+        let mut tenure = Tenure::begin(start);
+        tenure.used(256 * MIB);
+        let mut left = None;
+        for second in 1..60 {
+            tenure.used(2 * MIB);
+            if tenure.is_over(seconds(start, second), 2 * MIB, 256 * MIB) {
+                left = Some(second);
+                break;
+            }
+        }
+        assert_eq!(left, Some(20), "a whole period went by with little in use");
+    }
+
+    #[test]
+    fn a_little_is_kept_whatever_is_in_use() {
+        let start = Instant::now();
+        let mut tenure = Tenure::begin(start);
+        for second in 1..60 {
+            tenure.used(8192);
+            assert!(!tenure.is_over(seconds(start, second), 8192, MIB));
+        }
+    }
+}

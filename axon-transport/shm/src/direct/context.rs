@@ -1,0 +1,275 @@
+//! What a process needs once to publish to others and to be woken by them.
+
+use std::{
+    collections::HashMap,
+    fmt,
+    sync::{
+        Arc, Mutex, MutexGuard, PoisonError, Weak,
+        atomic::{AtomicU32, Ordering},
+    },
+    time::Duration,
+};
+
+use crate::{
+    direct::{
+        connect::{Granted, News},
+        lines::Lines,
+    },
+    error::ShmError,
+    ids::{Gid, SessionId},
+    os::descriptors::PassedFd,
+    ring::layout::Location,
+    session::{
+        leader::ExternalLeader,
+        peer::{Peer, PeerDescriptors, PeerSession},
+        segment::SessionSegment,
+        segment_message::{SegmentName, SegmentOpened},
+    },
+};
+
+/// Segments of one other context that are kept to be mapped later, at most.
+const MANY: usize = 64;
+
+/// The memory, doorbell and identity that publishers and subscribers of a process share. Starts no
+/// thread. Clones are the same context; all methods may be called from any thread.
+#[derive(Clone)]
+pub struct Context {
+    inner: Arc<Inner>,
+}
+
+struct Inner {
+    session: Arc<SessionSegment>,
+    entities: AtomicU32,
+    /// The other contexts, each mapped once.
+    peers: Mutex<HashMap<SessionId, Known>>,
+    lines: Arc<Lines>,
+    /// What other contexts handed over and could not be mapped then.
+    unmapped: Mutex<Vec<Unmapped>>,
+    /// What subscribers of this context ask for, and what its own publishers answered.
+    own: Mutex<HashMap<Gid, Own>>,
+}
+
+type Unmapped = (Weak<PeerSession>, SegmentOpened, PassedFd);
+
+/// A question of this context's.
+struct Own {
+    lane: Location,
+    granted: Option<Granted>,
+}
+
+/// That a subscriber asks, until it has its answer.
+pub(crate) struct Asking<'a> {
+    context: &'a Context,
+    reader: Gid,
+}
+
+impl Asking<'_> {
+    /// The end that answered `granted` as this very context. Our id, memory and pidfd prove
+    /// nothing, as every peer has them: a publisher of ours must have granted just that.
+    pub(crate) fn answered(&self, granted: &Granted) -> Result<Peer, ShmError> {
+        match self.context.own()?.get(&self.reader) {
+            Some(own) if own.granted.as_ref() == Some(granted) => Ok(self.context.local()),
+            _ => Err(ShmError::Refused { what: "no publisher of this context has granted that" }),
+        }
+    }
+}
+
+impl Drop for Asking<'_> {
+    fn drop(&mut self) {
+        if let Ok(mut own) = self.context.own() {
+            own.remove(&self.reader);
+        }
+    }
+}
+
+/// Another context.
+struct Known {
+    session: Weak<PeerSession>,
+    /// Device and inode of its first segment.
+    memory: (u64, u64),
+}
+
+impl Context {
+    /// A new context of this process.
+    ///
+    /// # Errors
+    /// Memory or descriptors are short, or the system has no sealed memfds.
+    pub fn new() -> Result<Self, ShmError> {
+        Ok(Self::of(SessionSegment::create(SessionId::random())?))
+    }
+
+    fn of(session: Arc<SessionSegment>) -> Self {
+        let (entities, peers) = (AtomicU32::new(1), Mutex::default());
+        let lines = Arc::new(Lines::new(session.id()));
+        let told = Arc::clone(&lines);
+        session.on_segment(move |event| told.tell(event));
+        let (unmapped, own) = (Mutex::default(), Mutex::default());
+        Self { inner: Arc::new(Inner { session, entities, peers, lines, unmapped, own }) }
+    }
+
+    /// Another context says over its own line that it has opened a segment or given one up. What
+    /// it says of others is not listened to.
+    pub(crate) fn hear(&self, from: &Arc<PeerSession>, news: News) {
+        let (News::Opened(SegmentOpened { session, .. }, _)
+        | News::Gone(SegmentName { session, .. })) = &news;
+        if *session != from.id() {
+            return;
+        }
+        match news {
+            News::Opened(opened, fd) => match from.add_segment(opened.segment.into(), &fd) {
+                // One that is refused shows when it is read.
+                Ok(()) | Err(ShmError::Refused { .. }) => {}
+                Err(_) => {
+                    let mut unmapped = self.unmapped();
+                    let of = |other: &&Unmapped| other.0.as_ptr() == Arc::as_ptr(from);
+                    // Each of its lines tells of it.
+                    let known = unmapped.iter().filter(of).any(|(_, other, _)| *other == opened);
+                    if !known && unmapped.iter().filter(of).count() < MANY {
+                        unmapped.push((Arc::downgrade(from), opened, fd));
+                    }
+                }
+            },
+            News::Gone(gone) => {
+                self.unmapped().retain(|(_, opened, _)| {
+                    (opened.session, opened.segment.number) != (gone.session, gone.number)
+                });
+                from.remove_segment(gone.number);
+            }
+        }
+    }
+
+    /// Maps what could not be mapped when it came, if it can be now.
+    pub(crate) fn hear_again(&self) {
+        // Under the lock: one that is given up meanwhile is found here, or mapped already.
+        self.unmapped().retain(|(from, opened, fd)| {
+            let mapped = |from: Arc<PeerSession>| from.add_segment(opened.segment.into(), fd);
+            !matches!(
+                from.upgrade().map(mapped),
+                None | Some(Ok(()) | Err(ShmError::Refused { .. }))
+            )
+        });
+    }
+
+    fn unmapped(&self) -> MutexGuard<'_, Vec<Unmapped>> {
+        self.inner.unmapped.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    pub(crate) fn lines(&self) -> &Lines {
+        &self.inner.lines
+    }
+
+    /// Its id.
+    #[inline]
+    pub fn id(&self) -> SessionId {
+        self.session().id()
+    }
+
+    /// Blocks until `ready`, which is asked again whenever something was published to a subscriber
+    /// of this context or [`notify`](Self::notify) was called, or until `timeout` has passed.
+    /// Returns what `ready` said last.
+    pub fn wait(&self, ready: impl FnMut() -> bool, timeout: Option<Duration>) -> bool {
+        self.session().wait(ready, timeout)
+    }
+
+    /// Makes every [`wait`](Self::wait) look again.
+    pub fn notify(&self) {
+        self.session().notify();
+    }
+
+    /// A descriptor for an event loop, asynchronous ones too, which becomes readable when there is
+    /// something to look for. How to use it, with an example: [`ExternalLeader`].
+    ///
+    /// # Errors
+    /// The context has one already.
+    pub fn event(&self) -> Result<ExternalLeader, ShmError> {
+        self.session().external_leader()
+    }
+
+    #[inline]
+    pub(crate) fn session(&self) -> &Arc<SessionSegment> {
+        &self.inner.session
+    }
+
+    pub(crate) fn next_gid(&self) -> Gid {
+        Gid::new(self.id(), self.inner.entities.fetch_add(1, Ordering::Relaxed))
+    }
+
+    /// A subscriber of this context is about to ask with `lane`.
+    pub(crate) fn asking(&self, reader: Gid, lane: Location) -> Result<Asking<'_>, ShmError> {
+        self.own()?.insert(reader, Own { lane, granted: None });
+        Ok(Asking { context: self, reader })
+    }
+
+    /// This very context, if it has asked so.
+    pub(crate) fn asked_itself(&self, reader: Gid, lane: Location) -> Result<Peer, ShmError> {
+        match self.own()?.get(&reader) {
+            Some(own) if own.lane == lane => Ok(self.local()),
+            _ => Err(ShmError::Refused { what: "no subscriber of this context asks for that" }),
+        }
+    }
+
+    /// A publisher of this context answers a subscriber of it.
+    pub(crate) fn granted_itself(&self, granted: &Granted) -> Result<(), ShmError> {
+        if let Some(own) = self.own()?.get_mut(&granted.reader) {
+            own.granted = Some(*granted);
+        }
+        Ok(())
+    }
+
+    fn local(&self) -> Peer {
+        Peer::Local(Arc::clone(self.session()))
+    }
+
+    fn own(&self) -> Result<MutexGuard<'_, HashMap<Gid, Own>>, ShmError> {
+        // A thread of the parent may have held the lock when this process was forked.
+        if self.session().is_forked() {
+            return Err(ShmError::Forked);
+        }
+        Ok(self.inner.own.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// Another context, `id`, as seen from this one.
+    pub(crate) fn peer(
+        &self,
+        id: SessionId,
+        descriptors: PeerDescriptors,
+    ) -> Result<Peer, ShmError> {
+        // A thread of the parent may have held the lock below when this process was forked.
+        if self.session().is_forked() {
+            return Err(ShmError::Forked);
+        }
+        let refuse = |what| Err(ShmError::Refused { what });
+        let process = descriptors
+            .process()
+            .map_err(|source| ShmError::System { what: "looking up a process", source })?;
+        let Some(process) = process else {
+            return refuse(
+                "its pidfd names no process here: containers must share their processes (--pid)",
+            );
+        };
+        let Some(memory) = descriptors.segment.memory() else {
+            return refuse("its first segment is no memfd");
+        };
+        let mut peers = self.inner.peers.lock().unwrap_or_else(PoisonError::into_inner);
+        peers.retain(|_, known| known.session.strong_count() > 0);
+        if let Some(known) = peers.get(&id)
+            && let Some(session) = known.session.upgrade()
+        {
+            // Ids are no secret. Whoever comes first with another's would else be taken for it.
+            if known.memory != memory || !session.is_of(process) {
+                return refuse("another process has this context's id");
+            }
+            return Ok(Peer::Remote(session));
+        }
+        let others: Vec<_> = peers.values().filter_map(|other| other.session.upgrade()).collect();
+        let session = PeerSession::map_among(id, descriptors, &others)?;
+        peers.insert(id, Known { session: Arc::downgrade(&session), memory });
+        Ok(Peer::Remote(session))
+    }
+}
+
+impl fmt::Debug for Context {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Context").field(&self.id()).finish()
+    }
+}

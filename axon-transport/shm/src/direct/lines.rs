@@ -1,0 +1,282 @@
+//! Whom a context tells of its segments where there is no daemon: each subscriber over a line of its
+//! own.
+
+use std::{
+    os::fd::{AsFd, BorrowedFd},
+    sync::{
+        Mutex, MutexGuard, PoisonError, TryLockError,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::{Duration, Instant},
+};
+
+use rustix::net::sockopt;
+
+use crate::{
+    alloc::segments::{SegmentEvent, SegmentInfo},
+    direct::connect::{Channel, ConnectError, Granted},
+    ids::{Gid, SessionId},
+    os::descriptors::PassedFd,
+    ring::layout::SegmentKind,
+    session::{peer::Peer, segment::SessionSegment},
+    wake::Purpose,
+};
+
+/// What may stand in a line: some twenty packets. Each segment among them keeps its memory, though
+/// its publisher may have given it up since.
+const ROOM: usize = 8 << 10;
+/// How often those that could not be told of something are tried again, at most.
+const PAUSE: Duration = Duration::from_millis(10);
+
+/// All of a context's lines.
+pub(crate) struct Lines {
+    session: SessionId,
+    state: Mutex<State>,
+    /// Somebody has not been told all. A hint: what it is about is under the locks.
+    behind: AtomicBool,
+}
+
+#[derive(Default)]
+struct State {
+    lines: Vec<Line>,
+    /// When those that are behind were told last.
+    tried: Option<Instant>,
+}
+
+/// A subscriber that is to be told of segments.
+struct Line {
+    reader: Gid,
+    writer: Gid,
+    peer: Peer,
+    socket: PassedFd,
+    /// The segments that its context was given, and that this line has to tell when they are gone.
+    told: Vec<SegmentInfo>,
+    /// Nothing more is published to it.
+    ended: bool,
+}
+
+impl Line {
+    /// Whether what is in the segment may concern the subscriber.
+    fn reads(&self, kind: SegmentKind) -> bool {
+        match kind {
+            SegmentKind::Session => false,
+            SegmentKind::Heap => true,
+            SegmentKind::Samples(gid) => gid == self.writer,
+        }
+    }
+
+    fn open(
+        &mut self,
+        session: SessionId,
+        info: SegmentInfo,
+        fd: BorrowedFd<'_>,
+    ) -> Result<(), ConnectError> {
+        if self.ended || !self.reads(info.kind) || self.told.contains(&info) {
+            return Ok(());
+        }
+        self.channel().hand(session, info, fd)?;
+        self.told.push(info);
+        Ok(())
+    }
+
+    fn close(&mut self, session: SessionId, info: SegmentInfo) -> Result<(), ConnectError> {
+        if let Some(index) = self.told.iter().position(|told| *told == info) {
+            self.channel().withdraw(session, info.number)?;
+            self.told.swap_remove(index);
+        }
+        Ok(())
+    }
+
+    /// Makes what it was told what there is.
+    fn catch_up(&mut self, session: &SessionSegment, first: u32) -> Result<(), ConnectError> {
+        let mut segments = session.further();
+        segments.sort_by_key(|segment| (segment.number() != first, segment.number()));
+        let gone = |told: &&SegmentInfo| segments.iter().all(|segment| segment.info != **told);
+        for info in self.told.iter().filter(gone).copied().collect::<Vec<_>>() {
+            self.close(session.id(), info)?;
+        }
+        for segment in segments {
+            self.open(session.id(), segment.info, segment.memory.fd())?;
+        }
+        Ok(())
+    }
+
+    /// What it has to tell when it is gone. Other segments stay for as long as the context does.
+    fn samples(&self) -> impl Iterator<Item = &SegmentInfo> {
+        self.told.iter().filter(|told| matches!(told.kind, SegmentKind::Samples(_)))
+    }
+
+    /// Does not wait.
+    fn channel(&self) -> Channel<'_> {
+        Channel::new(self.socket.as_fd(), Some(Duration::ZERO))
+    }
+}
+
+impl State {
+    /// Has each line told something, and parts with those that are closed, or that have ended and
+    /// nothing left to tell. Whether all were told.
+    fn each(&mut self, mut tell: impl FnMut(&mut Line) -> Result<(), ConnectError>) -> bool {
+        let mut all = true;
+        let parted = self.lines.extract_if(.., |line| match tell(line) {
+            Ok(()) => line.ended && line.samples().next().is_none(),
+            Err(ConnectError::Closed) => true,
+            // Its queue is full, or descriptors are short: that passes.
+            Err(_) => {
+                all = false;
+                false
+            }
+        });
+        for parted in parted.collect::<Vec<_>>() {
+            // The context that it led to may go on, and have the segments mapped.
+            let same = |line: &&mut Line| line.peer.id() == parted.peer.id();
+            let Some(heir) = self.lines.iter_mut().find(same) else { continue };
+            for info in parted
+                .samples()
+                .filter(|info| !heir.told.contains(info))
+                .copied()
+                .collect::<Vec<_>>()
+            {
+                heir.told.push(info);
+                all = false;
+            }
+        }
+        all
+    }
+}
+
+impl Lines {
+    pub(crate) fn new(session: SessionId) -> Self {
+        Self { session, state: Mutex::default(), behind: AtomicBool::new(false) }
+    }
+
+    /// From now on a subscriber of session `peer` is told over `socket` of the segments that there
+    /// are, the one that its ring is in first, and of those to come.
+    pub(crate) fn add(
+        &self,
+        session: &SessionSegment,
+        peer: Peer,
+        granted: &Granted,
+        socket: PassedFd,
+    ) -> Result<(), ConnectError> {
+        let Granted { reader, writer, ring, .. } = *granted;
+        // One that cannot be set holds more, which is its own harm.
+        let _ = sockopt::set_socket_send_buffer_size(&socket, ROOM);
+        let mut line = Line { reader, writer, peer, socket, told: Vec::new(), ended: false };
+        let mut state = self.lock();
+        let told = line.catch_up(session, ring.segment);
+        let has_ring =
+            ring.segment == 0 || line.told.iter().any(|told| told.number == ring.segment);
+        match told {
+            Err(error) if !has_ring || matches!(error, ConnectError::Closed) => return Err(error),
+            told => self.note(told.is_ok()),
+        }
+        // Who asks once more hears over the new line alone.
+        state.lines.retain(|line| (line.reader, line.writer) != (reader, writer));
+        state.lines.push(line);
+        Ok(())
+    }
+
+    /// To be told of all segments. Called with their table locked, so it waits for nothing.
+    pub(crate) fn tell(&self, event: SegmentEvent<'_>) {
+        let mut state = match self.state.try_lock() {
+            Ok(state) => state,
+            Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),
+            Err(TryLockError::WouldBlock) => {
+                // Whoever has it may have seen all segments already.
+                self.behind.store(true, Ordering::Relaxed);
+                return;
+            }
+        };
+        self.note(state.each(|line| match event {
+            SegmentEvent::Opened(info, fd) => line.open(self.session, info, fd),
+            SegmentEvent::Gone(info) => line.close(self.session, info),
+            // Nobody prepares publishers here but their owner.
+            SegmentEvent::Low(_) => Ok(()),
+        }));
+    }
+
+    fn note(&self, all_told: bool) {
+        if !all_told {
+            self.behind.store(true, Ordering::Relaxed);
+        }
+    }
+
+    /// Tells those that are behind what they lack, if anybody is and not all the time. Waits for
+    /// nobody else who tells: the next call does what is left then.
+    #[inline]
+    pub(crate) fn keep_up(&self, session: &SessionSegment) {
+        if self.behind.load(Ordering::Relaxed) && !session.is_forked() {
+            match self.state.try_lock() {
+                Ok(state) => self.retry(state, session),
+                Err(TryLockError::Poisoned(state)) => self.retry(state.into_inner(), session),
+                Err(TryLockError::WouldBlock) => {}
+            }
+        }
+    }
+
+    /// The same at once, for a caller that may be the last.
+    pub(crate) fn keep_up_now(&self, session: &SessionSegment) {
+        if self.behind.load(Ordering::Relaxed) && !session.is_forked() {
+            self.catch_up(self.lock(), session);
+        }
+    }
+
+    #[cold]
+    fn retry(&self, state: MutexGuard<'_, State>, session: &SessionSegment) {
+        if state.tried.is_none_or(|tried| tried.elapsed() >= PAUSE) {
+            self.catch_up(state, session);
+        }
+    }
+
+    fn catch_up(&self, mut state: MutexGuard<'_, State>, session: &SessionSegment) {
+        state.tried = Some(Instant::now());
+        // Before the looks at what there is. What comes after such a look finds the lock taken, and
+        // by the lock of the segments' table stores its `true` after this.
+        self.behind.store(false, Ordering::Relaxed);
+        self.note(state.each(|line| {
+            let told = line.catch_up(session, 0);
+            // It may sleep over what it lacked.
+            line.peer.ring_if(Purpose::Samples);
+            told
+        }));
+    }
+
+    /// A subscriber is gone.
+    pub(crate) fn forget(&self, reader: Gid) {
+        let gone = |line: &mut Line| line.reader == reader;
+        let told =
+            self.lock().each(|line| if gone(line) { Err(ConnectError::Closed) } else { Ok(()) });
+        self.note(told);
+    }
+
+    /// Nothing more is published to a subscriber, or by a publisher. What was, may still be read.
+    pub(crate) fn end(&self, gid: Gid) {
+        let told = self.lock().each(|line| {
+            line.ended |= line.reader == gid || line.writer == gid;
+            Ok(())
+        });
+        self.note(told);
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_publish_does_not_wait_for_a_thread_that_tells() {
+        let session = SessionSegment::create(SessionId::random()).unwrap();
+        let lines = Lines::new(session.id());
+        lines.note(false);
+        let telling = lines.lock();
+        lines.keep_up(&session);
+        assert!(lines.behind.load(Ordering::Relaxed), "it is left for the next call");
+        drop(telling);
+        lines.keep_up(&session);
+        assert!(!lines.behind.load(Ordering::Relaxed));
+    }
+}

@@ -1,0 +1,7 @@
+//! Publishers and subscribers over a connected socket, without a daemon.
+
+pub(crate) mod connect;
+pub(crate) mod context;
+pub(crate) mod lines;
+pub(crate) mod publisher;
+pub(crate) mod subscriber;

@@ -1,0 +1,224 @@
+//! What can go wrong, for whom, and what to do about it.
+
+use std::{fmt, io};
+
+use crate::ids::{Gid, SessionId};
+
+/// A segment could not be made, checked or mapped.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ShmError {
+    /// A system call failed.
+    #[error("shared memory: {what}: {source}")]
+    System {
+        /// What was being done.
+        what: &'static str,
+        /// What the system answered.
+        source: io::Error,
+    },
+    /// There is not enough memory to back a new segment.
+    #[error(
+        "shared memory: {needed} bytes needed, {available} available: \
+         free memory or raise the memory limit of this process's control group"
+    )]
+    NoMemory {
+        /// Bytes that were needed.
+        needed: u64,
+        /// Bytes available to this process when it asked.
+        available: u64,
+    },
+    /// A descriptor from another process is not a segment as it must be.
+    #[error("shared memory of another process refused: {what}")]
+    Refused {
+        /// What was wrong with it.
+        what: &'static str,
+    },
+    /// Other processes' memory takes as much of this one's address space as it may.
+    #[error(
+        "shared memory not mapped: that of {whose} takes up to {maps} maps and {bytes} bytes of \
+         this process's address space"
+    )]
+    AddressSpace {
+        /// Whose memory that is.
+        whose: &'static str,
+        /// The most maps.
+        maps: u64,
+        /// The most bytes.
+        bytes: u64,
+    },
+    /// The samples would need more address space than a publisher may take.
+    #[error(
+        "a ring for messages of {max_message} bytes and {budget} bytes of history is too large: \
+         messages may take {} bytes and histories {} bytes",
+        super::limits::MAX_MESSAGE,
+        super::limits::MAX_BUDGET
+    )]
+    TooLarge {
+        /// The largest message that was asked for, in bytes.
+        max_message: u64,
+        /// The history that was asked for, in bytes.
+        budget: u64,
+    },
+    /// The session reads as many rings as a session may.
+    #[error("session {session} has no free reader lane left (of {lanes}): close subscriptions")]
+    NoLane {
+        /// The session.
+        session: SessionId,
+        /// How many lanes it has.
+        lanes: u32,
+    },
+    /// The servers of the session have as many clients as they may.
+    #[error(
+        "the servers of a relayed session may have {0} clients: share memory, or use more processes"
+    )]
+    NoRoom(usize),
+    /// The session has given out all numbers for segments of its memory.
+    #[error("session {0} has opened as many segments as a session may: open another session")]
+    NoNumber(SessionId),
+    /// A second waiter asked to lead the session's waits.
+    #[error("session {0} already has an external leader of its waits")]
+    AlreadyLed(SessionId),
+    /// The process forked: what was created before belongs to the parent.
+    #[error("used after fork: a child process must open a session of its own")]
+    Forked,
+}
+
+impl ShmError {
+    #[doc(hidden)]
+    pub fn system(what: &'static str) -> impl FnOnce(rustix::io::Errno) -> Self {
+        move |errno| Self::System { what, source: errno.into() }
+    }
+}
+
+/// A sample was not published.
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum PublishError {
+    /// The sample is larger than the ring was made for.
+    #[error("sample of {len} bytes; the largest is {max} (AXON_MAX_MESSAGE_MB)")]
+    TooLarge {
+        /// The sample's length in bytes.
+        len: u64,
+        /// The largest, in bytes.
+        max: u64,
+    },
+    /// A KEEP_ALL reader left no room for the whole time that a publish waits.
+    #[error("reader {reader} takes samples too slowly: KEEP_ALL history is full")]
+    Blocked {
+        /// The reader that lags.
+        reader: Gid,
+    },
+    /// Memory to hold the sample is not available.
+    #[error(
+        "no memory for the sample: {needed} bytes more needed, {available} available{}: \
+         free memory or raise the memory limit of this process's control group",
+        held_by(keeper.as_ref())
+    )]
+    NoMemory {
+        /// Bytes that were needed.
+        needed: u64,
+        /// Bytes available to this process when it asked.
+        available: u64,
+        /// A reader that keeps samples which would do.
+        keeper: Option<Keeper>,
+    },
+    /// The system refused a segment for large samples.
+    #[error("no segment for the sample: {reason}")]
+    Segment {
+        /// What the system refused, and why.
+        reason: String,
+    },
+    /// Loans that were neither published nor dropped hold the ring's memory.
+    #[error("{loans} loans hold the ring's memory: publish or drop them first")]
+    Loaned {
+        /// How many loans are out.
+        loans: u32,
+    },
+    /// Samples that a reader has not dropped hold the ring's memory.
+    #[error("the ring's memory is full{}: it must drop some, or end", held_by(Some(keeper)))]
+    Pinned {
+        /// A reader that keeps some.
+        keeper: Keeper,
+    },
+    /// The number that a publisher elsewhere gave its sample cannot be.
+    #[error("sequence number {sequence} after {last}: so many samples cannot have been lost")]
+    Sequence {
+        /// The sample's number.
+        sequence: u64,
+        /// That of the last sample before it.
+        last: u64,
+    },
+    /// A loan was published before all of it was written.
+    #[error("loan of {len} bytes published with {written} written")]
+    Incomplete {
+        /// The loan's length in bytes.
+        len: u64,
+        /// Bytes that were written.
+        written: u64,
+    },
+    /// The process forked: the publisher belongs to the parent.
+    #[error("used after fork: a child process must open a session of its own")]
+    Forked,
+}
+
+/// Who keeps samples that their publisher has given up.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Keeper {
+    /// A reader that keeps some.
+    pub reader: Gid,
+    /// Its process, where that is known and has not ended.
+    pub process: Option<u32>,
+    /// Samples that readers keep in all.
+    pub samples: usize,
+}
+
+impl fmt::Display for Keeper {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { reader, process, samples } = self;
+        write!(f, "reader {reader}")?;
+        if let Some(process) = process {
+            write!(f, " (pid {process})")?;
+        }
+        write!(f, " among those that keep {samples} samples")
+    }
+}
+
+fn held_by(keeper: Option<&Keeper>) -> String {
+    keeper.map_or_else(String::new, |keeper| format!(", held by {keeper}"))
+}
+
+/// A ring could not be read.
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum TakeError {
+    /// The publisher's process wrote what no publisher writes. The ring is not read again.
+    #[error("ring of publisher {writer} is corrupt ({what}): dropped")]
+    Corrupt {
+        /// The publisher.
+        writer: Gid,
+        /// What was wrong.
+        what: &'static str,
+    },
+    /// A sample is longer than the subscription expects. It was passed over and counts as lost.
+    #[error(
+        "sample of {len} bytes of publisher {writer} passed over: this process takes up to {max} \
+         (AXON_MAX_MESSAGE_MB)"
+    )]
+    TooLarge {
+        /// The publisher.
+        writer: Gid,
+        /// The sample's length in bytes.
+        len: u64,
+        /// The largest that is taken, in bytes.
+        max: u64,
+    },
+    /// The sample does not fit in this process's memory.
+    #[error("no memory to take a sample of {len} bytes")]
+    NoMemory {
+        /// The sample's length in bytes.
+        len: u64,
+    },
+    /// The process forked: the subscription belongs to the parent.
+    #[error("used after fork: a child process must open a session of its own")]
+    Forked,
+}

@@ -1,0 +1,90 @@
+#![doc = include_str!("../README.md")]
+//!
+//! # How it works
+//!
+//! Each context has a segment of memory, a sealed memfd that holds the words by which it is woken, the
+//! rings of its publishers, their samples of up to 4 KiB, and its readers' cursors and pins. A publisher
+//! of longer samples has a segment for them (and for loans of more than 512 bytes, if it
+//! [expects](PublisherOptions::expected_len) such), and a context that needs more room has further ones.
+//! Others map what they read from.
+#![deny(unsafe_code)]
+
+#[cfg(not(all(target_pointer_width = "64", target_endian = "little")))]
+compile_error!("rings are laid out for 64-bit little-endian machines");
+
+mod alloc;
+mod direct;
+mod error;
+pub mod ids;
+mod limits;
+mod memory;
+mod os;
+pub mod qos;
+mod reader;
+mod ring;
+mod session;
+mod sync;
+mod wake;
+mod writer;
+
+#[cfg(test)]
+mod tests;
+
+pub use direct::{
+    connect::ConnectError,
+    context::Context,
+    publisher::{Publisher, PublisherOptions},
+    subscriber::{Subscriber, SubscriberOptions},
+};
+pub use error::{Keeper, PublishError, ShmError, TakeError};
+pub use reader::sample::{Sample, SampleReader};
+pub use ring::types::{Meta, Published};
+pub use session::leader::ExternalLeader;
+pub use writer::loan::Loan;
+
+/// What the other crates of AXON use of this one. It is not part of its interface, and changes with any
+/// release.
+#[doc(hidden)]
+pub mod internal {
+    pub use crate::{
+        alloc::segments::{SegmentEvent, SegmentInfo},
+        direct::connect::reencode_packet,
+        memory::probe::{out_of_reach, probe},
+        os::{
+            clock::{monotonic, wall},
+            fork::ForkToken,
+            inherited::{close_inherited, survive_file_size_limit},
+            per_process::{Made, PerProcess, is_elevated},
+            signals::BlockedSignals,
+        },
+        reader::{Reader, ReaderOptions},
+        ring::{
+            layout::{Location, SegmentKind},
+            times::Times,
+            types::{Grant, RingOptions, Taken},
+            window::holds,
+        },
+        session::{
+            lane::Lane,
+            peer::{Peer, PeerDescriptors, PeerSession},
+            reader_info::{ReaderInfo, Terms},
+            segment::SessionSegment,
+            segment_message::{Segment, SegmentName, SegmentOpened},
+        },
+        wake::{Look, PassedOn, Purpose},
+        writer::{MAX_GAP, Writer},
+    };
+
+    /// What rings and lanes say of themselves.
+    pub mod inspect {
+        pub use crate::ring::inspect::{LaneCounts, RingCounts, committed, timestamp};
+    }
+
+    /// Descriptors that go from process to process.
+    pub mod passed {
+        pub use crate::os::descriptors::{
+            Packet, PassedFd, carries_descriptors, has_too_many_strangers, is_scarce, is_short,
+            receive, share,
+        };
+    }
+}

@@ -1,0 +1,216 @@
+//! Copies of memory that others may write to meanwhile.
+//!
+//! Such memory has no references as bytes, only as words that are atomic. What is copied may be of
+//! different times where somebody does write: samples that are copied out are checked afterwards,
+//! samples that are pinned stay as they are unless their publisher breaks the protocol.
+
+#![allow(unsafe_code)]
+
+use std::{
+    collections::TryReserveError,
+    mem::MaybeUninit,
+    sync::atomic::{AtomicU64, Ordering},
+};
+
+/// From here on words are slow: each is a load of its own to the compiler.
+#[cfg(all(target_arch = "x86_64", not(miri)))]
+const BULK: usize = 1024;
+
+/// Up to here, about a core's own cache, the processor's own copy is the fastest. Of what is longer and
+/// lies in another core's cache it fetches little ahead, and at times takes twice as long as a loop does.
+#[cfg(all(target_arch = "x86_64", not(miri)))]
+const CACHED: usize = 512 << 10;
+
+/// Fills `out` with the bytes from `at` on.
+///
+/// # Panics
+/// The words have fewer.
+pub(crate) fn read_at(words: &[AtomicU64], at: usize, out: &mut [u8]) {
+    // SAFETY: the same bytes, and nothing that is not a byte is written to them.
+    let out = unsafe { &mut *(std::ptr::from_mut(out) as *mut [MaybeUninit<u8>]) };
+    copy(words, at, out);
+}
+
+/// Replaces `out` by the `len` bytes of `words` from `at` on.
+///
+/// # Errors
+/// Memory for them is not to be had.
+///
+/// # Panics
+/// The words have fewer.
+pub(crate) fn copy_out(
+    words: &[AtomicU64],
+    at: usize,
+    len: usize,
+    out: &mut Vec<u8>,
+) -> Result<(), TryReserveError> {
+    out.clear();
+    out.try_reserve(len)?;
+    copy(words, at, &mut out.spare_capacity_mut()[..len]);
+    // SAFETY: within the reserved capacity, and `copy` wrote each of the `len` bytes.
+    unsafe { out.set_len(len) };
+    Ok(())
+}
+
+/// Writes the bytes from `at` on to all of `out`.
+///
+/// # Panics
+/// The words have fewer.
+#[inline]
+pub(crate) fn copy(words: &[AtomicU64], at: usize, out: &mut [MaybeUninit<u8>]) {
+    assert!(at.checked_add(out.len()).is_some_and(|end| end <= words.len() * 8));
+    #[cfg(all(target_arch = "x86_64", not(miri)))]
+    if out.len() >= BULK {
+        let from = words.as_ptr().cast::<u8>().wrapping_add(at);
+        let (lines, rest) = out.split_at_mut(if out.len() > CACHED { out.len() & !63 } else { 0 });
+        // SAFETY: the words hold as many bytes from `at` on, as was just checked.
+        unsafe { copy_lines(from, lines) };
+        // SAFETY: as above; the rest begins where the lines end.
+        return unsafe { copy_bulk(from.wrapping_add(lines.len()), rest) };
+    }
+    copy_words(words, at, out);
+}
+
+fn copy_words(words: &[AtomicU64], at: usize, out: &mut [MaybeUninit<u8>]) {
+    let load = |index: usize| words[index].load(Ordering::Relaxed).to_ne_bytes();
+    let mut next = at / 8;
+    let skip = at % 8;
+    let (first, rest) = out.split_at_mut(if skip > 0 { out.len().min(8 - skip) } else { 0 });
+    if !first.is_empty() {
+        put(first, &load(next)[skip..]);
+        next += 1;
+    }
+    let (whole, rest) = rest.as_chunks_mut::<8>();
+    let count = whole.len();
+    for (chunk, word) in whole.iter_mut().zip(&words[next..][..count]) {
+        put(chunk, &word.load(Ordering::Relaxed).to_ne_bytes());
+    }
+    if !rest.is_empty() {
+        put(rest, &load(next + count));
+    }
+}
+
+/// Fills `to` with the first of these bytes, of which there are enough.
+#[inline(always)]
+fn put(to: &mut [MaybeUninit<u8>], bytes: &[u8]) {
+    debug_assert!(bytes.len() >= to.len());
+    for (to, byte) in to.iter_mut().zip(bytes) {
+        to.write(*byte);
+    }
+}
+
+/// # Safety
+/// As many bytes from `from` on as `out` has are words of a map, whoever writes to them.
+#[cfg(all(target_arch = "x86_64", not(miri)))]
+#[inline]
+unsafe fn copy_bulk(from: *const u8, out: &mut [MaybeUninit<u8>]) {
+    // SAFETY: it reads what the caller promises, which is mapped, and writes to `out` alone, which
+    // is ours. That others may write what is read is no data race of the language: to the compiler
+    // this block is one that it cannot look into and that may do to this memory what loads of words
+    // do, relaxed and each once; and it is just that. It does not count on what it reads. The
+    // direction flag is clear, as it always is on the way in, and no flag is changed. Loads of the
+    // processor stay in their order, so what is loaded after an acquire fence that follows
+    // comes later, as with words; string instructions are an exception only in what they store.
+    unsafe {
+        std::arch::asm!(
+            "rep movsb",
+            inout("rsi") from => _,
+            inout("rdi") out.as_mut_ptr() => _,
+            inout("rcx") out.len() => _,
+            options(nostack, preserves_flags),
+        );
+    }
+}
+
+/// Copies 64 bytes at a time, in a loop that the processor fetches ahead of.
+///
+/// # Safety
+/// As many bytes from `from` on as `out` has, a multiple of 64, are words of a map, whoever writes to
+/// them.
+#[cfg(all(target_arch = "x86_64", not(miri)))]
+#[inline]
+unsafe fn copy_lines(from: *const u8, out: &mut [MaybeUninit<u8>]) {
+    let end = from.wrapping_add(out.len());
+    // SAFETY: it reads from `from` up to `end`, which the caller promises, and writes as much to `out`,
+    // which is ours; neither where there is nothing to copy. Registers of 16 bytes are part of x86_64.
+    // What `copy_bulk` says of other writers and of order goes for these loads as well.
+    unsafe {
+        std::arch::asm!(
+            "cmp {from}, {end}",
+            "je 3f",
+            "2:",
+            "movdqu {a}, [{from}]",
+            "movdqu {b}, [{from} + 16]",
+            "movdqu {c}, [{from} + 32]",
+            "movdqu {d}, [{from} + 48]",
+            "movdqu [{to}], {a}",
+            "movdqu [{to} + 16], {b}",
+            "movdqu [{to} + 32], {c}",
+            "movdqu [{to} + 48], {d}",
+            "add {to}, 64",
+            "add {from}, 64",
+            "cmp {from}, {end}",
+            "jne 2b",
+            "3:",
+            from = inout(reg) from => _,
+            end = in(reg) end,
+            to = inout(reg) out.as_mut_ptr() => _,
+            a = out(xmm_reg) _,
+            b = out(xmm_reg) _,
+            c = out(xmm_reg) _,
+            d = out(xmm_reg) _,
+            options(nostack),
+        );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Words of which each byte is told from its neighbours.
+    fn words(bytes: usize) -> (Vec<AtomicU64>, Vec<u8>) {
+        let bytes: Vec<u8> =
+            (0..bytes.next_multiple_of(8)).map(|at| (at * 7 % 251) as u8).collect();
+        let words =
+            bytes.as_chunks().0.iter().map(|chunk| AtomicU64::new(u64::from_ne_bytes(*chunk)));
+        (words.collect(), bytes)
+    }
+
+    #[test]
+    fn what_is_copied_is_what_is_there_wherever_it_begins_and_ends() {
+        let (words, bytes) = words(5000);
+        let lens = (0..40).chain(1000..1050).chain([4095, 4096]);
+        for (at, len) in lens.flat_map(|len| (0..17).chain([900]).map(move |at| (at, len))) {
+            let mut out = vec![0xff; len + 1];
+            read_at(&words, at, &mut out[..len]);
+            assert!(out[..len] == bytes[at..at + len] && out[len] == 0xff, "{len} from {at} on");
+        }
+    }
+
+    #[test]
+    fn whatever_was_there_is_replaced() {
+        let longest = 512 << 10;
+        let (words, bytes) = words(longest + 73);
+        let mut out = vec![1; 3];
+        let around = [longest - 1, longest, longest + 1, longest + 63, longest + 64, longest + 65];
+        for len in [0, 1, 8, 9, 1023, 1024, 1025, 5000].into_iter().chain(around).chain([7]) {
+            for at in [0, 4] {
+                copy_out(&words, at, len, &mut out).unwrap();
+                assert!(out == bytes[at..at + len], "{len} from {at} on");
+            }
+        }
+    }
+
+    #[test]
+    fn nothing_beyond_the_words_is_read() {
+        let (words, _) = words(2048);
+        for (at, len) in [(2048, 1), (1, 2048), (2047, 2), (usize::MAX, 2), (usize::MAX - 7, 2048)]
+        {
+            let read = || read_at(&words, at, &mut vec![0; len]);
+            assert!(std::panic::catch_unwind(read).is_err(), "{len} from {at} on");
+        }
+        assert!(copy_out(&words, 0, 1 << 60, &mut Vec::new()).is_err());
+        read_at(&words, 2048, &mut []);
+    }
+}

@@ -1,0 +1,174 @@
+//! How much memory this process may still take.
+//!
+//! Exceeding a control group's limit gets a process killed rather than an error, so rings ask
+//! before they grow.
+
+use std::{fs::File, io::Read as _, path::Path};
+
+use crate::error::ShmError;
+
+/// Left free for everybody else.
+const RESERVE: u64 = 8 << 20;
+
+/// Whether `needed` bytes more can be taken without starving the host or the control group.
+pub(crate) fn check(needed: u64) -> Result<(), ShmError> {
+    let enough = needed.saturating_add(RESERVE);
+    match at_most(enough) {
+        Some(available) if available < enough => Err(ShmError::NoMemory { needed, available }),
+        _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+thread_local! {
+    /// What a test has this thread believe to be available.
+    pub(crate) static PRETENDED: std::cell::Cell<Option<u64>> = const { std::cell::Cell::new(None) };
+}
+
+/// Bytes available to this process, or `None` where the system does not tell.
+pub(crate) fn available() -> Option<u64> {
+    at_most(u64::MAX)
+}
+
+/// The same, though whether it is more than `enough` is not looked at closely.
+fn at_most(enough: u64) -> Option<u64> {
+    #[cfg(test)]
+    if let Some(pretended) = PRETENDED.get() {
+        return Some(pretended);
+    }
+    available_in(Path::new("/proc"), Path::new("/sys/fs/cgroup"), enough)
+}
+
+fn available_in(proc: &Path, cgroup: &Path, enough: u64) -> Option<u64> {
+    let mut text = String::with_capacity(4096);
+    let host = read(&proc.join("meminfo"), &mut text)
+        .and_then(|text| field(text, "MemAvailable:"))
+        .map(|kib| kib.saturating_mul(1024));
+    let mut groups = String::with_capacity(1024);
+    read(&proc.join("self/cgroup"), &mut groups);
+    groups
+        .lines()
+        .filter_map(|line| {
+            let mut parts = line.splitn(3, ':');
+            let (_, controllers, path) = (parts.next()?, parts.next()?, parts.next()?);
+            let path = path.trim_start_matches('/');
+            if controllers.is_empty() {
+                lowest(cgroup, path, &V2, enough, &mut text)
+            } else if controllers.split(',').any(|c| c == "memory") {
+                lowest(&cgroup.join("memory"), path, &V1, enough, &mut text)
+            } else {
+                None
+            }
+        })
+        .chain(host)
+        .min()
+}
+
+struct Files {
+    limit: &'static str,
+    usage: &'static str,
+    reclaimable: &'static str,
+}
+
+const V2: Files =
+    Files { limit: "memory.max", usage: "memory.current", reclaimable: "inactive_file " };
+const V1: Files = Files {
+    limit: "memory.limit_in_bytes",
+    usage: "memory.usage_in_bytes",
+    reclaimable: "total_inactive_file ",
+};
+
+/// What is left to a group and its ancestors, by the tightest of their limits.
+fn lowest(root: &Path, group: &str, files: &Files, enough: u64, text: &mut String) -> Option<u64> {
+    let groups = Path::new(group).ancestors();
+    groups.filter_map(|group| room(&root.join(group), files, enough, text)).min()
+}
+
+fn room(directory: &Path, files: &Files, enough: u64, text: &mut String) -> Option<u64> {
+    let mut number = |name| read(&directory.join(name), text)?.trim_ascii().parse::<u64>().ok();
+    // A group without a limit says "max", which is no number.
+    let limit = number(files.limit)?;
+    let usage = number(files.usage)?;
+    let left = limit.saturating_sub(usage);
+    if left >= enough {
+        // The kernel adds up all processors' counters for what follows.
+        return Some(left);
+    }
+    let reclaimable = read(&directory.join("memory.stat"), text)
+        .and_then(|text| field(text, files.reclaimable))
+        .unwrap_or(0);
+    Some(limit.saturating_sub(usage.saturating_sub(reclaimable)))
+}
+
+/// Reads a file of the kernel's, which gives no length beforehand, into `text`.
+fn read<'a>(path: &Path, text: &'a mut String) -> Option<&'a str> {
+    text.clear();
+    File::open(path).ok()?.read_to_string(text).ok()?;
+    Some(text)
+}
+
+/// The number after `name` at the start of a line.
+fn field(text: &str, name: &str) -> Option<u64> {
+    let starts_line = |at: usize| at == 0 || text.as_bytes()[at - 1] == b'\n';
+    let (at, _) = text.match_indices(name).find(|(at, _)| starts_line(*at))?;
+    text[at + name.len()..].split_ascii_whitespace().next()?.parse().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    fn write(root: &Path, path: &str, text: &str) {
+        let path = root.join(path);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, text).unwrap();
+    }
+
+    #[test]
+    fn the_tightest_limit_of_host_and_groups_holds() {
+        let directory = tempfile::tempdir().unwrap();
+        let root = directory.path();
+        let (proc, cgroup) = (root.join("proc"), root.join("cgroup"));
+        assert_eq!(available_in(&proc, &cgroup, u64::MAX), None);
+
+        write(&proc, "meminfo", "MemTotal: 9000 kB\nMemAvailable:   4000 kB\n");
+        write(&proc, "self/cgroup", "9:name=systemd:/\n4:cpu,memory:/x\n0::/a/b\ngarbage\n");
+        assert_eq!(available_in(&proc, &cgroup, u64::MAX), Some(4_096_000));
+
+        write(&cgroup, "a/b/memory.max", "max\n");
+        write(&cgroup, "a/b/memory.current", "1\n");
+        write(&cgroup, "a/memory.max", "1000000\n");
+        write(&cgroup, "a/memory.current", "400000\n");
+        write(&cgroup, "a/memory.stat", "anon 5\ninactive_file 100000\n");
+        assert_eq!(available_in(&proc, &cgroup, u64::MAX), Some(700_000));
+        assert_eq!(available_in(&proc, &cgroup, 600_001), Some(700_000));
+        assert_eq!(
+            available_in(&proc, &cgroup, 600_000),
+            Some(600_000),
+            "enough without the cache"
+        );
+
+        write(&cgroup, "memory/x/memory.limit_in_bytes", "500000\n");
+        write(&cgroup, "memory/x/memory.usage_in_bytes", "600000\n");
+        assert_eq!(available_in(&proc, &cgroup, u64::MAX), Some(0));
+    }
+
+    #[test]
+    fn a_field_is_the_whole_word_that_a_line_begins_with() {
+        let text = "total_inactive_file 1\ninactive_file 2\ninactive_file 3\nlast 4";
+        assert_eq!(field(text, "inactive_file "), Some(2));
+        assert_eq!(field(text, "total_inactive_file "), Some(1));
+        assert_eq!(field(text, "last "), Some(4));
+        for absent in ["file ", "total ", "1", "other ", "last 4"] {
+            assert_eq!(field(text, absent), None, "{absent}");
+        }
+    }
+
+    #[test]
+    fn this_host_tells() {
+        assert!(available().is_some_and(|bytes| bytes > 0));
+        assert!(matches!(check(u64::MAX), Err(ShmError::NoMemory { .. })));
+    }
+}

@@ -1,0 +1,62 @@
+//! Whether memory can be shared at all: what a security module or a sandbox may refuse.
+
+#![allow(unsafe_code)]
+
+use std::{
+    os::fd::{AsFd, OwnedFd},
+    ptr,
+};
+
+use rustix::{
+    fs::{MemfdFlags, ftruncate, memfd_create},
+    io::Errno,
+    mm::{MapFlags, ProtFlags, mmap, munmap},
+};
+
+use crate::error::ShmError;
+
+const LEN: u64 = 4096;
+
+/// Memory with nothing in it, for another process to try whether it can map this one's.
+///
+/// # Errors
+/// There is none to be had.
+pub fn probe() -> Result<OwnedFd, ShmError> {
+    let fd = memfd_create("axon-probe", MemfdFlags::CLOEXEC)
+        .map_err(ShmError::system("creating a memfd"))?;
+    ftruncate(&fd, LEN).map_err(ShmError::system("sizing a memfd"))?;
+    Ok(fd)
+}
+
+/// Why the memory of another process is out of reach, if so. What else may be wrong with it is said
+/// by those who map it.
+pub fn out_of_reach(memory: impl AsFd) -> Option<std::io::Error> {
+    // SAFETY: a fresh mapping at an address of the kernel's choice aliases nothing, and nobody looks
+    // into it.
+    let mapped = unsafe {
+        mmap(ptr::null_mut(), LEN as usize, ProtFlags::READ, MapFlags::SHARED, memory, 0)
+    };
+    match mapped {
+        Ok(base) => {
+            // SAFETY: the mapping just made, of which nothing is borrowed.
+            let _ = unsafe { munmap(base, LEN as usize) };
+            None
+        }
+        Err(errno @ (Errno::ACCESS | Errno::PERM | Errno::NODEV)) => Some(errno.into()),
+        Err(_) => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn memory_that_may_not_be_read_is_out_of_reach_and_other_memory_is_not() {
+        let probe = probe().unwrap();
+        assert!(out_of_reach(&probe).is_none());
+        let path = format!("/proc/self/fd/{}", std::os::fd::AsRawFd::as_raw_fd(&probe));
+        let unreadable = std::fs::OpenOptions::new().write(true).open(path).unwrap();
+        assert_eq!(out_of_reach(&unreadable).unwrap().kind(), std::io::ErrorKind::PermissionDenied);
+    }
+}

@@ -1,0 +1,424 @@
+//! Descriptors that go from process to process, and how those of others are closed.
+//!
+//! Closing one may block for as long as whoever sent it likes: a TCP socket that lingers over unsent
+//! data, a file of a user's own file system, a unix socket in whose queue either of them waits. None
+//! is therefore closed on a thread that has anything else to do.
+
+use std::{
+    fmt,
+    io::{self, IoSliceMut},
+    mem::MaybeUninit,
+    os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd},
+    sync::atomic::Ordering,
+};
+
+use rustix::{
+    fs::{fcntl_get_seals, fstat},
+    io::Errno,
+    net::{
+        RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, ReturnFlags, Shutdown, recvmsg,
+        shutdown,
+    },
+    process::{Resource, WaitId, WaitIdOptions, getrlimit, waitid},
+};
+
+use super::closer::{self, Lane, OPEN};
+
+/// A memfd that holds less, in blocks of 512 bytes, is closed at once.
+const SMALL: i64 = (1 << 20) / 512;
+/// The most descriptors that the system lets a packet carry.
+const SCM_MAX_FD: usize = 253;
+/// Descriptors that stay free for what else a process opens, when what it [holds](PassedFd) of others
+/// [is too much](is_short): more than a packet can carry. Of a limit so low that this is more than half
+/// of it, half.
+const RESERVE: u64 = 400;
+
+/// A descriptor to be sent to another process, or [received](Self::received) from one. One that was
+/// received is closed without making the thread that drops it wait.
+pub struct PassedFd {
+    /// `None` only while it is dropped.
+    fd: Option<OwnedFd>,
+    origin: Origin,
+}
+
+/// Where it is from, which decides how it is closed.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Origin {
+    Own,
+    /// Another process sent it.
+    Passed,
+    /// The socket itself, in whose queue there may be such.
+    Connection(Lane),
+}
+
+impl PassedFd {
+    /// One that another process sent, and that can be anything.
+    pub fn received(fd: OwnedFd) -> Self {
+        Self::new(fd, Origin::Passed)
+    }
+
+    /// A connection, with whatever stands in its queue. Its other end is told at once when it is
+    /// dropped.
+    pub fn connection(fd: OwnedFd) -> Self {
+        Self::new(fd, Origin::Connection(Lane::Stranger))
+    }
+
+    /// The connection of somebody who may have a session.
+    pub fn trusted(mut self) -> Self {
+        self.origin = Origin::Connection(Lane::Session);
+        self
+    }
+
+    fn new(fd: OwnedFd, origin: Origin) -> Self {
+        // It guards nothing: `is_short` may be off by those that come and go at the moment.
+        OPEN.fetch_add(1, Ordering::Relaxed);
+        Self { fd: Some(fd), origin }
+    }
+
+    /// Another descriptor of the same thing.
+    ///
+    /// # Errors
+    /// The process has no descriptors left.
+    pub fn try_clone(&self) -> io::Result<Self> {
+        let origin = match self.origin {
+            // It is not over with a copy of its descriptor.
+            Origin::Connection(_) => Origin::Passed,
+            origin => origin,
+        };
+        Ok(Self::new(self.as_fd().try_clone_to_owned()?, origin))
+    }
+
+    /// Whether it is memory that can be sealed, or a file of a tmpfs, which is as good. Asks no file
+    /// system.
+    pub fn is_memfd(&self) -> bool {
+        fcntl_get_seals(self).is_ok()
+    }
+
+    /// Which file it is, by device and inode, where it is a memfd. Others could take their time to
+    /// tell.
+    pub fn memory(&self) -> Option<(u64, u64)> {
+        let found = self.is_memfd().then(|| fstat(self).ok()).flatten()?;
+        Some((found.st_dev, found.st_ino))
+    }
+
+    /// Whether it stands for a process. Takes no lock of what it is, which whoever sent it could
+    /// keep. Only a pidfd can be waited for, though by nobody but the process's parent (Linux 5.4).
+    pub fn is_pidfd(&self) -> bool {
+        let look = WaitIdOptions::EXITED | WaitIdOptions::NOHANG | WaitIdOptions::NOWAIT;
+        matches!(waitid(WaitId::PidFd(self.as_fd()), look), Ok(_) | Err(Errno::CHILD))
+    }
+
+    /// Who closes it, unless that can be done at once. Asks nothing that a file system of somebody
+    /// else's could answer late.
+    fn lane(&self) -> Option<Lane> {
+        match self.origin {
+            Origin::Own => None,
+            Origin::Connection(lane) => Some(lane),
+            Origin::Passed if self.is_memfd() => {
+                let small = fstat(self).is_ok_and(|found| found.st_blocks < SMALL);
+                (!small).then_some(Lane::Memory)
+            }
+            Origin::Passed => (!self.is_pidfd()).then_some(Lane::Session),
+        }
+    }
+}
+
+impl From<OwnedFd> for PassedFd {
+    /// One of our own.
+    fn from(fd: OwnedFd) -> Self {
+        Self::new(fd, Origin::Own)
+    }
+}
+
+impl AsFd for PassedFd {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.fd.as_ref().expect("it is not being dropped").as_fd()
+    }
+}
+
+impl AsRawFd for PassedFd {
+    fn as_raw_fd(&self) -> RawFd {
+        self.as_fd().as_raw_fd()
+    }
+}
+
+impl fmt::Debug for PassedFd {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.as_fd().fmt(f)
+    }
+}
+
+impl Drop for PassedFd {
+    fn drop(&mut self) {
+        if matches!(self.origin, Origin::Connection(_)) {
+            // It leaves the queue alone, so it does not block, and the other end need not wait for
+            // the closing to know.
+            let _ = shutdown(&*self, Shutdown::Both);
+        }
+        let lane = self.lane();
+        let Some(fd) = self.fd.take() else { return };
+        match lane {
+            Some(lane) => lane.close(fd),
+            None => {
+                drop(fd);
+                closer::closed();
+            }
+        }
+    }
+}
+
+/// Whether descriptors of others should not be taken in: so many are open, or wait to be closed, that
+/// those of a packet might find no room. The kernel closes what does not fit in the thread that
+/// receives.
+pub fn is_short() -> bool {
+    let open = OPEN.load(Ordering::Relaxed);
+    let limit = getrlimit(Resource::Nofile).current;
+    limit.is_some_and(|limit| open + reserve(limit) > limit) || Lane::Session.is_full()
+}
+
+fn reserve(limit: u64) -> u64 {
+    RESERVE.min(limit / 2)
+}
+
+/// Whether what this process may have open at most, `limit`, leaves no room for all that a packet can
+/// carry: who sends descriptors that are slow to close can then hold it up.
+pub fn is_scarce(limit: u64) -> bool {
+    reserve(limit) < RESERVE
+}
+
+/// Whether so many connections of strangers wait to be closed that nobody's should be accepted.
+pub fn has_too_many_strangers() -> bool {
+    Lane::Stranger.is_full()
+}
+
+/// The most descriptors that one of several processes should make this one hold.
+pub fn share() -> usize {
+    let limit = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
+    usize::try_from((limit - reserve(limit)) / 2).unwrap_or(usize::MAX)
+}
+
+/// A packet of a socket.
+pub struct Packet {
+    /// How long it is, as far as it was received.
+    pub bytes: usize,
+    /// It was longer than the buffer.
+    pub truncated: bool,
+    /// This process could not hold all of its descriptors.
+    pub lost: bool,
+    /// Those that came with it.
+    pub descriptors: Vec<PassedFd>,
+}
+
+/// Receives one packet without waiting, with all descriptors that can come with it.
+pub fn receive(socket: impl AsFd, buffer: &mut [u8]) -> Result<Packet, Errno> {
+    receive_with(&socket, buffer, RecvFlags::empty())
+}
+
+fn receive_with(socket: impl AsFd, buffer: &mut [u8], how: RecvFlags) -> Result<Packet, Errno> {
+    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(SCM_MAX_FD))];
+    let mut control = RecvAncillaryBuffer::new(&mut space);
+    let flags = RecvFlags::DONTWAIT | RecvFlags::CMSG_CLOEXEC | how;
+    let got = loop {
+        match recvmsg(&socket, &mut [IoSliceMut::new(buffer)], &mut control, flags) {
+            Err(Errno::INTR) => {}
+            other => break other?,
+        }
+    };
+    let mut descriptors = Vec::new();
+    for message in control.drain() {
+        if let RecvAncillaryMessage::ScmRights(received) = message {
+            descriptors.extend(received.map(PassedFd::received));
+        }
+    }
+    Ok(Packet {
+        bytes: got.bytes,
+        truncated: got.flags.contains(ReturnFlags::TRUNC),
+        // There is room for whatever can come.
+        lost: got.flags.contains(ReturnFlags::CTRUNC),
+        descriptors,
+    })
+}
+
+/// As [`receive`], but a packet for whose descriptors there is no room stays where it is.
+pub(crate) fn receive_whole(socket: impl AsFd, buffer: &mut [u8]) -> Result<Packet, Errno> {
+    // To look gives descriptors of the same things.
+    let packet = receive_with(&socket, buffer, RecvFlags::PEEK)?;
+    if packet.lost {
+        return Err(Errno::MFILE);
+    }
+    // So what goes with the packet is not closed for the last time here.
+    let mut none = RecvAncillaryBuffer::default();
+    let mut byte = [0];
+    while let Err(Errno::INTR) =
+        recvmsg(&socket, &mut [IoSliceMut::new(&mut byte)], &mut none, RecvFlags::DONTWAIT)
+    {}
+    Ok(packet)
+}
+
+/// Whether the next packet of a socket has descriptors, which stay where they are: nothing is closed
+/// by asking.
+pub fn carries_descriptors(socket: impl AsFd) -> bool {
+    let flags = RecvFlags::DONTWAIT | RecvFlags::PEEK;
+    let mut byte = [0];
+    let mut none = RecvAncillaryBuffer::default();
+    recvmsg(socket, &mut [IoSliceMut::new(&mut byte)], &mut none, flags)
+        .is_ok_and(|got| got.flags.contains(ReturnFlags::CTRUNC))
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use std::{
+        io::{IoSlice, Write},
+        net::{TcpListener, TcpStream},
+        time::Duration,
+    };
+
+    use rustix::{
+        fs::{MemfdFlags, memfd_create},
+        net::{
+            AddressFamily, SendAncillaryBuffer, SendAncillaryMessage, SendFlags, SocketFlags,
+            SocketType, sendmsg, socketpair, sockopt,
+        },
+    };
+
+    use super::*;
+
+    /// A socket whose last close takes hours, since it lingers over what its peer does not read.
+    pub(crate) fn reluctant() -> (OwnedFd, TcpStream) {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        sockopt::set_socket_recv_buffer_size(&listener, 4096).unwrap();
+        let mut ours = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+        let (peer, _) = listener.accept().unwrap();
+        ours.set_nonblocking(true).unwrap();
+        sockopt::set_socket_send_buffer_size(&ours, 4096).unwrap();
+        while ours.write(&[0; 1 << 16]).is_ok() {}
+        sockopt::set_socket_linger(&ours, Some(Duration::from_secs(10_000))).unwrap();
+        (ours.into(), peer)
+    }
+
+    /// A packet with a descriptor, which is from then on in nobody's hands but the receiver's.
+    pub(crate) fn send_away(socket: impl AsFd, bytes: &[u8], fd: OwnedFd) {
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
+        let mut control = SendAncillaryBuffer::new(&mut space);
+        let rights = [fd.as_fd()];
+        assert!(control.push(SendAncillaryMessage::ScmRights(&rights)));
+        sendmsg(socket, &[IoSlice::new(bytes)], &mut control, SendFlags::empty()).unwrap();
+    }
+
+    pub(crate) fn pair() -> (OwnedFd, OwnedFd) {
+        socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None).unwrap()
+    }
+
+    /// A unix socket with a reluctant one in its queue, which has the last reference to it.
+    fn hiding() -> (OwnedFd, TcpStream) {
+        let (fd, peer) = reluctant();
+        let (ours, theirs) = pair();
+        send_away(&theirs, b"x", fd);
+        (ours, peer)
+    }
+
+    fn await_end(of: &OwnedFd) {
+        let mut byte = [0];
+        assert_eq!(rustix::io::read(of, &mut byte), Ok(0), "it is closed in the end");
+    }
+
+    #[test]
+    fn descriptors_that_never_close_keep_nobody_waiting_and_each_kind_by_itself() {
+        let mut peers = Vec::new();
+        for _ in 0..Lane::Session.threads() + 2 {
+            let (fd, peer) = hiding();
+            drop(PassedFd::received(fd));
+            peers.push(peer);
+        }
+        // All threads are blocked. A connection's other end hears of its end all the same.
+        let (ours, theirs) = pair();
+        drop(PassedFd::connection(ours).trusted());
+        await_end(&theirs);
+        // Memory has a thread of its own: a map that was never read is gone with its memfd.
+        let memfd = memfd_create("test", MemfdFlags::CLOEXEC).unwrap();
+        rustix::io::write(&memfd, &vec![1; 2 << 20]).unwrap();
+        let path = format!("/proc/self/fd/{}", memfd.as_raw_fd());
+        drop(PassedFd::received(memfd));
+        while std::fs::read_link(&path).is_ok_and(|to| to.to_string_lossy().contains("memfd:test"))
+        {
+            std::thread::yield_now();
+        }
+        // As have strangers, whose connections are as many.
+        for _ in 0..Lane::Stranger.threads() + 2 {
+            let (fd, peer) = hiding();
+            drop(PassedFd::connection(fd));
+            peers.push(peer);
+        }
+        // Threads that were blocked go on when they can.
+        peers.clear();
+        let (ours, theirs) = pair();
+        drop(PassedFd::received(ours));
+        await_end(&theirs);
+    }
+
+    #[test]
+    fn a_socket_does_not_linger() {
+        // More than there are threads: none of them is blocked.
+        let mut peers = Vec::new();
+        for _ in 0..Lane::Session.threads() + 2 {
+            let (fd, peer) = reluctant();
+            drop(PassedFd::received(fd));
+            peers.push(peer);
+        }
+        let (ours, theirs) = pair();
+        drop(PassedFd::received(ours));
+        await_end(&theirs);
+    }
+
+    #[test]
+    fn to_ask_whether_descriptors_come_closes_none() {
+        let (ours, theirs) = pair();
+        assert!(!carries_descriptors(&ours), "nothing stands there");
+        rustix::net::send(&theirs, b"x", SendFlags::empty()).unwrap();
+        let (sent, kept) = pair();
+        send_away(&theirs, b"x", sent);
+        assert!(!carries_descriptors(&ours));
+        receive(&ours, &mut [0; 1]).unwrap();
+        assert!(carries_descriptors(&ours) && carries_descriptors(&ours));
+        let flags = RecvFlags::DONTWAIT;
+        assert_eq!(rustix::net::recv(&kept, &mut [0; 1], flags).err(), Some(Errno::AGAIN));
+        let packet = receive(&ours, &mut [0; 1]).unwrap();
+        assert!(packet.descriptors.len() == 1 && !packet.lost && !packet.truncated);
+    }
+
+    #[test]
+    fn what_closes_at_once_is_told_without_asking_its_file_system() {
+        let memfd = memfd_create("test", MemfdFlags::CLOEXEC).unwrap();
+        let memfd = PassedFd::received(memfd);
+        assert_eq!(memfd.lane(), None);
+        rustix::io::write(&memfd, &vec![1; 2 << 20]).unwrap();
+        assert_eq!(memfd.lane(), Some(Lane::Memory), "it gives much memory back");
+        let file = PassedFd::received(tempfile::tempfile().unwrap().into());
+        assert_eq!(file.lane(), Some(Lane::Session));
+    }
+
+    #[test]
+    fn only_a_pidfd_is_one() {
+        use rustix::{
+            event::{EventfdFlags, epoll, eventfd},
+            process::{PidfdFlags, getpid, getppid, pidfd_open},
+        };
+        let of = |pid| PassedFd::received(pidfd_open(pid, PidfdFlags::empty()).unwrap());
+        assert_eq!(of(getpid()).lane(), None);
+        assert!(of(getpid()).is_pidfd() && of(getppid().unwrap()).is_pidfd());
+        let mut child = std::process::Command::new("true").spawn().unwrap();
+        let ended = of(rustix::process::Pid::from_child(&child));
+        assert!(ended.is_pidfd());
+        child.wait().unwrap();
+        assert!(ended.is_pidfd(), "also of one that has ended");
+        let others: [OwnedFd; 5] = [
+            epoll::create(epoll::CreateFlags::CLOEXEC).unwrap(),
+            eventfd(0, EventfdFlags::CLOEXEC).unwrap(),
+            std::fs::File::open("/dev/null").unwrap().into(),
+            // Its directory names a process, too.
+            std::fs::File::open("/proc/self").unwrap().into(),
+            pair().0,
+        ];
+        others.map(PassedFd::received).iter().for_each(|fd| assert!(!fd.is_pidfd(), "{fd:?}"));
+    }
+}

@@ -1,0 +1,146 @@
+//! A profile as a caller asks for it, where a policy may be left to AXON or to what is there.
+
+use super::{Durability, History, Liveliness, Qos, Reliability};
+
+/// One policy of a [`QosRequest`].
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Choice<T> {
+    /// AXON's own default: that of [`Qos::default`].
+    #[default]
+    SystemDefault,
+    /// What matches most of the endpoints that the graph holds when the endpoint is created, at
+    /// the highest level that does. It is not looked at again later.
+    BestAvailable,
+    /// This.
+    Exactly(T),
+}
+
+impl<T> Choice<T> {
+    fn resolve(self, default: T, best: impl FnOnce() -> T) -> T {
+        match self {
+            Self::SystemDefault => default,
+            Self::BestAvailable => best(),
+            Self::Exactly(value) => value,
+        }
+    }
+}
+
+/// What a caller asks for. [`for_publisher`](Self::for_publisher) and its siblings make the
+/// [`Qos`] of it that the endpoint has from then on.
+///
+/// ```
+/// use axon_shm::qos::{Durability, Qos, QosRequest, Reliability};
+///
+/// let latched = Qos { durability: Durability::TransientLocal, ..Qos::default() };
+/// let qos = QosRequest::best_available().for_subscription(&[latched]);
+/// assert_eq!(qos.durability, Durability::TransientLocal);
+/// // One publisher that offers less, and the subscription asks for less, to match both.
+/// let qos = QosRequest::best_available().for_subscription(&[latched, Qos::sensor_data()]);
+/// assert_eq!(qos.reliability, Reliability::BestEffort);
+/// assert_eq!(qos.durability, Durability::Volatile);
+/// ```
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct QosRequest {
+    /// Whether every sample must arrive.
+    pub reliability: Choice<Reliability>,
+    /// What late joiners receive.
+    pub durability: Choice<Durability>,
+    /// How many samples are kept; there is no best one.
+    pub history: Option<History>,
+    /// The number kept by KEEP_LAST; 0 is the default depth.
+    pub depth: u32,
+    /// Longest time between two samples, in nanoseconds; `None` is infinite.
+    pub deadline: Choice<Option<u64>>,
+    /// Age at which a sample is no longer delivered, in nanoseconds.
+    pub lifespan: Option<u64>,
+    /// Who asserts liveliness.
+    pub liveliness: Choice<Liveliness>,
+    /// Time without an assertion after which a publisher counts as not alive, in nanoseconds.
+    pub lease: Choice<Option<u64>>,
+}
+
+impl From<Qos> for QosRequest {
+    fn from(qos: Qos) -> Self {
+        Self {
+            reliability: Choice::Exactly(qos.reliability),
+            durability: Choice::Exactly(qos.durability),
+            history: Some(qos.history),
+            depth: qos.depth,
+            deadline: Choice::Exactly(qos.deadline),
+            lifespan: qos.lifespan,
+            liveliness: Choice::Exactly(qos.liveliness),
+            lease: Choice::Exactly(qos.lease),
+        }
+    }
+}
+
+impl QosRequest {
+    /// ROS 2's best-available profile.
+    pub fn best_available() -> Self {
+        Self {
+            reliability: Choice::BestAvailable,
+            durability: Choice::BestAvailable,
+            deadline: Choice::BestAvailable,
+            liveliness: Choice::BestAvailable,
+            lease: Choice::BestAvailable,
+            ..Self::default()
+        }
+    }
+
+    /// For a publisher, where these subscriptions of its topic are known: RELIABLE and
+    /// TRANSIENT_LOCAL serve every subscription; deadline and lease are the shortest that one of
+    /// them requests, and liveliness is manual when one of them wants it so.
+    pub fn for_publisher(&self, subscriptions: &[Qos]) -> Qos {
+        let shortest = |of: fn(&Qos) -> Option<u64>| subscriptions.iter().filter_map(of).min();
+        let manual = subscriptions.iter().any(|q| q.liveliness == Liveliness::ManualByTopic);
+        self.resolve(Qos {
+            reliability: Reliability::Reliable,
+            durability: Durability::TransientLocal,
+            deadline: shortest(|q| q.deadline),
+            liveliness: if manual { Liveliness::ManualByTopic } else { Liveliness::Automatic },
+            lease: shortest(|q| q.lease),
+            ..Qos::default()
+        })
+    }
+
+    /// For a subscription, where these publishers of its topic are known: of each policy the
+    /// highest level that all of them offer. Among no publishers that is the highest there is,
+    /// without deadline or lease.
+    pub fn for_subscription(&self, publishers: &[Qos]) -> Qos {
+        // A publisher without a deadline serves no subscription that has one.
+        let longest = |of: fn(&Qos) -> Option<u64>| {
+            let all: Option<Vec<u64>> = publishers.iter().map(of).collect();
+            all.and_then(|all| all.into_iter().max())
+        };
+        let reliable = publishers.iter().all(|q| q.reliability == Reliability::Reliable);
+        let latched = publishers.iter().all(|q| q.durability == Durability::TransientLocal);
+        let manual = publishers.iter().all(|q| q.liveliness == Liveliness::ManualByTopic);
+        self.resolve(Qos {
+            reliability: if reliable { Reliability::Reliable } else { Reliability::BestEffort },
+            durability: if latched { Durability::TransientLocal } else { Durability::Volatile },
+            deadline: longest(|q| q.deadline),
+            liveliness: if manual { Liveliness::ManualByTopic } else { Liveliness::Automatic },
+            lease: longest(|q| q.lease),
+            ..Qos::default()
+        })
+    }
+
+    /// For a service or a client, which both ends create alike: what is best is the default.
+    pub fn for_service(&self) -> Qos {
+        self.resolve(Qos::default())
+    }
+
+    fn resolve(&self, best: Qos) -> Qos {
+        let default = Qos::default();
+        Qos {
+            reliability: self.reliability.resolve(default.reliability, || best.reliability),
+            durability: self.durability.resolve(default.durability, || best.durability),
+            history: self.history.unwrap_or(default.history),
+            depth: if self.depth == 0 { default.depth } else { self.depth },
+            deadline: self.deadline.resolve(default.deadline, || best.deadline),
+            lifespan: self.lifespan,
+            liveliness: self.liveliness.resolve(default.liveliness, || best.liveliness),
+            lease: self.lease.resolve(default.lease, || best.lease),
+        }
+    }
+}

@@ -1,0 +1,282 @@
+//! How a reader finds the next sample: past what is skipped or lost, in memory that may not have come.
+
+use std::{
+    sync::{Arc, atomic::AtomicU64},
+    time::Instant,
+};
+
+use super::{ATTEMPTS, Descriptors, KNOWN, MISSING, MISSING_DEAD, Missing, Obstacle, Reader};
+use crate::{
+    error::TakeError,
+    memory::copy,
+    reader::sample::Extract,
+    ring::{
+        layout::{self, Array, COPIED, COPIED_ALWAYS},
+        protocol::{self, Look, Place, Record, State},
+    },
+    session::peer::Found,
+};
+
+impl Reader {
+    /// The record at the cursor, once that is past all that is skipped or lost.
+    pub(super) fn find(&mut self) -> Result<Option<Record>, TakeError> {
+        if self.attachment.lane.is_forked() {
+            return Err(TakeError::Forked);
+        }
+        if let Some(what) = self.corrupt {
+            return Err(TakeError::Corrupt { writer: self.reads.writer, what });
+        }
+        if self.given_up {
+            return Ok(None);
+        }
+        match self.find_sane() {
+            Ok(found) => {
+                if found.is_none() {
+                    // Nothing at the cursor needs it.
+                    self.missing = None;
+                }
+                Ok(found)
+            }
+            Err(Obstacle::Missing(segment)) if self.lacks(segment) => {
+                // None of what is there will ever be found.
+                self.give_all_up().map_err(|what| self.corrupt(what)).map(|()| None)
+            }
+            Err(Obstacle::Missing(_)) => Ok(None),
+            Err(Obstacle::Corrupt(what)) => Err(self.corrupt(what)),
+        }
+    }
+
+    fn find_sane(&mut self) -> Result<Option<Record>, Obstacle> {
+        for _ in 0..ATTEMPTS {
+            let word = protocol::array(self.attachment.ring());
+            if self.descriptors.as_ref().is_none_or(|known| known.word != word) {
+                self.descriptors = None;
+                self.descriptors = Some(self.resolve(word)?);
+            }
+            let Some(descriptors) = &self.descriptors else { return Ok(None) };
+            let (cursor, depth) = (self.cursor, self.reads.depth);
+            let view = descriptors.view(&self.attachment);
+            match view.state(cursor) {
+                State::Ahead if cursor >= self.seen => return Ok(None),
+                State::Here => {
+                    // One look tells whether more than the depth is unread, if that many can be.
+                    let descriptors = (view.array.len() / layout::DESCRIPTOR_WORDS) as u64;
+                    let late = depth < descriptors && view.state(cursor + depth) != State::Ahead;
+                    let mut head = 0;
+                    if late {
+                        // The head may not say so yet, or never, if the publisher died.
+                        head = if view.stands(cursor) { cursor + depth + 1 } else { 0 };
+                    } else {
+                        match view.look(cursor) {
+                            Look::Sample(record) => return Ok(Some(record)),
+                            Look::Lapped => {}
+                            Look::Corrupt(what) => return Err(Obstacle::Corrupt(what)),
+                        }
+                    }
+                    self.count(head)?;
+                }
+                State::Ahead | State::Gone => {
+                    let wrong = view.stands(cursor);
+                    self.count(0)?;
+                    if wrong && self.cursor == cursor {
+                        let what = "a descriptor that stands carries another position";
+                        return Err(Obstacle::Corrupt(what));
+                    }
+                }
+            }
+        }
+        Ok(None)
+    }
+
+    /// Counts what is skipped and what is lost, by what the head, which is at least `least`, and
+    /// the tail say.
+    fn count(&mut self, least: u64) -> Result<(), Obstacle> {
+        let (tail, head) = protocol::bounds(self.attachment.ring()).map_err(Obstacle::Corrupt)?;
+        let head = head.max(least);
+        // A sample may be taken by its stamp before the head says so.
+        if head + 1 < self.cursor {
+            return Err(Obstacle::Corrupt("its head went back"));
+        }
+        self.seen = head;
+        let unread = head.saturating_sub(self.cursor);
+        if unread > self.reads.depth {
+            self.skipped += unread - self.reads.depth;
+            self.advance(head - self.reads.depth);
+        }
+        if self.cursor < tail {
+            self.lost += tail - self.cursor;
+            self.advance(tail);
+        }
+        Ok(())
+    }
+
+    /// Where the descriptors are that the ring's word speaks of.
+    pub(super) fn resolve(&self, word: u64) -> Result<Descriptors, Obstacle> {
+        let wrong = Obstacle::Corrupt("its descriptors are nowhere");
+        let Some(Array { at, descriptors }) = Array::from_word(word) else { return Err(wrong) };
+        let map = match self.reads.peer.find(at.segment) {
+            Found::Map(map) => map,
+            Found::Refused => return Err(wrong),
+            Found::Absent => return Err(Obstacle::Missing(at.segment)),
+        };
+        match at.words(descriptors * layout::DESCRIPTOR, map.words().len()) {
+            Some(words) => Ok(Descriptors { word, map, words }),
+            None => Err(wrong),
+        }
+    }
+
+    /// As [`find`](Self::find), and where its bytes are; without what is longer than the
+    /// subscription expects.
+    pub(super) fn find_whole(&mut self) -> Result<Option<(Record, Bytes)>, TakeError> {
+        for _ in 0..ATTEMPTS {
+            let Some(record) = self.find()? else { return Ok(None) };
+            let (len, max) = (u64::from(record.len), self.reads.max_message);
+            if len > max {
+                self.lose();
+                return Err(TakeError::TooLarge { writer: self.reads.writer, len, max });
+            }
+            match self.locate(&record) {
+                Ok(bytes) => {
+                    self.missing = None;
+                    return Ok(Some((record, bytes)));
+                }
+                Err(Obstacle::Missing(segment)) => {
+                    if !self.lacks(segment) {
+                        return Ok(None);
+                    }
+                    self.lose();
+                }
+                Err(Obstacle::Corrupt(what)) => return Err(self.corrupt(what)),
+            }
+        }
+        Ok(None)
+    }
+
+    /// Where the bytes of a record that stood are.
+    fn locate(&mut self, record: &Record) -> Result<Bytes, Obstacle> {
+        let (at, slot) = match record.place {
+            Place::Inline => return Ok(Bytes::Inline),
+            Place::Block(at) => (at, false),
+            Place::Slot(at) => (at, true),
+        };
+        let len = u64::from(record.len);
+        if slot && len <= COPIED_ALWAYS || !slot && len > COPIED {
+            return Err(Obstacle::Corrupt("a sample is in the wrong kind of place"));
+        }
+        let known = self.maps.iter().find(|(number, _)| *number == at.segment);
+        let map = match known.and_then(|(_, map)| map.upgrade()) {
+            Some(map) => map,
+            None => match self.reads.peer.find(at.segment) {
+                Found::Map(map) => {
+                    // Few are in use at a time, and one that is not here is found again.
+                    self.maps.retain(|(number, _)| *number != at.segment);
+                    if self.maps.len() >= KNOWN {
+                        self.maps.remove(0);
+                    }
+                    self.maps.push((at.segment, Arc::downgrade(&map)));
+                    map
+                }
+                Found::Refused => {
+                    return Err(Obstacle::Corrupt("a sample is in memory that was refused"));
+                }
+                Found::Absent => return Err(Obstacle::Missing(at.segment)),
+            },
+        };
+        let outside = Obstacle::Corrupt("a sample lies outside its segment");
+        let limit = map.words().len();
+        if slot {
+            let words = at.words_of(len, limit).ok_or(outside)?;
+            let skip = (at.offset % 8) as usize;
+            return Ok(Bytes::Slot(Extract { map, words, skip }));
+        }
+        let words = at.words(len, limit).ok_or(outside)?;
+        Ok(Bytes::Block(Extract { map, words, skip: 0 }))
+    }
+
+    /// Whether a pin keeps the sample in place; else it is copied as one in a block is.
+    pub(super) fn may_pin(&self, record: &Record) -> bool {
+        u64::from(record.len) <= self.reads.in_place
+    }
+
+    /// Copies the payload at the cursor; false when the publisher was faster.
+    pub(super) fn copy_out(
+        &self,
+        record: &Record,
+        bytes: &Bytes,
+        out: &mut Vec<u8>,
+    ) -> Result<bool, TakeError> {
+        let len = record.len as usize;
+        let Some(descriptors) = &self.descriptors else { return Ok(false) };
+        let view = descriptors.view(&self.attachment);
+        let mut copy = |words: &[AtomicU64], skip| {
+            copy::copy_out(words, skip, len, out)
+                .map_err(|_| TakeError::NoMemory { len: len as u64 })
+        };
+        match bytes {
+            Bytes::Inline => copy(view.inline(self.cursor), 0)?,
+            Bytes::Slot(there) if self.may_pin(record) => {
+                let copy = || copy(there.words(), there.skip);
+                let pinned = self.attachment.while_pinned(self.cursor, copy);
+                return pinned.transpose().map(|copied| copied.is_some());
+            }
+            Bytes::Block(there) | Bytes::Slot(there) => copy(there.words(), there.skip)?,
+        }
+        Ok(view.stands(self.cursor))
+    }
+
+    /// Notes that `segment` has not come, and has it asked for again at times. True when it never
+    /// will.
+    fn lacks(&mut self, segment: u32) -> bool {
+        let now = Instant::now();
+        match &mut self.missing {
+            Some(missing) if missing.segment == segment => {
+                let missing = *missing;
+                if self.is_over(&missing) {
+                    // So are all samples that are in it.
+                    return true;
+                }
+                if now.duration_since(missing.asked) < MISSING {
+                    return false;
+                }
+                self.missing = Some(Missing { asked: now, ..missing });
+            }
+            _ => self.missing = Some(Missing { segment, since: now, asked: now }),
+        }
+        if let Some(session) = self.reads.peer.remote() {
+            session.want(segment);
+        }
+        false
+    }
+
+    /// Whether a segment that has not come will not come any more.
+    pub(super) fn is_over(&self, missing: &Missing) -> bool {
+        let waited = missing.since.elapsed();
+        self.ended && waited >= MISSING || waited >= MISSING_DEAD && self.writer_dead()
+    }
+
+    /// All that is published is lost, and nothing else will be.
+    fn give_all_up(&mut self) -> Result<(), &'static str> {
+        let (_, head) = protocol::bounds(self.attachment.ring())?;
+        self.given_up = true;
+        self.missing = None;
+        self.lost += head.saturating_sub(self.cursor);
+        self.advance(head.max(self.cursor));
+        Ok(())
+    }
+
+    /// The sample at the cursor is lost.
+    fn lose(&mut self) {
+        self.lost += 1;
+        self.advance(self.cursor + 1);
+    }
+}
+
+/// Where a sample's bytes are.
+pub(super) enum Bytes {
+    /// In its descriptor.
+    Inline,
+    /// To be copied, and checked afterwards.
+    Block(Extract),
+    /// To be pinned, if the reader [may](Reader::may_pin).
+    Slot(Extract),
+}

@@ -1,0 +1,244 @@
+//! A sample that was taken without being copied.
+
+#![allow(unsafe_code)]
+
+use std::{
+    collections::TryReserveError,
+    fmt,
+    io::{self, Read, Seek, SeekFrom},
+    mem::MaybeUninit,
+    ops::Range,
+    slice,
+    sync::{Arc, atomic::AtomicU64},
+};
+
+use crate::{
+    memory::{copy, segment::Map},
+    ring::types::{Meta, Taken},
+    session::attachment::Pin,
+};
+
+/// A sample, in the publisher's memory where it is long enough for that to pay, else in a copy.
+///
+/// It stays as it was published for as long as this value lives, also after the subscription, the
+/// publisher and its process have ended; only then may the publisher use the memory again, which
+/// it never waits for. A subscription can have five such samples of one publisher; a sixth is
+/// copied, and so is one that is longer than its share of what the publisher can spare. It may be
+/// read and dropped by any thread.
+///
+/// A publisher in another process that does not keep to the protocol can still change the bytes.
+/// They are therefore read as values ([`read_at`](Self::read_at), [`copy_to`](Self::copy_to),
+/// [`reader`](Self::reader)), and as a slice only where the caller vouches for the publisher.
+///
+/// What is read in place borrows the sample:
+///
+/// ```compile_fail,E0505
+/// # use axon_shm::{Subscriber, TakeError};
+/// fn first(subscriber: &mut Subscriber) -> Result<(), TakeError> {
+///     if let Some(sample) = subscriber.take()? {
+///         let reader = sample.reader();
+///         drop(sample); // The publisher may write here from now on.
+///         std::io::copy(&mut { reader }, &mut std::io::sink()).unwrap();
+///     }
+///     Ok(())
+/// }
+/// ```
+///
+/// A forked child has no share in it: it reads nothing there.
+pub struct Sample {
+    taken: Taken,
+    len: usize,
+    data: Data,
+}
+
+enum Data {
+    Copied(Vec<u8>),
+    Pinned { there: Extract, pin: Pin },
+}
+
+/// Bytes of a map: from the one behind the first `skip` of these words on.
+pub(crate) struct Extract {
+    pub(crate) map: Arc<Map>,
+    pub(crate) words: Range<usize>,
+    pub(crate) skip: usize,
+}
+
+impl Extract {
+    #[inline]
+    pub(crate) fn words(&self) -> &[AtomicU64] {
+        &self.map.words()[self.words.clone()]
+    }
+}
+
+impl Sample {
+    /// A sample of its own bytes.
+    pub(crate) fn copied(taken: Taken, bytes: Vec<u8>) -> Self {
+        Self { taken, len: bytes.len(), data: Data::Copied(bytes) }
+    }
+
+    /// `len` bytes there, which the words hold and which `pin` pins.
+    pub(crate) fn pinned(taken: Taken, len: usize, there: Extract, pin: Pin) -> Self {
+        debug_assert!(there.skip + len <= there.words().len() * 8);
+        Self { taken, len, data: Data::Pinned { there, pin } }
+    }
+
+    /// What goes with it.
+    #[inline]
+    pub fn meta(&self) -> Meta {
+        self.taken.meta
+    }
+
+    /// Its position in the publisher's ring.
+    #[inline]
+    pub fn position(&self) -> u64 {
+        self.taken.position
+    }
+
+    /// Its length in bytes.
+    #[inline]
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Whether it has no bytes.
+    #[inline]
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// Whether it is in the publisher's memory.
+    #[inline]
+    pub fn is_borrowed(&self) -> bool {
+        matches!(self.data, Data::Pinned { .. })
+    }
+
+    /// Copies bytes from `at` on to the front of `out`, as many as there are and fit, and returns
+    /// how many.
+    #[inline]
+    pub fn read_at(&self, at: usize, out: &mut [u8]) -> usize {
+        let count = out.len().min(self.len.saturating_sub(at));
+        if count == 0 {
+            return 0;
+        }
+        let out = &mut out[..count];
+        match &self.data {
+            Data::Copied(bytes) => out.copy_from_slice(&bytes[at.min(self.len)..][..count]),
+            Data::Pinned { pin, .. } if pin.attachment().lane.is_forked() => return 0,
+            Data::Pinned { there, .. } => copy::read_at(there.words(), there.skip + at, out),
+        }
+        count
+    }
+
+    /// Writes its first bytes to all of `out`, of which it has as many; false, with nothing written, in
+    /// a forked child.
+    ///
+    /// # Panics
+    /// It has fewer.
+    #[doc(hidden)]
+    #[inline]
+    pub fn write_to(&self, out: &mut [MaybeUninit<u8>]) -> bool {
+        assert!(out.len() <= self.len);
+        match &self.data {
+            Data::Copied(bytes) => {
+                for (to, byte) in out.iter_mut().zip(bytes) {
+                    to.write(*byte);
+                }
+            }
+            Data::Pinned { pin, .. } if pin.attachment().lane.is_forked() => return false,
+            Data::Pinned { there, .. } => copy::copy(there.words(), there.skip, out),
+        }
+        true
+    }
+
+    /// Replaces what `out` holds by the sample's bytes. In a forked child, by none.
+    ///
+    /// # Errors
+    /// There is no memory for them.
+    pub fn copy_to(&self, out: &mut Vec<u8>) -> Result<(), TryReserveError> {
+        match &self.data {
+            Data::Copied(bytes) => {
+                out.clear();
+                out.try_reserve(bytes.len())?;
+                out.extend_from_slice(bytes);
+                Ok(())
+            }
+            Data::Pinned { pin, .. } if pin.attachment().lane.is_forked() => {
+                out.clear();
+                Ok(())
+            }
+            Data::Pinned { there, .. } => copy::copy_out(there.words(), there.skip, self.len, out),
+        }
+    }
+
+    /// Reads it from the front, for instance to deserialize it.
+    pub fn reader(&self) -> SampleReader<'_> {
+        SampleReader { sample: self, at: 0 }
+    }
+
+    /// Where its bytes are. Where it [is borrowed](Self::is_borrowed) they are aligned to 16, or those behind
+    /// the header that its publisher's [loan](crate::Publisher::loan_behind) had.
+    ///
+    /// They are readable for as long as the sample lives. A publisher that does not keep to the
+    /// protocol may change them at any time, so an access must be atomic or volatile.
+    #[inline]
+    pub fn as_ptr(&self) -> *const u8 {
+        match &self.data {
+            Data::Copied(bytes) => bytes.as_ptr(),
+            Data::Pinned { there, .. } => {
+                there.words().as_ptr().cast::<u8>().wrapping_add(there.skip)
+            }
+        }
+    }
+
+    /// Its bytes in place.
+    ///
+    /// # Safety
+    /// Where it [is borrowed](Self::is_borrowed), the publisher's process must be trusted not to
+    /// write to a sample that is pinned: what this crate publishes never does. And the slice must
+    /// not be used in a child that was forked while the sample lived.
+    pub unsafe fn as_slice(&self) -> &[u8] {
+        // SAFETY: `len` bytes from there on are initialized and readable for as long as `self`
+        // lives: those of the vector, or those of the map, which holds as many behind those
+        // that are skipped (`pinned`). That
+        // nobody writes to them meanwhile is the vector's nature, or the caller's promise.
+        unsafe { slice::from_raw_parts(self.as_ptr(), self.len) }
+    }
+}
+
+impl fmt::Debug for Sample {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Sample")
+            .field("meta", &self.meta())
+            .field("len", &self.len)
+            .field("borrowed", &self.is_borrowed())
+            .finish_non_exhaustive()
+    }
+}
+
+/// Reads a [`Sample`] from the front.
+#[derive(Debug)]
+pub struct SampleReader<'a> {
+    sample: &'a Sample,
+    at: u64,
+}
+
+impl Read for SampleReader<'_> {
+    fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
+        let count = usize::try_from(self.at).map_or(0, |at| self.sample.read_at(at, out));
+        self.at += count as u64;
+        Ok(count)
+    }
+}
+
+impl Seek for SampleReader<'_> {
+    fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+        let (from, by) = match to {
+            SeekFrom::Start(at) => (at, 0),
+            SeekFrom::Current(by) => (self.at, by),
+            SeekFrom::End(by) => (self.sample.len as u64, by),
+        };
+        let outside = || io::Error::new(io::ErrorKind::InvalidInput, "before a sample's start");
+        self.at = from.checked_add_signed(by).ok_or_else(outside)?;
+        Ok(self.at)
+    }
+}

@@ -1,0 +1,98 @@
+//! Samples that were taken, and of which somebody else says when they are done with.
+
+use std::collections::VecDeque;
+
+use super::Reader;
+use crate::ring::protocol;
+
+/// Numbers and positions of samples that were taken and are not done with, and how many samples were given
+/// up so far.
+#[derive(Default)]
+pub(super) struct UnderWay(VecDeque<(u64, u64)>, u64);
+
+impl UnderWay {
+    pub(super) fn add(&mut self, sequence: u64, position: u64) {
+        self.0.push_back((sequence, position));
+    }
+
+    /// The position of the oldest.
+    #[inline]
+    pub(super) fn first(&self) -> Option<u64> {
+        self.0.front().map(|(_, position)| *position)
+    }
+}
+
+impl Reader {
+    /// What is taken from now on is done with when [`finish`](Self::finish) says so: until then its
+    /// publisher takes it as not taken.
+    #[inline]
+    pub fn finish_later(&mut self) {
+        self.under_way.get_or_insert_default();
+    }
+
+    /// Whether samples that were taken are not done with.
+    #[inline]
+    pub fn is_under_way(&self) -> bool {
+        self.under_way.as_ref().is_some_and(|under_way| !under_way.0.is_empty())
+    }
+
+    /// Samples that are not done with, those that were not taken among them.
+    #[inline]
+    pub fn undone(&self) -> u64 {
+        let under_way = self.under_way.as_ref().map_or(0, |under_way| under_way.0.len() as u64);
+        under_way.saturating_add(self.unread())
+    }
+
+    /// Samples up to this number are done with.
+    #[inline]
+    pub fn finish(&mut self, sequence: u64) {
+        let Some(under_way) = &mut self.under_way else { return };
+        if self.attachment.lane.is_forked() {
+            return;
+        }
+        while under_way.0.front().is_some_and(|(number, _)| *number <= sequence) {
+            under_way.0.pop_front();
+        }
+        self.tell_cursor();
+    }
+
+    /// So many samples do not get where they are to go: their publisher sees that no later than that they
+    /// are [done with](Self::finish).
+    pub fn give_up(&mut self, samples: u64) {
+        let Some(under_way) = &mut self.under_way else { return };
+        if !self.attachment.lane.is_forked() {
+            under_way.1 = under_way.1.saturating_add(samples);
+            self.attachment.lane.give_up(under_way.1);
+        }
+    }
+
+    /// What was taken and is not done with is to be taken once more.
+    pub fn take_back(&mut self) {
+        let Some(under_way) = &mut self.under_way else { return };
+        if self.attachment.lane.is_forked() {
+            return;
+        }
+        let samples = std::mem::take(&mut under_way.0);
+        if let Some((_, position)) = samples.front() {
+            self.cursor = *position;
+            self.received = self.received.saturating_sub(samples.len() as u64);
+            self.missing = None;
+        }
+    }
+
+    /// As [`take_back`](Self::take_back), and so is all that stands of what it was granted, done with or
+    /// not.
+    pub fn begin_anew(&mut self) {
+        self.take_back();
+        if self.under_way.is_none() || self.attachment.lane.is_forked() {
+            return;
+        }
+        if let Ok((tail, _)) = protocol::bounds(self.attachment.ring()) {
+            let first = tail.max(self.reads.grant.first);
+            if first < self.cursor {
+                self.cursor = first;
+                self.tell_cursor();
+            }
+        }
+    }
+}

@@ -1,0 +1,9 @@
+//! What is in shared memory, word by word, and the order in which it is written and read. No calls of the system.
+
+pub(crate) mod inspect;
+pub(crate) mod layout;
+pub(crate) mod pins;
+pub(crate) mod protocol;
+pub(crate) mod times;
+pub(crate) mod types;
+pub(crate) mod window;

@@ -1,0 +1,69 @@
+//! Hazard pins over plain words: how a reader keeps a large sample in place while it reads it, and
+//! a publisher never waits for that.
+//!
+//! A reader stores the position in a record of its lane, fences, and looks at the tail: if that is
+//! still at or below the position, the sample stays until the record is cleared. The publisher
+//! raises the tail above the samples that it wants to reuse, fences, and looks at the records of
+//! every reader that may have one; what is pinned it leaves alone.
+//!
+//! The two fences have an order. If the reader's comes first, the publisher sees the pin, or what
+//! the same reader stored there after it was done. If the publisher's comes first, the reader sees
+//! the tail and lets go. So whoever reads on has been seen.
+//!
+//! A pin names a position, of which each is used once, and not a place: one that is out of date
+//! keeps nothing.
+
+use crate::{
+    ring::layout::lane::PINS,
+    sync::{Ordering, Site, Word, fence_at},
+};
+
+/// Records of a lane: how many samples of one publisher a reader can pin.
+pub(crate) const RECORDS: usize = 6;
+
+/// Reader: a record, of the first `count`, that pins nothing. It stays free until this thread uses
+/// it: only one at a time pins, though any may unpin.
+#[inline]
+pub(crate) fn free<W: Word>(lane: &[W], count: usize) -> Option<usize> {
+    let mut records = lane[PINS..PINS + count].iter();
+    // Pairs with `unpin`: what another thread read comes before the pin that this one stores there.
+    records.position(|record| record.load(Site::FreeLoad.order()) == 0)
+}
+
+/// Reader: pins `position` in a record that is not in use. False when the publisher has given the
+/// sample up already: then it is not pinned.
+#[inline]
+pub(crate) fn pin<W: Word>(lane: &[W], record: usize, position: u64, tail: &W) -> bool {
+    // Pairs with `scan`: who sees this pin knows that what the record held before was read.
+    lane[PINS + record].store(position + 1, Site::PinStore.order());
+    // Pairs with the fence of `about_to_scan`.
+    fence_at::<W>(Site::PinFence);
+    if tail.load(Ordering::Relaxed) <= position {
+        return true;
+    }
+    unpin(lane, record);
+    false
+}
+
+/// Reader: nothing is read any more of what the record pins.
+#[inline]
+pub(crate) fn unpin<W: Word>(lane: &[W], record: usize) {
+    // Pairs with `scan`: all reads come before the write that follows it; and with `free`.
+    lane[PINS + record].store(0, Site::UnpinStore.order());
+}
+
+/// Publisher: the tail has been raised above all that is to be reused; [`scan`] follows.
+#[inline]
+pub(crate) fn about_to_scan<W: Word>() {
+    // Pairs with the fence of `pin`.
+    fence_at::<W>(Site::ReclaimFence);
+}
+
+/// Publisher: the positions that a lane pins. Any other may be written over.
+#[inline]
+pub(crate) fn scan<W: Word>(lane: &[W]) -> impl Iterator<Item = u64> + '_ {
+    lane[PINS..PINS + RECORDS].iter().filter_map(|record| {
+        // Pairs with the stores of `pin` and `unpin`.
+        record.load(Site::ScanLoad.order()).checked_sub(1)
+    })
+}

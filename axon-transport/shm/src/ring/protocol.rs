@@ -1,0 +1,278 @@
+//! The ring's protocol over plain words: what a publisher stores and what a reader believes.
+//!
+//! A descriptor's stamp says which position stands in it; whoever sees the stamp sees the sample,
+//! so that one who waits for the next sample looks at one line. The head says the same of all
+//! below it, to those that have fallen behind.
+//!
+//! A reader copies first and checks afterwards, except for large samples, which it
+//! [pins](super::pins). The publisher raises the tail above a position before it reuses that
+//! position's descriptor or block; a reader that finds the tail still at or below its position
+//! after the copy has copied what was published. In the same way it finds out that the descriptors
+//! have moved to a larger array, and the memory of the old one has gone to others.
+
+use std::ops::Range;
+
+use crate::{
+    memory::prefetch::prefetch,
+    ring::layout::{
+        DESCRIPTOR_WORDS, Location, halves,
+        ring::{ARRAY, HEAD, LIFESPAN, TAIL},
+    },
+    sync::{Ordering, Site, Word, fence_at},
+};
+
+const STAMP: usize = 0;
+const SEQUENCE: usize = 1;
+const TIMESTAMP: usize = 2;
+/// Length in bytes, and in what kind of place of which segment.
+const PLACE: usize = 3;
+const DATA: usize = 4;
+/// When the sample was published, on the monotonic clock, where the lifespan is finite.
+const PUBLISHED: usize = DESCRIPTOR_WORDS - 1;
+const INLINE_WORDS: usize = PUBLISHED - DATA;
+
+/// No ring gets this far; a head beyond it was scribbled.
+pub(crate) const MAX_POSITION: u64 = 1 << 62;
+
+/// Where a sample's bytes are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Place {
+    /// In the descriptor.
+    Inline,
+    /// In memory that is written over as soon as the sample is given up.
+    Block(Location),
+    /// In memory that stays as it is while it is pinned.
+    Slot(Location),
+}
+
+impl Place {
+    fn word(self) -> (u32, u64) {
+        match self {
+            Self::Inline => (0, 0),
+            Self::Block(at) => (1 | at.segment << 8, at.offset),
+            Self::Slot(at) => (2 | at.segment << 8, at.offset),
+        }
+    }
+}
+
+/// What a descriptor says of its sample.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Record {
+    pub(crate) sequence: u64,
+    pub(crate) timestamp: i64,
+    /// 0 where the ring's lifespan is infinite.
+    pub(crate) published: u64,
+    pub(crate) len: u32,
+    pub(crate) place: Place,
+}
+
+fn descriptor<W>(array: &[W], position: u64) -> &[W] {
+    &array[words_of(array.len(), position)]
+}
+
+/// The words of a position's descriptor in an array of `len` words.
+fn words_of(len: usize, position: u64) -> Range<usize> {
+    let mask = (len / DESCRIPTOR_WORDS) as u64 - 1;
+    let start = (position & mask) as usize * DESCRIPTOR_WORDS;
+    start..start + DESCRIPTOR_WORDS
+}
+
+/// The source timestamp in a descriptor's words, as they were read at some time, if it was
+/// `position`'s.
+pub(crate) fn timestamp_of(words: &[u64; DESCRIPTOR_WORDS], position: u64) -> Option<i64> {
+    let stamp = position.checked_mul(2)?.checked_add(2)?;
+    (words[STAMP] == stamp).then_some(words[TIMESTAMP].cast_signed())
+}
+
+/// Publisher: positions below `tail` are about to be reused.
+pub(crate) fn retire<W: Word>(ring: &[W], tail: u64) {
+    // Pairs with `bounds`: a reader that sees this tail sees a head at least as high.
+    ring[TAIL].store(tail, Site::TailStore.order());
+}
+
+/// Publisher: stores to descriptors, blocks or whatever else the heap gave out follow on this
+/// thread. Whoever sees one of them sees the tail that was retired, and the array that was
+/// replaced before, by this thread or one that this thread synchronized with.
+#[inline]
+pub(crate) fn about_to_write<W: Word>() {
+    // Pairs with the acquire fence of `stands`.
+    fence_at::<W>(Site::ReuseFence);
+}
+
+/// Publisher: makes `position` visible, after [`about_to_write`]. A sample outside the descriptor
+/// has been copied in already.
+pub(crate) fn publish<W: Word>(
+    ring: &[W],
+    array: &[W],
+    position: u64,
+    record: &Record,
+    inline: &[u8],
+) {
+    let slot = descriptor(array, position);
+    slot[SEQUENCE].store(record.sequence, Ordering::Relaxed);
+    slot[TIMESTAMP].store(record.timestamp.cast_unsigned(), Ordering::Relaxed);
+    let (place, offset) = record.place.word();
+    slot[PLACE].store(u64::from(record.len) | u64::from(place) << 32, Ordering::Relaxed);
+    if record.published != 0 {
+        slot[PUBLISHED].store(record.published, Ordering::Relaxed);
+    }
+    match record.place {
+        Place::Inline => copy_in(&slot[DATA..PUBLISHED], inline),
+        Place::Block(_) | Place::Slot(_) => slot[DATA].store(offset, Ordering::Relaxed),
+    }
+    // Pairs with `state`: whoever sees the stamp sees the sample.
+    slot[STAMP].store(2 * position + 2, Site::StampStore.order());
+    // Pairs with `bounds`: whoever sees the head sees the stamp.
+    ring[HEAD].store(position + 1, Site::HeadStore.order());
+}
+
+/// Publisher: the number of the sample at a position that stands.
+pub(crate) fn number<W: Word>(array: &[W], position: u64) -> u64 {
+    // Relaxed: nobody else stores to it.
+    descriptor(array, position)[SEQUENCE].load(Ordering::Relaxed)
+}
+
+/// Publisher: fills a new array with what stands, from `tail` up to `head`, in the old one. After
+/// [`about_to_write`]; [`replace`] follows.
+pub(crate) fn copy_descriptors<W: Word>(old: &[W], new: &[W], tail: u64, head: u64) {
+    let descriptors = (new.len() / DESCRIPTOR_WORDS) as u64;
+    // As if each had been used last time round: a reader that asks for a position that was given
+    // up must find that it is late, and one that asks for the next must wait.
+    for next in head..head + descriptors {
+        let stamp = next.checked_sub(descriptors).map_or(0, |last| 2 * last + 2);
+        descriptor(new, next)[STAMP].store(stamp, Ordering::Relaxed);
+    }
+    for position in tail..head {
+        for (to, from) in descriptor(new, position).iter().zip(descriptor(old, position)) {
+            to.store(from.load(Ordering::Relaxed), Ordering::Relaxed);
+        }
+    }
+}
+
+/// Publisher: from now on the descriptors are in another array. The old one may be used for
+/// something else, after [`about_to_write`].
+pub(crate) fn replace<W: Word>(ring: &[W], array: u64) {
+    // Pairs with `array`: whoever sees it sees the descriptors there.
+    ring[ARRAY].store(array, Site::ArrayStore.order());
+}
+
+/// Reader: the word that says where the descriptors are.
+#[inline]
+pub(crate) fn array<W: Word>(ring: &[W]) -> u64 {
+    // Pairs with `replace`.
+    ring[ARRAY].load(Site::ArrayLoad.order())
+}
+
+/// Reader: the oldest position that stands and the next position to come.
+pub(crate) fn bounds<W: Word>(ring: &[W]) -> Result<(u64, u64), &'static str> {
+    // In this order: a tail is never above the head that a later load sees.
+    let tail = ring[TAIL].load(Site::TailLoad.order());
+    let head = ring[HEAD].load(Site::HeadLoad.order());
+    if tail > head || head > MAX_POSITION {
+        return Err("its head and tail make no sense");
+    }
+    Ok((tail, head))
+}
+
+/// Reader: how a position's descriptor looks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum State {
+    /// The position is not published yet.
+    Ahead,
+    /// It stands, or has just been given up.
+    Here,
+    /// A later one has its place.
+    Gone,
+}
+
+/// Reader: what a look at a published position gave.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum Look {
+    Sample(Record),
+    /// The publisher has reused the descriptor: look at the tail again.
+    Lapped,
+    Corrupt(&'static str),
+}
+
+/// A ring as a reader sees it.
+pub(crate) struct View<'a, W> {
+    /// Its header.
+    pub(crate) ring: &'a [W],
+    /// What [`array`] said, and the descriptors there.
+    pub(crate) word: u64,
+    pub(crate) array: &'a [W],
+}
+
+impl<'a, W: Word> View<'a, W> {
+    #[inline]
+    pub(crate) fn state(&self, position: u64) -> State {
+        let stamp = descriptor(self.array, position)[STAMP].load(Site::StampLoad.order());
+        // Pairs with `publish`.
+        match stamp.cmp(&(2 * position + 2)) {
+            std::cmp::Ordering::Less => State::Ahead,
+            std::cmp::Ordering::Equal => State::Here,
+            std::cmp::Ordering::Greater => State::Gone,
+        }
+    }
+
+    /// The record at `position`, whose descriptor is [here](State::Here). Where its bytes are has
+    /// not been checked.
+    pub(crate) fn look(&self, position: u64) -> Look {
+        let slot = descriptor(self.array, position);
+        let sequence = slot[SEQUENCE].load(Ordering::Relaxed);
+        let timestamp = slot[TIMESTAMP].load(Ordering::Relaxed).cast_signed();
+        let (len, place) = halves(slot[PLACE].load(Ordering::Relaxed));
+        let offset = slot[DATA].load(Ordering::Relaxed);
+        // Of a short sample the word is in a cache line that need not come otherwise.
+        let finite = self.ring[LIFESPAN].load(Ordering::Relaxed) != 0;
+        let published = if finite { slot[PUBLISHED].load(Ordering::Relaxed) } else { 0 };
+        if !self.stands(position) {
+            return Look::Lapped;
+        }
+        let at = Location { segment: place >> 8, offset };
+        let place = match place & 0xff {
+            0 if len as usize > INLINE_WORDS * 8 => {
+                return Look::Corrupt("a sample in a descriptor is longer than that");
+            }
+            0 => Place::Inline,
+            1 => Place::Block(at),
+            2 => Place::Slot(at),
+            _ => return Look::Corrupt("a sample is in no known kind of place"),
+        };
+        Look::Sample(Record { sequence, timestamp, published, len, place })
+    }
+
+    /// Has the rest of a descriptor that is [here](State::Here) on its way from the publisher's core
+    /// while the caller gets ready to take it: what locks in between would have it wait.
+    #[inline]
+    pub(crate) fn expect(&self, position: u64) {
+        prefetch(&descriptor(self.array, position)[DESCRIPTOR_WORDS / 2]);
+    }
+
+    /// The words of a sample that is in its descriptor.
+    pub(crate) fn inline(&self, position: u64) -> &'a [W] {
+        &descriptor(self.array, position)[DATA..PUBLISHED]
+    }
+
+    /// Whether all that was loaded of `position` so far is what was published.
+    pub(crate) fn stands(&self, position: u64) -> bool {
+        // Pairs with the release fence of `about_to_write`: had one of the loads before seen a
+        // reuse, the loads after see the tail and the array that were stored ahead of it.
+        fence_at::<W>(Site::StandsFence);
+        self.ring[TAIL].load(Ordering::Relaxed) <= position
+            && self.ring[ARRAY].load(Ordering::Relaxed) == self.word
+    }
+}
+
+/// Copies `bytes` into words; the last is filled up with zeros.
+pub(crate) fn copy_in<W: Word>(words: &[W], bytes: &[u8]) {
+    let (whole, rest) = bytes.as_chunks::<8>();
+    for (word, chunk) in words.iter().zip(whole) {
+        word.store(u64::from_ne_bytes(*chunk), Ordering::Relaxed);
+    }
+    if !rest.is_empty() {
+        let mut last = [0; 8];
+        last[..rest.len()].copy_from_slice(rest);
+        words[whole.len()].store(u64::from_ne_bytes(last), Ordering::Relaxed);
+    }
+}

@@ -1,0 +1,59 @@
+//! What the two ends of a ring tell each other and their owners.
+
+use crate::{ids::Gid, qos::Qos};
+
+/// What a ring is made for.
+#[derive(Clone, Copy, Debug)]
+pub struct RingOptions {
+    /// The publisher.
+    pub gid: Gid,
+    /// What it offers.
+    pub qos: Qos,
+    /// Bytes of samples to keep before the oldest go; one sample is always kept.
+    pub budget: u64,
+    /// The largest sample in bytes.
+    pub max_message: u64,
+    /// The length in bytes that is expected of samples. Where it is more than 512, readers have
+    /// memory of the publisher's own before the first of them comes, in which there are all
+    /// samples of more than 4 KiB, and loans of more than 512 bytes.
+    pub expected: u64,
+}
+
+/// What a reader is given when it attaches.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Grant {
+    /// Names this attachment; never 0.
+    pub generation: u64,
+    /// The first position that the reader takes.
+    pub first: u64,
+}
+
+/// What goes with a sample.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Meta {
+    /// The publisher's sequence number.
+    pub sequence: u64,
+    /// When it was published, in nanoseconds since the Unix epoch.
+    pub source_timestamp: i64,
+    /// When it was published, in nanoseconds of this host's CLOCK_MONOTONIC: that of a sample from
+    /// another host is its arrival less its age. The publisher's lifespan counts from then. 0 is now
+    /// for a sample that is published, and stands in one that was taken where the lifespan is infinite.
+    pub published: u64,
+}
+
+/// A sample that was published.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Published {
+    /// Its position in the ring, counted from 0 without gaps. None where nobody reads: then only
+    /// its number is used up.
+    pub position: Option<u64>,
+}
+
+/// A sample that was taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Taken {
+    /// What goes with it.
+    pub meta: Meta,
+    /// Its position in the publisher's ring.
+    pub position: u64,
+}

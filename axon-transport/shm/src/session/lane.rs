@@ -1,0 +1,296 @@
+//! A reader's own words in its session's segment.
+//!
+//! The first of them says who uses the lane: 0 nobody; with its highest bit set, a reader that has
+//! not seen its grant yet; any other value is the grant's. No value is used twice, so a publisher
+//! that knows what the word was when the reader asked, and what it granted, knows when the lane
+//! has passed on to somebody else.
+
+use std::sync::{Arc, atomic::AtomicU64};
+
+use crate::{
+    alloc::{allowance::Allowance, heap::Object},
+    ids::Gid,
+    memory::segment::Map,
+    ring::{
+        layout::{
+            self, LANE_WORDS, Location,
+            lane::{CURSOR, GENERATION, GIVEN_UP, LOST, MAPPED, READER, RECEIVED, SKIPPED, TAKEN},
+        },
+        pins,
+        types::Grant,
+    },
+    session::segment::SessionSegment,
+    sync::{Ordering, Site, Word},
+};
+
+/// Set in the generation word of a lane that is not open yet.
+const ASKED: u64 = 1 << 63;
+
+/// The part of a generation that says which time of the lane's use it is for: a grant of another
+/// time would bring back, for the publisher that gave it then, a reader that has left.
+const TIME: u64 = (1 << 24) - 1;
+
+/// Of the word that says how many samples were given up, what is the number; the rest is [`TIME`]'s part
+/// of the generation.
+const GIVEN_UP_BITS: u32 = 40;
+const GIVEN_UP_MAX: u64 = (1 << GIVEN_UP_BITS) - 1;
+
+/// Whether a grant of this generation is for the `number`th time that the session uses a lane.
+fn is_for(generation: u64, number: u64) -> bool {
+    // Any other value leaves the lane with nobody, or in the hands of one who asks.
+    (1..ASKED).contains(&generation) && generation & TIME == number & TIME
+}
+
+/// How a reader stands with the publisher that looks at its lane.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Standing {
+    /// It has not seen its grant yet.
+    Asked,
+    Open,
+    /// It has left, and has read all that it pinned.
+    Left,
+}
+
+/// What a publisher knows a reader's lane by.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Tenancy {
+    /// The generation word when the reader asked.
+    asked: u64,
+    /// The one that it was granted.
+    generation: u64,
+}
+
+impl Tenancy {
+    /// Publisher: gives a generation to the reader that asked with this lane.
+    pub(crate) fn grant<W: Word>(lane: &[W], allowance: Allowance) -> Self {
+        let asked = lane[GENERATION].load(Site::GenerationLoad.order());
+        let random = rand::random_range(1..ASKED >> 30) << 30;
+        Self { asked, generation: random | allowance.bits() | asked & TIME }
+    }
+
+    /// What its reader may pin.
+    pub(crate) fn allowance(&self) -> Allowance {
+        Allowance::of(self.generation)
+    }
+
+    /// Publisher: whether the lane is as it was when the reader asked.
+    pub(crate) fn is_asked<W: Word>(&self, lane: &[W]) -> bool {
+        lane[GENERATION].load(Site::GenerationLoad.order()) == self.asked
+    }
+
+    pub(crate) fn generation(&self) -> u64 {
+        self.generation
+    }
+
+    /// Publisher: how many samples the reader gave up by now; those below its [cursor](Self::cursor) are
+    /// counted if that was looked at before. `None` once the lane has passed on to another reader.
+    pub(crate) fn given_up<W: Word>(&self, lane: &[W]) -> Option<u64> {
+        // Ordered by the cursor.
+        match lane[GIVEN_UP].load(Ordering::Relaxed) {
+            // As readers of an older version leave it.
+            0 => Some(0),
+            word => {
+                (word >> GIVEN_UP_BITS == self.generation & TIME).then_some(word & GIVEN_UP_MAX)
+            }
+        }
+    }
+
+    /// Publisher: what the lane says of the reader now.
+    #[inline]
+    pub(crate) fn standing<W: Word>(&self, lane: &[W]) -> Standing {
+        // Pairs with `open`: who sees the lane open sees its cursor; and with `close`: who sees it
+        // closed, or in other hands, writes after all reads.
+        match lane[GENERATION].load(Site::GenerationLoad.order()) {
+            0 => Standing::Left,
+            word if word == self.generation => Standing::Open,
+            word if word == self.asked => Standing::Asked,
+            _ => Standing::Left,
+        }
+    }
+
+    /// Publisher: the next position that the reader takes, if it has opened the lane.
+    #[inline]
+    pub(crate) fn cursor<W: Word>(&self, lane: &[W]) -> Option<u64> {
+        (self.standing(lane) == Standing::Open).then(|| {
+            // Pairs with `advance`: what the reader has copied is not written over before.
+            lane[CURSOR].load(Site::CursorLoad.order())
+        })
+    }
+}
+
+/// Publisher: the highest number of its segments that came to the reader.
+#[inline]
+pub(crate) fn mapped<W: Word>(lane: &[W]) -> u64 {
+    // Pairs with `set_mapped`: what is told of the segment from now on finds it there.
+    lane[MAPPED].load(Site::MappedLoad.order())
+}
+
+/// Reader: this is the highest number of the segments of its publisher that came.
+pub(crate) fn set_mapped<W: Word>(lane: &[W], number: u64) {
+    // Pairs with `mapped`.
+    lane[MAPPED].store(number, Site::MappedStore.order());
+}
+
+/// Reader: is about to ask with this lane for the `number`th time that the session uses one.
+pub(crate) fn ask<W: Word>(lane: &[W], number: u64) {
+    lane[MAPPED].store(0, Ordering::Relaxed);
+    // Pairs with `standing`, for the publisher of the reader that had the lane before.
+    lane[GENERATION].store(ASKED | number, Site::AskStore.order());
+}
+
+/// Reader: has seen its grant.
+pub(crate) fn open<W: Word>(lane: &[W], grant: Grant) {
+    // The records are clear since the last pin was given up. To clear them once more could hide
+    // from the last reader's publisher that this one's reads come after that one's.
+    for word in [RECEIVED, LOST, SKIPPED, TAKEN] {
+        lane[word].store(0, Ordering::Relaxed);
+    }
+    give_up(lane, grant.generation, 0);
+    lane[CURSOR].store(grant.first, Ordering::Relaxed);
+    // Pairs with `standing`.
+    lane[GENERATION].store(grant.generation, Site::OpenStore.order());
+}
+
+/// Reader: has taken, or will not take, what is below `cursor`.
+#[inline]
+pub(crate) fn advance<W: Word>(lane: &[W], cursor: u64) {
+    // Pairs with `cursor`.
+    lane[CURSOR].store(cursor, Site::CursorStore.order());
+}
+
+/// Reader: gave up so many samples since it came. Before it is done with them.
+pub(crate) fn give_up<W: Word>(lane: &[W], number: u64, samples: u64) {
+    let word = (number & TIME) << GIVEN_UP_BITS | samples.min(GIVEN_UP_MAX);
+    // `advance` shows it.
+    lane[GIVEN_UP].store(word, Ordering::Relaxed);
+}
+
+/// Reader: has left, and pins nothing.
+pub(crate) fn close<W: Word>(lane: &[W]) {
+    // Pairs with `standing`.
+    lane[GENERATION].store(0, Site::CloseStore.order());
+}
+
+/// Another session's lane, or one of our own, as a publisher sees it.
+#[derive(Clone)]
+pub(crate) struct LaneView {
+    map: Arc<Map>,
+    /// The lane's first word.
+    start: usize,
+}
+
+impl LaneView {
+    /// The lane at an offset of a map, if there can be one.
+    pub(crate) fn new(map: &Arc<Map>, at: Location) -> Option<Self> {
+        let start = at.words(layout::LANE, map.words().len())?.start;
+        Some(Self { map: Arc::clone(map), start })
+    }
+
+    #[inline]
+    pub(crate) fn words(&self) -> &[AtomicU64; LANE_WORDS] {
+        self.map.words()[self.start..].first_chunk().expect("a lane is inside its map")
+    }
+}
+
+/// A place in a session's memory where one reader tells its publisher how far it is.
+///
+/// Freed when dropped.
+pub struct Lane {
+    session: Arc<SessionSegment>,
+    object: Object,
+    /// Which time it is that the session uses one.
+    number: u64,
+}
+
+impl Lane {
+    /// The lane in `object`, for the `number`th time that the session gives one out.
+    pub(crate) fn new(session: Arc<SessionSegment>, object: Object, number: u64) -> Self {
+        let lane = Self { session, object, number };
+        ask(lane.words(), number);
+        lane
+    }
+
+    /// Where it is, by which a publisher finds it.
+    #[inline]
+    pub fn location(&self) -> Location {
+        self.object.block.at
+    }
+
+    /// Whether the calling process is a fork of the lane's: it must not touch the lane.
+    #[inline]
+    pub(crate) fn is_forked(&self) -> bool {
+        self.session.is_forked()
+    }
+
+    /// Whether a grant may be the answer to this reader.
+    pub(crate) fn is_meant_by(&self, grant: Grant) -> bool {
+        is_for(grant.generation, self.number)
+    }
+
+    pub(crate) fn open(&self, grant: Grant, reader: Gid) {
+        layout::write_id(self.words(), READER, reader.0);
+        open(self.words(), grant);
+    }
+
+    /// The sample that is taken now carries this source timestamp.
+    #[inline]
+    pub(crate) fn taken(&self, timestamp: i64) {
+        self.words()[TAKEN].store(timestamp.cast_unsigned(), Ordering::Relaxed);
+    }
+
+    /// All below `cursor` is done with.
+    #[inline]
+    pub(crate) fn advance(&self, cursor: u64, received: u64, lost: u64, skipped: u64) {
+        let words = self.words();
+        words[RECEIVED].store(received, Ordering::Relaxed);
+        words[LOST].store(lost, Ordering::Relaxed);
+        words[SKIPPED].store(skipped, Ordering::Relaxed);
+        advance(words, cursor);
+    }
+
+    /// So many samples were given up since the lane was opened.
+    pub(crate) fn give_up(&self, samples: u64) {
+        give_up(self.words(), self.number, samples);
+    }
+
+    /// The highest number of the publisher's segments that came is `number`.
+    pub(crate) fn set_mapped(&self, number: u32) {
+        set_mapped(self.words(), number.into());
+    }
+
+    /// Takes no more; what is pinned stays pinned.
+    pub(crate) fn leave(&self) {
+        advance(self.words(), u64::MAX);
+    }
+
+    /// A record [that pins nothing](pins::free), of the first `count`.
+    #[inline]
+    pub(crate) fn free_record(&self, count: usize) -> Option<usize> {
+        pins::free(self.words(), count)
+    }
+
+    /// [Pins](pins::pin) `position`.
+    #[inline]
+    pub(crate) fn pin(&self, record: usize, position: u64, tail: &AtomicU64) -> bool {
+        pins::pin(self.words(), record, position, tail)
+    }
+
+    #[inline]
+    pub(crate) fn unpin(&self, record: usize) {
+        pins::unpin(self.words(), record);
+    }
+
+    #[inline]
+    pub(crate) fn words(&self) -> &[AtomicU64] {
+        self.object.words()
+    }
+}
+
+impl Drop for Lane {
+    fn drop(&mut self) {
+        if !self.is_forked() {
+            close(self.words());
+            self.session.free_lane(self.object.clone());
+        }
+    }
+}

@@ -1,0 +1,45 @@
+//! What publishers that are gone left to those that still read it.
+
+use std::sync::{Mutex, PoisonError};
+
+use crate::{
+    alloc::{
+        heap::{Block, Heap},
+        segments::Segments,
+    },
+    session::seats::Seats,
+};
+
+/// One publisher's memory.
+pub(crate) struct Orphan {
+    /// Those who may be reading it.
+    pub(crate) seats: Seats,
+    pub(crate) blocks: Vec<Block>,
+    /// The numbers of the segments of its large samples.
+    pub(crate) samples: Vec<u32>,
+}
+
+/// The memory of a session's publishers that are gone.
+#[derive(Default)]
+pub(crate) struct Orphans(Mutex<Vec<Orphan>>);
+
+impl Orphans {
+    pub(crate) fn adopt(&self, orphan: Orphan) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).push(orphan);
+    }
+
+    /// Takes back what nobody reads any more. Whether something is left.
+    pub(crate) fn sweep(&self, heap: &Heap, segments: &Segments) -> bool {
+        let mut orphans = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        orphans.retain_mut(|orphan| {
+            orphan.seats.sweep(|_| true);
+            if !orphan.seats.is_empty() {
+                return true;
+            }
+            orphan.blocks.drain(..).for_each(|block| heap.release(block));
+            orphan.samples.drain(..).for_each(|number| segments.close(number));
+            false
+        });
+        !orphans.is_empty()
+    }
+}

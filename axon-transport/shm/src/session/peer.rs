@@ -1,0 +1,424 @@
+//! Another session as seen from this one: its segments, its doorbell, and whether it lives.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    fs, io,
+    os::fd::{AsFd, AsRawFd, BorrowedFd},
+    sync::{
+        Arc, Mutex, MutexGuard, OnceLock, PoisonError, Weak,
+        atomic::{AtomicU64, Ordering},
+    },
+};
+
+use rustix::{
+    event::{PollFd, PollFlags, Timespec, poll},
+    process::{Pid, PidfdFlags, pidfd_open},
+};
+
+use crate::{
+    alloc::segments::SegmentInfo,
+    error::ShmError,
+    ids::{Gid, SessionId},
+    memory::{quota::Quota, segment::Map},
+    os::descriptors::PassedFd,
+    ring::layout::{self, Location, SegmentKind},
+    session::{attachment::Attachment, lane::LaneView, segment::SessionSegment},
+    wake::{Bell, Purpose, due, waits},
+};
+
+/// What a session hands over so that others can share memory with it, in the order in which the
+/// descriptors are sent.
+#[derive(Debug)]
+pub struct PeerDescriptors {
+    /// The first segment of its memory.
+    pub segment: PassedFd,
+    /// What wakes it: one end of a pair of unix sockets that keep packets apart.
+    pub doorbell: PassedFd,
+    /// The pidfd of its process.
+    pub pidfd: PassedFd,
+}
+
+impl PeerDescriptors {
+    /// Duplicates all of them.
+    ///
+    /// # Errors
+    /// The process has no descriptors left.
+    pub fn try_clone(&self) -> io::Result<Self> {
+        Ok(Self {
+            segment: self.segment.try_clone()?,
+            doorbell: self.doorbell.try_clone()?,
+            pidfd: self.pidfd.try_clone()?,
+        })
+    }
+
+    /// The process that the pidfd refers to, to be compared with the credentials of the socket
+    /// it came over. `None` when it is no pidfd, or its process has ended.
+    ///
+    /// # Errors
+    /// The process has no descriptors left to look it up with.
+    pub fn process(&self) -> io::Result<Option<u32>> {
+        process(&self.pidfd)
+    }
+
+    /// Whether the pidfd is of the process that has this number in our PID namespace.
+    ///
+    /// # Errors
+    /// Nobody has the number, or one of the two cannot be looked up.
+    pub fn is_of(&self, pid: u32) -> io::Result<bool> {
+        let number = i32::try_from(pid).ok().and_then(Pid::from_raw);
+        let Some(number) = number else { return Ok(false) };
+        let same = PassedFd::from(pidfd_open(number, PidfdFlags::empty())?);
+        // What /proc calls a process need not be its number here: it may be another namespace's.
+        let shown = process(&same)?;
+        Ok(shown.is_some() && shown == self.process()?)
+    }
+}
+
+fn process(pidfd: &PassedFd) -> io::Result<Option<u32>> {
+    // What some things tell of themselves there takes locks that others can keep.
+    if !pidfd.is_pidfd() {
+        return Ok(None);
+    }
+    let path = format!("/proc/self/fdinfo/{}", pidfd.as_fd().as_raw_fd());
+    let text = fs::read_to_string(path)?;
+    let pid = text.lines().find_map(|line| line.strip_prefix("Pid:"));
+    // -1 once the process has been reaped.
+    Ok(pid.and_then(|pid| pid.trim().parse().ok()).filter(|pid| *pid > 0))
+}
+
+/// Segments of another session that are kept in mind at most, whatever it opens.
+const MAX_SEGMENTS: usize = 4096;
+
+/// Another session, mapped read-only.
+pub struct PeerSession {
+    id: SessionId,
+    /// Its process, as it was at first.
+    process: Option<u32>,
+    /// What the memory of its process may take here.
+    quota: Arc<Quota>,
+    /// Its first segment.
+    first: Arc<Map>,
+    further: Mutex<Further>,
+    wanting: OnceLock<Box<dyn Fn() + Send + Sync>>,
+    bell: Bell,
+    pidfd: PassedFd,
+    /// The last ticket of each of its armed words that this process rang for.
+    rung: [AtomicU64; 2],
+}
+
+/// What is known of the segments besides the first.
+#[derive(Default)]
+struct Further {
+    /// By their numbers.
+    maps: BTreeMap<u32, Told>,
+    /// The highest number of those that came.
+    highest: u32,
+    /// Those that a reader has met and nobody has been asked for yet.
+    wanted: BTreeSet<u32>,
+    /// The readers, whose lanes tell the session which of its segments they have.
+    readers: Vec<Weak<Attachment>>,
+    /// How many subscribers a publisher has here, where nobody else looks after its memory.
+    subscribed: BTreeMap<Gid, usize>,
+}
+
+/// A segment that the session was said to have.
+struct Told {
+    kind: SegmentKind,
+    /// Absent for one that could not be used.
+    map: Option<Arc<Map>>,
+}
+
+/// What became of the look for a segment of another session.
+pub(crate) enum Found {
+    Map(Arc<Map>),
+    /// It was not as it must be.
+    Refused,
+    /// It has not come yet.
+    Absent,
+}
+
+impl PeerSession {
+    /// Checks and maps the first segment of session `id`.
+    ///
+    /// # Errors
+    /// The descriptors are not those of a session, or not of this one. Or there are too few of them,
+    /// or too little address space, to make use of them now.
+    pub fn map(id: SessionId, descriptors: PeerDescriptors) -> Result<Arc<Self>, ShmError> {
+        Self::map_among(id, descriptors, [])
+    }
+
+    /// As [`map`](Self::map), where `others` are mapped already: all sessions of one process together
+    /// get the address space of one.
+    ///
+    /// # Errors
+    /// As for [`map`](Self::map).
+    pub fn map_among<'a>(
+        id: SessionId,
+        descriptors: PeerDescriptors,
+        others: impl IntoIterator<Item = &'a Arc<Self>>,
+    ) -> Result<Arc<Self>, ShmError> {
+        let PeerDescriptors { segment, doorbell, pidfd } = descriptors;
+        let bell = Bell::received(doorbell).ok_or(ShmError::Refused {
+            what: "its doorbell is no unix socket that keeps packets",
+        })?;
+        let process = process(&pidfd)
+            .map_err(|source| ShmError::System { what: "looking up a process", source })?;
+        let mut others = others.into_iter();
+        let akin = others.find(|other| process.is_some() && other.process == process);
+        let quota = akin.map_or_else(Quota::of_process, |akin| Arc::clone(&akin.quota));
+        let first = Map::open(segment.as_fd(), &quota)?;
+        layout::check_segment(first.words(), id, 0, SegmentKind::Session)?;
+        Ok(Arc::new(Self {
+            id,
+            process,
+            quota,
+            first: Arc::new(first),
+            further: Mutex::default(),
+            wanting: OnceLock::new(),
+            bell,
+            pidfd,
+            rung: Default::default(),
+        }))
+    }
+
+    /// Checks and maps a further segment of the session. One that is mapped already stays.
+    ///
+    /// # Errors
+    /// It is not what it was said to be: rings that use it cannot be read. Or it cannot be mapped
+    /// now: it counts as missing, and readers that need it ask for it again.
+    pub fn add_segment(&self, info: SegmentInfo, segment: impl AsFd) -> Result<(), ShmError> {
+        let mut further = self.further();
+        let known = further.maps.contains_key(&info.number);
+        if known || info.number == 0 || info.number > layout::MAX_NUMBER {
+            return Ok(());
+        }
+        if further.maps.len() >= MAX_SEGMENTS {
+            return Err(ShmError::Refused { what: "its session has too many segments" });
+        }
+        let map = Map::open(segment.as_fd(), &self.quota).and_then(|map| {
+            layout::check_segment(map.words(), self.id, info.number, info.kind)?;
+            Ok(Arc::new(map))
+        });
+        let (map, result) = match map {
+            Ok(map) => (Some(map), Ok(())),
+            Err(error @ ShmError::Refused { .. }) => (None, Err(error)),
+            // It was none of its session's doing.
+            Err(error) => return Err(error),
+        };
+        further.maps.insert(info.number, Told { kind: info.kind, map });
+        further.wanted.remove(&info.number);
+        further.highest = further.highest.max(info.number);
+        let highest = further.highest;
+        further.readers.retain(|reader| match reader.upgrade() {
+            Some(reader) => {
+                reader.set_mapped(highest);
+                true
+            }
+            None => false,
+        });
+        result
+    }
+
+    /// Forgets a segment that its session has given up. Samples in it stay for as long as they are
+    /// in use.
+    pub fn remove_segment(&self, number: u32) {
+        self.further().maps.remove(&number);
+    }
+
+    /// The segments that came, besides the first.
+    pub fn segments(&self) -> Vec<SegmentInfo> {
+        let further = self.further();
+        let info = |(number, told): (&u32, &Told)| SegmentInfo { number: *number, kind: told.kind };
+        further.maps.iter().map(info).collect()
+    }
+
+    /// Has `ask` called when a reader finds that a segment is missing, which then
+    /// [`take_wanted`](Self::take_wanted) names. It must not block.
+    pub fn on_wanted(&self, ask: impl Fn() + Send + Sync + 'static) {
+        let _ = self.wanting.set(Box::new(ask));
+    }
+
+    /// The segments that readers have met and that have not come, each once.
+    pub fn take_wanted(&self) -> BTreeSet<u32> {
+        std::mem::take(&mut self.further().wanted)
+    }
+
+    /// Whether a segment has come.
+    pub fn has_segment(&self, number: u32) -> bool {
+        !matches!(self.find(number), Found::Absent)
+    }
+
+    pub(crate) fn find(&self, number: u32) -> Found {
+        if number == 0 {
+            return Found::Map(Arc::clone(&self.first));
+        }
+        match self.further().maps.get(&number) {
+            Some(Told { map: Some(map), .. }) => Found::Map(Arc::clone(map)),
+            Some(Told { map: None, .. }) => Found::Refused,
+            None => Found::Absent,
+        }
+    }
+
+    /// A reader has met a segment that is missing.
+    pub(crate) fn want(&self, number: u32) {
+        let mut further = self.further();
+        let known = further.maps.contains_key(&number) || further.wanted.len() >= MAX_SEGMENTS;
+        if !known && further.wanted.insert(number) {
+            drop(further);
+            if let Some(ask) = self.wanting.get() {
+                ask();
+            }
+        }
+    }
+
+    /// Has a reader tell the session which of its segments are mapped.
+    pub(crate) fn keep_told(&self, reader: &Arc<Attachment>) {
+        let mut further = self.further();
+        further.readers.retain(|reader| reader.strong_count() > 0);
+        further.readers.push(Arc::downgrade(reader));
+        reader.set_mapped(further.highest);
+    }
+
+    fn further(&self) -> MutexGuard<'_, Further> {
+        self.further.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Its id.
+    #[inline]
+    pub fn id(&self) -> SessionId {
+        self.id
+    }
+
+    /// Whether its process has ended: a system call.
+    pub fn is_dead(&self) -> bool {
+        let mut fds = [PollFd::from_borrowed_fd(self.pidfd.as_fd(), PollFlags::IN)];
+        poll(&mut fds, Some(&Timespec::default())).is_ok_and(|ready| ready > 0)
+    }
+
+    /// The number of its process; `None` once that has ended, or when it cannot be looked up.
+    pub fn process(&self) -> Option<u32> {
+        process(&self.pidfd).ok().flatten()
+    }
+
+    /// Whether it was `process`'s when it was mapped.
+    pub(crate) fn is_of(&self, process: u32) -> bool {
+        self.process == Some(process)
+    }
+
+    /// One more subscriber needs the memory of a publisher's large samples.
+    pub(crate) fn subscribe(&self, publisher: Gid) {
+        *self.further().subscribed.entry(publisher).or_default() += 1;
+    }
+
+    /// One less does. With the last of them that memory goes, but for samples that are in use.
+    pub(crate) fn unsubscribe(&self, publisher: Gid) {
+        let mut further = self.further();
+        let Some(count) = further.subscribed.get_mut(&publisher) else { return };
+        *count -= 1;
+        if *count == 0 {
+            further.subscribed.remove(&publisher);
+            further.maps.retain(|_, told| told.kind != SegmentKind::Samples(publisher));
+        }
+    }
+
+    /// Whether the two are sessions of one process.
+    pub(crate) fn is_akin_to(&self, other: &Self) -> bool {
+        self.id == other.id || (self.process.is_some() && self.process == other.process)
+    }
+
+    /// Its process: readable once that has ended.
+    pub fn pidfd(&self) -> BorrowedFd<'_> {
+        self.pidfd.as_fd()
+    }
+
+    #[inline]
+    fn ticket(&self, purpose: Purpose) -> &AtomicU64 {
+        &self.first.words()[match purpose {
+            Purpose::Samples => layout::session::ARMED,
+            Purpose::Room => layout::session::BLOCKED,
+        }]
+    }
+
+    #[inline]
+    fn waits(&self, purpose: Purpose) -> bool {
+        waits(self.ticket(purpose), &self.rung[purpose as usize])
+    }
+
+    fn ring_if(&self, purpose: Purpose) {
+        let rung = &self.rung[purpose as usize];
+        if due(self.ticket(purpose), rung) && !self.bell.ring() {
+            // Relaxed: whoever comes next rings for any ticket, or another one has.
+            rung.store(0, Ordering::Relaxed);
+        }
+    }
+}
+
+/// The session at the other end of a ring.
+#[derive(Clone)]
+pub enum Peer {
+    /// The very same session.
+    Local(Arc<SessionSegment>),
+    /// Another one, in this process or another.
+    Remote(Arc<PeerSession>),
+}
+
+impl Peer {
+    /// The session's id.
+    #[inline]
+    pub fn id(&self) -> SessionId {
+        match self {
+            Self::Local(session) => session.id(),
+            Self::Remote(session) => session.id(),
+        }
+    }
+
+    /// Whether its process has ended; never true of our own.
+    pub fn is_dead(&self) -> bool {
+        match self {
+            Self::Local(_) => false,
+            Self::Remote(session) => session.is_dead(),
+        }
+    }
+
+    #[inline]
+    pub(crate) fn remote(&self) -> Option<&Arc<PeerSession>> {
+        match self {
+            Self::Local(_) => None,
+            Self::Remote(session) => Some(session),
+        }
+    }
+
+    /// Whether somebody there waits for `purpose` and this process has not rung for it yet.
+    #[inline]
+    pub(crate) fn waits(&self, purpose: Purpose) -> bool {
+        match self {
+            Self::Local(session) => session.waits(purpose),
+            Self::Remote(session) => session.waits(purpose),
+        }
+    }
+
+    /// Rings if somebody there waits for `purpose` and this process has not rung for it yet.
+    #[inline]
+    pub(crate) fn ring_if(&self, purpose: Purpose) {
+        match self {
+            Self::Local(session) => session.ring_if(purpose),
+            Self::Remote(session) => session.ring_if(purpose),
+        }
+    }
+
+    /// The lane that the session has there.
+    pub(crate) fn lane(&self, at: Location) -> Result<LaneView, ShmError> {
+        match self.find(at.segment) {
+            Found::Map(map) => LaneView::new(&map, at),
+            Found::Refused | Found::Absent => None,
+        }
+        .ok_or(ShmError::Refused { what: "it has no such lane" })
+    }
+
+    pub(crate) fn find(&self, number: u32) -> Found {
+        match self {
+            Self::Local(session) => session.map(number).map_or(Found::Absent, Found::Map),
+            Self::Remote(session) => session.find(number),
+        }
+    }
+}

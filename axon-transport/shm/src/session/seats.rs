@@ -1,0 +1,187 @@
+//! The lanes that may pin samples of a ring, whether or not their readers still count for anything
+//! else.
+
+use std::sync::{Arc, atomic::AtomicU64};
+
+use crate::{
+    alloc::allowance::{Allowance, Pool},
+    error::ShmError,
+    ids::{Gid, SessionId},
+    ring::{
+        layout::{LANE_WORDS, Location},
+        pins,
+    },
+    session::{
+        lane::{LaneView, Standing, Tenancy},
+        peer::{Peer, PeerSession},
+    },
+    sync::Word,
+};
+
+/// Lanes of one other process at most, each of which a publish may have to look at. What may be
+/// pinned over them is [bounded](crate::alloc::allowance) apart from it.
+pub(crate) const OF_PROCESS: usize = 1024;
+
+/// What readers pin: positions, and the longest sample that each pin keeps.
+#[derive(Default)]
+pub(crate) struct Pinned(Vec<(u64, u64)>);
+
+impl Pinned {
+    /// Finds out anew, by `look`.
+    pub(crate) fn refresh(&mut self, look: impl FnOnce(&mut Self)) {
+        self.0.clear();
+        look(self);
+        self.0.sort_unstable();
+    }
+
+    /// Whether a sample of `len` bytes is kept.
+    pub(crate) fn keeps(&self, position: u64, len: u64) -> bool {
+        // The pin of it that keeps the longest comes last.
+        let end = self.0.partition_point(|(pinned, _)| *pinned <= position);
+        self.0[..end].last().is_some_and(|pin| pin.0 == position && len <= pin.1)
+    }
+}
+
+/// Adds to `found` the positions that a reader pins, and says how it stands. After
+/// [`pins::about_to_scan`].
+#[inline]
+pub(crate) fn scan<W: Word>(tenancy: &Tenancy, lane: &[W], found: &mut Pinned) -> Standing {
+    let standing = tenancy.standing(lane);
+    let longest = tenancy.allowance().longest();
+    // One that has not seen its grant pins nothing, and one that does from now on sees the tail.
+    if standing == Standing::Open && longest > 0 {
+        found.0.extend(pins::scan(lane).map(|position| (position, longest)));
+    }
+    standing
+}
+
+/// A reader that keeps samples.
+pub(crate) struct Holder {
+    pub(crate) reader: Gid,
+    /// Its session, where that is not our own.
+    pub(crate) peer: Option<Arc<PeerSession>>,
+}
+
+impl Holder {
+    /// Its process: read from the file system.
+    pub(crate) fn process(&self) -> Option<u32> {
+        self.peer.as_ref().map_or(Some(std::process::id()), |peer| peer.process())
+    }
+}
+
+/// One reader's lane, as its publisher knows it.
+pub(crate) struct Seat {
+    reader: Gid,
+    session: SessionId,
+    /// Absent where the session is our own.
+    peer: Option<Arc<PeerSession>>,
+    at: Location,
+    lane: LaneView,
+    pub(crate) tenancy: Tenancy,
+}
+
+impl Seat {
+    fn words(&self) -> &[AtomicU64; LANE_WORDS] {
+        self.lane.words()
+    }
+
+    fn is_dead(&self) -> bool {
+        self.peer.as_ref().is_some_and(|peer| peer.is_dead())
+    }
+
+    #[inline]
+    fn standing(&self) -> Standing {
+        self.tenancy.standing(self.words())
+    }
+}
+
+/// All lanes to which a grant was given, until they say that their reader has left, or its process
+/// has ended. That a reader is detached, by whomever, ends nothing here: it may hold samples still.
+pub(crate) struct Seats {
+    all: Vec<Seat>,
+    /// What they may keep.
+    pool: Pool,
+}
+
+impl Seats {
+    pub(crate) fn new(pool: Pool) -> Self {
+        Self { all: Vec::new(), pool }
+    }
+
+    /// Takes in the reader that asks with the lane that `peer` has `at` some place, before it hears
+    /// of its grant. As long as the lane stays as it is, the answer does, so that whoever asks for
+    /// ever adds nothing.
+    ///
+    /// # Errors
+    /// Its process has [as many](OF_PROCESS) as it may.
+    pub(crate) fn admit(
+        &mut self,
+        reader: Gid,
+        peer: &Peer,
+        at: Location,
+        lane: &LaneView,
+    ) -> Result<Tenancy, ShmError> {
+        let session = peer.id();
+        let same = |seat: &&Seat| {
+            (seat.session, seat.reader, seat.at) == (session, reader, at)
+                && seat.tenancy.is_asked(seat.words())
+        };
+        if let Some(seat) = self.all.iter().find(same) {
+            return Ok(seat.tenancy);
+        }
+        let mut allowance = Allowance::ALL;
+        if let Some(peer) = peer.remote() {
+            let akin = |seat: &&Seat| seat.peer.as_ref().is_some_and(|p| p.is_akin_to(peer));
+            let is_full = |seats: &[Seat]| seats.iter().filter(akin).count() >= OF_PROCESS;
+            // Some may have left.
+            self.sweep(|_| false);
+            if is_full(&self.all) && (!self.sweep(|_| true) || is_full(&self.all)) {
+                let what = "its process has as many readers of one publisher as it may";
+                return Err(ShmError::Refused { what });
+            }
+            let cost = |seat: &Seat| self.pool.cost(seat.tenancy.allowance());
+            let others = self.all.iter().filter(|seat| seat.peer.is_some());
+            let taken = others.map(cost).sum();
+            allowance = self.pool.share(taken, self.all.iter().filter(akin).map(cost).sum());
+        }
+        let tenancy = Tenancy::grant(lane.words(), allowance);
+        let peer = peer.remote().cloned();
+        self.all.push(Seat { reader, session, peer, at, lane: lane.clone(), tenancy });
+        Ok(tenancy)
+    }
+
+    /// Adds to `found` the positions that are pinned, after [`pins::about_to_scan`].
+    pub(crate) fn scan(&mut self, found: &mut Pinned) {
+        self.all.retain(|seat| scan(&seat.tenancy, seat.words(), found) != Standing::Left);
+    }
+
+    /// A reader that pins one of `positions`.
+    pub(crate) fn holder(&self, positions: &[u64]) -> Option<Holder> {
+        let holds = |seat: &&Seat| {
+            seat.standing() == Standing::Open
+                && pins::scan(seat.words()).any(|position| positions.contains(&position))
+        };
+        self.all
+            .iter()
+            .find(holds)
+            .map(|seat| Holder { reader: seat.reader, peer: seat.peer.clone() })
+    }
+
+    /// Forgets those that have left, and those of `suspects` whose process has ended. Whether
+    /// there were any.
+    pub(crate) fn sweep(&mut self, suspect: impl Fn(&Seat) -> bool) -> bool {
+        let before = self.all.len();
+        self.all
+            .retain(|seat| seat.standing() != Standing::Left && !(suspect(seat) && seat.is_dead()));
+        self.all.len() != before
+    }
+
+    pub(crate) fn is_empty(&self) -> bool {
+        self.all.is_empty()
+    }
+
+    #[cfg(test)]
+    pub(crate) fn len(&self) -> usize {
+        self.all.len()
+    }
+}

@@ -1,0 +1,349 @@
+//! This process's own session: its memory and what is in it, the words that say who sleeps, and by
+//! what others know it.
+
+use std::{
+    os::fd::{AsFd, BorrowedFd, OwnedFd},
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicU64, Ordering},
+    },
+    time::Duration,
+};
+
+use rustix::process::{PidfdFlags, getpid, pidfd_open};
+
+use crate::{
+    alloc::{
+        heap::{Block, Heap, Need, Object},
+        segments::{OwnSegment, SegmentEvent, SegmentInfo, Segments},
+    },
+    error::ShmError,
+    ids::{Gid, SessionId},
+    memory::segment::Map,
+    ring::layout::{self, SegmentKind},
+    session::{
+        lane::Lane,
+        leader::ExternalLeader,
+        orphans::{Orphan, Orphans},
+        peer::PeerDescriptors,
+    },
+    wake::{Doorbell, Knock, Look, PassedOn, Purpose, due, waits},
+};
+
+/// The memory, doorbell and identity by which other sessions know this one.
+///
+/// One per session; a process may have several. All methods may be called from any thread.
+pub struct SessionSegment {
+    id: SessionId,
+    /// The first of the segments.
+    first: Arc<OwnSegment>,
+    segments: Segments,
+    heap: Heap,
+    orphans: Orphans,
+    doorbell: Doorbell,
+    lanes: Mutex<Lanes>,
+    /// The last ticket of each of our own armed words that we rang for.
+    rung: [AtomicU64; 2],
+}
+
+#[derive(Default)]
+struct Lanes {
+    /// Those that nobody uses. Their memory never becomes something else: who looks at a lane that
+    /// has passed on must see that it has.
+    free: Vec<Object>,
+    /// How many there are.
+    made: u32,
+    /// How often one has been given out.
+    given: u64,
+}
+
+impl SessionSegment {
+    /// Makes the memory of a new session.
+    ///
+    /// # Errors
+    /// The system has no memory or descriptors left, or lacks sealed memfds.
+    pub fn create(id: SessionId) -> Result<Arc<Self>, ShmError> {
+        let segments = Segments::new(id);
+        let first = segments.open(SegmentKind::Session, layout::SESSION_BYTES)?;
+        Ok(Arc::new(Self {
+            id,
+            heap: Heap::new(Arc::clone(&first)),
+            first,
+            segments,
+            orphans: Orphans::default(),
+            doorbell: Doorbell::new().map_err(ShmError::system("creating a doorbell"))?,
+            lanes: Mutex::default(),
+            rung: Default::default(),
+        }))
+    }
+
+    /// Its id.
+    #[inline]
+    pub fn id(&self) -> SessionId {
+        self.id
+    }
+
+    /// Descriptors of their own for other sessions, which need them.
+    ///
+    /// # Errors
+    /// The process has no descriptors left, is a fork of the session's, or the system lacks pidfds
+    /// (Linux 5.3).
+    pub fn descriptors(&self) -> Result<PeerDescriptors, ShmError> {
+        // Others would wait for the end of the wrong process.
+        if self.is_forked() {
+            return Err(ShmError::Forked);
+        }
+        let doorbell = self.doorbell.bell().as_fd().try_clone_to_owned();
+        let doorbell = doorbell
+            .map_err(|source| ShmError::System { what: "duplicating a descriptor", source })?;
+        let pidfd = pidfd_open(getpid(), PidfdFlags::empty())
+            .map_err(ShmError::system("opening a pidfd of this process"))?;
+        Ok(PeerDescriptors {
+            segment: self.first.descriptor()?.into(),
+            doorbell: doorbell.into(),
+            pidfd: pidfd.into(),
+        })
+    }
+
+    /// An epoll instance that is readable when the session was rung.
+    pub fn doorbell(&self) -> BorrowedFd<'_> {
+        self.doorbell.as_fd()
+    }
+
+    /// Has `listener` hear of all further segments of the session: other sessions must be told of
+    /// them, and given their descriptors. False when there is a listener already.
+    ///
+    /// It is called while locks are held: it must neither block nor call into the session.
+    pub fn on_segment(&self, listener: impl Fn(SegmentEvent<'_>) + Send + Sync + 'static) -> bool {
+        self.segments.listen(Box::new(listener))
+    }
+
+    /// The segments that there are besides the first, by their numbers.
+    pub fn segments(&self) -> Vec<SegmentInfo> {
+        self.further().iter().map(|segment| segment.info).collect()
+    }
+
+    /// What the segment `number` is and a duplicate of its descriptor; `None` when it is gone.
+    ///
+    /// # Errors
+    /// The process has no descriptors left.
+    pub fn segment(&self, number: u32) -> Result<Option<(SegmentInfo, OwnedFd)>, ShmError> {
+        self.segments
+            .get(number)
+            .map(|segment| Ok((segment.info, segment.descriptor()?)))
+            .transpose()
+    }
+
+    /// Takes back the memory of publishers that are gone and that nobody reads any more. Whether
+    /// some is left that somebody reads.
+    pub fn tidy(&self) -> bool {
+        !self.is_forked() && self.orphans.sweep(&self.heap, &self.segments)
+    }
+
+    /// A lane for a reader that is about to attach.
+    ///
+    /// # Errors
+    /// All lanes are taken, or memory is short.
+    pub fn allocate_lane(self: &Arc<Self>) -> Result<Lane, ShmError> {
+        if self.is_forked() {
+            return Err(ShmError::Forked);
+        }
+        let mut lanes = self.lanes.lock().unwrap_or_else(PoisonError::into_inner);
+        let object = match lanes.free.pop() {
+            Some(object) => object,
+            None if lanes.made == layout::LANES => {
+                return Err(ShmError::NoLane { session: self.id, lanes: layout::LANES });
+            }
+            None => {
+                let object = self.heap.allocate_lane()?;
+                object.words().iter().for_each(|word| word.store(0, Ordering::Relaxed));
+                lanes.made += 1;
+                object
+            }
+        };
+        lanes.given += 1;
+        Ok(Lane::new(Arc::clone(self), object, lanes.given))
+    }
+
+    /// Blocks until `ready`, which is asked again whenever a publisher or [`Self::notify`] rang,
+    /// or until `timeout` has passed. Returns what `ready` said last.
+    ///
+    /// Any number of threads may wait; none of our locks is held while `ready` runs.
+    #[inline]
+    pub fn wait(&self, mut ready: impl FnMut() -> bool, timeout: Option<Duration>) -> bool {
+        if self.is_forked() {
+            return ready();
+        }
+        self.doorbell.wait(self.armed_words(), Purpose::Samples, ready, None, &[], timeout)
+    }
+
+    /// As [`wait`](Self::wait), for something that other threads can look for too, by what `look`
+    /// makes: this one is woken only when it is there.
+    #[inline]
+    pub fn wait_for(
+        &self,
+        ready: impl FnMut() -> bool,
+        look: &dyn Fn() -> Arc<dyn Look>,
+        timeout: Option<Duration>,
+    ) -> bool {
+        if self.is_forked() {
+            return false;
+        }
+        let words = self.armed_words();
+        self.doorbell.wait(words, Purpose::Samples, ready, Some(look), &[], timeout)
+    }
+
+    /// Has `elsewhere`, another session of this process where a thread waits, look again when `look` may
+    /// be ready, until what this returns is dropped. Somebody must listen for the session meanwhile.
+    pub fn pass_on(&self, look: Arc<dyn Look>, elsewhere: &Arc<SessionSegment>) -> PassedOn<'_> {
+        self.doorbell.pass_on(self.armed_words(), look, elsewhere.clone())
+    }
+
+    /// Somebody calls [`notify`](Self::notify) when a process ends that might have rung.
+    pub fn is_watched(&self) {
+        self.doorbell.is_watched();
+    }
+
+    /// Makes every waiter of the session look again.
+    #[inline]
+    pub fn notify(&self) {
+        if !self.is_forked() {
+            self.doorbell.notify();
+        }
+    }
+
+    /// Makes whoever listens look again, and have those look who follow. Async-signal-safe.
+    #[inline]
+    pub fn knock(&self) {
+        if !self.is_forked() {
+            self.doorbell.ring_own();
+        }
+    }
+
+    /// Lets an event loop lead the session's waits.
+    ///
+    /// # Errors
+    /// There is one already, or this process is a fork of the session's.
+    pub fn external_leader(self: &Arc<Self>) -> Result<ExternalLeader, ShmError> {
+        if self.is_forked() {
+            return Err(ShmError::Forked);
+        }
+        ExternalLeader::new(Arc::clone(self)).ok_or(ShmError::AlreadyLed(self.id))
+    }
+
+    /// Waits for room to publish; also looks again when one of `others` becomes readable.
+    pub(crate) fn wait_for_room(
+        &self,
+        ready: impl FnMut() -> bool,
+        others: &[BorrowedFd<'_>],
+        timeout: Duration,
+    ) -> bool {
+        let words = self.armed_words();
+        self.doorbell.wait(words, Purpose::Room, ready, None, others, Some(timeout))
+    }
+
+    #[inline]
+    pub(crate) fn doorbell_hub(&self) -> &Doorbell {
+        &self.doorbell
+    }
+
+    /// The word in which a waiter for that stores its ticket.
+    #[inline]
+    pub fn armed_word(&self, purpose: Purpose) -> &AtomicU64 {
+        &self.first.memory.words()[match purpose {
+            Purpose::Samples => layout::session::ARMED,
+            Purpose::Room => layout::session::BLOCKED,
+        }]
+    }
+
+    #[inline]
+    pub(crate) fn armed_words(&self) -> [&AtomicU64; 2] {
+        [self.armed_word(Purpose::Samples), self.armed_word(Purpose::Room)]
+    }
+
+    #[inline]
+    pub(crate) fn waits(&self, purpose: Purpose) -> bool {
+        waits(self.armed_word(purpose), &self.rung[purpose as usize])
+    }
+
+    #[inline]
+    pub(crate) fn ring_if(&self, purpose: Purpose) {
+        if due(self.armed_word(purpose), &self.rung[purpose as usize]) {
+            self.doorbell.ring_own();
+        }
+    }
+
+    /// Whether the calling process is a fork of the session's.
+    #[inline]
+    pub fn is_forked(&self) -> bool {
+        self.first.memory.is_forked()
+    }
+
+    pub(crate) fn free_lane(&self, lane: Object) {
+        self.lanes.lock().unwrap_or_else(PoisonError::into_inner).free.push(lane);
+    }
+
+    /// [Allocates](Heap::allocate) an object of the session.
+    pub(crate) fn allocate(
+        &self,
+        len: u64,
+        need: Need,
+        mapped: impl Fn(u32) -> bool,
+    ) -> Result<Option<Object>, ShmError> {
+        self.heap.allocate(&self.segments, len, need, mapped)
+    }
+
+    /// Has [room](Heap::foresee) for an object of the session.
+    pub(crate) fn foresee(&self, len: u64) {
+        self.heap.foresee(&self.segments, len);
+    }
+
+    pub(crate) fn release(&self, block: Block) {
+        self.heap.release(block);
+    }
+
+    /// The segments that there are besides the first.
+    pub(crate) fn further(&self) -> Vec<Arc<OwnSegment>> {
+        self.segments.further()
+    }
+
+    /// A segment for the large samples of a publisher.
+    pub(crate) fn open_samples(&self, gid: Gid, bytes: u64) -> Result<Arc<OwnSegment>, ShmError> {
+        self.segments.open(SegmentKind::Samples(gid), bytes)
+    }
+
+    /// A segment of the session.
+    pub(crate) fn own(&self, number: u32) -> Option<Arc<OwnSegment>> {
+        self.segments.get(number)
+    }
+
+    /// Nobody reads a segment of large samples any more.
+    pub(crate) fn close_samples(&self, number: u32) {
+        self.segments.close(number);
+    }
+
+    /// Tells the session's owner.
+    pub(crate) fn tell(&self, event: SegmentEvent<'_>) {
+        self.segments.tell(event);
+    }
+
+    /// Keeps what a publisher leaves for as long as somebody reads it.
+    pub(crate) fn adopt(&self, orphan: Orphan) {
+        self.orphans.adopt(orphan);
+        self.tidy();
+    }
+
+    pub(crate) fn map(&self, number: u32) -> Option<Arc<Map>> {
+        if number == 0 {
+            return Some(Arc::clone(self.first.map()));
+        }
+        self.segments.get(number).map(|segment| Arc::clone(segment.map()))
+    }
+}
+
+impl Knock for SessionSegment {
+    #[inline]
+    fn knock(&self) {
+        self.knock();
+    }
+}

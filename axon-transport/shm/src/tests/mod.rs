@@ -1,0 +1,183 @@
+//! Two ends of a ring: in one process, in two, with a hostile one, and under the model checker.
+
+mod api;
+mod bounds;
+mod hostile;
+mod images;
+mod inspect;
+mod lines;
+mod local;
+mod memory;
+mod model;
+mod mutation;
+mod pins;
+mod processes;
+mod samples;
+mod wire;
+
+use std::{
+    sync::{Arc, Mutex, Weak, atomic::Ordering::Relaxed},
+    time::{Duration, Instant},
+};
+
+use crate::{
+    Context, Meta, Publisher, PublisherOptions, Sample, Subscriber, SubscriberOptions,
+    alloc::segments::{SegmentEvent, SegmentInfo},
+    direct::connect::{self, ConnectError},
+    error::{PublishError, ShmError, TakeError},
+    ids::{Gid, SessionId},
+    memory::headroom,
+    qos::{Durability, History, Qos},
+    reader::{Reader, ReaderOptions},
+    ring::{
+        layout::{self, Location, SegmentKind},
+        types::{Grant, RingOptions},
+    },
+    session::{
+        lane::Lane,
+        peer::{Peer, PeerDescriptors, PeerSession},
+        reader_info::ReaderInfo,
+        segment::SessionSegment,
+    },
+    writer::Writer,
+};
+
+const MAX: u64 = 1 << 20;
+/// Only a wake-up that was lost takes this long: a wait that it ends has looked once more, and may
+/// have found what it was not woken for.
+const EVER: Duration = Duration::from_secs(60);
+
+/// Runs a wait of up to [`EVER`], which must end because it is woken.
+fn woken(wait: impl FnOnce() -> bool) {
+    let start = Instant::now();
+    assert!(wait() && start.elapsed() < EVER, "a wake-up was lost");
+}
+
+fn await_data(session: &SessionSegment, reader: &Reader) {
+    woken(|| session.wait(|| reader.has_data(), Some(EVER)));
+}
+
+fn session() -> Arc<SessionSegment> {
+    let session = silent_session();
+    let id = session.id();
+    session.on_segment(move |event| tell_views(id, event));
+    session
+}
+
+/// A session that tells nobody of its segments.
+fn silent_session() -> Arc<SessionSegment> {
+    SessionSegment::create(SessionId::random()).unwrap()
+}
+
+fn keep_last(depth: u32) -> Qos {
+    Qos { history: History::KeepLast, depth, ..Qos::default() }
+}
+
+fn transient(qos: Qos) -> Qos {
+    Qos { durability: Durability::TransientLocal, ..qos }
+}
+
+fn writer(session: &Arc<SessionSegment>, qos: Qos, budget: u64) -> Writer {
+    let gid = Gid::new(session.id(), 1);
+    let options = RingOptions { gid, qos, budget, max_message: MAX, expected: 0 };
+    Writer::create(session.clone(), options).unwrap()
+}
+
+/// Those who see a session, to be told of its segments.
+static VIEWS: Mutex<Vec<Weak<PeerSession>>> = Mutex::new(Vec::new());
+
+/// How `of` looks to `from`.
+fn peer(from: &SessionSegment, of: &Arc<SessionSegment>) -> Peer {
+    if from.id() == of.id() { Peer::Local(of.clone()) } else { Peer::Remote(view(of)) }
+}
+
+/// How a session looks to another that is told of its segments, as a daemon would.
+fn view(of: &SessionSegment) -> Arc<PeerSession> {
+    let view = PeerSession::map(of.id(), of.descriptors().unwrap()).unwrap();
+    VIEWS.lock().unwrap().push(Arc::downgrade(&view));
+    for info in of.segments() {
+        let (info, fd) = of.segment(info.number).unwrap().unwrap();
+        view.add_segment(info, fd).unwrap();
+    }
+    view
+}
+
+fn tell_views(of: SessionId, event: SegmentEvent<'_>) {
+    let mut views = VIEWS.lock().unwrap();
+    views.retain(|view| view.strong_count() > 0);
+    for view in views.iter().filter_map(Weak::upgrade).filter(|view| view.id() == of) {
+        match event {
+            SegmentEvent::Opened(info, fd) => {
+                view.add_segment(info, fd).unwrap();
+            }
+            SegmentEvent::Gone(info) => view.remove_segment(info.number),
+            SegmentEvent::Low(_) => {}
+        }
+    }
+}
+
+/// A subscription in `reader` on a publisher in `publisher`.
+fn attach(
+    writer: &Writer,
+    publisher: &Arc<SessionSegment>,
+    reader: &Arc<SessionSegment>,
+    qos: Qos,
+) -> Reader {
+    attach_to(writer, publisher, reader, peer(reader, publisher), qos)
+}
+
+/// As [`attach`], where `from` is how the reader's session sees the publisher's.
+fn attach_to(
+    writer: &Writer,
+    publisher: &Arc<SessionSegment>,
+    reader: &Arc<SessionSegment>,
+    from: Peer,
+    qos: Qos,
+) -> Reader {
+    let lane = reader.allocate_lane().unwrap();
+    let gid = Gid::new(reader.id(), 100 + (lane.location().offset / layout::LANE) as u32);
+    let grant = writer
+        .attach(ReaderInfo {
+            gid,
+            lane: lane.location(),
+            qos,
+            peer: peer(publisher, reader),
+            stands_for: None,
+        })
+        .unwrap();
+    let options = ReaderOptions {
+        reader: gid,
+        writer: writer.gid(),
+        peer: from,
+        ring: writer.location(),
+        lane,
+        grant,
+        qos,
+        max_message: MAX,
+    };
+    Reader::map(options).unwrap()
+}
+
+fn meta(sequence: u64) -> Meta {
+    Meta { sequence, source_timestamp: sequence.cast_signed() * 7 - 3, published: 0 }
+}
+
+/// Bytes that differ by sequence number and place.
+fn pattern(sequence: u64, len: usize) -> Vec<u8> {
+    let mut state = sequence.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
+    let mut bytes = Vec::with_capacity(len + 8);
+    while bytes.len() < len {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        bytes.extend_from_slice(&state.to_le_bytes());
+    }
+    bytes.truncate(len);
+    bytes
+}
+
+/// The lengths at which something changes: none, inline, words, granules, pages, powers of two.
+fn lengths() -> Vec<usize> {
+    let around = (3..=18).flat_map(|power| [(1 << power) - 1, 1 << power, (1 << power) + 1]);
+    (0..=200).chain(around).collect()
+}

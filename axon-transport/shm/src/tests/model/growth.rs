@@ -1,0 +1,154 @@
+//! Descriptors that move to a larger array, and memory that comes along.
+
+use loom::{
+    sync::{Arc, atomic::AtomicU64},
+    thread,
+};
+
+use crate::{
+    ring::{
+        layout::{DESCRIPTOR_WORDS, LANE_WORDS, RING_WORDS},
+        protocol::{
+            Look, Place, State, View, about_to_write, array, copy_descriptors, publish, replace,
+            retire,
+        },
+    },
+    session::lane,
+    sync::{Ordering, Word},
+    tests::model::{Cell, check, record, zeros},
+};
+
+/// A ring with two arrays to be in: two descriptors, then four.
+#[derive(Clone)]
+struct Growing {
+    header: Arc<Vec<AtomicU64>>,
+    arrays: [Arc<Vec<AtomicU64>>; 2],
+}
+
+impl Growing {
+    fn new() -> Self {
+        let arrays = [zeros(2 * DESCRIPTOR_WORDS), zeros(4 * DESCRIPTOR_WORDS)];
+        let ring = Self { header: zeros(RING_WORDS), arrays };
+        for position in 0..2 {
+            ring.show(0, position);
+        }
+        ring
+    }
+
+    fn show(&self, which: usize, position: u64) {
+        about_to_write::<AtomicU64>();
+        let record = record(position, Place::Inline);
+        publish(&self.header, &self.arrays[which], position, &record, &[]);
+    }
+
+    fn grow(&self, tail: u64, head: u64) {
+        about_to_write::<AtomicU64>();
+        copy_descriptors(&self.arrays[0], &self.arrays[1], tail, head);
+        replace(&self.header, 1);
+    }
+
+    fn view(&self) -> View<'_, AtomicU64> {
+        let word = array(&self.header[..]);
+        View { ring: &self.header, word, array: &self.arrays[word as usize] }
+    }
+}
+
+/// `ArrayStore`, `ArrayLoad`: what stands when the ring grows is found in either array.
+#[test]
+fn what_stands_stays_while_the_ring_grows() {
+    check(3, || {
+        let ring = Growing::new();
+        let publisher = {
+            let ring = ring.clone();
+            thread::spawn(move || {
+                ring.grow(0, 2);
+                ring.show(1, 2);
+            })
+        };
+        for position in 0..2 {
+            let view = ring.view();
+            assert_eq!(view.state(position), State::Here);
+            match view.look(position) {
+                Look::Sample(found) => assert_eq!(found, record(position, Place::Inline)),
+                // It moved meanwhile.
+                Look::Lapped => {}
+                Look::Corrupt(what) => panic!("{what}"),
+            }
+        }
+        publisher.join().unwrap();
+    });
+}
+
+/// `ReuseFence`, `StandsFence`: what another ring writes to the memory of the old array is not taken
+/// for a descriptor.
+#[test]
+fn an_old_array_that_became_something_else_is_noticed() {
+    check(3, || {
+        let ring = Growing::new();
+        let publisher = {
+            let ring = ring.clone();
+            thread::spawn(move || {
+                ring.grow(0, 2);
+                // By way of the heap: the memory is another ring's now, whose positions are its own.
+                about_to_write::<AtomicU64>();
+                for word in &ring.arrays[0][..DESCRIPTOR_WORDS] {
+                    Word::store(word, 2, Ordering::Relaxed);
+                }
+            })
+        };
+        let view = ring.view();
+        if view.state(0) == State::Here {
+            match view.look(0) {
+                Look::Sample(found) => assert_eq!(found, record(0, Place::Inline)),
+                Look::Lapped => {}
+                Look::Corrupt(what) => panic!("{what}"),
+            }
+        }
+        publisher.join().unwrap();
+    });
+}
+
+/// A reader that is late, and one that has taken all, find so in an array that is new to both.
+#[test]
+fn a_new_array_says_who_is_late_and_who_must_wait() {
+    check(2, || {
+        let ring = Growing::new();
+        retire(&ring.header, 1);
+        ring.show(0, 2);
+        ring.grow(1, 3);
+        let states: Vec<State> = (0..6).map(|position| ring.view().state(position)).collect();
+        assert!(!matches!(states[0], State::Ahead), "given up, but not to come");
+        assert_eq!(states[1..3], [State::Here; 2]);
+        assert_eq!(states[3..], [State::Ahead; 3]);
+        assert_eq!(ring.view().look(0), Look::Lapped);
+    });
+}
+
+/// `MappedStore`, `MappedLoad`: what moves to a segment because it is mapped is found there.
+#[test]
+fn a_segment_that_is_said_to_be_mapped_is() {
+    check(3, || {
+        let ring = Growing::new();
+        let (lane, table) = (zeros(LANE_WORDS), Arc::new(Cell::new(0)));
+        let control = {
+            let (lane, table) = (lane.clone(), table.clone());
+            thread::spawn(move || {
+                table.set(1);
+                lane::set_mapped(&lane[..], 1);
+            })
+        };
+        let publisher = {
+            let (ring, lane) = (ring.clone(), lane.clone());
+            thread::spawn(move || {
+                if lane::mapped(&lane[..]) >= 1 {
+                    replace(&ring.header, 1);
+                }
+            })
+        };
+        if array(&ring.header[..]) == 1 {
+            assert_eq!(table.get(), 1);
+        }
+        control.join().unwrap();
+        publisher.join().unwrap();
+    });
+}

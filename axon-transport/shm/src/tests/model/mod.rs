@@ -1,0 +1,105 @@
+//! The protocols under the model checker: every interleaving, and every reordering that the memory
+//! model allows, for small rings and a few threads. Each model names the orderings without which
+//! it fails, of which [`super::mutation`] makes sure.
+//!
+//! The checker runs the loads of a thread in their order. That a read comes before the store that
+//! says so therefore shows only where what is read is a [`Cell`], on which it sees any race.
+
+#![allow(unsafe_code)]
+
+mod growth;
+mod lanes;
+mod lock;
+mod pins;
+mod ring;
+
+use loom::sync::{Arc, atomic::AtomicU64};
+
+use crate::{
+    alloc::allowance::Allowance,
+    ring::{
+        layout::{DESCRIPTOR_WORDS, LANE_WORDS, RING_WORDS, ring::TAIL},
+        protocol::{Place, Record, View, about_to_write, publish},
+        types::Grant,
+    },
+    session::lane::{self, Tenancy},
+};
+
+/// Payload that is read and written like any memory.
+struct Cell(loom::cell::UnsafeCell<u64>);
+
+// SAFETY: as below.
+unsafe impl Send for Cell {}
+// SAFETY: the model checker itself finds any two accesses that are not ordered.
+unsafe impl Sync for Cell {}
+
+impl Cell {
+    fn new(value: u64) -> Self {
+        Self(loom::cell::UnsafeCell::new(value))
+    }
+
+    fn get(&self) -> u64 {
+        // SAFETY: the checker fails the model if anything writes meanwhile.
+        self.0.with(|value| unsafe { *value })
+    }
+
+    fn set(&self, to: u64) {
+        // SAFETY: the checker fails the model if anything reads or writes meanwhile.
+        self.0.with_mut(|value| unsafe { *value = to });
+    }
+}
+
+fn check(preemptions: usize, model: impl Fn() + Sync + Send + 'static) {
+    let mut builder = loom::model::Builder::new();
+    builder.preemption_bound = Some(preemptions);
+    builder.check(model);
+}
+
+fn zeros(count: usize) -> Arc<Vec<AtomicU64>> {
+    Arc::new((0..count).map(|_| AtomicU64::new(0)).collect())
+}
+
+/// A ring and its descriptors.
+#[derive(Clone)]
+struct Ring {
+    header: Arc<Vec<AtomicU64>>,
+    array: Arc<Vec<AtomicU64>>,
+}
+
+impl Ring {
+    /// Of two descriptors.
+    fn new() -> Self {
+        Self { header: zeros(RING_WORDS), array: zeros(2 * DESCRIPTOR_WORDS) }
+    }
+
+    fn view(&self) -> View<'_, AtomicU64> {
+        View { ring: &self.header, word: 0, array: &self.array }
+    }
+
+    fn tail(&self) -> &AtomicU64 {
+        &self.header[TAIL]
+    }
+
+    /// Publishes a sample whose payload is elsewhere.
+    fn show(&self, position: u64) {
+        self.publish(position, Place::Inline);
+    }
+
+    fn publish(&self, position: u64, place: Place) {
+        about_to_write::<AtomicU64>();
+        publish(&self.header, &self.array, position, &record(position, place), &[]);
+    }
+}
+
+fn record(position: u64, place: Place) -> Record {
+    Record { sequence: 10 + position, timestamp: 0, published: 0, len: 0, place }
+}
+
+/// A lane that a reader has opened to take `first` next.
+fn granted(first: u64) -> (Arc<Vec<AtomicU64>>, Tenancy) {
+    let lane = zeros(LANE_WORDS);
+    lane::ask(&lane[..], 1);
+    let tenancy = Tenancy::grant(&lane[..], Allowance::ALL);
+    lane::open(&lane[..], Grant { generation: tenancy.generation(), first });
+    (lane, tenancy)
+}

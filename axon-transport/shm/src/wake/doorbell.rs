@@ -1,0 +1,450 @@
+//! The doorbell of a session and the threads that wait for it.
+
+use std::{
+    os::fd::{AsFd, BorrowedFd},
+    sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, atomic::AtomicU64},
+    time::{Duration, Instant},
+};
+
+use rustix::{event::Timespec, io::Errno};
+
+use super::{
+    Bell, arm, disarm,
+    ear::{CLOSED, Drained, Ear, Heard},
+    spin::Spin,
+};
+
+/// How long who waits sleeps at most where nobody watches the processes that are to ring: what one of
+/// them did not live to ring for is found then. Tests sleep for ever, so that they notice.
+const LONGEST: Option<Duration> = if cfg!(test) { None } else { Some(Duration::from_secs(1)) };
+
+/// What a waiter waits for; each has its own armed word.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Purpose {
+    /// Samples to take, or any other news.
+    Samples = 0,
+    /// Room to publish.
+    Room = 1,
+}
+
+pub(crate) const PURPOSES: [Purpose; 2] = [Purpose::Samples, Purpose::Room];
+
+/// The armed words, in the order of [`PURPOSES`].
+pub(crate) type Words<'a> = [&'a AtomicU64; 2];
+
+/// What another thread may ask for a waiter: whether there is what it waits for.
+pub trait Look: Send + Sync {
+    /// Must be quick, and must not wait for a thread that waits.
+    fn ready(&self) -> bool;
+}
+
+/// A session of this process, at whose doorbell a thread may sleep.
+pub(crate) trait Knock: Send + Sync {
+    /// Makes whoever listens there look again.
+    fn knock(&self);
+}
+
+/// Who of this process sleeps, and who of them listens for all.
+///
+/// One waiter leads: it listens to the bell, and when it rang, wakes those of the others that may
+/// have something. These sleep until then. All tickets are given out under the lock, so the armed
+/// words only rise and a ringer never mistakes a new ticket for one it has rung for.
+pub(crate) struct Doorbell {
+    ear: Ear,
+    crowd: Mutex<Crowd>,
+    spin: Spin,
+    /// Where a leader that is to make way says that it has.
+    way: Condvar,
+}
+
+#[derive(Default)]
+struct Crowd {
+    /// Counts what may concern a waiter.
+    epoch: u64,
+    ticket: u64,
+    waiting: [u32; 2],
+    leader: Leader,
+    /// What the external leader has armed.
+    external: [bool; 2],
+    followers: Vec<Arc<Follower>>,
+    /// Rings whose events have come stand in the queue. They are taken before the next ticket is
+    /// given out, which is before anybody can rely on an event of one that is taken with them.
+    queued: bool,
+    /// Another process closed the bell for all.
+    closed: bool,
+    /// An event loop is about to lead.
+    coming: bool,
+    /// Somebody notifies when a process ends that might have rung.
+    watched: bool,
+}
+
+#[derive(Default, PartialEq, Eq)]
+enum Leader {
+    #[default]
+    None,
+    Thread,
+    External,
+}
+
+/// A waiter that sleeps while another one listens.
+struct Follower {
+    turn: Condvar,
+    look: Option<Arc<dyn Look>>,
+    /// It sleeps at the session's doorbell.
+    elsewhere: Option<Arc<dyn Knock>>,
+}
+
+impl Follower {
+    fn wake(&self) {
+        match &self.elsewhere {
+            Some(session) => session.knock(),
+            None => self.turn.notify_one(),
+        }
+    }
+}
+
+impl Doorbell {
+    pub(crate) fn new() -> Result<Self, Errno> {
+        Ok(Self {
+            ear: Ear::new()?,
+            crowd: Mutex::default(),
+            spin: Spin::new(),
+            way: Condvar::new(),
+        })
+    }
+
+    /// The end that others ring.
+    pub(crate) fn bell(&self) -> &Bell {
+        self.ear.bell()
+    }
+
+    /// Rings from this very process, whatever others do to the bell.
+    pub(crate) fn ring_own(&self) {
+        self.ear.knock();
+    }
+
+    /// Waits until `ready`, asked again after each ring, each [`Doorbell::notify`] and each event
+    /// on `others`, or until `timeout` has passed. Returns what `ready` said last.
+    ///
+    /// A thread that follows does not see `others`. With `look`, which is made when it begins to follow
+    /// and must say what `ready` says, it is woken for nothing else but its turn to lead.
+    pub(crate) fn wait(
+        &self,
+        words: Words<'_>,
+        purpose: Purpose,
+        mut ready: impl FnMut() -> bool,
+        look: Option<&dyn Fn() -> Arc<dyn Look>>,
+        others: &[BorrowedFd<'_>],
+        timeout: Option<Duration>,
+    ) -> bool {
+        // What does not sleep in the end costs no look at the clock that can be done without.
+        if ready() {
+            return true;
+        }
+        if timeout == Some(Duration::ZERO) {
+            return false;
+        }
+        let now = Instant::now();
+        let deadline = timeout.and_then(|timeout| now.checked_add(timeout));
+        if self.spin.look(&mut ready, now, deadline) {
+            return true;
+        }
+        let start = Instant::now();
+        // Also when `ready` panics.
+        let _waiting = Waiting::new(self, words, purpose);
+        loop {
+            let armed_at = {
+                let mut crowd = self.lock();
+                crowd.arm(&self.ear, &[words[purpose as usize]]);
+                crowd.epoch
+            };
+            if ready() {
+                self.spin.slept(start.elapsed());
+                return true;
+            }
+            let left = deadline.map(|deadline| deadline.saturating_duration_since(Instant::now()));
+            if left.is_some_and(|left| left.is_zero()) {
+                return false;
+            }
+            self.sleep(words, armed_at, look, others, left);
+            // Most sleeps end with what they were for, which is not kept waiting for another ticket.
+            if ready() {
+                self.spin.slept(start.elapsed());
+                return true;
+            }
+        }
+    }
+
+    /// Whoever says so [notifies](Self::notify) when a process ends that might have rung: from now on
+    /// waiters sleep for as long as nothing comes.
+    pub(crate) fn is_watched(&self) {
+        self.lock().watched = true;
+    }
+
+    /// Makes every waiter of this process look again.
+    pub(crate) fn notify(&self) {
+        let mut crowd = self.lock();
+        crowd.epoch += 1;
+        crowd.followers.iter().for_each(|follower| follower.wake());
+        let heard = crowd.leader != Leader::None;
+        drop(crowd);
+        if heard {
+            self.ear.knock();
+        }
+    }
+
+    /// Sleeps until something happened after epoch `armed_at`, or for `left`.
+    fn sleep(
+        &self,
+        words: Words<'_>,
+        armed_at: u64,
+        look: Option<&dyn Fn() -> Arc<dyn Look>>,
+        others: &[BorrowedFd<'_>],
+        left: Option<Duration>,
+    ) {
+        let mut crowd = self.lock();
+        if crowd.epoch != armed_at {
+            return;
+        }
+        if crowd.leader != Leader::None || crowd.coming {
+            self.follow(crowd, look.map(|look| look()), left);
+            return;
+        }
+        crowd.leader = Leader::Thread;
+        let left = crowd.not_too_long(left);
+        drop(crowd);
+        let heard = self.ear.listen(others, left);
+        let mut crowd = self.lock();
+        crowd.leader = Leader::None;
+        if crowd.coming {
+            self.way.notify_all();
+        }
+        self.spread(crowd, words, heard);
+    }
+
+    fn follow(
+        &self,
+        mut crowd: MutexGuard<'_, Crowd>,
+        look: Option<Arc<dyn Look>>,
+        left: Option<Duration>,
+    ) {
+        let follower = Arc::new(Follower { turn: Condvar::new(), look, elsewhere: None });
+        crowd.followers.push(Arc::clone(&follower));
+        crowd = match crowd.not_too_long(left) {
+            Some(left) => {
+                let woken = follower.turn.wait_timeout(crowd, left);
+                woken.unwrap_or_else(PoisonError::into_inner).0
+            }
+            None => follower.turn.wait(crowd).unwrap_or_else(PoisonError::into_inner),
+        };
+        crowd.followers.retain(|other| !Arc::ptr_eq(other, &follower));
+    }
+
+    /// Wakes those of the crowd that what was heard may concern.
+    fn spread(&self, mut crowd: MutexGuard<'_, Crowd>, words: Words<'_>, heard: Heard) {
+        if heard.closed && !crowd.closed {
+            crowd.give_up(&self.ear, "closed the session's doorbell");
+        }
+        crowd.queued = (crowd.queued || heard.queued) && !crowd.closed;
+        let rung = heard.rung || (heard.tick && crowd.closed);
+        if !rung {
+            return;
+        }
+        crowd.epoch += 1;
+        if crowd.followers.is_empty() {
+            return;
+        }
+        let followers = crowd.followers.clone();
+        if followers.iter().any(|follower| follower.look.is_some()) {
+            // What comes after a look must ring again.
+            crowd.arm(&self.ear, &[words[Purpose::Samples as usize]]);
+        }
+        drop(crowd);
+        for follower in followers {
+            if follower.look.as_ref().is_none_or(|look| look.ready()) {
+                follower.wake();
+            }
+        }
+    }
+
+    /// Has the doorbell of `elsewhere`, where a thread of this process sleeps, rung when `look` may be
+    /// ready, until what this returns is dropped. Somebody must listen here meanwhile.
+    pub(crate) fn pass_on<'a>(
+        &'a self,
+        words: Words<'a>,
+        look: Arc<dyn Look>,
+        elsewhere: Arc<dyn Knock>,
+    ) -> PassedOn<'a> {
+        let waiting = Waiting::new(self, words, Purpose::Samples);
+        let (look, elsewhere) = (Some(look), Some(elsewhere));
+        let follower = Arc::new(Follower { turn: Condvar::new(), look, elsewhere });
+        let mut crowd = self.lock();
+        crowd.followers.push(follower.clone());
+        crowd.arm(&self.ear, &[words[Purpose::Samples as usize]]);
+        PassedOn { follower, waiting }
+    }
+
+    /// An event loop leads from now on; `false` when another one does already.
+    pub(crate) fn lead_from_outside(&self) -> bool {
+        let mut crowd = self.lock();
+        if crowd.coming || crowd.leader == Leader::External {
+            return false;
+        }
+        crowd.coming = true;
+        while crowd.leader == Leader::Thread {
+            // It gives up the lead when it next wakes, which is now.
+            self.ear.knock();
+            crowd = self.way.wait(crowd).unwrap_or_else(PoisonError::into_inner);
+        }
+        crowd.coming = false;
+        crowd.leader = Leader::External;
+        crowd.pace(&self.ear);
+        true
+    }
+
+    /// The event loop takes what came.
+    pub(crate) fn take_from_outside(&self, words: Words<'_>) {
+        let heard = self.ear.take(Some(&Timespec::default()));
+        self.spread(self.lock(), words, heard);
+    }
+
+    /// The event loop is about to sleep.
+    pub(crate) fn arm_from_outside(&self, words: Words<'_>, purposes: &[Purpose]) {
+        let mut crowd = self.lock();
+        for &purpose in purposes {
+            crowd.external[purpose as usize] = true;
+            crowd.arm(&self.ear, &[words[purpose as usize]]);
+        }
+    }
+
+    /// The event loop is not going to sleep.
+    pub(crate) fn disarm_from_outside(&self, words: Words<'_>) {
+        let mut crowd = self.lock();
+        crowd.external = [false; 2];
+        PURPOSES.iter().for_each(|&purpose| crowd.disarm_idle(purpose, words));
+    }
+
+    /// The event loop leads no more.
+    pub(crate) fn leave_from_outside(&self) {
+        let mut crowd = self.lock();
+        crowd.leader = Leader::None;
+        crowd.pace(&self.ear);
+        crowd.hand_over();
+    }
+
+    /// As where the kernel cannot keep descriptors out of the bell.
+    #[cfg(test)]
+    pub(crate) fn let_rights_pass(&mut self) {
+        self.ear.let_rights_pass();
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Crowd> {
+        self.crowd.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl AsFd for Doorbell {
+    /// Readable when it rang.
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.ear.as_fd()
+    }
+}
+
+/// A follower that sleeps elsewhere, until it is dropped.
+pub struct PassedOn<'a> {
+    follower: Arc<Follower>,
+    waiting: Waiting<'a>,
+}
+
+impl Drop for PassedOn<'_> {
+    fn drop(&mut self) {
+        let mut crowd = self.waiting.doorbell.lock();
+        crowd.followers.retain(|other| !Arc::ptr_eq(other, &self.follower));
+    }
+}
+
+/// One of the crowd, until it is dropped.
+struct Waiting<'a> {
+    doorbell: &'a Doorbell,
+    words: Words<'a>,
+    purpose: Purpose,
+}
+
+impl<'a> Waiting<'a> {
+    fn new(doorbell: &'a Doorbell, words: Words<'a>, purpose: Purpose) -> Self {
+        doorbell.lock().waiting[purpose as usize] += 1;
+        Self { doorbell, words, purpose }
+    }
+}
+
+impl Drop for Waiting<'_> {
+    fn drop(&mut self) {
+        let mut crowd = self.doorbell.lock();
+        crowd.waiting[self.purpose as usize] -= 1;
+        crowd.disarm_idle(self.purpose, self.words);
+        crowd.hand_over();
+    }
+}
+
+impl Crowd {
+    /// Gives out a new ticket.
+    fn arm(&mut self, ear: &Ear, words: &[&AtomicU64]) {
+        if self.queued {
+            let drained = ear.drain();
+            self.queued = drained == Drained::Some;
+            match drained {
+                Drained::All => {}
+                // A ring whose event was still to come may have been taken with the others, and
+                // somebody sleeps who relies on it.
+                Drained::Some => ear.knock(),
+                Drained::Rights => self.give_up(ear, "put descriptors into the session's doorbell"),
+            }
+        }
+        self.ticket += 1;
+        words.iter().for_each(|word| arm(*word, self.ticket));
+    }
+
+    /// The bell is of no use any more: there is a look for news by time.
+    fn give_up(&mut self, ear: &Ear, what: &str) {
+        self.closed = true;
+        ear.give_up();
+        self.pace(ear);
+        tracing::error!(
+            "another process {what}: from now on it looks for news every few milliseconds"
+        );
+    }
+
+    /// Has who listens woken for nothing as often as is needed.
+    fn pace(&self, ear: &Ear) {
+        let interval = match self.leader {
+            _ if self.closed => Some(CLOSED),
+            // Threads that listen see to it themselves.
+            Leader::External => self.longest(),
+            Leader::None | Leader::Thread => None,
+        };
+        ear.tick(interval);
+    }
+
+    fn longest(&self) -> Option<Duration> {
+        LONGEST.filter(|_| !self.watched)
+    }
+
+    fn not_too_long(&self, left: Option<Duration>) -> Option<Duration> {
+        left.into_iter().chain(self.longest()).min()
+    }
+
+    fn disarm_idle(&self, purpose: Purpose, words: Words<'_>) {
+        if self.waiting[purpose as usize] == 0 && !self.external[purpose as usize] {
+            disarm(words[purpose as usize]);
+        }
+    }
+
+    /// Has one of those that sleep listen, when nobody does.
+    fn hand_over(&self) {
+        if self.leader == Leader::None
+            && let Some(follower) = self.followers.iter().rfind(|one| one.elsewhere.is_none())
+        {
+            follower.wake();
+        }
+    }
+}

@@ -1,0 +1,19 @@
+//! Sleeping until another process has something: tickets, and the doorbell that ends a sleep.
+//!
+//! A waiter stores a new ticket in a shared word before it sleeps; whoever has something for it
+//! reads the word and rings the doorbell once per ticket, so a burst costs one system call. In a
+//! process one waiter listens to the doorbell and the others follow it.
+
+mod bell;
+mod doorbell;
+mod ear;
+mod spin;
+mod ticket;
+
+#[cfg(test)]
+mod tests;
+
+pub(crate) use bell::Bell;
+pub(crate) use doorbell::{Doorbell, Knock, PURPOSES};
+pub use doorbell::{Look, PassedOn, Purpose};
+pub(crate) use ticket::{arm, disarm, due, settle, waits};

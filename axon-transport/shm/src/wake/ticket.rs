@@ -1,0 +1,45 @@
+//! The protocol between one that is about to sleep and those that may have to wake it.
+//!
+//! The sleeper stores its ticket, fences, and looks once more whether there is something; the
+//! waker makes that something visible, fences, and looks whether there is a ticket. One of the two
+//! sees the other. Neither fence can be weaker: each side stores one word and loads another.
+
+use crate::sync::{Ordering, Site, Word, fence_at};
+
+/// Sleeper: arms `word` with `ticket`, larger than any before. Look for work after it.
+pub(crate) fn arm<W: Word>(word: &W, ticket: u64) {
+    word.store(ticket, Ordering::Relaxed);
+    // Pairs with the fence of `settle`.
+    fence_at::<W>(Site::ArmFence);
+}
+
+/// Sleeper: nobody sleeps any more.
+pub(crate) fn disarm<W: Word>(word: &W) {
+    word.store(0, Ordering::Relaxed);
+}
+
+/// Waker: all that was stored so far comes before the look at any ticket that follows.
+#[inline]
+pub(crate) fn settle<W: Word>() {
+    // Pairs with the fence of `arm`.
+    fence_at::<W>(Site::SettleFence);
+}
+
+/// Waker, after [`settle`]: whether somebody is to be woken, now that there is something. `rung` is
+/// the last ticket that this process rang for; it is no concern of another process.
+#[inline]
+pub(crate) fn waits<W: Word>(word: &W, rung: &W) -> bool {
+    unrung(word, rung).is_some()
+}
+
+/// Waker, after [`settle`]: whether the doorbell must be rung, by the one who is told so.
+#[inline]
+pub(crate) fn due<W: Word>(word: &W, rung: &W) -> bool {
+    unrung(word, rung).is_some_and(|ticket| rung.fetch_max(ticket, Ordering::Relaxed) < ticket)
+}
+
+#[inline]
+fn unrung<W: Word>(word: &W, rung: &W) -> Option<u64> {
+    let ticket = word.load(Ordering::Relaxed);
+    (ticket != 0 && rung.load(Ordering::Relaxed) < ticket).then_some(ticket)
+}

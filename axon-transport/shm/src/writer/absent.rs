@@ -1,0 +1,103 @@
+//! Readers that carried samples to another process and whose own process ended: what they had not
+//! delivered is kept for a while.
+//!
+//! Such a reader is the daemon's, on behalf of a relayed session. The next daemon asks under the same
+//! GID, and goes on where the last one was.
+
+use std::time::{Duration, Instant};
+
+use crate::ids::Gid;
+
+/// How long samples are kept for a reader whose process ended.
+const ABSENCE: Duration = Duration::from_secs(10);
+
+/// The absent readers of one ring.
+#[derive(Debug, Default)]
+pub(crate) struct Absences(Vec<Absent>);
+
+#[derive(Debug)]
+struct Absent {
+    gid: Gid,
+    /// The oldest position that was not delivered.
+    position: u64,
+    until: Instant,
+}
+
+impl Absences {
+    /// Keeps samples from `position` on for a reader.
+    pub(crate) fn add(&mut self, gid: Gid, position: u64) {
+        self.0.retain(|absent| absent.gid != gid);
+        self.0.push(Absent { gid, position, until: Instant::now() + ABSENCE });
+    }
+
+    /// The reader is there again.
+    pub(crate) fn end(&mut self, gid: &Gid) {
+        self.0.retain(|absent| absent.gid != *gid);
+    }
+
+    /// Forgets the readers that were absent for too long; how many samples below `head` are given up.
+    pub(crate) fn expire(&mut self, head: u64) -> u64 {
+        if self.0.is_empty() {
+            return 0;
+        }
+        let now = Instant::now();
+        let over = self.0.extract_if(.., |absent| absent.until <= now);
+        over.fold(0, |all, Absent { gid, position, .. }| {
+            let samples = head.saturating_sub(position);
+            tracing::warn!(reader = %gid, samples, "a relayed reader did not come back: lost");
+            all.saturating_add(samples)
+        })
+    }
+
+    /// Whether nothing is kept for anybody.
+    #[inline]
+    pub(crate) fn is_empty(&self) -> bool {
+        self.there().next().is_none()
+    }
+
+    /// Those that were not absent for too long. There seldom are any: no clock is read then.
+    #[inline]
+    fn there(&self) -> impl Iterator<Item = &Absent> {
+        self.0.iter().filter(|absent| absent.until > Instant::now())
+    }
+
+    /// How long until the first of them is given up.
+    pub(crate) fn left(&self) -> Option<Duration> {
+        let until = self.0.iter().map(|absent| absent.until).min()?;
+        Some(until.saturating_duration_since(Instant::now()))
+    }
+
+    /// Where a reader goes on.
+    pub(crate) fn position_of(&self, gid: &Gid) -> Option<u64> {
+        self.there().find(|absent| absent.gid == *gid).map(|absent| absent.position)
+    }
+
+    /// The oldest position that is kept, and for whom.
+    #[inline]
+    pub(crate) fn oldest(&self) -> Option<(u64, Gid)> {
+        self.there().map(|absent| (absent.position, absent.gid)).min()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn samples_are_kept_from_the_oldest_position_until_the_reader_is_back() {
+        let mut absences = Absences::default();
+        assert!(absences.is_empty() && absences.oldest().is_none() && absences.left().is_none());
+        let [one, other] = [1, 2].map(|byte| Gid([byte; 16]));
+        absences.add(one, 7);
+        absences.add(other, 5);
+        // It died once more before it had got on.
+        absences.add(one, 6);
+        assert_eq!((absences.position_of(&one), absences.oldest()), (Some(6), Some((5, other))));
+        assert_eq!(absences.expire(9), 0, "they were not absent for long");
+        absences.end(&other);
+        assert_eq!((absences.position_of(&other), absences.oldest()), (None, Some((6, one))));
+        absences.0[0].until = Instant::now();
+        assert!(absences.is_empty() && absences.position_of(&one).is_none());
+        assert_eq!((absences.expire(9), absences.left()), (3, None));
+    }
+}

@@ -1,0 +1,265 @@
+//! A sample's way into the ring.
+
+use std::{
+    sync::{Arc, atomic::AtomicU64},
+    time::{Duration, Instant},
+};
+
+use super::{LOOKS, Numbering, Payload, State};
+use crate::{
+    alloc::area::Area,
+    error::PublishError,
+    os::clock::monotonic,
+    qos::Durability,
+    ring::{
+        layout::{self, COPIED, INLINE, Location},
+        protocol::{self, Place, Record},
+        types::{Meta, Published},
+    },
+    session::peer::PeerSession,
+    sync::{Ordering, Word},
+    wake::{Purpose, settle},
+    writer::{
+        Writer,
+        history::Extent,
+        loan::{Lender, Loan, Place as LoanPlace},
+        room::Refusal,
+    },
+};
+
+/// How long a publish waits altogether, from the first time on that it has to.
+pub(crate) struct Patience {
+    whole: Duration,
+    end: Option<Instant>,
+}
+
+/// Samples that a publisher elsewhere may be ahead of the last one of its here: more than an hour of
+/// outage at a million samples a second.
+pub const MAX_GAP: u64 = 1 << 32;
+/// Samples that it may have published before the first one that comes here.
+const MAX_FIRST: u64 = 1 << 48;
+
+/// Refuses a number from outside that would make readers count losses that cannot be.
+fn judge(state: &State, numbering: Numbering) -> Result<(), PublishError> {
+    let Numbering::Given(Meta { sequence, .. }) = numbering else { return Ok(()) };
+    let last = state.last;
+    let most = if last == 0 { MAX_FIRST } else { last.saturating_add(MAX_GAP) };
+    if sequence > most { Err(PublishError::Sequence { sequence, last }) } else { Ok(()) }
+}
+
+impl Patience {
+    pub(crate) fn new(whole: Duration) -> Self {
+        Self { whole, end: None }
+    }
+
+    fn left(&mut self) -> Duration {
+        let now = Instant::now();
+        self.end.get_or_insert(now + self.whole).saturating_duration_since(now)
+    }
+}
+
+impl Writer {
+    #[inline]
+    pub(super) fn publish_within(
+        &self,
+        numbering: Numbering,
+        payload: &[u8],
+        patience: Duration,
+    ) -> Result<(u64, Published), PublishError> {
+        let bytes = self.check(payload.len())?;
+        let mut patience = Patience::new(patience);
+        if payload.len() as u64 <= COPIED {
+            return self.commit(numbering, Payload::Bytes(payload), patience);
+        }
+        let lent: Result<LoanPlace, Meta> = self.patiently(&mut patience, |state| {
+            judge(state, numbering)?;
+            if self.is_unread(state) {
+                return Ok(Err(self.pass(state, numbering)));
+            }
+            self.lend(state, bytes).map(Ok)
+        })?;
+        let place = match lent {
+            Ok(place) => place,
+            Err(passed) => return Ok((passed.sequence, Published { position: None })),
+        };
+        // Copied outside the lock: nobody else knows of the place yet.
+        let mut loan = Loan::placed(Lender::Borrowed(self), 0, payload.len(), place);
+        loan.copy_from_slice(payload);
+        loan.commit(payload.len(), numbering, patience)
+    }
+
+    /// Publishes what has been, or is here, copied in. Memory that was lent and that no sample
+    /// takes is given back by whoever borrowed it.
+    pub(crate) fn commit(
+        &self,
+        numbering: Numbering,
+        payload: Payload<'_>,
+        mut patience: Patience,
+    ) -> Result<(u64, Published), PublishError> {
+        // A loan may have been made before the fork.
+        if self.is_forked() {
+            return Err(PublishError::Forked);
+        }
+        let (meta, position, waiting) = self.patiently(&mut patience, |state| {
+            judge(state, numbering)?;
+            if self.is_unread(state) {
+                return Ok((self.pass(state, numbering), None, None));
+            }
+            self.make_place(state)?;
+            let (extent, place) = match payload {
+                Payload::Bytes(bytes) if bytes.len() <= INLINE => (Extent::Inline, Place::Inline),
+                Payload::Bytes(bytes) => {
+                    let block = self.copy_in(state, bytes)?;
+                    (Extent::Block(block), Place::Block(block.at))
+                }
+                Payload::Written { at, lead, len: sample, lent } => {
+                    let len = Area::rounded(lent as u64);
+                    let first = Location { offset: at.offset + lead as u64, ..at };
+                    (Extent::Slot { at, len, sample: sample as u64 }, Place::Slot(first))
+                }
+            };
+            let meta = self.number(state, numbering);
+            let position = self.show(state, meta, extent, place, payload);
+            settle::<AtomicU64>();
+            Ok((meta, Some(position), state.audience.waiting()))
+        })?;
+        // A system call for each session that sleeps, without the lock.
+        for peer in waiting.iter().flat_map(|peers| &**peers) {
+            peer.ring_if(Purpose::Samples);
+        }
+        Ok((meta.sequence, Published { position }))
+    }
+
+    /// Whether nobody will ever read what is published now.
+    #[inline]
+    pub(super) fn is_unread(&self, state: &State) -> bool {
+        state.audience.is_empty() && self.options.qos.durability == Durability::Volatile
+    }
+
+    /// A sample that nobody reads.
+    pub(super) fn pass(&self, state: &mut State, numbering: Numbering) -> Meta {
+        let meta = self.number(state, numbering);
+        self.count(state);
+        // No sample to come asks for the memory of those that were in use.
+        self.reclaim(state);
+        meta
+    }
+
+    #[inline]
+    fn number(&self, state: &mut State, numbering: Numbering) -> Meta {
+        let meta = match numbering {
+            Numbering::Given(meta) => meta,
+            Numbering::Next(source_timestamp) => {
+                Meta { sequence: state.last.saturating_add(1), source_timestamp, published: 0 }
+            }
+        };
+        state.last = meta.sequence;
+        meta
+    }
+
+    #[inline]
+    fn count(&self, state: &mut State) {
+        state.published += 1;
+        let published = &self.ring.words()[layout::ring::PUBLISHED];
+        Word::store(published, state.published, Ordering::Relaxed);
+    }
+
+    fn show(
+        &self,
+        state: &mut State,
+        meta: Meta,
+        extent: Extent,
+        place: Place,
+        payload: Payload<'_>,
+    ) -> u64 {
+        let (len, inline) = match payload {
+            Payload::Bytes(bytes) => (bytes.len(), bytes),
+            Payload::Written { len, .. } => (len, &[][..]),
+        };
+        self.count(state);
+        let position = state.history.push(extent);
+        let record = Record {
+            sequence: meta.sequence,
+            timestamp: meta.source_timestamp,
+            published: self.published_at(meta),
+            len: u32::try_from(len).expect("no longer than the largest message"),
+            place,
+        };
+        protocol::about_to_write::<AtomicU64>();
+        protocol::publish(self.ring.words(), state.array.words(), position, &record, inline);
+        position
+    }
+
+    /// The time from which the sample's lifespan counts; 0 where that is infinite.
+    #[inline]
+    fn published_at(&self, meta: Meta) -> u64 {
+        match (self.options.qos.lifespan, meta.published) {
+            (None, _) => 0,
+            (Some(_), 0) => monotonic(),
+            (Some(_), earlier) => earlier,
+        }
+    }
+
+    /// Tries until it works or `patience` is at its end. The lock is not held in between.
+    pub(super) fn patiently<T>(
+        &self,
+        patience: &mut Patience,
+        attempt: impl FnMut(&mut State) -> Result<T, Refusal>,
+    ) -> Result<T, PublishError> {
+        let tried = self.try_for(patience, attempt);
+        if let Err(error) = &tried {
+            self.count_failure(error, patience.whole);
+        }
+        tried
+    }
+
+    fn try_for<T>(
+        &self,
+        patience: &mut Patience,
+        mut attempt: impl FnMut(&mut State) -> Result<T, Refusal>,
+    ) -> Result<T, PublishError> {
+        for look in 0u32.. {
+            let laggards = {
+                let mut state = self.lock();
+                match attempt(&mut state) {
+                    Ok(done) => return Ok(done),
+                    Err(Refusal::Error(error)) => return Err(error),
+                    Err(Refusal::Kept(kept)) => {
+                        drop(state);
+                        return Err(kept.into_error());
+                    }
+                    Err(Refusal::Held) => {}
+                }
+                let State { history, audience, .. } = &mut *state;
+                audience.laggards(history.tail(), history.head())
+            };
+            let left = patience.left();
+            match laggards {
+                Some((reader, _)) if left.is_zero() => {
+                    return Err(PublishError::Blocked { reader });
+                }
+                Some((_, peers)) => self.await_room(&peers, left),
+                // It moved on between the two looks. One that does so for ever is out for trouble.
+                None if left.is_zero() && look >= LOOKS => {
+                    return Err(PublishError::Blocked { reader: self.options.gid });
+                }
+                None => {}
+            }
+        }
+        unreachable!("the deadline comes first")
+    }
+
+    fn await_room(&self, laggards: &[Arc<PeerSession>], left: Duration) {
+        let ready = || {
+            let mut state = self.lock();
+            let State { history, audience, .. } = &mut *state;
+            audience.floors(history.head()).held > history.tail()
+                || laggards.iter().any(|peer| peer.is_dead())
+        };
+        let pidfds: Vec<_> = laggards.iter().map(|peer| peer.pidfd()).collect();
+        self.session.wait_for_room(ready, &pidfds, left);
+        let mut state = self.lock();
+        let State { history, audience, .. } = &mut *state;
+        audience.mark_dead(history.head());
+    }
+}

@@ -1,0 +1,96 @@
+//! What readers that stand for others, elsewhere, are done with.
+
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use super::{State, Writer};
+use crate::{ids::Gid, session::peer::PeerSession};
+
+impl Writer {
+    /// The number up to which all that was published has been handed to those who carry it elsewhere.
+    pub fn handed_over(&self) -> u64 {
+        let mut state = self.lock();
+        let State { history, audience, .. } = &mut *state;
+        let position = audience.handed_over(history.head());
+        state.number_before(position)
+    }
+
+    /// Waits until those who carry samples elsewhere are done with all that was published so far;
+    /// whether none of it was given up. What was given up makes it false once.
+    pub fn wait_handed_over(&self, timeout: Duration) -> bool {
+        if self.is_forked() {
+            return true;
+        }
+        let end = Instant::now().checked_add(timeout);
+        let published = self.lock().history.head();
+        loop {
+            let (relays, absent) = {
+                let mut state = self.lock();
+                let State { history, audience, known_given_up, .. } = &mut *state;
+                audience.mark_dead(history.head());
+                // In this order: what is handed over since it was given up is counted by then.
+                let handed_over = audience.handed_over(published) >= published;
+                let given_up = audience.given_up(history.head());
+                if std::mem::replace(known_given_up, given_up) != given_up {
+                    return false;
+                }
+                if handed_over {
+                    return true;
+                }
+                (audience.relays(), audience.absent_for())
+            };
+            let left =
+                end.map_or(Duration::MAX, |end| end.saturating_duration_since(Instant::now()));
+            if left.is_zero() {
+                return false;
+            }
+            let left = left.min(absent.unwrap_or(Duration::MAX));
+            self.await_handover(published, &relays, left);
+        }
+    }
+
+    /// Samples with which those who carry them elsewhere are not done.
+    pub fn under_way(&self) -> u64 {
+        if self.is_forked() {
+            return 0;
+        }
+        let mut state = self.lock();
+        let State { history, audience, .. } = &mut *state;
+        let head = history.head();
+        audience.mark_dead(head);
+        head.saturating_sub(audience.handed_over(head))
+    }
+
+    /// Samples that those who carry them elsewhere gave up.
+    pub fn given_up(&self) -> u64 {
+        if self.is_forked() {
+            return 0;
+        }
+        let mut state = self.lock();
+        let State { history, audience, .. } = &mut *state;
+        audience.given_up(history.head())
+    }
+
+    /// One of them says that it gave up so many.
+    pub fn give_up(&self, reader: Gid, samples: u64) {
+        if !self.is_forked() {
+            let mut state = self.lock();
+            let State { history, audience, .. } = &mut *state;
+            audience.give_up(reader, samples, history.head());
+        }
+    }
+
+    fn await_handover(&self, published: u64, relays: &[Arc<PeerSession>], left: Duration) {
+        let ready = || {
+            let mut state = self.lock();
+            let State { history, audience, known_given_up, .. } = &mut *state;
+            audience.handed_over(published) >= published
+                || audience.given_up(history.head()) != *known_given_up
+                || relays.iter().any(|peer| peer.is_dead())
+        };
+        let pidfds: Vec<_> = relays.iter().map(|peer| peer.pidfd()).collect();
+        self.session.wait_for_room(ready, &pidfds, left);
+    }
+}

@@ -1,0 +1,373 @@
+//! Which samples of a ring stand, and how room is made for the next: plain data, no shared memory.
+
+use crate::{
+    alloc::{blocks::Blocks, classes, heap::Block, limbo::Limbo},
+    ring::layout::{self, Location},
+};
+
+/// The samples that stand, oldest to newest, and what they take of memory.
+///
+/// Samples that readers copy out are in blocks, which are written over as soon as a sample is given
+/// up, for the readers find out. Samples that readers pin are in slots.
+#[derive(Debug)]
+pub(crate) struct History {
+    head: u64,
+    tail: u64,
+    /// By descriptor.
+    extents: Box<[Extent]>,
+    blocks: Blocks,
+    pinned: Limbo,
+    /// Bytes that samples and loans take; what is in limbo does not count.
+    used: u64,
+    /// Samples in blocks and slots.
+    placed: u64,
+    budget: u64,
+    /// Bytes of the budget that each sample takes beside its block or slot.
+    overhead: u64,
+}
+
+/// What memory a sample takes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) enum Extent {
+    /// None but its descriptor.
+    #[default]
+    Inline,
+    Block(Block),
+    /// In a segment of the publisher's own.
+    Slot {
+        at: Location,
+        len: u64,
+        /// Bytes of the sample itself.
+        sample: u64,
+    },
+}
+
+/// The oldest sample may not be given up.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) struct Held;
+
+impl History {
+    /// A history of samples in `descriptors` descriptors.
+    pub(crate) fn new(descriptors: u64, budget: u64) -> Self {
+        Self {
+            head: 0,
+            tail: 0,
+            extents: vec![Extent::Inline; descriptors as usize].into_boxed_slice(),
+            blocks: Blocks::default(),
+            pinned: Limbo::default(),
+            used: 0,
+            placed: 0,
+            budget,
+            overhead: 0,
+        }
+    }
+
+    /// Descriptors take of the budget, too: it is all that bounds this history.
+    pub(crate) fn count_descriptors(&mut self) {
+        self.overhead = layout::DESCRIPTOR;
+    }
+
+    /// The next position.
+    pub(crate) fn head(&self) -> u64 {
+        self.head
+    }
+
+    /// The oldest position that stands.
+    pub(crate) fn tail(&self) -> u64 {
+        self.tail
+    }
+
+    /// The most samples that can stand while another is written.
+    pub(crate) fn capacity(&self) -> u64 {
+        self.extents.len() as u64 - 1
+    }
+
+    /// Whether the next position has no descriptor.
+    pub(crate) fn is_full(&self) -> bool {
+        self.head - self.tail > self.capacity()
+    }
+
+    /// Twice as many descriptors.
+    pub(crate) fn grow(&mut self) {
+        let mut extents = vec![Extent::Inline; 2 * self.extents.len()].into_boxed_slice();
+        for position in self.tail..self.head {
+            extents[index(&extents, position)] = self.extents[index(&self.extents, position)];
+        }
+        self.extents = extents;
+    }
+
+    /// The blocks for the next samples.
+    pub(crate) fn blocks(&mut self) -> &mut Blocks {
+        &mut self.blocks
+    }
+
+    /// The slots.
+    pub(crate) fn pinned(&mut self) -> &mut Limbo {
+        &mut self.pinned
+    }
+
+    /// All blocks, of samples that stand and of those to come.
+    pub(crate) fn all_blocks(&mut self) -> Vec<Block> {
+        let standing = self.extents.iter().filter_map(|extent| match extent {
+            Extent::Block(block) => Some(*block),
+            Extent::Inline | Extent::Slot { .. } => None,
+        });
+        standing.chain(self.blocks.drain()).collect()
+    }
+
+    /// Gives up all samples below `floor`.
+    pub(crate) fn release_below(&mut self, floor: u64) {
+        while self.tail < floor.min(self.head) {
+            let at = index(&self.extents, self.tail);
+            match std::mem::take(&mut self.extents[at]) {
+                Extent::Inline => {}
+                Extent::Block(block) => {
+                    self.blocks.put(block);
+                    self.used -= block.len;
+                    self.placed -= 1;
+                }
+                Extent::Slot { at, len, sample } => {
+                    self.pinned.retire(self.tail, at, len, sample);
+                    self.used -= len;
+                    self.placed -= 1;
+                }
+            }
+            self.tail += 1;
+        }
+    }
+
+    /// Makes sure that the next position has a descriptor, giving up the oldest that `may_go`.
+    pub(crate) fn make_place(&mut self, may_go: impl Fn(u64) -> bool) -> Result<(), Held> {
+        while self.is_full() {
+            self.give_up_oldest(&may_go)?;
+        }
+        Ok(())
+    }
+
+    /// Gives up the oldest samples that `may_go` until `len` bytes more are within the budget. One
+    /// sample always stays, whatever its length.
+    pub(crate) fn make_room(&mut self, len: u64, may_go: impl Fn(u64) -> bool) -> Result<(), Held> {
+        while !self.has_room(len) {
+            self.give_up_oldest(&may_go)?;
+        }
+        Ok(())
+    }
+
+    /// Gives up the oldest sample, if another one is in a block or slot. Whether it did.
+    pub(crate) fn shrink(&mut self, may_go: impl Fn(u64) -> bool) -> Result<bool, Held> {
+        if self.placed <= 1 {
+            return Ok(false);
+        }
+        self.give_up_oldest(&may_go)?;
+        Ok(true)
+    }
+
+    /// Whether it would be in vain to give up samples for one of `len` bytes, as the budget asks for,
+    /// without more memory. Takes its time where samples differ in length.
+    pub(crate) fn is_short_of(&self, len: u64) -> bool {
+        let alike = match self.extents[index(&self.extents, self.tail)] {
+            Extent::Slot { len: oldest, .. } => {
+                oldest >= len && classes::class(oldest) == classes::class(len)
+            }
+            Extent::Inline | Extent::Block(_) => false,
+        };
+        !self.has_room(len) && !alike && !self.would_hold(len, false)
+    }
+
+    /// Whether there would be a slot of `len` bytes if all samples were given up but one, and nothing
+    /// that readers keep: with no more memory than there is, unless it can `grow`. Takes its time.
+    pub(crate) fn would_hold(&self, len: u64, grow: bool) -> bool {
+        let placed = (self.tail..self.head)
+            .map(|position| self.extents[index(&self.extents, position)])
+            .filter(|extent| *extent != Extent::Inline)
+            .take(self.placed.saturating_sub(1) as usize);
+        let slots = placed.filter_map(|extent| match extent {
+            Extent::Slot { at, len, .. } => Some((at, len)),
+            Extent::Inline | Extent::Block(_) => None,
+        });
+        self.pinned.would_hold(len, slots, grow)
+    }
+
+    /// Takes `len` bytes that nobody reads for a loan.
+    pub(crate) fn lend(&mut self, len: u64) -> Option<Location> {
+        let at = self.pinned.lend(len)?;
+        self.used += len;
+        Some(at)
+    }
+
+    /// The same, where it is within the budget as it is and slots [take turns](Limbo::lend_turn).
+    pub(crate) fn lend_turn(&mut self, len: u64) -> Option<Location> {
+        if !self.has_room(len) {
+            return None;
+        }
+        let at = self.pinned.lend_turn(len)?;
+        self.used += len;
+        Some(at)
+    }
+
+    /// Whether so much more is within the budget.
+    pub(crate) fn has_room(&self, len: u64) -> bool {
+        let standing = self.head - self.tail;
+        let counted = if self.overhead == 0 { self.placed } else { standing };
+        counted <= 1 || self.used + self.overhead * (standing + 1) + len <= self.budget
+    }
+
+    /// Whether the next sample's descriptor is within the budget.
+    pub(crate) fn has_room_for_descriptor(&self) -> bool {
+        self.overhead == 0 || self.has_room(0)
+    }
+
+    /// Gives back a loan.
+    pub(crate) fn give_back(&mut self, at: Location, len: u64) {
+        self.pinned.give_back(at, len);
+        self.used -= len;
+    }
+
+    /// There is no memory for a loan.
+    pub(crate) fn withdraw(&mut self, at: Location, len: u64) {
+        self.pinned.withdraw(at, len);
+        self.used -= len;
+    }
+
+    /// The next position is taken by a sample. There must be a [place](Self::make_place) for it.
+    pub(crate) fn push(&mut self, extent: Extent) -> u64 {
+        let position = self.head;
+        match extent {
+            Extent::Inline => {}
+            Extent::Block(block) => {
+                self.placed += 1;
+                self.used += block.len;
+            }
+            Extent::Slot { .. } => {
+                self.placed += 1;
+                self.pinned.published();
+            }
+        }
+        self.extents[index(&self.extents, position)] = extent;
+        self.head += 1;
+        position
+    }
+
+    fn give_up_oldest(&mut self, may_go: &impl Fn(u64) -> bool) -> Result<(), Held> {
+        if self.tail == self.head || !may_go(self.tail) {
+            return Err(Held);
+        }
+        self.release_below(self.tail + 1);
+        Ok(())
+    }
+}
+
+fn index(extents: &[Extent], position: u64) -> usize {
+    (position & (extents.len() as u64 - 1)) as usize
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SEGMENT: u32 = 3;
+
+    fn history(descriptors: u64, slots: u64, budget: u64) -> History {
+        let mut history = History::new(descriptors, budget);
+        history.pinned().open(SEGMENT, 0..slots);
+        history
+    }
+
+    #[test]
+    fn depth_one_holds_the_last_sample_while_the_largest_is_written() {
+        let max = 1 << 20;
+        let mut history = history(16, 4 * max, 4096);
+        let mut places = Vec::new();
+        for position in 0..100 {
+            history.make_place(|_| true).unwrap();
+            history.make_room(max, |_| true).unwrap();
+            history.pinned().reclaim(|_, _| false);
+            let at = history.lend(max).unwrap();
+            if position > 0 {
+                assert!(history.tail() < position, "the last one stands");
+            }
+            history.push(Extent::Slot { at, len: max, sample: max });
+            places.push(at);
+        }
+        assert!(places.iter().all(|at| at.offset <= max), "memory stays near the live window");
+    }
+
+    #[test]
+    fn what_may_not_go_is_kept() {
+        let mut history = History::new(4, 0);
+        for _ in 0..3 {
+            history.make_place(|_| false).unwrap();
+            history.push(Extent::Inline);
+        }
+        history.push(Extent::Inline);
+        assert_eq!(history.make_place(|position| position > 0), Err(Held));
+        assert_eq!(history.make_place(|_| true), Ok(()));
+        assert_eq!((history.tail(), history.head()), (1, 4));
+    }
+
+    #[test]
+    fn a_place_is_not_given_out_again_while_it_is_pinned() {
+        let size = 1 << 16;
+        let mut history = history(4, 2 * size, 0);
+        let first = history.lend(size).unwrap();
+        let position = history.push(Extent::Slot { at: first, len: size, sample: size });
+        history.release_below(1);
+        let second = history.lend(size).unwrap();
+        assert_ne!(first, second, "nobody has looked at the pins");
+        history.pinned().reclaim(|pinned, _| pinned == position);
+        assert_eq!(history.lend(size), None);
+        assert_eq!(history.pinned().retired().collect::<Vec<_>>(), [position]);
+        assert_eq!(history.pinned().loans(), 1);
+        history.pinned().reclaim(|_, _| false);
+        assert_eq!(history.lend(size), Some(first));
+    }
+
+    #[test]
+    fn descriptors_that_count_share_the_budget_with_blocks() {
+        const BUDGET: u64 = 100 * 128;
+        let mut history = History::new(256, BUDGET);
+        history.count_descriptors();
+        let mut inline = 0..1000;
+        while inline.next().is_some() {
+            history.make_place(|_| true).unwrap();
+            if !history.has_room_for_descriptor() {
+                history.make_room(0, |_| true).unwrap();
+            }
+            history.push(Extent::Inline);
+        }
+        assert_eq!(history.head() - history.tail(), 100);
+        for position in history.head()..history.head() + 1000 {
+            history.make_room(128, |_| true).unwrap();
+            let at = Location { segment: 0, offset: position * 128 };
+            history.push(Extent::Block(Block { at, len: 128 }));
+        }
+        assert_eq!(history.head() - history.tail(), 50);
+        // One stays, whatever it takes.
+        history.make_room(BUDGET, |_| true).unwrap();
+        assert_eq!(history.head() - history.tail(), 1);
+    }
+
+    #[test]
+    fn growing_changes_nothing_of_what_stands() {
+        let mut history = history(4, 1 << 20, 1 << 20);
+        let mut expected = std::collections::VecDeque::new();
+        for round in 0..100u64 {
+            if round % 30 == 29 {
+                history.grow();
+            }
+            history.make_place(|_| true).unwrap();
+            let at = Location { segment: 0, offset: round * 128 };
+            expected.push_back(Block { at, len: 128 });
+            history.push(Extent::Block(expected[expected.len() - 1]));
+            while (expected.len() as u64) > history.head() - history.tail() {
+                expected.pop_front();
+            }
+        }
+        assert_eq!(history.capacity(), 31);
+        history.release_below(u64::MAX);
+        // The last that was given up is the first to be used again.
+        while let Some(block) = expected.pop_back() {
+            assert_eq!(history.blocks().take(128), Some(block));
+        }
+    }
+}

@@ -1,0 +1,272 @@
+//! A sample that is written before it is published.
+
+#![allow(unsafe_code)]
+
+use std::{
+    io,
+    ops::{Deref, DerefMut},
+    ptr::NonNull,
+    slice,
+    sync::Arc,
+};
+
+use crate::{
+    alloc::segments::OwnSegment,
+    error::PublishError,
+    os::clock::wall,
+    ring::{
+        layout::{ALIGNED, Location},
+        types::{Meta, Published},
+    },
+    writer::{Numbering, PATIENCE, Patience, Payload, Writer},
+};
+
+/// Memory to be filled and published: shared memory where such a sample is read in place. Dropping
+/// it gives it back.
+///
+/// Written from the front through [`io::Write`], or anywhere as the slice that it dereferences to;
+/// what the slice holds at first is zeros or bytes of earlier samples. In a forked child it is of
+/// no use: dereferencing it panics, and using a slice that was borrowed before ends the child.
+///
+/// It borrows its publisher, and to publish it is the end of it:
+///
+/// ```compile_fail,E0505
+/// # use axon_shm::{PublishError, Publisher};
+/// fn too_late(publisher: Publisher) -> Result<(), PublishError> {
+///     let loan = publisher.loan(10_000)?;
+///     drop(publisher);
+///     loan.publish_now().map(drop)
+/// }
+/// ```
+///
+/// ```compile_fail,E0382
+/// # use axon_shm::{PublishError, Publisher};
+/// fn written_while_it_is_read(publisher: &Publisher) -> Result<(), PublishError> {
+///     let mut loan = publisher.loan(10_000)?;
+///     loan.fill(1);
+///     loan.publish_now()?;
+///     loan.fill(2);
+///     Ok(())
+/// }
+/// ```
+pub struct Loan<'a> {
+    writer: Lender<'a>,
+    /// Bytes of the memory before the first that is lent.
+    lead: usize,
+    len: usize,
+    written: usize,
+    memory: Memory,
+}
+
+/// Whose memory it is.
+pub(crate) enum Lender<'a> {
+    Borrowed(&'a Writer),
+    Shared(Arc<Writer>),
+}
+
+impl Deref for Lender<'_> {
+    type Target = Writer;
+
+    #[inline]
+    fn deref(&self) -> &Writer {
+        match self {
+            Self::Borrowed(writer) => writer,
+            Self::Shared(writer) => writer,
+        }
+    }
+}
+
+enum Memory {
+    /// Of words that are aligned to 16.
+    Own(Vec<u128>),
+    Shared(Place),
+    Published,
+}
+
+/// Shared memory that was lent.
+pub(crate) struct Place {
+    pub(crate) segment: Arc<OwnSegment>,
+    /// Where it is in the segment, in bytes.
+    pub(crate) at: u64,
+}
+
+impl Place {
+    fn location(&self) -> Location {
+        Location { segment: self.segment.number(), offset: self.at }
+    }
+}
+
+impl<'a> Loan<'a> {
+    pub(crate) fn copied(writer: Lender<'a>, lead: usize, len: usize) -> Self {
+        let words = vec![0; (lead + len).div_ceil(ALIGNED)];
+        Self { writer, lead, len, written: 0, memory: Memory::Own(words) }
+    }
+
+    /// `len` bytes there behind the first `lead`, all of which have been lent.
+    pub(crate) fn placed(writer: Lender<'a>, lead: usize, len: usize, place: Place) -> Self {
+        Self { writer, lead, len, written: 0, memory: Memory::Shared(place) }
+    }
+
+    /// Publishes it, waiting for a slot as [`Writer::publish`] does.
+    ///
+    /// # Errors
+    /// It was neither written to the end nor borrowed as a slice, or as [`Writer::publish`]. The
+    /// loan is given back.
+    #[inline]
+    pub fn publish(self, meta: Meta) -> Result<Published, PublishError> {
+        self.publish_as(Numbering::Given(meta)).map(|(_, published)| published)
+    }
+
+    /// As [`publish`](Self::publish), with the sequence number that follows the publisher's last,
+    /// which is returned.
+    ///
+    /// # Errors
+    /// As for [`publish`](Self::publish).
+    #[inline]
+    pub fn publish_next(self, source_timestamp: i64) -> Result<u64, PublishError> {
+        self.publish_as(Numbering::Next(source_timestamp)).map(|(sequence, _)| sequence)
+    }
+
+    /// As [`publish_next`](Self::publish_next), stamped with the current time.
+    ///
+    /// # Errors
+    /// As for [`publish`](Self::publish).
+    #[inline]
+    pub fn publish_now(self) -> Result<u64, PublishError> {
+        self.publish_next(wall())
+    }
+
+    /// As [`publish_next`](Self::publish_next), of its first `len` bytes.
+    #[doc(hidden)]
+    #[inline]
+    pub fn publish_front(self, len: usize, source_timestamp: i64) -> Result<u64, PublishError> {
+        let (most, written) = (self.len as u64, self.written as u64);
+        if self.written < len {
+            return Err(PublishError::Incomplete { len: most, written });
+        }
+        let numbering = Numbering::Next(source_timestamp);
+        self.commit(len, numbering, Patience::new(PATIENCE)).map(|(sequence, _)| sequence)
+    }
+
+    #[inline]
+    fn publish_as(self, numbering: Numbering) -> Result<(u64, Published), PublishError> {
+        let len = self.len;
+        if self.written < len {
+            let (len, written) = (len as u64, self.written as u64);
+            return Err(PublishError::Incomplete { len, written });
+        }
+        self.commit(len, numbering, Patience::new(PATIENCE))
+    }
+
+    pub(crate) fn commit(
+        mut self,
+        len: usize,
+        numbering: Numbering,
+        patience: Patience,
+    ) -> Result<(u64, Published), PublishError> {
+        if self.writer.is_forked() {
+            return Err(PublishError::Forked);
+        }
+        let payload = match &self.memory {
+            Memory::Shared(place) if len as u64 > self.writer.longest_copied() => {
+                let (lead, lent) = (self.lead, self.lead + self.len);
+                Payload::Written { at: place.location(), lead, len, lent }
+            }
+            // What has become short is copied from where it was written.
+            Memory::Own(_) | Memory::Shared(_) => Payload::Bytes(&self[..len]),
+            Memory::Published => unreachable!("publishing takes the loan"),
+        };
+        let taken = matches!(payload, Payload::Written { .. });
+        let (sequence, published) = self.writer.commit(numbering, payload, patience)?;
+        // What nobody reads has not become a sample, and its memory is given back.
+        if taken && published.position.is_some() {
+            self.memory = Memory::Published;
+        }
+        Ok((sequence, published))
+    }
+
+    /// The address of the memory that is lent.
+    #[inline]
+    fn lent(&self, place: &Place) -> NonNull<u8> {
+        assert!(!self.writer.is_forked(), "a loan of shared memory, used after fork");
+        place.segment.memory.address(place.at + self.lead as u64, self.len)
+    }
+}
+
+impl Deref for Loan<'_> {
+    type Target = [u8];
+
+    #[inline]
+    fn deref(&self) -> &[u8] {
+        match &self.memory {
+            Memory::Own(words) => &bytes_of(words)[self.lead..][..self.len],
+            // SAFETY: `len` bytes of the segment's map, which lives as long as the loan. They are
+            // memory from the system or bytes of earlier samples, so initialized. They are lent to
+            // this loan alone, and no reader reads them before they are published, which takes the
+            // loan: nothing writes to them while it is borrowed. The words of the whole map that
+            // exist beside are atomic and not touched here.
+            Memory::Shared(place) => unsafe {
+                slice::from_raw_parts(self.lent(place).as_ptr(), self.len)
+            },
+            Memory::Published => &[],
+        }
+    }
+}
+
+impl DerefMut for Loan<'_> {
+    /// Whoever borrows it is taken to write all of it.
+    #[inline]
+    fn deref_mut(&mut self) -> &mut [u8] {
+        self.written = self.len;
+        if let Memory::Shared(place) = &self.memory {
+            let start = self.lent(place).as_ptr();
+            // SAFETY: as in `deref`, and borrowed mutably like the loan itself. Other processes
+            // have the memory mapped; they cannot write to it, and those that keep to the protocol
+            // do not read it.
+            return unsafe { slice::from_raw_parts_mut(start, self.len) };
+        }
+        match &mut self.memory {
+            Memory::Own(words) => &mut bytes_of_mut(words)[self.lead..][..self.len],
+            Memory::Shared(_) | Memory::Published => &mut [],
+        }
+    }
+}
+
+impl io::Write for Loan<'_> {
+    /// Appends; writes nothing once the loan is full.
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if self.writer.is_forked() {
+            return Err(io::Error::other(PublishError::Forked));
+        }
+        let from = self.written;
+        let count = bytes.len().min(self.len - from);
+        self[from..from + count].copy_from_slice(&bytes[..count]);
+        self.written = from + count;
+        Ok(count)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl Drop for Loan<'_> {
+    fn drop(&mut self) {
+        // The history of a forked child is a copy that nobody uses, and its lock may be held.
+        if let Memory::Shared(place) = &self.memory
+            && !self.writer.is_forked()
+        {
+            self.writer.give_back(place.location(), self.lead + self.len);
+        }
+    }
+}
+
+fn bytes_of(words: &[u128]) -> &[u8] {
+    // SAFETY: the same memory, borrowed as long; any byte of a word is a byte.
+    unsafe { slice::from_raw_parts(words.as_ptr().cast(), size_of_val(words)) }
+}
+
+fn bytes_of_mut(words: &mut [u128]) -> &mut [u8] {
+    // SAFETY: the same memory, borrowed as long and mutably; any bytes are a word.
+    unsafe { slice::from_raw_parts_mut(words.as_mut_ptr().cast(), size_of_val(words)) }
+}

@@ -1,0 +1,505 @@
+//! The publishing end of a ring.
+
+pub(crate) mod absent;
+pub(crate) mod audience;
+mod commit;
+mod handover;
+pub(crate) mod history;
+pub(crate) mod loan;
+pub(crate) mod room;
+pub(crate) mod samples;
+mod tally;
+mod times;
+
+use std::{sync::Arc, time::Duration};
+
+pub use self::commit::MAX_GAP;
+pub(super) use self::commit::Patience;
+
+use crate::{
+    alloc::{
+        allowance::Pool,
+        area::Area,
+        heap::{Need, Object},
+    },
+    error::{PublishError, ShmError},
+    ids::Gid,
+    os::pi_mutex::{PiGuard, PiMutex},
+    qos::History as Keep,
+    ring::{
+        layout::{self, ALIGNED, Array, COPIED, COPIED_ALWAYS, Location},
+        protocol,
+        times::offer,
+        types::{Grant, Meta, Published, RingOptions},
+        window::keeps_all,
+    },
+    session::{
+        orphans::Orphan,
+        reader_info::{ReaderInfo, Terms},
+        seats::Pinned,
+        segment::SessionSegment,
+    },
+    writer::{
+        audience::Audience,
+        history::History,
+        loan::{Lender, Loan},
+        room::Maps,
+        samples::Samples,
+    },
+};
+
+/// How long a publish waits for a KEEP_ALL reader.
+pub(super) const PATIENCE: Duration = Duration::from_millis(100);
+/// How often a publish looks for the reader that is in its way before it gives up on the answer.
+pub(super) const LOOKS: u32 = 1000;
+/// Descriptors up to which a ring grows for its readers' depths.
+const DESCRIPTORS: u64 = 1 << 14;
+/// Descriptors up to which one grows for its own depth, whatever that is: they do not count for its budget.
+const DESCRIPTORS_KEEP_LAST: u64 = 1 << 18;
+/// Descriptors up to which one grows that keeps all until its readers have it, and no longer: beyond that
+/// it holds its publisher back.
+const DESCRIPTORS_KEEP_ALL: u64 = 1 << 13;
+
+/// A publisher's ring. All methods may be called from any thread.
+///
+/// Readers keep the ring mapped after it is dropped and drain what it holds.
+///
+/// ```
+/// use axon_shm::{
+///     Meta,
+///     ids::{Gid, SessionId},
+///     internal::{Peer, Reader, ReaderInfo, ReaderOptions, RingOptions, SessionSegment, Writer},
+///     qos::Qos,
+/// };
+///
+/// let id = SessionId::random();
+/// let session = SessionSegment::create(id)?;
+/// let (writer_gid, reader_gid) = (Gid::new(id, 1), Gid::new(id, 2));
+/// let options = RingOptions {
+///     gid: writer_gid,
+///     qos: Qos::default(),
+///     budget: 1 << 20,
+///     max_message: 1 << 20,
+///     expected: 0,
+/// };
+/// let writer = Writer::create(session.clone(), options)?;
+///
+/// let lane = session.allocate_lane()?;
+/// let peer = Peer::Local(session.clone());
+/// let grant = writer.attach(ReaderInfo {
+///     gid: reader_gid,
+///     lane: lane.location(),
+///     qos: Qos::default(),
+///     peer: peer.clone(),
+///     stands_for: None,
+/// })?;
+/// let mut reader = Reader::map(ReaderOptions {
+///     reader: reader_gid,
+///     writer: writer_gid,
+///     peer,
+///     ring: writer.location(),
+///     lane,
+///     grant,
+///     qos: Qos::default(),
+///     max_message: 1 << 20,
+/// })?;
+///
+/// writer.publish(Meta { sequence: 1, source_timestamp: 0, published: 0 }, b"hello")?;
+/// let mut payload = Vec::new();
+/// let taken = reader.take(&mut payload)?.expect("a sample");
+/// assert_eq!((taken.meta.sequence, &payload[..]), (1, &b"hello"[..]));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+pub struct Writer {
+    options: RingOptions,
+    pub(super) session: Arc<SessionSegment>,
+    /// The ring's header.
+    pub(super) ring: Object,
+    /// The most descriptors.
+    pub(super) limit: u64,
+    state: PiMutex<State>,
+}
+
+pub(super) struct State {
+    pub(super) history: History,
+    pub(super) audience: Audience,
+    /// The descriptors.
+    pub(super) array: Object,
+    /// The segments that blocks are in.
+    pub(super) maps: Maps,
+    /// Where the next samples go that readers pin, once there has been one.
+    pub(super) samples: Option<Samples>,
+    /// The tail as readers see it.
+    pub(super) shown_tail: u64,
+    /// What was found pinned, kept for its memory.
+    pub(super) pinned: Pinned,
+    /// The last sample's sequence number.
+    last: u64,
+    /// Of the samples that relays gave up: those of which a wait said so.
+    known_given_up: u64,
+    /// Samples published, read or not.
+    published: u64,
+}
+
+/// The descriptors that a ring needs which keeps what fits in `budget`: a sample takes one at least.
+fn most_descriptors(budget: u64) -> u64 {
+    (budget / layout::DESCRIPTOR).max(layout::FIRST_DESCRIPTORS).next_power_of_two()
+}
+
+impl State {
+    /// The first position that stands whose sample has a higher number.
+    fn position_after(&self, number: u64) -> u64 {
+        let standing = self.history.tail()..self.history.head();
+        let later = |position: &u64| protocol::number(self.array.words(), *position) > number;
+        standing.rev().take_while(later).last().unwrap_or(self.history.head())
+    }
+
+    /// The number of the last sample in front of a position.
+    pub(super) fn number_before(&self, position: u64) -> u64 {
+        let stands = position >= self.history.tail() && position < self.history.head();
+        if stands {
+            protocol::number(self.array.words(), position).saturating_sub(1)
+        } else {
+            self.last
+        }
+    }
+
+    fn new(audience: Audience, history: History, array: Object) -> Self {
+        Self {
+            history,
+            audience,
+            array,
+            maps: Maps::default(),
+            samples: None,
+            shown_tail: 0,
+            pinned: Pinned::default(),
+            last: 0,
+            known_given_up: 0,
+            published: 0,
+        }
+    }
+}
+
+/// How samples are numbered.
+#[derive(Clone, Copy)]
+pub(super) enum Numbering {
+    /// As given.
+    Given(Meta),
+    /// One up from the last, with this source timestamp.
+    Next(i64),
+}
+
+/// A sample's bytes on their way into a ring.
+#[derive(Clone, Copy)]
+pub(super) enum Payload<'a> {
+    /// At most [`COPIED`] bytes, copied in under the lock.
+    Bytes(&'a [u8]),
+    /// Written to memory that was lent: where, how far behind its start, the sample's length, and how
+    /// much was lent.
+    Written { at: Location, lead: usize, len: usize, lent: usize },
+}
+
+impl Writer {
+    /// Makes a ring. Its memory is taken as samples need it.
+    ///
+    /// # Errors
+    /// The options exceed what a ring may take, or memory or descriptors are short.
+    pub fn create(session: Arc<SessionSegment>, options: RingOptions) -> Result<Self, ShmError> {
+        if session.is_forked() {
+            return Err(ShmError::Forked);
+        }
+        let RingOptions { qos, budget, max_message, expected, .. } = options;
+        if max_message > layout::MAX_MESSAGE || budget > layout::MAX_BUDGET {
+            return Err(ShmError::TooLarge { max_message, budget });
+        }
+        session.tidy();
+        let limit = match qos.history {
+            Keep::KeepLast => (u64::from(qos.depth) + 1)
+                .next_power_of_two()
+                .clamp(DESCRIPTORS, DESCRIPTORS_KEEP_LAST),
+            Keep::KeepAll if keeps_all(&qos) => most_descriptors(budget),
+            Keep::KeepAll => DESCRIPTORS_KEEP_ALL,
+        }
+        .min(layout::MAX_DESCRIPTORS);
+        // Readers are told of the segments with the ring.
+        let allocate = |len| {
+            let object = session.allocate(len, Need::Now, |_| true)?;
+            Ok::<Object, ShmError>(object.expect("there is always one that will do"))
+        };
+        let ring = allocate(layout::RING)?;
+        let descriptors = layout::FIRST_DESCRIPTORS;
+        let array = match allocate(descriptors * layout::DESCRIPTOR) {
+            Ok(array) => array,
+            Err(error) => {
+                session.release(ring.block);
+                return Err(error);
+            }
+        };
+        protocol::copy_descriptors(array.words(), array.words(), 0, 0);
+        let at = Array { at: array.block.at, descriptors };
+        layout::write_ring(ring.words(), options.gid, &at);
+        offer(ring.words(), &options.qos);
+        let mut history = History::new(descriptors, budget);
+        if keeps_all(&qos) {
+            history.count_descriptors();
+        }
+        let audience = Audience::new(qos, limit - 1, Pool::new(budget, max_message));
+        let state = State::new(audience, history, array);
+        let writer = Self { options, session, ring, limit, state: PiMutex::new(state)? };
+        writer.add_bytes(layout::RING + descriptors * layout::DESCRIPTOR);
+        writer.show_window(&writer.lock());
+        if expected > COPIED_ALWAYS {
+            writer.open_samples(&mut writer.lock())?;
+        }
+        Ok(writer)
+    }
+
+    /// As [`create`](Self::create), for requests or responses: of a KEEP_LAST reader in another session,
+    /// too, it gives up nothing that is within the depth.
+    pub fn create_for_calls(
+        session: Arc<SessionSegment>,
+        options: RingOptions,
+    ) -> Result<Self, ShmError> {
+        let writer = Self::create(session, options)?;
+        writer.lock().audience.heed_depths();
+        Ok(writer)
+    }
+
+    /// The publisher's GID.
+    #[inline]
+    pub fn gid(&self) -> Gid {
+        self.options.gid
+    }
+
+    /// Where the ring is in its session's memory, for readers.
+    #[inline]
+    pub fn location(&self) -> Location {
+        self.ring.block.at
+    }
+
+    /// Adds a reader, or answers with the grant that stands when it is attached by the same lane.
+    ///
+    /// # Errors
+    /// Its session has no such lane, or its process as many readers of this publisher as it may.
+    pub fn attach(&self, reader: ReaderInfo) -> Result<Grant, ShmError> {
+        Ok(self.attach_on(reader, Terms::default())?.0)
+    }
+
+    /// As [`attach`](Self::attach), on a reader's terms: one that was attached before goes on with what
+    /// stands of the samples behind those that it has. Also returns the number of the sample in front of
+    /// the first that it is granted.
+    ///
+    /// # Errors
+    /// As [`attach`](Self::attach).
+    pub fn attach_on(&self, reader: ReaderInfo, terms: Terms) -> Result<(Grant, u64), ShmError> {
+        if self.is_forked() {
+            return Err(ShmError::Forked);
+        }
+        let lane = reader.peer.lane(reader.lane)?;
+        let mut state = self.lock();
+        let resumed = terms.after.map(|after| state.position_after(after));
+        let State { audience, history, .. } = &mut *state;
+        let (tail, head) = (history.tail(), history.head());
+        let granted = audience.attach(reader, lane, tail, head, resumed, terms.carries);
+        self.show_window(&state);
+        granted.map(|grant| (grant, state.number_before(grant.first)))
+    }
+
+    /// Forgets a reader; false when it was not attached. The samples that it keeps it may keep.
+    pub fn detach(&self, reader: Gid) -> bool {
+        !self.is_forked() && self.change(|audience, head| audience.detach(reader, head))
+    }
+
+    /// Forgets the readers whose process has ended, and names them.
+    pub fn drop_dead(&self) -> Vec<Gid> {
+        if self.is_forked() { Vec::new() } else { self.change(Audience::drop_dead) }
+    }
+
+    /// As [`drop_dead`](Self::drop_dead), and those that have left without a word.
+    pub fn drop_gone(&self) -> Vec<Gid> {
+        if self.is_forked() { Vec::new() } else { self.change(Audience::drop_gone) }
+    }
+
+    fn change<T>(&self, by: impl FnOnce(&mut Audience, u64) -> T) -> T {
+        let mut state = self.lock();
+        // A session of which this was the last part is unmapped after the lock, and not under it.
+        let peers = state.audience.peers();
+        let State { audience, history, .. } = &mut *state;
+        let changed = by(audience, history.head());
+        self.show_window(&state);
+        drop(state);
+        drop(peers);
+        changed
+    }
+
+    /// The subscriptions that are attached; a relay shows as those that it stands for.
+    pub fn readers(&self) -> Vec<Gid> {
+        if self.is_forked() { Vec::new() } else { self.lock().audience.readers() }
+    }
+
+    /// Whether any reader is attached.
+    #[inline]
+    pub fn has_readers(&self) -> bool {
+        !self.is_forked() && !self.lock().audience.is_empty()
+    }
+
+    /// If a sample would be read by nobody, now or later, uses up the next sequence number as if one
+    /// had been published, and returns it. `None` when somebody would. So whoever has to serialize
+    /// first can save itself the work.
+    ///
+    /// # Errors
+    /// The process forked.
+    pub fn skip_unread(&self) -> Result<Option<u64>, PublishError> {
+        if self.is_forked() {
+            return Err(PublishError::Forked);
+        }
+        let mut state = self.lock();
+        Ok(self.is_unread(&state).then(|| self.pass(&mut state, Numbering::Next(0)).sequence))
+    }
+
+    /// Publishes a sample. Where this publisher and a reader of another session are both RELIABLE
+    /// and KEEP_ALL, waits up to 100 ms for the reader to make room; never otherwise.
+    ///
+    /// # Errors
+    /// The sample was not published; what to do is in the error.
+    #[inline]
+    pub fn publish(&self, meta: Meta, payload: &[u8]) -> Result<Published, PublishError> {
+        self.publish_within(Numbering::Given(meta), payload, PATIENCE)
+            .map(|(_, published)| published)
+    }
+
+    /// As [`publish`](Self::publish), but does not wait: [`PublishError::Blocked`] at once.
+    ///
+    /// # Errors
+    /// As [`publish`](Self::publish).
+    #[inline]
+    pub fn try_publish(&self, meta: Meta, payload: &[u8]) -> Result<Published, PublishError> {
+        let numbering = Numbering::Given(meta);
+        self.publish_within(numbering, payload, Duration::ZERO).map(|(_, published)| published)
+    }
+
+    /// As [`publish`](Self::publish), with the sequence number that follows the last, which is
+    /// returned.
+    ///
+    /// # Errors
+    /// As [`publish`](Self::publish).
+    #[inline]
+    pub fn publish_next(&self, source_timestamp: i64, payload: &[u8]) -> Result<u64, PublishError> {
+        let numbering = Numbering::Next(source_timestamp);
+        self.publish_within(numbering, payload, PATIENCE).map(|(sequence, _)| sequence)
+    }
+
+    /// As [`publish_next`](Self::publish_next), but does not wait.
+    ///
+    /// # Errors
+    /// As [`try_publish`](Self::try_publish).
+    #[inline]
+    pub fn try_publish_next(
+        &self,
+        source_timestamp: i64,
+        payload: &[u8],
+    ) -> Result<u64, PublishError> {
+        let numbering = Numbering::Next(source_timestamp);
+        self.publish_within(numbering, payload, Duration::ZERO).map(|(sequence, _)| sequence)
+    }
+
+    /// Lends `len` bytes to be written and then published: of shared memory where it is more than
+    /// 4 KiB, or 512 bytes if so many are [expected](RingOptions::expected). May wait as
+    /// [`publish`](Self::publish) does.
+    ///
+    /// # Errors
+    /// As [`publish`](Self::publish).
+    #[inline]
+    pub fn loan(&self, len: usize) -> Result<Loan<'_>, PublishError> {
+        self.loan_behind(0, len)
+    }
+
+    /// As [`loan`](Self::loan); aligned to 16 is what is behind the first `header` bytes.
+    ///
+    /// # Errors
+    /// As [`publish`](Self::publish).
+    #[inline]
+    pub fn loan_behind(&self, header: usize, len: usize) -> Result<Loan<'_>, PublishError> {
+        self.lend_to(Lender::Borrowed(self), header, len)
+    }
+
+    /// As [`loan_behind`](Self::loan_behind), for who keeps the writer with it.
+    #[inline]
+    pub fn loan_owned(
+        self: &Arc<Self>,
+        header: usize,
+        len: usize,
+    ) -> Result<Loan<'static>, PublishError> {
+        self.lend_to(Lender::Shared(Arc::clone(self)), header, len)
+    }
+
+    /// The longest loan in bytes that is copied after all.
+    #[inline]
+    pub(super) fn longest_copied(&self) -> u64 {
+        if self.options.expected > COPIED_ALWAYS { COPIED_ALWAYS } else { COPIED }
+    }
+
+    fn lend_to<'a>(
+        &self,
+        lender: Lender<'a>,
+        header: usize,
+        len: usize,
+    ) -> Result<Loan<'a>, PublishError> {
+        self.check(len)?;
+        let lead = header.wrapping_neg() % ALIGNED;
+        if len as u64 <= self.longest_copied() {
+            return Ok(Loan::copied(lender, lead, len));
+        }
+        let bytes = Area::rounded((lead + len) as u64);
+        let place =
+            self.patiently(&mut Patience::new(PATIENCE), |state| self.lend(state, bytes))?;
+        Ok(Loan::placed(lender, lead, len, place))
+    }
+
+    pub(super) fn give_back(&self, at: Location, len: usize) {
+        self.lock().history.give_back(at, Area::rounded(len as u64));
+    }
+
+    #[inline]
+    pub(super) fn is_forked(&self) -> bool {
+        self.session.is_forked()
+    }
+
+    #[inline]
+    pub(super) fn options(&self) -> &RingOptions {
+        &self.options
+    }
+
+    fn check(&self, len: usize) -> Result<u64, PublishError> {
+        if self.is_forked() {
+            return Err(PublishError::Forked);
+        }
+        let (len, max) = (len as u64, self.options.max_message);
+        if len > max { Err(PublishError::TooLarge { len, max }) } else { Ok(Area::rounded(len)) }
+    }
+
+    #[inline]
+    pub(super) fn lock(&self) -> PiGuard<'_, State> {
+        self.state.lock()
+    }
+}
+
+impl Drop for Writer {
+    fn drop(&mut self) {
+        // In a forked child all of it is the parent's.
+        if self.is_forked() {
+            return;
+        }
+        let State { mut history, array, audience, .. } = {
+            let mut state = self.lock();
+            let nobody = Audience::new(self.options.qos, 0, Pool::default());
+            let empty = State::new(nobody, History::new(1, 0), self.ring.clone());
+            std::mem::replace(&mut *state, empty)
+        };
+        // Readers drain what stands. After them nobody looks at any of it.
+        let mut blocks = vec![self.ring.block, array.block];
+        blocks.extend(history.all_blocks());
+        let samples = history.pinned().segments().collect();
+        self.session.adopt(Orphan { seats: audience.into_seats(), blocks, samples });
+    }
+}

@@ -1,0 +1,224 @@
+//! How a publisher gets room for the next sample: descriptors, blocks, and what it gives up for
+//! them. Large samples have [memory of their own](super::samples).
+
+use std::sync::{Arc, atomic::AtomicU64};
+
+use crate::{
+    alloc::{
+        area::Area,
+        heap::{Block, Need, Object},
+    },
+    error::{Keeper, PublishError, ShmError},
+    memory::segment::Map,
+    ring::{
+        layout::{self, Array, COPIED},
+        protocol,
+    },
+    session::seats::Holder,
+    writer::{State, Writer, history::Held},
+};
+
+/// Why an attempt to publish did not succeed.
+pub(crate) enum Refusal {
+    /// A KEEP_ALL reader holds the oldest sample.
+    Held,
+    Error(PublishError),
+    /// Readers keep what memory there is.
+    Kept(Kept),
+}
+
+/// Who keeps it.
+pub(crate) struct Kept {
+    pub(crate) holder: Holder,
+    pub(crate) samples: usize,
+    /// Why there is no more of it, where it is not that the segments are full.
+    pub(crate) short: Option<PublishError>,
+}
+
+impl Kept {
+    /// As whoever publishes is told. Looks the process up, so not to be called under a lock.
+    pub(crate) fn into_error(self) -> PublishError {
+        let Self { holder, samples, short } = self;
+        let keeper = Keeper { reader: holder.reader, process: holder.process(), samples };
+        match short {
+            Some(PublishError::NoMemory { needed, available, .. }) => {
+                PublishError::NoMemory { needed, available, keeper: Some(keeper) }
+            }
+            Some(other) => other,
+            None => PublishError::Pinned { keeper },
+        }
+    }
+}
+
+impl From<PublishError> for Refusal {
+    fn from(error: PublishError) -> Self {
+        Self::Error(error)
+    }
+}
+
+impl From<Held> for Refusal {
+    fn from(Held: Held) -> Self {
+        Self::Held
+    }
+}
+
+/// The maps of the segments that a ring's blocks are in: few.
+#[derive(Default)]
+pub(crate) struct Maps(Vec<(u32, Arc<Map>)>);
+
+impl Maps {
+    fn add(&mut self, object: &Object) {
+        let number = object.block.at.segment;
+        if self.0.iter().all(|(known, _)| *known != number) {
+            self.0.push((number, Arc::clone(&object.map)));
+        }
+    }
+
+    fn words(&self, block: &Block) -> &[AtomicU64] {
+        let (_, map) = self
+            .0
+            .iter()
+            .find(|(number, _)| *number == block.at.segment)
+            .expect("the segment of each block was added");
+        let start = block.at.offset as usize / 8;
+        &map.words()[start..start + block.len as usize / 8]
+    }
+}
+
+/// As whoever publishes is told.
+pub(crate) fn no_memory(error: ShmError) -> PublishError {
+    match error {
+        ShmError::NoMemory { needed, available } => {
+            PublishError::NoMemory { needed, available, keeper: None }
+        }
+        other => PublishError::Segment { reason: other.to_string() },
+    }
+}
+
+impl Writer {
+    /// Makes sure that the next position has a descriptor.
+    pub(crate) fn make_place(&self, state: &mut State) -> Result<(), Refusal> {
+        if state.history.is_full() {
+            let floors = state.audience.floors(state.history.head());
+            // What has been taken in is kept a little longer than the window asks for, so that the
+            // tail moves seldom and readers keep it in their caches.
+            let window = state.audience.window();
+            let surplus = floors.retained.saturating_sub(state.history.tail());
+            let wanted = window.saturating_add((window / 4).max(4));
+            if surplus == 0 || state.history.capacity() < wanted {
+                // A publish that waits for readers leaves them the time to map what they lack.
+                // Nor does one give up what it keeps for others because of a reader that lacks it.
+                let now = floors.held < u64::MAX || state.audience.keeps_all();
+                let need = if now { Need::Now } else { Need::Mapped };
+                self.grow(state, need);
+            }
+            let history = &mut state.history;
+            if history.is_full() && surplus > 0 {
+                history.release_below(history.tail() + surplus.div_ceil(2));
+            }
+            history.make_place(|position| position < floors.held)?;
+        }
+        if !state.history.has_room_for_descriptor() {
+            let floors = state.audience.floors(state.history.head());
+            state.history.make_room(0, |position| position < floors.held)?;
+        }
+        self.show_tail(state);
+        Ok(())
+    }
+
+    /// Moves to twice as many descriptors, if they are to be had where they are needed. If not, the
+    /// oldest samples go, and the next publish tries again.
+    fn grow(&self, state: &mut State, need: Need) {
+        let descriptors = 2 * (state.history.capacity() + 1);
+        if descriptors > self.limit {
+            return;
+        }
+        let audience = &state.audience;
+        let bytes = descriptors * layout::DESCRIPTOR;
+        let mapped = |number| audience.has_mapped(number);
+        let Ok(Some(array)) = self.session.allocate(bytes, need, mapped) else { return };
+        // Only what stands moves, so readers must not take more for standing.
+        self.show_tail(state);
+        let history = &mut state.history;
+        let (tail, head) = (history.tail(), history.head());
+        protocol::copy_descriptors(state.array.words(), array.words(), tail, head);
+        let word = Array { at: array.block.at, descriptors }.word();
+        protocol::replace(self.ring.words(), word);
+        history.grow();
+        let old = std::mem::replace(&mut state.array, array);
+        self.add_bytes(bytes);
+        self.subtract_bytes(old.block.len);
+        self.session.release(old.block);
+        if 2 * descriptors <= self.limit {
+            self.session.foresee(2 * bytes);
+        }
+    }
+
+    /// Copies at most [`COPIED`] bytes in for the next position, which has a descriptor.
+    pub(crate) fn copy_in(&self, state: &mut State, payload: &[u8]) -> Result<Block, Refusal> {
+        debug_assert!(payload.len() as u64 <= COPIED);
+        let bytes = Area::rounded(payload.len() as u64);
+        // Nobody asks without need how far readers are: they say so in cache lines of their own.
+        let at_hand =
+            if state.history.has_room(bytes) { state.history.blocks().take(bytes) } else { None };
+        let block = match at_hand {
+            Some(block) => block,
+            None => self.block_with_room(state, bytes)?,
+        };
+        self.show_tail(state);
+        protocol::about_to_write::<AtomicU64>();
+        protocol::copy_in(state.maps.words(&block), payload);
+        Ok(block)
+    }
+
+    /// A block for a sample, for which the oldest samples go if they have to.
+    fn block_with_room(&self, state: &mut State, bytes: u64) -> Result<Block, Refusal> {
+        let floors = state.audience.floors(state.history.head());
+        let may_go = |position| position < floors.held;
+        state.history.make_room(bytes, may_go)?;
+        loop {
+            if let Some(block) = state.history.blocks().take(bytes) {
+                return Ok(block);
+            }
+            match self.block(state, bytes) {
+                Ok(block) => return Ok(block),
+                Err(error) if !state.history.shrink(may_go)? => return Err(error.into()),
+                Err(_) => self.give_blocks_back(state),
+            }
+        }
+    }
+
+    /// A new block of the session's memory.
+    fn block(&self, state: &mut State, bytes: u64) -> Result<Block, PublishError> {
+        if state.history.blocks().are_many() {
+            self.give_blocks_back(state);
+        }
+        let audience = &state.audience;
+        let mapped = |number| audience.has_mapped(number);
+        let object = self
+            .session
+            .allocate(bytes, Need::Now, mapped)
+            .map_err(no_memory)?
+            .expect("there is always one that will do");
+        state.maps.add(&object);
+        self.add_bytes(object.block.len);
+        Ok(object.block)
+    }
+
+    fn give_blocks_back(&self, state: &mut State) {
+        // Others write there from now on.
+        self.show_tail(state);
+        for block in state.history.blocks().drain() {
+            self.subtract_bytes(block.len);
+            self.session.release(block);
+        }
+    }
+
+    /// Tells readers what has been given up. Before any of it is written over.
+    pub(crate) fn show_tail(&self, state: &mut State) {
+        if state.shown_tail != state.history.tail() {
+            state.shown_tail = state.history.tail();
+            protocol::retire(self.ring.words(), state.shown_tail);
+        }
+    }
+}

@@ -1,0 +1,313 @@
+//! The memory of a publisher's large samples, which readers read in place: segments of its own,
+//! which come with the first such sample and go when they are not needed any more.
+
+use std::{
+    sync::{Arc, atomic::AtomicU64},
+    time::Instant,
+};
+
+use crate::{
+    alloc::{
+        allowance::samples_bytes,
+        segments::{OwnSegment, SegmentEvent},
+        slots::TURNS,
+        tenure::Tenure,
+    },
+    error::{PublishError, ShmError},
+    ring::{
+        layout::{self, COPIED_ALWAYS, Location, SLOTS_AT},
+        pins::{self, RECORDS},
+        protocol,
+    },
+    session::seats::Holder,
+    writer::{
+        LOOKS, State, Writer,
+        history::Held,
+        loan::Place,
+        room::{Kept, Refusal, no_memory},
+    },
+};
+
+/// Segments of one publisher at most: while readers keep all that one holds, another takes over.
+const SEGMENTS: usize = 4;
+/// Bytes that are committed at most beyond what is needed.
+const AHEAD: u64 = 1 << 20;
+
+/// The segment that takes samples in.
+pub(crate) struct Samples {
+    segment: Arc<OwnSegment>,
+    tenure: Tenure,
+    /// The length in bytes of the last sample, when no slot is ready for another like it.
+    ahead: Option<u64>,
+    /// Slots that may be taken before readers are looked at again.
+    turns: u32,
+}
+
+/// Backs a segment with memory up to `end`, a little further when it keeps growing. Up to where.
+fn back(segment: &OwnSegment, backed: u64, end: u64) -> Result<u64, PublishError> {
+    let ahead = backed + ((backed - SLOTS_AT) / 8).min(AHEAD);
+    let memory = &segment.memory;
+    let upto = end.max(ahead).next_multiple_of(layout::ALIGN).min(memory.bytes());
+    memory.commit(backed, upto).map_err(no_memory)?;
+    memory.touch(backed, upto);
+    Ok(upto)
+}
+
+impl Writer {
+    /// Has memory ready for one more sample like the last large one, so that publishing it waits
+    /// for none: for whoever has time between samples. [`SegmentEvent::Low`] tells when to.
+    ///
+    /// # Errors
+    /// There is no memory, or the process forked.
+    pub fn prepare(&self) -> Result<(), ShmError> {
+        if self.is_forked() {
+            return Err(ShmError::Forked);
+        }
+        let (segment, at, len, from, end) = {
+            let mut state = self.lock();
+            let Some(samples) = &mut state.samples else { return Ok(()) };
+            let Some(len) = samples.ahead.take() else { return Ok(()) };
+            let segment = Arc::clone(&samples.segment);
+            let pinned = state.history.pinned();
+            let Some(at) = pinned.take(len) else { return Ok(()) };
+            let slots = pinned.slots(at);
+            let (from, end) = (slots.backed(), slots.end(at.offset, len));
+            if end <= from {
+                pinned.put_back(at, len);
+                return Ok(());
+            }
+            (segment, at, len, from, end.next_multiple_of(layout::ALIGN))
+        };
+        // It is nobody else's meanwhile, so this needs no lock. That a publish backs some of it,
+        // too, does no harm.
+        let end = end.min(segment.memory.bytes());
+        let committed = segment.memory.commit(from, end);
+        if committed.is_ok() {
+            segment.memory.touch(from, end);
+        }
+        let mut state = self.lock();
+        let pinned = state.history.pinned();
+        match committed {
+            Ok(()) => {
+                pinned.slots(at).back(end);
+                pinned.put_back(at, len);
+            }
+            Err(_) => pinned.forgo(at, len),
+        }
+        committed
+    }
+
+    /// Gives memory of large samples back that is not needed any more: all of it once there was
+    /// no such sample for ten seconds and none is wanted, else what is far more than was needed
+    /// for as long. To be called about once a second for as long as it says that there is any.
+    pub fn tend(&self, now: Instant) -> bool {
+        if self.is_forked() {
+            return false;
+        }
+        let mut state = self.lock();
+        let State { history, audience, .. } = &mut *state;
+        if history.pinned().segments().len() == 0 {
+            return false;
+        }
+        audience.sweep();
+        let floors = audience.floors(history.head());
+        history.release_below(floors.retained.max(audience.consumed(history.head())));
+        self.reclaim(&mut state);
+        let State { history, samples, .. } = &mut *state;
+        if let (Some(open), Some((used, backed))) = (samples.as_mut(), history.pinned().extent())
+            && open.tenure.is_over(now, used, backed - SLOTS_AT)
+        {
+            history.pinned().leave();
+            *samples = None;
+        }
+        self.close_vacated(&mut state);
+        state.history.pinned().segments().len() > 0
+    }
+
+    /// Has a segment that takes samples in.
+    pub(crate) fn open_samples(&self, state: &mut State) -> Result<(), ShmError> {
+        if state.samples.is_none() { self.open_another(state) } else { Ok(()) }
+    }
+
+    /// Has a new segment take samples in. What is in the last one stays there.
+    fn open_another(&self, state: &mut State) -> Result<(), ShmError> {
+        let options = self.options();
+        let bytes = samples_bytes(options.budget, options.max_message, RECORDS as u64);
+        let segment = self.session.open_samples(options.gid, bytes)?;
+        state.history.pinned().open(segment.number(), SLOTS_AT..bytes);
+        let tenure = Tenure::begin(Instant::now());
+        state.samples = Some(Samples { segment, tenure, ahead: None, turns: 0 });
+        Ok(())
+    }
+
+    /// Takes `bytes`, more than [`COPIED_ALWAYS`], that no reader reads.
+    pub(crate) fn lend(&self, state: &mut State, bytes: u64) -> Result<Place, Refusal> {
+        debug_assert!(bytes > COPIED_ALWAYS);
+        self.open_samples(state).map_err(no_memory)?;
+        if let Some(place) = self.next_turn(state, bytes) {
+            return Ok(place);
+        }
+        let floors = state.audience.floors(state.history.head());
+        let may_go = |position| position < floors.held;
+        // What all readers have taken goes first: its memory is the warmest.
+        let consumed = state.audience.consumed(state.history.head());
+        state.history.release_below(floors.retained.max(consumed));
+        let mut short = None;
+        if state.history.is_short_of(bytes) {
+            // It takes more memory in any case, so that is had before anything is given up for it.
+            self.reclaim(state);
+            match self.place(state, bytes, true) {
+                Ok(Some(place)) => {
+                    return match state.history.make_room(0, may_go) {
+                        Ok(()) => Ok(place),
+                        Err(held) => {
+                            let at = Location { segment: place.segment.number(), offset: place.at };
+                            state.history.give_back(at, bytes);
+                            Err(held.into())
+                        }
+                    };
+                }
+                Ok(None) => {}
+                Err(error) => short = Some(error),
+            }
+        }
+        if short.is_none() {
+            state.history.make_room(bytes, may_go)?;
+        }
+        let mut worthwhile = None;
+        for look in 0.. {
+            self.reclaim(state);
+            // Asked once: from then on only memory that there is.
+            match self.place(state, bytes, short.is_none()) {
+                Ok(Some(place)) => return Ok(place),
+                Ok(None) => {}
+                Err(error) => {
+                    short = Some(error);
+                    worthwhile = None;
+                }
+            }
+            let kept: Vec<u64> = state.history.pinned().retired().collect();
+            // Readers keep what there is of it, which is their right.
+            let segments = state.history.pinned().segments().len();
+            if short.is_none() && !kept.is_empty() && segments < SEGMENTS {
+                match self.open_another(state).map_err(no_memory) {
+                    Ok(()) => {}
+                    Err(error) => short = Some(error),
+                }
+                continue;
+            }
+            // What stands lower may be large enough, or backed already. But nothing is given up for
+            // a sample that not even all of it makes room for.
+            let history = &mut state.history;
+            if *worthwhile.get_or_insert_with(|| history.would_hold(bytes, short.is_none())) {
+                match history.shrink(may_go) {
+                    Ok(true) => continue,
+                    Err(Held) if short.is_none() => return Err(Refusal::Held),
+                    Ok(false) | Err(Held) => {}
+                }
+            }
+            if kept.is_empty() {
+                let loans = state.history.pinned().loans();
+                return Err(short.unwrap_or(PublishError::Loaned { loans }).into());
+            }
+            match state.audience.holder(&kept) {
+                // Whoever pinned them has let go, or died, just now. One that does so for ever is
+                // out for trouble.
+                None if look < LOOKS => {}
+                holder => {
+                    let holder = holder.unwrap_or(Holder { reader: self.gid(), peer: None });
+                    return Err(Refusal::Kept(Kept { holder, samples: kept.len(), short }));
+                }
+            }
+        }
+        unreachable!("the looks are counted")
+    }
+
+    /// A slot at hand, as long as slots take turns: to find out what readers have taken costs lines
+    /// that they have just written to, and need not be done for each sample.
+    fn next_turn(&self, state: &mut State, bytes: u64) -> Option<Place> {
+        let State { history, samples: Some(samples), .. } = state else { return None };
+        let Some(turns) = samples.turns.checked_sub(1) else {
+            samples.turns = TURNS - 1;
+            return None;
+        };
+        let at = history.lend_turn(bytes)?;
+        samples.turns = turns;
+        // That there is no memory for it only ends the turns.
+        self.settled(state, at, bytes, true).ok().flatten()
+    }
+
+    /// A place in the segment that takes samples in; `None` when that is full, or has none that is
+    /// backed and must not `grow`.
+    fn place(
+        &self,
+        state: &mut State,
+        bytes: u64,
+        grow: bool,
+    ) -> Result<Option<Place>, PublishError> {
+        match state.history.lend(bytes) {
+            Some(at) => self.settled(state, at, bytes, grow),
+            None => Ok(None),
+        }
+    }
+
+    /// What was lent, in memory that there is.
+    fn settled(
+        &self,
+        state: &mut State,
+        at: Location,
+        bytes: u64,
+        grow: bool,
+    ) -> Result<Option<Place>, PublishError> {
+        let State { history, samples: Some(samples), .. } = state else { return Ok(None) };
+        let slots = history.pinned().slots(at);
+        let end = slots.end(at.offset, bytes);
+        let is_open = at.segment == samples.segment.number();
+        let segment = match is_open {
+            true => Arc::clone(&samples.segment),
+            false => self.session.own(at.segment).expect("a segment that was left is not closed"),
+        };
+        if end > slots.backed() {
+            let backed = match grow {
+                true => back(&segment, slots.backed(), end).map(Some),
+                false => Ok(None),
+            };
+            match backed {
+                Ok(Some(upto)) => slots.back(upto),
+                other => {
+                    history.withdraw(at, bytes);
+                    return other.map(|_| None);
+                }
+            }
+        }
+        if is_open {
+            samples.tenure.used(slots.used());
+            if samples.ahead.is_none() && !slots.has_another(bytes) {
+                samples.ahead = Some(bytes);
+                self.session.tell(SegmentEvent::Low(self.gid()));
+            }
+        }
+        // Readers that copy without a pin find out by this that it is written over.
+        protocol::about_to_write::<AtomicU64>();
+        Ok(Some(Place { segment, at: at.offset }))
+    }
+
+    /// Frees what was given up and is not read by anybody.
+    pub(crate) fn reclaim(&self, state: &mut State) {
+        if state.history.pinned().retired().len() > 0 {
+            self.show_tail(state);
+            pins::about_to_scan::<AtomicU64>();
+            let State { history, audience, pinned, .. } = state;
+            pinned.refresh(|pinned| audience.scan(pinned));
+            history.pinned().reclaim(|position, len| pinned.keeps(position, len));
+        }
+        self.close_vacated(state);
+    }
+
+    /// Gives segments up that were left and that nobody reads any more.
+    fn close_vacated(&self, state: &mut State) {
+        for number in state.history.pinned().vacated() {
+            self.session.close_samples(number);
+        }
+    }
+}

@@ -1,0 +1,51 @@
+//! What a ring says of itself to people: words of its header that no reader looks at. Whoever has the
+//! segment's descriptor [reads](crate::ring::inspect) them.
+//!
+//! Nobody else can write them, so they are the counters themselves. Each is changed under the
+//! commit lock.
+
+use std::time::Duration;
+
+use crate::{
+    error::PublishError,
+    ring::layout::ring::{BLOCKED, BYTES, NO_MEMORY, PINNED, WINDOW},
+    sync::{Ordering, Word},
+    writer::{State, Writer},
+};
+
+impl Writer {
+    /// The session's memory gave the ring `bytes` more.
+    pub(crate) fn add_bytes(&self, bytes: u64) {
+        self.update(BYTES, |now| now.wrapping_add(bytes));
+    }
+
+    /// The session's memory has `bytes` of the ring's back.
+    pub(crate) fn subtract_bytes(&self, bytes: u64) {
+        self.update(BYTES, |now| now.wrapping_sub(bytes));
+    }
+
+    /// The readers have changed.
+    pub(crate) fn show_window(&self, state: &State) {
+        self.update(WINDOW, |_| state.audience.window());
+    }
+
+    /// A publish that had so long to succeed did not. Whoever gave it no time tries again, so that
+    /// nothing is dropped yet.
+    #[cold]
+    pub(crate) fn count_failure(&self, error: &PublishError, patience: Duration) {
+        let word = match error {
+            PublishError::Blocked { .. } if !patience.is_zero() => BLOCKED,
+            PublishError::NoMemory { .. } | PublishError::Segment { .. } => NO_MEMORY,
+            PublishError::Pinned { .. } | PublishError::Loaned { .. } => PINNED,
+            _ => return,
+        };
+        let _lock = self.lock();
+        self.update(word, |now| now.wrapping_add(1));
+    }
+
+    fn update(&self, word: usize, change: impl FnOnce(u64) -> u64) {
+        // Relaxed: the number alone matters, and only this process writes it.
+        let word = &self.ring.words()[word];
+        Word::store(word, change(Word::load(word, Ordering::Relaxed)), Ordering::Relaxed);
+    }
+}
