@@ -15,11 +15,13 @@ use syn::{Attribute, Item, UseTree};
 
 /// Stands before the table of a crate, with the folder of its sources.
 const MARK: &str = "<!-- floors: ";
+/// More files than that in a folder are more than one room.
+const MOST_FILES: usize = 15;
 
 /// Checks each crate that has a table; says how many imports were looked at.
 ///
 /// # Errors
-/// Each import that runs up, each room that no table has, and each that is no room.
+/// Each import that runs up, each room that no table has, and each folder with too many files.
 pub(crate) fn check(root: &Path) -> Result<String, String> {
     let page = root.join("docs/architecture.md");
     let text = fs::read_to_string(&page).map_err(|e| format!("{}: {e}", page.display()))?;
@@ -30,7 +32,10 @@ pub(crate) fn check(root: &Path) -> Result<String, String> {
     let mut lines = Vec::new();
     let mut wrong = Vec::new();
     for (folder, floors) in houses {
-        let imports = imports(&root.join(&folder))?;
+        let mut sources = Vec::new();
+        read(&root.join(&folder), &root.join(&folder), &mut sources)?;
+        wrong.extend(crowded(&sources));
+        let imports = imports(sources);
         wrong.extend(judge(&folder, &floors, &imports));
         lines.push(format!(
             "{folder}: {} imports between {} rooms run down",
@@ -114,10 +119,20 @@ struct Source {
     file: syn::File,
 }
 
-/// All imports between rooms, and from the root, of the crate whose sources are in `folder`.
-fn imports(folder: &Path) -> Result<BTreeSet<Import>, String> {
-    let mut sources = Vec::new();
-    read(folder, folder, &mut sources)?;
+/// The folders with more files than a newcomer can look over.
+fn crowded(sources: &[Source]) -> Vec<String> {
+    let mut files: BTreeMap<&Path, usize> = BTreeMap::new();
+    for folder in sources.iter().filter_map(|source| source.path.parent()) {
+        *files.entry(folder).or_default() += 1;
+    }
+    let crowded = files.into_iter().filter(|(_, count)| *count > MOST_FILES);
+    crowded
+        .map(|(folder, count)| format!("{}: {count} files, more than one room", folder.display()))
+        .collect()
+}
+
+/// All imports between rooms, and from the root, of a crate.
+fn imports(sources: Vec<Source>) -> BTreeSet<Import> {
     let rooms: BTreeSet<String> =
         sources.iter().filter_map(|s| s.module.first()).cloned().collect();
     let tests: Vec<Vec<String>> = sources.iter().flat_map(Source::test_modules).collect();
@@ -138,7 +153,7 @@ fn imports(folder: &Path) -> Result<BTreeSet<Import>, String> {
             }
         }
     }
-    Ok(found)
+    found
 }
 
 /// Reads the files below `dir`, but for programs in `bin`.
@@ -194,7 +209,8 @@ impl Paths {
     /// Notes a path by its parts, if it leaves this module.
     fn note(&mut self, parts: &[String]) {
         match parts.first().map(String::as_str) {
-            Some("crate") => self.found.push(parts[1..].to_vec()),
+            // Alone it is that of `pub(crate)`, in a macro.
+            Some("crate") if parts.len() > 1 => self.found.push(parts[1..].to_vec()),
             Some("super") => {
                 let ups = parts.iter().take_while(|part| *part == "super").count();
                 let above = &self.module[..self.module.len().saturating_sub(ups)];
@@ -374,13 +390,23 @@ More text with `roof`.
             #[cfg(test)] mod tests;
             #[cfg(test)] mod checks { use crate::roof::Top; }
             #[cfg(test)] use crate::roof::Top;
-            pub(in crate::left) fn f() {}";
+            pub(in crate::left) fn f() {}
+            made! { pub(crate) fn g() {} }";
         let inner = "use super::C; use crate::left::D;";
         let files = [
             ("left.rs", text),
             ("left/inner.rs", inner),
             ("left/tests/all.rs", "use crate::roof::Top;"),
         ];
+        assert_eq!(wrong(&files), "");
+    }
+
+    #[test]
+    fn a_folder_with_too_many_files_is_named() {
+        let names: Vec<String> = (0..=MOST_FILES).map(|n| format!("left/part{n}.rs")).collect();
+        let mut files: Vec<(&str, &str)> = names.iter().map(|name| (name.as_str(), "")).collect();
+        assert!(wrong(&files).contains("left: 16 files, more than one room"), "{}", wrong(&files));
+        files.pop();
         assert_eq!(wrong(&files), "");
     }
 
