@@ -33,7 +33,7 @@ fn intact(sample: &Sample) {
 }
 
 /// Samples that the publisher has given up, whose memory it has not used since.
-fn in_limbo(writer: &Writer) -> usize {
+fn retired(writer: &Writer) -> usize {
     writer.lock().history.pinned().retired().len()
 }
 
@@ -55,11 +55,11 @@ fn a_sample_in_use_stays_while_the_ring_goes_round() {
                 publish(&writer, sequence, len);
             }
             intact(&sample);
-            assert!(in_limbo(&writer) <= 2, "what is pinned, and the last that was given up");
+            assert!(retired(&writer) <= 2, "what is pinned, and the last that was given up");
             drop(sample);
             publish(&writer, 160, len);
             publish(&writer, 161, len);
-            assert!(in_limbo(&writer) <= 1);
+            assert!(retired(&writer) <= 1);
             intact(&take(&mut reader));
         }
     }
@@ -213,7 +213,7 @@ fn what_is_dropped_is_forgotten() {
     assert_eq!(b.allocate_lane().unwrap().location(), lane, "the lane is free again");
     (1..4).for_each(|sequence| publish(&writer, sequence, LARGE));
     assert_eq!(seats(&writer), 0);
-    assert!(in_limbo(&writer) <= 1);
+    assert!(retired(&writer) <= 1);
 }
 
 #[test]
@@ -392,7 +392,7 @@ fn a_sample_may_end_on_any_thread() {
     for sequence in total..total + 3 {
         publish(&writer, sequence, LARGE);
     }
-    assert!(in_limbo(&writer) <= 1, "all pins were given back");
+    assert!(retired(&writer) <= 1, "all pins were given back");
 }
 
 #[test]
@@ -453,11 +453,11 @@ fn scribbled_pins_keep_six_samples_at_most() {
             pin.store(absurd[(record + sequence as usize) % 6], Relaxed);
         }
         publish(&writer, sequence, LARGE);
-        assert!(in_limbo(&writer) <= RECORDS + 1);
+        assert!(retired(&writer) <= RECORDS + 1);
     }
     pins.iter().enumerate().for_each(|(n, pin)| pin.store(290 + n as u64, Relaxed));
     (300..400).for_each(|sequence| publish(&writer, sequence, LARGE));
-    assert!(in_limbo(&writer) <= RECORDS + 1);
+    assert!(retired(&writer) <= RECORDS + 1);
 }
 
 #[test]

@@ -336,7 +336,7 @@ fn keeper(session: &Arc<SessionSegment>) -> (Other, Writer) {
 
 const KEPT: usize = 100_000;
 
-fn in_limbo(writer: &Writer) -> usize {
+fn retired(writer: &Writer) -> usize {
     writer.lock().history.pinned().retired().len()
 }
 
@@ -356,13 +356,13 @@ fn what_another_process_keeps_is_not_written_over() {
         other.wire.send_numbers(&[0]);
         assert_eq!(other.wire.receive_numbers(), [5]);
     }
-    assert!((5..=7).contains(&in_limbo(&writer)));
+    assert!((5..=7).contains(&retired(&writer)));
     other.wire.send(b"", &[]);
     other.succeed();
     // Its process has ended: it told us, or we find out.
     writer.drop_dead();
     (0..4).for_each(|n| publish(&writer, 1000 + n, &pattern(1000 + n, KEPT)));
-    assert!(in_limbo(&writer) <= 1);
+    assert!(retired(&writer) <= 1);
 }
 
 #[test]
@@ -376,11 +376,11 @@ fn a_process_killed_with_samples_in_use_gives_them_back() {
     let pid = rustix::process::Pid::from_child(&other.child);
     rustix::process::kill_process(pid, rustix::process::Signal::STOP).unwrap();
     (5..200).for_each(large);
-    assert!((5..=7).contains(&in_limbo(&writer)));
+    assert!((5..=7).contains(&retired(&writer)));
     other.kill();
     assert_eq!(writer.drop_dead().len(), 1);
     (200..210).for_each(large);
-    assert!(in_limbo(&writer) <= 1);
+    assert!(retired(&writer) <= 1);
     assert_eq!(writer.lock().audience.seats(), 0);
 }
 

@@ -1,7 +1,7 @@
 //! Which samples of a ring stand, and how room is made for the next: plain data, no shared memory.
 
 use crate::{
-    alloc::{blocks::Blocks, classes, heap::Block, limbo::Limbo},
+    alloc::{blocks::Blocks, classes, heap::Block, retire_list::RetireList},
     ring::layout::{self, Location},
 };
 
@@ -16,8 +16,8 @@ pub(crate) struct History {
     /// By descriptor.
     extents: Box<[Extent]>,
     blocks: Blocks,
-    pinned: Limbo,
-    /// Bytes that samples and loans take; what is in limbo does not count.
+    pinned: RetireList,
+    /// Bytes that samples and loans take; what is in the retire list does not count.
     used: u64,
     /// Samples in blocks and slots.
     placed: u64,
@@ -54,7 +54,7 @@ impl History {
             tail: 0,
             extents: vec![Extent::Inline; descriptors as usize].into_boxed_slice(),
             blocks: Blocks::default(),
-            pinned: Limbo::default(),
+            pinned: RetireList::default(),
             used: 0,
             placed: 0,
             budget,
@@ -102,7 +102,7 @@ impl History {
     }
 
     /// The slots.
-    pub(crate) fn pinned(&mut self) -> &mut Limbo {
+    pub(crate) fn pinned(&mut self) -> &mut RetireList {
         &mut self.pinned
     }
 
@@ -195,7 +195,7 @@ impl History {
         Some(at)
     }
 
-    /// The same, where it is within the budget as it is and slots [take turns](Limbo::lend_turn).
+    /// The same, where it is within the budget as it is and slots [take turns](RetireList::lend_turn).
     pub(crate) fn lend_turn(&mut self, len: u64) -> Option<Location> {
         if !self.has_room(len) {
             return None;

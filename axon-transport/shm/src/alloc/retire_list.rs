@@ -1,5 +1,5 @@
 //! The memory of a publisher's samples that readers read in place: samples that were given up stay
-//! in limbo until no reader pins them. Plain data, no shared memory.
+//! in the retire list until no reader pins them. Plain data, no shared memory.
 
 use std::ops::Range;
 
@@ -8,7 +8,7 @@ use crate::{alloc::slots::Slots, ring::layout::Location};
 /// Who has which bytes of which segments. One at a time takes samples in; those that have been
 /// left are [vacated](Self::vacated) once the last of theirs has gone.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Limbo {
+pub(crate) struct RetireList {
     /// The one that takes samples in is the last of them.
     stores: Vec<Store>,
     retired: Vec<Retired>,
@@ -32,7 +32,7 @@ struct Retired {
     sample: u64,
 }
 
-impl Limbo {
+impl RetireList {
     /// The segment of this number, of which `range` is for samples, takes them in from now on.
     pub(crate) fn open(&mut self, number: u32, range: Range<u64>) {
         self.leave();
@@ -186,46 +186,46 @@ mod tests {
 
     #[test]
     fn a_segment_that_was_left_goes_with_the_last_that_it_holds() {
-        let mut limbo = Limbo::default();
-        limbo.open(1, 0..4 * LEN);
-        let [sample, loan] = [(); 2].map(|()| limbo.lend(LEN).unwrap());
-        limbo.published();
-        limbo.open(2, 0..4 * LEN);
-        assert_eq!(limbo.lend(LEN).unwrap().segment, 2, "the new one takes over");
-        assert!(limbo.vacated().is_empty());
+        let mut list = RetireList::default();
+        list.open(1, 0..4 * LEN);
+        let [sample, loan] = [(); 2].map(|()| list.lend(LEN).unwrap());
+        list.published();
+        list.open(2, 0..4 * LEN);
+        assert_eq!(list.lend(LEN).unwrap().segment, 2, "the new one takes over");
+        assert!(list.vacated().is_empty());
 
-        limbo.retire(7, sample, LEN, LEN);
-        limbo.reclaim(|position, _| position == 7);
-        limbo.give_back(loan, LEN);
-        assert!(limbo.vacated().is_empty(), "a reader is still at it");
-        limbo.reclaim(|_, _| false);
-        assert_eq!(limbo.vacated(), [1]);
-        assert_eq!(limbo.segments().collect::<Vec<_>>(), [2]);
+        list.retire(7, sample, LEN, LEN);
+        list.reclaim(|position, _| position == 7);
+        list.give_back(loan, LEN);
+        assert!(list.vacated().is_empty(), "a reader is still at it");
+        list.reclaim(|_, _| false);
+        assert_eq!(list.vacated(), [1]);
+        assert_eq!(list.segments().collect::<Vec<_>>(), [2]);
     }
 
     #[test]
     fn a_segment_that_takes_samples_in_stays_though_it_is_empty() {
-        let mut limbo = Limbo::default();
-        assert_eq!(limbo.lend(LEN), None);
-        limbo.open(1, 0..4 * LEN);
-        assert!(limbo.vacated().is_empty());
-        limbo.leave();
-        assert!(limbo.extent().is_none());
-        assert_eq!((limbo.take(LEN), limbo.vacated()), (None, vec![1]));
-        assert_eq!(limbo.lend(LEN), None);
+        let mut list = RetireList::default();
+        assert_eq!(list.lend(LEN), None);
+        list.open(1, 0..4 * LEN);
+        assert!(list.vacated().is_empty());
+        list.leave();
+        assert!(list.extent().is_none());
+        assert_eq!((list.take(LEN), list.vacated()), (None, vec![1]));
+        assert_eq!(list.lend(LEN), None);
     }
 
     #[test]
     fn a_segment_that_was_left_helps_out_while_it_is_there() {
-        let mut limbo = Limbo::default();
-        limbo.open(1, 0..2 * LEN);
-        let kept = limbo.lend(LEN).unwrap();
-        limbo.open(2, 0..LEN);
-        let places = [(); 3].map(|()| limbo.lend(LEN).map(|at| at.segment));
+        let mut list = RetireList::default();
+        list.open(1, 0..2 * LEN);
+        let kept = list.lend(LEN).unwrap();
+        list.open(2, 0..LEN);
+        let places = [(); 3].map(|()| list.lend(LEN).map(|at| at.segment));
         assert_eq!(places, [Some(2), Some(1), None]);
-        assert!(limbo.would_hold(LEN, [(kept, LEN)].into_iter(), true));
-        assert!(!limbo.would_hold(LEN, [(kept, LEN)].into_iter(), false), "it is not backed");
-        assert!(!limbo.would_hold(LEN, std::iter::empty(), true));
-        assert_eq!(limbo.loans(), 3, "to ask takes nothing");
+        assert!(list.would_hold(LEN, [(kept, LEN)].into_iter(), true));
+        assert!(!list.would_hold(LEN, [(kept, LEN)].into_iter(), false), "it is not backed");
+        assert!(!list.would_hold(LEN, std::iter::empty(), true));
+        assert_eq!(list.loans(), 3, "to ask takes nothing");
     }
 }
