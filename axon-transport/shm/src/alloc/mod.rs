@@ -6,7 +6,7 @@ pub(crate) mod area;
 pub(crate) mod blocks;
 pub(crate) mod classes;
 pub(crate) mod heap;
+pub(crate) mod retention;
 pub(crate) mod retire_list;
 pub(crate) mod segments;
 pub(crate) mod slots;
-pub(crate) mod tenure;

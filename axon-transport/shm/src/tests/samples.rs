@@ -7,7 +7,7 @@ use std::{fs, os::fd::OwnedFd};
 use rustix::fs::fstat;
 
 use super::*;
-use crate::alloc::tenure::IDLE;
+use crate::alloc::retention::IDLE;
 
 const IMAGE: usize = 200_000;
 

@@ -9,9 +9,9 @@ use std::{
 use crate::{
     alloc::{
         allowance::samples_bytes,
+        retention::Retention,
         segments::{OwnSegment, SegmentEvent},
         slots::TURNS,
-        tenure::Tenure,
     },
     error::{PublishError, ShmError},
     ring::{
@@ -36,7 +36,7 @@ const AHEAD: u64 = 1 << 20;
 /// The segment that takes samples in.
 pub(crate) struct Samples {
     segment: Arc<OwnSegment>,
-    tenure: Tenure,
+    retention: Retention,
     /// The length in bytes of the last sample, when no slot is ready for another like it.
     ahead: Option<u64>,
     /// Slots that may be taken before readers are looked at again.
@@ -115,7 +115,7 @@ impl Writer {
         self.reclaim(&mut state);
         let State { history, samples, .. } = &mut *state;
         if let (Some(open), Some((used, backed))) = (samples.as_mut(), history.pinned().extent())
-            && open.tenure.is_over(now, used, backed - SLOTS_AT)
+            && open.retention.is_over(now, used, backed - SLOTS_AT)
         {
             history.pinned().leave();
             *samples = None;
@@ -135,8 +135,8 @@ impl Writer {
         let bytes = samples_bytes(options.budget, options.max_message, RECORDS as u64);
         let segment = self.session.open_samples(options.gid, bytes)?;
         state.history.pinned().open(segment.number(), SLOTS_AT..bytes);
-        let tenure = Tenure::begin(Instant::now());
-        state.samples = Some(Samples { segment, tenure, ahead: None, turns: 0 });
+        let retention = Retention::begin(Instant::now());
+        state.samples = Some(Samples { segment, retention, ahead: None, turns: 0 });
         Ok(())
     }
 
@@ -281,7 +281,7 @@ impl Writer {
             }
         }
         if is_open {
-            samples.tenure.used(slots.used());
+            samples.retention.used(slots.used());
             if samples.ahead.is_none() && !slots.has_another(bytes) {
                 samples.ahead = Some(bytes);
                 self.session.tell(SegmentEvent::Low(self.gid()));

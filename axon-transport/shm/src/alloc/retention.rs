@@ -1,5 +1,5 @@
-//! How long a publisher keeps the memory of its large samples: as long as it publishes such, and
-//! about as much as they need. Plain data; whoever looks after the publisher says what time it is.
+//! Retention policy for large-sample memory: a publisher keeps it as long as it publishes large samples,
+//! and about as much as they need. Plain data; the caller says what time it is.
 
 use std::time::{Duration, Instant};
 
@@ -12,7 +12,7 @@ const MODEST: u64 = 1 << 20;
 
 /// What was used of a segment.
 #[derive(Debug)]
-pub(crate) struct Tenure {
+pub(crate) struct Retention {
     /// Whether there was a large sample since the last look.
     used: bool,
     /// When there was one last, as far as the looks tell.
@@ -22,7 +22,7 @@ pub(crate) struct Tenure {
     since: Instant,
 }
 
-impl Tenure {
+impl Retention {
     pub(crate) fn begin(now: Instant) -> Self {
         Self { used: true, last: now, peak: 0, since: now }
     }
@@ -65,43 +65,43 @@ mod tests {
     #[test]
     fn memory_that_nobody_uses_is_left() {
         let start = Instant::now();
-        let mut tenure = Tenure::begin(start);
-        tenure.used(MIB);
+        let mut retention = Retention::begin(start);
+        retention.used(MIB);
         for second in 1..=10 {
-            assert!(!tenure.is_over(seconds(start, second), 0, MIB), "used {second} s ago");
+            assert!(!retention.is_over(seconds(start, second), 0, MIB), "used {second} s ago");
         }
-        assert!(tenure.is_over(seconds(start, 11), 0, MIB), "10 s after the look that saw it");
+        assert!(retention.is_over(seconds(start, 11), 0, MIB), "10 s after the look that saw it");
     }
 
     #[test]
     fn a_sample_that_stands_keeps_its_memory() {
         let start = Instant::now();
-        let mut tenure = Tenure::begin(start);
-        tenure.used(20 * MIB);
+        let mut retention = Retention::begin(start);
+        retention.used(20 * MIB);
         for second in 1..1000 {
-            assert!(!tenure.is_over(seconds(start, second), 20 * MIB, 40 * MIB));
+            assert!(!retention.is_over(seconds(start, second), 20 * MIB, 40 * MIB));
         }
     }
 
     #[test]
     fn memory_in_use_stays_for_ever() {
         let start = Instant::now();
-        let mut tenure = Tenure::begin(start);
+        let mut retention = Retention::begin(start);
         for second in 1..1000 {
-            tenure.used(20 * MIB);
-            assert!(!tenure.is_over(seconds(start, second), 20 * MIB, 64 * MIB));
+            retention.used(20 * MIB);
+            assert!(!retention.is_over(seconds(start, second), 20 * MIB, 64 * MIB));
         }
     }
 
     #[test]
     fn far_too_much_memory_is_left_after_a_while() {
         let start = Instant::now();
-        let mut tenure = Tenure::begin(start);
-        tenure.used(256 * MIB);
+        let mut retention = Retention::begin(start);
+        retention.used(256 * MIB);
         let mut left = None;
         for second in 1..60 {
-            tenure.used(2 * MIB);
-            if tenure.is_over(seconds(start, second), 2 * MIB, 256 * MIB) {
+            retention.used(2 * MIB);
+            if retention.is_over(seconds(start, second), 2 * MIB, 256 * MIB) {
                 left = Some(second);
                 break;
             }
@@ -112,10 +112,10 @@ mod tests {
     #[test]
     fn a_little_is_kept_whatever_is_in_use() {
         let start = Instant::now();
-        let mut tenure = Tenure::begin(start);
+        let mut retention = Retention::begin(start);
         for second in 1..60 {
-            tenure.used(8192);
-            assert!(!tenure.is_over(seconds(start, second), 8192, MIB));
+            retention.used(8192);
+            assert!(!retention.is_over(seconds(start, second), 8192, MIB));
         }
     }
 }
