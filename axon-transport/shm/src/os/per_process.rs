@@ -29,6 +29,7 @@ pub struct Made<T: 'static> {
 
 impl<T: Send + Sync> PerProcess<T> {
     /// A place without one.
+    #[expect(clippy::new_without_default, reason = "it is for statics, which cannot be made so")]
     pub const fn new() -> Self {
         Self(AtomicPtr::new(ptr::null_mut()))
     }
