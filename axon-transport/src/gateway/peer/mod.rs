@@ -368,15 +368,18 @@ pub(super) fn spawn_reader(
     events: mpsc::Sender<Event>,
 ) {
     tokio::spawn(async move {
-        loop {
-            let next = reader.next_within(&account).await;
-            if let Ok((message, _)) = &next {
+        let pace = |cost| {
+            let (account, connection) = (Arc::clone(&account), connection.clone());
+            async move {
                 tokio::select! {
-                    () = account.pace(message) => {}
+                    () = account.pace(cost) => {}
                     // Its end is heard of at once.
                     _ = connection.closed() => {}
                 }
             }
+        };
+        loop {
+            let next = reader.next_within(&account, &pace).await;
             let ended = next.is_err();
             if events.send(Event::Control(link, next)).await.is_err() || ended {
                 return;
