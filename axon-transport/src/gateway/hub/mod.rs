@@ -408,7 +408,7 @@ impl Hub {
                 Ok(())
             }
             Message::Received(received) => {
-                peer.received(received);
+                peer.received(&received);
                 Ok(())
             }
             Message::RouteRefused(refused) => {

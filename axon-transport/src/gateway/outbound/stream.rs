@@ -14,7 +14,7 @@ use bytes::Bytes;
 use quinn::{SendStream, VarInt};
 use tokio::sync::Notify;
 
-use super::{Carrier, Done, Flow, Shared, flight::Flight};
+use super::{Carrier, Done, Flow, Shared, acknowledged::Awaited, flight::Flight};
 use crate::{
     gateway::{
         frames::Frames,
@@ -49,6 +49,8 @@ pub(super) struct Stream {
     /// Bytes that QUIC took over.
     moved: Arc<AtomicU64>,
     task: tokio::task::JoinHandle<()>,
+    /// As long as there is something that the peer may acknowledge.
+    _awaited: Option<Awaited>,
 }
 
 impl Drop for Stream {
@@ -63,6 +65,7 @@ impl Stream {
         let queue = Arc::new(Mutex::new(queue));
         let filled = Arc::new(Notify::new());
         let moved = Arc::default();
+        let awaited = flow.acknowledged.then(|| shared.acknowledged.await_of(flow.number, of));
         let writer = Writer {
             flow,
             of,
@@ -76,7 +79,7 @@ impl Stream {
             frames: Frames::default(),
         };
         let task = tokio::spawn(writer.run());
-        Self { queue, filled, moved, task }
+        Self { queue, filled, moved, task, _awaited: awaited }
     }
 
     /// Queues a sample as `qos` says. It must not be over.

@@ -25,8 +25,9 @@ fn shared(connection: &Connection) -> (Arc<Shared>, watch::Sender<Carrier>) {
     let (sender, carrier) = watch::channel(Carrier { connection, protection, in_use });
     let (popped, ended) = (Notify::new(), AtomicBool::new(false));
     let (counters, queues) = (Arc::default(), Room::new(256 << 20).of_peer());
-    let done = Mutex::default();
-    (Arc::new(Shared { carrier, counters, queues, popped, ended, done }), sender)
+    let (acknowledged, done) = (Arc::default(), Mutex::default());
+    let shared = Shared { carrier, counters, queues, popped, ended, acknowledged, done };
+    (Arc::new(shared), sender)
 }
 
 fn a_sample(sequence: u64) -> Sample {

@@ -27,7 +27,7 @@ use super::{
     hub::{Event, Local, Shared},
     inbound::Inbound,
     intake::Intake,
-    outbound::{self, Carrier, Owner},
+    outbound::{self, Acknowledged, Carrier, Inbox, Owner},
     receipts::Receipts,
     routes::RouteKey,
     routes_in::RoutesIn,
@@ -95,6 +95,8 @@ pub(super) struct Peer {
     /// Servers there whose host takes requests for them.
     answering: BTreeSet<Gid>,
     orders: mpsc::UnboundedSender<outbound::Order>,
+    /// Samples that it acknowledged.
+    acknowledged: Arc<Acknowledged>,
 }
 
 impl Peer {
@@ -111,11 +113,13 @@ impl Peer {
         let counters = Arc::new(Counters::default());
         let intake = Arc::clone(&account.intake);
         let (orders, receiver) = mpsc::unbounded_channel();
+        let acknowledged = Arc::<Acknowledged>::default();
+        let inbox = Inbox { orders: receiver, acknowledged: Arc::clone(&acknowledged) };
         let (queues, pulse) = (shared.queues.of_peer(), shared.pulse.clone());
         let (daemon, stalled_after) = (owner.daemon, shared.stalled_after);
         let owner_identity = owner.identity.clone();
         let sent = Arc::clone(&counters);
-        tokio::spawn(outbound::run(carrier, receiver, sent, queues, pulse, owner, stalled_after));
+        tokio::spawn(outbound::run(carrier, inbox, sent, queues, pulse, owner, stalled_after));
         let receipts = Receipts::new(outbox.clone());
         let telling = OnDrop(tokio::spawn(Arc::clone(&receipts).run()));
         Self {
@@ -145,6 +149,7 @@ impl Peer {
             alive: Alive::default(),
             answering: BTreeSet::new(),
             orders,
+            acknowledged,
         }
     }
 
@@ -248,8 +253,8 @@ impl Peer {
     }
 
     /// The peer acknowledges samples.
-    pub(super) fn received(&self, received: Received) {
-        let _ = self.orders.send(outbound::Order::Received(received.flows));
+    pub(super) fn received(&self, received: &Received) {
+        self.acknowledged.note(&received.flows);
     }
 
     /// What the peer sees: what it is shown, and publishers that ended and are kept in its sight.
