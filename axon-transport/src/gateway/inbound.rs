@@ -11,7 +11,7 @@ use quinn::{Connection, RecvStream, VarInt};
 use tokio::sync::{mpsc, watch};
 
 use super::{
-    counters::Counters,
+    counters::Counting,
     establish::close,
     hub::Event,
     intake::Intake,
@@ -46,7 +46,7 @@ pub(super) struct Inbound {
     /// How its messages are protected.
     pub(super) protection: Protection,
     /// What arrives.
-    pub(super) counters: Arc<Counters>,
+    pub(super) counters: Counting,
     /// Wakes a publish that waits for room.
     pub(super) pulse: Pulse,
     /// Largest payload accepted.

@@ -30,7 +30,7 @@ use tokio::sync::{Notify, mpsc, oneshot, watch};
 pub(super) use self::acknowledged::Acknowledged;
 use self::{acknowledged::Acknowledgement, ending::Endings, feed::Feed, stalling::Stalling};
 use super::{
-    counters::Counters,
+    counters::Counting,
     hub::Event,
     keyring::lock,
     pulse::Pulse,
@@ -225,7 +225,7 @@ pub(super) struct Carrier {
 /// What the streams of a peer share.
 struct Shared {
     carrier: watch::Receiver<Carrier>,
-    counters: Arc<Counters>,
+    counters: Counting,
     /// What may wait in the queues.
     queues: Arc<Room>,
     /// A queue has room again, or is over.
@@ -276,7 +276,7 @@ struct Active {
 pub(super) async fn run(
     first: Carrier,
     inbox: Inbox,
-    counters: Arc<Counters>,
+    counters: Counting,
     queues: Arc<Room>,
     pulse: Pulse,
     owner: Owner,

@@ -4,6 +4,7 @@ use quinn::{Connection, VarInt};
 use super::{stream::Stream, *};
 use crate::{
     gateway::{
+        counters::Tally,
         played::{Pair, block_on},
         queue::Offered,
     },
@@ -24,7 +25,7 @@ fn shared(connection: &Connection) -> (Arc<Shared>, watch::Sender<Carrier>) {
     let in_use = watch::channel(()).1;
     let (sender, carrier) = watch::channel(Carrier { connection, protection, in_use });
     let (popped, ended) = (Notify::new(), AtomicBool::new(false));
-    let (counters, queues) = (Arc::default(), Room::new(256 << 20).of_peer());
+    let (counters, queues) = (Tally::default().counting(), Room::new(256 << 20).of_peer());
     let (acknowledged, done) = (Arc::default(), Mutex::default());
     let shared = Shared { carrier, counters, queues, popped, ended, acknowledged, done };
     (Arc::new(shared), sender)

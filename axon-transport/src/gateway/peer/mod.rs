@@ -23,7 +23,7 @@ pub(super) use self::{
 use super::{
     account::Account,
     control::Outbox,
-    counters::Counters,
+    counters::Tally,
     hub::{Event, Local, Shared},
     inbound::Inbound,
     intake::Intake,
@@ -58,7 +58,7 @@ pub(super) struct Peer {
     /// Control messages to it.
     pub(super) outbox: Outbox,
     /// What was carried and dropped.
-    pub(super) counters: Arc<Counters>,
+    pub(super) counters: Tally,
     pub(super) remote: Remote,
     /// Proves to it which sessions are this daemon's.
     prover: Prover,
@@ -110,7 +110,7 @@ impl Peer {
         shared: &Arc<Shared>,
         owner: Owner,
     ) -> Self {
-        let counters = Arc::new(Counters::default());
+        let counters = Tally::default();
         let intake = Arc::clone(&account.intake);
         let (orders, receiver) = mpsc::unbounded_channel();
         let acknowledged = Arc::<Acknowledged>::default();
@@ -118,7 +118,7 @@ impl Peer {
         let (queues, pulse) = (shared.queues.of_peer(), shared.pulse.clone());
         let (daemon, stalled_after) = (owner.daemon, shared.stalled_after);
         let owner_identity = owner.identity.clone();
-        let sent = Arc::clone(&counters);
+        let sent = counters.counting();
         tokio::spawn(outbound::run(carrier, inbox, sent, queues, pulse, owner, stalled_after));
         let receipts = Receipts::new(outbox.clone());
         let telling = OnDrop(tokio::spawn(Arc::clone(&receipts).run()));
@@ -186,7 +186,7 @@ impl Peer {
             connection: carrier.connection,
             protection: carrier.protection,
             routes: Arc::clone(&self.routes_in),
-            counters: Arc::clone(&self.counters),
+            counters: self.counters.counting(),
             pulse: shared.pulse.clone(),
             max_message: shared.max_message,
             wanted,
@@ -345,6 +345,11 @@ impl Peer {
         let refused = self.remote.refused().map(str::to_owned);
         let said = std::mem::replace(&mut self.refusal_said, refused.is_some());
         refused.filter(|_| !said)
+    }
+
+    /// The peer is gone. What its tasks count until they have ended.
+    pub(super) fn over(self) -> Tally {
+        self.counters
     }
 
     /// Puts what the peer's graph takes into `status`.
