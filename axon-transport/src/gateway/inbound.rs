@@ -13,7 +13,6 @@ use tokio::sync::{mpsc, watch};
 use super::{
     counters::Counting,
     establish::close,
-    hub::Event,
     intake::Intake,
     pieces::Pieces,
     pulse::Pulse,
@@ -59,8 +58,6 @@ pub(super) struct Inbound {
     pub(super) receipts: Arc<Receipts>,
     /// Samples that could not be published here, for the log.
     pub(super) losses: Arc<Seldom>,
-    /// To the hub.
-    pub(super) events: mpsc::Sender<Event>,
     /// What was refused, for the log and status.
     pub(super) refused: mpsc::Sender<(CloseCode, String)>,
 }
@@ -159,7 +156,7 @@ impl Inbound {
         let Some(opened) = self.protection.open(body, from.route).map_err(refused)? else {
             // Nothing is wrong with it. The rest is read to be counted.
             let why = "the link ended before they were read";
-            self.lost("no_link", from.number, from.gid, &why).await;
+            self.lost("no_link", from.number, from.gid, &why);
             return Ok(true);
         };
         let gid = writer(from.route.kind, from.gid, &opened.header)
@@ -222,7 +219,7 @@ impl Inbound {
                     let _ = tokio::time::timeout(Duration::from_millis(100), beat.changed()).await;
                 }
                 Err(error) => {
-                    self.lost("ring", from.number, stand_in.gid(), &error).await;
+                    self.lost("ring", from.number, stand_in.gid(), &error);
                     return false;
                 }
             }
@@ -235,14 +232,12 @@ impl Inbound {
     }
 
     /// A sample of this route came here and is lost.
-    async fn lost(&self, cause: &'static str, number: u32, gid: Gid, error: &(dyn Display + Sync)) {
-        self.counters.dropped(cause, 1);
+    fn lost(&self, cause: &'static str, number: u32, gid: Gid, error: &dyn Display) {
         let topic = self.topic(number);
+        self.counters.lost(&topic, cause, 1);
         if let Some(samples) = self.losses.count(Instant::now()) {
             tracing::warn!(%topic, %gid, %error, samples, "samples from a peer are lost");
         }
-        // An error: the hub is gone, and the status with it.
-        let _ = self.events.send(Event::Lost { topic, cause, samples: 1 }).await;
     }
 }
 

@@ -310,8 +310,7 @@ impl Hub {
         };
         let (who, wanted) = (self.peer_of(link), link.reading.subscribe());
         let (refused, mut violations) = mpsc::channel(1);
-        let inbound: Inbound =
-            peer.inbound(carrier, &self.shared, wanted, self.events.clone(), refused);
+        let inbound: Inbound = peer.inbound(carrier, &self.shared, wanted, refused);
         tokio::spawn(inbound.run());
         let events = self.events.clone();
         tokio::spawn(async move {

@@ -179,7 +179,6 @@ impl Peer {
         carrier: Carrier,
         shared: &Shared,
         wanted: watch::Receiver<()>,
-        events: mpsc::Sender<Event>,
         refused: mpsc::Sender<(crate::link::CloseCode, String)>,
     ) -> Inbound {
         Inbound {
@@ -193,7 +192,6 @@ impl Peer {
             intake: Arc::clone(&self.intake),
             receipts: Arc::clone(&self.receipts),
             losses: Arc::default(),
-            events,
             refused,
         }
     }
