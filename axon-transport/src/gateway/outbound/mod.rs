@@ -340,7 +340,7 @@ pub(super) async fn run(
             };
             if over {
                 take_up(&mut routes, &shared);
-                return endings.link_over(&routes).await;
+                return endings.link_over(&mut routes, &shared).await;
             }
         }
         // All that there are: a peer that asks and takes back all the time has none wait.
