@@ -59,6 +59,10 @@ impl ControlReader {
     /// Both HELLOs were checked: larger frames are allowed from now on.
     pub(super) fn hello_checked(&mut self) {
         self.limit = MAX_FRAME;
+    }
+
+    /// The peer is who it says. Until then nothing is paced, so nothing long is decompressed.
+    pub(super) fn proven(&mut self) {
         self.inflated = MAX_INFLATED;
     }
 
@@ -273,6 +277,7 @@ mod tests {
             let (_, receive) = pair.there.accept_bi().await.unwrap();
             let mut reader = ControlReader::new(receive);
             reader.hello_checked();
+            reader.proven();
             let account = Accounts::new(0).of("a");
             let paced = std::cell::RefCell::new(Vec::new());
             let pace = |cost| {
@@ -288,6 +293,25 @@ mod tests {
             assert_eq!(paced.borrow().len(), 4, "{paced:?}");
             assert!(reader.next_within(&account, pace).await.is_err());
             assert_eq!(paced.borrow()[4..], [1025]);
+        });
+    }
+
+    #[test]
+    fn nothing_long_is_decompressed_for_a_peer_that_proved_nothing() {
+        block_on(async {
+            let pair = Pair::new().await;
+            let (mut send, _) = pair.here.open_bi().await.unwrap();
+            let publishers = vec![Gid::default(); 1000];
+            let ready = Message::RouteReady(RouteReady { route: 1, publishers });
+            for _ in 0..2 {
+                send.write_all(&ready.to_frame().unwrap()).await.unwrap();
+            }
+            let (_, receive) = pair.there.accept_bi().await.unwrap();
+            let mut reader = ControlReader::new(receive);
+            reader.hello_checked();
+            assert!(reader.next().await.is_err());
+            reader.proven();
+            assert_eq!(reader.next().await.unwrap(), ready);
         });
     }
 
