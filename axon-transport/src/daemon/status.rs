@@ -150,11 +150,11 @@ pub struct TopicStatus {
     pub bytes_committed: u64,
     /// Samples that were not delivered on this host, by why: `overwritten` before a reader took
     /// them within its depth; `blocked`, `no_memory`, `pinned` as for [`WriterStatus`]. And samples of
-    /// publishers here that another host did not acknowledge: `link_ended` when its link did,
-    /// `publisher_ended` ten seconds without progress after their publisher did, `stalled` when its
-    /// readers took nothing. On the way to other hosts: `queue` while more waited than the history's
-    /// depth, `late` for what could not arrive in time, `no_key` while there was none, `no_link`,
-    /// `no_route` when the other host did not want them any more. On arrival: `ring`, `no_link`,
+    /// publishers here that another host did not acknowledge: `link_ended` when its link did (so are
+    /// requests and responses that were not sent), `publisher_ended` ten seconds without progress after
+    /// their publisher did, `stalled` when its readers took nothing. On the way to other hosts: `queue`
+    /// while more waited than the history's depth, `late` for what could not arrive in time, `no_key` while there
+    /// was none, `no_link`, `no_route` when the other host did not want them any more. On arrival: `ring`, `no_link`,
     /// `no_route`, `no_client`.
     pub dropped: BTreeMap<String, u64>,
     /// The publishers on this host, stand-ins for remote ones among them: up to 64, those with the

@@ -21,7 +21,10 @@ use super::{
     pace::{Bucket, Turns},
     routes::MAX_RELAYS,
 };
-use crate::link::{MAX_FRAME, MAX_INFLATED, Message};
+use crate::{
+    keys::KeyMessage,
+    link::{MAX_FRAME, MAX_INFLATED, Message, is_known, unpacked_length},
+};
 
 /// Stand-ins of one identity. Each costs a ring.
 pub(super) const MAX_STAND_INS: usize = 1024;
@@ -41,8 +44,13 @@ const READING: usize = 2 * MAX_FRAME;
 const UNPACKED: usize = MAX_INFLATED;
 /// What each of them counts for at least: so many may wait before another peer's.
 const MESSAGE: usize = 64 << 10;
-/// What one identity may say a second, and at once, by [`cost`].
+/// What one identity may say a second, and at once, by [`cost`] and [`cost_of_frame`].
 const SAID: (u32, u32) = (4096, 16_384);
+/// Bytes of a control message that cost as much as one change: what it takes to decompress and decode
+/// them.
+const BYTES: usize = 4096;
+/// GIDs that cost as much as one change, where each is looked up and nothing else.
+const LOOKED_UP: usize = 32;
 
 /// Something that may be held up to a bound.
 #[derive(Debug)]
@@ -172,26 +180,51 @@ impl Account {
         room(&self.unpacked, length.max(MESSAGE), UNPACKED).await
     }
 
-    /// Waits for as long as the identity said more than it may.
-    pub(super) async fn pace(&self, message: &Message) {
-        let wait = lock(&self.said).owe(cost(message), Instant::now());
+    /// Takes this much of what the identity may say, and waits for as long as that is more than it may.
+    pub(super) async fn pace(&self, cost: u32) {
+        let wait = lock(&self.said).owe(cost, Instant::now());
         if !wait.is_zero() {
             tokio::time::sleep(wait).await;
         }
     }
 }
 
+/// What a frame costs before it is decompressed, by the length that its map will have; one of unknown
+/// type, which is not decompressed, by its own.
+pub(super) fn cost_of_frame(frame: &[u8]) -> u32 {
+    let unpacked = if is_known(frame) { unpacked_length(frame).min(MAX_INFLATED) } else { 0 };
+    costs(unpacked.max(frame.len()) / BYTES)
+}
+
 /// What a message costs: about as many changes as it says.
-fn cost(message: &Message) -> u32 {
-    let elements = match message {
-        Message::Graph(graph) => graph.added.len() + graph.removed.len(),
+pub(super) fn cost(message: &Message) -> u32 {
+    costs(match message {
+        Message::Graph(graph) => {
+            let toward = [&graph.localhost, &graph.listing].into_iter().flatten();
+            let toward = toward.map(Vec::len).sum::<usize>() / LOOKED_UP;
+            graph.added.len() + graph.removed.len() + toward
+        }
         Message::Subscribe(subscribe) => 7 + subscribe.subscribers.len() + subscribe.last.len(),
         Message::Unsubscribe(_) | Message::RouteRefused(_) => 7,
         Message::Asserted(asserted) => asserted.publishers.len() / 8,
         Message::Owners(owners) => 7 * owners.proofs.len(),
+        Message::Received(received) => received.flows.len() / LOOKED_UP,
+        Message::RouteReady(ready) => ready.publishers.len() / LOOKED_UP,
         // Keys are bounded where they are kept.
-        _ => 0,
-    };
+        Message::Keys(KeyMessage::Announce(key_ids)) => key_ids.len() / 8,
+        Message::Keys(
+            KeyMessage::Ready { .. } | KeyMessage::Failed { .. } | KeyMessage::Retire { .. },
+        ) => 0,
+        Message::Hello(_)
+        | Message::Elected(_)
+        | Message::GraphResync(_)
+        | Message::Keepalive
+        | Message::LinkClosed(_) => 0,
+    })
+}
+
+/// That of a message with so many elements: it costs something itself.
+fn costs(elements: usize) -> u32 {
     u32::try_from(1 + elements).unwrap_or(u32::MAX)
 }
 
@@ -231,7 +264,11 @@ impl Accounts {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gateway::played::block_on;
+    use crate::{
+        gateway::played::block_on,
+        ids::Gid,
+        link::{Received, ReceivedOf, RouteReady},
+    };
 
     #[test]
     fn an_identity_has_one_account_and_what_is_dropped_is_given_back() {
@@ -261,6 +298,25 @@ mod tests {
         assert_eq!((two.amount(), meter.held()), (28, 36));
         drop((two, three));
         assert_eq!(meter.held(), 0);
+    }
+
+    #[test]
+    fn a_message_costs_what_it_says_and_a_frame_what_it_is_unpacked() {
+        let flow = ReceivedOf { route: 1, publisher: Gid::default(), sequence: 1, dropped: 0 };
+        let received = |count| Message::Received(Received { flows: vec![flow; count] });
+        let publishers = vec![Gid::default(); 65_536];
+        let ready = Message::RouteReady(RouteReady { route: 1, publishers });
+        assert_eq!((cost(&received(65_536)), cost(&ready)), (2049, 2049));
+        // So do those that a peer says after each few samples, or of a thousand topics at once.
+        assert_eq!((cost(&received(1)), cost(&received(1024))), (1, 33));
+
+        let frame = |kind: u8, unpacked: u32| [&[kind][..], &unpacked.to_be_bytes()].concat();
+        assert_eq!(cost_of_frame(&frame(0x83, 4 << 20)), 1025);
+        // Nobody unpacks more than that, and nobody what is of unknown type.
+        assert_eq!(cost_of_frame(&frame(0x83, u32::MAX)), 1025);
+        assert_eq!(cost_of_frame(&frame(0xff, 4 << 20)), 1);
+        assert_eq!(cost_of_frame(&vec![0x7f; 1 << 20]), 257);
+        assert_eq!(cost_of_frame(&[8, 0xa0]), 1);
     }
 
     #[test]

@@ -9,13 +9,13 @@ use quinn::{Connection, RecvStream, SendStream};
 use tokio::sync::mpsc;
 
 use super::{
-    account::{Account, Charge, Meter, Unpacked},
+    account::{Account, Charge, Meter, Unpacked, cost, cost_of_frame},
     establish::close,
 };
 use crate::{
     graph::Endpoint,
     link::{
-        CloseCode, FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, Message,
+        CloseCode, FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, Message, is_known,
         read_length, unpacked_length,
     },
 };
@@ -59,6 +59,10 @@ impl ControlReader {
     /// Both HELLOs were checked: larger frames are allowed from now on.
     pub(super) fn hello_checked(&mut self) {
         self.limit = MAX_FRAME;
+    }
+
+    /// The peer is who it says. Until then nothing is paced, so nothing long is decompressed.
+    pub(super) fn proven(&mut self) {
         self.inflated = MAX_INFLATED;
     }
 
@@ -74,20 +78,32 @@ impl ControlReader {
     }
 
     /// As [`next`](Self::next), once the peer's account has room for the frame, and then for what
-    /// becomes of it: until the message is handled, and what comes with it here is dropped.
-    pub(super) async fn next_within(
+    /// becomes of it: until the message is handled, and what comes with it here is dropped. `pace` waits
+    /// for as long as this costs: before a frame is decompressed, also one that is passed over, and for
+    /// what its message costs beyond that.
+    pub(super) async fn next_within<P: Future<Output = ()>>(
         &mut self,
         account: &Account,
+        pace: impl Fn(u32) -> P,
     ) -> Result<(Message, Unpacked), ControlError> {
         loop {
             let length = self.length().await?;
             let reading = account.reading(length).await;
             let frame = self.frame(length).await?;
+            let paid = cost_of_frame(&frame);
+            pace(paid).await;
+            if !is_known(&frame) {
+                continue;
+            }
             // What is too long for anybody is refused before it waits.
             let unpacked = account.unpacked(unpacked_length(&frame).min(self.inflated)).await;
             let message = Message::from_frame(&frame, self.inflated)?;
             drop((frame, reading));
             if let Some(message) = message {
+                match cost(&message).saturating_sub(paid) {
+                    0 => {}
+                    more => pace(more).await,
+                }
                 return Ok((message, unpacked));
             }
         }
@@ -219,8 +235,12 @@ impl ControlWriter {
 mod tests {
     use super::*;
     use crate::{
-        gateway::played::{Pair, block_on},
-        link::RouteRefused,
+        gateway::{
+            account::Accounts,
+            played::{Pair, block_on},
+        },
+        ids::Gid,
+        link::{RouteReady, RouteRefused},
     };
 
     const LENGTH: usize = 64 << 10;
@@ -235,6 +255,64 @@ mod tests {
         let outbox = Outbox::spawn(pair.here.clone(), ControlWriter::new(stream));
         outbox.charge_to(Arc::clone(identity));
         outbox
+    }
+
+    #[test]
+    fn each_frame_is_paced_before_it_is_decompressed_also_one_that_is_skipped() {
+        block_on(async {
+            let pair = Pair::new().await;
+            let (mut send, _) = pair.here.open_bi().await.unwrap();
+            let frame = |kind: u8, unpacked: u32, body: &[u8]| {
+                let frame = [&[kind][..], &unpacked.to_be_bytes(), body].concat();
+                [&(frame.len() as u32).to_be_bytes()[..], &frame].concat()
+            };
+            // Of unknown type, a GRAPH that is no zstd frame, and messages of few and many elements.
+            let gids = |count| vec![Gid::default(); count];
+            let ready =
+                |count| Message::RouteReady(RouteReady { route: 1, publishers: gids(count) });
+            send.write_all(&frame(0xff, 4 << 20, &[0x5a; 9_000])).await.unwrap();
+            send.write_all(&ready(1).to_frame().unwrap()).await.unwrap();
+            send.write_all(&ready(65_536).to_frame().unwrap()).await.unwrap();
+            send.write_all(&frame(0x83, 4 << 20, b"no zstd frame")).await.unwrap();
+            let (_, receive) = pair.there.accept_bi().await.unwrap();
+            let mut reader = ControlReader::new(receive);
+            reader.hello_checked();
+            reader.proven();
+            let account = Accounts::new(0).of("a");
+            let paced = std::cell::RefCell::new(Vec::new());
+            let pace = |cost| {
+                paced.borrow_mut().push(cost);
+                std::future::ready(())
+            };
+            for count in [1, 65_536] {
+                let (message, _) = reader.next_within(&account, pace).await.unwrap();
+                assert_eq!(message, ready(count));
+            }
+            assert_eq!(paced.borrow()[..2], [3, 1]);
+            assert_eq!(paced.borrow()[2..].iter().sum::<u32>(), 2049);
+            assert_eq!(paced.borrow().len(), 4, "{paced:?}");
+            assert!(reader.next_within(&account, pace).await.is_err());
+            assert_eq!(paced.borrow()[4..], [1025]);
+        });
+    }
+
+    #[test]
+    fn nothing_long_is_decompressed_for_a_peer_that_proved_nothing() {
+        block_on(async {
+            let pair = Pair::new().await;
+            let (mut send, _) = pair.here.open_bi().await.unwrap();
+            let publishers = vec![Gid::default(); 1000];
+            let ready = Message::RouteReady(RouteReady { route: 1, publishers });
+            for _ in 0..2 {
+                send.write_all(&ready.to_frame().unwrap()).await.unwrap();
+            }
+            let (_, receive) = pair.there.accept_bi().await.unwrap();
+            let mut reader = ControlReader::new(receive);
+            reader.hello_checked();
+            assert!(reader.next().await.is_err());
+            reader.proven();
+            assert_eq!(reader.next().await.unwrap(), ready);
+        });
     }
 
     #[test]

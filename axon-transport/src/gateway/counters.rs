@@ -2,11 +2,14 @@
 
 use std::{
     collections::BTreeMap,
+    ops::Deref,
     sync::{
         Arc, Mutex,
         atomic::{AtomicU64, Ordering},
     },
 };
+
+use tokio::sync::watch;
 
 use super::keyring::lock;
 use crate::{daemon::bridge::OTHER_TOPICS, text::plain};
@@ -36,6 +39,48 @@ pub(super) struct Counters {
     dropped: Mutex<BTreeMap<&'static str, u64>>,
     /// What was dropped since it was looked at last.
     lost: Mutex<BTreeMap<Arc<str>, BTreeMap<&'static str, u64>>>,
+}
+
+/// The counters of one peer, as the hub has them.
+#[derive(Debug, Default)]
+pub(super) struct Tally {
+    counters: Arc<Counters>,
+    counting: watch::Sender<()>,
+}
+
+/// The counters of one peer, as a task has them that counts.
+#[derive(Clone, Debug)]
+pub(super) struct Counting {
+    counters: Arc<Counters>,
+    _of: watch::Receiver<()>,
+}
+
+impl Tally {
+    /// For one more task that counts.
+    pub(super) fn counting(&self) -> Counting {
+        Counting { counters: Arc::clone(&self.counters), _of: self.counting.subscribe() }
+    }
+
+    /// Waits until nobody counts any more.
+    pub(super) async fn is_final(&self) {
+        self.counting.closed().await;
+    }
+}
+
+impl Deref for Tally {
+    type Target = Counters;
+
+    fn deref(&self) -> &Counters {
+        &self.counters
+    }
+}
+
+impl Deref for Counting {
+    type Target = Counters;
+
+    fn deref(&self) -> &Counters {
+        &self.counters
+    }
 }
 
 impl Counters {
@@ -119,7 +164,30 @@ fn worst(losses: &[Loss]) -> Option<(&str, String, u64, u64)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::daemon::status::LinkStatus;
+    use crate::{daemon::status::LinkStatus, gateway::played::block_on};
+
+    #[test]
+    fn a_tally_is_final_once_the_last_task_that_counts_has_ended() {
+        block_on(async {
+            let tally = Tally::default();
+            let (one, other) = (tally.counting(), tally.counting().clone());
+            let topic = Arc::<str>::from("/scan");
+            let counts = |counting: Counting| {
+                let topic = Arc::clone(&topic);
+                tokio::spawn(async move {
+                    tokio::task::yield_now().await;
+                    counting.lost(&topic, "no_link", 1);
+                })
+            };
+            let tasks = [counts(one), counts(other)];
+            tally.is_final().await;
+            let loss = Loss { topic: Arc::clone(&topic), cause: "no_link", samples: 2 };
+            assert_eq!(tally.take_lost(), [loss]);
+            for task in tasks {
+                task.await.unwrap();
+            }
+        });
+    }
 
     #[test]
     fn losses_are_counted_by_topic_and_handed_over_once() {

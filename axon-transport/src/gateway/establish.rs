@@ -207,6 +207,7 @@ async fn run(
         }
         _ => None,
     };
+    reader.proven();
     Ok(Established {
         number,
         connection: connection.clone(),

@@ -12,9 +12,8 @@ use quinn::{Connection, RecvStream, VarInt};
 use tokio::sync::{mpsc, watch};
 
 use super::{
-    counters::Counters,
+    counters::Counting,
     establish::close,
-    hub::Event,
     intake::Intake,
     pieces::Pieces,
     pulse::Pulse,
@@ -26,6 +25,8 @@ use super::{
 use crate::{ids::Gid, link::CloseCode, seldom::Seldom, session::Written};
 
 const STREAM_HEADER: usize = 24;
+/// A message that is longer once it is decompressed holds up no other task while that is done.
+const LONG: usize = 64 << 10;
 const RELIABLE: u8 = 1;
 const BEST_EFFORT: u8 = 2;
 /// A stream for a route that is gone is stopped with this.
@@ -41,7 +42,7 @@ pub(super) struct Inbound {
     /// How its messages are protected.
     pub(super) protection: Protection,
     /// What arrives.
-    pub(super) counters: Arc<Counters>,
+    pub(super) counters: Counting,
     /// Wakes a publish that waits for room.
     pub(super) pulse: Pulse,
     /// Largest payload accepted.
@@ -54,8 +55,6 @@ pub(super) struct Inbound {
     pub(super) receipts: Arc<Receipts>,
     /// Samples that could not be published here, for the log.
     pub(super) losses: Arc<Seldom>,
-    /// To the hub.
-    pub(super) events: mpsc::Sender<Event>,
     /// What was refused, for the log and status.
     pub(super) refused: mpsc::Sender<(CloseCode, String)>,
 }
@@ -154,7 +153,7 @@ impl Inbound {
         let Some(opened) = self.protection.open(body, from.route).map_err(refused)? else {
             // Nothing is wrong with it. The rest is read to be counted.
             let why = "the link ended before they were read";
-            self.lost("no_link", from.number, from.gid, &why).await;
+            self.lost("no_link", from.number, from.gid, &why);
             return Ok(true);
         };
         let gid = writer(from.route.kind, from.gid, &opened.header)
@@ -162,14 +161,20 @@ impl Inbound {
         if opened.header.compressed {
             self.intake.expand(&mut room).await;
         }
-        let payload = opened.payload(self.max_message).map_err(refused)?;
+        // `expand` lets one at a time through: no peer has several threads work for it.
+        let long =
+            if opened.header.compressed { opened.header.uncompressed_len as usize } else { 0 };
+        let payload = aside(long, || opened.payload(self.max_message)).map_err(refused)?;
         let meta = Meta {
             sequence: opened.header.sequence,
             source_timestamp: opened.header.source_timestamp,
             published: published(opened.header.age_ms),
         };
         match self.routes.writer(from.number, gid).await {
-            Some(stand_in) => self.take_in(&stand_in, from, meta, &payload).await,
+            Some(stand_in) => {
+                let came = Came { meta, payload: &payload, long };
+                self.take_in(&stand_in, from, came).await;
+            }
             None => self.counters.lost(&self.topic(from.number), "no_route", 1),
         }
         drop(payload);
@@ -179,13 +184,14 @@ impl Inbound {
 
     /// Writes into the stand-in's ring, and has the peer told if it awaits that. What came over an
     /// earlier link and was sent again is there already.
-    async fn take_in(&self, stand_in: &StandIn, from: From, meta: Meta, payload: &[u8]) {
+    async fn take_in(&self, stand_in: &StandIn, from: From, came: Came<'_>) {
         let From { number, gid, reliable, route } = from;
+        let Came { meta, payload, .. } = came;
         let told = reliable && route.kind == Kind::Topic;
         if told && stand_in.last_sequence() >= Some(meta.sequence) {
             return self.receipts.came(number, gid, meta.sequence, payload.len());
         }
-        let there = self.publish(stand_in, from, meta, payload).await;
+        let there = self.publish(stand_in, from, came).await;
         match told {
             true if there => self.receipts.came(number, gid, meta.sequence, payload.len()),
             true => self.receipts.dropped(number, gid, meta.sequence),
@@ -196,10 +202,11 @@ impl Inbound {
     /// Writes into the stand-in's ring; waits for a reader that keeps all, which in turn holds the peer's
     /// stream back: as long as the link stands, and beyond that for what had come when a successor took
     /// over. Whether it is there.
-    async fn publish(&self, stand_in: &StandIn, from: From, meta: Meta, payload: &[u8]) -> bool {
+    async fn publish(&self, stand_in: &StandIn, from: From, came: Came<'_>) -> bool {
+        let Came { meta, payload, long } = came;
         let mut waiting = None;
         loop {
-            match stand_in.try_write(&from.gid, meta, payload) {
+            match aside(long, || stand_in.try_write(&from.gid, meta, payload)) {
                 Ok(Written::Yes) => {
                     self.counters.arrived(payload.len());
                     return true;
@@ -217,7 +224,7 @@ impl Inbound {
                     let _ = tokio::time::timeout(Duration::from_millis(100), beat.changed()).await;
                 }
                 Err(error) => {
-                    self.lost("ring", from.number, stand_in.gid(), &error).await;
+                    self.lost("ring", from.number, stand_in.gid(), &error);
                     return false;
                 }
             }
@@ -230,14 +237,12 @@ impl Inbound {
     }
 
     /// A sample of this route came here and is lost.
-    async fn lost(&self, cause: &'static str, number: u32, gid: Gid, error: &(dyn Display + Sync)) {
-        self.counters.dropped(cause, 1);
+    fn lost(&self, cause: &'static str, number: u32, gid: Gid, error: &dyn Display) {
         let topic = self.topic(number);
+        self.counters.lost(&topic, cause, 1);
         if let Some(samples) = self.losses.count(Instant::now()) {
             tracing::warn!(%topic, %gid, %error, samples, "samples from a peer are lost");
         }
-        // An error: the hub is gone, and the status with it.
-        let _ = self.events.send(Event::Lost { topic, cause, samples: 1 }).await;
     }
 }
 
@@ -245,6 +250,20 @@ impl Inbound {
 fn published(age_ms: u32) -> u64 {
     // 0 would be now.
     monotonic().saturating_sub(u64::from(age_ms) * 1_000_000).max(1)
+}
+
+/// Does `work` on so many bytes; if they are many, while another thread has this one's other tasks.
+fn aside<T>(bytes: usize, work: impl FnOnce() -> T) -> T {
+    if bytes > LONG { tokio::task::block_in_place(work) } else { work() }
+}
+
+/// A message that came.
+#[derive(Clone, Copy)]
+struct Came<'a> {
+    meta: Meta,
+    payload: &'a [u8],
+    /// Bytes of it that a peer made of few.
+    long: usize,
 }
 
 /// Where a stream says that it comes from.
@@ -284,6 +303,21 @@ pub(super) fn stream_header(reliable: bool, route: u32, gid: Gid) -> [u8; STREAM
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn decompression_of_a_long_message_leaves_the_worker_to_other_tasks() {
+        let mut builder = tokio::runtime::Builder::new_multi_thread();
+        let runtime = builder.worker_threads(1).enable_all().build().unwrap();
+        let (say, hear) = std::sync::mpsc::channel();
+        let long = runtime.spawn(async move {
+            let other = tokio::spawn(async move { say.send(()).unwrap() });
+            // It ends once another task of the only worker ran.
+            let heard = aside(LONG + 1, || hear.recv_timeout(Duration::from_secs(60)));
+            other.await.unwrap();
+            heard
+        });
+        assert_eq!(runtime.block_on(long).unwrap(), Ok(()));
+    }
 
     #[test]
     fn a_stream_header_comes_back_and_anything_else_is_refused() {

@@ -136,6 +136,11 @@ impl Queue {
         self.over
     }
 
+    /// Samples that nobody took.
+    pub(super) fn waiting(&self) -> u64 {
+        self.samples.len() as u64
+    }
+
     /// Whether nobody takes from it any more.
     pub(super) fn is_over(&self) -> bool {
         self.over

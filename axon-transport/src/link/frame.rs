@@ -56,6 +56,11 @@ pub fn read_length(prefix: [u8; 4], limit: usize) -> Result<usize, FrameError> {
     }
 }
 
+/// Whether `frame` (without its length) has a type that this version knows.
+pub(crate) fn is_known(frame: &[u8]) -> bool {
+    frame.first().is_some_and(|kind| Message::is_known(kind & !COMPRESSED))
+}
+
 /// Bytes of the map in `frame` (without its length) once it is decompressed, as the frame says.
 pub fn unpacked_length(frame: &[u8]) -> usize {
     match frame.split_first() {
@@ -107,6 +112,10 @@ impl Message {
         let (&kind, body) = frame.split_first().ok_or(FrameError::Empty)?;
         if kind & COMPRESSED == 0 {
             return Self::decode(kind, body);
+        }
+        // Nothing is decompressed in order to be passed over.
+        if !is_known(frame) {
+            return Ok(None);
         }
         let (length, body) =
             body.split_first_chunk::<4>().ok_or(FrameError::Compression("no length"))?;

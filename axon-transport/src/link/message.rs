@@ -330,6 +330,11 @@ impl Message {
         }
     }
 
+    /// Whether [`decode`](Self::decode) knows this type.
+    pub(super) fn is_known(kind: u8) -> bool {
+        matches!(kind, 1..=13 | 16..=19)
+    }
+
     /// The message of type `kind`, `None` for an unknown type.
     pub(super) fn decode(kind: u8, map: &[u8]) -> Result<Option<Self>, FrameError> {
         let message = match kind {
@@ -375,8 +380,9 @@ impl Message {
                     && m.added.iter().all(Endpoint::is_sane),
                 "an endpoint is out of bounds",
             ),
-            Self::Asserted(m) => {
-                ok(m.publishers.len() <= LIMITS.endpoints, "more publishers than there can be")
+            Self::Asserted(Asserted { publishers })
+            | Self::RouteReady(RouteReady { publishers, .. }) => {
+                ok(publishers.len() <= LIMITS.endpoints, "more publishers than there can be")
             }
             Self::Received(m) => {
                 ok(m.flows.len() <= LIMITS.endpoints, "more publishers than there can be")
@@ -392,7 +398,13 @@ impl Message {
                     && m.subscribers.iter().all(|s| s.qos.depth >= 1),
                 "a route is out of bounds",
             ),
-            _ => Ok(()),
+            Self::Elected(_)
+            | Self::GraphResync(_)
+            | Self::Unsubscribe(_)
+            | Self::Keepalive
+            | Self::LinkClosed(_) => Ok(()),
+            // Their decoder bounds them.
+            Self::Keys(_) => Ok(()),
         }
     }
 }

@@ -12,6 +12,7 @@ mod order;
 
 pub use close::CloseCode;
 pub use election::{Candidate, keep};
+pub(crate) use frame::is_known;
 pub use frame::{
     FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, read_length, unpacked_length,
 };

@@ -129,6 +129,29 @@ fn unknown_types_and_keys_are_skipped() {
 }
 
 #[test]
+fn an_unknown_type_is_skipped_without_decompression() {
+    // No zstd frame, and of a length that no map may have.
+    for length in [16, u32::MAX] {
+        let frame = [&[0xff][..], &length.to_be_bytes(), b"no zstd frame"].concat();
+        assert_eq!(decode(&frame).unwrap(), None);
+    }
+    for kind in 0..0x80 {
+        let skipped = matches!(Message::decode(kind, &[0xa0]), Ok(None));
+        assert_eq!(skipped, !Message::is_known(kind), "type {kind}");
+    }
+}
+
+#[test]
+fn a_list_of_more_publishers_than_there_can_be_is_refused() {
+    let gids = |count| vec![Gid::default(); count];
+    let ready = |count| Message::RouteReady(RouteReady { route: 1, publishers: gids(count) });
+    let asserted = |count| Message::Asserted(Asserted { publishers: gids(count) });
+    let taken = |message: Message| decode(body(&message.to_frame().unwrap())).is_ok();
+    assert!(taken(ready(65_536)) && taken(asserted(65_536)));
+    assert!(!taken(ready(65_537)) && !taken(asserted(65_537)));
+}
+
+#[test]
 fn bounds_are_enforced_before_anything_is_allocated() {
     assert!(matches!(
         read_length([0xff; 4], MAX_FRAME),

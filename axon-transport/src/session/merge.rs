@@ -4,7 +4,7 @@
 //! Whoever carries messages away from where they were written needs that: to another host, or to or from
 //! a process that shares no memory.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use crate::ids::Gid;
 
@@ -85,6 +85,12 @@ impl<T> Merge<T> {
     /// Whether there is one of any reader.
     pub(crate) fn holds_any(&self) -> bool {
         self.ways.values().any(|way| way.next.is_some())
+    }
+
+    /// How many messages there are that readers have given up to it.
+    pub(crate) fn held(&self) -> usize {
+        let numbers = self.ways.values().filter_map(|way| Some(way.next.as_ref()?.number));
+        numbers.collect::<BTreeSet<_>>().len()
     }
 
     /// Whether readers have more that another had than could be dropped in one go: there is no next one

@@ -82,6 +82,28 @@ fn samples_that_a_slow_peer_is_spared_are_counted_by_topic() {
 }
 
 #[test]
+fn best_effort_that_a_link_had_when_it_broke_is_counted() {
+    const SAMPLES: u64 = 100;
+    let mut hosts = Plan::new([classic(&[]), classic(&[])]).start();
+    let (lossy, _reads) = across(&hosts, "/lossy", Qos::sensor_data());
+    let there = hosts[1].status().pid;
+    signal(there, Signal::STOP);
+    for _ in 0..SAMPLES {
+        lossy.publish(&[0x5a; 1_000]).unwrap();
+    }
+    // It is killed, and has a successor on the same port.
+    assert_eq!(hosts[1].daemon.take().unwrap().0.id(), there);
+    until("each is counted", || {
+        let topics = hosts[0].status().topics;
+        let of = topics.iter().filter(|of| of.topic == "/lossy");
+        of.flat_map(|of| of.dropped.values()).sum::<u64>() == SAMPLES
+    });
+    assert!(dropped(&hosts[0], "/lossy", "no_link") > 0);
+    let address = hosts[1].address.to_string();
+    hosts[0].wait_log(&["WARN", "samples are dropped", "/lossy", "no_link", &address]);
+}
+
+#[test]
 fn samples_without_a_key_are_counted_by_topic() {
     let kmes = Kmes::start();
     let more = [("AXON_QKD_KEY_MODE", "messages10")];

@@ -1,6 +1,8 @@
-//! A pinned peer whose samples have numbers that no publisher can have reached.
+//! A pinned peer whose samples have numbers that no publisher can have reached, or are far longer than what
+//! it sends.
 
 use axon_envelope::inner::Header;
+use axon_tests::Sizes;
 use axon_transport::{
     ids::{DaemonId, Gid},
     owner::SessionKey,
@@ -13,6 +15,75 @@ use super::{
     hoard::{TOPIC, TYPE, published},
     process::{PATIENCE, until},
 };
+
+/// `length` zeros in a zstd frame of RLE blocks, four bytes for each 128 KiB.
+fn zeros(length: u32) -> Vec<u8> {
+    const BLOCK: u32 = 128 << 10;
+    let mut frame = vec![0x28, 0xb5, 0x2f, 0xfd, 0xa0];
+    frame.extend_from_slice(&length.to_le_bytes());
+    for from in (0..length).step_by(BLOCK as usize) {
+        let (size, last) = ((length - from).min(BLOCK), from + BLOCK >= length);
+        frame.extend_from_slice(&(size << 3 | 1 << 1 | u32::from(last)).to_le_bytes()[..3]);
+        frame.push(0);
+    }
+    frame
+}
+
+#[test]
+fn samples_that_are_far_longer_than_what_comes_of_them_arrive_in_order_and_others_meanwhile() {
+    const LENGTH: u32 = 8 << 20;
+    const SAMPLES: u64 = 24;
+    let camera = Camera::new();
+    let mut there = camera.a.subscribe(Sizes::Small);
+    let mut stream = camera.b.publish(Sizes::Small, 1, None);
+    there.wait_taken(1);
+    let session = camera.a.session("reader");
+    let spec = EndpointSpec::new(TOPIC, TYPE, Qos::keep_all());
+    let subscription = session.create_subscription(spec).unwrap();
+    let (mut link, key) = (camera.link(0xff), SessionKey::generate().unwrap());
+    camera.stranger.prove(&mut link, DaemonId([0xff; 16]), &[&key]);
+    let publisher = Gid::new(key.id(), 1);
+    let route = published(&camera, &mut link, publisher);
+    let mut bytes = vec![1, 0, 0, 0];
+    bytes.extend_from_slice(&route.to_be_bytes());
+    bytes.extend_from_slice(&publisher.0);
+    let lengths = |sequence: u64| if sequence.is_multiple_of(3) { 6 } else { LENGTH };
+    for sequence in 1..=SAMPLES {
+        let length = lengths(sequence);
+        let (compressed, payload) = match length {
+            LENGTH => (true, zeros(length)),
+            _ => (false, vec![0; length as usize]),
+        };
+        let header = Header {
+            gid: publisher.0,
+            sequence,
+            source_timestamp: 0,
+            request_id: Default::default(),
+            compressed,
+            age_ms: 0,
+            uncompressed_len: length,
+        };
+        let header = header.encode();
+        bytes.extend_from_slice(&u32::to_be_bytes((header.len() + payload.len()) as u32));
+        bytes.extend_from_slice(&header);
+        bytes.extend_from_slice(&payload);
+    }
+    let mut data = camera.stranger.open(&link).expect("a stream");
+    let before = there.tally().taken;
+    camera.stranger.write_for(&mut data, &bytes, PATIENCE);
+    let mut sample = Vec::new();
+    for sequence in 1..=SAMPLES {
+        let info = subscription.recv(&mut sample, Some(PATIENCE)).expect("a sample");
+        assert_eq!((info.sequence, subscription.lost()), (sequence, 0));
+        assert!(sample.len() == lengths(sequence) as usize && sample.iter().all(|byte| *byte == 0));
+    }
+    there.wait_taken(before + 1);
+    let sent = stream.stop();
+    there.wait_taken(sent);
+    let tally = there.tally();
+    assert_eq!((tally.lost, tally.repeated, tally.corrupt), (0, 0, 0), "{tally:?}");
+    assert_eq!(link.connection.close_reason(), None);
+}
 
 #[test]
 fn a_number_that_cannot_be_is_refused_counted_by_topic_and_loses_nothing_else() {
@@ -55,5 +126,7 @@ fn a_number_that_cannot_be_is_refused_counted_by_topic_and_loses_nothing_else() 
         topic.is_some_and(|topic| topic.dropped.get("ring") == Some(&3))
     });
     camera.a.wait_log(&["samples from a peer are lost", TOPIC]);
+    // As what is dropped for any cause: once a second, however many there are.
+    camera.a.wait_log(&["WARN", "samples are dropped", TOPIC, "ring"]);
     assert_eq!(camera.a.status().links.iter().filter(|link| link.host == "camera").count(), 1);
 }

@@ -50,7 +50,7 @@ impl Hub {
         let Some(peer) = self.peers.get_mut(&daemon) else { return };
         let Some(stalled) = peer.stalled(route, &self.shared) else { return };
         peer.update_services(&self.local, &self.shared);
-        let (number, counters) = (peer.link, Arc::clone(&peer.counters));
+        let (number, counters) = (peer.link, peer.counters.counting());
         let Some(link) = self.links.get(&number) else { return };
         let (who, events) = (self.peer_of(link), self.events.clone());
         let (topic, reason) = (stalled.topic, stalled.reason);

@@ -310,8 +310,7 @@ impl Hub {
         };
         let (who, wanted) = (self.peer_of(link), link.reading.subscribe());
         let (refused, mut violations) = mpsc::channel(1);
-        let inbound: Inbound =
-            peer.inbound(carrier, &self.shared, wanted, self.events.clone(), refused);
+        let inbound: Inbound = peer.inbound(carrier, &self.shared, wanted, refused);
         tokio::spawn(inbound.run());
         let events = self.events.clone();
         tokio::spawn(async move {
@@ -422,7 +421,12 @@ impl Hub {
         }
         // Its graph, and what of its streams was not read.
         if let Some(peer) = self.peers.remove(&daemon) {
-            self.tell_lost(&peer).await;
+            let (events, who, tally) = (self.events.clone(), self.peer_of(&link), peer.over());
+            tokio::spawn(async move {
+                tally.is_final().await;
+                // An error: the hub is gone.
+                let _ = events.send(Event::LinkLost(who, tally.take_lost())).await;
+            });
             give_memory_back();
         }
         self.freed = true;

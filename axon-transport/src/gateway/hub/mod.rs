@@ -127,6 +127,8 @@ pub(super) enum Event {
         /// How many.
         samples: u64,
     },
+    /// What was dropped on the way to or from this peer and was not told when its link ended.
+    LinkLost(String, Vec<Loss>),
 }
 
 /// A connection between HELLO and its end.
@@ -326,6 +328,7 @@ impl Hub {
             Event::Lost { topic, cause, samples } => {
                 self.tell(ToControl::Lost { topic: topic.to_string(), cause, samples }).await;
             }
+            Event::LinkLost(peer, losses) => self.tell_lost(&peer, losses).await,
             Event::Expired(link) => {
                 let text = "AXON_QKD_SESSION_MAX_AGE is reached and no successor came";
                 if let Some(l) = self.links.get(&link) {
@@ -408,7 +411,7 @@ impl Hub {
                 Ok(())
             }
             Message::Received(received) => {
-                peer.received(received);
+                peer.received(&received);
                 Ok(())
             }
             Message::RouteRefused(refused) => {
@@ -461,10 +464,8 @@ impl Hub {
     }
 
     /// What was dropped since it was told last, on the way to or from a peer.
-    async fn tell_lost(&self, peer: &Peer) {
-        let losses = peer.counters.take_lost();
-        let link = self.links.get(&peer.link).map(|link| self.peer_of(link));
-        counters::log(&losses, link.as_deref().unwrap_or("a peer whose link ended"));
+    async fn tell_lost(&self, peer: &str, losses: Vec<Loss>) {
+        counters::log(&losses, peer);
         for Loss { topic, cause, samples } in losses {
             self.tell(ToControl::Lost { topic: topic.to_string(), cause, samples }).await;
         }
@@ -472,8 +473,8 @@ impl Hub {
 
     async fn report(&self) {
         for peer in self.peers.values() {
-            self.tell_lost(peer).await;
             if let Some(link) = self.links.get(&peer.link) {
+                self.tell_lost(&self.peer_of(link), peer.counters.take_lost()).await;
                 let mut status =
                     status::link(&link.established, &link.connection, link.since_unix_ms);
                 peer.counters.fill(&mut status);

@@ -7,8 +7,10 @@ use std::{
     time::{Duration, Instant},
 };
 
+use axon_envelope::Kind;
+
 use super::{Active, Owner, Shared};
-use crate::{gateway::hub::Event, ids::Gid};
+use crate::{gateway::hub::Event, ids::Gid, qos::Reliability};
 
 /// What a publisher left is given up after so long without progress.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -93,18 +95,23 @@ impl Endings {
         self.endings.values().map(|ending| ending.since + PATIENCE).min()
     }
 
-    /// The link is over: what was to be sent reliably is given up.
-    pub(super) async fn link_over(&self, routes: &HashMap<u32, Active>) {
-        for active in routes.values() {
-            let samples = active.give_up();
+    /// The link is over: what was not sent, or not acknowledged where it was to be, is given up.
+    pub(super) async fn link_over(&self, routes: &mut HashMap<u32, Active>, shared: &Shared) {
+        for active in routes.values_mut() {
+            let unsent = active.end().await;
+            let topic = &active.flow.topic;
+            let samples = match active.flow.route.kind {
+                Kind::Topic => {
+                    shared.counters.lost(topic, "no_link", unsent);
+                    active.give_up()
+                }
+                Kind::Request | Kind::Response => unsent,
+            };
             if samples > 0 {
-                let topic = &*active.flow.topic;
                 let peer = &self.owner.daemon;
-                tracing::warn!(topic, %peer, samples,
+                tracing::warn!(topic = &**topic, %peer, samples,
                     "the link ended before the peer acknowledged them: samples may be lost");
-                let topic = Arc::clone(&active.flow.topic);
-                let lost = Event::Lost { topic, cause: "link_ended", samples };
-                let _ = self.owner.events.send(lost).await;
+                shared.counters.lost(topic, "link_ended", samples);
             }
         }
     }
@@ -118,6 +125,22 @@ impl Active {
             while source.take_of(of).is_some() {}
             source.acknowledge_of(of, u64::MAX);
         }
+    }
+
+    /// Ends all that is sent. How many samples, requests or responses were taken and not written, but for
+    /// samples that are RELIABLE: of these those count that are not acknowledged.
+    async fn end(&mut self) -> u64 {
+        let mut unsent = 0;
+        for (of, feed) in &mut self.feeds {
+            let left = feed.end().await;
+            // As the first asks that reads it.
+            let source = self.sources.iter().find(|source| source.reads(of));
+            let reliable = source.is_some_and(|s| s.qos().reliability == Reliability::Reliable);
+            if self.flow.route.kind != Kind::Topic || !reliable {
+                unsent += left;
+            }
+        }
+        unsent
     }
 
     /// Tells the publishers what does not get to the peer; how many samples that are.

@@ -69,6 +69,16 @@ impl Feed {
         self.holds() || self.stream.is_some()
     }
 
+    /// The link is over. How many samples were taken and not written.
+    pub(super) async fn end(&mut self) -> u64 {
+        let held = usize::from(self.held.take().is_some()) + self.samples.held();
+        let queued = match self.stream.take() {
+            Some(stream) => stream.end().await,
+            None => 0,
+        };
+        held as u64 + queued
+    }
+
     /// The peer says that it has samples up to this number, but for so many that it dropped: of those
     /// that were sent to it, and not more of them.
     pub(super) fn acknowledge(&mut self, sequence: u64, dropped: u64) -> Option<Done> {

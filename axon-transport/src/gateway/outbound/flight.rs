@@ -13,7 +13,10 @@ use quinn::{SendStream, VarInt};
 use tokio::sync::Notify;
 
 use super::Carrier;
-use crate::{gateway::keyring::lock, link::CloseCode};
+use crate::{
+    gateway::{counters::Counting, keyring::lock},
+    link::CloseCode,
+};
 
 /// So many are under way whatever their length: the next one leaves while the last one is acknowledged.
 const ALWAYS: usize = 2;
@@ -41,6 +44,13 @@ struct Samples {
     under_way: VecDeque<(u64, u64, Arc<Notify>)>,
 }
 
+/// What is counted of a sample once it is known what came of it.
+pub(super) struct Handed {
+    pub(super) counters: Counting,
+    pub(super) topic: Arc<str>,
+    pub(super) payload: usize,
+}
+
 impl Flight {
     /// Whether one more may be handed over, where the congestion window is this long.
     pub(super) fn has_room(&self, window: impl FnOnce() -> u64) -> bool {
@@ -66,8 +76,15 @@ impl Flight {
     }
 
     /// A finished stream of so many bytes is under way. It is reset after `life`, when the peer would
-    /// drop the sample. Its carrier is in use until it is acknowledged.
-    pub(super) fn add(&self, mut stream: SendStream, bytes: u64, life: Duration, carrier: Carrier) {
+    /// drop the sample. Its carrier is in use until it is acknowledged; then it counts as sent.
+    pub(super) fn add(
+        &self,
+        mut stream: SendStream,
+        bytes: u64,
+        life: Duration,
+        carrier: Carrier,
+        sample: Handed,
+    ) {
         let (flight, begun) = (self.clone(), Instant::now());
         let (number, first) = {
             let mut samples = lock(&self.0.samples);
@@ -81,15 +98,22 @@ impl Flight {
                 let acknowledged = stream.stopped();
                 tokio::pin!(acknowledged);
                 tokio::select! {
-                    _ = &mut acknowledged => return,
+                    over = &mut acknowledged => return over,
                     () = first.notified() => {}
                 }
                 // Nothing to change where it is acknowledged already.
                 let _ = stream.set_priority(0);
-                let _ = acknowledged.await;
+                acknowledged.await
             };
-            if tokio::time::timeout(LONGEST.min(life), over).await.is_err() {
-                let _ = stream.reset(VarInt::from_u32(CloseCode::Goodbye.code()));
+            let Handed { counters, topic, payload } = sample;
+            match tokio::time::timeout(LONGEST.min(life), over).await {
+                // A peer that stops it has no such route any more, and counts it.
+                Ok(Ok(_)) => counters.sent(payload),
+                Ok(Err(_)) => counters.lost(&topic, "no_link", 1),
+                Err(_) => {
+                    let _ = stream.reset(VarInt::from_u32(CloseCode::Goodbye.code()));
+                    counters.lost(&topic, "late", 1);
+                }
             }
             flight.land(number, begun.elapsed());
             drop(carrier);

@@ -5,6 +5,7 @@
 //! queues and then leaves its samples in the ring, where they hold back a KEEP_ALL publisher and
 //! nobody else.
 
+mod acknowledged;
 mod ending;
 mod feed;
 mod flight;
@@ -26,9 +27,10 @@ use axon_envelope::Route;
 use quinn::Connection;
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 
-use self::{ending::Endings, feed::Feed, stalling::Stalling};
+pub(super) use self::acknowledged::Acknowledged;
+use self::{acknowledged::Acknowledgement, ending::Endings, feed::Feed, stalling::Stalling};
 use super::{
-    counters::Counters,
+    counters::Counting,
     hub::Event,
     keyring::lock,
     pulse::Pulse,
@@ -40,7 +42,6 @@ use super::{
 };
 use crate::{
     ids::{DaemonId, Gid},
-    link::ReceivedOf,
     qos::{Qos, Reliability},
     session::Subscription,
 };
@@ -169,10 +170,16 @@ pub(super) enum Order {
     GiveUp(u32, oneshot::Sender<u64>),
     /// Send over this connection from now on.
     Connection(Carrier),
-    /// The peer acknowledges samples.
-    Received(Vec<ReceivedOf>),
     /// This publisher has ended: what it left is carried, and then the hub is told.
     Ending(Gid),
+}
+
+/// What an outbound task hears.
+pub(super) struct Inbox {
+    /// What the hub tells it.
+    pub(super) orders: mpsc::UnboundedReceiver<Order>,
+    /// What the peer acknowledges.
+    pub(super) acknowledged: Arc<Acknowledged>,
 }
 
 /// Whose outbound task it is, and who is told what came of it.
@@ -218,13 +225,15 @@ pub(super) struct Carrier {
 /// What the streams of a peer share.
 struct Shared {
     carrier: watch::Receiver<Carrier>,
-    counters: Arc<Counters>,
+    counters: Counting,
     /// What may wait in the queues.
     queues: Arc<Room>,
     /// A queue has room again, or is over.
     popped: Notify,
     /// A queue is over.
     ended: AtomicBool,
+    /// What the peer acknowledges.
+    acknowledged: Arc<Acknowledged>,
     /// What was sent, or dropped, to a peer that acknowledges nothing, by route and publisher.
     done: Mutex<HashMap<(u32, Gid), Done>>,
 }
@@ -266,13 +275,14 @@ struct Active {
 /// Serves one peer until the order channel closes.
 pub(super) async fn run(
     first: Carrier,
-    mut orders: mpsc::UnboundedReceiver<Order>,
-    counters: Arc<Counters>,
+    inbox: Inbox,
+    counters: Counting,
     queues: Arc<Room>,
     pulse: Pulse,
     owner: Owner,
     stalled_after: Duration,
 ) {
+    let Inbox { mut orders, acknowledged } = inbox;
     let (carrier, current) = watch::channel(first);
     let (popped, ended) = (Notify::new(), AtomicBool::new(false));
     let shared = Arc::new(Shared {
@@ -281,6 +291,7 @@ pub(super) async fn run(
         queues,
         popped,
         ended,
+        acknowledged,
         done: Mutex::default(),
     });
     let (mut endings, mut stalling) = (Endings::new(owner), Stalling::new(stalled_after));
@@ -297,11 +308,7 @@ pub(super) async fn run(
         if shared.ended.swap(false, Ordering::Relaxed) {
             routes.values_mut().for_each(Active::prune);
         }
-        for ((route, of), done) in std::mem::take(&mut *lock(&shared.done)) {
-            if let Some(active) = routes.get(&route) {
-                active.done(of, done);
-            }
-        }
+        take_up(&mut routes, &shared);
         let ending = endings.look(&mut routes, &shared);
         let stalling = stalling.look(&mut routes, &shared, endings.owner());
         let again = ending.into_iter().chain(stalling).min();
@@ -315,20 +322,45 @@ pub(super) async fn run(
         if moved.any {
             // More may wait; let the streams and orders run in between.
             tokio::task::yield_now().await;
-            while let Ok(order) = orders.try_recv() {
-                apply(order, &mut routes, &carrier, &mut endings);
+        } else {
+            let over = tokio::select! {
+                order = orders.recv() => match order {
+                    Some(order) => {
+                        take_up(&mut routes, &shared);
+                        apply(order, &mut routes, &carrier, &mut endings);
+                        false
+                    }
+                    None => true,
+                },
+                changed = beat.changed() => changed.is_err(),
+                () = shared.acknowledged.noted() => false,
+                () = popped => false,
+                () = freed => false,
+                () = rested(moved.again) => false,
+            };
+            if over {
+                take_up(&mut routes, &shared);
+                return endings.link_over(&mut routes, &shared).await;
             }
-            continue;
         }
-        tokio::select! {
-            order = orders.recv() => match order {
-                Some(order) => apply(order, &mut routes, &carrier, &mut endings),
-                None => return endings.link_over(&routes).await,
-            },
-            changed = beat.changed() => if changed.is_err() { return endings.link_over(&routes).await },
-            () = popped => {}
-            () = freed => {}
-            () = rested(moved.again) => {}
+        // All that there are: a peer that asks and takes back all the time has none wait.
+        take_up(&mut routes, &shared);
+        while let Ok(order) = orders.try_recv() {
+            apply(order, &mut routes, &carrier, &mut endings);
+        }
+    }
+}
+
+/// Takes up what is done with and what the peer acknowledged, which was before any order that waits.
+fn take_up(routes: &mut HashMap<u32, Active>, shared: &Shared) {
+    for ((route, of), done) in std::mem::take(&mut *lock(&shared.done)) {
+        if let Some(active) = routes.get(&route) {
+            active.done(of, done);
+        }
+    }
+    for ((route, of), acknowledged) in shared.acknowledged.take() {
+        if let Some(active) = routes.get_mut(&route) {
+            active.acknowledge(of, acknowledged);
         }
     }
 }
@@ -360,13 +392,6 @@ fn apply(
             let _ = told.send(given_up);
         }
         Order::Ending(of) => endings.add(of),
-        Order::Received(flows) => {
-            for ReceivedOf { route, publisher, sequence, dropped } in flows {
-                if let Some(active) = routes.get_mut(&route) {
-                    active.acknowledge(publisher, sequence, dropped);
-                }
-            }
-        }
         Order::Route(number, RouteOut { topic, route, acknowledged, sources, seen }) => {
             let active = routes.entry(number).or_insert_with(|| Active {
                 flow: Flow { number, topic, route, acknowledged },
@@ -401,7 +426,8 @@ impl Active {
     }
 
     /// The peer has samples of a publisher up to this number, but for some that it dropped.
-    fn acknowledge(&mut self, of: Gid, sequence: u64, dropped: u64) {
+    fn acknowledge(&mut self, of: Gid, acknowledged: Acknowledgement) {
+        let Acknowledgement { sequence, dropped } = acknowledged;
         let done = self.feeds.get_mut(&of).and_then(|feed| feed.acknowledge(sequence, dropped));
         // Of what was never sent nothing is acknowledged, whatever a peer says.
         if let Some(done) = done {

@@ -4,7 +4,7 @@ use std::{
     collections::VecDeque,
     sync::{
         Arc, Mutex,
-        atomic::{AtomicU64, Ordering},
+        atomic::{AtomicU64, AtomicUsize, Ordering},
     },
     time::Duration,
 };
@@ -14,7 +14,11 @@ use bytes::Bytes;
 use quinn::{SendStream, VarInt};
 use tokio::sync::Notify;
 
-use super::{Carrier, Done, Flow, Shared, flight::Flight};
+use super::{
+    Carrier, Done, Flow, Shared,
+    acknowledged::Awaited,
+    flight::{Flight, Handed},
+};
 use crate::{
     gateway::{
         frames::Frames,
@@ -48,7 +52,11 @@ pub(super) struct Stream {
     filled: Arc<Notify>,
     /// Bytes that QUIC took over.
     moved: Arc<AtomicU64>,
+    /// Samples that the task had taken from the queue and not written when it ended.
+    left: Arc<AtomicUsize>,
     task: tokio::task::JoinHandle<()>,
+    /// As long as there is something that the peer may acknowledge.
+    _awaited: Option<Awaited>,
 }
 
 impl Drop for Stream {
@@ -62,13 +70,15 @@ impl Stream {
         let queue = Queue::new(qos, Arc::clone(&shared.queues), flow.acknowledged);
         let queue = Arc::new(Mutex::new(queue));
         let filled = Arc::new(Notify::new());
-        let moved = Arc::default();
+        let (moved, left) = (Arc::default(), Arc::default());
+        let awaited = flow.acknowledged.then(|| shared.acknowledged.await_of(flow.number, of));
         let writer = Writer {
             flow,
             of,
             queue: Arc::clone(&queue),
             filled: Arc::clone(&filled),
             moved: Arc::clone(&moved),
+            left: Arc::clone(&left),
             shared,
             batch: VecDeque::new(),
             delivery: Delivery::Reliable,
@@ -76,7 +86,7 @@ impl Stream {
             frames: Frames::default(),
         };
         let task = tokio::spawn(writer.run());
-        Self { queue, filled, moved, task }
+        Self { queue, filled, moved, left, task, _awaited: awaited }
     }
 
     /// Queues a sample as `qos` says. It must not be over.
@@ -105,6 +115,15 @@ impl Stream {
         self.moved.load(Ordering::Relaxed)
     }
 
+    /// Ends it. How many samples were not written.
+    pub(super) async fn end(mut self) -> u64 {
+        self.task.abort();
+        // An error: it was aborted.
+        let _ = (&mut self.task).await;
+        // Relaxed: the end of the task comes before it.
+        lock(&self.queue).waiting() + self.left.load(Ordering::Relaxed) as u64
+    }
+
     /// Whether it has ended, with nothing left to send.
     pub(super) fn is_over(&self) -> bool {
         lock(&self.queue).is_over()
@@ -118,6 +137,7 @@ struct Writer {
     queue: Arc<Mutex<Queue>>,
     filled: Arc<Notify>,
     moved: Arc<AtomicU64>,
+    left: Arc<AtomicUsize>,
     shared: Arc<Shared>,
     /// What was taken from the queue and is not known to be written.
     batch: VecDeque<Sample>,
@@ -127,6 +147,13 @@ struct Writer {
     flight: Flight,
     /// What of it is sealed.
     frames: Frames,
+}
+
+impl Drop for Writer {
+    fn drop(&mut self) {
+        // Relaxed as where it is read.
+        self.left.store(self.batch.len(), Ordering::Relaxed);
+    }
 }
 
 /// The link is gone. What it did not carry goes over the next one, if there is one.
@@ -351,8 +378,10 @@ impl Writer {
             return Err("late");
         }
         let _ = stream.finish();
-        self.batch.iter().for_each(|s| self.shared.counters.sent(s.payload.len()));
-        self.flight.add(stream, bytes, left, carrier.clone());
+        let payload = self.batch.iter().map(|sample| sample.payload.len()).sum();
+        let (counters, topic) = (self.shared.counters.clone(), Arc::clone(&self.flow.topic));
+        let sample = Handed { counters, topic, payload };
+        self.flight.add(stream, bytes, left, carrier.clone(), sample);
         Ok(())
     }
 }

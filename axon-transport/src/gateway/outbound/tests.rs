@@ -3,7 +3,9 @@ use quinn::{Connection, VarInt};
 
 use super::{stream::Stream, *};
 use crate::{
+    daemon::status::LinkStatus,
     gateway::{
+        counters::Tally,
         played::{Pair, block_on},
         queue::Offered,
     },
@@ -24,9 +26,10 @@ fn shared(connection: &Connection) -> (Arc<Shared>, watch::Sender<Carrier>) {
     let in_use = watch::channel(()).1;
     let (sender, carrier) = watch::channel(Carrier { connection, protection, in_use });
     let (popped, ended) = (Notify::new(), AtomicBool::new(false));
-    let (counters, queues) = (Arc::default(), Room::new(256 << 20).of_peer());
-    let done = Mutex::default();
-    (Arc::new(Shared { carrier, counters, queues, popped, ended, done }), sender)
+    let (counters, queues) = (Tally::default().counting(), Room::new(256 << 20).of_peer());
+    let (acknowledged, done) = (Arc::default(), Mutex::default());
+    let shared = Shared { carrier, counters, queues, popped, ended, acknowledged, done };
+    (Arc::new(shared), sender)
 }
 
 fn a_sample(sequence: u64) -> Sample {
@@ -168,6 +171,84 @@ fn samples_that_are_dropped_are_counted_by_topic_and_cause() {
         queued(feed.queue(a_sample(sequence), &newest, &flow(), &shared));
         while lost(&shared).iter().all(|(cause, _)| *cause != "no_link") {
             tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    });
+}
+
+#[test]
+fn best_effort_counts_as_sent_once_it_is_acknowledged_and_as_late_where_it_is_reset() {
+    block_on(async {
+        let pair = Pair::new().await;
+        let (shared, carrier) = shared(&pair.here);
+        let flight = flight::Flight::default();
+        let topic = Arc::<str>::from("/t");
+        let hand = async |finished: bool, life: Duration| {
+            let mut stream = pair.here.open_uni().await.unwrap();
+            stream.write_all(b"sample").await.unwrap();
+            // One that is not at its end is never acknowledged to it.
+            if finished {
+                stream.finish().unwrap();
+            }
+            let (counters, topic) = (shared.counters.clone(), Arc::clone(&topic));
+            let sample = flight::Handed { counters, topic, payload: 6 };
+            flight.add(stream, 6, life, carrier.borrow().clone(), sample);
+        };
+        let sent = || {
+            let mut status = LinkStatus::default();
+            shared.counters.fill(&mut status);
+            status.samples_out
+        };
+        let lost = async || {
+            loop {
+                let losses = shared.counters.take_lost();
+                if let [loss] = &losses[..] {
+                    return (Arc::clone(&loss.topic), loss.cause, loss.samples);
+                }
+                assert!(losses.is_empty(), "{losses:?}");
+                tokio::time::sleep(Duration::from_millis(5)).await;
+            }
+        };
+        hand(true, Duration::MAX).await;
+        while sent() < 1 {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        hand(false, Duration::from_millis(1)).await;
+        assert_eq!(lost().await, (Arc::clone(&topic), "late", 1));
+        hand(false, Duration::MAX).await;
+        pair.here.close(VarInt::from_u32(0), b"");
+        assert_eq!(lost().await, (Arc::clone(&topic), "no_link", 1));
+        assert_eq!(sent(), 1);
+    });
+}
+
+#[test]
+fn all_that_a_link_did_not_carry_is_counted_when_it_ends() {
+    block_on(async {
+        let pair = Pair::new().await;
+        let (shared, _carrier) = shared(&pair.here);
+        pair.here.close(VarInt::from_u32(0), b"");
+        let counted = async |kind: Kind, qos: &Qos| {
+            let topic = TopicHash::new(0, "/t", "T").unwrap();
+            let flow = Flow { route: Route { kind, topic }, ..flow() };
+            let mut feed = Feed::new(OF);
+            for sequence in 1..=3 {
+                queued(feed.queue(a_sample(sequence), qos, &flow, &shared));
+            }
+            // The task may have taken some of them.
+            tokio::task::yield_now().await;
+            let (sources, seen, feeds) = (Vec::new(), HashMap::new(), HashMap::from([(OF, feed)]));
+            let active = Active { flow, stalled: false, sources, seen, feeds };
+            let events = mpsc::channel(1).0;
+            let owner = Owner { daemon: DaemonId([1; 16]), identity: "b".into(), events };
+            let mut routes = HashMap::from([(1, active)]);
+            Endings::new(owner).link_over(&mut routes, &shared).await;
+            let losses = shared.counters.take_lost();
+            losses.iter().map(|loss| (loss.cause, loss.samples)).collect::<Vec<_>>()
+        };
+        let several = Qos { depth: 5, ..Qos::sensor_data() };
+        assert_eq!(counted(Kind::Topic, &several).await, [("no_link", 3)]);
+        for kind in [Kind::Request, Kind::Response] {
+            assert_eq!(counted(kind, &Qos::keep_all()).await, [("link_ended", 3)]);
         }
     });
 }

@@ -23,11 +23,11 @@ pub(super) use self::{
 use super::{
     account::Account,
     control::Outbox,
-    counters::Counters,
+    counters::Tally,
     hub::{Event, Local, Shared},
     inbound::Inbound,
     intake::Intake,
-    outbound::{self, Carrier, Owner},
+    outbound::{self, Acknowledged, Carrier, Inbox, Owner},
     receipts::Receipts,
     routes::RouteKey,
     routes_in::RoutesIn,
@@ -58,7 +58,7 @@ pub(super) struct Peer {
     /// Control messages to it.
     pub(super) outbox: Outbox,
     /// What was carried and dropped.
-    pub(super) counters: Arc<Counters>,
+    pub(super) counters: Tally,
     pub(super) remote: Remote,
     /// Proves to it which sessions are this daemon's.
     prover: Prover,
@@ -95,6 +95,8 @@ pub(super) struct Peer {
     /// Servers there whose host takes requests for them.
     answering: BTreeSet<Gid>,
     orders: mpsc::UnboundedSender<outbound::Order>,
+    /// Samples that it acknowledged.
+    acknowledged: Arc<Acknowledged>,
 }
 
 impl Peer {
@@ -108,14 +110,16 @@ impl Peer {
         shared: &Arc<Shared>,
         owner: Owner,
     ) -> Self {
-        let counters = Arc::new(Counters::default());
+        let counters = Tally::default();
         let intake = Arc::clone(&account.intake);
         let (orders, receiver) = mpsc::unbounded_channel();
+        let acknowledged = Arc::<Acknowledged>::default();
+        let inbox = Inbox { orders: receiver, acknowledged: Arc::clone(&acknowledged) };
         let (queues, pulse) = (shared.queues.of_peer(), shared.pulse.clone());
         let (daemon, stalled_after) = (owner.daemon, shared.stalled_after);
         let owner_identity = owner.identity.clone();
-        let sent = Arc::clone(&counters);
-        tokio::spawn(outbound::run(carrier, receiver, sent, queues, pulse, owner, stalled_after));
+        let sent = counters.counting();
+        tokio::spawn(outbound::run(carrier, inbox, sent, queues, pulse, owner, stalled_after));
         let receipts = Receipts::new(outbox.clone());
         let telling = OnDrop(tokio::spawn(Arc::clone(&receipts).run()));
         Self {
@@ -145,6 +149,7 @@ impl Peer {
             alive: Alive::default(),
             answering: BTreeSet::new(),
             orders,
+            acknowledged,
         }
     }
 
@@ -174,21 +179,19 @@ impl Peer {
         carrier: Carrier,
         shared: &Shared,
         wanted: watch::Receiver<()>,
-        events: mpsc::Sender<Event>,
         refused: mpsc::Sender<(crate::link::CloseCode, String)>,
     ) -> Inbound {
         Inbound {
             connection: carrier.connection,
             protection: carrier.protection,
             routes: Arc::clone(&self.routes_in),
-            counters: Arc::clone(&self.counters),
+            counters: self.counters.counting(),
             pulse: shared.pulse.clone(),
             max_message: shared.max_message,
             wanted,
             intake: Arc::clone(&self.intake),
             receipts: Arc::clone(&self.receipts),
             losses: Arc::default(),
-            events,
             refused,
         }
     }
@@ -248,8 +251,8 @@ impl Peer {
     }
 
     /// The peer acknowledges samples.
-    pub(super) fn received(&self, received: Received) {
-        let _ = self.orders.send(outbound::Order::Received(received.flows));
+    pub(super) fn received(&self, received: &Received) {
+        self.acknowledged.note(&received.flows);
     }
 
     /// What the peer sees: what it is shown, and publishers that ended and are kept in its sight.
@@ -342,6 +345,11 @@ impl Peer {
         refused.filter(|_| !said)
     }
 
+    /// The peer is gone. What its tasks count until they have ended.
+    pub(super) fn over(self) -> Tally {
+        self.counters
+    }
+
     /// Puts what the peer's graph takes into `status`.
     pub(super) fn fill(&self, status: &mut LinkStatus) {
         status.endpoints = self.remote.len() as u64;
@@ -368,15 +376,18 @@ pub(super) fn spawn_reader(
     events: mpsc::Sender<Event>,
 ) {
     tokio::spawn(async move {
-        loop {
-            let next = reader.next_within(&account).await;
-            if let Ok((message, _)) = &next {
+        let pace = |cost| {
+            let (account, connection) = (Arc::clone(&account), connection.clone());
+            async move {
                 tokio::select! {
-                    () = account.pace(message) => {}
+                    () = account.pace(cost) => {}
                     // Its end is heard of at once.
                     _ = connection.closed() => {}
                 }
             }
+        };
+        loop {
+            let next = reader.next_within(&account, &pace).await;
             let ended = next.is_err();
             if events.send(Event::Control(link, next)).await.is_err() || ended {
                 return;
