@@ -30,8 +30,8 @@ use axon_transport::{
         EndpointSpec, Publisher, Session, SessionOptions, Subscription,
         address::Address,
         message::{
-            Announce, Asserted, Credit, EndpointRole, Head, Hello, Matched, Message, PROTOCOL,
-            Piece, Refused, SessionRole,
+            Announce, Asserted, Credit, EndpointRole, GivenUp, Head, Hello, Matched, Message,
+            PROTOCOL, Piece, Refused, SessionRole,
         },
         socket::{self, SocketError},
     },

@@ -21,7 +21,7 @@ use super::{
     calls::{self, Calls},
     flow::{Channel, Incoming},
     news::News,
-    pipe::{End, Pipe},
+    pipe::{End, Loss, Pipe},
 };
 use crate::{
     events::Alive,
@@ -32,7 +32,9 @@ use crate::{
         Session, SessionError, Shared,
         connect::Connected,
         local::House,
-        message::{Announce, Asserted, EndpointRole, Gone, Graph, Leaving, Message, Refused},
+        message::{
+            Announce, Asserted, EndpointRole, GivenUp, Gone, Graph, Leaving, Message, Refused,
+        },
         socket::SocketError,
     },
     wait::ExternalLeader,
@@ -215,7 +217,11 @@ impl<'a> Served<'a> {
             }
             let stand_ins = &self.stand_ins;
             let find = |gid: &Gid| stand_ins.get(gid).map(StandIn::face);
-            self.pipe.write(find, |gid, samples, first| common.shared.lost(gid, samples, first))?;
+            let credits = self.pipe.write(find, |gid, loss| {
+                let first = matches!(loss, Loss::Before { first: true, .. });
+                common.shared.lost(gid, loss.samples(), first);
+            });
+            self.pipe.give_back(credits)?;
             if self.pipe.is_over() {
                 return Err(SocketError::Closed.into());
             }
@@ -265,6 +271,12 @@ impl<'a> Served<'a> {
                     && let Some(sequence) = credit.done
                 {
                     relay.acknowledge(sequence);
+                }
+            }
+            // It comes before the credit that confirms them.
+            Message::GivenUp(GivenUp { writer, samples, .. }) => {
+                if let Some(relay) = self.relays.get(&writer) {
+                    relay.lose(samples);
                 }
             }
             Message::Asserted(asserted) => {
