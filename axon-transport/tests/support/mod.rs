@@ -221,8 +221,14 @@ pub(crate) fn wait_for_the_end() {
 
 /// Waits for something that must come.
 #[track_caller]
-pub(crate) fn until(what: &str, mut reached: impl FnMut() -> bool) {
-    let deadline = Instant::now() + PATIENCE;
+pub(crate) fn until(what: &str, reached: impl FnMut() -> bool) {
+    until_within(PATIENCE, what, reached);
+}
+
+/// As [`until`], for what is so much work that a loaded machine needs longer.
+#[track_caller]
+pub(crate) fn until_within(limit: Duration, what: &str, mut reached: impl FnMut() -> bool) {
+    let deadline = Instant::now() + limit;
     while !reached() {
         assert!(Instant::now() < deadline, "in vain: {what}");
         std::thread::sleep(Duration::from_millis(10));
