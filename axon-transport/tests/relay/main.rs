@@ -155,6 +155,16 @@ fn take_until(subscription: &Subscription, last: u64) -> Vec<u64> {
     taken
 }
 
+/// Takes what is left of the child "talker", whose first hundred samples were taken: all of it whole.
+fn take_rest_of_talker(subscription: &Subscription) {
+    let mut bytes = Vec::new();
+    let mut next = 101;
+    while let Some(info) = subscription.take(&mut bytes) {
+        assert_eq!((info.sequence, bytes.len()), (next, next as usize % 10_000));
+        next += 1;
+    }
+}
+
 fn relays(status: &Status) -> Vec<RelayStatus> {
     status.sessions.iter().filter_map(|s| s.relay.clone()).collect()
 }

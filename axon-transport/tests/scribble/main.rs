@@ -21,6 +21,8 @@
 #![expect(clippy::print_stdout, reason = "what it prints is its result")]
 
 mod hostile;
+#[path = "../support/kept.rs"]
+mod kept;
 mod meeting;
 mod neighbour;
 
@@ -29,7 +31,7 @@ use std::{
     io::{BufRead as _, BufReader},
     os::unix::net::UnixDatagram,
     path::Path,
-    process::{Child, Command, ExitCode, Stdio},
+    process::{Command, ExitCode, Stdio},
     sync::{
         atomic::{AtomicBool, Ordering},
         mpsc,
@@ -42,6 +44,7 @@ use axon_transport::{
     qos::Qos,
     shm::{Context, Publisher, PublisherOptions, Subscriber, SubscriberOptions},
 };
+use kept::Kept;
 
 /// The environment variables that make a process one of them: what it plays, and where they meet.
 const ROLE: &str = "SCRIBBLE_ROLE";
@@ -78,16 +81,6 @@ fn main() -> ExitCode {
     let plain = arguments.iter().any(|a| a == "--plain");
     conduct(time, value("--seed").unwrap_or(1), plain);
     ExitCode::SUCCESS
-}
-
-/// A process that does not outlive this one.
-struct Kept(Child);
-
-impl Drop for Kept {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
 }
 
 fn play(role: &str, place: &Path, seed: u64, through: &[&str]) -> Kept {

@@ -2,13 +2,14 @@
 //! play applications. A child is this very test program, told by `PLAY` what to do.
 
 pub(crate) mod excerpt;
+mod kept;
 
 use std::{
     ffi::OsString,
     fs,
     io::{BufRead, BufReader, Lines, Write as _},
     path::Path,
-    process::{Child, ChildStdout, Command, Stdio},
+    process::{ChildStdout, Command, Stdio},
     time::{Duration, Instant},
 };
 
@@ -17,6 +18,8 @@ use axon_transport::{
     daemon::status::Status,
     session::{Session, SessionError, SessionOptions, daemon_status},
 };
+
+pub(crate) use kept::Kept;
 
 /// Long enough for a loaded machine; a test that works never waits for it.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
@@ -132,16 +135,6 @@ impl Drop for Host {
                 }
             }
         }
-    }
-}
-
-/// A process that does not outlive the test.
-pub(crate) struct Kept(pub(crate) Child);
-
-impl Drop for Kept {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
     }
 }
 
