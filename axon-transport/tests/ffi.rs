@@ -1,6 +1,8 @@
 //! The C interface: that the header is the code's, and a C program that uses every function, wrongly
 //! too, built by plain `cc` and run as it is, under valgrind, and under AddressSanitizer.
 
+#[path = "support/kept.rs"]
+mod kept;
 #[path = "support/skip.rs"]
 mod skip;
 
@@ -9,11 +11,12 @@ use std::{
     ffi::OsStr,
     fs,
     path::{Path, PathBuf},
-    process::{Child, Command},
+    process::Command,
     sync::Once,
     time::{Duration, SystemTime},
 };
 
+use kept::Kept;
 use skip::skip;
 
 const HERE: &str = env!("CARGO_MANIFEST_DIR");
@@ -185,16 +188,6 @@ fn the_test_program_uses_every_function() {
         .filter(|name| !sources.iter().any(|source| source.contains(&format!("{name}("))))
         .collect();
     assert!(exported().len() > 30 && unused.is_empty(), "not used: {unused:?}");
-}
-
-/// Ends with the test.
-struct Kept(Child);
-
-impl Drop for Kept {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
 }
 
 /// The programs of the README, as processes of one host.

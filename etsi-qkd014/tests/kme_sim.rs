@@ -1,24 +1,14 @@
 //! The binary `kme-sim` as a user runs it.
 
+mod program;
+
 use std::collections::HashMap;
 use std::io::{BufRead, BufReader};
 use std::net::TcpListener;
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 
 use etsi_qkd014::Client;
-
-fn kme_sim() -> Command {
-    Command::new(env!("CARGO_BIN_EXE_kme-sim"))
-}
-
-struct Killed(Child);
-
-impl Drop for Killed {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
+use program::{Killed, kme_sim};
 
 #[test]
 fn wrong_arguments_end_with_status_2_and_create_nothing() {

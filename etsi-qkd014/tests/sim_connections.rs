@@ -3,13 +3,16 @@
 
 #![cfg(target_os = "linux")]
 
+mod program;
+
 use std::io::{BufRead, BufReader};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use etsi_qkd014::{Client, RetryPolicy};
+use program::{Killed, kme_sim};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
 /// Connections that a KME serves at a time.
@@ -17,19 +20,6 @@ const PLACES: usize = 1024;
 /// In each of the floods.
 const CONNECTIONS: usize = 250;
 const MINUTE: Duration = Duration::from_secs(60);
-
-fn kme_sim() -> Command {
-    Command::new(env!("CARGO_BIN_EXE_kme-sim"))
-}
-
-struct Killed(Child);
-
-impl Drop for Killed {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
 
 impl Killed {
     /// `kme-sim run` with these arguments behind the directory's, and the address of its one KME.

@@ -1,11 +1,14 @@
 //! Faults changed while the simulator runs: over real sockets, and with the binary as a user does.
 
+mod program;
+
 use std::io::{BufRead, BufReader};
 use std::net::{SocketAddr, TcpListener};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::Arc;
 
 use etsi_qkd014::sim::{Control, Network};
+use program::{Killed, kme_sim};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
@@ -152,19 +155,6 @@ async fn a_certificate_expires_and_is_renewed_at_run_time() {
         let on = request(addr, "PUT /faults/kme-a", &format!("[\"{plan},on=status\"]"));
         assert_eq!(send(addr, &on).await.0, 400, "it meets connections, not methods");
     }
-}
-
-struct Killed(Child);
-
-impl Drop for Killed {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
-fn kme_sim() -> Command {
-    Command::new(env!("CARGO_BIN_EXE_kme-sim"))
 }
 
 #[test]

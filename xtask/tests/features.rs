@@ -1,16 +1,17 @@
 //! What the features of axon-tls bring along.
 
-use std::path::Path;
+mod support;
+
 use std::process::Command;
+
+use support::{run, workspace};
 
 /// The packages that axon-tls is compiled with, each as `name vVERSION`.
 fn dependencies(features: &str) -> Vec<String> {
-    let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
     let mut tree = Command::new(env!("CARGO"));
     tree.args(["tree", "--package", "axon-tls", "--edges", "normal", "--prefix", "none"]);
     tree.args(["--offline", "--no-default-features", "--features", features]);
-    let output = tree.current_dir(workspace).output().unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let output = run(tree.current_dir(workspace()));
     String::from_utf8_lossy(&output.stdout).lines().map(str::to_owned).collect()
 }
 

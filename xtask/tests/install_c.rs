@@ -5,18 +5,19 @@
 //! It builds axon-transport by itself, with other features than the workspace's, so that all that it
 //! depends on may be built once more: `cargo test -p xtask --test install_c -- --include-ignored`.
 
+mod support;
+
 use std::collections::BTreeSet;
 use std::fs;
 use std::io::{Write, stderr};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command};
+use std::process::Command;
 
-fn run(command: &mut Command) -> String {
-    let output = command.output().unwrap_or_else(|error| panic!("{command:?}: {error}"));
-    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    let (out, err) = (text(&output.stdout), text(&output.stderr));
-    assert!(output.status.success(), "{command:?}: {}\n{out}\n{err}", output.status);
-    out
+use support::{Kept, run, target, with_daemon, workspace};
+
+/// What a command prints.
+fn printed(command: &mut Command) -> String {
+    String::from_utf8_lossy(&run(command).stdout).into_owned()
 }
 
 /// Where everything was installed.
@@ -27,8 +28,7 @@ impl Installed {
         let prefix = tempfile::tempdir().unwrap();
         let mut install = Command::new(env!("CARGO_BIN_EXE_xtask"));
         // What the workspace has built is of use here.
-        let target = Path::new(env!("CARGO_TARGET_TMPDIR")).parent().unwrap();
-        install.env("CARGO_TARGET_DIR", target).args(["install-c"]).arg(prefix.path()).arg("dev");
+        install.env("CARGO_TARGET_DIR", target()).args(["install-c"]).arg(prefix.path()).arg("dev");
         run(&mut install);
         Self(prefix)
     }
@@ -51,7 +51,7 @@ impl Installed {
     /// What a program finds in the shared library.
     fn exported(&self) -> BTreeSet<String> {
         let library = self.path("lib/libaxon_transport.so");
-        let symbols = run(Command::new("nm").args(["-D", "--defined-only"]).arg(library));
+        let symbols = printed(Command::new("nm").args(["-D", "--defined-only"]).arg(library));
         symbols.lines().filter_map(|line| line.split(' ').nth(2)).map(str::to_owned).collect()
     }
 
@@ -59,13 +59,12 @@ impl Installed {
     fn asked(&self, options: &[&str]) -> Vec<String> {
         let mut ask = Command::new("pkg-config");
         ask.env("PKG_CONFIG_PATH", self.path("lib/pkgconfig")).args(options).arg("axon-transport");
-        run(&mut ask).split_whitespace().map(str::to_owned).collect()
+        printed(&mut ask).split_whitespace().map(str::to_owned).collect()
     }
 
     /// An example, built as the README says.
     fn example(&self, name: &str, options: &[&str]) -> PathBuf {
-        let repository = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
-        let source = repository.join("axon-transport/examples/c").join(name).with_extension("c");
+        let source = workspace().join("axon-transport/examples/c").join(name).with_extension("c");
         let program = self.path(name);
         run(Command::new("cc").arg(source).args(self.asked(options)).arg("-o").arg(&program));
         program
@@ -73,30 +72,10 @@ impl Installed {
 
     /// A program among which there is a daemon of theirs, which does not stay long.
     fn command(&self, program: &Path) -> Command {
-        let mut command = Command::new(program);
-        let ours = |name: &str| name.starts_with("AXON_") || name.starts_with("ROS_");
-        for (name, _) in std::env::vars().filter(|(name, _)| ours(name)) {
-            command.env_remove(name);
-        }
-        let config = self.path("axon.toml");
-        fs::write(&config, "[link]\ngrace_s = 1\n").unwrap();
+        let mut command = with_daemon(program, self.0.path());
         command.env("LD_LIBRARY_PATH", self.path("lib"));
         command.env("AXON_DAEMON_PATH", self.asked(&["--variable=daemon"]).concat());
-        command.env("AXON_RUNTIME_DIR", self.path("run")).env("AXON_CONFIG", config);
         command
-            .env("AXON_BIND_ADDRS", "127.0.0.1")
-            .env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST");
-        command
-    }
-}
-
-/// Ends with the test.
-struct Kept(Child);
-
-impl Drop for Kept {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
     }
 }
 
@@ -115,7 +94,7 @@ fn programs_in_c_build_and_run_with_what_is_installed() {
     }
     let talker = installed.example("talker", &["--cflags", "--libs"]);
     let needed =
-        run(Command::new("ldd").env("LD_LIBRARY_PATH", installed.path("lib")).arg(&talker));
+        printed(Command::new("ldd").env("LD_LIBRARY_PATH", installed.path("lib")).arg(&talker));
     assert!(needed.contains("libaxon_transport.so => "), "{needed}");
     // The linker takes the static library where the other is missing.
     let shared = installed.path("lib/libaxon_transport.so");
@@ -125,6 +104,6 @@ fn programs_in_c_build_and_run_with_what_is_installed() {
     fs::rename(&aside, &shared).unwrap();
 
     let _talker = Kept(installed.command(&talker).spawn().unwrap());
-    let heard = run(&mut installed.command(&listener));
+    let heard = printed(&mut installed.command(&listener));
     assert_eq!(heard.lines().filter(|line| line.starts_with("heard hello ")).count(), 3, "{heard}");
 }

@@ -4,8 +4,9 @@ use std::collections::BTreeMap;
 
 use axon_tls::{Cipher, PskKex};
 
+use super::pair::Pair;
 use super::psk;
-use super::wire::Reader;
+use super::wire::{CryptoStream, InitialKeys, Kind, Reader, packets};
 
 pub(crate) const SERVER_NAME: u16 = 0;
 pub(crate) const SUPPORTED_GROUPS: u16 = 10;
@@ -60,6 +61,22 @@ pub(crate) struct ClientHello {
 }
 
 impl ClientHello {
+    /// Has a client dial a server that never hears of it, and reads the ClientHello out of the Initial
+    /// packets: with a group share it takes more than one.
+    pub(crate) fn over_quic(client: quinn::ClientConfig, server: quinn::ServerConfig) -> Self {
+        let mut pair = Pair::new(server);
+        let mut crypto = CryptoStream::default();
+        pair.dial(client);
+        pair.run(|_, datagram| {
+            for packet in packets(datagram) {
+                assert_eq!(packet.kind, Kind::Initial, "a client begins with nothing else");
+                crypto.take_from(&InitialKeys::client(packet.dst_cid).open(&packet));
+            }
+            datagram.clear();
+        });
+        Self::parse(&crypto.bytes())
+    }
+
     pub(crate) fn parse(message: &[u8]) -> Self {
         let mut message = Reader(message);
         assert_eq!(message.take(1), [1], "a ClientHello");

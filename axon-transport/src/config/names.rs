@@ -27,7 +27,7 @@ pub(super) const SETTINGS: &[&str] = &[
     "AXON_SAE_KEY",
     "AXON_DAEMON",
     "AXON_DAEMON_PATH",
-    "AXON_RUNTIME_DIR",
+    RUNTIME_DIR,
     "AXON_BIND_ADDRS",
     "AXON_DAEMON_PEERS",
     "AXON_ADVERTISE_ADDRS",
@@ -36,7 +36,7 @@ pub(super) const SETTINGS: &[&str] = &[
     "AXON_RELIABLE_QUEUE_MB",
     "AXON_SHM",
     "AXON_SHM_COPY",
-    "AXON_TRUSTED_UIDS",
+    TRUSTED_UIDS,
     "AXON_LOG",
 ];
 
@@ -57,6 +57,12 @@ pub(super) const PATHS: &[&str] = &[
     "AXON_SAE_CERT",
     "AXON_SAE_KEY",
 ];
+
+/// Where a daemon keeps files, always an absolute path.
+pub(super) const RUNTIME_DIR: &str = "AXON_RUNTIME_DIR";
+
+/// Users who are let in.
+pub(super) const TRUSTED_UIDS: &str = "AXON_TRUSTED_UIDS";
 
 /// Where `axon.toml` is; the one setting that the file cannot hold.
 pub(super) const CONFIG: &str = "AXON_CONFIG";

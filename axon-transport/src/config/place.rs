@@ -6,12 +6,12 @@ use std::{
 };
 
 use super::{
-    Config, ConfigError, Files, OsFiles, environment, file_beside, resolve, sources::Sources,
+    Config, ConfigError, Files, OsFiles, environment, file_beside,
+    names::{RUNTIME_DIR, TRUSTED_UIDS},
+    resolve,
+    sources::Sources,
     values::Values,
 };
-
-const RUNTIME_DIR: &str = "AXON_RUNTIME_DIR";
-const TRUSTED_UIDS: &str = "AXON_TRUSTED_UIDS";
 
 /// Where the daemon of this user and domain listens, and whose it may be. It is known although other
 /// settings, or the files that they name, are wrong: for tools that look at a daemon, and open no session.

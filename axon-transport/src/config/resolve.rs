@@ -92,7 +92,7 @@ pub(super) fn resolve(
         reliable_queue: megabytes("AXON_RELIABLE_QUEUE_MB", 65_536, 256)?,
         shm: values.choice("AXON_SHM", &[("on", true), ("off", false)])?.unwrap_or(true),
         shm_copy: values.choice("AXON_SHM_COPY", &[("0", false), ("1", true)])?.unwrap_or(false),
-        trusted_uids: values.uids("AXON_TRUSTED_UIDS")?,
+        trusted_uids: values.uids(names::TRUSTED_UIDS)?,
         log: values.log_filter("AXON_LOG")?.unwrap_or_else(|| "warn".to_owned()),
         link: link(&values)?,
         passed_on,
@@ -284,7 +284,7 @@ fn range(sources: &Sources) -> Result<(DiscoveryRange, Vec<String>), ConfigError
 pub(super) fn runtime_dir(
     values: &Values<'_, impl Files>,
 ) -> Result<(Option<PathBuf>, bool), ConfigError> {
-    const NAME: &str = "AXON_RUNTIME_DIR";
+    const NAME: &str = names::RUNTIME_DIR;
     if let Some(path) = values.directory(NAME)? {
         let socket = path.as_os_str().len() + "/axon-232.sock".len();
         if socket > LONGEST_SOCKET_PATH {

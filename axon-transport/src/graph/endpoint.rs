@@ -98,3 +98,21 @@ impl Endpoint {
             && self.qos.depth >= 1
     }
 }
+
+#[cfg(test)]
+impl Endpoint {
+    /// An endpoint of the topic `/t` and the type `T`, with the default QoS and of no node.
+    pub(crate) fn example(gid: Gid, kind: EndpointKind) -> Self {
+        Self {
+            gid,
+            kind,
+            topic: "/t".into(),
+            type_name: "T".into(),
+            type_hash: Vec::new(),
+            qos: Qos::default(),
+            node: String::new(),
+            namespace: String::new(),
+            enclave: String::new(),
+        }
+    }
+}

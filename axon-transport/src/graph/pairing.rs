@@ -62,15 +62,11 @@ mod tests {
     fn endpoint(kind: EndpointKind) -> Endpoint {
         let node = kind == Node;
         Endpoint {
-            gid: Gid([1; 16]),
-            kind,
             topic: if node { String::new() } else { "/t".into() },
             type_name: if node { String::new() } else { "T".into() },
-            type_hash: vec![],
-            qos: Qos::default(),
             node: "n".into(),
             namespace: "/".into(),
-            enclave: String::new(),
+            ..Endpoint::example(Gid([1; 16]), kind)
         }
     }
 

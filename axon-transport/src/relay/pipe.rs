@@ -23,7 +23,7 @@ use crate::{
     seldom::Seldom,
     session::{
         Face, Written,
-        message::Message,
+        message::{Credit, Message},
         socket::{self, Received, SocketError},
     },
 };
@@ -53,6 +53,34 @@ pub(super) enum End {
     Other(String),
 }
 
+/// Samples that are written, and of which it is not known whether they are where they are to go.
+struct OnTheirWay {
+    /// The number up to which the other end was told that they are.
+    said: u64,
+    /// The last that was written.
+    last: u64,
+    /// The number to say once that one is: of the last that came, written or not.
+    then: u64,
+}
+
+/// Samples that were lost.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Loss {
+    /// These did not come; whether that was before the `first` of the channel.
+    Before { samples: u64, first: bool },
+    /// One came and could not be written.
+    Unwritten,
+}
+
+impl Loss {
+    pub(super) fn samples(self) -> u64 {
+        match self {
+            Self::Before { samples, .. } => samples,
+            Self::Unwritten => 1,
+        }
+    }
+}
+
 pub(super) struct Pipe {
     socket: PassedFd,
     buffer: Vec<u8>,
@@ -67,9 +95,8 @@ pub(super) struct Pipe {
     begun: BTreeSet<Channel>,
     /// Whether one of them waits for a reader.
     blocked: bool,
-    /// Channels whose samples are written and not all handed over: up to which number the other end was
-    /// told that they are, and the last number.
-    written: BTreeMap<Channel, (u64, u64)>,
+    /// Channels whose samples are written and not all handed over.
+    written: BTreeMap<Channel, OnTheirWay>,
     /// MATCHED that this end has said, and those that it has heard: by these both ends tell a channel
     /// from an earlier one of the same name.
     said: u64,
@@ -202,13 +229,13 @@ impl Pipe {
         Ok((messages, true))
     }
 
-    /// Writes what came, as far as readers make room; `lost` hears of samples that did not come, and
-    /// whether it was before the first of its channel.
+    /// Writes what came, as far as readers make room; `lost` hears of samples that were lost. Returns
+    /// what the other end is to be [given back](Self::give_back).
     pub(super) fn write<'a>(
         &mut self,
         find: impl Fn(&Gid) -> Option<&'a Face>,
-        mut lost: impl FnMut(&Gid, u64, bool),
-    ) -> Result<(), End> {
+        mut lost: impl FnMut(&Gid, Loss),
+    ) -> Vec<Credit> {
         self.blocked = false;
         let mut credits = Vec::new();
         for (channel, samples) in &mut self.arrived {
@@ -217,11 +244,15 @@ impl Pipe {
                 let Some(face) = find(gid) else { break };
                 match std::mem::take(&mut sample.lost) {
                     0 => {}
-                    count => lost(gid, count, !self.begun.contains(channel)),
+                    samples => {
+                        let first = !self.begun.contains(channel);
+                        lost(gid, Loss::Before { samples, first });
+                    }
                 }
                 self.begun.insert(*channel);
                 let client = client.as_ref().unwrap_or(gid);
                 let number = sample.meta.sequence;
+                let mut last = number;
                 match face.try_write(client, sample.meta, &sample.payload) {
                     Ok(Written::Yes) => self.tally.arrived(sample.payload.len()),
                     Ok(Written::Nobody) => {}
@@ -230,7 +261,8 @@ impl Pipe {
                         break;
                     }
                     Err(error) => {
-                        lost(gid, 1, false);
+                        last = self.written.get(channel).map_or(0, |before| before.last);
+                        lost(gid, Loss::Unwritten);
                         if let Some(samples) = self.losses.count(Instant::now()) {
                             tracing::error!(%gid, %error, samples, "relayed samples are lost");
                         }
@@ -240,23 +272,30 @@ impl Pipe {
                     && let Some(mut credit) = self.incoming.done(&sample)
                 {
                     // What is written is in this process's memory only, where others carry it on.
-                    if let Some(over) = face.handed_over().filter(|over| *over < number) {
+                    if let Some(over) = face.handed_over().filter(|over| *over < last) {
                         credit.done = Some(over);
-                        self.written.insert(*channel, (over, number));
+                        self.written
+                            .insert(*channel, OnTheirWay { said: over, last, then: number });
                     }
                     credits.push(credit);
                 }
             }
         }
         self.arrived.retain(|_, samples| !samples.is_empty());
-        self.written.retain(|channel, (said, last)| {
+        self.written.retain(|channel, OnTheirWay { said, last, then }| {
             let over = find(&channel.writer).and_then(Face::handed_over).unwrap_or(*last);
-            if over > *said {
-                *said = over;
-                credits.push(channel.done(over));
+            let now = if over < *last { over } else { over.max(*then) };
+            if now > *said {
+                *said = now;
+                credits.push(channel.done(now));
             }
             over < *last
         });
+        credits
+    }
+
+    /// Tells the other end what it is given back, and which of its samples are where they are to go.
+    pub(super) fn give_back(&mut self, credits: Vec<Credit>) -> Result<(), End> {
         credits.into_iter().try_for_each(|credit| self.say(&Message::Credit(credit)))
     }
 

@@ -95,27 +95,14 @@ mod tests {
     use std::sync::Arc;
 
     use super::*;
-    use crate::{
-        graph::{Endpoint, EndpointKind},
-        qos::Qos,
-    };
+    use crate::graph::{Endpoint, EndpointKind};
 
     const fn gid(number: u8) -> Gid {
         Gid([number; 16])
     }
 
     fn entry(number: u8) -> GraphEntry {
-        let endpoint = Endpoint {
-            gid: gid(number),
-            kind: EndpointKind::Publisher,
-            topic: "/t".into(),
-            type_name: "T".into(),
-            type_hash: vec![],
-            qos: Qos::default(),
-            node: String::new(),
-            namespace: String::new(),
-            enclave: String::new(),
-        };
+        let endpoint = Endpoint::example(gid(number), EndpointKind::Publisher);
         GraphEntry { endpoint: Arc::new(endpoint), daemon: None, reach: None }
     }
 

@@ -55,7 +55,12 @@ pub(crate) struct Caller<'a> {
     pub(crate) cancel: Option<&'a dyn Fn() -> bool>,
 }
 
-impl Caller<'_> {
+impl<'a> Caller<'a> {
+    /// A caller without a segment that is not relayed and waits as long as it takes.
+    pub(crate) fn new(config: &'a Config, options: &'a SessionOptions, id: SessionId) -> Self {
+        Self { config, options, id, segment: None, relay: None, cancel: None }
+    }
+
     /// Connects to the daemon, which is started when there is none and the policy says so.
     pub(crate) fn connect(&self) -> Result<Connected, SessionError> {
         let address = Address::of(self.config);

@@ -122,6 +122,15 @@ impl Face {
         }
     }
 
+    /// How many samples of those that it has written do not get where they are to go, where somebody
+    /// waits for that. All below a number that was [handed over](Self::handed_over) before are counted.
+    pub(crate) fn given_up(&self) -> Option<u64> {
+        match self {
+            Self::Publisher(publisher) => Some(publisher.given_up()),
+            Self::Client(_) | Self::Server(_) => None,
+        }
+    }
+
     /// The next request or response of `writer`, in place.
     pub(crate) fn take_from(&self, writer: &Gid) -> Option<Sample> {
         match self {

@@ -40,14 +40,7 @@ impl Session {
         }
         let reason = if config.shm {
             let segment = SessionSegment::create(id)?;
-            let caller = Caller {
-                config,
-                options: &options,
-                id,
-                segment: Some(&segment),
-                relay: None,
-                cancel: None,
-            };
+            let caller = Caller { segment: Some(&segment), ..Caller::new(config, &options, id) };
             match caller.connect() {
                 Ok(daemon) => {
                     let start = Start::Daemon(daemon);
@@ -71,14 +64,7 @@ impl Session {
         reason: String,
     ) -> Result<Self, SessionError> {
         tracing::info!(reason, "samples pass through the daemon");
-        let caller = Caller {
-            config,
-            options: &options,
-            id,
-            segment: None,
-            relay: Some(&reason),
-            cancel: None,
-        };
+        let caller = Caller { relay: Some(&reason), ..Caller::new(config, &options, id) };
         let connected = caller.connect()?;
         let house = Arc::<House>::default();
         let segment = SessionSegment::create(id)?;
@@ -114,14 +100,7 @@ impl Session {
         options: SessionOptions,
     ) -> Result<Self, SessionError> {
         let segment = SessionSegment::create(id)?;
-        let caller = Caller {
-            config,
-            options: &options,
-            id,
-            segment: Some(&segment),
-            relay: None,
-            cancel: None,
-        };
+        let caller = Caller { segment: Some(&segment), ..Caller::new(config, &options, id) };
         let connected = caller.greet_over(socket)?;
         Ok(Self::of(Self::start(config, options, segment, Start::Socket(connected))?))
     }

@@ -128,8 +128,8 @@ impl Publisher {
         self.writer.under_way()
     }
 
-    /// Samples for other hosts that were never acknowledged, and will not be. Some of them may have
-    /// arrived.
+    /// Samples that were never acknowledged, and will not be: for other hosts, or lost in the daemon where
+    /// it carries this session's samples. Some of them may have arrived.
     pub fn given_up(&self) -> u64 {
         self.writer.given_up()
     }

@@ -79,15 +79,7 @@ pub fn daemon_status(config: &Config) -> Result<String, SessionError> {
 pub fn daemon_status_at(place: &DaemonPlace) -> Result<String, SessionError> {
     let config = Config { daemon: DaemonPolicy::Require, ..place.config() };
     let options = SessionOptions::new("status").role(SessionRole::Tool);
-    let caller = Caller {
-        config: &config,
-        options: &options,
-        id: SessionId::random(),
-        segment: None,
-        relay: None,
-        cancel: None,
-    };
-    let connected = caller.connect()?;
+    let connected = Caller::new(&config, &options, SessionId::random()).connect()?;
     let address = Address::of(&config).to_string();
     status_text(ask(&connected.socket, &address, ANSWER)?)
 }

@@ -4,6 +4,21 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::*;
 
+/// What a tool says first.
+fn tool_hello() -> Message {
+    Message::Hello(Hello {
+        protocol: PROTOCOL,
+        session: SessionId::random(),
+        role: SessionRole::Tool,
+        name: "tool".into(),
+        domain: 0,
+        settings: Vec::new(),
+        relay: None,
+        range: Some(0),
+        static_peers: None,
+    })
+}
+
 #[test]
 fn garbage_on_the_socket_hurts_nobody() {
     let host = Host::new();
@@ -50,18 +65,7 @@ fn garbage_on_the_socket_hurts_nobody() {
     drop(crowd);
     // A tool that speaks out of turn.
     let tool = address.connect().unwrap();
-    let packet = Message::Hello(Hello {
-        protocol: PROTOCOL,
-        session: SessionId::random(),
-        role: SessionRole::Tool,
-        name: "tool".into(),
-        domain: 0,
-        settings: Vec::new(),
-        relay: None,
-        range: Some(0),
-        static_peers: None,
-    });
-    socket::send(&tool, &packet.encode().unwrap(), &[]).unwrap();
+    socket::send(&tool, &tool_hello().encode().unwrap(), &[]).unwrap();
     socket::send(&tool, &Message::Resync.encode().unwrap(), &[]).unwrap();
     until("the tool is put out", || {
         matches!(socket::receive(&tool, &mut Vec::new()), Err(socket::SocketError::Closed))
@@ -162,17 +166,7 @@ fn descriptors_that_are_slow_to_close_do_not_stop_the_daemon() {
     let host = Host::new();
     let daemon = host.daemon();
     let address = Address::of(&host.config());
-    let tool = Message::Hello(Hello {
-        protocol: PROTOCOL,
-        session: SessionId::random(),
-        role: SessionRole::Tool,
-        name: "tool".into(),
-        domain: 0,
-        settings: Vec::new(),
-        relay: None,
-        range: Some(0),
-        static_peers: None,
-    });
+    let tool = tool_hello();
     // The daemon receives nothing before all is sent: one that had closed a descriptor already would leave
     // its last close to this thread.
     signal(daemon.0.id(), Signal::STOP);

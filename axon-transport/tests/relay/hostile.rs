@@ -210,6 +210,23 @@ fn what_was_said_before_the_connection_ended_is_heard() {
 }
 
 #[test]
+fn a_sample_that_cannot_be_written_is_given_up() {
+    let host = host();
+    let _daemon = host.daemon();
+    let socket = by_hand(&host, hello(&host));
+    announce_and_await_credit(&socket);
+    // Further ahead than any publisher may be.
+    let sequence = 1 << 60;
+    let head = Some(Head { length: 0, sequence, source_timestamp: 0, lost: 0, published: 0 });
+    say_to(&socket, &Message::Piece(Piece { publisher: own(), head, bytes: vec![], client: None }));
+    let told = hear(&socket, |m| matches!(m, Message::GivenUp(_) | Message::Credit(_)));
+    let given_up = GivenUp { reader: own(), writer: own(), samples: 1 };
+    assert_eq!(told, Some(Message::GivenUp(given_up)), "before it counts as acknowledged");
+    let done = |m: &Message| matches!(m, Message::Credit(c) if c.done == Some(sequence));
+    assert!(hear(&socket, done).is_some());
+}
+
+#[test]
 fn what_a_process_said_before_it_was_killed_is_heard() {
     let host = host();
     let daemon = host.daemon();

@@ -14,12 +14,7 @@ fn a_process_that_is_killed_leaves_whole_samples_and_nothing_else() {
     assert_eq!(take_until(&subscription, 100).len(), 100);
     signal(talker.pid(), Signal::KILL);
     until("it is gone", || subscription.matched().is_empty());
-    let mut bytes = Vec::new();
-    let mut next = 101;
-    while let Some(info) = subscription.take(&mut bytes) {
-        assert_eq!((info.sequence, bytes.len()), (next, next as usize % 10_000));
-        next += 1;
-    }
+    take_rest_of_talker(&subscription);
     drop(talker);
 
     let publisher = listener.create_publisher(spec("/t", Qos::keep_all())).unwrap();

@@ -30,8 +30,8 @@ use axon_transport::{
         EndpointSpec, Publisher, Session, SessionOptions, Subscription,
         address::Address,
         message::{
-            Announce, Asserted, Credit, EndpointRole, Head, Hello, Matched, Message, PROTOCOL,
-            Piece, Refused, SessionRole,
+            Announce, Asserted, Credit, EndpointRole, GivenUp, Head, Hello, Matched, Message,
+            PROTOCOL, Piece, Refused, SessionRole,
         },
         socket::{self, SocketError},
     },
@@ -153,6 +153,16 @@ fn take_until(subscription: &Subscription, last: u64) -> Vec<u64> {
         taken.push(info.sequence);
     }
     taken
+}
+
+/// Takes what is left of the child "talker", whose first hundred samples were taken: all of it whole.
+fn take_rest_of_talker(subscription: &Subscription) {
+    let mut bytes = Vec::new();
+    let mut next = 101;
+    while let Some(info) = subscription.take(&mut bytes) {
+        assert_eq!((info.sequence, bytes.len()), (next, next as usize % 10_000));
+        next += 1;
+    }
 }
 
 fn relays(status: &Status) -> Vec<RelayStatus> {

@@ -147,6 +147,31 @@ fn a_sample_is_acknowledged_once_the_daemon_has_it() {
 }
 
 #[test]
+fn samples_that_the_daemon_gave_up_are_not_acknowledged() {
+    let host = host();
+    let (session, socket) = played(&host);
+    for qos in [Qos::default(), Qos::keep_all(), best_effort(10), latched(10)] {
+        let publisher = session.create_publisher(spec("/t", qos)).unwrap();
+        let gid = publisher.gid();
+        announced(&socket, gid);
+        let outside = show(&socket, publisher.endpoint(), EndpointKind::Subscription);
+        matched(&socket, gid, &[outside]);
+        until("it counts the one outside", || publisher.matched() == [outside]);
+        say_to(&socket, &Message::Credit(open_for(gid, 99)));
+        for _ in 0..3 {
+            publisher.publish(b"x").unwrap();
+            assert!(hear(&socket, |m| matches!(m, Message::Piece(_))).is_some());
+        }
+        say_to(&socket, &Message::GivenUp(GivenUp { reader: gid, writer: gid, samples: 2 }));
+        let back = Credit { bytes: 3 * 129, opens: None, ..open_for(gid, 0) };
+        say_to(&socket, &Message::Credit(Credit { done: Some(3), ..back }));
+        assert!(!publisher.wait_acknowledged(PATIENCE), "two are lost");
+        assert_eq!((publisher.given_up(), publisher.unacknowledged()), (2, 0));
+        assert!(publisher.wait_acknowledged(PATIENCE), "it was said once");
+    }
+}
+
+#[test]
 fn a_session_ends_though_nobody_takes_what_it_left() {
     let host = host();
     let (session, socket) = played(&host);

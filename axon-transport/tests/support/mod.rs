@@ -2,13 +2,14 @@
 //! play applications. A child is this very test program, told by `PLAY` what to do.
 
 pub(crate) mod excerpt;
+mod kept;
 
 use std::{
     ffi::OsString,
     fs,
     io::{BufRead, BufReader, Lines, Write as _},
     path::Path,
-    process::{Child, ChildStdout, Command, Stdio},
+    process::{ChildStdout, Command, Stdio},
     time::{Duration, Instant},
 };
 
@@ -17,6 +18,8 @@ use axon_transport::{
     daemon::status::Status,
     session::{Session, SessionError, SessionOptions, daemon_status},
 };
+
+pub(crate) use kept::Kept;
 
 /// Long enough for a loaded machine; a test that works never waits for it.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
@@ -135,16 +138,6 @@ impl Drop for Host {
     }
 }
 
-/// A process that does not outlive the test.
-pub(crate) struct Kept(pub(crate) Child);
-
-impl Drop for Kept {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
 /// A child that plays an application.
 pub(crate) struct Player {
     pub(crate) child: Kept,
@@ -221,8 +214,14 @@ pub(crate) fn wait_for_the_end() {
 
 /// Waits for something that must come.
 #[track_caller]
-pub(crate) fn until(what: &str, mut reached: impl FnMut() -> bool) {
-    let deadline = Instant::now() + PATIENCE;
+pub(crate) fn until(what: &str, reached: impl FnMut() -> bool) {
+    until_within(PATIENCE, what, reached);
+}
+
+/// As [`until`], for what is so much work that a loaded machine needs longer.
+#[track_caller]
+pub(crate) fn until_within(limit: Duration, what: &str, mut reached: impl FnMut() -> bool) {
+    let deadline = Instant::now() + limit;
     while !reached() {
         assert!(Instant::now() < deadline, "in vain: {what}");
         std::thread::sleep(Duration::from_millis(10));

@@ -1,6 +1,7 @@
 //! The crates in one program with those that their users have, and each by itself.
 
-use crate::project::{Project, reached, run};
+use crate::project::Project;
+use crate::support::{reached, run, workspace};
 
 /// What a program that uses AXON is likely to use as well, each with all its default features. They
 /// bring a rustls with other providers than ours.
@@ -63,7 +64,7 @@ fn each_library_builds_alone_without_features_and_with_all() {
 fn all_features_are_listed() {
     for (library, all, least) in LIBRARIES {
         let (_, dir) = crate::PUBLISHED.iter().find(|(name, _)| *name == library).expect(library);
-        let manifest = crate::project::workspace().join(dir).join("Cargo.toml");
+        let manifest = workspace().join(dir).join("Cargo.toml");
         let manifest = std::fs::read_to_string(manifest).expect(library);
         let features = manifest.split_once("\n[features]\n").map_or("", |(_, rest)| rest);
         let features = features.split("\n[").next().unwrap_or_default();

@@ -7,7 +7,8 @@ use std::process::Command;
 use serde_json::Value;
 
 use crate::PUBLISHED;
-use crate::project::{cargo, run, workspace};
+use crate::project::cargo;
+use crate::support::{run, workspace};
 
 /// Each crate for programs in Rust has one; axon-cli is itself a program.
 #[test]

@@ -13,6 +13,8 @@ mod examples;
 mod project;
 mod readme;
 mod run;
+#[path = "../support/mod.rs"]
+mod support;
 
 /// The crates that are published, and where they are in this repository.
 const PUBLISHED: [(&str, &str); 7] = [

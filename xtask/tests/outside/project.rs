@@ -1,43 +1,15 @@
 //! The packages of the published crates, and projects outside of the workspace that depend on them.
 
 use std::fs;
-use std::io::{Write, stderr};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::Command;
 use std::sync::LazyLock;
 
 use crate::PUBLISHED;
-
-/// What cargo says when it is the registry that is missing.
-const UNREACHABLE: [&str; 6] = [
-    "failed to download",
-    "download of config.json failed",
-    "Could not resolve host",
-    "Couldn't resolve host",
-    "spurious network error",
-    "network failure seems to have happened",
-];
-
-pub(crate) fn workspace() -> &'static Path {
-    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("xtask is in the repository")
-}
-
-/// The workspace's target directory: it has aws-lc, built.
-pub(crate) fn target() -> &'static Path {
-    Path::new(env!("CARGO_TARGET_TMPDIR")).parent().expect("it is in the target directory")
-}
+use crate::support::{profiles, reached, run, target, unpack, workspace};
 
 fn scratch() -> PathBuf {
     Path::new(env!("CARGO_TARGET_TMPDIR")).join("outside")
-}
-
-#[track_caller]
-pub(crate) fn run(command: &mut Command) -> Output {
-    let output = command.output().unwrap_or_else(|error| panic!("{command:?}: {error}"));
-    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    let (out, err) = (text(&output.stdout), text(&output.stderr));
-    assert!(output.status.success(), "{command:?}: {}\n{out}\n{err}", output.status);
-    output
 }
 
 /// Cargo in a directory, with the target directory of the workspace. What else it would inherit is of
@@ -69,10 +41,7 @@ static PACKAGES: LazyLock<Vec<PathBuf>> = LazyLock::new(|| {
         files.find_map(|entry| Some(entry.path()).filter(is_it)).expect(name)
     };
     let unpacked = PUBLISHED.iter().map(|(name, _)| {
-        let file = packed(name);
-        // -m: cargo goes by the time of a file, and all packed ones have the same
-        run(Command::new("tar").arg("-xmzf").arg(&file).arg("-C").arg(scratch()));
-        let dir = scratch().join(file.file_stem().expect("name and version"));
+        let dir = unpack(&packed(name), &scratch());
         // Otherwise cargo looks for a workspace in the directories above, and finds this one.
         let manifest = dir.join("Cargo.toml");
         let text = fs::read_to_string(&manifest).expect("a manifest") + "\n[workspace]\n";
@@ -108,10 +77,8 @@ impl Project {
         let dir = scratch().join("projects").join(name);
         let _ = fs::remove_dir_all(&dir);
         fs::create_dir_all(dir.join("src/bin")).expect("a directory");
-        let manifest = fs::read_to_string(workspace().join("Cargo.toml")).expect("the manifest");
-        let profiles = &manifest[manifest.find("\n[profile.dev]").expect("a profile")..];
         let own = format!("[package]\nname = {name:?}\nversion = \"0.0.0\"\nedition = \"2024\"\n");
-        let text = format!("{own}[workspace]\n{patch}{profiles}");
+        let text = format!("{own}[workspace]\n{patch}{}", profiles());
         fs::write(dir.join("Cargo.toml"), text).expect("a manifest");
         fs::copy(workspace().join("Cargo.lock"), dir.join("Cargo.lock")).expect("a lock file");
         let project = Self { dir };
@@ -141,17 +108,4 @@ impl Project {
         }
         reached(&mut add)
     }
-}
-
-/// Runs a command that needs the registry. `None` where that is out of reach, and says so.
-pub(crate) fn reached(command: &mut Command) -> Option<()> {
-    let output = command.output().expect("cargo runs");
-    let why = String::from_utf8_lossy(&output.stderr);
-    if !output.status.success() && UNREACHABLE.iter().any(|part| why.contains(part)) {
-        // Past the harness, which would show it only beside a failure.
-        let _ = writeln!(stderr(), "skipped: the registry is out of reach:\n{why}");
-        return None;
-    }
-    assert!(output.status.success(), "{command:?}: {why}");
-    Some(())
 }

@@ -3,7 +3,7 @@
 use std::fs;
 
 use crate::PUBLISHED;
-use crate::project::workspace;
+use crate::support::workspace;
 
 pub(crate) struct Readme {
     /// The lines of its `sh` and `console` blocks, without comments.

@@ -5,10 +5,11 @@ use std::io::{BufRead, BufReader};
 use std::net::TcpListener;
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 
-use crate::project::{Project, cargo, package, run, target, workspace};
+use crate::project::{Project, cargo, package};
 use crate::readme::Readme;
+use crate::support::{Kept, alone, run, target, with_daemon, workspace};
 
 /// A project with a program for each `rust` block of the README, built. `None` without a registry.
 fn built(name: &str) -> Option<Vec<PathBuf>> {
@@ -52,34 +53,16 @@ impl Place {
     }
 
     fn command(&self, program: &Path) -> Command {
-        let mut command = Command::new(program);
-        let ours = |name: &str| name.starts_with("AXON_") || name.starts_with("ROS_");
-        for (name, _) in std::env::vars().filter(|(name, _)| ours(name)) {
-            command.env_remove(name);
-        }
+        let mut command = alone(program);
         command.current_dir(self.0.path());
         command
     }
 
-    /// The same, with a daemon that does not stay long and talks to no other host.
+    /// The same, with a daemon.
     fn with_daemon(&self, program: &Path) -> Command {
-        let config = self.0.path().join("axon.toml");
-        fs::write(&config, "[link]\ngrace_s = 1\n").expect("a file");
-        let mut command = self.command(program);
-        command.env("AXON_CONFIG", config).env("AXON_RUNTIME_DIR", self.0.path().join("run"));
-        command.env("AXON_BIND_ADDRS", "127.0.0.1");
-        command.env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST");
+        let mut command = with_daemon(program, self.0.path());
+        command.current_dir(self.0.path());
         command
-    }
-}
-
-/// Ends with the test.
-struct Kept(Child);
-
-impl Drop for Kept {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
     }
 }
 

@@ -6,11 +6,15 @@
 //! `cargo test -p xtask --test packaged_rustls -- --include-ignored` also builds what is long:
 //! aws-lc once more from a vendored copy, and the documentation.
 
+#[path = "../support/mod.rs"]
+mod support;
+
 use std::fs;
-use std::io::{Write, stderr};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::LazyLock;
+
+use support::{profiles, reached, run, target, unpack, workspace};
 
 /// Both crates used in one program: a handshake in memory with each.
 const PROGRAM: &str = include_str!("program.rs");
@@ -22,16 +26,6 @@ const KEY: &[u8] = include_bytes!("key.der");
 /// A stock rustls of the same line that is newer than all there are.
 const NEWER: &str = "0.23.9999";
 
-/// What cargo says when it is the registry that is missing.
-const UNREACHABLE: [&str; 6] = [
-    "failed to download",
-    "download of config.json failed",
-    "Could not resolve host",
-    "Couldn't resolve host",
-    "spurious network error",
-    "network failure seems to have happened",
-];
-
 fn scratch() -> PathBuf {
     Path::new(env!("CARGO_TARGET_TMPDIR")).join("packaged-rustls")
 }
@@ -41,14 +35,6 @@ fn cargo(dir: &Path, args: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO"));
     command.args(args).current_dir(dir).env_remove("CARGO_TARGET_DIR");
     command
-}
-
-#[track_caller]
-fn run(command: &mut Command) -> Output {
-    let output = command.output().unwrap();
-    let text = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{command:?}: {text}");
-    output
 }
 
 /// The unpacked package, made once, as a release makes it.
@@ -62,9 +48,7 @@ static PACKAGE: LazyLock<PathBuf> = LazyLock::new(|| {
 
     let mut packed = fs::read_dir(out.join("package")).unwrap().map(|entry| entry.unwrap().path());
     let packed = packed.find(|path| path.extension().is_some_and(|end| end == "crate")).unwrap();
-    // -m: cargo goes by the time of a file, and all packed ones have the same
-    run(Command::new("tar").arg("-xmzf").arg(&packed).arg("-C").arg(scratch()));
-    scratch().join(packed.file_stem().unwrap())
+    unpack(&packed, &scratch())
 });
 
 /// A new project that depends on the package and the newest rustls, and has all it needs in cargo's
@@ -72,11 +56,7 @@ static PACKAGE: LazyLock<PathBuf> = LazyLock::new(|| {
 fn project(name: &str, features: &str, main: &str) -> Option<PathBuf> {
     let dir = scratch().join(name);
     let package = PACKAGE.file_name().unwrap().to_str().unwrap();
-    let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
-    // the same profile as here, so that what was built for the workspace is not built again
-    let manifest = fs::read_to_string(workspace.join("Cargo.toml")).unwrap();
-    let profile = &manifest[manifest.find("\n[profile.dev]").unwrap()..];
-
+    let profiles = profiles();
     fs::create_dir_all(dir.join("src")).unwrap();
     fs::write(
         dir.join("Cargo.toml"),
@@ -85,25 +65,18 @@ fn project(name: &str, features: &str, main: &str) -> Option<PathBuf> {
              [dependencies]\nzeroize = \"1\"\n\
              rustls = {{ version = \"0.23\", default-features = false, features = [{features}] }}\n\
              [dependencies.rustls-axon]\npath = \"../{package}\"\n\
-             default-features = false\nfeatures = [{features}]\n{profile}"
+             default-features = false\nfeatures = [{features}]\n{profiles}"
         ),
     )
     .unwrap();
     fs::write(dir.join("src/main.rs"), main).unwrap();
     fs::write(dir.join("src/certificate.der"), CERTIFICATE).unwrap();
     fs::write(dir.join("src/key.der"), KEY).unwrap();
-    fs::copy(workspace.join("Cargo.lock"), dir.join("Cargo.lock")).unwrap();
+    fs::copy(workspace().join("Cargo.lock"), dir.join("Cargo.lock")).unwrap();
 
     // the workspace is not asked for its rustls: the newest one is
     for step in [&["update", "--package", "rustls"][..], &["fetch"]] {
-        let output = cargo(&dir, step).output().unwrap();
-        let why = String::from_utf8_lossy(&output.stderr);
-        if !output.status.success() && UNREACHABLE.iter().any(|part| why.contains(part)) {
-            // Past the harness, which would show it only beside a failure.
-            let _ = writeln!(stderr(), "skipped: the registry is out of reach:\n{why}");
-            return None;
-        }
-        assert!(output.status.success(), "{why}");
+        reached(&mut cargo(&dir, step))?;
     }
     Some(dir)
 }
@@ -129,10 +102,8 @@ const PROVIDERS: &str = "\"aws_lc_rs\", \"std\"";
 fn the_package_runs_beside_the_newest_rustls() {
     let Some(project) = project("beside", PROVIDERS, PROGRAM) else { return };
     eprintln!("beside rustls {}", locked(&project).join(", "));
-    // the workspace's own target directory has aws-lc, built
-    let target = Path::new(env!("CARGO_TARGET_TMPDIR")).parent().unwrap();
     let run_it = ["run", "--offline", "--locked"];
-    both_shook_hands(&run(cargo(&project, &run_it).env("CARGO_TARGET_DIR", target)));
+    both_shook_hands(&run(cargo(&project, &run_it).env("CARGO_TARGET_DIR", target())));
 }
 
 /// Who adds the package compiles rustls's source once: as this crate, and not to build it.
@@ -154,10 +125,9 @@ fn the_package_has_no_build_script_and_no_build_dependencies() {
 /// Cargo's own command would pack what cannot be built.
 #[test]
 fn a_checkout_cannot_be_packaged_without_its_source() {
-    let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
     let out = scratch().join("refused");
     let package = ["package", "--package", "rustls-axon", "--no-verify", "--allow-dirty"];
-    let mut command = cargo(workspace, &package);
+    let mut command = cargo(workspace(), &package);
     let output = command.args(["--offline", "--target-dir"]).arg(&out).output().unwrap();
     let why = String::from_utf8_lossy(&output.stderr);
     assert!(!output.status.success() && why.contains("made-by-cargo-xtask-package"), "{why}");
@@ -184,12 +154,11 @@ fn the_package_does_not_care_which_rustls_stands_beside_it() {
     fs::write(newer.join("Cargo.toml"), manifest).unwrap();
 
     let patch = "patch.crates-io.rustls.path=\"../rustls-newer\"";
-    let target = Path::new(env!("CARGO_TARGET_TMPDIR")).parent().unwrap();
     let update = ["update", "--offline", "--package", "rustls", "--config", patch];
     run(&mut cargo(&project, &update));
     assert_eq!(locked(&project), [NEWER]);
     let check = ["check", "--offline", "--locked", "--config", patch];
-    run(cargo(&project, &check).env("CARGO_TARGET_DIR", target));
+    run(cargo(&project, &check).env("CARGO_TARGET_DIR", target()));
 }
 
 /// Cargo has an empty home, and all it finds is in `vendor/`.

@@ -32,22 +32,8 @@ fn drain(registry: &mut Registry<Label>, number: u8) -> Vec<Message> {
         .collect()
 }
 
-fn endpoint(gid: Gid, kind: EndpointKind) -> Endpoint {
-    Endpoint {
-        gid,
-        kind,
-        topic: "/t".into(),
-        type_name: "T".into(),
-        type_hash: Vec::new(),
-        qos: Qos::default(),
-        node: String::new(),
-        namespace: String::new(),
-        enclave: String::new(),
-    }
-}
-
 fn announce(registry: &mut Registry<Label>, session: u8, number: u32, kind: EndpointKind) {
-    let endpoint = endpoint(Gid::new(id(session), number), kind);
+    let endpoint = Endpoint::example(Gid::new(id(session), number), kind);
     announce_as(registry, session, endpoint, EndpointRole::Application);
 }
 
@@ -113,7 +99,7 @@ fn the_gateway_brings_the_publishers_of_other_hosts_to_every_reader() {
         Gid(gid)
     };
     for number in 0..remote {
-        let endpoint = endpoint(stand_in(number), EndpointKind::Publisher);
+        let endpoint = Endpoint::example(stand_in(number), EndpointKind::Publisher);
         announce_as(&mut registry, 1, endpoint, EndpointRole::StandIn);
     }
     assert_eq!(registry.pairs.len(), (readers * remote) as usize);
@@ -121,7 +107,7 @@ fn the_gateway_brings_the_publishers_of_other_hosts_to_every_reader() {
 
     // What all of them may make is bounded, and the gateway is told and stays.
     for number in remote..=u32::try_from(MAX_ALL_PAIRS).unwrap() / readers {
-        let endpoint = endpoint(stand_in(number), EndpointKind::Publisher);
+        let endpoint = Endpoint::example(stand_in(number), EndpointKind::Publisher);
         announce_as(&mut registry, 1, endpoint, EndpointRole::StandIn);
     }
     assert!(registry.pairs.len() <= MAX_ALL_PAIRS);
@@ -137,7 +123,7 @@ fn the_gateway_brings_the_publishers_of_other_hosts_to_every_reader() {
 #[test]
 fn the_gateway_is_told_of_this_host_alone() {
     let mut registry = registry(&[SessionRole::Gateway, SessionRole::Application]);
-    let elsewhere = endpoint(Gid([9; 16]), EndpointKind::Publisher);
+    let elsewhere = Endpoint::example(Gid([9; 16]), EndpointKind::Publisher);
     registry.remote_graph(DaemonId([1; 16]), true, [elsewhere.clone()], vec![]);
     registry.flush();
     assert!(drain(&mut registry, 1).is_empty());
@@ -159,7 +145,7 @@ fn the_gateway_is_told_of_this_host_alone() {
 #[test]
 fn sessions_that_are_told_everything_share_its_packets() {
     let mut registry = registry(&[SessionRole::Application; 2]);
-    let many = (0..100).map(|n| endpoint(Gid::new(id(9), n), EndpointKind::Publisher));
+    let many = (0..100).map(|n| Endpoint::example(Gid::new(id(9), n), EndpointKind::Publisher));
     registry.remote_graph(DaemonId([1; 16]), true, many, vec![]);
     registry.flush();
     let mut first = [1, 2].map(|number| {

@@ -20,7 +20,7 @@ use super::{
     calls::{self, Calls},
     flow::{Channel, Incoming},
     news::News,
-    pipe::{End, Pipe},
+    pipe::{End, Loss, Pipe},
 };
 use crate::{
     config::Config,
@@ -31,7 +31,8 @@ use crate::{
     session::{
         Face, Node, Session, SessionError, SessionOptions, Subscription,
         message::{
-            Announce, Asserted, EndpointRole, Leaving, Matched, Message, PROTOCOL, Refused, Welcome,
+            Announce, Asserted, EndpointRole, GivenUp, Leaving, Matched, Message, PROTOCOL,
+            Refused, Welcome,
         },
         socket::{self, SocketError},
     },
@@ -112,6 +113,7 @@ impl Far {
             calls: Calls::default(),
             callers: BTreeMap::new(),
             alive: Alive::default(),
+            unreached: BTreeMap::new(),
             graph: Arc::default(),
             left: VecDeque::new(),
             given_up: Seldom::default(),
@@ -125,6 +127,23 @@ impl Far {
 
 fn failed(error: &SessionError) -> End {
     End::Other(error.to_string())
+}
+
+/// Samples of one publisher that do not get where they are to go.
+#[derive(Default)]
+struct Unreached {
+    /// Those that came and could not be written.
+    unwritten: u64,
+    /// How many its process was told of.
+    told: u64,
+}
+
+impl Unreached {
+    /// How many are to be told of, if readers gave up so many in all.
+    fn news(&mut self, given_up: u64) -> u64 {
+        let all = given_up.saturating_add(self.unwritten);
+        all.saturating_sub(std::mem::replace(&mut self.told, all))
+    }
 }
 
 /// A session that is served.
@@ -145,6 +164,8 @@ struct Served {
     /// The clients that its process has for each of its servers: whose responses may come.
     callers: BTreeMap<Gid, BTreeSet<Gid>>,
     alive: Alive,
+    /// What its publishers lost.
+    unreached: BTreeMap<Gid, Unreached>,
     /// The graph as it was told.
     graph: Arc<GraphView>,
     /// The pairs, an endpoint of the session first, of which the other is gone and has left something,
@@ -188,12 +209,12 @@ impl Served {
             for publishers in self.alive.news(Instant::now(), leased) {
                 self.pipe.say(&Message::Asserted(Asserted { publishers }))?;
             }
-            let (writers, tally) = (&self.writers, &self.tally);
-            let find = |gid: &Gid| writers.get(gid);
-            self.pipe.write(find, |_, samples, _| tally.lost(samples))?;
+            self.write()?;
             if self.pipe.is_over() {
                 return self.wind_up();
             }
+            let writers = &self.writers;
+            let find = |gid: &Gid| writers.get(gid);
             let (sources, subscriptions) = (&mut self.sources, &self.subscriptions);
             let calls = &mut self.calls;
             let sent = self.pipe.send(|channel| {
@@ -216,6 +237,32 @@ impl Served {
         }
     }
 
+    /// Writes what came, and tells the process what became of it.
+    fn write(&mut self) -> Result<(), End> {
+        let (writers, tally, unreached) = (&self.writers, &self.tally, &mut self.unreached);
+        let credits = self.pipe.write(
+            |gid| writers.get(gid),
+            |gid, loss| {
+                tally.lost(loss.samples());
+                if let Loss::Unwritten = loss {
+                    unreached.entry(*gid).or_default().unwritten += 1;
+                }
+            },
+        );
+        let publishers: BTreeSet<Gid> = credits.iter().map(|credit| credit.publisher).collect();
+        for writer in publishers {
+            let Some(given_up) = self.writers.get(&writer).and_then(Face::given_up) else {
+                continue;
+            };
+            let samples = self.unreached.entry(writer).or_default().news(given_up);
+            if samples > 0 {
+                // Ahead of the credit by which they count as acknowledged.
+                self.pipe.say(&Message::GivenUp(GivenUp { reader: writer, writer, samples }))?;
+            }
+        }
+        self.pipe.give_back(credits)
+    }
+
     /// The process is gone, and was heard to the end: what it wrote goes to readers that make room for it
     /// soon, while nobody counts it any more.
     fn wind_up(mut self) -> Result<(), End> {
@@ -227,8 +274,7 @@ impl Served {
             self.leader.clear();
             self.leader.arm(true);
             self.news.take();
-            let (writers, tally) = (&self.writers, &self.tally);
-            self.pipe.write(|gid| writers.get(gid), |_, samples, _| tally.lost(samples))?;
+            self.write()?;
             if self.pipe.is_blocked() {
                 let left = end.saturating_duration_since(Instant::now());
                 self.pipe.sleep(&self.leader, &self.news, None, Some(left));
@@ -337,6 +383,7 @@ impl Served {
         self.subscriptions.remove(gid);
         self.nodes.remove(gid);
         self.callers.remove(gid);
+        self.unreached.remove(gid);
         if self.told.remove(gid).is_some() {
             self.close_unwanted();
         }

@@ -8,7 +8,7 @@ use rustix::{
 };
 
 use super::*;
-use crate::{config::OsFiles, ids::DaemonId, qos::Qos};
+use crate::{config::OsFiles, ids::DaemonId};
 
 /// Only what was lost takes this long.
 const EVER: Duration = Duration::from_secs(60);
@@ -71,15 +71,10 @@ fn what_the_control_plane_refuses_its_process_is_told_of() {
     for (number, kind) in (1..).zip(all) {
         let named = |name: &str| if kind == EndpointKind::Node { "" } else { name }.to_owned();
         let endpoint = Endpoint {
-            gid: Gid::new(id, number),
-            kind,
             topic: named("/t"),
             type_name: named("T"),
-            type_hash: Vec::new(),
-            qos: Qos::default(),
             node: "n".into(),
-            namespace: String::new(),
-            enclave: String::new(),
+            ..Endpoint::example(Gid::new(id, number), kind)
         };
         let (gid, role) = (endpoint.gid, EndpointRole::Application);
         let (stands_for, ring, only) = (Vec::new(), None, None);

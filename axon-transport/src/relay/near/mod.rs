@@ -26,7 +26,7 @@ use super::{
     calls::{self, Calls},
     flow::{Channel, Incoming},
     news::News,
-    pipe::{End, Pipe},
+    pipe::{End, Loss, Pipe},
 };
 use crate::{
     events::Alive,
@@ -36,7 +36,9 @@ use crate::{
         Session, SessionError, Shared,
         connect::Connected,
         local::House,
-        message::{Announce, Asserted, EndpointRole, Gone, Graph, Leaving, Message, Refused},
+        message::{
+            Announce, Asserted, EndpointRole, GivenUp, Gone, Graph, Leaving, Message, Refused,
+        },
         socket::SocketError,
     },
 };
@@ -218,7 +220,11 @@ impl<'a> Served<'a> {
             }
             let stand_ins = &self.stand_ins;
             let find = |gid: &Gid| stand_ins.get(gid).map(StandIn::face);
-            self.pipe.write(find, |gid, samples, first| common.shared.lost(gid, samples, first))?;
+            let credits = self.pipe.write(find, |gid, loss| {
+                let first = matches!(loss, Loss::Before { first: true, .. });
+                common.shared.lost(gid, loss.samples(), first);
+            });
+            self.pipe.give_back(credits)?;
             if self.pipe.is_over() {
                 return Err(SocketError::Closed.into());
             }
@@ -268,6 +274,12 @@ impl<'a> Served<'a> {
                     && let Some(sequence) = credit.done
                 {
                     relay.acknowledge(sequence);
+                }
+            }
+            // It comes before the credit that confirms them.
+            Message::GivenUp(GivenUp { writer, samples, .. }) => {
+                if let Some(relay) = self.relays.get(&writer) {
+                    relay.lose(samples);
                 }
             }
             Message::Asserted(asserted) => {

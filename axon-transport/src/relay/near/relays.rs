@@ -65,6 +65,11 @@ impl Relay {
         self.subscription.acknowledge_of(&self.publisher.gid, sequence);
     }
 
+    /// The daemon says that so many of the publisher's samples do not get where they are to go.
+    pub(super) fn lose(&self, samples: u64) {
+        self.subscription.give_up(self.publisher.gid, samples);
+    }
+
     /// How long it still waits at most for the readers that it had before the last daemon was gone.
     pub(super) fn waits_for(&self) -> Option<Duration> {
         let until = self.awaits.as_ref()?.until;

@@ -90,13 +90,10 @@ impl Control {
             // Pairs with the release store in `Shared::stop`.
             while !shared.stopping.load(Ordering::Acquire) {
                 let caller = Caller {
-                    config: &shared.config,
-                    options: &shared.options,
-                    id: shared.id,
                     segment: Some(&shared.segment),
-                    relay: None,
                     // Pairs with the release store in `Shared::stop`.
                     cancel: Some(&|| shared.stopping.load(Ordering::Acquire)),
+                    ..Caller::new(&shared.config, &shared.options, shared.id)
                 };
                 match caller.connect() {
                     Ok(connected) => {

@@ -425,7 +425,7 @@ pub struct Leaving {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct GivenUp {
-    /// The relay.
+    /// The relay; the publisher itself where its session is relayed.
     #[n(0)]
     pub reader: Gid,
     /// The publisher.

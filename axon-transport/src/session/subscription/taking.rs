@@ -308,17 +308,7 @@ mod tests {
     }
 
     fn subscription(gid: Gid) -> SubscriptionInner {
-        let endpoint = Endpoint {
-            gid,
-            kind: EndpointKind::Subscription,
-            topic: "/t".into(),
-            type_name: "T".into(),
-            type_hash: Vec::new(),
-            qos: Qos::default(),
-            node: String::new(),
-            namespace: String::new(),
-            enclave: String::new(),
-        };
+        let endpoint = Endpoint::example(gid, EndpointKind::Subscription);
         SubscriptionInner::new(endpoint, EndpointRole::Application, Vec::new())
     }
 

@@ -103,6 +103,67 @@ impl Taker {
     }
 }
 
+/// The reader elsewhere that a relay stands for.
+const ELSEWHERE: Gid = Gid([5; 16]);
+/// Some of these are all that a publisher keeps.
+const LARGE_SAMPLE: &[u8] = &[7; 1 << 19];
+
+/// A publisher that is matched with [`ELSEWHERE`] alone, through a relay.
+struct Relayed {
+    publisher: Publisher,
+    relay: Gid,
+    daemon: Daemon,
+    session: Session,
+}
+
+impl Relayed {
+    fn new(qos: Qos) -> (Self, Taking) {
+        let (session, daemon) = session();
+        let publisher = publisher(&session, qos);
+        let taker = Taker::new();
+        let taking = taker.attach(&publisher, Some(vec![ELSEWHERE]), &daemon);
+        until("it is matched", || publisher.matched() == [ELSEWHERE]);
+        (Self { publisher, relay: taker.gid, daemon, session }, taking)
+    }
+
+    /// With [`Qos::keep_all`], and a relay that says later what has arrived.
+    fn with_receipts() -> (Self, Taking) {
+        let (relayed, mut taking) = Self::new(Qos::keep_all());
+        taking.reader.finish_later();
+        (relayed, taking)
+    }
+
+    /// Publishes three samples, which the relay takes.
+    fn three(&self, taking: &mut Taking) {
+        for number in 1..=3 {
+            self.publisher.publish(b"x").unwrap();
+            assert_eq!(taking.take(&self.daemon), number);
+        }
+    }
+
+    /// Publishes until there is no room; returns how many samples that took.
+    fn fill(&self) -> u64 {
+        let mut published = 0;
+        while self.publisher.publish(LARGE_SAMPLE).is_ok() {
+            published += 1;
+            assert!(published < 1000, "its budget is much less");
+        }
+        published
+    }
+
+    /// The daemon says that the relay gave up so many samples.
+    fn gives_up(&self, samples: u64) {
+        let given_up = GivenUp { reader: self.relay, writer: self.publisher.gid(), samples };
+        self.daemon.say(Message::GivenUp(given_up), &[]);
+    }
+
+    /// The daemon says that the relay ended.
+    fn ends(&self) {
+        let pair = Pair { reader: self.relay, writer: self.publisher.gid() };
+        self.daemon.say(Message::Detach(pair), &[]);
+    }
+}
+
 fn appears(daemon: &Daemon, endpoint: Endpoint) {
     let added = vec![GraphItem { endpoint, daemon: None, reach: None }];
     let graph =
@@ -199,12 +260,8 @@ fn a_publisher_is_counted_once_it_is_received_from() {
 
 #[test]
 fn a_sample_is_acknowledged_when_whoever_carries_it_away_has_it() {
-    let (session, daemon) = session();
-    let publisher = publisher(&session, Qos::default());
-    let elsewhere = vec![Gid([5; 16])];
-    let taker = Taker::new();
-    let mut taking = taker.attach(&publisher, Some(elsewhere), &daemon);
-    until("it is matched", || publisher.matched() == [Gid([5; 16])]);
+    let (relayed, mut taking) = Relayed::new(Qos::default());
+    let Relayed { publisher, daemon, session, .. } = &relayed;
     assert!(publisher.wait_acknowledged(Duration::ZERO), "nothing was published");
     let room = || session.segment().armed_word(Purpose::Room);
     for round in 0..3u8 {
@@ -214,7 +271,7 @@ fn a_sample_is_acknowledged_when_whoever_carries_it_away_has_it() {
             let waiting = scope.spawn(|| publisher.wait_acknowledged(EVER));
             until("it sleeps", || room().load(std::sync::atomic::Ordering::Relaxed) != 0);
             assert!(!waiting.is_finished());
-            taking.take(&daemon);
+            taking.take(daemon);
             assert!(waiting.join().unwrap(), "nobody told it");
         });
     }
@@ -225,30 +282,22 @@ fn a_sample_is_acknowledged_when_whoever_carries_it_away_has_it() {
         until("it sleeps", || room().load(std::sync::atomic::Ordering::Relaxed) != 0);
         // The daemon says that it ended, and not that it gave anything up.
         drop(taking);
-        daemon.say(Message::Detach(Pair { reader: taker.gid, writer: publisher.gid() }), &[]);
+        relayed.ends();
         assert!(waiting.join().unwrap(), "nobody told it");
     });
 }
 
 #[test]
 fn a_sample_that_is_given_up_is_not_acknowledged() {
-    let (session, daemon) = session();
-    let publisher = publisher(&session, Qos::keep_all());
-    let taker = Taker::new();
-    let mut taking = taker.attach(&publisher, Some(vec![Gid([5; 16])]), &daemon);
-    taking.reader.finish_later();
-    until("it is matched", || publisher.matched() == [Gid([5; 16])]);
-    for number in 1..=3 {
-        publisher.publish(b"x").unwrap();
-        assert_eq!(taking.take(&daemon), number);
-    }
+    let (relayed, mut taking) = Relayed::with_receipts();
+    let publisher = &relayed.publisher;
+    relayed.three(&mut taking);
     taking.reader.finish(1);
     assert_eq!((publisher.unacknowledged(), publisher.given_up()), (2, 0));
-    let (reader, writer) = (taker.gid, publisher.gid());
     thread::scope(|scope| {
         let waiting = scope.spawn(|| publisher.wait_acknowledged(EVER));
-        daemon.say(Message::GivenUp(GivenUp { reader, writer, samples: 2 }), &[]);
-        daemon.say(Message::Detach(Pair { reader, writer }), &[]);
+        relayed.gives_up(2);
+        relayed.ends();
         assert!(!waiting.join().unwrap());
     });
     until("it ended", || publisher.matched().is_empty());
@@ -258,29 +307,20 @@ fn a_sample_that_is_given_up_is_not_acknowledged() {
 
 #[test]
 fn a_publisher_that_goes_on_since_its_relay_left_has_no_acknowledgement() {
-    let (session, daemon) = session();
-    let publisher = publisher(&session, Qos::keep_all());
-    let taker = Taker::new();
-    let mut taking = taker.attach(&publisher, Some(vec![Gid([5; 16])]), &daemon);
-    taking.reader.finish_later();
-    until("it is matched", || publisher.matched() == [Gid([5; 16])]);
-    let sample = vec![7; 1 << 19];
-    let mut published = 0;
-    while publisher.publish(&sample).is_ok() {
-        published += 1;
-    }
-    assert_eq!(taking.take(&daemon), 1);
+    let (relayed, mut taking) = Relayed::with_receipts();
+    let publisher = &relayed.publisher;
+    let published = relayed.fill();
+    assert_eq!(taking.take(&relayed.daemon), 1);
     drop(taking);
-    assert_eq!(publisher.publish(&sample), Ok(published + 1), "nobody holds it back");
+    assert_eq!(publisher.publish(LARGE_SAMPLE), Ok(published + 1), "nobody holds it back");
     for _ in 0..3 {
         assert!(
             !publisher.wait_acknowledged(Duration::ZERO),
             "the daemon has not said what became of it"
         );
     }
-    let (reader, writer) = (taker.gid, publisher.gid());
-    daemon.say(Message::GivenUp(GivenUp { reader, writer, samples: published }), &[]);
-    daemon.say(Message::Detach(Pair { reader, writer }), &[]);
+    relayed.gives_up(published);
+    relayed.ends();
     until("it ended", || publisher.matched().is_empty());
     assert!(!publisher.wait_acknowledged(Duration::ZERO));
     assert_eq!(publisher.given_up(), published);
@@ -288,24 +328,16 @@ fn a_publisher_that_goes_on_since_its_relay_left_has_no_acknowledgement() {
 
 #[test]
 fn a_sample_that_its_relay_gave_up_is_never_acknowledged_before_the_daemon_says_so() {
-    let (session, daemon) = session();
-    let publisher = publisher(&session, Qos::keep_all());
-    let taker = Taker::new();
-    let mut taking = taker.attach(&publisher, Some(vec![Gid([5; 16])]), &daemon);
-    taking.reader.finish_later();
-    until("it is matched", || publisher.matched() == [Gid([5; 16])]);
-    for number in 1..=3 {
-        publisher.publish(b"x").unwrap();
-        assert_eq!(taking.take(&daemon), number);
-    }
+    let (relayed, mut taking) = Relayed::with_receipts();
+    let publisher = &relayed.publisher;
+    relayed.three(&mut taking);
     taking.reader.give_up(2);
     taking.reader.finish(3);
     assert!(!publisher.wait_acknowledged(Duration::ZERO), "two are lost");
     assert_eq!((publisher.unacknowledged(), publisher.given_up()), (0, 2));
     // The message about them comes later, and makes them no more.
-    let (reader, writer) = (taker.gid, publisher.gid());
-    daemon.say(Message::GivenUp(GivenUp { reader, writer, samples: 2 }), &[]);
-    daemon.say(Message::Detach(Pair { reader, writer }), &[]);
+    relayed.gives_up(2);
+    relayed.ends();
     until("it ended", || publisher.matched().is_empty());
     assert_eq!(publisher.given_up(), 2);
     assert!(publisher.wait_acknowledged(Duration::ZERO), "it was said once");
@@ -313,14 +345,10 @@ fn a_sample_that_its_relay_gave_up_is_never_acknowledged_before_the_daemon_says_
 
 #[test]
 fn no_more_is_given_up_than_was_published() {
-    let (session, daemon) = session();
-    let publisher = publisher(&session, Qos::keep_all());
-    let taker = Taker::new();
-    let taking = taker.attach(&publisher, Some(vec![Gid([5; 16])]), &daemon);
-    until("it is matched", || publisher.matched() == [Gid([5; 16])]);
-    let (reader, writer) = (taker.gid, publisher.gid());
+    let (relayed, _taking) = Relayed::new(Qos::keep_all());
+    let publisher = &relayed.publisher;
     let given_up = |samples, all| {
-        daemon.say(Message::GivenUp(GivenUp { reader, writer, samples }), &[]);
+        relayed.gives_up(samples);
         until("it is counted", || publisher.given_up() == all);
         assert!(!publisher.wait_acknowledged(Duration::ZERO), "each is told");
     };
@@ -328,27 +356,20 @@ fn no_more_is_given_up_than_was_published() {
     given_up(u64::MAX, 1);
     publisher.publish(b"x").unwrap();
     given_up(u64::MAX - 1, 2);
-    drop(taking);
 }
 
 #[test]
 fn a_reliable_publisher_is_held_up_by_who_takes_nothing_and_goes_on_when_it_does() {
-    let (session, daemon) = session();
-    let publisher = publisher(&session, Qos::keep_all());
-    let mut taking = Taker::new().attach(&publisher, Some(vec![Gid([5; 16])]), &daemon);
-    let sample = vec![7; 1 << 19];
-    let mut published = 0;
-    while publisher.publish(&sample).is_ok() {
-        published += 1;
-        assert!(published < 1000, "its budget is much less");
-    }
-    assert!(matches!(publisher.publish(&sample), Err(PublishError::Blocked { .. })));
+    let (relayed, mut taking) = Relayed::new(Qos::keep_all());
+    let Relayed { publisher, daemon, .. } = &relayed;
+    let published = relayed.fill();
+    assert!(matches!(publisher.publish(LARGE_SAMPLE), Err(PublishError::Blocked { .. })));
     // Nothing of it is given up, and what is taken makes room.
     for sequence in 1..=published {
-        assert_eq!(taking.take(&daemon), sequence);
+        assert_eq!(taking.take(daemon), sequence);
     }
-    publisher.publish(&sample).unwrap();
-    assert_eq!((taking.take(&daemon), taking.reader.lost()), (published + 1, 0));
+    publisher.publish(LARGE_SAMPLE).unwrap();
+    assert_eq!((taking.take(daemon), taking.reader.lost()), (published + 1, 0));
 }
 
 #[test]

@@ -61,26 +61,26 @@ impl World {
 
     fn own(&mut self, session: u8, number: u32, kind: EndpointKind) -> Gid {
         let gid = Gid::new(id(session), number);
-        self.announce(session, of(endpoint(gid, kind), EndpointRole::Application, vec![]));
+        self.announce(session, of(Endpoint::example(gid, kind), EndpointRole::Application, vec![]));
         gid
     }
 
     /// The gateway's stand-in for a publisher elsewhere.
     fn stand_in(&mut self, remote: Gid) {
-        let endpoint = endpoint(remote, Publisher);
+        let endpoint = Endpoint::example(remote, Publisher);
         self.announce(GATEWAY, of(endpoint, EndpointRole::StandIn, vec![]));
     }
 
     /// The gateway's relay for subscriptions elsewhere.
     fn relay(&mut self, number: u32, stands_for: Vec<Gid>) -> Gid {
         let gid = Gid::new(id(GATEWAY), number);
-        let endpoint = endpoint(gid, Subscription);
+        let endpoint = Endpoint::example(gid, Subscription);
         self.announce(GATEWAY, of(endpoint, EndpointRole::Relay, stands_for));
         gid
     }
 
     fn remote(&mut self, daemon: DaemonId, gid: Gid, kind: EndpointKind, toward: Toward) {
-        let remote = RemoteEndpoint { endpoint: endpoint(gid, kind).into(), toward };
+        let remote = RemoteEndpoint { endpoint: Endpoint::example(gid, kind).into(), toward };
         self.registry.remote_graph(daemon, false, vec![remote], vec![]);
     }
 
@@ -123,20 +123,6 @@ impl World {
 fn of(endpoint: Endpoint, role: EndpointRole, stands_for: Vec<Gid>) -> Announce {
     let ring = (endpoint.kind == Publisher).then_some(Location { segment: 0, offset: 4096 });
     Announce { endpoint, role, stands_for, ring, only: None }
-}
-
-fn endpoint(gid: Gid, kind: EndpointKind) -> Endpoint {
-    Endpoint {
-        gid,
-        kind,
-        topic: "/t".into(),
-        type_name: "T".into(),
-        type_hash: Vec::new(),
-        qos: Qos::default(),
-        node: String::new(),
-        namespace: String::new(),
-        enclave: String::new(),
-    }
 }
 
 const REMOTE: Gid = Gid([150; 16]);

@@ -67,15 +67,17 @@ fn an_endpoint_out_of_bounds_is_refused_and_the_session_goes_on() {
     assert_eq!(world.registry.endpoints().count(), 0);
 }
 
+fn connect_gateway(world: &mut World) -> SessionId {
+    let (gateway, name) = (session_id(200), String::new());
+    let registry = &mut world.registry;
+    registry.connect(gateway, SessionRole::Gateway, name, 1, Some(handed(gateway)), None).unwrap();
+    gateway
+}
+
 #[test]
 fn a_sample_never_goes_back_to_where_it_came_from() {
     let mut world = connected(1);
-    let gateway = session_id(200);
-    let name = String::new();
-    world
-        .registry
-        .connect(gateway, SessionRole::Gateway, name, 1, Some(handed(gateway)), None)
-        .unwrap();
+    let gateway = connect_gateway(&mut world);
     let own = first(&world);
     let remote = endpoint(Gid([9; 16]), EndpointKind::Publisher, 0, Qos::default());
     let relay = endpoint(Gid::new(gateway, 1), EndpointKind::Subscription, 0, Qos::default());
@@ -113,12 +115,7 @@ fn a_sample_never_goes_back_to_where_it_came_from() {
 #[test]
 fn ends_of_a_service_elsewhere_meet_those_here_and_never_each_other() {
     let mut world = connected(1);
-    let gateway = session_id(200);
-    let name = String::new();
-    world
-        .registry
-        .connect(gateway, SessionRole::Gateway, name, 1, Some(handed(gateway)), None)
-        .unwrap();
+    let gateway = connect_gateway(&mut world);
     let own = first(&world);
     let of = |gid, kind| endpoint(gid, kind, 0, Qos::default());
     let (client, server) =
@@ -227,17 +224,7 @@ fn a_remote_endpoint_that_comes_and_goes_ends_nothing_here() {
     let own = first(&world);
     while world.registry.next_output(&own).is_some() {}
     let gid = Gid([9; 16]);
-    let endpoint = Endpoint {
-        gid,
-        kind: EndpointKind::Publisher,
-        topic: "/a".into(),
-        type_name: "t".into(),
-        type_hash: vec![],
-        qos: Qos::default(),
-        node: String::new(),
-        namespace: String::new(),
-        enclave: String::new(),
-    };
+    let endpoint = Endpoint::example(gid, EndpointKind::Publisher);
     // A successor link repeats the whole graph within one flush.
     for _ in 0..2 {
         world.registry.remote_graph(DaemonId([1; 16]), true, vec![endpoint.clone()], vec![]);

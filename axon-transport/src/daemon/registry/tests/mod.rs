@@ -29,17 +29,7 @@ fn handed(id: SessionId) -> [Label; 3] {
 }
 
 fn endpoint(gid: Gid, kind: EndpointKind, topic: u8, qos: Qos) -> Endpoint {
-    Endpoint {
-        gid,
-        kind,
-        topic: format!("/t{topic}"),
-        type_name: "T".into(),
-        type_hash: Vec::new(),
-        qos,
-        node: String::new(),
-        namespace: String::new(),
-        enclave: String::new(),
-    }
+    Endpoint { topic: format!("/t{topic}"), qos, ..Endpoint::example(gid, kind) }
 }
 
 const PLACE: Location = Location { segment: 0, offset: 4096 };

@@ -1,0 +1,95 @@
+//! What the tests of this crate share: the workspace, commands, and the environment of AXON's programs.
+#![allow(dead_code, reason = "each test file uses its own part")]
+
+use std::fs;
+use std::io::{Write, stderr};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output};
+
+/// What cargo says when it is the registry that is missing.
+const UNREACHABLE: [&str; 6] = [
+    "failed to download",
+    "download of config.json failed",
+    "Could not resolve host",
+    "Couldn't resolve host",
+    "spurious network error",
+    "network failure seems to have happened",
+];
+
+pub(crate) fn workspace() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("xtask is in the repository")
+}
+
+/// The workspace's target directory: it has aws-lc, built.
+pub(crate) fn target() -> &'static Path {
+    Path::new(env!("CARGO_TARGET_TMPDIR")).parent().expect("it is in the target directory")
+}
+
+/// The profiles of the workspace's manifest. A project that has them too builds nothing again that was
+/// built for the workspace.
+pub(crate) fn profiles() -> String {
+    let manifest = fs::read_to_string(workspace().join("Cargo.toml")).expect("the manifest");
+    manifest[manifest.find("\n[profile.dev]").expect("a profile")..].to_owned()
+}
+
+/// Runs a command that has to succeed.
+#[track_caller]
+pub(crate) fn run(command: &mut Command) -> Output {
+    let output = command.output().unwrap_or_else(|error| panic!("{command:?}: {error}"));
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    let (out, err) = (text(&output.stdout), text(&output.stderr));
+    assert!(output.status.success(), "{command:?}: {}\n{out}\n{err}", output.status);
+    output
+}
+
+/// Runs a command that needs the registry. `None` where that is out of reach, and says so.
+#[track_caller]
+pub(crate) fn reached(command: &mut Command) -> Option<()> {
+    let output = command.output().expect("cargo runs");
+    let why = String::from_utf8_lossy(&output.stderr);
+    if !output.status.success() && UNREACHABLE.iter().any(|part| why.contains(part)) {
+        // Past the harness, which would show it only beside a failure.
+        let _ = writeln!(stderr(), "skipped: the registry is out of reach:\n{why}");
+        return None;
+    }
+    assert!(output.status.success(), "{command:?}: {why}");
+    Some(())
+}
+
+/// Unpacks a `.crate` file into a directory; returns the package's own directory in it.
+pub(crate) fn unpack(file: &Path, into: &Path) -> PathBuf {
+    // -m: cargo goes by the time of a file, and all packed ones have the same
+    run(Command::new("tar").arg("-xmzf").arg(file).arg("-C").arg(into));
+    into.join(file.file_stem().expect("name and version"))
+}
+
+/// A program with nothing of AXON or ROS 2 in its environment.
+pub(crate) fn alone(program: &Path) -> Command {
+    let mut command = Command::new(program);
+    let ours = |name: &str| name.starts_with("AXON_") || name.starts_with("ROS_");
+    for (name, _) in std::env::vars().filter(|(name, _)| ours(name)) {
+        command.env_remove(name);
+    }
+    command
+}
+
+/// The same, with a daemon that keeps its files in a directory, does not stay long, and talks to no
+/// other host.
+pub(crate) fn with_daemon(program: &Path, directory: &Path) -> Command {
+    let config = directory.join("axon.toml");
+    fs::write(&config, "[link]\ngrace_s = 1\n").expect("a file");
+    let mut command = alone(program);
+    command.env("AXON_CONFIG", config).env("AXON_RUNTIME_DIR", directory.join("run"));
+    command.env("AXON_BIND_ADDRS", "127.0.0.1").env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST");
+    command
+}
+
+/// A process that does not outlive the test.
+pub(crate) struct Kept(pub(crate) Child);
+
+impl Drop for Kept {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
