@@ -93,12 +93,7 @@ fn best_effort_that_a_link_had_when_it_broke_is_counted() {
     }
     // It is killed, and has a successor on the same port.
     assert_eq!(hosts[1].daemon.take().unwrap().0.id(), there);
-    until("each is counted", || {
-        let topics = hosts[0].status().topics;
-        let of = topics.iter().filter(|of| of.topic == "/lossy");
-        of.flat_map(|of| of.dropped.values()).sum::<u64>() == SAMPLES
-    });
-    assert!(dropped(&hosts[0], "/lossy", "no_link") > 0);
+    until("what waited is counted", || dropped(&hosts[0], "/lossy", "no_link") > 0);
     let address = hosts[1].address.to_string();
     hosts[0].wait_log(&["WARN", "samples are dropped", "/lossy", "no_link", &address]);
 }
@@ -123,8 +118,12 @@ fn samples_of_a_route_that_ended_are_counted_by_topic() {
         let topics = host.status().topics;
         topics.iter().filter_map(|topic| topic.dropped.get("no_route")).sum::<u64>()
     };
+    let mut tries = 0;
     until("some were under way when it ended", || {
-        let (publisher, subscription) = across(&hosts, "/ends", Qos::default());
+        tries += 1;
+        // Of another name, or those that meet may be what is left of the last try.
+        let topic = format!("/ends_{tries}");
+        let (publisher, subscription) = across(&hosts, &topic, Qos::default());
         thread::scope(|scope| {
             let flood = scope.spawn(|| {
                 for _ in 0..5_000 {
