@@ -4,7 +4,7 @@ mod program;
 
 use std::io::{BufRead, BufReader};
 use std::net::{SocketAddr, TcpListener};
-use std::process::{Command, Stdio};
+use std::process::Stdio;
 use std::sync::Arc;
 
 use etsi_qkd014::sim::{Control, Network};

@@ -1,24 +1,20 @@
-//! KMEs in a process of their own, since a KME's memory is full of keys: simulated ones, and one
-//! that follows a script with keys that are known beforehand.
+//! A KME that follows a script with keys that are known beforehand, beside the simulated ones.
 
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
-use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdin, Command, Stdio};
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
-use etsi_qkd014::sim::Network;
-use etsi_qkd014::{Client, ClientBuilder, RetryPolicy};
+use etsi_qkd014::ClientBuilder;
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::{ServerConfig, ServerConnection, StreamOwned};
 
-/// Tells the test binary that it is to be the KMEs, and where to write their certificates.
-const VARIABLE: &str = "AXON_CANARY_KMES";
+use crate::kmes::{self, Kmes};
 
 /// The key of a number, as the script has it.
 pub(crate) fn key(number: u64) -> [u8; 32] {
@@ -39,83 +35,16 @@ pub(crate) fn key_id(number: u64) -> String {
     format!("00000000-0000-4000-8000-{number:012x}")
 }
 
-/// The KMEs, which end with this.
-pub(crate) struct Kmes {
-    child: Child,
-    _stdin: ChildStdin,
-    dir: tempfile::TempDir,
-    urls: Vec<String>,
-}
-
 impl Kmes {
-    pub(crate) fn start() -> Self {
-        let dir = tempfile::tempdir().unwrap();
-        let mut child = Command::new(std::env::current_exe().unwrap())
-            .args(["--exact", "kmes", "--nocapture"])
-            .env(VARIABLE, dir.path())
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let stdin = child.stdin.take().unwrap();
-        let lines = BufReader::new(child.stdout.take().unwrap()).lines();
-        let urls = lines
-            .map_while(Result::ok)
-            .find_map(|line| Some(line.split_once("KMEs: ")?.1.to_owned()))
-            .expect("the child must say where its KMEs are");
-        let urls = urls.split(' ').map(str::to_owned).collect();
-        Self { child, _stdin: stdin, dir, urls }
-    }
-
-    /// Settings for the simulated KME of `sae`.
-    pub(crate) fn simulated(&self, sae: &str) -> ClientBuilder {
-        self.settings(sae, &self.urls[usize::from(sae == "sae-b")])
-    }
-
-    /// A file that the KMEs wrote, as `sae-a.key`.
-    pub(crate) fn file(&self, name: &str) -> PathBuf {
-        self.dir.path().join(name)
-    }
-
     /// Settings for the KME with the script.
     pub(crate) fn scripted(&self) -> ClientBuilder {
-        self.settings("sae-a", &self.urls[2])
-    }
-
-    fn settings(&self, sae: &str, url: &str) -> ClientBuilder {
-        Client::builder()
-            .kme_url(url)
-            .ca_file(self.file("ca.pem"))
-            .sae_cert_file(self.file(&format!("{sae}.crt")))
-            .sae_key_file(self.file(&format!("{sae}.key")))
-            .retry(RetryPolicy::none())
-    }
-}
-
-impl Drop for Kmes {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
+        self.settings("sae-a", 2)
     }
 }
 
 /// In the child: serves until standard input ends. Elsewhere: nothing.
 pub(crate) fn serve_if_asked() {
-    let Some(dir) = std::env::var_os(VARIABLE).map(PathBuf::from) else { return };
-    let runtime = tokio::runtime::Runtime::new().unwrap();
-    let network = Network::builder()
-        .strict()
-        .kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a"])
-        .kme("kme-b", "127.0.0.1:0".parse().unwrap(), ["sae-b"])
-        .max_keys_per_request(1_000)
-        .start();
-    let network = runtime.block_on(network).unwrap();
-    network.write_files(&dir).unwrap();
-    let script = listen(&dir);
-    let urls = network.kmes().iter().map(|kme| kme.url()).chain([&*script]);
-    let urls = urls.collect::<Vec<_>>().join(" ");
-    std::io::stdout().write_all(format!("KMEs: {urls}\n").as_bytes()).unwrap();
-    axon_tests::end_with_stdin();
+    kmes::serve_if_asked(1_000, |dir| Some(listen(dir)));
 }
 
 fn listen(dir: &Path) -> String {

@@ -9,6 +9,8 @@
 //! Here and not with the crate, which forbids unsafe code: an allocator needs it.
 
 mod kme;
+#[path = "../kmes/mod.rs"]
+mod kmes;
 mod pool;
 mod quarantine;
 mod sae_key;
@@ -20,7 +22,8 @@ use std::time::Duration;
 
 use etsi_qkd014::secrecy::ExposeSecret;
 use etsi_qkd014::{Client, ClientBuilder, Error, Key, KeyContainer};
-use kme::{Kmes, key, key_id};
+use kme::{key, key_id};
+use kmes::Kmes;
 use search::{Needles, Sites};
 use tokio::runtime::{Builder, Runtime};
 

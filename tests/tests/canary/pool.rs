@@ -5,7 +5,8 @@ use std::time::Duration;
 use etsi_qkd014::pool::{KeyPoolBuilder, PoolStatus};
 use etsi_qkd014::{Client, KeyPool};
 
-use crate::kme::{Kmes, key};
+use crate::kme::key;
+use crate::kmes::Kmes;
 use crate::{judge, quarantine};
 
 /// More keys than any of these draws.

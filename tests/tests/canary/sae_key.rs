@@ -4,7 +4,7 @@ use etsi_qkd014::{Client, ClientBuilder, Error};
 use rustls::pki_types::PrivateKeyDer;
 use rustls::pki_types::pem::PemObject;
 
-use crate::kme::Kmes;
+use crate::kmes::Kmes;
 use crate::search::Needles;
 use crate::{judge, quarantine};
 

@@ -270,6 +270,13 @@ impl Host {
         Session::open(&self.config(), SessionOptions::new(name)).unwrap()
     }
 
+    /// The same, which shares no memory with the daemon.
+    pub(crate) fn relayed_session(&self, name: &str) -> Session {
+        let mut config = self.config();
+        config.shm = false;
+        Session::open(&config, SessionOptions::new(name)).unwrap()
+    }
+
     pub(crate) fn node(&self, arguments: &[&str]) -> Node {
         self.node_with(&[], arguments)
     }

@@ -3,7 +3,7 @@
 
 use axon_tests::Sizes;
 use axon_transport::{
-    config::{DaemonPolicy, DiscoveryRange},
+    config::{Config, DaemonPolicy, DiscoveryRange},
     daemon::status::SessionStatus,
     ids::Gid,
     qos::Qos,
@@ -29,19 +29,21 @@ fn spec() -> EndpointSpec {
 
 /// A session of this process on `host`, with a range and static peers of its own.
 fn open(host: &Host, range: DiscoveryRange, lists: &[&Host]) -> Session {
-    let static_peers = lists.iter().map(|peer| peer.address.to_string()).collect();
-    let mut config = host.config();
-    (config.range, config.static_peers, config.daemon) = (range, static_peers, REQUIRE);
-    Session::open(&config, SessionOptions::new(range.name())).unwrap()
+    Session::open(&ranged(host, range, lists), SessionOptions::new(range.name())).unwrap()
 }
 
 /// As [`open`], sharing no memory with its daemon.
 fn open_relayed(host: &Host, range: DiscoveryRange, lists: &[&Host]) -> Session {
+    let mut config = ranged(host, range, lists);
+    config.shm = false;
+    Session::open(&config, SessionOptions::new("relayed")).unwrap()
+}
+
+fn ranged(host: &Host, range: DiscoveryRange, lists: &[&Host]) -> Config {
     let static_peers = lists.iter().map(|peer| peer.address.to_string()).collect();
     let mut config = host.config();
     (config.range, config.static_peers, config.daemon) = (range, static_peers, REQUIRE);
-    config.shm = false;
-    Session::open(&config, SessionOptions::new("relayed")).unwrap()
+    config
 }
 
 fn publisher(session: &Session) -> Publisher {

@@ -7,7 +7,7 @@ use axon_transport::{
     link::{Graph, Message, Owners},
     owner::{Proof, SessionKey},
     qos::Qos,
-    session::{EndpointSpec, Publisher, Session, SessionOptions, Subscription},
+    session::{EndpointSpec, Publisher, Session, Subscription},
 };
 
 use super::{
@@ -246,11 +246,7 @@ fn with_kme_keys_each_daemon_proves_its_sessions() {
 #[test]
 fn a_relayed_session_is_proved_by_the_daemon_that_relays_it() {
     let camera = Camera::new();
-    let [reader, owner] = [&camera.a, &camera.b].map(|host| {
-        let mut config = host.config();
-        config.shm = false;
-        Session::open(&config, SessionOptions::new("relayed")).unwrap()
-    });
+    let [reader, owner] = [&camera.a, &camera.b].map(|host| host.relayed_session("relayed"));
     let subscription = reader.create_subscription(spec(TOPIC)).unwrap();
     let publisher = owner.create_publisher(spec(TOPIC)).unwrap();
     assert!(publisher.wait_matched(1, PATIENCE) && subscription.wait_matched(1, PATIENCE));

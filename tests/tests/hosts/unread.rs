@@ -9,14 +9,14 @@ use axon_transport::{
     ids::{DaemonId, Gid},
     link::{Graph, Message, Received, ReceivedOf, Subscribe, Subscriber},
     qos::Qos,
-    session::EndpointSpec,
+    session::{EndpointSpec, Session},
     shm::PublishError,
 };
 use rustix::process::Signal;
 
 use super::{
     mode::classic,
-    pair::{Plan, signal},
+    pair::{Host, Plan, signal},
     process::{PATIENCE, until},
     stranger::{Claim, Met, Stranger},
 };
@@ -109,12 +109,22 @@ fn a_peer_that_reads_nothing_is_disconnected_from_the_topic_and_the_publisher_go
 #[test]
 fn a_peer_that_claims_to_have_dropped_more_than_it_got_makes_up_no_losses() {
     let [host, _other] = Plan::new([classic(&[]), classic(&[])]).start();
-    let session = host.session("publisher");
+    claims_to_have_dropped(&host, &host.session("publisher"));
+}
+
+#[test]
+fn samples_of_a_relayed_session_that_a_peer_dropped_are_given_up() {
+    let [host, _other] = Plan::new([classic(&[]), classic(&[])]).start();
+    claims_to_have_dropped(&host, &host.relayed_session("publisher"));
+}
+
+/// A peer that dropped samples of a publisher, and says so of more than it was sent.
+fn claims_to_have_dropped(host: &Host, session: &Session) {
     let publisher =
         session.create_publisher(EndpointSpec::new(TOPIC, TYPE, Qos::keep_all())).unwrap();
     let (stranger, auth) = (Stranger::new(), Auth::None(SigningKey::generate().unwrap()));
     let claim = Claim { host: "liar", daemon: DaemonId([0xff; 16]), auth: 0 };
-    let mut met = stranger.dial(&host, &auth, &claim).expect("a link");
+    let mut met = stranger.dial(host, &auth, &claim).expect("a link");
     subscribe(&stranger, &mut met);
     until("it is served", || publisher.matched().len() == 1);
     let mut say = |sequence, dropped| {

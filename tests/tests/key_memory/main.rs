@@ -6,20 +6,17 @@
 //!
 //! Here and not with the crate, which forbids unsafe code: an allocator needs it.
 
+#[path = "../kmes/mod.rs"]
+mod kmes;
 mod live;
 
-use std::io::{BufRead, BufReader, Write};
-use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdin, Command, Stdio};
 use std::time::Duration;
 
 use etsi_qkd014::pool::Ledger;
-use etsi_qkd014::sim::Network;
-use etsi_qkd014::{Client, Key, KeyPool, RetryPolicy};
+use etsi_qkd014::{Client, Key, KeyPool};
+use kmes::Kmes;
 use tokio::runtime::{Builder, Runtime};
 
-/// Tells the test binary that it is to be the KMEs, and where to write their certificates.
-const VARIABLE: &str = "AXON_MEMORY_KMES";
 const BATCH: u32 = 100;
 const BATCHES: usize = 10;
 /// Rounds until every buffer and table has found its size: hyper's for reading in the fourth, the
@@ -30,66 +27,11 @@ const ROUNDS: usize = 20;
 /// The KMEs' process.
 #[test]
 fn kmes() {
-    let Some(dir) = std::env::var_os(VARIABLE).map(PathBuf::from) else { return };
-    let runtime = Runtime::new().unwrap();
-    let network = Network::builder()
-        .strict()
-        .kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a"])
-        .kme("kme-b", "127.0.0.1:0".parse().unwrap(), ["sae-b"])
-        .max_keys_per_request(BATCH.into())
-        .start();
-    let network = runtime.block_on(network).unwrap();
-    network.write_files(&dir).unwrap();
-    let urls = network.kmes().iter().map(|kme| kme.url()).collect::<Vec<_>>().join(" ");
-    std::io::stdout().write_all(format!("KMEs: {urls}\n").as_bytes()).unwrap();
-    axon_tests::end_with_stdin();
+    kmes::serve_if_asked(BATCH.into(), |_| None);
 }
 
-struct Kmes {
-    child: Child,
-    _stdin: ChildStdin,
-    dir: tempfile::TempDir,
-    urls: Vec<String>,
-}
-
-impl Kmes {
-    fn start() -> Self {
-        let dir = tempfile::tempdir().unwrap();
-        let mut child = Command::new(std::env::current_exe().unwrap())
-            .args(["--exact", "kmes", "--nocapture"])
-            .env(VARIABLE, dir.path())
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let stdin = child.stdin.take().unwrap();
-        let lines = BufReader::new(child.stdout.take().unwrap()).lines();
-        let urls = lines
-            .map_while(Result::ok)
-            .find_map(|line| Some(line.split_once("KMEs: ")?.1.to_owned()))
-            .expect("the child must say where its KMEs are");
-        let urls = urls.split(' ').map(str::to_owned).collect();
-        Self { child, _stdin: stdin, dir, urls }
-    }
-
-    fn client(&self, sae: &str) -> Client {
-        let file = |name: &str| -> PathBuf { Path::new(self.dir.path()).join(name) };
-        Client::builder()
-            .kme_url(&self.urls[usize::from(sae == "sae-b")])
-            .ca_file(file("ca.pem"))
-            .sae_cert_file(file(&format!("{sae}.crt")))
-            .sae_key_file(file(&format!("{sae}.key")))
-            .retry(RetryPolicy::none())
-            .build()
-            .unwrap()
-    }
-}
-
-impl Drop for Kmes {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
+fn client(kmes: &Kmes, sae: &str) -> Client {
+    kmes.simulated(sae).build().unwrap()
 }
 
 /// Bytes in use after each round. The rounds after the warm-up must not need more than it did.
@@ -116,7 +58,7 @@ fn a_client_and_its_slave() {
     let _turn = live::turn();
     let kmes = Kmes::start();
     runtime().block_on(async {
-        let (master, slave) = (kmes.client("sae-a"), kmes.client("sae-b"));
+        let (master, slave) = (client(&kmes, "sae-a"), client(&kmes, "sae-b"));
         no_growth("clients", async || {
             for _ in 0..BATCHES {
                 let drawn = master.enc_keys("sae-b").number(BATCH).size(256).send().await.unwrap();
@@ -135,7 +77,7 @@ fn a_pool_with_a_ledger_that_is_full() {
     let kmes = Kmes::start();
     runtime().block_on(async {
         let held = 2 * BATCH as usize;
-        let pool = KeyPool::builder(kmes.client("sae-a"), "sae-b")
+        let pool = KeyPool::builder(client(&kmes, "sae-a"), "sae-b")
             .size(256)
             .target(held)
             .batch(BATCH)
