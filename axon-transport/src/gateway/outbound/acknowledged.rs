@@ -2,7 +2,7 @@
 //! peer says and however fast.
 
 use std::{
-    collections::{HashMap, HashSet},
+    collections::HashMap,
     sync::{Arc, Mutex},
 };
 
@@ -22,8 +22,8 @@ pub(in crate::gateway) struct Acknowledged {
 
 #[derive(Default)]
 struct Noted {
-    /// Streams whose samples are acknowledged.
-    awaited: HashSet<Key>,
+    /// Streams whose samples are acknowledged, and up to which number they are.
+    awaited: HashMap<Key, u64>,
     /// What the peer said of these and nobody took up.
     due: HashMap<Key, Acknowledgement>,
 }
@@ -51,10 +51,12 @@ impl Acknowledged {
         let first = due.is_empty();
         for ReceivedOf { route, publisher, sequence, dropped } in flows {
             let key = (*route, *publisher);
-            if awaited.contains(&key) {
+            if let Some(last) = awaited.get_mut(&key) {
                 let due = due.entry(key).or_default();
+                // Of samples that this acknowledges, not of those of an entry that it is added to.
+                due.dropped += (*dropped).min(sequence.saturating_sub(*last));
+                *last = (*last).max(*sequence);
                 due.sequence = due.sequence.max(*sequence);
-                due.dropped = due.dropped.saturating_add(*dropped);
             }
         }
         if first && !due.is_empty() {
@@ -64,7 +66,7 @@ impl Acknowledged {
 
     /// Acknowledgements of this stream are noted from now on.
     pub(super) fn await_of(self: &Arc<Self>, route: u32, of: Gid) -> Awaited {
-        lock(&self.noted).awaited.insert((route, of));
+        lock(&self.noted).awaited.insert((route, of), 0);
         Awaited { of: (route, of), at: Arc::clone(self) }
     }
 
@@ -117,7 +119,8 @@ mod tests {
         }
         assert!(is_woken() && !is_woken());
         let due = acknowledged.take();
-        let all = Acknowledgement { sequence: 1000, dropped: u64::MAX };
+        // One for each number: what is said again of samples that are acknowledged adds nothing.
+        let all = Acknowledgement { sequence: 1000, dropped: 1000 };
         assert_eq!(due, HashMap::from([((1, Gid([1; 16])), all)]));
 
         acknowledged.note(&[flow(1, 1, 1001, 0)]);
