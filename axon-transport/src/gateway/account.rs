@@ -307,7 +307,7 @@ mod tests {
         let publishers = vec![Gid::default(); 65_536];
         let ready = Message::RouteReady(RouteReady { route: 1, publishers });
         assert_eq!((cost(&received(65_536)), cost(&ready)), (2049, 2049));
-        // So do those that a peer says after each few samples, or of a thousand topics at once.
+        // An honest peer sends one after each few samples, and one of a thousand topics at once.
         assert_eq!((cost(&received(1)), cost(&received(1024))), (1, 33));
 
         let frame = |kind: u8, unpacked: u32| [&[kind][..], &unpacked.to_be_bytes()].concat();

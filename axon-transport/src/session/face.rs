@@ -122,8 +122,8 @@ impl Face {
         }
     }
 
-    /// How many samples of those that it has written do not get where they are to go, where somebody
-    /// waits for that. All below a number that was [handed over](Self::handed_over) before are counted.
+    /// The number of written samples that do not reach their reader, if the publisher waits for readers. All
+    /// samples below a number that was [handed over](Self::handed_over) before are counted.
     pub(crate) fn given_up(&self) -> Option<u64> {
         match self {
             Self::Publisher(publisher) => Some(publisher.given_up()),

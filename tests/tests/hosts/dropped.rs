@@ -121,7 +121,7 @@ fn samples_of_a_route_that_ended_are_counted_by_topic() {
     let mut tries = 0;
     until("some were under way when it ended", || {
         tries += 1;
-        // Of another name, or those that meet may be what is left of the last try.
+        // Each try has a topic of its own: endpoints of the last try may still be in the graph.
         let topic = format!("/ends_{tries}");
         let (publisher, subscription) = across(&hosts, &topic, Qos::default());
         thread::scope(|scope| {

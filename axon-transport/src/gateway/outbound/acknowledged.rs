@@ -1,5 +1,5 @@
-//! What a peer acknowledges, on its way to the outbound task: one entry for each stream, whatever the
-//! peer says and however fast.
+//! The acknowledgements of a peer, on their way to the outbound task: one entry for each stream, however
+//! many messages the peer sends.
 
 use std::{
     collections::HashMap,
@@ -24,7 +24,7 @@ pub(in crate::gateway) struct Acknowledged {
 struct Noted {
     /// Streams whose samples are acknowledged, and up to which number they are.
     awaited: HashMap<Key, u64>,
-    /// What the peer said of these and nobody took up.
+    /// Acknowledgements that the outbound task has not taken up yet.
     due: HashMap<Key, Acknowledgement>,
 }
 

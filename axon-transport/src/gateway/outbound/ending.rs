@@ -127,8 +127,8 @@ impl Active {
         }
     }
 
-    /// Ends all that is sent. How many samples, requests or responses were taken and not written, but for
-    /// samples that are RELIABLE: of these those count that are not acknowledged.
+    /// Ends all streams. Returns how many samples, requests and responses were taken and not written. A
+    /// RELIABLE sample counts until it is acknowledged.
     async fn end(&mut self) -> u64 {
         let mut unsent = 0;
         for (of, feed) in &mut self.feeds {

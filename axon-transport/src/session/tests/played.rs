@@ -105,7 +105,7 @@ impl Taker {
 
 /// The reader elsewhere that a relay stands for.
 const ELSEWHERE: Gid = Gid([5; 16]);
-/// Some of these are all that a publisher keeps.
+/// A publisher keeps only a few samples of this length.
 const LARGE_SAMPLE: &[u8] = &[7; 1 << 19];
 
 /// A publisher that is matched with [`ELSEWHERE`] alone, through a relay.
