@@ -7,14 +7,58 @@ use axon_transport::{
     ids::{DaemonId, Gid},
     owner::SessionKey,
     qos::Qos,
-    session::EndpointSpec,
+    session::{EndpointSpec, Subscription},
 };
 
 use super::{
     greedy::Camera,
     hoard::{TOPIC, TYPE, published},
     process::{PATIENCE, until},
+    stranger::Met,
 };
+
+/// A subscription to the peer's topic, here.
+fn subscription(camera: &Camera) -> Subscription {
+    let spec = EndpointSpec::new(TOPIC, TYPE, Qos::keep_all());
+    camera.a.session("reader").create_subscription(spec).unwrap()
+}
+
+/// The data stream of a publisher that the peer announced.
+struct Lies {
+    publisher: Gid,
+    bytes: Vec<u8>,
+}
+
+impl Lies {
+    /// The peer's link, and the head of its stream.
+    fn new(camera: &Camera) -> (Met, Self) {
+        let (mut link, key) = (camera.link(0xff), SessionKey::generate().unwrap());
+        camera.stranger.prove(&mut link, DaemonId([0xff; 16]), &[&key]);
+        let publisher = Gid::new(key.id(), 1);
+        let route = published(camera, &mut link, publisher);
+        let mut bytes = vec![1, 0, 0, 0];
+        bytes.extend_from_slice(&route.to_be_bytes());
+        bytes.extend_from_slice(&publisher.0);
+        (link, Self { publisher, bytes })
+    }
+
+    /// Adds a sample that is said to have `length` bytes.
+    fn add(&mut self, sequence: u64, compressed: bool, length: u32, payload: &[u8]) {
+        let header = Header {
+            gid: self.publisher.0,
+            sequence,
+            source_timestamp: 0,
+            request_id: Default::default(),
+            compressed,
+            age_ms: 0,
+            uncompressed_len: length,
+        };
+        let header = header.encode();
+        self.bytes.extend_from_slice(&u32::to_be_bytes((header.len() + payload.len()) as u32));
+        self.bytes.extend_from_slice(&header);
+        self.bytes.extend_from_slice(payload);
+    }
+}
 
 /// `length` zeros in a zstd frame of RLE blocks, four bytes for each 128 KiB.
 fn zeros(length: u32) -> Vec<u8> {
@@ -37,16 +81,8 @@ fn samples_that_are_far_longer_than_what_comes_of_them_arrive_in_order_and_other
     let mut there = camera.a.subscribe(Sizes::Small);
     let mut stream = camera.b.publish(Sizes::Small, 1, None);
     there.wait_taken(1);
-    let session = camera.a.session("reader");
-    let spec = EndpointSpec::new(TOPIC, TYPE, Qos::keep_all());
-    let subscription = session.create_subscription(spec).unwrap();
-    let (mut link, key) = (camera.link(0xff), SessionKey::generate().unwrap());
-    camera.stranger.prove(&mut link, DaemonId([0xff; 16]), &[&key]);
-    let publisher = Gid::new(key.id(), 1);
-    let route = published(&camera, &mut link, publisher);
-    let mut bytes = vec![1, 0, 0, 0];
-    bytes.extend_from_slice(&route.to_be_bytes());
-    bytes.extend_from_slice(&publisher.0);
+    let subscription = subscription(&camera);
+    let (link, mut lies) = Lies::new(&camera);
     let lengths = |sequence: u64| if sequence.is_multiple_of(3) { 6 } else { LENGTH };
     for sequence in 1..=SAMPLES {
         let length = lengths(sequence);
@@ -54,23 +90,11 @@ fn samples_that_are_far_longer_than_what_comes_of_them_arrive_in_order_and_other
             LENGTH => (true, zeros(length)),
             _ => (false, vec![0; length as usize]),
         };
-        let header = Header {
-            gid: publisher.0,
-            sequence,
-            source_timestamp: 0,
-            request_id: Default::default(),
-            compressed,
-            age_ms: 0,
-            uncompressed_len: length,
-        };
-        let header = header.encode();
-        bytes.extend_from_slice(&u32::to_be_bytes((header.len() + payload.len()) as u32));
-        bytes.extend_from_slice(&header);
-        bytes.extend_from_slice(&payload);
+        lies.add(sequence, compressed, length, &payload);
     }
     let mut data = camera.stranger.open(&link).expect("a stream");
     let before = there.tally().taken;
-    camera.stranger.write_for(&mut data, &bytes, PATIENCE);
+    camera.stranger.write_for(&mut data, &lies.bytes, PATIENCE);
     let mut sample = Vec::new();
     for sequence in 1..=SAMPLES {
         let info = subscription.recv(&mut sample, Some(PATIENCE)).expect("a sample");
@@ -88,34 +112,14 @@ fn samples_that_are_far_longer_than_what_comes_of_them_arrive_in_order_and_other
 #[test]
 fn a_number_that_cannot_be_is_refused_counted_by_topic_and_loses_nothing_else() {
     let camera = Camera::new();
-    let session = camera.a.session("reader");
-    let spec = EndpointSpec::new(TOPIC, TYPE, Qos::keep_all());
-    let subscription = session.create_subscription(spec).unwrap();
-    let (mut link, key) = (camera.link(0xff), SessionKey::generate().unwrap());
-    camera.stranger.prove(&mut link, DaemonId([0xff; 16]), &[&key]);
-    let publisher = Gid::new(key.id(), 1);
-    let route = published(&camera, &mut link, publisher);
-    let mut bytes = vec![1, 0, 0, 0];
-    bytes.extend_from_slice(&route.to_be_bytes());
-    bytes.extend_from_slice(&publisher.0);
+    let subscription = subscription(&camera);
+    let (link, mut lies) = Lies::new(&camera);
     let payload = b"sample";
     for sequence in [u64::MAX, 1, u64::MAX - 1, 1 << 50, 2] {
-        let header = Header {
-            gid: publisher.0,
-            sequence,
-            source_timestamp: 0,
-            request_id: Default::default(),
-            compressed: false,
-            age_ms: 0,
-            uncompressed_len: payload.len() as u32,
-        };
-        let header = header.encode();
-        bytes.extend_from_slice(&u32::to_be_bytes((header.len() + payload.len()) as u32));
-        bytes.extend_from_slice(&header);
-        bytes.extend_from_slice(payload);
+        lies.add(sequence, false, payload.len() as u32, payload);
     }
     let mut stream = camera.stranger.open(&link).expect("a stream");
-    camera.stranger.write_for(&mut stream, &bytes, PATIENCE);
+    camera.stranger.write_for(&mut stream, &lies.bytes, PATIENCE);
     for sequence in 1..=2 {
         let info = subscription.recv(&mut Vec::new(), Some(PATIENCE)).expect("a sample");
         assert_eq!((info.sequence, subscription.lost()), (sequence, 0));

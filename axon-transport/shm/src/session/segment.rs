@@ -212,7 +212,7 @@ impl SessionSegment {
         }
     }
 
-    /// Makes whoever listens look again, and have those look who follow. Async-signal-safe.
+    /// Makes the listening thread, and through it the threads that follow it, look again. Async-signal-safe.
     #[inline]
     pub fn knock(&self) {
         if !self.is_forked() {

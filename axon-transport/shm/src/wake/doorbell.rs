@@ -40,7 +40,7 @@ pub trait Look: Send + Sync {
 
 /// A session of this process, at whose doorbell a thread may sleep.
 pub(crate) trait Knock: Send + Sync {
-    /// Makes whoever listens there look again.
+    /// Makes the thread that listens there look again.
     fn knock(&self);
 }
 
