@@ -62,6 +62,8 @@ pub(super) struct Queue {
 struct Sent {
     samples: VecDeque<Sample>,
     bytes: usize,
+    /// The number of the newest sample that was ever taken.
+    newest: u64,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -205,6 +207,7 @@ impl Queue {
                     return;
                 }
                 let Some(sample) = self.samples.pop_front() else { return };
+                sent.newest = sample.info.sequence;
                 into.push_back(sample.clone());
                 sent.samples.push_back(sample);
                 sent.bytes += size;
@@ -235,19 +238,32 @@ impl Queue {
     }
 
     /// The peer has samples up to this number. How many of them were awaited, and the newest of these.
+    /// Samples that were taken once and wait to be sent again are among them.
     pub(super) fn acknowledge(&mut self, sequence: u64) -> (u64, Option<u64>) {
         let (mut samples, mut newest) = (0, None);
-        while let Some(sent) = &mut self.sent
-            && sent.samples.front().is_some_and(|sample| sample.info.sequence <= sequence)
-            && let Some(sample) = sent.samples.pop_front()
-        {
-            let size = sample.size();
-            sent.bytes -= size;
-            self.bytes -= size;
-            self.give_back(size);
+        while let Some(sample) = self.pop_taken(sequence) {
             (samples, newest) = (samples + 1, Some(sample.info.sequence));
         }
         (samples, newest)
+    }
+
+    /// The oldest sample that was taken and is not acknowledged, unless its number is above `most`.
+    fn pop_taken(&mut self, most: u64) -> Option<Sample> {
+        let sent = self.sent.as_mut()?;
+        let most = most.min(sent.newest);
+        let is_up_to = |sample: &&Sample| sample.info.sequence <= most;
+        if sent.samples.is_empty() {
+            // What was rewound comes first of all.
+            self.samples.front().filter(is_up_to)?;
+            return self.pop();
+        }
+        sent.samples.front().filter(is_up_to)?;
+        let sample = sent.samples.pop_front()?;
+        let size = sample.size();
+        sent.bytes -= size;
+        self.bytes -= size;
+        self.give_back(size);
+        Some(sample)
     }
 
     /// What is not acknowledged is to be sent again, first of all.
@@ -463,7 +479,11 @@ mod tests {
         assert_eq!(taken(&mut queue), [1, 2, 3]);
         assert_eq!((queue.acknowledge(1), offer(&mut queue, 4, 10)), ((1, Some(1)), Ok(0)));
         queue.rewind();
-        assert_eq!(taken(&mut queue), [2, 3, 4]);
+        assert_eq!(queue.acknowledge(2), (1, Some(2)), "the peer had it before the link broke");
+        assert_eq!(taken(&mut queue), [3, 4]);
+        queue.rewind();
+        assert_eq!((queue.acknowledge(u64::MAX), offer(&mut queue, 5, 10)), ((2, Some(4)), Ok(0)));
+        assert_eq!(queue.acknowledge(u64::MAX), (0, None), "the fifth was never sent");
         drop(queue);
         assert!(peer.take(8 * peer.of_queue()), "nothing is left of it");
     }

@@ -7,7 +7,7 @@ use std::{
 
 use axon_envelope::Kind;
 
-use super::{Done, Flow, Moved, Shared, Source, stream::Stream};
+use super::{Flow, Moved, Shared, Source, stream::Stream};
 use crate::{
     gateway::queue::{Offered, Sample},
     ids::Gid,
@@ -79,12 +79,12 @@ impl Feed {
         held as u64 + queued
     }
 
-    /// The peer says that it has samples up to this number, but for so many that it dropped: of those
-    /// that were sent to it, and not more of them.
-    pub(super) fn acknowledge(&mut self, sequence: u64, dropped: u64) -> Option<Done> {
-        let (samples, newest) = self.stream.as_ref()?.acknowledge(sequence);
+    /// The peer acknowledged so many samples that were sent to it.
+    pub(super) fn acknowledge(&mut self, samples: u64) {
         self.acknowledged += samples;
-        Some(Done { sequence: newest?, given_up: dropped.min(samples) })
+        if let Some(stream) = &self.stream {
+            stream.has_room();
+        }
     }
 
     /// What changes when it gets on: samples that were acknowledged, and large parts of one that were

@@ -327,7 +327,7 @@ pub(super) async fn run(
                 order = orders.recv() => match order {
                     Some(order) => {
                         take_up(&mut routes, &shared);
-                        apply(order, &mut routes, &carrier, &mut endings);
+                        apply(order, &mut routes, &shared, &carrier, &mut endings);
                         false
                     }
                     None => true,
@@ -346,7 +346,7 @@ pub(super) async fn run(
         // All that there are: a peer that asks and takes back all the time has none wait.
         take_up(&mut routes, &shared);
         while let Ok(order) = orders.try_recv() {
-            apply(order, &mut routes, &carrier, &mut endings);
+            apply(order, &mut routes, &shared, &carrier, &mut endings);
         }
     }
 }
@@ -376,6 +376,7 @@ async fn rested(again: Option<Instant>) {
 fn apply(
     order: Order,
     routes: &mut HashMap<u32, Active>,
+    shared: &Shared,
     carrier: &watch::Sender<Carrier>,
     endings: &mut Endings,
 ) {
@@ -385,9 +386,11 @@ fn apply(
         }
         Order::End(number) => {
             routes.remove(&number);
+            shared.acknowledged.forget(number);
         }
         Order::GiveUp(number, told) => {
             let given_up = routes.remove(&number).map_or(0, |active| active.give_up());
+            shared.acknowledged.forget(number);
             // An error: the hub is gone.
             let _ = told.send(given_up);
         }
@@ -425,14 +428,13 @@ impl Active {
         }
     }
 
-    /// The peer has samples of a publisher up to this number, but for some that it dropped.
+    /// The peer acknowledged samples of a publisher that were sent to it, and dropped some of them.
     fn acknowledge(&mut self, of: Gid, acknowledged: Acknowledgement) {
-        let Acknowledgement { sequence, dropped } = acknowledged;
-        let done = self.feeds.get_mut(&of).and_then(|feed| feed.acknowledge(sequence, dropped));
-        // Of what was never sent nothing is acknowledged, whatever a peer says.
-        if let Some(done) = done {
-            self.done(of, done);
+        let Acknowledgement { sequence, samples, dropped } = acknowledged;
+        if let Some(feed) = self.feeds.get_mut(&of) {
+            feed.acknowledge(samples);
         }
+        self.done(of, Done { sequence, given_up: dropped });
     }
 
     fn done(&self, of: Gid, Done { sequence, given_up }: Done) {

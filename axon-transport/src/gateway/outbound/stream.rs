@@ -71,7 +71,8 @@ impl Stream {
         let queue = Arc::new(Mutex::new(queue));
         let filled = Arc::new(Notify::new());
         let (moved, left) = (Arc::default(), Arc::default());
-        let awaited = flow.acknowledged.then(|| shared.acknowledged.await_of(flow.number, of));
+        let awaited =
+            flow.acknowledged.then(|| shared.acknowledged.await_of(flow.number, of, &queue));
         let writer = Writer {
             flow,
             of,
@@ -101,12 +102,9 @@ impl Stream {
         offered
     }
 
-    /// The peer has samples up to this number. How many of them were awaited, and the newest of these.
-    pub(super) fn acknowledge(&self, sequence: u64) -> (u64, Option<u64>) {
-        let acknowledged = lock(&self.queue).acknowledge(sequence);
-        // There may be room for more to be under way.
+    /// The peer acknowledged samples: there may be room for more to be under way.
+    pub(super) fn has_room(&self) {
         self.filled.notify_one();
-        acknowledged
     }
 
     /// Bytes that QUIC took over.
