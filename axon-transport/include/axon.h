@@ -1451,7 +1451,8 @@ axon_ret_t axon_session_subscription_wait_matched(struct axon_subscription_t sub
 /**
  * Copies the oldest sample, by source timestamp among all publishers, to where `room` says, and
  * stores what is known of it at `info`, which may be null. `taken` is 0 where there was none, and
- * then `room` is not called.
+ * then `room` is not called. A publisher whose sample is in memory that this process has not been told
+ * of yet, such as its first one of more than 4 KiB, holds up none of the others.
  *
  * AXON_RET_BAD_ALLOC: `room` gave none; the sample is gone.
  *

@@ -12,6 +12,9 @@ pub(super) const RING: u64 = 8 << 20;
 /// So much of it stands whatever the lengths of samples do to memory; the bound itself is the product's.
 const SURE: u64 = RING / 2;
 
+/// A longer sample may be in memory of its publisher that its readers hear of a little later.
+const COPIED: u64 = 4096;
+
 /// A node or an endpoint as the model has it.
 pub(super) struct Modelled {
     pub(super) gid: String,
@@ -50,7 +53,8 @@ struct Met {
 #[derive(Clone, Debug)]
 pub(super) struct Owed {
     pub(super) sample: Sample,
-    /// Bytes that its publisher had published before it.
+    /// The process of its publisher, and the bytes that it had published before it.
+    pub(super) process: usize,
     pub(super) behind: u64,
     /// Whether it is too old to be delivered.
     pub(super) expired: bool,
@@ -234,6 +238,27 @@ impl Modelled {
         self.told = losses.total;
     }
 
+    /// Of one publisher samples come by number, of several by time. But nobody waits for memory of a
+    /// publisher that this process has not heard of yet.
+    fn assert_order(&self, taken: &[&Sample], due: &[&Owed]) {
+        let late = |owed: &&&Owed| owed.process != self.process && owed.sample.len > COPIED;
+        let late: BTreeSet<_> =
+            due.iter().filter(late).map(|owed| &owed.sample.publisher).collect();
+        let mut newest = i64::MIN;
+        let mut numbers: BTreeMap<&String, u64> = BTreeMap::new();
+        for sample in taken {
+            let before = numbers.insert(&sample.publisher, sample.sequence);
+            assert!(before < Some(sample.sequence), "after {before:?}: {sample:?} of {taken:?}");
+            let in_time = sample.stamp >= newest || late.contains(&sample.publisher);
+            assert!(in_time, "after one of {newest}: {sample:?} of {taken:?}");
+            newest = newest.max(sample.stamp);
+        }
+        let mut taken = taken.to_vec();
+        taken.sort_by_key(|sample| sample.stamp);
+        let due: Vec<&Sample> = due.iter().map(|owed| &owed.sample).collect();
+        assert_eq!(taken, due, "what was taken, and what there was to take");
+    }
+
     /// Holds what it took against what it had to. `published` says how many bytes each publisher has
     /// published. How many were lost.
     pub(super) fn take(&mut self, taken: &Taken, published: &BTreeMap<String, u64>) -> u64 {
@@ -248,8 +273,7 @@ impl Modelled {
         let (expired, fresh): (Vec<_>, Vec<_>) = owed.values().partition(|owed| owed.expired);
         let (come, missing): (Vec<_>, Vec<_>) =
             fresh.into_iter().partition(|owed| stamps.contains(&owed.sample.stamp));
-        let come: Vec<&Sample> = come.iter().map(|owed| &owed.sample).collect();
-        assert_eq!(samples, come, "what was taken, and what there was to take");
+        self.assert_order(&samples, &come);
         for lost in &missing {
             assert!(self.what.profile.depth.is_none(), "what is within a depth stands: {lost:?}");
             assert!(!lost.held, "its publisher was to wait for it: {lost:?}");

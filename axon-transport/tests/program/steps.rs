@@ -202,8 +202,8 @@ impl Stage {
 
     fn publish_of(&mut self, id: u64, count: u64, len: u64) -> Published {
         let publisher = &self.model[&id];
-        let (process, behind) = (publisher.process, if publisher.slow { SLOW } else { 0 });
-        let stamp = self.clock + 1 - behind;
+        let (process, slow_by) = (publisher.process, if publisher.slow { SLOW } else { 0 });
+        let stamp = self.clock + 1 - slow_by;
         self.clock += i64::try_from(count).unwrap();
         let published: Published = self.ask(process, &Order::Publish { id, stamp, count, len });
         let mut publisher = self.model.remove(&id).unwrap();
@@ -219,7 +219,8 @@ impl Stage {
                 stamp: stamp + i64::try_from(done).unwrap(),
                 len,
             };
-            let sample = Owed { sample, behind: publisher.bytes, expired, held: false };
+            let behind = publisher.bytes;
+            let sample = Owed { sample, process, behind, expired, held: false };
             publisher.bytes += len;
             publisher.sequence += 1;
             publisher.keep_history(&sample);

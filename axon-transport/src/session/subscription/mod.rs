@@ -86,6 +86,8 @@ impl Subscription {
     /// The oldest sample by source timestamp among all publishers, into `out`, which it replaces.
     /// `None` when there is none.
     ///
+    /// A publisher whose sample is in memory that this process has not been told of yet, such as its
+    /// first one of more than 4 KiB, holds up none of the others: newer samples of theirs come first.
     /// Clocks are taken at their word. Where KEEP_LAST's depth passes samples over, they are those
     /// with the oldest timestamps: a publisher whose clock is ahead has the others' passed over.
     pub fn take(&self, out: &mut Vec<u8>) -> Option<MessageInfo> {
