@@ -203,7 +203,8 @@ pub struct WriterStatus {
     pub published: u64,
     /// Publishes that failed since a KEEP_ALL reader left no room for as long as they could wait.
     pub blocked: u64,
-    /// Publishes that failed for want of memory or descriptors.
+    /// Publishes that failed for want of memory or descriptors, and samples that went for it though they
+    /// were to be kept: for late joiners, or within the depth of a reader.
     pub no_memory: u64,
     /// Publishes that failed since readers or loans keep all of its memory.
     pub pinned: u64,

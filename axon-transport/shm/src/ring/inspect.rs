@@ -25,7 +25,8 @@ pub struct RingCounts {
     pub bytes: u64,
     /// Publishes that failed since a KEEP_ALL reader left no room for as long as they could wait.
     pub blocked: u64,
-    /// Publishes that failed for want of memory.
+    /// Publishes that failed for want of memory, and samples that went for it though they were to be
+    /// kept: for late joiners, or within the depth of a reader.
     pub no_memory: u64,
     /// Publishes that failed since readers or loans keep all memory of the publisher's.
     pub pinned: u64,

@@ -83,6 +83,57 @@ fn memory_comes_and_goes_with_descriptors_and_blocks() {
     assert!(counts(&ours, &writer).bytes < full);
 }
 
+/// More samples than the first segment of a session has room for.
+const MANY: u64 = 2048;
+
+#[test]
+fn what_goes_for_want_of_memory_though_late_joiners_were_to_get_it_is_counted() {
+    let ours = session();
+    let all =
+        Qos { history: History::KeepAll, reliability: Reliability::Reliable, ..Qos::default() };
+    let writer = writer(&ours, transient(all), MAX);
+    headroom::PRETENDED.set(Some(0));
+    for sequence in 1..=MANY {
+        writer.publish(meta(sequence), &pattern(sequence, 8)).unwrap();
+    }
+    let ring = counts(&ours, &writer);
+    let gone = MANY - (ring.standing.1 - ring.standing.0);
+    assert!(gone > 0, "{ring:?}");
+    assert_eq!((ring.blocked, ring.no_memory), (0, gone), "{ring:?}");
+    // The same of blocks, where there is none for another sample.
+    for sequence in ring.standing.1 + 1..=10_000 {
+        writer.publish(meta(sequence), &pattern(sequence, 1000)).unwrap();
+    }
+    let ring = counts(&ours, &writer);
+    assert_eq!(ring.no_memory, 10_000 - (ring.standing.1 - ring.standing.0), "{ring:?}");
+}
+
+#[test]
+fn a_reader_is_not_blamed_where_memory_is_short() {
+    let (ours, theirs) = (session(), session());
+    let all =
+        Qos { history: History::KeepAll, reliability: Reliability::Reliable, ..Qos::default() };
+    let writer = writer(&ours, all, MAX);
+    let mut reader = attach(&writer, &ours, &theirs, all);
+    headroom::PRETENDED.set(Some(0));
+    let mut last = 0;
+    for len in [8, 1000] {
+        let (before, mut taken) = (last, 0);
+        let error = loop {
+            match writer.try_publish(meta(last + 1), &pattern(last + 1, len)) {
+                Ok(_) => last += 1,
+                Err(error) => break error,
+            }
+        };
+        assert!(matches!(error, PublishError::NoMemory { .. }), "{error}");
+        // Nothing is lost: the publisher waited for its reader.
+        while reader.take_sample().unwrap().is_some() {
+            taken += 1;
+        }
+        assert_eq!((taken, reader.lost()), (last - before, 0));
+    }
+}
+
 #[test]
 fn publishes_that_fail_are_counted_by_why() {
     let (ours, theirs) = (session(), session());

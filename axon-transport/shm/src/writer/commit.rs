@@ -219,24 +219,24 @@ impl Writer {
         mut attempt: impl FnMut(&mut State) -> Result<T, Refusal>,
     ) -> Result<T, PublishError> {
         for look in 0u32.. {
-            let laggards = {
+            let (short, laggards) = {
                 let mut state = self.lock();
-                match attempt(&mut state) {
+                let short = match attempt(&mut state) {
                     Ok(done) => return Ok(done),
                     Err(Refusal::Error(error)) => return Err(error),
                     Err(Refusal::Kept(kept)) => {
                         drop(state);
                         return Err(kept.into_error());
                     }
-                    Err(Refusal::Held) => {}
-                }
+                    Err(Refusal::Held { short }) => short,
+                };
                 let State { history, audience, .. } = &mut *state;
-                audience.laggards(history.tail(), history.head())
+                (short, audience.laggards(history.tail(), history.head()))
             };
             let left = patience.left();
             match laggards {
                 Some((reader, _)) if left.is_zero() => {
-                    return Err(PublishError::Blocked { reader });
+                    return Err(short.unwrap_or(PublishError::Blocked { reader }));
                 }
                 Some((_, peers)) => self.await_room(&peers, left),
                 // It moved on between the two looks. One that does so for ever is out for trouble.

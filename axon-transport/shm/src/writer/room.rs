@@ -21,7 +21,10 @@ use crate::{
 /// Why an attempt to publish did not succeed.
 pub(crate) enum Refusal {
     /// A KEEP_ALL reader holds the oldest sample.
-    Held,
+    Held {
+        /// Why there is no room for more than it holds, where that is for want of memory.
+        short: Option<PublishError>,
+    },
     Error(PublishError),
     /// Readers keep what memory there is.
     Kept(Kept),
@@ -58,7 +61,7 @@ impl From<PublishError> for Refusal {
 
 impl From<Held> for Refusal {
     fn from(Held: Held) -> Self {
-        Self::Held
+        Self::Held { short: None }
     }
 }
 
@@ -105,18 +108,24 @@ impl Writer {
             let window = state.audience.window();
             let surplus = floors.retained.saturating_sub(state.history.tail());
             let wanted = window.saturating_add((window / 4).max(4));
+            let mut short = None;
             if surplus == 0 || state.history.capacity() < wanted {
                 // A publish that waits for readers leaves them the time to map what they lack.
                 // Nor does one give up what it keeps for others because of a reader that lacks it.
                 let now = floors.held < u64::MAX || state.audience.keeps_all();
                 let need = if now { Need::Now } else { Need::Mapped };
-                self.grow(state, need);
+                short = self.grow(state, need).err().map(no_memory);
             }
             let history = &mut state.history;
             if history.is_full() && surplus > 0 {
                 history.release_below(history.tail() + surplus.div_ceil(2));
             }
-            history.make_place(|position| position < floors.held)?;
+            let is_lost = history.is_full() && short.is_some();
+            let made = history.make_place(|position| position < floors.held);
+            made.map_err(|Held| Refusal::Held { short })?;
+            if is_lost {
+                self.count_short();
+            }
         }
         if !state.history.has_room_for_descriptor() {
             let floors = state.audience.floors(state.history.head());
@@ -128,15 +137,18 @@ impl Writer {
 
     /// Moves to twice as many descriptors, if they are to be had where they are needed. If not, the
     /// oldest samples go, and the next publish tries again.
-    fn grow(&self, state: &mut State, need: Need) {
+    ///
+    /// # Errors
+    /// There is no memory for them.
+    fn grow(&self, state: &mut State, need: Need) -> Result<(), ShmError> {
         let descriptors = 2 * (state.history.capacity() + 1);
         if descriptors > self.limit {
-            return;
+            return Ok(());
         }
         let audience = &state.audience;
         let bytes = descriptors * layout::DESCRIPTOR;
         let mapped = |number| audience.has_mapped(number);
-        let Ok(Some(array)) = self.session.allocate(bytes, need, mapped) else { return };
+        let Some(array) = self.session.allocate(bytes, need, mapped)? else { return Ok(()) };
         // Only what stands moves, so readers must not take more for standing.
         self.show_tail(state);
         let history = &mut state.history;
@@ -152,6 +164,7 @@ impl Writer {
         if 2 * descriptors <= self.limit {
             self.session.foresee(2 * bytes);
         }
+        Ok(())
     }
 
     /// Copies at most [`COPIED`] bytes in for the next position, which has a descriptor.
@@ -182,8 +195,16 @@ impl Writer {
             }
             match self.block(state, bytes) {
                 Ok(block) => return Ok(block),
-                Err(error) if !state.history.shrink(may_go)? => return Err(error.into()),
-                Err(_) => self.give_blocks_back(state),
+                Err(error) => {
+                    let was_kept = state.history.tail() >= floors.retained;
+                    match state.history.shrink(may_go) {
+                        Ok(false) => return Err(error.into()),
+                        Ok(true) if was_kept => self.count_short(),
+                        Ok(true) => {}
+                        Err(Held) => return Err(Refusal::Held { short: Some(error) }),
+                    }
+                    self.give_blocks_back(state);
+                }
             }
         }
     }

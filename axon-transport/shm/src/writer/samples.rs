@@ -201,8 +201,13 @@ impl Writer {
             let history = &mut state.history;
             if *worthwhile.get_or_insert_with(|| history.would_hold(bytes, short.is_none())) {
                 match history.shrink(may_go) {
-                    Ok(true) => continue,
-                    Err(Held) if short.is_none() => return Err(Refusal::Held),
+                    Ok(true) => {
+                        if short.is_some() {
+                            self.count_short();
+                        }
+                        continue;
+                    }
+                    Err(held) if short.is_none() => return Err(held.into()),
                     Ok(false) | Err(Held) => {}
                 }
             }

@@ -43,6 +43,12 @@ impl Writer {
         self.update(word, |now| now.wrapping_add(1));
     }
 
+    /// A sample that was to be kept went, since there was no memory for more descriptors.
+    #[cold]
+    pub(crate) fn count_short(&self) {
+        self.update(NO_MEMORY, |now| now.wrapping_add(1));
+    }
+
     fn update(&self, word: usize, change: impl FnOnce(u64) -> u64) {
         // Relaxed: the number alone matters, and only this process writes it.
         let word = &self.ring.words()[word];
