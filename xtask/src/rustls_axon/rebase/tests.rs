@@ -147,6 +147,71 @@ fn a_documentation_test_that_moved_is_the_same() {
     assert_ne!(parse(795), suite::parse("test x.rs - a::B (line 795) ... ok\n"));
 }
 
+#[test]
+fn a_failed_test_is_listed_with_its_panic_message() {
+    let output = |message: &str, line: u32| {
+        format!(
+            "running 2 tests\ntest a::b ... FAILED\ntest c ... ok\n\nfailures:\n\n\
+             ---- a::b stdout ----\nsaid by the test\n\n\
+             thread 'a::b' (7) panicked at src/a.rs:{line}:5:\n{message}\n\
+             note: run with `RUST_BACKTRACE=1`\n\n\nfailures:\n    a::b\n\n\
+             test result: FAILED. 1 passed; 1 failed\n"
+        )
+    };
+    let plain = suite::reasons(&output("assertion failed\n  left: 1\n right: 2", 10));
+    let moved = suite::reasons(&output("assertion failed\n  left: 1\n right: 2", 30));
+    assert_eq!(plain, moved, "patches move lines");
+    assert_eq!(
+        suite::failures(&plain, &moved),
+        "\n  failed: a::b\n    assertion failed left: 1 right: 2"
+    );
+
+    let other = suite::reasons(&output("no such key", 10));
+    assert_eq!(
+        suite::failures(&plain, &other),
+        "\n  failed: a::b\n    unpatched: assertion failed left: 1 right: 2\
+         \n    patched:   no such key"
+    );
+    let list = suite::failures(&suite::Reasons::new(), &other);
+    assert!(list.contains("unpatched: did not fail"), "{list}");
+    assert_eq!(suite::failures(&suite::Reasons::new(), &suite::Reasons::new()), "");
+}
+
+#[test]
+fn a_suite_that_did_not_run_to_its_end_is_refused() {
+    let ended = "running 1 test\ntest a ... ok\n\ntest result: ok. 1 passed\n";
+    suite::check_ran(ended, "").unwrap();
+
+    let crashed = format!("{ended}\nrunning 2 tests\ntest b ... ok\n");
+    let error = suite::check_ran(&crashed, "(signal: 11, SIGSEGV)\n").unwrap_err();
+    assert!(error.contains("1 of 2 test programs ended before their last test"), "{error}");
+    assert!(error.contains("SIGSEGV"), "{error}");
+
+    let errors = "   Compiling rustls\nerror[E0432]: unresolved imports `aws_lc_rs::X`\n --> a.rs\n\
+                  error: could not compile `rustls` (lib) due to 1 previous error\n";
+    let error = suite::check_ran("", errors).unwrap_err();
+    assert!(error.contains("E0432") && error.contains("cargo update -p rustls-webpki"), "{error}");
+
+    let error = suite::check_ran("", "error: no matching package named `x` found\n").unwrap_err();
+    assert!(error.contains("no matching package") && !error.contains("cargo update"), "{error}");
+}
+
+#[test]
+fn tracked_files_that_the_checkout_lacks_are_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let (repository, copy) = (dir.path().join("repository"), dir.path().join("copy"));
+    fs::create_dir_all(repository.join("tests")).unwrap();
+    for name in ["Cargo.toml", "tests/vectors.json"] {
+        fs::write(repository.join(name), name).unwrap();
+    }
+    super::super::git(&repository, &["init", "--quiet"]).unwrap();
+    super::super::git(&repository, &["add", "--all"]).unwrap();
+    fs::remove_file(repository.join("tests/vectors.json")).unwrap();
+
+    assert_eq!(suite::copy_tracked(&repository, &copy).unwrap(), ["tests/vectors.json"]);
+    assert_eq!(files(&copy).len(), 1);
+}
+
 /// Every file below `dir`, but what cargo keeps for itself.
 fn files(dir: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = BTreeMap::new();
