@@ -95,7 +95,10 @@ fn a_wrong_argument_has_status_2_too() {
 #[test]
 fn a_standard_error_that_takes_nothing_changes_no_status() {
     let full = || std::fs::OpenOptions::new().write(true).open("/dev/full").expect("Linux has it");
+    // Where no daemon is, whatever else runs on this host.
+    let dir = tempfile::tempdir().expect("temporary directory");
     let mut setting = axon([("AXON_QKD_TYPO", "x")]);
+    setting.env("AXON_RUNTIME_DIR", dir.path());
     assert_eq!(setting.arg("status").stderr(full()).status().expect("runs").code(), Some(2));
     let mut missing = axon([]);
     let file = ["play", "/nowhere/log.mcap"];

@@ -169,7 +169,12 @@ fn a_relayed_process_at_rest_does_not_wake_up() {
 
 #[test]
 fn a_daemon_whose_sessions_rest_does_not_wake_up() {
-    let host = Host::new();
+    // A domain and an address of its own: other daemons of this host link with it, and peers of one that
+    // ended still send to its port.
+    let [.., high, low] = std::process::id().to_be_bytes();
+    let host = Host::new()
+        .with("ROS_DOMAIN_ID", &(173 + low % 27).to_string())
+        .with("AXON_BIND_ADDRS", &format!("127.8.{high}.{low}"));
     let daemon = host.daemon();
     let mut players = ["waits", "callbacks"].map(|part| host.play(part));
     players.iter_mut().for_each(|player| assert_eq!(player.hear(), "rests"));
