@@ -18,6 +18,7 @@ use serde::{Serialize, de::DeserializeOwned};
 
 use super::Result;
 
+const ENDED: &str = "the other process has ended";
 const LARGEST: usize = 4096;
 const MOST_DESCRIPTORS: usize = 4;
 
@@ -50,8 +51,11 @@ impl Channel {
         if !fds.is_empty() && !control.push(SendAncillaryMessage::ScmRights(fds)) {
             return Err("too many descriptors for a packet".into());
         }
-        sendmsg(&self.0, &[IoSlice::new(&bytes)], &mut control, SendFlags::NOSIGNAL)?;
-        Ok(())
+        match sendmsg(&self.0, &[IoSlice::new(&bytes)], &mut control, SendFlags::NOSIGNAL) {
+            Err(Errno::PIPE | Errno::CONNRESET) => Err(ENDED.into()),
+            Err(error) => Err(error.into()),
+            Ok(_) => Ok(()),
+        }
     }
 
     /// Awaits a packet.
@@ -74,11 +78,12 @@ impl Channel {
             let mut into = [IoSliceMut::new(&mut bytes)];
             match recvmsg(&self.0, &mut into, &mut control, RecvFlags::CMSG_CLOEXEC) {
                 Err(Errno::INTR) => {}
+                Err(Errno::CONNRESET) => return Err(ENDED.into()),
                 other => break other?.bytes,
             }
         };
         if got == 0 {
-            return Err("the other process has ended".into());
+            return Err(ENDED.into());
         }
         let mut fds = Vec::new();
         for message in control.drain() {
@@ -99,5 +104,23 @@ impl From<Channel> for OwnedFd {
 impl AsFd for Channel {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.0.as_fd()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn who_tells_or_hears_a_process_that_ended_is_told_so() {
+        let (channel, other) = Channel::pair().unwrap();
+        drop(other);
+        assert_eq!(channel.tell(&"go on").unwrap_err().to_string(), ENDED);
+        assert_eq!(channel.hear::<String>().unwrap_err().to_string(), ENDED);
+        // A packet that it had not read.
+        let (channel, other) = Channel::pair().unwrap();
+        channel.tell(&"go on").unwrap();
+        drop(other);
+        assert_eq!(channel.hear::<String>().unwrap_err().to_string(), ENDED);
     }
 }
