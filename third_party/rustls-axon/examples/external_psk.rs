@@ -1,6 +1,6 @@
 //! A client and a server that share a key, over TCP: no certificates.
 //!
-//! `cargo run --example psk`
+//! `cargo run --example external_psk`
 
 use std::error::Error;
 use std::io::{Read, Write};
