@@ -41,7 +41,8 @@ pub enum SessionError {
     /// The program to start was not found.
     #[error(
         "no daemon runs, and none can be started: there is neither axon_daemon nor axon in {}{}; install \
-         it with `cargo install --git {} axon-cli`, or set AXON_DAEMON_PATH to the daemon's program",
+         it with `cargo install --locked --git {} axon-cli`, or set AXON_DAEMON_PATH to the \
+         daemon's program",
         list(tried),
         PassedOver(untrusted),
         // Not from crates.io, where another project owns the name.

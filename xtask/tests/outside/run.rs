@@ -80,7 +80,7 @@ fn the_readme_of_etsi_qkd014_does_what_it_says() {
     assert_ne!(programs.len(), 0);
     let commands = Readme::of("etsi-qkd014").commands;
     let told = |line: &str| assert!(commands.iter().any(|one| one == line), "{line}: {commands:?}");
-    told("cargo install etsi-qkd014 --features sim");
+    told("cargo install --locked etsi-qkd014 --features sim");
     told("kme-sim init certs");
     told("kme-sim run certs");
 
@@ -142,7 +142,7 @@ fn the_readme_of_axon_shm_does_what_it_says() {
 #[test]
 #[ignore = "builds all that axon-transport and axon-cli depend on"]
 fn the_readmes_of_axon_transport_and_axon_cli_do_what_they_say() {
-    let install = format!("cargo install --git {} axon-cli", env!("CARGO_PKG_REPOSITORY"));
+    let install = format!("cargo install --locked --git {} axon-cli", env!("CARGO_PKG_REPOSITORY"));
     for readme in ["axon-transport", "axon-cli"].map(Readme::of) {
         assert!(readme.commands.contains(&install), "{install}: {:?}", readme.commands);
     }
