@@ -30,7 +30,10 @@ pub enum SessionError {
     #[error("what is waited for belongs to a session that is closed or led by an event loop")]
     OtherSession,
     /// `AXON_DAEMON=require`, and there is none.
-    #[error("no daemon listens at {address}: start `axon_daemon`, or set AXON_DAEMON=spawn")]
+    #[error(
+        "no daemon listens at {address}: a session starts one unless AXON_DAEMON is require or off; \
+         `axon daemon` and `axon_daemon` start one by hand"
+    )]
     NoDaemon {
         /// Where it was looked for.
         address: String,
