@@ -152,13 +152,22 @@ impl Used {
 
     fn fails(&mut self, why: String) {
         if self.trouble.is_none() {
-            tracing::warn!(
-                "the record of used KME keys cannot be kept: {why}. Should the KME give a key again \
-                 after this daemon was restarted, that is not noticed. Repair it, or move the file \
-                 away, and restart the daemon; `axon status` shows how it stands"
-            );
+            tracing::warn!("{}", self.complaint(&why));
         }
         self.trouble = Some(why);
+    }
+
+    /// The log line for a record that cannot be kept, with its remedy.
+    fn complaint(&self, why: &str) -> String {
+        let remedy = match self.path {
+            Some(_) => "Repair it, or move the file away",
+            None => "Set AXON_RUNTIME_DIR to a directory of this user",
+        };
+        format!(
+            "the record of used KME keys cannot be kept: {why}. If the KME gives a key again after this \
+             daemon was restarted, the daemon does not notice. {remedy}, and restart the daemon; \
+             `axon status` shows the state of the record"
+        )
     }
 }
 
@@ -170,6 +179,16 @@ mod tests {
 
     fn ids(names: &[&str]) -> Vec<String> {
         names.iter().map(|name| (*name).to_owned()).collect()
+    }
+
+    #[test]
+    fn without_a_directory_the_log_names_the_setting_and_no_file() {
+        let says = |used: &UsedKeys| used.used().complaint("why");
+        let none = says(&UsedKeys::open(None, 0));
+        assert!(none.contains("Set AXON_RUNTIME_DIR") && !none.contains("file"), "{none}");
+        let dir = tempfile::tempdir().unwrap();
+        let some = says(&UsedKeys::open(Some(dir.path()), 0));
+        assert!(some.contains("move the file away") && !some.contains("Set"), "{some}");
     }
 
     #[test]
