@@ -18,8 +18,8 @@ Start here:
   axon trust keygen host.key    a key for this host, for peers to pin
   axon bench shm                what shared memory costs on this machine
 
-Settings come from the environment (AXON_SECURITY_MODE, AXON_DAEMON_PEERS, ...) and from the file
-that AXON_CONFIG names; docs/configuration.md lists them. The first session on a host starts the
+Settings come from the environment (AXON_SECURITY_MODE, AXON_DAEMON_PEERS, ...) and from the file \
+that AXON_CONFIG names; docs/configuration.md lists them. The first session on a host starts the \
 daemon; it ends by itself when the last session has been gone for a while.
 
 Exit status:
@@ -76,8 +76,8 @@ pub(crate) enum Command {
 }
 
 const DEMO_HELP: &str = "\
-Starts two KMEs (ETSI GS QKD 014 over mutual TLS, certificates made on the spot) and two hosts, each
-with a daemon, a runtime directory, a KME and an SAE identity of its own, on 127.0.0.1 and 127.0.0.2.
+Starts two KMEs (ETSI GS QKD 014 over mutual TLS, certificates made on the spot) and two hosts, each \
+with a daemon, a runtime directory, a KME and an SAE identity of its own, on 127.0.0.1 and 127.0.0.2. \
 A log that a robot recorded goes from host A to a subscriber on host A and one on host B:
 
   shared memory          between processes of one host
@@ -85,7 +85,7 @@ A log that a robot recorded goes from host A to a subscriber on host A and one o
   QUIC qkd/session       TLS 1.3 on a pre-shared key from the KMEs
   QUIC qkd/messages10    the same, and every message in an envelope under a KME key of its own ten
 
-Each message is compared byte for byte with the log. Then peers that must not get in try to. Settings
+Each message is compared byte for byte with the log. Then peers that must not get in try to. Settings \
 in the environment do not reach the demo's hosts (AXON_LOG does). Everything is removed at the end.
 
 Examples:
@@ -94,7 +94,7 @@ Examples:
   axon demo --file camera.mcap --rate 1
   axon demo --kme-env sae-1.env --kme-env sae-2.env --rate 10
 
-With --kme-env the keys come from KMEs that run already: the first FILE says which SAE host A is, the
+With --kme-env the keys come from KMEs that run already: the first FILE says which SAE host A is, the \
 second host B, as kme-sim init prints it. docs/qukaydee.md does so with KMEs in the cloud.
 
 Exit status: 0 only when nothing was lost, all compared equal and every wrong peer was refused.";
@@ -120,13 +120,13 @@ pub(crate) struct Demo {
 }
 
 const PLAY_HELP: &str = "\
-Each topic is published under the name and type in the log, at the pace of the recording. With
---qos keep-all, the default, a full reader that keeps all as well slows the replay and nothing is
-lost; the other profiles never wait. At the end it waits for other hosts to acknowledge what they got,
-prints how many messages are acknowledged, and fails where some are not: after 15 s in which no more
+Each topic is published under the name and type in the log, at the pace of the recording. With \
+--qos keep-all, the default, a full reader that keeps all as well slows the replay and nothing is \
+lost; the other profiles never wait. At the end it waits for other hosts to acknowledge what they got, \
+prints how many messages are acknowledged, and fails where some are not: after 15 s in which no more \
 were, or when a link or a daemon was lost with them.
 
-A log whose end is missing, or that fails a checksum, is refused; the error says how much of it is
+A log whose end is missing, or that fails a checksum, is refused; the error says how much of it is \
 whole, and --incomplete publishes that.
 
 Examples:
@@ -169,9 +169,9 @@ pub(crate) enum Profile {
 }
 
 const ECHO_HELP: &str = "\
-A line says when the message was published (UTC), its size, and the head of its payload in
-hexadecimal and ASCII. Without --qos the subscription asks for what the publishers offer: RELIABLE
-where all of them do, else BEST_EFFORT, and never slows them. How many messages it missed, if any,
+A line says when the message was published (UTC), its size, and the head of its payload in \
+hexadecimal and ASCII. Without --qos the subscription asks for what the publishers offer: RELIABLE \
+where all of them do, else BEST_EFFORT, and never slows them. How many messages it missed, if any, \
 is said on stderr at the end.
 
 Examples:
@@ -216,8 +216,8 @@ pub(crate) struct Status {
 }
 
 const DAEMON_HELP: &str = "\
-The same as axon_daemon. The first session on a host starts it, so this is for service managers,
-for logs (AXON_LOG=info) and for a host that only relays. Ends on SIGINT or SIGTERM. One that a
+The same as axon_daemon. The first session on a host starts it, so this is for service managers, \
+for logs (AXON_LOG=info) and for a host that only relays. Ends on SIGINT or SIGTERM. One that a \
 session started ends after its grace time without sessions; this one stays.
 
 Examples:
@@ -258,11 +258,11 @@ pub(crate) enum Bench {
 }
 
 const BENCH_NET_HELP: &str = "\
-Two hosts with a daemon each, on this machine's loopback: latency, and streams of a publisher that
-waits for a slow reader (KEEP_ALL) and of one that overtakes it (KEEP_LAST), each beside a stream of
-bare quinn in the same run (written and read 64 KiB at a time, where messages follow each other), with
-the processor time of a message in all processes. With X25519MLKEM768
-(classic) and with keys of two KMEs that are simulated. The rest of the machine should be idle.
+Two hosts with a daemon each, on this machine's loopback: latency, and streams of a publisher that \
+waits for a slow reader (KEEP_ALL) and of one that overtakes it (KEEP_LAST), each beside a stream of \
+bare quinn in the same run (written and read 64 KiB at a time, where messages follow each other), with \
+the processor time of a message in all processes. With X25519MLKEM768 \
+(classic) and with keys of two KMEs that are simulated. The rest of the machine should be idle. \
 About three minutes; --quick takes seconds and is only to see it run. Writes net.json.
 
 Examples:
@@ -288,10 +288,10 @@ pub(crate) struct BenchNet {
 }
 
 const BENCH_SESSION_HELP: &str = "\
-Latency of a publisher and a subscription, and of a service, in the sessions of two processes with a
-daemon of their own, beside bare shared memory in the same run: with a receiver that polls and one
-that waits on a wait set. Then the throughput of the same, and with each figure the processor time of a
-message. The rest of the machine should be idle. Under a minute; --quick takes seconds and is only to
+Latency of a publisher and a subscription, and of a service, in the sessions of two processes with a \
+daemon of their own, beside bare shared memory in the same run: with a receiver that polls and one \
+that waits on a wait set. Then the throughput of the same, and with each figure the processor time of a \
+message. The rest of the machine should be idle. Under a minute; --quick takes seconds and is only to \
 see it run. Writes session.json, with all percentiles.
 
 Examples:
@@ -314,11 +314,11 @@ pub(crate) struct BenchSession {
 }
 
 const BENCH_SHM_HELP: &str = "\
-Latency (p50, p99, p99.9) with a receiver that polls, one that looks for 50 us before it sleeps, and
-one that sleeps between messages that come at 100 Hz and 1 kHz; throughput; and a publish to 1 to 16
-processes that sleep and read every byte. Each stands beside the raw limit of the same run (a spin on a
-shared atomic, epoll and eventfd, a futex, one memcpy, two), with the processor time of a message in all
-processes. The rest of the machine should be idle. About five minutes; --quick takes seconds and is only
+Latency (p50, p99, p99.9) with a receiver that polls, one that looks for 50 us before it sleeps, and \
+one that sleeps between messages that come at 100 Hz and 1 kHz; throughput; and a publish to 1 to 16 \
+processes that sleep and read every byte. Each stands beside the raw limit of the same run (a spin on a \
+shared atomic, epoll and eventfd, a futex, one memcpy, two), with the processor time of a message in all \
+processes. The rest of the machine should be idle. About five minutes; --quick takes seconds and is only \
 to see it run. Writes shm.json, with all percentiles, and shm.svg.
 
 Examples:
@@ -381,6 +381,22 @@ mod tests {
     #[test]
     fn the_command_line_is_consistent() {
         Cli::command().debug_assert();
+    }
+
+    /// The terminal's width decides where a line ends: a break in the text would be one more.
+    fn assert_unbroken(command: &clap::Command) {
+        let text = command.get_after_help().map(ToString::to_string).unwrap_or_default();
+        let is_prose = |line: &str| !line.is_empty() && !line.starts_with(' ');
+        for (line, next) in text.lines().zip(text.lines().skip(1)) {
+            let is_whole = !is_prose(line) || line.ends_with(':') || !is_prose(next);
+            assert!(is_whole, "{}: a paragraph is broken after {line:?}", command.get_name());
+        }
+        command.get_subcommands().for_each(assert_unbroken);
+    }
+
+    #[test]
+    fn help_leaves_line_breaks_to_the_terminal() {
+        assert_unbroken(&Cli::command());
     }
 
     #[test]

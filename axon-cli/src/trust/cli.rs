@@ -31,8 +31,8 @@ pub(crate) enum Trust {
 }
 
 const KEYGEN_HELP: &str = "\
-FILE is created with mode 0600. A file that exists is never overwritten: delete it first if its key
-is not needed any more. The line goes into the trust file of every host that is to link with this
+FILE is created with mode 0600. A file that exists is never overwritten: delete it first if its key \
+is not needed any more. The line goes into the trust file of every host that is to link with this \
 one, by a way on which nobody can exchange it. No setting is read.
 
 Examples:
@@ -73,11 +73,11 @@ impl From<Algorithm> for KeyAlgorithm {
 }
 
 const SCAN_HELP: &str = "\
-Connects to the daemon there, takes the key that it signs the handshake with, and breaks off: no
+Connects to the daemon there, takes the key that it signs the handshake with, and breaks off: no \
 data is sent. Standard output has a line for a trust file, standard error where it is from.
 
-NOTHING IS VERIFIED. Whoever answers in the host's place shows a key of their own. Compare the line
-with what keygen printed on the host before a trust file has it. The daemon there notes a refused
+NOTHING IS VERIFIED. Whoever answers in the host's place shows a key of their own. Compare the line \
+with what keygen printed on the host before a trust file has it. The daemon there notes a refused \
 handshake. No setting is read but ROS_DOMAIN_ID, for the ports to try.
 
 Examples:
@@ -101,7 +101,7 @@ pub(crate) struct Scan {
 }
 
 const LIST_HELP: &str = "\
-\"valid\" says that a link with that key is accepted now, \"expired\" that its last day (UTC) is over.
+\"valid\" says that a link with that key is accepted now, \"expired\" that its last day (UTC) is over. \
 This host's own key is marked where it stands in the file, and printed below the table.
 
 Examples:
