@@ -18,6 +18,7 @@ mod secrets;
 mod seldom;
 pub mod session;
 pub mod text;
+pub mod wire;
 
 pub use axon_shm as shm;
 #[doc(inline)]

@@ -6,10 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use axon_transport::{
-    config::{Config, FileFacts, FileKind, Files, Security},
-    discovery::Terms,
-};
+use axon_transport::{config::{Config, FileFacts, FileKind, Files, Security}, wire::Terms};
 
 /// A file system in which every file exists and is `axon.toml`.
 struct OneFile<'a>(&'a [u8]);

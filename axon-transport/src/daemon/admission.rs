@@ -6,11 +6,8 @@ use axon_shm::internal::{PeerDescriptors, out_of_reach, passed::PassedFd};
 
 use crate::{
     config::{Config, security_settings},
-    session::{
-        connect::SHM,
-        message::{Hello, PROTOCOL, Refused, SessionRole},
-        socket::Peer,
-    },
+    session::{connect::SHM, socket::Peer},
+    wire::session::{Hello, PROTOCOL, Refused, SessionRole},
 };
 
 /// What a daemon compares sessions with.

@@ -18,10 +18,8 @@ use super::{
 };
 use crate::{
     ids::SessionId,
-    session::{
-        message::Message,
-        socket::{self, Received, SocketError},
-    },
+    session::socket::{self, Received, SocketError},
+    wire::session::Message,
 };
 
 /// Packets that may wait for a session whose own are taken: its endpoints may make more of them than

@@ -9,10 +9,8 @@ use zeroize::Zeroize;
 use super::{admission::unshared, conversation::receive, listen::say};
 use crate::{
     owner::{OWNER, SessionKey},
-    session::{
-        message::{Hello, Message, Refused},
-        socket::{Received, SocketError},
-    },
+    session::socket::{Received, SocketError},
+    wire::session::{Hello, Message, Refused},
 };
 
 /// Messages of unknown types that may come before HELLO.

@@ -27,11 +27,9 @@ use crate::{
     ids::{Gid, SessionId},
     owner::SessionKey,
     relay::{Tally, far::Far},
-    session::{
-        message::{Hello, Message, PROTOCOL, Refused, Welcome},
-        socket::{self, Peer},
-    },
+    session::socket::{self, Peer},
     text,
+    wire::session::{Hello, Message, PROTOCOL, Refused, Welcome},
 };
 
 /// How long a connection may take to say HELLO.

@@ -10,7 +10,7 @@ use super::{
 use crate::{
     config::{KeyMode, Security},
     discovery::Wanted,
-    session::message::{PROTOCOL, SessionRole},
+    wire::session::{PROTOCOL, SessionRole},
 };
 
 pub(super) fn status(control: &Control) -> Status {

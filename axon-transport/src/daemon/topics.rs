@@ -24,7 +24,7 @@ use super::{
 use crate::{
     graph::{Endpoint, EndpointKind},
     qos::{History, Qos},
-    session::message::{Attach, EndpointRole},
+    wire::session::{Attach, EndpointRole},
 };
 
 /// Publishers, and readers, of a topic that the status lists.

@@ -1,6 +1,6 @@
 //! Discovery: which daemons are there, and which of them to dial.
 //!
-//! [`beacon`] is the wire format, [`Peers`] the state machine, [`socket`] the shared UDP port, and
+//! [`wire::beacon`](crate::wire::beacon) is the wire format, [`Peers`] the state machine, [`socket`] the shared UDP port, and
 //! [`run`] the task that ties them together. Datagrams from and to QUIC ports pass through whoever
 //! owns the QUIC socket. All of it is unauthenticated: it says whom to try, never whom to trust.
 
@@ -14,26 +14,21 @@ use std::{
 
 use crate::ids::DaemonId;
 
-pub mod beacon;
 mod interfaces;
 mod peers;
 mod run;
 pub mod socket;
 mod standing;
-mod terms;
 #[cfg(test)]
 mod tests;
 mod wanted;
 
+pub use crate::wire::{Difference, Terms};
 pub use interfaces::{Interface, interfaces};
 pub use peers::{Arrival, Local, Output, Peers};
 pub use run::{Event, run};
 pub use standing::Standing;
-pub use terms::{Difference, Terms};
 pub use wanted::Wanted;
-
-/// The protocol versions that this release speaks.
-pub const PROTOCOLS: RangeInclusive<u8> = 1..=1;
 
 /// The UDP ports that daemons of `domain` take their QUIC port from, the first that is free.
 ///

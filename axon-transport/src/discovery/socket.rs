@@ -13,7 +13,8 @@ use socket2::{Domain, InterfaceIndexOrAddress, Protocol, Socket, Type};
 use tokio::net::UdpSocket;
 use tracing::{debug, warn};
 
-use super::{Interface, beacon::LONGEST, shared_group};
+use super::{Interface, shared_group};
+use crate::wire::beacon::LONGEST;
 
 /// Most local addresses that beacons are sent from.
 const MOST_SENDERS: usize = 16;

@@ -8,8 +8,11 @@ use tokio::{
     time::timeout,
 };
 
-use super::{beacon::Datagram, socket::SharedSocket, *};
-use crate::config::{Config, OsFiles};
+use super::{socket::SharedSocket, *};
+use crate::{
+    config::{Config, OsFiles},
+    wire::beacon::Datagram,
+};
 
 /// Long enough that only a defect reaches it.
 const PATIENCE: Duration = Duration::from_secs(30);

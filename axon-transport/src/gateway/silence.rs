@@ -18,7 +18,7 @@ use quinn::Connection;
 use tokio::sync::{mpsc, oneshot};
 
 use super::{endpoint::Endpoints, hub::Event, keyring::lock, socket};
-use crate::{discovery::beacon::Datagram, ids::DaemonId, link::Side};
+use crate::{ids::DaemonId, link::Side, wire::beacon::Datagram};
 
 /// Between two probes.
 const PROBE_EVERY: Duration = Duration::from_millis(250);

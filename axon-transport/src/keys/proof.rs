@@ -7,8 +7,7 @@ use hmac::{Hmac, KeyInit, Mac};
 use sha2::Sha256;
 use zeroize::Zeroizing;
 
-/// Bytes of a proof.
-pub const LEN: usize = 32;
+use crate::wire::keys::PROOF_LEN as LEN;
 
 /// `HMAC-SHA256(HKDF-SHA256(no salt, key, "axon ready"), key_ID || ready)`; `ready` is the
 /// connection's TLS exporter [`READY_EXPORTER`](super::READY_EXPORTER).

@@ -1,10 +1,10 @@
 //! What two daemons must agree on before a link carries anything.
 
-use super::{CloseCode, message::Hello};
+use super::CloseCode;
 use crate::{
     config::{Config, Security},
-    discovery::Terms,
     ids::DaemonId,
+    wire::{Terms, link::Hello},
 };
 
 /// The protocol version of this build; it speaks no other.

@@ -3,8 +3,7 @@
 //! HELLO both ways, in qkd the proof of the client's name, ELECTED by the lower daemon id; graph,
 //! routes, data and ordinary keys only after that (`docs/formats.md`, section 6).
 
-use super::message::Message;
-use crate::keys::KeyMessage;
+use crate::wire::{keys::KeyMessage, link::Message};
 
 /// Which end of the TLS handshake this side is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -19,10 +19,8 @@ use axon_shm::{Meta, Sample};
 
 use crate::{
     ids::Gid,
-    session::{
-        merge::Taken,
-        message::{Credit, Head, Piece},
-    },
+    session::merge::Taken,
+    wire::session::{Credit, Head, Piece},
 };
 
 /// Bytes that a channel may have under way without asking.

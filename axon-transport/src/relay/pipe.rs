@@ -23,9 +23,9 @@ use crate::{
     seldom::Seldom,
     session::{
         Face, Written,
-        message::{Credit, Message},
         socket::{self, Received, SocketError},
     },
+    wire::session::Message,
 };
 
 /// Bytes of control messages that may wait for an end that does not read.

@@ -23,8 +23,8 @@ use rustix::{
     },
 };
 
-use super::{message::PROTOCOL, socket};
-use crate::config::Config;
+use super::socket;
+use crate::{config::Config, wire::session::PROTOCOL};
 
 /// Where the daemon of a user and domain listens.
 #[derive(Clone, Debug)]

@@ -9,7 +9,6 @@ use axon_shm::{
 
 use super::{
     Client, EndpointSpec, Publisher, Server, Session, SessionError, Subscription,
-    message::EndpointRole,
     publisher::PublisherInner,
     rings::{Lanes, Rings},
     state::Outgoing,
@@ -19,6 +18,7 @@ use crate::{
     graph::{Endpoint, EndpointKind, Pairing, pairing},
     ids::Gid,
     qos::Qos,
+    wire::session::EndpointRole,
 };
 
 /// How long a new endpoint waits for those that it is matched with.

@@ -9,8 +9,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::message::Pair;
-use crate::{graph::GraphEntry, ids::Gid};
+use crate::{graph::GraphEntry, ids::Gid, wire::session::Pair};
 
 /// How long an endpoint is held back at most.
 pub(super) const PATIENCE: Duration = Duration::from_secs(1);

@@ -12,13 +12,13 @@ use super::{
     SessionOptions,
     address::{Address, AddressError},
     error::SessionError,
-    message::{Hello, Message, PROTOCOL, SessionRole, Welcome},
     socket::{self, SocketError},
 };
 use crate::{
     config::{Config, DaemonPolicy, DiscoveryRange, security_settings},
     daemon::spawn::{Outcome, spawn},
     ids::SessionId,
+    wire::session::{Hello, Message, PROTOCOL, SessionRole, Welcome},
 };
 
 /// How long a daemon may take to come up and answer.

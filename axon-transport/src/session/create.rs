@@ -2,12 +2,13 @@
 
 use super::{
     Client, EndpointSpec, GuardCondition, Node, Publisher, Server, Session, SessionError,
-    Subscription, message::EndpointRole, state::Outgoing, subscription::SubscriptionInner,
+    Subscription, state::Outgoing, subscription::SubscriptionInner,
 };
 use crate::{
     graph::{Endpoint, EndpointKind},
     ids::Gid,
     qos::Qos,
+    wire::session::EndpointRole,
 };
 
 impl Session {

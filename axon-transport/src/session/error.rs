@@ -4,8 +4,8 @@ use std::{fmt, path::PathBuf};
 
 use axon_shm::ShmError;
 
-use super::{address::AddressError, message::CodecError};
-use crate::config::ConfigError;
+use super::address::AddressError;
+use crate::{config::ConfigError, wire::session::CodecError};
 
 /// Why a session could not be opened or used.
 ///

@@ -3,15 +3,12 @@
 
 use axon_shm::{Meta, PublishError, Sample};
 
-use super::{
-    Client, Publisher, Server, Session, SessionError,
-    message::{EndpointRole, Leaving, Message},
-    state::Outgoing,
-};
+use super::{Client, Publisher, Server, Session, SessionError, state::Outgoing};
 use crate::{
     graph::{Endpoint, EndpointKind},
     ids::Gid,
     qos::Qos,
+    wire::session::{EndpointRole, Leaving, Message},
 };
 
 /// What stands for it here. Of a service it reads, too: a client's is given the responses that go to

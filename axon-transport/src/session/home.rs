@@ -14,7 +14,6 @@ use axon_shm::{
 
 use super::{
     events::Source,
-    message::EndpointRole,
     publisher::PublisherInner,
     state::Shared,
     subscription::{Accept, Numbers, SubscriptionInner},
@@ -22,6 +21,7 @@ use super::{
 use crate::{
     graph::{Endpoint, Pairing, pairing},
     ids::Gid,
+    wire::session::EndpointRole,
 };
 
 impl Shared {

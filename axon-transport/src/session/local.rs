@@ -10,11 +10,12 @@ use std::{
 
 use axon_shm::{ShmError, internal::passed::PassedFd};
 
-use super::{message::Message, state::Shared};
+use super::state::Shared;
 use crate::{
     daemon::registry::Registry,
     graph::Endpoint,
     ids::{DaemonId, Gid, SessionId},
+    wire::session::Message,
 };
 
 /// Brings the sessions of one process together.

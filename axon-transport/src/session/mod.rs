@@ -20,7 +20,6 @@ mod guard;
 mod home;
 pub(crate) mod local;
 pub(crate) mod merge;
-pub mod message;
 mod node;
 mod open;
 mod options;
@@ -43,13 +42,13 @@ use std::{
     time::Duration,
 };
 
+pub use crate::wire::session::SessionRole;
 use axon_shm::internal::SessionSegment;
 pub use callback::OnNew;
 pub use error::SessionError;
 pub use events::Event;
 pub(crate) use face::{Face, Written};
 pub use guard::GuardCondition;
-pub use message::SessionRole;
 pub use node::Node;
 pub use options::{DaemonCommand, EndpointSpec, SessionOptions};
 pub(crate) use publisher::OwnedLoan;

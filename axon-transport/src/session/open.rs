@@ -12,7 +12,6 @@ use super::{
     connect::Caller,
     control::{Control, Start},
     local::House,
-    message::SessionRole,
     state::Shared,
 };
 use crate::{
@@ -20,6 +19,7 @@ use crate::{
     ids::SessionId,
     owner::SessionKey,
     relay::near::Near,
+    wire::session::SessionRole,
 };
 
 impl Session {

@@ -2,8 +2,7 @@
 
 use std::{ffi::OsString, io, path::PathBuf, sync::Arc};
 
-use super::message::SessionRole;
-use crate::{owner::SessionKey, qos::Qos};
+use crate::{owner::SessionKey, qos::Qos, wire::session::SessionRole};
 
 /// How a session is opened.
 #[derive(Clone, Debug)]

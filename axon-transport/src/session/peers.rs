@@ -23,11 +23,11 @@ use rustix::{
     io::Errno,
 };
 
-use super::{
-    message::{Pair, Segment},
-    state::MemoryNews,
+use super::state::MemoryNews;
+use crate::{
+    ids::{Gid, SessionId},
+    wire::session::{Pair, Segment},
 };
-use crate::ids::{Gid, SessionId};
 
 pub(super) struct Peers {
     own: Arc<SessionSegment>,

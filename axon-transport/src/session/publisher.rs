@@ -16,7 +16,6 @@ use axon_shm::{
 use super::{
     Session, clock,
     events::{Changes, EndpointEvents, Event, Source},
-    message::EndpointRole,
     rings::Rings,
 };
 use crate::{
@@ -24,6 +23,7 @@ use crate::{
     graph::Endpoint,
     ids::Gid,
     qos::{Liveliness, Qos},
+    wire::session::EndpointRole,
 };
 
 /// Sends the samples of a topic. Thread-safe. When it is dropped, readers still take what it left.

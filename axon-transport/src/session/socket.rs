@@ -15,7 +15,7 @@ use rustix::{
     process::{Pid, PidfdFlags, pidfd_open},
 };
 
-use super::message::{CodecError, MAX_DESCRIPTORS, MAX_PACKET, Message};
+use crate::wire::session::{CodecError, MAX_DESCRIPTORS, MAX_PACKET, Message};
 
 /// A message that arrived, and what came with it.
 #[derive(Debug)]

@@ -21,7 +21,6 @@ use super::{
     SessionOptions,
     events::{Changes, Source},
     guard::GuardCondition,
-    message::{EndpointRole, Gone, Message, StatusPart},
     publisher::PublisherInner,
     rings::Room,
     subscription::SubscriptionInner,
@@ -30,6 +29,7 @@ use crate::{
     config::Config,
     graph::{Endpoint, GraphEntry, GraphView},
     ids::{DaemonId, Gid, SessionId},
+    wire::session::{EndpointRole, Gone, Message, StatusPart},
 };
 
 /// Something that a session's owner may want to hear of.

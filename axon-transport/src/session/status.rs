@@ -14,13 +14,13 @@ use super::{
     address::Address,
     connect::Caller,
     error::SessionError,
-    message::Message,
     socket::{self, SocketError},
     state::{Outgoing, StatusAnswer, StatusText},
 };
 use crate::{
     config::{Config, DaemonPlace, DaemonPolicy},
     ids::SessionId,
+    wire::session::Message,
 };
 
 /// How long a daemon may take to answer.

@@ -29,10 +29,6 @@ use rustix::{
 };
 
 use super::{
-    message::{
-        Attach, Granted, Graph, Message, PROTOCOL, Pair, Refused, Segment, SegmentOpened, Unmatch,
-        Welcome,
-    },
     socket::{Received, SocketError},
     *,
 };
@@ -41,6 +37,10 @@ use crate::{
     graph::EndpointKind,
     ids::Gid,
     qos::{Durability, Qos},
+    wire::session::{
+        Attach, Granted, Graph, Message, PROTOCOL, Pair, Refused, Segment, SegmentOpened, Unmatch,
+        Welcome,
+    },
 };
 
 /// Only what was lost takes this long.

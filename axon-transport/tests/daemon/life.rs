@@ -6,10 +6,7 @@ use std::{
     process::{Command, Stdio},
 };
 
-use axon_transport::{
-    ids::DaemonId,
-    session::{address::Address, message::Welcome},
-};
+use axon_transport::{ids::DaemonId, session::address::Address, wire::session::Welcome};
 use rustix::process::{Pid, Signal, kill_process_group};
 
 use super::*;

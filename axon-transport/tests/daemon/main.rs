@@ -26,11 +26,10 @@ use axon_transport::{
     qos::Qos,
     session::{
         EndpointSpec, Publisher, Session, SessionError, SessionOptions, Subscription,
-        address::Address,
-        message::{Hello, Message, PROTOCOL, Segment, SegmentOpened, SessionRole},
-        socket,
+        address::Address, socket,
     },
     shm::{PublishError, internal::SessionSegment},
+    wire::session::{Hello, Message, PROTOCOL, Segment, SegmentOpened, SessionRole},
 };
 use rustix::{
     fs::{MemfdFlags, memfd_create},

@@ -4,12 +4,9 @@ use std::{fs, os::unix::process::CommandExt as _, path::Path, process::Command, 
 
 use axon_transport::{
     qos::{Durability, Qos},
-    session::{
-        SessionEvent,
-        message::{Hello, Message, PROTOCOL, SessionRole},
-        socket,
-    },
+    session::{SessionEvent, socket},
     shm::{Context, PublishError, Publisher, PublisherOptions, Subscriber, SubscriberOptions},
+    wire::session::{Hello, Message, PROTOCOL, SessionRole},
 };
 use rustix::process::{Resource, Rlimit, setrlimit};
 

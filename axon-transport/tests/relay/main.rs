@@ -29,13 +29,13 @@ use axon_transport::{
     session::{
         EndpointSpec, Publisher, Session, SessionOptions, Subscription,
         address::Address,
-        message::{
-            Announce, Asserted, Credit, EndpointRole, GivenUp, Head, Hello, Matched, Message,
-            PROTOCOL, Piece, Refused, SessionRole,
-        },
         socket::{self, SocketError},
     },
     shm::PublishError,
+    wire::session::{
+        Announce, Asserted, Credit, EndpointRole, Head, Hello, Matched, Message, PROTOCOL, Piece,
+        Refused, SessionRole,
+    },
 };
 use hostile::{say_to, stop};
 use rustix::process::Signal;

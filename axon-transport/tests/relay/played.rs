@@ -2,7 +2,7 @@
 
 use axon_transport::{
     ids::DaemonId,
-    session::message::{Gone, Graph, GraphItem, Welcome},
+    wire::session::{Gone, Graph, GraphItem, Welcome},
 };
 
 use super::{hostile::hear, *};

@@ -12,11 +12,11 @@ use std::{
 
 use axon_transport::{
     daemon::status::Status,
-    discovery::{
+    ids::DaemonId,
+    wire::{
         Terms,
         beacon::{Beacon, Datagram},
     },
-    ids::DaemonId,
 };
 
 use super::{

@@ -4,7 +4,7 @@ use super::*;
 use crate::{
     graph::EndpointKind,
     qos::Qos,
-    session::message::{
+    wire::session::{
         Announce, Attach, EndpointRole, Gone, Granted, Leaving, Message, Segment, SegmentName,
         SegmentOpened, StatusPart, Unmatch,
     },

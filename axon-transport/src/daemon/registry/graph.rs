@@ -9,7 +9,7 @@ use super::{LocalEndpoint, Registry, output::encode};
 use crate::{
     graph::{Endpoint, LIMITS, RemoteEndpoint},
     ids::{DaemonId, Gid, SessionId},
-    session::message::{EndpointRole, Graph, GraphItem, Message},
+    wire::session::{EndpointRole, Graph, GraphItem, Message},
 };
 
 /// Bytes of endpoints in one packet; leaves room for the rest of the message and one endpoint more.

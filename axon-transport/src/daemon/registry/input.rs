@@ -10,12 +10,11 @@ use super::{
 use crate::{
     graph::{Endpoint, EndpointKind, LIMITS, Scope, writes},
     ids::{Gid, SessionId},
-    relay,
-    session::message::{
+    relay, text,
+    wire::session::{
         Announce, Attach, EndpointRole, GivenUp, Granted, Leaving, Message, Pair, Refused,
         SessionRole, Unmatch,
     },
-    text,
 };
 
 impl<F: Clone> Registry<F> {

@@ -4,7 +4,7 @@ use super::{Asked, LocalEndpoint, Members, Registry, Topic};
 use crate::{
     graph::{Endpoint, EndpointKind, Pairing, pairing, reads, writes},
     ids::{Gid, SessionId},
-    session::message::{EndpointRole, Message, Pair, Unmatch},
+    wire::session::{EndpointRole, Message, Pair, Unmatch},
 };
 
 impl<F: Clone> Registry<F> {

@@ -30,7 +30,7 @@ use crate::{
     graph::{Endpoint, RemoteEndpoint, Scope},
     ids::{DaemonId, Gid, SessionId},
     relay::Tally,
-    session::message::{Attach, EndpointRole, Granted, Pair, Segment, SessionRole},
+    wire::session::{Attach, EndpointRole, Granted, Pair, Segment, SessionRole},
 };
 
 /// Packets that may wait for one session before it is told everything anew instead.

@@ -9,7 +9,7 @@ use super::{MAX_QUEUE, MAX_QUEUE_BYTES, Registry, STATUS_SLICE, SessionEntry};
 use crate::{
     graph::Scope,
     ids::SessionId,
-    session::message::{Graph, Message, SessionRole, StatusPart},
+    wire::session::{Graph, Message, SessionRole, StatusPart},
 };
 
 /// Pairs of which a session is told at a time, and the rest of those of one endpoint.

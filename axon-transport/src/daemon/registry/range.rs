@@ -15,7 +15,7 @@ use crate::{
         Endpoint, OutOfRange, Pairing, Reach, RemoteEndpoint, Scope, Toward, out_of_range, pairing,
     },
     ids::{DaemonId, Gid, SessionId},
-    session::message::{EndpointRole, GraphItem, Pair, SessionRole},
+    wire::session::{EndpointRole, GraphItem, Pair, SessionRole},
 };
 
 /// Which parts of the graph a session is shown. Sessions of one view are told the same.

@@ -7,7 +7,7 @@
 use super::{MAX_SEGMENTS, Registry, SessionSegment, Violation};
 use crate::{
     ids::{Gid, SessionId},
-    session::message::{MAX_DESCRIPTORS, Message, Refused, Segment, SegmentName, SegmentOpened},
+    wire::session::{MAX_DESCRIPTORS, Message, Refused, Segment, SegmentName, SegmentOpened},
 };
 
 impl<F: Clone> Registry<F> {

@@ -11,11 +11,8 @@ use rand::RngExt;
 use super::{Output, Peers, record::Record};
 use crate::{
     config::DiscoveryRange,
-    discovery::{
-        PROTOCOLS,
-        beacon::{Beacon, Datagram},
-        quic_ports,
-    },
+    discovery::quic_ports,
+    wire::beacon::{Beacon, Datagram, PROTOCOLS},
 };
 
 /// The first beacons, when all is new.

@@ -84,7 +84,7 @@ impl Here {
             addresses.clone_from(&self.bind);
         }
         addresses.sort_by_key(IpAddr::is_ipv6);
-        addresses.truncate(crate::discovery::beacon::MOST_ADDRESSES);
+        addresses.truncate(crate::wire::beacon::MOST_ADDRESSES);
         addresses
     }
 }

@@ -4,7 +4,7 @@ use super::{
     tests::{HIGHER, LOWER, OWN, beacon, from, local, secs, settled},
     *,
 };
-use crate::discovery::beacon::{Beacon, Datagram};
+use crate::wire::beacon::{Beacon, Datagram};
 
 /// When the honest host starts; the forger began before it.
 const STARTS: u64 = 1_000;

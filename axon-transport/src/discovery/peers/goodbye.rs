@@ -4,7 +4,7 @@ use super::{
     tests::{HIGHER, LOWER, actions, beacon, dials, fail, from, hear, local, secs, settled},
     *,
 };
-use crate::discovery::beacon::{Beacon, Datagram};
+use crate::wire::beacon::{Beacon, Datagram};
 
 #[test]
 fn a_goodbye_counts_once_the_link_is_down_and_only_from_where_the_peer_is() {

@@ -4,8 +4,8 @@ use std::net::IpAddr;
 
 use crate::{
     config::{Config, DiscoveryRange, QkdPeers, Security},
-    discovery::Terms,
     ids::DaemonId,
+    wire::Terms,
 };
 
 /// This daemon, as others are to see it and as it judges others.

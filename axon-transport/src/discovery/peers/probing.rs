@@ -13,8 +13,9 @@ use rand::RngExt;
 
 use super::{Peers, record::Source};
 use crate::{
-    discovery::{Standing, beacon::Datagram, quic_ports},
+    discovery::{Standing, quic_ports},
     ids::DaemonId,
+    wire::beacon::Datagram,
 };
 
 /// Most probes whose answer is awaited.

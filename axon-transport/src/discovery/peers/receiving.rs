@@ -8,12 +8,12 @@ use tracing::{debug, info};
 use super::{Arrival, Peers, record::Source};
 use crate::{
     config::DiscoveryRange,
-    discovery::{
-        Action, Mismatch, PROTOCOLS,
-        beacon::{Beacon, Datagram, Foreign},
-        terms::Difference,
-    },
+    discovery::{Action, Mismatch},
     ids::DaemonId,
+    wire::{
+        Difference,
+        beacon::{Beacon, Datagram, Foreign, PROTOCOLS},
+    },
 };
 
 /// A peer is answered at most this often.

@@ -9,10 +9,7 @@ use std::{
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
 use super::*;
-use crate::{
-    config::QkdPeers,
-    discovery::{Terms, quic_ports},
-};
+use crate::{config::QkdPeers, discovery::quic_ports, wire::Terms};
 
 const CLASSIC: Terms = Terms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(0) };
 const CLASSIC_AES: Terms = Terms { cipher: 1, ..CLASSIC };

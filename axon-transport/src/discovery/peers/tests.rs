@@ -5,8 +5,9 @@ use proptest::{collection::vec, prelude::*};
 use super::*;
 use crate::{
     config::QkdPeers,
-    discovery::{
-        Mismatch, Terms,
+    discovery::Mismatch,
+    wire::{
+        Terms,
         beacon::{Beacon, Datagram, Foreign},
     },
 };

@@ -6,9 +6,9 @@ use std::time::Duration;
 use axon_envelope::{KeyId, KmeKey};
 use etsi_qkd014::pool::{Ask, Core, FailureClass, Ledger, PoolStatus, Settings};
 
-use crate::keys::{
-    message,
-    request::{Answer, FailureKind, Fetched, Purpose, Request},
+use crate::{
+    keys::request::{Answer, FailureKind, Fetched, Purpose, Request},
+    wire::keys::announceable,
 };
 
 /// Most keys a call asks for: what a call that is cut off can lose.
@@ -142,7 +142,7 @@ impl Pool {
     /// # Errors
     /// Why not.
     pub(super) fn admit(&self, key_id: &KeyId) -> Result<(), String> {
-        let text = message::announceable(key_id)
+        let text = announceable(key_id)
             .ok_or_else(|| format!("key_ID {key_id} is no text of at most 128 bytes"))?;
         match self.seen.record([text]).as_deref() {
             Ok([true]) => Ok(()),

@@ -18,11 +18,14 @@ use super::{
     disagreement::Disagreements,
     pool::{Fresh, Pool},
 };
-use crate::keys::{
-    Exporters, KeyMessage, Violation,
-    exporters::Exporter,
-    message, proof,
-    request::{Answer, Request},
+use crate::{
+    keys::{
+        Exporters, KeyMessage, Violation,
+        exporters::Exporter,
+        proof,
+        request::{Answer, Request},
+    },
+    wire::keys::MAX_ANNOUNCED,
 };
 
 /// How long an announced key waits for READY or FAILED, over all connections that it is announced
@@ -435,7 +438,7 @@ impl Sender {
         let conn = self.link.as_ref()?.conn;
         let room = MAX_UNRETIRED.saturating_sub(self.announced.len() + self.ready.len());
         let mut key_ids = Vec::new();
-        while key_ids.len() < message::MAX_ANNOUNCED.min(room)
+        while key_ids.len() < MAX_ANNOUNCED.min(room)
             && let Some(Fresh { key_id, key, asked, announced }) = self.pool.take(now)
         {
             let since = announced.unwrap_or(now);

@@ -4,11 +4,14 @@ use std::{sync::Arc, time::Duration};
 
 use axon_envelope::{KeyId, KmeKey};
 
-use crate::keys::{
-    Exporters, KeyMessage,
-    exporters::Exporter,
-    message, proof,
-    request::{Answer, Failure, FailureKind, Fetched, Purpose, Request},
+use crate::{
+    keys::{
+        Exporters, KeyMessage,
+        exporters::Exporter,
+        proof,
+        request::{Answer, Failure, FailureKind, Fetched, Purpose, Request},
+    },
+    wire::keys::announceable,
 };
 
 /// How long the whole proof may take at most: four calls of the longest that may be set.
@@ -126,9 +129,7 @@ impl ClientProof {
         let invalid = |text: &str| Failure::new(FailureKind::Invalid, text);
         let failure = match answer.outcome {
             Ok(Fetched::Keys(mut keys)) => match keys.pop() {
-                Some((key_id, key))
-                    if keys.is_empty() && message::announceable(&key_id).is_some() =>
-                {
+                Some((key_id, key)) if keys.is_empty() && announceable(&key_id).is_some() => {
                     self.step = Step::Announce(key_id, key);
                     return;
                 }

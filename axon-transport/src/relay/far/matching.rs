@@ -22,8 +22,8 @@ use crate::{
     session::{
         Face, Subscription,
         merge::{Merge, Taken},
-        message::{GraphItem, Matched, Message},
     },
+    wire::session::{GraphItem, Matched, Message},
 };
 
 /// Partners of a session's endpoints that are gone and whose last samples are kept until it takes them.

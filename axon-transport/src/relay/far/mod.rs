@@ -30,11 +30,10 @@ use crate::{
     seldom::Seldom,
     session::{
         Face, Node, Session, SessionError, SessionOptions, Subscription,
-        message::{
-            Announce, Asserted, EndpointRole, GivenUp, Leaving, Matched, Message, PROTOCOL,
-            Refused, Welcome,
-        },
         socket::{self, SocketError},
+    },
+    wire::session::{
+        Announce, Asserted, EndpointRole, GivenUp, Leaving, Matched, Message, PROTOCOL, Refused, Welcome,
     },
 };
 

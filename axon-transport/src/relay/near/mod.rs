@@ -33,14 +33,9 @@ use crate::{
     graph::{Endpoint, EndpointKind, reads, writes},
     ids::{DaemonId, Gid},
     session::{
-        Session, SessionError, Shared,
-        connect::Connected,
-        local::House,
-        message::{
-            Announce, Asserted, EndpointRole, GivenUp, Gone, Graph, Leaving, Message, Refused,
-        },
-        socket::SocketError,
+        Session, SessionError, Shared, connect::Connected, local::House, socket::SocketError,
     },
+    wire::session::{Announce, Asserted, EndpointRole, GivenUp, Gone, Graph, Leaving, Message, Refused},
 };
 
 /// Carries a session's samples to its daemon and back, until it is dropped.

@@ -11,10 +11,8 @@ use crate::{
     graph::{Endpoint, EndpointKind, Pairing, pairing, reads},
     ids::Gid,
     relay::{MAX_CALLERS, flow::Channel, pipe::End},
-    session::{
-        Face,
-        message::{Matched, Message},
-    },
+    session::Face,
+    wire::session::{Matched, Message},
 };
 
 /// How long a client's requests wait for servers that it counts and that the daemon does not say yet

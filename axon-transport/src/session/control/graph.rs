@@ -12,11 +12,11 @@ use crate::{
     ids::Gid,
     session::{
         events::{Changes, Source},
-        message::{Graph, Pair},
         publisher::PublisherInner,
         state::SessionEvent,
         subscription::SubscriptionInner,
     },
+    wire::session::{Graph, Pair},
 };
 
 impl Control {

@@ -12,14 +12,14 @@ use crate::{
     graph::EndpointKind,
     ids::{Gid, SessionId},
     session::{
-        message::{
-            Attach, GivenUp, Granted, Leaving, MAX_DESCRIPTORS, Message, Pair, Refused, Segment,
-            SegmentName, SegmentOpened, Unmatch,
-        },
         peers::PeerError,
         publisher::PublisherInner,
         state::StatusAnswer,
         subscription::{Accept, Asking, Numbers, SubscriptionInner},
+    },
+    wire::session::{
+        Attach, GivenUp, Granted, Leaving, MAX_DESCRIPTORS, Message, Pair, Refused, Segment,
+        SegmentName, SegmentOpened, Unmatch,
     },
 };
 

@@ -17,9 +17,9 @@ use crate::{
     session::{
         connect::{Caller, Connected},
         error::SessionError,
-        message::{Gone, Message},
         state::{Outgoing, SegmentChange, SessionEvent, StatusAnswer},
     },
+    wire::session::{Gone, Message},
 };
 
 /// Between attempts to find a daemon.

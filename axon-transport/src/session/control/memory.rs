@@ -3,9 +3,9 @@
 use std::time::{Duration, Instant};
 
 use super::Control;
-use crate::session::{
-    message::{Message, SegmentName, SegmentOpened},
-    state::SegmentChange,
+use crate::{
+    session::state::SegmentChange,
+    wire::session::{Message, SegmentName, SegmentOpened},
 };
 
 /// How often the memory of large samples is looked after.

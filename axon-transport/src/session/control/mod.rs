@@ -24,14 +24,17 @@ use super::{
     error::SessionError,
     events::Source,
     local::{House, Local},
-    message::{Announce, EndpointRole, Gone, Message, Pair},
     peers::Peers,
     publisher::PublisherInner,
     socket::{self, SocketError},
     state::{Outgoing, Shared},
     subscription::{Asking, SubscriptionInner},
 };
-use crate::{graph::GraphView, ids::Gid};
+use crate::{
+    graph::GraphView,
+    ids::Gid,
+    wire::session::{Announce, EndpointRole, Gone, Message, Pair},
+};
 
 /// Packets handled before queued ones are sent: neither direction starves the other.
 const BATCH: usize = 64;

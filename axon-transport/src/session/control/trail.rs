@@ -1,7 +1,7 @@
 //! The life of each pair, in the log at `debug`: who granted what to whom, and why it ended. Rare, so
 //! that a test can keep all of it and print the history of a pair that lost something.
 
-use crate::session::message::Pair;
+use crate::wire::session::Pair;
 
 /// What it is logged under.
 const TARGET: &str = "axon_transport::pairs";

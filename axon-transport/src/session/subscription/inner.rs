@@ -17,9 +17,9 @@ use crate::{
         callback::Callback,
         clock,
         events::{Changes, EndpointEvents},
-        message::EndpointRole,
         state::Shared,
     },
+    wire::session::EndpointRole,
 };
 
 /// The reading side of a subscription, client or server, which the session's control thread shares

@@ -24,10 +24,15 @@ use self::{inner::lock, slots::Slots};
 use super::{
     OnNew, Session, SessionError, clock,
     events::{Event, Source},
-    message::{GivenUp, Message, Pair},
     state::Outgoing,
 };
-use crate::{events::EventKind, graph::Endpoint, ids::Gid, qos::Durability};
+use crate::{
+    events::EventKind,
+    graph::Endpoint,
+    ids::Gid,
+    qos::Durability,
+    wire::session::{GivenUp, Message, Pair},
+};
 
 /// Receives the samples of a topic. Thread-safe.
 pub struct Subscription {

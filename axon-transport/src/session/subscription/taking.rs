@@ -9,11 +9,7 @@ use super::{
     inner::SubscriptionInner,
     slots::{Slot, Slots},
 };
-use crate::{
-    graph::Endpoint,
-    ids::Gid,
-    session::{clock, message::EndpointRole},
-};
+use crate::{graph::Endpoint, ids::Gid, session::clock, wire::session::EndpointRole};
 
 /// Samples that one take passes over because they were taken before.
 const REPEATS: usize = 64;

@@ -8,10 +8,8 @@ use axon_shm::{
 use super::*;
 use crate::{
     graph::{Endpoint, EndpointKind},
-    session::{
-        arrivals,
-        message::{GivenUp, GraphItem},
-    },
+    session::arrivals,
+    wire::session::{GivenUp, GraphItem},
 };
 
 /// What is read, and the session that it is of as the reader has it.

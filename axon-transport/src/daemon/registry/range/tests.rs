@@ -6,7 +6,7 @@ use super::*;
 use crate::{
     graph::{Endpoint, EndpointKind},
     qos::Qos,
-    session::message::{Announce, Attach, Granted, Message},
+    wire::session::{Announce, Attach, Granted, Message},
 };
 
 use DiscoveryRange::{Localhost, Off, Subnet};

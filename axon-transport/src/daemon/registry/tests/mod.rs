@@ -12,7 +12,7 @@ use super::*;
 use crate::{
     graph::EndpointKind,
     qos::{Qos, Reliability, compatible},
-    session::message::{
+    wire::session::{
         Announce, Gone, Granted, Message, Segment, SegmentName, SegmentOpened, Unmatch,
     },
 };

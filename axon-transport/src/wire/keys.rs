@@ -4,14 +4,15 @@
 use axon_envelope::{IndexMask, KeyId};
 use minicbor::{Decoder, Encoder, data::Type};
 
-use super::proof;
-
 /// Most key_IDs in one ANNOUNCE.
 pub const MAX_ANNOUNCED: usize = 16;
 /// Longest key_ID on the control stream, in bytes.
 pub const MAX_KEY_ID: usize = 128;
 /// Longest reason in FAILED, in bytes.
 pub const MAX_REASON: usize = 128;
+
+/// Bytes of the proof in READY.
+pub const PROOF_LEN: usize = 32;
 
 const ANNOUNCE: u8 = 16;
 const READY: u8 = 17;
@@ -27,8 +28,8 @@ pub enum KeyMessage {
     Ready {
         /// The key.
         key_id: KeyId,
-        /// [`proof::compute`] of it.
-        proof: [u8; proof::LEN],
+        /// Its proof, see `keys::proof`.
+        proof: [u8; PROOF_LEN],
     },
     /// From a receiver: this one cannot be had.
     Failed {
@@ -213,14 +214,14 @@ struct Fields {
     seen: u8,
     key_ids: Vec<KeyId>,
     key_id: Option<KeyId>,
-    proof: Option<[u8; proof::LEN]>,
+    proof: Option<[u8; PROOF_LEN]>,
     reason: Option<String>,
     used: Option<IndexMask>,
     reliable: Option<IndexMask>,
 }
 
 /// A key_ID's text, if it can be announced at all: text of at most [`MAX_KEY_ID`] bytes.
-pub(super) fn announceable(key_id: &KeyId) -> Option<&str> {
+pub(crate) fn announceable(key_id: &KeyId) -> Option<&str> {
     let fits = key_id.as_bytes().len() <= MAX_KEY_ID;
     std::str::from_utf8(key_id.as_bytes()).ok().filter(|_| fits)
 }

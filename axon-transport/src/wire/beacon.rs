@@ -1,6 +1,6 @@
 //! Discovery datagrams: bytes to values and back (formats, section 5).
 
-use std::net::IpAddr;
+use std::{net::IpAddr, ops::RangeInclusive};
 
 use minicbor::{
     Decode, Decoder, Encode, Encoder,
@@ -9,9 +9,11 @@ use minicbor::{
     encode::{Error as EncodeError, Write},
 };
 
-use super::{PROTOCOLS, Terms};
+use super::Terms;
 use crate::ids::DaemonId;
 
+/// The protocol versions that this release speaks.
+pub const PROTOCOLS: RangeInclusive<u8> = 1..=1;
 /// Longest datagram, in bytes.
 pub const LONGEST: usize = 512;
 /// Most addresses in a beacon.

@@ -2,7 +2,7 @@
 
 use minicbor::{Decode, Encode};
 
-use super::message::Message;
+use super::Message;
 
 /// Largest frame before both HELLOs were checked, in bytes after the length.
 pub const MAX_FRAME_BEFORE_HELLO: usize = 4 * 1024;

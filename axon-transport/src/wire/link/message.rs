@@ -6,9 +6,9 @@ use super::frame::{FrameError, from_map, to_map};
 use crate::{
     graph::{Endpoint, LIMITS},
     ids::{DaemonId, Gid},
-    keys::KeyMessage,
     owner::Proof,
     qos::Qos,
+    wire::keys::KeyMessage,
 };
 
 /// Who a daemon is and how it is set up: the first message in each direction.

@@ -1,0 +1,15 @@
+//! What two daemons tell each other over the control stream of a link (`docs/formats.md`, section 6).
+
+mod close;
+mod frame;
+mod message;
+
+pub use close::CloseCode;
+pub(crate) use frame::is_known;
+pub use frame::{
+    FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, read_length, unpacked_length,
+};
+pub use message::{
+    Asserted, Elected, Graph, GraphResync, Hello, LastSeen, LinkClosed, MAX_PROOFS, Message,
+    Owners, Received, ReceivedOf, RouteReady, RouteRefused, Subscribe, Subscriber, Unsubscribe,
+};
