@@ -4,8 +4,8 @@ use std::{collections::BTreeMap, fmt::Write as _, io::Write as _, process::ExitC
 
 use axon_transport::{
     config::DaemonPlace,
-    daemon::status::{LinkStatus, RelayStatus, SessionStatus, Status, TopicStatus},
     gateway, session,
+    status::{LinkStatus, RelayStatus, SessionStatus, Status, TopicStatus},
 };
 use serde_json::Value;
 
@@ -350,7 +350,7 @@ fn section(out: &mut String, title: &str, none: &str, table: Table) {
 
 #[cfg(test)]
 mod tests {
-    use axon_transport::daemon::status::{
+    use axon_transport::status::{
         DiscoveryStatus, OutOfRangeStatus, ReaderStatus, RefusalStatus, TrafficStatus, WriterStatus,
     };
     use serde_json::json;

@@ -13,10 +13,12 @@ mod heap;
 pub mod keys;
 pub mod link;
 pub mod owner;
+pub mod registry;
 pub mod relay;
 mod secrets;
 mod seldom;
 pub mod session;
+pub mod status;
 pub mod text;
 pub mod wire;
 

@@ -80,7 +80,7 @@ fn child() {
     wait_for_the_end();
 }
 
-fn status(json: &str) -> axon_transport::daemon::status::Status {
+fn status(json: &str) -> axon_transport::status::Status {
     serde_json::from_str(json).unwrap()
 }
 

@@ -14,9 +14,9 @@ use std::{
 };
 
 use axon_transport::{
-    daemon::status::{SessionStatus, Status},
     qos::Qos,
     session::{EndpointSpec, address::Address, socket},
+    status::{SessionStatus, Status},
 };
 use rustix::process::Signal;
 use support::{Host, Player, of_child, say, signal, until_within, wait_for_the_end};

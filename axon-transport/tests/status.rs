@@ -5,10 +5,10 @@
 mod support;
 
 use axon_transport::{
-    daemon::status::{ReaderStatus, TopicStatus},
     qos::{Qos, Reliability},
     session::EndpointSpec,
     shm::PublishError,
+    status::{ReaderStatus, TopicStatus},
 };
 use rustix::process::Signal;
 use support::{Host, PATIENCE, of_child, say, signal, until, wait_for_the_end};

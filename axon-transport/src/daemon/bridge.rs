@@ -13,13 +13,13 @@ use std::{
 
 use tokio::sync::mpsc;
 
-use super::status::LinkStatus;
 use crate::{
     config::Config,
     discovery::Standing,
     graph::RemoteEndpoint,
     ids::{DaemonId, Gid},
     owner::SessionKeys,
+    status::LinkStatus,
 };
 
 /// What either channel holds.

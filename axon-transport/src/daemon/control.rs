@@ -15,8 +15,6 @@ use tokio::sync::{Notify, watch};
 use super::{
     admission::Admission,
     bridge::{OTHER_TOPICS, ToControl},
-    registry::Registry,
-    status::{LinkStatus, RefusalStatus, TrafficStatus, unix_ms},
     turns::Turns,
 };
 use crate::{
@@ -24,8 +22,10 @@ use crate::{
     discovery::Wanted,
     ids::{DaemonId, SessionId},
     owner::SessionKeys,
+    registry::Registry,
     relay::Pool,
     session::address::Address,
+    status::{LinkStatus, RefusalStatus, TrafficStatus, unix_ms},
 };
 
 /// Refusals that are remembered.

@@ -13,11 +13,11 @@ use tokio::{io::unix::AsyncFd, sync::Notify};
 
 use super::{
     control::Control,
-    registry::{MAX_QUEUE, SessionEntry},
     turns::{PART, Turn},
 };
 use crate::{
     ids::SessionId,
+    registry::{MAX_QUEUE, SessionEntry},
     session::socket::{self, Received, SocketError},
     wire::session::Message,
 };

@@ -2,14 +2,11 @@
 
 use std::collections::BTreeMap;
 
-use super::{
-    control::Control,
-    status::{DiscoveryStatus, SessionStatus, Status},
-    topics::topics,
-};
+use super::{control::Control, topics::topics};
 use crate::{
     config::{KeyMode, Security},
     discovery::Wanted,
+    status::{DiscoveryStatus, SessionStatus, Status},
     wire::session::{PROTOCOL, SessionRole},
 };
 
@@ -38,7 +35,7 @@ pub(super) fn status(control: &Control) -> Status {
         range_stated: s.scope.as_ref().is_some_and(|scope| scope.stated),
         static_peers: s.scope.as_ref().map_or_else(Vec::new, |scope| scope.static_peers.clone()),
         lists: s.lists.iter().map(ToString::to_string).collect(),
-        relay: s.relay.as_deref().map(crate::relay::Tally::show),
+        relay: s.relay.as_deref().map(crate::registry::Tally::show),
     });
     Status {
         daemon: control.id.to_string(),

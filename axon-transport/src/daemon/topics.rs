@@ -17,13 +17,11 @@ use axon_shm::internal::{
     passed::PassedFd,
 };
 
-use super::{
-    registry::{LocalEndpoint, Registry, SessionEntry},
-    status::{OutOfRangeStatus, ReaderStatus, TopicStatus, WriterStatus},
-};
 use crate::{
     graph::{Endpoint, EndpointKind},
     qos::{History, Qos},
+    registry::{LocalEndpoint, Registry, SessionEntry},
+    status::{OutOfRangeStatus, ReaderStatus, TopicStatus, WriterStatus},
     wire::session::{Attach, EndpointRole},
 };
 

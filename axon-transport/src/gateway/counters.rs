@@ -129,7 +129,7 @@ impl Counters {
     }
 
     /// Puts the counters into `status`.
-    pub(super) fn fill(&self, status: &mut crate::daemon::status::LinkStatus) {
+    pub(super) fn fill(&self, status: &mut crate::status::LinkStatus) {
         status.samples_in = self.samples_in.load(Ordering::Relaxed);
         status.bytes_in = self.bytes_in.load(Ordering::Relaxed);
         status.samples_out = self.samples_out.load(Ordering::Relaxed);
@@ -164,7 +164,7 @@ fn worst(losses: &[Loss]) -> Option<(&str, String, u64, u64)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{daemon::status::LinkStatus, gateway::played::block_on};
+    use crate::{gateway::played::block_on, status::LinkStatus};
 
     #[test]
     fn a_tally_is_final_once_the_last_task_that_counts_has_ended() {

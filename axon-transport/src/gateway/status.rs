@@ -9,7 +9,7 @@ use axon_tls::{
 use quinn::Connection;
 
 use super::{context::Context, hub::Summary};
-use crate::{daemon::status::LinkStatus, link::Hello};
+use crate::{link::Hello, status::LinkStatus};
 
 /// As whom a peer proved itself.
 #[derive(Clone, Debug)]

@@ -18,10 +18,8 @@ pub mod flow;
 pub(crate) mod near;
 mod news;
 mod pipe;
-mod status;
 
 pub(crate) use flow::Pool;
-pub(crate) use status::Tally;
 
 /// Relayed sessions of one daemon: each costs it two threads and memory of its own.
 pub(crate) const MAX_SESSIONS: usize = 32;
@@ -33,5 +31,3 @@ const MAX_CALLERS: usize = 1024;
 const MAX_MATCHED: usize = 1024;
 /// How long an end that ends waits for what was written before to have gone on.
 const LINGER: Duration = Duration::from_secs(1);
-/// Bytes of the reason for which a session is relayed.
-pub(crate) const MAX_REASON: usize = 200;

@@ -14,12 +14,12 @@ use rustix::{
 };
 
 use super::{
-    Tally,
     flow::{Arrived, Channel, Departing, Incoming, Outgoing, Violation},
     news::News,
 };
 use crate::{
     ids::Gid,
+    registry::Tally,
     seldom::Seldom,
     session::{
         Face, Written,

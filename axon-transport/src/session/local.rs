@@ -12,9 +12,9 @@ use axon_shm::{ShmError, internal::passed::PassedFd};
 
 use super::state::Shared;
 use crate::{
-    daemon::registry::Registry,
     graph::Endpoint,
     ids::{DaemonId, Gid, SessionId},
+    registry::Registry,
     wire::session::Message,
 };
 

@@ -27,7 +27,7 @@ use crate::{
 const ANSWER: Duration = Duration::from_secs(5);
 
 impl Session {
-    /// The daemon's status: the JSON of [`Status`](crate::daemon::status::Status).
+    /// The daemon's status: the JSON of [`Status`](crate::status::Status).
     ///
     /// # Errors
     /// When there is no daemon or it does not answer in time.

@@ -20,7 +20,6 @@ use axon_transport::{
     daemon::{
         self, DaemonOptions, GatewayEntry,
         bridge::{GatewayParts, ToControl},
-        status::Status,
     },
     ids::SessionId,
     qos::Qos,
@@ -29,6 +28,7 @@ use axon_transport::{
         address::Address, socket,
     },
     shm::{PublishError, internal::SessionSegment},
+    status::Status,
     wire::session::{Hello, Message, PROTOCOL, Segment, SegmentOpened, SessionRole},
 };
 use rustix::{

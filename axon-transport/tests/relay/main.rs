@@ -22,7 +22,6 @@ use std::{
 
 use axon_transport::{
     config::{Config, DaemonPolicy, security_settings},
-    daemon::status::{RelayStatus, Status},
     graph::{Endpoint, EndpointKind},
     ids::{Gid, SessionId},
     qos::{Durability, History, Qos, Reliability},
@@ -32,6 +31,7 @@ use axon_transport::{
         socket::{self, SocketError},
     },
     shm::PublishError,
+    status::{RelayStatus, Status},
     wire::session::{
         Announce, Asserted, Credit, EndpointRole, Head, Hello, Matched, Message, PROTOCOL, Piece,
         Refused, SessionRole,

@@ -9,11 +9,11 @@ use std::{
 
 use axon_transport::{
     config::{Config, OsFiles},
-    daemon::status::TrafficStatus,
     graph::{GraphEntry, GraphView},
     ids::Gid,
     qos::{Durability, Qos},
     session::{EndpointSpec, Session, SessionOptions},
+    status::TrafficStatus,
 };
 
 use super::{TOPICS, support};

@@ -15,8 +15,8 @@ use std::{
 
 use axon_transport::{
     config::{Config, ConfigError, DaemonPolicy, OsFiles},
-    daemon::status::Status,
     session::{Session, SessionError, SessionOptions, daemon_status},
+    status::Status,
 };
 
 pub(crate) use kept::Kept;

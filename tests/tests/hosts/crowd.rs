@@ -2,11 +2,11 @@
 
 use axon_tls::identity::{Auth, SigningKey};
 use axon_transport::{
-    daemon::status::LinkStatus,
     ids::{DaemonId, Gid},
     link::{Message, Subscribe, Subscriber, Unsubscribe},
     qos::Qos,
     session::{EndpointSpec, Publisher, Session, Subscription},
+    status::LinkStatus,
 };
 
 use super::{

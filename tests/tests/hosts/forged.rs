@@ -11,8 +11,8 @@ use std::{
 };
 
 use axon_transport::{
-    daemon::status::Status,
     ids::DaemonId,
+    status::Status,
     wire::{
         Terms,
         beacon::{Beacon, Datagram},

@@ -13,8 +13,8 @@ use std::{
 use axon_tests::Sizes;
 use axon_transport::{
     config::{Config, OsFiles},
-    daemon::status::{LinkStatus, Status},
     session::{Session, SessionOptions, daemon_status},
+    status::{LinkStatus, Status},
 };
 use rustix::process::{Pid, Signal, kill_process};
 

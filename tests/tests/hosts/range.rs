@@ -4,10 +4,10 @@
 use axon_tests::Sizes;
 use axon_transport::{
     config::{Config, DaemonPolicy, DiscoveryRange},
-    daemon::status::SessionStatus,
     ids::Gid,
     qos::Qos,
     session::{EndpointSpec, Publisher, Session, SessionOptions, Subscription},
+    status::SessionStatus,
 };
 
 use super::{

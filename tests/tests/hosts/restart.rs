@@ -3,7 +3,7 @@
 use std::fs;
 
 use axon_tests::{Sizes, Tally};
-use axon_transport::daemon::status::Status;
+use axon_transport::status::Status;
 use rustix::process::Signal;
 
 use super::{

@@ -215,7 +215,7 @@ impl Hub {
             sealing: established.sealing,
             elected: None,
             until: None,
-            since_unix_ms: crate::daemon::status::unix_ms(),
+            since_unix_ms: crate::status::unix_ms(),
             unread: account.unread.nothing(),
             account: Arc::clone(&account),
             traffic: Traffic::default(),

@@ -34,11 +34,11 @@ use super::{
 };
 use crate::{
     config::DiscoveryRange,
-    daemon::status::LinkStatus,
     events::Alive,
     graph::{Endpoint, EndpointKind, RemoteEndpoint, Toward},
     ids::{DaemonId, Gid},
     link::{Graph, Message, Received},
+    status::LinkStatus,
 };
 
 /// Routes that a peer may ask for, and that it is asked for.

@@ -7,10 +7,10 @@ use std::{
 
 use super::{MAX_ROUTES, Peer};
 use crate::{
-    daemon::status::LinkStatus,
     gateway::routes::RouteKey,
     link::{Message, RouteRefused},
     seldom::Seldom,
+    status::LinkStatus,
 };
 
 /// Names that status lists.

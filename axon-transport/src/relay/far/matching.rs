@@ -10,10 +10,10 @@ use axon_shm::Sample;
 
 use super::Served;
 use crate::{
-    daemon::registry::parts,
     graph::Endpoint,
     ids::Gid,
     qos::{Durability, History, Qos},
+    registry::parts,
     relay::{
         MAX_MATCHED,
         flow::{Channel, Departing},

@@ -16,7 +16,7 @@ use rustix::io::Errno;
 
 use self::matching::{Source, take};
 use super::{
-    LINGER, MAX_CALLERS, MAX_ENDPOINTS, Pool, Tally,
+    LINGER, MAX_CALLERS, MAX_ENDPOINTS, Pool,
     calls::{self, Calls},
     flow::{Channel, Incoming},
     news::News,
@@ -27,6 +27,7 @@ use crate::{
     events::Alive,
     graph::{Endpoint, EndpointKind, GraphView},
     ids::{Gid, SessionId},
+    registry::Tally,
     seldom::Seldom,
     session::{
         Face, Node, Session, SessionError, SessionOptions, Subscription,

@@ -22,7 +22,7 @@ use axon_shm::{
 
 use self::{relays::Relay, stand_ins::StandIn};
 use super::{
-    Pool, Tally,
+    Pool,
     calls::{self, Calls},
     flow::{Channel, Incoming},
     news::News,
@@ -32,6 +32,7 @@ use crate::{
     events::Alive,
     graph::{Endpoint, EndpointKind, reads, writes},
     ids::{DaemonId, Gid},
+    registry::Tally,
     session::{
         Session, SessionError, Shared, connect::Connected, local::House, socket::SocketError,
     },

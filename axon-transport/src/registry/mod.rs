@@ -12,6 +12,7 @@ mod input;
 mod matching;
 mod output;
 mod range;
+mod relayed;
 mod segments;
 #[cfg(test)]
 mod tests;
@@ -25,11 +26,11 @@ use axon_shm::internal::Location;
 pub(crate) use graph::parts;
 pub use output::Output;
 pub use range::KeptApart;
+pub(crate) use relayed::Tally;
 
 use crate::{
     graph::{Endpoint, RemoteEndpoint, Scope},
     ids::{DaemonId, Gid, SessionId},
-    relay::Tally,
     wire::session::{Attach, EndpointRole, Granted, Pair, Segment, SessionRole},
 };
 

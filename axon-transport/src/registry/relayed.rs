@@ -2,7 +2,10 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use crate::daemon::status::RelayStatus;
+use crate::status::RelayStatus;
+
+/// Bytes of the reason for which a session is relayed.
+pub(super) const MAX_REASON: usize = 200;
 
 /// Counts what crosses a relay's socket.
 #[derive(Debug, Default)]
@@ -18,24 +21,24 @@ pub(crate) struct Tally {
 impl Tally {
     /// Of a session that is relayed for this reason.
     pub(crate) fn new(reason: &str) -> Self {
-        let reason = crate::text::plain(reason, super::MAX_REASON);
+        let reason = crate::text::plain(reason, MAX_REASON);
         Self { reason, ..Self::default() }
     }
 
     // Relaxed throughout: each count stands for itself alone.
 
-    pub(super) fn arrived(&self, bytes: usize) {
+    pub(crate) fn arrived(&self, bytes: usize) {
         self.samples_in.fetch_add(1, Ordering::Relaxed);
         self.bytes_in.fetch_add(bytes as u64, Ordering::Relaxed);
     }
 
-    pub(super) fn departed(&self, bytes: usize) {
+    pub(crate) fn departed(&self, bytes: usize) {
         self.samples_out.fetch_add(1, Ordering::Relaxed);
         self.bytes_out.fetch_add(bytes as u64, Ordering::Relaxed);
     }
 
     /// Samples of the session's publishers that did not get here, or of others' that it did not take.
-    pub(super) fn lost(&self, samples: u64) {
+    pub(crate) fn lost(&self, samples: u64) {
         self.lost.fetch_add(samples, Ordering::Relaxed);
     }
 

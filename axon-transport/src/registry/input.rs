@@ -6,11 +6,12 @@ use super::{
     Asked, LocalEndpoint, MAX_ALL_PAIRS, MAX_PAIRS, MAX_SESSIONS, MAX_TOMBSTONES, Registry,
     SessionEntry, Violation,
     output::{PAIRS_TOGETHER, session_entry},
+    relayed::MAX_REASON,
 };
 use crate::{
     graph::{Endpoint, EndpointKind, LIMITS, Scope, writes},
     ids::{Gid, SessionId},
-    relay, text,
+    text,
     wire::session::{
         Announce, Attach, EndpointRole, GivenUp, Granted, Leaving, Message, Pair, Refused,
         SessionRole, Unmatch,
@@ -365,7 +366,7 @@ impl<F: Clone> Registry<F> {
             return Err(Violation::NotItsOwn(reader));
         }
         let topic = self.endpoints.get(&writer).map_or("", |writer| &writer.endpoint.topic);
-        let reason = text::plain(&reason, relay::MAX_REASON);
+        let reason = text::plain(&reason, MAX_REASON);
         let text = format!(
             "topic {topic:?}: reader {reader} and publisher {writer} do not meet: {reason}. \
              AXON_SHM=off for the process of one of them has samples pass through the daemon"
