@@ -25,7 +25,7 @@ use crate::{
         Face, Written,
         socket::{self, Received, SocketError},
     },
-    wire::session::Message,
+    wire::session::{Credit, Message},
 };
 
 /// Bytes of control messages that may wait for an end that does not read.

@@ -33,8 +33,8 @@ use axon_transport::{
     shm::PublishError,
     status::{RelayStatus, Status},
     wire::session::{
-        Announce, Asserted, Credit, EndpointRole, Head, Hello, Matched, Message, PROTOCOL, Piece,
-        Refused, SessionRole,
+        Announce, Asserted, Credit, EndpointRole, GivenUp, Head, Hello, Matched, Message, PROTOCOL,
+        Piece, Refused, SessionRole,
     },
 };
 use hostile::{say_to, stop};

@@ -3,7 +3,6 @@ use quinn::{Connection, VarInt};
 
 use super::{stream::Stream, *};
 use crate::{
-    daemon::status::LinkStatus,
     gateway::{
         counters::Tally,
         played::{Pair, block_on},
@@ -11,6 +10,7 @@ use crate::{
     },
     link::CloseCode,
     session::MessageInfo,
+    status::LinkStatus,
 };
 
 const OF: Gid = Gid([7; 16]);

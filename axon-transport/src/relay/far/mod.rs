@@ -34,7 +34,8 @@ use crate::{
         socket::{self, SocketError},
     },
     wire::session::{
-        Announce, Asserted, EndpointRole, GivenUp, Leaving, Matched, Message, PROTOCOL, Refused, Welcome,
+        Announce, Asserted, EndpointRole, GivenUp, Leaving, Matched, Message, PROTOCOL, Refused,
+        Welcome,
     },
 };
 

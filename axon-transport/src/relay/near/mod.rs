@@ -36,7 +36,9 @@ use crate::{
     session::{
         Session, SessionError, Shared, connect::Connected, local::House, socket::SocketError,
     },
-    wire::session::{Announce, Asserted, EndpointRole, GivenUp, Gone, Graph, Leaving, Message, Refused},
+    wire::session::{
+        Announce, Asserted, EndpointRole, GivenUp, Gone, Graph, Leaving, Message, Refused,
+    },
 };
 
 /// Carries a session's samples to its daemon and back, until it is dropped.

@@ -3,6 +3,10 @@
 mod close;
 mod frame;
 mod message;
+#[cfg(test)]
+pub(crate) mod samples;
+#[cfg(test)]
+mod tests;
 
 pub use close::CloseCode;
 pub(crate) use frame::is_known;
