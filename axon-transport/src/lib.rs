@@ -14,7 +14,6 @@ pub mod keys;
 pub mod link;
 pub mod owner;
 pub mod registry;
-pub mod relay;
 mod secrets;
 mod seldom;
 pub mod session;

@@ -15,7 +15,10 @@ use std::{
 
 use axon_transport::{
     qos::Qos,
-    session::{EndpointSpec, address::Address, socket},
+    session::{
+        EndpointSpec,
+        daemon::{address::Address, socket},
+    },
     status::{SessionStatus, Status},
 };
 use rustix::process::Signal;

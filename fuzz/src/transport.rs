@@ -1,7 +1,7 @@
 //! Discovery datagrams, frames between daemons, packets between a session and its daemon.
 
 use axon_envelope::{IndexMask, KeyId};
-use axon_transport::{wire::{Terms, beacon::{self, Beacon, Datagram}, session::{self as session, CodecError, MAX_PACKET}}, graph::{Endpoint, EndpointKind}, ids::{DaemonId, Gid, SessionId}, keys::KeyMessage, link::{self, FrameError}, qos::Qos, relay::flow::{Channel, Incoming, Pool, WINDOW}, shm::internal::{Location, reencode_packet}};
+use axon_transport::{wire::{Terms, beacon::{self, Beacon, Datagram}, session::{self as session, CodecError, MAX_PACKET}}, graph::{Endpoint, EndpointKind}, ids::{DaemonId, Gid, SessionId}, keys::KeyMessage, link::{self, FrameError}, qos::Qos, session::relayed::flow::{Channel, Incoming, Pool, WINDOW}, shm::internal::{Location, reencode_packet}};
 
 const TERMS: Terms = Terms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(1) };
 

@@ -11,10 +11,12 @@ use std::path::{Path, PathBuf};
 
 use proc_macro2::{TokenStream, TokenTree};
 use syn::visit::{self, Visit};
-use syn::{Attribute, Item, UseTree};
+use syn::{Attribute, Item, UsePath, UseRename, UseTree};
 
-/// Stands before the table of a crate, with the folder of its sources.
+/// Stands before the table of a crate, with the folder of its sources, and after `; crowded:` the folders in it
+/// that have too many files and are to be parted: a folder that no longer has too many may not stand there.
 const MARK: &str = "<!-- floors: ";
+const CROWDED: &str = "; crowded: ";
 /// More files than that in a folder are more than one room.
 const MOST_FILES: usize = 15;
 
@@ -31,10 +33,10 @@ pub(crate) fn check(root: &Path) -> Result<String, String> {
     }
     let mut lines = Vec::new();
     let mut wrong = Vec::new();
-    for (folder, floors) in houses {
+    for House { folder, floors, crowded } in houses {
         let mut sources = Vec::new();
         read(&root.join(&folder), &root.join(&folder), &mut sources)?;
-        wrong.extend(crowded(&sources));
+        wrong.extend(judge_crowds(&root.join(&folder), &sources, &crowded));
         let imports = imports(sources);
         wrong.extend(judge(&folder, &floors, &imports));
         lines.push(format!(
@@ -49,11 +51,22 @@ pub(crate) fn check(root: &Path) -> Result<String, String> {
 /// The floor of each room, 0 the highest.
 type Floors = BTreeMap<String, usize>;
 
-/// The folders of sources that the page names, and the rooms in the first column of the table below each.
-fn houses(page: &str) -> Result<Vec<(String, Floors)>, String> {
+/// What the page says of a crate.
+struct House {
+    /// Of its sources.
+    folder: String,
+    /// The rooms in the first column of the table.
+    floors: Floors,
+    /// Folders in it that may have too many files.
+    crowded: BTreeSet<PathBuf>,
+}
+
+fn houses(page: &str) -> Result<Vec<House>, String> {
     let mut found = Vec::new();
     for part in page.split(MARK).skip(1) {
-        let (folder, rest) = part.split_once(" -->").ok_or("a mark of floors has no end")?;
+        let (mark, rest) = part.split_once(" -->").ok_or("a mark of floors has no end")?;
+        let (folder, crowded) = mark.split_once(CROWDED).unwrap_or((mark, ""));
+        let crowded = crowded.split_whitespace().map(PathBuf::from).collect();
         let rows = rest
             .lines()
             .skip_while(|line| !line.starts_with('|'))
@@ -68,7 +81,7 @@ fn houses(page: &str) -> Result<Vec<(String, Floors)>, String> {
                 }
             }
         }
-        found.push((folder.to_owned(), floors));
+        found.push(House { folder: folder.to_owned(), floors, crowded });
     }
     Ok(found)
 }
@@ -119,22 +132,29 @@ struct Source {
     file: syn::File,
 }
 
-/// The folders with more files than a newcomer can look over.
-fn crowded(sources: &[Source]) -> Vec<String> {
+/// The folders with more files than a newcomer can look over, and those that are said to have so many and
+/// have not.
+fn judge_crowds(root: &Path, sources: &[Source], crowded: &BTreeSet<PathBuf>) -> Vec<String> {
     let mut files: BTreeMap<&Path, usize> = BTreeMap::new();
     for folder in sources.iter().filter_map(|source| source.path.parent()) {
         *files.entry(folder).or_default() += 1;
     }
-    let crowded = files.into_iter().filter(|(_, count)| *count > MOST_FILES);
-    crowded
-        .map(|(folder, count)| format!("{}: {count} files, more than one room", folder.display()))
-        .collect()
+    files.retain(|_, count| *count > MOST_FILES);
+    let is_said = |folder: &Path| crowded.iter().any(|of| root.join(of) == folder);
+    let unsaid = files.iter().filter(|(folder, _)| !is_said(folder));
+    let unsaid = unsaid
+        .map(|(folder, count)| format!("{}: {count} files, more than one room", folder.display()));
+    let empty = crowded.iter().map(|of| root.join(of)).filter(|of| !files.contains_key(&**of));
+    let empty = empty.map(|of| format!("{}: docs/architecture.md calls it crowded", of.display()));
+    unsaid.chain(empty).collect()
 }
 
 /// All imports between rooms, and from the root, of a crate.
 fn imports(sources: Vec<Source>) -> BTreeSet<Import> {
     let rooms: BTreeSet<String> =
         sources.iter().filter_map(|s| s.module.first()).cloned().collect();
+    let roots = sources.iter().filter(|source| source.module.is_empty());
+    let foreign: BTreeSet<String> = roots.flat_map(|root| root.of_other_crates(&rooms)).collect();
     let tests: Vec<Vec<String>> = sources.iter().flat_map(Source::test_modules).collect();
     let mut found = BTreeSet::new();
     for Source { path, module, file } in sources {
@@ -145,6 +165,9 @@ fn imports(sources: Vec<Source>) -> BTreeSet<Import> {
         let mut paths = Paths { module, found: Vec::new() };
         paths.visit_file(&file);
         for what in paths.found {
+            if what.first().is_some_and(|first| foreign.contains(first)) {
+                continue;
+            }
             let to =
                 what.first().filter(|first| rooms.contains(*first)).cloned().unwrap_or_default();
             if to != from {
@@ -154,6 +177,17 @@ fn imports(sources: Vec<Source>) -> BTreeSet<Import> {
         }
     }
     found
+}
+
+/// The names that a `use` brings.
+fn names_of(tree: &UseTree, names: &mut Vec<String>) {
+    match tree {
+        UseTree::Path(path) => names_of(&path.tree, names),
+        UseTree::Group(group) => group.items.iter().for_each(|tree| names_of(tree, names)),
+        UseTree::Name(name) => names.push(name.ident.to_string()),
+        UseTree::Rename(name) => names.push(name.rename.to_string()),
+        UseTree::Glob(_) => {}
+    }
 }
 
 /// Reads the files below `dir`, but for programs in `bin`.
@@ -176,6 +210,24 @@ fn read(folder: &Path, dir: &Path, sources: &mut Vec<Source>) -> Result<(), Stri
 }
 
 impl Source {
+    /// The names that this root hands out of other crates.
+    fn of_other_crates(&self, rooms: &BTreeSet<String>) -> Vec<String> {
+        let mut names = Vec::new();
+        for item in &self.file.items {
+            let Item::Use(item) = item else { continue };
+            let (UseTree::Path(UsePath { ident, .. }) | UseTree::Rename(UseRename { ident, .. })) =
+                &item.tree
+            else {
+                continue;
+            };
+            let first = ident.to_string();
+            if !rooms.contains(&first) && !["crate", "self", "super"].contains(&&*first) {
+                names_of(&item.tree, &mut names);
+            }
+        }
+        names
+    }
+
     /// The modules in files of their own that this one has for tests only.
     fn test_modules(&self) -> Vec<Vec<String>> {
         let is_test_file = |item: &Item| match item {
@@ -408,6 +460,28 @@ More text with `roof`.
         assert!(wrong(&files).contains("left: 16 files, more than one room"), "{}", wrong(&files));
         files.pop();
         assert_eq!(wrong(&files), "");
+    }
+
+    #[test]
+    fn what_the_root_hands_out_of_another_crate_is_no_room() {
+        let root = "mod roof; mod left; mod right; mod ground; pub use other as named;
+            pub use other::{ids, deep::Stone as Rock}; pub use roof::Top;";
+        let text = "use crate::{ids::Gid, Rock, named::f};";
+        assert_eq!(wrong(&[("lib.rs", root), ("ground.rs", text)]), "");
+        assert!(
+            wrong(&[("lib.rs", root), ("ground.rs", "use crate::Top;")]).contains("from the root")
+        );
+    }
+
+    #[test]
+    fn a_folder_may_be_called_crowded_as_long_as_it_is() {
+        let page = PAGE.replace("src -->", "src; crowded: left -->");
+        let names: Vec<String> = (0..=MOST_FILES).map(|n| format!("left/part{n}.rs")).collect();
+        let mut files: Vec<(&str, &str)> = names.iter().map(|name| (name.as_str(), "")).collect();
+        files.push(("../docs/architecture.md", &page));
+        assert_eq!(wrong(&files), "");
+        files.remove(0);
+        assert!(wrong(&files).contains("left: docs/architecture.md calls it crowded"));
     }
 
     #[test]

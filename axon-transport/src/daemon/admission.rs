@@ -6,7 +6,7 @@ use axon_shm::internal::{PeerDescriptors, out_of_reach, passed::PassedFd};
 
 use crate::{
     config::{Config, security_settings},
-    session::{connect::SHM, socket::Peer},
+    session::daemon::{connect::SHM, socket::Peer},
     wire::session::{Hello, PROTOCOL, Refused, SessionRole},
 };
 

@@ -12,19 +12,15 @@ use std::{
 use axon_shm::internal::{passed::PassedFd, probe};
 use tokio::sync::{Notify, watch};
 
-use super::{
-    admission::Admission,
-    bridge::{OTHER_TOPICS, ToControl},
-    turns::Turns,
-};
+use super::{admission::Admission, turns::Turns};
 use crate::{
     config::Config,
     discovery::Wanted,
+    gateway::bridge::{OTHER_TOPICS, ToControl},
     ids::{DaemonId, SessionId},
     owner::SessionKeys,
     registry::Registry,
-    relay::Pool,
-    session::address::Address,
+    session::{daemon::address::Address, relayed::Pool},
     status::{LinkStatus, RefusalStatus, TrafficStatus, unix_ms},
 };
 

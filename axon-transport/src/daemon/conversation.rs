@@ -18,7 +18,7 @@ use super::{
 use crate::{
     ids::SessionId,
     registry::{MAX_QUEUE, SessionEntry},
-    session::socket::{self, Received, SocketError},
+    session::daemon::socket::{self, Received, SocketError},
     wire::session::Message,
 };
 

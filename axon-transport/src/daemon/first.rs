@@ -9,7 +9,7 @@ use zeroize::Zeroize;
 use super::{admission::unshared, conversation::receive, listen::say};
 use crate::{
     owner::{OWNER, SessionKey},
-    session::socket::{Received, SocketError},
+    session::daemon::socket::{Received, SocketError},
     wire::session::{Hello, Message, Refused},
 };
 

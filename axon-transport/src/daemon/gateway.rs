@@ -19,10 +19,10 @@ use tokio::{
 };
 
 use super::{
-    bridge::{CHANNEL, GatewayParts, ToControl, ToGateway},
     control::Control,
     listen::{Inside, serve},
 };
+use crate::gateway::bridge::{CHANNEL, GatewayParts, ToControl, ToGateway};
 
 /// What runs on the gateway's thread.
 pub type GatewayEntry = fn(GatewayParts) -> Result<(), String>;

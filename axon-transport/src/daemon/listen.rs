@@ -18,16 +18,16 @@ use super::{
     first::{First, first},
     strangers::{Stranger, Strangers},
     turns::Turn,
-    watch::watch,
 };
 use crate::{
     config::Config,
+    daemon::relayed::Far,
+    gateway::watch::watch,
     graph::Scope,
     ids::{Gid, SessionId},
     owner::SessionKey,
     registry::{MAX_OF_PROCESS, SessionEntry, Tally},
-    relay::far::Far,
-    session::socket::{self, Peer},
+    session::daemon::socket::{self, Peer},
     text,
     wire::session::{Hello, Message, PROTOCOL, Refused, Welcome},
 };
@@ -193,10 +193,10 @@ fn relay(control: &Rc<RefCell<Control>>, socket: AsyncFd<PassedFd>, first: First
     let checked = its_own.and_then(|()| state.admission.check(&hello, descriptors, peer, false));
     let checked = match checked {
         Err(refused) => Err(*refused),
-        Ok(_) if state.registry.relayed() >= crate::relay::MAX_SESSIONS => {
+        Ok(_) if state.registry.relayed() >= crate::session::relayed::MAX_SESSIONS => {
             Err(Refused::because(format!(
                 "{} sessions are relayed already; one that shares memory is served",
-                crate::relay::MAX_SESSIONS
+                crate::session::relayed::MAX_SESSIONS
             )))
         }
         Ok(_) => {

@@ -2,25 +2,24 @@
 //! on other hosts.
 //!
 //! The control plane (`registry`, `control`) runs on the calling thread. The gateway to other
-//! hosts runs on a thread and runtime of its own; `bridge` is all they share. Samples between
+//! hosts runs on a thread and runtime of its own; `gateway::bridge` is all they share. Samples between
 //! processes of this host pass neither.
 
 mod admission;
-pub mod bridge;
 mod control;
 mod conversation;
+mod detach;
 mod first;
 mod gateway;
 mod listen;
 pub mod log;
+mod relayed;
 mod remote;
 mod report;
 mod run;
-pub mod spawn;
 mod strangers;
 mod topics;
 mod turns;
-pub(crate) mod watch;
 
 pub use crate::secrets::ErasingHeap;
 pub use gateway::GatewayEntry;

@@ -9,12 +9,12 @@ use tokio::{
 };
 
 use super::{
-    bridge::{CHANNEL, ToControl, ToGateway},
     control::Control,
     gateway::{GatewayEntry, Pause, Running},
 };
 use crate::{
     discovery::{self, Action, Event},
+    gateway::bridge::{CHANNEL, ToControl, ToGateway},
     ids::DaemonId,
 };
 

@@ -17,17 +17,17 @@ use tokio::{
 
 use super::{
     control::Control,
+    detach::{Report, detach, start_detached},
     gateway::GatewayEntry,
     listen::accept,
     log,
     remote::Remote,
-    spawn::{Report, detach, start_detached},
 };
 use crate::{
     config::{Config, ConfigError, security_settings},
     discovery::Event,
     secrets::erase_from_now_on,
-    session::address::{Address, AddressError, private_directory},
+    session::daemon::address::{Address, AddressError, private_directory},
 };
 
 /// Changes of the graph within this time go out together.
@@ -178,7 +178,7 @@ pub fn run(config: Config, mut options: DaemonOptions) -> Result<(), DaemonError
     outcome
 }
 
-type Started = (Control, Vec<OwnedFd>, crate::session::address::Lock);
+type Started = (Control, Vec<OwnedFd>, crate::session::daemon::address::Lock);
 
 /// Everything before the runtime: the socket first, since it is the lock.
 fn start(config: Config, _options: &DaemonOptions) -> Result<Started, DaemonError> {

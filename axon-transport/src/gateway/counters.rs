@@ -12,7 +12,7 @@ use std::{
 use tokio::sync::watch;
 
 use super::keyring::lock;
-use crate::{daemon::bridge::OTHER_TOPICS, text::plain};
+use crate::{gateway::bridge::OTHER_TOPICS, text::plain};
 
 /// Topics of which losses are noted between two looks: as many as routes may cross each way.
 const TOPICS: usize = 2048;

@@ -9,6 +9,7 @@ pub mod attempt;
 
 mod accept;
 mod account;
+pub mod bridge;
 mod check;
 mod context;
 mod control;
@@ -45,6 +46,7 @@ mod socket;
 mod stalls;
 mod stand_in;
 mod status;
+pub(crate) mod watch;
 
 pub use check::check;
 pub use endpoint::EndpointError;

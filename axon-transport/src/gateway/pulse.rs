@@ -12,7 +12,7 @@ use std::{
 use axon_shm::ShmError;
 use tokio::sync::watch;
 
-use crate::{daemon::watch::watch as watch_descriptor, session::Session};
+use crate::{gateway::watch::watch as watch_descriptor, session::Session};
 
 /// Wakes whoever waits for samples in a ring, or for room in one.
 #[derive(Clone)]

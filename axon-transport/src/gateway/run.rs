@@ -23,7 +23,7 @@ use super::{
     stand_in::StandIns,
 };
 use crate::{
-    daemon::bridge::{CHANNEL, GatewayParts, ToControl},
+    gateway::bridge::{CHANNEL, GatewayParts, ToControl},
     keys::UsedKeys,
     session::{Session, SessionEvent, SessionOptions, SessionRole},
 };
@@ -130,7 +130,7 @@ async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
                 return;
             }
         }
-        let _ = ordered.send(Event::Order(crate::daemon::bridge::ToGateway::Shutdown)).await;
+        let _ = ordered.send(Event::Order(crate::gateway::bridge::ToGateway::Shutdown)).await;
     });
     let hub = Hub::new(context, endpoints, echoes, shared, control, events);
     if hub.run(inbox, &noticed).await { Ok(()) } else { Err(GatewayError::SessionLost) }

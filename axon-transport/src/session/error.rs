@@ -4,7 +4,7 @@ use std::{fmt, path::PathBuf};
 
 use axon_shm::ShmError;
 
-use super::address::AddressError;
+use super::daemon::address::AddressError;
 use crate::{config::ConfigError, wire::session::CodecError};
 
 /// Why a session could not be opened or used.

@@ -5,14 +5,12 @@
 //! descriptors over; when it dies, what is attached flows on, and the control thread `axon-ctl`
 //! finds or starts another and repeats what the first one knew.
 
-pub mod address;
 mod announce;
 mod arrivals;
 mod callback;
 mod clock;
-pub(crate) mod connect;
-mod control;
 mod create;
+pub mod daemon;
 mod error;
 mod events;
 mod face;
@@ -25,11 +23,10 @@ mod open;
 mod options;
 mod peers;
 mod publisher;
+pub mod relayed;
 mod rings;
 mod service;
-pub mod socket;
 mod state;
-mod status;
 mod subscription;
 #[cfg(test)]
 mod tests;
@@ -45,6 +42,7 @@ use std::{
 pub use crate::wire::session::SessionRole;
 use axon_shm::internal::SessionSegment;
 pub use callback::OnNew;
+pub use daemon::{daemon_status, daemon_status_at};
 pub use error::SessionError;
 pub use events::Event;
 pub(crate) use face::{Face, Written};
@@ -56,7 +54,6 @@ pub use publisher::{Loan, Publisher};
 pub use service::{Client, Server};
 pub use state::SessionEvent;
 pub(crate) use state::Shared;
-pub use status::{daemon_status, daemon_status_at};
 #[cfg(test)]
 pub(crate) use subscription::Lifetime;
 pub use subscription::{MessageInfo, Subscription};
@@ -66,7 +63,7 @@ use crate::{
     config::DaemonPolicy,
     graph::GraphView,
     ids::{DaemonId, Gid, SessionId},
-    relay::near::Near,
+    session::relayed::near::Near,
 };
 
 /// A process's session. Cheap to clone; thread-safe. It ends when the last clone and the last of

@@ -9,8 +9,10 @@ use axon_shm::internal::{BlockedSignals, SessionSegment};
 
 use super::{
     Handle, Session, SessionError, SessionOptions,
-    connect::Caller,
-    control::{Control, Start},
+    daemon::{
+        connect::Caller,
+        control::{Control, Start},
+    },
     local::House,
     state::Shared,
 };
@@ -18,7 +20,7 @@ use crate::{
     config::{Config, DaemonPolicy},
     ids::SessionId,
     owner::SessionKey,
-    relay::near::Near,
+    session::relayed::near::Near,
     wire::session::SessionRole,
 };
 

@@ -29,7 +29,7 @@ use rustix::{
 };
 
 use super::{
-    socket::{Received, SocketError},
+    daemon::socket::{self, Received, SocketError},
     *,
 };
 use crate::{

@@ -6,7 +6,7 @@ use std::{
     process::{Command, Stdio},
 };
 
-use axon_transport::{ids::DaemonId, session::address::Address, wire::session::Welcome};
+use axon_transport::{ids::DaemonId, session::daemon::address::Address, wire::session::Welcome};
 use rustix::process::{Pid, Signal, kill_process_group};
 
 use super::*;

@@ -17,15 +17,13 @@ use std::{
 
 use axon_transport::{
     config::{Config, DaemonPolicy, security_settings},
-    daemon::{
-        self, DaemonOptions, GatewayEntry,
-        bridge::{GatewayParts, ToControl},
-    },
+    daemon::{self, DaemonOptions, GatewayEntry},
+    gateway::bridge::{GatewayParts, ToControl},
     ids::SessionId,
     qos::Qos,
     session::{
         EndpointSpec, Publisher, Session, SessionError, SessionOptions, Subscription,
-        address::Address, socket,
+        daemon::{address::Address, socket},
     },
     shm::{PublishError, internal::SessionSegment},
     status::Status,

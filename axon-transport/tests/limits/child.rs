@@ -4,7 +4,7 @@ use std::{fs, os::unix::process::CommandExt as _, path::Path, process::Command, 
 
 use axon_transport::{
     qos::{Durability, Qos},
-    session::{SessionEvent, socket},
+    session::{SessionEvent, daemon::socket},
     shm::{Context, PublishError, Publisher, PublisherOptions, Subscriber, SubscriberOptions},
     wire::session::{Hello, Message, PROTOCOL, SessionRole},
 };

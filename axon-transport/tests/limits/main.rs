@@ -22,7 +22,7 @@ use std::{
 
 use axon_transport::{
     qos::{Durability, Qos},
-    session::{EndpointSpec, address::Address},
+    session::{EndpointSpec, daemon::address::Address},
     shm::{ConnectError, Context, Publisher, PublisherOptions, ShmError},
 };
 use group::Group;

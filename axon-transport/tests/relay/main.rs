@@ -27,8 +27,10 @@ use axon_transport::{
     qos::{Durability, History, Qos, Reliability},
     session::{
         EndpointSpec, Publisher, Session, SessionOptions, Subscription,
-        address::Address,
-        socket::{self, SocketError},
+        daemon::{
+            address::Address,
+            socket::{self, SocketError},
+        },
     },
     shm::PublishError,
     status::{RelayStatus, Status},

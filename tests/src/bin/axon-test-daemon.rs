@@ -3,9 +3,9 @@
 
 use std::process::ExitCode;
 
-use axon_transport::daemon::{
-    self, ErasingHeap, Start,
-    spawn::{DETACHED, SPAWNED},
+use axon_transport::{
+    daemon::{self, ErasingHeap, Start},
+    session::daemon::spawn::{DETACHED, SPAWNED},
 };
 
 #[global_allocator]

@@ -7,8 +7,8 @@ use std::{
 
 use super::{Event, Hub};
 use crate::{
-    daemon::bridge::ToControl,
     gateway::{
+        bridge::ToControl,
         establish::close,
         keyring::lock,
         peer::{GraphChange, Peer},

@@ -13,9 +13,9 @@ use tokio::sync::{mpsc, watch};
 
 use super::{Event, Hub, Link, Summary, leaving::Leaving};
 use crate::{
-    daemon::bridge::ToControl,
     gateway::{
         account::Account,
+        bridge::ToControl,
         control::ControlReader,
         dial::{Target, dial},
         endpoint::{open_streams, open_window},

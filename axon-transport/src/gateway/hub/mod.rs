@@ -43,7 +43,7 @@ use super::{
     status::{self, Who},
 };
 use crate::{
-    daemon::bridge::{ToControl, ToGateway},
+    gateway::bridge::{ToControl, ToGateway},
     graph::{Endpoint, Reach},
     ids::{DaemonId, Gid},
     link::{Candidate, CloseCode, Elected, GraphResync, Hello, Message},

@@ -7,7 +7,7 @@ use super::*;
 use crate::{
     config::{Config, OsFiles},
     owner::OWNER,
-    session::{address::Address, tests::played::Taker},
+    session::{daemon::address::Address, tests::played::Taker},
 };
 
 /// Where the test plays one daemon after another.

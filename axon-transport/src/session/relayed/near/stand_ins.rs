@@ -10,8 +10,10 @@ use super::Served;
 use crate::{
     graph::{Endpoint, EndpointKind, Pairing, pairing, reads},
     ids::Gid,
-    relay::{MAX_CALLERS, flow::Channel, pipe::End},
-    session::Face,
+    session::{
+        Face,
+        relayed::{MAX_CALLERS, flow::Channel, pipe::End},
+    },
     wire::session::{Matched, Message},
 };
 

@@ -14,11 +14,13 @@ use crate::{
     graph::{Endpoint, EndpointKind},
     ids::Gid,
     qos::{Durability, History, Liveliness, Qos, Reliability},
-    relay::{
-        MAX_MATCHED,
-        flow::{Channel, Departing},
+    session::{
+        EndpointSpec, Subscription,
+        relayed::{
+            MAX_MATCHED,
+            flow::{Channel, Departing},
+        },
     },
-    session::{EndpointSpec, Subscription},
 };
 
 pub(super) struct Relay {

@@ -10,16 +10,18 @@ use axon_shm::ShmError;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::{
-    Session, SessionOptions, SessionRole,
     address::Address,
     connect::Caller,
-    error::SessionError,
     socket::{self, SocketError},
-    state::{Outgoing, StatusAnswer, StatusText},
 };
 use crate::{
     config::{Config, DaemonPlace, DaemonPolicy},
     ids::SessionId,
+    session::{
+        Session, SessionOptions, SessionRole,
+        error::SessionError,
+        state::{Outgoing, StatusAnswer, StatusText},
+    },
     wire::session::Message,
 };
 

@@ -15,13 +15,6 @@ use axon_shm::{ExternalLeader, internal::passed::PassedFd};
 use rustix::io::Errno;
 
 use self::matching::{Source, take};
-use super::{
-    LINGER, MAX_CALLERS, MAX_ENDPOINTS, Pool,
-    calls::{self, Calls},
-    flow::{Channel, Incoming},
-    news::News,
-    pipe::{End, Loss, Pipe},
-};
 use crate::{
     config::Config,
     events::Alive,
@@ -31,7 +24,14 @@ use crate::{
     seldom::Seldom,
     session::{
         Face, Node, Session, SessionError, SessionOptions, Subscription,
-        socket::{self, SocketError},
+        daemon::socket::{self, SocketError},
+        relayed::{
+            LINGER, MAX_CALLERS, MAX_ENDPOINTS, Pool,
+            calls::{self, Calls},
+            flow::{Channel, Incoming},
+            news::News,
+            pipe::{End, Loss, Pipe},
+        },
     },
     wire::session::{
         Announce, Asserted, EndpointRole, GivenUp, Leaving, Matched, Message, PROTOCOL, Refused,

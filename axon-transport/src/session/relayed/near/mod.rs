@@ -34,7 +34,9 @@ use crate::{
     ids::{DaemonId, Gid},
     registry::Tally,
     session::{
-        Session, SessionError, Shared, connect::Connected, local::House, socket::SocketError,
+        Session, SessionError, Shared,
+        daemon::{connect::Connected, socket::SocketError},
+        local::House,
     },
     wire::session::{
         Announce, Asserted, EndpointRole, GivenUp, Gone, Graph, Leaving, Message, Refused,

@@ -19,20 +19,22 @@ use axon_shm::{ExternalLeader, ShmError, internal::passed::PassedFd};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::{
-    arrivals::Arrivals,
     connect::Connected,
-    error::SessionError,
-    events::Source,
-    local::{House, Local},
-    peers::Peers,
-    publisher::PublisherInner,
     socket::{self, SocketError},
-    state::{Outgoing, Shared},
-    subscription::{Asking, SubscriptionInner},
 };
 use crate::{
     graph::GraphView,
     ids::Gid,
+    session::{
+        arrivals::Arrivals,
+        error::SessionError,
+        events::Source,
+        local::{House, Local},
+        peers::Peers,
+        publisher::PublisherInner,
+        state::{Outgoing, Shared},
+        subscription::{Asking, SubscriptionInner},
+    },
     wire::session::{Announce, EndpointRole, Gone, Message, Pair},
 };
 
@@ -45,7 +47,7 @@ const FAREWELL: Duration = Duration::from_secs(1);
 /// A relay stands for at most this many remote subscriptions by name; one packet holds no more.
 const MAX_STANDS_FOR: usize = 1024;
 
-pub(super) struct Control {
+pub(in crate::session) struct Control {
     shared: Arc<Shared>,
     link: Link,
     reconnects: bool,
@@ -94,7 +96,7 @@ struct Rematching {
 }
 
 /// With whom a session speaks first.
-pub(super) enum Start {
+pub(in crate::session) enum Start {
     /// A daemon; another one when it is gone.
     Daemon(Connected),
     /// Whoever is at the other end of a socket, and nobody after it.
@@ -113,7 +115,7 @@ enum Link {
 }
 
 impl Control {
-    pub(super) fn new(shared: Arc<Shared>, start: Start) -> Result<Self, SessionError> {
+    pub(in crate::session) fn new(shared: Arc<Shared>, start: Start) -> Result<Self, SessionError> {
         let reconnects = matches!(start, Start::Daemon(_));
         shared.segment.is_watched();
         let peers = Peers::new(shared.segment.clone(), shared.memory.clone())
@@ -152,7 +154,7 @@ impl Control {
         Ok(control)
     }
 
-    pub(super) fn run(mut self) {
+    pub(in crate::session) fn run(mut self) {
         let _ = self.shared.control.set(std::thread::current().id());
         // Pairs with the release store in `Shared::stop`.
         while !self.shared.stopping.load(Ordering::Acquire) {

@@ -23,7 +23,7 @@ use crate::{
     seldom::Seldom,
     session::{
         Face, Written,
-        socket::{self, Received, SocketError},
+        daemon::socket::{self, Received, SocketError},
     },
     wire::session::{Credit, Message},
 };
@@ -38,7 +38,7 @@ const NAP: Duration = Duration::from_millis(5);
 
 /// Why a relay ends.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum End {
+pub(crate) enum End {
     #[error("{0}")]
     Socket(#[from] SocketError),
     #[error("the other end sent {0}")]
@@ -65,7 +65,7 @@ struct OnTheirWay {
 
 /// Samples that were lost.
 #[derive(Clone, Copy, Debug)]
-pub(super) enum Loss {
+pub(crate) enum Loss {
     /// These did not come; whether that was before the `first` of the channel.
     Before { samples: u64, first: bool },
     /// One came and could not be written.
@@ -73,7 +73,7 @@ pub(super) enum Loss {
 }
 
 impl Loss {
-    pub(super) fn samples(self) -> u64 {
+    pub(crate) fn samples(self) -> u64 {
         match self {
             Self::Before { samples, .. } => samples,
             Self::Unwritten => 1,
@@ -81,14 +81,14 @@ impl Loss {
     }
 }
 
-pub(super) struct Pipe {
+pub(crate) struct Pipe {
     socket: PassedFd,
     buffer: Vec<u8>,
     /// Packets that go before any piece.
     waiting: VecDeque<Vec<u8>>,
     waiting_bytes: usize,
-    pub(super) outgoing: Outgoing<Sample>,
-    pub(super) incoming: Incoming,
+    pub(crate) outgoing: Outgoing<Sample>,
+    pub(crate) incoming: Incoming,
     /// Samples that came and are not published yet.
     arrived: BTreeMap<Channel, VecDeque<Arrived>>,
     /// Channels of which a sample was written, or is to be.
@@ -110,7 +110,7 @@ pub(super) struct Pipe {
 }
 
 impl Pipe {
-    pub(super) fn new(socket: PassedFd, incoming: Incoming, tally: Arc<Tally>) -> Self {
+    pub(crate) fn new(socket: PassedFd, incoming: Incoming, tally: Arc<Tally>) -> Self {
         Self {
             socket,
             buffer: Vec::new(),
@@ -132,7 +132,7 @@ impl Pipe {
     }
 
     /// Queues a control message.
-    pub(super) fn say(&mut self, message: &Message) -> Result<(), End> {
+    pub(crate) fn say(&mut self, message: &Message) -> Result<(), End> {
         if self.gone {
             return Ok(());
         }
@@ -149,12 +149,12 @@ impl Pipe {
     }
 
     /// Opens a channel for samples that go, once the MATCHED is said by which the other end knows.
-    pub(super) fn open_out(&mut self, channel: Channel) {
+    pub(crate) fn open_out(&mut self, channel: Channel) {
         self.outgoing.open(channel, self.said);
     }
 
     /// Opens a channel for samples that come.
-    pub(super) fn open_in(&mut self, channel: Channel) -> Result<(), End> {
+    pub(crate) fn open_in(&mut self, channel: Channel) -> Result<(), End> {
         match self.incoming.open(channel, self.heard) {
             Some(credit) => self.say(&Message::Credit(credit)),
             None => Ok(()),
@@ -162,7 +162,7 @@ impl Pipe {
     }
 
     /// Closes those that `keep` does not want.
-    pub(super) fn retain(&mut self, keep: impl Fn(&Channel) -> bool) {
+    pub(crate) fn retain(&mut self, keep: impl Fn(&Channel) -> bool) {
         self.incoming.retain(&keep);
         self.arrived.retain(|channel, _| keep(channel));
         self.written.retain(|channel, _| keep(channel));
@@ -170,18 +170,18 @@ impl Pipe {
     }
 
     /// Whether a sample waits for a reader.
-    pub(super) fn is_blocked(&self) -> bool {
+    pub(crate) fn is_blocked(&self) -> bool {
         self.blocked
     }
 
     /// Whether readers that go on are worth being woken for.
-    pub(super) fn waits_for_readers(&self) -> bool {
+    pub(crate) fn waits_for_readers(&self) -> bool {
         self.blocked || !self.written.is_empty()
     }
 
     /// The other end is gone, or as good as that: what it has said is heard, and nothing is said to it
     /// any more.
-    pub(super) fn hang_up(&mut self) {
+    pub(crate) fn hang_up(&mut self) {
         // Whoever has its end besides adds nothing, so that there is an end to what is to be heard.
         let _ = shutdown(&self.socket, Shutdown::Both);
         self.gone = true;
@@ -190,17 +190,17 @@ impl Pipe {
     }
 
     /// Whether the other end is gone and all that it had said is heard.
-    pub(super) fn is_over(&self) -> bool {
+    pub(crate) fn is_over(&self) -> bool {
         self.over
     }
 
     /// Samples that came and are not published.
-    pub(super) fn arrived(&self) -> usize {
+    pub(crate) fn arrived(&self) -> usize {
         self.arrived.values().map(VecDeque::len).sum()
     }
 
     /// Takes packets; the messages among them that are not of samples, and whether there may be more.
-    pub(super) fn receive(&mut self) -> Result<(Vec<Message>, bool), End> {
+    pub(crate) fn receive(&mut self) -> Result<(Vec<Message>, bool), End> {
         let mut messages = Vec::new();
         for _ in 0..BATCH {
             let message = match socket::receive(&self.socket, &mut self.buffer) {
@@ -231,7 +231,7 @@ impl Pipe {
 
     /// Writes what came, as far as readers make room; `lost` hears of samples that were lost. Returns
     /// what the other end is to be [given back](Self::give_back).
-    pub(super) fn write<'a>(
+    pub(crate) fn write<'a>(
         &mut self,
         find: impl Fn(&Gid) -> Option<&'a Face>,
         mut lost: impl FnMut(&Gid, Loss),
@@ -295,13 +295,13 @@ impl Pipe {
     }
 
     /// Tells the other end what it is given back, and which of its samples are where they are to go.
-    pub(super) fn give_back(&mut self, credits: Vec<Credit>) -> Result<(), End> {
+    pub(crate) fn give_back(&mut self, credits: Vec<Credit>) -> Result<(), End> {
         credits.into_iter().try_for_each(|credit| self.say(&Message::Credit(credit)))
     }
 
     /// Sends what there is, as far as the socket has room: what `take` has of each channel that may
     /// send. Whether anything was sent.
-    pub(super) fn send(
+    pub(crate) fn send(
         &mut self,
         mut take: impl FnMut(&Channel) -> Option<Departing<Sample>>,
     ) -> Result<bool, End> {
@@ -348,7 +348,7 @@ impl Pipe {
 impl Pipe {
     /// Sleeps until there is something to do, for at most `left`. The other end is gone once `end`, its
     /// process, is readable.
-    pub(super) fn sleep(
+    pub(crate) fn sleep(
         &mut self,
         leader: &ExternalLeader,
         news: &News,

@@ -14,19 +14,19 @@ use crate::session::{Session, SessionEvent};
 
 /// Becomes readable when something happened.
 #[derive(Debug)]
-pub(super) struct News {
+pub(crate) struct News {
     wake: OwnedFd,
     lost: AtomicBool,
 }
 
 impl News {
-    pub(super) fn new() -> std::io::Result<Arc<Self>> {
+    pub(crate) fn new() -> std::io::Result<Arc<Self>> {
         let wake = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?;
         Ok(Arc::new(Self { wake, lost: AtomicBool::new(false) }))
     }
 
     /// Has `session` tell of whatever changes.
-    pub(super) fn of(self: &Arc<Self>, session: &Session) {
+    pub(crate) fn of(self: &Arc<Self>, session: &Session) {
         let news = Arc::clone(self);
         session.set_listener(move |event| {
             if *event == SessionEvent::DaemonLost {
@@ -38,17 +38,17 @@ impl News {
     }
 
     /// Whether the session has no daemon any more.
-    pub(super) fn is_lost(&self) -> bool {
+    pub(crate) fn is_lost(&self) -> bool {
         self.lost.load(Ordering::Acquire)
     }
 
-    pub(super) fn wake(&self) {
+    pub(crate) fn wake(&self) {
         // An eventfd whose counter is full is readable, which is all that is wanted.
         let _ = rustix::io::write(&self.wake, &1u64.to_ne_bytes());
     }
 
     /// Takes the news; whether there was any.
-    pub(super) fn take(&self) -> bool {
+    pub(crate) fn take(&self) -> bool {
         rustix::io::read(&self.wake, &mut [0; 8]).is_ok()
     }
 }

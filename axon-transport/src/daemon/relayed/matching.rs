@@ -14,14 +14,14 @@ use crate::{
     ids::Gid,
     qos::{Durability, History, Qos},
     registry::parts,
-    relay::{
-        MAX_MATCHED,
-        flow::{Channel, Departing},
-        pipe::End,
-    },
     session::{
         Face, Subscription,
         merge::{Merge, Taken},
+        relayed::{
+            MAX_MATCHED,
+            flow::{Channel, Departing},
+            pipe::End,
+        },
     },
     wire::session::{GraphItem, Matched, Message},
 };

@@ -13,10 +13,10 @@ use super::{
 use crate::{
     config::{Config, DaemonPolicy},
     ids::Gid,
-    relay::LINGER,
     session::{
         SessionError,
-        connect::{Caller, Connected},
+        daemon::connect::{Caller, Connected},
+        relayed::LINGER,
     },
 };
 

@@ -1,4 +1,4 @@
-//! Starting a daemon from a session, and a daemon's first steps in life.
+//! Starting a daemon from a session. What the daemon does at its start is in the daemon's `detach`.
 //!
 //! The command runs twice: the first process (`--spawned`) starts the second (`--detached`) and
 //! ends, so that the daemon is nobody's child; neither a zombie nor a SIGCHLD surprises the
@@ -8,9 +8,9 @@
 use std::{
     collections::BTreeMap,
     ffi::{OsStr, OsString},
-    io::{Read, Write},
+    io::Read,
     os::{
-        fd::{AsFd, OwnedFd},
+        fd::OwnedFd,
         unix::fs::{MetadataExt, PermissionsExt},
     },
     path::{Path, PathBuf},
@@ -21,10 +21,9 @@ use std::{
 use axon_shm::internal::is_elevated;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
-use super::log;
 use crate::{
     config::{Config, DiscoveryRange, elevated::check_owner},
-    session::{DaemonCommand, SessionError, address::private_directory},
+    session::{DaemonCommand, SessionError},
 };
 
 /// The flag of the first process.
@@ -261,79 +260,6 @@ fn read_report(pipe: OwnedFd, cancelled: &dyn Fn() -> bool) -> String {
         }
     }
     String::from_utf8_lossy(&report).into_owned()
-}
-
-/// The daemon's end of the start-up pipe. In the foreground there is none.
-#[derive(Debug)]
-pub struct Report {
-    pipe: Option<OwnedFd>,
-}
-
-impl Report {
-    /// Nobody waits.
-    pub fn none() -> Self {
-        Self { pipe: None }
-    }
-
-    /// Takes standard output, which goes to the null device from now on.
-    ///
-    /// # Errors
-    /// What the system says.
-    pub fn from_stdout() -> std::io::Result<Self> {
-        let pipe = rustix::stdio::stdout().try_clone_to_owned()?;
-        let null = std::fs::OpenOptions::new().write(true).open("/dev/null")?;
-        rustix::stdio::dup2_stdout(null.as_fd())?;
-        Ok(Self { pipe: Some(pipe) })
-    }
-
-    /// The daemon takes sessions.
-    pub fn ready(&mut self) {
-        self.say("ready\n");
-    }
-
-    /// Another daemon has the address.
-    pub fn taken(&mut self) {
-        self.say("taken\n");
-    }
-
-    /// The daemon gives up.
-    pub fn error(&mut self, text: &str) {
-        self.say(&format!("error: {}\n", text.replace('\n', " ")));
-    }
-
-    fn say(&mut self, text: &str) {
-        if let Some(pipe) = self.pipe.take() {
-            // Whoever started us may have gone meanwhile.
-            let _ = std::fs::File::from(pipe).write_all(text.as_bytes());
-        }
-    }
-}
-
-/// The first process: starts the second one with the same arguments, and is done.
-///
-/// # Errors
-/// When it cannot be started.
-pub fn start_detached() -> std::io::Result<()> {
-    let arguments = std::env::args_os().skip(1).filter(|argument| argument != SPAWNED);
-    // The handle is dropped: when this process ends, the daemon's parent is the system.
-    Command::new(std::env::current_exe()?).args(arguments).arg(DETACHED).spawn().map(drop)
-}
-
-/// The second process: leaves the session's terminal, directory and descriptors.
-///
-/// # Errors
-/// What the system says.
-pub fn detach(config: Option<&Config>) -> std::io::Result<()> {
-    rustix::process::setsid()?;
-    rustix::process::chdir("/")?;
-    if let Some(config) = config
-        && let Some(dir) = &config.runtime_dir
-        && private_directory(dir).is_ok()
-    {
-        // Without its log a daemon works as well.
-        let _ = log::keep_in(&dir.join(format!("axon-{}.log", config.domain)));
-    }
-    Ok(())
 }
 
 #[cfg(test)]

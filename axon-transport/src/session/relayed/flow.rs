@@ -57,7 +57,7 @@ impl Channel {
     }
 
     /// Samples up to this number are where they are to go.
-    pub(super) fn done(self, sequence: u64) -> Credit {
+    pub(crate) fn done(self, sequence: u64) -> Credit {
         Credit { done: Some(sequence), ..self.credit(0, None) }
     }
 

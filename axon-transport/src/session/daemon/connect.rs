@@ -9,15 +9,17 @@ use axon_shm::internal::{SessionSegment, out_of_reach, passed::PassedFd};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::{
-    SessionOptions,
     address::{Address, AddressError},
-    error::SessionError,
     socket::{self, SocketError},
 };
 use crate::{
     config::{Config, DaemonPolicy, DiscoveryRange, security_settings},
-    daemon::spawn::{Outcome, spawn},
     ids::SessionId,
+    session::{
+        SessionOptions,
+        daemon::spawn::{Outcome, spawn},
+        error::SessionError,
+    },
     wire::session::{Hello, Message, PROTOCOL, SessionRole, Welcome},
 };
 
@@ -138,7 +140,10 @@ impl<'a> Caller<'a> {
     }
 
     /// HELLO and its answer, over a socket that is connected.
-    pub(super) fn greet_over(&self, socket: OwnedFd) -> Result<Connected, SessionError> {
+    pub(in crate::session) fn greet_over(
+        &self,
+        socket: OwnedFd,
+    ) -> Result<Connected, SessionError> {
         let deadline = Instant::now() + PATIENCE;
         self.greet(socket, "the daemon's socket pair", std::process::id(), deadline).map_err(
             |attempt| match attempt {

@@ -15,7 +15,7 @@ use super::{Control, Link};
 use crate::{
     ids::Gid,
     session::{
-        connect::{Caller, Connected},
+        daemon::connect::{Caller, Connected},
         error::SessionError,
         state::{Outgoing, SegmentChange, SessionEvent, StatusAnswer},
     },
