@@ -131,6 +131,7 @@ impl Control {
 
     /// Wakes the tasks of sessions that got something to be told.
     pub(super) fn settle(&mut self) {
+        self.registry.answer_fences();
         for (id, why) in self.registry.take_refused() {
             let who = self.registry.session(&id).map_or_else(
                 || format!("session {id}"),

@@ -140,6 +140,18 @@ fn send_some(
     if !control.is_current(id, bell) {
         return Ok(Sent::All);
     }
+    let sent = send_packets(control, socket, id);
+    if control.registry.has_fences() {
+        control.settle();
+    }
+    sent
+}
+
+fn send_packets(
+    control: &mut Control,
+    socket: &AsyncFd<PassedFd>,
+    id: &SessionId,
+) -> Result<Sent, SocketError> {
     let (registry, begin) = (&mut control.registry, Instant::now());
     while let Some(output) = registry.next_output(id) {
         let descriptors: Vec<BorrowedFd<'_>> =

@@ -106,6 +106,7 @@ impl<F: Clone> Registry<F> {
             Message::Grant(grant) => self.grant(id, grant),
             Message::Detach(pair) => self.detach(id, pair),
             Message::GivenUp(given_up) => self.give_up(id, given_up),
+            Message::Fence(fence) => self.fence(id, fence),
             Message::Unmatch(unmatch) => self.fail(id, unmatch),
             Message::Resync => {
                 // Everything costs much more to tell than to ask for.

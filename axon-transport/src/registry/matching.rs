@@ -69,6 +69,7 @@ impl<F: Clone> Registry<F> {
     /// Forgets an endpoint, which its session's entry no longer lists.
     pub(super) fn remove_endpoint(&mut self, gid: &Gid, reason: &str) {
         let Some(local) = self.endpoints.remove(gid) else { return };
+        self.forget_fence(gid);
         let topic = topic(&local.endpoint);
         let mut pairs = Vec::new();
         if let Some(members) = self.topics.get_mut(&topic) {

@@ -7,6 +7,7 @@
 
 #[cfg(test)]
 mod bounds;
+mod fence;
 mod graph;
 mod input;
 mod matching;
@@ -81,6 +82,8 @@ pub struct Registry<F> {
     ready: BTreeSet<SessionId>,
     /// The first endpoint of each session that was refused, and why.
     refused: Vec<(SessionId, String)>,
+    /// FENCEs that are not answered yet.
+    fences: Vec<fence::Asked>,
 }
 
 /// A session as the registry knows it.
@@ -105,6 +108,8 @@ pub struct SessionEntry<F> {
     /// Other sessions whose descriptors it holds.
     known: HashMap<SessionId, Known>,
     queue: VecDeque<Output<F>>,
+    /// The number of the last packet that was queued.
+    last_queued: u64,
     queue_limit: usize,
     queued_bytes: usize,
     bytes_limit: usize,
@@ -227,6 +232,7 @@ impl<F> Default for Registry<F> {
             whole: (0, BTreeMap::new()),
             ready: BTreeSet::new(),
             refused: Vec::new(),
+            fences: Vec::new(),
         }
     }
 }

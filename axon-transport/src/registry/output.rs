@@ -24,6 +24,8 @@ pub struct Output<F> {
     pub descriptors: Vec<F>,
     /// The session's segment that it hands over and nothing else.
     pub(super) segment: Option<(SessionId, u32)>,
+    /// Which it is of the packets that were queued for its session; 0 before it is.
+    pub(super) number: u64,
 }
 
 impl<F: Clone> Registry<F> {
@@ -101,7 +103,7 @@ impl<F: Clone> Registry<F> {
             Message::Segment(opened) => Some((opened.session, opened.segment.number)),
             _ => None,
         };
-        self.push_packet(to, Output { packet, descriptors, segment });
+        self.push_packet(to, Output { packet, descriptors, segment, number: 0 });
     }
 
     pub(super) fn push_shared(&mut self, to: &[SessionId], message: &Message) {
@@ -112,8 +114,8 @@ impl<F: Clone> Registry<F> {
 
     pub(super) fn push_encoded(&mut self, to: &[SessionId], packet: &Arc<[u8]>) {
         for id in to {
-            let packet = Arc::clone(packet);
-            self.push_packet(id, Output { packet, descriptors: Vec::new(), segment: None });
+            let (packet, descriptors) = (Arc::clone(packet), Vec::new());
+            self.push_packet(id, Output { packet, descriptors, segment: None, number: 0 });
         }
     }
 
@@ -127,7 +129,8 @@ impl<F: Clone> Registry<F> {
             return;
         }
         entry.queued_bytes += output.packet.len();
-        entry.queue.push_back(output);
+        entry.last_queued += 1;
+        entry.queue.push_back(Output { number: entry.last_queued, ..output });
         self.ready.insert(*to);
     }
 
@@ -229,7 +232,7 @@ fn next_part<F>(status: &mut Option<(Arc<[u8]>, u32)>) -> Option<Output<F>> {
     let slice = &text[from..text.len().min(from + STATUS_SLICE)];
     let part = Message::Status(StatusPart { part: *next, parts, text: slice.to_vec() });
     *next += 1;
-    Some(Output { packet: encode(&part)?, descriptors: Vec::new(), segment: None })
+    Some(Output { packet: encode(&part)?, descriptors: Vec::new(), segment: None, number: 0 })
 }
 
 pub(super) fn session_entry<F>(
@@ -250,6 +253,7 @@ pub(super) fn session_entry<F>(
         segments: BTreeMap::new(),
         known: HashMap::new(),
         queue: VecDeque::new(),
+        last_queued: 0,
         queue_limit: MAX_QUEUE,
         queued_bytes: 0,
         bytes_limit: MAX_QUEUE_BYTES,

@@ -60,6 +60,7 @@ impl Inside {
     /// Wakes the sessions that have something to hear, but the one that is about to listen.
     fn settle(&mut self, listening: Option<&SessionId>) {
         self.registry.flush();
+        self.registry.answer_fences();
         for id in self.registry.take_ready() {
             if Some(&id) != listening
                 && let Some(wake) = self.wakers.get(&id)
@@ -118,6 +119,8 @@ impl Local {
                 }
             }
         }
+        // By now it was sent what others wait for it to be sent.
+        inside.settle(None);
         answers
     }
 }

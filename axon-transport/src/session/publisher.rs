@@ -17,13 +17,14 @@ use super::{
     Session, clock,
     events::{Changes, EndpointEvents, Event, Source},
     rings::Rings,
+    state::Outgoing,
 };
 use crate::{
     events::EventKind,
     graph::Endpoint,
     ids::Gid,
     qos::{Liveliness, Qos},
-    wire::session::EndpointRole,
+    wire::session::{EndpointRole, Fence},
 };
 
 /// Sends the samples of a topic. Thread-safe. When it is dropped, readers still take what it left.
@@ -161,9 +162,22 @@ impl Publisher {
 }
 
 impl Publisher {
-    /// The number up to which its samples are with those who carry them to other processes and hosts.
+    /// The number up to which its samples are with those who carry them to other processes and hosts, and
+    /// can be read by all others whatever becomes of this process: these were sent the memory that they
+    /// are in. Whoever waits for that has the session's memory wake it.
     pub(crate) fn handed_over(&self) -> u64 {
-        self.writer.handed_over()
+        let number = self.writer.handed_over();
+        // In this order: it counts what the readers of those samples have to be sent.
+        let handovers = self.session.shared().memory.handovers();
+        let mut sending = self.inner.sending();
+        if sending.sent == handovers {
+            sending.number = sending.number.max(number);
+        } else if sending.asked != Some(handovers) {
+            sending.asked = Some(handovers);
+            let fence = Fence { writer: self.gid(), number: handovers };
+            self.session.shared().tell(Outgoing::Fence(fence));
+        }
+        number.min(sending.number)
     }
 
     /// As [`loan`](Self::loan), of `len` bytes at most, for who cannot borrow the publisher. What is
@@ -269,6 +283,19 @@ pub(super) struct PublisherInner {
     pub(super) relayed: bool,
     /// Readers that were granted; a relay as itself.
     attached: Mutex<BTreeSet<Gid>>,
+    sending: Mutex<Sending>,
+}
+
+/// How far readers were sent what they need to find a publisher's samples, by the session's count of
+/// [handovers](super::state::MemoryNews::handovers).
+#[derive(Default)]
+struct Sending {
+    /// What the daemon was asked for last.
+    asked: Option<u64>,
+    /// What it said was sent.
+    sent: u64,
+    /// The number of the last sample that can be found by that.
+    number: u64,
 }
 
 impl PublisherInner {
@@ -276,8 +303,8 @@ impl PublisherInner {
         let Qos { liveliness, lease, .. } = endpoint.qos;
         let asserts = liveliness == Liveliness::ManualByTopic && lease.is_some();
         let events = EndpointEvents::of_publisher(&endpoint.qos, clock::monotonic());
-        let (relayed, attached) = (false, Mutex::default());
-        Self { endpoint, role, rings, events, asserts, relayed, attached }
+        let (relayed, attached, sending) = (false, Mutex::default(), Mutex::default());
+        Self { endpoint, role, rings, events, asserts, relayed, attached, sending }
     }
 
     /// Has it be alive when it is said to be, whatever its liveliness: its process is elsewhere.
@@ -313,6 +340,16 @@ impl PublisherInner {
             attached.remove(gid);
         });
         !dead.is_empty()
+    }
+
+    /// The daemon says that readers were sent what they needed as this count was reached.
+    pub(super) fn was_sent(&self, handovers: u64) {
+        let mut sending = self.sending();
+        sending.sent = sending.sent.max(handovers);
+    }
+
+    fn sending(&self) -> MutexGuard<'_, Sending> {
+        self.sending.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     pub(super) fn attached(&self) -> MutexGuard<'_, BTreeSet<Gid>> {

@@ -6,7 +6,7 @@ use std::{
     os::fd::OwnedFd,
     sync::{
         Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError,
-        atomic::{AtomicBool, Ordering},
+        atomic::{AtomicBool, AtomicU64, Ordering},
     },
     thread::ThreadId,
     time::{Duration, Instant},
@@ -29,7 +29,7 @@ use crate::{
     config::Config,
     graph::{Endpoint, GraphEntry, GraphView},
     ids::{DaemonId, Gid, SessionId},
-    wire::session::{EndpointRole, Gone, Message, StatusPart},
+    wire::session::{EndpointRole, Fence, Gone, Message, StatusPart},
 };
 
 /// Something that a session's owner may want to hear of.
@@ -185,6 +185,8 @@ impl State {
 pub(super) struct MemoryNews {
     wake: Arc<OwnedFd>,
     changes: Mutex<Vec<SegmentChange>>,
+    /// Counts what readers have to be sent before they find samples.
+    handovers: AtomicU64,
 }
 
 /// What became of the session's own memory, or is to be asked of another's.
@@ -200,12 +202,27 @@ pub(super) enum SegmentChange {
 
 impl MemoryNews {
     fn note(&self, event: SegmentEvent<'_>) {
-        let change = match event {
-            SegmentEvent::Opened(info, _) => SegmentChange::Opened(info.number),
-            SegmentEvent::Gone(info) => SegmentChange::Gone(info.number),
-            SegmentEvent::Low(publisher) => SegmentChange::Low(publisher),
-        };
-        self.push(change);
+        match event {
+            SegmentEvent::Opened(info, _) => {
+                self.push(SegmentChange::Opened(info.number));
+                self.hands_over();
+            }
+            SegmentEvent::Gone(info) => self.push(SegmentChange::Gone(info.number)),
+            SegmentEvent::Low(publisher) => self.push(SegmentChange::Low(publisher)),
+        }
+    }
+
+    /// Readers have to be sent something more: memory that was opened, a grant, or all of it by another
+    /// daemon.
+    pub(super) fn hands_over(&self) {
+        // Relaxed: whoever publishes reads it under, or after, the writer's lock, in front of which this
+        // is counted.
+        self.handovers.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// How often that was so. Read after a sample was published, it covers all that its readers need.
+    pub(super) fn handovers(&self) -> u64 {
+        self.handovers.load(Ordering::Relaxed)
     }
 
     /// Readers miss memory of another session.
@@ -236,6 +253,8 @@ pub(super) enum Outgoing {
     Announce(Gid),
     /// A message without descriptors.
     Message(Box<Message>),
+    /// A question behind all that readers have to be sent.
+    Fence(Fence),
 }
 
 /// The parts of a status that have come.
@@ -282,7 +301,8 @@ impl Shared {
     ) -> Self {
         let wake = Arc::new(wake);
         let room = Arc::new(Room::new(options.callers));
-        let memory = Arc::new(MemoryNews { wake: wake.clone(), changes: Mutex::default() });
+        let (changes, handovers) = (Mutex::default(), AtomicU64::new(0));
+        let memory = Arc::new(MemoryNews { wake: wake.clone(), changes, handovers });
         let listener = memory.clone();
         segment.on_segment(move |event| listener.note(event));
         Self {

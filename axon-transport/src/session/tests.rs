@@ -2,6 +2,7 @@
 //! order it says what.
 
 mod followed;
+mod handed;
 mod played;
 
 use std::{

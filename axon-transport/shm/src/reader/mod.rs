@@ -399,6 +399,20 @@ impl Reader {
         self.missing.map(|missing| missing.segment)
     }
 
+    /// Gives up what is left if memory that it needs to go on has not come; whether it did. What is left
+    /// counts as skipped: for one whose publisher is gone, and of which another has all of that.
+    pub fn forgo_missing(&mut self) -> bool {
+        if self.missing.is_none() || self.given_up {
+            return false;
+        }
+        let head = protocol::bounds(self.attachment.ring()).map_or(self.cursor, |(_, head)| head);
+        self.given_up = true;
+        self.missing = None;
+        self.skipped += head.saturating_sub(self.cursor);
+        self.advance(head.max(self.cursor));
+        true
+    }
+
     /// Whether there is nothing to take now, nor will be when the segments come that are on their
     /// way. For one whose publisher is gone.
     pub fn is_drained(&self) -> bool {

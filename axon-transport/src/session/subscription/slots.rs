@@ -176,7 +176,7 @@ impl Slots {
     }
 
     /// When to look again though nobody rings: for memory to take a sample, or for memory of a writer.
-    pub(super) fn look_again(&self) -> Option<Instant> {
+    pub(in crate::session) fn look_again(&self) -> Option<Instant> {
         let missing = self.slots.iter().filter_map(|slot| slot.reader.look_again());
         missing.chain(self.short_until()).min()
     }
@@ -408,6 +408,30 @@ impl Slots {
     /// Whether anything of this writer's is read, or may be soon.
     pub(in crate::session) fn reads(&self, writer: &Gid) -> bool {
         self.pending.contains_key(writer) || self.slots.iter().any(|s| s.reader.writer() == *writer)
+    }
+
+    /// Gives up what a writer left in memory that never came, where it has come back in another process and
+    /// sends once more what was not confirmed. What is missing then is missing among its numbers.
+    pub(super) fn forgo_missing(&mut self) {
+        let mut forgone = false;
+        for index in 0..self.slots.len().saturating_sub(1) {
+            let (earlier, later) = self.slots.split_at_mut(index + 1);
+            let slot = &mut earlier[index];
+            let sends_again = |other: &Slot| {
+                other.reader.writer() == slot.reader.writer()
+                    && other.resumed
+                    && other.numbers != Numbers::None
+                    && !other.reader.is_of_ring(&slot.reader)
+            };
+            let returned = slot.over
+                && slot.reader.missing().is_some()
+                && slot.reader.writer_dead()
+                && later.iter().any(sends_again);
+            forgone |= returned && slot.reader.forgo_missing();
+        }
+        if forgone {
+            self.sweep();
+        }
     }
 
     /// Unmaps writers that are gone and drained, and of which nothing is under way.

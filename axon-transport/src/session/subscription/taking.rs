@@ -27,6 +27,7 @@ impl Slots {
             if let Some(depth) = of.shared_depth.filter(|_| self.slots.len() > 1) {
                 self.skip_to_depth(depth.into());
             }
+            self.forgo_missing();
             let Some(index) = self.oldest() else {
                 // What was skipped may have been the last of a writer that is gone.
                 if self.slots.iter().any(|slot| slot.over) {
@@ -50,6 +51,7 @@ impl Slots {
     ) -> Option<(MessageInfo, T)> {
         self.slots.iter_mut().for_each(|slot| slot.overtaken = false);
         for _ in 0..REPEATS {
+            self.forgo_missing();
             let next = self.slots.iter().position(|slot| {
                 !slot.overtaken && slot.reader.writer() == *writer && slot.reader.has_data()
             });

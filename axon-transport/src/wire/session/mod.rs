@@ -436,6 +436,20 @@ pub struct GivenUp {
     pub samples: u64,
 }
 
+/// A session asks whether all that it said of one of its publishers was sent to those who read it: the
+/// memory in which they find its samples, and what it granted. The daemon answers with the same message
+/// once it was.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Fence {
+    /// The publisher.
+    #[n(0)]
+    pub writer: Gid,
+    /// A number of the session's own, which tells its questions apart.
+    #[n(1)]
+    pub number: u64,
+}
+
 /// A message of the session socket.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[allow(missing_docs)]
@@ -459,6 +473,7 @@ pub enum Message {
     Need(SegmentName),
     Leaving(Leaving),
     GivenUp(GivenUp),
+    Fence(Fence),
     Matched(Matched),
     Piece(Piece),
     Credit(Credit),

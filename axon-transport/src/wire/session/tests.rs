@@ -102,6 +102,7 @@ fn messages() -> Vec<Message> {
         Message::SegmentGone(SegmentName { session, number: 9 }),
         Message::Need(SegmentName { session, number: 9 }),
         Message::Leaving(Leaving { gid: writer, leaving: true }),
+        Message::Fence(Fence { writer, number: 12 }),
         Message::Matched(Matched { gid: reader, others: vec![writer] }),
         Message::Piece(Piece {
             publisher: writer,

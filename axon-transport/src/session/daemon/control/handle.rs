@@ -18,7 +18,7 @@ use crate::{
         subscription::{Accept, Asking, Numbers, SubscriptionInner},
     },
     wire::session::{
-        Attach, GivenUp, Granted, Leaving, MAX_DESCRIPTORS, Message, Pair, Refused, Segment,
+        Attach, Fence, GivenUp, Granted, Leaving, MAX_DESCRIPTORS, Message, Pair, Refused, Segment,
         SegmentName, SegmentOpened, Unmatch,
     },
 };
@@ -38,6 +38,7 @@ impl Control {
             Message::Unmatch(unmatch) => self.unmatch(&unmatch),
             Message::Leaving(leaving) => self.leave(leaving),
             Message::GivenUp(given_up) => self.give_up(given_up),
+            Message::Fence(fence) => self.fence(fence),
             Message::Segment(opened) => self.segment(&opened, &descriptors),
             Message::SegmentGone(gone) => {
                 self.peers.gone(&gone.session, gone.number);
@@ -110,6 +111,16 @@ impl Control {
         let publisher = self.shared.state().publishers.get(&writer).cloned();
         if let Some(publisher) = publisher {
             publisher.rings.give_up(reader, samples);
+            // Those who wait for acknowledgements.
+            self.shared.segment.notify();
+        }
+    }
+
+    /// All that was said of a publisher here until it asked was sent to those who read it.
+    fn fence(&self, Fence { writer, number }: Fence) {
+        let publisher = self.shared.state().publishers.get(&writer).cloned();
+        if let Some(publisher) = publisher {
+            publisher.was_sent(number);
             // Those who wait for acknowledgements.
             self.shared.segment.notify();
         }
@@ -255,6 +266,8 @@ impl Control {
         if own && !self.has_lane(&pair, attach.lane) {
             return;
         }
+        // Before it is served: what is published for it from then on waits for its grant to be sent.
+        self.shared.memory.hands_over();
         let grant = peer.map_err(|e| e.to_string()).and_then(|peer| {
             let Attach { reader: gid, lane, qos, stands_for, after, carries, .. } = attach;
             let reader = ReaderInfo { gid, lane, qos, peer, stands_for };

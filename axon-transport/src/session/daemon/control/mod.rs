@@ -222,7 +222,7 @@ impl Control {
         if self.is_linked() {
             self.tell_segments();
         }
-        let mut gone = Vec::new();
+        let (mut gone, mut fences) = (Vec::new(), Vec::new());
         let mut state = shared.state();
         if !state.outgoing.is_empty() {
             self.timed = None;
@@ -239,6 +239,14 @@ impl Control {
                         gone.push(gid);
                     }
                     self.say(*message);
+                }
+                Outgoing::Fence(fence) => {
+                    self.tell_segments();
+                    if self.untold.is_empty() {
+                        self.outbox.push_back((Message::Fence(fence), Vec::new()));
+                    } else {
+                        fences.push(Outgoing::Fence(fence));
+                    }
                 }
                 Outgoing::Announce(gid) => {
                     if let Some(publisher) = state.publishers.get(&gid) {
@@ -280,6 +288,8 @@ impl Control {
                 }
             }
         }
+        // For want of descriptors there is memory that the daemon was not told of.
+        state.outgoing.extend(fences);
         drop(state);
         gone.iter().for_each(|gid| self.own_gone(gid));
     }
@@ -309,9 +319,14 @@ impl Control {
                             return;
                         }
                         Err(error) => {
-                            // What the daemon said last, such as REFUSED, is worth hearing.
-                            self.receive();
-                            self.tell_matched();
+                            // What the daemon said last is worth hearing: REFUSED, or memory in which
+                            // samples are found. It adds nothing, so that there is an end to it.
+                            while matches!(error, SocketError::Closed)
+                                && matches!(self.link, Link::Socket(_))
+                            {
+                                self.receive();
+                                self.tell_matched();
+                            }
                             if matches!(self.link, Link::Socket(_)) {
                                 self.lost(&error);
                             }

@@ -1,0 +1,259 @@
+//! FENCE: a session learns that all it said of a publisher was sent to those who must not lose a sample.
+//!
+//! A relayed publisher's process keeps a sample until the daemon confirms it. The sample is then in the
+//! daemon's memory, which a reader can go on reading after the daemon was killed: but only if it was sent
+//! the descriptors of that memory, and its grant, before.
+
+use axon_shm::internal::holds;
+
+use super::{Registry, SessionEntry, Violation};
+use crate::{
+    ids::{Gid, SessionId},
+    wire::session::{Fence, Message, Pair},
+};
+
+/// A FENCE that is not answered yet.
+#[derive(Debug)]
+pub(super) struct Asked {
+    /// Who asked.
+    by: SessionId,
+    fence: Fence,
+    /// The readers' sessions that have not been sent all, and the number of the last packet that each has
+    /// to be sent: `None` while it is told everything anew.
+    readers: Vec<(SessionId, Option<u64>)>,
+}
+
+impl<F: Clone> Registry<F> {
+    /// A session asks. A later question about the same publisher takes the place of an earlier one.
+    pub(super) fn fence(&mut self, id: &SessionId, fence: Fence) -> Result<(), Violation> {
+        match self.endpoints.get(&fence.writer) {
+            Some(writer) if writer.session == *id => {}
+            Some(_) => return Err(Violation::NotItsOwn(fence.writer)),
+            // It was refused.
+            None => return Ok(()),
+        }
+        let readers = self.keeping_readers(&fence.writer).into_iter();
+        let readers = readers.map(|reader| {
+            let last = self.sessions.get(&reader).filter(|entry| !entry.is_told_anew());
+            (reader, last.map(|entry| entry.last_queued))
+        });
+        let asked = Asked { by: *id, fence, readers: readers.collect() };
+        self.fences.retain(|earlier| earlier.fence.writer != fence.writer);
+        self.fences.push(asked);
+        self.answer_fences();
+        Ok(())
+    }
+
+    /// Answers those of which everything was sent by now. Has to be called when packets were sent, and
+    /// when sessions ended.
+    pub fn answer_fences(&mut self) {
+        if self.fences.is_empty() {
+            return;
+        }
+        let mut asked = std::mem::take(&mut self.fences);
+        for fence in &mut asked {
+            fence.readers.retain_mut(|(reader, last)| !self.was_sent(reader, last));
+        }
+        let (answered, waiting) = asked.into_iter().partition(|asked| asked.readers.is_empty());
+        self.fences = waiting;
+        for Asked { by, fence, .. } in answered {
+            self.push(&by, &Message::Fence(fence), Vec::new());
+        }
+    }
+
+    /// Whether there are any that wait for packets to be sent.
+    pub fn has_fences(&self) -> bool {
+        !self.fences.is_empty()
+    }
+
+    /// A publisher is gone, and with it what was asked about it.
+    pub(super) fn forget_fence(&mut self, writer: &Gid) {
+        self.fences.retain(|asked| asked.fence.writer != *writer);
+    }
+
+    /// Whether a session was sent all up to the packet of that number, or has ended.
+    fn was_sent(&self, id: &SessionId, last: &mut Option<u64>) -> bool {
+        let Some(entry) = self.sessions.get(id) else { return true };
+        if entry.is_told_anew() {
+            *last = None;
+            return false;
+        }
+        let last = *last.get_or_insert(entry.last_queued);
+        entry.queue.front().is_none_or(|next| next.number > last)
+    }
+
+    /// The sessions that read what a publisher writes, and whose reader and publisher both lose nothing.
+    fn keeping_readers(&self, writer: &Gid) -> Vec<SessionId> {
+        let Some(local) = self.endpoints.get(writer).filter(|w| holds(&w.endpoint.qos)) else {
+            return Vec::new();
+        };
+        let pairs = self.prospective_pairs(&local.endpoint).into_iter();
+        let pairs = pairs.filter(|pair: &Pair| pair.writer == *writer);
+        let readers = pairs.filter(|pair| self.pairs.contains_key(pair));
+        let readers = readers.filter_map(|pair| self.endpoints.get(&pair.reader));
+        let keeping = readers.filter(|reader| holds(&reader.endpoint.qos));
+        let mut sessions: Vec<SessionId> = keeping.map(|reader| reader.session).collect();
+        sessions.sort_unstable();
+        sessions.dedup();
+        sessions
+    }
+}
+
+impl<F> SessionEntry<F> {
+    /// Whether it is told everything from the beginning, or is about to be.
+    fn is_told_anew(&self) -> bool {
+        self.behind || self.resync || self.telling.is_some()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use axon_shm::internal::Location;
+
+    use super::*;
+    use crate::{
+        graph::{Endpoint, EndpointKind},
+        qos::Qos,
+        registry::MAX_QUEUE,
+        wire::session::{Announce, EndpointRole, Gone, Segment, SegmentOpened, SessionRole},
+    };
+
+    const WRITER: u8 = 1;
+    const KEEPS: u8 = 2;
+    const KEEPS_LAST: u8 = 3;
+
+    fn id(number: u8) -> SessionId {
+        SessionId([number; 16])
+    }
+
+    fn gid(session: u8) -> Gid {
+        Gid::new(id(session), 1)
+    }
+
+    /// A KEEP_ALL publisher, a subscription that keeps all, and one that does not.
+    fn registry() -> Registry<&'static str> {
+        let mut registry = Registry::default();
+        for (session, kind, qos) in [
+            (WRITER, EndpointKind::Publisher, Qos::keep_all()),
+            (KEEPS, EndpointKind::Subscription, Qos::keep_all()),
+            (KEEPS_LAST, EndpointKind::Subscription, Qos::default()),
+        ] {
+            let handed = Some(["segment", "doorbell", "pidfd"]);
+            let (role, name) = (SessionRole::Application, String::new());
+            registry.connect(id(session), role, name, 1, handed, None).unwrap();
+            let endpoint = Endpoint { qos, ..Endpoint::example(gid(session), kind) };
+            let ring = (session == WRITER).then_some(Location { segment: 0, offset: 4096 });
+            let (role, stands_for) = (EndpointRole::Application, Vec::new());
+            let announce = Announce { endpoint, role, stands_for, ring, only: None };
+            registry.message(&id(session), Message::Endpoint(announce), vec![]).unwrap();
+        }
+        [WRITER, KEEPS, KEEPS_LAST].iter().for_each(|session| drop(take(&mut registry, *session)));
+        registry
+    }
+
+    fn take(registry: &mut Registry<&'static str>, session: u8) -> Vec<Message> {
+        let taken = std::iter::from_fn(|| registry.next_output(&id(session)));
+        let taken = taken.map(|output| Message::decode(&output.packet).unwrap()).collect();
+        registry.answer_fences();
+        taken
+    }
+
+    fn ask(registry: &mut Registry<&'static str>, number: u64) {
+        let fence = Fence { writer: gid(WRITER), number };
+        registry.message(&id(WRITER), Message::Fence(fence), vec![]).unwrap();
+    }
+
+    /// What was answered.
+    fn answers(registry: &mut Registry<&'static str>) -> Vec<u64> {
+        let answers = take(registry, WRITER).into_iter().filter_map(|message| match message {
+            Message::Fence(fence) => Some(fence.number),
+            _ => None,
+        });
+        answers.collect()
+    }
+
+    fn say(registry: &mut Registry<&'static str>, to: u8) {
+        registry.push(&id(to), &Message::Resync, Vec::new());
+    }
+
+    #[test]
+    fn it_is_answered_when_those_who_keep_all_were_sent_what_came_before() {
+        let mut registry = registry();
+        ask(&mut registry, 1);
+        assert_eq!(answers(&mut registry), [1], "nothing waits");
+
+        [KEEPS, KEEPS, KEEPS_LAST].iter().for_each(|to| say(&mut registry, *to));
+        ask(&mut registry, 2);
+        say(&mut registry, KEEPS);
+        assert_eq!(answers(&mut registry), [0; 0]);
+        // One of two; and one that could not be sent.
+        registry.next_output(&id(KEEPS)).unwrap();
+        let unsent = registry.next_output(&id(KEEPS)).unwrap();
+        registry.return_output(&id(KEEPS), unsent);
+        registry.answer_fences();
+        assert_eq!(answers(&mut registry), [0; 0]);
+        // What came after the question still waits, as does all of who may lose samples.
+        registry.next_output(&id(KEEPS)).unwrap();
+        registry.answer_fences();
+        assert_eq!(answers(&mut registry), [2]);
+        assert!(!registry.has_fences());
+    }
+
+    #[test]
+    fn memory_that_is_given_up_before_it_is_sent_counts_as_no_other_packet() {
+        let mut registry = registry();
+        say(&mut registry, KEEPS);
+        ask(&mut registry, 1);
+        let segment = Segment { number: 1, publisher: None };
+        let opened = Message::Segment(SegmentOpened { session: id(WRITER), segment });
+        registry.push(&id(KEEPS), &opened, vec!["map"]);
+        assert!(registry.take_back(&id(KEEPS), &id(WRITER), 1));
+        registry.answer_fences();
+        assert_eq!(answers(&mut registry), [0; 0]);
+        take(&mut registry, KEEPS);
+        assert_eq!(answers(&mut registry), [1]);
+    }
+
+    #[test]
+    fn who_is_behind_has_to_be_told_everything_first() {
+        let mut registry = registry();
+        say(&mut registry, KEEPS);
+        ask(&mut registry, 1);
+        (0..=MAX_QUEUE).for_each(|_| say(&mut registry, KEEPS));
+        registry.answer_fences();
+        assert_eq!(answers(&mut registry), [0; 0], "its queue is empty, for it was thrown away");
+        ask(&mut registry, 2);
+        registry.next_output(&id(KEEPS)).unwrap();
+        registry.answer_fences();
+        assert_eq!(answers(&mut registry), [0; 0], "it was told a part");
+        take(&mut registry, KEEPS);
+        assert_eq!(answers(&mut registry), [2], "the later question alone");
+    }
+
+    #[test]
+    fn who_ended_is_not_waited_for() {
+        let mut registry = registry();
+        say(&mut registry, KEEPS);
+        ask(&mut registry, 1);
+        registry.disconnect(&id(KEEPS));
+        registry.answer_fences();
+        assert_eq!(answers(&mut registry), [1]);
+        // What was asked about a publisher that is gone is forgotten.
+        let mut registry = self::registry();
+        say(&mut registry, KEEPS);
+        ask(&mut registry, 1);
+        let gone = Message::EndpointGone(Gone { gid: gid(WRITER) });
+        registry.message(&id(WRITER), gone, vec![]).unwrap();
+        assert!(!registry.has_fences());
+        ask(&mut registry, 2);
+        assert!(!registry.has_fences());
+    }
+
+    #[test]
+    fn nobody_asks_about_the_publisher_of_another() {
+        let mut registry = registry();
+        let fence = Message::Fence(Fence { writer: gid(WRITER), number: 1 });
+        let refused = registry.message(&id(KEEPS), fence, vec![]);
+        assert_eq!(refused, Err(Violation::NotItsOwn(gid(WRITER))));
+    }
+}

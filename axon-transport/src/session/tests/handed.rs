@@ -1,0 +1,125 @@
+//! Memory of large samples that a reader needs, and that its daemon may not have sent it when it was
+//! killed.
+
+use rustix::process::{Pid, PidfdFlags, pidfd_open};
+
+use super::{played::Taker, *};
+use crate::wire::session::Fence;
+
+/// What the session asks the daemon next, and whether it told of memory before that.
+fn hear_fence(daemon: &Daemon) -> (Fence, bool) {
+    let mut told = false;
+    let fence = daemon.hear(|message| match message {
+        Message::Segment(_) => {
+            told = true;
+            None
+        }
+        Message::Fence(fence) => Some(fence),
+        _ => None,
+    });
+    (fence, told)
+}
+
+#[test]
+fn a_sample_is_handed_over_when_its_reader_was_sent_the_memory_that_it_is_in() {
+    let (session, daemon) = session();
+    let spec = EndpointSpec::new("/p", "test/Bytes", Qos::keep_all());
+    let publisher = session.create_publisher(spec).unwrap();
+    let taker = Taker::new();
+    let _taking = taker.attach(&publisher, None, &daemon);
+    publisher.publish(b"small").unwrap();
+    assert_eq!(publisher.handed_over(), 0, "its grant may not have been sent");
+    let (granted, _) = hear_fence(&daemon);
+    assert_eq!(granted.writer, publisher.gid());
+    daemon.say(Message::Fence(granted), &[]);
+    until("it was", || publisher.handed_over() == 1);
+
+    publisher.publish(&[1; LARGE]).unwrap();
+    assert_eq!(publisher.handed_over(), 1);
+    let (opened, told) = hear_fence(&daemon);
+    assert!(told && opened.number > granted.number);
+    daemon.say(Message::Fence(granted), &[]);
+    // Whoever waits for room is woken by the answer, and asks once more.
+    publisher.publish(b"small").unwrap();
+    thread::sleep(Duration::from_millis(20));
+    assert_eq!(publisher.handed_over(), 1, "that was an answer to something else");
+    daemon.say(Message::Fence(opened), &[]);
+    until("both were", || publisher.handed_over() == 3);
+    // Its memory is known by now.
+    publisher.publish(&[2; LARGE / 2]).unwrap();
+    assert_eq!(publisher.handed_over(), 4);
+}
+
+/// A process that only has to live until it is killed.
+struct Process(std::process::Child);
+
+impl Process {
+    fn start() -> Self {
+        Self(Command::new("sleep").arg("1000").spawn().unwrap())
+    }
+
+    fn descriptor(&self) -> OwnedFd {
+        let pid = Pid::from_child(&self.0);
+        pidfd_open(pid, PidfdFlags::empty()).unwrap()
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// A session's publisher that stands for one in a process without shared memory, as the daemon has it
+/// that is the `process`.
+fn stands_in(id: SessionId, daemon: &Daemon, process: &Process) -> (Far, Vec<OwnedFd>) {
+    let session = SessionSegment::create(id).unwrap();
+    let view = PeerSession::map(daemon.id, daemon.handed.try_clone().unwrap()).unwrap();
+    let far = Far::with(1, session, Peer::Remote(view));
+    let mut introduction = far.introduction();
+    introduction[2] = process.descriptor();
+    (far, introduction)
+}
+
+fn grant(far: &Far, introduction: &[OwnedFd], subscription: &Subscription, daemon: &Daemon) {
+    daemon.say(Message::Match(far.pair(subscription)), &[]);
+    let granted = Granted { relayed: Some(true), ..far.grant(&daemon.hear_attach()) };
+    let introduction: Vec<_> = introduction.iter().map(AsFd::as_fd).collect();
+    daemon.say(Message::Grant(granted), &introduction);
+}
+
+#[test]
+fn what_a_killed_daemon_did_not_hand_over_comes_once_through_the_next() {
+    let (session, daemon) = session();
+    let subscription = subscription(&session);
+    let (id, first) = (SessionId::random(), Process::start());
+    let (far, introduction) = stands_in(id, &daemon, &first);
+    grant(&far, &introduction, &subscription, &daemon);
+    assert!(subscription.wait_matched(1, EVER));
+    far.publish(1, b"x");
+    assert_eq!(take(&subscription), Some(1));
+    far.publish(2, &[2; LARGE]);
+    far.publish(3, b"x");
+    assert_eq!(take(&subscription), None, "its memory was not handed over");
+    drop(first);
+    until("it is known to be dead", || subscription.matched().is_empty());
+
+    let second = Process::start();
+    let (far, introduction) = stands_in(id, &daemon, &second);
+    grant(&far, &introduction, &subscription, &daemon);
+    assert!(subscription.wait_matched(1, EVER));
+    // What was not confirmed comes again.
+    far.publish(2, &[2; LARGE]);
+    far.publish(3, b"x");
+    far.publish(4, b"x");
+    far.hand(1, &daemon);
+    let mut taken = Vec::new();
+    until("the last", || {
+        taken.extend(take(&subscription));
+        taken.last() == Some(&4)
+    });
+    assert_eq!((taken, subscription.lost()), (vec![2, 3, 4], 0));
+    // Nothing is left that would be given up, and counted, later.
+    assert_eq!(subscription.inner.lock().look_again(), None);
+}
