@@ -71,7 +71,7 @@ pub mod internal {
             segment::SessionSegment,
             segment_message::{Segment, SegmentName, SegmentOpened},
         },
-        wake::{Look, PassedOn, Purpose},
+        wake::{ForwardedWakeups, Look, Purpose},
         writer::{MAX_GAP, Writer},
     };
 
@@ -81,7 +81,7 @@ pub mod internal {
     }
 
     /// Descriptors that go from process to process.
-    pub mod passed {
+    pub mod descriptors {
         pub use crate::os::descriptors::{
             Packet, PassedFd, carries_descriptors, has_too_many_strangers, is_scarce, is_short,
             receive, share,

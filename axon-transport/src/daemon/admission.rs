@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use axon_shm::internal::{PeerDescriptors, out_of_reach, passed::PassedFd};
+use axon_shm::internal::{PeerDescriptors, descriptors::PassedFd, out_of_reach};
 
 use crate::{
     config::{Config, security_settings},

@@ -9,7 +9,7 @@ use std::{
     time::Instant,
 };
 
-use axon_shm::internal::{passed::PassedFd, probe};
+use axon_shm::internal::{descriptors::PassedFd, probe};
 use tokio::sync::{Notify, watch};
 
 use super::{admission::Admission, turns::Turns};

@@ -8,7 +8,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_shm::internal::passed::{self, PassedFd};
+use axon_shm::internal::descriptors::{self, PassedFd};
 use tokio::{io::unix::AsyncFd, sync::Notify};
 
 use super::{
@@ -177,7 +177,7 @@ fn send_packets(
 
 /// Receives one packet, unless it has descriptors for which there may be no room.
 pub(super) fn receive(socket: &PassedFd, buffer: &mut Vec<u8>) -> Result<Received, SocketError> {
-    if passed::is_short() && passed::carries_descriptors(socket) {
+    if descriptors::is_short() && descriptors::carries_descriptors(socket) {
         return Err(SocketError::NoDescriptors);
     }
     socket::receive(socket, buffer)
@@ -212,9 +212,9 @@ fn receive_some(
             // Without a segment it goes on; without its connection it would have to come back, with
             // all that it has.
             Ok(Received { message: Message::Segment(_), .. })
-                if control.registry.holds_as_many_as(id, passed::share()) =>
+                if control.registry.holds_as_many_as(id, descriptors::share()) =>
             {
-                let share = passed::share();
+                let share = descriptors::share();
                 control.registry.refuse_segment(
                     id,
                     &format!(

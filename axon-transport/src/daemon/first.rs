@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use axon_shm::internal::passed::{self, PassedFd};
+use axon_shm::internal::descriptors::{self, PassedFd};
 use tokio::io::unix::AsyncFd;
 use zeroize::Zeroize;
 
@@ -64,7 +64,7 @@ pub(super) async fn first(socket: &AsyncFd<PassedFd>) -> Option<First> {
             }
             Err(SocketError::NotReady) => ready.clear_ready(),
             // Not for want of room here: somebody keeps them back.
-            Err(SocketError::NoDescriptors) if !passed::is_short() => {
+            Err(SocketError::NoDescriptors) if !descriptors::is_short() => {
                 let text = "its descriptors do not arrive".to_owned();
                 say(socket, Message::Refused(*unshared(text)), &[]);
                 return None;

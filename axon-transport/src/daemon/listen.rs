@@ -8,7 +8,7 @@ use std::{
     time::Duration,
 };
 
-use axon_shm::internal::passed::{self, PassedFd};
+use axon_shm::internal::descriptors::{self, PassedFd};
 use rustix::net::{AddressFamily, SocketFlags, SocketType, accept_with, socketpair};
 use tokio::{io::unix::AsyncFd, sync::Notify, task::spawn_local, time::timeout};
 
@@ -57,7 +57,7 @@ async fn accept_at(control: Rc<RefCell<Control>>, listener: OwnedFd, strangers: 
     let mut full = false;
     loop {
         let Ok(mut ready) = listener.readable().await else { return };
-        if passed::is_short() || passed::has_too_many_strangers() {
+        if descriptors::is_short() || descriptors::has_too_many_strangers() {
             // Those that have a session keep it.
             if !std::mem::replace(&mut full, true) {
                 tracing::error!("too many descriptors are open: no more sessions are accepted");

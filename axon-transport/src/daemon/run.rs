@@ -5,7 +5,7 @@ use std::{
     time::Duration,
 };
 
-use axon_shm::internal::{close_inherited, passed, survive_file_size_limit};
+use axon_shm::internal::{close_inherited, descriptors, survive_file_size_limit};
 use rustix::process::{
     DumpableBehavior, Resource, Rlimit, getrlimit, set_dumpable_behavior, setrlimit,
 };
@@ -221,7 +221,7 @@ fn harden() {
         refused("RLIMIT_NOFILE", error);
     }
     if let Some(limit) = getrlimit(Resource::Nofile).current
-        && passed::is_scarce(limit)
+        && descriptors::is_scarce(limit)
     {
         tracing::warn!(
             limit,

@@ -13,8 +13,8 @@ use std::{
 
 use axon_shm::internal::{
     Location,
+    descriptors::PassedFd,
     inspect::{self, LaneCounts, RingCounts},
-    passed::PassedFd,
 };
 
 use crate::{

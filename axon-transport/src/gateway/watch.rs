@@ -4,7 +4,7 @@
 
 use std::io;
 
-use axon_shm::internal::passed::PassedFd;
+use axon_shm::internal::descriptors::PassedFd;
 use tokio::io::unix::AsyncFd;
 
 /// Has the current runtime watch a descriptor.

@@ -50,9 +50,9 @@ impl Guard {
     /// One load, one exchange, and a system call where it did not stand.
     pub(super) fn trigger(&self) {
         // Release pairs with the acquire of `is_triggered` and `take`: who sees it sees what was
-        // done before. A waiter that looked before this is woken by the knock.
+        // done before. A waiter that looked before this is woken by the call below.
         if !self.triggered.swap(true, Ordering::AcqRel) {
-            self.segment.knock();
+            self.segment.wake_listener();
         }
     }
 

@@ -8,7 +8,7 @@ use std::{
     sync::{Arc, Mutex, MutexGuard, PoisonError},
 };
 
-use axon_shm::{ShmError, internal::passed::PassedFd};
+use axon_shm::{ShmError, internal::descriptors::PassedFd};
 
 use super::state::Shared;
 use crate::{

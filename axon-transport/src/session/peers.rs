@@ -15,7 +15,7 @@ use axon_shm::{
     ShmError,
     internal::{
         Peer, PeerDescriptors, PeerSession, SegmentInfo, SegmentKind, SessionSegment,
-        passed::PassedFd,
+        descriptors::PassedFd,
     },
 };
 use rustix::{

@@ -4,7 +4,7 @@ use std::{ops::Deref, sync::Arc, time::Duration};
 
 use axon_shm::{
     ShmError,
-    internal::{Look, PassedOn, SessionSegment},
+    internal::{ForwardedWakeups, Look, SessionSegment},
 };
 use smallvec::SmallVec;
 
@@ -63,13 +63,13 @@ pub(crate) struct Watch {
 /// While another session is waited at, its control thread listens for it, and passes on what comes.
 struct Visit<'a> {
     other: &'a Shared,
-    _passed: PassedOn<'a>,
+    _forwarded: ForwardedWakeups<'a>,
 }
 
 impl<'a> Visit<'a> {
     fn new(other: &'a Shared, watch: &Arc<Watch>, waits: &Shared) -> Result<Self, ShmError> {
         other.listen()?;
-        Ok(Self { other, _passed: other.segment.pass_on(watch.clone(), &waits.segment) })
+        Ok(Self { other, _forwarded: other.segment.forward_wakeups(watch.clone(), &waits.segment) })
     }
 }
 

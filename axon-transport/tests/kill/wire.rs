@@ -10,7 +10,7 @@ use std::{
 
 use axon_shm::internal::{
     Grant, Lane, Location, Peer, PeerDescriptors, PeerSession, Reader, ReaderInfo, ReaderOptions,
-    SegmentEvent, SegmentInfo, SegmentKind, SessionSegment, Writer, passed::PassedFd,
+    SegmentEvent, SegmentInfo, SegmentKind, SessionSegment, Writer, descriptors::PassedFd,
 };
 use axon_transport::{
     ids::{Gid, SessionId},

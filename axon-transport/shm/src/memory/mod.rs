@@ -1,7 +1,7 @@
 //! Memory that is shared: sealed memfds, the maps over them, and how much of either there may be.
 
+pub(crate) mod available;
 pub(crate) mod copy;
-pub(crate) mod headroom;
 pub(crate) mod prefetch;
 pub(crate) mod probe;
 pub(crate) mod quota;

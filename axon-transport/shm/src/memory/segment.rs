@@ -23,7 +23,7 @@ use crate::{
     error::ShmError,
     limits::{ALIGN, MAX_SEGMENT},
     memory::{
-        headroom,
+        available,
         quota::{Quota, Share},
     },
     os::{atfork::Place, fork::ForkToken},
@@ -64,7 +64,7 @@ impl Segment {
     /// Backs `range` with memory, so that touching it can neither fault nor get the process
     /// killed for exceeding its control group's limit.
     pub(crate) fn commit(&self, from: u64, to: u64) -> Result<(), ShmError> {
-        headroom::check(to - from)?;
+        available::check(to - from)?;
         // In pieces, since older kernels undo a whole call on any signal: one that comes often
         // could otherwise keep a large one from ever getting through.
         let mut done = from;
@@ -74,7 +74,7 @@ impl Segment {
                 Ok(()) => done += len,
                 Err(Errno::INTR) => {}
                 Err(Errno::NOSPC | Errno::NOMEM) => {
-                    let available = headroom::available().unwrap_or(0);
+                    let available = available::bytes().unwrap_or(0);
                     return Err(ShmError::NoMemory { needed: to - done, available });
                 }
                 Err(errno) => return Err(ShmError::system("committing shared memory")(errno)),

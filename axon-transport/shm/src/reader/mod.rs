@@ -12,7 +12,7 @@ use std::{
 
 use self::{find::Bytes, under_way::UnderWay};
 use crate::{
-    alloc::allowance::Allowance,
+    alloc::pin_limit::PinLimit,
     error::{ShmError, TakeError},
     ids::Gid,
     memory::segment::Map,
@@ -162,7 +162,7 @@ impl Reader {
         }
         lane.open(grant, reader);
         let tells = holds(&qos) && peer.remote().is_some();
-        let (depth, in_place) = (depth(&qos), Allowance::of(grant.generation).longest());
+        let (depth, in_place) = (depth(&qos), PinLimit::of(grant.generation).longest());
         let attachment = Attachment::new(map, words, lane);
         if let Some(session) = peer.remote() {
             session.keep_told(&attachment);

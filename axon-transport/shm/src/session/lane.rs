@@ -8,7 +8,7 @@
 use std::sync::{Arc, atomic::AtomicU64};
 
 use crate::{
-    alloc::{allowance::Allowance, heap::Object},
+    alloc::{heap::Object, pin_limit::PinLimit},
     ids::Gid,
     memory::segment::Map,
     ring::{
@@ -62,15 +62,15 @@ pub(crate) struct Tenancy {
 
 impl Tenancy {
     /// Publisher: gives a generation to the reader that asked with this lane.
-    pub(crate) fn grant<W: Word>(lane: &[W], allowance: Allowance) -> Self {
+    pub(crate) fn grant<W: Word>(lane: &[W], pin_limit: PinLimit) -> Self {
         let asked = lane[GENERATION].load(Site::GenerationLoad.order());
         let random = rand::random_range(1..ASKED >> 30) << 30;
-        Self { asked, generation: random | allowance.bits() | asked & TIME }
+        Self { asked, generation: random | pin_limit.bits() | asked & TIME }
     }
 
     /// What its reader may pin.
-    pub(crate) fn allowance(&self) -> Allowance {
-        Allowance::of(self.generation)
+    pub(crate) fn pin_limit(&self) -> PinLimit {
+        PinLimit::of(self.generation)
     }
 
     /// Publisher: whether the lane is as it was when the reader asked.

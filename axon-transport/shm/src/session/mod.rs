@@ -6,7 +6,7 @@ pub(crate) mod lane;
 pub(crate) mod leader;
 pub(crate) mod orphans;
 pub(crate) mod peer;
+pub(crate) mod pin_lanes;
 pub(crate) mod reader_info;
-pub(crate) mod seats;
 pub(crate) mod segment;
 pub(crate) mod segment_message;

@@ -7,13 +7,13 @@ use crate::{
         heap::{Block, Heap},
         segments::Segments,
     },
-    session::seats::Seats,
+    session::pin_lanes::PinLanes,
 };
 
 /// One publisher's memory.
 pub(crate) struct Orphan {
     /// Those who may be reading it.
-    pub(crate) seats: Seats,
+    pub(crate) pin_lanes: PinLanes,
     pub(crate) blocks: Vec<Block>,
     /// The numbers of the segments of its large samples.
     pub(crate) samples: Vec<u32>,
@@ -32,8 +32,8 @@ impl Orphans {
     pub(crate) fn sweep(&self, heap: &Heap, segments: &Segments) -> bool {
         let mut orphans = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         orphans.retain_mut(|orphan| {
-            orphan.seats.sweep(|_| true);
-            if !orphan.seats.is_empty() {
+            orphan.pin_lanes.sweep(|_| true);
+            if !orphan.pin_lanes.is_empty() {
                 return true;
             }
             orphan.blocks.drain(..).for_each(|block| heap.release(block));

@@ -27,7 +27,7 @@ use crate::{
         orphans::{Orphan, Orphans},
         peer::PeerDescriptors,
     },
-    wake::{Doorbell, Knock, Look, PassedOn, Purpose, due, waits},
+    wake::{Doorbell, ForwardedWakeups, Look, Purpose, WakeListener, due, waits},
 };
 
 /// The memory, doorbell and identity by which other sessions know this one.
@@ -195,8 +195,12 @@ impl SessionSegment {
 
     /// Has `elsewhere`, another session of this process where a thread waits, look again when `look` may
     /// be ready, until what this returns is dropped. Somebody must listen for the session meanwhile.
-    pub fn pass_on(&self, look: Arc<dyn Look>, elsewhere: &Arc<SessionSegment>) -> PassedOn<'_> {
-        self.doorbell.pass_on(self.armed_words(), look, elsewhere.clone())
+    pub fn forward_wakeups(
+        &self,
+        look: Arc<dyn Look>,
+        elsewhere: &Arc<SessionSegment>,
+    ) -> ForwardedWakeups<'_> {
+        self.doorbell.forward_wakeups(self.armed_words(), look, elsewhere.clone())
     }
 
     /// Somebody calls [`notify`](Self::notify) when a process ends that might have rung.
@@ -214,7 +218,7 @@ impl SessionSegment {
 
     /// Makes the listening thread, and through it the threads that follow it, look again. Async-signal-safe.
     #[inline]
-    pub fn knock(&self) {
+    pub fn wake_listener(&self) {
         if !self.is_forked() {
             self.doorbell.ring_own();
         }
@@ -341,9 +345,9 @@ impl SessionSegment {
     }
 }
 
-impl Knock for SessionSegment {
+impl WakeListener for SessionSegment {
     #[inline]
-    fn knock(&self) {
-        self.knock();
+    fn wake_listener(&self) {
+        self.wake_listener();
     }
 }

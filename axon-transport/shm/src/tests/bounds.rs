@@ -1,7 +1,7 @@
 //! What one process can take of another: only so much.
 
 use super::*;
-use crate::{memory::segment::Segment, session::seats::OF_PROCESS};
+use crate::{memory::segment::Segment, session::pin_lanes::OF_PROCESS};
 
 /// A segment as a session would announce it: of address space, and of next to no memory.
 fn sparse(of: &SessionSegment, number: u32, bytes: u64) -> Segment {
@@ -85,7 +85,7 @@ fn a_process_gets_no_more_lanes_of_a_ring_than_it_may() {
         assert!(lanes.len() <= OF_PROCESS, "there is an end");
     };
     assert!(refused.to_string().contains("its process has as many readers"), "{refused}");
-    assert_eq!((lanes.len(), writer.lock().audience.seats()), (OF_PROCESS, OF_PROCESS));
+    assert_eq!((lanes.len(), writer.lock().audience.pin_lanes()), (OF_PROCESS, OF_PROCESS));
     let mut gids = writer.readers();
     gids.sort();
     let mut both = sessions.each_ref().map(|session| Gid::new(session.id(), 7));

@@ -92,7 +92,7 @@ fn what_goes_for_want_of_memory_though_late_joiners_were_to_get_it_is_counted() 
     let all =
         Qos { history: History::KeepAll, reliability: Reliability::Reliable, ..Qos::default() };
     let writer = writer(&ours, transient(all), MAX);
-    headroom::PRETENDED.set(Some(0));
+    available::PRETENDED.set(Some(0));
     for sequence in 1..=MANY {
         writer.publish(meta(sequence), &pattern(sequence, 8)).unwrap();
     }
@@ -115,7 +115,7 @@ fn a_reader_is_not_blamed_where_memory_is_short() {
         Qos { history: History::KeepAll, reliability: Reliability::Reliable, ..Qos::default() };
     let writer = writer(&ours, all, MAX);
     let mut reader = attach(&writer, &ours, &theirs, all);
-    headroom::PRETENDED.set(Some(0));
+    available::PRETENDED.set(Some(0));
     let mut last = 0;
     for len in [8, 1000] {
         let (before, mut taken) = (last, 0);

@@ -26,7 +26,7 @@ use crate::{
     direct::connect::{self, ConnectError},
     error::{PublishError, ShmError, TakeError},
     ids::{Gid, SessionId},
-    memory::headroom,
+    memory::available,
     qos::{Durability, History, Qos},
     reader::{Reader, ReaderOptions},
     ring::{

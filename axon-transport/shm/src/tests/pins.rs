@@ -37,8 +37,8 @@ fn retired(writer: &Writer) -> usize {
     writer.lock().history.pinned().retired().len()
 }
 
-fn seats(writer: &Writer) -> usize {
-    writer.lock().audience.seats()
+fn pin_lanes(writer: &Writer) -> usize {
+    writer.lock().audience.pin_lanes()
 }
 
 #[test]
@@ -194,7 +194,7 @@ fn nothing_that_ends_ends_a_sample_in_use() {
     drop(b);
     (50..100).for_each(|sequence| publish(&writer, sequence, LARGE));
     intact(&sample);
-    assert_eq!(seats(&writer), 1);
+    assert_eq!(pin_lanes(&writer), 1);
     // The publisher ends.
     drop(writer);
     intact(&sample);
@@ -212,7 +212,7 @@ fn what_is_dropped_is_forgotten() {
     drop(sample);
     assert_eq!(b.allocate_lane().unwrap().location(), lane, "the lane is free again");
     (1..4).for_each(|sequence| publish(&writer, sequence, LARGE));
-    assert_eq!(seats(&writer), 0);
+    assert_eq!(pin_lanes(&writer), 0);
     assert!(retired(&writer) <= 1);
 }
 
@@ -502,9 +502,9 @@ fn asking_for_ever_takes_no_memory() {
         grants.push(writer.attach(info).unwrap());
         assert!(writer.detach(Gid::new(b.id(), 1)));
     }
-    assert_eq!(seats(&writer), 3);
+    assert_eq!(pin_lanes(&writer), 3);
     assert_eq!(grants[0], grants[297]);
     drop(lanes);
     assert!(writer.drop_dead().is_empty());
-    assert_eq!(seats(&writer), 0);
+    assert_eq!(pin_lanes(&writer), 0);
 }

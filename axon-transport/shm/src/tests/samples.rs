@@ -260,7 +260,7 @@ fn nothing_is_given_up_for_a_sample_that_there_is_no_memory_for() {
         let sequences: Vec<u64> = taken.map(|sample| sample.meta().sequence).collect();
         assert_eq!(sequences, expected);
     };
-    headroom::PRETENDED.set(Some(0));
+    available::PRETENDED.set(Some(0));
     // The budget is full, so that all but one would go for it.
     let refused = writer.loan(MAX as usize).map(drop);
     assert!(matches!(refused, Err(PublishError::NoMemory { .. })), "{refused:?}");

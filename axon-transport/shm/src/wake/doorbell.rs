@@ -10,7 +10,7 @@ use rustix::{event::Timespec, io::Errno};
 
 use super::{
     Bell, arm, disarm,
-    ear::{CLOSED, Drained, Ear, Heard},
+    receiver::{BellReceiver, CLOSED, Drained, Heard},
     spin::Spin,
 };
 
@@ -39,9 +39,9 @@ pub trait Look: Send + Sync {
 }
 
 /// A session of this process, at whose doorbell a thread may sleep.
-pub(crate) trait Knock: Send + Sync {
+pub(crate) trait WakeListener: Send + Sync {
     /// Makes the thread that listens there look again.
-    fn knock(&self);
+    fn wake_listener(&self);
 }
 
 /// Who of this process sleeps, and who of them listens for all.
@@ -50,15 +50,15 @@ pub(crate) trait Knock: Send + Sync {
 /// have something. These sleep until then. All tickets are given out under the lock, so the armed
 /// words only rise and a ringer never mistakes a new ticket for one it has rung for.
 pub(crate) struct Doorbell {
-    ear: Ear,
-    crowd: Mutex<Crowd>,
+    receiver: BellReceiver,
+    waiters: Mutex<Waiters>,
     spin: Spin,
     /// Where a leader that is to make way says that it has.
     way: Condvar,
 }
 
 #[derive(Default)]
-struct Crowd {
+struct Waiters {
     /// Counts what may concern a waiter.
     epoch: u64,
     ticket: u64,
@@ -91,13 +91,13 @@ struct Follower {
     turn: Condvar,
     look: Option<Arc<dyn Look>>,
     /// It sleeps at the session's doorbell.
-    elsewhere: Option<Arc<dyn Knock>>,
+    elsewhere: Option<Arc<dyn WakeListener>>,
 }
 
 impl Follower {
     fn wake(&self) {
         match &self.elsewhere {
-            Some(session) => session.knock(),
+            Some(session) => session.wake_listener(),
             None => self.turn.notify_one(),
         }
     }
@@ -106,8 +106,8 @@ impl Follower {
 impl Doorbell {
     pub(crate) fn new() -> Result<Self, Errno> {
         Ok(Self {
-            ear: Ear::new()?,
-            crowd: Mutex::default(),
+            receiver: BellReceiver::new()?,
+            waiters: Mutex::default(),
             spin: Spin::new(),
             way: Condvar::new(),
         })
@@ -115,12 +115,12 @@ impl Doorbell {
 
     /// The end that others ring.
     pub(crate) fn bell(&self) -> &Bell {
-        self.ear.bell()
+        self.receiver.bell()
     }
 
     /// Rings from this very process, whatever others do to the bell.
     pub(crate) fn ring_own(&self) {
-        self.ear.knock();
+        self.receiver.wake_self();
     }
 
     /// Waits until `ready`, asked again after each ring, each [`Doorbell::notify`] and each event
@@ -154,9 +154,9 @@ impl Doorbell {
         let _waiting = Waiting::new(self, words, purpose);
         loop {
             let armed_at = {
-                let mut crowd = self.lock();
-                crowd.arm(&self.ear, &[words[purpose as usize]]);
-                crowd.epoch
+                let mut waiters = self.lock();
+                waiters.arm(&self.receiver, &[words[purpose as usize]]);
+                waiters.epoch
             };
             if ready() {
                 self.spin.slept(start.elapsed());
@@ -183,13 +183,13 @@ impl Doorbell {
 
     /// Makes every waiter of this process look again.
     pub(crate) fn notify(&self) {
-        let mut crowd = self.lock();
-        crowd.epoch += 1;
-        crowd.followers.iter().for_each(|follower| follower.wake());
-        let heard = crowd.leader != Leader::None;
-        drop(crowd);
+        let mut waiters = self.lock();
+        waiters.epoch += 1;
+        waiters.followers.iter().for_each(|follower| follower.wake());
+        let heard = waiters.leader != Leader::None;
+        drop(waiters);
         if heard {
-            self.ear.knock();
+            self.receiver.wake_self();
         }
     }
 
@@ -202,64 +202,64 @@ impl Doorbell {
         others: &[BorrowedFd<'_>],
         left: Option<Duration>,
     ) {
-        let mut crowd = self.lock();
-        if crowd.epoch != armed_at {
+        let mut waiters = self.lock();
+        if waiters.epoch != armed_at {
             return;
         }
-        if crowd.leader != Leader::None || crowd.coming {
-            self.follow(crowd, look.map(|look| look()), left);
+        if waiters.leader != Leader::None || waiters.coming {
+            self.follow(waiters, look.map(|look| look()), left);
             return;
         }
-        crowd.leader = Leader::Thread;
-        let left = crowd.not_too_long(left);
-        drop(crowd);
-        let heard = self.ear.listen(others, left);
-        let mut crowd = self.lock();
-        crowd.leader = Leader::None;
-        if crowd.coming {
+        waiters.leader = Leader::Thread;
+        let left = waiters.not_too_long(left);
+        drop(waiters);
+        let heard = self.receiver.listen(others, left);
+        let mut waiters = self.lock();
+        waiters.leader = Leader::None;
+        if waiters.coming {
             self.way.notify_all();
         }
-        self.spread(crowd, words, heard);
+        self.spread(waiters, words, heard);
     }
 
     fn follow(
         &self,
-        mut crowd: MutexGuard<'_, Crowd>,
+        mut waiters: MutexGuard<'_, Waiters>,
         look: Option<Arc<dyn Look>>,
         left: Option<Duration>,
     ) {
         let follower = Arc::new(Follower { turn: Condvar::new(), look, elsewhere: None });
-        crowd.followers.push(Arc::clone(&follower));
-        crowd = match crowd.not_too_long(left) {
+        waiters.followers.push(Arc::clone(&follower));
+        waiters = match waiters.not_too_long(left) {
             Some(left) => {
-                let woken = follower.turn.wait_timeout(crowd, left);
+                let woken = follower.turn.wait_timeout(waiters, left);
                 woken.unwrap_or_else(PoisonError::into_inner).0
             }
-            None => follower.turn.wait(crowd).unwrap_or_else(PoisonError::into_inner),
+            None => follower.turn.wait(waiters).unwrap_or_else(PoisonError::into_inner),
         };
-        crowd.followers.retain(|other| !Arc::ptr_eq(other, &follower));
+        waiters.followers.retain(|other| !Arc::ptr_eq(other, &follower));
     }
 
-    /// Wakes those of the crowd that what was heard may concern.
-    fn spread(&self, mut crowd: MutexGuard<'_, Crowd>, words: Words<'_>, heard: Heard) {
-        if heard.closed && !crowd.closed {
-            crowd.give_up(&self.ear, "closed the session's doorbell");
+    /// Wakes those of the waiters that what was heard may concern.
+    fn spread(&self, mut waiters: MutexGuard<'_, Waiters>, words: Words<'_>, heard: Heard) {
+        if heard.closed && !waiters.closed {
+            waiters.give_up(&self.receiver, "closed the session's doorbell");
         }
-        crowd.queued = (crowd.queued || heard.queued) && !crowd.closed;
-        let rung = heard.rung || (heard.tick && crowd.closed);
+        waiters.queued = (waiters.queued || heard.queued) && !waiters.closed;
+        let rung = heard.rung || (heard.tick && waiters.closed);
         if !rung {
             return;
         }
-        crowd.epoch += 1;
-        if crowd.followers.is_empty() {
+        waiters.epoch += 1;
+        if waiters.followers.is_empty() {
             return;
         }
-        let followers = crowd.followers.clone();
+        let followers = waiters.followers.clone();
         if followers.iter().any(|follower| follower.look.is_some()) {
             // What comes after a look must ring again.
-            crowd.arm(&self.ear, &[words[Purpose::Samples as usize]]);
+            waiters.arm(&self.receiver, &[words[Purpose::Samples as usize]]);
         }
-        drop(crowd);
+        drop(waiters);
         for follower in followers {
             if follower.look.as_ref().is_none_or(|look| look.ready()) {
                 follower.wake();
@@ -269,101 +269,101 @@ impl Doorbell {
 
     /// Has the doorbell of `elsewhere`, where a thread of this process sleeps, rung when `look` may be
     /// ready, until what this returns is dropped. Somebody must listen here meanwhile.
-    pub(crate) fn pass_on<'a>(
+    pub(crate) fn forward_wakeups<'a>(
         &'a self,
         words: Words<'a>,
         look: Arc<dyn Look>,
-        elsewhere: Arc<dyn Knock>,
-    ) -> PassedOn<'a> {
+        elsewhere: Arc<dyn WakeListener>,
+    ) -> ForwardedWakeups<'a> {
         let waiting = Waiting::new(self, words, Purpose::Samples);
         let (look, elsewhere) = (Some(look), Some(elsewhere));
         let follower = Arc::new(Follower { turn: Condvar::new(), look, elsewhere });
-        let mut crowd = self.lock();
-        crowd.followers.push(follower.clone());
-        crowd.arm(&self.ear, &[words[Purpose::Samples as usize]]);
-        PassedOn { follower, waiting }
+        let mut waiters = self.lock();
+        waiters.followers.push(follower.clone());
+        waiters.arm(&self.receiver, &[words[Purpose::Samples as usize]]);
+        ForwardedWakeups { follower, waiting }
     }
 
     /// An event loop leads from now on; `false` when another one does already.
     pub(crate) fn lead_from_outside(&self) -> bool {
-        let mut crowd = self.lock();
-        if crowd.coming || crowd.leader == Leader::External {
+        let mut waiters = self.lock();
+        if waiters.coming || waiters.leader == Leader::External {
             return false;
         }
-        crowd.coming = true;
-        while crowd.leader == Leader::Thread {
+        waiters.coming = true;
+        while waiters.leader == Leader::Thread {
             // It gives up the lead when it next wakes, which is now.
-            self.ear.knock();
-            crowd = self.way.wait(crowd).unwrap_or_else(PoisonError::into_inner);
+            self.receiver.wake_self();
+            waiters = self.way.wait(waiters).unwrap_or_else(PoisonError::into_inner);
         }
-        crowd.coming = false;
-        crowd.leader = Leader::External;
-        crowd.pace(&self.ear);
+        waiters.coming = false;
+        waiters.leader = Leader::External;
+        waiters.pace(&self.receiver);
         true
     }
 
     /// The event loop takes what came.
     pub(crate) fn take_from_outside(&self, words: Words<'_>) {
-        let heard = self.ear.take(Some(&Timespec::default()));
+        let heard = self.receiver.take(Some(&Timespec::default()));
         self.spread(self.lock(), words, heard);
     }
 
     /// The event loop is about to sleep.
     pub(crate) fn arm_from_outside(&self, words: Words<'_>, purposes: &[Purpose]) {
-        let mut crowd = self.lock();
+        let mut waiters = self.lock();
         for &purpose in purposes {
-            crowd.external[purpose as usize] = true;
-            crowd.arm(&self.ear, &[words[purpose as usize]]);
+            waiters.external[purpose as usize] = true;
+            waiters.arm(&self.receiver, &[words[purpose as usize]]);
         }
     }
 
     /// The event loop is not going to sleep.
     pub(crate) fn disarm_from_outside(&self, words: Words<'_>) {
-        let mut crowd = self.lock();
-        crowd.external = [false; 2];
-        PURPOSES.iter().for_each(|&purpose| crowd.disarm_idle(purpose, words));
+        let mut waiters = self.lock();
+        waiters.external = [false; 2];
+        PURPOSES.iter().for_each(|&purpose| waiters.disarm_idle(purpose, words));
     }
 
     /// The event loop leads no more.
     pub(crate) fn leave_from_outside(&self) {
-        let mut crowd = self.lock();
-        crowd.leader = Leader::None;
-        crowd.pace(&self.ear);
-        crowd.hand_over();
+        let mut waiters = self.lock();
+        waiters.leader = Leader::None;
+        waiters.pace(&self.receiver);
+        waiters.hand_over();
     }
 
     /// As where the kernel cannot keep descriptors out of the bell.
     #[cfg(test)]
     pub(crate) fn let_rights_pass(&mut self) {
-        self.ear.let_rights_pass();
+        self.receiver.let_rights_pass();
     }
 
-    fn lock(&self) -> MutexGuard<'_, Crowd> {
-        self.crowd.lock().unwrap_or_else(PoisonError::into_inner)
+    fn lock(&self) -> MutexGuard<'_, Waiters> {
+        self.waiters.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl AsFd for Doorbell {
     /// Readable when it rang.
     fn as_fd(&self) -> BorrowedFd<'_> {
-        self.ear.as_fd()
+        self.receiver.as_fd()
     }
 }
 
 /// A follower that sleeps elsewhere, until it is dropped.
-pub struct PassedOn<'a> {
+pub struct ForwardedWakeups<'a> {
     follower: Arc<Follower>,
     waiting: Waiting<'a>,
 }
 
-impl Drop for PassedOn<'_> {
+impl Drop for ForwardedWakeups<'_> {
     fn drop(&mut self) {
-        let mut crowd = self.waiting.doorbell.lock();
-        crowd.followers.retain(|other| !Arc::ptr_eq(other, &self.follower));
+        let mut waiters = self.waiting.doorbell.lock();
+        waiters.followers.retain(|other| !Arc::ptr_eq(other, &self.follower));
     }
 }
 
-/// One of the crowd, until it is dropped.
+/// One of the waiters, until it is dropped.
 struct Waiting<'a> {
     doorbell: &'a Doorbell,
     words: Words<'a>,
@@ -379,25 +379,27 @@ impl<'a> Waiting<'a> {
 
 impl Drop for Waiting<'_> {
     fn drop(&mut self) {
-        let mut crowd = self.doorbell.lock();
-        crowd.waiting[self.purpose as usize] -= 1;
-        crowd.disarm_idle(self.purpose, self.words);
-        crowd.hand_over();
+        let mut waiters = self.doorbell.lock();
+        waiters.waiting[self.purpose as usize] -= 1;
+        waiters.disarm_idle(self.purpose, self.words);
+        waiters.hand_over();
     }
 }
 
-impl Crowd {
+impl Waiters {
     /// Gives out a new ticket.
-    fn arm(&mut self, ear: &Ear, words: &[&AtomicU64]) {
+    fn arm(&mut self, receiver: &BellReceiver, words: &[&AtomicU64]) {
         if self.queued {
-            let drained = ear.drain();
+            let drained = receiver.drain();
             self.queued = drained == Drained::Some;
             match drained {
                 Drained::All => {}
                 // A ring whose event was still to come may have been taken with the others, and
                 // somebody sleeps who relies on it.
-                Drained::Some => ear.knock(),
-                Drained::Rights => self.give_up(ear, "put descriptors into the session's doorbell"),
+                Drained::Some => receiver.wake_self(),
+                Drained::Rights => {
+                    self.give_up(receiver, "put descriptors into the session's doorbell")
+                }
             }
         }
         self.ticket += 1;
@@ -405,24 +407,24 @@ impl Crowd {
     }
 
     /// The bell is of no use any more: there is a look for news by time.
-    fn give_up(&mut self, ear: &Ear, what: &str) {
+    fn give_up(&mut self, receiver: &BellReceiver, what: &str) {
         self.closed = true;
-        ear.give_up();
-        self.pace(ear);
+        receiver.give_up();
+        self.pace(receiver);
         tracing::error!(
             "another process {what}: from now on it looks for news every few milliseconds"
         );
     }
 
     /// Has who listens woken for nothing as often as is needed.
-    fn pace(&self, ear: &Ear) {
+    fn pace(&self, receiver: &BellReceiver) {
         let interval = match self.leader {
             _ if self.closed => Some(CLOSED),
             // Threads that listen see to it themselves.
             Leader::External => self.longest(),
             Leader::None | Leader::Thread => None,
         };
-        ear.tick(interval);
+        receiver.tick(interval);
     }
 
     fn longest(&self) -> Option<Duration> {

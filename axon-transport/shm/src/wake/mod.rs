@@ -6,7 +6,7 @@
 
 mod bell;
 mod doorbell;
-mod ear;
+mod receiver;
 mod spin;
 mod ticket;
 
@@ -14,6 +14,6 @@ mod ticket;
 mod tests;
 
 pub(crate) use bell::Bell;
-pub(crate) use doorbell::{Doorbell, Knock, PURPOSES};
-pub use doorbell::{Look, PassedOn, Purpose};
+pub(crate) use doorbell::{Doorbell, PURPOSES, WakeListener};
+pub use doorbell::{ForwardedWakeups, Look, Purpose};
 pub(crate) use ticket::{arm, disarm, due, settle, waits};

@@ -16,7 +16,7 @@ use rustix::{
     net::{RecvFlags, Shutdown, recv, shutdown},
 };
 
-use super::{Bell, Doorbell, Look, Purpose, arm, disarm, due, ear::whole_millis, settle};
+use super::{Bell, Doorbell, Look, Purpose, arm, disarm, due, receiver::whole_millis, settle};
 use crate::{
     ids::SessionId,
     os::descriptors::{

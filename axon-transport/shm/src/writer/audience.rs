@@ -3,7 +3,7 @@
 use std::{collections::HashSet, sync::Arc, time::Duration};
 
 use crate::{
-    alloc::allowance::Pool,
+    alloc::pin_limit::Pool,
     error::ShmError,
     ids::Gid,
     qos::{Durability, History, Qos},
@@ -14,8 +14,8 @@ use crate::{
     session::{
         lane::{self, LaneView, Standing, Tenancy},
         peer::{Peer, PeerSession},
+        pin_lanes::{Holder, PinLanes, Pinned},
         reader_info::ReaderInfo,
-        seats::{Holder, Pinned, Seats},
     },
     wake::Purpose,
     writer::absent::Absences,
@@ -32,7 +32,7 @@ pub(crate) struct Audience {
     /// Those that carried samples to others and whose process ended.
     absent: Absences,
     /// Their lanes, and those of readers that were here and may hold samples still.
-    seats: Seats,
+    pin_lanes: PinLanes,
     /// Their sessions, each once, shared with publishes that ring after they have unlocked.
     peers: Arc<[Peer]>,
     window: u64,
@@ -142,7 +142,7 @@ impl Audience {
             capacity,
             readers: Vec::new(),
             absent: Absences::default(),
-            seats: Seats::new(pool),
+            pin_lanes: PinLanes::new(pool),
             peers: Arc::new([]),
             window: 0,
             given_up: 0,
@@ -239,7 +239,7 @@ impl Audience {
         let absent = self.absent.position_of(&info.gid);
         let resumed = absent.into_iter().chain(resumed).min();
         let first = resumed.map_or(first, |resumed| resumed.clamp(tail, head).min(first));
-        let tenancy = self.seats.admit(info.gid, &info.peer, info.lane, &lane)?;
+        let tenancy = self.pin_lanes.admit(info.gid, &info.peer, info.lane, &lane)?;
         let grant = Grant { generation: tenancy.generation(), first };
         self.detach(info.gid, head);
         self.joined(&info);
@@ -274,8 +274,8 @@ impl Audience {
     }
 
     /// The lanes of those that may be reading still.
-    pub(crate) fn into_seats(self) -> Seats {
-        self.seats
+    pub(crate) fn into_pin_lanes(self) -> PinLanes {
+        self.pin_lanes
     }
 
     pub(crate) fn detach(&mut self, reader: Gid, head: u64) -> bool {
@@ -298,23 +298,23 @@ impl Audience {
     /// Adds to `found` the positions that any reader pins, after
     /// [`about_to_scan`](crate::ring::pins::about_to_scan).
     pub(crate) fn scan(&mut self, found: &mut Pinned) {
-        self.seats.scan(found);
+        self.pin_lanes.scan(found);
     }
 
     /// A reader that pins one of `positions`, and its session where that is not our own; `None` when
     /// looking for it found that some of those that did are dead.
     pub(crate) fn holder(&mut self, positions: &[u64]) -> Option<Holder> {
-        if self.seats.sweep(|_| true) { None } else { self.seats.holder(positions) }
+        if self.pin_lanes.sweep(|_| true) { None } else { self.pin_lanes.holder(positions) }
     }
 
     #[cfg(test)]
-    pub(crate) fn seats(&self) -> usize {
-        self.seats.len()
+    pub(crate) fn pin_lanes(&self) -> usize {
+        self.pin_lanes.len()
     }
 
     /// Forgets those that may keep samples no longer, as they have left or their process has ended.
     pub(crate) fn sweep(&mut self) {
-        self.seats.sweep(|_| true);
+        self.pin_lanes.sweep(|_| true);
     }
 
     /// Stops counting on readers whose process has ended; [`Self::drop_dead`] names them. What a relay
@@ -383,7 +383,7 @@ impl Audience {
         if !gids.is_empty() {
             self.changed();
         }
-        self.seats.sweep(|_| true);
+        self.pin_lanes.sweep(|_| true);
         gids
     }
 
@@ -481,6 +481,6 @@ impl Audience {
         // Nobody watches the processes of those that are not attached any more.
         let attached: HashSet<u64> =
             self.readers.iter().map(|reader| reader.grant.generation).collect();
-        self.seats.sweep(|seat| !attached.contains(&seat.tenancy.generation()));
+        self.pin_lanes.sweep(|lane| !attached.contains(&lane.tenancy.generation()));
     }
 }

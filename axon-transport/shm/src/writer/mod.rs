@@ -18,9 +18,9 @@ pub(super) use self::commit::Patience;
 
 use crate::{
     alloc::{
-        allowance::Pool,
         area::Area,
         heap::{Need, Object},
+        pin_limit::Pool,
     },
     error::{PublishError, ShmError},
     ids::Gid,
@@ -35,8 +35,8 @@ use crate::{
     },
     session::{
         orphans::Orphan,
+        pin_lanes::Pinned,
         reader_info::{ReaderInfo, Terms},
-        seats::Pinned,
         segment::SessionSegment,
     },
     writer::{
@@ -500,6 +500,6 @@ impl Drop for Writer {
         let mut blocks = vec![self.ring.block, array.block];
         blocks.extend(history.all_blocks());
         let samples = history.pinned().segments().collect();
-        self.session.adopt(Orphan { seats: audience.into_seats(), blocks, samples });
+        self.session.adopt(Orphan { pin_lanes: audience.into_pin_lanes(), blocks, samples });
     }
 }

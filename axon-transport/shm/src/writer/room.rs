@@ -14,7 +14,7 @@ use crate::{
         layout::{self, Array, COPIED},
         protocol,
     },
-    session::seats::Holder,
+    session::pin_lanes::Holder,
     writer::{State, Writer, history::Held},
 };
 

@@ -8,7 +8,7 @@ use std::{
 
 use crate::{
     alloc::{
-        allowance::samples_bytes,
+        pin_limit::samples_bytes,
         retention::Retention,
         segments::{OwnSegment, SegmentEvent},
         slots::TURNS,
@@ -19,7 +19,7 @@ use crate::{
         pins::{self, RECORDS},
         protocol,
     },
-    session::seats::Holder,
+    session::pin_lanes::Holder,
     writer::{
         LOOKS, State, Writer,
         history::Held,

@@ -11,7 +11,7 @@ use std::{
     time::Instant,
 };
 
-use axon_shm::{ExternalLeader, internal::passed::PassedFd};
+use axon_shm::{ExternalLeader, internal::descriptors::PassedFd};
 use rustix::io::Errno;
 
 use self::matching::{Source, take};

@@ -5,7 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_shm::internal::{SessionSegment, out_of_reach, passed::PassedFd};
+use axon_shm::internal::{SessionSegment, descriptors::PassedFd, out_of_reach};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::{

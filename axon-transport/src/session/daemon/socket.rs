@@ -8,7 +8,7 @@ use std::{
     os::fd::{AsFd, AsRawFd, BorrowedFd, FromRawFd, OwnedFd},
 };
 
-use axon_shm::internal::passed::{self, Packet, PassedFd};
+use axon_shm::internal::descriptors::{self, Packet, PassedFd};
 use rustix::{
     io::Errno,
     net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg},
@@ -169,9 +169,9 @@ pub fn send(
 /// for [`SocketError::NoDescriptors`]: the packet is gone, and the next ones may come whole.
 pub fn receive(socket: impl AsFd, buffer: &mut Vec<u8>) -> Result<Received, SocketError> {
     buffer.resize(MAX_PACKET + 1, 0);
-    let packet = match passed::receive(&socket, buffer) {
+    let packet = match descriptors::receive(&socket, buffer) {
         // Said once, before what the other end has sent: it closed without having read all of ours.
-        Err(Errno::CONNRESET) => passed::receive(&socket, buffer),
+        Err(Errno::CONNRESET) => descriptors::receive(&socket, buffer),
         received => received,
     };
     let Packet { bytes, truncated, lost, descriptors } = packet?;

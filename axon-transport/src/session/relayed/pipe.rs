@@ -7,7 +7,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_shm::{ExternalLeader, PublishError, Sample, internal::passed::PassedFd};
+use axon_shm::{ExternalLeader, PublishError, Sample, internal::descriptors::PassedFd};
 use rustix::{
     event::{PollFd, PollFlags, Timespec, poll},
     net::{Shutdown, shutdown},

@@ -3,7 +3,7 @@
 use loom::{sync::Arc, thread};
 
 use crate::{
-    alloc::allowance::Allowance,
+    alloc::pin_limit::PinLimit,
     ring::{
         layout::{LANE_WORDS, lane::CURSOR},
         pins::{about_to_scan, pin, unpin},
@@ -12,7 +12,7 @@ use crate::{
     },
     session::{
         lane::{self, Standing, Tenancy},
-        seats::{Pinned, scan},
+        pin_lanes::{Pinned, scan},
     },
     sync::{Ordering, Word},
     tests::model::{Cell, Ring, check, granted, zeros},
@@ -25,7 +25,7 @@ fn a_lane_that_is_open_shows_the_cursor_of_its_reader() {
         let lane = zeros(LANE_WORDS);
         Word::store(&lane[CURSOR], 9, Ordering::Relaxed);
         lane::ask(&lane[..], 1);
-        let tenancy = Tenancy::grant(&lane[..], Allowance::ALL);
+        let tenancy = Tenancy::grant(&lane[..], PinLimit::ALL);
         let reader = {
             let lane = lane.clone();
             thread::spawn(move || {
@@ -54,7 +54,7 @@ fn what_is_given_up_shows_before_the_cursor_that_passes_it() {
                 lane::advance(&lane[..], 5);
                 lane::close(&lane[..]);
                 lane::ask(&lane[..], 2);
-                let next = Tenancy::grant(&lane[..], Allowance::ALL).generation();
+                let next = Tenancy::grant(&lane[..], PinLimit::ALL).generation();
                 lane::open(&lane[..], Grant { generation: next, first: 0 });
                 lane::give_up(&lane[..], next, 7);
             })
@@ -108,7 +108,7 @@ fn a_reader_that_opens_its_lane_and_pins_is_seen() {
         let ring = Ring::new();
         let lane = zeros(LANE_WORDS);
         lane::ask(&lane[..], 1);
-        let tenancy = Tenancy::grant(&lane[..], Allowance::ALL);
+        let tenancy = Tenancy::grant(&lane[..], PinLimit::ALL);
         let cell = Arc::new(Cell::new(1));
         ring.show(0);
         let reader = {

@@ -16,7 +16,7 @@ mod ring;
 use loom::sync::{Arc, atomic::AtomicU64};
 
 use crate::{
-    alloc::allowance::Allowance,
+    alloc::pin_limit::PinLimit,
     ring::{
         layout::{DESCRIPTOR_WORDS, LANE_WORDS, RING_WORDS, ring::TAIL},
         protocol::{Place, Record, View, about_to_write, publish},
@@ -99,7 +99,7 @@ fn record(position: u64, place: Place) -> Record {
 fn granted(first: u64) -> (Arc<Vec<AtomicU64>>, Tenancy) {
     let lane = zeros(LANE_WORDS);
     lane::ask(&lane[..], 1);
-    let tenancy = Tenancy::grant(&lane[..], Allowance::ALL);
+    let tenancy = Tenancy::grant(&lane[..], PinLimit::ALL);
     lane::open(&lane[..], Grant { generation: tenancy.generation(), first });
     (lane, tenancy)
 }

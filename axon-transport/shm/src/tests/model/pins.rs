@@ -12,7 +12,7 @@ use crate::{
     },
     session::{
         lane::{self, Tenancy},
-        seats::{Pinned, scan},
+        pin_lanes::{Pinned, scan},
     },
     tests::model::{Cell, Ring, check, granted},
 };

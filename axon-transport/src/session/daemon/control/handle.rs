@@ -4,7 +4,7 @@ use std::{collections::HashSet, sync::Arc};
 
 use axon_shm::{
     ShmError,
-    internal::{Grant, Location, Peer, ReaderInfo, Terms, passed::PassedFd},
+    internal::{Grant, Location, Peer, ReaderInfo, Terms, descriptors::PassedFd},
 };
 
 use super::{Control, Link, stands_for, trail};

@@ -9,7 +9,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_shm::internal::passed::PassedFd;
+use axon_shm::internal::descriptors::PassedFd;
 
 use super::{Control, Link};
 use crate::{

@@ -15,7 +15,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_shm::{ExternalLeader, ShmError, internal::passed::PassedFd};
+use axon_shm::{ExternalLeader, ShmError, internal::descriptors::PassedFd};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::{

@@ -17,7 +17,7 @@ use std::{
 
 use axon_shm::{
     ExternalLeader,
-    internal::{BlockedSignals, passed::PassedFd},
+    internal::{BlockedSignals, descriptors::PassedFd},
 };
 
 use self::{relays::Relay, stand_ins::StandIn};

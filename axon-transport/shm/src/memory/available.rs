@@ -26,7 +26,7 @@ thread_local! {
 }
 
 /// Bytes available to this process, or `None` where the system does not tell.
-pub(crate) fn available() -> Option<u64> {
+pub(crate) fn bytes() -> Option<u64> {
     at_most(u64::MAX)
 }
 
@@ -168,7 +168,7 @@ mod tests {
 
     #[test]
     fn this_host_tells() {
-        assert!(available().is_some_and(|bytes| bytes > 0));
+        assert!(bytes().is_some_and(|bytes| bytes > 0));
         assert!(matches!(check(u64::MAX), Err(ShmError::NoMemory { .. })));
     }
 }

@@ -19,12 +19,12 @@ const PART: u64 = 16;
 
 /// The longest sample that a reader may pin: a power of two in bytes, or none at all.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Allowance {
+pub(crate) struct PinLimit {
     /// Its binary logarithm; 0 for none.
     power: u32,
 }
 
-impl Allowance {
+impl PinLimit {
     pub(crate) const NONE: Self = Self { power: 0 };
     /// For readers in the publisher's own session, to which it may do what it likes.
     pub(crate) const ALL: Self = Self { power: BITS as u32 };
@@ -74,19 +74,19 @@ impl Pool {
 
     /// What a reader may get where `taken` bytes have been given out, `process` of them to its own
     /// process, which gets no more than three quarters of all.
-    pub(crate) fn share(&self, taken: u64, process: u64) -> Allowance {
-        let whole = Allowance::at_least(self.largest);
+    pub(crate) fn share(&self, taken: u64, process: u64) -> PinLimit {
+        let whole = PinLimit::at_least(self.largest);
         if taken + self.cost(whole) <= self.bytes / 2 {
             return whole;
         }
         let left = self.bytes.saturating_sub(taken);
         let left = left.min((self.bytes / 4 * 3).saturating_sub(process));
-        Allowance::at_most(left / PART / RECORDS as u64)
+        PinLimit::at_most(left / PART / RECORDS as u64)
     }
 
     /// Bytes that a reader may keep in all.
-    pub(crate) fn cost(&self, allowance: Allowance) -> u64 {
-        RECORDS as u64 * allowance.longest().min(self.largest)
+    pub(crate) fn cost(&self, pin_limit: PinLimit) -> u64 {
+        RECORDS as u64 * pin_limit.longest().min(self.largest)
     }
 }
 
@@ -110,15 +110,15 @@ mod tests {
 
     #[test]
     fn a_generation_tells_what_it_allows() {
-        for allowance in [Allowance::NONE, Allowance::ALL, Allowance::at_most(25 * MIB)] {
-            let generation = 77 << 30 | allowance.bits() | 0xff_ffff;
-            assert_eq!(Allowance::of(generation), allowance);
+        for pin_limit in [PinLimit::NONE, PinLimit::ALL, PinLimit::at_most(25 * MIB)] {
+            let generation = 77 << 30 | pin_limit.bits() | 0xff_ffff;
+            assert_eq!(PinLimit::of(generation), pin_limit);
         }
-        assert_eq!(Allowance::at_most(25 * MIB).longest(), 16 * MIB);
-        assert_eq!(Allowance::at_least(25 * MIB).longest(), 32 * MIB);
+        assert_eq!(PinLimit::at_most(25 * MIB).longest(), 16 * MIB);
+        assert_eq!(PinLimit::at_least(25 * MIB).longest(), 32 * MIB);
         assert_eq!(
-            (Allowance::NONE.longest(), Allowance::at_most(COPIED_ALWAYS)),
-            (0, Allowance::NONE)
+            (PinLimit::NONE.longest(), PinLimit::at_most(COPIED_ALWAYS)),
+            (0, PinLimit::NONE)
         );
     }
 

@@ -4,7 +4,7 @@
 use std::sync::{Arc, atomic::AtomicU64};
 
 use crate::{
-    alloc::allowance::{Allowance, Pool},
+    alloc::pin_limit::{PinLimit, Pool},
     error::ShmError,
     ids::{Gid, SessionId},
     ring::{
@@ -19,7 +19,7 @@ use crate::{
 };
 
 /// Lanes of one other process at most, each of which a publish may have to look at. What may be
-/// pinned over them is [bounded](crate::alloc::allowance) apart from it.
+/// pinned over them is [bounded](crate::alloc::pin_limit) apart from it.
 pub(crate) const OF_PROCESS: usize = 1024;
 
 /// What readers pin: positions, and the longest sample that each pin keeps.
@@ -47,7 +47,7 @@ impl Pinned {
 #[inline]
 pub(crate) fn scan<W: Word>(tenancy: &Tenancy, lane: &[W], found: &mut Pinned) -> Standing {
     let standing = tenancy.standing(lane);
-    let longest = tenancy.allowance().longest();
+    let longest = tenancy.pin_limit().longest();
     // One that has not seen its grant pins nothing, and one that does from now on sees the tail.
     if standing == Standing::Open && longest > 0 {
         found.0.extend(pins::scan(lane).map(|position| (position, longest)));
@@ -70,7 +70,7 @@ impl Holder {
 }
 
 /// One reader's lane, as its publisher knows it.
-pub(crate) struct Seat {
+pub(crate) struct PinLane {
     reader: Gid,
     session: SessionId,
     /// Absent where the session is our own.
@@ -80,7 +80,7 @@ pub(crate) struct Seat {
     pub(crate) tenancy: Tenancy,
 }
 
-impl Seat {
+impl PinLane {
     fn words(&self) -> &[AtomicU64; LANE_WORDS] {
         self.lane.words()
     }
@@ -97,13 +97,13 @@ impl Seat {
 
 /// All lanes to which a grant was given, until they say that their reader has left, or its process
 /// has ended. That a reader is detached, by whomever, ends nothing here: it may hold samples still.
-pub(crate) struct Seats {
-    all: Vec<Seat>,
+pub(crate) struct PinLanes {
+    all: Vec<PinLane>,
     /// What they may keep.
     pool: Pool,
 }
 
-impl Seats {
+impl PinLanes {
     pub(crate) fn new(pool: Pool) -> Self {
         Self { all: Vec::new(), pool }
     }
@@ -122,57 +122,57 @@ impl Seats {
         lane: &LaneView,
     ) -> Result<Tenancy, ShmError> {
         let session = peer.id();
-        let same = |seat: &&Seat| {
-            (seat.session, seat.reader, seat.at) == (session, reader, at)
-                && seat.tenancy.is_asked(seat.words())
+        let same = |held: &&PinLane| {
+            (held.session, held.reader, held.at) == (session, reader, at)
+                && held.tenancy.is_asked(held.words())
         };
-        if let Some(seat) = self.all.iter().find(same) {
-            return Ok(seat.tenancy);
+        if let Some(held) = self.all.iter().find(same) {
+            return Ok(held.tenancy);
         }
-        let mut allowance = Allowance::ALL;
+        let mut pin_limit = PinLimit::ALL;
         if let Some(peer) = peer.remote() {
-            let akin = |seat: &&Seat| seat.peer.as_ref().is_some_and(|p| p.is_akin_to(peer));
-            let is_full = |seats: &[Seat]| seats.iter().filter(akin).count() >= OF_PROCESS;
+            let akin = |held: &&PinLane| held.peer.as_ref().is_some_and(|p| p.is_akin_to(peer));
+            let is_full = |all: &[PinLane]| all.iter().filter(akin).count() >= OF_PROCESS;
             // Some may have left.
             self.sweep(|_| false);
             if is_full(&self.all) && (!self.sweep(|_| true) || is_full(&self.all)) {
                 let what = "its process has as many readers of one publisher as it may";
                 return Err(ShmError::Refused { what });
             }
-            let cost = |seat: &Seat| self.pool.cost(seat.tenancy.allowance());
-            let others = self.all.iter().filter(|seat| seat.peer.is_some());
+            let cost = |held: &PinLane| self.pool.cost(held.tenancy.pin_limit());
+            let others = self.all.iter().filter(|held| held.peer.is_some());
             let taken = others.map(cost).sum();
-            allowance = self.pool.share(taken, self.all.iter().filter(akin).map(cost).sum());
+            pin_limit = self.pool.share(taken, self.all.iter().filter(akin).map(cost).sum());
         }
-        let tenancy = Tenancy::grant(lane.words(), allowance);
+        let tenancy = Tenancy::grant(lane.words(), pin_limit);
         let peer = peer.remote().cloned();
-        self.all.push(Seat { reader, session, peer, at, lane: lane.clone(), tenancy });
+        self.all.push(PinLane { reader, session, peer, at, lane: lane.clone(), tenancy });
         Ok(tenancy)
     }
 
     /// Adds to `found` the positions that are pinned, after [`pins::about_to_scan`].
     pub(crate) fn scan(&mut self, found: &mut Pinned) {
-        self.all.retain(|seat| scan(&seat.tenancy, seat.words(), found) != Standing::Left);
+        self.all.retain(|held| scan(&held.tenancy, held.words(), found) != Standing::Left);
     }
 
     /// A reader that pins one of `positions`.
     pub(crate) fn holder(&self, positions: &[u64]) -> Option<Holder> {
-        let holds = |seat: &&Seat| {
-            seat.standing() == Standing::Open
-                && pins::scan(seat.words()).any(|position| positions.contains(&position))
+        let holds = |held: &&PinLane| {
+            held.standing() == Standing::Open
+                && pins::scan(held.words()).any(|position| positions.contains(&position))
         };
         self.all
             .iter()
             .find(holds)
-            .map(|seat| Holder { reader: seat.reader, peer: seat.peer.clone() })
+            .map(|held| Holder { reader: held.reader, peer: held.peer.clone() })
     }
 
     /// Forgets those that have left, and those of `suspects` whose process has ended. Whether
     /// there were any.
-    pub(crate) fn sweep(&mut self, suspect: impl Fn(&Seat) -> bool) -> bool {
+    pub(crate) fn sweep(&mut self, suspect: impl Fn(&PinLane) -> bool) -> bool {
         let before = self.all.len();
         self.all
-            .retain(|seat| seat.standing() != Standing::Left && !(suspect(seat) && seat.is_dead()));
+            .retain(|held| held.standing() != Standing::Left && !(suspect(held) && held.is_dead()));
         self.all.len() != before
     }
 

@@ -29,14 +29,14 @@ pub(super) const CLOSED: Duration = Duration::from_millis(5);
 const FLOOD: usize = 512;
 
 const BELL: u64 = 0;
-const KNOCK: u64 = 1;
+const OWN_WAKEUP: u64 = 1;
 const TICK: u64 = 2;
 
 /// A pair of sockets, of which one end rings, and what else wakes this process.
 ///
 /// The ends are of packets and edge-triggered: each ring is an event, whether those before it have
 /// been taken or not. So who is woken need not take any, and is back in one system call.
-pub(super) struct Ear {
+pub(super) struct BellReceiver {
     set: OwnedFd,
     /// Where the kernel cannot keep descriptors out of it, it closes like one of another process.
     heard: PassedFd,
@@ -44,14 +44,14 @@ pub(super) struct Ear {
     rights: bool,
     bell: Bell,
     /// Never handed out: an eventfd that this process wakes itself with.
-    knock: OwnedFd,
+    own_wakeup: OwnedFd,
     tick: OwnedFd,
 }
 
 /// What came.
 #[derive(Clone, Copy, Default)]
 pub(super) struct Heard {
-    /// A ring of the bell, or a knock.
+    /// A ring of the bell, or a wake-up from this process.
     pub(super) rung: bool,
     /// A ring of the bell, which stands in its queue.
     pub(super) queued: bool,
@@ -61,23 +61,23 @@ pub(super) struct Heard {
     pub(super) tick: bool,
 }
 
-impl Ear {
+impl BellReceiver {
     pub(super) fn new() -> Result<Self, Errno> {
         let (heard, given) =
             socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None)?;
         let rights = !pass_rights(heard.as_fd(), false);
         let heard = if rights { PassedFd::received(heard) } else { heard.into() };
         let flags = EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK;
-        let knock = eventfd(0, flags)?;
+        let own_wakeup = eventfd(0, flags)?;
         let flags = TimerfdFlags::CLOEXEC | TimerfdFlags::NONBLOCK;
         let tick = timerfd_create(TimerfdClockId::Monotonic, flags)?;
         let set = epoll::create(epoll::CreateFlags::CLOEXEC)?;
         let edge = epoll::EventFlags::IN | epoll::EventFlags::RDHUP | epoll::EventFlags::ET;
         epoll::add(&set, &heard, epoll::EventData::new_u64(BELL), edge)?;
-        epoll::add(&set, &knock, epoll::EventData::new_u64(KNOCK), edge)?;
+        epoll::add(&set, &own_wakeup, epoll::EventData::new_u64(OWN_WAKEUP), edge)?;
         let level = epoll::EventFlags::IN;
         epoll::add(&set, &tick, epoll::EventData::new_u64(TICK), level)?;
-        Ok(Self { set, heard, rights, bell: Bell::new(given.into()), knock, tick })
+        Ok(Self { set, heard, rights, bell: Bell::new(given.into()), own_wakeup, tick })
     }
 
     /// The end that rings.
@@ -86,9 +86,9 @@ impl Ear {
     }
 
     /// Wakes whoever listens, from this very process.
-    pub(super) fn knock(&self) {
+    pub(super) fn wake_self(&self) {
         // A counter that is full, after 2^64 of them, would be the only error.
-        let _ = write(&self.knock, &1u64.to_ne_bytes());
+        let _ = write(&self.own_wakeup, &1u64.to_ne_bytes());
     }
 
     /// Has whoever listens woken at intervals; `None` ends it.
@@ -196,7 +196,7 @@ pub(super) enum Drained {
     Rights,
 }
 
-impl AsFd for Ear {
+impl AsFd for BellReceiver {
     /// Readable when there is something to take.
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.set.as_fd()
