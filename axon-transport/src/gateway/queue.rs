@@ -9,7 +9,7 @@ use std::{collections::VecDeque, sync::Arc, time::Duration};
 use axon_envelope::Delivery;
 use bytes::Bytes;
 
-use super::room::Room;
+use super::queue_budget::QueueBudget;
 use crate::{
     ids::Gid,
     qos::{History, Qos, Reliability},
@@ -49,7 +49,7 @@ pub(super) enum Offered {
 pub(super) struct Queue {
     samples: VecDeque<Sample>,
     bytes: usize,
-    room: Arc<Room>,
+    room: Arc<QueueBudget>,
     policy: Policy,
     /// RELIABLE samples that were taken and that the peer has not acknowledged, where it does so.
     sent: Option<Sent>,
@@ -107,7 +107,7 @@ impl Sample {
 impl Queue {
     /// The queue for a relay with `qos`, in the room of a peer. One sample may always wait.
     /// Where the peer `acknowledges`, a RELIABLE sample keeps its room until then.
-    pub(super) fn new(qos: &Qos, room: Arc<Room>, acknowledges: bool) -> Self {
+    pub(super) fn new(qos: &Qos, room: Arc<QueueBudget>, acknowledges: bool) -> Self {
         let (samples, sent) = (VecDeque::new(), acknowledges.then(Sent::default));
         Self { samples, bytes: 0, room, policy: Policy::of(qos), sent, over: false }
     }
@@ -309,8 +309,8 @@ mod tests {
     }
 
     /// Room in which each queue has some for so many samples of so many bytes.
-    fn room(samples: usize, size: usize) -> Arc<Room> {
-        Room::new(32 * (samples * sample(0, size).size()) as u64)
+    fn room(samples: usize, size: usize) -> Arc<QueueBudget> {
+        QueueBudget::new(32 * (samples * sample(0, size).size()) as u64)
     }
 
     /// A queue with room for so many samples of so many bytes.

@@ -17,7 +17,7 @@ use super::{
     hub::{Event, Hub, Noticed, Shared},
     keyring::Keyring,
     pulse::Pulse,
-    room::Room,
+    queue_budget::QueueBudget,
     shares::Handshakes,
     silence::Echoes,
     stand_in::StandIns,
@@ -80,7 +80,7 @@ async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
         max_message: config.max_message,
         keys,
         accounts: Accounts::new(config.link.graph),
-        queues: Room::new(config.reliable_queue),
+        queues: QueueBudget::new(config.reliable_queue),
         stalled_after: config.link.stalled,
         stalls: Mutex::default(),
     });

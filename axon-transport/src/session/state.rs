@@ -68,7 +68,7 @@ pub(crate) struct Shared {
     /// One status request at a time.
     pub(super) asking: Mutex<()>,
     /// Held while pairs of the session's own endpoints come or go.
-    pub(super) home: Mutex<()>,
+    pub(super) own_pairs: Mutex<()>,
     /// For the clients of its servers.
     pub(super) room: Arc<Room>,
     state: Mutex<State>,
@@ -317,7 +317,7 @@ impl Shared {
             listening: Mutex::default(),
             listener: Mutex::new(None),
             asking: Mutex::new(()),
-            home: Mutex::default(),
+            own_pairs: Mutex::default(),
             room,
             state: Mutex::default(),
             changed: Condvar::new(),

@@ -20,8 +20,8 @@ use axon_transport::{
 };
 
 use crate::{
+    pair_log::PairLog,
     sample::{LONGEST, Random, fill, is_whole},
-    trail::Trail,
 };
 
 /// The environment variable that makes a process one of them; its value is the seed.
@@ -41,7 +41,7 @@ struct Child {
     taken: AtomicU64,
     /// What the KEEP_ALL subscription missed.
     missed: Mutex<Vec<Miss>>,
-    trail: Trail,
+    pair_log: PairLog,
     /// How many samples were published by each publisher: whoever publishes holds it meanwhile.
     published: [Mutex<u64>; 2],
 }
@@ -67,7 +67,7 @@ pub(crate) fn run(seed: u64) {
         print(info);
         std::process::abort();
     }));
-    let trail = Trail::keep();
+    let pair_log = PairLog::keep();
     let config = Config::from_env().expect("a configuration");
     let start = Instant::now();
     let session = loop {
@@ -90,7 +90,7 @@ pub(crate) fn run(seed: u64) {
         last: Mutex::default(),
         taken: AtomicU64::new(0),
         missed: Mutex::default(),
-        trail,
+        pair_log,
         published: Default::default(),
     };
     say(&hex(subscriptions[0].gid()));
@@ -125,8 +125,8 @@ impl Child {
                     say(&missed.collect::<Vec<_>>().join(" "));
                 }
                 // Of the pairs with this reader or writer, for people.
-                Some("trail") => {
-                    self.trail.print(words.next().expect("a GID"));
+                Some("pair_log") => {
+                    self.pair_log.print(words.next().expect("a GID"));
                     say("printed");
                 }
                 Some("quiet") => self.quiet.store(true, Ordering::Relaxed),
@@ -217,7 +217,7 @@ impl Child {
         let at = at.expect("after the epoch").as_millis();
         self.missed.lock().expect("no panic").push(Miss { publisher, samples, at, counted });
         let said = if counted { "counted" } else { "NOT COUNTED" };
-        self.trail.add(&format!(
+        self.pair_log.add(&format!(
             "{publisher}: {samples} samples missing between {before} and {}, {said}",
             info.sequence
         ));

@@ -403,10 +403,10 @@ fn missed(players: &mut [Player], deaths: &HashMap<String, u128>) -> u64 {
     }
     for (index, reader, what) in &wrong {
         let publisher = what.split(' ').nth(2).expect("its GID").to_owned();
-        players[*index].ask(&format!("trail {publisher}"));
+        players[*index].ask(&format!("pair_log {publisher}"));
         for player in players.iter_mut() {
             if session(&player.reader()) == session(&publisher) {
-                player.ask(&format!("trail {reader}"));
+                player.ask(&format!("pair_log {reader}"));
             }
         }
     }

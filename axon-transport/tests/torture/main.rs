@@ -19,8 +19,8 @@
 
 mod child;
 mod conductor;
+mod pair_log;
 mod sample;
-mod trail;
 
 use std::{
     env,

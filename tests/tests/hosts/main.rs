@@ -1,7 +1,6 @@
 //! Two hosts as real processes on loopback addresses: a daemon each, applications of their own, and
 //! in qkd a KME each, simulated in the test's process.
 
-mod crowd;
 mod cut;
 mod delivery;
 mod disagree;
@@ -21,6 +20,7 @@ mod hostile;
 mod identity;
 mod liar;
 mod load;
+mod many_topics;
 mod mismatch;
 mod mixed;
 mod mode;

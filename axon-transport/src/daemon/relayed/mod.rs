@@ -28,8 +28,8 @@ use crate::{
         relayed::{
             LINGER, MAX_CALLERS, MAX_ENDPOINTS, Pool,
             calls::{self, Calls},
+            change_signal::ChangeSignal,
             flow::{Channel, Incoming},
-            news::News,
             pipe::{End, Loss, Pipe},
         },
     },
@@ -94,8 +94,8 @@ impl Far {
                 return Err(failed(&error));
             }
         };
-        let news = News::new().map_err(|e| End::Other(e.to_string()))?;
-        news.of(&session);
+        let change_signal = ChangeSignal::new().map_err(|e| End::Other(e.to_string()))?;
+        change_signal.of(&session);
         let leader = session.segment().external_leader().map_err(|e| End::Other(e.to_string()))?;
         let daemon = session.daemon().unwrap_or_default();
         let pid = std::process::id();
@@ -119,7 +119,7 @@ impl Far {
             left: VecDeque::new(),
             given_up: Seldom::default(),
             leader,
-            news,
+            change_signal,
             process,
             session,
         })
@@ -175,7 +175,7 @@ struct Served {
     /// Those of them that were given up.
     given_up: Seldom,
     leader: ExternalLeader,
-    news: Arc<News>,
+    change_signal: Arc<ChangeSignal>,
     process: Option<OwnedFd>,
     /// Last: what is above is of it.
     session: Session,
@@ -188,8 +188,8 @@ impl Served {
             self.leader.clear();
             let waits = self.pipe.waits_for_readers();
             self.leader.arm(waits);
-            let news = self.news.take() | !std::mem::replace(&mut begun, true);
-            if self.news.is_lost() {
+            let signalled = self.change_signal.take() | !std::mem::replace(&mut begun, true);
+            if self.change_signal.is_lost() {
                 // Most often the daemon ends, and its process with it. Its readers shall not say before
                 // that they have left: what they had not delivered is kept for the next daemon.
                 self.pipe.hang_up();
@@ -199,11 +199,11 @@ impl Served {
             let (messages, more) = self.pipe.receive()?;
             let changed = messages.iter().any(|m| !matches!(m, Message::Credit(_)));
             messages.into_iter().try_for_each(|message| self.handle(message))?;
-            if news {
+            if signalled {
                 self.tell_refused()?;
                 self.tell_graph()?;
             }
-            if news || changed || !self.left.is_empty() {
+            if signalled || changed || !self.left.is_empty() {
                 self.match_up()?;
             }
             let leased = self.subscriptions.values().flat_map(Subscription::assertions);
@@ -234,7 +234,7 @@ impl Served {
             }
             let process = self.process.as_ref().map(AsFd::as_fd);
             let left = self.alive.left(Instant::now());
-            self.pipe.sleep(&self.leader, &self.news, process, left);
+            self.pipe.sleep(&self.leader, &self.change_signal, process, left);
         }
     }
 
@@ -271,14 +271,14 @@ impl Served {
         self.subscriptions.clear();
         self.nodes.clear();
         self.writers.values().for_each(|face| face.leave(true));
-        while self.pipe.is_blocked() && !self.news.is_lost() && Instant::now() < end {
+        while self.pipe.is_blocked() && !self.change_signal.is_lost() && Instant::now() < end {
             self.leader.clear();
             self.leader.arm(true);
-            self.news.take();
+            self.change_signal.take();
             self.write()?;
             if self.pipe.is_blocked() {
                 let left = end.saturating_duration_since(Instant::now());
-                self.pipe.sleep(&self.leader, &self.news, None, Some(left));
+                self.pipe.sleep(&self.leader, &self.change_signal, None, Some(left));
             }
         }
         let samples = self.pipe.arrived();

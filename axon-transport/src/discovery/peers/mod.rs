@@ -8,6 +8,7 @@ mod announcing;
 mod bucket;
 mod candidates;
 mod dialling;
+mod eviction;
 #[cfg(test)]
 mod flood;
 #[cfg(test)]
@@ -16,7 +17,6 @@ mod local;
 mod probing;
 mod receiving;
 mod record;
-mod room;
 #[cfg(test)]
 mod simulation;
 #[cfg(test)]

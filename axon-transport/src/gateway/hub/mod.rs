@@ -33,8 +33,8 @@ use super::{
     outbound::Carrier,
     peer::{GraphTaken, Peer, binding},
     pulse::Pulse,
+    queue_budget::QueueBudget,
     refusal::{Refusal, RefusedBy},
-    room::Room,
     seal::Protection,
     shares::Said,
     silence::{Echoes, Traffic},
@@ -71,7 +71,7 @@ pub(super) struct Shared {
     /// What peers may have this daemon hold.
     pub(super) accounts: Accounts,
     /// What may wait to be sent reliably.
-    pub(super) queues: Arc<Room>,
+    pub(super) queues: Arc<QueueBudget>,
     /// A peer that reads nothing for so long is disconnected from the topic.
     pub(super) stalled_after: Duration,
     /// Those that were.

@@ -120,7 +120,7 @@ mod tests {
     use crate::{
         gateway::{
             queue::{Offered, Sample},
-            room::Room,
+            queue_budget::QueueBudget,
         },
         qos::Qos,
         session::MessageInfo,
@@ -132,7 +132,7 @@ mod tests {
 
     /// The queue of a stream with these samples.
     fn queue(numbers: std::ops::RangeInclusive<u64>) -> Arc<Mutex<Queue>> {
-        let queue = Queue::new(&Qos::keep_all(), Room::new(1 << 30).of_peer(), true);
+        let queue = Queue::new(&Qos::keep_all(), QueueBudget::new(1 << 30).of_peer(), true);
         let queue = Arc::new(Mutex::new(queue));
         numbers.for_each(|number| offer(&queue, number));
         queue

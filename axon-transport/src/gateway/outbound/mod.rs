@@ -35,7 +35,7 @@ use super::{
     keyring::lock,
     pulse::Pulse,
     queue::Sample,
-    room::Room,
+    queue_budget::QueueBudget,
     routes::RelaySpec,
     seal::{Protection, sample},
     stand_in::StandIn,
@@ -227,7 +227,7 @@ struct Shared {
     carrier: watch::Receiver<Carrier>,
     counters: Counting,
     /// What may wait in the queues.
-    queues: Arc<Room>,
+    queues: Arc<QueueBudget>,
     /// A queue has room again, or is over.
     popped: Notify,
     /// A queue is over.
@@ -277,7 +277,7 @@ pub(super) async fn run(
     first: Carrier,
     inbox: Inbox,
     counters: Counting,
-    queues: Arc<Room>,
+    queues: Arc<QueueBudget>,
     pulse: Pulse,
     owner: Owner,
     stalled_after: Duration,

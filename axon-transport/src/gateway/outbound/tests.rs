@@ -26,7 +26,7 @@ fn shared(connection: &Connection) -> (Arc<Shared>, watch::Sender<Carrier>) {
     let in_use = watch::channel(()).1;
     let (sender, carrier) = watch::channel(Carrier { connection, protection, in_use });
     let (popped, ended) = (Notify::new(), AtomicBool::new(false));
-    let (counters, queues) = (Tally::default().counting(), Room::new(256 << 20).of_peer());
+    let (counters, queues) = (Tally::default().counting(), QueueBudget::new(256 << 20).of_peer());
     let (acknowledged, done) = (Arc::default(), Mutex::default());
     let shared = Shared { carrier, counters, queues, popped, ended, acknowledged, done };
     (Arc::new(shared), sender)

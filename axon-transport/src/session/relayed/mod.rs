@@ -13,9 +13,9 @@
 use std::time::Duration;
 
 pub(crate) mod calls;
+pub(crate) mod change_signal;
 pub mod flow;
 pub(crate) mod near;
-pub(crate) mod news;
 pub(crate) mod pipe;
 
 pub(crate) use flow::Pool;

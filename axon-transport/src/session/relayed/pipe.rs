@@ -14,8 +14,8 @@ use rustix::{
 };
 
 use super::{
+    change_signal::ChangeSignal,
     flow::{Arrived, Channel, Departing, Incoming, Outgoing, Violation},
-    news::News,
 };
 use crate::{
     ids::Gid,
@@ -351,12 +351,13 @@ impl Pipe {
     pub(crate) fn sleep(
         &mut self,
         leader: &ExternalLeader,
-        news: &News,
+        change_signal: &ChangeSignal,
         end: Option<BorrowedFd<'_>>,
         left: Option<Duration>,
     ) {
         let out = if self.is_full() { PollFlags::OUT } else { PollFlags::empty() };
-        let mut fds = vec![PollFd::new(leader, PollFlags::IN), PollFd::new(news, PollFlags::IN)];
+        let mut fds =
+            vec![PollFd::new(leader, PollFlags::IN), PollFd::new(change_signal, PollFlags::IN)];
         // What has come to its end is readable for ever.
         if !self.over {
             fds.push(PollFd::new(&self.socket, PollFlags::IN | out));

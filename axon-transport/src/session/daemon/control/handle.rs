@@ -7,7 +7,7 @@ use axon_shm::{
     internal::{Grant, Location, Peer, ReaderInfo, Terms, descriptors::PassedFd},
 };
 
-use super::{Control, Link, stands_for, trail};
+use super::{Control, Link, pair_log, stands_for};
 use crate::{
     graph::EndpointKind,
     ids::{Gid, SessionId},
@@ -75,7 +75,7 @@ impl Control {
             let detached = gids.iter().filter(|gid| publisher.detach(**gid));
             let writer = publisher.endpoint.gid;
             let detached = detached.inspect(|gid| {
-                trail::over(&Pair { reader: **gid, writer }, "the reader ended");
+                pair_log::over(&Pair { reader: **gid, writer }, "the reader ended");
             });
             if detached.count() > 0 {
                 self.writer_changed(&publisher);
@@ -86,7 +86,7 @@ impl Control {
             let reader = subscription.endpoint.gid;
             let ended = gids.iter().filter(|gid| slots.end(gid));
             let ended = ended.inspect(|gid| {
-                trail::over(&Pair { reader, writer: **gid }, "the writer ended");
+                pair_log::over(&Pair { reader, writer: **gid }, "the writer ended");
             });
             let news = ended.count();
             drop(slots);
@@ -136,8 +136,8 @@ impl Control {
             let (writer, attached) = (publisher.endpoint.gid, publisher.attached().clone());
             for reader in attached {
                 let pair = Pair { reader, writer };
-                if is_over(&pair) && !self.is_at_home(&pair) && publisher.detach(reader) {
-                    trail::over(&pair, "the daemon did not repeat it to the writer");
+                if is_over(&pair) && !self.is_own_pair(&pair) && publisher.detach(reader) {
+                    pair_log::over(&pair, "the daemon did not repeat it to the writer");
                     self.writer_changed(&publisher);
                 }
             }
@@ -149,12 +149,12 @@ impl Control {
                 .writers()
                 .into_iter()
                 .map(|writer| Pair { reader, writer })
-                .filter(|pair| is_over(pair) && !self.is_at_home(pair))
+                .filter(|pair| is_over(pair) && !self.is_own_pair(pair))
                 .map(|pair| pair.writer);
             let gone = gone.collect::<Vec<_>>().into_iter().filter(|writer| slots.end(writer));
             let gone = gone.inspect(|writer| {
                 let pair = Pair { reader, writer: *writer };
-                trail::over(&pair, "the daemon did not repeat it to the reader");
+                pair_log::over(&pair, "the daemon did not repeat it to the reader");
             });
             let news = gone.count();
             drop(slots);
@@ -174,7 +174,7 @@ impl Control {
     }
 
     /// Whether both are the session's own, which part as soon as one of them ends.
-    fn is_at_home(&self, pair: &Pair) -> bool {
+    fn is_own_pair(&self, pair: &Pair) -> bool {
         pair.reader.is_of(&self.shared.id) && pair.writer.is_of(&self.shared.id)
     }
 
@@ -258,8 +258,8 @@ impl Control {
         let peer = self.hold(attach.session, pair, descriptors, &attach.segments);
         let shared = self.shared.clone();
         let own = attach.session == shared.id;
-        // Neither of two at home shall end between the look at it and the grant.
-        let home = own.then(|| shared.home());
+        // Neither of two of our own shall end between the look at it and the grant.
+        let own_pairs = own.then(|| shared.lock_own_pairs());
         let Some(publisher) = self.shared.state().publishers.get(&attach.writer).cloned() else {
             return;
         };
@@ -274,11 +274,11 @@ impl Control {
             let terms = Terms { after, carries: carries == Some(true) };
             publisher.attach(reader, terms).map_err(|e| e.to_string())
         });
-        drop(home);
+        drop(own_pairs);
         match grant {
             Ok((Grant { generation, first }, after, ring)) => {
                 let Pair { reader, writer } = pair;
-                trail::granted(&pair, generation, first);
+                pair_log::granted(&pair, generation, first);
                 let session = self.shared.id;
                 let segments = Vec::new();
                 let after = Some(after);
@@ -324,7 +324,7 @@ impl Control {
         }
         let shared = self.shared.clone();
         let own = session == shared.id;
-        let home = own.then(|| shared.home());
+        let own_pairs = own.then(|| shared.lock_own_pairs());
         let Some(subscription) = self.shared.state().subscriptions.get(&reader).cloned() else {
             return;
         };
@@ -336,7 +336,7 @@ impl Control {
         let lane = match slots.accept(writer, grant) {
             Accept::Stands => return,
             Accept::AskAgain => {
-                trail::forgotten(&pair);
+                pair_log::forgotten(&pair);
                 // Under the same lock: the lane of before is in use still, so this is another one,
                 // and what we ask is no repetition, which the daemon would not pass on.
                 let segment = &self.shared.segment;
@@ -353,7 +353,7 @@ impl Control {
         });
         match mapped {
             Ok(mapped) => {
-                trail::accepted(&pair, generation, first);
+                pair_log::accepted(&pair, generation, first);
                 let stands_in = !writer.is_of(&session) || relayed == Some(true);
                 let linked = matches!(self.link, Link::Socket(_));
                 let numbers = match subscription.endpoint.kind {
@@ -364,13 +364,13 @@ impl Control {
                     _ => Numbers::None,
                 };
                 subscription.lock().add(mapped, after, numbers);
-                drop(home);
+                drop(own_pairs);
                 self.reader_changed(&subscription);
                 // It may have history to take.
                 self.shared.segment.notify();
             }
             Err(error) => {
-                drop(home);
+                drop(own_pairs);
                 let topic = &subscription.endpoint.topic;
                 tracing::error!(topic, %writer, error, "a publisher cannot be received from");
                 self.tell_failure(&pair, error);
@@ -439,7 +439,7 @@ impl Control {
         let subscription = self.shared.state().subscriptions.get(reader).cloned();
         if let Some(subscription) = subscription {
             if subscription.lock().end(writer) {
-                trail::over(&pair, reason);
+                pair_log::over(&pair, reason);
                 self.reader_changed(&subscription);
             }
             let topic = &subscription.endpoint.topic;
@@ -450,7 +450,7 @@ impl Control {
     fn detach_reader(&mut self, pair: &Pair) {
         let publisher = self.shared.state().publishers.get(&pair.writer).cloned();
         if let Some(publisher) = publisher.filter(|p| p.detach(pair.reader)) {
-            trail::over(pair, "the daemon said so to the writer");
+            pair_log::over(pair, "the daemon said so to the writer");
             self.writer_changed(&publisher);
         }
         if self.shared.segment.tidy() {

@@ -5,8 +5,8 @@ mod graph;
 mod handle;
 mod link;
 mod memory;
+mod pair_log;
 mod time;
-mod trail;
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashSet, VecDeque},

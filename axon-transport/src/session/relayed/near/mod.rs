@@ -1,6 +1,6 @@
 //! The end in a relayed session's own process.
 
-mod next;
+mod reconnect;
 mod relays;
 mod stand_ins;
 
@@ -24,8 +24,8 @@ use self::{relays::Relay, stand_ins::StandIn};
 use super::{
     Pool,
     calls::{self, Calls},
+    change_signal::ChangeSignal,
     flow::{Channel, Incoming},
-    news::News,
     pipe::{End, Loss, Pipe},
 };
 use crate::{
@@ -47,7 +47,7 @@ use crate::{
 #[derive(Debug)]
 pub(crate) struct Near {
     finish: Arc<AtomicBool>,
-    news: Arc<News>,
+    change_signal: Arc<ChangeSignal>,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -59,7 +59,7 @@ struct Common {
     /// Stands for the world outside.
     outside: Session,
     leader: ExternalLeader,
-    news: Arc<News>,
+    change_signal: Arc<ChangeSignal>,
     finish: Arc<AtomicBool>,
     finish_by: OnceCell<Instant>,
     reason: String,
@@ -74,8 +74,8 @@ impl Near {
         reason: String,
     ) -> Result<Self, SessionError> {
         let system = |what| move |source: std::io::Error| SessionError::System { what, source };
-        let news = News::new().map_err(system("creating an eventfd"))?;
-        news.of(&outside);
+        let change_signal = ChangeSignal::new().map_err(system("creating an eventfd"))?;
+        change_signal.of(&outside);
         let finish = Arc::new(AtomicBool::new(false));
         let leader = outside.segment().external_leader()?;
         let common = Common {
@@ -83,7 +83,7 @@ impl Near {
             house,
             outside,
             leader,
-            news: Arc::clone(&news),
+            change_signal: Arc::clone(&change_signal),
             finish: Arc::clone(&finish),
             finish_by: OnceCell::new(),
             reason,
@@ -94,7 +94,7 @@ impl Near {
             .spawn(move || common.run(connected))
             .map_err(system("starting the relay's thread"))?;
         drop(blocked);
-        Ok(Self { finish, news, thread: Some(thread) })
+        Ok(Self { finish, change_signal, thread: Some(thread) })
     }
 }
 
@@ -102,7 +102,7 @@ impl Drop for Near {
     fn drop(&mut self) {
         // Pairs with the loads of the relay's thread.
         self.finish.store(true, Ordering::Release);
-        self.news.wake();
+        self.change_signal.wake();
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }
@@ -203,7 +203,7 @@ impl<'a> Served<'a> {
             common.leader.clear();
             let waiting = self.pipe.waits_for_readers();
             common.leader.arm(waiting);
-            let news = common.news.take() | !std::mem::replace(&mut begun, true);
+            let signalled = common.change_signal.take() | !std::mem::replace(&mut begun, true);
             let (messages, more) = self.pipe.receive()?;
             let changed = messages.iter().any(|m| !matches!(m, Message::Credit(_)));
             messages.into_iter().for_each(|message| self.handle(message));
@@ -211,7 +211,7 @@ impl<'a> Served<'a> {
                 || !self.ending.is_empty()
                 || !self.settling.is_empty()
                 || self.relays.values().any(Relay::is_kept);
-            if news || changed || waits {
+            if signalled || changed || waits {
                 self.update()?;
             }
             let leased = self.relays.values().flat_map(Relay::assertions);
@@ -259,7 +259,7 @@ impl<'a> Served<'a> {
                 .chain(self.relays.values().filter_map(Relay::waits_for))
                 .chain(end)
                 .min();
-            self.pipe.sleep(&common.leader, &common.news, None, left);
+            self.pipe.sleep(&common.leader, &common.change_signal, None, left);
         }
     }
 

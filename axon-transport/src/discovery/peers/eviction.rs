@@ -38,9 +38,9 @@ impl Peers {
         let candidates = self.records.iter().filter(|(_, record)| record.may_be_forgotten());
         let candidates = candidates.filter(|(_, record)| of_heard(record) == heard_goes);
         let victim = candidates.min_by_key(|(_, record)| {
-            let crowd = of_host.get(&record.host()).copied().unwrap_or_default();
+            let records = of_host.get(&record.host()).copied().unwrap_or_default();
             // One whose peer was heard from goes last, whatever was forged under its address.
-            (record.has_answered(), std::cmp::Reverse(crowd), record.last_seen)
+            (record.has_answered(), std::cmp::Reverse(records), record.last_seen)
         });
         if let Some(victim) = victim.map(|(id, _)| *id) {
             self.forget(victim);

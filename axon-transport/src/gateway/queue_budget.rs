@@ -14,7 +14,7 @@ const QUEUE: usize = 32;
 
 /// What all queues share, or of that those towards one peer.
 #[derive(Debug)]
-pub(super) struct Room {
+pub(super) struct QueueBudget {
     most: usize,
     taken: AtomicUsize,
     /// One queue alone.
@@ -22,10 +22,10 @@ pub(super) struct Room {
     /// Somebody found too little.
     awaited: AtomicBool,
     freed: Notify,
-    of: Option<Arc<Room>>,
+    of: Option<Arc<QueueBudget>>,
 }
 
-impl Room {
+impl QueueBudget {
     /// That of a daemon.
     pub(super) fn new(bytes: u64) -> Arc<Self> {
         let most = usize::try_from(bytes).unwrap_or(usize::MAX);
@@ -37,7 +37,7 @@ impl Room {
         Arc::new(Self::with(self.most / PEER, self.queue, Some(Arc::clone(self))))
     }
 
-    fn with(most: usize, queue: usize, of: Option<Arc<Room>>) -> Self {
+    fn with(most: usize, queue: usize, of: Option<Arc<QueueBudget>>) -> Self {
         let (taken, awaited) = (AtomicUsize::new(0), AtomicBool::new(false));
         Self { most, taken, queue, awaited, freed: Notify::new(), of }
     }
@@ -108,7 +108,7 @@ mod tests {
 
     #[test]
     fn a_peer_leaves_room_for_the_others() {
-        let daemon = Room::new(3200);
+        let daemon = QueueBudget::new(3200);
         let peers: Vec<_> = (0..5).map(|_| daemon.of_peer()).collect();
         assert_eq!((daemon.of_queue(), peers[0].of_queue()), (100, 100));
         for peer in &peers[..4] {
@@ -128,7 +128,7 @@ mod tests {
 
     #[test]
     fn one_more_than_there_is_room_for_is_counted() {
-        let daemon = Room::new(100);
+        let daemon = QueueBudget::new(100);
         let peer = daemon.of_peer();
         peer.overtake(1000);
         assert!(!peer.take(1));
@@ -138,7 +138,7 @@ mod tests {
 
     #[test]
     fn whoever_found_no_room_hears_of_what_another_peer_makes() {
-        let daemon = Room::new(400);
+        let daemon = QueueBudget::new(400);
         let (slow, waiting) = (daemon.of_peer(), daemon.of_peer());
         slow.overtake(400);
         let freed = waiting.freed();

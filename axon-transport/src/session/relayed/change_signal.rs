@@ -14,12 +14,12 @@ use crate::session::{Session, SessionEvent};
 
 /// Becomes readable when something happened.
 #[derive(Debug)]
-pub(crate) struct News {
+pub(crate) struct ChangeSignal {
     wake: OwnedFd,
     lost: AtomicBool,
 }
 
-impl News {
+impl ChangeSignal {
     pub(crate) fn new() -> std::io::Result<Arc<Self>> {
         let wake = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?;
         Ok(Arc::new(Self { wake, lost: AtomicBool::new(false) }))
@@ -27,13 +27,13 @@ impl News {
 
     /// Has `session` tell of whatever changes.
     pub(crate) fn of(self: &Arc<Self>, session: &Session) {
-        let news = Arc::clone(self);
+        let signal = Arc::clone(self);
         session.set_listener(move |event| {
             if *event == SessionEvent::DaemonLost {
                 // Pairs with the load in `is_lost`.
-                news.lost.store(true, Ordering::Release);
+                signal.lost.store(true, Ordering::Release);
             }
-            news.wake();
+            signal.wake();
         });
     }
 
@@ -47,13 +47,13 @@ impl News {
         let _ = rustix::io::write(&self.wake, &1u64.to_ne_bytes());
     }
 
-    /// Takes the news; whether there was any.
+    /// Clears the signal; returns whether it was set.
     pub(crate) fn take(&self) -> bool {
         rustix::io::read(&self.wake, &mut [0; 8]).is_ok()
     }
 }
 
-impl AsFd for News {
+impl AsFd for ChangeSignal {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.wake.as_fd()
     }

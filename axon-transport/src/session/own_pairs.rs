@@ -26,14 +26,14 @@ use crate::{
 
 impl Shared {
     /// Under this lock, the pairs of a session's own endpoints come and go with them.
-    pub(super) fn home(&self) -> MutexGuard<'_, ()> {
-        self.home.lock().unwrap_or_else(PoisonError::into_inner)
+    pub(super) fn lock_own_pairs(&self) -> MutexGuard<'_, ()> {
+        self.own_pairs.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Attaches a new endpoint to those of its session that go with it, and shows it in the session's
     /// graph.
     pub(super) fn meet(&self, own: &Endpoint) {
-        let home = self.home();
+        let held = self.lock_own_pairs();
         let pairs = self.pairs_of(&own.gid);
         let mut changed = Vec::new();
         for (writer, reader) in pairs {
@@ -45,7 +45,7 @@ impl Shared {
                 }
             }
         }
-        drop(home);
+        drop(held);
         self.rematch(changed);
         self.state().show(own);
         self.wake();
@@ -90,7 +90,7 @@ impl Shared {
 
     /// Takes an endpoint or a node out of what the session has, and parts it from the others there.
     pub(super) fn part(&self, gid: &Gid) {
-        let home = self.home();
+        let held = self.lock_own_pairs();
         let mut state = self.state();
         let node = state.nodes.remove(gid);
         let publisher = state.publishers.remove(gid);
@@ -120,7 +120,7 @@ impl Shared {
                 Source::Subscription(reader) => reader.lock().end(gid),
             }
         });
-        drop(home);
+        drop(held);
         drop((node, publisher, subscription));
         self.rematch(others);
     }

@@ -115,7 +115,7 @@ fn links_of_made_up_keys_from_one_address_keep_no_other_host_out() {
     let [mut host, mut other] = Plan::new([classic(&[]), classic(&[])]).prepare();
     host.start();
     let stranger = Stranger::new();
-    let crowd: Vec<_> = (0..LINKS)
+    let links: Vec<_> = (0..LINKS)
         .map(|number| {
             let mut daemon = [0xff; 16];
             daemon[15] = number;
@@ -133,5 +133,5 @@ fn links_of_made_up_keys_from_one_address_keep_no_other_host_out() {
     until("the other host is linked", || host.status().links.iter().any(is_other));
     host.wait_log(&["takes its place"]);
     host.wait_refusal("it is said once of the address", |text| text.contains("as many links"));
-    drop(crowd);
+    drop(links);
 }

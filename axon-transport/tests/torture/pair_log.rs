@@ -11,22 +11,22 @@ use tracing_subscriber::{EnvFilter, fmt::MakeWriter};
 
 /// Lines that are kept.
 const LINES: usize = 50_000;
-/// What of the library's log belongs to the trail: pairs, and the daemons that come and go.
+/// What of the library's log belongs to the log of pairs: pairs, and the daemons that come and go.
 const FILTER: &str = "axon_transport::pairs=debug,axon_transport::session=debug";
 
 #[derive(Clone, Default)]
-pub(crate) struct Trail(Arc<Mutex<VecDeque<String>>>);
+pub(crate) struct PairLog(Arc<Mutex<VecDeque<String>>>);
 
-impl Trail {
+impl PairLog {
     /// Keeps what the library logs from now on.
     pub(crate) fn keep() -> Self {
-        let trail = Self::default();
+        let pair_log = Self::default();
         let subscriber = tracing_subscriber::fmt()
             .with_env_filter(EnvFilter::new(FILTER))
             .with_ansi(false)
-            .with_writer(trail.clone());
+            .with_writer(pair_log.clone());
         subscriber.init();
-        trail
+        pair_log
     }
 
     pub(crate) fn add(&self, line: &str) {
@@ -47,7 +47,7 @@ impl Trail {
     }
 }
 
-impl io::Write for Trail {
+impl io::Write for PairLog {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let mut lines = self.lines();
         if lines.len() == LINES {
@@ -63,7 +63,7 @@ impl io::Write for Trail {
     }
 }
 
-impl<'a> MakeWriter<'a> for Trail {
+impl<'a> MakeWriter<'a> for PairLog {
     type Writer = Self;
 
     fn make_writer(&'a self) -> Self {
