@@ -104,7 +104,7 @@ void start_logging()
   gate();
   // The logger's level, which may change at any time, says what is told.
   check(axon_session_log_set_severity(AXON_LOG_DEBUG));
-  // Refused where the program has its own ear for what Rust code says: then it hears it there.
+  // Refused where the program has a subscriber of its own for the log of Rust code: it gets all.
   axon_session_log_set_callback(tell, nullptr);
 }
 

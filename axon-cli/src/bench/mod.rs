@@ -20,7 +20,7 @@ use self::{
     harness::{
         Axon, Load, Medium, Motion, Pair, Progress, Raw, Rounds, SIZES, Sleeps, Wake, words,
     },
-    readers::{Cost, Crowd},
+    readers::{Cost, ReaderProcesses},
     run::Run,
 };
 use crate::{cli, failure::Failure};
@@ -151,12 +151,12 @@ fn measure(
     drop(pair);
 
     progress.step("a publish by its readers");
-    let crowd = Crowd::start(&run.machine, &[READING])?;
+    let readers = ReaderProcesses::start(&run.machine, &[READING])?;
     for size in read_sizes {
-        publish.extend(crowd.measure(*size, run.effort)?);
+        publish.extend(readers.measure(*size, run.effort)?);
         progress.advance();
     }
-    drop(crowd);
+    drop(readers);
     Ok(Results { run, latency, paced, streams, publish })
 }
 

@@ -6,7 +6,7 @@ use axon_tls::{Cipher, PskKex};
 
 use super::{
     ClassicAuth, Config, ConfigError, DaemonPolicy, DiscoveryRange, KeyMode, OsFiles, QkdPeers,
-    SecurityMode, names, passed_on::PassedOn, resolve::resolve, sources::Given, values::method,
+    SecurityMode, daemon_env::DaemonEnv, names, resolve::resolve, sources::Given, values::method,
 };
 
 /// Makes a [`Config`] in code. Each method gives the setting of `docs/configuration.md` that has its name:
@@ -88,8 +88,8 @@ impl ConfigBuilder {
         }
         let set =
             given.iter().filter_map(|(name, text)| Some((name.into(), text.as_ref()?.into())));
-        let passed_on = PassedOn::whole(set, None, &OsFiles);
-        resolve([], &given, None, &OsFiles, passed_on)
+        let daemon_env = DaemonEnv::whole(set, None, &OsFiles);
+        resolve([], &given, None, &OsFiles, daemon_env)
     }
 
     /// The settings that were given.

@@ -14,12 +14,12 @@ use std::{
 };
 
 mod builder;
+mod daemon_env;
 pub(crate) mod elevated;
 mod error;
 mod files;
 mod model;
 mod names;
-mod passed_on;
 mod place;
 mod resolve;
 mod sources;
@@ -28,7 +28,7 @@ mod summary;
 mod tests;
 mod values;
 
-use passed_on::PassedOn;
+use daemon_env::DaemonEnv;
 use sources::Given;
 
 pub use builder::ConfigBuilder;
@@ -71,8 +71,8 @@ impl Config {
             };
         }
         let file = file_beside(variables.get(OsStr::new(DAEMON_PATH)).map(Path::new), daemon)?;
-        let passed_on = PassedOn::inherited(overrides, &OsFiles);
-        resolve::resolve(variables, &Given::new(), file.as_deref(), &OsFiles, passed_on)
+        let daemon_env = DaemonEnv::inherited(overrides, &OsFiles);
+        resolve::resolve(variables, &Given::new(), file.as_deref(), &OsFiles, daemon_env)
     }
 
     /// The configuration of this process, where a builder was given some of it.
@@ -84,8 +84,8 @@ impl Config {
         };
         let file = file_beside(daemon, None)?;
         let set = given.iter().map(|(name, text)| (*name, text.as_ref().map(OsString::from)));
-        let passed_on = PassedOn::inherited(set, &OsFiles);
-        resolve::resolve(variables, &given, file.as_deref(), &OsFiles, passed_on)
+        let daemon_env = DaemonEnv::inherited(set, &OsFiles);
+        resolve::resolve(variables, &given, file.as_deref(), &OsFiles, daemon_env)
     }
 
     /// The configuration that an environment makes, with `default_file` where it names no file. The
@@ -111,8 +111,8 @@ impl Config {
     ) -> Result<Self, ConfigError> {
         let env: Vec<_> = env.into_iter().collect();
         let file = default_file.filter(|path| files.facts(path).is_ok());
-        let passed_on = PassedOn::whole(env.iter().cloned(), file, files);
-        resolve::resolve(env, &Given::new(), default_file, files, passed_on)
+        let daemon_env = DaemonEnv::whole(env.iter().cloned(), file, files);
+        resolve::resolve(env, &Given::new(), default_file, files, daemon_env)
     }
 
     /// What whoever starts with this configuration should be told, once.

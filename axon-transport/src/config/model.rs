@@ -5,7 +5,7 @@ use std::{net::IpAddr, path::PathBuf, time::Duration};
 use axon_tls::{Cipher, PskKex};
 use minicbor::{Decode, Encode};
 
-use super::passed_on::PassedOn;
+use super::daemon_env::DaemonEnv;
 
 /// Everything that the environment and `axon.toml`, or a [`ConfigBuilder`](super::ConfigBuilder), decide.
 ///
@@ -57,7 +57,7 @@ pub struct Config {
     /// Variables of the environment that begin with `AXON_` and are no settings. They count for nothing.
     pub unknown_variables: Vec<String>,
     /// How a daemon that a session starts comes to these settings.
-    pub(crate) passed_on: PassedOn,
+    pub(crate) daemon_env: DaemonEnv,
 }
 
 /// The choice that [`Security`] holds the settings of (`AXON_SECURITY_MODE`).

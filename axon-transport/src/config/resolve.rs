@@ -11,9 +11,9 @@ use axon_tls::{Cipher, PskKex};
 use super::{
     ClassicAuth, ClassicConfig, Config, ConfigError, DaemonPolicy, DiscoveryRange, KeyMode,
     LinkConfig, QkdConfig, QkdPeers, Security, SecurityMode,
+    daemon_env::DaemonEnv,
     files::Files,
     names,
-    passed_on::PassedOn,
     sources::{Given, Sources},
     values::{self, Use, Values},
 };
@@ -29,7 +29,7 @@ pub(super) fn resolve(
     given: &Given,
     default_file: Option<&Path>,
     files: &impl Files,
-    passed_on: PassedOn,
+    daemon_env: DaemonEnv,
 ) -> Result<Config, ConfigError> {
     let mut sources = Sources::collect(env, given, default_file, files)?;
     let modes = [SecurityMode::Classic, SecurityMode::Qkd].map(|mode| (mode.name(), mode));
@@ -95,7 +95,7 @@ pub(super) fn resolve(
         trusted_uids: values.uids(names::TRUSTED_UIDS)?,
         log: values.log_filter("AXON_LOG")?.unwrap_or_else(|| "warn".to_owned()),
         link: link(&values)?,
-        passed_on,
+        daemon_env,
         unknown_variables: sources.strangers.clone(),
     })
 }

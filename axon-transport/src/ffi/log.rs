@@ -58,14 +58,14 @@ pub type axon_log_t = Option<
 #[derive(Default)]
 struct Log {
     waiting: Waiting,
-    ear: Mutex<Ear>,
+    slot: Mutex<CallbackSlot>,
     /// A call has returned.
     returned: Condvar,
 }
 
-/// Who is told.
+/// The callback that is set, and the one that is being called.
 #[derive(Default)]
-struct Ear {
+struct CallbackSlot {
     told: Option<Told>,
     /// Rises with each that is set.
     version: u64,
@@ -154,39 +154,39 @@ impl Log {
     }
 
     fn set(&self, told: Option<Told>) {
-        let mut ear = self.ear();
-        let same = match (&ear.told, &told) {
+        let mut slot = self.slot();
+        let same = match (&slot.told, &told) {
             (Some(one), Some(other)) => one.is(other),
             _ => false,
         };
         if same {
             return;
         }
-        ear.told = told;
-        ear.version += 1;
-        let version = ear.version;
-        while ear.called.is_some_and(|called| called < version) {
-            ear = self.returned.wait(ear).unwrap_or_else(PoisonError::into_inner);
+        slot.told = told;
+        slot.version += 1;
+        let version = slot.version;
+        while slot.called.is_some_and(|called| called < version) {
+            slot = self.returned.wait(slot).unwrap_or_else(PoisonError::into_inner);
         }
     }
 
     /// Calls the program, if it still wants to hear of this. No lock is held meanwhile.
     fn tell(&self, line: &Line) {
-        let mut ear = self.ear();
-        let Some(told) = ear.told.filter(|_| is_wanted(line.severity)) else { return };
-        ear.called = Some(ear.version);
-        drop(ear);
+        let mut slot = self.slot();
+        let Some(told) = slot.told.filter(|_| is_wanted(line.severity)) else { return };
+        slot.called = Some(slot.version);
+        drop(slot);
         let text = |text: &str| CString::new(text.replace('\0', " ")).unwrap_or_default();
         let (part, text) = (text(line.part), text(&line.text));
         // SAFETY: whoever set it says that it may be called so until it is replaced, and `set` does not
         // return before this call has.
         unsafe { (told.function)(told.user.0, line.severity, part.as_ptr(), text.as_ptr()) };
-        self.ear().called = None;
+        self.slot().called = None;
         self.returned.notify_all();
     }
 
-    fn ear(&self) -> MutexGuard<'_, Ear> {
-        self.ear.lock().unwrap_or_else(PoisonError::into_inner)
+    fn slot(&self) -> MutexGuard<'_, CallbackSlot> {
+        self.slot.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 

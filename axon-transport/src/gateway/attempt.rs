@@ -21,8 +21,8 @@ use super::{
     inbound::stream_header,
     keyring::Keyring,
     peer::binding,
+    protection::{Protection, sample},
     queue::Sample,
-    seal::{Protection, sample},
 };
 use crate::{
     config::{Config, Security},

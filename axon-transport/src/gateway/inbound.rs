@@ -16,13 +16,13 @@ use super::{
     establish::close,
     intake::Intake,
     pieces::Pieces,
-    pulse::Pulse,
+    protection::{MAX_OVERHEAD, Protection, RefusedMessage, writer},
     receipts::Receipts,
+    ring_wakeups::RingWakeups,
     routes_in::RoutesIn,
-    seal::{MAX_OVERHEAD, Protection, RefusedMessage, writer},
     stand_in::StandIn,
 };
-use crate::{ids::Gid, link::CloseCode, seldom::Seldom, session::Written};
+use crate::{ids::Gid, link::CloseCode, log_limit::LogLimit, session::Written};
 
 const STREAM_HEADER: usize = 24;
 /// A message that is longer once it is decompressed holds up no other task while that is done.
@@ -44,7 +44,7 @@ pub(super) struct Inbound {
     /// What arrives.
     pub(super) counters: Counting,
     /// Wakes a publish that waits for room.
-    pub(super) pulse: Pulse,
+    pub(super) ring_wakeups: RingWakeups,
     /// Largest payload accepted.
     pub(super) max_message: u64,
     /// Held by each stream that is read; its other end goes when what is left of them is not wanted.
@@ -54,7 +54,7 @@ pub(super) struct Inbound {
     /// What the peer is told of it.
     pub(super) receipts: Arc<Receipts>,
     /// Samples that could not be published here, for the log.
-    pub(super) losses: Arc<Seldom>,
+    pub(super) losses: Arc<LogLimit>,
     /// What was refused, for the log and status.
     pub(super) refused: mpsc::Sender<(CloseCode, String)>,
 }
@@ -216,12 +216,13 @@ impl Inbound {
                     return false;
                 }
                 Err(PublishError::Blocked { .. }) if self.wanted.has_changed().is_ok() => {
-                    // Tried once more with the first beat: there may have been room since.
-                    let (beat, _) = waiting.get_or_insert_with(|| {
-                        (self.pulse.subscribe(), self.pulse.wait_for_room())
+                    // Tried once more with the first wake-up: there may have been room since.
+                    let (wakeups, _) = waiting.get_or_insert_with(|| {
+                        (self.ring_wakeups.subscribe(), self.ring_wakeups.wait_for_room())
                     });
                     // The timeout only covers a link that ends meanwhile.
-                    let _ = tokio::time::timeout(Duration::from_millis(100), beat.changed()).await;
+                    let _ =
+                        tokio::time::timeout(Duration::from_millis(100), wakeups.changed()).await;
                 }
                 Err(error) => {
                     self.lost("ring", from.number, stand_in.gid(), &error);

@@ -30,16 +30,16 @@ mod peer;
 mod pieces;
 #[cfg(test)]
 mod played;
+mod protection;
 mod prove;
-mod pulse;
 mod queue;
 mod queue_budget;
 mod receipts;
 mod refusal;
+mod ring_wakeups;
 mod routes;
 mod routes_in;
 mod run;
-mod seal;
 mod shares;
 mod silence;
 mod socket;

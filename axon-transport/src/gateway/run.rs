@@ -16,8 +16,8 @@ use super::{
     error::GatewayError,
     hub::{Event, Hub, Noticed, Shared},
     keyring::Keyring,
-    pulse::Pulse,
     queue_budget::QueueBudget,
+    ring_wakeups::RingWakeups,
     shares::Handshakes,
     silence::Echoes,
     stand_in::StandIns,
@@ -74,7 +74,7 @@ async fn serve(parts: GatewayParts) -> Result<(), GatewayError> {
     let session = open_session(socket, &config, Arc::clone(&noticed)).await?;
     let shared = Arc::new(Shared {
         stand_ins: StandIns::default(),
-        pulse: Pulse::start(&session)?,
+        ring_wakeups: RingWakeups::start(&session)?,
         session,
         domain: config.domain,
         max_message: config.max_message,

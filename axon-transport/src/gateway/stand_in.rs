@@ -22,13 +22,13 @@ use axon_shm::{Meta, PublishError};
 use super::{
     account::{Account, Charge},
     keyring::lock,
+    protection::sample,
     queue::Sample,
-    seal::sample,
 };
 use crate::{
     graph::Endpoint,
     ids::Gid,
-    session::{Face, Session, SessionError, Written},
+    session::{RemoteWriter, Session, SessionError, Written},
 };
 
 type Known = Arc<Mutex<HashMap<Gid, Weak<StandIn>>>>;
@@ -40,7 +40,7 @@ pub(super) struct StandIns(Known);
 /// Something remote that writes, as those see it that read here.
 pub(super) struct StandIn {
     /// Taken only by `drop`.
-    face: Option<Face>,
+    remote_writer: Option<RemoteWriter>,
     /// Held by the stream that feeds it: the stream of a successor waits until its predecessor's
     /// is read to the end, so samples stay in order.
     pub(super) feeding: Arc<tokio::sync::Mutex<()>>,
@@ -83,7 +83,7 @@ impl StandIns {
                 None => {
                     let Some(place) = account.stand_ins.charge(1) else { return Ok(None) };
                     let stand_in = Arc::new(StandIn {
-                        face: Some(Face::stand_in(session, remote.clone())?),
+                        remote_writer: Some(RemoteWriter::stand_in(session, remote.clone())?),
                         feeding: Arc::default(),
                         last: AtomicU64::new(0),
                         gid: remote.gid,
@@ -105,12 +105,12 @@ impl StandIn {
     }
 
     fn endpoint(&self) -> &Endpoint {
-        self.face().endpoint()
+        self.remote_writer().endpoint()
     }
 
     /// Those here whom it reaches and who, where it is of a service, reach it.
     pub(super) fn partners(&self) -> Vec<Gid> {
-        self.face().partners()
+        self.remote_writer().partners()
     }
 
     /// Writes a sample, a request, or a response to `client`, without waiting for room.
@@ -123,7 +123,7 @@ impl StandIn {
         meta: Meta,
         payload: &[u8],
     ) -> Result<Written, PublishError> {
-        let written = self.face().try_write(client, meta, payload)?;
+        let written = self.remote_writer().try_write(client, meta, payload)?;
         // Relaxed: only where a resumed route begins; sessions drop what they have seen.
         self.last.store(meta.sequence, Ordering::Relaxed);
         Ok(written)
@@ -131,51 +131,53 @@ impl StandIn {
 
     /// Its host says that it is alive.
     pub(super) fn assert_alive(&self) {
-        self.face().assert_alive();
+        self.remote_writer().assert_alive();
     }
 
     /// The clients of whose calls there is something to be taken here: requests to a server, or a client's
     /// responses.
     pub(super) fn with_calls(&self) -> Vec<Gid> {
-        match self.face() {
-            Face::Publisher(_) => Vec::new(),
-            Face::Client(client) => client.has_response().then_some(self.gid).into_iter().collect(),
-            Face::Server(server) => server.with_requests(),
+        match self.remote_writer() {
+            RemoteWriter::Publisher(_) => Vec::new(),
+            RemoteWriter::Client(client) => {
+                client.has_response().then_some(self.gid).into_iter().collect()
+            }
+            RemoteWriter::Server(server) => server.with_requests(),
         }
     }
 
     /// Whether calls of this client are taken here.
     pub(super) fn reads(&self, client: &Gid) -> bool {
-        match self.face() {
-            Face::Publisher(_) => false,
-            Face::Client(_) => *client == self.gid,
-            Face::Server(server) => server.reads(client),
+        match self.remote_writer() {
+            RemoteWriter::Publisher(_) => false,
+            RemoteWriter::Client(_) => *client == self.gid,
+            RemoteWriter::Server(server) => server.reads(client),
         }
     }
 
     /// What goes to its host: the next request of this client, or response to it.
     pub(super) fn take_of(&self, client: &Gid) -> Option<Sample> {
-        let (info, payload) = match self.face() {
-            Face::Publisher(_) => return None,
-            Face::Client(own) => {
+        let (info, payload) = match self.remote_writer() {
+            RemoteWriter::Publisher(_) => return None,
+            RemoteWriter::Client(own) => {
                 let mut payload = Vec::new();
                 let info = (*client == self.gid).then(|| own.take_response(&mut payload))??;
                 (info, payload)
             }
-            Face::Server(server) => server.take_request_of(client)?,
+            RemoteWriter::Server(server) => server.take_request_of(client)?,
         };
         Some(Sample { client: Some(*client), ..sample(info, payload) })
     }
 
     /// Sequence number of the newest sample of a publisher that was written.
     pub(super) fn last_sequence(&self) -> Option<u64> {
-        let publisher = matches!(self.face(), Face::Publisher(_));
+        let publisher = matches!(self.remote_writer(), RemoteWriter::Publisher(_));
         Some(self.last.load(Ordering::Relaxed)).filter(|n| publisher && *n > 0)
     }
 
-    fn face(&self) -> &Face {
+    fn remote_writer(&self) -> &RemoteWriter {
         // Only `drop` takes it, and nobody looks at what is being dropped.
-        self.face.as_ref().expect("a stand-in has its face until it is dropped")
+        self.remote_writer.as_ref().expect("a stand-in has its writer until it is dropped")
     }
 }
 
@@ -189,7 +191,7 @@ impl Drop for StandIn {
     fn drop(&mut self) {
         // Under the lock: the GID is free for another stand-in once this one is gone.
         let mut known = lock(&self.known);
-        drop(self.face.take());
+        drop(self.remote_writer.take());
         known.remove(&self.gid);
     }
 }

@@ -10,7 +10,7 @@ use axon_shm::{
 use super::{
     Client, EndpointSpec, Publisher, Server, Session, SessionError, Subscription,
     publisher::PublisherInner,
-    rings::{Lanes, Rings},
+    rings::{Rings, RingsByClient},
     state::Outgoing,
     subscription::SubscriptionInner,
 };
@@ -122,11 +122,11 @@ impl Session {
     pub(super) fn add_server(&self, endpoint: Endpoint, role: EndpointRole, reads: Qos) -> Server {
         let options = self.ring(&endpoint, Qos::keep_all());
         let shared = self.shared();
-        let lanes = Lanes::new(shared.segment.clone(), options, shared.room.clone());
-        let lanes = Arc::new(lanes);
-        let rings = Rings::Each(lanes.clone());
+        let by_client = RingsByClient::new(shared.segment.clone(), options, shared.room.clone());
+        let by_client = Arc::new(by_client);
+        let rings = Rings::Each(by_client.clone());
         let (responses, requests) = self.add_both(endpoint, role, reads, rings);
-        Server::new(responses, requests, lanes, self.clone())
+        Server::new(responses, requests, by_client, self.clone())
     }
 
     /// The two sides of an endpoint that writes and reads.

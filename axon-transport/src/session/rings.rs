@@ -20,11 +20,11 @@ pub(super) enum Rings {
     /// A publisher's samples, or a client's requests.
     Shared(Arc<Writer>),
     /// A server's responses, which are nobody's but the client's who asked.
-    Each(Arc<Lanes>),
+    Each(Arc<RingsByClient>),
 }
 
 /// A server's rings by client. Each is made when its client comes, and goes with it.
-pub(super) struct Lanes {
+pub(super) struct RingsByClient {
     session: Arc<SessionSegment>,
     options: RingOptions,
     room: Arc<Room>,
@@ -78,7 +78,7 @@ impl Rings {
     ) -> Result<(Grant, u64, Location), ShmError> {
         let writer = match self {
             Self::Shared(writer) => writer.clone(),
-            Self::Each(lanes) => lanes.ring_for(reader.gid)?,
+            Self::Each(rings) => rings.ring_for(reader.gid)?,
         };
         let (grant, after) = writer.attach_on(reader, terms)?;
         Ok((grant, after, writer.location()))
@@ -88,7 +88,7 @@ impl Rings {
     pub(super) fn has(&self, at: Location) -> bool {
         match self {
             Self::Shared(writer) => writer.location() == at,
-            Self::Each(lanes) => lanes.lock().values().any(|(ring, _)| ring.location() == at),
+            Self::Each(rings) => rings.lock().values().any(|(ring, _)| ring.location() == at),
         }
     }
 
@@ -96,7 +96,7 @@ impl Rings {
     pub(super) fn detach(&self, reader: Gid) -> bool {
         match self {
             Self::Shared(writer) => writer.detach(reader),
-            Self::Each(lanes) => lanes.lock().remove(&reader).is_some(),
+            Self::Each(rings) => rings.lock().remove(&reader).is_some(),
         }
     }
 
@@ -111,9 +111,9 @@ impl Rings {
     pub(super) fn drop_dead(&self) -> Vec<Gid> {
         match self {
             Self::Shared(writer) => writer.drop_dead(),
-            Self::Each(lanes) => {
+            Self::Each(rings) => {
                 let mut gone = Vec::new();
-                lanes.lock().retain(|reader, (ring, _)| {
+                rings.lock().retain(|reader, (ring, _)| {
                     let dead = !ring.drop_dead().is_empty();
                     gone.extend(dead.then_some(*reader));
                     !dead
@@ -127,7 +127,7 @@ impl Rings {
     pub(super) fn readers(&self) -> Vec<Gid> {
         match self {
             Self::Shared(writer) => writer.readers(),
-            Self::Each(lanes) => lanes.lock().keys().copied().collect(),
+            Self::Each(rings) => rings.lock().keys().copied().collect(),
         }
     }
 
@@ -135,8 +135,8 @@ impl Rings {
     pub(super) fn tend(&self, now: Instant) -> bool {
         match self {
             Self::Shared(writer) => writer.tend(now),
-            Self::Each(lanes) => {
-                let rings: Vec<_> = lanes.lock().values().map(|(ring, _)| ring.clone()).collect();
+            Self::Each(rings) => {
+                let rings: Vec<_> = rings.lock().values().map(|(ring, _)| ring.clone()).collect();
                 rings.iter().filter(|ring| ring.tend(now)).count() > 0
             }
         }
@@ -150,7 +150,7 @@ impl Rings {
     }
 }
 
-impl Lanes {
+impl RingsByClient {
     pub(super) fn new(session: Arc<SessionSegment>, options: RingOptions, room: Arc<Room>) -> Self {
         Self { session, options, room, rings: Mutex::default() }
     }

@@ -16,7 +16,7 @@ use axon_shm::{
 use super::{
     MessageInfo, OnNew, Session, SessionError, clock,
     publisher::PublisherInner,
-    rings::Lanes,
+    rings::RingsByClient,
     subscription::{SubscriptionInner, recv_from, take_from, take_of, take_sample_from},
 };
 use crate::{graph::Endpoint, ids::Gid};
@@ -27,7 +27,7 @@ const PATIENCE: Duration = Duration::from_millis(100);
 /// Answers requests. Thread-safe.
 pub struct Server {
     responses: Arc<PublisherInner>,
-    lanes: Arc<Lanes>,
+    rings: Arc<RingsByClient>,
     pub(super) requests: Arc<SubscriptionInner>,
     pub(super) session: Session,
 }
@@ -69,10 +69,10 @@ impl Server {
     pub(super) fn new(
         responses: Arc<PublisherInner>,
         requests: Arc<SubscriptionInner>,
-        lanes: Arc<Lanes>,
+        rings: Arc<RingsByClient>,
         session: Session,
     ) -> Self {
-        Self { responses, lanes, requests, session }
+        Self { responses, rings, requests, session }
     }
 
     /// Its GID.
@@ -121,7 +121,7 @@ impl Server {
         if self.session.is_forked() {
             return Err(PublishError::Forked);
         }
-        let ring = || self.lanes.ring(&client);
+        let ring = || self.rings.ring(&client);
         // Its request may have come before it could be answered.
         let settled = || ring().is_some() || !self.requests.lock().writers().contains(&client);
         if !settled() {
@@ -140,7 +140,7 @@ impl Server {
         meta: Meta,
         payload: &[u8],
     ) -> Result<bool, PublishError> {
-        let Some(ring) = self.lanes.ring(client) else { return Ok(false) };
+        let Some(ring) = self.rings.ring(client) else { return Ok(false) };
         ring.try_publish(meta, payload).map(|_| true)
     }
 

@@ -63,12 +63,12 @@ pub(super) struct Cost {
 }
 
 /// As many processes as the most readers.
-pub(super) struct Crowd<'a> {
+pub(super) struct ReaderProcesses<'a> {
     readers: Vec<Other>,
     machine: &'a Machine,
 }
 
-impl<'a> Crowd<'a> {
+impl<'a> ReaderProcesses<'a> {
     /// Starts them on every CPU but that of the process that measures, and leaves this thread on it.
     pub(super) fn start(machine: &'a Machine, arguments: &[&str]) -> Result<Self> {
         machine.beside()?;
@@ -97,7 +97,7 @@ impl<'a> Crowd<'a> {
             }
             publishers.push(publisher);
         }
-        let mut turns = Turns { crowd: self, place, bytes: vec![0x5a; size], published: 0 };
+        let mut turns = Turns { processes: self, place, bytes: vec![0x5a; size], published: 0 };
         let mut costs = Vec::new();
         for until in Until::ALL {
             let new = |readers| {
@@ -110,7 +110,8 @@ impl<'a> Crowd<'a> {
         for round in 0..=effort.paced_rounds {
             for cost in &mut costs {
                 let Cost { readers, until, raw, axon, .. } = cost;
-                let at = READERS.iter().position(|n| n == readers).ok_or("no such crowd")?;
+                let at =
+                    READERS.iter().position(|n| n == readers).ok_or("no such number of readers")?;
                 let sources = [(None, raw), (Some((at, &publishers[at])), axon)];
                 for (source, published) in sources {
                     let turn = turns.take(source, *readers, *until, effort.paced_messages)?;
@@ -139,7 +140,7 @@ struct Turn {
 }
 
 struct Turns<'a> {
-    crowd: &'a Crowd<'a>,
+    processes: &'a ReaderProcesses<'a>,
     place: Place,
     bytes: Vec<u8>,
     /// By all media together.
@@ -155,7 +156,7 @@ impl Turns<'_> {
         until: Until,
         messages: u64,
     ) -> Result<Turn> {
-        let readers = &self.crowd.readers[..readers];
+        let readers = &self.processes.readers[..readers];
         for (index, reader) in readers.iter().enumerate() {
             // A reader subscribes to those publishers only that have so many.
             let absent = READERS.iter().filter(|count| **count <= index).count();
@@ -185,7 +186,7 @@ impl Turns<'_> {
                 }
                 Some((_, publisher)) => drop(publisher.publish(&self.bytes)?),
             }
-            let call = start.elapsed().as_secs_f64() * 1e9 - self.crowd.machine.clock_ns;
+            let call = start.elapsed().as_secs_f64() * 1e9 - self.processes.machine.clock_ns;
             times[0].push(call.max(0.0));
             if until == Until::Told {
                 self.place.told().store(number, Ordering::Release);

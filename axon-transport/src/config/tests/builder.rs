@@ -65,7 +65,7 @@ fn every_setting_has_a_method() {
 }
 
 fn without_origin(config: &Config) -> String {
-    format!("{:?}", Config { passed_on: PassedOn::default(), ..config.clone() })
+    format!("{:?}", Config { daemon_env: DaemonEnv::default(), ..config.clone() })
 }
 
 #[test]
@@ -75,8 +75,8 @@ fn what_is_built_is_what_the_environment_would_make_and_so_it_is_passed_on() {
     std::fs::write(&key, "").unwrap();
     std::fs::set_permissions(&key, std::os::unix::fs::PermissionsExt::from_mode(0o600)).unwrap();
     let built = all_of_qkd().sae_key(&key).build().unwrap();
-    assert!(!built.passed_on.inherits);
-    let environment = built.passed_on.variables.clone().into_iter();
+    assert!(!built.daemon_env.inherits);
+    let environment = built.daemon_env.variables.clone().into_iter();
     let environment: Vec<_> = environment.filter_map(|(n, value)| Some((n, value?))).collect();
     assert!(environment.iter().all(|(name, _)| {
         names::SETTINGS
@@ -97,10 +97,10 @@ fn what_is_built_is_what_the_environment_would_make_and_so_it_is_passed_on() {
 fn the_default_is_the_empty_environment_and_names_no_file_to_its_daemon() {
     let default = Config::default();
     assert_eq!(without_origin(&default), without_origin(&resolve(&[], &[]).unwrap()));
-    let passed_on = default.passed_on;
-    assert!(!passed_on.inherits);
+    let daemon_env = default.daemon_env;
+    assert!(!daemon_env.inherits);
     assert_eq!(
-        passed_on.variables,
+        daemon_env.variables,
         BTreeMap::from([("AXON_CONFIG".into(), Some("/dev/null".into()))])
     );
 }
@@ -163,8 +163,9 @@ fn relative_files_are_found_from_any_directory() {
     let built = Config::builder().config("Cargo.toml").build();
     // It is no axon.toml, but found.
     assert!(built.unwrap_err().to_string().contains("Cargo.toml"));
-    let passed_on = PassedOn::whole(pairs(&[("AXON_CLASSIC_KEY", "key.pem")]), None, &Disk::new());
-    let key = passed_on.variables[OsStr::new("AXON_CLASSIC_KEY")].clone();
+    let daemon_env =
+        DaemonEnv::whole(pairs(&[("AXON_CLASSIC_KEY", "key.pem")]), None, &Disk::new());
+    let key = daemon_env.variables[OsStr::new("AXON_CLASSIC_KEY")].clone();
     assert_eq!(key, Some("/f/key.pem".into()));
 }
 

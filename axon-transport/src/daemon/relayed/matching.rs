@@ -15,7 +15,7 @@ use crate::{
     qos::{Durability, History, Qos},
     registry::parts,
     session::{
-        Face, Subscription,
+        RemoteWriter, Subscription,
         merge::{Merge, Taken},
         relayed::{
             MAX_MATCHED,
@@ -78,8 +78,8 @@ impl Served {
     /// write goes to it.
     pub(super) fn match_up(&mut self) -> Result<(), End> {
         let mut matched: BTreeMap<Gid, BTreeSet<Gid>> = BTreeMap::new();
-        let faces = self.writers.iter().map(|(gid, face)| (gid, face.partners()));
-        matched.extend(faces.map(|(gid, others)| (*gid, others.into_iter().collect())));
+        let partners = self.writers.iter().map(|(gid, writer)| (gid, writer.partners()));
+        matched.extend(partners.map(|(gid, others)| (*gid, others.into_iter().collect())));
         let readers = self.subscriptions.iter().map(|(gid, s)| (gid, s.attached()));
         matched.extend(readers.map(|(gid, others)| (*gid, others.into_iter().collect())));
         self.keep_what_is_left(&mut matched);
@@ -93,7 +93,7 @@ impl Served {
         let servers = self
             .told
             .iter()
-            .filter(|(gid, _)| matches!(self.writers.get(gid), Some(Face::Server(_))));
+            .filter(|(gid, _)| matches!(self.writers.get(gid), Some(RemoteWriter::Server(_))));
         self.calls.set(servers.flat_map(|(gid, all)| all.iter().map(|client| (*client, *gid))));
         let graph = &self.graph.endpoints;
         let sources = self.sources.keys().filter_map(|writer| graph.get(writer));
@@ -123,10 +123,10 @@ impl Served {
 
     /// Whether what `other` wrote for an endpoint of the session has not all been taken by it.
     fn has_left(&self, gid: &Gid, other: &Gid) -> bool {
-        if let Some(face) = self.writers.get(gid) {
-            return face.has_from(other)
+        if let Some(remote_writer) = self.writers.get(gid) {
+            return remote_writer.has_from(other)
                 || self.calls.holds(other, gid)
-                || !self.pipe.outgoing.is_idle(&channel(face, *other));
+                || !self.pipe.outgoing.is_idle(&channel(remote_writer, *other));
         }
         self.subscriptions.get(gid).is_some_and(|subscription| subscription.has_from(other))
             || self.sources.get(other).is_some_and(|source| source.samples.holds(gid))
@@ -136,7 +136,7 @@ impl Served {
     /// Gives up what `other`, which is gone, has left for an endpoint of a session that does not take it.
     fn discard(&self, gid: &Gid, other: &Gid) {
         let take = || match self.writers.get(gid) {
-            Some(face) => face.take_from(other),
+            Some(remote_writer) => remote_writer.take_from(other),
             None => self.subscriptions.get(gid)?.take_from(other).map(|(sample, _)| sample),
         };
         let samples = std::iter::from_fn(take).count() as u64;
@@ -165,8 +165,10 @@ impl Served {
     /// On which channels the session gets what `others` write for an endpoint of its.
     fn channels(&self, gid: &Gid, others: &BTreeSet<Gid>) -> Vec<Channel> {
         match self.writers.get(gid) {
-            Some(Face::Publisher(_)) => Vec::new(),
-            Some(face) => others.iter().map(|other| channel(face, *other)).collect(),
+            Some(RemoteWriter::Publisher(_)) => Vec::new(),
+            Some(remote_writer) => {
+                others.iter().map(|other| channel(remote_writer, *other)).collect()
+            }
             None => others.iter().map(|writer| Channel::of(*writer)).collect(),
         }
     }
@@ -242,9 +244,9 @@ fn taken(
 }
 
 /// On which channel the session gets what `other` writes for one of its clients or servers.
-fn channel(of: &Face, other: Gid) -> Channel {
+fn channel(of: &RemoteWriter, other: Gid) -> Channel {
     match of {
-        Face::Client(client) => Channel::between(other, client.gid()),
-        Face::Server(_) | Face::Publisher(_) => Channel::of(other),
+        RemoteWriter::Client(client) => Channel::between(other, client.gid()),
+        RemoteWriter::Server(_) | RemoteWriter::Publisher(_) => Channel::of(other),
     }
 }

@@ -20,10 +20,10 @@ use crate::{
     events::Alive,
     graph::{Endpoint, EndpointKind, GraphView},
     ids::{Gid, SessionId},
+    log_limit::LogLimit,
     registry::Tally,
-    seldom::Seldom,
     session::{
-        Face, Node, Session, SessionError, SessionOptions, Subscription,
+        Node, RemoteWriter, Session, SessionError, SessionOptions, Subscription,
         daemon::socket::{self, SocketError},
         relayed::{
             LINGER, MAX_CALLERS, MAX_ENDPOINTS, Pool,
@@ -117,7 +117,7 @@ impl Far {
             unreached: BTreeMap::new(),
             graph: Arc::default(),
             left: VecDeque::new(),
-            given_up: Seldom::default(),
+            given_up: LogLimit::default(),
             leader,
             change_signal,
             process,
@@ -153,7 +153,7 @@ struct Served {
     pipe: Pipe,
     tally: Arc<Tally>,
     /// Its publishers, clients and servers.
-    writers: BTreeMap<Gid, Face>,
+    writers: BTreeMap<Gid, RemoteWriter>,
     subscriptions: BTreeMap<Gid, Subscription>,
     nodes: BTreeMap<Gid, Node>,
     /// The others that each endpoint was said to be matched with.
@@ -173,7 +173,7 @@ struct Served {
     /// in the order in which they went.
     left: VecDeque<(Gid, Gid)>,
     /// Those of them that were given up.
-    given_up: Seldom,
+    given_up: LogLimit,
     leader: ExternalLeader,
     change_signal: Arc<ChangeSignal>,
     process: Option<OwnedFd>,
@@ -252,7 +252,7 @@ impl Served {
         );
         let publishers: BTreeSet<Gid> = credits.iter().map(|credit| credit.publisher).collect();
         for writer in publishers {
-            let Some(given_up) = self.writers.get(&writer).and_then(Face::given_up) else {
+            let Some(given_up) = self.writers.get(&writer).and_then(RemoteWriter::given_up) else {
                 continue;
             };
             let samples = self.unreached.entry(writer).or_default().news(given_up);
@@ -270,7 +270,7 @@ impl Served {
         let end = Instant::now() + LINGER;
         self.subscriptions.clear();
         self.nodes.clear();
-        self.writers.values().for_each(|face| face.leave(true));
+        self.writers.values().for_each(|remote_writer| remote_writer.leave(true));
         while self.pipe.is_blocked() && !self.change_signal.is_lost() && Instant::now() < end {
             self.leader.clear();
             self.leader.arm(true);
@@ -297,15 +297,15 @@ impl Served {
             }
             Message::Leaving(Leaving { gid, leaving }) => {
                 // It may have been refused.
-                if let Some(face) = self.writers.get(&gid) {
-                    face.leave(leaving);
+                if let Some(remote_writer) = self.writers.get(&gid) {
+                    remote_writer.leave(leaving);
                 }
                 Ok(())
             }
             Message::Matched(matched) => self.callers(matched),
             Message::Asserted(asserted) => {
                 let own = asserted.publishers.iter().filter_map(|gid| self.writers.get(gid));
-                own.for_each(Face::assert_alive);
+                own.for_each(RemoteWriter::assert_alive);
                 Ok(())
             }
             Message::Credit(credit) => {
@@ -348,7 +348,11 @@ impl Served {
         match kind {
             EndpointKind::Subscription => self.subscriptions.len(),
             EndpointKind::Node => self.nodes.len(),
-            _ => self.writers.values().filter(|face| face.endpoint().kind == kind).count(),
+            _ => self
+                .writers
+                .values()
+                .filter(|remote_writer| remote_writer.endpoint().kind == kind)
+                .count(),
         }
     }
 
@@ -361,9 +365,9 @@ impl Served {
             EndpointKind::Node => {
                 self.nodes.insert(gid, self.session.adopt_node(endpoint));
             }
-            kind => match Face::adopt(&self.session, endpoint.clone()) {
-                Ok(face) => {
-                    self.writers.insert(gid, face);
+            kind => match RemoteWriter::adopt(&self.session, endpoint.clone()) {
+                Ok(remote_writer) => {
+                    self.writers.insert(gid, remote_writer);
                     // A server's responses are a channel for each of its clients.
                     if kind != EndpointKind::Server {
                         self.pipe.open_in(Channel::of(gid))?;
@@ -395,7 +399,7 @@ impl Served {
         let Matched { gid, others } = matched;
         let others: BTreeSet<Gid> = others.into_iter().collect();
         match self.writers.get(&gid) {
-            Some(Face::Server(_)) => {}
+            Some(RemoteWriter::Server(_)) => {}
             // It was refused.
             None if gid.is_of(&self.id) => return Ok(()),
             _ => return Err(End::Other(format!("{gid} is no server of its own"))),

@@ -32,10 +32,10 @@ use super::{
     establish::{Established, Sealing, close, peer_text},
     outbound::Carrier,
     peer::{GraphTaken, Peer, binding},
-    pulse::Pulse,
+    protection::Protection,
     queue_budget::QueueBudget,
     refusal::{Refusal, RefusedBy},
-    seal::Protection,
+    ring_wakeups::RingWakeups,
     shares::Said,
     silence::{Echoes, Traffic},
     stalls::Stalls,
@@ -61,7 +61,7 @@ pub(super) struct Shared {
     /// Remote publishers as they are seen here.
     pub(super) stand_ins: StandIns,
     /// Wakes tasks when rings change.
-    pub(super) pulse: Pulse,
+    pub(super) ring_wakeups: RingWakeups,
     /// ROS domain.
     pub(super) domain: u32,
     /// Largest payload.

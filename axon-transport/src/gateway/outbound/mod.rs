@@ -33,11 +33,11 @@ use super::{
     counters::Counting,
     hub::Event,
     keyring::lock,
-    pulse::Pulse,
+    protection::{Protection, sample},
     queue::Sample,
     queue_budget::QueueBudget,
+    ring_wakeups::RingWakeups,
     routes::RelaySpec,
-    seal::{Protection, sample},
     stand_in::StandIn,
 };
 use crate::{
@@ -278,7 +278,7 @@ pub(super) async fn run(
     inbox: Inbox,
     counters: Counting,
     queues: Arc<QueueBudget>,
-    pulse: Pulse,
+    ring_wakeups: RingWakeups,
     owner: Owner,
     stalled_after: Duration,
 ) {
@@ -296,9 +296,9 @@ pub(super) async fn run(
     });
     let (mut endings, mut stalling) = (Endings::new(owner), Stalling::new(stalled_after));
     let mut routes: HashMap<u32, Active> = HashMap::new();
-    let mut beat = pulse.subscribe();
+    let mut wakeups = ring_wakeups.subscribe();
     loop {
-        beat.mark_unchanged();
+        wakeups.mark_unchanged();
         let (popped, freed) = (shared.popped.notified(), shared.queues.freed());
         tokio::pin!(popped, freed);
         // Registered before the queues are looked at, so that nothing in between is missed.
@@ -332,7 +332,7 @@ pub(super) async fn run(
                     }
                     None => true,
                 },
-                changed = beat.changed() => changed.is_err(),
+                changed = wakeups.changed() => changed.is_err(),
                 () = shared.acknowledged.noted() => false,
                 () = popped => false,
                 () = freed => false,

@@ -115,11 +115,19 @@ impl Peer {
         let (orders, receiver) = mpsc::unbounded_channel();
         let acknowledged = Arc::<Acknowledged>::default();
         let inbox = Inbox { orders: receiver, acknowledged: Arc::clone(&acknowledged) };
-        let (queues, pulse) = (shared.queues.of_peer(), shared.pulse.clone());
+        let (queues, ring_wakeups) = (shared.queues.of_peer(), shared.ring_wakeups.clone());
         let (daemon, stalled_after) = (owner.daemon, shared.stalled_after);
         let owner_identity = owner.identity.clone();
         let sent = counters.counting();
-        tokio::spawn(outbound::run(carrier, inbox, sent, queues, pulse, owner, stalled_after));
+        tokio::spawn(outbound::run(
+            carrier,
+            inbox,
+            sent,
+            queues,
+            ring_wakeups,
+            owner,
+            stalled_after,
+        ));
         let receipts = Receipts::new(outbox.clone());
         let telling = OnDrop(tokio::spawn(Arc::clone(&receipts).run()));
         Self {
@@ -186,7 +194,7 @@ impl Peer {
             protection: carrier.protection,
             routes: Arc::clone(&self.routes_in),
             counters: self.counters.counting(),
-            pulse: shared.pulse.clone(),
+            ring_wakeups: shared.ring_wakeups.clone(),
             max_message: shared.max_message,
             wanted,
             intake: Arc::clone(&self.intake),

@@ -9,7 +9,7 @@ use super::{MAX_ROUTES, Peer};
 use crate::{
     gateway::routes::RouteKey,
     link::{Message, RouteRefused},
-    seldom::Seldom,
+    log_limit::LogLimit,
     status::LinkStatus,
 };
 
@@ -29,7 +29,7 @@ pub(super) struct RefusedRoutes {
     unserved: BTreeMap<RouteKey, (String, Option<Instant>)>,
     /// What the peer asked for and does not get, by its number.
     theirs: BTreeMap<u32, (RouteKey, String)>,
-    logged: Seldom,
+    logged: LogLimit,
 }
 
 /// Why this side asks for no more.

@@ -184,17 +184,17 @@ fn own_file() -> Option<PathBuf> {
 }
 
 /// The environment of a daemon: what its system libraries need of this process's, the settings that
-/// [`passed_on`](Config) says, and what each session has of its own.
+/// [`daemon_env`](Config) says, and what each session has of its own.
 fn environment(
     config: &Config,
     own: impl IntoIterator<Item = (OsString, OsString)>,
     is_elevated: bool,
 ) -> BTreeMap<OsString, OsString> {
-    let passed_on = &config.passed_on;
-    let inherited = |name: &OsString| inherited(name, is_elevated, passed_on.inherits);
+    let daemon_env = &config.daemon_env;
+    let inherited = |name: &OsString| inherited(name, is_elevated, daemon_env.inherits);
     let mut environment: BTreeMap<_, _> =
         own.into_iter().filter(|(name, _)| inherited(name)).collect();
-    for (name, value) in &passed_on.variables {
+    for (name, value) in &daemon_env.variables {
         match value {
             Some(value) => environment.insert(name.clone(), value.clone()),
             None => environment.remove(name),
@@ -308,8 +308,8 @@ mod tests {
         assert_eq!(names(&built, false), [&["AXON_CONFIG", "LC_ALL", "PATH"], &ros[..]].concat());
         assert_eq!(names(&built, true), [&["AXON_CONFIG", "LC_ALL"], &ros[..]].concat());
         let mut read = Config::default();
-        read.passed_on.inherits = true;
-        read.passed_on.variables.clear();
+        read.daemon_env.inherits = true;
+        read.daemon_env.variables.clear();
         let of_axon = ["AXON_LOG", "AXON_STRICT_ENV", "LC_ALL"];
         assert_eq!(
             names(&read, false),

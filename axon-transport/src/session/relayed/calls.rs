@@ -9,7 +9,7 @@ use super::flow::{Channel, Departing};
 use crate::{
     ids::Gid,
     session::{
-        Face,
+        RemoteWriter,
         merge::{Merge, Taken},
     },
 };
@@ -38,14 +38,17 @@ impl Calls {
     pub(crate) fn request<'a>(
         &mut self,
         client: &Gid,
-        find: impl Fn(&Gid) -> Option<&'a Face>,
+        find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
     ) -> Option<Departing<Sample>> {
         let requests = self.requests.get_mut(client)?;
         requests.next(|server| find(server)?.take_from(client).map(taken)).map(Departing::from)
     }
 
     /// Takes the requests that were sent by way of another server; whether there are more.
-    pub(crate) fn pass_over<'a>(&mut self, find: impl Fn(&Gid) -> Option<&'a Face>) -> bool {
+    pub(crate) fn pass_over<'a>(
+        &mut self,
+        find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
+    ) -> bool {
         let mut more = false;
         for (client, requests) in &mut self.requests {
             more |= requests.pass_over(|server| find(server)?.take_from(client).map(taken));
@@ -62,7 +65,7 @@ impl Calls {
 /// The next response on `channel`; `client` finds the one that it is for.
 pub(crate) fn response<'a>(
     channel: &Channel,
-    find: impl Fn(&Gid) -> Option<&'a Face>,
+    find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
 ) -> Option<Departing<Sample>> {
     let client = find(&channel.client?)?;
     client.take_from(&channel.writer).map(taken).map(Departing::from)

@@ -19,10 +19,10 @@ use super::{
 };
 use crate::{
     ids::Gid,
+    log_limit::LogLimit,
     registry::Tally,
-    seldom::Seldom,
     session::{
-        Face, Written,
+        RemoteWriter, Written,
         daemon::socket::{self, Received, SocketError},
     },
     wire::session::{Credit, Message},
@@ -106,7 +106,7 @@ pub(crate) struct Pipe {
     /// What it had said has been heard to its end.
     over: bool,
     tally: Arc<Tally>,
-    losses: Seldom,
+    losses: LogLimit,
 }
 
 impl Pipe {
@@ -127,7 +127,7 @@ impl Pipe {
             gone: false,
             over: false,
             tally,
-            losses: Seldom::default(),
+            losses: LogLimit::default(),
         }
     }
 
@@ -233,7 +233,7 @@ impl Pipe {
     /// what the other end is to be [given back](Self::give_back).
     pub(crate) fn write<'a>(
         &mut self,
-        find: impl Fn(&Gid) -> Option<&'a Face>,
+        find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
         mut lost: impl FnMut(&Gid, Loss),
     ) -> Vec<Credit> {
         self.blocked = false;
@@ -241,7 +241,7 @@ impl Pipe {
         for (channel, samples) in &mut self.arrived {
             let Channel { writer: gid, client } = channel;
             while let Some(sample) = samples.front_mut() {
-                let Some(face) = find(gid) else { break };
+                let Some(remote_writer) = find(gid) else { break };
                 match std::mem::take(&mut sample.lost) {
                     0 => {}
                     samples => {
@@ -253,7 +253,7 @@ impl Pipe {
                 let client = client.as_ref().unwrap_or(gid);
                 let number = sample.meta.sequence;
                 let mut last = number;
-                match face.try_write(client, sample.meta, &sample.payload) {
+                match remote_writer.try_write(client, sample.meta, &sample.payload) {
                     Ok(Written::Yes) => self.tally.arrived(sample.payload.len()),
                     Ok(Written::Nobody) => {}
                     Err(PublishError::Blocked { .. }) => {
@@ -272,7 +272,7 @@ impl Pipe {
                     && let Some(mut credit) = self.incoming.done(&sample)
                 {
                     // What is written is in this process's memory only, where others carry it on.
-                    if let Some(over) = face.handed_over().filter(|over| *over < last) {
+                    if let Some(over) = remote_writer.handed_over().filter(|over| *over < last) {
                         credit.done = Some(over);
                         self.written
                             .insert(*channel, OnTheirWay { said: over, last, then: number });
@@ -283,7 +283,7 @@ impl Pipe {
         }
         self.arrived.retain(|_, samples| !samples.is_empty());
         self.written.retain(|channel, OnTheirWay { said, last, then }| {
-            let over = find(&channel.writer).and_then(Face::handed_over).unwrap_or(*last);
+            let over = find(&channel.writer).and_then(RemoteWriter::handed_over).unwrap_or(*last);
             let now = if over < *last { over } else { over.max(*then) };
             if now > *said {
                 *said = now;

@@ -219,7 +219,7 @@ impl<'a> Served<'a> {
                 self.pipe.say(&Message::Asserted(Asserted { publishers }))?;
             }
             let stand_ins = &self.stand_ins;
-            let find = |gid: &Gid| stand_ins.get(gid).map(StandIn::face);
+            let find = |gid: &Gid| stand_ins.get(gid).map(StandIn::remote_writer);
             let credits = self.pipe.write(find, |gid, loss| {
                 let first = matches!(loss, Loss::Before { first: true, .. });
                 common.shared.lost(gid, loss.samples(), first);
@@ -284,7 +284,7 @@ impl<'a> Served<'a> {
             }
             Message::Asserted(asserted) => {
                 let named = asserted.publishers.iter().filter_map(|gid| self.stand_ins.get(gid));
-                named.for_each(|stand_in| stand_in.face().assert_alive());
+                named.for_each(|stand_in| stand_in.remote_writer().assert_alive());
             }
             Message::Refused(Refused { endpoint, text: reason, .. }) => {
                 tracing::error!(reason, "the daemon refuses an endpoint");

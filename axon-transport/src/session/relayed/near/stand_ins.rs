@@ -11,7 +11,7 @@ use crate::{
     graph::{Endpoint, EndpointKind, Pairing, pairing, reads},
     ids::Gid,
     session::{
-        Face,
+        RemoteWriter,
         relayed::{MAX_CALLERS, flow::Channel, pipe::End},
     },
     wire::session::{Matched, Message},
@@ -23,15 +23,15 @@ const SETTLING: Duration = Duration::from_secs(1);
 
 /// What stands for one of them.
 pub(super) struct StandIn {
-    face: Face,
+    remote_writer: RemoteWriter,
     since: Instant,
     /// Whom it stands for is gone, and has left something.
     leaving: bool,
 }
 
 impl StandIn {
-    pub(super) fn face(&self) -> &Face {
-        &self.face
+    pub(super) fn remote_writer(&self) -> &RemoteWriter {
+        &self.remote_writer
     }
 }
 
@@ -89,11 +89,11 @@ impl Served<'_> {
             if !self.stand_ins.contains_key(&writer) {
                 // The graph may say later who it is.
                 let Some((_, endpoint)) = self.world.get(&writer) else { continue };
-                match Face::stand_in(&self.common.outside, endpoint.clone()) {
-                    Ok(face) => {
+                match RemoteWriter::stand_in(&self.common.outside, endpoint.clone()) {
+                    Ok(remote_writer) => {
                         self.stand_ins.insert(
                             writer,
-                            StandIn { face, since: Instant::now(), leaving: false },
+                            StandIn { remote_writer, since: Instant::now(), leaving: false },
                         );
                     }
                     Err(error) => {
@@ -103,9 +103,9 @@ impl Served<'_> {
                     }
                 }
             }
-            let face = self.stand_ins[&writer].face();
-            let partners = face.partners();
-            if let Face::Server(_) = face {
+            let remote_writer = self.stand_ins[&writer].remote_writer();
+            let partners = remote_writer.partners();
+            if let RemoteWriter::Server(_) = remote_writer {
                 for client in readers.iter().filter(|client| partners.contains(client)) {
                     self.pipe.open_in(Channel::between(writer, *client))?;
                 }
@@ -114,7 +114,8 @@ impl Served<'_> {
             // Whoever there is to read it, whether or not the daemon has said so of all of them: what
             // comes first is theirs, too. Who is gone and has left something reads no more.
             let own = self.own.values().filter(|e| !self.ending.contains_key(&e.gid));
-            let mut readers = own.filter(|e| pairing(face.endpoint(), e) == Pairing::Match);
+            let mut readers =
+                own.filter(|e| pairing(remote_writer.endpoint(), e) == Pairing::Match);
             if readers.all(|reader| partners.contains(&reader.gid)) {
                 self.pipe.open_in(Channel::of(writer))?;
             }
@@ -127,7 +128,7 @@ impl Served<'_> {
         for (gid, stand_in) in &mut self.stand_ins {
             let leaving = !self.world.contains_key(gid);
             if std::mem::replace(&mut stand_in.leaving, leaving) != leaving {
-                stand_in.face.leave(leaving);
+                stand_in.remote_writer.leave(leaving);
             }
         }
     }
@@ -137,9 +138,9 @@ impl Served<'_> {
     pub(super) fn is_served(&self, reader: &Endpoint) -> bool {
         // A client may be told of: its requests wait until it is served (`settling`).
         !matches!(reader.kind, EndpointKind::Subscription | EndpointKind::Server)
-            || self.stand_ins.values().map(StandIn::face).all(|face| {
-                pairing(face.endpoint(), reader) != Pairing::Match
-                    || face.partners().contains(&reader.gid)
+            || self.stand_ins.values().map(StandIn::remote_writer).all(|remote_writer| {
+                pairing(remote_writer.endpoint(), reader) != Pairing::Match
+                    || remote_writer.partners().contains(&reader.gid)
             })
     }
 
@@ -150,13 +151,13 @@ impl Served<'_> {
         for client in self.own.values().filter(|e| e.kind == EndpointKind::Client) {
             let matched = self.matched.get(&client.gid);
             for (server, stand_in) in &self.stand_ins {
-                let face = stand_in.face();
-                if pairing(client, face.endpoint()) != Pairing::Match {
+                let remote_writer = stand_in.remote_writer();
+                if pairing(client, remote_writer.endpoint()) != Pairing::Match {
                     continue;
                 }
                 pairs.push((client.gid, *server));
                 if !matched.is_some_and(|all| all.contains(server))
-                    && face.partners().contains(&client.gid)
+                    && remote_writer.partners().contains(&client.gid)
                 {
                     // It stands for the sake of another client, and this one counts it already.
                     let told = self.asking.get(&client.gid).copied().unwrap_or(stand_in.since);
@@ -220,7 +221,7 @@ impl Served<'_> {
     pub(super) fn is_asked(&self, client: &Gid) -> bool {
         self.pipe.outgoing.is_idle(&Channel::of(*client))
             && self.stand_ins.iter().all(|(server, stand_in)| {
-                !stand_in.face().has_from(client) && !self.calls.holds(client, server)
+                !stand_in.remote_writer().has_from(client) && !self.calls.holds(client, server)
             })
     }
 
@@ -229,7 +230,7 @@ impl Served<'_> {
         let clients = self.callers.get(server).into_iter().flatten();
         let mut there = clients.filter_map(|client| Some((client, self.stand_ins.get(client)?)));
         there.all(|(client, stand_in)| {
-            !stand_in.face().has_from(server)
+            !stand_in.remote_writer().has_from(server)
                 && self.pipe.outgoing.is_idle(&Channel::between(*server, *client))
         })
     }

@@ -10,14 +10,14 @@ use super::{files::Files, names, sources::FOREIGN};
 
 /// The variables of a daemon that a session starts.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct PassedOn {
+pub(crate) struct DaemonEnv {
     /// Whether it gets the settings in the session's environment too, as they are when it is started.
     pub(crate) inherits: bool,
     /// Variables that have this value, or none, whatever the session's environment says.
     pub(crate) variables: BTreeMap<OsString, Option<OsString>>,
 }
 
-impl PassedOn {
+impl DaemonEnv {
     /// The settings of a session that did not read the environment: these alone, and no `axon.toml` but
     /// `file`.
     pub(super) fn whole(

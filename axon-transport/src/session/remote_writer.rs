@@ -13,7 +13,7 @@ use crate::{
 
 /// What stands for it here. Of a service it reads, too: a client's is given the responses that go to
 /// where the client is, and a server's the requests.
-pub(crate) enum Face {
+pub(crate) enum RemoteWriter {
     Publisher(Publisher),
     Client(Client),
     Server(Server),
@@ -28,7 +28,7 @@ pub(crate) enum Written {
     Nobody,
 }
 
-impl Face {
+impl RemoteWriter {
     /// A stand-in for `remote`, under its GID. For gateways alone; a daemon refuses it from anybody
     /// else.
     ///

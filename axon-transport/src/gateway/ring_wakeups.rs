@@ -16,8 +16,8 @@ use crate::{gateway::watch::watch as watch_descriptor, session::Session};
 
 /// Wakes whoever waits for samples in a ring, or for room in one.
 #[derive(Clone)]
-pub(super) struct Pulse {
-    beat: watch::Receiver<u64>,
+pub(super) struct RingWakeups {
+    wakeups: watch::Receiver<u64>,
     blocked: Arc<AtomicUsize>,
     session: Session,
 }
@@ -32,11 +32,11 @@ impl Drop for Blocked {
     }
 }
 
-impl Pulse {
-    /// Starts the task that watches the doorbell of `session`; it ends when all pulses are gone.
+impl RingWakeups {
+    /// Starts the task that watches the doorbell of `session`; it ends when all copies of it are gone.
     pub(super) fn start(session: &Session) -> Result<Self, ShmError> {
         let leader = session.segment().external_leader()?;
-        let (sender, beat) = watch::channel(0);
+        let (sender, wakeups) = watch::channel(0);
         let blocked = Arc::new(AtomicUsize::new(0));
         let count = Arc::clone(&blocked);
         tokio::spawn(async move {
@@ -44,12 +44,12 @@ impl Pulse {
                 tracing::error!(%error, "the gateway can no longer hear its doorbell");
             }
         });
-        Ok(Self { beat, blocked, session: session.clone() })
+        Ok(Self { wakeups, blocked, session: session.clone() })
     }
 
     /// A receiver whose `changed` resolves whenever a ring may hold something new.
     pub(super) fn subscribe(&self) -> watch::Receiver<u64> {
-        self.beat.clone()
+        self.wakeups.clone()
     }
 
     /// From now until the guard is dropped room in a ring counts too.
@@ -63,19 +63,19 @@ impl Pulse {
 
 async fn watch_doorbell(
     leader: axon_shm::ExternalLeader,
-    beat: &watch::Sender<u64>,
+    wakeups: &watch::Sender<u64>,
     blocked: &AtomicUsize,
 ) -> io::Result<()> {
     let doorbell = watch_descriptor(leader.as_fd().try_clone_to_owned()?)?;
-    while !beat.is_closed() {
+    while !wakeups.is_closed() {
         leader.clear();
         leader.arm(blocked.load(Ordering::Relaxed) > 0);
         // After the arming: what came before it is found by the tasks that this wakes, what comes
         // after it rings.
-        beat.send_modify(|n| *n += 1);
+        wakeups.send_modify(|n| *n += 1);
         tokio::select! {
             ready = doorbell.readable() => ready?.clear_ready(),
-            () = beat.closed() => {}
+            () = wakeups.closed() => {}
         }
     }
     Ok(())

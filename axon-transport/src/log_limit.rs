@@ -9,7 +9,7 @@ const BETWEEN: Duration = Duration::from_secs(1);
 
 /// Counts what would be said of each.
 #[derive(Debug, Default)]
-pub(crate) struct Seldom(Mutex<Said>);
+pub(crate) struct LogLimit(Mutex<Said>);
 
 #[derive(Debug, Default)]
 struct Said {
@@ -17,7 +17,7 @@ struct Said {
     since: u64,
 }
 
-impl Seldom {
+impl LogLimit {
     /// One more at `now`. How many there were since it was said last, this one among them, if it is to
     /// be said.
     pub(crate) fn count(&self, now: Instant) -> Option<u64> {
@@ -37,8 +37,8 @@ mod tests {
 
     #[test]
     fn it_is_said_at_once_and_then_once_a_second_with_how_many_there_were() {
-        let (seldom, start) = (Seldom::default(), Instant::now());
-        let at = |milliseconds| seldom.count(start + Duration::from_millis(milliseconds));
+        let (limit, start) = (LogLimit::default(), Instant::now());
+        let at = |milliseconds| limit.count(start + Duration::from_millis(milliseconds));
         assert_eq!([0, 1, 500, 999].map(at), [Some(1), None, None, None]);
         assert_eq!([1000, 1001, 2500].map(at), [Some(4), None, Some(2)]);
     }
