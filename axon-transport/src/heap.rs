@@ -1,4 +1,4 @@
-//! The process's heap as a whole.
+//! Returns freed memory of the allocator to the system.
 
 #![allow(unsafe_code)]
 

@@ -1,4 +1,4 @@
-//! What is logged of many samples: once a second at most, and then how many there were.
+//! Limits log lines about many samples to one a second, with the number of samples since the last line.
 
 use std::{
     sync::{Mutex, PoisonError},

@@ -1,4 +1,4 @@
-//! What can go wrong, for whom, and what to do about it.
+//! The errors of this crate, each with its cause and what to do about it.
 
 use std::{fmt, io};
 

@@ -1,4 +1,5 @@
-//! How the settings of a session reach the daemon that it starts: by the environment, and by nothing else.
+//! The environment of a daemon that a session starts. It is the only way by which the session's settings
+//! reach that daemon.
 
 use std::{
     collections::BTreeMap,

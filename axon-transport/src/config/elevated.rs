@@ -1,5 +1,5 @@
-//! What a program that runs with more rights than its caller takes from that caller: no programs, no
-//! files and no users to trust.
+//! Restricts the settings of a set-uid, set-gid or file-capability program: its caller may name no
+//! programs, no files and no trusted users.
 //!
 //! The environment of a set-uid, set-gid or file-capability program is its caller's. A path in it would
 //! be executed or read with rights that the caller does not have.

@@ -1,4 +1,4 @@
-//! What validation may ask of the file system.
+//! The file system as validation sees it. Tests replace it.
 
 use std::{
     fs::{File, Metadata, OpenOptions},

@@ -1,4 +1,4 @@
-//! What it takes to find a daemon: the few settings that say where it listens.
+//! The few settings that say where a daemon listens, for tools that look for one and open no session.
 
 use std::{
     ffi::OsString,

@@ -1,4 +1,4 @@
-//! Which settings go together, and what the absent ones are.
+//! Checks which settings go together, and fills in the defaults.
 
 use std::{
     ffi::OsString,

@@ -1,4 +1,5 @@
-//! The control plane's state in a running daemon. One thread; never borrowed across an await.
+//! The state of the control plane in a running daemon. One thread uses it, and no borrow of it lives across
+//! an await.
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap, VecDeque},

@@ -1,4 +1,5 @@
-//! What a session says before it is admitted: perhaps its key, and HELLO.
+//! Reads the first messages of a connection, before it is admitted as a session: optionally the session's
+//! key, then HELLO.
 
 use std::sync::Arc;
 

@@ -1,4 +1,4 @@
-//! Puts the status together.
+//! Builds the daemon's [`Status`] from the state of the control plane.
 
 use std::collections::BTreeMap;
 

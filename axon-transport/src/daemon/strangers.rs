@@ -1,4 +1,5 @@
-//! Connections that have not said HELLO yet.
+//! Limits the connections that have not said HELLO yet. If there are too many, the process with the most of
+//! them loses one.
 
 use std::{
     cell::RefCell,

@@ -1,4 +1,4 @@
-//! What the status says of topics.
+//! The part of the daemon's status about topics.
 //!
 //! What publishers and readers count is read from the descriptors of their sessions' segments: the
 //! daemon maps no session's memory.

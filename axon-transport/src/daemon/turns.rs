@@ -1,4 +1,4 @@
-//! Whose turn it is: the control plane is one thread, and a process may have many sessions.
+//! Shares the control plane's one thread fairly between processes: a process may have many sessions.
 //!
 //! What a session asks for is done in parts of about [`PART`], and of one process one part at a time.
 //! After each the others are served, so that a process that asks for much waits for itself.

@@ -1,4 +1,4 @@
-//! Why a daemon may be at an address.
+//! How sure it is that a daemon is at an address, from a proven link down to an unverified beacon.
 
 /// What speaks for a daemon being where a beacon puts it, the best first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]

@@ -1,4 +1,4 @@
-//! How far discovery looks, and for which peers.
+//! The range and the peers that a daemon's sessions need of discovery together.
 
 use std::collections::BTreeSet;
 

@@ -1,5 +1,5 @@
-//! Who is alive, as those are told who do not see it themselves, such as another host: in time for the
-//! shortest lease, the publishers that said so since.
+//! Collects which publishers asserted their liveliness, to tell processes and hosts that cannot see it
+//! themselves, in time for the shortest lease.
 
 use std::{
     collections::BTreeMap,

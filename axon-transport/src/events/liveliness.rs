@@ -1,4 +1,4 @@
-//! Who is alive: leases that are asserted, run out, and are asserted again.
+//! Liveliness: leases that are asserted, run out, and are asserted again.
 
 use std::collections::HashMap;
 

@@ -1,4 +1,4 @@
-//! Functions of the program that are told how often something happened.
+//! Callbacks of the C program that are called with the number of new events.
 
 use std::{ffi::c_void, sync::Arc};
 

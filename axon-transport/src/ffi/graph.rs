@@ -1,4 +1,4 @@
-//! What one asks of the graph.
+//! The C functions that query the graph.
 
 use std::{
     ffi::{CString, c_void},

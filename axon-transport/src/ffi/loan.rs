@@ -1,4 +1,4 @@
-//! Memory that is written before it is published.
+//! The C functions of loans: memory that the program writes before it publishes it.
 
 use std::sync::{Mutex, PoisonError, Weak};
 

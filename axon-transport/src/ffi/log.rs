@@ -1,4 +1,4 @@
-//! What the library logs, for the program to hear.
+//! Passes the library's log lines to a callback of the C program. A thread of the library's own calls it.
 
 mod queue;
 

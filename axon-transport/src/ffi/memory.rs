@@ -1,4 +1,4 @@
-//! What a C program points to.
+//! Checked access to the pointers that a C program passes.
 
 use std::{ffi::CStr, os::raw::c_char, slice};
 

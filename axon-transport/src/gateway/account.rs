@@ -1,4 +1,4 @@
-//! What one peer may have this daemon hold, over all of its daemon ids and links.
+//! Limits what one peer may make this daemon hold, over all of its daemon ids and links.
 //!
 //! A peer is an identity here: the SAE, pinned name or certificate's host that it proved, its address
 //! where nothing is proved. What counts for a [`Meter`] is held by a [`Charge`] and given back when

@@ -1,4 +1,4 @@
-//! What the control plane and the gateway say to each other.
+//! The messages between the control plane and the gateway.
 //!
 //! They run on threads and runtimes of their own and share nothing but these two bounded channels,
 //! one session socket, and the table of the sessions' keys. Neither waits for the other: the control

@@ -1,4 +1,4 @@
-//! Whether a daemon could start its gateway, found out without one.
+//! Checks whether a daemon could start its gateway with a configuration, without starting one.
 
 use super::{GatewayError, identity};
 use crate::{

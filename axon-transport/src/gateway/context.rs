@@ -1,4 +1,4 @@
-//! What every task of the gateway shares.
+//! The state that all tasks of the gateway share.
 
 use std::{
     collections::BTreeSet,

@@ -1,4 +1,4 @@
-//! What a link carried and what was dropped on the way, for status.
+//! The counters of a link for status: what it carried, and what was dropped on the way.
 
 use std::{
     collections::BTreeMap,

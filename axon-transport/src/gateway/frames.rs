@@ -1,4 +1,5 @@
-//! What is written to a stream at once: short messages lie together, a long payload stays where it is.
+//! Collects the buffers of one write to a stream: short messages are copied together, long payloads are not
+//! copied.
 
 use bytes::Bytes;
 

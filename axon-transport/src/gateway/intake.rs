@@ -1,5 +1,5 @@
-//! Memory for the messages of one peer that are on their way in: that come piece by piece, or wait for
-//! room in a ring.
+//! Limits the memory of one peer's incoming messages: those that arrive in pieces, or wait for room in a
+//! ring.
 
 use std::sync::Arc;
 

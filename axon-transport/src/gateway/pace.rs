@@ -1,5 +1,5 @@
-//! How fast a peer's changes are taken: a token bucket for what it says, and turns for what follows
-//! from it, so that one that never rests leaves time for the others.
+//! Limits how fast a peer's control messages are handled: a token bucket for the messages, and turns for
+//! the work that follows, so that a busy peer leaves time for the others.
 
 use std::time::{Duration, Instant};
 

@@ -1,4 +1,4 @@
-//! What has come of a stream, piece by piece: many pieces are taken from the connection at a time.
+//! Reads a QUIC stream in pieces, many of them at a time.
 
 use bytes::Bytes;
 use quinn::{RecvStream, VarInt};

@@ -1,4 +1,4 @@
-//! The body of a data message: the inner header and the payload, in `messages10` within an
+//! Seals and opens the body of a data message: the inner header and the payload, in `messages10` within an
 //! AXQKD001 envelope (`docs/formats.md`, sections 3 and 7).
 
 use std::{borrow::Cow, sync::Arc, time::Instant};

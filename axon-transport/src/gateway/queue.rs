@@ -1,4 +1,4 @@
-//! What waits to be sent for one publisher towards one peer: plain data in, data out.
+//! The queue of samples from one publisher to one peer: plain data in, data out.
 //!
 //! KEEP_LAST never blocks its publisher: it is lossless up to the bound, then drops the oldest and
 //! counts it. Only KEEP_ALL makes the relay wait, which leaves its samples in the ring and so in

@@ -1,6 +1,5 @@
-//! How many bytes of samples may wait for RELIABLE delivery: `AXON_RELIABLE_QUEUE_MB` in all, a quarter
-//! of it towards one peer, so that one that is slow leaves room for the others, and of one publisher
-//! towards one peer a thirty-second.
+//! Limits the bytes of samples that wait for RELIABLE delivery: `AXON_RELIABLE_QUEUE_MB` in all, a quarter
+//! of it towards one peer, and a thirty-second for one publisher towards one peer.
 
 use std::sync::{
     Arc,

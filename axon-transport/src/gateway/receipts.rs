@@ -1,4 +1,4 @@
-//! What the peer is told of the samples that came from it: up to which number they are in their ring.
+//! Acknowledges received samples to the peer: up to which number they are in their ring.
 
 use std::{
     collections::HashMap,

@@ -1,4 +1,5 @@
-//! Turns the session's doorbell into wake-ups for the gateway's tasks.
+//! Turns the doorbell of the gateway's session into wake-ups of tokio tasks. Tasks that move samples wait
+//! for it.
 
 use std::{
     io,

@@ -1,4 +1,4 @@
-//! What the hosts at one address may take of what this daemon has for all of them.
+//! Limits what the hosts behind one address may take of the daemon's handshakes and links.
 //!
 //! Keys can be made up, a source address that QUIC validated cannot: it is what is shared by.
 //! Hosts behind one translated address share it, so sharing begins only where there is scarcity.

@@ -1,5 +1,5 @@
-//! Peers that asked for a topic and stopped reading it: how long they wait before they are served again.
-//! Plain data in, data out.
+//! Remembers peers that asked for a topic and stopped reading it, and how long they wait before they are
+//! served again. Plain data in, data out.
 
 use std::{
     collections::HashMap,

@@ -1,4 +1,4 @@
-//! Stand-ins: what writes on other hosts, as those who read here see it.
+//! Stand-ins: local publishers, clients and servers that speak for remote ones, under the remote GID.
 //!
 //! There is one a GID, whatever link its samples come over: the daemon of a host can be restarted,
 //! and its successor announces the same endpoints while the last samples of the old link are still

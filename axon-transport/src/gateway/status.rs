@@ -1,4 +1,4 @@
-//! Who a peer is, and what status says of a link.
+//! Who a peer is, and the status of a link.
 
 use std::{fmt, net::SocketAddr};
 

@@ -1,4 +1,4 @@
-//! Descriptors on tokio's reactor.
+//! Registers descriptors with tokio's reactor.
 
 #![allow(unsafe_code)]
 

@@ -1,4 +1,4 @@
-//! What one asks of a graph: who is there, and what is spoken of.
+//! Queries on a graph: nodes, topics, services and their types.
 
 use std::collections::{BTreeMap, BTreeSet};
 

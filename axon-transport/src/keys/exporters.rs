@@ -1,4 +1,4 @@
-//! What ties keys to the one TLS connection they were announced on.
+//! The TLS exporters of a connection, which bind keys to it.
 
 use std::sync::Arc;
 

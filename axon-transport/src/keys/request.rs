@@ -1,4 +1,4 @@
-//! What the machines ask of the KME, and what they are told.
+//! The requests that key machines make to the KME, and the answers.
 
 use std::{fmt, time::Duration};
 

@@ -1,4 +1,4 @@
-//! Which of two connections between the same daemons stays.
+//! Elects which of two connections between the same daemons stays.
 
 use super::order::Side;
 use crate::ids::DaemonId;

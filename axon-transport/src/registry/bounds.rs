@@ -1,4 +1,4 @@
-//! What one session may ask of the daemon, however often it asks.
+//! Limits on what one session may ask of the daemon, however often it asks.
 
 use super::*;
 use crate::{

@@ -1,4 +1,4 @@
-//! What sessions say.
+//! Handles the messages of sessions.
 
 use std::collections::BTreeSet;
 

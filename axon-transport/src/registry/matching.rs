@@ -1,4 +1,4 @@
-//! Who goes with whom.
+//! Decides which endpoints are matched, and keeps the pairs.
 
 use super::{Asked, LocalEndpoint, Members, Registry, Topic};
 use crate::{

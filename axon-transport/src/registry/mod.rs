@@ -1,5 +1,5 @@
-//! The control plane's state: sessions, endpoints, who is matched with whom, and what each session
-//! has yet to be told.
+//! The control plane's state: sessions, endpoints, matched pairs, and the messages that each session still
+//! has to be sent.
 //!
 //! Plain data: messages go in, packets and descriptors come out, and nothing here does I/O. `F`
 //! stands for a descriptor. Matching is a function of the endpoints alone, so a session that

@@ -1,4 +1,4 @@
-//! What sessions are told.
+//! Queues the messages to sessions.
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap, VecDeque},

@@ -1,4 +1,4 @@
-//! What a daemon shows of a relayed session.
+//! The counters of a relayed session, which the daemon's status shows.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 

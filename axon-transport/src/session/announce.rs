@@ -1,4 +1,4 @@
-//! How endpoints come to be known, and go.
+//! Adds endpoints to a session and announces them to the daemon, and takes them back when they are dropped.
 
 use std::{sync::Arc, time::Duration};
 

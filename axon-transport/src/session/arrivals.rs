@@ -1,5 +1,5 @@
-//! Endpoints of others that the graph does not show yet: whoever counts one shall reach it, so it
-//! appears once every pair that it makes with the session's own endpoints stands.
+//! Remote endpoints that are not shown in the graph yet. An endpoint appears once its pairs with the
+//! session's own endpoints are attached, so that a counted endpoint can be reached.
 //!
 //! Plain data. None is held back for longer than [`PATIENCE`]: a stopped process must not hide what
 //! others may use.

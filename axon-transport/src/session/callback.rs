@@ -1,4 +1,4 @@
-//! A callback that is told how often something happened.
+//! A callback of the application that is called with the number of new events.
 
 use std::{
     convert::Infallible,

@@ -1,4 +1,4 @@
-//! What a session makes: endpoints, nodes and conditions.
+//! Creates publishers, subscriptions, clients, servers, nodes and guard conditions of a session.
 
 use super::{
     Client, EndpointSpec, GuardCondition, Node, Publisher, Server, Session, SessionError,

@@ -1,4 +1,4 @@
-//! What an endpoint reports of itself: statuses, and who is told of them.
+//! The events of endpoints: their statuses, and the wait sets and callbacks that are told of them.
 
 use std::{
     cmp::Ordering,

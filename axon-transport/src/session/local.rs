@@ -1,6 +1,6 @@
-//! The registry of a process without a daemon of its own to ask: that of the one session under
-//! `AXON_DAEMON=off`, whose endpoints find each other in the usual way; and that of a relayed session,
-//! where a second one stands for the world outside (`session::relayed`).
+//! A registry inside the application's process, for a session that asks no daemon. With `AXON_DAEMON=off`
+//! the process's one session finds its own endpoints in it. In a relayed session a second session in it
+//! stands for the world outside (`session::relayed`).
 
 use std::{
     collections::HashMap,

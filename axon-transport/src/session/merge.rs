@@ -1,5 +1,5 @@
-//! What one writer writes and several readers of its ring have, as where some ask for more of it than
-//! others, or came later: each message once, in the order of their numbers.
+//! Merges what several readers took of one writer's ring into one sequence: each message once, in the order
+//! of its number. Readers differ where they ask for different QoS or came at different times.
 //!
 //! Whoever carries messages away from where they were written needs that: to another host, or to or from
 //! a process that shares no memory.

@@ -1,4 +1,4 @@
-//! What a session and its endpoints are opened with.
+//! The options of a session and of its endpoints.
 
 use std::{ffi::OsString, io, path::PathBuf, sync::Arc};
 

@@ -1,5 +1,5 @@
-//! Pairs within one session: the thread that creates the second end attaches them, and the one that
-//! drops the first parts them, each before it returns.
+//! Pairs of endpoints within one session. The thread that creates the second endpoint attaches them, and
+//! the thread that drops the first one detaches them, before the call returns.
 //!
 //! The daemon tells of such a pair as of any other, and it stands already: asked by the same lane
 //! again, a writer repeats its grant. What it cannot do at once, such as for want of memory, is left

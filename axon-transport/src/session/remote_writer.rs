@@ -1,5 +1,5 @@
-//! Whoever writes elsewhere, as those see it that read here: a publisher, client or server that another
-//! process, of this host or of another, speaks for.
+//! The local stand-in for a remote writer: a publisher, client or server here that speaks for one in
+//! another process, on this host or another. Gateway and relays write into it what arrives.
 
 use axon_shm::{Meta, PublishError, Sample};
 

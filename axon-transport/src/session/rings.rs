@@ -1,4 +1,4 @@
-//! The rings of one that writes: one that all readers share, or one for each of them.
+//! The rings of a writing endpoint: one that all readers share, or for a server one for each client.
 
 use std::{
     collections::BTreeMap,

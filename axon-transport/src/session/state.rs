@@ -1,4 +1,4 @@
-//! What the handles of a session and its control thread share.
+//! The state of a session, which its handles and its control thread share.
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap, VecDeque},

@@ -1,4 +1,4 @@
-//! Waiting for any of several things.
+//! Wait sets: waits for any of several subscriptions, guard conditions and events.
 
 use std::{ops::Deref, sync::Arc, time::Duration};
 

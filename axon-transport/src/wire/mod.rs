@@ -1,5 +1,6 @@
-//! The bytes that AXON's processes tell each other by, one file a section of `docs/formats.md`. Nothing
-//! else knows them. Plain data; every decoder bounds what it allocates.
+//! The encodings of messages: between sessions and their daemon, between daemons, and of beacons. One file a
+//! section of `docs/formats.md`, and no other module knows the bytes. Plain data; every decoder bounds what
+//! it allocates.
 
 pub mod beacon;
 pub mod keys;

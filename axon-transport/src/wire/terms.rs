@@ -1,4 +1,4 @@
-//! What two daemons must have in common before they may link.
+//! The security settings that two daemons must share before they may link.
 
 use axon_tls::{Cipher, PskKex};
 

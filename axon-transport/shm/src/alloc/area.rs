@@ -1,5 +1,5 @@
-//! Who has which bytes of a segment: first fit from the bottom, so that little more memory is
-//! touched than what is in use.
+//! Allocates ranges of a segment: first fit from the bottom, so that little more memory is touched than is
+//! in use. Plain data; the owner of the segment calls it under a lock.
 
 use std::ops::Range;
 

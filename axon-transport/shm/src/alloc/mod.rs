@@ -1,5 +1,5 @@
-//! A session's memory as its own process gives it out: segments, objects, slots for large samples, and who
-//! may keep how much.
+//! Allocation of a session's own memory: segments, objects, slots for large samples, and limits for what
+//! readers keep.
 
 pub(crate) mod area;
 pub(crate) mod blocks;

@@ -1,6 +1,6 @@
-//! How much of a publisher's memory its readers may keep: enough for two of them to keep samples of any
-//! length, and for many to keep shorter ones. What is beyond a reader's share it copies, so that the
-//! publisher finds room for the next sample whatever readers do. Plain data.
+//! Limits the length of the samples that a reader may pin, so that readers never keep all of a publisher's
+//! memory: two readers may pin samples of any length, many may pin shorter ones, and readers copy what is
+//! longer. Plain data; the publisher computes a reader's limit when it attaches, and the grant carries it.
 
 use crate::{
     alloc::classes,

@@ -1,4 +1,5 @@
-//! What a process needs once to publish to others and to be woken by them.
+//! The context that the publishers and subscribers of a process share where there is no daemon: its memory,
+//! its doorbell, and the other contexts that it has mapped.
 
 use std::{
     collections::HashMap,

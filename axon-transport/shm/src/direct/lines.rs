@@ -1,5 +1,5 @@
-//! Whom a context tells of its segments where there is no daemon: each subscriber over a line of its
-//! own.
+//! Tells subscribers of a context's segments where there is no daemon. Each subscriber has a socket of its
+//! own (a line), over which it hears of new and closed segments.
 
 use std::{
     os::fd::{AsFd, BorrowedFd},

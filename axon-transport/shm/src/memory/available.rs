@@ -1,4 +1,5 @@
-//! How much memory this process may still take.
+//! How many bytes of memory this process may still take: the least that the host and the process's control
+//! groups have left.
 //!
 //! Exceeding a control group's limit gets a process killed rather than an error, so rings ask
 //! before they grow.

@@ -1,4 +1,5 @@
-//! Whether memory can be shared at all: what a security module or a sandbox may refuse.
+//! Finds out whether this process can share memory with another one: a security module or a sandbox may
+//! refuse. Sessions try it on the daemon's probe when they connect.
 
 #![allow(unsafe_code)]
 

@@ -1,5 +1,5 @@
-//! How much address space the memory of other processes may take: whatever they hand over is mapped
-//! before anybody uses it, and a process that can map nothing more is at its end.
+//! Limits the address space that the memory of other processes may take here. A peer's segment is mapped
+//! before it is used, and a process without free address space cannot go on.
 
 use std::sync::{
     Arc,

@@ -1,7 +1,7 @@
-//! What becomes of writable maps in a forked child.
+//! Replaces writable maps by inaccessible pages in a forked child.
 //!
-//! They are absent there, so that a child cannot be a second writer. But a slice of one may have been
-//! borrowed before the fork, and whatever the child maps next may come to lie under it. A child of
+//! Writable maps are absent in a child, so that it cannot be a second writer. But a slice of one may have
+//! been borrowed before the fork, and whatever the child maps next may come to lie under it. A child of
 //! `fork` therefore begins by putting inaccessible pages in their places: using such a slice ends it.
 //!
 //! A child of `_Fork`, or of `clone` without shared memory, runs no handler, and where one that was

@@ -1,4 +1,5 @@
-//! Threads on which descriptors of others are closed.
+//! Threads (`axon-close`) that close descriptors received from other processes, since closing one may
+//! block.
 
 use std::{
     os::fd::{AsFd, OwnedFd},

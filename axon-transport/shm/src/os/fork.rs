@@ -1,4 +1,4 @@
-//! Whether this process is still the one that made something.
+//! Detects that the calling process is a fork of the one that created an object.
 //!
 //! Writable maps do not survive a fork, so a child must be told before it touches one. Asking the
 //! kernel for the process id would be a system call on each publish; a page that the kernel wipes

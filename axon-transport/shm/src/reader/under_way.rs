@@ -1,4 +1,5 @@
-//! Samples that were taken, and of which somebody else says when they are done with.
+//! Samples that a reader took and has not finished, because another process or host is still to confirm
+//! them. Relays use it: the publisher keeps such samples until the relay says that they arrived.
 
 use std::collections::VecDeque;
 

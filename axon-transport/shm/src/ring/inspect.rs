@@ -1,5 +1,5 @@
-//! What rings and lanes say of themselves, read from a segment's descriptor: for the status, by
-//! whoever maps no session's memory. What is read is another process's word for it, no more.
+//! Reads the counters of rings and lanes from a segment's descriptor, without mapping it. The daemon uses
+//! it for `axon status`. The values are what another process wrote, and are not to be trusted.
 
 use std::os::fd::BorrowedFd;
 

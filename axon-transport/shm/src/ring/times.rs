@@ -1,5 +1,5 @@
-//! What a ring says of its publisher besides samples: how long these and its leases last, and when it
-//! was heard of last. Times are nanoseconds of the monotonic clock that all processes of a host share.
+//! The times in a ring's header: the publisher's lifespan and lease, and when it last published or asserted
+//! its liveliness. Nanoseconds of CLOCK_MONOTONIC, which all processes of a host share.
 
 use crate::{
     qos::Qos,

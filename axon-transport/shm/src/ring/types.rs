@@ -1,4 +1,4 @@
-//! What the two ends of a ring tell each other and their owners.
+//! The types that a writer and a reader of a ring exchange with each other and with their owners.
 
 use crate::{ids::Gid, qos::Qos};
 

@@ -1,4 +1,4 @@
-//! What of a ring a profile asks to be kept.
+//! How many samples of a ring are kept for a QoS profile.
 
 use crate::qos::{Durability, History, Qos, Reliability};
 

@@ -1,4 +1,5 @@
-//! What a reader shares with the samples that it lent out: the ring's header and the lane.
+//! A reader's maps of the ring's header and of its lane. The reader shares them with the samples that it
+//! lent out, so that both stay mapped until the last sample is dropped.
 
 use std::{
     ops::Range,

@@ -1,6 +1,7 @@
-//! A reader's own words in its session's segment.
+//! The lane of a reader: its cursor, pins and counters, in its own session's segment, where the publisher
+//! reads them.
 //!
-//! The first of them says who uses the lane: 0 nobody; with its highest bit set, a reader that has
+//! Its first word says who uses it: 0 nobody; with its highest bit set, a reader that has
 //! not seen its grant yet; any other value is the grant's. No value is used twice, so a publisher
 //! that knows what the word was when the reader asked, and what it granted, knows when the lane
 //! has passed on to somebody else.

@@ -1,4 +1,4 @@
-//! A session's doorbell in an event loop.
+//! Lets an event loop wait for a session's doorbell, in place of a blocked thread.
 
 use std::{
     os::fd::{AsFd, AsRawFd, BorrowedFd, RawFd},

@@ -1,4 +1,5 @@
-//! What publishers that are gone left to those that still read it.
+//! Memory of publishers that were dropped while readers still pinned their samples. The session's owner
+//! frees it once no reader pins it.
 
 use std::sync::{Mutex, PoisonError};
 

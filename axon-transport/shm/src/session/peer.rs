@@ -1,4 +1,5 @@
-//! Another session as seen from this one: its segments, its doorbell, and whether it lives.
+//! Another session as this one sees it: its mapped segments, its doorbell, and whether its process is
+//! alive.
 
 use std::{
     collections::{BTreeMap, BTreeSet},

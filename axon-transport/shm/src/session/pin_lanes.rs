@@ -1,5 +1,6 @@
-//! The lanes that may pin samples of a ring, whether or not their readers still count for anything
-//! else.
+//! The lanes that may pin samples of a ring. A lane stays here until its reader has left or its process has
+//! ended, even if the reader is detached, because it may still hold samples. The publisher reads the pins
+//! under its lock.
 
 use std::sync::{Arc, atomic::AtomicU64};
 

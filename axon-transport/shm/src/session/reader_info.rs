@@ -1,4 +1,4 @@
-//! What a reader says of itself when it asks a publisher.
+//! What a reader tells a publisher when it attaches.
 
 use crate::{ids::Gid, qos::Qos, ring::layout::Location, session::peer::Peer};
 

@@ -1,5 +1,5 @@
-//! This process's own session: its memory and what is in it, the words that say who sleeps, and by
-//! what others know it.
+//! A session's own memory: its segments, its lanes, and the words that say which of its threads sleep.
+//! Other sessions know it by its descriptors.
 
 use std::{
     os::fd::{AsFd, BorrowedFd, OwnedFd},

@@ -1,4 +1,4 @@
-//! The ringing end of a doorbell.
+//! The ringing end of a doorbell, which other processes hold.
 
 use std::{
     os::fd::{AsFd, BorrowedFd},

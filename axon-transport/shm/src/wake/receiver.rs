@@ -1,4 +1,5 @@
-//! The hearing end of a doorbell: what the kernel tells one who sleeps.
+//! The receiving end of a doorbell: an epoll set of the bell's socket, of an eventfd by which this process
+//! wakes itself, and of a timer. One thread of a session sleeps on it.
 
 #![allow(unsafe_code)]
 

@@ -1,4 +1,4 @@
-//! How long it pays to look before one sleeps.
+//! How long a waiter polls before it sleeps, learned from how long its last waits took.
 
 use std::{
     hint::spin_loop,

@@ -1,4 +1,4 @@
-//! The protocol between one that is about to sleep and those that may have to wake it.
+//! The protocol between a thread that is about to sleep and the processes that may have to wake it.
 //!
 //! The sleeper stores its ticket, fences, and looks once more whether there is something; the
 //! waker makes that something visible, fences, and looks whether there is a ticket. One of the two

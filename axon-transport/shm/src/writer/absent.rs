@@ -1,5 +1,5 @@
-//! Readers that carried samples to another process and whose own process ended: what they had not
-//! delivered is kept for a while.
+//! Readers whose process ended while they carried samples to another process. The publisher keeps what they
+//! had not confirmed for 10 s.
 //!
 //! Such a reader is the daemon's, on behalf of a relayed session. The next daemon asks under the same
 //! GID, and goes on where the last one was.

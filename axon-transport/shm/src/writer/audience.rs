@@ -1,4 +1,4 @@
-//! Who reads a ring, and what of it must stand for them.
+//! The readers of a ring, and the oldest positions that the publisher must keep for them.
 
 use std::{collections::HashSet, sync::Arc, time::Duration};
 

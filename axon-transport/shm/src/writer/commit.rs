@@ -1,4 +1,5 @@
-//! A sample's way into the ring.
+//! Publishing: numbers a sample, writes its descriptor into the ring and rings the doorbells of its
+//! readers.
 
 use std::{
     sync::{Arc, atomic::AtomicU64},

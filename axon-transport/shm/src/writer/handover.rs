@@ -1,4 +1,5 @@
-//! What readers that stand for others, elsewhere, are done with.
+//! How far relays have delivered what was published, and how many samples they gave up. `wait_acknowledged`
+//! is made of it.
 
 use std::{
     sync::Arc,

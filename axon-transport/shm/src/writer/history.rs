@@ -1,4 +1,5 @@
-//! Which samples of a ring stand, and how room is made for the next: plain data, no shared memory.
+//! The samples that a ring keeps, oldest to newest, and which of them are dropped to make room for the
+//! next. Plain data, no shared memory.
 
 use crate::{
     alloc::{blocks::Blocks, classes, heap::Block, retire_list::RetireList},

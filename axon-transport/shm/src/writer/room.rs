@@ -1,5 +1,5 @@
-//! How a publisher gets room for the next sample: descriptors, blocks, and what it gives up for
-//! them. Large samples have [memory of their own](super::samples).
+//! Makes room for the next sample: finds a descriptor and a block, and drops old samples for them. Large
+//! samples have [memory of their own](super::samples).
 
 use std::sync::{Arc, atomic::AtomicU64};
 

@@ -1,5 +1,5 @@
-//! What a ring says of itself to people: words of its header that no reader looks at. Whoever has the
-//! segment's descriptor [reads](crate::ring::inspect) them.
+//! The counters in a ring's header. No reader uses them; the daemon [reads](crate::ring::inspect) them for
+//! `axon status`.
 //!
 //! Nobody else can write them, so they are the counters themselves. Each is changed under the
 //! commit lock.

@@ -1,4 +1,4 @@
-//! What a publisher says of its times.
+//! Writes the publisher's times into the ring's header.
 
 use super::Writer;
 use crate::{

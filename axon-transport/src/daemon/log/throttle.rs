@@ -1,4 +1,4 @@
-//! How many lines of one kind are logged.
+//! Limits how many log lines of one kind are written.
 
 use std::{
     collections::HashMap,

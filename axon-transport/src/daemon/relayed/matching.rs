@@ -1,4 +1,5 @@
-//! Whom a relayed session's endpoints are matched with, and what of theirs it gets.
+//! Matches the endpoints of a relayed session in the daemon, and decides which remote samples are sent to
+//! it. Runs on the session's thread `axon-relay`.
 
 use std::{
     collections::{BTreeMap, BTreeSet},

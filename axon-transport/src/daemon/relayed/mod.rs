@@ -1,4 +1,5 @@
-//! The daemon's end: the endpoints of a relayed session, in memory that every session maps.
+//! The daemon's end of a relayed session: holds the session's endpoints in memory that every session can
+//! map. One thread `axon-relay` for each session.
 
 mod matching;
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! When this daemon says that it is here, to whom, and in what words.
+//! Decides when this daemon sends beacons, to which addresses, and with what content.
 
 use std::{
     collections::BTreeSet,

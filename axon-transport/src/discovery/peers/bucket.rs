@@ -1,4 +1,4 @@
-//! How often something may happen.
+//! A token bucket, for rate limits.
 
 use std::time::Duration;
 

@@ -1,4 +1,4 @@
-//! Where a peer may be reached, best first.
+//! The addresses at which a peer may be reached, best first.
 
 use std::net::{IpAddr, SocketAddr};
 

@@ -1,4 +1,4 @@
-//! Whom to dial, and when.
+//! Decides which peers are dialled, and when.
 
 use std::{net::IpAddr, time::Duration};
 

@@ -1,4 +1,4 @@
-//! Which records are kept when there are too many.
+//! Chooses which peer records are dropped when there are too many.
 
 use std::{collections::BTreeMap, net::IpAddr, time::Duration};
 

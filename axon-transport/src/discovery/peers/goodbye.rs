@@ -1,4 +1,4 @@
-//! Goodbyes: of those who leave, and of others in their names.
+//! Handles goodbyes: of daemons that end, and forged ones.
 
 use super::{
     tests::{HIGHER, LOWER, actions, beacon, dials, fail, from, hear, local, secs, settled},

@@ -1,4 +1,4 @@
-//! This daemon.
+//! What discovery knows of this daemon itself.
 
 use std::net::IpAddr;
 

@@ -1,4 +1,5 @@
-//! Who is there and whom to dial: datagrams, events and time in, datagrams and dials out.
+//! Discovery's state machine: which daemons exist and when to dial them. Datagrams, events and time in,
+//! datagrams and dials out.
 //!
 //! Nothing here does I/O or looks at a clock. `now` is any clock that does not go back. A beacon is
 //! a hint from anybody, so every collection is bounded, every answer rationed, and nothing that

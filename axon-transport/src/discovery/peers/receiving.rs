@@ -1,4 +1,4 @@
-//! What datagrams change.
+//! Handles received datagrams: beacons, probes and goodbyes.
 
 use std::{net::SocketAddr, time::Duration};
 

@@ -1,4 +1,4 @@
-//! What is known of one peer.
+//! The record of one peer: its addresses, its beacons, and whether it is linked.
 
 use std::{
     net::{IpAddr, SocketAddr},

@@ -1,4 +1,4 @@
-//! Superseded links: what was given to them arrives.
+//! Superseded links: kept open until what was sent over them has arrived.
 //!
 //! Nothing new goes over a link that has a successor. Each side ends its control stream there once the
 //! other has acknowledged all that it sent, and closes the connection once both have: what was

@@ -1,6 +1,5 @@
-//! The acknowledgements of a peer. Each is held against the samples that were sent at that moment. What
-//! comes of it waits for the outbound task: one entry for each stream, however many messages the peer
-//! sends.
+//! Applies a peer's acknowledgements to the queues of samples sent to it. The results wait for the outbound
+//! task: one entry for each stream, however many messages the peer sends.
 
 use std::{
     collections::HashMap,

@@ -1,5 +1,5 @@
-//! What is left when a publisher ends, or a link: carried as long as that gets on, and counted where it
-//! is not.
+//! What is still queued when a publisher or a link ends: it is sent as long as there is progress, then
+//! counted as lost.
 
 use std::{
     collections::HashMap,

@@ -1,4 +1,5 @@
-//! What goes out of one publisher, or client of a service, whichever sources have it.
+//! Moves the samples of one publisher, or of one client of a service, from their rings into the queue
+//! towards a peer. Runs in the outbound task of that peer.
 
 use std::{
     sync::Arc,

@@ -1,4 +1,4 @@
-//! Which routes their peer does not read, though publishers wait for it.
+//! Finds routes that the peer does not read while their publishers wait, so that the hub can end them.
 
 use std::{
     collections::HashMap,

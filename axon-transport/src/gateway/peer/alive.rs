@@ -1,5 +1,5 @@
-//! Who is alive, where nobody publishes: what publishers with a lease say goes to the other host, and
-//! what those there say comes here.
+//! Liveliness between hosts: tells the peer which publishers with a lease were asserted here, and takes
+//! what the peer tells.
 
 use std::time::{Duration, Instant};
 

@@ -1,4 +1,5 @@
-//! To which daemon sessions belong: what this side proves to a peer, and what the peer proves here.
+//! Proofs of which daemon a session belongs to: those that this daemon sends to a peer, and those that the
+//! peer sends.
 
 use std::{
     collections::{BTreeSet, HashMap, HashSet},

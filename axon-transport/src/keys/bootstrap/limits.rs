@@ -1,4 +1,4 @@
-//! What made-up identities may cost: bounds on the `dec_keys` calls that handshakes cause.
+//! Limits the `dec_keys` calls that handshakes can cause, since anybody can make up an identity.
 
 use std::{
     collections::HashMap,

@@ -1,4 +1,5 @@
-//! Memories of bounded size: the oldest entry makes room.
+//! A memory of bounded size for key_IDs and identities that were seen: the oldest entry is dropped for a
+//! new one.
 
 use std::{
     collections::{HashMap, VecDeque},

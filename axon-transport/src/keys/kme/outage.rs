@@ -1,4 +1,4 @@
-//! What of the KME fails at present, so that the log says it once, by name, and says its end.
+//! Remembers which calls to the KME fail at present, so that the log reports each outage and its end once.
 
 use std::{
     collections::HashMap,

@@ -1,4 +1,4 @@
-//! How many keys the messages need, and how many to have ahead for them.
+//! Measures how many keys the messages need, and decides how many are held ahead.
 
 use std::{fmt, time::Duration};
 

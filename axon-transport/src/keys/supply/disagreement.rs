@@ -1,4 +1,4 @@
-//! Keys that the two KMEs gave differently, as they are reported.
+//! Reports keys that the two KMEs gave with different bytes.
 
 use std::{fmt, time::Duration};
 

@@ -1,4 +1,4 @@
-//! The server's side.
+//! Has the client of a connection prove its name: the server's side.
 
 use std::{sync::Arc, time::Duration};
 

@@ -1,6 +1,6 @@
-//! Who the client is. The binder proves that it holds the PSK, but a KME may answer `dec_keys` to
-//! the slave without proof of who the master was; so the server fetches a key for the SAE the
-//! client claims to be, and has it prove that it got that one (docs/formats.md, section 2).
+//! Proves which SAE the client of a connection is. The binder proves only that it holds the PSK: a KME may
+//! answer `dec_keys` without checking who the master was. So the server fetches a key for the SAE that the
+//! client claims to be, and the client proves that it received that key (docs/formats.md, section 2).
 
 mod client_proof;
 mod proof_responder;

@@ -1,4 +1,5 @@
-//! The client's side in `session`; in `messages10` the [`Receiver`](crate::keys::Receiver) answers.
+//! Answers the server's request for the proof: the client's side in `session`. In `messages10` the
+//! [`Receiver`](crate::keys::Receiver) answers.
 
 use std::{sync::Arc, time::Duration};
 

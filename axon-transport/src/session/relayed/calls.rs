@@ -1,5 +1,5 @@
-//! Services: what of them goes to the other end of a relay. In the daemon clients and servers are the
-//! session's own, in the session's process they stand for the world's; otherwise both ends do the same.
+//! Carries requests and responses over a relay. In the daemon the clients and servers are the session's
+//! own; in the session's process they are stand-ins for remote ones. The rest is the same at both ends.
 
 use std::collections::BTreeMap;
 

@@ -1,4 +1,5 @@
-//! What the control thread of a session notices, for a thread that sleeps in `poll`.
+//! An eventfd that becomes readable when a session changes. The session's control thread sets it, and the
+//! relay's thread polls it.
 
 use std::{
     os::fd::{AsFd, BorrowedFd, OwnedFd},

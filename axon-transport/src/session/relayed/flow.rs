@@ -1,4 +1,4 @@
-//! Samples in pieces, and who may send how many of them: plain data in, data out.
+//! Splits samples into pieces and controls their flow: plain data in, data out.
 //!
 //! There is a [`Channel`] for each publisher whose samples cross, each client's requests, and the
 //! responses of each server to each client. Its receiver lets the sender have so many bytes under way,

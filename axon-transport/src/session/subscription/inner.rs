@@ -1,4 +1,4 @@
-//! What the session's control thread shares with a subscription's handle.
+//! The state of a subscription, which its handle and the session's control thread share.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 

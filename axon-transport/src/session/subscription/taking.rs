@@ -1,4 +1,4 @@
-//! Which of a subscription's publishers is taken from next.
+//! Chooses from which of its publishers a subscription takes the next sample.
 
 use std::{collections::HashMap, time::Instant};
 

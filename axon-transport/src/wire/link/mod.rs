@@ -1,4 +1,4 @@
-//! What two daemons tell each other over the control stream of a link (`docs/formats.md`, section 6).
+//! The messages between two daemons on the control stream of a link (`docs/formats.md`, section 6).
 
 mod close;
 mod frame;

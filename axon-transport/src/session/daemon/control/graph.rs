@@ -1,4 +1,4 @@
-//! The graph as the session shows it, and what its own endpoints are to the others in it.
+//! The graph that the session shows, and the matches of its own endpoints.
 
 use std::{
     collections::{BTreeSet, HashSet},

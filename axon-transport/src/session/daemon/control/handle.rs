@@ -1,4 +1,4 @@
-//! What the daemon says, and what a session does about it.
+//! Handles the daemon's messages on the control thread.
 
 use std::{collections::HashSet, sync::Arc};
 

@@ -1,4 +1,5 @@
-//! A session's own memory: what others are told of it, and what is given back.
+//! The session's own memory: tells the daemon of new and closed segments, and frees memory that is no
+//! longer needed.
 
 use std::time::{Duration, Instant};
 

@@ -1,5 +1,5 @@
-//! The life of each pair, in the log at `debug`: who granted what to whom, and why it ended. Rare, so
-//! that a test can keep all of it and print the history of a pair that lost something.
+//! Logs the life of each pair at `debug`: which grant it got, and why it ended. A test can keep all of it
+//! and print the history of a pair that lost samples.
 
 use crate::wire::session::Pair;
 

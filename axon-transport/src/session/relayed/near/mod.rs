@@ -1,4 +1,5 @@
-//! The end in a relayed session's own process.
+//! The session's end of a relay: a thread in the session's own process that carries samples to the daemon
+//! and back.
 
 mod reconnect;
 mod relays;

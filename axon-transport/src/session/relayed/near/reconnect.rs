@@ -1,4 +1,5 @@
-//! The daemon after the one that is gone, and how long a session that ends waits for it.
+//! Connects to the next daemon after the last one is gone. A session that is closed waits for that for a
+//! limited time.
 
 use std::{
     collections::BTreeMap,

@@ -1,5 +1,5 @@
-//! What the application publishes, as the daemon is to get it: a relay for each publisher. It stands for
-//! those with whom the daemon says that this publisher is matched: whom the publisher counts, it reaches.
+//! Relays for the application's publishers: each reads a publisher's ring for the remote readers that the
+//! daemon matched with it, so that a reader that the publisher counts is reached.
 
 use std::{
     collections::{BTreeMap, BTreeSet},

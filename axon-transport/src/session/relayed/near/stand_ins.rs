@@ -1,5 +1,4 @@
-//! What stands in the session's process for those outside with whom the daemon says its endpoints are
-//! matched.
+//! Stand-ins in the session's process for the remote writers that the daemon matched with its endpoints.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
