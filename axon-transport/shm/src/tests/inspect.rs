@@ -109,23 +109,48 @@ fn what_goes_for_want_of_memory_though_late_joiners_were_to_get_it_is_counted() 
 }
 
 #[test]
+fn what_every_reader_has_taken_goes_without_a_loss() {
+    let (ours, theirs) = (session(), session());
+    let writer = writer(&ours, keep_last(1000), MAX);
+    let mut reader = attach(&writer, &ours, &theirs, keep_last(1000));
+    available::PRETENDED.set(Some(0));
+    for sequence in 1..=10_000 {
+        let len = if sequence > 5_000 { 1000 } else { 8 };
+        writer.publish(meta(sequence), &pattern(sequence, len)).unwrap();
+        assert!(reader.take_sample().unwrap().is_some());
+    }
+    let ring = counts(&ours, &writer);
+    assert!(ring.standing.1 - ring.standing.0 < 1000, "memory was to be short: {ring:?}");
+    assert_eq!((reader.lost(), ring.no_memory), (0, 0));
+}
+
+#[test]
 fn a_reader_is_not_blamed_where_memory_is_short() {
     let (ours, theirs) = (session(), session());
     let all =
         Qos { history: History::KeepAll, reliability: Reliability::Reliable, ..Qos::default() };
     let writer = writer(&ours, all, MAX);
     let mut reader = attach(&writer, &ours, &theirs, all);
-    available::PRETENDED.set(Some(0));
-    let mut last = 0;
-    for len in [8, 1000] {
+    let (mut last, mut failed) = (0, 0);
+    for len in [8, 1000, 8000] {
         let (before, mut taken) = (last, 0);
+        // There is memory for samples of this length, and then no more of it.
+        available::PRETENDED.set(None);
+        last += 1;
+        writer.publish(meta(last), &pattern(last, len)).unwrap();
+        available::PRETENDED.set(Some(0));
         let error = loop {
             match writer.try_publish(meta(last + 1), &pattern(last + 1, len)) {
                 Ok(_) => last += 1,
                 Err(error) => break error,
             }
         };
-        assert!(matches!(error, PublishError::NoMemory { .. }), "{error}");
+        // Whoever does not wait for the reader tries again until that has made room.
+        assert!(matches!(error, PublishError::Blocked { .. }), "{len}: {error}");
+        assert_eq!(counts(&ours, &writer).no_memory, failed, "nothing is dropped yet");
+        let error = writer.publish(meta(last + 1), &pattern(last + 1, len)).unwrap_err();
+        assert!(matches!(error, PublishError::NoMemory { .. }), "{len}: {error}");
+        failed += 1;
         // Nothing is lost: the publisher waited for its reader.
         while reader.take_sample().unwrap().is_some() {
             taken += 1;

@@ -237,7 +237,10 @@ impl Writer {
             let left = patience.left();
             match laggards {
                 Some((reader, _)) if left.is_zero() => {
-                    return Err(short.unwrap_or(PublishError::Blocked { reader }));
+                    let blocked = PublishError::Blocked { reader };
+                    // Whoever does not wait tries again: the reader makes room, memory or not.
+                    let short = short.filter(|_| !patience.whole.is_zero());
+                    return Err(short.unwrap_or(blocked));
                 }
                 Some((_, peers)) => self.await_room(&peers, left),
                 // It moved on between the two looks. One that does so for ever is out for trouble.

@@ -154,6 +154,11 @@ impl State {
         standing.rev().take_while(later).last().unwrap_or(self.history.head())
     }
 
+    /// Below this position every reader has taken what it wanted, and nobody asks for it again.
+    pub(super) fn consumed(&self) -> u64 {
+        self.audience.consumed(self.history.head())
+    }
+
     /// The number of the last sample in front of a position.
     pub(super) fn number_before(&self, position: u64) -> u64 {
         let stands = position >= self.history.tail() && position < self.history.head();

@@ -116,11 +116,13 @@ impl Writer {
                 let need = if now { Need::Now } else { Need::Mapped };
                 short = self.grow(state, need).err().map(no_memory);
             }
+            let consumed = if short.is_some() { state.consumed() } else { 0 };
             let history = &mut state.history;
             if history.is_full() && surplus > 0 {
                 history.release_below(history.tail() + surplus.div_ceil(2));
             }
-            let is_lost = history.is_full() && short.is_some();
+            // What all have taken goes without a loss.
+            let is_lost = history.is_full() && short.is_some() && history.tail() >= consumed;
             let made = history.make_place(|position| position < floors.held);
             made.map_err(|Held| Refusal::Held { short })?;
             if is_lost {
@@ -196,7 +198,8 @@ impl Writer {
             match self.block(state, bytes) {
                 Ok(block) => return Ok(block),
                 Err(error) => {
-                    let was_kept = state.history.tail() >= floors.retained;
+                    let tail = state.history.tail();
+                    let was_kept = tail >= floors.retained && tail >= state.consumed();
                     match state.history.shrink(may_go) {
                         Ok(false) => return Err(error.into()),
                         Ok(true) if was_kept => self.count_short(),

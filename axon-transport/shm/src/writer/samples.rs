@@ -207,8 +207,9 @@ impl Writer {
                         }
                         continue;
                     }
-                    Err(held) if short.is_none() => return Err(held.into()),
-                    Ok(false) | Err(Held) => {}
+                    // Room that the reader makes will do, whether or not there is memory.
+                    Err(Held) => return Err(Refusal::Held { short }),
+                    Ok(false) => {}
                 }
             }
             if kept.is_empty() {
