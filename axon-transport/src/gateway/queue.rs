@@ -207,7 +207,8 @@ impl Queue {
                     return;
                 }
                 let Some(sample) = self.samples.pop_front() else { return };
-                sent.newest = sample.info.sequence;
+                // After a rewind it begins anew with the oldest.
+                sent.newest = sent.newest.max(sample.info.sequence);
                 into.push_back(sample.clone());
                 sent.samples.push_back(sample);
                 sent.bytes += size;
@@ -486,6 +487,19 @@ mod tests {
         assert_eq!(queue.acknowledge(u64::MAX), (0, None), "the fifth was never sent");
         drop(queue);
         assert!(peer.take(8 * peer.of_queue()), "nothing is left of it");
+    }
+
+    #[test]
+    fn what_was_taken_once_is_acknowledged_though_a_part_alone_is_taken_again() {
+        let mut queue = Queue::new(&Qos::keep_all(), room(9, 10).of_peer(), true);
+        (1..=4).for_each(|sequence| assert_eq!(offer(&mut queue, sequence, 10), Ok(0)));
+        let mut into = VecDeque::new();
+        (0..3).for_each(|_| queue.pop_together(1, &mut into));
+        assert_eq!(into.len(), 3);
+        queue.rewind();
+        queue.pop_together(1, &mut into);
+        assert_eq!(queue.acknowledge(3), (3, Some(3)), "the peer had them over the last link");
+        assert_eq!(queue.acknowledge(4), (0, None), "the fourth was never sent");
     }
 
     #[test]

@@ -166,10 +166,15 @@ impl Feed {
         flow: &Flow,
         shared: &Arc<Shared>,
     ) -> Offered {
-        self.stream.take_if(|stream| stream.is_over());
-        let (of, start) = (self.of, || Arc::clone(shared));
-        let stream = self.stream.get_or_insert_with(|| Stream::new(flow.clone(), of, qos, start()));
-        let offered = stream.offer(sample, qos);
+        let (of, mut sample) = (self.of, sample);
+        let offered = loop {
+            let start = || Stream::new(flow.clone(), of, qos, Arc::clone(shared));
+            match self.stream.get_or_insert_with(start).offer(sample, qos) {
+                Ok(offered) => break offered,
+                // It had nothing to send for a while, and ended.
+                Err(back) => (self.stream, sample) = (None, back),
+            }
+        };
         if let Offered::Queued { dropped } = offered {
             shared.counters.lost(&flow.topic, "queue", dropped);
         }

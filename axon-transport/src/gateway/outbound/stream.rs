@@ -90,16 +90,23 @@ impl Stream {
         Self { queue, filled, moved, left, task, _awaited: awaited }
     }
 
-    /// Queues a sample as `qos` says. It must not be over.
-    pub(super) fn offer(&self, sample: Sample, qos: &Qos) -> Offered {
+    /// Queues a sample as `qos` says.
+    ///
+    /// # Errors
+    /// The sample: it [is over](Self::is_over).
+    pub(super) fn offer(&self, sample: Sample, qos: &Qos) -> Result<Offered, Sample> {
         let mut queue = lock(&self.queue);
+        // Under the lock under which it ends: nobody takes from it any more.
+        if queue.is_over() {
+            return Err(sample);
+        }
         queue.serve(qos);
         let offered = queue.offer(sample);
         drop(queue);
         if matches!(offered, Offered::Queued { .. }) {
             self.filled.notify_one();
         }
-        offered
+        Ok(offered)
     }
 
     /// The peer acknowledged samples: there may be room for more to be under way.
@@ -324,7 +331,9 @@ impl Writer {
                 *stream = None;
                 let newest = self.batch.drain(..sealed).map(|sample| sample.info.sequence).last();
                 let acknowledged = lock(&self.queue).acknowledge(newest.unwrap_or(0)).0;
-                let given_up = acknowledged.max(sealed as u64);
+                // Of those that the peer acknowledges some may have been.
+                let all = sealed as u64;
+                let given_up = if self.flow.acknowledged { acknowledged } else { all };
                 self.shared.counters.lost(&self.flow.topic, "no_route", given_up);
                 if let Some(sequence) = newest {
                     self.done(Done { sequence, given_up });

@@ -57,8 +57,8 @@ async fn until_over(shared: &Shared) {
     }
 }
 
-fn queued(offered: Offered) {
-    assert!(matches!(offered, Offered::Queued { dropped: 0 }), "{offered:?}");
+fn queued(offered: Result<Offered, Sample>) {
+    assert!(matches!(offered, Ok(Offered::Queued { dropped: 0 })), "{offered:?}");
 }
 
 #[test]
@@ -92,7 +92,7 @@ fn one_that_sends_no_more_leaves_nothing_behind() {
         for qos in [Qos::keep_all(), Qos::sensor_data()] {
             let mut feeds = HashMap::from([(OF, Feed::new(OF))]);
             let feed = feeds.get_mut(&OF).unwrap();
-            queued(feed.queue(a_sample(1), &qos, &flow(), &shared));
+            queued(Ok(feed.queue(a_sample(1), &qos, &flow(), &shared)));
             assert!(feed.is_in_use());
             let sources = Vec::new();
             let seen = HashMap::new();
@@ -108,13 +108,28 @@ fn one_that_sends_no_more_leaves_nothing_behind() {
 }
 
 #[test]
+fn a_stream_that_is_over_gives_a_sample_back() {
+    block_on(async {
+        let pair = Pair::new().await;
+        let (shared, _carrier) = shared(&pair.here);
+        let qos = Qos::keep_all();
+        let stream = Stream::new(flow(), OF, &qos, Arc::clone(&shared));
+        queued(stream.offer(a_sample(1), &qos));
+        arrived(&pair.there).await;
+        until_over(&shared).await;
+        let back = stream.offer(a_sample(2), &qos).unwrap_err();
+        assert_eq!(back.info.sequence, 2);
+    });
+}
+
+#[test]
 fn what_comes_when_a_stream_is_over_has_another() {
     block_on(async {
         let pair = Pair::new().await;
         let (shared, _carrier) = shared(&pair.here);
         let mut feed = Feed::new(OF);
         for sequence in 1..=2 {
-            queued(feed.queue(a_sample(sequence), &Qos::keep_all(), &flow(), &shared));
+            queued(Ok(feed.queue(a_sample(sequence), &Qos::keep_all(), &flow(), &shared)));
             assert!(arrived(&pair.there).await.0);
             until_over(&shared).await;
             assert!(!feed.is_in_use());
@@ -150,25 +165,25 @@ fn samples_that_are_dropped_are_counted_by_topic_and_cause() {
         for (sequence, age) in [(6, 10), (7, 10), (8, 0)] {
             let mut sample = a_sample(sequence);
             sample.since -= Duration::from_secs(age);
-            queued(feed.queue(sample, &several, &flow(), &shared));
+            queued(Ok(feed.queue(sample, &several, &flow(), &shared)));
         }
         arrived(&pair.there).await;
         assert_eq!(lost(&shared), [("late", 2)]);
 
         let reliable = Qos::keep_all();
-        queued(feed.queue(a_sample(9), &reliable, &flow(), &shared));
+        queued(Ok(feed.queue(a_sample(9), &reliable, &flow(), &shared)));
         let mut refused = pair.there.accept_uni().await.unwrap();
         refused.stop(VarInt::from_u32(CloseCode::OutOfOrder as u32)).unwrap();
         let mut sequence = 10;
         while lost(&shared).iter().all(|(cause, _)| *cause != "no_route") {
-            queued(feed.queue(a_sample(sequence), &reliable, &flow(), &shared));
+            queued(Ok(feed.queue(a_sample(sequence), &reliable, &flow(), &shared)));
             sequence += 1;
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
 
         pair.there.close(VarInt::from_u32(0), b"");
         pair.here.closed().await;
-        queued(feed.queue(a_sample(sequence), &newest, &flow(), &shared));
+        queued(Ok(feed.queue(a_sample(sequence), &newest, &flow(), &shared)));
         while lost(&shared).iter().all(|(cause, _)| *cause != "no_link") {
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
@@ -232,7 +247,7 @@ fn all_that_a_link_did_not_carry_is_counted_when_it_ends() {
             let flow = Flow { route: Route { kind, topic }, ..flow() };
             let mut feed = Feed::new(OF);
             for sequence in 1..=3 {
-                queued(feed.queue(a_sample(sequence), qos, &flow, &shared));
+                queued(Ok(feed.queue(a_sample(sequence), qos, &flow, &shared)));
             }
             // The task may have taken some of them.
             tokio::task::yield_now().await;
