@@ -227,7 +227,7 @@ impl Control {
             ToControl::Keys(keys) => self.keys = keys,
             ToControl::Lost { topic, cause, samples } => self.lost(topic, cause, samples),
             ToControl::Draining(draining) => self.draining = draining,
-            ToControl::DialFailed { .. } | ToControl::Datagram { .. } => {}
+            ToControl::DialFailed { .. } | ToControl::Datagram { .. } | ToControl::Finished => {}
         }
         self.settle();
     }

@@ -1,7 +1,7 @@
 //! The control plane's dealings with other hosts: discovery says whom to dial, the gateway dials,
 //! and the registry learns what they have.
 
-use std::{cell::RefCell, collections::BTreeSet, net::IpAddr, rc::Rc, sync::Arc};
+use std::{cell::RefCell, collections::BTreeSet, net::IpAddr, rc::Rc, sync::Arc, time::Duration};
 
 use tokio::{
     sync::mpsc,
@@ -18,6 +18,9 @@ use crate::{
     ids::DaemonId,
 };
 
+/// How long a gateway may take to finish: longer than it waits for what it has on its way.
+const FINISH: Duration = Duration::from_secs(8);
+
 /// The gateway of every daemon that is not told otherwise.
 pub(super) const GATEWAY: Option<GatewayEntry> =
     Some(|parts| crate::gateway::run(parts).map_err(|error| error.to_string()));
@@ -31,6 +34,8 @@ pub(super) struct Remote {
     linked: BTreeSet<DaemonId>,
     /// Addresses of listed peers, as the gateway was told.
     listed: BTreeSet<IpAddr>,
+    /// The gateway has nothing on its way any more, or it does not get on.
+    finished: bool,
 }
 
 struct Discovery {
@@ -55,6 +60,7 @@ impl Remote {
             discovery: None,
             linked: BTreeSet::new(),
             listed: BTreeSet::new(),
+            finished: false,
         };
         let Some(entry) = entry else { return Ok(remote) };
         let mut running = Running::start(control, entry).map_err(|e| e.to_string())?;
@@ -73,10 +79,20 @@ impl Remote {
         self.discovery.as_ref().map(|discovery| discovery.events.clone())
     }
 
-    /// Passes on what the gateway and discovery say, and starts a gateway that failed again.
+    /// The daemon is to end: has what waits for other hosts arrive first, as far as that gets on.
+    pub(super) async fn finish(&mut self, control: &Rc<RefCell<Control>>) {
+        if self.order(ToGateway::Finish)
+            && tokio::time::timeout(FINISH, self.run(control)).await.is_err()
+        {
+            tracing::warn!("the gateway does not say whether samples are on their way");
+        }
+    }
+
+    /// Passes on what the gateway and discovery say, and starts a gateway that failed again, until it
+    /// [has finished](Self::finish).
     pub(super) async fn run(&mut self, control: &Rc<RefCell<Control>>) {
         let Some(entry) = self.entry else { return std::future::pending().await };
-        loop {
+        while !self.finished {
             tokio::select! {
                 event = said(self.running.as_mut()) => match event {
                     Ok(event) => self.event(control, event),
@@ -119,6 +135,7 @@ impl Remote {
             ToControl::DialFailed { daemon, standing } => {
                 self.tell(Event::DialFailed { daemon: *daemon, standing: *standing });
             }
+            ToControl::Finished => self.finished = true,
             _ => {}
         }
         match event {
@@ -200,7 +217,7 @@ impl Remote {
                 }
             };
             // It says what it has to say at once.
-            let patience = std::time::Duration::from_millis(500);
+            let patience = Duration::from_millis(500);
             let _ = tokio::time::timeout(patience, goodbye).await;
             task.abort();
         }

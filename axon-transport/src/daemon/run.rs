@@ -254,11 +254,22 @@ async fn serve(
     let accepting = spawn_local(accept(control.clone(), listeners));
     let flushing = spawn_local(flush(control.clone(), remote.digests()));
     options.report.ready();
-    tokio::select! {
-        _ = terminate.recv() => tracing::info!("SIGTERM"),
-        _ = interrupt.recv() => tracing::info!("SIGINT"),
-        () = unneeded(&control), if !options.stays => tracing::info!("no session needs the daemon any more"),
-        () = remote.run(&control) => {}
+    let told = tokio::select! {
+        _ = terminate.recv() => Some("SIGTERM"),
+        _ = interrupt.recv() => Some("SIGINT"),
+        () = unneeded(&control), if !options.stays => None,
+        () = remote.run(&control) => None,
+    };
+    match told {
+        Some(signal) => {
+            tracing::info!("{signal}: what waits for other hosts is sent first");
+            tokio::select! {
+                () = remote.finish(&control) => {}
+                _ = terminate.recv() => tracing::info!("SIGTERM once more"),
+                _ = interrupt.recv() => tracing::info!("SIGINT once more"),
+            }
+        }
+        None => tracing::info!("no session needs the daemon any more"),
     }
     // The address is free from here on: who connects now starts a new daemon.
     accepting.abort();

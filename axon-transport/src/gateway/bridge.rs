@@ -117,6 +117,8 @@ pub enum ToControl {
     Draining(bool),
     /// What is to be shown of the key supply.
     Keys(serde_json::Value),
+    /// What waited when the daemon was told to end has arrived, or does not get on: it may end.
+    Finished,
 }
 
 /// From the control plane to the gateway.
@@ -144,6 +146,8 @@ pub enum ToGateway {
     },
     /// These addresses are those of listed peers from now on.
     Listed(BTreeSet<IpAddr>),
+    /// Say when what waits to be sent has arrived: the daemon is to end.
+    Finish,
     /// Say goodbye to every peer and return.
     Shutdown,
 }

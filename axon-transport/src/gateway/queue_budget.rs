@@ -80,6 +80,11 @@ impl QueueBudget {
         }
     }
 
+    /// Bytes that wait.
+    pub(super) fn taken(&self) -> usize {
+        self.taken.load(Ordering::SeqCst)
+    }
+
     /// When there is more room for all after somebody found too little. Those of one peer are told of
     /// what is freed there.
     pub(super) fn freed(&self) -> Notified<'_> {

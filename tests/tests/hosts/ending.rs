@@ -164,3 +164,32 @@ fn what_a_link_had_when_it_broke_is_counted() {
     until("it is counted", || lost(&hosts[0], "link_ended") == 100);
     hosts[0].wait_log(&[TOPIC, "samples=100", "the link ended"]);
 }
+
+#[test]
+fn a_daemon_that_is_told_to_end_sends_what_waits_first() {
+    let hosts = Plan::new([classic(&[]), classic(&[])]).start();
+    let (publisher, subscription) = across(&hosts);
+    let there = hosts[1].status().pid;
+    signal(there, Signal::STOP);
+    publish(&publisher, 100);
+    signal(hosts[0].status().pid, Signal::TERM);
+    hosts[0].wait_log(&["SIGTERM", "sent first"]);
+    signal(there, Signal::CONT);
+    assert!(take(&subscription, 100).into_iter().eq(1..=100));
+    until("the daemon ends", || hosts[0].try_status().is_none());
+    assert_eq!(publisher.given_up(), 0);
+}
+
+#[test]
+fn what_a_daemon_that_is_told_to_end_cannot_send_is_counted() {
+    let hosts = Plan::new([classic(&[]), classic(&[])]).start();
+    let (publisher, _subscription) = across(&hosts);
+    let there = hosts[1].status().pid;
+    signal(there, Signal::STOP);
+    publish(&publisher, 100);
+    signal(hosts[0].status().pid, Signal::TERM);
+    assert!(!publisher.wait_acknowledged(PATIENCE));
+    assert_eq!(publisher.given_up(), 100);
+    hosts[0].wait_log(&[TOPIC, "samples=100", "the link ended"]);
+    signal(there, Signal::CONT);
+}

@@ -3,6 +3,7 @@
 //! One task owns this state; dialling, accepting and every stream run in tasks of their own and
 //! reach it by events.
 
+mod finishing;
 mod graph;
 mod leaving;
 mod links;
@@ -20,7 +21,7 @@ use tokio::{
     time::sleep,
 };
 
-use self::leaving::Leaving;
+use self::{finishing::Finishing, leaving::Leaving};
 use super::{
     accept::Incomer,
     account::{Account, Accounts, Charge, Unpacked},
@@ -194,6 +195,8 @@ pub(super) struct Hub {
     draining: bool,
     /// A peer went, or an endpoint of one, since peers that lost endpoints to another were asked again.
     freed: bool,
+    /// The daemon is to end.
+    finishing: Option<Finishing>,
 }
 
 impl Hub {
@@ -220,6 +223,7 @@ impl Hub {
             crowded: Said::default(),
             draining: false,
             freed: false,
+            finishing: None,
         }
     }
 
@@ -235,6 +239,7 @@ impl Hub {
             let now = Instant::now();
             let alive_in = self.peers.values().filter_map(|peer| peer.alive_in(now)).min();
             let turn_in = self.turn_in(now);
+            let look_in = self.finishing.as_ref().map(|finishing| finishing.look_in(now));
             tokio::select! {
                 event = inbox.recv() => match event {
                     None | Some(Event::Order(ToGateway::Shutdown)) => break,
@@ -252,6 +257,9 @@ impl Hub {
                 () = sleep(turn_in.unwrap_or_default()), if turn_in.is_some() => {
                     self.take_turns().await;
                 }
+                () = sleep(look_in.unwrap_or_default()), if look_in.is_some() => {
+                    self.look_whether_finished().await;
+                }
                 // Without a link, and keys, there is nothing that time would change.
                 _ = second.tick(), if !self.links.is_empty() || self.context.keyring.is_some() => {
                     seconds = seconds.wrapping_add(1);
@@ -268,6 +276,7 @@ impl Hub {
         for link in self.links.values() {
             close(&link.connection, CloseCode::Goodbye, "the daemon ends");
         }
+        self.count_what_is_left().await;
         for endpoint in &self.endpoints.all {
             // Lets the CONNECTION_CLOSE frames out.
             let _ = tokio::time::timeout(Duration::from_millis(500), endpoint.wait_idle()).await;
@@ -283,6 +292,7 @@ impl Hub {
             }
             Event::Order(ToGateway::SendDatagram { to, bytes }) => self.endpoints.send(to, &bytes),
             Event::Order(ToGateway::Listed(addresses)) => self.context.set_listed(addresses),
+            Event::Order(ToGateway::Finish) => self.finish(),
             Event::Order(ToGateway::Shutdown) => {}
             Event::Dialled(target, result) => match *result {
                 Ok(established) => self.established(established, target.replaces).await,
