@@ -124,7 +124,8 @@ Each topic is published under the name and type in the log, at the pace of the r
 --qos keep-all, the default, a full reader that keeps all as well slows the replay and nothing is \
 lost; the other profiles never wait. At the end it waits for other hosts to acknowledge what they got, \
 prints how many messages are acknowledged, and fails where some are not: after 15 s in which no more \
-were, or when a link or a daemon was lost with them.
+were, or when a link or a daemon was lost with them. A message that had no subscription is not \
+acknowledged; with --wait N one that had fewer than N makes it fail as well.
 
 A log whose end is missing, or that fails a checksum, is refused; the error says how much of it is \
 whole, and --incomplete publishes that.

@@ -64,6 +64,22 @@ fn play_fails_where_messages_are_lost_with_its_daemon() {
     assert!(said.contains("messages were lost with a link or a daemon"), "{said}");
 }
 
+/// Nothing is on its way when the other host's subscriptions leave, so that nothing is given up.
+#[test]
+fn play_fails_where_the_subscriptions_that_it_waited_for_leave() {
+    let [a, b] = Host::pair();
+    let echoes = Echoes::start(&b);
+    let play = play(&a, "60");
+    eventually("the middle of the replay", || a.published() > 500);
+    drop(echoes);
+    let (code, said) = outcome(play);
+    assert_eq!(code, Some(1), "{said}");
+    assert!(said.contains("messages found fewer subscriptions than --wait asks for"), "{said}");
+    let count = said.split_once(" acknowledged").and_then(|(before, _)| before.rsplit_once("; "));
+    let count: u64 = count.expect("a count").1.replace(',', "").parse().expect("a number");
+    assert!((500..MESSAGES).contains(&count), "{said}");
+}
+
 fn signal(pid: i32, signal: Signal) {
     let pid = rustix::process::Pid::from_raw(pid).expect("a process id");
     rustix::process::kill_process(pid, signal).expect("it is there");
