@@ -45,6 +45,19 @@ fn is_erased(layout: Layout) -> bool {
     layout.size() <= LONGEST_ERASED && ERASES.load(Ordering::Relaxed)
 }
 
+/// Overwrites a block.
+///
+/// # Safety
+/// It has `size` bytes, which nobody else uses.
+unsafe fn erase(block: *mut u8, size: usize) {
+    // SAFETY: the caller says so.
+    unsafe { block.write_bytes(0, size) };
+    // SAFETY: as above, and all of it was just written.
+    let erased = unsafe { slice::from_raw_parts(block, size) };
+    // Or the compiler leaves the erasure out, since the block is freed.
+    zeroize::optimization_barrier(erased);
+}
+
 // SAFETY: every block is one of `System` with the layout asked for, and goes back to it once with
 // that layout. What is written to a block is written before it goes back.
 unsafe impl GlobalAlloc for ErasingHeap {
@@ -61,11 +74,7 @@ unsafe impl GlobalAlloc for ErasingHeap {
     unsafe fn dealloc(&self, block: *mut u8, layout: Layout) {
         if is_erased(layout) {
             // SAFETY: the block has that many bytes, and the caller gives it up.
-            unsafe { block.write_bytes(0, layout.size()) };
-            // SAFETY: as above, and all of it was just written.
-            let erased = unsafe { slice::from_raw_parts(block, layout.size()) };
-            // Or the compiler leaves the erasure out, since the block is freed.
-            zeroize::optimization_barrier(erased);
+            unsafe { erase(block, layout.size()) };
         }
         // SAFETY: the caller's promises are those `System` asks for.
         unsafe { System.dealloc(block, layout) }
@@ -103,6 +112,20 @@ mod tests {
         // SAFETY: it has that many bytes.
         unsafe { block.write_bytes(0x5a, layout.size()) };
         block
+    }
+
+    #[test]
+    fn a_block_that_is_given_back_is_overwritten_to_its_end() {
+        for size in [1, 32, 4097, LONGEST_ERASED] {
+            let layout = Layout::from_size_align(size, 1).unwrap();
+            let block = block(layout);
+            // SAFETY: the block of this layout, which nobody else knows.
+            unsafe { erase(block, layout.size()) };
+            // SAFETY: it is still allocated, and was written.
+            assert!(unsafe { slice::from_raw_parts(block, size) }.iter().all(|byte| *byte == 0));
+            // SAFETY: the block with its layout.
+            unsafe { ErasingHeap.dealloc(block, layout) };
+        }
     }
 
     #[test]

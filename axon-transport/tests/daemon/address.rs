@@ -2,7 +2,11 @@
 
 use std::os::{fd::OwnedFd, unix::fs::PermissionsExt as _};
 
-use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, socket_with};
+use rustix::{
+    net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, listen, socket_with},
+    process::Uid,
+    thread::set_thread_uid,
+};
 
 use super::*;
 
@@ -35,6 +39,30 @@ fn a_bound_name_is_an_error_that_says_so_where_there_is_no_runtime_directory() {
     let _squatter = squat(&host);
     let said = host.play("idle").hear();
     assert!(said.contains("XDG_RUNTIME_DIR") && said.contains("serves no session"), "{said}");
+}
+
+#[test]
+fn a_name_at_which_another_user_listens_is_an_error_that_says_whose_it_is() {
+    const NOBODY: u32 = 65534;
+    if !rustix::process::geteuid().is_root() {
+        return skip::skip("only root can be two users");
+    }
+    let host = host("188");
+    // The kernel notes the user of the thread that listens.
+    let listener = std::thread::scope(|scope| {
+        let other_user = scope.spawn(|| {
+            set_thread_uid(Uid::from_raw(NOBODY)).unwrap();
+            let socket = squat(&host);
+            listen(&socket, 8).unwrap();
+            socket
+        });
+        other_user.join().unwrap()
+    });
+    let said = host.play("idle").hear();
+    assert!(said.contains("belongs to uid 65534") && said.contains("XDG_RUNTIME_DIR"), "{said}");
+    drop(listener);
+    let daemon = host.play("idle").hear();
+    assert!(daemon.len() == 32, "{daemon}");
 }
 
 #[test]

@@ -53,6 +53,8 @@ impl Trap {
         let script = format!("#!/bin/sh\n: > {}\n", trap.path("open/executed").display());
         fs::write(trap.path("daemon"), script).unwrap();
         mode(&trap.path("daemon"), 0o755);
+        fs::create_dir(trap.path("bin")).unwrap();
+        fs::copy(trap.path("daemon"), trap.path("bin/axon_daemon")).unwrap();
         fs::write(trap.path("axon.toml.of_caller"), "daemon_path = \"daemon\"\n").unwrap();
         mode(&trap.path("axon.toml.of_caller"), 0o644);
         Some(trap)
@@ -94,6 +96,15 @@ impl Trap {
         assert!(self.was_executed(), "{said}");
         let said = self.run(&self.program(), "AXON_CONFIG", &self.path("axon.toml.of_caller"));
         assert!(self.was_executed(), "{said}");
+        for (name, value) in self.folders() {
+            let said = self.run(&self.program(), name, &value);
+            assert!(self.was_executed(), "{name}: {said}");
+        }
+    }
+
+    /// Variables that say where programs are, in whatever program.
+    fn folders(&self) -> [(&'static str, PathBuf); 2] {
+        [("PATH", self.path("bin")), ("CARGO_HOME", self.dir.clone())]
     }
 
     /// With others' rights they do not; whether the kernel gives them here.
@@ -120,6 +131,10 @@ impl Trap {
             let said = self.run(&self.program(), name, value);
             assert!(said.contains(&format!("refused {name}")), "{said}");
             assert!(said.contains("set-uid, set-gid or file capabilities"), "{said}");
+        }
+        for (name, value) in self.folders() {
+            let said = self.run(&self.program(), name, &value);
+            assert!(said.contains("not opened"), "{name}: {said}");
         }
         assert!(!self.was_executed());
         // Not an error, and not used: there is no daemon beside the program.

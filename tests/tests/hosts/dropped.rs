@@ -1,6 +1,6 @@
 //! What is dropped on the way to another host is counted and logged by topic where it is dropped.
 
-use std::thread;
+use std::{thread, time::Instant};
 
 use axon_transport::{
     qos::Qos,
@@ -127,7 +127,9 @@ fn samples_of_a_route_that_ended_are_counted_by_topic() {
         thread::scope(|scope| {
             // Until the subscription's end is known here: what is sent meanwhile has no route there.
             let flood = scope.spawn(|| {
+                let end = Instant::now() + PATIENCE;
                 while !publisher.matched().is_empty() {
+                    assert!(Instant::now() < end, "the subscription's end is not known");
                     publisher.publish(&[0x5a; 1_000]).unwrap();
                 }
             });

@@ -111,8 +111,18 @@ fn what_is_more_than_may_cross_is_named_on_both_hosts_and_harms_nothing_else() {
 const LINKS: u8 = 160;
 
 #[test]
-fn links_of_made_up_keys_from_one_address_keep_no_other_host_out() {
-    let [mut host, mut other] = Plan::new([classic(&[]), classic(&[])]).prepare();
+fn links_of_made_up_keys_from_one_address_keep_no_listed_host_out() {
+    made_up_keys_keep_no_other_host_out(true);
+}
+
+#[test]
+fn links_of_made_up_keys_from_one_address_keep_no_host_out_that_nobody_lists() {
+    made_up_keys_keep_no_other_host_out(false);
+}
+
+fn made_up_keys_keep_no_other_host_out(listed: bool) {
+    let plan = Plan { listed, ..Plan::new([classic(&[]), classic(&[])]) };
+    let [mut host, mut other] = plan.prepare();
     host.start();
     let stranger = Stranger::new();
     let links: Vec<_> = (0..LINKS)
