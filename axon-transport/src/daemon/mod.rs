@@ -22,5 +22,6 @@ mod topics;
 mod turns;
 
 pub use crate::secrets::ErasingHeap;
+pub use detach::Report;
 pub use gateway::GatewayEntry;
 pub use run::{DaemonError, DaemonOptions, Start, main, run};
