@@ -1,5 +1,5 @@
-//! The raw limit between two hosts: one stream of bare quinn, under AXON's key exchange and cipher and
-//! with its windows. Messages have a length before them; in a stream they are written 64 KiB at a time,
+//! The raw limit between two hosts: one stream of bare quinn, under AXON's key exchange and cipher, with a
+//! daemon's socket buffers and send window. Messages have a length before them; in a stream they are written 64 KiB at a time,
 //! and always read so.
 
 use std::{
@@ -28,10 +28,14 @@ const BATCH: usize = 64 << 10;
 const HEADER: usize = 4;
 /// Between two looks at whether a turn is over.
 const LOOK: Duration = Duration::from_millis(1);
-/// As a daemon's, like the two windows.
+/// As a daemon's.
 const SOCKET_BUFFER: usize = 8 << 20;
-const STREAM_WINDOW: u32 = 32 << 20;
+/// As a daemon's.
 const SEND_WINDOW: u64 = 16 << 20;
+/// Wider than a daemon's (at most 4 MiB), which has many peers: a user of quinn alone has one.
+const STREAM_WINDOW: u32 = 32 << 20;
+/// Wider than a daemon's too (1 MiB and a share of 64 MiB).
+const CONNECTION_WINDOW: u32 = 256 << 20;
 
 /// quinn and nothing else.
 pub(super) struct BareQuic;
@@ -178,7 +182,7 @@ fn transport() -> Arc<TransportConfig> {
     let mut transport = TransportConfig::default();
     transport
         .stream_receive_window(VarInt::from_u32(STREAM_WINDOW))
-        .receive_window(VarInt::from_u32(256 << 20))
+        .receive_window(VarInt::from_u32(CONNECTION_WINDOW))
         .send_window(SEND_WINDOW);
     Arc::new(transport)
 }
