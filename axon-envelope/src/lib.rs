@@ -48,7 +48,7 @@
 //!   moves, since they live behind a pointer, nor on the stack by their derivation
 //!   ([`KmeKey::derive`]). A [`Sealer`] or [`Opener`] prints names and counts. A key can stay in
 //!   locked memory of the caller's: [`KmeKey::from_holder`]. Bytes of a key come out only through the
-//!   trait [`ExposeSecret`](secrecy::ExposeSecret) of the crate [`secrecy`].
+//!   trait [`ExposeSecret`](secrecy::ExposeSecret) of the crate [`secrecy`] and [`KmeKey::derive`].
 //!
 //! # Features
 //!

@@ -28,9 +28,10 @@
 //! - **Mutual TLS, and only the CA you name.** The system's roots are never consulted, redirects
 //!   and proxies from the environment are never followed. TLS 1.3 and 1.2; X25519MLKEM768 is
 //!   preferred where the KME has it.
-//! - **Secrets are zeroized.** A [`Key`] cannot be cloned or printed, compares in constant time and
-//!   shows its bytes only through the trait [`ExposeSecret`](secrecy::ExposeSecret) of [`secrecy`]. See [Secrets](#secrets) for what the crate can
-//!   and cannot reach.
+//! - **Secrets are zeroized.** A [`Key`] cannot be cloned or printed, and compares in constant time. Its
+//!   bytes come out only through the trait [`ExposeSecret`](secrecy::ExposeSecret) of [`secrecy`],
+//!   [`Key::expose_array`] and [`Key::into_secret`]. See [Secrets](#secrets) for what the crate can and
+//!   cannot reach.
 //! - **What a KME says is checked**, each check named by the clause it comes from
 //!   ([`Error::Check`]). Deviations that real KMEs show are tolerated only by name: [`Quirks`].
 //! - **Keys are not lost silently.** A call cut off after its request may have left says so:
