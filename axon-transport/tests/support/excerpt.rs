@@ -1,5 +1,5 @@
-//! What a test that failed shows of a long text: its end, and the first warnings before. All of it is kept
-//! in a file.
+//! What a test that failed shows of a long text, a log or what a compiler says: its end, and the first
+//! warnings before. All of it is kept in a file.
 
 use std::{fs, path::Path, thread};
 
@@ -19,7 +19,10 @@ pub(crate) fn excerpt(name: &str, text: &str) -> String {
     if before.is_empty() && lines.iter().all(|line| line.chars().count() <= LINE) {
         return format!("--- {name}:\n{}", end.join("\n"));
     }
-    let warns = |line: &&&str| ["WARN", "ERROR", "panicked"].iter().any(|word| line.contains(word));
+    let warns = |line: &&&str| {
+        let words = ["WARN", "ERROR", "panicked"];
+        line.starts_with("error") || words.iter().any(|word| line.contains(word))
+    };
     let warnings: Vec<_> = before.iter().filter(warns).take(WARNINGS).map(shown).collect();
     let kept = match keep(name, text) {
         Ok(path) => format!("all {} lines are in {path}", lines.len()),

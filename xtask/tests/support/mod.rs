@@ -1,10 +1,16 @@
 //! What the tests of this crate share: the workspace, commands, and the environment of AXON's programs.
 #![allow(dead_code, reason = "each test file uses its own part")]
 
+#[path = "../../../axon-transport/tests/support/excerpt.rs"]
+mod excerpt;
+
 use std::fs;
 use std::io::{Write, stderr};
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output};
+
+use excerpt::excerpt;
 
 /// What cargo says when it is the registry that is missing.
 const UNREACHABLE: [&str; 6] = [
@@ -32,14 +38,33 @@ pub(crate) fn profiles() -> String {
     manifest[manifest.find("\n[profile.dev]").expect("a profile")..].to_owned()
 }
 
-/// Runs a command that has to succeed.
+/// Runs a command that has to succeed. Of what it says when it does not, a part is shown.
 #[track_caller]
 pub(crate) fn run(command: &mut Command) -> Output {
     let output = command.output().unwrap_or_else(|error| panic!("{command:?}: {error}"));
-    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    let (out, err) = (text(&output.stdout), text(&output.stderr));
-    assert!(output.status.success(), "{command:?}: {}\n{out}\n{err}", output.status);
+    assert_success(command, &output);
     output
+}
+
+#[track_caller]
+fn assert_success(command: &Command, output: &Output) {
+    if !output.status.success() {
+        let part = |name, bytes| excerpt(name, &String::from_utf8_lossy(bytes));
+        let (out, err) = (part("stdout", &output.stdout), part("stderr", &output.stderr));
+        panic!("{command:?}: {}\n{out}\n{err}", output.status);
+    }
+}
+
+#[test]
+fn of_a_command_that_fails_a_part_is_shown() {
+    let mut command = Command::new("sh");
+    command.args(["-c", "seq 5000; echo 'error[E0277]: this' >&2; seq 5000 >&2; exit 3"]);
+    let failed = catch_unwind(AssertUnwindSafe(|| run(&mut command))).expect_err("it fails");
+    let shown = failed.downcast_ref::<String>().expect("a message");
+    assert!(shown.lines().count() < 250, "{shown}");
+    for part in ["exit status: 3", "\n5000", "error[E0277]: this", "all 5001 lines are in "] {
+        assert!(shown.contains(part), "{part}: {shown}");
+    }
 }
 
 /// Runs a command that needs the registry. `None` where that is out of reach, and says so.
@@ -48,11 +73,12 @@ pub(crate) fn reached(command: &mut Command) -> Option<()> {
     let output = command.output().expect("cargo runs");
     let why = String::from_utf8_lossy(&output.stderr);
     if !output.status.success() && UNREACHABLE.iter().any(|part| why.contains(part)) {
+        let why = excerpt("stderr", &why);
         // Past the harness, which would show it only beside a failure.
         let _ = writeln!(stderr(), "skipped: the registry is out of reach:\n{why}");
         return None;
     }
-    assert!(output.status.success(), "{command:?}: {why}");
+    assert_success(command, &output);
     Some(())
 }
 
