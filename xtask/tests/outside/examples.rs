@@ -1,4 +1,4 @@
-//! The examples of the published crates.
+//! The examples and changelogs of the published crates.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -17,6 +17,15 @@ fn each_library_has_an_example() {
         let examples = fs::read_dir(workspace().join(dir).join("examples")).into_iter().flatten();
         let programs = examples.flatten().filter(|e| e.path().extension() == Some("rs".as_ref()));
         assert_ne!(programs.count(), 0, "{name} has no example");
+    }
+}
+
+/// docs/release.md says that each has one.
+#[test]
+fn each_crate_has_a_changelog() {
+    for (name, dir) in PUBLISHED {
+        let text = fs::read_to_string(workspace().join(dir).join("CHANGELOG.md")).expect(name);
+        assert!(text.starts_with("# Changelog\n") && text.contains("\n## "), "{name}");
     }
 }
 
