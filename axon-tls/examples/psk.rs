@@ -8,15 +8,15 @@ use std::error::Error;
 use std::sync::Arc;
 
 use axon_tls::psk::{self, Psk, PskTable};
+use axon_tls::secrecy::SecretSlice;
 use axon_tls::stream::{TlsAcceptor, TlsConnector};
-use axon_tls::zeroize::Zeroizing;
 use axon_tls::{Cipher, PskKex};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 
 /// In a program of your own: 32 bytes from a provisioning step, the same on both ends.
-fn secret() -> Zeroizing<Vec<u8>> {
-    Zeroizing::new(vec![0x2a; 32])
+fn secret() -> SecretSlice<u8> {
+    vec![0x2a; 32].into()
 }
 
 #[tokio::main]

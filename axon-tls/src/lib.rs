@@ -56,7 +56,7 @@ pub use quinn;
 pub use rustls;
 #[cfg(feature = "tokio")]
 pub use tokio;
-pub use {rustls_axon, zeroize};
+pub use {rustls_axon, secrecy, zeroize};
 
 // For AXON's own crates; not part of the interface.
 #[doc(hidden)]

@@ -10,14 +10,13 @@
 //!
 //! use axon_tls::psk::{self, Psk, PskTable};
 //! use axon_tls::stream::{TlsAcceptor, TlsConnector};
-//! use axon_tls::zeroize::Zeroizing;
 //! use axon_tls::{Cipher, PskKex};
 //! use tokio::io::{AsyncReadExt, AsyncWriteExt};
 //!
 //! # #[tokio::main(flavor = "current_thread")]
 //! # async fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let (cipher, kex) = (Cipher::default(), PskKex::PskDheKe);
-//! let key = || Psk::new("key 1", Zeroizing::new(vec![7; 32]), cipher).map(Arc::new);
+//! let key = || Psk::new("key 1", vec![7; 32].into(), cipher).map(Arc::new);
 //! let client = psk::client_config(vec![key()?], kex, b"")?;
 //! let server = psk::server_config(Arc::new(PskTable::new([key()?])?), cipher, kex, b"")?;
 //!

@@ -20,7 +20,7 @@ const UNKNOWN_PSK_IDENTITY: u8 = 115;
 const ALPN: &[u8] = b"test/1";
 
 fn key(identity: &[u8], secret: u8, cipher: Cipher) -> Arc<Psk> {
-    Arc::new(Psk::new(identity, Zeroizing::new(vec![secret; 32]), cipher).unwrap())
+    Arc::new(Psk::new(identity, vec![secret; 32].into(), cipher).unwrap())
 }
 
 fn table<const N: usize>(keys: [Arc<Psk>; N]) -> Arc<PskTable> {
@@ -164,7 +164,7 @@ async fn imported_key_works_and_is_not_mixed_with_others() {
     let works = agreed(vec![imported()], table([imported()]), PskKex::PskDheKe).await;
     assert_eq!(works.unwrap(), name);
 
-    let not_imported = Psk::new(name, Zeroizing::new(vec![1; 48]), Cipher::Aes256Gcm).unwrap();
+    let not_imported = Psk::new(name, vec![1; 48].into(), Cipher::Aes256Gcm).unwrap();
     let mixed = agreed(vec![imported()], table([Arc::new(not_imported)]), PskKex::PskKe).await;
     assert_eq!(mixed, Err(DECRYPT_ERROR));
 }
@@ -172,7 +172,7 @@ async fn imported_key_works_and_is_not_mixed_with_others() {
 #[test]
 fn unusable_keys_and_offers_are_refused() {
     let cipher = Cipher::default();
-    let new = |identity: &[u8], len| Psk::new(identity, Zeroizing::new(vec![1; len]), cipher);
+    let new = |identity: &[u8], len| Psk::new(identity, vec![1; len].into(), cipher);
     for (identity, len) in [(&b""[..], 32), (&[1; 65_530], 32), (b"a", 0), (b"a", 15)] {
         assert!(matches!(new(identity, len), Err(Error::RustlsAxon(_))));
     }

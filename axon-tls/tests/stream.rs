@@ -11,7 +11,6 @@ use std::task::{Context, Waker};
 use axon_tls::psk::{self, Psk, PskTable};
 use axon_tls::rustls_axon::{AlertDescription, ClientConfig, Error, PeerMisbehaved, ServerConfig};
 use axon_tls::stream::{TlsAcceptor, TlsConnector, TlsStream};
-use axon_tls::zeroize::Zeroizing;
 use axon_tls::{Cipher, KeyExchange, PskKex};
 use pieces::{Pieces, Shared};
 use tokio::io::{
@@ -20,7 +19,7 @@ use tokio::io::{
 use tokio::net::{TcpListener, TcpStream};
 
 fn key(secret: u8, cipher: Cipher) -> Arc<Psk> {
-    Arc::new(Psk::new("a key", Zeroizing::new(vec![secret; 32]), cipher).unwrap())
+    Arc::new(Psk::new("a key", vec![secret; 32].into(), cipher).unwrap())
 }
 
 fn client(secret: u8, cipher: Cipher, kex: PskKex) -> Arc<ClientConfig> {

@@ -4,6 +4,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use rustls_axon::crypto::hash::HashAlgorithm;
 use rustls_axon::external_psk::ExternalPsk;
+use secrecy::{ExposeSecret, SecretSlice};
 use zeroize::Zeroizing;
 
 use crate::{Cipher, Error};
@@ -21,7 +22,7 @@ pub struct Psk {
 }
 
 impl Psk {
-    /// A key from `secret`, for connections with `cipher`.
+    /// A key from `secret`, for connections with `cipher`. A `Vec<u8>` becomes such a secret by `into()`.
     ///
     /// Both ends configure the same identity, secret and cipher: TLS ties a pre-shared key to the hash
     /// of one cipher suite (RFC 8446 section 4.2.11). See the [module](crate::psk#security) for what
@@ -32,9 +33,10 @@ impl Psk {
     /// fewer than 16.
     pub fn new(
         identity: impl Into<Vec<u8>>,
-        secret: Zeroizing<Vec<u8>>,
+        secret: SecretSlice<u8>,
         cipher: Cipher,
     ) -> Result<Self, Error> {
+        let secret = Zeroizing::new(secret.expose_secret().to_vec());
         Ok(ExternalPsk::new(identity, secret, cipher.hash())?.into())
     }
 

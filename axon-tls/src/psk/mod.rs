@@ -9,10 +9,10 @@
 //! use std::sync::Arc;
 //!
 //! use axon_tls::psk::{self, Psk, PskTable};
-//! use axon_tls::zeroize::Zeroizing;
+//! use axon_tls::secrecy::SecretSlice;
 //! use axon_tls::{Cipher, PskKex, rustls_axon};
 //!
-//! # fn secret() -> Zeroizing<Vec<u8>> { Zeroizing::new(vec![7; 32]) }
+//! # fn secret() -> SecretSlice<u8> { vec![7; 32].into() }
 //! let cipher = Cipher::default();
 //! let client = psk::client_config(
 //!     vec![Arc::new(Psk::new("robot-7 to base, 2026", secret(), cipher)?)],

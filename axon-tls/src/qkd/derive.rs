@@ -3,6 +3,7 @@
 use std::hint::black_box;
 
 use aws_lc_rs::hkdf::{HKDF_SHA256, KeyType, Salt};
+use rustls_axon::external_psk::ExternalPsk;
 use zeroize::Zeroizing;
 
 use super::PskIdentity;
@@ -38,7 +39,7 @@ pub fn derive_psk(
     };
     let names = [key_id, client_sae, server_sae, hash_name];
     let secret = erasing_stack(|| secret(key, names, len))?;
-    Psk::new(identity.to_bytes(), secret, cipher)
+    Ok(ExternalPsk::new(identity.to_bytes(), secret, cipher.hash())?.into())
 }
 
 fn secret(key: &[u8; 32], names: [&str; 4], len: usize) -> Result<Zeroizing<Vec<u8>>, Error> {
