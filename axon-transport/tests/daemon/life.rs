@@ -3,6 +3,7 @@
 use std::{
     fs,
     os::unix::{fs::PermissionsExt as _, process::CommandExt as _},
+    path::Path,
     process::{Command, Stdio},
 };
 
@@ -75,6 +76,38 @@ pub(crate) fn streamless() {
     loop {
         std::thread::park();
     }
+}
+
+#[test]
+fn without_a_program_to_start_the_error_says_where_it_was_looked_for_and_how_it_is_installed() {
+    let host = Host::new().without("AXON_DAEMON_PATH");
+    let [path, home] = ["bin", "home"].map(|name| host.dir.path().join(name));
+    let beside = std::env::current_exe().unwrap().parent().unwrap().to_path_buf();
+    let cargo = home.join(".cargo/bin");
+    for (path, home, folders) in [
+        (Path::new(""), Path::new(""), &[&beside][..]),
+        (&*path, &*home, &[&beside, &path, &cargo]),
+    ] {
+        let mut command = host.command(std::env::current_exe().unwrap());
+        command.env("PATH", path).env("HOME", home).env_remove("CARGO_HOME");
+        let mut player = host.play_in(command, "nobody to start");
+        let (shown, debug) = (player.hear(), player.hear());
+        player.finish();
+        let folders: Vec<_> = folders.iter().map(|folder| folder.display().to_string()).collect();
+        for said in [shown, debug] {
+            assert!(said.contains(&format!(" in {};", folders.join(", "))), "{said}");
+            assert!(said.contains("cargo install --locked --git https://"), "{said}");
+            assert!(said.contains(" axon-cli`, or set AXON_DAEMON_PATH"), "{said}");
+        }
+    }
+}
+
+/// What the child does: it says what `Display` and `Debug` say, which a `main` prints.
+pub(crate) fn nobody_to_start() {
+    let opened = Session::open(&Config::from_env().unwrap(), SessionOptions::new("nobody"));
+    let error = opened.err().expect("there is no daemon, and none to start");
+    say(&error);
+    say(format!("{error:?}"));
 }
 
 #[test]

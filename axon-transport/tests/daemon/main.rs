@@ -1,6 +1,7 @@
 //! Sessions and their daemon as real processes.
 
 mod address;
+mod foreign;
 mod hostile;
 mod life;
 mod logging;
@@ -66,6 +67,8 @@ fn receive(subscription: &Subscription) -> u64 {
 fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
     match part.as_str() {
+        "foreign" => return foreign::sessions(),
+        "nobody to start" => return life::nobody_to_start(),
         "streamless" => life::streamless(),
         "few descriptors" => return life::few_descriptors(),
         _ => {}
