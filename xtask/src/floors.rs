@@ -25,15 +25,9 @@ const MOST_FILES: usize = 15;
 /// # Errors
 /// Each import that runs up, each room that no table has, and each folder with too many files.
 pub(crate) fn check(root: &Path) -> Result<String, String> {
-    let page = root.join("docs/architecture.md");
-    let text = fs::read_to_string(&page).map_err(|e| format!("{}: {e}", page.display()))?;
-    let houses = houses(&text)?;
-    if houses.is_empty() {
-        return Err(format!("{} has no table of floors", page.display()));
-    }
     let mut lines = Vec::new();
     let mut wrong = Vec::new();
-    for House { folder, floors, crowded } in houses {
+    for House { folder, floors, crowded } in of_page(root)? {
         let mut sources = Vec::new();
         read(&root.join(&folder), &root.join(&folder), &mut sources)?;
         wrong.extend(judge_crowds(&root.join(&folder), &sources, &crowded));
@@ -52,13 +46,33 @@ pub(crate) fn check(root: &Path) -> Result<String, String> {
 type Floors = BTreeMap<String, usize>;
 
 /// What the page says of a crate.
-struct House {
+pub(crate) struct House {
     /// Of its sources.
-    folder: String,
+    pub(crate) folder: String,
     /// The rooms in the first column of the table.
-    floors: Floors,
+    pub(crate) floors: Floors,
     /// Folders in it that may have too many files.
     crowded: BTreeSet<PathBuf>,
+}
+
+/// The crates of which the page has a table.
+pub(crate) fn of_page(root: &Path) -> Result<Vec<House>, String> {
+    let page = root.join("docs/architecture.md");
+    let text = fs::read_to_string(&page).map_err(|e| format!("{}: {e}", page.display()))?;
+    let houses = houses(&text)?;
+    if houses.is_empty() {
+        return Err(format!("{} has no table of floors", page.display()));
+    }
+    Ok(houses)
+}
+
+/// Which rooms of a crate import from which others.
+pub(crate) fn arrows(root: &Path, house: &House) -> Result<BTreeSet<(String, String)>, String> {
+    let folder = root.join(&house.folder);
+    let mut sources = Vec::new();
+    read(&folder, &folder, &mut sources)?;
+    let imports = imports(sources).into_iter().filter(|import| !import.to.is_empty());
+    Ok(imports.map(|import| (import.from, import.to)).collect())
 }
 
 fn houses(page: &str) -> Result<Vec<House>, String> {

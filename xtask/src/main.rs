@@ -9,6 +9,7 @@ use std::process::ExitCode;
 mod floors;
 mod install_c;
 mod package;
+mod picture;
 mod repeat;
 mod rustls_axon;
 
@@ -23,6 +24,7 @@ usage: cargo xtask COMMAND
   package [CRATE]... [--allow-dirty] [--no-verify] [--offline] [--target-dir DIR]
                        make the packages of these crates, or of all that are published, from a copy
                        of the workspace in which rustls-axon has its patched source
+  picture              draw docs/architecture.svg anew, from the manifests and the imports
   repeat TIMES [--busy N] [NAME ...]
                        run the test suite, or the test programs with such a name, TIMES times,
                        beside N busy threads, and list the tests that failed in any run
@@ -49,6 +51,7 @@ fn main() -> ExitCode {
             Some(options) => package::package(&options),
             None => return usage(),
         },
+        ["picture"] => picture::draw(rustls_axon::workspace()),
         ["repeat", times, ref options @ ..] => match repeat_options(times, options) {
             Some(options) => repeat::repeat(&options),
             None => return usage(),
