@@ -22,7 +22,8 @@ pub struct Psk {
 }
 
 impl Psk {
-    /// A key from `secret`, for connections with `cipher`. A `Vec<u8>` becomes such a secret by `into()`.
+    /// A key from `secret`, for connections with `cipher`. A `Vec<u8>` becomes such a secret by `into()`; one with
+    /// more capacity than bytes may be moved for that, and what it leaves behind is not erased.
     ///
     /// Both ends configure the same identity, secret and cipher: TLS ties a pre-shared key to the hash
     /// of one cipher suite (RFC 8446 section 4.2.11). See the [module](crate::psk#security) for what

@@ -18,8 +18,10 @@ use crate::{
     ids::DaemonId,
 };
 
+/// Between two attempts to give an order to a gateway that is busy.
+const BUSY: Duration = Duration::from_millis(10);
 /// How long a gateway may take to finish: longer than it waits for what it has on its way.
-const FINISH: Duration = Duration::from_secs(8);
+const FINISH: Duration = Duration::from_secs(6);
 
 /// The gateway of every daemon that is not told otherwise.
 pub(super) const GATEWAY: Option<GatewayEntry> =
@@ -81,9 +83,16 @@ impl Remote {
 
     /// The daemon is to end: has what waits for other hosts arrive first, as far as that gets on.
     pub(super) async fn finish(&mut self, control: &Rc<RefCell<Control>>) {
-        if self.order(ToGateway::Finish)
-            && tokio::time::timeout(FINISH, self.run(control)).await.is_err()
-        {
+        // An order that finds the channel full is dropped: this one is given again.
+        let finish = async {
+            while self.running.is_some() && !self.order(ToGateway::Finish) {
+                tokio::time::sleep(BUSY).await;
+            }
+            if self.running.is_some() {
+                self.run(control).await;
+            }
+        };
+        if tokio::time::timeout(FINISH, finish).await.is_err() {
             tracing::warn!("the gateway does not say whether samples are on their way");
         }
     }

@@ -16,6 +16,8 @@ const QUEUE: usize = 32;
 pub(super) struct QueueBudget {
     most: usize,
     taken: AtomicUsize,
+    /// Bytes that were given back in all.
+    released: AtomicUsize,
     /// One queue alone.
     queue: usize,
     /// Somebody found too little.
@@ -37,8 +39,9 @@ impl QueueBudget {
     }
 
     fn with(most: usize, queue: usize, of: Option<Arc<QueueBudget>>) -> Self {
-        let (taken, awaited) = (AtomicUsize::new(0), AtomicBool::new(false));
-        Self { most, taken, queue, awaited, freed: Notify::new(), of }
+        let (taken, released) = (AtomicUsize::new(0), AtomicUsize::new(0));
+        let awaited = AtomicBool::new(false);
+        Self { most, taken, released, queue, awaited, freed: Notify::new(), of }
     }
 
     /// Most that one queue may take.
@@ -96,7 +99,15 @@ impl QueueBudget {
         self.taken.fetch_update(Ordering::SeqCst, Ordering::SeqCst, more).is_ok()
     }
 
+    /// Bytes that were given back since the daemon began; it may begin anew with 0.
+    pub(super) fn released(&self) -> usize {
+        // Relaxed: it is compared with itself.
+        self.released.load(Ordering::Relaxed)
+    }
+
     fn release(&self, bytes: usize) {
+        // Relaxed: as above.
+        self.released.fetch_add(bytes, Ordering::Relaxed);
         self.taken.fetch_sub(bytes, Ordering::SeqCst);
         if self.awaited.swap(false, Ordering::SeqCst) {
             self.freed.notify_waiters();

@@ -166,14 +166,16 @@ impl Publisher {
     /// can be read by all others whatever becomes of this process: these were sent the memory that they
     /// are in. Whoever waits for that has the session's memory wake it.
     pub(crate) fn handed_over(&self) -> u64 {
-        let number = self.writer.handed_over();
+        let memory = &self.session.shared().memory;
+        let (began, number) = (memory.connections(), self.writer.handed_over());
         // In this order: it counts what the readers of those samples have to be sent.
-        let handovers = self.session.shared().memory.handovers();
+        let handovers = memory.handovers();
         let mut sending = self.inner.sending();
-        if sending.sent == handovers {
+        if sending.sent == Some(handovers) {
             sending.number = sending.number.max(number);
-        } else if sending.asked != Some(handovers) {
-            sending.asked = Some(handovers);
+        } else if sending.asked.is_none_or(|asked| asked.connection != began) {
+            // One at a time: where there is always something more to be sent, each is answered.
+            sending.asked = Some(Asked { connection: began, handovers, number });
             let fence = Fence { writer: self.gid(), number: handovers };
             self.session.shared().tell(Outgoing::Fence(fence));
         }
@@ -290,11 +292,21 @@ pub(super) struct PublisherInner {
 /// [handovers](super::state::MemoryNews::handovers).
 #[derive(Default)]
 struct Sending {
-    /// What the daemon was asked for last.
-    asked: Option<u64>,
+    /// What the daemon was asked, and has not answered.
+    asked: Option<Asked>,
     /// What it said was sent.
-    sent: u64,
+    sent: Option<u64>,
     /// The number of the last sample that can be found by that.
+    number: u64,
+}
+
+/// A question to the daemon.
+#[derive(Clone, Copy)]
+struct Asked {
+    /// Which connection to a daemon it was said on: another one does not answer it.
+    connection: u64,
+    handovers: u64,
+    /// The last sample that had been handed over as it was asked.
     number: u64,
 }
 
@@ -345,7 +357,10 @@ impl PublisherInner {
     /// The daemon says that readers were sent what they needed as this count was reached.
     pub(super) fn was_sent(&self, handovers: u64) {
         let mut sending = self.sending();
-        sending.sent = sending.sent.max(handovers);
+        if let Some(asked) = sending.asked.take_if(|asked| asked.handovers == handovers) {
+            sending.sent = Some(handovers);
+            sending.number = sending.number.max(asked.number);
+        }
     }
 
     fn sending(&self) -> MutexGuard<'_, Sending> {

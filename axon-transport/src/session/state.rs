@@ -187,6 +187,8 @@ pub(super) struct MemoryNews {
     changes: Mutex<Vec<SegmentChange>>,
     /// Counts what readers have to be sent before they find samples.
     handovers: AtomicU64,
+    /// Counts the times that the daemon was told, or tells, everything from the beginning.
+    connections: AtomicU64,
 }
 
 /// What became of the session's own memory, or is to be asked of another's.
@@ -220,7 +222,19 @@ impl MemoryNews {
         self.handovers.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// How often that was so. Read after a sample was published, it covers all that its readers need.
+    /// The daemon is another one, or tells everything anew: it may not answer what it was asked before.
+    pub(super) fn begins_anew(&self) {
+        // Relaxed: a question that is asked once more is answered once more.
+        self.connections.fetch_add(1, Ordering::Relaxed);
+        self.hands_over();
+    }
+
+    /// How often that was so.
+    pub(super) fn connections(&self) -> u64 {
+        self.connections.load(Ordering::Relaxed)
+    }
+
+    /// How often readers had to be sent something more. Read after a sample was published, it covers all that its readers need.
     pub(super) fn handovers(&self) -> u64 {
         self.handovers.load(Ordering::Relaxed)
     }
@@ -301,8 +315,12 @@ impl Shared {
     ) -> Self {
         let wake = Arc::new(wake);
         let room = Arc::new(Room::new(options.callers));
-        let (changes, handovers) = (Mutex::default(), AtomicU64::new(0));
-        let memory = Arc::new(MemoryNews { wake: wake.clone(), changes, handovers });
+        let memory = Arc::new(MemoryNews {
+            wake: wake.clone(),
+            changes: Mutex::default(),
+            handovers: AtomicU64::new(0),
+            connections: AtomicU64::new(0),
+        });
         let listener = memory.clone();
         segment.on_segment(move |event| listener.note(event));
         Self {

@@ -402,7 +402,10 @@ impl Reader {
     /// Gives up what is left if memory that it needs to go on has not come; whether it did. What is left
     /// counts as skipped: for one whose publisher is gone, and of which another has all of that.
     pub fn forgo_missing(&mut self) -> bool {
-        if self.missing.is_none() || self.given_up {
+        // It may have come since it was looked for.
+        let lacks =
+            |missing: &Missing| matches!(self.reads.peer.find(missing.segment), Found::Absent);
+        if self.given_up || !self.missing.as_ref().is_some_and(lacks) {
             return false;
         }
         let head = protocol::bounds(self.attachment.ring()).map_or(self.cursor, |(_, head)| head);

@@ -16,8 +16,8 @@ const COUNT: Duration = Duration::from_millis(500);
 /// Since when the daemon is to end, and how far that is.
 pub(super) struct Finishing {
     begun: Instant,
-    /// Bytes that waited when there were fewer than before, and when that was.
-    least: usize,
+    /// Bytes that had arrived, or were given up, at the last look, and since when there were no more.
+    gone: usize,
     since: Instant,
     next: Instant,
     /// Nothing waited at the last look.
@@ -26,8 +26,8 @@ pub(super) struct Finishing {
 
 impl Finishing {
     pub(super) fn new(now: Instant) -> Self {
-        let (least, next) = (usize::MAX, now + LOOK);
-        Self { begun: now, least, since: now, next, empty: false }
+        let next = now + LOOK;
+        Self { begun: now, gone: 0, since: now, next, empty: false }
     }
 
     /// How long it is until the next look.
@@ -35,11 +35,12 @@ impl Finishing {
         self.next.saturating_duration_since(now)
     }
 
-    /// Whether it is over, now that so many bytes wait.
-    fn is_over(&mut self, waiting: usize, now: Instant) -> bool {
+    /// Whether it is over, now that so many bytes wait, and so many are gone. As many may wait as before,
+    /// since publishers go on.
+    fn is_over(&mut self, waiting: usize, gone: usize, now: Instant) -> bool {
         self.next = now + LOOK;
-        if waiting < self.least {
-            (self.least, self.since) = (waiting, now);
+        if gone != self.gone {
+            (self.gone, self.since) = (gone, now);
         }
         let was_empty = std::mem::replace(&mut self.empty, waiting == 0);
         (was_empty && self.empty)
@@ -57,7 +58,8 @@ impl Hub {
     /// Looks whether something still waits, and tells the control plane if not.
     pub(super) async fn look_whether_finished(&mut self) {
         let Some(finishing) = &mut self.finishing else { return };
-        if finishing.is_over(self.shared.queues.taken(), Instant::now()) {
+        let queues = &self.shared.queues;
+        if finishing.is_over(queues.taken(), queues.released(), Instant::now()) {
             self.finishing = None;
             self.tell(ToControl::Finished).await;
         }
@@ -84,15 +86,18 @@ mod tests {
     #[test]
     fn it_is_over_when_nothing_waits_twice_or_nothing_gets_on() {
         let begun = Instant::now();
-        let looks = |waiting: &mut dyn FnMut(u32) -> usize| {
+        let looks = |at: fn(u32) -> (usize, usize)| {
             let mut finishing = Finishing::new(begun);
-            (1..).find(|look| finishing.is_over(waiting(*look), begun + LOOK * *look))
+            (1..).find(|look| {
+                let (waiting, gone) = at(*look);
+                finishing.is_over(waiting, gone, begun + LOOK * *look)
+            })
         };
-        assert_eq!(looks(&mut |_| 0), Some(2), "a publisher may have written just now");
-        assert_eq!(looks(&mut |look| 3_usize.saturating_sub(look as usize)), Some(4));
-        assert_eq!(looks(&mut |_| 7), Some(1 + PATIENCE.div_duration_f64(LOOK) as u32));
-        // It gets on, but for too long.
-        let most = LONGEST.div_duration_f64(LOOK) as u32;
-        assert_eq!(looks(&mut |look| 1_000_000 - look as usize), Some(most));
+        let [patience, longest] = [PATIENCE, LONGEST].map(|t| t.div_duration_f64(LOOK) as u32);
+        assert_eq!(looks(|_| (0, 9)), Some(2), "a publisher may have written just now");
+        assert_eq!(looks(|look| (3_usize.saturating_sub(look as usize), look as usize)), Some(4));
+        assert_eq!(looks(|_| (7, 0)), Some(patience));
+        assert_eq!(looks(|look| (7, look.min(10) as usize)), Some(10 + patience));
+        assert_eq!(looks(|look| (7, look as usize)), Some(longest), "publishers go on for ever");
     }
 }

@@ -413,6 +413,10 @@ impl Slots {
     /// Gives up what a writer left in memory that never came, where it has come back in another process and
     /// sends once more what was not confirmed. What is missing then is missing among its numbers.
     pub(super) fn forgo_missing(&mut self) {
+        // To others nothing is sent again.
+        if !self.keeps_all {
+            return;
+        }
         let mut forgone = false;
         for index in 0..self.slots.len().saturating_sub(1) {
             let (earlier, later) = self.slots.split_at_mut(index + 1);

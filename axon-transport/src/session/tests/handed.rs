@@ -50,6 +50,36 @@ fn a_sample_is_handed_over_when_its_reader_was_sent_the_memory_that_it_is_in() {
     assert_eq!(publisher.handed_over(), 4);
 }
 
+#[test]
+fn a_question_counts_for_what_it_was_asked_though_more_is_to_be_sent_since() {
+    let (session, daemon) = session();
+    let spec = EndpointSpec::new("/p", "test/Bytes", Qos::keep_all());
+    let publisher = session.create_publisher(spec).unwrap();
+    let _first = Taker::new().attach(&publisher, None, &daemon);
+    publisher.publish(b"x").unwrap();
+    assert_eq!(publisher.handed_over(), 0);
+    let (asked, _) = hear_fence(&daemon);
+    let _second = Taker::new().attach(&publisher, None, &daemon);
+    publisher.publish(b"x").unwrap();
+    assert_eq!(publisher.handed_over(), 0, "the grant of the second may not have been sent");
+    daemon.say(Message::Fence(asked), &[]);
+    until("the first sample was", || publisher.handed_over() == 1);
+    let (again, _) = hear_fence(&daemon);
+    assert!(again.number > asked.number);
+    daemon.say(Message::Fence(again), &[]);
+    until("the second was", || publisher.handed_over() == 2);
+    // A daemon that tells everything anew may have dropped its answer.
+    publisher.publish(&[1; LARGE]).unwrap();
+    assert_eq!(publisher.handed_over(), 2);
+    hear_fence(&daemon);
+    daemon.tell_all(Vec::new());
+    until("it is asked once more", || {
+        let _ = publisher.handed_over();
+        let heard = socket::receive(&daemon.socket, &mut Vec::new());
+        heard.is_ok_and(|heard| matches!(heard.message, Message::Fence(_)))
+    });
+}
+
 /// A process that only has to live until it is killed.
 struct Process(std::process::Child);
 
@@ -91,6 +121,17 @@ fn grant(far: &Far, introduction: &[OwnedFd], subscription: &Subscription, daemo
 
 #[test]
 fn what_a_killed_daemon_did_not_hand_over_comes_once_through_the_next() {
+    a_daemon_is_killed_whose_memory(false);
+}
+
+#[test]
+fn memory_that_came_since_it_was_looked_for_is_read_after_the_daemons_death() {
+    a_daemon_is_killed_whose_memory(true);
+}
+
+/// Whether the memory of the last samples `comes` before the daemon is killed. If so, they are confirmed, and
+/// do not come again.
+fn a_daemon_is_killed_whose_memory(comes: bool) {
     let (session, daemon) = session();
     let subscription = subscription(&session);
     let (id, first) = (SessionId::random(), Process::start());
@@ -102,6 +143,9 @@ fn what_a_killed_daemon_did_not_hand_over_comes_once_through_the_next() {
     far.publish(2, &[2; LARGE]);
     far.publish(3, b"x");
     assert_eq!(take(&subscription), None, "its memory was not handed over");
+    if comes {
+        far.hand(1, &daemon);
+    }
     drop(first);
     until("it is known to be dead", || subscription.matched().is_empty());
 
@@ -109,11 +153,12 @@ fn what_a_killed_daemon_did_not_hand_over_comes_once_through_the_next() {
     let (far, introduction) = stands_in(id, &daemon, &second);
     grant(&far, &introduction, &subscription, &daemon);
     assert!(subscription.wait_matched(1, EVER));
-    // What was not confirmed comes again.
-    far.publish(2, &[2; LARGE]);
-    far.publish(3, b"x");
+    if !comes {
+        far.publish(2, &[2; LARGE]);
+        far.publish(3, b"x");
+        far.hand(1, &daemon);
+    }
     far.publish(4, b"x");
-    far.hand(1, &daemon);
     let mut taken = Vec::new();
     until("the last", || {
         taken.extend(take(&subscription));

@@ -67,6 +67,8 @@ impl Control {
             let told = repeated.is_some();
             if let Some(repeated) = repeated {
                 self.drop_unrepeated(repeated);
+                // An answer may have been among what was too much for this session.
+                self.shared.memory.begins_anew();
             }
             self.drop_unread(told);
             self.graph_changed = true;

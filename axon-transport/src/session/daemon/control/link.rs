@@ -53,7 +53,7 @@ impl Control {
             state.outgoing.extend(gone.map(|m| Outgoing::Message(Box::new(m))));
         }
         self.link = Link::Socket(PassedFd::connection(connected.socket).trusted());
-        self.shared.memory.hands_over();
+        self.shared.memory.begins_anew();
         for info in self.shared.segment.segments() {
             self.tell_segment(SegmentChange::Opened(info.number));
         }

@@ -222,7 +222,7 @@ impl Control {
         if self.is_linked() {
             self.tell_segments();
         }
-        let (mut gone, mut fences) = (Vec::new(), Vec::new());
+        let (mut gone, mut fences) = (Vec::new(), BTreeMap::new());
         let mut state = shared.state();
         if !state.outgoing.is_empty() {
             self.timed = None;
@@ -245,7 +245,7 @@ impl Control {
                     if self.untold.is_empty() {
                         self.outbox.push_back((Message::Fence(fence), Vec::new()));
                     } else {
-                        fences.push(Outgoing::Fence(fence));
+                        fences.insert(fence.writer, Outgoing::Fence(fence));
                     }
                 }
                 Outgoing::Announce(gid) => {
@@ -289,7 +289,7 @@ impl Control {
             }
         }
         // For want of descriptors there is memory that the daemon was not told of.
-        state.outgoing.extend(fences);
+        state.outgoing.extend(fences.into_values());
         drop(state);
         gone.iter().for_each(|gid| self.own_gone(gid));
     }
