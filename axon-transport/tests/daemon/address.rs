@@ -25,7 +25,10 @@ fn with_login(host: Host) -> Host {
 
 /// Binds the abstract name of a host's daemon, and does not listen there.
 fn squat(host: &Host) -> OwnedFd {
-    let address = Address::of(&host.config()).to_string();
+    bind_name(&Address::of(&host.config()).to_string())
+}
+
+fn bind_name(address: &str) -> OwnedFd {
     let name = address.strip_prefix('@').expect("an abstract name");
     let flags = SocketFlags::CLOEXEC;
     let socket = socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None).unwrap();
@@ -48,11 +51,13 @@ fn a_name_at_which_another_user_listens_is_an_error_that_says_whose_it_is() {
         return skip::skip("only root can be two users");
     }
     let host = host("188");
+    // Of this user: an address names whose it is.
+    let address = Address::of(&host.config()).to_string();
     // The kernel notes the user of the thread that listens.
     let listener = std::thread::scope(|scope| {
         let other_user = scope.spawn(|| {
             set_thread_uid(Uid::from_raw(NOBODY)).unwrap();
-            let socket = squat(&host);
+            let socket = bind_name(&address);
             listen(&socket, 8).unwrap();
             socket
         });
