@@ -42,6 +42,8 @@ pub(super) enum Offered {
     },
     /// There is no room and nothing may be dropped: offer it again later.
     Full(Sample),
+    /// Nobody takes from this queue any more: offer it to another one.
+    Over(Sample),
 }
 
 /// The queue of one (route, publisher).
@@ -150,6 +152,9 @@ impl Queue {
 
     /// Puts `sample` at the end, as the policy says.
     pub(super) fn offer(&mut self, sample: Sample) -> Offered {
+        if self.over {
+            return Offered::Over(sample);
+        }
         let mut dropped = 0;
         while !self.takes(sample.size()) {
             if self.policy == Policy::Wait {
@@ -322,7 +327,7 @@ mod tests {
     fn offer(queue: &mut Queue, sequence: u64, size: usize) -> Result<u64, u64> {
         match queue.offer(sample(sequence, size)) {
             Offered::Queued { dropped } => Ok(dropped),
-            Offered::Full(s) => Err(s.info.sequence),
+            Offered::Full(s) | Offered::Over(s) => Err(s.info.sequence),
         }
     }
 

@@ -105,7 +105,7 @@ fn without_a_program_to_start_the_error_says_where_it_was_looked_for_and_how_it_
 /// What the child does: it says what `Display` and `Debug` say, which a `main` prints.
 pub(crate) fn nobody_to_start() {
     let opened = Session::open(&Config::from_env().unwrap(), SessionOptions::new("nobody"));
-    let error = opened.err().expect("there is no daemon, and none to start");
+    let Err(error) = opened else { panic!("there is no daemon, and none to start") };
     say(&error);
     say(format!("{error:?}"));
 }

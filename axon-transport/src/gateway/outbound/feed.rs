@@ -126,7 +126,7 @@ impl Feed {
                     moved.queued += 1;
                     moved.any = true;
                 }
-                Offered::Full(sample) => {
+                Offered::Full(sample) | Offered::Over(sample) => {
                     self.held = Some(sample);
                     break;
                 }
@@ -170,9 +170,9 @@ impl Feed {
         let offered = loop {
             let start = || Stream::new(flow.clone(), of, qos, Arc::clone(shared));
             match self.stream.get_or_insert_with(start).offer(sample, qos) {
-                Ok(offered) => break offered,
                 // It had nothing to send for a while, and ended.
-                Err(back) => (self.stream, sample) = (None, back),
+                Offered::Over(back) => (self.stream, sample) = (None, back),
+                offered => break offered,
             }
         };
         if let Offered::Queued { dropped } = offered {

@@ -90,23 +90,17 @@ impl Stream {
         Self { queue, filled, moved, left, task, _awaited: awaited }
     }
 
-    /// Queues a sample as `qos` says.
-    ///
-    /// # Errors
-    /// The sample: it [is over](Self::is_over).
-    pub(super) fn offer(&self, sample: Sample, qos: &Qos) -> Result<Offered, Sample> {
+    /// Queues a sample as `qos` says, unless the stream [is over](Self::is_over).
+    pub(super) fn offer(&self, sample: Sample, qos: &Qos) -> Offered {
+        // The lock under which it ends.
         let mut queue = lock(&self.queue);
-        // Under the lock under which it ends: nobody takes from it any more.
-        if queue.is_over() {
-            return Err(sample);
-        }
         queue.serve(qos);
         let offered = queue.offer(sample);
         drop(queue);
         if matches!(offered, Offered::Queued { .. }) {
             self.filled.notify_one();
         }
-        Ok(offered)
+        offered
     }
 
     /// The peer acknowledged samples: there may be room for more to be under way.
