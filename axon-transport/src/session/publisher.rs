@@ -164,7 +164,7 @@ impl Publisher {
 impl Publisher {
     /// The number up to which its samples are with those who carry them to other processes and hosts, and
     /// can be read by all others whatever becomes of this process: these were sent the memory that they
-    /// are in. Whoever waits for that has the session's memory wake it.
+    /// are in. The session's memory wakes the thread that waits for that.
     pub(crate) fn handed_over(&self) -> u64 {
         let memory = &self.session.shared().memory;
         let (began, number) = (memory.connections(), self.writer.handed_over());

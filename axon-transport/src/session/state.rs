@@ -217,8 +217,8 @@ impl MemoryNews {
     /// Readers have to be sent something more: memory that was opened, a grant, or all of it by another
     /// daemon.
     pub(super) fn hands_over(&self) {
-        // Relaxed: whoever publishes reads it under, or after, the writer's lock, in front of which this
-        // is counted.
+        // Relaxed: this is counted before the writer's lock is taken, and the publishing thread reads it
+        // under that lock or after.
         self.handovers.fetch_add(1, Ordering::Relaxed);
     }
 

@@ -1,4 +1,4 @@
-//! Variables that begin with `AXON_` and are other programs': whoever reads the settings warns of them.
+//! Variables that begin with `AXON_` and belong to other programs: daemon and session warn of them.
 
 use std::{fs, fs::File};
 

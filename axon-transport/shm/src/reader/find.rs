@@ -1,21 +1,38 @@
 //! How a reader finds the next sample: past what is skipped or lost, in memory that may not have come.
 
 use std::{
+    ops::Range,
     sync::{Arc, atomic::AtomicU64},
     time::Instant,
 };
 
-use super::{ATTEMPTS, Descriptors, KNOWN, MISSING, MISSING_DEAD, Missing, Obstacle, Reader};
+use super::{ATTEMPTS, Attachment, KNOWN, MISSING, MISSING_DEAD, Missing, Obstacle, Reader};
 use crate::{
     error::TakeError,
-    memory::copy,
+    memory::{copy, segment::Map},
     reader::sample::Extract,
     ring::{
         layout::{self, Array, COPIED, COPIED_ALWAYS},
-        protocol::{self, Look, Place, Record, State},
+        protocol::{self, Look, Place, Record, State, View},
     },
     session::peer::Found,
 };
+
+/// Where a ring's descriptors were found.
+pub(super) struct Descriptors {
+    /// What the ring said.
+    pub(super) word: u64,
+    map: Arc<Map>,
+    words: Range<usize>,
+}
+
+impl Descriptors {
+    #[inline]
+    pub(super) fn view<'a>(&'a self, attachment: &'a Attachment) -> View<'a, AtomicU64> {
+        let array = &self.map.words()[self.words.clone()];
+        View { ring: attachment.ring(), word: self.word, array }
+    }
+}
 
 impl Reader {
     /// The record at the cursor, once that is past all that is skipped or lost.

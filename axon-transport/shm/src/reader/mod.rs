@@ -5,12 +5,14 @@ pub(crate) mod sample;
 mod under_way;
 
 use std::{
-    ops::Range,
     sync::{Arc, Weak, atomic::AtomicU64},
     time::{Duration, Instant},
 };
 
-use self::{find::Bytes, under_way::UnderWay};
+use self::{
+    find::{Bytes, Descriptors},
+    under_way::UnderWay,
+};
 use crate::{
     alloc::pin_limit::PinLimit,
     error::{ShmError, TakeError},
@@ -20,7 +22,7 @@ use crate::{
     reader::sample::Sample,
     ring::{
         layout::{self, Location},
-        protocol::{self, MAX_POSITION, Record, State, View},
+        protocol::{self, MAX_POSITION, Record, State},
         times::{Times, read},
         types::{Grant, Meta, Taken},
         window::{depth, holds},
@@ -90,22 +92,6 @@ pub struct Reader {
     corrupt: Option<&'static str>,
     /// The publisher is gone, and its descriptors are in memory that never came.
     given_up: bool,
-}
-
-/// Where a ring's descriptors were found.
-struct Descriptors {
-    /// What the ring said.
-    word: u64,
-    map: Arc<Map>,
-    words: Range<usize>,
-}
-
-impl Descriptors {
-    #[inline]
-    fn view<'a>(&'a self, attachment: &'a Attachment) -> View<'a, AtomicU64> {
-        let array = &self.map.words()[self.words.clone()];
-        View { ring: attachment.ring(), word: self.word, array }
-    }
 }
 
 /// A segment that is needed to go on.

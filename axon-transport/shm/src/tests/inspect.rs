@@ -145,7 +145,7 @@ fn a_reader_is_not_blamed_where_memory_is_short() {
                 Err(error) => break error,
             }
         };
-        // Whoever does not wait for the reader tries again until that has made room.
+        // A publish that does not wait is tried again until the reader has made room.
         assert!(matches!(error, PublishError::Blocked { .. }), "{len}: {error}");
         assert_eq!(counts(&ours, &writer).no_memory, failed, "nothing is dropped yet");
         let error = writer.publish(meta(last + 1), &pattern(last + 1, len)).unwrap_err();

@@ -238,7 +238,7 @@ impl Writer {
             match laggards {
                 Some((reader, _)) if left.is_zero() => {
                     let blocked = PublishError::Blocked { reader };
-                    // Whoever does not wait tries again: the reader makes room, memory or not.
+                    // A caller that does not wait tries again: the reader makes room, memory or not.
                     let short = short.filter(|_| !patience.whole.is_zero());
                     return Err(short.unwrap_or(blocked));
                 }

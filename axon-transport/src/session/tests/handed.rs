@@ -39,7 +39,7 @@ fn a_sample_is_handed_over_when_its_reader_was_sent_the_memory_that_it_is_in() {
     let (opened, told) = hear_fence(&daemon);
     assert!(told && opened.number > granted.number);
     daemon.say(Message::Fence(granted), &[]);
-    // Whoever waits for room is woken by the answer, and asks once more.
+    // An answer wakes those who wait for room, and they ask once more.
     publisher.publish(b"small").unwrap();
     thread::sleep(Duration::from_millis(20));
     assert_eq!(publisher.handed_over(), 1, "that was an answer to something else");
