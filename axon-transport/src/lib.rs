@@ -9,7 +9,6 @@ pub mod ffi;
 mod files;
 pub mod gateway;
 pub mod graph;
-mod heap;
 pub mod keys;
 pub mod link;
 mod log_limit;

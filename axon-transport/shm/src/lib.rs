@@ -49,11 +49,16 @@ pub mod internal {
     pub use crate::{
         alloc::segments::{SegmentEvent, SegmentInfo},
         direct::connect::reencode_packet,
-        memory::probe::{out_of_reach, probe},
+        memory::{
+            locked::LockedPages,
+            probe::{out_of_reach, probe},
+        },
         os::{
             clock::{monotonic, wall},
             fork::ForkToken,
+            heap::{ErasingHeap, erase_from_now_on, return_free_memory},
             inherited::{close_inherited, survive_file_size_limit},
+            peer_process::{PeerProcess, peer_pidfd, peer_process},
             per_process::{Made, PerProcess, is_elevated},
             signals::BlockedSignals,
         },

@@ -3,11 +3,11 @@
 
 use std::sync::Arc;
 
-use axon_shm::internal::{PeerDescriptors, descriptors::PassedFd, out_of_reach};
+use axon_shm::internal::{PeerDescriptors, PeerProcess, descriptors::PassedFd, out_of_reach};
 
 use crate::{
     config::{Config, security_settings},
-    session::daemon::{connect::SHM, socket::Peer},
+    session::daemon::connect::SHM,
     wire::session::{Hello, PROTOCOL, Refused, SessionRole},
 };
 
@@ -40,7 +40,7 @@ impl Admission {
         &mut self,
         hello: &Hello,
         descriptors: Vec<PassedFd>,
-        peer: Peer,
+        peer: PeerProcess,
         inside: bool,
     ) -> Result<Option<[PassedFd; 3]>, Box<Refused>> {
         if hello.protocol != PROTOCOL {
@@ -181,7 +181,7 @@ mod tests {
     }
 
     fn refusal(hello: &Hello) -> Refused {
-        let peer = Peer { uid: 1000, pid: std::process::id() };
+        let peer = PeerProcess { uid: 1000, pid: std::process::id() };
         *admission().check(hello, Vec::new(), peer, false).unwrap_err()
     }
 
@@ -219,7 +219,7 @@ mod tests {
         let mut admission =
             Admission::new(Arc::new(config.clone()), security_settings(&config).unwrap());
         let mut why = |settings| {
-            let peer = Peer { uid: 1000, pid: std::process::id() };
+            let peer = PeerProcess { uid: 1000, pid: std::process::id() };
             let hello = Hello { domain: 0, settings, ..hello() };
             admission.check(&hello, Vec::new(), peer, false).unwrap_err().text
         };
@@ -251,7 +251,7 @@ mod tests {
         let null = || PassedFd::from(OwnedFd::from(std::fs::File::open("/dev/null").unwrap()));
         let parent = rustix::process::getppid().unwrap();
         let of = |pid: Pid| PassedFd::from(pidfd_open(pid, PidfdFlags::empty()).unwrap());
-        let peer = Peer { uid: 1000, pid: std::process::id() };
+        let peer = PeerProcess { uid: 1000, pid: std::process::id() };
         let memfd = || {
             let flags = rustix::fs::MemfdFlags::CLOEXEC;
             PassedFd::from(rustix::fs::memfd_create("test", flags).unwrap())
@@ -265,7 +265,7 @@ mod tests {
         let refused = admission().check(&hello(), fds, peer, false).unwrap_err();
         assert!(refused.text.contains("memfd"));
         // As SO_PEERCRED shows who is in a PID namespace of its own.
-        let hidden = Peer { pid: 0, ..peer };
+        let hidden = PeerProcess { pid: 0, ..peer };
         let fds = vec![memfd(), null(), own()];
         let refused = admission().check(&hello(), fds, hidden, false).unwrap_err();
         assert!(refused.text.contains("PID namespace"));

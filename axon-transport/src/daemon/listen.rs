@@ -8,7 +8,11 @@ use std::{
     time::Duration,
 };
 
-use axon_shm::internal::descriptors::{self, PassedFd};
+use axon_shm::internal::{
+    PeerProcess,
+    descriptors::{self, PassedFd},
+    peer_process,
+};
 use rustix::net::{AddressFamily, SocketFlags, SocketType, accept_with, socketpair};
 use tokio::{io::unix::AsyncFd, sync::Notify, task::spawn_local, time::timeout};
 
@@ -27,7 +31,7 @@ use crate::{
     ids::{Gid, SessionId},
     owner::SessionKey,
     registry::{MAX_OF_PROCESS, SessionEntry, Tally},
-    session::daemon::socket::{self, Peer},
+    session::daemon::socket,
     text,
     wire::session::{Hello, Message, PROTOCOL, Refused, Welcome},
 };
@@ -71,7 +75,7 @@ async fn accept_at(control: Rc<RefCell<Control>>, listener: OwnedFd, strangers: 
         match accepted {
             Ok(Ok(socket)) => {
                 let socket = PassedFd::connection(socket);
-                let pid = socket::peer(&socket).map_or(0, |peer| peer.pid);
+                let pid = peer_process(&socket).map_or(0, |peer| peer.pid);
                 let stranger = strangers.add(pid);
                 spawn_local(serve(control.clone(), socket, Inside::No, Some(stranger)));
                 // Those that were served meanwhile go on.
@@ -104,7 +108,7 @@ pub(super) async fn serve(
     inside: Inside,
     stranger: Option<Stranger>,
 ) {
-    let Ok(peer) = socket::peer(&socket) else { return };
+    let Ok(peer) = peer_process(&socket) else { return };
     if !control.borrow().admission.trusts(peer.uid) {
         tracing::warn!(uid = peer.uid, pid = peer.pid, "a stranger's connection was closed");
         return;
@@ -165,7 +169,7 @@ fn refuse(
     control: &mut Control,
     socket: &AsyncFd<PassedFd>,
     name: &str,
-    peer: Peer,
+    peer: PeerProcess,
     refused: Refused,
 ) {
     let what = if refused.variable.is_empty() { "session" } else { &refused.variable }.to_owned();
@@ -180,7 +184,12 @@ fn shown(name: &str) -> String {
 }
 
 /// Has a session relayed whose memory is not shared.
-fn relay(control: &Rc<RefCell<Control>>, socket: AsyncFd<PassedFd>, first: First, peer: Peer) {
+fn relay(
+    control: &Rc<RefCell<Control>>,
+    socket: AsyncFd<PassedFd>,
+    first: First,
+    peer: PeerProcess,
+) {
     let its_own = first.is_its_own();
     let First { mut hello, descriptors, key } = first;
     hello.name = shown(&hello.name);
@@ -250,7 +259,7 @@ fn admit(
     control: &Rc<RefCell<Control>>,
     socket: &AsyncFd<PassedFd>,
     first: First,
-    peer: Peer,
+    peer: PeerProcess,
     inside: &Inside,
 ) -> Option<Admitted> {
     let its_own = first.is_its_own();

@@ -21,7 +21,7 @@ mod strangers;
 mod topics;
 mod turns;
 
-pub use crate::secrets::ErasingHeap;
+pub use axon_shm::internal::ErasingHeap;
 pub use detach::Report;
 pub use gateway::GatewayEntry;
 pub use run::{DaemonError, DaemonOptions, Start, main, run};

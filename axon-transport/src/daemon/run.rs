@@ -5,7 +5,9 @@ use std::{
     time::Duration,
 };
 
-use axon_shm::internal::{close_inherited, descriptors, survive_file_size_limit};
+use axon_shm::internal::{
+    close_inherited, descriptors, erase_from_now_on, survive_file_size_limit,
+};
 use rustix::process::{
     DumpableBehavior, Resource, Rlimit, getrlimit, set_dumpable_behavior, setrlimit,
 };
@@ -26,7 +28,6 @@ use super::{
 use crate::{
     config::{Config, ConfigError, security_settings},
     discovery::Event,
-    secrets::erase_from_now_on,
     session::daemon::address::{Address, AddressError, private_directory},
 };
 

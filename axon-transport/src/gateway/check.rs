@@ -1,10 +1,11 @@
 //! Checks whether a daemon could start its gateway with a configuration, without starting one.
 
+use axon_shm::internal::erase_from_now_on;
+
 use super::{GatewayError, identity};
 use crate::{
     config::{Config, Security},
     keys::Kme,
-    secrets::erase_from_now_on,
 };
 
 /// Reads the files that a daemon with this configuration would read, its private key included, and says

@@ -12,7 +12,10 @@ use std::{
     time::Instant,
 };
 
-use axon_shm::{ExternalLeader, internal::descriptors::PassedFd};
+use axon_shm::{
+    ExternalLeader,
+    internal::{descriptors::PassedFd, peer_pidfd},
+};
 use rustix::io::Errno;
 
 use self::matching::{Source, take};
@@ -78,9 +81,9 @@ impl Far {
             // The connection is new: its buffer has room.
             Ok::<(), End>(socket::send(&socket, &packet, &[])?)
         };
-        let process = match socket::process(&socket) {
+        let process = match peer_pidfd(&socket) {
             Ok(process) => Some(process),
-            Err(SocketError::System(Errno::SRCH)) => return Err(End::Gone),
+            Err(Errno::SRCH) => return Err(End::Gone),
             // It is served as long as somebody holds the connection.
             Err(error) => {
                 tracing::debug!(session = %id, %error, "the end of its process will not be seen");

@@ -449,7 +449,7 @@ impl Hub {
 fn give_memory_back() {
     tokio::spawn(async {
         tokio::time::sleep(Duration::from_secs(1)).await;
-        let _ = tokio::task::spawn_blocking(crate::heap::give_back).await;
+        let _ = tokio::task::spawn_blocking(axon_shm::internal::return_free_memory).await;
     });
 }
 

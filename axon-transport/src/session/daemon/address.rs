@@ -23,7 +23,8 @@ use rustix::{
     },
 };
 
-use super::socket;
+use axon_shm::internal::peer_process;
+
 use crate::{config::Config, wire::session::PROTOCOL};
 
 /// Where the daemon of a user and domain listens.
@@ -307,7 +308,7 @@ fn is_served(name: &str) -> Result<bool, AddressError> {
 
 fn is_own(socket: &OwnedFd) -> bool {
     let own = rustix::process::geteuid().as_raw();
-    socket::peer(socket).is_ok_and(|peer| peer.uid == own)
+    peer_process(socket).is_ok_and(|peer| peer.uid == own)
 }
 
 fn abstract_name(name: &str) -> Result<SocketAddrUnix, AddressError> {

@@ -5,7 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_shm::internal::{SessionSegment, descriptors::PassedFd, out_of_reach};
+use axon_shm::internal::{SessionSegment, descriptors::PassedFd, out_of_reach, peer_process};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::{
@@ -126,7 +126,7 @@ impl<'a> Caller<'a> {
             Err(AddressError::Busy) => return Err(Attempt::Again),
             Err(error) => return Err(Attempt::Final(error.into())),
         };
-        let peer = socket::peer(&socket).map_err(|_| Attempt::Again)?;
+        let peer = peer_process(&socket).map_err(|_| Attempt::Again)?;
         let own = rustix::process::geteuid().as_raw();
         if peer.uid != own && !self.config.trusted_uids.contains(&peer.uid) {
             let address = address.to_string();

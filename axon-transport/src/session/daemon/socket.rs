@@ -1,18 +1,15 @@
 //! One packet of the session socket: bytes and descriptors, sent and received without blocking.
 
-#![allow(unsafe_code)]
-
 use std::{
     io::IoSlice,
     mem::MaybeUninit,
-    os::fd::{AsFd, AsRawFd, BorrowedFd, FromRawFd, OwnedFd},
+    os::fd::{AsFd, BorrowedFd},
 };
 
 use axon_shm::internal::descriptors::{self, Packet, PassedFd};
 use rustix::{
     io::Errno,
     net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg},
-    process::{Pid, PidfdFlags, pidfd_open},
 };
 
 use crate::wire::session::{CodecError, MAX_DESCRIPTORS, MAX_PACKET, Message};
@@ -62,77 +59,6 @@ impl From<Errno> for SocketError {
             other => Self::System(other),
         }
     }
-}
-
-/// The process at the other end, as the kernel recorded it at connect time.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Peer {
-    /// Its user.
-    pub uid: u32,
-    /// Its process; 0 when that is in a PID namespace which this one does not see.
-    pub pid: u32,
-}
-
-/// Who is at the other end (SO_PEERCRED).
-///
-/// # Errors
-/// What the system says.
-pub fn peer(socket: impl AsFd) -> Result<Peer, SocketError> {
-    // Not rustix's: its process ids are never 0, as this one may be.
-    let mut found = libc::ucred { pid: 0, uid: u32::MAX, gid: u32::MAX };
-    // SAFETY: the option's value is a `ucred`, of which all bit patterns are valid.
-    unsafe { option(socket.as_fd(), libc::SO_PEERCRED, &mut found) }?;
-    Ok(Peer { uid: found.uid, pid: u32::try_from(found.pid).unwrap_or(0) })
-}
-
-/// The process at the other end, as the kernel recorded it at connect time, by a descriptor that means no
-/// other even when it has ended.
-///
-/// # Errors
-/// ESRCH when it has ended and been forgotten, if the kernel has no descriptor for that; else what the
-/// system says.
-pub(crate) fn process(socket: impl AsFd) -> Result<OwnedFd, SocketError> {
-    let mut found: libc::c_int = -1;
-    // SAFETY: the option's value is an `int`.
-    match unsafe { option(socket.as_fd(), libc::SO_PEERPIDFD, &mut found) } {
-        // SAFETY: it is a descriptor that the kernel has just made for this call.
-        Ok(()) => Ok(unsafe { OwnedFd::from_raw_fd(found) }),
-        // Before Linux 6.5 there is only its number, which could be another's by now.
-        Err(SocketError::System(Errno::NOPROTOOPT)) => {
-            let pid = peer(socket)?.pid.cast_signed();
-            let pid = Pid::from_raw(pid).ok_or(SocketError::System(Errno::NODATA))?;
-            Ok(pidfd_open(pid, PidfdFlags::empty()).map_err(SocketError::System)?)
-        }
-        Err(error) => Err(error),
-    }
-}
-
-/// An option of the socket's.
-///
-/// # Safety
-/// Its value is a `T`, of which all bit patterns are valid.
-unsafe fn option<T>(
-    socket: BorrowedFd<'_>,
-    name: libc::c_int,
-    value: &mut T,
-) -> Result<(), SocketError> {
-    let mut len = libc::socklen_t::try_from(size_of::<T>()).expect("a few bytes");
-    // SAFETY: `len` says how long `value` is, and both live as long as the call; what the kernel writes
-    // there is a `T`, as the caller says.
-    let done = unsafe {
-        libc::getsockopt(
-            socket.as_raw_fd(),
-            libc::SOL_SOCKET,
-            name,
-            (&raw mut *value).cast(),
-            &raw mut len,
-        )
-    };
-    if done != 0 {
-        let errno = std::io::Error::last_os_error().raw_os_error().unwrap_or(libc::EINVAL);
-        return Err(SocketError::System(Errno::from_raw_os_error(errno)));
-    }
-    Ok(())
 }
 
 /// Sends one packet.
@@ -234,7 +160,6 @@ mod tests {
         let got = receive(&b, &mut Vec::new()).unwrap();
         assert_eq!(got.message, Message::Resync);
         assert_eq!(got.descriptors.len(), 2);
-        assert_eq!(peer(&b).unwrap().pid, std::process::id());
         drop(a);
         assert!(matches!(receive(&b, &mut Vec::new()), Err(SocketError::Closed)));
     }

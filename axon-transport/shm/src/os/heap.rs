@@ -1,4 +1,4 @@
-//! An allocator that erases what is given back to it.
+//! An allocator that erases what is given back to it, and memory that goes back to the system.
 
 // An allocator has no safe interface.
 #![allow(unsafe_code)]
@@ -13,30 +13,27 @@ use std::{
 /// erasing these would cost as much as copying them.
 const LONGEST_ERASED: usize = 64 << 10;
 
-/// Whether this process is a daemon.
+/// Whether this process has asked for it.
 static ERASES: AtomicBool = AtomicBool::new(false);
 
-/// The system's allocator, which in a daemon erases each block of at most 64 KiB before it is
-/// freed, and when it grows into another one.
-///
-/// The libraries of the KME client copy keys into buffers that they free as they are. A program
-/// that can be the daemon makes this its global allocator:
-///
-/// ```
-/// #[global_allocator]
-/// static HEAP: axon_transport::daemon::ErasingHeap = axon_transport::daemon::ErasingHeap;
-/// ```
-///
-/// It erases nothing until [`run`](crate::daemon::run) is called, so the program's other commands
-/// pay for one load.
+/// The system's allocator, which erases each block of at most 64 KiB before it is freed, and when it grows
+/// into another one. It erases nothing before [`erase_from_now_on`] is called; until then it costs one load.
 #[derive(Debug, Clone, Copy)]
 pub struct ErasingHeap;
 
 /// Erases what is freed from here on, if [`ErasingHeap`] is this program's allocator.
-pub(crate) fn erase_from_now_on() {
+pub fn erase_from_now_on() {
     // Relaxed: a thread that does not see it yet has no keys yet. Those that have are started, or
     // sent what they have, after this.
     ERASES.store(true, Ordering::Relaxed);
+}
+
+/// Gives what the allocator keeps of freed memory back to the system, where the allocator can. Takes
+/// milliseconds, and other threads may wait meanwhile for memory.
+pub fn return_free_memory() {
+    #[cfg(target_env = "gnu")]
+    // SAFETY: it takes no pointer, and may be called from any thread at any time.
+    let _ = unsafe { libc::malloc_trim(0) };
 }
 
 /// Whether a block of this layout is erased.

@@ -1,0 +1,40 @@
+//! Pages for secrets: not swapped out, not part of a core file, and empty in a forked child.
+
+// Mapped memory has no safe interface.
+#![allow(unsafe_code)]
+
+use std::{io, ptr, slice};
+
+use rustix::mm::{Advice, MapFlags, ProtFlags, madvise, mlock, mmap_anonymous};
+
+/// Pages that stay mapped until the process ends, and what the system did for them.
+pub struct LockedPages {
+    /// Zeros at first, and in a forked child zeros again.
+    pub bytes: &'static mut [u8],
+    /// Why they may be written to swap space.
+    pub locked: rustix::io::Result<()>,
+    /// Why they may be in core files or in forked processes.
+    pub advised: rustix::io::Result<()>,
+}
+
+impl LockedPages {
+    /// Maps `len` bytes, a multiple of the page size.
+    ///
+    /// # Errors
+    /// The system gives no memory.
+    pub fn map(len: usize) -> io::Result<Self> {
+        let (access, private) = (ProtFlags::READ | ProtFlags::WRITE, MapFlags::PRIVATE);
+        // SAFETY: a new mapping, wherever the system puts it, that replaces none.
+        let pages = unsafe { mmap_anonymous(ptr::null_mut(), len, access, private) }?;
+        // SAFETY: the mapping just made, of that length.
+        let locked = unsafe { mlock(pages, len) };
+        // SAFETY: as above. What is left out of core files is not changed.
+        let kept_out = unsafe { madvise(pages, len, Advice::LinuxDontDump) };
+        // SAFETY: as above. A forked child finds zeros, which are as valid as any other bytes.
+        let wiped = unsafe { madvise(pages, len, Advice::LinuxWipeOnFork) };
+        // SAFETY: the mapping just made, of that length, which is never unmapped and which nobody else
+        // knows.
+        let bytes = unsafe { slice::from_raw_parts_mut(pages.cast(), len) };
+        Ok(Self { bytes, locked, advised: kept_out.and(wiped) })
+    }
+}
