@@ -7,7 +7,7 @@ mod support;
 
 use std::{fs, path::PathBuf};
 
-use axon_tls::Cipher;
+use axon_transport::config::QuicCipher;
 use axon_transport::{
     config::{Config, ConfigBuilder, DaemonPolicy},
     session::{Session, SessionError, SessionOptions},
@@ -65,7 +65,7 @@ fn child() {
                 .runtime_dir(get("TEST_RUN"))
                 .daemon_path(get("TEST_DAEMON"))
                 .bind_addrs(["127.0.0.1".parse().unwrap()])
-                .quic_cipher(Cipher::Aes256Gcm)
+                .quic_cipher(QuicCipher::Aes256Gcm)
                 .max_message_mb(7)
                 .log("debug")
                 .link_grace(std::time::Duration::ZERO)

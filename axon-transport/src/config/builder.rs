@@ -2,11 +2,10 @@
 
 use std::{fmt::Display, net::IpAddr, path::Path, time::Duration};
 
-use axon_tls::{Cipher, PskKex};
-
 use super::{
-    ClassicAuth, Config, ConfigError, DaemonPolicy, DiscoveryRange, KeyMode, OsFiles, QkdPeers,
-    SecurityMode, daemon_env::DaemonEnv, names, resolve::resolve, sources::Given, values::method,
+    ClassicAuth, Config, ConfigError, DaemonPolicy, DiscoveryRange, KeyMode, OsFiles, QkdKex,
+    QkdPeers, QuicCipher, SecurityMode, daemon_env::DaemonEnv, names, resolve::resolve,
+    sources::Given, values::method,
 };
 
 /// Makes a [`Config`] in code. Each method gives the setting of `docs/configuration.md` that has its name:
@@ -145,7 +144,7 @@ impl ConfigBuilder {
     }
 
     /// The one cipher offered. Default ChaCha20-Poly1305.
-    pub fn quic_cipher(self, cipher: Cipher) -> Self {
+    pub fn quic_cipher(self, cipher: QuicCipher) -> Self {
         self.set("AXON_QUIC_CIPHER", cipher.name())
     }
 
@@ -187,7 +186,7 @@ impl ConfigBuilder {
     }
 
     /// The key exchange beside the KME key. Default `psk_ke`, none.
-    pub fn qkd_kex(self, kex: PskKex) -> Self {
+    pub fn qkd_kex(self, kex: QkdKex) -> Self {
         self.set("AXON_QKD_KEX", kex.name())
     }
 
@@ -222,7 +221,7 @@ impl ConfigBuilder {
     }
 
     /// Deviations of the KME to tolerate, by the names of
-    /// [`Quirks::NAMES`](etsi_qkd014::Quirks::NAMES). Default none.
+    /// [`QkdConfig::KME_QUIRKS`]. Default none.
     pub fn kme_quirks(self, names: impl IntoIterator<Item = impl Into<String>>) -> Self {
         self.list("AXON_KME_QUIRKS", names.into_iter().map(Into::into))
     }

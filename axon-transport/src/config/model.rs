@@ -2,7 +2,6 @@
 
 use std::{net::IpAddr, path::PathBuf, time::Duration};
 
-use axon_tls::{Cipher, PskKex};
 use minicbor::{Decode, Encode};
 
 use super::daemon_env::DaemonEnv;
@@ -16,7 +15,7 @@ pub struct Config {
     /// How peers prove themselves and agree on keys.
     pub security: Security,
     /// The one cipher offered (`AXON_QUIC_CIPHER`).
-    pub cipher: Cipher,
+    pub cipher: QuicCipher,
     /// `ROS_DOMAIN_ID`.
     pub domain: u32,
     /// How far a session is discovered (`ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_LOCALHOST_ONLY`). Of a
@@ -122,7 +121,7 @@ pub struct QkdConfig {
     /// `AXON_QKD_KEY_MODE`.
     pub key_mode: KeyMode,
     /// `AXON_QKD_KEX`.
-    pub kex: PskKex,
+    pub kex: QkdKex,
     /// `AXON_QKD_PEERS`.
     pub peers: QkdPeers,
     /// `AXON_QKD_SESSION_MAX_AGE`.
@@ -153,9 +152,64 @@ impl QkdConfig {
     /// from other holders of a certificate from [`kme_ca`](Self::kme_ca). Not valid without that ID.
     pub const NO_NAME_CHECK: &'static str = "no-name-check";
 
+    /// The quirks that [`kme_quirks`](Self::kme_quirks) may name: those of `etsi-qkd014`, and
+    /// [`NO_NAME_CHECK`](Self::NO_NAME_CHECK).
+    pub const KME_QUIRKS: [&'static str; 10] = [
+        "any-key-id",
+        "null-members",
+        "missing-status-numbers",
+        "size-in-bytes",
+        "any-case-members",
+        "any-media-type",
+        "extra-members",
+        "http-1.0",
+        "any-extension",
+        Self::NO_NAME_CHECK,
+    ];
+
     /// Whether the KME's certificate must name the host in the KME's URL.
     pub fn checks_name(&self) -> bool {
         !self.kme_quirks.iter().any(|quirk| quirk == Self::NO_NAME_CHECK)
+    }
+}
+
+/// The cipher suite of every connection (`AXON_QUIC_CIPHER`): TLS 1.3 with a 256-bit key.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum QuicCipher {
+    /// TLS_CHACHA20_POLY1305_SHA256
+    #[default]
+    ChaCha20Poly1305,
+    /// TLS_AES_256_GCM_SHA384
+    Aes256Gcm,
+}
+
+impl QuicCipher {
+    /// As `AXON_QUIC_CIPHER` spells it.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::ChaCha20Poly1305 => "chacha20-poly1305",
+            Self::Aes256Gcm => "aes-256-gcm",
+        }
+    }
+}
+
+/// How a KME key is used as a pre-shared key (`AXON_QKD_KEX`; RFC 8446 section 4.2.9).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum QkdKex {
+    /// The key alone. No forward secrecy: who learns the key later reads a recorded connection.
+    #[default]
+    PskKe,
+    /// The key together with X25519MLKEM768.
+    PskDheKe,
+}
+
+impl QkdKex {
+    /// As `AXON_QKD_KEX` spells it.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::PskKe => "psk_ke",
+            Self::PskDheKe => "psk_dhe_ke",
+        }
     }
 }
 

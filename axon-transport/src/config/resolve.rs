@@ -6,11 +6,9 @@ use std::{
     time::Duration,
 };
 
-use axon_tls::{Cipher, PskKex};
-
 use super::{
     ClassicAuth, ClassicConfig, Config, ConfigError, DaemonPolicy, DiscoveryRange, KeyMode,
-    LinkConfig, QkdConfig, QkdPeers, Security, SecurityMode,
+    LinkConfig, QkdConfig, QkdKex, QkdPeers, QuicCipher, Security, SecurityMode,
     daemon_env::DaemonEnv,
     files::Files,
     names,
@@ -58,7 +56,7 @@ pub(super) fn resolve(
             Security::Qkd(qkd(&values)?)
         }
     };
-    let ciphers = [Cipher::ChaCha20Poly1305, Cipher::Aes256Gcm].map(|c| (c.name(), c));
+    let ciphers = [QuicCipher::ChaCha20Poly1305, QuicCipher::Aes256Gcm].map(|c| (c.name(), c));
     let policies = [DaemonPolicy::Spawn, DaemonPolicy::Require, DaemonPolicy::Off];
     let policies = policies.map(|policy| (policy.name(), policy));
     let domain = domain(&sources)?;
@@ -179,7 +177,7 @@ fn classic(values: &Values<'_, impl Files>) -> Result<ClassicConfig, ConfigError
 
 fn qkd(values: &Values<'_, impl Files>) -> Result<QkdConfig, ConfigError> {
     let key_modes = [("messages10", KeyMode::Messages10), ("session", KeyMode::Session)];
-    let kexes = [PskKex::PskKe, PskKex::PskDheKe].map(|kex| (kex.name(), kex));
+    let kexes = [QkdKex::PskKe, QkdKex::PskDheKe].map(|kex| (kex.name(), kex));
     let file = |name: &str, usage: Use| {
         let path = values.file(name, usage)?;
         required(path, name, "the path of a file; AXON_SECURITY_MODE=qkd needs it")

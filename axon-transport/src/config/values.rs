@@ -143,9 +143,7 @@ impl<F: Files> Values<'_, F> {
     }
 
     pub(super) fn quirks(&self, name: &str) -> Result<Vec<String>, ConfigError> {
-        let mut known: Vec<&str> =
-            etsi_qkd014::Quirks::NAMES.iter().map(|(name, _)| *name).collect();
-        known.push(QkdConfig::NO_NAME_CHECK);
+        let known = QkdConfig::KME_QUIRKS;
         let mut quirks = self.list(name, &known.join(", "), LONGEST_LIST, |entry| {
             known.contains(&entry).then(|| entry.to_owned())
         })?;

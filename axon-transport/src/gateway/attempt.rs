@@ -23,6 +23,7 @@ use super::{
     peer::binding,
     protection::{Protection, sample},
     queue::Sample,
+    tls_settings::tls_cipher,
 };
 use crate::{
     config::{Config, Security},
@@ -144,7 +145,8 @@ async fn forged(
         }
     };
     let id = String::from_utf8_lossy(key_id.as_bytes()).into_owned();
-    let psk = derive_psk(key.expose_secret(), &id, &qkd.sae_id, peer, context.config.cipher);
+    let psk =
+        derive_psk(key.expose_secret(), &id, &qkd.sae_id, peer, tls_cipher(context.config.cipher));
     let attempt = keys::Attempt { key_id, psk: Arc::new(psk.map_err(|e| internal(&e))?) };
     let client = context.qkd_client(&attempt).map_err(|e| internal(&e))?;
     let mut tries = 0;

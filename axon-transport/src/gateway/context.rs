@@ -19,7 +19,13 @@ use axon_tls::{
 
 use rustls_pki_types::CertificateDer;
 
-use super::{GatewayError, endpoint::transport, identity::Identity, keyring::Keyring};
+use super::{
+    GatewayError,
+    endpoint::transport,
+    identity::Identity,
+    keyring::Keyring,
+    tls_settings::{psk_kex, tls_cipher},
+};
 use crate::{
     config::{ClassicAuth, ClassicConfig, Config, Security},
     ids::DaemonId,
@@ -158,7 +164,7 @@ impl Context {
     /// The client's side of a classic handshake.
     pub(super) fn classic_client(&self) -> Result<quinn::ClientConfig, GatewayError> {
         let auth = self.auth().ok_or(GatewayError::WrongMode)?;
-        let mut client = hybrid_client(&auth, self.config.cipher, ALPN)?;
+        let mut client = hybrid_client(&auth, tls_cipher(self.config.cipher), ALPN)?;
         client.transport_config(Arc::clone(&self.transport));
         Ok(client)
     }
@@ -171,7 +177,7 @@ impl Context {
         let Security::Qkd(qkd) = &self.config.security else {
             return Err(GatewayError::WrongMode);
         };
-        let mut client = qkd_client(Arc::clone(&attempt.psk), qkd.kex, ALPN)?;
+        let mut client = qkd_client(Arc::clone(&attempt.psk), psk_kex(qkd.kex), ALPN)?;
         client.transport_config(Arc::clone(&self.transport));
         Ok(client)
     }
@@ -181,11 +187,11 @@ impl Context {
         &self,
         source: SocketAddr,
     ) -> Result<(quinn::ServerConfig, Option<Arc<Resolver>>), GatewayError> {
-        let cipher = self.config.cipher;
+        let cipher = tls_cipher(self.config.cipher);
         let (mut server, resolver) = match (&self.config.security, &self.keyring, self.auth()) {
             (Security::Qkd(qkd), Some(keyring), _) => {
                 let resolver = keyring.acceptor.resolver(source.ip());
-                let server = qkd_server(resolver.clone(), cipher, qkd.kex, ALPN)?;
+                let server = qkd_server(resolver.clone(), cipher, psk_kex(qkd.kex), ALPN)?;
                 (server, Some(resolver))
             }
             (Security::Classic(_), _, Some(auth)) => (hybrid_server(&auth, cipher, ALPN)?, None),

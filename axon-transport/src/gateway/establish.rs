@@ -5,7 +5,7 @@ use std::{net::SocketAddr, sync::Arc, time::Duration};
 
 use axon_envelope::{KeyId, KmeKey};
 use axon_tls::{
-    KeyExchange, Negotiated, PskKex,
+    KeyExchange, Negotiated,
     identity::{Auth, CaMaterial},
     qkd::PskIdentity,
     quic::{ALPN, negotiated},
@@ -18,9 +18,10 @@ use super::{
     keyring::PeerKeys,
     prove::Proof,
     refusal::Refusal,
+    tls_settings::tls_cipher,
 };
 use crate::{
-    config::Security,
+    config::{QkdKex, Security},
     keys::{Completion, Exporters},
     link::{CloseCode, Hello, Message, Order, Side, check},
 };
@@ -230,11 +231,11 @@ fn agreed(context: &Context, connection: &Connection) -> Result<Negotiated, Fail
     let wanted = match &context.config.security {
         Security::Classic(_) => KeyExchange::X25519MlKem768,
         Security::Qkd(qkd) => match qkd.kex {
-            PskKex::PskKe => KeyExchange::PskKe,
-            PskKex::PskDheKe => KeyExchange::PskDheKe,
+            QkdKex::PskKe => KeyExchange::PskKe,
+            QkdKex::PskDheKe => KeyExchange::PskDheKe,
         },
     };
-    if negotiated.key_exchange != wanted || negotiated.cipher != context.config.cipher {
+    if negotiated.key_exchange != wanted || negotiated.cipher != tls_cipher(context.config.cipher) {
         return Err(internal("the handshake agreed on something else than the settings"));
     }
     if negotiated.alpn != ALPN {

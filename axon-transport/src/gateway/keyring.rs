@@ -14,7 +14,7 @@ use std::{
 use axon_envelope::{KeyId, KmeKey};
 use tokio::sync::{Notify, mpsc};
 
-use super::control::Outbox;
+use super::{control::Outbox, tls_settings::tls_cipher};
 use crate::{
     config::{Config, KeyMode, QkdConfig, Security},
     keys::{
@@ -68,11 +68,16 @@ impl Keyring {
         let used = used();
         let (kme, events) = Kme::start(qkd, used.clone())?;
         let keyring = Arc::new(Self {
-            acceptor: Acceptor::new(&qkd.sae_id, qkd.peers.clone(), config.cipher, clock.clone()),
+            acceptor: Acceptor::new(
+                &qkd.sae_id,
+                qkd.peers.clone(),
+                tls_cipher(config.cipher),
+                clock.clone(),
+            ),
             dialler: Mutex::new(Dialler::new(
                 &qkd.sae_id,
                 qkd.peers.clone(),
-                config.cipher,
+                tls_cipher(config.cipher),
                 qkd.kme_answer_timeout,
             )),
             dialler_answered: Notify::new(),

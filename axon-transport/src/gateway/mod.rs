@@ -46,6 +46,7 @@ mod socket;
 mod stalls;
 mod stand_in;
 mod status;
+mod tls_settings;
 pub(crate) mod watch;
 
 pub use check::check;

@@ -1,8 +1,6 @@
 //! The security settings that two daemons must share before they may link.
 
-use axon_tls::{Cipher, PskKex};
-
-use crate::config::{ClassicAuth, Config, KeyMode, Security};
+use crate::config::{ClassicAuth, Config, KeyMode, QkdKex, QuicCipher, Security};
 
 /// The security settings that beacon and HELLO state, by the codes of their keys 4 to 7 and 12.
 ///
@@ -46,8 +44,8 @@ impl Terms {
     /// What a daemon with this configuration states.
     pub fn of(config: &Config) -> Self {
         let cipher = match config.cipher {
-            Cipher::ChaCha20Poly1305 => 0,
-            Cipher::Aes256Gcm => 1,
+            QuicCipher::ChaCha20Poly1305 => 0,
+            QuicCipher::Aes256Gcm => 1,
         };
         match &config.security {
             Security::Classic(classic) => {
@@ -64,8 +62,8 @@ impl Terms {
                     KeyMode::Messages10 => 2,
                 };
                 let kex = match qkd.kex {
-                    PskKex::PskKe => 1,
-                    PskKex::PskDheKe => 2,
+                    QkdKex::PskKe => 1,
+                    QkdKex::PskDheKe => 2,
                 };
                 Self { mode: Self::QKD, key_mode, kex, cipher, auth: None }
             }

@@ -254,7 +254,7 @@ fn other_security_settings_are_refused_by_name() {
     let host = Host::new().with("AXON_QUIC_CIPHER", "aes-256-gcm");
     let _daemon = host.daemon();
     let mut config = host.config();
-    config.cipher = axon_tls::Cipher::ChaCha20Poly1305;
+    config.cipher = axon_transport::config::QuicCipher::ChaCha20Poly1305;
     config.daemon = DaemonPolicy::Require;
     let refused = Session::open(&config, SessionOptions::new("other")).unwrap_err();
     let SessionError::Mismatch { variable, ours, theirs, .. } = &refused else {

@@ -9,7 +9,6 @@ use std::{
     time::Duration,
 };
 
-use axon_tls::{Cipher, PskKex};
 use proptest::prelude::*;
 
 use super::*;
@@ -120,7 +119,7 @@ fn classic(config: &Config) -> &ClassicConfig {
 fn nothing_given_is_the_table_of_defaults() {
     let config = resolve(&[], &[]).unwrap();
     assert_eq!(classic(&config).auth, ClassicAuth::None);
-    assert_eq!(config.cipher, Cipher::ChaCha20Poly1305);
+    assert_eq!(config.cipher, QuicCipher::ChaCha20Poly1305);
     assert_eq!((config.domain, config.range), (0, DiscoveryRange::Subnet));
     assert_eq!(config.daemon, DaemonPolicy::Spawn);
     assert_eq!((config.runtime_dir.clone(), config.socket_in_runtime_dir), (None, false));
@@ -142,7 +141,7 @@ fn nothing_given_is_the_table_of_defaults() {
 
     let config = resolve(QKD, &[]).unwrap();
     let qkd = qkd(&config);
-    assert_eq!((qkd.key_mode, qkd.kex), (KeyMode::Messages10, PskKex::PskKe));
+    assert_eq!((qkd.key_mode, qkd.kex), (KeyMode::Messages10, QkdKex::PskKe));
     assert_eq!(qkd.session_max_age, Duration::from_secs(3600));
     assert_eq!(qkd.peers, QkdPeers::Listed(vec!["sae-b".into(), "sae-c".into()]));
     assert!(qkd.kme_id.is_none() && qkd.kme_quirks.is_empty());
@@ -187,12 +186,12 @@ fn every_setting_takes_effect() {
     )
     .unwrap();
     let of_qkd = qkd(&config);
-    assert_eq!((of_qkd.key_mode, of_qkd.kex), (KeyMode::Session, PskKex::PskDheKe));
+    assert_eq!((of_qkd.key_mode, of_qkd.kex), (KeyMode::Session, QkdKex::PskDheKe));
     assert_eq!((&of_qkd.peers, of_qkd.session_max_age.as_secs()), (&QkdPeers::Any, 86_400));
     assert_eq!(of_qkd.kme_id.as_deref(), Some("KME A"));
     assert_eq!(of_qkd.kme_quirks, ["any-key-id", "null-members"]);
     assert_eq!((of_qkd.kme_connect_timeout.as_secs(), of_qkd.kme_answer_timeout.as_secs()), (4, 7));
-    assert_eq!(config.cipher, Cipher::Aes256Gcm);
+    assert_eq!(config.cipher, QuicCipher::Aes256Gcm);
     assert_eq!(config.daemon, DaemonPolicy::Require);
     assert_eq!(config.daemon_path, Some("/f/daemon".into()));
     assert_eq!(config.runtime_dir, Some("/f/created/later".into()));

@@ -3,13 +3,12 @@
 use std::{path::Path, time::Duration};
 
 use axon_envelope::KeyId;
-use axon_tls::PskKex;
 use etsi_qkd014::sim::{Fault, Network};
 use secrecy::ExposeSecret;
 
 use super::{Kme, KmeError, Origin};
 use crate::{
-    config::{KeyMode, QkdConfig, QkdPeers},
+    config::{KeyMode, QkdConfig, QkdKex, QkdPeers},
     keys::{
         UsedKeys,
         request::{FailureKind, Fetched, Purpose, Request},
@@ -30,7 +29,7 @@ fn config(network: &Network, sae: &str, dir: &Path) -> QkdConfig {
         network.sae(sae).unwrap().env(dir).into_iter().collect();
     QkdConfig {
         key_mode: KeyMode::Messages10,
-        kex: PskKex::PskKe,
+        kex: QkdKex::PskKe,
         peers: QkdPeers::Any,
         session_max_age: Duration::from_secs(3600),
         kme_url: env["AXON_KME_URL"].clone(),
@@ -275,4 +274,12 @@ async fn files_that_are_no_such_files_are_refused_at_once() {
         };
         assert!(reason.contains(expected), "{reason}");
     }
+}
+
+#[test]
+fn every_quirk_of_the_client_can_be_set_and_no_other() {
+    let of_client = etsi_qkd014::Quirks::NAMES.map(|(name, _)| name);
+    let of_daemon = [QkdConfig::NO_NAME_CHECK];
+    let names: Vec<_> = of_client.into_iter().chain(of_daemon).collect();
+    assert_eq!(names, QkdConfig::KME_QUIRKS);
 }
