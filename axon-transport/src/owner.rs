@@ -9,15 +9,12 @@ use std::{
     sync::{Arc, Mutex, PoisonError},
 };
 
-use aws_lc_rs::{
-    digest::{SHA256, digest},
-    signature::{ED25519, Ed25519KeyPair, KeyPair, UnparsedPublicKey},
-};
-use axon_tls::erasing;
+use ed25519_dalek::{Signature, Signer, SigningKey, VerifyingKey};
 use minicbor::{Decode, Encode};
 use rand::{TryRng, rngs::SysRng};
 use secrecy::ExposeSecret;
-use zeroize::Zeroizing;
+use sha2::{Digest, Sha256};
+use zeroize::{Zeroizing, zeroize_stack};
 
 use crate::{
     ids::{DaemonId, Gid, SessionId},
@@ -32,8 +29,9 @@ const SIGNED: &[u8] = b"axon session owner 1";
 /// The label of the TLS exporter of [`Binding`].
 pub const EXPORTER: &[u8] = b"EXPORTER-axon-session-owner";
 
-/// Bytes of stack, more than Ed25519 takes: its scalar and nonce are left there.
-const STACK: usize = 16 << 10;
+/// Bytes of stack, more than Ed25519 takes: its scalar and nonce are left there. Without optimization, code in
+/// Rust takes several times as much.
+const STACK: usize = if cfg!(debug_assertions) { 128 << 10 } else { 32 << 10 };
 
 /// 32 bytes that both ends of one connection know and no other connection has.
 pub type Binding = [u8; 32];
@@ -62,7 +60,8 @@ impl SessionKey {
 
     fn new(seed: &[u8; 32]) -> Option<Self> {
         let seed = LockedKey::copy_of(seed).ok()?;
-        let public = erasing::<STACK, _>(|| pair(&seed)?.public_key().as_ref().try_into().ok())?;
+        let public = public_of(&seed);
+        zeroize_stack::<STACK>();
         Some(Self { seed, public })
     }
 
@@ -91,23 +90,29 @@ impl SessionKey {
         if self.seed.is_forked() {
             return None;
         }
-        let message = signed(binding, from, &self.id());
-        let signature =
-            erasing::<STACK, _>(|| pair(&self.seed)?.sign(&message).as_ref().try_into().ok())?;
+        let signature = sign(&self.seed, &signed(binding, from, &self.id()));
+        zeroize_stack::<STACK>();
         Some(Proof { key: self.public, signature })
     }
 }
 
-/// Made for each use, since the library has its copy in memory that is not locked. It erases that
-/// copy when it frees it.
-fn pair(seed: &LockedKey) -> Option<Ed25519KeyPair> {
-    Ed25519KeyPair::from_seed_unchecked(seed.expose_secret()).ok()
+/// Never inlined, so that all it leaves is on the stack below the caller, who erases that.
+#[inline(never)]
+fn public_of(seed: &LockedKey) -> [u8; 32] {
+    SigningKey::from_bytes(seed.expose_secret()).verifying_key().to_bytes()
 }
 
-fn id_of(public: &[u8]) -> SessionId {
-    let hash = digest(&SHA256, &[&b"axon session id 1"[..], public].concat());
+/// As [`public_of`]. The library's key is made for each signature, since it is in memory that is not
+/// locked.
+#[inline(never)]
+fn sign(seed: &LockedKey, message: &[u8]) -> [u8; 64] {
+    SigningKey::from_bytes(seed.expose_secret()).sign(message).to_bytes()
+}
+
+fn id_of(public: &[u8; 32]) -> SessionId {
+    let hash = Sha256::new().chain_update(b"axon session id 1").chain_update(public).finalize();
     let mut id = [0; 16];
-    id.copy_from_slice(&hash.as_ref()[..16]);
+    id.copy_from_slice(&hash[..16]);
     SessionId(id)
 }
 
@@ -149,8 +154,9 @@ impl Proof {
     /// when the signature is not right.
     pub fn session(&self, binding: &Binding, from: DaemonId) -> Option<SessionId> {
         let id = self.claims();
-        let key = UnparsedPublicKey::new(&ED25519, &self.key);
-        key.verify(&signed(binding, from, &id), &self.signature).ok().map(|()| id)
+        let key = VerifyingKey::from_bytes(&self.key).ok()?;
+        let signature = Signature::from_bytes(&self.signature);
+        key.verify_strict(&signed(binding, from, &id), &signature).ok().map(|()| id)
     }
 }
 
@@ -213,7 +219,6 @@ mod tests {
     /// The secrets of a signature (RFC 8032, 5.1.6): the seed, its hash, the scalar, and the nonce
     /// for `message`.
     fn secrets(seed: &[u8; 32], message: &[u8]) -> Vec<Vec<u8>> {
-        use sha2::Digest;
         let hash = Sha512::digest(seed);
         let mut scalar = hash[..32].to_vec();
         scalar[0] &= 248;
