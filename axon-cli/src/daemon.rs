@@ -2,7 +2,7 @@
 
 use std::{io::Read, process::ExitCode, thread};
 
-use axon_transport::daemon::{self, Start};
+use axon_daemon::Start;
 use rustix::process::{Signal, getpid, kill_process};
 
 use crate::{cli, failure::Failure, logging};
@@ -18,7 +18,7 @@ pub(crate) fn run(args: &cli::Daemon) -> Result<ExitCode, Failure> {
     if args.while_stdin {
         thread::spawn(end_with_stdin);
     }
-    Ok(daemon::main(start))
+    Ok(axon_daemon::main(start))
 }
 
 /// Ends this process as SIGTERM would, when standard input ends.

@@ -7,10 +7,10 @@ use std::{
 };
 
 use axon_transport::{
+    EndpointSpec, GuardCondition, MessageInfo, Session, Subscription,
     graph::{EndpointKind, GraphView},
     ids::Gid,
     qos::{Qos, Reliability},
-    session::{EndpointSpec, GuardCondition, MessageInfo, Session, Subscription},
 };
 use serde_json::json;
 

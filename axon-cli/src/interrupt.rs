@@ -3,7 +3,7 @@
 
 use std::{io, process, thread};
 
-use axon_transport::session::{GuardCondition, Session};
+use axon_transport::{GuardCondition, Session};
 use tokio::{
     runtime,
     signal::unix::{SignalKind, signal},

@@ -1,6 +1,7 @@
 //! Where log lines go: standard error, filtered by `AXON_LOG`.
 
-use axon_transport::{config::Config, daemon::log};
+use axon_daemon::log;
+use axon_transport::config::Config;
 use tracing_subscriber::EnvFilter;
 
 use crate::failure::Failure;

@@ -23,7 +23,7 @@ mod trust;
 
 use std::process::ExitCode;
 
-use axon_transport::daemon::ErasingHeap;
+use axon_daemon::ErasingHeap;
 use clap::Parser;
 
 use crate::cli::{Bench, Cli, Command};

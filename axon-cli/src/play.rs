@@ -7,11 +7,8 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_transport::{
-    qos::Qos,
-    session::{EndpointSpec, Publisher, Session},
-    shm::PublishError,
-};
+use axon_shm::PublishError;
+use axon_transport::{EndpointSpec, Publisher, Session, qos::Qos};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::{

@@ -1,9 +1,6 @@
 //! Sessions of this tool: they start the daemon, where one must be started, from this very binary.
 
-use axon_transport::{
-    config::Config,
-    session::{DaemonCommand, Session, SessionError, SessionOptions},
-};
+use axon_transport::{DaemonCommand, Session, SessionError, SessionOptions, config::Config};
 
 use crate::failure::Failure;
 

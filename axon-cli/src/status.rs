@@ -4,7 +4,6 @@ use std::{collections::BTreeMap, fmt::Write as _, io::Write as _, process::ExitC
 
 use axon_transport::{
     config::DaemonPlace,
-    gateway, session,
     status::{LinkStatus, RelayStatus, SessionStatus, Status, TopicStatus},
 };
 use serde_json::Value;
@@ -28,12 +27,12 @@ pub(crate) fn run(args: &cli::Status) -> Result<ExitCode, Failure> {
             if let Some(line) = config.unknown_variables() {
                 say(format_args!("axon: {line}"));
             }
-            gateway::check(&config).map_err(Failure::failed).err()
+            axon_daemon::check(&config).map_err(Failure::failed).err()
         }
         Err(failure) => Some(failure),
     };
     let status = wrong.as_ref().map(Failure::report);
-    let json = match DaemonPlace::from_env().map(|place| session::daemon_status_at(&place)) {
+    let json = match DaemonPlace::from_env().map(|place| axon_transport::daemon_status_at(&place)) {
         Ok(Ok(json)) => json,
         Ok(Err(error)) => {
             let failure = crate::session::failure(error);

@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use axon_transport::text::is_plain;
+use axon_transport::internal::text::is_plain;
 
 /// A table of text: a header, rows, columns as wide as their widest cell.
 pub(crate) struct Table {

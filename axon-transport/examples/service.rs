@@ -10,9 +10,9 @@
 use std::{error::Error, thread, time::Duration};
 
 use axon_transport::{
+    EndpointSpec, Server, Session, SessionOptions,
     config::{Config, DaemonPolicy},
     qos::Qos,
-    session::{EndpointSpec, Server, Session, SessionOptions},
 };
 
 const PATIENCE: Duration = Duration::from_secs(10);

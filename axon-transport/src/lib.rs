@@ -2,24 +2,73 @@
 #![deny(unsafe_code)]
 
 pub mod config;
-pub mod daemon;
-pub mod discovery;
 pub mod events;
 pub mod ffi;
 mod files;
-pub mod gateway;
 pub mod graph;
-pub mod keys;
-pub mod link;
 mod log_limit;
-pub mod owner;
-pub mod registry;
+mod registry;
 mod secrets;
-pub mod session;
+mod session;
+mod session_key;
 pub mod status;
-pub mod text;
-pub mod wire;
+mod text;
+mod wire;
 
 pub use axon_shm as shm;
 #[doc(inline)]
 pub use axon_shm::{ids, qos};
+pub use session::{
+    Client, DaemonCommand, EndpointSpec, Event, GuardCondition, Lifetime, Loan, MessageInfo, Node,
+    OnNew, Publisher, Ready, Server, Session, SessionError, SessionEvent, SessionOptions,
+    SessionRole, Subscription, Waitable, daemon_status, daemon_status_at,
+};
+
+/// What the other crates of AXON and its tests use of this one. It is not part of its interface, and changes
+/// with any release.
+#[doc(hidden)]
+pub mod internal {
+    pub use crate::session_key::{OWNER, SessionKey, session_id};
+
+    /// Leases of publishers.
+    pub mod events {
+        pub use crate::events::alive::Alive;
+    }
+    /// Who may match whom.
+    pub mod graph {
+        pub use crate::graph::{
+            endpoint::{LIMITS, Limits},
+            pairing::{Pairing, pairing, reads, writes},
+            range::{OutOfRange, Reach, RemoteEndpoint, Scope, Toward, out_of_range},
+            view::reach_of,
+        };
+    }
+    /// Files that settings name.
+    pub mod files {
+        pub use crate::files::*;
+    }
+    /// Log lines at a bounded rate.
+    pub mod log_limit {
+        pub use crate::log_limit::*;
+    }
+    /// Sessions and endpoints, and which of them match.
+    pub mod registry {
+        pub use crate::registry::*;
+    }
+    /// Keys in locked memory.
+    pub mod secrets {
+        pub use crate::secrets::*;
+    }
+    /// The parts of a session.
+    pub mod session {
+        pub use crate::session::*;
+    }
+    /// Text from outside.
+    pub mod text {
+        pub use crate::text::*;
+    }
+    /// The messages between sessions and their daemon.
+    pub mod wire {
+        pub use crate::wire::*;
+    }
+}

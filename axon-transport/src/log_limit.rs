@@ -9,7 +9,7 @@ const BETWEEN: Duration = Duration::from_secs(1);
 
 /// Counts what would be said of each.
 #[derive(Debug, Default)]
-pub(crate) struct LogLimit(Mutex<Said>);
+pub struct LogLimit(Mutex<Said>);
 
 #[derive(Debug, Default)]
 struct Said {
@@ -20,7 +20,7 @@ struct Said {
 impl LogLimit {
     /// One more at `now`. How many there were since it was said last, this one among them, if it is to
     /// be said.
-    pub(crate) fn count(&self, now: Instant) -> Option<u64> {
+    pub fn count(&self, now: Instant) -> Option<u64> {
         let mut said = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         said.since += 1;
         let due = said.last.is_none_or(|last| now.saturating_duration_since(last) >= BETWEEN);

@@ -8,7 +8,7 @@ pub fn is_plain(c: char) -> bool {
 }
 
 /// The first `longest` characters of `text`, each that is not plain replaced by a space.
-pub(crate) fn plain(text: &str, longest: usize) -> String {
+pub fn plain(text: &str, longest: usize) -> String {
     text.chars().take(longest).map(|c| if is_plain(c) { c } else { ' ' }).collect()
 }
 

@@ -1,9 +1,9 @@
 //! The C interface: that the header is the code's, and a C program that uses every function, wrongly
 //! too, built by plain `cc` and run as it is, under valgrind, and under AddressSanitizer.
 
-#[path = "support/kept.rs"]
-mod kept;
-#[path = "support/skip.rs"]
+#[path = "support/c_program.rs"]
+mod c_program;
+#[path = "../daemon/tests/support/skip.rs"]
 mod skip;
 
 use std::{
@@ -16,52 +16,8 @@ use std::{
     time::{Duration, SystemTime},
 };
 
-use kept::Kept;
+use c_program::{SYSTEM, WARNINGS, library, path, run};
 use skip::skip;
-
-const HERE: &str = env!("CARGO_MANIFEST_DIR");
-/// What a static library of Rust needs of the system.
-const SYSTEM: &[&str] = &["-lgcc_s", "-lutil", "-lrt", "-lpthread", "-lm", "-ldl", "-lc"];
-const WARNINGS: &[&str] = &["-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O1", "-g"];
-
-fn path(within: &str) -> PathBuf {
-    Path::new(HERE).join(within)
-}
-
-/// A library of the C interface. `cargo test` builds it with the examples; where only this test is
-/// asked for, it is built here.
-fn library(name: &str) -> PathBuf {
-    static BUILT: Once = Once::new();
-    let program = std::env::current_exe().unwrap();
-    let profile = program.parent().and_then(Path::parent).unwrap();
-    let library = profile.join("examples").join(name);
-    BUILT.call_once(|| {
-        let changed = |path: &Path| fs::metadata(path).and_then(|facts| facts.modified()).ok();
-        // The test program was linked after the crate, and the library is as old as it or younger.
-        let source = newest(&path("src"));
-        if changed(&library).is_some_and(|built| built >= source) {
-            return;
-        }
-        let mut cargo = Command::new(env!("CARGO"));
-        cargo.args(["build", "--offline", "-p", "axon-transport", "--example", "axon_c"]);
-        cargo.arg("--target-dir").arg(profile.parent().unwrap());
-        if profile.file_name() == Some(OsStr::new("release")) {
-            cargo.arg("--release");
-        }
-        run(&mut cargo);
-    });
-    library
-}
-
-/// When the newest file in a directory was changed.
-fn newest(directory: &Path) -> SystemTime {
-    let entries = fs::read_dir(directory).unwrap().map(|entry| entry.unwrap().path());
-    let times = entries.map(|path| match path.is_dir() {
-        true => newest(&path),
-        false => fs::metadata(&path).unwrap().modified().unwrap(),
-    });
-    times.max().unwrap_or(SystemTime::UNIX_EPOCH)
-}
 
 fn files(directory: &str, extension: &str) -> Vec<PathBuf> {
     let entries = fs::read_dir(path(directory)).unwrap();
@@ -70,14 +26,6 @@ fn files(directory: &str, extension: &str) -> Vec<PathBuf> {
     files.sort();
     assert!(!files.is_empty());
     files
-}
-
-fn run(command: &mut Command) -> String {
-    let output = command.output().unwrap_or_else(|error| panic!("{command:?}: {error}"));
-    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    let (out, err) = (text(&output.stdout), text(&output.stderr));
-    assert!(output.status.success(), "{command:?}: {}\n{out}\n{err}", output.status);
-    out
 }
 
 /// Whether a program runs; what needs it is skipped where it does not.
@@ -188,49 +136,6 @@ fn the_test_program_uses_every_function() {
         .filter(|name| !sources.iter().any(|source| source.contains(&format!("{name}("))))
         .collect();
     assert!(exported().len() > 30 && unused.is_empty(), "not used: {unused:?}");
-}
-
-/// The programs of the README, as processes of one host.
-#[test]
-fn the_examples_are_built_by_plain_cc_and_meet() {
-    let directory = tempfile::tempdir().unwrap();
-    let readme = fs::read_to_string(path("README.md")).unwrap();
-    let build = |name: &str| {
-        let source = path("examples/c").join(name).with_extension("c");
-        let text = fs::read_to_string(&source).unwrap();
-        assert!(
-            readme.contains(&format!("```c\n{text}```\n")),
-            "the README shows another {name}.c"
-        );
-        let program = directory.path().join(name);
-        let mut cc = Command::new("cc");
-        cc.args(WARNINGS).arg(source).arg("-I").arg(path("include"));
-        run(cc.arg(library("libaxon_c.a")).args(SYSTEM).arg("-o").arg(&program));
-        program
-    };
-    let there = |program: &Path| {
-        let mut command = alone(program);
-        command.env("AXON_DAEMON", "require").env("AXON_BIND_ADDRS", "127.0.0.1");
-        command.env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST");
-        command.env("AXON_RUNTIME_DIR", directory.path());
-        command
-    };
-    let (talker, listener, service) = (build("talker"), build("listener"), build("service"));
-    let daemon = Path::new(env!("CARGO_BIN_EXE_axon_daemon"));
-    let _daemon = Kept(there(daemon).env_remove("AXON_DAEMON").spawn().unwrap());
-    // Once it has the address.
-    while !directory.path().join("axon-0.sock").exists() {
-        std::thread::sleep(Duration::from_millis(10));
-    }
-    let _talker = Kept(there(&talker).spawn().unwrap());
-    let heard = run(&mut there(&listener));
-    let numbers: Vec<u32> = heard
-        .lines()
-        .map(|line| line.strip_prefix("heard hello ").unwrap().parse().unwrap())
-        .collect();
-    assert!(numbers.len() == 3 && numbers.windows(2).all(|pair| pair[0] < pair[1]), "{heard}");
-    let _service = Kept(there(&service).spawn().unwrap());
-    assert_eq!(run(there(&service).arg("a question")), "A QUESTION\n");
 }
 
 /// What `cargo xtask install-c` fills in and installs.

@@ -6,7 +6,9 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use axon_transport::{config::{Config, FileFacts, FileKind, Files, Security}, wire::Terms};
+use axon_daemon::internal::wire::Terms;
+use axon_transport::config::{Config, FileFacts, FileKind, Files, Security};
+
 
 /// A file system in which every file exists and is `axon.toml`.
 struct OneFile<'a>(&'a [u8]);

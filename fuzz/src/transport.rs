@@ -1,7 +1,9 @@
 //! Discovery datagrams, frames between daemons, packets between a session and its daemon.
 
+use axon_transport::{graph::{Endpoint, EndpointKind}, ids::{DaemonId, Gid, SessionId}, internal::{session::relayed::flow::{Channel, Incoming, Pool, WINDOW}, wire::session::{CodecError, MAX_PACKET, self as session}}, qos::Qos};
 use axon_envelope::{IndexMask, KeyId};
-use axon_transport::{wire::{Terms, beacon::{self, Beacon, Datagram}, session::{self as session, CodecError, MAX_PACKET}}, graph::{Endpoint, EndpointKind}, ids::{DaemonId, Gid, SessionId}, keys::KeyMessage, link::{self, FrameError}, qos::Qos, session::relayed::flow::{Channel, Incoming, Pool, WINDOW}, shm::internal::{Location, reencode_packet}};
+use axon_daemon::internal::{keys::KeyMessage, link::{FrameError, self}, wire::{Terms, beacon::{Beacon, Datagram, self}}};
+use axon_shm::internal::{Location, reencode_packet};
 
 const TERMS: Terms = Terms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(1) };
 
@@ -199,7 +201,7 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
         Message::GraphResync(link::GraphResync { version: 2 }),
         Message::Asserted(link::Asserted { publishers: vec![gid] }),
         Message::Owners(link::Owners {
-            proofs: vec![axon_transport::owner::Proof { key: [1; 32], signature: [2; 64] }],
+            proofs: vec![axon_daemon::internal::owner::Proof { key: [1; 32], signature: [2; 64] }],
         }),
         Message::Subscribe(link::Subscribe {
             route: 1,

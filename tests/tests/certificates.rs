@@ -10,11 +10,10 @@ use std::{
     sync::Arc,
 };
 
+use axon_daemon::internal::keys::{Kme, UsedKeys};
 use axon_tls::identity::CaMaterial;
-use axon_transport::{
-    config::{ClassicAuth, Config, ConfigBuilder, QkdConfig, QkdPeers, Security, SecurityMode},
-    gateway,
-    keys::{Kme, UsedKeys},
+use axon_transport::config::{
+    ClassicAuth, Config, ConfigBuilder, QkdConfig, QkdPeers, Security, SecurityMode,
 };
 use etsi_qkd014::sim::{Layout, Network, Pki, Site};
 use rcgen::{BasicConstraints, CertificateParams, DnType, IsCa, Issuer, KeyPair, SigningKey as _};
@@ -264,7 +263,7 @@ fn our_own_certificate_is_refused_for_what_is_wrong_with_it() {
     let good = ca.issue("a", &["a"]);
     let other = ca.issue("a", &["a"]);
     let check = |roots: &str, pair: &Pair| {
-        gateway::check(&host(dir.path(), roots, pair)).map_err(|error| error.to_string())
+        axon_daemon::check(&host(dir.path(), roots, pair)).map_err(|error| error.to_string())
     };
     check(&ca.pem, &good).unwrap();
     check(&version_1(&ca.pem, &ca.key), &good).unwrap();

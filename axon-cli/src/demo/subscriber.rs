@@ -5,7 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_transport::{qos::Qos, session::EndpointSpec};
+use axon_transport::{EndpointSpec, qos::Qos};
 
 use super::{
     events::Event,

@@ -7,13 +7,11 @@ use std::{
     time::Duration,
 };
 
-use axon_transport::{
-    config::{Config, OsFiles},
-    gateway::{
-        Refusal, RefusedBy,
-        attempt::{self, Bootstrap, Tamper},
-    },
+use axon_daemon::internal::{
+    Refusal, RefusedBy,
+    attempt::{self, Bootstrap, Tamper},
 };
+use axon_transport::config::{Config, OsFiles};
 use serde_json::Value;
 use tokio::time::Instant;
 

@@ -8,11 +8,9 @@ use std::{
     time::Duration,
 };
 
+use axon_daemon::internal::quic_ports;
 use axon_tls::identity::{Shown, SpkiDigest};
-use axon_transport::{
-    config::{Config, OsFiles},
-    discovery::quic_ports,
-};
+use axon_transport::config::{Config, OsFiles};
 use quinn::Endpoint;
 use tokio::{
     task::JoinSet,

@@ -15,7 +15,7 @@ const PART: usize = 1024;
 
 /// What one end tells another of its publishers' leases.
 #[derive(Default)]
-pub(crate) struct Alive {
+pub struct Alive {
     every: Option<Duration>,
     looked: Option<Instant>,
     told: BTreeMap<Gid, u64>,
@@ -23,12 +23,12 @@ pub(crate) struct Alive {
 
 impl Alive {
     /// These are the leases of the publishers that count, in nanoseconds.
-    pub(crate) fn watch(&mut self, leases: impl Iterator<Item = u64>) {
+    pub fn watch(&mut self, leases: impl Iterator<Item = u64>) {
         self.every = leases.min().map(|least| (Duration::from_nanos(least) / 4).max(SHORTEST));
     }
 
     /// How long it is until the next look; `None` when nobody has a lease.
-    pub(crate) fn left(&self, now: Instant) -> Option<Duration> {
+    pub fn left(&self, now: Instant) -> Option<Duration> {
         let every = self.every?;
         let since = self.looked.map(|looked| now.saturating_duration_since(looked));
         Some(since.map_or(Duration::ZERO, |since| every.saturating_sub(since)))
@@ -36,7 +36,7 @@ impl Alive {
 
     /// If it is time: those that have been alive since this was last asked, as many together as go into
     /// a message. `asserted` has when each was; a publisher may be in it several times.
-    pub(crate) fn news(
+    pub fn news(
         &mut self,
         now: Instant,
         asserted: impl Iterator<Item = (Gid, u64)>,

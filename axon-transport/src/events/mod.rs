@@ -4,7 +4,7 @@
 //! Plain data: time comes in as nanoseconds of one monotonic clock, and nothing is waited for.
 //! A session's control thread feeds these, and hands what is new to wait sets and callbacks.
 
-mod alive;
+pub(crate) mod alive;
 mod deadline;
 mod liveliness;
 mod status;

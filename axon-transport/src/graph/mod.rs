@@ -2,14 +2,15 @@
 //!
 //! Plain data in, data out; the daemon and the gateway move it.
 
-mod endpoint;
-mod pairing;
+pub(crate) mod endpoint;
+pub(crate) mod pairing;
 mod query;
-mod range;
-mod view;
+pub(crate) mod range;
+pub(crate) mod view;
 
-pub use endpoint::{Endpoint, EndpointKind, LIMITS, Limits};
-pub use pairing::{Pairing, pairing, reads, writes};
+pub(crate) use endpoint::LIMITS;
+pub use endpoint::{Endpoint, EndpointKind};
+pub(crate) use pairing::{Pairing, pairing, reads, writes};
 pub use query::{NamesAndTypes, NodeName, SERVICE_KINDS, TOPIC_KINDS};
-pub use range::{OutOfRange, Reach, RemoteEndpoint, Scope, Toward, out_of_range};
+pub(crate) use range::{OutOfRange, Reach, RemoteEndpoint, Scope, Toward, out_of_range};
 pub use view::{GraphEntry, GraphView};

@@ -24,3 +24,8 @@ pub struct GraphEntry {
     /// How far its session is discovered: of endpoints of this host, in the gateway's view alone.
     pub(crate) reach: Option<Reach>,
 }
+
+/// How far the session of an endpoint of this host is discovered, in the gateway's view.
+pub fn reach_of(entry: &GraphEntry) -> Option<&Reach> {
+    entry.reach.as_ref()
+}

@@ -215,7 +215,7 @@ fn packets(
 }
 
 /// Splits a change into packets. `open` leaves `more` set in the last.
-pub(crate) fn parts(
+pub fn parts(
     version: u64,
     whole: bool,
     added: impl Iterator<Item = GraphItem>,

@@ -24,10 +24,10 @@ use std::{
 };
 
 use axon_shm::internal::Location;
-pub(crate) use graph::parts;
+pub use graph::parts;
 pub use output::Output;
 pub use range::KeptApart;
-pub(crate) use relayed::Tally;
+pub use relayed::Tally;
 
 use crate::{
     graph::{Endpoint, RemoteEndpoint, Scope},
@@ -127,7 +127,7 @@ pub struct SessionEntry<F> {
     /// It was told that no more segments of its memory are taken.
     short: bool,
     /// What is shown of its relay, where it is relayed. Pairs within it are its own process's.
-    pub(crate) relay: Option<Arc<Tally>>,
+    pub relay: Option<Arc<Tally>>,
 }
 
 /// A segment of a session's memory.
@@ -249,14 +249,14 @@ impl<F: Clone> Registry<F> {
     }
 
     /// A session is relayed.
-    pub(crate) fn set_relayed(&mut self, id: &SessionId, relay: Arc<Tally>) {
+    pub fn set_relayed(&mut self, id: &SessionId, relay: Arc<Tally>) {
         if let Some(entry) = self.sessions.get_mut(id) {
             entry.relay = Some(relay);
         }
     }
 
     /// How many are.
-    pub(crate) fn relayed(&self) -> usize {
+    pub fn relayed(&self) -> usize {
         self.sessions.values().filter(|s| s.relay.is_some()).count()
     }
 

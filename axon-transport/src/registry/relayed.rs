@@ -9,7 +9,7 @@ pub(super) const MAX_REASON: usize = 200;
 
 /// Counts what crosses a relay's socket.
 #[derive(Debug, Default)]
-pub(crate) struct Tally {
+pub struct Tally {
     reason: String,
     samples_in: AtomicU64,
     bytes_in: AtomicU64,
@@ -20,7 +20,7 @@ pub(crate) struct Tally {
 
 impl Tally {
     /// Of a session that is relayed for this reason.
-    pub(crate) fn new(reason: &str) -> Self {
+    pub fn new(reason: &str) -> Self {
         let reason = crate::text::plain(reason, MAX_REASON);
         Self { reason, ..Self::default() }
     }
@@ -38,11 +38,12 @@ impl Tally {
     }
 
     /// Samples of the session's publishers that did not get here, or of others' that it did not take.
-    pub(crate) fn lost(&self, samples: u64) {
+    pub fn lost(&self, samples: u64) {
         self.lost.fetch_add(samples, Ordering::Relaxed);
     }
 
-    pub(crate) fn show(&self) -> RelayStatus {
+    /// As `axon status` shows it.
+    pub fn show(&self) -> RelayStatus {
         RelayStatus {
             reason: self.reason.clone(),
             samples_in: self.samples_in.load(Ordering::Relaxed),

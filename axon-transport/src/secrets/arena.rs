@@ -39,7 +39,7 @@ fn lock(arena: Own) -> MutexGuard<'static, Arena> {
 }
 
 /// A key in locked memory, erased on drop. Neither `Clone` nor `Debug`.
-pub(crate) struct LockedKey {
+pub struct LockedKey {
     /// `None` only while it is dropped.
     slot: Option<&'static mut Slot>,
     arena: Own,
@@ -53,7 +53,7 @@ impl RefUnwindSafe for LockedKey {}
 ///
 /// # Errors
 /// The system gives no memory.
-pub(crate) fn prepare() -> io::Result<()> {
+pub fn prepare() -> io::Result<()> {
     let arena = arena()?;
     let mut held = lock(arena);
     let grown = if held.slots == 0 { Some(held.grow()?) } else { None };
@@ -67,7 +67,7 @@ impl LockedKey {
     ///
     /// # Errors
     /// The system gives no memory.
-    pub(crate) fn copy_of(key: &[u8; 32]) -> io::Result<Self> {
+    pub fn copy_of(key: &[u8; 32]) -> io::Result<Self> {
         let (arena, mut grown) = (arena()?, None);
         let mut held = lock(arena);
         let slot = loop {
@@ -85,7 +85,7 @@ impl LockedKey {
     }
 
     /// Whether the calling process is a fork of the one that made it, and so has no key here.
-    pub(crate) fn is_forked(&self) -> bool {
+    pub fn is_forked(&self) -> bool {
         self.arena.is_forked()
     }
 }

@@ -104,14 +104,14 @@ impl Session {
 
     /// A subscription as another process of the session describes it, under its GID there. Where it
     /// keeps all, what it takes is acknowledged when it [says so](Subscription::acknowledge_of).
-    pub(crate) fn adopt_subscription(&self, endpoint: Endpoint) -> Subscription {
+    pub fn adopt_subscription(&self, endpoint: Endpoint) -> Subscription {
         let mut inner = SubscriptionInner::new(endpoint, EndpointRole::Application, Vec::new());
         inner.carries = inner.keeps_all();
         self.add_reader(inner)
     }
 
     /// As [`adopt_subscription`](Self::adopt_subscription), a node.
-    pub(crate) fn adopt_node(&self, endpoint: Endpoint) -> Node {
+    pub fn adopt_node(&self, endpoint: Endpoint) -> Node {
         let gid = endpoint.gid;
         let changed = self.create_guard_condition();
         {

@@ -13,18 +13,20 @@ const BATCH: usize = 64;
 
 /// A message that was taken.
 #[derive(Debug)]
-pub(crate) struct Taken<T> {
-    pub(crate) number: u64,
+pub struct Taken<T> {
+    /// Its number.
+    pub number: u64,
     /// Of the writer's messages, those that the reader has lost by then. Of what is given on, those that
     /// all have lost since the one before.
-    pub(crate) lost: u64,
-    pub(crate) content: T,
+    pub lost: u64,
+    /// What was taken.
+    pub content: T,
 }
 
 /// A writer's messages, by way of all readers of it that there are. What one of them has, and has not
 /// been given on, is not lost when another has gone further or comes to an end.
 #[derive(Debug)]
-pub(crate) struct Merge<T> {
+pub struct Merge<T> {
     /// The number of the newest one that was given on.
     given: Option<u64>,
     ways: BTreeMap<Gid, Way<T>>,
@@ -56,51 +58,51 @@ impl<T> Default for Way<T> {
 
 impl<T> Merge<T> {
     /// These are the readers from now on.
-    pub(crate) fn set(&mut self, readers: impl IntoIterator<Item = Gid>) {
+    pub fn set(&mut self, readers: impl IntoIterator<Item = Gid>) {
         let mut before = std::mem::take(&mut self.ways);
         let ways = readers.into_iter().map(|gid| (gid, before.remove(&gid).unwrap_or_default()));
         self.ways = ways.collect();
     }
 
     /// The readers.
-    pub(crate) fn readers(&self) -> impl Iterator<Item = &Gid> {
+    pub fn readers(&self) -> impl Iterator<Item = &Gid> {
         self.ways.keys()
     }
 
     /// Whatever the readers have is given on once more: one of them has what came before.
-    pub(crate) fn begin_anew(&mut self) {
+    pub fn begin_anew(&mut self) {
         self.given = None;
     }
 
     /// Those up to this number need not be given on.
-    pub(crate) fn pass(&mut self, number: u64) {
+    pub fn pass(&mut self, number: u64) {
         self.given = self.given.max(Some(number));
     }
 
     /// Whether there is a message that a reader has given up to it.
-    pub(crate) fn holds(&self, reader: &Gid) -> bool {
+    pub fn holds(&self, reader: &Gid) -> bool {
         self.ways.get(reader).is_some_and(|way| way.next.is_some())
     }
 
     /// Whether there is one of any reader.
-    pub(crate) fn holds_any(&self) -> bool {
+    pub fn holds_any(&self) -> bool {
         self.ways.values().any(|way| way.next.is_some())
     }
 
     /// How many messages there are that readers have given up to it.
-    pub(crate) fn held(&self) -> usize {
+    pub fn held(&self) -> usize {
         let numbers = self.ways.values().filter_map(|way| Some(way.next.as_ref()?.number));
         numbers.collect::<BTreeSet<_>>().len()
     }
 
     /// Whether readers have more that another had than could be dropped in one go: there is no next one
     /// until that is gone.
-    pub(crate) fn is_behind(&self) -> bool {
+    pub fn is_behind(&self) -> bool {
         self.behind
     }
 
     /// The next message. `take` has that of one reader.
-    pub(crate) fn next(&mut self, take: impl Fn(&Gid) -> Option<Taken<T>>) -> Option<Taken<T>> {
+    pub fn next(&mut self, take: impl Fn(&Gid) -> Option<Taken<T>>) -> Option<Taken<T>> {
         self.look(&take);
         if self.ways.len() > 1 && self.holds_any() {
             // Where there was nothing there may be by now what was written before that one.
@@ -120,7 +122,7 @@ impl<T> Merge<T> {
     }
 
     /// Drops what one reader has and another had; whether it [is behind](Self::is_behind).
-    pub(crate) fn pass_over(&mut self, take: impl Fn(&Gid) -> Option<Taken<T>>) -> bool {
+    pub fn pass_over(&mut self, take: impl Fn(&Gid) -> Option<Taken<T>>) -> bool {
         if self.ways.len() > 1 || self.behind {
             self.look(&take);
         }

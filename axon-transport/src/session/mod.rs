@@ -15,7 +15,7 @@ mod error;
 mod events;
 mod guard;
 pub(crate) mod local;
-pub(crate) mod merge;
+pub mod merge;
 mod node;
 mod open;
 mod options;
@@ -50,13 +50,11 @@ pub use node::Node;
 pub use options::{DaemonCommand, EndpointSpec, SessionOptions};
 pub(crate) use publisher::OwnedLoan;
 pub use publisher::{Loan, Publisher};
-pub(crate) use remote_writer::{RemoteWriter, Written};
+pub use remote_writer::{RemoteWriter, Written};
 pub use service::{Client, Server};
 pub use state::SessionEvent;
 pub(crate) use state::Shared;
-#[cfg(test)]
-pub(crate) use subscription::Lifetime;
-pub use subscription::{MessageInfo, Subscription};
+pub use subscription::{Lifetime, MessageInfo, Subscription};
 pub use waiting::{Ready, Waitable};
 
 use crate::{
@@ -143,7 +141,7 @@ impl Session {
     }
 
     /// Its endpoints that the daemon does not take, and why.
-    pub(crate) fn refused(&self) -> BTreeMap<Gid, String> {
+    pub fn refused(&self) -> BTreeMap<Gid, String> {
         self.shared().state().refused.clone()
     }
 

@@ -19,8 +19,8 @@ use super::{
 use crate::{
     config::{Config, DaemonPolicy},
     ids::SessionId,
-    owner::SessionKey,
     session::relayed::near::Near,
+    session_key::SessionKey,
     wire::session::SessionRole,
 };
 
@@ -95,7 +95,7 @@ impl Session {
 
     /// As [`over`](Self::over), under a given id: for the daemon, in whose memory the endpoints of a
     /// relayed session are.
-    pub(crate) fn over_as(
+    pub fn over_as(
         id: SessionId,
         socket: OwnedFd,
         config: &Config,

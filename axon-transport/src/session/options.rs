@@ -2,7 +2,7 @@
 
 use std::{ffi::OsString, io, path::PathBuf, sync::Arc};
 
-use crate::{owner::SessionKey, qos::Qos, wire::session::SessionRole};
+use crate::{qos::Qos, session_key::SessionKey, wire::session::SessionRole};
 
 /// How a session is opened.
 #[derive(Clone, Debug)]
@@ -35,7 +35,7 @@ impl SessionOptions {
 
     /// How many clients its servers may have, each counted once for each of them.
     #[must_use]
-    pub(crate) fn callers(mut self, most: usize) -> Self {
+    pub fn callers(mut self, most: usize) -> Self {
         self.callers = most;
         self
     }

@@ -13,15 +13,18 @@ use crate::{
 
 /// What stands for it here. Of a service it reads, too: a client's is given the responses that go to
 /// where the client is, and a server's the requests.
-pub(crate) enum RemoteWriter {
+pub enum RemoteWriter {
+    /// Of a publisher.
     Publisher(Publisher),
+    /// Of a service's client.
     Client(Client),
+    /// Of a service's server.
     Server(Server),
 }
 
 /// What became of a message that was to be written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Written {
+pub enum Written {
     /// Its readers have it.
     Yes,
     /// The client that it answers is gone.
@@ -34,7 +37,7 @@ impl RemoteWriter {
     ///
     /// # Errors
     /// When there is no memory.
-    pub(crate) fn stand_in(session: &Session, remote: Endpoint) -> Result<Self, SessionError> {
+    pub fn stand_in(session: &Session, remote: Endpoint) -> Result<Self, SessionError> {
         Self::new(session, remote, EndpointRole::StandIn)
     }
 
@@ -42,7 +45,7 @@ impl RemoteWriter {
     ///
     /// # Errors
     /// When there is no memory.
-    pub(crate) fn adopt(session: &Session, own: Endpoint) -> Result<Self, SessionError> {
+    pub fn adopt(session: &Session, own: Endpoint) -> Result<Self, SessionError> {
         Self::new(session, own, EndpointRole::Application)
     }
 
@@ -56,7 +59,8 @@ impl RemoteWriter {
         })
     }
 
-    pub(crate) fn endpoint(&self) -> &Endpoint {
+    /// What it stands for.
+    pub fn endpoint(&self) -> &Endpoint {
         match self {
             Self::Publisher(publisher) => publisher.endpoint(),
             Self::Client(client) => client.endpoint(),
@@ -66,7 +70,7 @@ impl RemoteWriter {
 
     /// Those here whom it reaches and who, where it is of a service, reach it; whether or not they
     /// have ended but for what they left.
-    pub(crate) fn partners(&self) -> Vec<Gid> {
+    pub fn partners(&self) -> Vec<Gid> {
         match self {
             Self::Publisher(publisher) => publisher.matched(),
             Self::Client(client) => client.attached(),
@@ -76,7 +80,7 @@ impl RemoteWriter {
 
     /// Says that it has ended but for what is to be written, or that it has not: nobody counts it
     /// until then, and those who read it get the rest.
-    pub(crate) fn leave(&self, leaving: bool) {
+    pub fn leave(&self, leaving: bool) {
         let session = match self {
             Self::Publisher(publisher) => &publisher.session,
             Self::Client(client) => &client.session,
@@ -90,7 +94,7 @@ impl RemoteWriter {
     ///
     /// # Errors
     /// [`PublishError::Blocked`] when there is none; the others say what does not fit.
-    pub(crate) fn try_write(
+    pub fn try_write(
         &self,
         client: &Gid,
         meta: Meta,
@@ -112,7 +116,7 @@ impl RemoteWriter {
 
     /// The number up to which what it has written is where it is to go, as far as that takes longer than
     /// writing it.
-    pub(crate) fn handed_over(&self) -> Option<u64> {
+    pub fn handed_over(&self) -> Option<u64> {
         match self {
             Self::Publisher(publisher) => Some(publisher.handed_over()),
             Self::Client(_) | Self::Server(_) => None,
@@ -121,7 +125,7 @@ impl RemoteWriter {
 
     /// The number of written samples that do not reach their reader, if the publisher waits for readers. All
     /// samples below a number that was [handed over](Self::handed_over) before are counted.
-    pub(crate) fn given_up(&self) -> Option<u64> {
+    pub fn given_up(&self) -> Option<u64> {
         match self {
             Self::Publisher(publisher) => Some(publisher.given_up()),
             Self::Client(_) | Self::Server(_) => None,
@@ -129,7 +133,7 @@ impl RemoteWriter {
     }
 
     /// The next request or response of `writer`, in place.
-    pub(crate) fn take_from(&self, writer: &Gid) -> Option<Sample> {
+    pub fn take_from(&self, writer: &Gid) -> Option<Sample> {
         match self {
             Self::Publisher(_) => None,
             Self::Client(client) => client.take_response_from(writer),
@@ -138,7 +142,7 @@ impl RemoteWriter {
     }
 
     /// Whether there is a request or response of `writer` to be taken.
-    pub(crate) fn has_from(&self, writer: &Gid) -> bool {
+    pub fn has_from(&self, writer: &Gid) -> bool {
         match self {
             Self::Publisher(_) => false,
             Self::Client(client) => client.has_response_from(writer),
@@ -147,7 +151,7 @@ impl RemoteWriter {
     }
 
     /// Whoever speaks for it says that it is alive.
-    pub(crate) fn assert_alive(&self) {
+    pub fn assert_alive(&self) {
         if let Self::Publisher(publisher) = self {
             // Only a forked child is refused.
             let _ = publisher.assert_liveliness();

@@ -150,12 +150,12 @@ impl Server {
     }
 
     /// As [`take_request_from`](Self::take_request_from), as bytes.
-    pub(crate) fn take_request_of(&self, client: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
+    pub fn take_request_of(&self, client: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
         take_of(&self.requests, &self.session, client)
     }
 
     /// The clients of which there is a request to be taken.
-    pub(crate) fn with_requests(&self) -> Vec<Gid> {
+    pub fn with_requests(&self) -> Vec<Gid> {
         if self.session.is_forked() {
             Vec::new()
         } else {
@@ -164,7 +164,7 @@ impl Server {
     }
 
     /// Whether it reads what this client asks or asked, or may do so soon.
-    pub(crate) fn reads(&self, client: &Gid) -> bool {
+    pub fn reads(&self, client: &Gid) -> bool {
         !self.session.is_forked() && self.requests.lock().reads(client)
     }
 

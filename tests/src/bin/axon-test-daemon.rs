@@ -3,23 +3,16 @@
 
 use std::process::ExitCode;
 
-use axon_transport::{
-    daemon::{self, ErasingHeap, Start},
-    session::daemon::spawn::{DETACHED, SPAWNED},
-};
+use axon_daemon::{ErasingHeap, Start};
 
 #[global_allocator]
 static HEAP: ErasingHeap = ErasingHeap;
 
 fn main() -> ExitCode {
-    let start = match std::env::args().nth(1).as_deref() {
-        Some(SPAWNED) => Start::Spawned,
-        Some(DETACHED) => Start::Detached,
-        Some("--while-stdin") => {
-            std::thread::spawn(axon_tests::end_with_stdin);
-            Start::Foreground
-        }
-        _ => Start::Foreground,
-    };
-    daemon::main(start)
+    let mut arguments: Vec<_> = std::env::args_os().skip(1).collect();
+    if arguments.first().is_some_and(|flag| flag == "--while-stdin") {
+        std::thread::spawn(axon_tests::end_with_stdin);
+        arguments.remove(0);
+    }
+    axon_daemon::main(Start::from_arguments(arguments).unwrap_or(Start::Foreground))
 }

@@ -17,13 +17,9 @@ use std::{
     time::{Duration, Instant},
 };
 
+use axon_shm::PublishError;
 use axon_tests::{Sizes, Tally, Word, payload};
-use axon_transport::{
-    config::Config,
-    qos::Qos,
-    session::{EndpointSpec, Session, SessionOptions},
-    shm::PublishError,
-};
+use axon_transport::{EndpointSpec, Session, SessionOptions, config::Config, qos::Qos};
 
 const PATIENCE: Duration = Duration::from_secs(90);
 const REPORT: Duration = Duration::from_millis(50);

@@ -1,8 +1,7 @@
 //! A publisher on A, subscribers on A and B: everything arrives, once, in order, as it was.
 
 use axon_tests::{Sizes, Tally};
-
-use axon_transport::{qos::Qos, session::EndpointSpec};
+use axon_transport::{EndpointSpec, qos::Qos};
 
 use super::{
     mode::{Kmes, Settings, classic, pinned},

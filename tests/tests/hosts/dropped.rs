@@ -2,10 +2,7 @@
 
 use std::{thread, time::Instant};
 
-use axon_transport::{
-    qos::Qos,
-    session::{EndpointSpec, Publisher, Subscription},
-};
+use axon_transport::{EndpointSpec, Publisher, Subscription, qos::Qos};
 use etsi_qkd014::sim::{Fault, FaultPlan, Method};
 use rustix::process::Signal;
 

@@ -3,13 +3,13 @@
 
 use std::net::SocketAddr;
 
+use axon_daemon::internal::link::{Elected, Graph, GraphResync, Message, Subscribe, Subscriber};
 use axon_tls::identity::{Auth, SigningKey};
 use axon_transport::{
+    EndpointSpec,
     graph::{Endpoint, EndpointKind},
     ids::{DaemonId, Gid},
-    link::{Elected, Graph, GraphResync, Message, Subscribe, Subscriber},
     qos::Qos,
-    session::EndpointSpec,
 };
 
 use super::{

@@ -5,11 +5,8 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_transport::{
-    qos::Qos,
-    session::{EndpointSpec, Publisher, Subscription},
-    shm::PublishError,
-};
+use axon_shm::PublishError;
+use axon_transport::{EndpointSpec, Publisher, Subscription, qos::Qos};
 use rustix::process::Signal;
 
 use super::{

@@ -7,9 +7,9 @@ use std::{
 };
 
 use axon_transport::{
+    EndpointSpec, Event, Publisher, Session, Subscription, Waitable,
     events::{Counted, EventKind, EventStatus, LivelinessChanged, Matched},
     qos::{Durability, Incompatible, Liveliness, Qos, Reliability},
-    session::{EndpointSpec, Event, Publisher, Session, Subscription, Waitable},
 };
 use rustix::process::Signal;
 

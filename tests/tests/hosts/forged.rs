@@ -10,14 +10,11 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_transport::{
-    ids::DaemonId,
-    status::Status,
-    wire::{
-        Terms,
-        beacon::{Beacon, Datagram},
-    },
+use axon_daemon::internal::wire::{
+    Terms,
+    beacon::{Beacon, Datagram},
 };
+use axon_transport::{ids::DaemonId, status::Status};
 
 use super::{
     mode::{Settings, classic, pinned},

@@ -2,10 +2,10 @@
 //! whoever waits for it to change needs to look at no other time.
 
 use axon_transport::{
+    EndpointSpec, Node, Session, Waitable,
     graph::{Endpoint, EndpointKind, GraphView},
     ids::Gid,
     qos::{Durability, History, Liveliness, Qos, Reliability},
-    session::{EndpointSpec, Node, Session, Waitable},
 };
 use rustix::process::Signal;
 

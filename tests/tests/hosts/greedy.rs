@@ -7,15 +7,15 @@ use std::{
     time::{Duration, Instant},
 };
 
+use axon_daemon::internal::link::{Graph, Message, Subscribe, Subscriber};
 use axon_tests::Sizes;
 use axon_tls::identity::{Auth, KeyAlgorithm, SigningKey, Trust, TrustFile};
 use axon_transport::{
+    EndpointSpec,
     graph::{Endpoint, EndpointKind},
     ids::{DaemonId, Gid, SessionId},
-    link::{Graph, Message, Subscribe, Subscriber},
-    owner::SessionKey,
+    internal::SessionKey,
     qos::Qos,
-    session::EndpointSpec,
 };
 
 use super::{

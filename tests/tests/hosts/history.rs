@@ -1,8 +1,8 @@
 //! What a KEEP_ALL, TRANSIENT_LOCAL publisher keeps for those that come later: all that its memory holds.
 
 use axon_transport::{
+    EndpointSpec, Publisher, Subscription,
     qos::{Durability, Qos},
-    session::{EndpointSpec, Publisher, Subscription},
 };
 
 use super::{

@@ -2,13 +2,13 @@
 
 use std::time::Duration;
 
+use axon_daemon::internal::link::{Graph, Message};
 use axon_transport::{
+    EndpointSpec,
     graph::{Endpoint, EndpointKind},
     ids::{DaemonId, Gid},
-    link::{Graph, Message},
-    owner::SessionKey,
+    internal::SessionKey,
     qos::Qos,
-    session::EndpointSpec,
 };
 
 use super::{greedy::Camera, process::until, stranger::Met};

@@ -6,7 +6,7 @@ use std::{
 };
 
 use axon_tests::{Sizes, Tally};
-use axon_transport::session::daemon::{address::Address, socket};
+use axon_transport::internal::session::daemon::{address::Address, socket};
 
 use super::{
     mode::{Kmes, Settings, classic},

@@ -4,10 +4,10 @@
 use axon_envelope::inner::Header;
 use axon_tests::Sizes;
 use axon_transport::{
+    EndpointSpec, Subscription,
     ids::{DaemonId, Gid},
-    owner::SessionKey,
+    internal::SessionKey,
     qos::Qos,
-    session::{EndpointSpec, Subscription},
 };
 
 use super::{

@@ -2,12 +2,8 @@
 
 use std::{thread, time::Duration};
 
-use axon_transport::{
-    qos::Qos,
-    session::{EndpointSpec, Publisher, Subscription},
-    shm::PublishError,
-};
-
+use axon_shm::PublishError;
+use axon_transport::{EndpointSpec, Publisher, Subscription, qos::Qos};
 use rustix::process::Signal;
 
 use super::{

@@ -8,7 +8,7 @@ mod dropped;
 mod election;
 mod ending;
 mod events;
-#[path = "../../../axon-transport/tests/support/excerpt.rs"]
+#[path = "../../../axon-transport/daemon/tests/support/excerpt.rs"]
 mod excerpt;
 mod flooded;
 mod forged;

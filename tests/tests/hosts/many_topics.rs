@@ -1,11 +1,11 @@
 //! More topics between two hosts than may cross.
 
+use axon_daemon::internal::link::{Message, Subscribe, Subscriber, Unsubscribe};
 use axon_tls::identity::{Auth, SigningKey};
 use axon_transport::{
+    EndpointSpec, Publisher, Session, Subscription,
     ids::{DaemonId, Gid},
-    link::{Message, Subscribe, Subscriber, Unsubscribe},
     qos::Qos,
-    session::{EndpointSpec, Publisher, Session, Subscription},
     status::LinkStatus,
 };
 

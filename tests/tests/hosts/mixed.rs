@@ -5,11 +5,8 @@ use std::{
     thread,
 };
 
-use axon_transport::{
-    qos::Qos,
-    session::{EndpointSpec, Publisher, Session, Subscription},
-    shm::PublishError,
-};
+use axon_shm::PublishError;
+use axon_transport::{EndpointSpec, Publisher, Session, Subscription, qos::Qos};
 
 use super::{
     mode::classic,

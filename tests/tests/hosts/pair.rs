@@ -12,8 +12,9 @@ use std::{
 
 use axon_tests::Sizes;
 use axon_transport::{
+    Session, SessionOptions,
     config::{Config, OsFiles},
-    session::{Session, SessionOptions, daemon_status},
+    daemon_status,
     status::{LinkStatus, Status},
 };
 use rustix::process::{Pid, Signal, kill_process};

@@ -3,10 +3,10 @@
 
 use axon_tests::Sizes;
 use axon_transport::{
+    EndpointSpec, Publisher, Session, SessionOptions, Subscription,
     config::{Config, DaemonPolicy, DiscoveryRange},
     ids::Gid,
     qos::Qos,
-    session::{EndpointSpec, Publisher, Session, SessionOptions, Subscription},
     status::SessionStatus,
 };
 

@@ -2,12 +2,9 @@
 
 use std::{thread, time::Duration};
 
+use axon_shm::PublishError;
 use axon_tests::{Sizes, Tally};
-use axon_transport::{
-    qos::Qos,
-    session::{EndpointSpec, Publisher},
-    shm::PublishError,
-};
+use axon_transport::{EndpointSpec, Publisher, qos::Qos};
 
 use super::{
     mode::Kmes,

@@ -4,10 +4,7 @@
 use std::{fs, thread, time::Duration};
 
 use axon_tests::{Sizes, payload};
-use axon_transport::{
-    qos::Qos,
-    session::{Client, EndpointSpec, MessageInfo, Server, Session},
-};
+use axon_transport::{Client, EndpointSpec, MessageInfo, Server, Session, qos::Qos};
 use rustix::process::Signal;
 
 use super::{

@@ -1,13 +1,16 @@
 //! A peer that announces the endpoints of another host as its own.
 
+use axon_daemon::internal::{
+    link::{Graph, Message, Owners},
+    owner::{Proof, prove},
+};
 use axon_tls::identity::{Auth, SigningKey};
 use axon_transport::{
+    EndpointSpec, Publisher, Session, Subscription,
     graph::{Endpoint, EndpointKind},
     ids::{DaemonId, Gid},
-    link::{Graph, Message, Owners},
-    owner::{Proof, SessionKey},
+    internal::SessionKey,
     qos::Qos,
-    session::{EndpointSpec, Publisher, Session, Subscription},
 };
 
 use super::{
@@ -136,7 +139,7 @@ fn a_proof_of_another_connection_or_daemon_is_worth_nothing_and_one_of_its_own_c
     let mut link = camera.link(0xff);
     // What the owner would say on another connection, in the name of another daemon, or torn.
     let daemon = DaemonId([0xff; 16]);
-    let replayed = key.prove(&[7; 32], daemon).unwrap();
+    let replayed = prove(&key, &[7; 32], daemon).unwrap();
     let torn = Proof { signature: [3; 64], ..replayed.clone() };
     camera.stranger.say(&mut link, &Message::Owners(Owners { proofs: vec![replayed, torn] }));
     camera.stranger.prove(&mut link, DaemonId([0xfe; 16]), &[&key]);
@@ -155,8 +158,8 @@ fn a_flood_of_proofs_holds_up_nobody() {
     let camera = Camera::new();
     let mut link = camera.link(0xff);
     let key = SessionKey::generate().unwrap();
-    let proof = key.prove(&[7; 32], DaemonId([0xff; 16])).unwrap();
-    let proofs = vec![proof; axon_transport::link::MAX_PROOFS];
+    let proof = prove(&key, &[7; 32], DaemonId([0xff; 16])).unwrap();
+    let proofs = vec![proof; axon_daemon::internal::link::MAX_PROOFS];
     for _ in 0..32 {
         camera.stranger.say(&mut link, &Message::Owners(Owners { proofs: proofs.clone() }));
     }

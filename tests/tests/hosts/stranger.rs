@@ -5,16 +5,16 @@ use std::{
     time::Duration,
 };
 
+use axon_daemon::internal::{
+    link::{Hello, MAX_FRAME, Message, Owners, read_length},
+    owner::{EXPORTER, prove},
+};
 use axon_tls::{
     Cipher,
     identity::Auth,
     quic::{ALPN, hybrid_client},
 };
-use axon_transport::{
-    ids::DaemonId,
-    link::{Hello, MAX_FRAME, Message, Owners, read_length},
-    owner::{EXPORTER, SessionKey},
-};
+use axon_transport::{ids::DaemonId, internal::SessionKey};
 use quinn::{Connection, Endpoint, RecvStream, SendStream};
 
 use super::{pair::Host, process::PATIENCE};
@@ -103,7 +103,7 @@ impl Stranger {
     pub(crate) fn prove(&self, met: &mut Met, daemon: DaemonId, sessions: &[&SessionKey]) {
         let mut binding = [0; 32];
         met.connection.export_keying_material(&mut binding, EXPORTER, b"").unwrap();
-        let proofs = sessions.iter().map(|key| key.prove(&binding, daemon).unwrap()).collect();
+        let proofs = sessions.iter().map(|key| prove(key, &binding, daemon).unwrap()).collect();
         self.say(met, &Message::Owners(Owners { proofs }));
     }
 

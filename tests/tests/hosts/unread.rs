@@ -2,15 +2,15 @@
 
 use std::{thread, time::Duration};
 
+use axon_daemon::internal::link::{Graph, Message, Received, ReceivedOf, Subscribe, Subscriber};
+use axon_shm::PublishError;
 use axon_tests::Sizes;
 use axon_tls::identity::{Auth, SigningKey};
 use axon_transport::{
+    EndpointSpec, Session,
     graph::{Endpoint, EndpointKind},
     ids::{DaemonId, Gid},
-    link::{Graph, Message, Received, ReceivedOf, Subscribe, Subscriber},
     qos::Qos,
-    session::{EndpointSpec, Session},
-    shm::PublishError,
 };
 use rustix::process::Signal;
 

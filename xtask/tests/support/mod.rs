@@ -1,7 +1,7 @@
 //! What the tests of this crate share: the workspace, commands, and the environment of AXON's programs.
 #![allow(dead_code, reason = "each test file uses its own part")]
 
-#[path = "../../../axon-transport/tests/support/excerpt.rs"]
+#[path = "../../../axon-transport/daemon/tests/support/excerpt.rs"]
 mod excerpt;
 
 use std::fs;

@@ -5,10 +5,8 @@ use std::{
     time::Duration,
 };
 
-use axon_transport::{
-    qos::Qos,
-    shm::{Context, Publisher, PublisherOptions, Subscriber, SubscriberOptions},
-};
+use axon_shm::{Context, Publisher, PublisherOptions, Subscriber, SubscriberOptions};
+use axon_transport::qos::Qos;
 
 use super::{Channel, End, Load, Medium, Motion, Result, Side, agree, stamp};
 
@@ -21,7 +19,7 @@ const COPIED: usize = 4096;
 /// Up to here what is loaned is copied, too, so that `publish` is the shorter way.
 const LOANS_COPIED: usize = 512;
 
-/// `axon_transport::shm` without a daemon, RELIABLE and KEEP_LAST.
+/// `axon_shm` without a daemon, RELIABLE and KEEP_LAST.
 pub(crate) struct Axon;
 
 impl Medium for Axon {

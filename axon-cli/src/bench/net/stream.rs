@@ -2,7 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-use axon_transport::{qos::Qos, session::EndpointSpec, shm::PublishError};
+use axon_shm::PublishError;
+use axon_transport::{EndpointSpec, qos::Qos};
 use rustix::process::{Signal, set_parent_process_death_signal};
 use serde::{Deserialize, Serialize};
 

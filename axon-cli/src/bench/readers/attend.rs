@@ -5,7 +5,7 @@ use std::{
     time::Duration,
 };
 
-use axon_transport::shm::{Context, Subscriber, SubscriberOptions};
+use axon_shm::{Context, Subscriber, SubscriberOptions};
 use rustix::{
     io::Errno,
     process::{Signal, set_parent_process_death_signal},

@@ -10,7 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_transport::shm::{Context, Publisher, PublisherOptions};
+use axon_shm::{Context, Publisher, PublisherOptions};
 use rustix::thread::futex;
 
 pub(super) use self::attend::attend;

@@ -6,9 +6,7 @@ use std::{
 };
 
 use axon_transport::{
-    ids::Gid,
-    qos::Qos,
-    session::{Client, EndpointSpec, Publisher, Server, Session, Subscription, Waitable},
+    Client, EndpointSpec, Publisher, Server, Session, Subscription, Waitable, ids::Gid, qos::Qos,
 };
 
 use super::place::{PATIENCE, Settings, daemon_pid, session};

@@ -8,8 +8,9 @@ use std::{
 };
 
 use axon_transport::{
+    Session, SessionOptions,
     config::{Config, DaemonPolicy, OsFiles},
-    session::{Session, SessionOptions, daemon_status},
+    daemon_status,
 };
 use serde_json::Value;
 

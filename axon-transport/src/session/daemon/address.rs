@@ -194,7 +194,7 @@ impl Address {
     }
 
     /// Removes the socket file of a daemon that ends.
-    pub(crate) fn remove(&self) {
+    pub fn remove(&self) {
         if let Some(place) = &self.place {
             let _ = std::fs::remove_file(&place.socket);
         }

@@ -32,7 +32,7 @@ const UNSERVED: u32 = 4;
 /// How long another may take to start a daemon before this one does, too.
 const TURN: Duration = Duration::from_secs(5);
 /// What a daemon names that cannot share memory with a session.
-pub(crate) const SHM: &str = "AXON_SHM";
+pub const SHM: &str = "AXON_SHM";
 
 /// A daemon that took the session.
 #[derive(Debug)]

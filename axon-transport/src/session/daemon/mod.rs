@@ -2,7 +2,7 @@
 //! socket between them, and the thread that keeps up the conversation.
 
 pub mod address;
-pub(crate) mod connect;
+pub mod connect;
 pub(super) mod control;
 pub mod socket;
 pub mod spawn;

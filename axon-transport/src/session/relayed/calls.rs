@@ -16,14 +16,14 @@ use crate::{
 
 /// The channels to the other end that a relay's clients and servers call for, and how far they have got.
 #[derive(Default)]
-pub(crate) struct Calls {
+pub struct Calls {
     /// The requests of each client that is on this side, by way of the servers here.
     requests: BTreeMap<Gid, Merge<Sample>>,
 }
 
 impl Calls {
     /// From now on these are the pairs of client and server by way of whose servers requests are taken.
-    pub(crate) fn set(&mut self, pairs: impl Iterator<Item = (Gid, Gid)>) {
+    pub fn set(&mut self, pairs: impl Iterator<Item = (Gid, Gid)>) {
         let mut servers: BTreeMap<Gid, Vec<Gid>> = BTreeMap::new();
         for (client, server) in pairs {
             servers.entry(client).or_default().push(server);
@@ -35,7 +35,7 @@ impl Calls {
     }
 
     /// The next request of `client` that has not been sent. It came to each of the servers.
-    pub(crate) fn request<'a>(
+    pub fn request<'a>(
         &mut self,
         client: &Gid,
         find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
@@ -45,10 +45,7 @@ impl Calls {
     }
 
     /// Takes the requests that were sent by way of another server; whether there are more.
-    pub(crate) fn pass_over<'a>(
-        &mut self,
-        find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
-    ) -> bool {
+    pub fn pass_over<'a>(&mut self, find: impl Fn(&Gid) -> Option<&'a RemoteWriter>) -> bool {
         let mut more = false;
         for (client, requests) in &mut self.requests {
             more |= requests.pass_over(|server| find(server)?.take_from(client).map(taken));
@@ -57,13 +54,13 @@ impl Calls {
     }
 
     /// Whether a request of `client` came by way of `server` and is still to be sent.
-    pub(crate) fn holds(&self, client: &Gid, server: &Gid) -> bool {
+    pub fn holds(&self, client: &Gid, server: &Gid) -> bool {
         self.requests.get(client).is_some_and(|requests| requests.holds(server))
     }
 }
 
 /// The next response on `channel`; `client` finds the one that it is for.
-pub(crate) fn response<'a>(
+pub fn response<'a>(
     channel: &Channel,
     find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
 ) -> Option<Departing<Sample>> {

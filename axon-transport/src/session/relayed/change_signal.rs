@@ -15,19 +15,23 @@ use crate::session::{Session, SessionEvent};
 
 /// Becomes readable when something happened.
 #[derive(Debug)]
-pub(crate) struct ChangeSignal {
+pub struct ChangeSignal {
     wake: OwnedFd,
     lost: AtomicBool,
 }
 
 impl ChangeSignal {
-    pub(crate) fn new() -> std::io::Result<Arc<Self>> {
+    /// One that is not readable.
+    ///
+    /// # Errors
+    /// The process has no descriptors left.
+    pub fn new() -> std::io::Result<Arc<Self>> {
         let wake = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?;
         Ok(Arc::new(Self { wake, lost: AtomicBool::new(false) }))
     }
 
     /// Has `session` tell of whatever changes.
-    pub(crate) fn of(self: &Arc<Self>, session: &Session) {
+    pub fn of(self: &Arc<Self>, session: &Session) {
         let signal = Arc::clone(self);
         session.set_listener(move |event| {
             if *event == SessionEvent::DaemonLost {
@@ -39,7 +43,7 @@ impl ChangeSignal {
     }
 
     /// Whether the session has no daemon any more.
-    pub(crate) fn is_lost(&self) -> bool {
+    pub fn is_lost(&self) -> bool {
         self.lost.load(Ordering::Acquire)
     }
 
@@ -49,7 +53,7 @@ impl ChangeSignal {
     }
 
     /// Clears the signal; returns whether it was set.
-    pub(crate) fn take(&self) -> bool {
+    pub fn take(&self) -> bool {
         rustix::io::read(&self.wake, &mut [0; 8]).is_ok()
     }
 }

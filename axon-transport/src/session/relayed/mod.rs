@@ -12,21 +12,21 @@
 
 use std::time::Duration;
 
-pub(crate) mod calls;
-pub(crate) mod change_signal;
+pub mod calls;
+pub mod change_signal;
 pub mod flow;
 pub(crate) mod near;
-pub(crate) mod pipe;
+pub mod pipe;
 
-pub(crate) use flow::Pool;
+pub use flow::Pool;
 
 /// Relayed sessions of one daemon: each costs it two threads and memory of its own.
-pub(crate) const MAX_SESSIONS: usize = 32;
+pub const MAX_SESSIONS: usize = 32;
 /// Publishers, subscriptions, clients, and servers, of a relayed session.
-pub(crate) const MAX_ENDPOINTS: usize = 1024;
+pub const MAX_ENDPOINTS: usize = 1024;
 /// Clients elsewhere that a relayed session's servers answer, each counted once for each of them.
-pub(crate) const MAX_CALLERS: usize = 1024;
+pub const MAX_CALLERS: usize = 1024;
 /// Others that one endpoint is said to be matched with; one packet holds no more.
-pub(crate) const MAX_MATCHED: usize = 1024;
+pub const MAX_MATCHED: usize = 1024;
 /// How long an end that ends waits for what was written before to have gone on.
-pub(crate) const LINGER: Duration = Duration::from_secs(1);
+pub const LINGER: Duration = Duration::from_secs(1);

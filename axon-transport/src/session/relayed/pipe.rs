@@ -38,17 +38,23 @@ const NAP: Duration = Duration::from_millis(5);
 
 /// Why a relay ends.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum End {
+pub enum End {
+    /// The socket failed.
     #[error("{0}")]
     Socket(#[from] SocketError),
+    /// The other end broke the protocol of pieces and credit.
     #[error("the other end sent {0}")]
     Violation(#[from] Violation),
+    /// The other end sent descriptors, which no message of a relay has.
     #[error("the other end sent descriptors")]
     Descriptors,
+    /// Too many control messages wait for the other end.
     #[error("the other end does not read")]
     Deaf,
+    /// The session's process ended.
     #[error("its process ended")]
     Gone,
+    /// Something else failed here.
     #[error("{0}")]
     Other(String),
 }
@@ -65,15 +71,21 @@ struct OnTheirWay {
 
 /// Samples that were lost.
 #[derive(Clone, Copy, Debug)]
-pub(crate) enum Loss {
+pub enum Loss {
     /// These did not come; whether that was before the `first` of the channel.
-    Before { samples: u64, first: bool },
+    Before {
+        /// How many.
+        samples: u64,
+        /// Whether none of the channel had come before.
+        first: bool,
+    },
     /// One came and could not be written.
     Unwritten,
 }
 
 impl Loss {
-    pub(crate) fn samples(self) -> u64 {
+    /// How many.
+    pub fn samples(self) -> u64 {
         match self {
             Self::Before { samples, .. } => samples,
             Self::Unwritten => 1,
@@ -81,13 +93,15 @@ impl Loss {
     }
 }
 
-pub(crate) struct Pipe {
+/// One end of a relay's connection: sends samples within the other end's credit, publishes those that come.
+pub struct Pipe {
     socket: PassedFd,
     buffer: Vec<u8>,
     /// Packets that go before any piece.
     waiting: VecDeque<Vec<u8>>,
     waiting_bytes: usize,
-    pub(crate) outgoing: Outgoing<Sample>,
+    /// Samples on their way to the other end.
+    pub outgoing: Outgoing<Sample>,
     pub(crate) incoming: Incoming,
     /// Samples that came and are not published yet.
     arrived: BTreeMap<Channel, VecDeque<Arrived>>,
@@ -110,7 +124,8 @@ pub(crate) struct Pipe {
 }
 
 impl Pipe {
-    pub(crate) fn new(socket: PassedFd, incoming: Incoming, tally: Arc<Tally>) -> Self {
+    /// An end that has said and heard nothing.
+    pub fn new(socket: PassedFd, incoming: Incoming, tally: Arc<Tally>) -> Self {
         Self {
             socket,
             buffer: Vec::new(),
@@ -132,7 +147,7 @@ impl Pipe {
     }
 
     /// Queues a control message.
-    pub(crate) fn say(&mut self, message: &Message) -> Result<(), End> {
+    pub fn say(&mut self, message: &Message) -> Result<(), End> {
         if self.gone {
             return Ok(());
         }
@@ -149,12 +164,12 @@ impl Pipe {
     }
 
     /// Opens a channel for samples that go, once the MATCHED is said by which the other end knows.
-    pub(crate) fn open_out(&mut self, channel: Channel) {
+    pub fn open_out(&mut self, channel: Channel) {
         self.outgoing.open(channel, self.said);
     }
 
     /// Opens a channel for samples that come.
-    pub(crate) fn open_in(&mut self, channel: Channel) -> Result<(), End> {
+    pub fn open_in(&mut self, channel: Channel) -> Result<(), End> {
         match self.incoming.open(channel, self.heard) {
             Some(credit) => self.say(&Message::Credit(credit)),
             None => Ok(()),
@@ -162,7 +177,7 @@ impl Pipe {
     }
 
     /// Closes those that `keep` does not want.
-    pub(crate) fn retain(&mut self, keep: impl Fn(&Channel) -> bool) {
+    pub fn retain(&mut self, keep: impl Fn(&Channel) -> bool) {
         self.incoming.retain(&keep);
         self.arrived.retain(|channel, _| keep(channel));
         self.written.retain(|channel, _| keep(channel));
@@ -170,18 +185,18 @@ impl Pipe {
     }
 
     /// Whether a sample waits for a reader.
-    pub(crate) fn is_blocked(&self) -> bool {
+    pub fn is_blocked(&self) -> bool {
         self.blocked
     }
 
     /// Whether readers that go on are worth being woken for.
-    pub(crate) fn waits_for_readers(&self) -> bool {
+    pub fn waits_for_readers(&self) -> bool {
         self.blocked || !self.written.is_empty()
     }
 
     /// The other end is gone, or as good as that: what it has said is heard, and nothing is said to it
     /// any more.
-    pub(crate) fn hang_up(&mut self) {
+    pub fn hang_up(&mut self) {
         // Whoever has its end besides adds nothing, so that there is an end to what is to be heard.
         let _ = shutdown(&self.socket, Shutdown::Both);
         self.gone = true;
@@ -190,17 +205,17 @@ impl Pipe {
     }
 
     /// Whether the other end is gone and all that it had said is heard.
-    pub(crate) fn is_over(&self) -> bool {
+    pub fn is_over(&self) -> bool {
         self.over
     }
 
     /// Samples that came and are not published.
-    pub(crate) fn arrived(&self) -> usize {
+    pub fn arrived(&self) -> usize {
         self.arrived.values().map(VecDeque::len).sum()
     }
 
     /// Takes packets; the messages among them that are not of samples, and whether there may be more.
-    pub(crate) fn receive(&mut self) -> Result<(Vec<Message>, bool), End> {
+    pub fn receive(&mut self) -> Result<(Vec<Message>, bool), End> {
         let mut messages = Vec::new();
         for _ in 0..BATCH {
             let message = match socket::receive(&self.socket, &mut self.buffer) {
@@ -231,7 +246,7 @@ impl Pipe {
 
     /// Writes what came, as far as readers make room; `lost` hears of samples that were lost. Returns
     /// what the other end is to be [given back](Self::give_back).
-    pub(crate) fn write<'a>(
+    pub fn write<'a>(
         &mut self,
         find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
         mut lost: impl FnMut(&Gid, Loss),
@@ -295,13 +310,13 @@ impl Pipe {
     }
 
     /// Tells the other end what it is given back, and which of its samples are where they are to go.
-    pub(crate) fn give_back(&mut self, credits: Vec<Credit>) -> Result<(), End> {
+    pub fn give_back(&mut self, credits: Vec<Credit>) -> Result<(), End> {
         credits.into_iter().try_for_each(|credit| self.say(&Message::Credit(credit)))
     }
 
     /// Sends what there is, as far as the socket has room: what `take` has of each channel that may
     /// send. Whether anything was sent.
-    pub(crate) fn send(
+    pub fn send(
         &mut self,
         mut take: impl FnMut(&Channel) -> Option<Departing<Sample>>,
     ) -> Result<bool, End> {
@@ -348,7 +363,7 @@ impl Pipe {
 impl Pipe {
     /// Sleeps until there is something to do, for at most `left`. The other end is gone once `end`, its
     /// process, is readable.
-    pub(crate) fn sleep(
+    pub fn sleep(
         &mut self,
         leader: &ExternalLeader,
         change_signal: &ChangeSignal,

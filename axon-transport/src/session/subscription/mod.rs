@@ -54,15 +54,17 @@ pub struct MessageInfo {
     /// Its number among those that the endpoint has taken, from 1.
     pub reception: u64,
     /// Its age and lifespan, where the lifespan is finite.
-    pub(crate) lifetime: Option<Lifetime>,
+    pub lifetime: Option<Lifetime>,
 }
 
 /// The age of a sample when it was taken, and its publisher's lifespan. The monotonic clock tells both,
 /// so that neither a step of the wall clock nor that of another host counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Lifetime {
-    pub(crate) age: Duration,
-    pub(crate) lifespan: Duration,
+pub struct Lifetime {
+    /// How long ago it was published when it was taken.
+    pub age: Duration,
+    /// How old it may be to be delivered.
+    pub lifespan: Duration,
 }
 
 impl Lifetime {
@@ -179,7 +181,7 @@ impl Subscription {
 
     /// For a relay: the publishers of whom something may come. Those who have ended, but for what is
     /// on its way, do not count any more.
-    pub(crate) fn attached(&self) -> Vec<Gid> {
+    pub fn attached(&self) -> Vec<Gid> {
         let mut gids = self.matched();
         if !self.session.is_forked() {
             gids.extend(self.inner.lock().leaving());
@@ -189,7 +191,7 @@ impl Subscription {
 
     /// For a relay: the next sample of one publisher, and how many of that publisher's this
     /// subscription has lost by then.
-    pub(crate) fn take_from(&self, writer: &Gid) -> Option<(Sample, u64)> {
+    pub fn take_from(&self, writer: &Gid) -> Option<(Sample, u64)> {
         if self.session.is_forked() {
             return None;
         }
@@ -207,7 +209,7 @@ impl Subscription {
 
     /// For a relay: samples of this publisher up to this number are where they are to go. Until then
     /// nobody takes them as acknowledged.
-    pub(crate) fn acknowledge_of(&self, writer: &Gid, sequence: u64) {
+    pub fn acknowledge_of(&self, writer: &Gid, sequence: u64) {
         if !self.session.is_forked() {
             self.inner.lock().finish_of(writer, sequence);
         }
@@ -215,12 +217,12 @@ impl Subscription {
 
     /// For a relay: samples that are not acknowledged, those that were not taken among them, by
     /// publisher.
-    pub(crate) fn unacknowledged(&self) -> HashMap<Gid, u64> {
+    pub fn unacknowledged(&self) -> HashMap<Gid, u64> {
         if self.session.is_forked() { HashMap::new() } else { self.inner.lock().undone() }
     }
 
     /// For a relay: so many samples of this publisher do not get where they are to go. It is told.
-    pub(crate) fn give_up(&self, writer: Gid, samples: u64) {
+    pub fn give_up(&self, writer: Gid, samples: u64) {
         if self.session.is_forked() {
             return;
         }
@@ -232,27 +234,27 @@ impl Subscription {
     }
 
     /// For a relay: the next sample of one publisher, as bytes.
-    pub(crate) fn take_of(&self, writer: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
+    pub fn take_of(&self, writer: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
         take_of(&self.inner, &self.session, writer)
     }
 
     /// The publishers of which there is something to take.
-    pub(crate) fn with_data(&self) -> Vec<Gid> {
+    pub fn with_data(&self) -> Vec<Gid> {
         if self.session.is_forked() { Vec::new() } else { self.inner.lock().with_data().collect() }
     }
 
     /// Whether it reads what this publisher writes or wrote, or may do so soon.
-    pub(crate) fn reads(&self, writer: &Gid) -> bool {
+    pub fn reads(&self, writer: &Gid) -> bool {
         !self.session.is_forked() && self.inner.lock().reads(writer)
     }
 
     /// Whether there is something to take of this publisher.
-    pub(crate) fn has_from(&self, writer: &Gid) -> bool {
+    pub fn has_from(&self, writer: &Gid) -> bool {
         !self.session.is_forked() && self.inner.lock().has_from(writer)
     }
 
     /// The publishers that have a lease, and when each was last alive, by the monotonic clock.
-    pub(crate) fn assertions(&self) -> Vec<(Gid, u64)> {
+    pub fn assertions(&self) -> Vec<(Gid, u64)> {
         if self.session.is_forked() {
             return Vec::new();
         }

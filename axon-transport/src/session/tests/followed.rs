@@ -6,8 +6,8 @@ use rustix::net::accept_with;
 use super::*;
 use crate::{
     config::{Config, OsFiles},
-    owner::OWNER,
     session::{daemon::address::Address, tests::played::Taker},
+    session_key::OWNER,
 };
 
 /// Where the test plays one daemon after another.

@@ -139,7 +139,7 @@ impl Refused {
     }
 
     /// Of one endpoint.
-    pub(crate) fn of(endpoint: &Endpoint, why: &str) -> Self {
+    pub fn of(endpoint: &Endpoint, why: &str) -> Self {
         let text = format!("endpoint {} of topic {:?}: {why}", endpoint.gid, endpoint.topic);
         Self { endpoint: Some(endpoint.gid), ..Self::because(text) }
     }

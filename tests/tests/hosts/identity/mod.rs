@@ -1,11 +1,11 @@
 //! Who a peer is, in `classic`: what is accepted, and what changes while the daemons run.
 
+use axon_transport::ids::DaemonId;
+
 mod authority;
 mod ca;
 mod pinned;
 mod replay;
-
-use axon_transport::ids::DaemonId;
 
 /// An id as status has it.
 fn daemon_id(text: &str) -> DaemonId {

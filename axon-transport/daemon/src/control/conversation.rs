@@ -1,0 +1,259 @@
+//! The conversation with a session that was admitted: packets between its socket and the registry.
+
+use std::{
+    cell::RefCell,
+    os::fd::{AsFd, BorrowedFd},
+    rc::Rc,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use axon_shm::{
+    ids::SessionId,
+    internal::descriptors::{self, PassedFd},
+};
+use axon_transport::internal::{
+    registry::{MAX_QUEUE, SessionEntry},
+    session::daemon::socket::{self, Received, SocketError},
+    wire::session::Message,
+};
+use tokio::{io::unix::AsyncFd, sync::Notify};
+
+use super::{
+    plane::Control,
+    turns::{PART, Turn},
+};
+
+/// Packets that may wait for a session whose own are taken: its endpoints may make more of them than
+/// it reads.
+const UNREAD: usize = MAX_QUEUE / 4;
+/// Parts of work, each of [`PART`], that what a session left behind in its socket may take.
+const REST: usize = 1000;
+
+/// Moves packets both ways until the session ends; why it did.
+pub(super) async fn converse(
+    control: &Rc<RefCell<Control>>,
+    socket: &AsyncFd<PassedFd>,
+    id: SessionId,
+    bell: &Rc<Notify>,
+    turn: &Turn,
+    death: Option<&AsyncFd<PassedFd>>,
+) -> String {
+    let mut buffer = Vec::new();
+    loop {
+        let sent = {
+            let _turn = turn.lock().await;
+            send_some(control, socket, &id, bell)
+        };
+        let full = match sent {
+            Ok(Sent::All) => false,
+            Ok(Sent::Full) => true,
+            Ok(Sent::Some) => {
+                tokio::task::yield_now().await;
+                continue;
+            }
+            Err(error) => {
+                take_rest(control, socket, &id, bell, turn).await;
+                return error.to_string();
+            }
+        };
+        let queued = control.borrow().registry.session(&id).map_or(0, SessionEntry::queued);
+        tokio::select! {
+            () = bell.notified() => {
+                if !control.borrow().is_current(&id, bell) {
+                    return "it came back on another connection".into();
+                }
+            }
+            ready = socket.writable(), if full => {
+                let Ok(mut ready) = ready else { return "its socket cannot be watched".into() };
+                let sent = {
+                    let _turn = turn.lock().await;
+                    send_some(control, socket, &id, bell)
+                };
+                match sent {
+                    Ok(Sent::Full) => ready.clear_ready(),
+                    Ok(Sent::All | Sent::Some) => {}
+                    Err(error) => {
+                        take_rest(control, socket, &id, bell, turn).await;
+                        return error.to_string();
+                    }
+                }
+            }
+            // Too many descriptors in flight: nothing says when that is over.
+            () = tokio::time::sleep(Duration::from_millis(20)), if full => {}
+            ready = socket.readable(), if queued < UNREAD => {
+                let Ok(mut ready) = ready else { return "its socket cannot be watched".into() };
+                let turn = turn.lock().await;
+                let received = receive_some(control, socket, &id, bell, &mut buffer, UNREAD);
+                drop(turn);
+                match received {
+                    Ok(true) => ready.clear_ready(),
+                    Ok(false) => tokio::task::yield_now().await,
+                    Err(why) => return why,
+                }
+            }
+            () = ended(death) => {
+                take_rest(control, socket, &id, bell, turn).await;
+                return "its process ended".into();
+            }
+        }
+    }
+}
+
+/// Takes what a session sent before its process or its connection ended: memory in which its readers find
+/// the last samples.
+async fn take_rest(
+    control: &Rc<RefCell<Control>>,
+    socket: &AsyncFd<PassedFd>,
+    id: &SessionId,
+    bell: &Rc<Notify>,
+    turn: &Turn,
+) {
+    let mut buffer = Vec::new();
+    // Bounded: a child that inherited the socket may send without end.
+    for _ in 0..REST {
+        let _turn = turn.lock().await;
+        match receive_some(control, socket, id, bell, &mut buffer, usize::MAX) {
+            Ok(false) => {}
+            Ok(true) | Err(_) => return,
+        }
+    }
+}
+
+/// What came of sending.
+enum Sent {
+    /// Nothing waits any more.
+    All,
+    /// Some waits, and the others have their turn first.
+    Some,
+    /// The socket is full.
+    Full,
+}
+
+/// Sends what waits for a session, for as long as a turn is.
+fn send_some(
+    control: &Rc<RefCell<Control>>,
+    socket: &AsyncFd<PassedFd>,
+    id: &SessionId,
+    bell: &Rc<Notify>,
+) -> Result<Sent, SocketError> {
+    let control = &mut *control.borrow_mut();
+    // What waits is for the connection on which the session came back.
+    if !control.is_current(id, bell) {
+        return Ok(Sent::All);
+    }
+    let sent = send_packets(control, socket, id);
+    if control.registry.has_fences() {
+        control.settle();
+    }
+    sent
+}
+
+fn send_packets(
+    control: &mut Control,
+    socket: &AsyncFd<PassedFd>,
+    id: &SessionId,
+) -> Result<Sent, SocketError> {
+    let (registry, begin) = (&mut control.registry, Instant::now());
+    while let Some(output) = registry.next_output(id) {
+        let descriptors: Vec<BorrowedFd<'_>> =
+            output.descriptors.iter().map(|d| d.as_fd()).collect();
+        match socket::send(socket.get_ref(), &output.packet, &descriptors) {
+            Ok(()) => {
+                control.traffic.packets_out += 1;
+                control.traffic.bytes_out += output.packet.len() as u64;
+            }
+            Err(SocketError::NotReady) => {
+                drop(descriptors);
+                registry.return_output(id, output);
+                return Ok(Sent::Full);
+            }
+            Err(error) => return Err(error),
+        }
+        if begin.elapsed() >= PART {
+            return Ok(Sent::Some);
+        }
+    }
+    Ok(Sent::All)
+}
+
+/// Receives one packet, unless it has descriptors for which there may be no room.
+pub(super) fn receive(socket: &PassedFd, buffer: &mut Vec<u8>) -> Result<Received, SocketError> {
+    if descriptors::is_short() && descriptors::carries_descriptors(socket) {
+        return Err(SocketError::NoDescriptors);
+    }
+    socket::receive(socket, buffer)
+}
+
+/// Takes packets for as long as a turn is, or until as many as `unread` wait for the session to read them;
+/// whether the socket is empty now.
+fn receive_some(
+    control: &Rc<RefCell<Control>>,
+    socket: &AsyncFd<PassedFd>,
+    id: &SessionId,
+    bell: &Rc<Notify>,
+    buffer: &mut Vec<u8>,
+    unread: usize,
+) -> Result<bool, String> {
+    let control = &mut *control.borrow_mut();
+    if !control.is_current(id, bell) {
+        return Err("it came back on another connection".into());
+    }
+    let (mut outcome, begin) = (Ok(false), Instant::now());
+    let queued = |c: &Control| c.registry.session(id).map_or(0, SessionEntry::queued);
+    while begin.elapsed() < PART && queued(control) < unread {
+        match receive(socket.get_ref(), buffer) {
+            Ok(Received { message: Message::StatusRequest, .. }) => control.send_status(id),
+            // The one thing that is handed over after HELLO, and the only one that the daemon reads:
+            // reading anything else may block.
+            Ok(Received { descriptors, .. }) if !descriptors.iter().all(PassedFd::is_memfd) => {
+                tracing::warn!(session = %id, "a session that sent no memfd was disconnected");
+                outcome = Err("it sent a descriptor that is no memfd".into());
+                break;
+            }
+            // Without a segment it goes on; without its connection it would have to come back, with
+            // all that it has.
+            Ok(Received { message: Message::Segment(_), .. })
+                if control.registry.holds_as_many_as(id, descriptors::share()) =>
+            {
+                let share = descriptors::share();
+                control.registry.refuse_segment(
+                    id,
+                    &format!(
+                        "the daemon holds {share} descriptors of it, one session's share of its \
+                         RLIMIT_NOFILE (raise that: ulimit -n, LimitNOFILE)"
+                    ),
+                );
+            }
+            Ok(Received { message, descriptors }) => {
+                control.traffic.packets_in += 1;
+                let descriptors = descriptors.into_iter().map(Arc::new).collect();
+                if let Err(violation) = control.registry.message(id, message, descriptors) {
+                    tracing::warn!(session = %id, %violation, "a session was disconnected");
+                    outcome = Err(violation.to_string());
+                    break;
+                }
+            }
+            Err(SocketError::NotReady) => {
+                outcome = Ok(true);
+                break;
+            }
+            Err(error) => {
+                if !matches!(error, SocketError::Closed) {
+                    tracing::warn!(session = %id, %error, "a session was disconnected");
+                }
+                outcome = Err(error.to_string());
+                break;
+            }
+        }
+    }
+    control.settle();
+    outcome
+}
+
+async fn ended(death: Option<&AsyncFd<PassedFd>>) {
+    match death {
+        Some(pidfd) => drop(pidfd.readable().await),
+        None => std::future::pending().await,
+    }
+}

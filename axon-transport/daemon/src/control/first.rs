@@ -1,0 +1,78 @@
+//! Reads the first messages of a connection, before it is admitted as a session: optionally the session's
+//! key, then HELLO.
+
+use std::sync::Arc;
+
+use axon_shm::internal::descriptors::{self, PassedFd};
+use axon_transport::internal::{
+    OWNER, SessionKey,
+    session::daemon::socket::{Received, SocketError},
+    wire::session::{Hello, Message, Refused},
+};
+use tokio::io::unix::AsyncFd;
+use zeroize::Zeroize;
+
+use super::{admission::unshared, conversation::receive, listen::say};
+
+/// Messages of unknown types that may come before HELLO.
+const UNKNOWN: u32 = 8;
+
+/// What a connection begins with.
+pub(super) struct First {
+    pub(super) hello: Hello,
+    pub(super) descriptors: Vec<PassedFd>,
+    /// What came before: the key that the session's id is made of.
+    pub(super) key: Option<Arc<SessionKey>>,
+}
+
+impl First {
+    /// Whether the key that came, if one did, is that of the id.
+    pub(super) fn is_its_own(&self) -> Result<(), Box<Refused>> {
+        match &self.key {
+            Some(key) if key.id() != self.hello.session => {
+                let text = "the session's id is not made of the key that it handed over";
+                Err(Box::new(Refused::because(text.into())))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Waits for HELLO; `None` when something else comes.
+pub(super) async fn first(socket: &AsyncFd<PassedFd>) -> Option<First> {
+    let mut buffer = Vec::new();
+    let mut unknown = 0;
+    let mut key = None;
+    loop {
+        let mut ready = socket.readable().await.ok()?;
+        match receive(socket.get_ref(), &mut buffer) {
+            Ok(Received { message: Message::Hello(hello), descriptors }) => {
+                return Some(First { hello, descriptors, key });
+            }
+            Ok(Received { message: Message::Unknown(OWNER), descriptors })
+                if key.is_none() && descriptors.is_empty() =>
+            {
+                // One that is no key ends the connection: it comes once at most.
+                let its_key = SessionKey::from_packet(&buffer);
+                buffer.zeroize();
+                key = Some(Arc::new(its_key?));
+            }
+            // A later version may say something first; a flood would keep everybody else waiting.
+            Ok(Received { message: Message::Unknown(_), descriptors })
+                if unknown < UNKNOWN && descriptors.is_empty() =>
+            {
+                unknown += 1;
+            }
+            Err(SocketError::NotReady) => ready.clear_ready(),
+            // Not for want of room here: somebody keeps them back.
+            Err(SocketError::NoDescriptors) if !descriptors::is_short() => {
+                let text = "its descriptors do not arrive".to_owned();
+                say(socket, Message::Refused(*unshared(text)), &[]);
+                return None;
+            }
+            Ok(_) | Err(_) => return None,
+        }
+        // A socket that stays readable must not keep the others, or the time limit, from their turn.
+        tokio::task::yield_now().await;
+    }
+}

@@ -1,0 +1,159 @@
+//! Runs the gateway on a thread of its own, and starts it again when it fails.
+
+use std::{
+    cell::RefCell,
+    panic::{AssertUnwindSafe, catch_unwind},
+    rc::Rc,
+    sync::Arc,
+    time::Duration,
+};
+
+use rustix::net::{AddressFamily, SocketFlags, SocketType, socketpair};
+use tokio::{
+    sync::{
+        mpsc::{self, error::TrySendError},
+        oneshot,
+    },
+    task::spawn_local,
+    time::{sleep, timeout},
+};
+
+use super::{
+    listen::{Inside, serve},
+    plane::Control,
+};
+use crate::gateway::bridge::{CHANNEL, GatewayParts, ToControl, ToGateway};
+
+/// What runs on the gateway's thread.
+pub type GatewayEntry = fn(GatewayParts) -> Result<(), String>;
+
+/// How long the first gateway may take to stand.
+const START: Duration = Duration::from_secs(10);
+/// How long a gateway may take to say goodbye.
+const GOODBYE: Duration = Duration::from_secs(2);
+/// How long a gateway must have run for its failure not to lengthen the pause.
+const STEADY: Duration = Duration::from_secs(60);
+
+/// A gateway that runs, or ran.
+pub(super) struct Running {
+    orders: mpsc::Sender<ToGateway>,
+    events: mpsc::Receiver<ToControl>,
+    end: oneshot::Receiver<String>,
+}
+
+impl Running {
+    /// Starts one.
+    pub(super) fn start(
+        control: &Rc<RefCell<Control>>,
+        entry: GatewayEntry,
+    ) -> std::io::Result<Self> {
+        let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+        let (ours, theirs) = socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None)?;
+        let (to_control, events) = mpsc::channel(CHANNEL);
+        let (orders, from_control) = mpsc::channel(CHANNEL);
+        let (ended, end) = oneshot::channel();
+        let parts = {
+            let mut control = control.borrow_mut();
+            control.gateway = "starting".into();
+            GatewayParts {
+                config: Arc::clone(&control.config),
+                daemon: control.id,
+                keys: Arc::clone(&control.keys_of_sessions),
+                socket: theirs,
+                control: to_control,
+                orders: from_control,
+            }
+        };
+        std::thread::Builder::new().name("axon-gateway".into()).spawn(move || {
+            let outcome = catch_unwind(AssertUnwindSafe(|| entry(parts)));
+            let _ = ended.send(match outcome {
+                Ok(Ok(())) => "ended".to_owned(),
+                Ok(Err(error)) => error,
+                Err(_) => "panicked; the log says where".to_owned(),
+            });
+        })?;
+        spawn_local(serve(control.clone(), ours.into(), Inside::Gateway, None));
+        Ok(Self { orders, events, end })
+    }
+
+    /// Waits until it stands.
+    ///
+    /// # Errors
+    /// Why it does not.
+    pub(super) async fn stands(&mut self, control: &Rc<RefCell<Control>>) -> Result<(), String> {
+        let started = async {
+            tokio::select! {
+                // One that stood and failed since then did stand.
+                biased;
+                event = self.events.recv() => event,
+                why = &mut self.end => return Err(why.unwrap_or_else(|_| "ended".into())),
+            }
+            .ok_or_else(String::new)
+        };
+        match timeout(START, started).await {
+            Ok(Ok(event)) => {
+                control.borrow_mut().gateway_says(event);
+                Ok(())
+            }
+            // It closed the channel before it ended: the end says why.
+            Ok(Err(why)) if why.is_empty() => {
+                Err((&mut self.end).await.unwrap_or_else(|_| "ended".into()))
+            }
+            Ok(Err(why)) => Err(why),
+            Err(_) => Err(format!("it did not stand within {} s", START.as_secs())),
+        }
+    }
+
+    /// What the gateway says next; `Err` with the reason when it has ended.
+    pub(super) async fn next(&mut self) -> Result<ToControl, String> {
+        match self.events.recv().await {
+            Some(event) => Ok(event),
+            None => Err((&mut self.end).await.unwrap_or_else(|_| "ended".into())),
+        }
+    }
+
+    /// Gives an order, unless the gateway is gone or so far behind that the channel is full.
+    /// Whether it was given.
+    pub(super) fn order(&self, order: ToGateway) -> bool {
+        let sent = self.orders.try_send(order);
+        if let Err(TrySendError::Full(order)) = &sent {
+            tracing::debug!(?order, "the gateway is busy; an order was dropped");
+        }
+        sent.is_ok()
+    }
+
+    /// Has it say goodbye, and waits for that, but not for ever.
+    pub(super) async fn end(mut self) {
+        let goodbye = async {
+            if self.orders.send(ToGateway::Shutdown).await.is_ok() {
+                while self.events.recv().await.is_some() {}
+                let _ = self.end.await;
+            }
+        };
+        if timeout(GOODBYE, goodbye).await.is_err() {
+            tracing::warn!("the gateway did not end in time");
+        }
+    }
+}
+
+/// The pause before a gateway that failed is started again.
+#[derive(Debug)]
+pub(super) struct Pause {
+    next: Duration,
+    since: std::time::Instant,
+}
+
+impl Pause {
+    pub(super) fn new() -> Self {
+        Self { next: Duration::from_millis(200), since: std::time::Instant::now() }
+    }
+
+    pub(super) async fn wait(&mut self) {
+        if self.since.elapsed() > STEADY {
+            *self = Self::new();
+        }
+        sleep(self.next).await;
+        self.next = (self.next * 2).min(Duration::from_secs(10));
+        self.since = std::time::Instant::now();
+    }
+}

@@ -1,0 +1,346 @@
+//! Sessions' sockets: accepting connections and admitting sessions.
+
+use std::{
+    cell::RefCell,
+    os::fd::{AsFd, BorrowedFd, OwnedFd},
+    rc::Rc,
+    sync::Arc,
+    time::Duration,
+};
+
+use axon_shm::{
+    ids::{Gid, SessionId},
+    internal::{
+        PeerProcess,
+        descriptors::{self, PassedFd},
+        peer_process,
+    },
+};
+use axon_transport::{
+    config::Config,
+    internal::{
+        SessionKey,
+        graph::Scope,
+        registry::{MAX_OF_PROCESS, SessionEntry, Tally},
+        session::daemon::socket,
+        text,
+        wire::session::{Hello, Message, PROTOCOL, Refused, Welcome},
+    },
+};
+use rustix::net::{AddressFamily, SocketFlags, SocketType, accept_with, socketpair};
+use tokio::{io::unix::AsyncFd, sync::Notify, task::spawn_local, time::timeout};
+
+use super::{
+    conversation::converse,
+    first::{First, first},
+    plane::Control,
+    strangers::{Stranger, Strangers},
+    turns::Turn,
+};
+use crate::{control::relayed::Far, gateway::watch::watch};
+
+/// How long a connection may take to say HELLO.
+const HELLO: Duration = Duration::from_secs(5);
+/// Between attempts when no connection can be accepted.
+const PAUSE: Duration = Duration::from_millis(50);
+/// Accepts sessions for as long as it is polled.
+pub(super) async fn accept(control: Rc<RefCell<Control>>, listeners: Vec<OwnedFd>) {
+    let strangers = Strangers::default();
+    let mut listeners = listeners.into_iter();
+    // A path, a name, or both.
+    let [first, second] = [listeners.next(), listeners.next()].map(|listener| async {
+        if let Some(listener) = listener {
+            accept_at(control.clone(), listener, strangers.clone()).await;
+        }
+    });
+    tokio::join!(first, second);
+}
+
+async fn accept_at(control: Rc<RefCell<Control>>, listener: OwnedFd, strangers: Strangers) {
+    let listener = match watch(listener) {
+        Ok(listener) => listener,
+        Err(error) => return tracing::error!(%error, "the session socket cannot be watched"),
+    };
+    let mut full = false;
+    loop {
+        let Ok(mut ready) = listener.readable().await else { return };
+        if descriptors::is_short() || descriptors::has_too_many_strangers() {
+            // Those that have a session keep it.
+            if !std::mem::replace(&mut full, true) {
+                tracing::error!("too many descriptors are open: no more sessions are accepted");
+            }
+            tokio::time::sleep(PAUSE).await;
+            continue;
+        }
+        full = false;
+        let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+        let accepted = ready.try_io(|l| Ok(accept_with(l.get_ref(), flags)?));
+        match accepted {
+            Ok(Ok(socket)) => {
+                let socket = PassedFd::connection(socket);
+                let pid = peer_process(&socket).map_or(0, |peer| peer.pid);
+                let stranger = strangers.add(pid);
+                spawn_local(serve(control.clone(), socket, Inside::No, Some(stranger)));
+                // Those that were served meanwhile go on.
+                tokio::task::yield_now().await;
+            }
+            Ok(Err(error)) => {
+                // Out of descriptors, or the caller has gone: neither ends the daemon.
+                tracing::warn!(%error, "a session could not be accepted");
+                tokio::time::sleep(PAUSE).await;
+            }
+            Err(_not_ready) => {}
+        }
+    }
+}
+
+/// Whose end of a socket pair it is that the daemon serves.
+pub(super) enum Inside {
+    /// Nobody's: somebody connected.
+    No,
+    /// The gateway's.
+    Gateway,
+    /// That of a relayed session of process `pid`.
+    Relay { pid: u32, tally: Arc<Tally>, key: Option<Arc<SessionKey>> },
+}
+
+/// Serves one connection to its end. It is a `stranger` until it said HELLO.
+pub(super) async fn serve(
+    control: Rc<RefCell<Control>>,
+    socket: PassedFd,
+    inside: Inside,
+    stranger: Option<Stranger>,
+) {
+    let Ok(peer) = peer_process(&socket) else { return };
+    if !control.borrow().admission.trusts(peer.uid) {
+        tracing::warn!(uid = peer.uid, pid = peer.pid, "a stranger's connection was closed");
+        return;
+    }
+    let Ok(socket) = watch(socket.trusted()) else { return };
+    let replaced = async {
+        match &stranger {
+            Some(stranger) => stranger.replaced().await,
+            None => std::future::pending().await,
+        }
+    };
+    let first = tokio::select! {
+        first = timeout(HELLO, first(&socket)) => first,
+        () = replaced => {
+            return tracing::warn!(
+                pid = peer.pid,
+                "too many connections say nothing: one of them was closed for another"
+            );
+        }
+    };
+    drop(stranger);
+    let Ok(Some(first)) = first else { return };
+    if first.hello.relay.is_some() {
+        return relay(&control, socket, first, peer);
+    }
+    let Some(Admitted { id, bell, turn, death }) = admit(&control, &socket, first, peer, &inside)
+    else {
+        return;
+    };
+    let why = converse(&control, &socket, id, &bell, &turn, death.as_ref()).await;
+    tracing::debug!(session = %id, why, "a session ended");
+    // Its descriptors are closed at once, its endpoints removed in its process's turns.
+    drop((socket, death));
+    loop {
+        {
+            let _turn = turn.lock().await;
+            if !control.borrow_mut().remove_some(&id, &bell) {
+                return;
+            }
+        }
+        tokio::task::yield_now().await;
+    }
+}
+
+/// Says something to somebody new, whose socket has room; whether it was said.
+pub(super) fn say(
+    socket: &AsyncFd<PassedFd>,
+    message: Message,
+    descriptors: &[BorrowedFd<'_>],
+) -> bool {
+    let packet = message.encode();
+    let sent = packet.map(|packet| socket::send(socket.get_ref(), &packet, descriptors));
+    matches!(sent, Ok(Ok(())))
+}
+
+/// Refuses somebody, and shows it.
+fn refuse(
+    control: &mut Control,
+    socket: &AsyncFd<PassedFd>,
+    name: &str,
+    peer: PeerProcess,
+    refused: Refused,
+) {
+    let what = if refused.variable.is_empty() { "session" } else { &refused.variable }.to_owned();
+    let who = format!("session {name} (pid {})", peer.pid);
+    control.refused(who, what, refused.text.clone());
+    say(socket, Message::Refused(refused), &[]);
+}
+
+/// What is shown of a session in log and status.
+fn shown(name: &str) -> String {
+    text::plain(name, 64)
+}
+
+/// Has a session relayed whose memory is not shared.
+fn relay(
+    control: &Rc<RefCell<Control>>,
+    socket: AsyncFd<PassedFd>,
+    first: First,
+    peer: PeerProcess,
+) {
+    let its_own = first.is_its_own();
+    let First { mut hello, descriptors, key } = first;
+    hello.name = shown(&hello.name);
+    let mut state = control.borrow_mut();
+    let reason = hello.relay.clone().unwrap_or_default();
+    let pair = || {
+        let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+        socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None)
+    };
+    let checked = its_own.and_then(|()| state.admission.check(&hello, descriptors, peer, false));
+    let checked = match checked {
+        Err(refused) => Err(*refused),
+        Ok(_)
+            if state.registry.relayed()
+                >= axon_transport::internal::session::relayed::MAX_SESSIONS =>
+        {
+            Err(Refused::because(format!(
+                "{} sessions are relayed already; one that shares memory is served",
+                axon_transport::internal::session::relayed::MAX_SESSIONS
+            )))
+        }
+        Ok(_) => {
+            pair().map_err(|error| Refused::because(format!("no socket to relay it by: {error}")))
+        }
+    };
+    let (ours, theirs) = match checked {
+        Ok(pair) => pair,
+        Err(refused) => return refuse(&mut state, &socket, &hello.name, peer, refused),
+    };
+    let tally = Arc::new(Tally::new(&reason));
+    tracing::info!(name = hello.name, pid = peer.pid, reason, "a session is relayed");
+    let inside = Inside::Relay { pid: peer.pid, tally: Arc::clone(&tally), key };
+    spawn_local(serve(control.clone(), ours.into(), inside, None));
+    let far = Far {
+        socket: socket.into_inner(),
+        inside: theirs,
+        config: scoped(&state.config, scope_of(&hello)),
+        name: hello.name,
+        id: hello.session,
+        tally,
+        pool: Arc::clone(&state.pool),
+    };
+    if let Err(error) = far.start() {
+        tracing::error!(%error, "no thread to relay a session");
+    }
+}
+
+/// How far a session is discovered, as it says.
+fn scope_of(hello: &Hello) -> Scope {
+    Scope::of(hello.range, hello.static_peers.clone().unwrap_or_default())
+}
+
+/// The daemon's settings with the range of a relayed session, under whose id they are used.
+fn scoped(config: &Config, scope: Scope) -> Arc<Config> {
+    let Scope { range, static_peers, .. } = scope;
+    let mut own = config.clone();
+    (own.range, own.static_peers) = (range, static_peers);
+    Arc::new(own)
+}
+
+/// A session that is served.
+struct Admitted {
+    id: SessionId,
+    bell: Rc<Notify>,
+    /// Its process's.
+    turn: Turn,
+    /// Tells that its process ended.
+    death: Option<AsyncFd<PassedFd>>,
+}
+
+fn admit(
+    control: &Rc<RefCell<Control>>,
+    socket: &AsyncFd<PassedFd>,
+    first: First,
+    peer: PeerProcess,
+    inside: &Inside,
+) -> Option<Admitted> {
+    let its_own = first.is_its_own();
+    let First { mut hello, descriptors, mut key } = first;
+    hello.name = shown(&hello.name);
+    let control = &mut *control.borrow_mut();
+    let gateway = matches!(inside, Inside::Gateway);
+    let admission = &mut control.admission;
+    let checked = its_own.and_then(|()| admission.check(&hello, descriptors, peer, gateway));
+    let handed = match checked {
+        Ok(handed) => handed,
+        Err(refused) => {
+            refuse(control, socket, &hello.name, peer, *refused);
+            return None;
+        }
+    };
+    let pid = if let Inside::Relay { pid, .. } = inside { *pid } else { peer.pid };
+    // Endpoints are named after their session's id: who has another's could end them.
+    if let Some(pid) = taken_by(control, &hello.session, pid) {
+        let text = format!("process {pid} has a session with this one's id or one like it");
+        refuse(control, socket, &hello.name, peer, Refused::because(text));
+        return None;
+    }
+    let same = |(_, entry): &(&SessionId, &SessionEntry<_>)| entry.pid == pid;
+    if !gateway && control.registry.sessions().filter(same).count() >= MAX_OF_PROCESS {
+        let text = format!("its process has {MAX_OF_PROCESS} sessions already");
+        refuse(control, socket, &hello.name, peer, Refused::because(text));
+        return None;
+    }
+    let death = match &handed {
+        Some([_, _, pidfd]) => Some(watch(pidfd.try_clone().ok()?).ok()?),
+        None => None,
+    };
+    let scope = (!gateway).then(|| scope_of(&hello));
+    let Hello { session, role, name, .. } = hello;
+    tracing::debug!(%session, name, pid, "a session");
+    let handed = handed.map(|fds| fds.map(Arc::new));
+    if let Err(violation) =
+        control.registry.connect(session, role, name.clone(), pid, handed, scope)
+    {
+        refuse(control, socket, &name, peer, Refused::because(violation.to_string()));
+        return None;
+    }
+    control.relist();
+    if let Inside::Relay { tally, key: of_process, .. } = inside {
+        control.registry.set_relayed(&session, Arc::clone(tally));
+        key = of_process.clone();
+    }
+    if let Some(key) = key {
+        control.keys_of_sessions.insert(key);
+    }
+    let turn = control.turns.of(pid);
+    let pid = std::process::id();
+    let welcome = Welcome { protocol: PROTOCOL, daemon: control.id, pid, ranges: Some(true) };
+    let probe: Vec<BorrowedFd<'_>> = control.probe.iter().map(AsFd::as_fd).collect();
+    if !say(socket, Message::Welcome(welcome), &probe) {
+        control.registry.disconnect(&session);
+        control.keys_of_sessions.remove(&session);
+        control.settle();
+        return None;
+    }
+    let bell = control.add_waker(session);
+    control.settle();
+    Some(Admitted { id: session, bell, turn, death })
+}
+
+/// The process of a session whose endpoints have the same GIDs as those of `session`, of process
+/// `pid`, would have. The session itself may come back.
+fn taken_by(control: &Control, session: &SessionId, pid: u32) -> Option<u32> {
+    let alike = |id: &SessionId| Gid::new(*id, 0) == Gid::new(*session, 0);
+    let mut others = control.registry.sessions();
+    others
+        // A process that cannot be seen could be any.
+        .find(|(id, entry)| alike(id) && (*id != session || entry.pid != pid || pid == 0))
+        .map(|(_, entry)| entry.pid)
+}

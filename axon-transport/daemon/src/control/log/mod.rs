@@ -1,0 +1,86 @@
+//! The log of a daemon: lines on standard error, or in a file that is rotated.
+//!
+//! Logging never ends a daemon: a line that cannot be written is dropped. A peer or another user
+//! cannot fill a file system with it either: each kind of line has a rate (`throttle`), and the
+//! file a size (`output`).
+
+mod output;
+mod throttle;
+
+use std::{fmt, time::Instant};
+
+use axon_transport::{config::Config, internal::text::is_plain};
+use tracing::{Event, Level, Subscriber, callsite};
+use tracing_subscriber::{
+    EnvFilter,
+    fmt::{
+        FmtContext, FormatEvent, FormatFields,
+        format::{Format, Writer},
+    },
+    registry::LookupSpan,
+};
+
+pub(super) use self::output::keep_in;
+use self::throttle::Throttle;
+
+/// Sends what this process logs to standard error, filtered by `AXON_LOG`. For a program's `main`;
+/// where a subscriber is set already, that one stays.
+pub fn start(config: &Config) {
+    // A program that checks its configuration refuses a wrong filter; warnings are shown without one.
+    let filter = EnvFilter::try_new(&config.log).unwrap_or_else(|_| EnvFilter::new("warn"));
+    let set = tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(|| output::Output)
+        // What cannot be written is dropped; the default prints that to standard error, and panics
+        // where that fails as well.
+        .log_internal_errors(false)
+        .event_format(Lines { format: Format::default(), throttle: Throttle::default() })
+        .try_init();
+    if set.is_err() {
+        tracing::debug!("logging was set up before");
+    }
+}
+
+/// One line for each event, of plain characters, and not too many of a kind.
+struct Lines {
+    format: Format,
+    /// By the place in the code, and not by the text: the cause of a flood may choose the text.
+    throttle: Throttle<callsite::Identifier>,
+}
+
+impl<S, N> FormatEvent<S, N> for Lines
+where
+    S: Subscriber + for<'a> LookupSpan<'a>,
+    N: for<'a> FormatFields<'a> + 'static,
+{
+    fn format_event(
+        &self,
+        context: &FmtContext<'_, S, N>,
+        mut writer: Writer<'_>,
+        event: &Event<'_>,
+    ) -> fmt::Result {
+        let metadata = event.metadata();
+        let left_out = if *metadata.level() <= Level::INFO {
+            match self.throttle.admit(metadata.callsite(), Instant::now()) {
+                Some(left_out) => left_out,
+                None => return Ok(()),
+            }
+        } else {
+            // DEBUG and TRACE are only on where somebody asked for all details.
+            0
+        };
+        let mut line = String::new();
+        self.format.format_event(context, Writer::new(&mut line), event)?;
+        for c in line.trim_end_matches('\n').chars() {
+            if is_plain(c) {
+                writer.write_char(c)?;
+            } else {
+                write!(writer, "{}", c.escape_unicode())?;
+            }
+        }
+        if left_out > 0 {
+            write!(writer, " ({left_out} lines of this kind were left out before)")?;
+        }
+        writer.write_char('\n')
+    }
+}

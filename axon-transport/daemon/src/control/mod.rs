@@ -1,0 +1,25 @@
+//! The control plane: brings the sessions of one user and domain on this host together, and with those on
+//! other hosts.
+//!
+//! It runs on the thread that calls [`run`]. The gateway to other hosts runs on a thread and runtime of its
+//! own; `gateway::bridge` is all they share. Samples between processes of this host pass neither.
+
+mod admission;
+mod conversation;
+mod detach;
+mod first;
+mod gateway;
+mod listen;
+pub mod log;
+mod plane;
+mod relayed;
+mod remote;
+mod report;
+mod run;
+mod strangers;
+mod topics;
+mod turns;
+
+pub use detach::Report;
+pub use gateway::GatewayEntry;
+pub use run::{DaemonError, DaemonOptions, Start, main, run};

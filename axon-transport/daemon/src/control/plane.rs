@@ -1,0 +1,287 @@
+//! The state of the control plane in a running daemon. One thread uses it, and no borrow of it lives across
+//! an await.
+
+use std::{
+    collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
+    net::IpAddr,
+    os::fd::OwnedFd,
+    rc::Rc,
+    sync::Arc,
+    time::Instant,
+};
+
+use axon_shm::{
+    ids::{DaemonId, SessionId},
+    internal::{descriptors::PassedFd, probe},
+};
+use axon_transport::{
+    config::Config,
+    internal::{
+        registry::Registry,
+        session::{daemon::address::Address, relayed::Pool},
+    },
+    status::{LinkStatus, RefusalStatus, TrafficStatus, unix_ms},
+};
+use tokio::sync::{Notify, watch};
+
+use super::{admission::Admission, turns::Turns};
+use crate::{
+    discovery::Wanted,
+    gateway::bridge::{OTHER_TOPICS, ToControl},
+    owner::SessionKeys,
+};
+
+/// Refusals that are remembered.
+const REFUSALS: usize = 32;
+/// Topics whose losses on the way to other hosts are remembered.
+const TOPICS_WITH_LOSSES: usize = 1024;
+
+pub(super) struct Control {
+    pub(super) config: Arc<Config>,
+    pub(super) admission: Admission,
+    pub(super) id: DaemonId,
+    pub(super) started: Instant,
+    pub(super) address: Address,
+    pub(super) registry: Registry<Arc<PassedFd>>,
+    pub(super) links: BTreeMap<String, LinkStatus>,
+    pub(super) refusals: VecDeque<RefusalStatus>,
+    /// Samples that did not get to other hosts, by topic and cause.
+    pub(super) lost: BTreeMap<String, BTreeMap<&'static str, u64>>,
+    /// Whether samples of publishers that ended are on their way to other hosts.
+    draining: bool,
+    pub(super) keys: serde_json::Value,
+    pub(super) port: Option<u16>,
+    pub(super) gateway: String,
+    /// The sessions' own keys, with which the gateway proves that they are this daemon's.
+    pub(super) keys_of_sessions: Arc<SessionKeys>,
+    /// For the samples that arrive over relays.
+    pub(super) pool: Arc<Pool>,
+    /// Memory that sessions try whether they can map it.
+    pub(super) probe: Option<OwnedFd>,
+    /// Packets that were exchanged with sessions.
+    pub(super) traffic: TrafficStatus,
+    /// The range and the hosts of discovery: what the widest session needs.
+    pub(super) wanted: watch::Sender<Wanted>,
+    /// The addresses that names of static peers have.
+    names: BTreeMap<String, Vec<IpAddr>>,
+    /// Where linked peers are.
+    linked: BTreeMap<DaemonId, IpAddr>,
+    wakers: HashMap<SessionId, Rc<Notify>>,
+    pub(super) turns: Turns,
+    /// Wakes the task that flushes the graph.
+    pub(super) changed: Rc<Notify>,
+    /// Whether there is an application, and what wakes the task that waits for that to change.
+    needed: bool,
+    pub(super) need: Rc<Notify>,
+}
+
+impl Control {
+    pub(super) fn new(config: Arc<Config>, settings: Vec<(String, String)>) -> Self {
+        Self {
+            admission: Admission::new(Arc::clone(&config), settings),
+            id: DaemonId::random(),
+            started: Instant::now(),
+            address: Address::of(&config),
+            registry: Registry::default(),
+            links: BTreeMap::new(),
+            refusals: VecDeque::new(),
+            lost: BTreeMap::new(),
+            draining: false,
+            keys: serde_json::Value::Null,
+            port: None,
+            gateway: "off".into(),
+            keys_of_sessions: Arc::default(),
+            pool: Pool::new(config.reliable_queue),
+            probe: probe().inspect_err(|error| tracing::error!(%error, "no memory to try")).ok(),
+            traffic: TrafficStatus::default(),
+            wanted: watch::Sender::new(Wanted::of(&config, [])),
+            names: BTreeMap::new(),
+            linked: BTreeMap::new(),
+            wakers: HashMap::new(),
+            turns: Turns::default(),
+            config,
+            changed: Rc::default(),
+            needed: false,
+            need: Rc::default(),
+        }
+    }
+
+    /// The bell of a session's task.
+    pub(super) fn add_waker(&mut self, id: SessionId) -> Rc<Notify> {
+        let bell = Rc::new(Notify::new());
+        // The task of a connection that is replaced ends at once, and with it its descriptors.
+        if let Some(replaced) = self.wakers.insert(id, bell.clone()) {
+            replaced.notify_one();
+        }
+        bell
+    }
+
+    /// A session's task ends: removes a part of what is left of the session; whether there is more.
+    /// `bell` is its own: a session that came back has another.
+    pub(super) fn remove_some(&mut self, id: &SessionId, bell: &Rc<Notify>) -> bool {
+        if !self.is_current(id, bell) {
+            return false;
+        }
+        let more = self.registry.disconnect_some(id);
+        if !more {
+            self.wakers.remove(id);
+            self.keys_of_sessions.remove(id);
+        }
+        self.settle();
+        more
+    }
+
+    /// Whether `bell` is still that of the session's task.
+    pub(super) fn is_current(&self, id: &SessionId, bell: &Rc<Notify>) -> bool {
+        self.wakers.get(id).is_some_and(|current| Rc::ptr_eq(current, bell))
+    }
+
+    /// Wakes the tasks of sessions that got something to be told.
+    pub(super) fn settle(&mut self) {
+        self.registry.answer_fences();
+        for (id, why) in self.registry.take_refused() {
+            let who = self.registry.session(&id).map_or_else(
+                || format!("session {id}"),
+                |session| format!("session {} (pid {})", session.name, session.pid),
+            );
+            self.refused(who, "endpoint".into(), why);
+        }
+        for id in self.registry.take_ready() {
+            if let Some(bell) = self.wakers.get(&id) {
+                bell.notify_one();
+            }
+        }
+        if self.registry.take_rescoped() {
+            let wanted = Wanted::of(&self.config, self.registry.scopes());
+            self.wanted
+                .send_if_modified(|known| std::mem::replace(known, wanted.clone()) != wanted);
+        }
+        self.changed.notify_one();
+        let needed = self.is_needed();
+        if std::mem::replace(&mut self.needed, needed) != needed {
+            self.need.notify_one();
+        }
+    }
+
+    /// Whether there is an application, or something on its way to another host.
+    pub(super) fn is_needed(&self) -> bool {
+        self.draining || self.registry.is_needed()
+    }
+
+    /// Samples of a topic did not get to another host.
+    fn lost(&mut self, topic: String, cause: &'static str, samples: u64) {
+        let there = self.lost.contains_key(&topic) || self.lost.len() < TOPICS_WITH_LOSSES;
+        let topic = if there { topic } else { OTHER_TOPICS.to_owned() };
+        let count = self.lost.entry(topic).or_default().entry(cause).or_default();
+        *count = count.saturating_add(samples);
+    }
+
+    /// Answers a session that asks for the status. One that asks again before it has taken the
+    /// answer gets the same one from its beginning.
+    pub(super) fn send_status(&mut self, id: &SessionId) {
+        if self.registry.repeat_status(id) {
+            return;
+        }
+        let text = match serde_json::to_vec(&super::report::status(self)) {
+            Ok(text) => text,
+            Err(error) => {
+                tracing::error!(%error, "the status cannot be written");
+                Vec::new()
+            }
+        };
+        self.registry.tell_status(id, text.into());
+    }
+
+    pub(super) fn refused(&mut self, peer: String, what: String, reason: String) {
+        tracing::warn!(peer, what, reason, "refused");
+        // The same peer refused for the same cause again is the same news.
+        self.refusals.retain(|r| r.peer != peer || r.what != what || r.reason != reason);
+        if self.refusals.len() == REFUSALS {
+            self.refusals.pop_front();
+        }
+        self.refusals.push_back(RefusalStatus { unix_ms: unix_ms(), peer, what, reason });
+    }
+
+    /// What the gateway says, but for what concerns discovery alone.
+    pub(super) fn gateway_says(&mut self, message: ToControl) {
+        match message {
+            ToControl::Started { port } => {
+                self.port = Some(port);
+                self.gateway = "running".into();
+            }
+            ToControl::LinkUp { daemon, address } => self.linked_at(daemon, address.ip()),
+            ToControl::RemoteGraph { daemon, reset, added, removed } => {
+                self.registry.remote_graph(daemon, reset, added, removed);
+            }
+            ToControl::Link(status) => {
+                // A peer may have moved.
+                let daemon = self.linked.keys().find(|d| d.to_string() == status.peer).copied();
+                let address = status.address.parse::<std::net::SocketAddr>();
+                if let (Some(daemon), Ok(address)) = (daemon, address) {
+                    self.linked_at(daemon, address.ip());
+                }
+                self.links.insert(status.peer.clone(), *status);
+            }
+            ToControl::LinkDown { daemon, reason } => {
+                tracing::info!(%daemon, reason, "link down");
+                self.links.remove(&daemon.to_string());
+                self.registry.remote_gone(&daemon);
+                self.linked.remove(&daemon);
+                self.relist();
+            }
+            ToControl::Refusal { peer, what, reason } => self.refused(peer, what, reason),
+            ToControl::Keys(keys) => self.keys = keys,
+            ToControl::Lost { topic, cause, samples } => self.lost(topic, cause, samples),
+            ToControl::Draining(draining) => self.draining = draining,
+            ToControl::DialFailed { .. } | ToControl::Datagram { .. } | ToControl::Finished => {}
+        }
+        self.settle();
+    }
+
+    /// The addresses that names of static peers have now.
+    pub(super) fn named(&mut self, names: BTreeMap<String, Vec<IpAddr>>) {
+        self.names = names;
+        self.relist();
+        self.settle();
+    }
+
+    fn linked_at(&mut self, daemon: DaemonId, address: IpAddr) {
+        let address = address.to_canonical();
+        if self.linked.insert(daemon, address) != Some(address) {
+            self.relist();
+        }
+    }
+
+    /// Decides anew which linked peers each session lists: those whose link is at an address that one
+    /// of its static peers has. What beacons say of addresses does not count, as anybody can write it.
+    pub(super) fn relist(&mut self) {
+        let (names, linked) = (&self.names, &self.linked);
+        self.registry.relist(|peers| {
+            let addresses: BTreeSet<IpAddr> = peers
+                .iter()
+                .flat_map(|peer| match peer.parse::<IpAddr>() {
+                    Ok(address) => vec![address.to_canonical()],
+                    Err(_) => names.get(peer).cloned().unwrap_or_default(),
+                })
+                .collect();
+            let listed = linked.iter().filter(|(_, address)| addresses.contains(address));
+            listed.map(|(daemon, _)| *daemon).collect()
+        });
+    }
+
+    /// The gateway is no more, and with it everything that was known of other hosts.
+    pub(super) fn gateway_ended(&mut self, why: &str) {
+        self.gateway = why.to_owned();
+        self.port = None;
+        self.draining = false;
+        self.links.clear();
+        self.linked.clear();
+        self.relist();
+        let daemons: BTreeSet<DaemonId> =
+            self.registry.remote_endpoints().map(|(daemon, _)| *daemon).collect();
+        for daemon in daemons {
+            self.registry.remote_gone(&daemon);
+        }
+        self.settle();
+    }
+}

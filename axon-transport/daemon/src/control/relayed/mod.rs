@@ -1,0 +1,441 @@
+//! The daemon's end of a relayed session: holds the session's endpoints in memory that every session can
+//! map. One thread `axon-relay` for each session.
+
+mod matching;
+#[cfg(test)]
+mod tests;
+
+use std::{
+    collections::{BTreeMap, BTreeSet, VecDeque},
+    os::fd::{AsFd, OwnedFd},
+    sync::Arc,
+    time::Instant,
+};
+
+use axon_shm::{
+    ExternalLeader,
+    ids::{Gid, SessionId},
+    internal::{descriptors::PassedFd, peer_pidfd},
+};
+use axon_transport::{
+    Node, Session, SessionError, SessionOptions, Subscription,
+    config::Config,
+    graph::{Endpoint, EndpointKind, GraphView},
+    internal::{
+        events::Alive,
+        log_limit::LogLimit,
+        registry::Tally,
+        session::{
+            RemoteWriter,
+            daemon::socket::{self, SocketError},
+            relayed::{
+                LINGER, MAX_CALLERS, MAX_ENDPOINTS, Pool,
+                calls::{self, Calls},
+                change_signal::ChangeSignal,
+                flow::{Channel, Incoming},
+                pipe::{End, Loss, Pipe},
+            },
+        },
+        wire::session::{
+            Announce, Asserted, EndpointRole, GivenUp, Leaving, Matched, Message, PROTOCOL,
+            Refused, Welcome,
+        },
+    },
+};
+use rustix::io::Errno;
+
+use self::matching::{Source, take};
+
+/// What a relay is started with.
+pub(crate) struct Far {
+    /// The session's connection.
+    pub(crate) socket: PassedFd,
+    /// One end of a socket pair, at whose other end the control plane serves.
+    pub(crate) inside: OwnedFd,
+    pub(crate) config: Arc<Config>,
+    /// The session's name and id.
+    pub(crate) name: String,
+    pub(crate) id: SessionId,
+    pub(crate) tally: Arc<Tally>,
+    pub(crate) pool: Arc<Pool>,
+}
+
+impl Far {
+    /// Serves the session on a thread of its own, until it or the control plane ends it.
+    pub(crate) fn start(self) -> std::io::Result<()> {
+        std::thread::Builder::new().name("axon-relay".into()).spawn(move || self.run()).map(drop)
+    }
+
+    fn run(self) {
+        let id = self.id;
+        match self.open().and_then(Served::serve) {
+            Ok(()) => {}
+            Err(End::Socket(SocketError::Closed)) => {
+                tracing::debug!(session = %id, "a relayed session ended");
+            }
+            Err(why) => tracing::warn!(session = %id, %why, "a relayed session was disconnected"),
+        }
+    }
+
+    fn open(self) -> Result<Served, End> {
+        let Self { socket, inside, config, name, id, tally, pool } = self;
+        let say = |message: Message| {
+            let packet = message.encode().map_err(|e| End::Other(e.to_string()))?;
+            // The connection is new: its buffer has room.
+            Ok::<(), End>(socket::send(&socket, &packet, &[])?)
+        };
+        let process = match peer_pidfd(&socket) {
+            Ok(process) => Some(process),
+            Err(Errno::SRCH) => return Err(End::Gone),
+            // It is served as long as somebody holds the connection.
+            Err(error) => {
+                tracing::debug!(session = %id, %error, "the end of its process will not be seen");
+                None
+            }
+        };
+        let options = SessionOptions::new(name).callers(MAX_CALLERS);
+        let session = match Session::over_as(id, inside, &config, options) {
+            Ok(session) => session,
+            Err(error) => {
+                say(Message::Refused(Refused::because(error.to_string())))?;
+                return Err(failed(&error));
+            }
+        };
+        let change_signal = ChangeSignal::new().map_err(|e| End::Other(e.to_string()))?;
+        change_signal.of(&session);
+        let leader = session.segment().external_leader().map_err(|e| End::Other(e.to_string()))?;
+        let daemon = session.daemon().unwrap_or_default();
+        let pid = std::process::id();
+        let welcome = Welcome { protocol: PROTOCOL, daemon, pid, ranges: Some(true) };
+        say(Message::Welcome(welcome))?;
+        let incoming = Incoming::new(config.max_message, pool);
+        Ok(Served {
+            id,
+            pipe: Pipe::new(socket, incoming, Arc::clone(&tally)),
+            tally,
+            writers: BTreeMap::new(),
+            subscriptions: BTreeMap::new(),
+            nodes: BTreeMap::new(),
+            told: BTreeMap::new(),
+            sources: BTreeMap::new(),
+            calls: Calls::default(),
+            callers: BTreeMap::new(),
+            alive: Alive::default(),
+            unreached: BTreeMap::new(),
+            graph: Arc::default(),
+            left: VecDeque::new(),
+            given_up: LogLimit::default(),
+            leader,
+            change_signal,
+            process,
+            session,
+        })
+    }
+}
+
+fn failed(error: &SessionError) -> End {
+    End::Other(error.to_string())
+}
+
+/// Samples of one publisher that do not get where they are to go.
+#[derive(Default)]
+struct Unreached {
+    /// Those that came and could not be written.
+    unwritten: u64,
+    /// How many its process was told of.
+    told: u64,
+}
+
+impl Unreached {
+    /// How many are to be told of, if readers gave up so many in all.
+    fn news(&mut self, given_up: u64) -> u64 {
+        let all = given_up.saturating_add(self.unwritten);
+        all.saturating_sub(std::mem::replace(&mut self.told, all))
+    }
+}
+
+/// A session that is served.
+struct Served {
+    id: SessionId,
+    pipe: Pipe,
+    tally: Arc<Tally>,
+    /// Its publishers, clients and servers.
+    writers: BTreeMap<Gid, RemoteWriter>,
+    subscriptions: BTreeMap<Gid, Subscription>,
+    nodes: BTreeMap<Gid, Node>,
+    /// The others that each endpoint was said to be matched with.
+    told: BTreeMap<Gid, BTreeSet<Gid>>,
+    /// The publishers whose samples the session gets.
+    sources: BTreeMap<Gid, Source>,
+    /// What is asked of its servers.
+    calls: Calls,
+    /// The clients that its process has for each of its servers: whose responses may come.
+    callers: BTreeMap<Gid, BTreeSet<Gid>>,
+    alive: Alive,
+    /// What its publishers lost.
+    unreached: BTreeMap<Gid, Unreached>,
+    /// The graph as it was told.
+    graph: Arc<GraphView>,
+    /// The pairs, an endpoint of the session first, of which the other is gone and has left something,
+    /// in the order in which they went.
+    left: VecDeque<(Gid, Gid)>,
+    /// Those of them that were given up.
+    given_up: LogLimit,
+    leader: ExternalLeader,
+    change_signal: Arc<ChangeSignal>,
+    process: Option<OwnedFd>,
+    /// Last: what is above is of it.
+    session: Session,
+}
+
+impl Served {
+    fn serve(mut self) -> Result<(), End> {
+        let mut begun = false;
+        loop {
+            self.leader.clear();
+            let waits = self.pipe.waits_for_readers();
+            self.leader.arm(waits);
+            let signalled = self.change_signal.take() | !std::mem::replace(&mut begun, true);
+            if self.change_signal.is_lost() {
+                // Most often the daemon ends, and its process with it. Its readers shall not say before
+                // that they have left: what they had not delivered is kept for the next daemon.
+                self.pipe.hang_up();
+                std::thread::sleep(LINGER);
+                return Err(End::Other("the control plane dropped it".into()));
+            }
+            let (messages, more) = self.pipe.receive()?;
+            let changed = messages.iter().any(|m| !matches!(m, Message::Credit(_)));
+            messages.into_iter().try_for_each(|message| self.handle(message))?;
+            if signalled {
+                self.tell_refused()?;
+                self.tell_graph()?;
+            }
+            if signalled || changed || !self.left.is_empty() {
+                self.match_up()?;
+            }
+            let leased = self.subscriptions.values().flat_map(Subscription::assertions);
+            for publishers in self.alive.news(Instant::now(), leased) {
+                self.pipe.say(&Message::Asserted(Asserted { publishers }))?;
+            }
+            self.write()?;
+            if self.pipe.is_over() {
+                return self.wind_up();
+            }
+            let writers = &self.writers;
+            let find = |gid: &Gid| writers.get(gid);
+            let (sources, subscriptions) = (&mut self.sources, &self.subscriptions);
+            let calls = &mut self.calls;
+            let sent = self.pipe.send(|channel| {
+                if channel.client.is_some() {
+                    calls::response(channel, find)
+                } else if let Some(source) = sources.get_mut(&channel.writer) {
+                    take(source, subscriptions, &channel.writer)
+                } else {
+                    calls.request(&channel.writer, find)
+                }
+            })?;
+            let passed = self.pass_over();
+            if more || sent || passed || self.pipe.waits_for_readers() && !waits {
+                self.leader.disarm();
+                continue;
+            }
+            let process = self.process.as_ref().map(AsFd::as_fd);
+            let left = self.alive.left(Instant::now());
+            self.pipe.sleep(&self.leader, &self.change_signal, process, left);
+        }
+    }
+
+    /// Writes what came, and tells the process what became of it.
+    fn write(&mut self) -> Result<(), End> {
+        let (writers, tally, unreached) = (&self.writers, &self.tally, &mut self.unreached);
+        let credits = self.pipe.write(
+            |gid| writers.get(gid),
+            |gid, loss| {
+                tally.lost(loss.samples());
+                if let Loss::Unwritten = loss {
+                    unreached.entry(*gid).or_default().unwritten += 1;
+                }
+            },
+        );
+        let publishers: BTreeSet<Gid> = credits.iter().map(|credit| credit.publisher).collect();
+        for writer in publishers {
+            let Some(given_up) = self.writers.get(&writer).and_then(RemoteWriter::given_up) else {
+                continue;
+            };
+            let samples = self.unreached.entry(writer).or_default().news(given_up);
+            if samples > 0 {
+                // Ahead of the credit by which they count as acknowledged.
+                self.pipe.say(&Message::GivenUp(GivenUp { reader: writer, writer, samples }))?;
+            }
+        }
+        self.pipe.give_back(credits)
+    }
+
+    /// The process is gone, and was heard to the end: what it wrote goes to readers that make room for it
+    /// soon, while nobody counts it any more.
+    fn wind_up(mut self) -> Result<(), End> {
+        let end = Instant::now() + LINGER;
+        self.subscriptions.clear();
+        self.nodes.clear();
+        self.writers.values().for_each(|remote_writer| remote_writer.leave(true));
+        while self.pipe.is_blocked() && !self.change_signal.is_lost() && Instant::now() < end {
+            self.leader.clear();
+            self.leader.arm(true);
+            self.change_signal.take();
+            self.write()?;
+            if self.pipe.is_blocked() {
+                let left = end.saturating_duration_since(Instant::now());
+                self.pipe.sleep(&self.leader, &self.change_signal, None, Some(left));
+            }
+        }
+        let samples = self.pipe.arrived();
+        if samples > 0 {
+            tracing::warn!(session = %self.id, samples, "what a process left is not taken: lost");
+        }
+        Err(SocketError::Closed.into())
+    }
+
+    fn handle(&mut self, message: Message) -> Result<(), End> {
+        match message {
+            Message::Endpoint(announce) => self.announce(announce),
+            Message::EndpointGone(gone) => {
+                self.forget(&gone.gid);
+                self.pipe.say(&Message::EndpointGone(gone))
+            }
+            Message::Leaving(Leaving { gid, leaving }) => {
+                // It may have been refused.
+                if let Some(remote_writer) = self.writers.get(&gid) {
+                    remote_writer.leave(leaving);
+                }
+                Ok(())
+            }
+            Message::Matched(matched) => self.callers(matched),
+            Message::Asserted(asserted) => {
+                let own = asserted.publishers.iter().filter_map(|gid| self.writers.get(gid));
+                own.for_each(RemoteWriter::assert_alive);
+                Ok(())
+            }
+            Message::Credit(credit) => {
+                self.pipe.outgoing.credit(&credit);
+                if let Some(source) = self.sources.get_mut(&credit.publisher) {
+                    source.done = source.done.max(credit.done);
+                    source.acknowledge(&self.subscriptions, &credit.publisher);
+                }
+                Ok(())
+            }
+            Message::Unknown(_) => Ok(()),
+            _ => Err(End::Other("it sent a message that no relayed session sends".into())),
+        }
+    }
+
+    fn announce(&mut self, announce: Announce) -> Result<(), End> {
+        let Announce { endpoint, role, .. } = announce;
+        let gid = endpoint.gid;
+        if role != EndpointRole::Application || !gid.is_of(&self.id) {
+            return Err(End::Other(format!("endpoint {gid} is not its own")));
+        }
+        let known = self.writers.contains_key(&gid)
+            || self.subscriptions.contains_key(&gid)
+            || self.nodes.contains_key(&gid);
+        let refusal = match endpoint.kind {
+            _ if known => return Ok(()),
+            _ if !endpoint.is_sane() => Some("a name, type hash or depth out of bounds"),
+            kind if self.count(kind) >= MAX_ENDPOINTS => {
+                Some("a relayed session may have no more of its kind")
+            }
+            _ => None,
+        };
+        match refusal {
+            Some(text) => self.refuse(&endpoint, text),
+            None => self.adopt(endpoint),
+        }
+    }
+
+    fn count(&self, kind: EndpointKind) -> usize {
+        match kind {
+            EndpointKind::Subscription => self.subscriptions.len(),
+            EndpointKind::Node => self.nodes.len(),
+            _ => self
+                .writers
+                .values()
+                .filter(|remote_writer| remote_writer.endpoint().kind == kind)
+                .count(),
+        }
+    }
+
+    fn adopt(&mut self, endpoint: Endpoint) -> Result<(), End> {
+        let gid = endpoint.gid;
+        match endpoint.kind {
+            EndpointKind::Subscription => {
+                self.subscriptions.insert(gid, self.session.adopt_subscription(endpoint));
+            }
+            EndpointKind::Node => {
+                self.nodes.insert(gid, self.session.adopt_node(endpoint));
+            }
+            kind => match RemoteWriter::adopt(&self.session, endpoint.clone()) {
+                Ok(remote_writer) => {
+                    self.writers.insert(gid, remote_writer);
+                    // A server's responses are a channel for each of its clients.
+                    if kind != EndpointKind::Server {
+                        self.pipe.open_in(Channel::of(gid))?;
+                    }
+                }
+                Err(error) => self.refuse(&endpoint, &error.to_string())?,
+            },
+        }
+        Ok(())
+    }
+
+    /// An endpoint is gone. What it was sent is not wanted any more from here on, as both ends know by
+    /// the answer: its channels must not be taken for those of another that come after them.
+    fn forget(&mut self, gid: &Gid) {
+        if self.writers.remove(gid).is_some() {
+            self.pipe.retain(|channel| channel.writer != *gid);
+        }
+        self.subscriptions.remove(gid);
+        self.nodes.remove(gid);
+        self.callers.remove(gid);
+        self.unreached.remove(gid);
+        if self.told.remove(gid).is_some() {
+            self.close_unwanted();
+        }
+    }
+
+    /// The process has what stands for these clients of a server, whose responses they get by way of it.
+    fn callers(&mut self, matched: Matched) -> Result<(), End> {
+        let Matched { gid, others } = matched;
+        let others: BTreeSet<Gid> = others.into_iter().collect();
+        match self.writers.get(&gid) {
+            Some(RemoteWriter::Server(_)) => {}
+            // It was refused.
+            None if gid.is_of(&self.id) => return Ok(()),
+            _ => return Err(End::Other(format!("{gid} is no server of its own"))),
+        }
+        self.callers.remove(&gid);
+        let elsewhere: usize = self.callers.values().map(BTreeSet::len).sum();
+        if elsewhere + others.len() > MAX_CALLERS {
+            return Err(End::Other(format!("its servers answer more than {MAX_CALLERS} clients")));
+        }
+        let wanted = |client: Option<Gid>| client.is_some_and(|client| others.contains(&client));
+        self.pipe.retain(|channel| channel.writer != gid || wanted(channel.client));
+        for client in &others {
+            self.pipe.open_in(Channel::between(gid, *client))?;
+        }
+        self.callers.insert(gid, others);
+        Ok(())
+    }
+
+    /// What the control plane does not take, its process is told of as of what is refused here.
+    fn tell_refused(&mut self) -> Result<(), End> {
+        for (gid, text) in self.session.refused() {
+            self.forget(&gid);
+            let refused = Refused { endpoint: Some(gid), ..Refused::because(text) };
+            self.pipe.say(&Message::Refused(refused))?;
+        }
+        Ok(())
+    }
+
+    fn refuse(&mut self, endpoint: &Endpoint, why: &str) -> Result<(), End> {
+        self.pipe.say(&Message::Refused(Refused::of(endpoint, why)))
+    }
+}

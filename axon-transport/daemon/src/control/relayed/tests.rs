@@ -1,0 +1,105 @@
+//! A relay whose process and whose control plane are played by the test.
+
+use std::time::Duration;
+
+use axon_shm::{ids::DaemonId, qos::Qos};
+use axon_transport::config::OsFiles;
+use rustix::{
+    event::{PollFd, PollFlags, poll},
+    net::{AddressFamily, SocketFlags, SocketType, socketpair},
+};
+
+use super::*;
+
+/// Only what was lost takes this long.
+const EVER: Duration = Duration::from_secs(60);
+
+fn pair() -> [OwnedFd; 2] {
+    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+    socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None).unwrap().into()
+}
+
+fn say(socket: &OwnedFd, message: &Message) {
+    socket::send(socket, &message.encode().unwrap(), &[]).unwrap();
+}
+
+/// The next message of those that `pick` wants.
+#[track_caller]
+fn hear<T>(socket: &OwnedFd, mut pick: impl FnMut(Message) -> Option<T>) -> T {
+    loop {
+        match socket::receive(socket, &mut Vec::new()) {
+            Ok(received) => {
+                if let Some(picked) = pick(received.message) {
+                    return picked;
+                }
+            }
+            Err(SocketError::NotReady) => {
+                let mut fds = [PollFd::new(socket, PollFlags::IN)];
+                assert_eq!(poll(&mut fds, Some(&EVER.try_into().unwrap())), Ok(1), "in vain");
+            }
+            Err(error) => panic!("{error}"),
+        }
+    }
+}
+
+#[test]
+fn what_the_control_plane_refuses_its_process_is_told_of() {
+    let ([process, far], [control, inside]) = (pair(), pair());
+    let id = SessionId::random();
+    let relay = Far {
+        socket: PassedFd::connection(far),
+        inside,
+        config: Arc::new(Config::resolve([], None, &OsFiles).unwrap()),
+        name: "t".into(),
+        id,
+        tally: Arc::default(),
+        pool: Pool::new(0),
+    };
+    relay.start().unwrap();
+    hear(&control, |message| matches!(message, Message::Hello(_)).then_some(()));
+    let pid = std::process::id();
+    let welcome =
+        Welcome { protocol: PROTOCOL, daemon: DaemonId([7; 16]), pid, ranges: Some(true) };
+    say(&control, &Message::Welcome(welcome));
+    hear(&process, |message| matches!(message, Message::Welcome(_)).then_some(()));
+    let all = [
+        EndpointKind::Publisher,
+        EndpointKind::Subscription,
+        EndpointKind::Client,
+        EndpointKind::Server,
+        EndpointKind::Node,
+    ];
+    for (number, kind) in (1..).zip(all) {
+        let named = |name: &str| if kind == EndpointKind::Node { "" } else { name }.to_owned();
+        let endpoint = Endpoint {
+            gid: Gid::new(id, number),
+            kind,
+            topic: named("/t"),
+            type_name: named("T"),
+            type_hash: Vec::new(),
+            qos: Qos::default(),
+            node: "n".into(),
+            namespace: String::new(),
+            enclave: String::new(),
+        };
+        let (gid, role) = (endpoint.gid, EndpointRole::Application);
+        let (stands_for, ring, only) = (Vec::new(), None, None);
+        say(&process, &Message::Endpoint(Announce { endpoint, role, stands_for, ring, only }));
+        let announced = hear(&control, |message| match message {
+            Message::Endpoint(announce) => Some(announce.endpoint),
+            _ => None,
+        });
+        assert_eq!(announced.gid, gid);
+        say(&control, &Message::Refused(Refused::of(&announced, "there are enough")));
+        let refused = hear(&process, |message| match message {
+            Message::Refused(refused) => Some(refused),
+            _ => None,
+        });
+        assert_eq!(refused.endpoint, Some(gid), "{kind:?}");
+        assert!(refused.text.contains("there are enough"), "{}", refused.text);
+        // It is given up here, too.
+        hear(&control, |message| {
+            matches!(message, Message::EndpointGone(gone) if gone.gid == gid).then_some(())
+        });
+    }
+}

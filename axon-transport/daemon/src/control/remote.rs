@@ -1,0 +1,277 @@
+//! The control plane's dealings with other hosts: discovery says whom to dial, the gateway dials,
+//! and the registry learns what they have.
+
+use std::{cell::RefCell, collections::BTreeSet, net::IpAddr, rc::Rc, sync::Arc, time::Duration};
+
+use axon_shm::ids::DaemonId;
+use tokio::{
+    sync::mpsc,
+    task::{JoinHandle, spawn_local},
+};
+
+use super::{
+    gateway::{GatewayEntry, Pause, Running},
+    plane::Control,
+};
+use crate::{
+    discovery::{self, Action, Event},
+    gateway::bridge::{CHANNEL, ToControl, ToGateway},
+};
+
+/// Between two attempts to give an order to a gateway that is busy.
+const BUSY: Duration = Duration::from_millis(10);
+/// How long a gateway may take to finish: longer than it waits for what it has on its way.
+const FINISH: Duration = Duration::from_secs(6);
+
+/// The gateway of every daemon that is not told otherwise.
+pub(super) const GATEWAY: Option<GatewayEntry> =
+    Some(|parts| crate::gateway::run(parts).map_err(|error| error.to_string()));
+
+/// The gateway and discovery of a running daemon.
+pub(super) struct Remote {
+    entry: Option<GatewayEntry>,
+    running: Option<Running>,
+    pause: Pause,
+    discovery: Option<Discovery>,
+    linked: BTreeSet<DaemonId>,
+    /// Addresses of listed peers, as the gateway was told.
+    listed: BTreeSet<IpAddr>,
+    /// The gateway has nothing on its way any more, or it does not get on.
+    finished: bool,
+}
+
+struct Discovery {
+    events: mpsc::Sender<Event>,
+    actions: mpsc::Receiver<Action>,
+    task: JoinHandle<()>,
+}
+
+impl Remote {
+    /// Starts the gateway, waits until it stands, and starts discovery.
+    ///
+    /// # Errors
+    /// Why the gateway does not stand.
+    pub(super) async fn start(
+        control: &Rc<RefCell<Control>>,
+        entry: Option<GatewayEntry>,
+    ) -> Result<Self, String> {
+        let mut remote = Self {
+            entry,
+            running: None,
+            pause: Pause::new(),
+            discovery: None,
+            linked: BTreeSet::new(),
+            listed: BTreeSet::new(),
+            finished: false,
+        };
+        let Some(entry) = entry else { return Ok(remote) };
+        let mut running = Running::start(control, entry).map_err(|e| e.to_string())?;
+        running.stands(control).await?;
+        remote.running = Some(running);
+        let discovery = Discovery::start(&control.borrow());
+        if let Some(port) = control.borrow().port {
+            discovery.tell(Event::QuicPort(port));
+        }
+        remote.discovery = Some(discovery);
+        Ok(remote)
+    }
+
+    /// Who is told of changes of this host's graph.
+    pub(super) fn digests(&self) -> Option<mpsc::Sender<Event>> {
+        self.discovery.as_ref().map(|discovery| discovery.events.clone())
+    }
+
+    /// The daemon is to end: has what waits for other hosts arrive first, as far as that gets on.
+    pub(super) async fn finish(&mut self, control: &Rc<RefCell<Control>>) {
+        // An order that finds the channel full is dropped: this one is given again.
+        let finish = async {
+            while self.running.is_some() && !self.order(ToGateway::Finish) {
+                tokio::time::sleep(BUSY).await;
+            }
+            if self.running.is_some() {
+                self.run(control).await;
+            }
+        };
+        if tokio::time::timeout(FINISH, finish).await.is_err() {
+            tracing::warn!("the gateway does not say whether samples are on their way");
+        }
+    }
+
+    /// Passes on what the gateway and discovery say, and starts a gateway that failed again, until it
+    /// [has finished](Self::finish).
+    pub(super) async fn run(&mut self, control: &Rc<RefCell<Control>>) {
+        let Some(entry) = self.entry else { return std::future::pending().await };
+        while !self.finished {
+            tokio::select! {
+                event = said(self.running.as_mut()) => match event {
+                    Ok(event) => self.event(control, event),
+                    Err(why) => {
+                        tracing::error!(why, "the gateway failed; it is started again");
+                        self.gateway_ended(control, &why);
+                        self.pause.wait().await;
+                        match Running::start(control, entry) {
+                            Ok(running) => self.running = Some(running),
+                            Err(error) => tracing::error!(%error, "the gateway has no thread"),
+                        }
+                    }
+                },
+                action = wanted(self.discovery.as_mut()) => match action {
+                    Some(action) => self.action(control, action),
+                    None => {
+                        tracing::error!("discovery failed; it is started again");
+                        self.pause.wait().await;
+                        self.restart_discovery(control);
+                    }
+                },
+            }
+        }
+    }
+
+    fn event(&mut self, control: &Rc<RefCell<Control>>, event: ToControl) {
+        match &event {
+            ToControl::Started { port } => {
+                self.order(ToGateway::Listed(self.listed.clone()));
+                self.tell(Event::QuicPort(*port));
+            }
+            ToControl::LinkUp { daemon, address } => {
+                self.linked.insert(*daemon);
+                self.tell(Event::LinkUp { daemon: *daemon, address: *address });
+            }
+            ToControl::LinkDown { daemon, .. } => {
+                self.linked.remove(daemon);
+                self.tell(Event::LinkDown { daemon: *daemon });
+            }
+            ToControl::DialFailed { daemon, standing } => {
+                self.tell(Event::DialFailed { daemon: *daemon, standing: *standing });
+            }
+            ToControl::Finished => self.finished = true,
+            _ => {}
+        }
+        match event {
+            ToControl::Datagram { from, bytes } => self.tell(Event::Datagram { from, bytes }),
+            other => control.borrow_mut().gateway_says(other),
+        }
+    }
+
+    fn action(&mut self, control: &Rc<RefCell<Control>>, action: Action) {
+        match action {
+            Action::Dial { daemon, sae, addrs: addresses, listed, standing } => {
+                let dial = ToGateway::Dial { daemon, sae, addresses, listed, standing };
+                if !self.order(dial) {
+                    self.tell(Event::DialFailed { daemon, standing });
+                }
+            }
+            Action::SendFromQuicPort { to, bytes } => {
+                self.order(ToGateway::SendDatagram { to, bytes });
+            }
+            Action::Mismatch(mismatch) => {
+                let peer = format!("{} at {}", mismatch.peer, mismatch.address);
+                let what = mismatch.setting.to_owned();
+                let reason =
+                    format!("{what} is {} here and {} there", mismatch.ours, mismatch.theirs);
+                control.borrow_mut().refused(peer, what, reason);
+            }
+            Action::Named(names) => {
+                self.listed = names.values().flatten().copied().collect();
+                self.order(ToGateway::Listed(self.listed.clone()));
+                control.borrow_mut().named(names);
+            }
+            Action::Gone { daemon } => tracing::debug!(%daemon, "a peer is gone"),
+        }
+    }
+
+    /// Whether the gateway got it.
+    fn order(&self, order: ToGateway) -> bool {
+        self.running.as_ref().is_some_and(|running| running.order(order))
+    }
+
+    fn tell(&self, event: Event) {
+        if let Some(discovery) = &self.discovery {
+            discovery.tell(event);
+        }
+    }
+
+    fn gateway_ended(&mut self, control: &Rc<RefCell<Control>>, why: &str) {
+        self.running = None;
+        control.borrow_mut().gateway_ended(why);
+        for daemon in std::mem::take(&mut self.linked) {
+            self.tell(Event::LinkDown { daemon });
+        }
+    }
+
+    fn restart_discovery(&mut self, control: &Rc<RefCell<Control>>) {
+        let control = control.borrow();
+        let discovery = Discovery::start(&control);
+        if let Some(port) = control.port {
+            discovery.tell(Event::QuicPort(port));
+        }
+        for link in control.links.values() {
+            let daemon = self.linked.iter().find(|daemon| daemon.to_string() == link.peer);
+            if let (Some(&daemon), Ok(address)) = (daemon, link.address.parse()) {
+                discovery.tell(Event::LinkUp { daemon, address });
+            }
+        }
+        self.discovery = Some(discovery);
+    }
+
+    /// Says goodbye.
+    pub(super) async fn end(mut self) {
+        if let Some(Discovery { events, mut actions, task }) = self.discovery.take() {
+            drop(events);
+            let goodbye = async {
+                while let Some(action) = actions.recv().await {
+                    if let Action::SendFromQuicPort { to, bytes } = action {
+                        self.order(ToGateway::SendDatagram { to, bytes });
+                    }
+                }
+            };
+            // It says what it has to say at once.
+            let patience = Duration::from_millis(500);
+            let _ = tokio::time::timeout(patience, goodbye).await;
+            task.abort();
+        }
+        if let Some(running) = self.running {
+            running.end().await;
+        }
+    }
+}
+
+impl Discovery {
+    fn start(control: &Control) -> Self {
+        let (events, inbox) = mpsc::channel(CHANNEL);
+        let (outbox, actions) = mpsc::channel(CHANNEL);
+        let (config, daemon) = (Arc::clone(&control.config), control.id);
+        let wanted = control.wanted.subscribe();
+        let task = spawn_local(async move {
+            discovery::run(&config, daemon, wanted, inbox, outbox).await;
+        });
+        Self { events, actions, task }
+    }
+
+    fn tell(&self, event: Event) {
+        // Anybody can send datagrams: they leave room for what the gateway says of links.
+        let crowded = self.events.capacity() < CHANNEL / 4;
+        if matches!(event, Event::Datagram { .. }) && crowded {
+            return;
+        }
+        if self.events.try_send(event).is_err() {
+            tracing::debug!("discovery is busy; an event was dropped");
+        }
+    }
+}
+
+/// What the gateway says next, or why it says nothing any more.
+async fn said(running: Option<&mut Running>) -> Result<ToControl, String> {
+    match running {
+        Some(running) => running.next().await,
+        None => Err("it has no thread".to_owned()),
+    }
+}
+
+/// What discovery wants next.
+async fn wanted(discovery: Option<&mut Discovery>) -> Option<Action> {
+    match discovery {
+        Some(discovery) => discovery.actions.recv().await,
+        None => std::future::pending().await,
+    }
+}

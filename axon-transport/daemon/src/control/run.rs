@@ -1,0 +1,346 @@
+//! A daemon's life: from its first system call to its exit status.
+
+use std::{
+    cell::RefCell, ffi::OsString, io::Write as _, os::fd::OwnedFd, process::ExitCode, rc::Rc,
+    sync::Arc, time::Duration,
+};
+
+use axon_shm::internal::{
+    close_inherited, descriptors, erase_from_now_on, survive_file_size_limit,
+};
+use axon_transport::{
+    config::{Config, ConfigError, security_settings},
+    internal::session::daemon::{
+        address::{Address, AddressError, private_directory},
+        spawn::{DETACHED, SPAWNED},
+    },
+};
+use rustix::process::{
+    DumpableBehavior, Resource, Rlimit, getrlimit, set_dumpable_behavior, setrlimit,
+};
+use tokio::{
+    signal::unix::{SignalKind, signal},
+    sync::mpsc,
+    task::{LocalSet, spawn_local},
+};
+
+use super::{
+    detach::{Report, detach, start_detached},
+    gateway::GatewayEntry,
+    listen::accept,
+    log,
+    plane::Control,
+    remote::{GATEWAY, Remote},
+};
+use crate::discovery::Event;
+
+/// Changes of the graph within this time go out together.
+const COALESCE: Duration = Duration::from_millis(5);
+
+/// How a daemon process came to be.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Start {
+    /// By hand or by a service manager: it stays in the foreground until a signal ends it.
+    Foreground,
+    /// By a session (`--spawned`): starts the real daemon and ends.
+    Spawned,
+    /// By the process before (`--detached`): the real daemon.
+    Detached,
+}
+
+impl Start {
+    /// What the arguments of a daemon program say: none, or the one flag that a session adds to its
+    /// [`DaemonCommand`](axon_transport::DaemonCommand). `None` for any others.
+    pub fn from_arguments(arguments: impl IntoIterator<Item = OsString>) -> Option<Self> {
+        let mut arguments = arguments.into_iter();
+        let start = match arguments.next() {
+            None => Self::Foreground,
+            Some(flag) if flag == SPAWNED => Self::Spawned,
+            Some(flag) if flag == DETACHED => Self::Detached,
+            Some(_) => return None,
+        };
+        arguments.next().is_none().then_some(start)
+    }
+}
+
+/// How long a daemon waits for its first session at least.
+const FIRST_SESSION: Duration = Duration::from_secs(10);
+
+/// What a daemon runs with besides its configuration.
+#[derive(Debug)]
+pub struct DaemonOptions {
+    /// Who waits for it to be ready.
+    pub report: Report,
+    /// The gateway to other hosts. Without one, the daemon serves this host alone.
+    pub gateway: Option<GatewayEntry>,
+    /// Whether it stays when no session needs it. Otherwise it ends after its grace time.
+    pub stays: bool,
+}
+
+impl Default for DaemonOptions {
+    fn default() -> Self {
+        Self { report: Report::none(), gateway: GATEWAY, stays: false }
+    }
+}
+
+/// Why a daemon does not run.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum DaemonError {
+    /// A setting, or a file that it names.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// Another daemon serves this user and domain.
+    #[error("another daemon serves {0} already")]
+    Taken(String),
+    /// The session socket.
+    #[error("the session socket: {0}")]
+    Address(#[from] AddressError),
+    /// The gateway to other hosts does not start.
+    #[error("the gateway: {0}")]
+    Gateway(String),
+    /// The system refused.
+    #[error("{what}: {source}")]
+    System {
+        /// What was tried.
+        what: &'static str,
+        /// What the system said.
+        source: std::io::Error,
+    },
+}
+
+/// The whole of a daemon program's `main`: reads the configuration from the environment, detaches
+/// if it is to, sets logging up (to standard error, which is the log file by then), and runs. Call
+/// it before anything else opens a file or starts a thread.
+pub fn main(start: Start) -> ExitCode {
+    survive_file_size_limit();
+    let fail = |report: &mut Report, text: &str, status: u8| {
+        report.error(text);
+        eprint_line(text);
+        ExitCode::from(status)
+    };
+    if start == Start::Spawned {
+        close_inherited();
+        return match start_detached() {
+            Ok(()) => ExitCode::SUCCESS,
+            Err(error) => {
+                let mut report = Report::from_stdout().unwrap_or(Report::none());
+                fail(&mut report, &error.to_string(), 1)
+            }
+        };
+    }
+    let detached = start == Start::Detached;
+    let mut report = if detached {
+        match Report::from_stdout() {
+            Ok(report) => report,
+            Err(error) => return fail(&mut Report::none(), &error.to_string(), 1),
+        }
+    } else {
+        Report::none()
+    };
+    let config = match Config::from_env() {
+        Ok(config) => config,
+        Err(error) => return fail(&mut report, &error.to_string(), 2),
+    };
+    if detached && let Err(error) = detach(Some(&config)) {
+        return fail(&mut report, &error.to_string(), 1);
+    }
+    log::start(&config);
+    if let Some(line) = config.unknown_variables() {
+        tracing::warn!("{line}");
+    }
+    let options = DaemonOptions { report, stays: !detached, ..DaemonOptions::default() };
+    match run(config, options) {
+        Ok(()) => ExitCode::SUCCESS,
+        // Losing the race to start is how all but one end.
+        Err(DaemonError::Taken(_)) if detached => ExitCode::SUCCESS,
+        Err(error @ DaemonError::Config(_)) => {
+            eprint_line(&error.to_string());
+            ExitCode::from(2)
+        }
+        Err(error) => {
+            eprint_line(&error.to_string());
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// Runs a daemon on this thread until SIGTERM or SIGINT, or, unless it [stays](DaemonOptions::stays),
+/// until no session has needed it for its grace time.
+///
+/// # Errors
+/// When it cannot start. What goes wrong later is logged and shown in its status.
+pub fn run(config: Config, mut options: DaemonOptions) -> Result<(), DaemonError> {
+    let started = start(config, &options);
+    let (control, listeners, _bound) = match started {
+        Ok(started) => started,
+        Err(error) => {
+            match &error {
+                DaemonError::Taken(_) => options.report.taken(),
+                other => options.report.error(&other.to_string()),
+            }
+            return Err(error);
+        }
+    };
+    let system = |what| move |source| DaemonError::System { what, source };
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .map_err(system("the control runtime"))?;
+    let control = Rc::new(RefCell::new(control));
+    let local = LocalSet::new();
+    let outcome = local.block_on(&runtime, serve(control.clone(), listeners, options));
+    let address = control.borrow().address.clone();
+    address.remove();
+    // A session that is being served, or a gateway that hangs, does not hold up the end.
+    runtime.shutdown_background();
+    outcome
+}
+
+type Started = (Control, Vec<OwnedFd>, axon_transport::internal::session::daemon::address::Lock);
+
+/// Everything before the runtime: the socket first, since it is the lock.
+fn start(config: Config, _options: &DaemonOptions) -> Result<Started, DaemonError> {
+    erase_from_now_on();
+    harden();
+    let settings = security_settings(&config)?;
+    let address = Address::of(&config);
+    let (listeners, lock) = match address.bind() {
+        Ok(bound) => bound.into_parts(),
+        Err(AddressError::Taken) => return Err(DaemonError::Taken(address.to_string())),
+        Err(error) => return Err(error.into()),
+    };
+    let mut config = config;
+    if let Some(dir) = &config.runtime_dir
+        && let Err(error) = private_directory(dir)
+    {
+        tracing::warn!(%error, "nothing is kept across restarts");
+        config.runtime_dir = None;
+    }
+    Ok((Control::new(Arc::new(config), settings), listeners, lock))
+}
+
+/// Keys live in this process: no core file, no debugger of the same user. And a robot has many
+/// sessions with three descriptors each.
+fn harden() {
+    let refused = |what, error: rustix::io::Errno| tracing::warn!(what, %error, "not hardened");
+    if let Err(error) = set_dumpable_behavior(DumpableBehavior::NotDumpable) {
+        refused("PR_SET_DUMPABLE", error);
+    }
+    let none = Rlimit { current: Some(0), maximum: Some(0) };
+    if let Err(error) = setrlimit(Resource::Core, none) {
+        refused("RLIMIT_CORE", error);
+    }
+    let size = getrlimit(Resource::Fsize);
+    if let Err(error) = setrlimit(Resource::Fsize, Rlimit { current: size.maximum, ..size }) {
+        refused("RLIMIT_FSIZE", error);
+    }
+    let files = getrlimit(Resource::Nofile);
+    if let Err(error) = setrlimit(Resource::Nofile, Rlimit { current: files.maximum, ..files }) {
+        refused("RLIMIT_NOFILE", error);
+    }
+    if let Some(limit) = getrlimit(Resource::Nofile).current
+        && descriptors::is_scarce(limit)
+    {
+        tracing::warn!(
+            limit,
+            "few descriptors (RLIMIT_NOFILE): few sessions are served, and one of this user that \
+             sends others which are slow to close may hold all of them up"
+        );
+    }
+}
+
+async fn serve(
+    control: Rc<RefCell<Control>>,
+    listeners: Vec<OwnedFd>,
+    mut options: DaemonOptions,
+) -> Result<(), DaemonError> {
+    let signals =
+        signal(SignalKind::terminate()).and_then(|t| Ok((t, signal(SignalKind::interrupt())?)));
+    let (mut terminate, mut interrupt) =
+        signals.map_err(|source| DaemonError::System { what: "watching signals", source })?;
+    let mut remote = match Remote::start(&control, options.gateway).await {
+        Ok(remote) => remote,
+        Err(text) => {
+            options.report.error(&format!("the gateway: {text}"));
+            return Err(DaemonError::Gateway(text));
+        }
+    };
+    {
+        let control = control.borrow();
+        tracing::info!(daemon = %control.id, address = %control.address, "the daemon takes sessions");
+    }
+    let accepting = spawn_local(accept(control.clone(), listeners));
+    let flushing = spawn_local(flush(control.clone(), remote.digests()));
+    options.report.ready();
+    let told = tokio::select! {
+        _ = terminate.recv() => Some("SIGTERM"),
+        _ = interrupt.recv() => Some("SIGINT"),
+        () = unneeded(&control), if !options.stays => None,
+        () = remote.run(&control) => None,
+    };
+    match told {
+        Some(signal) => {
+            tracing::info!("{signal}: what waits for other hosts is sent first");
+            tokio::select! {
+                () = remote.finish(&control) => {}
+                _ = terminate.recv() => tracing::info!("SIGTERM once more"),
+                _ = interrupt.recv() => tracing::info!("SIGINT once more"),
+            }
+        }
+        None => tracing::info!("no session needs the daemon any more"),
+    }
+    // The address is free from here on: who connects now starts a new daemon.
+    accepting.abort();
+    let _ = accepting.await;
+    flushing.abort();
+    // It holds a sender, and discovery ends when there is none.
+    let _ = flushing.await;
+    remote.end().await;
+    Ok(())
+}
+
+/// Sends changes of the graph a moment after they happened, and tells discovery, whose beacons say
+/// whether a peer has missed some.
+async fn flush(control: Rc<RefCell<Control>>, digests: Option<mpsc::Sender<Event>>) {
+    loop {
+        if control.borrow().registry.needs_flush() {
+            tokio::time::sleep(COALESCE).await;
+            let control = &mut *control.borrow_mut();
+            control.registry.flush();
+            control.settle();
+            if let Some(digests) = &digests {
+                // One that is dropped is overtaken by the next.
+                let _ = digests.try_send(Event::GraphDigest(control.registry.digest()));
+            }
+        }
+        let changed = control.borrow().changed.clone();
+        changed.notified().await;
+    }
+}
+
+/// Ends when there was no application for the grace time.
+async fn unneeded(control: &Rc<RefCell<Control>>) {
+    let grace = control.borrow().config.link.grace;
+    let changed = control.borrow().need.clone();
+    // The session that started this daemon has yet to come, however short the grace time is.
+    if !control.borrow().is_needed() {
+        let first = grace.max(FIRST_SESSION);
+        if tokio::time::timeout(first, changed.notified()).await.is_err() {
+            return;
+        }
+    }
+    loop {
+        if control.borrow().is_needed() {
+            changed.notified().await;
+        } else if tokio::time::timeout(grace, changed.notified()).await.is_err() {
+            return;
+        }
+    }
+}
+
+/// The one line of a program that cannot go on.
+fn eprint_line(text: &str) {
+    // Where it cannot be written, the exit status remains.
+    let _ = writeln!(std::io::stderr(), "axon: {}", text.replace('\n', " "));
+}

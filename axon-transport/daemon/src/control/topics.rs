@@ -1,0 +1,275 @@
+//! The part of the daemon's status about topics.
+//!
+//! What publishers and readers count is read from the descriptors of their sessions' segments: the
+//! daemon maps no session's memory.
+
+use std::{
+    cmp::Reverse,
+    collections::{BTreeMap, HashMap},
+    os::fd::{AsFd, BorrowedFd},
+    sync::Arc,
+    time::{Duration, SystemTime},
+};
+
+use axon_shm::{
+    internal::{
+        Location,
+        descriptors::PassedFd,
+        inspect::{self, LaneCounts, RingCounts},
+    },
+    qos::{History, Qos},
+};
+use axon_transport::{
+    graph::{Endpoint, EndpointKind},
+    internal::{
+        registry::{LocalEndpoint, Registry, SessionEntry},
+        wire::session::{Attach, EndpointRole},
+    },
+    status::{OutOfRangeStatus, ReaderStatus, TopicStatus, WriterStatus},
+};
+
+/// Publishers, and readers, of a topic that the status lists.
+const LISTED: usize = 64;
+/// Readers that are looked at for one status: so many that it still takes a fraction of a second.
+const LOOKED_AT: usize = 1 << 16;
+/// Pairs out of range that the status lists, of all topics.
+const KEPT_APART: usize = 64;
+
+type Sessions = Registry<Arc<PassedFd>>;
+type Session = SessionEntry<Arc<PassedFd>>;
+
+/// All topics with an endpoint somewhere.
+pub(super) fn topics(
+    registry: &Sessions,
+    lost: &BTreeMap<String, BTreeMap<&'static str, u64>>,
+) -> Vec<TopicStatus> {
+    let mut topics: BTreeMap<(String, String), TopicStatus> = BTreeMap::new();
+    let mut rings = HashMap::new();
+    for local in registry.endpoints().filter(|e| e.endpoint.kind != EndpointKind::Node) {
+        let topic = entry(&mut topics, &local.endpoint);
+        match local.endpoint.kind {
+            EndpointKind::Publisher => {
+                let ring = ring(registry, local);
+                let published = ring.as_ref().map_or(0, |(_, counts)| counts.published);
+                if local.role == EndpointRole::Application {
+                    topic.publishers += 1;
+                    add(&mut topic.published, published);
+                } else {
+                    add(&mut topic.arrived, published);
+                }
+                if let Some((session, counts)) = ring {
+                    topic.writers.push(writer(session, local, &counts));
+                    rings.insert(local.endpoint.gid, (session, counts));
+                }
+            }
+            EndpointKind::Subscription if local.role == EndpointRole::Application => {
+                topic.subscriptions += 1;
+            }
+            _ => {}
+        }
+    }
+    for (_, endpoint) in registry.remote_endpoints().filter(|(_, e)| e.kind != EndpointKind::Node) {
+        let topic = entry(&mut topics, endpoint);
+        match endpoint.kind {
+            EndpointKind::Publisher => topic.remote_publishers += 1,
+            EndpointKind::Subscription => topic.remote_subscriptions += 1,
+            EndpointKind::Server | EndpointKind::Client | EndpointKind::Node => {}
+        }
+    }
+    let locals: HashMap<_, _> = registry.endpoints().map(|e| (e.endpoint.gid, e)).collect();
+    let mut processes = HashMap::new();
+    for attach in registry.attached().take(LOOKED_AT) {
+        let Some(local) = locals.get(&attach.reader) else { continue };
+        let Some(session) = registry.session(&attach.session) else { continue };
+        let stopped = *processes.entry(session.pid).or_insert_with(|| is_stopped(session.pid));
+        let mut reader = reader(session, local, attach, rings.get(&attach.writer));
+        reader.stopped = stopped;
+        entry(&mut topics, &local.endpoint).readers.push(reader);
+    }
+    for apart in registry.kept_apart(KEPT_APART, LOOKED_AT) {
+        if let Some(topic) = topics.get_mut(&(apart.topic, apart.type_name)) {
+            topic.out_of_range.push(OutOfRangeStatus {
+                writer: apart.pair.writer.to_string(),
+                reader: apart.pair.reader.to_string(),
+                reason: apart.why.to_string(),
+            });
+        }
+    }
+    let mut topics: Vec<_> = topics.into_values().map(summed_up).collect();
+    for (name, causes) in lost {
+        let known = topics.iter().position(|topic| topic.topic == *name);
+        let index = known.unwrap_or_else(|| {
+            topics.push(TopicStatus { topic: name.clone(), ..TopicStatus::default() });
+            topics.len() - 1
+        });
+        for (cause, samples) in causes {
+            add(topics[index].dropped.entry((*cause).to_owned()).or_default(), *samples);
+        }
+    }
+    topics
+}
+
+fn entry<'a>(
+    topics: &'a mut BTreeMap<(String, String), TopicStatus>,
+    endpoint: &Endpoint,
+) -> &'a mut TopicStatus {
+    let (topic, type_name) = (endpoint.topic.clone(), endpoint.type_name.clone());
+    topics.entry((topic.clone(), type_name.clone())).or_insert_with(|| TopicStatus {
+        topic,
+        type_name,
+        ..TopicStatus::default()
+    })
+}
+
+fn writer(session: &Session, local: &LocalEndpoint, counts: &RingCounts) -> WriterStatus {
+    let gid = local.endpoint.gid;
+    let own = session.segments.values().filter(|s| s.segment.publisher == Some(gid));
+    let own = own.map(|segment| inspect::committed(segment.descriptor.as_fd()));
+    let own = own.fold(0, u64::saturating_add);
+    WriterStatus {
+        pid: session.pid,
+        writer: gid.to_string(),
+        stand_in: local.role == EndpointRole::StandIn,
+        depth: depth(&local.endpoint.qos),
+        window: counts.window,
+        bytes_committed: own.saturating_add(counts.bytes),
+        published: counts.published,
+        blocked: counts.blocked,
+        no_memory: counts.no_memory,
+        pinned: counts.pinned,
+    }
+}
+
+fn reader(
+    session: &Session,
+    local: &LocalEndpoint,
+    attach: &Attach,
+    ring: Option<&(&Session, RingCounts)>,
+) -> ReaderStatus {
+    let lane = memory(session, attach.lane).and_then(|m| LaneCounts::read(m, attach.lane));
+    let lane = lane.unwrap_or_default();
+    let unread = ring.map_or(0, |(_, counts)| unread(counts, &lane));
+    let waiting = ring.filter(|_| unread > 0).and_then(|(writer, counts)| {
+        let since = oldest_unread(writer, counts, &lane)?;
+        let since = SystemTime::UNIX_EPOCH + Duration::from_nanos(u64::try_from(since).ok()?);
+        Some(SystemTime::now().duration_since(since).unwrap_or_default())
+    });
+    let depth = depth(&local.endpoint.qos);
+    ReaderStatus {
+        pid: session.pid,
+        reader: attach.reader.to_string(),
+        writer: attach.writer.to_string(),
+        relay: local.role == EndpointRole::Relay,
+        depth,
+        unread: unread.min(depth.map_or(u64::MAX, u64::from)),
+        received: lane.received,
+        lost: lane.lost,
+        skipped: lane.skipped,
+        waiting_ms: waiting.map(|age| u64::try_from(age.as_millis()).unwrap_or(u64::MAX)),
+        stopped: false,
+    }
+}
+
+/// Samples that stand and that the reader has not taken.
+fn unread(counts: &RingCounts, lane: &LaneCounts) -> u64 {
+    let (tail, head) = counts.standing;
+    head.saturating_sub(lane.cursor.max(tail))
+}
+
+/// When the oldest sample was published that the reader has not taken. Where that does not stand
+/// any more, the one before it, which the reader has taken: hardly older on a topic so busy.
+fn oldest_unread(writer: &Session, counts: &RingCounts, lane: &LaneCounts) -> Option<i64> {
+    let (tail, _) = counts.standing;
+    if let (true, Some(taken)) = (lane.cursor < tail, lane.taken) {
+        return Some(taken);
+    }
+    let position = lane.cursor.max(tail);
+    let at = counts.descriptor(position)?;
+    inspect::timestamp(memory(writer, at)?, at, position)
+}
+
+fn summed_up(mut topic: TopicStatus) -> TopicStatus {
+    for writer in &topic.writers {
+        add(&mut topic.bytes_committed, writer.bytes_committed);
+    }
+    let mut drop = |cause: &str, count: u64| {
+        if count > 0 {
+            add(topic.dropped.entry(cause.to_owned()).or_default(), count);
+        }
+    };
+    for reader in &topic.readers {
+        drop("overwritten", reader.lost);
+    }
+    for writer in &topic.writers {
+        drop("blocked", writer.blocked);
+        drop("no_memory", writer.no_memory);
+        drop("pinned", writer.pinned);
+    }
+    let worst_first = |reader: &ReaderStatus| Reverse((reader.waiting_ms, reader.lost));
+    topic.readers.sort_by_key(worst_first);
+    topic.more_readers = topic.readers.len().saturating_sub(LISTED);
+    topic.readers.truncate(LISTED);
+    let largest_first = |writer: &WriterStatus| Reverse(writer.bytes_committed);
+    topic.writers.sort_by_key(largest_first);
+    topic.more_writers = topic.writers.len().saturating_sub(LISTED);
+    topic.writers.truncate(LISTED);
+    topic
+}
+
+/// Whatever another process says that it counted.
+fn add(sum: &mut u64, count: u64) {
+    *sum = sum.saturating_add(count);
+}
+
+/// `None` for KEEP_ALL.
+fn depth(qos: &Qos) -> Option<u32> {
+    (qos.history == History::KeepLast).then_some(qos.depth)
+}
+
+/// What a publisher counts, and its session.
+fn ring<'a>(registry: &'a Sessions, local: &LocalEndpoint) -> Option<(&'a Session, RingCounts)> {
+    let (session, at) = (registry.session(&local.session)?, local.ring?);
+    Some((session, RingCounts::read(memory(session, at)?, at)?))
+}
+
+/// The segment that an object of a session is in.
+fn memory(session: &Session, at: Location) -> Option<BorrowedFd<'_>> {
+    match (at.segment, &session.descriptors) {
+        (0, Some([first, ..])) => Some(first.as_fd()),
+        (number, _) => session.segments.get(&number).map(|segment| segment.descriptor.as_fd()),
+    }
+}
+
+/// Whether a process is stopped, by a signal or a debugger.
+fn is_stopped(pid: u32) -> bool {
+    let Ok(stat) = std::fs::read(format!("/proc/{pid}/stat")) else { return false };
+    // The name before it may hold anything.
+    let state = stat.iter().rposition(|byte| *byte == b')').and_then(|end| stat.get(end + 2));
+    matches!(state, Some(b'T' | b't'))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_others_count_is_summed_up_whatever_it_is_and_the_worst_are_listed() {
+        let mut topic = TopicStatus::default();
+        for number in 0..100 {
+            let mut reader = ReaderStatus { lost: u64::MAX, ..ReaderStatus::default() };
+            reader.waiting_ms = (number % 2 == 0).then_some(number);
+            topic.readers.push(reader);
+            let bytes_committed = u64::MAX - number;
+            let writer = WriterStatus { bytes_committed, blocked: u64::MAX, ..Default::default() };
+            topic.writers.push(writer);
+        }
+        let topic = summed_up(topic);
+        assert_eq!(topic.bytes_committed, u64::MAX);
+        assert!(topic.dropped.values().all(|count| *count == u64::MAX));
+        assert_eq!((topic.readers.len(), topic.more_readers), (LISTED, 36));
+        assert_eq!((topic.writers.len(), topic.more_writers), (LISTED, 36));
+        assert_eq!(topic.readers[0].waiting_ms, Some(98));
+        assert!(topic.readers[..50].iter().all(|reader| reader.waiting_ms.is_some()));
+        assert_eq!(topic.writers[0].bytes_committed, u64::MAX);
+    }
+}

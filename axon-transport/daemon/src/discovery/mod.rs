@@ -1,0 +1,115 @@
+//! Discovery: which daemons are there, and which of them to dial.
+//!
+//! [`wire::beacon`](crate::wire::beacon) is the wire format, [`Peers`] the state machine, [`socket`] the shared UDP port, and
+//! [`run`] the task that ties them together. Datagrams from and to QUIC ports pass through whoever
+//! owns the QUIC socket. All of it is unauthenticated: it says whom to try, never whom to trust.
+
+#![forbid(unsafe_code)]
+
+use std::{
+    collections::BTreeMap,
+    net::{IpAddr, Ipv4Addr, SocketAddr, SocketAddrV4},
+    ops::RangeInclusive,
+};
+
+use axon_shm::ids::DaemonId;
+
+mod interfaces;
+mod peers;
+mod run;
+pub(crate) mod socket;
+mod standing;
+#[cfg(test)]
+mod tests;
+mod wanted;
+
+pub(crate) use interfaces::{Interface, interfaces};
+pub(crate) use peers::{Arrival, Local, Output, Peers};
+pub(crate) use run::{Event, run};
+pub(crate) use standing::Standing;
+pub(crate) use wanted::Wanted;
+
+/// The UDP ports that daemons of `domain` take their QUIC port from, the first that is free.
+///
+/// ```
+/// assert_eq!(axon_transport::discovery::quic_ports(0), 61300..=61315);
+/// assert_eq!(axon_transport::discovery::quic_ports(232), 65012..=65027);
+/// ```
+pub fn quic_ports(domain: u32) -> RangeInclusive<u16> {
+    let first = 61_300 + 16 * (domain.min(232) as u16);
+    first..=first + 15
+}
+
+/// The multicast group and port that all daemons of `domain` share.
+///
+/// ```
+/// let group = axon_transport::discovery::shared_group(7);
+/// assert_eq!(group, "239.255.88.8:61007".parse().unwrap());
+/// ```
+pub fn shared_group(domain: u32) -> SocketAddrV4 {
+    let domain = domain.min(232) as u16;
+    let last = 1 + (domain % 254) as u8;
+    SocketAddrV4::new(Ipv4Addr::new(239, 255, 88, last), 61_000 + domain)
+}
+
+/// Whether a datagram on a QUIC port that begins with this byte is discovery's and not QUIC's.
+pub(crate) const fn is_discovery(first_byte: u8) -> bool {
+    first_byte & 0b1100_0000 == 0
+}
+
+/// What discovery asks of the daemon.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Action {
+    /// Dial this daemon. To be answered with [`Event::LinkUp`] or [`Event::DialFailed`]; without
+    /// an answer it counts as failed after 30 s.
+    Dial {
+        /// Whom to expect there.
+        daemon: DaemonId,
+        /// In qkd its SAE ID, for the KME.
+        sae: Option<String>,
+        /// Where it may be, best first: one to eight addresses.
+        addrs: Vec<SocketAddr>,
+        /// Whether we list it, for our HELLO.
+        listed: bool,
+        /// Why it may be there; the answer says it again.
+        standing: Standing,
+    },
+    /// Send this from the QUIC port, best effort.
+    SendFromQuicPort {
+        /// Where to.
+        to: SocketAddr,
+        /// At most 512 bytes.
+        bytes: Vec<u8>,
+    },
+    /// This peer is not dialled, and why. Said once a peer; after 32 of them one a second.
+    Mismatch(Mismatch),
+    /// The addresses that the names of static peers have.
+    Named(BTreeMap<String, Vec<IpAddr>>),
+    /// Nothing was heard of this peer for long, or it said goodbye.
+    Gone {
+        /// Which.
+        daemon: DaemonId,
+    },
+}
+
+/// A setting that keeps this daemon and a peer apart.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Mismatch {
+    /// The peer, as it calls itself.
+    pub peer: DaemonId,
+    /// Where its beacon came from.
+    pub address: SocketAddr,
+    /// The variable to look at.
+    pub setting: &'static str,
+    /// This daemon's value.
+    pub ours: String,
+    /// The peer's value, as it says.
+    pub theirs: String,
+}
+
+impl std::fmt::Display for Mismatch {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { peer, address, setting, ours, theirs } = self;
+        write!(f, "peer {peer} at {address} not dialled: {setting} is {theirs} there, {ours} here")
+    }
+}

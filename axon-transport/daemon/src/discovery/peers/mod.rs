@@ -1,0 +1,315 @@
+//! Discovery's state machine: which daemons exist and when to dial them. Datagrams, events and time in,
+//! datagrams and dials out.
+//!
+//! Nothing here does I/O or looks at a clock. `now` is any clock that does not go back. A beacon is
+//! a hint from anybody, so every collection is bounded, every answer rationed, and nothing that
+//! arrives here closes a link or keeps one from being made to a peer that was acceptable before.
+
+mod announcing;
+mod bucket;
+mod candidates;
+mod dialling;
+mod eviction;
+#[cfg(test)]
+mod flood;
+#[cfg(test)]
+mod goodbye;
+mod local;
+mod probing;
+mod receiving;
+mod record;
+#[cfg(test)]
+mod simulation;
+#[cfg(test)]
+mod tests;
+
+use std::{
+    collections::{BTreeMap, VecDeque},
+    net::{IpAddr, SocketAddr},
+    time::Duration,
+};
+
+use axon_shm::ids::DaemonId;
+use axon_transport::config::DiscoveryRange;
+use rand::{RngExt, SeedableRng, rngs::StdRng};
+
+#[cfg(test)]
+use self::dialling::MOST_IN_FLIGHT;
+pub(crate) use self::local::Local;
+use self::{
+    bucket::Bucket,
+    candidates::Here,
+    probing::Probes,
+    record::{Record, Source},
+};
+use super::{Action, Interface, Standing};
+
+/// Most records of peers that are not linked.
+const MOST_UNAUTHENTICATED: usize = 256;
+/// Most addresses of listed peers.
+const MOST_LISTED: usize = 128;
+
+/// How a datagram came.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Arrival {
+    /// To the shared port, by multicast or broadcast.
+    Shared,
+    /// To our QUIC port alone: the sender lists us, answers us, or is on this host.
+    Quic,
+}
+
+/// What [`Peers`] wants done.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Output {
+    /// To the group, on every interface.
+    Multicast(Vec<u8>),
+    /// For the daemon.
+    Action(Action),
+}
+
+/// The state machine of discovery.
+#[derive(Debug)]
+pub(crate) struct Peers {
+    local: Local,
+    here: Here,
+    records: BTreeMap<DaemonId, Record>,
+    /// Addresses of listed peers, with a port where one was given.
+    listed: Vec<(IpAddr, Option<u16>)>,
+    port: Option<u16>,
+    graph: u64,
+    /// When the next beacon goes, and how many of the burst are still to go.
+    next_beacon: Option<Duration>,
+    burst_left: usize,
+    answers: Bucket,
+    /// For those at addresses that this host knows.
+    known_answers: Bucket,
+    echoes: Bucket,
+    known_echoes: Bucket,
+    /// Beacons and goodbyes that are looked at, of strangers and of hosts that this one knows.
+    heard: Bucket,
+    known_heard: Bucket,
+    probes: Bucket,
+    known_probes: Bucket,
+    asked: Probes,
+    /// Where links stood, the latest last.
+    met: VecDeque<IpAddr>,
+    reports: Bucket,
+    random: StdRng,
+    outputs: VecDeque<Output>,
+}
+
+impl Peers {
+    /// A daemon that knows nobody. It is silent until its [QUIC port](Self::set_port) is known.
+    pub(crate) fn new(local: Local, seed: u64) -> Self {
+        let here = Here { bind: local.bind.clone(), interfaces: Vec::new() };
+        Self {
+            local,
+            here,
+            records: BTreeMap::new(),
+            listed: Vec::new(),
+            port: None,
+            graph: 0,
+            next_beacon: None,
+            burst_left: 0,
+            answers: Bucket::new(64, 64),
+            known_answers: Bucket::new(64, 64),
+            echoes: Bucket::new(1024, 1024),
+            known_echoes: Bucket::new(1024, 1024),
+            heard: Bucket::new(1024, 1024),
+            known_heard: Bucket::new(1024, 1024),
+            probes: Bucket::new(1024, 1024),
+            known_probes: Bucket::new(1024, 1024),
+            asked: Probes::new(),
+            met: VecDeque::new(),
+            reports: Bucket::new(32, 1),
+            random: StdRng::seed_from_u64(seed),
+            outputs: VecDeque::new(),
+        }
+    }
+
+    /// The next thing to do; ask until it says `None`.
+    pub(crate) fn poll(&mut self) -> Option<Output> {
+        self.outputs.pop_front()
+    }
+
+    /// When [`advance`](Self::advance) is to be called at the latest.
+    pub(crate) fn next_wakeup(&self) -> Option<Duration> {
+        let in_flight = self.dials_in_flight();
+        let lifetime = self.lifetime();
+        let of_records = self.records.values().flat_map(|record| {
+            let dials = Standing::ALL.into_iter().flat_map(|standing| {
+                let dial = &record.dials[standing as usize];
+                let host = record.of(standing).next().map(|source| source.address.ip());
+                let may_dial =
+                    self.wants_dial(record, standing) && in_flight.has_room(standing, host);
+                [dial.due.filter(|_| may_dial), dial.in_flight]
+            });
+            let expiry = record.may_be_forgotten().then(|| record.gone_at(lifetime));
+            dials.chain([expiry]).flatten().min()
+        });
+        of_records.chain(self.next_beacon).min()
+    }
+
+    /// Does what is due at `now`.
+    pub(crate) fn advance(&mut self, now: Duration) {
+        self.give_up_lost_dials(now);
+        self.forget_silent(now);
+        self.forget_unanswered(now);
+        self.dial_due(now);
+        if self.next_beacon.is_some_and(|at| at <= now) {
+            let first = self.burst_left > 0;
+            if self.announces() {
+                self.send_beacon(first);
+                self.schedule_beacon(now);
+            } else {
+                self.next_beacon = None;
+            }
+        }
+    }
+
+    /// The QUIC port is bound.
+    pub(crate) fn set_port(&mut self, now: Duration, port: u16) {
+        if self.port.replace(port) != Some(port) {
+            self.start_burst(now);
+        }
+    }
+
+    /// How far this daemon looks from now on. Links that stand are left alone: what goes over them is
+    /// decided for each pair.
+    pub(crate) fn set_range(&mut self, now: Duration, range: DiscoveryRange) {
+        let before = std::mem::replace(&mut self.local.range, range);
+        if range > before {
+            self.start_burst(now);
+        }
+        if range == DiscoveryRange::Off {
+            self.next_beacon = None;
+        }
+        if range < before {
+            // Those who still want this daemon say so to its QUIC port.
+            let unlinked = self.records.iter_mut().filter(|(_, record)| !record.linked);
+            let far: Vec<DaemonId> = unlinked
+                .filter(|(_, record)| range == DiscoveryRange::Off || !record.listed)
+                .map(|(id, _)| *id)
+                .collect();
+            far.into_iter().for_each(|daemon| self.forget(daemon));
+            self.records.values_mut().for_each(|record| record.near = record.listed);
+        } else {
+            self.dial_all(now);
+        }
+    }
+
+    fn dial_all(&mut self, now: Duration) {
+        let ids: Vec<DaemonId> = self.records.keys().copied().collect();
+        ids.into_iter().for_each(|id| self.schedule_dial(now, id));
+    }
+
+    /// The interfaces of this host, whenever they were looked at.
+    pub(crate) fn set_interfaces(&mut self, now: Duration, interfaces: Vec<Interface>) {
+        if self.here.interfaces == interfaces {
+            return;
+        }
+        self.here.interfaces = interfaces;
+        let dials = self.records.values_mut().flat_map(|record| &mut record.dials);
+        dials.for_each(record::Dial::reset);
+        self.dial_all(now);
+        if self.port.is_some() {
+            self.start_burst(now);
+        }
+    }
+
+    /// The addresses of listed peers, names resolved.
+    pub(crate) fn set_listed(&mut self, now: Duration, mut listed: Vec<(IpAddr, Option<u16>)>) {
+        listed.truncate(MOST_LISTED);
+        let new = listed.iter().any(|peer| !self.listed.contains(peer));
+        self.listed = listed;
+        let listed: Vec<IpAddr> = self.listed.iter().map(|(address, _)| *address).collect();
+        for record in self.records.values_mut() {
+            let lists = |source: &Source| listed.contains(&source.address.ip());
+            record.listed = record.sources.iter().any(lists);
+            for source in &mut record.sources {
+                let address = source.address.ip();
+                source.known = listed.contains(&address) || self.met.contains(&address);
+            }
+            record.order();
+        }
+        if new && self.port.is_some() {
+            self.start_burst(now);
+        }
+    }
+
+    /// The digest of this daemon's graph, for the beacons to come.
+    pub(crate) fn set_graph(&mut self, digest: u64) {
+        self.graph = digest;
+    }
+
+    /// A link with `daemon` stands, whoever dialled it.
+    pub(crate) fn link_up(&mut self, now: Duration, daemon: DaemonId, address: SocketAddr) {
+        let listed = self.lists(address.ip().to_canonical());
+        let address = SocketAddr::new(address.ip().to_canonical(), address.port());
+        self.meet(address.ip());
+        let record = self.records.entry(daemon).or_default();
+        record.listed |= listed;
+        record.linked = true;
+        record.leaving = None;
+        record.last_seen = record.last_seen.max(now);
+        record.from = Some(address.ip());
+        record.done();
+        record.proved(address);
+        self.dial_due(now);
+    }
+
+    /// The link with `daemon` is no more.
+    pub(crate) fn link_down(&mut self, now: Duration, daemon: DaemonId) {
+        let Some(record) = self.records.get_mut(&daemon) else { return };
+        record.linked = false;
+        record.done();
+        let left = record.left(now);
+        // One that dialled us and whose beacons never came cannot be dialled.
+        if !record.compatible {
+            self.forget(daemon);
+        } else if left {
+            self.leaves(now, daemon);
+        } else {
+            record.last_seen = record.last_seen.max(now);
+            self.schedule_dial(now, daemon);
+        }
+    }
+
+    /// A dial to addresses of this standing did not become a link.
+    pub(crate) fn dial_failed(&mut self, now: Duration, daemon: DaemonId, standing: Standing) {
+        let jitter = self.random.random_range(0.5..1.5);
+        let record = self.records.get_mut(&daemon);
+        let under_way = |record: &&mut Record| record.dials[standing as usize].in_flight.is_some();
+        if let Some(record) = record.filter(under_way) {
+            record.failed(standing, now, jitter);
+            if record.may_be_forgotten() && record.left(now) {
+                self.leaves(now, daemon);
+            } else {
+                self.schedule_dial(now, daemon);
+            }
+        }
+        self.dial_due(now);
+    }
+
+    /// Whether a dial would make sense, and the range lets this daemon look for the peer.
+    fn wants_dial(&self, record: &Record, standing: Standing) -> bool {
+        let in_range = match self.local.range {
+            DiscoveryRange::Off => false,
+            DiscoveryRange::Localhost => record.near || record.listed,
+            DiscoveryRange::Subnet => true,
+        };
+        in_range && record.wants_dial(standing)
+    }
+
+    fn lists(&self, address: IpAddr) -> bool {
+        self.listed.iter().any(|(listed, _)| *listed == address)
+    }
+
+    fn send(&mut self, to: SocketAddr, bytes: Vec<u8>) {
+        self.act(Action::SendFromQuicPort { to, bytes });
+    }
+
+    fn act(&mut self, action: Action) {
+        self.outputs.push_back(Output::Action(action));
+    }
+}

@@ -1,0 +1,336 @@
+//! The task that gives [`Peers`] its clock, its sockets and its events.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    future::pending,
+    net::{IpAddr, SocketAddr},
+    time::Duration,
+};
+
+use axon_shm::ids::DaemonId;
+use axon_transport::config::{Config, DiscoveryRange};
+use tokio::{
+    sync::{mpsc, watch},
+    task::JoinSet,
+    time::{Instant, MissedTickBehavior, interval, sleep_until, timeout},
+};
+use tracing::{debug, warn};
+
+use super::{
+    Action, Arrival, Local, Output, Peers, Standing, Wanted, interfaces, socket::SharedSocket,
+};
+
+/// How often interfaces are looked at.
+const INTERFACES_EVERY: Duration = Duration::from_secs(3);
+/// How often names of listed peers are looked up.
+const NAMES_EVERY: Duration = Duration::from_secs(30);
+const NAME_TIMEOUT: Duration = Duration::from_secs(5);
+/// Most datagrams that are looked at before what came of them is done.
+const TOGETHER: usize = 64;
+/// Most addresses of one name.
+const MOST_OF_A_NAME: usize = 4;
+
+/// What the daemon tells discovery.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub(crate) enum Event {
+    /// A datagram came to the QUIC port whose first byte [is discovery's](super::is_discovery).
+    Datagram {
+        /// Where from.
+        from: SocketAddr,
+        /// All of it.
+        bytes: Vec<u8>,
+    },
+    /// The QUIC port is bound. Discovery says nothing before.
+    QuicPort(u16),
+    /// A link stands, whoever dialled it.
+    LinkUp {
+        /// With this daemon.
+        daemon: DaemonId,
+        /// At this address.
+        address: SocketAddr,
+    },
+    /// The last link with a daemon is gone.
+    LinkDown {
+        /// Which.
+        daemon: DaemonId,
+    },
+    /// An [`Action::Dial`] became no link.
+    DialFailed {
+        /// To whom.
+        daemon: DaemonId,
+        /// As the action said it.
+        standing: Standing,
+    },
+    /// The graph has a new digest.
+    GraphDigest(u64),
+}
+
+/// Discovers as far as is `wanted`, until `events` closes; then says goodbye and ends, which closes
+/// `actions`.
+///
+/// Never waits for `actions` to have room: a datagram that finds none is lost, a dial counts as
+/// failed. No failure of a socket, an interface or a name ends it; what cannot work is logged, and
+/// the rest goes on. Dropping the future is safe, and says no goodbye.
+pub(crate) async fn run(
+    config: &Config,
+    daemon: DaemonId,
+    mut wanted: watch::Receiver<Wanted>,
+    mut events: mpsc::Receiver<Event>,
+    actions: mpsc::Sender<Action>,
+) {
+    let mut shell = Shell::new(config, daemon, actions);
+    let mut look = interval(INTERFACES_EVERY);
+    look.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut names = interval(NAMES_EVERY);
+    names.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut lookups = JoinSet::new();
+    let mut hosts = BTreeSet::new();
+    let mut range = DiscoveryRange::Off;
+    wanted.mark_changed();
+
+    loop {
+        let nameless = hosts.is_empty() && shell.names.is_empty();
+        let looks = looks_for_somebody(range, &hosts);
+        let wakeup = shell.peers.next_wakeup().map(|at| shell.start + at);
+        tokio::select! {
+            event = events.recv() => match event {
+                Some(event) => {
+                    shell.event(event);
+                    // What more there is now is looked at together.
+                    let more = std::iter::from_fn(|| events.try_recv().ok());
+                    more.take(TOGETHER).for_each(|event| shell.event(event));
+                }
+                None => break,
+            },
+            datagram = receive(shell.socket.as_ref()) => match datagram {
+                Ok((from, bytes)) => shell.heard(from, &bytes),
+                Err(error) => {
+                    debug!(%error, "the shared discovery port fails, opening it anew");
+                    shell.socket = None;
+                }
+            },
+            () = sleep_until_some(wakeup) => {}
+            Ok(()) = wanted.changed() => {
+                let now = wanted.borrow_and_update().clone();
+                range = now.range;
+                shell.set_range(range);
+                if hosts != now.hosts {
+                    hosts = now.hosts;
+                    // Once the one that is under way is over, with what is wanted by then.
+                    names.reset_immediately();
+                }
+                if range != DiscoveryRange::Off {
+                    shell.look_at_interfaces();
+                }
+                // A timer that is set fires, whether or not it is waited for.
+                if looks_for_somebody(range, &hosts) {
+                    look.reset();
+                }
+            }
+            _ = look.tick(), if looks => shell.look_at_interfaces(),
+            _ = names.tick(), if lookups.is_empty() && !nameless => {
+                lookups.spawn(look_up(hosts.clone()));
+            }
+            Some(found) = lookups.join_next() => if let Ok(found) = found {
+                shell.set_found(found);
+            },
+        }
+        let now = shell.start.elapsed();
+        shell.peers.advance(now);
+        shell.carry_out();
+    }
+    shell.peers.say_goodbye();
+    shell.carry_out();
+}
+
+struct Shell {
+    start: Instant,
+    peers: Peers,
+    socket: Option<SharedSocket>,
+    /// Whether the shared port is used at all.
+    multicast: bool,
+    domain: u32,
+    bind: Vec<IpAddr>,
+    actions: mpsc::Sender<Action>,
+    /// The addresses of static peers. A name keeps those that it had while its look-up fails.
+    names: BTreeMap<String, Vec<IpAddr>>,
+    /// The last failure to open the shared port, so that it is said once.
+    complained: bool,
+}
+
+impl Shell {
+    fn new(config: &Config, daemon: DaemonId, actions: mpsc::Sender<Action>) -> Self {
+        Self {
+            start: Instant::now(),
+            peers: Peers::new(Local::of(config, daemon), rand::random()),
+            socket: None,
+            multicast: false,
+            domain: config.domain,
+            bind: config.bind_addrs.clone(),
+            actions,
+            names: BTreeMap::new(),
+            complained: false,
+        }
+    }
+
+    fn set_range(&mut self, range: DiscoveryRange) {
+        self.multicast = range == DiscoveryRange::Subnet;
+        if !self.multicast {
+            // Leaves the group.
+            self.socket = None;
+        }
+        let now = self.start.elapsed();
+        self.peers.set_range(now, range);
+    }
+
+    fn set_found(&mut self, found: Found) {
+        let now = self.start.elapsed();
+        let mut listed = Vec::new();
+        let mut names: BTreeMap<String, Vec<IpAddr>> = BTreeMap::new();
+        for ((host, port), mut addresses) in found {
+            if addresses.is_empty() {
+                addresses = self.names.get(&host).cloned().unwrap_or_default();
+            }
+            listed.extend(addresses.iter().map(|address| (*address, port)));
+            names.entry(host).or_default().extend(addresses);
+        }
+        listed.dedup();
+        self.peers.set_listed(now, listed);
+        self.names.clone_from(&names);
+        // One that is dropped is overtaken by the next.
+        let _ = self.actions.try_send(Action::Named(names));
+    }
+
+    /// A datagram came to the shared port: it is looked at, with those that wait there.
+    fn heard(&mut self, from: SocketAddr, bytes: &[u8]) {
+        let now = self.start.elapsed();
+        self.peers.datagram(now, from, Arrival::Shared, bytes);
+        for _ in 1..TOGETHER {
+            let next = self.socket.as_ref().and_then(SharedSocket::try_receive);
+            let Some((from, bytes)) = next else { return };
+            self.peers.datagram(now, from, Arrival::Shared, &bytes);
+        }
+    }
+
+    fn event(&mut self, event: Event) {
+        let now = self.start.elapsed();
+        match event {
+            Event::Datagram { from, bytes } => {
+                self.peers.datagram(now, from, Arrival::Quic, &bytes);
+            }
+            Event::QuicPort(port) => self.peers.set_port(now, port),
+            Event::LinkUp { daemon, address } => self.peers.link_up(now, daemon, address),
+            Event::LinkDown { daemon } => self.peers.link_down(now, daemon),
+            Event::DialFailed { daemon, standing } => {
+                self.peers.dial_failed(now, daemon, standing);
+            }
+            Event::GraphDigest(digest) => self.peers.set_graph(digest),
+        }
+    }
+
+    fn look_at_interfaces(&mut self) {
+        let found = match interfaces() {
+            Ok(found) => found,
+            Err(error) => return warn!(%error, "cannot list the network interfaces"),
+        };
+        if self.multicast && self.socket.is_none() {
+            match SharedSocket::open(self.domain, &self.bind) {
+                Ok(socket) => self.socket = Some(socket),
+                Err(error) if !self.complained => {
+                    self.complained = true;
+                    warn!(%error, "cannot open the shared discovery port; listed peers work");
+                }
+                Err(_) => {}
+            }
+        }
+        if let Some(socket) = &mut self.socket {
+            socket.follow(&found);
+        }
+        let now = self.start.elapsed();
+        self.peers.set_interfaces(now, found);
+    }
+
+    fn carry_out(&mut self) {
+        while let Some(output) = self.peers.poll() {
+            match output {
+                Output::Multicast(bytes) => {
+                    if let Some(socket) = &mut self.socket {
+                        socket.send(&bytes);
+                    }
+                }
+                Output::Action(action) => {
+                    let dial = match &action {
+                        Action::Dial { daemon, standing, .. } => Some((*daemon, *standing)),
+                        _ => None,
+                    };
+                    if let (Err(_), Some((daemon, standing))) =
+                        (self.actions.try_send(action), dial)
+                    {
+                        let now = self.start.elapsed();
+                        self.peers.dial_failed(now, daemon, standing);
+                    }
+                }
+            }
+        }
+    }
+}
+
+async fn receive(socket: Option<&SharedSocket>) -> std::io::Result<(SocketAddr, Vec<u8>)> {
+    match socket {
+        Some(socket) => socket.receive().await,
+        None => pending().await,
+    }
+}
+
+/// Where nobody is looked for, interfaces that change are no reason to wake up.
+fn looks_for_somebody(range: DiscoveryRange, hosts: &BTreeSet<(String, Option<u16>)>) -> bool {
+    match range {
+        DiscoveryRange::Off => false,
+        DiscoveryRange::Localhost => !hosts.is_empty(),
+        DiscoveryRange::Subnet => true,
+    }
+}
+
+async fn sleep_until_some(at: Option<Instant>) {
+    match at {
+        Some(at) => sleep_until(at).await,
+        None => pending().await,
+    }
+}
+
+/// Hosts, with a port where one was given, and their addresses.
+type Found = Vec<((String, Option<u16>), Vec<IpAddr>)>;
+
+async fn look_up(hosts: BTreeSet<(String, Option<u16>)>) -> Found {
+    // At once: a name server that does not answer for one host holds up no other.
+    let mut lookups = JoinSet::new();
+    for (host, port) in hosts {
+        lookups.spawn(async move {
+            let addresses = addresses_of(&host).await;
+            ((host, port), addresses)
+        });
+    }
+    let mut found = lookups.join_all().await;
+    found.sort_unstable();
+    found
+}
+
+async fn addresses_of(host: &str) -> Vec<IpAddr> {
+    if let Ok(address) = host.parse::<IpAddr>() {
+        return vec![address.to_canonical()];
+    }
+    match timeout(NAME_TIMEOUT, tokio::net::lookup_host((host, 0))).await {
+        Ok(Ok(addresses)) => {
+            addresses.take(MOST_OF_A_NAME).map(|address| address.ip().to_canonical()).collect()
+        }
+        Ok(Err(error)) => {
+            debug!(host, %error, "static peer has no address");
+            Vec::new()
+        }
+        Err(_) => {
+            debug!(host, "static peer: no answer to the look-up of its name");
+            Vec::new()
+        }
+    }
+}

@@ -1,0 +1,148 @@
+//! The messages between the control plane and the gateway.
+//!
+//! They run on threads and runtimes of their own and share nothing but these two bounded channels,
+//! one session socket, and the table of the sessions' keys. Neither waits for the other: the control
+//! plane drops an order that does not fit, and a gateway that fails is started again.
+
+use std::{
+    collections::BTreeSet,
+    net::{IpAddr, SocketAddr},
+    os::fd::OwnedFd,
+    sync::Arc,
+};
+
+use axon_shm::ids::{DaemonId, Gid};
+use axon_transport::{config::Config, internal::graph::RemoteEndpoint, status::LinkStatus};
+use tokio::sync::mpsc;
+
+use crate::{discovery::Standing, owner::SessionKeys};
+
+/// What either channel holds.
+pub const CHANNEL: usize = 1024;
+
+/// Stands in the status for topics whose losses are not kept apart: too many, or too long a name.
+pub(crate) const OTHER_TOPICS: &str = "(other topics)";
+
+/// What a gateway is started with.
+#[derive(Debug)]
+pub struct GatewayParts {
+    /// The daemon's settings.
+    pub config: Arc<Config>,
+    /// The daemon.
+    pub daemon: DaemonId,
+    /// The keys of the sessions, with which the gateway proves to peers that they are this daemon's.
+    pub keys: Arc<SessionKeys>,
+    /// One end of a socket pair, for [`Session::over`](axon_transport::Session::over).
+    pub socket: OwnedFd,
+    /// To the control plane.
+    pub control: mpsc::Sender<ToControl>,
+    /// From the control plane.
+    pub orders: mpsc::Receiver<ToGateway>,
+}
+
+/// From the gateway to the control plane.
+#[derive(Debug)]
+pub enum ToControl {
+    /// The gateway stands; its QUIC socket has this port. Sent once, before anything else.
+    Started {
+        /// The UDP port.
+        port: u16,
+    },
+    /// A peer's endpoints changed.
+    RemoteGraph {
+        /// The peer.
+        daemon: DaemonId,
+        /// Forget what it had.
+        reset: bool,
+        /// Endpoints that are new.
+        added: Vec<RemoteEndpoint>,
+        /// Endpoints that are gone.
+        removed: Vec<Gid>,
+    },
+    /// A dial, ours or the peer's, became a link.
+    LinkUp {
+        /// The peer.
+        daemon: DaemonId,
+        /// Where it is.
+        address: SocketAddr,
+    },
+    /// How a link does: at its start and from time to time. Replaces what was known of the peer.
+    Link(Box<LinkStatus>),
+    /// A link is over. The peer's endpoints are forgotten.
+    LinkDown {
+        /// The peer.
+        daemon: DaemonId,
+        /// Why.
+        reason: String,
+    },
+    /// A dial that was ordered came to nothing. Why is said by [`ToControl::Refusal`].
+    DialFailed {
+        /// The peer.
+        daemon: DaemonId,
+        /// Why it may be there, as the order said it.
+        standing: Standing,
+    },
+    /// A discovery datagram that arrived at the QUIC port.
+    Datagram {
+        /// Its sender.
+        from: SocketAddr,
+        /// Its content.
+        bytes: Vec<u8>,
+    },
+    /// Somebody was refused, by this host or by the other.
+    Refusal {
+        /// The other: a daemon id, SAE ID or address.
+        peer: String,
+        /// What was refused, such as `handshake` or the variable that differs.
+        what: String,
+        /// Why.
+        reason: String,
+    },
+    /// Samples of a topic did not get to another host.
+    Lost {
+        /// The topic.
+        topic: String,
+        /// Why, as the status names it.
+        cause: &'static str,
+        /// How many.
+        samples: u64,
+    },
+    /// Whether samples of publishers that ended are on their way to other hosts: the daemon does not
+    /// end meanwhile.
+    Draining(bool),
+    /// What is to be shown of the key supply.
+    Keys(serde_json::Value),
+    /// What waited when the daemon was told to end has arrived, or does not get on: it may end.
+    Finished,
+}
+
+/// From the control plane to the gateway.
+#[derive(Debug)]
+pub enum ToGateway {
+    /// Connect to a peer. Answered by [`ToControl::LinkUp`] or [`ToControl::DialFailed`].
+    Dial {
+        /// The daemon expected there.
+        daemon: DaemonId,
+        /// Its SAE ID, in qkd.
+        sae: Option<String>,
+        /// Where it may be, best first.
+        addresses: Vec<SocketAddr>,
+        /// Whether this host lists it as a static peer.
+        listed: bool,
+        /// Why it may be there; the answer says it again.
+        standing: Standing,
+    },
+    /// Send a discovery datagram from the QUIC port.
+    SendDatagram {
+        /// To whom.
+        to: SocketAddr,
+        /// What.
+        bytes: Vec<u8>,
+    },
+    /// These addresses are those of listed peers from now on.
+    Listed(BTreeSet<IpAddr>),
+    /// Say when what waits to be sent has arrived: the daemon is to end.
+    Finish,
+    /// Say goodbye to every peer and return.
+    Shutdown,
+}

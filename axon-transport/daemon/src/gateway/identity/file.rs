@@ -1,0 +1,56 @@
+//! A file of the identity.
+
+use std::path::{Path, PathBuf};
+
+use axon_tls::identity::TrustFile;
+use axon_transport::internal::files::Demands;
+use zeroize::Zeroizing;
+
+use crate::gateway::GatewayError;
+pub(super) use axon_transport::internal::files::Stamp;
+
+/// A file that a setting names.
+#[derive(Clone, Debug)]
+pub(super) struct Named {
+    pub(super) variable: &'static str,
+    pub(super) path: PathBuf,
+    demands: Demands,
+}
+
+impl Named {
+    /// The file at `path`, if the setting is given.
+    ///
+    /// # Errors
+    /// It is not.
+    pub(super) fn new(variable: &'static str, path: Option<&Path>) -> Result<Self, GatewayError> {
+        let path = path.ok_or(GatewayError::Missing(variable))?.to_owned();
+        let demands = match variable {
+            "AXON_CLASSIC_KEY" => Demands::KEY,
+            "AXON_CLASSIC_TRUST" => Demands::public(TrustFile::MAX_LEN as u64),
+            _ => Demands::CERTIFICATES,
+        };
+        Ok(Self { variable, path, demands })
+    }
+
+    /// The failure of this file.
+    pub(super) fn unusable(&self, reason: impl std::fmt::Display) -> GatewayError {
+        GatewayError::File {
+            variable: self.variable,
+            path: self.path.clone(),
+            reason: reason.to_string(),
+        }
+    }
+
+    /// How the file is now; why it cannot be used if that shows from outside.
+    pub(super) fn stamp(&self) -> Result<Stamp, String> {
+        self.demands.stamp(&self.path)
+    }
+
+    /// The whole file, into a buffer that never moves and is erased.
+    ///
+    /// # Errors
+    /// It is not what the settings demand of it, cannot be read, or is too large.
+    pub(super) fn read(&self) -> Result<Zeroizing<Vec<u8>>, GatewayError> {
+        self.demands.read(&self.path).map_err(|reason| self.unusable(reason))
+    }
+}

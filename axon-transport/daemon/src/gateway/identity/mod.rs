@@ -1,0 +1,130 @@
+//! The classic identity: our key and whom it trusts, from the files that the settings name.
+//!
+//! The files are read again when they change. Files that cannot be used then let nobody new in: a
+//! link that stands is kept by what was in force before, since nothing says that its peer was
+//! removed.
+
+mod file;
+mod load;
+#[cfg(test)]
+mod tests;
+mod watch;
+
+use std::{
+    sync::{Mutex, PoisonError, RwLock},
+    time::Instant,
+};
+
+use axon_tls::identity::Auth;
+use axon_transport::config::ClassicConfig;
+
+use self::{
+    load::Sources,
+    watch::{Look, Watch},
+};
+use super::{GatewayError, keyring::lock};
+
+/// Whether the files that `classic` names can be used.
+///
+/// # Errors
+/// A file that cannot, by the name of its variable.
+pub(super) fn check(classic: &ClassicConfig) -> Result<(), GatewayError> {
+    Sources::of(classic)?.load(None).map(drop)
+}
+
+/// What this host is, and whom it trusts, as its files say.
+pub(super) struct Identity {
+    sources: Sources,
+    host: String,
+    in_force: RwLock<InForce>,
+    watch: Mutex<Watch>,
+}
+
+struct InForce {
+    auth: Auth,
+    /// Why nobody new is let in.
+    closed: Option<String>,
+}
+
+impl Identity {
+    /// Reads what `classic` names; an ephemeral key for `none`. `node` is this host's own name.
+    ///
+    /// # Errors
+    /// A file that cannot be used, by the name of its variable; or a certificate that does not say
+    /// which host this is.
+    pub(super) fn load(classic: &ClassicConfig, node: &str) -> Result<Self, GatewayError> {
+        let sources = Sources::of(classic)?;
+        // Before they are read: what is written meanwhile is read again.
+        let watch = Watch::new(sources.files());
+        let auth = sources.load(None)?.put_in_force();
+        let host = sources.host(&auth, node)?;
+        let in_force = RwLock::new(InForce { auth, closed: None });
+        Ok(Self { sources, host, in_force, watch: Mutex::new(watch) })
+    }
+
+    /// What this host is called in HELLO.
+    pub(super) fn host(&self) -> &str {
+        &self.host
+    }
+
+    /// What is in force.
+    pub(super) fn auth(&self) -> Auth {
+        self.in_force.read().unwrap_or_else(PoisonError::into_inner).auth.clone()
+    }
+
+    /// Why nobody new is let in now, for people on this host.
+    pub(super) fn closed(&self) -> Option<String> {
+        self.in_force.read().unwrap_or_else(PoisonError::into_inner).closed.clone()
+    }
+
+    /// Whether there are files that can change.
+    pub(super) fn has_files(&self) -> bool {
+        !lock(&self.watch).is_empty()
+    }
+
+    /// Looks whether the files changed, a few times a second; whether something else is in force
+    /// now. Blocks on the file system.
+    pub(super) fn look(&self, now: Instant) -> bool {
+        let mut watch = lock(&self.watch);
+        match watch.look(now) {
+            Look::Same | Look::Changing => false,
+            Look::Restless => self.close(
+                "the files of this host's identity keep changing, and are not used until they \
+                 stand still"
+                    .into(),
+            ),
+            Look::Changed => {
+                let before = self.auth();
+                let loaded = self.sources.load(Some(&before)).and_then(|loaded| {
+                    self.sources.still_names(loaded.auth(), &self.host).map(|()| loaded)
+                });
+                if !watch.confirm() {
+                    return false;
+                }
+                match loaded {
+                    Ok(loaded) => {
+                        let auth = loaded.put_in_force();
+                        tracing::info!("the files of this host's identity were read again");
+                        *self.write() = InForce { auth, closed: None };
+                        true
+                    }
+                    Err(error) => self.close(error.to_string()),
+                }
+            }
+        }
+    }
+
+    fn close(&self, why: String) -> bool {
+        tracing::error!(
+            why,
+            "no new link is accepted until the files of this host's identity can be used again; \
+             links that stand are kept"
+        );
+        self.write().closed = Some(why);
+        true
+    }
+
+    fn write(&self) -> std::sync::RwLockWriteGuard<'_, InForce> {
+        self.in_force.write().unwrap_or_else(PoisonError::into_inner)
+    }
+}

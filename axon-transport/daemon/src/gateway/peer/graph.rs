@@ -1,0 +1,469 @@
+//! A peer's graph as this side holds it: as much of it as the peer's account has room for.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    sync::Arc,
+};
+
+use axon_shm::ids::{DaemonId, Gid};
+use axon_transport::{
+    config::DiscoveryRange,
+    graph::{Endpoint, EndpointKind},
+    internal::graph::{LIMITS, RemoteEndpoint, Toward},
+};
+
+use super::owners::Proven;
+use crate::{
+    gateway::account::{Account, Charge},
+    link::Graph,
+    owner::{Binding, Prefix, Proof, prefix_of},
+};
+
+/// What changed in a peer's graph.
+#[derive(Debug)]
+pub(in crate::gateway) struct GraphChange {
+    /// Whether it replaces everything that was known of the peer.
+    pub(in crate::gateway) reset: bool,
+    /// Endpoints that came or changed.
+    pub(in crate::gateway) added: Vec<RemoteEndpoint>,
+    /// Endpoints that went.
+    pub(in crate::gateway) removed: Vec<Gid>,
+}
+
+/// What became of a GRAPH message.
+#[derive(Debug, PartialEq, Eq)]
+pub(in crate::gateway) enum GraphTaken {
+    /// It counts. `whole` when it was the end of a whole graph.
+    Changed { whole: bool },
+    /// More of it is to come.
+    Part,
+    /// A version is missing: the whole graph must be asked for.
+    Gap,
+}
+
+/// An endpoint of the peer.
+#[derive(Clone, Debug)]
+struct Held {
+    remote: RemoteEndpoint,
+    _charge: Arc<Charge>,
+}
+
+/// An endpoint for which there was no room.
+#[derive(Debug)]
+struct Refused {
+    /// It by name, and why.
+    text: String,
+    /// Bytes that it would take; `None` when bytes are not what is missing.
+    bytes: Option<usize>,
+}
+
+/// The graph of one peer.
+#[derive(Debug)]
+pub(in crate::gateway) struct Remote {
+    account: Arc<Account>,
+    proven: Proven,
+    all: BTreeMap<Gid, Held>,
+    version: u64,
+    /// What came of a whole graph so far.
+    gathered: Option<BTreeMap<Gid, Held>>,
+    /// Endpoints that came, changed or went since the last [`changes`](Self::changes).
+    changed: BTreeSet<Gid>,
+    /// Nothing was told of it yet.
+    fresh: bool,
+    /// The first that was refused since the last whole graph, and how many there were.
+    refused: Option<Refused>,
+    left_out: u64,
+}
+
+impl Remote {
+    /// That of a peer which must prove its sessions, if `proofs`.
+    pub(in crate::gateway) fn new(account: Arc<Account>, proofs: bool) -> Self {
+        Self {
+            account,
+            proven: Proven::new(proofs),
+            all: BTreeMap::new(),
+            version: 0,
+            gathered: None,
+            changed: BTreeSet::new(),
+            fresh: true,
+            refused: None,
+            left_out: 0,
+        }
+    }
+
+    /// Takes a GRAPH in, as far as there is room.
+    pub(in crate::gateway) fn take(&mut self, graph: Graph) -> GraphTaken {
+        let Graph { version, before, added, removed, more, localhost, listing } = graph;
+        let [localhost, listing] = [localhost, listing]
+            .map(|gids| gids.unwrap_or_default().into_iter().collect::<BTreeSet<Gid>>());
+        let toward = |gid: &Gid| {
+            let near = localhost.contains(gid);
+            let range = if near { DiscoveryRange::Localhost } else { DiscoveryRange::Subnet };
+            Toward { range, lists: listing.contains(gid) }
+        };
+        if before == 0 {
+            self.gathered = Some(BTreeMap::new());
+            (self.refused, self.left_out) = (None, 0);
+        } else if before != self.version {
+            return GraphTaken::Gap;
+        }
+        self.version = version;
+        if let Some(mut gathered) = self.gathered.take() {
+            for endpoint in added {
+                let toward = toward(&endpoint.gid);
+                self.gather(&mut gathered, endpoint, toward);
+            }
+            if more {
+                self.gathered = Some(gathered);
+                return GraphTaken::Part;
+            }
+            let old = std::mem::replace(&mut self.all, gathered);
+            let same = |held: &Held, other: Option<&Held>| {
+                other.is_some_and(|other| {
+                    let (held, other) = (&held.remote, &other.remote);
+                    Arc::ptr_eq(&held.endpoint, &other.endpoint) && held.toward == other.toward
+                })
+            };
+            let came = self.all.iter().filter(|(gid, held)| !same(held, old.get(gid)));
+            self.changed.extend(came.map(|(gid, _)| *gid));
+            self.changed.extend(old.keys().filter(|gid| !self.all.contains_key(gid)));
+            self.proven.settle();
+            return GraphTaken::Changed { whole: true };
+        }
+        for gid in removed {
+            if self.all.remove(&gid).is_some() {
+                self.changed.insert(gid);
+            }
+        }
+        for endpoint in added {
+            let gid = endpoint.gid;
+            if !self.proven.owns(&gid) {
+                self.disown(&gid, || named(&endpoint));
+                continue;
+            }
+            // What it replaces makes room for it.
+            let before = self.all.remove(&gid);
+            let known = before.is_some();
+            drop(before);
+            let held = self.hold(endpoint, toward(&gid), self.all.len());
+            if known || held.is_some() {
+                self.changed.insert(gid);
+            }
+            self.all.extend(held.map(|held| (gid, held)));
+        }
+        self.proven.settle();
+        GraphTaken::Changed { whole: false }
+    }
+
+    /// One more endpoint of a whole graph. One that is known already takes nothing more.
+    fn gather(&mut self, gathered: &mut BTreeMap<Gid, Held>, endpoint: Endpoint, toward: Toward) {
+        let gid = endpoint.gid;
+        let held = match self.all.get(&gid) {
+            _ if !self.proven.owns(&gid) => {
+                self.disown(&gid, || named(&endpoint));
+                None
+            }
+            Some(known) if *known.remote.endpoint == endpoint => {
+                let remote = RemoteEndpoint { toward, ..known.remote.clone() };
+                Some(Held { remote, ..known.clone() })
+            }
+            _ => self.hold(endpoint, toward, gathered.len()),
+        };
+        gathered.extend(held.map(|held| (gid, held)));
+    }
+
+    /// Another connection takes over: on it the peer proves its sessions anew, before it says anything of
+    /// them.
+    pub(in crate::gateway) fn succeed(&mut self) {
+        self.proven.succeed();
+    }
+
+    /// Takes what the peer's daemon proves on the connection that `binding` is of.
+    pub(in crate::gateway) fn prove(
+        &mut self,
+        proofs: &[Proof],
+        binding: &Binding,
+        from: DaemonId,
+    ) {
+        let all = &self.all;
+        let used = |session: &Prefix| {
+            let mut first = [0; 16];
+            first[..session.len()].copy_from_slice(session);
+            let next = all.range(Gid(first)..).next();
+            next.is_some_and(|(gid, _)| prefix_of(gid) == *session)
+        };
+        self.proven.take(proofs, binding, from, used);
+    }
+
+    /// Whether the peer may speak for an endpoint of this GID.
+    pub(in crate::gateway) fn owns(&self, gid: &Gid) -> bool {
+        self.proven.owns(gid)
+    }
+
+    /// A reader that the peer names in SUBSCRIBE is left out.
+    pub(in crate::gateway) fn disown_reader(&mut self, gid: &Gid, topic: &str) {
+        self.disown(gid, || format!("the reader of {}", short(topic)));
+    }
+
+    fn disown(&mut self, gid: &Gid, named: impl FnOnce() -> String) {
+        self.left_out += 1;
+        self.refused.get_or_insert_with(|| {
+            let text = format!(
+                "{} is left out: the peer did not prove that its GID {gid} is of a session of its own",
+                named()
+            );
+            Refused { text, bytes: None }
+        });
+    }
+
+    fn hold(&mut self, endpoint: Endpoint, toward: Toward, beside: usize) -> Option<Held> {
+        let bytes = endpoint.bytes();
+        if beside < LIMITS.endpoints
+            && let Some(charge) = self.account.graph.charge(bytes)
+        {
+            let remote = RemoteEndpoint { endpoint: Arc::new(endpoint), toward };
+            return Some(Held { remote, _charge: Arc::new(charge) });
+        }
+        self.left_out += 1;
+        if self.refused.is_none() {
+            let (why, bytes) = if beside < LIMITS.endpoints {
+                let most = self.account.graph.most() >> 20;
+                (format!("more than {most} MiB ([link] graph_mb here)"), Some(bytes))
+            } else {
+                (format!("more than {} endpoints", LIMITS.endpoints), None)
+            };
+            let text = format!("{} is left out: the peer's graph has {why}", named(&endpoint));
+            self.refused = Some(Refused { text, bytes });
+        }
+        None
+    }
+
+    /// What changed since the last call.
+    pub(in crate::gateway) fn changes(&mut self) -> GraphChange {
+        let reset = std::mem::replace(&mut self.fresh, false);
+        let (mut added, mut removed) = (Vec::new(), Vec::new());
+        for gid in std::mem::take(&mut self.changed) {
+            match self.all.get(&gid) {
+                Some(held) => added.push(held.remote.clone()),
+                None => removed.push(gid),
+            }
+        }
+        GraphChange { reset, added, removed }
+    }
+
+    /// The first endpoint that was left out of the graph, and why; `None` when it is complete.
+    pub(in crate::gateway) fn refused(&self) -> Option<&str> {
+        self.refused.as_ref().map(|refused| refused.text.as_str())
+    }
+
+    /// How many were left out since the peer said its whole graph.
+    pub(in crate::gateway) fn left_out(&self) -> u64 {
+        self.left_out
+    }
+
+    /// Whether there is room by now for the first that was left out: the whole graph is worth asking
+    /// for.
+    pub(in crate::gateway) fn has_room_again(&self) -> bool {
+        let needed = self.refused.as_ref().and_then(|refused| refused.bytes);
+        self.gathered.is_none() && needed.is_some_and(|n| self.account.graph.charge(n).is_some())
+    }
+
+    /// The version that this side holds.
+    pub(in crate::gateway) fn version(&self) -> u64 {
+        self.version
+    }
+
+    /// How many endpoints there are.
+    pub(in crate::gateway) fn len(&self) -> usize {
+        self.all.len()
+    }
+
+    /// The peer's account.
+    pub(in crate::gateway) fn account(&self) -> &Arc<Account> {
+        &self.account
+    }
+
+    /// One endpoint.
+    pub(in crate::gateway) fn get(&self, gid: &Gid) -> Option<&Endpoint> {
+        self.all.get(gid).map(|held| &*held.remote.endpoint)
+    }
+
+    /// Whether it has this endpoint, as was found in [`changes`](Self::changes).
+    pub(in crate::gateway) fn has(&self, gid: &Gid) -> bool {
+        self.all.contains_key(gid) && !self.changed.contains(gid)
+    }
+
+    /// All endpoints.
+    pub(in crate::gateway) fn endpoints(&self) -> impl Iterator<Item = &RemoteEndpoint> {
+        self.all.values().map(|held| &held.remote)
+    }
+
+    /// These endpoints are another daemon's.
+    pub(in crate::gateway) fn forget(&mut self, gids: &[Gid]) {
+        for gid in gids {
+            self.all.remove(gid);
+        }
+    }
+}
+
+fn short(name: &str) -> String {
+    format!("{:?}", name.chars().take(100).collect::<String>())
+}
+
+/// An endpoint for log and status, with whatever names a peer gave it.
+fn named(endpoint: &Endpoint) -> String {
+    let what = match endpoint.kind {
+        EndpointKind::Publisher => "the publisher of",
+        EndpointKind::Subscription => "the subscription to",
+        EndpointKind::Server => "the server of",
+        EndpointKind::Client => "the client of",
+        EndpointKind::Node => return format!("the node {}", short(&endpoint.node)),
+    };
+    format!("{what} {} in node {}", short(&endpoint.topic), short(&endpoint.node))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use axon_shm::qos::Qos;
+    use axon_transport::internal::SessionKey;
+
+    use crate::{gateway::account::Accounts, owner::prove};
+
+    fn endpoint(number: u8, name: &str) -> Endpoint {
+        Endpoint {
+            gid: Gid([number; 16]),
+            kind: EndpointKind::Publisher,
+            topic: name.into(),
+            type_name: "T".into(),
+            type_hash: Vec::new(),
+            qos: Qos::default(),
+            node: "n".into(),
+            namespace: "/".into(),
+            enclave: String::new(),
+        }
+    }
+
+    fn graph(before: u64, added: Vec<Endpoint>, removed: Vec<Gid>, more: bool) -> Graph {
+        let version = before + 1;
+        Graph { version, before, added, removed, more, localhost: None, listing: None }
+    }
+
+    fn one() -> usize {
+        endpoint(1, "/t").bytes()
+    }
+
+    /// GIDs of what came and went.
+    fn changes(remote: &mut Remote) -> (Vec<u8>, Vec<u8>) {
+        let GraphChange { added, removed, .. } = remote.changes();
+        let first = |gid: &Gid| gid.0[0];
+        (
+            added.iter().map(|e| first(&e.endpoint.gid)).collect(),
+            removed.iter().map(first).collect(),
+        )
+    }
+
+    #[test]
+    fn what_was_proved_on_one_connection_counts_for_nothing_on_the_next() {
+        let account = Accounts::new(10 * one()).of("a");
+        let mut remote = Remote::new(account, true);
+        let key = SessionKey::generate().unwrap();
+        let (own, from) = (Gid::new(key.id(), 1), DaemonId([7; 16]));
+        let [first, second] = [[1; 32], [2; 32]];
+        let all = || graph(0, vec![Endpoint { gid: own, ..endpoint(1, "/t") }], vec![], false);
+        remote.prove(&[prove(&key, &first, from).unwrap()], &first, from);
+        remote.take(all());
+        assert_eq!((remote.left_out(), changes(&mut remote).0.len()), (0, 1));
+        remote.succeed();
+        assert!(!remote.owns(&own));
+        // The old proof is of the other connection.
+        remote.prove(&[prove(&key, &first, from).unwrap()], &second, from);
+        remote.take(all());
+        assert_eq!((remote.left_out(), changes(&mut remote).1.len()), (1, 1));
+        remote.prove(&[prove(&key, &second, from).unwrap()], &second, from);
+        remote.take(all());
+        assert_eq!((remote.left_out(), changes(&mut remote).0.len()), (0, 1));
+    }
+
+    #[test]
+    fn what_there_is_no_room_for_is_left_out_by_name_and_the_rest_counts() {
+        let account = Accounts::new(2 * one()).of("a");
+        let (mut remote, mut other) =
+            (Remote::new(Arc::clone(&account), false), Remote::new(Arc::clone(&account), false));
+        assert_eq!(
+            remote.take(graph(0, vec![endpoint(1, "/t")], vec![], false)),
+            GraphTaken::Changed { whole: true }
+        );
+        // Of the same identity under another daemon id.
+        other.take(graph(0, vec![endpoint(2, "/t"), endpoint(3, "/u")], vec![], false));
+        assert_eq!(changes(&mut other), (vec![2], vec![]));
+        assert!(other.refused().unwrap().contains("the publisher of \"/u\" in node \"n\""));
+        assert_eq!((other.left_out(), other.has_room_again()), (1, false));
+        assert_eq!(remote.refused(), None);
+        // One goes: there is room for another, and for the one that was left out.
+        remote.take(graph(1, vec![], vec![Gid([1; 16])], false));
+        assert!(other.has_room_again());
+        other.take(graph(0, vec![endpoint(2, "/t"), endpoint(3, "/u")], vec![], false));
+        assert_eq!((changes(&mut other), other.refused()), ((vec![3], vec![]), None));
+        drop(other);
+        assert_eq!(account.graph.held(), 0);
+    }
+
+    #[test]
+    fn a_whole_graph_that_is_said_again_takes_no_more_and_changes_nothing() {
+        let account = Accounts::new(3 * one()).of("a");
+        let mut remote = Remote::new(Arc::clone(&account), false);
+        let all = || (1..=3).map(|n| endpoint(n, "/t")).collect::<Vec<_>>();
+        remote.take(graph(0, all(), vec![], false));
+        assert_eq!(changes(&mut remote), (vec![1, 2, 3], vec![]));
+        let mut parts = all().into_iter();
+        let first = parts.next().into_iter().collect();
+        assert_eq!(remote.take(graph(0, first, vec![], true)), GraphTaken::Part);
+        assert_eq!(remote.len(), 3, "until all of it is there");
+        let rest = vec![parts.next().unwrap(), endpoint(4, "/t")];
+        remote.take(graph(1, rest, vec![], false));
+        // The one that is gone made no room yet when the new one came.
+        assert_eq!((changes(&mut remote), remote.left_out()), ((vec![], vec![3]), 1));
+        assert!(remote.has_room_again());
+        assert_eq!(account.graph.held(), 2 * one());
+    }
+
+    #[test]
+    fn the_newest_state_of_an_endpoint_counts_once() {
+        let mut remote = Remote::new(Accounts::new(1 << 20).of("a"), false);
+        remote.take(graph(0, vec![endpoint(1, "/t")], vec![], false));
+        changes(&mut remote);
+        for before in (1..100).step_by(2) {
+            remote.take(graph(before, vec![], vec![Gid([1; 16])], false));
+            remote.take(graph(
+                before + 1,
+                vec![endpoint(1, "/u"), endpoint(2, "/t")],
+                vec![],
+                false,
+            ));
+        }
+        assert_eq!(remote.get(&Gid([1; 16])).unwrap().topic, "/u");
+        assert_eq!(changes(&mut remote), (vec![1, 2], vec![]));
+        assert_eq!(remote.take(graph(7, vec![], vec![], false)), GraphTaken::Gap);
+    }
+
+    #[test]
+    fn an_endpoint_of_a_session_that_is_not_proven_is_left_out_and_one_that_is_counts() {
+        let (own, others) = (SessionKey::generate().unwrap(), SessionKey::generate().unwrap());
+        let (binding, here) = ([7; 32], DaemonId([1; 16]));
+        let mut remote = Remote::new(Accounts::new(1 << 20).of("a"), true);
+        remote.prove(&[prove(&own, &binding, here).unwrap()], &binding, here);
+        // The proof of another host, for another connection.
+        remote.prove(&[prove(&others, &[8; 32], here).unwrap()], &binding, here);
+        let of =
+            |key: &SessionKey, topic| Endpoint { gid: Gid::new(key.id(), 1), ..endpoint(0, topic) };
+        for before in [0, 1] {
+            let added = vec![of(&others, "/squatted"), of(&own, "/t")];
+            remote.take(graph(before, added, vec![], false));
+            assert_eq!((remote.len(), remote.left_out()), (1, before + 1));
+            assert!(remote.owns(&Gid::new(own.id(), 9)) && !remote.owns(&Gid::new(others.id(), 1)));
+        }
+        assert!(remote.refused().unwrap().contains("\"/squatted\""));
+        assert!(!remote.has_room_again());
+    }
+}

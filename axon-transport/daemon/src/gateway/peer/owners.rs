@@ -1,0 +1,312 @@
+//! Proofs of which daemon a session belongs to: those that this daemon sends to a peer, and those that the
+//! peer sends.
+
+use std::{
+    collections::{BTreeSet, HashMap, HashSet},
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use axon_shm::ids::{DaemonId, Gid};
+use axon_transport::internal::SessionKey;
+use quinn::Connection;
+
+use crate::{
+    link::{MAX_PROOFS, Message, Owners},
+    owner::{Binding, EXPORTER, Prefix, Proof, SessionKeys, prefix, prefix_of, prove},
+};
+
+/// Sessions of one daemon that are taken for proven.
+const MAX_PROVEN: usize = 8192;
+/// How often sessions without endpoints are looked for, where there are too many.
+const SWEEP: Duration = Duration::from_secs(1);
+
+/// The bytes that both ends of this connection share and no other connection has.
+pub(in crate::gateway) fn binding(connection: &Connection) -> Option<Binding> {
+    let mut binding = [0; 32];
+    connection.export_keying_material(&mut binding, EXPORTER, b"").ok().map(|()| binding)
+}
+
+/// Proves to one peer that sessions are this daemon's.
+pub(in crate::gateway) struct Prover {
+    keys: Arc<SessionKeys>,
+    daemon: DaemonId,
+    /// Whether proofs are asked for: where peers prove who they are.
+    needed: bool,
+    binding: Option<Binding>,
+    /// The sessions whose proofs the peer has, of those that were made on the connection in use.
+    proved: HashSet<Prefix>,
+    /// The proofs: as long as the connection is the same, they are.
+    made: HashMap<Prefix, Proof>,
+    /// The keys of sessions that the peer sees. A publisher that ended is seen longer than its session
+    /// is connected.
+    held: HashMap<Prefix, Arc<SessionKey>>,
+}
+
+impl Prover {
+    /// Proves sessions of `daemon` on this connection, if `needed`.
+    pub(in crate::gateway) fn new(
+        keys: &Arc<SessionKeys>,
+        daemon: DaemonId,
+        needed: bool,
+        connection: &Connection,
+    ) -> Self {
+        let mut prover = Self {
+            keys: Arc::clone(keys),
+            daemon,
+            needed,
+            binding: None,
+            proved: HashSet::new(),
+            made: HashMap::new(),
+            held: HashMap::new(),
+        };
+        prover.succeed(connection);
+        prover
+    }
+
+    /// Whether proofs are asked for.
+    pub(super) fn is_needed(&self) -> bool {
+        self.needed
+    }
+
+    /// Another connection takes over: everything is proved anew there.
+    pub(super) fn succeed(&mut self, connection: &Connection) {
+        self.binding = if self.needed { binding(connection) } else { None };
+        self.made.clear();
+        self.forget();
+    }
+
+    /// The peer asks for everything: every proof is said again.
+    pub(super) fn forget(&mut self) {
+        self.proved.clear();
+    }
+
+    /// The proofs that the peer lacks for endpoints of these GIDs.
+    pub(super) fn owed<'a>(&mut self, gids: impl Iterator<Item = &'a Gid>) -> Vec<Message> {
+        let Some(binding) = self.binding else { return Vec::new() };
+        let sessions: BTreeSet<Prefix> = gids.map(prefix_of).collect();
+        self.proved.retain(|session| sessions.contains(session));
+        self.made.retain(|session, _| sessions.contains(session));
+        self.held.retain(|session, _| sessions.contains(session));
+        let mut proofs = Vec::new();
+        for session in sessions {
+            if self.proved.contains(&session) {
+                continue;
+            }
+            if let Some(key) = self.keys.get(&session) {
+                self.held.insert(session, key);
+            }
+            // A signature costs time: one for each session and connection.
+            if !self.made.contains_key(&session)
+                && let Some(key) = self.held.get(&session)
+                && let Some(proof) = prove(&key, &binding, self.daemon)
+            {
+                self.made.insert(session, proof);
+            }
+            if let Some(proof) = self.made.get(&session) {
+                self.proved.insert(session);
+                proofs.push(proof.clone());
+            }
+        }
+        let parts = proofs.chunks(MAX_PROOFS);
+        parts.map(|part| Message::Owners(Owners { proofs: part.to_vec() })).collect()
+    }
+}
+
+/// The sessions of a peer.
+#[derive(Debug)]
+pub(super) struct Proven {
+    /// Whether proofs are asked for: where peers prove who they are.
+    needed: bool,
+    sessions: HashSet<Prefix>,
+    /// Those that were proved since the last GRAPH, which may bring their endpoints.
+    fresh: HashSet<Prefix>,
+    swept: Option<Instant>,
+}
+
+impl Proven {
+    pub(super) fn new(needed: bool) -> Self {
+        Self { needed, sessions: HashSet::new(), fresh: HashSet::new(), swept: None }
+    }
+
+    /// Takes what the daemon `from` proves. `used` says of which sessions there are endpoints: the others
+    /// are forgotten where there are too many.
+    pub(super) fn take(
+        &mut self,
+        proofs: &[Proof],
+        binding: &Binding,
+        from: DaemonId,
+        used: impl Fn(&Prefix) -> bool,
+    ) {
+        if !self.needed {
+            return;
+        }
+        for proof in proofs {
+            let session = prefix(&proof.claims());
+            // A signature costs time, and what is known is known.
+            if self.has(&session) {
+                continue;
+            }
+            if self.is_full() && self.swept.is_none_or(|swept| swept.elapsed() >= SWEEP) {
+                self.swept = Some(Instant::now());
+                self.sessions.retain(&used);
+            }
+            if !self.is_full() && proof.session(binding, from).is_some() {
+                self.fresh.insert(session);
+            }
+        }
+    }
+
+    /// Another connection takes over: what was proved on the one before counts no more.
+    pub(super) fn succeed(&mut self) {
+        self.sessions.clear();
+        self.fresh.clear();
+    }
+
+    /// A GRAPH came: a session that it says nothing of has no endpoint yet.
+    pub(super) fn settle(&mut self) {
+        self.sessions.extend(self.fresh.drain());
+    }
+
+    /// Whether the peer may speak for this endpoint.
+    pub(super) fn owns(&self, gid: &Gid) -> bool {
+        !self.needed || self.has(&prefix_of(gid))
+    }
+
+    fn has(&self, session: &Prefix) -> bool {
+        self.sessions.contains(session) || self.fresh.contains(session)
+    }
+
+    fn is_full(&self) -> bool {
+        self.sessions.len() + self.fresh.len() >= MAX_PROVEN
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const BINDING: Binding = [7; 32];
+    const HERE: DaemonId = DaemonId([1; 16]);
+
+    fn key() -> SessionKey {
+        SessionKey::generate().unwrap()
+    }
+
+    fn gid(key: &SessionKey) -> Gid {
+        Gid::new(key.id(), 3)
+    }
+
+    fn proof(key: &SessionKey) -> Proof {
+        prove(key, &BINDING, HERE).unwrap()
+    }
+
+    fn full_of(sessions: impl IntoIterator<Item = Prefix>) -> Proven {
+        let mut proven = Proven::new(true);
+        proven.sessions.extend(sessions);
+        for number in 0_u64.. {
+            if proven.is_full() {
+                break;
+            }
+            let mut prefix = [0; 12];
+            prefix[..8].copy_from_slice(&number.to_be_bytes());
+            proven.sessions.insert(prefix);
+        }
+        proven
+    }
+
+    #[test]
+    fn sessions_without_endpoints_make_room_for_others() {
+        let (used, new) = (key(), key());
+        let mut proven = full_of([prefix(&used.id())]);
+        let is_used = |session: &Prefix| *session == prefix(&used.id());
+        proven.take(&[proof(&new)], &BINDING, HERE, is_used);
+        assert!(proven.owns(&gid(&used)) && proven.owns(&gid(&new)));
+        assert_eq!(proven.sessions.len(), 1);
+    }
+
+    #[test]
+    fn a_flood_of_proofs_is_not_kept_and_what_is_used_stays() {
+        let (used, new) = (key(), key());
+        let mut proven = full_of([prefix(&used.id())]);
+        for _ in 0..3 {
+            proven.take(&[proof(&new)], &BINDING, HERE, |_| true);
+        }
+        assert!(proven.owns(&gid(&used)) && !proven.owns(&gid(&new)));
+        assert_eq!(proven.sessions.len() + proven.fresh.len(), MAX_PROVEN);
+    }
+
+    #[test]
+    fn what_is_proved_before_its_endpoints_come_is_not_swept() {
+        let (first, second) = (key(), key());
+        let mut proven = full_of([]);
+        proven.take(&[proof(&first), proof(&second)], &BINDING, HERE, |_| false);
+        proven.swept = None;
+        let filling = full_of([]).sessions;
+        proven.sessions.extend(filling);
+        proven.take(&[proof(&key())], &BINDING, HERE, |_| false);
+        assert!(proven.owns(&gid(&first)) && proven.owns(&gid(&second)));
+        proven.settle();
+        assert!(proven.fresh.is_empty() && proven.owns(&gid(&first)));
+    }
+
+    #[test]
+    fn where_nothing_is_proved_nothing_is_kept() {
+        let mut proven = Proven::new(false);
+        proven.take(&[proof(&key())], &BINDING, HERE, |_| true);
+        assert!(proven.sessions.is_empty() && proven.fresh.is_empty());
+        assert!(proven.owns(&gid(&key())));
+    }
+
+    fn prover(keys: &Arc<SessionKeys>) -> Prover {
+        Prover {
+            keys: Arc::clone(keys),
+            daemon: HERE,
+            needed: true,
+            binding: Some(BINDING),
+            proved: HashSet::new(),
+            made: HashMap::new(),
+            held: HashMap::new(),
+        }
+    }
+
+    fn proved(messages: &[Message]) -> usize {
+        let count = |message: &Message| match message {
+            Message::Owners(owners) => owners.proofs.len(),
+            other => panic!("{other:?}"),
+        };
+        messages.iter().map(count).sum()
+    }
+
+    #[test]
+    fn a_session_is_proved_once_on_each_connection_and_again_when_it_came_back() {
+        let keys = Arc::new(SessionKeys::default());
+        let own = Arc::new(key());
+        keys.insert(Arc::clone(&own));
+        let (known, other) = (gid(&own), gid(&key()));
+        let mut prover = prover(&keys);
+        assert_eq!(proved(&prover.owed([&known, &other].into_iter())), 1);
+        assert!(prover.owed([&known, &other].into_iter()).is_empty());
+        prover.forget();
+        // Its session ended, and a publisher of its is still seen.
+        keys.remove(&own.id());
+        assert_eq!(proved(&prover.owed([&known].into_iter())), 1);
+        assert!(prover.owed([].into_iter()).is_empty());
+        assert!(prover.held.is_empty() && prover.owed([&known].into_iter()).is_empty());
+        keys.insert(own);
+        assert_eq!(proved(&prover.owed([&known].into_iter())), 1);
+    }
+
+    #[test]
+    fn many_sessions_take_several_messages() {
+        let keys = Arc::new(SessionKeys::default());
+        let mut gids = Vec::new();
+        for _ in 0..=MAX_PROOFS {
+            let key = Arc::new(key());
+            gids.push(gid(&key));
+            keys.insert(key);
+        }
+        let said = prover(&keys).owed(gids.iter());
+        assert_eq!((said.len(), proved(&said)), (2, MAX_PROOFS + 1));
+    }
+}

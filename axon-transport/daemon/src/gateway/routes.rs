@@ -1,0 +1,352 @@
+//! Which topics a peer must send here, and under which QoS the gateway asks for them on the
+//! other side: plain data in, data out.
+
+use std::{
+    cmp::Reverse,
+    collections::{BTreeMap, BTreeSet},
+    fmt,
+};
+
+use axon_envelope::Kind;
+use axon_shm::{
+    ids::Gid,
+    qos::{Durability, History, Qos, Reliability},
+};
+use axon_transport::{
+    graph::{Endpoint, EndpointKind},
+    internal::graph::{Pairing, RemoteEndpoint, Toward, out_of_range, pairing, reads, writes},
+};
+
+use crate::link::Subscriber;
+
+/// What a route carries: samples, requests or responses, of one name and type.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub(super) struct RouteKey {
+    /// Which of the three.
+    pub(super) kind: Kind,
+    /// Topic or service name.
+    pub(super) topic: String,
+    /// Type name.
+    pub(super) type_name: String,
+}
+
+impl fmt::Display for RouteKey {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let kind = match self.kind {
+            Kind::Topic => "",
+            Kind::Request => " (requests)",
+            Kind::Response => " (responses)",
+        };
+        write!(f, "{}{kind} [{}]", self.topic, self.type_name)
+    }
+}
+
+impl RouteKey {
+    /// The key of what `writer` writes; `None` where it writes nothing.
+    fn of(writer: &Endpoint) -> Option<Self> {
+        let kind = match writer.kind {
+            EndpointKind::Publisher => Kind::Topic,
+            EndpointKind::Client => Kind::Request,
+            EndpointKind::Server => Kind::Response,
+            EndpointKind::Subscription | EndpointKind::Node => return None,
+        };
+        let (topic, type_name) = (writer.topic.clone(), writer.type_name.clone());
+        Some(Self { kind, topic, type_name })
+    }
+
+    /// The key of the same service in the other direction; of a topic its own.
+    pub(super) fn other_way(&self) -> Self {
+        let kind = match self.kind {
+            Kind::Topic => Kind::Topic,
+            Kind::Request => Kind::Response,
+            Kind::Response => Kind::Request,
+        };
+        Self { kind, ..self.clone() }
+    }
+}
+
+/// What one route needs from one peer.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(super) struct Wanted {
+    /// Readers here that some writer there serves.
+    pub(super) subscribers: Vec<Subscriber>,
+    /// Writers there, and how many readers here each serves.
+    pub(super) writers: Vec<(Endpoint, usize)>,
+}
+
+/// Matches a peer's writers with this host's readers, as far as the ranges of their sessions permit.
+pub(super) fn wanted<'a>(
+    local: impl IntoIterator<Item = (&'a Endpoint, Toward)>,
+    remote: impl IntoIterator<Item = &'a RemoteEndpoint>,
+) -> BTreeMap<RouteKey, Wanted> {
+    let mut readers: BTreeMap<&str, Vec<(&Endpoint, Toward)>> = BTreeMap::new();
+    for (endpoint, toward) in local.into_iter().filter(|(e, _)| reads(e.kind)) {
+        readers.entry(&endpoint.topic).or_default().push((endpoint, toward));
+    }
+    let mut routes: BTreeMap<RouteKey, Wanted> = BTreeMap::new();
+    let mut counted = BTreeSet::new();
+    for remote in remote.into_iter().filter(|remote| writes(remote.endpoint.kind)) {
+        let writer: &Endpoint = &remote.endpoint;
+        let candidates = readers.get(&*writer.topic).into_iter().flatten();
+        let in_range = candidates.filter(|(_, own)| out_of_range(*own, remote.toward).is_none());
+        let served: Vec<&Endpoint> = in_range
+            .map(|(reader, _)| *reader)
+            .filter(|reader| pairing(writer, reader) == Pairing::Match)
+            .collect();
+        let Some(key) = RouteKey::of(writer).filter(|_| !served.is_empty()) else { continue };
+        let route = routes.entry(key).or_default();
+        for reader in &served {
+            if counted.insert(reader.gid) {
+                route.subscribers.push(Subscriber { gid: reader.gid, qos: reader.qos });
+            }
+        }
+        route.writers.push((writer.clone(), served.len()));
+    }
+    for route in routes.values_mut() {
+        route.subscribers.sort_by_key(|s| s.gid);
+        route.writers.sort_by_key(|(w, _)| w.gid);
+    }
+    routes
+}
+
+/// Relays that a peer may have: a thirty-second of the endpoints that the gateway's session may have for
+/// all peers. Each takes a lane for each publisher here that it reads.
+pub(super) const MAX_RELAYS: usize = 2048;
+/// Those for one route.
+const MAX_RELAYS_OF_ROUTE: usize = 16;
+
+/// One relay subscription that the sending side opens for a topic's route.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct RelaySpec {
+    /// What it requests locally.
+    pub(super) qos: Qos,
+    /// How many samples the deepest of those it stands for wants to wait at most.
+    pub(super) depth: u32,
+    /// The hash of its type, where the peer's subscriptions know it.
+    pub(super) type_hash: Vec<u8>,
+    /// The peer's subscriptions that it stands for.
+    pub(super) stands_for: Vec<Gid>,
+}
+
+impl RelaySpec {
+    /// Whether it is the relay that `other` is, for the same subscriptions or for others.
+    pub(super) fn is(&self, other: &Self) -> bool {
+        self.qos == other.qos && self.type_hash == other.type_hash
+    }
+
+    /// How what it sends is queued.
+    pub(super) fn queued(&self) -> Qos {
+        Qos { depth: self.depth, ..self.qos }
+    }
+}
+
+/// The relays of a topic's route, those that ask for more first. `hash` gives the hash of a
+/// subscription's type.
+///
+/// Subscriptions are grouped by reliability, durability and type hash, because a relay must match
+/// exactly the publishers that its subscriptions match, and because only a reliable one may hold a
+/// publisher back; and by how much they keep, because which relay stands for a subscription must not
+/// change when others come or go: it would miss what is published meanwhile. So a publisher may be read
+/// by several; [`axon_transport::internal::session::merge`] sends each sample once.
+pub(super) fn relays(subscribers: &[Subscriber], hash: impl Fn(&Gid) -> Vec<u8>) -> Vec<RelaySpec> {
+    let mut groups: BTreeMap<_, RelaySpec> = BTreeMap::new();
+    for subscriber in subscribers {
+        let (offered, type_hash) = (subscriber.qos, hash(&subscriber.gid));
+        let keeps_all = offered.history == History::KeepAll;
+        // Deadline, lifespan and liveliness are judged where the subscription lives.
+        let qos = Qos {
+            reliability: offered.reliability,
+            durability: offered.durability,
+            history: offered.history,
+            depth: if keeps_all { Qos::keep_all().depth } else { class(offered.depth) },
+            ..Qos::default()
+        };
+        let key = (
+            qos.reliability == Reliability::BestEffort,
+            !keeps_all,
+            Reverse(qos.depth),
+            qos.durability == Durability::Volatile,
+            type_hash.clone(),
+        );
+        let new = RelaySpec { qos, depth: 0, type_hash, stands_for: Vec::new() };
+        let group = groups.entry(key).or_insert(new);
+        group.depth = group.depth.max(offered.depth);
+        group.stands_for.push(subscriber.gid);
+    }
+    groups.into_values().collect()
+}
+
+/// Leaves of `specs` those that there are already, and as many of the others as a peer may have that has
+/// so many relays for other routes. How many it leaves out.
+pub(super) fn admit(
+    specs: &mut Vec<RelaySpec>,
+    is_there: impl Fn(&RelaySpec) -> bool,
+    elsewhere: usize,
+) -> usize {
+    let (asked, there) = (specs.len(), specs.iter().filter(|spec| is_there(spec)).count());
+    let most = MAX_RELAYS_OF_ROUTE.min(MAX_RELAYS.saturating_sub(elsewhere));
+    let mut more = most.saturating_sub(there);
+    specs.retain(|spec| {
+        let new = !is_there(spec);
+        let admitted = !new || more > 0;
+        more -= usize::from(new && admitted);
+        admitted
+    });
+    asked - specs.len()
+}
+
+/// The depth of the relay that stands for a subscription of this depth: one of few, so that not each
+/// takes a relay of its own.
+fn class(depth: u32) -> u32 {
+    let classes = (0..u32::BITS).step_by(4).map(|bits| 1 << bits);
+    classes.skip(1).find(|class| *class >= depth).unwrap_or(u32::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use axon_transport::config::DiscoveryRange;
+
+    fn endpoint(number: u8, kind: EndpointKind, topic: &str, qos: Qos) -> Endpoint {
+        Endpoint {
+            gid: Gid([number; 16]),
+            kind,
+            topic: topic.into(),
+            type_name: "t".into(),
+            type_hash: vec![],
+            qos,
+            node: String::new(),
+            namespace: String::new(),
+            enclave: String::new(),
+        }
+    }
+
+    fn wanted(local: &[Endpoint], remote: &[Endpoint]) -> BTreeMap<RouteKey, Wanted> {
+        let remote: Vec<RemoteEndpoint> = remote.iter().cloned().map(Into::into).collect();
+        super::wanted(local.iter().map(|e| (e, SUBNET)), &remote)
+    }
+
+    const SUBNET: Toward = Toward { range: DiscoveryRange::Subnet, lists: false };
+
+    #[test]
+    fn a_reader_whose_range_a_writer_is_out_of_asks_for_nothing() {
+        use EndpointKind::{Publisher, Subscription};
+        let localhost = Toward { range: DiscoveryRange::Localhost, lists: false };
+        let readers = [1, 2].map(|n| endpoint(n, Subscription, "/t", Qos::default()));
+        let mut writer = RemoteEndpoint::from(endpoint(11, Publisher, "/t", Qos::default()));
+        let asked = |own: [Toward; 2], writer: &RemoteEndpoint| {
+            let routes = super::wanted(readers.iter().zip(own), [writer]);
+            routes.values().map(|wanted| wanted.subscribers.len()).sum::<usize>()
+        };
+        assert_eq!(asked([SUBNET, localhost], &writer), 1);
+        assert_eq!(asked([localhost; 2], &writer), 0);
+        assert_eq!(asked([Toward { lists: true, ..localhost }, localhost], &writer), 1);
+        writer.toward = localhost;
+        assert_eq!(asked([SUBNET; 2], &writer), 0);
+        writer.toward.lists = true;
+        assert_eq!(asked([SUBNET, localhost], &writer), 2);
+    }
+
+    #[test]
+    fn only_topics_with_a_compatible_pair_are_wanted() {
+        use EndpointKind::{Publisher, Subscription};
+        let q = Qos::default();
+        let local = [
+            endpoint(1, Subscription, "/a", q),
+            endpoint(2, Subscription, "/b", q),
+            endpoint(3, Subscription, "/c", Qos::sensor_data()),
+            endpoint(4, Publisher, "/d", q),
+            Endpoint { type_hash: vec![1], ..endpoint(5, Subscription, "/e", q) },
+        ];
+        let remote = [
+            endpoint(11, Publisher, "/a", q),
+            endpoint(12, Publisher, "/b", Qos::sensor_data()),
+            endpoint(13, Publisher, "/c", Qos::sensor_data()),
+            endpoint(14, Subscription, "/d", q),
+            Endpoint { type_name: "other".into(), ..endpoint(15, Publisher, "/a", q) },
+            Endpoint { type_hash: vec![2], ..endpoint(16, Publisher, "/e", q) },
+        ];
+        let routes = wanted(&local, &remote);
+        let topics: Vec<_> = routes.keys().map(|k| k.topic.as_str()).collect();
+        assert_eq!(topics, ["/a", "/c"]);
+        assert_eq!(routes.values().next().unwrap().writers.len(), 1);
+    }
+
+    #[test]
+    fn a_service_is_wanted_by_whom_it_has_on_either_side_and_in_one_direction_each() {
+        use EndpointKind::{Client, Server};
+        let q = Qos::default();
+        let local = [endpoint(1, Server, "/s", q), endpoint(2, Server, "/s", q)];
+        let remote = [
+            endpoint(11, Client, "/s", q),
+            endpoint(12, Client, "/s", Qos::sensor_data()),
+            endpoint(13, Server, "/s", q),
+        ];
+        let routes: Vec<_> = wanted(&local, &remote).into_iter().collect();
+        let [(key, requests)] = &routes[..] else { panic!("{routes:?}") };
+        assert_eq!(key.kind, Kind::Request);
+        assert_eq!(requests.writers, [(remote[0].clone(), 2)]);
+        assert_eq!(requests.subscribers.len(), 2);
+        let routes: Vec<_> = wanted(&remote, &local).into_iter().collect();
+        let [(key, responses)] = &routes[..] else { panic!("{routes:?}") };
+        assert_eq!(key.kind, Kind::Response);
+        assert_eq!(responses.subscribers.len(), 1, "the client that goes with neither");
+        assert_eq!(key.other_way().kind, Kind::Request);
+    }
+
+    fn subscriber(number: u8, qos: Qos) -> Subscriber {
+        Subscriber { gid: Gid([number; 16]), qos }
+    }
+
+    #[test]
+    fn a_mixed_route_has_a_relay_per_group_that_asks_for_most_first() {
+        let latched = Qos { durability: Durability::TransientLocal, ..Qos::default() };
+        let deep = Qos { depth: 17, ..Qos::default() };
+        let qos = [Qos::sensor_data(), Qos::default(), latched, deep, Qos::keep_all()];
+        let subscribers: Vec<_> = (0..).zip(qos).map(|(n, qos)| subscriber(n, qos)).collect();
+        let specs = relays(&subscribers, |_| Vec::new());
+        let order: Vec<u8> = specs.iter().map(|spec| spec.stands_for[0].0[0]).collect();
+        assert_eq!(order, [4, 3, 2, 1, 0]);
+        assert_eq!(specs[0].qos.history, History::KeepAll);
+    }
+
+    #[test]
+    fn who_stands_for_a_subscription_is_the_same_whoever_else_there_is() {
+        let of = |depths: &[u32]| {
+            let qos = |depth| Qos { depth, ..Qos::default() };
+            let all = (0..).zip(depths).map(|(n, depth)| subscriber(n, qos(*depth)));
+            relays(&all.collect::<Vec<_>>(), |_| Vec::new())
+        };
+        let stands_for = |specs: &[RelaySpec]| {
+            let its = specs.iter().find(|spec| spec.stands_for.contains(&Gid([0; 16])));
+            its.cloned().unwrap()
+        };
+        let alone = stands_for(&of(&[10]));
+        assert_eq!((alone.qos.depth, alone.queued().depth), (16, 10));
+        for others in [&[10, 1][..], &[10, 16], &[10, 17], &[10, u32::MAX, 300]] {
+            assert!(stands_for(&of(others)).is(&alone), "{others:?}");
+        }
+        let together = of(&[10, 16, 1]);
+        assert_eq!((together.len(), together[0].queued().depth), (1, 16));
+        let depths = [0, 16, 17, 257, 1 << 28, (1 << 28) + 1, u32::MAX];
+        let classes = [16, 16, 256, 4096, 1 << 28, u32::MAX, u32::MAX];
+        assert_eq!(depths.map(class), classes);
+    }
+    #[test]
+    fn a_peer_has_so_many_relays_and_keeps_those_that_it_has() {
+        let of = |hashes: std::ops::Range<u8>| {
+            let all: Vec<_> = hashes.map(|n| subscriber(n, Qos::default())).collect();
+            relays(&all, |gid| vec![gid.0[0]])
+        };
+        let mut specs = of(0..20);
+        assert_eq!((admit(&mut specs, |_| false, 0), specs.len()), (4, 16));
+        let mut specs = of(0..20);
+        let later = |spec: &RelaySpec| spec.type_hash[0] >= 10;
+        assert_eq!((admit(&mut specs, later, 0), specs.len()), (4, 16));
+        assert_eq!(specs.iter().filter(|spec| later(spec)).count(), 10);
+        let mut specs = of(0..5);
+        assert_eq!((admit(&mut specs, |_| false, MAX_RELAYS - 3), specs.len()), (2, 3));
+        let mut specs = of(0..5);
+        assert_eq!((admit(&mut specs, |_| true, MAX_RELAYS), specs.len()), (0, 5));
+    }
+}

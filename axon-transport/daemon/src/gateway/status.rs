@@ -1,0 +1,132 @@
+//! Who a peer is, and the status of a link.
+
+use std::{fmt, net::SocketAddr};
+
+use axon_tls::{
+    Negotiated,
+    identity::{Auth, SpkiDigest},
+};
+use axon_transport::status::LinkStatus;
+use quinn::Connection;
+
+use super::{context::Context, hub::Summary};
+use crate::link::Hello;
+
+/// As whom a peer proved itself.
+#[derive(Clone, Debug)]
+pub(super) enum Who {
+    /// By a KME key.
+    Sae(String),
+    /// By a key that is pinned under this name.
+    Pinned(String, SpkiDigest),
+    /// By a certificate that has this host's name.
+    Host(String, SpkiDigest),
+    /// As the owner of a key that says nothing about who that is.
+    Somebody(Option<SpkiDigest>),
+}
+
+impl Who {
+    /// The peer of a link whose HELLO was checked.
+    pub(super) fn of(context: &Context, hello: &Hello, negotiated: &Negotiated) -> Self {
+        if let (Some(_), Some(sae)) = (&context.keyring, &hello.sae) {
+            return Self::Sae(sae.clone());
+        }
+        let Some(key) = negotiated.peer else { return Self::Somebody(None) };
+        match context.auth() {
+            // The name can be gone by now: a pin that was removed after the handshake.
+            Some(Auth::Pinned { trust, .. }) => match trust.name_of(&key) {
+                Some(name) => Self::Pinned(name, key),
+                None => Self::Somebody(Some(key)),
+            },
+            Some(Auth::Ca(_)) => Self::Host(hello.host.to_ascii_lowercase(), key),
+            _ => Self::Somebody(Some(key)),
+        }
+    }
+
+    /// Whether both are the same host. A name may have another key by now; who has no name is one
+    /// for as long as it has its key.
+    pub(super) fn is(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::Sae(one), Self::Sae(other)) => one == other,
+            (Self::Pinned(one, _), Self::Pinned(other, _)) => one == other,
+            (Self::Host(one, _), Self::Host(other, _)) => one == other,
+            (Self::Somebody(one), Self::Somebody(other)) => one == other,
+            _ => false,
+        }
+    }
+
+    /// Tells whether two daemons are on the same host, by what they proved; with nothing proven the
+    /// address.
+    pub(super) fn host_identity(&self, address: SocketAddr) -> String {
+        match self {
+            Self::Sae(sae) => format!("sae {sae}"),
+            Self::Pinned(name, _) => format!("pin {name}"),
+            Self::Host(name, _) => format!("host {name}"),
+            Self::Somebody(_) => format!("address {}", address.ip()),
+        }
+    }
+}
+
+impl fmt::Display for Who {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Sae(sae) => write!(f, "SAE {sae} (KME key)"),
+            Self::Pinned(name, key) => write!(f, "{name} ({key})"),
+            Self::Host(name, key) => write!(f, "{name} (certificate, {key})"),
+            Self::Somebody(Some(key)) => write!(f, "UNAUTHENTICATED (key {key})"),
+            Self::Somebody(None) => f.write_str("UNAUTHENTICATED"),
+        }
+    }
+}
+
+/// The status of a link, its counters aside.
+pub(super) fn link(summary: &Summary, connection: &Connection, since_unix_ms: u64) -> LinkStatus {
+    LinkStatus {
+        peer: summary.hello.daemon.to_string(),
+        host: match &summary.who {
+            // What it calls itself is nobody's word but its own.
+            Who::Pinned(name, _) => name.clone(),
+            _ => summary.hello.host.clone(),
+        },
+        sae: summary.hello.sae.clone(),
+        address: connection.remote_address().to_string(),
+        state: "connected".into(),
+        key_exchange: summary.negotiated.key_exchange.to_string(),
+        cipher: summary.negotiated.cipher.name().into(),
+        authenticated_as: summary.who.to_string(),
+        since_unix_ms,
+        rtt_us: u64::try_from(connection.rtt().as_micros()).unwrap_or(u64::MAX),
+        ..LinkStatus::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_name_is_the_same_under_another_key_and_no_other_name_is() {
+        let [one, two] = [1, 2].map(|byte| SpkiDigest([byte; 32]));
+        let name = "arm".to_owned();
+        let all = [
+            Who::Sae(name.clone()),
+            Who::Pinned(name.clone(), one),
+            Who::Pinned("UNAUTHENTICATED".into(), one),
+            Who::Host(name.clone(), one),
+            Who::Host("UNAUTHENTICATED".into(), one),
+            Who::Somebody(Some(one)),
+            Who::Somebody(Some(two)),
+            Who::Somebody(None),
+        ];
+        let here = ([127, 0, 0, 1], 1).into();
+        for (i, a) in all.iter().enumerate() {
+            for (j, b) in all.iter().enumerate() {
+                assert_eq!(a.is(b), i == j, "{a:?} {b:?}");
+                let nobodies = i >= 5 && j >= 5;
+                assert_eq!(a.host_identity(here) == b.host_identity(here), i == j || nobodies);
+            }
+        }
+        assert!(Who::Pinned(name.clone(), one).is(&Who::Pinned(name.clone(), two)));
+        assert!(Who::Host(name.clone(), one).is(&Who::Host(name, two)));
+    }
+}

@@ -1,0 +1,474 @@
+//! The server's side: keys that handshakes name, looked up at once and fetched within bounds.
+
+use std::{
+    collections::{HashMap, VecDeque},
+    fmt,
+    net::IpAddr,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::Duration,
+};
+
+use axon_envelope::KeyId;
+use axon_tls::{
+    Cipher,
+    qkd::{self, Psk, PskIdentity, PskResolver},
+};
+use axon_transport::config::QkdPeers;
+use secrecy::ExposeSecret;
+use tokio::sync::Notify;
+
+use super::{
+    Completion,
+    limits::{Buckets, IN_FLIGHT, KEPT, PER_SOURCE, Source, Unproven},
+    memory::{Fingerprint, Memory, fingerprint},
+};
+use crate::keys::{
+    Clock,
+    request::{Answer, FailureKind, Fetched, Purpose, Request},
+};
+
+/// Unspent PSKs kept for one SAE.
+const CACHED: usize = 8;
+/// SAEs with unspent PSKs.
+const CACHED_SAES: usize = 256;
+/// How long an unspent PSK is kept.
+const CACHED_FOR: Duration = Duration::from_secs(60);
+/// key_IDs that the KME does not know.
+const UNKNOWN: usize = 1024;
+/// How long one is not asked for again after it was unknown twice, and remembered at all.
+const UNKNOWN_FOR: Duration = Duration::from_secs(30);
+/// How long after the first time: KMEs that still relay a key answer as if there were none, and the
+/// dialler gives a key up after ten seconds.
+const MISSED_FOR: Duration = Duration::from_secs(1);
+/// Spent keys remembered.
+const SPENT: usize = 4096;
+/// Sources, and SAEs, remembered to have authenticated.
+const KNOWN: usize = 1024;
+/// After this a call counts as lost, answered or not.
+const LOST: Duration = Duration::from_secs(60);
+
+/// What a look-up does about a key that is not at hand.
+#[derive(Clone, Copy)]
+enum Miss {
+    /// Has the KME asked for it, within the limits of its source.
+    Fetch,
+    /// Nothing.
+    Leave,
+}
+
+/// What a look-up found, and why nothing more.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Lookup {
+    /// The PSK is at hand.
+    Found,
+    /// The KME is being asked: the client's next attempt may find it.
+    Fetching,
+    /// A handshake under this key was completed before.
+    Spent,
+    /// The KME does not know this key.
+    UnknownKeyId,
+    /// The identity's SAE is not in `AXON_QKD_PEERS`.
+    NotAPeer,
+    /// The identity names this host's own SAE.
+    OwnSaeId,
+    /// Not an identity of AXON's form.
+    Malformed,
+    /// A bound on calls to the KME is reached; which one.
+    Limited(&'static str),
+    /// The KME could not be asked.
+    KmeFailed(String),
+}
+
+impl fmt::Display for Lookup {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Found => f.write_str("key at hand"),
+            Self::Fetching => f.write_str("the KME is being asked for this key"),
+            Self::Spent => f.write_str("a handshake under this key was completed before"),
+            Self::UnknownKeyId => f.write_str("the KME does not know this key_ID"),
+            Self::NotAPeer => f.write_str("this SAE is not in AXON_QKD_PEERS"),
+            Self::OwnSaeId => f.write_str("the client claims this host's own SAE ID"),
+            Self::Malformed => f.write_str("not an identity of the form axon-qkd-v1:SAE:key_ID"),
+            Self::Limited(which) => {
+                write!(f, "it would cost too many keys or calls to the KME: {which}")
+            }
+            Self::KmeFailed(why) => write!(f, "dec_keys: {why}"),
+        }
+    }
+}
+
+/// The keys under which this host accepts. One for the daemon; clones share it.
+///
+/// Look-ups happen inside the TLS handshake, from whatever thread drives it, so all methods take
+/// `&self` and the time comes from a [`Clock`].
+#[derive(Clone)]
+pub struct Acceptor(Arc<Inner>);
+
+struct Inner {
+    sae_id: String,
+    allowed: QkdPeers,
+    cipher: Cipher,
+    clock: Clock,
+    state: Mutex<State>,
+    queued: Notify,
+}
+
+struct State {
+    cached: HashMap<String, VecDeque<Cached>>,
+    /// Calls that are queued or in flight.
+    pending: Vec<Pending>,
+    /// Unknown to the KME once.
+    missed: Memory<Fingerprint>,
+    /// Unknown to it again.
+    unknown: Memory<Fingerprint>,
+    /// Keys whose last call failed, with the reason.
+    failed: VecDeque<(Fingerprint, String)>,
+    spent: Memory<Fingerprint>,
+    buckets: Buckets,
+    unproven: Unproven,
+    known_sources: Memory<Source>,
+    known_saes: Memory<String>,
+}
+
+struct Cached {
+    psk: Arc<Psk>,
+    since: Duration,
+}
+
+impl Drop for Cached {
+    /// A handshake that looked it up keeps the PSK.
+    fn drop(&mut self) {
+        self.psk.erase();
+    }
+}
+
+struct Pending {
+    identity: PskIdentity,
+    key_id: KeyId,
+    source: Source,
+    known: bool,
+    since: Duration,
+    asked: bool,
+}
+
+impl Acceptor {
+    /// For the host `sae_id`, which accepts `allowed`.
+    pub fn new(sae_id: &str, allowed: QkdPeers, cipher: Cipher, clock: Clock) -> Self {
+        Self(Arc::new(Inner {
+            sae_id: sae_id.to_owned(),
+            allowed,
+            cipher,
+            clock,
+            state: Mutex::new(State {
+                cached: HashMap::new(),
+                pending: Vec::new(),
+                missed: Memory::new(UNKNOWN),
+                unknown: Memory::new(UNKNOWN),
+                failed: VecDeque::new(),
+                spent: Memory::new(SPENT),
+                buckets: Buckets::default(),
+                unproven: Unproven::default(),
+                known_sources: Memory::new(KNOWN),
+                known_saes: Memory::new(KNOWN),
+            }),
+            queued: Notify::new(),
+        }))
+    }
+
+    /// The resolver for one incoming connection from a validated `source`.
+    pub fn resolver(&self, source: IpAddr) -> Arc<Resolver> {
+        let acceptor = self.clone();
+        Arc::new(Resolver { acceptor, source, last: Mutex::new(None) })
+    }
+
+    /// Looks up, and fetches within the same bounds, a key that a probe names ahead of its
+    /// handshake.
+    pub fn prefetch(&self, source: IpAddr, identity: &[u8]) -> Lookup {
+        self.look_up(source, identity, Miss::Fetch).0
+    }
+
+    /// A handshake under `identity` is complete: the key is spent, and erased.
+    pub fn spent(&self, identity: &[u8]) -> Completion {
+        let now = self.0.clock.now();
+        let Ok(parsed) = PskIdentity::parse(identity) else { return Completion::Reused };
+        let mut state = self.state();
+        if let Some(cached) = state.cached.get_mut(parsed.client_sae()) {
+            cached.retain(|c| c.psk.identity() != identity);
+        }
+        match state.spent.insert(now, fingerprint(parsed.key_id().as_bytes())) {
+            true => Completion::First,
+            false => Completion::Reused,
+        }
+    }
+
+    /// `client_sae` proved its name from `source`: both keep room of their own from now on.
+    pub fn authenticated(&self, source: IpAddr, client_sae: &str) {
+        let now = self.0.clock.now();
+        let mut state = self.state();
+        state.known_sources.insert(now, source.into());
+        state.known_saes.insert(now, client_sae.to_owned());
+        state.unproven.proven(source.into(), client_sae);
+    }
+
+    /// Somebody who claims to be `client_sae` had a key announced and did not prove to hold it.
+    /// Each such try costs a key, so that more of them from this source have to wait.
+    pub fn unproven(&self, source: IpAddr, client_sae: &str) {
+        let now = self.0.clock.now();
+        self.state().unproven.failed(now, source.into(), client_sae);
+    }
+
+    /// The next call to the KME, if any.
+    pub fn poll_request(&self) -> Option<Request> {
+        let mut state = self.state();
+        let pending = state.pending.iter_mut().find(|p| !p.asked)?;
+        pending.asked = true;
+        Some(Request::Dec {
+            master: pending.identity.client_sae().to_owned(),
+            key_ids: vec![pending.key_id.clone()],
+            purpose: Purpose::Accept,
+        })
+    }
+
+    /// The next call to the KME, when there is one. Cancel safe; for one caller at a time.
+    pub async fn next_request(&self) -> Request {
+        loop {
+            if let Some(request) = self.poll_request() {
+                return request;
+            }
+            self.0.queued.notified().await;
+        }
+    }
+
+    /// The KME's answer to one of our requests.
+    pub fn on_answer(&self, answer: Answer) {
+        let now = self.0.clock.now();
+        let Request::Dec { master, key_ids, .. } = answer.request else { return };
+        let mut state = self.state();
+        let Some(i) = state
+            .pending
+            .iter()
+            .position(|p| p.identity.client_sae() == master && key_ids.first() == Some(&p.key_id))
+        else {
+            return;
+        };
+        let pending = state.pending.swap_remove(i);
+        let seen = fingerprint(&pending.identity.to_bytes());
+        let failure = match answer.outcome {
+            Ok(Fetched::Keys(keys)) => match keys.as_slice() {
+                [(key_id, key)] if *key_id == pending.key_id => {
+                    let name = pending.identity.key_id();
+                    match qkd::derive_psk(
+                        key.expose_secret(),
+                        name,
+                        &master,
+                        &self.0.sae_id,
+                        self.0.cipher,
+                    ) {
+                        Ok(psk) => return state.keep(now, master, psk, name),
+                        Err(e) => e.to_string(),
+                    }
+                }
+                _ => "the KME did not give the one key asked for".to_owned(),
+            },
+            Ok(Fetched::Stock(_)) => "the KME answered another call".to_owned(),
+            Err(failure) if failure.kind == FailureKind::Refused => {
+                if state.missed.last_seen(&seen).is_some() {
+                    state.unknown.insert(now, seen);
+                } else {
+                    state.missed.insert(now, seen);
+                }
+                return;
+            }
+            Err(failure) => failure.text,
+        };
+        if state.failed.len() == IN_FLIGHT {
+            state.failed.pop_front();
+        }
+        state.failed.push_back((seen, failure));
+    }
+
+    /// Unspent keys at hand, for status.
+    pub fn cached(&self) -> usize {
+        self.state().cached.values().map(VecDeque::len).sum()
+    }
+
+    /// Erases what time has ended; to be called about once a second.
+    pub fn expire(&self) {
+        let now = self.0.clock.now();
+        self.state().expire(now);
+    }
+
+    fn look_up(&self, source: IpAddr, identity: &[u8], miss: Miss) -> (Lookup, Option<Arc<Psk>>) {
+        let inner = &*self.0;
+        let Ok(parsed) = PskIdentity::parse(identity) else { return (Lookup::Malformed, None) };
+        let Ok(key_id) = KeyId::new(parsed.key_id()) else { return (Lookup::Malformed, None) };
+        // One spelling only, or a copy in another spelling would be another key here.
+        if parsed.to_bytes() != identity {
+            return (Lookup::Malformed, None);
+        }
+        if parsed.client_sae() == inner.sae_id {
+            return (Lookup::OwnSaeId, None);
+        }
+        if !inner.allowed.allows(parsed.client_sae()) {
+            return (Lookup::NotAPeer, None);
+        }
+        let now = inner.clock.now();
+        let mut state = self.state();
+        state.expire(now);
+        if state.spent.contains(&fingerprint(key_id.as_bytes())) {
+            return (Lookup::Spent, None);
+        }
+        if state.unproven.waits(now, source.into(), parsed.client_sae()) {
+            let which = "it did not prove its name with the last keys, and has to wait";
+            return (Lookup::Limited(which), None);
+        }
+        let cached = state.cached.get(parsed.client_sae());
+        if let Some(c) = cached.and_then(|c| c.iter().find(|c| c.psk.identity() == identity)) {
+            return (Lookup::Found, Some(Arc::clone(&c.psk)));
+        }
+        if state.pending.iter().any(|p| p.identity == parsed) {
+            return (Lookup::Fetching, None);
+        }
+        if matches!(miss, Miss::Leave) {
+            return (Lookup::UnknownKeyId, None);
+        }
+        let seen = fingerprint(identity);
+        let missed = state.missed.last_seen(&seen);
+        let missed = missed.is_some_and(|at| now.saturating_sub(at) < MISSED_FOR);
+        if missed || state.unknown.contains(&seen) {
+            return (Lookup::UnknownKeyId, None);
+        }
+        let source = Source::from(source);
+        let limited = state.limit(now, &inner.allowed, source, parsed.client_sae());
+        let failure = state.failed.iter().position(|(f, _)| *f == seen);
+        let failure = failure.and_then(|i| state.failed.remove(i));
+        if let Some(which) = limited {
+            return (Lookup::Limited(which), None);
+        }
+        let known = state.known_sources.contains(&source);
+        let identity = parsed;
+        state.pending.push(Pending { identity, key_id, source, known, since: now, asked: false });
+        drop(state);
+        inner.queued.notify_one();
+        (failure.map_or(Lookup::Fetching, |(_, why)| Lookup::KmeFailed(why)), None)
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        // No operation leaves the state half-changed, so what a panicking thread held is sound.
+        self.0.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl fmt::Debug for Acceptor {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Acceptor").field("sae_id", &self.0.sae_id).finish_non_exhaustive()
+    }
+}
+
+impl State {
+    /// Which bound forbids another call, if one does. Takes a token where none does.
+    fn limit(
+        &mut self,
+        now: Duration,
+        allowed: &QkdPeers,
+        source: Source,
+        sae: &str,
+    ) -> Option<&'static str> {
+        let known = self.known_sources.contains(&source);
+        let strangers = self.pending.iter().filter(|p| !p.known).count();
+        if self.pending.len() >= IN_FLIGHT {
+            return Some("16 in flight");
+        }
+        if !known && strangers >= IN_FLIGHT - KEPT {
+            return Some("8 in flight for addresses that never authenticated");
+        }
+        let same = |p: &&Pending| p.source == source && p.identity.client_sae() == sae;
+        if self.pending.iter().filter(same).count() >= PER_SOURCE {
+            return Some("2 in flight for one address and SAE");
+        }
+        // Under `*` anyone can make names up, so those that never authenticated share a bucket.
+        let own =
+            matches!(allowed, QkdPeers::Listed(_)) || self.known_saes.contains(&sae.to_owned());
+        // Strangers who name an SAE must not empty the bucket of the address that is this SAE.
+        let sae = if own { sae } else { "" };
+        let bucket = format!("{} {sae}", if known { "known" } else { "new" });
+        if !self.buckets.take(now, &bucket) {
+            return Some("5 a second for one SAE");
+        }
+        None
+    }
+
+    fn keep(&mut self, now: Duration, sae: String, psk: Psk, key_id: &str) {
+        if self.spent.contains(&fingerprint(key_id.as_bytes())) {
+            return;
+        }
+        if !self.cached.contains_key(&sae) && self.cached.len() >= CACHED_SAES {
+            let oldest = |c: &VecDeque<Cached>| c.front().map(|c| c.since);
+            let oldest = self.cached.iter().min_by_key(|(_, c)| oldest(c)).map(|(s, _)| s.clone());
+            oldest.and_then(|sae| self.cached.remove(&sae));
+        }
+        let cached = self.cached.entry(sae).or_default();
+        if cached.len() >= CACHED {
+            cached.pop_front();
+        }
+        cached.push_back(Cached { psk: Arc::new(psk), since: now });
+    }
+
+    fn expire(&mut self, now: Duration) {
+        let young = |since: Duration, limit: Duration| now.saturating_sub(since) < limit;
+        for cached in self.cached.values_mut() {
+            cached.retain(|c| young(c.since, CACHED_FOR));
+        }
+        self.cached.retain(|_, cached| !cached.is_empty());
+        self.pending.retain(|p| young(p.since, LOST));
+        self.missed.forget_before(now.saturating_sub(UNKNOWN_FOR));
+        self.unknown.forget_before(now.saturating_sub(UNKNOWN_FOR));
+        self.buckets.expire(now);
+        self.unproven.expire(now);
+    }
+}
+
+/// Looks keys up for one incoming connection, and remembers what it found.
+pub struct Resolver {
+    acceptor: Acceptor,
+    source: IpAddr,
+    last: Mutex<Option<(Lookup, Option<PskIdentity>)>>,
+}
+
+impl Resolver {
+    /// What the look-up found; `None` before the client's identity was seen.
+    pub fn outcome(&self) -> Option<Lookup> {
+        self.last().as_ref().map(|(lookup, _)| lookup.clone())
+    }
+
+    /// The identity that was looked up, where it was one.
+    pub fn identity(&self) -> Option<PskIdentity> {
+        self.last().as_ref().and_then(|(_, identity)| identity.clone())
+    }
+
+    fn last(&self) -> MutexGuard<'_, Option<(Lookup, Option<PskIdentity>)>> {
+        self.last.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl PskResolver for Resolver {
+    fn resolve(&self, identity: &[u8]) -> Option<Arc<Psk>> {
+        let (lookup, psk) = self.acceptor.look_up(self.source, identity, Miss::Fetch);
+        *self.last() = Some((lookup, PskIdentity::parse(identity).ok()));
+        psk
+    }
+
+    fn resolve_known(&self, identity: &[u8]) -> Option<Arc<Psk>> {
+        let (lookup, psk) = self.acceptor.look_up(self.source, identity, Miss::Leave);
+        let psk = psk?;
+        *self.last() = Some((lookup, PskIdentity::parse(identity).ok()));
+        Some(psk)
+    }
+}
+
+impl fmt::Debug for Resolver {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Resolver").field("source", &self.source).finish_non_exhaustive()
+    }
+}

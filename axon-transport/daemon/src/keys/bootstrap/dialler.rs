@@ -1,0 +1,330 @@
+//! The client's side: one unspent key for each peer, asked for once, kept until it is spent.
+
+use std::{collections::HashMap, fmt, sync::Arc, time::Duration};
+
+use axon_envelope::{KeyId, KmeKey};
+use axon_tls::{
+    Cipher,
+    qkd::{self, Psk},
+};
+use axon_transport::config::QkdPeers;
+use secrecy::ExposeSecret;
+
+use super::Completion;
+use crate::keys::request::{Answer, Fetched, Purpose, Request};
+
+/// How long a key is kept without being spent.
+const KEY_MAX_AGE: Duration = Duration::from_secs(600);
+/// Waits before the same key is tried again after it was refused; the last one repeats.
+const REDIAL: [Duration; 6] = [
+    Duration::from_millis(50),
+    Duration::from_millis(100),
+    Duration::from_millis(200),
+    Duration::from_millis(400),
+    Duration::from_millis(800),
+    Duration::from_millis(1600),
+];
+/// How long a key is tried against refusals, beyond the time that the peer's KME may take.
+const REFUSED_FOR: Duration = Duration::from_secs(7);
+/// Alerts `decrypt_error` after which a key is given up. More than one, since anybody on the path
+/// can forge the alert.
+const MISMATCHES: u32 = 4;
+/// Longest wait before the KME is asked for another key, after a call or a key that failed.
+const BACK_OFF_MAX: Duration = Duration::from_secs(60);
+/// Most peers remembered: beacons, which anyone can send, name SAEs.
+const MAX_PEERS: usize = 256;
+/// Calls in flight at once.
+const IN_FLIGHT: usize = 8;
+
+/// What to do about a peer that is to be dialled.
+#[derive(Debug)]
+pub enum Dial {
+    /// Dial it with this key.
+    Attempt(Attempt),
+    /// Ask again later.
+    Wait {
+        /// When; `None`: when the KME has answered.
+        until: Option<Duration>,
+        /// For log and status.
+        why: String,
+    },
+    /// It is not to be dialled at all.
+    Refused(DialRefusal),
+}
+
+/// The key of a dial. Attempts may overlap: the first that succeeds spends the key for all.
+pub struct Attempt {
+    /// Names the key in what is reported back about this attempt.
+    pub key_id: KeyId,
+    /// The PSK, for [`axon_tls::quic::qkd_client`].
+    pub psk: Arc<Psk>,
+}
+
+impl fmt::Debug for Attempt {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Attempt").field("key_id", &self.key_id).finish_non_exhaustive()
+    }
+}
+
+/// Why a peer is never dialled.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum DialRefusal {
+    /// It claims our own name.
+    #[error("peer claims this host's own SAE ID {0:?}: give each host an AXON_SAE_ID of its own")]
+    OwnSaeId(String),
+    /// It is not listed.
+    #[error("SAE {0:?} is not in AXON_QKD_PEERS")]
+    NotAPeer(String),
+    /// Too many peers have keys or calls under way.
+    #[error("more than {MAX_PEERS} SAEs are being dialled")]
+    TooMany,
+}
+
+/// The keys with which this host dials. One for the daemon.
+pub struct Dialler {
+    sae_id: String,
+    allowed: QkdPeers,
+    cipher: Cipher,
+    /// How long a KME may take.
+    answer: Duration,
+    peers: HashMap<String, Peer>,
+}
+
+struct Peer {
+    state: State,
+    /// Keys and calls that failed since the last success.
+    failures: u32,
+}
+
+enum State {
+    /// The next dial asks for a key, from this time on.
+    Empty {
+        not_before: Duration,
+        why: String,
+    },
+    /// A key is wanted.
+    Wanted,
+    /// The KME was asked.
+    Asked,
+    Held(Held),
+}
+
+struct Held {
+    key_id: KeyId,
+    psk: Arc<Psk>,
+    since: Duration,
+    not_before: Duration,
+    refusals: usize,
+    mismatches: u32,
+    last_refusal: Option<Duration>,
+    refused_for: Duration,
+}
+
+impl Drop for Held {
+    /// Attempts and connections keep their configuration, and with it the PSK.
+    fn drop(&mut self) {
+        self.psk.erase();
+    }
+}
+
+impl Dialler {
+    /// For the host `sae_id`, which may dial `allowed`. A KME may take as long as `answer`.
+    pub fn new(sae_id: &str, allowed: QkdPeers, cipher: Cipher, answer: Duration) -> Self {
+        Self { sae_id: sae_id.to_owned(), allowed, cipher, answer, peers: HashMap::new() }
+    }
+
+    /// Whether and with which key to dial `sae` now. Asks the KME for one where there is none.
+    pub fn dial(&mut self, now: Duration, sae: &str) -> Dial {
+        if sae == self.sae_id {
+            return Dial::Refused(DialRefusal::OwnSaeId(sae.to_owned()));
+        }
+        if !self.allowed.allows(sae) {
+            return Dial::Refused(DialRefusal::NotAPeer(sae.to_owned()));
+        }
+        self.expire(now);
+        if !self.peers.contains_key(sae) && !self.make_room(now) {
+            return Dial::Refused(DialRefusal::TooMany);
+        }
+        let peer = self.peers.entry(sae.to_owned()).or_insert_with(Peer::new);
+        match &peer.state {
+            State::Empty { not_before, why } if *not_before > now => {
+                return Dial::Wait { until: Some(*not_before), why: why.clone() };
+            }
+            State::Empty { .. } => peer.state = State::Wanted,
+            State::Held(held) if held.not_before > now => {
+                return Dial::Wait {
+                    until: Some(held.not_before),
+                    why: format!("peer does not know key_ID {} yet", held.key_id),
+                };
+            }
+            State::Held(held) => {
+                let psk = Arc::clone(&held.psk);
+                return Dial::Attempt(Attempt { key_id: held.key_id.clone(), psk });
+            }
+            State::Wanted | State::Asked => {}
+        }
+        Dial::Wait { until: None, why: "waiting for the KME's enc_keys answer".to_owned() }
+    }
+
+    /// The handshake under `key_id` is complete: the key is spent, and erased.
+    pub fn succeeded(&mut self, _now: Duration, sae: &str, key_id: &KeyId) -> Completion {
+        let Some(peer) = self.peers.get_mut(sae) else { return Completion::Reused };
+        match &peer.state {
+            State::Held(held) if held.key_id == *key_id => {
+                *peer = Peer::new();
+                Completion::First
+            }
+            _ => Completion::Reused,
+        }
+    }
+
+    /// The peer holds another key under `key_id` (0x133). Returns whether the key is given up.
+    pub fn mismatched(&mut self, now: Duration, sae: &str, key_id: &KeyId) -> bool {
+        let held = self.peers.get_mut(sae).and_then(|peer| match &mut peer.state {
+            State::Held(held) if held.key_id == *key_id => Some(held),
+            _ => None,
+        });
+        let Some(held) = held else { return false };
+        held.mismatches += 1;
+        let given_up = held.mismatches >= MISMATCHES;
+        self.refused(now, sae, key_id);
+        if given_up
+            && let Some(peer) = self.peers.get_mut(sae)
+            && matches!(peer.state, State::Held(_))
+        {
+            peer.failed(now, format!("peer holds another key under key_ID {key_id}"));
+        }
+        given_up
+    }
+
+    /// The peer refused the key `key_id`: it is unknown to it (0x173).
+    pub fn refused(&mut self, now: Duration, sae: &str, key_id: &KeyId) {
+        let Some(peer) = self.peers.get_mut(sae) else { return };
+        let State::Held(held) = &mut peer.state else { return };
+        if held.key_id != *key_id {
+            return;
+        }
+        let wait = REDIAL[held.refusals.min(REDIAL.len() - 1)];
+        held.refusals += 1;
+        held.not_before = now + wait;
+        // Only time between two refusals in a row counts, and a caller's own pauses do not.
+        let since =
+            held.last_refusal.replace(now).map_or(Duration::ZERO, |last| now.saturating_sub(last));
+        held.refused_for += since.min(2 * REDIAL[REDIAL.len() - 1]);
+        let patience = REFUSED_FOR + self.answer;
+        if held.refused_for >= patience {
+            let why = format!(
+                "peer does not have key_ID {key_id} after {patience:?}: its KME does not give it, or \
+                 cannot be asked; its own log says which"
+            );
+            peer.failed(now, why);
+        }
+    }
+
+    /// Nothing came back about `key_id`. It stays; silence says nothing of the key.
+    pub fn silent(&mut self, _now: Duration, sae: &str, key_id: &KeyId) {
+        if let Some(Peer { state: State::Held(held), .. }) = self.peers.get_mut(sae)
+            && held.key_id == *key_id
+        {
+            held.last_refusal = None;
+        }
+    }
+
+    /// The next call to the KME, if any.
+    pub fn poll_request(&mut self, now: Duration) -> Option<Request> {
+        self.expire(now);
+        let asked = self.peers.values().filter(|p| matches!(p.state, State::Asked)).count();
+        if asked >= IN_FLIGHT {
+            return None;
+        }
+        let (sae, peer) = self.peers.iter_mut().find(|(_, p)| matches!(p.state, State::Wanted))?;
+        peer.state = State::Asked;
+        Some(Request::Enc { slave: sae.clone(), number: 1, purpose: Purpose::Bootstrap })
+    }
+
+    /// The KME's answer to one of our requests.
+    pub fn on_answer(&mut self, now: Duration, answer: Answer) {
+        let Request::Enc { slave, .. } = answer.request else { return };
+        let Some(peer) = self.peers.get_mut(&slave) else { return };
+        if !matches!(peer.state, State::Asked) {
+            return;
+        }
+        let key = match answer.outcome {
+            Ok(Fetched::Keys(mut keys)) if keys.len() == 1 => keys.remove(0),
+            Ok(_) => return peer.failed(now, "the KME did not give one key".to_owned()),
+            Err(failure) => return peer.failed(now, format!("enc_keys: {failure}")),
+        };
+        match derive(&key, &self.sae_id, &slave, self.cipher) {
+            Ok(psk) => {
+                peer.state = State::Held(Held {
+                    key_id: key.0,
+                    psk: Arc::new(psk),
+                    since: now,
+                    not_before: now,
+                    refusals: 0,
+                    mismatches: 0,
+                    last_refusal: None,
+                    refused_for: Duration::ZERO,
+                });
+            }
+            Err(why) => peer.failed(now, why),
+        }
+    }
+
+    /// When to poll again without other cause: a key ends.
+    pub fn poll_timeout(&self) -> Option<Duration> {
+        let end = |p: &Peer| match &p.state {
+            State::Held(held) => Some(held.since + KEY_MAX_AGE),
+            _ => None,
+        };
+        self.peers.values().filter_map(end).min()
+    }
+
+    fn expire(&mut self, now: Duration) {
+        for peer in self.peers.values_mut() {
+            if matches!(&peer.state, State::Held(held) if held.since + KEY_MAX_AGE <= now) {
+                peer.state = State::Empty { not_before: now, why: String::new() };
+            }
+        }
+    }
+
+    /// Forgets a peer that nothing hangs on, when there are too many.
+    fn make_room(&mut self, now: Duration) -> bool {
+        if self.peers.len() < MAX_PEERS {
+            return true;
+        }
+        let idle =
+            |p: &Peer| matches!(p.state, State::Empty { not_before, .. } if not_before <= now);
+        let Some(sae) = self.peers.iter().find(|(_, p)| idle(p)).map(|(sae, _)| sae.clone()) else {
+            return false;
+        };
+        self.peers.remove(&sae);
+        true
+    }
+}
+
+impl Peer {
+    fn new() -> Self {
+        Self { state: State::Empty { not_before: Duration::ZERO, why: String::new() }, failures: 0 }
+    }
+
+    /// A call or a key failed: a held PSK is erased, also for attempts under way, and the KME is left
+    /// alone for a while.
+    fn failed(&mut self, now: Duration, why: String) {
+        let wait = Duration::from_secs(1 << self.failures.min(6)).min(BACK_OFF_MAX);
+        self.failures += 1;
+        self.state = State::Empty { not_before: now + wait, why };
+    }
+}
+
+fn derive(
+    (key_id, key): &(KeyId, KmeKey),
+    client: &str,
+    server: &str,
+    cipher: Cipher,
+) -> Result<Psk, String> {
+    let text = std::str::from_utf8(key_id.as_bytes())
+        .map_err(|_| format!("the KME named a key {key_id}, which is no text"))?;
+    qkd::derive_psk(key.expose_secret(), text, client, server, cipher).map_err(|e| e.to_string())
+}

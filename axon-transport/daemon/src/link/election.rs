@@ -1,0 +1,61 @@
+//! Elects which of two connections between the same daemons stays.
+
+use axon_shm::ids::DaemonId;
+
+use super::order::Side;
+
+/// A connection that completed its HELLOs (and proof).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Candidate {
+    /// Which end this side is.
+    pub side: Side,
+    /// Whether it succeeds a link that is up (a new key, a new address).
+    pub successor: bool,
+}
+
+/// Whether `new` takes the place of `current` between `ours` and `peer`, as the lower id decides it.
+///
+/// A successor always does: it was dialled on purpose. Otherwise the lower id's own dial stays,
+/// and of two dials by the same side the newer one, since a daemon dials again only when it gave
+/// the first one up.
+pub fn keep(ours: DaemonId, peer: DaemonId, current: Candidate, new: Candidate) -> bool {
+    let dialled_by_lower = |c: Candidate| (c.side == Side::Client) == (ours < peer);
+    new.successor
+        || current.side == new.side
+        || (dialled_by_lower(new) && !dialled_by_lower(current))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LOW: DaemonId = DaemonId([1; 16]);
+    const HIGH: DaemonId = DaemonId([2; 16]);
+
+    fn plain(side: Side) -> Candidate {
+        Candidate { side, successor: false }
+    }
+
+    #[test]
+    fn both_ends_keep_the_dial_of_the_lower_id() {
+        // At the lower id its own dial is the client's end, at the higher one the server's.
+        assert!(keep(LOW, HIGH, plain(Side::Server), plain(Side::Client)));
+        assert!(!keep(LOW, HIGH, plain(Side::Client), plain(Side::Server)));
+        assert!(keep(HIGH, LOW, plain(Side::Client), plain(Side::Server)));
+        assert!(!keep(HIGH, LOW, plain(Side::Server), plain(Side::Client)));
+    }
+
+    #[test]
+    fn a_successor_replaces_whoever_dialled() {
+        for side in [Side::Client, Side::Server] {
+            let new = Candidate { side, successor: true };
+            assert!(keep(LOW, HIGH, plain(Side::Client), new));
+            assert!(keep(HIGH, LOW, plain(Side::Server), new));
+        }
+    }
+
+    #[test]
+    fn the_newer_of_two_dials_by_one_side_stays() {
+        assert!(keep(LOW, HIGH, plain(Side::Server), plain(Side::Server)));
+    }
+}

@@ -1,0 +1,110 @@
+//! What two daemons must agree on before a link carries anything.
+
+use axon_shm::ids::DaemonId;
+use axon_transport::config::{Config, Security};
+
+use super::CloseCode;
+use crate::wire::{Terms, link::Hello};
+
+/// The protocol version of this build; it speaks no other.
+pub const PROTOCOL: u8 = 1;
+
+/// A setting in which two daemons differ.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{setting} is {ours} on the side that refuses, {theirs} on the other")]
+pub struct Mismatch {
+    /// The code that closes the link.
+    pub code: CloseCode,
+    /// The variable or field.
+    pub setting: &'static str,
+    /// The value of the side that checks.
+    pub ours: String,
+    /// The value in the peer's HELLO.
+    pub theirs: String,
+}
+
+impl Hello {
+    /// What `config` says of this daemon.
+    pub fn new(config: &Config, daemon: DaemonId) -> Self {
+        let Terms { mode, key_mode, kex, cipher, auth } = Terms::of(config);
+        let sae = match &config.security {
+            Security::Classic(_) => None,
+            Security::Qkd(qkd) => Some(qkd.sae_id.clone()),
+        };
+        let host = rustix::system::uname().nodename().to_string_lossy().chars().take(63).collect();
+        Self {
+            protocol_min: PROTOCOL,
+            protocol_max: PROTOCOL,
+            domain: config.domain,
+            daemon,
+            mode,
+            key_mode,
+            kex,
+            cipher,
+            sae,
+            host,
+            auth,
+            replaces: None,
+            expects: None,
+            static_peer: false,
+        }
+    }
+
+    /// What both sides must have in common.
+    fn terms(&self) -> Terms {
+        Terms {
+            mode: self.mode,
+            key_mode: self.key_mode,
+            kex: self.kex,
+            cipher: self.cipher,
+            auth: self.auth,
+        }
+    }
+}
+
+/// Checks the peer's HELLO against ours. `psk_sae` is the peer's SAE as the PSK names it; `None` in
+/// classic.
+///
+/// # Errors
+/// The first [`Mismatch`].
+pub fn check(ours: &Hello, theirs: &Hello, psk_sae: Option<&str>) -> Result<(), Mismatch> {
+    let differ =
+        |code, setting, ours: String, theirs: String| Err(Mismatch { code, setting, ours, theirs });
+    if theirs.protocol_min > ours.protocol_max || theirs.protocol_max < ours.protocol_min {
+        let range = |h: &Hello| format!("{}..={}", h.protocol_min, h.protocol_max);
+        return differ(CloseCode::Protocol, "protocol version", range(ours), range(theirs));
+    }
+    if theirs.daemon == ours.daemon {
+        let id = ours.daemon.to_string();
+        return differ(CloseCode::Self_, "daemon id", id.clone(), id);
+    }
+    if let Some(expected) = theirs.expects.filter(|e| *e != ours.daemon) {
+        return differ(
+            CloseCode::Goodbye,
+            "daemon id",
+            ours.daemon.to_string(),
+            format!("{expected} (it dialled a daemon that is gone)"),
+        );
+    }
+    if theirs.domain != ours.domain {
+        let (o, t) = (ours.domain.to_string(), theirs.domain.to_string());
+        return differ(CloseCode::Domain, "ROS_DOMAIN_ID", o, t);
+    }
+    if let Some(difference) = ours.terms().first_difference(&theirs.terms()) {
+        let code = match difference.setting {
+            "AXON_SECURITY_MODE" => CloseCode::Mode,
+            "AXON_QKD_KEY_MODE" => CloseCode::KeyMode,
+            "AXON_QKD_KEX" => CloseCode::Kex,
+            "AXON_QUIC_CIPHER" => CloseCode::Cipher,
+            _ => CloseCode::Auth,
+        };
+        return differ(code, difference.setting, difference.ours, difference.theirs);
+    }
+    // In classic nobody proves an SAE, so nobody may claim one.
+    if theirs.sae.as_deref() != psk_sae {
+        let text = |sae: Option<&str>| sae.unwrap_or("absent").to_owned();
+        let proven = format!("{} (by the PSK)", text(psk_sae));
+        return differ(CloseCode::Sae, "SAE ID", proven, text(theirs.sae.as_deref()));
+    }
+    Ok(())
+}

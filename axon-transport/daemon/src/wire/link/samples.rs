@@ -1,0 +1,91 @@
+//! One of each message, for the tests.
+
+use axon_envelope::{IndexMask, KeyId};
+use axon_shm::{
+    ids::{DaemonId, Gid},
+    qos::Qos,
+};
+
+use super::*;
+use crate::{owner::Proof, wire::keys::KeyMessage};
+
+pub(crate) fn key_id(id: &str) -> KeyId {
+    KeyId::new(id).unwrap()
+}
+
+pub(crate) fn hello() -> Hello {
+    Hello {
+        protocol_min: 1,
+        protocol_max: 1,
+        domain: 0,
+        daemon: DaemonId([1; 16]),
+        mode: 1,
+        key_mode: 2,
+        kex: 1,
+        cipher: 0,
+        sae: Some("sae-a".into()),
+        host: "robot".into(),
+        auth: None,
+        replaces: None,
+        expects: None,
+        static_peer: false,
+    }
+}
+
+pub(crate) fn peer() -> Hello {
+    Hello { daemon: DaemonId([2; 16]), sae: Some("sae-b".into()), ..hello() }
+}
+
+pub(crate) fn elected() -> Message {
+    Message::Elected(Elected { link: [9; 16], election: 3 })
+}
+
+/// HELLO first.
+pub(crate) fn messages() -> Vec<Message> {
+    let qos = Qos { lifespan: Some(7), ..Qos::keep_all() };
+    vec![
+        Message::Hello(Hello {
+            replaces: Some([3; 16]),
+            expects: Some(DaemonId([4; 16])),
+            ..hello()
+        }),
+        elected(),
+        Message::Graph(Graph {
+            version: 2,
+            before: 1,
+            added: vec![],
+            removed: vec![Gid([5; 16])],
+            more: true,
+            localhost: None,
+            listing: None,
+        }),
+        Message::GraphResync(GraphResync { version: 2 }),
+        Message::Subscribe(Subscribe {
+            route: 1,
+            topic: "/scan".into(),
+            type_name: "sensor_msgs/msg/LaserScan".into(),
+            kind: 0,
+            subscribers: vec![Subscriber { gid: Gid([6; 16]), qos }],
+            last: vec![LastSeen { publisher: Gid([7; 16]), sequence: 42 }],
+            acknowledges: Some(true),
+        }),
+        Message::Received(Received {
+            flows: vec![ReceivedOf { route: 1, publisher: Gid([7; 16]), sequence: 43, dropped: 1 }],
+        }),
+        Message::RouteRefused(RouteRefused { route: 1, reason: "why".into(), retry_s: Some(10) }),
+        Message::Unsubscribe(Unsubscribe { route: 1 }),
+        Message::RouteReady(RouteReady { route: 1, publishers: vec![Gid([7; 16])] }),
+        Message::Keepalive,
+        Message::Asserted(Asserted { publishers: vec![Gid([7; 16]), Gid([8; 16])] }),
+        Message::Owners(Owners { proofs: vec![Proof { key: [1; 32], signature: [2; 64] }; 2] }),
+        Message::LinkClosed(LinkClosed { link: [3; 16] }),
+        Message::Keys(KeyMessage::Announce(vec![key_id("k1"), key_id("k2")])),
+        Message::Keys(KeyMessage::Ready { key_id: key_id("k1"), proof: [8; 32] }),
+        Message::Keys(KeyMessage::Failed { key_id: key_id("k2"), reason: "unknown".into() }),
+        Message::Keys(KeyMessage::Retire {
+            key_id: key_id("k1"),
+            used: IndexMask::from_bits(0x3ff).unwrap(),
+            reliable: IndexMask::from_bits(0x155).unwrap(),
+        }),
+    ]
+}

@@ -1,0 +1,198 @@
+//! Logging never ends a daemon, and never fills a file system.
+
+use std::{
+    fs::{self, File, OpenOptions},
+    os::{fd::OwnedFd, unix::fs::PermissionsExt as _},
+    process::{Command, Stdio},
+    time::Instant,
+};
+
+use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with};
+
+use super::*;
+use crate::{skip::skip, support::Kept};
+
+const NOBODY: libc::uid_t = 65534;
+
+/// A daemon in the foreground, given this standard error, that logs all that it does.
+fn foreground(host: &Host, mut command: Command, stderr: impl Into<Stdio>) -> Kept {
+    let daemon = Kept(command.stderr(stderr).spawn().unwrap());
+    until("the daemon answers", || host.status().is_ok());
+    daemon
+}
+
+fn program(host: &Host) -> Command {
+    host.command(env!("CARGO_BIN_EXE_axon_daemon"))
+}
+
+/// Sessions come and go, and one connection is refused; the daemon logs each of these.
+fn cause_log_lines(host: &Host) {
+    for _ in 0..3 {
+        let session = host.session("short").unwrap();
+        session.create_publisher(spec("/t")).unwrap();
+        let stranger = Address::of(&host.config()).connect().unwrap();
+        let _ = socket::send(&stranger, &Message::Resync.encode().unwrap(), &[]);
+    }
+}
+
+fn assert_it_goes_on(host: &Host, mut daemon: Kept) {
+    cause_log_lines(host);
+    let status = host.status().expect("the daemon answers");
+    assert_eq!(status.pid, daemon.0.id());
+    assert!(daemon.0.try_wait().unwrap().is_none(), "the daemon runs");
+}
+
+#[test]
+fn a_daemon_outlives_a_full_disk_under_its_log() {
+    let host = Host::new();
+    let full = OpenOptions::new().write(true).open("/dev/full").unwrap();
+    assert_it_goes_on(&host, foreground(&host, program(&host), full));
+}
+
+#[test]
+fn a_daemon_outlives_whoever_reads_its_standard_error() {
+    let host = Host::new();
+    let (reader, writer) = std::io::pipe().unwrap();
+    let daemon = foreground(&host, program(&host), OwnedFd::from(writer));
+    drop(reader);
+    assert_it_goes_on(&host, daemon);
+}
+
+#[test]
+fn a_daemon_outlives_a_limit_on_the_size_of_files() {
+    let host = Host::new();
+    let log = host.dir.path().join("stderr");
+    fs::write(&log, vec![b'\n'; 4 << 20]).unwrap();
+    let full = OpenOptions::new().append(true).open(&log).unwrap();
+    // Units of 512 bytes: its log file is as long as any may be.
+    assert_it_goes_on(&host, foreground(&host, limited(&host, 8192), full));
+    assert_eq!(fs::metadata(&log).unwrap().len(), 4 << 20);
+}
+
+#[test]
+fn a_daemon_that_may_not_write_at_all_ends_with_an_error_and_not_by_a_signal() {
+    let host = Host::new();
+    let log = File::create(host.dir.path().join("stderr")).unwrap();
+    let mut daemon = Kept(limited(&host, 0).stderr(log).spawn().unwrap());
+    let mut ended = None;
+    until("it ends", || {
+        ended = daemon.0.try_wait().unwrap();
+        ended.is_some()
+    });
+    let status = ended.unwrap();
+    assert!(status.code().is_some_and(|code| code > 0), "{status}");
+}
+
+/// A daemon none of whose files may be longer.
+fn limited(host: &Host, blocks: u32) -> Command {
+    let mut shell = host.command("sh");
+    let script = format!("ulimit -f {blocks}; exec \"$0\"");
+    shell.args(["-c", &script, env!("CARGO_BIN_EXE_axon_daemon")]);
+    shell
+}
+
+#[test]
+fn a_daemon_in_the_background_begins_a_new_log_file_at_8_mib() {
+    let host = Host::new();
+    let run = host.dir.path().join("run");
+    let [log, before] = ["axon-0.log", "axon-0.log.1"].map(|name| run.join(name));
+    fs::create_dir(&run).unwrap();
+    fs::set_permissions(&run, fs::Permissions::from_mode(0o700)).unwrap();
+    fs::write(&log, vec![b'\n'; 8 << 20]).unwrap();
+    fs::write(&before, "two files before").unwrap();
+    let mut player = host.play("idle");
+    player.hear();
+    until("the daemon logs into a new file", || {
+        fs::read_to_string(&log).is_ok_and(|text| text.len() < 8 << 20 && text.contains("daemon"))
+    });
+    let kept = fs::read(&before).unwrap();
+    assert_eq!(kept.len(), 8 << 20, "what was logged before is kept once");
+}
+
+#[test]
+fn a_flood_of_one_kind_leaves_few_lines_and_a_count() {
+    let host = Host::new();
+    let log = host.dir.path().join("stderr");
+    let daemon = foreground(&host, program(&host), File::create(&log).unwrap());
+    let address = Address::of(&host.config());
+    const FLOOD: usize = 500;
+    let hello = Message::Hello(Hello {
+        protocol: PROTOCOL + 1,
+        session: SessionId::random(),
+        role: SessionRole::Application,
+        name: "\u{202e}flood\u{1b}[2J".into(),
+        domain: 0,
+        settings: Vec::new(),
+        relay: None,
+        range: None,
+        static_peers: None,
+    });
+    for _ in 0..FLOOD {
+        let stranger = address.connect().unwrap();
+        socket::send(&stranger, &hello.encode().unwrap(), &[]).unwrap();
+        until("the refusal comes", || socket::receive(&stranger, &mut Vec::new()).is_ok());
+    }
+    let text = fs::read_to_string(&log).unwrap();
+    let refused =
+        text.lines().filter(|line| line.contains("PROTOCOL") || line.contains("protocol"));
+    assert!((1..FLOOD / 4).contains(&refused.count()), "{text}");
+    assert!(
+        text.chars().all(|c| c == '\n' || axon_transport::internal::text::is_plain(c)),
+        "{text:?}"
+    );
+    assert_it_goes_on(&host, daemon);
+}
+
+#[test]
+fn another_user_who_connects_without_end_leaves_few_lines() {
+    const CONNECTIONS: u64 = 3_000;
+    const CAUSE: &str = "a stranger's connection was closed";
+    if !rustix::process::geteuid().is_root() {
+        return skip("only root can be two users");
+    }
+    let host = Host::new().with("AXON_LOG", "warn");
+    let log = host.dir.path().join("stderr");
+    let daemon = foreground(&host, program(&host), File::create(&log).unwrap());
+    // The daemon ends some time after its last session.
+    let session = host.session("stays").unwrap();
+    // Nobody keeps the other user out but the daemon.
+    let run = host.dir.path().join("run");
+    let socket = run.join("axon-0.sock");
+    for path in [host.dir.path(), &run, &socket] {
+        fs::set_permissions(path, fs::Permissions::from_mode(0o777)).unwrap();
+    }
+    let address = SocketAddrUnix::new(&socket).unwrap();
+    let begin = Instant::now();
+    let flood = std::thread::spawn(move || {
+        // SAFETY: has no effect on memory. The system call itself changes the thread that calls it, and not
+        // the process, as the function of the C library would; the thread ends as the other user.
+        let changed = unsafe { libc::syscall(libc::SYS_setresuid, NOBODY, NOBODY, NOBODY) };
+        assert_eq!(changed, 0);
+        for _ in 0..CONNECTIONS {
+            let (unix, packets) = (AddressFamily::UNIX, SocketType::SEQPACKET);
+            let stranger = socket_with(unix, packets, SocketFlags::CLOEXEC, None).unwrap();
+            connect(&stranger, &address).unwrap();
+            // Until it is put out.
+            while let Ok(_) | Err(socket::SocketError::NotReady) =
+                socket::receive(&stranger, &mut Vec::new())
+            {
+                std::thread::yield_now();
+            }
+        }
+    });
+    flood.join().unwrap();
+    drop(session);
+    let text = fs::read_to_string(&log).unwrap();
+    let took = begin.elapsed();
+    let lines = text.lines().filter(|line| line.contains(CAUSE)).count() as u64;
+    eprintln!(
+        "{CONNECTIONS} connections of another user in {took:?}: {lines} lines, {:.0} bytes a second",
+        text.len() as f64 / took.as_secs_f64()
+    );
+    // Ten at once, and then one a second.
+    assert!((1..=10 + took.as_secs() + 1).contains(&lines), "{lines} lines in {took:?}:\n{text}");
+    assert!(lines < CONNECTIONS / 10, "{lines}");
+    let others = text.lines().filter(|line| line.contains("WARN") && !line.contains(CAUSE)).count();
+    assert!(others <= 2, "and of hardly any other cause:\n{text}");
+    assert_it_goes_on(&host, daemon);
+}

@@ -1,0 +1,252 @@
+//! Each of the eleven events tells its callback: at once of what nobody was told of, then of each
+//! occurrence, and of none once it is unset.
+
+use std::{
+    any::Any,
+    sync::{Arc, Mutex},
+    thread::{self, ThreadId},
+};
+
+use axon_transport::{
+    EndpointSpec, Event, OnNew, Session,
+    events::{EventKind, EventStatus},
+    ids::Gid,
+    qos::{Liveliness, Qos},
+};
+
+use super::{
+    MILLI, await_event, flood, less, lossy,
+    pair::Pair,
+    spec,
+    support::{PATIENCE, until},
+};
+
+/// Makes an event occur once, by an endpoint of this GID; or, without one, at least once before long.
+type Cause<'a> = Box<dyn FnMut() -> Option<Gid> + 'a>;
+
+/// An event, and what makes it occur.
+struct Scene<'a> {
+    event: Event,
+    session: &'a Session,
+    cause: Cause<'a>,
+    /// What it is about.
+    _cast: Box<dyn Any>,
+}
+
+fn scene(kind: EventKind, pair: &Pair) -> Scene<'_> {
+    let (here, there) = (&pair.here, &pair.there);
+    let (offered, requested) = (less()[0].1, less()[0].2);
+    // Those of before may not have gone everywhere.
+    let spec = |qos| EndpointSpec { topic: format!("/{kind:?}"), ..spec(qos) };
+    let other = |qos| EndpointSpec { type_name: "U".into(), ..spec(qos) };
+    let plain = Qos::default;
+    // Publishers and subscriptions that come one after another, and stay. Within a session, the one that
+    // comes is the last to be told.
+    let publishers = |spec: EndpointSpec, theirs: EventKind| {
+        let mut all = Vec::new();
+        move || {
+            let new = here.create_publisher(spec.clone()).unwrap();
+            await_event(here, &new.event(theirs).unwrap());
+            let gid = new.gid();
+            all.push(new);
+            Some(gid)
+        }
+    };
+    let subscriptions = |spec: EndpointSpec, theirs: EventKind| {
+        let mut all = Vec::new();
+        move || {
+            let new = there.create_subscription(spec.clone()).unwrap();
+            await_event(there, &new.event(theirs).unwrap());
+            let gid = new.gid();
+            all.push(new);
+            Some(gid)
+        }
+    };
+    if kind.is_publishers() {
+        let timed = Qos { deadline: Some(50 * MILLI), ..plain() };
+        let manual = Liveliness::ManualByTopic;
+        let own = match kind {
+            EventKind::OfferedQosIncompatible => offered,
+            EventKind::OfferedDeadlineMissed => timed,
+            EventKind::LivelinessLost => {
+                Qos { liveliness: manual, lease: Some(50 * MILLI), ..plain() }
+            }
+            _ => plain(),
+        };
+        let publisher = Arc::new(here.create_publisher(spec(own)).unwrap());
+        let own = publisher.clone();
+        let cause: Cause<'_> = match kind {
+            EventKind::PublicationMatched => {
+                Box::new(subscriptions(spec(plain()), EventKind::SubscriptionMatched))
+            }
+            EventKind::OfferedQosIncompatible => {
+                Box::new(subscriptions(spec(requested), EventKind::RequestedQosIncompatible))
+            }
+            EventKind::PublisherIncompatibleType => {
+                let theirs = EventKind::SubscriptionIncompatibleType;
+                Box::new(subscriptions(other(plain()), theirs))
+            }
+            EventKind::OfferedDeadlineMissed => Box::new(move || {
+                own.publish(b"and no more").unwrap();
+                None
+            }),
+            EventKind::LivelinessLost => Box::new(move || {
+                own.assert_liveliness().unwrap();
+                None
+            }),
+            _ => unreachable!("{kind:?}"),
+        };
+        let event = publisher.event(kind).unwrap();
+        return Scene { event, session: here, cause, _cast: Box::new(publisher) };
+    }
+    let timed = Qos { deadline: Some(50 * MILLI), ..plain() };
+    let (_cast, event, cause): (Box<dyn Any>, _, Cause<'_>) = match kind {
+        EventKind::MessageLost | EventKind::RequestedDeadlineMissed => {
+            let qos = if kind == EventKind::MessageLost { lossy() } else { timed };
+            let (publisher, subscription) = pair.matched_as(spec(qos), spec(qos));
+            let event = subscription.event(kind).unwrap();
+            let subscription = Arc::new(subscription);
+            let taker = subscription.clone();
+            let cause = move || {
+                if kind == EventKind::MessageLost {
+                    flood(&publisher);
+                    // Nobody looks for what is lost but who takes or waits.
+                    while taker.take(&mut Vec::new()).is_some() {}
+                } else {
+                    publisher.publish(b"and no more").unwrap();
+                }
+                None
+            };
+            (Box::new(subscription), event, Box::new(cause))
+        }
+        _ => {
+            let own = if kind == EventKind::RequestedQosIncompatible { requested } else { plain() };
+            let subscription = there.create_subscription(spec(own)).unwrap();
+            let event = subscription.event(kind).unwrap();
+            let cause: Cause<'_> = match kind {
+                EventKind::RequestedQosIncompatible => {
+                    Box::new(publishers(spec(offered), EventKind::OfferedQosIncompatible))
+                }
+                EventKind::SubscriptionIncompatibleType => {
+                    Box::new(publishers(other(plain()), EventKind::PublisherIncompatibleType))
+                }
+                EventKind::SubscriptionMatched | EventKind::LivelinessChanged => {
+                    Box::new(publishers(spec(plain()), EventKind::PublicationMatched))
+                }
+                _ => unreachable!("{kind:?}"),
+            };
+            (Box::new(subscription), event, cause)
+        }
+    };
+    Scene { event, session: there, cause, _cast }
+}
+
+impl Scene<'_> {
+    /// Makes it occur, and waits until it has.
+    fn occur(&mut self) {
+        match (self.cause)() {
+            // What another session's endpoint is to one's own has been counted when the graph shows it.
+            Some(gid) => {
+                let shown = self.session.wait_graph(PATIENCE, |g| g.endpoints.contains_key(&gid));
+                assert!(shown);
+            }
+            None => await_event(self.session, &self.event),
+        }
+    }
+}
+
+/// Who was told how often, one call after another.
+type Calls = Arc<Mutex<Vec<(ThreadId, u64)>>>;
+
+fn recorder() -> (OnNew, Calls) {
+    let calls = Calls::default();
+    let told = calls.clone();
+    (Arc::new(move |new| told.lock().unwrap().push((thread::current().id(), new))), calls)
+}
+
+fn told(calls: &Calls) -> Vec<u64> {
+    calls.lock().unwrap().iter().map(|(_, new)| *new).collect()
+}
+
+/// How often it occurred in all, where it says so.
+fn total(event: &Event) -> Option<u64> {
+    match event.take() {
+        EventStatus::Counted(status) => Some(status.total),
+        EventStatus::IncompatibleQos(status) => Some(status.count.total),
+        EventStatus::Matched(status) => Some(status.total),
+        EventStatus::LivelinessChanged(status) => Some(status.alive),
+    }
+}
+
+#[test]
+fn each_of_the_eleven_tells_its_callback() {
+    for pair in Pair::all() {
+        for kind in EventKind::ALL {
+            eprintln!("{kind:?}");
+            let mut scene = scene(kind, &pair);
+            let timed = matches!(
+                kind,
+                EventKind::RequestedDeadlineMissed
+                    | EventKind::OfferedDeadlineMissed
+                    | EventKind::LivelinessLost
+            );
+            if timed || kind == EventKind::MessageLost {
+                each_is_told_in_all(&mut scene);
+            } else {
+                each_is_told_once(&mut scene);
+            }
+        }
+    }
+}
+
+/// Of an event that occurs once by each cause.
+fn each_is_told_once(scene: &mut Scene<'_>) {
+    scene.occur();
+    scene.occur();
+    let (callback, calls) = recorder();
+    scene.event.set_callback(Some(callback));
+    let me = thread::current().id();
+    assert_eq!(calls.lock().unwrap()[..], [(me, 2)], "the backlog, at once");
+    scene.occur();
+    until("it is told", || told(&calls).len() > 1);
+    scene.occur();
+    until("it is told again", || told(&calls).len() > 2);
+    assert_eq!(told(&calls), [2, 1, 1]);
+    scene.event.set_callback(None);
+    scene.occur();
+    assert_eq!(told(&calls), [2, 1, 1], "nobody listens");
+    let (callback, later) = recorder();
+    scene.event.set_callback(Some(callback));
+    assert_eq!(told(&later), [1], "what nobody was told of");
+    scene.event.set_callback(None);
+    scene.occur();
+    assert_eq!(total(&scene.event), Some(6));
+    let (callback, last) = recorder();
+    scene.event.set_callback(Some(callback));
+    assert!(told(&last).is_empty(), "it has been looked at");
+    assert_eq!(told(&calls), [2, 1, 1]);
+}
+
+/// Of an event that occurs at times of its own, or several times at once.
+fn each_is_told_in_all(scene: &mut Scene<'_>) {
+    scene.occur();
+    let (callback, calls) = recorder();
+    scene.event.set_callback(Some(callback));
+    let me = thread::current().id();
+    assert_eq!(calls.lock().unwrap()[0].0, me, "the backlog, at once");
+    let before = told(&calls).len();
+    scene.occur();
+    until("it is told", || told(&calls).len() > before);
+    // Periods go on: it is told of all that has been counted, sooner or later.
+    until("it is told of all", || {
+        let counted = total(&scene.event);
+        counted == Some(told(&calls).iter().sum())
+    });
+    scene.event.set_callback(None);
+    let before = told(&calls);
+    total(&scene.event);
+    scene.occur();
+    await_event(scene.session, &scene.event);
+    assert_eq!(told(&calls), before, "nobody listens");
+    assert!(total(&scene.event) > Some(before.iter().sum()));
+}

@@ -1,0 +1,179 @@
+//! Who has nothing to do does nothing: processes at rest are not scheduled. What is asserted are counts
+//! of the kernel's, not times.
+
+#[allow(dead_code, reason = "what other tests need of it")]
+mod support;
+
+use std::{
+    collections::BTreeMap,
+    fs,
+    sync::Arc,
+    thread,
+    time::{Duration, Instant},
+};
+
+use axon_transport::{
+    EndpointSpec, Session, SessionOptions, Waitable, config::Config, events::EventKind, qos::Qos,
+};
+use support::{Host, PATIENCE, say, until, wait_for_the_end};
+
+/// How long a process is watched. It used to wake up every second, several threads of it.
+const WATCH: Duration = Duration::from_secs(5);
+/// Between two looks whether a process has come to rest.
+const SETTLE: Duration = Duration::from_millis(500);
+
+/// The lease of who has one, in nanoseconds. It is renewed at each third of it.
+const LEASE: u64 = 3_000_000_000;
+
+fn spec(topic: &str) -> EndpointSpec {
+    EndpointSpec::new(topic, "test/Bytes", Qos::default())
+}
+
+/// Not a test of its own: a process with some of everything, and a thread in each kind of wait.
+#[test]
+fn child() {
+    let Ok(part) = std::env::var("PLAY") else { return };
+    let lease = (part == "leased").then_some(LEASE);
+    let leased = || EndpointSpec { qos: Qos { lease, ..Qos::default() }, ..spec("/a") };
+    let session = Session::open(&Config::from_env().unwrap(), SessionOptions::new(&*part)).unwrap();
+    let _node = session.create_node("idle", "/", "/").unwrap();
+    let talker = session.create_publisher(leased()).unwrap();
+    let heard = session.create_subscription(leased()).unwrap();
+    let silent = session.create_subscription(spec("/b")).unwrap();
+    let called = session.create_subscription(leased()).unwrap();
+    let server = session.create_server(spec("/s")).unwrap();
+    let client = session.create_client(spec("/s")).unwrap();
+    let lost = silent.event(EventKind::MessageLost).unwrap();
+    let never = session.create_guard_condition();
+    if part == "callbacks" {
+        called.set_on_new_sample(Some(Arc::new(|_| {}))).unwrap();
+    }
+    assert!(talker.wait_matched(2, PATIENCE) && client.wait_available(PATIENCE));
+    // One sample for everybody: who has slept and been woken sleeps again.
+    talker.publish(b"once").unwrap();
+    let all = [
+        Waitable::GuardCondition(&never),
+        Waitable::Event(&lost),
+        Waitable::Subscription(&silent),
+        Waitable::Client(&client),
+    ];
+    thread::scope(|scope| {
+        scope.spawn(|| while heard.recv(&mut Vec::new(), None).is_some() {});
+        scope.spawn(|| silent.recv(&mut Vec::new(), None));
+        scope.spawn(|| session.wait(|| silent.has_data(), None));
+        scope.spawn(|| server.recv_request(&mut Vec::new(), None));
+        scope.spawn(|| session.wait_for(&all, None));
+        say("rests");
+        wait_for_the_end();
+        std::process::exit(0);
+    });
+}
+
+/// How often each thread of a process has gone to sleep, by its number and name.
+fn sleeps(pid: u32) -> BTreeMap<String, u64> {
+    let mut all = BTreeMap::new();
+    for task in fs::read_dir(format!("/proc/{pid}/task")).unwrap() {
+        let status = fs::read_to_string(task.unwrap().path().join("status")).unwrap();
+        let field = |name: &str| {
+            let line = status.lines().find_map(|line| line.strip_prefix(name)).unwrap();
+            line.trim().to_owned()
+        };
+        let number = field("voluntary_ctxt_switches:").parse().unwrap();
+        all.insert(format!("{} {}", field("Pid:"), field("Name:")), number);
+    }
+    all
+}
+
+/// Once the threads of a process have come to rest, but those whose names `busy` knows.
+fn settle(pid: u32, busy: impl Fn(&str) -> bool) {
+    let resting = || -> BTreeMap<_, _> {
+        sleeps(pid).into_iter().filter(|(thread, _)| !busy(thread)).collect()
+    };
+    let mut before = resting();
+    until("it comes to rest", || {
+        thread::sleep(SETTLE);
+        let now = resting();
+        now == std::mem::replace(&mut before, now.clone())
+    });
+}
+
+/// What has happened in a process since `before`, as counts of sleeps by thread.
+fn since(before: &BTreeMap<String, u64>, pid: u32) -> BTreeMap<String, u64> {
+    let mut after = sleeps(pid);
+    for (thread, count) in before {
+        *after.entry(thread.clone()).or_default() -= count;
+    }
+    after.retain(|_, count| *count > 0);
+    after
+}
+
+/// What a process at rest does within [`WATCH`].
+fn wakes(pid: u32) -> BTreeMap<String, u64> {
+    settle(pid, |_| false);
+    let before = sleeps(pid);
+    thread::sleep(WATCH);
+    since(&before, pid)
+}
+
+#[test]
+fn a_process_at_rest_does_not_wake_up() {
+    let host = Host::new();
+    let _daemon = host.daemon();
+    let mut players = ["waits", "callbacks"].map(|part| host.play(part));
+    players.iter_mut().for_each(|player| assert_eq!(player.hear(), "rests"));
+    for player in &players {
+        assert_eq!(wakes(player.pid()), BTreeMap::new());
+    }
+}
+
+/// Each offers a lease, and watches its own and the other's.
+#[test]
+fn leases_wake_the_control_thread_up_three_times_each_and_nobody_else() {
+    let host = Host::new();
+    let _daemon = host.daemon();
+    let mut players = [0, 1].map(|_| host.play("leased"));
+    players.iter_mut().for_each(|player| assert_eq!(player.hear(), "rests"));
+    for player in &players {
+        let control = |thread: &str| thread.ends_with(" axon-ctl");
+        settle(player.pid(), control);
+        // However late this process is: what is counted was within the time that is.
+        let start = Instant::now();
+        let before = sleeps(player.pid());
+        let mut woken = BTreeMap::new();
+        until("it renewed its lease some times", || {
+            woken = since(&before, player.pid());
+            woken.values().sum::<u64>() >= 3
+        });
+        let thirds = start.elapsed().as_nanos() / u128::from(LEASE / 3);
+        let threads: Vec<_> = woken.keys().collect();
+        assert!(threads.len() == 1 && control(threads[0]), "{woken:?}");
+        assert!(
+            woken.values().all(|count| u128::from(*count) <= thirds + 1),
+            "{woken:?}, {thirds}"
+        );
+    }
+}
+
+#[test]
+fn a_relayed_process_at_rest_does_not_wake_up() {
+    let host = Host::new();
+    let _daemon = host.daemon();
+    let relayed = host.with("AXON_SHM", "off");
+    let mut player = relayed.play("alone");
+    assert_eq!(player.hear(), "rests");
+    assert_eq!(wakes(player.pid()), BTreeMap::new());
+}
+
+#[test]
+fn a_daemon_whose_sessions_rest_does_not_wake_up() {
+    // A domain and an address of its own: other daemons of this host link with it, and peers of one that
+    // ended still send to its port.
+    let [.., high, low] = std::process::id().to_be_bytes();
+    let host = Host::new()
+        .with("ROS_DOMAIN_ID", &(173 + low % 27).to_string())
+        .with("AXON_BIND_ADDRS", &format!("127.8.{high}.{low}"));
+    let daemon = host.daemon();
+    let mut players = ["waits", "callbacks"].map(|part| host.play(part));
+    players.iter_mut().for_each(|player| assert_eq!(player.hear(), "rests"));
+    assert_eq!(wakes(daemon.0.id()), BTreeMap::new());
+}

@@ -1,0 +1,72 @@
+//! What a process did about its pairs, kept in memory: printed when one of them lost something.
+#![expect(clippy::print_stderr, reason = "it is for people who look for a cause")]
+
+use std::{
+    collections::VecDeque,
+    io,
+    sync::{Arc, Mutex, MutexGuard},
+};
+
+use tracing_subscriber::{EnvFilter, fmt::MakeWriter};
+
+/// Lines that are kept.
+const LINES: usize = 50_000;
+/// What of the library's log belongs to the log of pairs: pairs, and the daemons that come and go.
+const FILTER: &str = "axon_transport::pairs=debug,axon_transport::internal::session=debug";
+
+#[derive(Clone, Default)]
+pub(crate) struct PairLog(Arc<Mutex<VecDeque<String>>>);
+
+impl PairLog {
+    /// Keeps what the library logs from now on.
+    pub(crate) fn keep() -> Self {
+        let pair_log = Self::default();
+        let subscriber = tracing_subscriber::fmt()
+            .with_env_filter(EnvFilter::new(FILTER))
+            .with_ansi(false)
+            .with_writer(pair_log.clone());
+        subscriber.init();
+        pair_log
+    }
+
+    pub(crate) fn add(&self, line: &str) {
+        tracing::debug!(target: "axon_transport::pairs", "{line}");
+    }
+
+    /// Prints what concerns a reader or writer, and all that concerns no pair.
+    pub(crate) fn print(&self, gid: &str) {
+        let of_pairs = |line: &str| line.contains("axon_transport::pairs");
+        let lines = self.lines();
+        let lines = lines.iter().filter(|line| line.contains(gid) || !of_pairs(line));
+        let lines: String = lines.map(String::as_str).collect();
+        eprintln!("--- process {}, {gid}:\n{lines}", std::process::id());
+    }
+
+    fn lines(&self) -> MutexGuard<'_, VecDeque<String>> {
+        self.0.lock().expect("no panic")
+    }
+}
+
+impl io::Write for PairLog {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let mut lines = self.lines();
+        if lines.len() == LINES {
+            lines.pop_front();
+        }
+        // The library's log is written an event at a time.
+        lines.push_back(String::from_utf8_lossy(bytes).into_owned());
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl<'a> MakeWriter<'a> for PairLog {
+    type Writer = Self;
+
+    fn make_writer(&'a self) -> Self {
+        self.clone()
+    }
+}
