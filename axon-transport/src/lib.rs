@@ -4,7 +4,6 @@
 pub mod config;
 pub mod events;
 pub mod ffi;
-mod files;
 pub mod graph;
 mod log_limit;
 mod registry;
@@ -42,10 +41,6 @@ pub mod internal {
             range::{OutOfRange, Reach, RemoteEndpoint, Scope, Toward, out_of_range},
             view::reach_of,
         };
-    }
-    /// Files that settings name.
-    pub mod files {
-        pub use crate::files::*;
     }
     /// Log lines at a bounded rate.
     pub mod log_limit {

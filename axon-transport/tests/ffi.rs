@@ -12,8 +12,6 @@ use std::{
     fs,
     path::{Path, PathBuf},
     process::Command,
-    sync::Once,
-    time::{Duration, SystemTime},
 };
 
 use c_program::{SYSTEM, WARNINGS, library, path, run};

@@ -14,15 +14,16 @@ pub(crate) fn install(prefix: &Path, profile: &str) -> Result<String> {
     let prefix = std::path::absolute(prefix).map_err(|e| format!("{}: {e}", prefix.display()))?;
     let cargo = |args: &[&str]| {
         let mut command = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
-        command.current_dir(root).args(args).args(["--package", "axon-transport"]);
+        command.current_dir(root).args(args);
         match command.args(["--profile", profile]).status() {
             Ok(status) if status.success() => Ok(()),
             Ok(status) => Err(format!("cargo {}: {status}", args[0])),
             Err(error) => Err(format!("cargo {}: {error}", args[0])),
         }
     };
-    cargo(&["build", "--bin", "axon_daemon"])?;
-    cargo(&["rustc", "--lib", "--crate-type", "staticlib,cdylib"])?;
+    cargo(&["build", "--package", "axon-daemon", "--bin", "axon_daemon"])?;
+    let libraries = "staticlib,cdylib";
+    cargo(&["rustc", "--package", "axon-transport", "--lib", "--crate-type", libraries])?;
 
     let target = env::var_os("CARGO_TARGET_DIR").map_or_else(|| root.join("target"), PathBuf::from);
     let built = target.join(if profile == "dev" { "debug" } else { profile });

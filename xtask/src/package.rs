@@ -8,13 +8,14 @@ use std::process::Command;
 use super::rustls_axon::{self, cargo, git, workspace};
 
 /// What is published, each crate after those it depends on.
-pub(crate) const PUBLISHED: [&str; 7] = [
+pub(crate) const PUBLISHED: [&str; 8] = [
     "etsi-qkd014",
     "axon-envelope",
     "rustls-axon",
     "axon-tls",
     "axon-shm",
     "axon-transport",
+    "axon-daemon",
     "axon-cli",
 ];
 

@@ -16,9 +16,10 @@ use crate::floors::{self, House};
 /// Where it stands.
 const FILE: &str = "docs/architecture.svg";
 /// The crates that somebody may depend on, or start.
-const CRATES: [&str; 8] = [
+const CRATES: [&str; 9] = [
     "rmw-axon-core",
     "axon-cli",
+    "axon-daemon",
     "axon-transport",
     "axon-shm",
     "axon-tls",

@@ -1,9 +1,9 @@
-//! The daemon of AXON.
-
+#![doc = include_str!("../README.md")]
 #![deny(unsafe_code)]
 
 mod control;
 mod discovery;
+mod files;
 mod gateway;
 mod keys;
 mod link;

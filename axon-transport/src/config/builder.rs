@@ -18,9 +18,9 @@ use super::{
 ///
 /// ```
 /// use axon_transport::{
+///     EndpointSpec, Session, SessionOptions,
 ///     config::{Config, DaemonPolicy},
 ///     qos::Qos,
-///     session::{EndpointSpec, Session, SessionOptions},
 /// };
 ///
 /// let config = Config::builder()

@@ -29,10 +29,10 @@ use crate::{
 /// use std::time::Duration;
 ///
 /// use axon_transport::{
+///     EndpointSpec, Session, SessionOptions,
 ///     config::{Config, DaemonPolicy},
 ///     events::{EventKind, EventStatus},
 ///     qos::Qos,
-///     session::{EndpointSpec, Session, SessionOptions},
 /// };
 ///
 /// let config = Config::builder().daemon(DaemonPolicy::Off).build()?;

@@ -69,9 +69,9 @@ use crate::{
 ///
 /// ```no_run
 /// use axon_transport::{
+///     EndpointSpec, Session, SessionOptions,
 ///     config::Config,
 ///     qos::Qos,
-///     session::{EndpointSpec, Session, SessionOptions},
 /// };
 ///
 /// let config = Config::from_env()?;

@@ -14,9 +14,9 @@ use crate::{graph::Endpoint, ids::Gid};
 ///
 /// ```
 /// use axon_transport::{
+///     EndpointSpec, Session, SessionOptions,
 ///     config::{Config, DaemonPolicy},
 ///     qos::Qos,
-///     session::{EndpointSpec, Session, SessionOptions},
 /// };
 ///
 /// let config = Config::builder().daemon(DaemonPolicy::Off).build()?;

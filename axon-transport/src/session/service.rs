@@ -38,9 +38,9 @@ pub struct Server {
 /// use std::time::Duration;
 ///
 /// use axon_transport::{
+///     EndpointSpec, Session, SessionOptions,
 ///     config::{Config, DaemonPolicy},
 ///     qos::Qos,
-///     session::{EndpointSpec, Session, SessionOptions},
 /// };
 ///
 /// let config = Config::builder().daemon(DaemonPolicy::Off).build()?;

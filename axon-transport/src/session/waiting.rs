@@ -92,9 +92,9 @@ impl Session {
     /// use std::time::Duration;
     ///
     /// use axon_transport::{
+    ///     EndpointSpec, Session, SessionOptions, Waitable,
     ///     config::{Config, DaemonPolicy},
     ///     qos::Qos,
-    ///     session::{EndpointSpec, Session, SessionOptions, Waitable},
     /// };
     ///
     /// let config = Config::builder().daemon(DaemonPolicy::Off).build()?;

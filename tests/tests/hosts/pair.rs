@@ -121,7 +121,10 @@ impl Host {
             ("AXON_RUNTIME_DIR".to_owned(), path("run")),
             ("AXON_CONFIG".to_owned(), path("axon.toml")),
             ("AXON_DAEMON_PATH".to_owned(), env!("CARGO_BIN_EXE_axon-test-daemon").to_owned()),
-            ("AXON_LOG".to_owned(), "info,axon_shm=debug,axon_transport=debug".to_owned()),
+            (
+                "AXON_LOG".to_owned(),
+                "info,axon_daemon=debug,axon_shm=debug,axon_transport=debug".to_owned(),
+            ),
             ("RUST_BACKTRACE".to_owned(), "1".to_owned()),
         ];
         env.extend(settings.into_iter().map(|(name, value)| (name.to_owned(), value)));

@@ -32,8 +32,8 @@ pub(crate) use wanted::Wanted;
 /// The UDP ports that daemons of `domain` take their QUIC port from, the first that is free.
 ///
 /// ```
-/// assert_eq!(axon_transport::discovery::quic_ports(0), 61300..=61315);
-/// assert_eq!(axon_transport::discovery::quic_ports(232), 65012..=65027);
+/// assert_eq!(axon_daemon::internal::quic_ports(0), 61300..=61315);
+/// assert_eq!(axon_daemon::internal::quic_ports(232), 65012..=65027);
 /// ```
 pub fn quic_ports(domain: u32) -> RangeInclusive<u16> {
     let first = 61_300 + 16 * (domain.min(232) as u16);
@@ -43,7 +43,7 @@ pub fn quic_ports(domain: u32) -> RangeInclusive<u16> {
 /// The multicast group and port that all daemons of `domain` share.
 ///
 /// ```
-/// let group = axon_transport::discovery::shared_group(7);
+/// let group = axon_daemon::internal::shared_group(7);
 /// assert_eq!(group, "239.255.88.8:61007".parse().unwrap());
 /// ```
 pub fn shared_group(domain: u32) -> SocketAddrV4 {

@@ -73,7 +73,7 @@ impl Terms {
     /// The first setting in which the two differ, the one that explains most first.
     ///
     /// ```
-    /// use axon_transport::wire::Terms;
+    /// use axon_daemon::internal::wire::Terms;
     ///
     /// let classic = Terms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(1) };
     /// let qkd = Terms { mode: 1, key_mode: 2, kex: 1, cipher: 0, auth: None };

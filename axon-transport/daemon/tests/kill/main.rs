@@ -7,7 +7,7 @@
 //! every instruction. One that copies thousands of bytes may be stopped after each of them: after a
 //! few hundred, a kill at its end stands for the rest. The bounded run kills around the states, all of
 //! them where they are few, and at instructions chosen at random; the full run
-//! (`cargo test --release -p axon-transport --test kill -- --full`) at every single instruction, or
+//! (`cargo test --release -p axon-daemon --test kill -- --full`) at every single instruction, or
 //! evenly over an operation of very many and around its states. A part of a name runs the cases that
 //! have it in theirs. `--steps=200000` is a full run that takes so many steps at about each operation,
 //! not 2,000,000: for a slow machine.

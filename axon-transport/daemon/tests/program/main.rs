@@ -5,7 +5,7 @@
 //! publisher waits for; which requests a server gets and which responses a client; and what a wait finds
 //! ready. Nodes and endpoints come and go, processes are killed, and so is the daemon.
 //!
-//! A bounded sample of them; more: `PROGRAMS=200 cargo test -p axon-transport --test program`. One that
+//! A bounded sample of them; more: `PROGRAMS=200 cargo test -p axon-daemon --test program`. One that
 //! failed says its seed, and `PROGRAM_SEED=...` repeats it alone.
 
 mod cast;

@@ -1,7 +1,7 @@
 //! What many processes of many endpoints take: what each holds of the others, where each reads from
 //! each ([`held`]), and how soon all know all when they start at once ([`startup`]).
 //!
-//! In the full size: `SIZING=50 cargo test --release -p axon-transport --test sizing -- --nocapture`
+//! In the full size: `SIZING=50 cargo test --release -p axon-daemon --test sizing -- --nocapture`
 #![expect(clippy::print_stdout, reason = "what it prints is its result")]
 
 mod held;

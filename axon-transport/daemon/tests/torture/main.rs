@@ -11,7 +11,7 @@
 //! There are two plans. `Brief`: eight processes, stopped for some tenths of a second, often. `Stops`:
 //! twelve, stopped for one to four seconds, while the daemon is killed.
 //!
-//! One round of some seconds of each by default. For longer, `cargo test --release -p axon-transport
+//! One round of some seconds of each by default. For longer, `cargo test --release -p axon-daemon
 //! --test torture -- --minutes 60`: rounds of half a minute, each of another seed, and a line of a table
 //! for each; `--stops` has them all be of the second plan, which otherwise alternate. `--seed N` begins
 //! with that one: the same disturbances again, though not the same moments.

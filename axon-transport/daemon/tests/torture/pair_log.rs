@@ -12,7 +12,7 @@ use tracing_subscriber::{EnvFilter, fmt::MakeWriter};
 /// Lines that are kept.
 const LINES: usize = 50_000;
 /// What of the library's log belongs to the log of pairs: pairs, and the daemons that come and go.
-const FILTER: &str = "axon_transport::pairs=debug,axon_transport::internal::session=debug";
+const FILTER: &str = "axon_transport::pairs=debug,axon_transport::session=debug";
 
 #[derive(Clone, Default)]
 pub(crate) struct PairLog(Arc<Mutex<VecDeque<String>>>);

@@ -2,7 +2,7 @@
 //! ordering in turn, in a process of its own, and expects the model that names it to fail. As they
 //! are, the models run with the other tests.
 //!
-//! `cargo test -p axon-transport --lib mutation`
+//! `cargo test -p axon-shm --lib mutation`
 
 use std::{
     env,

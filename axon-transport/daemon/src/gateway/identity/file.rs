@@ -2,12 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::files::Demands;
 use axon_tls::identity::TrustFile;
-use axon_transport::internal::files::Demands;
 use zeroize::Zeroizing;
 
+pub(super) use crate::files::Stamp;
 use crate::gateway::GatewayError;
-pub(super) use axon_transport::internal::files::Stamp;
 
 /// A file that a setting names.
 #[derive(Clone, Debug)]

@@ -369,7 +369,7 @@ fn best_effort_that_crosses_an_idle_link_slowly_arrives() {
     assert!(share > 0.9, "{share}");
 }
 
-/// `cargo test -p axon-transport --lib best_effort_figures -- --ignored --nocapture`
+/// `cargo test -p axon-daemon --lib best_effort_figures -- --ignored --nocapture`
 #[test]
 #[ignore = "figures: 512 KiB at 54 Mbit/s"]
 fn best_effort_figures() {

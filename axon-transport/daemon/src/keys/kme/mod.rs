@@ -14,10 +14,8 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_transport::{
-    config::QkdConfig,
-    internal::{files::Demands, secrets},
-};
+use crate::files::Demands;
+use axon_transport::{config::QkdConfig, internal::secrets};
 use etsi_qkd014::{Client, Quirks, RetryPolicy};
 use tokio::{
     sync::{Semaphore, mpsc},

@@ -16,7 +16,7 @@ const LARGEST_PEM: u64 = 4 << 20;
 
 /// What the settings demand of a file, and of what takes its place.
 #[derive(Clone, Copy, Debug)]
-pub struct Demands {
+pub(crate) struct Demands {
     largest: u64,
     secret: bool,
 }
@@ -24,7 +24,7 @@ pub struct Demands {
 /// What `stat` tells of a file, which differs when its content does: who preserves the time of
 /// writing cannot preserve that of the change.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Stamp {
+pub(crate) struct Stamp {
     place: (u64, u64),
     len: u64,
     written: (i64, i64),
@@ -34,12 +34,12 @@ pub struct Stamp {
 
 impl Demands {
     /// Of a file with a secret key: nobody but its owner may read it.
-    pub const KEY: Self = Self { largest: LARGEST_KEY, secret: true };
+    pub(crate) const KEY: Self = Self { largest: LARGEST_KEY, secret: true };
     /// Of a file with certificates.
-    pub const CERTIFICATES: Self = Self::public(LARGEST_PEM);
+    pub(crate) const CERTIFICATES: Self = Self::public(LARGEST_PEM);
 
     /// Rules for a file of trusted keys or certificates: it must not be world-writable.
-    pub const fn public(largest: u64) -> Self {
+    pub(crate) const fn public(largest: u64) -> Self {
         Self { largest, secret: false }
     }
 
@@ -47,7 +47,7 @@ impl Demands {
     ///
     /// # Errors
     /// Why it cannot be used, if that shows from outside.
-    pub fn stamp(&self, path: &Path) -> Result<Stamp, String> {
+    pub(crate) fn stamp(&self, path: &Path) -> Result<Stamp, String> {
         self.judge(&std::fs::metadata(path).map_err(|e| e.to_string())?)
     }
 
@@ -55,7 +55,7 @@ impl Demands {
     ///
     /// # Errors
     /// It is not what the settings demand of it, cannot be read, or is too large.
-    pub fn read(&self, path: &Path) -> Result<Zeroizing<Vec<u8>>, String> {
+    pub(crate) fn read(&self, path: &Path) -> Result<Zeroizing<Vec<u8>>, String> {
         let text = |e: std::io::Error| e.to_string();
         let mut file = open(path).map_err(text)?;
         let len = self.judge(&file.metadata().map_err(text)?)?.len;
