@@ -9,7 +9,6 @@ use std::{
 use axon_daemon::internal::wire::Terms;
 use axon_transport::config::{Config, FileFacts, FileKind, Files, Security};
 
-
 /// A file system in which every file exists and is `axon.toml`.
 struct OneFile<'a>(&'a [u8]);
 

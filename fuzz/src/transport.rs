@@ -1,9 +1,24 @@
 //! Discovery datagrams, frames between daemons, packets between a session and its daemon.
 
-use axon_transport::{graph::{Endpoint, EndpointKind}, ids::{DaemonId, Gid, SessionId}, internal::{session::relayed::flow::{Channel, Incoming, Pool, WINDOW}, wire::session::{CodecError, MAX_PACKET, self as session}}, qos::Qos};
+use axon_daemon::internal::{
+    keys::KeyMessage,
+    link::{self, FrameError},
+    wire::{
+        Terms,
+        beacon::{self, Beacon, Datagram},
+    },
+};
 use axon_envelope::{IndexMask, KeyId};
-use axon_daemon::internal::{keys::KeyMessage, link::{FrameError, self}, wire::{Terms, beacon::{Beacon, Datagram, self}}};
 use axon_shm::internal::{Location, reencode_packet};
+use axon_transport::{
+    graph::{Endpoint, EndpointKind},
+    ids::{DaemonId, Gid, SessionId},
+    internal::{
+        session::relayed::flow::{Channel, Incoming, Pool, WINDOW},
+        wire::session::{self as session, CodecError, MAX_PACKET},
+    },
+    qos::Qos,
+};
 
 const TERMS: Terms = Terms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(1) };
 

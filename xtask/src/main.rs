@@ -10,6 +10,7 @@ mod floors;
 mod install_c;
 mod package;
 mod picture;
+mod public_api;
 mod repeat;
 mod rustls_axon;
 
@@ -25,6 +26,7 @@ usage: cargo xtask COMMAND
                        make the packages of these crates, or of all that are published, from a copy
                        of the workspace in which rustls-axon has its patched source
   picture              draw docs/architecture.svg anew, from the manifests and the imports
+  public-api [--write] compare what the published crates show with their public-api.txt, or write these
   repeat TIMES [--busy N] [NAME ...]
                        run the test suite, or the test programs with such a name, TIMES times,
                        beside N busy threads, and list the tests that failed in any run
@@ -41,6 +43,9 @@ usage: cargo xtask COMMAND
                          --dry-run    change nothing";
 
 fn main() -> ExitCode {
+    if let Some(status) = public_api::rustdoc() {
+        return status;
+    }
     let args: Vec<String> = env::args().skip(1).collect();
     let args: Vec<&str> = args.iter().map(String::as_str).collect();
     let result = match args[..] {
@@ -52,6 +57,8 @@ fn main() -> ExitCode {
             None => return usage(),
         },
         ["picture"] => picture::draw(rustls_axon::workspace()),
+        ["public-api"] => public_api::check(rustls_axon::workspace(), false),
+        ["public-api", "--write"] => public_api::check(rustls_axon::workspace(), true),
         ["repeat", times, ref options @ ..] => match repeat_options(times, options) {
             Some(options) => repeat::repeat(&options),
             None => return usage(),

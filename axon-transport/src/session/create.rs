@@ -2,7 +2,7 @@
 
 use super::{
     Client, EndpointSpec, GuardCondition, Node, Publisher, Server, Session, SessionError,
-    Subscription, state::Outgoing, subscription::SubscriptionInner,
+    Subscription, subscription::SubscriptionInner,
 };
 use crate::{
     graph::{Endpoint, EndpointKind},
@@ -102,40 +102,6 @@ impl Session {
         GuardCondition::new(self.shared())
     }
 
-    /// A subscription as another process of the session describes it, under its GID there. Where it
-    /// keeps all, what it takes is acknowledged when it [says so](Subscription::acknowledge_of).
-    pub fn adopt_subscription(&self, endpoint: Endpoint) -> Subscription {
-        let mut inner = SubscriptionInner::new(endpoint, EndpointRole::Application, Vec::new());
-        inner.carries = inner.keeps_all();
-        self.add_reader(inner)
-    }
-
-    /// As [`adopt_subscription`](Self::adopt_subscription), a node.
-    pub fn adopt_node(&self, endpoint: Endpoint) -> Node {
-        let gid = endpoint.gid;
-        let changed = self.create_guard_condition();
-        {
-            let mut state = self.shared().state();
-            state.nodes.insert(gid, (endpoint.clone(), changed.clone()));
-            state.show(&endpoint);
-        }
-        self.shared().tell(Outgoing::Announce(gid));
-        Node::new(endpoint, changed, self.clone())
-    }
-
-    /// A local reader that carries samples to subscriptions on another host, `stands_for`. For the
-    /// gateway alone; a daemon refuses it from anybody else.
-    ///
-    /// # Errors
-    /// When the specification is out of bounds.
-    pub fn create_relay(
-        &self,
-        spec: EndpointSpec,
-        stands_for: Vec<Gid>,
-    ) -> Result<Subscription, SessionError> {
-        self.add_relay(spec, None, stands_for, false)
-    }
-
     /// As [`create_relay`](Self::create_relay), of one publisher alone. Where the publisher `waits` for
     /// it, what it takes is acknowledged when it [says so](Subscription::acknowledge_of), whether or not
     /// there is somebody for whom it stands.
@@ -149,7 +115,7 @@ impl Session {
         self.add_relay(spec, Some(publisher), stands_for, waits)
     }
 
-    fn add_relay(
+    pub(super) fn add_relay(
         &self,
         spec: EndpointSpec,
         only: Option<Gid>,

@@ -14,6 +14,7 @@ pub mod daemon;
 mod error;
 mod events;
 mod guard;
+mod hidden;
 pub(crate) mod local;
 pub mod merge;
 mod node;
@@ -33,14 +34,12 @@ mod tests;
 mod waiting;
 
 use std::{
-    collections::BTreeMap,
     sync::{Arc, PoisonError},
     thread::JoinHandle,
     time::Duration,
 };
 
 pub use crate::wire::session::SessionRole;
-use axon_shm::internal::SessionSegment;
 pub use callback::OnNew;
 pub use daemon::{daemon_status, daemon_status_at};
 pub use error::SessionError;
@@ -60,7 +59,7 @@ pub use waiting::{Ready, Waitable};
 use crate::{
     config::DaemonPolicy,
     graph::GraphView,
-    ids::{DaemonId, Gid, SessionId},
+    ids::{DaemonId, SessionId},
     session::relayed::near::Near,
 };
 
@@ -133,16 +132,6 @@ impl Session {
     /// Returns its last value.
     pub fn wait(&self, ready: impl FnMut() -> bool, timeout: Option<Duration>) -> bool {
         self.shared().segment.wait(ready, timeout)
-    }
-
-    /// The session's segment, for waiting in other ways.
-    pub fn segment(&self) -> &Arc<SessionSegment> {
-        &self.shared().segment
-    }
-
-    /// Its endpoints that the daemon does not take, and why.
-    pub fn refused(&self) -> BTreeMap<Gid, String> {
-        self.shared().state().refused.clone()
     }
 
     /// Has `listener` called on the control thread for every event. It must not block, and must

@@ -1,9 +1,6 @@
 //! How a session begins and ends: with a daemon, with none, or relayed by one.
 
-use std::{
-    os::fd::OwnedFd,
-    sync::{Arc, Once},
-};
+use std::sync::{Arc, Once};
 
 use axon_shm::internal::{BlockedSignals, SessionSegment};
 
@@ -81,33 +78,7 @@ impl Session {
         Ok(Self::of(handle))
     }
 
-    /// A session over a socket that is connected to a daemon. It ends with that connection.
-    ///
-    /// # Errors
-    /// When the daemon refuses it.
-    pub fn over(
-        socket: OwnedFd,
-        config: &Config,
-        options: SessionOptions,
-    ) -> Result<Self, SessionError> {
-        Self::over_as(SessionId::random(), socket, config, options)
-    }
-
-    /// As [`over`](Self::over), under a given id: for the daemon, in whose memory the endpoints of a
-    /// relayed session are.
-    pub fn over_as(
-        id: SessionId,
-        socket: OwnedFd,
-        config: &Config,
-        options: SessionOptions,
-    ) -> Result<Self, SessionError> {
-        let segment = SessionSegment::create(id)?;
-        let caller = Caller { segment: Some(&segment), ..Caller::new(config, &options, id) };
-        let connected = caller.greet_over(socket)?;
-        Ok(Self::of(Self::start(config, options, segment, Start::Socket(connected))?))
-    }
-
-    fn start(
+    pub(super) fn start(
         config: &Config,
         options: SessionOptions,
         segment: Arc<SessionSegment>,
@@ -128,7 +99,7 @@ impl Session {
         Ok(Handle { shared, thread: Some(thread), relay: None })
     }
 
-    fn of(handle: Handle) -> Self {
+    pub(super) fn of(handle: Handle) -> Self {
         Self { handle: Arc::new(handle) }
     }
 }

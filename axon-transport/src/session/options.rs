@@ -26,20 +26,6 @@ impl SessionOptions {
         Self { name, role, daemon_command: None, callers: usize::MAX, key: None }
     }
 
-    /// Another kind of session.
-    #[must_use]
-    pub fn role(mut self, role: SessionRole) -> Self {
-        self.role = role;
-        self
-    }
-
-    /// How many clients its servers may have, each counted once for each of them.
-    #[must_use]
-    pub fn callers(mut self, most: usize) -> Self {
-        self.callers = most;
-        self
-    }
-
     /// How to start a daemon, for a program that can be one itself. `AXON_DAEMON_PATH` wins.
     #[must_use]
     pub fn daemon_command(mut self, command: DaemonCommand) -> Self {

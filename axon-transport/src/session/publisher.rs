@@ -9,7 +9,7 @@ use std::{
 };
 
 use axon_shm::{
-    Meta, PublishError, ShmError,
+    PublishError, ShmError,
     internal::{Grant, Location, ReaderInfo, Terms, Writer},
 };
 
@@ -61,22 +61,6 @@ impl Publisher {
     /// As for [`publish`](Self::publish).
     pub fn publish_at(&self, source_timestamp: i64, payload: &[u8]) -> Result<u64, PublishError> {
         self.inner.published(self.writer.publish_next(source_timestamp, payload))
-    }
-
-    /// Publishes for a remote publisher, whose number and time the sample keeps.
-    ///
-    /// # Errors
-    /// As for [`publish`](Self::publish).
-    pub fn publish_with(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
-        self.inner.published(self.writer.publish(meta, payload)).map(drop)
-    }
-
-    /// As [`publish_with`](Self::publish_with), but never waits for room.
-    ///
-    /// # Errors
-    /// [`PublishError::Blocked`] at once when there is none.
-    pub fn try_publish_with(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
-        self.inner.published(self.writer.try_publish(meta, payload)).map(drop)
     }
 
     /// If a sample would be read by nobody, now or later, uses up the next sequence number and
@@ -396,7 +380,7 @@ impl PublisherInner {
     }
 
     /// Notes what was published, where somebody watches the time.
-    fn published<T>(&self, result: Result<T, PublishError>) -> Result<T, PublishError> {
+    pub(super) fn published<T>(&self, result: Result<T, PublishError>) -> Result<T, PublishError> {
         let deadline = self.endpoint.qos.deadline.is_some();
         if result.is_ok()
             && (deadline || self.asserts)

@@ -17,7 +17,7 @@ use super::{
     MessageInfo, OnNew, Session, SessionError, clock,
     publisher::PublisherInner,
     rings::RingsByClient,
-    subscription::{SubscriptionInner, recv_from, take_from, take_of, take_sample_from},
+    subscription::{SubscriptionInner, recv_from, take_from, take_sample_from},
 };
 use crate::{graph::Endpoint, ids::Gid};
 
@@ -147,25 +147,6 @@ impl Server {
     /// For a relay: the next request of one client.
     pub(crate) fn take_request_from(&self, client: &Gid) -> Option<Sample> {
         take_from_one(&self.requests, &self.session, client)
-    }
-
-    /// As [`take_request_from`](Self::take_request_from), as bytes.
-    pub fn take_request_of(&self, client: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
-        take_of(&self.requests, &self.session, client)
-    }
-
-    /// The clients of which there is a request to be taken.
-    pub fn with_requests(&self) -> Vec<Gid> {
-        if self.session.is_forked() {
-            Vec::new()
-        } else {
-            self.requests.lock().with_data().collect()
-        }
-    }
-
-    /// Whether it reads what this client asks or asked, or may do so soon.
-    pub fn reads(&self, client: &Gid) -> bool {
-        !self.session.is_forked() && self.requests.lock().reads(client)
     }
 
     /// Whether there is a request of this client to be taken.

@@ -41,7 +41,7 @@ pub(in crate::session) struct SubscriptionInner {
     pub(in crate::session) rising: bool,
     pub(in crate::session) role: EndpointRole,
     pub(in crate::session) events: EndpointEvents,
-    pub(super) stands_for: Mutex<Vec<Gid>>,
+    stands_for: Mutex<Vec<Gid>>,
     slots: Mutex<Slots>,
     arrived: Callback,
     /// Whether the control thread listens for it.
@@ -211,6 +211,10 @@ impl SubscriptionInner {
         lock(&self.slots)
     }
 
+    pub(in crate::session) fn set_stands_for(&self, gids: Vec<Gid>) {
+        *lock(&self.stands_for) = gids;
+    }
+
     pub(in crate::session) fn stands_for(&self) -> Vec<Gid> {
         lock(&self.stands_for).clone()
     }
@@ -226,6 +230,6 @@ impl Look for SubscriptionInner {
     }
 }
 
-pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+pub(in crate::session) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -5,7 +5,6 @@ mod slots;
 mod taking;
 
 use std::{
-    collections::HashMap,
     fmt,
     sync::Arc,
     time::{Duration, Instant},
@@ -16,11 +15,11 @@ use axon_shm::{
     internal::{Look, Reader},
 };
 
+use self::slots::Slots;
 pub(super) use self::{
     inner::SubscriptionInner,
     slots::{Accept, Asking, Numbers},
 };
-use self::{inner::lock, slots::Slots};
 use super::{
     OnNew, Session, SessionError, clock,
     events::{Event, Source},
@@ -31,7 +30,7 @@ use crate::{
     graph::Endpoint,
     ids::Gid,
     qos::Durability,
-    wire::session::{GivenUp, Message, Pair},
+    wire::session::{Message, Pair},
 };
 
 /// Receives the samples of a topic. Thread-safe.
@@ -179,25 +178,6 @@ impl Subscription {
         if self.session.is_forked() { 0 } else { self.inner.lock().received }
     }
 
-    /// For a relay: the publishers of whom something may come. Those who have ended, but for what is
-    /// on its way, do not count any more.
-    pub fn attached(&self) -> Vec<Gid> {
-        let mut gids = self.matched();
-        if !self.session.is_forked() {
-            gids.extend(self.inner.lock().leaving());
-        }
-        gids
-    }
-
-    /// For a relay: the next sample of one publisher, and how many of that publisher's this
-    /// subscription has lost by then.
-    pub fn take_from(&self, writer: &Gid) -> Option<(Sample, u64)> {
-        if self.session.is_forked() {
-            return None;
-        }
-        self.inner.lock().take_from(writer, &self.inner)
-    }
-
     /// For a relay: what was taken and not acknowledged is to be taken once more; where its publisher
     /// keeps a history, all of that.
     pub(crate) fn take_back(&self) {
@@ -205,73 +185,6 @@ impl Subscription {
             let history = self.inner.qos.durability == Durability::TransientLocal;
             self.inner.lock().take_back(history);
         }
-    }
-
-    /// For a relay: samples of this publisher up to this number are where they are to go. Until then
-    /// nobody takes them as acknowledged.
-    pub fn acknowledge_of(&self, writer: &Gid, sequence: u64) {
-        if !self.session.is_forked() {
-            self.inner.lock().finish_of(writer, sequence);
-        }
-    }
-
-    /// For a relay: samples that are not acknowledged, those that were not taken among them, by
-    /// publisher.
-    pub fn unacknowledged(&self) -> HashMap<Gid, u64> {
-        if self.session.is_forked() { HashMap::new() } else { self.inner.lock().undone() }
-    }
-
-    /// For a relay: so many samples of this publisher do not get where they are to go. It is told.
-    pub fn give_up(&self, writer: Gid, samples: u64) {
-        if self.session.is_forked() {
-            return;
-        }
-        // The publisher sees it before it sees that they are acknowledged. Its process is told besides: it
-        // may be of an older version, and the publisher may wait for acknowledgements.
-        self.inner.lock().give_up_of(&writer, samples);
-        let given_up = GivenUp { reader: self.gid(), writer, samples };
-        self.session.shared().tell(Outgoing::Message(Box::new(Message::GivenUp(given_up))));
-    }
-
-    /// For a relay: the next sample of one publisher, as bytes.
-    pub fn take_of(&self, writer: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
-        take_of(&self.inner, &self.session, writer)
-    }
-
-    /// The publishers of which there is something to take.
-    pub fn with_data(&self) -> Vec<Gid> {
-        if self.session.is_forked() { Vec::new() } else { self.inner.lock().with_data().collect() }
-    }
-
-    /// Whether it reads what this publisher writes or wrote, or may do so soon.
-    pub fn reads(&self, writer: &Gid) -> bool {
-        !self.session.is_forked() && self.inner.lock().reads(writer)
-    }
-
-    /// Whether there is something to take of this publisher.
-    pub fn has_from(&self, writer: &Gid) -> bool {
-        !self.session.is_forked() && self.inner.lock().has_from(writer)
-    }
-
-    /// The publishers that have a lease, and when each was last alive, by the monotonic clock.
-    pub fn assertions(&self) -> Vec<(Gid, u64)> {
-        if self.session.is_forked() {
-            return Vec::new();
-        }
-        let slots = self.inner.lock();
-        let there = slots.slots.iter().filter(|slot| !slot.over);
-        let times = there.map(|slot| (slot.reader.writer(), slot.reader.times()));
-        let leased = times.filter(|(_, times)| times.lease.is_some());
-        leased.filter_map(|(gid, times)| Some((gid, times.asserted?))).collect()
-    }
-
-    /// For a relay: the remote subscriptions that it stands for from now on.
-    pub fn set_stands_for(&self, gids: Vec<Gid>) {
-        if self.session.is_forked() {
-            return;
-        }
-        *lock(&self.inner.stands_for) = gids;
-        self.session.renew(self.gid());
     }
 }
 

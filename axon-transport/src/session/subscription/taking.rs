@@ -66,6 +66,14 @@ impl Slots {
         None
     }
 
+    /// The publishers that have a lease, and when each was last alive, by the monotonic clock.
+    pub(in crate::session) fn assertions(&self) -> Vec<(Gid, u64)> {
+        let there = self.slots.iter().filter(|slot| !slot.over);
+        let times = there.map(|slot| (slot.reader.writer(), slot.reader.times()));
+        let leased = times.filter(|(_, times)| times.lease.is_some());
+        leased.filter_map(|(gid, times)| Some((gid, times.asserted?))).collect()
+    }
+
     /// The writers of which there is something to take.
     pub(in crate::session) fn with_data(&self) -> impl Iterator<Item = Gid> {
         let some = self.slots.iter().filter(|slot| slot.reader.has_data());

@@ -1,0 +1,241 @@
+//! Methods of an application's types that only the daemon, its relays and stand-ins, and this crate call. They
+//! are hidden in the documentation, are no part of the interface, and change with any release.
+
+use std::{
+    collections::{BTreeMap, HashMap},
+    os::fd::OwnedFd,
+    sync::Arc,
+};
+
+use axon_shm::{Meta, PublishError, Sample, internal::SessionSegment};
+
+use super::{
+    EndpointSpec, MessageInfo, Node, Publisher, Server, Session, SessionError, SessionOptions,
+    Subscription,
+    daemon::connect::Caller,
+    daemon::control::Start,
+    state::Outgoing,
+    subscription::{SubscriptionInner, take_of},
+};
+use crate::{
+    config::Config,
+    graph::Endpoint,
+    ids::{Gid, SessionId},
+    wire::session::{EndpointRole, GivenUp, Message, SessionRole},
+};
+
+#[doc(hidden)]
+impl Session {
+    /// A session over a socket that is connected to a daemon. It ends with that connection.
+    ///
+    /// # Errors
+    /// When the daemon refuses it.
+    pub fn over(
+        socket: OwnedFd,
+        config: &Config,
+        options: SessionOptions,
+    ) -> Result<Self, SessionError> {
+        Self::over_as(SessionId::random(), socket, config, options)
+    }
+
+    /// As [`over`](Self::over), under a given id: for the daemon, in whose memory the endpoints of a
+    /// relayed session are.
+    pub fn over_as(
+        id: SessionId,
+        socket: OwnedFd,
+        config: &Config,
+        options: SessionOptions,
+    ) -> Result<Self, SessionError> {
+        let segment = SessionSegment::create(id)?;
+        let caller = Caller { segment: Some(&segment), ..Caller::new(config, &options, id) };
+        let connected = caller.greet_over(socket)?;
+        Ok(Self::of(Self::start(config, options, segment, Start::Socket(connected))?))
+    }
+
+    /// A subscription as another process of the session describes it, under its GID there. Where it
+    /// keeps all, what it takes is acknowledged when it [says so](Subscription::acknowledge_of).
+    pub fn adopt_subscription(&self, endpoint: Endpoint) -> Subscription {
+        let mut inner = SubscriptionInner::new(endpoint, EndpointRole::Application, Vec::new());
+        inner.carries = inner.keeps_all();
+        self.add_reader(inner)
+    }
+
+    /// As [`adopt_subscription`](Self::adopt_subscription), a node.
+    pub fn adopt_node(&self, endpoint: Endpoint) -> Node {
+        let gid = endpoint.gid;
+        let changed = self.create_guard_condition();
+        {
+            let mut state = self.shared().state();
+            state.nodes.insert(gid, (endpoint.clone(), changed.clone()));
+            state.show(&endpoint);
+        }
+        self.shared().tell(Outgoing::Announce(gid));
+        Node::new(endpoint, changed, self.clone())
+    }
+
+    /// A local reader that carries samples to subscriptions on another host, `stands_for`. For the
+    /// gateway alone; a daemon refuses it from anybody else.
+    ///
+    /// # Errors
+    /// When the specification is out of bounds.
+    pub fn create_relay(
+        &self,
+        spec: EndpointSpec,
+        stands_for: Vec<Gid>,
+    ) -> Result<Subscription, SessionError> {
+        self.add_relay(spec, None, stands_for, false)
+    }
+
+    /// The session's segment, for waiting in other ways.
+    pub fn segment(&self) -> &Arc<SessionSegment> {
+        &self.shared().segment
+    }
+
+    /// Its endpoints that the daemon does not take, and why.
+    pub fn refused(&self) -> BTreeMap<Gid, String> {
+        self.shared().state().refused.clone()
+    }
+}
+
+#[doc(hidden)]
+impl SessionOptions {
+    /// Another kind of session.
+    #[must_use]
+    pub fn role(mut self, role: SessionRole) -> Self {
+        self.role = role;
+        self
+    }
+
+    /// How many clients its servers may have, each counted once for each of them.
+    #[must_use]
+    pub fn callers(mut self, most: usize) -> Self {
+        self.callers = most;
+        self
+    }
+}
+
+#[doc(hidden)]
+impl Publisher {
+    /// Publishes for a remote publisher, whose number and time the sample keeps.
+    ///
+    /// # Errors
+    /// As for [`publish`](Self::publish).
+    pub fn publish_with(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
+        self.inner.published(self.writer.publish(meta, payload)).map(drop)
+    }
+
+    /// As [`publish_with`](Self::publish_with), but never waits for room.
+    ///
+    /// # Errors
+    /// [`PublishError::Blocked`] at once when there is none.
+    pub fn try_publish_with(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
+        self.inner.published(self.writer.try_publish(meta, payload)).map(drop)
+    }
+}
+
+#[doc(hidden)]
+impl Subscription {
+    /// For a relay: the publishers of whom something may come. Those who have ended, but for what is
+    /// on its way, do not count any more.
+    pub fn attached(&self) -> Vec<Gid> {
+        let mut gids = self.matched();
+        if !self.session.is_forked() {
+            gids.extend(self.inner.lock().leaving());
+        }
+        gids
+    }
+
+    /// For a relay: the next sample of one publisher, and how many of that publisher's this
+    /// subscription has lost by then.
+    pub fn take_from(&self, writer: &Gid) -> Option<(Sample, u64)> {
+        if self.session.is_forked() {
+            return None;
+        }
+        self.inner.lock().take_from(writer, &self.inner)
+    }
+
+    /// For a relay: samples of this publisher up to this number are where they are to go. Until then
+    /// nobody takes them as acknowledged.
+    pub fn acknowledge_of(&self, writer: &Gid, sequence: u64) {
+        if !self.session.is_forked() {
+            self.inner.lock().finish_of(writer, sequence);
+        }
+    }
+
+    /// For a relay: samples that are not acknowledged, those that were not taken among them, by
+    /// publisher.
+    pub fn unacknowledged(&self) -> HashMap<Gid, u64> {
+        if self.session.is_forked() { HashMap::new() } else { self.inner.lock().undone() }
+    }
+
+    /// For a relay: so many samples of this publisher do not get where they are to go. It is told.
+    pub fn give_up(&self, writer: Gid, samples: u64) {
+        if self.session.is_forked() {
+            return;
+        }
+        // The publisher sees it before it sees that they are acknowledged. Its process is told besides: it
+        // may be of an older version, and the publisher may wait for acknowledgements.
+        self.inner.lock().give_up_of(&writer, samples);
+        let given_up = GivenUp { reader: self.gid(), writer, samples };
+        self.session.shared().tell(Outgoing::Message(Box::new(Message::GivenUp(given_up))));
+    }
+
+    /// For a relay: the next sample of one publisher, as bytes.
+    pub fn take_of(&self, writer: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
+        take_of(&self.inner, &self.session, writer)
+    }
+
+    /// The publishers of which there is something to take.
+    pub fn with_data(&self) -> Vec<Gid> {
+        if self.session.is_forked() { Vec::new() } else { self.inner.lock().with_data().collect() }
+    }
+
+    /// Whether it reads what this publisher writes or wrote, or may do so soon.
+    pub fn reads(&self, writer: &Gid) -> bool {
+        !self.session.is_forked() && self.inner.lock().reads(writer)
+    }
+
+    /// Whether there is something to take of this publisher.
+    pub fn has_from(&self, writer: &Gid) -> bool {
+        !self.session.is_forked() && self.inner.lock().has_from(writer)
+    }
+
+    /// The publishers that have a lease, and when each was last alive, by the monotonic clock.
+    pub fn assertions(&self) -> Vec<(Gid, u64)> {
+        if self.session.is_forked() {
+            return Vec::new();
+        }
+        self.inner.lock().assertions()
+    }
+
+    /// For a relay: the remote subscriptions that it stands for from now on.
+    pub fn set_stands_for(&self, gids: Vec<Gid>) {
+        if self.session.is_forked() {
+            return;
+        }
+        self.inner.set_stands_for(gids);
+        self.session.renew(self.gid());
+    }
+}
+
+#[doc(hidden)]
+impl Server {
+    /// As [`take_request_from`](Self::take_request_from), as bytes.
+    pub fn take_request_of(&self, client: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
+        take_of(&self.requests, &self.session, client)
+    }
+
+    /// The clients of which there is a request to be taken.
+    pub fn with_requests(&self) -> Vec<Gid> {
+        if self.session.is_forked() {
+            Vec::new()
+        } else {
+            self.requests.lock().with_data().collect()
+        }
+    }
+
+    /// Whether it reads what this client asks or asked, or may do so soon.
+    pub fn reads(&self, client: &Gid) -> bool {
+        !self.session.is_forked() && self.requests.lock().reads(client)
+    }
+}
