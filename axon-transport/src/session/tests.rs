@@ -19,7 +19,7 @@ use axon_shm::{
     Meta,
     internal::{
         Grant, Location, Peer, PeerDescriptors, PeerSession, Purpose, ReaderInfo, RingOptions,
-        SegmentInfo, SegmentKind, Terms, Writer,
+        SegmentInfo, SegmentKind, SessionSegment, Terms, Writer,
     },
 };
 use rustix::{
