@@ -3,7 +3,7 @@
 
 pub mod config;
 pub mod events;
-pub mod ffi;
+mod ffi;
 pub mod graph;
 mod log_limit;
 mod registry;
@@ -20,7 +20,7 @@ pub use axon_shm::{ids, qos};
 pub use session::{
     Client, DaemonCommand, EndpointSpec, Event, GuardCondition, Lifetime, Loan, MessageInfo, Node,
     OnNew, Publisher, Ready, Server, Session, SessionError, SessionEvent, SessionOptions,
-    SessionRole, Subscription, Waitable, daemon_status, daemon_status_at,
+    Subscription, Waitable, daemon_status, daemon_status_at,
 };
 
 /// What the other crates of AXON and its tests use of this one. It is not part of its interface, and changes
@@ -29,6 +29,10 @@ pub use session::{
 pub mod internal {
     pub use crate::session_key::{OWNER, SessionKey, session_id};
 
+    /// What `include/axon.h` declares, for crates that make libraries of it.
+    pub mod ffi {
+        pub use crate::ffi::*;
+    }
     /// Leases of publishers.
     pub mod events {
         pub use crate::events::alive::Alive;

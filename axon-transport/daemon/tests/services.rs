@@ -35,7 +35,7 @@ fn keeping(depth: Option<u32>) -> EndpointSpec {
         Some(depth) => Qos { history: History::KeepLast, depth, ..Qos::default() },
         None => Qos::keep_all(),
     };
-    EndpointSpec { qos, ..spec() }
+    spec().qos(qos)
 }
 
 /// Who asked, and under what number, of all that waits.
@@ -194,7 +194,7 @@ fn a_response_to_nobody_is_no_error() {
 #[test]
 fn profiles_that_go_together_one_way_only_make_no_service() {
     let session = alone();
-    let weak = EndpointSpec { qos: Qos::sensor_data(), ..spec() };
+    let weak = spec().qos(Qos::sensor_data());
     let client = session.create_client(weak.clone()).unwrap();
     let server = session.create_server(spec()).unwrap();
     thread::sleep(Duration::from_millis(50));

@@ -210,7 +210,7 @@ fn a_waiting_reader_is_woken_by_a_sample() {
 fn loans_that_are_expected_are_in_place_from_513_bytes_on() {
     let session = alone();
     for (expected_len, shortest) in [(0, 4097), (512, 4097), (513, 513), (1 << 20, 513)] {
-        let spec = EndpointSpec { expected_len, ..spec(Qos::default()) };
+        let spec = spec(Qos::default()).expected_len(expected_len);
         let publisher = session.create_publisher(spec.clone()).unwrap();
         let subscription = session.create_subscription(spec).unwrap();
         assert!(subscription.wait_matched(1, PATIENCE));

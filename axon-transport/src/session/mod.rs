@@ -39,7 +39,6 @@ use std::{
     time::Duration,
 };
 
-pub use crate::wire::session::SessionRole;
 pub use callback::OnNew;
 pub use daemon::{daemon_status, daemon_status_at};
 pub use error::SessionError;

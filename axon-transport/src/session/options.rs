@@ -60,7 +60,17 @@ impl DaemonCommand {
 }
 
 /// What an endpoint is.
+///
+/// ```
+/// use axon_transport::{EndpointSpec, qos::Qos};
+///
+/// let scan = EndpointSpec::new("/scan", "sensor_msgs/msg/LaserScan", Qos::sensor_data())
+///     .node("lidar", "/front")
+///     .ignore_local(true);
+/// assert_eq!((&*scan.node, scan.ignore_local), ("lidar", true));
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct EndpointSpec {
     /// The full topic name.
     pub topic: String,
@@ -94,5 +104,54 @@ impl EndpointSpec {
             ignore_local: false,
             expected_len: 0,
         }
+    }
+
+    /// Of another topic.
+    #[must_use]
+    pub fn topic(mut self, topic: impl Into<String>) -> Self {
+        self.topic = topic.into();
+        self
+    }
+
+    /// Of another type.
+    #[must_use]
+    pub fn type_name(mut self, type_name: impl Into<String>) -> Self {
+        self.type_name = type_name.into();
+        self
+    }
+
+    /// Of a type with this hash.
+    #[must_use]
+    pub fn type_hash(mut self, hash: impl Into<Vec<u8>>) -> Self {
+        self.type_hash = hash.into();
+        self
+    }
+
+    /// Offers or requests this.
+    #[must_use]
+    pub fn qos(mut self, qos: Qos) -> Self {
+        self.qos = qos;
+        self
+    }
+
+    /// Of this node.
+    #[must_use]
+    pub fn node(mut self, name: impl Into<String>, namespace: impl Into<String>) -> Self {
+        (self.node, self.namespace) = (name.into(), namespace.into());
+        self
+    }
+
+    /// A subscription: whether it receives nothing from publishers of its own session.
+    #[must_use]
+    pub fn ignore_local(mut self, whether: bool) -> Self {
+        self.ignore_local = whether;
+        self
+    }
+
+    /// A publisher: the length of most samples in bytes.
+    #[must_use]
+    pub fn expected_len(mut self, len: u64) -> Self {
+        self.expected_len = len;
+        self
     }
 }

@@ -1,3 +1,3 @@
 //! What `include/axon.h` declares, as a static library.
 
-pub use axon_transport::ffi::*;
+pub use axon_transport::internal::ffi::*;

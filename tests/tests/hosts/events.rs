@@ -132,9 +132,8 @@ fn each_policy_that_falls_short_is_reported_on_both_hosts() {
 fn another_type_is_reported_on_both_hosts() {
     let [a, b] = hosts();
     let (here, there) = (a.session("publisher"), b.session("subscription"));
-    let spec = |type_name: &str, hash: u8| EndpointSpec {
-        type_hash: vec![hash; 32],
-        ..EndpointSpec::new("/typed", type_name, Qos::default())
+    let spec = |type_name: &str, hash: u8| {
+        EndpointSpec::new("/typed", type_name, Qos::default()).type_hash(vec![hash; 32])
     };
     let publisher = here.create_publisher(spec("test/Bytes", 1)).unwrap();
     let offers = publisher.event(EventKind::PublisherIncompatibleType).unwrap();

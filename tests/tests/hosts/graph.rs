@@ -104,9 +104,8 @@ fn every_field_of_what_is_on_one_host_is_in_the_others_graph_for_as_long_as_it_i
 
     let all = Qos { history: History::KeepAll, depth: 3, ..odd() };
     let few = Qos { depth: 4, ..Qos::default() };
-    let spec = |topic: &str, hash: u8, qos| EndpointSpec {
-        type_hash: vec![hash; 32],
-        ..EndpointSpec::new(topic, format!("test/Of{hash}"), qos)
+    let spec = |topic: &str, hash: u8, qos| {
+        EndpointSpec::new(topic, format!("test/Of{hash}"), qos).type_hash(vec![hash; 32])
     };
     let of = |node: &Node, gid, kind, topic: &str, hash: u8, qos| Endpoint {
         gid,

@@ -82,7 +82,7 @@ impl Medium for Sessions {
         let expected_len = load.size as u64;
         let spec = |way| {
             let spec = spec(&format!("{name}/{way}"), qos(load.window)?);
-            Ok::<_, Error>(EndpointSpec { expected_len, ..spec })
+            Ok::<_, Error>(spec.expected_len(expected_len))
         };
         let subscription = session.create_subscription(spec(back)?)?;
         let publisher = session.create_publisher(spec(out)?)?;

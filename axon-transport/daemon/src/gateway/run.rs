@@ -6,7 +6,7 @@ use std::{
     time::Duration,
 };
 
-use axon_transport::{Session, SessionEvent, SessionOptions, SessionRole};
+use axon_transport::{Session, SessionEvent, SessionOptions, internal::wire::session::SessionRole};
 use tokio::sync::mpsc;
 
 use super::{

@@ -37,8 +37,8 @@ fn scene(kind: EventKind, pair: &Pair) -> Scene<'_> {
     let (here, there) = (&pair.here, &pair.there);
     let (offered, requested) = (less()[0].1, less()[0].2);
     // Those of before may not have gone everywhere.
-    let spec = |qos| EndpointSpec { topic: format!("/{kind:?}"), ..spec(qos) };
-    let other = |qos| EndpointSpec { type_name: "U".into(), ..spec(qos) };
+    let spec = |qos| spec(qos).topic(format!("/{kind:?}"));
+    let other = |qos| spec(qos).type_name("U");
     let plain = Qos::default;
     // Publishers and subscriptions that come one after another, and stay. Within a session, the one that
     // comes is the last to be told.

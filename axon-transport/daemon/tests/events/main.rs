@@ -163,7 +163,7 @@ fn incompatible_profiles_are_reported_at_both_ends_with_the_policy() {
     for pair in Pair::all() {
         for (policy, offered, requested) in less() {
             // Those before may not have gone everywhere.
-            let spec = |qos| EndpointSpec { topic: format!("/{policy}"), ..spec(qos) };
+            let spec = |qos| spec(qos).topic(format!("/{policy}"));
             let publisher = pair.here.create_publisher(spec(offered)).unwrap();
             let offers = of_publisher(&publisher, EventKind::OfferedQosIncompatible);
             for total in 1..=2 {
@@ -186,7 +186,7 @@ fn incompatible_profiles_are_reported_at_both_ends_with_the_policy() {
 #[test]
 fn another_type_under_the_same_name_is_reported_at_both_ends() {
     for pair in Pair::all() {
-        let hashed = |hash: &[u8]| EndpointSpec { type_hash: hash.into(), ..spec(Qos::default()) };
+        let hashed = |hash: &[u8]| spec(Qos::default()).type_hash(hash);
         let publisher = pair.here.create_publisher(hashed(&[1; 32])).unwrap();
         let named = EndpointSpec::new("/t", "U", Qos::default());
         for (total, spec) in [(1, hashed(&[2; 32])), (2, named)] {

@@ -149,10 +149,7 @@ proptest! {
         let mut living: Vec<Living> = Vec::new();
         let mut model: BTreeMap<Gid, Expected> = BTreeMap::new();
         for step in steps {
-            let spec = |typed: &Typed| EndpointSpec {
-                type_hash: typed.hash.clone(),
-                ..EndpointSpec::new("/t", typed.type_name, typed.profile.qos())
-            };
+            let spec = |typed: &Typed| EndpointSpec::new("/t", typed.type_name, typed.profile.qos()).type_hash(typed.hash.clone());
             let new = match &step {
                 Step::Publisher(typed) => Living {
                     ends: Ends::Publisher(session.create_publisher(spec(typed)).unwrap()),

@@ -96,7 +96,7 @@ impl Cast {
             return gid;
         }
         let qos = profile.qos();
-        let spec = EndpointSpec { type_hash: hash, ..EndpointSpec::new(topic, type_name, qos) };
+        let spec = EndpointSpec::new(topic, type_name, qos).type_hash(hash);
         // A node's endpoints have its name whatever they are told.
         let (session, node) = (&self.session, by.map(|by| &self.nodes[&by]));
         macro_rules! make {

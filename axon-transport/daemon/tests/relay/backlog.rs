@@ -26,8 +26,8 @@ fn who_keeps_the_newest_only_gets_them_and_holds_nobody_back() {
     const MANY: u64 = 500;
     let newest = Qos { depth: 3, ..Qos::default() };
     with_both_ends(|here, there| {
-        let server = here.create_server(EndpointSpec { qos: newest, ..service() }).unwrap();
-        let client = there.create_client(EndpointSpec { qos: newest, ..service() }).unwrap();
+        let server = here.create_server(service().qos(newest)).unwrap();
+        let client = there.create_client(service().qos(newest)).unwrap();
         assert!(client.wait_available(PATIENCE));
         until("the server counts it", || server.clients() == [client.gid()]);
         // Unless all that comes is taken or passed over the ring on one way would be full.

@@ -62,10 +62,8 @@ pub(super) fn play_node(processes: usize) {
     let session = session();
     let name = format!("node{}", std::process::id());
     let node = session.create_node(&name, "/", "/").unwrap();
-    let spec = |topic: String, kind: &str, qos| EndpointSpec {
-        type_hash: vec![7; 32],
-        ..EndpointSpec::new(topic, kind, qos)
-    };
+    let spec =
+        |topic: String, kind: &str, qos| EndpointSpec::new(topic, kind, qos).type_hash(vec![7; 32]);
     let deep = Qos { depth: 1000, ..Qos::default() };
     let latched = Qos { durability: Durability::TransientLocal, ..deep };
     let _log = node.create_publisher(spec("/rosout".into(), "rcl_interfaces/msg/Log", latched));

@@ -18,11 +18,11 @@ use crate::{
     config::{Config, DaemonPlace, DaemonPolicy},
     ids::SessionId,
     session::{
-        Session, SessionOptions, SessionRole,
+        Session, SessionOptions,
         error::SessionError,
         state::{Outgoing, StatusAnswer, StatusText},
     },
-    wire::session::Message,
+    wire::session::{Message, SessionRole},
 };
 
 /// How long a daemon may take to answer.

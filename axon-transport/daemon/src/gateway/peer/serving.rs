@@ -220,10 +220,8 @@ impl Peer {
                 sources.push(Source::Relay(spec, Arc::clone(subscription)));
                 continue;
             }
-            let endpoint = EndpointSpec {
-                type_hash: type_hash.clone(),
-                ..EndpointSpec::new(&*key.topic, &*key.type_name, qos)
-            };
+            let endpoint =
+                EndpointSpec::new(&*key.topic, &*key.type_name, qos).type_hash(type_hash.clone());
             match shared.session.create_relay(endpoint, stands_for.clone()) {
                 Ok(subscription) => sources.push(Source::Relay(spec, Arc::new(subscription))),
                 Err(error) => {
