@@ -44,7 +44,7 @@ fn child() {
             wait_for_the_end();
         }
         "leased" => {
-            let lease = Some(300_000_000);
+            let lease = Some(Duration::from_millis(300));
             let qos = Qos { lease, ..Qos::default() };
             let publisher = session.create_publisher(EndpointSpec::new("/t", "T", qos)).unwrap();
             assert!(publisher.wait_matched(1, PATIENCE));

@@ -22,8 +22,8 @@ const WATCH: Duration = Duration::from_secs(5);
 /// Between two looks whether a process has come to rest.
 const SETTLE: Duration = Duration::from_millis(500);
 
-/// The lease of who has one, in nanoseconds. It is renewed at each third of it.
-const LEASE: u64 = 3_000_000_000;
+/// The lease of who has one. It is renewed at each third of it.
+const LEASE: Duration = Duration::from_secs(3);
 
 fn spec(topic: &str) -> EndpointSpec {
     EndpointSpec::new(topic, "test/Bytes", Qos::default())
@@ -144,7 +144,7 @@ fn leases_wake_the_control_thread_up_three_times_each_and_nobody_else() {
             woken = since(&before, player.pid());
             woken.values().sum::<u64>() >= 3
         });
-        let thirds = start.elapsed().as_nanos() / u128::from(LEASE / 3);
+        let thirds = start.elapsed().as_nanos() / (LEASE / 3).as_nanos();
         let threads: Vec<_> = woken.keys().collect();
         assert!(threads.len() == 1 && control(threads[0]), "{woken:?}");
         assert!(

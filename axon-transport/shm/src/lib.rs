@@ -62,6 +62,7 @@ pub mod internal {
             per_process::{Made, PerProcess, is_elevated},
             signals::BlockedSignals,
         },
+        qos::nanoseconds::nanoseconds,
         reader::{Reader, ReaderOptions},
         ring::{
             layout::{Location, SegmentKind},

@@ -22,9 +22,9 @@ pub struct Alive {
 }
 
 impl Alive {
-    /// These are the leases of the publishers that count, in nanoseconds.
-    pub fn watch(&mut self, leases: impl Iterator<Item = u64>) {
-        self.every = leases.min().map(|least| (Duration::from_nanos(least) / 4).max(SHORTEST));
+    /// These are the leases of the publishers that count.
+    pub fn watch(&mut self, leases: impl Iterator<Item = Duration>) {
+        self.every = leases.min().map(|least| (least / 4).max(SHORTEST));
     }
 
     /// How long it is until the next look; `None` when nobody has a lease.
@@ -61,7 +61,7 @@ impl Alive {
 mod tests {
     use super::*;
 
-    const LEASE: u64 = 400_000_000;
+    const LEASE: Duration = Duration::from_millis(400);
 
     fn gid(number: u8) -> Gid {
         Gid([number; 16])
@@ -76,7 +76,7 @@ mod tests {
         assert_eq!(alive.left(start), Some(Duration::ZERO));
         let both = [(gid(1), 1), (gid(2), 1), (gid(1), 3)];
         assert_eq!(alive.news(start, both.into_iter()), [[gid(1), gid(2)]]);
-        let quarter = Duration::from_nanos(LEASE) / 4;
+        let quarter = LEASE / 4;
         assert_eq!(alive.left(start), Some(quarter));
         let early = start + quarter / 2;
         assert!(alive.news(early, [(gid(2), 2)].into_iter()).is_empty(), "not yet");
@@ -84,7 +84,7 @@ mod tests {
         let next = start + quarter;
         let now = [(gid(1), 3), (gid(1), 1), (gid(2), 2), (gid(3), 1)];
         assert_eq!(alive.news(next, now.into_iter()), [[gid(2), gid(3)]]);
-        alive.watch([1].into_iter());
+        alive.watch([Duration::from_nanos(1)].into_iter());
         assert_eq!(alive.left(next), Some(SHORTEST));
         alive.watch(std::iter::empty());
         assert_eq!(alive.left(next + quarter), None);

@@ -1,6 +1,8 @@
 //! Quality of service, as C has it.
 
-use std::{mem::MaybeUninit, os::raw::c_char};
+use std::{mem::MaybeUninit, os::raw::c_char, time::Duration};
+
+use axon_shm::internal::nanoseconds;
 
 use super::{
     error::{Failure, axon_ret_t},
@@ -132,13 +134,13 @@ impl axon_qos_t {
             AXON_DURATION_BEST_AVAILABLE => {
                 return Err(Failure::argument("there is no best available lifespan"));
             }
-            nanoseconds => Some(nanoseconds),
+            nanoseconds => Some(Duration::from_nanos(nanoseconds)),
         };
         let period = |period: u64| match period {
             AXON_DURATION_DEFAULT => Choice::SystemDefault,
             AXON_DURATION_BEST_AVAILABLE => Choice::BestAvailable,
             AXON_DURATION_INFINITE => Choice::Exactly(None),
-            nanoseconds => Choice::Exactly(Some(nanoseconds)),
+            nanoseconds => Choice::Exactly(Some(Duration::from_nanos(nanoseconds))),
         };
         let (deadline, lease, depth) = (period(self.deadline), period(self.lease), self.depth);
         Ok(QosRequest {
@@ -156,7 +158,7 @@ impl axon_qos_t {
 
 impl From<&Qos> for axon_qos_t {
     fn from(qos: &Qos) -> Self {
-        let period = |period: Option<u64>| period.unwrap_or(AXON_DURATION_INFINITE);
+        let period = |period: Option<Duration>| period.map_or(AXON_DURATION_INFINITE, nanoseconds);
         Self {
             reliability: match qos.reliability {
                 Reliability::Reliable => AXON_RELIABILITY_RELIABLE,

@@ -7,7 +7,7 @@ use std::{
     sync::{Arc, Mutex, MutexGuard, PoisonError},
 };
 
-use axon_shm::internal::Times;
+use axon_shm::internal::{Times, nanoseconds};
 
 use super::{
     Session,
@@ -246,7 +246,7 @@ const SHORTEST: u64 = 1_000_000;
 impl EndpointEvents {
     pub(super) fn of_publisher(qos: &Qos, now: u64) -> Self {
         let manual = qos.liveliness == Liveliness::ManualByTopic && qos.lease.is_some();
-        let lease = manual.then(|| Lease::new(qos.lease, now));
+        let lease = manual.then(|| Lease::new(qos.lease.map(nanoseconds), now));
         Self::new(Statuses::of_publisher(), qos, lease)
     }
 
@@ -262,7 +262,7 @@ impl EndpointEvents {
             incompatible: BTreeSet::new(),
             liveness: Liveness::default(),
             lease,
-            deadline: qos.deadline.map(Deadline::new),
+            deadline: qos.deadline.map(nanoseconds).map(Deadline::new),
         };
         Self { inner: Mutex::new(inner) }
     }
@@ -402,7 +402,7 @@ impl EndpointEvents {
                     inner.statuses.liveliness_lost();
                 }
                 // Where it has run out, one looks whether it is asserted again.
-                due = earlier(due, lease.due().or(third(qos.lease, now)));
+                due = earlier(due, lease.due().or(third(qos.lease.map(nanoseconds), now)));
             }
             due = earlier(due, inner.deadlines(qos, times.sampled, now));
         });
@@ -441,7 +441,7 @@ impl EndpointEvents {
             }
             if writers.is_empty() {
                 // It runs from the first sample of the next one on.
-                inner.deadline = qos.deadline.map(Deadline::new);
+                inner.deadline = qos.deadline.map(nanoseconds).map(Deadline::new);
             } else {
                 let sampled = writers.iter().filter_map(|(_, times)| times.sampled).max();
                 due = earlier(due, inner.deadlines(qos, sampled, now));
@@ -493,7 +493,8 @@ impl Inner {
             self.statuses.deadlines_missed(missed);
         }
         // The first sample, from which it runs, may come at any time.
-        deadline.due().or(qos.deadline.map(|period| now.saturating_add(period)))
+        let after = |period| now.saturating_add(nanoseconds(period));
+        deadline.due().or(qos.deadline.map(after))
     }
 }
 

@@ -10,7 +10,7 @@ use std::{
 
 use axon_shm::{
     PublishError, ShmError,
-    internal::{Grant, Location, ReaderInfo, Terms, Writer},
+    internal::{Grant, Location, ReaderInfo, Terms, Writer, nanoseconds},
 };
 
 use super::{
@@ -370,7 +370,7 @@ impl PublisherInner {
         let Some(lease) = qos.lease.filter(|_| !self.asserts) else {
             return (due, news);
         };
-        let third = (lease / 3).max(1_000_000);
+        let third = nanoseconds(lease / 3).max(1_000_000);
         let mut next = times.asserted.map_or(now, |asserted| asserted.saturating_add(third));
         if next <= now {
             writer.assert(now);

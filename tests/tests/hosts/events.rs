@@ -19,7 +19,7 @@ use super::{
     process::PATIENCE,
 };
 
-const SECOND: u64 = 1_000_000_000;
+const SECOND: Duration = Duration::from_secs(1);
 
 fn hosts() -> [Host; 2] {
     Plan::new([classic(&[]), classic(&[])]).start()

@@ -1,6 +1,8 @@
 //! The graph of one host as the other has it: every field of every node and endpoint, and nothing else;
 //! whoever waits for it to change needs to look at no other time.
 
+use std::time::Duration;
+
 use axon_transport::{
     EndpointSpec, Node, Session, Waitable,
     graph::{Endpoint, EndpointKind, GraphView},
@@ -56,10 +58,10 @@ fn odd() -> Qos {
         durability: Durability::TransientLocal,
         history: History::KeepLast,
         depth: 7,
-        deadline: Some(3_600_000_000_001),
-        lifespan: Some(5_000_000_003),
+        deadline: Some(Duration::from_nanos(3_600_000_000_001)),
+        lifespan: Some(Duration::from_nanos(5_000_000_003)),
         liveliness: Liveliness::ManualByTopic,
-        lease: Some(7_200_000_000_005),
+        lease: Some(Duration::from_nanos(7_200_000_000_005)),
     }
 }
 

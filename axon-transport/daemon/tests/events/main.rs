@@ -30,7 +30,7 @@ use axon_transport::{
 use pair::Pair;
 use support::{PATIENCE, until};
 
-const MILLI: u64 = 1_000_000;
+const MILLI: Duration = Duration::from_millis(1);
 
 fn spec(qos: Qos) -> EndpointSpec {
     EndpointSpec::new("/t", "T", qos)
@@ -310,7 +310,7 @@ fn a_lease_that_is_not_asserted_runs_out_and_comes_back() {
 fn a_sample_older_than_its_lifespan_is_not_delivered() {
     let session = alone();
     let mortal = |lifespan| Qos { lifespan: Some(lifespan), ..Qos::default() };
-    let short = session.create_publisher(spec(mortal(1))).unwrap();
+    let short = session.create_publisher(spec(mortal(Duration::from_nanos(1)))).unwrap();
     let long = session.create_publisher(spec(mortal(3_600_000 * MILLI))).unwrap();
     let immortal = session.create_publisher(spec(Qos::default())).unwrap();
     let subscription = session.create_subscription(spec(Qos::keep_all())).unwrap();

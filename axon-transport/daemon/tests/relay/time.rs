@@ -9,7 +9,7 @@ use axon_transport::{
 
 use super::*;
 
-const MILLI: u64 = 1_000_000;
+const MILLI: Duration = Duration::from_millis(1);
 
 fn await_counted(session: &Session, event: &Event) -> Counted {
     let ready = session.wait_for(&[Waitable::Event(event)], Some(PATIENCE)).unwrap();

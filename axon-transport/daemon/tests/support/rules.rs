@@ -2,12 +2,10 @@
 //! the models of tests. What decides here asks nothing of what is tested: it is the table of ROS 2's
 //! documentation ("About Quality of Service settings"), a line a policy.
 
-use std::collections::BTreeSet;
+use std::{collections::BTreeSet, time::Duration};
 
 use axon_transport::qos::{Durability, History, Liveliness, Qos, Reliability};
 use serde::{Deserialize, Serialize};
-
-const SECOND: u64 = 1_000_000_000;
 
 /// A quality of service. Times are in seconds, `None` is infinite.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -57,7 +55,7 @@ impl Profile {
 
     /// As an endpoint is made with it.
     pub(crate) fn qos(&self) -> Qos {
-        let period = |seconds: Option<u64>| seconds.map(|seconds| seconds * SECOND);
+        let period = |seconds: Option<u64>| seconds.map(Duration::from_secs);
         Qos {
             reliability: if self.reliable {
                 Reliability::Reliable
@@ -81,7 +79,7 @@ impl Profile {
     /// As an endpoint says it is. `None` where it is nothing that [`qos`](Self::qos) makes.
     #[allow(dead_code, reason = "not every test looks at others' profiles")]
     pub(crate) fn of(qos: &Qos) -> Option<Self> {
-        let seconds = |period: Option<u64>| period.map(|period| period / SECOND);
+        let seconds = |period: Option<Duration>| period.map(|period| period.as_secs());
         let profile = Self {
             reliable: qos.reliability == Reliability::Reliable,
             transient_local: qos.durability == Durability::TransientLocal,

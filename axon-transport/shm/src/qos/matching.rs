@@ -1,6 +1,6 @@
 //! Which offered and requested profiles go together, as DDS and ROS 2 define it.
 
-use std::fmt;
+use std::{fmt, time::Duration};
 
 use super::{Choice, Durability, Liveliness, Qos, QosRequest, Reliability};
 
@@ -123,7 +123,7 @@ fn pick(request: &QosRequest, highest: bool) -> Qos {
     }
     let (reliability, durability, liveliness, time) = if highest {
         let manual = Liveliness::ManualByTopic;
-        (Reliability::Reliable, Durability::TransientLocal, manual, Some(0))
+        (Reliability::Reliable, Durability::TransientLocal, manual, Some(Duration::ZERO))
     } else {
         (Reliability::BestEffort, Durability::Volatile, Liveliness::Automatic, None)
     };
@@ -138,6 +138,6 @@ fn pick(request: &QosRequest, highest: bool) -> Qos {
 }
 
 /// Whether the period offered is longer than the one requested; `None` is infinite.
-fn longer(offered: Option<u64>, requested: Option<u64>) -> bool {
+fn longer(offered: Option<Duration>, requested: Option<Duration>) -> bool {
     requested.is_some_and(|r| offered.is_none_or(|o| o > r))
 }

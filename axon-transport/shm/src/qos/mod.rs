@@ -1,9 +1,10 @@
 //! Quality of service: the policies under their ROS 2 names, and which offered and requested
 //! profiles go together.
 //!
-//! Plain data; no I/O. Durations are in nanoseconds, `None` is infinite.
+//! Plain data; no I/O. Of periods, `None` is infinite.
 
 mod matching;
+pub(crate) mod nanoseconds;
 mod policy;
 mod request;
 #[cfg(test)]

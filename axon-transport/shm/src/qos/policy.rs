@@ -1,5 +1,7 @@
 //! The policies of one endpoint.
 
+use std::time::Duration;
+
 use minicbor::{Decode, Encode};
 use serde::Serialize;
 
@@ -71,18 +73,21 @@ pub struct Qos {
     /// The number of samples kept by [`History::KeepLast`]; at least 1.
     #[n(3)]
     pub depth: u32,
-    /// Longest time between two samples, in nanoseconds.
-    #[n(4)]
-    pub deadline: Option<u64>,
-    /// Age at which a sample is no longer delivered, in nanoseconds.
-    #[n(5)]
-    pub lifespan: Option<u64>,
+    /// Longest time between two samples.
+    #[cbor(n(4), with = "super::nanoseconds", has_nil)]
+    #[serde(serialize_with = "super::nanoseconds::serialize")]
+    pub deadline: Option<Duration>,
+    /// Age at which a sample is no longer delivered.
+    #[cbor(n(5), with = "super::nanoseconds", has_nil)]
+    #[serde(serialize_with = "super::nanoseconds::serialize")]
+    pub lifespan: Option<Duration>,
     /// Who asserts liveliness.
     #[n(6)]
     pub liveliness: Liveliness,
-    /// Time without an assertion after which a publisher counts as not alive, in nanoseconds.
-    #[n(7)]
-    pub lease: Option<u64>,
+    /// Time without an assertion after which a publisher counts as not alive.
+    #[cbor(n(7), with = "super::nanoseconds", has_nil)]
+    #[serde(serialize_with = "super::nanoseconds::serialize")]
+    pub lease: Option<Duration>,
 }
 
 impl Default for Qos {

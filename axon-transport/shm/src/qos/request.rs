@@ -1,5 +1,7 @@
 //! A profile as a caller asks for it, where a policy may be left to AXON or to what is there.
 
+use std::time::Duration;
+
 use super::{Durability, History, Liveliness, Qos, Reliability};
 
 /// One policy of a [`QosRequest`].
@@ -49,14 +51,14 @@ pub struct QosRequest {
     pub history: Option<History>,
     /// The number kept by KEEP_LAST; 0 is the default depth.
     pub depth: u32,
-    /// Longest time between two samples, in nanoseconds; `None` is infinite.
-    pub deadline: Choice<Option<u64>>,
-    /// Age at which a sample is no longer delivered, in nanoseconds.
-    pub lifespan: Option<u64>,
+    /// Longest time between two samples; `None` is infinite.
+    pub deadline: Choice<Option<Duration>>,
+    /// Age at which a sample is no longer delivered.
+    pub lifespan: Option<Duration>,
     /// Who asserts liveliness.
     pub liveliness: Choice<Liveliness>,
-    /// Time without an assertion after which a publisher counts as not alive, in nanoseconds.
-    pub lease: Choice<Option<u64>>,
+    /// Time without an assertion after which a publisher counts as not alive.
+    pub lease: Choice<Option<Duration>>,
 }
 
 impl From<Qos> for QosRequest {
@@ -91,7 +93,7 @@ impl QosRequest {
     /// TRANSIENT_LOCAL serve every subscription; deadline and lease are the shortest that one of
     /// them requests, and liveliness is manual when one of them wants it so.
     pub fn for_publisher(&self, subscriptions: &[Qos]) -> Qos {
-        let shortest = |of: fn(&Qos) -> Option<u64>| subscriptions.iter().filter_map(of).min();
+        let shortest = |of: fn(&Qos) -> Option<Duration>| subscriptions.iter().filter_map(of).min();
         let manual = subscriptions.iter().any(|q| q.liveliness == Liveliness::ManualByTopic);
         self.resolve(Qos {
             reliability: Reliability::Reliable,
@@ -108,8 +110,8 @@ impl QosRequest {
     /// without deadline or lease.
     pub fn for_subscription(&self, publishers: &[Qos]) -> Qos {
         // A publisher without a deadline serves no subscription that has one.
-        let longest = |of: fn(&Qos) -> Option<u64>| {
-            let all: Option<Vec<u64>> = publishers.iter().map(of).collect();
+        let longest = |of: fn(&Qos) -> Option<Duration>| {
+            let all: Option<Vec<Duration>> = publishers.iter().map(of).collect();
             all.and_then(|all| all.into_iter().max())
         };
         let reliable = publishers.iter().all(|q| q.reliability == Reliability::Reliable);

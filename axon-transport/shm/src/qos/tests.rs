@@ -1,5 +1,7 @@
 //! Matching against the rules of ROS 2, written out a second time as a table.
 
+use std::time::Duration;
+
 use proptest::prelude::*;
 
 use super::*;
@@ -23,10 +25,11 @@ const LIVELINESS: [(Liveliness, Liveliness, bool); 4] = [
     (Liveliness::ManualByTopic, Liveliness::Automatic, true),
     (Liveliness::ManualByTopic, Liveliness::ManualByTopic, true),
 ];
+const SEVEN: Option<Duration> = Some(Duration::from_nanos(7));
 /// Deadline and lease, with x < y.
-const X: Option<u64> = Some(5);
-const Y: Option<u64> = Some(6);
-const PERIOD: [(Option<u64>, Option<u64>, bool); 9] = [
+const X: Option<Duration> = Some(Duration::from_nanos(5));
+const Y: Option<Duration> = Some(Duration::from_nanos(6));
+const PERIOD: [(Option<Duration>, Option<Duration>, bool); 9] = [
     (None, None, true),
     (None, X, false),
     (None, Y, false),
@@ -80,7 +83,7 @@ fn every_combination_of_policies_is_judged_as_the_table_says() {
 }
 
 fn qos() -> impl Strategy<Value = Qos> {
-    let period = || prop_oneof![Just(None), (1u64..4).prop_map(Some)];
+    let period = || prop_oneof![Just(None), (1u64..4).prop_map(|n| Some(Duration::from_nanos(n)))];
     (any::<[bool; 4]>(), period(), period(), 1u32..20).prop_map(
         |([reliable, latched, manual, all], deadline, lease, depth)| Qos {
             reliability: if reliable { Reliability::Reliable } else { Reliability::BestEffort },
@@ -143,7 +146,8 @@ proptest! {
         if mine.liveliness == Liveliness::Automatic {
             higher.push(Qos { liveliness: Liveliness::ManualByTopic, ..mine });
         }
-        let shorter = |period: Option<u64>| Some(period.map_or(3, |p| p - 1));
+        let least = Duration::from_nanos(1);
+        let shorter = |period: Option<Duration>| Some(period.map_or(3 * least, |p| p - least));
         higher.push(Qos { deadline: shorter(mine.deadline), ..mine });
         higher.push(Qos { lease: shorter(mine.lease), ..mine });
         for raised in higher {
@@ -205,9 +209,9 @@ fn what_is_left_open_is_the_default() {
 
 #[test]
 fn a_deadline_that_one_publisher_does_not_offer_is_not_requested() {
-    let with = Qos { deadline: Some(7), ..Qos::default() };
+    let with = Qos { deadline: SEVEN, ..Qos::default() };
     let best = QosRequest::best_available();
-    assert_eq!(best.for_subscription(&[with]).deadline, Some(7));
+    assert_eq!(best.for_subscription(&[with]).deadline, SEVEN);
     assert_eq!(best.for_subscription(&[with, Qos::default()]).deadline, None);
-    assert_eq!(best.for_publisher(&[with, Qos::default()]).deadline, Some(7));
+    assert_eq!(best.for_publisher(&[with, Qos::default()]).deadline, SEVEN);
 }

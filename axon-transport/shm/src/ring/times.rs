@@ -1,8 +1,10 @@
 //! The times in a ring's header: the publisher's lifespan and lease, and when it last published or asserted
 //! its liveliness. Nanoseconds of CLOCK_MONOTONIC, which all processes of a host share.
 
+use std::time::Duration;
+
 use crate::{
-    qos::Qos,
+    qos::{Qos, nanoseconds::nanoseconds},
     ring::layout::ring,
     sync::{Ordering, Word},
 };
@@ -23,7 +25,7 @@ pub struct Times {
 /// Writes what is offered into the header of a new ring.
 pub(crate) fn offer(words: &[impl Word], qos: &Qos) {
     // 0 is not a time, but the shortest that there is comes to the same.
-    let period = |period: Option<u64>| period.map_or(0, |period| period.max(1));
+    let period = |period: Option<Duration>| period.map_or(0, |period| nanoseconds(period).max(1));
     words[ring::LEASE].store(period(qos.lease), Ordering::Relaxed);
     words[ring::LIFESPAN].store(period(qos.lifespan), Ordering::Relaxed);
 }

@@ -42,7 +42,7 @@ pub(crate) fn elected() -> Message {
 
 /// HELLO first.
 pub(crate) fn messages() -> Vec<Message> {
-    let qos = Qos { lifespan: Some(7), ..Qos::keep_all() };
+    let qos = Qos { lifespan: Some(std::time::Duration::from_nanos(7)), ..Qos::keep_all() };
     vec![
         Message::Hello(Hello {
             replaces: Some([3; 16]),
