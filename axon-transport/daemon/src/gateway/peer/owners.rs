@@ -99,7 +99,7 @@ impl Prover {
             // A signature costs time: one for each session and connection.
             if !self.made.contains_key(&session)
                 && let Some(key) = self.held.get(&session)
-                && let Some(proof) = prove(&key, &binding, self.daemon)
+                && let Some(proof) = prove(key, &binding, self.daemon)
             {
                 self.made.insert(session, proof);
             }
