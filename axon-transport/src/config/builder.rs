@@ -221,7 +221,7 @@ impl ConfigBuilder {
     }
 
     /// Deviations of the KME to tolerate, by the names of
-    /// [`QkdConfig::KME_QUIRKS`]. Default none.
+    /// [`QkdConfig::KME_QUIRKS`](super::QkdConfig::KME_QUIRKS). Default none.
     pub fn kme_quirks(self, names: impl IntoIterator<Item = impl Into<String>>) -> Self {
         self.list("AXON_KME_QUIRKS", names.into_iter().map(Into::into))
     }

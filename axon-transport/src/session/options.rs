@@ -35,7 +35,7 @@ impl SessionOptions {
 }
 
 /// A command that runs a daemon: it passes the flags `--spawned` and `--detached`, which are added
-/// after the arguments, on to [`daemon::main`](crate::daemon::main).
+/// after the arguments, on to `axon_daemon::Start::from_arguments`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DaemonCommand {
     /// The program.
