@@ -9,13 +9,14 @@ const NEIGHBOURS: [&str; 4] = ["quinn", "rustls", "reqwest", "zenoh"];
 
 /// Each library of ours, all its features, and the least that it is of use with: axon-envelope needs an
 /// AEAD, and says so.
-const LIBRARIES: [(&str, &str, &str); 6] = [
+const LIBRARIES: [(&str, &str, &str); 7] = [
     ("etsi-qkd014", "blocking,pool,sim", ""),
     ("axon-envelope", "aws-lc-rs,rust-crypto", "rust-crypto"),
     ("rustls-axon", "aws_lc_rs,std,logging,tls12", ""),
     ("axon-tls", "hybrid,quic,tokio", ""),
     ("axon-shm", "", ""),
     ("axon-transport", "", ""),
+    ("axon-daemon", "", ""),
 ];
 
 // One program with all of ours: with a program for each, cargo builds zenoh anew for each, since the features that

@@ -25,7 +25,14 @@ fn each_library_has_an_example() {
 fn each_crate_has_a_changelog() {
     for (name, dir) in PUBLISHED {
         let text = fs::read_to_string(workspace().join(dir).join("CHANGELOG.md")).expect(name);
-        assert!(text.starts_with("# Changelog\n") && text.contains("\n## "), "{name}");
+        assert!(text.starts_with("# Changelog\n"), "{name}");
+        let headings: Vec<_> = text.lines().filter(|line| line.starts_with('#')).skip(1).collect();
+        assert_eq!(headings.first(), Some(&"## [Unreleased]"), "{name}");
+        let kinds = ["Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"];
+        let is_known = |line: &&&str| {
+            line.strip_prefix("### ").map_or(line.starts_with("## ["), |kind| kinds.contains(&kind))
+        };
+        assert_eq!(headings.iter().find(|line| !is_known(line)), None, "{name}");
     }
 }
 

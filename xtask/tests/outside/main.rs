@@ -17,12 +17,13 @@ mod run;
 mod support;
 
 /// The crates that are published, and where they are in this repository.
-const PUBLISHED: [(&str, &str); 7] = [
+const PUBLISHED: [(&str, &str); 8] = [
     ("etsi-qkd014", "etsi-qkd014"),
     ("axon-envelope", "axon-envelope"),
     ("rustls-axon", "third_party/rustls-axon"),
     ("axon-tls", "axon-tls"),
     ("axon-shm", "axon-transport/shm"),
     ("axon-transport", "axon-transport"),
+    ("axon-daemon", "axon-transport/daemon"),
     ("axon-cli", "axon-cli"),
 ];

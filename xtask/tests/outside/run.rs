@@ -140,6 +140,24 @@ fn the_readme_of_axon_shm_does_what_it_says() {
 }
 
 #[test]
+#[ignore = "builds all that axon-daemon depends on"]
+fn the_readme_of_axon_daemon_does_what_it_says() {
+    let Some(programs) = built("axon-daemon") else { return };
+    assert_ne!(programs.len(), 0);
+    for program in programs {
+        let place = Place::new();
+        // No other daemon is to be found: it is its own.
+        let mut own = place.with_daemon(&program);
+        own.env_remove("AXON_DAEMON_PATH")
+            .env("PATH", "/usr/bin:/bin")
+            .env("CARGO_HOME", place.0.path());
+        let printed = run(&mut own).stdout;
+        let printed = String::from_utf8_lossy(&printed);
+        assert!(printed.starts_with("the daemon is Some("), "{printed}");
+    }
+}
+
+#[test]
 #[ignore = "builds all that axon-transport and axon-cli depend on"]
 fn the_readmes_of_axon_transport_and_axon_cli_do_what_they_say() {
     let install = format!("cargo install --locked --git {} axon-cli", env!("CARGO_PKG_REPOSITORY"));
