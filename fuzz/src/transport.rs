@@ -1,5 +1,7 @@
 //! Discovery datagrams, frames between daemons, packets between a session and its daemon.
 
+use std::time::Duration;
+
 use axon_daemon::internal::{
     keys::KeyMessage,
     link::{self, FrameError},
@@ -170,7 +172,11 @@ fn endpoint() -> Endpoint {
         topic: "/scan".into(),
         type_name: "sensor_msgs/msg/LaserScan".into(),
         type_hash: vec![1, 2, 3],
-        qos: Qos { deadline: Some(5), lifespan: Some(6), ..Qos::keep_all() },
+        qos: Qos {
+            deadline: Some(Duration::from_nanos(5)),
+            lifespan: Some(Duration::from_nanos(6)),
+            ..Qos::keep_all()
+        },
         node: "lidar".into(),
         namespace: "/".into(),
         enclave: String::new(),
