@@ -12,8 +12,21 @@ mod owner;
 mod residue;
 mod wire;
 
+/// The system's allocator, which in a daemon erases each block of at most 64 KiB before it is freed, and when it
+/// grows into another one.
+///
+/// The libraries of the KME client copy keys into buffers that they free as they are. A program that can be the
+/// daemon makes this its global allocator:
+///
+/// ```
+/// #[global_allocator]
+/// static HEAP: axon_daemon::ErasingHeap = axon_daemon::ErasingHeap;
+/// ```
+///
+/// It erases nothing until [`run`] or [`main`] is called, so the program's other commands pay for one load.
+#[doc(inline)]
 pub use axon_shm::internal::ErasingHeap;
-pub use control::{DaemonError, DaemonOptions, Report, Start, log, main, run};
+pub use control::{DaemonError, DaemonOptions, Start, log, main, run};
 pub use gateway::{GatewayError, check};
 
 /// What the other crates of AXON and its tests use of this one. It is not part of its interface, and changes

@@ -19,13 +19,13 @@ use super::log;
 
 /// The daemon's end of the start-up pipe. In the foreground there is none.
 #[derive(Debug)]
-pub struct Report {
+pub(super) struct Report {
     pipe: Option<OwnedFd>,
 }
 
 impl Report {
     /// Nobody waits.
-    pub fn none() -> Self {
+    pub(super) fn none() -> Self {
         Self { pipe: None }
     }
 
@@ -33,7 +33,7 @@ impl Report {
     ///
     /// # Errors
     /// What the system says.
-    pub fn from_stdout() -> std::io::Result<Self> {
+    pub(super) fn from_stdout() -> std::io::Result<Self> {
         let pipe = rustix::stdio::stdout().try_clone_to_owned()?;
         let null = std::fs::OpenOptions::new().write(true).open("/dev/null")?;
         rustix::stdio::dup2_stdout(null.as_fd())?;
@@ -41,17 +41,17 @@ impl Report {
     }
 
     /// The daemon takes sessions.
-    pub fn ready(&mut self) {
+    pub(super) fn ready(&mut self) {
         self.say("ready\n");
     }
 
     /// Another daemon has the address.
-    pub fn taken(&mut self) {
+    pub(super) fn taken(&mut self) {
         self.say("taken\n");
     }
 
     /// The daemon gives up.
-    pub fn error(&mut self, text: &str) {
+    pub(super) fn error(&mut self, text: &str) {
         self.say(&format!("error: {}\n", text.replace('\n', " ")));
     }
 

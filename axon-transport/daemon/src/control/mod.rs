@@ -20,6 +20,5 @@ mod strangers;
 mod topics;
 mod turns;
 
-pub use detach::Report;
 pub use gateway::GatewayEntry;
 pub use run::{DaemonError, DaemonOptions, Start, main, run};

@@ -70,11 +70,27 @@ const FIRST_SESSION: Duration = Duration::from_secs(10);
 #[derive(Debug)]
 pub struct DaemonOptions {
     /// Who waits for it to be ready.
-    pub report: Report,
+    report: Report,
     /// The gateway to other hosts. Without one, the daemon serves this host alone.
-    pub gateway: Option<GatewayEntry>,
-    /// Whether it stays when no session needs it. Otherwise it ends after its grace time.
-    pub stays: bool,
+    gateway: Option<GatewayEntry>,
+    stays: bool,
+}
+
+impl DaemonOptions {
+    /// Whether it stays when no session needs it. Otherwise, and by default, it ends after its grace time.
+    #[must_use]
+    pub fn stays(mut self, whether: bool) -> Self {
+        self.stays = whether;
+        self
+    }
+
+    /// Another gateway than the real one, for tests.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn gateway(mut self, gateway: GatewayEntry) -> Self {
+        self.gateway = Some(gateway);
+        self
+    }
 }
 
 impl Default for DaemonOptions {

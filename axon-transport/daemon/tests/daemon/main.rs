@@ -17,7 +17,7 @@ use std::{
 };
 
 use axon_daemon::{
-    self, DaemonOptions,
+    DaemonOptions,
     internal::{
         GatewayEntry,
         bridge::{GatewayParts, ToControl},
@@ -436,7 +436,7 @@ fn a_gateway_that_panics_is_started_again_and_nobody_else_notices() {
     let host = Host::new();
     let config = host.config();
     let daemon = std::thread::spawn(move || {
-        let options = DaemonOptions { gateway: Some(failing_gateway), ..DaemonOptions::default() };
+        let options = DaemonOptions::default().gateway(failing_gateway);
         axon_daemon::run(config, options)
     });
     until("the daemon answers", || host.status().is_ok());
@@ -460,7 +460,7 @@ fn a_gateway_that_panics_is_started_again_and_nobody_else_notices() {
 fn a_gateway_that_cannot_start_is_an_error_of_the_daemon() {
     let host = Host::new();
     let gateway: GatewayEntry = |_| Err("AXON_SAE_KEY: no key in it".into());
-    let options = DaemonOptions { gateway: Some(gateway), ..DaemonOptions::default() };
+    let options = DaemonOptions::default().gateway(gateway);
     let error = axon_daemon::run(host.config(), options).unwrap_err();
     assert!(error.to_string().contains("AXON_SAE_KEY"), "{error}");
     assert!(matches!(host.status(), Err(SessionError::NoDaemon { .. })));
