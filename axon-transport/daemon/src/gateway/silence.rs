@@ -128,27 +128,172 @@ impl Watch {
     }
 
     async fn probe(&self, nonce: [u8; 8]) {
-        let began = Instant::now();
         let silent = || {
             let over = self.connection.close_reason().is_some();
             !over && !Traffic::of(&self.connection).answered_since(self.traffic)
         };
         let bytes = Datagram::Probe { daemon: self.daemon, nonce }.encode();
-        let mut echo = self.echoes.await_one(nonce);
+        let mut echo = None;
+        let mut prober = Prober::new(Instant::now(), self.side);
         while silent() {
-            self.endpoints.send(self.connection.remote_address(), &bytes);
-            if tokio::time::timeout(PROBE_EVERY, &mut echo).await.is_err() {
+            match prober.handle_timeout(Instant::now()) {
+                Some(Step::Probe) => {
+                    echo.get_or_insert_with(|| self.echoes.await_one(nonce));
+                    self.endpoints.send(self.connection.remote_address(), &bytes);
+                }
+                Some(Step::Replace) => {
+                    let silence = Event::Silent(self.number, self.traffic);
+                    if self.events.send(silence).await.is_err() {
+                        return;
+                    }
+                }
+                None => {}
+            }
+            let due = tokio::time::Instant::from_std(prober.poll_timeout());
+            let asked = echo.as_mut().filter(|_| prober.awaits_echo());
+            let Some(asked) = asked else {
+                tokio::time::sleep_until(due).await;
                 continue;
+            };
+            if let Ok(answer) = tokio::time::timeout_at(due, asked).await {
+                echo = None;
+                // An error: nobody will answer, and it is not asked for again.
+                if answer.is_err() {
+                    return;
+                }
+                prober.handle_echo(Instant::now());
             }
-            let grace = if began.elapsed() < LONG { GRACE } else { GRACE_AFTER_LONG };
-            let more = if self.side == Side::Client { Duration::ZERO } else { DIALLED };
-            tokio::time::sleep(grace + more).await;
-            let silence = Event::Silent(self.number, self.traffic);
-            if !silent() || self.events.send(silence).await.is_err() {
-                return;
-            }
-            tokio::time::sleep(AGAIN).await;
-            echo = self.echoes.await_one(nonce);
         }
+    }
+}
+
+/// What to do for a silent link.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Step {
+    /// Send a probe.
+    Probe,
+    /// Dial a successor: the path works.
+    Replace,
+}
+
+/// Decides when a silent link is probed and when it is replaced. Plain data: whoever has it asks
+/// [`handle_timeout`](Self::handle_timeout) at [`poll_timeout`](Self::poll_timeout), and tells of answers.
+#[derive(Debug)]
+struct Prober {
+    began: Instant,
+    side: Side,
+    next: Step,
+    due: Instant,
+    /// A probe was sent and not answered.
+    asked: bool,
+}
+
+impl Prober {
+    /// The link was found silent at `now`: a probe is due.
+    fn new(now: Instant, side: Side) -> Self {
+        Self { began: now, side, next: Step::Probe, due: now, asked: false }
+    }
+
+    /// Whether an answer to a probe counts.
+    fn awaits_echo(&self) -> bool {
+        self.asked
+    }
+
+    /// A probe was answered: QUIC is given some time more.
+    fn handle_echo(&mut self, now: Instant) {
+        let silent = now.saturating_duration_since(self.began);
+        let grace = if silent < LONG { GRACE } else { GRACE_AFTER_LONG };
+        let more = if self.side == Side::Client { Duration::ZERO } else { DIALLED };
+        (self.next, self.due, self.asked) = (Step::Replace, now + grace + more, false);
+    }
+
+    /// When to ask again.
+    fn poll_timeout(&self) -> Instant {
+        self.due
+    }
+
+    /// What is due at `now`.
+    fn handle_timeout(&mut self, now: Instant) -> Option<Step> {
+        if now < self.due {
+            return None;
+        }
+        let step = self.next;
+        let pause = if step == Step::Probe { PROBE_EVERY } else { AGAIN };
+        (self.next, self.due, self.asked) = (Step::Probe, now + pause, step == Step::Probe);
+        Some(step)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ROUND_TRIP: Duration = Duration::from_millis(50);
+
+    /// Cuts the path for `cut` after the link was found silent. How many probes were sent meanwhile, and how
+    /// long after the path's return the successor is dialled.
+    fn replaced_after(cut: Duration, side: Side) -> (u32, Duration) {
+        let start = Instant::now();
+        let mut prober = Prober::new(start, side);
+        let mut probes = 0;
+        let mut echo = None;
+        loop {
+            let now = match echo {
+                Some(at) if at < prober.poll_timeout() => {
+                    echo = None;
+                    prober.handle_echo(at);
+                    continue;
+                }
+                _ => prober.poll_timeout(),
+            };
+            match prober.handle_timeout(now) {
+                Some(Step::Probe) => {
+                    probes += 1;
+                    // One that leaves during the cut is lost.
+                    if now >= start + cut && echo.is_none() {
+                        echo = Some(now + ROUND_TRIP);
+                    }
+                }
+                Some(Step::Replace) => return (probes, now - (start + cut)),
+                None => unreachable!("it is due"),
+            }
+        }
+    }
+
+    #[test]
+    fn a_successor_is_dialled_within_half_a_second_of_the_paths_return_whenever_that_is() {
+        for millis in 3_000..12_000 {
+            let cut = Duration::from_millis(millis);
+            for (side, bound) in [(Side::Client, 400), (Side::Server, 600)] {
+                let (probes, after) = replaced_after(cut, side);
+                assert!(after <= Duration::from_millis(bound), "{cut:?}, {side:?}: {after:?}");
+                // Four a second, and no more.
+                assert!(u64::from(probes) <= millis / 250 + 2, "{cut:?}: {probes}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_short_silence_gives_quic_time_to_end_it_itself() {
+        let (_, after) = replaced_after(Duration::ZERO, Side::Client);
+        assert_eq!(after, ROUND_TRIP + GRACE);
+        let (_, after) = replaced_after(Duration::ZERO, Side::Server);
+        assert_eq!(after, ROUND_TRIP + GRACE + DIALLED);
+    }
+
+    #[test]
+    fn a_successor_that_does_not_come_about_is_dialled_again() {
+        let start = Instant::now();
+        let mut prober = Prober::new(start, Side::Client);
+        assert!(!prober.awaits_echo(), "nothing was asked");
+        assert_eq!(prober.handle_timeout(start), Some(Step::Probe));
+        assert!(prober.awaits_echo());
+        prober.handle_echo(start + ROUND_TRIP);
+        let replaced = prober.poll_timeout();
+        assert_eq!(prober.handle_timeout(replaced - Duration::from_millis(1)), None);
+        assert_eq!(prober.handle_timeout(replaced), Some(Step::Replace));
+        assert_eq!(prober.poll_timeout(), replaced + AGAIN);
+        assert!(!prober.awaits_echo(), "an answer that comes twice dials no other one");
+        assert_eq!(prober.handle_timeout(replaced + AGAIN), Some(Step::Probe));
     }
 }
