@@ -7,6 +7,22 @@ use axon_shm::ShmError;
 use super::daemon::address::AddressError;
 use crate::{config::ConfigError, wire::session::CodecError};
 
+/// Why waiting for a message ended without one.
+///
+/// There is no variant for a session that is closed: an endpoint keeps its session open for as long as the
+/// endpoint lives, and a call that waits borrows the endpoint. A publisher that ends is no error either:
+/// another one may come.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum RecvError {
+    /// Nothing came within the timeout.
+    #[error("no message came within the timeout")]
+    TimedOut,
+    /// The process forked: the endpoint belongs to the parent.
+    #[error("used after fork: a child process must open a session of its own")]
+    Forked,
+}
+
 /// Why a session could not be opened or used.
 ///
 /// `Debug` says the same as `Display`: it is what a `main` prints that returns the error.

@@ -42,7 +42,7 @@ use std::{
 pub use crate::wire::session::SessionRole;
 pub use callback::OnNew;
 pub use daemon::{daemon_status, daemon_status_at};
-pub use error::SessionError;
+pub use error::{RecvError, SessionError};
 pub use events::Event;
 pub use guard::GuardCondition;
 pub use node::Node;
