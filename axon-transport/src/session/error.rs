@@ -5,7 +5,7 @@ use std::{fmt, path::PathBuf};
 use axon_shm::ShmError;
 
 use super::daemon::address::AddressError;
-use crate::{config::ConfigError, wire::session::CodecError};
+use crate::{config::ConfigError, ids::SessionId, wire::session::CodecError};
 
 /// Why waiting for a message ended without one.
 ///
@@ -21,6 +21,21 @@ pub enum RecvError {
     /// The process forked: the endpoint belongs to the parent.
     #[error("used after fork: a child process must open a session of its own")]
     Forked,
+    /// An event loop of the program's listens already (an [`ExternalLeader`](axon_shm::ExternalLeader)), so
+    /// that the session cannot wake tasks. Waiting in a thread works nevertheless.
+    #[error("session {0} already has an external leader of its waits, and cannot wake tasks")]
+    AlreadyLed(SessionId),
+}
+
+impl RecvError {
+    /// Why the control thread cannot listen.
+    pub(super) fn of_listening(error: &ShmError) -> Self {
+        match error {
+            ShmError::AlreadyLed(session) => Self::AlreadyLed(*session),
+            // The only other reason to refuse an external leader.
+            _ => Self::Forked,
+        }
+    }
 }
 
 /// Why a session could not be opened or used.

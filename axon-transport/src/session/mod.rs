@@ -29,6 +29,7 @@ mod rings;
 mod service;
 mod state;
 mod subscription;
+mod tasks;
 #[cfg(test)]
 mod tests;
 mod waiting;
@@ -54,6 +55,7 @@ pub use service::{Client, Server};
 pub use state::SessionEvent;
 pub(crate) use state::Shared;
 pub use subscription::{Lifetime, MessageInfo, Subscription};
+pub use tasks::{CallError, Messages};
 pub use waiting::{Ready, Waitable};
 
 use crate::{

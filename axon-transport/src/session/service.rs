@@ -57,7 +57,7 @@ pub struct Server {
 /// ```
 pub struct Client {
     requests: Arc<PublisherInner>,
-    ring: Arc<Writer>,
+    pub(super) ring: Arc<Writer>,
     pub(super) responses: Arc<SubscriptionInner>,
     pub(super) session: Session,
 }
