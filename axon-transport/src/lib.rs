@@ -20,7 +20,7 @@ pub use axon_shm::{ids, qos};
 pub use session::{
     CallError, Client, DaemonCommand, EndpointSpec, Event, GuardCondition, Lifetime, Loan,
     MessageInfo, Messages, Node, OnNew, Publisher, Ready, RecvError, Server, Session, SessionError,
-    SessionEvent, SessionOptions, SessionRole, Subscription, Waitable,
+    SessionEvent, SessionOptions, SessionRole, Subscription, TrustedSubscription, Waitable,
     daemon_status, daemon_status_at,
 };
 

@@ -3,4 +3,5 @@
 mod calls;
 mod forked;
 mod receive;
+mod slices;
 mod support;

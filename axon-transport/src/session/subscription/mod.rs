@@ -3,6 +3,7 @@
 mod inner;
 mod slots;
 mod taking;
+mod trusted;
 
 use std::{
     fmt,
@@ -16,6 +17,7 @@ use axon_shm::{
 };
 
 use self::slots::Slots;
+pub use self::trusted::TrustedSubscription;
 pub(super) use self::{
     inner::SubscriptionInner,
     slots::{Accept, Asking, Numbers},
