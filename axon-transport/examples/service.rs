@@ -17,7 +17,7 @@ use axon_transport::{
 
 const PATIENCE: Duration = Duration::from_secs(10);
 
-fn main() -> Result<(), Box<dyn Error>> {
+fn main() -> Result<(), Box<dyn Error + Send + Sync>> {
     let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
     let session = Session::open(&config, SessionOptions::new("example"))?;
     let spec = || EndpointSpec::new("/length", "example/Length", Qos::default());
@@ -31,17 +31,17 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
     let number = client.send_request(b"how long is this?")?;
     let mut bytes = Vec::new();
-    let response = client.recv_response(&mut bytes, Some(PATIENCE)).ok_or("no response")?;
+    let response = client.recv_response(&mut bytes, Some(PATIENCE))?;
     assert_eq!(response.sequence, number);
     println!("{} bytes", String::from_utf8(bytes)?);
-    answering.join().expect("the server ends").map_err(Into::into)
+    answering.join().expect("the server ends")
 }
 
 /// Answers one request with its length.
-fn answer(server: &Server) -> Result<(), String> {
+fn answer(server: &Server) -> Result<(), Box<dyn Error + Send + Sync>> {
     let mut bytes = Vec::new();
-    let request = server.recv_request(&mut bytes, Some(PATIENCE)).ok_or("no request")?;
+    let request = server.recv_request(&mut bytes, Some(PATIENCE))?;
     let length = bytes.len().to_string();
-    let sent = server.send_response(request.publisher, request.sequence, length.as_bytes());
-    sent.map_err(|error| error.to_string())
+    server.send_response(request.publisher, request.sequence, length.as_bytes())?;
+    Ok(())
 }

@@ -18,9 +18,10 @@ pub use axon_shm as shm;
 #[doc(inline)]
 pub use axon_shm::{ids, qos};
 pub use session::{
-    Client, DaemonCommand, EndpointSpec, Event, GuardCondition, Lifetime, Loan, MessageInfo, Node,
-    OnNew, Publisher, Ready, Server, Session, SessionError, SessionEvent, SessionOptions,
-    Subscription, Waitable, daemon_status, daemon_status_at,
+    CallError, Client, DaemonCommand, EndpointSpec, Event, GuardCondition, Lifetime, Loan,
+    MessageInfo, Messages, Node, OnNew, Publisher, Ready, RecvError, Server, Session, SessionError,
+    SessionEvent, SessionOptions, Subscription, TrustedSubscription, Waitable, daemon_status,
+    daemon_status_at,
 };
 
 /// What the other crates of AXON and its tests use of this one. It is not part of its interface, and changes

@@ -12,7 +12,8 @@ use std::{
 
 use alone::alone;
 use axon_transport::{
-    EndpointSpec, Publisher, Session, SessionError, SessionOptions, Subscription, Waitable,
+    EndpointSpec, Publisher, RecvError, Session, SessionError, SessionOptions, Subscription,
+    Waitable,
     config::{Config, DaemonPolicy},
     events::{EventKind, EventStatus},
     graph::EndpointKind,
@@ -74,7 +75,7 @@ fn sessions_of_a_process_without_a_daemon_know_nothing_of_each_other() {
     }
     let mut bytes = Vec::new();
     for (number, (_, subscription, _)) in ends.iter().enumerate() {
-        assert!(subscription.recv(&mut bytes, Some(PATIENCE)).is_some());
+        assert!(subscription.recv(&mut bytes, Some(PATIENCE)).is_ok());
         assert_eq!(bytes.iter().map(|byte| usize::from(*byte)).collect::<Vec<_>>(), [number]);
     }
     // Were there more to come, it would have begun to long ago.
@@ -203,7 +204,8 @@ fn a_waiting_reader_is_woken_by_a_sample() {
         publisher.publish(b"x").unwrap();
         assert_eq!(reader.join().unwrap().publisher, publisher.gid());
     });
-    assert!(subscription.recv(&mut Vec::new(), Some(Duration::from_millis(1))).is_none());
+    let late = subscription.recv(&mut Vec::new(), Some(Duration::from_millis(1)));
+    assert_eq!(late, Err(RecvError::TimedOut));
 }
 
 #[test]
@@ -344,8 +346,9 @@ fn a_forked_child_is_refused_by_whatever_it_asks_and_never_waits() {
                     publisher.publish(b"x").is_err_and(|e| e.to_string().contains("fork")),
                     publisher.loan(5000).is_err_and(|e| e.to_string().contains("fork")),
                     subscription.take(&mut bytes).is_none(),
-                    subscription.recv(&mut bytes, Some(Duration::from_millis(1))).is_none(),
-                    subscription.recv(&mut bytes, None).is_none(),
+                    subscription.recv(&mut bytes, Some(Duration::from_millis(1)))
+                        == Err(RecvError::Forked),
+                    subscription.recv(&mut bytes, None) == Err(RecvError::Forked),
                     !subscription.has_data() && subscription.matched().is_empty(),
                     publisher.matched().is_empty() && !publisher.wait_matched(1, PATIENCE),
                     session.daemon().is_none() && session.graph().endpoints.is_empty(),
@@ -363,7 +366,8 @@ fn a_forked_child_is_refused_by_whatever_it_asks_and_never_waits() {
                         .send_response(client.gid(), number, b"x")
                         .is_err_and(|e| e.to_string().contains("fork")),
                     server.take_request(&mut bytes).is_none() && !server.has_request(),
-                    client.recv_response(&mut bytes, None).is_none() && !client.is_available(),
+                    client.recv_response(&mut bytes, None) == Err(RecvError::Forked)
+                        && !client.is_available(),
                     !matched.is_ready() && !lost.is_ready(),
                     matches!(matched.take(), EventStatus::Matched(status) if status.total == 0),
                     publisher.assert_liveliness().is_err_and(|e| e.to_string().contains("fork")),
@@ -385,8 +389,8 @@ fn a_forked_child_is_refused_by_whatever_it_asks_and_never_waits() {
         over.store(true, Ordering::Relaxed);
     });
     publisher.publish(b"x").unwrap();
-    assert!(subscription.recv(&mut Vec::new(), Some(PATIENCE)).is_some());
-    assert!(server.recv_request(&mut Vec::new(), Some(PATIENCE)).is_some());
+    assert!(subscription.recv(&mut Vec::new(), Some(PATIENCE)).is_ok());
+    assert!(server.recv_request(&mut Vec::new(), Some(PATIENCE)).is_ok());
     assert!(matched.is_ready() && !guard.is_triggered());
 }
 
@@ -481,7 +485,7 @@ fn a_session_may_end_while_its_endpoints_wait() {
         thread::scope(|scope| {
             let waiter = scope.spawn(move || subscription.recv(&mut Vec::new(), Some(PATIENCE)));
             scope.spawn(move || publisher.publish(b"x").unwrap());
-            assert!(waiter.join().unwrap().is_some());
+            assert!(waiter.join().unwrap().is_ok());
         });
     }
 }

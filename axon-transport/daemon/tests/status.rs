@@ -39,7 +39,7 @@ fn child() {
     }
     let end = std::thread::spawn(wait_for_the_end);
     while !end.is_finished() {
-        subscription.recv(&mut bytes, Some(std::time::Duration::from_millis(20)));
+        let _ = subscription.recv(&mut bytes, Some(std::time::Duration::from_millis(20)));
     }
 }
 

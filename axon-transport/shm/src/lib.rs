@@ -37,7 +37,10 @@ pub use direct::{
     subscriber::{Subscriber, SubscriberOptions},
 };
 pub use error::{Keeper, PublishError, ShmError, TakeError};
-pub use reader::sample::{Sample, SampleReader};
+pub use reader::{
+    sample::{Sample, SampleReader},
+    slice::{SampleSlice, TrustPublishers},
+};
 pub use ring::types::{Meta, Published};
 pub use session::leader::ExternalLeader;
 pub use writer::loan::Loan;

@@ -5,7 +5,38 @@ use std::{fmt, path::PathBuf};
 use axon_shm::ShmError;
 
 use super::daemon::address::AddressError;
-use crate::{config::ConfigError, wire::session::CodecError};
+use crate::{config::ConfigError, ids::SessionId, wire::session::CodecError};
+
+/// Why waiting for a message ended without one.
+///
+/// There is no variant for a session that is closed: an endpoint keeps its session open for as long as the
+/// endpoint lives, and a call that waits borrows the endpoint. A publisher that ends is no error either:
+/// another one may come.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum RecvError {
+    /// Nothing came within the timeout.
+    #[error("no message came within the timeout")]
+    TimedOut,
+    /// The process forked: the endpoint belongs to the parent.
+    #[error("used after fork: a child process must open a session of its own")]
+    Forked,
+    /// An event loop of the program's listens already (an [`ExternalLeader`](axon_shm::ExternalLeader)), so
+    /// that the session cannot wake tasks. Waiting in a thread works nevertheless.
+    #[error("session {0} already has an external leader of its waits, and cannot wake tasks")]
+    AlreadyLed(SessionId),
+}
+
+impl RecvError {
+    /// Why the control thread cannot listen.
+    pub(super) fn of_listening(error: &ShmError) -> Self {
+        match error {
+            ShmError::AlreadyLed(session) => Self::AlreadyLed(*session),
+            // The only other reason to refuse an external leader.
+            _ => Self::Forked,
+        }
+    }
+}
 
 /// Why a session could not be opened or used.
 ///

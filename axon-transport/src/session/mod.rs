@@ -29,6 +29,7 @@ mod rings;
 mod service;
 mod state;
 mod subscription;
+mod tasks;
 #[cfg(test)]
 mod tests;
 mod waiting;
@@ -41,7 +42,7 @@ use std::{
 
 pub use callback::OnNew;
 pub use daemon::{daemon_status, daemon_status_at};
-pub use error::SessionError;
+pub use error::{RecvError, SessionError};
 pub use events::Event;
 pub use guard::GuardCondition;
 pub use node::Node;
@@ -52,7 +53,8 @@ pub use remote_writer::{RemoteWriter, Written};
 pub use service::{Client, Server};
 pub use state::SessionEvent;
 pub(crate) use state::Shared;
-pub use subscription::{Lifetime, MessageInfo, Subscription};
+pub use subscription::{Lifetime, MessageInfo, Subscription, TrustedSubscription};
+pub use tasks::{CallError, Messages};
 pub use waiting::{Ready, Waitable};
 
 use crate::{

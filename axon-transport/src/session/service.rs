@@ -8,16 +8,13 @@
 
 use std::{fmt, sync::Arc, time::Duration};
 
-use axon_shm::{
-    Meta, PublishError, Sample, ShmError,
-    internal::{Reader, Writer},
-};
+use axon_shm::{Meta, PublishError, Sample, ShmError, internal::Writer};
 
 use super::{
-    MessageInfo, OnNew, Session, SessionError, clock,
+    MessageInfo, OnNew, RecvError, Session, SessionError, clock,
     publisher::PublisherInner,
     rings::RingsByClient,
-    subscription::{SubscriptionInner, recv_from, take_from, take_sample_from},
+    subscription::{SubscriptionInner, recv_from, take_bytes_from, take_sample_from},
 };
 use crate::{graph::Endpoint, ids::Gid};
 
@@ -52,15 +49,15 @@ pub struct Server {
 ///
 /// let number = client.send_request(b"1 + 2")?;
 /// let mut bytes = Vec::new();
-/// let request = server.recv_request(&mut bytes, None).expect("the request");
+/// let request = server.recv_request(&mut bytes, None)?;
 /// server.send_response(request.publisher, request.sequence, b"3")?;
-/// let response = client.recv_response(&mut bytes, None).expect("the response");
+/// let response = client.recv_response(&mut bytes, None)?;
 /// assert_eq!((response.sequence, &bytes[..]), (number, &b"3"[..]));
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 pub struct Client {
     requests: Arc<PublisherInner>,
-    ring: Arc<Writer>,
+    pub(super) ring: Arc<Writer>,
     pub(super) responses: Arc<SubscriptionInner>,
     pub(super) session: Session,
 }
@@ -88,22 +85,24 @@ impl Server {
     /// The next request, into `out`, which it replaces. `None` when there is none. What is known of
     /// it names the client, and the number that the response must carry.
     pub fn take_request(&self, out: &mut Vec<u8>) -> Option<MessageInfo> {
-        let take = |reader: &mut Reader| Ok(reader.take(out)?.map(|taken| (taken.meta, ())));
-        take_from(&self.requests, &self.session, take).map(|(info, ())| info)
+        take_bytes_from(&self.requests, self.session.shared(), out)
     }
 
     /// As [`take_request`](Self::take_request), in place, as
     /// [`Subscription::take_sample`](super::Subscription::take_sample).
     pub fn take_request_sample(&self) -> Option<(MessageInfo, Sample)> {
-        take_sample_from(&self.requests, &self.session)
+        take_sample_from(&self.requests, self.session.shared())
     }
 
     /// As [`take_request`](Self::take_request), after waiting for at most `timeout`.
+    ///
+    /// # Errors
+    /// [`RecvError::TimedOut`], and [`RecvError::Forked`] in a forked child.
     pub fn recv_request(
         &self,
         out: &mut Vec<u8>,
         timeout: Option<Duration>,
-    ) -> Option<MessageInfo> {
+    ) -> Result<MessageInfo, RecvError> {
         recv_from(&self.requests, &self.session, timeout, || self.take_request(out))
     }
 
@@ -241,22 +240,24 @@ impl Client {
     /// The next response, into `out`, which it replaces. `None` when there is none. What is known of
     /// it names the server, and the number of the request that it answers.
     pub fn take_response(&self, out: &mut Vec<u8>) -> Option<MessageInfo> {
-        let take = |reader: &mut Reader| Ok(reader.take(out)?.map(|taken| (taken.meta, ())));
-        take_from(&self.responses, &self.session, take).map(|(info, ())| info)
+        take_bytes_from(&self.responses, self.session.shared(), out)
     }
 
     /// As [`take_response`](Self::take_response), in place, as
     /// [`Subscription::take_sample`](super::Subscription::take_sample).
     pub fn take_response_sample(&self) -> Option<(MessageInfo, Sample)> {
-        take_sample_from(&self.responses, &self.session)
+        take_sample_from(&self.responses, self.session.shared())
     }
 
     /// As [`take_response`](Self::take_response), after waiting for at most `timeout`.
+    ///
+    /// # Errors
+    /// [`RecvError::TimedOut`], and [`RecvError::Forked`] in a forked child.
     pub fn recv_response(
         &self,
         out: &mut Vec<u8>,
         timeout: Option<Duration>,
-    ) -> Option<MessageInfo> {
+    ) -> Result<MessageInfo, RecvError> {
         recv_from(&self.responses, &self.session, timeout, || self.take_response(out))
     }
 

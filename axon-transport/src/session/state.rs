@@ -13,7 +13,7 @@ use std::{
 };
 
 use axon_shm::{
-    ExternalLeader, ShmError,
+    ShmError,
     internal::{SegmentEvent, SessionSegment},
 };
 
@@ -24,6 +24,7 @@ use super::{
     publisher::PublisherInner,
     rings::Room,
     subscription::SubscriptionInner,
+    tasks::Listening,
 };
 use crate::{
     config::Config,
@@ -62,8 +63,8 @@ pub(crate) struct Shared {
     pub(crate) stopping: AtomicBool,
     /// The control thread, once it runs.
     pub(super) control: OnceLock<ThreadId>,
-    /// By which the control thread hears of samples, and for how many subscriptions it does.
-    listening: Mutex<(usize, Option<Arc<ExternalLeader>>)>,
+    /// By what the control thread hears of samples, and for whom.
+    pub(super) listening: Listening,
     pub(super) listener: Mutex<Option<Listener>>,
     /// One status request at a time.
     pub(super) asking: Mutex<()>,
@@ -332,7 +333,7 @@ impl Shared {
             memory,
             stopping: AtomicBool::new(false),
             control: OnceLock::new(),
-            listening: Mutex::default(),
+            listening: Listening::default(),
             listener: Mutex::new(None),
             asking: Mutex::new(()),
             own_pairs: Mutex::default(),
@@ -374,32 +375,17 @@ impl Shared {
 
     /// Has the control thread listen for samples on behalf of one subscription more.
     pub(super) fn listen(&self) -> Result<(), ShmError> {
-        let mut listening = self.listening.lock().unwrap_or_else(PoisonError::into_inner);
-        if listening.1.is_none() {
-            listening.1 = Some(Arc::new(self.segment.external_leader()?));
+        if self.listening.begin_callback(&self.segment)? {
+            self.wake();
         }
-        listening.0 += 1;
-        drop(listening);
-        self.wake();
         Ok(())
     }
 
     /// One subscription has nobody any more who would hear.
     pub(super) fn listen_no_more(&self) {
-        let mut listening = self.listening.lock().unwrap_or_else(PoisonError::into_inner);
-        listening.0 -= 1;
-        drop(listening);
-        self.wake();
-    }
-
-    /// For the control thread, which has nothing left of what this gave it before.
-    pub(super) fn listening(&self) -> Option<Arc<ExternalLeader>> {
-        let mut listening = self.listening.lock().unwrap_or_else(PoisonError::into_inner);
-        if listening.0 == 0 {
-            // Here, where it ends at once: whoever listens next would find that one leads still.
-            listening.1 = None;
+        if self.listening.end_callback() {
+            self.wake();
         }
-        listening.1.clone()
     }
 
     /// Has those who wait look again then.

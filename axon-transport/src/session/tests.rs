@@ -265,7 +265,7 @@ fn memory_that_comes_with_a_repeated_grant_wakes_who_waits_for_it() {
         daemon.say(Message::Grant(granted), &[descriptor.as_fd()]);
         reader.join().unwrap()
     });
-    assert_eq!(received.map(|info| info.sequence), Some(1));
+    assert_eq!(received.map(|info| info.sequence), Ok(1));
     assert!(start.elapsed() < EVER, "a wake-up was lost");
 }
 

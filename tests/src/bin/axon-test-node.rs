@@ -127,7 +127,7 @@ fn subscribe(
     let (mut bytes, mut expected) = (Vec::new(), Vec::new());
     let (mut tally, mut told, mut reported) = (Tally::default(), Tally::default(), Instant::now());
     while stdin.try_recv() != Err(TryRecvError::Disconnected) {
-        if let Some(info) = subscription.recv(&mut bytes, Some(REPORT / 2)) {
+        if let Ok(info) = subscription.recv(&mut bytes, Some(REPORT / 2)) {
             tally.count(sizes, info.sequence, &bytes, &mut expected);
         }
         if reported.elapsed() >= REPORT {
@@ -152,11 +152,11 @@ fn serve(
     Word::Ready.say()?;
     let mut bytes = Vec::new();
     for _ in 0..count {
-        let request = server.recv_request(&mut bytes, Some(PATIENCE)).ok_or("no request")?;
+        let request = server.recv_request(&mut bytes, Some(PATIENCE))?;
         bytes.reverse();
         server.send_response(request.publisher, request.sequence, &bytes)?;
     }
-    server.recv_request(&mut bytes, Some(PATIENCE)).ok_or("no further request")?;
+    server.recv_request(&mut bytes, Some(PATIENCE))?;
     Word::Sent(count).say()?;
     while stdin.recv().is_ok() {}
     Ok(())

@@ -44,7 +44,7 @@ fn publish(publisher: &Publisher, samples: u64) {
 fn take(subscription: &Subscription, last: u64) -> Vec<u64> {
     let (mut bytes, mut numbers) = (Vec::new(), Vec::new());
     while numbers.last() != Some(&last) {
-        let Some(info) = subscription.recv(&mut bytes, Some(PATIENCE)) else { break };
+        let Ok(info) = subscription.recv(&mut bytes, Some(PATIENCE)) else { break };
         numbers.push(info.sequence);
     }
     numbers

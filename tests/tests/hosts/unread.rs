@@ -77,7 +77,7 @@ fn a_peer_that_reads_nothing_is_disconnected_from_the_topic_and_the_publisher_go
     until("it is served", || publisher.matched().len() == 2);
     let reader = thread::spawn(move || {
         let mut bytes = Vec::new();
-        while let Some(info) = local.recv(&mut bytes, Some(PATIENCE)) {
+        while let Ok(info) = local.recv(&mut bytes, Some(PATIENCE)) {
             if bytes.is_empty() {
                 return info.sequence;
             }

@@ -153,7 +153,7 @@ fn read(channel: &Channel, settings: &Settings, topic: &str, flow: Flow) -> Resu
     channel.tell(&())?;
     let mut bytes = Vec::new();
     count(|| {
-        subscription.recv(&mut bytes, Some(PATIENCE)).ok_or("the stream does not end")?;
+        subscription.recv(&mut bytes, Some(PATIENCE)).map_err(|_| "the stream does not end")?;
         let [first, last] = [bytes.first_chunk(), bytes.last_chunk()];
         agree(*first.ok_or("too short")?, *last.ok_or("too short")?)
     })

@@ -136,7 +136,7 @@ fn child() {
             let (mut number, mut last, mut bytes) = (first, None, Vec::new());
             while last != Some(number) {
                 let nap = Some(Duration::from_millis(20));
-                if let Some(info) = subscription.recv(&mut bytes, nap) {
+                if let Ok(info) = subscription.recv(&mut bytes, nap) {
                     assert_eq!(info.sequence, number + 1, "a gap or a repetition");
                     assert_eq!(bytes, info.sequence.to_le_bytes());
                     number += 1;
@@ -234,7 +234,7 @@ fn an_endpoint_that_ends_while_there_is_no_daemon_is_gone_for_its_peers() {
     until("the publisher heard of it", || !publisher.matched().contains(&gid));
     assert_eq!(publisher.matched(), [other.gid()]);
     let mut bytes = Vec::new();
-    assert!(other.recv(&mut bytes, Some(PATIENCE)).is_some());
+    assert!(other.recv(&mut bytes, Some(PATIENCE)).is_ok());
     assert_eq!(bytes, b"still");
     publisher.publish(b"again").unwrap();
     assert_eq!(other.recv(&mut bytes, Some(PATIENCE)).unwrap().sequence, 2);
@@ -448,7 +448,7 @@ fn a_gateway_that_panics_is_started_again_and_nobody_else_notices() {
         let subscription = other.create_subscription(spec("/t")).unwrap();
         assert!(subscription.wait_matched(1, PATIENCE) && publisher.wait_matched(1, PATIENCE));
         publisher.publish(b"x").unwrap();
-        assert!(subscription.recv(&mut Vec::new(), Some(PATIENCE)).is_some());
+        assert!(subscription.recv(&mut Vec::new(), Some(PATIENCE)).is_ok());
         drop(subscription);
         until("the reader is gone", || publisher.matched().is_empty());
     }

@@ -254,7 +254,7 @@ fn a_process_that_ends_hands_over_to_the_next_daemon() {
     let mut taken = 0;
     while taken + lost < LEFT {
         let info = subscription.recv(&mut bytes, Some(PATIENCE));
-        let info = info.unwrap_or_else(|| panic!("{taken} arrived and {lost} were counted"));
+        let info = info.unwrap_or_else(|e| panic!("{e}: {taken} arrived and {lost} were counted"));
         taken += 1;
         assert_eq!((info.sequence, &bytes), (taken, &pattern(taken, 500)));
     }

@@ -67,7 +67,7 @@ fn beside_relayed(name: &str, test: impl Fn(&Session, &Host)) {
 
 pub(crate) fn nothing_more(client: &Client) {
     let mut bytes = Vec::new();
-    assert!(client.recv_response(&mut bytes, Some(Duration::from_millis(20))).is_none());
+    assert!(client.recv_response(&mut bytes, Some(Duration::from_millis(20))).is_err());
 }
 
 #[test]

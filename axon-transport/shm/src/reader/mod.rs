@@ -2,6 +2,7 @@
 
 mod find;
 pub(crate) mod sample;
+pub(crate) mod slice;
 mod under_way;
 
 use std::{

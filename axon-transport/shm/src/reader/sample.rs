@@ -28,7 +28,8 @@ use crate::{
 ///
 /// A publisher in another process that does not keep to the protocol can still change the bytes.
 /// They are therefore read as values ([`read_at`](Self::read_at), [`copy_to`](Self::copy_to),
-/// [`reader`](Self::reader)), and as a slice only where the caller vouches for the publisher.
+/// [`reader`](Self::reader)), and as a slice only where the caller
+/// [vouches for the publisher](Self::into_slice).
 ///
 /// What is read in place borrows the sample:
 ///
@@ -110,6 +111,12 @@ impl Sample {
     #[inline]
     pub fn is_borrowed(&self) -> bool {
         matches!(self.data, Data::Pinned { .. })
+    }
+
+    /// Whether this is a forked child, which has no share in it.
+    #[inline]
+    pub(super) fn is_forked(&self) -> bool {
+        matches!(&self.data, Data::Pinned { pin, .. } if pin.attachment().lane.is_forked())
     }
 
     /// Copies bytes from `at` on to the front of `out`, as many as there are and fit, and returns

@@ -13,6 +13,7 @@ mod mutation;
 mod pins;
 mod processes;
 mod samples;
+mod slices;
 mod wire;
 
 use std::{

@@ -18,6 +18,7 @@ use crate::{
         clock,
         events::{Changes, EndpointEvents},
         state::Shared,
+        tasks::{Calls, Wakers},
     },
     wire::session::EndpointRole,
 };
@@ -44,8 +45,12 @@ pub(in crate::session) struct SubscriptionInner {
     stands_for: Mutex<Vec<Gid>>,
     slots: Mutex<Slots>,
     arrived: Callback,
-    /// Whether the control thread listens for it.
+    /// Whether the control thread listens for its callback.
     listens: Mutex<bool>,
+    /// The tasks that wait for a message.
+    pub(in crate::session) wakers: Wakers,
+    /// Of a client: the requests whose responses tasks wait for.
+    pub(in crate::session) calls: Calls,
 }
 
 impl SubscriptionInner {
@@ -83,6 +88,8 @@ impl SubscriptionInner {
             slots: slots.into(),
             arrived: Callback::default(),
             listens: Mutex::new(false),
+            wakers: Wakers::default(),
+            calls: Calls::default(),
         }
     }
 
@@ -117,7 +124,7 @@ impl SubscriptionInner {
         let _ = self.listen(false, shared);
     }
 
-    /// Has the control thread listen for it, or not any more.
+    /// Has the control thread listen for its callback, or not any more.
     fn listen(&self, whether: bool, shared: &Shared) -> Result<(), ShmError> {
         let mut listens = lock(&self.listens);
         match (*listens, whether) {

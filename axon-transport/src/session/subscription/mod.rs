@@ -3,6 +3,7 @@
 mod inner;
 mod slots;
 mod taking;
+mod trusted;
 
 use std::{
     fmt,
@@ -16,14 +17,15 @@ use axon_shm::{
 };
 
 use self::slots::Slots;
+pub use self::trusted::TrustedSubscription;
 pub(super) use self::{
     inner::SubscriptionInner,
     slots::{Accept, Asking, Numbers},
 };
 use super::{
-    OnNew, Session, SessionError, clock,
+    OnNew, RecvError, Session, SessionError, clock,
     events::{Event, Source},
-    state::Outgoing,
+    state::{Outgoing, Shared},
 };
 use crate::{
     events::EventKind,
@@ -97,19 +99,26 @@ impl Subscription {
     /// Clocks are taken at their word. Where KEEP_LAST's depth passes samples over, they are those
     /// with the oldest timestamps: a publisher whose clock is ahead has the others' passed over.
     pub fn take(&self, out: &mut Vec<u8>) -> Option<MessageInfo> {
-        let take = |reader: &mut Reader| Ok(reader.take(out)?.map(|taken| (taken.meta, ())));
-        take_from(&self.inner, &self.session, take).map(|(info, ())| info)
+        take_bytes_from(&self.inner, self.session.shared(), out)
     }
 
     /// As [`take`](Self::take), but a sample of more than 4 KiB, or a loan of more than 512 bytes whose
     /// publisher [expects](super::EndpointSpec::expected_len) so many, stays in the publisher's memory
     /// for as long as it is kept, unless `AXON_SHM_COPY` asks for copies.
     pub fn take_sample(&self) -> Option<(MessageInfo, Sample)> {
-        take_sample_from(&self.inner, &self.session)
+        take_sample_from(&self.inner, self.session.shared())
     }
 
-    /// As [`take`](Self::take), after waiting for a sample for at most `timeout`.
-    pub fn recv(&self, out: &mut Vec<u8>, timeout: Option<Duration>) -> Option<MessageInfo> {
+    /// As [`take`](Self::take), after waiting for a sample for at most `timeout`; without end where it is
+    /// `None`.
+    ///
+    /// # Errors
+    /// [`RecvError::TimedOut`], and [`RecvError::Forked`] in a forked child.
+    pub fn recv(
+        &self,
+        out: &mut Vec<u8>,
+        timeout: Option<Duration>,
+    ) -> Result<MessageInfo, RecvError> {
         recv_from(&self.inner, &self.session, timeout, || self.take(out))
     }
 
@@ -204,10 +213,10 @@ impl Drop for Subscription {
 /// The oldest of what one may take, in place.
 pub(super) fn take_sample_from(
     inner: &SubscriptionInner,
-    session: &Session,
+    shared: &Shared,
 ) -> Option<(MessageInfo, Sample)> {
-    let copy = session.shared().config.shm_copy;
-    take_from(inner, session, |reader| {
+    let copy = shared.config.shm_copy;
+    take_from(inner, shared, |reader| {
         let sample = if copy { reader.take_copy() } else { reader.take_sample() };
         Ok(sample?.map(|sample| (sample.meta(), sample)))
     })
@@ -216,10 +225,20 @@ pub(super) fn take_sample_from(
 /// The oldest of what one may take.
 pub(super) fn take_from<T>(
     inner: &SubscriptionInner,
-    session: &Session,
+    shared: &Shared,
     take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
 ) -> Option<(MessageInfo, T)> {
-    take_with(inner, session, |slots| slots.take(take, inner))
+    take_with(inner, shared, |slots| slots.take(take, inner))
+}
+
+/// The same as bytes, into `out`, which it replaces.
+pub(super) fn take_bytes_from(
+    inner: &SubscriptionInner,
+    shared: &Shared,
+    out: &mut Vec<u8>,
+) -> Option<MessageInfo> {
+    let take = |reader: &mut Reader| Ok(reader.take(out)?.map(|taken| (taken.meta, ())));
+    take_from(inner, shared, take).map(|(info, ())| info)
 }
 
 /// The next of one writer, as bytes.
@@ -230,17 +249,18 @@ pub(super) fn take_of(
 ) -> Option<(MessageInfo, Vec<u8>)> {
     let mut out = Vec::new();
     let take = |reader: &mut Reader| Ok(reader.take(&mut out)?.map(|taken| (taken.meta, ())));
-    let (info, ()) = take_with(inner, session, |slots| slots.take_of(writer, take, inner))?;
+    let shared = session.shared();
+    let (info, ()) = take_with(inner, shared, |slots| slots.take_of(writer, take, inner))?;
     Some((info, out))
 }
 
 fn take_with<T>(
     inner: &SubscriptionInner,
-    session: &Session,
+    shared: &Shared,
     take: impl FnOnce(&mut Slots) -> Option<(MessageInfo, T)>,
 ) -> Option<(MessageInfo, T)> {
     // A thread of the parent may have held the lock when this process was forked.
-    if session.is_forked() {
+    if shared.segment.is_forked() {
         tracing::error!("an endpoint of the parent process is used after fork");
         return None;
     }
@@ -251,12 +271,12 @@ fn take_with<T>(
     let again = if taken.is_none() { slots.look_again() } else { None };
     drop(slots);
     if let Some(again) = again {
-        session.shared().look_again(again);
+        shared.look_again(again);
     }
     inner.events.lost(lost);
     for writer in gone {
         let detach = Message::Detach(Pair { reader: inner.endpoint.gid, writer });
-        session.shared().tell(Outgoing::Message(Box::new(detach)));
+        shared.tell(Outgoing::Message(Box::new(detach)));
     }
     taken
 }
@@ -267,15 +287,15 @@ pub(super) fn recv_from<T>(
     session: &Session,
     timeout: Option<Duration>,
     mut take: impl FnMut() -> Option<T>,
-) -> Option<T> {
+) -> Result<T, RecvError> {
     let mut begun = None;
     loop {
         // Nothing comes to a forked child, however long it waits.
         if session.is_forked() {
-            return None;
+            return Err(RecvError::Forked);
         }
         if let Some(taken) = take() {
-            return Some(taken);
+            return Ok(taken);
         }
         // What is there already is taken without a look at the clock.
         let now = Instant::now();
@@ -284,7 +304,7 @@ pub(super) fn recv_from<T>(
         let look = || -> Arc<dyn Look> { inner.clone() };
         let over = left.is_some_and(|left| left.is_zero());
         if over || !session.segment().wait_for(|| inner.has_data(), &look, left) {
-            return None;
+            return Err(RecvError::TimedOut);
         }
     }
 }

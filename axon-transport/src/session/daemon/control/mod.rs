@@ -346,7 +346,7 @@ impl Control {
             let waits = if self.outbox.is_empty() { PollFlags::empty() } else { PollFlags::OUT };
             fds.push(PollFd::new(socket, PollFlags::IN | waits));
         }
-        let listening = self.shared.listening();
+        let (listening, until) = self.shared.listening.leader();
         if let Some(listening) = &listening {
             fds.push(PollFd::new(listening, PollFlags::IN));
             self.tell_arrived(listening);
@@ -357,7 +357,13 @@ impl Control {
         let nap = blocked.then_some(Duration::from_millis(20));
         let tend = self.tend.filter(|_| self.is_linked());
         let again = self.look_again();
-        let due = tend.into_iter().chain(self.retry).chain(self.arrivals.due()).chain(again).min();
+        let due = tend
+            .into_iter()
+            .chain(self.retry)
+            .chain(self.arrivals.due())
+            .chain(again)
+            .chain(until)
+            .min();
         let due = due.map(|due| due.saturating_duration_since(Instant::now()));
         let timeout = nap.into_iter().chain(due).chain(self.until_alarm()).min();
         let timeout = timeout.and_then(|timeout| Timespec::try_from(timeout).ok());
@@ -366,12 +372,19 @@ impl Control {
         let _ = rustix::io::read(&self.shared.wake, &mut count);
     }
 
-    /// Tells those who want to hear of samples as they come. What comes later rings.
+    /// Tells callbacks and tasks of samples that came. What comes later rings, unless all tasks were woken
+    /// and there is no callback: a task arms a ticket of its own before it sleeps again.
     fn tell_arrived(&self, listening: &ExternalLeader) {
         listening.clear();
-        listening.arm(false);
         let (_, subscriptions) = self.endpoints();
-        subscriptions.iter().for_each(|subscription| subscription.tell_arrived());
+        // All are woken: it must not end with the first whose tasks wait.
+        let wake_tasks =
+            || subscriptions.iter().filter(|of| of.wake_tasks(&self.shared)).count() > 0;
+        if self.shared.listening.has_callbacks() || wake_tasks() {
+            listening.arm(false);
+            subscriptions.iter().for_each(|subscription| subscription.tell_arrived());
+            wake_tasks();
+        }
     }
 
     fn receive(&mut self) {

@@ -1,0 +1,104 @@
+//! The examples of axon-transport do what they say.
+
+#[allow(dead_code, reason = "not every test needs all of it")]
+mod support;
+
+use std::{
+    ffi::OsStr,
+    fs,
+    path::{Path, PathBuf},
+    process::{Command, Stdio},
+    sync::Once,
+    time::SystemTime,
+};
+
+use support::{Host, Kept};
+
+const EXAMPLES: [&str; 6] = ["session", "service", "wait_set", "loan", "two_hosts", "tokio"];
+
+/// The program of an example. `cargo test` builds the examples of the whole workspace; where only this test is
+/// asked for, they are built here.
+fn example(name: &str) -> PathBuf {
+    static BUILT: Once = Once::new();
+    let test = std::env::current_exe().unwrap();
+    let profile = test.parent().and_then(Path::parent).unwrap();
+    let program = |name: &str| profile.join("examples").join(name);
+    BUILT.call_once(|| {
+        let package = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+        let source = ["src", "shm/src", "examples"].map(|part| newest(&package.join(part)));
+        let built =
+            |name: &&str| fs::metadata(program(name)).and_then(|facts| facts.modified()).ok();
+        if EXAMPLES.iter().all(|name| built(name) >= source.into_iter().max()) {
+            return;
+        }
+        let mut cargo = Command::new(env!("CARGO"));
+        cargo.args(["build", "--offline", "-p", "axon-transport"]);
+        for name in EXAMPLES {
+            cargo.args(["--example", name]);
+        }
+        cargo.arg("--target-dir").arg(profile.parent().unwrap());
+        if profile.file_name() == Some(OsStr::new("release")) {
+            cargo.arg("--release");
+        }
+        assert!(cargo.status().unwrap().success(), "{cargo:?}");
+    });
+    program(name)
+}
+
+/// When the newest file in a directory was changed.
+fn newest(directory: &Path) -> SystemTime {
+    let entries = fs::read_dir(directory).unwrap().map(|entry| entry.unwrap().path());
+    let times = entries.map(|path| match path.is_dir() {
+        true => newest(&path),
+        false => fs::metadata(&path).unwrap().modified().unwrap(),
+    });
+    times.max().unwrap()
+}
+
+/// What a command prints that must succeed.
+fn run(command: &mut Command) -> String {
+    let output = command.stderr(Stdio::inherit()).output().unwrap();
+    let printed = String::from_utf8(output.stdout).unwrap();
+    assert!(output.status.success(), "{command:?}: {}\n{printed}", output.status);
+    printed
+}
+
+#[test]
+fn those_of_one_process_need_no_daemon() {
+    // Where no daemon could be started.
+    let host = Host::new().with("AXON_DAEMON_PATH", "/dev/null");
+    let printed = |name| run(&mut host.command(example(name)));
+    assert_eq!(printed("service"), "17 bytes\n");
+    assert_eq!(printed("wait_set"), "speed: 1.5 m/s\nhalt: at once\n");
+    assert_eq!(printed("loan"), "image 1: 307200 bytes, mean 120.0\n");
+    assert_eq!(printed("tokio"), "POST\nQUANTUM\n");
+}
+
+#[test]
+fn the_session_uses_the_daemon_of_its_user() {
+    let host = Host::new().with("AXON_DAEMON", "require");
+    let _daemon = host.daemon();
+    let printed = run(&mut host.command(example("session")));
+    assert_eq!(printed, "1: greeting 1\n2: greeting 2\n3: greeting 3\n");
+}
+
+#[test]
+fn the_two_hosts_meet() {
+    let pid = std::process::id();
+    let address = |host: u32| format!("127.{}.{}.{host}", 230 + pid / 250 % 20, 1 + pid % 250);
+    // Below 100: other tests' daemons are above.
+    let domain = (1 + pid % 98).to_string();
+    let hosts = [1, 2].map(|host| {
+        Host::new()
+            .without("ROS_AUTOMATIC_DISCOVERY_RANGE")
+            .with("AXON_BIND_ADDRS", &address(host))
+            .with("AXON_DAEMON_PEERS", &address(3 - host))
+            .with("ROS_DOMAIN_ID", &domain)
+            .with("AXON_DAEMON", "require")
+    });
+    let _daemons = hosts.each_ref().map(Host::daemon);
+    let [talker, listener] = hosts.each_ref().map(|host| host.command(example("two_hosts")));
+    let mut talking = { talker }.arg("talk").stdout(Stdio::null()).spawn().map(Kept).unwrap();
+    assert_eq!(run({ listener }.arg("listen")), "heard hello 1\nheard hello 2\nheard hello 3\n");
+    assert!(talking.0.wait().unwrap().success());
+}

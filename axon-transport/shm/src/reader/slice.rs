@@ -1,0 +1,123 @@
+//! A sample as a slice, for a caller that trusts its publishers.
+
+#![allow(unsafe_code)]
+
+use std::{fmt, ops::Deref};
+
+use super::sample::Sample;
+use crate::ring::types::Meta;
+
+/// The caller's word that publishers do not write to a sample that is being read. It is given once, and turns
+/// samples into [slices](Sample::into_slice) without further `unsafe`.
+///
+/// ```
+/// use axon_shm::TrustPublishers;
+///
+/// // SAFETY: only our own programs publish to what this one reads, over this crate, and this one forks no child.
+/// let trust = unsafe { TrustPublishers::new() };
+/// # let _ = trust;
+/// ```
+#[derive(Clone, Copy, Debug)]
+pub struct TrustPublishers(());
+
+impl TrustPublishers {
+    /// Trusts the publishers of all samples that are turned into slices by this value or a copy of it.
+    ///
+    /// # Safety
+    /// As long as such a slice is in use, nobody may write to its bytes. They are in memory that another process
+    /// has mapped for writing, as the bytes of a memory-mapped file are. A reader is told nothing of a write,
+    /// and a write to bytes behind a `&[u8]` is undefined behaviour: what was checked need not be true any more. So
+    ///
+    /// - the process of each publisher keeps to the protocol. What this crate publishes does, in whatever
+    ///   version and also where its process is killed: a sample that is pinned is not written to. A process
+    ///   that was taken over, or that overwrites memory by mistake, need not. Where samples come through an AXON
+    ///   daemon, it is one of the publishers.
+    /// - no `&[u8]` that was borrowed from such a slice before a fork is used in the child, where the memory is
+    ///   not mapped. Borrowed there, it is empty.
+    ///
+    /// The memory cannot be truncated, unlike a file's: it is sealed, so that reading it raises no signal.
+    #[must_use]
+    pub const unsafe fn new() -> Self {
+        Self(())
+    }
+}
+
+/// The bytes of a [`Sample`] in place: a `&[u8]` wherever one is asked for.
+///
+/// It keeps the sample from being overwritten, as the [`Sample`] does that it was made of. In a forked child it is
+/// empty.
+pub struct SampleSlice {
+    sample: Sample,
+}
+
+impl Sample {
+    /// Its bytes in place, for a caller that trusts its publisher. Nothing is copied.
+    #[must_use]
+    pub fn into_slice(self, _trust: TrustPublishers) -> SampleSlice {
+        SampleSlice { sample: self }
+    }
+}
+
+impl SampleSlice {
+    /// What goes with it.
+    pub fn meta(&self) -> Meta {
+        self.sample.meta()
+    }
+
+    /// The sample, to be read as values.
+    pub fn sample(&self) -> &Sample {
+        &self.sample
+    }
+
+    /// Back to the sample.
+    pub fn into_sample(self) -> Sample {
+        self.sample
+    }
+}
+
+impl Deref for SampleSlice {
+    type Target = [u8];
+
+    #[inline]
+    fn deref(&self) -> &[u8] {
+        if self.sample.is_forked() {
+            return &[];
+        }
+        // SAFETY: a value of this type is made by `into_slice` only, for which a `TrustPublishers` was given:
+        // its maker vouches that nobody writes to the sample, and that what is borrowed here is not used in a
+        // child that is forked later. This process is no such child.
+        unsafe { self.sample.as_slice() }
+    }
+}
+
+impl AsRef<[u8]> for SampleSlice {
+    fn as_ref(&self) -> &[u8] {
+        self
+    }
+}
+
+impl fmt::Debug for SampleSlice {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("SampleSlice").field(&self.sample).finish()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ring::types::Taken;
+
+    #[test]
+    fn a_copied_sample_is_a_slice_of_its_own_bytes() {
+        let taken =
+            Taken { meta: Meta { sequence: 1, source_timestamp: 2, published: 3 }, position: 0 };
+        // SAFETY: the sample has its bytes to itself.
+        let trust = unsafe { TrustPublishers::new() };
+        for bytes in [&b""[..], b"x", b"several"] {
+            let slice = Sample::copied(taken, bytes.to_vec()).into_slice(trust);
+            assert_eq!((&slice[..], slice.meta()), (bytes, taken.meta));
+            assert_eq!(slice.as_ref().as_ptr(), slice.sample().as_ptr());
+            assert_eq!(slice.into_sample().len(), bytes.len());
+        }
+    }
+}

@@ -1,0 +1,151 @@
+//! Whether the control thread listens on the session's doorbell, and for whom.
+
+use std::{
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::{Duration, Instant},
+};
+
+use axon_shm::{ExternalLeader, ShmError, internal::SessionSegment};
+
+use crate::session::{error::RecvError, state::Shared};
+
+/// How long it still listens after the last task: most tasks wait again, and each end and begin costs several
+/// system calls.
+const LINGER: Duration = Duration::from_secs(1);
+
+/// By what the control thread hears of samples, and who wants it to.
+#[derive(Default)]
+pub(in crate::session) struct Listening {
+    state: Mutex<State>,
+}
+
+#[derive(Default)]
+struct State {
+    /// Subscriptions with a callback, and waits of other sessions. Each ring is answered for these.
+    callbacks: usize,
+    /// Futures that wait, and streams that may wait again. These arm a ticket when they wait.
+    tasks: usize,
+    leader: Option<Arc<ExternalLeader>>,
+    /// When it ends, unless somebody wants it then. The control thread has a look at that time.
+    until: Option<Instant>,
+}
+
+impl Listening {
+    /// Begins for a callback. Whether that is news for the control thread.
+    pub(in crate::session) fn begin_callback(
+        &self,
+        segment: &Arc<SessionSegment>,
+    ) -> Result<bool, ShmError> {
+        let mut state = self.lock();
+        let new = state.lead(segment)?;
+        state.callbacks += 1;
+        // For a thread that is asleep already, having armed no ticket since the last one was used up.
+        state.arm();
+        Ok(new)
+    }
+
+    /// A callback ended. Whether that is news for the control thread.
+    pub(in crate::session) fn end_callback(&self) -> bool {
+        let mut state = self.lock();
+        state.callbacks -= 1;
+        let idle = state.is_idle();
+        if idle {
+            state.until = Some(Instant::now());
+        }
+        idle
+    }
+
+    fn begin_task(&self, segment: &Arc<SessionSegment>) -> Result<bool, ShmError> {
+        let mut state = self.lock();
+        let new = state.lead(segment)?;
+        state.tasks += 1;
+        Ok(new)
+    }
+
+    /// A task ended. Whether that is news for the control thread: no, if it looks soon anyway.
+    fn end_task(&self) -> bool {
+        let mut state = self.lock();
+        state.tasks -= 1;
+        state.is_idle() && state.until.is_none()
+    }
+
+    /// Whatever comes from now on rings.
+    pub(super) fn arm(&self) {
+        self.lock().arm();
+    }
+
+    /// Whether somebody is to be told of whatever comes.
+    pub(in crate::session) fn has_callbacks(&self) -> bool {
+        self.lock().callbacks > 0
+    }
+
+    /// For the control thread, which has nothing left of what this gave it before: by what it listens, and when
+    /// it has to ask again.
+    pub(in crate::session) fn leader(&self) -> (Option<Arc<ExternalLeader>>, Option<Instant>) {
+        let mut state = self.lock();
+        if state.leader.is_none() {
+            return (None, None);
+        }
+        let now = Instant::now();
+        if state.is_idle() {
+            let until = *state.until.get_or_insert(now + LINGER);
+            if until <= now {
+                // Dropped here, under the lock: whoever listens next would find that one leads still.
+                state.leader = None;
+                state.until = None;
+            }
+        } else if state.until.is_some_and(|until| until <= now) {
+            state.until = None;
+        }
+        (state.leader.clone(), state.until)
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl State {
+    /// Makes sure that there is a leader. Whether it is a new one.
+    fn lead(&mut self, segment: &Arc<SessionSegment>) -> Result<bool, ShmError> {
+        let new = self.leader.is_none();
+        if new {
+            self.leader = Some(Arc::new(segment.external_leader()?));
+        }
+        Ok(new)
+    }
+
+    fn arm(&self) {
+        if let Some(leader) = &self.leader {
+            leader.arm(false);
+        }
+    }
+
+    fn is_idle(&self) -> bool {
+        self.callbacks + self.tasks == 0
+    }
+}
+
+/// Has the control thread listen for a task, until it is dropped.
+pub(super) struct Listener<'a> {
+    shared: &'a Shared,
+}
+
+impl<'a> Listener<'a> {
+    pub(super) fn new(shared: &'a Shared) -> Result<Self, RecvError> {
+        let begun = shared.listening.begin_task(&shared.segment);
+        if begun.map_err(|error| RecvError::of_listening(&error))? {
+            shared.wake();
+        }
+        Ok(Self { shared })
+    }
+}
+
+impl Drop for Listener<'_> {
+    fn drop(&mut self) {
+        // A forked child has none of the parent's locks.
+        if !self.shared.segment.is_forked() && self.shared.listening.end_task() {
+            self.shared.wake();
+        }
+    }
+}

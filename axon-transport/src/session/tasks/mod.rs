@@ -1,0 +1,42 @@
+//! Futures that wait for messages: for any runtime, and without a thread of their own.
+//!
+//! The session's control thread listens on the doorbell for them, as it does for callbacks, and wakes the tasks
+//! whose endpoint has something. A task does four things before it sleeps, in this order:
+//!
+//! 1. It has the control thread [listen](listening::Listener).
+//! 2. It puts its waker in the endpoint's [`Wakers`].
+//! 3. It [arms](listening::Listening::arm) a new ticket of the doorbell.
+//! 4. It looks for a message once more.
+//!
+//! No wake-up is lost. A writer publishes and then looks for an armed ticket; the doorbell's own protocol says
+//! that of a look that follows an arming, and a publication, one sees the other. So a message that step 4 does
+//! not find was published by a writer that finds the ticket of step 3, or a later one. If the ticket is still armed, the
+//! writer rings. The control thread takes each ring and then looks at the wakers, and step 2 came before the
+//! ring. If another message has used the ticket up, that message's ring is still to be answered: the control
+//! thread takes it, finds the waker of step 2, and looks whether its endpoint has something. Either it sees the message, or
+//! it arms a ticket before it looks again. It does so for as long as a waker is left whose endpoint has nothing.
+//!
+//! Wakers are woken and dropped under no lock: either may run anything, even drop the endpoint.
+
+mod calls;
+mod listening;
+mod receive;
+mod wakers;
+
+use super::{state::Shared, subscription::SubscriptionInner};
+
+pub use calls::CallError;
+pub(in crate::session) use calls::Calls;
+pub(in crate::session) use listening::Listening;
+pub use receive::Messages;
+pub(in crate::session) use wakers::Wakers;
+
+impl SubscriptionInner {
+    /// For the control thread: wakes the tasks for which something came. Whether some still wait, so that
+    /// whatever comes next must ring.
+    pub(in crate::session) fn wake_tasks(&self, shared: &Shared) -> bool {
+        let calls = self.calls.collect(self, shared);
+        let receivers = self.wakers.wake_if(|| self.has_data());
+        calls || receivers
+    }
+}
