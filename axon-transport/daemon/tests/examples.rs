@@ -52,7 +52,7 @@ fn newest(directory: &Path) -> SystemTime {
         true => newest(&path),
         false => fs::metadata(&path).unwrap().modified().unwrap(),
     });
-    times.max().unwrap()
+    times.max().unwrap_or(SystemTime::UNIX_EPOCH)
 }
 
 /// What a command prints that must succeed.
