@@ -197,6 +197,79 @@ async fn a_stuck_kme_holds_no_more_than_its_bounds_and_links_go_first() {
     assert!(event.answer.outcome.is_ok());
 }
 
+/// By the order of the answers: the first call would wait for half a minute.
+#[tokio::test(flavor = "multi_thread")]
+async fn request_does_not_wait_for_one_that_the_kme_never_answers() {
+    let network = network().await;
+    let dir = tempfile::tempdir().unwrap();
+    let (kme, mut events) =
+        Kme::start(&config(&network, "sae-a", dir.path()), UsedKeys::in_memory()).unwrap();
+    let sim = network.kme("kme-a").unwrap();
+    let (slave, purpose) = ("sae-b".to_owned(), Purpose::Bootstrap);
+    let for_a_link = Request::Enc { slave, number: 1, purpose };
+    for request in [enc(1), for_a_link] {
+        sim.inject(Fault::Silence, 1);
+        kme.submit(Origin::Sender(1), request.clone()).unwrap();
+        // The KME has the request, and says nothing to it.
+        while !sim.plans().is_empty() {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        kme.submit(Origin::Sender(2), request).unwrap();
+        let event = events.recv().await.unwrap();
+        assert_eq!(event.origin, Origin::Sender(2), "the first one's end was waited for");
+        assert!(event.answer.outcome.is_ok());
+    }
+}
+
+/// In time that stands still but for what is waited for: seconds are exact, and take none.
+#[tokio::test]
+async fn silent_kme_is_given_up_after_the_answer_limit_of_the_settings() {
+    let network = network().await;
+    let dir = tempfile::tempdir().unwrap();
+    let settings = config(&network, "sae-a", dir.path());
+    let sim = network.kme("kme-a").unwrap();
+    for seconds in [3, 7] {
+        let limit = Duration::from_secs(seconds);
+        let settings = QkdConfig { kme_answer_timeout: limit, ..settings.clone() };
+        let (kme, mut events) = Kme::start(&settings, UsedKeys::in_memory()).unwrap();
+        // There is a connection: time would pass while one is made.
+        kme.probe("sae-b").await.unwrap();
+        sim.inject(Fault::Silence, 1);
+        tokio::time::pause();
+        let begun = tokio::time::Instant::now();
+        kme.submit(Origin::Sender(0), enc(1)).unwrap();
+        let failure = events.recv().await.unwrap().answer.outcome.expect_err("silence");
+        let took = begun.elapsed();
+        tokio::time::resume();
+        assert_eq!(failure.kind, FailureKind::Ambiguous, "{failure}");
+        assert!(took.abs_diff(limit) < Duration::from_millis(50), "{took:?} and not {limit:?}");
+        sim.clear_faults();
+    }
+}
+
+/// As above. The kernel takes the connection, and nobody speaks TLS.
+#[tokio::test]
+async fn kme_that_takes_no_connection_is_given_up_after_the_connect_limit_of_the_settings() {
+    let network = network().await;
+    let dir = tempfile::tempdir().unwrap();
+    let settings = config(&network, "sae-a", dir.path());
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let kme_url = format!("https://{}", listener.local_addr().unwrap());
+    for seconds in [2, 5] {
+        let limit = Duration::from_secs(seconds);
+        let (kme_connect_timeout, kme_url) = (limit, kme_url.clone());
+        let settings = QkdConfig { kme_connect_timeout, kme_url, ..settings.clone() };
+        let (kme, _events) = Kme::start(&settings, UsedKeys::in_memory()).unwrap();
+        tokio::time::pause();
+        let begun = tokio::time::Instant::now();
+        let failure = kme.probe("sae-b").await.unwrap_err();
+        let took = begun.elapsed();
+        tokio::time::resume();
+        assert_eq!(failure.kind, FailureKind::Unreachable, "{failure}");
+        assert!(took.abs_diff(limit) < Duration::from_millis(50), "{took:?} and not {limit:?}");
+    }
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn events_end_when_the_last_handle_is_dropped() {
     let network = network().await;
