@@ -1159,10 +1159,11 @@ axon_ret_t axon_session_publisher_describe(struct axon_publisher_t publisher,
  * nanoseconds since the Unix epoch, or AXON_TIME_NOW. Its sequence number, from 1, is stored at
  * `sequence`, which may be null.
  *
- * Where the publisher and a subscription are both RELIABLE and KEEP_ALL, it may block for 100 ms for
- * room: AXON_RET_TIMEOUT where none came. Never else. AXON_RET_INVALID_ARGUMENT: the sample is longer
- * than `AXON_MAX_MESSAGE_MB` allows. AXON_RET_BAD_ALLOC: memory is short. A sample that was refused
- * has no number: nobody counts it lost.
+ * Where the publisher and a subscription are both RELIABLE and KEEP_ALL, it may block for 100 ms until
+ * the subscription makes room: AXON_RET_TIMEOUT where its history stayed full, AXON_RET_BAD_ALLOC where
+ * memory stayed short. Never else. AXON_RET_BAD_ALLOC: memory is short, or what loans and subscriptions
+ * hold fills that of the publisher. AXON_RET_INVALID_ARGUMENT: the sample is longer than
+ * `AXON_MAX_MESSAGE_MB` allows. A sample that was refused has no number: nobody counts it lost.
  *
  * # Safety
  * `data` points to `len` bytes, or is null and `len` 0; `sequence` is null or points to room for a

@@ -136,3 +136,22 @@ impl From<PublishError> for Failure {
 pub extern "C" fn axon_session_last_error() -> *const c_char {
     LAST.try_with(|last| last.borrow().as_ptr()).unwrap_or(ptr::null())
 }
+
+#[cfg(test)]
+mod tests {
+    use axon_shm::ids::Gid;
+
+    use super::*;
+
+    #[test]
+    fn only_a_full_history_is_a_timeout_of_publish() {
+        let code = |error: PublishError| Failure::from(error).code;
+        let reader = Gid([7; 16]);
+        assert_eq!(code(PublishError::Blocked { reader }), AXON_RET_TIMEOUT);
+        let short = PublishError::NoMemory { needed: 8, available: 0, keeper: None };
+        assert_eq!(code(short), AXON_RET_BAD_ALLOC);
+        assert_eq!(code(PublishError::Loaned { loans: 1 }), AXON_RET_BAD_ALLOC);
+        assert_eq!(code(PublishError::TooLarge { len: 2, max: 1 }), AXON_RET_INVALID_ARGUMENT);
+        assert_eq!(code(PublishError::Forked), AXON_RET_FORKED);
+    }
+}
