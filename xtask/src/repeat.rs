@@ -4,12 +4,14 @@ use std::collections::BTreeMap;
 use std::env;
 use std::fs::{self, File};
 use std::io;
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitStatus, Stdio};
+use std::process::{Command, ExitStatus, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use rustix::process::{Pid, Signal, kill_process_group};
 use serde_json::Value;
 
 type Result<T> = std::result::Result<T, String>;
@@ -119,29 +121,36 @@ fn run_all(
     Ok(())
 }
 
-/// Runs a test program as cargo does, its output to `log`. `None`: it hung and was killed.
+/// Runs a test program as cargo does, its output to `log`. `None`: it hung and was killed, with the
+/// processes that it had started.
 fn run_one(program: &Program, log: &Path) -> io::Result<Option<ExitStatus>> {
     let out = File::create(log)?;
     let package = program.manifest.parent().expect("a manifest is in a folder");
-    let mut child = Command::new(&program.executable)
+    let mut command = Command::new(&program.executable);
+    command
         .current_dir(package)
         .env("CARGO_MANIFEST_DIR", package)
         .stdin(Stdio::null())
         .stderr(out.try_clone()?)
-        .stdout(out)
-        .spawn()?;
-    wait(&mut child)
+        .stdout(out);
+    let since = Instant::now();
+    finish(&mut command, || since.elapsed() >= PATIENCE)
 }
 
-fn wait(child: &mut Child) -> io::Result<Option<ExitStatus>> {
-    let since = Instant::now();
-    while since.elapsed() < PATIENCE {
+/// Runs a program to its end in a process group of its own, or kills that group when it `is_late`.
+fn finish(
+    command: &mut Command,
+    mut is_late: impl FnMut() -> bool,
+) -> io::Result<Option<ExitStatus>> {
+    let mut child = command.process_group(0).spawn()?;
+    while !is_late() {
         if let Some(status) = child.try_wait()? {
             return Ok(Some(status));
         }
         thread::sleep(Duration::from_millis(50));
     }
-    child.kill()?;
+    // It was not waited for, so its number is still that of its group.
+    kill_process_group(Pid::from_child(&child), Signal::KILL)?;
     child.wait()?;
     Ok(None)
 }
@@ -224,5 +233,32 @@ mod tests {
         assert_eq!(test, "p (exit status: 1)");
         assert_eq!(failures.runs, [1, 2]);
         assert!(failures.log.exists());
+    }
+
+    /// What a test started would keep a processor, a port or a lock for as long as it lives.
+    #[test]
+    fn program_that_is_late_is_killed_with_what_it_started() {
+        let dir = tempfile::tempdir().unwrap();
+        let note = dir.path().join("pid");
+        let mut command = Command::new("sh");
+        command.arg("-c").arg("sleep 3600 & echo $! >new && mv new pid && wait");
+        command.current_dir(dir.path()).stdin(Stdio::null());
+        // It is late once it has started the other one.
+        assert!(finish(&mut command, || note.exists()).unwrap().is_none());
+        let pid = fs::read_to_string(note).unwrap();
+        let stat = Path::new("/proc").join(pid.trim()).join("stat");
+        let lives = || {
+            let stat = fs::read_to_string(&stat).unwrap_or_default();
+            stat.rsplit_once(") ").is_some_and(|(_, rest)| !rest.starts_with(['Z', 'X']))
+        };
+        for _ in 0..600 {
+            if !lives() {
+                return;
+            }
+            thread::sleep(Duration::from_millis(100));
+        }
+        let pid = Pid::from_raw(pid.trim().parse().unwrap()).unwrap();
+        let _ = rustix::process::kill_process(pid, Signal::KILL);
+        panic!("what the program started lives on");
     }
 }
