@@ -43,15 +43,18 @@ pub(super) async fn converse(
     loop {
         let sent = {
             let _turn = turn.lock().await;
-            send_some(control, socket, &id, bell)
+            let sent = send_some(control, socket, &id, bell);
+            if matches!(sent, Ok(Sent::Some)) {
+                // With the turn in hand: else all sessions of the process do a part before the others are
+                // looked at.
+                tokio::task::yield_now().await;
+            }
+            sent
         };
         let full = match sent {
             Ok(Sent::All) => false,
             Ok(Sent::Full) => true,
-            Ok(Sent::Some) => {
-                tokio::task::yield_now().await;
-                continue;
-            }
+            Ok(Sent::Some) => continue,
             Err(error) => {
                 take_rest(control, socket, &id, bell, turn).await;
                 return error.to_string();
@@ -85,12 +88,12 @@ pub(super) async fn converse(
                 let Ok(mut ready) = ready else { return "its socket cannot be watched".into() };
                 let turn = turn.lock().await;
                 let received = receive_some(control, socket, &id, bell, &mut buffer, UNREAD);
-                drop(turn);
                 match received {
                     Ok(true) => ready.clear_ready(),
                     Ok(false) => tokio::task::yield_now().await,
                     Err(why) => return why,
                 }
+                drop(turn);
             }
             () = ended(death) => {
                 take_rest(control, socket, &id, bell, turn).await;

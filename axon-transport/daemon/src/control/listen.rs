@@ -151,8 +151,8 @@ pub(super) async fn serve(
             if !control.borrow_mut().remove_some(&id, &bell) {
                 return;
             }
+            tokio::task::yield_now().await;
         }
-        tokio::task::yield_now().await;
     }
 }
 

@@ -49,4 +49,48 @@ mod tests {
         let _third = turns.of(3);
         assert_eq!(turns.0.len(), 2);
     }
+
+    /// Counted in parts, not in time: how long a part takes is the machine's affair.
+    #[test]
+    fn process_with_a_thousand_busy_sessions_has_one_part_between_two_of_another_process() {
+        use std::cell::Cell;
+
+        use tokio::task::{LocalSet, spawn_local, yield_now};
+
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        LocalSet::new().block_on(&runtime, async {
+            let (mut turns, parts) = (Turns::default(), Rc::new(Cell::new(0_u32)));
+            for _ in 0..1000 {
+                let (turn, parts) = (turns.of(1), Rc::clone(&parts));
+                spawn_local(async move {
+                    loop {
+                        {
+                            let _turn = turn.lock().await;
+                            parts.set(parts.get() + 1);
+                            // As a conversation does after each part.
+                            yield_now().await;
+                        }
+                    }
+                });
+            }
+            let turn = turns.of(2);
+            let other = spawn_local(async move {
+                // All of them have begun.
+                while parts.get() < 10_000 {
+                    yield_now().await;
+                }
+                let mut most = 0;
+                for _ in 0..1000 {
+                    let before = parts.get();
+                    yield_now().await;
+                    drop(turn.lock().await);
+                    most = most.max(parts.get() - before);
+                }
+                (most, parts.get())
+            });
+            let (most, parts) = other.await.unwrap();
+            assert!(most <= 2, "{most} parts in between");
+            assert!(parts > 10_100, "they stand still: {parts}");
+        });
+    }
 }
