@@ -1,58 +1,24 @@
 //! The examples of axon-transport do what they say.
 
+#[path = "../../tests/support/built_examples.rs"]
+mod built_examples;
 #[allow(dead_code, reason = "not every test needs all of it")]
 mod support;
 
 use std::{
-    ffi::OsStr,
-    fs,
     path::{Path, PathBuf},
     process::{Command, Stdio},
-    sync::Once,
-    time::SystemTime,
 };
 
+use built_examples::built_examples;
 use support::{Host, Kept};
 
 const EXAMPLES: [&str; 6] = ["session", "service", "wait_set", "loan", "two_hosts", "tokio"];
 
-/// The program of an example. `cargo test` builds the examples of the whole workspace; where only this test is
-/// asked for, they are built here.
+/// The program of an example.
 fn example(name: &str) -> PathBuf {
-    static BUILT: Once = Once::new();
-    let test = std::env::current_exe().unwrap();
-    let profile = test.parent().and_then(Path::parent).unwrap();
-    let program = |name: &str| profile.join("examples").join(name);
-    BUILT.call_once(|| {
-        let package = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
-        let source = ["src", "shm/src", "examples"].map(|part| newest(&package.join(part)));
-        let built =
-            |name: &&str| fs::metadata(program(name)).and_then(|facts| facts.modified()).ok();
-        if EXAMPLES.iter().all(|name| built(name) >= source.into_iter().max()) {
-            return;
-        }
-        let mut cargo = Command::new(env!("CARGO"));
-        cargo.args(["build", "--offline", "-p", "axon-transport"]);
-        for name in EXAMPLES {
-            cargo.args(["--example", name]);
-        }
-        cargo.arg("--target-dir").arg(profile.parent().unwrap());
-        if profile.file_name() == Some(OsStr::new("release")) {
-            cargo.arg("--release");
-        }
-        assert!(cargo.status().unwrap().success(), "{cargo:?}");
-    });
-    program(name)
-}
-
-/// When the newest file in a directory was changed.
-fn newest(directory: &Path) -> SystemTime {
-    let entries = fs::read_dir(directory).unwrap().map(|entry| entry.unwrap().path());
-    let times = entries.map(|path| match path.is_dir() {
-        true => newest(&path),
-        false => fs::metadata(&path).unwrap().modified().unwrap(),
-    });
-    times.max().unwrap_or(SystemTime::UNIX_EPOCH)
+    let package = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+    built_examples(package, &EXAMPLES, &EXAMPLES).join(name)
 }
 
 /// What a command prints that must succeed.

@@ -1,13 +1,14 @@
 //! Builds C programs against the C interface.
 
+#[path = "built_examples.rs"]
+mod built_examples;
+
 use std::{
-    ffi::OsStr,
-    fs,
     path::{Path, PathBuf},
     process::Command,
-    sync::Once,
-    time::SystemTime,
 };
+
+use built_examples::built_examples;
 
 /// What a static library of Rust needs of the system.
 pub(crate) const SYSTEM: &[&str] =
@@ -23,39 +24,9 @@ pub(crate) fn path(within: &str) -> PathBuf {
     here.join(within)
 }
 
-/// A library of the C interface. `cargo test` builds it with the examples; where only this test is
-/// asked for, it is built here.
+/// A library of the C interface.
 pub(crate) fn library(name: &str) -> PathBuf {
-    static BUILT: Once = Once::new();
-    let program = std::env::current_exe().unwrap();
-    let profile = program.parent().and_then(Path::parent).unwrap();
-    let library = profile.join("examples").join(name);
-    BUILT.call_once(|| {
-        let changed = |path: &Path| fs::metadata(path).and_then(|facts| facts.modified()).ok();
-        // The test program was linked after the crate, and the library is as old as it or younger.
-        let source = newest(&path("src"));
-        if changed(&library).is_some_and(|built| built >= source) {
-            return;
-        }
-        let mut cargo = Command::new(env!("CARGO"));
-        cargo.args(["build", "--offline", "-p", "axon-transport", "--example", "axon_c"]);
-        cargo.arg("--target-dir").arg(profile.parent().unwrap());
-        if profile.file_name() == Some(OsStr::new("release")) {
-            cargo.arg("--release");
-        }
-        run(&mut cargo);
-    });
-    library
-}
-
-/// When the newest file in a directory was changed.
-fn newest(directory: &Path) -> SystemTime {
-    let entries = fs::read_dir(directory).unwrap().map(|entry| entry.unwrap().path());
-    let times = entries.map(|path| match path.is_dir() {
-        true => newest(&path),
-        false => fs::metadata(&path).unwrap().modified().unwrap(),
-    });
-    times.max().unwrap_or(SystemTime::UNIX_EPOCH)
+    built_examples(&path(""), &["axon_c"], &[name]).join(name)
 }
 
 /// Runs a command that must succeed; what it printed.
