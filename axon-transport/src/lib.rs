@@ -38,7 +38,7 @@ pub mod internal {
     pub mod events {
         pub use crate::events::alive::Alive;
     }
-    /// Who may match whom.
+    /// The endpoints that may match, and the hosts on which they may.
     pub mod graph {
         pub use crate::graph::{
             endpoint::{LIMITS, Limits},

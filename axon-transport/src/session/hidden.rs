@@ -135,8 +135,8 @@ impl Publisher {
 
 #[doc(hidden)]
 impl Subscription {
-    /// For a relay: the publishers of whom something may come. Those who have ended, but for what is
-    /// on its way, do not count any more.
+    /// For a relay: the publishers that may still send samples. A publisher that has ended is among them while
+    /// samples of it are on their way.
     pub fn attached(&self) -> Vec<Gid> {
         let mut gids = self.matched();
         if !self.session.is_forked() {

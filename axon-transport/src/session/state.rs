@@ -63,7 +63,7 @@ pub(crate) struct Shared {
     pub(crate) stopping: AtomicBool,
     /// The control thread, once it runs.
     pub(super) control: OnceLock<ThreadId>,
-    /// By what the control thread hears of samples, and for whom.
+    /// The callbacks and tasks for which the control thread listens for samples.
     pub(super) listening: Listening,
     pub(super) listener: Mutex<Option<Listener>>,
     /// One status request at a time.

@@ -176,8 +176,9 @@ enum Step {
     Replace,
 }
 
-/// Decides when a silent link is probed and when it is replaced. Plain data: whoever has it asks
-/// [`handle_timeout`](Self::handle_timeout) at [`poll_timeout`](Self::poll_timeout), and tells of answers.
+/// Decides when a silent link is probed and when it is replaced. Plain data: its owner calls
+/// [`handle_timeout`](Self::handle_timeout) at [`poll_timeout`](Self::poll_timeout), and
+/// [`handle_echo`](Self::handle_echo) when a probe is answered.
 #[derive(Debug)]
 struct Prober {
     began: Instant,
@@ -261,7 +262,8 @@ mod tests {
     }
 
     #[test]
-    fn a_successor_is_dialled_within_half_a_second_of_the_paths_return_whenever_that_is() {
+    fn the_side_that_dialled_replaces_a_link_within_400_ms_of_the_paths_return_the_other_within_600()
+     {
         for millis in 3_000..12_000 {
             let cut = Duration::from_millis(millis);
             for (side, bound) in [(Side::Client, 400), (Side::Server, 600)] {

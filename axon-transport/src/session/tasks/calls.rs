@@ -95,8 +95,8 @@ impl Calls {
 
     /// Hands out the responses that came, and drops those that nobody waits for. Whether a call still waits.
     pub(super) fn collect(&self, of: &SubscriptionInner, shared: &Shared) -> bool {
-        // The lock is held from a response's leaving its ring until its call has it: whoever looks for it
-        // finds it in one of both.
+        // The lock is held from the moment that a response leaves its ring until its call has it. A reader of
+        // `calls` therefore finds the response either in the ring or in its call.
         let mut calls = self.lock();
         let (mut woken, mut passed) = (Vec::new(), Vec::new());
         let mut waiting = calls.values().filter(|call| call.outcome.is_none()).count();

@@ -1,4 +1,4 @@
-//! Whether the control thread listens on the session's doorbell, and for whom.
+//! Counts the callbacks and tasks for which the control thread listens on the session's doorbell.
 
 use std::{
     sync::{Arc, Mutex, MutexGuard, PoisonError},
@@ -13,7 +13,7 @@ use crate::session::{error::RecvError, state::Shared};
 /// system calls.
 const LINGER: Duration = Duration::from_secs(1);
 
-/// By what the control thread hears of samples, and who wants it to.
+/// The leader by which the control thread listens, and the number of callbacks and tasks that need it.
 #[derive(Default)]
 pub(in crate::session) struct Listening {
     state: Mutex<State>,
@@ -62,25 +62,25 @@ impl Listening {
         Ok(new)
     }
 
-    /// A task ended. Whether that is news for the control thread: no, if it looks soon anyway.
+    /// A task ended. Whether the control thread must be woken. It need not be if it looks soon anyway.
     fn end_task(&self) -> bool {
         let mut state = self.lock();
         state.tasks -= 1;
         state.is_idle() && state.until.is_none()
     }
 
-    /// Whatever comes from now on rings.
+    /// Arms the doorbell: the next sample rings it.
     pub(super) fn arm(&self) {
         self.lock().arm();
     }
 
-    /// Whether somebody is to be told of whatever comes.
+    /// Whether a callback is set, which is told of every sample.
     pub(in crate::session) fn has_callbacks(&self) -> bool {
         self.lock().callbacks > 0
     }
 
-    /// For the control thread, which has nothing left of what this gave it before: by what it listens, and when
-    /// it has to ask again.
+    /// The leader by which the control thread listens, and the time at which it must ask again. The control thread
+    /// must have dropped the leader that it got before.
     pub(in crate::session) fn leader(&self) -> (Option<Arc<ExternalLeader>>, Option<Instant>) {
         let mut state = self.lock();
         if state.leader.is_none() {
@@ -90,7 +90,7 @@ impl Listening {
         if state.is_idle() {
             let until = *state.until.get_or_insert(now + LINGER);
             if until <= now {
-                // Dropped here, under the lock: whoever listens next would find that one leads still.
+                // Dropped under the lock: otherwise the next listener would find a leader and could not begin.
                 state.leader = None;
                 state.until = None;
             }
