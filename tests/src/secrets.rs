@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use base64::{Engine, engine::general_purpose::STANDARD};
 use hkdf::Hkdf;
-use sha2::Sha256;
+use sha2::{Digest, Sha256};
 
 use crate::memory::{Find, Needles, Secret};
 
@@ -17,7 +17,7 @@ impl Needles {
     }
 
     /// Adds `HKDF-SHA256` of a key: what [`add_extracted`](Self::add_extracted) adds, and as `kind`
-    /// what is expanded.
+    /// what is expanded, which it returns.
     pub fn add_derived(
         &mut self,
         kind: &'static str,
@@ -25,12 +25,30 @@ impl Needles {
         salt: Option<&[u8]>,
         key: &[u8],
         info: &[&[u8]],
-    ) {
+    ) -> [u8; 32] {
         self.add_extracted(number, salt, key);
         let mut derived = [0; 32];
         let expand = Hkdf::<Sha256>::new(salt, key);
         expand.expand_multi_info(info, &mut derived).expect("32 bytes are few");
         self.add(kind, number, &derived);
+        derived
+    }
+
+    /// Adds the secrets of TLS that a PSK alone decides (RFC 8446, 7.1), with SHA-256: in psk_ke they open
+    /// a recording of the connection.
+    pub fn add_tls_secrets(&mut self, number: usize, psk: &[u8; 32]) {
+        let nothing_heard = Sha256::digest([]);
+        let mut salt = [0; 32];
+        let zeros = [0; 32];
+        let steps =
+            [(psk, "early secret"), (&zeros, "handshake secret"), (&zeros, "master secret")];
+        for (input, kind) in steps {
+            let (secret, hkdf) = Hkdf::<Sha256>::extract(Some(&salt), input);
+            self.add(kind, number, &secret);
+            let info: [&[u8]; 4] = [&[0, 32, 13], b"tls13 derived", &[32], &nothing_heard];
+            hkdf.expand_multi_info(&info, &mut salt).expect("32 bytes are few");
+            self.add("derived secret", number, &salt);
+        }
     }
 
     /// Adds what `HKDF-SHA256` extracts from a key, and the two states of HMAC that stand for it.
