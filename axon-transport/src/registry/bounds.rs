@@ -20,14 +20,14 @@ fn registry(roles: &[SessionRole]) -> Registry<Label> {
     let mut registry = Registry::default();
     for (number, role) in (1..).zip(roles) {
         let handed = (*role != SessionRole::Tool).then_some(["segment", "doorbell", "pidfd"]);
-        registry.connect(id(number), *role, String::new(), 1, handed, None).unwrap();
+        registry.handle_connect(id(number), *role, String::new(), 1, handed, None).unwrap();
         drain(&mut registry, number);
     }
     registry
 }
 
 fn drain(registry: &mut Registry<Label>, number: u8) -> Vec<Message> {
-    std::iter::from_fn(|| registry.next_output(&id(number)))
+    std::iter::from_fn(|| registry.poll_output(&id(number)))
         .map(|output| Message::decode(&output.packet).unwrap())
         .collect()
 }
@@ -47,7 +47,7 @@ fn announce_as(
     let ring = (endpoint.kind == EndpointKind::Publisher).then_some(place);
     let announce = Announce { endpoint, role, stands_for: vec![], ring, only: None };
     let message = Message::Endpoint(announce);
-    registry.message(&id(session), message, vec![]).unwrap();
+    registry.handle_message(&id(session), message, vec![]).unwrap();
 }
 
 fn graphs(messages: &[Message]) -> usize {
@@ -81,7 +81,7 @@ fn the_pairs_that_a_session_makes_are_bounded_and_others_make_theirs() {
 
     announce(&mut registry, 2, 1, EndpointKind::Subscription);
     assert_eq!(registry.pairs.len(), MAX_PAIRS + 32);
-    registry.disconnect(&id(1));
+    registry.handle_disconnect(&id(1));
     assert!(registry.pairs.is_empty());
     assert_eq!(registry.session(&id(2)).unwrap().pairs, 0, "what is gone does not count");
 }
@@ -115,8 +115,8 @@ fn the_gateway_brings_the_publishers_of_other_hosts_to_every_reader() {
     let last = stand_in(u32::try_from(MAX_ALL_PAIRS).unwrap() / readers);
     assert!(!registry.endpoints.contains_key(&last), "it was refused");
     let gone = |gid| Message::EndpointGone(Gone { gid });
-    assert_eq!(registry.message(&id(1), gone(last), vec![]), Ok(()));
-    let other = registry.message(&id(2), gone(last), vec![]);
+    assert_eq!(registry.handle_message(&id(1), gone(last), vec![]), Ok(()));
+    let other = registry.handle_message(&id(2), gone(last), vec![]);
     assert_eq!(other, Err(Violation::NotItsOwn(last)), "nobody else speaks for other hosts");
 }
 
@@ -131,7 +131,7 @@ fn the_gateway_is_told_of_this_host_alone() {
     announce(&mut registry, 2, 1, EndpointKind::Publisher);
     registry.flush();
     assert_eq!(graphs(&drain(&mut registry, 1)), 1);
-    registry.message(&id(1), Message::Resync, vec![]).unwrap();
+    registry.handle_message(&id(1), Message::Resync, vec![]).unwrap();
     let told = drain(&mut registry, 1);
     let items = told.iter().filter_map(|m| if let Message::Graph(g) = m { Some(g) } else { None });
     let gids: Vec<_> = items.flat_map(|g| &g.added).map(|item| item.endpoint.gid).collect();
@@ -149,20 +149,20 @@ fn sessions_that_are_told_everything_share_its_packets() {
     registry.remote_graph(DaemonId([1; 16]), true, many, vec![]);
     registry.flush();
     let mut first = [1, 2].map(|number| {
-        registry.message(&id(number), Message::Resync, vec![]).unwrap();
+        registry.handle_message(&id(number), Message::Resync, vec![]).unwrap();
         while registry.session(&id(number)).is_some_and(|s| s.queued() > 0) {
-            registry.next_output(&id(number));
+            registry.poll_output(&id(number));
         }
-        registry.next_output(&id(number)).unwrap().packet
+        registry.poll_output(&id(number)).unwrap().packet
     });
     assert!(Arc::ptr_eq(&first[0], &first[1]));
     // Of another version are others.
     announce(&mut registry, 1, 1, EndpointKind::Subscription);
-    registry.message(&id(2), Message::Resync, vec![]).unwrap();
+    registry.handle_message(&id(2), Message::Resync, vec![]).unwrap();
     while registry.session(&id(2)).is_some_and(|s| s.queued() > 0) {
-        registry.next_output(&id(2));
+        registry.poll_output(&id(2));
     }
-    first[1] = registry.next_output(&id(2)).unwrap().packet;
+    first[1] = registry.poll_output(&id(2)).unwrap().packet;
     assert!(!Arc::ptr_eq(&first[0], &first[1]));
 }
 
@@ -170,10 +170,10 @@ fn sessions_that_are_told_everything_share_its_packets() {
 fn everything_is_told_anew_once_however_often_it_is_asked_for() {
     let mut registry = registry(&[SessionRole::Application]);
     for _ in 0..100 {
-        registry.message(&id(1), Message::Resync, vec![]).unwrap();
+        registry.handle_message(&id(1), Message::Resync, vec![]).unwrap();
     }
     assert_eq!(whole_graphs(&drain(&mut registry, 1)), 1);
-    registry.message(&id(1), Message::Resync, vec![]).unwrap();
+    registry.handle_message(&id(1), Message::Resync, vec![]).unwrap();
     assert_eq!(whole_graphs(&drain(&mut registry, 1)), 1);
 }
 
@@ -215,12 +215,12 @@ fn a_status_larger_than_the_queue_is_told_whole() {
         assert_eq!(registry.take_ready(), [id(1)].into());
         assert_eq!(registry.session(&id(1)).unwrap().queued(), 0, "it waits in no queue");
         // A socket that has no room for one of the parts, and for the last.
-        let first = registry.next_output(&id(1)).unwrap();
+        let first = registry.poll_output(&id(1)).unwrap();
         registry.return_output(&id(1), first);
         let mut all = Vec::new();
-        while let Some(output) = registry.next_output(&id(1)) {
+        while let Some(output) = registry.poll_output(&id(1)) {
             registry.return_output(&id(1), output);
-            let output = registry.next_output(&id(1)).unwrap();
+            let output = registry.poll_output(&id(1)).unwrap();
             all.push(Message::decode(&output.packet).unwrap());
         }
         assert!(put_together(&all) == status);
@@ -233,7 +233,7 @@ fn who_asks_again_is_told_the_same_status_from_its_beginning() {
     let mut registry = registry(&[SessionRole::Tool]);
     registry.tell_status(&id(1), vec![7; 6_000_000].into());
     for _ in 0..20 {
-        registry.next_output(&id(1)).unwrap();
+        registry.poll_output(&id(1)).unwrap();
     }
     assert!(registry.repeat_status(&id(1)));
     assert_eq!(put_together(&drain(&mut registry, 1)).len(), 6_000_000);
@@ -251,7 +251,7 @@ fn a_pair_that_cannot_share_memory_is_shown_with_the_reason() {
     let fail = |registry: &mut Registry<Label>, session| {
         let reason = "not \u{1b}[1mmapped".to_owned() + &"!".repeat(10_000);
         let unmatch = Message::Unmatch(Unmatch { reader, writer, reason });
-        registry.message(&id(session), unmatch, vec![])
+        registry.handle_message(&id(session), unmatch, vec![])
     };
     assert_eq!(fail(&mut registry, 3), Err(Violation::NotItsOwn(reader)));
     assert!(registry.take_refused().is_empty());
@@ -288,7 +288,7 @@ fn memory_that_is_given_up_does_not_wait_for_who_is_stopped() {
     let (after, carries) = (None, None);
     let attach =
         Attach { reader, writer, lane, qos, session, stands_for, segments, after, carries };
-    registry.message(&id(2), Message::Attach(attach), vec![]).unwrap();
+    registry.handle_message(&id(2), Message::Attach(attach), vec![]).unwrap();
     let relayed = None;
     let (generation, first, segments, session) = (1, 0, vec![], id(1));
     let granted = Granted {
@@ -302,17 +302,17 @@ fn memory_that_is_given_up_does_not_wait_for_who_is_stopped() {
         after,
         relayed,
     };
-    registry.message(&id(1), Message::Grant(granted), vec![]).unwrap();
+    registry.handle_message(&id(1), Message::Grant(granted), vec![]).unwrap();
     drain(&mut registry, 2);
     let mut turn = |number| {
         let (session, publisher) = (id(1), Some(writer));
         let segment = Segment { number, publisher };
         let opened = Message::Segment(SegmentOpened { session, segment });
-        registry.message(&session, opened, vec!["map"]).unwrap();
+        registry.handle_message(&session, opened, vec!["map"]).unwrap();
         // The first is taken before it is given up.
         let taken = (number == 1).then(|| drain(&mut registry, 2).len());
         let gone = Message::SegmentGone(SegmentName { session, number });
-        registry.message(&session, gone, vec![]).unwrap();
+        registry.handle_message(&session, gone, vec![]).unwrap();
         taken
     };
     assert_eq!(turn(1), Some(1));
@@ -332,13 +332,13 @@ fn the_segments_of_a_session_are_bounded_and_it_is_told() {
     for number in 1..=MAX_SEGMENTS as u32 + 1 {
         let segment = Segment { number, publisher: None };
         let opened = Message::Segment(SegmentOpened { session, segment });
-        registry.message(&session, opened, vec!["map"]).unwrap();
+        registry.handle_message(&session, opened, vec!["map"]).unwrap();
     }
     assert_eq!(registry.session(&session).unwrap().segments.len(), MAX_SEGMENTS);
     let refused = drain(&mut registry, 1);
     assert!(refused.iter().any(|m| matches!(m, Message::Refused(r) if r.text.contains("memory"))));
     let gone = Message::SegmentGone(SegmentName { session, number: 1 });
-    registry.message(&session, gone, vec![]).unwrap();
+    registry.handle_message(&session, gone, vec![]).unwrap();
     assert_eq!(registry.session(&session).unwrap().segments.len(), MAX_SEGMENTS - 1);
 }
 
@@ -360,7 +360,7 @@ fn who_leaves_is_shown_to_nobody_and_read_to_its_end() {
         after: None,
         carries: None,
     };
-    registry.message(&id(2), Message::Attach(attach), vec![]).unwrap();
+    registry.handle_message(&id(2), Message::Attach(attach), vec![]).unwrap();
     let grant = Granted {
         reader,
         writer,
@@ -372,14 +372,14 @@ fn who_leaves_is_shown_to_nobody_and_read_to_its_end() {
         after: None,
         relayed: None,
     };
-    registry.message(&id(1), Message::Grant(grant), vec![]).unwrap();
+    registry.handle_message(&id(1), Message::Grant(grant), vec![]).unwrap();
     registry.flush();
     (1..=3).for_each(|session| drop(drain(&mut registry, session)));
     let before = registry.digest();
 
     let leave = |registry: &mut Registry<Label>, session, leaving| {
         let leaving = Message::Leaving(Leaving { gid: writer, leaving });
-        registry.message(&id(session), leaving, vec![])
+        registry.handle_message(&id(session), leaving, vec![])
     };
     assert_eq!(leave(&mut registry, 2, true), Err(Violation::NotItsOwn(writer)));
     for _ in 0..2 {
@@ -399,7 +399,7 @@ fn who_leaves_is_shown_to_nobody_and_read_to_its_end() {
     announce(&mut registry, 3, 1, EndpointKind::Subscription);
     assert!(!drain(&mut registry, 3).iter().any(|m| matches!(m, Message::Match(_))));
     drain(&mut registry, 2);
-    registry.message(&id(2), Message::Resync, vec![]).unwrap();
+    registry.handle_message(&id(2), Message::Resync, vec![]).unwrap();
     let told = drain(&mut registry, 2);
     let granted = told.iter().position(|m| matches!(m, Message::Grant(_))).unwrap();
     assert!(told[granted..].iter().any(|m| is_leaving(&m)));
@@ -413,7 +413,7 @@ fn who_leaves_is_shown_to_nobody_and_read_to_its_end() {
     assert!(told.iter().any(shows) && told.iter().any(|m| matches!(m, Message::Match(_))));
     assert_eq!(registry.pairs.len(), 2);
     leave(&mut registry, 1, true).unwrap();
-    registry.message(&id(1), Message::EndpointGone(Gone { gid: writer }), vec![]).unwrap();
+    registry.handle_message(&id(1), Message::EndpointGone(Gone { gid: writer }), vec![]).unwrap();
     assert!(registry.pairs.is_empty());
     assert_eq!(registry.session(&id(1)).unwrap().pairs, 0);
 }

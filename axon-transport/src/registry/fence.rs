@@ -140,19 +140,19 @@ mod tests {
         ] {
             let handed = Some(["segment", "doorbell", "pidfd"]);
             let (role, name) = (SessionRole::Application, String::new());
-            registry.connect(id(session), role, name, 1, handed, None).unwrap();
+            registry.handle_connect(id(session), role, name, 1, handed, None).unwrap();
             let endpoint = Endpoint { qos, ..Endpoint::example(gid(session), kind) };
             let ring = (session == WRITER).then_some(Location { segment: 0, offset: 4096 });
             let (role, stands_for) = (EndpointRole::Application, Vec::new());
             let announce = Announce { endpoint, role, stands_for, ring, only: None };
-            registry.message(&id(session), Message::Endpoint(announce), vec![]).unwrap();
+            registry.handle_message(&id(session), Message::Endpoint(announce), vec![]).unwrap();
         }
         [WRITER, KEEPS, KEEPS_LAST].iter().for_each(|session| drop(take(&mut registry, *session)));
         registry
     }
 
     fn take(registry: &mut Registry<&'static str>, session: u8) -> Vec<Message> {
-        let taken = std::iter::from_fn(|| registry.next_output(&id(session)));
+        let taken = std::iter::from_fn(|| registry.poll_output(&id(session)));
         let taken = taken.map(|output| Message::decode(&output.packet).unwrap()).collect();
         registry.answer_fences();
         taken
@@ -160,7 +160,7 @@ mod tests {
 
     fn ask(registry: &mut Registry<&'static str>, number: u64) {
         let fence = Fence { writer: gid(WRITER), number };
-        registry.message(&id(WRITER), Message::Fence(fence), vec![]).unwrap();
+        registry.handle_message(&id(WRITER), Message::Fence(fence), vec![]).unwrap();
     }
 
     /// What was answered.
@@ -187,13 +187,13 @@ mod tests {
         say(&mut registry, KEEPS);
         assert_eq!(answers(&mut registry), [0; 0]);
         // One of two; and one that could not be sent.
-        registry.next_output(&id(KEEPS)).unwrap();
-        let unsent = registry.next_output(&id(KEEPS)).unwrap();
+        registry.poll_output(&id(KEEPS)).unwrap();
+        let unsent = registry.poll_output(&id(KEEPS)).unwrap();
         registry.return_output(&id(KEEPS), unsent);
         registry.answer_fences();
         assert_eq!(answers(&mut registry), [0; 0]);
         // What came after the question still waits, as does all of who may lose samples.
-        registry.next_output(&id(KEEPS)).unwrap();
+        registry.poll_output(&id(KEEPS)).unwrap();
         registry.answer_fences();
         assert_eq!(answers(&mut registry), [2]);
         assert!(!registry.has_fences());
@@ -223,7 +223,7 @@ mod tests {
         registry.answer_fences();
         assert_eq!(answers(&mut registry), [0; 0], "its queue is empty, for it was thrown away");
         ask(&mut registry, 2);
-        registry.next_output(&id(KEEPS)).unwrap();
+        registry.poll_output(&id(KEEPS)).unwrap();
         registry.answer_fences();
         assert_eq!(answers(&mut registry), [0; 0], "it was told a part");
         take(&mut registry, KEEPS);
@@ -235,7 +235,7 @@ mod tests {
         let mut registry = registry();
         say(&mut registry, KEEPS);
         ask(&mut registry, 1);
-        registry.disconnect(&id(KEEPS));
+        registry.handle_disconnect(&id(KEEPS));
         registry.answer_fences();
         assert_eq!(answers(&mut registry), [1]);
         // What was asked about a publisher that is gone is forgotten.
@@ -243,7 +243,7 @@ mod tests {
         say(&mut registry, KEEPS);
         ask(&mut registry, 1);
         let gone = Message::EndpointGone(Gone { gid: gid(WRITER) });
-        registry.message(&id(WRITER), gone, vec![]).unwrap();
+        registry.handle_message(&id(WRITER), gone, vec![]).unwrap();
         assert!(!registry.has_fences());
         ask(&mut registry, 2);
         assert!(!registry.has_fences());
@@ -253,7 +253,7 @@ mod tests {
     fn nobody_asks_about_the_publisher_of_another() {
         let mut registry = registry();
         let fence = Message::Fence(Fence { writer: gid(WRITER), number: 1 });
-        let refused = registry.message(&id(KEEPS), fence, vec![]);
+        let refused = registry.handle_message(&id(KEEPS), fence, vec![]);
         assert_eq!(refused, Err(Violation::NotItsOwn(gid(WRITER))));
     }
 }

@@ -24,7 +24,7 @@ impl<F: Clone> Registry<F> {
     ///
     /// # Errors
     /// When there are too many sessions.
-    pub fn connect(
+    pub fn handle_connect(
         &mut self,
         id: SessionId,
         role: SessionRole,
@@ -33,7 +33,7 @@ impl<F: Clone> Registry<F> {
         descriptors: Option<[F; 3]>,
         scope: Option<Scope>,
     ) -> Result<(), Violation> {
-        self.disconnect(&id);
+        self.handle_disconnect(&id);
         if self.sessions.len() >= MAX_SESSIONS {
             return Err(Violation::Sessions);
         }
@@ -46,13 +46,13 @@ impl<F: Clone> Registry<F> {
     }
 
     /// A session that is gone, and its endpoints with it.
-    pub fn disconnect(&mut self, id: &SessionId) {
-        while self.disconnect_some(id) {}
+    pub fn handle_disconnect(&mut self, id: &SessionId) {
+        while self.handle_disconnect_in_parts(id) {}
     }
 
-    /// As [`disconnect`](Self::disconnect), a part of it; whether there is more to do. What is left of
+    /// As [`handle_disconnect`](Self::handle_disconnect), a part of it; whether there is more to do. What is left of
     /// the session is told nothing any more.
-    pub fn disconnect_some(&mut self, id: &SessionId) -> bool {
+    pub fn handle_disconnect_in_parts(&mut self, id: &SessionId) -> bool {
         self.mark_behind(id);
         let mut pairs = 0;
         while let Some(entry) = self.sessions.get_mut(id) {
@@ -76,7 +76,7 @@ impl<F: Clone> Registry<F> {
     ///
     /// # Errors
     /// When no session sends such a message; the caller disconnects it.
-    pub fn message(
+    pub fn handle_message(
         &mut self,
         id: &SessionId,
         message: Message,

@@ -35,7 +35,7 @@ impl<F: Clone> Registry<F> {
     /// to its readers, and what readers asked of its writers, closed by a GRAPH without `more`. What
     /// it does not hear again is over. It is told a part at a time, when it has taken what waits for it:
     /// so the parts and what changes in between come in the order in which they were so.
-    pub fn next_output(&mut self, id: &SessionId) -> Option<Output<F>> {
+    pub fn poll_output(&mut self, id: &SessionId) -> Option<Output<F>> {
         let entry = self.sessions.get_mut(id)?;
         if entry.queue.is_empty() {
             if entry.telling.is_some() {

@@ -90,7 +90,7 @@ impl Local {
         let mut inside = house.lock();
         inside.wakers.insert(id, session.wake.clone());
         // There are at most two, which is never too many.
-        let _ = inside.registry.connect(id, role, name, std::process::id(), handed, None);
+        let _ = inside.registry.handle_connect(id, role, name, std::process::id(), handed, None);
         drop(inside);
         Self { id, house }
     }
@@ -103,13 +103,13 @@ impl Local {
         let mut inside = self.house.lock();
         if let Some((message, descriptors)) = message {
             let descriptors = descriptors.into_iter().map(Arc::new).collect();
-            if let Err(violation) = inside.registry.message(&self.id, message, descriptors) {
+            if let Err(violation) = inside.registry.handle_message(&self.id, message, descriptors) {
                 tracing::error!(%violation, "a message to no daemon");
             }
         }
         inside.settle(Some(&self.id));
         let mut answers = Vec::new();
-        while let Some(output) = inside.registry.next_output(&self.id) {
+        while let Some(output) = inside.registry.poll_output(&self.id) {
             let descriptors: std::io::Result<Vec<PassedFd>> =
                 output.descriptors.iter().map(|d| d.try_clone()).collect();
             match (Message::decode(&output.packet), descriptors) {
@@ -129,7 +129,7 @@ impl Drop for Local {
     fn drop(&mut self) {
         let mut inside = self.house.lock();
         inside.wakers.remove(&self.id);
-        inside.registry.disconnect(&self.id);
+        inside.registry.handle_disconnect(&self.id);
         inside.settle(None);
     }
 }

@@ -158,7 +158,7 @@ fn send_packets(
     id: &SessionId,
 ) -> Result<Sent, SocketError> {
     let (registry, begin) = (&mut control.registry, Instant::now());
-    while let Some(output) = registry.next_output(id) {
+    while let Some(output) = registry.poll_output(id) {
         let descriptors: Vec<BorrowedFd<'_>> =
             output.descriptors.iter().map(|d| d.as_fd()).collect();
         match socket::send(socket.get_ref(), &output.packet, &descriptors) {
@@ -231,7 +231,7 @@ fn receive_some(
             Ok(Received { message, descriptors }) => {
                 control.traffic.packets_in += 1;
                 let descriptors = descriptors.into_iter().map(Arc::new).collect();
-                if let Err(violation) = control.registry.message(id, message, descriptors) {
+                if let Err(violation) = control.registry.handle_message(id, message, descriptors) {
                     tracing::warn!(session = %id, %violation, "a session was disconnected");
                     outcome = Err(violation.to_string());
                     break;

@@ -306,7 +306,7 @@ fn admit(
     tracing::debug!(%session, name, pid, "a session");
     let handed = handed.map(|fds| fds.map(Arc::new));
     if let Err(violation) =
-        control.registry.connect(session, role, name.clone(), pid, handed, scope)
+        control.registry.handle_connect(session, role, name.clone(), pid, handed, scope)
     {
         refuse(control, socket, &name, peer, Refused::because(violation.to_string()));
         return None;
@@ -324,7 +324,7 @@ fn admit(
     let welcome = Welcome { protocol: PROTOCOL, daemon: control.id, pid, ranges: Some(true) };
     let probe: Vec<BorrowedFd<'_>> = control.probe.iter().map(AsFd::as_fd).collect();
     if !say(socket, Message::Welcome(welcome), &probe) {
-        control.registry.disconnect(&session);
+        control.registry.handle_disconnect(&session);
         control.keys_of_sessions.remove(&session);
         control.settle();
         return None;

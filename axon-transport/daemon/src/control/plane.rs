@@ -122,7 +122,7 @@ impl Control {
         if !self.is_current(id, bell) {
             return false;
         }
-        let more = self.registry.disconnect_some(id);
+        let more = self.registry.handle_disconnect_in_parts(id);
         if !more {
             self.wakers.remove(id);
             self.keys_of_sessions.remove(id);

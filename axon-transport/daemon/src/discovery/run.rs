@@ -92,7 +92,7 @@ pub(crate) async fn run(
     loop {
         let nameless = hosts.is_empty() && shell.names.is_empty();
         let looks = looks_for_somebody(range, &hosts);
-        let wakeup = shell.peers.next_wakeup().map(|at| shell.start + at);
+        let wakeup = shell.peers.poll_timeout().map(|at| shell.start + at);
         tokio::select! {
             event = events.recv() => match event {
                 Some(event) => {
@@ -137,7 +137,7 @@ pub(crate) async fn run(
             },
         }
         let now = shell.start.elapsed();
-        shell.peers.advance(now);
+        shell.peers.handle_timeout(now);
         shell.carry_out();
     }
     shell.peers.say_goodbye();
@@ -205,11 +205,11 @@ impl Shell {
     /// A datagram came to the shared port: it is looked at, with those that wait there.
     fn heard(&mut self, from: SocketAddr, bytes: &[u8]) {
         let now = self.start.elapsed();
-        self.peers.datagram(now, from, Arrival::Shared, bytes);
+        self.peers.handle_datagram(now, from, Arrival::Shared, bytes);
         for _ in 1..TOGETHER {
             let next = self.socket.as_ref().and_then(SharedSocket::try_receive);
             let Some((from, bytes)) = next else { return };
-            self.peers.datagram(now, from, Arrival::Shared, &bytes);
+            self.peers.handle_datagram(now, from, Arrival::Shared, &bytes);
         }
     }
 
@@ -217,13 +217,13 @@ impl Shell {
         let now = self.start.elapsed();
         match event {
             Event::Datagram { from, bytes } => {
-                self.peers.datagram(now, from, Arrival::Quic, &bytes);
+                self.peers.handle_datagram(now, from, Arrival::Quic, &bytes);
             }
             Event::QuicPort(port) => self.peers.set_port(now, port),
-            Event::LinkUp { daemon, address } => self.peers.link_up(now, daemon, address),
-            Event::LinkDown { daemon } => self.peers.link_down(now, daemon),
+            Event::LinkUp { daemon, address } => self.peers.handle_link_up(now, daemon, address),
+            Event::LinkDown { daemon } => self.peers.handle_link_down(now, daemon),
             Event::DialFailed { daemon, standing } => {
-                self.peers.dial_failed(now, daemon, standing);
+                self.peers.handle_dial_failed(now, daemon, standing);
             }
             Event::GraphDigest(digest) => self.peers.set_graph(digest),
         }
@@ -252,7 +252,7 @@ impl Shell {
     }
 
     fn carry_out(&mut self) {
-        while let Some(output) = self.peers.poll() {
+        while let Some(output) = self.peers.poll_output() {
             match output {
                 Output::Multicast(bytes) => {
                     if let Some(socket) = &mut self.socket {
@@ -268,7 +268,7 @@ impl Shell {
                         (self.actions.try_send(action), dial)
                     {
                         let now = self.start.elapsed();
-                        self.peers.dial_failed(now, daemon, standing);
+                        self.peers.handle_dial_failed(now, daemon, standing);
                     }
                 }
             }

@@ -278,7 +278,7 @@ impl Link {
 
     fn key_message(&self, message: &keys::KeyMessage) {
         if let (Some(keyring), Some(sealing)) = (&self.context.keyring, &self.established.sealing) {
-            let _ = sealing.keys.on_message(keyring, self.established.number, message);
+            let _ = sealing.keys.handle_message(keyring, self.established.number, message);
         }
     }
 

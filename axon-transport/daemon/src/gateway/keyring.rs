@@ -107,7 +107,7 @@ impl Keyring {
                     self.with_dialler(|_, _| ());
                     let peers: Vec<_> = lock(&self.peers).values().cloned().collect();
                     for peer in peers {
-                        peer.with_receiver(&self, |now, receiver| receiver.expire(now));
+                        peer.with_receiver(&self, |now, receiver| receiver.handle_timeout(now));
                         peer.warn(&self);
                     }
                 }
@@ -254,10 +254,10 @@ impl Keyring {
         let Event { origin, answer } = event;
         match origin {
             Origin::Dialler => {
-                self.with_dialler(|now, dialler| dialler.on_answer(now, answer));
+                self.with_dialler(|now, dialler| dialler.handle_answer(now, answer));
                 self.dialler_answered.notify_waiters();
             }
-            Origin::Acceptor => self.acceptor.on_answer(answer),
+            Origin::Acceptor => self.acceptor.handle_answer(answer),
             Origin::Proof(link) | Origin::Responder(link) => {
                 if let Some(waiting) = lock(&self.proofs).get(&link) {
                     let _ = waiting.send(answer);
@@ -265,12 +265,12 @@ impl Keyring {
             }
             Origin::Sender(number) => {
                 if let Some(peer) = self.by_number(number) {
-                    peer.with_sender(self, |now, sender| sender.on_answer(now, answer));
+                    peer.with_sender(self, |now, sender| sender.handle_answer(now, answer));
                 }
             }
             Origin::Receiver(number) => {
                 if let Some(peer) = self.by_number(number) {
-                    peer.with_receiver(self, |now, receiver| receiver.on_answer(now, answer));
+                    peer.with_receiver(self, |now, receiver| receiver.handle_answer(now, answer));
                 }
             }
         }
@@ -352,7 +352,7 @@ impl PeerKeys {
     }
 
     /// A key announcement came in.
-    pub(super) fn on_message(
+    pub(super) fn handle_message(
         &self,
         keyring: &Keyring,
         connection: u64,
@@ -360,11 +360,11 @@ impl PeerKeys {
     ) -> Result<(), SupplyError> {
         match message {
             KeyMessage::Announce(_) | KeyMessage::Retire { .. } => {
-                self.with_receiver(keyring, |now, r| r.on_message(now, connection, message))
+                self.with_receiver(keyring, |now, r| r.handle_message(now, connection, message))
             }
             KeyMessage::Ready { .. } | KeyMessage::Failed { .. } => {
                 let result =
-                    self.with_sender(keyring, |now, s| s.on_message(now, connection, message));
+                    self.with_sender(keyring, |now, s| s.handle_message(now, connection, message));
                 // A key may have become READY.
                 self.changed.notify_waiters();
                 self.warn(keyring);
@@ -425,8 +425,7 @@ impl PeerKeys {
     async fn run_timers(self: Arc<Self>, keyring: Arc<Keyring>, connection: u64) {
         while lock(&self.outboxes).contains_key(&connection) {
             let now = keyring.clock.now();
-            let next =
-                [lock(&self.sender).poll_timeout(now), lock(&self.receiver).poll_timeout(now)];
+            let next = [lock(&self.sender).poll_timeout(), lock(&self.receiver).poll_timeout()];
             let next = next.into_iter().flatten().min();
             let sleep = next
                 .map_or(Duration::from_secs(1), |at| at.saturating_sub(now))

@@ -117,16 +117,16 @@ impl Proof<'_> {
                 at.saturating_sub(clock.now()).min(Duration::from_secs(1))
             });
             tokio::select! {
-                Some(answer) = answers.recv() => proof.on_answer(clock.now(), answer),
+                Some(answer) = answers.recv() => proof.handle_answer(clock.now(), answer),
                 message = &mut read => {
-                    proof.on_message(clock.now(), &message?);
+                    proof.handle_message(clock.now(), &message?);
                     // At most one message proves or fails; another read is started only if not.
                     if matches!(proof.state(), ProofState::Pending) {
                         let text = "the message is no answer to the announced key";
                         return Err(Failure::Ours(CloseCode::OutOfOrder, text.into()));
                     }
                 }
-                () = tokio::time::sleep(until) => proof.on_timeout(clock.now()),
+                () = tokio::time::sleep(until) => proof.handle_timeout(clock.now()),
             }
         }
         drop(read);
@@ -170,7 +170,7 @@ impl Proof<'_> {
         let mut answers = self.keyring.proof_answers(self.number);
         let mut responder = ProofResponder::new(self.sae, &exporters);
         let announce = self.next(reader, order).await?;
-        responder.on_message(clock.now(), &announce).map_err(|violation| {
+        responder.handle_message(clock.now(), &announce).map_err(|violation| {
             let code = CloseCode::from_code(violation.code()).unwrap_or(CloseCode::Malformed);
             Failure::Ours(code, violation.to_string())
         })?;
@@ -190,7 +190,7 @@ impl Proof<'_> {
                 at.saturating_sub(clock.now()).min(Duration::from_secs(1))
             });
             tokio::select! {
-                Some(answer) = answers.recv() => responder.on_answer(clock.now(), answer),
+                Some(answer) = answers.recv() => responder.handle_answer(clock.now(), answer),
                 () = tokio::time::sleep(until) => {}
             }
         }
@@ -206,7 +206,7 @@ impl Proof<'_> {
     ) -> Result<Arc<PeerKeys>, Failure> {
         let keys = self.attach(exporters)?;
         let announce = self.next(reader, order).await?;
-        keys.on_message(self.keyring, self.number, &announce)
+        keys.handle_message(self.keyring, self.number, &announce)
             .map_err(|e| Failure::Ours(CloseCode::Malformed, e.to_string()))?;
         let KeyMessage::Announce(key_ids) = announce else {
             return Err(Failure::Ours(CloseCode::OutOfOrder, "ANNOUNCE was due".into()));

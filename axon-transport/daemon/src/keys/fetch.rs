@@ -67,7 +67,7 @@ impl Fetches {
     }
 
     /// What became of the keys that `answer` settles; none where they are asked for again.
-    pub(super) fn on_answer(&mut self, now: Duration, answer: Answer) -> Vec<Outcome> {
+    pub(super) fn handle_answer(&mut self, now: Duration, answer: Answer) -> Vec<Outcome> {
         let Request::Dec { key_ids, .. } = answer.request else { return Vec::new() };
         let Some(i) = self.in_flight.iter().position(|b| b.key_ids == key_ids) else {
             return Vec::new();

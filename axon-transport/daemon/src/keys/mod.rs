@@ -1,14 +1,10 @@
 //! KME keys: where they come from, what each of them may be used for, and when they end.
 //!
 //! [`bootstrap`] gives a link its first key (the TLS external PSK), [`verifier`] proves the
-//! client's name over it, [`supply`] keeps `messages10` in envelope keys. They are state machines:
-//! time, answers and messages go in, requests and messages come out. [`kme`] alone talks to the
-//! KME.
-//!
-//! Each machine hands its requests out by `poll_request` and takes their [`Answer`]s by
-//! `on_answer`. After any call on a machine, drain `poll_request` and `poll_message`;
-//! `poll_timeout` says when to do so without other cause. Every `now` is the time of the daemon's
-//! one [`Clock`].
+//! client's name over it, [`supply`] keeps `messages10` in envelope keys. They are state machines
+//! (`docs/architecture.md`): `poll_request` gives what is to be asked of the KME, `handle_answer` takes
+//! the [`Answer`]. [`kme`] alone talks to the KME. Every `now` is the time of the daemon's one
+//! [`Clock`].
 
 #![forbid(unsafe_code)]
 

@@ -45,18 +45,18 @@ impl World {
 
     fn connect(&mut self, number: u8, role: SessionRole, scope: Option<Scope>) {
         let handed = Some(["segment", "doorbell", "pidfd"]);
-        self.registry.connect(id(number), role, String::new(), 1, handed, scope).unwrap();
+        self.registry.handle_connect(id(number), role, String::new(), 1, handed, scope).unwrap();
         self.drain(number);
     }
 
     fn drain(&mut self, number: u8) -> Vec<Message> {
-        std::iter::from_fn(|| self.registry.next_output(&id(number)))
+        std::iter::from_fn(|| self.registry.poll_output(&id(number)))
             .map(|output| Message::decode(&output.packet).unwrap())
             .collect()
     }
 
     fn announce(&mut self, session: u8, announce: Announce) {
-        self.registry.message(&id(session), Message::Endpoint(announce), vec![]).unwrap();
+        self.registry.handle_message(&id(session), Message::Endpoint(announce), vec![]).unwrap();
     }
 
     fn own(&mut self, session: u8, number: u32, kind: EndpointKind) -> Gid {
@@ -114,7 +114,7 @@ impl World {
 
     fn sees(&mut self, session: u8) -> BTreeSet<Gid> {
         let mut known = BTreeSet::new();
-        self.registry.message(&id(session), Message::Resync, vec![]).unwrap();
+        self.registry.handle_message(&id(session), Message::Resync, vec![]).unwrap();
         self.graph(session, &mut known);
         known
     }
@@ -226,7 +226,7 @@ fn pairs_and_graph_follow_a_link_that_comes_and_goes() {
         let told = world.drain(1);
         let parted = |m: &Message| matches!(m, Message::Unmatch(u) if u.writer == writer);
         assert!(told.iter().any(parted), "{told:?}");
-        world.registry.message(&id(1), Message::Resync, vec![]).unwrap();
+        world.registry.handle_message(&id(1), Message::Resync, vec![]).unwrap();
         world.graph(1, &mut seen[0]);
         assert!(!seen[0].contains(&subscription));
         assert!(seen[0].contains(&unlisted));
@@ -270,7 +270,7 @@ fn a_publisher_counts_those_of_a_relay_that_it_meets() {
         after: None,
         carries: None,
     };
-    world.registry.message(&id(GATEWAY), Message::Attach(attach), vec![]).unwrap();
+    world.registry.handle_message(&id(GATEWAY), Message::Attach(attach), vec![]).unwrap();
     let stands_for = |told: &[Message]| {
         told.iter().rev().find_map(|message| match message {
             Message::Attach(attach) => attach.stands_for.clone(),
@@ -289,7 +289,7 @@ fn a_publisher_counts_those_of_a_relay_that_it_meets() {
         after: None,
         relayed: None,
     };
-    world.registry.message(&id(1), Message::Grant(granted), vec![]).unwrap();
+    world.registry.handle_message(&id(1), Message::Grant(granted), vec![]).unwrap();
     // The other host's session lists this host from now on.
     world.remote(OTHER, not_met, Subscription, Toward { lists: true, ..SUBNET });
     assert_eq!(stands_for(&world.drain(1)), Some(vec![met, not_met]));

@@ -18,38 +18,45 @@ fn what_no_session_does_is_a_violation() {
     let (own, other) = (first(&world), world.clients[&1].id);
     let registry = &mut world.registry;
     let foreign = endpoint(Gid::new(other, 1), EndpointKind::Subscription, 0, Qos::default());
-    let stolen = registry.message(&own, announce(foreign.clone()), vec![]);
+    let stolen = registry.handle_message(&own, announce(foreign.clone()), vec![]);
     assert_eq!(stolen, Err(Violation::NotItsOwn(foreign.gid)));
-    registry.message(&other, announce(foreign.clone()), vec![]).unwrap();
-    let gone = registry.message(&own, Message::EndpointGone(Gone { gid: foreign.gid }), vec![]);
+    registry.handle_message(&other, announce(foreign.clone()), vec![]).unwrap();
+    let gone =
+        registry.handle_message(&own, Message::EndpointGone(Gone { gid: foreign.gid }), vec![]);
     assert_eq!(gone, Err(Violation::NotItsOwn(foreign.gid)));
 
     let writer = endpoint(Gid::new(own, 1), EndpointKind::Publisher, 0, Qos::default());
     let role = EndpointRole::Application;
     let endpoint = writer.clone();
     let placeless = Announce { endpoint, role, stands_for: vec![], ring: None, only: None };
-    let placeless = registry.message(&own, Message::Endpoint(placeless), vec![]);
+    let placeless = registry.handle_message(&own, Message::Endpoint(placeless), vec![]);
     assert_eq!(placeless, Err(Violation::Unexpected));
     let segment = Segment { number: 3, publisher: None };
     let opened = Message::Segment(SegmentOpened { session: own, segment });
     for fds in [vec![], vec![(own, "map"); 2]] {
-        let opened = registry.message(&own, opened.clone(), fds);
+        let opened = registry.handle_message(&own, opened.clone(), fds);
         assert!(matches!(opened, Err(Violation::Descriptors(_))));
     }
-    registry.message(&own, opened.clone(), vec![(own, "map")]).unwrap();
-    let twice = registry.message(&own, opened, vec![(own, "map")]);
+    registry.handle_message(&own, opened.clone(), vec![(own, "map")]).unwrap();
+    let twice = registry.handle_message(&own, opened, vec![(own, "map")]);
     assert_eq!(twice, Err(Violation::Segments(3)));
     for role in [EndpointRole::StandIn, EndpointRole::Relay] {
-        let taken = registry.message(&own, announce_as(writer.clone(), role), vec![]);
+        let taken = registry.handle_message(&own, announce_as(writer.clone(), role), vec![]);
         assert_eq!(taken, Err(Violation::NotItsOwn(writer.gid)), "{role:?}");
     }
-    let littered = registry.message(&own, Message::Resync, vec![(own, "ring")]);
+    let littered = registry.handle_message(&own, Message::Resync, vec![(own, "ring")]);
     assert_eq!(littered, Err(Violation::Descriptors(1)));
-    assert_eq!(registry.message(&own, Message::StatusRequest, vec![]), Err(Violation::Unexpected));
-    let pair = Pair { reader: foreign.gid, writer: writer.gid };
-    assert_eq!(registry.message(&own, Message::Match(pair), vec![]), Err(Violation::Unexpected));
     assert_eq!(
-        registry.message(&own, Message::Detach(pair), vec![]),
+        registry.handle_message(&own, Message::StatusRequest, vec![]),
+        Err(Violation::Unexpected)
+    );
+    let pair = Pair { reader: foreign.gid, writer: writer.gid };
+    assert_eq!(
+        registry.handle_message(&own, Message::Match(pair), vec![]),
+        Err(Violation::Unexpected)
+    );
+    assert_eq!(
+        registry.handle_message(&own, Message::Detach(pair), vec![]),
         Err(Violation::NotItsOwn(foreign.gid))
     );
 }
@@ -58,11 +65,11 @@ fn what_no_session_does_is_a_violation() {
 fn an_endpoint_out_of_bounds_is_refused_and_the_session_goes_on() {
     let mut world = connected(1);
     let own = first(&world);
-    while world.registry.next_output(&own).is_some() {}
+    while world.registry.poll_output(&own).is_some() {}
     let mut huge = endpoint(Gid::new(own, 1), EndpointKind::Subscription, 0, Qos::default());
     huge.topic = "x".repeat(1000);
-    world.registry.message(&own, announce(huge), vec![]).unwrap();
-    let answer = world.registry.next_output(&own).unwrap();
+    world.registry.handle_message(&own, announce(huge), vec![]).unwrap();
+    let answer = world.registry.poll_output(&own).unwrap();
     assert!(matches!(Message::decode(&answer.packet).unwrap(), Message::Refused(_)));
     assert_eq!(world.registry.endpoints().count(), 0);
 }
@@ -70,7 +77,9 @@ fn an_endpoint_out_of_bounds_is_refused_and_the_session_goes_on() {
 fn connect_gateway(world: &mut World) -> SessionId {
     let (gateway, name) = (session_id(200), String::new());
     let registry = &mut world.registry;
-    registry.connect(gateway, SessionRole::Gateway, name, 1, Some(handed(gateway)), None).unwrap();
+    registry
+        .handle_connect(gateway, SessionRole::Gateway, name, 1, Some(handed(gateway)), None)
+        .unwrap();
     gateway
 }
 
@@ -84,7 +93,7 @@ fn a_sample_never_goes_back_to_where_it_came_from() {
     let local = endpoint(Gid::new(own, 1), EndpointKind::Subscription, 0, Qos::default());
     let talker = endpoint(Gid::new(own, 2), EndpointKind::Publisher, 0, Qos::default());
     let say = |registry: &mut Registry<Label>, who, endpoint: &Endpoint, role| {
-        registry.message(&who, announce_as(endpoint.clone(), role), vec![]).unwrap();
+        registry.handle_message(&who, announce_as(endpoint.clone(), role), vec![]).unwrap();
     };
     say(&mut world.registry, gateway, &remote, EndpointRole::StandIn);
     say(&mut world.registry, gateway, &relay, EndpointRole::Relay);
@@ -125,12 +134,12 @@ fn ends_of_a_service_elsewhere_meet_those_here_and_never_each_other() {
     let registry = &mut world.registry;
     for stand_in in &there {
         let message = announce_as(stand_in.clone(), EndpointRole::StandIn);
-        let claimed = registry.message(&own, message.clone(), vec![]);
+        let claimed = registry.handle_message(&own, message.clone(), vec![]);
         assert_eq!(claimed, Err(Violation::NotItsOwn(stand_in.gid)));
-        registry.message(&gateway, message, vec![]).unwrap();
+        registry.handle_message(&gateway, message, vec![]).unwrap();
     }
     for endpoint in [&client, &server] {
-        registry.message(&own, announce(endpoint.clone()), vec![]).unwrap();
+        registry.handle_message(&own, announce(endpoint.clone()), vec![]).unwrap();
     }
     let both = |one: &Endpoint, other: &Endpoint| {
         [(one.gid, other.gid), (other.gid, one.gid)].map(|(reader, writer)| Pair { reader, writer })
@@ -149,7 +158,7 @@ fn a_gid_that_is_taken_is_nobody_elses() {
     let remote = endpoint(Gid([9; 16]), EndpointKind::Publisher, 0, Qos::default());
     // Another host claims the GID before its session announces it.
     world.registry.remote_graph(a, true, vec![local.clone(), remote.clone()], vec![]);
-    world.registry.message(&own, announce(local.clone()), vec![]).unwrap();
+    world.registry.handle_message(&own, announce(local.clone()), vec![]).unwrap();
     world.registry.remote_graph(b, true, vec![local.clone(), remote.clone()], vec![]);
     let of: Vec<_> = world.registry.remote_endpoints().map(|(d, e)| (*d, e.gid)).collect();
     assert_eq!(of, [(a, remote.gid)]);
@@ -163,11 +172,11 @@ fn a_tombstone_reaches_those_who_come_later() {
     let mut world = connected(1);
     let own = first(&world);
     let gid = Gid::new(own, 7);
-    world.registry.message(&own, Message::EndpointGone(Gone { gid }), vec![]).unwrap();
+    world.registry.handle_message(&own, Message::EndpointGone(Gone { gid }), vec![]).unwrap();
     world.take(Step::Connect(1));
     let late = world.clients[&1].id;
     let mut removed = Vec::new();
-    while let Some(output) = world.registry.next_output(&late) {
+    while let Some(output) = world.registry.poll_output(&late) {
         if let Message::Graph(graph) = Message::decode(&output.packet).unwrap() {
             removed.extend(graph.ended.unwrap_or_default());
         }
@@ -222,7 +231,7 @@ fn a_large_graph_is_told_in_packets_that_fit() {
 fn a_remote_endpoint_that_comes_and_goes_ends_nothing_here() {
     let mut world = connected(1);
     let own = first(&world);
-    while world.registry.next_output(&own).is_some() {}
+    while world.registry.poll_output(&own).is_some() {}
     let gid = Gid([9; 16]);
     let endpoint = Endpoint::example(gid, EndpointKind::Publisher);
     // A successor link repeats the whole graph within one flush.
@@ -231,7 +240,7 @@ fn a_remote_endpoint_that_comes_and_goes_ends_nothing_here() {
     }
     world.registry.flush();
     let mut seen = false;
-    while let Some(output) = world.registry.next_output(&own) {
+    while let Some(output) = world.registry.poll_output(&own) {
         if let Message::Graph(graph) = Message::decode(&output.packet).unwrap() {
             assert_eq!(graph.ended.unwrap_or_default(), vec![]);
             seen |= graph.added.iter().any(|item| item.endpoint.gid == gid);

@@ -282,7 +282,7 @@ impl World {
         let outgoing = std::mem::take(&mut client.outgoing);
         let any = !outgoing.is_empty();
         for (message, descriptors) in outgoing {
-            self.registry.message(&client.id, message, descriptors).unwrap();
+            self.registry.handle_message(&client.id, message, descriptors).unwrap();
         }
         any
     }
@@ -293,7 +293,7 @@ impl World {
         };
         let mut any = false;
         for _ in 0..count {
-            let Some(output) = self.registry.next_output(&client.id) else { break };
+            let Some(output) = self.registry.poll_output(&client.id) else { break };
             client.handle(&output);
             any = true;
         }
@@ -307,14 +307,21 @@ impl World {
                 self.generation = self.generation.wrapping_add(SESSIONS);
                 let id = session_id(self.generation.wrapping_add(session));
                 self.registry
-                    .connect(id, SessionRole::Application, String::new(), 1, Some(handed(id)), None)
+                    .handle_connect(
+                        id,
+                        SessionRole::Application,
+                        String::new(),
+                        1,
+                        Some(handed(id)),
+                        None,
+                    )
                     .unwrap();
                 let client = Client { id, connected: true, ..Client::default() };
                 self.clients.insert(session, client);
             }
             Step::Disconnect(session) => {
                 if let Some(client) = self.clients.remove(&session) {
-                    self.registry.disconnect(&client.id);
+                    self.registry.handle_disconnect(&client.id);
                 }
             }
             Step::Add { session, topic, writes, reliable } => {

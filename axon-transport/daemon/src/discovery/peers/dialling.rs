@@ -41,7 +41,7 @@ impl Peers {
             lost.map(|(standing, _)| (*id, standing))
         });
         for (daemon, standing) in lost.collect::<Vec<_>>() {
-            self.dial_failed(now, daemon, standing);
+            self.handle_dial_failed(now, daemon, standing);
         }
     }
 

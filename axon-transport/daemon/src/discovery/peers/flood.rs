@@ -63,7 +63,7 @@ impl Scene {
         let mut scene = Self::new(honest, forger);
         scene.honest_speaks();
         let (at, address) = (scene.time(), scene.address);
-        scene.peers.link_up(at, honest, address);
+        scene.peers.handle_link_up(at, honest, address);
         scene
     }
 
@@ -78,7 +78,7 @@ impl Scene {
             Arrival::Quic => self.address,
             Arrival::Shared => SocketAddr::new(self.address.ip(), 40_000),
         };
-        self.peers.datagram(self.time(), source, self.arrival, &bytes);
+        self.peers.handle_datagram(self.time(), source, self.arrival, &bytes);
     }
 
     /// Milliseconds from the honest host's start until this host dials it where it is.
@@ -87,14 +87,14 @@ impl Scene {
         for passed in 0..self.starts + 2 * LIMIT {
             self.now = begin + passed;
             for (source, arrival, datagram) in (self.forger)(passed) {
-                self.peers.datagram(self.time(), source, arrival, &datagram.encode());
+                self.peers.handle_datagram(self.time(), source, arrival, &datagram.encode());
             }
             let speaks =
                 passed.checked_sub(self.starts).is_some_and(|since| BURST.contains(&since));
             if speaks {
                 self.honest_speaks();
             }
-            self.peers.advance(self.time());
+            self.peers.handle_timeout(self.time());
             if self.is_dialled() && passed >= self.starts {
                 return Some(passed - self.starts);
             }
@@ -107,9 +107,9 @@ impl Scene {
         let mut dialled = false;
         while self.echoes.front().is_some_and(|(at, _)| *at <= self.now) {
             let (_, echo) = self.echoes.pop_front().unwrap();
-            self.peers.datagram(self.time(), self.address, Arrival::Quic, &echo);
+            self.peers.handle_datagram(self.time(), self.address, Arrival::Quic, &echo);
         }
-        while let Some(output) = self.peers.poll() {
+        while let Some(output) = self.peers.poll_output() {
             match output {
                 Output::Action(Action::Dial { daemon, addrs, .. }) => {
                     // An address that does not answer takes 5 s; the first is what counts.
@@ -151,7 +151,7 @@ impl Scene {
             if second % 10 == 0 {
                 self.honest_speaks();
             }
-            self.peers.advance(self.time());
+            self.peers.handle_timeout(self.time());
             self.is_dialled();
         }
         assert_eq!(self.peers.records.len(), 1, "the honest host alone is known");
@@ -286,10 +286,10 @@ fn a_host_that_was_linked_is_dialled_again_through_any_flood() {
             for ms in 0..1_000 {
                 scene.now += 1;
                 for (source, arrival, datagram) in forger(ms) {
-                    scene.peers.datagram(scene.time(), source, arrival, &datagram.encode());
+                    scene.peers.handle_datagram(scene.time(), source, arrival, &datagram.encode());
                 }
             }
-            scene.peers.link_down(scene.time(), honest);
+            scene.peers.handle_link_down(scene.time(), honest);
             scene.starts = 0;
             scene.links(what);
         }
@@ -315,14 +315,14 @@ fn an_answer_is_asked_of_no_flood() {
     for ms in 0..5_000 {
         scene.now += 1;
         for (source, arrival, datagram) in from_everywhere(ms) {
-            scene.peers.datagram(scene.time(), source, arrival, &datagram.encode());
+            scene.peers.handle_datagram(scene.time(), source, arrival, &datagram.encode());
         }
         scene.is_dialled();
     }
     let ask = Beacon { port: 61300, answer_wanted: true, ..beacon(HIGHER) };
     let bytes = Datagram::Beacon(ask).encode();
-    scene.peers.datagram(scene.time(), scene.address, Arrival::Quic, &bytes);
-    let answered = std::iter::from_fn(|| scene.peers.poll()).any(|output| match output {
+    scene.peers.handle_datagram(scene.time(), scene.address, Arrival::Quic, &bytes);
+    let answered = std::iter::from_fn(|| scene.peers.poll_output()).any(|output| match output {
         Output::Action(Action::SendFromQuicPort { to, bytes }) => {
             let said = Datagram::decode(&bytes);
             to == scene.address && matches!(said, Ok(Datagram::Beacon(b)) if b.daemon == OWN)
@@ -337,7 +337,7 @@ fn an_answer_is_asked_of_no_flood() {
 /// Probes that were sent since the last look, by host.
 fn probed(peers: &mut Peers) -> BTreeMap<IpAddr, usize> {
     let mut hosts = BTreeMap::new();
-    while let Some(output) = peers.poll() {
+    while let Some(output) = peers.poll_output() {
         if let Output::Action(Action::SendFromQuicPort { to, bytes }) = output
             && matches!(Datagram::decode(&bytes), Ok(Datagram::Probe { .. }))
         {
@@ -353,10 +353,10 @@ fn most_probed(mut scene: Scene) -> usize {
         scene.now += 1;
         for number in 4 * ms..4 * ms + 4 {
             for (source, arrival, datagram) in (scene.forger)(number) {
-                scene.peers.datagram(scene.time(), source, arrival, &datagram.encode());
+                scene.peers.handle_datagram(scene.time(), source, arrival, &datagram.encode());
             }
         }
-        scene.peers.advance(scene.time());
+        scene.peers.handle_timeout(scene.time());
     }
     probed(&mut scene.peers).into_values().max().unwrap_or(0)
 }
@@ -378,10 +378,10 @@ fn a_host_in_whose_name_beacons_are_forged_hears_few_probes() {
         scene.now += 1;
         for number in 4 * ms..4 * ms + 4 {
             for (source, arrival, datagram) in from_the_expected_ports(number) {
-                scene.peers.datagram(scene.time(), source, arrival, &datagram.encode());
+                scene.peers.handle_datagram(scene.time(), source, arrival, &datagram.encode());
             }
         }
-        scene.peers.advance(scene.time());
+        scene.peers.handle_timeout(scene.time());
         scene.is_dialled();
     }
     assert!((1..=41).contains(&scene.probes), "{}", scene.probes);
@@ -393,12 +393,12 @@ fn probes_of_strangers_keep_no_answer_from_a_host_that_is_known() {
     let (now, address) = (scene.time(), scene.address);
     let probe = |nonce: u64| Datagram::Probe { daemon: HIGHER, nonce: nonce.to_be_bytes() };
     for number in 0..5_000 {
-        scene.peers.datagram(now, forged(number), Arrival::Quic, &probe(number).encode());
+        scene.peers.handle_datagram(now, forged(number), Arrival::Quic, &probe(number).encode());
     }
-    let echoes = std::iter::from_fn(|| scene.peers.poll()).count();
+    let echoes = std::iter::from_fn(|| scene.peers.poll_output()).count();
     assert!(echoes <= 1_024, "{echoes}");
-    scene.peers.datagram(now, address, Arrival::Quic, &probe(7).encode());
-    assert!(scene.peers.poll().is_some());
+    scene.peers.handle_datagram(now, address, Arrival::Quic, &probe(7).encode());
+    assert!(scene.peers.poll_output().is_some());
 }
 
 #[test]
@@ -407,9 +407,9 @@ fn no_more_beacons_of_strangers_are_looked_at_than_a_second_has_time_for() {
     let now = scene.time();
     let all = |number| said(forged(number), made_up(number));
     for (source, arrival, datagram) in (0..20_000).map(all) {
-        scene.peers.datagram(now, source, arrival, &datagram.encode());
+        scene.peers.handle_datagram(now, source, arrival, &datagram.encode());
     }
-    let outputs = std::iter::from_fn(|| scene.peers.poll());
+    let outputs = std::iter::from_fn(|| scene.peers.poll_output());
     let gone = outputs.filter(|o| matches!(o, Output::Action(Action::Gone { .. }))).count();
     let heard = gone + scene.peers.records.len();
     assert!((500..=1_024).contains(&heard), "{heard}");
@@ -429,9 +429,9 @@ fn a_flood_pushes_out_no_host_that_answered() {
     for ms in 0..10_000 {
         scene.now += 1;
         for (source, arrival, datagram) in from_the_honest_address(ms) {
-            scene.peers.datagram(scene.time(), source, arrival, &datagram.encode());
+            scene.peers.handle_datagram(scene.time(), source, arrival, &datagram.encode());
         }
-        while scene.peers.poll().is_some() {}
+        while scene.peers.poll_output().is_some() {}
     }
     let record = &scene.peers.records[&HIGHER];
     assert!(record.sources.iter().any(|s| s.answered && s.address == source));
@@ -443,7 +443,7 @@ fn an_address_that_answers_under_many_names_counts_once() {
     for number in 0..100 {
         let (_, arrival, datagram) = said(forged(number), made_up(number));
         let one = SocketAddr::from(([10, 0, 0, 66], 61_300));
-        scene.peers.datagram(scene.time(), one, arrival, &datagram.encode());
+        scene.peers.handle_datagram(scene.time(), one, arrival, &datagram.encode());
     }
     for record in scene.peers.records.values_mut() {
         record.sources.iter_mut().for_each(|source| source.answered = true);

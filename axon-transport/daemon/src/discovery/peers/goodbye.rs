@@ -11,26 +11,26 @@ fn a_goodbye_counts_once_the_link_is_down_and_only_from_where_the_peer_is() {
     let goodbye = Datagram::Goodbye { domain: 0, daemon: HIGHER }.encode();
     let mut peers = settled(local());
     hear(&mut peers, 3.0, beacon(HIGHER));
-    peers.link_up(secs(3.1), HIGHER, from("10.0.0.2:61301"));
+    peers.handle_link_up(secs(3.1), HIGHER, from("10.0.0.2:61301"));
     actions(&mut peers);
-    peers.datagram(secs(4.0), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
-    peers.link_down(secs(4.1), HIGHER);
+    peers.handle_datagram(secs(4.0), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
+    peers.handle_link_down(secs(4.1), HIGHER);
     // Anybody could have said it: it is asked, and not dialled meanwhile.
     assert_eq!(probes(&mut peers).len(), 1);
-    peers.advance(secs(7.0));
+    peers.handle_timeout(secs(7.0));
     assert_eq!(actions(&mut peers), []);
-    peers.advance(secs(7.2));
+    peers.handle_timeout(secs(7.2));
     assert_eq!(actions(&mut peers), [Action::Gone { daemon: HIGHER }]);
 
     let at = |host: &str| format!("10.0.0.{host}:4000").parse().unwrap();
     let heard = Beacon { port: 61301, ..beacon(LOWER) };
-    peers.datagram(secs(8.0), at("3"), Arrival::Shared, &Datagram::Beacon(heard).encode());
+    peers.handle_datagram(secs(8.0), at("3"), Arrival::Shared, &Datagram::Beacon(heard).encode());
     let goodbye = Datagram::Goodbye { domain: 0, daemon: LOWER }.encode();
-    peers.datagram(secs(8.1), at("66"), Arrival::Shared, &goodbye);
+    peers.handle_datagram(secs(8.1), at("66"), Arrival::Shared, &goodbye);
     assert_eq!(actions(&mut peers), [], "said by another");
-    peers.datagram(secs(8.2), at("3"), Arrival::Shared, &goodbye);
+    peers.handle_datagram(secs(8.2), at("3"), Arrival::Shared, &goodbye);
     assert_eq!(probes(&mut peers).len(), 1);
-    peers.advance(secs(11.3));
+    peers.handle_timeout(secs(11.3));
     assert_eq!(actions(&mut peers), [Action::Gone { daemon: LOWER }]);
 }
 
@@ -40,22 +40,22 @@ fn a_peer_that_answers_after_a_goodbye_in_its_name_stays() {
     let mut peers = settled(local());
     hear(&mut peers, 3.0, beacon(HIGHER));
     let address = from("10.0.0.2:61301");
-    peers.link_up(secs(3.1), HIGHER, address);
+    peers.handle_link_up(secs(3.1), HIGHER, address);
     actions(&mut peers);
-    peers.datagram(secs(4.0), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
-    peers.link_down(secs(4.1), HIGHER);
+    peers.handle_datagram(secs(4.0), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
+    peers.handle_link_down(secs(4.1), HIGHER);
     let probes = probes(&mut peers);
     let [(to, nonce)] = probes[..] else { panic!("{probes:?}") };
     assert_eq!(to, address);
     let echo = Datagram::Echo { daemon: HIGHER, nonce }.encode();
-    peers.datagram(secs(4.2), address, Arrival::Quic, &echo);
+    peers.handle_datagram(secs(4.2), address, Arrival::Quic, &echo);
     assert_eq!(dials(&mut peers), [HIGHER]);
     fail(&mut peers, secs(4.3), HIGHER);
     // More of them say nothing for a while, so that they cost nothing either.
     for _ in 0..100 {
-        peers.datagram(secs(4.4), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
+        peers.handle_datagram(secs(4.4), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
     }
-    peers.advance(secs(6.0));
+    peers.handle_timeout(secs(6.0));
     assert_eq!(dials(&mut peers), [HIGHER], "and it alone");
 }
 
@@ -64,11 +64,11 @@ fn contested(now: f64) -> Peers {
     let mut peers = settled(local());
     hear(&mut peers, now, beacon(HIGHER));
     let elsewhere = Datagram::Beacon(beacon(HIGHER)).encode();
-    peers.datagram(secs(now), from("10.0.0.66:4000"), Arrival::Shared, &elsewhere);
+    peers.handle_datagram(secs(now), from("10.0.0.66:4000"), Arrival::Shared, &elsewhere);
     fail(&mut peers, secs(now + 0.2), HIGHER);
     actions(&mut peers);
     let goodbye = Datagram::Goodbye { domain: 0, daemon: HIGHER }.encode();
-    peers.datagram(secs(now + 0.5), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
+    peers.handle_datagram(secs(now + 0.5), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
     peers
 }
 
@@ -80,8 +80,8 @@ fn an_address_of_several_is_asked_before_a_goodbye_from_there_counts() {
     let [(to, nonce)] = probes[..] else { panic!("{probes:?}") };
     assert_eq!(to, address);
     let echo = Datagram::Echo { daemon: HIGHER, nonce }.encode();
-    peers.datagram(secs(3.6), address, Arrival::Quic, &echo);
-    peers.advance(secs(8.0));
+    peers.handle_datagram(secs(3.6), address, Arrival::Quic, &echo);
+    peers.handle_timeout(secs(8.0));
     let record = &peers.records[&HIGHER];
     assert_eq!((record.sources[0].address, record.standing()), (address, Standing::Answered));
 }
@@ -89,9 +89,9 @@ fn an_address_of_several_is_asked_before_a_goodbye_from_there_counts() {
 #[test]
 fn an_address_of_several_that_does_not_answer_after_a_goodbye_is_forgotten_alone() {
     let mut peers = contested(3.0);
-    peers.advance(secs(6.4));
+    peers.handle_timeout(secs(6.4));
     assert_eq!(peers.records[&HIGHER].sources.len(), 2, "an answer may still come");
-    peers.advance(secs(6.6));
+    peers.handle_timeout(secs(6.6));
     let left: Vec<_> = peers.records[&HIGHER].sources.iter().map(|s| s.address).collect();
     assert_eq!(left, [from("10.0.0.66:61301")]);
 }

@@ -1,8 +1,7 @@
-//! Discovery's state machine: which daemons exist and when to dial them. Datagrams, events and time in,
-//! datagrams and dials out.
+//! Discovery's state machine (`docs/architecture.md`): which daemons exist and when to dial them.
+//! Datagrams and events of links go in, datagrams and dials come out.
 //!
-//! Nothing here does I/O or looks at a clock. `now` is any clock that does not go back. A beacon is
-//! a hint from anybody, so every collection is bounded, every answer rationed, and nothing that
+//! A beacon is a hint from anybody, so every collection is bounded, every answer rationed, and nothing that
 //! arrives here closes a link or keeps one from being made to a peer that was acceptable before.
 
 mod announcing;
@@ -128,12 +127,12 @@ impl Peers {
     }
 
     /// The next thing to do; ask until it says `None`.
-    pub(crate) fn poll(&mut self) -> Option<Output> {
+    pub(crate) fn poll_output(&mut self) -> Option<Output> {
         self.outputs.pop_front()
     }
 
-    /// When [`advance`](Self::advance) is to be called at the latest.
-    pub(crate) fn next_wakeup(&self) -> Option<Duration> {
+    /// When [`handle_timeout`](Self::handle_timeout) is to be called at the latest.
+    pub(crate) fn poll_timeout(&self) -> Option<Duration> {
         let in_flight = self.dials_in_flight();
         let lifetime = self.lifetime();
         let of_records = self.records.values().flat_map(|record| {
@@ -151,7 +150,7 @@ impl Peers {
     }
 
     /// Does what is due at `now`.
-    pub(crate) fn advance(&mut self, now: Duration) {
+    pub(crate) fn handle_timeout(&mut self, now: Duration) {
         self.give_up_lost_dials(now);
         self.forget_silent(now);
         self.forget_unanswered(now);
@@ -243,7 +242,7 @@ impl Peers {
     }
 
     /// A link with `daemon` stands, whoever dialled it.
-    pub(crate) fn link_up(&mut self, now: Duration, daemon: DaemonId, address: SocketAddr) {
+    pub(crate) fn handle_link_up(&mut self, now: Duration, daemon: DaemonId, address: SocketAddr) {
         let listed = self.lists(address.ip().to_canonical());
         let address = SocketAddr::new(address.ip().to_canonical(), address.port());
         self.meet(address.ip());
@@ -259,7 +258,7 @@ impl Peers {
     }
 
     /// The link with `daemon` is no more.
-    pub(crate) fn link_down(&mut self, now: Duration, daemon: DaemonId) {
+    pub(crate) fn handle_link_down(&mut self, now: Duration, daemon: DaemonId) {
         let Some(record) = self.records.get_mut(&daemon) else { return };
         record.linked = false;
         record.done();
@@ -276,7 +275,12 @@ impl Peers {
     }
 
     /// A dial to addresses of this standing did not become a link.
-    pub(crate) fn dial_failed(&mut self, now: Duration, daemon: DaemonId, standing: Standing) {
+    pub(crate) fn handle_dial_failed(
+        &mut self,
+        now: Duration,
+        daemon: DaemonId,
+        standing: Standing,
+    ) {
         let jitter = self.random.random_range(0.5..1.5);
         let record = self.records.get_mut(&daemon);
         let under_way = |record: &&mut Record| record.dials[standing as usize].in_flight.is_some();

@@ -21,7 +21,7 @@ const ANSWER_SPACING: Duration = Duration::from_secs(1);
 
 impl Peers {
     /// A datagram came.
-    pub(crate) fn datagram(
+    pub(crate) fn handle_datagram(
         &mut self,
         now: Duration,
         from: SocketAddr,

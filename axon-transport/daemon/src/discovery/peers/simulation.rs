@@ -129,8 +129,8 @@ impl Subnet {
 
     /// Lets a host do all it wants at this moment.
     fn settle(&mut self, host: usize) {
-        self.hosts[host].peers.advance(self.now);
-        while let Some(output) = self.hosts[host].peers.poll() {
+        self.hosts[host].peers.handle_timeout(self.now);
+        while let Some(output) = self.hosts[host].peers.poll_output() {
             match output {
                 Output::Multicast(bytes) => {
                     for to in (0..self.hosts.len()).filter(|to| *to != host) {
@@ -168,7 +168,7 @@ impl Subnet {
                 }
             }
         }
-        self.wakeups[host] = self.hosts[host].peers.next_wakeup();
+        self.wakeups[host] = self.hosts[host].peers.poll_timeout();
     }
 
     fn run_until(&mut self, end: Duration) {
@@ -183,7 +183,7 @@ impl Subnet {
             if coming == Some(next) {
                 match self.coming.pop_first().unwrap().1 {
                     What::Datagram { to, from, arrival, bytes } => {
-                        self.hosts[to].peers.datagram(self.now, from, arrival, &bytes);
+                        self.hosts[to].peers.handle_datagram(self.now, from, arrival, &bytes);
                         self.settle(to);
                     }
                     What::DialEnds { from, to, standing } => self.dial_ends(from, to, standing),
@@ -201,13 +201,13 @@ impl Subnet {
         let now = self.now;
         self.hosts[from].in_flight.remove(&to);
         if self.random.random_bool(self.loss) {
-            self.hosts[from].peers.dial_failed(now, id(to), standing);
+            self.hosts[from].peers.handle_dial_failed(now, id(to), standing);
             return self.settle(from);
         }
         for (a, b) in [(from, to), (to, from)] {
             let address = self.hosts[b].address;
             self.hosts[a].links.insert(b);
-            self.hosts[a].peers.link_up(now, id(b), address);
+            self.hosts[a].peers.handle_link_up(now, id(b), address);
             self.settle(a);
         }
     }
@@ -216,7 +216,7 @@ impl Subnet {
         let now = self.now;
         for (a, b) in [(a, b), (b, a)] {
             if self.hosts[a].links.remove(&b) {
-                self.hosts[a].peers.link_down(now, id(b));
+                self.hosts[a].peers.handle_link_down(now, id(b));
                 self.settle(a);
             }
         }
@@ -265,7 +265,7 @@ fn a_host_that_comes_late_is_found_within_the_first_beacons() {
     let mut fresh = Subnet::new(1, &[CLASSIC; 9], 0.0);
     subnet.hosts.push(fresh.hosts.pop().unwrap());
     subnet.wakeups.push(None);
-    while subnet.hosts[late].peers.poll().is_some() {}
+    while subnet.hosts[late].peers.poll_output().is_some() {}
     subnet.start(late);
     subnet.run_until(Duration::from_secs(33));
     subnet.assert_whole();

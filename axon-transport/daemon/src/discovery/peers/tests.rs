@@ -54,16 +54,16 @@ pub(super) fn settled(local: Local) -> Peers {
     peers.set_port(Duration::ZERO, 61300);
     for _ in 0..5 {
         // A daemon that looks for nobody sends no beacons and rests at once.
-        let Some(at) = peers.next_wakeup() else { break };
+        let Some(at) = peers.poll_timeout() else { break };
         assert!(at <= secs(2.0));
-        peers.advance(at);
+        peers.handle_timeout(at);
     }
     actions(&mut peers);
     peers
 }
 
 pub(super) fn actions(peers: &mut Peers) -> Vec<Action> {
-    std::iter::from_fn(|| peers.poll())
+    std::iter::from_fn(|| peers.poll_output())
         .filter_map(|output| match output {
             Output::Action(action) => Some(action),
             Output::Multicast(_) => None,
@@ -100,12 +100,12 @@ pub(super) fn from(text: &str) -> SocketAddr {
 
 pub(super) fn hear(peers: &mut Peers, now: f64, beacon: Beacon) {
     let bytes = Datagram::Beacon(beacon).encode();
-    peers.datagram(secs(now), from("10.0.0.2:4000"), Arrival::Shared, &bytes);
+    peers.handle_datagram(secs(now), from("10.0.0.2:4000"), Arrival::Shared, &bytes);
 }
 
 /// Whatever dial to the peer is under way fails.
 pub(super) fn fail(peers: &mut Peers, now: Duration, daemon: DaemonId) {
-    Standing::ALL.into_iter().for_each(|standing| peers.dial_failed(now, daemon, standing));
+    Standing::ALL.into_iter().for_each(|standing| peers.handle_dial_failed(now, daemon, standing));
 }
 
 fn mismatches(peers: &mut Peers) -> Vec<Mismatch> {
@@ -131,7 +131,7 @@ fn a_peer_of_other_terms_is_told_apart_once_and_never_dialled() {
                 ..beacon(LOWER)
             },
         );
-        peers.advance(secs(3.5 + f64::from(n)));
+        peers.handle_timeout(secs(3.5 + f64::from(n)));
     }
     let all = actions(&mut peers);
     let told: Vec<_> = all.iter().filter(|a| matches!(a, Action::Mismatch(_))).collect();
@@ -185,7 +185,7 @@ fn other_domains_and_protocols_are_told_apart() {
     hear(&mut peers, 3.0, Beacon { domain: 9, ..beacon(LOWER) });
     let foreign = Foreign { protocols: (7, 9), domain: 0, daemon: HIGHER };
     let bytes = Datagram::Foreign(foreign).encode();
-    peers.datagram(secs(3.0), from("10.0.0.3:4000"), Arrival::Shared, &bytes);
+    peers.handle_datagram(secs(3.0), from("10.0.0.3:4000"), Arrival::Shared, &bytes);
     let told: Vec<_> = mismatches(&mut peers).into_iter().map(|m| (m.setting, m.theirs)).collect();
     assert_eq!(told[0], ("ROS_DOMAIN_ID", "9".to_owned()));
     assert_eq!(told[1], ("protocol version", "7 to 9".to_owned()));
@@ -199,17 +199,17 @@ fn forged_beacons_change_nothing_for_a_peer_that_was_acceptable() {
     assert_eq!(dials(&mut peers), [HIGHER]);
     hear(&mut peers, 3.1, forged());
     fail(&mut peers, secs(3.2), HIGHER);
-    peers.advance(secs(4.5));
+    peers.handle_timeout(secs(4.5));
     assert_eq!(dials(&mut peers), [HIGHER], "still dialled");
 
-    peers.link_up(secs(5.0), HIGHER, from("10.0.0.2:61301"));
+    peers.handle_link_up(secs(5.0), HIGHER, from("10.0.0.2:61301"));
     hear(&mut peers, 5.1, forged());
     let goodbye = Datagram::Goodbye { domain: 0, daemon: HIGHER }.encode();
-    peers.datagram(secs(5.2), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
-    peers.advance(secs(500.0));
+    peers.handle_datagram(secs(5.2), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
+    peers.handle_timeout(secs(500.0));
     let quiet = |a: &Action| matches!(a, Action::SendFromQuicPort { .. });
     assert!(actions(&mut peers).iter().all(quiet), "a link is neither closed nor forgotten");
-    peers.link_down(secs(501.0), HIGHER);
+    peers.handle_link_down(secs(501.0), HIGHER);
     assert_eq!(dials(&mut peers), [HIGHER]);
 }
 
@@ -221,9 +221,9 @@ fn the_lower_id_dials_at_once_the_other_after_a_start() {
 
     hear(&mut peers, 3.0, beacon(LOWER));
     assert_eq!(dials(&mut peers), []);
-    peers.advance(secs(3.299));
+    peers.handle_timeout(secs(3.299));
     assert_eq!(dials(&mut peers), []);
-    peers.advance(secs(3.3));
+    peers.handle_timeout(secs(3.3));
     assert_eq!(dials(&mut peers), [LOWER]);
 
     // A listed peer may be behind a NAT that lets only us begin.
@@ -235,8 +235,8 @@ fn the_lower_id_dials_at_once_the_other_after_a_start() {
     // Linked by its dial in the meantime.
     let mut peers = settled(local());
     hear(&mut peers, 3.0, beacon(LOWER));
-    peers.link_up(secs(3.2), LOWER, from("10.0.0.2:61301"));
-    peers.advance(secs(4.0));
+    peers.handle_link_up(secs(3.2), LOWER, from("10.0.0.2:61301"));
+    peers.handle_timeout(secs(4.0));
     assert_eq!(dials(&mut peers), []);
 }
 
@@ -251,10 +251,10 @@ fn failed_dials_back_off_up_to_eight_seconds() {
         fail(&mut peers, now, HIGHER);
         let failed = now;
         loop {
-            now = peers.next_wakeup().unwrap();
+            now = peers.poll_timeout().unwrap();
             // It goes on saying that it is there.
             hear(&mut peers, now.as_secs_f64(), beacon(HIGHER));
-            peers.advance(now);
+            peers.handle_timeout(now);
             if dials(&mut peers) == [HIGHER] {
                 break;
             }
@@ -270,8 +270,8 @@ fn failed_dials_back_off_up_to_eight_seconds() {
     // An outcome that nobody reports is a failure in the end.
     let lost = now + secs(31.0);
     hear(&mut peers, lost.as_secs_f64(), beacon(HIGHER));
-    peers.advance(lost);
-    peers.advance(lost + secs(2.0));
+    peers.handle_timeout(lost);
+    peers.handle_timeout(lost + secs(2.0));
     assert_eq!(dials(&mut peers), [HIGHER]);
 }
 
@@ -280,7 +280,7 @@ fn strangers_are_bounded_and_push_out_no_linked_peer() {
     let mut peers = settled(local());
     let linked: Vec<DaemonId> = (0..100).map(|n| DaemonId([n; 16])).collect();
     for daemon in &linked {
-        peers.link_up(secs(3.0), *daemon, from("10.0.0.9:61300"));
+        peers.handle_link_up(secs(3.0), *daemon, from("10.0.0.9:61300"));
     }
     for n in 0..5_000_u32 {
         let mut id = [0xee; 16];
@@ -290,8 +290,8 @@ fn strangers_are_bounded_and_push_out_no_linked_peer() {
         assert!(peers.in_flight() <= MOST_IN_FLIGHT);
     }
     assert!(linked.iter().all(|daemon| peers.records[daemon].linked));
-    peers.advance(secs(1e4));
-    peers.advance(secs(2e4));
+    peers.handle_timeout(secs(1e4));
+    peers.handle_timeout(secs(2e4));
     assert_eq!(peers.records.len(), 100, "the silent are forgotten");
 }
 
@@ -310,7 +310,7 @@ fn answers_are_rationed() {
         _ => false,
     });
     assert_eq!(sent.count(), 64);
-    assert!(peers.next_wakeup().unwrap() <= secs(4.0), "the rest by one beacon to all");
+    assert!(peers.poll_timeout().unwrap() <= secs(4.0), "the rest by one beacon to all");
 }
 
 #[test]
@@ -318,7 +318,7 @@ fn ranges_are_kept() {
     let heard = |range, from: &str, arrival, localhost| {
         let mut peers = settled(Local { range, ..local() });
         let bytes = Datagram::Beacon(Beacon { localhost, ..beacon(HIGHER) }).encode();
-        peers.datagram(secs(3.0), from.parse().unwrap(), arrival, &bytes);
+        peers.handle_datagram(secs(3.0), from.parse().unwrap(), arrival, &bytes);
         dials(&mut peers) == [HIGHER]
     };
     use Arrival::{Quic, Shared};
@@ -335,16 +335,16 @@ fn ranges_are_kept() {
     off.set_port(Duration::ZERO, 61300);
     off.set_listed(Duration::ZERO, vec![("10.0.0.2".parse().unwrap(), None)]);
     hear(&mut off, 1.0, beacon(HIGHER));
-    off.advance(secs(1.0));
-    assert_eq!(off.poll(), None);
+    off.handle_timeout(secs(1.0));
+    assert_eq!(off.poll_output(), None);
 
     let mut alone = Peers::new(Local { range: Localhost, bind: Vec::new(), ..local() }, 1);
     alone.set_port(Duration::ZERO, 61300);
-    alone.advance(Duration::ZERO);
-    assert_eq!((alone.poll(), alone.next_wakeup()), (None, None), "it lists nobody");
+    alone.handle_timeout(Duration::ZERO);
+    assert_eq!((alone.poll_output(), alone.poll_timeout()), (None, None), "it lists nobody");
     alone.set_listed(secs(1.0), vec![("10.0.0.2".parse().unwrap(), None)]);
-    alone.advance(secs(1.0));
-    let sent: Vec<_> = std::iter::from_fn(|| alone.poll()).collect();
+    alone.handle_timeout(secs(1.0));
+    let sent: Vec<_> = std::iter::from_fn(|| alone.poll_output()).collect();
     assert_eq!(sent.len(), 16, "the QUIC ports of the host that it lists");
     assert!(!sent.iter().any(|output| matches!(output, Output::Multicast(_))));
 }
@@ -353,13 +353,13 @@ fn ranges_are_kept() {
 fn a_range_that_changes_is_followed() {
     use DiscoveryRange::{Localhost, Off, Subnet};
     let multicasts = |peers: &mut Peers, now: f64| {
-        peers.advance(secs(now));
-        let sent: Vec<_> = std::iter::from_fn(|| peers.poll()).collect();
+        peers.handle_timeout(secs(now));
+        let sent: Vec<_> = std::iter::from_fn(|| peers.poll_output()).collect();
         sent.iter().filter(|output| matches!(output, Output::Multicast(_))).count()
     };
     let mut peers = Peers::new(Local { range: Off, ..local() }, 1);
     peers.set_port(Duration::ZERO, 61300);
-    assert_eq!(peers.next_wakeup(), None, "it is silent");
+    assert_eq!(peers.poll_timeout(), None, "it is silent");
     assert_eq!(multicasts(&mut peers, 0.0), 0);
     peers.set_range(secs(1.0), Localhost);
     assert_eq!(multicasts(&mut peers, 1.0), 0);
@@ -367,28 +367,28 @@ fn a_range_that_changes_is_followed() {
     assert_eq!(multicasts(&mut peers, 2.0), 1);
     hear(&mut peers, 3.0, beacon(HIGHER));
     assert_eq!(dials(&mut peers), [HIGHER]);
-    peers.link_up(secs(3.0), HIGHER, from("10.0.0.2:61301"));
+    peers.handle_link_up(secs(3.0), HIGHER, from("10.0.0.2:61301"));
 
     // A link stays; once it is down it is not made again for nobody.
     peers.set_range(secs(4.0), Localhost);
     assert_eq!(multicasts(&mut peers, 30.0), 0);
-    peers.link_down(secs(31.0), HIGHER);
-    peers.advance(secs(60.0));
+    peers.handle_link_down(secs(31.0), HIGHER);
+    peers.handle_timeout(secs(60.0));
     assert_eq!(dials(&mut peers), []);
     hear(&mut peers, 61.0, beacon(HIGHER));
     assert_eq!(dials(&mut peers), [], "by multicast");
     let bytes = Datagram::Beacon(beacon(HIGHER)).encode();
-    peers.datagram(secs(62.0), from("10.0.0.2:61301"), Arrival::Quic, &bytes);
+    peers.handle_datagram(secs(62.0), from("10.0.0.2:61301"), Arrival::Quic, &bytes);
     assert_eq!(dials(&mut peers), [HIGHER], "it lists this host");
 
     peers.set_range(secs(63.0), Off);
     fail(&mut peers, secs(64.0), HIGHER);
     actions(&mut peers);
-    peers.datagram(secs(65.0), from("10.0.0.2:61301"), Arrival::Quic, &bytes);
-    peers.advance(secs(90.0));
-    assert_eq!(peers.poll(), None);
+    peers.handle_datagram(secs(65.0), from("10.0.0.2:61301"), Arrival::Quic, &bytes);
+    peers.handle_timeout(secs(90.0));
+    assert_eq!(peers.poll_output(), None);
     peers.say_goodbye();
-    assert_eq!(peers.poll(), None);
+    assert_eq!(peers.poll_output(), None);
 }
 
 #[test]
@@ -397,11 +397,11 @@ fn probes_are_echoed_and_own_beacons_ignored() {
     hear(&mut peers, 3.0, beacon(OWN));
     assert!(peers.records.is_empty());
     let probe = Datagram::Probe { daemon: HIGHER, nonce: [7; 8] }.encode();
-    peers.datagram(secs(3.0), from("[::ffff:10.0.0.2]:61301"), Arrival::Quic, &probe);
+    peers.handle_datagram(secs(3.0), from("[::ffff:10.0.0.2]:61301"), Arrival::Quic, &probe);
     let echo = Datagram::Echo { daemon: OWN, nonce: [7; 8] }.encode();
     let to = from("10.0.0.2:61301");
     assert_eq!(actions(&mut peers), [Action::SendFromQuicPort { to, bytes: echo }]);
-    peers.datagram(secs(3.0), to, Arrival::Shared, &probe);
+    peers.handle_datagram(secs(3.0), to, Arrival::Shared, &probe);
     assert_eq!(actions(&mut peers), [], "to the shared port nobody probes");
 }
 
@@ -410,7 +410,7 @@ fn listed_peers_are_tried_on_every_port_or_the_one_given() {
     let mut peers = settled(local());
     let listed = vec![("10.9.9.9".parse().unwrap(), None), ("10.0.0.7".parse().unwrap(), Some(9))];
     peers.set_listed(secs(3.0), listed);
-    peers.advance(secs(3.0));
+    peers.handle_timeout(secs(3.0));
     let to: Vec<_> = actions(&mut peers)
         .into_iter()
         .map(|action| match action {
@@ -436,13 +436,13 @@ proptest! {
             let at = SocketAddr::new([10, 0, 0, who].into(), 61300);
             let quic = if wait % 2 == 0 { Arrival::Quic } else { Arrival::Shared };
             match step {
-                0 => peers.link_up(now, daemon, at),
-                1 => peers.link_down(now, daemon),
+                0 => peers.handle_link_up(now, daemon, at),
+                1 => peers.handle_link_down(now, daemon),
                 2 => fail(&mut peers, now, daemon),
-                3 => peers.datagram(now, at, quic, &bytes),
+                3 => peers.handle_datagram(now, at, quic, &bytes),
                 4 => {
                     let goodbye = Datagram::Goodbye { domain: 0, daemon }.encode();
-                    peers.datagram(now, at, quic, &goodbye);
+                    peers.handle_datagram(now, at, quic, &goodbye);
                 }
                 5 => peers.set_listed(now, vec![(at.ip(), Some(who.into())); usize::from(who) * 60]),
                 6 => peers.set_interfaces(now, Vec::new()),
@@ -451,11 +451,11 @@ proptest! {
                     let terms = Terms { cipher: seed as u8 % 3, ..QKD };
                     let answer_wanted = seed % 2 == 0;
                     let heard = Beacon { terms, sae, answer_wanted, ..beacon(daemon) };
-                    peers.datagram(now, at, quic, &Datagram::Beacon(heard).encode());
+                    peers.handle_datagram(now, at, quic, &Datagram::Beacon(heard).encode());
                 }
             }
-            peers.advance(now);
-            if let Some(at) = peers.next_wakeup() {
+            peers.handle_timeout(now);
+            if let Some(at) = peers.poll_timeout() {
                 prop_assert!(at > now, "nothing is due that was just done");
             }
             prop_assert!(peers.in_flight() <= MOST_IN_FLIGHT);

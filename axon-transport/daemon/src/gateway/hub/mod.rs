@@ -310,7 +310,7 @@ impl Hub {
                 self.refused(peer, refusal).await;
             }
             Event::Control(link, Ok((message, _until_handled))) => {
-                self.on_message(link, message).await;
+                self.handle_message(link, message).await;
             }
             Event::Control(link, Err(error)) => {
                 if let (Some(code), Some(l)) = (error.code(), self.links.get(&link)) {
@@ -348,7 +348,7 @@ impl Hub {
         }
     }
 
-    async fn on_message(&mut self, number: u64, message: Message) {
+    async fn handle_message(&mut self, number: u64, message: Message) {
         let Some(link) = self.links.get_mut(&number) else { return };
         if let Err(error) = link.order.accept(&message) {
             return self.violation(number, CloseCode::OutOfOrder, error.to_string()).await;
@@ -363,7 +363,7 @@ impl Hub {
             else {
                 return;
             };
-            if let Err(error) = peer.on_message(&keyring, number, keys) {
+            if let Err(error) = peer.handle_message(&keyring, number, keys) {
                 let code = CloseCode::from_code(error.code()).unwrap_or(CloseCode::Internal);
                 self.violation(number, code, error.to_string()).await;
             }

@@ -241,7 +241,7 @@ impl Acceptor {
     }
 
     /// The KME's answer to one of our requests.
-    pub fn on_answer(&self, answer: Answer) {
+    pub fn handle_answer(&self, answer: Answer) {
         let now = self.0.clock.now();
         let Request::Dec { master, key_ids, .. } = answer.request else { return };
         let mut state = self.state();

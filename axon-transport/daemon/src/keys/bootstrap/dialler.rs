@@ -244,7 +244,7 @@ impl Dialler {
     }
 
     /// The KME's answer to one of our requests.
-    pub fn on_answer(&mut self, now: Duration, answer: Answer) {
+    pub fn handle_answer(&mut self, now: Duration, answer: Answer) {
         let Request::Enc { slave, .. } = answer.request else { return };
         let Some(peer) = self.peers.get_mut(&slave) else { return };
         if !matches!(peer.state, State::Asked) {

@@ -91,7 +91,7 @@ impl Pool {
     }
 
     /// Takes the answer to one of these calls. Says what was wrong with it, if anything was.
-    pub(super) fn on_answer(&mut self, now: Duration, answer: Answer) -> Option<String> {
+    pub(super) fn handle_answer(&mut self, now: Duration, answer: Answer) -> Option<String> {
         let asked = now.saturating_sub(answer.took);
         let ask = match answer.request {
             Request::Status { .. } => Ask::Status,

@@ -137,7 +137,7 @@ impl Receiver {
     ///
     /// # Errors
     /// The peer broke a rule, or the connection is not attached.
-    pub fn on_message(
+    pub fn handle_message(
         &mut self,
         now: Duration,
         conn: u64,
@@ -177,8 +177,8 @@ impl Receiver {
     }
 
     /// The KME's answer to one of our requests.
-    pub fn on_answer(&mut self, now: Duration, answer: Answer) {
-        for (key_id, outcome) in self.fetches.on_answer(now, answer) {
+    pub fn handle_answer(&mut self, now: Duration, answer: Answer) {
+        for (key_id, outcome) in self.fetches.handle_answer(now, answer) {
             // Retired meanwhile: nobody waits for it.
             let Some(conn) = self.wanted.remove(&key_id) else { continue };
             match outcome {
@@ -190,12 +190,12 @@ impl Receiver {
     }
 
     /// When to poll again without other cause.
-    pub fn poll_timeout(&self, _now: Duration) -> Option<Duration> {
+    pub fn poll_timeout(&self) -> Option<Duration> {
         self.fetches.poll_timeout()
     }
 
     /// Erases what time has retired; to be called about once a second.
-    pub fn expire(&mut self, now: Duration) {
+    pub fn handle_timeout(&mut self, now: Duration) {
         for link in self.links.values_mut() {
             self.counts.add(link.opener.expire(now));
         }

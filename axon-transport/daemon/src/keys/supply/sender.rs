@@ -262,7 +262,7 @@ impl Sender {
     ///
     /// # Errors
     /// The peer broke a rule, or the system gives no random bytes.
-    pub fn on_message(
+    pub fn handle_message(
         &mut self,
         now: Duration,
         conn: u64,
@@ -321,14 +321,14 @@ impl Sender {
     }
 
     /// The KME's answer to one of our requests.
-    pub fn on_answer(&mut self, now: Duration, answer: Answer) {
-        if let Some(failure) = self.pool.on_answer(now, answer) {
+    pub fn handle_answer(&mut self, now: Duration, answer: Answer) {
+        if let Some(failure) = self.pool.handle_answer(now, answer) {
             self.counts.last_failure = Some(failure);
         }
     }
 
     /// When to poll again without other cause.
-    pub fn poll_timeout(&self, _now: Duration) -> Option<Duration> {
+    pub fn poll_timeout(&self) -> Option<Duration> {
         let used = self.begun.map(|at| at + KEY_MAX_AGE);
         let unanswered = self.announced.values().map(|a| a.since + ANSWER_WITHIN).min();
         let calls = self.link.as_ref().and_then(|_| self.pool.poll_timeout());

@@ -122,7 +122,7 @@ impl ClientProof {
     }
 
     /// The KME's answer to our request.
-    pub fn on_answer(&mut self, now: Duration, answer: Answer) {
+    pub fn handle_answer(&mut self, now: Duration, answer: Answer) {
         if !matches!(self.step, Step::Asked) {
             return;
         }
@@ -162,7 +162,7 @@ impl ClientProof {
     }
 
     /// What the client sent. Everything but the right READY ends in failure.
-    pub fn on_message(&mut self, _now: Duration, message: &KeyMessage) {
+    pub fn handle_message(&mut self, _now: Duration, message: &KeyMessage) {
         let sae = || self.client_sae.clone();
         let failure = match (&self.step, message) {
             (Step::Failed(_), _) => return,
@@ -184,7 +184,7 @@ impl ClientProof {
         self.step = Step::Failed(failure);
     }
 
-    /// When to call [`on_timeout`](Self::on_timeout) and poll again without other cause.
+    /// When to call [`handle_timeout`](Self::handle_timeout) and poll again without other cause.
     pub fn poll_timeout(&self) -> Option<Duration> {
         match &self.step {
             Step::Proven(..) | Step::Failed(_) => None,
@@ -194,7 +194,7 @@ impl ClientProof {
     }
 
     /// Ends the proof when its time is over.
-    pub fn on_timeout(&mut self, now: Duration) {
+    pub fn handle_timeout(&mut self, now: Duration) {
         if now >= self.deadline && !matches!(self.step, Step::Proven(..) | Step::Failed(_)) {
             self.step = Step::Failed(ProofFailure::Timeout(self.client_sae.clone()));
         }

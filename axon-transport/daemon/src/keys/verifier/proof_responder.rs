@@ -36,7 +36,7 @@ impl ProofResponder {
     ///
     /// # Errors
     /// Anything but one ANNOUNCE of one key.
-    pub fn on_message(&mut self, now: Duration, message: &KeyMessage) -> Result<(), Violation> {
+    pub fn handle_message(&mut self, now: Duration, message: &KeyMessage) -> Result<(), Violation> {
         match message {
             KeyMessage::Announce(key_ids) if !self.announced && key_ids.len() == 1 => {
                 self.announced = true;
@@ -53,8 +53,8 @@ impl ProofResponder {
     }
 
     /// The KME's answer to one of our requests. The key is used for the proof, and erased.
-    pub fn on_answer(&mut self, now: Duration, answer: Answer) {
-        for (key_id, outcome) in self.fetches.on_answer(now, answer) {
+    pub fn handle_answer(&mut self, now: Duration, answer: Answer) {
+        for (key_id, outcome) in self.fetches.handle_answer(now, answer) {
             let (message, answered) = match outcome {
                 Ok(key) => {
                     let proof = proof::compute(&key, &key_id, &self.ready);

@@ -37,7 +37,7 @@ fn failed(request: Request, kind: FailureKind) -> Answer {
 fn announced() -> ClientProof {
     let mut proof = ClientProof::new(NOW, "sae-a", &exporters());
     let request = proof.poll_request(NOW).unwrap();
-    proof.on_answer(NOW, given(request, 1));
+    proof.handle_answer(NOW, given(request, 1));
     assert_eq!(proof.poll_message(), Some(KeyMessage::Announce(vec![id("k1")])));
     assert_eq!(proof.poll_message(), None);
     assert_eq!(proof.state(), ProofState::Pending);
@@ -58,19 +58,19 @@ fn nothing_but_the_right_proof_will_do() {
         (KeyMessage::Failed { key_id: id("k1"), reason: "gone".to_owned() }, 0x23),
     ] {
         let mut proof = announced();
-        proof.on_message(NOW, &message);
+        proof.handle_message(NOW, &message);
         let ProofState::Failed(failure) = proof.state() else { panic!("{message:?}") };
         assert_eq!(failure.code(), code, "{failure}");
-        proof.on_message(NOW, &ready("k1", right));
+        proof.handle_message(NOW, &ready("k1", right));
         assert!(matches!(proof.state(), ProofState::Failed(_)), "and it stays so");
         assert!(proof.into_key().is_none());
     }
     let mut proof = ClientProof::new(NOW, "sae-a", &exporters());
-    proof.on_message(NOW, &ready("k1", right));
+    proof.handle_message(NOW, &ready("k1", right));
     assert!(matches!(proof.state(), ProofState::Failed(_)), "before anything was announced");
 
     let mut proof = announced();
-    proof.on_message(NOW, &ready("k1", right));
+    proof.handle_message(NOW, &ready("k1", right));
     assert_eq!(proof.state(), ProofState::Proven);
     let (key_id, proven) = proof.into_key().unwrap();
     assert_eq!((key_id, *proven.expose_secret()), (id("k1"), [1; 32]));
@@ -80,9 +80,9 @@ fn nothing_but_the_right_proof_will_do() {
 fn time_runs_out() {
     let mut proof = announced();
     let end = proof.poll_timeout().unwrap();
-    proof.on_timeout(end - Duration::from_millis(1));
+    proof.handle_timeout(end - Duration::from_millis(1));
     assert_eq!(proof.state(), ProofState::Pending);
-    proof.on_timeout(end);
+    proof.handle_timeout(end);
     assert_eq!(proof.state(), ProofState::Failed(ProofFailure::Timeout("sae-a".to_owned())));
 }
 
@@ -101,7 +101,7 @@ fn enc_keys_is_repeated_only_where_no_key_can_be_lost() {
         while proof.state() == ProofState::Pending {
             if let Some(request) = proof.poll_request(now) {
                 made += 1;
-                proof.on_answer(now, failed(request, kind));
+                proof.handle_answer(now, failed(request, kind));
             }
             now += Duration::from_millis(100);
         }
@@ -117,16 +117,16 @@ fn the_client_answers_one_announcement_of_one_key() {
     let mut server = announced();
     let mut client = ProofResponder::new("sae-b", &exporters());
     let retire = KeyMessage::Failed { key_id: id("k1"), reason: String::new() };
-    assert!(client.on_message(NOW, &retire).is_err());
-    assert!(client.on_message(NOW, &KeyMessage::Announce(vec![id("k1"), id("k2")])).is_err());
-    client.on_message(NOW, &KeyMessage::Announce(vec![id("k1")])).unwrap();
-    assert!(client.on_message(NOW, &KeyMessage::Announce(vec![id("k2")])).is_err());
+    assert!(client.handle_message(NOW, &retire).is_err());
+    assert!(client.handle_message(NOW, &KeyMessage::Announce(vec![id("k1"), id("k2")])).is_err());
+    client.handle_message(NOW, &KeyMessage::Announce(vec![id("k1")])).unwrap();
+    assert!(client.handle_message(NOW, &KeyMessage::Announce(vec![id("k2")])).is_err());
     let request = client.poll_request(NOW).unwrap();
     assert!(matches!(&request, Request::Dec { master, .. } if master == "sae-b"));
     assert_eq!(client.answered(), None);
-    client.on_answer(NOW, given(request, 1));
+    client.handle_answer(NOW, given(request, 1));
     assert_eq!(client.answered(), Some(Ok(())));
-    server.on_message(NOW, &client.poll_message().unwrap());
+    server.handle_message(NOW, &client.poll_message().unwrap());
     assert_eq!(server.state(), ProofState::Proven);
 }
 
@@ -134,14 +134,14 @@ fn the_client_answers_one_announcement_of_one_key() {
 fn a_client_without_the_key_says_so() {
     let mut server = announced();
     let mut client = ProofResponder::new("sae-b", &exporters());
-    client.on_message(NOW, &KeyMessage::Announce(vec![id("k1")])).unwrap();
+    client.handle_message(NOW, &KeyMessage::Announce(vec![id("k1")])).unwrap();
     let request = client.poll_request(NOW).unwrap();
     let outcome = Err(Failure::new(FailureKind::Refused, "kme.lan:8443 says 400"));
-    client.on_answer(NOW, Answer { request, took: Duration::ZERO, outcome });
+    client.handle_answer(NOW, Answer { request, took: Duration::ZERO, outcome });
     assert_eq!(client.answered(), Some(Err("kme.lan:8443 says 400".to_owned())), "for the log");
     let message = client.poll_message().unwrap();
     assert!(!format!("{message:?}").contains("kme.lan"), "not for the peer: {message:?}");
-    server.on_message(NOW, &message);
+    server.handle_message(NOW, &message);
     let ProofState::Failed(failure) = server.state() else { panic!() };
     assert!(matches!(failure, ProofFailure::ClientHasNoKey { .. }), "{failure}");
 }

@@ -42,7 +42,7 @@ fn a_miss_asks_once_and_the_next_look_up_finds_the_clients_psk() {
     assert!(acceptor.poll_request().is_none(), "one call for one key");
     let Request::Dec { master, key_ids, .. } = &request else { panic!() };
     assert_eq!((master.as_str(), &key_ids[..]), ("sae-a", &[id("k1")][..]));
-    acceptor.on_answer(key(request, "k1", 9));
+    acceptor.handle_answer(key(request, "k1", 9));
 
     let resolver = acceptor.resolver(ip("10.0.0.1"));
     let found = resolver.resolve(&bytes).expect("cached");
@@ -57,7 +57,7 @@ fn a_look_up_among_several_identities_fetches_nothing() {
     let (acceptor, _) = new(listed(&["sae-a"]));
     let (missing, cached) = (identity("sae-a", "k0"), identity("sae-a", "k1"));
     look_up(&acceptor, "10.0.0.1", &cached);
-    acceptor.on_answer(key(acceptor.poll_request().unwrap(), "k1", 9));
+    acceptor.handle_answer(key(acceptor.poll_request().unwrap(), "k1", 9));
 
     let resolver = acceptor.resolver(ip("10.0.0.1"));
     assert!(resolver.resolve_known(&missing).is_none());
@@ -75,7 +75,7 @@ fn only_a_completed_handshake_spends_a_key_and_only_once() {
     let (acceptor, clock) = new(listed(&["sae-a"]));
     let bytes = identity("sae-a", "k1");
     look_up(&acceptor, "10.0.0.1", &bytes);
-    acceptor.on_answer(key(acceptor.poll_request().unwrap(), "k1", 9));
+    acceptor.handle_answer(key(acceptor.poll_request().unwrap(), "k1", 9));
     for _ in 0..1000 {
         // Copied ClientHellos, wrong binders.
         assert_eq!(look_up(&acceptor, "10.0.0.66", &bytes), Lookup::Found);
@@ -97,7 +97,7 @@ fn a_key_that_arrives_after_it_was_spent_is_not_kept() {
     look_up(&acceptor, "10.0.0.1", &bytes);
     let request = acceptor.poll_request().unwrap();
     assert_eq!(acceptor.spent(&bytes), Completion::First);
-    acceptor.on_answer(key(request, "k1", 9));
+    acceptor.handle_answer(key(request, "k1", 9));
     assert_eq!(acceptor.cached(), 0);
     assert_eq!(look_up(&acceptor, "10.0.0.1", &bytes), Lookup::Spent);
 }
@@ -107,12 +107,12 @@ fn a_key_unknown_twice_is_not_asked_for_again_for_thirty_seconds() {
     let (acceptor, clock) = new(listed(&["sae-a"]));
     let bytes = identity("sae-a", "k1");
     look_up(&acceptor, "10.0.0.1", &bytes);
-    acceptor.on_answer(failed(acceptor.poll_request().unwrap(), FailureKind::Refused));
+    acceptor.handle_answer(failed(acceptor.poll_request().unwrap(), FailureKind::Refused));
     assert_eq!(look_up(&acceptor, "10.0.0.1", &bytes), Lookup::UnknownKeyId);
     assert!(acceptor.poll_request().is_none());
     clock.advance(s(1));
     assert_eq!(look_up(&acceptor, "10.0.0.1", &bytes), Lookup::Fetching, "relayed late");
-    acceptor.on_answer(failed(acceptor.poll_request().unwrap(), FailureKind::Refused));
+    acceptor.handle_answer(failed(acceptor.poll_request().unwrap(), FailureKind::Refused));
     clock.advance(s(29));
     assert_eq!(look_up(&acceptor, "10.0.0.1", &bytes), Lookup::UnknownKeyId);
     assert!(acceptor.poll_request().is_none());
@@ -125,7 +125,7 @@ fn a_kme_that_is_down_is_named_and_asked_again() {
     let (acceptor, _) = new(listed(&["sae-a"]));
     let bytes = identity("sae-a", "k1");
     look_up(&acceptor, "10.0.0.1", &bytes);
-    acceptor.on_answer(failed(acceptor.poll_request().unwrap(), FailureKind::Unreachable));
+    acceptor.handle_answer(failed(acceptor.poll_request().unwrap(), FailureKind::Unreachable));
     let again = look_up(&acceptor, "10.0.0.1", &bytes);
     assert_eq!(again, Lookup::KmeFailed("as the test says".to_owned()));
     assert!(acceptor.poll_request().is_some());
@@ -137,7 +137,7 @@ fn unspent_keys_are_kept_a_minute_and_eight_for_each_sae() {
     let name = |i: u32| format!("k{i}");
     for i in 0..9 {
         look_up(&acceptor, "10.0.0.1", &identity("sae-a", &name(i)));
-        acceptor.on_answer(key(acceptor.poll_request().unwrap(), &name(i), 9));
+        acceptor.handle_answer(key(acceptor.poll_request().unwrap(), &name(i), 9));
         clock.advance(s(1));
     }
     for i in 1..9 {
@@ -158,7 +158,7 @@ fn one_address_has_two_calls_in_flight_for_an_sae() {
     assert!(matches!(look_up("10.0.0.1", "sae-a", "k3"), Lookup::Limited(_)));
     assert_eq!(look_up("10.0.0.2", "sae-a", "k3"), Lookup::Fetching);
     assert_eq!(look_up("10.0.0.1", "sae-c", "k3"), Lookup::Fetching);
-    acceptor.on_answer(key(acceptor.poll_request().unwrap(), "k1", 9));
+    acceptor.handle_answer(key(acceptor.poll_request().unwrap(), "k1", 9));
     assert_eq!(look_up("10.0.0.1", "sae-a", "k4"), Lookup::Fetching);
 }
 
@@ -183,7 +183,7 @@ fn strangers_do_not_empty_the_bucket_of_an_address_that_authenticated() {
     for i in 0..100 {
         acceptor.prefetch(ip("10.0.0.1"), &identity("sae-a", &format!("made-up-{i}")));
         while let Some(request) = acceptor.poll_request() {
-            acceptor.on_answer(failed(request, FailureKind::Refused));
+            acceptor.handle_answer(failed(request, FailureKind::Refused));
         }
     }
     let stranger = look_up(&acceptor, "10.0.0.2", &identity("sae-a", "k"));
@@ -219,7 +219,7 @@ fn an_expired_displaced_or_spent_psk_is_erased_in_handshakes_under_way() {
                 clock.advance(s(1));
                 let name = format!("later-{number}");
                 look_up(acceptor, "10.0.0.1", &identity("sae-a", &name));
-                acceptor.on_answer(key(acceptor.poll_request().unwrap(), &name, 1));
+                acceptor.handle_answer(key(acceptor.poll_request().unwrap(), &name, 1));
             }
         }),
         ("spent", |acceptor, _| {
@@ -230,7 +230,7 @@ fn an_expired_displaced_or_spent_psk_is_erased_in_handshakes_under_way() {
         let (acceptor, clock) = new(listed(&["sae-a"]));
         let bytes = identity("sae-a", "k1");
         look_up(&acceptor, "10.0.0.1", &bytes);
-        acceptor.on_answer(key(acceptor.poll_request().unwrap(), "k1", 9));
+        acceptor.handle_answer(key(acceptor.poll_request().unwrap(), "k1", 9));
         let psk = acceptor.resolver(ip("10.0.0.1")).resolve(&bytes).unwrap();
         assert!(!psk.is_erased(), "{name}");
         end(&acceptor, &clock);

@@ -14,7 +14,7 @@ fn holding(now: Duration, name: &str) -> Dialler {
 fn give(dialler: &mut Dialler, now: Duration, name: &str) {
     assert!(matches!(dialler.dial(now, "sae-b"), Dial::Wait { until: None, .. }));
     let request = dialler.poll_request(now).expect("asks for a key");
-    dialler.on_answer(now, key(request, name, 1));
+    dialler.handle_answer(now, key(request, name, 1));
 }
 
 fn attempt(dialler: &mut Dialler, now: Duration) -> Option<KeyId> {
@@ -104,7 +104,7 @@ fn kmes_that_disagree_about_every_key_are_asked_ever_more_seldom() {
         }
         if let Some(request) = dialler.poll_request(now) {
             asked += 1;
-            dialler.on_answer(now, key(request, &format!("k{asked}"), 1));
+            dialler.handle_answer(now, key(request, &format!("k{asked}"), 1));
         }
     }
     // 1, 2, 4 … 60 s apart.
@@ -141,7 +141,7 @@ fn failed_calls_are_spaced_out_up_to_a_minute() {
         assert!(matches!(dialler.dial(now, "sae-b"), Dial::Wait { until: None, .. }));
         let request = dialler.poll_request(now).unwrap();
         assert!(dialler.poll_request(now).is_none(), "never two calls for one peer");
-        dialler.on_answer(now, failed(request, FailureKind::Ambiguous));
+        dialler.handle_answer(now, failed(request, FailureKind::Ambiguous));
         let Dial::Wait { until: Some(until), why } = dialler.dial(now, "sae-b") else { panic!() };
         assert!(why.contains("as the test says"), "{why}");
         pauses.push((until - now).as_secs());
@@ -170,11 +170,11 @@ fn made_up_names_under_a_star_are_bounded() {
 fn answers_nobody_waits_for_are_dropped() {
     let mut dialler = holding(s(0), "k1");
     let request = Request::Status { slave: "sae-b".to_owned() };
-    dialler.on_answer(s(1), failed(request, FailureKind::Refused));
+    dialler.handle_answer(s(1), failed(request, FailureKind::Refused));
     let mut other = new();
     other.dial(s(1), "sae-b");
     let request = other.poll_request(s(1)).unwrap();
-    dialler.on_answer(s(1), key(request, "k2", 2));
+    dialler.handle_answer(s(1), key(request, "k2", 2));
     assert_eq!(attempt(&mut dialler, s(1)), Some(id("k1")));
 }
 

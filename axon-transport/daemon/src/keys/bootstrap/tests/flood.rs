@@ -44,7 +44,7 @@ proptest! {
                     let request = in_flight.swap_remove(which % in_flight.len());
                     let Request::Dec { key_ids, .. } = &request else { unreachable!() };
                     let name = key_ids[0].to_string();
-                    acceptor.on_answer(match kind {
+                    acceptor.handle_answer(match kind {
                         0 => failed(request, FailureKind::Refused),
                         1 => failed(request, FailureKind::Ambiguous),
                         2 => key(request, "another", 1),

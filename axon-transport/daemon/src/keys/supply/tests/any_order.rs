@@ -84,7 +84,7 @@ proptest! {
                 }
                 Step::Dry(left) => pair.kmes.left = left,
             }
-            pair.receiver.expire(pair.now);
+            pair.receiver.handle_timeout(pair.now);
             let s = pair.sender.statistics(pair.now);
             prop_assert!(s.ready + s.announced + s.asked <= 4096);
         }

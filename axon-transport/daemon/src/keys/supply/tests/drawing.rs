@@ -28,7 +28,7 @@ fn an_empty_store_is_asked_for_less_and_less_often() {
                 asked.push(number);
             }
             let answer = pair.kmes.answer(request);
-            pair.sender.on_answer(pair.now, answer);
+            pair.sender.handle_answer(pair.now, answer);
         }
         pair.now += ms(10);
     }
@@ -47,18 +47,18 @@ fn a_kme_that_asks_for_a_pause_has_it_but_not_for_ever() {
         let mut pair = Pair::new();
         let status = pair.sender.poll_request(pair.now).unwrap();
         let answer = pair.kmes.answer(status);
-        pair.sender.on_answer(pair.now, answer);
+        pair.sender.handle_answer(pair.now, answer);
         let request = pair.sender.poll_request(pair.now).unwrap();
         let busy = Failure {
             retry_after: Some(asked),
             ..Failure::new(FailureKind::Unavailable, "the KME is busy")
         };
-        pair.sender.on_answer(pair.now, Answer { request, took: ms(10), outcome: Err(busy) });
+        pair.sender.handle_answer(pair.now, Answer { request, took: ms(10), outcome: Err(busy) });
         while pair.now < pause {
             if let Some(request) = pair.sender.poll_request(pair.now) {
                 assert!(matches!(request, Request::Status { .. }), "{:?}: {request:?}", pair.now);
                 let answer = pair.kmes.answer(request);
-                pair.sender.on_answer(pair.now, answer);
+                pair.sender.handle_answer(pair.now, answer);
             }
             pair.now += ms(100);
         }
@@ -74,11 +74,11 @@ fn a_call_that_may_have_lost_keys_is_not_repeated_at_once() {
     let status = pair.sender.poll_request(pair.now).unwrap();
     assert!(pair.sender.poll_request(pair.now).is_none(), "not before the KME told its limits");
     let answer = pair.kmes.answer(status);
-    pair.sender.on_answer(pair.now, answer);
+    pair.sender.handle_answer(pair.now, answer);
     let request = pair.sender.poll_request(pair.now).unwrap();
     pair.kmes.failures = vec![FailureKind::Ambiguous];
     let answer = pair.kmes.answer(request);
-    pair.sender.on_answer(pair.now, answer);
+    pair.sender.handle_answer(pair.now, answer);
     assert!(pair.sender.poll_request(pair.now + ms(999)).is_none());
     assert!(pair.sender.poll_request(pair.now + ms(1000)).is_some());
 }
@@ -89,7 +89,7 @@ fn a_kme_without_a_status_is_asked_for_one_key_at_a_time() {
     let status = pair.sender.poll_request(pair.now).unwrap();
     pair.kmes.failures = vec![FailureKind::Unauthorized];
     let answer = pair.kmes.answer(status);
-    pair.sender.on_answer(pair.now, answer);
+    pair.sender.handle_answer(pair.now, answer);
     for _ in 0..4 {
         assert_eq!(number(&pair.sender.poll_request(pair.now).unwrap()), 1);
     }
@@ -102,7 +102,7 @@ fn answers_to_another_call_give_nothing_and_are_not_asked_for_in_a_loop() {
     let status = pair.sender.poll_request(pair.now).unwrap();
     let key = (id("key-of-status"), KmeKey::from_slice(&[1; 32]).unwrap());
     let outcome = Ok(Fetched::Keys(vec![key]));
-    pair.sender.on_answer(pair.now, Answer { request: status, took: ms(1), outcome });
+    pair.sender.handle_answer(pair.now, Answer { request: status, took: ms(1), outcome });
     let mut calls = 0;
     while let Some(request) = pair.sender.poll_request(pair.now) {
         number(&request);
@@ -112,7 +112,7 @@ fn answers_to_another_call_give_nothing_and_are_not_asked_for_in_a_loop() {
             stored_key_count: 1000,
             max_key_per_request: 128,
         }));
-        pair.sender.on_answer(pair.now, Answer { request, took: ms(1), outcome });
+        pair.sender.handle_answer(pair.now, Answer { request, took: ms(1), outcome });
     }
     assert!(pair.sender.poll_message(pair.now).is_none(), "nothing to announce");
     let statistics = pair.sender.statistics(pair.now);

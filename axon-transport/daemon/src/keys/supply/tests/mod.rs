@@ -115,7 +115,7 @@ impl Pair {
         self.receiver.attach(self.now, self.conn, &exporters(self.conn)).unwrap();
         for (conn, message) in owed {
             assert_eq!(conn, self.conn - 1, "owed where it was announced");
-            self.receiver.on_message(self.now, conn, &message).unwrap();
+            self.receiver.handle_message(self.now, conn, &message).unwrap();
             self.log.push(message);
         }
     }
@@ -129,7 +129,7 @@ impl Pair {
     fn draw(&mut self) {
         while let Some(request) = self.sender.poll_request(self.now) {
             let answer = self.kmes.answer(request);
-            self.sender.on_answer(self.now, answer);
+            self.sender.handle_answer(self.now, answer);
         }
     }
 
@@ -141,17 +141,17 @@ impl Pair {
                     assert!(number <= 8, "a lost call loses at most eight keys");
                 }
                 let answer = self.kmes.answer(request);
-                self.sender.on_answer(self.now, answer);
+                self.sender.handle_answer(self.now, answer);
             } else if let Some(request) = self.receiver.poll_request(self.now) {
                 let answer = self.kmes.answer(request);
-                self.receiver.on_answer(self.now, answer);
+                self.receiver.handle_answer(self.now, answer);
             } else if let Some((conn, message)) = self.sender.poll_message(self.now) {
                 if conn == self.conn {
-                    self.receiver.on_message(self.now, conn, &message).unwrap();
+                    self.receiver.handle_message(self.now, conn, &message).unwrap();
                 }
                 self.log.push(message);
             } else if let Some((conn, message)) = self.receiver.poll_message() {
-                self.sender.on_message(self.now, conn, &message).unwrap();
+                self.sender.handle_message(self.now, conn, &message).unwrap();
                 self.log.push(message);
             } else {
                 return;

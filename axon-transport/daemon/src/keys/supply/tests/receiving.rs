@@ -13,11 +13,11 @@ fn a_batch_with_an_unknown_key_is_fetched_one_by_one() {
     let mut pair = Pair::new();
     let known: Vec<KeyId> = (0..3).map(|_| pair.kmes.issue().0).collect();
     let announce = KeyMessage::Announce(vec![known[0].clone(), id("lost"), known[1].clone()]);
-    pair.receiver.on_message(pair.now, 1, &announce).unwrap();
+    pair.receiver.handle_message(pair.now, 1, &announce).unwrap();
     let mut said = Vec::new();
     while let Some(request) = pair.receiver.poll_request(pair.now) {
         let answer = pair.kmes.answer(request);
-        pair.receiver.on_answer(pair.now, answer);
+        pair.receiver.handle_answer(pair.now, answer);
     }
     while let Some((_, message)) = pair.receiver.poll_message() {
         said.push(message);
@@ -33,13 +33,13 @@ fn dec_keys_is_tried_three_times_with_the_same_ids() {
     let mut pair = Pair::new();
     let (key_id, _) = pair.kmes.issue();
     pair.kmes.failures = vec![FailureKind::Ambiguous, FailureKind::Unreachable];
-    pair.receiver.on_message(pair.now, 1, &KeyMessage::Announce(vec![key_id])).unwrap();
+    pair.receiver.handle_message(pair.now, 1, &KeyMessage::Announce(vec![key_id])).unwrap();
     let mut tries = 0;
     for _ in 0..10 {
         while let Some(request) = pair.receiver.poll_request(pair.now) {
             tries += 1;
             let answer = pair.kmes.answer(request);
-            pair.receiver.on_answer(pair.now, answer);
+            pair.receiver.handle_answer(pair.now, answer);
         }
         pair.now += ms(1000);
     }
@@ -47,11 +47,11 @@ fn dec_keys_is_tried_three_times_with_the_same_ids() {
     assert!(matches!(pair.receiver.poll_message(), Some((1, KeyMessage::Ready { .. }))));
 
     pair.kmes.failures = vec![FailureKind::Unreachable; 9];
-    pair.receiver.on_message(pair.now, 1, &KeyMessage::Announce(vec![id("k")])).unwrap();
+    pair.receiver.handle_message(pair.now, 1, &KeyMessage::Announce(vec![id("k")])).unwrap();
     for _ in 0..10 {
         while let Some(request) = pair.receiver.poll_request(pair.now) {
             let answer = pair.kmes.answer(request);
-            pair.receiver.on_answer(pair.now, answer);
+            pair.receiver.handle_answer(pair.now, answer);
         }
         pair.now += ms(1000);
     }
@@ -64,18 +64,18 @@ fn the_next_try_of_dec_keys_is_when_the_kme_says() {
     for (asked, pause) in [(ms(0), ms(2000)), (ms(3000), ms(5000)), (Duration::MAX, ms(12_000))] {
         let mut pair = Pair::new();
         let (key_id, _) = pair.kmes.issue();
-        pair.receiver.on_message(pair.now, 1, &KeyMessage::Announce(vec![key_id])).unwrap();
+        pair.receiver.handle_message(pair.now, 1, &KeyMessage::Announce(vec![key_id])).unwrap();
         let request = pair.receiver.poll_request(pair.now).unwrap();
         let busy = Failure {
             retry_after: Some(asked),
             ..Failure::new(FailureKind::Unavailable, "the KME is busy")
         };
-        pair.receiver.on_answer(pair.now, Answer { request, took: ms(10), outcome: Err(busy) });
-        assert_eq!(pair.receiver.poll_timeout(pair.now), Some(pause));
+        pair.receiver.handle_answer(pair.now, Answer { request, took: ms(10), outcome: Err(busy) });
+        assert_eq!(pair.receiver.poll_timeout(), Some(pause));
         assert!(pair.receiver.poll_request(pause - ms(1)).is_none());
         let request = pair.receiver.poll_request(pause).unwrap();
         let answer = pair.kmes.answer(request);
-        pair.receiver.on_answer(pause, answer);
+        pair.receiver.handle_answer(pause, answer);
         assert!(matches!(pair.receiver.poll_message(), Some((1, KeyMessage::Ready { .. }))));
     }
 }
@@ -85,7 +85,7 @@ fn a_peer_that_only_announces_is_stopped_at_the_cap() {
     let mut pair = Pair::new();
     for i in 0..600 {
         let key_ids = (0..16).map(|j| id(&format!("flood-{i}-{j}"))).collect();
-        pair.receiver.on_message(pair.now, 1, &KeyMessage::Announce(key_ids)).unwrap();
+        pair.receiver.handle_message(pair.now, 1, &KeyMessage::Announce(key_ids)).unwrap();
     }
     assert_eq!(pair.receiver.statistics().fetching, 4096);
     assert_eq!(pair.receiver.statistics().failed, 600 * 16 - 4096);
@@ -105,15 +105,18 @@ fn contradicting_masks_end_the_link() {
         _ => None,
     });
     let key_id = first.unwrap();
-    assert!(pair.receiver.on_message(pair.now, 1, &retire(&key_id, 1, 2)).is_err());
+    assert!(pair.receiver.handle_message(pair.now, 1, &retire(&key_id, 1, 2)).is_err());
     let envelope = pair.seal(Delivery::Reliable).unwrap();
     pair.open(envelope).unwrap();
     assert!(
-        pair.receiver.on_message(pair.now, 1, &retire(&key_id, 0, 0)).is_err(),
+        pair.receiver.handle_message(pair.now, 1, &retire(&key_id, 0, 0)).is_err(),
         "index 0 opened"
     );
-    pair.receiver.on_message(pair.now, 1, &retire("never-seen", 3, 1)).unwrap();
-    assert!(pair.receiver.on_message(pair.now, 9, &retire(&key_id, 1, 1)).is_err(), "no such link");
+    pair.receiver.handle_message(pair.now, 1, &retire("never-seen", 3, 1)).unwrap();
+    assert!(
+        pair.receiver.handle_message(pair.now, 9, &retire(&key_id, 1, 1)).is_err(),
+        "no such link"
+    );
 }
 
 #[test]
@@ -130,10 +133,10 @@ fn messages_that_never_came_are_counted_once() {
     let missing = |pair: &Pair| pair.receiver.statistics().messages_missing;
     pair.connect();
     pair.run();
-    pair.receiver.expire(pair.now);
+    pair.receiver.handle_timeout(pair.now);
     assert_eq!(missing(&pair), 0, "they may still come");
     pair.now += ms(5_000);
-    pair.receiver.expire(pair.now);
+    pair.receiver.handle_timeout(pair.now);
     assert_eq!(missing(&pair), 2);
     pair.seal(Delivery::BestEffort).unwrap();
     pair.connect();
@@ -141,7 +144,7 @@ fn messages_that_never_came_are_counted_once() {
     // The connection closes before the next look.
     pair.close(pair.conn - 1);
     assert_eq!(missing(&pair), 3);
-    pair.receiver.expire(pair.now);
+    pair.receiver.handle_timeout(pair.now);
     assert_eq!((missing(&pair), pair.receiver.statistics().expired), (3, 2));
 }
 
@@ -151,16 +154,16 @@ fn names_that_no_kme_knows_cost_a_bounded_number_of_calls() {
     let mut calls = 0;
     for tick in 0..6_000 {
         let made_up = (0..16).map(|i| id(&format!("made-up-{tick}-{i}"))).collect();
-        pair.receiver.on_message(pair.now, 1, &KeyMessage::Announce(made_up)).unwrap();
+        pair.receiver.handle_message(pair.now, 1, &KeyMessage::Announce(made_up)).unwrap();
         while let Some(request) = pair.receiver.poll_request(pair.now) {
             calls += 1;
             let answer = pair.kmes.answer(request);
-            pair.receiver.on_answer(pair.now, answer);
+            pair.receiver.handle_answer(pair.now, answer);
         }
         while pair.receiver.poll_message().is_some() {}
         pair.now += ms(10);
     }
     assert!(calls <= 300 + 60 * 5 + 4, "{calls} in a minute");
-    let next = pair.receiver.poll_timeout(pair.now).expect("calls go on");
+    let next = pair.receiver.poll_timeout().expect("calls go on");
     assert!(next <= pair.now + ms(1000));
 }

@@ -13,7 +13,7 @@ fn nothing_is_sealed_before_ready() {
     assert_eq!(pair.seal(Delivery::Reliable), Err(NoKey::None), "keys held, none announced");
     let (_, announce) = pair.sender.poll_message(pair.now).unwrap();
     assert_eq!(pair.seal(Delivery::Reliable), Err(NoKey::None), "announced, none READY");
-    pair.receiver.on_message(pair.now, 1, &announce).unwrap();
+    pair.receiver.handle_message(pair.now, 1, &announce).unwrap();
     pair.run();
     let envelope = pair.seal(Delivery::Reliable).unwrap();
     pair.open(envelope).unwrap();
@@ -29,23 +29,23 @@ fn a_wrong_proof_retires_its_key_and_nothing_else() {
     for (wrong, proof) in [[0; 32], [0xff; 32]].into_iter().enumerate() {
         let key_id = key_ids[wrong].clone();
         let ready = KeyMessage::Ready { key_id: key_id.clone(), proof };
-        pair.sender.on_message(pair.now, 1, &ready).unwrap();
+        pair.sender.handle_message(pair.now, 1, &ready).unwrap();
         let expected = retire(std::str::from_utf8(key_id.as_bytes()).unwrap(), 0, 0);
         assert_eq!(pair.sender.poll_message(pair.now), Some((1, expected)));
         // Said again, it is about a key that nobody holds any more.
-        pair.sender.on_message(pair.now, 1, &ready).unwrap();
+        pair.sender.handle_message(pair.now, 1, &ready).unwrap();
     }
     let statistics = pair.sender.statistics(pair.now);
     assert_eq!((statistics.disagreed, statistics.announced), (2, key_ids.len() - 2));
     let unknown = KeyMessage::Ready { key_id: id("nobody's"), proof: [0; 32] };
-    pair.sender.on_message(pair.now, 1, &unknown).unwrap();
+    pair.sender.handle_message(pair.now, 1, &unknown).unwrap();
     assert_eq!(pair.seal(Delivery::Reliable), Err(NoKey::None));
     for unexpected in [KeyMessage::Announce(vec![id("k")]), retire("k", 0, 0)] {
-        assert!(pair.sender.on_message(pair.now, 1, &unexpected).is_err());
+        assert!(pair.sender.handle_message(pair.now, 1, &unexpected).is_err());
     }
     // The others are as good as before.
     let announce = KeyMessage::Announce(key_ids[2..].to_vec());
-    pair.receiver.on_message(pair.now, 1, &announce).unwrap();
+    pair.receiver.handle_message(pair.now, 1, &announce).unwrap();
     pair.run();
     let envelope = pair.seal(Delivery::Reliable).unwrap();
     pair.open(envelope).unwrap();
@@ -85,7 +85,7 @@ fn a_peer_that_fails_every_proof_burns_few_keys() {
                 let KeyMessage::Announce(key_ids) = message else { continue };
                 for key_id in key_ids {
                     let ready = KeyMessage::Ready { key_id, proof: [1; 32] };
-                    pair.sender.on_message(pair.now, conn, &ready).unwrap();
+                    pair.sender.handle_message(pair.now, conn, &ready).unwrap();
                 }
             }
             pair.now += ms(10);
@@ -185,7 +185,7 @@ fn a_peer_that_refuses_every_key_burns_few() {
             let KeyMessage::Announce(key_ids) = message else { continue };
             for key_id in key_ids {
                 let failed = KeyMessage::Failed { key_id, reason: String::new() };
-                pair.sender.on_message(pair.now, conn, &failed).unwrap();
+                pair.sender.handle_message(pair.now, conn, &failed).unwrap();
             }
         }
         pair.now += ms(10);
@@ -216,7 +216,7 @@ fn many_keys_that_are_refused_together_are_one_cause_to_wait() {
         for key_id in key_ids {
             refused += 1;
             let failed = KeyMessage::Failed { key_id, reason: String::new() };
-            pair.sender.on_message(pair.now, conn, &failed).unwrap();
+            pair.sender.handle_message(pair.now, conn, &failed).unwrap();
         }
     }
     assert!(refused > 8, "{refused}");
@@ -236,7 +236,7 @@ fn a_peer_that_is_owed_many_keys_and_refuses_them_soon_gets_few() {
             let KeyMessage::Announce(key_ids) = message else { continue };
             for key_id in key_ids {
                 let ready = KeyMessage::Ready { key_id, proof: [1; 32] };
-                pair.sender.on_message(pair.now, conn, &ready).unwrap();
+                pair.sender.handle_message(pair.now, conn, &ready).unwrap();
             }
         }
         pair.now += ms(10);
