@@ -43,7 +43,7 @@ pub mod internal {
         pub use crate::graph::{
             endpoint::{LIMITS, Limits},
             pairing::{Pairing, pairing, reads, writes},
-            range::{OutOfRange, Reach, RemoteEndpoint, Scope, Toward, out_of_range},
+            range::{EndpointRange, OutOfRange, RangeToHost, RemoteEndpoint, Scope, out_of_range},
             view::reach_of,
         };
     }

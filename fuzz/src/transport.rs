@@ -111,7 +111,7 @@ pub fn relay_pieces(data: &[u8]) -> bool {
         let length = usize::from(u16::from_be_bytes(*length)).min(rest.len());
         let (packet, rest) = rest.split_at(length);
         packets = rest;
-        let Ok(session::Message::Piece(piece)) = session::Message::decode(packet) else {
+        let Ok(session::Message::SampleFragment(piece)) = session::Message::decode(packet) else {
             return false;
         };
         match incoming.piece(piece) {
@@ -256,9 +256,9 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
 /// One sample in one piece, one on each of three channels at a time in several, and one longer than a
 /// channel's window.
 pub fn relay_pieces_seeds() -> Vec<Vec<u8>> {
-    use session::{Head, Message, Piece};
+    use session::{SampleHeader, Message, SampleFragment};
     let piece = |channel: usize, length: Option<u32>, bytes: usize| {
-        let head = length.map(|length| Head {
+        let head = length.map(|length| SampleHeader {
             length,
             sequence: 1,
             source_timestamp: 2,
@@ -266,8 +266,8 @@ pub fn relay_pieces_seeds() -> Vec<Vec<u8>> {
             published: 4,
         });
         let Channel { writer: publisher, client } = relay_channels()[channel];
-        let piece = Piece { publisher, head, bytes: vec![0; bytes], client };
-        let packet = Message::Piece(piece).encode().unwrap();
+        let piece = SampleFragment { publisher, head, bytes: vec![0; bytes], client };
+        let packet = Message::SampleFragment(piece).encode().unwrap();
         let length = u16::try_from(packet.len()).unwrap().to_be_bytes();
         [&length[..], &packet].concat()
     };
@@ -299,8 +299,8 @@ pub fn connect_packet_seeds() -> Vec<Vec<u8>> {
 /// Every message of the session socket.
 pub fn session_message_seeds() -> Vec<Vec<u8>> {
     use session::{
-        Announce, Asserted, Attach, Credit, EndpointRole, Gone, Granted, Graph, GraphItem, Head,
-        Hello, Matched, Message, PROTOCOL, Pair, Piece, Refused, Segment, SegmentName,
+        Announce, Asserted, Attach, Credit, EndpointRole, Gone, Granted, Graph, GraphItem, SampleHeader,
+        Hello, Matched, Message, PROTOCOL, Pair, SampleFragment, Refused, Segment, SegmentName,
         SegmentOpened, SessionRole, StatusPart, Unmatch, Welcome,
     };
     let (reader, writer) = (Gid([1; 16]), Gid([2; 16]));
@@ -376,9 +376,9 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
         Message::SegmentGone(SegmentName { session, number: 3 }),
         Message::Need(SegmentName { session, number: 3 }),
         Message::Matched(Matched { gid: reader, others: vec![writer] }),
-        Message::Piece(Piece {
+        Message::SampleFragment(SampleFragment {
             publisher: writer,
-            head: Some(Head {
+            head: Some(SampleHeader {
                 length: 3,
                 sequence: 7,
                 source_timestamp: -1,

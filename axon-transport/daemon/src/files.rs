@@ -16,7 +16,7 @@ const LARGEST_PEM: u64 = 4 << 20;
 
 /// What the settings demand of a file, and of what takes its place.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Demands {
+pub(crate) struct FileRules {
     largest: u64,
     secret: bool,
 }
@@ -24,7 +24,7 @@ pub(crate) struct Demands {
 /// What `stat` tells of a file, which differs when its content does: who preserves the time of
 /// writing cannot preserve that of the change.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Stamp {
+pub(crate) struct FileStamp {
     place: (u64, u64),
     len: u64,
     written: (i64, i64),
@@ -32,7 +32,7 @@ pub(crate) struct Stamp {
     mode: u32,
 }
 
-impl Demands {
+impl FileRules {
     /// Of a file with a secret key: nobody but its owner may read it.
     pub(crate) const KEY: Self = Self { largest: LARGEST_KEY, secret: true };
     /// Of a file with certificates.
@@ -47,7 +47,7 @@ impl Demands {
     ///
     /// # Errors
     /// Why it cannot be used, if that shows from outside.
-    pub(crate) fn stamp(&self, path: &Path) -> Result<Stamp, String> {
+    pub(crate) fn stamp(&self, path: &Path) -> Result<FileStamp, String> {
         self.judge(&std::fs::metadata(path).map_err(|e| e.to_string())?)
     }
 
@@ -74,7 +74,7 @@ impl Demands {
         Err("it grew while it was read".into())
     }
 
-    fn judge(&self, file: &Metadata) -> Result<Stamp, String> {
+    fn judge(&self, file: &Metadata) -> Result<FileStamp, String> {
         if !file.is_file() {
             return Err("it is not a regular file".into());
         }
@@ -88,7 +88,7 @@ impl Demands {
         if !self.secret && file.mode() & 0o002 != 0 {
             return Err("everybody may write it; chmod o-w".into());
         }
-        Ok(Stamp {
+        Ok(FileStamp {
             place: (file.dev(), file.ino()),
             len: file.len(),
             written: (file.mtime(), file.mtime_nsec()),

@@ -120,7 +120,7 @@ pub enum PublishError {
         /// Bytes available to this process when it asked.
         available: u64,
         /// A reader that keeps samples which would do.
-        keeper: Option<Keeper>,
+        keeper: Option<PinHolder>,
     },
     /// The system refused a segment for large samples.
     #[error("no segment for the sample: {reason}")]
@@ -138,7 +138,7 @@ pub enum PublishError {
     #[error("the ring's memory is full{}: it must drop some, or end", held_by(Some(keeper)))]
     Pinned {
         /// A reader that keeps some.
-        keeper: Keeper,
+        keeper: PinHolder,
     },
     /// The number that a publisher elsewhere gave its sample cannot be.
     #[error("sequence number {sequence} after {last}: so many samples cannot have been lost")]
@@ -163,7 +163,7 @@ pub enum PublishError {
 
 /// Who keeps samples that their publisher has given up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Keeper {
+pub struct PinHolder {
     /// A reader that keeps some.
     pub reader: Gid,
     /// Its process, where that is known and has not ended.
@@ -172,7 +172,7 @@ pub struct Keeper {
     pub samples: usize,
 }
 
-impl fmt::Display for Keeper {
+impl fmt::Display for PinHolder {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { reader, process, samples } = self;
         write!(f, "reader {reader}")?;
@@ -183,7 +183,7 @@ impl fmt::Display for Keeper {
     }
 }
 
-fn held_by(keeper: Option<&Keeper>) -> String {
+fn held_by(keeper: Option<&PinHolder>) -> String {
     keeper.map_or_else(String::new, |keeper| format!(", held by {keeper}"))
 }
 

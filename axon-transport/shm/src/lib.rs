@@ -36,7 +36,7 @@ pub use direct::{
     publisher::{Publisher, PublisherOptions},
     subscriber::{Subscriber, SubscriberOptions},
 };
-pub use error::{Keeper, PublishError, ShmError, TakeError};
+pub use error::{PinHolder, PublishError, ShmError, TakeError};
 pub use reader::{
     sample::{Sample, SampleReader},
     slice::{SampleSlice, TrustPublishers},
@@ -92,7 +92,7 @@ pub mod internal {
     /// Descriptors that go from process to process.
     pub mod descriptors {
         pub use crate::os::descriptors::{
-            Packet, PassedFd, carries_descriptors, has_too_many_strangers, is_scarce, is_short,
+            Packet, PassedFd, carries_descriptors, close_queue_is_full, is_scarce, is_short,
             receive, share,
         };
     }

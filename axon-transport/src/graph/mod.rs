@@ -12,5 +12,7 @@ pub(crate) use endpoint::LIMITS;
 pub use endpoint::{Endpoint, EndpointKind};
 pub(crate) use pairing::{Pairing, pairing, reads, writes};
 pub use query::{NamesAndTypes, NodeName, SERVICE_KINDS, TOPIC_KINDS};
-pub(crate) use range::{OutOfRange, Reach, RemoteEndpoint, Scope, Toward, out_of_range};
+pub(crate) use range::{
+    EndpointRange, OutOfRange, RangeToHost, RemoteEndpoint, Scope, out_of_range,
+};
 pub use view::{GraphEntry, GraphView};

@@ -48,7 +48,7 @@ impl Scope {
 /// The discovery range of an endpoint's session, and the linked peers that the session lists.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
-pub struct Reach {
+pub struct EndpointRange {
     /// The range.
     #[n(0)]
     pub range: DiscoveryRange,
@@ -57,16 +57,16 @@ pub struct Reach {
     pub lists: Vec<DaemonId>,
 }
 
-impl Reach {
+impl EndpointRange {
     /// What it comes to towards one peer.
-    pub fn toward(&self, peer: DaemonId) -> Toward {
-        Toward { range: self.range, lists: self.lists.contains(&peer) }
+    pub fn toward(&self, peer: DaemonId) -> RangeToHost {
+        RangeToHost { range: self.range, lists: self.lists.contains(&peer) }
     }
 }
 
 /// The discovery range of a session, and whether the session lists the host on the other side.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Toward {
+pub struct RangeToHost {
     /// The range.
     pub range: DiscoveryRange,
     /// Whether the host of the other endpoint is among the session's static peers.
@@ -79,13 +79,13 @@ pub struct RemoteEndpoint {
     /// The endpoint.
     pub endpoint: Arc<Endpoint>,
     /// The range of its session towards this host.
-    pub toward: Toward,
+    pub toward: RangeToHost,
 }
 
 impl From<Endpoint> for RemoteEndpoint {
     /// An endpoint whose daemon says nothing of ranges: its session is SUBNET and lists nobody.
     fn from(endpoint: Endpoint) -> Self {
-        let toward = Toward { range: DiscoveryRange::Subnet, lists: false };
+        let toward = RangeToHost { range: DiscoveryRange::Subnet, lists: false };
         Self { endpoint: Arc::new(endpoint), toward }
     }
 }
@@ -108,7 +108,7 @@ pub enum OutOfRange {
 }
 
 /// Why endpoints of two sessions on different hosts are not matched; `None` where they may be.
-pub fn out_of_range(one: Toward, other: Toward) -> Option<OutOfRange> {
+pub fn out_of_range(one: RangeToHost, other: RangeToHost) -> Option<OutOfRange> {
     let has = |range| one.range == range || other.range == range;
     if has(DiscoveryRange::Off) {
         Some(OutOfRange::Off)
@@ -149,7 +149,7 @@ mod tests {
     #[test]
     fn hosts_are_matched_as_the_table_of_ros_says() {
         use DiscoveryRange::{Localhost, Off, Subnet};
-        let toward = |range, lists| Toward { range, lists };
+        let toward = |range, lists| RangeToHost { range, lists };
         for (one, other, expected) in [
             (toward(Subnet, false), toward(Subnet, false), None),
             (toward(Subnet, true), toward(Subnet, false), None),

@@ -2,7 +2,7 @@
 
 use std::{collections::HashMap, sync::Arc};
 
-use super::{Endpoint, Reach};
+use super::{Endpoint, EndpointRange};
 use crate::ids::{DaemonId, Gid};
 
 /// Every node and endpoint that a session's daemon knows, here and on other hosts.
@@ -22,10 +22,10 @@ pub struct GraphEntry {
     /// The daemon it belongs to when it is on another host.
     pub daemon: Option<DaemonId>,
     /// How far its session is discovered: of endpoints of this host, in the gateway's view alone.
-    pub(crate) reach: Option<Reach>,
+    pub(crate) reach: Option<EndpointRange>,
 }
 
 /// How far the session of an endpoint of this host is discovered, in the gateway's view.
-pub fn reach_of(entry: &GraphEntry) -> Option<&Reach> {
+pub fn reach_of(entry: &GraphEntry) -> Option<&EndpointRange> {
     entry.reach.as_ref()
 }

@@ -14,7 +14,7 @@ use crate::{
 
 /// A FENCE that is not answered yet.
 #[derive(Debug)]
-pub(super) struct Asked {
+pub(super) struct FenceRequest {
     /// Who asked.
     by: SessionId,
     fence: Fence,
@@ -37,7 +37,7 @@ impl<F: Clone> Registry<F> {
             let last = self.sessions.get(&reader).filter(|entry| !entry.is_told_anew());
             (reader, last.map(|entry| entry.last_queued))
         });
-        let asked = Asked { by: *id, fence, readers: readers.collect() };
+        let asked = FenceRequest { by: *id, fence, readers: readers.collect() };
         self.fences.retain(|earlier| earlier.fence.writer != fence.writer);
         self.fences.push(asked);
         self.answer_fences();
@@ -56,7 +56,7 @@ impl<F: Clone> Registry<F> {
         }
         let (answered, waiting) = asked.into_iter().partition(|asked| asked.readers.is_empty());
         self.fences = waiting;
-        for Asked { by, fence, .. } in answered {
+        for FenceRequest { by, fence, .. } in answered {
             self.push(&by, &Message::Fence(fence), Vec::new());
         }
     }

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use super::{
-    Asked, LocalEndpoint, MAX_ALL_PAIRS, MAX_PAIRS, MAX_SESSIONS, MAX_TOMBSTONES, Registry,
+    LocalEndpoint, MAX_ALL_PAIRS, MAX_PAIRS, MAX_SESSIONS, MAX_TOMBSTONES, PairProgress, Registry,
     SessionEntry, Violation,
     output::{PAIRS_TOGETHER, session_entry},
     relayed::MAX_REASON,
@@ -289,7 +289,7 @@ impl<F: Clone> Registry<F> {
         // without end.
         let of = |attach: &Option<Attach>| attach.clone().map(|a| Attach { after: None, ..a });
         if of(&asked.attach) != of(&attach) {
-            *asked = Asked { attach, stands_for: None, grant: None, by: asked.by };
+            *asked = PairProgress { attach, stands_for: None, grant: None, by: asked.by };
             self.forward_attach(&pair);
         }
         Ok(())

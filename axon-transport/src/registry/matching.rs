@@ -1,6 +1,6 @@
 //! Decides which endpoints are matched, and keeps the pairs.
 
-use super::{Asked, LocalEndpoint, Members, Registry, Topic};
+use super::{LocalEndpoint, Members, PairProgress, Registry, Topic};
 use crate::{
     graph::{Endpoint, EndpointKind, Pairing, pairing, reads, writes},
     ids::{Gid, SessionId},
@@ -48,8 +48,10 @@ impl<F: Clone> Registry<F> {
             match pairing(&w.endpoint, &r.endpoint) {
                 Pairing::Match => {
                     let by = if pair.writer == *gid { to_writer } else { to_reader };
-                    self.pairs
-                        .insert(pair, Asked { by, attach: None, stands_for: None, grant: None });
+                    self.pairs.insert(
+                        pair,
+                        PairProgress { by, attach: None, stands_for: None, grant: None },
+                    );
                     if let Some(entry) = self.sessions.get_mut(&by) {
                         entry.pairs += 1;
                     }

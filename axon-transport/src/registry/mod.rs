@@ -26,8 +26,8 @@ use std::{
 use axon_shm::internal::Location;
 pub use graph::parts;
 pub use output::Output;
-pub use range::KeptApart;
-pub use relayed::Tally;
+pub use range::OutOfRangePair;
+pub use relayed::RelayCounters;
 
 use crate::{
     graph::{Endpoint, RemoteEndpoint, Scope},
@@ -64,7 +64,7 @@ pub struct Registry<F> {
     sessions: BTreeMap<SessionId, SessionEntry<F>>,
     endpoints: HashMap<Gid, LocalEndpoint>,
     topics: HashMap<Topic, Members>,
-    pairs: BTreeMap<Pair, Asked>,
+    pairs: BTreeMap<Pair, PairProgress>,
     remote: BTreeMap<DaemonId, BTreeMap<Gid, RemoteEndpoint>>,
     tombstones: VecDeque<Gid>,
     version: u64,
@@ -78,12 +78,12 @@ pub struct Registry<F> {
     /// Applications' sessions came or went.
     rescoped: bool,
     /// The packets of the whole graph as each view was told it last, and the version of it.
-    whole: (u64, BTreeMap<range::View, SharedPackets>),
+    whole: (u64, BTreeMap<range::GraphFilter, SharedPackets>),
     ready: BTreeSet<SessionId>,
     /// The first endpoint of each session that was refused, and why.
     refused: Vec<(SessionId, String)>,
     /// FENCEs that are not answered yet.
-    fences: Vec<fence::Asked>,
+    fences: Vec<fence::FenceRequest>,
 }
 
 /// A session as the registry knows it.
@@ -106,7 +106,7 @@ pub struct SessionEntry<F> {
     /// The segments of its memory besides the first, by number.
     pub segments: BTreeMap<u32, SessionSegment<F>>,
     /// Other sessions whose descriptors it holds.
-    known: HashMap<SessionId, Known>,
+    known: HashMap<SessionId, SentSegments>,
     queue: VecDeque<Output<F>>,
     /// The number of the last packet that was queued.
     last_queued: u64,
@@ -127,7 +127,7 @@ pub struct SessionEntry<F> {
     /// It was told that no more segments of its memory are taken.
     short: bool,
     /// What is shown of its relay, where it is relayed. Pairs within it are its own process's.
-    pub relay: Option<Arc<Tally>>,
+    pub relay: Option<Arc<RelayCounters>>,
 }
 
 /// A segment of a session's memory.
@@ -141,7 +141,7 @@ pub struct SessionSegment<F> {
 
 /// What a session holds of another.
 #[derive(Debug, Default)]
-struct Known {
+struct SentSegments {
     /// The pairs for which it does.
     pairs: HashSet<Pair>,
     /// The numbers of the segments that it was handed.
@@ -169,7 +169,7 @@ pub struct LocalEndpoint {
 
 /// How far a pair has come.
 #[derive(Debug)]
-struct Asked {
+struct PairProgress {
     /// The session that announced the second of the two.
     by: SessionId,
     /// What its reader asked.
@@ -249,7 +249,7 @@ impl<F: Clone> Registry<F> {
     }
 
     /// A session is relayed.
-    pub fn set_relayed(&mut self, id: &SessionId, relay: Arc<Tally>) {
+    pub fn set_relayed(&mut self, id: &SessionId, relay: Arc<RelayCounters>) {
         if let Some(entry) = self.sessions.get_mut(id) {
             entry.relay = Some(relay);
         }

@@ -12,7 +12,8 @@ use super::{LocalEndpoint, Registry, SessionEntry, matching::topic};
 use crate::{
     config::DiscoveryRange,
     graph::{
-        Endpoint, OutOfRange, Pairing, Reach, RemoteEndpoint, Scope, Toward, out_of_range, pairing,
+        Endpoint, EndpointRange, OutOfRange, Pairing, RangeToHost, RemoteEndpoint, Scope,
+        out_of_range, pairing,
     },
     ids::{DaemonId, Gid, SessionId},
     wire::session::{EndpointRole, GraphItem, Pair, SessionRole},
@@ -20,7 +21,7 @@ use crate::{
 
 /// Which parts of the graph a session is shown. Sessions of one view are told the same.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct View {
+pub(super) struct GraphFilter {
     /// Present where ranges apply: those of this host's registry, not those within a process.
     scope: Option<(DiscoveryRange, Vec<DaemonId>)>,
     /// A session that sees no other.
@@ -30,7 +31,7 @@ pub(super) struct View {
 
 /// A pair that would be matched but for the ranges of its sessions.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct KeptApart {
+pub struct OutOfRangePair {
     /// The topic or service.
     pub topic: String,
     /// Its type.
@@ -41,7 +42,7 @@ pub struct KeptApart {
     pub why: OutOfRange,
 }
 
-impl View {
+impl GraphFilter {
     pub(super) fn is_gateway(&self) -> bool {
         self.gateway
     }
@@ -49,14 +50,14 @@ impl View {
 
 impl<F> SessionEntry<F> {
     /// Its range, and the daemons of linked peers that it lists; `None` where ranges do not apply.
-    fn reach(&self) -> Option<Reach> {
+    fn reach(&self) -> Option<EndpointRange> {
         let scope = self.scope.as_ref()?;
-        Some(Reach { range: scope.range, lists: self.lists.iter().copied().collect() })
+        Some(EndpointRange { range: scope.range, lists: self.lists.iter().copied().collect() })
     }
 
-    fn toward(&self, peer: &DaemonId) -> Option<Toward> {
+    fn toward(&self, peer: &DaemonId) -> Option<RangeToHost> {
         let scope = self.scope.as_ref()?;
-        Some(Toward { range: scope.range, lists: self.lists.contains(peer) })
+        Some(RangeToHost { range: scope.range, lists: self.lists.contains(peer) })
     }
 
     fn is_off(&self) -> bool {
@@ -195,10 +196,10 @@ impl<F: Clone> Registry<F> {
         out_of_range(entry.toward(daemon)?, remote.toward)
     }
 
-    pub(super) fn view(&self, id: &SessionId) -> View {
+    pub(super) fn view(&self, id: &SessionId) -> GraphFilter {
         let entry = self.sessions.get(id);
         let reach = entry.and_then(SessionEntry::reach);
-        View {
+        GraphFilter {
             alone: entry.is_some_and(SessionEntry::is_off).then_some(*id),
             scope: reach.map(|reach| (reach.range, reach.lists)),
             gateway: entry.is_some_and(|entry| entry.role == SessionRole::Gateway),
@@ -209,7 +210,7 @@ impl<F: Clone> Registry<F> {
     /// gateway is shown those of this host alone: it told of the others itself.
     pub(super) fn shown_in(
         &self,
-        view: &View,
+        view: &GraphFilter,
         endpoint: &Endpoint,
         daemon: Option<DaemonId>,
     ) -> Option<GraphItem> {
@@ -228,7 +229,7 @@ impl<F: Clone> Registry<F> {
             return None;
         }
         if let Some((range, lists)) = &view.scope {
-            let own = Toward { range: *range, lists: lists.contains(&daemon) };
+            let own = RangeToHost { range: *range, lists: lists.contains(&daemon) };
             let remote = self.remote.get(&daemon)?.get(gid)?;
             if out_of_range(own, remote.toward).is_some() {
                 return None;
@@ -238,8 +239,8 @@ impl<F: Clone> Registry<F> {
     }
 
     /// The sessions that are told of the graph, by what they are shown of it.
-    pub(super) fn views(&self) -> BTreeMap<View, Vec<SessionId>> {
-        let mut views: BTreeMap<View, Vec<SessionId>> = BTreeMap::new();
+    pub(super) fn views(&self) -> BTreeMap<GraphFilter, Vec<SessionId>> {
+        let mut views: BTreeMap<GraphFilter, Vec<SessionId>> = BTreeMap::new();
         for (id, entry) in &self.sessions {
             if entry.role != SessionRole::Tool && !entry.behind {
                 views.entry(self.view(id)).or_default().push(*id);
@@ -250,7 +251,7 @@ impl<F: Clone> Registry<F> {
 
     /// Pairs that would be matched but for the ranges of their sessions: at most `most`, of at most
     /// `looked_at` that are looked at.
-    pub fn kept_apart(&self, most: usize, looked_at: usize) -> Vec<KeptApart> {
+    pub fn kept_apart(&self, most: usize, looked_at: usize) -> Vec<OutOfRangePair> {
         let limited = self.scopes().any(|scope| scope.range != DiscoveryRange::Subnet);
         let own =
             |gid: &Gid| self.endpoints.get(gid).filter(|e| e.role == EndpointRole::Application);
@@ -283,7 +284,7 @@ impl<F: Clone> Registry<F> {
             let why = why.filter(|_| pairing(writer, reader) == Pairing::Match)?;
             let pair = Pair { reader: reader.gid, writer: writer.gid };
             let (topic, type_name) = (writer.topic.clone(), writer.type_name.clone());
-            Some(KeptApart { topic, type_name, pair, why })
+            Some(OutOfRangePair { topic, type_name, pair, why })
         });
         apart.take(most).collect()
     }

@@ -9,7 +9,7 @@ pub(super) const MAX_REASON: usize = 200;
 
 /// Counts what crosses a relay's socket.
 #[derive(Debug, Default)]
-pub struct Tally {
+pub struct RelayCounters {
     reason: String,
     samples_in: AtomicU64,
     bytes_in: AtomicU64,
@@ -18,7 +18,7 @@ pub struct Tally {
     lost: AtomicU64,
 }
 
-impl Tally {
+impl RelayCounters {
     /// Of a session that is relayed for this reason.
     pub fn new(reason: &str) -> Self {
         let reason = crate::text::plain(reason, MAX_REASON);

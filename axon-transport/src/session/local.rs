@@ -20,10 +20,10 @@ use crate::{
 
 /// Brings the sessions of one process together.
 #[derive(Debug, Default)]
-pub(crate) struct House(Mutex<Inside>);
+pub(crate) struct LocalRegistry(Mutex<LocalRegistryState>);
 
 #[derive(Debug, Default)]
-struct Inside {
+struct LocalRegistryState {
     registry: Registry<Arc<PassedFd>>,
     /// What wakes the control thread of each session.
     wakers: HashMap<SessionId, Arc<OwnedFd>>,
@@ -33,10 +33,10 @@ struct Inside {
 #[derive(Debug)]
 pub(super) struct Local {
     id: SessionId,
-    house: Arc<House>,
+    local_registry: Arc<LocalRegistry>,
 }
 
-impl House {
+impl LocalRegistry {
     /// What the world outside has: endpoints of `daemon` that are new, and those that are gone.
     pub(crate) fn outside(&self, daemon: DaemonId, added: Vec<Endpoint>, removed: Vec<Gid>) {
         let mut inside = self.lock();
@@ -51,12 +51,12 @@ impl House {
         inside.settle(None);
     }
 
-    fn lock(&self) -> MutexGuard<'_, Inside> {
+    fn lock(&self) -> MutexGuard<'_, LocalRegistryState> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl Inside {
+impl LocalRegistryState {
     /// Wakes the sessions that have something to hear, but the one that is about to listen.
     fn settle(&mut self, listening: Option<&SessionId>) {
         self.registry.flush();
@@ -73,26 +73,33 @@ impl Inside {
 }
 
 impl Local {
-    /// A house of its own, where nobody else is and nothing is handed to anybody.
+    /// A registry of its own, where nobody else is and nothing is handed to anybody.
     pub(super) fn alone(session: &Shared) -> Self {
         Self::enter(Arc::default(), session, None)
     }
 
-    /// Joins `house`.
-    pub(super) fn join(house: Arc<House>, session: &Shared) -> Result<Self, ShmError> {
+    /// Joins `local_registry`.
+    pub(super) fn join(
+        local_registry: Arc<LocalRegistry>,
+        session: &Shared,
+    ) -> Result<Self, ShmError> {
         let handed = session.segment.descriptors()?;
         let handed = [handed.segment, handed.doorbell, handed.pidfd].map(Arc::new);
-        Ok(Self::enter(house, session, Some(handed)))
+        Ok(Self::enter(local_registry, session, Some(handed)))
     }
 
-    fn enter(house: Arc<House>, session: &Shared, handed: Option<[Arc<PassedFd>; 3]>) -> Self {
+    fn enter(
+        local_registry: Arc<LocalRegistry>,
+        session: &Shared,
+        handed: Option<[Arc<PassedFd>; 3]>,
+    ) -> Self {
         let (id, role, name) = (session.id, session.options.role, session.options.name.clone());
-        let mut inside = house.lock();
+        let mut inside = local_registry.lock();
         inside.wakers.insert(id, session.wake.clone());
         // There are at most two, which is never too many.
         let _ = inside.registry.handle_connect(id, role, name, std::process::id(), handed, None);
         drop(inside);
-        Self { id, house }
+        Self { id, local_registry }
     }
 
     /// What a daemon would answer to nothing, or to a message.
@@ -100,7 +107,7 @@ impl Local {
         &mut self,
         message: Option<(Message, Vec<PassedFd>)>,
     ) -> Vec<(Message, Vec<PassedFd>)> {
-        let mut inside = self.house.lock();
+        let mut inside = self.local_registry.lock();
         if let Some((message, descriptors)) = message {
             let descriptors = descriptors.into_iter().map(Arc::new).collect();
             if let Err(violation) = inside.registry.handle_message(&self.id, message, descriptors) {
@@ -127,7 +134,7 @@ impl Local {
 
 impl Drop for Local {
     fn drop(&mut self) {
-        let mut inside = self.house.lock();
+        let mut inside = self.local_registry.lock();
         inside.wakers.remove(&self.id);
         inside.registry.handle_disconnect(&self.id);
         inside.settle(None);

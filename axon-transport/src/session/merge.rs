@@ -29,13 +29,13 @@ pub struct Taken<T> {
 pub struct Merge<T> {
     /// The number of the newest one that was given on.
     given: Option<u64>,
-    ways: BTreeMap<Gid, Way<T>>,
+    ways: BTreeMap<Gid, MergeSource<T>>,
     /// Whether a reader had more to be dropped than was looked at.
     behind: bool,
 }
 
 #[derive(Debug)]
-struct Way<T> {
+struct MergeSource<T> {
     /// Taken, and newer than what was given on.
     next: Option<Taken<T>>,
     /// Messages that its reader has lost, as far as is known.
@@ -50,7 +50,7 @@ impl<T> Default for Merge<T> {
     }
 }
 
-impl<T> Default for Way<T> {
+impl<T> Default for MergeSource<T> {
     fn default() -> Self {
         Self { next: None, lost: 0, missed: 0 }
     }
@@ -70,7 +70,7 @@ impl<T> Merge<T> {
     }
 
     /// Whatever the readers have is given on once more: one of them has what came before.
-    pub fn begin_anew(&mut self) {
+    pub fn rewind(&mut self) {
         self.given = None;
     }
 
@@ -290,7 +290,7 @@ mod tests {
         readers.have(ONE, whole(8..=9));
         assert!(all(&mut merge, &readers).into_iter().eq(whole(8..=9)));
         readers.have(OTHER, whole(1..=9));
-        merge.begin_anew();
+        merge.rewind();
         readers.have(ONE, whole(10..=10));
         assert!(all(&mut merge, &readers).into_iter().eq(whole(1..=10)));
     }

@@ -61,7 +61,7 @@ use crate::{
     config::DaemonPolicy,
     graph::GraphView,
     ids::{DaemonId, SessionId},
-    session::relayed::near::Near,
+    session::relayed::near::SessionRelay,
 };
 
 /// A process's session. Cheap to clone; thread-safe. It ends when the last clone and the last of
@@ -91,7 +91,7 @@ struct Handle {
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
     /// What carries its samples, where it shares no memory.
-    relay: Option<Near>,
+    relay: Option<SessionRelay>,
 }
 
 impl Session {

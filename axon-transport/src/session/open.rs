@@ -10,13 +10,13 @@ use super::{
         connect::Caller,
         control::{Control, Start},
     },
-    local::House,
+    local::LocalRegistry,
     state::Shared,
 };
 use crate::{
     config::{Config, DaemonPolicy},
     ids::SessionId,
-    session::relayed::near::Near,
+    session::relayed::near::SessionRelay,
     session_key::SessionKey,
     wire::session::SessionRole,
 };
@@ -65,16 +65,21 @@ impl Session {
         tracing::info!(reason, "samples pass through the daemon");
         let caller = Caller { relay: Some(&reason), ..Caller::new(config, &options, id) };
         let connected = caller.connect()?;
-        let house = Arc::<House>::default();
+        let local_registry = Arc::<LocalRegistry>::default();
         let segment = SessionSegment::create(id)?;
-        let start = Start::House(Arc::clone(&house));
+        let start = Start::LocalRegistry(Arc::clone(&local_registry));
         let mut handle = Self::start(config, options, segment, start)?;
         let outside = SessionOptions::new("relay").role(SessionRole::Gateway);
         let segment = SessionSegment::create(SessionId::random())?;
-        let start = Start::House(Arc::clone(&house));
+        let start = Start::LocalRegistry(Arc::clone(&local_registry));
         let outside = Self::of(Self::start(config, outside, segment, start)?);
-        handle.relay =
-            Some(Near::start(Arc::clone(&handle.shared), house, outside, connected, reason)?);
+        handle.relay = Some(SessionRelay::start(
+            Arc::clone(&handle.shared),
+            local_registry,
+            outside,
+            connected,
+            reason,
+        )?);
         Ok(Self::of(handle))
     }
 

@@ -76,14 +76,14 @@ impl Shared {
         let (from, gid, peer) =
             (writer.endpoint.gid, reader.endpoint.gid, Peer::Local(self.segment.clone()));
         // All of it under one lock: between two parts, the control thread would ask by another lane.
-        let mut slots = reader.lock();
-        let lane = slots.lane_for(from, || self.segment.allocate_lane())?.lane;
+        let mut matched_readers = reader.lock();
+        let lane = matched_readers.lane_for(from, || self.segment.allocate_lane())?.lane;
         let reads = ReaderInfo { gid, lane, qos: reader.qos, peer: peer.clone(), stands_for: None };
         let (grant, after, ring) = writer.attach(reads, Terms::default())?;
-        if let Accept::Map(lane) = slots.accept(from, grant) {
+        if let Accept::Map(lane) = matched_readers.accept(from, grant) {
             let max_message = self.config.max_message;
             let mapped = reader.map(from, peer, ring, lane, grant, max_message)?;
-            slots.add(mapped, Some(after), Numbers::None);
+            matched_readers.add(mapped, Some(after), Numbers::None);
         }
         Ok(())
     }
@@ -103,14 +103,14 @@ impl Shared {
             Some((_, EndpointRole::StandIn | EndpointRole::Relay)) => state.tell_gone(gid),
             Some((endpoint, EndpointRole::Application)) => {
                 state.unindex(endpoint);
-                state.bury(gid);
+                state.remove_dead(gid);
                 for other in state.topics.get(&endpoint.topic).into_iter().flatten() {
                     others.extend(state.publishers.get(other).cloned().map(Source::Publisher));
                     let reads = state.subscriptions.get(other).cloned();
                     others.extend(reads.map(Source::Subscription));
                 }
             }
-            None => state.bury(gid),
+            None => state.remove_dead(gid),
         }
         drop(state);
         others.retain(|other| {

@@ -33,7 +33,7 @@ pub(super) struct Peers {
     own: Arc<SessionSegment>,
     news: Arc<MemoryNews>,
     peers: HashMap<SessionId, Entry>,
-    held: Held,
+    held: PairRefs,
     /// An epoll instance of their pidfds: with hundreds of them, looking at each whenever anything
     /// happens would be most of what there is to do.
     deaths: Arc<OwnedFd>,
@@ -97,13 +97,13 @@ impl Drop for Entry {
 /// For which pairs sessions are held: of thousands of pairs with hundreds of sessions one is over at a
 /// time.
 #[derive(Default)]
-struct Held {
+struct PairRefs {
     pairs: BTreeSet<(Pair, SessionId)>,
     /// How many of them each session has.
     counts: HashMap<SessionId, usize>,
 }
 
-impl Held {
+impl PairRefs {
     fn add(&mut self, pair: Pair, id: SessionId) {
         if self.pairs.insert((pair, id)) {
             *self.counts.entry(id).or_default() += 1;
@@ -151,7 +151,7 @@ pub(super) enum PeerError {
 impl Peers {
     pub(super) fn new(own: Arc<SessionSegment>, news: Arc<MemoryNews>) -> Result<Self, Errno> {
         let deaths = Arc::new(epoll::create(epoll::CreateFlags::CLOEXEC)?);
-        Ok(Self { own, news, peers: HashMap::new(), held: Held::default(), deaths })
+        Ok(Self { own, news, peers: HashMap::new(), held: PairRefs::default(), deaths })
     }
 
     /// The session `id`, for `pair`, with the descriptors that came along, if any: those of its
@@ -249,7 +249,7 @@ impl Peers {
 
     /// The daemon starts to count anew. What is mapped stays, for the pairs that it will repeat.
     pub(super) fn recount(&mut self) {
-        self.held = Held::default();
+        self.held = PairRefs::default();
         self.peers.values_mut().for_each(|entry| entry.named.clear());
     }
 
@@ -312,7 +312,7 @@ mod tests {
         ) {
             let pair = |number: u8| Pair { reader: Gid([number; 16]), writer: Gid([9; 16]) };
             let session = |number: u8| SessionId([number; 16]);
-            let (mut held, mut model) = (Held::default(), HashMap::<u8, HashSet<u8>>::new());
+            let (mut held, mut model) = (PairRefs::default(), HashMap::<u8, HashSet<u8>>::new());
             for step in steps {
                 match step {
                     Step::Add(one, of) => {

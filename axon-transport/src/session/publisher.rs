@@ -124,7 +124,7 @@ impl Publisher {
         Event::new(Source::Publisher(self.inner.clone()), kind, self.session.clone())
     }
 
-    /// Room for a sample of exactly `len` bytes, to serialize into: in shared memory where it is
+    /// ClientLimit for a sample of exactly `len` bytes, to serialize into: in shared memory where it is
     /// more than 4 KiB, or more than 512 bytes if so many are
     /// [expected](super::EndpointSpec::expected_len).
     ///
@@ -149,9 +149,9 @@ impl Publisher {
     /// The number up to which its samples are with those who carry them to other processes and hosts, and
     /// can be read by all others whatever becomes of this process: these were sent the memory that they
     /// are in. The session's memory wakes the thread that waits for that.
-    pub(crate) fn handed_over(&self) -> u64 {
+    pub(crate) fn delivered_up_to(&self) -> u64 {
         let memory = &self.session.shared().memory;
-        let (began, number) = (memory.connections(), self.writer.handed_over());
+        let (began, number) = (memory.connections(), self.writer.delivered_up_to());
         // In this order: it counts what the readers of those samples have to be sent.
         let handovers = memory.handovers();
         let mut sending = self.inner.sending();
@@ -159,7 +159,7 @@ impl Publisher {
             sending.number = sending.number.max(number);
         } else if sending.asked.is_none_or(|asked| asked.connection != began) {
             // One at a time: where there is always something more to be sent, each is answered.
-            sending.asked = Some(Asked { connection: began, handovers, number });
+            sending.asked = Some(PendingFence { connection: began, handovers, number });
             let fence = Fence { writer: self.gid(), number: handovers };
             self.session.shared().tell(Outgoing::Fence(fence));
         }
@@ -277,7 +277,7 @@ pub(super) struct PublisherInner {
 #[derive(Default)]
 struct Sending {
     /// What the daemon was asked, and has not answered.
-    asked: Option<Asked>,
+    asked: Option<PendingFence>,
     /// What it said was sent.
     sent: Option<u64>,
     /// The number of the last sample that can be found by that.
@@ -286,7 +286,7 @@ struct Sending {
 
 /// A question to the daemon.
 #[derive(Clone, Copy)]
-struct Asked {
+struct PendingFence {
     /// Which connection to a daemon it was said on: another one does not answer it.
     connection: u64,
     handovers: u64,

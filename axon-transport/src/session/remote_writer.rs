@@ -116,15 +116,15 @@ impl RemoteWriter {
 
     /// The number up to which what it has written is where it is to go, as far as that takes longer than
     /// writing it.
-    pub fn handed_over(&self) -> Option<u64> {
+    pub fn delivered_up_to(&self) -> Option<u64> {
         match self {
-            Self::Publisher(publisher) => Some(publisher.handed_over()),
+            Self::Publisher(publisher) => Some(publisher.delivered_up_to()),
             Self::Client(_) | Self::Server(_) => None,
         }
     }
 
     /// The number of written samples that do not reach their reader, if the publisher waits for readers. All
-    /// samples below a number that was [handed over](Self::handed_over) before are counted.
+    /// samples below a number that was [handed over](Self::delivered_up_to) before are counted.
     pub fn given_up(&self) -> Option<u64> {
         match self {
             Self::Publisher(publisher) => Some(publisher.given_up()),

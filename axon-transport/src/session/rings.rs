@@ -27,36 +27,36 @@ pub(super) enum Rings {
 pub(super) struct RingsByClient {
     session: Arc<SessionSegment>,
     options: RingOptions,
-    room: Arc<Room>,
-    rings: Mutex<BTreeMap<Gid, (Arc<Writer>, Place)>>,
+    room: Arc<ClientLimit>,
+    rings: Mutex<BTreeMap<Gid, (Arc<Writer>, ClientSlot)>>,
 }
 
 /// How many clients the servers of a session have, and may have: each counted once for each of them.
 #[derive(Debug)]
-pub(super) struct Room {
+pub(super) struct ClientLimit {
     most: usize,
     taken: AtomicUsize,
 }
 
 /// Of one client of one server.
-struct Place(Arc<Room>);
+struct ClientSlot(Arc<ClientLimit>);
 
-impl Room {
+impl ClientLimit {
     pub(super) fn new(most: usize) -> Self {
         Self { most, taken: AtomicUsize::new(0) }
     }
 
     // Relaxed, here and below: the count guards nothing but itself.
-    fn take(self: &Arc<Self>) -> Result<Place, ShmError> {
+    fn take(self: &Arc<Self>) -> Result<ClientSlot, ShmError> {
         let more = |taken| (taken < self.most).then_some(taken + 1);
         match self.taken.fetch_update(Ordering::Relaxed, Ordering::Relaxed, more) {
-            Ok(_) => Ok(Place(Arc::clone(self))),
+            Ok(_) => Ok(ClientSlot(Arc::clone(self))),
             Err(_) => Err(ShmError::NoRoom(self.most)),
         }
     }
 }
 
-impl Drop for Place {
+impl Drop for ClientSlot {
     fn drop(&mut self) {
         self.0.taken.fetch_sub(1, Ordering::Relaxed);
     }
@@ -132,12 +132,12 @@ impl Rings {
     }
 
     /// Looks after the memory of large samples; whether there is more to do later.
-    pub(super) fn tend(&self, now: Instant) -> bool {
+    pub(super) fn reclaim_idle(&self, now: Instant) -> bool {
         match self {
-            Self::Shared(writer) => writer.tend(now),
+            Self::Shared(writer) => writer.reclaim_idle(now),
             Self::Each(rings) => {
                 let rings: Vec<_> = rings.lock().values().map(|(ring, _)| ring.clone()).collect();
-                rings.iter().filter(|ring| ring.tend(now)).count() > 0
+                rings.iter().filter(|ring| ring.reclaim_idle(now)).count() > 0
             }
         }
     }
@@ -151,7 +151,11 @@ impl Rings {
 }
 
 impl RingsByClient {
-    pub(super) fn new(session: Arc<SessionSegment>, options: RingOptions, room: Arc<Room>) -> Self {
+    pub(super) fn new(
+        session: Arc<SessionSegment>,
+        options: RingOptions,
+        room: Arc<ClientLimit>,
+    ) -> Self {
         Self { session, options, room, rings: Mutex::default() }
     }
 
@@ -170,7 +174,7 @@ impl RingsByClient {
         Ok(ring)
     }
 
-    fn lock(&self) -> MutexGuard<'_, BTreeMap<Gid, (Arc<Writer>, Place)>> {
+    fn lock(&self) -> MutexGuard<'_, BTreeMap<Gid, (Arc<Writer>, ClientSlot)>> {
         self.rings.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

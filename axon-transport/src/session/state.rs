@@ -22,7 +22,7 @@ use super::{
     events::{Changes, Source},
     guard::GuardCondition,
     publisher::PublisherInner,
-    rings::Room,
+    rings::ClientLimit,
     subscription::SubscriptionInner,
     tasks::Listening,
 };
@@ -71,7 +71,7 @@ pub(crate) struct Shared {
     /// Held while pairs of the session's own endpoints come or go.
     pub(super) own_pairs: Mutex<()>,
     /// For the clients of its servers.
-    pub(super) room: Arc<Room>,
+    pub(super) room: Arc<ClientLimit>,
     state: Mutex<State>,
     changed: Condvar,
 }
@@ -159,7 +159,7 @@ impl State {
     }
 
     /// One of its own is gone: nobody here counts it any more, whatever the daemon has heard.
-    pub(super) fn bury(&mut self, gid: &Gid) {
+    pub(super) fn remove_dead(&mut self, gid: &Gid) {
         self.tombstones.insert(*gid);
         self.refused.remove(gid);
         self.hide(gid);
@@ -315,7 +315,7 @@ impl Shared {
         wake: OwnedFd,
     ) -> Self {
         let wake = Arc::new(wake);
-        let room = Arc::new(Room::new(options.callers));
+        let room = Arc::new(ClientLimit::new(options.callers));
         let memory = Arc::new(MemoryNews {
             wake: wake.clone(),
             changes: Mutex::default(),

@@ -216,7 +216,7 @@ impl Far {
     fn give_memory_up(&self) {
         let now = Instant::now();
         for second in 0..60 {
-            self.writer.tend(now + Duration::from_secs(second));
+            self.writer.reclaim_idle(now + Duration::from_secs(second));
         }
         assert!(self.session.segments().is_empty());
     }

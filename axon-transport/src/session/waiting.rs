@@ -47,33 +47,33 @@ enum Part<'a> {
 }
 
 /// The same, kept for others to look at.
-enum Kept {
+enum OwnedWaitable {
     Data(Arc<SubscriptionInner>),
     Guard(Arc<Guard>),
     Event(Source, EventKind),
 }
 
 /// What is waited for, without keeping it from ending.
-pub(crate) struct Watch {
-    parts: Vec<Kept>,
+pub(crate) struct WeakWaitSet {
+    parts: Vec<OwnedWaitable>,
     /// The sessions that it belongs to, but for the one that waits.
     others: Vec<Arc<Shared>>,
 }
 
 /// While another session is waited at, its control thread listens for it, and passes on what comes.
-struct Visit<'a> {
+struct ForeignWait<'a> {
     other: &'a Shared,
     _forwarded: ForwardedWakeups<'a>,
 }
 
-impl<'a> Visit<'a> {
-    fn new(other: &'a Shared, watch: &Arc<Watch>, waits: &Shared) -> Result<Self, ShmError> {
+impl<'a> ForeignWait<'a> {
+    fn new(other: &'a Shared, watch: &Arc<WeakWaitSet>, waits: &Shared) -> Result<Self, ShmError> {
         other.listen()?;
         Ok(Self { other, _forwarded: other.segment.forward_wakeups(watch.clone(), &waits.segment) })
     }
 }
 
-impl Drop for Visit<'_> {
+impl Drop for ForeignWait<'_> {
     fn drop(&mut self) {
         self.other.listen_no_more();
     }
@@ -124,13 +124,16 @@ impl Session {
         let take = || indices(waitables.iter().map(|one| one.part().take()));
         let watch = || {
             let parts = waitables.iter().map(|one| one.part().kept()).collect();
-            Arc::new(Watch { parts, others: Vec::new() })
+            Arc::new(WeakWaitSet { parts, others: Vec::new() })
         };
         self.wait_until(take, watch, timeout)
     }
 
     /// What [`wait_watch`](Self::wait_watch) waits for.
-    pub(crate) fn watch(&self, waitables: &[Waitable<'_>]) -> Result<Arc<Watch>, SessionError> {
+    pub(crate) fn watch(
+        &self,
+        waitables: &[Waitable<'_>],
+    ) -> Result<Arc<WeakWaitSet>, SessionError> {
         let (mut parts, mut others) = (Vec::with_capacity(waitables.len()), Vec::new());
         for waitable in waitables {
             parts.push(waitable.part().kept());
@@ -141,19 +144,19 @@ impl Session {
                 }
             }
         }
-        Ok(Arc::new(Watch { parts, others }))
+        Ok(Arc::new(WeakWaitSet { parts, others }))
     }
 
     /// As [`wait_for`](Self::wait_for).
     pub(crate) fn wait_watch(
         &self,
-        watch: &Arc<Watch>,
+        watch: &Arc<WeakWaitSet>,
         timeout: Option<Duration>,
     ) -> Result<Ready, SessionError> {
         if self.is_forked() {
             return Err(ShmError::Forked.into());
         }
-        let visit = |other| Visit::new(other, watch, self.shared());
+        let visit = |other| ForeignWait::new(other, watch, self.shared());
         let visits: Result<Vec<_>, _> = watch.others.iter().map(|one| visit(one)).collect();
         let _visits = visits.map_err(|_| SessionError::OtherSession)?;
         let take = || indices(watch.parts.iter().map(|kept| kept.part().take()));
@@ -165,7 +168,7 @@ impl Session {
     fn wait_until(
         &self,
         mut take: impl FnMut() -> Ready,
-        watch: impl Fn() -> Arc<Watch>,
+        watch: impl Fn() -> Arc<WeakWaitSet>,
         timeout: Option<Duration>,
     ) -> Result<Ready, SessionError> {
         if self.is_forked() {
@@ -258,16 +261,16 @@ impl Part<'_> {
         }
     }
 
-    fn kept(self) -> Kept {
+    fn kept(self) -> OwnedWaitable {
         match self {
-            Part::Data(inner) => Kept::Data(Arc::clone(inner)),
-            Part::Guard(guard) => Kept::Guard(Arc::clone(guard)),
-            Part::Event(source, kind) => Kept::Event(source.clone(), kind),
+            Part::Data(inner) => OwnedWaitable::Data(Arc::clone(inner)),
+            Part::Guard(guard) => OwnedWaitable::Guard(Arc::clone(guard)),
+            Part::Event(source, kind) => OwnedWaitable::Event(source.clone(), kind),
         }
     }
 }
 
-impl Kept {
+impl OwnedWaitable {
     fn part(&self) -> Part<'_> {
         match self {
             Self::Data(inner) => Part::Data(inner),
@@ -277,7 +280,7 @@ impl Kept {
     }
 }
 
-impl Look for Watch {
+impl Look for WeakWaitSet {
     fn ready(&self) -> bool {
         self.parts.iter().any(|kept| kept.part().may_be_ready())
     }

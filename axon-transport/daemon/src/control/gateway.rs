@@ -19,7 +19,7 @@ use tokio::{
 };
 
 use super::{
-    listen::{Inside, serve},
+    listen::{InternalPeer, serve},
     plane::Control,
 };
 use crate::gateway::bridge::{CHANNEL, GatewayParts, ToControl, ToGateway};
@@ -72,7 +72,7 @@ impl Running {
                 Err(_) => "panicked; the log says where".to_owned(),
             });
         })?;
-        spawn_local(serve(control.clone(), ours.into(), Inside::Gateway, None));
+        spawn_local(serve(control.clone(), ours.into(), InternalPeer::Gateway, None));
         Ok(Self { orders, events, end })
     }
 

@@ -21,7 +21,7 @@ use axon_transport::{
     internal::{
         SessionKey,
         graph::Scope,
-        registry::{MAX_OF_PROCESS, SessionEntry, Tally},
+        registry::{MAX_OF_PROCESS, RelayCounters, SessionEntry},
         session::daemon::socket,
         text,
         wire::session::{Hello, Message, PROTOCOL, Refused, Welcome},
@@ -33,11 +33,11 @@ use tokio::{io::unix::AsyncFd, sync::Notify, task::spawn_local, time::timeout};
 use super::{
     conversation::converse,
     first::{First, first},
+    pending::{PendingConnections, Stranger},
     plane::Control,
-    strangers::{Stranger, Strangers},
     turns::Turn,
 };
-use crate::{control::relayed::Far, gateway::watch::watch};
+use crate::{control::relayed::DaemonRelay, gateway::watch::watch};
 
 /// How long a connection may take to say HELLO.
 const HELLO: Duration = Duration::from_secs(5);
@@ -45,7 +45,7 @@ const HELLO: Duration = Duration::from_secs(5);
 const PAUSE: Duration = Duration::from_millis(50);
 /// Accepts sessions for as long as it is polled.
 pub(super) async fn accept(control: Rc<RefCell<Control>>, listeners: Vec<OwnedFd>) {
-    let strangers = Strangers::default();
+    let strangers = PendingConnections::default();
     let mut listeners = listeners.into_iter();
     // A path, a name, or both.
     let [first, second] = [listeners.next(), listeners.next()].map(|listener| async {
@@ -56,7 +56,11 @@ pub(super) async fn accept(control: Rc<RefCell<Control>>, listeners: Vec<OwnedFd
     tokio::join!(first, second);
 }
 
-async fn accept_at(control: Rc<RefCell<Control>>, listener: OwnedFd, strangers: Strangers) {
+async fn accept_at(
+    control: Rc<RefCell<Control>>,
+    listener: OwnedFd,
+    strangers: PendingConnections,
+) {
     let listener = match watch(listener) {
         Ok(listener) => listener,
         Err(error) => return tracing::error!(%error, "the session socket cannot be watched"),
@@ -64,7 +68,7 @@ async fn accept_at(control: Rc<RefCell<Control>>, listener: OwnedFd, strangers: 
     let mut full = false;
     loop {
         let Ok(mut ready) = listener.readable().await else { return };
-        if descriptors::is_short() || descriptors::has_too_many_strangers() {
+        if descriptors::is_short() || descriptors::close_queue_is_full() {
             // Those that have a session keep it.
             if !std::mem::replace(&mut full, true) {
                 tracing::error!("too many descriptors are open: no more sessions are accepted");
@@ -80,7 +84,7 @@ async fn accept_at(control: Rc<RefCell<Control>>, listener: OwnedFd, strangers: 
                 let socket = PassedFd::connection(socket);
                 let pid = peer_process(&socket).map_or(0, |peer| peer.pid);
                 let stranger = strangers.add(pid);
-                spawn_local(serve(control.clone(), socket, Inside::No, Some(stranger)));
+                spawn_local(serve(control.clone(), socket, InternalPeer::No, Some(stranger)));
                 // Those that were served meanwhile go on.
                 tokio::task::yield_now().await;
             }
@@ -95,20 +99,20 @@ async fn accept_at(control: Rc<RefCell<Control>>, listener: OwnedFd, strangers: 
 }
 
 /// Whose end of a socket pair it is that the daemon serves.
-pub(super) enum Inside {
+pub(super) enum InternalPeer {
     /// Nobody's: somebody connected.
     No,
     /// The gateway's.
     Gateway,
     /// That of a relayed session of process `pid`.
-    Relay { pid: u32, tally: Arc<Tally>, key: Option<Arc<SessionKey>> },
+    Relay { pid: u32, tally: Arc<RelayCounters>, key: Option<Arc<SessionKey>> },
 }
 
 /// Serves one connection to its end. It is a `stranger` until it said HELLO.
 pub(super) async fn serve(
     control: Rc<RefCell<Control>>,
     socket: PassedFd,
-    inside: Inside,
+    inside: InternalPeer,
     stranger: Option<Stranger>,
 ) {
     let Ok(peer) = peer_process(&socket) else { return };
@@ -222,11 +226,11 @@ fn relay(
         Ok(pair) => pair,
         Err(refused) => return refuse(&mut state, &socket, &hello.name, peer, refused),
     };
-    let tally = Arc::new(Tally::new(&reason));
+    let tally = Arc::new(RelayCounters::new(&reason));
     tracing::info!(name = hello.name, pid = peer.pid, reason, "a session is relayed");
-    let inside = Inside::Relay { pid: peer.pid, tally: Arc::clone(&tally), key };
+    let inside = InternalPeer::Relay { pid: peer.pid, tally: Arc::clone(&tally), key };
     spawn_local(serve(control.clone(), ours.into(), inside, None));
-    let far = Far {
+    let far = DaemonRelay {
         socket: socket.into_inner(),
         inside: theirs,
         config: scoped(&state.config, scope_of(&hello)),
@@ -268,13 +272,13 @@ fn admit(
     socket: &AsyncFd<PassedFd>,
     first: First,
     peer: PeerProcess,
-    inside: &Inside,
+    inside: &InternalPeer,
 ) -> Option<Admitted> {
     let its_own = first.is_its_own();
     let First { mut hello, descriptors, mut key } = first;
     hello.name = shown(&hello.name);
     let control = &mut *control.borrow_mut();
-    let gateway = matches!(inside, Inside::Gateway);
+    let gateway = matches!(inside, InternalPeer::Gateway);
     let admission = &mut control.admission;
     let checked = its_own.and_then(|()| admission.check(&hello, descriptors, peer, gateway));
     let handed = match checked {
@@ -284,7 +288,7 @@ fn admit(
             return None;
         }
     };
-    let pid = if let Inside::Relay { pid, .. } = inside { *pid } else { peer.pid };
+    let pid = if let InternalPeer::Relay { pid, .. } = inside { *pid } else { peer.pid };
     // Endpoints are named after their session's id: who has another's could end them.
     if let Some(pid) = taken_by(control, &hello.session, pid) {
         let text = format!("process {pid} has a session with this one's id or one like it");
@@ -312,7 +316,7 @@ fn admit(
         return None;
     }
     control.relist();
-    if let Inside::Relay { tally, key: of_process, .. } = inside {
+    if let InternalPeer::Relay { tally, key: of_process, .. } = inside {
         control.registry.set_relayed(&session, Arc::clone(tally));
         key = of_process.clone();
     }

@@ -11,12 +11,12 @@ mod first;
 mod gateway;
 mod listen;
 pub mod log;
+mod pending;
 mod plane;
 mod relayed;
 mod remote;
 mod report;
 mod run;
-mod strangers;
 mod topics;
 mod turns;
 

@@ -36,7 +36,7 @@ pub(super) fn status(control: &Control) -> Status {
         range_stated: s.scope.as_ref().is_some_and(|scope| scope.stated),
         static_peers: s.scope.as_ref().map_or_else(Vec::new, |scope| scope.static_peers.clone()),
         lists: s.lists.iter().map(ToString::to_string).collect(),
-        relay: s.relay.as_deref().map(axon_transport::internal::registry::Tally::show),
+        relay: s.relay.as_deref().map(axon_transport::internal::registry::RelayCounters::show),
     });
     Status {
         daemon: control.id.to_string(),

@@ -14,19 +14,19 @@ use std::{
 
 use axon_shm::ids::DaemonId;
 
+mod confidence;
 mod interfaces;
 mod peers;
 mod run;
 pub(crate) mod socket;
-mod standing;
 #[cfg(test)]
 mod tests;
 mod wanted;
 
+pub(crate) use confidence::AddressConfidence;
 pub(crate) use interfaces::{Interface, interfaces};
 pub(crate) use peers::{Arrival, Local, Output, Peers};
 pub(crate) use run::{Event, run};
-pub(crate) use standing::Standing;
 pub(crate) use wanted::Wanted;
 
 /// The UDP ports that daemons of `domain` take their QUIC port from, the first that is free.
@@ -72,7 +72,7 @@ pub(crate) enum Action {
         /// Whether we list it, for our HELLO.
         listed: bool,
         /// Why it may be there; the answer says it again.
-        standing: Standing,
+        standing: AddressConfidence,
     },
     /// Send this from the QUIC port, best effort.
     SendFromQuicPort {

@@ -17,7 +17,8 @@ use tokio::{
 use tracing::{debug, warn};
 
 use super::{
-    Action, Arrival, Local, Output, Peers, Standing, Wanted, interfaces, socket::SharedSocket,
+    Action, AddressConfidence, Arrival, Local, Output, Peers, Wanted, interfaces,
+    socket::SharedSocket,
 };
 
 /// How often interfaces are looked at.
@@ -60,7 +61,7 @@ pub(crate) enum Event {
         /// To whom.
         daemon: DaemonId,
         /// As the action said it.
-        standing: Standing,
+        standing: AddressConfidence,
     },
     /// The graph has a new digest.
     GraphDigest(u64),
@@ -79,7 +80,7 @@ pub(crate) async fn run(
     mut events: mpsc::Receiver<Event>,
     actions: mpsc::Sender<Action>,
 ) {
-    let mut shell = Shell::new(config, daemon, actions);
+    let mut shell = DiscoveryIo::new(config, daemon, actions);
     let mut look = interval(INTERFACES_EVERY);
     look.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut names = interval(NAMES_EVERY);
@@ -144,7 +145,7 @@ pub(crate) async fn run(
     shell.carry_out();
 }
 
-struct Shell {
+struct DiscoveryIo {
     start: Instant,
     peers: Peers,
     socket: Option<SharedSocket>,
@@ -159,7 +160,7 @@ struct Shell {
     complained: bool,
 }
 
-impl Shell {
+impl DiscoveryIo {
     fn new(config: &Config, daemon: DaemonId, actions: mpsc::Sender<Action>) -> Self {
         Self {
             start: Instant::now(),

@@ -15,7 +15,7 @@ use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::{config::Config, internal::graph::RemoteEndpoint, status::LinkStatus};
 use tokio::sync::mpsc;
 
-use crate::{discovery::Standing, owner::SessionKeys};
+use crate::{discovery::AddressConfidence, owner::SessionKeys};
 
 /// What either channel holds.
 pub const CHANNEL: usize = 1024;
@@ -80,7 +80,7 @@ pub enum ToControl {
         /// The peer.
         daemon: DaemonId,
         /// Why it may be there, as the order said it.
-        standing: Standing,
+        standing: AddressConfidence,
     },
     /// A discovery datagram that arrived at the QUIC port.
     Datagram {
@@ -130,7 +130,7 @@ pub enum ToGateway {
         /// Whether this host lists it as a static peer.
         listed: bool,
         /// Why it may be there; the answer says it again.
-        standing: Standing,
+        standing: AddressConfidence,
     },
     /// Send a discovery datagram from the QUIC port.
     SendDatagram {

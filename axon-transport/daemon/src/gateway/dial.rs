@@ -13,7 +13,7 @@ use super::{
     refusal::Refusal,
 };
 use crate::{
-    discovery::Standing,
+    discovery::AddressConfidence,
     keys::{Completion, Dial},
     link::{CloseCode, Hello, Side},
 };
@@ -39,7 +39,7 @@ pub(super) struct Target {
     /// Whether this host lists it as a static peer.
     pub(super) listed: bool,
     /// Why it may be there, where discovery says so.
-    pub(super) standing: Option<Standing>,
+    pub(super) standing: Option<AddressConfidence>,
     /// The link that the new connection succeeds.
     pub(super) replaces: Option<[u8; 16]>,
 }

@@ -14,7 +14,7 @@ use axon_shm::{
 };
 use axon_transport::{
     graph::{Endpoint, EndpointKind},
-    internal::graph::{Pairing, RemoteEndpoint, Toward, out_of_range, pairing, reads, writes},
+    internal::graph::{Pairing, RangeToHost, RemoteEndpoint, out_of_range, pairing, reads, writes},
 };
 
 use crate::link::Subscriber;
@@ -76,10 +76,10 @@ pub(super) struct Wanted {
 
 /// Matches a peer's writers with this host's readers, as far as the ranges of their sessions permit.
 pub(super) fn wanted<'a>(
-    local: impl IntoIterator<Item = (&'a Endpoint, Toward)>,
+    local: impl IntoIterator<Item = (&'a Endpoint, RangeToHost)>,
     remote: impl IntoIterator<Item = &'a RemoteEndpoint>,
 ) -> BTreeMap<RouteKey, Wanted> {
-    let mut readers: BTreeMap<&str, Vec<(&Endpoint, Toward)>> = BTreeMap::new();
+    let mut readers: BTreeMap<&str, Vec<(&Endpoint, RangeToHost)>> = BTreeMap::new();
     for (endpoint, toward) in local.into_iter().filter(|(e, _)| reads(e.kind)) {
         readers.entry(&endpoint.topic).or_default().push((endpoint, toward));
     }
@@ -226,21 +226,21 @@ mod tests {
         super::wanted(local.iter().map(|e| (e, SUBNET)), &remote)
     }
 
-    const SUBNET: Toward = Toward { range: DiscoveryRange::Subnet, lists: false };
+    const SUBNET: RangeToHost = RangeToHost { range: DiscoveryRange::Subnet, lists: false };
 
     #[test]
     fn a_reader_whose_range_a_writer_is_out_of_asks_for_nothing() {
         use EndpointKind::{Publisher, Subscription};
-        let localhost = Toward { range: DiscoveryRange::Localhost, lists: false };
+        let localhost = RangeToHost { range: DiscoveryRange::Localhost, lists: false };
         let readers = [1, 2].map(|n| endpoint(n, Subscription, "/t", Qos::default()));
         let mut writer = RemoteEndpoint::from(endpoint(11, Publisher, "/t", Qos::default()));
-        let asked = |own: [Toward; 2], writer: &RemoteEndpoint| {
+        let asked = |own: [RangeToHost; 2], writer: &RemoteEndpoint| {
             let routes = super::wanted(readers.iter().zip(own), [writer]);
             routes.values().map(|wanted| wanted.subscribers.len()).sum::<usize>()
         };
         assert_eq!(asked([SUBNET, localhost], &writer), 1);
         assert_eq!(asked([localhost; 2], &writer), 0);
-        assert_eq!(asked([Toward { lists: true, ..localhost }, localhost], &writer), 1);
+        assert_eq!(asked([RangeToHost { lists: true, ..localhost }, localhost], &writer), 1);
         writer.toward = localhost;
         assert_eq!(asked([SUBNET; 2], &writer), 0);
         writer.toward.lists = true;

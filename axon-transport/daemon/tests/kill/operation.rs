@@ -138,7 +138,7 @@ impl Case {
         }
         let bytes = payload(self.before, self.len);
         let start = Instant::now();
-        writer.tend(start);
+        writer.reclaim_idle(start);
         self.around.begin();
         mark();
         match self.operation {
@@ -168,7 +168,7 @@ impl Case {
             Operation::DropWriter => return self.drop_writer(writer),
             Operation::Prepare => writer.prepare().expect("memory"),
             Operation::Tend => {
-                let kept = writer.tend(start + Duration::from_secs(60));
+                let kept = writer.reclaim_idle(start + Duration::from_secs(60));
                 assert_eq!(kept, self.pinned > 0);
             }
             other => unreachable!("{other:?} is the reader's"),

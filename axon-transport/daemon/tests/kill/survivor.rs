@@ -307,8 +307,11 @@ fn go_on(case: &Case, session: &Arc<SessionSegment>, writer: &Writer, sequence: 
     assert_eq!(writer.drop_gone().len(), 1);
     // What the dead one pinned has come back, too.
     let start = Instant::now();
-    writer.tend(start);
-    assert!(!writer.tend(start + Duration::from_secs(60)), "memory of large samples is kept");
+    writer.reclaim_idle(start);
+    assert!(
+        !writer.reclaim_idle(start + Duration::from_secs(60)),
+        "memory of large samples is kept"
+    );
     let samples = |info: &SegmentInfo| matches!(info.kind, SegmentKind::Samples(_));
     assert!(!session.segments().iter().any(samples));
 }

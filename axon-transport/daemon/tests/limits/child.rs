@@ -94,7 +94,7 @@ pub(crate) fn play(part: &str) {
             std::io::stdin().read_line(&mut line).unwrap();
             for _ in 0..3 {
                 assert!(subscriber.recv(Some(Duration::from_millis(20))).unwrap().is_none());
-                subscriber.tend();
+                subscriber.reclaim_idle();
             }
             drop(all);
             say(subscriber.recv(Some(PATIENCE)).unwrap().map_or(0, |sample| sample.len()));

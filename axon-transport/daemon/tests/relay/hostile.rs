@@ -85,14 +85,14 @@ fn announce(gid: Gid, kind: EndpointKind, role: EndpointRole) -> Message {
 }
 
 fn piece(publisher: Gid, length: Option<u32>, bytes: usize) -> Message {
-    let head = length.map(|length| Head {
+    let head = length.map(|length| SampleHeader {
         length,
         sequence: 1,
         source_timestamp: 0,
         lost: 0,
         published: 0,
     });
-    Message::Piece(Piece { publisher, head, bytes: vec![0; bytes], client: None })
+    Message::SampleFragment(SampleFragment { publisher, head, bytes: vec![0; bytes], client: None })
 }
 
 #[test]
@@ -174,9 +174,18 @@ const SAID: u64 = 20;
 
 fn say_all(socket: &OwnedFd) {
     for sequence in 1..=SAID {
-        let head = Some(Head { length: 10, sequence, source_timestamp: 0, lost: 0, published: 0 });
+        let head =
+            Some(SampleHeader { length: 10, sequence, source_timestamp: 0, lost: 0, published: 0 });
         let bytes = pattern(sequence, 10);
-        say_to(socket, &Message::Piece(Piece { publisher: own(), head, bytes, client: None }));
+        say_to(
+            socket,
+            &Message::SampleFragment(SampleFragment {
+                publisher: own(),
+                head,
+                bytes,
+                client: None,
+            }),
+        );
     }
 }
 
@@ -217,8 +226,17 @@ fn a_sample_that_cannot_be_written_is_given_up() {
     announce_and_await_credit(&socket);
     // Further ahead than any publisher may be.
     let sequence = 1 << 60;
-    let head = Some(Head { length: 0, sequence, source_timestamp: 0, lost: 0, published: 0 });
-    say_to(&socket, &Message::Piece(Piece { publisher: own(), head, bytes: vec![], client: None }));
+    let head =
+        Some(SampleHeader { length: 0, sequence, source_timestamp: 0, lost: 0, published: 0 });
+    say_to(
+        &socket,
+        &Message::SampleFragment(SampleFragment {
+            publisher: own(),
+            head,
+            bytes: vec![],
+            client: None,
+        }),
+    );
     let told = hear(&socket, |m| matches!(m, Message::GivenUp(_) | Message::Credit(_)));
     let given_up = GivenUp { reader: own(), writer: own(), samples: 1 };
     assert_eq!(told, Some(Message::GivenUp(given_up)), "before it counts as acknowledged");
@@ -365,9 +383,10 @@ fn whoever_answers_what_nobody_asked_it_reaches_nobody() {
     assert!(client.wait_available(PATIENCE));
     let own = Gid::new(SessionId([9; 16]), 1);
     let answer = |of: Gid, client: Gid, length: u32, bytes: usize| {
-        let head = Some(Head { length, sequence: 1, source_timestamp: 0, lost: 0, published: 0 });
+        let head =
+            Some(SampleHeader { length, sequence: 1, source_timestamp: 0, lost: 0, published: 0 });
         let bytes = vec![7; bytes];
-        Message::Piece(Piece { publisher: of, head, bytes, client: Some(client) })
+        Message::SampleFragment(SampleFragment { publisher: of, head, bytes, client: Some(client) })
     };
 
     // Not its own, or no server.
@@ -439,7 +458,7 @@ fn whoever_gives_no_credit_back_does_not_have_the_daemon_keep_all_that_ever_wrot
         let credit = open_for(gid, u64::MAX);
         say_to(&socket, &Message::Credit(credit));
         publish(&publisher, b"x");
-        let piece = |m: &Message| matches!(m, Message::Piece(p) if p.publisher == gid);
+        let piece = |m: &Message| matches!(m, Message::SampleFragment(p) if p.publisher == gid);
         assert!(hear(&socket, piece).is_some());
     }
     let first = first.unwrap();

@@ -32,8 +32,8 @@ use axon_transport::{
             socket::{self, SocketError},
         },
         wire::session::{
-            Announce, Asserted, Credit, EndpointRole, GivenUp, Head, Hello, Matched, Message,
-            PROTOCOL, Piece, Refused, SessionRole,
+            Announce, Asserted, Credit, EndpointRole, GivenUp, Hello, Matched, Message, PROTOCOL,
+            Refused, SampleFragment, SampleHeader, SessionRole,
         },
     },
     qos::{Durability, History, Qos, Reliability},

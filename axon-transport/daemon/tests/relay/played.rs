@@ -113,9 +113,9 @@ fn whom_the_daemon_names_for_another_publisher_is_not_counted() {
         let number = other.publish(b"x").unwrap();
         let credit = open_for(other.gid(), 9);
         say_to(&socket, &Message::Credit(credit));
-        let piece = hear(&socket, |m| matches!(m, Message::Piece(_)));
-        let Some(Message::Piece(piece)) = piece else { panic!("it hangs up") };
-        let Head { sequence, lost, .. } = piece.head.unwrap();
+        let piece = hear(&socket, |m| matches!(m, Message::SampleFragment(_)));
+        let Some(Message::SampleFragment(piece)) = piece else { panic!("it hangs up") };
+        let SampleHeader { sequence, lost, .. } = piece.head.unwrap();
         assert_eq!((piece.publisher, sequence, lost), (other.gid(), number, 0));
     }
 }
@@ -135,7 +135,7 @@ fn a_sample_is_acknowledged_once_the_daemon_has_it() {
         say_to(&socket, &Message::Credit(open_for(publisher.gid(), 99)));
         for sequence in 1..=2 {
             assert_eq!(publisher.publish(b"x").unwrap(), sequence);
-            assert!(hear(&socket, |m| matches!(m, Message::Piece(_))).is_some());
+            assert!(hear(&socket, |m| matches!(m, Message::SampleFragment(_))).is_some());
         }
         for sequence in 1..=2 {
             assert!(!publisher.wait_acknowledged(soon), "{sequence} is on its way");
@@ -160,7 +160,7 @@ fn samples_that_the_daemon_gave_up_are_not_acknowledged() {
         say_to(&socket, &Message::Credit(open_for(gid, 99)));
         for _ in 0..3 {
             publisher.publish(b"x").unwrap();
-            assert!(hear(&socket, |m| matches!(m, Message::Piece(_))).is_some());
+            assert!(hear(&socket, |m| matches!(m, Message::SampleFragment(_))).is_some());
         }
         say_to(&socket, &Message::GivenUp(GivenUp { reader: gid, writer: gid, samples: 2 }));
         let back = Credit { bytes: 3 * 129, opens: None, ..open_for(gid, 0) };
@@ -228,16 +228,17 @@ fn a_request_is_sent_once_however_many_servers_it_is_for() {
     say_to(&socket, &Message::Credit(credit));
     for number in 1..=3 {
         assert_eq!(own.send_request(b"x").unwrap(), number);
-        let piece = hear(&socket, |m| matches!(m, Message::Piece(_)));
-        let Some(Message::Piece(piece)) = piece else { panic!("no request") };
+        let piece = hear(&socket, |m| matches!(m, Message::SampleFragment(_)));
+        let Some(Message::SampleFragment(piece)) = piece else { panic!("no request") };
         assert_eq!((piece.publisher, piece.client), (own.gid(), None));
         assert_eq!(piece.head.unwrap().sequence, number);
     }
     // To whom it answers, and which it answers, is the server's to say; whose it is, is not.
     let other = Gid::new(SessionId([9; 16]), 7);
     let answer = |server, client, sequence| {
-        let head = Some(Head { length: 1, sequence, source_timestamp: 0, lost: 0, published: 0 });
-        Message::Piece(Piece { publisher: server, head, bytes: vec![0], client })
+        let head =
+            Some(SampleHeader { length: 1, sequence, source_timestamp: 0, lost: 0, published: 0 });
+        Message::SampleFragment(SampleFragment { publisher: server, head, bytes: vec![0], client })
     };
     say_to(&socket, &answer(other, Some(own.gid()), 1));
     say_to(&socket, &answer(one, Some(other), 1));
@@ -265,8 +266,8 @@ fn what_waits_for_one_server_goes_before_what_another_has_too() {
     let credit = open_for(own.gid(), 1);
     say_to(&socket, &Message::Credit(credit));
     for number in 1..=5 {
-        let piece = hear(&socket, |m| matches!(m, Message::Piece(_)));
-        let Some(Message::Piece(piece)) = piece else { panic!("no request") };
+        let piece = hear(&socket, |m| matches!(m, Message::SampleFragment(_)));
+        let Some(Message::SampleFragment(piece)) = piece else { panic!("no request") };
         assert_eq!(piece.head.unwrap().sequence, number);
     }
 }
@@ -286,10 +287,24 @@ fn a_channel_goes_on_when_one_of_its_readers_ends_and_another_is_matched() {
     until("both receive from it", || other.matched() == [outside]);
     let (gone, bytes) = (one.gid(), pattern(1, 1000));
     let (front, rest) = bytes.split_at(500);
-    let head = Some(Head { length: 1000, sequence: 1, source_timestamp: 0, lost: 0, published: 0 });
+    let head = Some(SampleHeader {
+        length: 1000,
+        sequence: 1,
+        source_timestamp: 0,
+        lost: 0,
+        published: 0,
+    });
     let piece = |head, bytes: &[u8]| {
         let bytes = bytes.to_vec();
-        say_to(&socket, &Message::Piece(Piece { publisher: outside, head, bytes, client: None }));
+        say_to(
+            &socket,
+            &Message::SampleFragment(SampleFragment {
+                publisher: outside,
+                head,
+                bytes,
+                client: None,
+            }),
+        );
     };
     piece(head, front);
     drop(one);

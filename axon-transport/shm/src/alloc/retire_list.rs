@@ -77,8 +77,8 @@ impl RetireList {
     }
 
     /// There is no memory for what was taken.
-    pub(crate) fn forgo(&mut self, at: Location, len: u64) {
-        slots(&mut self.stores, at).forgo(at.offset, len);
+    pub(crate) fn release_unbacked(&mut self, at: Location, len: u64) {
+        slots(&mut self.stores, at).release_unbacked(at.offset, len);
     }
 
     /// A place that nobody reads, for a loan: in a segment that was left only if nowhere else.
@@ -126,7 +126,7 @@ impl RetireList {
 
     /// There is no memory for the loan.
     pub(crate) fn withdraw(&mut self, at: Location, len: u64) {
-        self.forgo(at, len);
+        self.release_unbacked(at, len);
         self.loans -= 1;
     }
 

@@ -102,7 +102,7 @@ impl Slots {
     }
 
     /// Gives back the slot at `at`, which was taken for `len` bytes and could not be backed.
-    pub(crate) fn forgo(&mut self, at: u64, len: u64) {
+    pub(crate) fn release_unbacked(&mut self, at: u64, len: u64) {
         // It was taken of what is in no list. In one it would be the next to be tried.
         let bytes = classes::rounded(len);
         self.used -= bytes;
@@ -215,7 +215,7 @@ mod tests {
         let mut slots = slots(16 * MIB);
         let low = take(&mut slots, len).unwrap();
         let unbacked = slots.take_turn(len).unwrap();
-        slots.forgo(unbacked, len);
+        slots.release_unbacked(unbacked, len);
         assert_eq!(slots.take_turn(len), None);
         slots.release(low, len);
         assert_eq!((slots.take_turn(len), slots.used()), (Some(low), len));
@@ -261,7 +261,7 @@ mod tests {
         let [low, high] = [(); 2].map(|()| take(&mut slots, 4 * MIB).unwrap());
         let unbacked = slots.take(MIB).unwrap();
         assert!(slots.end(unbacked, MIB) > slots.backed());
-        slots.forgo(unbacked, MIB);
+        slots.release_unbacked(unbacked, MIB);
         slots.release(low, 4 * MIB);
         assert_eq!(slots.take(MIB), Some(low));
         slots.release(low, MIB);

@@ -84,7 +84,7 @@ impl From<Errno> for ConnectError {
 
 /// What a subscriber asks.
 #[derive(Clone, Copy, Debug, Encode, Decode)]
-pub(crate) struct Asked {
+pub(crate) struct AttachRequest {
     #[n(0)]
     pub(crate) session: SessionId,
     #[n(1)]
@@ -131,7 +131,7 @@ struct Refused {
 #[derive(Debug, Encode, Decode)]
 enum Packet {
     #[n(0)]
-    Asked(#[n(0)] Asked),
+    AttachRequest(#[n(0)] AttachRequest),
     #[n(1)]
     Granted(#[n(0)] Granted),
     #[n(2)]
@@ -193,17 +193,19 @@ impl<'a> Channel<'a> {
     /// Asks, and hands over the end of a [line] over which segments are to come.
     pub(crate) fn ask(
         &self,
-        asked: &Asked,
+        asked: &AttachRequest,
         own: &PeerDescriptors,
         line: impl AsFd,
     ) -> Result<(), ConnectError> {
         let fds = [own.segment.as_fd(), own.doorbell.as_fd(), own.pidfd.as_fd(), line.as_fd()];
-        self.send(&Packet::Asked(*asked), &fds)
+        self.send(&Packet::AttachRequest(*asked), &fds)
     }
 
-    pub(crate) fn await_asked(&self) -> Result<(Asked, PeerDescriptors, PassedFd), ConnectError> {
+    pub(crate) fn await_asked(
+        &self,
+    ) -> Result<(AttachRequest, PeerDescriptors, PassedFd), ConnectError> {
         match self.receive()? {
-            (Packet::Asked(asked), fds) => {
+            (Packet::AttachRequest(asked), fds) => {
                 let [segment, doorbell, pidfd, line] = fds
                     .try_into()
                     .map_err(|_| ConnectError::Protocol("another number of descriptors"))?;
@@ -249,7 +251,7 @@ impl<'a> Channel<'a> {
                 }
                 (Packet::Granted(_) | Packet::Refused(_), _) => {}
                 (Packet::Opened(_) | Packet::Gone(_), _) => {}
-                (Packet::Asked(_), _) => {
+                (Packet::AttachRequest(_), _) => {
                     return Err(ConnectError::Protocol("a question where an answer was due"));
                 }
             }
@@ -282,7 +284,7 @@ impl<'a> Channel<'a> {
                     }
                 }
                 (Packet::Gone(gone), _) => return Ok(News::Gone(gone)),
-                (Packet::Asked(_) | Packet::Granted(_) | Packet::Refused(_), _) => {}
+                (Packet::AttachRequest(_) | Packet::Granted(_) | Packet::Refused(_), _) => {}
             }
         }
     }

@@ -14,7 +14,7 @@ use std::{
 use crate::{
     direct::{
         connect::{Granted, News},
-        lines::Lines,
+        segment_channels::SegmentChannels,
     },
     error::ShmError,
     ids::{Gid, SessionId},
@@ -42,8 +42,8 @@ struct Inner {
     session: Arc<SessionSegment>,
     entities: AtomicU32,
     /// The other contexts, each mapped once.
-    peers: Mutex<HashMap<SessionId, Known>>,
-    lines: Arc<Lines>,
+    peers: Mutex<HashMap<SessionId, MappedContext>>,
+    lines: Arc<SegmentChannels>,
     /// What other contexts handed over and could not be mapped then.
     unmapped: Mutex<Vec<Unmapped>>,
     /// What subscribers of this context ask for, and what its own publishers answered.
@@ -84,7 +84,7 @@ impl Drop for Asking<'_> {
 }
 
 /// Another context.
-struct Known {
+struct MappedContext {
     session: Weak<PeerSession>,
     /// Device and inode of its first segment.
     memory: (u64, u64),
@@ -101,7 +101,7 @@ impl Context {
 
     fn of(session: Arc<SessionSegment>) -> Self {
         let (entities, peers) = (AtomicU32::new(1), Mutex::default());
-        let lines = Arc::new(Lines::new(session.id()));
+        let lines = Arc::new(SegmentChannels::new(session.id()));
         let told = Arc::clone(&lines);
         session.on_segment(move |event| told.tell(event));
         let (unmapped, own) = (Mutex::default(), Mutex::default());
@@ -155,7 +155,7 @@ impl Context {
         self.inner.unmapped.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub(crate) fn lines(&self) -> &Lines {
+    pub(crate) fn lines(&self) -> &SegmentChannels {
         &self.inner.lines
     }
 
@@ -264,7 +264,7 @@ impl Context {
         }
         let others: Vec<_> = peers.values().filter_map(|other| other.session.upgrade()).collect();
         let session = PeerSession::map_among(id, descriptors, &others)?;
-        peers.insert(id, Known { session: Arc::downgrade(&session), memory });
+        peers.insert(id, MappedContext { session: Arc::downgrade(&session), memory });
         Ok(Peer::Remote(session))
     }
 }

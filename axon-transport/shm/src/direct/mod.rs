@@ -2,6 +2,6 @@
 
 pub(crate) mod connect;
 pub(crate) mod context;
-pub(crate) mod lines;
 pub(crate) mod publisher;
+pub(crate) mod segment_channels;
 pub(crate) mod subscriber;

@@ -8,7 +8,7 @@ use std::{
 
 use crate::{
     direct::{
-        connect::{Asked, Channel, ConnectError, Granted},
+        connect::{AttachRequest, Channel, ConnectError, Granted},
         context::Context,
     },
     error::{PublishError, ShmError},
@@ -64,7 +64,7 @@ impl PublisherOptions {
 
 /// Publishes samples to the subscribers that it [serves](Self::serve). All methods may be called
 /// from any thread, at the same time too. When it is dropped, subscribers still take what it left;
-/// the memory of that comes back as other publishers of the context [tend](Self::tend) theirs, or
+/// the memory of that comes back as other publishers of the context [reclaim](Self::reclaim_idle) theirs, or
 /// with the context.
 pub struct Publisher {
     context: Context,
@@ -122,10 +122,10 @@ impl Publisher {
 
     fn admit(
         &self,
-        asked: Asked,
+        asked: AttachRequest,
         descriptors: PeerDescriptors,
     ) -> Result<(Granted, Peer), ConnectError> {
-        let Asked { session, reader: gid, lane, qos } = asked;
+        let AttachRequest { session, reader: gid, lane, qos } = asked;
         compatible(&self.qos, &qos).map_err(ConnectError::Incompatible)?;
         let peer = if session == self.context.id() {
             self.context.asked_itself(gid, lane)?
@@ -250,8 +250,8 @@ impl Publisher {
     /// was needed for as long. And hands over what a subscriber had no room for when it came into use,
     /// which the last sample before a pause may be in. To be called about once a second for as long as
     /// it returns true, and after the last sample before a pause.
-    pub fn tend(&self) -> bool {
-        let more = self.writer.tend(Instant::now());
+    pub fn reclaim_idle(&self) -> bool {
+        let more = self.writer.reclaim_idle(Instant::now());
         let more = self.context.session().tidy() || more;
         self.context.lines().keep_up_now(self.context.session());
         more

@@ -11,7 +11,7 @@ use rustix::net::{Shutdown, shutdown};
 
 use crate::{
     direct::{
-        connect::{Asked, Channel, ConnectError, line},
+        connect::{AttachRequest, Channel, ConnectError, line},
         context::Context,
     },
     error::TakeError,
@@ -133,7 +133,8 @@ impl Subscriber {
         let channel = Channel::new(socket.as_fd(), timeout);
         let lane = context.session().allocate_lane()?;
         let gid = context.next_gid();
-        let asked = Asked { session: context.id(), reader: gid, lane: lane.location(), qos };
+        let asked =
+            AttachRequest { session: context.id(), reader: gid, lane: lane.location(), qos };
         let asking = context.asking(gid, lane.location())?;
         let (ours, theirs) = line()?;
         channel.ask(&asked, &context.session().descriptors()?, &theirs)?;
@@ -239,7 +240,7 @@ impl Subscriber {
 
     /// Lets go of memory that the publisher gave up. To be called about once a second where samples
     /// in place are taken now and then; [`recv`](Self::recv) does it while it waits.
-    pub fn tend(&self) {
+    pub fn reclaim_idle(&self) {
         self.hear();
     }
 
@@ -254,7 +255,7 @@ impl Subscriber {
             // Not only once there is nothing to take, which may never be.
             if self.line.is_some() && self.tended.elapsed() >= LONGEST_SLEEP {
                 self.tended = Instant::now();
-                self.tend();
+                self.reclaim_idle();
             }
             if let Some(sample) = self.take()? {
                 return Ok(Some(sample));
@@ -267,7 +268,7 @@ impl Subscriber {
                 return Ok(None);
             }
             if !self.context.wait(|| self.has_data(), Some(left)) {
-                self.tend();
+                self.reclaim_idle();
             }
         }
     }

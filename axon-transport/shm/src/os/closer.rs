@@ -19,7 +19,7 @@ use crate::os::{
 
 /// Whose threads close a descriptor. None waits for what another's wait for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Lane {
+pub(super) enum FdClass {
     /// Memory: it may take long to give back, and cannot block.
     Memory,
     /// What a session of this user, or of a trusted one, sent.
@@ -41,7 +41,7 @@ pub(super) fn closed() {
     OPEN.fetch_sub(1, Ordering::Relaxed);
 }
 
-impl Lane {
+impl FdClass {
     pub(super) fn close(self, fd: OwnedFd) {
         match current() {
             Some(closer) => closer.crews[self as usize].close(fd),
@@ -64,11 +64,11 @@ impl Lane {
 
 /// The threads of a process: a forked child has none of its parent's.
 struct Closer {
-    crews: [Crew; 3],
+    crews: [CloserPool; 3],
 }
 
 /// The threads of a lane. One that finds nothing to do waits, and ends when another waits already.
-struct Crew {
+struct CloserPool {
     most: usize,
     state: Mutex<State>,
     work: Condvar,
@@ -87,7 +87,11 @@ static CLOSER: PerProcess<Closer> = PerProcess::new();
 /// That of this process; `None` where there is no memory to tell it from its parent's by.
 fn current() -> Option<&'static Closer> {
     let new = |_| Closer {
-        crews: THREADS.map(|most| Crew { most, state: Mutex::default(), work: Condvar::new() }),
+        crews: THREADS.map(|most| CloserPool {
+            most,
+            state: Mutex::default(),
+            work: Condvar::new(),
+        }),
     };
     CLOSER.get(new, Closer::inherit).ok().map(Made::value)
 }
@@ -104,7 +108,7 @@ impl Closer {
     }
 }
 
-impl Crew {
+impl CloserPool {
     fn close(&'static self, fd: OwnedFd) {
         let mut state = self.lock();
         state.waiting.push(fd);
@@ -132,7 +136,7 @@ impl Crew {
         loop {
             if let Some(fd) = state.waiting.pop() {
                 drop(state);
-                hurry(&fd);
+                disable_linger(&fd);
                 drop(fd);
                 closed();
                 state = self.lock();
@@ -155,7 +159,7 @@ impl Crew {
 
 /// Has a socket of a network not linger over what its peer does not take. To ask and to set may block
 /// as the close may.
-fn hurry(fd: &OwnedFd) {
+fn disable_linger(fd: &OwnedFd) {
     let internet = [AddressFamily::INET, AddressFamily::INET6];
     if sockopt::socket_domain(fd.as_fd()).is_ok_and(|domain| internet.contains(&domain)) {
         let _ = sockopt::set_socket_linger(fd.as_fd(), None);

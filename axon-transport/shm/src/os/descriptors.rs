@@ -22,7 +22,7 @@ use rustix::{
     process::{Resource, WaitId, WaitIdOptions, getrlimit, waitid},
 };
 
-use super::closer::{self, Lane, OPEN};
+use super::closer::{self, FdClass, OPEN};
 
 /// A memfd that holds less, in blocks of 512 bytes, is closed at once.
 const SMALL: i64 = (1 << 20) / 512;
@@ -48,7 +48,7 @@ enum Origin {
     /// Another process sent it.
     Passed,
     /// The socket itself, in whose queue there may be such.
-    Connection(Lane),
+    Connection(FdClass),
 }
 
 impl PassedFd {
@@ -60,12 +60,12 @@ impl PassedFd {
     /// A connection, with whatever stands in its queue. Its other end is told at once when it is
     /// dropped.
     pub fn connection(fd: OwnedFd) -> Self {
-        Self::new(fd, Origin::Connection(Lane::Stranger))
+        Self::new(fd, Origin::Connection(FdClass::Stranger))
     }
 
     /// The connection of somebody who may have a session.
     pub fn trusted(mut self) -> Self {
-        self.origin = Origin::Connection(Lane::Session);
+        self.origin = Origin::Connection(FdClass::Session);
         self
     }
 
@@ -110,15 +110,15 @@ impl PassedFd {
 
     /// Who closes it, unless that can be done at once. Asks nothing that a file system of somebody
     /// else's could answer late.
-    fn lane(&self) -> Option<Lane> {
+    fn lane(&self) -> Option<FdClass> {
         match self.origin {
             Origin::Own => None,
             Origin::Connection(lane) => Some(lane),
             Origin::Passed if self.is_memfd() => {
                 let small = fstat(self).is_ok_and(|found| found.st_blocks < SMALL);
-                (!small).then_some(Lane::Memory)
+                (!small).then_some(FdClass::Memory)
             }
-            Origin::Passed => (!self.is_pidfd()).then_some(Lane::Session),
+            Origin::Passed => (!self.is_pidfd()).then_some(FdClass::Session),
         }
     }
 }
@@ -173,7 +173,7 @@ impl Drop for PassedFd {
 pub fn is_short() -> bool {
     let open = OPEN.load(Ordering::Relaxed);
     let limit = getrlimit(Resource::Nofile).current;
-    limit.is_some_and(|limit| open + reserve(limit) > limit) || Lane::Session.is_full()
+    limit.is_some_and(|limit| open + reserve(limit) > limit) || FdClass::Session.is_full()
 }
 
 fn reserve(limit: u64) -> u64 {
@@ -187,8 +187,8 @@ pub fn is_scarce(limit: u64) -> bool {
 }
 
 /// Whether so many connections of strangers wait to be closed that nobody's should be accepted.
-pub fn has_too_many_strangers() -> bool {
-    Lane::Stranger.is_full()
+pub fn close_queue_is_full() -> bool {
+    FdClass::Stranger.is_full()
 }
 
 /// The most descriptors that one of several processes should make this one hold.
@@ -325,7 +325,7 @@ pub(crate) mod tests {
     #[test]
     fn descriptors_that_never_close_keep_nobody_waiting_and_each_kind_by_itself() {
         let mut peers = Vec::new();
-        for _ in 0..Lane::Session.threads() + 2 {
+        for _ in 0..FdClass::Session.threads() + 2 {
             let (fd, peer) = hiding();
             drop(PassedFd::received(fd));
             peers.push(peer);
@@ -344,7 +344,7 @@ pub(crate) mod tests {
             std::thread::yield_now();
         }
         // As have strangers, whose connections are as many.
-        for _ in 0..Lane::Stranger.threads() + 2 {
+        for _ in 0..FdClass::Stranger.threads() + 2 {
             let (fd, peer) = hiding();
             drop(PassedFd::connection(fd));
             peers.push(peer);
@@ -360,7 +360,7 @@ pub(crate) mod tests {
     fn a_socket_does_not_linger() {
         // More than there are threads: none of them is blocked.
         let mut peers = Vec::new();
-        for _ in 0..Lane::Session.threads() + 2 {
+        for _ in 0..FdClass::Session.threads() + 2 {
             let (fd, peer) = reluctant();
             drop(PassedFd::received(fd));
             peers.push(peer);
@@ -392,9 +392,9 @@ pub(crate) mod tests {
         let memfd = PassedFd::received(memfd);
         assert_eq!(memfd.lane(), None);
         rustix::io::write(&memfd, &vec![1; 2 << 20]).unwrap();
-        assert_eq!(memfd.lane(), Some(Lane::Memory), "it gives much memory back");
+        assert_eq!(memfd.lane(), Some(FdClass::Memory), "it gives much memory back");
         let file = PassedFd::received(tempfile::tempfile().unwrap().into());
-        assert_eq!(file.lane(), Some(Lane::Session));
+        assert_eq!(file.lane(), Some(FdClass::Session));
     }
 
     #[test]

@@ -388,7 +388,7 @@ impl Reader {
 
     /// Gives up what is left if memory that it needs to go on has not come; whether it did. What is left
     /// counts as skipped: for one whose publisher is gone, and of which another has all of that.
-    pub fn forgo_missing(&mut self) -> bool {
+    pub fn skip_missing(&mut self) -> bool {
         // It may have come since it was looked for.
         let lacks =
             |missing: &Missing| matches!(self.reads.peer.find(missing.segment), Found::Absent);

@@ -83,7 +83,7 @@ impl Reader {
 
     /// As [`take_back`](Self::take_back), and so is all that stands of what it was granted, done with or
     /// not.
-    pub fn begin_anew(&mut self) {
+    pub fn rewind(&mut self) {
         self.take_back();
         if self.under_way.is_none() || self.attachment.lane.is_forked() {
             return;

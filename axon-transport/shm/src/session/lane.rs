@@ -44,7 +44,7 @@ fn is_for(generation: u64, number: u64) -> bool {
 
 /// How a reader stands with the publisher that looks at its lane.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Standing {
+pub(crate) enum LaneState {
     /// It has not seen its grant yet.
     Asked,
     Open,
@@ -54,14 +54,14 @@ pub(crate) enum Standing {
 
 /// What a publisher knows a reader's lane by.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Tenancy {
+pub(crate) struct LaneId {
     /// The generation word when the reader asked.
     asked: u64,
     /// The one that it was granted.
     generation: u64,
 }
 
-impl Tenancy {
+impl LaneId {
     /// Publisher: gives a generation to the reader that asked with this lane.
     pub(crate) fn grant<W: Word>(lane: &[W], pin_limit: PinLimit) -> Self {
         let asked = lane[GENERATION].load(Site::GenerationLoad.order());
@@ -98,21 +98,21 @@ impl Tenancy {
 
     /// Publisher: what the lane says of the reader now.
     #[inline]
-    pub(crate) fn standing<W: Word>(&self, lane: &[W]) -> Standing {
+    pub(crate) fn standing<W: Word>(&self, lane: &[W]) -> LaneState {
         // Pairs with `open`: who sees the lane open sees its cursor; and with `close`: who sees it
         // closed, or in other hands, writes after all reads.
         match lane[GENERATION].load(Site::GenerationLoad.order()) {
-            0 => Standing::Left,
-            word if word == self.generation => Standing::Open,
-            word if word == self.asked => Standing::Asked,
-            _ => Standing::Left,
+            0 => LaneState::Left,
+            word if word == self.generation => LaneState::Open,
+            word if word == self.asked => LaneState::Asked,
+            _ => LaneState::Left,
         }
     }
 
     /// Publisher: the next position that the reader takes, if it has opened the lane.
     #[inline]
     pub(crate) fn cursor<W: Word>(&self, lane: &[W]) -> Option<u64> {
-        (self.standing(lane) == Standing::Open).then(|| {
+        (self.standing(lane) == LaneState::Open).then(|| {
             // Pairs with `advance`: what the reader has copied is not written over before.
             lane[CURSOR].load(Site::CursorLoad.order())
         })

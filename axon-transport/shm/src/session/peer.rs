@@ -111,7 +111,7 @@ pub struct PeerSession {
 #[derive(Default)]
 struct Further {
     /// By their numbers.
-    maps: BTreeMap<u32, Told>,
+    maps: BTreeMap<u32, AnnouncedSegment>,
     /// The highest number of those that came.
     highest: u32,
     /// Those that a reader has met and nobody has been asked for yet.
@@ -123,7 +123,7 @@ struct Further {
 }
 
 /// A segment that the session was said to have.
-struct Told {
+struct AnnouncedSegment {
     kind: SegmentKind,
     /// Absent for one that could not be used.
     map: Option<Arc<Map>>,
@@ -206,7 +206,7 @@ impl PeerSession {
             // It was none of its session's doing.
             Err(error) => return Err(error),
         };
-        further.maps.insert(info.number, Told { kind: info.kind, map });
+        further.maps.insert(info.number, AnnouncedSegment { kind: info.kind, map });
         further.wanted.remove(&info.number);
         further.highest = further.highest.max(info.number);
         let highest = further.highest;
@@ -229,7 +229,10 @@ impl PeerSession {
     /// The segments that came, besides the first.
     pub fn segments(&self) -> Vec<SegmentInfo> {
         let further = self.further();
-        let info = |(number, told): (&u32, &Told)| SegmentInfo { number: *number, kind: told.kind };
+        let info = |(number, told): (&u32, &AnnouncedSegment)| SegmentInfo {
+            number: *number,
+            kind: told.kind,
+        };
         further.maps.iter().map(info).collect()
     }
 
@@ -254,8 +257,8 @@ impl PeerSession {
             return Found::Map(Arc::clone(&self.first));
         }
         match self.further().maps.get(&number) {
-            Some(Told { map: Some(map), .. }) => Found::Map(Arc::clone(map)),
-            Some(Told { map: None, .. }) => Found::Refused,
+            Some(AnnouncedSegment { map: Some(map), .. }) => Found::Map(Arc::clone(map)),
+            Some(AnnouncedSegment { map: None, .. }) => Found::Refused,
             None => Found::Absent,
         }
     }

@@ -13,7 +13,7 @@ use crate::{
         pins,
     },
     session::{
-        lane::{LaneView, Standing, Tenancy},
+        lane::{LaneId, LaneState, LaneView},
         peer::{Peer, PeerSession},
     },
     sync::Word,
@@ -46,24 +46,24 @@ impl Pinned {
 /// Adds to `found` the positions that a reader pins, and says how it stands. After
 /// [`pins::about_to_scan`].
 #[inline]
-pub(crate) fn scan<W: Word>(tenancy: &Tenancy, lane: &[W], found: &mut Pinned) -> Standing {
+pub(crate) fn scan<W: Word>(tenancy: &LaneId, lane: &[W], found: &mut Pinned) -> LaneState {
     let standing = tenancy.standing(lane);
     let longest = tenancy.pin_limit().longest();
     // One that has not seen its grant pins nothing, and one that does from now on sees the tail.
-    if standing == Standing::Open && longest > 0 {
+    if standing == LaneState::Open && longest > 0 {
         found.0.extend(pins::scan(lane).map(|position| (position, longest)));
     }
     standing
 }
 
 /// A reader that keeps samples.
-pub(crate) struct Holder {
+pub(crate) struct PinningReader {
     pub(crate) reader: Gid,
     /// Its session, where that is not our own.
     pub(crate) peer: Option<Arc<PeerSession>>,
 }
 
-impl Holder {
+impl PinningReader {
     /// Its process: read from the file system.
     pub(crate) fn process(&self) -> Option<u32> {
         self.peer.as_ref().map_or(Some(std::process::id()), |peer| peer.process())
@@ -78,7 +78,7 @@ pub(crate) struct PinLane {
     peer: Option<Arc<PeerSession>>,
     at: Location,
     lane: LaneView,
-    pub(crate) tenancy: Tenancy,
+    pub(crate) tenancy: LaneId,
 }
 
 impl PinLane {
@@ -91,7 +91,7 @@ impl PinLane {
     }
 
     #[inline]
-    fn standing(&self) -> Standing {
+    fn standing(&self) -> LaneState {
         self.tenancy.standing(self.words())
     }
 }
@@ -121,7 +121,7 @@ impl PinLanes {
         peer: &Peer,
         at: Location,
         lane: &LaneView,
-    ) -> Result<Tenancy, ShmError> {
+    ) -> Result<LaneId, ShmError> {
         let session = peer.id();
         let same = |held: &&PinLane| {
             (held.session, held.reader, held.at) == (session, reader, at)
@@ -145,7 +145,7 @@ impl PinLanes {
             let taken = others.map(cost).sum();
             pin_limit = self.pool.share(taken, self.all.iter().filter(akin).map(cost).sum());
         }
-        let tenancy = Tenancy::grant(lane.words(), pin_limit);
+        let tenancy = LaneId::grant(lane.words(), pin_limit);
         let peer = peer.remote().cloned();
         self.all.push(PinLane { reader, session, peer, at, lane: lane.clone(), tenancy });
         Ok(tenancy)
@@ -153,27 +153,28 @@ impl PinLanes {
 
     /// Adds to `found` the positions that are pinned, after [`pins::about_to_scan`].
     pub(crate) fn scan(&mut self, found: &mut Pinned) {
-        self.all.retain(|held| scan(&held.tenancy, held.words(), found) != Standing::Left);
+        self.all.retain(|held| scan(&held.tenancy, held.words(), found) != LaneState::Left);
     }
 
     /// A reader that pins one of `positions`.
-    pub(crate) fn holder(&self, positions: &[u64]) -> Option<Holder> {
+    pub(crate) fn holder(&self, positions: &[u64]) -> Option<PinningReader> {
         let holds = |held: &&PinLane| {
-            held.standing() == Standing::Open
+            held.standing() == LaneState::Open
                 && pins::scan(held.words()).any(|position| positions.contains(&position))
         };
         self.all
             .iter()
             .find(holds)
-            .map(|held| Holder { reader: held.reader, peer: held.peer.clone() })
+            .map(|held| PinningReader { reader: held.reader, peer: held.peer.clone() })
     }
 
     /// Forgets those that have left, and those of `suspects` whose process has ended. Whether
     /// there were any.
     pub(crate) fn sweep(&mut self, suspect: impl Fn(&PinLane) -> bool) -> bool {
         let before = self.all.len();
-        self.all
-            .retain(|held| held.standing() != Standing::Left && !(suspect(held) && held.is_dead()));
+        self.all.retain(|held| {
+            held.standing() != LaneState::Left && !(suspect(held) && held.is_dead())
+        });
         self.all.len() != before
     }
 

@@ -162,7 +162,7 @@ fn what_another_end_may_do_wrong_is_refused() {
     let (a, b) = (SessionId::random(), SessionId::random());
     for reader in [Gid::new(a, 1), Gid::new(b, 1)] {
         let lane = Location { segment: 0, offset: 4096 };
-        let asked = connect::Asked { session: a, reader, lane, qos: Qos::default() };
+        let asked = connect::AttachRequest { session: a, reader, lane, qos: Qos::default() };
         let channel = connect::Channel::new(theirs.as_fd(), soon);
         let (_, line) = connect::line().unwrap();
         channel.ask(&asked, &context.session().descriptors().unwrap(), line).unwrap();

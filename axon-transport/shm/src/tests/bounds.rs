@@ -85,7 +85,7 @@ fn a_process_gets_no_more_lanes_of_a_ring_than_it_may() {
         assert!(lanes.len() <= OF_PROCESS, "there is an end");
     };
     assert!(refused.to_string().contains("its process has as many readers"), "{refused}");
-    assert_eq!((lanes.len(), writer.lock().audience.pin_lanes()), (OF_PROCESS, OF_PROCESS));
+    assert_eq!((lanes.len(), writer.lock().reader_set.pin_lanes()), (OF_PROCESS, OF_PROCESS));
     let mut gids = writer.readers();
     gids.sort();
     let mut both = sessions.each_ref().map(|session| Gid::new(session.id(), 7));

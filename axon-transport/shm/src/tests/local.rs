@@ -459,8 +459,8 @@ fn one_who_carries_samples_on_from_later_has_none_of_those_before_to_hand_over()
     };
     assert_eq!(writer.attach(info).unwrap().first, 3);
     // Somebody has waited since the first of the three.
-    let handed_over = |published| writer.lock().audience.handed_over(published);
-    assert_eq!([1, 3, 4].map(handed_over), [1, 3, 3]);
+    let delivered_up_to = |published| writer.lock().reader_set.delivered_up_to(published);
+    assert_eq!([1, 3, 4].map(delivered_up_to), [1, 3, 3]);
 }
 
 #[test]

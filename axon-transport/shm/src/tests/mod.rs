@@ -5,7 +5,6 @@ mod bounds;
 mod hostile;
 mod images;
 mod inspect;
-mod lines;
 mod local;
 mod memory;
 mod model;
@@ -13,6 +12,7 @@ mod mutation;
 mod pins;
 mod processes;
 mod samples;
+mod segment_channels;
 mod slices;
 mod wire;
 

@@ -11,7 +11,7 @@ use std::{
 use super::*;
 use crate::{
     ring::pins::RECORDS,
-    writer::{Numbering, Patience},
+    writer::{Numbering, PublishDeadline},
 };
 
 const LARGE: usize = 10_000;
@@ -38,7 +38,7 @@ fn retired(writer: &Writer) -> usize {
 }
 
 fn pin_lanes(writer: &Writer) -> usize {
-    writer.lock().audience.pin_lanes()
+    writer.lock().reader_set.pin_lanes()
 }
 
 #[test]
@@ -156,7 +156,7 @@ fn a_slot_longer_than_its_sample_is_kept_as_long() {
         let publish = |sequence: u64, len: usize| {
             let mut loan = writer.loan_behind(header, lent).unwrap();
             loan[..len].copy_from_slice(&pattern(sequence, len));
-            let patience = Patience::new(Duration::ZERO);
+            let patience = PublishDeadline::new(Duration::ZERO);
             loan.commit(len, Numbering::Given(meta(sequence)), patience).unwrap();
         };
         // The later they come, the shorter is what they may keep in place.

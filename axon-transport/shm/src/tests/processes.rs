@@ -381,7 +381,7 @@ fn a_process_killed_with_samples_in_use_gives_them_back() {
     assert_eq!(writer.drop_dead().len(), 1);
     (200..210).for_each(large);
     assert!(retired(&writer) <= 1);
-    assert_eq!(writer.lock().audience.pin_lanes(), 0);
+    assert_eq!(writer.lock().reader_set.pin_lanes(), 0);
 }
 
 #[test]

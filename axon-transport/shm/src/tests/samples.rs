@@ -55,8 +55,11 @@ fn whole(sample: &Sample) {
 }
 
 /// Looks after the writer as a control thread does, for the given seconds from `from` on.
-fn tend(writer: &Writer, from: Instant, seconds: u64) -> bool {
-    (0..=seconds).map(|second| writer.tend(from + Duration::from_secs(second))).last().unwrap()
+fn reclaim_idle(writer: &Writer, from: Instant, seconds: u64) -> bool {
+    (0..=seconds)
+        .map(|second| writer.reclaim_idle(from + Duration::from_secs(second)))
+        .last()
+        .unwrap()
 }
 
 #[test]
@@ -93,23 +96,26 @@ fn memory_that_is_not_used_any_more_comes_back() {
     let writer = writer(&a, keep_last(5), 16 << 20);
     let mut reader = attach(&writer, &a, &b, keep_last(5));
     let start = Instant::now();
-    assert!(!tend(&writer, start, 0), "there is none yet");
+    assert!(!reclaim_idle(&writer, start, 0), "there is none yet");
     for sequence in 0..20 {
         publish(&writer, sequence, IMAGE);
     }
     let inodes = inodes(&a);
     assert!(exists(&inodes) && backed(&a) > 5 * IMAGE as u64);
-    assert!(tend(&writer, start, 60), "what the reader has not taken stays");
+    assert!(reclaim_idle(&writer, start, 60), "what the reader has not taken stays");
     let mut last = None;
     while let Some(sample) = reader.take_sample().unwrap() {
         last = Some(sample);
     }
-    assert!(tend(&writer, start + Duration::from_secs(61), 60), "what a reader keeps stays");
+    assert!(
+        reclaim_idle(&writer, start + Duration::from_secs(61), 60),
+        "what a reader keeps stays"
+    );
     let sample = last.expect("samples");
     whole(&sample);
     assert!(exists(&inodes));
     drop(sample);
-    assert!(!tend(&writer, start + Duration::from_secs(122), 30), "nothing is left");
+    assert!(!reclaim_idle(&writer, start + Duration::from_secs(122), 30), "nothing is left");
     assert_eq!(backed(&a), 0);
     assert!(!exists(&inodes), "neither its publisher nor its reader keeps it");
     // And it comes when it is needed again.
@@ -132,7 +138,7 @@ fn far_too_much_memory_is_given_back_while_samples_flow() {
     for second in 0..60 {
         publish(&writer, 20 + second, 8192);
         whole(&reader.take_sample().unwrap().expect("the last"));
-        writer.tend(start + Duration::from_secs(second));
+        writer.reclaim_idle(start + Duration::from_secs(second));
     }
     assert!(backed(&a) < before / 4, "{} bytes of {before}", backed(&a));
     assert_eq!(samples_of(&a).len(), 1);
@@ -147,11 +153,11 @@ fn a_loan_of_memory_that_is_given_up_can_still_be_published() {
     let mut reader = attach(&writer, &a, &b, keep_last(1));
     let mut loan = writer.loan(IMAGE).unwrap();
     let start = Instant::now();
-    assert!(tend(&writer, start, 60));
+    assert!(reclaim_idle(&writer, start, 60));
     loan.copy_from_slice(&pattern(1, IMAGE));
     loan.publish(meta(1)).unwrap();
     whole(&reader.take_sample().unwrap().expect("a sample"));
-    assert!(!tend(&writer, start + Duration::from_secs(61), 30));
+    assert!(!reclaim_idle(&writer, start + Duration::from_secs(61), 30));
 }
 
 #[test]
@@ -187,7 +193,7 @@ fn history_is_kept_for_those_to_come_whoever_has_taken_it() {
         publish(&writer, sequence, IMAGE);
         reader.take_sample().unwrap().unwrap();
     }
-    assert!(tend(&writer, Instant::now(), 60));
+    assert!(reclaim_idle(&writer, Instant::now(), 60));
     let mut late = attach(&writer, &a, &b, qos);
     for sequence in 20..30 {
         assert_eq!(late.take_sample().unwrap().unwrap().meta(), meta(sequence));
@@ -242,7 +248,7 @@ fn readers_that_keep_all_they_can_are_given_way_and_named_at_the_end() {
     assert!(samples_of(&a).len() > 1);
     kept.clear();
     publish(&writer, sequence, MAX as usize);
-    assert!(tend(&writer, Instant::now(), 1));
+    assert!(reclaim_idle(&writer, Instant::now(), 1));
     assert_eq!(samples_of(&a).len(), 1, "the others went with what was kept in them");
 }
 
@@ -283,7 +289,7 @@ fn a_sample_that_went_before_its_memory_came_holds_nobody_up() {
     // The budget holds no more: the large one goes, and its memory with it.
     publish(&writer, 1, 1000);
     publish(&writer, 2, 1000);
-    assert!(!tend(&writer, Instant::now(), 20));
+    assert!(!reclaim_idle(&writer, Instant::now(), 20));
     assert!(reader.has_data(), "there is something to take");
     let sample = reader.take_sample().unwrap().expect("a sample");
     assert_eq!((sample.meta(), reader.lost()), (meta(1), 1));
@@ -297,8 +303,8 @@ fn a_child_after_fork_looks_after_nothing() {
     // SAFETY: the child takes no lock, allocates nothing and leaves by _exit.
     let child = unsafe { libc::fork() };
     if child == 0 {
-        let refused =
-            matches!(writer.prepare(), Err(ShmError::Forked)) && !writer.tend(Instant::now());
+        let refused = matches!(writer.prepare(), Err(ShmError::Forked))
+            && !writer.reclaim_idle(Instant::now());
         // SAFETY: ends the process without running anything else.
         unsafe { libc::_exit(i32::from(!refused)) };
     }
@@ -306,7 +312,7 @@ fn a_child_after_fork_looks_after_nothing() {
     // SAFETY: waits for the child just made; `status` outlives the call.
     assert_eq!(unsafe { libc::waitpid(child, &mut status, 0) }, child);
     assert_eq!(status, 0);
-    assert!(tend(&writer, Instant::now(), IDLE.as_secs() + 2), "the parent's stands");
+    assert!(reclaim_idle(&writer, Instant::now(), IDLE.as_secs() + 2), "the parent's stands");
 }
 
 #[test]

@@ -23,13 +23,13 @@ use crate::{
     writer::{
         Writer,
         history::Extent,
-        loan::{Lender, Loan, Place as LoanPlace},
+        loan::{Lender, Loan, LoanPlace},
         room::Refusal,
     },
 };
 
 /// How long a publish waits altogether, from the first time on that it has to.
-pub(crate) struct Patience {
+pub(crate) struct PublishDeadline {
     whole: Duration,
     end: Option<Instant>,
 }
@@ -48,7 +48,7 @@ fn judge(state: &State, numbering: Numbering) -> Result<(), PublishError> {
     if sequence > most { Err(PublishError::Sequence { sequence, last }) } else { Ok(()) }
 }
 
-impl Patience {
+impl PublishDeadline {
     pub(crate) fn new(whole: Duration) -> Self {
         Self { whole, end: None }
     }
@@ -65,14 +65,14 @@ impl Writer {
         &self,
         numbering: Numbering,
         payload: &[u8],
-        patience: Duration,
+        deadline: Duration,
     ) -> Result<(u64, Published), PublishError> {
         let bytes = self.check(payload.len())?;
-        let mut patience = Patience::new(patience);
+        let mut deadline = PublishDeadline::new(deadline);
         if payload.len() as u64 <= COPIED {
-            return self.commit(numbering, Payload::Bytes(payload), patience);
+            return self.commit(numbering, Payload::Bytes(payload), deadline);
         }
-        let lent: Result<LoanPlace, Meta> = self.patiently(&mut patience, |state| {
+        let lent: Result<LoanPlace, Meta> = self.retry_until(&mut deadline, |state| {
             judge(state, numbering)?;
             if self.is_unread(state) {
                 return Ok(Err(self.pass(state, numbering)));
@@ -86,7 +86,7 @@ impl Writer {
         // Copied outside the lock: nobody else knows of the place yet.
         let mut loan = Loan::placed(Lender::Borrowed(self), 0, payload.len(), place);
         loan.copy_from_slice(payload);
-        loan.commit(payload.len(), numbering, patience)
+        loan.commit(payload.len(), numbering, deadline)
     }
 
     /// Publishes what has been, or is here, copied in. Memory that was lent and that no sample
@@ -95,13 +95,13 @@ impl Writer {
         &self,
         numbering: Numbering,
         payload: Payload<'_>,
-        mut patience: Patience,
+        mut deadline: PublishDeadline,
     ) -> Result<(u64, Published), PublishError> {
         // A loan may have been made before the fork.
         if self.is_forked() {
             return Err(PublishError::Forked);
         }
-        let (meta, position, waiting) = self.patiently(&mut patience, |state| {
+        let (meta, position, waiting) = self.retry_until(&mut deadline, |state| {
             judge(state, numbering)?;
             if self.is_unread(state) {
                 return Ok((self.pass(state, numbering), None, None));
@@ -122,7 +122,7 @@ impl Writer {
             let meta = self.number(state, numbering);
             let position = self.show(state, meta, extent, place, payload);
             settle::<AtomicU64>();
-            Ok((meta, Some(position), state.audience.waiting()))
+            Ok((meta, Some(position), state.reader_set.waiting()))
         })?;
         // A system call for each session that sleeps, without the lock.
         for peer in waiting.iter().flat_map(|peers| &**peers) {
@@ -134,7 +134,7 @@ impl Writer {
     /// Whether nobody will ever read what is published now.
     #[inline]
     pub(super) fn is_unread(&self, state: &State) -> bool {
-        state.audience.is_empty() && self.options.qos.durability == Durability::Volatile
+        state.reader_set.is_empty() && self.options.qos.durability == Durability::Volatile
     }
 
     /// A sample that nobody reads.
@@ -201,22 +201,22 @@ impl Writer {
         }
     }
 
-    /// Tries until it works or `patience` is at its end. The lock is not held in between.
-    pub(super) fn patiently<T>(
+    /// Tries until it works or `deadline` is at its end. The lock is not held in between.
+    pub(super) fn retry_until<T>(
         &self,
-        patience: &mut Patience,
+        deadline: &mut PublishDeadline,
         attempt: impl FnMut(&mut State) -> Result<T, Refusal>,
     ) -> Result<T, PublishError> {
-        let tried = self.try_for(patience, attempt);
+        let tried = self.try_for(deadline, attempt);
         if let Err(error) = &tried {
-            self.count_failure(error, patience.whole);
+            self.count_failure(error, deadline.whole);
         }
         tried
     }
 
     fn try_for<T>(
         &self,
-        patience: &mut Patience,
+        deadline: &mut PublishDeadline,
         mut attempt: impl FnMut(&mut State) -> Result<T, Refusal>,
     ) -> Result<T, PublishError> {
         for look in 0u32.. {
@@ -229,17 +229,17 @@ impl Writer {
                         drop(state);
                         return Err(kept.into_error());
                     }
-                    Err(Refusal::Held { short }) => short,
+                    Err(Refusal::OldestInUse { short }) => short,
                 };
-                let State { history, audience, .. } = &mut *state;
-                (short, audience.laggards(history.tail(), history.head()))
+                let State { history, reader_set, .. } = &mut *state;
+                (short, reader_set.laggards(history.tail(), history.head()))
             };
-            let left = patience.left();
+            let left = deadline.left();
             match laggards {
                 Some((reader, _)) if left.is_zero() => {
                     let blocked = PublishError::Blocked { reader };
                     // A caller that does not wait tries again: the reader makes room, memory or not.
-                    let short = short.filter(|_| !patience.whole.is_zero());
+                    let short = short.filter(|_| !deadline.whole.is_zero());
                     return Err(short.unwrap_or(blocked));
                 }
                 Some((_, peers)) => self.await_room(&peers, left),
@@ -256,14 +256,14 @@ impl Writer {
     fn await_room(&self, laggards: &[Arc<PeerSession>], left: Duration) {
         let ready = || {
             let mut state = self.lock();
-            let State { history, audience, .. } = &mut *state;
-            audience.floors(history.head()).held > history.tail()
+            let State { history, reader_set, .. } = &mut *state;
+            reader_set.floors(history.head()).held > history.tail()
                 || laggards.iter().any(|peer| peer.is_dead())
         };
         let pidfds: Vec<_> = laggards.iter().map(|peer| peer.pidfd()).collect();
         self.session.wait_for_room(ready, &pidfds, left);
         let mut state = self.lock();
-        let State { history, audience, .. } = &mut *state;
-        audience.mark_dead(history.head());
+        let State { history, reader_set, .. } = &mut *state;
+        reader_set.mark_dead(history.head());
     }
 }

@@ -45,7 +45,7 @@ pub(crate) enum Extent {
 
 /// The oldest sample may not be given up.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) struct Held;
+pub(crate) struct OldestInUse;
 
 impl History {
     /// A history of samples in `descriptors` descriptors.
@@ -138,7 +138,7 @@ impl History {
     }
 
     /// Makes sure that the next position has a descriptor, giving up the oldest that `may_go`.
-    pub(crate) fn make_place(&mut self, may_go: impl Fn(u64) -> bool) -> Result<(), Held> {
+    pub(crate) fn make_place(&mut self, may_go: impl Fn(u64) -> bool) -> Result<(), OldestInUse> {
         while self.is_full() {
             self.give_up_oldest(&may_go)?;
         }
@@ -147,7 +147,11 @@ impl History {
 
     /// Gives up the oldest samples that `may_go` until `len` bytes more are within the budget. One
     /// sample always stays, whatever its length.
-    pub(crate) fn make_room(&mut self, len: u64, may_go: impl Fn(u64) -> bool) -> Result<(), Held> {
+    pub(crate) fn make_room(
+        &mut self,
+        len: u64,
+        may_go: impl Fn(u64) -> bool,
+    ) -> Result<(), OldestInUse> {
         while !self.has_room(len) {
             self.give_up_oldest(&may_go)?;
         }
@@ -155,7 +159,7 @@ impl History {
     }
 
     /// Gives up the oldest sample, if another one is in a block or slot. Whether it did.
-    pub(crate) fn shrink(&mut self, may_go: impl Fn(u64) -> bool) -> Result<bool, Held> {
+    pub(crate) fn shrink(&mut self, may_go: impl Fn(u64) -> bool) -> Result<bool, OldestInUse> {
         if self.placed <= 1 {
             return Ok(false);
         }
@@ -249,9 +253,9 @@ impl History {
         position
     }
 
-    fn give_up_oldest(&mut self, may_go: &impl Fn(u64) -> bool) -> Result<(), Held> {
+    fn give_up_oldest(&mut self, may_go: &impl Fn(u64) -> bool) -> Result<(), OldestInUse> {
         if self.tail == self.head || !may_go(self.tail) {
-            return Err(Held);
+            return Err(OldestInUse);
         }
         self.release_below(self.tail + 1);
         Ok(())
@@ -301,7 +305,7 @@ mod tests {
             history.push(Extent::Inline);
         }
         history.push(Extent::Inline);
-        assert_eq!(history.make_place(|position| position > 0), Err(Held));
+        assert_eq!(history.make_place(|position| position > 0), Err(OldestInUse));
         assert_eq!(history.make_place(|_| true), Ok(()));
         assert_eq!((history.tail(), history.head()), (1, 4));
     }

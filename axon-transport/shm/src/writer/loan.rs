@@ -18,7 +18,7 @@ use crate::{
         layout::{ALIGNED, Location},
         types::{Meta, Published},
     },
-    writer::{Numbering, PATIENCE, Patience, Payload, Writer},
+    writer::{Numbering, PATIENCE, Payload, PublishDeadline, Writer},
 };
 
 /// Memory to be filled and published: shared memory where such a sample is read in place. Dropping
@@ -55,7 +55,7 @@ pub struct Loan<'a> {
     lead: usize,
     len: usize,
     written: usize,
-    memory: Memory,
+    memory: LoanMemory,
 }
 
 /// Whose memory it is.
@@ -76,21 +76,21 @@ impl Deref for Lender<'_> {
     }
 }
 
-enum Memory {
+enum LoanMemory {
     /// Of words that are aligned to 16.
     Own(Vec<u128>),
-    Shared(Place),
+    Shared(LoanPlace),
     Published,
 }
 
 /// Shared memory that was lent.
-pub(crate) struct Place {
+pub(crate) struct LoanPlace {
     pub(crate) segment: Arc<OwnSegment>,
     /// Where it is in the segment, in bytes.
     pub(crate) at: u64,
 }
 
-impl Place {
+impl LoanPlace {
     fn location(&self) -> Location {
         Location { segment: self.segment.number(), offset: self.at }
     }
@@ -99,12 +99,12 @@ impl Place {
 impl<'a> Loan<'a> {
     pub(crate) fn copied(writer: Lender<'a>, lead: usize, len: usize) -> Self {
         let words = vec![0; (lead + len).div_ceil(ALIGNED)];
-        Self { writer, lead, len, written: 0, memory: Memory::Own(words) }
+        Self { writer, lead, len, written: 0, memory: LoanMemory::Own(words) }
     }
 
     /// `len` bytes there behind the first `lead`, all of which have been lent.
-    pub(crate) fn placed(writer: Lender<'a>, lead: usize, len: usize, place: Place) -> Self {
-        Self { writer, lead, len, written: 0, memory: Memory::Shared(place) }
+    pub(crate) fn placed(writer: Lender<'a>, lead: usize, len: usize, place: LoanPlace) -> Self {
+        Self { writer, lead, len, written: 0, memory: LoanMemory::Shared(place) }
     }
 
     /// Publishes it, waiting for a slot as [`Writer::publish`] does.
@@ -145,7 +145,7 @@ impl<'a> Loan<'a> {
             return Err(PublishError::Incomplete { len: most, written });
         }
         let numbering = Numbering::Next(source_timestamp);
-        self.commit(len, numbering, Patience::new(PATIENCE)).map(|(sequence, _)| sequence)
+        self.commit(len, numbering, PublishDeadline::new(PATIENCE)).map(|(sequence, _)| sequence)
     }
 
     #[inline]
@@ -155,39 +155,39 @@ impl<'a> Loan<'a> {
             let (len, written) = (len as u64, self.written as u64);
             return Err(PublishError::Incomplete { len, written });
         }
-        self.commit(len, numbering, Patience::new(PATIENCE))
+        self.commit(len, numbering, PublishDeadline::new(PATIENCE))
     }
 
     pub(crate) fn commit(
         mut self,
         len: usize,
         numbering: Numbering,
-        patience: Patience,
+        deadline: PublishDeadline,
     ) -> Result<(u64, Published), PublishError> {
         if self.writer.is_forked() {
             return Err(PublishError::Forked);
         }
         let payload = match &self.memory {
-            Memory::Shared(place) if len as u64 > self.writer.longest_copied() => {
+            LoanMemory::Shared(place) if len as u64 > self.writer.longest_copied() => {
                 let (lead, lent) = (self.lead, self.lead + self.len);
                 Payload::Written { at: place.location(), lead, len, lent }
             }
             // What has become short is copied from where it was written.
-            Memory::Own(_) | Memory::Shared(_) => Payload::Bytes(&self[..len]),
-            Memory::Published => unreachable!("publishing takes the loan"),
+            LoanMemory::Own(_) | LoanMemory::Shared(_) => Payload::Bytes(&self[..len]),
+            LoanMemory::Published => unreachable!("publishing takes the loan"),
         };
         let taken = matches!(payload, Payload::Written { .. });
-        let (sequence, published) = self.writer.commit(numbering, payload, patience)?;
+        let (sequence, published) = self.writer.commit(numbering, payload, deadline)?;
         // What nobody reads has not become a sample, and its memory is given back.
         if taken && published.position.is_some() {
-            self.memory = Memory::Published;
+            self.memory = LoanMemory::Published;
         }
         Ok((sequence, published))
     }
 
     /// The address of the memory that is lent.
     #[inline]
-    fn lent(&self, place: &Place) -> NonNull<u8> {
+    fn lent(&self, place: &LoanPlace) -> NonNull<u8> {
         assert!(!self.writer.is_forked(), "a loan of shared memory, used after fork");
         place.segment.memory.address(place.at + self.lead as u64, self.len)
     }
@@ -199,16 +199,16 @@ impl Deref for Loan<'_> {
     #[inline]
     fn deref(&self) -> &[u8] {
         match &self.memory {
-            Memory::Own(words) => &bytes_of(words)[self.lead..][..self.len],
+            LoanMemory::Own(words) => &bytes_of(words)[self.lead..][..self.len],
             // SAFETY: `len` bytes of the segment's map, which lives as long as the loan. They are
             // memory from the system or bytes of earlier samples, so initialized. They are lent to
             // this loan alone, and no reader reads them before they are published, which takes the
             // loan: nothing writes to them while it is borrowed. The words of the whole map that
             // exist beside are atomic and not touched here.
-            Memory::Shared(place) => unsafe {
+            LoanMemory::Shared(place) => unsafe {
                 slice::from_raw_parts(self.lent(place).as_ptr(), self.len)
             },
-            Memory::Published => &[],
+            LoanMemory::Published => &[],
         }
     }
 }
@@ -218,7 +218,7 @@ impl DerefMut for Loan<'_> {
     #[inline]
     fn deref_mut(&mut self) -> &mut [u8] {
         self.written = self.len;
-        if let Memory::Shared(place) = &self.memory {
+        if let LoanMemory::Shared(place) = &self.memory {
             let start = self.lent(place).as_ptr();
             // SAFETY: as in `deref`, and borrowed mutably like the loan itself. Other processes
             // have the memory mapped; they cannot write to it, and those that keep to the protocol
@@ -226,8 +226,8 @@ impl DerefMut for Loan<'_> {
             return unsafe { slice::from_raw_parts_mut(start, self.len) };
         }
         match &mut self.memory {
-            Memory::Own(words) => &mut bytes_of_mut(words)[self.lead..][..self.len],
-            Memory::Shared(_) | Memory::Published => &mut [],
+            LoanMemory::Own(words) => &mut bytes_of_mut(words)[self.lead..][..self.len],
+            LoanMemory::Shared(_) | LoanMemory::Published => &mut [],
         }
     }
 }
@@ -253,7 +253,7 @@ impl io::Write for Loan<'_> {
 impl Drop for Loan<'_> {
     fn drop(&mut self) {
         // The history of a forked child is a copy that nobody uses, and its lock may be held.
-        if let Memory::Shared(place) = &self.memory
+        if let LoanMemory::Shared(place) = &self.memory
             && !self.writer.is_forked()
         {
             self.writer.give_back(place.location(), self.lead + self.len);

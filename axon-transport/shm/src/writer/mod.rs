@@ -1,11 +1,11 @@
 //! The publishing end of a ring.
 
 pub(crate) mod absent;
-pub(crate) mod audience;
 mod commit;
-mod handover;
+mod delivery;
 pub(crate) mod history;
 pub(crate) mod loan;
+pub(crate) mod reader_set;
 pub(crate) mod room;
 pub(crate) mod samples;
 mod tally;
@@ -14,7 +14,7 @@ mod times;
 use std::{sync::Arc, time::Duration};
 
 pub use self::commit::MAX_GAP;
-pub(super) use self::commit::Patience;
+pub(super) use self::commit::PublishDeadline;
 
 use crate::{
     alloc::{
@@ -40,9 +40,9 @@ use crate::{
         segment::SessionSegment,
     },
     writer::{
-        audience::Audience,
         history::History,
         loan::{Lender, Loan},
+        reader_set::ReaderSet,
         room::Maps,
         samples::Samples,
     },
@@ -122,7 +122,7 @@ pub struct Writer {
 
 pub(super) struct State {
     pub(super) history: History,
-    pub(super) audience: Audience,
+    pub(super) reader_set: ReaderSet,
     /// The descriptors.
     pub(super) array: Object,
     /// The segments that blocks are in.
@@ -156,7 +156,7 @@ impl State {
 
     /// Below this position every reader has taken what it wanted, and nobody asks for it again.
     pub(super) fn consumed(&self) -> u64 {
-        self.audience.consumed(self.history.head())
+        self.reader_set.consumed(self.history.head())
     }
 
     /// The number of the last sample in front of a position.
@@ -169,10 +169,10 @@ impl State {
         }
     }
 
-    fn new(audience: Audience, history: History, array: Object) -> Self {
+    fn new(reader_set: ReaderSet, history: History, array: Object) -> Self {
         Self {
             history,
-            audience,
+            reader_set,
             array,
             maps: Maps::default(),
             samples: None,
@@ -248,8 +248,8 @@ impl Writer {
         if keeps_all(&qos) {
             history.count_descriptors();
         }
-        let audience = Audience::new(qos, limit - 1, Pool::new(budget, max_message));
-        let state = State::new(audience, history, array);
+        let reader_set = ReaderSet::new(qos, limit - 1, Pool::new(budget, max_message));
+        let state = State::new(reader_set, history, array);
         let writer = Self { options, session, ring, limit, state: PiMutex::new(state)? };
         writer.add_bytes(layout::RING + descriptors * layout::DESCRIPTOR);
         writer.show_window(&writer.lock());
@@ -266,7 +266,7 @@ impl Writer {
         options: RingOptions,
     ) -> Result<Self, ShmError> {
         let writer = Self::create(session, options)?;
-        writer.lock().audience.heed_depths();
+        writer.lock().reader_set.enforce_depths();
         Ok(writer)
     }
 
@@ -303,34 +303,34 @@ impl Writer {
         let lane = reader.peer.lane(reader.lane)?;
         let mut state = self.lock();
         let resumed = terms.after.map(|after| state.position_after(after));
-        let State { audience, history, .. } = &mut *state;
+        let State { reader_set, history, .. } = &mut *state;
         let (tail, head) = (history.tail(), history.head());
-        let granted = audience.attach(reader, lane, tail, head, resumed, terms.carries);
+        let granted = reader_set.attach(reader, lane, tail, head, resumed, terms.carries);
         self.show_window(&state);
         granted.map(|grant| (grant, state.number_before(grant.first)))
     }
 
     /// Forgets a reader; false when it was not attached. The samples that it keeps it may keep.
     pub fn detach(&self, reader: Gid) -> bool {
-        !self.is_forked() && self.change(|audience, head| audience.detach(reader, head))
+        !self.is_forked() && self.change(|reader_set, head| reader_set.detach(reader, head))
     }
 
     /// Forgets the readers whose process has ended, and names them.
     pub fn drop_dead(&self) -> Vec<Gid> {
-        if self.is_forked() { Vec::new() } else { self.change(Audience::drop_dead) }
+        if self.is_forked() { Vec::new() } else { self.change(ReaderSet::drop_dead) }
     }
 
     /// As [`drop_dead`](Self::drop_dead), and those that have left without a word.
     pub fn drop_gone(&self) -> Vec<Gid> {
-        if self.is_forked() { Vec::new() } else { self.change(Audience::drop_gone) }
+        if self.is_forked() { Vec::new() } else { self.change(ReaderSet::drop_gone) }
     }
 
-    fn change<T>(&self, by: impl FnOnce(&mut Audience, u64) -> T) -> T {
+    fn change<T>(&self, by: impl FnOnce(&mut ReaderSet, u64) -> T) -> T {
         let mut state = self.lock();
         // A session of which this was the last part is unmapped after the lock, and not under it.
-        let peers = state.audience.peers();
-        let State { audience, history, .. } = &mut *state;
-        let changed = by(audience, history.head());
+        let peers = state.reader_set.peers();
+        let State { reader_set, history, .. } = &mut *state;
+        let changed = by(reader_set, history.head());
         self.show_window(&state);
         drop(state);
         drop(peers);
@@ -339,13 +339,13 @@ impl Writer {
 
     /// The subscriptions that are attached; a relay shows as those that it stands for.
     pub fn readers(&self) -> Vec<Gid> {
-        if self.is_forked() { Vec::new() } else { self.lock().audience.readers() }
+        if self.is_forked() { Vec::new() } else { self.lock().reader_set.readers() }
     }
 
     /// Whether any reader is attached.
     #[inline]
     pub fn has_readers(&self) -> bool {
-        !self.is_forked() && !self.lock().audience.is_empty()
+        !self.is_forked() && !self.lock().reader_set.is_empty()
     }
 
     /// If a sample would be read by nobody, now or later, uses up the next sequence number as if one
@@ -457,7 +457,7 @@ impl Writer {
         }
         let bytes = Area::rounded((lead + len) as u64);
         let place =
-            self.patiently(&mut Patience::new(PATIENCE), |state| self.lend(state, bytes))?;
+            self.retry_until(&mut PublishDeadline::new(PATIENCE), |state| self.lend(state, bytes))?;
         Ok(Loan::placed(lender, lead, len, place))
     }
 
@@ -495,9 +495,9 @@ impl Drop for Writer {
         if self.is_forked() {
             return;
         }
-        let State { mut history, array, audience, .. } = {
+        let State { mut history, array, reader_set, .. } = {
             let mut state = self.lock();
-            let nobody = Audience::new(self.options.qos, 0, Pool::default());
+            let nobody = ReaderSet::new(self.options.qos, 0, Pool::default());
             let empty = State::new(nobody, History::new(1, 0), self.ring.clone());
             std::mem::replace(&mut *state, empty)
         };
@@ -505,6 +505,6 @@ impl Drop for Writer {
         let mut blocks = vec![self.ring.block, array.block];
         blocks.extend(history.all_blocks());
         let samples = history.pinned().segments().collect();
-        self.session.adopt(Orphan { pin_lanes: audience.into_pin_lanes(), blocks, samples });
+        self.session.adopt(Orphan { pin_lanes: reader_set.into_pin_lanes(), blocks, samples });
     }
 }

@@ -8,20 +8,20 @@ use crate::{
         area::Area,
         heap::{Block, Need, Object},
     },
-    error::{Keeper, PublishError, ShmError},
+    error::{PinHolder, PublishError, ShmError},
     memory::segment::Map,
     ring::{
         layout::{self, Array, COPIED},
         protocol,
     },
-    session::pin_lanes::Holder,
-    writer::{State, Writer, history::Held},
+    session::pin_lanes::PinningReader,
+    writer::{State, Writer, history::OldestInUse},
 };
 
 /// Why an attempt to publish did not succeed.
 pub(crate) enum Refusal {
     /// A KEEP_ALL reader holds the oldest sample.
-    Held {
+    OldestInUse {
         /// Why there is no room for more than it holds, where that is for want of memory.
         short: Option<PublishError>,
     },
@@ -32,7 +32,7 @@ pub(crate) enum Refusal {
 
 /// Who keeps it.
 pub(crate) struct Kept {
-    pub(crate) holder: Holder,
+    pub(crate) holder: PinningReader,
     pub(crate) samples: usize,
     /// Why there is no more of it, where it is not that the segments are full.
     pub(crate) short: Option<PublishError>,
@@ -42,7 +42,7 @@ impl Kept {
     /// As whoever publishes is told. Looks the process up, so not to be called under a lock.
     pub(crate) fn into_error(self) -> PublishError {
         let Self { holder, samples, short } = self;
-        let keeper = Keeper { reader: holder.reader, process: holder.process(), samples };
+        let keeper = PinHolder { reader: holder.reader, process: holder.process(), samples };
         match short {
             Some(PublishError::NoMemory { needed, available, .. }) => {
                 PublishError::NoMemory { needed, available, keeper: Some(keeper) }
@@ -59,9 +59,9 @@ impl From<PublishError> for Refusal {
     }
 }
 
-impl From<Held> for Refusal {
-    fn from(Held: Held) -> Self {
-        Self::Held { short: None }
+impl From<OldestInUse> for Refusal {
+    fn from(OldestInUse: OldestInUse) -> Self {
+        Self::OldestInUse { short: None }
     }
 }
 
@@ -102,17 +102,17 @@ impl Writer {
     /// Makes sure that the next position has a descriptor.
     pub(crate) fn make_place(&self, state: &mut State) -> Result<(), Refusal> {
         if state.history.is_full() {
-            let floors = state.audience.floors(state.history.head());
+            let floors = state.reader_set.floors(state.history.head());
             // What has been taken in is kept a little longer than the window asks for, so that the
             // tail moves seldom and readers keep it in their caches.
-            let window = state.audience.window();
+            let window = state.reader_set.window();
             let surplus = floors.retained.saturating_sub(state.history.tail());
             let wanted = window.saturating_add((window / 4).max(4));
             let mut short = None;
             if surplus == 0 || state.history.capacity() < wanted {
                 // A publish that waits for readers leaves them the time to map what they lack.
                 // Nor does one give up what it keeps for others because of a reader that lacks it.
-                let now = floors.held < u64::MAX || state.audience.keeps_all();
+                let now = floors.held < u64::MAX || state.reader_set.keeps_all();
                 let need = if now { Need::Now } else { Need::Mapped };
                 short = self.grow(state, need).err().map(no_memory);
             }
@@ -124,13 +124,13 @@ impl Writer {
             // What all have taken goes without a loss.
             let is_lost = history.is_full() && short.is_some() && history.tail() >= consumed;
             let made = history.make_place(|position| position < floors.held);
-            made.map_err(|Held| Refusal::Held { short })?;
+            made.map_err(|OldestInUse| Refusal::OldestInUse { short })?;
             if is_lost {
                 self.count_short();
             }
         }
         if !state.history.has_room_for_descriptor() {
-            let floors = state.audience.floors(state.history.head());
+            let floors = state.reader_set.floors(state.history.head());
             state.history.make_room(0, |position| position < floors.held)?;
         }
         self.show_tail(state);
@@ -147,9 +147,9 @@ impl Writer {
         if descriptors > self.limit {
             return Ok(());
         }
-        let audience = &state.audience;
+        let reader_set = &state.reader_set;
         let bytes = descriptors * layout::DESCRIPTOR;
-        let mapped = |number| audience.has_mapped(number);
+        let mapped = |number| reader_set.has_mapped(number);
         let Some(array) = self.session.allocate(bytes, need, mapped)? else { return Ok(()) };
         // Only what stands moves, so readers must not take more for standing.
         self.show_tail(state);
@@ -188,7 +188,7 @@ impl Writer {
 
     /// A block for a sample, for which the oldest samples go if they have to.
     fn block_with_room(&self, state: &mut State, bytes: u64) -> Result<Block, Refusal> {
-        let floors = state.audience.floors(state.history.head());
+        let floors = state.reader_set.floors(state.history.head());
         let may_go = |position| position < floors.held;
         state.history.make_room(bytes, may_go)?;
         loop {
@@ -204,7 +204,9 @@ impl Writer {
                         Ok(false) => return Err(error.into()),
                         Ok(true) if was_kept => self.count_short(),
                         Ok(true) => {}
-                        Err(Held) => return Err(Refusal::Held { short: Some(error) }),
+                        Err(OldestInUse) => {
+                            return Err(Refusal::OldestInUse { short: Some(error) });
+                        }
                     }
                     self.give_blocks_back(state);
                 }
@@ -217,8 +219,8 @@ impl Writer {
         if state.history.blocks().are_many() {
             self.give_blocks_back(state);
         }
-        let audience = &state.audience;
-        let mapped = |number| audience.has_mapped(number);
+        let reader_set = &state.reader_set;
+        let mapped = |number| reader_set.has_mapped(number);
         let object = self
             .session
             .allocate(bytes, Need::Now, mapped)

@@ -19,11 +19,11 @@ use crate::{
         pins::{self, RECORDS},
         protocol,
     },
-    session::pin_lanes::Holder,
+    session::pin_lanes::PinningReader,
     writer::{
         LOOKS, State, Writer,
-        history::Held,
-        loan::Place,
+        history::OldestInUse,
+        loan::LoanPlace,
         room::{Kept, Refusal, no_memory},
     },
 };
@@ -92,7 +92,7 @@ impl Writer {
                 pinned.slots(at).back(end);
                 pinned.put_back(at, len);
             }
-            Err(_) => pinned.forgo(at, len),
+            Err(_) => pinned.release_unbacked(at, len),
         }
         committed
     }
@@ -100,18 +100,18 @@ impl Writer {
     /// Gives memory of large samples back that is not needed any more: all of it once there was
     /// no such sample for ten seconds and none is wanted, else what is far more than was needed
     /// for as long. To be called about once a second for as long as it says that there is any.
-    pub fn tend(&self, now: Instant) -> bool {
+    pub fn reclaim_idle(&self, now: Instant) -> bool {
         if self.is_forked() {
             return false;
         }
         let mut state = self.lock();
-        let State { history, audience, .. } = &mut *state;
+        let State { history, reader_set, .. } = &mut *state;
         if history.pinned().segments().len() == 0 {
             return false;
         }
-        audience.sweep();
-        let floors = audience.floors(history.head());
-        history.release_below(floors.retained.max(audience.consumed(history.head())));
+        reader_set.sweep();
+        let floors = reader_set.floors(history.head());
+        history.release_below(floors.retained.max(reader_set.consumed(history.head())));
         self.reclaim(&mut state);
         let State { history, samples, .. } = &mut *state;
         if let (Some(open), Some((used, backed))) = (samples.as_mut(), history.pinned().extent())
@@ -141,16 +141,16 @@ impl Writer {
     }
 
     /// Takes `bytes`, more than [`COPIED_ALWAYS`], that no reader reads.
-    pub(crate) fn lend(&self, state: &mut State, bytes: u64) -> Result<Place, Refusal> {
+    pub(crate) fn lend(&self, state: &mut State, bytes: u64) -> Result<LoanPlace, Refusal> {
         debug_assert!(bytes > COPIED_ALWAYS);
         self.open_samples(state).map_err(no_memory)?;
         if let Some(place) = self.next_turn(state, bytes) {
             return Ok(place);
         }
-        let floors = state.audience.floors(state.history.head());
+        let floors = state.reader_set.floors(state.history.head());
         let may_go = |position| position < floors.held;
         // What all readers have taken goes first: its memory is the warmest.
-        let consumed = state.audience.consumed(state.history.head());
+        let consumed = state.reader_set.consumed(state.history.head());
         state.history.release_below(floors.retained.max(consumed));
         let mut short = None;
         if state.history.is_short_of(bytes) {
@@ -208,7 +208,7 @@ impl Writer {
                         continue;
                     }
                     // Room that the reader makes will do, whether or not there is memory.
-                    Err(Held) => return Err(Refusal::Held { short }),
+                    Err(OldestInUse) => return Err(Refusal::OldestInUse { short }),
                     Ok(false) => {}
                 }
             }
@@ -216,12 +216,12 @@ impl Writer {
                 let loans = state.history.pinned().loans();
                 return Err(short.unwrap_or(PublishError::Loaned { loans }).into());
             }
-            match state.audience.holder(&kept) {
+            match state.reader_set.holder(&kept) {
                 // Whoever pinned them has let go, or died, just now. One that does so for ever is
                 // out for trouble.
                 None if look < LOOKS => {}
                 holder => {
-                    let holder = holder.unwrap_or(Holder { reader: self.gid(), peer: None });
+                    let holder = holder.unwrap_or(PinningReader { reader: self.gid(), peer: None });
                     return Err(Refusal::Kept(Kept { holder, samples: kept.len(), short }));
                 }
             }
@@ -231,7 +231,7 @@ impl Writer {
 
     /// A slot at hand, as long as slots take turns: to find out what readers have taken costs lines
     /// that they have just written to, and need not be done for each sample.
-    fn next_turn(&self, state: &mut State, bytes: u64) -> Option<Place> {
+    fn next_turn(&self, state: &mut State, bytes: u64) -> Option<LoanPlace> {
         let State { history, samples: Some(samples), .. } = state else { return None };
         let Some(turns) = samples.turns.checked_sub(1) else {
             samples.turns = TURNS - 1;
@@ -250,7 +250,7 @@ impl Writer {
         state: &mut State,
         bytes: u64,
         grow: bool,
-    ) -> Result<Option<Place>, PublishError> {
+    ) -> Result<Option<LoanPlace>, PublishError> {
         match state.history.lend(bytes) {
             Some(at) => self.settled(state, at, bytes, grow),
             None => Ok(None),
@@ -264,7 +264,7 @@ impl Writer {
         at: Location,
         bytes: u64,
         grow: bool,
-    ) -> Result<Option<Place>, PublishError> {
+    ) -> Result<Option<LoanPlace>, PublishError> {
         let State { history, samples: Some(samples), .. } = state else { return Ok(None) };
         let slots = history.pinned().slots(at);
         let end = slots.end(at.offset, bytes);
@@ -295,7 +295,7 @@ impl Writer {
         }
         // Readers that copy without a pin find out by this that it is written over.
         protocol::about_to_write::<AtomicU64>();
-        Ok(Some(Place { segment, at: at.offset }))
+        Ok(Some(LoanPlace { segment, at: at.offset }))
     }
 
     /// Frees what was given up and is not read by anybody.
@@ -303,8 +303,8 @@ impl Writer {
         if state.history.pinned().retired().len() > 0 {
             self.show_tail(state);
             pins::about_to_scan::<AtomicU64>();
-            let State { history, audience, pinned, .. } = state;
-            pinned.refresh(|pinned| audience.scan(pinned));
+            let State { history, reader_set, pinned, .. } = state;
+            pinned.refresh(|pinned| reader_set.scan(pinned));
             history.pinned().reclaim(|position, len| pinned.keeps(position, len));
         }
         self.close_vacated(state);

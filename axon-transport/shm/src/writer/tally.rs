@@ -26,15 +26,15 @@ impl Writer {
 
     /// The readers have changed.
     pub(crate) fn show_window(&self, state: &State) {
-        self.update(WINDOW, |_| state.audience.window());
+        self.update(WINDOW, |_| state.reader_set.window());
     }
 
     /// A publish that had so long to succeed did not. Whoever gave it no time tries again, so that
     /// nothing is dropped yet.
     #[cold]
-    pub(crate) fn count_failure(&self, error: &PublishError, patience: Duration) {
+    pub(crate) fn count_failure(&self, error: &PublishError, deadline: Duration) {
         let word = match error {
-            PublishError::Blocked { .. } if !patience.is_zero() => BLOCKED,
+            PublishError::Blocked { .. } if !deadline.is_zero() => BLOCKED,
             PublishError::NoMemory { .. } | PublishError::Segment { .. } => NO_MEMORY,
             PublishError::Pinned { .. } | PublishError::Loaned { .. } => PINNED,
             _ => return,

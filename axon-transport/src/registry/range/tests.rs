@@ -79,7 +79,7 @@ impl World {
         gid
     }
 
-    fn remote(&mut self, daemon: DaemonId, gid: Gid, kind: EndpointKind, toward: Toward) {
+    fn remote(&mut self, daemon: DaemonId, gid: Gid, kind: EndpointKind, toward: RangeToHost) {
         let remote = RemoteEndpoint { endpoint: Endpoint::example(gid, kind).into(), toward };
         self.registry.remote_graph(daemon, false, vec![remote], vec![]);
     }
@@ -126,8 +126,8 @@ fn of(endpoint: Endpoint, role: EndpointRole, stands_for: Vec<Gid>) -> Announce 
 }
 
 const REMOTE: Gid = Gid([150; 16]);
-const SUBNET: Toward = Toward { range: Subnet, lists: false };
-const LOCALHOST: Toward = Toward { range: Localhost, lists: false };
+const SUBNET: RangeToHost = RangeToHost { range: Subnet, lists: false };
+const LOCALHOST: RangeToHost = RangeToHost { range: Localhost, lists: false };
 
 #[test]
 fn an_off_session_matches_nothing_but_itself_and_is_seen_by_nobody() {
@@ -156,9 +156,9 @@ fn a_localhost_session_meets_another_host_only_where_one_lists_the_other() {
         (Localhost, &["10.0.0.3"], SUBNET, false),
         (Subnet, &[], LOCALHOST, false),
         (Subnet, &[LISTED], LOCALHOST, true),
-        (Localhost, &[], Toward { lists: true, ..SUBNET }, true),
-        (Localhost, &[], Toward { lists: true, ..LOCALHOST }, true),
-        (Off, &[LISTED], Toward { lists: true, ..SUBNET }, false),
+        (Localhost, &[], RangeToHost { lists: true, ..SUBNET }, true),
+        (Localhost, &[], RangeToHost { lists: true, ..LOCALHOST }, true),
+        (Off, &[LISTED], RangeToHost { lists: true, ..SUBNET }, false),
     ] {
         let case = format!("{own:?} {peers:?} {remote:?}");
         let mut world = World::new(&[scope(own, peers)]);
@@ -220,7 +220,7 @@ fn pairs_and_graph_follow_a_link_that_comes_and_goes() {
             }
             _ => None,
         });
-        assert_eq!(reach, Some(Reach { range: Localhost, lists: vec![PEER] }));
+        assert_eq!(reach, Some(EndpointRange { range: Localhost, lists: vec![PEER] }));
         world.unlink();
         assert!(world.pairs().is_empty(), "another address is another host");
         let told = world.drain(1);
@@ -239,7 +239,7 @@ fn what_another_host_says_of_its_session_is_followed() {
     world.own(1, 1, Subscription);
     world.stand_in(REMOTE);
     for lists in [false, true, false, true] {
-        world.remote(PEER, REMOTE, Publisher, Toward { range: Subnet, lists });
+        world.remote(PEER, REMOTE, Publisher, RangeToHost { range: Subnet, lists });
         assert_eq!(world.pairs().len(), usize::from(lists));
         assert_eq!(world.sees(1).contains(&REMOTE), lists);
     }
@@ -291,7 +291,7 @@ fn a_publisher_counts_those_of_a_relay_that_it_meets() {
     };
     world.registry.handle_message(&id(1), Message::Grant(granted), vec![]).unwrap();
     // The other host's session lists this host from now on.
-    world.remote(OTHER, not_met, Subscription, Toward { lists: true, ..SUBNET });
+    world.remote(OTHER, not_met, Subscription, RangeToHost { lists: true, ..SUBNET });
     assert_eq!(stands_for(&world.drain(1)), Some(vec![met, not_met]));
     assert_eq!(world.pairs(), [Pair { reader, writer }]);
 }

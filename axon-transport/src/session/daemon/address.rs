@@ -30,14 +30,14 @@ use crate::{config::Config, wire::session::PROTOCOL};
 /// Where the daemon of a user and domain listens.
 #[derive(Clone, Debug)]
 pub struct Address {
-    place: Option<Place>,
+    place: Option<SocketFiles>,
     /// A name in the abstract namespace: a kill frees it, and no file system is needed.
     name: Option<String>,
 }
 
 /// A socket in the file system, with what belongs to it.
 #[derive(Clone, Debug)]
-struct Place {
+struct SocketFiles {
     socket: PathBuf,
     /// Locked by the daemon as long as it lives.
     lock: PathBuf,
@@ -65,7 +65,7 @@ impl Bound {
 
 /// The turn to start a daemon, until it is dropped or its process ends.
 #[derive(Debug)]
-pub(crate) struct Turn {
+pub(crate) struct SpawnLock {
     _kept: Option<OwnedFd>,
 }
 
@@ -108,7 +108,7 @@ impl Address {
             let uid = rustix::process::geteuid().as_raw();
             format!("axon/{uid}/{domain}/{PROTOCOL}")
         };
-        let place = |dir: &Path, stem: String| Place {
+        let place = |dir: &Path, stem: String| SocketFiles {
             socket: dir.join(format!("{stem}.sock")),
             lock: dir.join(format!("{stem}.lock")),
         };
@@ -132,7 +132,7 @@ impl Address {
     /// # Errors
     /// [`AddressError::Absent`] when there is none.
     pub fn connect(&self) -> Result<OwnedFd, AddressError> {
-        let at_place = |place: &Place| path_name(&place.socket).and_then(|path| call(&path));
+        let at_place = |place: &SocketFiles| path_name(&place.socket).and_then(|path| call(&path));
         let at_name = |name: &String| abstract_name(name).and_then(|name| call(&name));
         match (&self.place, &self.name) {
             (Some(place), None) => at_place(place),
@@ -160,7 +160,7 @@ impl Address {
     pub fn bind(&self) -> Result<Bound, AddressError> {
         let mut listeners = Vec::new();
         let mut lock = Lock { _file: None };
-        match self.place.as_ref().map(Place::bind) {
+        match self.place.as_ref().map(SocketFiles::bind) {
             None => {}
             Some(Ok((listener, file))) => {
                 listeners.push(listener);
@@ -202,11 +202,11 @@ impl Address {
 
     /// The turn to start a daemon here; `None` where another thread or process has it. What keeps it
     /// is a bound name or a locked file: where neither can be had, nobody is kept from trying.
-    pub(crate) fn turn(&self) -> Option<Turn> {
+    pub(crate) fn turn(&self) -> Option<SpawnLock> {
         match self.try_turn() {
-            Ok(kept) => Some(Turn { _kept: Some(kept) }),
+            Ok(kept) => Some(SpawnLock { _kept: Some(kept) }),
             Err(Errno::ADDRINUSE | Errno::WOULDBLOCK) => None,
-            Err(_) => Some(Turn { _kept: None }),
+            Err(_) => Some(SpawnLock { _kept: None }),
         }
     }
 
@@ -239,7 +239,7 @@ impl Address {
     }
 }
 
-impl Place {
+impl SocketFiles {
     /// Listens there, once the lock is had.
     fn bind(&self) -> Result<(OwnedFd, File), AddressError> {
         let Self { socket, lock } = self;

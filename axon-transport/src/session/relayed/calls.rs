@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use axon_shm::Sample;
 
-use super::flow::{Channel, Departing};
+use super::flow::{Channel, OutboundSample};
 use crate::{
     ids::Gid,
     session::{
@@ -39,9 +39,9 @@ impl Calls {
         &mut self,
         client: &Gid,
         find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
-    ) -> Option<Departing<Sample>> {
+    ) -> Option<OutboundSample<Sample>> {
         let requests = self.requests.get_mut(client)?;
-        requests.next(|server| find(server)?.take_from(client).map(taken)).map(Departing::from)
+        requests.next(|server| find(server)?.take_from(client).map(taken)).map(OutboundSample::from)
     }
 
     /// Takes the requests that were sent by way of another server; whether there are more.
@@ -63,9 +63,9 @@ impl Calls {
 pub fn response<'a>(
     channel: &Channel,
     find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
-) -> Option<Departing<Sample>> {
+) -> Option<OutboundSample<Sample>> {
     let client = find(&channel.client?)?;
-    client.take_from(&channel.writer).map(taken).map(Departing::from)
+    client.take_from(&channel.writer).map(taken).map(OutboundSample::from)
 }
 
 fn taken(content: Sample) -> Taken<Sample> {

@@ -20,7 +20,7 @@ use axon_shm::{Meta, Sample};
 use crate::{
     ids::Gid,
     session::merge::Taken,
-    wire::session::{Credit, Head, Piece},
+    wire::session::{Credit, SampleFragment, SampleHeader},
 };
 
 /// Bytes that a channel may have under way without asking.
@@ -102,7 +102,7 @@ impl Content for Vec<u8> {
 
 /// A sample to be sent.
 #[derive(Debug)]
-pub struct Departing<S> {
+pub struct OutboundSample<S> {
     /// Its number and time.
     pub meta: Meta,
     /// Samples of its publisher that were lost since the one before.
@@ -111,7 +111,7 @@ pub struct Departing<S> {
     pub content: S,
 }
 
-impl From<Taken<Sample>> for Departing<Sample> {
+impl From<Taken<Sample>> for OutboundSample<Sample> {
     fn from(Taken { lost, content, .. }: Taken<Sample>) -> Self {
         Self { meta: content.meta(), lost, content }
     }
@@ -134,7 +134,7 @@ struct Sending<S> {
     /// What it was when the receiver opened its end: all of it is back when nothing is under way.
     window: u64,
     /// What is sent piece by piece, and how far.
-    current: Option<(Departing<S>, Option<usize>)>,
+    current: Option<(OutboundSample<S>, Option<usize>)>,
     in_turn: bool,
 }
 
@@ -193,7 +193,7 @@ impl<S: Content> Outgoing<S> {
 
     /// Asks for the next sample of each channel that has none under way and may send one. Whether
     /// there was any.
-    pub fn fill(&mut self, mut take: impl FnMut(&Channel) -> Option<Departing<S>>) -> bool {
+    pub fn fill(&mut self, mut take: impl FnMut(&Channel) -> Option<OutboundSample<S>>) -> bool {
         let mut found = Vec::new();
         for (name, channel) in &mut self.channels {
             if channel.current.is_none() && channel.credit >= Some(OVERHEAD) {
@@ -206,7 +206,7 @@ impl<S: Content> Outgoing<S> {
     }
 
     /// The next piece, of the channel whose turn it is.
-    pub fn next_piece(&mut self) -> Option<Piece> {
+    pub fn next_piece(&mut self) -> Option<SampleFragment> {
         loop {
             let name = self.turns.pop_front()?;
             let Some(channel) = self.channels.get_mut(&name) else { continue };
@@ -226,7 +226,8 @@ impl<S: Content> Outgoing<S> {
                     // No sample is longer than AXON_MAX_MESSAGE_MB allows, which is below 4 GiB.
                     let length = u32::try_from(sample.content.len()).unwrap_or(u32::MAX);
                     let lost = sample.lost;
-                    head = Some(Head { length, sequence, source_timestamp, lost, published });
+                    head =
+                        Some(SampleHeader { length, sequence, source_timestamp, lost, published });
                     0
                 }
             };
@@ -247,7 +248,7 @@ impl<S: Content> Outgoing<S> {
                 self.enqueue(name);
             }
             let Channel { writer: publisher, client } = name;
-            return Some(Piece { publisher, head, bytes, client });
+            return Some(SampleFragment { publisher, head, bytes, client });
         }
     }
 
@@ -263,7 +264,7 @@ impl<S: Content> Outgoing<S> {
 
 /// A sample that has come whole.
 #[derive(Debug, PartialEq, Eq)]
-pub struct Arrived {
+pub struct InboundSample {
     /// On which channel.
     pub channel: Channel,
     /// Its number and time.
@@ -274,7 +275,7 @@ pub struct Arrived {
     pub payload: Vec<u8>,
 }
 
-impl Arrived {
+impl InboundSample {
     fn cost(&self) -> u64 {
         OVERHEAD + self.payload.len() as u64
     }
@@ -353,7 +354,7 @@ struct Receiving {
 
 #[derive(Debug)]
 struct Partial {
-    head: Head,
+    head: SampleHeader,
     payload: Vec<u8>,
 }
 
@@ -389,8 +390,8 @@ impl Incoming {
     ///
     /// # Errors
     /// [`Violation`].
-    pub fn piece(&mut self, piece: Piece) -> Result<Option<Arrived>, Violation> {
-        let Piece { publisher, head, bytes, client } = piece;
+    pub fn piece(&mut self, piece: SampleFragment) -> Result<Option<InboundSample>, Violation> {
+        let SampleFragment { publisher, head, bytes, client } = piece;
         let name = Channel { writer: publisher, client };
         // Of a channel that was closed meanwhile.
         let Some(channel) = self.channels.get_mut(&name) else { return Ok(None) };
@@ -421,9 +422,9 @@ impl Incoming {
             }
             return Ok(None);
         }
-        let Head { sequence, source_timestamp, lost, published, .. } = head;
+        let SampleHeader { sequence, source_timestamp, lost, published, .. } = head;
         let meta = Meta { sequence, source_timestamp, published };
-        Ok(Some(Arrived { channel: name, meta, lost, payload }))
+        Ok(Some(InboundSample { channel: name, meta, lost, payload }))
     }
 
     /// For whom there is room now. One for whom there is none keeps none of the others waiting.
@@ -469,7 +470,7 @@ impl Incoming {
     }
 
     /// A sample has gone to where it belongs, or nowhere: what its sender is given back.
-    pub fn done(&mut self, sample: &Arrived) -> Option<Credit> {
+    pub fn done(&mut self, sample: &InboundSample) -> Option<Credit> {
         let name = sample.channel;
         let channel = self.channels.get_mut(&name)?;
         let (cost, more) = (sample.cost(), extra(sample.payload.len()));

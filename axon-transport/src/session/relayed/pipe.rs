@@ -15,12 +15,12 @@ use rustix::{
 
 use super::{
     change_signal::ChangeSignal,
-    flow::{Arrived, Channel, Departing, Incoming, Outgoing, Violation},
+    flow::{Channel, InboundSample, Incoming, OutboundSample, Outgoing, Violation},
 };
 use crate::{
     ids::Gid,
     log_limit::LogLimit,
-    registry::Tally,
+    registry::RelayCounters,
     session::{
         RemoteWriter, Written,
         daemon::socket::{self, Received, SocketError},
@@ -60,7 +60,7 @@ pub enum End {
 }
 
 /// Samples that are written, and of which it is not known whether they are where they are to go.
-struct OnTheirWay {
+struct Unacknowledged {
     /// The number up to which the other end was told that they are.
     said: u64,
     /// The last that was written.
@@ -71,7 +71,7 @@ struct OnTheirWay {
 
 /// Samples that were lost.
 #[derive(Clone, Copy, Debug)]
-pub enum Loss {
+pub enum LossReport {
     /// These did not come; whether that was before the `first` of the channel.
     Before {
         /// How many.
@@ -83,7 +83,7 @@ pub enum Loss {
     Unwritten,
 }
 
-impl Loss {
+impl LossReport {
     /// How many.
     pub fn samples(self) -> u64 {
         match self {
@@ -104,13 +104,13 @@ pub struct Pipe {
     pub outgoing: Outgoing<Sample>,
     pub(crate) incoming: Incoming,
     /// Samples that came and are not published yet.
-    arrived: BTreeMap<Channel, VecDeque<Arrived>>,
+    arrived: BTreeMap<Channel, VecDeque<InboundSample>>,
     /// Channels of which a sample was written, or is to be.
     begun: BTreeSet<Channel>,
     /// Whether one of them waits for a reader.
     blocked: bool,
     /// Channels whose samples are written and not all handed over.
-    written: BTreeMap<Channel, OnTheirWay>,
+    written: BTreeMap<Channel, Unacknowledged>,
     /// MATCHED that this end has said, and those that it has heard: by these both ends tell a channel
     /// from an earlier one of the same name.
     said: u64,
@@ -119,13 +119,13 @@ pub struct Pipe {
     gone: bool,
     /// What it had said has been heard to its end.
     over: bool,
-    tally: Arc<Tally>,
+    tally: Arc<RelayCounters>,
     losses: LogLimit,
 }
 
 impl Pipe {
     /// An end that has said and heard nothing.
-    pub fn new(socket: PassedFd, incoming: Incoming, tally: Arc<Tally>) -> Self {
+    pub fn new(socket: PassedFd, incoming: Incoming, tally: Arc<RelayCounters>) -> Self {
         Self {
             socket,
             buffer: Vec::new(),
@@ -230,7 +230,7 @@ impl Pipe {
                 Err(error) => return Err(error.into()),
             };
             match message {
-                Message::Piece(piece) => {
+                Message::SampleFragment(piece) => {
                     if let Some(sample) = self.incoming.piece(piece)? {
                         self.arrived.entry(sample.channel).or_default().push_back(sample);
                     }
@@ -249,7 +249,7 @@ impl Pipe {
     pub fn write<'a>(
         &mut self,
         find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
-        mut lost: impl FnMut(&Gid, Loss),
+        mut lost: impl FnMut(&Gid, LossReport),
     ) -> Vec<Credit> {
         self.blocked = false;
         let mut credits = Vec::new();
@@ -261,7 +261,7 @@ impl Pipe {
                     0 => {}
                     samples => {
                         let first = !self.begun.contains(channel);
-                        lost(gid, Loss::Before { samples, first });
+                        lost(gid, LossReport::Before { samples, first });
                     }
                 }
                 self.begun.insert(*channel);
@@ -277,7 +277,7 @@ impl Pipe {
                     }
                     Err(error) => {
                         last = self.written.get(channel).map_or(0, |before| before.last);
-                        lost(gid, Loss::Unwritten);
+                        lost(gid, LossReport::Unwritten);
                         if let Some(samples) = self.losses.count(Instant::now()) {
                             tracing::error!(%gid, %error, samples, "relayed samples are lost");
                         }
@@ -287,18 +287,20 @@ impl Pipe {
                     && let Some(mut credit) = self.incoming.done(&sample)
                 {
                     // What is written is in this process's memory only, where others carry it on.
-                    if let Some(over) = remote_writer.handed_over().filter(|over| *over < last) {
+                    if let Some(over) = remote_writer.delivered_up_to().filter(|over| *over < last)
+                    {
                         credit.done = Some(over);
                         self.written
-                            .insert(*channel, OnTheirWay { said: over, last, then: number });
+                            .insert(*channel, Unacknowledged { said: over, last, then: number });
                     }
                     credits.push(credit);
                 }
             }
         }
         self.arrived.retain(|_, samples| !samples.is_empty());
-        self.written.retain(|channel, OnTheirWay { said, last, then }| {
-            let over = find(&channel.writer).and_then(RemoteWriter::handed_over).unwrap_or(*last);
+        self.written.retain(|channel, Unacknowledged { said, last, then }| {
+            let over =
+                find(&channel.writer).and_then(RemoteWriter::delivered_up_to).unwrap_or(*last);
             let now = if over < *last { over } else { over.max(*then) };
             if now > *said {
                 *said = now;
@@ -318,7 +320,7 @@ impl Pipe {
     /// send. Whether anything was sent.
     pub fn send(
         &mut self,
-        mut take: impl FnMut(&Channel) -> Option<Departing<Sample>>,
+        mut take: impl FnMut(&Channel) -> Option<OutboundSample<Sample>>,
     ) -> Result<bool, End> {
         if self.gone {
             return Ok(false);
@@ -339,7 +341,7 @@ impl Pipe {
                     self.outgoing.next_piece()
                 });
                 let Some(piece) = piece else { break };
-                self.say(&Message::Piece(piece))?;
+                self.say(&Message::SampleFragment(piece))?;
             }
             let Some(packet) = self.waiting.front() else { break };
             match socket::send(&self.socket, packet, &[]) {

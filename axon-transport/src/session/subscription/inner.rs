@@ -7,7 +7,7 @@ use axon_shm::{
     internal::{Grant, Lane, Location, Look, Peer, Reader, ReaderOptions, holds},
 };
 
-use super::slots::Slots;
+use super::matched_readers::MatchedReaders;
 use crate::{
     graph::{Endpoint, EndpointKind},
     ids::Gid,
@@ -43,7 +43,7 @@ pub(in crate::session) struct SubscriptionInner {
     pub(in crate::session) role: EndpointRole,
     pub(in crate::session) events: EndpointEvents,
     stands_for: Mutex<Vec<Gid>>,
-    slots: Mutex<Slots>,
+    matched_readers: Mutex<MatchedReaders>,
     arrived: Callback,
     /// Whether the control thread listens for its callback.
     listens: Mutex<bool>,
@@ -73,7 +73,7 @@ impl SubscriptionInner {
     fn reading(endpoint: Endpoint, role: EndpointRole, qos: Qos) -> Self {
         let events = EndpointEvents::of_subscription(&endpoint.qos);
         let keeps_all = endpoint.kind == EndpointKind::Subscription && holds(&qos);
-        let slots = Slots::new(keeps_all);
+        let matched_readers = MatchedReaders::new(keeps_all);
         Self {
             endpoint,
             qos,
@@ -85,7 +85,7 @@ impl SubscriptionInner {
             role,
             events,
             stands_for: Mutex::default(),
-            slots: slots.into(),
+            matched_readers: matched_readers.into(),
             arrived: Callback::default(),
             listens: Mutex::new(false),
             wakers: Wakers::default(),
@@ -110,10 +110,10 @@ impl SubscriptionInner {
         let listens = callback.is_some();
         self.arrived.replace(callback, |untold| {
             self.listen(listens, shared)?;
-            let mut slots = self.lock();
+            let mut matched_readers = self.lock();
             // Of those that nobody was told of some may have been taken, or lost.
-            let untold = untold + slots.new_arrivals();
-            Ok(untold.min(slots.unread(self.shared_depth)))
+            let untold = untold + matched_readers.new_arrivals();
+            Ok(untold.min(matched_readers.unread(self.shared_depth)))
         })
     }
 
@@ -172,8 +172,8 @@ impl SubscriptionInner {
     /// What became of its matches since it was asked last.
     pub(in crate::session) fn rematch(&self) -> Changes {
         let leases = || {
-            let slots = self.lock();
-            let active = slots.slots.iter().filter(|slot| slot.counts());
+            let matched_readers = self.lock();
+            let active = matched_readers.matched_readers.iter().filter(|slot| slot.counts());
             active.map(|slot| (slot.reader.writer(), slot.lease)).collect()
         };
         self.events.writers(leases, clock::monotonic())
@@ -183,8 +183,8 @@ impl SubscriptionInner {
     /// something happened.
     pub(in crate::session) fn look_at_time(&self, now: u64) -> (Option<u64>, bool) {
         let times: Vec<_> = {
-            let slots = self.lock();
-            let active = slots.slots.iter().filter(|slot| slot.counts());
+            let matched_readers = self.lock();
+            let active = matched_readers.matched_readers.iter().filter(|slot| slot.counts());
             let times = active.map(|slot| {
                 let mut times = slot.reader.times();
                 times.sampled = times.sampled.filter(|sampled| *sampled >= slot.since);
@@ -197,25 +197,25 @@ impl SubscriptionInner {
 
     /// The same for who must not wait for a thread that takes.
     pub(in crate::session) fn may_have_losses(&self) -> bool {
-        let Ok(mut slots) = self.slots.try_lock() else { return true };
-        slots.slots.iter_mut().for_each(|slot| drop(slot.reader.peek()));
-        slots.losses() != slots.lost_before
+        let Ok(mut matched_readers) = self.matched_readers.try_lock() else { return true };
+        matched_readers.matched_readers.iter_mut().for_each(|slot| drop(slot.reader.peek()));
+        matched_readers.losses() != matched_readers.lost_before
     }
 
     /// Counts what would be found lost by taking now.
     pub(in crate::session) fn look_for_losses(&self) {
-        let mut slots = self.lock();
-        for slot in &mut slots.slots {
+        let mut matched_readers = self.lock();
+        for slot in &mut matched_readers.matched_readers {
             // What is wrong with its memory, the next take says.
             let _ = slot.reader.peek();
         }
-        let lost = slots.new_losses();
-        drop(slots);
+        let lost = matched_readers.new_losses();
+        drop(matched_readers);
         self.events.lost(lost);
     }
 
-    pub(in crate::session) fn lock(&self) -> MutexGuard<'_, Slots> {
-        lock(&self.slots)
+    pub(in crate::session) fn lock(&self) -> MutexGuard<'_, MatchedReaders> {
+        lock(&self.matched_readers)
     }
 
     pub(in crate::session) fn set_stands_for(&self, gids: Vec<Gid>) {
@@ -229,8 +229,8 @@ impl SubscriptionInner {
 
 impl Look for SubscriptionInner {
     fn ready(&self) -> bool {
-        match self.slots.try_lock() {
-            Ok(slots) => slots.has_data(),
+        match self.matched_readers.try_lock() {
+            Ok(matched_readers) => matched_readers.has_data(),
             // Whoever has it may be about to add something.
             Err(_) => true,
         }

@@ -1,7 +1,7 @@
 //! A reader of every matched publisher of a topic, merged into one stream.
 
 mod inner;
-mod slots;
+mod matched_readers;
 mod taking;
 mod trusted;
 
@@ -16,11 +16,11 @@ use axon_shm::{
     internal::{Look, Reader},
 };
 
-use self::slots::Slots;
+use self::matched_readers::MatchedReaders;
 pub use self::trusted::TrustedSubscription;
 pub(super) use self::{
     inner::SubscriptionInner,
-    slots::{Accept, Asking, Numbers},
+    matched_readers::{Accept, Asking, Numbers},
 };
 use super::{
     OnNew, RecvError, Session, SessionError, clock,
@@ -132,8 +132,13 @@ impl Subscription {
         if self.session.is_forked() {
             return Vec::new();
         }
-        let slots = self.inner.lock();
-        slots.slots.iter().filter(|s| s.counts()).map(|s| s.reader.writer()).collect()
+        let matched_readers = self.inner.lock();
+        matched_readers
+            .matched_readers
+            .iter()
+            .filter(|s| s.counts())
+            .map(|s| s.reader.writer())
+            .collect()
     }
 
     /// Waits until it receives from at least `count` publishers; whether it does.
@@ -228,7 +233,7 @@ pub(super) fn take_from<T>(
     shared: &Shared,
     take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
 ) -> Option<(MessageInfo, T)> {
-    take_with(inner, shared, |slots| slots.take(take, inner))
+    take_with(inner, shared, |matched_readers| matched_readers.take(take, inner))
 }
 
 /// The same as bytes, into `out`, which it replaces.
@@ -250,26 +255,27 @@ pub(super) fn take_of(
     let mut out = Vec::new();
     let take = |reader: &mut Reader| Ok(reader.take(&mut out)?.map(|taken| (taken.meta, ())));
     let shared = session.shared();
-    let (info, ()) = take_with(inner, shared, |slots| slots.take_of(writer, take, inner))?;
+    let (info, ()) =
+        take_with(inner, shared, |matched_readers| matched_readers.take_of(writer, take, inner))?;
     Some((info, out))
 }
 
 fn take_with<T>(
     inner: &SubscriptionInner,
     shared: &Shared,
-    take: impl FnOnce(&mut Slots) -> Option<(MessageInfo, T)>,
+    take: impl FnOnce(&mut MatchedReaders) -> Option<(MessageInfo, T)>,
 ) -> Option<(MessageInfo, T)> {
     // A thread of the parent may have held the lock when this process was forked.
     if shared.segment.is_forked() {
         tracing::error!("an endpoint of the parent process is used after fork");
         return None;
     }
-    let mut slots = inner.lock();
-    let taken = take(&mut slots);
-    let gone = std::mem::take(&mut slots.discarded);
-    let lost = slots.new_losses();
-    let again = if taken.is_none() { slots.look_again() } else { None };
-    drop(slots);
+    let mut matched_readers = inner.lock();
+    let taken = take(&mut matched_readers);
+    let gone = std::mem::take(&mut matched_readers.discarded);
+    let lost = matched_readers.new_losses();
+    let again = if taken.is_none() { matched_readers.look_again() } else { None };
+    drop(matched_readers);
     if let Some(again) = again {
         shared.look_again(again);
     }

@@ -7,30 +7,30 @@ use axon_shm::{Meta, Sample, TakeError, internal::Reader};
 use super::{
     Lifetime, MessageInfo,
     inner::SubscriptionInner,
-    slots::{Slot, Slots},
+    matched_readers::{MatchedReader, MatchedReaders},
 };
 use crate::{graph::Endpoint, ids::Gid, session::clock, wire::session::EndpointRole};
 
 /// Samples that one take passes over because they were taken before.
 const REPEATS: usize = 64;
 
-impl Slots {
+impl MatchedReaders {
     pub(super) fn take<T>(
         &mut self,
         mut take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
         of: &SubscriptionInner,
     ) -> Option<(MessageInfo, T)> {
-        self.slots.iter_mut().for_each(|slot| slot.overtaken = false);
+        self.matched_readers.iter_mut().for_each(|slot| slot.overtaken = false);
         // A writer that repeats itself without end must not keep the lock: callers come back as
         // long as there is something to take.
         for _ in 0..REPEATS {
-            if let Some(depth) = of.shared_depth.filter(|_| self.slots.len() > 1) {
+            if let Some(depth) = of.shared_depth.filter(|_| self.matched_readers.len() > 1) {
                 self.skip_to_depth(depth.into());
             }
-            self.forgo_missing();
+            self.skip_missing();
             let Some(index) = self.oldest() else {
                 // What was skipped may have been the last of a writer that is gone.
-                if self.slots.iter().any(|slot| slot.over) {
+                if self.matched_readers.iter().any(|slot| slot.over) {
                     self.sweep();
                 }
                 return None;
@@ -49,10 +49,10 @@ impl Slots {
         mut take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
         of: &SubscriptionInner,
     ) -> Option<(MessageInfo, T)> {
-        self.slots.iter_mut().for_each(|slot| slot.overtaken = false);
+        self.matched_readers.iter_mut().for_each(|slot| slot.overtaken = false);
         for _ in 0..REPEATS {
-            self.forgo_missing();
-            let next = self.slots.iter().position(|slot| {
+            self.skip_missing();
+            let next = self.matched_readers.iter().position(|slot| {
                 !slot.overtaken && slot.reader.writer() == *writer && slot.reader.has_data()
             });
             let Some(index) = next else {
@@ -68,7 +68,7 @@ impl Slots {
 
     /// The publishers that have a lease, and when each was last alive, by the monotonic clock.
     pub(in crate::session) fn assertions(&self) -> Vec<(Gid, u64)> {
-        let there = self.slots.iter().filter(|slot| !slot.over);
+        let there = self.matched_readers.iter().filter(|slot| !slot.over);
         let times = there.map(|slot| (slot.reader.writer(), slot.reader.times()));
         let leased = times.filter(|(_, times)| times.lease.is_some());
         leased.filter_map(|(gid, times)| Some((gid, times.asserted?))).collect()
@@ -76,7 +76,7 @@ impl Slots {
 
     /// The writers of which there is something to take.
     pub(in crate::session) fn with_data(&self) -> impl Iterator<Item = Gid> {
-        let some = self.slots.iter().filter(|slot| slot.reader.has_data());
+        let some = self.matched_readers.iter().filter(|slot| slot.reader.has_data());
         some.map(|slot| slot.reader.writer())
     }
 
@@ -88,7 +88,7 @@ impl Slots {
         of: &SubscriptionInner,
     ) -> Option<(MessageInfo, T)> {
         let endpoint = &of.endpoint;
-        let slot = &mut self.slots[index];
+        let slot = &mut self.matched_readers[index];
         let writer = slot.reader.writer();
         let (meta, taken) = match take(&mut slot.reader) {
             Ok(Some(taken)) => taken,
@@ -152,10 +152,10 @@ impl Slots {
         of: &SubscriptionInner,
     ) -> Option<(Sample, u64)> {
         let endpoint = &of.endpoint;
-        let index = self.slots.iter().position(|slot| {
+        let index = self.matched_readers.iter().position(|slot| {
             slot.reader.writer() == *writer && (!slot.over || slot.reader.has_data())
         })?;
-        let slot = &mut self.slots[index];
+        let slot = &mut self.matched_readers[index];
         match slot.reader.take_sample() {
             Ok(sample) => {
                 if let Some(sample) = &sample {
@@ -181,7 +181,7 @@ impl Slots {
 
     /// Samples of `writer` up to this number are done with.
     pub(in crate::session) fn finish_of(&mut self, writer: &Gid, sequence: u64) {
-        let of = self.slots.iter_mut().filter(|slot| slot.reader.writer() == *writer);
+        let of = self.matched_readers.iter_mut().filter(|slot| slot.reader.writer() == *writer);
         let mut over = false;
         for slot in of {
             slot.reader.finish(sequence);
@@ -194,7 +194,7 @@ impl Slots {
 
     /// So many samples of `writer` do not get where they are to go.
     pub(in crate::session) fn give_up_of(&mut self, writer: &Gid, samples: u64) {
-        let slot = self.slots.iter_mut().find(|slot| slot.reader.writer() == *writer);
+        let slot = self.matched_readers.iter_mut().find(|slot| slot.reader.writer() == *writer);
         if let Some(slot) = slot {
             slot.reader.give_up(samples);
         }
@@ -203,15 +203,15 @@ impl Slots {
     /// What was taken and is not done with is to be taken once more; and all of the `history` that
     /// stands, if so.
     pub(in crate::session) fn take_back(&mut self, history: bool) {
-        for Slot { reader, .. } in &mut self.slots {
-            if history { reader.begin_anew() } else { reader.take_back() }
+        for MatchedReader { reader, .. } in &mut self.matched_readers {
+            if history { reader.rewind() } else { reader.take_back() }
         }
     }
 
     /// Samples that are not done with, by writer.
     pub(in crate::session) fn undone(&self) -> HashMap<Gid, u64> {
         let mut undone = HashMap::new();
-        for slot in &self.slots {
+        for slot in &self.matched_readers {
             let samples = slot.reader.undone();
             if samples > 0 {
                 *undone.entry(slot.reader.writer()).or_default() += samples;
@@ -221,13 +221,15 @@ impl Slots {
     }
 
     pub(in crate::session) fn has_from(&self, writer: &Gid) -> bool {
-        self.slots.iter().any(|slot| slot.reader.writer() == *writer && slot.reader.has_data())
+        self.matched_readers
+            .iter()
+            .any(|slot| slot.reader.writer() == *writer && slot.reader.has_data())
     }
 
     /// Samples of `writer` that were lost before they came to its ring here. What is missing before the
     /// `first` in that ring is seen by its number, where the subscription knows an earlier one.
     pub(in crate::session) fn lost_elsewhere(&mut self, writer: &Gid, samples: u64, first: bool) {
-        let mut of = self.slots.iter().filter(|slot| slot.reader.writer() == *writer);
+        let mut of = self.matched_readers.iter().filter(|slot| slot.reader.writer() == *writer);
         if of.any(|slot| !(slot.over || first && slot.resumed)) {
             self.lost = self.lost.saturating_add(samples);
         }
@@ -238,20 +240,22 @@ impl Slots {
     /// says: taken the other way round it would count as repeated.
     fn oldest(&mut self) -> Option<usize> {
         let index = self.oldest_by_time()?;
-        let writer = self.slots[index].reader.writer();
-        let earlier = self.slots[..index].iter().position(|slot| {
+        let writer = self.matched_readers[index].reader.writer();
+        let earlier = self.matched_readers[..index].iter().position(|slot| {
             slot.over && !slot.overtaken && slot.reader.writer() == writer && slot.reader.has_data()
         });
         Some(earlier.unwrap_or(index))
     }
 
     fn oldest_by_time(&mut self) -> Option<usize> {
-        if let [slot] = self.slots.as_slice() {
+        if let [slot] = self.matched_readers.as_slice() {
             // Taking finds out whether it has anything, which most often it has.
             return (!slot.overtaken).then_some(0);
         }
         let mut oldest = None;
-        for (index, slot) in self.slots.iter_mut().enumerate().filter(|(_, s)| !s.overtaken) {
+        for (index, slot) in
+            self.matched_readers.iter_mut().enumerate().filter(|(_, s)| !s.overtaken)
+        {
             // A writer whose memory is corrupt is chosen, so that taking finds out.
             let stamp = match slot.reader.peek() {
                 Ok(Some(meta)) => meta.source_timestamp,
@@ -267,10 +271,10 @@ impl Slots {
 
     /// A subscription's KEEP_LAST(depth) counts over all publishers together.
     fn skip_to_depth(&mut self, depth: u64) {
-        let mut unread: u64 = self.slots.iter().map(|s| s.reader.unread()).sum();
+        let mut unread: u64 = self.matched_readers.iter().map(|s| s.reader.unread()).sum();
         while unread > depth {
             let Some(index) = self.oldest() else { return };
-            if !self.slots[index].reader.skip() {
+            if !self.matched_readers[index].reader.skip() {
                 return;
             }
             unread -= 1;
@@ -279,7 +283,7 @@ impl Slots {
 
     fn discard(&mut self, index: usize, error: &TakeError, endpoint: &Endpoint) {
         tracing::error!(topic = endpoint.topic, %error, "a publisher's memory is not usable");
-        let slot = self.slots.remove(index);
+        let slot = self.matched_readers.remove(index);
         self.retire(&slot);
         if !slot.over {
             self.discarded.push(slot.reader.writer());
@@ -323,17 +327,17 @@ mod tests {
         let session = SessionSegment::create(SessionId::random()).unwrap();
         let [writer, gid] = [1, 2].map(|number| Gid::new(session.id(), number));
         let (publisher, reader) = reading(&session, writer, gid);
-        let mut slots = Slots::default();
-        slots.add(reader, None, Numbers::None);
+        let mut matched_readers = MatchedReaders::default();
+        matched_readers.add(reader, None, Numbers::None);
         publisher.publish_next(0, b"sample").unwrap();
-        assert!(slots.has_data());
+        assert!(matched_readers.has_data());
         let inner = subscription(gid);
         let none = |_: &mut Reader| Err::<Option<(Meta, ())>, _>(TakeError::NoMemory { len: 6 });
-        assert!(slots.take(none, &inner).is_none() && !slots.has_data());
+        assert!(matched_readers.take(none, &inner).is_none() && !matched_readers.has_data());
         // Whoever asks nevertheless gets it, if it can be had.
         let mut out = Vec::new();
         let take = |reader: &mut Reader| Ok(reader.take(&mut out)?.map(|taken| (taken.meta, ())));
-        assert!(slots.take(take, &inner).is_some());
+        assert!(matched_readers.take(take, &inner).is_some());
         assert_eq!(out, b"sample");
     }
 
@@ -342,11 +346,12 @@ mod tests {
         const FURTHEST: u64 = 1 + (1 << 32);
         let session = SessionSegment::create(SessionId::random()).unwrap();
         let [gid, writers @ ..] = [1, 2, 3].map(|number| Gid::new(session.id(), number));
-        let (mut slots, inner, mut out) = (Slots::default(), subscription(gid), Vec::new());
+        let (mut matched_readers, inner, mut out) =
+            (MatchedReaders::default(), subscription(gid), Vec::new());
         let mut publishers = Vec::new();
         for writer in writers {
             let (publisher, reader) = reading(&session, writer, gid);
-            slots.add(reader, None, Numbers::All);
+            matched_readers.add(reader, None, Numbers::All);
             let say = |sequence| {
                 publisher.publish(Meta { sequence, source_timestamp: 0, published: 0 }, b"sample")
             };
@@ -358,18 +363,18 @@ mod tests {
             publishers.push(publisher);
         }
         let mut numbers = Vec::new();
-        let mut take = |slots: &mut Slots| {
+        let mut take = |matched_readers: &mut MatchedReaders| {
             let take = |reader: &mut Reader| Ok(reader.take(&mut out)?.map(|t| (t.meta, ())));
-            slots.take(take, &inner)
+            matched_readers.take(take, &inner)
         };
-        while let Some((info, ())) = take(&mut slots) {
+        while let Some((info, ())) = take(&mut matched_readers) {
             numbers.push(info.sequence);
         }
         numbers.sort_unstable();
         let lost = 2 * (FURTHEST - 2);
         assert_eq!(numbers, [1, 1, FURTHEST, FURTHEST]);
-        assert_eq!((slots.new_losses(), slots.losses()), (lost, lost));
-        assert!(writers.iter().all(|writer| slots.end(writer)));
-        assert_eq!((slots.new_losses(), slots.losses()), (0, lost));
+        assert_eq!((matched_readers.new_losses(), matched_readers.losses()), (lost, lost));
+        assert!(writers.iter().all(|writer| matched_readers.end(writer)));
+        assert_eq!((matched_readers.new_losses(), matched_readers.losses()), (0, lost));
     }
 }

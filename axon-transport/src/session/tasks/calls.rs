@@ -137,10 +137,12 @@ fn fail_those_without_server(
     of: &SubscriptionInner,
     woken: &mut Vec<Waker>,
 ) -> usize {
-    let slots = of.lock();
+    let matched_readers = of.lock();
     let waiting = calls.values_mut().filter(|call| call.outcome.is_none());
     let mut failed = 0;
-    for call in waiting.filter(|call| !call.servers.iter().any(|server| slots.reads(server))) {
+    for call in
+        waiting.filter(|call| !call.servers.iter().any(|server| matched_readers.reads(server)))
+    {
         call.outcome = Some(Err(ServerGone));
         woken.extend(call.waker.take());
         failed += 1;

@@ -28,26 +28,26 @@ fn a_sample_is_handed_over_when_its_reader_was_sent_the_memory_that_it_is_in() {
     let taker = Taker::new();
     let _taking = taker.attach(&publisher, None, &daemon);
     publisher.publish(b"small").unwrap();
-    assert_eq!(publisher.handed_over(), 0, "its grant may not have been sent");
+    assert_eq!(publisher.delivered_up_to(), 0, "its grant may not have been sent");
     let (granted, _) = hear_fence(&daemon);
     assert_eq!(granted.writer, publisher.gid());
     daemon.say(Message::Fence(granted), &[]);
-    until("it was", || publisher.handed_over() == 1);
+    until("it was", || publisher.delivered_up_to() == 1);
 
     publisher.publish(&[1; LARGE]).unwrap();
-    assert_eq!(publisher.handed_over(), 1);
+    assert_eq!(publisher.delivered_up_to(), 1);
     let (opened, told) = hear_fence(&daemon);
     assert!(told && opened.number > granted.number);
     daemon.say(Message::Fence(granted), &[]);
     // An answer wakes those who wait for room, and they ask once more.
     publisher.publish(b"small").unwrap();
     thread::sleep(Duration::from_millis(20));
-    assert_eq!(publisher.handed_over(), 1, "that was an answer to something else");
+    assert_eq!(publisher.delivered_up_to(), 1, "that was an answer to something else");
     daemon.say(Message::Fence(opened), &[]);
-    until("both were", || publisher.handed_over() == 3);
+    until("both were", || publisher.delivered_up_to() == 3);
     // Its memory is known by now.
     publisher.publish(&[2; LARGE / 2]).unwrap();
-    assert_eq!(publisher.handed_over(), 4);
+    assert_eq!(publisher.delivered_up_to(), 4);
 }
 
 #[test]
@@ -57,24 +57,24 @@ fn a_question_counts_for_what_it_was_asked_though_more_is_to_be_sent_since() {
     let publisher = session.create_publisher(spec).unwrap();
     let _first = Taker::new().attach(&publisher, None, &daemon);
     publisher.publish(b"x").unwrap();
-    assert_eq!(publisher.handed_over(), 0);
+    assert_eq!(publisher.delivered_up_to(), 0);
     let (asked, _) = hear_fence(&daemon);
     let _second = Taker::new().attach(&publisher, None, &daemon);
     publisher.publish(b"x").unwrap();
-    assert_eq!(publisher.handed_over(), 0, "the grant of the second may not have been sent");
+    assert_eq!(publisher.delivered_up_to(), 0, "the grant of the second may not have been sent");
     daemon.say(Message::Fence(asked), &[]);
-    until("the first sample was", || publisher.handed_over() == 1);
+    until("the first sample was", || publisher.delivered_up_to() == 1);
     let (again, _) = hear_fence(&daemon);
     assert!(again.number > asked.number);
     daemon.say(Message::Fence(again), &[]);
-    until("the second was", || publisher.handed_over() == 2);
+    until("the second was", || publisher.delivered_up_to() == 2);
     // A daemon that tells everything anew may have dropped its answer.
     publisher.publish(&[1; LARGE]).unwrap();
-    assert_eq!(publisher.handed_over(), 2);
+    assert_eq!(publisher.delivered_up_to(), 2);
     hear_fence(&daemon);
     daemon.tell_all(Vec::new());
     until("it is asked once more", || {
-        let _ = publisher.handed_over();
+        let _ = publisher.delivered_up_to();
         let heard = socket::receive(&daemon.socket, &mut Vec::new());
         heard.is_ok_and(|heard| matches!(heard.message, Message::Fence(_)))
     });

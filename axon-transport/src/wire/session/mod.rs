@@ -14,7 +14,7 @@ use minicbor::{Decode, Encode};
 use serde::Serialize;
 
 use crate::{
-    graph::{Endpoint, Reach},
+    graph::{Endpoint, EndpointRange},
     ids::{DaemonId, Gid, SessionId},
     qos::Qos,
 };
@@ -187,7 +187,7 @@ pub struct GraphItem {
     pub daemon: Option<DaemonId>,
     /// To the gateway, of an endpoint of this host: how far its session is discovered.
     #[n(2)]
-    pub reach: Option<Reach>,
+    pub reach: Option<EndpointRange>,
 }
 
 /// A change of the graph, or a part of the whole of it.
@@ -341,13 +341,13 @@ pub struct Matched {
 /// A part of a sample that crosses a relay.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
-pub struct Piece {
+pub struct SampleFragment {
     /// Its publisher, client or server.
     #[n(0)]
     pub publisher: Gid,
     /// In the first part.
     #[n(1)]
-    pub head: Option<Head>,
+    pub head: Option<SampleHeader>,
     /// The bytes that follow those of the part before.
     #[cbor(n(2), with = "minicbor::bytes")]
     pub bytes: Vec<u8>,
@@ -358,7 +358,7 @@ pub struct Piece {
 
 /// What goes with a sample that crosses a relay.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
-pub struct Head {
+pub struct SampleHeader {
     /// Its length in bytes.
     #[n(0)]
     pub length: u32,
@@ -475,7 +475,7 @@ pub enum Message {
     GivenUp(GivenUp),
     Fence(Fence),
     Matched(Matched),
-    Piece(Piece),
+    SampleFragment(SampleFragment),
     Credit(Credit),
     Asserted(Asserted),
     /// A type that this version does not know; to be skipped.

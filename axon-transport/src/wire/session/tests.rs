@@ -104,9 +104,9 @@ fn messages() -> Vec<Message> {
         Message::Leaving(Leaving { gid: writer, leaving: true }),
         Message::Fence(Fence { writer, number: 12 }),
         Message::Matched(Matched { gid: reader, others: vec![writer] }),
-        Message::Piece(Piece {
+        Message::SampleFragment(SampleFragment {
             publisher: writer,
-            head: Some(Head {
+            head: Some(SampleHeader {
                 length: 3,
                 sequence: 7,
                 source_timestamp: -1,
@@ -116,7 +116,7 @@ fn messages() -> Vec<Message> {
             bytes: vec![1, 2],
             client: None,
         }),
-        Message::Piece(Piece {
+        Message::SampleFragment(SampleFragment {
             publisher: writer,
             head: None,
             bytes: vec![3],

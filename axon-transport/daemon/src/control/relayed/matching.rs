@@ -22,7 +22,7 @@ use axon_transport::{
             merge::{Merge, Taken},
             relayed::{
                 MAX_MATCHED,
-                flow::{Channel, Departing},
+                flow::{Channel, OutboundSample},
                 pipe::End,
             },
         },
@@ -30,7 +30,7 @@ use axon_transport::{
     },
 };
 
-use super::Served;
+use super::RelayedSession;
 
 /// Partners of a session's endpoints that are gone and whose last samples are kept until it takes them.
 /// Those samples are in memory of a process that may have ended.
@@ -55,7 +55,7 @@ impl Source {
     }
 }
 
-impl Served {
+impl RelayedSession {
     /// Tells what changed in the graph.
     pub(super) fn tell_graph(&mut self) -> Result<(), End> {
         let now = self.session.graph();
@@ -207,7 +207,7 @@ impl Served {
             source.samples.set(readers);
             if history > source.history {
                 source.history = history;
-                source.samples.begin_anew();
+                source.samples.rewind();
             }
         }
     }
@@ -236,8 +236,8 @@ pub(super) fn take(
     source: &mut Source,
     subscriptions: &BTreeMap<Gid, Subscription>,
     writer: &Gid,
-) -> Option<Departing<Sample>> {
-    source.samples.next(|reader| taken(subscriptions, reader, writer)).map(Departing::from)
+) -> Option<OutboundSample<Sample>> {
+    source.samples.next(|reader| taken(subscriptions, reader, writer)).map(OutboundSample::from)
 }
 
 fn taken(

@@ -24,7 +24,7 @@ use axon_transport::{
     internal::{
         events::Alive,
         log_limit::LogLimit,
-        registry::Tally,
+        registry::RelayCounters,
         session::{
             RemoteWriter,
             daemon::socket::{self, SocketError},
@@ -33,7 +33,7 @@ use axon_transport::{
                 calls::{self, Calls},
                 change_signal::ChangeSignal,
                 flow::{Channel, Incoming},
-                pipe::{End, Loss, Pipe},
+                pipe::{End, LossReport, Pipe},
             },
         },
         wire::session::{
@@ -47,7 +47,7 @@ use rustix::io::Errno;
 use self::matching::{Source, take};
 
 /// What a relay is started with.
-pub(crate) struct Far {
+pub(crate) struct DaemonRelay {
     /// The session's connection.
     pub(crate) socket: PassedFd,
     /// One end of a socket pair, at whose other end the control plane serves.
@@ -56,11 +56,11 @@ pub(crate) struct Far {
     /// The session's name and id.
     pub(crate) name: String,
     pub(crate) id: SessionId,
-    pub(crate) tally: Arc<Tally>,
+    pub(crate) tally: Arc<RelayCounters>,
     pub(crate) pool: Arc<Pool>,
 }
 
-impl Far {
+impl DaemonRelay {
     /// Serves the session on a thread of its own, until it or the control plane ends it.
     pub(crate) fn start(self) -> std::io::Result<()> {
         std::thread::Builder::new().name("axon-relay".into()).spawn(move || self.run()).map(drop)
@@ -68,7 +68,7 @@ impl Far {
 
     fn run(self) {
         let id = self.id;
-        match self.open().and_then(Served::serve) {
+        match self.open().and_then(RelayedSession::serve) {
             Ok(()) => {}
             Err(End::Socket(SocketError::Closed)) => {
                 tracing::debug!(session = %id, "a relayed session ended");
@@ -77,7 +77,7 @@ impl Far {
         }
     }
 
-    fn open(self) -> Result<Served, End> {
+    fn open(self) -> Result<RelayedSession, End> {
         let Self { socket, inside, config, name, id, tally, pool } = self;
         let say = |message: Message| {
             let packet = message.encode().map_err(|e| End::Other(e.to_string()))?;
@@ -109,7 +109,7 @@ impl Far {
         let welcome = Welcome { protocol: PROTOCOL, daemon, pid, ranges: Some(true) };
         say(Message::Welcome(welcome))?;
         let incoming = Incoming::new(config.max_message, pool);
-        Ok(Served {
+        Ok(RelayedSession {
             id,
             pipe: Pipe::new(socket, incoming, Arc::clone(&tally)),
             tally,
@@ -155,10 +155,10 @@ impl Unreached {
 }
 
 /// A session that is served.
-struct Served {
+struct RelayedSession {
     id: SessionId,
     pipe: Pipe,
-    tally: Arc<Tally>,
+    tally: Arc<RelayCounters>,
     /// Its publishers, clients and servers.
     writers: BTreeMap<Gid, RemoteWriter>,
     subscriptions: BTreeMap<Gid, Subscription>,
@@ -188,7 +188,7 @@ struct Served {
     session: Session,
 }
 
-impl Served {
+impl RelayedSession {
     fn serve(mut self) -> Result<(), End> {
         let mut begun = false;
         loop {
@@ -219,7 +219,7 @@ impl Served {
             }
             self.write()?;
             if self.pipe.is_over() {
-                return self.wind_up();
+                return self.drain();
             }
             let writers = &self.writers;
             let find = |gid: &Gid| writers.get(gid);
@@ -252,7 +252,7 @@ impl Served {
             |gid| writers.get(gid),
             |gid, loss| {
                 tally.lost(loss.samples());
-                if let Loss::Unwritten = loss {
+                if let LossReport::Unwritten = loss {
                     unreached.entry(*gid).or_default().unwritten += 1;
                 }
             },
@@ -273,7 +273,7 @@ impl Served {
 
     /// The process is gone, and was heard to the end: what it wrote goes to readers that make room for it
     /// soon, while nobody counts it any more.
-    fn wind_up(mut self) -> Result<(), End> {
+    fn drain(mut self) -> Result<(), End> {
         let end = Instant::now() + LINGER;
         self.subscriptions.clear();
         self.nodes.clear();

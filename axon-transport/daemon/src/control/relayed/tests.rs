@@ -46,7 +46,7 @@ fn hear<T>(socket: &OwnedFd, mut pick: impl FnMut(Message) -> Option<T>) -> T {
 fn what_the_control_plane_refuses_its_process_is_told_of() {
     let ([process, far], [control, inside]) = (pair(), pair());
     let id = SessionId::random();
-    let relay = Far {
+    let relay = DaemonRelay {
         socket: PassedFd::connection(far),
         inside,
         config: Arc::new(Config::resolve([], None, &OsFiles).unwrap()),

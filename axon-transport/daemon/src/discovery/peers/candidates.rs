@@ -9,13 +9,13 @@ const MOST: usize = 8;
 
 /// What this host's addresses say about others.
 #[derive(Debug, Default)]
-pub(super) struct Here {
+pub(super) struct LocalAddresses {
     /// `AXON_BIND_ADDRS`; empty means every address.
     pub(super) bind: Vec<IpAddr>,
     pub(super) interfaces: Vec<Interface>,
 }
 
-impl Here {
+impl LocalAddresses {
     /// Whether `address` leads to this host.
     pub(super) fn is_local(&self, address: IpAddr) -> bool {
         address.is_loopback() || self.interfaces.iter().any(|i| i.address == address)
@@ -100,7 +100,7 @@ fn is_unicast(address: IpAddr) -> bool {
 mod tests {
     use super::*;
 
-    fn here(bind: &[&str]) -> Here {
+    fn here(bind: &[&str]) -> LocalAddresses {
         let interface = |name: &str, address: &str, prefix| Interface {
             name: name.to_owned(),
             index: 1,
@@ -109,7 +109,7 @@ mod tests {
             broadcast: None,
             loopback: name == "lo",
         };
-        Here {
+        LocalAddresses {
             bind: bind.iter().map(|a| a.parse().unwrap()).collect(),
             interfaces: vec![
                 interface("lo", "127.0.0.1", 8),

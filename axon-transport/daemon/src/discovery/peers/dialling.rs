@@ -6,30 +6,30 @@ use axon_shm::ids::DaemonId;
 use rand::RngExt;
 
 use super::{Peers, record::Record};
-use crate::discovery::{Action, Standing};
+use crate::discovery::{Action, AddressConfidence};
 
 /// Most dials at once.
 pub(super) const MOST_IN_FLIGHT: usize = 8;
 /// Most dials at once to addresses of this standing and of worse ones together: the rest is kept
 /// for better ones.
-const MOST_DOWN_FROM: [usize; Standing::COUNT] = [MOST_IN_FLIGHT, 7, 6, 5, 3];
+const MOST_DOWN_FROM: [usize; AddressConfidence::COUNT] = [MOST_IN_FLIGHT, 7, 6, 5, 3];
 /// Most dials at once of one standing to one host.
 const MOST_OF_A_HOST: usize = 2;
 /// The side that is to dial first gets this much of a start.
 const SECOND_DIAL: Duration = Duration::from_millis(300);
 
 /// The dials that are under way.
-pub(super) struct InFlight(Vec<(Standing, Option<IpAddr>)>);
+pub(super) struct InFlight(Vec<(AddressConfidence, Option<IpAddr>)>);
 
 impl InFlight {
     /// Whether one more of this standing, to this host, is within the bounds.
-    pub(super) fn has_room(&self, standing: Standing, host: Option<IpAddr>) -> bool {
+    pub(super) fn has_room(&self, standing: AddressConfidence, host: Option<IpAddr>) -> bool {
         let down_from = |best: usize| self.0.iter().filter(|(s, _)| *s as usize >= best).count();
         let within = (0..=standing as usize).all(|best| down_from(best) < MOST_DOWN_FROM[best]);
         within && self.of_host(standing, host) < MOST_OF_A_HOST
     }
 
-    fn of_host(&self, standing: Standing, host: Option<IpAddr>) -> usize {
+    fn of_host(&self, standing: AddressConfidence, host: Option<IpAddr>) -> usize {
         self.0.iter().filter(|other| **other == (standing, host)).count()
     }
 }
@@ -57,7 +57,7 @@ impl Peers {
 
     pub(super) fn schedule_dial(&mut self, now: Duration, daemon: DaemonId) {
         let mut due = false;
-        for standing in Standing::ALL {
+        for standing in AddressConfidence::ALL {
             let Some(record) = self.records.get(&daemon) else { return };
             if !self.wants_dial(record, standing) {
                 continue;
@@ -83,7 +83,7 @@ impl Peers {
         let mut in_flight = self.dials_in_flight();
         let mut due = Vec::new();
         for (id, record) in &self.records {
-            for standing in Standing::ALL {
+            for standing in AddressConfidence::ALL {
                 let dial = &record.dials[standing as usize];
                 let Some(at) = dial.due.filter(|at| *at <= now) else { continue };
                 if self.wants_dial(record, standing) {
@@ -108,10 +108,10 @@ impl Peers {
     }
 
     /// Whether a dial is under way now.
-    fn dial(&mut self, now: Duration, daemon: DaemonId, standing: Standing) -> bool {
+    fn dial(&mut self, now: Duration, daemon: DaemonId, standing: AddressConfidence) -> bool {
         let jitter = self.random.random_range(0.5..1.5);
         let Some(record) = self.records.get_mut(&daemon) else { return false };
-        let listed = record.listed && standing <= Standing::Known;
+        let listed = record.listed && standing <= AddressConfidence::Known;
         let Some(first) = record.of(standing).next() else { return false };
         let (sae, advertised) = (first.sae.clone(), first.advertised.clone());
         let same = record.of(standing).filter(|source| source.sae == sae);

@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, net::IpAddr, time::Duration};
 use axon_shm::ids::DaemonId;
 
 use super::{MOST_UNAUTHENTICATED, Peers, record::Record};
-use crate::discovery::{Action, Standing};
+use crate::discovery::{Action, AddressConfidence};
 
 /// Most records of daemons of which nothing is known but a beacon; the rest is kept for others.
 const MOST_HEARD: usize = 192;
@@ -22,7 +22,7 @@ impl Peers {
             return;
         }
         let unlinked = || self.records.values().filter(|record| !record.linked);
-        let of_heard = |record: &Record| record.standing() == Standing::Heard;
+        let of_heard = |record: &Record| record.standing() == AddressConfidence::Heard;
         let (all, heard) = (unlinked().count(), unlinked().filter(|r| of_heard(r)).count());
         let full = all >= MOST_UNAUTHENTICATED;
         let crowded = heard >= MOST_HEARD && !self.knows(from);

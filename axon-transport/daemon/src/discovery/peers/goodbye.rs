@@ -83,7 +83,10 @@ fn an_address_of_several_is_asked_before_a_goodbye_from_there_counts() {
     peers.handle_datagram(secs(3.6), address, Arrival::Quic, &echo);
     peers.handle_timeout(secs(8.0));
     let record = &peers.records[&HIGHER];
-    assert_eq!((record.sources[0].address, record.standing()), (address, Standing::Answered));
+    assert_eq!(
+        (record.sources[0].address, record.standing()),
+        (address, AddressConfidence::Answered)
+    );
 }
 
 #[test]

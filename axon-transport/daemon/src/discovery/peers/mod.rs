@@ -37,11 +37,11 @@ use self::dialling::MOST_IN_FLIGHT;
 pub(crate) use self::local::Local;
 use self::{
     bucket::Bucket,
-    candidates::Here,
+    candidates::LocalAddresses,
     probing::Probes,
     record::{Record, Source},
 };
-use super::{Action, Interface, Standing};
+use super::{Action, AddressConfidence, Interface};
 
 /// Most records of peers that are not linked.
 const MOST_UNAUTHENTICATED: usize = 256;
@@ -70,7 +70,7 @@ pub(crate) enum Output {
 #[derive(Debug)]
 pub(crate) struct Peers {
     local: Local,
-    here: Here,
+    here: LocalAddresses,
     records: BTreeMap<DaemonId, Record>,
     /// Addresses of listed peers, with a port where one was given.
     listed: Vec<(IpAddr, Option<u16>)>,
@@ -100,7 +100,7 @@ pub(crate) struct Peers {
 impl Peers {
     /// A daemon that knows nobody. It is silent until its [QUIC port](Self::set_port) is known.
     pub(crate) fn new(local: Local, seed: u64) -> Self {
-        let here = Here { bind: local.bind.clone(), interfaces: Vec::new() };
+        let here = LocalAddresses { bind: local.bind.clone(), interfaces: Vec::new() };
         Self {
             local,
             here,
@@ -136,7 +136,7 @@ impl Peers {
         let in_flight = self.dials_in_flight();
         let lifetime = self.lifetime();
         let of_records = self.records.values().flat_map(|record| {
-            let dials = Standing::ALL.into_iter().flat_map(|standing| {
+            let dials = AddressConfidence::ALL.into_iter().flat_map(|standing| {
                 let dial = &record.dials[standing as usize];
                 let host = record.of(standing).next().map(|source| source.address.ip());
                 let may_dial =
@@ -279,7 +279,7 @@ impl Peers {
         &mut self,
         now: Duration,
         daemon: DaemonId,
-        standing: Standing,
+        standing: AddressConfidence,
     ) {
         let jitter = self.random.random_range(0.5..1.5);
         let record = self.records.get_mut(&daemon);
@@ -296,7 +296,7 @@ impl Peers {
     }
 
     /// Whether a dial would make sense, and the range lets this daemon look for the peer.
-    fn wants_dial(&self, record: &Record, standing: Standing) -> bool {
+    fn wants_dial(&self, record: &Record, standing: AddressConfidence) -> bool {
         let in_range = match self.local.range {
             DiscoveryRange::Off => false,
             DiscoveryRange::Localhost => record.near || record.listed,

@@ -14,7 +14,7 @@ use rand::RngExt;
 
 use super::{Peers, record::Source};
 use crate::{
-    discovery::{Standing, quic_ports},
+    discovery::{AddressConfidence, quic_ports},
     wire::beacon::Datagram,
 };
 
@@ -30,7 +30,7 @@ pub(super) const ANSWER_WITHIN: Duration = Duration::from_secs(3);
 
 /// A probe whose answer is awaited.
 #[derive(Debug)]
-pub(super) struct Asked {
+pub(super) struct ProbeInFlight {
     at: Duration,
     nonce: [u8; 8],
     daemon: DaemonId,
@@ -42,7 +42,7 @@ pub(super) struct Asked {
 }
 
 /// The probes whose answers are awaited, the oldest first.
-pub(super) type Probes = VecDeque<Asked>;
+pub(super) type Probes = VecDeque<ProbeInFlight>;
 
 impl Peers {
     /// Asks the addresses of this standing that were not asked since their latest beacon.
@@ -50,7 +50,7 @@ impl Peers {
         &mut self,
         now: Duration,
         daemon: DaemonId,
-        standing: Standing,
+        standing: AddressConfidence,
     ) {
         let Some(record) = self.records.get_mut(&daemon) else { return };
         let may_ask = |source: &Source| !source.asked && !source.answered && !source.proven;
@@ -76,12 +76,13 @@ impl Peers {
     fn ask(&mut self, now: Duration, daemon: DaemonId, source: Source) -> bool {
         let to = source.address;
         // The answer says which daemon is there, whichever was asked for.
-        let recent = |asked: &Asked| asked.source.address == to && asked.at + ASKED_AGAIN > now;
+        let recent =
+            |asked: &ProbeInFlight| asked.source.address == to && asked.at + ASKED_AGAIN > now;
         if let Some(recent) = self.asked.iter().rfind(|asked| recent(asked)) {
             return !recent.answered;
         }
         let counts = !(source.known && self.expects(to));
-        let of_host = |asked: &&Asked| {
+        let of_host = |asked: &&ProbeInFlight| {
             asked.counts && !asked.answered && asked.source.address.ip() == to.ip()
         };
         if counts && self.asked.iter().filter(of_host).count() >= MOST_ASKED_OF_A_HOST {
@@ -95,7 +96,14 @@ impl Peers {
         if self.asked.len() >= MOST_ASKED {
             self.asked.pop_front();
         }
-        self.asked.push_back(Asked { at: now, nonce, daemon, source, counts, answered: false });
+        self.asked.push_back(ProbeInFlight {
+            at: now,
+            nonce,
+            daemon,
+            source,
+            counts,
+            answered: false,
+        });
         self.send(to, Datagram::Probe { daemon: self.local.daemon, nonce }.encode());
         true
     }
@@ -127,7 +135,8 @@ impl Peers {
     /// nothing but a beacon are asked, and forgotten if nobody answers there in time.
     pub(super) fn leaves_host(&mut self, now: Duration, daemon: DaemonId, host: IpAddr) {
         let Some(record) = self.records.get(&daemon) else { return };
-        let heard = record.of(Standing::Heard).filter(|source| source.address.ip() == host);
+        let heard =
+            record.of(AddressConfidence::Heard).filter(|source| source.address.ip() == host);
         for source in heard.cloned().collect::<Vec<_>>() {
             let address = source.address;
             if source.leaving.is_none() && self.ask(now, daemon, source) {
@@ -147,7 +156,7 @@ impl Peers {
         daemon: DaemonId,
         nonce: [u8; 8],
     ) {
-        let awaited = |asked: &&mut Asked| {
+        let awaited = |asked: &&mut ProbeInFlight| {
             !asked.answered && asked.nonce == nonce && asked.source.address == from
         };
         let Some(asked) = self.asked.iter_mut().find(awaited) else { return };

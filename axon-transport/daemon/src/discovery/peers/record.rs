@@ -6,7 +6,7 @@ use std::{
 };
 
 use super::probing::ANSWER_WITHIN;
-use crate::discovery::Standing;
+use crate::discovery::AddressConfidence;
 
 /// Most addresses of one standing that are kept of a peer.
 const MOST_SOURCES: usize = 4;
@@ -39,13 +39,13 @@ pub(super) struct Source {
 }
 
 impl Source {
-    pub(super) fn standing(&self) -> Standing {
+    pub(super) fn standing(&self) -> AddressConfidence {
         match (self.proven, self.known, self.answered) {
-            (true, _, _) => Standing::Proven,
-            (_, true, true) => Standing::KnownAnswered,
-            (_, true, false) => Standing::Known,
-            (_, false, true) => Standing::Answered,
-            (_, false, false) => Standing::Heard,
+            (true, _, _) => AddressConfidence::Proven,
+            (_, true, true) => AddressConfidence::KnownAnswered,
+            (_, true, false) => AddressConfidence::Known,
+            (_, false, true) => AddressConfidence::Answered,
+            (_, false, false) => AddressConfidence::Heard,
         }
     }
 }
@@ -75,7 +75,7 @@ pub(super) struct Record {
     pub(super) stayed: Option<Duration>,
     pub(super) linked: bool,
     /// One for each standing: a dial to an address where nobody is holds up no better one.
-    pub(super) dials: [Dial; Standing::COUNT],
+    pub(super) dials: [Dial; AddressConfidence::COUNT],
 }
 
 /// When to dial.
@@ -127,7 +127,7 @@ impl Record {
     /// Puts the sources in order again. Those of one standing push out no others.
     pub(super) fn order(&mut self) {
         self.sources.sort_by_key(Source::standing);
-        let mut kept = [0; Standing::COUNT];
+        let mut kept = [0; AddressConfidence::COUNT];
         self.sources.retain(|source| {
             let kept = &mut kept[source.standing() as usize];
             *kept += 1;
@@ -138,11 +138,12 @@ impl Record {
     /// Those that were left, as a goodbye said and nobody there denied in time.
     pub(super) fn forget_unanswered(&mut self, now: Duration) {
         let left = |source: &Source| source.leaving.is_some_and(|at| at + ANSWER_WITHIN <= now);
-        self.sources.retain(|source| !left(source) || source.standing() != Standing::Heard);
+        self.sources
+            .retain(|source| !left(source) || source.standing() != AddressConfidence::Heard);
     }
 
     /// The addresses of this standing, the latest first.
-    pub(super) fn of(&self, standing: Standing) -> impl Iterator<Item = &Source> {
+    pub(super) fn of(&self, standing: AddressConfidence) -> impl Iterator<Item = &Source> {
         self.sources.iter().filter(move |source| source.standing() == standing)
     }
 
@@ -157,12 +158,12 @@ impl Record {
     }
 
     /// The best standing of any of its addresses.
-    pub(super) fn standing(&self) -> Standing {
-        self.sources.first().map_or(Standing::Heard, Source::standing)
+    pub(super) fn standing(&self) -> AddressConfidence {
+        self.sources.first().map_or(AddressConfidence::Heard, Source::standing)
     }
 
     /// Whether a dial to addresses of this standing would make sense.
-    pub(super) fn wants_dial(&self, standing: Standing) -> bool {
+    pub(super) fn wants_dial(&self, standing: AddressConfidence) -> bool {
         let Some(source) = self.of(standing).next() else { return false };
         let elsewhere =
             |dial: &Dial| dial.in_flight.is_none() || dial.first != Some(source.address);
@@ -173,20 +174,20 @@ impl Record {
             && self.dials.iter().all(elsewhere)
     }
 
-    pub(super) fn in_flight(&self) -> impl Iterator<Item = (Standing, &Dial)> {
-        let dials = Standing::ALL.into_iter().zip(&self.dials);
+    pub(super) fn in_flight(&self) -> impl Iterator<Item = (AddressConfidence, &Dial)> {
+        let dials = AddressConfidence::ALL.into_iter().zip(&self.dials);
         dials.filter(|(_, dial)| dial.in_flight.is_some())
     }
 
     /// Schedules a dial to addresses of this standing unless one is scheduled.
-    pub(super) fn schedule(&mut self, standing: Standing, at: Duration) {
+    pub(super) fn schedule(&mut self, standing: AddressConfidence, at: Duration) {
         if self.dials[standing as usize].due.is_none() {
             self.dials[standing as usize].due = Some(self.spaced(standing, at));
         }
     }
 
     /// The dial failed; `jitter` is between 0.5 and 1.5.
-    pub(super) fn failed(&mut self, standing: Standing, now: Duration, jitter: f64) {
+    pub(super) fn failed(&mut self, standing: AddressConfidence, now: Duration, jitter: f64) {
         let dial = &mut self.dials[standing as usize];
         dial.in_flight = None;
         let doubled = BACKOFF_FIRST.saturating_mul(1 << dial.failures.min(16));
@@ -195,7 +196,7 @@ impl Record {
         self.dials[standing as usize].due = Some(self.spaced(standing, at));
     }
 
-    fn spaced(&self, standing: Standing, at: Duration) -> Duration {
+    fn spaced(&self, standing: AddressConfidence, at: Duration) -> Duration {
         let own = self.dials[standing as usize].last;
         let address = self.of(standing).next().map(|source| source.address);
         let same = self.dials.iter().filter(|dial| dial.first.is_some() && dial.first == address);

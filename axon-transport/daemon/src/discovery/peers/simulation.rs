@@ -30,7 +30,7 @@ struct Host {
 
 enum What {
     Datagram { to: usize, from: SocketAddr, arrival: Arrival, bytes: Vec<u8> },
-    DialEnds { from: usize, to: usize, standing: Standing },
+    DialEnds { from: usize, to: usize, standing: AddressConfidence },
 }
 
 struct Subnet {
@@ -197,7 +197,7 @@ impl Subnet {
         }
     }
 
-    fn dial_ends(&mut self, from: usize, to: usize, standing: Standing) {
+    fn dial_ends(&mut self, from: usize, to: usize, standing: AddressConfidence) {
         let now = self.now;
         self.hosts[from].in_flight.remove(&to);
         if self.random.random_bool(self.loss) {

@@ -105,7 +105,9 @@ pub(super) fn hear(peers: &mut Peers, now: f64, beacon: Beacon) {
 
 /// Whatever dial to the peer is under way fails.
 pub(super) fn fail(peers: &mut Peers, now: Duration, daemon: DaemonId) {
-    Standing::ALL.into_iter().for_each(|standing| peers.handle_dial_failed(now, daemon, standing));
+    AddressConfidence::ALL
+        .into_iter()
+        .for_each(|standing| peers.handle_dial_failed(now, daemon, standing));
 }
 
 fn mismatches(peers: &mut Peers) -> Vec<Mismatch> {

@@ -16,7 +16,7 @@ use std::{
 
 use axon_shm::ids::{DaemonId, Gid};
 use axon_tls::Negotiated;
-use axon_transport::{Session, graph::Endpoint, internal::graph::Reach};
+use axon_transport::{Session, graph::Endpoint, internal::graph::EndpointRange};
 use tokio::{
     sync::{Notify, mpsc, watch},
     task::JoinHandle,
@@ -173,7 +173,7 @@ pub(super) struct Summary {
 }
 
 /// The endpoints of applications on this host, and how far their sessions are discovered.
-pub(super) type Local = BTreeMap<Gid, (Arc<Endpoint>, Reach)>;
+pub(super) type Local = BTreeMap<Gid, (Arc<Endpoint>, EndpointRange)>;
 
 /// The hub's state.
 pub(super) struct Hub {

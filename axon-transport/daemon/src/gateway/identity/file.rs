@@ -2,11 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::files::Demands;
+use crate::files::FileRules;
 use axon_tls::identity::TrustFile;
 use zeroize::Zeroizing;
 
-pub(super) use crate::files::Stamp;
+pub(super) use crate::files::FileStamp;
 use crate::gateway::GatewayError;
 
 /// A file that a setting names.
@@ -14,7 +14,7 @@ use crate::gateway::GatewayError;
 pub(super) struct Named {
     pub(super) variable: &'static str,
     pub(super) path: PathBuf,
-    demands: Demands,
+    demands: FileRules,
 }
 
 impl Named {
@@ -25,9 +25,9 @@ impl Named {
     pub(super) fn new(variable: &'static str, path: Option<&Path>) -> Result<Self, GatewayError> {
         let path = path.ok_or(GatewayError::Missing(variable))?.to_owned();
         let demands = match variable {
-            "AXON_CLASSIC_KEY" => Demands::KEY,
-            "AXON_CLASSIC_TRUST" => Demands::public(TrustFile::MAX_LEN as u64),
-            _ => Demands::CERTIFICATES,
+            "AXON_CLASSIC_KEY" => FileRules::KEY,
+            "AXON_CLASSIC_TRUST" => FileRules::public(TrustFile::MAX_LEN as u64),
+            _ => FileRules::CERTIFICATES,
         };
         Ok(Self { variable, path, demands })
     }
@@ -42,7 +42,7 @@ impl Named {
     }
 
     /// How the file is now; why it cannot be used if that shows from outside.
-    pub(super) fn stamp(&self) -> Result<Stamp, String> {
+    pub(super) fn stamp(&self) -> Result<FileStamp, String> {
         self.demands.stamp(&self.path)
     }
 

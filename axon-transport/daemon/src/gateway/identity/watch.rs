@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use super::file::{Named, Stamp};
+use super::file::{FileStamp, Named};
 
 /// Somebody who writes for so long is not waited for.
 const LONGEST_WRITE: Duration = Duration::from_secs(5);
@@ -32,7 +32,7 @@ pub(super) struct Watch {
 }
 
 /// A file, or why there is none to use.
-type Seen = Result<Stamp, String>;
+type Seen = Result<FileStamp, String>;
 
 impl Watch {
     /// Files that are about to be read for the first time.

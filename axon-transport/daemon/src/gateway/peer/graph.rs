@@ -9,7 +9,7 @@ use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::{
     config::DiscoveryRange,
     graph::{Endpoint, EndpointKind},
-    internal::graph::{LIMITS, RemoteEndpoint, Toward},
+    internal::graph::{LIMITS, RangeToHost, RemoteEndpoint},
 };
 
 use super::owners::Proven;
@@ -99,7 +99,7 @@ impl Remote {
         let toward = |gid: &Gid| {
             let near = localhost.contains(gid);
             let range = if near { DiscoveryRange::Localhost } else { DiscoveryRange::Subnet };
-            Toward { range, lists: listing.contains(gid) }
+            RangeToHost { range, lists: listing.contains(gid) }
         };
         if before == 0 {
             self.gathered = Some(BTreeMap::new());
@@ -156,7 +156,12 @@ impl Remote {
     }
 
     /// One more endpoint of a whole graph. One that is known already takes nothing more.
-    fn gather(&mut self, gathered: &mut BTreeMap<Gid, Held>, endpoint: Endpoint, toward: Toward) {
+    fn gather(
+        &mut self,
+        gathered: &mut BTreeMap<Gid, Held>,
+        endpoint: Endpoint,
+        toward: RangeToHost,
+    ) {
         let gid = endpoint.gid;
         let held = match self.all.get(&gid) {
             _ if !self.proven.owns(&gid) => {
@@ -216,7 +221,7 @@ impl Remote {
         });
     }
 
-    fn hold(&mut self, endpoint: Endpoint, toward: Toward, beside: usize) -> Option<Held> {
+    fn hold(&mut self, endpoint: Endpoint, toward: RangeToHost, beside: usize) -> Option<Held> {
         let bytes = endpoint.bytes();
         if beside < LIMITS.endpoints
             && let Some(charge) = self.account.graph.charge(bytes)

@@ -19,7 +19,7 @@ use axon_transport::{
     graph::{Endpoint, EndpointKind},
     internal::{
         events::Alive,
-        graph::{RemoteEndpoint, Toward},
+        graph::{RangeToHost, RemoteEndpoint},
     },
     status::LinkStatus,
 };
@@ -303,7 +303,7 @@ impl Peer {
         let last = parts.len() - 1;
         for (index, part) in parts.into_iter().enumerate() {
             self.sent_version += 1;
-            let named = |is: fn(&Toward) -> bool| {
+            let named = |is: fn(&RangeToHost) -> bool| {
                 let gids = part.iter().filter(|e| is(&e.toward)).map(|e| e.endpoint.gid);
                 Some(gids.collect::<Vec<_>>()).filter(|gids| !gids.is_empty())
             };

@@ -19,8 +19,8 @@ use tokio::sync::Notify;
 
 use super::{
     Completion,
-    limits::{Buckets, IN_FLIGHT, KEPT, PER_SOURCE, Source, Unproven},
-    memory::{Fingerprint, Memory, fingerprint},
+    limits::{Buckets, IN_FLIGHT, KEPT, PER_SOURCE, ProofBackoff, Source},
+    seen_set::{Fingerprint, SeenSet, fingerprint},
 };
 use crate::keys::{
     Clock,
@@ -49,7 +49,7 @@ const LOST: Duration = Duration::from_secs(60);
 
 /// What a look-up does about a key that is not at hand.
 #[derive(Clone, Copy)]
-enum Miss {
+enum CacheMiss {
     /// Has the KME asked for it, within the limits of its source.
     Fetch,
     /// Nothing.
@@ -119,16 +119,16 @@ struct State {
     /// Calls that are queued or in flight.
     pending: Vec<Pending>,
     /// Unknown to the KME once.
-    missed: Memory<Fingerprint>,
+    missed: SeenSet<Fingerprint>,
     /// Unknown to it again.
-    unknown: Memory<Fingerprint>,
+    unknown: SeenSet<Fingerprint>,
     /// Keys whose last call failed, with the reason.
     failed: VecDeque<(Fingerprint, String)>,
-    spent: Memory<Fingerprint>,
+    spent: SeenSet<Fingerprint>,
     buckets: Buckets,
-    unproven: Unproven,
-    known_sources: Memory<Source>,
-    known_saes: Memory<String>,
+    unproven: ProofBackoff,
+    known_sources: SeenSet<Source>,
+    known_saes: SeenSet<String>,
 }
 
 struct Cached {
@@ -163,14 +163,14 @@ impl Acceptor {
             state: Mutex::new(State {
                 cached: HashMap::new(),
                 pending: Vec::new(),
-                missed: Memory::new(UNKNOWN),
-                unknown: Memory::new(UNKNOWN),
+                missed: SeenSet::new(UNKNOWN),
+                unknown: SeenSet::new(UNKNOWN),
                 failed: VecDeque::new(),
-                spent: Memory::new(SPENT),
+                spent: SeenSet::new(SPENT),
                 buckets: Buckets::default(),
-                unproven: Unproven::default(),
-                known_sources: Memory::new(KNOWN),
-                known_saes: Memory::new(KNOWN),
+                unproven: ProofBackoff::default(),
+                known_sources: SeenSet::new(KNOWN),
+                known_saes: SeenSet::new(KNOWN),
             }),
             queued: Notify::new(),
         }))
@@ -185,7 +185,7 @@ impl Acceptor {
     /// Looks up, and fetches within the same bounds, a key that a probe names ahead of its
     /// handshake.
     pub fn prefetch(&self, source: IpAddr, identity: &[u8]) -> Lookup {
-        self.look_up(source, identity, Miss::Fetch).0
+        self.look_up(source, identity, CacheMiss::Fetch).0
     }
 
     /// A handshake under `identity` is complete: the key is spent, and erased.
@@ -299,7 +299,12 @@ impl Acceptor {
         self.state().expire(now);
     }
 
-    fn look_up(&self, source: IpAddr, identity: &[u8], miss: Miss) -> (Lookup, Option<Arc<Psk>>) {
+    fn look_up(
+        &self,
+        source: IpAddr,
+        identity: &[u8],
+        miss: CacheMiss,
+    ) -> (Lookup, Option<Arc<Psk>>) {
         let inner = &*self.0;
         let Ok(parsed) = PskIdentity::parse(identity) else { return (Lookup::Malformed, None) };
         let Ok(key_id) = KeyId::new(parsed.key_id()) else { return (Lookup::Malformed, None) };
@@ -330,7 +335,7 @@ impl Acceptor {
         if state.pending.iter().any(|p| p.identity == parsed) {
             return (Lookup::Fetching, None);
         }
-        if matches!(miss, Miss::Leave) {
+        if matches!(miss, CacheMiss::Leave) {
             return (Lookup::UnknownKeyId, None);
         }
         let seen = fingerprint(identity);
@@ -454,13 +459,13 @@ impl Resolver {
 
 impl PskResolver for Resolver {
     fn resolve(&self, identity: &[u8]) -> Option<Arc<Psk>> {
-        let (lookup, psk) = self.acceptor.look_up(self.source, identity, Miss::Fetch);
+        let (lookup, psk) = self.acceptor.look_up(self.source, identity, CacheMiss::Fetch);
         *self.last() = Some((lookup, PskIdentity::parse(identity).ok()));
         psk
     }
 
     fn resolve_known(&self, identity: &[u8]) -> Option<Arc<Psk>> {
-        let (lookup, psk) = self.acceptor.look_up(self.source, identity, Miss::Leave);
+        let (lookup, psk) = self.acceptor.look_up(self.source, identity, CacheMiss::Leave);
         let psk = psk?;
         *self.last() = Some((lookup, PskIdentity::parse(identity).ok()));
         Some(psk)

@@ -107,10 +107,10 @@ enum State {
     Wanted,
     /// The KME was asked.
     Asked,
-    Held(Held),
+    UnspentKey(UnspentKey),
 }
 
-struct Held {
+struct UnspentKey {
     key_id: KeyId,
     psk: Arc<Psk>,
     since: Duration,
@@ -121,7 +121,7 @@ struct Held {
     refused_for: Duration,
 }
 
-impl Drop for Held {
+impl Drop for UnspentKey {
     /// Attempts and connections keep their configuration, and with it the PSK.
     fn drop(&mut self) {
         self.psk.erase();
@@ -152,13 +152,13 @@ impl Dialler {
                 return Dial::Wait { until: Some(*not_before), why: why.clone() };
             }
             State::Empty { .. } => peer.state = State::Wanted,
-            State::Held(held) if held.not_before > now => {
+            State::UnspentKey(held) if held.not_before > now => {
                 return Dial::Wait {
                     until: Some(held.not_before),
                     why: format!("peer does not know key_ID {} yet", held.key_id),
                 };
             }
-            State::Held(held) => {
+            State::UnspentKey(held) => {
                 let psk = Arc::clone(&held.psk);
                 return Dial::Attempt(Attempt { key_id: held.key_id.clone(), psk });
             }
@@ -171,7 +171,7 @@ impl Dialler {
     pub fn succeeded(&mut self, _now: Duration, sae: &str, key_id: &KeyId) -> Completion {
         let Some(peer) = self.peers.get_mut(sae) else { return Completion::Reused };
         match &peer.state {
-            State::Held(held) if held.key_id == *key_id => {
+            State::UnspentKey(held) if held.key_id == *key_id => {
                 *peer = Peer::new();
                 Completion::First
             }
@@ -182,7 +182,7 @@ impl Dialler {
     /// The peer holds another key under `key_id` (0x133). Returns whether the key is given up.
     pub fn mismatched(&mut self, now: Duration, sae: &str, key_id: &KeyId) -> bool {
         let held = self.peers.get_mut(sae).and_then(|peer| match &mut peer.state {
-            State::Held(held) if held.key_id == *key_id => Some(held),
+            State::UnspentKey(held) if held.key_id == *key_id => Some(held),
             _ => None,
         });
         let Some(held) = held else { return false };
@@ -191,7 +191,7 @@ impl Dialler {
         self.refused(now, sae, key_id);
         if given_up
             && let Some(peer) = self.peers.get_mut(sae)
-            && matches!(peer.state, State::Held(_))
+            && matches!(peer.state, State::UnspentKey(_))
         {
             peer.failed(now, format!("peer holds another key under key_ID {key_id}"));
         }
@@ -201,7 +201,7 @@ impl Dialler {
     /// The peer refused the key `key_id`: it is unknown to it (0x173).
     pub fn refused(&mut self, now: Duration, sae: &str, key_id: &KeyId) {
         let Some(peer) = self.peers.get_mut(sae) else { return };
-        let State::Held(held) = &mut peer.state else { return };
+        let State::UnspentKey(held) = &mut peer.state else { return };
         if held.key_id != *key_id {
             return;
         }
@@ -224,7 +224,7 @@ impl Dialler {
 
     /// Nothing came back about `key_id`. It stays; silence says nothing of the key.
     pub fn silent(&mut self, _now: Duration, sae: &str, key_id: &KeyId) {
-        if let Some(Peer { state: State::Held(held), .. }) = self.peers.get_mut(sae)
+        if let Some(Peer { state: State::UnspentKey(held), .. }) = self.peers.get_mut(sae)
             && held.key_id == *key_id
         {
             held.last_refusal = None;
@@ -257,7 +257,7 @@ impl Dialler {
         };
         match derive(&key, &self.sae_id, &slave, self.cipher) {
             Ok(psk) => {
-                peer.state = State::Held(Held {
+                peer.state = State::UnspentKey(UnspentKey {
                     key_id: key.0,
                     psk: Arc::new(psk),
                     since: now,
@@ -275,7 +275,7 @@ impl Dialler {
     /// When to poll again without other cause: a key ends.
     pub fn poll_timeout(&self) -> Option<Duration> {
         let end = |p: &Peer| match &p.state {
-            State::Held(held) => Some(held.since + KEY_MAX_AGE),
+            State::UnspentKey(held) => Some(held.since + KEY_MAX_AGE),
             _ => None,
         };
         self.peers.values().filter_map(end).min()
@@ -283,7 +283,7 @@ impl Dialler {
 
     fn expire(&mut self, now: Duration) {
         for peer in self.peers.values_mut() {
-            if matches!(&peer.state, State::Held(held) if held.since + KEY_MAX_AGE <= now) {
+            if matches!(&peer.state, State::UnspentKey(held) if held.since + KEY_MAX_AGE <= now) {
                 peer.state = State::Empty { not_before: now, why: String::new() };
             }
         }

@@ -43,14 +43,14 @@ const UNPROVEN: usize = 1024;
 
 /// Failed proofs by source and SAE: each one costs a key.
 #[derive(Default)]
-pub(super) struct Unproven(HashMap<(Source, String), Tries>);
+pub(super) struct ProofBackoff(HashMap<(Source, String), FailedProofs>);
 
-struct Tries {
+struct FailedProofs {
     failed: u32,
     until: Duration,
 }
 
-impl Unproven {
+impl ProofBackoff {
     /// One more proof failed.
     pub(super) fn failed(&mut self, now: Duration, source: Source, sae: &str) {
         let key = (source, sae.to_owned());
@@ -58,7 +58,7 @@ impl Unproven {
             let first = self.0.iter().min_by_key(|(_, tries)| tries.until).map(|(k, _)| k.clone());
             first.and_then(|first| self.0.remove(&first));
         }
-        let tries = self.0.entry(key).or_insert(Tries { failed: 0, until: now });
+        let tries = self.0.entry(key).or_insert(FailedProofs { failed: 0, until: now });
         tries.failed = tries.failed.saturating_add(1);
         let over = tries.failed.saturating_sub(FAILED_PROOFS);
         if over > 0 {
@@ -156,7 +156,7 @@ mod tests {
     {
         let source = |a: &str| Source::from(a.parse::<IpAddr>().unwrap());
         let (here, there) = (source("10.0.0.1"), source("10.0.0.2"));
-        let mut unproven = Unproven::default();
+        let mut unproven = ProofBackoff::default();
         let mut now = Duration::ZERO;
         let mut pauses = Vec::new();
         for _ in 0..12 {

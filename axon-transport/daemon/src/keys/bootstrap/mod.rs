@@ -4,7 +4,7 @@
 mod acceptor;
 mod dialler;
 mod limits;
-mod memory;
+mod seen_set;
 #[cfg(test)]
 mod tests;
 

@@ -14,7 +14,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use crate::files::Demands;
+use crate::files::FileRules;
 use axon_transport::{config::QkdConfig, internal::secrets};
 use etsi_qkd014::{Client, Quirks, RetryPolicy};
 use tokio::{
@@ -240,11 +240,11 @@ fn client(config: &QkdConfig) -> Result<Client, KmeError> {
     let quirks = of_client.cloned().collect::<Vec<_>>().join(",").parse::<Quirks>();
     // In a block of its own size, which nobody has to shrink; what was read is erased.
     let sae_key =
-        Box::<[u8]>::from(read("AXON_SAE_KEY", &config.sae_key, Demands::KEY)?.as_slice());
+        Box::<[u8]>::from(read("AXON_SAE_KEY", &config.sae_key, FileRules::KEY)?.as_slice());
     let mut builder = Client::builder()
         .kme_url(&config.kme_url)
-        .ca(read("AXON_KME_CA", &config.kme_ca, Demands::CERTIFICATES)?.as_slice())
-        .sae_cert(read("AXON_SAE_CERT", &config.sae_cert, Demands::CERTIFICATES)?.as_slice())
+        .ca(read("AXON_KME_CA", &config.kme_ca, FileRules::CERTIFICATES)?.as_slice())
+        .sae_cert(read("AXON_SAE_CERT", &config.sae_cert, FileRules::CERTIFICATES)?.as_slice())
         .sae_key(sae_key)
         .connect_timeout(config.kme_connect_timeout)
         .timeout(config.kme_answer_timeout)
@@ -263,7 +263,7 @@ fn client(config: &QkdConfig) -> Result<Client, KmeError> {
 fn read(
     variable: &'static str,
     path: &Path,
-    demands: Demands,
+    demands: FileRules,
 ) -> Result<Zeroizing<Vec<u8>>, KmeError> {
     let failure = |reason| KmeError::File { variable, path: path.display().to_string(), reason };
     demands.read(path).map_err(failure)

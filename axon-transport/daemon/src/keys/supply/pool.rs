@@ -29,7 +29,7 @@ const ROUNDS_OF_MANY: u32 = 2;
 const FEW: usize = 4;
 
 /// A key that no connection knows of.
-pub(super) struct Fresh {
+pub(super) struct UnusedKey {
     pub(super) key_id: KeyId,
     pub(super) key: KmeKey,
     /// When it was asked for, where its lead time is to be measured.
@@ -40,7 +40,7 @@ pub(super) struct Fresh {
 
 /// The keys of one sending direction before they are announced.
 pub(super) struct Pool {
-    core: Core<Fresh>,
+    core: Core<UnusedKey>,
     /// Key_IDs of this direction, so that a KME that repeats itself has no key used twice.
     seen: Ledger,
     /// Rounds of refused keys that no READY made up for.
@@ -123,13 +123,17 @@ impl Pool {
     }
 
     /// Those of `keys` that may be announced, and why another may not.
-    fn usable(&self, asked: Duration, keys: Vec<(KeyId, KmeKey)>) -> (Vec<Fresh>, Option<String>) {
+    fn usable(
+        &self,
+        asked: Duration,
+        keys: Vec<(KeyId, KmeKey)>,
+    ) -> (Vec<UnusedKey>, Option<String>) {
         let mut refused = None;
         let mut usable = Vec::with_capacity(keys.len());
         for (key_id, key) in keys {
             match self.admit(&key_id) {
                 Ok(()) => {
-                    usable.push(Fresh { key_id, key, asked: Some(asked), announced: None });
+                    usable.push(UnusedKey { key_id, key, asked: Some(asked), announced: None });
                 }
                 Err(why) => refused = Some(why),
             }
@@ -152,19 +156,19 @@ impl Pool {
     }
 
     /// Takes out the key to announce next.
-    pub(super) fn take(&mut self, now: Duration) -> Option<Fresh> {
+    pub(super) fn take(&mut self, now: Duration) -> Option<UnusedKey> {
         self.core.take(now)
     }
 
     /// Takes in a key that was drawn elsewhere, as the newest.
     pub(super) fn put(&mut self, now: Duration, key_id: KeyId, key: KmeKey) {
-        self.core.put(now, Fresh { key_id, key, asked: None, announced: None });
+        self.core.put(now, UnusedKey { key_id, key, asked: None, announced: None });
     }
 
     /// Takes back a key that nothing was sealed under, to be announced before all others: the peer
     /// may hold it already. `announced`: since when the peer owes an answer for it.
     pub(super) fn put_back(&mut self, key_id: KeyId, key: KmeKey, announced: Option<Duration>) {
-        self.core.put(Duration::ZERO, Fresh { key_id, key, asked: None, announced });
+        self.core.put(Duration::ZERO, UnusedKey { key_id, key, asked: None, announced });
     }
 
     /// The peer could not use a key that was `announced` then, or did not answer for it.

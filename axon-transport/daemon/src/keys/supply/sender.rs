@@ -16,7 +16,7 @@ use super::{
     Disagreement, MAX_UNRETIRED, SupplyError, SupplyWarning,
     demand::{self, Demand},
     disagreement::Disagreements,
-    pool::{Fresh, Pool},
+    pool::{Pool, UnusedKey},
 };
 use crate::{
     keys::{
@@ -439,7 +439,7 @@ impl Sender {
         let room = MAX_UNRETIRED.saturating_sub(self.announced.len() + self.ready.len());
         let mut key_ids = Vec::new();
         while key_ids.len() < MAX_ANNOUNCED.min(room)
-            && let Some(Fresh { key_id, key, asked, announced }) = self.pool.take(now)
+            && let Some(UnusedKey { key_id, key, asked, announced }) = self.pool.take(now)
         {
             let since = announced.unwrap_or(now);
             if now.saturating_sub(since) >= ANSWER_WITHIN {

@@ -11,7 +11,7 @@ use crate::{
         types::Grant,
     },
     session::{
-        lane::{self, Standing, Tenancy},
+        lane::{self, LaneId, LaneState},
         pin_lanes::{Pinned, scan},
     },
     sync::{Ordering, Word},
@@ -25,7 +25,7 @@ fn a_lane_that_is_open_shows_the_cursor_of_its_reader() {
         let lane = zeros(LANE_WORDS);
         Word::store(&lane[CURSOR], 9, Ordering::Relaxed);
         lane::ask(&lane[..], 1);
-        let tenancy = Tenancy::grant(&lane[..], PinLimit::ALL);
+        let tenancy = LaneId::grant(&lane[..], PinLimit::ALL);
         let reader = {
             let lane = lane.clone();
             thread::spawn(move || {
@@ -34,7 +34,7 @@ fn a_lane_that_is_open_shows_the_cursor_of_its_reader() {
             })
         };
         match tenancy.cursor(&lane[..]) {
-            None => assert_ne!(tenancy.standing(&lane[..]), Standing::Left),
+            None => assert_ne!(tenancy.standing(&lane[..]), LaneState::Left),
             Some(cursor) => assert!((3..=4).contains(&cursor)),
         }
         reader.join().unwrap();
@@ -54,7 +54,7 @@ fn what_is_given_up_shows_before_the_cursor_that_passes_it() {
                 lane::advance(&lane[..], 5);
                 lane::close(&lane[..]);
                 lane::ask(&lane[..], 2);
-                let next = Tenancy::grant(&lane[..], PinLimit::ALL).generation();
+                let next = LaneId::grant(&lane[..], PinLimit::ALL).generation();
                 lane::open(&lane[..], Grant { generation: next, first: 0 });
                 lane::give_up(&lane[..], next, 7);
             })
@@ -93,7 +93,7 @@ fn a_reader_that_has_left_has_read_all() {
         };
         retire(&ring.header, 1);
         about_to_scan::<loom::sync::atomic::AtomicU64>();
-        if scan(&tenancy, &lane[..], &mut Pinned::default()) == Standing::Left {
+        if scan(&tenancy, &lane[..], &mut Pinned::default()) == LaneState::Left {
             cell.set(2);
         }
         reader.join().unwrap();
@@ -108,7 +108,7 @@ fn a_reader_that_opens_its_lane_and_pins_is_seen() {
         let ring = Ring::new();
         let lane = zeros(LANE_WORDS);
         lane::ask(&lane[..], 1);
-        let tenancy = Tenancy::grant(&lane[..], PinLimit::ALL);
+        let tenancy = LaneId::grant(&lane[..], PinLimit::ALL);
         let cell = Arc::new(Cell::new(1));
         ring.show(0);
         let reader = {

@@ -22,7 +22,7 @@ use crate::{
         protocol::{Place, Record, View, about_to_write, publish},
         types::Grant,
     },
-    session::lane::{self, Tenancy},
+    session::lane::{self, LaneId},
 };
 
 /// Payload that is read and written like any memory.
@@ -96,10 +96,10 @@ fn record(position: u64, place: Place) -> Record {
 }
 
 /// A lane that a reader has opened to take `first` next.
-fn granted(first: u64) -> (Arc<Vec<AtomicU64>>, Tenancy) {
+fn granted(first: u64) -> (Arc<Vec<AtomicU64>>, LaneId) {
     let lane = zeros(LANE_WORDS);
     lane::ask(&lane[..], 1);
-    let tenancy = Tenancy::grant(&lane[..], PinLimit::ALL);
+    let tenancy = LaneId::grant(&lane[..], PinLimit::ALL);
     lane::open(&lane[..], Grant { generation: tenancy.generation(), first });
     (lane, tenancy)
 }

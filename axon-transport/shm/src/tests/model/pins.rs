@@ -11,14 +11,14 @@ use crate::{
         protocol::{bounds, retire},
     },
     session::{
-        lane::{self, Tenancy},
+        lane::{self, LaneId},
         pin_lanes::{Pinned, scan},
     },
     tests::model::{Cell, Ring, check, granted},
 };
 
 /// Whether `position`, below the tail, may be written over.
-fn is_free(lane: &[AtomicU64], tenancy: &Tenancy, position: u64) -> bool {
+fn is_free(lane: &[AtomicU64], tenancy: &LaneId, position: u64) -> bool {
     about_to_scan::<AtomicU64>();
     let mut found = Pinned::default();
     found.refresh(|found| _ = scan(tenancy, lane, found));

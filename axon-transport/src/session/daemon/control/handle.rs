@@ -82,14 +82,14 @@ impl Control {
             }
         }
         for subscription in subscriptions {
-            let mut slots = subscription.lock();
+            let mut matched_readers = subscription.lock();
             let reader = subscription.endpoint.gid;
-            let ended = gids.iter().filter(|gid| slots.end(gid));
+            let ended = gids.iter().filter(|gid| matched_readers.end(gid));
             let ended = ended.inspect(|gid| {
                 pair_log::over(&Pair { reader, writer: **gid }, "the writer ended");
             });
             let news = ended.count();
-            drop(slots);
+            drop(matched_readers);
             if news > 0 {
                 self.reader_changed(&subscription);
             }
@@ -144,20 +144,21 @@ impl Control {
         }
         for subscription in subscriptions {
             let reader = subscription.endpoint.gid;
-            let mut slots = subscription.lock();
-            let gone = slots
+            let mut matched_readers = subscription.lock();
+            let gone = matched_readers
                 .writers()
                 .into_iter()
                 .map(|writer| Pair { reader, writer })
                 .filter(|pair| is_over(pair) && !self.is_own_pair(pair))
                 .map(|pair| pair.writer);
-            let gone = gone.collect::<Vec<_>>().into_iter().filter(|writer| slots.end(writer));
+            let gone =
+                gone.collect::<Vec<_>>().into_iter().filter(|writer| matched_readers.end(writer));
             let gone = gone.inspect(|writer| {
                 let pair = Pair { reader, writer: *writer };
                 pair_log::over(&pair, "the daemon did not repeat it to the reader");
             });
             let news = gone.count();
-            drop(slots);
+            drop(matched_readers);
             if news > 0 {
                 self.reader_changed(&subscription);
             }
@@ -332,21 +333,21 @@ impl Control {
             return;
         }
         let grant = Grant { generation, first };
-        let mut slots = subscription.lock();
-        let lane = match slots.accept(writer, grant) {
+        let mut matched_readers = subscription.lock();
+        let lane = match matched_readers.accept(writer, grant) {
             Accept::Stands => return,
             Accept::AskAgain => {
                 pair_log::forgotten(&pair);
                 // Under the same lock: the lane of before is in use still, so this is another one,
                 // and what we ask is no repetition, which the daemon would not pass on.
                 let segment = &self.shared.segment;
-                let asking = slots.lane_for(writer, || segment.allocate_lane());
-                drop(slots);
+                let asking = matched_readers.lane_for(writer, || segment.allocate_lane());
+                drop(matched_readers);
                 return self.ask_with(&subscription, writer, asking);
             }
             Accept::Map(lane) => lane,
         };
-        drop(slots);
+        drop(matched_readers);
         let mapped = peer.map_err(|e| e.to_string()).and_then(|peer| {
             let most = shared.config.max_message;
             subscription.map(writer, peer, ring, lane, grant, most).map_err(|e| e.to_string())

@@ -77,19 +77,19 @@ impl Control {
 
     /// There is memory that may have to be given back.
     pub(super) fn look_after_memory(&mut self) {
-        self.tend.get_or_insert_with(|| Instant::now() + TEND);
+        self.reclaim_idle.get_or_insert_with(|| Instant::now() + TEND);
     }
 
     /// Looks after the memory of large samples and of publishers that are gone. Memory that is given up may have to be opened anew,
     /// and only a daemon can say so to the readers: so not while there is none.
-    pub(super) fn tend(&mut self) {
+    pub(super) fn reclaim_idle(&mut self) {
         let now = Instant::now();
-        if !self.is_linked() || self.tend.is_none_or(|due| now < due) {
+        if !self.is_linked() || self.reclaim_idle.is_none_or(|due| now < due) {
             return;
         }
         let publishers: Vec<_> = self.shared.state().publishers.values().cloned().collect();
-        let more = publishers.iter().filter(|publisher| publisher.rings.tend(now)).count();
+        let more = publishers.iter().filter(|publisher| publisher.rings.reclaim_idle(now)).count();
         let more = self.shared.segment.tidy() || more > 0;
-        self.tend = more.then(|| now + TEND);
+        self.reclaim_idle = more.then(|| now + TEND);
     }
 }

@@ -29,7 +29,7 @@ use crate::{
         arrivals::Arrivals,
         error::SessionError,
         events::Source,
-        local::{House, Local},
+        local::{Local, LocalRegistry},
         peers::Peers,
         publisher::PublisherInner,
         state::{Outgoing, Shared},
@@ -64,7 +64,7 @@ pub(in crate::session) struct Control {
     /// Whether this connection has brought a whole graph already.
     told: bool,
     /// When to look after the memory of large samples, while there is any.
-    tend: Option<Instant>,
+    reclaim_idle: Option<Instant>,
     /// The segments of our memory that this connection was told of.
     segments: BTreeSet<u32>,
     /// Those that it could not be told of, for want of descriptors.
@@ -102,7 +102,7 @@ pub(in crate::session) enum Start {
     /// Whoever is at the other end of a socket, and nobody after it.
     Socket(Connected),
     /// The registry of its own process, where it meets another session.
-    House(Arc<House>),
+    LocalRegistry(Arc<LocalRegistry>),
     /// Nobody.
     Alone,
 }
@@ -131,7 +131,7 @@ impl Control {
             repeated: None,
             spoken: HashSet::new(),
             told: false,
-            tend: None,
+            reclaim_idle: None,
             segments: BTreeSet::new(),
             untold: BTreeSet::new(),
             low: BTreeSet::new(),
@@ -146,8 +146,8 @@ impl Control {
         };
         match start {
             Start::Daemon(connected) | Start::Socket(connected) => control.connected(connected),
-            Start::House(house) => {
-                control.link = Link::Local(Local::join(house, &control.shared)?);
+            Start::LocalRegistry(local_registry) => {
+                control.link = Link::Local(Local::join(local_registry, &control.shared)?);
             }
             Start::Alone => control.link = Link::Local(Local::alone(&control.shared)),
         }
@@ -170,8 +170,8 @@ impl Control {
             self.tell_graph();
             self.sleep();
             self.receive();
-            self.bury();
-            self.tend();
+            self.remove_dead();
+            self.reclaim_idle();
         }
         // What was queued last, such as ENDPOINT_GONE, is said by the end of the connection. Only
         // of memory, in which readers may find the last samples, nobody else could tell.
@@ -355,9 +355,9 @@ impl Control {
         // does not say when that passes.
         let blocked = self.is_linked() && !(self.outbox.is_empty() && self.untold.is_empty());
         let nap = blocked.then_some(Duration::from_millis(20));
-        let tend = self.tend.filter(|_| self.is_linked());
+        let reclaim_idle = self.reclaim_idle.filter(|_| self.is_linked());
         let again = self.look_again();
-        let due = tend
+        let due = reclaim_idle
             .into_iter()
             .chain(self.retry)
             .chain(self.arrivals.due())
@@ -410,7 +410,7 @@ impl Control {
     }
 
     /// Looks for peers that died.
-    fn bury(&mut self) {
+    fn remove_dead(&mut self) {
         if !self.peers.note_deaths() {
             return;
         }

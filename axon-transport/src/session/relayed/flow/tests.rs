@@ -22,19 +22,19 @@ fn incoming() -> Incoming {
     Incoming::new(MAX, Pool::new(MAX))
 }
 
-fn departing(sequence: u64, len: usize) -> Departing<Vec<u8>> {
+fn departing(sequence: u64, len: usize) -> OutboundSample<Vec<u8>> {
     let meta = Meta { sequence, source_timestamp: -(sequence as i64), published: sequence * 5 };
     let content = (0..len).map(|at| (at as u64 * 31 + sequence) as u8).collect();
-    Departing { meta, lost: sequence, content }
+    OutboundSample { meta, lost: sequence, content }
 }
 
-fn head(length: u32) -> Option<Head> {
-    Some(Head { length, sequence: 1, source_timestamp: 0, lost: 0, published: 0 })
+fn head(length: u32) -> Option<SampleHeader> {
+    Some(SampleHeader { length, sequence: 1, source_timestamp: 0, lost: 0, published: 0 })
 }
 
-fn piece(number: u8, head: Option<Head>, len: usize) -> Piece {
+fn piece(number: u8, head: Option<SampleHeader>, len: usize) -> SampleFragment {
     let name = channel(number);
-    Piece { publisher: name.writer, head, bytes: vec![0; len], client: name.client }
+    SampleFragment { publisher: name.writer, head, bytes: vec![0; len], client: name.client }
 }
 
 #[test]
@@ -44,7 +44,7 @@ fn what_no_sender_does_is_refused() {
         incoming.open(channel(1), 0);
         incoming
     };
-    let refused = |pieces: &[Piece]| {
+    let refused = |pieces: &[SampleFragment]| {
         let mut incoming = open();
         let (last, before) = pieces.split_last().unwrap();
         for piece in before {
@@ -197,7 +197,7 @@ proptest! {
         let pool = Pool::new(300_000);
         let mut incoming = Incoming::new(MAX, Arc::clone(&pool));
         let mut outgoing = Outgoing::default();
-        let mut queues: HashMap<Channel, VecDeque<Departing<Vec<u8>>>> = HashMap::new();
+        let mut queues: HashMap<Channel, VecDeque<OutboundSample<Vec<u8>>>> = HashMap::new();
         let mut expected: HashMap<Channel, VecDeque<Vec<u8>>> = HashMap::new();
         for number in 0..4 {
             outgoing.open(channel(number), 0);
@@ -208,7 +208,7 @@ proptest! {
             expected.entry(channel(*of)).or_default().push_back(sample.content.clone());
             queues.entry(channel(*of)).or_default().push_back(sample);
         }
-        let mut held: Vec<Arrived> = Vec::new();
+        let mut held: Vec<InboundSample> = Vec::new();
         let mut random = order;
         for round in 0.. {
             let all_there = queues.values().all(VecDeque::is_empty)

@@ -27,17 +27,17 @@ use super::{
     calls::{self, Calls},
     change_signal::ChangeSignal,
     flow::{Channel, Incoming},
-    pipe::{End, Loss, Pipe},
+    pipe::{End, LossReport, Pipe},
 };
 use crate::{
     events::Alive,
     graph::{Endpoint, EndpointKind, reads, writes},
     ids::{DaemonId, Gid},
-    registry::Tally,
+    registry::RelayCounters,
     session::{
         Session, SessionError, Shared,
         daemon::{connect::Connected, socket::SocketError},
-        local::House,
+        local::LocalRegistry,
     },
     wire::session::{
         Announce, Asserted, EndpointRole, GivenUp, Gone, Graph, Leaving, Message, Refused,
@@ -46,7 +46,7 @@ use crate::{
 
 /// Carries a session's samples to its daemon and back, until it is dropped.
 #[derive(Debug)]
-pub(crate) struct Near {
+pub(crate) struct SessionRelay {
     finish: Arc<AtomicBool>,
     change_signal: Arc<ChangeSignal>,
     thread: Option<JoinHandle<()>>,
@@ -56,7 +56,7 @@ pub(crate) struct Near {
 struct Common {
     /// The session.
     shared: Arc<Shared>,
-    house: Arc<House>,
+    local_registry: Arc<LocalRegistry>,
     /// Stands for the world outside.
     outside: Session,
     leader: ExternalLeader,
@@ -66,10 +66,10 @@ struct Common {
     reason: String,
 }
 
-impl Near {
+impl SessionRelay {
     pub(crate) fn start(
         shared: Arc<Shared>,
-        house: Arc<House>,
+        local_registry: Arc<LocalRegistry>,
         outside: Session,
         connected: Connected,
         reason: String,
@@ -81,7 +81,7 @@ impl Near {
         let leader = outside.segment().external_leader()?;
         let common = Common {
             shared,
-            house,
+            local_registry,
             outside,
             leader,
             change_signal: Arc::clone(&change_signal),
@@ -99,7 +99,7 @@ impl Near {
     }
 }
 
-impl Drop for Near {
+impl Drop for SessionRelay {
     fn drop(&mut self) {
         // Pairs with the loads of the relay's thread.
         self.finish.store(true, Ordering::Release);
@@ -117,7 +117,7 @@ impl Common {
         while let Some(connected) = next {
             let since = Instant::now();
             let daemon = connected.welcome.daemon;
-            let mut served = Served::new(&self, connected, std::mem::take(&mut kept));
+            let mut served = RelayConnection::new(&self, connected, std::mem::take(&mut kept));
             self.shared.set_daemon(Some(daemon));
             let why = served.serve();
             served.forget_world();
@@ -137,7 +137,7 @@ impl Common {
 }
 
 /// One connection.
-struct Served<'a> {
+struct RelayConnection<'a> {
     common: &'a Common,
     daemon: DaemonId,
     pipe: Pipe,
@@ -170,7 +170,7 @@ struct Served<'a> {
     world: HashMap<Gid, (DaemonId, Endpoint)>,
 }
 
-impl<'a> Served<'a> {
+impl<'a> RelayConnection<'a> {
     fn new(common: &'a Common, connected: Connected, relays: BTreeMap<Gid, Relay>) -> Self {
         // This end trusts its daemon with memory: there is one, and it takes what it is given credit
         // for.
@@ -179,7 +179,7 @@ impl<'a> Served<'a> {
         Self {
             common,
             daemon: connected.welcome.daemon,
-            pipe: Pipe::new(socket, incoming, Arc::new(Tally::default())),
+            pipe: Pipe::new(socket, incoming, Arc::new(RelayCounters::default())),
             own: BTreeMap::new(),
             refused: BTreeSet::new(),
             ending: BTreeMap::new(),
@@ -211,7 +211,7 @@ impl<'a> Served<'a> {
             let waits = self.held_back
                 || !self.ending.is_empty()
                 || !self.settling.is_empty()
-                || self.relays.values().any(Relay::is_kept);
+                || self.relays.values().any(Relay::is_carried_over);
             if signalled || changed || waits {
                 self.update()?;
             }
@@ -222,7 +222,7 @@ impl<'a> Served<'a> {
             let stand_ins = &self.stand_ins;
             let find = |gid: &Gid| stand_ins.get(gid).map(StandIn::remote_writer);
             let credits = self.pipe.write(find, |gid, loss| {
-                let first = matches!(loss, Loss::Before { first: true, .. });
+                let first = matches!(loss, LossReport::Before { first: true, .. });
                 common.shared.lost(gid, loss.samples(), first);
             });
             self.pipe.give_back(credits)?;
@@ -314,13 +314,13 @@ impl<'a> Served<'a> {
             }
         }
         for (daemon, (added, removed)) in changes {
-            self.common.house.outside(daemon, added, removed);
+            self.common.local_registry.outside(daemon, added, removed);
         }
     }
 
     fn forget_world(&mut self) {
         let daemons: BTreeSet<DaemonId> = self.world.values().map(|(daemon, _)| *daemon).collect();
-        daemons.iter().for_each(|daemon| self.common.house.outside_gone(daemon));
+        daemons.iter().for_each(|daemon| self.common.local_registry.outside_gone(daemon));
     }
 
     /// Brings what the daemon knows of the session, and the session of the world, up to date.
@@ -394,9 +394,9 @@ impl<'a> Served<'a> {
     /// Publishers that ended before the next daemon had all of what they left are announced to it once
     /// more.
     fn announce_ended(&mut self) -> Result<(), End> {
-        let kept = self.relays.values_mut().filter(|relay| relay.is_kept());
+        let kept = self.relays.values_mut().filter(|relay| relay.is_carried_over());
         let untold = kept.filter(|relay| !self.own.contains_key(&relay.publisher().gid));
-        let untold: Vec<_> = untold.map(Relay::revive).collect();
+        let untold: Vec<_> = untold.map(Relay::resume).collect();
         for endpoint in untold {
             self.announce(&endpoint)?;
             self.ending.insert(endpoint.gid, false);

@@ -9,7 +9,7 @@ use std::{
 
 use axon_shm::{Sample, internal::holds};
 
-use super::Served;
+use super::RelayConnection;
 use crate::{
     graph::{Endpoint, EndpointKind},
     ids::Gid,
@@ -18,7 +18,7 @@ use crate::{
         EndpointSpec, Subscription,
         relayed::{
             MAX_MATCHED,
-            flow::{Channel, Departing},
+            flow::{Channel, OutboundSample},
         },
     },
 };
@@ -57,7 +57,7 @@ impl Relay {
     }
 
     /// Its publisher, which has ended, is announced for the sake of what it left.
-    pub(super) fn revive(&mut self) -> Arc<Endpoint> {
+    pub(super) fn resume(&mut self) -> Arc<Endpoint> {
         self.revived = true;
         Arc::clone(&self.publisher)
     }
@@ -84,7 +84,7 @@ impl Relay {
     }
 
     /// Whether it comes from an earlier connection, and it is not decided yet how it goes on.
-    pub(super) fn is_kept(&self) -> bool {
+    pub(super) fn is_carried_over(&self) -> bool {
         self.awaits.is_some()
     }
 
@@ -105,15 +105,15 @@ impl Relay {
     }
 
     /// The next sample of its publisher.
-    pub(super) fn take(&mut self) -> Option<Departing<Sample>> {
-        if self.is_kept() {
+    pub(super) fn take(&mut self) -> Option<OutboundSample<Sample>> {
+        if self.is_carried_over() {
             return None;
         }
         let (content, now) = self.subscription.take_from(&self.publisher.gid)?;
         let before = std::mem::replace(&mut self.lost, now);
         // Where the publisher has granted anew, it counts from 0.
         let lost = now.checked_sub(before).unwrap_or(now);
-        Some(Departing { meta: content.meta(), lost, content })
+        Some(OutboundSample { meta: content.meta(), lost, content })
     }
 
     /// Takes back what was not confirmed, to be sent through the next daemon; whether it is kept for
@@ -145,7 +145,7 @@ pub(super) fn drop_overdue(kept: &mut BTreeMap<Gid, Relay>) {
     });
 }
 
-impl Served<'_> {
+impl RelayConnection<'_> {
     /// The relays that outlive the connection.
     pub(super) fn keep_relays(&mut self) -> BTreeMap<Gid, Relay> {
         let mut relays = std::mem::take(&mut self.relays);
@@ -161,14 +161,15 @@ impl Served<'_> {
             // History goes ahead of those who will ask for it; what is left is carried to its end.
             let history = publisher.qos.durability == Durability::TransientLocal;
             let known = self.relays.get(&gid);
-            let rest = self.ending.contains_key(&gid) && known.is_some_and(|r| !r.is_kept());
+            let rest =
+                self.ending.contains_key(&gid) && known.is_some_and(|r| !r.is_carried_over());
             if history || rest || known.is_some_and(Relay::waits) || !readers.is_empty() {
                 wanted.insert(gid, readers);
             }
         }
         self.relays.retain(|publisher, relay| {
             let is_wanted = wanted.contains_key(publisher);
-            if !is_wanted && relay.is_kept() {
+            if !is_wanted && relay.is_carried_over() {
                 relay.give_up();
             }
             is_wanted

@@ -5,7 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::Served;
+use super::RelayConnection;
 use crate::{
     graph::{Endpoint, EndpointKind, Pairing, pairing, reads},
     ids::Gid,
@@ -34,7 +34,7 @@ impl StandIn {
     }
 }
 
-impl Served<'_> {
+impl RelayConnection<'_> {
     /// The daemon says with whom an endpoint of the session is matched. What it was matched with before
     /// is let go of at once: another message may have it come back, and its channels begin anew then.
     pub(super) fn rematch(&mut self, matched: Matched) {

@@ -2,7 +2,7 @@
 
 /// What speaks for a daemon being where a beacon puts it, the best first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Standing {
+pub enum AddressConfidence {
     /// A link with this very daemon stood there.
     Proven,
     /// This host lists the address, or had a link with somebody there; and the daemon answered there.
@@ -15,7 +15,7 @@ pub enum Standing {
     Heard,
 }
 
-impl Standing {
+impl AddressConfidence {
     /// How many there are.
     pub(super) const COUNT: usize = 5;
     /// All of them, the best first.

@@ -11,10 +11,10 @@ use crate::{ids::Gid, session::peer::PeerSession};
 
 impl Writer {
     /// The number up to which all that was published has been handed to those who carry it elsewhere.
-    pub fn handed_over(&self) -> u64 {
+    pub fn delivered_up_to(&self) -> u64 {
         let mut state = self.lock();
-        let State { history, audience, .. } = &mut *state;
-        let position = audience.handed_over(history.head());
+        let State { history, reader_set, .. } = &mut *state;
+        let position = reader_set.delivered_up_to(history.head());
         state.number_before(position)
     }
 
@@ -29,18 +29,18 @@ impl Writer {
         loop {
             let (relays, absent) = {
                 let mut state = self.lock();
-                let State { history, audience, known_given_up, .. } = &mut *state;
-                audience.mark_dead(history.head());
+                let State { history, reader_set, known_given_up, .. } = &mut *state;
+                reader_set.mark_dead(history.head());
                 // In this order: what is handed over since it was given up is counted by then.
-                let handed_over = audience.handed_over(published) >= published;
-                let given_up = audience.given_up(history.head());
+                let delivered_up_to = reader_set.delivered_up_to(published) >= published;
+                let given_up = reader_set.given_up(history.head());
                 if std::mem::replace(known_given_up, given_up) != given_up {
                     return false;
                 }
-                if handed_over {
+                if delivered_up_to {
                     return true;
                 }
-                (audience.relays(), audience.absent_for())
+                (reader_set.relays(), reader_set.absent_for())
             };
             let left =
                 end.map_or(Duration::MAX, |end| end.saturating_duration_since(Instant::now()));
@@ -58,10 +58,10 @@ impl Writer {
             return 0;
         }
         let mut state = self.lock();
-        let State { history, audience, .. } = &mut *state;
+        let State { history, reader_set, .. } = &mut *state;
         let head = history.head();
-        audience.mark_dead(head);
-        head.saturating_sub(audience.handed_over(head))
+        reader_set.mark_dead(head);
+        head.saturating_sub(reader_set.delivered_up_to(head))
     }
 
     /// Samples that those who carry them elsewhere gave up.
@@ -70,25 +70,25 @@ impl Writer {
             return 0;
         }
         let mut state = self.lock();
-        let State { history, audience, .. } = &mut *state;
-        audience.given_up(history.head())
+        let State { history, reader_set, .. } = &mut *state;
+        reader_set.given_up(history.head())
     }
 
     /// One of them says that it gave up so many.
     pub fn give_up(&self, reader: Gid, samples: u64) {
         if !self.is_forked() {
             let mut state = self.lock();
-            let State { history, audience, .. } = &mut *state;
-            audience.give_up(reader, samples, history.head());
+            let State { history, reader_set, .. } = &mut *state;
+            reader_set.give_up(reader, samples, history.head());
         }
     }
 
     fn await_handover(&self, published: u64, relays: &[Arc<PeerSession>], left: Duration) {
         let ready = || {
             let mut state = self.lock();
-            let State { history, audience, known_given_up, .. } = &mut *state;
-            audience.handed_over(published) >= published
-                || audience.given_up(history.head()) != *known_given_up
+            let State { history, reader_set, known_given_up, .. } = &mut *state;
+            reader_set.delivered_up_to(published) >= published
+                || reader_set.given_up(history.head()) != *known_given_up
                 || relays.iter().any(|peer| peer.is_dead())
         };
         let pidfds: Vec<_> = relays.iter().map(|peer| peer.pidfd()).collect();

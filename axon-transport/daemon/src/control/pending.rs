@@ -15,7 +15,7 @@ const MOST: usize = 256;
 /// Those of all processes. Of too many the process goes short that has the most of them, by the one
 /// that has said nothing for longest: a process that speaks as it connects is not held up by others.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Strangers(Rc<RefCell<Waiting>>);
+pub(super) struct PendingConnections(Rc<RefCell<Waiting>>);
 
 #[derive(Debug, Default)]
 struct Waiting {
@@ -27,12 +27,12 @@ struct Waiting {
 /// One of them, until it is dropped.
 #[derive(Debug)]
 pub(super) struct Stranger {
-    strangers: Strangers,
+    strangers: PendingConnections,
     number: u64,
     replaced: Rc<Notify>,
 }
 
-impl Strangers {
+impl PendingConnections {
     /// A connection of process `pid` came. Another one may have to go for it.
     pub(super) fn add(&self, pid: u32) -> Stranger {
         let mut waiting = self.0.borrow_mut();
@@ -80,7 +80,7 @@ mod tests {
 
     #[test]
     fn the_oldest_of_the_process_with_the_most_connections_makes_room() {
-        let strangers = Strangers::default();
+        let strangers = PendingConnections::default();
         let there =
             |stranger: &Stranger| strangers.0.borrow().connections.contains_key(&stranger.number);
         let honest = strangers.add(7);
@@ -95,7 +95,7 @@ mod tests {
 
     #[test]
     fn of_many_processes_with_one_each_the_oldest_makes_room() {
-        let strangers = Strangers::default();
+        let strangers = PendingConnections::default();
         let crowd: Vec<_> = (0..2 * MOST).map(|pid| strangers.add(pid as u32)).collect();
         let there: Vec<_> = strangers.0.borrow().connections.keys().copied().collect();
         assert_eq!(there, (MOST as u64..2 * MOST as u64).collect::<Vec<_>>());

@@ -15,7 +15,7 @@ use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use super::*;
 use crate::{
     alloc::heap::Need,
-    direct::connect::{Asked, Channel, Granted, News},
+    direct::connect::{AttachRequest, Channel, Granted, News},
     os::descriptors::PassedFd,
     tests::api::{SOON, pair, publisher, together},
 };
@@ -40,7 +40,7 @@ fn untold(
         let subscriber = scope.spawn(|| Subscriber::connect(context, theirs, options, SOON));
         let channel = Channel::new(ours.as_fd(), SOON);
         let (asked, descriptors, line) = channel.await_asked().unwrap();
-        let Asked { session: id, reader, lane, qos } = asked;
+        let AttachRequest { session: id, reader, lane, qos } = asked;
         let peer = Peer::Remote(PeerSession::map(id, descriptors).unwrap());
         let info = ReaderInfo { gid: reader, lane, qos, peer, stands_for: None };
         let Grant { generation, first } = writer.attach(info).unwrap();
@@ -85,7 +85,7 @@ fn a_subscriber_whose_line_was_full_is_told_later() {
     thread::scope(|scope| {
         scope.spawn(|| {
             while !over.load(Relaxed) {
-                publisher.tend();
+                publisher.reclaim_idle();
                 thread::yield_now();
             }
         });
@@ -104,7 +104,8 @@ fn what_was_given_up_does_not_pile_up_in_a_line_that_nobody_reads() {
     let (ours, theirs) = pair();
     let (line, far) = connect::line().unwrap();
     let reader = Gid::new(there.id(), 1);
-    let asked = Asked { session: there.id(), reader, lane: lane.location(), qos: keep_last(1) };
+    let asked =
+        AttachRequest { session: there.id(), reader, lane: lane.location(), qos: keep_last(1) };
     let descriptors = there.session().descriptors().unwrap();
     Channel::new(theirs.as_fd(), SOON).ask(&asked, &descriptors, far).unwrap();
     publisher.serve(ours, SOON).unwrap();
@@ -130,7 +131,7 @@ fn what_was_given_up_does_not_pile_up_in_a_line_that_nobody_reads() {
     let start = Instant::now();
     while drain().1 > 0 {
         assert!(start.elapsed() < EVER);
-        publisher.tend();
+        publisher.reclaim_idle();
     }
 }
 
@@ -160,8 +161,8 @@ fn memory_of_a_publisher_that_is_gone_is_let_go_of() {
     let start = Instant::now();
     while seen.has_segment(gone) {
         assert!(start.elapsed() < EVER);
-        second.tend();
-        right.tend();
+        second.reclaim_idle();
+        right.reclaim_idle();
     }
     assert!(seen.has_segment(stays));
 }
@@ -211,7 +212,7 @@ fn memory_that_could_not_be_mapped_is_mapped_when_there_is_room() {
     let start = Instant::now();
     while !numbers.iter().all(|number| seen.has_segment(*number)) {
         assert!(start.elapsed() < EVER);
-        subscriber.tend();
+        subscriber.reclaim_idle();
         publisher.reap();
     }
     publisher.publish(&pattern(1, 5000)).unwrap();
@@ -306,7 +307,7 @@ fn who_asks_as_ourselves_is_served_only_if_we_ask() {
     let (ours, theirs) = pair();
     let (_line, far) = connect::line().unwrap();
     let (session, reader) = (here.id(), Gid::new(here.id(), 77));
-    let asked = Asked { session, reader, lane: lane.location(), qos: keep_last(1) };
+    let asked = AttachRequest { session, reader, lane: lane.location(), qos: keep_last(1) };
     let descriptors = here.session().descriptors().unwrap();
     Channel::new(theirs.as_fd(), SOON).ask(&asked, &descriptors, far).unwrap();
     let served = publisher.serve(ours, SOON);
@@ -358,7 +359,7 @@ fn a_forked_child_cuts_no_line_of_its_parents_and_takes_nothing_from_it() {
     // have held, and leaves by _exit.
     let child = unsafe { libc::fork() };
     if child == 0 {
-        subscriber.tend();
+        subscriber.reclaim_idle();
         let idle = !subscriber.has_data();
         drop(subscriber);
         // SAFETY: ends the process without running anything else.
@@ -371,8 +372,8 @@ fn a_forked_child_cuts_no_line_of_its_parents_and_takes_nothing_from_it() {
     assert_eq!(subscriber.recv(SOON).unwrap().expect("the news are there").len(), 5000);
     // And so is the line: more memory comes over it.
     let _more = here.session().open_samples(publisher.gid(), 2 * layout::ALIGN).unwrap();
-    publisher.tend();
-    subscriber.tend();
+    publisher.reclaim_idle();
+    subscriber.reclaim_idle();
     let peer = there.peer(here.id(), here.session().descriptors().unwrap()).unwrap();
     let numbers: Vec<u32> = here.session().segments().iter().map(|info| info.number).collect();
     assert!(peer.remote().is_some_and(|peer| numbers.iter().all(|n| peer.has_segment(*n))));

@@ -12,9 +12,9 @@ use crate::{
         window::{BURST, depth, holds, keeps_all, wanted},
     },
     session::{
-        lane::{self, LaneView, Standing, Tenancy},
+        lane::{self, LaneId, LaneState, LaneView},
         peer::{Peer, PeerSession},
-        pin_lanes::{Holder, PinLanes, Pinned},
+        pin_lanes::{PinLanes, Pinned, PinningReader},
         reader_info::ReaderInfo,
     },
     wake::Purpose,
@@ -22,7 +22,7 @@ use crate::{
 };
 
 /// The readers of one ring.
-pub(crate) struct Audience {
+pub(crate) struct ReaderSet {
     offered: Qos,
     /// Whether it waits for KEEP_LAST readers, too: for what is within their depth.
     heeds_depths: bool,
@@ -43,7 +43,7 @@ pub(crate) struct Audience {
 struct Attached {
     info: ReaderInfo,
     lane: LaneView,
-    tenancy: Tenancy,
+    tenancy: LaneId,
     grant: Grant,
     /// Carries samples to another process.
     carries: bool,
@@ -73,9 +73,9 @@ impl Attached {
         let lane = self.lane.words();
         match self.tenancy.standing(lane) {
             // It may have left between the two looks, and then it holds nothing.
-            Standing::Open => self.tenancy.cursor(lane),
-            Standing::Asked => Some(self.grant.first),
-            Standing::Left => None,
+            LaneState::Open => self.tenancy.cursor(lane),
+            LaneState::Asked => Some(self.grant.first),
+            LaneState::Left => None,
         }
     }
 
@@ -134,9 +134,9 @@ impl Attached {
     }
 }
 
-impl Audience {
+impl ReaderSet {
     pub(crate) fn new(offered: Qos, capacity: u64, pool: Pool) -> Self {
-        let mut audience = Self {
+        let mut reader_set = Self {
             offered,
             heeds_depths: false,
             capacity,
@@ -147,12 +147,12 @@ impl Audience {
             window: 0,
             given_up: 0,
         };
-        audience.changed();
-        audience
+        reader_set.changed();
+        reader_set
     }
 
     /// Holds what is within its readers' depths, too.
-    pub(crate) fn heed_depths(&mut self) {
+    pub(crate) fn enforce_depths(&mut self) {
         self.heeds_depths = true;
     }
 
@@ -303,7 +303,7 @@ impl Audience {
 
     /// A reader that pins one of `positions`, and its session where that is not our own; `None` when
     /// looking for it found that some of those that did are dead.
-    pub(crate) fn holder(&mut self, positions: &[u64]) -> Option<Holder> {
+    pub(crate) fn holder(&mut self, positions: &[u64]) -> Option<PinningReader> {
         if self.pin_lanes.sweep(|_| true) { None } else { self.pin_lanes.holder(positions) }
     }
 
@@ -351,7 +351,7 @@ impl Audience {
     }
 
     /// Samples that readers who stand for others gave up: those of them that were
-    /// [handed over](Self::handed_over) are counted if that was asked before.
+    /// [handed over](Self::delivered_up_to) are counted if that was asked before.
     pub(crate) fn given_up(&mut self, head: u64) -> u64 {
         for reader in self.readers.iter_mut().filter(|r| !r.dead && r.info.stands_for.is_some()) {
             self.given_up = self.given_up.saturating_add(reader.newly_given_up(head));
@@ -420,7 +420,7 @@ impl Audience {
     }
 
     /// Below this every reader that carries samples elsewhere is done with what it wanted.
-    pub(crate) fn handed_over(&mut self, head: u64) -> u64 {
+    pub(crate) fn delivered_up_to(&mut self, head: u64) -> u64 {
         let carriers = self.readers.iter_mut().filter(|r| !r.dead && r.is_carrier());
         let done = carriers.filter_map(|reader| reader.delivered(head));
         let absent = self.absent.oldest().map(|(position, _)| position.min(head));

@@ -29,7 +29,7 @@ const ROOM: usize = 8 << 10;
 const PAUSE: Duration = Duration::from_millis(10);
 
 /// All of a context's lines.
-pub(crate) struct Lines {
+pub(crate) struct SegmentChannels {
     session: SessionId,
     state: Mutex<State>,
     /// Somebody has not been told all. A hint: what it is about is under the locks.
@@ -38,13 +38,13 @@ pub(crate) struct Lines {
 
 #[derive(Default)]
 struct State {
-    lines: Vec<Line>,
+    lines: Vec<SegmentChannel>,
     /// When those that are behind were told last.
     tried: Option<Instant>,
 }
 
 /// A subscriber that is to be told of segments.
-struct Line {
+struct SegmentChannel {
     reader: Gid,
     writer: Gid,
     peer: Peer,
@@ -55,7 +55,7 @@ struct Line {
     ended: bool,
 }
 
-impl Line {
+impl SegmentChannel {
     /// Whether what is in the segment may concern the subscriber.
     fn reads(&self, kind: SegmentKind) -> bool {
         match kind {
@@ -115,7 +115,10 @@ impl Line {
 impl State {
     /// Has each line told something, and parts with those that are closed, or that have ended and
     /// nothing left to tell. Whether all were told.
-    fn each(&mut self, mut tell: impl FnMut(&mut Line) -> Result<(), ConnectError>) -> bool {
+    fn each(
+        &mut self,
+        mut tell: impl FnMut(&mut SegmentChannel) -> Result<(), ConnectError>,
+    ) -> bool {
         let mut all = true;
         let parted = self.lines.extract_if(.., |line| match tell(line) {
             Ok(()) => line.ended && line.samples().next().is_none(),
@@ -128,7 +131,7 @@ impl State {
         });
         for parted in parted.collect::<Vec<_>>() {
             // The context that it led to may go on, and have the segments mapped.
-            let same = |line: &&mut Line| line.peer.id() == parted.peer.id();
+            let same = |line: &&mut SegmentChannel| line.peer.id() == parted.peer.id();
             let Some(heir) = self.lines.iter_mut().find(same) else { continue };
             for info in parted
                 .samples()
@@ -144,7 +147,7 @@ impl State {
     }
 }
 
-impl Lines {
+impl SegmentChannels {
     pub(crate) fn new(session: SessionId) -> Self {
         Self { session, state: Mutex::default(), behind: AtomicBool::new(false) }
     }
@@ -161,7 +164,8 @@ impl Lines {
         let Granted { reader, writer, ring, .. } = *granted;
         // One that cannot be set holds more, which is its own harm.
         let _ = sockopt::set_socket_send_buffer_size(&socket, ROOM);
-        let mut line = Line { reader, writer, peer, socket, told: Vec::new(), ended: false };
+        let mut line =
+            SegmentChannel { reader, writer, peer, socket, told: Vec::new(), ended: false };
         let mut state = self.lock();
         let told = line.catch_up(session, ring.segment);
         let has_ring =
@@ -243,7 +247,7 @@ impl Lines {
 
     /// A subscriber is gone.
     pub(crate) fn forget(&self, reader: Gid) {
-        let gone = |line: &mut Line| line.reader == reader;
+        let gone = |line: &mut SegmentChannel| line.reader == reader;
         let told =
             self.lock().each(|line| if gone(line) { Err(ConnectError::Closed) } else { Ok(()) });
         self.note(told);
@@ -270,7 +274,7 @@ mod tests {
     #[test]
     fn a_publish_does_not_wait_for_a_thread_that_tells() {
         let session = SessionSegment::create(SessionId::random()).unwrap();
-        let lines = Lines::new(session.id());
+        let lines = SegmentChannels::new(session.id());
         lines.note(false);
         let telling = lines.lock();
         lines.keep_up(&session);

@@ -16,13 +16,13 @@ pub(super) fn fingerprint(bytes: &[u8]) -> Fingerprint {
 }
 
 /// The last `capacity` things seen, each with the time of that.
-pub(super) struct Memory<K> {
+pub(super) struct SeenSet<K> {
     capacity: usize,
     seen: HashMap<K, Duration>,
     order: VecDeque<(Duration, K)>,
 }
 
-impl<K: Clone + Eq + std::hash::Hash> Memory<K> {
+impl<K: Clone + Eq + std::hash::Hash> SeenSet<K> {
     pub(super) fn new(capacity: usize) -> Self {
         Self { capacity, seen: HashMap::new(), order: VecDeque::new() }
     }
@@ -76,7 +76,7 @@ mod tests {
 
     #[test]
     fn the_oldest_makes_room() {
-        let mut memory = Memory::new(3);
+        let mut memory = SeenSet::new(3);
         for i in 0..10 {
             assert!(memory.insert(s(i), i));
             assert!(memory.len() <= 3);

@@ -17,8 +17,8 @@ const LEFT: usize = 8;
 const SHORT: Duration = Duration::from_secs(1);
 
 #[derive(Default)]
-pub(in crate::session) struct Slots {
-    pub(super) slots: Vec<Slot>,
+pub(in crate::session) struct MatchedReaders {
+    pub(super) matched_readers: Vec<MatchedReader>,
     /// Lanes given to writers that have not granted yet, and the number behind which each is to go on.
     pub(super) pending: HashMap<Gid, (Lane, Option<u64>)>,
     /// The last sequence number taken of each publisher that is gone: one that comes back, as a remote
@@ -70,7 +70,7 @@ pub(in crate::session) enum Accept {
     AskAgain,
 }
 
-pub(super) struct Slot {
+pub(super) struct MatchedReader {
     pub(super) reader: Reader,
     /// When it was mapped: what was published before is no news. By the monotonic clock.
     pub(super) since: u64,
@@ -124,7 +124,7 @@ impl Gaps {
     }
 }
 
-impl Slot {
+impl MatchedReader {
     /// Whether the writer is one of those that the subscription is matched with.
     pub(super) fn counts(&self) -> bool {
         !self.over && !self.leaving
@@ -156,14 +156,14 @@ impl Slot {
     }
 }
 
-impl Slots {
+impl MatchedReaders {
     /// Those of a subscription that wants every sample, or does not.
     pub(super) fn new(keeps_all: bool) -> Self {
         Self { keeps_all, ..Self::default() }
     }
 
     pub(super) fn has_data(&self) -> bool {
-        !self.is_short() && self.slots.iter().any(|slot| slot.reader.has_data())
+        !self.is_short() && self.matched_readers.iter().any(|slot| slot.reader.has_data())
     }
 
     pub(super) fn is_short(&self) -> bool {
@@ -177,22 +177,22 @@ impl Slots {
 
     /// When to look again though nobody rings: for memory to take a sample, or for memory of a writer.
     pub(in crate::session) fn look_again(&self) -> Option<Instant> {
-        let missing = self.slots.iter().filter_map(|slot| slot.reader.look_again());
+        let missing = self.matched_readers.iter().filter_map(|slot| slot.reader.look_again());
         missing.chain(self.short_until()).min()
     }
 
     /// Whether the lease of one of the writers may run out.
     pub(in crate::session) fn offers_lease(&self) -> bool {
-        self.slots.iter().any(|slot| slot.counts() && slot.lease.is_some())
+        self.matched_readers.iter().any(|slot| slot.counts() && slot.lease.is_some())
     }
 
     pub(super) fn losses(&self) -> u64 {
-        self.slots.iter().map(Slot::lost).fold(self.lost, u64::saturating_add)
+        self.matched_readers.iter().map(MatchedReader::lost).fold(self.lost, u64::saturating_add)
     }
 
     /// Samples that came since this was last asked.
     pub(super) fn new_arrivals(&mut self) -> u64 {
-        let present = self.slots.iter().map(|slot| slot.reader.arrived()).sum::<u64>();
+        let present = self.matched_readers.iter().map(|slot| slot.reader.arrived()).sum::<u64>();
         let arrived = self.arrived + present;
         // A writer whose memory is corrupt takes its numbers with it.
         arrived.saturating_sub(std::mem::replace(&mut self.arrived_before, arrived))
@@ -200,7 +200,7 @@ impl Slots {
 
     /// Samples to be taken: of all writers together at most `depth`, if they share one.
     pub(super) fn unread(&self, depth: Option<u32>) -> u64 {
-        let unread = self.slots.iter().map(|slot| slot.reader.unread()).sum::<u64>();
+        let unread = self.matched_readers.iter().map(|slot| slot.reader.unread()).sum::<u64>();
         depth.map_or(unread, |depth| unread.min(depth.into()))
     }
 
@@ -216,14 +216,16 @@ impl Slots {
         writer: Gid,
         allocate: impl FnOnce() -> Result<Lane, E>,
     ) -> Result<Asking, E> {
-        if let Some(slot) = self.slots.iter().find(|s| s.reader.writer() == writer && !s.over) {
+        if let Some(slot) =
+            self.matched_readers.iter().find(|s| s.reader.writer() == writer && !s.over)
+        {
             return Ok(Asking { lane: slot.reader.lane(), after: None });
         }
         if let Some((lane, after)) = self.pending.get(&writer) {
             return Ok(Asking { lane: lane.location(), after: *after });
         }
-        let earlier = self.slots.iter().find(|slot| slot.reader.writer() == writer);
-        let after = earlier.map_or_else(|| self.last.get(&writer).copied(), Slot::reached);
+        let earlier = self.matched_readers.iter().find(|slot| slot.reader.writer() == writer);
+        let after = earlier.map_or_else(|| self.last.get(&writer).copied(), MatchedReader::reached);
         let lane = allocate()?;
         let location = lane.location();
         self.pending.insert(writer, (lane, after));
@@ -233,7 +235,7 @@ impl Slots {
     /// The lanes of all that are attached, or asked to be: what is repeated when `stands_for`
     /// changes.
     pub(in crate::session) fn lanes(&self) -> Vec<(Gid, Location)> {
-        let attached = self.slots.iter().filter(|s| !s.over);
+        let attached = self.matched_readers.iter().filter(|s| !s.over);
         let attached = attached.map(|s| (s.reader.writer(), s.reader.lane()));
         attached
             .chain(self.pending.iter().map(|(gid, (lane, _))| (*gid, lane.location())))
@@ -242,7 +244,9 @@ impl Slots {
 
     /// What a grant of `writer` calls for.
     pub(in crate::session) fn accept(&mut self, writer: Gid, grant: Grant) -> Accept {
-        if let Some(slot) = self.slots.iter_mut().find(|s| !s.over && s.reader.writer() == writer) {
+        if let Some(slot) =
+            self.matched_readers.iter_mut().find(|s| !s.over && s.reader.writer() == writer)
+        {
             if slot.reader.grant() == grant {
                 return Accept::Stands;
             }
@@ -266,7 +270,11 @@ impl Slots {
         let lifespan = times.lifespan.map(Duration::from_nanos);
         let lease = times.lease;
         let (over, leaving, overtaken) = (false, false, false);
-        let earlier = self.slots.iter().find(|s| s.reader.writer() == writer).map(Slot::reached);
+        let earlier = self
+            .matched_readers
+            .iter()
+            .find(|s| s.reader.writer() == writer)
+            .map(MatchedReader::reached);
         let last = earlier.unwrap_or_else(|| self.last.remove(&writer));
         let resumed = earlier.is_some() || last.is_some();
         let told = match numbers {
@@ -276,7 +284,7 @@ impl Slots {
         };
         let gaps = told.then(Gaps::default);
         let missed = 0;
-        self.slots.push(Slot {
+        self.matched_readers.push(MatchedReader {
             reader,
             since,
             lifespan,
@@ -298,7 +306,7 @@ impl Slots {
     /// Whether that is news.
     pub(in crate::session) fn end(&mut self, writer: &Gid) -> bool {
         self.pending.remove(writer);
-        for slot in self.slots.iter_mut().filter(|slot| slot.reader.writer() == *writer) {
+        for slot in self.matched_readers.iter_mut().filter(|slot| slot.reader.writer() == *writer) {
             slot.reader.end();
         }
         self.end_where(|reader| reader.writer() == *writer)
@@ -307,7 +315,7 @@ impl Slots {
     /// The writer is gone though more comes of it, or is not after all. Whether that is news.
     pub(in crate::session) fn leave(&mut self, writer: &Gid, leaving: bool) -> bool {
         let mut news = false;
-        for slot in self.slots.iter_mut().filter(|slot| slot.reader.writer() == *writer) {
+        for slot in self.matched_readers.iter_mut().filter(|slot| slot.reader.writer() == *writer) {
             news |= slot.leaving != leaving;
             slot.leaving = leaving;
         }
@@ -316,7 +324,7 @@ impl Slots {
 
     /// Those who are, though more comes of them.
     pub(in crate::session) fn leaving(&self) -> Vec<Gid> {
-        let leaving = self.slots.iter().filter(|slot| slot.leaving && !slot.over);
+        let leaving = self.matched_readers.iter().filter(|slot| slot.leaving && !slot.over);
         leaving.map(|slot| slot.reader.writer()).collect()
     }
 
@@ -333,7 +341,7 @@ impl Slots {
 
     fn end_where(&mut self, which: impl Fn(&Reader) -> bool) -> bool {
         let mut news = false;
-        for slot in self.slots.iter_mut().filter(|s| !s.over && which(&s.reader)) {
+        for slot in self.matched_readers.iter_mut().filter(|s| !s.over && which(&s.reader)) {
             slot.over = true;
             news = true;
         }
@@ -346,22 +354,25 @@ impl Slots {
     fn forget_older(&mut self, writer: Gid) {
         loop {
             let of = self.slots_of(writer);
-            let over = of.iter().filter(|index| self.slots[**index].over).count();
+            let over = of.iter().filter(|index| self.matched_readers[**index].over).count();
             let [older, newer, ..] = of[..] else { return };
-            let same = self.slots[newer].reader.is_of_ring(&self.slots[older].reader);
+            let same =
+                self.matched_readers[newer].reader.is_of_ring(&self.matched_readers[older].reader);
             if over <= if self.keeps_all && !same { LEFT } else { 1 } {
                 return;
             }
-            let mut slot = self.slots.remove(older);
+            let mut slot = self.matched_readers.remove(older);
             self.count_left(&mut slot);
             self.retire(&slot);
         }
     }
 
     /// Counts what a slot that is given up has not taken and no later one of its writer will.
-    fn count_left(&mut self, slot: &mut Slot) {
+    fn count_left(&mut self, slot: &mut MatchedReader) {
         let writer = slot.reader.writer();
-        let Some(newer) = self.slots.iter().find(|s| s.reader.writer() == writer) else { return };
+        let Some(newer) = self.matched_readers.iter().find(|s| s.reader.writer() == writer) else {
+            return;
+        };
         if newer.reader.is_of_ring(&slot.reader) {
             let later = newer.reader.grant().first;
             self.lost = self.lost.saturating_add(slot.reader.unread_below(later));
@@ -383,7 +394,7 @@ impl Slots {
     }
 
     /// Keeps what a slot that is given up leaves to be known.
-    pub(super) fn retire(&mut self, slot: &Slot) {
+    pub(super) fn retire(&mut self, slot: &MatchedReader) {
         self.lost = self.lost.saturating_add(slot.lost());
         self.arrived += slot.reader.arrived();
         if self.last.len() >= REMEMBERED {
@@ -394,34 +405,35 @@ impl Slots {
 
     /// This sample of `writer` was taken.
     pub(super) fn note(&mut self, writer: Gid, sequence: u64) {
-        for slot in self.slots.iter_mut().filter(|s| s.reader.writer() == writer) {
+        for slot in self.matched_readers.iter_mut().filter(|s| s.reader.writer() == writer) {
             slot.last = Some(sequence);
         }
     }
 
     /// Where this writer's are, in the order in which it granted them.
     fn slots_of(&self, writer: Gid) -> Vec<usize> {
-        let of = |index: &usize| self.slots[*index].reader.writer() == writer;
-        (0..self.slots.len()).filter(of).collect()
+        let of = |index: &usize| self.matched_readers[*index].reader.writer() == writer;
+        (0..self.matched_readers.len()).filter(of).collect()
     }
 
     /// Whether anything of this writer's is read, or may be soon.
     pub(in crate::session) fn reads(&self, writer: &Gid) -> bool {
-        self.pending.contains_key(writer) || self.slots.iter().any(|s| s.reader.writer() == *writer)
+        self.pending.contains_key(writer)
+            || self.matched_readers.iter().any(|s| s.reader.writer() == *writer)
     }
 
     /// Gives up what a writer left in memory that never came, where it has come back in another process and
     /// sends once more what was not confirmed. What is missing then is missing among its numbers.
-    pub(super) fn forgo_missing(&mut self) {
+    pub(super) fn skip_missing(&mut self) {
         // To others nothing is sent again.
         if !self.keeps_all {
             return;
         }
         let mut forgone = false;
-        for index in 0..self.slots.len().saturating_sub(1) {
-            let (earlier, later) = self.slots.split_at_mut(index + 1);
+        for index in 0..self.matched_readers.len().saturating_sub(1) {
+            let (earlier, later) = self.matched_readers.split_at_mut(index + 1);
             let slot = &mut earlier[index];
-            let sends_again = |other: &Slot| {
+            let sends_again = |other: &MatchedReader| {
                 other.reader.writer() == slot.reader.writer()
                     && other.resumed
                     && other.numbers != Numbers::None
@@ -431,7 +443,7 @@ impl Slots {
                 && slot.reader.missing().is_some()
                 && slot.reader.writer_dead()
                 && later.iter().any(sends_again);
-            forgone |= returned && slot.reader.forgo_missing();
+            forgone |= returned && slot.reader.skip_missing();
         }
         if forgone {
             self.sweep();
@@ -440,9 +452,10 @@ impl Slots {
 
     /// Unmaps writers that are gone and drained, and of which nothing is under way.
     pub(super) fn sweep(&mut self) {
-        let over =
-            |slot: &mut Slot| slot.over && slot.reader.is_drained() && !slot.reader.is_under_way();
-        let gone: Vec<Slot> = self.slots.extract_if(.., over).collect();
+        let over = |slot: &mut MatchedReader| {
+            slot.over && slot.reader.is_drained() && !slot.reader.is_under_way()
+        };
+        let gone: Vec<MatchedReader> = self.matched_readers.extract_if(.., over).collect();
         gone.iter().for_each(|slot| self.retire(slot));
     }
 }
