@@ -1,25 +1,25 @@
 /* The C interface of AXON: sessions, in which publishers, subscriptions, services and clients meet those of
  * other processes and hosts.
  *
- * The rules, for a function that says nothing else of itself:
+ * Rules for every function whose documentation does not say otherwise:
  *
- * - It may be called from any thread at any time, also at the same time with the same handle.
- * - It does not block, but for locks that are held for microseconds.
- * - It returns AXON_RET_OK, or why it did not do what it was asked; then it did nothing, wrote to none of
- *   the places that it was given, and axon_session_last_error says in words what is wrong.
- * - It keeps no pointer that it was given. Strings are UTF-8 and end with a 0 byte.
- * - What it calls back must neither throw nor longjmp out of the call.
- * - Where it replaces a callback, or destroys what has one, that has returned when it returns, unless it is
- *   called from within it, and is called no more: whatever other threads do meanwhile, one that would set
- *   another gets AXON_RET_INVALID_HANDLE. It blocks until then: hold nothing that
- *   the callback waits for.
+ * - It may be called from any thread at any time, also concurrently with the same handle.
+ * - It does not block, except on locks that are held for microseconds.
+ * - It returns AXON_RET_OK or an error code. After an error it has done nothing and has written to no pointer that
+ *   the caller passed. axon_session_last_error returns the error as text.
+ * - It keeps no pointer that the caller passed. Strings are UTF-8 and end with a 0 byte.
+ * - A callback must neither throw nor longjmp out of the call.
+ * - A call that replaces or destroys a callback waits until a running call of the old callback returns. The
+ *   old callback is not called again. A call from inside the callback does not wait. While an object is being
+ *   destroyed, a thread that sets another callback for it gets AXON_RET_INVALID_HANDLE. The caller must not
+ *   hold anything that the callback waits for.
  *
- * Handles are numbers, never pointers, and may be copied freely: one that is 0, stale, destroyed twice, of
- * another kind or made up gives AXON_RET_INVALID_HANDLE, one that a forked child inherited
- * AXON_RET_FORKED; whichever the function, both are among what it returns, and so are
- * AXON_RET_INVALID_ARGUMENT for null where there must be something, AXON_RET_BAD_ALLOC where a new
- * handle finds no room, and AXON_RET_PANIC. An object may be destroyed by one thread while others use it:
- * calls that are under way end as they would have. A handle that is never destroyed keeps what it names.
+ * Handles are numbers, never pointers, and may be copied freely. A handle that is 0, stale, destroyed twice, of
+ * another kind or made up gives AXON_RET_INVALID_HANDLE. A handle that a forked child inherited gives
+ * AXON_RET_FORKED. Every function may return both, and also AXON_RET_INVALID_ARGUMENT for an unexpected null
+ * pointer, AXON_RET_BAD_ALLOC if there is no room for a new handle, and AXON_RET_PANIC. One thread may destroy an
+ * object while other threads use it: their running calls end as usual. A handle that is never destroyed keeps
+ * its object alive.
  *
  * A process that executes another program without closing its sessions is gone for the others as if it had
  * been killed, but for the samples that it holds: their memory is free once that program has ended.
@@ -120,22 +120,22 @@
 #define AXON_KIND_CLIENT 8
 
 /**
- * What helps to find a fault.
+ * Debug: details that help to find a fault.
  */
 #define AXON_LOG_DEBUG 10
 
 /**
- * What is as it should be.
+ * Informational: normal operation.
  */
 #define AXON_LOG_INFO 20
 
 /**
- * What is not, and is coped with.
+ * Warning: a problem that the library handles.
  */
 #define AXON_LOG_WARN 30
 
 /**
- * What does not work for it.
+ * Error: an operation of the library failed.
  */
 #define AXON_LOG_ERROR 40
 

@@ -1,4 +1,4 @@
-//! Limits log lines about many samples to one a second, with the number of samples since the last line.
+//! Limits log lines about many samples to one a second. Each line has the number of samples since the previous one.
 
 use std::{
     sync::{Mutex, PoisonError},

@@ -1,6 +1,6 @@
-//! The key of a session. Each session makes a key pair; its id, with which its GIDs begin, is a hash of the
-//! public key. The session hands the secret key to its daemon, which proves with it to other hosts that the
-//! session is its own.
+//! The key of a session. Each session makes a key pair; its id, with which its GIDs begin, is a hash of the public
+//! key. The session gives the secret key to its daemon. With it the daemon proves to other hosts that the session
+//! belongs to this daemon.
 
 use std::fmt;
 

@@ -1,4 +1,4 @@
-//! What a daemon says of itself: the JSON behind `axon status`.
+//! The daemon's status: the JSON for `axon status`.
 
 use std::{collections::BTreeMap, time::SystemTime};
 

@@ -1,4 +1,4 @@
-//! Text from outside, made fit for a log line or a terminal.
+//! Makes text from outside safe for a log line or a terminal.
 
 /// Whether `c` is shown as itself. Control characters, line separators, marks that turn the
 /// direction of writing, and other characters without a shape of their own are not.

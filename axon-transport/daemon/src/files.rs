@@ -1,4 +1,4 @@
-//! Files that settings name: what they must be, how they are read, and how a change of one shows.
+//! Files that settings name: their required properties, reading them, and detecting changes.
 
 use std::{
     fs::{File, Metadata, OpenOptions},

@@ -1,4 +1,4 @@
-//! The errors of this crate, each with its cause and what to do about it.
+//! The errors of this crate, each with its cause and the remedy.
 
 use std::{fmt, io};
 
@@ -119,7 +119,7 @@ pub enum PublishError {
         needed: u64,
         /// Bytes available to this process when it asked.
         available: u64,
-        /// A reader that keeps samples which would do.
+        /// A reader that pins samples whose memory would suffice.
         keeper: Option<PinHolder>,
     },
     /// The system refused a segment for large samples.
@@ -135,9 +135,9 @@ pub enum PublishError {
         loans: u32,
     },
     /// Samples that a reader has not dropped hold the ring's memory.
-    #[error("the ring's memory is full{}: it must drop some, or end", held_by(Some(keeper)))]
+    #[error("the ring's memory is full: {keeper}; drop samples in that reader or close it")]
     Pinned {
-        /// A reader that keeps some.
+        /// A reader that pins samples.
         keeper: PinHolder,
     },
     /// The number that a publisher elsewhere gave its sample cannot be.
@@ -161,14 +161,14 @@ pub enum PublishError {
     Forked,
 }
 
-/// Who keeps samples that their publisher has given up.
+/// A reader that pins samples which the publisher has given up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PinHolder {
-    /// A reader that keeps some.
+    /// The reader's GID.
     pub reader: Gid,
-    /// Its process, where that is known and has not ended.
+    /// The reader's process, if it is known and has not ended.
     pub process: Option<u32>,
-    /// Samples that readers keep in all.
+    /// Samples that all readers together pin.
     pub samples: usize,
 }
 
@@ -179,12 +179,12 @@ impl fmt::Display for PinHolder {
         if let Some(process) = process {
             write!(f, " (pid {process})")?;
         }
-        write!(f, " among those that keep {samples} samples")
+        write!(f, " holds pinned samples ({samples} pinned by all readers)")
     }
 }
 
 fn held_by(keeper: Option<&PinHolder>) -> String {
-    keeper.map_or_else(String::new, |keeper| format!(", held by {keeper}"))
+    keeper.map_or_else(String::new, |keeper| format!("; {keeper}"))
 }
 
 /// A ring could not be read.
@@ -192,7 +192,7 @@ fn held_by(keeper: Option<&PinHolder>) -> String {
 #[non_exhaustive]
 pub enum TakeError {
     /// The publisher's process wrote what no publisher writes. The ring is not read again.
-    #[error("ring of publisher {writer} is corrupt ({what}): dropped")]
+    #[error("ring of publisher {writer} is corrupt ({what}); detached from it")]
     Corrupt {
         /// The publisher.
         writer: Gid,

@@ -2,11 +2,11 @@
 //!
 //! # How it works
 //!
-//! Each context has a segment of memory, a sealed memfd that holds the words by which it is woken, the
-//! rings of its publishers, their samples of up to 4 KiB, and its readers' cursors and pins. A publisher
-//! of longer samples has a segment for them (and for loans of more than 512 bytes, if it
-//! [expects](PublisherOptions::expected_len) such), and a context that needs more room has further ones.
-//! Others map what they read from.
+//! Each context has a segment of memory: a sealed memfd. The segment holds the words for its wake-ups, the rings of
+//! its publishers, their samples of up to 4 KiB, and the cursors and pins of its readers. A publisher of longer
+//! samples has a separate segment for them, and for loans of more than 512 bytes if it
+//! [expects](PublisherOptions::expected_len) such samples. A context that needs more room has further segments.
+//! Other processes map the segments that they read from.
 #![deny(unsafe_code)]
 
 #[cfg(not(all(target_pointer_width = "64", target_endian = "little")))]

@@ -1,4 +1,4 @@
-//! Sizes that all of the crate goes by.
+//! Sizes and limits for the whole crate.
 
 /// Segments are multiples of this many bytes, and memory is committed in them.
 pub(super) const ALIGN: u64 = 64 << 10;

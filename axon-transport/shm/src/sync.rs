@@ -1,12 +1,11 @@
-//! The one place where the lock-free protocols get their atomics and their orderings from.
+//! The only source of atomics and memory orderings for the lock-free protocols.
 //!
-//! They are written over [`Word`], so that the code that runs over mapped memory is the code that
-//! the model checker explores, and they name each ordering by its [`Site`], so that a test can
-//! weaken one at a time and see that a model notices (`tests/mutation.rs`).
+//! The protocols are written over [`Word`], so that the code that runs over mapped memory is also the code that the
+//! model checker explores. They name each ordering by its [`Site`], so that a test can weaken one ordering at a time
+//! and check that a model fails (`tests/mutation.rs`).
 //!
-//! The language's memory model knows threads, not processes. Words of 64 bits are lock-free and
-//! free of addresses on the machines that this is built for, so what holds between threads holds
-//! between processes that map the same page.
+//! The language's memory model covers threads, not processes. On the supported machines, words of 64 bits are
+//! lock-free and address-free. So the guarantees between threads also hold between processes that map the same page.
 
 pub(crate) use std::sync::atomic::Ordering;
 use std::sync::atomic::{AtomicU32, AtomicU64, fence};

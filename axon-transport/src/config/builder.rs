@@ -1,4 +1,4 @@
-//! A configuration that a program writes, in place of the environment or on top of it.
+//! A configuration that a program builds, in place of the environment or on top of it.
 
 use std::{fmt::Display, net::IpAddr, path::Path, time::Duration};
 

@@ -1,5 +1,5 @@
-//! The environment of a daemon that a session starts. It is the only way by which the session's settings
-//! reach that daemon.
+//! The environment of a daemon that a session starts. The session passes its settings to that daemon only through
+//! the environment.
 
 use std::{
     collections::BTreeMap,

@@ -1,8 +1,8 @@
-//! Restricts the settings of a set-uid, set-gid or file-capability program: its caller may name no
-//! programs, no files and no trusted users.
+//! Restricts the settings of a set-uid, set-gid or file-capability program: its caller may name no programs, no
+//! files and no trusted users.
 //!
-//! The environment of a set-uid, set-gid or file-capability program is its caller's. A path in it would
-//! be executed or read with rights that the caller does not have.
+//! The caller controls the environment of such a program. The program would execute or read a path from it with
+//! rights that the caller does not have.
 
 use std::{
     collections::BTreeMap,

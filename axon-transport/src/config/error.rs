@@ -1,4 +1,4 @@
-//! Why a configuration was refused, in one line.
+//! The error for a refused configuration, in one line.
 
 use std::fmt::{self, Write as _};
 

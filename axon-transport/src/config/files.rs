@@ -1,4 +1,4 @@
-//! The file system as validation sees it. Tests replace it.
+//! The file system as validation accesses it. Tests replace it.
 
 use std::{
     fs::{File, Metadata, OpenOptions},

@@ -1,8 +1,8 @@
 //! Configuration: environment and `axon.toml`, or a [`ConfigBuilder`], in, one validated [`Config`] out.
 //!
-//! The only place that reads settings from the environment, and [`Config::builder`] and
-//! [`Config::default`] do not. A setting that is unknown, obsolete or half-given is an error that names the variable, what was read and
-//! what is accepted. Validation creates nothing, reads no private key, and runs in the process that starts,
+//! Only this module reads settings from the environment; [`Config::builder`] and [`Config::default`] do not. A
+//! setting that is unknown, obsolete or half-given is an error. The error names the variable, the value that was read
+//! and the accepted values. Validation creates nothing, reads no private key, and runs in the process that starts,
 //! before any daemon does.
 
 #![forbid(unsafe_code)]

@@ -1,4 +1,4 @@
-//! The names of all settings, and what to say about a name that is not one.
+//! The names of all settings, and the error for an unknown name.
 
 use super::ConfigError;
 

@@ -1,4 +1,4 @@
-//! The few settings that say where a daemon listens, for tools that look for one and open no session.
+//! The few settings that determine where a daemon listens, for tools that look for a daemon and open no session.
 
 use std::{
     ffi::OsString,

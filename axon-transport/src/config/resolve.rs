@@ -1,4 +1,4 @@
-//! Checks which settings go together, and fills in the defaults.
+//! Checks which settings may be combined, and fills in the defaults.
 
 use std::{
     ffi::OsString,

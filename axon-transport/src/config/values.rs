@@ -1,4 +1,4 @@
-//! From text to values, one function per kind of value.
+//! Parses settings: one function for each kind of value.
 
 use std::{
     net::IpAddr,

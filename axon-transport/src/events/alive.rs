@@ -1,5 +1,5 @@
-//! Collects which publishers asserted their liveliness, to tell processes and hosts that cannot see it
-//! themselves, in time for the shortest lease.
+//! Collects which publishers asserted their liveliness. The collection is sent to processes and hosts that cannot see
+//! the assertions themselves, in time for the shortest lease.
 
 use std::{
     collections::BTreeMap,

@@ -1,4 +1,4 @@
-//! Liveliness: leases that are asserted, run out, and are asserted again.
+//! Liveliness: leases that are asserted, expire, and are asserted again.
 
 use std::collections::HashMap;
 

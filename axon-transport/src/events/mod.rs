@@ -1,8 +1,8 @@
-//! What an endpoint can report of itself: the eleven events of ROS 2, their status counts, and the
-//! rules by which deadlines and leases run out.
+//! The events that an endpoint can report: the eleven events of ROS 2, their status counts, and the rules by which
+//! deadlines and leases expire.
 //!
-//! Plain data: time comes in as nanoseconds of one monotonic clock, and nothing is waited for.
-//! A session's control thread feeds these, and hands what is new to wait sets and callbacks.
+//! Plain data: time comes in as nanoseconds of one monotonic clock, and no function waits. A session's control thread
+//! feeds these state machines, and passes their news to wait sets and callbacks.
 
 pub(crate) mod alive;
 mod deadline;

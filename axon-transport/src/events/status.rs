@@ -1,4 +1,4 @@
-//! Status counts: what happened in all, and since it was last looked at.
+//! Status counts: the total, and the change since the last read.
 
 use crate::qos::Incompatible;
 

@@ -1,4 +1,4 @@
-//! Clients: the asking end of a service.
+//! Clients: the requesting end of a service.
 
 use std::ffi::c_void;
 

@@ -1,4 +1,4 @@
-//! What the C functions of publishers, subscriptions, clients and servers share.
+//! Code that the C functions of publishers, subscriptions, clients and servers share.
 
 use std::{ffi::c_void, os::raw::c_char};
 

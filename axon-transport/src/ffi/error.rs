@@ -1,4 +1,4 @@
-//! Return codes, and what went wrong in words.
+//! Return codes, and the text of the last error.
 
 use std::{
     cell::RefCell,

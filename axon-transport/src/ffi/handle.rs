@@ -1,4 +1,4 @@
-//! The kinds of handles, and what each of them names.
+//! The kinds of handles, and the object that each kind names.
 
 use std::sync::Arc;
 

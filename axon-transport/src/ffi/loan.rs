@@ -1,4 +1,4 @@
-//! The C functions of loans: memory that the program writes before it publishes it.
+//! The C functions of loans: memory that the program writes before it publishes the sample.
 
 use std::sync::{Mutex, PoisonError, Weak};
 

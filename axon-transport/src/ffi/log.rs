@@ -1,4 +1,4 @@
-//! Passes the library's log lines to a callback of the C program. A thread of the library's own calls it.
+//! Passes the library's log lines to a callback of the C program. A thread of the library calls the callback.
 
 mod queue;
 
@@ -30,13 +30,13 @@ use super::{
     guarded,
 };
 
-/// What helps to find a fault.
+/// Debug: details that help to find a fault.
 pub const AXON_LOG_DEBUG: u32 = 10;
-/// What is as it should be.
+/// Informational: normal operation.
 pub const AXON_LOG_INFO: u32 = 20;
-/// What is not, and is coped with.
+/// Warning: a problem that the library handles.
 pub const AXON_LOG_WARN: u32 = 30;
-/// What does not work for it.
+/// Error: an operation of the library failed.
 pub const AXON_LOG_ERROR: u32 = 40;
 
 /// Told of a line: how severe it is (AXON_LOG_*), which part of the library says it, and what. Both

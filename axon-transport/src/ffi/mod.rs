@@ -1,23 +1,22 @@
-//! The C interface, `axon_session_*`: what `include/axon.h` declares.
+//! The C interface, `axon_session_*`: the functions that `include/axon.h` declares.
 //!
-//! The rules, for a function that says nothing else of itself:
+//! Rules for every function whose documentation does not say otherwise:
 //!
-//! - It may be called from any thread at any time, also at the same time with the same handle.
-//! - It does not block, but for locks that are held for microseconds.
-//! - It returns [`AXON_RET_OK`], or why it did not do what it was asked; then it did nothing, wrote to
-//!   none of the places that it was given, and [`axon_session_last_error`] says in words what is wrong.
-//! - It keeps no pointer that it was given. Strings are UTF-8 and end with a 0 byte.
-//! - What it calls back must neither throw nor `longjmp` out of the call.
-//! - Where it replaces a callback, or destroys what has one, that has returned when it returns, unless it
-//!   is called from within it, and is called no more: whatever other threads do meanwhile, one that
-//!   would set another gets `AXON_RET_INVALID_HANDLE`. It blocks until then: hold nothing that
-//!   the callback waits for.
+//! - It may be called from any thread at any time, also concurrently with the same handle.
+//! - It does not block, except on locks that are held for microseconds.
+//! - It returns [`AXON_RET_OK`] or an error code. After an error it has done nothing and has written to no pointer
+//!   that the caller passed. [`axon_session_last_error`] returns the error as text.
+//! - It keeps no pointer that the caller passed. Strings are UTF-8 and end with a 0 byte.
+//! - A callback must neither throw nor `longjmp` out of the call.
+//! - A call that replaces or destroys a callback waits until a running call of the old callback returns. The
+//!   old callback is not called again. A call from inside the callback does not wait. While an object is being
+//!   destroyed, a thread that sets another callback for it gets `AXON_RET_INVALID_HANDLE`. The caller must not
+//!   hold anything that the callback waits for.
 //!
-//! Handles are numbers, never pointers: one that is 0, stale, destroyed twice, of another kind or made
-//! up gives [`AXON_RET_INVALID_HANDLE`], one that a forked child inherited [`AXON_RET_FORKED`]. An
-//! object may be destroyed by one thread while others use it: calls that are under way end as they
-//! would have. No panic crosses the border: what could panic is called in one place
-//! (`guarded`), which catches it.
+//! Handles are numbers, never pointers. A handle that is 0, stale, destroyed twice, of another kind or made up
+//! gives [`AXON_RET_INVALID_HANDLE`]. A handle that a forked child inherited gives [`AXON_RET_FORKED`]. One thread
+//! may destroy an object while other threads use it: their running calls end as usual. No panic crosses the
+//! interface: every call runs in `guarded`, which catches panics.
 #![allow(unsafe_code, non_camel_case_types)]
 
 mod callback;

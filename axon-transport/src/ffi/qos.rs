@@ -1,4 +1,4 @@
-//! Quality of service, as C has it.
+//! Quality of service in its C representation.
 
 use std::{mem::MaybeUninit, os::raw::c_char, time::Duration};
 

@@ -1,4 +1,4 @@
-//! Servers: the answering end of a service.
+//! Servers: the responding end of a service.
 
 use std::ffi::c_void;
 

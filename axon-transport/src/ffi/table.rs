@@ -1,10 +1,9 @@
-//! Handles for C: numbers that name an object, and that are found out when the object is gone.
+//! Handles for C: numbers that name an object. The table detects a handle whose object no longer exists.
 //!
-//! A handle is a place in a table and the place's generation, which rises whenever the place is
-//! given up; with it go the kind of the object and the process that made it. So a handle that is
-//! null, stale, destroyed twice, of another kind or made up names nothing: it is never a pointer
-//! that somebody follows. What is named lives on for as long as a call uses it, whoever destroys
-//! the handle meanwhile.
+//! A handle consists of an index in a table and the generation of that index, which rises whenever the index is
+//! freed. It also contains the kind of the object and the process that created it. So a handle that is null, stale,
+//! destroyed twice, of another kind or made up names no object, and no function ever follows it as a pointer. A
+//! named object lives for as long as a call uses it, even if another thread destroys the handle meanwhile.
 
 use std::sync::{Arc, Mutex, OnceLock, PoisonError, RwLock};
 

@@ -1,4 +1,4 @@
-//! Races that other threads would have to win, made to happen.
+//! Tests that force races between threads.
 
 use std::{
     cell::Cell,

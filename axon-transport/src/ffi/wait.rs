@@ -1,4 +1,4 @@
-//! Guard conditions, and waiting for any of several things.
+//! Guard conditions and wait sets.
 
 use std::{sync::Arc, time::Duration};
 

@@ -1,4 +1,4 @@
-//! One endpoint as it is described to sessions and peers.
+//! The description of one endpoint for sessions and peers.
 
 use minicbor::{Decode, Encode};
 use serde::Serialize;

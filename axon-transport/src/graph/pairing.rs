@@ -1,5 +1,5 @@
-//! Decides which endpoints match: one rule for the daemon that pairs them, the session that reports why
-//! they do not, and the gateway that carries samples between hosts.
+//! Decides which endpoints match. Three components use this one rule: the daemon that pairs endpoints, the session
+//! that reports the reason of a mismatch, and the gateway that carries samples between hosts.
 
 use super::{Endpoint, EndpointKind};
 use crate::qos::{Incompatible, compatible};

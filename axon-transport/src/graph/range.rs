@@ -1,5 +1,5 @@
-//! Which endpoints may be matched by the discovery ranges of their sessions: one rule for the daemons
-//! of both hosts, either of which can refuse a pair.
+//! Decides which endpoints may match by the discovery ranges of their sessions. The daemons of both hosts use this
+//! one rule, and either of them can refuse a pair.
 
 use std::sync::Arc;
 

@@ -1,4 +1,4 @@
-//! Limits on what one session may ask of the daemon, however often it asks.
+//! Tests the limits on the requests of one session to the daemon, however often it asks.
 
 use super::*;
 use crate::{

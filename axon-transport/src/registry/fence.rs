@@ -1,8 +1,9 @@
-//! FENCE: a session learns that all it said of a publisher was sent to those who must not lose a sample.
+//! FENCE: tells a session that all its messages about a publisher were sent to the readers that must not lose a
+//! sample.
 //!
-//! A relayed publisher's process keeps a sample until the daemon confirms it. The sample is then in the
-//! daemon's memory, which a reader can go on reading after the daemon was killed: but only if it was sent
-//! the descriptors of that memory, and its grant, before.
+//! A relayed publisher's process keeps a sample until the daemon confirms it. The sample is then in the daemon's
+//! memory. A reader can read that memory after the daemon was killed, but only if the daemon had sent it the
+//! descriptors of the memory, and its grant.
 
 use axon_shm::internal::holds;
 

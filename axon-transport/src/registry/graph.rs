@@ -1,4 +1,4 @@
-//! The graph that sessions are shown, and its changes.
+//! The graph that the daemon shows to sessions, and its changes.
 
 use std::{
     collections::{BTreeMap, BTreeSet},

@@ -1,4 +1,4 @@
-//! Decides which endpoints are matched, and keeps the pairs.
+//! Decides which endpoints match, and stores the pairs.
 
 use super::{LocalEndpoint, Members, PairProgress, Registry, Topic};
 use crate::{
@@ -61,7 +61,8 @@ impl<F: Clone> Registry<F> {
                     self.unmatch(&pair, to_writer, to_reader, &format!("incompatible {policy}"));
                 }
                 Pairing::IncompatibleType => {
-                    self.unmatch(&pair, to_writer, to_reader, "their types have other hashes");
+                    let reason = "type mismatch: the type names or the type hashes differ";
+                    self.unmatch(&pair, to_writer, to_reader, reason);
                 }
                 Pairing::Unrelated => {}
             }

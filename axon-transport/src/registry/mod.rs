@@ -1,9 +1,8 @@
-//! The control plane's state: sessions, endpoints, matched pairs, and the messages that each session still
-//! has to be sent.
+//! The control plane's state: sessions, endpoints, matched pairs, and the queued messages of each session.
 //!
-//! A state machine (`docs/architecture.md`) without time: messages of sessions go in, packets and
-//! descriptors come out. `F` stands for a descriptor. Matching is a function of the endpoints alone, so a
-//! session that could not be told in time is told everything anew ([`Registry::poll_output`]).
+//! A state machine (`docs/architecture.md`) without time: messages of sessions go in, packets and descriptors come
+//! out. `F` stands for a descriptor. Matching is a function of the endpoints alone. If a session cannot receive its
+//! messages in time, the registry sends it the complete state anew ([`Registry::poll_output`]).
 
 #[cfg(test)]
 mod bounds;

@@ -1,7 +1,7 @@
-//! How far each session is discovered, and which pairs and which parts of the graph follow from that.
+//! The discovery range of each session, and the pairs and parts of the graph that follow from it.
 //!
-//! The range and the static peers are each session's own, whichever process started the daemon. The
-//! daemon knows by the addresses of its links which linked peers a session lists ([`Registry::relist`]).
+//! The range and the static peers belong to each session, independent of the process that started the daemon. The
+//! daemon knows from the addresses of its links which linked peers a session lists ([`Registry::relist`]).
 
 #[cfg(test)]
 mod tests;

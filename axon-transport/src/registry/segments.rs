@@ -1,8 +1,8 @@
-//! The segments of sessions' memory, and who is handed which.
+//! The segments of sessions' memory, and the sessions that receive each of them.
 //!
-//! A session that reads from another is handed those that hold objects, and those that hold the
-//! samples of the publishers that it reads from: with what introduces the two to each other, and
-//! as they come into being. It asks for one that it misses all the same.
+//! A session that reads from another session receives its segments with objects, and the segments with samples of
+//! the publishers that it reads from. It receives existing segments with the message that introduces the two
+//! sessions, and later segments when they are opened. If a segment is missing nevertheless, the session asks for it.
 
 use super::{MAX_SEGMENTS, Registry, SessionSegment, Violation};
 use crate::{

@@ -1,5 +1,5 @@
-//! Keys in memory that is not swapped out, not part of a core file, and empty in a forked child. A child
-//! that uses a key of its parent is aborted: zeros are a key that everybody knows.
+//! Keys in memory that is not swapped out, not part of a core file, and empty in a forked child. A child that uses a
+//! key of its parent is aborted, because it would use a key of zeros, which anybody can guess.
 
 use std::{
     io,

@@ -1,4 +1,4 @@
-//! Adds endpoints to a session and announces them to the daemon, and takes them back when they are dropped.
+//! Adds endpoints to a session and announces them to the daemon. Removes them when they are dropped.
 
 use std::{sync::Arc, time::Duration};
 

@@ -1,8 +1,8 @@
-//! Remote endpoints that are not shown in the graph yet. An endpoint appears once its pairs with the
-//! session's own endpoints are attached, so that a counted endpoint can be reached.
+//! Remote endpoints that the graph does not show yet. An endpoint appears once its pairs with the session's own
+//! endpoints are attached, so that a counted endpoint can be reached.
 //!
-//! Plain data. None is held back for longer than [`PATIENCE`]: a stopped process must not hide what
-//! others may use.
+//! Plain data. An endpoint is delayed for [`PATIENCE`] at most: a stopped process must not hide endpoints from other
+//! processes.
 
 use std::{
     collections::{BTreeSet, HashMap},

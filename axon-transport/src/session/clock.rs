@@ -1,3 +1,3 @@
-//! The two clocks: one for what people read, one for what is waited for.
+//! The two clocks: wall-clock time for timestamps, monotonic time for timeouts.
 
 pub(super) use axon_shm::internal::{monotonic, wall};

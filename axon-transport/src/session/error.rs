@@ -1,4 +1,4 @@
-//! Why a session could not do what it was asked.
+//! The errors of sessions and of waits for messages.
 
 use std::{fmt, path::PathBuf};
 
@@ -44,8 +44,10 @@ impl RecvError {
 #[derive(thiserror::Error)]
 #[non_exhaustive]
 pub enum SessionError {
-    /// A publisher of another description still has this GID.
-    #[error("the GID {0} is in use by a publisher of another description; it ends soon")]
+    /// A publisher with different settings still uses this GID.
+    #[error(
+        "GID {0} is still in use by a publisher with different settings; retry when that publisher is gone"
+    )]
     InUse(crate::ids::Gid),
     /// A node's name or namespace is empty or too long.
     #[error(
@@ -57,8 +59,10 @@ pub enum SessionError {
         /// The name.
         name: String,
     },
-    /// Something to wait for belongs to another session, at which one cannot wait.
-    #[error("what is waited for belongs to a session that is closed or led by an event loop")]
+    /// A waitable belongs to another session, and that session is closed or led by an event loop.
+    #[error(
+        "cannot wait: a waitable's session is closed, or an event loop already waits on its doorbell"
+    )]
     OtherSession,
     /// `AXON_DAEMON=require`, and there is none.
     #[error(

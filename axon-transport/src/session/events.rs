@@ -1,4 +1,4 @@
-//! The events of endpoints: their statuses, and the wait sets and callbacks that are told of them.
+//! The events of endpoints: their statuses, and the wait sets and callbacks that receive them.
 
 use std::{
     cmp::Ordering,

@@ -1,4 +1,4 @@
-//! Conditions that a program triggers itself.
+//! Guard conditions: conditions that a program triggers itself.
 
 use std::{
     fmt,
@@ -69,7 +69,7 @@ impl Guard {
         self.triggered.load(Ordering::Acquire)
     }
 
-    /// Whether it stood; it does no more.
+    /// Clears the condition; returns whether it was set.
     pub(super) fn take(&self) -> bool {
         self.is_triggered() && self.triggered.swap(false, Ordering::AcqRel)
     }

@@ -1,5 +1,5 @@
-//! Methods of an application's types that only the daemon, its relays and stand-ins, and this crate call. They
-//! are hidden in the documentation, are no part of the interface, and change with any release.
+//! Methods of an application's types for the daemon, its relays and stand-ins, and this crate. They are hidden in the
+//! documentation, are no part of the interface, and change with any release.
 
 use std::{
     collections::{BTreeMap, HashMap},

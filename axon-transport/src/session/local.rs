@@ -1,6 +1,6 @@
-//! A registry inside the application's process, for a session that asks no daemon. With `AXON_DAEMON=off`
-//! the process's one session finds its own endpoints in it. In a relayed session a second session in it
-//! stands for the world outside (`session::relayed`).
+//! A registry inside the application's process, for a session that uses no daemon. With `AXON_DAEMON=off` the
+//! process's one session finds its own endpoints in it. In a relayed session a second session in it represents
+//! everything outside the process (`session::relayed`).
 
 use std::{
     collections::HashMap,
@@ -111,7 +111,7 @@ impl Local {
         if let Some((message, descriptors)) = message {
             let descriptors = descriptors.into_iter().map(Arc::new).collect();
             if let Err(violation) = inside.registry.handle_message(&self.id, message, descriptors) {
-                tracing::error!(%violation, "a message to no daemon");
+                tracing::error!(%violation, "the in-process registry rejected a message");
             }
         }
         inside.settle(Some(&self.id));
@@ -122,7 +122,12 @@ impl Local {
             match (Message::decode(&output.packet), descriptors) {
                 (Ok(message), Ok(descriptors)) => answers.push((message, descriptors)),
                 (message, descriptors) => {
-                    tracing::error!(?message, ?descriptors, "an answer of no daemon was lost");
+                    tracing::error!(
+                        ?message,
+                        ?descriptors,
+                        "the in-process registry's reply could not be decoded, or its descriptors could not be \
+                         duplicated; reply dropped"
+                    );
                 }
             }
         }

@@ -1,8 +1,8 @@
-//! Merges what several readers took of one writer's ring into one sequence: each message once, in the order
-//! of its number. Readers differ where they ask for different QoS or came at different times.
+//! Merges the samples that several readers took of one writer's ring into one sequence: each message once, in the
+//! order of its number. The readers ask for different QoS, or attached at different times.
 //!
-//! Whoever carries messages away from where they were written needs that: to another host, or to or from
-//! a process that shares no memory.
+//! The gateway and the relays need this order. They carry messages to another host, or to or from a process that
+//! shares no memory.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -258,7 +258,7 @@ mod tests {
         // 7 and 8 are of the one's three and the other's two.
         let found = all(&mut merge, &readers);
         assert_eq!(found, [(4, 0), (5, 0), (6, 0), (9, 2), (10, 0), (20, 5)]);
-        // Numbers that nobody lost were of nobody's samples. Who attached anew counts anew.
+        // A gap that no reader reports as lost was never a sample. A reader that attaches again counts from 0.
         readers.have(OTHER, [(30, 0), (40, 3)]);
         assert_eq!(all(&mut merge, &readers), [(30, 0), (40, 3)]);
     }

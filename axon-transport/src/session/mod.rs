@@ -1,9 +1,9 @@
-//! A process's way into AXON: publishers and subscriptions over shared memory, and the
-//! conversation with the daemon that brings them together.
+//! A process's access to AXON: publishers and subscriptions over shared memory, and the protocol with the daemon that
+//! matches them.
 //!
-//! Samples never pass the daemon. It tells readers and writers of each other and hands the
-//! descriptors over; when it dies, what is attached flows on, and the control thread `axon-ctl`
-//! finds or starts another and repeats what the first one knew.
+//! Samples never pass the daemon. The daemon announces readers and writers to each other and passes the descriptors
+//! on. When the daemon dies, attached pairs continue. The control thread `axon-ctl` finds or starts another daemon
+//! and repeats the announcements to it.
 
 mod announce;
 mod arrivals;

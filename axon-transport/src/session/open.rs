@@ -1,4 +1,4 @@
-//! How a session begins and ends: with a daemon, with none, or relayed by one.
+//! Opens and closes sessions: with a daemon, without one, or relayed by one.
 
 use std::sync::{Arc, Once};
 

@@ -1,9 +1,9 @@
 //! Pairs of endpoints within one session. The thread that creates the second endpoint attaches them, and
 //! the thread that drops the first one detaches them, before the call returns.
 //!
-//! The daemon tells of such a pair as of any other, and it stands already: asked by the same lane
-//! again, a writer repeats its grant. What it cannot do at once, such as for want of memory, is left
-//! to that.
+//! The daemon announces such a pair like any other, when the pair is already attached. A writer that is asked again
+//! for the same lane repeats its grant. If the thread cannot attach the pair at once, for example for lack of
+//! memory, the daemon's announcement attaches it later.
 
 use std::sync::{Arc, MutexGuard, PoisonError};
 

@@ -1,8 +1,8 @@
-//! The other sessions whose memory this one has mapped.
+//! The other sessions whose memory this session has mapped.
 //!
-//! The daemon hands a session's descriptors over once, with the first pair that needs them, and
-//! again only when the last such pair was over. This table counts the pairs exactly as the daemon
-//! does, so that both agree on what the session holds.
+//! The daemon sends a session's descriptors once, with the first pair that needs them, and again only after the last
+//! such pair has ended. This table counts the pairs exactly as the daemon does, so that both agree on the descriptors
+//! that the session holds.
 
 use std::{
     collections::{BTreeSet, HashMap, HashSet},

@@ -124,7 +124,7 @@ impl Publisher {
         Event::new(Source::Publisher(self.inner.clone()), kind, self.session.clone())
     }
 
-    /// ClientLimit for a sample of exactly `len` bytes, to serialize into: in shared memory where it is
+    /// Room for a sample of exactly `len` bytes, to serialize into: in shared memory where it is
     /// more than 4 KiB, or more than 512 bytes if so many are
     /// [expected](super::EndpointSpec::expected_len).
     ///
@@ -185,8 +185,8 @@ impl Drop for Publisher {
     }
 }
 
-/// A sample that is being written, from the front or as a slice. Dropped without
-/// [`publish`](Self::publish), it never was.
+/// A sample that the application writes in place, from the front or as a slice. Dropping the loan without
+/// calling [`publish`](Self::publish) discards the sample.
 pub struct Loan<'a> {
     loan: axon_shm::Loan<'a>,
     publisher: &'a PublisherInner,
@@ -303,7 +303,7 @@ impl PublisherInner {
         Self { endpoint, role, rings, events, asserts, relayed, attached, sending }
     }
 
-    /// Has it be alive when it is said to be, whatever its liveliness: its process is elsewhere.
+    /// Liveliness is asserted explicitly: the publisher runs in another process.
     pub(super) fn asserted(mut self) -> Self {
         self.asserts = self.endpoint.qos.lease.is_some();
         self.relayed = self.role == EndpointRole::Application;

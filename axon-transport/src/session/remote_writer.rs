@@ -1,5 +1,5 @@
-//! The local stand-in for a remote writer: a publisher, client or server here that speaks for one in
-//! another process, on this host or another. Gateway and relays write into it what arrives.
+//! Local stand-in for a remote writer: a publisher, client or server that represents one in another process, on this
+//! host or another. The gateway and relays write incoming messages to it.
 
 use axon_shm::{Meta, PublishError, Sample};
 

@@ -1,4 +1,4 @@
-//! The rings of a writing endpoint: one that all readers share, or for a server one for each client.
+//! The rings of a writing endpoint: one ring for all readers, or for a server one ring for each client.
 
 use std::{
     collections::BTreeMap,

@@ -1,10 +1,9 @@
-//! Services: requests that clients send to all servers, and responses that each server sends to the
-//! client that asked, and to nobody else.
+//! Services: requests that clients send to all servers, and responses that each server sends only to the client that
+//! asked.
 //!
-//! A client has one ring, which its servers read; a server has a ring for each of its clients. Of what
-//! was not taken a KEEP_ALL reader passes over nothing, and a KEEP_LAST one what is older than the newest
-//! of that client or server, as many as its depth. None of the rest is ever dropped to make room while
-//! its reader lives.
+//! A client has one ring, which its servers read; a server has a ring for each of its clients. A KEEP_ALL reader
+//! skips no untaken message. A KEEP_LAST reader keeps the newest untaken messages of each client or server, up to
+//! its depth, and skips older ones. No message within the depth is dropped to make room while its reader lives.
 
 use std::{fmt, sync::Arc, time::Duration};
 

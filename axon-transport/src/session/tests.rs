@@ -1,5 +1,5 @@
-//! A session whose daemon is played by the test: what it makes of what it is told, and in which
-//! order it says what.
+//! Tests of a session with a daemon that the test simulates: the session's reaction to messages, and the order of its
+//! own messages.
 
 mod followed;
 mod handed;

@@ -1,4 +1,4 @@
-//! The messages between sessions and their daemon (`docs/formats.md`). No other module knows the bytes.
-//! Plain data; every decoder bounds what it allocates.
+//! The messages between sessions and their daemon (`docs/formats.md`). No other module accesses the bytes.
+//! Plain data; every decoder limits its allocations.
 
 pub mod session;

@@ -170,7 +170,7 @@ fn a_daemon_that_is_told_to_end_sends_what_waits_first() {
     signal(there, Signal::STOP);
     publish(&publisher, 100);
     signal(hosts[0].status().pid, Signal::TERM);
-    hosts[0].wait_log(&["SIGTERM", "sent first"]);
+    hosts[0].wait_log(&["SIGTERM", "flushing samples"]);
     signal(there, Signal::CONT);
     assert!(take(&subscription, 100).into_iter().eq(1..=100));
     until("the daemon ends", || hosts[0].try_status().is_none());

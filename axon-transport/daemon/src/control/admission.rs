@@ -1,5 +1,5 @@
-//! Decides whether a process is accepted as a session: checks its user, and compares its HELLO with the
-//! daemon's settings. Runs on the control plane's thread.
+//! Decides whether a process is accepted as a session: checks its user, and compares its HELLO with the daemon's
+//! settings. Runs on the control plane's thread.
 
 use std::sync::Arc;
 

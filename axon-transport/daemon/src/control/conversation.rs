@@ -1,4 +1,4 @@
-//! The conversation with a session that was admitted: packets between its socket and the registry.
+//! The message exchange with an admitted session: passes packets between its socket and the registry.
 
 use std::{
     cell::RefCell,

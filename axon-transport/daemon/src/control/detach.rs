@@ -1,5 +1,5 @@
-//! A daemon's first steps in life: it leaves the session that started it, and reports to it over the
-//! start-up pipe. The session's end is in `session::daemon::spawn`.
+//! The first steps of a daemon: it leaves the session that started it, and reports to that session over the start-up
+//! pipe. The session's side is in `session::daemon::spawn`.
 
 use std::{
     io::Write,

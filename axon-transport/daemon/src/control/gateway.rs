@@ -1,4 +1,4 @@
-//! Runs the gateway on a thread of its own, and starts it again when it fails.
+//! Runs the gateway on a separate thread, and starts it again when it fails.
 
 use std::{
     cell::RefCell,

@@ -1,4 +1,4 @@
-//! Sessions' sockets: accepting connections and admitting sessions.
+//! The sockets for sessions: accepts connections and admits sessions.
 
 use std::{
     cell::RefCell,
@@ -132,7 +132,7 @@ pub(super) async fn serve(
         () = replaced => {
             return tracing::warn!(
                 pid = peer.pid,
-                "too many connections say nothing: one of them was closed for another"
+                "too many connections without HELLO: closed the oldest one of this process to accept a new one"
             );
         }
     };

@@ -1,8 +1,8 @@
-//! The control plane: brings the sessions of one user and domain on this host together, and with those on
+//! The control plane: matches the sessions of one user and domain on this host with each other, and with sessions on
 //! other hosts.
 //!
-//! It runs on the thread that calls [`run`]. The gateway to other hosts runs on a thread and runtime of its
-//! own; `gateway::bridge` is all they share. Samples between processes of this host pass neither.
+//! It runs on the thread that calls [`run`]. The gateway to other hosts has a separate thread and runtime; the two
+//! share only `gateway::bridge`. Samples between processes of this host pass neither.
 
 mod admission;
 mod conversation;

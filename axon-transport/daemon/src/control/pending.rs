@@ -1,5 +1,5 @@
-//! Limits the connections that have not said HELLO yet. If there are too many, the process with the most of
-//! them loses one.
+//! Limits the connections that have not sent HELLO yet. If there are too many, the daemon closes one connection of
+//! the process with the most of them.
 
 use std::{
     cell::RefCell,

@@ -92,7 +92,11 @@ impl Control {
             gateway: "off".into(),
             keys_of_sessions: Arc::default(),
             pool: Pool::new(config.reliable_queue),
-            probe: probe().inspect_err(|error| tracing::error!(%error, "no memory to try")).ok(),
+            probe: probe()
+                .inspect_err(
+                    |error| tracing::error!(%error, "could not create the shared-memory probe"),
+                )
+                .ok(),
             traffic: TrafficStatus::default(),
             wanted: watch::Sender::new(Wanted::of(&config, [])),
             names: BTreeMap::new(),

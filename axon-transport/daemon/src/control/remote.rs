@@ -1,5 +1,5 @@
-//! The control plane's dealings with other hosts: discovery says whom to dial, the gateway dials,
-//! and the registry learns what they have.
+//! Connects the control plane to other hosts: discovery selects the daemons to dial, the gateway dials them, and the
+//! registry receives their endpoints.
 
 use std::{cell::RefCell, collections::BTreeSet, net::IpAddr, rc::Rc, sync::Arc, time::Duration};
 
@@ -93,7 +93,7 @@ impl Remote {
             }
         };
         if tokio::time::timeout(FINISH, finish).await.is_err() {
-            tracing::warn!("the gateway does not say whether samples are on their way");
+            tracing::warn!("the gateway did not report its send queues in time; ending anyway");
         }
     }
 
@@ -111,7 +111,7 @@ impl Remote {
                         self.pause.wait().await;
                         match Running::start(control, entry) {
                             Ok(running) => self.running = Some(running),
-                            Err(error) => tracing::error!(%error, "the gateway has no thread"),
+                            Err(error) => tracing::error!(%error, "could not start the gateway's thread"),
                         }
                     }
                 },

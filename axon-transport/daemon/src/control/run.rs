@@ -1,4 +1,4 @@
-//! A daemon's life: from its first system call to its exit status.
+//! The life of a daemon: from its first system call to its exit status.
 
 use std::{
     cell::RefCell, ffi::OsString, io::Write as _, os::fd::OwnedFd, process::ExitCode, rc::Rc,
@@ -297,7 +297,7 @@ async fn serve(
     };
     match told {
         Some(signal) => {
-            tracing::info!("{signal}: what waits for other hosts is sent first");
+            tracing::info!("{signal}: flushing samples queued for other hosts before exit");
             tokio::select! {
                 () = remote.finish(&control) => {}
                 _ = terminate.recv() => tracing::info!("SIGTERM once more"),

@@ -1,7 +1,7 @@
-//! The part of the daemon's status about topics.
+//! The topics in the daemon's status.
 //!
-//! What publishers and readers count is read from the descriptors of their sessions' segments: the
-//! daemon maps no session's memory.
+//! The daemon reads the counters of publishers and readers through the descriptors of their sessions' segments. It
+//! maps no session's memory.
 
 use std::{
     cmp::Reverse,

@@ -1,7 +1,7 @@
 //! Shares the control plane's one thread fairly between processes: a process may have many sessions.
 //!
-//! What a session asks for is done in parts of about [`PART`], and of one process one part at a time.
-//! After each the others are served, so that a process that asks for much waits for itself.
+//! The daemon handles a session's requests in parts of about [`PART`], and one part of one process at a time. After
+//! each part it serves the other processes, so that a process with many requests delays only itself.
 
 use std::{
     collections::HashMap,

@@ -1,4 +1,4 @@
-//! How sure it is that a daemon is at an address, from a proven link down to an unverified beacon.
+//! How strongly an address of a daemon is verified, from a proven link down to an unverified beacon.
 
 /// What speaks for a daemon being where a beacon puts it, the best first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]

@@ -1,8 +1,9 @@
-//! Discovery: which daemons are there, and which of them to dial.
+//! Discovery: which daemons exist, and which of them to dial.
 //!
-//! [`wire::beacon`](crate::wire::beacon) is the wire format, [`Peers`] the state machine, [`socket`] the shared UDP port, and
-//! [`run`] the task that ties them together. Datagrams from and to QUIC ports pass through whoever
-//! owns the QUIC socket. All of it is unauthenticated: it says whom to try, never whom to trust.
+//! [`wire::beacon`](crate::wire::beacon) is the wire format, [`Peers`] the state machine, [`socket`] the shared
+//! UDP port, and [`run`] the task that ties them together. Discovery sends from QUIC ports through the gateway,
+//! whose `DemuxSocket` takes received discovery datagrams out of QUIC's. Discovery is unauthenticated: it selects
+//! addresses to dial and proves nothing.
 
 #![forbid(unsafe_code)]
 

@@ -1,4 +1,4 @@
-//! The task that gives [`Peers`] its clock, its sockets and its events.
+//! The task that supplies [`Peers`] with its clock, its sockets and its events.
 
 use std::{
     collections::{BTreeMap, BTreeSet},

@@ -1,8 +1,8 @@
 //! The UDP port that all daemons of a domain on this host share.
 //!
-//! Multicast and broadcast reach every socket bound to it; a unicast datagram would reach one of
-//! them only, so none is ever sent there. Each local address sends through a socket of its own,
-//! bound to it: the source of a beacon is where its sender is dialled.
+//! Multicast and broadcast reach every socket that is bound to the port. A unicast datagram would reach only one of
+//! them, so no daemon sends one there. Each local address has a separate socket that is bound to it and sends from
+//! it, because the source address of a beacon is the address at which its sender is dialled.
 
 use std::{
     io,

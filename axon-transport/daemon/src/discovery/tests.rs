@@ -1,4 +1,4 @@
-//! Real sockets on this host's loopback interface.
+//! Tests with real sockets on this host's loopback interface.
 
 use std::{net::SocketAddr, time::Duration};
 

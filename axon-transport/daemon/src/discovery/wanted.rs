@@ -1,4 +1,4 @@
-//! The range and the peers that a daemon's sessions need of discovery together.
+//! The union of the ranges and peers that a daemon's sessions need from discovery.
 
 use std::collections::BTreeSet;
 

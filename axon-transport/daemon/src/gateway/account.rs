@@ -1,8 +1,7 @@
 //! Limits what one peer may make this daemon hold, over all of its daemon ids and links.
 //!
-//! A peer is an identity here: the SAE, pinned name or certificate's host that it proved, its address
-//! where nothing is proved. What counts for a [`Meter`] is held by a [`Charge`] and given back when
-//! that is dropped.
+//! A peer here is an identity: its proven SAE ID, pinned name or certificate host, else its address. A
+//! [`Charge`] holds what counts for a [`Meter`], and gives it back when it is dropped.
 
 use std::{
     collections::HashMap,

@@ -1,7 +1,7 @@
 //! Limits what the hosts behind one address may take of the daemon's handshakes and links.
 //!
-//! Keys can be made up, a source address that QUIC validated cannot: it is what is shared by.
-//! Hosts behind one translated address share it, so sharing begins only where there is scarcity.
+//! Limits are per source address: QUIC validates the address, while an attacker can create any number of keys.
+//! Hosts behind one translated address share it, so the limits apply only where there is scarcity.
 
 use std::{
     collections::{HashMap, VecDeque},

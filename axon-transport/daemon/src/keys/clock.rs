@@ -1,4 +1,4 @@
-//! The one time that all key machines share.
+//! The clock that all key state machines share.
 
 use std::{
     sync::{

@@ -1,4 +1,4 @@
-//! `dec_keys` for announced key_IDs: again with the same IDs, then one by one, then given up.
+//! Fetches announced key_IDs with `dec_keys`: retries with the same IDs, then one by one, then gives up.
 
 use std::{collections::VecDeque, time::Duration};
 

@@ -1,10 +1,9 @@
-//! KME keys: where they come from, what each of them may be used for, and when they end.
+//! KME keys: their source, the permitted use of each key, and its end.
 //!
-//! [`bootstrap`] gives a link its first key (the TLS external PSK), [`verifier`] proves the
-//! client's name over it, [`supply`] keeps `messages10` in envelope keys. They are state machines
-//! (`docs/architecture.md`): `poll_request` gives what is to be asked of the KME, `handle_answer` takes
-//! the [`Answer`]. [`kme`] alone talks to the KME. Every `now` is the time of the daemon's one
-//! [`Clock`].
+//! [`bootstrap`] gives a link its first key (the TLS external PSK), [`verifier`] proves the client's name over it,
+//! and [`supply`] provides `messages10` with envelope keys. They are state machines (`docs/architecture.md`):
+//! `poll_request` returns the next request to the KME, and `handle_answer` takes the [`Answer`]. Only [`kme`] talks
+//! to the KME. Every `now` is the time of the daemon's one [`Clock`].
 
 #![forbid(unsafe_code)]
 

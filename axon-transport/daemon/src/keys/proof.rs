@@ -1,4 +1,4 @@
-//! The proof in READY: its sender holds the key, and means this connection (docs/formats.md,
+//! The proof in READY: it shows that its sender holds the key, and binds the key to this connection (docs/formats.md,
 //! section 2).
 
 use axon_envelope::{KeyId, KmeKey};

@@ -1,4 +1,4 @@
-//! The requests that key machines make to the KME, and the answers.
+//! The requests of key state machines to the KME, and the answers.
 
 use std::{fmt, time::Duration};
 

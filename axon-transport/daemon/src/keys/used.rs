@@ -1,5 +1,5 @@
-//! The key_IDs that this host's KME gave before, over restarts of the daemon: a KME that gives a key
-//! a second time is noticed, and the key is not used.
+//! Records the key_IDs that this host's KME returned before, over restarts of the daemon. If a KME returns a key a
+//! second time, the daemon detects it and does not use the key.
 
 use std::{
     collections::VecDeque,

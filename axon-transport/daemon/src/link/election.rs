@@ -1,4 +1,4 @@
-//! Elects which of two connections between the same daemons stays.
+//! Decides which of two connections between the same daemons stays.
 
 use axon_shm::ids::DaemonId;
 

@@ -1,4 +1,4 @@
-//! What two daemons must agree on before a link carries anything.
+//! The terms on which two daemons must agree before a link carries data.
 
 use axon_shm::ids::DaemonId;
 use axon_transport::config::{Config, Security};

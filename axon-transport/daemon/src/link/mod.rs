@@ -1,5 +1,5 @@
-//! The protocol between two daemons: frames of the control stream, what HELLO must agree on, the
-//! order in which a connection becomes a link, and which of two connections stays.
+//! The protocol between two daemons: frames of the control stream, the terms that HELLO must agree on, the order in
+//! which a connection becomes a link, and the choice between two connections.
 //!
 //! Plain data in, data out (`docs/formats.md`, section 6); the gateway owns the sockets.
 

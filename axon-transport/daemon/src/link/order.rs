@@ -1,7 +1,7 @@
 //! The order in which a connection becomes a link.
 //!
-//! HELLO both ways, in qkd the proof of the client's name, ELECTED by the lower daemon id; graph,
-//! routes, data and ordinary keys only after that (`docs/formats.md`, section 6).
+//! Both sides send HELLO. In qkd the client proves its name. The side with the lower daemon id sends ELECTED. Only
+//! after that may graph, routes, data and ordinary keys follow (`docs/formats.md`, section 6).
 
 use crate::wire::{keys::KeyMessage, link::Message};
 

@@ -1,4 +1,4 @@
-//! HELLO, and the order of messages.
+//! Tests HELLO, and the order of messages.
 
 use super::*;
 use crate::wire::{

@@ -1,4 +1,4 @@
-//! Discovery datagrams: bytes to values and back (formats, section 5).
+//! Encodes and decodes discovery datagrams (formats, section 5).
 
 use std::{net::IpAddr, ops::RangeInclusive};
 

@@ -1,6 +1,6 @@
-//! The encodings of messages between daemons, and of beacons. One file a section of `docs/formats.md`, and no
-//! other module knows the bytes. Plain data; every decoder bounds what it allocates. The messages between
-//! sessions and their daemon are `axon-transport`'s.
+//! The encodings of messages between daemons, and of beacons. Each file covers one section of `docs/formats.md`, and
+//! no other module accesses the bytes. Plain data; every decoder limits its allocations. The messages between
+//! sessions and their daemon are in `axon-transport`.
 
 pub mod beacon;
 pub mod keys;

@@ -209,7 +209,7 @@ pub(super) fn publish_and_end(session: &Session) {
 
 /// Samples that a process counted as lost when it ended, by its log.
 fn given_up(log: &[String]) -> u64 {
-    let lost = log.iter().filter(|line| line.contains("no daemon confirmed them: lost"));
+    let lost = log.iter().filter(|line| line.contains("gave up samples: no daemon confirmed them"));
     lost.filter_map(|line| {
         let (_, count) = line.split_once("samples=")?;
         count.split_whitespace().next()?.parse::<u64>().ok()

@@ -1,5 +1,5 @@
-//! Allocates ranges of a segment: first fit from the bottom, so that little more memory is touched than is
-//! in use. Plain data; the owner of the segment calls it under a lock.
+//! Allocates ranges of a segment: first fit from the bottom, so that allocations touch little more memory than
+//! they use. Plain data; the owner of the segment calls it under a lock.
 
 use std::ops::Range;
 

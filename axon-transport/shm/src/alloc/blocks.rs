@@ -1,5 +1,5 @@
-//! Blocks that a ring keeps for its next samples of up to 4 KiB, so that a steady publish asks
-//! nobody for memory. Plain data, no shared memory.
+//! Blocks that a ring keeps for its next samples of up to 4 KiB, so that a publisher in steady state allocates
+//! nothing. Plain data, no shared memory.
 
 use std::collections::BTreeMap;
 

@@ -1,7 +1,6 @@
-//! The sizes of slots: four an octave, in whole pages.
+//! The size classes of slots: four for each power of two, in whole pages.
 //!
-//! A slot that a sample leaves can then be used by any other of about its size, and at most a
-//! quarter of it, or a page, is left over.
+//! Any sample of about the same size can reuse a free slot. At most a quarter of the slot, or a page, is wasted.
 
 /// Slots are multiples of this many bytes.
 pub(crate) const PAGE: u64 = 4096;

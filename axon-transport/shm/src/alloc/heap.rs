@@ -1,7 +1,7 @@
-//! A session's memory for objects: lanes, rings, their descriptors, and samples of up to 4 KiB. In
-//! the session's first segment for as long as that has room, then in further ones.
+//! A session's memory for objects: lanes, rings, their descriptors, and samples of up to 4 KiB. Objects are in the
+//! session's first segment while it has room, then in further segments.
 //!
-//! Used when something attaches or grows, not by a steady publish.
+//! The session allocates objects when an endpoint attaches or a ring grows, not for a publish in steady state.
 
 use std::{
     sync::{Arc, Mutex, MutexGuard, PoisonError, atomic::AtomicU64},

@@ -1,5 +1,5 @@
-//! Allocation of a session's own memory: segments, objects, slots for large samples, and limits for what
-//! readers keep.
+//! Allocation of a session's own memory: segments, objects, slots for large samples, and limits for the samples
+//! that readers pin.
 
 pub(crate) mod area;
 pub(crate) mod blocks;

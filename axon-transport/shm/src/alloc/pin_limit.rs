@@ -1,6 +1,6 @@
-//! Limits the length of the samples that a reader may pin, so that readers never keep all of a publisher's
-//! memory: two readers may pin samples of any length, many may pin shorter ones, and readers copy what is
-//! longer. Plain data; the publisher computes a reader's limit when it attaches, and the grant carries it.
+//! Limits the length of the samples that a reader may pin, so that readers never keep all of a publisher's memory.
+//! Two readers may pin samples of any length, and many readers may pin shorter ones. Readers copy longer samples.
+//! Plain data; the publisher computes a reader's limit when the reader attaches, and the grant carries the limit.
 
 use crate::{
     alloc::classes,

@@ -1,5 +1,5 @@
-//! Retention policy for large-sample memory: a publisher keeps it as long as it publishes large samples,
-//! and about as much as they need. Plain data; the caller says what time it is.
+//! Retention policy for large-sample memory: a publisher keeps the memory as long as it publishes large samples,
+//! and keeps about as much as they need. Plain data; the caller passes the time.
 
 use std::time::{Duration, Instant};
 

@@ -1,5 +1,5 @@
-//! The memory of a publisher's samples that readers read in place: samples that were given up stay
-//! in the retire list until no reader pins them. Plain data, no shared memory.
+//! The memory of a publisher's samples that readers read in place: samples that the publisher gave up stay in the
+//! retire list until no reader pins them. Plain data, no shared memory.
 
 use std::ops::Range;
 

@@ -1,14 +1,12 @@
-//! Which bytes of a segment are free to hold large samples: plain data of the publisher alone.
+//! The free bytes of a segment that can hold large samples: plain data of the publisher alone.
 //!
-//! A slot that comes back goes on top of a list of its [class](super::classes), and the next
-//! sample of that class takes it from there: its memory is warm in the caches. When a class has
-//! none, memory that is backed and in no list serves, then a slot of one of the next larger
-//! classes. Only when all of that fails are the lists given up, what touches is joined, and the
-//! lowest place that is large enough is taken, so that memory grows last.
+//! A returned slot goes on top of the list of its [class](super::classes), and the next sample of that class takes
+//! it from there, because its memory is warm in the caches. If the list is empty, the allocator takes backed memory
+//! that is in no list, then a slot of one of the next larger classes. Only if all of that fails does it empty the
+//! lists, join adjacent ranges, and take the lowest range that is large enough, so that memory grows last.
 //!
-//! Slots that fit in a core's own cache are [taken in turns](Slots::take_turn) as well: to write to
-//! the one that was read last, the writer would have to wait for the reader's core to hand over each
-//! line of it.
+//! Slots that fit in a core's own cache are also [used in rotation](Slots::take_turn). If the publisher wrote to the
+//! slot that was read last, each cache line would first have to move from the reader's core.
 
 use std::ops::Range;
 

@@ -1,5 +1,5 @@
-//! How a subscriber and a publisher find each other over a connected socket, without a daemon: one
-//! packet there, one back, and over a socket of their own one for each segment of memory (`docs/formats.md`, section 9).
+//! Connects a subscriber and a publisher over a connected socket, without a daemon. Each side sends one packet. A
+//! further socket carries one packet for each segment of memory (`docs/formats.md`, section 9).
 
 use std::{
     cell::Cell,

@@ -1,5 +1,5 @@
-//! The context that the publishers and subscribers of a process share where there is no daemon: its memory,
-//! its doorbell, and the other contexts that it has mapped.
+//! The context that the publishers and subscribers of a process share without a daemon: its memory, its doorbell,
+//! and the other contexts that it has mapped.
 
 use std::{
     collections::HashMap,

@@ -1,5 +1,5 @@
-//! Tells subscribers of a context's segments where there is no daemon. Each subscriber has a socket of its
-//! own (a line), over which it hears of new and closed segments.
+//! Announces a context's segments to subscribers, without a daemon. Each subscriber has a socket of its own (a
+//! line), over which it receives news of opened and closed segments.
 
 use std::{
     os::fd::{AsFd, BorrowedFd},

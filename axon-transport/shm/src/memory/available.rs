@@ -1,8 +1,7 @@
-//! How many bytes of memory this process may still take: the least that the host and the process's control
-//! groups have left.
+//! The number of bytes of memory that this process may still allocate: the minimum of the remaining memory of the
+//! host and of the process's control groups.
 //!
-//! Exceeding a control group's limit gets a process killed rather than an error, so rings ask
-//! before they grow.
+//! A process that exceeds a control group's limit is killed and gets no error, so rings check before they grow.
 
 use std::{fs::File, io::Read as _, path::Path};
 

@@ -1,8 +1,8 @@
-//! Copies of memory that others may write to meanwhile.
+//! Copies of memory that other processes may write to during the copy.
 //!
-//! Such memory has no references as bytes, only as words that are atomic. What is copied may be of
-//! different times where somebody does write: samples that are copied out are checked afterwards,
-//! samples that are pinned stay as they are unless their publisher breaks the protocol.
+//! No byte references to such memory exist, only references to atomic words. If another process writes during the
+//! copy, the copy may mix old and new words. The reader checks copied samples afterwards. Pinned samples do not
+//! change unless their publisher breaks the protocol.
 
 #![allow(unsafe_code)]
 

@@ -1,4 +1,4 @@
-//! Pages for secrets: not swapped out, not part of a core file, and empty in a forked child.
+//! Pages for secrets: they are not swapped out, not part of a core file, and empty in a forked child.
 
 // Mapped memory has no safe interface.
 #![allow(unsafe_code)]

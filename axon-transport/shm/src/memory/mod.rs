@@ -1,5 +1,4 @@
-//! Memory that is shared: sealed memfds, the maps over them, and how much of either there may be. And pages
-//! that nobody shares.
+//! Shared memory: sealed memfds, the maps over them, and limits for both. Also private pages for secrets.
 
 pub(crate) mod available;
 pub(crate) mod copy;

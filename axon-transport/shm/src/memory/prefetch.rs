@@ -1,4 +1,4 @@
-//! Asking for memory ahead of its use.
+//! Prefetches cache lines before they are used.
 
 #![allow(unsafe_code)]
 

@@ -1,5 +1,5 @@
-//! Finds out whether this process can share memory with another one: a security module or a sandbox may
-//! refuse. Sessions try it on the daemon's probe when they connect.
+//! Finds out whether this process can share memory with another process: a security module or a sandbox may
+//! refuse. A session maps the daemon's probe when it connects.
 
 #![allow(unsafe_code)]
 

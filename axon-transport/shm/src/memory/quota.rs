@@ -1,5 +1,5 @@
-//! Limits the address space that the memory of other processes may take here. A peer's segment is mapped
-//! before it is used, and a process without free address space cannot go on.
+//! Limits the address space that the memory of other processes may take in this process. A peer's segment is
+//! mapped before it is used, and a process without free address space cannot continue.
 
 use std::sync::{
     Arc,

@@ -1,12 +1,12 @@
 //! Replaces writable maps by inaccessible pages in a forked child.
 //!
-//! Writable maps are absent in a child, so that it cannot be a second writer. But a slice of one may have
-//! been borrowed before the fork, and whatever the child maps next may come to lie under it. A child of
-//! `fork` therefore begins by putting inaccessible pages in their places: using such a slice ends it.
+//! Writable maps are absent in a child, so that the child cannot be a second writer. But a slice of a map may have
+//! been borrowed before the fork, and the child's next map may be placed at the same address. A child of `fork`
+//! therefore begins by putting inaccessible pages in place of the maps: an access to such a slice ends the child.
 //!
-//! A child of `_Fork`, or of `clone` without shared memory, runs no handler, and where one that was
-//! registered earlier has mapped something there, that stays. There such a slice shows what it should
-//! not: this is a net, and what is safe without it asks whether it is in a child.
+//! A child of `_Fork`, or of `clone` without shared memory, runs no handler. A handler that was registered earlier
+//! may have mapped something in that place, which then stays. In such a child the slice reads foreign memory. This
+//! is a second line of defence; safe code checks `is_forked`.
 
 #![allow(unsafe_code)]
 

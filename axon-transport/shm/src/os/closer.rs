@@ -1,4 +1,4 @@
-//! Threads (`axon-close`) that close descriptors received from other processes, since closing one may
+//! Threads (`axon-close`) that close descriptors received from other processes, because closing a descriptor may
 //! block.
 
 use std::{

@@ -1,8 +1,8 @@
-//! Descriptors that go from process to process, and how those of others are closed.
+//! Descriptors that processes pass to each other, and the way in which received descriptors are closed.
 //!
-//! Closing one may block for as long as whoever sent it likes: a TCP socket that lingers over unsent
-//! data, a file of a user's own file system, a unix socket in whose queue either of them waits. None
-//! is therefore closed on a thread that has anything else to do.
+//! The sender of a descriptor can make its close block for an arbitrary time: a TCP socket that lingers over unsent
+//! data, a file of a user's own file system, or a unix socket with either of them in its queue. Therefore only
+//! threads that have no other work close such descriptors.
 
 use std::{
     fmt,

@@ -1,8 +1,8 @@
-//! Detects that the calling process is a fork of the one that created an object.
+//! Detects that the calling process is a fork of the process that created an object.
 //!
-//! Writable maps do not survive a fork, so a child must be told before it touches one. Asking the
-//! kernel for the process id would be a system call on each publish; a page that the kernel wipes
-//! in a child costs one load.
+//! Writable maps do not survive a fork, so a child must detect the fork before it accesses a map. Reading the
+//! process id from the kernel would cost a system call for each publish. A page that the kernel wipes in a child
+//! costs one load.
 
 #![allow(unsafe_code)]
 

@@ -1,4 +1,4 @@
-//! An allocator that erases what is given back to it, and memory that goes back to the system.
+//! An allocator that erases freed memory, and a function that returns free memory to the system.
 
 // An allocator has no safe interface.
 #![allow(unsafe_code)]

@@ -1,8 +1,8 @@
-//! What a daemon inherits from the application that starts it and must not keep.
+//! Removes the state that a daemon inherits from the application that starts it and must not keep.
 //!
-//! Descriptors that an application left open across exec: a port that its daemon kept open would
-//! stay taken when the application is long gone. A limit on the size of files: the signal that
-//! enforces it would end the daemon at a log line.
+//! - Descriptors that the application left open across exec: a port that the daemon kept open would stay in use long
+//!   after the application has ended.
+//! - A limit on the size of files: the signal that enforces the limit would end the daemon at a log line.
 
 #![allow(unsafe_code)]
 

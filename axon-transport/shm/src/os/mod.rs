@@ -1,5 +1,5 @@
 //! System calls that need `unsafe` or care: descriptors of other processes, forks, signals, clocks, the heap, and a
-//! lock that hands its priority on.
+//! lock with priority inheritance.
 
 pub(crate) mod atfork;
 pub(crate) mod clock;

@@ -1,4 +1,4 @@
-//! State of which each process has one, and a forked child makes its own; the rights of the process.
+//! Per-process singletons; a forked child creates its own. Also the privileges of the process.
 
 #![allow(unsafe_code)]
 

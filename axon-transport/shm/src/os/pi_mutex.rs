@@ -1,15 +1,15 @@
-//! A mutex between the threads of one process with priority inheritance: while a thread of high
-//! priority waits for it, its holder runs at that priority, so that a thread in between cannot
-//! keep both from the processor. Publishing takes it, and `SCHED_FIFO` threads publish.
+//! A mutex between the threads of one process with priority inheritance. While a thread of high priority waits for
+//! the mutex, its holder runs at that priority, so that a thread of a priority in between cannot keep both from the
+//! processor. Publishing takes the mutex, and `SCHED_FIFO` threads publish.
 //!
-//! Taken without contention it costs two atomic operations; otherwise the kernel hands it on
-//! (`FUTEX_LOCK_PI`, futex(2)). Where the kernel refuses to, those who wait look again and again,
-//! with naps in between that let any holder run; then nothing is inherited. A panic while it is held does not poison it. Nothing of it is
-//! shared between processes.
+//! Without contention the mutex costs two atomic operations. With contention the kernel passes it on
+//! (`FUTEX_LOCK_PI`, futex(2)). If the kernel refuses, waiters poll, and sleep in between so that any holder can run;
+//! then there is no priority inheritance. A panic while the mutex is held does not poison it. No part of it is shared
+//! between processes.
 //!
-//! The kernel knows a holder by its thread's id. A forked child's only thread has another one than
-//! in the parent, and the threads that may hold a lock are not there: a child must not touch a
-//! mutex of its parent, which is what [`ForkToken`] is asked for. Mutexes of its own work.
+//! The kernel identifies a holder by its thread id. A forked child's only thread has another id than in the parent,
+//! and the parent's other threads, which may hold a lock, do not exist in the child. A child must therefore not touch
+//! a mutex of its parent; [`ForkToken`] tells whether it is in a child. Mutexes that the child creates work.
 
 #![allow(unsafe_code)]
 

@@ -1,4 +1,4 @@
-//! Signals belong to the application's threads: none is delivered to ours.
+//! Blocks signals in AXON's own threads: signals belong to the application's threads.
 
 #![allow(unsafe_code)]
 

@@ -1,4 +1,4 @@
-//! Which offered and requested profiles go together, as DDS and ROS 2 define it.
+//! Compatibility of offered and requested profiles, as DDS and ROS 2 define it.
 
 use std::{fmt, time::Duration};
 

@@ -1,7 +1,7 @@
-//! Quality of service: the policies under their ROS 2 names, and which offered and requested
-//! profiles go together.
+//! Quality of service: the policies under their ROS 2 names, and the compatibility of offered and requested
+//! profiles.
 //!
-//! Plain data; no I/O. Of periods, `None` is infinite.
+//! Plain data; no I/O. For periods, `None` is infinite.
 
 mod matching;
 pub(crate) mod nanoseconds;

@@ -1,5 +1,5 @@
-//! Periods as they are on every wire and in shared memory: nanoseconds, in 64 bits. A longer one, of over 584
-//! years, is as good as the longest.
+//! Periods as they are on every wire and in shared memory: nanoseconds, in 64 bits. A longer period, of over 584
+//! years, is encoded as the longest one.
 
 use std::time::Duration;
 

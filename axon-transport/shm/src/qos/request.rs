@@ -1,4 +1,5 @@
-//! A profile as a caller asks for it, where a policy may be left to AXON or to what is there.
+//! A profile as a caller requests it. The caller can leave a policy to AXON's default or to the endpoints in the
+//! graph.
 
 use std::time::Duration;
 

@@ -1,4 +1,4 @@
-//! Matching against the rules of ROS 2, written out a second time as a table.
+//! Tests matching against the rules of ROS 2, which are written out a second time as a table.
 
 use std::time::Duration;
 

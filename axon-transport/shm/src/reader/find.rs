@@ -1,4 +1,4 @@
-//! How a reader finds the next sample: past what is skipped or lost, in memory that may not have come.
+//! Finds a reader's next sample: passes skipped and lost samples, and handles segments that have not arrived yet.
 
 use std::{
     ops::Range,

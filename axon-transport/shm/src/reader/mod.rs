@@ -1,4 +1,4 @@
-//! The taking end of a ring.
+//! The reading end of a ring.
 
 mod find;
 pub(crate) mod sample;

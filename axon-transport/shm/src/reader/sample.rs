@@ -1,4 +1,4 @@
-//! A sample that was taken without being copied.
+//! A sample that a reader took without copying it.
 
 #![allow(unsafe_code)]
 

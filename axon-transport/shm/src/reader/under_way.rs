@@ -1,5 +1,5 @@
-//! Samples that a reader took and has not finished, because another process or host is still to confirm
-//! them. Relays use it: the publisher keeps such samples until the relay says that they arrived.
+//! Samples that a reader took and that another process or host still has to confirm. Relays use this: the publisher
+//! keeps such samples until the relay says that they arrived.
 
 use std::collections::VecDeque;
 

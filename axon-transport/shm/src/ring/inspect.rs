@@ -1,5 +1,5 @@
-//! Reads the counters of rings and lanes from a segment's descriptor, without mapping it. The daemon uses
-//! it for `axon status`. The values are what another process wrote, and are not to be trusted.
+//! Reads the counters of rings and lanes from a segment's descriptor, without mapping the segment. The daemon uses
+//! it for `axon status`. Another process wrote the values, so they are not trusted.
 
 use std::os::fd::BorrowedFd;
 

@@ -1,4 +1,4 @@
-//! Where things are in the segments, in words of eight bytes (`docs/formats.md`, shared memory).
+//! The layout of segments, in words of eight bytes (`docs/formats.md`, shared memory).
 
 use std::sync::atomic::AtomicU64;
 

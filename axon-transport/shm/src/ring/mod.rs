@@ -1,4 +1,4 @@
-//! What is in shared memory, word by word, and the order in which it is written and read. No calls of the system.
+//! The layout of shared memory, word by word, and the order in which it is written and read. No system calls.
 
 pub(crate) mod inspect;
 pub(crate) mod layout;

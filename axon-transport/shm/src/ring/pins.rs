@@ -1,17 +1,16 @@
-//! Hazard pins over plain words: how a reader keeps a large sample in place while it reads it, and
-//! a publisher never waits for that.
+//! Hazard pins over plain words: a reader keeps a large sample in place while it reads the sample, and the
+//! publisher never waits for the reader.
 //!
-//! A reader stores the position in a record of its lane, fences, and looks at the tail: if that is
-//! still at or below the position, the sample stays until the record is cleared. The publisher
-//! raises the tail above the samples that it wants to reuse, fences, and looks at the records of
-//! every reader that may have one; what is pinned it leaves alone.
+//! The reader stores the position in a record of its lane, fences, and loads the tail. If the tail is still at or
+//! below the position, the sample stays until the record is cleared. The publisher raises the tail above the
+//! samples that it wants to reuse, fences, and loads the records of every reader that may have a pin. It leaves
+//! pinned samples alone.
 //!
-//! The two fences have an order. If the reader's comes first, the publisher sees the pin, or what
-//! the same reader stored there after it was done. If the publisher's comes first, the reader sees
-//! the tail and lets go. So whoever reads on has been seen.
+//! The two fences have an order. If the reader's fence comes first, the publisher sees the pin, or a later
+//! store of the same reader to that record. If the publisher's fence comes first, the reader sees the tail and gives
+//! the sample up. So the publisher has seen every reader that continues.
 //!
-//! A pin names a position, of which each is used once, and not a place: one that is out of date
-//! keeps nothing.
+//! A pin names a position, not a place, and each position is used once: a stale pin has no effect.
 
 use crate::{
     ring::layout::lane::PINS,

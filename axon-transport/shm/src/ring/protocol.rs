@@ -1,14 +1,14 @@
-//! The ring's protocol over plain words: what a publisher stores and what a reader believes.
+//! The ring's protocol over plain words: the stores of a publisher and the checks of a reader.
 //!
-//! A descriptor's stamp says which position stands in it; whoever sees the stamp sees the sample,
-//! so that one who waits for the next sample looks at one line. The head says the same of all
-//! below it, to those that have fallen behind.
+//! A descriptor's stamp says which position the descriptor holds. The stamp is stored with release after the
+//! sample, so a reader that sees the stamp sees the sample. A reader that waits for the next sample polls one
+//! cache line. A lagging reader uses the head instead, which covers all positions below it.
 //!
-//! A reader copies first and checks afterwards, except for large samples, which it
-//! [pins](super::pins). The publisher raises the tail above a position before it reuses that
-//! position's descriptor or block; a reader that finds the tail still at or below its position
-//! after the copy has copied what was published. In the same way it finds out that the descriptors
-//! have moved to a larger array, and the memory of the old one has gone to others.
+//! A reader copies first and checks afterwards. Large samples are the exception: the reader [pins](super::pins)
+//! them. The publisher raises the tail above a position before it reuses that position's descriptor or block. A
+//! reader that finds the tail still at or below its position after the copy has copied the published sample. In the
+//! same way the reader finds out that the descriptors have moved to a larger array, and that the memory of the
+//! old array has been reused.
 
 use std::ops::Range;
 

@@ -1,4 +1,4 @@
-//! How many samples of a ring are kept for a QoS profile.
+//! The number of samples that a ring keeps for a QoS profile.
 
 use crate::qos::{Durability, History, Qos, Reliability};
 

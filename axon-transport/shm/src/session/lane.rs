@@ -1,10 +1,10 @@
-//! The lane of a reader: its cursor, pins and counters, in its own session's segment, where the publisher
-//! reads them.
+//! The lane of a reader: its cursor, pins and counters. The lane is in the segment of the reader's session, where
+//! the publisher reads it.
 //!
-//! Its first word says who uses it: 0 nobody; with its highest bit set, a reader that has
-//! not seen its grant yet; any other value is the grant's. No value is used twice, so a publisher
-//! that knows what the word was when the reader asked, and what it granted, knows when the lane
-//! has passed on to somebody else.
+//! The first word of a lane identifies its user. 0 means that nobody uses the lane. A value with the highest bit set
+//! means that a reader has not seen its grant yet. Any other value is the grant's. No value is used twice. A
+//! publisher knows the word from the time of the reader's request, and the value that it granted. So it can detect
+//! that another reader uses the lane.
 
 use std::sync::{Arc, atomic::AtomicU64};
 

@@ -1,5 +1,4 @@
-//! A session, as its own process has it and as others see it: segments, doorbell, lanes, and what readers hold
-//! of it.
+//! A session, as its own process and as other sessions see it: segments, doorbell, lanes, and pinned samples.
 
 pub(crate) mod attachment;
 pub(crate) mod lane;

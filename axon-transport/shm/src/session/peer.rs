@@ -1,5 +1,4 @@
-//! Another session as this one sees it: its mapped segments, its doorbell, and whether its process is
-//! alive.
+//! Another session as this session sees it: its mapped segments, its doorbell, and whether its process is alive.
 
 use std::{
     collections::{BTreeMap, BTreeSet},

@@ -1,4 +1,4 @@
-//! What a reader tells a publisher when it attaches.
+//! The data that a reader sends to a publisher when it attaches.
 
 use crate::{ids::Gid, qos::Qos, ring::layout::Location, session::peer::Peer};
 

@@ -1,5 +1,5 @@
-//! A session's own memory: its segments, its lanes, and the words that say which of its threads sleep.
-//! Other sessions know it by its descriptors.
+//! A session's own memory: its segments, its lanes, and the words that say which of its threads sleep. Other
+//! sessions access it through its descriptors.
 
 use std::{
     os::fd::{AsFd, BorrowedFd, OwnedFd},

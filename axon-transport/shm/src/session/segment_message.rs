@@ -1,5 +1,5 @@
-//! How one process tells another of its segments: as CBOR, over the socket by which they met or by way of
-//! the daemon (`docs/formats.md`, sections 8 and 9).
+//! The message by which one process announces its segments to another. It is CBOR. It goes over the socket by which
+//! the processes connected, or through the daemon (`docs/formats.md`, sections 8 and 9).
 
 use minicbor::{Decode, Encode};
 

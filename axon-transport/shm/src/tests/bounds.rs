@@ -1,4 +1,4 @@
-//! What one process can take of another: only so much.
+//! Limits on the resources that one process can take from another.
 
 use super::*;
 use crate::{memory::segment::Segment, session::pin_lanes::OF_PROCESS};

@@ -1,5 +1,5 @@
-//! Descriptors and memory that no honest process hands over: refused or reported, never a panic,
-//! a hang or a read outside the segment.
+//! Descriptors and memory that no honest process sends: they are refused or reported, and never cause a panic, a
+//! hang or a read outside the segment.
 
 use std::{
     os::fd::{AsFd, OwnedFd},

@@ -1,4 +1,4 @@
-//! Images at depth one beside other topics, at the sizes that AXON's settings are by default.
+//! Images at depth one beside other topics, at AXON's default sizes.
 
 use std::{collections::VecDeque, thread};
 

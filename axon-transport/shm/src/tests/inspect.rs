@@ -1,4 +1,4 @@
-//! What the status reads of rings and lanes.
+//! Tests the values that the status reads from rings and lanes.
 
 use std::os::fd::AsFd;
 

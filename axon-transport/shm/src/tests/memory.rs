@@ -1,4 +1,4 @@
-//! Rings that grow, segments that come later than what is in them, and memory that comes back.
+//! Rings that grow, segments that arrive later than the samples in them, and memory that is returned.
 
 use super::*;
 

@@ -1,6 +1,5 @@
-//! The models are worth something only if they fail when the protocol is wrong: weakens each
-//! ordering in turn, in a process of its own, and expects the model that names it to fail. As they
-//! are, the models run with the other tests.
+//! Checks that the models fail when the protocol is wrong. It weakens each ordering in turn, in a separate process,
+//! and expects the model that names the ordering to fail. The unmodified models run with the other tests.
 //!
 //! `cargo test -p axon-shm --lib mutation`
 

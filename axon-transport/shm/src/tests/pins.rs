@@ -1,4 +1,4 @@
-//! Samples that are kept in place, by readers that come and go in any order.
+//! Samples that readers keep in place, with readers that come and go in any order.
 
 #![allow(unsafe_code)]
 
@@ -292,7 +292,7 @@ fn memory_that_readers_keep_is_named_and_comes_back() {
     let error = error.expect("an end of memory");
     let PublishError::Pinned { keeper } = error else { panic!("{error}") };
     assert!(writer.readers().contains(&keeper.reader) && keeper.samples >= 40, "{keeper}");
-    let named = format!("held by reader {} (pid {})", keeper.reader, std::process::id());
+    let named = format!("reader {} (pid {}) holds", keeper.reader, std::process::id());
     assert!(error.to_string().contains(&named), "{error}");
     kept.iter().for_each(intact);
     // Small ones need none of it.

@@ -1,5 +1,5 @@
-//! The two ends in two processes: this test binary runs itself as the other one, and the
-//! descriptors go over a socket pair as they do between sessions.
+//! The two ends in two processes: this test binary runs itself as the second process. The descriptors go over a
+//! socket pair, as they do between sessions.
 
 #![allow(unsafe_code)]
 

@@ -1,4 +1,4 @@
-//! The memory of large samples: what they take, who keeps it, and that it comes back.
+//! The memory of large samples: its size, the readers that keep it, and its release.
 
 #![allow(unsafe_code)]
 

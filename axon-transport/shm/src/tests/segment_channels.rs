@@ -1,4 +1,4 @@
-//! How subscribers hear of their publisher's memory where there is no daemon.
+//! Tests the announcement of a publisher's memory to subscribers without a daemon.
 
 #![allow(unsafe_code)]
 

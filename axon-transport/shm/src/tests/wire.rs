@@ -1,4 +1,4 @@
-//! The other process of a test, and what goes over to it.
+//! The second process of a test, and the messages that the test sends to it.
 
 use std::{
     env,

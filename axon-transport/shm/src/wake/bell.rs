@@ -1,4 +1,4 @@
-//! The ringing end of a doorbell, which other processes hold.
+//! The sending end of a doorbell, which other processes hold.
 
 use std::{
     os::fd::{AsFd, BorrowedFd},
@@ -45,7 +45,9 @@ impl Bell {
                 _ => return true,
             }
         }
-        tracing::error!("the kernel has no memory to wake a process: it hears of the next sample");
+        tracing::error!(
+            "could not ring the peer's doorbell (ENOBUFS or ENOMEM); the next sample will wake it"
+        );
         false
     }
 }

@@ -412,7 +412,7 @@ impl Waiters {
         receiver.give_up();
         self.pace(receiver);
         tracing::error!(
-            "another process {what}: from now on it looks for news every few milliseconds"
+            "doorbell unusable: another process {what}; this session now polls every few milliseconds"
         );
     }
 

@@ -1,8 +1,8 @@
-//! Sleeping until another process has something: tickets, and the doorbell that ends a sleep.
+//! Sleeping until another process has news: tickets, and the doorbell that ends a sleep.
 //!
-//! A waiter stores a new ticket in a shared word before it sleeps; whoever has something for it
-//! reads the word and rings the doorbell once per ticket, so a burst costs one system call. In a
-//! process one waiter listens to the doorbell and the others follow it.
+//! A waiter stores a new ticket in a shared word before it sleeps. A process with news for it reads the word and
+//! rings the doorbell once per ticket, so a burst costs one system call. In each process one waiter listens to the
+//! doorbell, and it wakes the others.
 
 mod bell;
 mod doorbell;

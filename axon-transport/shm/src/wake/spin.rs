@@ -1,4 +1,4 @@
-//! How long a waiter polls before it sleeps, learned from how long its last waits took.
+//! The time for which a waiter polls before it sleeps, learned from the duration of its last waits.
 
 use std::{
     hint::spin_loop,

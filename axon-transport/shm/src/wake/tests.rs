@@ -1,4 +1,4 @@
-//! No ring is ever lost: under the model checker and under load.
+//! Checks that no ring is ever lost: under the model checker and under load.
 
 use std::{
     os::fd::AsFd,

@@ -1,8 +1,8 @@
 //! The protocol between a thread that is about to sleep and the processes that may have to wake it.
 //!
-//! The sleeper stores its ticket, fences, and looks once more whether there is something; the
-//! waker makes that something visible, fences, and looks whether there is a ticket. One of the two
-//! sees the other. Neither fence can be weaker: each side stores one word and loads another.
+//! The sleeper stores its ticket, fences, and checks once more for news. The waker makes its news visible, fences,
+//! and checks for a ticket. At least one of the two sees the other's store. Neither fence can be weaker, because
+//! each side stores one word and loads another.
 
 use crate::sync::{Ordering, Site, Word, fence_at};
 

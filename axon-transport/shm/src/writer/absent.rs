@@ -1,8 +1,8 @@
-//! Readers whose process ended while they carried samples to another process. The publisher keeps what they
-//! had not confirmed for 10 s.
+//! Readers whose process ended while they carried samples to another process. The publisher keeps their unconfirmed
+//! samples for 10 s.
 //!
-//! Such a reader is the daemon's, on behalf of a relayed session. The next daemon asks under the same
-//! GID, and goes on where the last one was.
+//! Such a reader belongs to the daemon, which reads on behalf of a relayed session. The next daemon attaches under
+//! the same GID, and continues at the last reader's position.
 
 use std::time::{Duration, Instant};
 
@@ -44,7 +44,10 @@ impl Absences {
         let over = self.0.extract_if(.., |absent| absent.until <= now);
         over.fold(0, |all, Absent { gid, position, .. }| {
             let samples = head.saturating_sub(position);
-            tracing::warn!(reader = %gid, samples, "a relayed reader did not come back: lost");
+            tracing::warn!(
+                reader = %gid, samples,
+                "gave up samples: the relayed reader did not reconnect within {ABSENCE:?}"
+            );
             all.saturating_add(samples)
         })
     }

@@ -243,7 +243,7 @@ impl Writer {
                     return Err(short.unwrap_or(blocked));
                 }
                 Some((_, peers)) => self.await_room(&peers, left),
-                // It moved on between the two looks. One that does so for ever is out for trouble.
+                // The reader moved on between the two looks. A reader that keeps doing this is misbehaving.
                 None if left.is_zero() && look >= LOOKS => {
                     return Err(PublishError::Blocked { reader: self.options.gid });
                 }

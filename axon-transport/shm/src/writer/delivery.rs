@@ -1,5 +1,4 @@
-//! How far relays have delivered what was published, and how many samples they gave up. `wait_acknowledged`
-//! is made of it.
+//! Delivery watermarks of relays and the number of samples they gave up; `wait_acknowledged` uses both.
 
 use std::{
     sync::Arc,

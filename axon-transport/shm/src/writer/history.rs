@@ -1,5 +1,5 @@
-//! The samples that a ring keeps, oldest to newest, and which of them are dropped to make room for the
-//! next. Plain data, no shared memory.
+//! The samples that a ring keeps, oldest to newest, and the choice of samples to drop for the next one. Plain data,
+//! no shared memory.
 
 use crate::{
     alloc::{blocks::Blocks, classes, heap::Block, retire_list::RetireList},

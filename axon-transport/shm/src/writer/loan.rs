@@ -1,4 +1,4 @@
-//! A sample that is written before it is published.
+//! A sample that the application writes in place before it publishes it.
 
 #![allow(unsafe_code)]
 

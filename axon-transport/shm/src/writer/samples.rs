@@ -1,5 +1,5 @@
-//! The memory of a publisher's large samples, which readers read in place: segments of its own,
-//! which come with the first such sample and go when they are not needed any more.
+//! The memory of a publisher's large samples, which readers read in place. The publisher has separate segments for
+//! it, opens them with the first such sample, and closes them when it no longer needs them.
 
 use std::{
     sync::{Arc, atomic::AtomicU64},
@@ -217,8 +217,8 @@ impl Writer {
                 return Err(short.unwrap_or(PublishError::Loaned { loans }).into());
             }
             match state.reader_set.holder(&kept) {
-                // Whoever pinned them has let go, or died, just now. One that does so for ever is
-                // out for trouble.
+                // The reader that pinned them has just released them, or died. A reader that keeps
+                // doing this is misbehaving.
                 None if look < LOOKS => {}
                 holder => {
                     let holder = holder.unwrap_or(PinningReader { reader: self.gid(), peer: None });

@@ -1,7 +1,7 @@
 //! The counters in a ring's header. No reader uses them; the daemon [reads](crate::ring::inspect) them for
 //! `axon status`.
 //!
-//! Nobody else can write them, so they are the counters themselves. Each is changed under the
+//! No other process can write the counters, so the publisher keeps no second copy. It changes each of them under the
 //! commit lock.
 
 use std::time::Duration;

@@ -1,4 +1,4 @@
-//! A builder says what the environment says, and nothing that it could not say.
+//! A builder can express exactly the settings that the environment can express.
 
 use std::net::IpAddr;
 

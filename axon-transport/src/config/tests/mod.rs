@@ -1,4 +1,4 @@
-//! What is accepted, and what it then is.
+//! Accepted settings and their values.
 
 use std::{
     collections::BTreeMap,

@@ -1,4 +1,4 @@
-//! A daemon is found whatever else is wrong.
+//! Tools find a daemon even if unrelated settings are wrong.
 
 use super::*;
 

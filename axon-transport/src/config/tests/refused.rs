@@ -1,4 +1,4 @@
-//! What is refused, and what is said about it.
+//! Refused settings and their error messages.
 
 use std::os::unix::ffi::OsStringExt;
 

@@ -1,8 +1,8 @@
-//! Lines that wait to be told, and the thread that tells them.
+//! Log lines that wait for the callback, and the thread that passes them to it.
 //!
-//! Who says something may hold locks that the program waits for in turn, with one of its own held that
-//! its callback needs (the lock of a logger that publishes what it logs). So the callback is never called
-//! from there.
+//! The thread that logs a line may hold a lock that the program waits for. At the same time the program may hold a
+//! lock that its callback needs, such as the lock of a logger that publishes its lines. Therefore the logging thread
+//! never calls the callback.
 
 use std::{
     cell::Cell,

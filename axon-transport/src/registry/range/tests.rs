@@ -1,4 +1,4 @@
-//! Pairs, and the graph, under sessions of different ranges.
+//! Tests pairs and the graph with sessions of different ranges.
 
 use axon_shm::internal::Location;
 

@@ -1,4 +1,4 @@
-//! What the daemon does with single messages.
+//! Tests the daemon's reaction to single messages.
 
 use super::*;
 

@@ -1,6 +1,6 @@
-//! The registry under random sessions, some of them slow, checked against what a session may rely
-//! on: in the end everybody knows the graph, exactly the right pairs are attached at both ends, and
-//! a session is handed another's descriptors exactly when it holds none.
+//! The registry under random sessions, some of them slow, checked against the guarantees for sessions. In the end
+//! every session knows the graph, exactly the right pairs are attached at both ends, and a session receives another
+//! session's descriptors exactly when it holds none.
 
 mod cases;
 

@@ -1,9 +1,9 @@
-//! Where a daemon's socket is: a path in the runtime directory, or an abstract name.
+//! The address of a daemon's socket: a path in the runtime directory, or an abstract name.
 //!
-//! Any user of the host may bind an abstract name first, so a path is preferred where there is a
-//! directory of this user's own. Under `AXON_RUNTIME_DIR` the path is the whole address. Under
-//! `XDG_RUNTIME_DIR` the daemon listens at the name as well, for processes of the same user that
-//! are started without that variable, as services are; who has the variable uses the path first.
+//! Any user of the host may bind an abstract name first, so a path is preferred if this user has a directory of its
+//! own. Under `AXON_RUNTIME_DIR` the path is the whole address. Under `XDG_RUNTIME_DIR` the daemon also listens at
+//! the name, for processes of the same user that start without that variable, as services do. A process that has the
+//! variable tries the path first.
 
 use std::{
     fs::{DirBuilder, File, OpenOptions},

@@ -1,4 +1,4 @@
-//! Reaching the daemon: find it or start it, check who it is, and exchange HELLO and WELCOME.
+//! Connects to the daemon: finds or starts it, checks its identity, and exchanges HELLO and WELCOME.
 
 use std::{
     os::fd::{AsFd, BorrowedFd, OwnedFd},

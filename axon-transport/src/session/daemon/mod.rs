@@ -1,5 +1,5 @@
-//! The session's side of its conversation with the daemon: where the daemon is, how it is started, the
-//! socket between them, and the thread that keeps up the conversation.
+//! The session's side of the protocol with the daemon: the daemon's address, its start, the socket to it, and the
+//! thread that exchanges messages with it.
 
 pub mod address;
 pub mod connect;

@@ -1,9 +1,8 @@
-//! Starting a daemon from a session. What the daemon does at its start is in the daemon's `detach`.
+//! Starts a daemon from a session. The daemon's own first steps are in the daemon's `detach`.
 //!
-//! The command runs twice: the first process (`--spawned`) starts the second (`--detached`) and
-//! ends, so that the daemon is nobody's child; neither a zombie nor a SIGCHLD surprises the
-//! application. Standard output is the start-up pipe, over which the daemon says that it is ready,
-//! that another one was faster, or what is wrong.
+//! The command runs twice. The first process (`--spawned`) starts the second process (`--detached`) and ends, so
+//! that the daemon is no child of the application, which sees neither a zombie nor a SIGCHLD. Standard output is the
+//! start-up pipe. On it the daemon reports that it is ready, that another daemon was faster, or an error.
 
 use std::{
     collections::BTreeMap,

@@ -1,4 +1,4 @@
-//! The daemon's status, asked for over the session's connection or one that does nothing else.
+//! Requests the daemon's status, over the session's connection or over a separate one.
 
 use std::{
     os::fd::OwnedFd,

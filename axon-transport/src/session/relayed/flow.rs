@@ -1,11 +1,11 @@
 //! Splits samples into pieces and controls their flow: plain data in, data out.
 //!
-//! There is a [`Channel`] for each publisher whose samples cross, each client's requests, and the
-//! responses of each server to each client. Its receiver lets the sender have so many bytes under way,
-//! and gives them back when samples have gone to where they belong: whoever is not read leaves its
-//! samples in the ring they come from, where their publisher's QoS says what becomes of them, and holds
-//! up no other channel but with long samples ([`Incoming::grants`]). Pieces of all channels take turns, so that an image does not keep a small
-//! sample waiting.
+//! There is a [`Channel`] for each publisher whose samples cross, for each client's requests, and for the
+//! responses of each server to each client. The receiver of a channel grants the sender a number of bytes in
+//! flight. It gives the credit back when the samples have reached their destination. Samples of a channel that
+//! nobody reads stay in their source ring, where the publisher's QoS applies; such a channel delays others only
+//! through long samples ([`Incoming::grants`]). Pieces of all channels take turns, so that an image does not delay
+//! a small sample.
 
 use std::{
     collections::{BTreeMap, HashMap, VecDeque},

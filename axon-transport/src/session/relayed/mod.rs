@@ -1,14 +1,14 @@
 //! Sessions that share no memory: their samples pass through the daemon, over the session socket.
 //!
-//! To its daemon such a session is much like another host. In its own process a registry and a
-//! gateway session of their own stand for the world outside (`near`): relays read the samples that the
-//! application publishes, stand-ins write those that it subscribes to, and all else works as with shared
-//! memory. In the daemon (`daemon::relayed`) a session of the same id has the application's endpoints, in
-//! memory that everybody maps: to others, on this host and elsewhere, it is a session like any. Clients
-//! and servers stand for others and cross as topics do (`calls`); liveliness is told separately.
+//! The daemon treats such a session much like another host. In its own process a separate registry and gateway
+//! session represent everything outside the process (`near`). Relays read the samples that the application
+//! publishes, and stand-ins write the samples that it subscribes to. Everything else works as with shared memory. In
+//! the daemon (`daemon::relayed`) a session of the same id holds the application's endpoints, in memory that every
+//! session can map. Other sessions, on this host and elsewhere, see an ordinary session. Clients and servers have
+//! stand-ins and cross as topics do (`calls`). Liveliness is sent separately.
 //!
-//! [`flow`] is plain data: samples in pieces, and who may send how many of them. `pipe` moves them
-//! over the socket (`docs/formats.md`, section 10).
+//! [`flow`] is plain data: it splits samples into pieces and decides how many pieces each channel may send. `pipe`
+//! moves the pieces over the socket (`docs/formats.md`, section 10).
 
 use std::time::Duration;
 

@@ -1,4 +1,4 @@
-//! The readers of a subscription, one for each publisher: how they come and go.
+//! The readers of a subscription, one for each publisher: their attachment and removal.
 
 use std::{
     collections::HashMap,

@@ -1,4 +1,4 @@
-//! A reader of every matched publisher of a topic, merged into one stream.
+//! A reader of all matched publishers of a topic, merged into one stream.
 
 mod inner;
 mod matched_readers;

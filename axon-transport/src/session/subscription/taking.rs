@@ -1,4 +1,4 @@
-//! Chooses from which of its publishers a subscription takes the next sample.
+//! Chooses the publisher from which a subscription takes the next sample.
 
 use std::{collections::HashMap, time::Instant};
 

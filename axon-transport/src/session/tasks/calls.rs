@@ -1,4 +1,4 @@
-//! Requests whose responses tasks wait for, each for its own.
+//! Requests for whose responses tasks wait. Each task receives the response to its own request.
 
 use std::{
     collections::HashMap,
@@ -34,7 +34,7 @@ pub enum CallError {
     #[error("no server is available")]
     Unavailable,
     /// All servers that the request was sent to are gone, and none of them answered.
-    #[error("the server ended, or the way to it did, before it answered")]
+    #[error("the server or the link to it was lost before the response arrived")]
     ServerGone,
     /// The request could not be sent. [`PublishError::Blocked`] says that a server does not take its requests and
     /// that there is no room for more: the call does not wait for room.

@@ -1,4 +1,4 @@
-//! A daemon that follows another, and readers that are attached anew.
+//! A daemon that replaces another one, and readers that are attached again.
 
 use axon_shm::{PublishError, internal::probe};
 use rustix::net::accept_with;

@@ -1,5 +1,4 @@
-//! Memory of large samples that a reader needs, and that its daemon may not have sent it when it was
-//! killed.
+//! Memory of large samples that a reader needs, and that a killed daemon may not have sent to it.
 
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
 

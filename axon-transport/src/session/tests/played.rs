@@ -1,4 +1,4 @@
-//! What only a played daemon can bring about: an order in which things happen.
+//! Cases that only a simulated daemon can produce, because they depend on an order of events.
 
 use axon_shm::{
     PublishError,

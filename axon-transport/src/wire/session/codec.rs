@@ -1,4 +1,4 @@
-//! Messages as bytes of a packet.
+//! Encodes messages as the bytes of a packet, and decodes them.
 
 use minicbor::{Decode, Encode};
 

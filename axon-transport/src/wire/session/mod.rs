@@ -1,7 +1,7 @@
 //! The control messages between sessions and their daemon (`docs/formats.md`, section 8).
 //!
-//! A packet is a type byte and one CBOR map. Unknown keys are skipped; a packet of unknown type
-//! decodes to [`Message::Unknown`]; everything else that does not fit is an error.
+//! A packet is a type byte and one CBOR map. Unknown keys are skipped. A packet of unknown type decodes to
+//! [`Message::Unknown`]. Any other invalid packet is an error.
 
 mod codec;
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! Packets as they come, from whomever.
+//! Tests decoding of packets from any sender.
 
 use proptest::prelude::*;
 

@@ -1,8 +1,7 @@
 //! The log of a daemon: lines on standard error, or in a file that is rotated.
 //!
-//! Logging never ends a daemon: a line that cannot be written is dropped. A peer or another user
-//! cannot fill a file system with it either: each kind of line has a rate (`throttle`), and the
-//! file a size (`output`).
+//! Logging never ends a daemon: a line that cannot be written is dropped. A peer or another user cannot fill a file
+//! system through the log: each kind of line has a rate limit (`throttle`), and the file has a size limit (`output`).
 
 mod output;
 mod throttle;

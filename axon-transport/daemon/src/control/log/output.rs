@@ -1,4 +1,4 @@
-//! Where log lines go: standard error, which for a daemon in the background is a file.
+//! The output of log lines: standard error, which for a daemon in the background is a file.
 
 use std::{
     fs::{File, OpenOptions},

@@ -149,7 +149,10 @@ impl RelayedSession {
         self.tally.lost(samples);
         if let Some(writers) = self.given_up.count(Instant::now()) {
             let (session, limit) = (&self.id, MAX_LEFT);
-            tracing::warn!(%session, %other, writers, limit, "what was left is not taken: lost");
+            tracing::warn!(
+                %session, %other, writers, limit,
+                "discarded samples of ended writers: the relayed session does not take them"
+            );
         }
     }
 

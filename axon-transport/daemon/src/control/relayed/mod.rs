@@ -290,7 +290,11 @@ impl RelayedSession {
         }
         let samples = self.pipe.arrived();
         if samples > 0 {
-            tracing::warn!(session = %self.id, samples, "what a process left is not taken: lost");
+            tracing::warn!(
+                session = %self.id,
+                samples,
+                "discarded samples of a process that ended: no reader takes them"
+            );
         }
         Err(SocketError::Closed.into())
     }

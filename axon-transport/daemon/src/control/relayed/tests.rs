@@ -1,4 +1,4 @@
-//! A relay whose process and whose control plane are played by the test.
+//! Tests a relay with a simulated process and a simulated control plane.
 
 use std::time::Duration;
 

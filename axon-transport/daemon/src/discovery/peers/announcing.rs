@@ -1,4 +1,4 @@
-//! Decides when this daemon sends beacons, to which addresses, and with what content.
+//! Decides when this daemon sends beacons, to which addresses, and with which content.
 
 use std::{
     collections::BTreeSet,

@@ -1,4 +1,4 @@
-//! Forged beacons: an honest host is found and dialled while they last, and nothing of them stays.
+//! Tests with forged beacons: an honest host is still found and dialled, and no forged record remains.
 
 use super::{
     tests::{HIGHER, LOWER, OWN, beacon, from, local, secs, settled},

@@ -1,4 +1,4 @@
-//! Handles goodbyes: of daemons that end, and forged ones.
+//! Handles goodbyes, from daemons that end and from forgers.
 
 use super::{
     tests::{HIGHER, LOWER, actions, beacon, dials, fail, from, hear, local, secs, settled},

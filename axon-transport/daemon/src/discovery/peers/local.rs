@@ -1,4 +1,4 @@
-//! What discovery knows of this daemon itself.
+//! The properties of this daemon that discovery uses.
 
 use std::net::IpAddr;
 

@@ -1,8 +1,8 @@
-//! Discovery's state machine (`docs/architecture.md`): which daemons exist and when to dial them.
-//! Datagrams and events of links go in, datagrams and dials come out.
+//! Discovery's state machine (`docs/architecture.md`): decides which daemons exist and when to dial them. Datagrams
+//! and events of links go in, datagrams and dials come out.
 //!
-//! A beacon is a hint from anybody, so every collection is bounded, every answer rationed, and nothing that
-//! arrives here closes a link or keeps one from being made to a peer that was acceptable before.
+//! Anybody can send a beacon, so a beacon is only a hint. Every collection is bounded, and every answer is
+//! rate-limited. No received datagram closes a link, or prevents a link to a peer that was acceptable before.
 
 mod announcing;
 mod bucket;

@@ -1,7 +1,7 @@
-//! Asking addresses whether the daemon that beacons put there answers.
+//! Probes an address to verify that the daemon named in a beacon is there.
 //!
-//! A beacon's source address can be forged, an answer from there cannot be had. A probe costs one
-//! short datagram, a dial to an address where nobody is costs one of eight places for seconds.
+//! A beacon's source address can be forged. An answer from a forged address cannot be obtained. A probe costs one
+//! short datagram; a dial to an address without a daemon occupies one of eight dials for seconds.
 
 use std::{
     collections::VecDeque,

@@ -1,4 +1,4 @@
-//! A whole subnet in one thread: seeded loss, delay, reordering and duplication, a clock that jumps.
+//! Simulates a whole subnet in one thread: seeded loss, delay, reordering and duplication, and a clock that jumps.
 
 use std::{
     collections::{BTreeMap, BTreeSet},

@@ -1,4 +1,4 @@
-//! One state machine, fed by hand.
+//! Tests one state machine with hand-made events.
 
 use axon_transport::config::QkdPeers;
 use proptest::{collection::vec, prelude::*};

@@ -1,4 +1,4 @@
-//! The daemon is to end: what waits to be sent arrives first, for as long as that gets on.
+//! Shutdown: flushes queued samples while there is progress, for at most 5 s.
 
 use std::time::{Duration, Instant};
 

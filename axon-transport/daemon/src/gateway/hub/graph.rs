@@ -123,7 +123,7 @@ impl Hub {
             .collect();
         if !ours.is_empty() {
             tracing::warn!(peer = %daemon, endpoints = ours.len(),
-                "a peer announces endpoints of this host; they are ignored");
+                "ignored endpoints announced by a peer: they belong to this host");
             added.retain(|e| !ours.contains(&e.endpoint.gid));
             if let Some(peer) = self.peers.get_mut(&daemon) {
                 peer.remote.forget(&ours);
@@ -164,7 +164,7 @@ impl Hub {
             }
             if !same_host {
                 tracing::warn!(peer = %daemon, endpoints = moved.len(),
-                    "a peer announces endpoints of another peer; they stay where they were");
+                    "ignored endpoints announced by a peer: they belong to another peer");
                 if let Some(claimer) = self.peers.get_mut(&daemon) {
                     claimer.remote.forget(&moved);
                     claimer.displaced = true;

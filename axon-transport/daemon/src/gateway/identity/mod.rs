@@ -1,8 +1,7 @@
-//! The classic identity: our key and whom it trusts, from the files that the settings name.
+//! The classic identity: this host's key and the peers that it trusts, from the files that the settings name.
 //!
-//! The files are read again when they change. Files that cannot be used then let nobody new in: a
-//! link that stands is kept by what was in force before, since nothing says that its peer was
-//! removed.
+//! The files are read again when they change. If a file is unusable, new links are refused. Existing links
+//! stay, because nothing shows that their peer was removed.
 
 mod file;
 mod load;

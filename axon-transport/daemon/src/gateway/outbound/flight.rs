@@ -1,7 +1,8 @@
 //! Best-effort samples of one publisher that were handed to QUIC and are not acknowledged.
 //!
-//! What QUIC has it sends, however late. So it gets no more than it can send at once: the rest waits in
-//! the queue, where the history's depth and its age decide what is still worth sending.
+//! QUIC sends everything handed to it, however late. So the gateway hands over only what fits the congestion
+//! window, or two samples. The rest waits in the queue, where the history's depth and a sample's age decide
+//! whether it is still sent.
 
 use std::{
     collections::VecDeque,

@@ -207,7 +207,7 @@ impl Peer {
             tracing::warn!(
                 topic,
                 refused,
-                "a peer asks in more ways than it may: some get nothing"
+                "peer exceeded its relay limit; some of its subscriptions to this topic get no samples"
             );
         }
         let mut sources = Vec::new();

@@ -1,4 +1,4 @@
-//! The server's side: keys that handshakes name, looked up at once and fetched within bounds.
+//! Server side: looks up the PSK identity of a handshake without blocking; fetches missing keys at a bounded rate.
 
 use std::{
     collections::{HashMap, VecDeque},

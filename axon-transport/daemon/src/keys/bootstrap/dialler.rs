@@ -1,4 +1,4 @@
-//! The client's side: one unspent key for each peer, asked for once, kept until it is spent.
+//! Client side: requests one key for each peer and keeps it until it is spent.
 
 use std::{collections::HashMap, fmt, sync::Arc, time::Duration};
 

@@ -1,4 +1,4 @@
-//! Limits the `dec_keys` calls that handshakes can cause, since anybody can make up an identity.
+//! Limits the `dec_keys` calls that handshakes can cause, because anybody can make up an identity.
 
 use std::{
     collections::HashMap,

@@ -1,5 +1,5 @@
-//! The first key of a link: who fetches it, how long it is kept, and when it is spent
-//! (docs/formats.md, sections 1 and 2).
+//! The first key of a link: which side fetches it, how long it is kept, and when it is spent (docs/formats.md,
+//! sections 1 and 2).
 
 mod acceptor;
 mod dialler;

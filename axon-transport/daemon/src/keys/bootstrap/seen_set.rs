@@ -1,5 +1,4 @@
-//! A memory of bounded size for key_IDs and identities that were seen: the oldest entry is dropped for a
-//! new one.
+//! A bounded set of key_IDs and identities that were seen. A new entry replaces the oldest one.
 
 use std::{
     collections::{HashMap, VecDeque},

@@ -1,4 +1,4 @@
-//! One request as one call of the client.
+//! Executes one request as one call of the KME client.
 
 use std::{
     sync::{Mutex, PoisonError},

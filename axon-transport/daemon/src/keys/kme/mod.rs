@@ -1,8 +1,8 @@
-//! The only place that talks to the KME: runs the machines' [`Request`]s, bounded, and answers
-//! every one of them.
+//! Runs the key state machines' [`Request`]s at the KME, with limits, and answers every one of them. No other module
+//! talks to the KME.
 //!
-//! Calls for links (bootstrap, handshakes, proofs) and calls for messages wait in two queues with
-//! their own limits, so that a hungry supply cannot keep a link from being made.
+//! Calls for links (bootstrap, handshakes, proofs) and calls for messages wait in two queues with separate limits,
+//! so that the message supply cannot block the start of a link.
 
 mod calls;
 mod outage;

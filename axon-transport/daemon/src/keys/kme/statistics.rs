@@ -1,4 +1,4 @@
-//! What the KME was asked and what it gave, for status.
+//! Counts requests to the KME and keys from it, for the status.
 
 use std::{
     collections::BTreeMap,

@@ -1,4 +1,4 @@
-//! Against the simulator: real HTTP over real mutual TLS.
+//! Tests against the simulator: real HTTP over real mutual TLS.
 
 use std::{path::Path, time::Duration};
 

@@ -1,4 +1,4 @@
-//! Measures how many keys the messages need, and decides how many are held ahead.
+//! Measures how many keys the messages need, and decides how many keys are fetched ahead.
 
 use std::{fmt, time::Duration};
 

@@ -1,4 +1,4 @@
-//! Reports keys that the two KMEs gave with different bytes.
+//! Reports keys for which the two KMEs returned different bytes.
 
 use std::{fmt, time::Duration};
 

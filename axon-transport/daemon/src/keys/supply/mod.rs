@@ -1,9 +1,9 @@
-//! Keys for `messages10`: ten messages each, fetched ahead, announced, proven, used, retired
-//! (docs/formats.md, section 4).
+//! Keys for `messages10`: ten messages each, fetched ahead, announced, proven, used, retired (docs/formats.md,
+//! section 4).
 //!
-//! Each host is master for what it sends: its [`Sender`] asks for keys, the peer's [`Receiver`]
-//! fetches the same ones. There is one pair for each peer SAE, and it outlives connections. When to
-//! draw from the KME, and how many, are the rules of [`etsi_qkd014::pool`].
+//! Each host is master for the messages that it sends: its [`Sender`] requests keys, and the peer's [`Receiver`]
+//! fetches the same keys. There is one pair for each peer SAE, and it outlives connections. The rules of
+//! [`etsi_qkd014::pool`] decide when to draw from the KME, and how many keys.
 
 mod demand;
 mod disagreement;

@@ -1,5 +1,5 @@
-//! Keys drawn from the KME and not yet announced. When to draw, and how many, are the rules of
-//! [`etsi_qkd014::pool`]; here its calls become [`Request`]s, and it is told what came of them.
+//! Keys that were drawn from the KME and are not announced yet. The rules of [`etsi_qkd014::pool`] decide when to
+//! draw, and how many keys. This module turns their calls into [`Request`]s, and reports the results to them.
 
 use std::time::Duration;
 

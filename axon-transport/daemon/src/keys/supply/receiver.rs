@@ -1,4 +1,4 @@
-//! The receiving direction: fetches what is announced, and opens.
+//! The receiving direction: fetches announced keys, and opens messages.
 
 use std::{
     collections::{HashMap, VecDeque},

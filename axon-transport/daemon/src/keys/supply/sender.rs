@@ -1,4 +1,4 @@
-//! The sending direction: fetches keys ahead, announces them, and seals under those that are READY.
+//! The sending direction: fetches keys ahead, announces them, and seals messages under keys that are READY.
 
 use std::{
     collections::{HashMap, VecDeque},

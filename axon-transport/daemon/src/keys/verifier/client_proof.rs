@@ -1,4 +1,4 @@
-//! Has the client of a connection prove its name: the server's side.
+//! Server side: requires the client of a connection to prove its name.
 
 use std::{sync::Arc, time::Duration};
 

@@ -1,4 +1,4 @@
-//! Answers the server's request for the proof: the client's side in `session`. In `messages10` the
+//! Client side in `session`: answers the server's request for the proof. In `messages10` the
 //! [`Receiver`](crate::keys::Receiver) answers.
 
 use std::{sync::Arc, time::Duration};

@@ -1,4 +1,4 @@
-//! Why a connection was closed: the application error codes of the link protocol.
+//! The reasons for which a connection is closed: the application error codes of the link protocol.
 
 use std::fmt;
 

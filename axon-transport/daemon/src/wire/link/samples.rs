@@ -1,4 +1,4 @@
-//! One of each message, for the tests.
+//! Example messages for tests.
 
 use axon_envelope::{IndexMask, KeyId};
 use axon_shm::{

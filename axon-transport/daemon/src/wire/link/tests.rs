@@ -1,4 +1,4 @@
-//! Frames under hostile and ordinary input.
+//! Tests frames with hostile and with ordinary input.
 
 use axon_shm::ids::Gid;
 use proptest::prelude::*;

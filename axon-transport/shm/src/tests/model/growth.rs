@@ -1,4 +1,4 @@
-//! Descriptors that move to a larger array, and memory that comes along.
+//! Descriptors that move to a larger array, and memory that is added at the same time.
 
 use loom::{
     sync::{Arc, atomic::AtomicU64},

@@ -1,5 +1,5 @@
-//! The publisher's lock where the kernel has no part in it: taken while it is free, and let go while
-//! nobody waits.
+//! The publisher's lock without the kernel: a thread takes it while it is free, and releases it while no thread
+//! waits.
 
 use loom::{
     sync::{Arc, atomic::AtomicU32},

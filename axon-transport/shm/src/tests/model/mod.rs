@@ -1,9 +1,9 @@
-//! The protocols under the model checker: every interleaving, and every reordering that the memory
-//! model allows, for small rings and a few threads. Each model names the orderings without which
-//! it fails, of which [`super::mutation`] makes sure.
+//! The protocols under the model checker: every interleaving, and every reordering that the memory model allows, for
+//! small rings and a few threads. Each model names the orderings without which it fails, and [`super::mutation`]
+//! checks that.
 //!
-//! The checker runs the loads of a thread in their order. That a read comes before the store that
-//! says so therefore shows only where what is read is a [`Cell`], on which it sees any race.
+//! The checker runs the loads of a thread in their order. So a read that must come before a later store is checked
+//! only if it reads a [`Cell`], on which the checker detects any race.
 
 #![allow(unsafe_code)]
 

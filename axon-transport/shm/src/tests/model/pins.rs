@@ -1,4 +1,4 @@
-//! Samples that are read in place, and memory that is used again.
+//! Samples that readers read in place, and memory that the publisher reuses.
 
 use loom::{
     sync::{Arc, atomic::AtomicU64},

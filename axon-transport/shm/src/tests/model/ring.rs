@@ -1,4 +1,4 @@
-//! Samples that are copied out, by readers that are overtaken and by such that hold the publisher.
+//! Samples that readers copy out: readers that are overtaken, and readers that hold the publisher back.
 
 use loom::{
     sync::{Arc, atomic::AtomicU64},

@@ -398,16 +398,18 @@ impl Control {
         held
     }
 
-    /// Whether a subscription of ours has that lane for the writer. A lane is written to, and a ring
-    /// taken at its word, wherever the daemon says that they are; here that could be the bytes of a
-    /// sample.
+    /// Whether a subscription of this session has that lane for the writer. The daemon's message says where
+    /// lanes and rings are. Without this check it could name the bytes of one of this session's samples.
     fn has_lane(&self, pair: &Pair, lane: Location) -> bool {
         let subscription = self.shared.state().subscriptions.get(&pair.reader).cloned();
         // It may have ended, with its lanes, since it asked.
         let Some(subscription) = subscription else { return false };
         let has = subscription.lock().lanes().contains(&(pair.writer, lane));
         if !has {
-            tracing::error!(reader = %pair.reader, "a lane of the session that it has not");
+            tracing::error!(
+                reader = %pair.reader,
+                "ignored an attachment: it names a lane that this session does not have"
+            );
         }
         has
     }
@@ -418,7 +420,7 @@ impl Control {
         let Some(publisher) = publisher else { return false };
         let has = publisher.rings.has(ring);
         if !has {
-            tracing::error!(%writer, "a ring of the session that it has not");
+            tracing::error!(%writer, "ignored a grant: it names a ring that this session does not have");
         }
         has
     }

@@ -1,4 +1,4 @@
-//! The connection to a daemon, and the search for another.
+//! The connection to a daemon, and the search for a new daemon.
 
 use std::{
     collections::BTreeSet,

@@ -1,5 +1,4 @@
-//! The session's own memory: tells the daemon of new and closed segments, and frees memory that is no
-//! longer needed.
+//! The session's own memory: announces new and closed segments to the daemon, and frees unused memory.
 
 use std::time::{Duration, Instant};
 
@@ -41,7 +40,10 @@ impl Control {
                 }
                 Err(error) => {
                     if self.untold.insert(number) {
-                        tracing::error!(%error, "samples stay unseen by others until there is one");
+                        tracing::error!(
+                            %error,
+                            "no free file descriptor: new samples stay invisible to other processes until one is free"
+                        );
                     }
                 }
             },

@@ -1,5 +1,5 @@
-//! The control thread: sends what the handles queue, handles what the daemon says, watches peers
-//! for their death, and finds another daemon when the old one is gone.
+//! The control thread: sends the messages that the handles queue, handles the daemon's messages, watches peers for
+//! their death, and finds another daemon when the connection to the old one is lost.
 
 mod graph;
 mod handle;
@@ -400,7 +400,10 @@ impl Control {
                 Err(SocketError::NotReady) => return,
                 Err(error @ SocketError::NoDescriptors) => {
                     // Others would have to match anew what a new connection has it announce.
-                    tracing::error!(%error, "what the daemon said is asked for again");
+                    tracing::error!(
+                        %error,
+                        "lost a daemon message: out of file descriptors; requesting it again in {RETRY:?}"
+                    );
                     self.retry.get_or_insert_with(|| Instant::now() + RETRY);
                 }
                 Err(error) => return self.lost(&error),

@@ -1,5 +1,5 @@
-//! Logs the life of each pair at `debug`: which grant it got, and why it ended. A test can keep all of it
-//! and print the history of a pair that lost samples.
+//! Logs the life of each pair at `debug`: its grant, and the reason for its end. A test can keep all lines and print
+//! the history of a pair that lost samples.
 
 use crate::wire::session::Pair;
 

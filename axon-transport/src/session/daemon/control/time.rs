@@ -1,4 +1,4 @@
-//! Deadlines and leases: looked at when the next one may run out, and never where none is finite.
+//! Deadlines and leases: checked when the next one may expire, and never if none is finite.
 
 use std::time::{Duration, Instant};
 

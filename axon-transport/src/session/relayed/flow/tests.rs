@@ -1,4 +1,4 @@
-//! Both ends without a socket in between.
+//! Tests both ends without a socket in between.
 
 use std::collections::{HashMap, VecDeque};
 

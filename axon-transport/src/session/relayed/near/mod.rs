@@ -1,5 +1,4 @@
-//! The session's end of a relay: a thread in the session's own process that carries samples to the daemon
-//! and back.
+//! The session's end of a relay: a thread in the session's own process that carries samples to and from the daemon.
 
 mod reconnect;
 mod relays;

@@ -1,5 +1,5 @@
-//! Connects to the next daemon after the last one is gone. A session that is closed waits for that for a
-//! limited time.
+//! Connects to the next daemon after the connection to the last one is lost. A session that is being closed waits for
+//! that for a limited time.
 
 use std::{
     collections::BTreeMap,

@@ -1,5 +1,5 @@
-//! Relays for the application's publishers: each reads a publisher's ring for the remote readers that the
-//! daemon matched with it, so that a reader that the publisher counts is reached.
+//! Relays for the application's publishers. Each relay reads a publisher's ring for the remote readers that the
+//! daemon matched with the publisher. Every reader that the publisher counts receives its samples.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -100,7 +100,7 @@ impl Relay {
         if samples > 0 {
             let Endpoint { gid, topic, .. } = &*self.publisher;
             self.subscription.give_up(*gid, samples);
-            tracing::warn!(topic, publisher = %gid, samples, "no daemon confirmed them: lost");
+            tracing::warn!(topic, publisher = %gid, samples, "gave up samples: no daemon confirmed them");
         }
     }
 

@@ -1,4 +1,4 @@
-//! What the sender asks of its KME, and what it makes of the answers.
+//! Tests the sender's requests to its KME, and its reaction to the answers.
 
 use std::time::Duration;
 

@@ -1,4 +1,4 @@
-//! A [`Sender`] and a [`Receiver`] with two KMEs between them, and a clock that stands still.
+//! Tests a [`Sender`] and a [`Receiver`] with two KMEs between them, and a clock that stands still.
 
 mod any_order;
 mod drawing;
