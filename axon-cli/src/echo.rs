@@ -6,6 +6,7 @@ use std::{
     time::Duration,
 };
 
+use axon_transport::internal::session::unix_nanos;
 use axon_transport::{
     EndpointSpec, GuardCondition, MessageInfo, Session, Subscription,
     graph::{EndpointKind, GraphView},
@@ -136,7 +137,7 @@ fn qos_of(session: &Session, topic: &str) -> Qos {
 fn as_text(info: &MessageInfo, payload: &[u8]) -> String {
     format!(
         "{}  {:>9} B  {:<47}  {}",
-        text::instant(info.source_timestamp),
+        text::instant(unix_nanos(info.source_timestamp)),
         payload.len(),
         text::hex(payload, HEAD),
         text::ascii(payload, HEAD),
@@ -145,8 +146,8 @@ fn as_text(info: &MessageInfo, payload: &[u8]) -> String {
 
 fn as_json(info: &MessageInfo, payload: &[u8]) -> String {
     json!({
-        "source_timestamp_ns": info.source_timestamp,
-        "received_timestamp_ns": info.received_timestamp,
+        "source_timestamp_ns": unix_nanos(info.source_timestamp),
+        "received_timestamp_ns": unix_nanos(info.received_timestamp),
         "publisher": info.publisher,
         "sequence": info.sequence,
         "size": payload.len(),

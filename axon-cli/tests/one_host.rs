@@ -4,6 +4,9 @@
 
 mod common;
 
+use std::time::Duration;
+
+use axon_transport::{EndpointSpec, qos::Qos};
 use common::{Echoes, Host, LOG, Running, eventually};
 use rustix::process::{Pid, Signal, kill_process};
 
@@ -37,6 +40,68 @@ fn nothing_that_a_command_says_steers_a_terminal() {
     let stderr = String::from_utf8(output.stderr).expect("UTF-8");
     assert!(stderr.contains("\\u{1b}[2Jne\\u{2066}\\u{61c}.mcap"), "{stderr}");
     assert!(stderr.chars().all(|c| c == '\n' || !c.is_control()), "{stderr:?}");
+}
+
+/// A log whose last tenth was not written.
+fn log_without_its_end() -> tempfile::NamedTempFile {
+    let whole = std::fs::read(LOG).expect("the log");
+    let file = tempfile::NamedTempFile::new().expect("temporary file");
+    std::fs::write(file.path(), &whole[..whole.len() / 10 * 9]).expect("write");
+    file
+}
+
+#[test]
+fn play_of_a_damaged_log_publishes_nothing_unless_told_to_publish_its_whole_part() {
+    let host = Host::new();
+    let cut = log_without_its_end();
+    let file = cut.path().to_str().expect("a path in UTF-8");
+    let output = host.run(&["play", file, "--rate", "0"]);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains(file) && said.contains("--incomplete"), "{said}");
+    assert!(host.status().is_none(), "no daemon is started for a log that is not played");
+
+    let output = host.run(&["play", file, "--rate", "0", "--incomplete"]);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{said}");
+    let number = |before: &str, after: &str| {
+        let (_, rest) = said.split_once(before).unwrap_or_else(|| panic!("no {before:?}: {said}"));
+        rest.split_once(after).unwrap_or_else(|| panic!("no {after:?}: {said}")).0.to_owned()
+    };
+    let whole = number("playing the ", " messages");
+    assert_eq!(number(" before\naxon play: ", " messages"), whole, "{said}");
+    assert_ne!(whole, "0");
+}
+
+#[test]
+fn names_of_another_session_steer_no_terminal() {
+    let host = Host::new();
+    let daemon = Running::start(host.axon(&["daemon"]));
+    eventually("the daemon", || host.status().is_some());
+    let topic = "/no\u{1b}[2Jne\u{2066}\u{61c}\u{9b}";
+    let session = host.session("a\u{202e}name\r");
+    let spec = EndpointSpec::new(topic, "test/\u{1b}]0;Bytes", Qos::keep_all());
+    let publisher = session.create_publisher(spec).expect("a publisher");
+    let steers = |text: &str| {
+        let of_bidi =
+            |c| matches!(c, '\u{61c}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
+        text.chars().any(|c| c != '\n' && c.is_control() || of_bidi(c))
+    };
+    for arguments in [&["status"][..], &["status", "--json"]] {
+        let output = host.run(arguments);
+        let text = String::from_utf8(output.stdout).expect("UTF-8");
+        assert!(text.contains("[2Jne"), "the topic is shown: {text}");
+        assert!(!steers(&text), "{arguments:?}: {text:?}");
+    }
+    let mut echo = Running::start(host.axon(&["echo", topic, "--count", "1"]));
+    assert!(publisher.wait_matched(1, Duration::from_secs(60)));
+    publisher.publish(b"\x1b[2J").expect("published");
+    let text: String = echo.lines().collect::<Vec<_>>().join("\n");
+    let output = echo.finish();
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{said}");
+    assert!(!text.is_empty() && !steers(&text) && !steers(&said), "{text:?} {said:?}");
+    drop(daemon);
 }
 
 #[test]

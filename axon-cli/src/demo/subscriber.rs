@@ -5,6 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use axon_transport::internal::session::unix_nanos;
 use axon_transport::{EndpointSpec, qos::Qos};
 
 use super::{
@@ -46,8 +47,8 @@ pub(crate) fn run(args: &cli::DemoSubscriber) -> Result<(), Failure> {
                 tally.arrived(Arrival {
                     topic,
                     sequence: info.sequence,
-                    published: info.source_timestamp,
-                    received: info.received_timestamp,
+                    published: unix_nanos(info.source_timestamp),
+                    received: unix_nanos(info.received_timestamp),
                     payload: &payload,
                 });
             }

@@ -73,6 +73,17 @@ impl Host {
         command
     }
 
+    /// A session of this process with the daemon of the host, which runs already.
+    pub(crate) fn session(&self, name: &str) -> axon_transport::Session {
+        let config = axon_transport::config::Config::builder()
+            .runtime_dir(self.dir.path())
+            .domain(self.domain.parse().expect("a number"))
+            .build()
+            .expect("settings");
+        let options = axon_transport::SessionOptions::new(name);
+        axon_transport::Session::open(&config, options).expect("a session")
+    }
+
     pub(crate) fn run(&self, args: &[&str]) -> Output {
         self.axon(args).output().expect("the tool runs")
     }

@@ -11,6 +11,7 @@ use std::{
 };
 
 use alone::alone;
+use axon_transport::internal::session::{from_unix_nanos, unix_nanos};
 use axon_transport::{
     EndpointSpec, Publisher, RecvError, Session, SessionError, SessionOptions, Subscription,
     Waitable,
@@ -39,7 +40,10 @@ fn spec(qos: Qos) -> EndpointSpec {
 
 fn drain(subscription: &Subscription) -> Vec<i64> {
     let mut bytes = Vec::new();
-    std::iter::from_fn(|| subscription.take(&mut bytes).map(|info| info.source_timestamp)).collect()
+    std::iter::from_fn(|| {
+        subscription.take(&mut bytes).map(|info| unix_nanos(info.source_timestamp))
+    })
+    .collect()
 }
 
 fn publishers(session: &Session, count: usize, qos: Qos) -> Vec<Publisher> {
@@ -146,7 +150,7 @@ fn publishers_are_merged_by_source_timestamp() {
     assert!(subscription.wait_matched(3, PATIENCE));
     for round in 0..10 {
         for (offset, publisher) in [2, 0, 1].iter().zip(&publishers) {
-            publisher.publish_at(round * 3 + offset, b"x").unwrap();
+            publisher.publish_at(from_unix_nanos(round * 3 + offset), b"x").unwrap();
         }
     }
     assert_eq!(drain(&subscription), (0..30).collect::<Vec<_>>());
@@ -161,7 +165,9 @@ fn depth_counts_over_all_publishers_and_skipping_is_not_loss() {
         session.create_subscription(spec(Qos { depth: 4, ..Qos::default() })).unwrap();
     assert!(subscription.wait_matched(3, PATIENCE));
     for time in 0..9 {
-        publishers[usize::try_from(time).unwrap() % 3].publish_at(time, b"x").unwrap();
+        publishers[usize::try_from(time).unwrap() % 3]
+            .publish_at(from_unix_nanos(time), b"x")
+            .unwrap();
     }
     assert_eq!(drain(&subscription), [5, 6, 7, 8]);
     assert_eq!(subscription.lost(), 0);
@@ -174,7 +180,7 @@ fn what_a_publisher_left_is_taken_after_its_end() {
     let publisher = session.create_publisher(spec(Qos::keep_all())).unwrap();
     assert!(subscription.wait_matched(1, PATIENCE));
     for time in 0..5 {
-        publisher.publish_at(time, b"x").unwrap();
+        publisher.publish_at(from_unix_nanos(time), b"x").unwrap();
     }
     drop(publisher);
     assert!(session.wait_graph(PATIENCE, |graph| graph.endpoints.len() == 1));

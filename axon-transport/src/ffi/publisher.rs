@@ -9,7 +9,7 @@ use super::{
     qos::axon_qos_t,
     wait::{duration, time},
 };
-use crate::{graph::EndpointKind, qos::Qos};
+use crate::{graph::EndpointKind, qos::Qos, session::from_unix_nanos};
 
 /// The time at which the call is made, as a sample's source timestamp.
 pub const AXON_TIME_NOW: i64 = i64::MIN;
@@ -91,7 +91,7 @@ pub unsafe extern "C" fn axon_session_publisher_publish(
         // SAFETY: the caller's word.
         let payload = unsafe { elements(data, len, "the sample") }?;
         let published = match time(source_timestamp) {
-            Some(time) => publisher.publish_at(time, payload),
+            Some(time) => publisher.publish_at(from_unix_nanos(time), payload),
             None => publisher.publish(payload),
         };
         let number = published.map_err(|e| Failure::from(e).of_endpoint(publisher.endpoint()))?;

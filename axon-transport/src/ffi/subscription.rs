@@ -17,7 +17,7 @@ use super::{
 use crate::{
     graph::{Endpoint, EndpointKind},
     qos::Qos,
-    session::MessageInfo,
+    session::{MessageInfo, unix_nanos},
 };
 
 /// What is known of a message besides its bytes. Times are nanoseconds since the Unix epoch.
@@ -232,8 +232,8 @@ impl axon_message_info_t {
             sender: info.publisher.into(),
             publication_sequence: info.sequence,
             reception_sequence: info.reception,
-            source_timestamp: info.source_timestamp,
-            received_timestamp: info.received_timestamp,
+            source_timestamp: unix_nanos(info.source_timestamp),
+            received_timestamp: unix_nanos(info.received_timestamp),
             own_session: u8::from(info.publisher.is_of_session_of(&endpoint.gid)),
             reserved: [0; 7],
         }

@@ -5,13 +5,14 @@ use std::{
     collections::{BTreeMap, HashMap},
     os::fd::OwnedFd,
     sync::Arc,
+    time::{Duration, SystemTime},
 };
 
 use axon_shm::{Meta, PublishError, Sample, internal::SessionSegment};
 
 use super::{
-    EndpointSpec, MessageInfo, Node, Publisher, Server, Session, SessionError, SessionOptions,
-    Subscription,
+    EndpointSpec, Lifetime, MessageInfo, Node, Publisher, Server, Session, SessionError,
+    SessionOptions, Subscription,
     daemon::connect::Caller,
     daemon::control::Start,
     state::Outgoing,
@@ -23,6 +24,24 @@ use crate::{
     ids::{Gid, SessionId},
     wire::session::{EndpointRole, GivenUp, Message, SessionRole},
 };
+
+#[doc(hidden)]
+impl MessageInfo {
+    /// Of a sample with this number, of no particular time.
+    pub fn of(publisher: Gid, sequence: u64) -> Self {
+        let [source_timestamp, received_timestamp] = [SystemTime::UNIX_EPOCH; 2];
+        let (reception, lifetime) = (sequence, None);
+        Self { publisher, sequence, source_timestamp, received_timestamp, reception, lifetime }
+    }
+}
+
+#[doc(hidden)]
+impl Lifetime {
+    /// A sample of this age and lifespan.
+    pub fn new(age: Duration, lifespan: Duration) -> Self {
+        Self { age, lifespan }
+    }
+}
 
 #[doc(hidden)]
 impl Session {

@@ -5,7 +5,7 @@ use std::{
     fmt, io,
     ops::{Deref, DerefMut},
     sync::{Arc, Mutex, MutexGuard, PoisonError},
-    time::Duration,
+    time::{Duration, SystemTime},
 };
 
 use axon_shm::{
@@ -51,15 +51,20 @@ impl Publisher {
     /// [`PublishError::Blocked`] after 100 ms when a KEEP_ALL reader makes no room; the others say
     /// what does not fit. A sample that was refused has no sequence number: nobody counts it lost.
     pub fn publish(&self, payload: &[u8]) -> Result<u64, PublishError> {
-        self.publish_at(clock::wall(), payload)
+        self.inner.published(self.writer.publish_next(clock::wall(), payload))
     }
 
-    /// As [`publish`](Self::publish), with a source timestamp of the caller's, in nanoseconds since
-    /// the Unix epoch.
+    /// As [`publish`](Self::publish), with a source timestamp of the caller's: of 1677 to 2262, in
+    /// nanoseconds.
     ///
     /// # Errors
     /// As for [`publish`](Self::publish).
-    pub fn publish_at(&self, source_timestamp: i64, payload: &[u8]) -> Result<u64, PublishError> {
+    pub fn publish_at(
+        &self,
+        source_timestamp: SystemTime,
+        payload: &[u8],
+    ) -> Result<u64, PublishError> {
+        let source_timestamp = clock::unix_nanos(source_timestamp);
         self.inner.published(self.writer.publish_next(source_timestamp, payload))
     }
 

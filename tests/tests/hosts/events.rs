@@ -6,6 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use axon_transport::internal::session::from_unix_nanos;
 use axon_transport::{
     EndpointSpec, Event, Publisher, Session, Subscription, Waitable,
     events::{Counted, EventKind, EventStatus, LivelinessChanged, Matched},
@@ -206,7 +207,7 @@ fn what_is_older_than_its_lifespan_is_not_taken_elsewhere() {
     };
     // By the clock of its host it is of 1970: the clock does not matter.
     let (publisher, subscription) = matched(&here, &there, lasts(3600));
-    publisher.publish_at(1_000_000_000, b"new").unwrap();
+    publisher.publish_at(from_unix_nanos(1_000_000_000), b"new").unwrap();
     let mut bytes = Vec::new();
     let info = subscription.recv(&mut bytes, Some(PATIENCE)).expect("it is not old");
     assert_eq!((&bytes[..], info.sequence, subscription.lost()), (&b"new"[..], 1, 0));
@@ -214,7 +215,7 @@ fn what_is_older_than_its_lifespan_is_not_taken_elsewhere() {
     let spec = || EndpointSpec::new("/late", "test/Bytes", lasts(6));
     let late = here.create_publisher(spec()).unwrap();
     let over = Instant::now() + Duration::from_secs(6);
-    late.publish_at(i64::MAX, b"old").unwrap();
+    late.publish_at(from_unix_nanos(i64::MAX), b"old").unwrap();
     thread::sleep(Duration::from_secs(4));
     let subscription = there.create_subscription(spec()).unwrap();
     while !subscription.has_data() && Instant::now() < over {

@@ -146,7 +146,7 @@ fn in_session(kex: &str) {
         ("AXON_QKD_KEY_MODE", "session"),
         ("AXON_QKD_KEX", kex),
         // A KME's connection is closed as idle after four seconds.
-        ("AXON_QKD_SESSION_MAX_AGE", "12"),
+        ("AXON_QKD_SESSION_MAX_AGE", "20"),
     ];
     let hosts = Plan::new([0, 1].map(|host| kmes.settings(host, &mode))).start();
     let [a, b] = &hosts;

@@ -327,14 +327,7 @@ impl Link {
 }
 
 fn greeting(publisher: Gid) -> Sample {
-    let info = MessageInfo {
-        publisher,
-        sequence: 1,
-        source_timestamp: 0,
-        received_timestamp: 0,
-        reception: 1,
-        lifetime: None,
-    };
+    let info = MessageInfo::of(publisher, 1);
     sample(info, b"an attempt".to_vec())
 }
 

@@ -6,6 +6,8 @@ use std::{borrow::Cow, sync::Arc, time::Instant};
 use axon_envelope::{Delivery, Kind, OpenError, Route, TAG_LEN, inner};
 use axon_shm::ids::Gid;
 
+use axon_transport::internal::session::unix_nanos;
+
 use super::{
     frames::Frames,
     keyring::{Keyring, PeerKeys},
@@ -86,7 +88,7 @@ fn header(sample: &Sample) -> inner::Header {
     inner::Header {
         gid: sample.info.publisher.0,
         sequence: sample.info.sequence,
-        source_timestamp: sample.info.source_timestamp,
+        source_timestamp: unix_nanos(sample.info.source_timestamp),
         request_id,
         compressed: false,
         age_ms: u32::try_from(age).unwrap_or(u32::MAX),
@@ -222,14 +224,7 @@ mod tests {
     #[test]
     fn what_belongs_to_another_stream_or_call_is_refused() {
         let (client, server) = (Gid([1; 16]), Gid([2; 16]));
-        let info = |publisher| MessageInfo {
-            publisher,
-            sequence: 7,
-            source_timestamp: 0,
-            received_timestamp: 0,
-            reception: 1,
-            lifetime: None,
-        };
+        let info = |publisher| MessageInfo::of(publisher, 7);
         let topic = header(&sample(info(client), Vec::new()));
         let call = |of| header(&Sample { client: Some(client), ..sample(info(of), Vec::new()) });
         let (request, response) = (call(client), call(server));

@@ -22,6 +22,7 @@ use std::{
 };
 
 use alone::alone;
+use axon_transport::internal::session::from_unix_nanos;
 use axon_transport::{
     EndpointSpec, Event, OnNew, Publisher, Session, Subscription, Waitable,
     events::{Counted, EventKind, EventStatus, LivelinessChanged, Matched},
@@ -317,10 +318,10 @@ fn a_sample_older_than_its_lifespan_is_not_delivered() {
     // The wall clock, by which the one is of 1970 and the other of 2262, does not matter. In a
     // descriptor, in a block and in a slot.
     for len in [8, 88, 89, 96, 97, 20_000] {
-        short.publish_at(i64::MAX, &vec![1; len]).unwrap();
-        long.publish_at(1_000_000_000, &vec![2; len]).unwrap();
+        short.publish_at(from_unix_nanos(i64::MAX), &vec![1; len]).unwrap();
+        long.publish_at(from_unix_nanos(1_000_000_000), &vec![2; len]).unwrap();
     }
-    immortal.publish_at(1_000_000_000, b"of no lifespan").unwrap();
+    immortal.publish_at(from_unix_nanos(1_000_000_000), b"of no lifespan").unwrap();
     let mut bytes = Vec::new();
     let mut taken = Vec::new();
     while let Some(info) = subscription.take(&mut bytes) {

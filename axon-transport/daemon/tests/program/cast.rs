@@ -6,6 +6,7 @@ use std::{
 };
 
 use axon_shm::PublishError;
+use axon_transport::internal::session::{from_unix_nanos, unix_nanos};
 use axon_transport::{
     Client, EndpointSpec, MessageInfo, Node, Publisher, Server, Session, SessionOptions,
     Subscription, Waitable,
@@ -144,7 +145,7 @@ impl Cast {
         for done in 0..count {
             let stamp = stamp + i64::try_from(done).unwrap();
             payload.fill(stamp as u8);
-            match publisher.publish_at(stamp, &payload) {
+            match publisher.publish_at(from_unix_nanos(stamp), &payload) {
                 Ok(sequence) => {
                     let first = *first.get_or_insert(sequence);
                     assert_eq!(sequence, first + done, "a number was left out");
@@ -165,7 +166,7 @@ impl Cast {
         let mut bytes = Vec::new();
         let mut take = || {
             let info = subscription.take(&mut bytes)?;
-            assert!(bytes.iter().all(|byte| *byte == info.source_timestamp as u8));
+            assert!(bytes.iter().all(|byte| *byte == unix_nanos(info.source_timestamp) as u8));
             samples.push((sample(&info, bytes.len()), info.reception));
             Some(())
         };
@@ -261,7 +262,7 @@ fn sample(info: &MessageInfo, len: usize) -> Sample {
     Sample {
         publisher: info.publisher.to_string(),
         sequence: info.sequence,
-        stamp: info.source_timestamp,
+        stamp: unix_nanos(info.source_timestamp),
         len: len as u64,
     }
 }

@@ -17,7 +17,7 @@ use std::{
     os::fd::{AsFd, OwnedFd},
     sync::atomic::{AtomicBool, AtomicU32, Ordering},
     thread,
-    time::{Duration, Instant},
+    time::{Duration, Instant, SystemTime},
 };
 
 use axon_shm::PublishError;
@@ -257,7 +257,7 @@ fn samples_of_all_sizes_cross_whole_and_in_order_whoever_shares_memory() {
         let mut bytes = Vec::new();
         for (number, len) in (0..).zip(SIZES.iter().chain(SIZES.iter().rev())) {
             let payload = pattern(number, *len);
-            let time = 1_000 + number as i64;
+            let time = SystemTime::UNIX_EPOCH + Duration::from_nanos(1_000 + number);
             assert_eq!(publisher.publish_at(time, &payload).unwrap(), number + 1);
             let info = subscription.recv(&mut bytes, Some(PATIENCE)).expect("a sample in time");
             assert!(bytes == payload, "{len} bytes");

@@ -1,6 +1,7 @@
 //! Deadlines, leases and lifespans where samples pass through the daemon: each is judged where its endpoint
 //! lives.
 
+use axon_transport::internal::session::from_unix_nanos;
 use axon_transport::{
     Event, Waitable,
     events::{Counted, EventKind, EventStatus, LivelinessChanged},
@@ -114,13 +115,13 @@ fn a_sample_that_outlived_its_lifespan_is_not_delivered_beyond_a_relay() {
         let mortal = |lifespan| Qos { lifespan: Some(lifespan), ..Qos::default() };
         // The wall clock does not matter: by it this one is of 1970.
         let (publisher, subscription) = connect(from, to, "/long", mortal(3_600_000 * MILLI));
-        publisher.publish_at(1_000_000_000, b"new").unwrap();
+        publisher.publish_at(from_unix_nanos(1_000_000_000), b"new").unwrap();
         let mut bytes = Vec::new();
         let info = subscription.recv(&mut bytes, Some(PATIENCE)).unwrap();
         assert_eq!((info.sequence, &bytes[..]), (1, &b"new"[..]));
         // The age counts from publication, not from when the relay had it: here it is taken later.
         let (publisher, subscription) = connect(from, to, "/short", mortal(300 * MILLI));
-        publisher.publish_at(i64::MAX, b"old").unwrap();
+        publisher.publish_at(from_unix_nanos(i64::MAX), b"old").unwrap();
         thread::sleep(Duration::from_millis(400));
         publisher.publish(b"the last").unwrap();
         until("the last came, or its lifespan was over", || {

@@ -25,7 +25,7 @@ const LEN: u64 = 4096;
 pub fn probe() -> Result<OwnedFd, ShmError> {
     let fd = memfd_create("axon-probe", MemfdFlags::CLOEXEC)
         .map_err(ShmError::system("creating a memfd"))?;
-    ftruncate(&fd, LEN).map_err(ShmError::system("sizing a memfd"))?;
+    ftruncate(&fd, LEN).map_err(ShmError::system(super::segment::SIZING))?;
     Ok(fd)
 }
 

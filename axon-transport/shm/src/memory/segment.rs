@@ -37,6 +37,9 @@ fn seals() -> SealFlags {
     SealFlags::SHRINK | SealFlags::GROW | SealFlags::FUTURE_WRITE | SealFlags::SEAL
 }
 
+/// The step that a limit on the length of files forbids.
+pub(super) const SIZING: &str = "sizing a memfd, whose length `ulimit -f` must allow";
+
 /// Memory that this process alone writes, sparse until [`Segment::commit`].
 pub(crate) struct Segment {
     fd: OwnedFd,
@@ -54,7 +57,7 @@ impl Segment {
             other => other,
         }
         .map_err(ShmError::system("creating a memfd"))?;
-        ftruncate(&fd, len).map_err(ShmError::system("sizing a memfd"))?;
+        ftruncate(&fd, len).map_err(ShmError::system(SIZING))?;
         // FUTURE_WRITE forbids writable maps from then on, so ours is made first.
         let map = Map::new(fd.as_fd(), len, Access::Write)?;
         fcntl_add_seals(&fd, seals()).map_err(ShmError::system("sealing a memfd"))?;

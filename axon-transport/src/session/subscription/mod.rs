@@ -8,7 +8,7 @@ mod trusted;
 use std::{
     fmt,
     sync::Arc,
-    time::{Duration, Instant},
+    time::{Duration, Instant, SystemTime},
 };
 
 use axon_shm::{
@@ -41,17 +41,18 @@ pub struct Subscription {
     pub(super) session: Session,
 }
 
-/// What is known of a sample besides its bytes. Times are nanoseconds since the Unix epoch.
+/// What is known of a sample besides its bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct MessageInfo {
     /// Who published it.
     pub publisher: Gid,
     /// The publication's number, from 1.
     pub sequence: u64,
     /// When it was published, by the publisher's clock.
-    pub source_timestamp: i64,
+    pub source_timestamp: SystemTime,
     /// When it was taken, by this host's clock.
-    pub received_timestamp: i64,
+    pub received_timestamp: SystemTime,
     /// Its number among those that the endpoint has taken, from 1.
     pub reception: u64,
     /// Its age and lifespan, where the lifespan is finite.
@@ -61,6 +62,7 @@ pub struct MessageInfo {
 /// The age of a sample when it was taken, and its publisher's lifespan. The monotonic clock tells both,
 /// so that neither a step of the wall clock nor that of another host counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Lifetime {
     /// How long ago it was published when it was taken.
     pub age: Duration,

@@ -116,7 +116,7 @@ impl MatchedReaders {
             }
         };
         let over = slot.over;
-        let received_timestamp = clock::wall();
+        let received_timestamp = clock::from_unix_nanos(clock::wall());
         let lifetime = slot.lifespan.map(|lifespan| Lifetime::of(&meta, lifespan));
         let expired = lifetime.is_some_and(Lifetime::is_over);
         slot.passed(meta.sequence);
@@ -138,7 +138,7 @@ impl MatchedReaders {
         let info = MessageInfo {
             publisher: writer,
             sequence: meta.sequence,
-            source_timestamp: meta.source_timestamp,
+            source_timestamp: clock::from_unix_nanos(meta.source_timestamp),
             received_timestamp,
             reception: self.received,
             lifetime,

@@ -136,14 +136,7 @@ mod tests {
     }
 
     fn offer(queue: &Mutex<Queue>, sequence: u64) {
-        let info = MessageInfo {
-            publisher: Gid([1; 16]),
-            sequence,
-            source_timestamp: 0,
-            received_timestamp: 0,
-            reception: sequence,
-            lifetime: None,
-        };
+        let info = MessageInfo::of(Gid([1; 16]), sequence);
         let since = std::time::Instant::now();
         let offered =
             lock(queue).offer(Sample { info, client: None, payload: Bytes::new(), since });

@@ -32,14 +32,7 @@ fn shared(connection: &Connection) -> (Arc<Shared>, watch::Sender<Carrier>) {
 }
 
 fn a_sample(sequence: u64) -> Sample {
-    let info = MessageInfo {
-        publisher: OF,
-        sequence,
-        source_timestamp: 0,
-        received_timestamp: 0,
-        reception: sequence,
-        lifetime: None,
-    };
+    let info = MessageInfo::of(OF, sequence);
     sample(info, b"sample".to_vec())
 }
 
@@ -357,9 +350,11 @@ fn overload(rate: u64, length: usize, samples: u32, load: f64, depth: u32) -> (f
 
 #[test]
 fn of_best_effort_beyond_what_a_link_carries_most_of_what_it_carries_arrives() {
-    // A link can carry half of it.
-    let (share, _) = overload(1_000_000, 64 << 10, 60, 2.0, 5);
-    assert!(share > 0.2, "{share}");
+    // The part of it that a link can carry is 0.99, 0.5 and 0.43.
+    for (load, least) in [(1.01, 0.5), (2.0, 0.2), (2.3, 0.15)] {
+        let (share, _) = overload(1_000_000, 64 << 10, 60, load, 5);
+        assert!(share > least, "{share} of {load}");
+    }
 }
 
 #[test]

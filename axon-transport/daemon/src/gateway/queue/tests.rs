@@ -5,14 +5,7 @@ use axon_transport::internal::session::Lifetime;
 use super::*;
 
 fn sample(sequence: u64, size: usize) -> Sample {
-    let info = MessageInfo {
-        publisher: Gid::default(),
-        sequence,
-        source_timestamp: 0,
-        received_timestamp: 0,
-        reception: sequence,
-        lifetime: None,
-    };
+    let info = MessageInfo::of(Gid::default(), sequence);
     Sample { info, client: None, payload: vec![0; size].into(), since: std::time::Instant::now() }
 }
 
@@ -225,9 +218,10 @@ fn best_effort_ages_by_its_publishers_lifespan_from_publication_on() {
     let [life, age] = [1000, 900].map(Duration::from_secs);
     let transit = Duration::from_secs(200);
     let mortal = |sequence, age| {
-        let lifetime = Some(Lifetime { age, lifespan: Duration::from_secs(1000) });
-        let sample = sample(sequence, 1);
-        Sample { info: MessageInfo { lifetime, ..sample.info }, ..sample }
+        let lifetime = Some(Lifetime::new(age, Duration::from_secs(1000)));
+        let mut sample = sample(sequence, 1);
+        sample.info.lifetime = lifetime;
+        sample
     };
     assert!(mortal(1, age).age() >= age, "it was as old when it was copied out");
     assert!(mortal(1, age).left().unwrap() <= Duration::from_secs(100));
