@@ -1,4 +1,4 @@
-//! The two clocks: one for people, one for waits.
+//! The two clocks: wall-clock time for timestamps, monotonic time for timeouts.
 
 use std::time::{Duration, SystemTime};
 
