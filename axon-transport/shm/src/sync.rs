@@ -31,20 +31,20 @@ pub(crate) trait LockWord {
 ///
 /// | site | pairs with | so that |
 /// | --- | --- | --- |
-/// | `StampStore` | `StampLoad` | whoever sees the stamp sees the sample |
-/// | `HeadStore` | `HeadLoad` | whoever sees the head sees the stamp of the sample below it |
+/// | `StampStore` | `StampLoad` | a reader that sees the stamp sees the sample |
+/// | `HeadStore` | `HeadLoad` | a reader that sees the head sees the stamp of the sample below it |
 /// | `TailStore` | `TailLoad` | a reader never sees a tail above the head that it loads next |
 /// | `ReuseFence` | `StandsFence` | a reader that saw a reuse sees the tail or array that announced it |
-/// | `ArrayStore` | `ArrayLoad` | whoever sees the new array sees the descriptors in it |
+/// | `ArrayStore` | `ArrayLoad` | a reader that sees the new array sees the descriptors in it |
 /// | `MappedStore` | `MappedLoad` | what moves to a segment that came is found there |
 /// | `ReclaimFence` | `PinFence` | the publisher sees the pin, or the reader sees the tail |
 /// | `PinStore`, `UnpinStore` | `ScanLoad` | a pinned sample is read before it is written over |
-/// | `UnpinStore` | `FreeLoad` | who sees the next pin in a record knows that the last was read |
-/// | `OpenStore` | `GenerationLoad` | whoever sees a lane open sees its cursor |
-/// | `CloseStore`, `AskStore` | `GenerationLoad` | whoever sees a reader gone writes after it read |
+/// | `UnpinStore` | `FreeLoad` | a publisher that sees the next pin in a record knows that the last was read |
+/// | `OpenStore` | `GenerationLoad` | a publisher that sees a lane open sees its cursor |
+/// | `CloseStore`, `AskStore` | `GenerationLoad` | a publisher that sees a reader gone writes after it read |
 /// | `CursorStore` | `CursorLoad` | a sample is copied out before KEEP_ALL writes over it |
 /// | `ArmFence` | `SettleFence` | the sleeper sees the news, or the waker sees the ticket |
-/// | `LetGoSwap` | `TakeSwap` | whoever takes a lock sees what its last holder did |
+/// | `LetGoSwap` | `TakeSwap` | a thread that takes a lock sees what its last holder did |
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Site {
     StampStore,

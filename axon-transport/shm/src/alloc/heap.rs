@@ -158,8 +158,8 @@ impl Heap {
             found = parts.iter_mut().find_map(|part| part.give(len, &mut short));
         }
         drop(parts);
-        // Whoever gave this memory back did so after it raised a tail or replaced an array, and
-        // under the lock: readers that see what is written there now see that too.
+        // The thread that gave this memory back did so after it raised a tail or replaced an array,
+        // and under the lock: readers that see what is written there now see that too.
         about_to_write::<AtomicU64>();
         match (found, short) {
             (None, Some(error)) => Err(error),
@@ -173,7 +173,7 @@ impl Heap {
         let len = Area::rounded(len);
         let mut parts = self.parts();
         if !parts.iter().any(|part| part.fits(len))
-            // What lacks now, whoever needs it then is told.
+            // An error is ignored here: the allocation that needs the memory reports it.
             && let Ok(part) = Self::another(segments, len)
         {
             parts.push(part);

@@ -14,7 +14,7 @@ use crate::{
 /// Where it is in a grant's generation.
 const SHIFT: u32 = 24;
 const BITS: u64 = (1 << 6) - 1;
-/// Of what is left, one more reader gets this part.
+/// One more reader gets one part in so many of the remaining memory.
 const PART: u64 = 16;
 
 /// The longest sample that a reader may pin: a power of two in bytes, or none at all.

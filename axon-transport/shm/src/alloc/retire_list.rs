@@ -5,8 +5,8 @@ use std::ops::Range;
 
 use crate::{alloc::slots::Slots, ring::layout::Location};
 
-/// Who has which bytes of which segments. One at a time takes samples in; those that have been
-/// left are [vacated](Self::vacated) once the last of theirs has gone.
+/// Which store has which bytes of which segments. One store at a time takes samples in; those that
+/// have been left are [vacated](Self::vacated) once the last of theirs has gone.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct RetireList {
     /// The one that takes samples in is the last of them.

@@ -256,7 +256,8 @@ impl Context {
         if let Some(known) = peers.get(&id)
             && let Some(session) = known.session.upgrade()
         {
-            // Ids are no secret. Whoever comes first with another's would else be taken for it.
+            // Ids are no secret. Without this check the owner of an id would get the session of a process
+            // that came with that id first.
             if known.memory != memory || !session.is_of(process) {
                 return refuse("another process has this context's id");
             }

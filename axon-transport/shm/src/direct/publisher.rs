@@ -96,8 +96,8 @@ impl Publisher {
     /// `socket`, a connected unix socket that keeps packets apart (`SOCK_SEQPACKET` or
     /// `SOCK_DGRAM`), and returns its GID. Waits for it for at most `timeout`.
     ///
-    /// Whoever holds the other end is trusted to be who it says. Memory that it shares is not. The
-    /// socket is not needed any more after it.
+    /// The process at the other end is trusted to be the one that it claims to be. Memory that it
+    /// shares is not trusted. The socket is not needed any more afterwards.
     ///
     /// # Errors
     /// It did not ask in time, asked for what this publisher does not offer, or handed over what
@@ -203,7 +203,7 @@ impl Publisher {
 
     /// If a sample would be read by nobody, now or later, uses up the next sequence number and
     /// returns it; `None` when somebody would. Where nobody reads, publishing does the same, but
-    /// whoever has to serialize first can save itself the work.
+    /// a caller that has to serialize first can save the work.
     ///
     /// # Errors
     /// [`PublishError::Forked`].
@@ -222,8 +222,9 @@ impl Publisher {
         self.loan_behind(0, len)
     }
 
-    /// As [`loan`](Self::loan), but what is aligned to 16 is not its first byte but that behind the first
-    /// `header`, for whoever takes it in place too: a structure that follows a header of four bytes, say.
+    /// As [`loan`](Self::loan), but the byte behind the first `header` bytes is aligned to 16, not the
+    /// first byte. It is so for a reader that takes the sample in place, too. An example is a structure
+    /// that follows a header of four bytes.
     ///
     /// # Errors
     /// As for [`publish`](Self::publish).
@@ -246,7 +247,7 @@ impl Publisher {
     }
 
     /// Gives memory back that samples in place took and that is not needed any more: all
-    /// of it ten seconds after the last that anybody wants, else what is more than four times what
+    /// of it ten seconds after the last that anybody wants, else the part above four times what
     /// was needed for as long. And hands over what a subscriber had no room for when it came into use,
     /// which the last sample before a pause may be in. To be called about once a second for as long as
     /// it returns true, and after the last sample before a pause.

@@ -174,7 +174,7 @@ impl SegmentChannels {
             Err(error) if !has_ring || matches!(error, ConnectError::Closed) => return Err(error),
             told => self.note(told.is_ok()),
         }
-        // Who asks once more hears over the new line alone.
+        // A pair that asks again is told over its new line only.
         state.lines.retain(|line| (line.reader, line.writer) != (reader, writer));
         state.lines.push(line);
         Ok(())
@@ -186,7 +186,7 @@ impl SegmentChannels {
             Ok(state) => state,
             Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),
             Err(TryLockError::WouldBlock) => {
-                // Whoever has it may have seen all segments already.
+                // The thread that holds the lock may have visited all segments already.
                 self.behind.store(true, Ordering::Relaxed);
                 return;
             }
@@ -205,8 +205,8 @@ impl SegmentChannels {
         }
     }
 
-    /// Tells those that are behind what they lack, if anybody is and not all the time. Waits for
-    /// nobody else who tells: the next call does what is left then.
+    /// Tells those that are behind what they lack, if anybody is and not all the time. Does not
+    /// wait for another thread that is telling them: the next call does the rest then.
     #[inline]
     pub(crate) fn keep_up(&self, session: &SessionSegment) {
         if self.behind.load(Ordering::Relaxed) && !session.is_forked() {

@@ -155,7 +155,7 @@ impl Subscriber {
             while !peer.has_segment(ring.segment) {
                 context.hear(peer, channel.take_news()?);
             }
-            // Whoever has the other end decides what stands in it, and how long that takes to close.
+            // The process at the other end decides what is queued in it, and so how long closing it takes.
             kept = Some(Mutex::new(PassedFd::received(ours)));
         }
         let reader = Reader::map(ReaderOptions {
@@ -280,7 +280,7 @@ impl Subscriber {
         if self.reader.has_data() {
             return true;
         }
-        // What is missing may stand in the line.
+        // The missing segment may be queued in the socket.
         self.reader.missing().is_some() && {
             self.hear();
             self.reader.has_data()

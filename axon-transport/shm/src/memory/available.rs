@@ -78,7 +78,7 @@ const V1: Files = Files {
     reclaimable: "total_inactive_file ",
 };
 
-/// What is left to a group and its ancestors, by the tightest of their limits.
+/// The memory left to a group and its ancestors, by the tightest of their limits.
 fn lowest(root: &Path, group: &str, files: &Files, enough: u64, text: &mut String) -> Option<u64> {
     let groups = Path::new(group).ancestors();
     groups.filter_map(|group| room(&root.join(group), files, enough, text)).min()

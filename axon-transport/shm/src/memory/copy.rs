@@ -90,7 +90,7 @@ fn copy_words(words: &[AtomicU64], at: usize, out: &mut [MaybeUninit<u8>]) {
     }
 }
 
-/// Fills `to` with the first of these bytes, of which there are enough.
+/// Fills `to` with the first of `bytes`, which are enough.
 #[inline(always)]
 fn put(to: &mut [MaybeUninit<u8>], bytes: &[u8]) {
     debug_assert!(bytes.len() >= to.len());
@@ -100,7 +100,7 @@ fn put(to: &mut [MaybeUninit<u8>], bytes: &[u8]) {
 }
 
 /// # Safety
-/// As many bytes from `from` on as `out` has are words of a map, whoever writes to them.
+/// As many bytes from `from` on as `out` has are words of a map. Other processes may write to them.
 #[cfg(all(target_arch = "x86_64", not(miri)))]
 #[inline]
 unsafe fn copy_bulk(from: *const u8, out: &mut [MaybeUninit<u8>]) {
@@ -125,8 +125,8 @@ unsafe fn copy_bulk(from: *const u8, out: &mut [MaybeUninit<u8>]) {
 /// Copies 64 bytes at a time, in a loop that the processor fetches ahead of.
 ///
 /// # Safety
-/// As many bytes from `from` on as `out` has, a multiple of 64, are words of a map, whoever writes to
-/// them.
+/// As many bytes from `from` on as `out` has, a multiple of 64, are words of a map. Other processes may
+/// write to them.
 #[cfg(all(target_arch = "x86_64", not(miri)))]
 #[inline]
 unsafe fn copy_lines(from: *const u8, out: &mut [MaybeUninit<u8>]) {

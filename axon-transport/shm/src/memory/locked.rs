@@ -28,7 +28,7 @@ impl LockedPages {
         let pages = unsafe { mmap_anonymous(ptr::null_mut(), len, access, private) }?;
         // SAFETY: the mapping just made, of that length.
         let locked = unsafe { mlock(pages, len) };
-        // SAFETY: as above. What is left out of core files is not changed.
+        // SAFETY: as above. Leaving the pages out of core files does not change them.
         let kept_out = unsafe { madvise(pages, len, Advice::LinuxDontDump) };
         // SAFETY: as above. A forked child finds zeros, which are as valid as any other bytes.
         let wiped = unsafe { madvise(pages, len, Advice::LinuxWipeOnFork) };

@@ -155,8 +155,8 @@ const TMPFS_MAGIC: i64 = 0x0102_1994;
 // SAFETY: what `base` points to is plain memory, and unmapping it works from any thread. The other fields
 // may go anywhere by themselves.
 unsafe impl Send for Map {}
-// SAFETY: as above: all access is atomic, but for bytes whose address a `Segment` gives away, and who asks
-// for that answers for it (what is lent is one loan's alone).
+// SAFETY: as above: all access is atomic, but for bytes whose address a `Segment` gives away, and the
+// caller that asks for it answers for that (what is lent is one loan's alone).
 unsafe impl Sync for Map {}
 
 impl Map {

@@ -58,7 +58,7 @@ impl Place {
         }
         let entry = free_entry();
         entry.bytes.store(bytes, Ordering::Relaxed);
-        // Pairs with the acquire load in `in_child`: whoever sees the address sees the length.
+        // Pairs with the acquire load in `in_child`: a child that sees the address sees the length.
         entry.base.store(base.as_ptr().addr(), Ordering::Release);
         Ok(Self(entry))
     }
@@ -88,7 +88,7 @@ fn free_entry() -> &'static Entry {
         bytes: AtomicUsize::new(0),
         next,
     }));
-    // Release: pairs with the acquire loads of those who walk the list.
+    // Release: pairs with the acquire loads of the functions that walk the list.
     while let Err(newer) =
         ENTRIES.compare_exchange(next, ptr::from_mut(entry), Ordering::Release, Ordering::Acquire)
     {

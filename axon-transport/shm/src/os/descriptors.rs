@@ -101,8 +101,8 @@ impl PassedFd {
         Some((found.st_dev, found.st_ino))
     }
 
-    /// Whether it stands for a process. Takes no lock of what it is, which whoever sent it could
-    /// keep. Only a pidfd can be waited for, though by nobody but the process's parent (Linux 5.4).
+    /// Whether it stands for a process. Takes no lock of the file behind it, which its
+    /// sender could hold. Only a pidfd can be waited for, though by nobody but the process's parent (Linux 5.4).
     pub fn is_pidfd(&self) -> bool {
         let look = WaitIdOptions::EXITED | WaitIdOptions::NOHANG | WaitIdOptions::NOWAIT;
         matches!(waitid(WaitId::PidFd(self.as_fd()), look), Ok(_) | Err(Errno::CHILD))
@@ -181,7 +181,7 @@ fn reserve(limit: u64) -> u64 {
 }
 
 /// Whether what this process may have open at most, `limit`, leaves no room for all that a packet can
-/// carry: who sends descriptors that are slow to close can then hold it up.
+/// carry: a peer that sends descriptors that are slow to close can then hold this process up.
 pub fn is_scarce(limit: u64) -> bool {
     reserve(limit) < RESERVE
 }

@@ -52,7 +52,7 @@ impl<T: Send + Sync> PerProcess<T> {
             let token = ForkToken::current()?;
             let fresh = Box::into_raw(Box::new(Made { token, before, value: make(token) }));
             let seen = before.map_or(ptr::null_mut(), |made| ptr::from_ref(made).cast_mut());
-            // Release pairs with the acquire of `latest`: whoever sees it sees it whole.
+            // Release pairs with the acquire of `latest`: a thread that sees it sees it whole.
             let (made, other) = (Ordering::AcqRel, Ordering::Acquire);
             if self.0.compare_exchange(seen, fresh, made, other).is_err() {
                 // SAFETY: made by `into_raw` above, and nobody else has seen it.

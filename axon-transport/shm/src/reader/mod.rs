@@ -386,8 +386,9 @@ impl Reader {
         self.missing.map(|missing| missing.segment)
     }
 
-    /// Gives up what is left if memory that it needs to go on has not come; whether it did. What is left
-    /// counts as skipped: for one whose publisher is gone, and of which another has all of that.
+    /// Gives up the remaining samples if memory that the reader needs to go on has not come; returns
+    /// whether it gave up. These samples count as skipped: for a reader whose publisher is gone and
+    /// whose samples another reader has, too.
     pub fn skip_missing(&mut self) -> bool {
         // It may have come since it was looked for.
         let lacks =

@@ -57,7 +57,7 @@ enum Data {
     Pinned { there: Extract, pin: Pin },
 }
 
-/// Bytes of a map: from the one behind the first `skip` of these words on.
+/// Bytes of a map: those of `words`, without the first `skip` bytes.
 pub(crate) struct Extract {
     pub(crate) map: Arc<Map>,
     pub(crate) words: Range<usize>,

@@ -91,7 +91,7 @@ pub(crate) fn retire<W: Word>(ring: &[W], tail: u64) {
 }
 
 /// Publisher: stores to descriptors, blocks or whatever else the heap gave out follow on this
-/// thread. Whoever sees one of them sees the tail that was retired, and the array that was
+/// thread. A reader that sees one of them sees the tail that was retired, and the array that was
 /// replaced before, by this thread or one that this thread synchronized with.
 #[inline]
 pub(crate) fn about_to_write<W: Word>() {
@@ -120,9 +120,9 @@ pub(crate) fn publish<W: Word>(
         Place::Inline => copy_in(&slot[DATA..PUBLISHED], inline),
         Place::Block(_) | Place::Slot(_) => slot[DATA].store(offset, Ordering::Relaxed),
     }
-    // Pairs with `state`: whoever sees the stamp sees the sample.
+    // Pairs with `state`: a reader that sees the stamp sees the sample.
     slot[STAMP].store(2 * position + 2, Site::StampStore.order());
-    // Pairs with `bounds`: whoever sees the head sees the stamp.
+    // Pairs with `bounds`: a reader that sees the head sees the stamp.
     ring[HEAD].store(position + 1, Site::HeadStore.order());
 }
 
@@ -152,7 +152,7 @@ pub(crate) fn copy_descriptors<W: Word>(old: &[W], new: &[W], tail: u64, head: u
 /// Publisher: from now on the descriptors are in another array. The old one may be used for
 /// something else, after [`about_to_write`].
 pub(crate) fn replace<W: Word>(ring: &[W], array: u64) {
-    // Pairs with `array`: whoever sees it sees the descriptors there.
+    // Pairs with `array`: a reader that sees it sees the descriptors there.
     ring[ARRAY].store(array, Site::ArrayStore.order());
 }
 

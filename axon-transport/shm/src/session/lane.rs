@@ -38,7 +38,7 @@ const GIVEN_UP_MAX: u64 = (1 << GIVEN_UP_BITS) - 1;
 
 /// Whether a grant of this generation is for the `number`th time that the session uses a lane.
 fn is_for(generation: u64, number: u64) -> bool {
-    // Any other value leaves the lane with nobody, or in the hands of one who asks.
+    // Any other value leaves the lane without a reader, or to a reader that still asks.
     (1..ASKED).contains(&generation) && generation & TIME == number & TIME
 }
 

@@ -350,7 +350,7 @@ impl PeerSession {
     fn ring_if(&self, purpose: Purpose) {
         let rung = &self.rung[purpose as usize];
         if due(self.ticket(purpose), rung) && !self.bell.ring() {
-            // Relaxed: whoever comes next rings for any ticket, or another one has.
+            // Relaxed: the next thread rings for any ticket, or another thread has rung.
             rung.store(0, Ordering::Relaxed);
         }
     }

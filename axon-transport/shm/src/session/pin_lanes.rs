@@ -97,7 +97,7 @@ impl PinLane {
 }
 
 /// All lanes to which a grant was given, until they say that their reader has left, or its process
-/// has ended. That a reader is detached, by whomever, ends nothing here: it may hold samples still.
+/// has ended. Detaching a reader ends nothing here: the reader may still hold samples.
 pub(crate) struct PinLanes {
     all: Vec<PinLane>,
     /// What they may keep.
@@ -110,8 +110,8 @@ impl PinLanes {
     }
 
     /// Takes in the reader that asks with the lane that `peer` has `at` some place, before it hears
-    /// of its grant. As long as the lane stays as it is, the answer does, so that whoever asks for
-    /// ever adds nothing.
+    /// of its grant. As long as the lane stays as it is, the answer does, so that a reader that
+    /// keeps asking adds nothing.
     ///
     /// # Errors
     /// Its process has [as many](OF_PROCESS) as it may.

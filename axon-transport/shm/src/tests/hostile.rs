@@ -156,7 +156,7 @@ fn a_segment_must_be_a_sealed_memfd_of_a_sane_size() {
 }
 
 #[test]
-fn what_is_handed_over_cannot_be_changed_by_whoever_gets_it() {
+fn memory_that_is_handed_over_cannot_be_changed_by_its_receiver() {
     let a = session();
     let writer = writer(&a, transient(keep_last(1)), 0);
     writer.publish(meta(0), &[0; 5000]).unwrap();
@@ -193,7 +193,7 @@ fn rings_that_make_no_sense_are_refused() {
 
 #[test]
 fn grants_that_make_no_sense_are_refused() {
-    // With 0 nobody would have the lane, and with the others somebody who asks.
+    // With 0 no reader would have the lane, and with the others a reader that still asks.
     // Nor is one for an earlier or later reader with the same lane for this one.
     for generation in [0, 1 << 63, 1 << 63 | 1, u64::MAX, 2, 7 << 24, 7 << 24 | 2] {
         let mut scribble = Scribble::new();
@@ -242,7 +242,8 @@ fn sessions_that_make_no_sense_are_refused() {
         let peer = PeerSession::map(a.id(), a.descriptors().unwrap()).unwrap();
         assert!(peer.add_segment(SegmentInfo { number, kind }, &fd).is_err());
     }
-    // Whoever rings a pipe or an eventfd could be made to wait, and a stream be told something.
+    // A process that rings a pipe or an eventfd could be made to wait, and one that rings a stream
+    // would send data to it.
     let flags = rustix::event::EventfdFlags::NONBLOCK;
     let socket = |family, kind| {
         let flags = rustix::net::SocketFlags::CLOEXEC;
@@ -388,7 +389,7 @@ fn a_segment_that_never_comes_holds_no_reader_for_ever() {
         (reader.missing(), reader.has_data(), reader.is_drained()),
         (Some(77), false, false)
     );
-    // What is more recent and fills the depth is there.
+    // The samples that are more recent and fill the depth are there.
     for position in 1..3 {
         scribble.descriptor(position, 1, 0, 0);
     }
@@ -414,7 +415,7 @@ fn descriptors_that_never_come_are_given_up_once_the_writer_is_gone() {
     }
     assert_eq!(reader.take(&mut Vec::new()), Ok(None));
     assert_eq!((reader.lost(), reader.unread(), reader.missing()), (1, 0, None));
-    assert!(!reader.has_data() && reader.is_drained(), "who waits for it would not sleep again");
+    assert!(!reader.has_data() && reader.is_drained(), "a waiter would not sleep again");
     assert_eq!(reader.take(&mut Vec::new()), Ok(None));
 }
 

@@ -76,7 +76,7 @@ fn memory_comes_and_goes_with_descriptors_and_blocks() {
     let full = counts(&ours, &writer).bytes;
     assert!(full >= layout::RING + 200 * (layout::DESCRIPTOR + 1024), "{full}");
     assert!(full <= layout::RING + 512 * (layout::DESCRIPTOR + 1024), "{full}");
-    // Blocks of another length take the place of most of these.
+    // Blocks of another length replace most of the earlier ones.
     for sequence in 301..=700 {
         writer.publish(meta(sequence), &pattern(sequence, 200)).unwrap();
     }
@@ -174,7 +174,7 @@ fn publishes_that_fail_are_counted_by_why() {
         }
     };
     assert!(matches!(error, PublishError::Blocked { .. }), "{error}");
-    assert_eq!(counts(&ours, &writer).blocked, 0, "whoever does not wait tries again");
+    assert_eq!(counts(&ours, &writer).blocked, 0, "a caller that does not wait tries again");
     writer.publish(meta(sequence), &pattern(sequence, 4000)).unwrap_err();
     let ring = counts(&ours, &writer);
     assert_eq!((ring.blocked, ring.no_memory, ring.pinned), (1, 0, 0));

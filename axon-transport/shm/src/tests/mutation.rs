@@ -37,9 +37,7 @@ fn caught_by(site: Site) -> &'static str {
         AskStore | CloseStore | GenerationLoad => {
             "tests::model::lanes::a_reader_that_has_left_has_read_all"
         }
-        LetGoSwap | TakeSwap => {
-            "tests::model::lock::whoever_takes_a_lock_sees_what_its_last_holder_did"
-        }
+        LetGoSwap | TakeSwap => "tests::model::lock::a_new_lock_holder_sees_what_the_last_one_did",
         ArmFence | SettleFence => "wake::tests::the_last_look_or_the_ring_finds_what_came",
     }
 }

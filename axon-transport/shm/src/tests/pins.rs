@@ -184,7 +184,7 @@ fn nothing_that_ends_ends_a_sample_in_use() {
     let sample = take(&mut reader);
     let (lane, gid) = (reader.lane(), writer.readers()[0]);
 
-    // The daemon, or whoever says so, unmatches the two.
+    // The daemon, or another caller of `detach`, unmatches the two.
     assert!(writer.detach(gid));
     (1..50).for_each(|sequence| publish(&writer, sequence, LARGE));
     intact(&sample);
@@ -333,7 +333,7 @@ fn a_sample_that_may_not_be_pinned_is_copied_whole_or_not_at_all() {
     const LEN: usize = MAX as usize;
     let (a, b) = (session(), session());
     let writer = writer(&a, keep_last(1), 0);
-    // Made before, so that the publisher is faster than who reads.
+    // Made before, so that the publisher is faster than the reader.
     let payloads: Vec<_> = (0..4).map(|number| pattern(number, LEN)).collect();
     let payload = |sequence: u64| &payloads[sequence as usize % 4];
     let _others = [(); 2].map(|()| attach(&writer, &a, &b, keep_last(1)));

@@ -350,7 +350,7 @@ fn what_another_process_keeps_is_not_written_over() {
             writer.try_publish(meta(sequence), &pattern(sequence, KEPT)).unwrap();
         }
         if round == 10 {
-            // Whoever says so: the samples are in use all the same.
+            // The samples stay in use when their reader is detached.
             assert!(writer.detach(writer.readers()[0]));
         }
         other.wire.send_numbers(&[0]);

@@ -184,7 +184,7 @@ fn what_all_have_taken_is_written_over_first() {
 }
 
 #[test]
-fn history_is_kept_for_those_to_come_whoever_has_taken_it() {
+fn history_is_kept_for_late_readers_also_when_others_have_taken_it() {
     let (a, b) = (session(), session());
     let qos = transient(keep_last(10));
     let writer = writer(&a, qos, 64 << 20);

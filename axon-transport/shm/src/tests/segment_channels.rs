@@ -249,7 +249,7 @@ fn fill(socket: &impl AsFd) -> u32 {
 }
 
 #[test]
-fn whoever_sends_without_pause_holds_nobody_up() {
+fn a_peer_that_sends_without_pause_holds_nobody_up() {
     // One whose time is over takes one packet, however many there are.
     let (ours, theirs) = pair();
     let sent = fill(&ours);
@@ -300,7 +300,7 @@ fn who_answers_as_ourselves_is_believed_only_what_we_granted() {
 }
 
 #[test]
-fn who_asks_as_ourselves_is_served_only_if_we_ask() {
+fn a_reader_with_our_session_id_is_served_only_if_we_ask() {
     let (here, _) = contexts();
     let publisher = publisher(&here, keep_last(1));
     let lane = here.session().allocate_lane().unwrap();

@@ -18,7 +18,7 @@ use crate::os::descriptors::PassedFd;
 
 /// Tells this binary that it is the other process, and which part it plays.
 pub(super) const PART: &str = "SHM_TEST_PART";
-/// The largest message of these tests.
+/// The largest message that the tests send.
 pub(super) const LARGE: u64 = 25_000_000;
 
 /// One end of the socket pair.

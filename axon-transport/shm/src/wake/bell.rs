@@ -16,7 +16,7 @@ use crate::os::descriptors::PassedFd;
 const TRIES: u32 = 100;
 const NAP: Duration = Duration::from_millis(1);
 
-/// One end of a pair of unix sockets. Whoever holds it can ring, and nothing worse: it cannot take
+/// One end of a pair of unix sockets. A process that holds it can ring, and nothing worse: it cannot take
 /// rings away, nor keep another from ringing but by closing the bell for all, which is noticed.
 pub(crate) struct Bell(PassedFd);
 
@@ -33,7 +33,7 @@ impl Bell {
         (unix && packets).then_some(Self(fd))
     }
 
-    /// Rings, without waiting for whoever is at the other end; kernels before 6.9 may first look for
+    /// Rings, without waiting for the process at the other end; kernels before 6.9 may first look for
     /// sockets that nobody can reach any more. That there is no room is as good: then rings stand
     /// there that nobody has heard yet. `false` when the kernel had no memory for it for as long as a
     /// publish may wait, and nobody was woken.

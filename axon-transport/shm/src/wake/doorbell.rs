@@ -14,8 +14,8 @@ use super::{
     spin::Spin,
 };
 
-/// How long who waits sleeps at most where nobody watches the processes that are to ring: what one of
-/// them did not live to ring for is found then. Tests sleep for ever, so that they notice.
+/// The longest sleep of a waiter where nobody watches the processes that are to ring: the waiter then
+/// finds news of a process that ended before it rang. Tests sleep for ever, so that they notice.
 const LONGEST: Option<Duration> = if cfg!(test) { None } else { Some(Duration::from_secs(1)) };
 
 /// What a waiter waits for; each has its own armed word.
@@ -175,7 +175,7 @@ impl Doorbell {
         }
     }
 
-    /// Whoever says so [notifies](Self::notify) when a process ends that might have rung: from now on
+    /// The caller [notifies](Self::notify) when a process ends that might have rung: from now on
     /// waiters sleep for as long as nothing comes.
     pub(crate) fn is_watched(&self) {
         self.lock().watched = true;

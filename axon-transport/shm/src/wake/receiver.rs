@@ -86,13 +86,13 @@ impl BellReceiver {
         &self.bell
     }
 
-    /// Wakes whoever listens, from this very process.
+    /// Wakes the thread that listens, from within this process.
     pub(super) fn wake_self(&self) {
         // A counter that is full, after 2^64 of them, would be the only error.
         let _ = write(&self.own_wakeup, &1u64.to_ne_bytes());
     }
 
-    /// Has whoever listens woken at intervals; `None` ends it.
+    /// Wakes the thread that listens once per `interval`; `None` ends this.
     pub(super) fn tick(&self, interval: Option<Duration>) {
         let interval = Timespec::try_from(interval.unwrap_or_default()).unwrap_or_default();
         let timer = Itimerspec { it_interval: interval, it_value: interval };

@@ -75,7 +75,7 @@ impl Absences {
         self.there().find(|absent| absent.gid == *gid).map(|absent| absent.position)
     }
 
-    /// The oldest position that is kept, and for whom.
+    /// The oldest position that is kept, and the reader that it is kept for.
     #[inline]
     pub(crate) fn oldest(&self) -> Option<(u64, Gid)> {
         self.there().map(|absent| (absent.position, absent.gid)).min()

@@ -90,7 +90,7 @@ impl Writer {
     }
 
     /// Publishes what has been, or is here, copied in. Memory that was lent and that no sample
-    /// takes is given back by whoever borrowed it.
+    /// takes is given back by its borrower.
     pub(crate) fn commit(
         &self,
         numbering: Numbering,

@@ -214,7 +214,7 @@ impl Deref for Loan<'_> {
 }
 
 impl DerefMut for Loan<'_> {
-    /// Whoever borrows it is taken to write all of it.
+    /// A caller that borrows the bytes counts as writing all of them.
     #[inline]
     fn deref_mut(&mut self) -> &mut [u8] {
         self.written = self.len;

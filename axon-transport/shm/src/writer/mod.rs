@@ -349,8 +349,8 @@ impl Writer {
     }
 
     /// If a sample would be read by nobody, now or later, uses up the next sequence number as if one
-    /// had been published, and returns it. `None` when somebody would. So whoever has to serialize
-    /// first can save itself the work.
+    /// had been published, and returns it. `None` when somebody would. So a caller that has to
+    /// serialize first can save the work.
     ///
     /// # Errors
     /// The process forked.

@@ -156,7 +156,7 @@ impl ReaderSet {
         self.heeds_depths = true;
     }
 
-    /// The readers for whom more than the window is kept, each with whether the publisher waits for it.
+    /// The readers for which more than the window is kept, each with whether the publisher waits for it.
     fn heeded(&self) -> impl Iterator<Item = (&Attached, bool)> {
         let all = self.heeds_depths;
         let heeded = move |reader: &&Attached| {
@@ -407,8 +407,8 @@ impl ReaderSet {
         floors
     }
 
-    /// Below this every reader has taken what it wanted, and whoever comes later gets nothing: so
-    /// nobody asks for it again.
+    /// Below this position every reader has taken what it wanted, and a later reader gets nothing:
+    /// so no reader asks for it again.
     pub(crate) fn consumed(&self, head: u64) -> u64 {
         if self.offered.durability == Durability::TransientLocal {
             return 0;

@@ -39,7 +39,8 @@ pub(crate) struct Kept {
 }
 
 impl Kept {
-    /// As whoever publishes is told. Looks the process up, so not to be called under a lock.
+    /// The error that the caller of a publish gets. Looks the process up, so not to be called under a
+    /// lock.
     pub(crate) fn into_error(self) -> PublishError {
         let Self { holder, samples, short } = self;
         let keeper = PinHolder { reader: holder.reader, process: holder.process(), samples };
@@ -88,7 +89,7 @@ impl Maps {
     }
 }
 
-/// As whoever publishes is told.
+/// The error that the caller of a publish gets.
 pub(crate) fn no_memory(error: ShmError) -> PublishError {
     match error {
         ShmError::NoMemory { needed, available } => {

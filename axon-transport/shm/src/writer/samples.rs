@@ -55,7 +55,7 @@ fn back(segment: &OwnSegment, backed: u64, end: u64) -> Result<u64, PublishError
 
 impl Writer {
     /// Has memory ready for one more sample like the last large one, so that publishing it waits
-    /// for none: for whoever has time between samples. [`SegmentEvent::Low`] tells when to.
+    /// for none: for a caller that has time between samples. [`SegmentEvent::Low`] tells when to.
     ///
     /// # Errors
     /// There is no memory, or the process forked.

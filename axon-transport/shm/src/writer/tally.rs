@@ -29,7 +29,7 @@ impl Writer {
         self.update(WINDOW, |_| state.reader_set.window());
     }
 
-    /// A publish that had so long to succeed did not. Whoever gave it no time tries again, so that
+    /// A publish that had `deadline` to succeed failed. A caller that gave it no time tries again, so
     /// nothing is dropped yet.
     #[cold]
     pub(crate) fn count_failure(&self, error: &PublishError, deadline: Duration) {

@@ -35,7 +35,7 @@ pub(crate) fn run(place: &Path, seed: u64) {
         while start.elapsed() < ROUND {
             scribble(&random);
         }
-        // So that whoever is attached has something to notice, whatever chance did.
+        // So that an attached process has something to notice, whatever chance did.
         deface();
         thread::sleep(Duration::from_millis(20));
         // The others may wait for ever for what they have scribbled over.

@@ -33,7 +33,7 @@ fn sample(number: u64) -> Vec<u8> {
     number.to_le_bytes().iter().cycle().take(length).copied().collect()
 }
 
-/// Publishes to whoever meets it, for as long as it lives.
+/// Publishes to the subscriber that meets it, for as long as this process lives.
 pub(crate) fn publish(place: &Path) {
     let context = Context::new().expect("memory");
     let publisher =

@@ -13,7 +13,7 @@ use crate::{
 
 /// `LetGoSwap`, `TakeSwap`.
 #[test]
-fn whoever_takes_a_lock_sees_what_its_last_holder_did() {
+fn a_new_lock_holder_sees_what_the_last_one_did() {
     check(3, || {
         let lock = Arc::new((AtomicU32::new(0), Cell::new(0)));
         let count = |lock: &(AtomicU32, Cell), thread| {
