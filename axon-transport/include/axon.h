@@ -709,7 +709,7 @@ typedef struct axon_session_options_t {
     const char *name;
     /**
      * The daemon's program, where `AXON_DAEMON_PATH` names none. An `axon.toml` beside it is read. Null:
-     * `axon_daemon`, else `axon`, in the first of these folders that has it: this program's own, the
+     * `axon_daemon`, else `axon`, in the first of the following folders that has it: this program's own, the
      * library's, those in `PATH`, and the one where cargo installs programs.
      */
     const char *daemon_path;
@@ -994,7 +994,7 @@ axon_ret_t axon_session_graph_nodes(struct axon_session_t session,
                                     void *user);
 
 /**
- * Calls `visitor` with the names that endpoints of these kinds (the sum of AXON_KIND_*) have, in
+ * Calls `visitor` with the names that endpoints of the given kinds (the sum of AXON_KIND_*) have, in
  * order, each with its types: of all endpoints, or, where `node` is not null, of those of the node of
  * this name and namespace.
  *
@@ -1178,7 +1178,7 @@ axon_ret_t axon_session_publisher_publish(struct axon_publisher_t publisher,
 /**
  * If a sample would be read by nobody, now or later, uses up the next sequence number and stores it
  * at `sequence`; stores 0 where somebody would. Publishing does the same where nobody reads, but
- * whoever has to serialize first can save itself the work.
+ * a caller that has to serialize first can save the work.
  *
  * # Safety
  * `sequence` points to room for a number.
@@ -1477,7 +1477,7 @@ axon_ret_t axon_session_subscription_take(struct axon_subscription_t subscriptio
  * Where there is none the handle is 0, and nothing else is stored.
  *
  * Nobody may write to the bytes, and a forked child may not read them. Such a publisher, in another
- * process, could change them meanwhile: whoever parses them reads each once, and checks what it read.
+ * process, could change them meanwhile: a parser reads each byte once, and checks what it read.
  * `AXON_SHM_COPY=1` has all of them copied.
  *
  * # Safety

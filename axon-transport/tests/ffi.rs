@@ -188,7 +188,7 @@ fn a_c_program_uses_every_function_under_valgrind() {
     let mut valgrind = alone("valgrind");
     // It keeps account of the address space, too: what nobody uses of it takes most of the time.
     valgrind.envs([("AXON_RING_BUFFER_SIZE_MB", "1"), ("AXON_MAX_MESSAGE_MB", "1")]);
-    // Who waits for a thread that does not run gives way to it.
+    // A thread that waits for one that does not run gives way to it.
     valgrind.args(["--quiet", "--fair-sched=try", "--error-exitcode=99", "--leak-check=full"]);
     valgrind.args(["--errors-for-leak-kinds=definite", "--show-leak-kinds=definite"]);
     let known = path("tests/ffi/valgrind.supp");

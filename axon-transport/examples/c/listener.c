@@ -24,7 +24,7 @@ int main(void) {
     for (int heard = 0; heard < 3; heard++) {
         axon_sample_t sample = {0};
         while (sample.id == 0) {
-            /* What is not ready is set to 0, so the wait gets a copy. */
+            /* A handle that is not ready is set to 0, so the wait gets a copy. */
             axon_subscription_t ready = subscription;
             axon_wait_set_t set = {0};
             const uint8_t *data;

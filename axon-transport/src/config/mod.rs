@@ -115,7 +115,7 @@ impl Config {
         resolve::resolve(env, &Given::new(), default_file, files, daemon_env)
     }
 
-    /// What whoever starts with this configuration should be told, once.
+    /// The warnings that a process started with this configuration should show once.
     pub fn warnings(&self) -> Vec<String> {
         let mut warnings = Vec::new();
         match &self.security {

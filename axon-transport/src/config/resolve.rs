@@ -34,7 +34,7 @@ pub(super) fn resolve(
     let mode = Values { sources: &sources, files }.choice("AXON_SECURITY_MODE", &modes)?;
     let mode = match mode {
         Some(mode) => mode,
-        // Whoever wrote the section believes in it.
+        // The user who wrote the section expects it to apply.
         None if sources.has_qkd() => {
             let accepted = "classic or qkd: a file with a section [qkd] needs security_mode";
             return Err(ConfigError::missing("AXON_SECURITY_MODE", accepted));
@@ -98,8 +98,8 @@ pub(super) fn resolve(
     })
 }
 
-/// A setting of the other mode would be without effect: whoever gave it believes in a protection
-/// that is not there.
+/// A setting of the other mode would have no effect: the user who gave it expects a protection that
+/// is not there.
 fn refuse_all(
     values: &Values<'_, impl Files>,
     settings: &[&str],

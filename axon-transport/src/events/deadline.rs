@@ -1,7 +1,7 @@
 //! Deadlines: the longest permitted time between two samples.
 
-/// Watches one deadline. It runs from the first sample on: who has never sent anything has missed
-/// nothing (DDS 1.4, 2.2.3.7: the deadline is an instance's, which the first sample makes).
+/// Watches one deadline. It runs from the first sample on: a writer that has never sent anything
+/// has missed nothing (DDS 1.4, 2.2.3.7: the deadline is an instance's, which the first sample makes).
 #[derive(Clone, Copy, Debug)]
 pub struct Deadline {
     period: u64,

@@ -13,8 +13,8 @@ pub type axon_callback_t = Option<unsafe extern "C" fn(user: *const c_void, coun
 #[derive(Clone, Copy)]
 pub(super) struct User(pub(super) *const c_void);
 
-// SAFETY: it is never dereferenced here, and whoever sets a callback says that it may be called with
-// it from any thread.
+// SAFETY: it is never dereferenced here, and the caller that sets a callback says that it may be
+// called with it from any thread.
 unsafe impl Send for User {}
 // SAFETY: as above.
 unsafe impl Sync for User {}
@@ -26,8 +26,8 @@ pub(super) fn told(callback: axon_callback_t, user: *const c_void) -> Option<OnN
     Some(Arc::new(move |count: u64| {
         let User(pointer) = { user };
         let count = usize::try_from(count).unwrap_or(usize::MAX);
-        // SAFETY: whoever set it says that it may be called with this until it is replaced or its
-        // object destroyed. Neither returns before this call does, and none begins after them
+        // SAFETY: the caller that set it says that it may be called with this until it is replaced or
+        // its object destroyed. Neither returns before this call does, and none begins after them
         // (`Callback::vacate`, `Callback::end`), whichever threads set and destroy.
         unsafe { function(pointer, count) };
     }))

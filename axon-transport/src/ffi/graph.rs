@@ -97,7 +97,7 @@ pub unsafe extern "C" fn axon_session_graph_nodes(
     })
 }
 
-/// Calls `visitor` with the names that endpoints of these kinds (the sum of AXON_KIND_*) have, in
+/// Calls `visitor` with the names that endpoints of the given kinds (the sum of AXON_KIND_*) have, in
 /// order, each with its types: of all endpoints, or, where `node` is not null, of those of the node of
 /// this name and namespace.
 ///

@@ -178,8 +178,8 @@ impl Log {
         drop(slot);
         let text = |text: &str| CString::new(text.replace('\0', " ")).unwrap_or_default();
         let (part, text) = (text(line.part), text(&line.text));
-        // SAFETY: whoever set it says that it may be called so until it is replaced, and `set` does not
-        // return before this call has.
+        // SAFETY: the caller that set it says that it may be called so until it is replaced, and `set` does
+        // not return before this call has.
         unsafe { (told.function)(told.user.0, line.severity, part.as_ptr(), text.as_ptr()) };
         self.slot().called = None;
         self.returned.notify_all();
@@ -281,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn whoever_says_something_waits_for_no_callback_and_what_is_too_much_is_counted() {
+    fn logging_waits_for_no_callback_and_lines_beyond_the_bound_are_counted() {
         let (sender, heard) = mpsc::channel::<String>();
         let sender = Mutex::new(sender);
         let set = |callback: axon_log_t| {

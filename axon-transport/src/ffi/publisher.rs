@@ -102,7 +102,7 @@ pub unsafe extern "C" fn axon_session_publisher_publish(
 
 /// If a sample would be read by nobody, now or later, uses up the next sequence number and stores it
 /// at `sequence`; stores 0 where somebody would. Publishing does the same where nobody reads, but
-/// whoever has to serialize first can save itself the work.
+/// a caller that has to serialize first can save the work.
 ///
 /// # Safety
 /// `sequence` points to room for a number.

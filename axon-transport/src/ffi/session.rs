@@ -58,7 +58,7 @@ pub struct axon_session_options_t {
     /// Shown to people; null or empty: the program's name.
     pub name: *const c_char,
     /// The daemon's program, where `AXON_DAEMON_PATH` names none. An `axon.toml` beside it is read. Null:
-    /// `axon_daemon`, else `axon`, in the first of these folders that has it: this program's own, the
+    /// `axon_daemon`, else `axon`, in the first of the following folders that has it: this program's own, the
     /// library's, those in `PATH`, and the one where cargo installs programs.
     pub daemon_path: *const c_char,
 }
@@ -180,7 +180,7 @@ unsafe fn settings(
 ) -> Result<(Config, SessionOptions), Failure> {
     // SAFETY: the caller's word. All versions of it begin with their number.
     check_abi(unsafe { value(options.cast::<u32>(), "the pointer to the options") }?)?;
-    // SAFETY: the caller's word, who has this version.
+    // SAFETY: the caller's word. The caller has this version.
     let options = unsafe { value(options, "the pointer to the options") }?;
     let mut overrides: Vec<(&'static str, Option<OsString>)> = Vec::new();
     if options.domain != AXON_DOMAIN_ENVIRONMENT {

@@ -162,7 +162,7 @@ pub unsafe extern "C" fn axon_session_subscription_take(
 /// Where there is none the handle is 0, and nothing else is stored.
 ///
 /// Nobody may write to the bytes, and a forked child may not read them. Such a publisher, in another
-/// process, could change them meanwhile: whoever parses them reads each once, and checks what it read.
+/// process, could change them meanwhile: a parser reads each byte once, and checks what it read.
 /// `AXON_SHM_COPY=1` has all of them copied.
 ///
 /// # Safety

@@ -118,7 +118,7 @@ pub unsafe extern "C" fn axon_session_wait(
                 .chain(clients.iter().map(|one| Waitable::Client(one)))
                 .chain(events.iter().map(|one| Waitable::Event(one)))
                 .collect();
-            // It does not keep what is waited for from ending.
+            // It does not keep the objects that it waits for from ending.
             session.watch(&waitables)?
         };
         let ready = session.wait_watch(&watch, limit(timeout))?;

@@ -43,7 +43,7 @@ impl GraphView {
         self.of(&[EndpointKind::Node]).any(|entry| belongs(entry, name, namespace))
     }
 
-    /// The names that endpoints of these kinds have, with their types.
+    /// The names of the endpoints of the given `kinds`, with their types.
     pub fn names_and_types(&self, kinds: &[EndpointKind]) -> NamesAndTypes {
         collect(self.of(kinds))
     }

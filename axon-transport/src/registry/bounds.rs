@@ -229,7 +229,7 @@ fn a_status_larger_than_the_queue_is_told_whole() {
 }
 
 #[test]
-fn who_asks_again_is_told_the_same_status_from_its_beginning() {
+fn a_tool_that_asks_again_is_told_the_same_status_from_its_beginning() {
     let mut registry = registry(&[SessionRole::Tool]);
     registry.tell_status(&id(1), vec![7; 6_000_000].into());
     for _ in 0..20 {

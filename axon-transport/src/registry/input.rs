@@ -50,7 +50,7 @@ impl<F: Clone> Registry<F> {
         while self.handle_disconnect_in_parts(id) {}
     }
 
-    /// As [`handle_disconnect`](Self::handle_disconnect), a part of it; whether there is more to do. What is left of
+    /// As [`handle_disconnect`](Self::handle_disconnect), a part of it; whether there is more to do. The rest of
     /// the session is told nothing any more.
     pub fn handle_disconnect_in_parts(&mut self, id: &SessionId) -> bool {
         self.mark_behind(id);
@@ -284,8 +284,8 @@ impl<F: Clone> Registry<F> {
         // The pair may have ended while the message was on its way.
         let Some(asked) = self.pairs.get_mut(&pair) else { return Ok(()) };
         let attach = Some(Attach { session: *id, segments: Vec::new(), ..attach });
-        // A repetition is not passed on: whoever should know has been told, is about to be, or is
-        // behind. Sessions that are told everything anew would otherwise set each other back
+        // A repetition is not passed on: each session that should know has been told, is about to be,
+        // or is behind. Sessions that are told everything anew would otherwise set each other back
         // without end.
         let of = |attach: &Option<Attach>| attach.clone().map(|a| Attach { after: None, ..a });
         if of(&asked.attach) != of(&attach) {

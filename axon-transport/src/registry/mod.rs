@@ -154,7 +154,7 @@ pub struct LocalEndpoint {
     pub session: SessionId,
     /// The endpoint.
     pub endpoint: Endpoint,
-    /// For whom it stands.
+    /// Whether it stands for itself or for others.
     pub role: EndpointRole,
     /// A relay's remote subscriptions.
     pub stands_for: Vec<Gid>,

@@ -73,7 +73,8 @@ impl<F: Clone> Registry<F> {
                 readers.push(*reader);
             }
         }
-        // Who has not taken it, a stopped one among them, need not hear of it, nor keep its memory.
+        // A session that has not taken it, as that of a stopped process, need not hear of it, nor keep
+        // its memory.
         readers.retain(|reader| !self.take_back(reader, id, number));
         self.push_shared(&readers, &gone);
     }

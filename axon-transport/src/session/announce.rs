@@ -193,8 +193,8 @@ impl Session {
         self.shared().tell(Outgoing::Announce(gid));
     }
 
-    /// Waits until a new endpoint is matched with all that the graph shows and that go with it: whoever
-    /// counts them reaches them. Not for long, and not where nobody could do it.
+    /// Waits until a new endpoint is matched with all that the graph shows and that go with it: a
+    /// caller that counts them reaches them. Not for long, and not where nobody could do it.
     pub(super) fn await_pairs(&self, own: &Endpoint, matched: impl Fn(&Gid) -> bool) {
         let shared = self.shared();
         if shared.control.get() == Some(&std::thread::current().id()) {

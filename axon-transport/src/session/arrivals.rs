@@ -77,7 +77,7 @@ impl Arrivals {
         self.arriving.values().map(|arriving| arriving.until).min()
     }
 
-    /// Everything is told anew: what is not told again is gone.
+    /// Everything is told anew: an endpoint that is not told again is gone.
     pub(super) fn restart(&mut self) {
         let arriving = std::mem::take(&mut self.arriving);
         self.before = arriving.into_iter().map(|(gid, arriving)| (gid, arriving.until)).collect();

@@ -22,8 +22,8 @@ pub(super) struct Callback {
 struct State {
     function: Option<OnNew>,
     untold: u64,
-    /// Who is in a function. Whoever has something to tell meanwhile leaves it to that thread: two in
-    /// the same function that both wait for the other to return would wait for ever.
+    /// The thread that is in a function. Another thread that has something to tell meanwhile leaves it to
+    /// that thread: two in the same function that both wait for the other to return would wait for ever.
     running: Option<ThreadId>,
     /// There is to be no function any more.
     ended: bool,

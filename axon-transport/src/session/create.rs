@@ -104,7 +104,7 @@ impl Session {
 
     /// As [`create_relay`](Self::create_relay), of one publisher alone. Where the publisher `waits` for
     /// it, what it takes is acknowledged when it [says so](Subscription::acknowledge_of), whether or not
-    /// there is somebody for whom it stands.
+    /// it stands for a remote subscription.
     pub(crate) fn create_relay_of(
         &self,
         publisher: Gid,

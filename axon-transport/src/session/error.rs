@@ -89,7 +89,7 @@ pub enum SessionError {
     NoProgram {
         /// The folders in which it was looked for.
         tried: Vec<PathBuf>,
-        /// Programs of these names that were not started: they belong to another user, or every user may
+        /// Programs with the daemon's names that were not started: they belong to another user, or every user may
         /// replace them.
         untrusted: Vec<PathBuf>,
     },
@@ -129,7 +129,7 @@ pub enum SessionError {
         /// Why.
         text: String,
     },
-    /// Whoever listens at the daemon's address belongs to another user.
+    /// The process that listens at the daemon's address belongs to another user.
     #[error(
         "{address} belongs to uid {uid}, which is neither this process's nor in AXON_TRUSTED_UIDS; \
          set XDG_RUNTIME_DIR or AXON_RUNTIME_DIR to a directory of this user's own"
@@ -137,7 +137,7 @@ pub enum SessionError {
     Untrusted {
         /// The address.
         address: String,
-        /// The user who has it.
+        /// The user of the process that listens there.
         uid: u32,
     },
     /// Another process has bound the daemon's abstract name and serves no session.

@@ -99,7 +99,7 @@ impl Source {
         self.events().unread(kind) > 0
     }
 
-    /// The same for others than who waits: where somebody is taking, it may.
+    /// The same for other threads than the one that waits: while a thread is taking, it may.
     pub(super) fn may_have(&self, kind: EventKind) -> bool {
         let losing = match (self, kind) {
             (Self::Subscription(inner), EventKind::MessageLost) => inner.may_have_losses(),

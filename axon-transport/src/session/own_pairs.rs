@@ -125,7 +125,7 @@ impl Shared {
         self.rematch(others);
     }
 
-    /// Counts what became of the pairs of these. The control thread tells the rest.
+    /// Counts the changes to the pairs of `endpoints`. The control thread tells the rest.
     fn rematch(&self, endpoints: Vec<Source>) {
         let news = endpoints.into_iter().map(|endpoint| (endpoint.rematch(), endpoint));
         let news: Vec<_> = news.filter(|(changes, _)| !changes.is_empty()).collect();

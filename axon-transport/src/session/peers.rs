@@ -155,7 +155,7 @@ impl Peers {
     }
 
     /// The session `id`, for `pair`, with the descriptors that came along, if any: those of its
-    /// introduction, and of these segments of its memory.
+    /// introduction, and of `segments` of its memory.
     pub(super) fn hold(
         &mut self,
         id: SessionId,

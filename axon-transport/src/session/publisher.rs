@@ -70,7 +70,7 @@ impl Publisher {
 
     /// If a sample would be read by nobody, now or later, uses up the next sequence number and
     /// returns it; `None` when somebody would. Where nobody reads, publishing does the same, but
-    /// whoever has to serialize first can save itself the work.
+    /// a caller that has to serialize first can save the work.
     ///
     /// # Errors
     /// [`PublishError::Forked`].

@@ -150,7 +150,7 @@ impl RemoteWriter {
         }
     }
 
-    /// Whoever speaks for it says that it is alive.
+    /// Asserts its liveliness: the process that speaks for the writer says that it is alive.
     pub fn assert_alive(&self) {
         if let Self::Publisher(publisher) = self {
             // Only a forked child is refused.

@@ -120,8 +120,8 @@ impl State {
         self.own().filter(|own| !self.refused.contains_key(&own.gid))
     }
 
-    /// Shows what the session has made, whatever the daemon does meanwhile: whoever made it finds it
-    /// in the graph, unless the daemon has refused it.
+    /// Shows what the session has made, whatever the daemon does meanwhile: the caller that
+    /// made it finds it in the graph, unless the daemon has refused it.
     pub(super) fn show(&mut self, own: &Endpoint) {
         if self.refused.contains_key(&own.gid) {
             return;
@@ -284,7 +284,7 @@ const MAX_STATUS: usize = 64 << 20;
 
 impl StatusText {
     /// Adds the part that is due; the whole, once it was the last. The first one may come again, for
-    /// who asks again; what else comes is of an answer that nobody waits for any more.
+    /// a caller that asks again; any other part is of an answer that nobody waits for any more.
     pub(super) fn add(&mut self, part: &StatusPart) -> Option<Vec<u8>> {
         if part.part == 0 {
             *self = Self::default();

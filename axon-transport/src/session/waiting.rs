@@ -53,7 +53,7 @@ enum OwnedWaitable {
     Event(Source, EventKind),
 }
 
-/// What is waited for, without keeping it from ending.
+/// The objects that a thread waits for, without keeping them from ending.
 pub(crate) struct WeakWaitSet {
     parts: Vec<OwnedWaitable>,
     /// The sessions that it belongs to, but for the one that waits.
@@ -252,7 +252,8 @@ impl Part<'_> {
         }
     }
 
-    /// The same for others than who waits, which changes nothing: where somebody is taking, it may be.
+    /// The same for other threads than the one that waits. It changes nothing: while a thread is taking, it
+    /// may be.
     fn may_be_ready(self) -> bool {
         match self {
             Part::Data(inner) => inner.ready(),

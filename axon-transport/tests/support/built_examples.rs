@@ -9,7 +9,7 @@ use std::{
     time::SystemTime,
 };
 
-/// The folder that has these `files` of these examples. `cargo test` of the workspace builds them; where only one
+/// The folder that has the `files` of `examples`. `cargo test` of the workspace builds them; where only one
 /// test is asked for, they are built here. `package` is the folder of `axon-transport`.
 pub(crate) fn built_examples(package: &Path, examples: &[&str], files: &[&str]) -> PathBuf {
     static BUILDING: Mutex<()> = Mutex::new(());

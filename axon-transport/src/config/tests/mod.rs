@@ -307,7 +307,7 @@ fn the_section_of_qkd_counts_in_qkd_alone() {
         with_file(&[("AXON_SECURITY_MODE", "classic"), ("AXON_SAE_ID", "a")], &file).unwrap_err();
     assert_eq!(error.variable(), "AXON_SAE_ID", "what the environment says is never ignored");
 
-    // The mode is said outright, here or there: whoever wrote the section believes in it.
+    // The environment or the file must set the mode: the user who wrote the section expects it to apply.
     for section in [section, "[qkd]"] {
         let error = with_file(&[], section).unwrap_err();
         assert_eq!(error.variable(), "AXON_SECURITY_MODE");

@@ -166,7 +166,7 @@ impl Address {
                 listeners.push(listener);
                 lock = Lock { _file: Some(file) };
             }
-            // XDG_RUNTIME_DIR may be what is left of a login: the name serves as well.
+            // XDG_RUNTIME_DIR may name the directory of a login that has ended: the name serves as well.
             Some(Err(error @ AddressError::Directory { .. })) if self.name.is_some() => {
                 tracing::warn!(%error, "the session socket has an abstract name only");
             }

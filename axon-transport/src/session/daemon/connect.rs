@@ -43,7 +43,7 @@ pub(crate) struct Connected {
     descriptors: Vec<PassedFd>,
 }
 
-/// Who asks.
+/// The session that connects.
 #[derive(Clone, Copy)]
 pub(crate) struct Caller<'a> {
     pub(crate) config: &'a Config,
@@ -85,7 +85,7 @@ impl<'a> Caller<'a> {
                     if turn.is_none() {
                         turn = address.turn();
                         if turn.is_some() {
-                            // Whoever had it before has started one, perhaps.
+                            // The process that had the turn before may have started a daemon.
                             continue;
                         }
                     }

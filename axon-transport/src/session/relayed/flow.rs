@@ -427,7 +427,8 @@ impl Incoming {
         Ok(Some(InboundSample { channel: name, meta, lost, payload }))
     }
 
-    /// For whom there is room now. One for whom there is none keeps none of the others waiting.
+    /// Credit for the channels that there is room for now. A channel that there is no room for does not
+    /// keep the others waiting.
     pub fn grants(&mut self) -> Vec<Credit> {
         let mut granted = Vec::new();
         self.is_short = false;

@@ -197,7 +197,7 @@ impl Pipe {
     /// The other end is gone, or as good as that: what it has said is heard, and nothing is said to it
     /// any more.
     pub fn hang_up(&mut self) {
-        // Whoever has its end besides adds nothing, so that there is an end to what is to be heard.
+        // Another process that holds the peer's end can add nothing, so that reading comes to an end.
         let _ = shutdown(&self.socket, Shutdown::Both);
         self.gone = true;
         self.waiting.clear();

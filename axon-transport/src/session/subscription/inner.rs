@@ -231,7 +231,7 @@ impl Look for SubscriptionInner {
     fn ready(&self) -> bool {
         match self.matched_readers.try_lock() {
             Ok(matched_readers) => matched_readers.has_data(),
-            // Whoever has it may be about to add something.
+            // The thread that holds the lock may be about to add something.
             Err(_) => true,
         }
     }

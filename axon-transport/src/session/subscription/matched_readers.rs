@@ -89,7 +89,7 @@ pub(super) struct MatchedReader {
     pub(super) last: Option<u64>,
     /// The number in front of the first that this slot was granted.
     after: Option<u64>,
-    /// What is missing of its numbers, where that tells of losses.
+    /// The gaps in its numbers, where they tell of losses.
     pub(super) gaps: Option<Gaps>,
     numbers: Numbers,
     /// A number of its writer was known when it was granted.
@@ -378,7 +378,7 @@ impl MatchedReaders {
             self.lost = self.lost.saturating_add(slot.reader.unread_below(later));
             return;
         }
-        // One after the other: what is missing among them was counted, or is by their numbers.
+        // One after the other: samples missing among them were counted, or are by their numbers.
         for _ in 0..slot.reader.unread() {
             let Ok(Some(next)) = slot.reader.peek() else { break };
             if !slot.reader.skip() {
@@ -423,7 +423,7 @@ impl MatchedReaders {
     }
 
     /// Gives up what a writer left in memory that never came, where it has come back in another process and
-    /// sends once more what was not confirmed. What is missing then is missing among its numbers.
+    /// sends once more what was not confirmed. Samples missing then show as gaps in its numbers.
     pub(super) fn skip_missing(&mut self) {
         // To others nothing is sent again.
         if !self.keeps_all {

@@ -226,8 +226,8 @@ impl MatchedReaders {
             .any(|slot| slot.reader.writer() == *writer && slot.reader.has_data())
     }
 
-    /// Samples of `writer` that were lost before they came to its ring here. What is missing before the
-    /// `first` in that ring is seen by its number, where the subscription knows an earlier one.
+    /// Samples of `writer` that were lost before they came to its ring here. Samples missing before
+    /// the `first` in that ring are seen by its number, where the subscription knows an earlier one.
     pub(in crate::session) fn lost_elsewhere(&mut self, writer: &Gid, samples: u64, first: bool) {
         let mut of = self.matched_readers.iter().filter(|slot| slot.reader.writer() == *writer);
         if of.any(|slot| !(slot.over || first && slot.resumed)) {
@@ -334,7 +334,7 @@ mod tests {
         let inner = subscription(gid);
         let none = |_: &mut Reader| Err::<Option<(Meta, ())>, _>(TakeError::NoMemory { len: 6 });
         assert!(matched_readers.take(none, &inner).is_none() && !matched_readers.has_data());
-        // Whoever asks nevertheless gets it, if it can be had.
+        // A caller that asks nevertheless gets it, if it can be had.
         let mut out = Vec::new();
         let take = |reader: &mut Reader| Ok(reader.take(&mut out)?.map(|taken| (taken.meta, ())));
         assert!(matched_readers.take(take, &inner).is_some());

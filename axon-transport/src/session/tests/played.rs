@@ -257,7 +257,7 @@ fn a_publisher_is_counted_once_it_is_received_from() {
 }
 
 #[test]
-fn a_sample_is_acknowledged_when_whoever_carries_it_away_has_it() {
+fn a_sample_is_acknowledged_when_the_relay_has_it() {
     let (relayed, mut taking) = Relayed::new(Qos::default());
     let Relayed { publisher, daemon, session, .. } = &relayed;
     assert!(publisher.wait_acknowledged(Duration::ZERO), "nothing was published");

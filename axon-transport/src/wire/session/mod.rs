@@ -42,7 +42,7 @@ pub enum SessionRole {
     Tool,
 }
 
-/// For whom an endpoint stands.
+/// Whether an endpoint stands for itself or for others.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Encode, Decode, Serialize)]
 #[cbor(index_only)]
 #[serde(rename_all = "snake_case")]
@@ -145,7 +145,7 @@ impl Refused {
     }
 }
 
-/// An endpoint exists. Repeating it changes only for whom it stands.
+/// An endpoint exists. Repeating it changes only which endpoints it stands for.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct Announce {
@@ -209,7 +209,7 @@ pub struct Graph {
     /// Whether another part of the same change follows.
     #[n(4)]
     pub more: bool,
-    /// Those of this host's own endpoints that ended. Whoever is attached to one lets go of it; an
+    /// Those of this host's own endpoints that ended. A session that is attached to one lets go of it; an
     /// endpoint of another host is attached to by way of its stand-in, which ends by UNMATCH.
     #[n(5)]
     pub ended: Option<Vec<Gid>>,

@@ -210,7 +210,7 @@ impl Control {
     }
 
     /// Reports to the session's endpoints that one does not go with them, and, if it is of this
-    /// session, to it that others do not. Whoever comes second finds the first.
+    /// session, to it that others do not. The endpoint that comes second finds the first.
     fn relate(&self, endpoint: &Endpoint) {
         let here = self.own(&endpoint.topic);
         // One of its own may have ended since it was announced, and others begun that never met it.

@@ -95,11 +95,11 @@ struct Rematching {
     readers: BTreeMap<Gid, Arc<SubscriptionInner>>,
 }
 
-/// With whom a session speaks first.
+/// The peer that a session speaks with first.
 pub(in crate::session) enum Start {
     /// A daemon; another one when it is gone.
     Daemon(Connected),
-    /// Whoever is at the other end of a socket, and nobody after it.
+    /// The process at the other end of a socket, and nobody after it.
     Socket(Connected),
     /// The registry of its own process, where it meets another session.
     LocalRegistry(Arc<LocalRegistry>),
@@ -161,7 +161,7 @@ impl Control {
             self.try_reconnected();
             self.try_again();
             self.tell_rematched();
-            // Before the others hear of it: whoever is granted something is counted here.
+            // Before the others hear of it: an endpoint that is granted something is counted here.
             self.tell_matched();
             self.collect();
             self.send();
@@ -431,7 +431,7 @@ impl Control {
     }
 }
 
-/// For whom a relay reads.
+/// The remote subscriptions that a relay reads for.
 fn stands_for(subscription: &SubscriptionInner) -> Option<Vec<Gid>> {
     (subscription.role == EndpointRole::Relay).then(|| {
         let mut gids = subscription.stands_for();

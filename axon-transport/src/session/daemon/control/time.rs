@@ -24,7 +24,7 @@ impl Control {
             news |= some;
         }
         if news {
-            // Who waits for events.
+            // Wakes the threads that wait for events.
             self.shared.segment.notify();
         }
         self.timed = Some(timed);

@@ -94,7 +94,7 @@ fn a_long_sample_waits_for_room_and_gives_it_back() {
     assert_eq!(second.piece(piece(1, head(100_000), 0)), Ok(None));
     assert_eq!(second.grants().len(), 1);
     drop(ends);
-    assert_eq!(pool.held(), 0, "whoever ends holds nothing");
+    assert_eq!(pool.held(), 0, "an end that is gone holds nothing");
 }
 
 #[test]

@@ -158,7 +158,8 @@ impl RelayConnection<'_> {
         for publisher in self.own.values().filter(|e| e.kind == EndpointKind::Publisher) {
             let gid = publisher.gid;
             let readers = self.matched.get(&gid).cloned().unwrap_or_default();
-            // History goes ahead of those who will ask for it; what is left is carried to its end.
+            // History goes ahead of the readers that will ask for it; the rest of an ending publisher's samples
+            // is carried to its end.
             let history = publisher.qos.durability == Durability::TransientLocal;
             let known = self.relays.get(&gid);
             let rest =

@@ -110,8 +110,8 @@ impl RelayConnection<'_> {
                 }
                 continue;
             }
-            // Whoever there is to read it, whether or not the daemon has said so of all of them: what
-            // comes first is theirs, too. Who is gone and has left something reads no more.
+            // All readers that are there, whether or not the daemon has named all of them: the first
+            // samples are for them, too. A reader that is ending reads no more.
             let own = self.own.values().filter(|e| !self.ending.contains_key(&e.gid));
             let mut readers =
                 own.filter(|e| pairing(remote_writer.endpoint(), e) == Pairing::Match);
@@ -172,7 +172,7 @@ impl RelayConnection<'_> {
         self.tell_callers()
     }
 
-    /// Tells the daemon of the clients for whom there is a stand-in, whose servers' responses may then
+    /// Tells the daemon of the clients that have a stand-in, whose servers' responses may then
     /// come.
     fn tell_callers(&mut self) -> Result<(), End> {
         let mut room = MAX_CALLERS;
