@@ -278,7 +278,7 @@ fn a_stopped_process_is_not_alive_and_is_again_when_it_goes_on() {
 }
 
 #[test]
-fn who_has_no_deadline_and_no_lease_is_never_woken() {
+fn a_process_without_deadlines_and_leases_is_never_woken() {
     let host = Host::new();
     let _daemon = host.daemon();
     let session = host.session("witness").unwrap();

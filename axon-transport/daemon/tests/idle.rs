@@ -1,4 +1,4 @@
-//! Who has nothing to do does nothing: processes at rest are not scheduled. What is asserted are counts
+//! A process that has nothing to do does nothing: processes at rest are not scheduled. What is asserted are counts
 //! of the kernel's, not times.
 
 #[allow(dead_code, reason = "what other tests need of it")]
@@ -22,7 +22,7 @@ const WATCH: Duration = Duration::from_secs(5);
 /// Between two looks whether a process has come to rest.
 const SETTLE: Duration = Duration::from_millis(500);
 
-/// The lease of who has one. It is renewed at each third of it.
+/// The lease of the publishers that have one. It is renewed at each third of it.
 const LEASE: Duration = Duration::from_secs(3);
 
 fn spec(topic: &str) -> EndpointSpec {
@@ -49,7 +49,7 @@ fn child() {
         called.set_on_new_sample(Some(Arc::new(|_| {}))).unwrap();
     }
     assert!(talker.wait_matched(2, PATIENCE) && client.wait_available(PATIENCE));
-    // One sample for everybody: who has slept and been woken sleeps again.
+    // One sample for everybody: a thread that has slept and been woken sleeps again.
     talker.publish(b"once").unwrap();
     let all = [
         Waitable::GuardCondition(&never),

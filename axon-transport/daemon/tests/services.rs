@@ -1,4 +1,4 @@
-//! Services: requests, the responses that are each client's own, and who is there for whom.
+//! Services: requests, the responses that are each client's own, and which servers and clients see each other.
 
 #[path = "support/alone.rs"]
 mod alone;

@@ -26,7 +26,7 @@ use support::{Host, Player, of_child, say, signal, until_within, wait_for_the_en
 const MANY: usize = 1000;
 /// What the honest process does, so often; `ROUNDS=5000` for longer.
 const ROUNDS: usize = 200;
-/// Of these so many before the daemon has taken what the crowd asks for.
+/// So many of the rounds before the daemon has taken what the crowd asks for.
 const BEFORE: usize = 20;
 /// How long it may take until the first of the crowd's pairs meets: the honest process goes first all the
 /// while. It is seconds on an idle machine, and was almost a minute on a loaded one.

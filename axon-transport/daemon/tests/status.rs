@@ -79,7 +79,7 @@ fn a_stopped_reader_is_named_with_what_it_missed_and_none_that_takes() {
         publisher.publish(&[0; 8]).unwrap();
     }
     let seen = topic(&host);
-    assert!(reader_of(&seen, still).is_stalled(), "what is waited with is older than what stands");
+    assert!(reader_of(&seen, still).is_stalled(), "the wait is older than the oldest sample");
     assert_eq!(reader_of(&seen, still).unread, 5);
 
     signal(stopped.pid(), Signal::CONT);

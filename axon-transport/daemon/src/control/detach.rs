@@ -57,7 +57,7 @@ impl Report {
 
     fn say(&mut self, text: &str) {
         if let Some(pipe) = self.pipe.take() {
-            // Whoever started us may have gone meanwhile.
+            // The process that started this one may have gone meanwhile.
             let _ = std::fs::File::from(pipe).write_all(text.as_bytes());
         }
     }

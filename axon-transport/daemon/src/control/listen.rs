@@ -289,7 +289,7 @@ fn admit(
         }
     };
     let pid = if let InternalPeer::Relay { pid, .. } = inside { *pid } else { peer.pid };
-    // Endpoints are named after their session's id: who has another's could end them.
+    // Endpoints are named after their session's id: a session with another's id could end them.
     if let Some(pid) = taken_by(control, &hello.session, pid) {
         let text = format!("process {pid} has a session with this one's id or one like it");
         refuse(control, socket, &hello.name, peer, Refused::because(text));

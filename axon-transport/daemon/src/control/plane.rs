@@ -120,7 +120,8 @@ impl Control {
         bell
     }
 
-    /// A session's task ends: removes a part of what is left of the session; whether there is more.
+    /// A session's task ends: removes a part of the session's remaining state; returns whether there is
+    /// more.
     /// `bell` is its own: a session that came back has another.
     pub(super) fn remove_some(&mut self, id: &SessionId, bell: &Rc<Notify>) -> bool {
         if !self.is_current(id, bell) {

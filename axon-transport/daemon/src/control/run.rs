@@ -69,7 +69,7 @@ const FIRST_SESSION: Duration = Duration::from_secs(10);
 /// What a daemon runs with besides its configuration.
 #[derive(Debug)]
 pub struct DaemonOptions {
-    /// Who waits for it to be ready.
+    /// The process that waits for the daemon to be ready.
     report: Report,
     /// The gateway to other hosts. Without one, the daemon serves this host alone.
     gateway: Option<GatewayEntry>,

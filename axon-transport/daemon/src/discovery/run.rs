@@ -44,7 +44,7 @@ pub(crate) enum Event {
     },
     /// The QUIC port is bound. Discovery says nothing before.
     QuicPort(u16),
-    /// A link stands, whoever dialled it.
+    /// A link stands, whichever side dialled it.
     LinkUp {
         /// With this daemon.
         daemon: DaemonId,

@@ -20,7 +20,7 @@ pub(crate) struct Wanted {
 }
 
 impl Wanted {
-    /// What sessions of these scopes need. A daemon without a session does what its own settings say,
+    /// What sessions with the given `scopes` need. A daemon without a session does what its own settings say,
     /// so that one that was started by hand is linked before its first session comes.
     ///
     /// `AXON_DAEMON_PEERS` says where else to look for peers of SUBNET sessions; it widens no range.

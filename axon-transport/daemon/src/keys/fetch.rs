@@ -10,7 +10,7 @@ use super::request::{Answer, Failure, FailureKind, Fetched, Purpose, Request};
 const TRIES: u8 = 3;
 /// Time between two tries, at least.
 const TRY: Duration = Duration::from_secs(2);
-/// Longest pause between two tries that a KME can ask for: whoever announced the keys waits too.
+/// Longest pause between two tries that a KME can ask for: the peer that announced the keys waits, too.
 const RETRY_AFTER_MAX: Duration = Duration::from_secs(10);
 /// Calls in flight at once.
 const IN_FLIGHT: usize = 4;

@@ -46,7 +46,7 @@ mod tests {
     }
 
     #[test]
-    fn a_successor_replaces_whoever_dialled() {
+    fn a_successor_replaces_a_link_whichever_side_dialled() {
         for side in [Side::Client, Side::Server] {
             let new = Candidate { side, successor: true };
             assert!(keep(LOW, HIGH, plain(Side::Client), new));

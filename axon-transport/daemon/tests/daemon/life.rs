@@ -50,7 +50,7 @@ fn the_terminals_interrupt_ends_an_application_and_not_the_daemon_it_started() {
 }
 
 #[test]
-fn a_daemon_is_started_by_who_has_no_standard_streams() {
+fn a_daemon_is_started_by_a_process_without_standard_streams() {
     let host = Host::new();
     let _player = Kept(command(&host, "streamless").spawn().unwrap());
     let status = sessions(&host, 1);
@@ -167,7 +167,7 @@ fn all_works_with_256_descriptors() {
     players.into_iter().for_each(Player::finish);
 }
 
-/// What each of these children does.
+/// What each child does.
 pub(crate) fn few_descriptors() {
     let few = rustix::process::Rlimit { current: Some(256), maximum: Some(256) };
     rustix::process::setrlimit(rustix::process::Resource::Nofile, few).unwrap();

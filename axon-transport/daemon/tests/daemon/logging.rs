@@ -26,7 +26,7 @@ fn program(host: &Host) -> Command {
     host.command(env!("CARGO_BIN_EXE_axon_daemon"))
 }
 
-/// Sessions come and go, and one connection is refused; the daemon logs each of these.
+/// Sessions come and go, and one connection is refused; the daemon logs each of them.
 fn cause_log_lines(host: &Host) {
     for _ in 0..3 {
         let session = host.session("short").unwrap();
@@ -51,7 +51,7 @@ fn a_daemon_outlives_a_full_disk_under_its_log() {
 }
 
 #[test]
-fn a_daemon_outlives_whoever_reads_its_standard_error() {
+fn a_daemon_outlives_the_reader_of_its_standard_error() {
     let host = Host::new();
     let (reader, writer) = std::io::pipe().unwrap();
     let daemon = foreground(&host, program(&host), OwnedFd::from(writer));

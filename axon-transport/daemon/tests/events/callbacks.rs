@@ -110,7 +110,7 @@ fn scene(kind: EventKind, pair: &Pair) -> Scene<'_> {
             let cause = move || {
                 if kind == EventKind::MessageLost {
                     flood(&publisher);
-                    // Nobody looks for what is lost but who takes or waits.
+                    // Only a thread that takes or waits looks for lost samples.
                     while taker.take(&mut Vec::new()).is_some() {}
                 } else {
                     publisher.publish(b"and no more").unwrap();

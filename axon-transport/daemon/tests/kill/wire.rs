@@ -79,7 +79,7 @@ impl Wire {
             match event {
                 SegmentEvent::Opened(info, fd) => to.hand(info, fd),
                 SegmentEvent::Gone(info) => {
-                    // Whoever is dead need not know.
+                    // A process that is dead need not know.
                     let _ = to.try_send(&info.number.to_le_bytes(), &[]);
                 }
                 SegmentEvent::Low(_) => {}

@@ -32,8 +32,8 @@ pub(crate) const STEPS: u64 = 2_000_000;
 const STATES: u64 = 100;
 /// So many at least, however long it is.
 const FEW_STATES: u64 = 8;
-/// Whoever takes longer for [so many steps](STRIDE), to set a scene or to get over a death, is
-/// wedged; in seconds.
+/// A process that takes longer for [so many steps](STRIDE), to set a scene or to get over a death,
+/// is wedged; in seconds.
 const PATIENCE: u32 = 60;
 const STRIDE: u64 = 1000;
 /// An operation of more instructions goes round in circles.

@@ -62,7 +62,7 @@ pub(crate) fn play(part: &str) {
             setrlimit(Resource::Nofile, few).unwrap();
             let context = Context::new().unwrap();
             let mut subscribers = Vec::new();
-            // The last socket stays open: whoever has not met it yet would wait in vain.
+            // The last socket stays open: a process that has not met it yet would wait in vain.
             let (_socket, error) = loop {
                 let socket = meet(&format!("{}-{}", place(), subscribers.len()), false);
                 let options = SubscriberOptions::new(Qos::keep_all());
@@ -157,7 +157,7 @@ pub(crate) fn play(part: &str) {
             });
             let options = options.budget(1 << 30).max_len(128 << 20);
             let publisher = Publisher::new(&context, options).unwrap();
-            // Fewer of these are kept than are wanted.
+            // Fewer samples of this size are kept than are wanted.
             let sample = vec![1; 4 << 20];
             for _ in 0..100 {
                 publisher.publish(&sample).unwrap();

@@ -41,7 +41,7 @@ fn latched(topic: &str) -> EndpointSpec {
     EndpointSpec::new(topic, "test/Bytes", qos)
 }
 
-/// Of what is read in place the newest are kept, for whoever comes.
+/// Of samples that are read in place, the newest are kept for readers that come later.
 fn image() -> EndpointSpec {
     let qos = Qos { durability: Durability::TransientLocal, ..Qos::default() };
     EndpointSpec::new("/image", "test/Bytes", qos)

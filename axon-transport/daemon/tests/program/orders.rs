@@ -64,7 +64,7 @@ pub(super) struct Published {
     pub(super) blocked: bool,
 }
 
-/// A sample, as whoever takes it is told of it.
+/// A sample, as the process that takes it is told of it.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Sample {
     pub(super) publisher: String,

@@ -54,7 +54,7 @@ impl Relation {
     }
 }
 
-/// What of these a run has not come across.
+/// The sights and policies that a run has not come across.
 pub(super) fn not_seen(sights: &BTreeMap<String, u64>) -> Vec<&'static str> {
     SIGHTS.into_iter().chain(POLICIES).filter(|sight| !sights.contains_key(*sight)).collect()
 }
@@ -79,7 +79,7 @@ impl Stage {
         }
     }
 
-    /// Takes what is left.
+    /// Takes the remaining samples.
     pub(super) fn drain(&mut self) {
         while self.model.values().any(|m| !m.owed.is_empty()) {
             self.take();
@@ -276,7 +276,7 @@ impl Stage {
             self.saw("publisher held back");
             return true;
         }
-        // Whoever loses hears of it before anything is taken.
+        // A reader that loses samples hears of it before anything is taken.
         let losers = readers().filter(|(_, reader)| reader.what.profile.depth.is_none());
         let losers: Vec<(u64, usize)> = losers.map(|(id, reader)| (*id, reader.process)).collect();
         for (id, process) in losers {

@@ -72,7 +72,7 @@ fn a_server_that_takes_no_requests_holds_its_clients_back_and_loses_nothing() {
 }
 
 #[test]
-fn who_has_ended_is_not_counted_though_more_of_it_is_to_come() {
+fn a_server_that_has_ended_is_not_counted_though_responses_are_still_to_come() {
     with_both_ends(|here, there| {
         let node = there.create_node("n", "/", "/").unwrap();
         let changed = [Waitable::GuardCondition(node.graph_changed())];

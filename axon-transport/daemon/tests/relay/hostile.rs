@@ -158,7 +158,7 @@ pub(crate) fn call_and_have_it_talk() -> u32 {
     holder.expect("yes is there").id()
 }
 
-/// The publisher of whoever speaks for itself.
+/// The publisher of a peer that speaks for itself.
 fn own() -> Gid {
     Gid::new(SessionId([9; 16]), 1)
 }
@@ -279,7 +279,7 @@ fn who_talks_on_a_connection_after_its_process_ended_is_hung_up_on() {
 }
 
 #[test]
-fn whoever_ended_before_it_is_served_is_not_served() {
+fn a_process_that_ended_before_it_is_served_is_not_served() {
     let host = host();
     let daemon = host.daemon();
     let mut caller = host.play("leaver");
@@ -373,7 +373,7 @@ fn server_for(host: &Host, own: Gid, others: Vec<Gid>) -> OwnedFd {
 }
 
 #[test]
-fn whoever_answers_what_nobody_asked_it_reaches_nobody() {
+fn a_server_that_answers_what_nobody_asked_it_reaches_nobody() {
     let host = host();
     let _daemon = host.daemon();
     let (here, there) = (session(&host, "server", true), session(&host, "client", false));
@@ -421,7 +421,7 @@ fn whoever_answers_what_nobody_asked_it_reaches_nobody() {
         say_to(&socket, &answer(own, stranger, 0, 0));
         assert!(hear(&socket, opened).is_some());
     }
-    // Whoever is not its own does not live by its word.
+    // Its word does not keep a publisher alive that is not its own.
     let publishers = vec![server.gid(), own, stranger];
     say_to(&socket, &Message::Asserted(Asserted { publishers }));
     assert!(client.recv_response(&mut Vec::new(), Some(Duration::from_millis(20))).is_err());
@@ -434,7 +434,7 @@ fn whoever_answers_what_nobody_asked_it_reaches_nobody() {
 }
 
 #[test]
-fn whoever_gives_no_credit_back_does_not_have_the_daemon_keep_all_that_ever_wrote() {
+fn a_reader_that_gives_no_credit_back_does_not_make_the_daemon_keep_ended_writers() {
     let host = host();
     let _daemon = host.daemon();
     let here = session(&host, "here", true);

@@ -3,7 +3,7 @@
 use super::*;
 use crate::support::Player;
 
-/// One of these is on its way, at least, whenever the daemon is killed.
+/// At least one sample is on its way whenever the daemon is killed.
 fn len_of(sequence: u64) -> usize {
     if sequence.is_multiple_of(50) { 40_000 } else { 90 }
 }

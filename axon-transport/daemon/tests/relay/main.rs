@@ -79,7 +79,7 @@ fn relaying(host: &Host) -> Host {
     relaying.with("AXON_SHM", "off").with("AXON_DAEMON", "require")
 }
 
-/// Has a test done with two sessions, whoever of them shares memory.
+/// Runs a test with two sessions, for each choice of which of them shares memory.
 fn with_both_ends(test: impl Fn(&Session, &Session)) {
     let host = host();
     let _daemon = host.daemon();
@@ -141,7 +141,7 @@ fn await_pair(publisher: &Publisher, subscription: &Subscription) {
     });
 }
 
-/// Opens a publisher's or client's channel to whoever has heard so many MATCHED.
+/// Opens a publisher's or client's channel to a peer that has heard so many MATCHED.
 fn open_for(publisher: Gid, heard: u64) -> Credit {
     Credit { publisher, bytes: 1000, opens: Some(heard), client: None, done: None }
 }
@@ -157,7 +157,7 @@ fn take_until(subscription: &Subscription, last: u64) -> Vec<u64> {
     taken
 }
 
-/// Takes what is left of the child "talker", whose first hundred samples were taken: all of it whole.
+/// Takes the remaining samples of the child "talker", whose first hundred samples were taken: all of it whole.
 fn take_rest_of_talker(subscription: &Subscription) {
     let mut bytes = Vec::new();
     let mut next = 101;
@@ -251,7 +251,7 @@ fn child() {
 }
 
 #[test]
-fn samples_of_all_sizes_cross_whole_and_in_order_whoever_shares_memory() {
+fn samples_of_all_sizes_cross_whole_and_in_order_whichever_side_shares_memory() {
     with_both_ends(|from, to| {
         let (publisher, subscription) = connect(from, to, "/t", Qos::keep_all());
         let mut bytes = Vec::new();

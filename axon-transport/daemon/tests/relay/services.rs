@@ -1,5 +1,5 @@
-//! Services where requests and responses pass through the daemon: who is there for whom, and whose each
-//! response is.
+//! Services where requests and responses pass through the daemon: which servers and clients see each other,
+//! and which client each response is for.
 
 use std::collections::HashSet;
 
@@ -71,7 +71,7 @@ pub(crate) fn nothing_more(client: &Client) {
 }
 
 #[test]
-fn calls_of_all_sizes_cross_whoever_shares_memory() {
+fn calls_of_all_sizes_cross_whichever_side_shares_memory() {
     with_both_ends(|here, there| {
         let server = serve(here);
         let client = ask(there, &server);

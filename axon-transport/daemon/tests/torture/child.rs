@@ -40,7 +40,7 @@ struct Child {
     /// What the KEEP_ALL subscription missed.
     missed: Mutex<Vec<Miss>>,
     pair_log: PairLog,
-    /// How many samples were published by each publisher: whoever publishes holds it meanwhile.
+    /// How many samples were published by each publisher: the thread that publishes holds the lock meanwhile.
     published: [Mutex<u64>; 2],
 }
 
@@ -208,7 +208,7 @@ impl Child {
         }
     }
 
-    /// Keeps what is missing between `before` and the sample that came, and prints how that came about.
+    /// Records the samples missing between `before` and the sample that came, and prints how that came about.
     fn missed(&self, info: &MessageInfo, before: u64, counted: bool) {
         let (publisher, samples) = (info.publisher, info.sequence - before - 1);
         let at = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
@@ -264,7 +264,7 @@ impl Child {
             self.taken.fetch_add(1, Ordering::Relaxed);
             if gapless {
                 self.last.lock().expect("no panic").insert(info.publisher, info.sequence);
-                // Whoever waits for the last of all looks again.
+                // The thread that waits for the last of all looks again.
                 self.session.segment().notify();
             }
         }

@@ -298,7 +298,7 @@ pub(crate) fn run(plan: Plan, time: Duration, seed: u64) -> Round {
     let (start, mut most) = (Instant::now(), 0);
     let mut looked = start;
     let (mut kills, mut stops, mut daemons) = (0, 0, 0);
-    // When the processes of these readers were killed.
+    // When the process of each reader was killed.
     let mut deaths: HashMap<String, u128> = HashMap::new();
     let mut kill_daemon_at: Option<Instant> = None;
     let mut rough_until = start;

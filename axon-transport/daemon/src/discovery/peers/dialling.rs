@@ -77,8 +77,8 @@ impl Peers {
     }
 
     /// Dials those that are due: the best standing first, and of one standing those first whose host
-    /// has the fewest dials under way. Who has to wait is asked whether it is there, which gives it a
-    /// better standing if it is.
+    /// has the fewest dials under way. A peer that has to wait is asked whether it is there, which
+    /// gives it a better standing if it is.
     pub(super) fn dial_due(&mut self, now: Duration) {
         let mut in_flight = self.dials_in_flight();
         let mut due = Vec::new();

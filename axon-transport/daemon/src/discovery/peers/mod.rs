@@ -241,7 +241,7 @@ impl Peers {
         self.graph = digest;
     }
 
-    /// A link with `daemon` stands, whoever dialled it.
+    /// A link with `daemon` stands, whichever side dialled it.
     pub(crate) fn handle_link_up(&mut self, now: Duration, daemon: DaemonId, address: SocketAddr) {
         let listed = self.lists(address.ip().to_canonical());
         let address = SocketAddr::new(address.ip().to_canonical(), address.port());

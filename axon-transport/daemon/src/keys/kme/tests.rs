@@ -221,7 +221,7 @@ async fn request_does_not_wait_for_one_that_the_kme_never_answers() {
     }
 }
 
-/// In time that stands still but for what is waited for: seconds are exact, and take none.
+/// Time stands still except while the test waits for something: seconds are exact, and take none.
 #[tokio::test]
 async fn silent_kme_is_given_up_after_the_answer_limit_of_the_settings() {
     let network = network().await;

@@ -90,7 +90,7 @@ impl Pool {
         self.core.poll_timeout()
     }
 
-    /// Takes the answer to one of these calls. Says what was wrong with it, if anything was.
+    /// Takes the answer to one of the pool's calls. Says what was wrong with it, if anything was.
     pub(super) fn handle_answer(&mut self, now: Duration, answer: Answer) -> Option<String> {
         let asked = now.saturating_sub(answer.took);
         let ask = match answer.request {

@@ -66,7 +66,7 @@ proptest! {
                 asked_at.push((if star { String::new() } else { master.clone() }, clock.now()));
                 in_flight.push(request);
             }
-            prop_assert!(in_flight.len() <= 8, "none of these addresses authenticated");
+            prop_assert!(in_flight.len() <= 8, "no address has authenticated");
         }
         for sae in ["", "sae-0", "sae-1"] {
             let times = asked_at.iter().filter(|(m, _)| m == sae);
