@@ -47,7 +47,7 @@ pub(crate) fn run(args: &cli::Echo) -> Result<(), Failure> {
     outcome
 }
 
-/// What is missing among the messages that came: lost, or passed over since more came than may wait.
+/// Counts the messages missing among those that came: lost, or passed over since more came than may wait.
 #[derive(Default)]
 struct Numbers {
     /// The last number of each publisher.

@@ -275,8 +275,7 @@ fn range(session: &SessionStatus, links: &[LinkStatus]) -> String {
         };
         let linked: Vec<String> = session.lists.iter().map(named).collect();
         let linked = if linked.is_empty() { "none".to_owned() } else { linked.join(", ") };
-        let _ =
-            write!(text, ", lists {}; linked of these: {linked}", session.static_peers.join(", "));
+        let _ = write!(text, ", lists {}; linked: {linked}", session.static_peers.join(", "));
     }
     text
 }
@@ -447,7 +446,7 @@ mod tests {
             "pid 41 (stopped, 12.0 s)",
             "wrong PSK",
             "SUBNET, looks for robot-2",
-            "LOCALHOST, lists robot-2; linked of these: none",
+            "LOCALHOST, lists robot-2; linked: none",
             "the range is LOCALHOST",
         ] {
             assert!(text.contains(part), "{part:?} is missing in:\n{text}");

@@ -25,7 +25,7 @@ const FIXED_LEN: usize = SENDER_AT + 1 + 1 + NONCE_LEN;
 
 /// An envelope's header, read and not yet believed.
 ///
-/// Everything in it is a claim of whoever sent it until the envelope has opened.
+/// Everything in it is a claim of its sender until the envelope has opened.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Header<'a> {
     /// Where the message says it belongs.

@@ -178,7 +178,7 @@ fn refused() -> Vec<(&'static str, RefusalCause, Vec<u8>)> {
     ]
 }
 
-/// What whoever prints or passes on the error gives away.
+/// The texts that a program which prints or passes on the error gives away.
 fn aloud(error: &OpenError) -> (String, String) {
     assert!(std::error::Error::source(error).is_none());
     (error.to_string(), format!("{error:?} {error:#?}"))

@@ -1,5 +1,5 @@
 //! Peers that show what is not theirs, or is nothing: every one is refused, in either role, and
-//! whoever looks at it lives.
+//! the end that checks it does not panic.
 #![cfg(feature = "hybrid")]
 
 use std::sync::Arc;
@@ -147,7 +147,7 @@ fn a_certificate_with_one_bit_changed_is_refused() {
     assert_eq!(meet(&us, std::slice::from_ref(&der), &key), [true, true]);
     for shown in mutations(&der) {
         assert_eq!(meet(&us, std::slice::from_ref(&shown), &key), [false, false], "{shown:02x?}");
-        // What is no certificate names nobody, and does not end who asks.
+        // Bytes that are no certificate name no host, and do not make the check panic.
         if shown.len() < der.len() {
             assert!(!CaMaterial::is_for_host(&CertificateDer::from(shown), "host"));
         }

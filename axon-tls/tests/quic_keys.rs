@@ -201,7 +201,7 @@ impl Meddler for OneByte {
 }
 
 /// Someone who has the keys of the packets, as anybody has those of Initial ones, changes a byte of
-/// the handshake: whoever reads it does not complete.
+/// the handshake: the end that reads it does not complete.
 #[test]
 fn no_byte_of_a_handshake_can_be_changed() {
     for (client, server, exchange) in modes() {

@@ -74,7 +74,7 @@ fn every_scheme() -> Vec<SignatureScheme> {
     default_provider().signature_verification_algorithms.supported_schemes()
 }
 
-/// Accepts whoever it is, in the given schemes.
+/// Accepts any peer, in the given schemes.
 #[derive(Debug)]
 struct Anybody(Vec<SignatureScheme>);
 

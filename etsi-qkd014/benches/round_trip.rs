@@ -106,7 +106,7 @@ fn median(mut times: Vec<Duration>) -> Duration {
 struct Times([Vec<Duration>; 3]);
 
 impl Times {
-    /// Who goes first in this round; whoever is later may profit from the earlier.
+    /// The order of the three in this round: a later one may profit from an earlier one.
     fn turns(round: usize) -> [usize; 3] {
         [round % 3, (round + 1) % 3, (round + 2) % 3]
     }

@@ -33,7 +33,7 @@ pub(crate) fn common_name_in(mut rdns: &[u8]) -> Option<String> {
             }
             let text = std::str::from_utf8(element(&mut attribute, tag)?).ok()?;
             if found.replace(text.to_owned()).is_some() {
-                // Two names: whoever issued this, it is not clear whom it names.
+                // Two names: it is not clear which of the two the certificate names.
                 return None;
             }
         }

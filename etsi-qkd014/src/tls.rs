@@ -127,7 +127,7 @@ fn certified_key(cert: &[u8], key: &[u8]) -> Result<CertifiedKey, Error> {
     if chain.iter().any(is_of_old_version) {
         return Err(config("sae_cert", format!("no usable certificate: {OldVersion}")));
     }
-    // The reasons of these parsers are not passed on: they have seen the key.
+    // The parsers' reasons are not passed on: they have seen the key.
     let unusable = || {
         let accepted = "accepted: PKCS#8, SEC1 or PKCS#1, as PEM or DER, unencrypted";
         config("sae_key", format!("no usable private key; {accepted}"))

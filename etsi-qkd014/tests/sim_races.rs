@@ -89,7 +89,7 @@ async fn of_batches_that_overlap_each_is_given_whole_or_not_at_all() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn each_slave_of_a_multicast_gets_the_key_once_whoever_else_asks() {
+async fn each_slave_of_a_multicast_gets_the_key_once_while_others_ask() {
     let network = two().start().await.unwrap();
     let master = client(&network, "sae-a");
     let request = master.enc_keys("sae-b").additional_slave_sae_ids(["sae-c"]).number(10);

@@ -128,7 +128,7 @@ const ID: &str = "bc490419-7d60-487f-adc1-4ddcc177c139";
 fn ok(body: &Value) -> String {
     let body = body.to_string();
     let length = body.len();
-    // Without the last of these lines the next request might be sent on the connection that ends.
+    // Without the last header line the next request might be sent on the connection that ends.
     format!(
         "HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: {length}\r\n\
          Connection: close\r\n\r\n{body}"

@@ -118,8 +118,8 @@ impl Meddler for Liar {
     }
 }
 
-/// Who hears another handshake than the one that was meant does not complete, and an unchanged one
-/// completes on both ends; whoever is connected says on what, and nobody before.
+/// An end that receives another handshake than its peer meant does not complete, and an unchanged one
+/// completes on both ends. A connected end reports what was negotiated, and no end does before.
 pub fn quic_handshake(data: &[u8]) -> bool {
     let Some(input) = Input::parse(data) else { return false };
     let (client, mut server) = configs(input.mode);

@@ -23,7 +23,7 @@ usage: cargo xtask COMMAND
                        build axon-transport's C libraries and daemon, in release unless told
                        otherwise, and install them with header and pkg-config file
   package [CRATE]... [--allow-dirty] [--no-verify] [--offline] [--target-dir DIR]
-                       make the packages of these crates, or of all that are published, from a copy
+                       make the packages of the named crates, or of all that are published, from a copy
                        of the workspace in which rustls-axon has its patched source
   picture              draw docs/architecture.svg anew, from the manifests and the imports
   public-api [--write] compare what the published crates show with their public-api.txt, or write these

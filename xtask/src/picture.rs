@@ -1,4 +1,4 @@
-//! Draws `docs/architecture.svg`: the crates, and the rooms of those whose rooms stand on floors, with arrows
+//! Draws `docs/architecture.svg`: the crates, and the rooms of the crates whose rooms stand on floors, with arrows
 //! for what they import.
 //!
 //! An arrow that follows from two others is left out: what a room imports by way of a room in between it may

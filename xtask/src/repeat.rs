@@ -25,7 +25,7 @@ pub(crate) struct Repeat<'a> {
     pub(crate) times: u32,
     /// Threads that keep a processor busy meanwhile.
     pub(crate) busy: u32,
-    /// Test programs to run: those whose name contains one of these. Empty: all.
+    /// Test programs to run: those whose name contains one of the texts. Empty: all.
     pub(crate) only: Vec<&'a str>,
 }
 

@@ -14,7 +14,7 @@ use crate::text::{self, Table};
 /// How figures are taken from rounds; in every output.
 const REPORTED: &str = "Raw and AXON take turns. Times are one way (half a round trip): p50 of the \
                         round in which it was least, p99 and p99.9 of all rounds together. Ratios: \
-                        of these p50, and the median of the rounds' ratios. A budget is judged by \
+                        of those p50, and the median of the rounds' ratios. A budget is judged by \
                         the first; where messages have a pace, and of a publish, p50 is of all \
                         rounds, and budgets are judged by the median. CPU is the processor time \
                         of a message in all processes together.";

@@ -20,7 +20,7 @@ const KNOWN: [&str; 9] = [
 const REQUIRED: [&str; 5] =
     ["AXON_KME_URL", "AXON_KME_CA", "AXON_SAE_ID", "AXON_SAE_CERT", "AXON_SAE_KEY"];
 
-/// Larger files are none of these.
+/// The length of the largest file that is read.
 const MAX: u64 = 64 << 10;
 
 /// Reads a file; the reason, with its path and line, where it cannot be used.

@@ -76,7 +76,7 @@ const SCAN_HELP: &str = "\
 Connects to the daemon there, takes the key that it signs the handshake with, and breaks off: no \
 data is sent. Standard output has a line for a trust file, standard error where it is from.
 
-NOTHING IS VERIFIED. Whoever answers in the host's place shows a key of their own. Compare the line \
+NOTHING IS VERIFIED. An attacker who answers in the host's place shows another key. Compare the line \
 with what keygen printed on the host before a trust file has it. The daemon there notes a refused \
 handshake. No setting is read but ROS_DOMAIN_ID, for the ports to try.
 

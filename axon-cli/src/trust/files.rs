@@ -42,7 +42,7 @@ pub(super) fn key(path: &Path) -> Result<SigningKey, Failure> {
     })
 }
 
-/// Why a file could not be opened or read, for somebody who has never seen this tool.
+/// Why a file could not be opened or read, for a user who is new to this tool.
 pub(super) fn unread(path: &Path, error: &io::Error) -> Failure {
     match error.kind() {
         io::ErrorKind::NotFound => failed(path, &"there is no such file"),

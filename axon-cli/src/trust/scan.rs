@@ -28,7 +28,7 @@ use crate::{failure::Failure, say::say, text::printable};
 const OTHERS: Duration = Duration::from_secs(1);
 
 const NOTHING_VERIFIED: &str = "\
-# Nothing was verified: whoever answers at an address can show a key of their own. Before a line goes
+# Nothing was verified: an attacker who answers at an address can show another key. Before a line goes
 # into a trust file, compare it with what `axon trust keygen` printed on that host. A host without
 # AXON_CLASSIC_KEY shows another key each time its daemon starts.";
 

@@ -56,7 +56,7 @@ pub(crate) fn aead_table<A: Aead>(effort: Effort) {
     row("a sealer made and dropped, once a key", &plain(effort, sealer::<A>));
 }
 
-/// An AEAD that does nothing, so that what is left is the envelope's own.
+/// An AEAD that does nothing, so that the remaining time is the envelope's own.
 struct Nothing;
 
 impl Aead for Nothing {

@@ -78,7 +78,7 @@ impl CaMaterial {
     /// Leaves the server's name to the application too, for protocols in which both ends say who
     /// they are once they are connected.
     ///
-    /// **Whoever calls this must check what each peer says with [`CaMaterial::is_for_host()`]**:
+    /// **The caller must check the name that each peer says with [`CaMaterial::is_for_host()`]**:
     /// until then any holder of a certificate from the roots can be the server.
     #[must_use]
     pub fn with_names_checked_by_application(mut self) -> Self {

@@ -26,7 +26,7 @@ pub struct TrustFile {
     pins: BTreeMap<SpkiDigest, Pin>,
 }
 
-/// A line of a trust file: who has which key, and until when.
+/// A line of a trust file: a peer's name, its key, and until when the key is trusted.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Pin {
     name: String,

@@ -40,7 +40,7 @@ struct Sample {
     number: u64,
     pn_len: usize,
     header: &'static str,
-    /// What is not padding.
+    /// The payload without its padding.
     payload: &'static str,
     payload_len: usize,
     packet: &'static str,

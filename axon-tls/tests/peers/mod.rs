@@ -1,7 +1,7 @@
 //! OpenSSL and GnuTLS as real processes: how the tests find, start and talk to them.
 //!
-//! `TEST_OPENSSL` may name a second `openssl`; X25519MLKEM768 needs 3.5 or later. What is missing is
-//! skipped with a line that says so.
+//! `TEST_OPENSSL` may name a second `openssl`; X25519MLKEM768 needs 3.5 or later. A program that is
+//! missing is skipped with a line that says so.
 #![allow(dead_code, reason = "each test file uses its own part")]
 
 pub(crate) mod psk;
@@ -202,7 +202,7 @@ pub(crate) fn gnutls() -> bool {
     found.is_some()
 }
 
-/// Says what is left out, and why, past the harness: it would show that only beside a failure.
+/// Says which test is left out, and why, past the harness: it would show that only beside a failure.
 pub(crate) fn skipped(what: impl Display) {
     let _ = writeln!(std::io::stderr(), "skipped: {what}");
 }

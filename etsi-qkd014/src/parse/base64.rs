@@ -65,7 +65,7 @@ fn value_of(digit: u8) -> u8 {
         .wrapping_add(within(b'/', b'/', 63))
 }
 
-/// Joins four values to three bytes, and what is left to one or two. Whether the bits that no byte
+/// Joins four values to three bytes, and the remaining values to one or two. Whether the bits that no byte
 /// takes are zero.
 fn join(values: &[u8], bytes: &mut [u8]) -> bool {
     let (fours, rest) = values.as_chunks::<4>();

@@ -391,7 +391,7 @@ fn enc_keys(
     Ok(container(drawn, &extensions, fault))
 }
 
-/// Refuses what is not supported, or supported and not to be had (clause 6.2).
+/// Refuses mandatory extensions that are not supported, or that are supported and not available (clause 6.2).
 fn mandatory(extensions: &[serde_json::Map<String, Value>]) -> Result<(), Answer> {
     let all = || extensions.iter().flatten();
     let details = |what: &str, of: Vec<(&String, &str)>| -> Vec<Value> {

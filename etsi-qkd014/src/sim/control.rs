@@ -1,7 +1,7 @@
 //! Faults changed while the KMEs run, by HTTP on a loopback address.
 //!
-//! Whoever reaches the address may break the KMEs, and every local program can, web browsers
-//! included. A page in a browser must not: a request needs the address itself as `Host` (no name
+//! A program that reaches the address may break the KMEs, and every local program can reach it, web
+//! browsers included. A page in a browser must not: a request needs the address itself as `Host` (no name
 //! that a page could rebind), no `Origin`, the header `X-Kme-Sim: 1`, which a page cannot send
 //! without asking first, and JSON as its media type. There is no answer to that question.
 

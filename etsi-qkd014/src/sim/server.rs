@@ -70,7 +70,7 @@ pub(super) async fn serve(
 }
 
 /// Connections that have not proved who they are, oldest first. Where all places are taken, one of
-/// these gives way after [`PATIENCE`], so that whoever has no certificate shuts nobody out for long.
+/// them gives way after [`PATIENCE`], so that a peer without a certificate shuts nobody out for long.
 #[derive(Default)]
 struct Strangers(VecDeque<Stranger>);
 

@@ -1,4 +1,4 @@
-//! The client against whoever means it ill, and against whoever uses it wrongly: bytes that no KME
+//! The client against hostile KMEs, and against programs that use it wrongly: bytes that no KME
 //! should send, settings that no program should make, and calls dropped half way.
 
 mod cancellation;

@@ -130,7 +130,7 @@ fn admit(version: &str) -> Result<(), String> {
 /// The released tree with patches and added files, or everything that hinders it.
 fn apply(released: &Tree, patches: &Tree, added: &Tree) -> Result<Tree, Vec<String>> {
     let mut changed = released.clone();
-    // the strict applier decides; what does not fit is found out for who has to resolve it
+    // the strict applier decides; the rest finds what does not fit, for the maintainer who resolves it
     let Err(why) = tree::change(&mut changed, patches, added) else { return Ok(changed) };
 
     let mut list = Vec::new();

@@ -1,7 +1,7 @@
 //! rustls-axon as its package has it: built in an empty project that also uses the newest rustls.
 //!
-//! The other tests build it in this workspace, from rustls's source and the patches. Whoever gets
-//! it from a registry has the patched tree, their own versions of everything, and no patches.
+//! The other tests build it in this workspace, from rustls's source and the patches. A project
+//! that gets it from a registry has the patched tree, its own versions of everything, and no patches.
 //!
 //! `cargo test -p xtask --test packaged_rustls -- --include-ignored` also builds what is long:
 //! aws-lc once more from a vendored copy, and the documentation.

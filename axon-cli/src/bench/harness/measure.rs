@@ -167,7 +167,7 @@ pub(crate) struct Ratio {
     pub(crate) median: f64,
 }
 
-/// The median of what is not empty.
+/// The median of `values`, which are not empty.
 pub(crate) fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     values[values.len() / 2]

@@ -16,7 +16,7 @@ use crate::{
 /// How figures are taken from rounds; in every output.
 const REPORTED: &str = "Bare shared memory, sessions and a service take turns. Times are p50 of the \
                         round in which it was least: one way (half a round trip), and for the \
-                        service both ways. Ratios are of these. A service copies requests and \
+                        service both ways. Ratios are of those p50. A service copies requests and \
                         responses, so that it is beside messages that are copied, too. Of a \
                         stream as much is under way as 16 MiB hold, from 4 to 64 messages. CPU is \
                         the processor time of a message in both processes and their daemon.";

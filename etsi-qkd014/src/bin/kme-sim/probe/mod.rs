@@ -24,8 +24,8 @@ use crate::{Failure, Outcome, other, say};
 /// Tries a KME, any KME, against the specification and prints a table: clause, what was expected,
 /// what came, verdict.
 ///
-/// Without --consume-keys nothing is asked that a KME would serve with keys. What is not given is
-/// read from the environment that `kme-sim init` prints. A refusal by a code that the specification
+/// Without --consume-keys nothing is asked that a KME would serve with keys. An option that is not
+/// given is read from the environment that `kme-sim init` prints. A refusal by a code that the specification
 /// does not name for it (a limit exceeded, an unknown SAE) is noted, and no failure. Exit status: 0 if
 /// all checks passed (or were skipped or noted), 1 if one failed or was only tolerated, 2 on wrong
 /// arguments.

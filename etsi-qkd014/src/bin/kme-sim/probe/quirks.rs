@@ -56,7 +56,7 @@ pub(super) fn lenient() -> Quirks {
     sum(&but_bytes())
 }
 
-/// The quirks of these names.
+/// The quirks with the given names.
 fn sum(names: &[&'static str]) -> Quirks {
     let chosen = Quirks::NAMES.iter().filter(|(name, _)| names.contains(name));
     chosen.fold(Quirks::STRICT, |all, (_, quirk)| all | *quirk)
