@@ -9,7 +9,7 @@ use crate::kme::key;
 use crate::kmes::Kmes;
 use crate::{judge, quarantine};
 
-/// More keys than any of these draws.
+/// More keys than any test here draws.
 const DRAWN: u64 = 2000;
 const HELD: usize = 64;
 
@@ -73,7 +73,7 @@ fn keys_taken_from_a_pool_and_dropped() {
             while let Some(key) = pool.try_take() {
                 taken.push(key);
             }
-            // Of those who wait, one is served and one gives up.
+            // Of the two waiting calls, one is served and one gives up.
             let soon = || tokio::time::Instant::now() + Duration::from_secs(30);
             let given_up = tokio::time::timeout(Duration::from_micros(1), pool.take(soon())).await;
             drop(given_up);

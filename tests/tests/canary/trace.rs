@@ -5,7 +5,7 @@ pub(crate) struct Trace {
     frames: [usize; Self::FRAMES],
 }
 
-/// What stands between a caller and the allocator, or carries bytes for whoever calls it.
+/// The crates that stand between a caller and the allocator, or that carry bytes for their caller.
 const CARRIERS: [&str; 8] =
     ["alloc", "backtrace", "bytes", "canary", "core", "hashbrown", "std", "zeroize"];
 

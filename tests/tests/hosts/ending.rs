@@ -1,4 +1,4 @@
-//! What is left when a publisher, a link or a daemon ends: it arrives, or is known not to.
+//! Samples that are left when a publisher, a link or a daemon ends: they arrive, or are known not to.
 
 use std::{
     thread,
@@ -96,7 +96,7 @@ fn what_a_publisher_leaves_keeps_the_daemon_until_it_arrived() {
     signal(there, Signal::STOP);
     publish(&publisher, 100);
     drop(publisher);
-    // Longer than the grace time, shorter than what is waited for progress.
+    // Longer than the grace time, shorter than the time that a daemon waits for progress.
     thread::sleep(Duration::from_secs(4));
     signal(there, Signal::CONT);
     assert!(take(&subscription, 100).into_iter().eq(1..=100));

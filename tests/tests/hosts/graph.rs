@@ -1,5 +1,5 @@
 //! The graph of one host as the other has it: every field of every node and endpoint, and nothing else;
-//! whoever waits for it to change needs to look at no other time.
+//! a thread that waits for it to change needs to look at no other time.
 
 use std::time::Duration;
 

@@ -203,7 +203,7 @@ fn a_graph_has_a_bound_for_all_daemon_ids_of_a_peer_and_the_rest_of_the_link_goe
     }
     drop(publisher);
     until("endpoints are shown up to the bound", || (seen() + 1000) * NAMES > BOUND / 2);
-    camera.a.wait_refusal("what is left out, by name and why", |text| {
+    camera.a.wait_refusal("the topics that are left out, by name and why", |text| {
         ["camera", "graph", "/topic_", "more than 16 MiB"].iter().all(|part| text.contains(part))
     });
     until("all of it is known", || {

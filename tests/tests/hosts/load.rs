@@ -1,4 +1,4 @@
-//! More than gets through: what waits for whom, and that the newest arrives.
+//! More samples than get through: which publisher waits for which reader, and that the newest arrives.
 
 use std::{thread, time::Duration};
 

@@ -69,7 +69,7 @@ impl Plan {
     pub(crate) fn prepare(self) -> [Host; 2] {
         static PAIRS: AtomicU32 = AtomicU32::new(0);
         let (pair, pid) = (PAIRS.fetch_add(1, Ordering::Relaxed), std::process::id());
-        // Where hardly anybody is; another run of these tests at the same time has its own.
+        // A network that hardly anybody uses; another run of the tests at the same time has its own.
         let net = [(16 + pair % 200) as u8, (1 + pid % 250) as u8];
         // Below 100: the tool's tests, whose daemons may still be in their grace time, are above.
         let domain = 1 + (pid.wrapping_mul(31) + 2 * pair) % 98;

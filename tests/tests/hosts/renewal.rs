@@ -159,7 +159,7 @@ fn in_messages10_what_waits_longer_than_its_key_may_live_is_nobodys_fault() {
     let publisher = here.create_publisher(spec()).unwrap();
     assert!(publisher.wait_matched(1, PATIENCE) && subscription.wait_matched(1, PATIENCE));
     fill(&publisher);
-    until("what is left of the old link is counted", || {
+    until("the samples dropped with the old link are counted", || {
         let links = b.status().links;
         links.iter().any(|link| link.dropped.get("no_link").is_some_and(|lost| *lost > 0))
     });

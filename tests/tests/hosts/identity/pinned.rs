@@ -35,7 +35,7 @@ fn new_key(dir: &Path) -> PathBuf {
     path
 }
 
-/// As an administrator does it who has heard of rename.
+/// Replaces the file by a rename, as a careful administrator does.
 fn replace(path: &Path, content: &str) {
     let new = path.with_extension("new");
     fs::write(&new, content).unwrap();
@@ -187,7 +187,7 @@ fn strangers_get_no_link_and_who_is_pinned_none_under_another_name() {
     stranger.dial(&a, &revealed, &Claim::pinned("host-1")).expect_err("an ephemeral key");
 
     let camera = as_owner(SigningKey::from_pem(&fs::read_to_string(&camera).unwrap()).unwrap());
-    // Another's daemon id is taken, whoever asks.
+    // Another daemon's id is taken, whatever peer asks for it.
     let claim = Claim { daemon: super::daemon_id(&daemon), ..Claim::pinned("host-1") };
     let why = stranger.dial(&a, &camera, &claim).expect_err("B's id");
     assert!(why.contains("under another identity"), "{why}");
