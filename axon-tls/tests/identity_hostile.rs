@@ -1,4 +1,4 @@
-//! Peers that show what is not theirs, or is nothing: every one is refused, in either role, and
+//! Peers that show a certificate that is not theirs, or that is none: every one is refused, in either role, and
 //! the end that checks it does not panic.
 #![cfg(feature = "hybrid")]
 

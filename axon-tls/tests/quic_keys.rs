@@ -200,7 +200,7 @@ impl Meddler for OneByte {
     }
 }
 
-/// Someone who has the keys of the packets, as anybody has those of Initial ones, changes a byte of
+/// An attacker with the keys of the packets, as anybody has those of Initial ones, changes a byte of
 /// the handshake: the end that reads it does not complete.
 #[test]
 fn no_byte_of_a_handshake_can_be_changed() {

@@ -72,7 +72,7 @@ rmw_subscription_t * rmw_create_subscription(
       subscription->rmw.topic_name = subscription->topic.c_str();
       subscription->rmw.options = *subscription_options;
       subscription->rmw.can_loan_messages = subscription->plan.plain;
-      // A filter that is asked for is not applied: whoever asked reads here that it filters itself.
+      // A filter that is asked for is not applied: the caller reads here that it has to filter itself.
       subscription->rmw.is_cft_enabled = false;
       return &subscription.release()->rmw;
     });

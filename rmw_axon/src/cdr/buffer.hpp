@@ -43,7 +43,7 @@ struct MayHold : std::false_type {};
 template<typename Sequence>
 struct MayHold<Sequence, std::void_t<decltype(Sequence::is_rosidl_buffer)>>: std::true_type {};
 
-// The Buffer that a sequence of numbers in C holds, or null. All of these sequences have one layout.
+// The Buffer that a sequence of numbers in C holds, or null. All such sequences have one layout.
 template<typename Sequence = rosidl_runtime_c__uint8__Sequence>
 const void * held_in_c(const void * sequence)
 {
