@@ -11,7 +11,7 @@ use serde::Serialize;
 
 use super::{DemoError, env_file};
 
-/// The host that asks a KME for keys.
+/// The party that asks a KME for keys.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Role {
     /// Host A.

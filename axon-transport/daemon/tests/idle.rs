@@ -22,7 +22,7 @@ const WATCH: Duration = Duration::from_secs(5);
 /// Between two looks whether a process has come to rest.
 const SETTLE: Duration = Duration::from_millis(500);
 
-/// The lease of the publishers that have one. It is renewed at each third of it.
+/// The lease of the endpoints that have one. It is renewed at each third of it.
 const LEASE: Duration = Duration::from_secs(3);
 
 fn spec(topic: &str) -> EndpointSpec {
