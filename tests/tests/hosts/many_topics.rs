@@ -74,7 +74,7 @@ fn ends<T>(session: &Session, create: impl Fn(&Session, EndpointSpec) -> T) -> V
 }
 
 #[test]
-fn what_is_more_than_may_cross_is_named_on_both_hosts_and_harms_nothing_else() {
+fn topics_beyond_what_may_cross_are_named_on_the_subscribing_host_and_harm_nothing_else() {
     let hosts = Plan::new([classic(&[]), classic(&[])]).start();
     let (here, there) = (hosts[0].session("publishers"), hosts[1].session("subscriptions"));
     let subscriptions: Vec<Subscription> =
@@ -83,9 +83,7 @@ fn what_is_more_than_may_cross_is_named_on_both_hosts_and_harms_nothing_else() {
         ends(&here, |session, spec| session.create_publisher(spec).unwrap());
     let crossing = || publishers.iter().filter(|p| !p.matched().is_empty()).count();
     until("as many cross as may", || crossing() == ROUTES as usize);
-    for host in &hosts {
-        until("the others are named", || refused(host) == MORE as usize);
-    }
+    until("the others are named there", || refused(&hosts[1]) == MORE as usize);
     for publisher in &publishers {
         publisher.publish(b"one").unwrap();
     }
