@@ -73,7 +73,7 @@ fn a_first_segment_that_is_full_keeps_nobody_from_connecting() {
 }
 
 #[test]
-fn a_subscriber_whose_line_was_full_is_told_later() {
+fn a_subscriber_whose_segment_channel_was_full_is_told_later() {
     let (here, there) = contexts();
     let publisher = publisher(&here, keep_last(1));
     let mut subscriber = together(&publisher, &there, keep_last(1)).1.unwrap();

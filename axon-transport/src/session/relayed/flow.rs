@@ -427,8 +427,8 @@ impl Incoming {
         Ok(Some(InboundSample { channel: name, meta, lost, payload }))
     }
 
-    /// Credit for the channels that there is room for now. A channel that there is no room for does not
-    /// keep the others waiting.
+    /// Grants credit to each waiting channel whose sample fits what the session may buffer. A channel whose
+    /// sample does not fit holds up no other one.
     pub fn grants(&mut self) -> Vec<Credit> {
         let mut granted = Vec::new();
         self.is_short = false;
