@@ -26,7 +26,7 @@ use crate::{
 };
 
 /// Stand-ins of one identity. Each costs a ring.
-pub(super) const MAX_STAND_INS: usize = 1024;
+pub(crate) const MAX_STAND_INS: usize = 1024;
 /// Stream data of one identity that was not read, in bytes: beside it each of its links has
 /// [`LINK_WINDOW`](super::endpoint::LINK_WINDOW).
 const UNREAD: usize = 64 << 20;
@@ -53,30 +53,30 @@ const LOOKED_UP: usize = 32;
 
 /// Something that may be held up to a bound.
 #[derive(Debug)]
-pub(super) struct Meter {
+pub(crate) struct Meter {
     most: usize,
     held: AtomicUsize,
 }
 
 /// A part of what a meter allows, until it is dropped.
 #[derive(Debug)]
-pub(super) struct Charge {
+pub(crate) struct Charge {
     meter: Arc<Meter>,
     amount: usize,
 }
 
 impl Meter {
-    pub(super) fn new(most: usize) -> Arc<Self> {
+    pub(crate) fn new(most: usize) -> Arc<Self> {
         Arc::new(Self { most, held: AtomicUsize::new(0) })
     }
 
     /// Holds nothing yet.
-    pub(super) fn nothing(self: &Arc<Self>) -> Charge {
+    pub(crate) fn nothing(self: &Arc<Self>) -> Charge {
         Charge { meter: Arc::clone(self), amount: 0 }
     }
 
     /// Holds `amount` more, if that is within the bound.
-    pub(super) fn charge(self: &Arc<Self>, amount: usize) -> Option<Charge> {
+    pub(crate) fn charge(self: &Arc<Self>, amount: usize) -> Option<Charge> {
         let more = |held: usize| held.checked_add(amount).filter(|sum| *sum <= self.most);
         // Relaxed: a bound, not a hand-over.
         self.held.fetch_update(Ordering::Relaxed, Ordering::Relaxed, more).ok()?;
@@ -85,7 +85,7 @@ impl Meter {
 
     /// Has `charge` hold half of what it holds and nobody else does, if that is more than it holds: so
     /// something is left for those that come later. Whether it is more.
-    pub(super) fn share(self: &Arc<Self>, charge: &mut Charge) -> bool {
+    pub(crate) fn share(self: &Arc<Self>, charge: &mut Charge) -> bool {
         let others = self.held().saturating_sub(charge.amount);
         let share = self.most.saturating_sub(others) / 2;
         let more = share.checked_sub(charge.amount).filter(|more| *more > 0);
@@ -99,19 +99,19 @@ impl Meter {
     }
 
     /// How much is held.
-    pub(super) fn held(&self) -> usize {
+    pub(crate) fn held(&self) -> usize {
         self.held.load(Ordering::Relaxed)
     }
 
     /// The bound.
-    pub(super) fn most(&self) -> usize {
+    pub(crate) fn most(&self) -> usize {
         self.most
     }
 }
 
 impl Charge {
     /// How much it holds.
-    pub(super) fn amount(&self) -> usize {
+    pub(crate) fn amount(&self) -> usize {
         self.amount
     }
 }
@@ -124,23 +124,25 @@ impl Drop for Charge {
 
 /// The account of one identity.
 #[derive(Debug)]
-pub(super) struct Account {
+pub(crate) struct Account {
     /// Bytes of its graph.
-    pub(super) graph: Arc<Meter>,
+    pub(crate) graph: Arc<Meter>,
     /// Bytes of the routes that it asks for: as many again, so that one whose graph is full is served.
-    pub(super) routes: Arc<Meter>,
+    pub(crate) routes: Arc<Meter>,
     /// Relays for the routes that it asks for.
-    pub(super) relays: Arc<Meter>,
+    pub(crate) relays: Arc<Meter>,
     /// Control messages that it has not read.
-    pub(super) unsent: Arc<Meter>,
+    pub(crate) unsent: Arc<Meter>,
     /// Its publishers, servers and clients that are shown here.
-    pub(super) stand_ins: Arc<Meter>,
+    pub(crate) stand_ins: Arc<Meter>,
     /// Stream data that it may send and that was not read.
-    pub(super) unread: Arc<Meter>,
+    pub(crate) unread: Arc<Meter>,
     /// Memory for its messages.
-    pub(super) intake: Arc<Intake>,
+    pub(crate) intake: Arc<Intake>,
+    /// Memory for its long messages, in bytes.
+    pub(crate) messages: Arc<Meter>,
     /// When its changes are followed up.
-    pub(super) turns: Mutex<Turns>,
+    pub(crate) turns: Mutex<Turns>,
     reading: Arc<Semaphore>,
     unpacked: Arc<Semaphore>,
     said: Mutex<Bucket>,
@@ -148,7 +150,7 @@ pub(super) struct Account {
 
 /// Room for a control message, until it is dropped.
 #[derive(Debug)]
-pub(super) struct Unpacked {
+pub(crate) struct Unpacked {
     _room: Option<OwnedSemaphorePermit>,
 }
 
@@ -162,6 +164,7 @@ impl Account {
             stand_ins: Meter::new(MAX_STAND_INS),
             unread: Meter::new(UNREAD),
             intake: Arc::new(Intake::new(INTAKE)),
+            messages: Meter::new(INTAKE),
             reading: Arc::new(Semaphore::new(READING / UNIT)),
             unpacked: Arc::new(Semaphore::new(UNPACKED / UNIT)),
             turns: Mutex::default(),
@@ -170,17 +173,22 @@ impl Account {
     }
 
     /// Room to read a frame of `length` bytes.
-    pub(super) async fn reading(&self, length: usize) -> Unpacked {
+    pub(crate) async fn reading(&self, length: usize) -> Unpacked {
         room(&self.reading, length, READING).await
     }
 
     /// Room for a message of `length` bytes once it is decompressed.
-    pub(super) async fn unpacked(&self, length: usize) -> Unpacked {
+    pub(crate) async fn unpacked(&self, length: usize) -> Unpacked {
         room(&self.unpacked, length.max(MESSAGE), UNPACKED).await
     }
 
+    /// Counts a control message of this cost. Returns how long the identity has to wait before its next one.
+    pub(crate) fn owe(&self, cost: u32, now: Instant) -> std::time::Duration {
+        lock(&self.said).owe(cost, now)
+    }
+
     /// Takes this much of what the identity may say, and waits for as long as that is more than it may.
-    pub(super) async fn pace(&self, cost: u32) {
+    pub(crate) async fn pace(&self, cost: u32) {
         let wait = lock(&self.said).owe(cost, Instant::now());
         if !wait.is_zero() {
             tokio::time::sleep(wait).await;
@@ -190,13 +198,13 @@ impl Account {
 
 /// What a frame costs before it is decompressed, by the length that its map will have; one of unknown
 /// type, which is not decompressed, by its own.
-pub(super) fn cost_of_frame(frame: &[u8]) -> u32 {
+pub(crate) fn cost_of_frame(frame: &[u8]) -> u32 {
     let unpacked = if is_known(frame) { unpacked_length(frame).min(MAX_INFLATED) } else { 0 };
     costs(unpacked.max(frame.len()) / BYTES)
 }
 
 /// What a message costs: about as many changes as it says.
-pub(super) fn cost(message: &Message) -> u32 {
+pub(crate) fn cost(message: &Message) -> u32 {
     costs(match message {
         Message::Graph(graph) => {
             let toward = [&graph.localhost, &graph.listing].into_iter().flatten();
@@ -236,19 +244,19 @@ async fn room(semaphore: &Arc<Semaphore>, length: usize, all: usize) -> Unpacked
 
 /// The accounts of all peers, each for as long as it is used.
 #[derive(Debug)]
-pub(super) struct Accounts {
+pub(crate) struct Accounts {
     graph: usize,
     open: Mutex<HashMap<String, Weak<Account>>>,
 }
 
 impl Accounts {
     /// `graph` bytes are what the graph of one identity may take.
-    pub(super) fn new(graph: usize) -> Self {
+    pub(crate) fn new(graph: usize) -> Self {
         Self { graph, open: Mutex::default() }
     }
 
     /// The account of an identity.
-    pub(super) fn of(&self, identity: &str) -> Arc<Account> {
+    pub(crate) fn of(&self, identity: &str) -> Arc<Account> {
         let mut open = lock(&self.open);
         if let Some(account) = open.get(identity).and_then(Weak::upgrade) {
             return account;

@@ -34,15 +34,15 @@ use crate::{
 };
 
 /// Shared by dialling, accepting and the hub.
-pub(super) struct Context {
+pub(crate) struct Context {
     /// The daemon's settings.
-    pub(super) config: Arc<Config>,
+    pub(crate) config: Arc<Config>,
     /// What this side says in HELLO.
-    pub(super) hello: Hello,
+    pub(crate) hello: Hello,
     /// Addresses of listed peers.
     listed: RwLock<BTreeSet<IpAddr>>,
     /// KME keys, in qkd.
-    pub(super) keyring: Option<Arc<Keyring>>,
+    pub(crate) keyring: Option<Arc<Keyring>>,
     /// The classic identity; `None` in qkd.
     identity: Option<Identity>,
     transport: Arc<quinn::TransportConfig>,
@@ -57,7 +57,7 @@ impl fmt::Debug for Context {
 
 impl Context {
     /// Loads the classic identity from its files, if this is classic.
-    pub(super) fn new(
+    pub(crate) fn new(
         config: Arc<Config>,
         daemon: DaemonId,
         keyring: Option<Arc<Keyring>>,
@@ -82,44 +82,44 @@ impl Context {
     }
 
     /// From now on the listed peers have these addresses.
-    pub(super) fn set_listed(&self, addresses: BTreeSet<IpAddr>) {
+    pub(crate) fn set_listed(&self, addresses: BTreeSet<IpAddr>) {
         *self.listed.write().unwrap_or_else(PoisonError::into_inner) = addresses;
     }
 
     /// Whether a listed peer has this address.
-    pub(super) fn is_listed(&self, address: IpAddr) -> bool {
+    pub(crate) fn is_listed(&self, address: IpAddr) -> bool {
         let listed = self.listed.read().unwrap_or_else(PoisonError::into_inner);
         listed.contains(&address.to_canonical())
     }
 
     /// A number for a new connection, unique in this daemon's life.
-    pub(super) fn next_link(&self) -> u64 {
+    pub(crate) fn next_link(&self) -> u64 {
         self.next_link.fetch_add(1, Ordering::Relaxed)
     }
 
     /// The classic identity in force; `None` in qkd.
-    pub(super) fn auth(&self) -> Option<Auth> {
+    pub(crate) fn auth(&self) -> Option<Auth> {
         self.identity.as_ref().map(Identity::auth)
     }
 
     /// Whether peers prove who they are.
-    pub(super) fn authenticates(&self) -> bool {
+    pub(crate) fn authenticates(&self) -> bool {
         !matches!(self.auth(), Some(Auth::None(_)))
     }
 
     /// Why nobody new is let in, if so: this host does not know at present whom to trust.
-    pub(super) fn closed(&self) -> Option<String> {
+    pub(crate) fn closed(&self) -> Option<String> {
         self.identity.as_ref().and_then(Identity::closed)
     }
 
     /// Whether [`Context::look_at_files()`] is worth calling.
-    pub(super) fn has_files(&self) -> bool {
+    pub(crate) fn has_files(&self) -> bool {
         self.identity.as_ref().is_some_and(Identity::has_files)
     }
 
     /// Reads the files of the classic identity again if they changed; whether somebody may be
     /// trusted now who was not, or the other way round. Blocks on the file system.
-    pub(super) fn look_at_files(&self) -> bool {
+    pub(crate) fn look_at_files(&self) -> bool {
         self.identity.as_ref().is_some_and(|identity| identity.look(Instant::now()))
     }
 
@@ -127,7 +127,7 @@ impl Context {
     /// or ran out, its certificate ran out or was revoked.
     ///
     /// Certificates are checked only if `certificates` says so: that costs signatures.
-    pub(super) fn distrust(
+    pub(crate) fn distrust(
         &self,
         connection: &quinn::Connection,
         negotiated: &Negotiated,
@@ -162,7 +162,7 @@ impl Context {
     }
 
     /// The client's side of a classic handshake.
-    pub(super) fn classic_client(&self) -> Result<quinn::ClientConfig, GatewayError> {
+    pub(crate) fn classic_client(&self) -> Result<quinn::ClientConfig, GatewayError> {
         let auth = self.auth().ok_or(GatewayError::WrongMode)?;
         let mut client = hybrid_client(&auth, tls_cipher(self.config.cipher), ALPN)?;
         client.transport_config(Arc::clone(&self.transport));
@@ -170,7 +170,7 @@ impl Context {
     }
 
     /// The client's side of a qkd handshake on one PSK.
-    pub(super) fn qkd_client(
+    pub(crate) fn qkd_client(
         &self,
         attempt: &Attempt,
     ) -> Result<quinn::ClientConfig, GatewayError> {
@@ -183,7 +183,7 @@ impl Context {
     }
 
     /// The server's side, and in qkd the resolver that will tell why a PSK was not found.
-    pub(super) fn server(
+    pub(crate) fn server(
         &self,
         source: SocketAddr,
     ) -> Result<(quinn::ServerConfig, Option<Arc<Resolver>>), GatewayError> {
@@ -203,7 +203,7 @@ impl Context {
 }
 
 /// What the peer showed in the handshake: certificates, or one raw public key.
-pub(super) fn chain(connection: &quinn::Connection) -> Vec<CertificateDer<'static>> {
+pub(crate) fn chain(connection: &quinn::Connection) -> Vec<CertificateDer<'static>> {
     let shown = connection.peer_identity().and_then(|shown| shown.downcast().ok());
     shown.map(|shown| *shown).unwrap_or_default()
 }

@@ -24,15 +24,15 @@ const LOGGED: usize = 256;
 
 /// Samples of one topic that were dropped for one cause.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Loss {
-    pub(super) topic: Arc<str>,
-    pub(super) cause: &'static str,
-    pub(super) samples: u64,
+pub(crate) struct Loss {
+    pub(crate) topic: Arc<str>,
+    pub(crate) cause: &'static str,
+    pub(crate) samples: u64,
 }
 
 /// The counters of one peer. Relaxed throughout: they are shown, never acted upon.
 #[derive(Debug, Default)]
-pub(super) struct Counters {
+pub(crate) struct Counters {
     samples_in: AtomicU64,
     bytes_in: AtomicU64,
     samples_out: AtomicU64,
@@ -44,26 +44,26 @@ pub(super) struct Counters {
 
 /// The counters of one peer, as the hub has them.
 #[derive(Debug, Default)]
-pub(super) struct Tally {
+pub(crate) struct Tally {
     counters: Arc<Counters>,
     counting: watch::Sender<()>,
 }
 
 /// The counters of one peer, as a task has them that counts.
 #[derive(Clone, Debug)]
-pub(super) struct Counting {
+pub(crate) struct Counting {
     counters: Arc<Counters>,
     _of: watch::Receiver<()>,
 }
 
 impl Tally {
     /// For one more task that counts.
-    pub(super) fn counting(&self) -> Counting {
+    pub(crate) fn counting(&self) -> Counting {
         Counting { counters: Arc::clone(&self.counters), _of: self.counting.subscribe() }
     }
 
     /// Waits until nobody counts any more.
-    pub(super) async fn is_final(&self) {
+    pub(crate) async fn is_final(&self) {
         self.counting.closed().await;
     }
 }
@@ -86,26 +86,26 @@ impl Deref for Counting {
 
 impl Counters {
     /// A sample arrived and was published here.
-    pub(super) fn arrived(&self, bytes: usize) {
+    pub(crate) fn arrived(&self, bytes: usize) {
         self.samples_in.fetch_add(1, Ordering::Relaxed);
         self.bytes_in.fetch_add(bytes as u64, Ordering::Relaxed);
     }
 
     /// A sample was handed to QUIC.
-    pub(super) fn sent(&self, bytes: usize) {
+    pub(crate) fn sent(&self, bytes: usize) {
         self.samples_out.fetch_add(1, Ordering::Relaxed);
         self.bytes_out.fetch_add(bytes as u64, Ordering::Relaxed);
     }
 
     /// `count` samples were dropped for `cause`.
-    pub(super) fn dropped(&self, cause: &'static str, count: u64) {
+    pub(crate) fn dropped(&self, cause: &'static str, count: u64) {
         if count > 0 {
             *lock(&self.dropped).entry(cause).or_default() += count;
         }
     }
 
     /// As [`dropped`](Self::dropped), of a topic, for [`take_lost`](Self::take_lost).
-    pub(super) fn lost(&self, topic: &Arc<str>, cause: &'static str, count: u64) {
+    pub(crate) fn lost(&self, topic: &Arc<str>, cause: &'static str, count: u64) {
         if count == 0 {
             return;
         }
@@ -118,7 +118,7 @@ impl Counters {
     }
 
     /// What was lost since the last call, by topic and cause: each sample once.
-    pub(super) fn take_lost(&self) -> Vec<Loss> {
+    pub(crate) fn take_lost(&self) -> Vec<Loss> {
         let lost = std::mem::take(&mut *lock(&self.lost));
         let each = lost.into_iter().flat_map(|(topic, causes)| {
             causes.into_iter().map(move |(cause, samples)| {
@@ -130,7 +130,7 @@ impl Counters {
     }
 
     /// Puts the counters into `status`.
-    pub(super) fn fill(&self, status: &mut axon_transport::status::LinkStatus) {
+    pub(crate) fn fill(&self, status: &mut axon_transport::status::LinkStatus) {
         status.samples_in = self.samples_in.load(Ordering::Relaxed);
         status.bytes_in = self.bytes_in.load(Ordering::Relaxed);
         status.samples_out = self.samples_out.load(Ordering::Relaxed);
@@ -141,7 +141,7 @@ impl Counters {
 }
 
 /// Logs what was lost on the way to or from a peer, in one line: the topic that lost most by name.
-pub(super) fn log(losses: &[Loss], peer: &str) {
+pub(crate) fn log(losses: &[Loss], peer: &str) {
     let Some((topic, causes, samples, others)) = worst(losses) else { return };
     let topic = plain(topic, LOGGED);
     if others == 0 {

@@ -34,15 +34,15 @@ const SEND_WINDOW: u64 = 16 << 20;
 const STREAM_WINDOW: (u64, u64) = (1 << 20, 4 << 20);
 /// What a link may have under way before it is elected, and each link has then beside its share of what
 /// its peer may have.
-pub(super) const LINK_WINDOW: u32 = 1 << 20;
+pub(crate) const LINK_WINDOW: u32 = 1 << 20;
 
 /// The endpoints of a daemon: one per bound address, all on the same port.
 #[derive(Debug)]
-pub(super) struct Endpoints {
+pub(crate) struct Endpoints {
     /// One per bound address.
-    pub(super) all: Vec<Endpoint>,
+    pub(crate) all: Vec<Endpoint>,
     /// The port that all of them have.
-    pub(super) port: u16,
+    pub(crate) port: u16,
     senders: Vec<(SocketAddr, UdpSocket)>,
 }
 
@@ -73,7 +73,7 @@ pub enum EndpointError {
 impl Endpoints {
     /// Binds the first free port of the domain on every address of `AXON_BIND_ADDRS` (every
     /// address when it is empty). `server` is what answers; quinn tasks run on this runtime.
-    pub(super) fn bind(
+    pub(crate) fn bind(
         config: &Config,
         reset_key: &[u8; 32],
         server: Option<quinn::ServerConfig>,
@@ -106,12 +106,12 @@ impl Endpoints {
     }
 
     /// The endpoint from which `to` can be dialled.
-    pub(super) fn towards(&self, to: SocketAddr) -> Option<&Endpoint> {
+    pub(crate) fn towards(&self, to: SocketAddr) -> Option<&Endpoint> {
         self.index_towards(to).map(|i| &self.all[i])
     }
 
     /// Sends a discovery datagram from the QUIC port; a failure is a lost datagram.
-    pub(super) fn send(&self, to: SocketAddr, bytes: &[u8]) {
+    pub(crate) fn send(&self, to: SocketAddr, bytes: &[u8]) {
         if let Some(i) = self.index_towards(to) {
             let _ = self.senders[i].1.send_to(bytes, to);
         }
@@ -185,7 +185,7 @@ fn endpoint_config(reset_key: &[u8; 32]) -> EndpointConfig {
 }
 
 /// The transport settings of a link, for either end.
-pub(super) fn transport(config: &Config) -> Arc<TransportConfig> {
+pub(crate) fn transport(config: &Config) -> Arc<TransportConfig> {
     let mut transport = TransportConfig::default();
     let window = (config.max_message * 2).clamp(STREAM_WINDOW.0, STREAM_WINDOW.1);
     let mut mtu = MtuDiscoveryConfig::default();
@@ -204,19 +204,19 @@ pub(super) fn transport(config: &Config) -> Arc<TransportConfig> {
 }
 
 /// The link was elected: its peer may open as many streams as a link may have.
-pub(super) fn open_streams(connection: &quinn::Connection) {
+pub(crate) fn open_streams(connection: &quinn::Connection) {
     connection.set_max_concurrent_uni_streams(VarInt::from_u32(STREAMS_OPEN));
 }
 
 /// Lets the peer of a link have `share` bytes under way over it beside what each link has.
-pub(super) fn open_window(connection: &quinn::Connection, share: usize) {
+pub(crate) fn open_window(connection: &quinn::Connection, share: usize) {
     let share = u32::try_from(share).unwrap_or(u32::MAX);
     connection.set_receive_window(VarInt::from_u32(LINK_WINDOW.saturating_add(share)));
 }
 
 /// The key of stateless resets: kept in the runtime directory, so that the daemon that takes over
 /// after a kill tells the peers of its predecessor at once that their links are gone.
-pub(super) fn reset_key(runtime_dir: Option<&Path>, domain: u32) -> [u8; 32] {
+pub(crate) fn reset_key(runtime_dir: Option<&Path>, domain: u32) -> [u8; 32] {
     use std::{fs, io::Write, os::unix::fs::OpenOptionsExt};
 
     let Some(dir) = runtime_dir else { return rand::random() };

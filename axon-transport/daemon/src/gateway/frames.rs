@@ -8,7 +8,7 @@ const COPIED: usize = 4096;
 
 /// The frames of some messages, one after the other.
 #[derive(Debug, Default)]
-pub(super) struct Frames {
+pub(crate) struct Frames {
     /// Complete pieces.
     pieces: Vec<Bytes>,
     /// The piece that grows.
@@ -17,12 +17,12 @@ pub(super) struct Frames {
 
 impl Frames {
     /// Adds a copy of `bytes`.
-    pub(super) fn copy(&mut self, bytes: &[u8]) {
+    pub(crate) fn copy(&mut self, bytes: &[u8]) {
         self.growing.extend_from_slice(bytes);
     }
 
     /// Adds `payload`, by reference where it is long.
-    pub(super) fn share(&mut self, payload: &Bytes) {
+    pub(crate) fn share(&mut self, payload: &Bytes) {
         if payload.len() <= COPIED {
             return self.copy(payload);
         }
@@ -32,7 +32,7 @@ impl Frames {
 
     /// Adds what `write` makes of so many zeros at most: as many bytes of their front as it says. If it
     /// fails, nothing.
-    pub(super) fn fill<E>(
+    pub(crate) fn fill<E>(
         &mut self,
         most: usize,
         write: impl FnOnce(&mut [u8]) -> Result<usize, E>,
@@ -53,9 +53,14 @@ impl Frames {
     }
 
     /// Takes what there is.
-    pub(super) fn take(&mut self) -> Vec<Bytes> {
+    pub(crate) fn take(&mut self) -> Vec<Bytes> {
         self.close();
         std::mem::take(&mut self.pieces)
+    }
+
+    /// Bytes since the last [`take`](Self::take).
+    pub(crate) fn len(&self) -> usize {
+        self.pieces.iter().map(Bytes::len).sum::<usize>() + self.growing.len()
     }
 
     fn close(&mut self) {

@@ -294,7 +294,7 @@ fn parse_header(header: &[u8; STREAM_HEADER]) -> Result<(u8, u32, Gid), &'static
 }
 
 /// The header of a data stream.
-pub(super) fn stream_header(reliable: bool, route: u32, gid: Gid) -> [u8; STREAM_HEADER] {
+pub(crate) fn stream_header(reliable: bool, route: u32, gid: Gid) -> [u8; STREAM_HEADER] {
     let mut header = [0; STREAM_HEADER];
     header[0] = if reliable { RELIABLE } else { BEST_EFFORT };
     header[4..8].copy_from_slice(&route.to_be_bytes());

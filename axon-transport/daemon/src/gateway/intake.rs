@@ -12,7 +12,7 @@ const UNIT: usize = 1024;
 
 /// What the messages of one peer share.
 #[derive(Debug)]
-pub(super) struct Intake {
+pub(crate) struct Intake {
     room: Arc<Semaphore>,
     units: u32,
     /// Held for a message that was compressed: how long it really is turns out when it is whole.
@@ -21,21 +21,21 @@ pub(super) struct Intake {
 
 /// Room for one message.
 #[derive(Default)]
-pub(super) struct Room {
+pub(crate) struct Room {
     _whole: Option<OwnedSemaphorePermit>,
     _expanded: Option<OwnedMutexGuard<()>>,
 }
 
 impl Intake {
     /// For messages of so many bytes together, or one that is longer.
-    pub(super) fn new(bytes: usize) -> Self {
+    pub(crate) fn new(bytes: usize) -> Self {
         let units = u32::try_from(bytes.div_ceil(UNIT)).unwrap_or(u32::MAX);
         let room = Arc::new(Semaphore::new(units as usize));
         Self { room, units, expanding: Arc::default() }
     }
 
     /// Room for a message of `length` bytes, in the order in which it is asked for.
-    pub(super) async fn room(&self, length: usize) -> Room {
+    pub(crate) async fn room(&self, length: usize) -> Room {
         if length <= SMALL {
             return Room::default();
         }
@@ -47,12 +47,12 @@ impl Intake {
 
     /// Room for what a compressed message becomes: for one at a time, so that none waits for another
     /// that waits for it.
-    pub(super) async fn expand(&self, room: &mut Room) {
+    pub(crate) async fn expand(&self, room: &mut Room) {
         room._expanded = Some(Arc::clone(&self.expanding).lock_owned().await);
     }
 
     /// Gives back what a buffer need not keep until the next message.
-    pub(super) fn shrink(body: &mut Vec<u8>) {
+    pub(crate) fn shrink(body: &mut Vec<u8>) {
         if body.capacity() > SMALL {
             *body = Vec::new();
         }

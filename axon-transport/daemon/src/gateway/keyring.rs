@@ -31,7 +31,7 @@ pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 /// The keys of the daemon.
-pub(super) struct Keyring {
+pub(crate) struct Keyring {
     /// The daemon's monotonic clock.
     pub(super) clock: Clock,
     /// The settings that made it.
@@ -293,7 +293,7 @@ impl Keyring {
 }
 
 /// The message keys of both directions with one peer SAE.
-pub(super) struct PeerKeys {
+pub(crate) struct PeerKeys {
     number: u64,
     sae: String,
     sender: Mutex<Sender>,

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 /// A token bucket.
 #[derive(Debug)]
-pub(super) struct Bucket {
+pub(crate) struct Bucket {
     a_second: f64,
     most: f64,
     tokens: f64,
@@ -14,20 +14,20 @@ pub(super) struct Bucket {
 
 impl Bucket {
     /// A full one for `most` at once and so many a second.
-    pub(super) fn new(a_second: u32, most: u32) -> Self {
+    pub(crate) fn new(a_second: u32, most: u32) -> Self {
         let (a_second, most) = (f64::from(a_second), f64::from(most));
         Self { a_second, most, tokens: most, at: None }
     }
 
     /// Takes `cost`, if need be in advance: how long it is until that is made up for.
-    pub(super) fn owe(&mut self, cost: u32, now: Instant) -> Duration {
+    pub(crate) fn owe(&mut self, cost: u32, now: Instant) -> Duration {
         self.fill(now);
         self.tokens -= f64::from(cost);
         self.until(0.0)
     }
 
     /// Takes one token if there is one; else how long it is until there is.
-    pub(super) fn take(&mut self, now: Instant) -> Duration {
+    pub(crate) fn take(&mut self, now: Instant) -> Duration {
         self.fill(now);
         let wait = self.until(1.0);
         if wait.is_zero() {
@@ -37,7 +37,7 @@ impl Bucket {
     }
 
     /// How long it is until there is one.
-    pub(super) fn wait(&mut self, now: Instant) -> Duration {
+    pub(crate) fn wait(&mut self, now: Instant) -> Duration {
         self.fill(now);
         self.until(1.0)
     }
@@ -61,7 +61,7 @@ const OTHERS: u32 = 9;
 /// When what follows from a peer's changes is worked out next. What changes in between is taken
 /// together: the newest state counts.
 #[derive(Debug)]
-pub(super) struct Turns {
+pub(crate) struct Turns {
     bucket: Bucket,
     not_before: Option<Instant>,
 }
@@ -74,17 +74,17 @@ impl Default for Turns {
 
 impl Turns {
     /// How long it is until the next one.
-    pub(super) fn wait(&mut self, now: Instant) -> Duration {
+    pub(crate) fn wait(&mut self, now: Instant) -> Duration {
         self.rest(now).max(self.bucket.wait(now))
     }
 
     /// Whether it is time; the turn is taken then.
-    pub(super) fn take(&mut self, now: Instant) -> bool {
+    pub(crate) fn take(&mut self, now: Instant) -> bool {
         self.rest(now).is_zero() && self.bucket.take(now).is_zero()
     }
 
     /// A turn that began at `began` is over.
-    pub(super) fn over(&mut self, began: Instant, now: Instant) {
+    pub(crate) fn over(&mut self, began: Instant, now: Instant) {
         self.not_before = Some(now + now.saturating_duration_since(began) * OTHERS);
     }
 

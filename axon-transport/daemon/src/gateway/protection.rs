@@ -16,12 +16,12 @@ use super::{
 use crate::keys::NoKey;
 
 /// Largest inner header and envelope around a payload.
-pub(super) const MAX_OVERHEAD: usize = axon_envelope::MAX_HEADER_LEN + inner::LEN + TAG_LEN;
+pub(crate) const MAX_OVERHEAD: usize = axon_envelope::MAX_HEADER_LEN + inner::LEN + TAG_LEN;
 const LENGTH: usize = 4;
 
 /// How one link protects its messages.
 #[derive(Clone)]
-pub(super) enum Protection {
+pub(crate) enum Protection {
     /// By QUIC alone: `classic`, and `qkd` with `session`.
     Link,
     /// Each message in an envelope of its own.
@@ -36,9 +36,9 @@ pub(super) enum Protection {
 }
 
 /// What an opened message says.
-pub(super) struct Opened<'a> {
+pub(crate) struct Opened<'a> {
     /// Publisher, sequence number, timestamp.
-    pub(super) header: inner::Header,
+    pub(crate) header: inner::Header,
     /// The payload as it came.
     sent: &'a [u8],
 }
@@ -48,7 +48,7 @@ impl<'a> Opened<'a> {
     ///
     /// # Errors
     /// [`RefusedMessage::Malformed`].
-    pub(super) fn payload(&self, most: u64) -> Result<Cow<'a, [u8]>, RefusedMessage> {
+    pub(crate) fn payload(&self, most: u64) -> Result<Cow<'a, [u8]>, RefusedMessage> {
         if !self.header.compressed {
             return Ok(self.sent.into());
         }
@@ -68,7 +68,7 @@ impl<'a> Opened<'a> {
 /// Why a message is refused.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
-pub(super) enum RefusedMessage {
+pub(crate) enum RefusedMessage {
     /// The envelope; the cause is for the local log alone.
     #[error("{text}")]
     Envelope {
@@ -78,6 +78,13 @@ pub(super) enum RefusedMessage {
     /// The inner header or the compression.
     #[error("{0}")]
     Malformed(String),
+}
+
+impl RefusedMessage {
+    /// An envelope that was refused.
+    pub(crate) fn of_envelope(error: &OpenError) -> Self {
+        Self::Envelope { text: cause(error) }
+    }
 }
 
 fn header(sample: &Sample) -> inner::Header {
@@ -109,7 +116,7 @@ impl Protection {
     /// # Errors
     /// [`NoKey`] in `messages10` when no READY key is left for this kind of delivery: then nothing was
     /// added.
-    pub(super) fn write(
+    pub(crate) fn write(
         &self,
         sample: &Sample,
         route: Route,
@@ -147,7 +154,7 @@ impl Protection {
     }
 
     /// So many more messages wait to be sealed: what the key supply plans by.
-    pub(super) fn demand(&self, messages: u32) {
+    pub(crate) fn demand(&self, messages: u32) {
         if let Self::Envelope { keyring, keys, .. } = self {
             keys.with_sender(keyring, |now, sender| sender.demand(now, messages));
         }
@@ -158,7 +165,7 @@ impl Protection {
     ///
     /// # Errors
     /// [`RefusedMessage`]; nothing of the payload is handed on before its tag was verified.
-    pub(super) fn open<'a>(
+    pub(crate) fn open<'a>(
         &self,
         body: &'a mut [u8],
         route: Route,
@@ -174,7 +181,7 @@ impl Protection {
                             let at = plain.as_ptr().addr() - start;
                             Ok(Some(at..at + plain.len()))
                         }
-                        Err(error) => Err(RefusedMessage::Envelope { text: cause(&error) }),
+                        Err(error) => Err(RefusedMessage::of_envelope(&error)),
                     }
                 })?;
                 let Some(range) = opened else { return Ok(None) };
@@ -196,7 +203,7 @@ fn cause(error: &OpenError) -> String {
 }
 
 /// A sample as it was taken from a relay.
-pub(super) fn sample(info: axon_transport::MessageInfo, payload: Vec<u8>) -> Sample {
+pub(crate) fn sample(info: axon_transport::MessageInfo, payload: Vec<u8>) -> Sample {
     Sample { info, client: None, payload: payload.into(), since: Instant::now() }
 }
 
@@ -205,7 +212,7 @@ pub(super) fn sample(info: axon_transport::MessageInfo, payload: Vec<u8>) -> Sam
 ///
 /// # Errors
 /// The inner header says that it belongs elsewhere.
-pub(super) fn writer(kind: Kind, of: Gid, header: &inner::Header) -> Result<Gid, &'static str> {
+pub(crate) fn writer(kind: Kind, of: Gid, header: &inner::Header) -> Result<Gid, &'static str> {
     let writer = Gid(header.gid);
     let call = inner::RequestId { client: of.0, sequence: number(header.sequence) };
     let fits = match kind {

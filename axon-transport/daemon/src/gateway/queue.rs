@@ -21,7 +21,7 @@ const ONE: usize = 1;
 
 /// One sample on its way to a peer.
 #[derive(Clone, Debug)]
-pub(super) struct Sample {
+pub(crate) struct Sample {
     /// Publisher, sequence number and timestamps.
     pub(super) info: MessageInfo,
     /// Whose call it is, where it is a request or a response.

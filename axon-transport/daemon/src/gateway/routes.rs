@@ -21,13 +21,13 @@ use crate::link::Subscriber;
 
 /// What a route carries: samples, requests or responses, of one name and type.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub(super) struct RouteKey {
+pub(crate) struct RouteKey {
     /// Which of the three.
-    pub(super) kind: Kind,
+    pub(crate) kind: Kind,
     /// Topic or service name.
-    pub(super) topic: String,
+    pub(crate) topic: String,
     /// Type name.
-    pub(super) type_name: String,
+    pub(crate) type_name: String,
 }
 
 impl fmt::Display for RouteKey {
@@ -55,7 +55,7 @@ impl RouteKey {
     }
 
     /// The key of the same service in the other direction; of a topic its own.
-    pub(super) fn other_way(&self) -> Self {
+    pub(crate) fn other_way(&self) -> Self {
         let kind = match self.kind {
             Kind::Topic => Kind::Topic,
             Kind::Request => Kind::Response,
@@ -67,15 +67,15 @@ impl RouteKey {
 
 /// What one route needs from one peer.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(super) struct Wanted {
+pub(crate) struct Wanted {
     /// Readers here that some writer there serves.
-    pub(super) subscribers: Vec<Subscriber>,
+    pub(crate) subscribers: Vec<Subscriber>,
     /// Writers there, and how many readers here each serves.
-    pub(super) writers: Vec<(Endpoint, usize)>,
+    pub(crate) writers: Vec<(Endpoint, usize)>,
 }
 
 /// Matches a peer's writers with this host's readers, as far as the ranges of their sessions permit.
-pub(super) fn wanted<'a>(
+pub(crate) fn wanted<'a>(
     local: impl IntoIterator<Item = (&'a Endpoint, RangeToHost)>,
     remote: impl IntoIterator<Item = &'a RemoteEndpoint>,
 ) -> BTreeMap<RouteKey, Wanted> {
@@ -111,31 +111,31 @@ pub(super) fn wanted<'a>(
 
 /// Relays that a peer may have: a thirty-second of the endpoints that the gateway's session may have for
 /// all peers. Each takes a lane for each publisher here that it reads.
-pub(super) const MAX_RELAYS: usize = 2048;
+pub(crate) const MAX_RELAYS: usize = 2048;
 /// Those for one route.
 const MAX_RELAYS_OF_ROUTE: usize = 16;
 
 /// One relay subscription that the sending side opens for a topic's route.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct RelaySpec {
+pub(crate) struct RelaySpec {
     /// What it requests locally.
-    pub(super) qos: Qos,
+    pub(crate) qos: Qos,
     /// How many samples the deepest of those it stands for wants to wait at most.
-    pub(super) depth: u32,
+    pub(crate) depth: u32,
     /// The hash of its type, where the peer's subscriptions know it.
-    pub(super) type_hash: Vec<u8>,
+    pub(crate) type_hash: Vec<u8>,
     /// The peer's subscriptions that it stands for.
-    pub(super) stands_for: Vec<Gid>,
+    pub(crate) stands_for: Vec<Gid>,
 }
 
 impl RelaySpec {
     /// Whether it is the relay that `other` is, for the same subscriptions or for others.
-    pub(super) fn is(&self, other: &Self) -> bool {
+    pub(crate) fn is(&self, other: &Self) -> bool {
         self.qos == other.qos && self.type_hash == other.type_hash
     }
 
     /// How what it sends is queued.
-    pub(super) fn queued(&self) -> Qos {
+    pub(crate) fn queued(&self) -> Qos {
         Qos { depth: self.depth, ..self.qos }
     }
 }
@@ -148,7 +148,7 @@ impl RelaySpec {
 /// publisher back; and by how much they keep, because which relay stands for a subscription must not
 /// change when others come or go: it would miss what is published meanwhile. So a publisher may be read
 /// by several; [`axon_transport::internal::session::merge`] sends each sample once.
-pub(super) fn relays(subscribers: &[Subscriber], hash: impl Fn(&Gid) -> Vec<u8>) -> Vec<RelaySpec> {
+pub(crate) fn relays(subscribers: &[Subscriber], hash: impl Fn(&Gid) -> Vec<u8>) -> Vec<RelaySpec> {
     let mut groups: BTreeMap<_, RelaySpec> = BTreeMap::new();
     for subscriber in subscribers {
         let (offered, type_hash) = (subscriber.qos, hash(&subscriber.gid));
@@ -178,7 +178,7 @@ pub(super) fn relays(subscribers: &[Subscriber], hash: impl Fn(&Gid) -> Vec<u8>)
 
 /// Leaves of `specs` those that there are already, and as many of the others as a peer may have that has
 /// so many relays for other routes. How many it leaves out.
-pub(super) fn admit(
+pub(crate) fn admit(
     specs: &mut Vec<RelaySpec>,
     is_there: impl Fn(&RelaySpec) -> bool,
     elsewhere: usize,

@@ -20,7 +20,7 @@ const SAID_AGAIN: Duration = Duration::from_secs(10);
 const MOST_SAID: usize = 64;
 
 /// What counts as one address: of IPv6 the network, as a host may take any address in it.
-pub(super) fn place(address: IpAddr) -> IpAddr {
+pub(crate) fn place(address: IpAddr) -> IpAddr {
     match address.to_canonical() {
         IpAddr::V6(v6) => {
             let [a, b, c, d, ..] = v6.segments();
@@ -32,26 +32,26 @@ pub(super) fn place(address: IpAddr) -> IpAddr {
 
 /// Handshakes under way, by address.
 #[derive(Debug)]
-pub(super) struct Handshakes {
+pub(crate) struct Handshakes {
     most: usize,
     under_way: Mutex<HashMap<IpAddr, usize>>,
 }
 
 /// A handshake that counts until this is dropped.
 #[derive(Debug)]
-pub(super) struct Place {
+pub(crate) struct Place {
     of: Arc<Handshakes>,
     at: IpAddr,
 }
 
 impl Handshakes {
-    pub(super) fn new(most: usize) -> Arc<Self> {
+    pub(crate) fn new(most: usize) -> Arc<Self> {
         Arc::new(Self { most, under_way: Mutex::default() })
     }
 
     /// A place for one more from this address: it may have as many as are free, so that another
     /// address always finds one. A listed peer has some that nobody else gets.
-    pub(super) fn enter(self: &Arc<Self>, address: IpAddr, listed: bool) -> Option<Place> {
+    pub(crate) fn enter(self: &Arc<Self>, address: IpAddr, listed: bool) -> Option<Place> {
         let at = place(address);
         let mut under_way = lock(&self.under_way);
         let all: usize = under_way.values().sum();
@@ -83,7 +83,7 @@ impl Drop for Place {
 ///
 /// The address that has the most gives its newest link. A listed peer has a place even where others
 /// have few, and does not give its own to an unlisted one.
-pub(super) fn gives_way(
+pub(crate) fn gives_way(
     newcomer: IpAddr,
     links: &[(IpAddr, u64)],
     is_listed: impl Fn(IpAddr) -> bool,
@@ -106,11 +106,11 @@ pub(super) fn gives_way(
 
 /// Of which addresses a refusal was said just now.
 #[derive(Debug, Default)]
-pub(super) struct Said(VecDeque<(IpAddr, Instant)>);
+pub(crate) struct Said(VecDeque<(IpAddr, Instant)>);
 
 impl Said {
     /// Whether it is to be said, which it then was.
-    pub(super) fn is_news(&mut self, address: IpAddr, now: Instant) -> bool {
+    pub(crate) fn is_news(&mut self, address: IpAddr, now: Instant) -> bool {
         self.0.retain(|(_, at)| now.saturating_duration_since(*at) < SAID_AGAIN);
         let at = place(address);
         if self.0.iter().any(|(said, _)| *said == at) || self.0.len() >= MOST_SAID {

@@ -37,11 +37,11 @@ const AGAIN_AT_MOST: Duration = Duration::from_secs(8);
 
 /// The answers to probes that somebody waits for, by the nonce of the probe.
 #[derive(Debug, Default)]
-pub(super) struct Echoes(Mutex<HashMap<[u8; 8], oneshot::Sender<()>>>);
+pub(crate) struct Echoes(Mutex<HashMap<[u8; 8], oneshot::Sender<()>>>);
 
 impl Echoes {
     /// Takes a datagram that answers a probe. Whether it did.
-    pub(super) fn take(&self, datagram: &socket::Datagram) -> bool {
+    pub(crate) fn take(&self, datagram: &socket::Datagram) -> bool {
         let mut awaited = lock(&self.0);
         if awaited.is_empty() {
             return false;
@@ -66,7 +66,7 @@ impl Echoes {
 
 /// What went over a connection, as far as silence is concerned.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) struct Traffic {
+pub(crate) struct Traffic {
     /// Datagrams that came.
     came: u64,
     /// Acknowledgements among what came.
@@ -77,7 +77,7 @@ pub(super) struct Traffic {
 }
 
 impl Traffic {
-    pub(super) fn of(connection: &Connection) -> Self {
+    pub(crate) fn of(connection: &Connection) -> Self {
         let stats = connection.stats();
         let sent = stats.frame_tx;
         let asked = sent.stream
@@ -90,40 +90,40 @@ impl Traffic {
     }
 
     /// Whether the peer acknowledged something since `before`: QUIC repeats at once what it has not got.
-    pub(super) fn answered_since(self, before: Self) -> bool {
+    pub(crate) fn answered_since(self, before: Self) -> bool {
         self.acknowledged != before.acknowledged
     }
 
     /// Whether something was asked since `before` and nothing came.
-    pub(super) fn is_silent_since(self, before: Self) -> bool {
+    pub(crate) fn is_silent_since(self, before: Self) -> bool {
         self.came == before.came && self.asked > before.asked
     }
 }
 
 /// A link to be watched.
-pub(super) struct Watch {
+pub(crate) struct Watch {
     /// Its number at the hub.
-    pub(super) number: u64,
+    pub(crate) number: u64,
     /// The connection.
-    pub(super) connection: Connection,
+    pub(crate) connection: Connection,
     /// What had gone over it when it was found silent. An answer may have come since.
-    pub(super) traffic: Traffic,
+    pub(crate) traffic: Traffic,
     /// Which end this side is.
-    pub(super) side: Side,
+    pub(crate) side: Side,
     /// This daemon.
-    pub(super) daemon: DaemonId,
+    pub(crate) daemon: DaemonId,
     /// Where probes are sent from.
-    pub(super) endpoints: Arc<Endpoints>,
+    pub(crate) endpoints: Arc<Endpoints>,
     /// Where answers come.
-    pub(super) echoes: Arc<Echoes>,
+    pub(crate) echoes: Arc<Echoes>,
     /// To the hub.
-    pub(super) events: mpsc::Sender<Event>,
+    pub(crate) events: mpsc::Sender<Event>,
 }
 
 impl Watch {
     /// Probes until the peer acknowledges something, or the link ends; tells the hub when the path works
     /// and the link stays silent.
-    pub(super) async fn run(self) {
+    pub(crate) async fn run(self) {
         let nonce = rand::random();
         self.probe(nonce).await;
         self.echoes.forget(nonce);

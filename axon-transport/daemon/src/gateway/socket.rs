@@ -25,7 +25,7 @@ const MAX_DISCOVERY: usize = 512;
 
 /// A discovery datagram that came in on the QUIC port.
 #[derive(Clone, Debug)]
-pub(super) struct Datagram {
+pub(crate) struct Datagram {
     /// Who sent it.
     pub(super) from: SocketAddr,
     /// What it says; at most 512 bytes.

@@ -18,7 +18,7 @@ const REMEMBERED: usize = 4096;
 /// What is known of peers that stalled, by who they proved to be, so that a new link or daemon id is no
 /// way around it.
 #[derive(Debug, Default)]
-pub(super) struct Stalls(HashMap<(String, RouteKey), Stall>);
+pub(crate) struct Stalls(HashMap<(String, RouteKey), Stall>);
 
 #[derive(Debug)]
 struct Stall {
@@ -28,7 +28,7 @@ struct Stall {
 
 impl Stalls {
     /// A peer was disconnected from a topic after it read nothing for `limit`. How long it waits.
-    pub(super) fn add(
+    pub(crate) fn add(
         &mut self,
         who: &str,
         key: &RouteKey,
@@ -50,7 +50,7 @@ impl Stalls {
     }
 
     /// How long this peer is not served this yet.
-    pub(super) fn left(&self, who: &str, key: &RouteKey, now: Instant) -> Option<Duration> {
+    pub(crate) fn left(&self, who: &str, key: &RouteKey, now: Instant) -> Option<Duration> {
         let stall = self.0.get(&(who.to_owned(), key.clone()))?;
         Some(stall.until.saturating_duration_since(now)).filter(|left| !left.is_zero())
     }

@@ -14,7 +14,7 @@ use crate::link::Hello;
 
 /// As whom a peer proved itself.
 #[derive(Clone, Debug)]
-pub(super) enum Who {
+pub(crate) enum Who {
     /// By a KME key.
     Sae(String),
     /// By a key that is pinned under this name.
@@ -27,7 +27,7 @@ pub(super) enum Who {
 
 impl Who {
     /// The peer of a link whose HELLO was checked.
-    pub(super) fn of(context: &Context, hello: &Hello, negotiated: &Negotiated) -> Self {
+    pub(crate) fn of(context: &Context, hello: &Hello, negotiated: &Negotiated) -> Self {
         if let (Some(_), Some(sae)) = (&context.keyring, &hello.sae) {
             return Self::Sae(sae.clone());
         }
@@ -45,7 +45,7 @@ impl Who {
 
     /// Whether both are the same host. A name may have another key by now; who has no name is one
     /// for as long as it has its key.
-    pub(super) fn is(&self, other: &Self) -> bool {
+    pub(crate) fn is(&self, other: &Self) -> bool {
         match (self, other) {
             (Self::Sae(one), Self::Sae(other)) => one == other,
             (Self::Pinned(one, _), Self::Pinned(other, _)) => one == other,
@@ -57,7 +57,7 @@ impl Who {
 
     /// Tells whether two daemons are on the same host, by what they proved; with nothing proven the
     /// address.
-    pub(super) fn host_identity(&self, address: SocketAddr) -> String {
+    pub(crate) fn host_identity(&self, address: SocketAddr) -> String {
         match self {
             Self::Sae(sae) => format!("sae {sae}"),
             Self::Pinned(name, _) => format!("pin {name}"),
@@ -80,7 +80,7 @@ impl fmt::Display for Who {
 }
 
 /// The status of a link, its counters aside.
-pub(super) fn link(summary: &Summary, connection: &Connection, since_unix_ms: u64) -> LinkStatus {
+pub(crate) fn link(summary: &Summary, connection: &Connection, since_unix_ms: u64) -> LinkStatus {
     LinkStatus {
         peer: summary.hello.daemon.to_string(),
         host: match &summary.who {

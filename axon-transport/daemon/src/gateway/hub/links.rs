@@ -23,7 +23,7 @@ use crate::{
         establish::{Established, Sealing, close, peer_text},
         inbound::Inbound,
         outbound::{Carrier, Owner},
-        peer::{Peer, Prover, spawn_reader},
+        peer::{Peer, Prover, binding, spawn_reader},
         protection::Protection,
         refusal::{Refusal, RefusedBy},
         shares::gives_way,
@@ -285,7 +285,8 @@ impl Hub {
                 let identity = link.established.who.host_identity(connection.remote_address());
                 let owner = Owner { daemon, identity, events: self.events.clone() };
                 let (ours, proofs) = (self.context.hello.daemon, self.context.authenticates());
-                let prover = Prover::new(&self.shared.keys, ours, proofs, &connection);
+                let binding = binding(&connection);
+                let prover = Prover::new(&self.shared.keys, ours, proofs, binding);
                 let (carrier, shared) = (carrier.clone(), &self.shared);
                 let peer = Peer::new(number, outbox, carrier, account, prover, shared, owner);
                 self.peers.insert(daemon, peer);

@@ -88,7 +88,7 @@ pub(super) struct Noticed {
 }
 
 /// What the hub reacts to.
-pub(super) enum Event {
+pub(crate) enum Event {
     /// The control plane wants something.
     Order(ToGateway),
     /// A dial of ours came to an end.
@@ -163,17 +163,17 @@ struct Link {
 
 /// What is kept of a link's beginning.
 #[derive(Clone)]
-pub(super) struct Summary {
+pub(crate) struct Summary {
     /// The peer's HELLO.
-    pub(super) hello: Hello,
+    pub(crate) hello: Hello,
     /// What the handshake agreed on.
-    pub(super) negotiated: Negotiated,
+    pub(crate) negotiated: Negotiated,
     /// As whom the peer proved itself.
-    pub(super) who: Who,
+    pub(crate) who: Who,
 }
 
 /// The endpoints of applications on this host, and how far their sessions are discovered.
-pub(super) type Local = BTreeMap<Gid, (Arc<Endpoint>, EndpointRange)>;
+pub(crate) type Local = BTreeMap<Gid, (Arc<Endpoint>, EndpointRange)>;
 
 /// The hub's state.
 pub(super) struct Hub {

@@ -21,18 +21,18 @@ use crate::{
 
 /// What changed in a peer's graph.
 #[derive(Debug)]
-pub(in crate::gateway) struct GraphChange {
+pub(crate) struct GraphChange {
     /// Whether it replaces everything that was known of the peer.
-    pub(in crate::gateway) reset: bool,
+    pub(crate) reset: bool,
     /// Endpoints that came or changed.
-    pub(in crate::gateway) added: Vec<RemoteEndpoint>,
+    pub(crate) added: Vec<RemoteEndpoint>,
     /// Endpoints that went.
-    pub(in crate::gateway) removed: Vec<Gid>,
+    pub(crate) removed: Vec<Gid>,
 }
 
 /// What became of a GRAPH message.
 #[derive(Debug, PartialEq, Eq)]
-pub(in crate::gateway) enum GraphTaken {
+pub(crate) enum GraphTaken {
     /// It counts. `whole` when it was the end of a whole graph.
     Changed { whole: bool },
     /// More of it is to come.
@@ -59,7 +59,7 @@ struct Refused {
 
 /// The graph of one peer.
 #[derive(Debug)]
-pub(in crate::gateway) struct Remote {
+pub(crate) struct Remote {
     account: Arc<Account>,
     proven: Proven,
     all: BTreeMap<Gid, Held>,
@@ -77,7 +77,7 @@ pub(in crate::gateway) struct Remote {
 
 impl Remote {
     /// That of a peer which must prove its sessions, if `proofs`.
-    pub(in crate::gateway) fn new(account: Arc<Account>, proofs: bool) -> Self {
+    pub(crate) fn new(account: Arc<Account>, proofs: bool) -> Self {
         Self {
             account,
             proven: Proven::new(proofs),
@@ -92,7 +92,7 @@ impl Remote {
     }
 
     /// Takes a GRAPH in, as far as there is room.
-    pub(in crate::gateway) fn take(&mut self, graph: Graph) -> GraphTaken {
+    pub(crate) fn take(&mut self, graph: Graph) -> GraphTaken {
         let Graph { version, before, added, removed, more, localhost, listing } = graph;
         let [localhost, listing] = [localhost, listing]
             .map(|gids| gids.unwrap_or_default().into_iter().collect::<BTreeSet<Gid>>());
@@ -179,12 +179,12 @@ impl Remote {
 
     /// Another connection takes over: on it the peer proves its sessions anew, before it says anything of
     /// them.
-    pub(in crate::gateway) fn succeed(&mut self) {
+    pub(crate) fn succeed(&mut self) {
         self.proven.succeed();
     }
 
     /// Takes what the peer's daemon proves on the connection that `binding` is of.
-    pub(in crate::gateway) fn prove(
+    pub(crate) fn prove(
         &mut self,
         proofs: &[Proof],
         binding: &Binding,
@@ -201,12 +201,12 @@ impl Remote {
     }
 
     /// Whether the peer may speak for an endpoint of this GID.
-    pub(in crate::gateway) fn owns(&self, gid: &Gid) -> bool {
+    pub(crate) fn owns(&self, gid: &Gid) -> bool {
         self.proven.owns(gid)
     }
 
     /// A reader that the peer names in SUBSCRIBE is left out.
-    pub(in crate::gateway) fn disown_reader(&mut self, gid: &Gid, topic: &str) {
+    pub(crate) fn disown_reader(&mut self, gid: &Gid, topic: &str) {
         self.disown(gid, || format!("the reader of {}", short(topic)));
     }
 
@@ -244,7 +244,7 @@ impl Remote {
     }
 
     /// What changed since the last call.
-    pub(in crate::gateway) fn changes(&mut self) -> GraphChange {
+    pub(crate) fn changes(&mut self) -> GraphChange {
         let reset = std::mem::replace(&mut self.fresh, false);
         let (mut added, mut removed) = (Vec::new(), Vec::new());
         for gid in std::mem::take(&mut self.changed) {
@@ -257,54 +257,54 @@ impl Remote {
     }
 
     /// The first endpoint that was left out of the graph, and why; `None` when it is complete.
-    pub(in crate::gateway) fn refused(&self) -> Option<&str> {
+    pub(crate) fn refused(&self) -> Option<&str> {
         self.refused.as_ref().map(|refused| refused.text.as_str())
     }
 
     /// How many were left out since the peer said its whole graph.
-    pub(in crate::gateway) fn left_out(&self) -> u64 {
+    pub(crate) fn left_out(&self) -> u64 {
         self.left_out
     }
 
     /// Whether there is room by now for the first that was left out: the whole graph is worth asking
     /// for.
-    pub(in crate::gateway) fn has_room_again(&self) -> bool {
+    pub(crate) fn has_room_again(&self) -> bool {
         let needed = self.refused.as_ref().and_then(|refused| refused.bytes);
         self.gathered.is_none() && needed.is_some_and(|n| self.account.graph.charge(n).is_some())
     }
 
     /// The version that this side holds.
-    pub(in crate::gateway) fn version(&self) -> u64 {
+    pub(crate) fn version(&self) -> u64 {
         self.version
     }
 
     /// How many endpoints there are.
-    pub(in crate::gateway) fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         self.all.len()
     }
 
     /// The peer's account.
-    pub(in crate::gateway) fn account(&self) -> &Arc<Account> {
+    pub(crate) fn account(&self) -> &Arc<Account> {
         &self.account
     }
 
     /// One endpoint.
-    pub(in crate::gateway) fn get(&self, gid: &Gid) -> Option<&Endpoint> {
+    pub(crate) fn get(&self, gid: &Gid) -> Option<&Endpoint> {
         self.all.get(gid).map(|held| &*held.remote.endpoint)
     }
 
     /// Whether it has this endpoint, as was found in [`changes`](Self::changes).
-    pub(in crate::gateway) fn has(&self, gid: &Gid) -> bool {
+    pub(crate) fn has(&self, gid: &Gid) -> bool {
         self.all.contains_key(gid) && !self.changed.contains(gid)
     }
 
     /// All endpoints.
-    pub(in crate::gateway) fn endpoints(&self) -> impl Iterator<Item = &RemoteEndpoint> {
+    pub(crate) fn endpoints(&self) -> impl Iterator<Item = &RemoteEndpoint> {
         self.all.values().map(|held| &held.remote)
     }
 
     /// These endpoints are another daemon's.
-    pub(in crate::gateway) fn forget(&mut self, gids: &[Gid]) {
+    pub(crate) fn forget(&mut self, gids: &[Gid]) {
         for gid in gids {
             self.all.remove(gid);
         }

@@ -2,8 +2,8 @@
 
 mod alive;
 mod asking;
-mod graph;
-mod owners;
+pub(crate) mod graph;
+pub(crate) mod owners;
 mod refused;
 mod serving;
 
@@ -170,7 +170,7 @@ impl Peer {
         self.link = link;
         self.receipts.succeed(outbox.clone());
         self.outbox = outbox;
-        self.prover.succeed(&carrier.connection);
+        self.prover.succeed(binding(&carrier.connection));
         self.remote.succeed();
         // SUBSCRIBE names sessions as GRAPH does.
         let visible = self.visible(local);

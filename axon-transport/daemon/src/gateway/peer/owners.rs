@@ -22,13 +22,13 @@ const MAX_PROVEN: usize = 8192;
 const SWEEP: Duration = Duration::from_secs(1);
 
 /// The bytes that both ends of this connection share and no other connection has.
-pub(in crate::gateway) fn binding(connection: &Connection) -> Option<Binding> {
+pub(crate) fn binding(connection: &Connection) -> Option<Binding> {
     let mut binding = [0; 32];
     connection.export_keying_material(&mut binding, EXPORTER, b"").ok().map(|()| binding)
 }
 
 /// Proves to one peer that sessions are this daemon's.
-pub(in crate::gateway) struct Prover {
+pub(crate) struct Prover {
     keys: Arc<SessionKeys>,
     daemon: DaemonId,
     /// Whether proofs are asked for: where peers prove who they are.
@@ -44,12 +44,12 @@ pub(in crate::gateway) struct Prover {
 }
 
 impl Prover {
-    /// Proves sessions of `daemon` on this connection, if `needed`.
-    pub(in crate::gateway) fn new(
+    /// Proves sessions of `daemon` on the connection that has this binding, if `needed`.
+    pub(crate) fn new(
         keys: &Arc<SessionKeys>,
         daemon: DaemonId,
         needed: bool,
-        connection: &Connection,
+        binding: Option<Binding>,
     ) -> Self {
         let mut prover = Self {
             keys: Arc::clone(keys),
@@ -60,29 +60,29 @@ impl Prover {
             made: HashMap::new(),
             held: HashMap::new(),
         };
-        prover.succeed(connection);
+        prover.succeed(binding);
         prover
     }
 
     /// Whether proofs are asked for.
-    pub(super) fn is_needed(&self) -> bool {
+    pub(crate) fn is_needed(&self) -> bool {
         self.needed
     }
 
     /// Another connection takes over: everything is proved anew there.
-    pub(super) fn succeed(&mut self, connection: &Connection) {
-        self.binding = if self.needed { binding(connection) } else { None };
+    pub(crate) fn succeed(&mut self, binding: Option<Binding>) {
+        self.binding = binding.filter(|_| self.needed);
         self.made.clear();
         self.forget();
     }
 
     /// The peer asks for everything: every proof is said again.
-    pub(super) fn forget(&mut self) {
+    pub(crate) fn forget(&mut self) {
         self.proved.clear();
     }
 
     /// The proofs that the peer lacks for endpoints of these GIDs.
-    pub(super) fn owed<'a>(&mut self, gids: impl Iterator<Item = &'a Gid>) -> Vec<Message> {
+    pub(crate) fn owed<'a>(&mut self, gids: impl Iterator<Item = &'a Gid>) -> Vec<Message> {
         let Some(binding) = self.binding else { return Vec::new() };
         let sessions: BTreeSet<Prefix> = gids.map(prefix_of).collect();
         self.proved.retain(|session| sessions.contains(session));
@@ -115,7 +115,7 @@ impl Prover {
 
 /// The sessions of a peer.
 #[derive(Debug)]
-pub(super) struct Proven {
+pub(crate) struct Proven {
     /// Whether proofs are asked for: where peers prove who they are.
     needed: bool,
     sessions: HashSet<Prefix>,
@@ -125,13 +125,13 @@ pub(super) struct Proven {
 }
 
 impl Proven {
-    pub(super) fn new(needed: bool) -> Self {
+    pub(crate) fn new(needed: bool) -> Self {
         Self { needed, sessions: HashSet::new(), fresh: HashSet::new(), swept: None }
     }
 
     /// Takes what the daemon `from` proves. `used` says of which sessions there are endpoints: the others
     /// are forgotten where there are too many.
-    pub(super) fn take(
+    pub(crate) fn take(
         &mut self,
         proofs: &[Proof],
         binding: &Binding,
@@ -158,18 +158,18 @@ impl Proven {
     }
 
     /// Another connection takes over: what was proved on the one before counts no more.
-    pub(super) fn succeed(&mut self) {
+    pub(crate) fn succeed(&mut self) {
         self.sessions.clear();
         self.fresh.clear();
     }
 
     /// A GRAPH came: a session that it says nothing of has no endpoint yet.
-    pub(super) fn settle(&mut self) {
+    pub(crate) fn settle(&mut self) {
         self.sessions.extend(self.fresh.drain());
     }
 
     /// Whether the peer may speak for this endpoint.
-    pub(super) fn owns(&self, gid: &Gid) -> bool {
+    pub(crate) fn owns(&self, gid: &Gid) -> bool {
         !self.needed || self.has(&prefix_of(gid))
     }
 

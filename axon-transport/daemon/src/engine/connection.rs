@@ -1,0 +1,94 @@
+//! One QUIC connection and its control stream.
+
+use std::collections::HashMap;
+
+use quinn_proto::{ConnectionHandle, StreamId};
+
+use super::{
+    control::Control,
+    outbound::{Class, FlowId},
+    protection::Seal,
+};
+
+/// Bulk that QUIC holds, at least and at most: between them it is twice the congestion window.
+const BULK: (u64, u64) = (128 << 10, 4 << 20);
+/// Bytes more that QUIC holds for all other classes.
+const RESERVE: u64 = 1 << 20;
+
+/// A QUIC connection.
+pub(crate) struct Connection {
+    /// The endpoint that it belongs to.
+    pub(super) endpoint: usize,
+    /// Its name at the endpoint.
+    pub(super) handle: ConnectionHandle,
+    /// The connection.
+    pub(super) quic: quinn_proto::Connection,
+    /// Its control stream.
+    pub(super) control: Control,
+    /// The flow of each data stream that this side opened.
+    pub(super) flows: HashMap<StreamId, FlowId>,
+    /// Whether it is in the list of connections with something to do.
+    pub(super) is_dirty: bool,
+    /// The deadline under which the engine knows it.
+    pub(super) deadline: Option<std::time::Instant>,
+}
+
+impl Connection {
+    pub(super) fn new(
+        endpoint: usize,
+        handle: ConnectionHandle,
+        quic: quinn_proto::Connection,
+    ) -> Self {
+        Self {
+            endpoint,
+            handle,
+            quic,
+            control: Control::default(),
+            flows: HashMap::new(),
+            is_dirty: false,
+            deadline: None,
+        }
+    }
+
+    /// The connection as a carrier of samples.
+    pub(super) fn carrier<'a>(&'a mut self, seal: Seal<'a>) -> Carrier<'a> {
+        let window = self.quic.congestion_state().window();
+        let bulk = (2 * window).clamp(BULK.0, BULK.1);
+        Carrier { quic: &mut self.quic, seal, streams: &mut self.flows, flow: 0, taken: 0, window, bulk }
+    }
+}
+
+/// A connection that carries samples, for one pass.
+pub(crate) struct Carrier<'a> {
+    /// The connection.
+    pub(super) quic: &'a mut quinn_proto::Connection,
+    /// Protects the messages.
+    pub(super) seal: Seal<'a>,
+    /// The flow of each stream.
+    pub(super) streams: &'a mut HashMap<StreamId, FlowId>,
+    /// The flow whose turn it is.
+    pub(super) flow: FlowId,
+    /// Bytes that QUIC took in this pass.
+    pub(super) taken: u64,
+    window: u64,
+    bulk: u64,
+}
+
+impl Carrier<'_> {
+    /// The congestion window in bytes.
+    pub(super) fn window(&self) -> u64 {
+        self.window
+    }
+
+    /// Lets QUIC take what it may hold while a flow of this class writes.
+    pub(super) fn limit(&mut self, class: Class) {
+        let reserve = if class == Class::Bulk { 0 } else { RESERVE };
+        self.quic.set_send_window(self.bulk + reserve);
+    }
+
+    /// Ends the pass. QUIC says that it takes more once it would of those that are blocked.
+    pub(super) fn rest(&mut self, small_blocked: bool) {
+        let reserve = if small_blocked { RESERVE } else { 0 };
+        self.quic.set_send_window(self.bulk + reserve);
+    }
+}

@@ -1,0 +1,303 @@
+//! The control stream of a connection: messages of the link protocol, each in a frame behind its length
+//! (`docs/formats.md`, section 4).
+
+use std::{collections::VecDeque, sync::Arc, time::Duration};
+
+use bytes::{Buf, Bytes};
+use quinn_proto::{ReadError, ReadableError, StreamId, WriteError};
+
+use crate::{
+    gateway::account::{Charge, Meter, cost, cost_of_frame},
+    link::{
+        FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, Message, is_known, read_length,
+    },
+};
+
+/// Bytes of messages that wait for a peer that does not read them.
+const MAX_QUEUED: usize = 64 << 20;
+/// The priority of the stream: before all data.
+const PRIORITY: i32 = i32::MAX;
+
+/// Why nothing more comes.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub(crate) enum ControlError {
+    /// The peer broke the format.
+    #[error(transparent)]
+    Frame(#[from] FrameError),
+    /// The stream ended.
+    #[error("the control stream ended: {0}")]
+    Ended(&'static str),
+    /// The peer does not read the messages.
+    #[error("control messages are not read")]
+    Unread,
+}
+
+/// What may be read, as far as the link has been opened.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct FrameLimits {
+    /// Bytes of a frame.
+    pub(crate) frame: usize,
+    /// Bytes of a frame once it is decompressed.
+    pub(crate) inflated: usize,
+}
+
+impl FrameLimits {
+    /// Before the peer's HELLO was checked.
+    pub(crate) const BEFORE_HELLO: Self =
+        Self { frame: MAX_FRAME_BEFORE_HELLO, inflated: MAX_FRAME_BEFORE_HELLO };
+    /// After HELLO, before the peer has proven who it is.
+    pub(crate) const UNPROVEN: Self = Self { frame: MAX_FRAME, inflated: MAX_FRAME_BEFORE_HELLO };
+    /// The peer has proven who it is.
+    pub(crate) const PROVEN: Self = Self { frame: MAX_FRAME, inflated: MAX_INFLATED };
+}
+
+/// The control stream.
+#[derive(Debug)]
+pub(crate) struct Control {
+    stream: Option<StreamId>,
+    limits: FrameLimits,
+    /// Frames that wait, with what they weigh on the account.
+    out: VecDeque<(Bytes, Option<Charge>)>,
+    queued: usize,
+    meter: Option<Arc<Meter>>,
+    /// Nothing is sent after the frames that wait.
+    finishing: bool,
+    finished: bool,
+    /// The rest of the last piece that QUIC gave.
+    piece: Bytes,
+    /// The length and body of the frame that is being read.
+    frame: Vec<u8>,
+    /// Whether the frame that was read is paid for.
+    paid: Option<u32>,
+    /// The peer said as much as it may for now.
+    paused_until: Option<Duration>,
+    readable: bool,
+    ended: bool,
+}
+
+impl Default for Control {
+    fn default() -> Self {
+        Self {
+            stream: None,
+            limits: FrameLimits::BEFORE_HELLO,
+            out: VecDeque::new(),
+            queued: 0,
+            meter: None,
+            finishing: false,
+            finished: false,
+            piece: Bytes::new(),
+            frame: Vec::new(),
+            paid: None,
+            paused_until: None,
+            readable: false,
+            ended: false,
+        }
+    }
+}
+
+impl Control {
+    /// Uses this stream.
+    pub(super) fn open(&mut self, stream: StreamId, quic: &mut quinn_proto::Connection) {
+        self.stream = Some(stream);
+        self.readable = true;
+        let _ = quic.send_stream(stream).set_priority(PRIORITY);
+    }
+
+    /// The stream, once there is one.
+    pub(super) fn stream(&self) -> Option<StreamId> {
+        self.stream
+    }
+
+    /// What may be read from now on.
+    pub(super) fn set_limits(&mut self, limits: FrameLimits) {
+        self.limits = limits;
+    }
+
+    /// Messages that wait count against this meter from now on.
+    pub(super) fn charge_to(&mut self, meter: Arc<Meter>) {
+        self.meter = Some(meter);
+    }
+
+    /// Queues a message.
+    ///
+    /// # Errors
+    /// The message is too large, or the peer does not read.
+    pub(super) fn send(&mut self, message: &Message) -> Result<(), ControlError> {
+        if self.finishing {
+            return Ok(());
+        }
+        let frame = message.to_frame()?;
+        let charge = self.meter.as_ref().map(|meter| meter.charge(frame.len()));
+        if self.queued > MAX_QUEUED || matches!(charge, Some(None)) {
+            return Err(ControlError::Unread);
+        }
+        self.queued += frame.len();
+        self.out.push_back((frame.into(), charge.flatten()));
+        Ok(())
+    }
+
+    /// Nothing is sent after the messages that wait.
+    pub(super) fn finish(&mut self) {
+        self.finishing = true;
+    }
+
+    /// Whether frames wait.
+    pub(super) fn has_output(&self) -> bool {
+        !self.out.is_empty() || self.finishing && !self.finished
+    }
+
+    /// Hands frames to QUIC. Returns whether it took any.
+    pub(super) fn write(&mut self, quic: &mut quinn_proto::Connection) -> bool {
+        let Some(stream) = self.stream else { return false };
+        // Control is small, and goes first whatever else QUIC holds.
+        quic.set_send_window(u64::MAX);
+        let mut wrote = false;
+        while let Some((frame, _)) = self.out.front_mut() {
+            match quic.send_stream(stream).write(frame) {
+                Ok(taken) => {
+                    wrote = true;
+                    self.queued -= taken;
+                    frame.advance(taken);
+                    if !frame.has_remaining() {
+                        self.out.pop_front();
+                    }
+                }
+                Err(WriteError::Blocked) => return wrote,
+                Err(WriteError::Stopped(_) | WriteError::ClosedStream) => {
+                    self.out.clear();
+                    self.queued = 0;
+                    return wrote;
+                }
+            }
+        }
+        if self.finishing && !self.finished {
+            self.finished = true;
+            let _ = quic.send_stream(stream).finish();
+            wrote = true;
+        }
+        wrote
+    }
+
+    /// QUIC has more of the stream.
+    pub(super) fn handle_readable(&mut self) {
+        self.readable = true;
+    }
+
+    /// When reading goes on, if the peer said as much as it may.
+    pub(super) fn poll_timeout(&self) -> Option<Duration> {
+        self.paused_until
+    }
+
+    /// Whether there may be a message.
+    pub(super) fn has_input(&self, now: Duration) -> bool {
+        !self.ended
+            && (self.readable || !self.piece.is_empty() || self.paid.is_some())
+            && self.paused_until.is_none_or(|until| until <= now)
+    }
+
+    /// The next message. `owe` is told what reading it costs, and says how long the peer has to wait then.
+    ///
+    /// # Errors
+    /// Nothing more comes.
+    pub(super) fn read(
+        &mut self,
+        quic: &mut quinn_proto::Connection,
+        mut owe: impl FnMut(u32) -> Duration,
+        now: Duration,
+    ) -> Result<Option<Message>, ControlError> {
+        let result = self.try_read(quic, &mut owe, now);
+        self.ended |= result.is_err();
+        result
+    }
+
+    fn try_read(
+        &mut self,
+        quic: &mut quinn_proto::Connection,
+        owe: &mut impl FnMut(u32) -> Duration,
+        now: Duration,
+    ) -> Result<Option<Message>, ControlError> {
+        if !self.has_input(now) {
+            return Ok(None);
+        }
+        self.paused_until = None;
+        loop {
+            if !self.gather(quic)? {
+                return Ok(None);
+            }
+            let paid = match self.paid {
+                Some(paid) => paid,
+                None => {
+                    let cost = cost_of_frame(&self.frame[4..]);
+                    self.paid = Some(cost);
+                    if self.pause(owe(cost), now) {
+                        return Ok(None);
+                    }
+                    cost
+                }
+            };
+            let body = &self.frame[4..];
+            let message = match is_known(body) {
+                true => Message::from_frame(body, self.limits.inflated)?,
+                false => None,
+            };
+            (self.frame, self.paid) = (Vec::new(), None);
+            if let Some(message) = message {
+                if let more @ 1.. = cost(&message).saturating_sub(paid) {
+                    self.pause(owe(more), now);
+                }
+                return Ok(Some(message));
+            }
+        }
+    }
+
+    fn pause(&mut self, wait: Duration, now: Duration) -> bool {
+        self.paused_until = (!wait.is_zero()).then(|| now + wait);
+        self.paused_until.is_some()
+    }
+
+    /// Reads on until a frame is whole. Its memory grows with what arrives, not with what the peer says.
+    fn gather(&mut self, quic: &mut quinn_proto::Connection) -> Result<bool, ControlError> {
+        loop {
+            let wanted = match self.frame.first_chunk::<4>() {
+                Some(prefix) => 4 + read_length(*prefix, self.limits.frame)?,
+                None => 4,
+            };
+            if wanted > 4 && self.frame.len() == wanted {
+                return Ok(true);
+            }
+            if self.piece.is_empty() && !self.next_piece(quic)? {
+                return Ok(false);
+            }
+            let taken = self.piece.split_to(self.piece.len().min(wanted - self.frame.len()));
+            self.frame.extend_from_slice(&taken);
+        }
+    }
+
+    fn next_piece(&mut self, quic: &mut quinn_proto::Connection) -> Result<bool, ControlError> {
+        let Some(stream) = self.stream.filter(|_| self.readable) else { return Ok(false) };
+        let mut stream = quic.recv_stream(stream);
+        let mut chunks = match stream.read(true) {
+            Ok(chunks) => chunks,
+            Err(ReadableError::ClosedStream) => return Err(ControlError::Ended("it is closed")),
+            Err(ReadableError::IllegalOrderedRead) => {
+                return Err(ControlError::Ended("it was read out of order"));
+            }
+        };
+        let next = chunks.next(usize::MAX);
+        // What it wants to send leaves with the pass.
+        let _ = chunks.finalize();
+        match next {
+            Ok(Some(chunk)) => {
+                self.piece = chunk.bytes;
+                Ok(true)
+            }
+            Ok(None) => Err(ControlError::Ended("the peer finished it")),
+            Err(ReadError::Blocked) => {
+                self.readable = false;
+                Ok(false)
+            }
+            Err(ReadError::Reset(_)) => Err(ControlError::Ended("the peer reset it")),
+        }
+    }
+}

@@ -1,0 +1,189 @@
+//! Reads one data stream: a header, then messages behind their lengths.
+
+use std::time::Duration;
+
+use axon_envelope::Route;
+use axon_shm::ids::Gid;
+use bytes::{Bytes, BytesMut};
+use quinn_proto::{ReadError, ReadableError, StreamId};
+
+use crate::gateway::account::Charge;
+
+/// Bytes of a stream's header.
+pub(super) const HEADER: usize = 24;
+/// A stream of RELIABLE samples, of requests, or of responses.
+pub(super) const RELIABLE: u8 = 1;
+/// A stream of one BEST_EFFORT sample.
+pub(super) const BEST_EFFORT: u8 = 2;
+
+/// What a stream carries, as its header says.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct StreamHeader {
+    pub(super) reliable: bool,
+    pub(super) route: u32,
+    /// The publisher; of responses the client.
+    pub(super) of: Gid,
+}
+
+impl StreamHeader {
+    /// Reads a header.
+    ///
+    /// # Errors
+    /// The peer broke the format.
+    pub(super) fn parse(header: &[u8]) -> Result<Self, &'static str> {
+        let (kind, flags, route, of) = match header {
+            [kind, a, b, c, rest @ ..] if rest.len() == HEADER - 4 => {
+                let (route, of) = rest.split_at(4);
+                (*kind, [*a, *b, *c], route, of)
+            }
+            _ => return Err("a data stream with a short header"),
+        };
+        if !matches!(kind, RELIABLE | BEST_EFFORT) {
+            return Err("a data stream of unknown kind");
+        }
+        if flags != [0; 3] {
+            return Err("a data stream with unknown flags");
+        }
+        let (mut number, mut gid) = ([0; 4], [0; 16]);
+        number.copy_from_slice(route);
+        gid.copy_from_slice(of);
+        Ok(Self { reliable: kind == RELIABLE, route: u32::from_be_bytes(number), of: Gid(gid) })
+    }
+}
+
+/// What came of asking a stream for bytes.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) enum Piece {
+    /// All of them.
+    Whole(Bytes),
+    /// Not all have arrived.
+    Later,
+    /// The stream ended before.
+    End,
+}
+
+/// What a stream waits for.
+#[derive(Debug)]
+pub(super) enum Step {
+    /// Its header.
+    Header,
+    /// The route, or the turn, of its flow, until this time.
+    Turn(Duration),
+    /// The length of the next message.
+    Length,
+    /// Memory for a message of this length.
+    Room(usize),
+    /// The message of this length.
+    Body(usize),
+    /// The stand-in of the message's writer, until this time.
+    Writer(Message, Duration),
+    /// Room in the ring.
+    Ring(Message),
+}
+
+/// A message that was read and opened.
+#[derive(Debug)]
+pub(super) struct Message {
+    pub(super) writer: Gid,
+    pub(super) meta: axon_shm::Meta,
+    pub(super) payload: Bytes,
+}
+
+/// A data stream.
+#[derive(Debug)]
+pub(super) struct Incoming {
+    pub(super) step: Step,
+    pub(super) header: Option<(StreamHeader, Option<Route>)>,
+    /// The rest of what QUIC gave last.
+    chunk: Bytes,
+    /// A piece that came in several chunks.
+    gathered: BytesMut,
+    /// The memory of a long message.
+    pub(super) room: Option<Charge>,
+    pub(super) is_ready: bool,
+}
+
+impl Default for Incoming {
+    fn default() -> Self {
+        Self {
+            step: Step::Header,
+            header: None,
+            chunk: Bytes::new(),
+            gathered: BytesMut::new(),
+            room: None,
+            is_ready: false,
+        }
+    }
+}
+
+impl Incoming {
+    /// The next `length` bytes of the stream. A piece within one chunk is not copied.
+    pub(super) fn take(
+        &mut self,
+        length: usize,
+        id: StreamId,
+        quic: &mut quinn_proto::Connection,
+        read: &mut usize,
+    ) -> Piece {
+        loop {
+            if self.gathered.is_empty() && self.chunk.len() >= length {
+                return Piece::Whole(self.chunk.split_to(length));
+            }
+            let missing = length - self.gathered.len();
+            if self.gathered.is_empty() && !self.chunk.is_empty() {
+                self.gathered.reserve(length);
+            }
+            let more = self.chunk.split_to(self.chunk.len().min(missing));
+            self.gathered.extend_from_slice(&more);
+            if self.gathered.len() == length {
+                return Piece::Whole(std::mem::take(&mut self.gathered).freeze());
+            }
+            match next_chunk(id, quic) {
+                Ok(Some(chunk)) => {
+                    *read += chunk.len();
+                    self.chunk = chunk;
+                }
+                Ok(None) => return Piece::Later,
+                Err(End) => return Piece::End,
+            }
+        }
+    }
+}
+
+/// A stream that ended, was reset, or was stopped.
+struct End;
+
+fn next_chunk(id: StreamId, quic: &mut quinn_proto::Connection) -> Result<Option<Bytes>, End> {
+    let mut stream = quic.recv_stream(id);
+    let mut chunks = match stream.read(true) {
+        Ok(chunks) => chunks,
+        Err(ReadableError::ClosedStream | ReadableError::IllegalOrderedRead) => return Err(End),
+    };
+    let next = chunks.next(usize::MAX);
+    // The window that it wants to announce leaves with the pass.
+    let _ = chunks.finalize();
+    match next {
+        Ok(Some(chunk)) => Ok(Some(chunk.bytes)),
+        Ok(None) | Err(ReadError::Reset(_)) => Err(End),
+        Err(ReadError::Blocked) => Ok(None),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gateway::inbound::stream_header;
+
+    #[test]
+    fn a_header_that_is_not_one_is_refused() {
+        let header = stream_header(true, 7, Gid([9; 16]));
+        let parsed = StreamHeader::parse(&header).unwrap();
+        assert!(parsed.reliable && parsed.route == 7 && parsed.of == Gid([9; 16]));
+        for (at, byte) in [(0, 0), (0, 3), (1, 1), (3, 0x80)] {
+            let mut broken = header;
+            broken[at] = byte;
+            StreamHeader::parse(&broken).unwrap_err();
+        }
+        StreamHeader::parse(&header[..23]).unwrap_err();
+    }
+}

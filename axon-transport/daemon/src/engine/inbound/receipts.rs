@@ -1,0 +1,137 @@
+//! Acknowledges the RELIABLE samples of topics that are in a stand-in's ring: up to which number of each publisher.
+//! At the latest 10 ms, 64 samples or 256 KiB after the first, whichever comes first.
+
+use std::{collections::HashMap, time::Duration};
+
+use axon_shm::ids::Gid;
+
+use crate::link::{Received, ReceivedOf};
+
+const DELAY: Duration = Duration::from_millis(10);
+const SAMPLES: u64 = 64;
+const BYTES: u64 = 256 << 10;
+/// Flows in one message.
+const FLOWS: usize = 4096;
+
+#[derive(Debug, Default)]
+struct Due {
+    sequence: u64,
+    dropped: u64,
+}
+
+/// What is to be acknowledged.
+#[derive(Debug, Default)]
+pub(super) struct Receipts {
+    due: HashMap<(u32, Gid), Due>,
+    samples: u64,
+    bytes: u64,
+    /// When the next message leaves.
+    at: Option<Duration>,
+}
+
+impl Receipts {
+    /// A sample is in the ring, or was before.
+    pub(super) fn came(
+        &mut self,
+        flow: (u32, Gid),
+        sequence: u64,
+        bytes: usize,
+        now: Duration,
+    ) {
+        self.note(flow, sequence, 0, bytes, now);
+    }
+
+    /// A sample was dropped here.
+    pub(super) fn dropped(&mut self, flow: (u32, Gid), sequence: u64, now: Duration) {
+        self.note(flow, sequence, 1, 0, now);
+    }
+
+    fn note(
+        &mut self,
+        flow: (u32, Gid),
+        sequence: u64,
+        dropped: u64,
+        bytes: usize,
+        now: Duration,
+    ) {
+        let due = self.due.entry(flow).or_default();
+        due.sequence = due.sequence.max(sequence);
+        due.dropped += dropped;
+        self.samples += 1;
+        self.bytes += bytes as u64;
+        let many = self.samples >= SAMPLES || self.bytes >= BYTES;
+        let at = if many { now } else { now + DELAY };
+        self.at = Some(self.at.map_or(at, |other| other.min(at)));
+    }
+
+    /// When [`poll_message`](Self::poll_message) has one.
+    pub(super) fn poll_timeout(&self) -> Option<Duration> {
+        self.at
+    }
+
+    /// The next message that is due.
+    pub(super) fn poll_message(&mut self, now: Duration) -> Option<Received> {
+        if self.at.is_none_or(|at| at > now) {
+            return None;
+        }
+        let of = |(route, publisher): (u32, Gid), due: Due| ReceivedOf {
+            route,
+            publisher,
+            sequence: due.sequence,
+            dropped: due.dropped,
+        };
+        let flows: Vec<_> = if self.due.len() <= FLOWS {
+            self.due.drain().map(|(flow, due)| of(flow, due)).collect()
+        } else {
+            let some: Vec<_> = self.due.keys().take(FLOWS).copied().collect();
+            some.into_iter().filter_map(|flow| Some(of(flow, self.due.remove(&flow)?))).collect()
+        };
+        if self.due.is_empty() {
+            (self.at, self.samples, self.bytes) = (None, 0, 0);
+        }
+        Some(Received { flows })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const FLOW: (u32, Gid) = (1, Gid([7; 16]));
+
+    fn at(millis: u64) -> Duration {
+        Duration::from_millis(millis)
+    }
+
+    #[test]
+    fn a_single_sample_is_acknowledged_after_ten_milliseconds() {
+        let mut receipts = Receipts::default();
+        receipts.came(FLOW, 3, 8, at(0));
+        receipts.dropped(FLOW, 4, at(9));
+        assert_eq!(receipts.poll_timeout(), Some(at(10)));
+        assert_eq!(receipts.poll_message(at(9)), None);
+        let of = ReceivedOf { route: 1, publisher: FLOW.1, sequence: 4, dropped: 1 };
+        assert_eq!(receipts.poll_message(at(10)), Some(Received { flows: vec![of] }));
+        assert_eq!((receipts.poll_message(at(20)), receipts.poll_timeout()), (None, None));
+    }
+
+    #[test]
+    fn many_samples_or_bytes_are_acknowledged_at_once() {
+        let mut receipts = Receipts::default();
+        (1..=64).for_each(|sequence| receipts.came(FLOW, sequence, 8, at(0)));
+        assert_eq!(receipts.poll_message(at(0)).unwrap().flows[0].sequence, 64);
+        receipts.came(FLOW, 65, 256 << 10, at(1));
+        assert_eq!(receipts.poll_timeout(), Some(at(1)));
+    }
+
+    #[test]
+    fn more_flows_than_a_message_holds_are_split() {
+        let mut receipts = Receipts::default();
+        for route in 0..5000 {
+            receipts.came((route, FLOW.1), 1, 8, at(0));
+        }
+        let first = receipts.poll_message(at(10)).unwrap().flows.len();
+        let second = receipts.poll_message(at(10)).unwrap().flows.len();
+        assert_eq!((first, second, receipts.poll_message(at(10))), (4096, 904, None));
+    }
+}

@@ -1,0 +1,234 @@
+//! Sends the BEST_EFFORT samples of one flow: each over a stream of its own, which is reset when the sample's time is
+//! over. Two samples at a time are with QUIC, or as many as fit the congestion window. The rest waits in the queue,
+//! where a newer sample replaces it.
+
+use std::{
+    collections::VecDeque,
+    sync::Arc,
+    time::Duration,
+};
+
+use axon_envelope::{Delivery, Route};
+use axon_shm::ids::Gid;
+use bytes::Bytes;
+use quinn_proto::{Connection, Dir, StreamId, VarInt, WriteError};
+
+use super::{
+    flow::{Done, Pause},
+    queue::Queue,
+    schedule::Class,
+};
+use crate::{
+    engine::connection::Carrier,
+    gateway::{counters::Counters, frames::Frames, inbound::stream_header},
+    link::CloseCode,
+};
+
+/// A sample that is older than this once it has crossed the link is dropped for a newer one.
+const LIFE: Duration = Duration::from_millis(200);
+/// A sample that QUIC did not deliver within this time is given up.
+const LONGEST: Duration = Duration::from_secs(10);
+/// So many samples may be under way whatever the congestion window.
+const ALWAYS: usize = 2;
+
+/// A sample that QUIC does not have entirely.
+#[derive(Debug)]
+struct Writing {
+    stream: StreamId,
+    pending: VecDeque<Bytes>,
+    sample: UnderWay,
+}
+
+/// A sample on its way.
+#[derive(Clone, Copy, Debug)]
+struct UnderWay {
+    stream: StreamId,
+    priority: i32,
+    sequence: u64,
+    /// With header and envelope.
+    bytes: u64,
+    payload: usize,
+    begun: Duration,
+    /// When it is given up.
+    deadline: Duration,
+}
+
+/// The best-effort samples of one flow.
+#[derive(Debug, Default)]
+pub(super) struct BestEffort {
+    writing: Option<Writing>,
+    under_way: VecDeque<UnderWay>,
+    /// What the last sample took to arrive.
+    took: Duration,
+}
+
+impl BestEffort {
+    /// Whether QUIC has a part of a sample.
+    pub(super) fn is_writing(&self) -> bool {
+        self.writing.is_some()
+    }
+
+    /// Whether no sample is under way.
+    pub(super) fn is_idle(&self) -> bool {
+        self.writing.is_none() && self.under_way.is_empty()
+    }
+
+    /// Hands the next sample, or a part of it, to QUIC. `None`: go on.
+    #[expect(clippy::too_many_arguments, reason = "the parts of a flow, borrowed one by one")]
+    pub(super) fn write(
+        &mut self,
+        (number, of, route, topic): (u32, Gid, Route, &Arc<str>),
+        queue: &mut Queue,
+        frames: &mut Frames,
+        carrier: &mut Carrier<'_>,
+        counters: &Counters,
+        done: &mut Done,
+        now: Duration,
+    ) -> Option<Pause> {
+        if self.writing.is_none() {
+            let under_way: u64 = self.under_way.iter().map(|sample| sample.bytes).sum();
+            if self.under_way.len() >= ALWAYS && under_way >= carrier.window() {
+                return Some(Pause::Blocked);
+            }
+            counters.lost(topic, "late", queue.drop_late(LIFE, self.took, now));
+            if queue.peek().is_none() {
+                return Some(Pause::Empty);
+            }
+            let Some(stream) = carrier.quic.streams().open(Dir::Uni) else {
+                return Some(Pause::NoStream);
+            };
+            let Some(sample) = queue.pop_best_effort(now) else { return Some(Pause::Empty) };
+            let (sequence, payload) = (sample.info.sequence, sample.payload.len());
+            done.sequence = done.sequence.max(Some(sequence));
+            if carrier.seal.write(&sample, route, Delivery::BestEffort, frames, now).is_err() {
+                counters.lost(topic, "no_key", 1);
+                let _ = carrier.quic.send_stream(stream).reset(goodbye());
+                return None;
+            }
+            let mut pending = VecDeque::from(frames.take());
+            pending.push_front(Bytes::copy_from_slice(&stream_header(false, number, of)));
+            let class = Class::of(false, false, payload);
+            let priority = class.priority() - i32::from(!self.under_way.is_empty());
+            let _ = carrier.quic.send_stream(stream).set_priority(priority);
+            carrier.streams.insert(stream, carrier.flow);
+            let left = sample.lifespan_left(now).unwrap_or(LONGEST).min(LONGEST);
+            let bytes = pending.iter().map(|piece| piece.len() as u64).sum();
+            let sample = UnderWay {
+                stream,
+                priority,
+                sequence,
+                bytes,
+                payload,
+                begun: now,
+                deadline: now + left,
+            };
+            self.writing = Some(Writing { stream, pending, sample });
+        }
+        let Writing { stream, pending, sample } = self.writing.as_mut()?;
+        carrier.limit(Class::of(false, false, sample.payload));
+        let mut quic = carrier.quic.send_stream(*stream);
+        match quic.write_chunks(pending.make_contiguous()) {
+            Ok(taken) => {
+                pending.drain(..taken.chunks);
+                carrier.taken += taken.bytes as u64;
+                if pending.is_empty() {
+                    let _ = quic.finish();
+                    self.under_way.push_back(*sample);
+                    self.writing = None;
+                }
+                None
+            }
+            Err(WriteError::Blocked) => Some(Pause::Blocked),
+            Err(WriteError::Stopped(_) | WriteError::ClosedStream) => {
+                let _ = quic.reset(goodbye());
+                counters.lost(topic, "no_route", 1);
+                self.writing = None;
+                None
+            }
+        }
+    }
+
+    /// The peer's QUIC has all of a sample, or wants no more of it.
+    pub(super) fn handle_finished(
+        &mut self,
+        stream: StreamId,
+        quic: &mut Connection,
+        counters: &Counters,
+        now: Duration,
+    ) {
+        let Some(at) = self.under_way.iter().position(|sample| sample.stream == stream) else {
+            return;
+        };
+        let Some(sample) = self.under_way.remove(at) else { return };
+        self.took = now.saturating_sub(sample.begun);
+        counters.sent(sample.payload);
+        if let Some(first) = self.under_way.front() {
+            let _ = quic.send_stream(first.stream).set_priority(first.priority + 1);
+        }
+    }
+
+    /// When the next sample is given up.
+    pub(super) fn poll_timeout(&self) -> Option<Duration> {
+        let writing = self.writing.as_ref().map(|writing| writing.sample.deadline);
+        self.under_way.iter().map(|sample| sample.deadline).chain(writing).min()
+    }
+
+    /// Gives up the samples whose time is over.
+    pub(super) fn handle_timeout(
+        &mut self,
+        carrier: &mut Carrier<'_>,
+        counters: &Counters,
+        topic: &Arc<str>,
+        now: Duration,
+    ) {
+        let mut late = Vec::new();
+        late.extend(self.writing.take_if(|w| w.sample.deadline <= now).map(|w| w.stream));
+        self.under_way.retain(|sample| {
+            let over = sample.deadline <= now;
+            late.extend(over.then_some(sample.stream));
+            !over
+        });
+        for stream in &late {
+            // Not finished: the sample would look whole.
+            let _ = carrier.quic.send_stream(*stream).reset(goodbye());
+        }
+        counters.lost(topic, "late", late.len() as u64);
+    }
+
+    /// A new link carries the flow. The old one delivers what it has, and the rest of a sample if it takes it.
+    pub(super) fn leave(
+        &mut self,
+        old: Option<&mut Connection>,
+        counters: &Counters,
+        topic: &Arc<str>,
+    ) {
+        let Some(old) = old else { return self.link_over(counters, topic) };
+        if let Some(Writing { stream, mut pending, sample }) = self.writing.take() {
+            old.set_send_window(u64::MAX);
+            let mut quic = old.send_stream(stream);
+            let whole: usize = pending.iter().map(Bytes::len).sum();
+            let taken = quic.write_chunks(pending.make_contiguous()).map_or(0, |t| t.bytes);
+            if taken == whole {
+                let _ = quic.finish();
+                self.under_way.push_back(sample);
+            } else {
+                let _ = quic.reset(goodbye());
+                counters.lost(topic, "no_link", 1);
+            }
+        }
+        for sample in self.under_way.drain(..) {
+            counters.sent(sample.payload);
+        }
+    }
+
+    /// The link is over: what was under way is lost.
+    pub(super) fn link_over(&mut self, counters: &Counters, topic: &Arc<str>) {
+        let lost = self.under_way.len() + usize::from(self.writing.is_some());
+        counters.lost(topic, "no_link", lost as u64);
+        *self = Self::default();
+    }
+}
+
+fn goodbye() -> VarInt {
+    VarInt::from_u32(CloseCode::Goodbye.code())
+}

@@ -1,0 +1,543 @@
+//! One flow: the samples of a publisher, or of a client's service calls, towards one peer. It moves them from their
+//! rings into its queue, and from there into QUIC streams as the scheduler gives it turns.
+
+use std::{collections::VecDeque, rc::Rc, sync::Arc, time::Duration};
+
+use axon_envelope::{Delivery, Kind, Route};
+use axon_shm::{
+    ids::Gid,
+    qos::{Qos, Reliability},
+};
+use axon_transport::internal::session::merge::{Merge, Taken};
+use bytes::Bytes;
+use quinn_proto::{Dir, StreamId, VarInt, WriteError};
+
+use super::{
+    best_effort::BestEffort,
+    budget::Budget,
+    queue::{Offered, Queue},
+    schedule::Class,
+    source::Source,
+};
+use crate::{
+    engine::{connection::Carrier, rings::Sample},
+    gateway::{counters::Counters, frames::Frames, inbound::stream_header},
+    keys::NoKey,
+    link::CloseCode,
+};
+
+/// Samples, and bytes, that one turn moves from the rings.
+const FILL: (usize, usize) = (256, 256 << 10);
+/// A KEEP_ALL flow with so many bytes waiting leaves further samples in the ring, which keeps them.
+const AHEAD: usize = 1 << 20;
+/// Bytes of samples that are sealed and written together.
+const TOGETHER: usize = 64 << 10;
+/// Bytes that one turn writes before other flows have theirs.
+const TURN: usize = 256 << 10;
+/// Bytes that count as progress of a long sample.
+const PART: u64 = 256 << 10;
+/// A reliable stream that sent nothing for so long is finished.
+pub(super) const STREAM_IDLE: Duration = Duration::from_secs(30);
+
+/// Why a flow has nothing to write now.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Pause {
+    /// Its turn is over. More waits.
+    Turn,
+    /// It has nothing to send.
+    Empty,
+    /// QUIC takes no more, of this stream or of the connection, until it says so.
+    Blocked,
+    /// The peer allows no more streams now.
+    NoStream,
+    /// There is no key for the next message.
+    NoKey,
+}
+
+/// Samples that one flow sent, dropped, or has done with since they were taken up last.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Done {
+    /// The sources may forget the samples up to this number.
+    pub(super) sequence: Option<u64>,
+    /// Samples among them that will never reach the peer.
+    pub(super) given_up: u64,
+}
+
+/// A message that was sealed and is not entirely with QUIC.
+#[derive(Debug)]
+struct Sealed {
+    sequence: u64,
+    payload: usize,
+    /// Where its frame ends, in bytes since the batch was sealed.
+    end: u64,
+}
+
+/// One flow.
+pub(super) struct Flow {
+    pub(super) route_number: u32,
+    /// The publisher, or the client of a service.
+    pub(super) of: Gid,
+    pub(super) topic: Arc<str>,
+    route: Route,
+    /// Whether the peer acknowledges the samples.
+    acknowledged: bool,
+    /// The samples of all sources, in one order.
+    merge: Merge<Sample>,
+    /// A sample that the queue had no room for.
+    held: Option<Sample>,
+    /// Whether the rings may hold more samples than the last turn moved.
+    more: bool,
+    queue: Queue,
+    /// The stream of its RELIABLE samples.
+    stream: Option<StreamId>,
+    priority: i32,
+    frames: Frames,
+    /// Frames that QUIC has not taken.
+    pending: VecDeque<Bytes>,
+    sealed: VecDeque<Sealed>,
+    /// Bytes of the batch that QUIC has taken.
+    written: u64,
+    best_effort: BestEffort,
+    /// When it last handed something to QUIC.
+    active_at: Duration,
+    /// The class under which the scheduler has it.
+    pub(super) scheduled: Option<Class>,
+    /// Whether QUIC said that it takes no more.
+    pub(super) blocked: bool,
+    /// When [`handle_timeout`](Self::handle_timeout) is due, if it is.
+    pub(super) timer: Option<Duration>,
+    acknowledged_samples: u64,
+    /// Bytes that QUIC took.
+    taken_bytes: u64,
+}
+
+/// The parts of a route that its flows share.
+pub(super) struct FlowRoute {
+    pub(super) number: u32,
+    pub(super) topic: Arc<str>,
+    pub(super) route: Route,
+    pub(super) acknowledged: bool,
+}
+
+impl Flow {
+    /// A flow without sources.
+    pub(super) fn new(
+        of: Gid,
+        of_route: &FlowRoute,
+        qos: &Qos,
+        budget: &Rc<Budget>,
+        now: Duration,
+    ) -> Self {
+        let FlowRoute { number, ref topic, route, acknowledged } = *of_route;
+        Self {
+            route_number: number,
+            of,
+            topic: Arc::clone(topic),
+            route,
+            acknowledged,
+            merge: Merge::default(),
+            held: None,
+            more: false,
+            queue: Queue::new(qos, Rc::clone(budget), now),
+            stream: None,
+            priority: 0,
+            frames: Frames::default(),
+            pending: VecDeque::new(),
+            sealed: VecDeque::new(),
+            written: 0,
+            best_effort: BestEffort::default(),
+            active_at: now,
+            scheduled: None,
+            blocked: false,
+            timer: None,
+            acknowledged_samples: 0,
+            taken_bytes: 0,
+        }
+    }
+
+    /// Takes these sources; the peer has the samples up to number `seen`.
+    pub(super) fn set_sources(&mut self, sources: &[Source], seen: Option<u64>) {
+        self.merge.set(sources.iter().map(Source::gid));
+        self.merge.pass(seen.unwrap_or(0));
+        self.more = true;
+    }
+
+    /// Whether anything of it waits or is not acknowledged.
+    pub(super) fn is_idle(&self) -> bool {
+        self.held.is_none()
+            && !self.merge.holds_any()
+            && self.queue.is_empty()
+            && self.pending.is_empty()
+            && self.stream.is_none()
+            && self.best_effort.is_idle()
+    }
+
+    /// The class of what it sends next, or `None` if it has nothing to send.
+    pub(super) fn class(&self) -> Option<Class> {
+        let length = match self.queue.peek() {
+            _ if !self.pending.is_empty() => self.pending.iter().map(Bytes::len).sum(),
+            Some(next) => next.payload.len(),
+            None if self.best_effort.is_writing() => usize::MAX,
+            None if self.more || self.held.is_some() => 0,
+            None => return None,
+        };
+        let reliable = self.queue.delivery() == Delivery::Reliable;
+        Some(Class::of(self.route.kind != Kind::Topic, reliable, length))
+    }
+
+    /// Samples wait in a ring.
+    pub(super) fn handle_samples(&mut self) {
+        self.more = true;
+    }
+
+    /// Whether a sample found no room.
+    pub(super) fn is_held(&self) -> bool {
+        self.held.is_some()
+    }
+
+    /// Bytes that wait for QUIC.
+    pub(super) fn waiting_bytes(&self) -> usize {
+        self.queue.waiting_bytes()
+    }
+
+    /// When the oldest sample that waits was taken from its ring.
+    pub(super) fn oldest(&self) -> Option<Duration> {
+        self.queue.oldest()
+    }
+
+    /// Moves samples from the rings into the queue. Returns how many were queued.
+    pub(super) fn fill(&mut self, sources: &[Source], counters: &Counters, now: Duration) -> u32 {
+        if !(self.more || self.held.is_some()) || !self.queue.wants_more(now) {
+            return 0;
+        }
+        let first = sources.iter().find(|source| source.reads(&self.of));
+        let qos = first.map_or_else(Qos::keep_all, Source::qos);
+        self.queue.set_qos(&qos);
+        let waits = qos.history == axon_shm::qos::History::KeepAll
+            && qos.reliability == Reliability::Reliable;
+        let (mut samples, mut bytes, mut dropped) = (0, 0, 0);
+        while samples < FILL.0 && bytes < FILL.1 {
+            if waits && self.queue.waiting_bytes() >= AHEAD {
+                break;
+            }
+            let Some(sample) = self.next(sources, now) else {
+                self.more = self.merge.is_behind();
+                break;
+            };
+            bytes += sample.payload.len();
+            match self.queue.offer(sample, now) {
+                Offered::Queued { dropped: older } => {
+                    samples += 1;
+                    dropped += older;
+                }
+                Offered::Full(sample) => {
+                    self.held = Some(sample);
+                    break;
+                }
+            }
+        }
+        counters.lost(&self.topic, "queue", dropped);
+        samples as u32
+    }
+
+    fn next(&mut self, sources: &[Source], now: Duration) -> Option<Sample> {
+        let of = self.of;
+        if let Some(held) = self.held.take() {
+            return Some(held);
+        }
+        if self.route.kind == Kind::Response {
+            return sources.iter().find_map(|source| source.take_of(&of, now));
+        }
+        let next = self.merge.next(|reader| {
+            let source = sources.iter().find(|source| source.gid() == *reader)?;
+            let content = source.take_of(&of, now)?;
+            Some(Taken { number: content.info.sequence, lost: 0, content })
+        });
+        Some(next?.content)
+    }
+
+    /// Has a turn: hands samples to QUIC until its turn is over or QUIC takes no more.
+    pub(super) fn write(
+        &mut self,
+        sources: &[Source],
+        carrier: &mut Carrier<'_>,
+        counters: &Counters,
+        done: &mut Done,
+        now: Duration,
+    ) -> Pause {
+        let mut left = TURN;
+        loop {
+            if self.pending.is_empty() && !self.best_effort.is_writing() {
+                let queued = self.fill(sources, counters, now);
+                carrier.seal.demand(queued, now);
+            }
+            let before = carrier.taken;
+            let pause = match self.queue.delivery() {
+                // What is left of a batch goes first, however the next sample is delivered.
+                Delivery::BestEffort if self.pending.is_empty() => {
+                    self.finish_stream(carrier);
+                    self.write_best_effort(carrier, counters, done, now)
+                }
+                _ => self.write_reliable(carrier, counters, done, now),
+            };
+            left = left.saturating_sub((carrier.taken - before) as usize);
+            match pause {
+                None if left == 0 => return Pause::Turn,
+                None => {}
+                Some(pause) => return pause,
+            }
+        }
+    }
+
+    /// Writes the pending batch, or seals the next one. `None`: go on.
+    fn write_reliable(
+        &mut self,
+        carrier: &mut Carrier<'_>,
+        counters: &Counters,
+        done: &mut Done,
+        now: Duration,
+    ) -> Option<Pause> {
+        if self.pending.is_empty() {
+            match self.seal(carrier, now) {
+                Ok(0) => return Some(Pause::Empty),
+                Ok(_) => {}
+                Err(NoKey::Detached) => return Some(Pause::Blocked),
+                Err(_) => return Some(Pause::NoKey),
+            }
+        }
+        let stream = match self.stream {
+            Some(stream) => stream,
+            None => {
+                let Some(id) = carrier.quic.streams().open(Dir::Uni) else {
+                    return Some(Pause::NoStream);
+                };
+                let header = stream_header(true, self.route_number, self.of);
+                self.pending.push_front(Bytes::copy_from_slice(&header));
+                self.sealed.iter_mut().for_each(|sealed| sealed.end += header.len() as u64);
+                carrier.streams.insert(id, carrier.flow);
+                self.priority = 0;
+                *self.stream.insert(id)
+            }
+        };
+        let class = self.class().unwrap_or(Class::Bulk);
+        if class.priority() != self.priority {
+            self.priority = class.priority();
+            let _ = carrier.quic.send_stream(stream).set_priority(self.priority);
+        }
+        carrier.limit(class);
+        match carrier.quic.send_stream(stream).write_chunks(self.pending.make_contiguous()) {
+            Ok(taken) => {
+                self.pending.drain(..taken.chunks);
+                self.handle_taken(taken.bytes as u64, carrier, counters, done, now);
+                None
+            }
+            Err(WriteError::Blocked) => Some(Pause::Blocked),
+            Err(WriteError::Stopped(_)) => {
+                self.stop(counters, done);
+                None
+            }
+            Err(WriteError::ClosedStream) => {
+                self.stream = None;
+                self.rewind();
+                None
+            }
+        }
+    }
+
+    /// QUIC took so many bytes of the batch.
+    fn handle_taken(
+        &mut self,
+        bytes: u64,
+        carrier: &mut Carrier<'_>,
+        counters: &Counters,
+        done: &mut Done,
+        now: Duration,
+    ) {
+        carrier.taken += bytes;
+        self.written += bytes;
+        self.taken_bytes += bytes;
+        self.active_at = now;
+        let mut whole = 0;
+        while let Some(sealed) = self.sealed.front()
+            && sealed.end <= self.written
+        {
+            counters.sent(sealed.payload);
+            if !self.acknowledged {
+                done.sequence = done.sequence.max(Some(sealed.sequence));
+            }
+            self.sealed.pop_front();
+            whole += 1;
+        }
+        if !self.acknowledged {
+            self.queue.written(whole);
+        }
+        if self.timer.is_none() {
+            self.timer = Some(now + STREAM_IDLE);
+        }
+    }
+
+    /// Seals a batch of waiting samples. Returns how many.
+    fn seal(&mut self, carrier: &mut Carrier<'_>, now: Duration) -> Result<usize, NoKey> {
+        let (mut bytes, mut samples) = (0, 0);
+        (self.written, self.sealed) = (0, VecDeque::new());
+        let mut end = 0;
+        while bytes < TOGETHER {
+            let Some(sample) = self.queue.send(now) else { break };
+            let (sequence, payload) = (sample.info.sequence, sample.payload.len());
+            let delivery = Delivery::Reliable;
+            if let Err(why) = carrier.seal.write(sample, self.route, delivery, &mut self.frames, now) {
+                self.queue.take_back();
+                if samples == 0 {
+                    return Err(why);
+                }
+                break;
+            }
+            end = self.frames.len() as u64;
+            bytes += payload;
+            samples += 1;
+            self.sealed.push_back(Sealed { sequence, payload, end });
+        }
+        debug_assert!(samples == 0 || end > 0, "a sealed message has bytes");
+        self.pending.extend(self.frames.take());
+        Ok(samples)
+    }
+
+    /// The peer takes no more of this route: the samples that it was sent are given up.
+    fn stop(&mut self, counters: &Counters, done: &mut Done) {
+        self.stream = None;
+        self.pending.clear();
+        self.sealed.clear();
+        let (given_up, newest) = self.queue.give_up_sent();
+        counters.lost(&self.topic, "no_route", given_up);
+        done.sequence = done.sequence.max(newest);
+        done.given_up += given_up;
+    }
+
+    /// Sends all samples again that are not acknowledged, or not entirely with QUIC.
+    fn rewind(&mut self) {
+        self.pending.clear();
+        self.sealed.clear();
+        self.queue.rewind();
+    }
+
+    /// A new link carries the flow: what the old one did not deliver goes first.
+    pub(super) fn succeed(
+        &mut self,
+        mut old: Option<&mut quinn_proto::Connection>,
+        counters: &Counters,
+    ) {
+        if let (Some(stream), Some(old)) = (self.stream.take(), old.as_deref_mut()) {
+            // A message that is cut off at the end of its stream is none.
+            let _ = old.send_stream(stream).finish();
+        }
+        self.best_effort.leave(old, counters, &self.topic);
+        self.stream = None;
+        self.blocked = false;
+        self.rewind();
+    }
+
+    /// The streams that carry it, which end with it.
+    pub(super) fn take_streams(&mut self) -> Option<StreamId> {
+        self.stream.take()
+    }
+
+    /// Samples that the peer acknowledged, and how often QUIC took a quarter of a MiB.
+    pub(super) fn progress(&self) -> (u64, u64) {
+        (self.acknowledged_samples, self.taken_bytes / PART)
+    }
+
+    /// The peer has the samples up to this number, and dropped some of them.
+    pub(super) fn acknowledge(&mut self, sequence: u64, dropped: u64, now: Duration) -> Option<Done> {
+        let (samples, newest) = self.queue.acknowledge(sequence, now);
+        self.acknowledged_samples += samples;
+        newest.map(|sequence| Done { sequence: Some(sequence), given_up: samples.min(dropped) })
+    }
+
+    /// The reliable stream carries nothing more.
+    fn finish_stream(&mut self, carrier: &mut Carrier<'_>) {
+        if let Some(stream) = self.stream.take() {
+            let _ = carrier.quic.send_stream(stream).finish();
+        }
+    }
+
+    fn write_best_effort(
+        &mut self,
+        carrier: &mut Carrier<'_>,
+        counters: &Counters,
+        done: &mut Done,
+        now: Duration,
+    ) -> Option<Pause> {
+        let (number, of, route) = (self.route_number, self.of, self.route);
+        let before = carrier.taken;
+        let pause = self.best_effort.write(
+            (number, of, route, &self.topic),
+            &mut self.queue,
+            &mut self.frames,
+            carrier,
+            counters,
+            done,
+            now,
+        );
+        if carrier.taken > before {
+            self.active_at = now;
+        }
+        self.set_timer(self.best_effort.poll_timeout());
+        pause
+    }
+
+    /// The peer's QUIC has all of this best-effort stream.
+    pub(super) fn handle_finished(&mut self, stream: StreamId, carrier_quic: &mut quinn_proto::Connection, counters: &Counters, now: Duration) {
+        self.best_effort.handle_finished(stream, carrier_quic, counters, now);
+    }
+
+    /// The peer stopped this stream.
+    pub(super) fn handle_stopped(
+        &mut self,
+        stream: StreamId,
+        quic: &mut quinn_proto::Connection,
+        counters: &Counters,
+        done: &mut Done,
+        now: Duration,
+    ) {
+        if self.stream == Some(stream) {
+            let _ = quic.send_stream(stream).reset(VarInt::from_u32(CloseCode::Goodbye.code()));
+            self.stop(counters, done);
+        } else {
+            self.best_effort.handle_finished(stream, quic, counters, now);
+        }
+    }
+
+    fn set_timer(&mut self, due: Option<Duration>) {
+        if let Some(due) = due {
+            self.timer = Some(self.timer.map_or(due, |timer| timer.min(due)));
+        }
+    }
+
+    /// Resets best-effort samples whose time is over, and finishes a stream that has been idle.
+    pub(super) fn handle_timeout(
+        &mut self,
+        carrier: &mut Carrier<'_>,
+        counters: &Counters,
+        now: Duration,
+    ) {
+        self.timer = None;
+        self.best_effort.handle_timeout(carrier, counters, &self.topic, now);
+        self.set_timer(self.best_effort.poll_timeout());
+        let idle_at = self.active_at + STREAM_IDLE;
+        if self.stream.is_some() {
+            if now >= idle_at && self.queue.is_empty() && self.pending.is_empty() {
+                self.finish_stream(carrier);
+            } else {
+                self.set_timer(Some(idle_at.max(now + Duration::from_secs(1))));
+            }
+        }
+    }
+
+    /// The link is over and no other carries the flow. Returns the samples that were taken and did not leave.
+    pub(super) fn end(&mut self, counters: &Counters) -> u64 {
+        self.best_effort.link_over(counters, &self.topic);
+        let held = usize::from(self.held.take().is_some()) + self.merge.held();
+        self.rewind();
+        held as u64 + self.queue.waiting()
+    }
+}

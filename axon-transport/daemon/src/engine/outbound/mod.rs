@@ -1,0 +1,554 @@
+//! Samples to one peer: from the rings of local publishers into QUIC streams.
+//!
+//! Samples that wait, wait here, where QoS can act on them. QUIC holds at most twice the congestion window of bulk,
+//! so that the newest sample is soon the next. A pass costs the flows that have something to send, and no others.
+
+mod best_effort;
+pub(crate) mod budget;
+mod ending;
+mod flow;
+mod queue;
+mod schedule;
+mod source;
+mod stall;
+#[cfg(test)]
+mod tests;
+
+use std::{
+    collections::{BTreeSet, HashMap},
+    rc::Rc,
+    sync::Arc,
+    time::Duration,
+};
+
+use axon_envelope::Route;
+use axon_shm::{
+    ids::Gid,
+    qos::Qos,
+};
+use quinn_proto::StreamId;
+
+use self::{
+    budget::Budget,
+    ending::Endings,
+    flow::{Done, Flow, FlowRoute, Pause},
+    schedule::Schedule,
+    stall::Stalls,
+};
+pub(crate) use self::{schedule::{Class, FlowId}, source::Source};
+use super::connection::Carrier;
+use crate::{gateway::counters::Counters, link::ReceivedOf};
+
+/// A flow without a key looks again after this time, if nobody told it of one.
+const KEY_RETRY: Duration = Duration::from_millis(250);
+
+/// A route that the peer asked for.
+pub(crate) struct RouteOut {
+    /// The topic's name.
+    pub(crate) topic: Arc<str>,
+    /// Topic and kind, for the envelope.
+    pub(crate) route: Route,
+    /// Whether the peer acknowledges the samples.
+    pub(crate) acknowledged: bool,
+    /// Where its samples are taken.
+    pub(crate) sources: Vec<Source>,
+    /// The newest sample of each publisher that the peer has already.
+    pub(crate) seen: HashMap<Gid, u64>,
+}
+
+/// What the peer's owner has to know.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum OutboundEvent {
+    /// Nothing is left of a publisher that ended.
+    Drained(Gid),
+    /// Samples were given up.
+    Lost {
+        /// The topic.
+        topic: Arc<str>,
+        /// The cause, as status shows it.
+        cause: &'static str,
+        /// How many.
+        samples: u64,
+    },
+    /// The peer does not read what it asked for over this route.
+    Stalled(u32),
+}
+
+/// A route and its flows.
+struct Served {
+    shared: FlowRoute,
+    /// Its peer reads nothing, as its owner knows.
+    stalled: bool,
+    sources: Vec<Source>,
+    seen: HashMap<Gid, u64>,
+    flows: HashMap<Gid, FlowId>,
+}
+
+/// Bytes and samples that wait for one peer.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Backlog {
+    /// Bytes that wait for QUIC.
+    pub(crate) bytes: usize,
+    /// When the oldest sample that waits was taken from its ring.
+    pub(crate) oldest: Option<Duration>,
+}
+
+/// The samples to one peer.
+pub(crate) struct Outbound {
+    routes: HashMap<u32, Served>,
+    flows: Vec<Option<Flow>>,
+    free: Vec<FlowId>,
+    schedule: Schedule,
+    budget: Rc<Budget>,
+    /// What the budget had released when flows that found no room were tried last.
+    released: usize,
+    counters: Arc<Counters>,
+    timers: BTreeSet<(Duration, FlowId)>,
+    without_stream: Vec<FlowId>,
+    without_key: Vec<FlowId>,
+    key_retry: Option<Duration>,
+    /// Flows whose next sample found no room in the queue.
+    held: BTreeSet<FlowId>,
+    /// Streams of routes that ended, and whether they are reset.
+    ended: Vec<StreamId>,
+    endings: Endings,
+    stalls: Stalls,
+    events: Vec<OutboundEvent>,
+}
+
+impl Outbound {
+    /// Serves nothing yet.
+    pub(crate) fn new(
+        budget: Rc<Budget>,
+        counters: Arc<Counters>,
+        stalled_after: Duration,
+        now: Duration,
+    ) -> Self {
+        Self {
+            routes: HashMap::new(),
+            flows: Vec::new(),
+            free: Vec::new(),
+            schedule: Schedule::default(),
+            released: budget.released(),
+            budget,
+            counters,
+            timers: BTreeSet::new(),
+            without_stream: Vec::new(),
+            without_key: Vec::new(),
+            key_retry: None,
+            held: BTreeSet::new(),
+            ended: Vec::new(),
+            endings: Endings::default(),
+            stalls: Stalls::new(stalled_after, now),
+            events: Vec::new(),
+        }
+    }
+
+    /// Serves this route from now on, or changes it.
+    pub(crate) fn set_route(&mut self, number: u32, route: RouteOut, now: Duration) {
+        let RouteOut { topic, route, acknowledged, sources, seen } = route;
+        let shared = FlowRoute { number, topic, route, acknowledged };
+        let served = self.routes.entry(number).or_insert_with(|| Served {
+            shared,
+            stalled: false,
+            sources: Vec::new(),
+            seen: HashMap::new(),
+            flows: HashMap::new(),
+        });
+        served.sources = sources;
+        served.seen = seen;
+        let Served { sources, seen, flows, .. } = served;
+        let mut unread = Vec::new();
+        for (of, id) in flows.iter() {
+            let Some(flow) = &mut self.flows[*id] else { continue };
+            flow.set_sources(sources, seen.get(of).copied());
+            if flow.is_idle() && !sources.iter().any(|source| source.reads(of)) {
+                unread.push(*of);
+            }
+        }
+        for of in unread {
+            self.remove_flow(number, &of);
+        }
+        self.look_for_samples(number, now);
+    }
+
+    /// The peer no longer wants this route.
+    pub(crate) fn end_route(&mut self, number: u32) {
+        let Some(served) = self.routes.remove(&number) else { return };
+        for id in served.flows.into_values() {
+            self.forget_flow(id);
+        }
+    }
+
+    /// The peer does not read this route: as [`end_route`](Self::end_route), but the samples that are not
+    /// acknowledged are given up. Returns how many.
+    pub(crate) fn give_up_route(&mut self, number: u32) -> u64 {
+        let given_up = self.routes.get(&number).map_or(0, Served::give_up);
+        self.end_route(number);
+        given_up
+    }
+
+    /// A publisher ended: the samples that it left are sent, and then [`OutboundEvent::Drained`] comes.
+    pub(crate) fn handle_publisher_ended(&mut self, publisher: Gid, now: Duration) {
+        self.endings.add(publisher, now);
+    }
+
+    /// A ring rang: samples may wait in any of them.
+    pub(crate) fn handle_samples(&mut self, now: Duration) {
+        let numbers: Vec<u32> = self.routes.keys().copied().collect();
+        for number in numbers {
+            self.look_for_samples(number, now);
+        }
+    }
+
+    fn look_for_samples(&mut self, number: u32, now: Duration) {
+        let Some(served) = self.routes.get(&number) else { return };
+        let mut waiting: Vec<Gid> =
+            served.sources.iter().flat_map(Source::with_data).collect();
+        if served.sources.len() > 1 {
+            waiting.sort_unstable();
+            waiting.dedup();
+        }
+        for of in waiting {
+            let id = self.flow(number, of, now);
+            if let Some(id) = id {
+                if let Some(flow) = &mut self.flows[id] {
+                    flow.handle_samples();
+                }
+                self.schedule(id);
+            }
+        }
+    }
+
+    /// The flow of a publisher, or client, over a route.
+    fn flow(&mut self, number: u32, of: Gid, now: Duration) -> Option<FlowId> {
+        let served = self.routes.get_mut(&number)?;
+        if let Some(id) = served.flows.get(&of) {
+            return Some(*id);
+        }
+        let first = served.sources.iter().find(|source| source.reads(&of));
+        let qos = first.map_or_else(Qos::keep_all, Source::qos);
+        let mut flow = Flow::new(of, &served.shared, &qos, &self.budget, now);
+        flow.set_sources(&served.sources, served.seen.get(&of).copied());
+        let id = match self.free.pop() {
+            Some(id) => {
+                self.flows[id] = Some(flow);
+                id
+            }
+            None => {
+                self.flows.push(Some(flow));
+                self.flows.len() - 1
+            }
+        };
+        served.flows.insert(of, id);
+        Some(id)
+    }
+
+    fn schedule(&mut self, id: FlowId) {
+        if let Some(flow) = &mut self.flows[id]
+            && flow.scheduled.is_none()
+            && !flow.blocked
+            && let Some(class) = flow.class()
+        {
+            flow.scheduled = Some(class);
+            self.schedule.push(id, class);
+        }
+    }
+
+    fn remove_flow(&mut self, number: u32, of: &Gid) {
+        let removed = self.routes.get_mut(&number).and_then(|served| served.flows.remove(of));
+        if let Some(id) = removed {
+            self.forget_flow(id);
+        }
+    }
+
+    /// Forgets a flow. Its number is free again once no list has it.
+    fn forget_flow(&mut self, id: FlowId) {
+        let Some(mut flow) = self.flows[id].take() else { return };
+        self.ended.extend(flow.take_streams());
+        self.timers.remove(&(flow.timer.unwrap_or_default(), id));
+        self.without_stream.retain(|other| *other != id);
+        self.without_key.retain(|other| *other != id);
+        self.held.remove(&id);
+        if flow.scheduled.is_some() {
+            self.schedule.remove(id);
+        }
+        self.free.push(id);
+    }
+
+    /// Hands samples to QUIC until it takes no more, or none is left.
+    pub(crate) fn pump(&mut self, carrier: &mut Carrier<'_>, now: Duration) {
+        for stream in self.ended.drain(..) {
+            let _ = carrier.quic.send_stream(stream).finish();
+        }
+        self.retry_held();
+        let mut small_blocked = false;
+        while let Some((id, class)) = self.schedule.pop() {
+            let Some(flow) = &mut self.flows[id] else { continue };
+            let Some(served) = self.routes.get(&flow.route_number) else { continue };
+            flow.scheduled = None;
+            carrier.flow = id;
+            let before = flow.timer;
+            let mut done = Done::default();
+            let pause = flow.write(&served.sources, carrier, &self.counters, &mut done, now);
+            served.done(flow.of, done);
+            if flow.is_held() {
+                self.held.insert(id);
+            }
+            if flow.timer != before {
+                self.timers.remove(&(before.unwrap_or_default(), id));
+                self.timers.extend(flow.timer.map(|due| (due, id)));
+            }
+            match pause {
+                Pause::Turn => self.schedule(id),
+                Pause::Empty => {}
+                Pause::Blocked => {
+                    flow.blocked = true;
+                    small_blocked |= class != Class::Bulk;
+                }
+                Pause::NoStream => self.without_stream.push(id),
+                Pause::NoKey => {
+                    self.without_key.push(id);
+                    self.key_retry.get_or_insert(now + KEY_RETRY);
+                }
+            }
+        }
+        carrier.rest(small_blocked);
+    }
+
+    /// Tries the flows again that found no room, if there is more now.
+    fn retry_held(&mut self) {
+        let released = self.budget.released();
+        if self.held.is_empty() || released == std::mem::replace(&mut self.released, released) {
+            return;
+        }
+        for id in std::mem::take(&mut self.held) {
+            self.schedule(id);
+        }
+    }
+
+    /// QUIC takes more of this flow's stream.
+    pub(crate) fn handle_writable(&mut self, id: FlowId) {
+        if let Some(flow) = self.flows.get_mut(id).and_then(Option::as_mut) {
+            flow.blocked = false;
+            self.schedule(id);
+        }
+    }
+
+    /// The peer allows more streams.
+    pub(crate) fn handle_streams_available(&mut self) {
+        for id in std::mem::take(&mut self.without_stream) {
+            self.schedule(id);
+        }
+    }
+
+    /// There may be keys for messages.
+    pub(crate) fn handle_keys(&mut self) {
+        self.key_retry = None;
+        for id in std::mem::take(&mut self.without_key) {
+            self.schedule(id);
+        }
+    }
+
+    /// The peer's QUIC has all of a stream.
+    pub(crate) fn handle_finished(
+        &mut self,
+        id: FlowId,
+        stream: StreamId,
+        quic: &mut quinn_proto::Connection,
+        now: Duration,
+    ) {
+        if let Some(flow) = self.flows.get_mut(id).and_then(Option::as_mut) {
+            flow.handle_finished(stream, quic, &self.counters, now);
+            flow.blocked = false;
+            self.schedule(id);
+        }
+    }
+
+    /// The peer wants no more of a stream.
+    pub(crate) fn handle_stopped(
+        &mut self,
+        id: FlowId,
+        stream: StreamId,
+        quic: &mut quinn_proto::Connection,
+        now: Duration,
+    ) {
+        let Some(flow) = self.flows.get_mut(id).and_then(Option::as_mut) else { return };
+        let mut done = Done::default();
+        flow.handle_stopped(stream, quic, &self.counters, &mut done, now);
+        flow.blocked = false;
+        if let Some(served) = self.routes.get(&flow.route_number) {
+            served.done(flow.of, done);
+        }
+        self.schedule(id);
+    }
+
+    /// The peer acknowledges samples. Numbers that were not sent to it, and more drops than samples, are ignored.
+    pub(crate) fn handle_received(&mut self, flows: &[ReceivedOf], now: Duration) {
+        for ReceivedOf { route, publisher, sequence, dropped } in flows {
+            let Some(served) = self.routes.get(route) else { continue };
+            if !served.shared.acknowledged {
+                continue;
+            }
+            let Some(id) = served.flows.get(publisher).copied() else { continue };
+            let Some(flow) = &mut self.flows[id] else { continue };
+            if let Some(done) = flow.acknowledge(*sequence, *dropped, now) {
+                served.done(*publisher, done);
+                self.schedule(id);
+            }
+        }
+    }
+
+    /// A new link carries all flows. What the old link did not deliver is sent again.
+    pub(crate) fn succeed(&mut self, mut old: Option<&mut quinn_proto::Connection>) {
+        for id in 0..self.flows.len() {
+            if let Some(flow) = &mut self.flows[id] {
+                flow.succeed(old.as_deref_mut(), &self.counters);
+                self.schedule(id);
+            }
+        }
+        self.handle_streams_available();
+        self.handle_keys();
+    }
+
+    /// The link is over, and no other carries the flows: counts what did not arrive, and tells the publishers. Returns
+    /// the losses by topic.
+    pub(crate) fn link_over(&mut self) -> Vec<(Arc<str>, u64)> {
+        let mut losses = Vec::new();
+        for served in self.routes.values() {
+            let mut unsent = 0;
+            for (of, id) in &served.flows {
+                let Some(flow) = &mut self.flows[*id] else { continue };
+                let left = flow.end(&self.counters);
+                let source = served.sources.iter().find(|source| source.reads(of));
+                let reliable = source.is_some_and(|source| {
+                    source.qos().reliability == axon_shm::qos::Reliability::Reliable
+                });
+                // A RELIABLE sample of a topic counts until it is acknowledged.
+                if served.is_service() || !reliable {
+                    unsent += left;
+                }
+            }
+            let topic = &served.shared.topic;
+            let lost = if served.is_service() {
+                unsent
+            } else {
+                self.counters.lost(topic, "no_link", unsent);
+                served.give_up()
+            };
+            if lost > 0 {
+                self.counters.lost(topic, "link_ended", lost);
+                losses.push((Arc::clone(topic), lost));
+            }
+        }
+        losses
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) is due.
+    pub(crate) fn poll_timeout(&self) -> Option<Duration> {
+        let flow = self.timers.first().map(|(due, _)| *due);
+        let endings = self.endings.poll_timeout();
+        let stalls = (!self.routes.is_empty()).then(|| self.stalls.poll_timeout()).flatten();
+        [flow, endings, stalls, self.key_retry].into_iter().flatten().min()
+    }
+
+    /// Does what is due. `heard` counts the datagrams that came over the link.
+    pub(crate) fn handle_timeout(&mut self, carrier: &mut Carrier<'_>, heard: u64, now: Duration) {
+        while let Some((due, id)) = self.timers.first().copied()
+            && due <= now
+        {
+            self.timers.pop_first();
+            let Some(flow) = &mut self.flows[id] else { continue };
+            flow.handle_timeout(carrier, &self.counters, now);
+            let (of, number, timer, idle) =
+                (flow.of, flow.route_number, flow.timer, flow.is_idle());
+            match timer {
+                Some(due) => {
+                    self.timers.insert((due, id));
+                }
+                None if idle => self.remove_unread(number, &of),
+                None => {}
+            }
+            self.schedule_if_there(id);
+        }
+        if self.key_retry.is_some_and(|due| due <= now) {
+            self.handle_keys();
+        }
+        self.look_at_endings(now);
+        self.look_at_stalls(heard, now);
+    }
+
+    fn schedule_if_there(&mut self, id: FlowId) {
+        if self.flows[id].is_some() {
+            self.schedule(id);
+        }
+    }
+
+    /// Forgets an idle flow whose publisher is gone.
+    fn remove_unread(&mut self, number: u32, of: &Gid) {
+        let Some(served) = self.routes.get(&number) else { return };
+        if !served.sources.iter().any(|source| source.reads(of)) {
+            self.remove_flow(number, of);
+        }
+    }
+
+    /// The next event.
+    pub(crate) fn poll_event(&mut self) -> Option<OutboundEvent> {
+        if self.events.is_empty() { None } else { Some(self.events.remove(0)) }
+    }
+
+    /// What waits for the peer.
+    pub(crate) fn backlog(&self) -> Backlog {
+        let flows = self.flows.iter().flatten();
+        flows.fold(Backlog::default(), |all, flow| Backlog {
+            bytes: all.bytes + flow.waiting_bytes(),
+            oldest: [all.oldest, flow.oldest()].into_iter().flatten().min(),
+        })
+    }
+
+    /// Whether there is anything to hand to QUIC.
+    pub(crate) fn has_work(&self) -> bool {
+        !self.schedule.is_empty() || !self.ended.is_empty()
+    }
+}
+
+impl Served {
+    fn is_service(&self) -> bool {
+        self.shared.route.kind != axon_envelope::Kind::Topic
+    }
+
+    /// Tells the sources up to which number they may forget the samples of a publisher.
+    fn done(&self, of: Gid, Done { sequence, given_up }: Done) {
+        let Some(sequence) = sequence else { return };
+        let sources = self.sources.iter().filter(|source| source.reads(&of));
+        for (number, source) in sources.enumerate() {
+            if number == 0 && given_up > 0 {
+                source.give_up(of, given_up);
+            }
+            source.acknowledge_of(&of, sequence);
+        }
+    }
+
+    /// RELIABLE samples that are not acknowledged, by publisher.
+    fn unacknowledged(&self) -> HashMap<Gid, u64> {
+        let mut most = HashMap::new();
+        for (of, samples) in self.sources.iter().flat_map(Source::unacknowledged) {
+            let known: &mut u64 = most.entry(of).or_default();
+            *known = samples.max(*known);
+        }
+        most
+    }
+
+    /// Tells the publishers which samples will not reach the peer. Returns how many.
+    fn give_up(&self) -> u64 {
+        let mut all = 0;
+        for (of, samples) in self.unacknowledged() {
+            all += samples;
+            let source = self.sources.iter().find(|source| source.has_unacknowledged(&of));
+            if let Some(source) = source {
+                source.give_up(of, samples);
+            }
+        }
+        all
+    }
+}

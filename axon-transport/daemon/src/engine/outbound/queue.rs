@@ -1,0 +1,466 @@
+//! The queue of one flow: samples that wait to be sent, and samples that were sent and are not acknowledged.
+//!
+//! KEEP_LAST never blocks its publisher. A burst is lossless: a queue that was empty within the last 500 ms holds as
+//! many samples as its bytes allow. A queue that was not empty for that long is behind: it holds its depth, and drops
+//! the oldest. KEEP_ALL drops nothing: what does not fit stays in the ring, and in time holds the publisher back.
+
+use std::{collections::VecDeque, rc::Rc, time::Duration};
+
+use axon_envelope::Delivery;
+use axon_shm::qos::{History, Qos, Reliability};
+
+use super::budget::Budget;
+use crate::engine::rings::Sample;
+
+/// A flow that had samples waiting for this long is behind.
+const BURST: Duration = Duration::from_millis(500);
+
+/// What became of a sample that was offered.
+#[derive(Debug)]
+pub(super) enum Offered {
+    /// It waits. So many older samples were dropped for it.
+    Queued {
+        /// Samples dropped.
+        dropped: u64,
+    },
+    /// There is no room, and nothing may be dropped.
+    Full(Sample),
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Policy {
+    /// RELIABLE and KEEP_ALL.
+    KeepAll,
+    /// RELIABLE and KEEP_LAST, with its depth.
+    KeepLast(usize),
+    /// BEST_EFFORT, with its depth. Its bytes do not count against the budget.
+    BestEffort(usize),
+}
+
+impl Policy {
+    fn of(qos: &Qos) -> Self {
+        let depth = (qos.depth as usize).max(1);
+        match (qos.reliability, qos.history) {
+            (Reliability::Reliable, History::KeepAll) => Self::KeepAll,
+            (Reliability::Reliable, History::KeepLast) => Self::KeepLast(depth),
+            (Reliability::BestEffort, _) => Self::BestEffort(depth),
+        }
+    }
+
+    fn is_reliable(self) -> bool {
+        !matches!(self, Self::BestEffort(_))
+    }
+}
+
+/// The queue of one flow.
+#[derive(Debug)]
+pub(super) struct Queue {
+    policy: Policy,
+    budget: Rc<Budget>,
+    waiting: VecDeque<Sample>,
+    /// RELIABLE samples that were sent and are not acknowledged, oldest first.
+    sent: VecDeque<Sample>,
+    /// Bytes of all samples, waiting and sent.
+    bytes: usize,
+    sent_bytes: usize,
+    /// The highest number that was ever sent.
+    newest_sent: u64,
+    /// When the queue was last seen with nothing waiting.
+    empty_at: Duration,
+}
+
+impl Queue {
+    /// An empty queue. A RELIABLE sample keeps its place until it is acknowledged, or [written](Self::written).
+    pub(super) fn new(qos: &Qos, budget: Rc<Budget>, now: Duration) -> Self {
+        Self {
+            policy: Policy::of(qos),
+            budget,
+            waiting: VecDeque::new(),
+            sent: VecDeque::new(),
+            bytes: 0,
+            sent_bytes: 0,
+            newest_sent: 0,
+            empty_at: now,
+        }
+    }
+
+    /// Takes the QoS of another relay, since the peer's subscriptions changed.
+    pub(super) fn set_qos(&mut self, qos: &Qos) {
+        let before = self.policy.is_reliable();
+        self.policy = Policy::of(qos);
+        match (before, self.policy.is_reliable()) {
+            (false, true) => self.budget.overtake(self.bytes),
+            (true, false) => self.budget.release(self.bytes),
+            _ => {}
+        }
+    }
+
+    /// How the samples are delivered.
+    pub(super) fn delivery(&self) -> Delivery {
+        if self.policy.is_reliable() { Delivery::Reliable } else { Delivery::BestEffort }
+    }
+
+    /// Whether samples waited for so long that this is no burst.
+    pub(super) fn is_behind(&self, now: Duration) -> bool {
+        !self.waiting.is_empty() && now.saturating_sub(self.empty_at) >= BURST
+    }
+
+    /// Whether the engine should move samples from the ring into the queue now. A flow that is behind leaves them
+    /// in the ring, where newer samples replace them without a copy.
+    pub(super) fn wants_more(&self, now: Duration) -> bool {
+        match self.policy {
+            Policy::KeepLast(_) => !self.is_behind(now),
+            Policy::KeepAll | Policy::BestEffort(_) => true,
+        }
+    }
+
+    /// Adds a sample.
+    pub(super) fn offer(&mut self, sample: Sample, now: Duration) -> Offered {
+        if self.waiting.is_empty() {
+            self.empty_at = now;
+        }
+        let most = match self.policy {
+            Policy::KeepAll => usize::MAX,
+            Policy::KeepLast(depth) if self.is_behind(now) => depth,
+            Policy::KeepLast(_) => usize::MAX,
+            Policy::BestEffort(depth) => depth,
+        };
+        let mut dropped = 0;
+        while self.waiting.len() >= most || !self.takes(sample.size()) {
+            if self.policy == Policy::KeepAll {
+                return Offered::Full(sample);
+            }
+            dropped += u64::from(self.pop(now).is_some());
+        }
+        self.bytes += sample.size();
+        self.waiting.push_back(sample);
+        Offered::Queued { dropped }
+    }
+
+    /// Takes so many bytes of the budget. The only sample of a queue always fits.
+    fn takes(&self, size: usize) -> bool {
+        let fits = self.bytes + size <= self.budget.of_flow();
+        if !self.policy.is_reliable() {
+            return fits || self.waiting.is_empty();
+        }
+        if fits && self.budget.try_take(size) {
+            return true;
+        }
+        // KEEP_LAST: a sample that is being sent does not keep a newer one out.
+        let alone = self.waiting.is_empty()
+            && (self.sent.is_empty() || self.policy != Policy::KeepAll);
+        if alone {
+            self.budget.overtake(size);
+        }
+        alone
+    }
+
+    fn release(&self, size: usize) {
+        if self.policy.is_reliable() {
+            self.budget.release(size);
+        }
+    }
+
+    /// Removes the oldest waiting sample.
+    fn pop(&mut self, now: Duration) -> Option<Sample> {
+        let sample = self.waiting.pop_front()?;
+        self.bytes -= sample.size();
+        self.release(sample.size());
+        if self.waiting.is_empty() {
+            self.empty_at = now;
+        }
+        Some(sample)
+    }
+
+    /// The next sample to send.
+    pub(super) fn peek(&self) -> Option<&Sample> {
+        self.waiting.front()
+    }
+
+    /// The next RELIABLE sample to send. It stays in the queue until it is acknowledged or written; there is none
+    /// while such samples fill the flow's share.
+    pub(super) fn send(&mut self, now: Duration) -> Option<&Sample> {
+        let size = self.waiting.front()?.size();
+        if !self.sent.is_empty() && self.sent_bytes + size > self.budget.of_flow() {
+            return None;
+        }
+        let sample = self.waiting.pop_front()?;
+        if self.waiting.is_empty() {
+            self.empty_at = now;
+        }
+        self.newest_sent = self.newest_sent.max(sample.info.sequence);
+        self.sent_bytes += size;
+        self.sent.push_back(sample);
+        self.sent.back()
+    }
+
+    /// Takes back the sample that was sent last: it could not be sealed.
+    pub(super) fn take_back(&mut self) {
+        if let Some(sample) = self.sent.pop_back() {
+            self.sent_bytes -= sample.size();
+            self.waiting.push_front(sample);
+        }
+    }
+
+    /// Takes the next best-effort sample to send.
+    pub(super) fn pop_best_effort(&mut self, now: Duration) -> Option<Sample> {
+        self.pop(now)
+    }
+
+    /// The oldest samples that were sent, this many, are with QUIC, and the peer does not acknowledge them.
+    pub(super) fn written(&mut self, samples: usize) {
+        for _ in 0..samples {
+            self.pop_sent();
+        }
+    }
+
+    /// Drops waiting samples that would arrive too late: older than `life` once they have crossed the link, which
+    /// takes `transit`, or at the end of their lifespan. The newest sample is dropped for its lifespan alone.
+    pub(super) fn drop_late(&mut self, life: Duration, transit: Duration, now: Duration) -> u64 {
+        let mut dropped = 0;
+        while let Some(oldest) = self.waiting.front() {
+            let newest = self.waiting.len() == 1;
+            let transit = if newest { Duration::ZERO } else { transit };
+            let late = !newest && now.saturating_sub(oldest.taken) + transit > life;
+            let expired = oldest.lifespan_left(now).is_some_and(|left| left <= transit);
+            if !late && !expired {
+                break;
+            }
+            dropped += u64::from(self.pop(now).is_some());
+        }
+        dropped
+    }
+
+    /// The peer has the samples up to this number. Returns how many samples that were, and the newest of them. A
+    /// number that was never sent acknowledges nothing.
+    pub(super) fn acknowledge(&mut self, sequence: u64, now: Duration) -> (u64, Option<u64>) {
+        let most = sequence.min(self.newest_sent);
+        let is_taken = |sample: &&Sample| sample.info.sequence <= most;
+        let (mut samples, mut newest) = (0, None);
+        loop {
+            let taken = if self.sent.is_empty() {
+                // It was sent over a link that ended, and waits to be sent again.
+                self.waiting.front().filter(is_taken).is_some().then(|| self.pop(now)).flatten()
+            } else {
+                self.sent.front().filter(is_taken).is_some().then(|| self.pop_sent()).flatten()
+            };
+            let Some(sample) = taken else { return (samples, newest) };
+            (samples, newest) = (samples + 1, Some(sample.info.sequence));
+        }
+    }
+
+    fn pop_sent(&mut self) -> Option<Sample> {
+        let sample = self.sent.pop_front()?;
+        self.sent_bytes -= sample.size();
+        self.bytes -= sample.size();
+        self.release(sample.size());
+        Some(sample)
+    }
+
+    /// Removes all samples that were sent and are not acknowledged. Returns how many, and the highest number.
+    pub(super) fn give_up_sent(&mut self) -> (u64, Option<u64>) {
+        let (mut samples, mut newest) = (0, None);
+        while let Some(sample) = self.pop_sent() {
+            (samples, newest) = (samples + 1, newest.max(Some(sample.info.sequence)));
+        }
+        (samples, newest)
+    }
+
+    /// The link ended: samples that are not acknowledged are sent again, before all others.
+    pub(super) fn rewind(&mut self) {
+        while let Some(sample) = self.sent.pop_back() {
+            self.waiting.push_front(sample);
+        }
+        self.sent_bytes = 0;
+    }
+
+    /// Samples that wait to be sent.
+    pub(super) fn waiting(&self) -> u64 {
+        self.waiting.len() as u64
+    }
+
+    /// Bytes that wait to be sent.
+    pub(super) fn waiting_bytes(&self) -> usize {
+        self.bytes - self.sent_bytes
+    }
+
+    /// When the oldest waiting sample was taken from its ring.
+    pub(super) fn oldest(&self) -> Option<Duration> {
+        self.waiting.front().map(|sample| sample.taken)
+    }
+
+    /// Whether samples are sent and not acknowledged.
+    pub(super) fn has_sent(&self) -> bool {
+        !self.sent.is_empty()
+    }
+
+    /// Whether it holds no sample at all.
+    pub(super) fn is_empty(&self) -> bool {
+        self.waiting.is_empty() && self.sent.is_empty()
+    }
+}
+
+impl Drop for Queue {
+    fn drop(&mut self) {
+        self.release(self.bytes);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use axon_shm::ids::Gid;
+    use axon_transport::MessageInfo;
+
+    use super::*;
+
+    const MIB: u64 = 1 << 20;
+
+    fn at(millis: u64) -> Duration {
+        Duration::from_millis(millis)
+    }
+
+    fn sample(sequence: u64, length: usize, now: Duration) -> Sample {
+        Sample::new(MessageInfo::of(Gid([1; 16]), sequence), vec![0; length], now)
+    }
+
+    fn keep_last(depth: u32) -> Qos {
+        Qos { depth, ..Qos::default() }
+    }
+
+    fn dropped(offered: Offered) -> u64 {
+        match offered {
+            Offered::Queued { dropped } => dropped,
+            Offered::Full(_) => panic!("full"),
+        }
+    }
+
+    fn numbers(queue: &mut Queue, now: Duration) -> Vec<u64> {
+        std::iter::from_fn(|| queue.send(now).map(|sample| sample.info.sequence)).collect()
+    }
+
+    #[test]
+    fn a_burst_of_keep_last_is_lossless_within_its_bytes() {
+        let budget = Budget::new(256 * MIB);
+        let mut queue = Queue::new(&keep_last(1), budget.of_peer(), at(0));
+        for sequence in 1..=1000 {
+            assert_eq!(dropped(queue.offer(sample(sequence, 100, at(0)), at(0))), 0);
+        }
+        assert_eq!(numbers(&mut queue, at(1)).len(), 1000);
+    }
+
+    #[test]
+    fn keep_last_that_is_behind_holds_its_depth_and_the_newest() {
+        let budget = Budget::new(256 * MIB);
+        let mut queue = Queue::new(&keep_last(2), budget.of_peer(), at(0));
+        for sequence in 1..=10 {
+            dropped(queue.offer(sample(sequence, 100, at(0)), at(0)));
+        }
+        assert!(queue.wants_more(at(499)) && !queue.wants_more(at(500)));
+        assert_eq!(dropped(queue.offer(sample(11, 100, at(600)), at(600))), 9);
+        assert_eq!(numbers(&mut queue, at(700)), [10, 11]);
+        // Empty again: the next samples are a burst.
+        assert!(queue.wants_more(at(1500)));
+        for sequence in 12..=20 {
+            assert_eq!(dropped(queue.offer(sample(sequence, 100, at(1500)), at(1500))), 0);
+        }
+    }
+
+    #[test]
+    fn keep_all_refuses_beyond_its_bytes_and_takes_one_sample_of_any_length() {
+        let budget = Budget::new(32 * MIB);
+        let mut queue = Queue::new(&Qos::keep_all(), budget.of_peer(), at(0));
+        assert_eq!(dropped(queue.offer(sample(1, 3 << 20, at(0)), at(0))), 0);
+        assert!(matches!(queue.offer(sample(2, 1, at(0)), at(0)), Offered::Full(s) if s.info.sequence == 2));
+        assert_eq!(queue.send(at(1)).unwrap().info.sequence, 1);
+        assert!(matches!(queue.offer(sample(2, 1, at(1)), at(1)), Offered::Full(_)), "not acknowledged");
+        assert_eq!(queue.acknowledge(1, at(2)), (1, Some(1)));
+        assert_eq!(dropped(queue.offer(sample(2, 1, at(2)), at(2))), 0);
+        drop(queue);
+        assert_eq!(budget.taken(), 0);
+    }
+
+    #[test]
+    fn keep_last_sends_the_newest_while_a_long_one_is_not_acknowledged() {
+        let budget = Budget::new(32 * MIB);
+        let mut queue = Queue::new(&keep_last(1), budget.of_peer(), at(0));
+        dropped(queue.offer(sample(1, 3 << 20, at(0)), at(0)));
+        queue.send(at(0)).unwrap();
+        for sequence in 2..=9 {
+            dropped(queue.offer(sample(sequence, 3 << 20, at(sequence)), at(sequence)));
+        }
+        assert_eq!(queue.waiting(), 1);
+        assert_eq!(queue.acknowledge(1, at(10)), (1, Some(1)));
+        assert_eq!(numbers(&mut queue, at(11)), [9]);
+    }
+
+    #[test]
+    fn numbers_that_were_not_sent_acknowledge_nothing() {
+        let budget = Budget::new(256 * MIB);
+        let mut queue = Queue::new(&Qos::keep_all(), budget.of_peer(), at(0));
+        for sequence in 1..=3 {
+            dropped(queue.offer(sample(sequence, 1, at(0)), at(0)));
+        }
+        assert_eq!(queue.acknowledge(u64::MAX, at(0)), (0, None));
+        queue.send(at(0)).unwrap();
+        assert_eq!(queue.acknowledge(u64::MAX, at(0)), (1, Some(1)));
+        assert_eq!(numbers(&mut queue, at(0)), [2, 3]);
+    }
+
+    #[test]
+    fn a_link_that_ended_has_its_samples_sent_again_in_order() {
+        let budget = Budget::new(256 * MIB);
+        let mut queue = Queue::new(&Qos::keep_all(), budget.of_peer(), at(0));
+        for sequence in 1..=4 {
+            dropped(queue.offer(sample(sequence, 1, at(0)), at(0)));
+        }
+        queue.send(at(0)).unwrap();
+        queue.send(at(0)).unwrap();
+        queue.rewind();
+        // The acknowledgement of the old link came after it ended.
+        assert_eq!(queue.acknowledge(1, at(1)), (1, Some(1)));
+        assert_eq!(numbers(&mut queue, at(1)), [2, 3, 4]);
+        assert!(queue.has_sent() && !queue.is_empty());
+    }
+
+    #[test]
+    fn best_effort_keeps_its_depth_and_drops_what_would_be_late() {
+        let budget = Budget::new(256 * MIB);
+        let qos = Qos { depth: 3, ..Qos::sensor_data() };
+        let mut queue = Queue::new(&qos, budget.of_peer(), at(0));
+        for sequence in 1..=5 {
+            dropped(queue.offer(sample(sequence, 1, at(10 * sequence)), at(10 * sequence)));
+        }
+        assert_eq!(queue.waiting(), 3);
+        assert_eq!(budget.taken(), 0, "best effort takes no other's room");
+        assert_eq!(queue.drop_late(at(200), at(100), at(145)), 2);
+        assert_eq!(queue.drop_late(at(200), at(100), at(9000)), 0, "the newest is sent however old");
+        let last = queue.pop_best_effort(at(9000)).unwrap();
+        assert_eq!((last.info.sequence, queue.is_empty()), (5, true));
+    }
+
+    #[test]
+    fn responses_leave_in_the_order_of_the_calls_that_were_answered() {
+        let budget = Budget::new(256 * MIB);
+        let mut queue = Queue::new(&Qos::keep_all(), budget.of_peer(), at(0));
+        for sequence in [5, 3, 4] {
+            dropped(queue.offer(sample(sequence, 1, at(0)), at(0)));
+        }
+        assert_eq!(numbers(&mut queue, at(0)), [5, 3, 4]);
+        queue.written(1);
+        queue.rewind();
+        assert_eq!(numbers(&mut queue, at(0)), [3, 4], "response 5 is with QUIC, the others are not");
+    }
+
+    #[test]
+    fn another_delivery_moves_the_bytes_of_the_budget() {
+        let budget = Budget::new(256 * MIB);
+        let mut queue = Queue::new(&Qos::sensor_data(), budget.of_peer(), at(0));
+        dropped(queue.offer(sample(1, 100, at(0)), at(0)));
+        queue.set_qos(&Qos::keep_all());
+        assert!(budget.taken() > 100);
+        queue.set_qos(&Qos::sensor_data());
+        assert_eq!(budget.taken(), 0);
+        drop(queue);
+        assert_eq!(budget.taken(), 0);
+    }
+}

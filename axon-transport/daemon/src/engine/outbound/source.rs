@@ -1,0 +1,116 @@
+//! Where the samples of a route are taken.
+
+use std::{collections::HashMap, rc::Rc, time::Duration};
+
+use axon_shm::{
+    ids::Gid,
+    qos::{Qos, Reliability},
+};
+
+use crate::{
+    engine::{rings::{RingReader, Sample}, stand_in::StandIn},
+    gateway::routes::RelaySpec,
+};
+
+/// A source of samples.
+#[derive(Clone)]
+pub(crate) enum Source {
+    /// Reads the local publishers of a topic.
+    Relay(RelaySpec, Rc<dyn RingReader>),
+    /// Reads what local endpoints of a service send to the peer's client or server.
+    StandIn(Rc<StandIn>),
+}
+
+impl Source {
+    /// The publishers, or clients, that have samples to take.
+    pub(super) fn with_data(&self) -> Vec<Gid> {
+        match self {
+            Self::Relay(_, reader) => reader.with_data(),
+            Self::StandIn(stand_in) => stand_in.ring().with_calls(),
+        }
+    }
+
+    /// Whether it reads this publisher or client.
+    pub(super) fn reads(&self, of: &Gid) -> bool {
+        match self {
+            Self::Relay(_, reader) => reader.reads(of),
+            Self::StandIn(stand_in) => stand_in.ring().reads_calls_of(of),
+        }
+    }
+
+    /// The reader's own GID.
+    pub(super) fn gid(&self) -> Gid {
+        match self {
+            Self::Relay(_, reader) => reader.gid(),
+            Self::StandIn(stand_in) => stand_in.gid(),
+        }
+    }
+
+    /// Takes the next sample of a publisher or client.
+    pub(super) fn take_of(&self, of: &Gid, now: Duration) -> Option<Sample> {
+        match self {
+            Self::Relay(_, reader) => {
+                let (info, payload) = reader.take_of(of)?;
+                Some(Sample::new(info, payload, now))
+            }
+            Self::StandIn(stand_in) => {
+                let (info, payload) = stand_in.ring().take_call_of(of)?;
+                Some(Sample { client: Some(*of), ..Sample::new(info, payload, now) })
+            }
+        }
+    }
+
+    /// How its samples are queued. No request or response is dropped.
+    pub(super) fn qos(&self) -> Qos {
+        match self {
+            Self::Relay(spec, _) => spec.queued(),
+            Self::StandIn(_) => Qos::keep_all(),
+        }
+    }
+
+    /// The samples of this publisher up to this number reached the peer, or never will.
+    pub(super) fn acknowledge_of(&self, of: &Gid, sequence: u64) {
+        if let Self::Relay(_, reader) = self {
+            reader.acknowledge_of(of, sequence);
+        }
+    }
+
+    /// RELIABLE samples that are not acknowledged, by publisher.
+    pub(super) fn unacknowledged(&self) -> HashMap<Gid, u64> {
+        match self {
+            Self::Relay(spec, reader) if spec.qos.reliability == Reliability::Reliable => {
+                reader.unacknowledged()
+            }
+            _ => HashMap::new(),
+        }
+    }
+
+    /// Whether it has such samples of this publisher.
+    pub(crate) fn has_unacknowledged(&self, of: &Gid) -> bool {
+        self.reads(of) && self.unacknowledged().contains_key(of)
+    }
+
+    /// So many samples of a publisher will never reach the peer.
+    pub(super) fn give_up(&self, of: Gid, samples: u64) {
+        if let Self::Relay(_, reader) = self {
+            reader.give_up(of, samples);
+        }
+    }
+
+    /// The publishers, or the local endpoints of a service, that it reads.
+    pub(crate) fn writers(&self) -> Vec<Gid> {
+        match self {
+            Self::Relay(_, reader) => reader.matched(),
+            Self::StandIn(stand_in) => stand_in.ring().partners(),
+        }
+    }
+
+    /// Whether it is the same source as `other`.
+    pub(crate) fn is(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::Relay(_, one), Self::Relay(_, other)) => Rc::ptr_eq(one, other),
+            (Self::StandIn(one), Self::StandIn(other)) => Rc::ptr_eq(one, other),
+            _ => false,
+        }
+    }
+}

@@ -1,0 +1,187 @@
+//! How a message stands in a data stream: behind its length, in `messages10` sealed as an AXQKD001 envelope.
+
+use std::{borrow::Cow, time::Duration};
+
+use axon_envelope::{Delivery, Kind, Route, inner};
+use axon_shm::ids::Gid;
+
+use super::rings::Sample;
+use crate::{
+    gateway::{frames::Frames, protection::RefusedMessage},
+    keys::{NoKey, Receiver, Sender},
+};
+use axon_transport::internal::session::unix_nanos;
+
+/// Bytes of the length before each message.
+const LENGTH: usize = 4;
+
+/// Protects the messages that leave over one connection.
+pub(crate) enum Seal<'a> {
+    /// TLS alone protects them.
+    Link,
+    /// Each message is sealed under a KME key.
+    Envelope {
+        /// The keys towards the peer.
+        sender: &'a mut Sender,
+        /// The connection.
+        connection: u64,
+    },
+}
+
+impl Seal<'_> {
+    /// The sender will need keys for so many messages more.
+    pub(crate) fn demand(&mut self, messages: u32, now: Duration) {
+        if let Self::Envelope { sender, .. } = self {
+            sender.demand(now, messages);
+        }
+    }
+
+    /// Adds a message to `frames`.
+    ///
+    /// # Errors
+    /// There is no key for it. Nothing is added then.
+    pub(crate) fn write(
+        &mut self,
+        sample: &Sample,
+        route: Route,
+        delivery: Delivery,
+        frames: &mut Frames,
+        now: Duration,
+    ) -> Result<(), NoKey> {
+        let header = header(sample, now).encode();
+        let plain = header.len() + sample.payload.len();
+        match self {
+            Self::Link => {
+                frames.copy(&(plain as u32).to_be_bytes());
+                frames.copy(&header);
+                frames.share(&sample.payload);
+                Ok(())
+            }
+            Self::Envelope { sender, connection } => {
+                if sender.attached() != Some(*connection) {
+                    return Err(NoKey::Detached);
+                }
+                let most = LENGTH + sender.overhead() + plain;
+                let slot = sender.slot(now, delivery)?;
+                let parts: [&[u8]; 2] = [&header, &sample.payload];
+                frames.fill(most, |frame| {
+                    let sealed = slot.seal_into(route, &parts, &mut frame[LENGTH..]);
+                    let length = sealed.map_err(|_| NoKey::None)?;
+                    frame[..LENGTH].copy_from_slice(&(length as u32).to_be_bytes());
+                    Ok(LENGTH + length)
+                })
+            }
+        }
+    }
+}
+
+/// The header of a message.
+fn header(sample: &Sample, now: Duration) -> inner::Header {
+    let age = sample.age(now).as_millis();
+    let request_id = sample.client.map_or_else(inner::RequestId::default, |client| {
+        inner::RequestId { client: client.0, sequence: number(sample.info.sequence) }
+    });
+    inner::Header {
+        gid: sample.info.publisher.0,
+        sequence: sample.info.sequence,
+        source_timestamp: unix_nanos(sample.info.source_timestamp),
+        request_id,
+        compressed: false,
+        age_ms: u32::try_from(age).unwrap_or(u32::MAX),
+        uncompressed_len: u32::try_from(sample.payload.len()).unwrap_or(u32::MAX),
+    }
+}
+
+/// The number of a call, which is signed in ROS 2.
+fn number(sequence: u64) -> i64 {
+    i64::try_from(sequence).unwrap_or(i64::MAX)
+}
+
+/// Opens the messages that arrive over one connection.
+pub(crate) enum Open<'a> {
+    /// TLS alone protects them.
+    Link,
+    /// Each message is an envelope.
+    Envelope {
+        /// The keys of the peer.
+        receiver: &'a mut Receiver,
+        /// The connection.
+        connection: u64,
+    },
+}
+
+/// A message that was opened.
+pub(crate) struct Opened<'a> {
+    /// Its header.
+    pub(crate) header: inner::Header,
+    sent: &'a [u8],
+}
+
+impl<'a> Opened<'a> {
+    /// A message without an envelope.
+    ///
+    /// # Errors
+    /// The peer broke the format.
+    pub(crate) fn plain(body: &'a [u8]) -> Result<Self, RefusedMessage> {
+        let (header, sent) =
+            inner::Header::decode(body).map_err(|e| RefusedMessage::Malformed(e.to_string()))?;
+        Ok(Self { header, sent })
+    }
+
+    /// The payload, decompressed to at most `most` bytes.
+    ///
+    /// # Errors
+    /// The peer broke the format.
+    pub(crate) fn payload(&self, most: u64) -> Result<Cow<'a, [u8]>, RefusedMessage> {
+        if !self.header.compressed {
+            return Ok(self.sent.into());
+        }
+        let length = u64::from(self.header.uncompressed_len);
+        if length > most {
+            let text = format!("{length} bytes when decompressed, at most {most} allowed");
+            return Err(RefusedMessage::Malformed(text));
+        }
+        let payload = zstd::bulk::decompress(self.sent, length as usize)
+            .ok()
+            .filter(|p| p.len() as u64 == length)
+            .ok_or_else(|| RefusedMessage::Malformed("not one zstd frame as declared".into()))?;
+        Ok(payload.into())
+    }
+}
+
+impl Open<'_> {
+    /// Opens a message in place. `None`: the connection has no keys any more.
+    ///
+    /// # Errors
+    /// The peer broke the format, or the envelope is refused.
+    pub(crate) fn open<'a>(
+        &mut self,
+        body: &'a mut [u8],
+        route: Route,
+        now: Duration,
+    ) -> Result<Option<Opened<'a>>, RefusedMessage> {
+        let Self::Envelope { receiver, connection } = self else {
+            return Opened::plain(body).map(Some);
+        };
+        let Some(opener) = receiver.opener(*connection) else { return Ok(None) };
+        match opener.open_in_place(now, route, body) {
+            Ok(plain) => Opened::plain(plain).map(Some),
+            Err(error) => Err(RefusedMessage::of_envelope(&error)),
+        }
+    }
+}
+
+/// The writer of a message on the stream of publisher, or client, `of`.
+///
+/// # Errors
+/// The message names another writer or call than its stream.
+pub(crate) fn writer_of(kind: Kind, of: Gid, header: &inner::Header) -> Result<Gid, &'static str> {
+    let writer = Gid(header.gid);
+    let call = inner::RequestId { client: of.0, sequence: number(header.sequence) };
+    let fits = match kind {
+        Kind::Topic => writer == of && header.request_id == inner::RequestId::default(),
+        Kind::Request => writer == of && header.request_id == call,
+        Kind::Response => header.request_id == call,
+    };
+    if fits { Ok(writer) } else { Err("a message names another publisher or call than its stream") }
+}

@@ -1,0 +1,121 @@
+//! The rings of this host, as the engine uses them: relay readers of local publishers, and stand-ins that write for
+//! remote ones. In the daemon they are shared memory; the simulator has models of them.
+
+use std::{collections::HashMap, rc::Rc, time::Duration};
+
+use axon_shm::{Meta, ids::Gid};
+use axon_transport::{EndpointSpec, MessageInfo, graph::Endpoint, internal::session::Written};
+use bytes::Bytes;
+
+/// Opens readers and writers.
+pub(crate) trait Rings {
+    /// Opens a relay: a subscription that reads for subscriptions of a peer, which it `stands_for`.
+    ///
+    /// # Errors
+    /// Why there is none, for the log.
+    fn open_reader(
+        &self,
+        spec: EndpointSpec,
+        stands_for: Vec<Gid>,
+    ) -> Result<Rc<dyn RingReader>, String>;
+
+    /// Opens a stand-in for a remote publisher, client or server, under its GID.
+    ///
+    /// # Errors
+    /// Why there is none, for the log.
+    fn open_writer(&self, remote: &Endpoint) -> Result<Rc<dyn RingWriter>, String>;
+
+    /// Says whether the engine waits for room in a ring: while it does, a reader that makes room wakes it.
+    fn set_waiting_for_room(&self, waiting: bool);
+}
+
+/// A relay subscription: it reads the rings of all local publishers of a topic.
+pub(crate) trait RingReader {
+    /// The relay's own GID.
+    fn gid(&self) -> Gid;
+    /// The publishers that have samples to take.
+    fn with_data(&self) -> Vec<Gid>;
+    /// Whether it reads this publisher.
+    fn reads(&self, publisher: &Gid) -> bool;
+    /// The publishers that it reads.
+    fn matched(&self) -> Vec<Gid>;
+    /// Takes the next sample of a publisher.
+    fn take_of(&self, publisher: &Gid) -> Option<(MessageInfo, Vec<u8>)>;
+    /// The peer has the samples of this publisher up to this number, or will never have them.
+    fn acknowledge_of(&self, publisher: &Gid, sequence: u64);
+    /// How many samples of each publisher are not acknowledged.
+    fn unacknowledged(&self) -> HashMap<Gid, u64>;
+    /// So many samples of this publisher will never reach the peer.
+    fn give_up(&self, publisher: Gid, samples: u64);
+    /// How often each publisher asserted its liveliness.
+    fn assertions(&self) -> Vec<(Gid, u64)>;
+    /// The peer's subscriptions that it reads for from now on.
+    fn set_stands_for(&self, gids: Vec<Gid>);
+}
+
+/// Why a sample was not written to a ring.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum RingError {
+    /// A KEEP_ALL reader has no room: try again when a reader made some.
+    Full,
+    /// The sample is lost; the text says why.
+    Lost(String),
+}
+
+/// A stand-in for a remote publisher, client or server. That of a client or server also reads: the responses or the
+/// requests that go to it.
+pub(crate) trait RingWriter {
+    /// The remote endpoint.
+    fn endpoint(&self) -> &Endpoint;
+    /// The local endpoints that it reaches.
+    fn partners(&self) -> Vec<Gid>;
+    /// Writes a sample; `client` is the client that a response answers.
+    ///
+    /// # Errors
+    /// The ring is full, or the sample is lost.
+    fn try_write(&self, client: &Gid, meta: Meta, payload: &[u8]) -> Result<Written, RingError>;
+    /// The remote publisher asserted its liveliness.
+    fn assert_alive(&self);
+    /// The clients whose calls, or responses, wait to be taken.
+    fn with_calls(&self) -> Vec<Gid>;
+    /// Whether it reads the calls, or responses, of this client.
+    fn reads_calls_of(&self, client: &Gid) -> bool;
+    /// Takes the next call, or response, of this client.
+    fn take_call_of(&self, client: &Gid) -> Option<(MessageInfo, Vec<u8>)>;
+}
+
+/// A sample on its way to a peer.
+#[derive(Clone, Debug)]
+pub(crate) struct Sample {
+    /// Its publisher, number and times.
+    pub(crate) info: MessageInfo,
+    /// The client that a request comes from, or a response answers.
+    pub(crate) client: Option<Gid>,
+    /// The serialized message.
+    pub(crate) payload: Bytes,
+    /// When the engine took it from its ring.
+    pub(crate) taken: Duration,
+}
+
+impl Sample {
+    /// A sample of a topic.
+    pub(crate) fn new(info: MessageInfo, payload: Vec<u8>, now: Duration) -> Self {
+        Self { info, client: None, payload: payload.into(), taken: now }
+    }
+
+    /// Time since it was published, as far as this host knows.
+    pub(crate) fn age(&self, now: Duration) -> Duration {
+        let before = self.info.lifetime.map_or(Duration::ZERO, |lifetime| lifetime.age);
+        before.saturating_add(now.saturating_sub(self.taken))
+    }
+
+    /// What is left of its lifespan; `None` if that is infinite.
+    pub(crate) fn lifespan_left(&self, now: Duration) -> Option<Duration> {
+        Some(self.info.lifetime?.lifespan.saturating_sub(self.age(now)))
+    }
+
+    /// The memory that a queue counts for it, in bytes.
+    pub(crate) fn size(&self) -> usize {
+        self.payload.len() + size_of::<Self>()
+    }
+}

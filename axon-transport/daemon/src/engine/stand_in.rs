@@ -1,0 +1,111 @@
+//! Stand-ins: local writers for remote publishers, clients and servers.
+
+use std::{
+    cell::{Cell, RefCell},
+    collections::HashMap,
+    fmt,
+    rc::{Rc, Weak},
+};
+
+use axon_shm::{Meta, ids::Gid};
+use axon_transport::{
+    graph::{Endpoint, EndpointKind},
+    internal::session::Written,
+};
+
+use super::rings::{RingError, RingWriter, Rings};
+use crate::gateway::account::{Account, Charge};
+
+/// A stand-in. A link and its successor share it.
+pub(crate) struct StandIn {
+    ring: Rc<dyn RingWriter>,
+    gid: Gid,
+    is_publisher: bool,
+    /// The highest number that was written; 0 is none.
+    last: Cell<u64>,
+    _place: Charge,
+}
+
+impl StandIn {
+    /// The remote endpoint's GID.
+    pub(crate) fn gid(&self) -> Gid {
+        self.gid
+    }
+
+    /// Its ring.
+    pub(crate) fn ring(&self) -> &dyn RingWriter {
+        &*self.ring
+    }
+
+    /// Writes a sample.
+    ///
+    /// # Errors
+    /// The ring is full, or the sample is lost.
+    pub(crate) fn try_write(
+        &self,
+        client: &Gid,
+        meta: Meta,
+        payload: &[u8],
+    ) -> Result<Written, RingError> {
+        let sequence = meta.sequence;
+        let written = self.ring.try_write(client, meta, payload)?;
+        self.last.set(sequence);
+        Ok(written)
+    }
+
+    /// The number of the newest sample of a publisher that is in the ring.
+    pub(crate) fn last_sequence(&self) -> Option<u64> {
+        Some(self.last.get()).filter(|last| self.is_publisher && *last > 0)
+    }
+}
+
+impl fmt::Debug for StandIn {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("StandIn").field(&self.gid).finish()
+    }
+}
+
+/// Why there is no stand-in for an endpoint.
+#[derive(Debug)]
+pub(crate) enum NoStandIn {
+    /// The identity that announced it has as many as it may.
+    TooMany,
+    /// The text says why.
+    Failed(String),
+}
+
+/// All stand-ins of this host.
+#[derive(Default)]
+pub(crate) struct StandIns(RefCell<HashMap<Gid, Weak<StandIn>>>);
+
+impl StandIns {
+    /// The stand-in for `remote`: the one that exists, or a new one that `account` pays for.
+    ///
+    /// # Errors
+    /// [`NoStandIn`].
+    pub(crate) fn get(
+        &self,
+        rings: &dyn Rings,
+        remote: &Endpoint,
+        account: &Account,
+    ) -> Result<Rc<StandIn>, NoStandIn> {
+        let mut known = self.0.borrow_mut();
+        if let Some(stand_in) = known.get(&remote.gid).and_then(Weak::upgrade) {
+            if stand_in.ring.endpoint() == remote {
+                return Ok(stand_in);
+            }
+            return Err(NoStandIn::Failed(format!("{} stands for another endpoint", remote.gid)));
+        }
+        let Some(place) = account.stand_ins.charge(1) else { return Err(NoStandIn::TooMany) };
+        let stand_in = Rc::new(StandIn {
+            ring: rings.open_writer(remote).map_err(NoStandIn::Failed)?,
+            gid: remote.gid,
+            is_publisher: remote.kind == EndpointKind::Publisher,
+            last: Cell::new(0),
+            _place: place,
+        });
+        known.retain(|_, other| other.strong_count() > 0);
+        known.insert(remote.gid, Rc::downgrade(&stand_in));
+        Ok(stand_in)
+    }
+}
