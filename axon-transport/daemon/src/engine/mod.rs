@@ -6,6 +6,7 @@ pub(crate) mod connection;
 pub(crate) mod control;
 pub(crate) mod inbound;
 pub(crate) mod outbound;
+pub(crate) mod peer;
 pub(crate) mod protection;
 pub(crate) mod rings;
 pub(crate) mod stand_in;

@@ -1,0 +1,189 @@
+//! The QUIC endpoints of this host, one for each address that it is bound to.
+
+use std::{
+    collections::VecDeque,
+    net::{IpAddr, SocketAddr},
+    sync::Arc,
+    time::Instant,
+};
+
+use bytes::BytesMut;
+use quinn_proto::{
+    ClientConfig, ConnectError, Connection, ConnectionEvent, ConnectionHandle, DatagramEvent,
+    EcnCodepoint, Endpoint, EndpointConfig, EndpointEvent, Incoming, ServerConfig, Transmit,
+};
+
+/// A packet of an endpoint, not of a connection.
+pub(super) struct Packet {
+    /// The endpoint that sends it.
+    pub(super) endpoint: usize,
+    /// Where it goes.
+    pub(super) to: SocketAddr,
+    /// The local address, if it matters.
+    pub(super) from: Option<IpAddr>,
+    pub(super) ecn: Option<EcnCodepoint>,
+    pub(super) bytes: Vec<u8>,
+}
+
+/// A datagram that was handed to an endpoint.
+pub(super) enum Received {
+    /// It is of this connection.
+    Connection(ConnectionHandle, ConnectionEvent),
+    /// It begins a connection.
+    Incoming(Incoming),
+    /// Nothing is left to do.
+    Done,
+}
+
+/// The endpoints.
+pub(super) struct Endpoints {
+    all: Vec<(SocketAddr, Endpoint)>,
+    packets: VecDeque<Packet>,
+}
+
+/// Packets of endpoints that wait at most; more are dropped, as a full socket drops them.
+const MAX_PACKETS: usize = 1024;
+
+impl Endpoints {
+    /// Endpoints at these local addresses. `server` gives the answer to packets of unknown connections; each
+    /// connection has settings of its own.
+    pub(super) fn new(
+        addresses: &[SocketAddr],
+        config: &Arc<EndpointConfig>,
+        server: &Arc<ServerConfig>,
+    ) -> Self {
+        let endpoint = |address: &SocketAddr| {
+            let server = Some(Arc::clone(server));
+            (*address, Endpoint::new(Arc::clone(config), server, true, None))
+        };
+        Self { all: addresses.iter().map(endpoint).collect(), packets: VecDeque::new() }
+    }
+
+    /// The endpoint that reaches an address.
+    pub(super) fn towards(&self, to: SocketAddr) -> Option<usize> {
+        let family = |a: &SocketAddr| a.is_ipv4() == to.is_ipv4();
+        let local = |a: &SocketAddr| a.ip().is_loopback() == to.ip().is_loopback();
+        // 127.0.0.1 alone must not be asked to reach another host.
+        self.all.iter().position(|(a, _)| family(a) && (local(a) || a.ip().is_unspecified()))
+    }
+
+    /// Handles a datagram.
+    pub(super) fn handle(
+        &mut self,
+        now: Instant,
+        endpoint: usize,
+        from: SocketAddr,
+        local: Option<IpAddr>,
+        ecn: Option<EcnCodepoint>,
+        bytes: BytesMut,
+    ) -> Received {
+        let mut buffer = Vec::new();
+        let Some((_, quic)) = self.all.get_mut(endpoint) else { return Received::Done };
+        match quic.handle(now, from, local, ecn, bytes, &mut buffer) {
+            Some(DatagramEvent::ConnectionEvent(handle, event)) => {
+                Received::Connection(handle, event)
+            }
+            Some(DatagramEvent::NewConnection(incoming)) => Received::Incoming(incoming),
+            Some(DatagramEvent::Response(transmit)) => {
+                self.respond(endpoint, &transmit, buffer);
+                Received::Done
+            }
+            None => Received::Done,
+        }
+    }
+
+    /// Begins a connection to an address.
+    ///
+    /// # Errors
+    /// QUIC refuses; `None` if no endpoint reaches the address.
+    pub(super) fn connect(
+        &mut self,
+        now: Instant,
+        to: SocketAddr,
+        config: ClientConfig,
+    ) -> Result<(usize, ConnectionHandle, Connection), Option<ConnectError>> {
+        let endpoint = self.towards(to).ok_or(None)?;
+        let (handle, quic) = self.all[endpoint].1.connect(now, config, to, "axon").map_err(Some)?;
+        Ok((endpoint, handle, quic))
+    }
+
+    /// Accepts a connection.
+    ///
+    /// # Errors
+    /// Why it failed at once. The peer has been told.
+    pub(super) fn accept(
+        &mut self,
+        now: Instant,
+        endpoint: usize,
+        incoming: Incoming,
+        config: Arc<ServerConfig>,
+    ) -> Result<(ConnectionHandle, Connection), quinn_proto::ConnectionError> {
+        let mut buffer = Vec::new();
+        match self.all[endpoint].1.accept(incoming, now, &mut buffer, Some(config)) {
+            Ok(accepted) => Ok(accepted),
+            Err(error) => {
+                if let Some(transmit) = &error.response {
+                    self.respond(endpoint, transmit, buffer);
+                }
+                Err(error.cause)
+            }
+        }
+    }
+
+    /// Refuses a connection.
+    pub(super) fn refuse(&mut self, endpoint: usize, incoming: Incoming) {
+        let mut buffer = Vec::new();
+        let transmit = self.all[endpoint].1.refuse(incoming, &mut buffer);
+        self.respond(endpoint, &transmit, buffer);
+    }
+
+    /// Has the peer prove that it receives at its address, or refuses it where that cannot be.
+    pub(super) fn retry(&mut self, endpoint: usize, incoming: Incoming) {
+        if !incoming.may_retry() {
+            return self.refuse(endpoint, incoming);
+        }
+        let mut buffer = Vec::new();
+        if let Ok(transmit) = self.all[endpoint].1.retry(incoming, &mut buffer) {
+            self.respond(endpoint, &transmit, buffer);
+        }
+    }
+
+    /// Handles an event of a connection.
+    pub(super) fn handle_event(
+        &mut self,
+        endpoint: usize,
+        handle: ConnectionHandle,
+        event: EndpointEvent,
+    ) -> Option<ConnectionEvent> {
+        self.all[endpoint].1.handle_event(handle, event)
+    }
+
+    /// Sends a datagram that is not QUIC's, from the port of QUIC. An address that no endpoint reaches drops it.
+    pub(super) fn send(&mut self, to: SocketAddr, bytes: Vec<u8>) {
+        if let Some(endpoint) = self.towards(to) {
+            self.push(Packet { endpoint, to, from: None, ecn: None, bytes });
+        }
+    }
+
+    fn respond(&mut self, endpoint: usize, transmit: &Transmit, mut bytes: Vec<u8>) {
+        bytes.truncate(transmit.size);
+        let Transmit { destination: to, ecn, src_ip: from, .. } = *transmit;
+        self.push(Packet { endpoint, to, from, ecn, bytes });
+    }
+
+    fn push(&mut self, packet: Packet) {
+        if self.packets.len() < MAX_PACKETS {
+            self.packets.push_back(packet);
+        }
+    }
+
+    /// The next packet that is not of a connection.
+    pub(super) fn poll_packet(&mut self) -> Option<Packet> {
+        self.packets.pop_front()
+    }
+
+    /// Connections that are not over, of all endpoints.
+    pub(super) fn open_connections(&self) -> usize {
+        self.all.iter().map(|(_, endpoint)| endpoint.open_connections()).sum()
+    }
+}

@@ -1,0 +1,261 @@
+//! The routes that this host asks a peer for.
+
+use std::{
+    collections::{BTreeMap, HashMap, HashSet},
+    rc::Rc,
+    time::Duration,
+};
+
+use axon_envelope::{Kind, Route, TopicHash};
+use axon_shm::ids::Gid;
+use axon_transport::graph::{Endpoint, EndpointKind};
+
+use super::{
+    POLL, Peer, Surroundings,
+    refused::{TOO_MANY_ASKED, TOO_MANY_WRITERS},
+};
+use crate::{
+    engine::{
+        inbound::RouteIn,
+        stand_in::{NoStandIn, StandIn},
+    },
+    gateway::routes::{self, RouteKey, Wanted},
+    link::{LastSeen, Message, Subscribe, Unsubscribe},
+};
+
+/// The peer is asked for a route once the local readers are attached, or after this time.
+const ATTACH_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// A route that this host asked for.
+pub(super) struct Asked {
+    pub(super) number: u32,
+    route: Route,
+    /// The readers and writers that it was last asked for.
+    wanted: Wanted,
+    /// Whether a writer of it is not shown.
+    incomplete: bool,
+    pub(super) stand_ins: HashMap<Gid, Rc<StandIn>>,
+}
+
+/// A route whose local readers are not all attached.
+pub(super) struct Attaching {
+    until: Duration,
+    awaited: Vec<(Rc<StandIn>, usize)>,
+}
+
+impl Asked {
+    /// Asks for it.
+    pub(super) fn message(&self, key: &RouteKey) -> Message {
+        let last = self.stand_ins.iter().filter_map(|(gid, stand_in)| {
+            Some(LastSeen { publisher: *gid, sequence: stand_in.last_sequence()? })
+        });
+        Message::Subscribe(Subscribe {
+            route: self.number,
+            topic: key.topic.clone(),
+            type_name: key.type_name.clone(),
+            kind: key.kind as u8,
+            subscribers: self.wanted.subscribers.clone(),
+            last: last.collect(),
+            acknowledges: Some(key.kind == Kind::Topic),
+        })
+    }
+}
+
+impl Peer {
+    /// Asks for the routes that follow from the graphs of both hosts.
+    pub(super) fn update(&mut self, with: &Surroundings<'_>, now: Duration) {
+        if self.stirred {
+            return;
+        }
+        let endpoints = with.local.values().map(|(endpoint, _)| endpoint);
+        let publishers = endpoints.filter(|e| e.kind == EndpointKind::Publisher);
+        self.alive.watch(publishers.filter_map(|e| e.qos.lease));
+        self.answering = self.now_answering();
+        let reachable = self.remote.endpoints().filter(|remote| {
+            let e = &remote.endpoint;
+            e.kind != EndpointKind::Server || self.answering.contains(&e.gid)
+        });
+        let own =
+            with.local.values().map(|(endpoint, reach)| (&**endpoint, reach.toward(self.daemon)));
+        let wanted = routes::wanted(own, reachable);
+        self.want(wanted, with, now);
+        self.feed_services(now);
+    }
+
+    /// Asks for the routes that follow from services, if those changed.
+    pub(super) fn update_services(&mut self, with: &Surroundings<'_>, now: Duration) {
+        if self.answering != self.now_answering() {
+            self.update(with, now);
+        }
+    }
+
+    /// The servers of the peer to which requests of this host go: their responses are wanted.
+    fn now_answering(&self) -> std::collections::BTreeSet<Gid> {
+        let requests = self.served.values().filter(|served| served.key.kind == Kind::Request);
+        requests.flat_map(|served| served.subscribers.iter().copied()).collect()
+    }
+
+    fn want(
+        &mut self,
+        wanted: BTreeMap<RouteKey, Wanted>,
+        with: &Surroundings<'_>,
+        now: Duration,
+    ) {
+        let gone: Vec<_> = self.asked.keys().filter(|k| !wanted.contains_key(k)).cloned().collect();
+        self.refused.retain_unasked(|key| wanted.contains_key(key));
+        let given_up = gone.len();
+        for key in gone {
+            self.refused.settle(&key);
+            if let Some(asked) = self.asked.remove(&key) {
+                self.numbers.remove(&asked.number);
+                self.attaching.remove(&asked.number);
+                self.inbound.routes().remove(&asked.number);
+                self.say(Message::Unsubscribe(Unsubscribe { route: asked.number }));
+            }
+        }
+        for (key, wanted) in wanted {
+            if self.asked.len() >= self.serves && !self.asked.contains_key(&key) {
+                self.refused.unasked(&key, TOO_MANY_ASKED);
+                continue;
+            }
+            self.want_one(key, wanted, with, now);
+        }
+        self.inbound.handle_routes();
+        if given_up > 0 {
+            self.ask_instead(given_up);
+        }
+    }
+
+    fn want_one(
+        &mut self,
+        key: RouteKey,
+        wanted: Wanted,
+        with: &Surroundings<'_>,
+        now: Duration,
+    ) {
+        let known = self.asked.get(&key);
+        if known.is_some_and(|asked| asked.wanted == wanted && !asked.incomplete) {
+            return;
+        }
+        let mut asked = match self.asked.remove(&key) {
+            Some(asked) => asked,
+            None => {
+                let hash = TopicHash::new(with.domain, &key.topic, &key.type_name);
+                // The peer's graph has no name that is too long.
+                let Ok(topic) = hash else { return };
+                self.next_route += 1;
+                Asked {
+                    number: self.next_route - 1,
+                    route: Route { kind: key.kind, topic },
+                    wanted: Wanted::default(),
+                    incomplete: false,
+                    stand_ins: HashMap::new(),
+                }
+            }
+        };
+        let writers: HashSet<_> = wanted.writers.iter().map(|(writer, _)| writer.gid).collect();
+        asked.stand_ins.retain(|gid, _| writers.contains(gid));
+        let fresh = self.show(&key, &mut asked, &wanted.writers, with);
+        if asked.stand_ins.is_empty() && asked.wanted.subscribers.is_empty() {
+            return;
+        }
+        if !asked.incomplete {
+            self.refused.asked(&key);
+        }
+        let changed = asked.wanted.subscribers != wanted.subscribers || fresh;
+        let route = self
+            .inbound
+            .routes()
+            .entry(asked.number)
+            .or_insert_with(|| RouteIn::new(key.topic.as_str().into(), asked.route));
+        route.writers.retain(|gid, _| asked.stand_ins.contains_key(gid));
+        if key.kind == Kind::Response {
+            route.clients = wanted.subscribers.iter().map(|client| client.gid).collect();
+        }
+        if changed {
+            let awaited = wanted.writers.iter().filter_map(|(writer, readers)| {
+                Some((Rc::clone(asked.stand_ins.get(&writer.gid)?), *readers))
+            });
+            let attaching = Attaching { until: now + ATTACH_TIMEOUT, awaited: awaited.collect() };
+            self.attaching.insert(asked.number, attaching);
+            self.look_at_attaching = Some(now);
+        }
+        asked.wanted = wanted;
+        self.numbers.insert(asked.number, key.clone());
+        self.asked.insert(key, asked);
+    }
+
+    /// Opens stand-ins for the writers of a route. Returns whether there are new ones.
+    fn show(
+        &mut self,
+        key: &RouteKey,
+        asked: &mut Asked,
+        writers: &[(Endpoint, usize)],
+        with: &Surroundings<'_>,
+    ) -> bool {
+        let mut fresh = false;
+        asked.incomplete = false;
+        for (writer, _) in writers {
+            if asked.stand_ins.contains_key(&writer.gid) {
+                continue;
+            }
+            match with.stand_ins.get(with.rings, writer, self.remote.account()) {
+                Ok(stand_in) => {
+                    asked.stand_ins.insert(writer.gid, stand_in);
+                    fresh = true;
+                }
+                Err(NoStandIn::TooMany) => {
+                    self.refused.unasked(key, TOO_MANY_WRITERS);
+                    asked.incomplete = true;
+                    break;
+                }
+                Err(NoStandIn::Failed(error)) => {
+                    asked.incomplete = true;
+                    let topic = &key.topic;
+                    tracing::error!(topic, error, "could not open a stand-in for a remote writer");
+                }
+            }
+        }
+        fresh
+    }
+
+    /// Asks for the routes whose local readers are attached by now.
+    pub(super) fn ask_for_attached(&mut self, now: Duration) {
+        if self.look_at_attaching.is_none_or(|due| due > now) {
+            return;
+        }
+        let mut asks = Vec::new();
+        let mut changed = false;
+        for (number, attaching) in &mut self.attaching {
+            let late = now >= attaching.until;
+            let ready = |(stand_in, readers): &mut (Rc<StandIn>, usize)| {
+                late || stand_in.ring().partners().len() >= *readers
+            };
+            let ready: Vec<_> = attaching.awaited.extract_if(.., ready).collect();
+            if let Some(route) = self.inbound.routes().get_mut(number)
+                && !ready.is_empty()
+            {
+                route.writers.extend(ready.into_iter().map(|(s, _)| (s.gid(), s)));
+                changed = true;
+            }
+            if attaching.awaited.is_empty() {
+                asks.push(*number);
+            }
+        }
+        if changed {
+            self.inbound.handle_routes();
+        }
+        asks.sort_unstable();
+        for number in asks {
+            self.attaching.remove(&number);
+            let key = self.numbers.get(&number).cloned();
+            if let Some((key, asked)) = key.and_then(|key| Some((self.asked.get(&key)?, key)))
+                .map(|(asked, key)| (key, asked))
+            {
+                let message = asked.message(&key);
+                self.say(message);
+            }
+        }
+        self.look_at_attaching = (!self.attaching.is_empty()).then(|| now + POLL);
+    }
+}

@@ -1,0 +1,463 @@
+//! A peer: its graph, the routes in both directions, and the samples that cross.
+
+mod asking;
+mod refused;
+mod serving;
+
+use std::{
+    cell::RefCell,
+    collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use axon_shm::ids::{DaemonId, Gid};
+use axon_transport::{
+    config::DiscoveryRange,
+    graph::{Endpoint, EndpointKind},
+    internal::{
+        events::Alive,
+        graph::{RangeToHost, RemoteEndpoint},
+    },
+    status::LinkStatus,
+};
+
+use self::{
+    asking::{Asked, Attaching},
+    refused::RefusedRoutes,
+    serving::Served,
+};
+pub(crate) use self::serving::{MAX_ROUTES, StalledRoute};
+use super::{
+    inbound::Inbound,
+    outbound::{Outbound, Source},
+    rings::Rings,
+    stand_in::StandIns,
+};
+use crate::{
+    gateway::{
+        account::{Account, MAX_STAND_INS},
+        counters::Counters,
+        hub::Local,
+        peer::{
+            graph::{GraphTaken, Remote},
+            owners::Prover,
+        },
+        routes::RouteKey,
+        stalls::Stalls,
+    },
+    link::{Asserted, CloseCode, Graph, Message},
+    owner::Binding,
+};
+
+/// Endpoints in one message of a graph.
+const GRAPH_PART: usize = 512;
+/// A whole graph is sent so often at most.
+const RESYNC: Duration = Duration::from_secs(1);
+/// Between two looks at pairs that are being attached.
+const POLL: Duration = Duration::from_millis(5);
+/// Routes of a peer whose HELLO does not say how many it serves.
+pub(crate) const ROUTES_UNSAID: usize = 1024;
+
+/// The parts of the engine that all peers use.
+pub(crate) struct Surroundings<'a> {
+    /// The rings of this host.
+    pub(crate) rings: &'a dyn Rings,
+    /// All stand-ins.
+    pub(crate) stand_ins: &'a StandIns,
+    /// The endpoints of this host.
+    pub(crate) local: &'a Local,
+    /// ROS_DOMAIN_ID.
+    pub(crate) domain: u32,
+    /// `[link] stalled_s`.
+    pub(crate) stalled_after: Duration,
+    /// Routes that were given up.
+    pub(crate) stalls: &'a RefCell<Stalls>,
+    /// When the engine's time was zero.
+    pub(crate) epoch: Instant,
+}
+
+impl Surroundings<'_> {
+    /// The same time as an instant.
+    fn instant(&self, now: Duration) -> Instant {
+        self.epoch + now
+    }
+}
+
+/// A peer with an elected link.
+pub(crate) struct Peer {
+    pub(super) daemon: DaemonId,
+    /// The link in use.
+    pub(super) link: u64,
+    /// Who it proved to be.
+    identity: String,
+    pub(super) counters: Arc<Counters>,
+    /// Its graph.
+    pub(super) remote: Remote,
+    prover: Prover,
+    /// Endpoints of it were ignored, since another peer had them.
+    pub(super) displaced: bool,
+    /// The graph that it was sent.
+    sent: BTreeMap<Gid, RemoteEndpoint>,
+    sent_version: u64,
+    resynced: Option<Duration>,
+    resync_due: bool,
+    /// Its graph changed, and what follows was not done.
+    pub(super) stirred: bool,
+    refusal_said: bool,
+    next_route: u32,
+    /// Routes that it serves at most.
+    serves: usize,
+    asked: BTreeMap<RouteKey, Asked>,
+    /// The routes of `asked`, by number.
+    numbers: HashMap<u32, RouteKey>,
+    attaching: BTreeMap<u32, Attaching>,
+    look_at_attaching: Option<Duration>,
+    refused: RefusedRoutes,
+    pub(super) inbound: Inbound,
+    pub(super) outbound: Outbound,
+    /// Publishers here that ended and whose samples have not all arrived: the peer sees them until then.
+    ending: BTreeMap<Gid, RemoteEndpoint>,
+    served: HashMap<u32, Served>,
+    /// The numbers of `served`.
+    served_as: HashMap<RouteKey, u32>,
+    announcing: BTreeMap<u32, Duration>,
+    look_at_announcing: Option<Duration>,
+    alive: Alive,
+    answering: BTreeSet<Gid>,
+    messages: VecDeque<Message>,
+}
+
+/// The parts of a new peer.
+pub(crate) struct PeerParts {
+    /// Its daemon.
+    pub(crate) daemon: DaemonId,
+    /// The link in use.
+    pub(crate) link: u64,
+    /// Who it proved to be.
+    pub(crate) identity: String,
+    /// Its account.
+    pub(crate) account: Arc<Account>,
+    /// Proves that sessions are of this host.
+    pub(crate) prover: Prover,
+    /// Counts its samples.
+    pub(crate) counters: Arc<Counters>,
+    /// Samples from it.
+    pub(crate) inbound: Inbound,
+    /// Samples to it.
+    pub(crate) outbound: Outbound,
+    /// Routes that it serves at most.
+    pub(crate) serves: usize,
+}
+
+impl Peer {
+    /// A peer whose graph is not known yet.
+    pub(super) fn new(parts: PeerParts) -> Self {
+        let PeerParts {
+            daemon,
+            link,
+            identity,
+            account,
+            prover,
+            counters,
+            inbound,
+            outbound,
+            serves,
+        } = parts;
+        Self {
+            daemon,
+            link,
+            identity,
+            counters,
+            remote: Remote::new(account, prover.is_needed()),
+            prover,
+            displaced: false,
+            sent: BTreeMap::new(),
+            sent_version: 0,
+            resynced: None,
+            resync_due: false,
+            stirred: false,
+            refusal_said: false,
+            next_route: 1,
+            serves,
+            asked: BTreeMap::new(),
+            numbers: HashMap::new(),
+            attaching: BTreeMap::new(),
+            look_at_attaching: None,
+            refused: RefusedRoutes::default(),
+            inbound,
+            outbound,
+            ending: BTreeMap::new(),
+            served: HashMap::new(),
+            served_as: HashMap::new(),
+            announcing: BTreeMap::new(),
+            look_at_announcing: None,
+            alive: Alive::default(),
+            answering: BTreeSet::new(),
+            messages: VecDeque::new(),
+        }
+    }
+
+    /// A successor took over. The peer's routes stand; this side asks for its own again.
+    pub(super) fn succeed(&mut self, link: u64, binding: Option<Binding>, local: &Local) {
+        self.link = link;
+        self.messages.clear();
+        self.prover.succeed(binding);
+        self.remote.succeed();
+        let visible = self.visible(local);
+        self.prove(&visible);
+        let asks: Vec<_> = self.asked.iter().map(|(key, asked)| asked.message(key)).collect();
+        asks.into_iter().for_each(|message| self.say(message));
+        for served in self.served.values_mut() {
+            served.repeated = false;
+        }
+    }
+
+    /// Queues a control message.
+    pub(super) fn say(&mut self, message: Message) {
+        self.messages.push_back(message);
+    }
+
+    /// The next control message.
+    pub(super) fn poll_message(&mut self) -> Option<Message> {
+        self.messages.pop_front()
+    }
+
+    /// A message of the peer that concerns it alone.
+    ///
+    /// # Errors
+    /// The peer broke a rule.
+    pub(super) fn handle_message(
+        &mut self,
+        message: Message,
+        with: &Surroundings<'_>,
+        now: Duration,
+    ) -> Result<(), (CloseCode, String)> {
+        match message {
+            Message::GraphResync(_) => self.resync(with.local, now),
+            Message::Subscribe(subscribe) => {
+                let served = self.serve(subscribe, with, now);
+                self.update_services(with, now);
+                return served.map_err(|reason| (CloseCode::Malformed, reason));
+            }
+            Message::Unsubscribe(unsubscribe) => {
+                self.unserve(unsubscribe.route);
+                self.update_services(with, now);
+            }
+            Message::Asserted(asserted) => self.handle_asserted(&asserted),
+            Message::Received(received) => self.outbound.handle_received(&received.flows, now),
+            Message::RouteRefused(refused) => self.handle_route_refused(refused, now),
+            Message::RouteReady(ready) => {
+                self.handle_route_ready(ready.route);
+                tracing::debug!(peer = %self.daemon, route = ready.route,
+                    publishers = ready.publishers.len(), "route ready");
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// The endpoints of this host that the peer may see.
+    fn shown(&self, local: &Local) -> BTreeMap<Gid, RemoteEndpoint> {
+        let listed = self.remote.endpoints().any(|remote| remote.toward.lists);
+        let shown = local.iter().filter_map(|(gid, (endpoint, reach))| {
+            let toward = reach.toward(self.daemon);
+            let shown = match toward.range {
+                DiscoveryRange::Off => false,
+                DiscoveryRange::Localhost => toward.lists || listed,
+                DiscoveryRange::Subnet => true,
+            };
+            shown.then(|| (*gid, RemoteEndpoint { endpoint: Arc::clone(endpoint), toward }))
+        });
+        shown.collect()
+    }
+
+    /// The graph of this host changed: the peer is told, and routes follow.
+    pub(super) fn handle_local_graph(&mut self, with: &Surroundings<'_>, now: Duration) {
+        self.keep_ending(with.local, now);
+        self.send_graph(with.local, false);
+        self.update(with, now);
+    }
+
+    /// Publishers that ended stay in the graph that the peer sees until their samples have arrived.
+    fn keep_ending(&mut self, local: &Local, now: Duration) {
+        let ended = self.sent.iter().filter(|(gid, shown)| {
+            shown.endpoint.kind == EndpointKind::Publisher
+                && !local.contains_key(gid)
+                && !self.ending.contains_key(gid)
+        });
+        let carried = |gid: &Gid| {
+            let mut sources = self.served.values().flat_map(|served| &served.sources);
+            sources.any(|source| source.has_unacknowledged(gid))
+        };
+        let ended = ended.filter(|(gid, _)| carried(gid));
+        let ended: Vec<_> = ended.map(|(gid, shown)| (*gid, shown.clone())).collect();
+        for (gid, shown) in ended {
+            self.outbound.handle_publisher_ended(gid, now);
+            self.ending.insert(gid, shown);
+        }
+    }
+
+    /// Nothing is left of a publisher that ended.
+    pub(super) fn handle_drained(&mut self, gid: &Gid, local: &Local) {
+        if self.ending.remove(gid).is_some() {
+            self.send_graph(local, false);
+        }
+    }
+
+    /// Whether samples of publishers that ended are on their way.
+    pub(super) fn is_draining(&self) -> bool {
+        !self.ending.is_empty()
+    }
+
+    fn visible(&self, local: &Local) -> BTreeMap<Gid, RemoteEndpoint> {
+        let mut visible = self.ending.clone();
+        visible.extend(self.shown(local));
+        visible
+    }
+
+    fn prove(&mut self, visible: &BTreeMap<Gid, RemoteEndpoint>) {
+        for proofs in self.prover.owed(visible.keys()) {
+            self.say(proofs);
+        }
+    }
+
+    /// Tells the peer what changed in the graph of this host, or all of it.
+    pub(super) fn send_graph(&mut self, local: &Local, whole: bool) {
+        if whole {
+            self.sent.clear();
+        }
+        let now = self.visible(local);
+        self.prove(&now);
+        let added: Vec<_> =
+            now.iter().filter(|(gid, e)| self.sent.get(gid) != Some(e)).map(|(_, e)| e).collect();
+        let removed: Vec<_> =
+            self.sent.keys().filter(|gid| !now.contains_key(gid)).copied().collect();
+        if !whole && added.is_empty() && removed.is_empty() {
+            return;
+        }
+        let mut before = if whole { 0 } else { self.sent_version };
+        let mut removed = Some(removed);
+        let mut parts: Vec<&[_]> = added.chunks(GRAPH_PART).collect();
+        if parts.is_empty() {
+            parts.push(&[]);
+        }
+        let last = parts.len() - 1;
+        for (index, part) in parts.into_iter().enumerate() {
+            self.sent_version += 1;
+            let named = |is: fn(&RangeToHost) -> bool| {
+                let gids = part.iter().filter(|e| is(&e.toward)).map(|e| e.endpoint.gid);
+                Some(gids.collect::<Vec<_>>()).filter(|gids| !gids.is_empty())
+            };
+            let graph = Graph {
+                version: self.sent_version,
+                before,
+                localhost: named(|toward| toward.range != DiscoveryRange::Subnet),
+                listing: named(|toward| toward.lists),
+                added: part.iter().map(|e| Endpoint::clone(&e.endpoint)).collect(),
+                removed: removed.take().unwrap_or_default(),
+                more: index < last,
+            };
+            self.messages.push_back(Message::Graph(graph));
+            before = self.sent_version;
+        }
+        self.sent = now;
+    }
+
+    /// The peer asks for the whole graph.
+    fn resync(&mut self, local: &Local, now: Duration) {
+        let recent = |sent| now.saturating_sub(sent) < RESYNC;
+        self.resync_due = self.resynced.is_some_and(recent);
+        if !self.resync_due {
+            self.resynced = Some(now);
+            self.prover.forget();
+            self.send_graph(local, true);
+        }
+    }
+
+    /// A part of the peer's graph.
+    pub(super) fn take_graph(&mut self, graph: Graph) -> GraphTaken {
+        let taken = self.remote.take(graph);
+        if taken == (GraphTaken::Changed { whole: true }) {
+            self.unserve_unrepeated();
+        }
+        taken
+    }
+
+    /// The peer's graph changed, and this host follows.
+    pub(super) fn handle_remote_graph(&mut self, with: &Surroundings<'_>, now: Duration) {
+        // Sessions there may list this host now, or no longer.
+        self.send_graph(with.local, false);
+        self.update(with, now);
+    }
+
+    /// Why a part of its graph is refused, if that is news.
+    pub(super) fn newly_refused(&mut self) -> Option<String> {
+        let refused = self.remote.refused().map(str::to_owned);
+        let said = std::mem::replace(&mut self.refusal_said, refused.is_some());
+        refused.filter(|_| !said)
+    }
+
+    /// When its publishers' liveliness is told.
+    fn alive_due(&self, with_epoch: Instant, now: Duration) -> Option<Duration> {
+        self.alive.left(with_epoch + now).map(|left| now + left)
+    }
+
+    fn tell_alive(&mut self, epoch: Instant, now: Duration) {
+        let sources = self.served.values().flat_map(|served| &served.sources);
+        let asserted = sources.flat_map(|source| match source {
+            Source::Relay(_, reader) => reader.assertions(),
+            Source::StandIn(_) => Vec::new(),
+        });
+        for publishers in self.alive.news(epoch + now, asserted) {
+            self.messages.push_back(Message::Asserted(Asserted { publishers }));
+        }
+    }
+
+    fn handle_asserted(&self, asserted: &Asserted) {
+        let known = asserted.publishers.iter().filter(|gid| self.remote.get(gid).is_some());
+        let stand_ins = known.take(MAX_STAND_INS).filter_map(|gid| self.inbound.stand_in(gid));
+        stand_ins.for_each(|stand_in| stand_in.ring().assert_alive());
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) is due, besides its samples.
+    pub(super) fn poll_timeout(&self, epoch: Instant, now: Duration) -> Option<Duration> {
+        let resync = self.resync_due.then(|| self.resynced.unwrap_or_default() + RESYNC);
+        let alive = self.alive_due(epoch, now);
+        let looks = [self.look_at_attaching, self.look_at_announcing];
+        let asks = self.refused.poll_timeout();
+        looks.into_iter().chain([alive, resync, asks]).flatten().min()
+    }
+
+    /// Does what is due.
+    pub(super) fn handle_timeout(&mut self, with: &Surroundings<'_>, now: Duration) {
+        self.ask_for_attached(now);
+        self.announce_ready(now);
+        self.tell_alive(with.epoch, now);
+        self.ask_again(now);
+        if self.resync_due {
+            self.resync(with.local, now);
+        }
+    }
+
+    /// Gives up a route that the peer does not read.
+    pub(super) fn handle_stalled(
+        &mut self,
+        route: u32,
+        with: &Surroundings<'_>,
+        now: Duration,
+    ) -> Option<StalledRoute> {
+        let stalled = self.give_up_stalled(route, with, now)?;
+        self.update_services(with, now);
+        Some(stalled)
+    }
+
+    /// Adds its graph and refused routes to the link's status.
+    pub(super) fn fill(&self, status: &mut LinkStatus) {
+        self.counters.fill(status);
+        self.show_refused(status);
+        status.endpoints = self.remote.len() as u64;
+        status.endpoints_left_out = self.remote.left_out();
+        status.graph_bytes = self.remote.account().graph.held() as u64;
+    }
+}

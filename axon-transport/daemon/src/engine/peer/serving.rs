@@ -1,0 +1,283 @@
+//! The routes that a peer asked this host for.
+
+use std::{collections::HashMap, rc::Rc, time::Duration};
+
+use axon_envelope::{Kind, Route, TopicHash};
+use axon_shm::ids::Gid;
+use axon_transport::EndpointSpec;
+
+use super::{POLL, Peer, Surroundings};
+use crate::{
+    engine::outbound::{RouteOut, Source},
+    gateway::{
+        account::Charge,
+        routes::{RelaySpec, RouteKey, admit, relays},
+    },
+    link::{Message, RouteReady, Subscribe, Subscriber},
+};
+
+/// A route is said to be ready once it has a writer, or after this time.
+const READY_TIMEOUT: Duration = Duration::from_secs(2);
+/// Memory of a route, in bytes, beside the names and subscribers of which it holds three copies.
+const ROUTE: usize = 512;
+const COPIES: usize = 3;
+/// Routes that a peer is served. HELLO says it.
+pub(crate) const MAX_ROUTES: usize = 32 << 10;
+
+/// A route that the peer asked for.
+pub(super) struct Served {
+    pub(super) key: RouteKey,
+    route: Route,
+    pub(super) subscribers: Vec<Gid>,
+    pub(super) sources: Vec<Source>,
+    _charges: [Charge; 2],
+    /// Whether the peer asked for it over the link in use.
+    pub(super) repeated: bool,
+}
+
+/// A route that was given up since the peer does not read it.
+pub(crate) struct StalledRoute {
+    /// The topic's name.
+    pub(crate) topic: String,
+    /// What both hosts show.
+    pub(crate) reason: String,
+    /// Samples that were lost.
+    pub(crate) samples: u64,
+}
+
+impl Peer {
+    /// Serves a route.
+    ///
+    /// # Errors
+    /// The peer broke a rule.
+    pub(super) fn serve(
+        &mut self,
+        subscribe: Subscribe,
+        with: &Surroundings<'_>,
+        now: Duration,
+    ) -> Result<(), String> {
+        let bytes = ROUTE + COPIES * subscribe.bytes();
+        let Subscribe { route: number, topic, type_name, kind, last, .. } = subscribe;
+        let subscribers = self.proven_only(subscribe.subscribers, &topic);
+        let hash = TopicHash::new(with.domain, &topic, &type_name).map_err(|e| e.to_string())?;
+        let kind = match kind {
+            0 => Kind::Topic,
+            1 => Kind::Request,
+            2 => Kind::Response,
+            other => return Err(format!("a route of kind {other}")),
+        };
+        let acknowledged = kind == Kind::Topic && subscribe.acknowledges == Some(true);
+        let key = RouteKey { kind, topic, type_name };
+        if let Some(other) = self.served_as.get(&key).copied().filter(|other| *other != number) {
+            if self.served.get(&other).is_some_and(|served| served.repeated) {
+                return Err(format!("{} has a route already", key.topic));
+            }
+            // The number is of a link before this one.
+            self.unserve(other);
+        }
+        if self.served.get(&number).is_some_and(|old| !old.repeated && old.key != key) {
+            self.unserve(number);
+        }
+        let old = match self.served.remove(&number) {
+            Some(served) if served.key == key => served.sources,
+            Some(_) => return Err("a route number for two topics".into()),
+            None => {
+                if self.served.len() >= MAX_ROUTES {
+                    let why = format!("a peer is served {MAX_ROUTES} routes at most, and has them");
+                    self.refuse(number, &key, why, None);
+                    return Ok(());
+                }
+                Vec::new()
+            }
+        };
+        self.served_as.remove(&key);
+        if let Some(left) = with.stalls.borrow().left(&self.identity, &key, with.instant(now)) {
+            self.outbound.end_route(number);
+            self.refuse(number, &key, "it was not read".into(), Some(left));
+            return Ok(());
+        }
+        let room = &self.remote.account().routes;
+        let (charge, most) = (room.charge(bytes), room.most() >> 20);
+        let Some(charge) = charge else {
+            self.outbound.end_route(number);
+            let why = format!("what a peer asks for takes more than {most} MiB ([link] graph_mb)");
+            self.refuse(number, &key, why, None);
+            return Ok(());
+        };
+        self.refused.forget(number);
+        let sources = match kind {
+            Kind::Topic => self.open_relays(&key, &subscribers, &old, with),
+            Kind::Request | Kind::Response => self.sources_of_service(&key),
+        };
+        let relays = sources.iter().filter(|source| matches!(source, Source::Relay(..))).count();
+        let room = &self.remote.account().relays;
+        let relays = room.charge(relays).unwrap_or_else(|| room.nothing());
+        self.announcing.insert(number, now + READY_TIMEOUT);
+        self.look_at_announcing = Some(now);
+        let route = Route { kind, topic: hash };
+        let seen = last.iter().map(|l| (l.publisher, l.sequence)).collect();
+        let topic = key.topic.as_str().into();
+        let out = RouteOut { topic, route, acknowledged, sources: sources.clone(), seen };
+        self.outbound.set_route(number, out, now);
+        self.served_as.insert(key.clone(), number);
+        let served = Served {
+            key,
+            route,
+            subscribers: subscribers.iter().map(|subscriber| subscriber.gid).collect(),
+            sources,
+            _charges: [charge, relays],
+            repeated: true,
+        };
+        self.served.insert(number, served);
+        Ok(())
+    }
+
+    /// The subscribers that are of the peer's own sessions.
+    fn proven_only(&mut self, mut subscribers: Vec<Subscriber>, topic: &str) -> Vec<Subscriber> {
+        let others = subscribers.extract_if(.., |reader| !self.remote.owns(&reader.gid));
+        let others: Vec<_> = others.map(|reader| reader.gid).collect();
+        for gid in others {
+            self.remote.disown_reader(&gid, topic);
+            self.stirred = true;
+        }
+        subscribers
+    }
+
+    /// Gives up a route that the peer does not read, for a while.
+    pub(super) fn give_up_stalled(
+        &mut self,
+        route: u32,
+        with: &Surroundings<'_>,
+        now: Duration,
+    ) -> Option<StalledRoute> {
+        let served = self.served.remove(&route)?;
+        self.served_as.remove(&served.key);
+        self.announcing.remove(&route);
+        let samples = self.outbound.give_up_route(route);
+        let (limit, key) = (with.stalled_after, &served.key);
+        let instant = with.instant(now);
+        let wait = with.stalls.borrow_mut().add(&self.identity, key, limit, instant);
+        let reason = format!(
+            "nothing of {} was read for {} s; it is not sent for {} s ([link] stalled_s)",
+            key.topic,
+            limit.as_secs(),
+            wait.as_secs()
+        );
+        self.refuse(route, key, reason.clone(), Some(wait));
+        Some(StalledRoute { topic: served.key.topic.clone(), reason, samples })
+    }
+
+    /// The peer no longer wants a route.
+    pub(super) fn unserve(&mut self, route: u32) {
+        self.refused.forget(route);
+        self.announcing.remove(&route);
+        if let Some(served) = self.served.remove(&route) {
+            self.served_as.remove(&served.key);
+        }
+        self.outbound.end_route(route);
+    }
+
+    /// Ends the routes that the peer did not ask for again over the link in use.
+    pub(super) fn unserve_unrepeated(&mut self) {
+        let unrepeated = self.served.iter().filter(|(_, served)| !served.repeated);
+        let lost: Vec<_> = unrepeated.map(|(route, _)| *route).collect();
+        lost.into_iter().for_each(|route| self.unserve(route));
+    }
+
+    /// Opens the relays of a topic; those that the route has are kept.
+    fn open_relays(
+        &self,
+        key: &RouteKey,
+        subscribers: &[Subscriber],
+        old: &[Source],
+        with: &Surroundings<'_>,
+    ) -> Vec<Source> {
+        let hash = |gid: &Gid| self.remote.get(gid).map_or_else(Vec::new, |e| e.type_hash.clone());
+        let mut specs = relays(subscribers, hash);
+        let there = |spec: &RelaySpec| {
+            old.iter().find_map(|source| match source {
+                Source::Relay(other, reader) if other.is(spec) => Some(Rc::clone(reader)),
+                _ => None,
+            })
+        };
+        let elsewhere = self.remote.account().relays.held();
+        let refused = admit(&mut specs, |spec| there(spec).is_some(), elsewhere);
+        if refused > 0 {
+            let topic = &key.topic;
+            tracing::warn!(
+                topic,
+                refused,
+                "peer exceeded its relay limit; some of its subscriptions to this topic get no samples"
+            );
+        }
+        let mut sources = Vec::new();
+        for spec in specs {
+            if let Some(reader) = there(&spec) {
+                reader.set_stands_for(spec.stands_for.clone());
+                sources.push(Source::Relay(spec, reader));
+                continue;
+            }
+            let endpoint = EndpointSpec::new(&*key.topic, &*key.type_name, spec.qos)
+                .type_hash(spec.type_hash.clone());
+            match with.rings.open_reader(endpoint, spec.stands_for.clone()) {
+                Ok(reader) => sources.push(Source::Relay(spec, reader)),
+                Err(error) => {
+                    let topic = &key.topic;
+                    tracing::error!(topic, error, "could not open a relay: a peer gets no samples");
+                }
+            }
+        }
+        sources
+    }
+
+    /// The stand-ins from which the calls, or responses, of a service are taken.
+    fn sources_of_service(&self, key: &RouteKey) -> Vec<Source> {
+        let asked = self.asked.get(&key.other_way());
+        let stand_ins = asked.into_iter().flat_map(|asked| asked.stand_ins.values());
+        let mut sources: Vec<_> = stand_ins.cloned().collect();
+        sources.sort_by_key(|stand_in| stand_in.gid());
+        sources.into_iter().map(Source::StandIn).collect()
+    }
+
+    /// Has the routes of services use the stand-ins that exist now.
+    pub(super) fn feed_services(&mut self, now: Duration) {
+        let services = self.served.iter().filter(|(_, served)| served.key.kind != Kind::Topic);
+        let mut changes = Vec::new();
+        for (number, served) in services {
+            let sources = self.sources_of_service(&served.key);
+            let same = sources.len() == served.sources.len()
+                && sources.iter().zip(&served.sources).all(|(one, other)| one.is(other));
+            if !same {
+                changes.push((*number, sources));
+            }
+        }
+        for (number, sources) in changes {
+            let Some(served) = self.served.get_mut(&number) else { continue };
+            served.sources.clone_from(&sources);
+            let topic = served.key.topic.as_str().into();
+            let (route, acknowledged, seen) = (served.route, false, HashMap::new());
+            let out = RouteOut { topic, route, acknowledged, sources, seen };
+            self.outbound.set_route(number, out, now);
+        }
+    }
+
+    /// Says which routes have a writer by now.
+    pub(super) fn announce_ready(&mut self, now: Duration) {
+        if self.look_at_announcing.is_none_or(|due| due > now) {
+            return;
+        }
+        let mut ready = Vec::new();
+        for (number, until) in &self.announcing {
+            let sources = self.served.get(number).map_or(&[][..], |served| &served.sources);
+            let publishers: Vec<Gid> = sources.iter().flat_map(Source::writers).collect();
+            if !publishers.is_empty() || now >= *until {
+                ready.push(RouteReady { route: *number, publishers });
+            }
+        }
+        for ready in ready {
+            self.announcing.remove(&ready.route);
+            self.say(Message::RouteReady(ready));
+        }
+        self.look_at_announcing = (!self.announcing.is_empty()).then(|| now + POLL);
+    }
+}
