@@ -49,7 +49,7 @@ impl std::error::Error for Refusal {}
 
 impl Refusal {
     /// This side refuses.
-    pub(super) fn here(code: CloseCode, reason: impl fmt::Display) -> Self {
+    pub(crate) fn here(code: CloseCode, reason: impl fmt::Display) -> Self {
         Self {
             by: RefusedBy::Here,
             name: code.name().into(),
@@ -59,7 +59,7 @@ impl Refusal {
     }
 
     /// The peer could not be reached, or it was not even tried.
-    pub(super) fn network(reason: impl fmt::Display) -> Self {
+    pub(crate) fn network(reason: impl fmt::Display) -> Self {
         Self {
             by: RefusedBy::Network,
             name: "unreachable".into(),
@@ -69,7 +69,7 @@ impl Refusal {
     }
 
     /// What `error` of a connection means.
-    pub(super) fn of(error: &ConnectionError) -> Self {
+    pub(crate) fn of(error: &ConnectionError) -> Self {
         let (by, name, reason) = match error {
             ConnectionError::ApplicationClosed(close) => {
                 let code = close.error_code.into_inner();
