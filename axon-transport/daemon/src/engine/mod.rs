@@ -4,7 +4,12 @@
 
 pub(crate) mod connection;
 pub(crate) mod control;
+pub(crate) mod credentials;
+pub(crate) mod endpoints;
 pub(crate) mod inbound;
+pub(crate) mod keyring;
+pub(crate) mod link;
+pub(crate) mod links;
 pub(crate) mod outbound;
 pub(crate) mod peer;
 pub(crate) mod protection;

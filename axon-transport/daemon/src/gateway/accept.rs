@@ -23,13 +23,13 @@ use crate::{
 
 const DECRYPT_ERROR: u8 = 51;
 /// Handshakes under way at once, but for those of listed peers; further dials are refused and come again.
-pub(super) const MAX_HANDSHAKES: usize = 64;
+pub(crate) const MAX_HANDSHAKES: usize = 64;
 /// A dialler that has its Retry is given this long for the rest of the handshake.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// What came of an incoming dial.
 #[derive(Debug)]
-pub(super) enum Incomer {
+pub(crate) enum Incomer {
     /// It awaits its election.
     Established(Box<Established>),
     /// It was refused.
@@ -42,7 +42,7 @@ pub(super) enum Incomer {
 }
 
 /// Accepts on `endpoint` until it is closed.
-pub(super) async fn accept(
+pub(crate) async fn accept(
     context: Arc<Context>,
     endpoint: Endpoint,
     handshakes: Arc<Handshakes>,

@@ -21,7 +21,7 @@ use crate::link::{
 /// Why no further message came.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
-pub(super) enum ControlError {
+pub(crate) enum ControlError {
     /// The peer sent what is not of the protocol.
     #[error(transparent)]
     Frame(#[from] FrameError),
@@ -32,7 +32,7 @@ pub(super) enum ControlError {
 
 impl ControlError {
     /// The code to close with, when it is this side that closes.
-    pub(super) fn code(&self) -> Option<CloseCode> {
+    pub(crate) fn code(&self) -> Option<CloseCode> {
         match self {
             Self::Frame(FrameError::TooLarge { .. }) => Some(CloseCode::TooLarge),
             Self::Frame(_) => Some(CloseCode::Malformed),

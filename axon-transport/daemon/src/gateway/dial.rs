@@ -10,6 +10,7 @@ use super::{
     context::Context,
     endpoint::Endpoints,
     establish::{Established, establish},
+    keyring::warn_disagreement,
     refusal::Refusal,
 };
 use crate::{
@@ -19,40 +20,55 @@ use crate::{
 };
 
 /// One address is given this long to complete the handshake.
-const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
+pub(crate) const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
 /// A dial, with all its redials, is given up after this, in qkd with two KME calls; discovery backs
 /// off and dials again.
 const DIAL_TIMEOUT: Duration = Duration::from_secs(20);
 /// Alerts of a server that does not have the key (yet), or has another.
-const UNKNOWN_PSK_IDENTITY: u8 = 115;
-const DECRYPT_ERROR: u8 = 51;
+pub(crate) const UNKNOWN_PSK_IDENTITY: u8 = 115;
+pub(crate) const DECRYPT_ERROR: u8 = 51;
 
 /// Whom to dial.
 #[derive(Clone, Debug)]
-pub(super) struct Target {
+pub(crate) struct Target {
     /// The daemon expected there, `None` when any will do.
-    pub(super) daemon: Option<DaemonId>,
+    pub(crate) daemon: Option<DaemonId>,
     /// Its SAE ID, in qkd.
-    pub(super) sae: Option<String>,
+    pub(crate) sae: Option<String>,
     /// Where it may be, best first.
-    pub(super) addresses: Vec<SocketAddr>,
+    pub(crate) addresses: Vec<SocketAddr>,
     /// Whether this host lists it as a static peer.
-    pub(super) listed: bool,
+    pub(crate) listed: bool,
     /// Why it may be there, where discovery says so.
-    pub(super) standing: Option<AddressConfidence>,
+    pub(crate) standing: Option<AddressConfidence>,
     /// The link that the new connection succeeds.
-    pub(super) replaces: Option<[u8; 16]>,
+    pub(crate) replaces: Option<[u8; 16]>,
 }
 
 impl Target {
     /// For log and status.
-    pub(super) fn text(&self) -> String {
+    pub(crate) fn text(&self) -> String {
         let addresses: Vec<_> = self.addresses.iter().map(ToString::to_string).collect();
         match &self.sae {
             Some(sae) => format!("{sae} at {}", addresses.join(", ")),
             None => addresses.join(", "),
         }
     }
+
+    /// This side's HELLO to it.
+    pub(crate) fn hello(&self, ours: &Hello) -> Hello {
+        Hello {
+            expects: self.daemon,
+            static_peer: self.listed,
+            replaces: self.replaces,
+            ..ours.clone()
+        }
+    }
+}
+
+/// How long a whole dial may take; in qkd a KME call may take as long as `kme_answer`.
+pub(crate) fn dial_limit(kme_answer: Option<Duration>) -> Duration {
+    DIAL_TIMEOUT + kme_answer.map(|answer| 2 * answer).unwrap_or_default()
 }
 
 /// Dials until a link awaits its election, or says why none does.
@@ -61,12 +77,7 @@ pub(super) async fn dial(
     endpoints: &Endpoints,
     target: &Target,
 ) -> Result<Established, Refusal> {
-    let hello = Hello {
-        expects: target.daemon,
-        static_peer: target.listed,
-        replaces: target.replaces,
-        ..context.hello.clone()
-    };
+    let hello = target.hello(&context.hello);
     let connect = async {
         match &context.keyring {
             None => {
@@ -77,8 +88,7 @@ pub(super) async fn dial(
         }
     };
     // Not around `establish`, which has limits of its own and cleans up after itself.
-    let calls = context.keyring.as_ref().map(|keyring| 2 * keyring.config.kme_answer_timeout);
-    let limit = DIAL_TIMEOUT + calls.unwrap_or_default();
+    let limit = dial_limit(context.keyring.as_ref().map(|k| k.config.kme_answer_timeout));
     let late = |_| Refusal::network(format!("no answer within {limit:?}"));
     let connection = tokio::time::timeout(limit, connect).await.map_err(late)??;
     establish(context, connection, Side::Client, hello, target.sae.as_deref()).await
@@ -89,7 +99,7 @@ fn internal(error: impl std::fmt::Display) -> Refusal {
 }
 
 /// Why no address answered.
-enum Unreached {
+pub(crate) enum Unreached {
     /// A peer, or this side, ended the handshake.
     Handshake(ConnectionError),
     /// Nothing came back.
@@ -97,7 +107,7 @@ enum Unreached {
 }
 
 impl Unreached {
-    fn refusal(&self) -> Refusal {
+    pub(crate) fn refusal(&self) -> Refusal {
         match self {
             Self::Handshake(error) => Refusal::of(error),
             Self::Silence(reason) => Refusal::network(reason),
@@ -199,7 +209,8 @@ async fn qkd(
                     Some(DECRYPT_ERROR) => {
                         tracing::debug!(peer = sae, %refusal, "the peer has another key");
                         if keyring.with_dialler(|now, d| d.mismatched(now, sae, key_id)) {
-                            keyring.warn_disagreement(sae, &format_args!("key_ID {key_id}"));
+                            let what = format_args!("key_ID {key_id}");
+                            warn_disagreement(&keyring.config, sae, &what);
                         }
                     }
                     _ => {

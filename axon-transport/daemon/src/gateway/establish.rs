@@ -10,8 +10,9 @@ use axon_tls::{
     qkd::PskIdentity,
     quic::{ALPN, negotiated},
 };
-use axon_transport::config::{QkdKex, Security};
-use quinn::{Connection, VarInt};
+use axon_transport::config::{Config, QkdKex, Security};
+use quinn::{Connection, ConnectionError, VarInt};
+use rustls_pki_types::CertificateDer;
 
 use super::{
     context::{Context, chain},
@@ -27,11 +28,16 @@ use crate::{
 };
 
 /// HELLO must be done in this time.
-const HELLO_TIMEOUT: Duration = Duration::from_secs(5);
+pub(crate) const HELLO_TIMEOUT: Duration = Duration::from_secs(5);
 /// The proof must be done in this time and that of its KME calls: this side's, and three tries of
 /// the peer's.
 const PROOF_TIMEOUT: Duration = Duration::from_secs(3);
 const PROOF_CALLS: u32 = 4;
+
+/// How long the proof may take, where a KME call may take as long as `kme_answer`.
+pub(crate) fn proof_limit(kme_answer: Duration) -> Duration {
+    PROOF_TIMEOUT + PROOF_CALLS * kme_answer
+}
 
 /// A connection whose peer said who it is and, in qkd, proved it.
 pub(super) struct Established {
@@ -77,8 +83,13 @@ impl std::fmt::Debug for Established {
 
 /// Closes with a code and says why.
 pub(super) fn close(connection: &Connection, code: CloseCode, reason: &str) {
+    connection.close(VarInt::from_u32(code.code()), close_text(reason));
+}
+
+/// The bytes of `reason` that fit into a close: at most 300, and no part of a character.
+pub(crate) fn close_text(reason: &str) -> &[u8] {
     let end = reason.char_indices().map(|(i, c)| i + c.len_utf8()).take_while(|e| *e <= 300).last();
-    connection.close(VarInt::from_u32(code.code()), &reason.as_bytes()[..end.unwrap_or(0)]);
+    &reason.as_bytes()[..end.unwrap_or(0)]
 }
 
 /// Carries a connection through HELLO and proof. `dialled` is the SAE that the client dialled.
@@ -96,23 +107,19 @@ pub(super) async fn establish(
         keyring.proof_over(number);
     }
     result.map_err(|failure| {
-        let told = match &failure {
-            Failure::Quietly { told, .. } => Some(*told),
-            _ => None,
-        };
-        let refusal = failure.into_refusal(&connection);
-        if let Some(code) = refusal.1 {
-            close(&connection, code, told.unwrap_or(&refusal.0.reason));
+        let (refusal, closes) = failure.into_refusal(connection.close_reason().as_ref());
+        if let Some((code, told)) = closes {
+            close(&connection, code, &told);
         }
         if let Some(keyring) = &context.keyring {
             keyring.forget_connection(number);
         }
-        refusal.0
+        refusal
     })
 }
 
 /// What went wrong on the way.
-pub(super) enum Failure {
+pub(crate) enum Failure {
     /// This side refuses.
     Ours(CloseCode, String),
     /// This side refuses, and tells the peer less than its own people.
@@ -124,20 +131,29 @@ pub(super) enum Failure {
 }
 
 impl Failure {
-    fn into_refusal(self, connection: &Connection) -> (Refusal, Option<CloseCode>) {
-        let lost = |fallback: String| match connection.close_reason() {
-            Some(error) => Refusal::of(&error),
+    /// The refusal for log and status, and the code and text with which this side closes, if it does.
+    /// `ended` is why the connection ended, if it did.
+    pub(crate) fn into_refusal(
+        self,
+        ended: Option<&ConnectionError>,
+    ) -> (Refusal, Option<(CloseCode, String)>) {
+        let lost = |fallback: String| match ended {
+            Some(error) => Refusal::of(error),
             None => Refusal::network(fallback),
         };
-        match self {
+        let (refusal, code) = match self {
+            Self::Quietly { code, told, why } => {
+                return (Refusal::here(code, why), Some((code, told.into())));
+            }
             Self::Ours(code, reason) => (Refusal::here(code, reason), Some(code)),
-            Self::Quietly { code, why, .. } => (Refusal::here(code, why), Some(code)),
             Self::Connection => (lost("the connection broke".into()), None),
             Self::Control(error) => match error.code() {
                 Some(code) => (Refusal::here(code, &error), Some(code)),
                 None => (lost(error.to_string()), Some(CloseCode::Internal)),
             },
-        }
+        };
+        let closes = code.map(|code| (code, refusal.reason.clone()));
+        (refusal, closes)
     }
 }
 
@@ -155,11 +171,8 @@ async fn run(
     dialled: Option<&str>,
     number: u64,
 ) -> Result<Established, Failure> {
-    let negotiated = agreed(context, connection)?;
-    if let Some(why) = context.closed() {
-        let told = "this host cannot read whom it trusts, and takes nobody; its log says more";
-        return Err(Failure::Quietly { code: CloseCode::NotAllowed, told, why });
-    }
+    let negotiated = agreed(&context.config, negotiated(connection))?;
+    admits(context.closed())?;
     let psk_sae = psk_sae(context, side, &negotiated, dialled).await?;
     let qkd = context.keyring.is_some();
     let mut order = Order::new(side, qkd);
@@ -176,7 +189,9 @@ async fn run(
         };
         check(&ours, &theirs, psk_sae.as_deref())
             .map_err(|m| Failure::Ours(m.code, m.to_string()))?;
-        is_who_it_says(context, connection, &theirs)?;
+        if matches!(context.auth(), Some(Auth::Ca(_))) {
+            names_its_host(&chain(connection), &theirs)?;
+        }
         if side == Side::Server {
             writer.send(&Message::Hello(ours.clone())).await?;
         }
@@ -192,7 +207,7 @@ async fn run(
     let sealing = match (&context.keyring, &theirs.sae) {
         (Some(keyring), Some(sae)) => {
             let proof = Proof { keyring, connection, number, sae, outbox: &outbox };
-            let limit = PROOF_TIMEOUT + PROOF_CALLS * keyring.config.kme_answer_timeout;
+            let limit = proof_limit(keyring.config.kme_answer_timeout);
             let late =
                 |_| Failure::Ours(CloseCode::KeySupply, format!("no proof within {limit:?}"));
             let sealing = tokio::time::timeout(limit, async {
@@ -224,18 +239,20 @@ async fn run(
 
 /// What the handshake agreed on, checked against the settings once more: a defect in the TLS
 /// configuration must end here and not in a weaker link.
-fn agreed(context: &Context, connection: &Connection) -> Result<Negotiated, Failure> {
+pub(crate) fn agreed(
+    config: &Config,
+    negotiated: Option<Negotiated>,
+) -> Result<Negotiated, Failure> {
     let internal = |text: &str| Failure::Ours(CloseCode::Internal, text.into());
-    let negotiated =
-        negotiated(connection).ok_or_else(|| internal("the handshake is not complete"))?;
-    let wanted = match &context.config.security {
+    let negotiated = negotiated.ok_or_else(|| internal("the handshake is not complete"))?;
+    let wanted = match &config.security {
         Security::Classic(_) => KeyExchange::X25519MlKem768,
         Security::Qkd(qkd) => match qkd.kex {
             QkdKex::PskKe => KeyExchange::PskKe,
             QkdKex::PskDheKe => KeyExchange::PskDheKe,
         },
     };
-    if negotiated.key_exchange != wanted || negotiated.cipher != tls_cipher(context.config.cipher) {
+    if negotiated.key_exchange != wanted || negotiated.cipher != tls_cipher(config.cipher) {
         return Err(internal("the handshake agreed on something else than the settings"));
     }
     if negotiated.alpn != ALPN {
@@ -244,17 +261,22 @@ fn agreed(context: &Context, connection: &Connection) -> Result<Negotiated, Fail
     Ok(negotiated)
 }
 
+/// Refuses a peer while this host does not know whom to trust; `closed` says why.
+pub(crate) fn admits(closed: Option<String>) -> Result<(), Failure> {
+    let told = "this host cannot read whom it trusts, and takes nobody; its log says more";
+    match closed {
+        Some(why) => Err(Failure::Quietly { code: CloseCode::NotAllowed, told, why }),
+        None => Ok(()),
+    }
+}
+
 /// In `ca` a certificate stands for the hosts that it names: the peer must be one of them. In
 /// `pinned` the pin has the peer's name, and what it calls itself counts for nothing.
-fn is_who_it_says(
-    context: &Context,
-    connection: &Connection,
+pub(crate) fn names_its_host(
+    chain: &[CertificateDer<'_>],
     theirs: &Hello,
 ) -> Result<(), Failure> {
-    if !matches!(context.auth(), Some(Auth::Ca(_))) {
-        return Ok(());
-    }
-    if chain(connection).first().is_some_and(|c| CaMaterial::is_for_host(c, &theirs.host)) {
+    if chain.first().is_some_and(|c| CaMaterial::is_for_host(c, &theirs.host)) {
         return Ok(());
     }
     let text = format!(
@@ -281,11 +303,14 @@ async fn psk_sae(
         .map_err(|e| Failure::Ours(CloseCode::Internal, e.to_string()))?;
     match keyring.spent(identity, parsed.key_id()).await {
         Completion::First => Ok(Some(parsed.client_sae().to_owned())),
-        Completion::Reused => {
-            let text = "this PSK has completed a handshake before; a KME key is used once";
-            Err(Failure::Ours(CloseCode::KeyReused, text.into()))
-        }
+        Completion::Reused => Err(reused()),
     }
+}
+
+/// The PSK of the handshake was spent before.
+pub(crate) fn reused() -> Failure {
+    let text = "this PSK has completed a handshake before; a KME key is used once";
+    Failure::Ours(CloseCode::KeyReused, text.into())
 }
 
 async fn open_control(

@@ -276,20 +276,20 @@ impl Keyring {
         }
     }
 
-    /// The peer's KME gave it another key than this host's KME gave here, under the same key_ID.
-    pub(super) fn warn_disagreement(&self, peer: &str, what: &impl std::fmt::Display) {
-        tracing::warn!(
-            "the KMEs disagree about {what}: SAE {} has one key from {}, SAE {peer} another one from \
-             its own KME. It is given up and protects nothing. If this comes again, have the \
-             operators of both KMEs compare what they hold for these two SAEs",
-            self.config.sae_id,
-            self.config.kme_url,
-        );
-    }
-
     fn by_number(&self, number: u64) -> Option<Arc<PeerKeys>> {
         lock(&self.peers).values().find(|p| p.number == number).cloned()
     }
+}
+
+/// The peer's KME gave it another key than this host's KME gave here, under the same key_ID.
+pub(crate) fn warn_disagreement(config: &QkdConfig, peer: &str, what: &impl std::fmt::Display) {
+    tracing::warn!(
+        "the KMEs disagree about {what}: SAE {} has one key from {}, SAE {peer} another one from \
+         its own KME. It is given up and protects nothing. If this comes again, have the operators \
+         of both KMEs compare what they hold for these two SAEs",
+        config.sae_id,
+        config.kme_url,
+    );
 }
 
 /// The message keys of both directions with one peer SAE.
@@ -465,7 +465,7 @@ impl PeerKeys {
             tracing::warn!(peer = %self.sae, "{warning}");
         }
         if let Some(disagreement) = disagreement {
-            keyring.warn_disagreement(&self.sae, &disagreement);
+            warn_disagreement(&keyring.config, &self.sae, &disagreement);
         }
     }
 }

@@ -2,6 +2,7 @@
 
 use std::{sync::Arc, time::Duration};
 
+use axon_transport::config::QkdConfig;
 use quinn::Connection;
 
 use super::{
@@ -110,7 +111,7 @@ impl Proof<'_> {
                     if matches!(failure, ProofFailure::NoKey { .. }) {
                         tried.cost_nothing();
                     }
-                    return Err(self.failed(&failure));
+                    return Err(unproven(&self.keyring.config, &failure));
                 }
             }
             let until = proof.poll_timeout().map_or(Duration::from_secs(1), |at| {
@@ -137,22 +138,6 @@ impl Proof<'_> {
         }
         let keys = self.attach(&exporters)?;
         Ok(Some(Sealing { keys, exporters, first: proof.into_key() }))
-    }
-
-    /// What the peer is told, and what the log says: there is more in it where keys differ.
-    fn failed(&self, failure: &ProofFailure) -> Failure {
-        let code = CloseCode::from_code(failure.code()).unwrap_or(CloseCode::Proof);
-        if !matches!(failure, ProofFailure::WrongProof(_)) {
-            return Failure::Ours(code, failure.to_string());
-        }
-        let (told, config) = ("the proof does not fit the announced key", &self.keyring.config);
-        let why = format!(
-            "{failure}: it holds another key than this host, SAE {}, has from {}. Either the two \
-             KMEs disagree, and their operators must compare what they hold for these two SAEs, or \
-             somebody poses as that SAE",
-            config.sae_id, config.kme_url,
-        );
-        Failure::Quietly { code, told, why }
     }
 
     /// Client: answers the server's ANNOUNCE.
@@ -231,4 +216,20 @@ impl Proof<'_> {
             }
         }
     }
+}
+
+/// What the peer is told, and what the log says: there is more in it where keys differ.
+pub(crate) fn unproven(config: &QkdConfig, failure: &ProofFailure) -> Failure {
+    let code = CloseCode::from_code(failure.code()).unwrap_or(CloseCode::Proof);
+    if !matches!(failure, ProofFailure::WrongProof(_)) {
+        return Failure::Ours(code, failure.to_string());
+    }
+    let told = "the proof does not fit the announced key";
+    let why = format!(
+        "{failure}: it holds another key than this host, SAE {}, has from {}. Either the two KMEs \
+         disagree, and their operators must compare what they hold for these two SAEs, or somebody \
+         poses as that SAE",
+        config.sae_id, config.kme_url,
+    );
+    Failure::Quietly { code, told, why }
 }

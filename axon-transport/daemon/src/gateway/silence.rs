@@ -78,7 +78,11 @@ pub(crate) struct Traffic {
 
 impl Traffic {
     pub(crate) fn of(connection: &Connection) -> Self {
-        let stats = connection.stats();
+        Self::from(&connection.stats())
+    }
+
+    /// The counters in these statistics of a connection.
+    pub(crate) fn from(stats: &quinn_proto::ConnectionStats) -> Self {
         let sent = stats.frame_tx;
         let asked = sent.stream
             + sent.datagram
@@ -172,7 +176,7 @@ impl Watch {
 
 /// What to do for a silent link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Step {
+pub(crate) enum Step {
     /// Send a probe.
     Probe,
     /// Dial a successor: the path works.
@@ -182,7 +186,7 @@ enum Step {
 /// Decides when a silent link is probed and when it is replaced. A state machine as `docs/architecture.md`
 /// describes them; `now` is the time since the link was found silent.
 #[derive(Debug)]
-struct Prober {
+pub(crate) struct Prober {
     side: Side,
     next: Step,
     due: Duration,
@@ -194,29 +198,29 @@ struct Prober {
 
 impl Prober {
     /// The link was found silent: a probe is due.
-    fn new(side: Side) -> Self {
+    pub(crate) fn new(side: Side) -> Self {
         Self { side, next: Step::Probe, due: Duration::ZERO, asked: false, again: AGAIN }
     }
 
     /// Whether an answer to a probe counts.
-    fn awaits_echo(&self) -> bool {
+    pub(crate) fn awaits_echo(&self) -> bool {
         self.asked
     }
 
     /// A probe was answered: QUIC is given some time more.
-    fn handle_echo(&mut self, now: Duration) {
+    pub(crate) fn handle_echo(&mut self, now: Duration) {
         let grace = if now < LONG { GRACE } else { GRACE_AFTER_LONG };
         let more = if self.side == Side::Client { Duration::ZERO } else { DIALLED };
         (self.next, self.due, self.asked) = (Step::Replace, now + grace + more, false);
     }
 
     /// When to call [`handle_timeout`](Self::handle_timeout).
-    fn poll_timeout(&self) -> Option<Duration> {
+    pub(crate) fn poll_timeout(&self) -> Option<Duration> {
         Some(self.due)
     }
 
     /// What is due at `now`.
-    fn handle_timeout(&mut self, now: Duration) -> Option<Step> {
+    pub(crate) fn handle_timeout(&mut self, now: Duration) -> Option<Step> {
         if now < self.due {
             return None;
         }

@@ -27,12 +27,12 @@ use super::{GatewayError, keyring::lock};
 ///
 /// # Errors
 /// A file that cannot, by the name of its variable.
-pub(super) fn check(classic: &ClassicConfig) -> Result<(), GatewayError> {
+pub(crate) fn check(classic: &ClassicConfig) -> Result<(), GatewayError> {
     Sources::of(classic)?.load(None).map(drop)
 }
 
 /// What this host is, and whom it trusts, as its files say.
-pub(super) struct Identity {
+pub(crate) struct Identity {
     sources: Sources,
     host: String,
     in_force: RwLock<InForce>,
@@ -51,7 +51,7 @@ impl Identity {
     /// # Errors
     /// A file that cannot be used, by the name of its variable; or a certificate that does not say
     /// which host this is.
-    pub(super) fn load(classic: &ClassicConfig, node: &str) -> Result<Self, GatewayError> {
+    pub(crate) fn load(classic: &ClassicConfig, node: &str) -> Result<Self, GatewayError> {
         let sources = Sources::of(classic)?;
         // Before they are read: what is written meanwhile is read again.
         let watch = Watch::new(sources.files());
@@ -62,28 +62,28 @@ impl Identity {
     }
 
     /// What this host is called in HELLO.
-    pub(super) fn host(&self) -> &str {
+    pub(crate) fn host(&self) -> &str {
         &self.host
     }
 
     /// What is in force.
-    pub(super) fn auth(&self) -> Auth {
+    pub(crate) fn auth(&self) -> Auth {
         self.in_force.read().unwrap_or_else(PoisonError::into_inner).auth.clone()
     }
 
     /// Why nobody new is let in now, for people on this host.
-    pub(super) fn closed(&self) -> Option<String> {
+    pub(crate) fn closed(&self) -> Option<String> {
         self.in_force.read().unwrap_or_else(PoisonError::into_inner).closed.clone()
     }
 
     /// Whether there are files that can change.
-    pub(super) fn has_files(&self) -> bool {
+    pub(crate) fn has_files(&self) -> bool {
         !lock(&self.watch).is_empty()
     }
 
     /// Looks whether the files changed, a few times a second; whether something else is in force
     /// now. Blocks on the file system.
-    pub(super) fn look(&self, now: Instant) -> bool {
+    pub(crate) fn look(&self, now: Instant) -> bool {
         let mut watch = lock(&self.watch);
         match watch.look(now) {
             Look::Same | Look::Changing => false,

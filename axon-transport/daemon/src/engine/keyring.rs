@@ -1,0 +1,450 @@
+//! All KME keys of the daemon in `qkd`: connects the machines of [`crate::keys`] with the KME and with the
+//! control streams.
+//!
+//! The owner drains [`poll_request`](Keyring::poll_request), [`poll_message`](Keyring::poll_message),
+//! [`poll_record`](Keyring::poll_record) and [`poll_changed`](Keyring::poll_changed) after each call that
+//! changes the keyring.
+
+use std::{
+    collections::{HashMap, VecDeque},
+    fmt, mem,
+    net::IpAddr,
+    sync::Arc,
+    time::Duration,
+};
+
+use axon_envelope::{KeyId, KmeKey};
+use axon_transport::config::{Config, KeyMode, QkdConfig, Security};
+
+use crate::{
+    gateway::{keyring::warn_disagreement, tls_settings::tls_cipher},
+    keys::{
+        Acceptor, Answer, Clock, Completion, Dial, Dialler, Event, Exporters, KeyMessage, Origin,
+        Receiver, Request, Resolver, Sender, Statistics, SupplyError, UsedStatistics,
+    },
+};
+
+#[cfg(test)]
+pub(crate) mod tests;
+
+/// Time between two looks for keys whose time is over.
+const EXPIRE_EVERY: Duration = Duration::from_secs(1);
+/// Shortest time to the next poll of a peer's machines: a deadline of theirs may be over although they
+/// wait for an answer of the KME.
+const SHORTEST_WAIT: Duration = Duration::from_millis(5);
+
+/// The keys of the daemon in `qkd`.
+pub(crate) struct Keyring {
+    /// The settings of `qkd`.
+    pub(crate) config: QkdConfig,
+    /// Look-up of PSKs for incoming handshakes. TLS calls it in the middle of a handshake.
+    pub(crate) acceptor: Acceptor,
+    /// The time of the acceptor: the engine's, as of the last call.
+    clock: Clock,
+    dialler: Dialler,
+    /// Whether the dialler may have a request.
+    dialler_touched: bool,
+    /// By number. A peer stays: its keys outlive connections.
+    peers: Vec<PeerKeys>,
+    /// Numbers by SAE ID.
+    numbers: HashMap<String, usize>,
+    /// The numbers of peers by attached connection.
+    connections: HashMap<u64, usize>,
+    /// Peers whose machines may have requests or messages.
+    touched: Vec<usize>,
+    requests: VecDeque<(Origin, Request)>,
+    messages: VecDeque<(u64, KeyMessage)>,
+    records: VecDeque<(u64, String)>,
+    changed: VecDeque<u64>,
+    /// When keys are next expired.
+    expires: Duration,
+}
+
+/// The message keys of both directions with one peer SAE.
+struct PeerKeys {
+    sae: String,
+    sender: Sender,
+    receiver: Receiver,
+    /// Whether it is in [`Keyring::touched`].
+    touched: bool,
+    /// When its machines have to be polled without other cause.
+    due: Option<Duration>,
+}
+
+/// The destination of a KME answer.
+#[derive(Debug)]
+#[must_use]
+pub(crate) enum Answered {
+    /// The keyring took the answer.
+    Here,
+    /// The dialler took the answer: each dial that waits for a key can go on.
+    Dialler,
+    /// The answer is for the opening of this connection.
+    Opening(u64, Answer),
+}
+
+impl fmt::Debug for Keyring {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Keyring").field("sae", &self.config.sae_id).finish_non_exhaustive()
+    }
+}
+
+impl Keyring {
+    /// The keyring of a daemon in `qkd`, `None` in `classic`.
+    pub(crate) fn new(config: &Config) -> Option<Self> {
+        let Security::Qkd(qkd) = &config.security else { return None };
+        let (clock, cipher) = (Clock::manual(), tls_cipher(config.cipher));
+        let allowed = qkd.peers.clone();
+        Some(Self {
+            acceptor: Acceptor::new(&qkd.sae_id, allowed.clone(), cipher, clock.clone()),
+            dialler: Dialler::new(&qkd.sae_id, allowed, cipher, qkd.kme_answer_timeout),
+            clock,
+            dialler_touched: false,
+            peers: Vec::new(),
+            numbers: HashMap::new(),
+            connections: HashMap::new(),
+            touched: Vec::new(),
+            requests: VecDeque::new(),
+            messages: VecDeque::new(),
+            records: VecDeque::new(),
+            changed: VecDeque::new(),
+            expires: EXPIRE_EVERY,
+            config: qkd.clone(),
+        })
+    }
+
+    /// Whether data is sealed per message.
+    pub(crate) fn seals_messages(&self) -> bool {
+        self.config.key_mode == KeyMode::Messages10
+    }
+
+    /// Moves the acceptor's time to `now`. The owner calls it before it gives a datagram to QUIC, because
+    /// TLS then asks the acceptor; every other method that takes `now` does the same.
+    pub(crate) fn set_time(&self, now: Duration) {
+        self.clock.advance(now.saturating_sub(self.clock.now()));
+    }
+
+    /// The resolver for one incoming connection from a validated `source`.
+    pub(crate) fn resolver(&self, now: Duration, source: IpAddr) -> Arc<Resolver> {
+        self.set_time(now);
+        self.acceptor.resolver(source)
+    }
+
+    /// Whether and with which key to dial `sae` now.
+    pub(crate) fn dial(&mut self, now: Duration, sae: &str) -> Dial {
+        self.dialler().dial(now, sae)
+    }
+
+    /// The dialler, for how a dial ended.
+    pub(crate) fn dialler(&mut self) -> &mut Dialler {
+        self.dialler_touched = true;
+        &mut self.dialler
+    }
+
+    /// The TLS handshake of connection `link` under `identity`, with the key `key_id`, is complete: the
+    /// key is spent. After [`Completion::First`] the ledger of used keys still has to be asked
+    /// ([`poll_record`](Self::poll_record)).
+    pub(crate) fn spent(
+        &mut self,
+        now: Duration,
+        link: u64,
+        identity: &[u8],
+        key_id: &str,
+    ) -> Completion {
+        self.set_time(now);
+        let completion = self.acceptor.spent(identity);
+        if completion == Completion::First {
+            self.records.push_back((link, key_id.to_owned()));
+        }
+        completion
+    }
+
+    /// The client at `source` proved that it is `sae`: the acceptor knows both from now on.
+    pub(crate) fn authenticated(&self, now: Duration, source: IpAddr, sae: &str) {
+        self.set_time(now);
+        self.acceptor.authenticated(source, sae);
+    }
+
+    /// A connection with the peer `sae` begins: it can receive announced keys.
+    ///
+    /// # Errors
+    /// The SAE IDs make no channel, or the system gives no random bytes.
+    pub(crate) fn attach_receiver(
+        &mut self,
+        now: Duration,
+        connection: u64,
+        sae: &str,
+        exporters: &Exporters,
+    ) -> Result<(), SupplyError> {
+        let number = self.number(sae)?;
+        self.peers[number].receiver.attach(now, connection, exporters)?;
+        self.connections.insert(connection, number);
+        self.touch(number);
+        Ok(())
+    }
+
+    /// The connection was elected: keys may be announced on it. `first` is the key that proved the
+    /// client's name, under which the server seals its first messages.
+    ///
+    /// # Errors
+    /// The connection has no receiver, the SAE IDs make no channel, or the system gives no random bytes.
+    pub(crate) fn attach_sender(
+        &mut self,
+        now: Duration,
+        connection: u64,
+        exporters: &Exporters,
+        first: Option<(KeyId, KmeKey)>,
+    ) -> Result<(), SupplyError> {
+        let number = *self.connections.get(&connection).ok_or(SupplyError::Unattached(connection))?;
+        self.touch(number);
+        let sender = &mut self.peers[number].sender;
+        // RETIREs that the previous connection still gets: a successor has not closed it yet. If a third
+        // connection took its place before, nobody reads them.
+        let owed = sender.attach(now, connection, exporters)?;
+        self.messages.extend(owed);
+        if let Some((key_id, key)) = first {
+            sender.adopt(now, connection, key_id, key)?;
+        }
+        self.changed.push_back(connection);
+        Ok(())
+    }
+
+    /// A connection ended, or failed before it became a link.
+    pub(crate) fn forget_connection(&mut self, now: Duration, connection: u64) {
+        let Some(number) = self.connections.remove(&connection) else { return };
+        let peer = &mut self.peers[number];
+        peer.receiver.detach(now, connection);
+        peer.sender.detach(now, connection);
+        self.touch(number);
+    }
+
+    /// A key announcement came in on `connection`.
+    ///
+    /// # Errors
+    /// The peer broke a rule, or the connection has no receiver.
+    pub(crate) fn handle_message(
+        &mut self,
+        now: Duration,
+        connection: u64,
+        message: &KeyMessage,
+    ) -> Result<(), SupplyError> {
+        let number = *self.connections.get(&connection).ok_or(SupplyError::Unattached(connection))?;
+        self.touch(number);
+        let peer = &mut self.peers[number];
+        match message {
+            KeyMessage::Announce(_) | KeyMessage::Retire { .. } => {
+                peer.receiver.handle_message(now, connection, message)
+            }
+            KeyMessage::Ready { .. } | KeyMessage::Failed { .. } => {
+                let result = peer.sender.handle_message(now, connection, message);
+                peer.warn(now, &self.config);
+                self.changed.push_back(connection);
+                result
+            }
+        }
+    }
+
+    /// An answer of the KME.
+    pub(crate) fn handle_answer(&mut self, now: Duration, event: Event) -> Answered {
+        self.set_time(now);
+        let Event { origin, answer } = event;
+        match origin {
+            Origin::Dialler => {
+                self.dialler().handle_answer(now, answer);
+                return Answered::Dialler;
+            }
+            Origin::Acceptor => self.acceptor.handle_answer(answer),
+            Origin::Proof(link) | Origin::Responder(link) => {
+                return Answered::Opening(link, answer);
+            }
+            Origin::Sender(number) => {
+                if let Some(number) = self.known(number) {
+                    self.peers[number].sender.handle_answer(now, answer);
+                    self.touch(number);
+                }
+            }
+            Origin::Receiver(number) => {
+                if let Some(number) = self.known(number) {
+                    self.peers[number].receiver.handle_answer(now, answer);
+                    self.touch(number);
+                }
+            }
+        }
+        Answered::Here
+    }
+
+    /// The sender that seals for `connection`. `None` before
+    /// [`attach_sender`](Self::attach_sender), and from the time at which a successor has the keys.
+    pub(crate) fn sender(&mut self, connection: u64) -> Option<&mut Sender> {
+        let number = *self.connections.get(&connection)?;
+        if self.peers[number].sender.attached() != Some(connection) {
+            return None;
+        }
+        self.touch(number);
+        Some(&mut self.peers[number].sender)
+    }
+
+    /// The receiver that opens messages of `connection`, `None` once the connection has ended.
+    pub(crate) fn receiver(&mut self, connection: u64) -> Option<&mut Receiver> {
+        let number = *self.connections.get(&connection)?;
+        self.touch(number);
+        Some(&mut self.peers[number].receiver)
+    }
+
+    /// The next call to the KME, if any.
+    pub(crate) fn poll_request(&mut self, now: Duration) -> Option<(Origin, Request)> {
+        self.drain(now);
+        if let Some(request) = self.acceptor.poll_request() {
+            return Some((Origin::Acceptor, request));
+        }
+        self.requests.pop_front()
+    }
+
+    /// The next key announcement, and the connection on whose control stream it goes.
+    pub(crate) fn poll_message(&mut self, now: Duration) -> Option<(u64, KeyMessage)> {
+        self.drain(now);
+        loop {
+            let (connection, message) = self.messages.pop_front()?;
+            if self.connections.contains_key(&connection) {
+                return Some((connection, message));
+            }
+        }
+    }
+
+    /// The next key_ID to record in the ledger of used keys, which blocks on a file. The opening of the
+    /// connection takes the result (`Opening::handle_recorded`).
+    pub(crate) fn poll_record(&mut self) -> Option<(u64, String)> {
+        self.records.pop_front()
+    }
+
+    /// The next connection whose keys changed: its flows may seal again, or its opening may be over.
+    pub(crate) fn poll_changed(&mut self, now: Duration) -> Option<u64> {
+        self.drain(now);
+        let connection = self.changed.pop_front()?;
+        self.changed.retain(|other| *other != connection);
+        Some(connection)
+    }
+
+    /// When to call [`handle_timeout`](Self::handle_timeout).
+    pub(crate) fn poll_timeout(&self) -> Duration {
+        let due = self.peers.iter().filter_map(|peer| peer.due).min();
+        due.map_or(self.expires, |due| due.min(self.expires))
+    }
+
+    /// Polls the machines whose time has come, and expires keys.
+    pub(crate) fn handle_timeout(&mut self, now: Duration) {
+        self.set_time(now);
+        for number in 0..self.peers.len() {
+            if self.peers[number].due.is_some_and(|due| due <= now) {
+                self.touch(number);
+            }
+        }
+        if now < self.expires {
+            return;
+        }
+        self.expires = now + EXPIRE_EVERY;
+        self.acceptor.expire();
+        self.dialler_touched = true;
+        for number in 0..self.peers.len() {
+            let peer = &mut self.peers[number];
+            peer.receiver.handle_timeout(now);
+            peer.warn(now, &self.config);
+            self.touch(number);
+        }
+    }
+
+    /// For status: counters of the KME client, of the ledger of used keys, and of each peer's supply.
+    pub(crate) fn status(
+        &self,
+        now: Duration,
+        kme: &Statistics,
+        used: &UsedStatistics,
+    ) -> serde_json::Value {
+        let peers: serde_json::Map<_, _> = self
+            .peers
+            .iter()
+            .map(|peer| {
+                let status = serde_json::json!({
+                    "sending": peer.sender.statistics(now),
+                    "receiving": peer.receiver.statistics(),
+                });
+                (peer.sae.clone(), status)
+            })
+            .collect();
+        serde_json::json!({ "kme": kme, "peers": peers, "used_keys": used })
+    }
+
+    /// The number of the peer `sae`, from now on if it has none.
+    fn number(&mut self, sae: &str) -> Result<usize, SupplyError> {
+        if let Some(number) = self.numbers.get(sae) {
+            return Ok(*number);
+        }
+        let number = self.peers.len();
+        self.peers.push(PeerKeys {
+            sae: sae.to_owned(),
+            sender: Sender::new(&self.config.sae_id, sae)?,
+            receiver: Receiver::new(&self.config.sae_id, sae)?,
+            touched: false,
+            due: None,
+        });
+        self.numbers.insert(sae.to_owned(), number);
+        Ok(number)
+    }
+
+    /// The number in an [`Origin`], if it is a peer's.
+    fn known(&self, number: u64) -> Option<usize> {
+        usize::try_from(number).ok().filter(|number| *number < self.peers.len())
+    }
+
+    fn touch(&mut self, number: usize) {
+        if !mem::replace(&mut self.peers[number].touched, true) {
+            self.touched.push(number);
+        }
+    }
+
+    /// Takes from the touched machines what they ask for and have to say.
+    fn drain(&mut self, now: Duration) {
+        self.set_time(now);
+        if mem::take(&mut self.dialler_touched) {
+            while let Some(request) = self.dialler.poll_request(now) {
+                self.requests.push_back((Origin::Dialler, request));
+            }
+        }
+        while let Some(number) = self.touched.pop() {
+            let peer = &mut self.peers[number];
+            peer.touched = false;
+            // Small: the number of peers that have or had a link.
+            let origin = number as u64;
+            while let Some(request) = peer.receiver.poll_request(now) {
+                self.requests.push_back((Origin::Receiver(origin), request));
+            }
+            while let Some((connection, message)) = peer.receiver.poll_message() {
+                if matches!(message, KeyMessage::Ready { .. }) {
+                    self.changed.push_back(connection);
+                }
+                self.messages.push_back((connection, message));
+            }
+            while let Some(request) = peer.sender.poll_request(now) {
+                self.requests.push_back((Origin::Sender(origin), request));
+            }
+            while let Some(message) = peer.sender.poll_message(now) {
+                self.messages.push_back(message);
+            }
+            let due = [peer.sender.poll_timeout(), peer.receiver.poll_timeout()];
+            let due = due.into_iter().flatten().min();
+            peer.due = due.map(|due| due.max(now + SHORTEST_WAIT));
+        }
+    }
+}
+
+impl PeerKeys {
+    /// Logs what the owner of this host should know of the keys.
+    fn warn(&mut self, now: Duration, config: &QkdConfig) {
+        if let Some(warning) = self.sender.warning(now) {
+            tracing::warn!(peer = %self.sae, "{warning}");
+        }
+        if let Some(disagreement) = self.sender.disagreement(now) {
+            warn_disagreement(config, &self.sae, &disagreement);
+        }
+    }
+}

@@ -1,0 +1,369 @@
+//! Dials a peer: each candidate address in turn, in qkd with one bootstrap key that is dialled again until
+//! the peer's KME has it (`docs/formats.md`, section 2).
+//!
+//! The machine has no `handle_timeout`: [`poll_action`](Dialling::poll_action) does what is due.
+
+use std::{fmt, net::SocketAddr, sync::Arc, time::Duration};
+
+use axon_envelope::KeyId;
+use quinn_proto::{ConnectError, ConnectionError};
+
+use crate::{
+    engine::keyring::Keyring,
+    gateway::{
+        Refusal,
+        dial::{
+            DECRYPT_ERROR, HANDSHAKE_TIMEOUT, Target, UNKNOWN_PSK_IDENTITY, Unreached, dial_limit,
+        },
+        keyring::warn_disagreement,
+    },
+    keys::{Attempt, Completion, Dial},
+    link::CloseCode,
+};
+
+#[cfg(test)]
+mod tests;
+
+/// Longest wait for a key until the dialler is asked again.
+const ASK_AGAIN: Duration = Duration::from_secs(1);
+/// A dial whose key needs a longer wait is given up; discovery dials again.
+const LONGEST_WAIT: Duration = Duration::from_secs(2);
+
+/// One dial of one peer.
+pub(crate) struct Dialling {
+    target: Target,
+    /// The whole dial ends at this time, `limit` after its start.
+    deadline: Duration,
+    limit: Duration,
+    state: State,
+    /// Why the dial last waited: logged once.
+    waited_for: String,
+}
+
+enum State {
+    /// The key of the next attempt has to be chosen, in classic none.
+    Choose,
+    /// No key can be used before this time, or before the dialler has an answer.
+    WaitForKey(Duration),
+    /// The addresses from `next` on are to be tried.
+    Try(Round),
+    /// A handshake with the address before `next` is under way until this time.
+    Connecting(Round, Duration),
+    /// That handshake ended.
+    Ended(Round, Outcome),
+    /// The connection is given up: the dial ends with the next poll.
+    Ending(Refusal),
+    /// The dial ended.
+    Over,
+}
+
+/// One pass over the addresses, in qkd under one key.
+struct Round {
+    attempt: Option<Arc<Attempt>>,
+    next: usize,
+    last: Unreached,
+}
+
+impl Round {
+    fn new(attempt: Option<Arc<Attempt>>) -> Self {
+        Self { attempt, next: 0, last: Unreached::Silence("no address to dial".into()) }
+    }
+}
+
+/// How a handshake ended.
+enum Outcome {
+    Connected,
+    Failed(ConnectionError),
+    /// No packet was sent.
+    Unreachable(String),
+    /// The TLS settings make no client.
+    Unusable(String),
+}
+
+/// What the owner has to do next.
+#[derive(Debug)]
+pub(crate) enum Action {
+    /// Start a handshake with this address, in qkd under this key.
+    Connect {
+        /// The address.
+        address: SocketAddr,
+        /// The PSK, in qkd.
+        attempt: Option<Arc<Attempt>>,
+    },
+    /// Close the connection of the last [`Connect`](Self::Connect). The dial takes no event of it any
+    /// more.
+    Close {
+        /// The application error code.
+        code: CloseCode,
+        /// The reason for the peer.
+        reason: &'static str,
+    },
+    /// The handshake of the last [`Connect`](Self::Connect) is complete: the opening begins. The dial is
+    /// over.
+    Open,
+    /// No address became a connection. The dial is over.
+    Failed(Refusal),
+}
+
+/// Ends a handshake that takes too long, as a dropped connection ends.
+const ABANDON: Action = Action::Close { code: CloseCode::Goodbye, reason: "" };
+
+impl fmt::Debug for Dialling {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Dialling").field("target", &self.target).finish_non_exhaustive()
+    }
+}
+
+impl Dialling {
+    /// Dials `target`, in qkd with the keys of this daemon.
+    pub(crate) fn new(now: Duration, target: Target, keyring: Option<&Keyring>) -> Self {
+        let limit = dial_limit(keyring.map(|keyring| keyring.config.kme_answer_timeout));
+        let (state, waited_for) = (State::Choose, String::new());
+        Self { target, deadline: now + limit, limit, state, waited_for }
+    }
+
+    /// The peer that is dialled.
+    pub(crate) fn target(&self) -> &Target {
+        &self.target
+    }
+
+    /// The handshake is complete.
+    pub(crate) fn handle_connected(&mut self) {
+        self.end(Outcome::Connected);
+    }
+
+    /// The connection ended before its handshake was complete.
+    pub(crate) fn handle_failed(&mut self, error: &ConnectionError) {
+        self.end(Outcome::Failed(error.clone()));
+    }
+
+    /// No handshake could be started with the address: no local address reaches it, or QUIC refused with
+    /// this error.
+    pub(crate) fn handle_unreachable(&mut self, error: Option<&ConnectError>) {
+        let State::Connecting(round, _) = &self.state else { return };
+        let address = self.target.addresses[round.next - 1];
+        self.end(Outcome::Unreachable(match error {
+            None => {
+                format!("{address} cannot be reached from the addresses in AXON_BIND_ADDRS")
+            }
+            Some(error) => format!("{address}: {error}"),
+        }));
+    }
+
+    /// The settings, or the key, make no TLS client.
+    pub(crate) fn handle_unusable(&mut self, error: impl fmt::Display) {
+        self.end(Outcome::Unusable(error.to_string()));
+    }
+
+    /// The dialler took an answer of the KME: a dial that waits for a key asks for it again.
+    pub(crate) fn handle_key(&mut self) {
+        if let State::WaitForKey(_) = self.state {
+            self.state = State::Choose;
+        }
+    }
+
+    /// When to call [`poll_action`](Self::poll_action) without other cause.
+    pub(crate) fn poll_timeout(&self) -> Option<Duration> {
+        match &self.state {
+            State::Over => None,
+            State::WaitForKey(until) | State::Connecting(_, until) => {
+                Some((*until).min(self.deadline))
+            }
+            // At once.
+            _ => Some(Duration::ZERO),
+        }
+    }
+
+    /// What to do next. `keyring` is that of a daemon in qkd.
+    pub(crate) fn poll_action(
+        &mut self,
+        now: Duration,
+        mut keyring: Option<&mut Keyring>,
+    ) -> Option<Action> {
+        loop {
+            match std::mem::replace(&mut self.state, State::Over) {
+                State::Over => return None,
+                State::Ending(refusal) => return Some(Action::Failed(refusal)),
+                State::Ended(round, outcome) => {
+                    let action = self.ended(now, round, outcome, keyring.as_deref_mut());
+                    if action.is_some() {
+                        return action;
+                    }
+                }
+                state if now >= self.deadline => {
+                    let late = Refusal::network(format!("no answer within {:?}", self.limit));
+                    if let State::Connecting(..) = state {
+                        self.state = State::Ending(late);
+                        return Some(ABANDON);
+                    }
+                    return Some(Action::Failed(late));
+                }
+                State::Connecting(round, until) if now < until => {
+                    self.state = State::Connecting(round, until);
+                    return None;
+                }
+                State::Connecting(round, _) => {
+                    self.silent(round);
+                    return Some(ABANDON);
+                }
+                State::WaitForKey(until) if now < until => {
+                    self.state = State::WaitForKey(until);
+                    return None;
+                }
+                State::WaitForKey(_) | State::Choose => {
+                    let action = self.choose(now, keyring.as_deref_mut());
+                    if action.is_some() {
+                        return action;
+                    }
+                }
+                State::Try(mut round) => {
+                    let Some(address) = self.target.addresses.get(round.next).copied() else {
+                        let refusal = round.last.refusal();
+                        match self.refused(now, &round, refusal, keyring.as_deref_mut()) {
+                            Some(action) => return Some(action),
+                            None => continue,
+                        }
+                    };
+                    round.next += 1;
+                    let attempt = round.attempt.clone();
+                    self.state = State::Connecting(round, now + HANDSHAKE_TIMEOUT);
+                    return Some(Action::Connect { address, attempt });
+                }
+            }
+        }
+    }
+
+    fn end(&mut self, outcome: Outcome) {
+        match std::mem::replace(&mut self.state, State::Over) {
+            State::Connecting(round, _) => self.state = State::Ended(round, outcome),
+            // An event of a connection that the dial gave up.
+            other => self.state = other,
+        }
+    }
+
+    /// Chooses the key of the next round.
+    fn choose(&mut self, now: Duration, keyring: Option<&mut Keyring>) -> Option<Action> {
+        let Some(keyring) = keyring else {
+            self.state = State::Try(Round::new(None));
+            return None;
+        };
+        let Some(sae) = self.target.sae.as_deref() else {
+            let text = "the peer states no SAE ID: it is not in qkd";
+            return Some(Action::Failed(Refusal::here(CloseCode::Mode, text)));
+        };
+        match keyring.dial(now, sae) {
+            Dial::Refused(reason) => {
+                Some(Action::Failed(Refusal::here(CloseCode::NotAllowed, reason)))
+            }
+            Dial::Wait { until, why } => {
+                // Given up until the next dial: the dialler is in its backoff.
+                if until.is_some_and(|until| until > now + LONGEST_WAIT) {
+                    return Some(Action::Failed(Refusal::here(CloseCode::KeySupply, why)));
+                }
+                if self.waited_for != why {
+                    tracing::debug!(peer = sae, why, "dial waits");
+                    self.waited_for = why;
+                }
+                let again = now + ASK_AGAIN;
+                self.state = State::WaitForKey(until.map_or(again, |until| until.min(again)));
+                None
+            }
+            Dial::Attempt(attempt) => {
+                self.state = State::Try(Round::new(Some(Arc::new(attempt))));
+                None
+            }
+        }
+    }
+
+    /// What follows from the end of a handshake.
+    fn ended(
+        &mut self,
+        now: Duration,
+        mut round: Round,
+        outcome: Outcome,
+        keyring: Option<&mut Keyring>,
+    ) -> Option<Action> {
+        match outcome {
+            Outcome::Connected => Some(self.connected(now, &round, keyring)),
+            Outcome::Unusable(error) => {
+                Some(Action::Failed(Refusal::here(CloseCode::Internal, error)))
+            }
+            Outcome::Unreachable(reason) => {
+                round.last = Unreached::Silence(reason);
+                self.state = State::Try(round);
+                None
+            }
+            Outcome::Failed(ConnectionError::TimedOut) => {
+                self.silent(round);
+                None
+            }
+            // The peer that answers at one address answers at all of them.
+            Outcome::Failed(error) => self.refused(now, &round, Refusal::of(&error), keyring),
+        }
+    }
+
+    /// The address before `next` did not answer.
+    fn silent(&mut self, mut round: Round) {
+        let address = self.target.addresses[round.next - 1];
+        round.last = Unreached::Silence(format!("{address} does not answer"));
+        self.state = State::Try(round);
+    }
+
+    /// The handshake is complete: in qkd its key is spent.
+    fn connected(
+        &mut self,
+        now: Duration,
+        round: &Round,
+        keyring: Option<&mut Keyring>,
+    ) -> Action {
+        let Some((keyring, sae, key_id)) = self.key(round, keyring) else { return Action::Open };
+        if keyring.dialler().succeeded(now, sae, key_id) == Completion::First {
+            return Action::Open;
+        }
+        let (code, reason) = (CloseCode::KeyReused, "this PSK has completed a handshake before");
+        self.state = State::Ending(Refusal::here(code, reason));
+        Action::Close { code, reason }
+    }
+
+    /// A round failed: in qkd the key may be dialled again.
+    fn refused(
+        &mut self,
+        now: Duration,
+        round: &Round,
+        refusal: Refusal,
+        keyring: Option<&mut Keyring>,
+    ) -> Option<Action> {
+        let Some((keyring, sae, key_id)) = self.key(round, keyring) else {
+            return Some(Action::Failed(refusal));
+        };
+        match refusal.alert {
+            Some(UNKNOWN_PSK_IDENTITY) => {
+                tracing::debug!(peer = sae, %refusal, "the peer does not have the key yet");
+                keyring.dialler().refused(now, sae, key_id);
+            }
+            Some(DECRYPT_ERROR) => {
+                tracing::debug!(peer = sae, %refusal, "the peer has another key");
+                if keyring.dialler().mismatched(now, sae, key_id) {
+                    let what = format_args!("key_ID {key_id}");
+                    warn_disagreement(&keyring.config, sae, &what);
+                }
+            }
+            _ => {
+                keyring.dialler().silent(now, sae, key_id);
+                return Some(Action::Failed(refusal));
+            }
+        }
+        self.state = State::Choose;
+        None
+    }
+
+    /// The key of a round, and the peer that it is for.
+    fn key<'a>(
+        &'a self,
+        round: &'a Round,
+        keyring: Option<&'a mut Keyring>,
+    ) -> Option<(&'a mut Keyring, &'a str, &'a KeyId)> {
+        let (keyring, attempt) = (keyring?, round.attempt.as_deref()?);
+        Some((keyring, self.target.sae.as_deref()?, &attempt.key_id))
+    }
+}

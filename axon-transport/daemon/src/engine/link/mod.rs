@@ -1,0 +1,5 @@
+//! From a dial, or an incoming handshake, to a link that awaits its election.
+
+pub(crate) mod dialling;
+pub(crate) mod opening;
+mod proving;

@@ -1,0 +1,476 @@
+//! From a completed TLS handshake to a connection that awaits its election: HELLO in both directions and, in
+//! qkd, the proof of the client's name (`docs/formats.md`, sections 2 and 6).
+//!
+//! After each call that changes the machine its owner drains [`poll_message`](Opening::poll_message), then
+//! [`poll_request`](Opening::poll_request), then [`poll_outcome`](Opening::poll_outcome). Key announcements
+//! that the keyring has for the connection go on its control stream before anything that the owner says
+//! because of the outcome: ELECTED must not overtake READY.
+
+use std::{collections::VecDeque, fmt, mem, net::SocketAddr, time::Duration};
+
+use axon_envelope::{KeyId, KmeKey};
+use axon_tls::{Negotiated, qkd::PskIdentity};
+use axon_transport::config::{ClassicAuth, Config, Security};
+use quinn_proto::ConnectionError;
+use rustls_pki_types::CertificateDer;
+
+use super::proving::Proving;
+use crate::{
+    engine::keyring::Keyring,
+    engine::control::FrameLimits,
+    gateway::{
+        Refusal,
+        control::ControlError,
+        establish::{Failure, HELLO_TIMEOUT, admits, agreed, names_its_host, reused},
+    },
+    keys::{Answer, Completion, Exporters, Origin, Request},
+    link::{
+        CloseCode, FrameError, Hello, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, Message,
+        Order, Side, check,
+    },
+};
+
+#[cfg(test)]
+mod tests;
+
+/// The facts of a completed TLS handshake.
+pub(crate) struct Handshake {
+    /// This daemon's number for the connection.
+    pub(crate) connection: u64,
+    /// Which end this side is.
+    pub(crate) side: Side,
+    /// The peer's address.
+    pub(crate) remote: SocketAddr,
+    /// What the two sides agreed on; `None` while the handshake is not complete.
+    pub(crate) negotiated: Option<Negotiated>,
+    /// The TLS exporters of the connection. They are used in qkd alone.
+    pub(crate) exporters: Option<Exporters>,
+    /// The certificates that the peer showed, or one raw public key.
+    pub(crate) chain: Vec<CertificateDer<'static>>,
+    /// The SAE that the client dialled, in qkd.
+    pub(crate) dialled: Option<String>,
+}
+
+/// One connection between its TLS handshake and its election.
+pub(crate) struct Opening {
+    connection: u64,
+    side: Side,
+    remote: SocketAddr,
+    ours: Hello,
+    /// In `ca`: the certificates that have to name the peer's host.
+    chain: Option<Vec<CertificateDer<'static>>>,
+    negotiated: Option<Negotiated>,
+    exporters: Option<Exporters>,
+    order: Order,
+    step: Step,
+    /// When the step ends at the latest.
+    until: Option<Duration>,
+    /// Both HELLOs were checked.
+    greeted: bool,
+    /// The opening succeeded.
+    opened: bool,
+    messages: VecDeque<Message>,
+    outcome: Option<Result<Opened, Refused>>,
+}
+
+enum Step {
+    /// Server in qkd: the ledger of used keys is asked about the PSK of this SAE.
+    Recording(String),
+    /// The peer's HELLO is due, in qkd with this SAE.
+    Hello(Option<String>),
+    /// The client's name is being proven, and HELLO was this.
+    Proof(Box<Proving>, Box<Hello>),
+    Over,
+}
+
+/// A connection whose peer said HELLO and, in qkd, proved its name.
+pub(crate) struct Opened {
+    /// The peer's HELLO.
+    pub(crate) hello: Hello,
+    /// What the handshake agreed on.
+    pub(crate) negotiated: Negotiated,
+    /// Judges the next messages.
+    pub(crate) order: Order,
+    /// The key material of the connection, in messages10. Its receiver is attached to the keyring.
+    pub(crate) sealing: Option<Sealing>,
+}
+
+/// What [`Keyring::attach_sender`] takes once the connection is elected.
+pub(crate) struct Sealing {
+    /// Bind the message keys to this connection.
+    pub(crate) exporters: Exporters,
+    /// Server: the key that proved the client's name, its first sending key.
+    pub(crate) first: Option<(KeyId, KmeKey)>,
+}
+
+/// Why a connection does not become a link. The keyring has let go of it.
+#[derive(Debug)]
+pub(crate) struct Refused {
+    /// For log and status.
+    pub(crate) refusal: Refusal,
+    /// The code and text with which this side closes the connection, if it does. The text may be longer
+    /// than a close takes.
+    pub(crate) close: Option<(CloseCode, String)>,
+}
+
+impl fmt::Debug for Opened {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Opened").field("hello", &self.hello).finish_non_exhaustive()
+    }
+}
+
+impl fmt::Debug for Opening {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut debug = f.debug_struct("Opening");
+        debug.field("connection", &self.connection).field("side", &self.side);
+        debug.finish_non_exhaustive()
+    }
+}
+
+impl Opening {
+    /// Begins with a connection whose TLS handshake is complete.
+    ///
+    /// `ours` is this side's HELLO, `closed` why this host accepts no new peer at present, and `keyring` that
+    /// of a daemon in qkd.
+    pub(crate) fn new(
+        now: Duration,
+        handshake: Handshake,
+        ours: Hello,
+        config: &Config,
+        closed: Option<String>,
+        mut keyring: Option<&mut Keyring>,
+    ) -> Self {
+        let Handshake { connection, side, remote, negotiated, exporters, chain, dialled } =
+            handshake;
+        let ca = matches!(&config.security, Security::Classic(c) if c.auth == ClassicAuth::Ca);
+        let mut opening = Self {
+            connection,
+            side,
+            remote,
+            ours,
+            chain: ca.then_some(chain),
+            negotiated: None,
+            exporters,
+            order: Order::new(side, keyring.is_some()),
+            step: Step::Hello(None),
+            until: None,
+            greeted: false,
+            opened: false,
+            messages: VecDeque::new(),
+            outcome: None,
+        };
+        let begun = agreed(config, negotiated).and_then(|negotiated| {
+            admits(closed)?;
+            opening.begin(now, negotiated, dialled, keyring.as_deref_mut())
+        });
+        if let Err(failure) = begun {
+            opening.fail(now, failure, None, keyring);
+        }
+        opening
+    }
+
+    /// This daemon's number for the connection.
+    pub(crate) fn connection(&self) -> u64 {
+        self.connection
+    }
+
+    /// Which end this side is.
+    pub(crate) fn side(&self) -> Side {
+        self.side
+    }
+
+    /// Whether the owner may read the next message from the control stream. What the peer sends
+    /// meanwhile waits in the stream.
+    pub(crate) fn reads(&self) -> bool {
+        match &self.step {
+            Step::Hello(_) => true,
+            Step::Proof(proving, _) => proving.reads(),
+            Step::Recording(_) | Step::Over => false,
+        }
+    }
+
+    /// The limits of the next frame.
+    pub(crate) fn limits(&self) -> FrameLimits {
+        FrameLimits {
+            frame: if self.greeted { MAX_FRAME } else { MAX_FRAME_BEFORE_HELLO },
+            inflated: if self.opened { MAX_INFLATED } else { MAX_FRAME_BEFORE_HELLO },
+        }
+    }
+
+    /// A message of a known type came. The owner calls it only while [`reads`](Self::reads) allows it: a
+    /// message at another time ends the opening.
+    pub(crate) fn handle_message(
+        &mut self,
+        now: Duration,
+        message: &Message,
+        mut keyring: Option<&mut Keyring>,
+    ) {
+        let taken = if self.reads() {
+            self.take(now, message, keyring.as_deref_mut())
+        } else {
+            let text = "a message was read before its time";
+            Err(Failure::Ours(CloseCode::Internal, text.into()))
+        };
+        match taken {
+            Ok(()) => self.advance(now, keyring),
+            Err(failure) => self.fail(now, failure, None, keyring),
+        }
+    }
+
+    /// The control stream carries bytes that are no frame.
+    pub(crate) fn handle_unreadable(
+        &mut self,
+        now: Duration,
+        error: FrameError,
+        keyring: Option<&mut Keyring>,
+    ) {
+        self.fail(now, ControlError::Frame(error).into(), None, keyring);
+    }
+
+    /// The peer ended the control stream; the connection stands.
+    pub(crate) fn handle_ended(&mut self, now: Duration, why: &str, keyring: Option<&mut Keyring>) {
+        self.fail(now, ControlError::Ended(why.to_owned()).into(), None, keyring);
+    }
+
+    /// The connection ended.
+    pub(crate) fn handle_lost(
+        &mut self,
+        now: Duration,
+        error: &ConnectionError,
+        keyring: Option<&mut Keyring>,
+    ) {
+        self.fail(now, Failure::Connection, Some(error), keyring);
+    }
+
+    /// The KME's answer to a request of this opening.
+    pub(crate) fn handle_answer(
+        &mut self,
+        now: Duration,
+        answer: Answer,
+        keyring: Option<&mut Keyring>,
+    ) {
+        if let Step::Proof(proving, _) = &mut self.step {
+            proving.handle_answer(now, answer);
+        }
+        self.advance(now, keyring);
+    }
+
+    /// The ledger of used keys recorded the PSK of the handshake; `first` when it was new there.
+    pub(crate) fn handle_recorded(
+        &mut self,
+        now: Duration,
+        first: bool,
+        keyring: Option<&mut Keyring>,
+    ) {
+        let Step::Recording(sae) = &mut self.step else { return };
+        let sae = mem::take(sae);
+        match first {
+            true => self.greet(now, Some(sae)),
+            false => self.fail(now, reused(), None, keyring),
+        }
+    }
+
+    /// The next message for the control stream.
+    pub(crate) fn poll_message(&mut self) -> Option<Message> {
+        self.messages.pop_front()
+    }
+
+    /// The next call to the KME, if any.
+    pub(crate) fn poll_request(&mut self, now: Duration) -> Option<(Origin, Request)> {
+        match &mut self.step {
+            Step::Proof(proving, _) => proving.poll_request(now),
+            _ => None,
+        }
+    }
+
+    /// How the opening ended, once. To be polled after each change of the connection's keys
+    /// ([`Keyring::poll_changed`]) as well.
+    pub(crate) fn poll_outcome(
+        &mut self,
+        now: Duration,
+        keyring: Option<&mut Keyring>,
+    ) -> Option<Result<Opened, Refused>> {
+        self.advance(now, keyring);
+        self.outcome.take()
+    }
+
+    /// When to call [`handle_timeout`](Self::handle_timeout).
+    pub(crate) fn poll_timeout(&self) -> Option<Duration> {
+        let proof = match &self.step {
+            Step::Proof(proving, _) => proving.poll_timeout(),
+            _ => None,
+        };
+        [self.until, proof].into_iter().flatten().min()
+    }
+
+    /// Ends a step whose time is over, and asks the KME again where that is due.
+    pub(crate) fn handle_timeout(&mut self, now: Duration, mut keyring: Option<&mut Keyring>) {
+        if let Step::Proof(proving, _) = &mut self.step {
+            proving.handle_timeout(now);
+        }
+        self.advance(now, keyring.as_deref_mut());
+        if self.until.is_none_or(|until| now < until) {
+            return;
+        }
+        let late = match &self.step {
+            Step::Hello(_) => Failure::Ours(CloseCode::OutOfOrder, "no HELLO within 5 s".into()),
+            Step::Proof(proving, _) => {
+                let text = format!("no proof within {:?}", proving.limit());
+                Failure::Ours(CloseCode::KeySupply, text)
+            }
+            Step::Recording(_) | Step::Over => return,
+        };
+        self.fail(now, late, None, keyring);
+    }
+
+    /// Finds out the peer's SAE by the PSK, in qkd. A server spends the PSK here: the client's Finished was
+    /// verified.
+    fn begin(
+        &mut self,
+        now: Duration,
+        negotiated: Negotiated,
+        dialled: Option<String>,
+        keyring: Option<&mut Keyring>,
+    ) -> Result<(), Failure> {
+        let Some(keyring) = keyring else {
+            self.negotiated = Some(negotiated);
+            self.greet(now, None);
+            return Ok(());
+        };
+        match self.side {
+            Side::Client => self.greet(now, dialled),
+            Side::Server => {
+                let identity = negotiated.psk_identity.as_deref().unwrap_or_default();
+                let parsed = PskIdentity::parse(identity)
+                    .map_err(|e| Failure::Ours(CloseCode::Internal, e.to_string()))?;
+                match keyring.spent(now, self.connection, identity, parsed.key_id()) {
+                    Completion::First => {
+                        self.step = Step::Recording(parsed.client_sae().to_owned());
+                    }
+                    Completion::Reused => return Err(reused()),
+                }
+            }
+        }
+        self.negotiated = Some(negotiated);
+        Ok(())
+    }
+
+    /// The client says HELLO, and both sides wait for the peer's.
+    fn greet(&mut self, now: Duration, psk_sae: Option<String>) {
+        if self.side == Side::Client {
+            self.messages.push_back(Message::Hello(self.ours.clone()));
+        }
+        self.step = Step::Hello(psk_sae);
+        self.until = Some(now + HELLO_TIMEOUT);
+    }
+
+    /// Takes the message that the step waits for.
+    fn take(
+        &mut self,
+        now: Duration,
+        message: &Message,
+        keyring: Option<&mut Keyring>,
+    ) -> Result<(), Failure> {
+        let out_of_order = |text: String| Failure::Ours(CloseCode::OutOfOrder, text);
+        self.order.accept(message).map_err(|e| out_of_order(e.to_string()))?;
+        match (&mut self.step, message, keyring) {
+            (Step::Hello(psk_sae), Message::Hello(theirs), keyring) => {
+                check(&self.ours, theirs, psk_sae.as_deref())
+                    .map_err(|m| Failure::Ours(m.code, m.to_string()))?;
+                if let Some(chain) = &self.chain {
+                    names_its_host(chain, theirs)?;
+                }
+                self.greeted(now, theirs, keyring)
+            }
+            (Step::Hello(_), ..) => Err(out_of_order("HELLO must come first".into())),
+            (Step::Proof(proving, _), Message::Keys(message), Some(keyring)) => {
+                proving.handle_message(now, message, keyring)
+            }
+            // KEEPALIVE.
+            _ => Ok(()),
+        }
+    }
+
+    /// The peer's HELLO is good.
+    fn greeted(
+        &mut self,
+        now: Duration,
+        theirs: &Hello,
+        keyring: Option<&mut Keyring>,
+    ) -> Result<(), Failure> {
+        if self.side == Side::Server {
+            self.messages.push_back(Message::Hello(self.ours.clone()));
+        }
+        self.greeted = true;
+        self.order.hello_checked(theirs.daemon < self.ours.daemon);
+        let Some(keyring) = keyring else {
+            self.open(theirs.clone(), None);
+            return Ok(());
+        };
+        let internal = |text: &str| Failure::Ours(CloseCode::Internal, text.into());
+        let sae = theirs.sae.as_deref().ok_or_else(|| internal("no SAE ID to prove"))?;
+        let exporters = self.exporters.as_ref().ok_or_else(|| internal("no TLS exporter"))?;
+        let (connection, source) = (self.connection, self.remote.ip());
+        let proving = match self.side {
+            Side::Server => Proving::demand(now, connection, source, sae, exporters, keyring),
+            Side::Client => Proving::give(now, connection, source, sae, exporters, keyring)?,
+        };
+        self.until = Some(now + proving.limit());
+        self.step = Step::Proof(Box::new(proving), Box::new(theirs.clone()));
+        Ok(())
+    }
+
+    /// Takes from the proof what it has to say, and its end.
+    fn advance(&mut self, now: Duration, keyring: Option<&mut Keyring>) {
+        let (Step::Proof(proving, hello), Some(keyring)) = (&mut self.step, keyring) else {
+            return;
+        };
+        while let Some(message) = proving.poll_message() {
+            self.messages.push_back(Message::Keys(message));
+        }
+        let Some(exporters) = &self.exporters else { return };
+        match proving.poll_outcome(now, exporters, keyring) {
+            None => {}
+            Some(Err(failure)) => self.fail(now, failure, None, Some(keyring)),
+            Some(Ok(first)) => {
+                let hello = (**hello).clone();
+                let exporters = self.exporters.take().filter(|_| keyring.seals_messages());
+                self.order.proven();
+                self.open(hello, exporters.map(|exporters| Sealing { exporters, first }));
+            }
+        }
+    }
+
+    /// The connection awaits its election.
+    fn open(&mut self, hello: Hello, sealing: Option<Sealing>) {
+        self.step = Step::Over;
+        self.until = None;
+        self.opened = true;
+        let order = self.order.clone();
+        if let Some(negotiated) = self.negotiated.take() {
+            self.outcome = Some(Ok(Opened { hello, negotiated, order, sealing }));
+        }
+    }
+
+    /// The connection does not become a link. `ended` is why it ended, if it did.
+    fn fail(
+        &mut self,
+        now: Duration,
+        failure: Failure,
+        ended: Option<&ConnectionError>,
+        keyring: Option<&mut Keyring>,
+    ) {
+        if matches!(self.step, Step::Over) && !matches!(self.outcome, Some(Ok(_))) {
+            return;
+        }
+        let (refusal, close) = failure.into_refusal(ended);
+        self.outcome = Some(Err(Refused { refusal, close }));
+        self.until = None;
+        if let Some(keyring) = keyring {
+            // Before the proof is dropped, which counts at this time.
+            keyring.set_time(now);
+            keyring.forget_connection(now, self.connection);
+        }
+        self.step = Step::Over;
+    }
+}
