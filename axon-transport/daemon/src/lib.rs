@@ -3,6 +3,8 @@
 
 mod control;
 mod discovery;
+#[cfg(test)]
+mod engine;
 mod files;
 mod gateway;
 mod keys;

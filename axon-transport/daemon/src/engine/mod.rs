@@ -1,0 +1,4 @@
+//! The gateway as one state machine without I/O.
+
+#[cfg(test)]
+mod sim;
