@@ -25,7 +25,7 @@ const DECRYPT_ERROR: u8 = 51;
 /// Handshakes under way at once, but for those of listed peers; further dials are refused and come again.
 pub(crate) const MAX_HANDSHAKES: usize = 64;
 /// A dialler that has its Retry is given this long for the rest of the handshake.
-const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
+pub(crate) const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// What came of an incoming dial.
 #[derive(Debug)]
@@ -125,7 +125,7 @@ async fn answer(context: &Arc<Context>, incoming: Incoming) -> Option<Incomer> {
 
 /// Why a handshake failed, with what the look-up of its key says; `None` where that is how every
 /// bootstrap begins: the key is being fetched, and the dialler comes again.
-fn explained(
+pub(crate) fn explained(
     error: &ConnectionError,
     resolver: Option<&Resolver>,
     source: SocketAddr,

@@ -28,7 +28,7 @@ const IDLE_TIMEOUT_MS: u32 = 20_000;
 /// Data streams a peer may open before its HELLO is checked; quinn allocates each of them.
 const STREAMS_BEFORE_HELLO: u32 = 128;
 /// Data streams of an open link: one per publisher and route, and best-effort messages in flight.
-const STREAMS_OPEN: u32 = 4096;
+pub(crate) const STREAMS_OPEN: u32 = 4096;
 const SOCKET_BUFFER: usize = 8 << 20;
 const SEND_WINDOW: u64 = 16 << 20;
 const STREAM_WINDOW: (u64, u64) = (1 << 20, 4 << 20);
@@ -168,7 +168,7 @@ impl HmacKey for ResetKey {
     }
 }
 
-fn endpoint_config(reset_key: &[u8; 32]) -> EndpointConfig {
+pub(crate) fn endpoint_config(reset_key: &[u8; 32]) -> EndpointConfig {
     let key = hmac::Key::new(hmac::HMAC_SHA256, reset_key);
     // Connection ids are checked before a stateless reset is sent, so those of the predecessor must
     // pass: their key is derived from the one that is kept.

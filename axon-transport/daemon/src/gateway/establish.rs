@@ -326,6 +326,6 @@ async fn open_control(
 }
 
 /// Where a peer is, for log and status.
-pub(super) fn peer_text(sae: Option<&str>, address: SocketAddr) -> String {
+pub(crate) fn peer_text(sae: Option<&str>, address: SocketAddr) -> String {
     sae.map_or_else(|| address.to_string(), |sae| format!("{sae} at {address}"))
 }

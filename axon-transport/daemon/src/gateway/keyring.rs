@@ -26,7 +26,7 @@ use crate::{
 };
 
 /// Locks a mutex; a panic elsewhere leaves nothing half-done that a later holder could trip over.
-pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 

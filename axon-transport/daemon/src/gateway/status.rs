@@ -1,15 +1,14 @@
 //! Who a peer is, and the status of a link.
 
-use std::{fmt, net::SocketAddr};
+use std::{fmt, net::SocketAddr, time::Duration};
 
 use axon_tls::{
     Negotiated,
     identity::{Auth, SpkiDigest},
 };
 use axon_transport::status::LinkStatus;
-use quinn::Connection;
 
-use super::{context::Context, hub::Summary};
+use super::hub::Summary;
 use crate::link::Hello;
 
 /// As whom a peer proved itself.
@@ -27,12 +26,17 @@ pub(crate) enum Who {
 
 impl Who {
     /// The peer of a link whose HELLO was checked.
-    pub(crate) fn of(context: &Context, hello: &Hello, negotiated: &Negotiated) -> Self {
-        if let (Some(_), Some(sae)) = (&context.keyring, &hello.sae) {
+    pub(crate) fn of(
+        qkd: bool,
+        auth: Option<&Auth>,
+        hello: &Hello,
+        negotiated: &Negotiated,
+    ) -> Self {
+        if let (true, Some(sae)) = (qkd, &hello.sae) {
             return Self::Sae(sae.clone());
         }
         let Some(key) = negotiated.peer else { return Self::Somebody(None) };
-        match context.auth() {
+        match auth {
             // The name can be gone by now: a pin that was removed after the handshake.
             Some(Auth::Pinned { trust, .. }) => match trust.name_of(&key) {
                 Some(name) => Self::Pinned(name, key),
@@ -80,7 +84,12 @@ impl fmt::Display for Who {
 }
 
 /// The status of a link, its counters aside.
-pub(crate) fn link(summary: &Summary, connection: &Connection, since_unix_ms: u64) -> LinkStatus {
+pub(crate) fn link(
+    summary: &Summary,
+    address: SocketAddr,
+    rtt: Duration,
+    since_unix_ms: u64,
+) -> LinkStatus {
     LinkStatus {
         peer: summary.hello.daemon.to_string(),
         host: match &summary.who {
@@ -89,13 +98,13 @@ pub(crate) fn link(summary: &Summary, connection: &Connection, since_unix_ms: u6
             _ => summary.hello.host.clone(),
         },
         sae: summary.hello.sae.clone(),
-        address: connection.remote_address().to_string(),
+        address: address.to_string(),
         state: "connected".into(),
         key_exchange: summary.negotiated.key_exchange.to_string(),
         cipher: summary.negotiated.cipher.name().into(),
         authenticated_as: summary.who.to_string(),
         since_unix_ms,
-        rtt_us: u64::try_from(connection.rtt().as_micros()).unwrap_or(u64::MAX),
+        rtt_us: u64::try_from(rtt.as_micros()).unwrap_or(u64::MAX),
         ..LinkStatus::default()
     }
 }

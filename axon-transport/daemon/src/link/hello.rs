@@ -47,6 +47,7 @@ impl Hello {
             replaces: None,
             expects: None,
             static_peer: false,
+            routes: None,
         }
     }
 

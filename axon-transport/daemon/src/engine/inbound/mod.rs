@@ -176,6 +176,16 @@ impl Inbound {
         !self.ready.is_empty()
     }
 
+    /// Streams that have something to read.
+    pub(crate) fn ready(&self) -> usize {
+        self.ready.len()
+    }
+
+    /// Forgets a stream that cannot be read any more.
+    pub(crate) fn forget_stream(&mut self, key: (u64, StreamId)) {
+        self.forget(key);
+    }
+
     /// The next stream that has something to read, and its link.
     pub(crate) fn next_ready(&mut self) -> Option<(u64, StreamId)> {
         let key = self.ready.pop_front()?;

@@ -92,7 +92,8 @@ impl Hub {
         }
         // Daemon ids are public: beacons carry them. Who has a link keeps it against anyone who
         // proves to be somebody else.
-        let who = Who::of(&self.context, &established.hello, &established.negotiated);
+        let (qkd, auth) = (self.context.keyring.is_some(), self.context.auth());
+        let who = Who::of(qkd, auth.as_ref(), &established.hello, &established.negotiated);
         if current.is_some_and(|c| !c.established.who.is(&who)) {
             return self.turn_away(established, TAKEN.into()).await;
         }

@@ -485,7 +485,12 @@ impl Hub {
             if let Some(link) = self.links.get(&peer.link) {
                 self.tell_lost(&self.peer_of(link), peer.counters.take_lost()).await;
                 let mut status =
-                    status::link(&link.established, &link.connection, link.since_unix_ms);
+                    status::link(
+                    &link.established,
+                    link.connection.remote_address(),
+                    link.connection.rtt(),
+                    link.since_unix_ms,
+                );
                 peer.counters.fill(&mut status);
                 peer.show_refused(&mut status);
                 peer.fill(&mut status);

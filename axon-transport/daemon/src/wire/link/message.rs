@@ -56,6 +56,9 @@ pub struct Hello {
     /// Whether the sender lists the receiver as a static peer.
     #[n(17)]
     pub static_peer: bool,
+    /// Routes that the sender serves a peer at most. Absent: 1,024.
+    #[n(18)]
+    pub routes: Option<u32>,
 }
 
 /// The connection that the lower daemon id keeps.

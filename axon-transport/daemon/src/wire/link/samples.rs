@@ -29,6 +29,7 @@ pub(crate) fn hello() -> Hello {
         replaces: None,
         expects: None,
         static_peer: false,
+        routes: None,
     }
 }
 

@@ -1,0 +1,307 @@
+//! Which of several connections with a peer becomes its link, and when a link is renewed.
+
+use std::{net::IpAddr, sync::Arc, time::Duration};
+
+use axon_shm::ids::DaemonId;
+use quinn_proto::{Dir, VarInt};
+
+use super::{
+    LinkEvent, LinkReport, Links, chain,
+    link::{LinkPeer, Phase, Silence},
+};
+use crate::{
+    discovery::AddressConfidence,
+    engine::link::opening::{Opened, Sealing},
+    gateway::{
+        Refusal,
+        dial::Target,
+        endpoint::{LINK_WINDOW, STREAMS_OPEN},
+        establish::peer_text,
+        hub::Summary,
+        shares::gives_way,
+        status::Who,
+    },
+    link::{Candidate, CloseCode, Elected, Message, Side, keep},
+};
+
+/// The peer elects one of its connections within this time.
+const ELECTION_TIMEOUT: Duration = Duration::from_secs(10);
+/// Links at a time.
+const MAX_LINKS: usize = 128 + 32;
+/// Links of one proven identity.
+const MAX_LINKS_OF_PEER: usize = 16;
+const TAKEN: &str = "this daemon id is linked already, under another identity";
+
+impl Links {
+    /// A connection's peer said HELLO and proved its name.
+    pub(super) fn established(&mut self, number: u64, opened: Opened, now: Duration) {
+        let (Some(connection), Some(link)) =
+            (self.connections.get(&number), self.links.get(&number))
+        else {
+            return;
+        };
+        let Opened { hello, negotiated, order, sealing } = opened;
+        let (side, address) = (link.side, connection.quic.remote_address());
+        let replaces = if side == Side::Server { hello.replaces } else { link.replaces };
+        let (daemon, ours) = (hello.daemon, self.hello.daemon);
+        let chain = chain(&connection.quic);
+        if let Some(why) = self.credentials.distrust(&negotiated, side, Some(&chain)) {
+            return self.turn_away(number, &hello, why, now);
+        }
+        let auth = self.credentials.auth();
+        let who = Who::of(self.keyring.is_some(), auth.as_ref(), &hello, &negotiated);
+        let current = self.current(daemon).and_then(|number| self.links.get(&number)?.peer.as_ref());
+        if current.is_some_and(|current| !current.summary.who.is(&who)) {
+            return self.turn_away(number, &hello, TAKEN.into(), now);
+        }
+        let peers = self.links.values().filter_map(|link| link.peer.as_ref());
+        let of_identity = peers.filter(|peer| peer.summary.who.is(&who)).count();
+        let links = self.links.values().filter(|link| link.peer.is_some()).count();
+        let is_new = current.is_none();
+        let too_many = if of_identity >= MAX_LINKS_OF_PEER {
+            Some("this peer has as many connections as it may")
+        } else if is_new && links >= MAX_LINKS && !self.make_place(address.ip(), now) {
+            Some("this daemon has as many links as it may, and no address has more than this one")
+        } else {
+            None
+        };
+        if let Some(text) = too_many {
+            let instant = self.instant(now);
+            if self.crowded.is_news(address.ip(), instant) {
+                return self.turn_away(number, &hello, text.into(), now);
+            }
+            self.links.remove(&number);
+            return self.close_connection(number, CloseCode::NotAllowed, text, now);
+        }
+        let current = self.current(daemon).and_then(|number| self.links.get(&number)?.peer.as_ref());
+        let successor = replaces.is_some()
+            && current.is_some_and(|current| current.elected.map(|e| e.link) == replaces);
+        let candidate = Candidate { side, successor };
+        let we_elect = ours < daemon;
+        if we_elect && current.is_some_and(|c| !keep(ours, daemon, c.candidate, candidate)) {
+            self.links.remove(&number);
+            self.close_connection(number, CloseCode::Duplicate, "another connection stands", now);
+            if side == Side::Client {
+                self.report(LinkReport::Up { daemon, address });
+            }
+            return;
+        }
+        let account = self.accounts.of(&who.host_identity(address));
+        let Some(connection) = self.connections.get_mut(&number) else { return };
+        connection.control.charge_to(Arc::clone(&account.unsent));
+        let Some(link) = self.links.get_mut(&number) else { return };
+        link.phase = Phase::Electing(now + ELECTION_TIMEOUT);
+        link.peer = Some(LinkPeer {
+            summary: Summary { hello, negotiated, who },
+            order,
+            candidate,
+            seals: sealing.is_some(),
+            sealing,
+            elected: None,
+            renew_at: None,
+            until: None,
+            since_unix_ms: axon_transport::status::unix_ms(),
+            unread: account.unread.nothing(),
+            account,
+            chain,
+            silence: Silence::new(),
+        });
+        if we_elect {
+            let elected = Elected { link: rand::random(), election: self.next_election };
+            self.next_election += 1;
+            self.send(number, &Message::Elected(elected), now);
+            if let Some(peer) = self.links.get_mut(&number).and_then(|link| link.peer.as_mut()) {
+                peer.order.elected();
+            }
+            self.open(number, elected, now);
+        }
+        self.touch(number);
+    }
+
+    fn turn_away(
+        &mut self,
+        number: u64,
+        hello: &crate::link::Hello,
+        why: String,
+        now: Duration,
+    ) {
+        let address = self.connections.get(&number).map(|c| c.quic.remote_address());
+        self.links.remove(&number);
+        self.close_connection(number, CloseCode::NotAllowed, &why, now);
+        if let Some(address) = address {
+            let peer = peer_text(hello.sae.as_deref(), address);
+            self.report(LinkReport::Refused(peer, Refusal::here(CloseCode::NotAllowed, why)));
+        }
+    }
+
+    /// Ends a link of an address that has more of them than a newcomer's.
+    fn make_place(&mut self, newcomer: IpAddr, now: Duration) -> bool {
+        let links = self.links.iter().filter(|(_, link)| link.peer.is_some());
+        let links: Vec<_> = links
+            .filter_map(|(number, _)| {
+                Some((self.connections.get(number)?.quic.remote_address().ip(), *number))
+            })
+            .collect();
+        let listed = |address: IpAddr| self.listed.contains(&address.to_canonical());
+        let Some(number) = gives_way(newcomer, &links, listed) else { return false };
+        let text = "a host at an address that has fewer links takes its place";
+        tracing::info!(%newcomer, "{text}");
+        let address = links.iter().find(|(_, other)| *other == number).map(|(ip, _)| *ip);
+        let instant = self.instant(now);
+        if let Some(address) = address
+            && self.crowded.is_news(address, instant)
+        {
+            let peer = self.peer_text(number);
+            self.report(LinkReport::Refused(peer, Refusal::here(CloseCode::NotAllowed, text)));
+        }
+        self.close_connection(number, CloseCode::NotAllowed, text, now);
+        self.end_link(number, text, None, now);
+        true
+    }
+
+    /// A link is elected: it carries samples from now on.
+    pub(super) fn open(&mut self, number: u64, elected: Elected, now: Duration) {
+        let Some(peer) = self.links.get(&number).and_then(|link| link.peer.as_ref()) else { return };
+        let daemon = peer.summary.hello.daemon;
+        let current = self.current(daemon);
+        let current_peer = current.and_then(|number| self.links.get(&number)?.peer.as_ref());
+        if current_peer.is_some_and(|current| !current.summary.who.is(&peer.summary.who)) {
+            return self.violation(number, CloseCode::NotAllowed, TAKEN, now);
+        }
+        let newer = current_peer.and_then(|current| current.elected);
+        let superseded = newer.is_some_and(|current| current.election > elected.election);
+        let age = self.keyring.as_ref().map(|keyring| keyring.config.session_max_age);
+        let Some(link) = self.links.get_mut(&number) else { return };
+        let side = link.side;
+        let Some(peer) = &mut link.peer else { return };
+        peer.elected = Some(elected);
+        if let Some(age) = age {
+            peer.until = Some(now + age);
+            peer.renew_at = (side == Side::Client).then(|| now + renewal_at(age));
+        }
+        link.phase = Phase::Open;
+        if let Some(connection) = self.connections.get_mut(&number) {
+            let streams = VarInt::from_u32(STREAMS_OPEN);
+            connection.quic.set_max_concurrent_streams(Dir::Uni, streams);
+        }
+        self.widen(number);
+        if superseded {
+            tracing::debug!(peer = %daemon, "superseded before its election was heard of");
+            self.hand_over(number, now);
+            return;
+        }
+        let sealing = self.links.get_mut(&number).and_then(|link| link.peer.as_mut()?.sealing.take());
+        if let (Some(keyring), Some(Sealing { exporters, first })) = (&mut self.keyring, sealing)
+            && let Err(error) = keyring.attach_sender(now, number, &exporters, first)
+        {
+            tracing::error!(peer = %daemon, %error, "no message keys for this link");
+        }
+        self.current.insert(daemon, number);
+        let closed = current.and_then(|old| self.hand_over(old, now));
+        self.events.push_back(LinkEvent::Up { number, daemon, old: current, closed });
+        if let Some(connection) = self.connections.get(&number) {
+            let address = connection.quic.remote_address();
+            tracing::info!(peer = %daemon, %address, new = current.is_none(), "link up");
+            self.report(LinkReport::Up { daemon, address });
+        }
+        self.touch(number);
+    }
+
+    /// Lets the peer send more that is not read, as far as its identity has room.
+    pub(super) fn widen(&mut self, number: u64) {
+        let (Some(connection), Some(peer)) = (
+            self.connections.get_mut(&number),
+            self.links.get_mut(&number).and_then(|link| link.peer.as_mut()),
+        ) else {
+            return;
+        };
+        if peer.account.unread.share(&mut peer.unread) {
+            let share = u32::try_from(peer.unread.amount()).unwrap_or(u32::MAX);
+            let window = VarInt::from_u32(LINK_WINDOW.saturating_add(share));
+            connection.quic.set_receive_window(window);
+            self.touch(number);
+        }
+    }
+
+    pub(super) fn widen_all(&mut self) {
+        let open = self.links.iter().filter(|(_, link)| link.is_open()).map(|(number, _)| *number);
+        let open: Vec<u64> = open.collect();
+        open.into_iter().for_each(|number| self.widen(number));
+    }
+
+    /// A successor is dialled, or the link is at its end.
+    pub(super) fn open_timeout(&mut self, number: u64, now: Duration) {
+        let Some(peer) = self.links.get(&number).and_then(|link| link.peer.as_ref()) else { return };
+        if peer.until.is_some_and(|until| until <= now) {
+            let text = "AXON_QKD_SESSION_MAX_AGE is reached and no successor came";
+            self.close_connection(number, CloseCode::KeySupply, text, now);
+            return self.end_link(number, text, None, now);
+        }
+        if peer.renew_at.is_some_and(|renew| renew <= now) {
+            let age = self.keyring.as_ref().map(|keyring| keyring.config.session_max_age);
+            // Should the dial fail, the next one is due before the key's age is reached.
+            let again = age.unwrap_or_default().mul_f64(0.04).max(Duration::from_secs(1));
+            if let Some(peer) = self.links.get_mut(&number).and_then(|link| link.peer.as_mut()) {
+                peer.renew_at = Some(now + again);
+            }
+            self.dial_successor(number, now);
+        }
+        self.probe(number, now);
+    }
+
+    /// Dials a connection that replaces a link.
+    pub(super) fn dial_successor(&mut self, number: u64, now: Duration) {
+        let (Some(connection), Some(peer)) = (
+            self.connections.get(&number),
+            self.links.get(&number).and_then(|link| link.peer.as_ref()),
+        ) else {
+            return;
+        };
+        let target = Target {
+            daemon: Some(peer.summary.hello.daemon),
+            sae: peer.summary.hello.sae.clone(),
+            addresses: vec![connection.quic.remote_address()],
+            listed: false,
+            standing: None,
+            replaces: peer.elected.map(|elected| elected.link),
+        };
+        self.dial(target, now);
+    }
+
+    /// Remembers for whom a connection was dialled, should its opening fail.
+    pub(super) fn note_dialled(
+        &mut self,
+        number: u64,
+        of: Option<(DaemonId, AddressConfidence)>,
+    ) {
+        self.dialled.extend(of.map(|of| (number, of)));
+    }
+
+    /// The opening of a dialled connection failed.
+    pub(super) fn failed_after_dial(&mut self, number: u64) {
+        if let Some((daemon, standing)) = self.dialled.remove(&number) {
+            self.report(LinkReport::DialFailed { daemon, standing });
+        }
+    }
+
+    /// Closes the links of peers that are no longer trusted. Certificates are looked at if `certificates` says so:
+    /// that costs signatures.
+    pub(in crate::engine) fn close_untrusted(&mut self, certificates: bool, now: Duration) {
+        let mut untrusted = Vec::new();
+        for (number, link) in &self.links {
+            let Some(peer) = &link.peer else { continue };
+            let chain = certificates.then_some(&peer.chain[..]);
+            let why = self.credentials.distrust(&peer.summary.negotiated, link.side, chain);
+            untrusted.extend(why.map(|why| (*number, why)));
+        }
+        for (number, why) in untrusted {
+            self.violation(number, CloseCode::NotAllowed, &why, now);
+        }
+    }
+}
+
+/// When the successor of a link is dialled: a tenth of its age before the end, but at least ten seconds where that is
+/// no more than half of it, since the KMEs may be slow.
+fn renewal_at(age: Duration) -> Duration {
+    age - (age / 10).max(Duration::from_secs(10)).min(age / 2)
+}

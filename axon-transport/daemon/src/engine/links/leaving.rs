@@ -1,0 +1,153 @@
+//! Links that a successor took over from: they deliver what is under way, and close.
+
+use std::time::Duration;
+
+use axon_shm::ids::DaemonId;
+
+use super::{
+    LinkEvent, Links,
+    link::{Leaving, Link, Phase},
+};
+use crate::{
+    gateway::silence::Traffic,
+    link::{CloseCode, LinkClosed},
+};
+
+/// The peer is waited for so long at a time.
+const HAND_OVER: Duration = Duration::from_secs(5);
+/// Superseded links of one identity. The oldest closes for another one.
+const MAX_LEAVING: usize = 8;
+const SUPERSEDED: &str = "a successor took over";
+
+impl Links {
+    /// A successor took over from a link. Returns what the peer is told if the link is silent.
+    pub(super) fn hand_over(&mut self, old: u64, now: Duration) -> Option<LinkClosed> {
+        let ours = self.hello.daemon;
+        let stats = self.connections.get(&old)?.quic.stats();
+        let link = self.links.get_mut(&old)?;
+        let peer = link.peer.as_mut()?;
+        peer.silence.silent &= !Traffic::from(&stats).answered_since(peer.silence.traffic);
+        peer.silence.probing = None;
+        let silent = peer.silence.silent;
+        let until = peer.until.map(|until| until.max(now + HAND_OVER));
+        let succeeded = ours > peer.summary.hello.daemon;
+        let (who, elected) = (peer.summary.who.clone(), peer.elected);
+        link.phase =
+            Phase::Leaving(Leaving { until, succeeded, ended: false, closed: false, wait: None });
+        self.nonces.retain(|_, number| *number != old);
+        tracing::debug!(link = old, silent, "the link is superseded");
+        let leaving = self.links.iter().filter(|(_, link)| matches!(link.phase, Phase::Leaving(_)));
+        let of_identity = leaving.filter(|(_, link)| {
+            link.peer.as_ref().is_some_and(|peer| peer.summary.who.is(&who))
+        });
+        let of_identity: Vec<u64> = of_identity.map(|(number, _)| *number).collect();
+        if of_identity.len() > MAX_LEAVING
+            && let Some(oldest) = of_identity.iter().min()
+        {
+            self.close_leaving(*oldest, now);
+        }
+        elected.filter(|_| silent).map(|elected| LinkClosed { link: elected.link })
+    }
+
+    fn leaving_of(&mut self, daemon: DaemonId) -> impl Iterator<Item = (u64, &mut Link)> {
+        self.links
+            .iter_mut()
+            .filter(move |(_, link)| {
+                let of_peer =
+                    link.peer.as_ref().is_some_and(|peer| peer.summary.hello.daemon == daemon);
+                of_peer && matches!(link.phase, Phase::Leaving(_))
+            })
+            .map(|(number, link)| (*number, link))
+    }
+
+    /// The peer sends over the successor.
+    pub(super) fn succeeded(&mut self, daemon: DaemonId) {
+        for (_, link) in self.leaving_of(daemon) {
+            if let Phase::Leaving(leaving) = &mut link.phase {
+                leaving.succeeded = true;
+            }
+        }
+    }
+
+    /// The peer says that it closed a link, whose packets do not arrive.
+    pub(super) fn closed_by_peer(&mut self, daemon: DaemonId, closed: LinkClosed) {
+        for (_, link) in self.leaving_of(daemon) {
+            let elected = link.peer.as_ref().and_then(|peer| peer.elected);
+            if elected.is_some_and(|elected| elected.link == closed.link)
+                && let Phase::Leaving(leaving) = &mut link.phase
+            {
+                leaving.closed = true;
+            }
+        }
+    }
+
+    /// The peer's last link is over: nothing more is waited for.
+    pub(super) fn abandon_leaving(&mut self, daemon: DaemonId, now: Duration) {
+        let numbers: Vec<u64> = self.leaving_of(daemon).map(|(number, _)| number).collect();
+        numbers.into_iter().for_each(|number| self.close_leaving(number, now));
+    }
+
+    /// The peer's control stream of a superseded link ended.
+    pub(super) fn leaving_ended(&mut self, number: u64) {
+        if let Some(Link { phase: Phase::Leaving(leaving), .. }) = self.links.get_mut(&number) {
+            leaving.ended = true;
+        }
+    }
+
+    /// The superseded links.
+    pub(in crate::engine) fn leaving(&self) -> Vec<(u64, DaemonId)> {
+        let leaving = self.links.iter().filter(|(_, link)| matches!(link.phase, Phase::Leaving(_)));
+        let of = leaving.filter_map(|(number, link)| {
+            Some((*number, link.peer.as_ref()?.summary.hello.daemon))
+        });
+        of.collect()
+    }
+
+    /// Closes a superseded link once all has arrived in both directions. So many of its streams are being read.
+    pub(in crate::engine) fn look_at_leaving(&mut self, number: u64, reading: usize, now: Duration) {
+        let (Some(connection), Some(link)) =
+            (self.connections.get_mut(&number), self.links.get_mut(&number))
+        else {
+            return;
+        };
+        let silent = link.peer.as_ref().is_some_and(|peer| peer.silence.silent);
+        let Phase::Leaving(leaving) = &mut link.phase else { return };
+        if leaving.closed || (silent && leaving.succeeded) {
+            return self.close_leaving(number, now);
+        }
+        // The control stream is one of them.
+        let sent = connection.quic.streams().send_streams() <= 1;
+        if silent || !leaving.succeeded || !(sent || leaving.wait.is_some()) {
+            return;
+        }
+        connection.control.finish();
+        let wait = *leaving.wait.get_or_insert(now + HAND_OVER);
+        let over = leaving.ended && reading == 0 || now >= wait && reading == 0;
+        if over {
+            return self.close_leaving(number, now);
+        }
+        if now >= wait {
+            leaving.wait = Some(now + HAND_OVER);
+        }
+        self.touch(number);
+    }
+
+    /// The time of a superseded link is over.
+    pub(super) fn leaving_timeout(&mut self, number: u64, now: Duration) {
+        let Some(Link { phase: Phase::Leaving(leaving), .. }) = self.links.get(&number) else {
+            return;
+        };
+        if leaving.until.is_some_and(|until| until <= now) {
+            self.close_leaving(number, now);
+        }
+    }
+
+    fn close_leaving(&mut self, number: u64, now: Duration) {
+        let Some(link) = self.links.remove(&number) else { return };
+        tracing::debug!(link = number, "the superseded link ends");
+        self.close_connection(number, CloseCode::Replaced, SUPERSEDED, now);
+        if let Some(peer) = link.peer {
+            self.events.push_back(LinkEvent::Gone(number, peer.summary.hello.daemon));
+        }
+    }
+}

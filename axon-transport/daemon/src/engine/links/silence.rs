@@ -1,0 +1,88 @@
+//! Links that do not answer: their path is probed, and a successor is dialled once it works.
+
+use std::{net::SocketAddr, time::Duration};
+
+use bytes::BytesMut;
+
+use super::{LinkReport, Links, link::Probing};
+use crate::{
+    gateway::silence::{Prober, Step, Traffic},
+    wire::beacon::Datagram,
+};
+
+impl Links {
+    /// A datagram of discovery, or the echo of a probe.
+    pub(super) fn handle_discovery(&mut self, from: SocketAddr, bytes: BytesMut, now: Duration) {
+        if !self.nonces.is_empty()
+            && let Ok(Datagram::Echo { nonce, .. }) = Datagram::decode(&bytes)
+            && let Some(number) = self.nonces.remove(&nonce)
+        {
+            let peer = self.links.get_mut(&number).and_then(|link| link.peer.as_mut());
+            if let Some(probing) = peer.and_then(|peer| peer.silence.probing.as_mut()) {
+                probing.prober.handle_echo(now.saturating_sub(probing.begun));
+            }
+            return;
+        }
+        self.report(LinkReport::Datagram { from, bytes: bytes.to_vec() });
+    }
+
+    /// Probes the path of links over which something went out, and nothing came in the last second.
+    pub(super) fn look_for_silence(&mut self, now: Duration) {
+        let open = self.links.iter().filter(|(_, link)| link.is_open()).map(|(number, _)| *number);
+        let open: Vec<u64> = open.collect();
+        for number in open {
+            let Some(connection) = self.connections.get(&number) else { continue };
+            let traffic = Traffic::from(&connection.quic.stats());
+            let Some(link) = self.links.get_mut(&number) else { continue };
+            let side = link.side;
+            let Some(peer) = &mut link.peer else { continue };
+            let before = std::mem::replace(&mut peer.silence.traffic, traffic);
+            // It is no longer silent: what is under way arrives.
+            peer.silence.silent &= !traffic.answered_since(before);
+            if peer.silence.probing.is_some() || !traffic.is_silent_since(before) {
+                continue;
+            }
+            tracing::debug!(peer = %peer.summary.hello.daemon,
+                "the link does not answer: probing its path");
+            peer.silence.probing = Some(Probing {
+                prober: Prober::new(side),
+                nonce: rand::random(),
+                begun: now,
+                traffic,
+            });
+            self.probe(number, now);
+        }
+    }
+
+    /// Goes on with the probes of a silent link.
+    pub(super) fn probe(&mut self, number: u64, now: Duration) {
+        let (Some(connection), Some(peer)) = (
+            self.connections.get(&number),
+            self.links.get_mut(&number).and_then(|link| link.peer.as_mut()),
+        ) else {
+            return;
+        };
+        let (address, daemon) = (connection.quic.remote_address(), peer.summary.hello.daemon);
+        let traffic = Traffic::from(&connection.quic.stats());
+        let Some(probing) = &mut peer.silence.probing else { return };
+        if traffic.answered_since(probing.traffic) {
+            self.nonces.remove(&probing.nonce);
+            peer.silence.probing = None;
+            return;
+        }
+        match probing.prober.handle_timeout(now.saturating_sub(probing.begun)) {
+            Some(Step::Probe) => {
+                self.nonces.insert(probing.nonce, number);
+                let probe = Datagram::Probe { daemon: self.hello.daemon, nonce: probing.nonce };
+                self.endpoints.send(address, probe.encode());
+            }
+            Some(Step::Replace) => {
+                peer.silence.silent = true;
+                tracing::info!(peer = %daemon, %address,
+                    "the link is silent though its path works: dialling a successor");
+                self.dial_successor(number, now);
+            }
+            None => {}
+        }
+    }
+}
