@@ -561,6 +561,10 @@ impl Engine {
             let text = "its host's daemon was restarted";
             self.links.replace(link, text, now);
         }
+        // The control plane forgets the endpoints of the dead link before it learns of the same ones here.
+        while let Some(event) = self.links.poll_event() {
+            self.handle_link_event(event, now);
+        }
         self.tell(ToControl::RemoteGraph { daemon, reset, added, removed });
         self.peers.get(&daemon).map_or(0, |peer| peer.remote.len())
     }
