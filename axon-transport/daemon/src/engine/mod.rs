@@ -256,7 +256,8 @@ impl Engine {
             self.follow_graphs(now);
             idle &= !self.read_streams(now);
             idle &= !self.say(now);
-            if idle {
+            // All that came over a lost connection is read before its link ends.
+            if idle && !self.links.end_lost(now) {
                 break;
             }
         }
