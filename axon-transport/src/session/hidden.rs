@@ -173,7 +173,7 @@ impl Subscription {
         self.inner.lock().take_from(writer, &self.inner)
     }
 
-    /// For a relay: how many samples of this publisher were overwritten before they were taken.
+    /// For a relay: how many samples of this publisher newer ones replaced before they were taken.
     pub fn lost_of(&self, writer: &Gid) -> u64 {
         if self.session.is_forked() { 0 } else { self.inner.lock().lost_of(writer) }
     }

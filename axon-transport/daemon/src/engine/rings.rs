@@ -41,7 +41,7 @@ pub(crate) trait RingReader {
     fn matched(&self) -> Vec<Gid>;
     /// Takes the next sample of a publisher.
     fn take_of(&self, publisher: &Gid) -> Option<(MessageInfo, Vec<u8>)>;
-    /// How many samples of this publisher were overwritten before they were taken.
+    /// How many samples of this publisher newer ones replaced before they were taken.
     fn lost_of(&self, _publisher: &Gid) -> u64 {
         0
     }

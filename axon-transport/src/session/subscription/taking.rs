@@ -226,13 +226,13 @@ impl MatchedReaders {
             .any(|slot| slot.reader.writer() == *writer && slot.reader.has_data())
     }
 
-    /// Samples of `writer` that were overwritten before they were taken.
+    /// Samples of `writer` that newer ones replaced before they were taken, in its ring or within the depth.
     pub(in crate::session) fn lost_of(&mut self, writer: &Gid) -> u64 {
         let of = self.matched_readers.iter_mut().filter(|slot| slot.reader.writer() == *writer);
         of.map(|slot| {
             // Finds what a take would find lost. The take says what is wrong with the memory.
             let _ = slot.reader.peek();
-            slot.reader.lost()
+            slot.reader.lost().saturating_add(slot.reader.skipped())
         })
         .sum()
     }

@@ -6,7 +6,7 @@ use std::{collections::VecDeque, rc::Rc, sync::Arc, time::Duration};
 use axon_envelope::{Delivery, Kind, Route};
 use axon_shm::{
     ids::Gid,
-    qos::{Qos, Reliability},
+    qos::{Durability, History, Qos, Reliability},
 };
 use axon_transport::internal::session::merge::{Merge, Taken};
 use bytes::Bytes;
@@ -87,6 +87,8 @@ pub(super) struct Flow {
     held: Option<Sample>,
     /// Whether the rings may hold more samples than the last turn moved.
     more: bool,
+    /// Samples for which the sender of message keys was not told that it will need keys.
+    undemanded: u32,
     /// The relay whose losses are counted, and how many are.
     counted: Option<(Gid, u64)>,
     queue: Queue,
@@ -140,6 +142,7 @@ impl Flow {
             merge: Merge::default(),
             held: None,
             more: false,
+            undemanded: 0,
             counted: None,
             queue: Queue::new(qos, Rc::clone(budget), now),
             stream: None,
@@ -193,6 +196,21 @@ impl Flow {
         self.more = true;
     }
 
+    /// Moves a burst of a KEEP_LAST publisher into the queue while QUIC takes nothing: in the ring it would be
+    /// overwritten. BEST_EFFORT samples stay there: only the newest will be sent. A KEEP_ALL publisher waits.
+    pub(super) fn take_burst(&mut self, sources: &[Source], counters: &Counters, now: Duration) {
+        if !(self.blocked || !self.pending.is_empty()) || !self.queue.keeps_bursts() {
+            return;
+        }
+        while self.more {
+            let queued = self.fill(sources, counters, now);
+            self.undemanded += queued;
+            if queued == 0 {
+                return;
+            }
+        }
+    }
+
     /// Whether a sample found no room.
     pub(super) fn is_held(&self) -> bool {
         self.held.is_some()
@@ -216,7 +234,7 @@ impl Flow {
         let first = sources.iter().find(|source| source.reads(&self.of));
         let qos = first.map_or_else(Qos::keep_all, Source::qos);
         self.queue.set_qos(&qos);
-        let waits = qos.history == axon_shm::qos::History::KeepAll
+        let waits = qos.history == History::KeepAll
             && qos.reliability == Reliability::Reliable;
         let (mut samples, mut bytes, mut dropped) = (0, 0, 0);
         while samples < FILL.0 && bytes < FILL.1 {
@@ -250,7 +268,12 @@ impl Flow {
         let Some(first) = sources.iter().find(|source| source.reads(&self.of)) else { return };
         let (relay, lost) = (first.gid(), first.lost_of(&self.of));
         let before = self.counted.replace((relay, lost));
-        let counted = before.filter(|(of, _)| *of == relay).map_or(0, |(_, counted)| counted);
+        let counted = match before {
+            Some((before, counted)) if before == relay => counted,
+            // What a relay with history passes over when it begins is no loss.
+            _ if first.qos().durability == Durability::TransientLocal => lost,
+            _ => 0,
+        };
         counters.lost(&self.topic, "queue", lost.saturating_sub(counted));
     }
 
@@ -282,7 +305,7 @@ impl Flow {
         let mut left = TURN;
         loop {
             if self.pending.is_empty() && !self.best_effort.is_writing() {
-                let queued = self.fill(sources, counters, now);
+                let queued = self.fill(sources, counters, now) + std::mem::take(&mut self.undemanded);
                 carrier.seal.demand(queued, now);
             }
             let before = carrier.taken;

@@ -104,8 +104,8 @@ pub(crate) struct Outbound {
     released: usize,
     counters: Arc<Counters>,
     timers: BTreeSet<(Duration, FlowId)>,
-    without_stream: Vec<FlowId>,
-    without_key: Vec<FlowId>,
+    without_stream: BTreeSet<FlowId>,
+    without_key: BTreeSet<FlowId>,
     key_retry: Option<Duration>,
     /// Flows whose next sample found no room in the queue.
     held: BTreeSet<FlowId>,
@@ -133,8 +133,8 @@ impl Outbound {
             budget,
             counters,
             timers: BTreeSet::new(),
-            without_stream: Vec::new(),
-            without_key: Vec::new(),
+            without_stream: BTreeSet::new(),
+            without_key: BTreeSet::new(),
             key_retry: None,
             held: BTreeSet::new(),
             ended: Vec::new(),
@@ -210,13 +210,13 @@ impl Outbound {
             waiting.dedup();
         }
         for of in waiting {
-            let id = self.flow(number, of, now);
-            if let Some(id) = id {
-                if let Some(flow) = &mut self.flows[id] {
-                    flow.handle_samples();
-                }
-                self.schedule(id);
-            }
+            let Some(id) = self.flow(number, of, now) else { continue };
+            let (Some(flow), Some(served)) = (&mut self.flows[id], self.routes.get(&number)) else {
+                continue;
+            };
+            flow.handle_samples();
+            flow.take_burst(&served.sources, &self.counters, now);
+            self.schedule(id);
         }
     }
 
@@ -267,8 +267,8 @@ impl Outbound {
         let Some(mut flow) = self.flows[id].take() else { return };
         self.ended.extend(flow.take_streams());
         self.timers.remove(&(flow.timer.unwrap_or_default(), id));
-        self.without_stream.retain(|other| *other != id);
-        self.without_key.retain(|other| *other != id);
+        self.without_stream.remove(&id);
+        self.without_key.remove(&id);
         self.held.remove(&id);
         if flow.scheduled.is_some() {
             self.schedule.remove(id);
@@ -304,11 +304,14 @@ impl Outbound {
                 Pause::Empty => {}
                 Pause::Blocked => {
                     flow.blocked = true;
+                    flow.take_burst(&served.sources, &self.counters, now);
                     small_blocked |= class != Class::Bulk;
                 }
-                Pause::NoStream => self.without_stream.push(id),
+                Pause::NoStream => {
+                    self.without_stream.insert(id);
+                }
                 Pause::NoKey => {
-                    self.without_key.push(id);
+                    self.without_key.insert(id);
                     self.key_retry.get_or_insert(now + KEY_RETRY);
                 }
             }

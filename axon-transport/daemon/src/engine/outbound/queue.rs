@@ -114,6 +114,11 @@ impl Queue {
         }
     }
 
+    /// Whether it takes bursts of which the ring keeps the newest samples alone.
+    pub(super) fn keeps_bursts(&self) -> bool {
+        matches!(self.policy, Policy::KeepLast(_))
+    }
+
     /// Adds a sample.
     pub(super) fn offer(&mut self, sample: Sample, now: Duration) -> Offered {
         if self.waiting.is_empty() {

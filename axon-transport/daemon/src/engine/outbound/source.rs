@@ -60,7 +60,7 @@ impl Source {
         }
     }
 
-    /// How many samples of this publisher were overwritten in its ring before they were taken.
+    /// How many samples of this publisher newer ones replaced before they were taken.
     pub(super) fn lost_of(&self, of: &Gid) -> u64 {
         match self {
             Self::Relay(_, reader) => reader.lost_of(of),
