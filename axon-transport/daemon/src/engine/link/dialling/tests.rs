@@ -313,6 +313,21 @@ fn silence_and_other_refusals_end_the_dial_and_keep_the_key() {
 }
 
 #[test]
+fn time_in_which_the_peer_is_silent_does_not_count_against_the_key() {
+    let mut dialled = Dialled::qkd(Some("sae-b"), 1);
+    for _ in 0..10 {
+        dialled.connects();
+        dialled.dial.handle_failed(&alert(UNKNOWN_PSK_IDENTITY));
+        let (_, attempt) = dialled.connects();
+        assert_eq!(attempt.unwrap().key_id, id("key-1"));
+        dialled.dial.handle_failed(&ConnectionError::Reset);
+        assert_eq!(dialled.fails().name, "reset");
+        dialled.now += s(4);
+        dialled.dial = Dialling::new(dialled.now, target(Some("sae-b"), 1), dialled.ring.as_ref());
+    }
+}
+
+#[test]
 fn second_handshake_under_one_key_is_closed() {
     let mut dialled = Dialled::qkd(Some("sae-b"), 1);
     let mut other = Dialling::new(s(0), target(Some("sae-b"), 1), dialled.ring.as_ref());
