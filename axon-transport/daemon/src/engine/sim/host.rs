@@ -83,7 +83,7 @@ impl Host {
             number,
             address: Ipv4Addr::new(10, 0, high, low),
             daemon: DaemonId::default(),
-            rings: SimRings::new(number as u8),
+            rings: SimRings::new(number),
             config: Arc::new(config),
             epoch,
             engine: None,
@@ -131,10 +131,12 @@ impl Host {
             endpoint: Arc::new(endpoint),
             epoch: self.epoch,
         };
+        let session_keys = SessionKeys::default();
+        session_keys.insert(self.rings.key());
         let parts = EngineParts {
             links,
             rings: Rc::new(self.rings.clone()),
-            session_keys: Arc::new(SessionKeys::default()),
+            session_keys: Arc::new(session_keys),
             session: [0xee; 12],
             epoch_nanos: 1_000_000_000,
         };
@@ -193,6 +195,18 @@ impl Host {
     /// Forgets a peer that is gone.
     pub(super) fn unwant(&mut self, daemon: DaemonId) {
         self.peers.remove(&daemon);
+    }
+
+    /// Samples that wait for peers, in bytes.
+    pub(super) fn backlog(&self) -> (usize, usize) {
+        self.engine.as_ref().map_or((0, 0), Engine::backlog)
+    }
+
+    /// A peer has another address.
+    pub(super) fn moved(&mut self, daemon: DaemonId, address: Ipv4Addr) {
+        if let Some(wanted) = self.peers.get_mut(&daemon) {
+            wanted.address = SocketAddr::from((address, PORT));
+        }
     }
 
     /// The endpoints of the host changed.

@@ -16,6 +16,7 @@ use axon_transport::{
     EndpointSpec, MessageInfo,
     graph::{Endpoint, EndpointKind},
     internal::{
+        OWNER, SessionKey,
         graph::{Pairing, pairing},
         session::Written,
     },
@@ -51,6 +52,8 @@ struct State {
     given_up: BTreeMap<Gid, u64>,
     /// Samples that came damaged.
     damaged: u64,
+    /// RELIABLE samples that a stand-in wrote after a newer one, or twice.
+    disordered: u64,
     next: u32,
     waits_for_room: bool,
 }
@@ -68,6 +71,7 @@ struct Cursors {
 #[derive(Clone)]
 pub(super) struct SimRings {
     session: SessionId,
+    key: Arc<SessionKey>,
     state: Rc<RefCell<State>>,
 }
 
@@ -82,10 +86,17 @@ fn payload(of: Gid, sequence: u64, length: usize) -> Vec<u8> {
 
 impl SimRings {
     /// The rings of a host whose sessions have this number.
-    pub(super) fn new(host: u8) -> Self {
-        let mut session = [0; 16];
-        (session[0], session[1]) = (0x51, host);
-        Self { session: SessionId(session), state: Rc::default() }
+    pub(super) fn new(host: usize) -> Self {
+        let mut packet = vec![OWNER];
+        packet.extend_from_slice(&[0x51; 24]);
+        packet.extend_from_slice(&(host as u64).to_be_bytes());
+        let key = Arc::new(SessionKey::from_packet(&packet).unwrap());
+        Self { session: key.id(), key, state: Rc::default() }
+    }
+
+    /// The key of the session that has the endpoints.
+    pub(super) fn key(&self) -> Arc<SessionKey> {
+        Arc::clone(&self.key)
     }
 
     fn endpoint(&self, kind: EndpointKind, topic: &str, qos: Qos) -> Endpoint {
@@ -196,6 +207,44 @@ impl SimRings {
         self.state.borrow().damaged
     }
 
+    /// RELIABLE samples that came twice, or after a newer one.
+    pub(super) fn disordered(&self) -> u64 {
+        self.state.borrow().disordered
+    }
+
+    /// The publishers of a topic that have not ended.
+    pub(super) fn publishers(&self, topic: &str) -> Vec<Gid> {
+        let state = self.state.borrow();
+        let of = state.publishers.iter().filter(|(_, p)| {
+            p.endpoint.topic == topic && p.endpoint.node != "ended"
+        });
+        of.map(|(gid, _)| *gid).collect()
+    }
+
+    /// For each RELIABLE and KEEP_ALL subscription, and each publisher of which it received a sample: the first
+    /// number, and how many came.
+    pub(super) fn complete(&self) -> Vec<(Gid, Gid, u64, u64)> {
+        let state = self.state.borrow();
+        let keeping = state.subscriptions.iter().filter(|(_, s)| {
+            let qos = &s.endpoint.qos;
+            qos.history == History::KeepAll && qos.reliability == Reliability::Reliable
+        });
+        let of = keeping.flat_map(|(gid, subscription)| {
+            subscription.received.iter().filter_map(|(publisher, received)| {
+                Some((*gid, *publisher, *received.first()?, received.len() as u64))
+            })
+        });
+        of.collect()
+    }
+
+    /// A publisher's QoS, and how many samples it published, if it has not ended.
+    pub(super) fn publisher(&self, gid: Gid) -> Option<(Qos, u64)> {
+        let state = self.state.borrow();
+        let publisher = state.publishers.get(&gid)?;
+        let ended = publisher.endpoint.node == "ended";
+        (!ended).then_some((publisher.endpoint.qos, publisher.published))
+    }
+
     /// Whether the engine waits for room.
     pub(super) fn waits_for_room(&self) -> bool {
         self.state.borrow().waits_for_room
@@ -217,6 +266,12 @@ struct SimReader {
 impl Drop for SimReader {
     fn drop(&mut self) {
         self.cursors.closed.set(true);
+        // A relay that ends gives up what is not acknowledged.
+        if self.cursors.spec.qos.reliability == Reliability::Reliable {
+            for (publisher, samples) in self.unacknowledged() {
+                self.give_up(publisher, samples);
+            }
+        }
     }
 }
 
@@ -294,6 +349,7 @@ impl RingReader for SimReader {
 struct SimWriter {
     rings: SimRings,
     endpoint: Endpoint,
+    last: Cell<u64>,
 }
 
 impl RingWriter for SimWriter {
@@ -328,11 +384,20 @@ impl RingWriter for SimWriter {
         if readers.iter().any(|s| keeps(s) && s.room == Some(0)) {
             return Err(RingError::Full);
         }
+        let reliable = self.endpoint.qos.reliability == Reliability::Reliable;
+        if reliable && meta.sequence <= self.last.replace(meta.sequence) {
+            state.disordered += 1;
+        }
         for subscription in &mut readers {
+            let received = subscription.received.entry(publisher).or_default();
+            // As a session does: a sample that is not newer is dropped.
+            if received.last().is_some_and(|last| *last >= meta.sequence) {
+                continue;
+            }
             if let Some(room) = &mut subscription.room {
                 *room = room.saturating_sub(1);
             }
-            subscription.received.entry(publisher).or_default().push(meta.sequence);
+            received.push(meta.sequence);
         }
         Ok(Written::Yes)
     }
@@ -381,7 +446,11 @@ impl Rings for SimRings {
     }
 
     fn open_writer(&self, remote: &Endpoint) -> Result<Rc<dyn RingWriter>, String> {
-        Ok(Rc::new(SimWriter { rings: self.clone(), endpoint: remote.clone() }))
+        Ok(Rc::new(SimWriter {
+            rings: self.clone(),
+            endpoint: remote.clone(),
+            last: Cell::new(0),
+        }))
     }
 
     fn set_waiting_for_room(&self, waiting: bool) {

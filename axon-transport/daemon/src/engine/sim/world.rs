@@ -29,6 +29,7 @@ pub(super) struct World {
     pub(super) hosts: Vec<Host>,
     pub(super) kmes: Kmes,
     answers: Vec<(Duration, usize, Event)>,
+    stopped: Vec<bool>,
     /// Passes of all hosts since the start.
     pub(super) passes: u64,
     /// Publishers and subscriptions whose samples are checked.
@@ -64,6 +65,7 @@ impl World {
             hosts: all,
             kmes: Kmes::default(),
             answers: Vec::new(),
+            stopped: vec![false; hosts],
             passes: 0,
             pairs: Vec::new(),
         };
@@ -88,9 +90,62 @@ impl World {
         }
     }
 
-    /// Kills a host's daemon.
-    pub(super) fn kill(&mut self, host: usize) {
+    /// Ends a host's daemon: at once, or as after SIGTERM.
+    pub(super) fn kill(&mut self, host: usize, orderly: bool) {
+        if orderly {
+            self.hosts[host].close(self.now);
+            self.transmit(host);
+        }
         self.hosts[host].kill();
+    }
+
+    /// Stops a host, or lets it go on. Datagrams wait meanwhile.
+    pub(super) fn stop(&mut self, host: usize, stopped: bool) {
+        self.stopped[host] = stopped;
+        if stopped {
+            self.network.pause(host);
+        } else {
+            self.network.resume(self.now, host);
+        }
+    }
+
+    /// Gives a host another address, which the others learn.
+    pub(super) fn move_host(&mut self, host: usize) {
+        let [_, subnet, high, low] = self.hosts[host].address.octets();
+        let address = std::net::Ipv4Addr::new(10, subnet.wrapping_add(1), high, low);
+        self.network.move_host(self.hosts[host].address, address);
+        self.hosts[host].address = address;
+        let daemon = self.hosts[host].daemon;
+        self.hosts.iter_mut().for_each(|other| other.moved(daemon, address));
+    }
+
+    /// Has each publisher of a topic on a host publish a sample.
+    pub(super) fn publish_all(&mut self, host: usize, topic: usize, size: usize) {
+        let publishers = self.hosts[host].rings.publishers(&super::run::name(topic));
+        for publisher in publishers {
+            self.hosts[host].rings.publish(publisher, size);
+            self.hosts[host].ring();
+        }
+    }
+
+    /// For each RELIABLE and KEEP_ALL pair of which samples came: the publisher, and the subscription with the
+    /// samples that are missing after the first that came.
+    pub(super) fn losses(&self) -> Vec<((usize, Gid), ((usize, Gid), u64))> {
+        let mut losses = Vec::new();
+        for there in &self.hosts {
+            for (subscription, publisher, first, came) in there.rings.complete() {
+                let from = self.hosts.iter().find_map(|host| {
+                    let (qos, published) = host.rings.publisher(publisher)?;
+                    let complete = qos.history == History::KeepAll
+                        && qos.reliability == Reliability::Reliable;
+                    complete.then_some((host.number, published))
+                });
+                let Some((from, published)) = from else { continue };
+                let missing = (published + 1 - first).saturating_sub(came);
+                losses.push(((from, publisher), ((there.number, subscription), missing)));
+            }
+        }
+        losses
     }
 
     /// Starts a host's daemon again, under a new id. The others forget the old one.
@@ -136,9 +191,13 @@ impl World {
         self.hosts[host].rings.received(subscription, pair.publisher.1)
     }
 
+    fn due(&self, host: usize) -> Option<Duration> {
+        if self.stopped[host] { None } else { self.hosts[host].poll_timeout(self.now) }
+    }
+
     /// The time of the next event.
     fn next(&self) -> Option<Duration> {
-        let hosts = self.hosts.iter().filter_map(|host| host.poll_timeout(self.now)).min();
+        let hosts = (0..self.hosts.len()).filter_map(|host| self.due(host)).min();
         let answer = self.answers.iter().map(|(at, ..)| *at).min();
         [hosts, answer, self.network.poll_timeout()].into_iter().flatten().min()
     }
@@ -190,7 +249,8 @@ impl World {
             self.pass(host);
         }
         for host in 0..self.hosts.len() {
-            if self.hosts[host].poll_timeout(now).is_some_and(|due| due <= now) {
+            let due = self.due(host);
+            if due.is_some_and(|due| due <= now) {
                 self.pass(host);
             }
         }
@@ -199,14 +259,9 @@ impl World {
     fn pass(&mut self, number: usize) {
         let now = self.now;
         self.passes += 1;
+        self.hosts[number].pass(now);
+        self.transmit(number);
         let host = &mut self.hosts[number];
-        host.pass(now);
-        let from = SocketAddr::from((host.address, PORT));
-        let mut buffer = Vec::new();
-        while let Some(transmit) = host.poll_transmit(&mut buffer, now) {
-            let (to, bytes) = (transmit.destination, &buffer[..transmit.size]);
-            self.network.send(now, from, to, transmit.ecn, bytes, transmit.segment_size);
-        }
         for (origin, request) in std::mem::take(&mut host.requests) {
             let answer = self.kmes.answer(request);
             self.answers.push((now + KME, number, Event { origin, answer }));
@@ -214,9 +269,22 @@ impl World {
         self.check(number);
     }
 
+    fn transmit(&mut self, number: usize) {
+        let now = self.now;
+        let host = &mut self.hosts[number];
+        let from = SocketAddr::from((host.address, PORT));
+        let mut buffer = Vec::new();
+        while let Some(transmit) = host.poll_transmit(&mut buffer, now) {
+            let (to, bytes) = (transmit.destination, &buffer[..transmit.size]);
+            self.network.send(now, from, to, transmit.ecn, bytes, transmit.segment_size);
+        }
+    }
+
     /// What must hold after each pass: no sample twice, none out of order, none damaged.
     fn check(&self, host: usize) {
-        assert_eq!(self.hosts[host].rings.damaged(), 0, "a sample was damaged");
+        let rings = &self.hosts[host].rings;
+        assert_eq!(rings.damaged(), 0, "a sample was damaged: {}", self.describe());
+        assert_eq!(rings.disordered(), 0, "a sample came twice or late: {}", self.describe());
         for pair in self.pairs.iter().filter(|pair| pair.subscription.0 == host) {
             let received = self.received(*pair);
             let last = received.len().saturating_sub(2);
