@@ -87,7 +87,7 @@ fn payload(of: Gid, sequence: u64, length: usize) -> Vec<u8> {
 impl SimRings {
     /// The rings of a host whose sessions have this number.
     pub(super) fn new(host: usize) -> Self {
-        let mut packet = vec![OWNER];
+        let mut packet = vec![OWNER, 0xa1, 0x00, 0x58, 0x20];
         packet.extend_from_slice(&[0x51; 24]);
         packet.extend_from_slice(&(host as u64).to_be_bytes());
         let key = Arc::new(SessionKey::from_packet(&packet).unwrap());
