@@ -3,13 +3,13 @@
 
 mod control;
 mod discovery;
-#[cfg(test)]
 mod engine;
 mod files;
 mod gateway;
 mod keys;
 mod link;
 mod owner;
+mod reactor;
 #[cfg(test)]
 mod residue;
 mod wire;

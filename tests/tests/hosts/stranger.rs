@@ -185,6 +185,7 @@ fn hello(domain: u32, claim: &Claim<'_>) -> Hello {
         replaces: None,
         expects: None,
         static_peer: false,
+        routes: None,
     }
 }
 

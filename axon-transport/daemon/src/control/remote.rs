@@ -25,7 +25,7 @@ const FINISH: Duration = Duration::from_secs(6);
 
 /// The gateway of every daemon that is not told otherwise.
 pub(super) const GATEWAY: Option<GatewayEntry> =
-    Some(|parts| crate::gateway::run(parts).map_err(|error| error.to_string()));
+    Some(|parts| crate::reactor::run(parts).map_err(|error| error.to_string()));
 
 /// The gateway and discovery of a running daemon.
 pub(super) struct Remote {

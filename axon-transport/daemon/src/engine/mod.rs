@@ -256,7 +256,8 @@ impl Engine {
             self.follow_graphs(now);
             idle &= !self.read_streams(now);
             idle &= !self.say(now);
-            if idle {
+            // All that came over a lost connection is read before its link ends.
+            if idle && !self.links.end_lost(now) {
                 break;
             }
         }
@@ -296,11 +297,7 @@ impl Engine {
             LinkEvent::Down { number, daemon, peer: text, reason } => {
                 if let Some(mut peer) = self.peers.remove(&daemon) {
                     peer.inbound.link_over(number);
-                    for (topic, samples) in peer.outbound.link_over() {
-                        tracing::warn!(topic = &*topic, peer = %daemon, samples,
-                            "the link ended before the peer acknowledged them: samples may be lost");
-                    }
-                    self.tell_lost(&text, peer.counters.take_lost());
+                    self.count_lost(daemon, &text, &mut peer);
                     self.effects.push_back(Effect::ReturnMemory);
                 }
                 self.freed = true;
@@ -561,6 +558,10 @@ impl Engine {
             let text = "its host's daemon was restarted";
             self.links.replace(link, text, now);
         }
+        // The control plane forgets the endpoints of the dead link before it learns of the same ones here.
+        while let Some(event) = self.links.poll_event() {
+            self.handle_link_event(event, now);
+        }
         self.tell(ToControl::RemoteGraph { daemon, reset, added, removed });
         self.peers.get(&daemon).map_or(0, |peer| peer.remote.len())
     }
@@ -758,10 +759,23 @@ impl Engine {
 
     /// Ends all links and counts what they did not carry.
     pub(crate) fn close(&mut self, now: Duration) {
+        let texts = self.peers.iter().map(|(d, peer)| (*d, self.links.peer_text(peer.link)));
+        let texts: Vec<_> = texts.collect();
         self.links.close_all(now);
-        for (_, mut peer) in self.peers.drain() {
-            let _ = peer.outbound.link_over();
+        for (daemon, text) in texts {
+            if let Some(mut peer) = self.peers.remove(&daemon) {
+                self.count_lost(daemon, &text, &mut peer);
+            }
         }
+    }
+
+    /// Counts and logs the samples that the last link of a peer did not carry.
+    fn count_lost(&mut self, daemon: DaemonId, text: &str, peer: &mut Peer) {
+        for (topic, samples) in peer.outbound.link_over() {
+            tracing::warn!(topic = &*topic, peer = %daemon, samples,
+                "the link ended before the peer acknowledged them: samples may be lost");
+        }
+        self.tell_lost(text, peer.counters.take_lost());
     }
 
     /// Whether all connections are over.

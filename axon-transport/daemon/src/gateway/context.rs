@@ -209,7 +209,10 @@ pub(crate) fn chain(connection: &quinn::Connection) -> Vec<CertificateDer<'stati
 }
 
 /// The classic identity that the settings name.
-fn load_identity(classic: &ClassicConfig, node: &str) -> Result<Identity, GatewayError> {
+///
+/// # Errors
+/// A file of it cannot be used.
+pub(crate) fn load_identity(classic: &ClassicConfig, node: &str) -> Result<Identity, GatewayError> {
     Identity::load(classic, node).inspect(|_| {
         if classic.auth == ClassicAuth::None {
             tracing::warn!(

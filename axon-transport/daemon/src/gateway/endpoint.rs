@@ -79,17 +79,7 @@ impl Endpoints {
         server: Option<quinn::ServerConfig>,
         discovery: &mpsc::Sender<Datagram>,
     ) -> Result<Self, EndpointError> {
-        let addresses = if config.bind_addrs.is_empty() {
-            vec![IpAddr::V4(Ipv4Addr::UNSPECIFIED)]
-        } else {
-            config.bind_addrs.clone()
-        };
-        let ports = quic_ports(config.domain);
-        let (first, last) = (*ports.start(), *ports.end());
-        let (port, sockets) = bind_first(&addresses, ports).map_err(|source| {
-            let list: Vec<_> = addresses.iter().map(ToString::to_string).collect();
-            EndpointError::NoPort { first, last, addresses: list.join(", "), source }
-        })?;
+        let (port, sockets) = bind_daemon(config)?;
         let mut all = Vec::new();
         let mut senders = Vec::new();
         for (address, socket) in sockets {
@@ -124,6 +114,27 @@ impl Endpoints {
         let local = |a: &SocketAddr| a.ip().is_loopback() == to.ip().is_loopback();
         self.senders.iter().position(|(a, _)| family(a) && (local(a) || a.ip().is_unspecified()))
     }
+}
+
+/// Binds the first free port of the domain on every address of `AXON_BIND_ADDRS`, or on the unspecified
+/// address if it is empty.
+///
+/// # Errors
+/// No port of the domain can be bound.
+pub(crate) fn bind_daemon(
+    config: &Config,
+) -> Result<(u16, Vec<(SocketAddr, UdpSocket)>), EndpointError> {
+    let addresses = if config.bind_addrs.is_empty() {
+        vec![IpAddr::V4(Ipv4Addr::UNSPECIFIED)]
+    } else {
+        config.bind_addrs.clone()
+    };
+    let ports = quic_ports(config.domain);
+    let (first, last) = (*ports.start(), *ports.end());
+    bind_first(&addresses, ports).map_err(|source| {
+        let list: Vec<_> = addresses.iter().map(ToString::to_string).collect();
+        EndpointError::NoPort { first, last, addresses: list.join(", "), source }
+    })
 }
 
 fn bind_first(

@@ -113,6 +113,8 @@ pub(super) struct Links {
     crowded: Said,
     /// Connections with something to do.
     dirty: VecDeque<u64>,
+    /// Links whose connection was lost, and that are not read to the end.
+    lost: VecDeque<(u64, ConnectionError)>,
     /// Connections that may have something to transmit.
     transmitting: VecDeque<u64>,
     deadlines: BTreeSet<(Instant, u64)>,
@@ -173,6 +175,7 @@ impl Links {
             listed: BTreeSet::new(),
             crowded: Said::default(),
             dirty: VecDeque::new(),
+            lost: VecDeque::new(),
             transmitting: VecDeque::new(),
             deadlines: BTreeSet::new(),
             nonces: HashMap::new(),
@@ -353,7 +356,13 @@ impl Links {
             let Some(connection) = self.connections.get_mut(&number) else { return };
             match connection.quic.poll() {
                 Some(Event::Connected) => self.handle_connected(number, now),
-                Some(Event::ConnectionLost { reason }) => self.handle_lost(number, &reason, now),
+                Some(Event::ConnectionLost { reason }) => {
+                    self.read_control(number, now);
+                    match self.links.get(&number) {
+                        Some(Link { peer: Some(_), .. }) => self.lost.push_back((number, reason)),
+                        _ => self.handle_lost(number, &reason, now),
+                    }
+                }
                 Some(Event::Stream(event)) => self.handle_stream(number, event),
                 Some(_) => {}
                 None => break,
@@ -369,10 +378,13 @@ impl Links {
         if connection.control.has_output() {
             connection.control.write(&mut connection.quic);
         }
-        if connection.quic.is_drained() {
-            let connection = self.connections.remove(&number);
-            if let Some(connection) = connection {
-                self.handles.remove(&(connection.endpoint, connection.handle));
+        if connection.quic.is_drained() && !self.lost.iter().any(|(lost, _)| *lost == number) {
+            if let Some(connection) = self.connections.remove(&number) {
+                let handle = (connection.endpoint, connection.handle);
+                // QUIC may have given it to another connection since.
+                if self.handles.get(&handle) == Some(&number) {
+                    self.handles.remove(&handle);
+                }
                 self.deadlines.remove(&(connection.deadline.unwrap_or(self.epoch), number));
             }
             return;
@@ -489,6 +501,16 @@ impl Links {
                 self.failed_after_dial(number);
             }
         }
+    }
+
+    /// Ends the links whose connection was lost. Returns whether there were any.
+    pub(super) fn end_lost(&mut self, now: Duration) -> bool {
+        let any = !self.lost.is_empty();
+        while let Some((number, reason)) = self.lost.pop_front() {
+            self.handle_lost(number, &reason, now);
+            self.touch(number);
+        }
+        any
     }
 
     /// A connection was lost.

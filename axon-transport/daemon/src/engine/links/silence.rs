@@ -10,9 +10,15 @@ use crate::{
     wire::beacon::Datagram,
 };
 
+/// No message of discovery is longer.
+const MAX_DISCOVERY: usize = 512;
+
 impl Links {
     /// A datagram of discovery, or the echo of a probe.
     pub(super) fn handle_discovery(&mut self, from: SocketAddr, bytes: BytesMut, now: Duration) {
+        if bytes.len() > MAX_DISCOVERY {
+            return;
+        }
         if !self.nonces.is_empty()
             && let Ok(Datagram::Echo { nonce, .. }) = Datagram::decode(&bytes)
             && let Some(number) = self.nonces.remove(&nonce)

@@ -184,6 +184,16 @@ impl Events {
     pub async fn recv(&mut self) -> Option<Event> {
         self.0.recv().await
     }
+
+    /// As [`recv`](Self::recv), for a task that polls.
+    pub fn poll_recv(&mut self, cx: &mut std::task::Context<'_>) -> std::task::Poll<Option<Event>> {
+        self.0.poll_recv(cx)
+    }
+
+    /// The next answer, if there is one now.
+    pub fn try_recv(&mut self) -> Option<Event> {
+        self.0.try_recv().ok()
+    }
 }
 
 /// Runs the jobs of one queue, `limit` at a time, and answers each.

@@ -1,0 +1,66 @@
+//! Shutdown: samples in the send queues leave first, while there is progress, for at most 5 s.
+
+use std::time::Duration;
+
+/// Limits of the whole, and of a time without progress.
+const LONGEST: Duration = Duration::from_secs(5);
+const PATIENCE: Duration = Duration::from_secs(2);
+/// Between two looks. A sample that was just published is read from its ring within this time.
+const LOOK: Duration = Duration::from_millis(20);
+
+/// The progress of a shutdown.
+#[derive(Debug)]
+pub(super) struct Finishing {
+    begun: Duration,
+    /// Bytes that had left the queues at the last look, and since when the number is the same.
+    released: usize,
+    since: Duration,
+    next: Duration,
+    /// Nothing waited at the last look.
+    empty: bool,
+}
+
+impl Finishing {
+    /// A shutdown that begins now.
+    pub(super) fn new(now: Duration) -> Self {
+        Self { begun: now, released: 0, since: now, next: now + LOOK, empty: false }
+    }
+
+    /// When to [look](Self::is_over) again.
+    pub(super) fn poll_timeout(&self) -> Duration {
+        self.next
+    }
+
+    /// Whether it is over. `backlog` is what [`Engine::backlog`](crate::engine::Engine::backlog) returns. The waiting
+    /// bytes alone do not show progress, since publishers go on.
+    pub(super) fn is_over(&mut self, backlog: (usize, usize), now: Duration) -> bool {
+        let (waiting, released) = backlog;
+        self.next = now + LOOK;
+        if released != self.released {
+            (self.released, self.since) = (released, now);
+        }
+        let was_empty = std::mem::replace(&mut self.empty, waiting == 0);
+        (was_empty && self.empty)
+            || now.saturating_sub(self.begun) >= LONGEST
+            || now.saturating_sub(self.since) >= PATIENCE
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn it_ends_when_nothing_waits_twice_or_without_progress() {
+        let looks = |at: fn(u32) -> (usize, usize)| {
+            let mut finishing = Finishing::new(Duration::ZERO);
+            (1..).find(|look| finishing.is_over(at(*look), LOOK * *look))
+        };
+        let [patience, longest] = [PATIENCE, LONGEST].map(|t| t.div_duration_f64(LOOK) as u32);
+        assert_eq!(looks(|_| (0, 9)), Some(2), "a publisher may have written just now");
+        assert_eq!(looks(|look| (3_usize.saturating_sub(look as usize), look as usize)), Some(4));
+        assert_eq!(looks(|_| (7, 0)), Some(patience));
+        assert_eq!(looks(|look| (7, look.min(10) as usize)), Some(10 + patience));
+        assert_eq!(looks(|look| (7, look as usize)), Some(longest), "publishers go on for ever");
+    }
+}

@@ -1,0 +1,32 @@
+//! The KME client, on a runtime with a thread of its own: TLS with the KME does not hold up the links.
+
+use axon_transport::config::{Config, Security};
+use tokio::runtime::{Builder, Runtime};
+
+use crate::{
+    gateway::GatewayError,
+    keys::{Events, Kme, UsedKeys},
+};
+
+/// The KME client and its thread.
+pub(super) struct KmeThread {
+    pub(super) kme: Kme,
+    pub(super) used: UsedKeys,
+    pub(super) runtime: Runtime,
+}
+
+/// Starts the KME client of a daemon in qkd; in classic there is none.
+///
+/// # Errors
+/// The settings make no client, or there is no thread for it.
+pub(super) fn start(config: &Config) -> Result<Option<(KmeThread, Events)>, GatewayError> {
+    let Security::Qkd(qkd) = &config.security else { return Ok(None) };
+    let runtime =
+        Builder::new_multi_thread().worker_threads(1).thread_name("axon-kme").enable_all().build()?;
+    let used = UsedKeys::open(config.runtime_dir.as_deref(), config.domain);
+    let (kme, events) = {
+        let _entered = runtime.enter();
+        Kme::start(qkd, used.clone())?
+    };
+    Ok(Some((KmeThread { kme, used, runtime }, events)))
+}

@@ -1,0 +1,113 @@
+//! The reactor: drives the [engine](crate::engine) with sockets, rings, clocks and the KME.
+//!
+//! One thread does all that concerns links. Each pass takes in what is ready, has the engine settle, sends its packets
+//! and carries out its effects. The KME client has a thread of its own, and files are read and written on others.
+//! Timers have a granularity of 1 ms.
+
+mod finishing;
+mod inputs;
+mod kme;
+mod pass;
+mod rings;
+mod session;
+mod sockets;
+mod told;
+
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use axon_shm::internal::monotonic;
+use axon_transport::config::Security;
+use tokio::runtime::{Builder, Runtime};
+
+use self::{
+    kme::KmeThread,
+    pass::{Reactor, ReactorParts},
+    rings::ShmRings,
+    sockets::Sockets,
+};
+use crate::{
+    engine::{Engine, EngineParts, credentials::Credentials, links::LinkParts, peer::MAX_ROUTES},
+    gateway::{
+        GatewayError,
+        bridge::{GatewayParts, ToControl},
+        context::load_identity,
+        endpoint::{endpoint_config, reset_key},
+    },
+    keys::Events,
+    link::Hello,
+};
+
+/// Tasks on other threads, such as a write to the ledger of used keys, are waited for so long at the end.
+const LAST_TASKS: Duration = Duration::from_secs(1);
+
+/// Runs the gateway until the control plane shuts it down.
+///
+/// # Errors
+/// [`GatewayError`]: before [`ToControl::Started`] why it cannot start, later that its session was dropped.
+pub(crate) fn run(parts: GatewayParts) -> Result<(), GatewayError> {
+    let runtime = Builder::new_current_thread().enable_all().build()?;
+    let (kme, events) = kme::start(&parts.config)?.unzip();
+    let (kme, kme_runtime) = kme.map(|KmeThread { kme, used, runtime }| ((kme, used), runtime)).unzip();
+    let result = runtime.block_on(serve(parts, kme, events));
+    let runtimes: [Option<Runtime>; 2] = [Some(runtime), kme_runtime];
+    runtimes.into_iter().flatten().for_each(|runtime| runtime.shutdown_timeout(LAST_TASKS));
+    result
+}
+
+async fn serve(
+    parts: GatewayParts,
+    kme: Option<(crate::keys::Kme, crate::keys::UsedKeys)>,
+    key_events: Option<Events>,
+) -> Result<(), GatewayError> {
+    let GatewayParts { config, daemon, keys, socket, control, orders } = parts;
+    let mut hello = Hello::new(&config, daemon);
+    hello.routes = u32::try_from(MAX_ROUTES).ok();
+    let identity = match &config.security {
+        Security::Classic(classic) => Some(Arc::new(load_identity(classic, &hello.host)?)),
+        Security::Qkd(_) => None,
+    };
+    if let Some(identity) = &identity {
+        identity.host().clone_into(&mut hello.host);
+    }
+    let sockets = Sockets::bind(&config)?;
+    let port = sockets.port();
+    let (session, notices) = session::open(socket, &config)?;
+    let rings = ShmRings::new(session.clone())?;
+    let reset = reset_key(config.runtime_dir.as_deref(), config.domain);
+    let mut of_session = [0; 12];
+    of_session.copy_from_slice(&session.id().0[..12]);
+    let epoch = Instant::now();
+    let engine = Engine::new(EngineParts {
+        links: LinkParts {
+            credentials: Credentials::new(Arc::clone(&config), identity.clone()),
+            hello,
+            addresses: sockets.addresses(),
+            endpoint: Arc::new(endpoint_config(&reset)),
+            epoch,
+            config,
+        },
+        rings: rings.clone(),
+        session_keys: keys,
+        session: of_session,
+        epoch_nanos: monotonic(),
+    })?;
+    // An error: the control plane is gone, which the orders say, too.
+    let _ = control.send(ToControl::Started { port }).await;
+    let reactor = Reactor::new(ReactorParts {
+        engine,
+        epoch,
+        sockets,
+        rings,
+        session,
+        notices,
+        control,
+        orders,
+        kme,
+        key_events,
+        identity,
+    })?;
+    reactor.run().await
+}

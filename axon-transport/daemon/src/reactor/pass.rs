@@ -1,0 +1,390 @@
+//! The loop: passes that take in what is ready, and the wait between them.
+
+use std::{
+    future::poll_fn,
+    io,
+    rc::Rc,
+    sync::Arc,
+    task::Poll,
+    time::{Duration, Instant},
+};
+
+use axon_shm::internal::return_free_memory;
+use axon_transport::Session;
+use tokio::{
+    sync::mpsc,
+    task::{spawn_blocking, yield_now},
+    time::sleep,
+};
+
+use super::{
+    finishing::Finishing,
+    inputs::{Done, Input, Inputs},
+    rings::ShmRings,
+    session::{Notices, local_graph},
+    sockets::{Datagram, Sockets},
+    told::Told,
+};
+use crate::{
+    engine::{Effect, Engine},
+    gateway::{
+        GatewayError,
+        bridge::{ToControl, ToGateway},
+        identity::Identity,
+    },
+    keys::{Event, Events, Kme, UsedKeys},
+};
+
+/// After a pass that did something, the next inputs are looked for this long before the thread sleeps.
+const POLL: Duration = Duration::from_micros(50);
+/// Packets that one pass sends before it takes in what has come, in system calls.
+const SENDS: usize = 64;
+/// Between two looks at the files of the identity: a change is in force within a second.
+const LOOK: Duration = Duration::from_millis(250);
+/// Between two reports of the keys.
+const KEYS: Duration = Duration::from_secs(1);
+/// How long the last packets of closed connections may take.
+const GOODBYE: Duration = Duration::from_millis(500);
+/// Freed memory is given back to the system after this time.
+const RETURN: Duration = Duration::from_secs(1);
+
+/// The parts of a reactor.
+pub(super) struct ReactorParts {
+    pub(super) engine: Engine,
+    /// When the engine's time was zero.
+    pub(super) epoch: Instant,
+    pub(super) sockets: Sockets,
+    pub(super) rings: Rc<ShmRings>,
+    pub(super) session: Session,
+    pub(super) notices: Arc<Notices>,
+    pub(super) control: mpsc::Sender<ToControl>,
+    pub(super) orders: mpsc::Receiver<ToGateway>,
+    /// In qkd.
+    pub(super) kme: Option<(Kme, UsedKeys)>,
+    pub(super) key_events: Option<Events>,
+    /// In classic.
+    pub(super) identity: Option<Arc<Identity>>,
+}
+
+/// The reactor of one daemon.
+pub(super) struct Reactor {
+    engine: Engine,
+    epoch: Instant,
+    sockets: Sockets,
+    rings: Rc<ShmRings>,
+    session: Session,
+    notices: Arc<Notices>,
+    told: Told,
+    inputs: Inputs,
+    kme: Option<(Kme, UsedKeys)>,
+    /// Answers that the KME client gave at once.
+    answers: Vec<Event>,
+    report_done: mpsc::UnboundedSender<Done>,
+    buffer: Vec<u8>,
+    /// Packets may be left that the last pass did not send.
+    has_packets: bool,
+    finishing: Option<Finishing>,
+    shutdown: bool,
+    next_keys: Duration,
+    polls: bool,
+}
+
+impl Reactor {
+    /// A reactor that has not begun. Needs a tokio runtime.
+    ///
+    /// # Errors
+    /// The doorbell cannot be watched.
+    pub(super) fn new(parts: ReactorParts) -> io::Result<Self> {
+        let (report_done, done) = mpsc::unbounded_channel();
+        if let Some(identity) = parts.identity.filter(|identity| identity.has_files()) {
+            tokio::spawn(watch_files(identity, report_done.clone()));
+        }
+        let inputs = Inputs::new(parts.orders, parts.key_events, done, &parts.rings)?;
+        Ok(Self {
+            engine: parts.engine,
+            epoch: parts.epoch,
+            sockets: parts.sockets,
+            rings: parts.rings,
+            session: parts.session,
+            notices: parts.notices,
+            told: Told::new(parts.control),
+            inputs,
+            kme: parts.kme,
+            answers: Vec::new(),
+            report_done,
+            buffer: Vec::new(),
+            has_packets: false,
+            finishing: None,
+            shutdown: false,
+            next_keys: KEYS,
+            polls: std::thread::available_parallelism().is_ok_and(|n| n.get() > 1),
+        })
+    }
+
+    fn now(&self) -> Duration {
+        self.epoch.elapsed()
+    }
+
+    /// Runs until the control plane ends it, or is gone.
+    ///
+    /// # Errors
+    /// The control plane dropped the gateway's session.
+    pub(super) async fn run(mut self) -> Result<(), GatewayError> {
+        let local = local_graph(&self.session);
+        self.engine.handle_local_graph(local, self.now());
+        while !self.shutdown && !self.notices.is_lost() {
+            let busy = self.pass();
+            if self.shutdown {
+                break;
+            }
+            self.wait(busy).await;
+        }
+        self.end().await;
+        if self.shutdown { Ok(()) } else { Err(GatewayError::SessionLost) }
+    }
+
+    /// Closes all links, and lets their last packets out.
+    async fn end(&mut self) {
+        let now = self.now();
+        self.engine.close(now);
+        let until = now + GOODBYE;
+        loop {
+            self.pass();
+            if self.engine.is_idle() || self.now() >= until {
+                break;
+            }
+            self.wait_until(Some(until)).await;
+        }
+        let _ = tokio::time::timeout(GOODBYE, self.told.flush()).await;
+    }
+
+    /// Takes in all that is ready, and does what follows. Returns whether there was anything.
+    fn pass(&mut self) -> bool {
+        let now = self.now();
+        let mut busy = self.take_in(now);
+        if self.engine.poll_timeout(now).is_some_and(|due| due <= now) {
+            self.engine.handle_timeout(now);
+            busy = true;
+        }
+        loop {
+            self.engine.settle(now);
+            self.carry_out(now);
+            // Arming it looks at the rings once more: room may have been made before.
+            if self.rings.is_armed_too_little() {
+                self.rings.arm();
+                self.engine.handle_rings(now);
+            } else if self.answers.is_empty() {
+                break;
+            }
+            for answer in std::mem::take(&mut self.answers) {
+                self.engine.handle_key_event(answer, now);
+            }
+        }
+        busy |= self.transmit(now);
+        self.look_whether_finished(now);
+        self.report_keys(now);
+        busy
+    }
+
+    fn take_in(&mut self, now: Duration) -> bool {
+        let mut busy = false;
+        if !self.told.is_behind() {
+            let engine = &mut self.engine;
+            busy |= self.sockets.receive(|datagram| {
+                let Datagram { socket, from, local, ecn, bytes } = datagram;
+                engine.handle_datagram(socket, from, local, ecn, bytes, now);
+            });
+        }
+        for input in self.inputs.take() {
+            busy = true;
+            match input {
+                Input::Order(order) => self.handle_order(order, now),
+                Input::Key(event) => self.engine.handle_key_event(event, now),
+                Input::Done(done) => self.handle_done(done, now),
+            }
+        }
+        if self.notices.take_graph() {
+            let local = local_graph(&self.session);
+            self.engine.handle_local_graph(local, now);
+            busy = true;
+        }
+        if self.inputs.take_ring() {
+            self.rings.arm();
+            self.engine.handle_rings(now);
+            busy = true;
+        }
+        busy
+    }
+
+    fn handle_order(&mut self, order: ToGateway, now: Duration) {
+        match order {
+            ToGateway::Shutdown => self.shutdown = true,
+            ToGateway::Finish => {
+                self.finishing.get_or_insert_with(|| Finishing::new(now));
+            }
+            order => self.engine.handle_order(order, now),
+        }
+    }
+
+    fn handle_done(&mut self, done: Done, now: Duration) {
+        match done {
+            Done::Recorded(link, first) => self.engine.handle_recorded(link, first, now),
+            Done::Identity => self.engine.handle_identity(now),
+            Done::Keys(statistics) => {
+                let (kme, used) = *statistics;
+                if let Some(status) = self.engine.key_status(&kme, &used, now) {
+                    self.told.tell(ToControl::Keys(status));
+                }
+            }
+        }
+    }
+
+    /// Carries out the engine's effects.
+    fn carry_out(&mut self, now: Duration) {
+        while let Some(effect) = self.engine.poll_effect() {
+            match effect {
+                Effect::Tell(what) => self.told.tell(what),
+                Effect::Kme(origin, request) => {
+                    if let Some((kme, _)) = &self.kme
+                        && let Err(event) = kme.submit(origin, request)
+                    {
+                        self.answers.push(*event);
+                    }
+                }
+                Effect::Record { link, key_id } => self.record(link, key_id, now),
+                Effect::ReturnMemory => {
+                    tokio::spawn(async {
+                        sleep(RETURN).await;
+                        let _ = spawn_blocking(return_free_memory).await;
+                    });
+                }
+            }
+        }
+    }
+
+    fn record(&mut self, link: u64, key_id: String, now: Duration) {
+        let Some((_, used)) = &self.kme else {
+            return self.engine.handle_recorded(link, false, now);
+        };
+        let (used, report) = (used.clone(), self.report_done.clone());
+        spawn_blocking(move || {
+            let first = used.record(&[key_id]) == [true];
+            // An error: the reactor is gone.
+            let _ = report.send(Done::Recorded(link, first));
+        });
+    }
+
+    /// Sends packets, up to a bound. Returns whether there was any.
+    fn transmit(&mut self, now: Duration) -> bool {
+        self.has_packets = false;
+        for sent in 0..SENDS {
+            if !self.sockets.flush() {
+                return sent > 0;
+            }
+            let most = self.sockets.max_datagrams();
+            let packets = self.engine.poll_transmit(most, &mut self.buffer, now);
+            let Some((socket, transmit)) = packets else { return sent > 0 };
+            self.sockets.send(socket, transmit, &self.buffer);
+        }
+        self.has_packets = true;
+        true
+    }
+
+    fn look_whether_finished(&mut self, now: Duration) {
+        if let Some(finishing) = &mut self.finishing
+            && finishing.poll_timeout() <= now
+            && finishing.is_over(self.engine.backlog(), now)
+        {
+            self.finishing = None;
+            self.told.tell(ToControl::Finished);
+        }
+    }
+
+    /// Has the counters of the keys read, on another thread: the ledger may wait for the disk.
+    fn report_keys(&mut self, now: Duration) {
+        let Some((kme, used)) = self.kme.as_ref().filter(|_| now >= self.next_keys) else { return };
+        self.next_keys = now + KEYS;
+        let (kme, used, report) = (kme.clone(), used.clone(), self.report_done.clone());
+        spawn_blocking(move || {
+            let _ = report.send(Done::Keys(Box::new((kme.statistics(), used.statistics()))));
+        });
+    }
+
+    /// Waits until there is something to do. After a `busy` pass it polls for a while before it sleeps.
+    async fn wait(&mut self, busy: bool) {
+        let now = self.now();
+        let finishing = self.finishing.as_ref().map(Finishing::poll_timeout);
+        let keys = self.kme.is_some().then_some(self.next_keys);
+        let until = [self.engine.poll_timeout(now), finishing, keys].into_iter().flatten().min();
+        if self.has_packets || until.is_some_and(|until| until <= now) {
+            // The kernel is asked for readiness all the same.
+            yield_now().await;
+            let _ = self.look().await;
+            return;
+        }
+        if busy && self.polls {
+            let end = until.map_or(now + POLL, |until| until.min(now + POLL));
+            loop {
+                yield_now().await;
+                if self.look().await {
+                    return;
+                }
+                if self.now() >= end {
+                    break;
+                }
+            }
+        }
+        self.wait_until(until).await;
+    }
+
+    /// Whether there is an input now.
+    async fn look(&mut self) -> bool {
+        let Self { inputs, sockets, .. } = self;
+        poll_fn(|cx| {
+            let ready = inputs.poll_ready(cx).is_ready() | sockets.poll_ready(cx).is_ready();
+            Poll::Ready(ready)
+        })
+        .await
+    }
+
+    /// Waits for inputs until this time at most.
+    async fn wait_until(&mut self, until: Option<Duration>) {
+        let left = until.map(|until| until.saturating_sub(self.now()));
+        let Self { inputs, sockets, notices, told, .. } = self;
+        // Datagrams stay with the kernel while the control plane is far behind.
+        let reads = !told.is_behind();
+        let ready = poll_fn(|cx| {
+            let ready = inputs.poll_ready(cx).is_ready() | (reads && sockets.poll_ready(cx).is_ready());
+            if ready { Poll::Ready(()) } else { Poll::Pending }
+        });
+        let slept = async {
+            match left {
+                Some(left) => sleep(left).await,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            biased;
+            () = ready => {}
+            () = notices.wait() => {}
+            () = told.send_next() => {}
+            () = slept => {}
+        }
+    }
+}
+
+/// Looks at the files of the identity until the reactor is gone.
+async fn watch_files(identity: Arc<Identity>, report: mpsc::UnboundedSender<Done>) {
+    let mut looks = tokio::time::interval(LOOK);
+    // After a stall, two looks at once would miss a write in between.
+    looks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    while !report.is_closed() {
+        looks.tick().await;
+        let identity = Arc::clone(&identity);
+        // On another thread: a file system can hang.
+        let changed = spawn_blocking(move || identity.look(Instant::now())).await;
+        if changed.unwrap_or(false) && report.send(Done::Identity).is_err() {
+            return;
+        }
+    }
+}

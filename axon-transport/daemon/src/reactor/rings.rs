@@ -1,0 +1,180 @@
+//! The rings of this host as shared memory: relay subscriptions and stand-ins of the gateway's session.
+
+use std::{
+    cell::Cell,
+    collections::HashMap,
+    rc::Rc,
+};
+
+use axon_shm::{ExternalLeader, Meta, PublishError, ShmError, ids::Gid};
+use axon_transport::{
+    EndpointSpec, MessageInfo, Session, Subscription,
+    graph::Endpoint,
+    internal::session::{RemoteWriter, Written},
+};
+
+use crate::engine::rings::{RingError, RingReader, RingWriter, Rings};
+
+/// The rings, and the doorbell that rings for samples and for room in them.
+pub(super) struct ShmRings {
+    session: Session,
+    doorbell: ExternalLeader,
+    /// Whether the engine waits for room in a ring.
+    waits_for_room: Cell<bool>,
+    /// Whether the doorbell is armed for room, too.
+    armed_for_room: Cell<bool>,
+}
+
+impl ShmRings {
+    /// The rings of `session`.
+    ///
+    /// # Errors
+    /// The session's doorbell is taken.
+    pub(super) fn new(session: Session) -> Result<Rc<Self>, ShmError> {
+        Ok(Rc::new(Self {
+            doorbell: session.segment().external_leader()?,
+            session,
+            waits_for_room: Cell::new(false),
+            armed_for_room: Cell::new(false),
+        }))
+    }
+
+    /// The doorbell. It is readable once after each [`arm`](Self::arm).
+    pub(super) fn doorbell(&self) -> &ExternalLeader {
+        &self.doorbell
+    }
+
+    /// Arms the doorbell. What came before it is found by a look at the rings, what comes after it rings.
+    pub(super) fn arm(&self) {
+        let room = self.waits_for_room.get();
+        self.doorbell.clear();
+        self.doorbell.arm(room);
+        self.armed_for_room.set(room);
+    }
+
+    /// Whether the engine waits for room since the doorbell was armed: it has to be armed again.
+    pub(super) fn is_armed_too_little(&self) -> bool {
+        self.waits_for_room.get() && !self.armed_for_room.get()
+    }
+}
+
+impl Rings for ShmRings {
+    fn open_reader(
+        &self,
+        spec: EndpointSpec,
+        stands_for: Vec<Gid>,
+    ) -> Result<Rc<dyn RingReader>, String> {
+        let subscription = self.session.create_relay(spec, stands_for);
+        Ok(Rc::new(Relay(subscription.map_err(|error| error.to_string())?)))
+    }
+
+    fn open_writer(&self, remote: &Endpoint) -> Result<Rc<dyn RingWriter>, String> {
+        let writer = RemoteWriter::stand_in(&self.session, remote.clone());
+        Ok(Rc::new(Writer(writer.map_err(|error| error.to_string())?)))
+    }
+
+    fn set_waiting_for_room(&self, waiting: bool) {
+        // The loop arms the doorbell again before it sleeps.
+        self.waits_for_room.set(waiting);
+    }
+}
+
+/// A relay subscription.
+struct Relay(Subscription);
+
+impl RingReader for Relay {
+    fn gid(&self) -> Gid {
+        self.0.gid()
+    }
+
+    fn with_data(&self) -> Vec<Gid> {
+        self.0.with_data()
+    }
+
+    fn reads(&self, publisher: &Gid) -> bool {
+        self.0.reads(publisher)
+    }
+
+    fn matched(&self) -> Vec<Gid> {
+        self.0.matched()
+    }
+
+    fn take_of(&self, publisher: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
+        self.0.take_of(publisher)
+    }
+
+    fn acknowledge_of(&self, publisher: &Gid, sequence: u64) {
+        self.0.acknowledge_of(publisher, sequence);
+    }
+
+    fn unacknowledged(&self) -> HashMap<Gid, u64> {
+        self.0.unacknowledged()
+    }
+
+    fn give_up(&self, publisher: Gid, samples: u64) {
+        self.0.give_up(publisher, samples);
+    }
+
+    fn assertions(&self) -> Vec<(Gid, u64)> {
+        self.0.assertions()
+    }
+
+    fn set_stands_for(&self, gids: Vec<Gid>) {
+        self.0.set_stands_for(gids);
+    }
+}
+
+/// A stand-in.
+struct Writer(RemoteWriter);
+
+impl RingWriter for Writer {
+    fn endpoint(&self) -> &Endpoint {
+        self.0.endpoint()
+    }
+
+    fn partners(&self) -> Vec<Gid> {
+        self.0.partners()
+    }
+
+    fn try_write(&self, client: &Gid, meta: Meta, payload: &[u8]) -> Result<Written, RingError> {
+        self.0.try_write(client, meta, payload).map_err(|error| match error {
+            PublishError::Blocked { .. } => RingError::Full,
+            error => RingError::Lost(error.to_string()),
+        })
+    }
+
+    fn assert_alive(&self) {
+        self.0.assert_alive();
+    }
+
+    fn with_calls(&self) -> Vec<Gid> {
+        match &self.0 {
+            RemoteWriter::Publisher(_) => Vec::new(),
+            RemoteWriter::Client(client) => {
+                client.has_response().then(|| client.gid()).into_iter().collect()
+            }
+            RemoteWriter::Server(server) => server.with_requests(),
+        }
+    }
+
+    fn reads_calls_of(&self, client: &Gid) -> bool {
+        match &self.0 {
+            RemoteWriter::Publisher(_) => false,
+            RemoteWriter::Client(own) => *client == own.gid(),
+            RemoteWriter::Server(server) => server.reads(client),
+        }
+    }
+
+    fn take_call_of(&self, client: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
+        match &self.0 {
+            RemoteWriter::Publisher(_) => None,
+            RemoteWriter::Client(own) if *client == own.gid() => {
+                let mut payload = Vec::new();
+                let info = own.take_response(&mut payload)?;
+                Some((info, payload))
+            }
+            RemoteWriter::Client(_) => None,
+            RemoteWriter::Server(server) => server.take_request_of(client),
+        }
+    }
+}
