@@ -384,7 +384,9 @@ impl RingWriter for SimWriter {
         if readers.iter().any(|s| keeps(s) && s.room == Some(0)) {
             return Err(RingError::Full);
         }
-        let reliable = self.endpoint.qos.reliability == Reliability::Reliable;
+        // For BEST_EFFORT readers alone, streams of one sample each may overtake each other.
+        let reliable =
+            readers.iter().any(|s| s.endpoint.qos.reliability == Reliability::Reliable);
         if reliable && meta.sequence <= self.last.replace(meta.sequence) {
             state.disordered += 1;
         }

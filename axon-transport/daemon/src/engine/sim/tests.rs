@@ -99,7 +99,14 @@ fn script(seed: u64, hosts: usize) -> Script {
         faults: 40,
         until: secs(30),
         longest: secs(12),
-        weights: Weights { rebind: 0, ..Weights::default() },
+        // quinn-proto 0.11.19 has a debug assertion that fails when the loss timer of a server expires after the
+        // client's address changed: the new path has nothing in flight, and the timer is the old path's. Without
+        // debug assertions it sends one probe.
+        weights: Weights {
+            rebind: 0,
+            change_address: u32::from(!cfg!(debug_assertions)),
+            ..Weights::default()
+        },
     };
     Script::generate(seed, &recipe)
 }
@@ -114,7 +121,8 @@ fn try_seed(seed: u64, hosts: usize) {
     };
     let script = script(seed, hosts);
     let Some(why) = fails(&script) else { return };
-    let why = why.downcast_ref::<String>().cloned().unwrap_or_default();
+    let text = why.downcast_ref::<&str>().map(|text| (*text).to_owned());
+    let why = why.downcast_ref::<String>().cloned().or(text).unwrap_or_default();
     let shrunk = script.shrink(200, |script| fails(script).is_some());
     panic!("seed {seed} with {hosts} hosts fails: {why}\nshrunk to:\n{}", shrunk.script);
 }
