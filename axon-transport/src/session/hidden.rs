@@ -173,6 +173,11 @@ impl Subscription {
         self.inner.lock().take_from(writer, &self.inner)
     }
 
+    /// For a relay: how many samples of this publisher were overwritten before they were taken.
+    pub fn lost_of(&self, writer: &Gid) -> u64 {
+        if self.session.is_forked() { 0 } else { self.inner.lock().lost_of(writer) }
+    }
+
     /// For a relay: samples of this publisher up to this number are where they are to go. Until then
     /// nobody takes them as acknowledged.
     pub fn acknowledge_of(&self, writer: &Gid, sequence: u64) {

@@ -723,6 +723,7 @@ impl Engine {
         if now >= self.next_report {
             self.next_report = now + REPORT;
             self.resync();
+            self.peers.values_mut().for_each(|peer| peer.outbound.count_overwritten());
             self.report();
         }
     }

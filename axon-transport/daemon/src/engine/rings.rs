@@ -41,6 +41,10 @@ pub(crate) trait RingReader {
     fn matched(&self) -> Vec<Gid>;
     /// Takes the next sample of a publisher.
     fn take_of(&self, publisher: &Gid) -> Option<(MessageInfo, Vec<u8>)>;
+    /// How many samples of this publisher were overwritten before they were taken.
+    fn lost_of(&self, _publisher: &Gid) -> u64 {
+        0
+    }
     /// The peer has the samples of this publisher up to this number, or will never have them.
     fn acknowledge_of(&self, publisher: &Gid, sequence: u64);
     /// How many samples of each publisher are not acknowledged.

@@ -116,7 +116,7 @@ impl Reactor {
             has_packets: false,
             finishing: None,
             shutdown: false,
-            next_keys: KEYS,
+            next_keys: Duration::ZERO,
             polls: std::thread::available_parallelism().is_ok_and(|n| n.get() > 1),
         })
     }

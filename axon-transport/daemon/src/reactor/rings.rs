@@ -103,6 +103,10 @@ impl RingReader for Relay {
         self.0.take_of(publisher)
     }
 
+    fn lost_of(&self, publisher: &Gid) -> u64 {
+        self.0.lost_of(publisher)
+    }
+
     fn acknowledge_of(&self, publisher: &Gid, sequence: u64) {
         self.0.acknowledge_of(publisher, sequence);
     }

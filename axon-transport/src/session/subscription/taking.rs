@@ -226,6 +226,17 @@ impl MatchedReaders {
             .any(|slot| slot.reader.writer() == *writer && slot.reader.has_data())
     }
 
+    /// Samples of `writer` that were overwritten before they were taken.
+    pub(in crate::session) fn lost_of(&mut self, writer: &Gid) -> u64 {
+        let of = self.matched_readers.iter_mut().filter(|slot| slot.reader.writer() == *writer);
+        of.map(|slot| {
+            // Finds what a take would find lost. The take says what is wrong with the memory.
+            let _ = slot.reader.peek();
+            slot.reader.lost()
+        })
+        .sum()
+    }
+
     /// Samples of `writer` that were lost before they came to its ring here. Samples missing before
     /// the `first` in that ring are seen by its number, where the subscription knows an earlier one.
     pub(in crate::session) fn lost_elsewhere(&mut self, writer: &Gid, samples: u64, first: bool) {

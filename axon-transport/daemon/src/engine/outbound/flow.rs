@@ -87,6 +87,8 @@ pub(super) struct Flow {
     held: Option<Sample>,
     /// Whether the rings may hold more samples than the last turn moved.
     more: bool,
+    /// The relay whose losses are counted, and how many are.
+    counted: Option<(Gid, u64)>,
     queue: Queue,
     /// The stream of its RELIABLE samples.
     stream: Option<StreamId>,
@@ -138,6 +140,7 @@ impl Flow {
             merge: Merge::default(),
             held: None,
             more: false,
+            counted: None,
             queue: Queue::new(qos, Rc::clone(budget)),
             stream: None,
             priority: 0,
@@ -242,7 +245,18 @@ impl Flow {
             }
         }
         counters.lost(&self.topic, "queue", dropped);
+        self.count_overwritten(sources, counters);
         samples as u32
+    }
+
+    /// Counts the samples that newer ones replaced in the ring. The relay that asks for most loses the fewest: a sample
+    /// that it has is sent.
+    pub(super) fn count_overwritten(&mut self, sources: &[Source], counters: &Counters) {
+        let Some(first) = sources.iter().find(|source| source.reads(&self.of)) else { return };
+        let (relay, lost) = (first.gid(), first.lost_of(&self.of));
+        let before = self.counted.replace((relay, lost));
+        let counted = before.filter(|(of, _)| *of == relay).map_or(0, |(_, counted)| counted);
+        counters.lost(&self.topic, "queue", lost.saturating_sub(counted));
     }
 
     fn next(&mut self, sources: &[Source], now: Duration) -> Option<Sample> {

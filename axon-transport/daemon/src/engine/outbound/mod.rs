@@ -492,6 +492,19 @@ impl Outbound {
         }
     }
 
+    /// Counts the samples that were overwritten in their rings while their flows left them there.
+    pub(crate) fn count_overwritten(&mut self) {
+        for served in self.routes.values() {
+            for id in served.flows.values() {
+                if let Some(flow) = &mut self.flows[*id]
+                    && flow.class().is_some()
+                {
+                    flow.count_overwritten(&served.sources, &self.counters);
+                }
+            }
+        }
+    }
+
     /// The next event.
     pub(crate) fn poll_event(&mut self) -> Option<OutboundEvent> {
         if self.events.is_empty() { None } else { Some(self.events.remove(0)) }

@@ -60,6 +60,14 @@ impl Source {
         }
     }
 
+    /// How many samples of this publisher were overwritten in its ring before they were taken.
+    pub(super) fn lost_of(&self, of: &Gid) -> u64 {
+        match self {
+            Self::Relay(_, reader) => reader.lost_of(of),
+            Self::StandIn(_) => 0,
+        }
+    }
+
     /// How its samples are queued. No request or response is dropped.
     pub(super) fn qos(&self) -> Qos {
         match self {
