@@ -10,8 +10,12 @@ use super::{
     protection::Seal,
 };
 
-/// Bulk that QUIC holds, at least and at most: between them it is twice the congestion window.
-const BULK: (u64, u64) = (128 << 10, 4 << 20);
+/// Bulk that QUIC holds, at least and at most. Between them it is the congestion window and a little more: as much as
+/// may be on the way, and what leaves before the next pass. All else waits in the flows, where a newer sample can
+/// replace it.
+const BULK: (u64, u64) = (128 << 10, 16 << 20);
+/// Bulk that QUIC holds beyond the congestion window, at least.
+const AHEAD: u64 = 64 << 10;
 /// Bytes more that QUIC holds for all other classes.
 const RESERVE: u64 = 1 << 20;
 
@@ -53,8 +57,16 @@ impl Connection {
     /// The connection as a carrier of samples.
     pub(super) fn carrier<'a>(&'a mut self, seal: Seal<'a>) -> Carrier<'a> {
         let window = self.quic.congestion_state().window();
-        let bulk = (2 * window).clamp(BULK.0, BULK.1);
-        Carrier { quic: &mut self.quic, seal, streams: &mut self.flows, flow: 0, taken: 0, window, bulk }
+        let bulk = (window + AHEAD.max(window / 8)).clamp(BULK.0, BULK.1);
+        Carrier {
+            quic: &mut self.quic,
+            seal,
+            streams: &mut self.flows,
+            flow: 0,
+            taken: 0,
+            window,
+            bulk,
+        }
     }
 }
 

@@ -195,7 +195,7 @@ impl Keyring {
         exporters: &Exporters,
         first: Option<(KeyId, KmeKey)>,
     ) -> Result<(), SupplyError> {
-        let number = *self.connections.get(&connection).ok_or(SupplyError::Unattached(connection))?;
+        let number = self.attached(connection)?;
         self.touch(number);
         let sender = &mut self.peers[number].sender;
         // RETIREs that the previous connection still gets: a successor has not closed it yet. If a third
@@ -228,7 +228,7 @@ impl Keyring {
         connection: u64,
         message: &KeyMessage,
     ) -> Result<(), SupplyError> {
-        let number = *self.connections.get(&connection).ok_or(SupplyError::Unattached(connection))?;
+        let number = self.attached(connection)?;
         self.touch(number);
         let peer = &mut self.peers[number];
         match message {
@@ -276,7 +276,7 @@ impl Keyring {
     /// The sender that seals for `connection`. `None` before
     /// [`attach_sender`](Self::attach_sender), and from the time at which a successor has the keys.
     pub(crate) fn sender(&mut self, connection: u64) -> Option<&mut Sender> {
-        let number = *self.connections.get(&connection)?;
+        let number = self.attached(connection).ok()?;
         if self.peers[number].sender.attached() != Some(connection) {
             return None;
         }
@@ -286,7 +286,7 @@ impl Keyring {
 
     /// The receiver that opens messages of `connection`, `None` once the connection has ended.
     pub(crate) fn receiver(&mut self, connection: u64) -> Option<&mut Receiver> {
-        let number = *self.connections.get(&connection)?;
+        let number = self.attached(connection).ok()?;
         self.touch(number);
         Some(&mut self.peers[number].receiver)
     }
@@ -389,6 +389,12 @@ impl Keyring {
         });
         self.numbers.insert(sae.to_owned(), number);
         Ok(number)
+    }
+
+    /// The number of the peer that the connection is attached to.
+    fn attached(&self, connection: u64) -> Result<usize, SupplyError> {
+        let number = self.connections.get(&connection).copied();
+        number.ok_or(SupplyError::Unattached(connection))
     }
 
     /// The number in an [`Origin`], if it is a peer's.

@@ -272,10 +272,7 @@ pub(crate) fn admits(closed: Option<String>) -> Result<(), Failure> {
 
 /// In `ca` a certificate stands for the hosts that it names: the peer must be one of them. In
 /// `pinned` the pin has the peer's name, and what it calls itself counts for nothing.
-pub(crate) fn names_its_host(
-    chain: &[CertificateDer<'_>],
-    theirs: &Hello,
-) -> Result<(), Failure> {
+pub(crate) fn names_its_host(chain: &[CertificateDer<'_>], theirs: &Hello) -> Result<(), Failure> {
     if chain.first().is_some_and(|c| CaMaterial::is_for_host(c, &theirs.host)) {
         return Ok(());
     }

@@ -344,9 +344,10 @@ fn failed_call_is_repeated_by_the_timer() {
     let mut ring = keyring("sae-b", KeyMode::Messages10);
     let mut kmes = Kmes { failures: vec![FailureKind::Unreachable], ..Kmes::default() };
     let (key_id, _) = kmes.issue();
-    ring.attach_receiver(s(0), 1, "sae-a", &exporters(1)).unwrap();
-    ring.handle_message(s(0), 1, &KeyMessage::Announce(vec![key_id])).unwrap();
-    let mut now = s(0);
+    // Between two of the ticks that poll every machine.
+    let mut now = ms(300);
+    ring.attach_receiver(now, 1, "sae-a", &exporters(1)).unwrap();
+    ring.handle_message(now, 1, &KeyMessage::Announce(vec![key_id])).unwrap();
     let mut times = Vec::new();
     for _ in 0..1000 {
         if let Some((origin, request)) = ring.poll_request(now) {
@@ -362,7 +363,7 @@ fn failed_call_is_repeated_by_the_timer() {
         now = due;
         ring.handle_timeout(now);
     }
-    assert_eq!(times, [s(0), s(2)]);
+    assert_eq!(times, [ms(300), ms(2300)]);
 }
 
 #[test]

@@ -310,14 +310,11 @@ impl Dialling {
     }
 
     /// The handshake is complete: in qkd its key is spent.
-    fn connected(
-        &mut self,
-        now: Duration,
-        round: &Round,
-        keyring: Option<&mut Keyring>,
-    ) -> Action {
-        let Some((keyring, sae, key_id)) = self.key(round, keyring) else { return Action::Open };
-        if keyring.dialler().succeeded(now, sae, key_id) == Completion::First {
+    fn connected(&mut self, now: Duration, round: &Round, keyring: Option<&mut Keyring>) -> Action {
+        let spent = |(keyring, sae, key_id): (&mut Keyring, &str, &KeyId)| {
+            keyring.dialler().succeeded(now, sae, key_id) == Completion::First
+        };
+        if round.attempt.is_none() || self.key(round, keyring).is_some_and(spent) {
             return Action::Open;
         }
         let (code, reason) = (CloseCode::KeyReused, "this PSK has completed a handshake before");

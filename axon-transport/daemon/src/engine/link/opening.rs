@@ -57,6 +57,8 @@ pub(crate) struct Opening {
     side: Side,
     remote: SocketAddr,
     ours: Hello,
+    /// Whether the settings are those of qkd.
+    qkd: bool,
     /// In `ca`: the certificates that have to name the peer's host.
     chain: Option<Vec<CertificateDer<'static>>>,
     negotiated: Option<Negotiated>,
@@ -143,15 +145,17 @@ impl Opening {
         let Handshake { connection, side, remote, negotiated, exporters, chain, dialled } =
             handshake;
         let ca = matches!(&config.security, Security::Classic(c) if c.auth == ClassicAuth::Ca);
+        let qkd = matches!(&config.security, Security::Qkd(_));
         let mut opening = Self {
             connection,
             side,
             remote,
             ours,
+            qkd,
             chain: ca.then_some(chain),
             negotiated: None,
             exporters,
-            order: Order::new(side, keyring.is_some()),
+            order: Order::new(side, qkd),
             step: Step::Hello(None),
             until: None,
             greeted: false,
@@ -332,11 +336,13 @@ impl Opening {
         dialled: Option<String>,
         keyring: Option<&mut Keyring>,
     ) -> Result<(), Failure> {
-        let Some(keyring) = keyring else {
+        if !self.qkd {
             self.negotiated = Some(negotiated);
             self.greet(now, None);
             return Ok(());
-        };
+        }
+        let without_keys = || Failure::Ours(CloseCode::Internal, "no keys in qkd".into());
+        let keyring = keyring.ok_or_else(without_keys)?;
         match self.side {
             Side::Client => self.greet(now, dialled),
             Side::Server => {
@@ -403,11 +409,12 @@ impl Opening {
         }
         self.greeted = true;
         self.order.hello_checked(theirs.daemon < self.ours.daemon);
-        let Some(keyring) = keyring else {
+        if !self.qkd {
             self.open(theirs.clone(), None);
             return Ok(());
-        };
+        }
         let internal = |text: &str| Failure::Ours(CloseCode::Internal, text.into());
+        let keyring = keyring.ok_or_else(|| internal("no keys to prove the client's name with"))?;
         let sae = theirs.sae.as_deref().ok_or_else(|| internal("no SAE ID to prove"))?;
         let exporters = self.exporters.as_ref().ok_or_else(|| internal("no TLS exporter"))?;
         let (connection, source) = (self.connection, self.remote.ip());

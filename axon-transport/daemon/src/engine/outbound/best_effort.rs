@@ -97,7 +97,7 @@ impl BestEffort {
             let Some(stream) = carrier.quic.streams().open(Dir::Uni) else {
                 return Some(Pause::NoStream);
             };
-            let Some(sample) = queue.pop_best_effort(now) else { return Some(Pause::Empty) };
+            let Some(sample) = queue.pop_best_effort() else { return Some(Pause::Empty) };
             let (sequence, payload) = (sample.info.sequence, sample.payload.len());
             done.sequence = done.sequence.max(Some(sequence));
             if carrier.seal.write(&sample, route, Delivery::BestEffort, frames, now).is_err() {

@@ -144,7 +144,7 @@ impl Flow {
             more: false,
             undemanded: 0,
             counted: None,
-            queue: Queue::new(qos, Rc::clone(budget), now),
+            queue: Queue::new(qos, Rc::clone(budget)),
             stream: None,
             priority: 0,
             frames: Frames::default(),
@@ -237,12 +237,17 @@ impl Flow {
         let waits = qos.history == History::KeepAll
             && qos.reliability == Reliability::Reliable;
         let (mut samples, mut bytes, mut dropped) = (0, 0, 0);
-        while samples < FILL.0 && bytes < FILL.1 {
+        // A flow that is behind looks at all, to keep the newest.
+        let most = if self.queue.is_behind(now) { usize::MAX } else { FILL.1 };
+        while samples < FILL.0 && bytes < most {
             if waits && self.queue.waiting_bytes() >= AHEAD {
                 break;
             }
             let Some(sample) = self.next(sources, now) else {
                 self.more = self.merge.is_behind();
+                if !self.more {
+                    self.queue.handle_empty_ring();
+                }
                 break;
             };
             bytes += sample.payload.len();
@@ -419,7 +424,7 @@ impl Flow {
         (self.written, self.sealed) = (0, VecDeque::new());
         let mut end = 0;
         while bytes < TOGETHER {
-            let Some(sample) = self.queue.send(now) else { break };
+            let Some(sample) = self.queue.send() else { break };
             let (sequence, payload) = (sample.info.sequence, sample.payload.len());
             let delivery = Delivery::Reliable;
             if let Err(why) = carrier.seal.write(sample, self.route, delivery, &mut self.frames, now) {
@@ -484,8 +489,8 @@ impl Flow {
     }
 
     /// The peer has the samples up to this number, and dropped some of them.
-    pub(super) fn acknowledge(&mut self, sequence: u64, dropped: u64, now: Duration) -> Option<Done> {
-        let (samples, newest) = self.queue.acknowledge(sequence, now);
+    pub(super) fn acknowledge(&mut self, sequence: u64, dropped: u64) -> Option<Done> {
+        let (samples, newest) = self.queue.acknowledge(sequence);
         self.acknowledged_samples += samples;
         newest.map(|sequence| Done { sequence: Some(sequence), given_up: samples.min(dropped) })
     }

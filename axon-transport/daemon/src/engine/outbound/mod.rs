@@ -387,7 +387,7 @@ impl Outbound {
     }
 
     /// The peer acknowledges samples. Numbers that were not sent to it, and more drops than samples, are ignored.
-    pub(crate) fn handle_received(&mut self, flows: &[ReceivedOf], now: Duration) {
+    pub(crate) fn handle_received(&mut self, flows: &[ReceivedOf]) {
         for ReceivedOf { route, publisher, sequence, dropped } in flows {
             let Some(served) = self.routes.get(route) else { continue };
             if !served.shared.acknowledged {
@@ -395,7 +395,7 @@ impl Outbound {
             }
             let Some(id) = served.flows.get(publisher).copied() else { continue };
             let Some(flow) = &mut self.flows[id] else { continue };
-            if let Some(done) = flow.acknowledge(*sequence, *dropped, now) {
+            if let Some(done) = flow.acknowledge(*sequence, *dropped) {
                 served.done(*publisher, done);
                 self.schedule(id);
             }

@@ -1,8 +1,8 @@
 //! The queue of one flow: samples that wait to be sent, and samples that were sent and are not acknowledged.
 //!
-//! KEEP_LAST never blocks its publisher. A burst is lossless: a queue that was empty within the last 500 ms holds as
-//! many samples as its bytes allow. A queue that was not empty for that long is behind: it holds its depth, and drops
-//! the oldest. KEEP_ALL drops nothing: what does not fit stays in the ring, and in time holds the publisher back.
+//! KEEP_LAST never blocks its publisher. A burst is lossless: a flow that had no sample waiting within the last 500 ms
+//! holds as many as its bytes allow. A flow that had some for longer is behind: it holds its depth, and drops the
+//! oldest. KEEP_ALL drops nothing: what does not fit stays in the ring, and in time holds the publisher back.
 
 use std::{collections::VecDeque, rc::Rc, time::Duration};
 
@@ -65,13 +65,13 @@ pub(super) struct Queue {
     sent_bytes: usize,
     /// The highest number that was ever sent.
     newest_sent: u64,
-    /// When the queue was last seen with nothing waiting.
-    empty_at: Duration,
+    /// Since when samples have waited, here or in the ring, without a moment in which none did.
+    since: Option<Duration>,
 }
 
 impl Queue {
     /// An empty queue. A RELIABLE sample keeps its place until it is acknowledged, or [written](Self::written).
-    pub(super) fn new(qos: &Qos, budget: Rc<Budget>, now: Duration) -> Self {
+    pub(super) fn new(qos: &Qos, budget: Rc<Budget>) -> Self {
         Self {
             policy: Policy::of(qos),
             budget,
@@ -80,7 +80,7 @@ impl Queue {
             bytes: 0,
             sent_bytes: 0,
             newest_sent: 0,
-            empty_at: now,
+            since: None,
         }
     }
 
@@ -102,14 +102,21 @@ impl Queue {
 
     /// Whether samples waited for so long that this is no burst.
     pub(super) fn is_behind(&self, now: Duration) -> bool {
-        !self.waiting.is_empty() && now.saturating_sub(self.empty_at) >= BURST
+        self.since.is_some_and(|since| now.saturating_sub(since) >= BURST)
+    }
+
+    /// The ring holds no sample. If the queue is empty too, the flow has caught up.
+    pub(super) fn handle_empty_ring(&mut self) {
+        if self.waiting.is_empty() {
+            self.since = None;
+        }
     }
 
     /// Whether the engine should move samples from the ring into the queue now. A flow that is behind leaves them
     /// in the ring, where newer samples replace them without a copy.
     pub(super) fn wants_more(&self, now: Duration) -> bool {
         match self.policy {
-            Policy::KeepLast(_) => !self.is_behind(now),
+            Policy::KeepLast(_) => self.waiting.is_empty() || !self.is_behind(now),
             Policy::KeepAll | Policy::BestEffort(_) => true,
         }
     }
@@ -121,9 +128,7 @@ impl Queue {
 
     /// Adds a sample.
     pub(super) fn offer(&mut self, sample: Sample, now: Duration) -> Offered {
-        if self.waiting.is_empty() {
-            self.empty_at = now;
-        }
+        self.since.get_or_insert(now);
         let most = match self.policy {
             Policy::KeepAll => usize::MAX,
             Policy::KeepLast(depth) if self.is_behind(now) => depth,
@@ -135,7 +140,7 @@ impl Queue {
             if self.policy == Policy::KeepAll {
                 return Offered::Full(sample);
             }
-            dropped += u64::from(self.pop(now).is_some());
+            dropped += u64::from(self.pop().is_some());
         }
         self.bytes += sample.size();
         self.waiting.push_back(sample);
@@ -167,13 +172,10 @@ impl Queue {
     }
 
     /// Removes the oldest waiting sample.
-    fn pop(&mut self, now: Duration) -> Option<Sample> {
+    fn pop(&mut self) -> Option<Sample> {
         let sample = self.waiting.pop_front()?;
         self.bytes -= sample.size();
         self.release(sample.size());
-        if self.waiting.is_empty() {
-            self.empty_at = now;
-        }
         Some(sample)
     }
 
@@ -184,15 +186,12 @@ impl Queue {
 
     /// The next RELIABLE sample to send. It stays in the queue until it is acknowledged or written; there is none
     /// while such samples fill the flow's share.
-    pub(super) fn send(&mut self, now: Duration) -> Option<&Sample> {
+    pub(super) fn send(&mut self) -> Option<&Sample> {
         let size = self.waiting.front()?.size();
         if !self.sent.is_empty() && self.sent_bytes + size > self.budget.of_flow() {
             return None;
         }
         let sample = self.waiting.pop_front()?;
-        if self.waiting.is_empty() {
-            self.empty_at = now;
-        }
         self.newest_sent = self.newest_sent.max(sample.info.sequence);
         self.sent_bytes += size;
         self.sent.push_back(sample);
@@ -208,8 +207,8 @@ impl Queue {
     }
 
     /// Takes the next best-effort sample to send.
-    pub(super) fn pop_best_effort(&mut self, now: Duration) -> Option<Sample> {
-        self.pop(now)
+    pub(super) fn pop_best_effort(&mut self) -> Option<Sample> {
+        self.pop()
     }
 
     /// The oldest samples that were sent, this many, are with QUIC, and the peer does not acknowledge them.
@@ -231,21 +230,21 @@ impl Queue {
             if !late && !expired {
                 break;
             }
-            dropped += u64::from(self.pop(now).is_some());
+            dropped += u64::from(self.pop().is_some());
         }
         dropped
     }
 
     /// The peer has the samples up to this number. Returns how many samples that were, and the newest of them. A
     /// number that was never sent acknowledges nothing.
-    pub(super) fn acknowledge(&mut self, sequence: u64, now: Duration) -> (u64, Option<u64>) {
+    pub(super) fn acknowledge(&mut self, sequence: u64) -> (u64, Option<u64>) {
         let most = sequence.min(self.newest_sent);
         let is_taken = |sample: &&Sample| sample.info.sequence <= most;
         let (mut samples, mut newest) = (0, None);
         loop {
             let taken = if self.sent.is_empty() {
                 // It was sent over a link that ended, and waits to be sent again.
-                self.waiting.front().filter(is_taken).is_some().then(|| self.pop(now)).flatten()
+                self.waiting.front().filter(is_taken).is_some().then(|| self.pop()).flatten()
             } else {
                 self.sent.front().filter(is_taken).is_some().then(|| self.pop_sent()).flatten()
             };
@@ -339,33 +338,40 @@ mod tests {
         }
     }
 
-    fn numbers(queue: &mut Queue, now: Duration) -> Vec<u64> {
-        std::iter::from_fn(|| queue.send(now).map(|sample| sample.info.sequence)).collect()
+    fn numbers(queue: &mut Queue) -> Vec<u64> {
+        std::iter::from_fn(|| queue.send().map(|sample| sample.info.sequence)).collect()
     }
 
     #[test]
     fn a_burst_of_keep_last_is_lossless_within_its_bytes() {
         let budget = Budget::new(256 * MIB);
-        let mut queue = Queue::new(&keep_last(1), budget.of_peer(), at(0));
+        let mut queue = Queue::new(&keep_last(1), budget.of_peer());
         for sequence in 1..=1000 {
             assert_eq!(dropped(queue.offer(sample(sequence, 100, at(0)), at(0))), 0);
         }
-        assert_eq!(numbers(&mut queue, at(1)).len(), 1000);
+        assert_eq!(numbers(&mut queue).len(), 1000);
     }
 
     #[test]
     fn keep_last_that_is_behind_holds_its_depth_and_the_newest() {
         let budget = Budget::new(256 * MIB);
-        let mut queue = Queue::new(&keep_last(2), budget.of_peer(), at(0));
+        let mut queue = Queue::new(&keep_last(2), budget.of_peer());
         for sequence in 1..=10 {
             dropped(queue.offer(sample(sequence, 100, at(0)), at(0)));
         }
         assert!(queue.wants_more(at(499)) && !queue.wants_more(at(500)));
         assert_eq!(dropped(queue.offer(sample(11, 100, at(600)), at(600))), 9);
-        assert_eq!(numbers(&mut queue, at(700)), [10, 11]);
-        // Empty again: the next samples are a burst.
+        assert_eq!(numbers(&mut queue), [10, 11]);
+        // The queue is empty, but the ring is not: it is still behind.
+        assert!(queue.wants_more(at(700)) && queue.is_behind(at(700)));
+        for sequence in 12..=14 {
+            dropped(queue.offer(sample(sequence, 100, at(800)), at(800)));
+        }
+        assert_eq!(numbers(&mut queue), [13, 14]);
+        queue.handle_empty_ring();
+        // It has caught up: the next samples are a burst.
         assert!(queue.wants_more(at(1500)));
-        for sequence in 12..=20 {
+        for sequence in 15..=20 {
             assert_eq!(dropped(queue.offer(sample(sequence, 100, at(1500)), at(1500))), 0);
         }
     }
@@ -373,12 +379,12 @@ mod tests {
     #[test]
     fn keep_all_refuses_beyond_its_bytes_and_takes_one_sample_of_any_length() {
         let budget = Budget::new(32 * MIB);
-        let mut queue = Queue::new(&Qos::keep_all(), budget.of_peer(), at(0));
+        let mut queue = Queue::new(&Qos::keep_all(), budget.of_peer());
         assert_eq!(dropped(queue.offer(sample(1, 3 << 20, at(0)), at(0))), 0);
         assert!(matches!(queue.offer(sample(2, 1, at(0)), at(0)), Offered::Full(s) if s.info.sequence == 2));
-        assert_eq!(queue.send(at(1)).unwrap().info.sequence, 1);
+        assert_eq!(queue.send().unwrap().info.sequence, 1);
         assert!(matches!(queue.offer(sample(2, 1, at(1)), at(1)), Offered::Full(_)), "not acknowledged");
-        assert_eq!(queue.acknowledge(1, at(2)), (1, Some(1)));
+        assert_eq!(queue.acknowledge(1), (1, Some(1)));
         assert_eq!(dropped(queue.offer(sample(2, 1, at(2)), at(2))), 0);
         drop(queue);
         assert_eq!(budget.taken(), 0);
@@ -387,43 +393,43 @@ mod tests {
     #[test]
     fn keep_last_sends_the_newest_while_a_long_one_is_not_acknowledged() {
         let budget = Budget::new(32 * MIB);
-        let mut queue = Queue::new(&keep_last(1), budget.of_peer(), at(0));
+        let mut queue = Queue::new(&keep_last(1), budget.of_peer());
         dropped(queue.offer(sample(1, 3 << 20, at(0)), at(0)));
-        queue.send(at(0)).unwrap();
+        queue.send().unwrap();
         for sequence in 2..=9 {
             dropped(queue.offer(sample(sequence, 3 << 20, at(sequence)), at(sequence)));
         }
         assert_eq!(queue.waiting(), 1);
-        assert_eq!(queue.acknowledge(1, at(10)), (1, Some(1)));
-        assert_eq!(numbers(&mut queue, at(11)), [9]);
+        assert_eq!(queue.acknowledge(1), (1, Some(1)));
+        assert_eq!(numbers(&mut queue), [9]);
     }
 
     #[test]
     fn numbers_that_were_not_sent_acknowledge_nothing() {
         let budget = Budget::new(256 * MIB);
-        let mut queue = Queue::new(&Qos::keep_all(), budget.of_peer(), at(0));
+        let mut queue = Queue::new(&Qos::keep_all(), budget.of_peer());
         for sequence in 1..=3 {
             dropped(queue.offer(sample(sequence, 1, at(0)), at(0)));
         }
-        assert_eq!(queue.acknowledge(u64::MAX, at(0)), (0, None));
-        queue.send(at(0)).unwrap();
-        assert_eq!(queue.acknowledge(u64::MAX, at(0)), (1, Some(1)));
-        assert_eq!(numbers(&mut queue, at(0)), [2, 3]);
+        assert_eq!(queue.acknowledge(u64::MAX), (0, None));
+        queue.send().unwrap();
+        assert_eq!(queue.acknowledge(u64::MAX), (1, Some(1)));
+        assert_eq!(numbers(&mut queue), [2, 3]);
     }
 
     #[test]
     fn a_link_that_ended_has_its_samples_sent_again_in_order() {
         let budget = Budget::new(256 * MIB);
-        let mut queue = Queue::new(&Qos::keep_all(), budget.of_peer(), at(0));
+        let mut queue = Queue::new(&Qos::keep_all(), budget.of_peer());
         for sequence in 1..=4 {
             dropped(queue.offer(sample(sequence, 1, at(0)), at(0)));
         }
-        queue.send(at(0)).unwrap();
-        queue.send(at(0)).unwrap();
+        queue.send().unwrap();
+        queue.send().unwrap();
         queue.rewind();
         // The acknowledgement of the old link came after it ended.
-        assert_eq!(queue.acknowledge(1, at(1)), (1, Some(1)));
-        assert_eq!(numbers(&mut queue, at(1)), [2, 3, 4]);
+        assert_eq!(queue.acknowledge(1), (1, Some(1)));
+        assert_eq!(numbers(&mut queue), [2, 3, 4]);
         assert!(queue.has_sent() && !queue.is_empty());
     }
 
@@ -431,7 +437,7 @@ mod tests {
     fn best_effort_keeps_its_depth_and_drops_what_would_be_late() {
         let budget = Budget::new(256 * MIB);
         let qos = Qos { depth: 3, ..Qos::sensor_data() };
-        let mut queue = Queue::new(&qos, budget.of_peer(), at(0));
+        let mut queue = Queue::new(&qos, budget.of_peer());
         for sequence in 1..=5 {
             dropped(queue.offer(sample(sequence, 1, at(10 * sequence)), at(10 * sequence)));
         }
@@ -439,27 +445,27 @@ mod tests {
         assert_eq!(budget.taken(), 0, "best effort takes no other's room");
         assert_eq!(queue.drop_late(at(200), at(100), at(145)), 2);
         assert_eq!(queue.drop_late(at(200), at(100), at(9000)), 0, "the newest is sent however old");
-        let last = queue.pop_best_effort(at(9000)).unwrap();
+        let last = queue.pop_best_effort().unwrap();
         assert_eq!((last.info.sequence, queue.is_empty()), (5, true));
     }
 
     #[test]
     fn responses_leave_in_the_order_of_the_calls_that_were_answered() {
         let budget = Budget::new(256 * MIB);
-        let mut queue = Queue::new(&Qos::keep_all(), budget.of_peer(), at(0));
+        let mut queue = Queue::new(&Qos::keep_all(), budget.of_peer());
         for sequence in [5, 3, 4] {
             dropped(queue.offer(sample(sequence, 1, at(0)), at(0)));
         }
-        assert_eq!(numbers(&mut queue, at(0)), [5, 3, 4]);
+        assert_eq!(numbers(&mut queue), [5, 3, 4]);
         queue.written(1);
         queue.rewind();
-        assert_eq!(numbers(&mut queue, at(0)), [3, 4], "response 5 is with QUIC, the others are not");
+        assert_eq!(numbers(&mut queue), [3, 4], "response 5 is with QUIC, the others are not");
     }
 
     #[test]
     fn another_delivery_moves_the_bytes_of_the_budget() {
         let budget = Budget::new(256 * MIB);
-        let mut queue = Queue::new(&Qos::sensor_data(), budget.of_peer(), at(0));
+        let mut queue = Queue::new(&Qos::sensor_data(), budget.of_peer());
         dropped(queue.offer(sample(1, 100, at(0)), at(0)));
         queue.set_qos(&Qos::keep_all());
         assert!(budget.taken() > 100);

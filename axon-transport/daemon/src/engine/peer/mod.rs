@@ -245,7 +245,7 @@ impl Peer {
                 self.update_services(with, now);
             }
             Message::Asserted(asserted) => self.handle_asserted(&asserted),
-            Message::Received(received) => self.outbound.handle_received(&received.flows, now),
+            Message::Received(received) => self.outbound.handle_received(&received.flows),
             Message::RouteRefused(refused) => self.handle_route_refused(refused, now),
             Message::RouteReady(ready) => {
                 self.handle_route_ready(ready.route);

@@ -1,10 +1,16 @@
 //! Drives many engines in one process, with a virtual clock, a simulated network and a script of faults.
 //!
-//! Everything follows from one seed. The parts here know nothing of the engine: [`network`] carries
-//! datagrams, [`script`] says which fault happens when, [`trace`] tells whether two runs were the same, and
-//! [`rng`] gives each part its own generator.
+//! Everything follows from one seed, but for the bytes of TLS. [`network`] carries datagrams, [`script`] says which
+//! fault happens when, [`trace`] tells whether two runs were the same, and [`rng`] gives each part its own generator.
+//! [`rings`] models a host's rings, [`host`] a host with its engine, and [`world`] all hosts and the clock. [`run`] runs
+//! a script in a world.
 
+mod host;
 pub(crate) mod network;
+mod rings;
 pub(crate) mod rng;
+mod run;
 pub(crate) mod script;
+mod tests;
 pub(crate) mod trace;
+mod world;

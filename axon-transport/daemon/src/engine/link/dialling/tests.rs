@@ -8,7 +8,7 @@ use super::*;
 use crate::{
     engine::keyring::{
         Answered,
-        tests::{Kmes, config, keyring, ms, s},
+        tests::{Kmes, config, id, keyring, ms, s},
     },
     gateway::RefusedBy,
     keys::{Event, FailureKind},
@@ -275,14 +275,12 @@ fn peer_that_has_no_key_yet_is_dialled_again_with_the_same_key() {
 #[test]
 fn key_that_the_peer_never_gets_is_given_up() {
     let mut dialled = Dialled::qkd(Some("sae-b"), 1);
-    let mut last = None;
-    while dialled.now < s(11) {
-        let (_, attempt) = dialled.connects();
-        last = attempt;
+    while dialled.connects().1.unwrap().key_id == id("key-1") {
         dialled.dial.handle_failed(&alert(UNKNOWN_PSK_IDENTITY));
     }
-    assert!(last.is_some_and(|attempt| attempt.key_id.to_string() != "key-1"));
-    assert_eq!(dialled.kmes.asked.len(), 2, "after 10 s the next key is asked for");
+    // Ten seconds of refusals, up to one wait more, and a second of backoff.
+    assert!((s(11)..s(13)).contains(&dialled.now), "{:?}", dialled.now);
+    assert_eq!(dialled.kmes.asked.len(), 2);
 }
 
 #[test]
@@ -290,11 +288,11 @@ fn key_that_the_peer_holds_differently_is_given_up_at_the_fourth_alert() {
     let mut dialled = Dialled::qkd(Some("sae-b"), 1);
     for _ in 0..4 {
         let (_, attempt) = dialled.connects();
-        assert_eq!(attempt.unwrap().key_id.to_string(), "key-1");
+        assert_eq!(attempt.unwrap().key_id, id("key-1"));
         dialled.dial.handle_failed(&alert(DECRYPT_ERROR));
     }
     let (_, attempt) = dialled.connects();
-    assert_eq!(attempt.unwrap().key_id.to_string(), "key-2");
+    assert_eq!(attempt.unwrap().key_id, id("key-2"));
 }
 
 #[test]
@@ -308,10 +306,25 @@ fn silence_and_other_refusals_end_the_dial_and_keep_the_key() {
 
     dialled.dial = Dialling::new(dialled.now, target(Some("sae-b"), 2), dialled.ring.as_ref());
     let (_, attempt) = dialled.connects();
-    assert_eq!(attempt.unwrap().key_id.to_string(), "key-1");
+    assert_eq!(attempt.unwrap().key_id, id("key-1"));
     dialled.dial.handle_failed(&alert(40));
     assert_eq!(dialled.fails().alert, Some(40));
     assert_eq!(dialled.kmes.asked.len(), 1);
+}
+
+#[test]
+fn time_in_which_the_peer_is_silent_does_not_count_against_the_key() {
+    let mut dialled = Dialled::qkd(Some("sae-b"), 1);
+    for _ in 0..10 {
+        dialled.connects();
+        dialled.dial.handle_failed(&alert(UNKNOWN_PSK_IDENTITY));
+        let (_, attempt) = dialled.connects();
+        assert_eq!(attempt.unwrap().key_id, id("key-1"));
+        dialled.dial.handle_failed(&ConnectionError::Reset);
+        assert_eq!(dialled.fails().name, "reset");
+        dialled.now += s(4);
+        dialled.dial = Dialling::new(dialled.now, target(Some("sae-b"), 1), dialled.ring.as_ref());
+    }
 }
 
 #[test]

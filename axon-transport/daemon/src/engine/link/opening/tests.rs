@@ -44,14 +44,19 @@ fn hybrid() -> Negotiated {
         let mut client = ClientConnection::new(Arc::new(client), name).unwrap();
         let mut server = ServerConnection::new(Arc::new(server)).unwrap();
         while client.is_handshaking() || server.is_handshaking() {
-            let mut wire = Vec::new();
+            let (mut wire, mut back) = (Vec::new(), Vec::new());
             client.write_tls(&mut wire).unwrap();
-            server.read_tls(&mut &wire[..]).unwrap();
-            server.process_new_packets().unwrap();
-            wire.clear();
-            server.write_tls(&mut wire).unwrap();
-            client.read_tls(&mut &wire[..]).unwrap();
-            client.process_new_packets().unwrap();
+            let mut wire = &wire[..];
+            while !wire.is_empty() {
+                server.read_tls(&mut wire).unwrap();
+                server.process_new_packets().unwrap();
+            }
+            server.write_tls(&mut back).unwrap();
+            let mut back = &back[..];
+            while !back.is_empty() {
+                client.read_tls(&mut back).unwrap();
+                client.process_new_packets().unwrap();
+            }
         }
         hybrid::negotiated(&client).unwrap()
     };
@@ -160,7 +165,8 @@ impl End {
         end.ask(now, kmes);
         assert!(end.outcome(now).is_none());
         let messages: Vec<_> = std::iter::from_fn(|| end.opening.poll_message()).collect();
-        let [Message::Hello(_), Message::Keys(KeyMessage::Announce(key_ids))] = &messages[..] else {
+        let [Message::Hello(_), Message::Keys(KeyMessage::Announce(key_ids))] = &messages[..]
+        else {
             panic!("{messages:?}");
         };
         assert_eq!(key_ids[..], [id("key-1")]);

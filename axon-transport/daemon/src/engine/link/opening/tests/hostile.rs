@@ -145,6 +145,24 @@ fn identity_of_another_form_is_refused() {
 }
 
 #[test]
+fn qkd_without_keys_opens_nothing() {
+    for key_mode in [KeyMode::Session, KeyMode::Messages10] {
+        for side in [Side::Client, Side::Server] {
+            let settings = settings(side, Some(key_mode));
+            let mut end = End::with(NOW, facts(side, Some(key_mode)), &settings, None);
+            end.refuses(NOW, "INTERNAL");
+
+            // Not even with a peer that claims no SAE.
+            let mut end = End::awaiting_hello(NOW, side, Some(key_mode));
+            end.ring = None;
+            let theirs = Hello { sae: None, ..theirs(side, Some(key_mode)) };
+            end.hears(NOW, &Message::Hello(theirs));
+            assert!(end.outcome(NOW).unwrap().is_err());
+        }
+    }
+}
+
+#[test]
 fn message_that_is_read_too_early_ends_the_opening() {
     let key_mode = Some(KeyMode::Session);
     let mut end = End::new(NOW, Side::Server, key_mode);

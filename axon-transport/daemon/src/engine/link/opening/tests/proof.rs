@@ -147,8 +147,9 @@ fn kme_that_does_not_answer_is_waited_for_until_the_limit() {
 
 #[test]
 fn failed_proofs_make_further_handshakes_wait() {
+    type Way = fn(&mut End);
     for key_mode in MODES {
-        let ways: [(&str, fn(&mut End)); 4] = [
+        let ways: [(&str, Way); 4] = [
             ("a wrong proof", |end| {
                 while end.opening.poll_message().is_some() {}
                 let Some(key_id) = &end.announced else { unreachable!() };

@@ -92,7 +92,8 @@ fn address_that_proved_its_name_has_room_of_its_own() {
     let ring = pair.server.ring.unwrap();
     let looks_up = |host: [u8; 4]| {
         let resolver = ring.resolver(s(1), host.into());
-        let identity = PskIdentity::new(&format!("sae-{}", host[3]), "k").unwrap().to_bytes();
+        let (sae, key_id) = (format!("sae-{}", host[3]), format!("key-{host:?}"));
+        let identity = PskIdentity::new(&sae, &key_id).unwrap().to_bytes();
         assert!(Arc::clone(&resolver).resolve(&identity).is_none());
         resolver.outcome().unwrap()
     };

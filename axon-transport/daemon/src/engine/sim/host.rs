@@ -1,0 +1,344 @@
+//! A simulated host: one engine with rings, a KME and a control plane that dials.
+
+use std::{
+    collections::{BTreeMap, BTreeSet, VecDeque},
+    net::{IpAddr, Ipv4Addr, SocketAddr},
+    rc::Rc,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use axon_shm::ids::{DaemonId, Gid};
+use axon_transport::{
+    config::{Config, DiscoveryRange},
+    internal::graph::{EndpointRange, RemoteEndpoint},
+    status::LinkStatus,
+};
+use bytes::BytesMut;
+use quinn_proto::{EcnCodepoint, EndpointConfig, Transmit};
+use rand::RngExt;
+
+use super::{
+    rings::SimRings,
+    rng::{Stream, stream},
+};
+use crate::{
+    discovery::AddressConfidence,
+    engine::{
+        Effect, Engine, EngineParts, credentials::Credentials, links::LinkParts, peer::MAX_ROUTES,
+    },
+    gateway::{
+        bridge::{ToControl, ToGateway},
+        identity::Identity,
+    },
+    keys::{Origin, Request},
+    link::Hello,
+    owner::SessionKeys,
+};
+
+/// The port of QUIC on each host.
+pub(super) const PORT: u16 = 61_300;
+/// Time between a failed dial, or the end of a link, and the next dial.
+const REDIAL: Duration = Duration::from_millis(250);
+
+/// A simulated host.
+pub(super) struct Host {
+    pub(super) number: usize,
+    pub(super) address: Ipv4Addr,
+    pub(super) daemon: DaemonId,
+    pub(super) rings: SimRings,
+    config: Arc<Config>,
+    epoch: Instant,
+    /// `None` while the daemon is dead.
+    engine: Option<Engine>,
+    seed: u64,
+    starts: u32,
+    /// Peers to be linked with, and when they are dialled next.
+    peers: BTreeMap<DaemonId, Wanted>,
+    /// The endpoints of each peer, as the control plane was told.
+    pub(super) graph: BTreeMap<DaemonId, BTreeMap<Gid, RemoteEndpoint>>,
+    pub(super) linked: BTreeSet<DaemonId>,
+    pub(super) status: BTreeMap<String, LinkStatus>,
+    pub(super) refusals: VecDeque<(Duration, String)>,
+    pub(super) lost: BTreeMap<(String, &'static str), u64>,
+    /// Requests to the KME that wait for an answer.
+    pub(super) requests: Vec<(Origin, Request)>,
+    records: Vec<(u64, String)>,
+    used: BTreeSet<String>,
+    graph_changed: bool,
+    rings_rang: bool,
+}
+
+struct Wanted {
+    address: SocketAddr,
+    sae: Option<String>,
+    dial_at: Option<Duration>,
+}
+
+impl Host {
+    /// A host whose daemon is not started.
+    pub(super) fn new(number: usize, config: Config, seed: u64, epoch: Instant) -> Self {
+        let [high, low] = (number as u16 + 1).to_be_bytes();
+        Self {
+            number,
+            address: Ipv4Addr::new(10, 0, high, low),
+            daemon: DaemonId::default(),
+            rings: SimRings::new(number),
+            config: Arc::new(config),
+            epoch,
+            engine: None,
+            seed,
+            starts: 0,
+            peers: BTreeMap::new(),
+            graph: BTreeMap::new(),
+            linked: BTreeSet::new(),
+            status: BTreeMap::new(),
+            refusals: VecDeque::new(),
+            lost: BTreeMap::new(),
+            requests: Vec::new(),
+            records: Vec::new(),
+            used: BTreeSet::new(),
+            graph_changed: false,
+            rings_rang: false,
+        }
+    }
+
+    /// Starts the daemon.
+    pub(super) fn start(&mut self, now: Duration) {
+        self.starts += 1;
+        let host = Stream::Host { host: self.number as u32, start: self.starts };
+        let mut random = stream(self.seed, host);
+        self.daemon = DaemonId(random.random());
+        let mut endpoint = EndpointConfig::default();
+        endpoint.rng_seed(Some(random.random())).grease_quic_bit(false);
+        endpoint.supported_versions(vec![1]);
+        let identity = match &self.config.security {
+            axon_transport::config::Security::Classic(classic) => {
+                Some(Arc::new(Identity::load(classic, "host").unwrap()))
+            }
+            axon_transport::config::Security::Qkd(_) => None,
+        };
+        let hello = Hello {
+            routes: Some(MAX_ROUTES as u32),
+            host: format!("host{}", self.number),
+            ..Hello::new(&self.config, self.daemon)
+        };
+        let links = LinkParts {
+            config: Arc::clone(&self.config),
+            credentials: Credentials::new(Arc::clone(&self.config), identity),
+            hello,
+            addresses: vec![SocketAddr::from(([0, 0, 0, 0], PORT))],
+            endpoint: Arc::new(endpoint),
+            epoch: self.epoch,
+        };
+        let session_keys = SessionKeys::default();
+        session_keys.insert(self.rings.key());
+        let parts = EngineParts {
+            links,
+            rings: Rc::new(self.rings.clone()),
+            session_keys: Arc::new(session_keys),
+            session: [0xee; 12],
+            epoch_nanos: 1_000_000_000,
+        };
+        self.engine = Some(Engine::new(parts).unwrap());
+        (self.graph, self.linked) = (BTreeMap::new(), BTreeSet::new());
+        (self.requests, self.records) = (Vec::new(), Vec::new());
+        self.status.clear();
+        for peer in self.peers.values_mut() {
+            peer.dial_at = Some(now);
+        }
+        self.graph_changed = true;
+    }
+
+    /// Kills the daemon: it says nothing, and its state is gone.
+    pub(super) fn kill(&mut self) {
+        self.engine = None;
+        self.linked.clear();
+        self.graph.clear();
+    }
+
+    /// Whether the daemon runs.
+    pub(super) fn is_running(&self) -> bool {
+        self.engine.is_some()
+    }
+
+    /// Ends the daemon in order. Its packets leave with the next transmit.
+    pub(super) fn close(&mut self, now: Duration) {
+        if let Some(engine) = &mut self.engine {
+            engine.close(now);
+            engine.settle(now);
+        }
+    }
+
+    /// The host's SAE ID, in qkd.
+    pub(super) fn sae(&self) -> Option<String> {
+        match &self.config.security {
+            axon_transport::config::Security::Classic(_) => None,
+            axon_transport::config::Security::Qkd(qkd) => Some(qkd.sae_id.clone()),
+        }
+    }
+
+    /// Has the host link with a peer. The lower id dials.
+    pub(super) fn want(
+        &mut self,
+        daemon: DaemonId,
+        address: Ipv4Addr,
+        sae: Option<String>,
+        now: Duration,
+    ) {
+        let address = SocketAddr::from((address, PORT));
+        // The other one dials too, later, as discovery has it.
+        let wait = if self.daemon < daemon { Duration::ZERO } else { Duration::from_millis(300) };
+        self.peers.insert(daemon, Wanted { address, sae, dial_at: Some(now + wait) });
+    }
+
+    /// Forgets a peer that is gone.
+    pub(super) fn unwant(&mut self, daemon: DaemonId) {
+        self.peers.remove(&daemon);
+    }
+
+    /// Samples that wait for peers, in bytes.
+    pub(super) fn backlog(&self) -> (usize, usize) {
+        self.engine.as_ref().map_or((0, 0), Engine::backlog)
+    }
+
+    /// A peer has another address.
+    pub(super) fn moved(&mut self, daemon: DaemonId, address: Ipv4Addr) {
+        if let Some(wanted) = self.peers.get_mut(&daemon) {
+            wanted.address = SocketAddr::from((address, PORT));
+        }
+    }
+
+    /// The endpoints of the host changed.
+    pub(super) fn touch_graph(&mut self) {
+        self.graph_changed = true;
+    }
+
+    /// A ring rang.
+    pub(super) fn ring(&mut self) {
+        self.rings_rang = true;
+    }
+
+    /// A datagram came.
+    pub(super) fn handle_datagram(
+        &mut self,
+        from: SocketAddr,
+        ecn: Option<EcnCodepoint>,
+        bytes: BytesMut,
+        now: Duration,
+    ) {
+        if let Some(engine) = &mut self.engine {
+            let local = Some(IpAddr::V4(self.address));
+            engine.handle_datagram(0, from, local, ecn, bytes, now);
+        }
+    }
+
+    /// The KME answered.
+    pub(super) fn handle_key_event(&mut self, event: crate::keys::Event, now: Duration) {
+        if let Some(engine) = &mut self.engine {
+            engine.handle_key_event(event, now);
+        }
+    }
+
+    /// When the host has something to do.
+    pub(super) fn poll_timeout(&self, now: Duration) -> Option<Duration> {
+        let engine = self.engine.as_ref()?;
+        let ready = (self.graph_changed || self.rings_rang || !self.records.is_empty()).then_some(now);
+        let dials = self.peers.iter().filter(|(daemon, _)| !self.linked.contains(daemon));
+        let dials = dials.filter_map(|(_, wanted)| wanted.dial_at).min();
+        [engine.poll_timeout(now), ready, dials].into_iter().flatten().min()
+    }
+
+    /// One pass of the host.
+    pub(super) fn pass(&mut self, now: Duration) {
+        let Some(engine) = &mut self.engine else { return };
+        if std::mem::take(&mut self.graph_changed) {
+            let range = EndpointRange { range: DiscoveryRange::Subnet, lists: Vec::new() };
+            let endpoints = self.rings.endpoints().into_iter();
+            let local = endpoints.map(|e| (e.gid, (e, range.clone()))).collect();
+            engine.handle_local_graph(local, now);
+        }
+        if std::mem::take(&mut self.rings_rang) {
+            engine.handle_rings(now);
+        }
+        for (link, key_id) in std::mem::take(&mut self.records) {
+            let first = self.used.insert(key_id);
+            engine.handle_recorded(link, first, now);
+        }
+        for (daemon, wanted) in &mut self.peers {
+            if self.linked.contains(daemon) || wanted.dial_at.is_none_or(|at| at > now) {
+                continue;
+            }
+            wanted.dial_at = None;
+            let (addresses, sae) = (vec![wanted.address], wanted.sae.clone());
+            let standing = AddressConfidence::Heard;
+            let dial = ToGateway::Dial { daemon: *daemon, sae, addresses, listed: false, standing };
+            engine.handle_order(dial, now);
+        }
+        if engine.poll_timeout(now).is_some_and(|due| due <= now) {
+            engine.handle_timeout(now);
+        }
+        engine.settle(now);
+        let mut effects = Vec::new();
+        while let Some(effect) = engine.poll_effect() {
+            effects.push(effect);
+        }
+        for effect in effects {
+            self.apply(effect, now);
+        }
+    }
+
+    fn apply(&mut self, effect: Effect, now: Duration) {
+        match effect {
+            Effect::Tell(what) => self.told(what, now),
+            Effect::Kme(origin, request) => self.requests.push((origin, request)),
+            Effect::Record { link, key_id } => self.records.push((link, key_id)),
+            Effect::ReturnMemory => {}
+        }
+    }
+
+    fn told(&mut self, what: ToControl, now: Duration) {
+        match what {
+            ToControl::RemoteGraph { daemon, reset, added, removed } => {
+                let graph = self.graph.entry(daemon).or_default();
+                if reset {
+                    graph.clear();
+                }
+                removed.iter().for_each(|gid| drop(graph.remove(gid)));
+                graph.extend(added.into_iter().map(|e| (e.endpoint.gid, e)));
+            }
+            ToControl::LinkUp { daemon, .. } => {
+                self.linked.insert(daemon);
+            }
+            ToControl::LinkDown { daemon, reason } => {
+                self.linked.remove(&daemon);
+                self.graph.remove(&daemon);
+                self.refusals.push_back((now, format!("down: {reason}")));
+                self.redial(daemon, now);
+            }
+            ToControl::DialFailed { daemon, .. } => self.redial(daemon, now),
+            ToControl::Refusal { peer, what, reason } => {
+                self.refusals.push_back((now, format!("{peer}: {what}: {reason}")));
+            }
+            ToControl::Lost { topic, cause, samples } => {
+                *self.lost.entry((topic, cause)).or_default() += samples;
+            }
+            ToControl::Link(status) => {
+                self.status.insert(status.peer.clone(), *status);
+            }
+            _ => {}
+        }
+    }
+
+    fn redial(&mut self, daemon: DaemonId, now: Duration) {
+        if let Some(wanted) = self.peers.get_mut(&daemon) {
+            let wait = if self.daemon < daemon { REDIAL } else { 2 * REDIAL };
+            wanted.dial_at = Some(now + wait);
+        }
+    }
+
+    /// The next packets.
+    pub(super) fn poll_transmit(&mut self, buffer: &mut Vec<u8>, now: Duration) -> Option<Transmit> {
+        Some(self.engine.as_mut()?.poll_transmit(10, buffer, now)?.1)
+    }
+}

@@ -1,0 +1,353 @@
+//! A world of hosts on one network, with a virtual clock.
+
+use std::{
+    fmt::Write,
+    net::SocketAddr,
+    time::{Duration, Instant},
+};
+
+use axon_shm::{
+    ids::Gid,
+    qos::{History, Qos, Reliability},
+};
+use axon_transport::config::Config;
+use bytes::BytesMut;
+
+use super::{
+    host::{Host, PORT},
+    network::Network,
+};
+use crate::{engine::keyring::tests::Kmes, keys::Event};
+
+/// A KME answers after this time.
+const KME: Duration = Duration::from_millis(20);
+
+/// Hosts on a network.
+pub(super) struct World {
+    pub(super) now: Duration,
+    pub(super) network: Network,
+    pub(super) hosts: Vec<Host>,
+    pub(super) kmes: Kmes,
+    answers: Vec<(Duration, usize, Event)>,
+    stopped: Vec<bool>,
+    /// Passes of all hosts since the start.
+    pub(super) passes: u64,
+    /// Publishers and subscriptions whose samples are checked.
+    pub(super) pairs: Vec<Pair>,
+}
+
+/// A publisher and a subscription on two hosts.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Pair {
+    pub(super) publisher: (usize, Gid),
+    pub(super) subscription: (usize, Gid),
+    /// RELIABLE and KEEP_ALL on both sides.
+    pub(super) complete: bool,
+    /// Samples that were published before the pair was whole.
+    pub(super) before: u64,
+}
+
+impl World {
+    /// So many hosts with these settings; their daemons are started and link with each other.
+    pub(super) fn new(seed: u64, hosts: usize, config: impl Fn(usize) -> Config) -> Self {
+        let epoch = Instant::now();
+        let mut network = Network::new(seed);
+        let mut all = Vec::new();
+        for number in 0..hosts {
+            let mut host = Host::new(number, config(number), seed, epoch);
+            assert_eq!(network.add_host(&[host.address]), number);
+            host.start(Duration::ZERO);
+            all.push(host);
+        }
+        let mut world = Self {
+            now: Duration::ZERO,
+            network,
+            hosts: all,
+            kmes: Kmes::default(),
+            answers: Vec::new(),
+            stopped: vec![false; hosts],
+            passes: 0,
+            pairs: Vec::new(),
+        };
+        for host in 0..hosts {
+            world.introduce(host);
+        }
+        world
+    }
+
+    /// Tells all hosts of a host's daemon, and the other way round.
+    fn introduce(&mut self, of: usize) {
+        let (daemon, address) = (self.hosts[of].daemon, self.hosts[of].address);
+        let sae = self.hosts[of].sae();
+        for other in 0..self.hosts.len() {
+            if other == of {
+                continue;
+            }
+            let (there, theirs) = (self.hosts[other].daemon, self.hosts[other].address);
+            let their_sae = self.hosts[other].sae();
+            self.hosts[other].want(daemon, address, sae.clone(), self.now);
+            self.hosts[of].want(there, theirs, their_sae, self.now);
+        }
+    }
+
+    /// Ends a host's daemon: at once, or as after SIGTERM.
+    pub(super) fn kill(&mut self, host: usize, orderly: bool) {
+        if orderly {
+            self.hosts[host].close(self.now);
+            self.transmit(host);
+        }
+        self.hosts[host].kill();
+    }
+
+    /// Stops a host, or lets it go on. Datagrams wait meanwhile.
+    pub(super) fn stop(&mut self, host: usize, stopped: bool) {
+        self.stopped[host] = stopped;
+        if stopped {
+            self.network.pause(host);
+        } else {
+            self.network.resume(self.now, host);
+        }
+    }
+
+    /// Gives a host another address, which the others learn.
+    pub(super) fn move_host(&mut self, host: usize) {
+        let [_, subnet, high, low] = self.hosts[host].address.octets();
+        let address = std::net::Ipv4Addr::new(10, subnet.wrapping_add(1), high, low);
+        self.network.move_host(self.hosts[host].address, address);
+        self.hosts[host].address = address;
+        let daemon = self.hosts[host].daemon;
+        self.hosts.iter_mut().for_each(|other| other.moved(daemon, address));
+    }
+
+    /// Has each publisher of a topic on a host publish a sample.
+    pub(super) fn publish_all(&mut self, host: usize, topic: usize, size: usize) {
+        let publishers = self.hosts[host].rings.publishers(&super::run::name(topic));
+        for publisher in publishers {
+            self.hosts[host].rings.publish(publisher, size);
+            self.hosts[host].ring();
+        }
+    }
+
+    /// For each RELIABLE and KEEP_ALL pair of which samples came: the publisher, and the subscription with the
+    /// samples that are missing after the first that came.
+    pub(super) fn losses(&self) -> Vec<((usize, Gid), ((usize, Gid), u64))> {
+        let mut losses = Vec::new();
+        for there in &self.hosts {
+            for (subscription, publisher, first, came) in there.rings.complete() {
+                let from = self.hosts.iter().find_map(|host| {
+                    let (qos, published) = host.rings.publisher(publisher)?;
+                    let complete = qos.history == History::KeepAll
+                        && qos.reliability == Reliability::Reliable;
+                    complete.then_some((host.number, published))
+                });
+                let Some((from, published)) = from else { continue };
+                let missing = (published + 1 - first).saturating_sub(came);
+                losses.push(((from, publisher), ((there.number, subscription), missing)));
+            }
+        }
+        losses
+    }
+
+    /// Starts a host's daemon again, under a new id. The others forget the old one.
+    pub(super) fn restart(&mut self, host: usize) {
+        let old = self.hosts[host].daemon;
+        for other in &mut self.hosts {
+            other.unwant(old);
+        }
+        let now = self.now;
+        self.hosts[host].start(now);
+        self.introduce(host);
+    }
+
+    /// Creates a publisher and a subscription of the same topic on two hosts.
+    pub(super) fn pair(&mut self, from: usize, to: usize, topic: &str, qos: Qos) -> Pair {
+        let publisher = self.hosts[from].rings.create_publisher(topic, qos);
+        let subscription = self.hosts[to].rings.create_subscription(topic, qos, None);
+        self.hosts[from].touch_graph();
+        self.hosts[to].touch_graph();
+        let complete =
+            qos.history == History::KeepAll && qos.reliability == Reliability::Reliable;
+        let pair = Pair {
+            publisher: (from, publisher),
+            subscription: (to, subscription),
+            complete,
+            before: 0,
+        };
+        self.pairs.push(pair);
+        pair
+    }
+
+    /// Publishes a sample.
+    pub(super) fn publish(&mut self, pair: Pair, length: usize) -> bool {
+        let (host, publisher) = pair.publisher;
+        let published = self.hosts[host].rings.publish(publisher, length);
+        self.hosts[host].ring();
+        published
+    }
+
+    /// The numbers of the samples that arrived.
+    pub(super) fn received(&self, pair: Pair) -> Vec<u64> {
+        let (host, subscription) = pair.subscription;
+        self.hosts[host].rings.received(subscription, pair.publisher.1)
+    }
+
+    fn due(&self, host: usize) -> Option<Duration> {
+        if self.stopped[host] { None } else { self.hosts[host].poll_timeout(self.now) }
+    }
+
+    /// The time of the next event.
+    fn next(&self) -> Option<Duration> {
+        let hosts = (0..self.hosts.len()).filter_map(|host| self.due(host)).min();
+        let answer = self.answers.iter().map(|(at, ..)| *at).min();
+        [hosts, answer, self.network.poll_timeout()].into_iter().flatten().min()
+    }
+
+    /// Runs until this time.
+    pub(super) fn run_until(&mut self, until: Duration) {
+        while self.now < until {
+            let next = self.next().unwrap_or(until).max(self.now);
+            if next > until {
+                self.now = until;
+                break;
+            }
+            self.now = next;
+            self.step();
+        }
+    }
+
+    /// Runs for so long.
+    pub(super) fn run_for(&mut self, time: Duration) {
+        self.run_until(self.now + time);
+    }
+
+    /// Runs until this holds, or panics with what all hosts say after so long.
+    pub(super) fn until(&mut self, most: Duration, holds: impl Fn(&Self) -> bool) {
+        let end = self.now + most;
+        while !holds(self) {
+            let next = self.next().unwrap_or(end).max(self.now);
+            assert!(next < end, "not within {most:?}:\n{}", self.describe());
+            self.now = next;
+            self.step();
+        }
+    }
+
+    /// One event: all that is due now.
+    fn step(&mut self) {
+        let now = self.now;
+        while let Some(delivery) = self.network.poll_delivery(now) {
+            if delivery.at.port() != PORT {
+                continue;
+            }
+            let bytes = BytesMut::from(delivery.bytes);
+            let host = &mut self.hosts[delivery.host];
+            host.handle_datagram(delivery.from, delivery.ecn, bytes, now);
+            self.pass(delivery.host);
+        }
+        let due: Vec<_> = self.answers.extract_if(.., |(at, ..)| *at <= now).collect();
+        for (_, host, event) in due {
+            self.hosts[host].handle_key_event(event, now);
+            self.pass(host);
+        }
+        for host in 0..self.hosts.len() {
+            let due = self.due(host);
+            if due.is_some_and(|due| due <= now) {
+                self.pass(host);
+            }
+        }
+    }
+
+    fn pass(&mut self, number: usize) {
+        let now = self.now;
+        self.passes += 1;
+        self.hosts[number].pass(now);
+        self.transmit(number);
+        let host = &mut self.hosts[number];
+        for (origin, request) in std::mem::take(&mut host.requests) {
+            let answer = self.kmes.answer(request);
+            self.answers.push((now + KME, number, Event { origin, answer }));
+        }
+        self.check(number);
+    }
+
+    fn transmit(&mut self, number: usize) {
+        let now = self.now;
+        let host = &mut self.hosts[number];
+        let from = SocketAddr::from((host.address, PORT));
+        let mut buffer = Vec::new();
+        while let Some(transmit) = host.poll_transmit(&mut buffer, now) {
+            let (to, bytes) = (transmit.destination, &buffer[..transmit.size]);
+            self.network.send(now, from, to, transmit.ecn, bytes, transmit.segment_size);
+        }
+    }
+
+    /// What must hold after each pass: no sample twice, none out of order, none damaged.
+    fn check(&self, host: usize) {
+        let rings = &self.hosts[host].rings;
+        assert_eq!(rings.damaged(), 0, "a sample was damaged: {}", self.describe());
+        assert_eq!(rings.disordered(), 0, "a sample came twice or late: {}", self.describe());
+        for pair in self.pairs.iter().filter(|pair| pair.subscription.0 == host) {
+            let received = self.received(*pair);
+            let last = received.len().saturating_sub(2);
+            assert!(
+                received[last..].is_sorted_by(|one, other| one < other),
+                "a sample came twice or out of order at {:?}: {:?}",
+                self.now,
+                &received[last..]
+            );
+        }
+    }
+
+    /// Whether all daemons that run are linked with each other.
+    pub(super) fn is_linked(&self) -> bool {
+        let running = self.hosts.iter().filter(|host| host.is_running());
+        running.clone().all(|host| {
+            running.clone().all(|o| o.number == host.number || host.linked.contains(&o.daemon))
+        })
+    }
+
+    /// Whether each host knows the endpoints of all others.
+    pub(super) fn is_whole(&self) -> bool {
+        self.is_linked()
+            && self.hosts.iter().filter(|host| host.is_running()).all(|host| {
+                self.hosts.iter().filter(|o| o.is_running() && o.number != host.number).all(|o| {
+                    let shown: Vec<Gid> = o.rings.endpoints().iter().map(|e| e.gid).collect();
+                    let known = host.graph.get(&o.daemon);
+                    known.is_some_and(|known| {
+                        known.len() == shown.len() && shown.iter().all(|g| known.contains_key(g))
+                    })
+                })
+            })
+    }
+
+    /// What all hosts say, for a failure.
+    pub(super) fn describe(&self) -> String {
+        let mut text = format!("at {:?}\n", self.now);
+        for host in &self.hosts {
+            let _ = writeln!(
+                text,
+                "host {} daemon {} linked {:?} lost {:?} waits for room {}",
+                host.number,
+                host.daemon,
+                host.linked.len(),
+                host.lost,
+                host.rings.waits_for_room()
+            );
+            for (at, refusal) in host.refusals.iter().rev().take(8) {
+                let _ = writeln!(text, "  {at:?} {refusal}");
+            }
+        }
+        for pair in &self.pairs {
+            let (host, publisher) = pair.publisher;
+            let received = self.received(*pair);
+            let _ = writeln!(
+                text,
+                "{pair:?}: published {}, received {}, given up {}, last {:?}",
+                self.hosts[host].rings.published(publisher),
+                received.len(),
+                self.hosts[host].rings.given_up(publisher),
+                received.last()
+            );
+        }
+        text
+    }
+}
