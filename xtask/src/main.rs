@@ -13,6 +13,7 @@ mod picture;
 mod public_api;
 mod repeat;
 mod rustls_axon;
+mod simulate;
 
 const USAGE: &str = "\
 usage: cargo xtask COMMAND
@@ -30,6 +31,9 @@ usage: cargo xtask COMMAND
   repeat TIMES [--busy N] [NAME ...]
                        run the test suite, or the test programs with such a name, TIMES times,
                        beside N busy threads, and list the tests that failed in any run
+  simulate [--seeds N] [--hosts M] [--first SEED]
+                       drive M simulated hosts through mixed faults, for each of N seeds, and shrink
+                       the script of a seed that fails
   rustls-digests       after a change to patches/ or added/: write patched.sha256 anew
   rustls-checkout DIR [VERSION]
                        make DIR a git repository with rustls's source and a commit a patch, and
@@ -61,6 +65,10 @@ fn main() -> ExitCode {
         ["public-api", "--write"] => public_api::check(rustls_axon::workspace(), true),
         ["repeat", times, ref options @ ..] => match repeat_options(times, options) {
             Some(options) => repeat::repeat(&options),
+            None => return usage(),
+        },
+        ["simulate", ref options @ ..] => match simulate::Options::parse(options) {
+            Some(options) => simulate::simulate(options),
             None => return usage(),
         },
         ["rustls-digests"] => rustls_axon::digests(),
